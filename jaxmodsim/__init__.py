@@ -1,0 +1,18 @@
+"""Differentiable mechanics with friction: Lagrangians in, motion, figures and fits out."""
+
+from .effects import AbstractEffect as AbstractEffect
+from .effects import AppliedForce as AppliedForce
+from .effects import Friction as Friction
+from .friction import Coulomb as Coulomb
+from .friction import DeadZone as DeadZone
+from .friction import LuGre as LuGre
+from .friction import Regularized as Regularized
+from .friction import Sign as Sign
+from .friction import Stribeck as Stribeck
+from .friction import Viscous as Viscous
+from .friction import asymmetric as asymmetric
+from .scene import Scene as Scene
+from .simulation import SimulationError as SimulationError
+from .simulation import Trajectory as Trajectory
+from .simulation import simulate as simulate
+from .solvers import Rodas5P as Rodas5P

@@ -1,0 +1,87 @@
+"""A force from outside."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from ..numerics import as_function
+from ._effect import AbstractEffect, Action, Power, result_shape
+
+
+def _optional_function(value: Any) -> Callable[..., Any] | None:
+    return None if value is None else as_function(value, name="AppliedForce at")
+
+
+class AppliedForce(AbstractEffect):
+    """A force given as a function, on the coordinates or at a point.
+
+    **Arguments:**
+
+    - `fn`: `fn(t, q, qd, params)` returns the force: without `at` the generalised force, shape `[dof]` [N or N m];
+      with `at` a Cartesian force [N] of the shape that `at` returns. Numbers that are to be differentiated or
+      swept belong into `params` (or into the leaves of an `eqx.Module` passed as `fn`).
+    - `at`: `at(q)` returns the position of the point of attack [m]; the force is mapped to the coordinates by the
+      transposed Jacobian of `at`.
+    - `name`: name in `run.forces`.
+
+    **Raises:**
+
+    - `ValueError` if `fn` or `at` is no function, or (at the run) returns a wrong shape.
+    """
+
+    fn: Callable[..., Any] = eqx.field(converter=partial(as_function, name="AppliedForce fn"))
+    at: Callable[..., Any] | None = eqx.field(default=None, converter=_optional_function)
+    name: str | None = eqx.field(default=None, static=True)
+
+    @property
+    def default_name(self) -> str:
+        """Name in the results."""
+        return "applied"
+
+    @property
+    def stiff(self) -> bool:
+        """Applied forces are taken to be smooth."""
+        return False
+
+    def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
+        """Check the shape that `fn` returns."""
+        given = result_shape(self.fn, q[0], q, qd, params)
+        wanted = q.shape if self.at is None else result_shape(self.at, q)
+        if given != wanted:
+            where = "the coordinates" if self.at is None else "what `at` returns"
+            raise ValueError(
+                f"AppliedForce {name!r}: fn returned the shape {given}, but {wanted} is needed (that of {where})."
+                " Return jnp.array([...]) with one entry for each."
+            )
+
+    def state0(self) -> PyTree:
+        """An applied force has no state."""
+        return None
+
+    def act(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
+    ) -> Action:
+        """Force as given, and mapped to the coordinates."""
+        del z
+        force = jnp.asarray(self.fn(t, q, qd, params), q.dtype)
+        if self.at is None:
+            return Action(force, force)
+        _, pull = jax.vjp(self.at, q)
+        return Action(pull(force)[0], force)
+
+    def power(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], action: Action
+    ) -> Power:
+        """All of it comes from outside."""
+        del t, q
+        return Power(jnp.sum(action.generalised * qd), jnp.zeros_like(qd[0]))
+
+    def stored(self, z: PyTree) -> float:
+        """Nothing is stored."""
+        del z
+        return 0.0

@@ -1,0 +1,76 @@
+"""What an effect is: something that puts a force on the mechanism."""
+
+import abc
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+from equinox import AbstractVar
+from jaxtyping import Array, Float, PyTree
+
+
+class Action(NamedTuple):
+    """What an effect does at one state.
+
+    - `generalised`: generalised force on each coordinate, shape `[dof]` [N or N m].
+    - `force`: the force in the effect's own terms, as reported along a run.
+    - `rate`: time derivative of the effect's own state; None where it has none.
+    """
+
+    generalised: Float[Array, " dof"]
+    force: Float[Array, "..."]
+    rate: PyTree = None
+
+
+class Power(NamedTuple):
+    """Power [W] that an effect brings in from outside, and that it absorbs (loses or stores)."""
+
+    supplied: Float[Array, ""]
+    absorbed: Float[Array, ""]
+
+
+class AbstractEffect(eqx.Module):
+    """A force on the mechanism, with or without a state of its own."""
+
+    # By which the effect is known in the results; None for the class's own.
+    name: AbstractVar[str | None]
+
+    @property
+    @abc.abstractmethod
+    def default_name(self) -> str:
+        """Name in the results where the user gave none."""
+
+    @property
+    @abc.abstractmethod
+    def stiff(self) -> bool:
+        """Whether the effect makes the equations of motion stiff."""
+
+    @abc.abstractmethod
+    def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
+        """Check shapes against the mechanism while tracing; raises `ValueError` naming the effect."""
+
+    @abc.abstractmethod
+    def state0(self) -> PyTree:
+        """State at rest; None for an effect without one."""
+
+    @abc.abstractmethod
+    def act(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
+    ) -> Action:
+        """Forces and the rate of the own state `z`."""
+
+    @abc.abstractmethod
+    def power(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], action: Action
+    ) -> Power:
+        """Power of an action of this effect."""
+
+    @abc.abstractmethod
+    def stored(self, z: PyTree) -> Float[Array, ""] | float:
+        """Energy [J] held in the own state."""
+
+
+def result_shape(fn: Any, *args: Any) -> tuple[int, ...] | None:
+    """Shape of what `fn(*args)` returns, or None where that is not one array."""
+    out = jax.eval_shape(fn, *args)
+    return getattr(out, "shape", None)

@@ -1,0 +1,94 @@
+"""What a friction law is. Sign: the force is positive when it opposes positive slip."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+from equinox import AbstractClassVar
+from jaxtyping import Array, Bool, Float
+
+from ..numerics import check_ranges
+
+
+class AbstractLaw(eqx.Module):
+    """A friction law: knows its slip velocity [m/s or rad/s] and its own state, nothing of the mechanism."""
+
+    # Whether the law makes the equations of motion stiff, which decides the default solver.
+    stiff: AbstractClassVar[bool]
+
+    def __check_init__(self) -> None:
+        """Refuse parameters out of range."""
+        check_ranges(self)
+
+
+class AbstractForceLaw(AbstractLaw):
+    """A law whose force is a function of slip velocity."""
+
+    @abc.abstractmethod
+    def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+        """Friction force [N] at slip velocity `v` [m/s]."""
+
+
+class AbstractSetValuedLaw(AbstractLaw):
+    """A law whose force at rest may be anything up to a limit: a rule for slip and a limit of stick.
+
+    Such a law says nothing yet about how it is executed; `Regularized`, `DeadZone` and `Sign` do.
+    """
+
+    @abc.abstractmethod
+    def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:
+        """Magnitude [N] of the dry part of the force in slip at velocity `v` [m/s], never negative.
+
+        At `v = 0` its limit from above.
+        """
+
+    @abc.abstractmethod
+    def wet(self, v: Float[Array, ""]) -> Float[Array, ""]:
+        """Part of the force [N] that is a smooth function of `v` [m/s], zero at rest."""
+
+    @abc.abstractmethod
+    def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+        """Largest force [N] in stick against a load that pulls towards `direction` (+1 or -1)."""
+
+
+class AbstractHoldingLaw(AbstractLaw):
+    """A law that balances the load in a band about rest: its force there depends on the other forces."""
+
+    @abc.abstractmethod
+    def holds(self, v: Float[Array, ""]) -> Bool[Array, ""]:
+        """Whether velocity `v` [m/s] counts as rest."""
+
+    @abc.abstractmethod
+    def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+        """Largest holding force [N] against a load that pulls towards `direction` (+1 or -1)."""
+
+    @abc.abstractmethod
+    def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+        """Friction force [N] at velocity `v` [m/s] outside the band."""
+
+
+class AbstractDynamicLaw(AbstractLaw):
+    """A law with a state of its own."""
+
+    @abc.abstractmethod
+    def state0(self) -> Any:
+        """State at rest and unloaded."""
+
+    @abc.abstractmethod
+    def rate(self, v: Float[Array, ""], z: Any) -> Any:
+        """Time derivative of the state `z` at slip velocity `v` [m/s]."""
+
+    @abc.abstractmethod
+    def force(self, v: Float[Array, ""], z: Any) -> Float[Array, ""]:
+        """Friction force [N] at slip velocity `v` [m/s] and state `z`."""
+
+    @abc.abstractmethod
+    def stored(self, z: Any) -> Float[Array, ""]:
+        """Energy [J] held in the state `z`."""
+
+    @abc.abstractmethod
+    def advance(self, distance: Float[Array, ""], v: Float[Array, ""], z: Any) -> Any:
+        """State after slipping `distance` [m] at constant velocity `v` [m/s], exactly and at any step.
+
+        Given the distance apart from the velocity, a measured position needs no differentiation.
+        """

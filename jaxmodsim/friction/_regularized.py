@@ -1,0 +1,39 @@
+"""Smooth execution of a set-valued law."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..numerics import Number, parameter
+from ._law import AbstractForceLaw, AbstractSetValuedLaw
+from ._refuse import set_valued_law
+
+
+class Regularized(AbstractForceLaw):
+    """A set-valued law made smooth over a stated width: `F = dry(v) tanh(v/width) + wet(v)`.
+
+    A load below the limit creeps at about `width * load/limit` instead of resting, and the equations become
+    stiff at the rate `dry(0)/(m width)`. Where the limit of stick is above the slip force at zero velocity (`Coulomb`
+    with `Fs`), the force passes through a smooth hump about `2 width` wide.
+
+    **Arguments:**
+
+    - `law`: `Coulomb`, `Stribeck` or another set-valued law.
+    - `width`: velocity at which the force has 76 % of its level [m/s], > 0.
+
+    **Raises:**
+
+    - `ValueError` if `law` is not set-valued or `width` is out of range.
+    """
+
+    law: AbstractSetValuedLaw = set_valued_law("Regularized")
+    width: Number = parameter("width", "m/s", lower=0.0, strict=True)
+    stiff: ClassVar[bool] = True
+
+    def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+        """Friction force [N] at velocity `v` [m/s]."""
+        level, spread = self.law.dry(v), v / (2.0 * self.width)
+        rest = jnp.zeros_like(v)
+        excess = self.law.limit(jnp.where(v < 0, -1.0, 1.0).astype(v.dtype)) - self.law.dry(rest)
+        return (level + excess * jnp.exp(-spread * spread)) * jnp.tanh(v / self.width) + self.law.wet(v)

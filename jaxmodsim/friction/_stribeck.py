@@ -1,0 +1,59 @@
+"""Coulomb friction with stiction, Stribeck effect and viscous term."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..numerics import Number, parameter, safe_power
+from ._law import AbstractSetValuedLaw
+
+
+class Stribeck(AbstractSetValuedLaw):
+    """Friction that falls from stiction to Coulomb level as slip begins, and then rises viscously.
+
+    In slip `F = (Fc + (Fs - Fc) exp(-(|v|/vs)^exponent)) sign(v) + Fv v`; in stick anything up to `Fs`.
+
+    **Arguments:**
+
+    - `Fc`: Coulomb force [N], >= 0.
+    - `Fs`: largest force in stick [N], >= Fc.
+    - `vs`: Stribeck velocity [m/s], > 0.
+    - `Fv`: viscous coefficient [N s/m], >= 0.
+    - `exponent`: shape of the fall, > 0: 2 (Gaussian) by default, 1 for the exponential form.
+
+    **Raises:**
+
+    - `ValueError` if a parameter is out of range or no number.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{armstrong1994survey,
+            author={Armstrong-H\\'elouvry, Brian and Dupont, Pierre and Canudas de Wit, Carlos},
+            title={A survey of models, analysis tools and compensation methods for the control of machines
+                   with friction},
+            journal={Automatica}, volume={30}, number={7}, pages={1083--1138}, year={1994},
+        }
+        ```
+    """
+
+    Fc: Number = parameter("Fc", "N", lower=0.0)
+    Fs: Number = parameter("Fs", "N", lower="Fc")
+    vs: Number = parameter("vs", "m/s", lower=0.0, strict=True)
+    Fv: Number = parameter("Fv", "N s/m", lower=0.0, default=0.0)
+    exponent: Number = parameter("exponent", "1", lower=0.0, strict=True, default=2.0)
+    stiff: ClassVar[bool] = False
+
+    def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:
+        """Magnitude [N] of the dry part in slip."""
+        return self.Fc + (self.Fs - self.Fc) * jnp.exp(-safe_power(jnp.abs(v) / self.vs, self.exponent))
+
+    def wet(self, v: Float[Array, ""]) -> Float[Array, ""]:
+        """Viscous part [N]."""
+        return self.Fv * v
+
+    def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+        """Largest force in stick [N]."""
+        del direction
+        return self.Fs

@@ -1,0 +1,87 @@
+"""Equations of motion from a Lagrangian, by automatic differentiation."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from ..numerics import solve_positive_definite
+
+Lagrangian: TypeAlias = Callable[[Any, Array, Array, Any], Array]
+
+
+class MotionEquations(NamedTuple):
+    """The Euler-Lagrange equations at one state, `mass @ qdd = load + Q`.
+
+    - `mass`: mass matrix d2L/dqd2, shape `[dof, dof]` [kg for lengths, kg m^2 for angles].
+    - `load`: `dL/dq - d2L/dqd dq qd - d2L/dqd dt`, shape `[dof]` [N or N m]: what the Lagrangian itself
+      contributes (gravity, springs, centrifugal and Coriolis terms).
+    """
+
+    mass: Float[Array, "dof dof"]
+    load: Float[Array, " dof"]
+
+
+def motion_equations(
+    lagrangian: Lagrangian, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+) -> MotionEquations:
+    """Mass matrix and load of `d/dt dL/dqd - dL/dq = Q` at one state.
+
+    The momentum dL/dqd is linearised once. Its derivative along (1, qd, 0) gives the bias and along the unit
+    velocities the mass matrix, so the Hessian by q is never formed.
+
+    **Arguments:**
+
+    - `lagrangian`: `L(t, q, qd, params)`, a scalar [J].
+    - `t`: time [s].
+    - `q`, `qd`: generalised coordinates and velocities, shape `[dof]`.
+    - `params`: whatever the Lagrangian takes.
+
+    **Returns:**
+
+    `MotionEquations`.
+    """
+
+    def momentum(t: Array, q: Array, qd: Array) -> tuple[Array, Array]:
+        by_q, by_qd = jax.grad(lagrangian, argnums=(1, 2))(t, q, qd, params)
+        return by_qd, by_q
+
+    _, push, by_q = jax.linearize(momentum, t, q, qd, has_aux=True)
+    zero_t, zero = jnp.zeros_like(t), jnp.zeros_like(q)
+    if q.shape[0] == 1:
+        mass = push(zero_t, zero, jnp.ones_like(qd))[None]
+    else:
+        mass = jax.vmap(lambda unit: push(zero_t, zero, unit), out_axes=1)(jnp.eye(q.shape[0], dtype=qd.dtype))
+    return MotionEquations(mass, by_q - push(jnp.ones_like(t), qd, zero))
+
+
+def acceleration(
+    lagrangian: Lagrangian,
+    t: Float[Array, ""],
+    q: Float[Array, " dof"],
+    qd: Float[Array, " dof"],
+    params: PyTree,
+    force: Float[Array, " dof"] | float = 0.0,
+) -> Float[Array, " dof"]:
+    """Accelerations `qdd` under the generalised force `force` [N or N m], shape `[dof]`; see `motion_equations`."""
+    equations = motion_equations(lagrangian, t, q, qd, params)
+    return solve_positive_definite(equations.mass, equations.load + force)
+
+
+def energies(
+    lagrangian: Lagrangian, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Kinetic and potential energy [J] of a Lagrangian.
+
+    **Returns:**
+
+    `(T, V)`: `T = qd @ mass @ qd / 2`, and `V` the rest of the energy function `qd @ dL/dqd - L`. For coordinates
+    that move by themselves (a rotating frame), `V` holds the centrifugal potential, and their sum is the Jacobi
+    integral.
+    """
+    momentum = jax.grad(lagrangian, argnums=2)(t, q, qd, params)
+    mass = motion_equations(lagrangian, t, q, qd, params).mass
+    kinetic = 0.5 * jnp.sum(qd * jnp.sum(mass * qd[None, :], axis=1))
+    return kinetic, jnp.sum(qd * momentum) - lagrangian(t, q, qd, params) - kinetic

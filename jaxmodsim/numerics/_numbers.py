@@ -1,0 +1,167 @@
+"""Numbers of a scene: how they are converted, in which range they are allowed, and how both are reported."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+Number: TypeAlias = Float[Array, ""]
+
+
+@dataclasses.dataclass(frozen=True)
+class Range:
+    """Admissible range and unit of a parameter: above (or at) a number, or at least another parameter.
+
+    **Arguments:**
+
+    - `unit`: SI unit, as printed.
+    - `lower`: lower limit; a string names another parameter of the same object; None for no limit.
+    - `strict`: whether the limit itself is excluded.
+    """
+
+    unit: str
+    lower: float | str | None = None
+    strict: bool = False
+
+    @property
+    def text(self) -> str:
+        """The range in words, such as `> 0 N/m`."""
+        if self.lower is None:
+            return f"a finite number [{self.unit}]"
+        relation = ">" if self.strict else ">="
+        limit = self.lower if isinstance(self.lower, str) else f"{self.lower:g}"
+        return f"finite and {relation} {limit} [{self.unit}]"
+
+    def holds(self, value: Float[Array, "..."], others: Mapping[str, Float[Array, "..."]]) -> Bool[Array, "..."]:
+        """Whether `value` is in range, elementwise; `others` are the parameters of the same object by name."""
+        finite = jnp.isfinite(value)
+        if self.lower is None:
+            return finite
+        lower = others[self.lower] if isinstance(self.lower, str) else self.lower
+        return finite & ((value > lower) if self.strict else (value >= lower))
+
+
+def as_number(value: Any, *, name: str) -> Float[Array, ""]:
+    """Convert to a real floating scalar; integers become floating, a dtype that is given is kept.
+
+    **Raises:**
+
+    - `ValueError` naming `name`, what was given and what is needed.
+    """
+    array = as_real(value, name=name)
+    if array.shape != ():
+        raise ValueError(
+            f"{name} has shape {array.shape}, but one number is needed. To run many values at once, build one scene"
+            " and batch its numbers with jax.vmap."
+        )
+    return array
+
+
+def as_real(value: Any, *, name: str) -> Float[Array, "..."]:
+    """Convert to a real floating array of any shape; see `as_number`."""
+    if isinstance(value, jax.Array | np.ndarray | np.number | int | float) and not isinstance(value, bool):
+        dtype = jnp.result_type(value)
+        if jnp.issubdtype(dtype, jnp.integer):
+            dtype = jnp.result_type(float)
+        if jnp.issubdtype(dtype, jnp.floating):
+            return jnp.asarray(value, dtype=dtype)  # a stated dtype also makes a weak type strong
+    given = value if isinstance(value, str | bool) else getattr(value, "dtype", type(value).__name__)
+    raise ValueError(f"{name} must be a real number or an array of real numbers, but {given!r} was given.")
+
+
+def parameter(
+    name: str, unit: str, *, lower: float | str | None = None, strict: bool = False, **field: Any
+) -> Any:
+    """Dataclass field of an `eqx.Module` that holds one number with a unit and an admissible range.
+
+    **Arguments:**
+
+    - `name`: name of the field, for error messages.
+    - `unit`, `lower`, `strict`: see `Range`.
+    - `field`: further arguments of `equinox.field`, such as `default`.
+    """
+    return eqx.field(
+        converter=partial(as_number, name=name), metadata={"range": Range(unit, lower, strict)}, **field
+    )
+
+
+def ranges_of(module: eqx.Module) -> dict[str, Range]:
+    """Ranges of the parameters that `module` holds, by name; an optional one that was not given has none."""
+    return {
+        f.name: f.metadata["range"]
+        for f in dataclasses.fields(module)
+        if "range" in f.metadata and getattr(module, f.name) is not None
+    }
+
+
+def range_checks(module: eqx.Module) -> list[tuple[str, Array]]:
+    """For each parameter of `module`: the sentence that says what is needed, and whether that holds."""
+    values = {name: getattr(module, name) for name in ranges_of(module)}
+    owner = type(module).__name__
+    return [
+        (f"{owner}: {name} must be {allowed.text}", allowed.holds(values[name], values))
+        for name, allowed in ranges_of(module).items()
+    ]
+
+
+def check_ranges(module: eqx.Module) -> None:
+    """Check the parameters of `module` that are known now (not being traced).
+
+    **Raises:**
+
+    - `ValueError` naming the parameter, its range and the value given.
+    """
+    values = {name: getattr(module, name) for name in ranges_of(module)}
+    for name, allowed in ranges_of(module).items():
+        limit = values.get(allowed.lower) if isinstance(allowed.lower, str) else None
+        if any(isinstance(x, jax.core.Tracer) for x in (values[name], limit)):
+            continue
+        if not bool(jnp.all(allowed.holds(values[name], values))):
+            against = "" if limit is None else f" ({allowed.lower} = {limit})"
+            raise ValueError(
+                f"{type(module).__name__}: {name} must be {allowed.text}{against}, but {values[name]} was given."
+            )
+
+
+class Function(eqx.Module):
+    """A plain function as part of a pytree: it holds no numbers and is compared by identity."""
+
+    fn: Callable[..., Any] = eqx.field(static=True)
+
+    def __call__(self, *args: Any) -> Any:
+        """Call the function."""
+        return self.fn(*args)
+
+
+def as_function(value: Any, *, name: str) -> Callable[..., Any]:
+    """Make a callable fit to sit in a pytree: an `eqx.Module` stays what it is, anything else is wrapped.
+
+    **Raises:**
+
+    - `ValueError` if `value` cannot be called.
+    """
+    if not callable(value):
+        raise ValueError(f"{name} must be a function, but {value!r} was given.")
+    return value if isinstance(value, eqx.Module) else Function(value)
+
+
+def modules_of(tree: Any, path: str = "") -> Iterator[tuple[str, eqx.Module]]:
+    """Every `eqx.Module` inside `tree` (itself included), with its path such as `.effects[0].law`."""
+    if isinstance(tree, eqx.Module):
+        yield path, tree
+        for field in dataclasses.fields(tree):
+            if not field.metadata.get("static", False):
+                yield from modules_of(getattr(tree, field.name), f"{path}.{field.name}")
+    elif isinstance(tree, tuple | list):
+        for i, item in enumerate(tree):
+            yield from modules_of(item, f"{path}[{i}]")
+    elif isinstance(tree, dict):
+        for key, item in tree.items():
+            yield from modules_of(item, f"{path}[{key!r}]")

@@ -1,0 +1,172 @@
+"""One step of a Rosenbrock method, for any tableau, on pytree states."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from ._linalg import MAX_UNROLLED_LU, LinearSolver, factor_lu
+
+State: TypeAlias = PyTree[Array]
+Parts: TypeAlias = list[Array]
+
+
+@dataclass(frozen=True)
+class RosenbrockTableau:
+    """Coefficients of a Rosenbrock method in the form that needs no product with the Jacobian.
+
+    With `W = I/(dt gamma) - J`, stage i solves
+    `W k_i = f(t + c_i dt, y + sum_j a_ij k_j) + (1/dt) sum_j c_ij k_j + dt d_i f_t`, and
+    `y1 = y + sum_j b_j k_j`, error estimate `sum_j e_j k_j`. Rows that are equal share one field evaluation.
+
+    **Arguments:**
+
+    - `gamma`: diagonal coefficient.
+    - `stage`: strictly lower triangular `a`, shape `[stages, stages]`.
+    - `coupling`: strictly lower triangular `c`, shape `[stages, stages]`.
+    - `nodes`: `c_i`, shape `[stages]`.
+    - `time`: `d_i`, shape `[stages]`.
+    - `solution`, `error`: `b`, `e`, shape `[stages]`.
+    - `dense`: `H` of the dense output `y(t + s dt) = (1-s) y0 + s (y1 + (1-s) (K_1 + s (K_2 + s K_3)))`,
+      `K = H k`, shape `[3, stages]`; None where the method has none.
+    """
+
+    gamma: float
+    stage: np.ndarray
+    coupling: np.ndarray
+    nodes: np.ndarray
+    time: np.ndarray
+    solution: np.ndarray
+    error: np.ndarray
+    dense: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class RosenbrockStep:
+    """What one step gives: the state at its end, the error estimate, and the vectors `K` of the dense output."""
+
+    y1: State
+    error: State
+    dense: tuple[State, ...]
+
+
+def _combine(weights: Sequence[float] | np.ndarray, terms: Sequence[Parts], base: Parts | None = None) -> Parts | None:
+    """`base + sum_j weights_j terms_j`, with zero weights left out and unit weights not multiplied."""
+    total = base
+    for weight, term in zip(weights, terms, strict=False):
+        if weight == 0.0:
+            continue
+        scaled = term if weight == 1.0 else [float(weight) * x for x in term]
+        total = scaled if total is None else [a + b for a, b in zip(total, scaled, strict=True)]
+    return total
+
+
+class _Layout:
+    """How a pytree state maps to the parts the step computes with: one scalar per entry, or one long vector."""
+
+    def __init__(self, y: State):
+        leaves, self.structure = jtu.tree_flatten(y)
+        self.shapes = [leaf.shape for leaf in leaves]
+        self.sizes = [leaf.size for leaf in leaves]
+        self.dtype = jnp.result_type(*leaves) if leaves else jnp.result_type(float)
+        self.dtypes = [leaf.dtype for leaf in leaves]
+        self.n = sum(self.sizes)
+        self.unrolled = self.n <= MAX_UNROLLED_LU
+
+    def split(self, y: State) -> Parts:
+        leaves = [jnp.ravel(leaf) for leaf in jtu.tree_leaves(y)]
+        if self.unrolled:
+            return [jnp.reshape(leaf, ()) if leaf.size == 1 else leaf[i] for leaf in leaves for i in range(leaf.size)]
+        return [jnp.concatenate([leaf.astype(self.dtype) for leaf in leaves])]
+
+    def join(self, parts: Parts) -> State:
+        leaves, start = [], 0
+        for shape, size, dtype in zip(self.shapes, self.sizes, self.dtypes, strict=True):
+            if not self.unrolled:
+                leaf = parts[0][start : start + size]
+            elif size == 1:
+                leaf = parts[start]
+            else:
+                leaf = jnp.stack(parts[start : start + size])
+            leaves.append(jnp.reshape(leaf, shape).astype(dtype))
+            start += size
+        return jtu.tree_unflatten(self.structure, leaves)
+
+
+def _linearise(
+    flow: Callable[[Array, Parts], Parts], t: Array, parts: Parts, layout: _Layout
+) -> tuple[Parts, Parts, Any]:
+    """Field, its time derivative and its Jacobian from one linearisation."""
+    f0, push = jax.linearize(flow, t, parts)
+    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
+    still = [jnp.zeros_like(p) for p in parts]
+    f_t = push(one, still)
+    if not layout.unrolled:
+        basis = jnp.eye(layout.n, dtype=layout.dtype)
+        return f0, f_t, jax.vmap(lambda e: push(zero, [e])[0], out_axes=1)(basis)
+    columns = [push(zero, [jnp.ones_like(p) if i == j else s for i, (p, s) in enumerate(zip(parts, still, strict=True))])
+               for j in range(layout.n)]
+    return f0, f_t, [[columns[j][i] for j in range(layout.n)] for i in range(layout.n)]
+
+
+def _factor(jacobian: Any, shift: Array, layout: _Layout) -> LinearSolver:
+    """Solver of `(shift I - jacobian) x = rhs`."""
+    if layout.unrolled:
+        return factor_lu([[shift - entry if i == j else -entry for j, entry in enumerate(row)]
+                          for i, row in enumerate(jacobian)])
+    lu = jax.scipy.linalg.lu_factor(shift * jnp.eye(layout.n, dtype=layout.dtype) - jacobian)
+    return lambda rhs: [jax.scipy.linalg.lu_solve(lu, rhs[0])]
+
+
+def rosenbrock_step(
+    tableau: RosenbrockTableau, field: Callable[[Array, State], State], t0: Array, dt: Array, y0: State
+) -> RosenbrockStep:
+    """Advance `y' = field(t, y)` from `t0` by `dt`.
+
+    **Arguments:**
+
+    - `tableau`: the method.
+    - `field`: `(t, y) -> dy/dt`, differentiable by JAX.
+    - `t0`, `dt`: start and length of the step, scalars.
+    - `y0`: state at `t0`, any pytree of real floating arrays.
+
+    **Returns:**
+
+    A `RosenbrockStep`.
+    """
+    layout = _Layout(y0)
+    parts = layout.split(y0)
+
+    def flow(t: Array, p: Parts) -> Parts:
+        return layout.split(field(t, layout.join(p)))
+
+    f0, f_t, jacobian = _linearise(flow, t0, parts, layout)
+    inverse_dt = 1.0 / dt
+    solve = _factor(jacobian, inverse_dt / tableau.gamma, layout)
+
+    stages: list[Parts] = []
+    slope = f0
+    for i in range(len(tableau.nodes)):
+        moved = i > 0 and (
+            tableau.nodes[i] != tableau.nodes[i - 1] or np.any(tableau.stage[i] != tableau.stage[i - 1])
+        )
+        if moved:
+            at = _combine(tableau.stage[i], stages, parts)
+            slope = flow(t0 + float(tableau.nodes[i]) * dt, at)
+        rhs = slope
+        coupled = _combine(tableau.coupling[i], stages)
+        if coupled is not None:
+            rhs = [a + inverse_dt * b for a, b in zip(rhs, coupled, strict=True)]
+        if tableau.time[i] != 0.0:
+            rhs = [a + (float(tableau.time[i]) * dt) * b for a, b in zip(rhs, f_t, strict=True)]
+        stages.append(solve(rhs))
+
+    y1 = layout.join(_combine(tableau.solution, stages, parts))
+    error = layout.join(_combine(tableau.error, stages, [jnp.zeros_like(p) for p in parts]))
+    dense = () if tableau.dense is None else tuple(layout.join(_combine(row, stages)) for row in tableau.dense)
+    return RosenbrockStep(y1, error, dense)

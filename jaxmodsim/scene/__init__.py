@@ -1,0 +1,8 @@
+"""Scenes: what is in them, and the vector field that follows."""
+
+from ._field import State as State
+from ._field import check_scene as check_scene
+from ._field import scene_field as scene_field
+from ._field import scene_forces as scene_forces
+from ._field import scene_power as scene_power
+from ._scene import Scene as Scene

@@ -1,0 +1,8 @@
+"""Runs of scenes."""
+
+from ._outcome import Outcome as Outcome
+from ._outcome import SimulationError as SimulationError
+from ._simulate import simulate as simulate
+from ._trajectory import Energy as Energy
+from ._trajectory import Events as Events
+from ._trajectory import Trajectory as Trajectory

@@ -1,0 +1,128 @@
+"""How a run ended: a code inside compiled code, a sentence outside."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..mechanics import motion_equations
+from ..numerics import cholesky_pivots, modules_of, range_checks, ranges_of
+from ..scene import Scene, State
+
+SUCCESS, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, FIRST_MASS = range(5)
+
+_GENERAL = (
+    "The run reached t1.",
+    "The step limit was reached before t1: pass a larger max_steps, a larger dt or looser tolerances. A law that"
+    " chatters (Sign) never gets through its zero crossings with adaptive steps.",
+    "The step size fell below what the time can resolve: the vector field jumps or is singular there. Run DeadZone"
+    " and Sign with a fixed step (dt=...).",
+    "The vector field gave a value that is not finite (NaN or infinity). With a fixed step this is also how a"
+    " step too long for the stiffness ends: pass a smaller dt, or solver=jaxmodsim.Rodas5P().",
+)
+
+
+class SimulationError(RuntimeError):
+    """A run that ended early; the message says how, when, and what to do."""
+
+
+class Outcome(eqx.Module):
+    """How a run ended.
+
+    - `code`: 0 for a run that reached t1; an index into `messages` otherwise. Under `jax.vmap` one per lane.
+    - `messages`: the sentence for each code.
+    """
+
+    code: Int[Array, "..."]
+    messages: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def ok(self) -> Array:
+        """Whether the run reached t1, elementwise."""
+        return self.code == SUCCESS
+
+    @property
+    def message(self) -> str:
+        """The sentence; for a batch of runs, one line for each outcome that occurs, with its count."""
+        codes, counts = np.unique(np.asarray(self.code), return_counts=True)
+        if np.ndim(self.code) == 0:
+            return self.messages[int(codes[0])]
+        return "\n".join(f"{n} x {self.messages[int(code)]}" for code, n in zip(codes, counts, strict=True))
+
+    def __str__(self) -> str:
+        """The sentence."""
+        return self.message
+
+
+def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
+    """The sentence for each code that a run of this scene can end with."""
+    mass = tuple(
+        f"The mass matrix is singular or indefinite at coordinate q[{i}]: its inertia is not positive"
+        + (" once the motion of the coordinates before it is taken out." if i else ".")
+        for i in range(dof)
+    )
+    ranges = tuple(
+        f"{text} (at scene{path})." for path, module in modules_of(scene) for text, _ in _checks(module)
+    )
+    return _GENERAL + mass + ranges
+
+
+def _checks(module: eqx.Module) -> list[tuple[str, Array]]:
+    return range_checks(module) if ranges_of(module) else []
+
+
+def start_code(scene: Scene, t: Float[Array, ""], y: State, rate: State) -> Int[Array, ""]:
+    """What is wrong before the first step: a parameter out of range, a mass matrix without inverse, a field of NaN."""
+    dof = y.q.shape[0]
+    code = jnp.asarray(SUCCESS)
+    finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
+    code = jnp.where(finite, code, NOT_FINITE)
+    code = jnp.where(code == SUCCESS, code, code)
+    code = _blame_mass(code, _pivots(scene, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
+    checks = [ok for _, module in modules_of(scene) for _, ok in _checks(module)]
+    for i, ok in reversed(list(enumerate(checks))):
+        code = jnp.where(ok, code, FIRST_MASS + dof + i)
+    return code
+
+
+def end_code(
+    scene: Scene, t: Float[Array, ""], y: State, rate: State, result: dfx.RESULTS
+) -> Int[Array, ""]:
+    """What ended the run, from diffrax's result and the last state."""
+    early = ~dfx.is_okay(result)
+    code = jnp.where(early, jnp.where(result == dfx.RESULTS.max_steps_reached, MAX_STEPS, STEP_TOO_SMALL), SUCCESS)
+    finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
+    code = jnp.where(early & ~finite, NOT_FINITE, code)
+    eps = float(jnp.finfo(y.q.dtype).eps)
+    # A run that stopped in front of a singular mass matrix cannot have come closer than its smallest step.
+    tolerance = jnp.where(early, eps**0.5, 16 * y.q.shape[0] * eps)
+    return _blame_mass(code, _pivots(scene, t, y), tolerance, jnp.all(jnp.isfinite(y.q)) & jnp.all(jnp.isfinite(y.qd)))
+
+
+def _pivots(scene: Scene, t: Float[Array, ""], y: State) -> Float[Array, " dof"]:
+    return cholesky_pivots(motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass)
+
+
+def _blame_mass(
+    code: Int[Array, ""], pivots: Float[Array, " dof"], tolerance: Array | float, known: Array | bool
+) -> Int[Array, ""]:
+    """Replace `code` by that of the first coordinate whose pivot is not above `tolerance`, where `known`."""
+    bad = ~(pivots > tolerance)
+    return jnp.where(jnp.any(bad) & known, FIRST_MASS + jnp.argmax(bad), code)
+
+
+def describe_failure(scene: Scene, t: float, y: State, code: int) -> str:
+    """The sentence for a failed run whose values are known, with time, state, and the coordinates or value at fault."""
+    dof = y.q.shape[0]
+    text = outcome_messages(scene, dof)[code]
+    if FIRST_MASS <= code < FIRST_MASS + dof:
+        mass = np.asarray(motion_equations(scene.lagrangian, jnp.asarray(t, y.q.dtype), y.q, y.qd, scene.params).mass)
+        text += f" Mass matrix {np.array2string(mass, precision=4)}"
+        if np.all(np.isfinite(mass)):
+            values, vectors = np.linalg.eigh(mass)
+            involved = [f"q[{i}]" for i in range(dof) if abs(vectors[i, 0]) > 0.05]
+            text += f", smallest eigenvalue {values[0]:.3g}, coordinates involved: {', '.join(involved)}"
+        text += "."
+    state = f"q = {np.array2string(np.asarray(y.q), precision=6)}, qd = {np.array2string(np.asarray(y.qd), precision=6)}"
+    return f"{text} The run stopped at t = {t:.9g} with {state}; throw=False returns what was computed up to there."

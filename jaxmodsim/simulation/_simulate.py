@@ -1,0 +1,203 @@
+"""`simulate`: a scene in, a trajectory out."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import ArrayLike, PyTree
+
+from ..scene import Scene
+from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages
+from ._solve import Options, Problem, Solved, solve
+from ._trajectory import Trajectory
+
+
+def simulate(
+    scene: Scene,
+    q0: ArrayLike | list[float],
+    qd0: ArrayLike | list[float],
+    t1: ArrayLike,
+    *,
+    t0: ArrayLike = 0.0,
+    ts: ArrayLike | None = None,
+    z0: dict[str, PyTree] | None = None,
+    rtol: ArrayLike = 1e-6,
+    atol: ArrayLike = 1e-9,
+    dt: ArrayLike | None = None,
+    solver: dfx.AbstractSolver | None = None,
+    adjoint: dfx.AbstractAdjoint | None = None,
+    max_steps: int = 16384,
+    throw: bool = True,
+) -> Trajectory:
+    """Run a scene from `t0` to `t1`.
+
+    Compiled on the first call for a scene of this structure; changing numbers, of the scene or of the arguments,
+    compiles nothing anew. All numbers run in the floating type of the scene and the initial state together.
+
+    **Arguments:**
+
+    - `scene`: the `Scene`.
+    - `q0`, `qd0`: initial coordinates and velocities, shape `[dof]`.
+    - `t1`: end time [s], >= t0.
+    - `t0`: start time [s].
+    - `ts`: times [s] at which the run is kept, increasing, within `[t0, t1]`; by default the end alone, in arrays of
+      length one.
+    - `z0`: initial own states of effects, by effect name; those left out start at rest.
+    - `rtol`, `atol`: relative and absolute tolerance of the local error.
+    - `dt`: fixed step [s], > 0, instead of tolerances.
+    - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`), and
+      `diffrax.Tsit5` otherwise.
+    - `adjoint`: how diffrax differentiates the run. By default for reverse mode (`jax.grad`); pass
+      `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`.
+    - `max_steps`: limit of the number of steps.
+    - `throw`: whether a run that ends early raises; otherwise `run.result` says how it ended, and what was computed
+      is kept.
+
+    **Returns:**
+
+    A `Trajectory`.
+
+    **Raises:**
+
+    - `ValueError` for wrong shapes, types or ranges, before anything runs.
+    - `SimulationError` if the run ended early and `throw` is set. Inside `jax.jit`, `jax.vmap` or `jax.grad` the
+      same sentence comes as equinox's run-time error.
+    """
+    problem = _problem(scene, q0, qd0, t1, t0, ts, z0, rtol, atol, dt)
+    if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
+        raise ValueError(f"max_steps must be a positive integer, but {max_steps!r} was given.")
+    solver_arrays, solver_rest = _split(solver, dfx.AbstractSolver, "solver")
+    adjoint_arrays, adjoint_rest = _split(adjoint, dfx.AbstractAdjoint, "adjoint")
+    problem = problem._replace(plugins=(solver_arrays, adjoint_arrays))
+    options = Options(solver_rest, adjoint_rest, max_steps)
+    try:
+        solved = solve(problem, options)
+    except TypeError as error:
+        if "custom_vjp" in str(error) and adjoint is None:
+            raise TypeError(
+                "Forward-mode derivatives of simulate need adjoint=diffrax.ForwardMode(); the default adjoint is for"
+                " reverse mode (jax.grad)."
+            ) from error
+        raise
+    if throw:
+        solved = _raise_early_end(problem, solved)
+    return Trajectory(
+        solved.t, solved.y.q, solved.y.qd, solved.y.z, solved.stats, solved.code, problem, options
+    )
+
+
+def _known(*values: Any) -> bool:
+    return not any(isinstance(value, jax.core.Tracer) for value in values)
+
+
+def _array(value: Any, dtype: Any) -> Any:
+    """As an array of `dtype`: NumPy for what is known (cheaper to hand over), JAX for what is traced or on a device."""
+    if isinstance(value, jax.Array):
+        return value if value.dtype == dtype else value.astype(dtype)
+    return np.asarray(value, dtype)
+
+
+def _problem(
+    scene: Any, q0: Any, qd0: Any, t1: Any, t0: Any, ts: Any, z0: Any, rtol: Any, atol: Any, dt: Any
+) -> Problem:
+    """Convert and check all numbers of a run."""
+    if not isinstance(scene, Scene):
+        raise ValueError(f"simulate needs a Scene, but a {type(scene).__name__} was given.")
+    given = {"q0": q0, "qd0": qd0, "t1": t1, "t0": t0, "rtol": rtol, "atol": atol}
+    given |= {name: value for name, value in (("ts", ts), ("dt", dt)) if value is not None}
+    for name, value in given.items():
+        _check_real(name, value)
+    typed = [x.dtype for x in (*jtu.tree_leaves(scene), q0, qd0) if hasattr(x, "dtype")]
+    dtype = jnp.result_type(*typed) if typed else jnp.result_type(float)
+    if not jnp.issubdtype(dtype, jnp.floating):
+        dtype = jnp.result_type(float)
+    array = {name: _array(value, dtype) for name, value in given.items()}
+    for name in ("q0", "qd0"):
+        if array[name].ndim != 1 or array[name].shape[0] == 0 or array[name].shape != array["q0"].shape:
+            raise ValueError(
+                f"q0 and qd0 must both have the shape [dof], but q0 has the shape {array['q0'].shape} and qd0"
+                f" {array['qd0'].shape}."
+            )
+    for name in ("t0", "t1", "rtol", "atol", "dt"):
+        if name in array and array[name].shape != ():
+            raise ValueError(f"{name} must be one number, but has the shape {array[name].shape}.")
+    _check_values(array)
+    return Problem(
+        scene, array["q0"], array["qd0"], _own_states(scene, z0, dtype) if z0 else {}, array["t0"], array["t1"],
+        array.get("ts"), array["rtol"], array["atol"], array.get("dt"), None,
+    )
+
+
+def _own_states(scene: Scene, z0: dict[str, PyTree], dtype: Any) -> dict[str, PyTree]:
+    """Convert and check the initial own states that were given."""
+    states = scene.state0()
+    for name, state in z0.items():
+        if name not in states:
+            raise ValueError(
+                f"z0 names {name!r}, but the effects with a state of their own are: {', '.join(states) or 'none'}."
+            )
+        if jtu.tree_structure(state) != jtu.tree_structure(states[name]):
+            raise ValueError(f"z0[{name!r}] must have the structure of {states[name]}, but {state} was given.")
+    return {name: jtu.tree_map(lambda x: _array(x, dtype), state) for name, state in z0.items()}
+
+
+def _check_real(name: str, value: Any) -> None:
+    if isinstance(value, jax.Array | np.ndarray | float | int):
+        kind = value.dtype.kind if hasattr(value, "dtype") else "f"
+    else:
+        try:
+            kind = np.asarray(value).dtype.kind
+        except ValueError:
+            kind = "O"
+    # "V" is how NumPy sees the extended floating types of JAX, such as bfloat16.
+    if kind not in "fiuV":
+        raise ValueError(f"{name} must hold real numbers, but {value!r} was given.")
+
+
+def _check_values(array: dict[str, Any]) -> None:
+    """Check the values that are known now; those that are traced are checked in the run."""
+    known = {name: np.asarray(value) for name, value in array.items() if _known(value)}
+    for name, value in known.items():
+        if not np.isfinite(value).all():
+            raise ValueError(f"{name} must be finite, but it is {value}.")
+    for name in ("rtol", "atol"):
+        if name in known and known[name] < 0:
+            raise ValueError(f"{name} must not be negative, but it is {known[name]}.")
+    if "rtol" in known and "atol" in known and known["rtol"] + known["atol"] <= 0:
+        raise ValueError("rtol and atol must not both be zero.")
+    if "dt" in known and known["dt"] <= 0:
+        raise ValueError(f"dt must be positive, but it is {known['dt']}.")
+    t0, t1, ts = known.get("t0"), known.get("t1"), known.get("ts")
+    if t0 is not None and t1 is not None and t1 < t0:
+        raise ValueError(f"t1 must not be before t0, but t0 = {t0} and t1 = {t1}.")
+    if "ts" in array and (array["ts"].ndim != 1 or array["ts"].shape[0] == 0):
+        raise ValueError(f"ts must be a vector of times, shape [time], but it has the shape {array['ts'].shape}.")
+    if ts is not None and (np.diff(ts) < 0).any():
+        raise ValueError("ts must increase.")
+    if ts is not None and t0 is not None and t1 is not None and not (t0 <= ts[0] and ts[-1] <= t1):
+        raise ValueError(f"ts must lie within [t0, t1] = [{t0}, {t1}], but runs from {ts[0]} to {ts[-1]}.")
+
+
+def _split(plugin: Any, kind: type, name: str) -> tuple[Any, Any]:
+    """Arrays of a plug-in, and the rest of it, which is compiled in."""
+    if plugin is None:
+        return None, None
+    if not isinstance(plugin, kind):
+        raise ValueError(f"{name} must be a diffrax.{kind.__name__} object, but {plugin!r} was given.")
+    return eqx.partition(plugin, eqx.is_array)
+
+
+def _raise_early_end(problem: Problem, solved: Solved) -> Solved:
+    """Raise for a run that ended early: at once where its values are known, by a run-time check where traced."""
+    if _known(solved.code):
+        code = int(solved.code)
+        if code != SUCCESS:
+            raise SimulationError(describe_failure(problem.scene, float(solved.t_end), solved.y_end, code))
+        return solved
+    messages = outcome_messages(problem.scene, problem.q0.shape[0])
+    return eqx.branched_error_if(solved, solved.code != SUCCESS, solved.code, messages)

@@ -1,0 +1,4 @@
+"""Plug-ins for diffrax."""
+
+from ._controllers import FiniteSteps as FiniteSteps
+from ._rodas5p import Rodas5P as Rodas5P

@@ -1,0 +1,143 @@
+"""Rodas5P: a Rosenbrock method of order 5 for stiff equations, as a diffrax solver."""
+
+from typing import Any, ClassVar
+
+import diffrax as dfx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from ..numerics import RosenbrockTableau, rosenbrock_step
+
+
+def _lower(rows: tuple[tuple[float, ...], ...]) -> np.ndarray:
+    """Square matrix from the rows of its strictly lower triangle."""
+    table = np.zeros((len(rows), len(rows)))
+    for i, row in enumerate(rows):
+        table[i, : len(row)] = row
+    return table
+
+
+_STAGE = _lower(
+    (
+        (),
+        (3.0,),
+        (2.849394379747939, 0.45842242204463923),
+        (-6.954028509809101, 2.489845061869568, -10.358996098473584),
+        (2.8029986275628964, 0.5072464736228206, -0.3988312541770524, -0.04721187230404641),
+        (-7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946),
+        (-7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946, 1.0),
+        (-7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946, 1.0, 1.0),
+    ),
+)
+_RODAS5P = RosenbrockTableau(
+    gamma=0.21193756319429014,
+    stage=_STAGE,
+    coupling=_lower(
+    (
+        (),
+        (-14.155112264123755,),
+        (-17.97296035885952, -2.859693295451294),
+        (147.12150275711716, -1.41221402718213, 71.68940251302358),
+        (165.43517024871676, -0.4592823456491126, 42.90938336958603, -5.961986721573306),
+        (24.854864614690072, -3.0009227002832186, 47.4931110020768, 5.5814197821558125, -0.6610691825249471),
+        (30.91273214028599, -3.1208243349937974, 77.79954646070892, 34.28646028294783, -19.097331116725623, -28.087943162872662),
+        (37.80277123390563, -3.2571969029072276, 112.26918849496327, 66.9347231244047, -40.06618937091002, -54.66780262877968, -9.48861652309627),
+    ),
+    ),
+    nodes=np.array((0.0, 0.6358126895828704, 0.4095798393397535, 0.9769306725060716, 0.4288403609558664, 1.0, 1.0, 1.0)),
+    time=np.array((0.21193756319429014, -0.42387512638858027, -0.3384627126235924, 1.8046452872882734, 2.325825639765069, 0.0, 0.0, 0.0)),
+    # Stiffly accurate: the solution is the last stage's point plus the last increment, which is the error estimate.
+    solution=_STAGE[-1] + np.eye(8)[-1],
+    error=np.eye(8)[-1],
+    dense=np.array((
+        (25.948786856663858, -2.5579724845846235, 10.433815404888879, -2.3679251022685204, 0.524948541321073, 1.1241088310450404, 0.4272876194431874, -0.17202221070155493),
+        (-9.91568850695171, -0.9689944594115154, 3.0438037242978453, -24.495224566215796, 20.176138334709044, 15.98066361424651, -6.789040303419874, -6.710236069923372),
+        (11.419903575922262, 2.8879645146136994, 72.92137995996029, 80.12511834622643, -52.072871366152654, -59.78993625266729, -0.15582684282751913, 4.883087185713722),
+    )),
+)
+
+
+class _RodasInterpolation(dfx.AbstractLocalInterpolation):
+    """Dense output of order 4: `y(t0 + s dt) = (1-s) y0 + s (y1 + (1-s) (K1 + s (K2 + s K3)))`."""
+
+    t0: Any
+    t1: Any
+    y0: PyTree[Array]
+    y1: PyTree[Array]
+    k: tuple[PyTree[Array], ...]
+
+    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> PyTree[Array]:
+        """State at `t0`, or the increment from `t0` to `t1`."""
+        del left
+        if t1 is not None:
+            return jtu.tree_map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
+        s = (t0 - self.t0) / (self.t1 - self.t0)
+
+        def at(y0: Array, y1: Array, k1: Array, k2: Array, k3: Array) -> Array:
+            r = s.astype(y0.dtype)
+            return (1 - r) * y0 + r * (y1 + (1 - r) * (k1 + r * (k2 + r * k3)))
+
+        return jtu.tree_map(at, self.y0, self.y1, *self.k)
+
+
+class Rodas5P(dfx.AbstractAdaptiveSolver):
+    """Steinebach's Rodas5P for stiff equations: eight stages, order 5, L-stable, no iteration.
+
+    Usable wherever diffrax takes a solver of an `ODETerm`, with adaptive or fixed steps, on any pytree of real
+    floating arrays, in float32 and float64. Up to 12 state entries the linear algebra is written out in
+    scalars, so that a whole step becomes one fused computation; above, LAPACK is called. Dense output has order 4.
+
+    **Arguments:** none.
+
+    **Raises:**
+
+    - `ValueError` (while tracing) for complex or integer states.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{steinebach2023rodas5p,
+            author={Steinebach, Gerd},
+            title={Construction of {R}osenbrock--{W}anner method {R}odas5{P} and numerical benchmarks within the
+                   {J}ulia {D}ifferential {E}quations package},
+            journal={BIT Numerical Mathematics}, volume={63}, number={27}, year={2023},
+        }
+        ```
+    """
+
+    term_structure: ClassVar = dfx.ODETerm
+    interpolation_cls: ClassVar = _RodasInterpolation
+
+    def order(self, terms: PyTree) -> int:
+        """Order of the solution: 5."""
+        del terms
+        return 5
+
+    def error_order(self, terms: PyTree) -> int:
+        """Local order of the error estimate, that of the embedded method of order 4: 5."""
+        del terms
+        return 5
+
+    def init(self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> None:
+        """The method keeps nothing from step to step; states of a wrong type are refused here."""
+        del terms, t0, t1, args
+        for leaf in jtu.tree_leaves(y0):
+            if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+                raise ValueError(
+                    f"Rodas5P needs a state of real floating numbers, but one of its arrays has the type"
+                    f" {jnp.result_type(leaf)}. Split complex numbers into real and imaginary parts."
+                )
+
+    def func(self, terms: PyTree, t0: Any, y0: PyTree, args: PyTree) -> PyTree:
+        """The vector field."""
+        return terms.vf(t0, y0, args)
+
+    def step(
+        self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree, solver_state: None, made_jump: Any
+    ) -> tuple[PyTree, PyTree, dict[str, PyTree], None, dfx.RESULTS]:
+        """One step; see `jaxmodsim.numerics.rosenbrock_step`."""
+        del solver_state, made_jump
+        step = rosenbrock_step(_RODAS5P, lambda t, y: terms.vf(t, y, args), t0, t1 - t0, y0)
+        return step.y1, step.error, {"y0": y0, "y1": step.y1, "k": step.dense}, None, dfx.RESULTS.successful
