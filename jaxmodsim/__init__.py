@@ -1,5 +1,7 @@
 """Differentiable mechanics with friction: Lagrangians in, motion, figures and fits out."""
 
+from . import problems as problems
+from ._speed import tune_cpu as tune_cpu
 from .effects import AbstractEffect as AbstractEffect
 from .effects import AppliedForce as AppliedForce
 from .effects import Friction as Friction

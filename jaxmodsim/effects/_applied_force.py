@@ -74,9 +74,7 @@ class AppliedForce(AbstractEffect):
         _, pull = jax.vjp(self.at, q)
         return Action(pull(force)[0], force)
 
-    def power(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], action: Action
-    ) -> Power:
+    def power(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], action: Action) -> Power:
         """All of it comes from outside."""
         del t, q
         return Power(jnp.sum(action.generalised * qd), jnp.zeros_like(qd[0]))

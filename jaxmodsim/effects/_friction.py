@@ -131,9 +131,7 @@ class Friction(AbstractEffect):
         fn = self.belt_velocity
         return jnp.asarray(fn(t), t.dtype) if callable(fn) else fn
 
-    def slip(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"]
-    ) -> Float[Array, ""]:
+    def slip(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"]) -> Float[Array, ""]:
         """Slip velocity [m/s or rad/s]."""
         speed = qd[0] if self.along is None else jax.jvp(self.along, (q,), (qd,))[1]
         return speed - self.belt(t)
@@ -166,9 +164,7 @@ class Friction(AbstractEffect):
         force = force if load is None else load * force
         return Action(self.push(q, force), force, rate)
 
-    def power(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], action: Action
-    ) -> Power:
+    def power(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], action: Action) -> Power:
         """The belt brings in -F times its velocity; slip absorbs F times the slip velocity."""
         return Power(-action.force * self.belt(t), action.force * self.slip(t, q, qd))
 

@@ -28,9 +28,7 @@ class Coulomb(AbstractSetValuedLaw):
     """
 
     Fc: Number = parameter("Fc", "N", lower=0.0)
-    Fs: Number | None = eqx.field(
-        default=None, converter=_number_or_none, metadata={"range": Range("N", "Fc")}
-    )
+    Fs: Number | None = eqx.field(default=None, converter=_number_or_none, metadata={"range": Range("N", "Fc")})
     stiff: ClassVar[bool] = False
 
     def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:

@@ -1,13 +1,17 @@
 """What a friction law is. Sign: the force is positive when it opposes positive slip."""
 
 import abc
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
-from equinox import AbstractClassVar
 from jaxtyping import Array, Bool, Float
 
 from ..numerics import check_ranges
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractClassVar
+else:
+    from equinox import AbstractClassVar
 
 
 class AbstractLaw(eqx.Module):

@@ -34,7 +34,7 @@ class LuGre(AbstractDynamicLaw):
 
         ```bibtex
         @article{canudas1995new,
-            author={Canudas de Wit, C. and Olsson, H. and {\\AA}str{\\"o}m, K. J. and Lischinsky, P.},
+            author={Canudas de Wit, C. and Olsson, H. and Astrom, K. J. and Lischinsky, P.},
             title={A new model for control of systems with friction},
             journal={IEEE Transactions on Automatic Control},
             volume={40}, number={3}, pages={419--425}, year={1995},
@@ -60,7 +60,7 @@ class LuGre(AbstractDynamicLaw):
         return jnp.zeros_like(self.sigma0)
 
     def rate(self, v: Float[Array, ""], z: Float[Array, ""]) -> Float[Array, ""]:
-        """z' [m/s] at slip velocity `v` [m/s] and deflection `z` [m]."""
+        """Z' [m/s] at slip velocity `v` [m/s] and deflection `z` [m]."""
         return v - self.sigma0 * jnp.abs(v) / self._level(v) * z
 
     def force(self, v: Float[Array, ""], z: Float[Array, ""]) -> Float[Array, ""]:

@@ -30,7 +30,7 @@ class Stribeck(AbstractSetValuedLaw):
 
         ```bibtex
         @article{armstrong1994survey,
-            author={Armstrong-H\\'elouvry, Brian and Dupont, Pierre and Canudas de Wit, Carlos},
+            author={Armstrong-Helouvry, Brian and Dupont, Pierre and Canudas de Wit, Carlos},
             title={A survey of models, analysis tools and compensation methods for the control of machines
                    with friction},
             journal={Automatica}, volume={30}, number={7}, pages={1083--1138}, year={1994},

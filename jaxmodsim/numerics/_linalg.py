@@ -157,6 +157,8 @@ def _solve_lu_jvp(primals: tuple[Any, Any, Any], tangents: tuple[Any, Any, Any])
     rows, factors, rhs = primals
     rows_dot, _, rhs_dot = tangents
     x = _solve_lu(rows, factors, rhs)
-    residual = [b_dot - sum(a_dot * xj for a_dot, xj in zip(row_dot, x, strict=True))
-                for row_dot, b_dot in zip(rows_dot, rhs_dot, strict=True)]
+    residual = [
+        b_dot - sum(a_dot * xj for a_dot, xj in zip(row_dot, x, strict=True))
+        for row_dot, b_dot in zip(rows_dot, rhs_dot, strict=True)
+    ]
     return x, _solve_lu(rows, factors, residual)

@@ -76,9 +76,7 @@ def as_real(value: Any, *, name: str) -> Float[Array, "..."]:
     raise ValueError(f"{name} must be a real number or an array of real numbers, but {given!r} was given.")
 
 
-def parameter(
-    name: str, unit: str, *, lower: float | str | None = None, strict: bool = False, **field: Any
-) -> Any:
+def parameter(name: str, unit: str, *, lower: float | str | None = None, strict: bool = False, **field: Any) -> Any:
     """Dataclass field of an `eqx.Module` that holds one number with a unit and an admissible range.
 
     **Arguments:**
@@ -87,9 +85,7 @@ def parameter(
     - `unit`, `lower`, `strict`: see `Range`.
     - `field`: further arguments of `equinox.field`, such as `default`.
     """
-    return eqx.field(
-        converter=partial(as_number, name=name), metadata={"range": Range(unit, lower, strict)}, **field
-    )
+    return eqx.field(converter=partial(as_number, name=name), metadata={"range": Range(unit, lower, strict)}, **field)
 
 
 def ranges_of(module: eqx.Module) -> dict[str, Range]:
@@ -149,7 +145,8 @@ def as_function(value: Any, *, name: str) -> Callable[..., Any]:
     """
     if not callable(value):
         raise ValueError(f"{name} must be a function, but {value!r} was given.")
-    return value if isinstance(value, eqx.Module) else Function(value)
+    fn: Callable[..., Any] = value
+    return fn if isinstance(value, eqx.Module) else Function(fn)
 
 
 def modules_of(tree: Any, path: str = "") -> Iterator[tuple[str, eqx.Module]]:

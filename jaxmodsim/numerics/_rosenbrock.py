@@ -1,6 +1,6 @@
 """One step of a Rosenbrock method, for any tableau, on pytree states."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -55,15 +55,21 @@ class RosenbrockStep:
     dense: tuple[State, ...]
 
 
-def _combine(weights: Sequence[float] | np.ndarray, terms: Sequence[Parts], base: Parts | None = None) -> Parts | None:
-    """`base + sum_j weights_j terms_j`, with zero weights left out and unit weights not multiplied."""
-    total = base
-    for weight, term in zip(weights, terms, strict=False):
-        if weight == 0.0:
-            continue
-        scaled = term if weight == 1.0 else [float(weight) * x for x in term]
-        total = scaled if total is None else [a + b for a, b in zip(total, scaled, strict=True)]
+def _combine(weights: np.ndarray, terms: list[Parts]) -> Parts:
+    """`sum_j weights_j terms_j`, with zero weights left out and unit weights not multiplied; one must not be zero."""
+    scaled = [
+        term if weight == 1.0 else [float(weight) * x for x in term]
+        for weight, term in zip(weights, terms, strict=False)
+        if weight != 0.0
+    ]
+    total = scaled[0]
+    for term in scaled[1:]:
+        total = _add(total, term)
     return total
+
+
+def _add(a: Parts, b: Parts) -> Parts:
+    return [x + y for x, y in zip(a, b, strict=True)]
 
 
 class _Layout:
@@ -109,16 +115,19 @@ def _linearise(
     if not layout.unrolled:
         basis = jnp.eye(layout.n, dtype=layout.dtype)
         return f0, f_t, jax.vmap(lambda e: push(zero, [e])[0], out_axes=1)(basis)
-    columns = [push(zero, [jnp.ones_like(p) if i == j else s for i, (p, s) in enumerate(zip(parts, still, strict=True))])
-               for j in range(layout.n)]
+    columns = [
+        push(zero, [jnp.ones_like(p) if i == j else s for i, (p, s) in enumerate(zip(parts, still, strict=True))])
+        for j in range(layout.n)
+    ]
     return f0, f_t, [[columns[j][i] for j in range(layout.n)] for i in range(layout.n)]
 
 
 def _factor(jacobian: Any, shift: Array, layout: _Layout) -> LinearSolver:
     """Solver of `(shift I - jacobian) x = rhs`."""
     if layout.unrolled:
-        return factor_lu([[shift - entry if i == j else -entry for j, entry in enumerate(row)]
-                          for i, row in enumerate(jacobian)])
+        return factor_lu(
+            [[shift - entry if i == j else -entry for j, entry in enumerate(row)] for i, row in enumerate(jacobian)]
+        )
     lu = jax.scipy.linalg.lu_factor(shift * jnp.eye(layout.n, dtype=layout.dtype) - jacobian)
     return lambda rhs: [jax.scipy.linalg.lu_solve(lu, rhs[0])]
 
@@ -152,21 +161,18 @@ def rosenbrock_step(
     stages: list[Parts] = []
     slope = f0
     for i in range(len(tableau.nodes)):
-        moved = i > 0 and (
-            tableau.nodes[i] != tableau.nodes[i - 1] or np.any(tableau.stage[i] != tableau.stage[i - 1])
-        )
+        moved = i > 0 and (tableau.nodes[i] != tableau.nodes[i - 1] or np.any(tableau.stage[i] != tableau.stage[i - 1]))
         if moved:
-            at = _combine(tableau.stage[i], stages, parts)
-            slope = flow(t0 + float(tableau.nodes[i]) * dt, at)
+            point = _add(parts, _combine(tableau.stage[i], stages)) if np.any(tableau.stage[i]) else parts
+            slope = flow(t0 + float(tableau.nodes[i]) * dt, point)
         rhs = slope
-        coupled = _combine(tableau.coupling[i], stages)
-        if coupled is not None:
-            rhs = [a + inverse_dt * b for a, b in zip(rhs, coupled, strict=True)]
+        if np.any(tableau.coupling[i]):
+            rhs = [a + inverse_dt * b for a, b in zip(rhs, _combine(tableau.coupling[i], stages), strict=True)]
         if tableau.time[i] != 0.0:
             rhs = [a + (float(tableau.time[i]) * dt) * b for a, b in zip(rhs, f_t, strict=True)]
         stages.append(solve(rhs))
 
-    y1 = layout.join(_combine(tableau.solution, stages, parts))
-    error = layout.join(_combine(tableau.error, stages, [jnp.zeros_like(p) for p in parts]))
+    y1 = layout.join(_add(parts, _combine(tableau.solution, stages)))
+    error = layout.join(_combine(tableau.error, stages))
     dense = () if tableau.dense is None else tuple(layout.join(_combine(row, stages)) for row in tableau.dense)
     return RosenbrockStep(y1, error, dense)

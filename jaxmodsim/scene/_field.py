@@ -101,9 +101,7 @@ def _hold(
     }
 
 
-def _slip_acceleration(
-    effect: Friction, t: Float[Array, ""], y: State, qdd: Float[Array, " dof"]
-) -> Float[Array, ""]:
+def _slip_acceleration(effect: Friction, t: Float[Array, ""], y: State, qdd: Float[Array, " dof"]) -> Float[Array, ""]:
     """Rate of the slip velocity if the accelerations were `qdd`."""
     return jax.jvp(effect.slip, (t, y.q, y.qd), (jnp.ones_like(t), y.qd, qdd))[1]
 

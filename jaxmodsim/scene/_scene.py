@@ -31,8 +31,8 @@ def _effects(effects: Any) -> tuple[AbstractEffect, ...]:
 class Scene(eqx.Module):
     """A mechanism and the effects on it.
 
-    A scene is a pytree whose leaves are all its numbers, so `jax.grad`, `jax.vmap` and `equinox.tree_at` work on it, and
-    changing a number never recompiles. Functions are compared by identity: define a Lagrangian once, not as a
+    A scene is a pytree whose leaves are all its numbers, so `jax.grad`, `jax.vmap` and `equinox.tree_at` work on it,
+    and changing a number never recompiles. Functions are compared by identity: define a Lagrangian once, not as a
     fresh lambda in every call.
 
     **Arguments:**

@@ -62,9 +62,7 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
         + (" once the motion of the coordinates before it is taken out." if i else ".")
         for i in range(dof)
     )
-    ranges = tuple(
-        f"{text} (at scene{path})." for path, module in modules_of(scene) for text, _ in _checks(module)
-    )
+    ranges = tuple(f"{text} (at scene{path})." for path, module in modules_of(scene) for text, _ in _checks(module))
     return _GENERAL + mass + ranges
 
 
@@ -86,9 +84,7 @@ def start_code(scene: Scene, t: Float[Array, ""], y: State, rate: State) -> Int[
     return code
 
 
-def end_code(
-    scene: Scene, t: Float[Array, ""], y: State, rate: State, result: dfx.RESULTS
-) -> Int[Array, ""]:
+def end_code(scene: Scene, t: Float[Array, ""], y: State, rate: State, result: dfx.RESULTS) -> Int[Array, ""]:
     """What ended the run, from diffrax's result and the last state."""
     early = ~dfx.is_okay(result)
     code = jnp.where(early, jnp.where(result == dfx.RESULTS.max_steps_reached, MAX_STEPS, STEP_TOO_SMALL), SUCCESS)
@@ -124,5 +120,7 @@ def describe_failure(scene: Scene, t: float, y: State, code: int) -> str:
             involved = [f"q[{i}]" for i in range(dof) if abs(vectors[i, 0]) > 0.05]
             text += f", smallest eigenvalue {values[0]:.3g}, coordinates involved: {', '.join(involved)}"
         text += "."
-    state = f"q = {np.array2string(np.asarray(y.q), precision=6)}, qd = {np.array2string(np.asarray(y.qd), precision=6)}"
+    state = (
+        f"q = {np.array2string(np.asarray(y.q), precision=6)}, qd = {np.array2string(np.asarray(y.qd), precision=6)}"
+    )
     return f"{text} The run stopped at t = {t:.9g} with {state}; throw=False returns what was computed up to there."

@@ -86,9 +86,7 @@ def simulate(
         raise
     if throw:
         solved = _raise_early_end(problem, solved)
-    return Trajectory(
-        solved.t, solved.y.q, solved.y.qd, solved.y.z, solved.stats, solved.code, problem, options
-    )
+    return Trajectory(solved.t, solved.y.q, solved.y.qd, solved.y.z, solved.stats, solved.code, problem, options)
 
 
 def _known(*values: Any) -> bool:
@@ -128,8 +126,17 @@ def _problem(
             raise ValueError(f"{name} must be one number, but has the shape {array[name].shape}.")
     _check_values(array)
     return Problem(
-        scene, array["q0"], array["qd0"], _own_states(scene, z0, dtype) if z0 else {}, array["t0"], array["t1"],
-        array.get("ts"), array["rtol"], array["atol"], array.get("dt"), None,
+        scene,
+        array["q0"],
+        array["qd0"],
+        _own_states(scene, z0, dtype) if z0 else {},
+        array["t0"],
+        array["t1"],
+        array.get("ts"),
+        array["rtol"],
+        array["atol"],
+        array.get("dt"),
+        None,
     )
 
 
@@ -147,15 +154,13 @@ def _own_states(scene: Scene, z0: dict[str, PyTree], dtype: Any) -> dict[str, Py
 
 
 def _check_real(name: str, value: Any) -> None:
-    if isinstance(value, jax.Array | np.ndarray | float | int):
-        kind = value.dtype.kind if hasattr(value, "dtype") else "f"
-    else:
+    kind = getattr(value, "dtype", None)
+    if kind is None and not isinstance(value, float):
         try:
-            kind = np.asarray(value).dtype.kind
+            kind = np.asarray(value).dtype
         except ValueError:
-            kind = "O"
-    # "V" is how NumPy sees the extended floating types of JAX, such as bfloat16.
-    if kind not in "fiuV":
+            kind = np.dtype(object)
+    if kind is not None and not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
         raise ValueError(f"{name} must hold real numbers, but {value!r} was given.")
 
 

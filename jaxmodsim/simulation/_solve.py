@@ -86,7 +86,8 @@ def _integrate(problem: Problem, options: Options, field: Any, y0: PyTree, state
     check_scene(scene, initial)
     solver = default_solver(scene) if options.solver is None else eqx.combine(options.solver, problem.plugins[0])
     adjoint = (
-        dfx.RecursiveCheckpointAdjoint() if options.adjoint is None
+        dfx.RecursiveCheckpointAdjoint()
+        if options.adjoint is None
         else eqx.combine(options.adjoint, problem.plugins[1])
     )
     if problem.dt is None:
@@ -115,6 +116,7 @@ def _integrate(problem: Problem, options: Options, field: Any, y0: PyTree, state
         throw=False,
     )
     assert solution.ts is not None
+    assert solution.ys is not None
     t_end, last = solution.ts[0][0], jtu.tree_map(lambda x: x[0], solution.ys[0])
     end_state = state_of(last)
     finish = end_code(scene, t_end, end_state, scene_field(t_end, end_state, scene), solution.result)
@@ -134,4 +136,5 @@ def solve_audited(problem: Problem, options: Options) -> Work:
     zero = jnp.zeros_like(problem.t0)
     y0 = (initial_state(problem), Work(zero, zero))
     solution, _, _ = _integrate(problem, options, _audited_flow, y0, lambda y: y[0])
+    assert solution.ys is not None
     return solution.ys[1][1]

@@ -1,10 +1,11 @@
 """The result of a run."""
 
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..mechanics import energies
@@ -49,7 +50,9 @@ class Energy(NamedTuple):
     balance: Float[Array, " time"]
 
 
-class Trajectory(eqx.Module):
+@jtu.register_dataclass
+@dataclass(frozen=True)
+class Trajectory:
     """A run of a scene. Everything but the motion itself is computed when it is asked for.
 
     - `t`: times [s], shape `[time]`; `ts`, or the end alone. Times that an early end left unreached are infinite.
@@ -67,7 +70,7 @@ class Trajectory(eqx.Module):
     stats: dict[str, Array]
     code: Int[Array, "..."]
     problem: Problem
-    options: Options = eqx.field(static=True)
+    options: Options = field(metadata={"static": True})
 
     @property
     def scene(self) -> Scene:
@@ -133,6 +136,4 @@ def _energy(problem: Problem, t: Array, y: State, work: Any) -> Energy:
     kinetic, potential, stored = jax.vmap(parts)(t, y)
     dissipated = work.absorbed - (stored - stored0)
     total = kinetic + potential + stored + dissipated - work.supplied
-    return Energy(
-        kinetic, potential, stored, work.supplied, dissipated, total - (kinetic0 + potential0 + stored0)
-    )
+    return Energy(kinetic, potential, stored, work.supplied, dissipated, total - (kinetic0 + potential0 + stored0))

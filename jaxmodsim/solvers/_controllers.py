@@ -25,7 +25,14 @@ class FiniteSteps(dfx.AbstractStepSizeController):
         return self.inner.init(terms, t0, t1, y0, dt0, args, func, error_order)
 
     def adapt_step_size(
-        self, t0: Any, t1: Any, y0: PyTree, y1_candidate: PyTree, args: PyTree, y_error: Any, error_order: Any,
+        self,
+        t0: Any,
+        t1: Any,
+        y0: PyTree,
+        y1_candidate: PyTree,
+        args: PyTree,
+        y_error: Any,
+        error_order: Any,
         controller_state: Any,
     ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:
         """Keep the step if all of its result is finite."""

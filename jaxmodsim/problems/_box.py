@@ -1,0 +1,65 @@
+"""A box on a table, pulled by a force that rises with time: the test bench of friction models.
+
+Mass 2 kg, force `ramp * t`, at rest at t = 0, ten seconds (NTNU course TTK4130, exercise 9, problem 2).
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
+
+from ..effects import AppliedForce, Friction
+from ..friction import Coulomb, LuGre, Stribeck
+from ..scene import Scene
+
+BOX_COULOMB = {"Fc": 1.5}
+BOX_STRIBECK = {"Fc": 1.5, "Fs": 1.75, "vs": 0.2, "Fv": 0.1}
+BOX_LUGRE = {"sigma0": 750.0, "sigma1": 0.0, "sigma2": 0.1, "Fc": 1.5, "Fs": 1.75, "vs": 0.2}
+
+# Velocity [m/s] and bristle deflection [m] at t = 10 s with BOX_LUGRE and a ramp of 1 N/s, on which four solvers
+# agree at tight tolerances.
+BOX_LUGRE_V10 = 15.694099521
+BOX_LUGRE_Z10 = 0.0020000000
+
+
+def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del t, q
+    return 0.5 * p["m"] * qd[0] ** 2
+
+
+def _pull(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del q, qd
+    return jnp.reshape(p["ramp"] * t, (1,))
+
+
+def ramped_box(law: Any = None, *, ramp: ArrayLike = 1.0, m: ArrayLike = 2.0) -> Scene:
+    """Box on a table pulled by the force `ramp * t`.
+
+    **Arguments:**
+
+    - `law`: friction law between box and table; None for no friction.
+    - `ramp`: rise of the force [N/s].
+    - `m`: mass [kg], > 0.
+
+    **Returns:**
+
+    A `Scene` with one coordinate [m] and the effects `pull` and (with a law) `friction`. Without friction
+    `v(t) = v0 + ramp t^2/(2 m)`; with dry friction up to `Fs` the box rests until `t = Fs/ramp`.
+    """
+    friction = () if law is None else (Friction(law),)
+    return Scene(_lagrangian, params={"m": m, "ramp": ramp}, effects=(AppliedForce(_pull, name="pull"), *friction))
+
+
+def box_coulomb() -> Coulomb:
+    """The box's Coulomb law."""
+    return Coulomb(**BOX_COULOMB)
+
+
+def box_stribeck() -> Stribeck:
+    """The box's law with stiction, Stribeck effect and viscous friction."""
+    return Stribeck(**BOX_STRIBECK)
+
+
+def box_lugre(**changes: ArrayLike) -> LuGre:
+    """The box's LuGre law, with `changes` to its parameters."""
+    return LuGre(**{**BOX_LUGRE, **changes})
