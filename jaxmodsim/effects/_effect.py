@@ -1,7 +1,7 @@
 """What an effect is: something that puts a force on the mechanism."""
 
 import abc
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -33,7 +33,10 @@ class AbstractEffect(eqx.Module):
     """A force on the mechanism, with or without a state of its own."""
 
     # By which the effect is known in the results; None for the class's own.
-    name: AbstractVar[str | None]
+    if TYPE_CHECKING:
+        name = cast("str | None", None)  # not a field, which would come before those of the effects
+    else:
+        name: AbstractVar[str | None]
 
     @property
     @abc.abstractmethod

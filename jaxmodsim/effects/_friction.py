@@ -129,7 +129,8 @@ class Friction(AbstractEffect):
     def belt(self, t: Float[Array, ""]) -> Float[Array, ""]:
         """Velocity [m/s or rad/s] of the surface."""
         fn = self.belt_velocity
-        return jnp.asarray(fn(t), t.dtype) if callable(fn) else fn
+        velocity: Any = fn(t) if callable(fn) else fn
+        return jnp.asarray(velocity, t.dtype)
 
     def slip(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"]) -> Float[Array, ""]:
         """Slip velocity [m/s or rad/s]."""

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -12,7 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-Number: TypeAlias = Float[Array, ""]
+if TYPE_CHECKING:
+    Number: TypeAlias = Any  # a plain number in the call: type checkers do not see the converter of `parameter`
+else:
+    Number: TypeAlias = Float[Array, ""]
 
 
 @dataclasses.dataclass(frozen=True)
