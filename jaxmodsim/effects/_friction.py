@@ -129,8 +129,7 @@ class Friction(AbstractEffect):
     def belt(self, t: Float[Array, ""]) -> Float[Array, ""]:
         """Velocity [m/s or rad/s] of the surface."""
         fn = self.belt_velocity
-        velocity: Any = fn(t) if callable(fn) else fn
-        return jnp.asarray(velocity, t.dtype)
+        return jnp.asarray(fn(t), t.dtype) if callable(fn) else fn
 
     def slip(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"]) -> Float[Array, ""]:
         """Slip velocity [m/s or rad/s]."""
@@ -144,7 +143,7 @@ class Friction(AbstractEffect):
         if self.normal_force is None:
             return None
         fn = self.normal_force
-        return jnp.maximum(fn(t, q, qd, params) if callable(fn) else fn, 0.0)
+        return jnp.maximum(jnp.asarray(fn(t, q, qd, params) if callable(fn) else fn), 0.0)
 
     def push(self, q: Float[Array, " dof"], force: Float[Array, ""]) -> Float[Array, " dof"]:
         """Generalised force of the friction force `force`."""
