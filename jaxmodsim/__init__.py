@@ -13,6 +13,10 @@ from .friction import Sign as Sign
 from .friction import Stribeck as Stribeck
 from .friction import Viscous as Viscous
 from .friction import asymmetric as asymmetric
+from .identify import FitResult as FitResult
+from .identify import Record as Record
+from .identify import fit as fit
+from .identify import fit_law as fit_law
 from .scene import Scene as Scene
 from .simulation import SimulationError as SimulationError
 from .simulation import Trajectory as Trajectory

@@ -5,4 +5,7 @@ from ._field import check_scene as check_scene
 from ._field import scene_field as scene_field
 from ._field import scene_forces as scene_forces
 from ._field import scene_power as scene_power
+from ._names import replace_numbers as replace_numbers
+from ._names import scene_numbers as scene_numbers
+from ._names import scene_ranges as scene_ranges
 from ._scene import Scene as Scene

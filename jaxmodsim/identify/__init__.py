@@ -1,0 +1,8 @@
+"""Identification: numbers of scenes and laws from measured records."""
+
+from ._fit import fit as fit
+from ._fit_law import fit_law as fit_law
+from ._fit_law import law_force as law_force
+from ._fit_result import FitResult as FitResult
+from ._record import Record as Record
+from ._replay import replay as replay

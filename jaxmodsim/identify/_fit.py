@@ -1,0 +1,95 @@
+"""`fit`: numbers of a scene from a measured record."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
+
+from ..scene import Scene, State, check_scene, replace_numbers, scene_numbers, scene_ranges
+from ._fit_result import FitResult
+from ._least_squares import Progress, least_squares
+from ._parameters import FreeParameters
+from ._record import Record
+from ._replay import replay
+
+
+def first_coordinate(q: Array, qd: Array) -> Array:
+    """The first coordinate, which is what a position sensor on one axis sees."""
+    del qd
+    return q[0]
+
+
+def fit(
+    scene: Scene,
+    record: Record,
+    free: Sequence[str],
+    *,
+    q0: ArrayLike | list[float] | None = None,
+    qd0: ArrayLike | list[float] | None = None,
+    observe: Callable[[Array, Array], Array] = first_coordinate,
+    substeps: int = 1,
+    rtol: float = 1e-6,
+    max_steps: int = 100,
+    progress: Progress | None = None,
+) -> FitResult:
+    """Fit numbers of a scene so that its open-loop simulation follows a record.
+
+    The inputs drive the scene, nothing measured is fed back, and the sum of squares of `observe - measured` over all
+    samples is minimised by Levenberg-Marquardt on the exact derivatives of the simulated run.
+
+    **Arguments:**
+
+    - `scene`: the model with start values; its `params` must be a dict with an entry for each input of the record.
+    - `record`: the `Record`.
+    - `free`: names of the numbers to fit, as `jaxmodsim.scene.scene_numbers` gives them: `("m", "friction.Fc")`.
+      Laws' parameters stay in their ranges.
+    - `q0`, `qd0`: state at the first sample, shape `[dof]`; by default, for one coordinate, the first measured value
+      and rest.
+    - `observe`: `observe(q, qd)`, what the record measured; by default the first coordinate.
+    - `substeps`: integration steps between two samples.
+    - `rtol`: relative tolerance on parameters and loss at which the search ends.
+    - `max_steps`: limit of iterations.
+    - `progress`: called after each iteration with its number, the RMSE and the parameters. Ctrl-C ends the fit
+      with the best so far.
+
+    **Returns:**
+
+    A `FitResult`.
+
+    **Raises:**
+
+    - `ValueError` for names that are unknown, a start on the limit of its range, inputs the scene has no entry for.
+    - `RuntimeError` if the model is not finite at its start values.
+    """
+    if not isinstance(scene.params, dict) or not set(record.inputs) <= set(scene.params):
+        have = ", ".join(scene.params) if isinstance(scene.params, dict) else "no dict"
+        raise ValueError(
+            f"The record's inputs ({', '.join(record.inputs)}) must be entries of the scene's params ({have})."
+        )
+    if substeps < 1:
+        raise ValueError(f"substeps must be at least 1, but {substeps} was given.")
+    driven = sorted(set(free) & set(record.inputs))
+    if driven:
+        raise ValueError(f"{driven[0]} is driven by the record and cannot be free.")
+    ranges = scene_ranges(scene)
+    parameters = FreeParameters.of(scene_numbers(scene), ranges, free)
+    start = [record.measured[0]] if q0 is None else q0
+    position = jnp.asarray(start, float)
+    velocity = jnp.zeros_like(position) if qd0 is None else jnp.asarray(qd0, float)
+    check_scene(scene, State(position, velocity, scene.state0()))
+
+    def residual(values: dict[str, Array], data: Any) -> Array:
+        t, inputs, measured = data
+        model = replace_numbers(scene, values)
+        return replay(model, t, inputs, position, velocity, substeps, observe) - measured
+
+    data = (
+        jnp.asarray(record.t),
+        {name: jnp.asarray(x) for name, x in record.inputs.items()},
+        jnp.asarray(record.measured),
+    )
+    estimate = least_squares(residual, parameters, data, rtol=rtol, max_steps=max_steps, progress=progress)
+    found = dict(zip(estimate.names, map(jnp.asarray, estimate.values), strict=True))
+    units = {name: allowed.unit for name, allowed in ranges.items()}
+    return FitResult.of(estimate, replace_numbers(scene, found), record, units)

@@ -1,0 +1,131 @@
+"""`fit_law`: parameters of a friction law from measured motion and force, without a mechanism."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..effects import Friction
+from ..friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw
+from ..scene import Scene, replace_numbers, scene_numbers, scene_ranges
+from ._fit_result import FitResult
+from ._least_squares import Progress, least_squares
+from ._parameters import FreeParameters
+from ._record import Record
+
+
+def fit_law(
+    law: AbstractLaw,
+    record: Record,
+    free: Sequence[str] | None = None,
+    *,
+    rtol: float = 1e-6,
+    max_steps: int = 100,
+    progress: Progress | None = None,
+) -> FitResult:
+    """Fit a friction law to a measured friction force under a measured motion.
+
+    The law's state is advanced exactly over each sample at constant velocity, so any sampling rate is stable and
+    the measured position needs no differentiation but in viscous terms.
+
+    **Arguments:**
+
+    - `law`: the law with start values; a dynamic law such as `LuGre`, or one that is a function of velocity.
+    - `record`: `measured` is the friction force [N], positive when it opposes positive slip; `inputs` holds the slip
+      displacement `x` [m] and, if the law's forces are per newton of load, the normal load `normal` [N]. The law
+      starts at rest and unloaded.
+    - `free`: names of the law's parameters to fit; by default all of them.
+    - `rtol`, `max_steps`, `progress`: see `fit`.
+
+    **Returns:**
+
+    A `FitResult` whose `model` is the law.
+
+    **Raises:**
+
+    - `ValueError` for unknown names or inputs, or a law that cannot run by itself.
+    """
+    if "x" not in record.inputs or not set(record.inputs) <= {"x", "normal"}:
+        raise ValueError(
+            f"fit_law needs the input 'x' [m] and may take 'normal' [N]; the record has: {', '.join(record.inputs)}."
+        )
+    # A scene of the law alone gives its numbers their names and ranges.
+    holder = Scene(_nothing, effects=(Friction(law, name="law"),))
+    prefix = "law."
+    numbers = {
+        name.removeprefix(prefix): value
+        for name, value in scene_numbers(holder).items()
+        if name != prefix + "belt_velocity"
+    }
+    ranges = {}
+    for name, allowed in scene_ranges(holder).items():
+        lower = allowed.lower.removeprefix(prefix) if isinstance(allowed.lower, str) else allowed.lower
+        ranges[name.removeprefix(prefix)] = type(allowed)(allowed.unit, lower, allowed.strict)
+    parameters = FreeParameters.of(numbers, ranges, tuple(numbers) if free is None else free)
+
+    def with_values(values: dict[str, Array]) -> AbstractLaw:
+        friction = replace_numbers(holder, {prefix + name: value for name, value in values.items()}).effects[0]
+        assert isinstance(friction, Friction)
+        return friction.law
+
+    def residual(values: dict[str, Array], data: Any) -> Array:
+        t, inputs, measured = data
+        return law_force(with_values(values), t, inputs["x"], inputs.get("normal")) - measured
+
+    data = (
+        jnp.asarray(record.t),
+        {name: jnp.asarray(x) for name, x in record.inputs.items()},
+        jnp.asarray(record.measured),
+    )
+    estimate = least_squares(residual, parameters, data, rtol=rtol, max_steps=max_steps, progress=progress)
+    found = with_values(dict(zip(estimate.names, map(jnp.asarray, estimate.values), strict=True)))
+    return FitResult.of(estimate, found, record, {name: allowed.unit for name, allowed in ranges.items()})
+
+
+def law_force(
+    law: AbstractLaw,
+    t: Float[Array, " samples"],
+    x: Float[Array, " samples"],
+    normal: Float[Array, " samples"] | None = None,
+) -> Float[Array, " samples"]:
+    """Friction force of a law under a sampled motion, from rest and unloaded.
+
+    **Arguments:**
+
+    - `law`: a dynamic law, or one that is a function of velocity.
+    - `t`: times [s], increasing.
+    - `x`: slip displacement [m] at these times; the velocity is constant from sample to sample.
+    - `normal`: normal load [N] for laws whose forces are per newton of load.
+
+    **Returns:**
+
+    The force [N] at each sample, with the velocity of the interval that ends there (0 at the first).
+
+    **Raises:**
+
+    - `ValueError` for a law whose force depends on more than its own motion.
+    """
+    distance = jnp.diff(x)
+    v = distance / jnp.diff(t)
+    if isinstance(law, AbstractDynamicLaw):
+
+        def advance(z: Any, interval: tuple[Array, Array]) -> tuple[Any, Array]:
+            z = law.advance(*interval, z)
+            return z, law.force(interval[1], z)
+
+        z0 = law.state0()
+        _, force = jax.lax.scan(advance, z0, (distance, v))
+        first = law.force(jnp.zeros_like(x[0]), z0)
+    elif isinstance(law, AbstractForceLaw):
+        force, first = jax.vmap(law.force)(v), law.force(jnp.zeros_like(x[0]))
+    else:
+        raise ValueError(f"{type(law).__name__} cannot run by itself: its force depends on the load it holds.")
+    force = jnp.concatenate([jnp.reshape(first, (1,)), force])
+    return force if normal is None else force * jnp.maximum(normal, 0.0)
+
+
+def _nothing(t: Array, q: Array, qd: Array, p: Any) -> Array:
+    del t, q, p
+    return 0.0 * qd[0]

@@ -1,0 +1,79 @@
+"""Free parameters: kept in their ranges by a transform to numbers without limits."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..numerics import Range
+
+
+@dataclass(frozen=True)
+class FreeParameters:
+    """Names, start values and lower limits of the parameters of a fit.
+
+    A parameter with a lower limit is `limit + (start - limit) exp(x)`, one without is `start + scale x`, with x free and
+    zero at the start; a limit may be another parameter, free or not. Limits that the range excludes are thereby
+    never reached, and those it includes only in the limit.
+    """
+
+    names: tuple[str, ...]
+    start: dict[str, float]
+    limits: dict[str, float | str | None]
+    fixed: dict[str, float]
+
+    @staticmethod
+    def of(numbers: Mapping[str, Any], ranges: Mapping[str, Range], free: Sequence[str]) -> "FreeParameters":
+        """Choose `free` among `numbers`.
+
+        **Raises:**
+
+        - `ValueError` for a name that is unknown, given twice or no single number, or a start on its limit.
+        """
+        if isinstance(free, str) or not free:
+            raise ValueError("free must name at least one number, as in free=('m', 'friction.Fc').")
+        for name in free:
+            if name not in numbers:
+                raise ValueError(f"free names {name!r}, but the numbers are: {', '.join(numbers)}.")
+            if list(free).count(name) > 1:
+                raise ValueError(f"free names {name!r} twice.")
+            if jnp.shape(numbers[name]) != ():
+                raise ValueError(f"{name} is an array of shape {jnp.shape(numbers[name])}; only single numbers fit.")
+        values = {name: float(x) for name, x in numbers.items() if jnp.shape(x) == ()}
+        limits = {name: ranges[name].lower if name in ranges else None for name in free}
+        for name, limit in limits.items():
+            lower = values[limit] if isinstance(limit, str) else limit
+            if lower is not None and values[name] <= lower:
+                shown = f"{limit} = {lower:g}" if isinstance(limit, str) else f"{lower:g}"
+                raise ValueError(f"The start {name} = {values[name]:g} must lie above its limit {shown}.")
+        # A limit by another free parameter needs that one first.
+        order = sorted(free, key=lambda name: limits[name] in free)
+        fixed = {name: value for name, value in values.items() if name not in free}
+        return FreeParameters(tuple(order), {name: values[name] for name in order}, limits, fixed)
+
+    def values(self, x: Float[Array, " free"]) -> dict[str, Array]:
+        """The parameters at `x`."""
+        values: dict[str, Array] = {}
+        for i, name in enumerate(self.names):
+            limit, start = self.limits[name], self.start[name]
+            if limit is None:
+                values[name] = start + max(abs(start), 1.0) * x[i]
+            elif isinstance(limit, str):
+                lower = values.get(limit, jnp.asarray(self.fixed.get(limit, 0.0)))
+                at_start = self.start.get(limit, self.fixed.get(limit, 0.0))
+                values[name] = lower + (start - at_start) * jnp.exp(x[i])
+            else:
+                values[name] = limit + (start - limit) * jnp.exp(x[i])
+        return values
+
+    def vector(self, x: Float[Array, " free"]) -> Float[Array, " free"]:
+        """The parameters at `x` as a vector in the order of `names`."""
+        values = self.values(x)
+        return jnp.stack([values[name] for name in self.names])
+
+    def slopes(self, x: Float[Array, " free"]) -> Float[Array, "free free"]:
+        """Derivatives of the parameters by x."""
+        return jax.jacfwd(self.vector)(x)

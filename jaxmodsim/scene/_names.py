@@ -1,0 +1,76 @@
+"""Every number of a scene by a name that a person would type."""
+
+from typing import Any
+
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from ..numerics import Range, ranges_of
+from ._scene import Scene
+
+
+def scene_numbers(scene: Scene) -> dict[str, Array]:
+    """All numbers of a scene by name.
+
+    Entries of `params` go by their key (`m`, nested ones `arm.m`), numbers of an effect by `effect.number`
+    (`friction.Fc`, `friction.belt_velocity`); wrapped laws add no level of their own (`friction.width`), the two
+    sides of a law that depends on direction do (`friction.forward.Fc`).
+
+    **Raises:**
+
+    - `ValueError` if two numbers come to the same name; give one of the effects a name.
+    """
+    leaves, _ = jtu.tree_flatten_with_path(scene)
+    numbers: dict[str, Array] = {}
+    for path, leaf in leaves:
+        name = _name(scene, path)
+        if name in numbers:
+            raise ValueError(f"Two numbers of the scene come to the name {name!r}; give the effect another name.")
+        numbers[name] = leaf
+    return numbers
+
+
+def scene_ranges(scene: Scene) -> dict[str, Range]:
+    """Admissible range of each number that has one, by the names of `scene_numbers`.
+
+    A limit by another number carries that number's full name.
+    """
+    leaves, _ = jtu.tree_flatten_with_path(scene)
+    ranges: dict[str, Range] = {}
+    for path, _ in leaves:
+        owner = scene
+        for key in path[:-1]:
+            owner = _step(owner, key)
+        last = path[-1]
+        if not isinstance(last, jtu.GetAttrKey):
+            continue
+        allowed = ranges_of(owner).get(last.name)
+        if allowed is None:
+            continue
+        if isinstance(allowed.lower, str):
+            limit = _name(scene, (*path[:-1], jtu.GetAttrKey(allowed.lower)))
+            allowed = Range(allowed.unit, limit, allowed.strict)
+        ranges[_name(scene, path)] = allowed
+    return ranges
+
+
+def replace_numbers(scene: Scene, values: dict[str, Any]) -> Scene:
+    """The scene with the numbers of these names replaced; the names are those of `scene_numbers`."""
+    names = list(scene_numbers(scene))
+    leaves, structure = jtu.tree_flatten(scene)
+    return jtu.tree_unflatten(structure, [values.get(n, leaf) for n, leaf in zip(names, leaves, strict=True)])
+
+
+def _step(node: Any, key: Any) -> Any:
+    if isinstance(key, jtu.GetAttrKey):
+        return getattr(node, key.name)
+    return node[key.idx if isinstance(key, jtu.SequenceKey) else key.key]
+
+
+def _name(scene: Scene, path: tuple[Any, ...]) -> str:
+    words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]
+    if words[0] == "effects":
+        words = [scene.names[int(words[1])], *(word for word in words[2:] if word != "law")]
+    elif words[0] == "params":
+        words = words[1:] or ["params"]
+    return ".".join(words)
