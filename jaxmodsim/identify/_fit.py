@@ -90,6 +90,5 @@ def fit(
         jnp.asarray(record.measured),
     )
     estimate = least_squares(residual, parameters, data, rtol=rtol, max_steps=max_steps, progress=progress)
-    found = dict(zip(estimate.names, map(jnp.asarray, estimate.values), strict=True))
     units = {name: allowed.unit for name, allowed in ranges.items()}
-    return FitResult.of(estimate, replace_numbers(scene, found), record, units)
+    return FitResult.of(estimate, replace_numbers(scene, estimate.found), record, units)

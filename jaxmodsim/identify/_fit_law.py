@@ -80,8 +80,11 @@ def fit_law(
         jnp.asarray(record.measured),
     )
     estimate = least_squares(residual, parameters, data, rtol=rtol, max_steps=max_steps, progress=progress)
-    found = with_values(dict(zip(estimate.names, map(jnp.asarray, estimate.values), strict=True)))
-    return FitResult.of(estimate, found, record, {name: allowed.unit for name, allowed in ranges.items()})
+    per_load = " per N" if "normal" in record.inputs else ""
+    units = {
+        name: allowed.unit + (per_load if allowed.unit.startswith("N") else "") for name, allowed in ranges.items()
+    }
+    return FitResult.of(estimate, with_values(estimate.found), record, units)
 
 
 def law_force(

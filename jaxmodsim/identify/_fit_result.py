@@ -42,13 +42,14 @@ class FitResult:
     def of(estimate: Estimate, model: eqx.Module, record: Record, units: dict[str, str]) -> "FitResult":
         """From an estimate whose residual is simulated minus measured."""
         errors = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
-        safe = np.where(errors > 0, errors, 1.0)
+        safe = np.where((errors > 0) & np.isfinite(errors), errors, 1.0)
+        correlation = np.where(np.isfinite(estimate.covariance), estimate.covariance / np.outer(safe, safe), 1.0)
         return FitResult(
             dict(zip(estimate.names, estimate.values.tolist(), strict=True)),
             dict(zip(estimate.names, errors.tolist(), strict=True)),
             dict(zip(estimate.names, estimate.start.tolist(), strict=True)),
             {name: units.get(name, "") for name in estimate.names},
-            estimate.covariance / np.outer(safe, safe),
+            correlation,
             model,
             record,
             record.measured + estimate.residual,
@@ -63,7 +64,9 @@ class FitResult:
         remarks = []
         for name, value in self.values.items():
             share = self.errors[name] / abs(value) if value else np.inf
-            if share > 0.5:
+            if not np.isfinite(share):
+                remarks.append(f"{name} has no effect on this record.")
+            elif share > 0.5:
                 remarks.append(
                     f"{name} is not determined by this record: its standard error is {100 * share:.0f} % of its value."
                 )

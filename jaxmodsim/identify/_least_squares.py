@@ -24,16 +24,24 @@ _BLOCKS = 32
 
 @dataclass(frozen=True)
 class Estimate:
-    """What least squares found; arrays in the order of `names`."""
+    """What least squares found; arrays in the order of `names`, `following` by name (see `FreeParameters`)."""
 
     names: tuple[str, ...]
     start: Float[np.ndarray, " free"]
     values: Float[np.ndarray, " free"]
+    following: dict[str, float]
     covariance: Float[np.ndarray, "free free"]
     residual: Float[np.ndarray, " samples"]
     jacobian: Float[np.ndarray, "samples free"]
     iterations: int
     ending: str
+
+    @property
+    def found(self) -> dict[str, Array]:
+        """All values that differ from the start, by name."""
+        return {
+            name: jnp.asarray(x) for name, x in (*zip(self.names, self.values, strict=True), *self.following.items())
+        }
 
 
 def least_squares(
@@ -88,6 +96,7 @@ def least_squares(
         free.names,
         np.array([free.start[name] for name in free.names]),
         np.asarray(free.vector(x)),
+        {name: float(value) for name, value in free.values(x).items() if name in free.following},
         _covariance(jacobian, r),
         r,
         jacobian,
@@ -129,10 +138,15 @@ def _covariance(jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
     blocks = max(min(_BLOCKS, n // 2), p + 1)
     edges = np.linspace(0, n, blocks + 1).astype(int)[:-1]
     scores = np.add.reduceat(jacobian * residual[:, None], edges, axis=0)
-    # Columns may differ by orders of magnitude: invert the scaled matrix.
+    # Columns differ by orders of magnitude, so the scaled matrix is inverted. Its eigenvalues are kept off zero: a
+    # direction that the record says nothing about gets a huge error, not none.
     scale = np.sqrt(np.sum(jacobian**2, axis=0))
-    scale = np.where(scale > 0, scale, 1.0)
-    bread = np.linalg.pinv((jacobian / scale).T @ (jacobian / scale), rcond=1e-14, hermitian=True)
+    silent = scale == 0
+    scale = np.where(silent, 1.0, scale)
+    eigenvalues, vectors = np.linalg.eigh((jacobian / scale).T @ (jacobian / scale))
+    bread = vectors / np.maximum(eigenvalues, 1e-15 * eigenvalues[-1]) @ vectors.T
     scores = scores / scale
     meat = scores.T @ scores * (blocks / max(blocks - p, 1))
-    return bread @ meat @ bread / np.outer(scale, scale)
+    covariance = bread @ meat @ bread / np.outer(scale, scale)
+    covariance[silent, silent] = np.inf
+    return covariance

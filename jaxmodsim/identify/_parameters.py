@@ -15,15 +15,20 @@ from ..numerics import Range
 class FreeParameters:
     """Names, start values and lower limits of the parameters of a fit.
 
-    A parameter with a lower limit is `limit + (start - limit) exp(x)`, one without is `start + scale x`, with x free and
-    zero at the start; a limit may be another parameter, free or not. Limits that the range excludes are thereby
-    never reached, and those it includes only in the limit.
+    A parameter with a lower limit is `limit + (start - limit) exp(x)`, one without is `start + scale x`, with x
+    free and zero at the start. A limit may be another parameter (Fs >= Fc). One that is not free itself, but whose
+    limit is, keeps its distance from the limit: with Fs = Fc at the start, it stays so.
+
+    - `names`: of the free parameters, each after its limit.
+    - `start`: values at the start, of these and of the ones that follow them.
+    - `limits`: lower limit of each, if it has one: a number or a name.
+    - `following`: names of the parameters that are not free but follow one that is.
     """
 
     names: tuple[str, ...]
     start: dict[str, float]
     limits: dict[str, float | str | None]
-    fixed: dict[str, float]
+    following: tuple[str, ...]
 
     @staticmethod
     def of(numbers: Mapping[str, Any], ranges: Mapping[str, Range], free: Sequence[str]) -> "FreeParameters":
@@ -43,30 +48,34 @@ class FreeParameters:
             if jnp.shape(numbers[name]) != ():
                 raise ValueError(f"{name} is an array of shape {jnp.shape(numbers[name])}; only single numbers fit.")
         values = {name: float(x) for name, x in numbers.items() if jnp.shape(x) == ()}
-        limits = {name: ranges[name].lower if name in ranges else None for name in free}
-        for name, limit in limits.items():
+        limits: dict[str, float | str | None] = {}
+        for name in free:
+            limit = ranges[name].lower if name in ranges else None
             lower = values[limit] if isinstance(limit, str) else limit
             if lower is not None and values[name] <= lower:
                 shown = f"{limit} = {lower:g}" if isinstance(limit, str) else f"{lower:g}"
                 raise ValueError(f"The start {name} = {values[name]:g} must lie above its limit {shown}.")
-        # A limit by another free parameter needs that one first.
-        order = sorted(free, key=lambda name: limits[name] in free)
-        fixed = {name: value for name, value in values.items() if name not in free}
-        return FreeParameters(tuple(order), {name: values[name] for name in order}, limits, fixed)
+            # A limit that is fixed is a number.
+            limits[name] = limit if limit in free else lower
+        order = sorted(free, key=lambda name: isinstance(limits[name], str))
+        following = tuple(name for name, r in ranges.items() if name not in free and r.lower in free)
+        limits |= {name: ranges[name].lower for name in following}
+        return FreeParameters(tuple(order), {name: values[name] for name in (*order, *following)}, limits, following)
 
     def values(self, x: Float[Array, " free"]) -> dict[str, Array]:
-        """The parameters at `x`."""
+        """The parameters at `x`, and those that follow them."""
         values: dict[str, Array] = {}
         for i, name in enumerate(self.names):
             limit, start = self.limits[name], self.start[name]
             if limit is None:
                 values[name] = start + max(abs(start), 1.0) * x[i]
             elif isinstance(limit, str):
-                lower = values.get(limit, jnp.asarray(self.fixed.get(limit, 0.0)))
-                at_start = self.start.get(limit, self.fixed.get(limit, 0.0))
-                values[name] = lower + (start - at_start) * jnp.exp(x[i])
+                values[name] = values[limit] + (start - self.start[limit]) * jnp.exp(x[i])
             else:
                 values[name] = limit + (start - limit) * jnp.exp(x[i])
+        for name in self.following:
+            limit = str(self.limits[name])
+            values[name] = values[limit] + (self.start[name] - self.start[limit])
         return values
 
     def vector(self, x: Float[Array, " free"]) -> Float[Array, " free"]:
