@@ -105,8 +105,9 @@ def factor_lu(rows: Sequence[Sequence[Scalar]]) -> LinearSolver:
     A function from a right-hand side (n scalars) to the solution (n scalars), differentiable in the matrix and the
     right-hand side. A singular matrix gives values that are not finite.
     """
-    frozen = [[jax.lax.stop_gradient(entry) for entry in row] for row in rows]
-    factors = _eliminate(frozen)
+    # The factors stay differentiable although the rule of `_solve_lu` ignores their tangents: transposed in reverse
+    # mode, a solve is plain arithmetic on the factors, and derivatives of that (Hessians) go through the elimination.
+    factors = _eliminate([list(row) for row in rows])
     return lambda rhs: _solve_lu([list(row) for row in rows], factors, list(rhs))
 
 
