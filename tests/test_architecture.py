@@ -1,0 +1,142 @@
+"""The rules of the code base that a reader cannot be expected to check by eye."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import jaxmodsim
+
+ROOT = Path(jaxmodsim.__file__).parent
+FILES = sorted(ROOT.rglob("*.py"))
+
+_CORE = ("numerics", "mechanics", "friction", "effects", "scene", "solvers", "simulation")
+# What each layer may import besides itself. The package's own `__init__` and `_speed` stand outside.
+ALLOWED: dict[str, set[str]] = {layer: set(_CORE[:i]) for i, layer in enumerate(_CORE)}
+ALLOWED["problems"] = {"numerics", "mechanics", "friction", "effects", "scene"}
+ALLOWED["identify"] = set(_CORE)
+ALLOWED["plot"] = {*_CORE, "problems", "identify"}
+ALLOWED["cli"] = {*_CORE, "problems", "identify", "plot", "_speed"}
+ALLOWED["_speed"] = set()
+
+# The command line imports inside its commands, so that `--help` does not wait for JAX.
+LAZY_IMPORTS = {"cli"}
+
+MAX_FILE_LINES = 500
+MAX_FUNCTION_LINES = 80
+LONG_FUNCTIONS: dict[str, str] = {}  # "file:function" -> reason
+
+
+def layer_of(path: Path) -> str:
+    first = path.relative_to(ROOT).parts[0]
+    return first.removesuffix(".py")
+
+
+def own_imports(path: Path, node: ast.AST) -> Iterator[str]:
+    """Modules of this package that an import statement names, as dotted paths from its root."""
+    if isinstance(node, ast.Import):
+        for alias in node.names:
+            if alias.name.split(".")[0] == "jaxmodsim":
+                yield alias.name.removeprefix("jaxmodsim").lstrip(".")
+    elif isinstance(node, ast.ImportFrom):
+        if node.level:
+            folder = path.parent.relative_to(ROOT).parts
+            base = folder[: len(folder) - (node.level - 1)]
+        elif (node.module or "").split(".")[0] == "jaxmodsim":
+            base = ()
+        else:
+            return
+        module = (node.module or "").removeprefix("jaxmodsim").lstrip(".")
+        stem = ".".join((*base, *([module] if module else [])))
+        if stem:
+            yield stem
+        else:  # from . import name, from jaxmodsim import name
+            yield from (alias.name for alias in node.names)
+
+
+def statements(path: Path, kind: tuple[type[ast.AST], ...]) -> list[ast.AST]:
+    return [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, kind)]
+
+
+def each_file(paths: list[Path]) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("path", paths, ids=lambda p: str(p.relative_to(ROOT)))
+
+
+@pytest.mark.quick
+def test_every_part_has_its_layer() -> None:
+    parts = {layer_of(path) for path in FILES} - {"__init__"}
+    assert parts <= set(ALLOWED), f"say in ALLOWED where {sorted(parts - set(ALLOWED))} belong"
+
+
+@each_file([path for path in FILES if path != ROOT / "__init__.py"])
+def test_layers_import_only_those_above(path: Path) -> None:
+    layer = layer_of(path)
+    for node in statements(path, (ast.Import, ast.ImportFrom)):
+        for module in own_imports(path, node):
+            target = module.split(".")[0]
+            assert target == layer or target in ALLOWED[layer], f"{layer} imports {module}"
+            assert target == layer or "._" not in module, f"{layer} reaches into {module}; import it from {target}"
+
+
+@each_file(FILES)
+def test_only_plot_imports_matplotlib(path: Path) -> None:
+    for node in statements(path, (ast.Import, ast.ImportFrom)):
+        names = [a.name for a in node.names] if isinstance(node, ast.Import) else [getattr(node, "module", None) or ""]
+        if any(name.split(".")[0] == "matplotlib" for name in names):
+            assert layer_of(path) == "plot"
+
+
+@each_file([path for path in FILES if layer_of(path) not in LAZY_IMPORTS])
+def test_no_import_of_our_own_inside_functions(path: Path) -> None:
+    for function in statements(path, (ast.FunctionDef, ast.AsyncFunctionDef)):
+        for node in ast.walk(function):
+            assert not list(own_imports(path, node)), f"line {getattr(node, 'lineno', '?')}"
+
+
+@each_file(FILES)
+def test_files_and_functions_are_short(path: Path) -> None:
+    """Lines of a function are counted without its docstring."""
+    assert len(path.read_text().splitlines()) < MAX_FILE_LINES
+    for node in statements(path, (ast.FunctionDef, ast.AsyncFunctionDef)):
+        assert isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        lines = (node.end_lineno or node.lineno) - node.lineno + 1
+        if ast.get_docstring(node) is not None:
+            lines -= (node.body[0].end_lineno or 0) - node.body[0].lineno + 1
+        allowed = f"{path.relative_to(ROOT)}:{node.name}" in LONG_FUNCTIONS
+        assert lines < MAX_FUNCTION_LINES or allowed, f"{node.name} has {lines} lines"
+
+
+def test_classes_are_abstract_or_final() -> None:
+    bases: dict[str, list[str]] = {}
+    for path in FILES:
+        for node in statements(path, (ast.ClassDef,)):
+            assert isinstance(node, ast.ClassDef)
+            names = [base.value if isinstance(base, ast.Subscript) else base for base in node.bases]
+            bases[node.name] = [n.id if isinstance(n, ast.Name) else getattr(n, "attr", "") for n in names]
+    derived = {
+        name: base
+        for name, of in bases.items()
+        for base in of
+        if base in bases and not base.lstrip("_").startswith("Abstract")
+    }
+    assert not derived, f"derived from a concrete class: {derived}"
+
+
+def test_the_rules_can_be_broken(tmp_path: Path) -> None:
+    """The readers of imports above see what they should."""
+    del tmp_path
+    inside = ROOT / "friction" / "_law.py"
+    cases = {
+        "from ..numerics import x": ["numerics"],
+        "from ..numerics._safe import x": ["numerics._safe"],
+        "from ._law import x": ["friction._law"],
+        "from .. import scene": ["scene"],
+        "import jaxmodsim.scene": ["scene"],
+        "from jaxmodsim import scene": ["scene"],
+        "from jaxmodsim.scene import Scene": ["scene"],
+        "import jax": [],
+        "from jax import numpy": [],
+    }
+    for source, expected in cases.items():
+        assert list(own_imports(inside, ast.parse(source).body[0])) == expected, source
