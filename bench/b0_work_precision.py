@@ -1,0 +1,93 @@
+"""Work against precision on the LuGre testbench: time of one run and its error, tolerance by tolerance.
+
+python bench/b0_work_precision.py [--smoke] [--no-tune] [--out DIR]
+"""
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import matplotlib as mpl
+from _lugre import ATOL, error_ladder, peers, reference_solution
+from _measure import describe_machine, machine_line, measure, write_json
+from matplotlib import pyplot as plt
+
+import jaxmodsim as jms
+
+LADDER = tuple(10.0**-k for k in range(3, 11))
+
+
+def main() -> None:
+    """Measure, and write `lugre_work_precision.json` and `.png`."""
+    parser = argparse.ArgumentParser(description="Work against precision on the LuGre testbench.")
+    parser.add_argument("--smoke", action="store_true", help="small configuration that shows that everything runs")
+    parser.add_argument("--no-tune", action="store_true", help="without jaxmodsim.tune_cpu(); files of their own")
+    parser.add_argument("--out", type=Path, default=None, help="folder of the results; default bench/results")
+    options = parser.parse_args()
+    folder = options.out or (Path(tempfile.mkdtemp()) if options.smoke else Path(__file__).parent / "results")
+    name = "lugre_work_precision_untuned" if options.no_tune else "lugre_work_precision"
+    if not options.no_tune:
+        jms.tune_cpu()
+    jax.config.update("jax_enable_x64", True)
+    solvers, (reference, agreement) = peers(), reference_solution()
+    points = {peer.name: error_ladder(peer, reference, LADDER[:2] if options.smoke else LADDER) for peer in solvers}
+    calls = {
+        f"{peer.name} {row['rtol']:.0e}": peer.once(row["rtol"])
+        for peer in solvers
+        for row in points[peer.name]
+        if "failed" not in row
+    }
+    times = measure(calls, 1 if options.smoke else 20)
+    for peer, rows in points.items():
+        for row in rows:
+            row |= times.get(f"{peer} {row['rtol']:.0e}", {})
+    content = {
+        "name": name,
+        "smoke": options.smoke,
+        "machine": describe_machine("jax", "jaxlib", "diffrax", "casadi", "scipy", "numpy", "jaxmodsim"),
+        "tuned": not options.no_tune,
+        "atol_over_rtol": ATOL,
+        "reference_disagreement": agreement,
+        "points": points,
+    }
+    content["table"] = _table(points)
+    content["caption"] = (
+        "Time of one run [ms] and largest error of the velocity over the run, relative to the largest velocity."
+        f" {machine_line(content['machine'])}"
+    )
+    write_json(folder / f"{name}.json", content)
+    draw(content, folder / f"{name}.png")
+
+
+def _table(points: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+    def cell(row: dict[str, Any]) -> str:
+        return "failed" if "failed" in row else f"{1e3 * row['median_s']:.2f} ms, {row['v_run']:.0e}"
+
+    tolerances = [f"rtol {row['rtol']:.0e}" for row in next(iter(points.values()))]
+    rows = [[peer, *(cell(row) for row in found)] for peer, found in points.items()]
+    return {"columns": ["solver", *tolerances], "rows": rows}
+
+
+def draw(content: dict[str, Any], path: Path) -> None:
+    """Work-precision diagram: the lower left is the better place."""
+    mpl.use("Agg")
+    figure, axes = plt.subplots(figsize=(7.0, 4.6), layout="constrained")
+    for marker, (peer, rows) in zip("osD^v", content["points"].items(), strict=False):
+        kept = [row for row in rows if "failed" not in row]
+        axes.loglog(
+            [row["v_run"] for row in kept], [1e3 * row["median_s"] for row in kept], marker=marker, ms=4.5, label=peer
+        )
+    axes.set_xlabel("largest error of the velocity over the run, relative to its maximum [1]")
+    axes.set_ylabel("time of one run, warm [ms]")
+    axes.set_title("LuGre testbench, 10 s, rtol from 1e-3 to 1e-10")
+    axes.grid(which="both", alpha=0.25)
+    axes.legend()
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+    print(f"written: {path}")
+
+
+if __name__ == "__main__":
+    main()
