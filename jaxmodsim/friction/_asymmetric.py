@@ -1,6 +1,6 @@
 """Laws whose parameters depend on the direction of slip."""
 
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, ClassVar, TypeVar, cast, overload
 
 import equinox as eqx
 import jax
@@ -50,6 +50,10 @@ class _AsymmetricSetValued(AbstractSetValuedLaw):
         return _side(direction, self.forward, self.backward).limit(direction)
 
 
+@overload
+def asymmetric(law: AbstractForceLaw, **backward: Any) -> AbstractForceLaw: ...
+@overload
+def asymmetric(law: AbstractSetValuedLaw, **backward: Any) -> AbstractSetValuedLaw: ...
 def asymmetric(law: Any, **backward: Any) -> AbstractForceLaw | AbstractSetValuedLaw:
     """A law with other parameters for negative slip velocities.
 

@@ -34,6 +34,8 @@ class Regularized(AbstractForceLaw):
     def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Friction force [N] at velocity `v` [m/s]."""
         level, spread = self.law.dry(v), v / (2.0 * self.width)
-        rest = jnp.zeros_like(v)
-        excess = self.law.limit(jnp.where(v < 0, -1.0, 1.0).astype(v.dtype)) - self.law.dry(rest)
+        direction = jnp.where(v < 0, -1.0, 1.0).astype(v.dtype)
+        # At rest, but on the side that v is on: a law may have other parameters for either direction.
+        rest = direction * float(jnp.finfo(v.dtype).tiny)
+        excess = self.law.limit(direction) - self.law.dry(rest)
         return (level + excess * jnp.exp(-spread * spread)) * jnp.tanh(v / self.width) + self.law.wet(v)
