@@ -1,5 +1,6 @@
 """Identification: numbers of scenes and laws from measured records."""
 
+from ._fit import first_coordinate as first_coordinate
 from ._fit import fit as fit
 from ._fit_law import fit_law as fit_law
 from ._fit_law import law_force as law_force

@@ -1,11 +1,12 @@
 """`fit`: numbers of a scene from a measured record."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
+from ..numerics import Range
 from ..scene import Scene, State, check_scene, replace_numbers, scene_numbers, scene_ranges
 from ._fit_result import FitResult
 from ._least_squares import Progress, least_squares
@@ -28,6 +29,7 @@ def fit(
     q0: ArrayLike | list[float] | None = None,
     qd0: ArrayLike | list[float] | None = None,
     observe: Callable[[Array, Array], Array] = first_coordinate,
+    lower: Mapping[str, float] | None = None,
     substeps: int = 1,
     rtol: float = 1e-6,
     max_steps: int = 100,
@@ -47,6 +49,7 @@ def fit(
     - `q0`, `qd0`: state at the first sample, shape `[dof]`; by default, for one coordinate, the first measured value
       and rest.
     - `observe`: `observe(q, qd)`, what the record measured; by default the first coordinate.
+    - `lower`: lower limits, excluded, of numbers that declare none: `{"m": 0.0}`.
     - `substeps`: integration steps between two samples.
     - `rtol`: relative tolerance on parameters and loss at which the search ends.
     - `max_steps`: limit of iterations.
@@ -72,7 +75,8 @@ def fit(
     driven = sorted(set(free) & set(record.inputs))
     if driven:
         raise ValueError(f"{driven[0]} is driven by the record and cannot be free.")
-    ranges = scene_ranges(scene)
+    limits = {name: Range("", limit, strict=True) for name, limit in (lower or {}).items()}
+    ranges = limits | scene_ranges(scene)
     parameters = FreeParameters.of(scene_numbers(scene), ranges, free)
     start = [record.measured[0]] if q0 is None else q0
     position = jnp.asarray(start, float)

@@ -86,7 +86,9 @@ def simulate(
         raise
     if throw:
         solved = _raise_early_end(problem, solved)
-    return Trajectory(solved.t, solved.y.q, solved.y.qd, solved.y.z, solved.stats, solved.code, problem, options)
+    return Trajectory(
+        solved.t, solved.y.q, solved.y.qd, solved.y.z, solved.t_end, solved.stats, solved.code, problem, options
+    )
 
 
 def _known(*values: Any) -> bool:

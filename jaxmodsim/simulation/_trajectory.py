@@ -58,6 +58,7 @@ class Trajectory:
     - `t`: times [s], shape `[time]`; `ts`, or the end alone. Times that an early end left unreached are infinite.
     - `q`, `qd`: coordinates and velocities, shape `[time, dof]`.
     - `z`: own states of effects, by effect name; each with a leading time axis.
+    - `t_end`: time that the run reached [s]; t1 unless it ended early.
     - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
 
     A run inside `jax.vmap` is read inside it, or by `jax.vmap(lambda run: run.forces)(runs)`.
@@ -67,6 +68,7 @@ class Trajectory:
     q: Float[Array, "*time dof"]
     qd: Float[Array, "*time dof"]
     z: dict[str, PyTree]
+    t_end: Float[Array, "..."]
     stats: dict[str, Array]
     code: Int[Array, "..."]
     problem: Problem

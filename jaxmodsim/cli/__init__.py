@@ -1,0 +1,17 @@
+"""The command line: `jaxmodsim demo | testbench | fit`."""
+
+import sys
+
+
+def main() -> None:
+    """Entry point; errors of the user's are one sentence and exit code 2."""
+    try:
+        import rich
+        import typer
+    except ImportError as error:
+        sys.stderr.write(f"jaxmodsim: the command line needs {error.name}: pip install 'jaxmodsim[cli]'\n")
+        sys.exit(2)
+    del rich, typer
+    from ._app import run
+
+    run()

@@ -1,0 +1,75 @@
+"""What the commands write: all of it at the end, each file whole or not at all."""
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from matplotlib.figure import Figure
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+console = Console()
+
+
+def write(out: Path, files: Mapping[str, Figure | pd.DataFrame | dict[str, Any]]) -> list[Path]:
+    """Write figures as PNG, tables as CSV, dicts as JSON into the folder `out`; returns the paths.
+
+    Each file is written under another name first and then renamed, so none is ever half there.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for name, content in files.items():
+        path, part = out / name, out / f".{name}.part"
+        try:
+            if isinstance(content, Figure):
+                content.savefig(part, format="png", dpi=130)
+            elif isinstance(content, pd.DataFrame):
+                content.to_csv(part, index=False)
+            else:
+                part.write_text(json.dumps(_plain(content), indent=2, allow_nan=False) + "\n")
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
+        paths.append(path)
+    return paths
+
+
+def _plain(value: Any) -> Any:
+    """As JSON knows it: numbers that are not finite become null."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def show_table(frame: pd.DataFrame, title: str) -> None:
+    """Print a table."""
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in frame.columns:
+        words = not pd.api.types.is_numeric_dtype(frame[column])
+        table.add_column(str(column), justify="left" if words else "right", overflow="fold", no_wrap=words)
+    for row in frame.itertuples(index=False):
+        table.add_row(*(_cell(value) for value in row))
+    # Off a terminal (a file, a pipe) nothing limits the width.
+    console.print(table, width=None if console.is_terminal else 140)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return "-" if math.isnan(value) else f"{value:.5g}"
+    return str(value)
+
+
+def show_paths(paths: list[Path]) -> None:
+    """Print where everything is."""
+    console.print("Wrote:")
+    for path in paths:
+        console.print(f"  {path.resolve()}", soft_wrap=True, highlight=False)
