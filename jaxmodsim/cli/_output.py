@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
-console = Console()
+# Off a terminal (a file, a pipe) there is no width to keep to.
+console = Console() if sys.stdout.isatty() else Console(width=140)
 
 
 def write(out: Path, files: Mapping[str, Figure | pd.DataFrame | dict[str, Any]]) -> list[Path]:
@@ -55,11 +58,10 @@ def show_table(frame: pd.DataFrame, title: str) -> None:
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for column in frame.columns:
         words = not pd.api.types.is_numeric_dtype(frame[column])
-        table.add_column(str(column), justify="left" if words else "right", overflow="fold", no_wrap=words)
+        table.add_column(escape(str(column)), justify="left" if words else "right", overflow="fold")
     for row in frame.itertuples(index=False):
-        table.add_row(*(_cell(value) for value in row))
-    # Off a terminal (a file, a pipe) nothing limits the width.
-    console.print(table, width=None if console.is_terminal else 140)
+        table.add_row(*(escape(_cell(value)) for value in row))
+    console.print(table)
 
 
 def _cell(value: Any) -> str:
@@ -72,4 +74,4 @@ def show_paths(paths: list[Path]) -> None:
     """Print where everything is."""
     console.print("Wrote:")
     for path in paths:
-        console.print(f"  {path.resolve()}", soft_wrap=True, highlight=False)
+        console.print(f"  {path.resolve()}", soft_wrap=True, highlight=False, markup=False)

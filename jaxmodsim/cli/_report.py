@@ -63,7 +63,7 @@ def _table(measured: list[Measured]) -> pd.DataFrame:
             "model": [m.case.label for m in measured],
             "away [s]": [m.break_away for m in measured],
             "crossings": [m.crossings for m in measured],
-            "v(10 s)": [float(m.run.velocity[-1]) if m.ok else float("nan") for m in measured],
+            "v(10 s) [m/s]": [float(m.run.velocity[-1]) if m.ok else float("nan") for m in measured],
             "steps": [m.steps for m in measured],
             "run [ms]": [round(m.milliseconds, 2) for m in measured],
             "ending": [m.ending for m in measured],

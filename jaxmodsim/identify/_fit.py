@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from ..numerics import Range
+from ..numerics import Range, check_ranges, modules_of
 from ..scene import Scene, State, check_scene, replace_numbers, scene_numbers, scene_ranges
 from ._fit_result import FitResult
 from ._least_squares import Progress, least_squares
@@ -75,9 +75,17 @@ def fit(
     driven = sorted(set(free) & set(record.inputs))
     if driven:
         raise ValueError(f"{driven[0]} is driven by the record and cannot be free.")
+    for _, module in modules_of(scene):
+        check_ranges(module)
+    numbers = scene_numbers(scene)
     limits = {name: Range("", limit, strict=True) for name, limit in (lower or {}).items()}
+    for name, limit in limits.items():
+        if name not in numbers or not bool(limit.holds(numbers[name], {})):
+            raise ValueError(
+                f"lower: {name} must be {limit.text}, but it is {numbers.get(name, 'no number of the scene')}."
+            )
     ranges = limits | scene_ranges(scene)
-    parameters = FreeParameters.of(scene_numbers(scene), ranges, free)
+    parameters = FreeParameters.of(numbers, ranges, free)
     start = [record.measured[0]] if q0 is None else q0
     position = jnp.asarray(start, float)
     velocity = jnp.zeros_like(position) if qd0 is None else jnp.asarray(qd0, float)

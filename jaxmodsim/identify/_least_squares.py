@@ -59,6 +59,7 @@ def least_squares(
 
     **Raises:**
 
+    - `ValueError` if there are no more samples than free parameters.
     - `RuntimeError` if the residual is not finite at the start.
     """
     function = _with_dense_jacobian(lambda x, data: residual(free.values(x), data))
@@ -66,6 +67,8 @@ def least_squares(
     options, tags = {"jac": "fwd"}, frozenset()
     x = jnp.zeros(len(free.names))
     f_struct, aux_struct = eqx.filter_eval_shape(function, x, data)
+    if f_struct.shape[0] <= x.shape[0]:
+        raise ValueError(f"{f_struct.shape[0]} samples are too few for {x.shape[0]} free parameters.")
     state = solver.init(function, x, data, options, f_struct, aux_struct, tags)
 
     @eqx.filter_jit
@@ -78,8 +81,11 @@ def least_squares(
     try:
         for steps in range(1, max_steps + 1):
             x, state, done, rms = iterate(x, state, data)
-            if steps == 2 and not np.isfinite(float(rms)):
-                raise RuntimeError("The model gives values that are not finite at the start of the fit.")
+            if steps == 1 and not np.isfinite(np.asarray(state.f_info.residual)).all():
+                raise RuntimeError(
+                    "The model gives values that are not finite at the start of the fit: check the start values, or"
+                    " take more substeps."
+                )
             if progress is not None and np.isfinite(float(rms)):
                 progress(steps, float(rms), {name: float(v) for name, v in free.values(x).items()})
             if bool(done):

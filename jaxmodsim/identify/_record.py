@@ -1,12 +1,12 @@
 """A measured record."""
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 
-@dataclass(frozen=True)
 class Record:
     """Samples of a measurement: one measured output, and the inputs that drove the machine.
 
@@ -26,37 +26,44 @@ class Record:
 
     t: Float[np.ndarray, " samples"]
     measured: Float[np.ndarray, " samples"]
-    inputs: dict[str, Float[np.ndarray, " samples"]] = field(default_factory=dict)
-    name: str = "record"
+    inputs: dict[str, Float[np.ndarray, " samples"]]
+    name: str
 
-    def __post_init__(self) -> None:
-        """Convert and check."""
-        columns = {"t": self.t, "measured": self.measured, **self.inputs}
-        arrays = {}
-        for label, column in columns.items():
-            try:
-                array = np.asarray(column, dtype=float)
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"{self.name}: column {label!r} holds something that is no number.") from error
-            if array.ndim != 1 or array.shape != np.shape(self.t) or array.shape[0] < 2:
-                raise ValueError(
-                    f"{self.name}: columns must have one shape [samples] with two samples or more, but 't' has"
-                    f" {np.shape(self.t)} and {label!r} has {array.shape}."
-                )
-            bad = np.flatnonzero(~np.isfinite(array))
-            if bad.size:
-                raise ValueError(
-                    f"{self.name}: column {label!r} has {bad.size} values that are not finite, the first in sample"
-                    f" {bad[0]} ({array[bad[0]]}). Remove or fill them first."
-                )
-            arrays[label] = array
+    def __init__(self, t: Any, measured: Any, inputs: Mapping[str, Any] | None = None, name: str = "record"):
+        arrays = {
+            label: _column(column, label, np.shape(t), name)
+            for label, column in {"t": t, "measured": measured, **(inputs or {})}.items()
+        }
         stalls = np.flatnonzero(np.diff(arrays["t"]) <= 0)
         if stalls.size:
             k = int(stalls[0])
             raise ValueError(
-                f"{self.name}: times must increase, but sample {k + 1} at t = {arrays['t'][k + 1]} s follows sample"
+                f"{name}: times must increase, but sample {k + 1} at t = {arrays['t'][k + 1]} s follows sample"
                 f" {k} at t = {arrays['t'][k]} s."
             )
-        object.__setattr__(self, "t", arrays.pop("t"))
-        object.__setattr__(self, "measured", arrays.pop("measured"))
-        object.__setattr__(self, "inputs", arrays)
+        self.t, self.measured = arrays.pop("t"), arrays.pop("measured")
+        self.inputs, self.name = arrays, name
+
+    def __repr__(self) -> str:
+        inputs = ", ".join(self.inputs) or "none"
+        return f"Record({self.name!r}, {len(self.t)} samples, {self.t[0]:g} to {self.t[-1]:g} s, inputs: {inputs})"
+
+
+def _column(column: Any, label: str, shape: tuple[int, ...], name: str) -> Float[np.ndarray, " samples"]:
+    """One column, converted and checked."""
+    try:
+        array = np.asarray(column, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: column {label!r} holds something that is no number.") from error
+    if array.ndim != 1 or array.shape != shape or array.shape[0] < 2:
+        raise ValueError(
+            f"{name}: columns must have one shape [samples] with two samples or more, but 't' has {shape} and"
+            f" {label!r} has {array.shape}."
+        )
+    bad = np.flatnonzero(~np.isfinite(array))
+    if bad.size:
+        raise ValueError(
+            f"{name}: column {label!r} has {bad.size} values that are not finite, the first in sample {bad[0]}"
+            f" ({array[bad[0]]}). Remove or fill them first."
+        )
+    return array

@@ -62,8 +62,11 @@ def replay(
             return scene_field(t, y, driven)
 
         step = dt / substeps
-        for k in range(substeps):
-            y = rosenbrock_step(_RODAS3, field, start + k * step, step, y).y1
+
+        def substep(k: Any, y: State) -> State:
+            return rosenbrock_step(_RODAS3, field, start + k * step, step, y).y1
+
+        y = substep(0, y) if substeps == 1 else jax.lax.fori_loop(0, substeps, substep, y)
         return y, observe(y.q, y.qd)
 
     y0 = State(q0, qd0, scene.state0())

@@ -36,11 +36,12 @@ class Range:
     @property
     def text(self) -> str:
         """The range in words, such as `> 0 N/m`."""
+        unit = f" [{self.unit}]" if self.unit else ""
         if self.lower is None:
-            return f"a finite number [{self.unit}]"
+            return f"a finite number{unit}"
         relation = ">" if self.strict else ">="
         limit = self.lower if isinstance(self.lower, str) else f"{self.lower:g}"
-        return f"finite and {relation} {limit} [{self.unit}]"
+        return f"finite and {relation} {limit}{unit}"
 
     def holds(self, value: Float[Array, "..."], others: Mapping[str, Float[Array, "..."]]) -> Bool[Array, "..."]:
         """Whether `value` is in range, elementwise; `others` are the parameters of the same object by name."""
