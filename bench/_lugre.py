@@ -128,6 +128,7 @@ def diffrax_run(p: Any, rtol: Any, solver: Any, *, ts: Any = None, adjoint: Any 
 
 
 def _diffrax(name: str, solver: Any, *, stacked: bool) -> Peer:
+    """Plain diffrax; `stacked`: whether one vector is faster than scalars for one run. In batches scalars always are."""
     end = jax.jit(lambda p, rtol: diffrax_run(p, rtol, solver, stacked=stacked).ys)
     full = jax.jit(lambda p, rtol, ts: _full(diffrax_run(p, rtol, solver, ts=ts, stacked=stacked)))
 
@@ -145,7 +146,10 @@ def _diffrax(name: str, solver: Any, *, stacked: bool) -> Peer:
         ys = diffrax_run(p, rtol, solver, adjoint=adjoint, stacked=stacked).ys
         return ys[-1, 1] if stacked else ys[1][-1]
 
-    return Peer(name, once, record, _batched(velocity), velocity)
+    def scalar_velocity(p: Any, rtol: Any) -> Any:
+        return diffrax_run(p, rtol, solver).ys[1][-1]
+
+    return Peer(name, once, record, _batched(scalar_velocity), velocity)
 
 
 def _full(solution: Any) -> tuple[Any, Any, Any]:
