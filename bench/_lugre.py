@@ -128,7 +128,7 @@ def diffrax_run(p: Any, rtol: Any, solver: Any, *, ts: Any = None, adjoint: Any 
 
 
 def _diffrax(name: str, solver: Any, *, stacked: bool) -> Peer:
-    """Plain diffrax; `stacked`: whether one vector is faster than scalars for one run. In batches scalars always are."""
+    """Plain diffrax; `stacked`: whether one vector beats scalars as the state of one run. In batches scalars win."""
     end = jax.jit(lambda p, rtol: diffrax_run(p, rtol, solver, stacked=stacked).ys)
     full = jax.jit(lambda p, rtol, ts: _full(diffrax_run(p, rtol, solver, ts=ts, stacked=stacked)))
 
