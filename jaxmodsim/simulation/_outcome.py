@@ -76,7 +76,6 @@ def start_code(scene: Scene, t: Float[Array, ""], y: State, rate: State) -> Int[
     code = jnp.asarray(SUCCESS)
     finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
     code = jnp.where(finite, code, NOT_FINITE)
-    code = jnp.where(code == SUCCESS, code, code)
     code = _blame_mass(code, _pivots(scene, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
     checks = [ok for _, module in modules_of(scene) for _, ok in _checks(module)]
     for i, ok in reversed(list(enumerate(checks))):

@@ -56,10 +56,11 @@ class Work(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """What a run gives."""
+    """What a run gives: saved times and states, the outcome, the end that was reached, and the numbers of steps."""
 
     t: Float[Array, " time"]
-    y: State
+    # A `State`; in an audited run a pair of it and `Work`.
+    y: Any
     code: Int[Array, ""]
     t_end: Float[Array, ""]
     y_end: State
@@ -79,8 +80,8 @@ def _audited_flow(t: Any, y: tuple[State, Work], scene: Scene) -> tuple[State, W
     return scene_field(t, y[0], scene), Work(*scene_power(t, y[0], scene))
 
 
-def _integrate(problem: Problem, options: Options, field: Any, y0: PyTree, state_of: Any) -> tuple[Any, Array, Any]:
-    """Run diffrax on `field`; returns its solution, the outcome and the last state."""
+def _integrate(problem: Problem, options: Options, field: Any, y0: PyTree, state_of: Any) -> Solved:
+    """Run diffrax on `field`."""
     scene = problem.scene
     initial = initial_state(problem)
     check_scene(scene, initial)
@@ -97,15 +98,17 @@ def _integrate(problem: Problem, options: Options, field: Any, y0: PyTree, state
         )
     else:
         controller = FiniteSteps()
-    end = dfx.SubSaveAt(t1=True)
-    saveat = dfx.SaveAt(subs=(end, end if problem.ts is None else dfx.SubSaveAt(ts=problem.ts)))
     start = start_code(scene, problem.t0, initial, scene_field(problem.t0, initial, scene))
+    # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
+    starts = start == SUCCESS
+    ts = None if problem.ts is None else jnp.where(starts, problem.ts, problem.t0)
+    end = dfx.SubSaveAt(t1=True)
+    saveat = dfx.SaveAt(subs=(end, end if ts is None else dfx.SubSaveAt(ts=ts)))
     solution = dfx.diffeqsolve(
         dfx.ODETerm(field),
         solver,
         problem.t0,
-        # A run that cannot start does not try to.
-        jnp.where(start == SUCCESS, problem.t1, problem.t0),
+        jnp.where(starts, problem.t1, problem.t0),
         problem.dt,
         y0,
         args=scene,
@@ -120,14 +123,19 @@ def _integrate(problem: Problem, options: Options, field: Any, y0: PyTree, state
     t_end, last = solution.ts[0][0], jtu.tree_map(lambda x: x[0], solution.ys[0])
     end_state = state_of(last)
     finish = end_code(scene, t_end, end_state, scene_field(t_end, end_state, scene), solution.result)
-    return solution, jnp.where(start == SUCCESS, finish, start), (t_end, end_state)
+    code = jnp.where(starts, finish, start)
+    t, y = solution.ts[1], solution.ys[1]
+    if problem.ts is not None:
+        reached = starts | (problem.ts <= problem.t0)
+        t = jnp.where(reached, t, jnp.inf)
+        y = jtu.tree_map(lambda x: jnp.where(jnp.expand_dims(reached, tuple(range(1, x.ndim))), x, jnp.inf), y)
+    return Solved(t, y, code, t_end, end_state, solution.stats)
 
 
 @partial(jax.jit, static_argnames=("options",))
 def solve(problem: Problem, options: Options) -> Solved:
     """Run a scene."""
-    solution, code, (t_end, y_end) = _integrate(problem, options, _flow, initial_state(problem), lambda y: y)
-    return Solved(solution.ts[1], solution.ys[1], code, t_end, y_end, solution.stats)
+    return _integrate(problem, options, _flow, initial_state(problem), lambda y: y)
 
 
 @partial(jax.jit, static_argnames=("options",))
@@ -135,6 +143,4 @@ def solve_audited(problem: Problem, options: Options) -> Work:
     """Run a scene again with the integrals of power beside it; returns the work at the saved times."""
     zero = jnp.zeros_like(problem.t0)
     y0 = (initial_state(problem), Work(zero, zero))
-    solution, _, _ = _integrate(problem, options, _audited_flow, y0, lambda y: y[0])
-    assert solution.ys is not None
-    return solution.ys[1][1]
+    return _integrate(problem, options, _audited_flow, y0, lambda y: y[0]).y[1]
