@@ -2,18 +2,20 @@
 
 import os
 
+import jax
 from jax._src import xla_bridge
 
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
 
 
-def tune_cpu(while_loop_bytes: int = 100_000) -> None:
+def tune_cpu(while_loop_bytes: int = 1_000_000) -> None:
     """Compile small loops as one function each on CPU: 2 to 8 times faster runs, for the whole process.
 
     XLA runs a loop whose buffers exceed a threshold (1 kB by default, which most loops with a Jacobian or an adjoint
     do) as many small kernels with a dispatch between them. This raises the threshold, by adding to the environment
-    variable `XLA_FLAGS`. The price is compile time for large unrolled loops. Nothing in the library calls this
-    for you, except the command line.
+    variable `XLA_FLAGS`. The price is compile time for large unrolled loops. It also turns off JAX's asynchronous
+    dispatch on CPU (`jax_cpu_enable_async_dispatch`), whose hand-over to another thread costs more than a short
+    run takes. Nothing in the library calls this for you, except the command line.
 
     **Arguments:**
 
@@ -32,5 +34,6 @@ def tune_cpu(while_loop_bytes: int = 100_000) -> None:
             " and before any jnp.array is made."
         )
     flags = os.environ.get("XLA_FLAGS", "")
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
     if _OPTION not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_backend_extra_options={_OPTION}={while_loop_bytes}".strip()

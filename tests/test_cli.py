@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 
 from jaxmodsim.cli import _app, _output
 from jaxmodsim.cli._demo import START, TRUTH, sprung_scene, synthetic_record
-from jaxmodsim.cli._fit import AxisColumns, read_record, rough_axis
+from jaxmodsim.cli._fit import AxisColumns, read_record
 from jaxmodsim.cli._testbench import cases, run_case, stick_sweep
 from jaxmodsim.friction import LuGre
-from jaxmodsim.identify import fit
+from jaxmodsim.identify import fit, rough_axis
 from jaxmodsim.plot import fit_figure, ramp_figure, truth_figure
 
 DATA = Path(__file__).parents[2] / "shared" / "data"

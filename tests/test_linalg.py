@@ -23,7 +23,7 @@ def spd(n: int, seed: int = 0) -> np.ndarray:
 
 def solve_lu(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
     n = rhs.shape[0]
-    solve = factor_lu([[matrix[i, j] for j in range(n)] for i in range(n)])
+    solve = factor_lu([[matrix[i, j] for j in range(n)] for i in range(n)], pivot=True)
     return jnp.stack(solve([rhs[i] for i in range(n)]))
 
 

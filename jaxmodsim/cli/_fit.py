@@ -2,21 +2,16 @@
 
 import difflib
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from jaxtyping import Array
 
-from ..effects import AbstractEffect, AppliedForce, Friction
-from ..friction import Coulomb, LuGre, Regularized, Stribeck, Viscous, asymmetric
-from ..identify import FitResult, Record, fit
+from ..identify import AXIS_MODELS, FitResult, Record, axis_scene, fit, rough_axis
 from ..plot import fit_figure
-from ..scene import Scene, replace_numbers, scene_numbers
+from ..scene import Scene, scene_numbers
 from ._output import console, show_paths, show_table, write
 
 
@@ -28,27 +23,6 @@ class AxisColumns:
     position: str
     force: str
     force_gain: float
-
-
-def _axis_lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q
-    return 0.5 * p["m"] * qd[0] ** 2
-
-
-def _drive(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q, qd
-    return jnp.reshape(p["u"] - p["offset"], (1,))
-
-
-@dataclass(frozen=True)
-class Rough:
-    """A first idea of an axis: mass [kg], viscous [N s/m] and dry friction [N], offset [N], top speed [m/s]."""
-
-    m: float
-    Fv: float
-    Fc: float
-    offset: float
-    top: float
 
 
 def read_record(path: Path, columns: AxisColumns) -> Record:
@@ -84,104 +58,6 @@ def read_record(path: Path, columns: AxisColumns) -> Record:
     )
 
 
-def rough_axis(record: Record) -> Rough:
-    """Start values by linear regression of the force on acceleration, velocity and its sign.
-
-    Differentiated positions are noisy, so they are smoothed first; the simulation then does the real work.
-    """
-    span = max(len(record.t) // 1000, 3)
-    kernel = np.hanning(2 * span + 3)[1:-1]
-    kernel /= kernel.sum()
-    edge = 3 * span
-
-    def smooth(x: np.ndarray) -> np.ndarray:
-        return np.convolve(np.pad(x, span, mode="edge"), kernel, mode="valid")
-
-    velocity = smooth(np.gradient(smooth(record.measured), record.t))
-    acceleration = np.gradient(velocity, record.t)
-    inside = slice(edge, -edge) if len(record.t) > 4 * edge else slice(None)
-    v, a, u = (x[inside] for x in (velocity, acceleration, smooth(record.inputs["u"])))
-    top = float(np.max(np.abs(v)))
-    if top == 0.0:
-        raise ValueError(f"{record.name}: the position never changes, so nothing can be fitted.")
-    moving = np.abs(v) > 0.05 * top
-    columns = np.column_stack([a, v, np.sign(v), np.ones_like(v)])[moving]
-    m, Fv, Fc, offset = np.linalg.lstsq(columns, u[moving], rcond=None)[0]
-    scale = float(np.sqrt(np.mean(u**2))) or 1.0
-    return Rough(
-        m if m > 0 else scale / max(float(np.max(np.abs(a))), 1e-12),
-        Fv if Fv > 0 else 0.1 * scale / top,
-        Fc if Fc > 0 else 0.1 * scale,
-        float(offset),
-        top,
-    )
-
-
-def _coulomb(rough: Rough) -> tuple[AbstractEffect, ...]:
-    return (
-        Friction(Regularized(Coulomb(rough.Fc), 0.005 * rough.top), name="dry"),
-        Friction(Viscous(rough.Fv), name="viscous"),
-    )
-
-
-def _asymmetric(rough: Rough) -> tuple[AbstractEffect, ...]:
-    return (
-        Friction(Regularized(asymmetric(Coulomb(rough.Fc), Fc=rough.Fc), 0.005 * rough.top), name="dry"),
-        Friction(asymmetric(Viscous(rough.Fv), Fv=rough.Fv), name="viscous"),
-    )
-
-
-def _stribeck(rough: Rough) -> tuple[AbstractEffect, ...]:
-    law = Stribeck(Fc=rough.Fc, Fs=1.2 * rough.Fc, vs=0.05 * rough.top, Fv=rough.Fv)
-    return (Friction(Regularized(law, 0.005 * rough.top), name="friction"),)
-
-
-def _lugre(rough: Rough) -> tuple[AbstractEffect, ...]:
-    # A break-away distance of a few milliseconds at top speed, and a tenth of critical damping in stick.
-    sigma0 = rough.Fc / (2e-3 * rough.top)
-    law = LuGre(
-        sigma0=sigma0,
-        sigma1=0.2 * np.sqrt(rough.m * sigma0),
-        sigma2=rough.Fv,
-        Fc=rough.Fc,
-        Fs=1.1 * rough.Fc,
-        vs=0.05 * rough.top,
-    )
-    return (Friction(law, name="friction"),)
-
-
-@dataclass(frozen=True)
-class Model:
-    """A model of the axis: its effects from rough values, what of it is fitted, and what it is in words."""
-
-    effects: Callable[[Rough], tuple[AbstractEffect, ...]]
-    free: tuple[str, ...]
-    words: str
-
-
-MODELS = {
-    "coulomb": Model(
-        _coulomb, ("m", "offset", "dry.Fc", "viscous.Fv"), "Coulomb friction (regularised) and viscous friction"
-    ),
-    "asymmetric": Model(
-        _asymmetric,
-        ("m", "dry.forward.Fc", "dry.backward.Fc", "viscous.forward.Fv", "viscous.backward.Fv"),
-        "Coulomb (regularised) and viscous friction, each with a value for either direction; a constant offset is part"
-        " of the difference of the Coulomb forces and held at zero",
-    ),
-    "stribeck": Model(
-        _stribeck,
-        ("m", "offset", "friction.Fc", "friction.Fs", "friction.vs", "friction.Fv"),
-        "stiction, Stribeck effect and viscous friction (regularised)",
-    ),
-    "lugre": Model(
-        _lugre,
-        ("m", "offset", *(f"friction.{x}" for x in ("sigma0", "sigma1", "sigma2", "Fc", "Fs", "vs"))),
-        "LuGre",
-    ),
-}
-
-
 def _assignments(option: str, texts: list[str], known: list[str]) -> dict[str, float]:
     """Read NAME=VALUE options."""
     values: dict[str, float] = {}
@@ -199,26 +75,18 @@ def _assignments(option: str, texts: list[str], known: list[str]) -> dict[str, f
     return values
 
 
-def axis_scene(model: Model, rough: Rough, start: dict[str, float], fixed: dict[str, float]) -> Scene:
-    """Scene of the axis with start values and fixed values put in."""
-    offset = 0.0 if "offset" not in model.free else rough.offset
-    params = {"m": rough.m, "offset": offset, "u": 0.0}
-    scene = Scene(_axis_lagrangian, params=params, effects=(AppliedForce(_drive, name="drive"), *model.effects(rough)))
-    return replace_numbers(scene, {name: jnp.asarray(x, float) for name, x in (start | fixed).items()})
-
-
 def run_fit(
     path: Path, columns: AxisColumns, model_name: str, start: list[str], fix: list[str], substeps: int, out: Path
 ) -> None:
     """Fit, print, and write figure, table and JSON to `out`."""
-    if model_name not in MODELS:
-        raise ValueError(f"There is no model {model_name!r}; the models are: {', '.join(MODELS)}.")
+    if model_name not in AXIS_MODELS:
+        raise ValueError(f"There is no model {model_name!r}; the models are: {', '.join(AXIS_MODELS)}.")
     if out.exists() and not out.is_dir():
         raise ValueError(f"--out {out} is a file; a folder is needed.")
-    model = MODELS[model_name]
+    model = AXIS_MODELS[model_name]
     record = read_record(path, columns)
     rough = rough_axis(record)
-    known = [name for name in scene_numbers(axis_scene(model, rough, {}, {})) if name != "u"]
+    known = [name for name in scene_numbers(axis_scene(model, rough)) if name != "u"]
     fixed = _assignments("--fix", fix, known)
     scene = axis_scene(model, rough, _assignments("--start", start, known), fixed)
     free = tuple(name for name in model.free if name not in fixed)

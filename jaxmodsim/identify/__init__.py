@@ -1,5 +1,9 @@
 """Identification: numbers of scenes and laws from measured records."""
 
+from ._axis import AXIS_MODELS as AXIS_MODELS
+from ._axis import AxisModel as AxisModel
+from ._axis import axis_scene as axis_scene
+from ._axis import rough_axis as rough_axis
 from ._fit import first_coordinate as first_coordinate
 from ._fit import fit as fit
 from ._fit_law import fit_law as fit_law

@@ -64,7 +64,7 @@ def replay(
         step = dt / substeps
 
         def substep(k: Any, y: State) -> State:
-            return rosenbrock_step(_RODAS3, field, start + k * step, step, y).y1
+            return rosenbrock_step(_RODAS3, field, start + k * step, step, y, pivot=True).y1
 
         y = substep(0, y) if substeps == 1 else jax.lax.fori_loop(0, substeps, substep, y)
         return y, observe(y.q, y.qd)

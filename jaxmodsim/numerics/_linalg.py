@@ -89,33 +89,38 @@ def solve_positive_definite(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]
     return jnp.stack(solution)
 
 
-def factor_lu(rows: Sequence[Sequence[Scalar]]) -> LinearSolver:
-    """LU factorisation with partial pivoting, written out in scalars; returns the solver of the factored system.
+def factor_lu(rows: Sequence[Sequence[Scalar]], *, pivot: bool) -> LinearSolver:
+    """LU factorisation written out in scalars; returns the solver of the factored system.
 
-    Pivoting is a bubble of conditional row swaps, so it holds no branch and vectorises under `jax.vmap`.
+    Pivoting is a bubble of conditional row swaps, without a branch. Still it costs a factor of 2.7 under `jax.vmap`,
+    because the swapped rows enter so many sums that XLA computes them over and over. Without it the elimination is
+    stable where the symmetric part of the matrix, in some scaling of the unknowns, is positive: so for
+    `I/(gamma dt) - J` of a dissipative system, and of any system whose growing modes the step resolves.
+
     Quotients are kept as divisions: XLA never recomputes a division in several kernels, as it does sums and
     products, and that alone is worth a factor of three under `jax.vmap`.
 
     **Arguments:**
 
     - `rows`: the matrix as n rows of n scalars.
+    - `pivot`: whether to swap rows so that every pivot is the largest in its column.
 
     **Returns:**
 
     A function from a right-hand side (n scalars) to the solution (n scalars), differentiable in the matrix and the
-    right-hand side. A singular matrix gives values that are not finite.
+    right-hand side. A singular matrix, or without pivoting a zero pivot, gives values that are not finite.
     """
     # The factors stay differentiable although the rule of `_solve_lu` ignores their tangents: transposed in reverse
     # mode, a solve is plain arithmetic on the factors, and derivatives of that (Hessians) go through the elimination.
-    factors = _eliminate([list(row) for row in rows])
+    factors = _eliminate([list(row) for row in rows], pivot)
     return lambda rhs: _solve_lu([list(row) for row in rows], factors, list(rhs))
 
 
-def _eliminate(rows: list[list[Scalar]]) -> Factors:
+def _eliminate(rows: list[list[Scalar]], pivot: bool) -> Factors:
     n = len(rows)
     table, swaps = [list(row) for row in rows], []
     for k in range(n):
-        for i in range(k + 1, n):
+        for i in range(k + 1, n if pivot else 0):
             swap = jnp.abs(table[i][k]) > jnp.abs(table[k][k])
             swaps.append(swap)
             above, below = table[k], table[i]
@@ -133,7 +138,7 @@ def _substitute(factors: Factors, rhs: list[Scalar]) -> list[Scalar]:
     n = len(table)
     x = list(rhs)
     pairs = [(k, i) for k in range(n) for i in range(k + 1, n)]
-    for (k, i), swap in zip(pairs, swaps, strict=True):
+    for (k, i), swap in zip(pairs if swaps else (), swaps, strict=True):
         x[k], x[i] = jnp.where(swap, x[i], x[k]), jnp.where(swap, x[k], x[i])
     for i in range(n):
         for k in range(i):

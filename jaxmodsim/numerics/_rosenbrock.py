@@ -122,18 +122,23 @@ def _linearise(
     return f0, f_t, [[columns[j][i] for j in range(layout.n)] for i in range(layout.n)]
 
 
-def _factor(jacobian: Any, shift: Array, layout: _Layout) -> LinearSolver:
+def _factor(jacobian: Any, shift: Array, layout: _Layout, pivot: bool) -> LinearSolver:
     """Solver of `(shift I - jacobian) x = rhs`."""
     if layout.unrolled:
-        return factor_lu(
-            [[shift - entry if i == j else -entry for j, entry in enumerate(row)] for i, row in enumerate(jacobian)]
-        )
+        rows = [[shift - x if i == j else -x for j, x in enumerate(row)] for i, row in enumerate(jacobian)]
+        return factor_lu(rows, pivot=pivot)
     lu = jax.scipy.linalg.lu_factor(shift * jnp.eye(layout.n, dtype=layout.dtype) - jacobian)
     return lambda rhs: [jax.scipy.linalg.lu_solve(lu, rhs[0])]
 
 
 def rosenbrock_step(
-    tableau: RosenbrockTableau, field: Callable[[Array, State], State], t0: Array, dt: Array, y0: State
+    tableau: RosenbrockTableau,
+    field: Callable[[Array, State], State],
+    t0: Array,
+    dt: Array,
+    y0: State,
+    *,
+    pivot: bool,
 ) -> RosenbrockStep:
     """Advance `y' = field(t, y)` from `t0` by `dt`.
 
@@ -143,6 +148,8 @@ def rosenbrock_step(
     - `field`: `(t, y) -> dy/dt`, differentiable by JAX.
     - `t0`, `dt`: start and length of the step, scalars.
     - `y0`: state at `t0`, any pytree of real floating arrays.
+    - `pivot`: whether the elimination in systems of up to 12 unknowns swaps rows; see `factor_lu`. Under error
+      control it need not: a step that a bad pivot spoils is rejected, and the next has other pivots.
 
     **Returns:**
 
@@ -156,7 +163,7 @@ def rosenbrock_step(
 
     f0, f_t, jacobian = _linearise(flow, t0, parts, layout)
     inverse_dt = 1.0 / dt
-    solve = _factor(jacobian, inverse_dt / tableau.gamma, layout)
+    solve = _factor(jacobian, inverse_dt / tableau.gamma, layout, pivot)
 
     stages: list[Parts] = []
     slope = f0

@@ -1,5 +1,6 @@
 """`simulate`: a scene in, a trajectory out."""
 
+import math
 from typing import Any
 
 import diffrax as dfx
@@ -86,9 +87,8 @@ def simulate(
         raise
     if throw:
         solved = _raise_early_end(problem, solved)
-    return Trajectory(
-        solved.t, solved.y.q, solved.y.qd, solved.y.z, solved.t_end, solved.stats, solved.code, problem, options
-    )
+    y, end = solved.y, None if solved.end is None else solved.end[0]
+    return Trajectory(solved.t, y.q, y.qd, y.z, solved.stats, solved.code, end, problem, options)
 
 
 def _known(*values: Any) -> bool:
@@ -111,9 +111,10 @@ def _problem(
     given = {"q0": q0, "qd0": qd0, "t1": t1, "t0": t0, "rtol": rtol, "atol": atol}
     given |= {name: value for name, value in (("ts", ts), ("dt", dt)) if value is not None}
     for name, value in given.items():
-        _check_real(name, value)
-    typed = [x.dtype for x in (*jtu.tree_leaves(scene), q0, qd0) if hasattr(x, "dtype")]
-    dtype = jnp.result_type(*typed) if typed else jnp.result_type(float)
+        if type(value) is not float:
+            _check_real(name, value)
+    kinds = {x.dtype for x in (*jtu.tree_leaves(scene), q0, qd0) if hasattr(x, "dtype")}
+    dtype = jnp.result_type(*kinds) if kinds else jnp.result_type(float)
     if not jnp.issubdtype(dtype, jnp.floating):
         dtype = jnp.result_type(float)
     array = {name: _array(value, dtype) for name, value in given.items()}
@@ -157,7 +158,7 @@ def _own_states(scene: Scene, z0: dict[str, PyTree], dtype: Any) -> dict[str, Py
 
 def _check_real(name: str, value: Any) -> None:
     kind = getattr(value, "dtype", None)
-    if kind is None and not isinstance(value, float):
+    if kind is None:
         try:
             kind = np.asarray(value).dtype
         except ValueError:
@@ -170,7 +171,7 @@ def _check_values(array: dict[str, Any]) -> None:
     """Check the values that are known now; those that are traced are checked in the run."""
     known = {name: np.asarray(value) for name, value in array.items() if _known(value)}
     for name, value in known.items():
-        if not np.isfinite(value).all():
+        if not (math.isfinite(value) if value.ndim == 0 else np.isfinite(value).all()):
             raise ValueError(f"{name} must be finite, but it is {value}.")
     for name in ("rtol", "atol"):
         if name in known and known[name] < 0:
@@ -204,7 +205,8 @@ def _raise_early_end(problem: Problem, solved: Solved) -> Solved:
     if _known(solved.code):
         code = int(solved.code)
         if code != SUCCESS:
-            raise SimulationError(describe_failure(problem.scene, float(solved.t_end), solved.y_end, code))
+            t, y = solved.end or (solved.t[-1], jtu.tree_map(lambda x: x[-1], solved.y))
+            raise SimulationError(describe_failure(problem.scene, float(t), y, code))
         return solved
     messages = outcome_messages(problem.scene, problem.q0.shape[0])
     return eqx.branched_error_if(solved, solved.code != SUCCESS, solved.code, messages)

@@ -62,8 +62,8 @@ class Solved(NamedTuple):
     # A `State`; in an audited run a pair of it and `Work`.
     y: Any
     code: Int[Array, ""]
-    t_end: Float[Array, ""]
-    y_end: State
+    # None where the end alone is kept, and so is in `t` and `y` already: every output of compiled code costs time.
+    end: tuple[Float[Array, ""], State] | None
     stats: dict[str, Array]
 
 
@@ -129,7 +129,8 @@ def _integrate(problem: Problem, options: Options, field: Any, y0: PyTree, state
         reached = starts | (problem.ts <= problem.t0)
         t = jnp.where(reached, t, jnp.inf)
         y = jtu.tree_map(lambda x: jnp.where(jnp.expand_dims(reached, tuple(range(1, x.ndim))), x, jnp.inf), y)
-    return Solved(t, y, code, t_end, end_state, solution.stats)
+    stats = {name: solution.stats[name] for name in ("num_steps", "num_rejected_steps")}
+    return Solved(t, y, code, None if problem.ts is None else (t_end, end_state), stats)
 
 
 @partial(jax.jit, static_argnames=("options",))

@@ -58,8 +58,7 @@ class Trajectory:
     - `t`: times [s], shape `[time]`; `ts`, or the end alone. Times that an early end left unreached are infinite.
     - `q`, `qd`: coordinates and velocities, shape `[time, dof]`.
     - `z`: own states of effects, by effect name; each with a leading time axis.
-    - `t_end`: time that the run reached [s]; t1 unless it ended early.
-    - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
+    - `stats`: `num_steps`, and `num_rejected_steps` of these.
 
     A run inside `jax.vmap` is read inside it, or by `jax.vmap(lambda run: run.forces)(runs)`.
     """
@@ -68,9 +67,9 @@ class Trajectory:
     q: Float[Array, "*time dof"]
     qd: Float[Array, "*time dof"]
     z: dict[str, PyTree]
-    t_end: Float[Array, "..."]
     stats: dict[str, Array]
     code: Int[Array, "..."]
+    end: Float[Array, "..."] | None
     problem: Problem
     options: Options = field(metadata={"static": True})
 
@@ -78,6 +77,11 @@ class Trajectory:
     def scene(self) -> Scene:
         """The scene that was run."""
         return self.problem.scene
+
+    @property
+    def t_end(self) -> Float[Array, "..."]:
+        """Time that the run reached [s]; t1 unless it ended early."""
+        return self.t[..., -1] if self.end is None else self.end
 
     @property
     def result(self) -> Outcome:

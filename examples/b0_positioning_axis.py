@@ -1,0 +1,68 @@
+"""Fits to the measured record of a positioning axis (EMPS), one friction model after the other.
+
+Each fit is run again with five integration steps for every sample: what changes then would be an artefact of the
+step, not the machine. The record is A. Janot, M. Gautier, M. Brunot, "Data set and reference models of EMPS",
+Workshop on Nonlinear System Identification Benchmarks, 2019; it is read from where it lies and not part of this
+repository.
+
+Run it: `python examples/b0_positioning_axis.py [--record CSV] [--smoke] [--out DIR]`.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxmodsim as jms
+from jaxmodsim.identify import AXIS_MODELS, FitResult, axis_scene, first_coordinate, fit, replay, rough_axis
+from jaxmodsim.plot import fit_figure
+
+RECORD = Path(__file__).parents[2] / "shared" / "data" / "emps" / "train.csv"
+DRIVE_GAIN = 35.15065188248547  # newtons per volt
+SOURCE = "Record: A. Janot, M. Gautier, M. Brunot, EMPS, nonlinearbenchmark.org, 2019"
+
+
+def resimulated(result: FitResult, substeps: int) -> float:
+    """RMSE [m] of a fitted scene with more integration steps for every sample."""
+    record, zero = result.record, jnp.zeros(1)
+    inputs = {name: jnp.asarray(values) for name, values in record.inputs.items()}
+    start = zero + record.measured[0]
+    position = replay(result.model, jnp.asarray(record.t), inputs, start, zero, substeps, first_coordinate)
+    return float(jnp.sqrt(jnp.mean((position - record.measured) ** 2)))
+
+
+def main(record_file: Path, out: Path, smoke: bool = False) -> None:
+    """Fit each model, check the step, write figures and the figures of merit."""
+    if not record_file.exists():
+        print(f"skipped: there is no record at {record_file}")
+        return
+    t, q, _, u = np.loadtxt(record_file, delimiter=",", skiprows=1).T
+    record = jms.Record(t, q, {"u": DRIVE_GAIN * u}, name="EMPS")
+    rough = rough_axis(record)
+    rows = {}
+    out.mkdir(parents=True, exist_ok=True)
+    for name in ("coulomb",) if smoke else AXIS_MODELS:
+        model = AXIS_MODELS[name]
+        result = fit(axis_scene(model, rough), record, model.free, lower={"m": 0.0})
+        fine = resimulated(result, 5)
+        print(f"\n{name}: {model.words}\n{result}\nwith five steps for every sample: RMSE {1e3 * fine:.4f} mm")
+        rows[name] = {"rmse_mm": 1e3 * result.rmse, "rmse_fine_mm": 1e3 * fine, **result.to_dict()}
+        fit_figure(result, caption=SOURCE).savefig(out / f"b0_emps_{name}.png", dpi=130)
+    if not smoke:
+        text = json.dumps(rows, indent=2, default=lambda x: None if not np.isfinite(x) else float(x))
+        (out / "b0_emps.json").write_text(text + "\n")
+    print(f"wrote figures to {out}")
+
+
+if __name__ == "__main__":
+    jms.tune_cpu()
+    jax.config.update("jax_enable_x64", True)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--record", type=Path, default=RECORD)
+    parser.add_argument("--smoke", action="store_true", help="the first model alone")
+    parser.add_argument("--out", type=Path, default=Path("example-output"))
+    arguments = parser.parse_args()
+    main(arguments.record, arguments.out, arguments.smoke)

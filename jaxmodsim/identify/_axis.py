@@ -1,0 +1,157 @@
+"""Models of one axis: mass, offset and friction, with start values from the record itself."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..effects import AbstractEffect, AppliedForce, Friction
+from ..friction import Coulomb, LuGre, Regularized, Stribeck, Viscous, asymmetric
+from ..scene import Scene, replace_numbers
+from ._record import Record
+
+
+def _axis_lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del t, q
+    return 0.5 * p["m"] * qd[0] ** 2
+
+
+def _drive(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del t, q, qd
+    return jnp.reshape(p["u"] - p["offset"], (1,))
+
+
+@dataclass(frozen=True)
+class RoughAxis:
+    """A first idea of an axis: mass [kg], viscous [N s/m] and dry friction [N], offset [N], top speed [m/s]."""
+
+    m: float
+    Fv: float
+    Fc: float
+    offset: float
+    top: float
+
+
+def rough_axis(record: Record) -> RoughAxis:
+    """Start values by linear regression of the force on acceleration, velocity and its sign.
+
+    Differentiated positions are noisy, so they are smoothed first; the simulation then does the real work.
+    """
+    span = max(len(record.t) // 1000, 3)
+    kernel = np.hanning(2 * span + 3)[1:-1]
+    kernel /= kernel.sum()
+    edge = 3 * span
+
+    def smooth(x: np.ndarray) -> np.ndarray:
+        return np.convolve(np.pad(x, span, mode="edge"), kernel, mode="valid")
+
+    velocity = smooth(np.gradient(smooth(record.measured), record.t))
+    acceleration = np.gradient(velocity, record.t)
+    inside = slice(edge, -edge) if len(record.t) > 4 * edge else slice(None)
+    v, a, u = (x[inside] for x in (velocity, acceleration, smooth(record.inputs["u"])))
+    top = float(np.max(np.abs(v)))
+    if top == 0.0:
+        raise ValueError(f"{record.name}: the position never changes, so nothing can be fitted.")
+    moving = np.abs(v) > 0.05 * top
+    columns = np.column_stack([a, v, np.sign(v), np.ones_like(v)])[moving]
+    m, Fv, Fc, offset = np.linalg.lstsq(columns, u[moving], rcond=None)[0]
+    scale = float(np.sqrt(np.mean(u**2))) or 1.0
+    return RoughAxis(
+        m if m > 0 else scale / max(float(np.max(np.abs(a))), 1e-12),
+        Fv if Fv > 0 else 0.1 * scale / top,
+        Fc if Fc > 0 else 0.1 * scale,
+        float(offset),
+        top,
+    )
+
+
+def _coulomb(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
+    return (
+        Friction(Regularized(Coulomb(rough.Fc), 0.005 * rough.top), name="dry"),
+        Friction(Viscous(rough.Fv), name="viscous"),
+    )
+
+
+def _asymmetric(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
+    return (
+        Friction(Regularized(asymmetric(Coulomb(rough.Fc), Fc=rough.Fc), 0.005 * rough.top), name="dry"),
+        Friction(asymmetric(Viscous(rough.Fv), Fv=rough.Fv), name="viscous"),
+    )
+
+
+def _stribeck(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
+    law = Stribeck(Fc=rough.Fc, Fs=1.2 * rough.Fc, vs=0.05 * rough.top, Fv=rough.Fv)
+    return (Friction(Regularized(law, 0.005 * rough.top), name="friction"),)
+
+
+def _lugre(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
+    # A break-away distance of a few milliseconds at top speed, and a tenth of critical damping in stick.
+    sigma0 = rough.Fc / (2e-3 * rough.top)
+    law = LuGre(
+        sigma0=sigma0,
+        sigma1=0.2 * np.sqrt(rough.m * sigma0),
+        sigma2=rough.Fv,
+        Fc=rough.Fc,
+        Fs=1.1 * rough.Fc,
+        vs=0.05 * rough.top,
+    )
+    return (Friction(law, name="friction"),)
+
+
+@dataclass(frozen=True)
+class AxisModel:
+    """A model of the axis: its effects from rough values, what of it is fitted, and what it is in words."""
+
+    effects: Callable[[RoughAxis], tuple[AbstractEffect, ...]]
+    free: tuple[str, ...]
+    words: str
+
+
+AXIS_MODELS = {
+    "coulomb": AxisModel(
+        _coulomb, ("m", "offset", "dry.Fc", "viscous.Fv"), "Coulomb friction (regularised) and viscous friction"
+    ),
+    "asymmetric": AxisModel(
+        _asymmetric,
+        ("m", "dry.forward.Fc", "dry.backward.Fc", "viscous.forward.Fv", "viscous.backward.Fv"),
+        "Coulomb (regularised) and viscous friction, each with a value for either direction; a constant offset is part"
+        " of the difference of the Coulomb forces and held at zero",
+    ),
+    "stribeck": AxisModel(
+        _stribeck,
+        ("m", "offset", "friction.Fc", "friction.Fs", "friction.vs", "friction.Fv"),
+        "stiction, Stribeck effect and viscous friction (regularised)",
+    ),
+    "lugre": AxisModel(
+        _lugre,
+        ("m", "offset", *(f"friction.{x}" for x in ("sigma0", "sigma1", "sigma2", "Fc", "Fs", "vs"))),
+        "LuGre",
+    ),
+}
+
+
+def axis_scene(
+    model: AxisModel,
+    rough: RoughAxis,
+    start: Mapping[str, float] | None = None,
+    fixed: Mapping[str, float] | None = None,
+) -> Scene:
+    """Scene of an axis, `m q'' = u - offset - friction`, ready to be fitted.
+
+    **Arguments:**
+
+    - `model`: one of `AXIS_MODELS`.
+    - `rough`: values to start from, as `rough_axis` finds them.
+    - `start`, `fixed`: other values by the names of `jaxmodsim.scene.scene_numbers`.
+
+    **Returns:**
+
+    A `Scene` whose `params` are `m` [kg], `offset` [N] and the input `u` [N].
+    """
+    offset = rough.offset if "offset" in model.free else 0.0
+    params = {"m": rough.m, "offset": offset, "u": 0.0}
+    scene = Scene(_axis_lagrangian, params=params, effects=(AppliedForce(_drive, name="drive"), *model.effects(rough)))
+    given = {**(start or {}), **(fixed or {})}
+    return replace_numbers(scene, {name: jnp.asarray(x, float) for name, x in given.items()})
