@@ -86,7 +86,9 @@ def start_code(scene: Scene, t: Float[Array, ""], y: State, rate: State) -> Int[
 def end_code(scene: Scene, t: Float[Array, ""], y: State, rate: State, result: dfx.RESULTS) -> Int[Array, ""]:
     """What ended the run, from diffrax's result and the last state."""
     early = ~dfx.is_okay(result)
-    code = jnp.where(early, jnp.where(result == dfx.RESULTS.max_steps_reached, MAX_STEPS, STEP_TOO_SMALL), SUCCESS)
+    code = jnp.where(result == dfx.RESULTS.dt_min_reached, STEP_TOO_SMALL, NOT_FINITE)
+    code = jnp.where(result == dfx.RESULTS.max_steps_reached, MAX_STEPS, code)
+    code = jnp.where(early, code, SUCCESS)
     finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
     code = jnp.where(early & ~finite, NOT_FINITE, code)
     eps = float(jnp.finfo(y.q.dtype).eps)

@@ -1,6 +1,6 @@
 """Step size control that stops at the first value that is not finite."""
 
-from typing import Any
+from typing import Any, cast
 
 import diffrax as dfx
 import jax.numpy as jnp
@@ -40,5 +40,7 @@ class FiniteSteps(dfx.AbstractStepSizeController):
             t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
         )
         finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y1_candidate)]).all()
-        result = dfx.RESULTS.where(finite, dfx.RESULTS.successful, dfx.RESULTS.dt_min_reached)
+        # diffrax has no code for a value that is not finite; this is the nearest that step control does not use.
+        failure = cast(dfx.RESULTS, dfx.RESULTS.nonlinear_divergence)
+        result = dfx.RESULTS.where(finite, dfx.RESULTS.successful, failure)
         return finite, jnp.where(finite, next_t0, t0), next_t1, jump, state, result
