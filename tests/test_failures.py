@@ -1,0 +1,117 @@
+"""Runs that end early: a code inside compiled code, a sentence outside, and what was computed is kept."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmodsim as jms
+from jaxmodsim import problems
+
+BOX = problems.ramped_box(problems.box_lugre())
+TS = jnp.linspace(0.0, 10.0, 11)
+
+
+def run_box(scene: jms.Scene = BOX, **arguments: Any) -> jms.Trajectory:
+    return jms.simulate(scene, [0.0], [0.0], 10.0, ts=TS, **arguments)
+
+
+def test_step_limit() -> None:
+    with pytest.raises(jms.SimulationError, match=r"step limit was reached before t1: pass a larger max_steps.*t = \d"):
+        run_box(max_steps=30)
+    run, whole = run_box(max_steps=30, throw=False), run_box()
+    assert not run.result.ok
+    assert "step limit" in str(run.result)
+    assert int(run.stats["num_steps"]) == 30
+    # What was reached is that of the whole run, and what was not says so.
+    reached = np.isfinite(np.asarray(run.t))
+    assert 0 < reached.sum() < TS.shape[0]
+    assert (np.diff(reached.astype(int)) <= 0).all()
+    np.testing.assert_allclose(run.q[reached], whole.q[reached], rtol=1e-10)
+    assert np.isinf(np.asarray(run.q)[~reached]).all()
+
+
+def test_parameter_out_of_range_is_found_where_it_was_not_built() -> None:
+    """`tree_at` and traced code go around the constructor's check; the run does not."""
+    bad = eqx.tree_at(lambda s: s.effects[1].law.Fc, BOX, jnp.array(-1.0))
+    sentence = r"LuGre: Fc must be finite and > 0 \[N\] \(at scene.effects\[1\].law\)"
+    with pytest.raises(jms.SimulationError, match=sentence):
+        run_box(bad)
+    run = run_box(bad, throw=False)
+    assert "Fc must be" in str(run.result)
+    np.testing.assert_array_equal(run.t, [0.0, *[np.inf] * 10])
+    np.testing.assert_array_equal(run.q[0], [0.0])
+
+
+def test_parameter_out_of_range_inside_jit() -> None:
+    def distance(Fc: Any) -> Any:
+        scene = problems.ramped_box(problems.box_lugre(Fc=Fc))
+        return jms.simulate(scene, [0.0], [0.0], 10.0).q[-1, 0]
+
+    compiled = eqx.filter_jit(distance)
+    assert float(compiled(jnp.array(1.5))) > 40
+    with pytest.raises(eqx.EquinoxRuntimeError, match=r"LuGre: Fs must be finite and >= Fc \[N\]"):
+        compiled(jnp.array(1.8))
+
+
+def root(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    """A force that stops being real once q has passed one."""
+    del t
+    return 0.5 * p["m"] * qd[0] ** 2 + p["c"] * jnp.sqrt(1.0 - q[0]) ** 3
+
+
+EARLY = jnp.array([0.2, 0.4, 2.9])
+ROOT = jms.Scene(root, params={"m": 1.0, "c": -0.1})
+
+
+@pytest.mark.parametrize("dt", [None, 0.01])
+def test_field_that_stops_being_finite(dt: float | None) -> None:
+    """At the last state before; with adaptive steps the run halves its way up to the edge."""
+    run = jms.simulate(ROOT, [0.0], [1.0], 3.0, ts=EARLY, dt=dt, throw=False)
+    assert np.isfinite(np.asarray(run.q)[:2]).all()
+    assert np.isinf(np.asarray(run.t)[2])
+    wanted = "not finite" if dt else "step size fell below|not finite"
+    with pytest.raises(jms.SimulationError, match=wanted) as info:
+        jms.simulate(ROOT, [0.0], [1.0], 3.0, ts=EARLY, dt=dt)
+    assert "throw=False returns what was computed" in str(info.value)
+
+
+def test_field_that_is_not_finite_from_the_start() -> None:
+    with pytest.raises(jms.SimulationError, match=r"not finite.*stopped at t = 0 with q = \[2.\]"):
+        jms.simulate(ROOT, [2.0], [1.0], 3.0, ts=EARLY)
+
+
+def test_pendulum_at_the_pole_names_its_coordinate() -> None:
+    with pytest.raises(jms.SimulationError, match=r"singular or indefinite at coordinate q\[1\]") as info:
+        jms.simulate(problems.spherical_pendulum(), [0.0, 0.0], [0.1, 0.0], 1.0)
+    assert "coordinates involved: q[1]" in str(info.value)
+
+
+def quadratic(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    del t, q
+    return 0.5 * jnp.sum(qd * (p @ qd))
+
+
+@pytest.mark.parametrize(
+    ("mass", "coordinate", "involved"),
+    [
+        ([[0.0, 0.0], [0.0, 1.0]], 0, "q[0]"),
+        ([[1.0, 0.0], [0.0, -2.0]], 1, "q[1]"),
+        ([[1.0, 1.0], [1.0, 1.0]], 1, "q[0], q[1]"),
+        ([[1.0, 2.0], [2.0, 1.0]], 1, "q[0], q[1]"),
+    ],
+)
+def test_mass_matrix_without_inverse_names_its_coordinates(mass: Any, coordinate: int, involved: str) -> None:
+    scene = jms.Scene(quadratic, params=jnp.array(mass))
+    with pytest.raises(jms.SimulationError) as info:
+        jms.simulate(scene, [0.0, 0.0], [1.0, 1.0], 1.0)
+    assert f"singular or indefinite at coordinate q[{coordinate}]" in str(info.value)
+    assert f"coordinates involved: {involved}." in str(info.value)
+
+
+def test_outcomes_can_be_read_under_jit() -> None:
+    codes = jax.jit(lambda s: run_box(s, throw=False).code)(BOX)
+    assert int(codes) == 0

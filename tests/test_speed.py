@@ -1,0 +1,43 @@
+"""The one switch for speed."""
+
+import subprocess
+import sys
+
+import jax.numpy as jnp
+import pytest
+
+from jaxmodsim import tune_cpu
+
+
+def test_too_late() -> None:
+    jnp.zeros(1).block_until_ready()
+    with pytest.raises(RuntimeError, match="comes too late: JAX has already started its backend"):
+        tune_cpu()
+
+
+@pytest.mark.parametrize("threshold", [0, -5, True, 1e5])
+def test_wrong_thresholds_are_refused(threshold: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # as users have it
+    with pytest.raises(ValueError, match=f"must be a positive integer, but {threshold!r} was given"):
+        tune_cpu(threshold)  # pyright: ignore[reportArgumentType]
+
+
+SCRIPT = """
+import os
+os.environ["XLA_FLAGS"] = "--xla_cpu_enable_fast_math=false"
+import jaxmodsim
+jaxmodsim.tune_cpu(50_000)
+first = os.environ["XLA_FLAGS"]
+jaxmodsim.tune_cpu()
+assert os.environ["XLA_FLAGS"] == first, "set twice"
+assert first.startswith("--xla_cpu_enable_fast_math=false ")
+assert first.endswith("xla_cpu_small_while_loop_byte_threshold=50000")
+import jax.numpy as jnp
+assert float(jnp.ones(3).sum()) == 3.0, "XLA does not take the flag"
+"""
+
+
+def test_in_time() -> None:
+    """In a process of its own, as the option holds for the whole process; importing the package computes nothing."""
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
