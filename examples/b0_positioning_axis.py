@@ -9,7 +9,6 @@ Run it: `python examples/b0_positioning_axis.py [--record CSV] [--smoke] [--out 
 """
 
 import argparse
-import json
 from pathlib import Path
 
 import jax
@@ -35,25 +34,20 @@ def resimulated(result: FitResult, substeps: int) -> float:
 
 
 def main(record_file: Path, out: Path, smoke: bool = False) -> None:
-    """Fit each model, check the step, write figures and the figures of merit."""
+    """Fit each model, check the step, write figures."""
     if not record_file.exists():
         print(f"skipped: there is no record at {record_file}")
         return
     t, q, _, u = np.loadtxt(record_file, delimiter=",", skiprows=1).T
     record = jms.Record(t, q, {"u": DRIVE_GAIN * u}, name="EMPS")
     rough = rough_axis(record)
-    rows = {}
     out.mkdir(parents=True, exist_ok=True)
     for name in ("coulomb",) if smoke else AXIS_MODELS:
         model = AXIS_MODELS[name]
         result = fit(axis_scene(model, rough), record, model.free, lower={"m": 0.0})
         fine = resimulated(result, 5)
         print(f"\n{name}: {model.words}\n{result}\nwith five steps for every sample: RMSE {1e3 * fine:.4f} mm")
-        rows[name] = {"rmse_mm": 1e3 * result.rmse, "rmse_fine_mm": 1e3 * fine, **result.to_dict()}
         fit_figure(result, caption=SOURCE).savefig(out / f"b0_emps_{name}.png", dpi=130)
-    if not smoke:
-        text = json.dumps(rows, indent=2, default=lambda x: None if not np.isfinite(x) else float(x))
-        (out / "b0_emps.json").write_text(text + "\n")
     print(f"wrote figures to {out}")
 
 

@@ -1,0 +1,67 @@
+"""The figures of the test bench of friction models, as `jaxmodsim testbench` prints them, for the README."""
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+
+import jax
+from _measure import describe_machine, machine_line, write_json
+
+import jaxmodsim as jms
+from jaxmodsim.cli._report import report_testbench
+
+HERE = Path(__file__).parent
+MODEL_COLUMNS = {
+    "model": "model",
+    "part": "part",
+    "away [s]": "break-away [s]",
+    "crossings": "zero crossings",
+    "steps": "steps",
+    "run [ms]": "run [ms]",
+    "ending": "ending",
+}
+STICK_COLUMNS = ("sigma0 [N/m]", "sigma1 [N s/m]", "oscillation [mN]", "creep until 1.5 s [mm]", "steps")
+
+
+def main() -> None:
+    """Run the test bench, and write `friction_models.json`."""
+    parser = argparse.ArgumentParser(description="The test bench of friction models.")
+    parser.add_argument("--smoke", action="store_true", help="into a temporary folder; the bench itself is small")
+    parser.add_argument("--out", type=Path, default=None, help="folder of the result; default bench/results")
+    options = parser.parse_args()
+    out = options.out or (Path(tempfile.mkdtemp()) if options.smoke else HERE / "results")
+    jms.tune_cpu()
+    jax.config.update("jax_enable_x64", True)
+    with tempfile.TemporaryDirectory() as folder:
+        report_testbench(Path(folder))
+        report = json.loads((Path(folder) / "testbench.json").read_text())
+    machine = describe_machine("jax", "jaxlib", "diffrax", "jaxmodsim")
+    tables = [
+        {
+            "columns": list(MODEL_COLUMNS.values()),
+            "rows": [[_cell(row[key]) for key in MODEL_COLUMNS] for row in report["models"]],
+            "caption": "A box of 2 kg under a force rising by 1 N/s (where not said otherwise), 10 s. Break-away:"
+            " friction falls behind the applied force by 0.05 N for good.",
+        },
+        {
+            "columns": list(STICK_COLUMNS),
+            "rows": [[_cell(row[key]) for key in STICK_COLUMNS] for row in report["stick"]],
+            "caption": "LuGre in stick: amplitude of the friction force about the applied force at the bristle's own"
+            f" frequency, and its price in creep and steps (rtol 1e-8). {machine_line(machine)}",
+        },
+    ]
+    write_json(
+        out / "friction_models.json",
+        {"name": "friction_models", "smoke": options.smoke, "machine": machine, "tables": tables, **report},
+    )
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+if __name__ == "__main__":
+    main()
