@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from matplotlib.figure import Figure
 from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+
+from ..plot import Figure
 
 # Off a terminal (a file, a pipe) there is no width to keep to.
 console = Console() if sys.stdout.isatty() else Console(width=140)
