@@ -21,9 +21,9 @@ def spd(n: int, seed: int = 0) -> np.ndarray:
     return factor @ factor.T + n * np.eye(n)
 
 
-def solve_lu(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
+def solve_lu(matrix: jax.Array, rhs: jax.Array, pivot: bool = True) -> jax.Array:
     n = rhs.shape[0]
-    solve = factor_lu([[matrix[i, j] for j in range(n)] for i in range(n)], pivot=True)
+    solve = factor_lu([[matrix[i, j] for j in range(n)] for i in range(n)], pivot=pivot)
     return jnp.stack(solve([rhs[i] for i in range(n)]))
 
 
@@ -105,6 +105,24 @@ def test_lu_solution(name: str) -> None:
 def test_lu_of_a_singular_matrix_is_not_finite() -> None:
     ours = np.asarray(solve_lu(jnp.array([[1.0, 2.0], [2.0, 4.0]]), jnp.array([1.0, 1.0])))
     assert not np.isfinite(ours).all()
+
+
+@pytest.mark.parametrize("n", [1, 2, 7])
+def test_lu_without_row_swaps(n: int) -> None:
+    """Where the symmetric part is positive definite, no swap is needed, however large the rest."""
+    rng = np.random.default_rng(6)
+    turning = rng.standard_normal((n, n))
+    matrix = spd(n, 7) / n + 30.0 * (turning - turning.T)
+    rhs = rng.standard_normal(n)
+    ours = solve_lu(jnp.asarray(matrix), jnp.asarray(rhs), pivot=False)
+    # The growth of the elimination is at most the ratio of both parts, about 100, times the condition.
+    np.testing.assert_allclose(ours, np.linalg.solve(matrix, rhs), rtol=100 * 1e-15 * np.linalg.cond(matrix))
+
+
+def test_lu_without_row_swaps_says_where_it_cannot() -> None:
+    matrix = jnp.asarray(lu_cases()["swap"])
+    assert not np.isfinite(solve_lu(matrix, jnp.ones(2), pivot=False)).all()
+    assert np.isfinite(solve_lu(matrix, jnp.ones(2))).all()
 
 
 def test_lu_in_a_batch_of_different_pivots() -> None:
