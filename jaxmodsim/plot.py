@@ -100,7 +100,8 @@ def stick_figure(
     for i in range(len(sigma0)):
         for j in range(len(sigma1)):
             value = 1e3 * oscillation[i, j]
-            right.text(j + 0.5, i + 0.5, f"{value:.2g}", ha="center", va="center", color="white", fontsize=9)
+            shade = "black" if oscillation[i, j] > 0.3 * oscillation.max() else "white"
+            right.text(j + 0.5, i + 0.5, f"{value:.2g}", ha="center", va="center", color=shade, fontsize=9)
     right.set_xticks(np.arange(len(sigma1)) + 0.5, [f"{x:g}" for x in sigma1])
     right.set_yticks(np.arange(len(sigma0)) + 0.5, [f"{x:g}" for x in sigma0])
     right.set(xlabel="sigma1 [N s/m]", ylabel="sigma0 [N/m]", title="Amplitude of the oscillation in stick [mN]")
