@@ -200,11 +200,17 @@ def test_energy_balance_of_a_lagrangian_that_depends_on_time() -> None:
 
 def test_default_solver() -> None:
     smooth = problems.ramped_box(jms.Viscous(0.1))
-    assert isinstance(default_solver(smooth), dfx.Tsit5)
-    assert isinstance(default_solver(problems.ramped_box()), dfx.Tsit5)
-    assert isinstance(default_solver(problems.ramped_box(jms.Sign(jms.Coulomb(1.0)))), dfx.Tsit5)
-    assert isinstance(default_solver(problems.ramped_box(problems.box_lugre())), jms.Rodas5P)
-    assert isinstance(default_solver(problems.ramped_box(jms.Regularized(jms.Coulomb(1.0), 0.1))), jms.Rodas5P)
+    assert isinstance(default_solver(smooth, fixed_step=False), dfx.Tsit5)
+    assert isinstance(default_solver(problems.ramped_box(), fixed_step=False), dfx.Tsit5)
+    assert isinstance(default_solver(problems.ramped_box(jms.Sign(jms.Coulomb(1.0))), fixed_step=False), dfx.Tsit5)
+    assert isinstance(default_solver(problems.ramped_box(problems.box_lugre()), fixed_step=False), jms.Rodas5P)
+    assert isinstance(
+        default_solver(problems.ramped_box(jms.Regularized(jms.Coulomb(1.0), 0.1)), fixed_step=False), jms.Rodas5P
+    )
+    # Nothing rejects a spoilt step where steps are fixed, so there the elimination swaps rows.
+    fixed = default_solver(problems.ramped_box(problems.box_lugre()), fixed_step=True)
+    assert isinstance(fixed, jms.Rodas5P)
+    assert fixed.pivot
 
 
 def ramp_to(**arguments: Any) -> jms.Trajectory:

@@ -25,7 +25,7 @@ def simulate(
     t1: ArrayLike,
     *,
     t0: ArrayLike = 0.0,
-    ts: ArrayLike | None = None,
+    ts: ArrayLike | list[float] | None = None,
     z0: dict[str, PyTree] | None = None,
     rtol: ArrayLike = 1e-6,
     atol: ArrayLike = 1e-9,

@@ -67,9 +67,9 @@ class Solved(NamedTuple):
     stats: dict[str, Array]
 
 
-def default_solver(scene: Scene) -> dfx.AbstractSolver:
+def default_solver(scene: Scene, fixed_step: bool) -> dfx.AbstractSolver:
     """Rodas5P where an effect of the scene is stiff, Tsit5 otherwise."""
-    return Rodas5P() if any(effect.stiff for effect in scene.effects) else dfx.Tsit5()
+    return Rodas5P(pivot=fixed_step) if any(effect.stiff for effect in scene.effects) else dfx.Tsit5()
 
 
 def _flow(t: Any, y: State, scene: Scene) -> State:
@@ -85,7 +85,11 @@ def _integrate(problem: Problem, options: Options, field: Any, y0: PyTree, state
     scene = problem.scene
     initial = initial_state(problem)
     check_scene(scene, initial)
-    solver = default_solver(scene) if options.solver is None else eqx.combine(options.solver, problem.plugins[0])
+    solver = (
+        default_solver(scene, problem.dt is not None)
+        if options.solver is None
+        else eqx.combine(options.solver, problem.plugins[0])
+    )
     adjoint = (
         dfx.RecursiveCheckpointAdjoint()
         if options.adjoint is None

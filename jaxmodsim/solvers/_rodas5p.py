@@ -3,6 +3,7 @@
 from typing import Any, ClassVar
 
 import diffrax as dfx
+import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -154,7 +155,10 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
     floating arrays, in float32 and float64. Up to 12 state entries the linear algebra is written out in
     scalars, so that a whole step becomes one fused computation; above, LAPACK is called. Dense output has order 4.
 
-    **Arguments:** none.
+    **Arguments:**
+
+    - `pivot`: whether the eliminations up to 12 state entries swap rows. Under error control they need not: a step
+      that a bad pivot spoils is rejected. With fixed steps nothing would notice, so `simulate(..., dt=...)` sets it.
 
     **Raises:**
 
@@ -166,12 +170,13 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
         @article{steinebach2023rodas5p,
             author={Steinebach, Gerd},
             title={Construction of {R}osenbrock--{W}anner method {R}odas5{P} and numerical benchmarks within the
-                   {J}ulia {D}ifferential {E}quations package},
+                   {J}ulia {D}ifferential {E}equations package},
             journal={BIT Numerical Mathematics}, volume={63}, number={27}, year={2023},
         }
         ```
     """
 
+    pivot: bool = eqx.field(default=False, static=True)
     term_structure: ClassVar = dfx.ODETerm
     interpolation_cls: ClassVar = _RodasInterpolation
 
@@ -204,5 +209,5 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
     ) -> tuple[PyTree, PyTree, dict[str, PyTree], None, dfx.RESULTS]:
         """One step; see `jaxmodsim.numerics.rosenbrock_step`."""
         del solver_state, made_jump
-        step = rosenbrock_step(_RODAS5P, lambda t, y: terms.vf(t, y, args), t0, t1 - t0, y0, pivot=False)
+        step = rosenbrock_step(_RODAS5P, lambda t, y: terms.vf(t, y, args), t0, t1 - t0, y0, pivot=self.pivot)
         return step.y1, step.error, {"y0": y0, "y1": step.y1, "k": step.dense}, None, dfx.RESULTS.successful
