@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..mechanics import motion_equations
-from ..numerics import cholesky_pivots, modules_of, range_checks, ranges_of
+from ..numerics import check_ranges, cholesky_pivots, modules_of, range_checks, ranges_of
 from ..scene import Scene, State
 
 SUCCESS, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, FIRST_MASS = range(5)
@@ -121,6 +121,11 @@ def describe_failure(scene: Scene, t: float, y: State, code: int) -> str:
             involved = [f"q[{i}]" for i in range(dof) if abs(vectors[i, 0]) > 0.05]
             text += f", smallest eigenvalue {values[0]:.3g}, coordinates involved: {', '.join(involved)}"
         text += "."
+    for path, module in modules_of(scene):
+        try:
+            check_ranges(module)
+        except ValueError as error:
+            text = f"{error} (at scene{path})"
     state = (
         f"q = {np.array2string(np.asarray(y.q), precision=6)}, qd = {np.array2string(np.asarray(y.qd), precision=6)}"
     )
