@@ -37,7 +37,7 @@ def test_step_limit() -> None:
 def test_parameter_out_of_range_is_found_where_it_was_not_built() -> None:
     """`tree_at` and traced code go around the constructor's check; the run does not."""
     bad = eqx.tree_at(lambda s: s.effects[1].law.Fc, BOX, jnp.array(-1.0))
-    sentence = r"LuGre: Fc must be finite and > 0 \[N\] \(at scene.effects\[1\].law\)"
+    sentence = r"LuGre: Fc must be finite and > 0 \[N\], but -1.0 was given. \(at scene.effects\[1\].law\)"
     with pytest.raises(jms.SimulationError, match=sentence):
         run_box(bad)
     run = run_box(bad, throw=False)

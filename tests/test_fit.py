@@ -242,6 +242,47 @@ def test_too_few_samples_are_refused(clean):
         jms.fit(sprung(), jms.Record(t[:3], q[:3], {"u": u[:3]}), tuple(TRUTH))
 
 
+def test_lower_limits_tighten_declared_ranges(clean):
+    result = jms.fit(sprung(Fc=2.5), noisy(clean, 0), ("friction.Fc",), q0=[0.0], lower={"friction.Fc": 2.0})
+    assert result.values["friction.Fc"] >= 2.0
+
+
+def test_a_step_too_long_for_the_friction_is_remarked(clean):
+    t, u, q = clean
+    coarse = jms.Record(t[::10], q[::10], {"u": u[::10]})
+    start = replace_numbers(sprung(), {"friction.width": jnp.asarray(1e-3)})
+    result = jms.fit(start, coarse, ("friction.Fc",), q0=[0.0])
+    assert result.step_error is not None
+    assert result.step_error > 0.1 * result.rmse
+    assert any("Raise substeps" in remark for remark in result.remarks)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"qd0": [0.0, 0.0]}, "of one shape"),
+        ({"q0": [float("nan")]}, "must be finite"),
+        ({"observe": lambda q, qd: q + 0 * qd}, r"observe\(q, qd\) returned the shape \(1,\)"),
+        ({"substeps": 1.5}, "substeps must be at least 1, an integer"),
+        ({"max_steps": 0}, "max_steps must be at least 1"),
+    ],
+)
+def test_wrong_options_are_refused(clean, options, text):
+    # Run-time type checks of the tests may come before our own; both name the argument.
+    with pytest.raises((ValueError, TypeError), match=text if "1.5" not in str(options) else "substeps"):
+        jms.fit(sprung(), noisy(clean, 0), ("m",), **options)
+
+
+def test_fit_law_leaves_alone_what_starts_on_its_limit_and_how_the_law_is_run():
+    t = np.arange(0.0, 4.0, 5e-3)
+    x = 1e-3 * np.sin(2 * np.pi * t)
+    force = np.asarray(law_force(jms.LuGre(1e4, 0.0, 0.0, 1.0, 1.0, 0.1), jnp.asarray(t), jnp.asarray(x)))
+    result = jms.fit_law(jms.LuGre(5e3, 0.0, 0.0, 0.8, 0.8, 0.1), jms.Record(t, force, {"x": x}), max_steps=20)
+    assert set(result.values) == {"sigma0", "Fc", "vs"}
+    regular = jms.Regularized(jms.Coulomb(0.8), 1e-3)
+    assert set(jms.fit_law(regular, jms.Record(t, force, {"x": x}), max_steps=5).values) == {"Fc"}
+
+
 def test_ctrl_c_keeps_the_best_so_far(clean):
     def impatient(step, rms, values):
         del rms, values

@@ -24,9 +24,10 @@ def run() -> None:
     except (ValueError, OSError, RuntimeError) as error:
         sys.stderr.write(f"jaxmodsim: {error}\n")
         sys.exit(2)
-    except KeyboardInterrupt:
-        sys.stderr.write("jaxmodsim: interrupted\n")
-        sys.exit(130)
+    except SystemExit as ending:
+        if ending.code == 130:  # what typer makes of Ctrl-C
+            sys.stderr.write("jaxmodsim: interrupted; nothing was written\n")
+        raise
 
 
 def _start() -> None:

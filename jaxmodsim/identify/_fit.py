@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
@@ -70,8 +71,9 @@ def fit(
         raise ValueError(
             f"The record's inputs ({', '.join(record.inputs)}) must be entries of the scene's params ({have})."
         )
-    if substeps < 1:
-        raise ValueError(f"substeps must be at least 1, but {substeps} was given.")
+    for label, count in (("substeps", substeps), ("max_steps", max_steps)):
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            raise ValueError(f"{label} must be at least 1, an integer, but {count!r} was given.")
     driven = sorted(set(free) & set(record.inputs))
     if driven:
         raise ValueError(f"{driven[0]} is driven by the record and cannot be free.")
@@ -84,12 +86,23 @@ def fit(
             raise ValueError(
                 f"lower: {name} must be {limit.text}, but it is {numbers.get(name, 'no number of the scene')}."
             )
-    ranges = limits | scene_ranges(scene)
+    ranges = scene_ranges(scene)
+    for name, limit in limits.items():
+        declared = ranges.get(name, limit)
+        if isinstance(declared.lower, str):
+            raise ValueError(f"lower: {name} is limited by {declared.lower} already.")
+        tighter = declared.lower is None or float(limit.lower or 0.0) >= declared.lower
+        ranges[name] = Range(declared.unit, limit.lower, strict=True) if tighter else declared
     parameters = FreeParameters.of(numbers, ranges, free)
     start = [record.measured[0]] if q0 is None else q0
     position = jnp.asarray(start, float)
     velocity = jnp.zeros_like(position) if qd0 is None else jnp.asarray(qd0, float)
+    if position.ndim != 1 or position.shape != velocity.shape or not jnp.isfinite(position + velocity).all():
+        raise ValueError(f"q0 and qd0 must be finite and of one shape [dof], but q0 = {start} and qd0 = {qd0}.")
     check_scene(scene, State(position, velocity, scene.state0()))
+    shape = getattr(jax.eval_shape(observe, position, velocity), "shape", None)
+    if shape != ():
+        raise ValueError(f"observe(q, qd) returned the shape {shape}, but one number, shape (), is needed.")
 
     def residual(values: dict[str, Array], data: Any) -> Array:
         t, inputs, measured = data
@@ -103,4 +116,8 @@ def fit(
     )
     estimate = least_squares(residual, parameters, data, rtol=rtol, max_steps=max_steps, progress=progress)
     units = {name: allowed.unit for name, allowed in ranges.items()}
-    return FitResult.of(estimate, replace_numbers(scene, estimate.found), record, units)
+    model = replace_numbers(scene, estimate.found)
+    t, inputs, measured = data
+    fine = replay(model, t, inputs, position, velocity, 4 * substeps, observe) - measured
+    step_error = float(jnp.sqrt(jnp.mean((fine - estimate.residual) ** 2)))
+    return FitResult.of(estimate, model, record, units, step_error)

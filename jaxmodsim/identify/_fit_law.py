@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from ..effects import Friction
 from ..friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw
+from ..numerics import Range
 from ..scene import Scene, replace_numbers, scene_numbers, scene_ranges
 from ._fit_result import FitResult
 from ._least_squares import Progress, least_squares
@@ -36,7 +37,8 @@ def fit_law(
     - `record`: `measured` is the friction force [N], positive when it opposes positive slip; `inputs` holds the slip
       displacement `x` [m] and, if the law's forces are per newton of load, the normal load `normal` [N]. The law
       starts at rest and unloaded.
-    - `free`: names of the law's parameters to fit; by default all of them.
+    - `free`: names of the law's parameters to fit; by default all but those that start on their limit (`sigma1 = 0`)
+      and the `width` of a wrapper, which is how the law is run and not what it is.
     - `rtol`, `max_steps`, `progress`: see `fit`.
 
     **Returns:**
@@ -63,7 +65,7 @@ def fit_law(
     for name, allowed in scene_ranges(holder).items():
         lower = allowed.lower.removeprefix(prefix) if isinstance(allowed.lower, str) else allowed.lower
         ranges[name.removeprefix(prefix)] = type(allowed)(allowed.unit, lower, allowed.strict)
-    parameters = FreeParameters.of(numbers, ranges, tuple(numbers) if free is None else free)
+    parameters = FreeParameters.of(numbers, ranges, _off_limits(numbers, ranges) if free is None else free)
 
     def with_values(values: dict[str, Array]) -> AbstractLaw:
         friction = replace_numbers(holder, {prefix + name: value for name, value in values.items()}).effects[0]
@@ -85,6 +87,17 @@ def fit_law(
         name: allowed.unit + (per_load if allowed.unit.startswith("N") else "") for name, allowed in ranges.items()
     }
     return FitResult.of(estimate, with_values(estimate.found), record, units)
+
+
+def _off_limits(numbers: dict[str, Array], ranges: dict[str, Range]) -> tuple[str, ...]:
+    """Names of the parameters that can be free where they start."""
+    free = []
+    for name, value in numbers.items():
+        lower = ranges[name].lower if name in ranges else None
+        limit = numbers[lower] if isinstance(lower, str) else lower
+        if name != "width" and (limit is None or bool(value > limit)):
+            free.append(name)
+    return tuple(free)
 
 
 def law_force(

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -24,6 +25,9 @@ class FitResult:
     - `simulated`: the model's output at the record's times, shape `[samples]`.
     - `rmse`: root mean square of `simulated - record.measured`, in the record's unit.
     - `iterations`, `ending`: how the search went and ended.
+    - `step_error`: root mean square by which `simulated` moves with four times as many integration steps; None where
+      there are none.
+    - `single_precision`: whether it was computed in float32.
     """
 
     values: dict[str, float]
@@ -37,13 +41,23 @@ class FitResult:
     rmse: float
     iterations: int
     ending: str
+    step_error: float | None
+    single_precision: bool
 
     @staticmethod
-    def of(estimate: Estimate, model: eqx.Module, record: Record, units: dict[str, str]) -> "FitResult":
+    def of(
+        estimate: Estimate,
+        model: eqx.Module,
+        record: Record,
+        units: dict[str, str],
+        step_error: float | None = None,
+    ) -> "FitResult":
         """From an estimate whose residual is simulated minus measured."""
         errors = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
         safe = np.where((errors > 0) & np.isfinite(errors), errors, 1.0)
-        correlation = np.where(np.isfinite(estimate.covariance), estimate.covariance / np.outer(safe, safe), 1.0)
+        known = np.isfinite(estimate.covariance) & np.isfinite(np.add.outer(errors, errors))
+        correlation = np.where(known, np.where(known, estimate.covariance, 0.0) / np.outer(safe, safe), 0.0)
+        np.fill_diagonal(correlation, 1.0)
         return FitResult(
             dict(zip(estimate.names, estimate.values.tolist(), strict=True)),
             dict(zip(estimate.names, errors.tolist(), strict=True)),
@@ -56,6 +70,8 @@ class FitResult:
             float(np.sqrt(np.mean(estimate.residual**2))),
             estimate.iterations,
             estimate.ending,
+            step_error,
+            jnp.result_type(float) == jnp.float32,
         )
 
     @property
@@ -78,7 +94,14 @@ class FitResult:
                         f"{names[j]} and {first} are hardly told apart (correlation {self.correlation[i, j]:+.3f})."
                     )
         if self.ending != "converged":
-            remarks.append(f"The search {self.ending}.")
+            remarks.append(f"The search {self.ending}: do not trust the standard errors.")
+        if self.step_error is not None and self.step_error > 0.1 * self.rmse:
+            remarks.append(
+                f"The integration step shows: with four times as many the output moves by {self.step_error:.2g} (root"
+                f" mean square) against an RMSE of {self.rmse:.2g}. Raise substeps."
+            )
+        if self.single_precision:
+            remarks.append("Computed in single precision: enable jax_enable_x64 for numbers that you mean to use.")
         return tuple(remarks)
 
     def rows(self) -> list[tuple[str, float, float, float, str]]:
@@ -100,6 +123,7 @@ class FitResult:
             "correlation": {"names": list(self.values), "matrix": self.correlation.tolist()},
             "iterations": self.iterations,
             "ending": self.ending,
+            "step_error": self.step_error,
             "remarks": list(self.remarks),
         }
 

@@ -150,7 +150,7 @@ def _covariance(jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
     silent = scale == 0
     scale = np.where(silent, 1.0, scale)
     eigenvalues, vectors = np.linalg.eigh((jacobian / scale).T @ (jacobian / scale))
-    bread = vectors / np.maximum(eigenvalues, 1e-15 * eigenvalues[-1]) @ vectors.T
+    bread = vectors / np.maximum(eigenvalues, 1e-15 * max(eigenvalues[-1], 1.0)) @ vectors.T
     scores = scores / scale
     meat = scores.T @ scores * (blocks / max(blocks - p, 1))
     covariance = bread @ meat @ bread / np.outer(scale, scale)

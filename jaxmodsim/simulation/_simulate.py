@@ -153,6 +153,8 @@ def _own_states(scene: Scene, z0: dict[str, PyTree], dtype: Any) -> dict[str, Py
             )
         if jtu.tree_structure(state) != jtu.tree_structure(states[name]):
             raise ValueError(f"z0[{name!r}] must have the structure of {states[name]}, but {state} was given.")
+        if [jnp.shape(x) for x in jtu.tree_leaves(state)] != [jnp.shape(x) for x in jtu.tree_leaves(states[name])]:
+            raise ValueError(f"z0[{name!r}] must have the shapes of {states[name]}, but {state} was given.")
     return {name: jtu.tree_map(lambda x: _array(x, dtype), state) for name, state in z0.items()}
 
 

@@ -139,7 +139,9 @@ class _RodasInterpolation(dfx.AbstractLocalInterpolation):
         del left
         if t1 is not None:
             return jtu.tree_map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
-        s = (t0 - self.t0) / (self.t1 - self.t0)
+        # A step of length zero is one of a finished lane under vmap; see `rosenbrock_step`.
+        length = self.t1 - self.t0
+        s = (t0 - self.t0) / jnp.where(length == 0, 1.0, length)
 
         def at(y0: Array, y1: Array, k1: Array, k2: Array, k3: Array) -> Array:
             r = s.astype(y0.dtype)
