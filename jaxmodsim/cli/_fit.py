@@ -94,9 +94,11 @@ def run_fit(
     show_fit(result, f"{record.name}: {model.words}", "m")
     console.print(f"{len(record.t)} samples, {seconds:.1f} s with compilation")
     frame = pd.DataFrame({"t [s]": record.t, "measured [m]": record.measured, "simulated [m]": result.simulated})
+    fitted = result.model
+    assert isinstance(fitted, Scene)
     held = {
         name: float(x)
-        for name, x in scene_numbers(scene).items()
+        for name, x in scene_numbers(fitted).items()
         if name not in free and name != "u" and not name.endswith("belt_velocity")
     }
     report = {"model": model_name, "words": model.words, **result.to_dict(), "held": held, "seconds": seconds}
