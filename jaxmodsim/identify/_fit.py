@@ -109,11 +109,7 @@ def fit(
         model = replace_numbers(scene, values)
         return replay(model, t, inputs, position, velocity, substeps, observe) - measured
 
-    data = (
-        jnp.asarray(record.t),
-        {name: jnp.asarray(x) for name, x in record.inputs.items()},
-        jnp.asarray(record.measured),
-    )
+    data = record.arrays
     estimate = least_squares(residual, parameters, data, rtol=rtol, max_steps=max_steps, progress=progress)
     units = {name: allowed.unit for name, allowed in ranges.items()}
     model = replace_numbers(scene, estimate.found)

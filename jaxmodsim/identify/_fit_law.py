@@ -76,11 +76,7 @@ def fit_law(
         t, inputs, measured = data
         return law_force(with_values(values), t, inputs["x"], inputs.get("normal")) - measured
 
-    data = (
-        jnp.asarray(record.t),
-        {name: jnp.asarray(x) for name, x in record.inputs.items()},
-        jnp.asarray(record.measured),
-    )
+    data = record.arrays
     estimate = least_squares(residual, parameters, data, rtol=rtol, max_steps=max_steps, progress=progress)
     per_load = " per N" if "normal" in record.inputs else ""
     units = {

@@ -3,8 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 
 class Record:
@@ -43,6 +44,12 @@ class Record:
             )
         self.t, self.measured = arrays.pop("t"), arrays.pop("measured")
         self.inputs, self.name = arrays, name
+
+    @property
+    def arrays(self) -> tuple[Array, dict[str, Array], Array]:
+        """`(t, inputs, measured)` as JAX arrays, for compiled code."""
+        inputs = {name: jnp.asarray(values) for name, values in self.inputs.items()}
+        return jnp.asarray(self.t), inputs, jnp.asarray(self.measured)
 
     def __repr__(self) -> str:
         inputs = ", ".join(self.inputs) or "none"

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..mechanics import motion_equations
-from ..numerics import check_ranges, cholesky_pivots, modules_of, range_checks, ranges_of
+from ..numerics import check_ranges, cholesky_pivots, modules_of, range_checks
 from ..scene import Scene, State
 
 SUCCESS, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, FIRST_MASS = range(5)
@@ -62,12 +62,10 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
         + (" once the motion of the coordinates before it is taken out." if i else ".")
         for i in range(dof)
     )
-    ranges = tuple(f"{text} (at scene{path})." for path, module in modules_of(scene) for text, _ in _checks(module))
+    ranges = tuple(
+        f"{text} (at scene{path})." for path, module in modules_of(scene) for text, _ in range_checks(module)
+    )
     return _GENERAL + mass + ranges
-
-
-def _checks(module: eqx.Module) -> list[tuple[str, Array]]:
-    return range_checks(module) if ranges_of(module) else []
 
 
 def start_code(scene: Scene, t: Float[Array, ""], y: State, rate: State) -> Int[Array, ""]:
@@ -77,7 +75,7 @@ def start_code(scene: Scene, t: Float[Array, ""], y: State, rate: State) -> Int[
     finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
     code = jnp.where(finite, code, NOT_FINITE)
     code = _blame_mass(code, _pivots(scene, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
-    checks = [ok for _, module in modules_of(scene) for _, ok in _checks(module)]
+    checks = [ok for _, module in modules_of(scene) for _, ok in range_checks(module)]
     for i, ok in reversed(list(enumerate(checks))):
         code = jnp.where(ok, code, FIRST_MASS + dof + i)
     return code
