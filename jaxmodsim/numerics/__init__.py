@@ -17,3 +17,6 @@ from ._numbers import ranges_of as ranges_of
 from ._rosenbrock import RosenbrockTableau as RosenbrockTableau
 from ._rosenbrock import rosenbrock_step as rosenbrock_step
 from ._safe import safe_power as safe_power
+from ._watch import Watch as Watch
+from ._watch import first_root as first_root
+from ._watch import watch as watch

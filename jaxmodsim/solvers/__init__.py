@@ -1,4 +1,10 @@
 """Plug-ins for diffrax."""
 
 from ._controllers import FiniteSteps as FiniteSteps
+from ._event_controller import EventController as EventController
+from ._event_solver import EventSolver as EventSolver
+from ._event_state import ACCUMULATION as ACCUMULATION
+from ._event_state import TOO_MANY as TOO_MANY
+from ._event_state import EventLog as EventLog
+from ._event_state import EventState as EventState
 from ._rodas5p import Rodas5P as Rodas5P

@@ -1,0 +1,126 @@
+"""A step size controller that ends steps on events."""
+
+from typing import Any, NamedTuple, cast
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float, PyTree
+
+from ._event_state import ACCUMULATION, TOO_MANY, EventState
+
+# How often a step may shrink only because its guards are not resolved.
+_MAX_DOUBTS = 12
+# A step whose successor may be this much longer was not limited by its error.
+_UNLIMITED = 5.0
+
+# An event this close ahead, in steps, is where the next step shall end.
+_CLOSE = 0.1
+# A step whose successor is at least this much of it was wrong by little.
+_MILD = 0.3
+
+_constant = jax.lax.stop_gradient
+
+
+class _ControllerState(NamedTuple):
+    """What the controller keeps.
+
+    - `inner`: state of the wrapped controller.
+    - `usual`: step that the error last allowed where it was the error that limited it.
+    - `doubts`: how many attempts since the last accepted step were rejected because the guards were not resolved.
+    """
+
+    inner: Any
+    usual: Float[Array, ""]
+    doubts: Float[Array, ""]
+
+
+class EventController(dfx.AbstractAdaptiveStepSizeController):
+    """TODO."""
+
+    controller: dfx.AbstractStepSizeController
+
+    @property
+    def rtol(self) -> Any:
+        """Relative tolerance of the wrapped controller."""
+        return cast(Any, self.controller).rtol
+
+    @property
+    def atol(self) -> Any:
+        """Absolute tolerance of the wrapped controller."""
+        return cast(Any, self.controller).atol
+
+    @property
+    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Norm of the wrapped controller."""
+        return cast(Any, self.controller).norm
+
+    def __check_init__(self) -> None:
+        """Tolerances are the wrapped controller's own matter."""
+
+    def wrap(self, direction: Any) -> "EventController":
+        """Wrap the controller inside."""
+        return EventController(self.controller.wrap(direction))
+
+    def init(
+        self, terms: PyTree, t0: Any, t1: Any, y0: EventState, dt0: Any, args: PyTree, func: Any, error_order: Any
+    ) -> tuple[Any, _ControllerState]:
+        """First step of the wrapped controller, on the part of the state that is integrated."""
+
+        def inner_func(terms: PyTree, t: Any, y: PyTree, args: PyTree) -> PyTree:
+            return func(terms, t, y0._replace(y=y), args)
+
+        first, inner = self.controller.init(terms, t0, t1, y0.y, dt0, args, inner_func, error_order)
+        zero = jnp.zeros_like(t0)
+        adaptive = isinstance(self.controller, dfx.AbstractAdaptiveStepSizeController)
+        usual = (_UNLIMITED if adaptive else 1.0) * (first - t0)
+        return _constant(first), _ControllerState(inner, _constant(usual), zero)
+
+    def adapt_step_size(
+        self,
+        t0: Any,
+        t1: Any,
+        y0: EventState,
+        y1_candidate: EventState,
+        args: PyTree,
+        y_error: PyTree,
+        error_order: Any,
+        controller_state: _ControllerState,
+    ) -> tuple[Any, Any, Any, Any, _ControllerState, dfx.RESULTS]:
+        """As the wrapped controller, but reject a step that passes an event or does not resolve the guards."""
+        old, seen = controller_state, y1_candidate
+        keep, inner_t0, inner_t1, jump, inner, result = self.controller.adapt_step_size(
+            t0, t1, y0.y, seen.y, args, y_error, error_order, old.inner
+        )
+        length = _constant(t1 - t0)
+        aim, room, landed = _constant(seen.aim), _constant(seen.room), _constant(seen.landed) > 0.5
+        proposed = inner_t1 - inner_t0
+        passed = keep & (aim < 1.0) & ~landed
+        doubtful = keep & ~passed & (room < 0.9) & (old.doubts < _MAX_DOUBTS) & ~landed
+        accept = keep & ~passed & ~doubtful
+        landed = landed & accept
+
+        shortest = 4.0 * float(jnp.finfo(length.dtype).eps) * jnp.maximum(jnp.abs(t0), length)
+        unlimited = proposed > _UNLIMITED * length
+        usual = jnp.where(accept & ~unlimited, proposed, old.usual)
+        step = jnp.minimum(proposed, jnp.clip(0.9 * room, 0.2, 10.0) * length)
+        # A step that failed by little still knows where the event is.
+        near = proposed > _MILD * length
+        step = jnp.where(keep, step, jnp.where(near, jnp.minimum(proposed, aim * length), proposed))
+        # Just in front of an event, go straight to it.
+        step = jnp.where(accept & (aim - 1.0 < _CLOSE), jnp.minimum(step, (aim - 1.0) * length), step)
+        step = jnp.where(landed, usual, step)
+        step = jnp.where(passed, jnp.maximum(aim * length, shortest), step)
+        next_t0 = jnp.where(accept, t1, t0)
+        state = _ControllerState(
+            jtu.tree_map(lambda a, b: jnp.where(accept | ~keep, a, b), inner, old.inner),
+            _constant(usual),
+            _constant(jnp.where(accept, 0.0, old.doubts + doubtful)),
+        )
+        trouble = jnp.where(landed, seen.trouble, 0.0)
+        ended = cast(dfx.RESULTS, dfx.RESULTS.where(landed, dfx.RESULTS.successful, result))
+        ended = dfx.RESULTS.where(trouble == ACCUMULATION, dfx.RESULTS.dt_min_reached, ended)
+        ended = dfx.RESULTS.where(trouble == TOO_MANY, dfx.RESULTS.max_steps_reached, ended)
+        return accept, next_t0, _constant(next_t0 + step), landed | jump, state, ended

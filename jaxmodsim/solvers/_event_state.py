@@ -1,0 +1,67 @@
+"""The state that diffrax integrates where events happen."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float, PyTree
+
+# Why events ended a run: they accumulate (Zeno, chatter), or there were more than allowed.
+NO_TROUBLE, ACCUMULATION, TOO_MANY = 0.0, 1.0, 2.0
+
+
+class EventLog(NamedTuple):
+    """Events in the order of time; entries that were not needed hold an infinite time and zeros.
+
+    - `t`: times [s], shape `[max_events]`.
+    - `fired`: 1 for each guard that fired, shape `[max_events, guards]`.
+    - `before`, `after`: the pair (y, mode) at the event before and after the reset, with a leading axis `max_events`.
+    """
+
+    t: Float[Array, "*s events"]
+    fired: Float[Array, "*s events guards"]
+    before: tuple[PyTree, PyTree]
+    after: tuple[PyTree, PyTree]
+
+
+class EventState(NamedTuple):
+    """State of a run with events; made by `EventSolver.start`.
+
+    - `y`: what the vector field integrates.
+    - `mode`: what is constant between events.
+    - `t`: time of the last event, or of the start.
+    - `count`: number of events so far.
+    - `trouble`: 0; 1 where events accumulate; 2 where there were more than allowed.
+    - `fired`: 1 for each guard that fired in the last event, shape `[guards]`.
+    - `log`: an `EventLog`, or None.
+
+    The rest is how `EventSolver` tells `EventController` what it saw: `guard` and `armed` at this state, `spread` the
+    longest of the last intervals between events, `pace` the longest of the last steps, `landed` whether the step ended on an event, `aim` where the next event
+    is or seems to be, in steps from the start of this one, `room` by which factor the step may
+    change before the guards are not resolved.
+    """
+
+    y: PyTree
+    mode: PyTree
+    t: Float[Array, "..."]
+    count: Float[Array, "..."]
+    trouble: Float[Array, "..."]
+    fired: Float[Array, "*s guards"]
+    log: EventLog | None
+    guard: Float[Array, "*s guards"]
+    armed: Float[Array, "*s guards"]
+    spread: Float[Array, "..."]
+    pace: Float[Array, "..."]
+    landed: Float[Array, "..."]
+    aim: Float[Array, "..."]
+    room: Float[Array, "..."]
+
+    def rate(self, dy: PyTree) -> "EventState":
+        """What a vector field returns: `dy` for `y`, and zero for everything else, which is constant in a step."""
+        return jtu.tree_map(jnp.zeros_like, self)._replace(y=dy)
+
+
+def write(log: Any, index: Array, entry: Any) -> Any:
+    """Array `log` with `entry` at `index`; without effect where the index lies outside."""
+    here = jnp.arange(log.shape[0]) == index
+    return jnp.where(jnp.reshape(here, (-1, *(1,) * (log.ndim - 1))), entry[None], log)
