@@ -21,4 +21,6 @@ from .scene import Scene as Scene
 from .simulation import SimulationError as SimulationError
 from .simulation import Trajectory as Trajectory
 from .simulation import simulate as simulate
+from .solvers import EventController as EventController
+from .solvers import EventSolver as EventSolver
 from .solvers import Rodas5P as Rodas5P

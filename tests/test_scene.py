@@ -127,13 +127,9 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: Scene(free, effects=(AppliedForce(push, name="x"), Friction(Viscous(1.0), name="x"))),
         "Two effects have the name 'x'",
     ),
-    "bare Coulomb": (
-        lambda: Friction(Coulomb(1.0)),
-        r"Coulomb is set-valued.*Regularized\(Coulomb.*DeadZone\(Coulomb.*Sign\(Coulomb",
-    ),
-    "bare Stribeck": (
-        lambda: Friction(Stribeck(1.0, 2.0, 0.1)),
-        r"Stribeck is set-valued.*Regularized.*DeadZone.*Sign",
+    "exact beside dead zone": (
+        lambda: Scene(free, effects=(Friction(Coulomb(1.0)), Friction(DeadZone(Coulomb(1.0), 0.1)))),
+        r"friction: set-valued laws of one scene run either all by events or all by DeadZone",
     ),
     "unknown law": (
         lambda: Friction(cast_any("lugre")),

@@ -19,13 +19,7 @@ from ..numerics import Number, as_function, as_number
 from ._effect import AbstractEffect, Action, Power, result_shape
 
 
-def _executable_law(law: Any) -> AbstractLaw:
-    if isinstance(law, AbstractSetValuedLaw):
-        kind = type(law).__name__
-        raise ValueError(
-            f"{kind} is set-valued at zero velocity, and exact events for such laws are not there yet. Say how it"
-            f" is to run: Regularized({kind}(...), width), DeadZone({kind}(...), width) or Sign({kind}(...))."
-        )
+def _law(law: Any) -> AbstractLaw:
     if not isinstance(law, AbstractLaw):
         given = repr(law) if isinstance(law, str) else f"a {type(law).__name__}"
         raise ValueError(
@@ -59,8 +53,9 @@ class Friction(AbstractEffect):
 
     **Arguments:**
 
-    - `law`: how friction depends on slip: `LuGre`, `Viscous`, or `Regularized`, `DeadZone` or `Sign` of a
-      set-valued law.
+    - `law`: how friction depends on slip. A set-valued law (`Coulomb`, `Stribeck`) runs exactly, by events: in stick
+      the slip velocity is zero and the force is what that takes, up to the law's limit. `Regularized`, `DeadZone` and
+      `Sign` run it in other ways.
     - `along`: `along(q)`, the displacement [m or rad], a scalar. By default the one coordinate.
     - `belt_velocity`: velocity [m/s or rad/s] of the surface, a number or a function of t.
     - `normal_force`: load [N], a number or `normal_force(t, q, qd, params)`. Then the law's forces are per newton of
@@ -70,11 +65,11 @@ class Friction(AbstractEffect):
 
     **Raises:**
 
-    - `ValueError` for a law that is none or cannot run by itself, and (at the run) for wrong shapes or for
-      `along` missing where there are several coordinates.
+    - `ValueError` for a law that is none, and (at the run) for wrong shapes or for `along` missing where there are
+      several coordinates.
     """
 
-    law: AbstractLaw = eqx.field(converter=_executable_law)
+    law: AbstractLaw = eqx.field(converter=_law)
     along: Callable[..., Any] | None = eqx.field(default=None, converter=_along)
     belt_velocity: Number | Callable[..., Any] = eqx.field(default=0.0, converter=_belt)
     normal_force: Number | Callable[..., Any] | None = eqx.field(default=None, converter=_load)
@@ -94,6 +89,11 @@ class Friction(AbstractEffect):
     def holding(self) -> bool:
         """Whether the law needs to know the other forces (`DeadZone`)."""
         return isinstance(self.law, AbstractHoldingLaw)
+
+    @property
+    def exact(self) -> bool:
+        """Whether the law runs by events: its force depends on a mode, and in stick on the other forces."""
+        return isinstance(self.law, AbstractSetValuedLaw)
 
     def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
         """Check that there is one displacement, one belt velocity and one load."""
@@ -149,6 +149,31 @@ class Friction(AbstractEffect):
         """Generalised force of the friction force `force`."""
         return jnp.reshape(-force, (1,)) if self.along is None else -force * self.direction(q)
 
+    def limit(self, direction: float, load: Float[Array, ""] | None) -> Float[Array, ""]:
+        """Largest force [N] of a set-valued law in stick against a load towards `direction` (+1 or -1)."""
+        assert isinstance(self.law, AbstractSetValuedLaw)
+        limit = self.law.limit(jnp.asarray(direction, jnp.result_type(self.law.limit(jnp.asarray(1.0)))))
+        return limit if load is None else load * limit
+
+    def slip_force(
+        self, v: Float[Array, ""], direction: Float[Array, ""], load: Float[Array, ""] | None
+    ) -> Float[Array, ""]:
+        """Force [N] of a set-valued law in slip at velocity `v` towards `direction` (+1 or -1).
+
+        A trial step may run past the end of the slip. There the law goes on as a straight line, so that the field is
+        smooth in the step.
+        """
+        assert isinstance(self.law, AbstractSetValuedLaw)
+        law, speed = self.law, direction * v
+        # On the side of the slip even at zero: a law may have other parameters for either direction.
+        rest = direction * float(jnp.finfo(v.dtype).tiny)
+        _, slope = jax.jvp(law.dry, (rest,), (direction,))
+        slope = jnp.where(jnp.isfinite(slope), slope, 0.0)
+        level = law.dry(direction * jnp.where(speed >= 0, speed, 0.0) + rest)
+        level = level + slope * jnp.where(speed >= 0, 0.0, speed)
+        force = direction * level + law.wet(v)
+        return force if load is None else load * force
+
     def act(
         self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
     ) -> Action:
@@ -159,7 +184,7 @@ class Friction(AbstractEffect):
         elif isinstance(self.law, AbstractForceLaw | AbstractHoldingLaw):
             force = self.law.force(v)
         else:
-            raise TypeError(f"{type(self.law).__name__} is of no known kind of law.")
+            raise TypeError(f"{type(self.law).__name__} acts by a mode, or is of no known kind of law.")
         load = self.load(t, q, qd, params)
         force = force if load is None else load * force
         return Action(self.push(q, force), force, rate)

@@ -71,6 +71,11 @@ def fit(
         raise ValueError(
             f"The record's inputs ({', '.join(record.inputs)}) must be entries of the scene's params ({have})."
         )
+    if scene.exact_names:
+        raise ValueError(
+            f"fit integrates with fixed steps and has no events yet, but {', '.join(scene.exact_names)} would need them:"
+            " wrap the law, as in Regularized(law, width)."
+        )
     for label, count in (("substeps", substeps), ("max_steps", max_steps)):
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise ValueError(f"{label} must be at least 1, an integer, but {count!r} was given.")

@@ -2,9 +2,14 @@
 
 from ._field import State as State
 from ._field import check_scene as check_scene
+from ._field import scene_drifts as scene_drifts
 from ._field import scene_field as scene_field
 from ._field import scene_forces as scene_forces
+from ._field import scene_guards as scene_guards
+from ._field import scene_modes as scene_modes
 from ._field import scene_power as scene_power
+from ._field import scene_stick as scene_stick
+from ._field import scene_switch as scene_switch
 from ._names import replace_numbers as replace_numbers
 from ._names import scene_numbers as scene_numbers
 from ._names import scene_ranges as scene_ranges

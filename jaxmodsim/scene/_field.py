@@ -1,50 +1,74 @@
 """The vector field of a scene, with only the terms the scene holds."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ..effects import Action, Friction, Power
 from ..friction import AbstractHoldingLaw
 from ..mechanics import MotionEquations, motion_equations
 from ..numerics import solve_positive_definite
+from ._contact import Contact, contact, contact_forces, contact_guards, next_modes, stop_slip
 from ._scene import Scene
+
+# Modes of the set-valued friction elements; None where the scene has none.
+Modes: TypeAlias = Any
 
 # Sweeps of projected Gauss-Seidel over holding elements that are coupled through the mechanism.
 _HOLDING_SWEEPS = 50
 
 
 class State(NamedTuple):
-    """State of a scene: coordinates and velocities, shape `[dof]`, and the effects' own states by name."""
+    """State of a scene: coordinates and velocities, shape `[dof]`, and the effects' own states by name.
+
+    The modes of set-valued friction elements come beside it, an array of -1, 0, +1 in the order of
+    `Scene.exact_names`, or None where there are none.
+    """
 
     q: Float[Array, " dof"]
     qd: Float[Array, " dof"]
     z: dict[str, PyTree]
 
 
-def _resolve(
-    scene: Scene, t: Float[Array, ""], y: State
-) -> tuple[MotionEquations, dict[str, Action], Float[Array, " dof"]]:
-    """Equations of motion, every effect's action, and the right-hand side with all forces in it."""
+class _Resolved(NamedTuple):
+    """Equations of motion, every effect's action, accelerations, and the friction elements with a mode, if any."""
+
+    equations: MotionEquations
+    actions: dict[str, Action]
+    qdd: Float[Array, " dof"]
+    found: Contact | None
+
+
+def _resolve(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -> _Resolved:
+    """Solve for the accelerations, and for the forces that depend on them."""
     equations = motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params)
     actions, rhs = {}, equations.load
+    exact, holding = {}, {}
     for name, effect in zip(scene.names, scene.effects, strict=True):
+        if isinstance(effect, Friction) and effect.exact:
+            exact[name] = effect
+            continue
         action = effect.act(t, y.q, y.qd, y.z.get(name), scene.params)
         actions[name] = action
         rhs = rhs + action.generalised
-    holding = {
-        name: effect
-        for name, effect in zip(scene.names, scene.effects, strict=True)
-        if isinstance(effect, Friction) and effect.holding
-    }
+        if isinstance(effect, Friction) and effect.holding:
+            holding[name] = effect
     if holding:
         held = _hold(scene, holding, actions, equations, rhs, t, y)
         for name, action in held.items():
             rhs = rhs + action.generalised - actions[name].generalised
             actions[name] = action
-    return equations, actions, rhs
+    qdd = solve_positive_definite(equations.mass, rhs)
+    if not exact:
+        return _Resolved(equations, actions, qdd, None)
+    assert mode is not None
+    found = contact(list(exact.values()), t, y.q, y.qd, scene.params, equations.mass, qdd)
+    forces = contact_forces(found, mode)
+    for i, (name, effect) in enumerate(exact.items()):
+        actions[name] = Action(effect.push(y.q, forces[i]), forces[i])
+    return _Resolved(equations, actions, qdd - jnp.sum(found.reach * forces[:, None], axis=0), found)
 
 
 def _hold(
@@ -106,24 +130,69 @@ def _slip_acceleration(effect: Friction, t: Float[Array, ""], y: State, qdd: Flo
     return jax.jvp(effect.slip, (t, y.q, y.qd), (jnp.ones_like(t), y.qd, qdd))[1]
 
 
-def scene_field(t: Float[Array, ""], y: State, scene: Scene) -> State:
-    """Right-hand side of `y' = field(t, y)`, in the form diffrax's `ODETerm` takes."""
-    equations, actions, rhs = _resolve(scene, t, y)
-    qdd = solve_positive_definite(equations.mass, rhs)
-    return State(y.qd, qdd, {name: actions[name].rate for name in y.z})
+def scene_field(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> State:
+    """Right-hand side of `y' = field(t, y)`."""
+    resolved = _resolve(scene, t, y, mode)
+    return State(y.qd, resolved.qdd, {name: resolved.actions[name].rate for name in y.z})
 
 
-def scene_forces(t: Float[Array, ""], y: State, scene: Scene) -> dict[str, Array]:
+def scene_guards(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Float[Array, " guards"]:
+    """Guards that are positive while the modes hold; see `contact_guards`."""
+    return contact_guards(_contact(t, y, scene, mode), mode)
+
+
+def scene_switch(
+    t: Float[Array, ""], y: State, scene: Scene, mode: Modes, fired: Bool[Array, " guards"]
+) -> tuple[State, Float[Array, " n"]]:
+    """State and modes after the guards that `fired`."""
+    found = _contact(t, y, scene, mode)
+    n = mode.shape[0]
+    upper, lower, slip = fired[:n], fired[n : 2 * n], fired[2 * n :]
+    released = jnp.where(upper, 1.0, jnp.where(lower, -1.0, jnp.zeros_like(mode)))
+    new = next_modes(found, mode, (mode == 0) | slip, released)
+    return y._replace(qd=stop_slip(found, y.qd, new == 0)), new
+
+
+def scene_modes(t: Float[Array, ""], y: State, scene: Scene) -> tuple[State, Float[Array, " n"]]:
+    """State and modes to begin with: elements without slip velocity, but for rounding, stick if they can."""
+    none = jnp.zeros(len(scene.exact_names), y.q.dtype)
+    found = _contact(t, y, scene, none)
+    elements = [effect for effect in scene.effects if isinstance(effect, Friction) and effect.exact]
+    speed = jnp.stack([jnp.sum(jnp.abs(e.direction(y.q) * y.qd)) + jnp.abs(e.belt(t)) for e in elements])
+    still = jnp.abs(found.v) <= 8.0 * float(jnp.finfo(y.q.dtype).eps) * jax.lax.stop_gradient(speed)
+    mode = next_modes(found, jnp.sign(found.v), still, none)
+    return y._replace(qd=stop_slip(found, y.qd, mode == 0)), mode
+
+
+def scene_stick(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> State:
+    """State with the slip velocity of sticking elements, which drifts with the error of integration, set to zero."""
+    return y._replace(qd=stop_slip(_contact(t, y, scene, mode), y.qd, mode == 0))
+
+
+def scene_drifts(scene: Scene) -> bool:
+    """Whether stick drifts with the error of integration: not where it holds one coordinate at a constant speed."""
+    elements = [effect for effect in scene.effects if isinstance(effect, Friction) and effect.exact]
+    return any(element.along is not None or callable(element.belt_velocity) for element in elements)
+
+
+def _contact(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Contact:
+    found = _resolve(scene, t, y, mode).found
+    assert found is not None
+    return found
+
+
+def scene_forces(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> dict[str, Array]:
     """Force of each effect in its own terms, by name."""
-    return {name: action.force for name, action in _resolve(scene, t, y)[1].items()}
+    actions = _resolve(scene, t, y, mode).actions
+    return {name: actions[name].force for name in scene.names}
 
 
-def scene_power(t: Float[Array, ""], y: State, scene: Scene) -> Power:
+def scene_power(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> Power:
     """Power [W] from outside into the mechanism and its effects, and absorbed by friction.
 
     A Lagrangian that depends on time by itself supplies `-dL/dt`.
     """
-    actions = _resolve(scene, t, y)[1]
+    actions = _resolve(scene, t, y, mode).actions
     own = jax.grad(lambda t: scene.lagrangian(t, y.q, y.qd, scene.params))(t)
     supplied, absorbed = -own, jnp.zeros_like(t)
     for name, effect in zip(scene.names, scene.effects, strict=True):

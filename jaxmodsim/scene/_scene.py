@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, Friction
 from ..mechanics import Lagrangian
 from ..numerics import as_function, as_real
 
@@ -57,6 +57,11 @@ class Scene(eqx.Module):
         for name in given:
             if given.count(name) > 1:
                 raise ValueError(f"Two effects have the name {name!r}; names of effects must differ.")
+        if self.exact_names and any(isinstance(x, Friction) and x.holding for x in self.effects):
+            raise ValueError(
+                f"{', '.join(self.exact_names)}: set-valued laws of one scene run either all by events or all by"
+                " DeadZone, as each must know the forces of the others. Wrap all of them in DeadZone, or none."
+            )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -70,6 +75,15 @@ class Scene(eqx.Module):
                 name = f"{effect.default_name}_{count}"
             names.append(name)
         return tuple(names)
+
+    @property
+    def exact_names(self) -> tuple[str, ...]:
+        """Names of the friction elements that run by events, in the order of their modes."""
+        return tuple(
+            name
+            for name, effect in zip(self.names, self.effects, strict=True)
+            if isinstance(effect, Friction) and effect.exact
+        )
 
     def state0(self) -> dict[str, PyTree]:
         """Own state of each effect that has one, at rest, by effect name."""

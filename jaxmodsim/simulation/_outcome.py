@@ -1,5 +1,7 @@
 """How a run ended: a code inside compiled code, a sentence outside."""
 
+from typing import NamedTuple
+
 import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,8 +11,9 @@ from jaxtyping import Array, Float, Int
 from ..mechanics import motion_equations
 from ..numerics import check_ranges, cholesky_pivots, modules_of, range_checks
 from ..scene import Scene, State
+from ..solvers import ACCUMULATION, TOO_MANY
 
-SUCCESS, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, FIRST_MASS = range(5)
+SUCCESS, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, MAX_EVENTS, FIRST_MASS = range(6)
 
 _GENERAL = (
     "The run reached t1.",
@@ -20,7 +23,15 @@ _GENERAL = (
     " and Sign with a fixed step (dt=...).",
     "The vector field gave a value that is not finite (NaN or infinity). With a fixed step this is also how a"
     " step too long for the stiffness ends: pass a smaller dt, or solver=jaxmodsim.Rodas5P().",
+    "The limit of mode changes was reached before t1: pass a larger max_events.",
 )
+
+
+class Ending(NamedTuple):
+    """What the last event says: whether events ended the run, and which guards fired in it."""
+
+    trouble: Float[Array, ""]
+    fired: Float[Array, " guards"]
 
 
 class SimulationError(RuntimeError):
@@ -65,7 +76,12 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
     ranges = tuple(
         f"{text} (at scene{path})." for path, module in modules_of(scene) for text, _ in range_checks(module)
     )
-    return _GENERAL + mass + ranges
+    chatter = tuple(
+        f"The mode changes of {name!r} accumulate: chatter between stick and slip. Pass hold_chatter=True to hold it in"
+        " stick from there on."
+        for name in scene.exact_names
+    )
+    return _GENERAL + mass + ranges + chatter
 
 
 def start_code(scene: Scene, t: Float[Array, ""], y: State, rate: State) -> Int[Array, ""]:
@@ -81,12 +97,20 @@ def start_code(scene: Scene, t: Float[Array, ""], y: State, rate: State) -> Int[
     return code
 
 
-def end_code(scene: Scene, t: Float[Array, ""], y: State, rate: State, result: dfx.RESULTS) -> Int[Array, ""]:
-    """What ended the run, from diffrax's result and the last state."""
+def end_code(
+    scene: Scene, t: Float[Array, ""], y: State, rate: State, result: dfx.RESULTS, ending: Ending | None
+) -> Int[Array, ""]:
+    """What ended the run, from diffrax's result, the last state and the last event."""
     early = ~dfx.is_okay(result)
     code = jnp.where(result == dfx.RESULTS.dt_min_reached, STEP_TOO_SMALL, NOT_FINITE)
     code = jnp.where(result == dfx.RESULTS.max_steps_reached, MAX_STEPS, code)
     code = jnp.where(early, code, SUCCESS)
+    if ending is not None:
+        count = len(scene.exact_names)
+        element = jnp.argmax(jnp.max(jnp.reshape(ending.fired, (3, count)), axis=0))
+        first = len(outcome_messages(scene, y.q.shape[0])) - count
+        chatters, full = ending.trouble == ACCUMULATION, ending.trouble == TOO_MANY
+        code = jnp.where(early & chatters, first + element, jnp.where(early & full, MAX_EVENTS, code))
     finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
     code = jnp.where(early & ~finite, NOT_FINITE, code)
     eps = float(jnp.finfo(y.q.dtype).eps)

@@ -33,6 +33,8 @@ def simulate(
     solver: dfx.AbstractSolver | None = None,
     adjoint: dfx.AbstractAdjoint | None = None,
     max_steps: int = 16384,
+    max_events: int = 1024,
+    hold_chatter: bool = False,
     throw: bool = True,
 ) -> Trajectory:
     """Run a scene from `t0` to `t1`.
@@ -56,6 +58,10 @@ def simulate(
     - `adjoint`: how diffrax differentiates the run. By default for reverse mode (`jax.grad`); pass
       `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`.
     - `max_steps`: limit of the number of steps.
+    - `max_events`: limit of the number of mode changes of set-valued laws; inside `jax.jit` also the length of
+      `run.events`.
+    - `hold_chatter`: whether an element whose mode changes accumulate is held in stick, until its load has been below
+      the limit again, instead of ending the run.
     - `throw`: whether a run that ends early raises; otherwise `run.result` says how it ended, and what was computed
       is kept.
 
@@ -70,12 +76,13 @@ def simulate(
       same sentence comes as equinox's run-time error.
     """
     problem = _problem(scene, q0, qd0, t1, t0, ts, z0, rtol, atol, dt)
-    if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
-        raise ValueError(f"max_steps must be a positive integer, but {max_steps!r} was given.")
+    for name, limit in (("max_steps", max_steps), ("max_events", max_events)):
+        if isinstance(limit, bool) or not isinstance(limit, int) or limit < 1:
+            raise ValueError(f"{name} must be a positive integer, but {limit!r} was given.")
     solver_arrays, solver_rest = _split(solver, dfx.AbstractSolver, "solver")
     adjoint_arrays, adjoint_rest = _split(adjoint, dfx.AbstractAdjoint, "adjoint")
     problem = problem._replace(plugins=(solver_arrays, adjoint_arrays))
-    options = Options(solver_rest, adjoint_rest, max_steps)
+    options = Options(solver_rest, adjoint_rest, max_steps, max_events, bool(hold_chatter))
     try:
         solved = solve(problem, options)
     except TypeError as error:
@@ -88,7 +95,7 @@ def simulate(
     if throw:
         solved = _raise_early_end(problem, solved)
     y, end = solved.y, None if solved.end is None else solved.end[0]
-    return Trajectory(solved.t, y.q, y.qd, y.z, solved.stats, solved.code, end, problem, options)
+    return Trajectory(solved.t, y.q, y.qd, y.z, solved.mode, solved.stats, solved.code, end, problem, options)
 
 
 def _known(*values: Any) -> bool:

@@ -11,9 +11,20 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PyTree
 
-from ..scene import Scene, State, check_scene, scene_field, scene_power
-from ..solvers import FiniteSteps, Rodas5P
-from ._outcome import SUCCESS, end_code, start_code
+from ..scene import (
+    Scene,
+    State,
+    check_scene,
+    scene_drifts,
+    scene_field,
+    scene_guards,
+    scene_modes,
+    scene_power,
+    scene_stick,
+    scene_switch,
+)
+from ..solvers import EventController, EventLog, EventSolver, EventState, FiniteSteps, Rodas5P
+from ._outcome import SUCCESS, Ending, end_code, start_code
 
 
 class Problem(NamedTuple):
@@ -46,6 +57,8 @@ class Options:
     solver: Any
     adjoint: Any
     max_steps: int
+    max_events: int
+    hold_chatter: bool
 
 
 class Work(NamedTuple):
@@ -61,6 +74,8 @@ class Solved(NamedTuple):
     t: Float[Array, " time"]
     # A `State`; in an audited run a pair of it and `Work`.
     y: Any
+    # Of the set-valued friction elements, shape `[time, elements]`; None where there are none.
+    mode: Any
     code: Int[Array, ""]
     # None where the end alone is kept, and so is in `t` and `y` already: every output of compiled code costs time.
     end: tuple[Float[Array, ""], State] | None
@@ -72,44 +87,110 @@ def default_solver(scene: Scene, fixed_step: bool) -> dfx.AbstractSolver:
     return Rodas5P(pivot=fixed_step) if any(effect.stiff for effect in scene.effects) else dfx.Tsit5()
 
 
-def _flow(t: Any, y: State, scene: Scene) -> State:
-    return scene_field(t, y, scene)
+class _Flow(NamedTuple):
+    """What is integrated: a `State`, or in an audited run a pair of it and `Work`."""
+
+    audited: bool
+
+    def start(self, y: State, t: Array) -> Any:
+        """What the run starts from."""
+        zero = jnp.zeros_like(t)
+        return (y, Work(zero, zero)) if self.audited else y
+
+    def state(self, y: Any) -> State:
+        """The state in what is integrated."""
+        return y[0] if self.audited else y
+
+    def replace(self, y: Any, state: State) -> Any:
+        """With another state."""
+        return (state, y[1]) if self.audited else state
+
+    def rate(self, t: Any, y: Any, scene: Scene, mode: Any = None) -> Any:
+        """Right-hand side."""
+        if self.audited:
+            return scene_field(t, y[0], scene, mode), Work(*scene_power(t, y[0], scene, mode))
+        return scene_field(t, y, scene, mode)
 
 
-def _audited_flow(t: Any, y: tuple[State, Work], scene: Scene) -> tuple[State, Work]:
-    return scene_field(t, y[0], scene), Work(*scene_power(t, y[0], scene))
+class _Hybrid(NamedTuple):
+    """The functions of a run with modes, in the form `EventSolver` takes."""
+
+    flow: _Flow
+
+    def rate(self, t: Any, s: EventState, scene: Scene) -> EventState:
+        return s.rate(self.flow.rate(t, s.y, scene, s.mode))
+
+    def guards(self, t: Any, s: EventState, scene: Scene) -> Array:
+        return scene_guards(t, self.flow.state(s.y), scene, s.mode)
+
+    def reset(self, t: Any, s: EventState, scene: Scene, fired: Array) -> EventState:
+        state, mode = scene_switch(t, self.flow.state(s.y), scene, s.mode, fired)
+        return s._replace(y=self.flow.replace(s.y, state), mode=mode)
+
+    def hold(self, t: Any, s: EventState, scene: Scene, fired: Array) -> EventState:
+        held = jnp.any(jnp.reshape(fired, (3, -1)), axis=0)
+        return self.stick(t, s._replace(mode=jnp.where(held, 0.0, s.mode)), scene)
+
+    def stick(self, t: Any, s: EventState, scene: Scene) -> EventState:
+        state = scene_stick(t, self.flow.state(s.y), scene, s.mode)
+        return s._replace(y=self.flow.replace(s.y, state))
 
 
-def _integrate(problem: Problem, options: Options, field: Any, y0: PyTree, state_of: Any) -> Solved:
-    """Run diffrax on `field`."""
-    scene = problem.scene
-    initial = initial_state(problem)
+def _controller(problem: Problem) -> dfx.AbstractStepSizeController:
+    if problem.dt is not None:
+        return FiniteSteps()
+    span = jnp.maximum(jnp.abs(problem.t0), jnp.abs(problem.t1))
+    return dfx.PIDController(
+        problem.rtol, problem.atol, dtmin=float(jnp.finfo(span.dtype).eps) * span, force_dtmin=False
+    )
+
+
+def _integrate(problem: Problem, options: Options, flow: _Flow, log: int | None) -> tuple[Solved, EventLog | None]:
+    """Run diffrax; with modes only where the scene has them, with a log of that many events where one is wanted."""
+    scene, exact = problem.scene, bool(problem.scene.exact_names)
+    initial, mode = initial_state(problem), None
     check_scene(scene, initial)
-    solver = (
-        default_solver(scene, problem.dt is not None)
-        if options.solver is None
-        else eqx.combine(options.solver, problem.plugins[0])
-    )
-    adjoint = (
-        dfx.RecursiveCheckpointAdjoint()
-        if options.adjoint is None
-        else eqx.combine(options.adjoint, problem.plugins[1])
-    )
-    if problem.dt is None:
-        span = jnp.maximum(jnp.abs(problem.t0), jnp.abs(problem.t1))
-        controller = dfx.PIDController(
-            problem.rtol, problem.atol, dtmin=float(jnp.finfo(span.dtype).eps) * span, force_dtmin=False
-        )
-    else:
-        controller = FiniteSteps()
-    start = start_code(scene, problem.t0, initial, scene_field(problem.t0, initial, scene))
+    solver, adjoint = default_solver(scene, problem.dt is not None), dfx.RecursiveCheckpointAdjoint()
+    if options.solver is not None:
+        solver = eqx.combine(options.solver, problem.plugins[0])
+    if options.adjoint is not None:
+        adjoint = eqx.combine(options.adjoint, problem.plugins[1])
+    if exact:
+        initial, mode = scene_modes(problem.t0, initial, scene)
+    start = start_code(scene, problem.t0, initial, scene_field(problem.t0, initial, scene, mode))
     # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
     starts = start == SUCCESS
     ts = None if problem.ts is None else jnp.where(starts, problem.ts, problem.t0)
-    end = dfx.SubSaveAt(t1=True)
-    saveat = dfx.SaveAt(subs=(end, end if ts is None else dfx.SubSaveAt(ts=ts)))
+    y0, controller, hybrid = flow.start(initial, problem.t0), _controller(problem), _Hybrid(flow)
+    if exact:
+        solver = EventSolver(
+            solver,
+            hybrid.guards,
+            hybrid.reset,
+            hold=hybrid.hold if options.hold_chatter else None,
+            project=hybrid.stick if scene_drifts(scene) else None,
+            max_events=options.max_events if log is None else min(log, options.max_events),
+            log=log is not None,
+        )
+        y0 = solver.start(problem.t0, y0, mode, scene, armed=True)
+        controller = EventController(controller)
+
+    def keep(t: Any, s: Any, scene: Scene) -> Any:
+        if not exact:
+            return s, None
+        return (hybrid.stick(t, s, scene) if scene_drifts(scene) else s).y, s.mode
+
+    def keep_end(t: Any, s: Any, scene: Scene) -> Any:
+        return keep(t, s, scene), ((s.count, s.trouble, s.fired), s.log) if exact else None
+
+    saveat = dfx.SaveAt(
+        subs=(
+            dfx.SubSaveAt(t1=True, fn=keep_end),
+            dfx.SubSaveAt(t1=True, fn=keep) if ts is None else dfx.SubSaveAt(ts=ts, fn=keep),
+        )
+    )
     solution = dfx.diffeqsolve(
-        dfx.ODETerm(field),
+        dfx.ODETerm(hybrid.rate if exact else flow.rate),
         solver,
         problem.t0,
         jnp.where(starts, problem.t1, problem.t0),
@@ -124,28 +205,39 @@ def _integrate(problem: Problem, options: Options, field: Any, y0: PyTree, state
     )
     assert solution.ts is not None
     assert solution.ys is not None
-    t_end, last = solution.ts[0][0], jtu.tree_map(lambda x: x[0], solution.ys[0])
-    end_state = state_of(last)
-    finish = end_code(scene, t_end, end_state, scene_field(t_end, end_state, scene), solution.result)
-    code = jnp.where(starts, finish, start)
-    t, y = solution.ts[1], solution.ys[1]
+    stats = {name: solution.stats[name] for name in ("num_steps", "num_rejected_steps")}
+    (last, mode), events = jtu.tree_map(lambda x: x[0], solution.ys[0])
+    t_end, end_state, ending, history = solution.ts[0][0], flow.state(last), None, None
+    if exact:
+        (count, trouble, fired), history = events
+        ending, stats["num_events"] = Ending(trouble, fired), count
+    rate = scene_field(t_end, end_state, scene, mode)
+    code = jnp.where(starts, end_code(scene, t_end, end_state, rate, solution.result, ending), start)
+    t, (y, modes) = solution.ts[1], solution.ys[1]
     if problem.ts is not None:
         reached = starts | (problem.ts <= problem.t0)
         t = jnp.where(reached, t, jnp.inf)
-        y = jtu.tree_map(lambda x: jnp.where(jnp.expand_dims(reached, tuple(range(1, x.ndim))), x, jnp.inf), y)
-    stats = {name: solution.stats[name] for name in ("num_steps", "num_rejected_steps")}
-    return Solved(t, y, code, None if problem.ts is None else (t_end, end_state), stats)
+        y, modes = jtu.tree_map(
+            lambda x: jnp.where(jnp.expand_dims(reached, tuple(range(1, x.ndim))), x, jnp.inf), (y, modes)
+        )
+    return Solved(t, y, modes, code, None if problem.ts is None else (t_end, end_state), stats), history
 
 
 @partial(jax.jit, static_argnames=("options",))
 def solve(problem: Problem, options: Options) -> Solved:
     """Run a scene."""
-    return _integrate(problem, options, _flow, initial_state(problem), lambda y: y)
+    return _integrate(problem, options, _Flow(audited=False), None)[0]
 
 
 @partial(jax.jit, static_argnames=("options",))
 def solve_audited(problem: Problem, options: Options) -> Work:
     """Run a scene again with the integrals of power beside it; returns the work at the saved times."""
-    zero = jnp.zeros_like(problem.t0)
-    y0 = (initial_state(problem), Work(zero, zero))
-    return _integrate(problem, options, _audited_flow, y0, lambda y: y[0]).y[1]
+    return _integrate(problem, options, _Flow(audited=True), None)[0].y[1]
+
+
+@partial(jax.jit, static_argnames=("options", "size"))
+def solve_logged(problem: Problem, options: Options, size: int) -> EventLog:
+    """Run a scene again with a log of `size` events beside it."""
+    log = _integrate(problem, options, _Flow(audited=False), size)[1]
+    assert log is not None
+    return log

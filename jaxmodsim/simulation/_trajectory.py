@@ -4,25 +4,26 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..mechanics import energies
 from ..scene import Scene, State, scene_forces
+from ..solvers import EventLog
 from ._outcome import Outcome, outcome_messages
-from ._solve import Options, Problem, initial_state, solve_audited
+from ._solve import Options, Problem, initial_state, solve_audited, solve_logged
 
 
 class Events(NamedTuple):
     """Mode changes along a run in order of time, padded with infinity or -1.
 
-    Laws that are executed without events (all but the exact stick-slip of set-valued laws) have none, and the
-    arrays have length 0.
+    Only set-valued laws that run exactly change modes. Elements that do so at the same instant have one entry each.
 
-    - `t`: time [s].
+    - `t`: time [s], differentiable.
     - `effect`: index of the effect in the scene.
-    - `before`, `after`: mode before and after.
+    - `before`, `after`: mode before and after: 0 in stick, else the sign of the slip velocity.
     """
 
     t: Float[Array, " events"]
@@ -59,7 +60,9 @@ class Trajectory:
     - `t`: times [s], shape `[time]`; `ts`, or the end alone. Times that an early end left unreached are infinite.
     - `q`, `qd`: coordinates and velocities, shape `[time, dof]`.
     - `z`: own states of effects, by effect name; each with a leading time axis.
-    - `stats`: `num_steps`, and `num_rejected_steps` of these.
+    - `modes`: of the friction elements that run by events, shape `[time, elements]`; None where there are none. By
+      name: `mode`.
+    - `stats`: `num_steps`, `num_rejected_steps` of these, and `num_events` where laws run by events.
 
     A run inside `jax.vmap` is read inside it, or by `jax.vmap(lambda run: run.forces)(runs)`.
     """
@@ -68,6 +71,7 @@ class Trajectory:
     q: Float[Array, "*time dof"]
     qd: Float[Array, "*time dof"]
     z: dict[str, PyTree]
+    modes: Float[Array, "*time elements"] | None
     stats: dict[str, Array]
     code: Int[Array, "..."]
     end: Float[Array, "..."] | None
@@ -97,13 +101,27 @@ class Trajectory:
         `AppliedForce` what its function returns, shape `[time, ...]`.
         """
         self._one_run("forces")
-        return _forces(self.scene, self.t, self._states())
+        return _forces(self.scene, self.t, self._states(), self.modes)
+
+    @property
+    def mode(self) -> dict[str, Array]:
+        """Mode of each friction element that runs by events, by effect name, shape `[time]`: 0 in stick, else +-1."""
+        if self.modes is None:
+            return {}
+        return {name: self.modes[..., i] for i, name in enumerate(self.scene.exact_names)}
 
     @property
     def events(self) -> Events:
-        """Mode changes along the run."""
-        none = jnp.zeros((*self.t.shape[:-1], 0), int)
-        return Events(jnp.zeros(none.shape, self.t.dtype), none, none, none)
+        """Mode changes along the run. Runs the scene once more, with a log beside it."""
+        self._one_run("events")
+        if self.modes is None:
+            none = jnp.zeros(0, int)
+            return Events(jnp.zeros(0, self.t.dtype), none, none, none)
+        count, size = self.stats["num_events"], self.options.max_events
+        if not isinstance(count, jax.core.Tracer):
+            # As many as needed, in powers of two: another length compiles anew.
+            size = min(size, 1 << max(int(count), 8).bit_length())
+        return _events(self.scene, solve_logged(self.problem, self.options, size))
 
     @property
     def energy(self) -> Energy:
@@ -124,8 +142,27 @@ class Trajectory:
 
 
 @jax.jit
-def _forces(scene: Scene, t: Array, y: State) -> dict[str, Array]:
-    return jax.vmap(lambda t, y: scene_forces(t, y, scene))(t, y)
+def _forces(scene: Scene, t: Array, y: State, mode: Any) -> dict[str, Array]:
+    return jax.vmap(lambda t, y, mode: scene_forces(t, y, scene, mode))(t, y, mode)
+
+
+@jax.jit
+def _events(scene: Scene, log: EventLog) -> Events:
+    """One entry for each element that changed its mode, from a log with one for each instant."""
+    before, after = log.before[1], log.after[1]
+    indices = jnp.asarray([scene.names.index(name) for name in scene.exact_names])
+    changed = jnp.ravel((before != after) & jnp.isfinite(log.t)[:, None])
+    order = jnp.argsort(~changed, stable=True)
+
+    def column(x: Array, filler: Any) -> Array:
+        return jnp.where(changed, jnp.ravel(jnp.broadcast_to(x, before.shape)), filler)[order]
+
+    return Events(
+        column(log.t[:, None], jnp.inf),
+        column(indices[None, :], -1),
+        column(before.astype(int), -1),
+        column(after.astype(int), -1),
+    )
 
 
 @jax.jit

@@ -3,7 +3,6 @@
 from typing import Any, NamedTuple, cast
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -38,7 +37,16 @@ class _ControllerState(NamedTuple):
 
 
 class EventController(dfx.AbstractAdaptiveStepSizeController):
-    """TODO."""
+    """Wrap a step size controller so that steps end on the events that `EventSolver` sees.
+
+    A step that passes a root of a guard is rejected and aimed at it, until one lands; the step after an event is as long
+    as the error last allowed. A step that does not resolve the guards is made smaller. Everything else is the wrapped
+    controller's.
+
+    **Arguments:**
+
+    - `controller`: any diffrax step size controller, adaptive or constant.
+    """
 
     controller: dfx.AbstractStepSizeController
 

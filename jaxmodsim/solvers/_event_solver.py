@@ -54,7 +54,87 @@ class _Field(eqx.Module):
 
 
 class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
-    """TODO."""
+    """Wrap a diffrax solver so that the solution passes through events: resets, changes of mode, counters.
+
+    To be used together with `EventController`:
+
+    ```python
+    def field(t, s, args):  # s.y is integrated, s.mode is constant between events
+        return s.rate(jnp.array([s.y[1], -9.81]))
+
+    def guards(t, s, args):
+        return s.y[:1]
+
+    def reset(t, s, args, fired):
+        return s._replace(y=jnp.array([0.0, -0.8 * s.y[1]]))
+
+    solver = EventSolver(diffrax.Tsit5(), guards, reset)
+    controller = EventController(diffrax.PIDController(rtol=1e-8, atol=1e-8))
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(field), solver, 0.0, 1.0, None, solver.start(0.0, jnp.array([1.0, 0.0])),
+        stepsize_controller=controller,
+    )
+    solution.ys.y, solution.ys.log.t
+    ```
+
+    Saving, dense output, progress meters and adjoints of diffrax work as without events. Time runs forward.
+
+    **What an event is.** Let `g_i(t)` be guard i along the solution on `[t0, t1]`. A guard is *armed* or waits. It
+    fires at the first `te > t0` where it is armed and `g_i(te) = 0`, `g_i < 0` right after `te`: events are crossings
+    from above to below (give `-g` for the other direction, both for both). An event at `t0` itself does not fire,
+    one at `t1` does, so that runs over `[t0, t1]` and `[t1, t2]` together have the events of one over `[t0, t2]`.
+
+    - *At the start* the guards with `g_i(t0) > 0` are armed, with `start(..., armed=True)` all of them. The others wait
+      until they are positive: a guard that is violated on entry, or zero and falling, does not fire; one that is zero
+      and rising is armed as it rises.
+    - *At an event* all armed guards whose roots lie within the landing distance (1e-5 of a step) of the first one
+      fire together, in one call of `reset` with all of them marked in `fired`. Later roots in the same step are looked
+      for again after the reset.
+    - *After an event* the guards that fired wait until they are positive, so that each crossing fires once; all
+      others are armed. So a guard that the reset has made negative fires at once. In that chain the
+      derivatives take the time of the later events for fixed; a `reset` that settles everything in one call
+      is exact.
+    - *Within a step* a guard is the cubic through its values at 0, 1/3, 2/3 (from dense output) and 1. A crossing and its
+      return inside one step are found if the cubic sees them. A step whose cubic share is large is
+      made smaller (up to twelve times), so that guards that vary within a step are resolved, but a guard may
+      still do between four points what no cubic does: a spike there is missed.
+
+    The event is located on steps of the solver, not on its dense output: a step that passes a root is
+    rejected and ends on it. The saved value at an event, and at t1 if that is one, is the one after the reset.
+
+    **Derivatives.** From the end of the step the state is carried to the root, reset there, and carried back with the
+    new field. The way is zero but for the landing error, while its derivative is that of the event's time: the result
+    is the saltation matrix `DR + (f_plus - DR f_minus - D_t R) (x) Dg / (D_t g + Dg f_minus)`, and times in the log are
+    differentiable. Second derivatives hold too, where the adjoint gives any. A guard that touches zero without crossing
+    (grazing) has no derivative.
+
+    **Where events accumulate** (a ball coming to rest, chatter): if the last intervals between events shrink below 1e-3
+    sqrt(eps) of the time, the run ends with `trouble = 1` in the state and diffrax's result `dt_min_reached`; with
+    `hold`, that function takes the place of `reset` there, and the guards that are not positive after it wait. At
+    `max_events` events it ends with `trouble = 2` and `max_steps_reached`.
+
+    **Arguments:**
+
+    - `solver`: the diffrax solver of an `ODETerm`: explicit, `Rodas5P`, `diffrax.Kvaerno5`.
+    - `guards`: `guards(t, s, args)` -> shape `[guards]`; `s` is an `EventState` of which `s.y` and `s.mode` are yours.
+    - `reset`: `reset(t, s, args, fired)` -> `s` with another `y` or `mode` (by `s._replace`); `fired` are booleans,
+      shape `[guards]`.
+    - `hold`: as `reset`, for events that accumulate; by default the run ends there.
+    - `project`: `project(t, s, args)` -> `s`, applied after every step, for invariants that drift.
+    - `max_events`: limit of the number of events, > 0, and length of the log.
+    - `log`: whether the state carries an `EventLog`.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{aizerman1958stability,
+            author={Aizerman, M. A. and Gantmacher, F. R.},
+            title={On the stability of periodic motions},
+            journal={Journal of Applied Mathematics and Mechanics}, volume={22}, number={6},
+            pages={1065--1078}, year={1958},
+        }
+        ```
+    """
 
     term_structure: ClassVar = dfx.ODETerm
     solver: dfx.AbstractSolver
@@ -92,8 +172,19 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         """Order of the error estimate of the wrapped solver."""
         return self.solver.error_order(terms)
 
-    def start(self, t0: Any, y0: PyTree, mode: PyTree = None, args: PyTree = None, *, armed: bool = False) -> EventState:
-        """State to begin with."""
+    def start(
+        self, t0: Any, y0: PyTree, mode: PyTree = None, args: PyTree = None, *, armed: bool = False
+    ) -> EventState:
+        """State to begin with, to be passed to `diffeqsolve` as `y0`.
+
+        **Arguments:**
+
+        - `t0`: start time.
+        - `y0`: what the vector field integrates, any pytree.
+        - `mode`: what is constant between events (modes, counters), any pytree of numbers; they become floating.
+        - `args`: as for `diffeqsolve`.
+        - `armed`: whether all guards are armed, so that one that is violated fires at once.
+        """
         y0, mode = jtu.tree_map(_real, (y0, mode))
         zero = jnp.zeros((), jnp.result_type(t0, *jtu.tree_leaves(y0)))
         t0 = jnp.asarray(t0, zero.dtype)
@@ -129,7 +220,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0._replace(log=None), args), solver_state, made_jump
         )
         if self.project is not None:
-            y1 = self.project(t1, y0._replace(y=y1), args)
+            y1 = self.project(t1, y0._replace(y=y1), args).y
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
         t_one, t_two = t0 + (t1 - t0) / 3.0, t0 + (t1 - t0) * (2.0 / 3.0)
         inside = [self._guards(t, y0._replace(y=path.evaluate(t)), args) for t in (t_one, t_two)]
@@ -185,6 +276,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         The way to the root is zero but for the error of the landing; its derivatives are those of the time of the
         event, to second order, so that those of the result are exact.
         """
+
         def field(t: Any, state: EventState) -> PyTree:
             return terms.vf(t, state, args).y
 
@@ -204,9 +296,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         rest = jnp.where(on_root, -guard(t + way, there) / rate, 0.0)
         te, before = t + way + rest, state._replace(y=_along(there, rest, middle))
 
-        spread = jnp.where(
-            state.count == 0, te - state.t, jnp.maximum(te - state.t, _FORGET * state.spread)
-        )
+        spread = jnp.where(state.count == 0, te - state.t, jnp.maximum(te - state.t, _FORGET * state.spread))
         spread = _constant(spread)
         eps = float(jnp.finfo(spread.dtype).eps)
         dense_events = (state.count >= 8) & (spread <= _ACCUMULATION * eps**0.5 * jnp.abs(_constant(te)))

@@ -36,9 +36,9 @@ class EventState(NamedTuple):
     - `log`: an `EventLog`, or None.
 
     The rest is how `EventSolver` tells `EventController` what it saw: `guard` and `armed` at this state, `spread` the
-    longest of the last intervals between events, `pace` the longest of the last steps, `landed` whether the step ended on an event, `aim` where the next event
-    is or seems to be, in steps from the start of this one, `room` by which factor the step may
-    change before the guards are not resolved.
+    longest of the last intervals between events, `pace` the longest of the last steps, `landed` whether the step ended
+    on an event, `aim` where the next event is or seems to be, in steps from the start of this one, `room` by
+    which factor the step may change before the guards are not resolved.
     """
 
     y: PyTree
