@@ -8,6 +8,8 @@ from jaxtyping import Array, Bool, Float
 
 # Refinements of a root. It only says where the next attempt of a step shall end.
 _REFINEMENTS = 4
+# A root this close to the start of a step, in steps, is at the start.
+_ZERO = 1e-6
 
 Numbers = Float[Array, " n"]
 Flags = Bool[Array, " n"]
@@ -16,6 +18,7 @@ Flags = Bool[Array, " n"]
 class Watch(NamedTuple):
     """What four values of a function in a step say about it, elementwise.
 
+    - `armed`: whether it counts as positive at some time of the step.
     - `crosses`: whether it falls through zero after it was positive or armed.
     - `root`: where it does so first, as a fraction of the step, roughly; 1 where it does not.
     - `ahead`: how far behind the end it would do so if it went on straight, or how far before the end it would have
@@ -24,6 +27,7 @@ class Watch(NamedTuple):
     - `cubic`: the coefficients of the cubic through the values.
     """
 
+    armed: Flags
     crosses: Flags
     root: Numbers
     ahead: Numbers
@@ -35,7 +39,7 @@ def watch(values: tuple[Numbers, Numbers, Numbers, Numbers], armed: Flags) -> Wa
     """First fall through zero of functions known at 0, 1/3, 2/3 and 1 of a step.
 
     Between the points each is the cubic through them, whose own minimum counts as a fifth point. If it is not armed, it
-    must be seen positive before it can fall. The third difference of the four values, the cubic's share in them, is
+    must be seen positive, or rise from zero at the start, before it can fall. The third difference of the four values, the cubic's share in them, is
     held below 0.3 of their range and 10 times the height of the minimum: more could hide a crossing.
 
     **Arguments:**
@@ -62,7 +66,9 @@ def watch(values: tuple[Numbers, Numbers, Numbers, Numbers], armed: Flags) -> Wa
     bottom = jnp.where(inside, g0 + lowest * (c1 + lowest * (c2 + lowest * c3)), g3)
 
     # Points in the order of time, the minimum among them; the first one below zero closes the bracket.
-    high1, high2, high3 = armed, armed | (g1 > 0), armed | (g1 > 0) | (g2 > 0)
+    rises = (c1 > 0) & (jnp.abs(g0) <= _ZERO * c1)
+    high1 = armed | rises
+    high2, high3 = high1 | (g1 > 0), high1 | (g1 > 0) | (g2 > 0)
     dips = inside & (bottom < 0) & jnp.where(lowest < 1 / 3, high1, jnp.where(lowest < 2 / 3, high2, high3))
     end, low = jnp.ones_like(g0), g3
     crosses = jnp.zeros_like(armed)
@@ -93,7 +99,7 @@ def watch(values: tuple[Numbers, Numbers, Numbers, Numbers], armed: Flags) -> Wa
     allowed = jnp.where(inside & (bottom > 0), jnp.minimum(allowed, 10.0 * bottom), allowed) + noise
     size = jnp.abs(third)
     room = jnp.where(size > 1e-3 * allowed, jnp.cbrt(allowed / jnp.where(size > 0, size, 1.0)), 10.0)
-    return Watch(crosses, root, ahead, room, (g0, c1, c2, c3))
+    return Watch(high3 | (g3 > 0), crosses, root, ahead, room, (g0, c1, c2, c3))
 
 
 def first_root(watched: Watch, passed: Flags) -> Float[Array, ""]:

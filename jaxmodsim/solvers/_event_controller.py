@@ -6,6 +6,7 @@ import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
 from ._event_state import ACCUMULATION, TOO_MANY, EventState
@@ -15,6 +16,8 @@ _MAX_DOUBTS = 12
 # A step whose successor may be this much longer was not limited by its error.
 _UNLIMITED = 5.0
 
+# The shortest step towards an event, in steps.
+_SHORTEST = 1e-9
 # An event this close ahead, in steps, is where the next step shall end.
 _CLOSE = 0.1
 # A step whose successor is at least this much of it was wrong by little.
@@ -39,8 +42,8 @@ class _ControllerState(NamedTuple):
 class EventController(dfx.AbstractAdaptiveStepSizeController):
     """Wrap a step size controller so that steps end on the events that `EventSolver` sees.
 
-    A step that passes a root of a guard is rejected and aimed at it, until one lands; the step after an event is as long
-    as the error last allowed. A step that does not resolve the guards is made smaller. Everything else is the wrapped
+    A step that passes a root of a guard is rejected and aimed at it, until one lands; the step after an event is as
+    long as the error last allowed. A step that does not resolve the guards is made smaller. Everything else is the wrapped
     controller's.
 
     **Arguments:**
@@ -52,21 +55,18 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
 
     @property
     def rtol(self) -> Any:
-        """Relative tolerance of the wrapped controller."""
-        return cast(Any, self.controller).rtol
+        """Relative tolerance of the wrapped controller, for implicit solvers; NaN if it has none."""
+        return getattr(self.controller, "rtol", float("nan"))
 
     @property
     def atol(self) -> Any:
-        """Absolute tolerance of the wrapped controller."""
-        return cast(Any, self.controller).atol
+        """Absolute tolerance of the wrapped controller, for implicit solvers; NaN if it has none."""
+        return getattr(self.controller, "atol", float("nan"))
 
     @property
-    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Norm of the wrapped controller."""
-        return cast(Any, self.controller).norm
-
-    def __check_init__(self) -> None:
-        """Tolerances are the wrapped controller's own matter."""
+    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Norm of the wrapped controller, for implicit solvers."""
+        return getattr(self.controller, "norm", optx.max_norm)
 
     def wrap(self, direction: Any) -> "EventController":
         """Wrap the controller inside."""
@@ -110,7 +110,7 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
         accept = keep & ~passed & ~doubtful
         landed = landed & accept
 
-        shortest = 4.0 * float(jnp.finfo(length.dtype).eps) * jnp.maximum(jnp.abs(t0), length)
+        shortest = jnp.maximum(4.0 * float(jnp.finfo(length.dtype).eps) * jnp.abs(t0), _SHORTEST * length)
         unlimited = proposed > _UNLIMITED * length
         usual = jnp.where(accept & ~unlimited, proposed, old.usual)
         step = jnp.minimum(proposed, jnp.clip(0.9 * room, 0.2, 10.0) * length)

@@ -16,6 +16,8 @@ from ._event_state import ACCUMULATION, NO_TROUBLE, TOO_MANY, EventLog, EventSta
 # How far beside the root a step may end, as a fraction of the step; from there the state is carried to the root, with
 # an error of the third power of that distance.
 _LANDING = 1e-5
+# A step this much shorter than the last ones has no length.
+_SHORT = 1e-6
 # Events accumulate where the longest of the last intervals is below this part of the time since the start, times the
 # square root of the rounding unit.
 _ACCUMULATION = 1e-3
@@ -188,7 +190,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         y0, mode = jtu.tree_map(_real, (y0, mode))
         zero = jnp.zeros((), jnp.result_type(t0, *jtu.tree_leaves(y0)))
         t0 = jnp.asarray(t0, zero.dtype)
-        state = EventState(y0, mode, t0, zero, zero, zero, None, zero, zero, zero, zero, zero, zero + 1.0, zero + 1.0)
+        state = EventState(y0, mode, t0, zero, zero, zero, None, zero, zero, zero, zero, zero + 1.0, zero + 1.0)
         guard = self._guards(t0, state, args)
         log = None
         if self.log:
@@ -209,15 +211,16 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         return self.solver.func(dfx.ODETerm(_Field(terms)), t0, y0.y, (y0, args))
 
     def init(self, terms: PyTree, t0: Any, t1: Any, y0: EventState, args: PyTree) -> Any:
-        """State of the wrapped solver."""
-        return self.solver.init(dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0, args))
+        """State of the wrapped solver, and the longest of the last steps."""
+        return self.solver.init(dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0, args)), _constant(t1 - t0)
 
     def step(
         self, terms: PyTree, t0: Any, t1: Any, y0: EventState, args: PyTree, solver_state: Any, made_jump: Any
     ) -> tuple[EventState, PyTree, dict[str, Any], Any, dfx.RESULTS]:
         """A step of the wrapped solver, a look at the guards along it, and the reset where it ends on an event."""
-        y1, error, dense, solver_state, result = self.solver.step(
-            dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0._replace(log=None), args), solver_state, made_jump
+        inner, pace = solver_state
+        y1, error, dense, inner, result = self.solver.step(
+            dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0._replace(log=None), args), inner, made_jump
         )
         if self.project is not None:
             y1 = self.project(t1, y0._replace(y=y1), args).y
@@ -226,19 +229,19 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         inside = [self._guards(t, y0._replace(y=path.evaluate(t)), args) for t in (t_one, t_two)]
         end = self._guards(t1, y0._replace(y=y1), args)
         values = tuple(_constant(value) for value in (y0.guard, *inside, end))
-        armed = y0.armed > 0.5
-        seen = watch(values, armed)
-        armed = armed | (values[1] > 0) | (values[2] > 0) | (values[3] > 0)
+        seen = watch(values, y0.armed > 0.5)
 
         # Around t0 = 0 the resolution of time is that of the step itself.
         length = _constant(t1 - t0)
         resolution = 4.0 * float(jnp.finfo(length.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-        near = jnp.maximum(_LANDING * jnp.maximum(length, y0.pace), _constant(resolution))
+        near = jnp.maximum(_LANDING * jnp.maximum(length, pace), _constant(resolution))
         near = near / jnp.where(length > 0, length, 1.0)
-        here = armed & (jnp.abs(seen.ahead) <= near)
+        here = seen.armed & (jnp.abs(seen.ahead) <= near)
+        # One that fires at the start of the step does so where the step is the shortest.
+        here = here | (seen.crosses & (seen.root * length <= resolution) & (length <= _SHORT * pace))
         passed = seen.crosses & ~here
         # Without a root inside, the next one may be in sight: then the next step shall end there.
-        sight = jnp.min(jnp.where(armed, seen.ahead, jnp.inf))
+        sight = jnp.min(jnp.where(seen.armed, seen.ahead, jnp.inf))
         missed = jnp.any(passed)
         landed = jnp.any(here) & ~missed & (length > 0)
         fired = here & landed
@@ -247,9 +250,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         state1 = y0._replace(
             y=y1,
             guard=end,
-            armed=jnp.where(armed, 1.0, jnp.zeros_like(end)),
+            armed=jnp.where(seen.armed, 1.0, jnp.zeros_like(end)),
             landed=jnp.where(landed, 1.0, jnp.zeros_like(aim)),
-            pace=jnp.maximum(length, _FORGET * y0.pace),
             aim=aim,
             room=jnp.min(seen.room),
         )
@@ -259,7 +261,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             lambda: state1,
         )
         dense = {"inner": dense, "state0": y0, "state1": state1}
-        return state1, error, dense, solver_state, result
+        pace = jnp.maximum(length, _FORGET * pace)
+        return state1, error, dense, (inner, pace), result
 
     def _jump(
         self,

@@ -36,7 +36,7 @@ class EventState(NamedTuple):
     - `log`: an `EventLog`, or None.
 
     The rest is how `EventSolver` tells `EventController` what it saw: `guard` and `armed` at this state, `spread` the
-    longest of the last intervals between events, `pace` the longest of the last steps, `landed` whether the step ended
+    longest of the last intervals between events, `landed` whether the step ended
     on an event, `aim` where the next event is or seems to be, in steps from the start of this one, `room` by
     which factor the step may change before the guards are not resolved.
     """
@@ -51,7 +51,6 @@ class EventState(NamedTuple):
     guard: Float[Array, "*s guards"]
     armed: Float[Array, "*s guards"]
     spread: Float[Array, "..."]
-    pace: Float[Array, "..."]
     landed: Float[Array, "..."]
     aim: Float[Array, "..."]
     room: Float[Array, "..."]
