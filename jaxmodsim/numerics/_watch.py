@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 # Refinements of a root. It only says where the next attempt of a step shall end.
 _REFINEMENTS = 4
 # A root this close to the start of a step, in steps, is at the start.
-_ZERO = 1e-6
+_ZERO = 1e-3
 
 Numbers = Float[Array, " n"]
 Flags = Bool[Array, " n"]
@@ -66,7 +66,7 @@ def watch(values: tuple[Numbers, Numbers, Numbers, Numbers], armed: Flags) -> Wa
     bottom = jnp.where(inside, g0 + lowest * (c1 + lowest * (c2 + lowest * c3)), g3)
 
     # Points in the order of time, the minimum among them; the first one below zero closes the bracket.
-    rises = (c1 > 0) & (jnp.abs(g0) <= _ZERO * c1)
+    rises = (c1 > 0) & (g0 >= -_ZERO * c1)
     high1 = armed | rises
     high2, high3 = high1 | (g1 > 0), high1 | (g1 > 0) | (g2 > 0)
     dips = inside & (bottom < 0) & jnp.where(lowest < 1 / 3, high1, jnp.where(lowest < 2 / 3, high2, high3))

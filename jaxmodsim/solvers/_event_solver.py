@@ -92,10 +92,10 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     - *At an event* all armed guards whose roots lie within the landing distance (1e-5 of a step) of the first one
       fire together, in one call of `reset` with all of them marked in `fired`. Later roots in the same step are looked
       for again after the reset.
-    - *After an event* the guards that fired wait until they are positive, so that each crossing fires once; all
-      others are armed. So a guard that the reset has made negative fires at once. In that chain the
-      derivatives take the time of the later events for fixed; a `reset` that settles everything in one call
-      is exact.
+    - *After an event* the guards that fired wait until they are positive, so that each crossing fires once; those that
+      were armed stay so. A guard that the reset has made negative therefore fires at once. In such a chain
+      the derivatives take the times of the later events for fixed; a `reset` that settles everything in one
+      call is exact.
     - *Within a step* a guard is the cubic through its values at 0, 1/3, 2/3 (from dense output) and 1. A crossing and its
       return inside one step are found if the cubic sees them. A step whose cubic share is large is
       made smaller (up to twelve times), so that guards that vary within a step are resolved, but a guard may
@@ -322,7 +322,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         if log is not None:
             entry = EventLog(te, flags, (before.y, before.mode), (after.y, after.mode))
             log = jtu.tree_map(lambda a, b: write(a, state.count, b), log, entry)
-        armed = ~fired | (_constant(guard_new) > 4.0 * jnp.abs(rate) * near)
+        clear = _constant(guard_new) > jnp.where(fired, 4.0 * jnp.abs(rate) * near, 0.0)
+        armed = clear | (~fired & (state.armed > 0.5))
         if self.hold is not None:
             armed = jnp.where(dense_events, guard_new > 0, armed)
         return state._replace(
