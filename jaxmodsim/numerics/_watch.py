@@ -109,7 +109,7 @@ def first_root(watched: Watch, passed: Flags) -> Float[Array, ""]:
     """
     rough = jnp.where(passed, watched.root, 1.0)
     first = jnp.min(rough)
-    only = passed & (rough == first)
+    only = jnp.arange(rough.shape[0]) == jnp.argmin(rough)  # one, also where several are equal
     c0, c1, c2, c3 = (jnp.max(jnp.where(only, c, -jnp.inf)) for c in watched.cubic)
     root = first
     for _ in range(_REFINEMENTS):

@@ -87,8 +87,8 @@ def _multipliers(found: Contact, drive: Float[Array, " n"], sticks: Bool[Array, 
     """Forces of the sticking elements that take their slip accelerations away; others get zero.
 
     Where sticking elements are redundant (two on one coordinate), the equations leave the share of each open. The one
-    with the smallest sum of squared utilisations is taken, `(f_i/limit_i)^2`: elements in parallel then reach their
-    limits together, as rigid-plastic ones do at collapse.
+    with the smallest sum of `f_i^2/limit_i` is taken: elements in parallel then share in proportion to their
+    limits and reach them together. Shares of redundant elements are right to the square root of the rounding unit.
     """
     n = drive.shape[0]
     if n == 1:
@@ -96,7 +96,8 @@ def _multipliers(found: Contact, drive: Float[Array, " n"], sticks: Bool[Array, 
         return jnp.where(sticks, drive / jnp.where(reach > 0, reach, jnp.inf), 0.0)
     weight = 0.5 * (found.upper + found.lower)
     largest = jnp.max(weight)
-    weight = _constant(jnp.where(largest > 0, jnp.maximum(weight / jnp.where(largest > 0, largest, 1.0), 1e-3), 1.0))
+    weight = jnp.maximum(weight / jnp.where(largest > 0, largest, 1.0), 1e-6)
+    weight = _constant(jnp.sqrt(jnp.where(largest > 0, weight, 1.0)))
     both = sticks[:, None] & sticks[None, :]
     matrix = jnp.where(both, found.coupling * weight[:, None] * weight[None, :], 0.0)
     scale = jnp.max(jnp.where(both, matrix, 0.0))
@@ -104,7 +105,7 @@ def _multipliers(found: Contact, drive: Float[Array, " n"], sticks: Bool[Array, 
     matrix, rhs = matrix / scale, jnp.where(sticks, weight * drive, 0.0) / scale
     # A shift keeps the factors of a redundant set finite, and picks the smallest solution; refinement takes its error
     # away, down to rounding where the set is not redundant.
-    shift = float(jnp.finfo(drive.dtype).eps) ** (2 / 3)
+    shift = float(jnp.finfo(drive.dtype).eps) ** 0.5
     identity = jnp.eye(n, dtype=drive.dtype)
     shifted = jnp.where(both, matrix, 0.0) + identity * jnp.where(sticks, shift, 1.0)[None, :]
     solution = jnp.zeros_like(rhs)
@@ -114,18 +115,19 @@ def _multipliers(found: Contact, drive: Float[Array, " n"], sticks: Bool[Array, 
     return jnp.where(sticks, weight * solution, 0.0)
 
 
-def contact_guards(found: Contact, mode: Float[Array, " n"]) -> Float[Array, "guards"]:
+def contact_guards(found: Contact, mode: Float[Array, " n"], rest: Float[Array, ""]) -> Float[Array, " guards"]:
     """Three guards for each element, positive while its mode holds: upper limit, lower limit, direction of slip.
 
-    A guard of another mode is 1. The limits are 16 rounding units further out, so that a force that
-    equals the limit does not flicker.
+    A guard of another mode is 1. What differs by rounding must not flicker: the limits are 16 rounding units
+    further out, and a slip has to turn by `rest` [m/s] before it ends (an element may be in slip, at its limit, while
+    others hold it).
     """
     sticks = mode == 0
     force = contact_forces(found, mode)
     wider = 1.0 + 16.0 * float(jnp.finfo(force.dtype).eps)
     upper = jnp.where(sticks, wider * found.upper - force, 1.0)
     lower = jnp.where(sticks, wider * found.lower + force, 1.0)
-    return jnp.concatenate([upper, lower, jnp.where(sticks, 1.0, mode * found.v)])
+    return jnp.concatenate([upper, lower, jnp.where(sticks, 1.0, mode * found.v + rest)])
 
 
 def next_modes(

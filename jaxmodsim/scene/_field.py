@@ -136,9 +136,11 @@ def scene_field(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None)
     return State(y.qd, resolved.qdd, {name: resolved.actions[name].rate for name in y.z})
 
 
-def scene_guards(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Float[Array, " guards"]:
+def scene_guards(
+    t: Float[Array, ""], y: State, scene: Scene, mode: Modes, rest: Float[Array, ""]
+) -> Float[Array, " guards"]:
     """Guards that are positive while the modes hold; see `contact_guards`."""
-    return contact_guards(_contact(t, y, scene, mode), mode)
+    return contact_guards(_contact(t, y, scene, mode), mode, rest)
 
 
 def scene_switch(

@@ -27,6 +27,10 @@ from ..solvers import EventController, EventLog, EventSolver, EventState, Finite
 from ._outcome import SUCCESS, Ending, end_code, start_code
 
 
+# Part of the absolute tolerance below which a slip velocity counts as none.
+_REST = 1e-3
+
+
 class Problem(NamedTuple):
     """All numbers of a run."""
 
@@ -116,12 +120,14 @@ class _Hybrid(NamedTuple):
     """The functions of a run with modes, in the form `EventSolver` takes."""
 
     flow: _Flow
+    # Slip velocity [m/s] that counts as none.
+    rest: Float[Array, ""]
 
     def rate(self, t: Any, s: EventState, scene: Scene) -> EventState:
         return s.rate(self.flow.rate(t, s.y, scene, s.mode))
 
     def guards(self, t: Any, s: EventState, scene: Scene) -> Array:
-        return scene_guards(t, self.flow.state(s.y), scene, s.mode)
+        return scene_guards(t, self.flow.state(s.y), scene, s.mode, self.rest)
 
     def reset(self, t: Any, s: EventState, scene: Scene, fired: Array) -> EventState:
         state, mode = scene_switch(t, self.flow.state(s.y), scene, s.mode, fired)
@@ -161,7 +167,7 @@ def _integrate(problem: Problem, options: Options, flow: _Flow, log: int | None)
     # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
     starts = start == SUCCESS
     ts = None if problem.ts is None else jnp.where(starts, problem.ts, problem.t0)
-    y0, controller, hybrid = flow.start(initial, problem.t0), _controller(problem), _Hybrid(flow)
+    y0, controller, hybrid = flow.start(initial, problem.t0), _controller(problem), _Hybrid(flow, _REST * problem.atol)
     if exact:
         solver = EventSolver(
             solver,

@@ -245,7 +245,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         missed = jnp.any(passed)
         landed = jnp.any(here) & ~missed & (length > 0)
         fired = here & landed
-        first = seen.ahead == sight
+        first = jnp.arange(fired.shape[0]) == jnp.argmin(jnp.where(fired, seen.ahead, jnp.inf))
         aim = jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0))
         state1 = y0._replace(
             y=y1,
