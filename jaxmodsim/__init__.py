@@ -2,6 +2,8 @@
 
 from . import problems as problems
 from ._speed import tune_cpu as tune_cpu
+from .analysis import GradientCheck as GradientCheck
+from .analysis import check_gradients as check_gradients
 from .effects import AbstractEffect as AbstractEffect
 from .effects import AppliedForce as AppliedForce
 from .effects import Friction as Friction
