@@ -43,9 +43,13 @@ def count(t: Any, s: Any, args: Any, fired: Any) -> Any:
 def solve(field: Any, guards: Any, reset: Any, y0: Any, t1: Any, **how: Any) -> Any:
     """One run with events; everything that is not an array is compiled in."""
     events = EventSolver(
-        how.get("solver", dfx.Tsit5()), guards, reset, how.get("hold"), max_events=how.get("max_events", 16)
+        how.get("solver", dfx.Tsit5()),
+        guards,
+        reset,
+        insist=how.get("insist", False),
+        max_events=how.get("max_events", 16),
     )
-    start = events.start(how.get("t0", 0.0), y0, how.get("mode"), armed=how.get("armed", False))
+    start = events.start(how.get("t0", 0.0), y0, how.get("mode"))
     return dfx.diffeqsolve(
         dfx.ODETerm(field),
         events,
@@ -118,22 +122,28 @@ def test_an_event_at_t1_belongs_to_the_run_that_ends_there() -> None:
 
 
 @pytest.mark.parametrize(
-    ("y0", "armed", "events"),
+    ("y0", "insist", "events"),
     [
         ([0.0, 3.0], False, 0),  # zero and rising: not back within 0.3 s
         ([0.0, 3.0], True, 0),
         ([0.0, -3.0], False, 0),  # zero and falling: the event belongs to the run before
-        ([0.0, -3.0], True, 1),  # unless all guards are armed
+        ([0.0, -3.0], True, 1),  # unless the guard has to hold
         ([-0.1, 0.0], False, 0),  # violated on entry
-        ([-0.1, 0.0], True, 1),
     ],
 )
-def test_guards_at_the_start(y0: list[float], armed: bool, events: int) -> None:
-    run = solve(fall, floor, bounce, jnp.array(y0), 0.3, armed=armed)
+def test_guards_at_the_start(y0: list[float], insist: bool, events: int) -> None:
+    run = solve(fall, floor, bounce, jnp.array(y0), 0.3, insist=insist)
     np.testing.assert_array_equal(run.ys.count, [float(events)])
     assert run.result == dfx.RESULTS.successful
     if events:
         np.testing.assert_allclose(run.ys.log.t[0, 0], 0.0, atol=1e-9)
+
+
+def test_a_violated_guard_that_has_to_hold_and_cannot_is_named() -> None:
+    """A ball below the floor is not lifted by a bounce."""
+    run = solve(fall, floor, bounce, jnp.array([-0.1, 0.0]), 0.3, insist=True, max_events=64)
+    np.testing.assert_array_equal(run.ys.trouble, [1.0])
+    assert run.result == dfx.RESULTS.dt_min_reached
 
 
 def test_a_guard_that_starts_at_zero_and_rises_fires_when_it_comes_down() -> None:
@@ -291,7 +301,9 @@ def test_batches_with_different_numbers_of_events_do_not_disturb_each_other() ->
             max_steps=2048,
             throw=False,
         )
-        return solution.ys.y[0, 1], (solution.ys.trouble[0], solution.ts[0])
+        state: Any = solution.ys
+        times: Any = solution.ts
+        return state.y[0, 1], (state.trouble[0], times[0])
 
     both = jax.jit(jax.value_and_grad(end, argnums=(0, 1), has_aux=True))
     e, v = jnp.array([0.8, 0.3, 0.5]), jnp.array([0.0, 0.5, -1.0])

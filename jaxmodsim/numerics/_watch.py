@@ -23,7 +23,8 @@ class Watch(NamedTuple):
     - `root`: where it does so first, as a fraction of the step, roughly; 1 where it does not.
     - `ahead`: how far behind the end it would do so if it went on straight, or how far before the end it would have
       done so (negative), in steps; infinite where it does not fall.
-    - `room`: by which factor the step may grow before the four values say too little; below 1 they already do.
+    - `clarity`: the cubic share that is allowed over the one there is: below 1 the four values say too little. The
+      share goes with the third power of the step.
     - `cubic`: the coefficients of the cubic through the values.
     """
 
@@ -31,7 +32,7 @@ class Watch(NamedTuple):
     crosses: Flags
     root: Numbers
     ahead: Numbers
-    room: Numbers
+    clarity: Numbers
     cubic: tuple[Numbers, Numbers, Numbers, Numbers]
 
 
@@ -99,8 +100,9 @@ def watch(values: tuple[Numbers, Numbers, Numbers, Numbers], armed: Flags) -> Wa
     allowed = 0.3 * (high - low)
     allowed = jnp.where(inside & (bottom > 0), jnp.minimum(allowed, 10.0 * bottom), allowed) + noise
     size = jnp.abs(third)
-    room = jnp.where(size > 1e-3 * allowed, jnp.cbrt(allowed / jnp.where(size > 0, size, 1.0)), 10.0)
-    return Watch(high3 | (g3 > 0), crosses, root, ahead, room, (g0, c1, c2, c3))
+    clarity = allowed / jnp.where(size > 0, size, 1.0)
+    clarity = jnp.where(size > 0, clarity, jnp.inf)
+    return Watch(high3 | (g3 > 0), crosses, root, ahead, clarity, (g0, c1, c2, c3))
 
 
 def first_root(watched: Watch, passed: Flags) -> Float[Array, ""]:

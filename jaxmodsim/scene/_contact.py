@@ -152,21 +152,27 @@ def next_modes(
     mode = jnp.where(still, released, mode)
     scale = 1e-6 * jnp.max(jnp.abs(found.coupling) * jnp.maximum(found.upper, found.lower)[None, :], axis=1)
 
-    def settle(_: object, mode: Array) -> Array:
-        force = contact_forces(found, mode)
+    def release(mode: Array, force: Array) -> tuple[Array, Array]:
         limit = jnp.where(force > 0, found.upper, found.lower)
         least = float(jnp.finfo(limit.dtype).tiny)
         use = jnp.where(mode == 0, jnp.abs(force) / jnp.maximum(limit, least), 0.0)
         worst = (use == jnp.max(use)) & (use > wider)
+        return jnp.where(worst, jnp.sign(force), mode), jnp.any(worst)
+
+    def settle(_: object, mode: Array) -> Array:
+        force = contact_forces(found, mode)
         acceleration = found.base - jnp.sum(found.coupling * force[None, :], axis=1)
         against = still & (mode * acceleration < -scale)
-        return jnp.where(
-            jnp.any(worst), jnp.where(worst, jnp.sign(force), mode), jnp.where(against, jnp.zeros_like(mode), mode)
-        )
+        released, any_released = release(mode, force)
+        return jnp.where(any_released, released, jnp.where(against, jnp.zeros_like(mode), mode))
 
-    if n == 1:
-        return settle(None, mode)
-    return jax.lax.fori_loop(0, 3 * n, settle, mode)
+    if n > 1:
+        mode = jax.lax.fori_loop(0, 3 * n, settle, mode)
+    # Where nothing is consistent, rather a slip that ends at once, which shows as chatter, than a stick above its
+    # limit.
+    for _ in range(n):
+        mode, _ = release(mode, contact_forces(found, mode))
+    return mode
 
 
 def stop_slip(found: Contact, qd: Float[Array, " dof"], sticks: Bool[Array, " n"]) -> Float[Array, " dof"]:

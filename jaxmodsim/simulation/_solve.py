@@ -174,10 +174,11 @@ def _integrate(problem: Problem, options: Options, flow: _Flow, log: int | None)
             hybrid.reset,
             hold=hybrid.hold if options.hold_chatter else None,
             project=hybrid.stick if scene_drifts(scene) else None,
+            insist=True,
             max_events=options.max_events if log is None else min(log, options.max_events),
             log=log is not None,
         )
-        y0 = solver.start(problem.t0, y0, mode, scene, armed=True)
+        y0 = solver.start(problem.t0, y0, mode, scene)
         controller = EventController(controller)
 
     def keep(t: Any, s: Any, scene: Scene) -> Any:

@@ -86,9 +86,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     from above to below (give `-g` for the other direction, both for both). An event at `t0` itself does not fire,
     one at `t1` does, so that runs over `[t0, t1]` and `[t1, t2]` together have the events of one over `[t0, t2]`.
 
-    - *At the start* the guards with `g_i(t0) > 0` are armed, with `start(..., armed=True)` all of them. The others wait
-      until they are positive: a guard that is violated on entry, or zero and falling, does not fire; one that is zero
-      and rising is armed as it rises.
+    - *At the start* the guards with `g_i(t0) > 0` are armed. The others wait until they are positive: a guard that is
+      violated on entry, or zero and falling, does not fire; one that is zero and rising is armed as it rises.
     - *At an event* all armed guards whose roots lie within the landing distance (1e-5 of a step) of the first one
       fire together, in one call of `reset` with all of them marked in `fired`. Later roots in the same step are looked
       for again after the reset.
@@ -96,6 +95,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
       were armed stay so. A guard that the reset has made negative therefore fires at once. In such a chain
       the derivatives take the times of the later events for fixed; a `reset` that settles everything in one
       call is exact.
+    - *With `insist`* all guards are armed at all times: one that is violated at the start fires at once, and one that
+      its own reset leaves violated fires again and again, until the events accumulate.
     - *Within a step* a guard is the cubic through its values at 0, 1/3, 2/3 (from dense output) and 1. A crossing and
       its return inside one step are found if the cubic sees them. A step whose cubic share is large is made smaller
       (up to twelve times), so that guards that vary within a step are resolved, but a guard may still do between four
@@ -123,6 +124,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
       shape `[guards]`.
     - `hold`: as `reset`, for events that accumulate; by default the run ends there.
     - `project`: `project(t, s, args)` -> `s`, applied after every step, for invariants that drift.
+    - `insist`: whether the guards are conditions that have to hold, not crossings that are to be noted.
     - `max_events`: limit of the number of events, > 0, and length of the log.
     - `log`: whether the state carries an `EventLog`.
 
@@ -144,6 +146,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     reset: Callable[..., Any]
     hold: Callable[..., Any] | None = None
     project: Callable[..., Any] | None = None
+    insist: bool = eqx.field(default=False, static=True)
     max_events: int = eqx.field(default=128, static=True)
     log: bool = eqx.field(default=True, static=True)
 
@@ -174,9 +177,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         """Order of the error estimate of the wrapped solver."""
         return self.solver.error_order(terms)
 
-    def start(
-        self, t0: Any, y0: PyTree, mode: PyTree = None, args: PyTree = None, *, armed: bool = False
-    ) -> EventState:
+    def start(self, t0: Any, y0: PyTree, mode: PyTree = None, args: PyTree = None) -> EventState:
         """State to begin with, to be passed to `diffeqsolve` as `y0`.
 
         **Arguments:**
@@ -185,7 +186,6 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         - `y0`: what the vector field integrates, any pytree.
         - `mode`: what is constant between events (modes, counters), any pytree of numbers; they become floating.
         - `args`: as for `diffeqsolve`.
-        - `armed`: whether all guards are armed, so that one that is violated fires at once.
         """
         y0, mode = jtu.tree_map(_real, (y0, mode))
         zero = jnp.zeros((), jnp.result_type(t0, *jtu.tree_leaves(y0)))
@@ -200,7 +200,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
 
             pair = jtu.tree_map(rows, (y0, mode))
             log = EventLog(jnp.full(self.max_events, jnp.inf, zero.dtype), rows(guard), pair, pair)
-        ready = jnp.ones_like(guard) if armed else jnp.where(guard > 0, 1.0, jnp.zeros_like(guard))
+        ready = jnp.ones_like(guard) if self.insist else jnp.where(guard > 0, 1.0, jnp.zeros_like(guard))
         return state._replace(fired=jnp.zeros_like(guard), log=log, guard=guard, armed=ready)
 
     def _guards(self, t: Any, state: EventState, args: PyTree) -> Float[Array, " guards"]:
@@ -236,9 +236,10 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         resolution = 4.0 * float(jnp.finfo(length.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
         near = jnp.maximum(_LANDING * jnp.maximum(length, pace), _constant(resolution))
         near = near / jnp.where(length > 0, length, 1.0)
+        shortest = jnp.maximum(_SHORT * pace, 2.0 * _constant(resolution))
         here = seen.armed & (jnp.abs(seen.ahead) <= near)
         # One that fires at the start of the step does so where the step is the shortest.
-        here = here | (seen.crosses & (seen.root * length <= resolution) & (length <= _SHORT * pace))
+        here = here | (seen.crosses & (seen.root * length <= resolution) & (length <= shortest))
         passed = seen.crosses & ~here
         # Without a root inside, the next one may be in sight: then the next step shall end there.
         sight = jnp.min(jnp.where(seen.armed, seen.ahead, jnp.inf))
@@ -253,11 +254,11 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             armed=jnp.where(seen.armed, 1.0, jnp.zeros_like(end)),
             landed=jnp.where(landed, 1.0, jnp.zeros_like(aim)),
             aim=aim,
-            room=jnp.min(seen.room),
+            room=jnp.cbrt(jnp.min(seen.clarity)),
         )
         state1 = jax.lax.cond(
             landed,
-            lambda: self._jump(terms, t1, state1, fired, first, near * length, args),
+            lambda: self._jump(terms, t1, state1, fired, first, (near * length, pace), args),
             lambda: state1,
         )
         dense = {"inner": dense, "state0": y0, "state1": state1}
@@ -271,7 +272,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         state: EventState,
         fired: Bool[Array, " guards"],
         first: Bool[Array, " guards"],
-        near: Array,
+        lengths: tuple[Array, Array],
         args: PyTree,
     ) -> EventState:
         """Carry the state to the root of the first guard, reset it there, and carry it back to `t`.
@@ -279,6 +280,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         The way to the root is zero but for the error of the landing; its derivatives are those of the time of the
         event, to second order, so that those of the result are exact.
         """
+        near, pace = lengths
 
         def field(t: Any, state: EventState) -> PyTree:
             return terms.vf(t, state, args).y
@@ -302,7 +304,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         spread = jnp.where(state.count == 0, te - state.t, jnp.maximum(te - state.t, _FORGET * state.spread))
         spread = _constant(spread)
         eps = float(jnp.finfo(spread.dtype).eps)
-        dense_events = (state.count >= 8) & (spread <= _ACCUMULATION * eps**0.5 * jnp.abs(_constant(te)))
+        scale = jnp.maximum(jnp.abs(_constant(te)), pace)
+        dense_events = (state.count >= 8) & (spread <= _ACCUMULATION * eps**0.5 * scale)
         after = self.reset(te, before, args, fired)
         trouble = jnp.where(dense_events, jnp.asarray(ACCUMULATION, spread.dtype), NO_TROUBLE)
         if self.hold is not None:
@@ -323,7 +326,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             entry = EventLog(te, flags, (before.y, before.mode), (after.y, after.mode))
             log = jtu.tree_map(lambda a, b: write(a, state.count, b), log, entry)
         clear = _constant(guard_new) > jnp.where(fired, 4.0 * jnp.abs(rate) * near, 0.0)
-        armed = clear | (~fired & (state.armed > 0.5))
+        armed = self.insist | clear | (~fired & (state.armed > 0.5))
         if self.hold is not None:
             armed = jnp.where(dense_events, guard_new > 0, armed)
         return state._replace(
