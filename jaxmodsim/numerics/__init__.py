@@ -14,6 +14,8 @@ from ._numbers import modules_of as modules_of
 from ._numbers import parameter as parameter
 from ._numbers import range_checks as range_checks
 from ._numbers import ranges_of as ranges_of
+from ._once import once as once
+from ._once import unit_of as unit_of
 from ._rosenbrock import RosenbrockTableau as RosenbrockTableau
 from ._rosenbrock import rosenbrock_step as rosenbrock_step
 from ._safe import safe_power as safe_power

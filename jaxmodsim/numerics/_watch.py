@@ -6,6 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ._once import once
+
 # Refinements of a root. It only says where the next attempt of a step shall end.
 _REFINEMENTS = 4
 # A root this close to the start of a step, in steps, is at the start.
@@ -36,7 +38,7 @@ class Watch(NamedTuple):
     cubic: tuple[Numbers, Numbers, Numbers, Numbers]
 
 
-def watch(values: tuple[Numbers, Numbers, Numbers, Numbers], armed: Flags) -> Watch:
+def watch(values: tuple[Numbers, Numbers, Numbers, Numbers], armed: Flags, unit: Float[Array, ""]) -> Watch:
     """First fall through zero of functions known at 0, 1/3, 2/3 and 1 of a step.
 
     Between the points each is the cubic through them, whose own minimum counts as a fifth point. If it is not armed, it
@@ -49,6 +51,7 @@ def watch(values: tuple[Numbers, Numbers, Numbers, Numbers], armed: Flags) -> Wa
     - `values`: at the four points, shape `[n]` each.
     - `armed`: whether a function counts as positive at the start, whatever its value there. If it is armed, not
       positive and does not rise, it falls at once.
+    - `unit`: a one, see `once`.
 
     **Returns:**
 
@@ -58,6 +61,7 @@ def watch(values: tuple[Numbers, Numbers, Numbers, Numbers], armed: Flags) -> Wa
     c1 = -5.5 * g0 + 9.0 * g1 - 4.5 * g2 + g3
     c2 = 9.0 * g0 - 22.5 * g1 + 18.0 * g2 - 4.5 * g3
     third = g3 - 3.0 * g2 + 3.0 * g1 - g0
+    c1, c2, third = once((c1, c2, third), unit)
     c3 = 4.5 * third
 
     # The minimum of a cubic, in the form of the quadratic formula that stays exact as c3 goes to zero.
@@ -90,7 +94,8 @@ def watch(values: tuple[Numbers, Numbers, Numbers, Numbers], armed: Flags) -> Wa
     # Not left of the middle: a function that rises from zero at the start has a root there that is not meant.
     secant = start + (end - start) * jnp.clip(high / jnp.where(high > low, high - low, 1.0), 0.5, 1.0)
     at_once = armed & (g0 <= 0) & (g1 < 0) & (c1 <= 0)
-    root = jnp.where(crosses, jnp.where(at_once, 0.0, secant), 1.0)
+    root = once(jnp.where(crosses, jnp.where(at_once, 0.0, secant), 1.0), unit)
+    crosses = root < 1.0
 
     falls = c1 + 2.0 * c2 + 3.0 * c3
     ahead = jnp.where(falls < 0, -g3 / jnp.where(falls < 0, falls, 1.0), jnp.inf)

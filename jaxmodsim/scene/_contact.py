@@ -115,23 +115,23 @@ def _multipliers(found: Contact, drive: Float[Array, " n"], sticks: Bool[Array, 
     return jnp.where(sticks, weight * solution, 0.0)
 
 
-def contact_guards(found: Contact, mode: Float[Array, " n"], rest: Float[Array, ""]) -> Float[Array, " guards"]:
-    """Three guards for each element, positive while its mode holds: upper limit, lower limit, direction of slip.
+def contact_guards(found: Contact, mode: Float[Array, " n"], rest: Float[Array, ""]) -> Float[Array, " n"]:
+    """One guard for each element, positive while its mode holds.
 
-    A guard of another mode is 1. What differs by rounding must not flicker: the limits are 16 rounding units
-    further out, and a slip has to turn by `rest` [m/s] before it ends (an element may be in slip, at its limit, while
-    others hold it).
+    In stick `(upper - f)(lower + f)/(upper + lower)` [N], which falls through zero at either limit with the slope of
+    the force; in slip the velocity in its direction [m/s]. What differs by rounding must not flicker: the limits are
+    16 rounding units further out, and a slip has to turn by `rest` [m/s] before it ends (an element may be in slip, at
+    its limit, while others hold it).
     """
-    sticks = mode == 0
     force = contact_forces(found, mode)
     wider = 1.0 + 16.0 * float(jnp.finfo(force.dtype).eps)
-    upper = jnp.where(sticks, wider * found.upper - force, 1.0)
-    lower = jnp.where(sticks, wider * found.lower + force, 1.0)
-    return jnp.concatenate([upper, lower, jnp.where(sticks, 1.0, mode * found.v + rest)])
+    span = found.upper + found.lower
+    inside = (wider * found.upper - force) * (wider * found.lower + force) / jnp.where(span > 0, span, 1.0)
+    return jnp.where(mode == 0, inside, mode * found.v + rest)
 
 
 def next_modes(
-    found: Contact, mode: Float[Array, " n"], still: Bool[Array, " n"], released: Float[Array, " n"]
+    found: Contact, mode: Float[Array, " n"], still: Bool[Array, " n"], at_limit: Bool[Array, " n"]
 ) -> Float[Array, " n"]:
     """Modes after an instant at which the elements `still` have no slip velocity; the others go on as they are.
 
@@ -144,12 +144,13 @@ def next_modes(
     - `found`: at this instant.
     - `mode`: modes before.
     - `still`: elements that may stick or change direction.
-    - `released`: +1 or -1 for those that have reached a limit of stick, 0 for the others.
+    - `at_limit`: sticking elements that have reached a limit, and slip in the direction of their load.
     """
     found = jax.tree.map(_constant, found)
     n = mode.shape[0]
     wider = 1.0 + 16.0 * float(jnp.finfo(mode.dtype).eps)
-    mode = jnp.where(still, released, mode)
+    load = jnp.sign(contact_forces(found, mode))
+    mode = jnp.where(still, jnp.where(at_limit, load, jnp.zeros_like(mode)), mode)
     scale = 1e-6 * jnp.max(jnp.abs(found.coupling) * jnp.maximum(found.upper, found.lower)[None, :], axis=1)
 
     def release(mode: Array, force: Array) -> tuple[Array, Array]:

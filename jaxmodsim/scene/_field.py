@@ -148,10 +148,7 @@ def scene_switch(
 ) -> tuple[State, Float[Array, " n"]]:
     """State and modes after the guards that `fired`."""
     found = _contact(t, y, scene, mode)
-    n = mode.shape[0]
-    upper, lower, slip = fired[:n], fired[n : 2 * n], fired[2 * n :]
-    released = jnp.where(upper, 1.0, jnp.where(lower, -1.0, jnp.zeros_like(mode)))
-    new = next_modes(found, mode, (mode == 0) | slip, released)
+    new = next_modes(found, mode, (mode == 0) | fired, fired & (mode == 0))
     return y._replace(qd=stop_slip(found, y.qd, new == 0)), new
 
 
@@ -162,7 +159,7 @@ def scene_modes(t: Float[Array, ""], y: State, scene: Scene) -> tuple[State, Flo
     elements = [effect for effect in scene.effects if isinstance(effect, Friction) and effect.exact]
     speed = jnp.stack([jnp.sum(jnp.abs(e.direction(y.q) * y.qd)) + jnp.abs(e.belt(t)) for e in elements])
     still = jnp.abs(found.v) <= 8.0 * float(jnp.finfo(y.q.dtype).eps) * jax.lax.stop_gradient(speed)
-    mode = next_modes(found, jnp.sign(found.v), still, none)
+    mode = next_modes(found, jnp.sign(found.v), still, jnp.zeros_like(still))
     return y._replace(qd=stop_slip(found, y.qd, mode == 0)), mode
 
 

@@ -107,7 +107,7 @@ def end_code(
     code = jnp.where(early, code, SUCCESS)
     if ending is not None:
         count = len(scene.exact_names)
-        element = jnp.argmax(jnp.max(jnp.reshape(ending.fired, (3, count)), axis=0))
+        element = jnp.argmax(ending.fired)
         first = len(outcome_messages(scene, y.q.shape[0])) - count
         chatters, full = ending.trouble == ACCUMULATION, ending.trouble == TOO_MANY
         code = jnp.where(early & chatters, first + element, jnp.where(early & full, MAX_EVENTS, code))

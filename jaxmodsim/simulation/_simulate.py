@@ -53,8 +53,9 @@ def simulate(
     - `z0`: initial own states of effects, by effect name; those left out start at rest.
     - `rtol`, `atol`: relative and absolute tolerance of the local error.
     - `dt`: fixed step [s], > 0, instead of tolerances.
-    - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`), and
-      `diffrax.Tsit5` otherwise.
+    - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`), else
+      `diffrax.Dopri8` where laws run by events, else `diffrax.Tsit5`. For batches of thousands of small scenes with
+      events `Rodas5P` is the fastest.
     - `adjoint`: how diffrax differentiates the run. By default for reverse mode (`jax.grad`); pass
       `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`.
     - `max_steps`: limit of the number of steps.
@@ -115,6 +116,11 @@ def _problem(
     """Convert and check all numbers of a run."""
     if not isinstance(scene, Scene):
         raise ValueError(f"simulate needs a Scene, but a {type(scene).__name__} was given.")
+    # A list may hold numbers that are traced, as in qd0=[scene.params["v"]].
+    q0, qd0, ts = (
+        jnp.asarray(value) if isinstance(value, list | tuple) and not _known(*value) else value
+        for value in (q0, qd0, ts)
+    )
     given = {"q0": q0, "qd0": qd0, "t1": t1, "t0": t0, "rtol": rtol, "atol": atol}
     given |= {name: value for name, value in (("ts", ts), ("dt", dt)) if value is not None}
     for name, value in given.items():

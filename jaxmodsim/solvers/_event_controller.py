@@ -9,6 +9,7 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
+from ..numerics import once, unit_of
 from ._event_state import ACCUMULATION, TOO_MANY, EventState
 
 # How often a step may shrink only because its guards are not resolved.
@@ -111,6 +112,7 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
         passed = keep & (aim < 1.0) & ~landed
         doubtful = keep & ~passed & (room < 0.9) & (old.doubts < _MAX_DOUBTS) & ~landed
         accept = keep & ~passed & ~doubtful
+        accept = once(jnp.where(accept, 1.0, jnp.zeros_like(length)), unit_of(length)) > 0.5
         landed = landed & accept
 
         shortest = jnp.maximum(4.0 * float(jnp.finfo(length.dtype).eps) * jnp.abs(t0), _SHORTEST * length)

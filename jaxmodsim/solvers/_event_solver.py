@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ..numerics import first_root, watch
+from ..numerics import first_root, once, unit_of, watch
 from ._event_state import ACCUMULATION, NO_TROUBLE, TOO_MANY, EventLog, EventState, write
 
 # How far beside the root a step may end, as a fraction of the step; from there the state is carried to the root, with
@@ -228,8 +228,9 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         t_one, t_two = t0 + (t1 - t0) / 3.0, t0 + (t1 - t0) * (2.0 / 3.0)
         inside = [self._guards(t, y0._replace(y=path.evaluate(t)), args) for t in (t_one, t_two)]
         end = self._guards(t1, y0._replace(y=y1), args)
-        one, two, end = (_constant(value) for value in (*inside, end))
-        seen = watch((y0.guard, one, two, end), y0.armed > 0.5)
+        unit = unit_of(_constant(t1 - t0))
+        one, two, end = once(_constant((*inside, end)), unit)
+        seen = watch((y0.guard, one, two, end), y0.armed > 0.5, unit)
 
         # Around t0 = 0 the resolution of time is that of the step itself.
         length = _constant(t1 - t0)
@@ -247,14 +248,15 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         landed = jnp.any(here) & ~missed & (length > 0)
         fired = here & landed
         first = jnp.arange(fired.shape[0]) == jnp.argmin(jnp.where(fired, seen.ahead, jnp.inf))
-        aim = jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0))
+        aim = once(jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0)), unit)
+        landed = once(jnp.where(landed, 1.0, jnp.zeros_like(aim)), unit) > 0.5
         state1 = y0._replace(
             y=y1,
             guard=end,
             armed=jnp.where(seen.armed, 1.0, jnp.zeros_like(end)),
             landed=jnp.where(landed, 1.0, jnp.zeros_like(aim)),
             aim=aim,
-            room=jnp.cbrt(jnp.min(seen.clarity)),
+            room=once(jnp.cbrt(jnp.min(seen.clarity)), unit),
         )
         state1 = jax.lax.cond(
             landed,
@@ -299,7 +301,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         middle = field(t + 0.5 * way, state._replace(y=_along(state.y, 0.5 * way, slope)))
         there = _along(state.y, way, middle)
         rest = jnp.where(on_root, -guard(t + way, there) / rate, 0.0)
-        te, before = t + way + rest, state._replace(y=_along(there, rest, middle))
+        unit = unit_of(pace)
+        te, before = t + way + rest, state._replace(y=once(_along(there, rest, middle), unit))
 
         spread = jnp.where(state.count == 0, te - state.t, jnp.maximum(te - state.t, _FORGET * state.spread))
         spread = _constant(spread)
@@ -312,13 +315,14 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             held = self.hold(te, before, args, fired)
             after = jtu.tree_map(lambda a, b: jnp.where(dense_events, a, b), held, after)
             trouble = jnp.zeros_like(spread)
+        after = after._replace(y=once(after.y, unit), mode=once(after.mode, unit))
         count = state.count + 1.0
         trouble = jnp.where((trouble == NO_TROUBLE) & (count >= self.max_events), TOO_MANY, trouble)
 
         back = -(way + rest)
         slope = field(te, after)
         middle = field(te + 0.5 * back, after._replace(y=_along(after.y, 0.5 * back, slope)))
-        end = after._replace(y=_along(after.y, back, middle))
+        end = after._replace(y=once(_along(after.y, back, middle), unit))
         guard_new = self._guards(t, end, args)
         flags = jnp.where(fired, 1.0, jnp.zeros_like(guard_new))
         log = state.log

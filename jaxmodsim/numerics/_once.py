@@ -1,0 +1,28 @@
+"""Values that XLA shall compute once."""
+
+from typing import TypeVar
+
+import jax
+from jaxtyping import Array, Float
+
+_Tree = TypeVar("_Tree")
+
+
+def once(tree: _Tree, unit: Float[Array, ""]) -> _Tree:
+    """The arrays of `tree`, divided by one.
+
+    XLA on CPU puts cheap operations into every kernel that needs their result, so that under `jax.vmap` a long chain is
+    computed over and over, once for each leaf of what a loop carries. A division it computes once, and keeps.
+    At the joints of a solver step that is worth a factor of 5.
+
+    **Arguments:**
+
+    - `tree`: arrays of any shape.
+    - `unit`: a one that XLA cannot know to be one, from `unit_of`.
+    """
+    return jax.tree.map(lambda x: x / unit.astype(x.dtype), tree)
+
+
+def unit_of(x: Float[Array, ""]) -> Float[Array, ""]:
+    """One, made from any finite number that is not known while compiling."""
+    return 1.0 + 0.0 * x
