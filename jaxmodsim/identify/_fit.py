@@ -73,7 +73,7 @@ def fit(
         )
     if scene.exact_names:
         raise ValueError(
-            f"fit integrates with fixed steps and has no events yet, but {', '.join(scene.exact_names)} would need them:"
+            f"fit integrates with fixed steps and knows no events, but {', '.join(scene.exact_names)} would need them:"
             " wrap the law, as in Regularized(law, width)."
         )
     for label, count in (("substeps", substeps), ("max_steps", max_steps)):

@@ -39,8 +39,9 @@ def watch(values: tuple[Numbers, Numbers, Numbers, Numbers], armed: Flags) -> Wa
     """First fall through zero of functions known at 0, 1/3, 2/3 and 1 of a step.
 
     Between the points each is the cubic through them, whose own minimum counts as a fifth point. If it is not armed, it
-    must be seen positive, or rise from zero at the start, before it can fall. The third difference of the four values, the cubic's share in them, is
-    held below 0.3 of their range and 10 times the height of the minimum: more could hide a crossing.
+    must be seen positive, or rise from zero at the start, before it can fall. The third difference of the four values,
+    the cubic's share in them, is held below 0.3 of their range and 10 times the height of the minimum: more could hide
+    a crossing.
 
     **Arguments:**
 

@@ -26,7 +26,6 @@ from ..scene import (
 from ..solvers import EventController, EventLog, EventSolver, EventState, FiniteSteps, Rodas5P
 from ._outcome import SUCCESS, Ending, end_code, start_code
 
-
 # Part of the absolute tolerance below which a slip velocity counts as none.
 _REST = 1e-3
 

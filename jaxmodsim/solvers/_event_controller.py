@@ -43,8 +43,8 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
     """Wrap a step size controller so that steps end on the events that `EventSolver` sees.
 
     A step that passes a root of a guard is rejected and aimed at it, until one lands; the step after an event is as
-    long as the error last allowed. A step that does not resolve the guards is made smaller. Everything else is the wrapped
-    controller's.
+    long as the error last allowed. A step that does not resolve the guards is made smaller. Everything else is the
+    wrapped controller's.
 
     **Arguments:**
 
@@ -53,18 +53,21 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
 
     controller: dfx.AbstractStepSizeController
 
+    def __init__(self, controller: dfx.AbstractStepSizeController):
+        self.controller = controller
+
     @property
-    def rtol(self) -> Any:
+    def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Relative tolerance of the wrapped controller, for implicit solvers; NaN if it has none."""
         return getattr(self.controller, "rtol", float("nan"))
 
     @property
-    def atol(self) -> Any:
+    def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Absolute tolerance of the wrapped controller, for implicit solvers; NaN if it has none."""
         return getattr(self.controller, "atol", float("nan"))
 
     @property
-    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Norm of the wrapped controller, for implicit solvers."""
         return getattr(self.controller, "norm", optx.max_norm)
 

@@ -1,7 +1,7 @@
 """A solver wrapper that makes events non-terminating."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import diffrax as dfx
 import equinox as eqx
@@ -96,10 +96,10 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
       were armed stay so. A guard that the reset has made negative therefore fires at once. In such a chain
       the derivatives take the times of the later events for fixed; a `reset` that settles everything in one
       call is exact.
-    - *Within a step* a guard is the cubic through its values at 0, 1/3, 2/3 (from dense output) and 1. A crossing and its
-      return inside one step are found if the cubic sees them. A step whose cubic share is large is
-      made smaller (up to twelve times), so that guards that vary within a step are resolved, but a guard may
-      still do between four points what no cubic does: a spike there is missed.
+    - *Within a step* a guard is the cubic through its values at 0, 1/3, 2/3 (from dense output) and 1. A crossing and
+      its return inside one step are found if the cubic sees them. A step whose cubic share is large is made smaller
+      (up to twelve times), so that guards that vary within a step are resolved, but a guard may still do between four
+      points what no cubic does: a spike there is missed.
 
     The event is located on steps of the solver, not on its dense output: a step that passes a root is
     rejected and ends on it. The saved value at an event, and at t1 if that is one, is the one after the reset.
@@ -139,7 +139,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     """
 
     term_structure: ClassVar = dfx.ODETerm
-    solver: dfx.AbstractSolver
+    solver: dfx.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
     guards: Callable[..., Any]
     reset: Callable[..., Any]
     hold: Callable[..., Any] | None = None
@@ -150,15 +150,15 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     @property
     def root_finder(self) -> Any:
         """That of the wrapped solver, if it is implicit: diffrax gives it the tolerances of the controller."""
-        return self.solver.root_finder
+        return cast(Any, self.solver).root_finder
 
     @property
     def scan_kind(self) -> Any:
         """That of the wrapped solver, if it is a Runge-Kutta method: diffrax sets it for the kind of derivative."""
-        return self.solver.scan_kind
+        return cast(Any, self.solver).scan_kind
 
     @property
-    def interpolation_cls(self) -> Any:
+    def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Interpolation of the wrapped solver, with the event at the end of the step."""
 
         def interpolation(*, t0: Any, t1: Any, inner: Any, state0: Any, state1: Any) -> _EventInterpolation:
@@ -228,8 +228,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         t_one, t_two = t0 + (t1 - t0) / 3.0, t0 + (t1 - t0) * (2.0 / 3.0)
         inside = [self._guards(t, y0._replace(y=path.evaluate(t)), args) for t in (t_one, t_two)]
         end = self._guards(t1, y0._replace(y=y1), args)
-        values = tuple(_constant(value) for value in (y0.guard, *inside, end))
-        seen = watch(values, y0.armed > 0.5)
+        one, two, end = (_constant(value) for value in (*inside, end))
+        seen = watch((y0.guard, one, two, end), y0.armed > 0.5)
 
         # Around t0 = 0 the resolution of time is that of the step itself.
         length = _constant(t1 - t0)
@@ -304,7 +304,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         eps = float(jnp.finfo(spread.dtype).eps)
         dense_events = (state.count >= 8) & (spread <= _ACCUMULATION * eps**0.5 * jnp.abs(_constant(te)))
         after = self.reset(te, before, args, fired)
-        trouble = jnp.where(dense_events, ACCUMULATION, NO_TROUBLE)
+        trouble = jnp.where(dense_events, jnp.asarray(ACCUMULATION, spread.dtype), NO_TROUBLE)
         if self.hold is not None:
             held = self.hold(te, before, args, fired)
             after = jtu.tree_map(lambda a, b: jnp.where(dense_events, a, b), held, after)
@@ -334,7 +334,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             trouble=trouble,
             fired=flags,
             log=log,
-            guard=guard_new,
+            guard=_constant(guard_new),
             armed=jnp.where(armed, 1.0, jnp.zeros_like(guard_new)),
             spread=spread,
         )
