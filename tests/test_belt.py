@@ -63,9 +63,33 @@ def end(start: Start, t1: Any, adjoint: Any) -> End:
 
 
 values = jax.jit(jax.vmap(observe, in_axes=(0, 0, None)))
-# Derivatives of each number of `End` by each number of `Start`.
-forward = jax.jit(jax.jacfwd(partial(end, adjoint=dfx.ForwardMode())))
-reverse = jax.jit(jax.jacrev(partial(end, adjoint=None)))
+
+
+@jax.jit
+@jax.grad
+def reverse(start: Start, t1: Any, weights: End) -> Any:
+    products = jax.tree.map(lambda x, y: jnp.sum(x * y), weights, end(start, t1, None))
+    return sum(products)
+
+
+jacobian = jax.jit(jax.jacfwd(partial(end, adjoint=dfx.ForwardMode())))
+
+
+def forward(start: Start, t1: Any, weights: End) -> Start:
+    columns = jacobian(start, t1)
+    parts = jax.tree.map(
+        lambda w, column: jax.tree.map(lambda x: jnp.tensordot(w, x, w.ndim), column), weights, columns
+    )
+    return jax.tree.map(lambda *x: sum(x), *parts)
+
+
+def pick(*, t: dict[int, float] | None = None, q: float = 0.0, qd: float = 0.0) -> End:
+    """Weights of the numbers of an `End`: the derivatives are those of the weighted sum."""
+    times = np.zeros(EVENTS)
+    for i, weight in (t or {}).items():
+        times[i] = weight
+    return End(jnp.asarray(times), jnp.asarray(q), jnp.asarray(qd))
+
 
 # On a table: several half cycles, with and without stiction, and a start within the range of rest.
 SPRINGS = [
@@ -209,15 +233,16 @@ period_slopes = jax.jit(jax.grad(lambda n: problems.belt_oscillator_cycle(**n).p
 def test_derivatives_of_braked_spring_and_belt_oscillator(derivatives: Any) -> None:
     """One test for both, and for single events, as they share the compiled code."""
     for numbers in SPRINGS:
-        got = derivatives(spring(numbers), spring_end(numbers))
+        start, t1 = spring(numbers), spring_end(numbers)
         exact, n = rest_slopes(floats(numbers)), int(problems.braked_spring_rest(**numbers).half_cycles)
-        place, stop = by_number(got.q), by_number(jax.tree.map(lambda x, n=n: x[n - 1], got.t))
+        place = by_number(derivatives(start, t1, pick(q=1.0)))
+        stop = by_number(derivatives(start, t1, pick(t={n - 1: 1.0} if n else None)))
         for name in numbers:
             np.testing.assert_allclose(place[name], exact.x[name], atol=1e-8, err_msg=f"place by {name}")
-            np.testing.assert_allclose(stop[name] * (n > 0), exact.t[name], atol=1e-8, err_msg=f"stop by {name}")
+            np.testing.assert_allclose(stop[name], exact.t[name], atol=1e-8, err_msg=f"stop by {name}")
     for numbers in BELTS:
-        got = derivatives(belt(numbers), belt_end(numbers))
-        period, exact = by_number(jax.tree.map(lambda x: x[3] - x[1], got.t)), period_slopes(floats(numbers))
+        period = by_number(derivatives(belt(numbers), belt_end(numbers), pick(t={3: 1.0, 1: -1.0})))
+        exact = period_slopes(floats(numbers))
         for name in numbers:
             np.testing.assert_allclose(period[name], exact[name], rtol=1e-8, atol=1e-8, err_msg=f"period by {name}")
         # The cycle forgets where it began.
@@ -230,7 +255,7 @@ def check_saltation(derivatives: Any) -> None:
     m, k, fc, fs, x0, v0 = 1.3, 2.7, 0.4, 0.6, 0.5, 0.8
     w = np.sqrt(k / m)
     # Under +Fc the mass swings about -Fc/k.
-    event = np.arctan2(v0 / w, x0 + fc / k) / w
+    event = float(np.arctan2(v0 / w, x0 + fc / k) / w)
     top = np.hypot(x0 + fc / k, v0 / w) - fc / k
 
     def way(t: float) -> np.ndarray:
@@ -240,8 +265,8 @@ def check_saltation(derivatives: Any) -> None:
     for low, high, after in ((fc, fs, "slip"), (fc, 3.0, "stick")):
         numbers = {"m": m, "k": k, "Fc": low, "Fs": high, "x0": x0}
         start = spring(numbers)._replace(qd0=jnp.array([v0]))
-        got = derivatives(start, event + 0.2)
-        after_by_before = np.array([[y.q0[0], y.qd0[0]] for y in (got.q, got.qd)])
+        rows = [derivatives(start, event + 0.2, weights) for weights in (pick(q=1.0), pick(qd=1.0))]
+        after_by_before = np.array([[row.q0[0], row.qd0[0]] for row in rows])
         a_minus, a_plus = -k * top - low, -k * top + low
         if after == "slip":
             assert k * top > high
