@@ -206,7 +206,7 @@ def _many_runs(count: int, rounds: int) -> dict[str, Any]:
 
 
 def _compile_times(smoke: bool) -> dict[str, Any]:
-    """Time to trace, lower and compile, from cleared caches, in turns.
+    """Time to trace, lower and compile, from cleared caches: the shortest of three turns, of gradients one.
 
     The legs that are written out end after 5 s, ours after 5 s, 60 s and 600 s, with ten times the events each.
     """
@@ -221,10 +221,11 @@ def _compile_times(smoke: bool) -> dict[str, Any]:
     if smoke:
         runs = {SCANNED: runs[SCANNED]}
     times: dict[str, list[float]] = {name: [] for name in runs}
-    for _ in range(1 if smoke else 3):
+    for turn in range(1 if smoke else 3):
         for name, run in runs.items():
-            times[name].append(_compile_time(run))
-    found = {name: {"median_s": float(np.median(taken)), "all_s": taken} for name, taken in times.items()}
+            if turn == 0 or not name.endswith("gradient"):
+                times[name].append(_compile_time(run))
+    found = {name: {"minimum_s": min(taken), "all_s": taken} for name, taken in times.items()}
     ends = {f"{OURS}, 60 s": T1, f"{OURS}, 600 s": 10 * T1, f"legs written out, {legs - 1} events": SHORT}
     for name in set(ends) & set(found):
         found[name]["events"] = events_until(ends[name])
@@ -312,13 +313,12 @@ def draw(content: dict[str, Any], path: Path) -> None:
     left.loglog(rtol, rtol, ":", color="0.5", label="error = rtol")
     left.set_ylabel("relative error of the period [1]")
     left.legend()
-    right.semilogx(rtol, [1e3 * row["median_s"] for row in rows], "s-", ms=4.5)
+    right.loglog(rtol, [1e3 * row["median_s"] for row in rows], "s-", ms=4.5)
     right.set_ylabel("time of one run of 60 s, warm [ms]")
-    right.set_ylim(bottom=0.0)
     for axes in (left, right):
         axes.set_xlabel("relative tolerance [1]")
         axes.invert_xaxis()
-        axes.grid(which="both", alpha=0.25)
+        axes.grid(which="major", alpha=0.3)
     figure.suptitle("Belt oscillator: period of the stick-slip cycle against the tolerance")
     figure.savefig(path, dpi=150)
     plt.close(figure)
@@ -338,6 +338,7 @@ def _jaxonomy(interpreter: str | None) -> dict[str, Any]:
     for label, tuned in ((SHIPPED, False), (TUNED, True)):
         task = {"tuned": tuned, "nominal": NOMINAL.tolist(), "sets": sets.tolist(), "ladder": LADDER, "rtol": RTOL}
         task |= {"t1": T1, "atol": ATOL, "max_events": events_until(T1) + 32, "rounds": 25}
+        before = numpy_workload_s()
         done = subprocess.run(
             [interpreter, str(Path(__file__).parent / "_jaxonomy_stick_slip.py")],
             input=json.dumps(task),
@@ -350,7 +351,7 @@ def _jaxonomy(interpreter: str | None) -> dict[str, Any]:
             reason = (done.stderr.strip().splitlines() or ["no output"])[-1]
             return {"missing": f"its script failed: {reason[:200]}"}
         row = json.loads(lines[0].removeprefix("RESULT "))
-        ours = numpy_workload_s()
+        ours = min(before, numpy_workload_s())
         scale = ours / row["numpy_workload_s"]
         row["ladder"] = [{"rtol": rtol, "error": _largest(ends, exact)} for rtol, ends in row.pop("ends")]
         row["times"] = {name: _rescaled(each, scale) for name, each in row["times"].items()}
@@ -438,21 +439,25 @@ def _row(name: str, ladder: Any, goal: float, timed: Any, gradient: Any, many: A
 def _compile_table(content: dict[str, Any]) -> dict[str, Any]:
     found = content["compile"]
     rows = [
-        [name, str(row.get("events", "-")), f"{row['median_s']:.2f}", _seconds(found.get(f"{name}: gradient"))]
+        [name, str(row.get("events", "-")), f"{row['minimum_s']:.2f}", _seconds(found.get(f"{name}: gradient"))]
         for name, row in found.items()
         if not name.endswith("gradient")
     ]
     columns = ["program", "events", "compilation of a run [s]", "of its reverse gradient [s]"]
-    return {"caption": f"Time to trace and compile, {_caption(content)}", "columns": columns, "rows": rows}
+    return {
+        "caption": f"Time to trace and compile, shortest of three, {_caption(content)}",
+        "columns": columns,
+        "rows": rows,
+    }
 
 
 def _seconds(row: dict[str, Any] | None) -> str:
-    return "-" if row is None else f"{row['median_s']:.2f}"
+    return "-" if row is None else f"{row['minimum_s']:.2f}"
 
 
 def _target_table(content: dict[str, Any]) -> dict[str, Any]:
     times, ladder, goal = content["one_run"]["times"], content["ladder"], content["one_run"]["goal"]
-    compile_s = {name: row["median_s"] for name, row in content["compile"].items()}
+    compile_s = {name: row["minimum_s"] for name, row in content["compile"].items()}
     picks = [(f"scipy {method}", _choose(ladder[f"scipy {method}"], goal)) for method in SCIPY]
     scipy = [times[f"{name} {row['rtol']:g}"]["median_s"] for name, row in picks if row]
     written = f"legs written out, {events_until(SHORT)} events"

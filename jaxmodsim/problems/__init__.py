@@ -1,5 +1,21 @@
 """Reference systems by name, each with its exact or reference solution."""
 
+from ._ball import BouncingBall as BouncingBall
+from ._ball import bouncing_ball_bounces as bouncing_ball_bounces
+from ._ball import bouncing_ball_motion as bouncing_ball_motion
+from ._ball import bouncing_ball_rest as bouncing_ball_rest
+from ._belt import BELT_OSCILLATOR as BELT_OSCILLATOR
+from ._belt import BELT_STRIBECK as BELT_STRIBECK
+from ._belt import BeltCycle as BeltCycle
+from ._belt import belt_coulomb as belt_coulomb
+from ._belt import belt_oscillator as belt_oscillator
+from ._belt import belt_oscillator_cycle as belt_oscillator_cycle
+from ._belt import belt_stribeck as belt_stribeck
+from ._belts import COUPLED_BELTS as COUPLED_BELTS
+from ._belts import COUPLED_BELTS_LAWS as COUPLED_BELTS_LAWS
+from ._belts import FirstSlip as FirstSlip
+from ._belts import coupled_belts as coupled_belts
+from ._belts import coupled_belts_first_slip as coupled_belts_first_slip
 from ._box import BOX_LUGRE_V10 as BOX_LUGRE_V10
 from ._box import BOX_LUGRE_Z10 as BOX_LUGRE_Z10
 from ._box import box_coulomb as box_coulomb
@@ -21,3 +37,6 @@ from ._spring import braked_spring as braked_spring
 from ._spring import braked_spring_law as braked_spring_law
 from ._spring import braked_spring_motion as braked_spring_motion
 from ._spring import braked_spring_rest as braked_spring_rest
+from ._stick_slip_pendulum import STICK_SLIP_PENDULUM as STICK_SLIP_PENDULUM
+from ._stick_slip_pendulum import stick_slip_pendulum as stick_slip_pendulum
+from ._stick_slip_pendulum import stick_slip_pendulum_turn as stick_slip_pendulum_turn

@@ -1,0 +1,103 @@
+"""A ball that bounces on the floor: infinitely many events in a finite time."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from ..numerics import Number, check_ranges, parameter
+
+
+class BouncingBall(eqx.Module):
+    """A point mass falling on a floor that gives a part of its speed back, as functions for `jaxmodsim.EventSolver`.
+
+    ```python
+    ball = BouncingBall(e=0.5)
+    solver = jaxmodsim.EventSolver(diffrax.Tsit5(), ball.guards, ball.reset, hold=ball.hold)
+    start = solver.start(0.0, ball.dropped(h=1.0), mode=0.0)
+    diffrax.diffeqsolve(diffrax.ODETerm(ball.field), solver, 0.0, 1.0, None, start, ...)
+    ```
+
+    What is integrated is (height [m], velocity [m/s]), positive upwards, shape `[2]`; the mode is 0, and 1 once the
+    ball lies on the floor, which only `hold` makes it do. The instants of the bounces: `bouncing_ball_bounces`; the
+    motion: `bouncing_ball_motion`; the end of all bounces: `bouncing_ball_rest`.
+
+    **Arguments:**
+
+    - `e`: coefficient of restitution, > 0, below 1 if it is to come to rest.
+    - `g`: gravity [m/s^2], > 0.
+    """
+
+    e: Number = parameter("e", "", lower=0.0, strict=True)
+    g: Number = parameter("g", "m/s^2", lower=0.0, strict=True, default=9.81)
+
+    def __check_init__(self) -> None:
+        """Refuse numbers out of range."""
+        check_ranges(self)
+
+    def dropped(self, h: ArrayLike) -> Float[Array, "2"]:
+        """What is integrated, at rest at the height `h` [m], > 0."""
+        h = jnp.asarray(h, self.g.dtype)
+        return jnp.stack([h, jnp.zeros_like(h)])
+
+    def field(self, t: Any, s: Any, args: Any) -> Any:
+        """Rate: in free fall, or zero on the floor."""
+        del t, args
+        return s.rate(jnp.where(s.mode > 0.5, 0.0, jnp.stack([s.y[1], -self.g])))
+
+    def guards(self, t: Any, s: Any, args: Any) -> Float[Array, "1"]:
+        """Height above the floor [m]."""
+        del t, args
+        return s.y[:1]
+
+    def reset(self, t: Any, s: Any, args: Any, fired: Bool[Array, "1"]) -> Any:
+        """Bounce: the velocity changes its sign and keeps the part e."""
+        del t, args, fired
+        return s._replace(y=jnp.stack([jnp.zeros_like(s.y[0]), -self.e * s.y[1]]))
+
+    def hold(self, t: Any, s: Any, args: Any, fired: Bool[Array, "1"]) -> Any:
+        """Come to rest on the floor."""
+        del t, args, fired
+        return s._replace(y=jnp.zeros_like(s.y), mode=jnp.ones_like(s.mode))
+
+
+def bouncing_ball_bounces(n: int, *, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81) -> Float[Array, " n"]:
+    """Times [s] of the first `n` bounces, dropped from `h` at t = 0: `sqrt(2 h/g) (1 + 2 (e + e^2 + ...))`.
+
+    **Arguments:**
+
+    - `n`: how many, > 0.
+    - `h`: height [m], > 0.
+    - `e`: coefficient of restitution, > 0.
+    - `g`: gravity [m/s^2], > 0.
+    """
+    powers = jnp.asarray(e) ** jnp.arange(1, n)
+    return jnp.sqrt(2.0 * h / jnp.asarray(g)) * jnp.concatenate([jnp.ones(1), 1.0 + 2.0 * jnp.cumsum(powers)])
+
+
+def bouncing_ball_rest(*, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81) -> Float[Array, ""]:
+    """Time [s] at which all bounces are over: `sqrt(2 h/g) (1 + e)/(1 - e)`; e < 1, else as `bouncing_ball_bounces`."""
+    e = jnp.asarray(e)
+    return jnp.sqrt(2.0 * h / jnp.asarray(g)) * (1.0 + e) / (1.0 - e)
+
+
+def bouncing_ball_motion(
+    t: Float[Array, "..."], *, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Height [m] and velocity [m/s] at the times `t` [s], dropped from `h` at t = 0; shape as `t`.
+
+    The time that is left before rest, in units of what is left after the first bounce, falls by the factor e from
+    bounce to bounce, so its logarithm counts them. From bounce n on it is a throw at `e^n sqrt(2 g h)`. Arguments as
+    for `bouncing_ball_rest`, t >= 0.
+    """
+    g = jnp.asarray(g)
+    fall, end = jnp.sqrt(2.0 * h / g), bouncing_ball_rest(h=h, e=e, g=g)
+    bouncing = (t >= fall) & (t < end)
+    left = jnp.where(bouncing, (end - t) / (end - fall), 1.0)
+    n = 1.0 + jnp.floor(jnp.log(left) / jnp.log(e))
+    speed = e**n * g * fall
+    since = t - (end - (end - fall) * e ** (n - 1.0))
+    height = jnp.where(bouncing, speed * since - 0.5 * g * since**2, h - 0.5 * g * t**2)
+    velocity = jnp.where(bouncing, speed - g * since, -g * t)
+    return jnp.where(t < end, height, 0.0), jnp.where(t < end, velocity, 0.0)

@@ -1,0 +1,98 @@
+"""Two masses on one belt, each on a spring of its own and coupled by a third."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from ..effects import Friction
+from ..friction import Coulomb
+from ..scene import Scene
+
+# Masses [kg], stiffnesses [N/m] to the ground and between the masses, belt [m/s].
+COUPLED_BELTS = {"m1": 1.0, "m2": 1.6, "k1": 100.0, "k2": 130.0, "coupling": 35.0, "belt": 0.1}
+# Forces [N] in slip and largest in stick, of either mass.
+COUPLED_BELTS_LAWS = ({"Fc": 5.0, "Fs": 8.0}, {"Fc": 6.0, "Fs": 9.5})
+
+
+class FirstSlip(NamedTuple):
+    """The first slip: at the time `t` [s], of the mass `which` (0 or 1), with both at the position `x` [m]."""
+
+    t: Float[Array, ""]
+    which: Int[Array, ""]
+    x: Float[Array, ""]
+
+
+def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del t
+    kinetic = 0.5 * p["m1"] * qd[0] ** 2 + 0.5 * p["m2"] * qd[1] ** 2
+    springs = 0.5 * p["k1"] * q[0] ** 2 + 0.5 * p["k2"] * q[1] ** 2 + 0.5 * p["coupling"] * (q[0] - q[1]) ** 2
+    return kinetic - springs
+
+
+def _first(q: Array) -> Array:
+    return q[0]
+
+
+def _second(q: Array) -> Array:
+    return q[1]
+
+
+def coupled_belts(
+    laws: tuple[Any, Any] | None = None,
+    *,
+    m1: ArrayLike = COUPLED_BELTS["m1"],
+    m2: ArrayLike = COUPLED_BELTS["m2"],
+    k1: ArrayLike = COUPLED_BELTS["k1"],
+    k2: ArrayLike = COUPLED_BELTS["k2"],
+    coupling: ArrayLike = COUPLED_BELTS["coupling"],
+    belt: ArrayLike = COUPLED_BELTS["belt"],
+) -> Scene:
+    """Two masses on a belt: `m1 x1'' = -k1 x1 - c (x1 - x2) - F1`, `m2 x2'' = -k2 x2 + c (x1 - x2) - F2`.
+
+    While one mass sticks, the slip of the other changes its load; they come to slip in turns that follow no simple
+    pattern. Between events the motion is linear.
+
+    **Arguments:**
+
+    - `laws`: friction laws of the two masses; None for Coulomb friction by `COUPLED_BELTS_LAWS`.
+    - `m1`, `m2`: masses [kg], > 0.
+    - `k1`, `k2`: stiffnesses of the springs to the ground [N/m], > 0, relaxed at q = 0.
+    - `coupling`: stiffness c of the spring between the masses [N/m], >= 0, relaxed at q[0] = q[1].
+    - `belt`: velocity of the belt [m/s].
+
+    **Returns:**
+
+    A `Scene` with two coordinates [m] and the effects `first` and `second`. Its start: `coupled_belts_first_slip`.
+    """
+    one, two = (Coulomb(**law) for law in COUPLED_BELTS_LAWS) if laws is None else laws
+    return Scene(
+        _lagrangian,
+        params={"m1": m1, "m2": m2, "k1": k1, "k2": k2, "coupling": coupling},
+        effects=(
+            Friction(one, along=_first, belt_velocity=belt, name="first"),
+            Friction(two, along=_second, belt_velocity=belt, name="second"),
+        ),
+    )
+
+
+def coupled_belts_first_slip(
+    *, k1: ArrayLike, k2: ArrayLike, belt: ArrayLike, Fs1: ArrayLike, Fs2: ArrayLike
+) -> FirstSlip:
+    """When, where and which of the two slips first, if both start in stick from q = 0.
+
+    Until then both go with the belt and the spring between them stays relaxed: mass i slips when `k_i belt t` reaches
+    its limit, so `t = min(Fs1/k1, Fs2/k2)/belt`.
+
+    **Arguments:**
+
+    - `k1`, `k2`: stiffnesses to the ground [N/m], > 0.
+    - `belt`: velocity of the belt [m/s], > 0.
+    - `Fs1`, `Fs2`: largest forces in stick [N], >= 0.
+
+    **Returns:**
+
+    A `FirstSlip`.
+    """
+    places = jnp.stack([jnp.asarray(Fs1) / k1, jnp.asarray(Fs2) / k2])
+    return FirstSlip(jnp.min(places) / belt, jnp.argmin(places), jnp.min(places))
