@@ -53,9 +53,8 @@ def simulate(
     - `z0`: initial own states of effects, by effect name; those left out start at rest.
     - `rtol`, `atol`: relative and absolute tolerance of the local error.
     - `dt`: fixed step [s], > 0, instead of tolerances.
-    - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`), else
-      `diffrax.Dopri8` where laws run by events, else `diffrax.Tsit5`. For batches of thousands of small scenes with
-      events `Rodas5P` is the fastest.
+    - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`) or runs by
+      events (set-valued laws), and `diffrax.Tsit5` otherwise.
     - `adjoint`: how diffrax differentiates the run. By default for reverse mode (`jax.grad`); pass
       `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`.
     - `max_steps`: limit of the number of steps.

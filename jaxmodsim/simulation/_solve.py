@@ -86,13 +86,13 @@ class Solved(NamedTuple):
 
 
 def default_solver(scene: Scene, fixed_step: bool) -> dfx.AbstractSolver:
-    """Rodas5P where an effect of the scene is stiff, else Dopri8 between events, else Tsit5.
+    """Rodas5P where an effect of the scene is stiff or runs by events, Tsit5 otherwise.
 
-    Every event costs about two steps whatever the method, and every step a look at the guards: long steps pay.
+    Every step of a run with events looks at the guards, whatever the method: Rodas5P makes the fewest of those whose
+    dense output keeps the tolerance, and is twice as fast as Tsit5 under vmap.
     """
-    if any(effect.stiff for effect in scene.effects):
-        return Rodas5P(pivot=fixed_step)
-    return dfx.Dopri8() if scene.exact_names and not fixed_step else dfx.Tsit5()
+    stiff = any(effect.stiff for effect in scene.effects)
+    return Rodas5P(pivot=fixed_step) if stiff or scene.exact_names else dfx.Tsit5()
 
 
 class _Flow(NamedTuple):
