@@ -12,9 +12,9 @@ from ._testbench import Measured, cases, run_case, stick_sweep
 
 PARTS = {
     "a": "a: Coulomb friction by sign(v)",
-    "b": "b: Coulomb friction, regularised",
+    "b": "b: Coulomb friction, exact and regularised",
     "c": "c: Karnopp's dead zone",
-    "d": "d: stiction, Stribeck effect and viscous friction, regularised",
+    "d": "d: stiction, Stribeck effect and viscous friction, exact and regularised",
     "e": "e: LuGre",
 }
 

@@ -64,12 +64,13 @@ class Measured:
 
 
 def cases() -> list[Case]:
-    """The runs of the exercise's parts a to e; b and d in their regularised form."""
+    """The runs of the exercise's parts a to e; b and d exactly, by events, and in their regularised form."""
     coulomb, stribeck = box_coulomb(), box_stribeck()
     return [
         Case("a", "sign, 1 N/s, adaptive", Sign(coulomb)),
         Case("a", "sign, 1 N/s, Euler 10 ms", Sign(coulomb), dt=FIXED_STEP, solver=dfx.Euler()),
         Case("a", "sign, 3 N/s, Euler 10 ms", Sign(coulomb), ramp=3.0, dt=FIXED_STEP, solver=dfx.Euler()),
+        Case("b", "Coulomb, exact", coulomb),
         Case("b", "Coulomb, regularised 1 mm/s", Regularized(coulomb, REGULARISED_WIDTH)),
         Case("c", "dead zone 1 m/s, v0 = 0", DeadZone(coulomb, 1.0), dt=FIXED_STEP),
         Case("c", "dead zone 1 m/s, v0 = -2 m/s", DeadZone(coulomb, 1.0), v0=-2.0, dt=FIXED_STEP),
@@ -81,6 +82,7 @@ def cases() -> list[Case]:
             dt=FIXED_STEP,
             solver=dfx.Euler(),
         ),
+        Case("d", "Stribeck, exact", stribeck),
         Case("d", "Stribeck, regularised 1 mm/s", Regularized(stribeck, REGULARISED_WIDTH)),
         Case("e", "LuGre, sigma0 750, sigma1 0", box_lugre()),
         Case("e", "LuGre, sigma0 7500, sigma1 80", box_lugre(sigma0=7500.0, sigma1=80.0)),
@@ -109,7 +111,7 @@ def run_case(case: Case) -> Measured:
     return Measured(
         case,
         drawn,
-        _break_away(drawn) if ok and not isinstance(case.law, Sign) else float("nan"),
+        _break_away(run, drawn) if ok and not isinstance(case.law, Sign) else float("nan"),
         int(np.sum(v[1:] * v[:-1] < 0)),
         int(run.stats["num_steps"]),
         elapsed,
@@ -118,8 +120,10 @@ def run_case(case: Case) -> Measured:
     )
 
 
-def _break_away(run: RampRun) -> float:
-    """Time after which friction stays behind the applied force; NaN where it never equalled it."""
+def _break_away(result: Trajectory, run: RampRun) -> float:
+    """Time of the event, or that after which friction stays behind the applied force; NaN where it never equals it."""
+    if result.mode:
+        return float(result.events.t[0])
     stuck = np.flatnonzero(np.abs(run.applied - run.friction) <= BREAK_AWAY_GAP)
     if stuck.size < 2 or stuck[-1] + 1 >= run.t.size:
         return float("nan")

@@ -153,27 +153,19 @@ def next_modes(
     mode = jnp.where(still, jnp.where(at_limit, load, jnp.zeros_like(mode)), mode)
     scale = 1e-6 * jnp.max(jnp.abs(found.coupling) * jnp.maximum(found.upper, found.lower)[None, :], axis=1)
 
-    def release(mode: Array, force: Array) -> tuple[Array, Array]:
+    def settle(i: Array, mode: Array) -> Array:
+        force = contact_forces(found, mode)
         limit = jnp.where(force > 0, found.upper, found.lower)
         least = float(jnp.finfo(limit.dtype).tiny)
         use = jnp.where(mode == 0, jnp.abs(force) / jnp.maximum(limit, least), 0.0)
         worst = (use == jnp.max(use)) & (use > wider)
-        return jnp.where(worst, jnp.sign(force), mode), jnp.any(worst)
-
-    def settle(_: object, mode: Array) -> Array:
-        force = contact_forces(found, mode)
         acceleration = found.base - jnp.sum(found.coupling * force[None, :], axis=1)
-        against = still & (mode * acceleration < -scale)
-        released, any_released = release(mode, force)
-        return jnp.where(any_released, released, jnp.where(against, jnp.zeros_like(mode), mode))
+        # Where nothing is consistent, the last word is rather a slip that ends at once, which shows as chatter, than a
+        # stick above its limit.
+        against = still & (mode * acceleration < -scale) & ~jnp.any(worst) & (i < 3 * n)
+        return jnp.where(worst, jnp.sign(force), jnp.where(against, jnp.zeros_like(mode), mode))
 
-    if n > 1:
-        mode = jax.lax.fori_loop(0, 3 * n, settle, mode)
-    # Where nothing is consistent, rather a slip that ends at once, which shows as chatter, than a stick above its
-    # limit.
-    for _ in range(n):
-        mode, _ = release(mode, contact_forces(found, mode))
-    return mode
+    return settle(jnp.asarray(3), mode) if n == 1 else jax.lax.fori_loop(0, 4 * n, settle, mode)
 
 
 def stop_slip(found: Contact, qd: Float[Array, " dof"], sticks: Bool[Array, " n"]) -> Float[Array, " dof"]:

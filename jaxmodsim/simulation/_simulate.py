@@ -53,8 +53,8 @@ def simulate(
     - `z0`: initial own states of effects, by effect name; those left out start at rest.
     - `rtol`, `atol`: relative and absolute tolerance of the local error.
     - `dt`: fixed step [s], > 0, instead of tolerances.
-    - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`) or runs by
-      events (set-valued laws), and `diffrax.Tsit5` otherwise.
+    - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`) or, on one
+      coordinate, runs by events (set-valued laws); `diffrax.Tsit5` otherwise.
     - `adjoint`: how diffrax differentiates the run. By default for reverse mode (`jax.grad`); pass
       `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`.
     - `max_steps`: limit of the number of steps.

@@ -85,14 +85,15 @@ class Solved(NamedTuple):
     stats: dict[str, Array]
 
 
-def default_solver(scene: Scene, fixed_step: bool) -> dfx.AbstractSolver:
-    """Rodas5P where an effect of the scene is stiff or runs by events, Tsit5 otherwise.
+def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolver:
+    """Rodas5P where an effect of the scene is stiff, or runs by events on one coordinate; Tsit5 otherwise.
 
-    Every step of a run with events looks at the guards, whatever the method: Rodas5P makes the fewest of those whose
-    dense output keeps the tolerance, and is twice as fast as Tsit5 under vmap.
+    Every step of a run with events looks at the guards, whatever the method. On one coordinate Rodas5P makes the fewest
+    of those whose dense output keeps the tolerance, and is twice as fast as Tsit5 under vmap; on more of them its
+    Jacobian costs more than that, most of all in compile time.
     """
     stiff = any(effect.stiff for effect in scene.effects)
-    return Rodas5P(pivot=fixed_step) if stiff or scene.exact_names else dfx.Tsit5()
+    return Rodas5P(pivot=fixed_step) if stiff or (scene.exact_names and dof == 1) else dfx.Tsit5()
 
 
 class _Flow(NamedTuple):
@@ -159,7 +160,10 @@ def _integrate(problem: Problem, options: Options, flow: _Flow, log: int | None)
     scene, exact = problem.scene, bool(problem.scene.exact_names)
     initial, mode = initial_state(problem), None
     check_scene(scene, initial)
-    solver, adjoint = default_solver(scene, problem.dt is not None), dfx.RecursiveCheckpointAdjoint()
+    solver, adjoint = (
+        default_solver(scene, initial.q.shape[0], problem.dt is not None),
+        dfx.RecursiveCheckpointAdjoint(),
+    )
     if options.solver is not None:
         solver = eqx.combine(options.solver, problem.plugins[0])
     if options.adjoint is not None:
