@@ -114,7 +114,9 @@ def stribeck_times(numbers: dict[str, Any], adjoint: Any) -> Any:
     p = dict(numbers)
     oscillator = {name: p.pop(name) for name in ("m", "k", "belt")}
     scene = problems.belt_oscillator(jms.Stribeck(**p), **oscillator)
-    arguments = {"adjoint": adjoint, "throw": False, **TIGHT}
+    # The law's second derivatives are singular at rest for exponents below 2. They enter the derivatives of an implicit
+    # step, but not those of an explicit one.
+    arguments = {"adjoint": adjoint, "throw": False, "solver": dfx.Tsit5(), **TIGHT}
     return jms.simulate(scene, jnp.zeros(1), jnp.reshape(oscillator["belt"], (1,)), 3.5, **arguments).events.t[:4]
 
 

@@ -121,6 +121,12 @@ class _Flow(NamedTuple):
         return scene_field(t, y, scene, mode)
 
 
+# A step with events evaluates field and guards a dozen times. Traced as one function each, they are traced, linearised
+# and transposed once.
+_rate = partial(jax.jit, static_argnums=0)(_Flow.rate)
+_guards = jax.jit(scene_guards)
+
+
 class _Hybrid(NamedTuple):
     """The functions of a run with modes, in the form `EventSolver` takes."""
 
@@ -129,10 +135,10 @@ class _Hybrid(NamedTuple):
     rest: Float[Array, ""]
 
     def rate(self, t: Any, s: EventState, scene: Scene) -> EventState:
-        return s.rate(self.flow.rate(t, s.y, scene, s.mode))
+        return s.rate(_rate(self.flow, t, s.y, scene, s.mode))
 
     def guards(self, t: Any, s: EventState, scene: Scene) -> Array:
-        return scene_guards(t, self.flow.state(s.y), scene, s.mode, self.rest)
+        return _guards(t, self.flow.state(s.y), scene, s.mode, self.rest)
 
     def reset(self, t: Any, s: EventState, scene: Scene, fired: Array) -> EventState:
         state, mode = scene_switch(t, self.flow.state(s.y), scene, s.mode, fired)
