@@ -126,6 +126,23 @@ def test_a_load_that_swings_within_the_limit_is_not_stepped_over() -> None:
     np.testing.assert_allclose(first, np.arcsin(1.1 / 1.15) / 20.0, rtol=1e-9)
 
 
+def pulses(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    return jnp.reshape(p["a"] * jnp.exp(200.0 * (jnp.cos(2.0 * jnp.pi * t) - 1.0)), (1,))
+
+
+def test_short_pulses_are_named_where_they_are_stepped_over_and_found_with_dtmax() -> None:
+    """Once a second a pulse of 6 N and a twentieth of a second on a box that 3 N hold."""
+    friction = Friction(Coulomb(2.0, 3.0))
+    box = Scene(masses, params={"m": 1.0, "k": 0.0, "a": 6.0}, effects=(AppliedForce(pulses), friction))
+    ts = jnp.linspace(0.5, 10.5, 201)
+    missed = simulate(box, [0.0], [0.0], 10.5, t0=0.5, ts=ts, throw=False)
+    assert "stepped over" in missed.result.message
+    found = simulate(box, [0.0], [0.0], 10.5, t0=0.5, ts=ts, dtmax=0.03)
+    assert found.stats["num_events"] == 20
+    fine = simulate(box, [0.0], [0.0], 10.5, t0=0.5, ts=ts, dt=0.002)
+    np.testing.assert_allclose(found.q, fine.q, atol=1e-6)
+
+
 def test_an_entry_above_the_limit_slips_at_once_and_in_the_direction_of_the_load() -> None:
     run = simulate(scene(Friction(Coulomb(1.0, 1.5)), k=1.0), [5.0], [0.0], 1.0, ts=jnp.array([0.0, 1.0]))
     np.testing.assert_array_equal(run.mode["friction"], [-1.0, -1.0])

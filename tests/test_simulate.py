@@ -200,15 +200,18 @@ def test_energy_balance_of_a_lagrangian_that_depends_on_time() -> None:
 
 def test_default_solver() -> None:
     smooth = problems.ramped_box(jms.Viscous(0.1))
-    assert isinstance(default_solver(smooth, fixed_step=False), dfx.Tsit5)
-    assert isinstance(default_solver(problems.ramped_box(), fixed_step=False), dfx.Tsit5)
-    assert isinstance(default_solver(problems.ramped_box(jms.Sign(jms.Coulomb(1.0))), fixed_step=False), dfx.Tsit5)
-    assert isinstance(default_solver(problems.ramped_box(problems.box_lugre()), fixed_step=False), jms.Rodas5P)
+    assert isinstance(default_solver(smooth, 1, fixed_step=False), dfx.Tsit5)
+    assert isinstance(default_solver(problems.ramped_box(), 1, fixed_step=False), dfx.Tsit5)
+    assert isinstance(default_solver(problems.ramped_box(jms.Sign(jms.Coulomb(1.0))), 1, fixed_step=False), dfx.Tsit5)
+    assert isinstance(default_solver(problems.ramped_box(problems.box_lugre()), 1, fixed_step=False), jms.Rodas5P)
     assert isinstance(
-        default_solver(problems.ramped_box(jms.Regularized(jms.Coulomb(1.0), 0.1)), fixed_step=False), jms.Rodas5P
+        default_solver(problems.ramped_box(jms.Regularized(jms.Coulomb(1.0), 0.1)), 1, fixed_step=False), jms.Rodas5P
     )
+    exact = problems.ramped_box(jms.Coulomb(1.0))
+    assert isinstance(default_solver(exact, 1, fixed_step=False), jms.Rodas5P)
+    assert isinstance(default_solver(exact, 2, fixed_step=False), dfx.Tsit5)
     # Nothing rejects a spoilt step where steps are fixed, so there the elimination swaps rows.
-    fixed = default_solver(problems.ramped_box(problems.box_lugre()), fixed_step=True)
+    fixed = default_solver(problems.ramped_box(problems.box_lugre()), 1, fixed_step=True)
     assert isinstance(fixed, jms.Rodas5P)
     assert fixed.pivot
 

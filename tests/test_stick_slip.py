@@ -316,7 +316,7 @@ def test_bouncing_ball_to_the_end_of_all_bounces() -> None:
         assert solution.result == dfx.RESULTS.dt_min_reached
         np.testing.assert_allclose(solution.ys.t[0], stop, atol=1e-8)
         np.testing.assert_allclose(solution.ts[0], stop, atol=1e-8)
-        n = int(solution.ys.count[0])
+        n = int(solution.ys.events[0])
         exact = problems.bouncing_ball_bounces(n, h=1.0, e=e)
         np.testing.assert_allclose(solution.ys.log.t[0, :n], exact, atol=1e-10)
 

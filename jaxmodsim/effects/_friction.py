@@ -57,7 +57,8 @@ class Friction(AbstractEffect):
       the slip velocity is zero and the force is what that takes, up to the law's limit. `Regularized`, `DeadZone` and
       `Sign` run it in other ways.
     - `along`: `along(q)`, the displacement [m or rad], a scalar. By default the one coordinate.
-    - `belt_velocity`: velocity [m/s or rad/s] of the surface, a number or a function of t.
+    - `belt_velocity`: velocity [m/s or rad/s] of the surface, a number or a continuous function of t; a jump would
+      carry with it what sticks.
     - `normal_force`: load [N], a number or `normal_force(t, q, qd, params)`. Then the law's forces are per newton of
       load (`Fc` is the coefficient of friction), and a negative load, which is lift-off, gives no friction. By
       default the law's forces are in newtons.

@@ -36,7 +36,7 @@ class AbstractForceLaw(AbstractLaw):
 class AbstractSetValuedLaw(AbstractLaw):
     """A law whose force at rest may be anything up to a limit: a rule for slip and a limit of stick.
 
-    Such a law says nothing yet about how it is executed; `Regularized`, `DeadZone` and `Sign` do.
+    By itself it runs exactly, by events; `Regularized`, `DeadZone` and `Sign` run it in other ways.
     """
 
     @abc.abstractmethod

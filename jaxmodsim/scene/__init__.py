@@ -7,6 +7,7 @@ from ._field import scene_field as scene_field
 from ._field import scene_forces as scene_forces
 from ._field import scene_guards as scene_guards
 from ._field import scene_modes as scene_modes
+from ._field import scene_overload as scene_overload
 from ._field import scene_power as scene_power
 from ._field import scene_stick as scene_stick
 from ._field import scene_switch as scene_switch

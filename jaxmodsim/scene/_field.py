@@ -152,15 +152,27 @@ def scene_switch(
     return y._replace(qd=stop_slip(found, y.qd, new == 0)), new
 
 
-def scene_modes(t: Float[Array, ""], y: State, scene: Scene) -> tuple[State, Float[Array, " n"]]:
-    """State and modes to begin with: elements without slip velocity, but for rounding, stick if they can."""
+def scene_modes(
+    t: Float[Array, ""], y: State, scene: Scene, rest: Float[Array, ""]
+) -> tuple[State, Float[Array, " n"]]:
+    """State and modes to begin with: elements with no more slip velocity than `rest` or rounding stick if they can."""
     none = jnp.zeros(len(scene.exact_names), y.q.dtype)
     found = _contact(t, y, scene, none)
     elements = [effect for effect in scene.effects if isinstance(effect, Friction) and effect.exact]
     speed = jnp.stack([jnp.sum(jnp.abs(e.direction(y.q) * y.qd)) + jnp.abs(e.belt(t)) for e in elements])
-    still = jnp.abs(found.v) <= 8.0 * float(jnp.finfo(y.q.dtype).eps) * jax.lax.stop_gradient(speed)
+    rounding = 8.0 * float(jnp.finfo(y.q.dtype).eps) * jax.lax.stop_gradient(speed)
+    still = jnp.abs(found.v) <= jnp.maximum(rounding, rest)
     mode = next_modes(found, jnp.sign(found.v), still, jnp.zeros_like(still))
     return y._replace(qd=stop_slip(found, y.qd, mode == 0)), mode
+
+
+def scene_overload(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Float[Array, " n"]:
+    """By how much the force of each sticking element exceeds its limit, in limits; 0 in slip."""
+    found = _contact(t, y, scene, mode)
+    force = contact_forces(found, mode)
+    limit = jnp.where(force > 0, found.upper, found.lower)
+    excess = (jnp.abs(force) - limit) / jnp.where(limit > 0, limit, 1.0)
+    return jnp.where(mode == 0, excess, 0.0)
 
 
 def scene_stick(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> State:

@@ -13,7 +13,7 @@ from ..numerics import check_ranges, cholesky_pivots, modules_of, range_checks
 from ..scene import Scene, State
 from ..solvers import ACCUMULATION, TOO_MANY
 
-SUCCESS, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, MAX_EVENTS, FIRST_MASS = range(6)
+SUCCESS, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, MAX_EVENTS, MISSED_EVENT, FIRST_MASS = range(7)
 
 _GENERAL = (
     "The run reached t1.",
@@ -24,6 +24,8 @@ _GENERAL = (
     "The vector field gave a value that is not finite (NaN or infinity). With a fixed step this is also how a"
     " step too long for the stiffness ends: pass a smaller dt, or solver=jaxmodsim.Rodas5P().",
     "The limit of mode changes was reached before t1: pass a larger max_events.",
+    "At a saved time an element sticks under a load beyond its limit: a short pulse was stepped over, as nothing moves"
+    " in stick and the steps grow. Pass dtmax, the longest step that cannot miss it, or a fixed step dt.",
 )
 
 

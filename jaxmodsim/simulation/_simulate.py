@@ -30,6 +30,7 @@ def simulate(
     rtol: ArrayLike = 1e-6,
     atol: ArrayLike = 1e-9,
     dt: ArrayLike | None = None,
+    dtmax: ArrayLike | None = None,
     solver: dfx.AbstractSolver | None = None,
     adjoint: dfx.AbstractAdjoint | None = None,
     max_steps: int = 16384,
@@ -53,15 +54,17 @@ def simulate(
     - `z0`: initial own states of effects, by effect name; those left out start at rest.
     - `rtol`, `atol`: relative and absolute tolerance of the local error.
     - `dt`: fixed step [s], > 0, instead of tolerances.
+    - `dtmax`: longest step [s], > 0. In stick nothing moves and steps grow, so that a load that comes in short pulses
+      can be stepped over: bound the step by the length of a pulse. Where that shows at a saved time, the run fails.
     - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`) or, on one
       coordinate, runs by events (set-valued laws); `diffrax.Tsit5` otherwise.
     - `adjoint`: how diffrax differentiates the run. By default for reverse mode (`jax.grad`); pass
       `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`.
     - `max_steps`: limit of the number of steps.
-    - `max_events`: limit of the number of mode changes of set-valued laws; inside `jax.jit` also the length of
-      `run.events`.
-    - `hold_chatter`: whether an element whose mode changes accumulate is held in stick, until its load has been below
-      the limit again, instead of ending the run.
+    - `max_events`: limit of the number of instants at which set-valued laws change modes. Inside `jax.jit`
+      `run.events` has as many entries for each such law, so a smaller one is faster there.
+    - `hold_chatter`: whether an element whose mode changes accumulate is held in stick, with whatever force that takes,
+      be it above the limit, instead of ending the run.
     - `throw`: whether a run that ends early raises; otherwise `run.result` says how it ended, and what was computed
       is kept.
 
@@ -75,14 +78,16 @@ def simulate(
     - `SimulationError` if the run ended early and `throw` is set. Inside `jax.jit`, `jax.vmap` or `jax.grad` the
       same sentence comes as equinox's run-time error.
     """
-    problem = _problem(scene, q0, qd0, t1, t0, ts, z0, rtol, atol, dt)
+    problem = _problem(scene, q0, qd0, t1, t0, ts, z0, rtol, atol, dt, dtmax)
     for name, limit in (("max_steps", max_steps), ("max_events", max_events)):
-        if isinstance(limit, bool) or not isinstance(limit, int) or limit < 1:
+        if isinstance(limit, bool) or not isinstance(limit, int | np.integer) or limit < 1:
             raise ValueError(f"{name} must be a positive integer, but {limit!r} was given.")
+    if not isinstance(hold_chatter, bool):
+        raise ValueError(f"hold_chatter must be True or False, but {hold_chatter!r} was given.")
     solver_arrays, solver_rest = _split(solver, dfx.AbstractSolver, "solver")
     adjoint_arrays, adjoint_rest = _split(adjoint, dfx.AbstractAdjoint, "adjoint")
     problem = problem._replace(plugins=(solver_arrays, adjoint_arrays))
-    options = Options(solver_rest, adjoint_rest, max_steps, max_events, bool(hold_chatter))
+    options = Options(solver_rest, adjoint_rest, int(max_steps), int(max_events), hold_chatter)
     try:
         solved = solve(problem, options)
     except TypeError as error:
@@ -110,7 +115,7 @@ def _array(value: Any, dtype: Any) -> Any:
 
 
 def _problem(
-    scene: Any, q0: Any, qd0: Any, t1: Any, t0: Any, ts: Any, z0: Any, rtol: Any, atol: Any, dt: Any
+    scene: Any, q0: Any, qd0: Any, t1: Any, t0: Any, ts: Any, z0: Any, rtol: Any, atol: Any, dt: Any, dtmax: Any
 ) -> Problem:
     """Convert and check all numbers of a run."""
     if not isinstance(scene, Scene):
@@ -121,7 +126,7 @@ def _problem(
         for value in (q0, qd0, ts)
     )
     given = {"q0": q0, "qd0": qd0, "t1": t1, "t0": t0, "rtol": rtol, "atol": atol}
-    given |= {name: value for name, value in (("ts", ts), ("dt", dt)) if value is not None}
+    given |= {name: value for name, value in (("ts", ts), ("dt", dt), ("dtmax", dtmax)) if value is not None}
     for name, value in given.items():
         if type(value) is not float:
             _check_real(name, value)
@@ -136,7 +141,7 @@ def _problem(
                 f"q0 and qd0 must both have the shape [dof], but q0 has the shape {array['q0'].shape} and qd0"
                 f" {array['qd0'].shape}."
             )
-    for name in ("t0", "t1", "rtol", "atol", "dt"):
+    for name in ("t0", "t1", "rtol", "atol", "dt", "dtmax"):
         if name in array and array[name].shape != ():
             raise ValueError(f"{name} must be one number, but has the shape {array[name].shape}.")
     _check_values(array)
@@ -151,6 +156,7 @@ def _problem(
         array["rtol"],
         array["atol"],
         array.get("dt"),
+        array.get("dtmax"),
         None,
     )
 
@@ -192,8 +198,11 @@ def _check_values(array: dict[str, Any]) -> None:
             raise ValueError(f"{name} must not be negative, but it is {known[name]}.")
     if "rtol" in known and "atol" in known and known["rtol"] + known["atol"] <= 0:
         raise ValueError("rtol and atol must not both be zero.")
-    if "dt" in known and known["dt"] <= 0:
-        raise ValueError(f"dt must be positive, but it is {known['dt']}.")
+    for name in ("dt", "dtmax"):
+        if name in known and known[name] <= 0:
+            raise ValueError(f"{name} must be positive, but it is {known[name]}.")
+    if "dt" in array and "dtmax" in array:
+        raise ValueError("dt fixes the step, so dtmax has no place beside it: pass one of them.")
     t0, t1, ts = known.get("t0"), known.get("t1"), known.get("ts")
     if t0 is not None and t1 is not None and t1 < t0:
         raise ValueError(f"t1 must not be before t0, but t0 = {t0} and t1 = {t1}.")

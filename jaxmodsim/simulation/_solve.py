@@ -19,15 +19,18 @@ from ..scene import (
     scene_field,
     scene_guards,
     scene_modes,
+    scene_overload,
     scene_power,
     scene_stick,
     scene_switch,
 )
 from ..solvers import EventController, EventLog, EventSolver, EventState, FiniteSteps, Rodas5P
-from ._outcome import SUCCESS, Ending, end_code, start_code
+from ._outcome import MISSED_EVENT, SUCCESS, Ending, end_code, start_code
 
 # Part of the absolute tolerance below which a slip velocity counts as none.
 _REST = 1e-3
+# Part of its limit by which a sticking element's force may exceed it at a saved time, for the error of dense output.
+_OVERLOAD = 1e-2
 
 
 class Problem(NamedTuple):
@@ -44,6 +47,7 @@ class Problem(NamedTuple):
     rtol: Float[Array, ""]
     atol: Float[Array, ""]
     dt: Float[Array, ""] | None
+    dtmax: Float[Array, ""] | None
     # Array leaves of the solver and the adjoint, if they have any.
     plugins: PyTree
 
@@ -156,9 +160,8 @@ def _controller(problem: Problem) -> dfx.AbstractStepSizeController:
     if problem.dt is not None:
         return FiniteSteps()
     span = jnp.maximum(jnp.abs(problem.t0), jnp.abs(problem.t1))
-    return dfx.PIDController(
-        problem.rtol, problem.atol, dtmin=float(jnp.finfo(span.dtype).eps) * span, force_dtmin=False
-    )
+    dtmin = float(jnp.finfo(span.dtype).eps) * span
+    return dfx.PIDController(problem.rtol, problem.atol, dtmin=dtmin, dtmax=problem.dtmax, force_dtmin=False)
 
 
 def _integrate(problem: Problem, options: Options, flow: _Flow, log: int | None) -> tuple[Solved, EventLog | None]:
@@ -175,7 +178,7 @@ def _integrate(problem: Problem, options: Options, flow: _Flow, log: int | None)
     if options.adjoint is not None:
         adjoint = eqx.combine(options.adjoint, problem.plugins[1])
     if exact:
-        initial, mode = scene_modes(problem.t0, initial, scene)
+        initial, mode = scene_modes(problem.t0, initial, scene, _REST * problem.atol)
     start = start_code(scene, problem.t0, initial, scene_field(problem.t0, initial, scene, mode))
     # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
     starts = start == SUCCESS
@@ -201,7 +204,7 @@ def _integrate(problem: Problem, options: Options, flow: _Flow, log: int | None)
         return (hybrid.stick(t, s, scene) if scene_drifts(scene) else s).y, s.mode
 
     def keep_end(t: Any, s: Any, scene: Scene) -> Any:
-        return keep(t, s, scene), ((s.count, s.trouble, s.fired), s.log) if exact else None
+        return keep(t, s, scene), ((s.events, s.trouble, s.fired), s.log) if exact else None
 
     saveat = dfx.SaveAt(
         subs=(
@@ -240,7 +243,19 @@ def _integrate(problem: Problem, options: Options, flow: _Flow, log: int | None)
         y, modes = jtu.tree_map(
             lambda x: jnp.where(jnp.expand_dims(reached, tuple(range(1, x.ndim))), x, jnp.inf), (y, modes)
         )
+        if exact and not options.hold_chatter:
+            missed = _passed_a_limit(scene, t, flow.state(y), modes)
+            code = jnp.where((code == SUCCESS) & missed, MISSED_EVENT, code)
     return Solved(t, y, modes, code, None if problem.ts is None else (t_end, end_state), stats), history
+
+
+def _passed_a_limit(scene: Scene, t: Array, y: State, modes: Array) -> Array:
+    """Whether an element sticks at a saved time under a load beyond its limit: then an event was stepped over."""
+
+    def beyond(t: Array, y: State, mode: Array) -> Array:
+        return jnp.any(scene_overload(t, y, scene, mode) > _OVERLOAD) & jnp.isfinite(t)
+
+    return jnp.any(jax.vmap(beyond)(*jax.lax.stop_gradient((t, y, modes))))
 
 
 @partial(jax.jit, static_argnames=("options",))

@@ -143,7 +143,9 @@ class Trajectory:
 
 @jax.jit
 def _forces(scene: Scene, t: Array, y: State, mode: Any) -> dict[str, Array]:
-    return jax.vmap(lambda t, y, mode: scene_forces(t, y, scene, mode))(t, y, mode)
+    forces = jax.vmap(lambda t, y, mode: scene_forces(t, y, scene, mode))(t, y, mode)
+    reached = jnp.isfinite(t)
+    return {name: jnp.where(jnp.expand_dims(reached, range(1, x.ndim)), x, jnp.inf) for name, x in forces.items()}
 
 
 @jax.jit

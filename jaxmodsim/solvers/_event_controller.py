@@ -88,6 +88,8 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
         zero = jnp.zeros_like(t0)
         adaptive = isinstance(self.controller, dfx.AbstractAdaptiveStepSizeController)
         usual = (_UNLIMITED if adaptive else 1.0) * (first - t0)
+        longest = getattr(self.controller, "dtmax", None)
+        usual = usual if longest is None else jnp.minimum(usual, longest)
         return _constant(first), _ControllerState(inner, _constant(usual), zero)
 
     def adapt_step_size(

@@ -23,6 +23,8 @@ _SHORT = 1e-6
 _ACCUMULATION = 1e-3
 # Weight that the last intervals between events, and the last steps, keep at each new one.
 _FORGET = 0.25
+# Events that few do not accumulate.
+_FEWEST = 8
 
 _constant = jax.lax.stop_gradient
 
@@ -82,9 +84,10 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     Saving, dense output, progress meters and adjoints of diffrax work as without events. Time runs forward.
 
     **What an event is.** Let `g_i(t)` be guard i along the solution on `[t0, t1]`. A guard is *armed* or waits. It
-    fires at the first `te > t0` where it is armed and `g_i(te) = 0`, `g_i < 0` right after `te`: events are crossings
-    from above to below (give `-g` for the other direction, both for both). An event at `t0` itself does not fire,
-    one at `t1` does, so that runs over `[t0, t1]` and `[t1, t2]` together have the events of one over `[t0, t2]`.
+    fires at the first `t_event > t0` where it is armed, `g_i(t_event) = 0`, and `g_i < 0` right after: events are
+    crossings from above to below (give `-g` for the other direction, both for both). An event at `t0` itself does not
+    fire, one at `t1` does, so that runs over `[t0, t1]` and `[t1, t2]` together have the events of one over
+    `[t0, t2]`.
 
     - *At the start* the guards with `g_i(t0) > 0` are armed. The others wait until they are positive: a guard that is
       violated on entry, or zero and falling, does not fire; one that is zero and rising is armed as it rises.
@@ -112,9 +115,9 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     (grazing) has no derivative.
 
     **Where events accumulate** (a ball coming to rest, chatter): if the last intervals between events shrink below 1e-3
-    sqrt(eps) of the time, the run ends with `trouble = 1` in the state and diffrax's result `dt_min_reached`; with
-    `hold`, that function takes the place of `reset` there, and the guards that are not positive after it wait. At
-    `max_events` events it ends with `trouble = 2` and `max_steps_reached`.
+    sqrt(eps) of the time since the start, the run ends with `trouble = 1` in the state and diffrax's result
+    `dt_min_reached`; with `hold`, that function takes the place of `reset` there, and the guards that are not positive
+    after it wait. After `max_events` events the next one ends the run with `trouble = 2` and `max_steps_reached`.
 
     **Arguments:**
 
@@ -211,14 +214,15 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         return self.solver.func(dfx.ODETerm(_Field(terms)), t0, y0.y, (y0, args))
 
     def init(self, terms: PyTree, t0: Any, t1: Any, y0: EventState, args: PyTree) -> Any:
-        """State of the wrapped solver, and the longest of the last steps."""
-        return self.solver.init(dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0, args)), _constant(t1 - t0)
+        """State of the wrapped solver, the longest of the last steps, and a time one first step before the start."""
+        inner = self.solver.init(dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0, args))
+        return inner, _constant(t1 - t0), _constant(t0 - (t1 - t0))
 
     def step(
         self, terms: PyTree, t0: Any, t1: Any, y0: EventState, args: PyTree, solver_state: Any, made_jump: Any
     ) -> tuple[EventState, PyTree, dict[str, Any], Any, dfx.RESULTS]:
         """A step of the wrapped solver, a look at the guards along it, and the reset where it ends on an event."""
-        inner, pace = solver_state
+        inner, pace, begin = solver_state
         y1, error, dense, inner, result = self.solver.step(
             dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0._replace(log=None), args), inner, made_jump
         )
@@ -260,12 +264,12 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         )
         state1 = jax.lax.cond(
             landed,
-            lambda: self._jump(terms, t1, state1, fired, first, (near * length, pace), args),
+            lambda: self._jump(terms, t1, state1, fired, first, (near * length, begin), args),
             lambda: state1,
         )
         dense = {"inner": dense, "state0": y0, "state1": state1}
         pace = jnp.maximum(length, _FORGET * pace)
-        return state1, error, dense, (inner, pace), result
+        return state1, error, dense, (inner, pace, begin), result
 
     def _jump(
         self,
@@ -274,7 +278,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         state: EventState,
         fired: Bool[Array, " guards"],
         first: Bool[Array, " guards"],
-        lengths: tuple[Array, Array],
+        times: tuple[Array, Array],
         args: PyTree,
     ) -> EventState:
         """Carry the state to the root of the first guard, reset it there, and carry it back to `t`.
@@ -282,7 +286,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         The way to the root is zero but for the error of the landing; its derivatives are those of the time of the
         event, to second order, so that those of the result are exact.
         """
-        near, pace = lengths
+        near, begin = times
 
         def field(t: Any, state: EventState) -> PyTree:
             return terms.vf(t, state, args).y
@@ -301,34 +305,35 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         middle = field(t + 0.5 * way, state._replace(y=_along(state.y, 0.5 * way, slope)))
         there = _along(state.y, way, middle)
         rest = jnp.where(on_root, -guard(t + way, there) / rate, 0.0)
-        unit = unit_of(pace)
-        te, before = t + way + rest, state._replace(y=once(_along(there, rest, middle), unit))
+        unit = unit_of(begin)
+        t_event, before = t + way + rest, state._replace(y=once(_along(there, rest, middle), unit))
 
-        spread = jnp.where(state.count == 0, te - state.t, jnp.maximum(te - state.t, _FORGET * state.spread))
+        spread = jnp.where(state.events == 0, t_event - state.t, jnp.maximum(t_event - state.t, _FORGET * state.spread))
         spread = _constant(spread)
         eps = float(jnp.finfo(spread.dtype).eps)
-        scale = jnp.maximum(jnp.abs(_constant(te)), pace)
-        dense_events = (state.count >= 8) & (spread <= _ACCUMULATION * eps**0.5 * scale)
-        after = self.reset(te, before, args, fired)
+        now = _constant(t_event)
+        shortest = jnp.maximum(_ACCUMULATION * eps**0.5 * (now - begin), 64.0 * eps * jnp.abs(now))
+        dense_events = (state.events >= _FEWEST) & (spread <= shortest)
+        after = self.reset(t_event, before, args, fired)
         trouble = jnp.where(dense_events, jnp.asarray(ACCUMULATION, spread.dtype), NO_TROUBLE)
         if self.hold is not None:
-            held = self.hold(te, before, args, fired)
+            held = self.hold(t_event, before, args, fired)
             after = jtu.tree_map(lambda a, b: jnp.where(dense_events, a, b), held, after)
             trouble = jnp.zeros_like(spread)
         after = after._replace(y=once(after.y, unit), mode=once(after.mode, unit))
-        count = state.count + 1.0
-        trouble = jnp.where((trouble == NO_TROUBLE) & (count >= self.max_events), TOO_MANY, trouble)
+        count = state.events + 1.0
+        trouble = jnp.where((trouble == NO_TROUBLE) & (count > self.max_events), TOO_MANY, trouble)
 
         back = -(way + rest)
-        slope = field(te, after)
-        middle = field(te + 0.5 * back, after._replace(y=_along(after.y, 0.5 * back, slope)))
+        slope = field(t_event, after)
+        middle = field(t_event + 0.5 * back, after._replace(y=_along(after.y, 0.5 * back, slope)))
         end = after._replace(y=once(_along(after.y, back, middle), unit))
         guard_new = self._guards(t, end, args)
         flags = jnp.where(fired, 1.0, jnp.zeros_like(guard_new))
         log = state.log
         if log is not None:
-            entry = EventLog(te, flags, (before.y, before.mode), (after.y, after.mode))
-            log = jtu.tree_map(lambda a, b: write(a, state.count, b), log, entry)
+            entry = EventLog(t_event, flags, (before.y, before.mode), (after.y, after.mode))
+            log = jtu.tree_map(lambda a, b: write(a, state.events, b), log, entry)
         clear = _constant(guard_new) > jnp.where(fired, 4.0 * jnp.abs(rate) * near, 0.0)
         armed = self.insist | clear | (~fired & (state.armed > 0.5))
         if self.hold is not None:
@@ -336,8 +341,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         return state._replace(
             y=end.y,
             mode=end.mode,
-            t=te,
-            count=count,
+            t=t_event,
+            events=count,
             trouble=trouble,
             fired=flags,
             log=log,

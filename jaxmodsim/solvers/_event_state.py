@@ -30,7 +30,7 @@ class EventState(NamedTuple):
     - `y`: what the vector field integrates.
     - `mode`: what is constant between events.
     - `t`: time of the last event, or of the start.
-    - `count`: number of events so far.
+    - `events`: number of events so far.
     - `trouble`: 0; 1 where events accumulate; 2 where there were more than allowed.
     - `fired`: 1 for each guard that fired in the last event, shape `[guards]`.
     - `log`: an `EventLog`, or None.
@@ -44,7 +44,7 @@ class EventState(NamedTuple):
     y: PyTree
     mode: PyTree
     t: Float[Array, "..."]
-    count: Float[Array, "..."]
+    events: Float[Array, "..."]
     trouble: Float[Array, "..."]
     fired: Float[Array, "*s guards"]
     log: EventLog | None
