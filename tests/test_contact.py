@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 
-from jaxmodsim import AppliedForce, Coulomb, Friction, LuGre, Scene, SimulationError, Stribeck, simulate
+from jaxmodsim import AppliedForce, Coulomb, Friction, LuGre, Regularized, Scene, SimulationError, Stribeck, simulate
 from jaxmodsim.friction import AbstractSetValuedLaw
 from jaxmodsim.scene._contact import Contact, contact_forces, next_modes
 
@@ -225,3 +225,28 @@ def test_the_limit_of_mode_changes_is_named() -> None:
     run = simulate(shaken, [0.0], [0.0], 10.0, max_events=5, throw=False)
     assert np.sum(np.isfinite(run.events.t)) == 5
     assert run.events.t[4] < run.t_end + 1e-6
+
+
+def test_smooth_and_bristle_laws_converge_to_the_exact_run() -> None:
+    """Where a mass on a spring comes to rest: the distance falls with the width, and with one over the stiffness."""
+    ts = jnp.linspace(0.0, 2.0, 5)
+    how: dict[str, Any] = {"ts": ts, "rtol": 1e-9, "atol": 1e-12}
+
+    def spring(law: Any) -> Any:
+        return simulate(
+            Scene(masses, params={"m": 1.0, "k": 100.0}, effects=(Friction(law),)), [0.1], [0.0], 2.0, **how
+        )
+
+    exact = spring(Coulomb(1.5))
+    assert exact.mode["friction"][-1] == 0
+    smooth = jax.jit(jax.vmap(lambda width: spring(Regularized(Coulomb(1.5), width)).q[-1, 0]))
+    widths = jnp.array([1e-4, 1e-5, 1e-6])
+    distance = np.abs(np.asarray(smooth(widths)) - float(exact.q[-1, 0]))
+    np.testing.assert_allclose(np.diff(np.log10(distance)), -1.0, atol=0.05)
+
+    def bristle(sigma0: Any) -> Any:
+        return spring(LuGre(sigma0=sigma0, sigma1=2 * jnp.sqrt(sigma0), sigma2=0.0, Fc=1.5, Fs=1.5, vs=0.1)).q[-1, 0]
+
+    stiffness = jnp.array([1e4, 1e5, 1e6])
+    distance = np.abs(np.asarray(jax.jit(jax.vmap(bristle))(stiffness)) - float(exact.q[-1, 0]))
+    np.testing.assert_allclose(np.diff(np.log10(distance)), -1.0, atol=0.05)
