@@ -137,7 +137,9 @@ def next_modes(
 
     All of them stick if they can. If limits are exceeded, the element that exceeds its own by the largest factor
     slips in the direction of its load, and the rest is solved again. An element that would then be accelerated
-    against its direction sticks again.
+    against its direction sticks again. Without stiction the modes that satisfy everything are unique, and found;
+    with it there may be several, and the search is a heuristic: where it fails, an element slips that is pushed back at
+    once, and the run ends as chatter.
 
     **Arguments:**
 

@@ -46,7 +46,8 @@ def simulate(
     **Arguments:**
 
     - `scene`: the `Scene`.
-    - `q0`, `qd0`: initial coordinates and velocities, shape `[dof]`.
+    - `q0`, `qd0`: initial coordinates and velocities, shape `[dof]`. Of an element that sticks at t0 the slip velocity
+      is taken away, and with it the derivative by that velocity.
     - `t1`: end time [s], >= t0.
     - `t0`: start time [s].
     - `ts`: times [s] at which the run is kept, increasing, within `[t0, t1]`; by default the end alone, in arrays of

@@ -16,6 +16,8 @@ from ._event_state import ACCUMULATION, NO_TROUBLE, TOO_MANY, EventLog, EventSta
 # How far beside the root a step may end, as a fraction of the step; from there the state is carried to the root, with
 # an error of the third power of that distance.
 _LANDING = 1e-5
+# What the step and the jump measure of the way to a root may differ by this factor.
+_LATITUDE = 4.0
 # A step this much shorter than the last ones has no length.
 _SHORT = 1e-6
 # Events accumulate where the longest of the last intervals is below this part of the time since the start, times the
@@ -287,6 +289,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         event, to second order, so that those of the result are exact.
         """
         near, begin = times
+        unit = unit_of(begin)
 
         def field(t: Any, state: EventState) -> PyTree:
             return terms.vf(t, state, args).y
@@ -294,62 +297,74 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         def guard(t: Any, y: PyTree) -> Array:
             return jnp.sum(jnp.where(first, self._guards(t, state._replace(y=y), args), 0.0))
 
-        slope = field(t, state)
-        height, rate = jax.jvp(guard, (t, state.y), (jnp.ones_like(t), slope))
-        rate = _constant(rate)
-        rate = jnp.where(rate == 0, 1.0, rate)
-        way = -height / rate
-        # A guard that a reset has violated fires where it stands; it has no root here.
-        on_root = (state.landed > 0.5) & (jnp.abs(_constant(way)) <= 4.0 * near)
-        way = jnp.where(on_root, way, 0.0)
-        middle = field(t + 0.5 * way, state._replace(y=_along(state.y, 0.5 * way, slope)))
-        there = _along(state.y, way, middle)
-        rest = jnp.where(on_root, -guard(t + way, there) / rate, 0.0)
-        unit = unit_of(begin)
-        t_event, before = t + way + rest, state._replace(y=once(_along(there, rest, middle), unit))
+        way, rate, before = _to_root(field, guard, t, state, near)
+        t_event, before = t + way, before._replace(y=once(before.y, unit))
+        since = jnp.where(state.events == 0, t_event - state.t, jnp.maximum(t_event - state.t, _FORGET * state.spread))
+        spread = _constant(since)
+        dense = _accumulates(spread, _constant(t_event), begin) & (state.events >= _FEWEST)
 
-        spread = jnp.where(state.events == 0, t_event - state.t, jnp.maximum(t_event - state.t, _FORGET * state.spread))
-        spread = _constant(spread)
-        eps = float(jnp.finfo(spread.dtype).eps)
-        now = _constant(t_event)
-        shortest = jnp.maximum(_ACCUMULATION * eps**0.5 * (now - begin), 64.0 * eps * jnp.abs(now))
-        dense_events = (state.events >= _FEWEST) & (spread <= shortest)
         after = self.reset(t_event, before, args, fired)
-        trouble = jnp.where(dense_events, jnp.asarray(ACCUMULATION, spread.dtype), NO_TROUBLE)
+        trouble = jnp.where(dense, jnp.asarray(ACCUMULATION, spread.dtype), NO_TROUBLE)
         if self.hold is not None:
             held = self.hold(t_event, before, args, fired)
-            after = jtu.tree_map(lambda a, b: jnp.where(dense_events, a, b), held, after)
+            after = jtu.tree_map(lambda a, b: jnp.where(dense, a, b), held, after)
             trouble = jnp.zeros_like(spread)
         after = after._replace(y=once(after.y, unit), mode=once(after.mode, unit))
-        count = state.events + 1.0
-        trouble = jnp.where((trouble == NO_TROUBLE) & (count > self.max_events), TOO_MANY, trouble)
+        events = state.events + 1.0
+        trouble = jnp.where((trouble == NO_TROUBLE) & (events > self.max_events), TOO_MANY, trouble)
 
-        back = -(way + rest)
-        slope = field(t_event, after)
-        middle = field(t_event + 0.5 * back, after._replace(y=_along(after.y, 0.5 * back, slope)))
-        end = after._replace(y=once(_along(after.y, back, middle), unit))
-        guard_new = self._guards(t, end, args)
-        flags = jnp.where(fired, 1.0, jnp.zeros_like(guard_new))
+        middle = field(t_event - 0.5 * way, after._replace(y=_along(after.y, -0.5 * way, field(t_event, after))))
+        end = after._replace(y=once(_along(after.y, -way, middle), unit))
+        values = self._guards(t, end, args)
+        clear = _constant(values) > jnp.where(fired, _LATITUDE * jnp.abs(rate) * near, 0.0)
+        armed = self.insist | clear | (~fired & (state.armed > 0.5))
+        if self.hold is not None:
+            armed = jnp.where(dense, values > 0, armed)
+        flags = jnp.where(fired, 1.0, jnp.zeros_like(values))
         log = state.log
         if log is not None:
             entry = EventLog(t_event, flags, (before.y, before.mode), (after.y, after.mode))
             log = jtu.tree_map(lambda a, b: write(a, state.events, b), log, entry)
-        clear = _constant(guard_new) > jnp.where(fired, 4.0 * jnp.abs(rate) * near, 0.0)
-        armed = self.insist | clear | (~fired & (state.armed > 0.5))
-        if self.hold is not None:
-            armed = jnp.where(dense_events, guard_new > 0, armed)
         return state._replace(
             y=end.y,
             mode=end.mode,
             t=t_event,
-            events=count,
+            events=events,
             trouble=trouble,
             fired=flags,
             log=log,
-            guard=_constant(guard_new),
-            armed=jnp.where(armed, 1.0, jnp.zeros_like(guard_new)),
+            guard=_constant(values),
+            armed=jnp.where(armed, 1.0, jnp.zeros_like(values)),
             spread=spread,
         )
+
+
+def _to_root(
+    field: Callable[..., Any], guard: Callable[..., Array], t: Any, state: EventState, near: Array
+) -> tuple[Array, Array, EventState]:
+    """The time from `t` to the root of `guard`, the rate of the guard, and the state at the root.
+
+    Two Newton steps with one rate on a flow of second order: right to second order in the perturbation of anything that
+    the root depends on, as `way` itself is next to zero.
+    """
+    slope = field(t, state)
+    height, rate = jax.jvp(guard, (t, state.y), (jnp.ones_like(t), slope))
+    rate = _constant(rate)
+    rate = jnp.where(rate == 0, 1.0, rate)
+    way = -height / rate
+    # A guard that a reset has violated fires where it stands; it has no root here.
+    on_root = (state.landed > 0.5) & (jnp.abs(_constant(way)) <= _LATITUDE * near)
+    way = jnp.where(on_root, way, 0.0)
+    middle = field(t + 0.5 * way, state._replace(y=_along(state.y, 0.5 * way, slope)))
+    there = _along(state.y, way, middle)
+    rest = jnp.where(on_root, -guard(t + way, there) / rate, 0.0)
+    return way + rest, rate, state._replace(y=_along(there, rest, middle))
+
+
+def _accumulates(spread: Array, t: Array, begin: Array) -> Array:
+    """Whether intervals between events of `spread` at most are none on the scale of the run, or not resolved at `t`."""
+    eps = float(jnp.finfo(spread.dtype).eps)
+    return spread <= jnp.maximum(_ACCUMULATION * eps**0.5 * (t - begin), 64.0 * eps * jnp.abs(t))
 
 
 def _real(x: Any) -> Array:
