@@ -164,19 +164,23 @@ def _controller(problem: Problem) -> dfx.AbstractStepSizeController:
     return dfx.PIDController(problem.rtol, problem.atol, dtmin=dtmin, dtmax=problem.dtmax, force_dtmin=False)
 
 
+def _plugins(problem: Problem, options: Options) -> tuple[Any, Any]:
+    """Solver and adjoint: those that were given, or the defaults."""
+    solver = default_solver(problem.scene, problem.q0.shape[0], problem.dt is not None)
+    adjoint = dfx.RecursiveCheckpointAdjoint()
+    if options.solver is not None:
+        solver = eqx.combine(options.solver, problem.plugins[0])
+    if options.adjoint is not None:
+        adjoint = eqx.combine(options.adjoint, problem.plugins[1])
+    return solver, adjoint
+
+
 def _integrate(problem: Problem, options: Options, flow: _Flow, log: int | None) -> tuple[Solved, EventLog | None]:
     """Run diffrax; with modes only where the scene has them, with a log of that many events where one is wanted."""
     scene, exact = problem.scene, bool(problem.scene.exact_names)
     initial, mode = initial_state(problem), None
     check_scene(scene, initial)
-    solver, adjoint = (
-        default_solver(scene, initial.q.shape[0], problem.dt is not None),
-        dfx.RecursiveCheckpointAdjoint(),
-    )
-    if options.solver is not None:
-        solver = eqx.combine(options.solver, problem.plugins[0])
-    if options.adjoint is not None:
-        adjoint = eqx.combine(options.adjoint, problem.plugins[1])
+    solver, adjoint = _plugins(problem, options)
     if exact:
         initial, mode = scene_modes(problem.t0, initial, scene, _REST * problem.atol)
     start = start_code(scene, problem.t0, initial, scene_field(problem.t0, initial, scene, mode))
