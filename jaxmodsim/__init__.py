@@ -19,9 +19,14 @@ from .identify import FitResult as FitResult
 from .identify import Record as Record
 from .identify import fit as fit
 from .identify import fit_law as fit_law
+from .mechanics import Constraint as Constraint
+from .mechanics import VelocityConstraint as VelocityConstraint
+from .mechanics import point_mass as point_mass
+from .mechanics import rigid_body as rigid_body
 from .scene import Scene as Scene
 from .simulation import SimulationError as SimulationError
 from .simulation import Trajectory as Trajectory
+from .simulation import consistent as consistent
 from .simulation import simulate as simulate
 from .solvers import EventController as EventController
 from .solvers import EventSolver as EventSolver

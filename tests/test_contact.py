@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxmodsim import AppliedForce, Coulomb, Friction, LuGre, Regularized, Scene, SimulationError, Stribeck, simulate
 from jaxmodsim.friction import AbstractSetValuedLaw
-from jaxmodsim.scene._contact import Contact, contact_forces, next_modes
+from jaxmodsim.scene._contact import Contact, balance, next_modes
 
 
 def masses(t: Any, q: Any, qd: Any, p: Any) -> Any:
@@ -38,12 +38,12 @@ def random_contact(rng: np.random.Generator, n: int, stiction: bool) -> Contact:
     level = limit * rng.uniform(0.5, 1.0, n) if stiction else limit
     base = 3.0 * rng.normal(size=n) * np.diag(coupling)
     numbers = (np.zeros(n), base, coupling, directions, level, -level, limit, limit)
-    return Contact(*(jnp.asarray(x) for x in numbers))
+    return Contact(*(jnp.asarray(x) for x in numbers), loads=None)
 
 
 def consistent(found: Contact, mode: Any) -> bool:
     """Stick within its limits and without acceleration, slip that is not accelerated against its direction."""
-    force = np.asarray(contact_forces(found, jnp.asarray(mode, float)))
+    force = np.asarray(balance(found, jnp.asarray(mode, float)).force)
     acceleration = np.asarray(found.base) - np.asarray(found.coupling) @ force
     stick = np.asarray(mode) == 0
     held = np.all(np.abs(force[stick]) <= np.asarray(found.upper)[stick] * (1 + 1e-9))

@@ -154,7 +154,7 @@ def test_force_at_a_point_is_mapped_by_the_transposed_jacobian() -> None:
     np.testing.assert_allclose(action.force, fn(t, q, qd, params))
     np.testing.assert_allclose(action.generalised, jax.jacobian(at)(q).T @ fn(t, q, qd, params), rtol=1e-14)
     # And its power is that of the force along the velocity of the point.
-    power = effect.power(t, q, qd, action)
+    power = effect.power(t, q, qd, params, action)
     np.testing.assert_allclose(power.supplied, fn(t, q, qd, params) @ (jax.jacobian(at)(q) @ qd), rtol=1e-14)
 
 

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import as_function
+from ..numerics import Place, as_function, as_place
 from ._effect import AbstractEffect, Action, Power, result_shape
 
 
-def _optional_function(value: Any) -> Callable[..., Any] | None:
-    return None if value is None else as_function(value, name="AppliedForce at")
+def _at(value: Any) -> Place | None:
+    return None if value is None else as_place(value, name="AppliedForce at")
 
 
 class AppliedForce(AbstractEffect):
@@ -25,7 +25,7 @@ class AppliedForce(AbstractEffect):
     - `fn`: `fn(t, q, qd, params)` returns the force: without `at` the generalised force, shape `[dof]` [N or N m];
       with `at` a Cartesian force [N] of the shape that `at` returns. Numbers that are to be differentiated or
       swept belong into `params` (or into the leaves of an `eqx.Module` passed as `fn`).
-    - `at`: `at(q)` returns the position of the point of attack [m]; the force is mapped to the coordinates by the
+    - `at`: `at(q)` or `at(q, params)` returns the position of the point of attack [m]; the force is mapped to the coordinates by the
       transposed Jacobian of `at`.
     - `name`: name in `run.forces`.
 
@@ -35,7 +35,7 @@ class AppliedForce(AbstractEffect):
     """
 
     fn: Callable[..., Any] = eqx.field(converter=partial(as_function, name="AppliedForce fn"))
-    at: Callable[..., Any] | None = eqx.field(default=None, converter=_optional_function)
+    at: Place | None = eqx.field(default=None, converter=_at)
     name: str | None = eqx.field(default=None, static=True)
 
     @property
@@ -51,7 +51,7 @@ class AppliedForce(AbstractEffect):
     def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
         """Check the shape that `fn` returns."""
         given = result_shape(self.fn, q[0], q, qd, params)
-        wanted = q.shape if self.at is None else result_shape(self.at, q)
+        wanted = q.shape if self.at is None else result_shape(self.at, q, params)
         if given != wanted:
             where = "the coordinates" if self.at is None else "what `at` returns"
             raise ValueError(
@@ -71,12 +71,14 @@ class AppliedForce(AbstractEffect):
         force = jnp.asarray(self.fn(t, q, qd, params), q.dtype)
         if self.at is None:
             return Action(force, force)
-        _, pull = jax.vjp(self.at, q)
+        _, pull = jax.vjp(lambda q: self.at(q, params), q)
         return Action(pull(force)[0], force)
 
-    def power(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], action: Action) -> Power:
+    def power(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, action: Action
+    ) -> Power:
         """All of it comes from outside."""
-        del t, q
+        del t, q, params
         return Power(jnp.sum(action.generalised * qd), jnp.zeros_like(qd[0]))
 
     def stored(self, z: PyTree) -> float:

@@ -63,7 +63,9 @@ class AbstractEffect(eqx.Module):
         """Forces and the rate of the own state `z`."""
 
     @abc.abstractmethod
-    def power(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], action: Action) -> Power:
+    def power(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, action: Action
+    ) -> Power:
         """Power of an action of this effect."""
 
     @abc.abstractmethod

@@ -5,6 +5,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
@@ -15,7 +16,7 @@ from ..friction import (
     AbstractLaw,
     AbstractSetValuedLaw,
 )
-from ..numerics import Number, as_function, as_number
+from ..numerics import Number, Place, as_function, as_number, as_place, safe_norm
 from ._effect import AbstractEffect, Action, Power, result_shape
 
 
@@ -29,8 +30,8 @@ def _law(law: Any) -> AbstractLaw:
     return law
 
 
-def _along(value: Any) -> Callable[..., Any] | None:
-    return None if value is None else as_function(value, name="Friction along")
+def _along(value: Any) -> Place | None:
+    return None if value is None else as_place(value, name="Friction along")
 
 
 def _belt(value: Any) -> Any:
@@ -39,14 +40,24 @@ def _belt(value: Any) -> Any:
     return as_number(value, name="Friction belt_velocity")
 
 
+class Reaction(eqx.Module):
+    """The load is the force of the constraint of this name."""
+
+    constraint: str = eqx.field(static=True)
+
+
 def _load(value: Any) -> Any:
-    if value is None or callable(value):
-        return None if value is None else as_function(value, name="Friction normal_force")
+    if value is None or isinstance(value, Reaction):
+        return value
+    if isinstance(value, str):
+        return Reaction(value)
+    if callable(value):
+        return as_function(value, name="Friction normal_force")
     return as_number(value, name="Friction normal_force")
 
 
 class Friction(AbstractEffect):
-    """A friction law acting along a scalar displacement of the mechanism.
+    """A friction law acting along a displacement of the mechanism.
 
     The slip velocity is `v = d/dt along(q) - belt_velocity`, and the friction force F, positive when it opposes
     positive slip, enters the equations of motion as `-F d along/dq`.
@@ -56,10 +67,14 @@ class Friction(AbstractEffect):
     - `law`: how friction depends on slip. A set-valued law (`Coulomb`, `Stribeck`) runs exactly, by events: in stick
       the slip velocity is zero and the force is what that takes, up to the law's limit. `Regularized`, `DeadZone` and
       `Sign` run it in other ways.
-    - `along`: `along(q)`, the displacement [m or rad], a scalar. By default the one coordinate.
-    - `belt_velocity`: velocity [m/s or rad/s] of the surface, a number or a continuous function of t; a jump would
-      carry with it what sticks.
-    - `normal_force`: load [N], a number or `normal_force(t, q, qd, params)`. Then the law's forces are per newton of
+    - `along`: `along(q)` or `along(q, params)`. A scalar displacement [m or rad]; by default the one coordinate. Or the
+      position of the contact [m], shape `[2]` or `[3]`: with one coordinate slip is the velocity along its path,
+      positive for a rising coordinate; with several it is a vector, and the friction force a vector opposite to it, of
+      the magnitude that the law gives at the magnitude of slip (for laws that are functions of slip).
+    - `belt_velocity`: velocity [m/s or rad/s] of the surface, a number or a continuous function of t (a jump would
+      carry with it what sticks); where slip is a vector, a function that returns one.
+    - `normal_force`: load [N]: a number, `normal_force(t, q, qd, params)`, or the name of a `Constraint`, whose
+      reaction is the load; friction and reaction are then solved together. The law's forces are per newton of
       load (`Fc` is the coefficient of friction), and a negative load, which is lift-off, gives no friction. By
       default the law's forces are in newtons.
     - `name`: name in `run.forces`.
@@ -71,9 +86,9 @@ class Friction(AbstractEffect):
     """
 
     law: AbstractLaw = eqx.field(converter=_law)
-    along: Callable[..., Any] | None = eqx.field(default=None, converter=_along)
+    along: Place | None = eqx.field(default=None, converter=_along)
     belt_velocity: Number | Callable[..., Any] = eqx.field(default=0.0, converter=_belt)
-    normal_force: Number | Callable[..., Any] | None = eqx.field(default=None, converter=_load)
+    normal_force: Number | Callable[..., Any] | Reaction | None = eqx.field(default=None, converter=_load)
     name: str | None = eqx.field(default=None, static=True)
 
     @property
@@ -96,64 +111,112 @@ class Friction(AbstractEffect):
         """Whether the law runs by events: its force depends on a mode, and in stick on the other forces."""
         return isinstance(self.law, AbstractSetValuedLaw)
 
+    @property
+    def rests_on(self) -> str | None:
+        """Name of the constraint whose reaction is the load; None for other loads."""
+        return self.normal_force.constraint if isinstance(self.normal_force, Reaction) else None
+
     def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
-        """Check that there is one displacement, one belt velocity and one load."""
-        if self.along is None:
-            if q.shape != (1,):
-                raise ValueError(
-                    f"Friction {name!r} acts on a mechanism with {q.shape[0]} coordinates: say along which"
-                    " displacement, as in Friction(law, along=lambda q: q[0])."
-                )
-        elif result_shape(self.along, q) != ():
+        """Check that displacement, belt velocity and load have the shapes they need."""
+        shape = () if self.along is None else result_shape(self.along, q, params)
+        if self.along is None and q.shape != (1,):
             raise ValueError(
-                f"Friction {name!r}: along(q) returned the shape {result_shape(self.along, q)}, but one number,"
-                " shape (), is needed."
+                f"Friction {name!r} acts on a mechanism with {q.shape[0]} coordinates: say along which"
+                " displacement, as in Friction(law, along=lambda q: q[0])."
             )
-        for label, fn, args in (
-            ("belt_velocity(t)", self.belt_velocity, (q[0],)),
-            ("normal_force(t, q, qd, params)", self.normal_force, (q[0], q, qd, params)),
+        if shape not in ((), (2,), (3,)):
+            raise ValueError(
+                f"Friction {name!r}: along(q) returned the shape {shape}, but one number, shape (), or a position, shape"
+                " (2,) or (3,), is needed."
+            )
+        slip = () if q.shape == (1,) else shape
+        if slip != () and not isinstance(self.law, AbstractForceLaw):
+            raise ValueError(
+                f"Friction {name!r}: along(q) is a position that moves in several directions, and there"
+                f" {type(self.law).__name__} cannot act. Needed is a law that is a function of slip: wrap a set-valued"
+                " one as Regularized(law, width), or give a scalar displacement."
+            )
+        if slip != () and not callable(self.belt_velocity) and _known_nonzero(self.belt_velocity):
+            raise ValueError(
+                f"Friction {name!r}: slip is a vector of shape {slip}, so belt_velocity must be a function of t that"
+                f" returns one, but {self.belt_velocity} was given."
+            )
+        load = None if self.rests_on is not None else self.normal_force
+        for label, fn, args, wanted in (
+            ("belt_velocity(t)", self.belt_velocity, (q[0],), slip),
+            ("normal_force(t, q, qd, params)", load, (q[0], q, qd, params), ()),
         ):
-            if callable(fn) and result_shape(fn, *args) != ():
+            if callable(fn) and result_shape(fn, *args) != wanted:
                 raise ValueError(
-                    f"Friction {name!r}: {label} returned the shape {result_shape(fn, *args)}, but one number,"
-                    " shape (), is needed."
+                    f"Friction {name!r}: {label} returned the shape {result_shape(fn, *args)}, but {wanted} is needed."
                 )
 
     def state0(self) -> PyTree:
         """State of the law; None where it has none."""
         return self.law.state0() if isinstance(self.law, AbstractDynamicLaw) else None
 
-    def direction(self, q: Float[Array, " dof"]) -> Float[Array, " dof"]:
-        """Gradient d along/dq: the generalised force of a unit force along the displacement."""
-        return jnp.ones_like(q) if self.along is None else jax.grad(self.along)(q)
+    def direction(self, q: Float[Array, " dof"], params: PyTree) -> Float[Array, " dof"]:
+        """Gradient d along/dq of a scalar slip: the generalised force of a unit force along the displacement."""
+        if self.along is None:
+            return jnp.ones_like(q)
+        if q.shape == (1,):
+            return jnp.reshape(self._pace(q, params), (1,))
+        return jax.grad(self.along)(q, params)
 
-    def belt(self, t: Float[Array, ""]) -> Float[Array, ""]:
+    def _pace(self, q: Float[Array, "1"], params: PyTree) -> Float[Array, ""]:
+        """Displacement per unit of the one coordinate; of a position the length of its tangent."""
+        assert self.along is not None
+        tangent = jax.jvp(lambda q: self.along(q, params), (q,), (jnp.ones_like(q),))[1]
+        return tangent if tangent.ndim == 0 else safe_norm(tangent)
+
+    def belt(self, t: Float[Array, ""]) -> Float[Array, "..."]:
         """Velocity [m/s or rad/s] of the surface."""
         fn = self.belt_velocity
         return jnp.asarray(fn(t), t.dtype) if callable(fn) else fn
 
-    def slip(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"]) -> Float[Array, ""]:
-        """Slip velocity [m/s or rad/s]."""
-        speed = qd[0] if self.along is None else jax.jvp(self.along, (q,), (qd,))[1]
-        return speed - self.belt(t)
+    def slip(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+    ) -> Float[Array, "..."]:
+        """Slip velocity [m/s or rad/s], a scalar, or a vector where `along` is a position that moves freely."""
+        if self.along is None:
+            return qd[0] - self.belt(t)
+        if q.shape == (1,):
+            return self._pace(q, params) * qd[0] - self.belt(t)
+        return jax.jvp(lambda q: self.along(q, params), (q,), (qd,))[1] - self.belt(t)
+
+    def slip_and_rate(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " dof"],
+        qd: Float[Array, " dof"],
+        qdd: Float[Array, " dof"],
+        params: PyTree,
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Slip velocity, and its rate where the accelerations are `qdd`."""
+        return jax.jvp(lambda t, q, qd: self.slip(t, q, qd, params), (t, q, qd), (jnp.ones_like(t), qd, qdd))
 
     def load(
         self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
     ) -> Float[Array, ""] | None:
-        """Normal load [N], never negative; None where the law's forces are in newtons."""
-        if self.normal_force is None:
-            return None
+        """Normal load [N], never negative; None where the law's forces are in newtons, or per newton of a reaction."""
         fn = self.normal_force
+        if fn is None or isinstance(fn, Reaction):
+            return None
         return jnp.maximum(jnp.asarray(fn(t, q, qd, params) if callable(fn) else fn), 0.0)
 
-    def push(self, q: Float[Array, " dof"], force: Float[Array, ""]) -> Float[Array, " dof"]:
+    def push(self, q: Float[Array, " dof"], force: Float[Array, "..."], params: PyTree) -> Float[Array, " dof"]:
         """Generalised force of the friction force `force`."""
-        return jnp.reshape(-force, (1,)) if self.along is None else -force * self.direction(q)
+        if self.along is None:
+            return jnp.reshape(-force, (1,))
+        if force.ndim == 0:
+            return -force * self.direction(q, params)
+        _, pull = jax.vjp(lambda q: self.along(q, params), q)
+        return pull(-force)[0]
 
-    def limit(self, direction: float, load: Float[Array, ""] | None) -> Float[Array, ""]:
-        """Largest force [N] of a set-valued law in stick against a load towards `direction` (+1 or -1)."""
-        assert isinstance(self.law, AbstractSetValuedLaw)
-        limit = self.law.limit(jnp.asarray(direction, jnp.result_type(self.law.limit(jnp.asarray(1.0)))))
+    def limit(self, direction: Float[Array, ""], load: Float[Array, ""] | None) -> Float[Array, ""]:
+        """Largest force [N] in stick against a load towards `direction` (+1 or -1)."""
+        assert isinstance(self.law, AbstractSetValuedLaw | AbstractHoldingLaw)
+        limit = self.law.limit(direction)
         return limit if load is None else load * limit
 
     def slip_force(
@@ -175,27 +238,52 @@ class Friction(AbstractEffect):
         force = direction * level + law.wet(v)
         return force if load is None else load * force
 
+    def unloaded(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
+    ) -> tuple[Float[Array, "..."], PyTree]:
+        """The law's force, in newtons or per newton of load, and the rate of its state."""
+        v = self.slip(t, q, qd, params)
+        if isinstance(self.law, AbstractDynamicLaw):
+            return self.law.force(v, z), self.law.rate(v, z)
+        if not isinstance(self.law, AbstractForceLaw | AbstractHoldingLaw):
+            raise TypeError(f"{type(self.law).__name__} acts by a mode, or is of no known kind of law.")
+        if v.ndim == 0:
+            return self.law.force(v), None
+        return _against(self.law.force, v), None
+
     def act(
         self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
     ) -> Action:
         """Friction force, its generalised force and the rate of the law's state."""
-        v, rate = self.slip(t, q, qd), None
-        if isinstance(self.law, AbstractDynamicLaw):
-            force, rate = self.law.force(v, z), self.law.rate(v, z)
-        elif isinstance(self.law, AbstractForceLaw | AbstractHoldingLaw):
-            force = self.law.force(v)
-        else:
-            raise TypeError(f"{type(self.law).__name__} acts by a mode, or is of no known kind of law.")
+        force, rate = self.unloaded(t, q, qd, z, params)
         load = self.load(t, q, qd, params)
         force = force if load is None else load * force
-        return Action(self.push(q, force), force, rate)
+        return Action(self.push(q, force, params), force, rate)
 
-    def power(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], action: Action) -> Power:
+    def power(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, action: Action
+    ) -> Power:
         """The belt brings in -F times its velocity; slip absorbs F times the slip velocity."""
-        return Power(-action.force * self.belt(t), action.force * self.slip(t, q, qd))
+        return Power(
+            -jnp.sum(action.force * self.belt(t)), jnp.sum(action.force * self.slip(t, q, qd, params))
+        )
 
     def stored(self, z: PyTree) -> Float[Array, ""] | float:
         """Energy [J] in the law's state, for laws in newtons; under a load of its own it has no fixed energy."""
         if isinstance(self.law, AbstractDynamicLaw) and self.normal_force is None:
             return self.law.stored(z)
         return 0.0
+
+
+def _against(force: Callable[..., Any], v: Float[Array, " d"]) -> Float[Array, " d"]:
+    """A force of the magnitude that a law has at the magnitude of slip, in the direction of slip."""
+    speed = safe_norm(v)
+    # At rest the force is a linear function of slip; the quotient would be 0/0.
+    rest = jnp.zeros_like(speed)
+    _, slope = jax.jvp(force, (rest,), (jnp.ones_like(speed),))
+    moves = speed > 0
+    return jnp.where(moves, force(speed) / jnp.where(moves, speed, 1.0), slope) * v
+
+
+def _known_nonzero(value: Any) -> bool:
+    return not isinstance(value, jax.core.Tracer) and bool(jnp.any(value != 0))

@@ -71,9 +71,9 @@ def fit(
         raise ValueError(
             f"The record's inputs ({', '.join(record.inputs)}) must be entries of the scene's params ({have})."
         )
-    if scene.exact_names:
+    if scene.exact:
         raise ValueError(
-            f"fit integrates with fixed steps and knows no events, but {', '.join(scene.exact_names)} would need them:"
+            f"fit integrates with fixed steps and knows no events, but {', '.join(scene.exact)} would need them:"
             " wrap the law, as in Regularized(law, width)."
         )
     for label, count in (("substeps", substeps), ("max_steps", max_steps)):

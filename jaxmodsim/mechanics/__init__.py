@@ -1,7 +1,19 @@
-"""From a Lagrangian to equations of motion."""
+"""From a Lagrangian to equations of motion, with constraints and their reactions."""
 
+from ._bodies import PointMass as PointMass
+from ._bodies import RigidBody as RigidBody
+from ._bodies import point_mass as point_mass
+from ._bodies import rigid_body as rigid_body
+from ._constraint import AbstractConstraint as AbstractConstraint
+from ._constraint import Constraint as Constraint
+from ._constraint import VelocityConstraint as VelocityConstraint
 from ._lagrange import Lagrangian as Lagrangian
 from ._lagrange import MotionEquations as MotionEquations
 from ._lagrange import acceleration as acceleration
 from ._lagrange import energies as energies
 from ._lagrange import motion_equations as motion_equations
+from ._restraint import Restraint as Restraint
+from ._restraint import project_position as project_position
+from ._restraint import project_velocity as project_velocity
+from ._restraint import restrain as restrain
+from ._restraint import sizes as sizes

@@ -2,6 +2,7 @@
 
 from ._linalg import cholesky_pivots as cholesky_pivots
 from ._linalg import factor_lu as factor_lu
+from ._linalg import factor_positive_definite as factor_positive_definite
 from ._linalg import solve_positive_definite as solve_positive_definite
 from ._numbers import Function as Function
 from ._numbers import Number as Number
@@ -16,9 +17,15 @@ from ._numbers import range_checks as range_checks
 from ._numbers import ranges_of as ranges_of
 from ._once import once as once
 from ._once import unit_of as unit_of
+from ._place import Amount as Amount
+from ._place import Place as Place
+from ._place import as_amount as as_amount
+from ._place import as_place as as_place
 from ._rosenbrock import RosenbrockTableau as RosenbrockTableau
 from ._rosenbrock import rosenbrock_step as rosenbrock_step
+from ._safe import safe_norm as safe_norm
 from ._safe import safe_power as safe_power
+from ._semidefinite import solve_semidefinite as solve_semidefinite
 from ._watch import Watch as Watch
 from ._watch import first_root as first_root
 from ._watch import watch as watch

@@ -63,11 +63,20 @@ def solve_positive_definite(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]
     The solution, shape `[n]`. Where a pivot is negative, NaN (for n = 1 the quotient): callers who must know
     which row is at fault ask `cholesky_pivots`.
     """
+    return factor_positive_definite(matrix)(rhs)
+
+
+def factor_positive_definite(matrix: Float[Array, "n n"]) -> Callable[[Array], Array]:
+    """Factor as `solve_positive_definite` does; returns the solver, for one right-hand side `[n]` or several `[n, k]`.
+
+    Several go through as vectors of length k, which keeps what is traced and compiled small.
+    """
     n = matrix.shape[0]
     if n == 1:
-        return rhs / matrix[0]
+        return lambda rhs: rhs / matrix[0]
     if n > MAX_UNROLLED_CHOLESKY:
-        return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), rhs)
+        factor = jnp.linalg.cholesky(matrix)
+        return lambda rhs: jax.scipy.linalg.cho_solve((factor, True), rhs)
     lower = [[matrix[i, j] for j in range(i + 1)] for i in range(n)]
     inverse_diagonal = []
     for j in range(n):
@@ -77,16 +86,20 @@ def solve_positive_definite(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]
         inverse_diagonal.append(1.0 / jnp.sqrt(lower[j][j]))
         for i in range(j + 1, n):
             lower[i][j] = lower[i][j] * inverse_diagonal[j]
-    solution = [rhs[i] for i in range(n)]
-    for i in range(n):
-        for k in range(i):
-            solution[i] = solution[i] - lower[i][k] * solution[k]
-        solution[i] = solution[i] * inverse_diagonal[i]
-    for i in reversed(range(n)):
-        for k in range(i + 1, n):
-            solution[i] = solution[i] - lower[k][i] * solution[k]
-        solution[i] = solution[i] * inverse_diagonal[i]
-    return jnp.stack(solution)
+
+    def solve(rhs: Array) -> Array:
+        solution = [rhs[i] for i in range(n)]
+        for i in range(n):
+            for k in range(i):
+                solution[i] = solution[i] - lower[i][k] * solution[k]
+            solution[i] = solution[i] * inverse_diagonal[i]
+        for i in reversed(range(n)):
+            for k in range(i + 1, n):
+                solution[i] = solution[i] - lower[k][i] * solution[k]
+            solution[i] = solution[i] * inverse_diagonal[i]
+        return jnp.stack(solution)
+
+    return solve
 
 
 def factor_lu(rows: Sequence[Sequence[Scalar]], *, pivot: bool) -> LinearSolver:

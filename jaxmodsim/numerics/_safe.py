@@ -12,3 +12,9 @@ def safe_power(base: Float[Array, "..."], exponent: Float[Array, "..."]) -> Floa
     """
     positive = base > 0
     return jnp.where(positive, jnp.where(positive, base, 1.0) ** exponent, 0.0)
+
+
+def safe_norm(x: Float[Array, " n"]) -> Float[Array, ""]:
+    """Euclidean length; value and derivative are zero at zero, where the derivative of a plain square root is NaN."""
+    square = jnp.sum(x * x)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)

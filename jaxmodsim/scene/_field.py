@@ -1,139 +1,39 @@
-"""The vector field of a scene, with only the terms the scene holds."""
+"""The vector field of a scene, with only the terms the scene holds, and what a run asks beside it."""
 
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
-from ..effects import Action, Friction, Power
-from ..friction import AbstractHoldingLaw
-from ..mechanics import MotionEquations, motion_equations
-from ..numerics import solve_positive_definite
-from ._contact import Contact, contact, contact_forces, contact_guards, next_modes, stop_slip
+from ..effects import Power
+from ..mechanics import motion_equations, project_position, project_velocity
+from ._contact import Contact, balance, contact_guards, next_modes, overload, stop_slip
+from ._resolve import Modes, State, by_constraint, resolve
 from ._scene import Scene
 
-# Modes of the set-valued friction elements; None where the scene has none.
-Modes: TypeAlias = Any
 
-# Sweeps of projected Gauss-Seidel over holding elements that are coupled through the mechanism.
-_HOLDING_SWEEPS = 50
+class Reaction(NamedTuple):
+    """What a constraint does; along a run with a leading axis of time.
 
-
-class State(NamedTuple):
-    """State of a scene: coordinates and velocities, shape `[dof]`, and the effects' own states by name.
-
-    The modes of set-valued friction elements come beside it, an array of -1, 0, +1 in the order of
-    `Scene.exact_names`, or None where there are none.
+    - `multiplier`: multipliers, shape `[m]`.
+    - `generalised`: generalised force `J^T lambda`, shape `[dof]` [N or N m].
+    - `force`: Cartesian force [N] on the constrained point, of the shape of its position; None where the constraint has
+      no `at`.
     """
 
-    q: Float[Array, " dof"]
-    qd: Float[Array, " dof"]
-    z: dict[str, PyTree]
-
-
-class _Resolved(NamedTuple):
-    """Equations of motion, every effect's action, accelerations, and the friction elements with a mode, if any."""
-
-    equations: MotionEquations
-    actions: dict[str, Action]
-    qdd: Float[Array, " dof"]
-    found: Contact | None
-
-
-def _resolve(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -> _Resolved:
-    """Solve for the accelerations, and for the forces that depend on them."""
-    equations = motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params)
-    actions, rhs = {}, equations.load
-    exact, holding = {}, {}
-    for name, effect in zip(scene.names, scene.effects, strict=True):
-        if isinstance(effect, Friction) and effect.exact:
-            exact[name] = effect
-            continue
-        action = effect.act(t, y.q, y.qd, y.z.get(name), scene.params)
-        actions[name] = action
-        rhs = rhs + action.generalised
-        if isinstance(effect, Friction) and effect.holding:
-            holding[name] = effect
-    if holding:
-        held = _hold(scene, holding, actions, equations, rhs, t, y)
-        for name, action in held.items():
-            rhs = rhs + action.generalised - actions[name].generalised
-            actions[name] = action
-    qdd = solve_positive_definite(equations.mass, rhs)
-    if not exact:
-        return _Resolved(equations, actions, qdd, None)
-    assert mode is not None
-    found = contact(list(exact.values()), t, y.q, y.qd, scene.params, equations.mass, qdd)
-    forces = contact_forces(found, mode)
-    for i, (name, effect) in enumerate(exact.items()):
-        actions[name] = Action(effect.push(y.q, forces[i]), forces[i])
-    return _Resolved(equations, actions, qdd - jnp.sum(found.reach * forces[:, None], axis=0), found)
-
-
-def _hold(
-    scene: Scene,
-    elements: dict[str, Friction],
-    slipping: dict[str, Action],
-    equations: MotionEquations,
-    rhs: Float[Array, " dof"],
-    t: Float[Array, ""],
-    y: State,
-) -> dict[str, Action]:
-    """Forces of the elements that hold: what keeps the slip velocity constant, within the limits of stick.
-
-    With directions D (rows), the slip acceleration is `D qdd + dD/dt qd - belt'`; each holding force F enters it
-    as `-D M^-1 D^T F`. Elements are solved one after the other, several of them in repeated sweeps, which
-    converge because that matrix is positive semidefinite.
-    """
-    names = list(elements)
-    active, limits, rows = [], [], []
-    free = rhs
-    for name in names:
-        effect, law = elements[name], elements[name].law
-        assert isinstance(law, AbstractHoldingLaw)
-        holds = law.holds(effect.slip(t, y.q, y.qd))
-        free = free - jnp.where(holds, slipping[name].generalised, 0.0)
-        load = effect.load(t, y.q, y.qd, scene.params)
-        one = jnp.ones_like(t)
-        pair = [law.limit(-one), law.limit(one)]
-        limits.append(pair if load is None else [load * x for x in pair])
-        active.append(holds)
-        rows.append(effect.direction(y.q))
-    reach = [solve_positive_definite(equations.mass, row) for row in rows]
-    qdd = solve_positive_definite(equations.mass, free)
-    drive = [_slip_acceleration(elements[name], t, y, qdd) for name in names]
-    coupling = [[jnp.sum(a * b) for b in reach] for a in rows]
-
-    def sweep(forces: list[Array]) -> list[Array]:
-        new = list(forces)
-        for i in range(len(names)):
-            others = sum(coupling[i][j] * new[j] for j in range(len(names)) if j != i)
-            force = jnp.clip((drive[i] - others) / coupling[i][i], -limits[i][0], limits[i][1])
-            new[i] = jnp.where(active[i], force, 0.0)
-        return new
-
-    forces = sweep([jnp.zeros_like(t) for _ in names])
-    if len(names) > 1:
-        forces = jax.lax.fori_loop(0, _HOLDING_SWEEPS, lambda _, f: sweep(f), forces)
-    return {
-        name: Action(
-            jnp.where(on, elements[name].push(y.q, force), slipping[name].generalised),
-            jnp.where(on, force, slipping[name].force),
-        )
-        for name, on, force in zip(names, active, forces, strict=True)
-    }
-
-
-def _slip_acceleration(effect: Friction, t: Float[Array, ""], y: State, qdd: Float[Array, " dof"]) -> Float[Array, ""]:
-    """Rate of the slip velocity if the accelerations were `qdd`."""
-    return jax.jvp(effect.slip, (t, y.q, y.qd), (jnp.ones_like(t), y.qd, qdd))[1]
+    multiplier: Float[Array, "*time m"]
+    generalised: Float[Array, "*time dof"]
+    force: Float[Array, "..."] | None
 
 
 def scene_field(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> State:
-    """Right-hand side of `y' = field(t, y)`."""
-    resolved = _resolve(scene, t, y, mode)
-    return State(y.qd, resolved.qdd, {name: resolved.actions[name].rate for name in y.z})
+    """Right-hand side of `y' = field(t, y)`; NaN where the equations do not hold, see `scene_margins`."""
+    resolved = resolve(scene, t, y, mode)
+    qdd = resolved.qdd
+    if resolved.margins is not None:
+        qdd = jnp.where(jnp.all(resolved.margins > 0), qdd, jnp.nan)
+    return State(y.qd, qdd, {name: resolved.actions[name].rate for name in y.z})
 
 
 def scene_guards(
@@ -156,23 +56,20 @@ def scene_modes(
     t: Float[Array, ""], y: State, scene: Scene, rest: Float[Array, ""]
 ) -> tuple[State, Float[Array, " n"]]:
     """State and modes to begin with: elements with no more slip velocity than `rest` or rounding stick if they can."""
-    none = jnp.zeros(len(scene.exact_names), y.q.dtype)
+    elements = [*scene.exact.values()]
+    none = jnp.zeros(len(elements), y.q.dtype)
     found = _contact(t, y, scene, none)
-    elements = [effect for effect in scene.effects if isinstance(effect, Friction) and effect.exact]
-    speed = jnp.stack([jnp.sum(jnp.abs(e.direction(y.q) * y.qd)) + jnp.abs(e.belt(t)) for e in elements])
+    speed = jnp.stack([jnp.sum(jnp.abs(e.direction(y.q, scene.params) * y.qd)) + jnp.abs(e.belt(t)) for e in elements])
     rounding = 8.0 * float(jnp.finfo(y.q.dtype).eps) * jax.lax.stop_gradient(speed)
-    still = jnp.abs(found.v) <= jnp.maximum(rounding, rest)
-    mode = next_modes(found, jnp.sign(found.v), still, jnp.zeros_like(still))
+    v = found.v[: len(elements)]
+    still = jnp.abs(v) <= jnp.maximum(rounding, rest)
+    mode = next_modes(found, jnp.sign(v), still, jnp.zeros_like(still))
     return y._replace(qd=stop_slip(found, y.qd, mode == 0)), mode
 
 
 def scene_overload(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Float[Array, " n"]:
     """By how much the force of each sticking element exceeds its limit, in limits; 0 in slip."""
-    found = _contact(t, y, scene, mode)
-    force = contact_forces(found, mode)
-    limit = jnp.where(force > 0, found.upper, found.lower)
-    excess = (jnp.abs(force) - limit) / jnp.where(limit > 0, limit, 1.0)
-    return jnp.where(mode == 0, excess, 0.0)
+    return overload(_contact(t, y, scene, mode), mode)
 
 
 def scene_stick(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> State:
@@ -182,34 +79,75 @@ def scene_stick(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Sta
 
 def scene_drifts(scene: Scene) -> bool:
     """Whether stick drifts with the error of integration: not where it holds one coordinate at a constant speed."""
-    elements = [effect for effect in scene.effects if isinstance(effect, Friction) and effect.exact]
-    return any(element.along is not None or callable(element.belt_velocity) for element in elements)
+    return any(each.along is not None or callable(each.belt_velocity) for each in scene.exact.values())
+
+
+def scene_project(t: Float[Array, ""], y: State, scene: Scene) -> State:
+    """State moved onto the constraints: the coordinates, then the velocities there."""
+    mass = motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass
+    q = project_position(scene.constraints, t, y.q, scene.params, mass)
+    return y._replace(q=q, qd=project_velocity(scene.constraints, t, q, y.qd, scene.params, mass))
+
+
+def scene_misfit(t: Float[Array, ""], y: State, scene: Scene) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """How far coordinates and velocities are from the constraints, relative to their own size or to one."""
+    there = jax.lax.stop_gradient(scene_project(t, y, scene))
+
+    def far(new: Array, old: Array) -> Array:
+        return jnp.max(jnp.abs(new - old)) / jnp.maximum(1.0, jnp.max(jnp.abs(old)))
+
+    return far(there.q, y.q), far(there.qd, y.qd)
+
+
+def scene_margins(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> Float[Array, " checks"] | None:
+    """What has to be positive for the equations to hold, in the order of `Scene.checks`; None for nothing."""
+    return resolve(scene, t, y, mode).margins
+
+
+def scene_reactions(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> dict[str, Reaction]:
+    """What each constraint does, by name."""
+    resolved = resolve(scene, t, y, mode)
+    if resolved.restraint is None:
+        return {}
+    parts = by_constraint(scene, t, y, resolved.multipliers)
+    reactions, start = {}, 0
+    for name, each in zip(scene.constraint_names, scene.constraints, strict=True):
+        multiplier = parts[name]
+        rows = resolved.restraint.rows[start : start + multiplier.shape[0]]
+        start += multiplier.shape[0]
+        generalised = jnp.sum(rows * multiplier[:, None], axis=0)
+        reactions[name] = Reaction(multiplier, generalised, each.force(t, y.q, scene.params, multiplier))
+    return reactions
 
 
 def _contact(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Contact:
-    found = _resolve(scene, t, y, mode).found
+    found = resolve(scene, t, y, mode).found
     assert found is not None
     return found
 
 
 def scene_forces(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> dict[str, Array]:
     """Force of each effect in its own terms, by name."""
-    actions = _resolve(scene, t, y, mode).actions
+    actions = resolve(scene, t, y, mode).actions
     return {name: actions[name].force for name in scene.names}
 
 
-def scene_power(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> Power:
-    """Power [W] from outside into the mechanism and its effects, and absorbed by friction.
+def scene_power(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> dict[str, Power]:
+    """Power [W] from outside into the mechanism and its effects, and absorbed by friction: of each effect by its name.
 
-    A Lagrangian that depends on time by itself supplies `-dL/dt`.
+    Besides, under the name of a constraint what its motion in time supplies, and under `lagrangian` what a Lagrangian
+    that depends on time by itself does, `-dL/dt`.
     """
-    actions = _resolve(scene, t, y, mode).actions
+    resolved = resolve(scene, t, y, mode)
+    zero = jnp.zeros_like(t)
+    powers = {
+        name: effect.power(t, y.q, y.qd, scene.params, resolved.actions[name])
+        for name, effect in zip(scene.names, scene.effects, strict=True)
+    }
+    for name, reaction in scene_reactions(t, y, scene, mode).items():
+        powers[name] = Power(jnp.sum(reaction.generalised * y.qd), zero)
     own = jax.grad(lambda t: scene.lagrangian(t, y.q, y.qd, scene.params))(t)
-    supplied, absorbed = -own, jnp.zeros_like(t)
-    for name, effect in zip(scene.names, scene.effects, strict=True):
-        power = effect.power(t, y.q, y.qd, actions[name])
-        supplied, absorbed = supplied + power.supplied, absorbed + power.absorbed
-    return Power(supplied, absorbed)
+    return powers | {"lagrangian": Power(-own, zero)}
 
 
 def check_scene(scene: Scene, y: State) -> None:
@@ -228,3 +166,11 @@ def check_scene(scene: Scene, y: State) -> None:
         )
     for name, effect in zip(scene.names, scene.effects, strict=True):
         effect.check(y.q, y.qd, scene.params, name)
+    for name, constraint in zip(scene.constraint_names, scene.constraints, strict=True):
+        constraint.check(y.q, y.qd, scene.params, name)
+        size = jax.eval_shape(constraint.rate, t, y.q, y.qd, scene.params).shape[0]
+        if name in scene.loaded and size != 1:
+            raise ValueError(
+                f"Constraint {name!r} loads friction (normal_force={name!r}), so it must be one equation, but it has"
+                f" {size}. Give each direction a Constraint of its own."
+            )

@@ -9,6 +9,10 @@ from ..numerics import Range, ranges_of
 from ._scene import Scene
 
 
+# Levels of the scene that say nothing about a number.
+_SILENT = ("law", "place", "amount")
+
+
 def scene_numbers(scene: Scene) -> dict[str, Array]:
     """All numbers of a scene by name.
 
@@ -70,7 +74,15 @@ def _step(node: Any, key: Any) -> Any:
 def _name(scene: Scene, path: tuple[Any, ...]) -> str:
     words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]
     if words[0] == "effects":
-        words = [scene.names[int(words[1])], *(word for word in words[2:] if word != "law")]
+        words = [scene.names[int(words[1])], *_telling(words[2:])]
+    elif words[0] == "constraints":
+        words = [scene.constraint_names[int(words[1])], *_telling(words[2:])]
+    elif words[0] == "lagrangian":
+        words = _telling(words)
     elif words[0] == "params":
         words = words[1:] or ["params"]
     return ".".join(words)
+
+
+def _telling(words: list[str]) -> list[str]:
+    return [word for word in words if word not in _SILENT]

@@ -1,5 +1,6 @@
 """What is in a scene: data only."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -8,8 +9,12 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from ..effects import AbstractEffect, Friction
-from ..mechanics import Lagrangian
+from ..mechanics import AbstractConstraint, Lagrangian
 from ..numerics import as_function, as_real
+
+
+# The test of uniqueness looks at every corner of the box of slopes: two to this power.
+_MOST_LOADS = 4
 
 
 def _params(params: PyTree) -> PyTree:
@@ -28,8 +33,33 @@ def _effects(effects: Any) -> tuple[AbstractEffect, ...]:
     return tuple(effects)
 
 
+def _constraints(constraints: Any) -> tuple[AbstractConstraint, ...]:
+    if isinstance(constraints, AbstractConstraint) or not isinstance(constraints, tuple | list):
+        raise ValueError(f"constraints must be a tuple, as in constraints=(constraint,), but got {constraints!r}.")
+    for constraint in constraints:
+        if not isinstance(constraint, AbstractConstraint):
+            raise ValueError(
+                f"constraints must hold Constraint or VelocityConstraint objects, but it holds {constraint!r}."
+            )
+    return tuple(constraints)
+
+
+def _names(things: Any, default: Callable[[Any], str]) -> tuple[str, ...]:
+    """Name of each: its own, or its kind's with a number from the second of the kind on."""
+    taken = {each.name for each in things if each.name is not None}
+    names: list[str] = []
+    for each in things:
+        kind = default(each)
+        name, count = each.name or kind, 1
+        while each.name is None and (name in taken or name in names):
+            count += 1
+            name = f"{kind}_{count}"
+        names.append(name)
+    return tuple(names)
+
+
 class Scene(eqx.Module):
-    """A mechanism and the effects on it.
+    """A mechanism, the effects on it, and the constraints it obeys.
 
     A scene is a pytree whose leaves are all its numbers, so `jax.grad`, `jax.vmap` and `equinox.tree_at` work on it,
     and changing a number never recompiles. Functions are compared by identity: define a Lagrangian once, not as a
@@ -41,49 +71,107 @@ class Scene(eqx.Module):
     - `params`: pytree of real numbers or arrays for the Lagrangian and the applied forces. Integers become
       floating; what is no number (sizes, options) belongs into the functions.
     - `effects`: tuple of `AppliedForce` and `Friction`.
+    - `constraints`: tuple of `Constraint` and `VelocityConstraint`, for coordinates that are not independent.
 
     **Raises:**
 
-    - `ValueError` naming the entry that is no number, no effect, or has another's name.
+    - `ValueError` naming the entry that is no number, no effect, or has another's name, and friction that rests on a
+      constraint that is not there.
     """
 
     lagrangian: Lagrangian = eqx.field(converter=partial(as_function, name="Scene lagrangian"))
     params: PyTree[Array] = eqx.field(default_factory=dict, converter=_params)
     effects: tuple[AbstractEffect, ...] = eqx.field(default=(), converter=_effects)
 
+    constraints: tuple[AbstractConstraint, ...] = eqx.field(default=(), converter=_constraints)
+
     def __check_init__(self) -> None:
-        """Refuse two effects of one name."""
-        given = [effect.name for effect in self.effects if effect.name is not None]
+        """Refuse two things of one name, and what does not go together."""
+        given = [each.name for each in self.effects if each.name is not None]
         for name in given:
             if given.count(name) > 1:
                 raise ValueError(f"Two effects have the name {name!r}; names of effects must differ.")
-        if self.exact_names and any(isinstance(x, Friction) and x.holding for x in self.effects):
+        held = [each.name for each in self.constraints if each.name is not None]
+        for name in held:
+            if held.count(name) > 1:
+                raise ValueError(f"Two constraints have the name {name!r}; names of constraints must differ.")
+        for name in set(self.names) & set(self.constraint_names):
+            raise ValueError(f"An effect and a constraint both have the name {name!r}; give one of them another name.")
+        if self.exact and any(isinstance(x, Friction) and x.holding for x in self.effects):
             raise ValueError(
-                f"{', '.join(self.exact_names)}: set-valued laws of one scene run either all by events or all by"
+                f"{', '.join(self.exact)}: set-valued laws of one scene run either all by events or all by"
                 " DeadZone, as each must know the forces of the others. Wrap all of them in DeadZone, or none."
+            )
+        for name, effect in zip(self.names, self.effects, strict=True):
+            if not isinstance(effect, Friction) or effect.rests_on is None:
+                continue
+            if effect.rests_on not in self.constraint_names:
+                known = ", ".join(repr(x) for x in self.constraint_names) or "none"
+                raise ValueError(
+                    f"Friction {name!r}: normal_force={effect.rests_on!r} names no constraint of the scene; there are:"
+                    f" {known}."
+                )
+            if effect.holding:
+                raise ValueError(
+                    f"Friction {name!r}: under the load of a constraint DeadZone cannot run; let the law run by events,"
+                    " or wrap it as Regularized(law, width)."
+                )
+        if len(self.loaded) > _MOST_LOADS:
+            raise ValueError(
+                f"Friction rests on {len(self.loaded)} constraints, but no more than {_MOST_LOADS} can be solved"
+                " together; give the load of the others as functions."
             )
 
     @property
     def names(self) -> tuple[str, ...]:
         """Name of each effect: its own, or its kind's with a number from the second of the kind on."""
-        taken = {effect.name for effect in self.effects if effect.name is not None}
-        names: list[str] = []
-        for effect in self.effects:
-            name, count = effect.name or effect.default_name, 1
-            while effect.name is None and (name in taken or name in names):
-                count += 1
-                name = f"{effect.default_name}_{count}"
-            names.append(name)
-        return tuple(names)
+        return _names(self.effects, lambda effect: effect.default_name)
 
     @property
-    def exact_names(self) -> tuple[str, ...]:
-        """Names of the friction elements that run by events, in the order of their modes."""
-        return tuple(
-            name
+    def constraint_names(self) -> tuple[str, ...]:
+        """Name of each constraint, made as those of effects."""
+        return _names(self.constraints, lambda _: "constraint")
+
+    @property
+    def exact(self) -> dict[str, Friction]:
+        """The friction elements that run by events, by name, in the order of their modes."""
+        return {
+            name: effect
             for name, effect in zip(self.names, self.effects, strict=True)
             if isinstance(effect, Friction) and effect.exact
-        )
+        }
+
+    @property
+    def leaning(self) -> dict[str, Friction]:
+        """The other friction elements whose load is the reaction of a constraint, by name."""
+        return {
+            name: effect
+            for name, effect in zip(self.names, self.effects, strict=True)
+            if isinstance(effect, Friction) and not effect.exact and effect.rests_on is not None
+        }
+
+    @property
+    def loaded(self) -> tuple[str, ...]:
+        """Names of the constraints whose reactions are loads of friction."""
+        resting = {each.rests_on for each in (*self.exact.values(), *self.leaning.values())}
+        return tuple(name for name in self.constraint_names if name in resting)
+
+    @property
+    def checks(self) -> tuple[str, ...]:
+        """What may end the equations of motion, in words, in the order of `Resolved.margins`."""
+        words = [
+            f"The constraint {name!r} can only push, and would have to pull: the contact opens. Its motion from there on"
+            " is that of a scene without it."
+            for name, each in zip(self.constraint_names, self.constraints, strict=True)
+            if each.one_sided
+        ]
+        if self.loaded:
+            words.append(
+                f"Friction under the reaction of {', '.join(map(repr, self.loaded))} has lost its unique solution: it"
+                " raises its own load without bound (Painleve's paradox, jamming). Lower the coefficient of friction,"
+                " or model the contact as elastic."
+            )
+        return tuple(words)
 
     def state0(self) -> dict[str, PyTree]:
         """Own state of each effect that has one, at rest, by effect name."""

@@ -1,5 +1,6 @@
 """Runs of scenes."""
 
+from ._consistent import consistent as consistent
 from ._outcome import Outcome as Outcome
 from ._outcome import SimulationError as SimulationError
 from ._simulate import simulate as simulate

@@ -1,6 +1,6 @@
 """How a run ended: a code inside compiled code, a sentence outside."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -10,10 +10,25 @@ from jaxtyping import Array, Float, Int
 
 from ..mechanics import motion_equations
 from ..numerics import check_ranges, cholesky_pivots, modules_of, range_checks
-from ..scene import Scene, State
+from ..scene import Scene, State, scene_margins, scene_misfit
 from ..solvers import ACCUMULATION, TOO_MANY
 
-SUCCESS, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, MAX_EVENTS, MISSED_EVENT, FIRST_MASS = range(7)
+(
+    SUCCESS,
+    MAX_STEPS,
+    STEP_TOO_SMALL,
+    NOT_FINITE,
+    MAX_EVENTS,
+    MISSED_EVENT,
+    INCONSISTENT,
+    DRIFTED,
+    FIRST_MASS,
+) = range(9)
+
+# Correction of the initial state, relative to its size or to one, below which it is meant to obey the constraints.
+_CONSISTENT = 1e-6
+# Correction of the last state above which the constraints are not kept.
+_KEPT = 1e-2
 
 _GENERAL = (
     "The run reached t1.",
@@ -26,7 +41,25 @@ _GENERAL = (
     "The limit of mode changes was reached before t1: pass a larger max_events.",
     "At a saved time an element sticks under a load beyond its limit: a short pulse was stepped over, as nothing moves"
     " in stick and the steps grow. Pass dtmax, the longest step that cannot miss it, or a fixed step dt.",
+    "The initial state does not obey the constraints: pass q0, qd0 = jaxmodsim.consistent(scene, q0, qd0), which finds"
+    " the nearest state that does.",
+    "The constraints are not kept: they contradict each other here, have become dependent (a singular configuration), or"
+    " drift without bound (project=False).",
 )
+
+
+class _Offsets(NamedTuple):
+    """The first code of each group of sentences that depends on the scene."""
+
+    ranges: int
+    chatter: int
+    checks: int
+
+
+def _offsets(scene: Scene, dof: int) -> _Offsets:
+    ranges = FIRST_MASS + dof
+    chatter = ranges + sum(len(range_checks(module)) for _, module in modules_of(scene))
+    return _Offsets(ranges, chatter, chatter + len(scene.exact))
 
 
 class Ending(NamedTuple):
@@ -81,44 +114,74 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
     chatter = tuple(
         f"The mode changes of {name!r} accumulate: chatter between stick and slip. Pass hold_chatter=True to hold it in"
         " stick from there on."
-        for name in scene.exact_names
+        for name in scene.exact
     )
-    return _GENERAL + mass + ranges + chatter
+    return _GENERAL + mass + ranges + chatter + scene.checks
 
 
-def start_code(scene: Scene, t: Float[Array, ""], y: State, rate: State) -> Int[Array, ""]:
-    """What is wrong before the first step: a parameter out of range, a mass matrix without inverse, a field of NaN."""
+def start_code(scene: Scene, t: Float[Array, ""], y: State, rate: State, mode: Any) -> Int[Array, ""]:
+    """What is wrong before the first step: a parameter out of range, a state off the constraints, a field of NaN."""
     dof = y.q.shape[0]
     code = jnp.asarray(SUCCESS)
     finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
     code = jnp.where(finite, code, NOT_FINITE)
+    offsets = _offsets(scene, dof)
+    code = _blame_margins(code, scene_margins(t, y, scene, mode), offsets.checks, True)
     code = _blame_mass(code, _pivots(scene, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
+    if scene.constraints:
+        off, turned = scene_misfit(t, y, scene)
+        code = jnp.where((off <= _CONSISTENT) & (turned <= _CONSISTENT), code, INCONSISTENT)
     checks = [ok for _, module in modules_of(scene) for _, ok in range_checks(module)]
     for i, ok in reversed(list(enumerate(checks))):
-        code = jnp.where(ok, code, FIRST_MASS + dof + i)
+        code = jnp.where(ok, code, offsets.ranges + i)
     return code
 
 
 def end_code(
-    scene: Scene, t: Float[Array, ""], y: State, rate: State, result: dfx.RESULTS, ending: Ending | None
+    scene: Scene,
+    t: Float[Array, ""],
+    y: State,
+    rate: State,
+    mode: Any,
+    result: dfx.RESULTS,
+    ending: Ending | None,
+    ahead: Float[Array, ""],
 ) -> Int[Array, ""]:
-    """What ended the run, from diffrax's result, the last state and the last event."""
+    """What ended the run, from diffrax's result, the last state and the last event.
+
+    `ahead` is the time [s] by which the next step may have failed.
+    """
     early = ~dfx.is_okay(result)
     code = jnp.where(result == dfx.RESULTS.dt_min_reached, STEP_TOO_SMALL, NOT_FINITE)
     code = jnp.where(result == dfx.RESULTS.max_steps_reached, MAX_STEPS, code)
     code = jnp.where(early, code, SUCCESS)
+    offsets = _offsets(scene, y.q.shape[0])
     if ending is not None:
-        count = len(scene.exact_names)
         element = jnp.argmax(ending.fired)
-        first = len(outcome_messages(scene, y.q.shape[0])) - count
         chatters, full = ending.trouble == ACCUMULATION, ending.trouble == TOO_MANY
-        code = jnp.where(early & chatters, first + element, jnp.where(early & full, MAX_EVENTS, code))
+        code = jnp.where(early & chatters, offsets.chatter + element, jnp.where(early & full, MAX_EVENTS, code))
     finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
     code = jnp.where(early & ~finite, NOT_FINITE, code)
+    if scene.checks:
+        # The run ends in front of the place where the equations cease to hold: look a little further.
+        beyond = y._replace(q=y.q + ahead * y.qd, qd=y.qd + ahead * rate.qd)
+        code = _blame_margins(code, scene_margins(t + ahead, beyond, scene, mode), offsets.checks, early)
+        code = _blame_margins(code, scene_margins(t, y, scene, mode), offsets.checks, early)
+    if scene.constraints:
+        kept = scene_misfit(t, y, scene)[0] <= _KEPT
+        code = jnp.where(kept | ~finite, code, DRIFTED)
     eps = float(jnp.finfo(y.q.dtype).eps)
     # A run that stopped in front of a singular mass matrix cannot have come closer than its smallest step.
     tolerance = jnp.where(early, eps**0.5, 16 * y.q.shape[0] * eps)
     return _blame_mass(code, _pivots(scene, t, y), tolerance, jnp.all(jnp.isfinite(y.q)) & jnp.all(jnp.isfinite(y.qd)))
+
+
+def _blame_margins(code: Int[Array, ""], margins: Any, first: int, known: Array | bool) -> Int[Array, ""]:
+    """Replace `code` by that of the first condition that does not hold, where `known`."""
+    if margins is None:
+        return code
+    bad = ~(margins > 0)
+    return jnp.where(jnp.any(bad) & known, first + jnp.argmax(bad), code)
 
 
 def _pivots(scene: Scene, t: Float[Array, ""], y: State) -> Float[Array, " dof"]:

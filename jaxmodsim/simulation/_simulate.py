@@ -36,6 +36,7 @@ def simulate(
     max_steps: int = 16384,
     max_events: int = 1024,
     hold_chatter: bool = False,
+    project: bool = True,
     throw: bool = True,
 ) -> Trajectory:
     """Run a scene from `t0` to `t1`.
@@ -47,7 +48,8 @@ def simulate(
 
     - `scene`: the `Scene`.
     - `q0`, `qd0`: initial coordinates and velocities, shape `[dof]`. Of an element that sticks at t0 the slip velocity
-      is taken away, and with it the derivative by that velocity.
+      is taken away, and with it the derivative by that velocity. They must obey the constraints to six digits, and are
+      then moved onto them; `jaxmodsim.consistent` finds such states.
     - `t1`: end time [s], >= t0.
     - `t0`: start time [s].
     - `ts`: times [s] at which the run is kept, increasing, within `[t0, t1]`; by default the end alone, in arrays of
@@ -66,6 +68,9 @@ def simulate(
       `run.events` has as many entries for each such law, so a smaller one is faster there.
     - `hold_chatter`: whether an element whose mode changes accumulate is held in stick, with whatever force that takes,
       be it above the limit, instead of ending the run.
+    - `project`: whether the state is moved onto the constraints after every step, and wherever it is kept, by the
+      smallest changes in the metric of the masses. Without, constraints hold for the accelerations alone and drift with
+      the error of integration, but for their own `stabilise`.
     - `throw`: whether a run that ends early raises; otherwise `run.result` says how it ended, and what was computed
       is kept.
 
@@ -83,12 +88,13 @@ def simulate(
     for name, limit in (("max_steps", max_steps), ("max_events", max_events)):
         if isinstance(limit, bool) or not isinstance(limit, int | np.integer) or limit < 1:
             raise ValueError(f"{name} must be a positive integer, but {limit!r} was given.")
-    if not isinstance(hold_chatter, bool):
-        raise ValueError(f"hold_chatter must be True or False, but {hold_chatter!r} was given.")
+    for name, flag in (("hold_chatter", hold_chatter), ("project", project)):
+        if not isinstance(flag, bool):
+            raise ValueError(f"{name} must be True or False, but {flag!r} was given.")
     solver_arrays, solver_rest = _split(solver, dfx.AbstractSolver, "solver")
     adjoint_arrays, adjoint_rest = _split(adjoint, dfx.AbstractAdjoint, "adjoint")
     problem = problem._replace(plugins=(solver_arrays, adjoint_arrays))
-    options = Options(solver_rest, adjoint_rest, int(max_steps), int(max_events), hold_chatter)
+    options = Options(solver_rest, adjoint_rest, int(max_steps), int(max_events), hold_chatter, project)
     try:
         solved = solve(problem, options)
     except TypeError as error:

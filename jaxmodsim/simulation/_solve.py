@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import diffrax as dfx
 import equinox as eqx
@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PyTree
 
+from ..effects import Power
 from ..scene import (
     Scene,
     State,
@@ -21,10 +22,11 @@ from ..scene import (
     scene_modes,
     scene_overload,
     scene_power,
+    scene_project,
     scene_stick,
     scene_switch,
 )
-from ..solvers import EventController, EventLog, EventSolver, EventState, FiniteSteps, Rodas5P
+from ..solvers import EventController, EventLog, EventSolver, EventState, FiniteSteps, Projected, Rodas5P
 from ._outcome import MISSED_EVENT, SUCCESS, Ending, end_code, start_code
 
 # Part of the absolute tolerance below which a slip velocity counts as none.
@@ -66,13 +68,11 @@ class Options:
     max_steps: int
     max_events: int
     hold_chatter: bool
+    project: bool
 
 
-class Work(NamedTuple):
-    """Energy [J] that went through a scene since t0: supplied from outside, and absorbed by friction."""
-
-    supplied: Float[Array, "..."]
-    absorbed: Float[Array, "..."]
+# Energy [J] that went through a scene since t0, by the names of `scene_power`: supplied from outside, and absorbed.
+Work: TypeAlias = dict[str, Power]
 
 
 class Solved(NamedTuple):
@@ -97,7 +97,7 @@ def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolv
     Jacobian costs more than that, most of all in compile time.
     """
     stiff = any(effect.stiff for effect in scene.effects)
-    return Rodas5P(pivot=fixed_step) if stiff or (scene.exact_names and dof == 1) else dfx.Tsit5()
+    return Rodas5P(pivot=fixed_step) if stiff or (scene.exact and dof == 1) else dfx.Tsit5()
 
 
 class _Flow(NamedTuple):
@@ -105,10 +105,9 @@ class _Flow(NamedTuple):
 
     audited: bool
 
-    def start(self, y: State, t: Array) -> Any:
+    def start(self, y: State, t: Array, scene: Scene, mode: Any) -> Any:
         """What the run starts from."""
-        zero = jnp.zeros_like(t)
-        return (y, Work(zero, zero)) if self.audited else y
+        return (y, jtu.tree_map(jnp.zeros_like, scene_power(t, y, scene, mode))) if self.audited else y
 
     def state(self, y: Any) -> State:
         """The state in what is integrated."""
@@ -121,7 +120,7 @@ class _Flow(NamedTuple):
     def rate(self, t: Any, y: Any, scene: Scene, mode: Any = None) -> Any:
         """Right-hand side."""
         if self.audited:
-            return scene_field(t, y[0], scene, mode), Work(*scene_power(t, y[0], scene, mode))
+            return scene_field(t, y[0], scene, mode), scene_power(t, y[0], scene, mode)
         return scene_field(t, y, scene, mode)
 
 
@@ -132,11 +131,14 @@ _guards = jax.jit(scene_guards)
 
 
 class _Hybrid(NamedTuple):
-    """The functions of a run with modes, in the form `EventSolver` takes."""
+    """The functions of a run, where it has modes in the form `EventSolver` takes."""
 
     flow: _Flow
     # Slip velocity [m/s] that counts as none.
     rest: Float[Array, ""]
+    # What drifts with the error of integration and is put right after every step: off the constraints, out of stick.
+    projects: bool
+    sticks: bool
 
     def rate(self, t: Any, s: EventState, scene: Scene) -> EventState:
         return s.rate(_rate(self.flow, t, s.y, scene, s.mode))
@@ -154,6 +156,13 @@ class _Hybrid(NamedTuple):
     def stick(self, t: Any, s: EventState, scene: Scene) -> EventState:
         state = scene_stick(t, self.flow.state(s.y), scene, s.mode)
         return s._replace(y=self.flow.replace(s.y, state))
+
+    def project(self, t: Any, y: Any, scene: Scene) -> Any:
+        return self.flow.replace(y, scene_project(t, self.flow.state(y), scene)) if self.projects else y
+
+    def settle(self, t: Any, s: EventState, scene: Scene) -> EventState:
+        s = s._replace(y=self.project(t, s.y, scene))
+        return self.stick(t, s, scene) if self.sticks else s
 
 
 def _controller(problem: Problem) -> dfx.AbstractStepSizeController:
@@ -177,35 +186,41 @@ def _plugins(problem: Problem, options: Options) -> tuple[Any, Any]:
 
 def _integrate(problem: Problem, options: Options, flow: _Flow, log: int | None) -> tuple[Solved, EventLog | None]:
     """Run diffrax; with modes only where the scene has them, with a log of that many events where one is wanted."""
-    scene, exact = problem.scene, bool(problem.scene.exact_names)
+    scene, exact = problem.scene, bool(problem.scene.exact)
+    projects, sticks = bool(scene.constraints) and options.project, exact and scene_drifts(scene)
     initial, mode = initial_state(problem), None
     check_scene(scene, initial)
     solver, adjoint = _plugins(problem, options)
+    given = initial
+    if projects:
+        initial = scene_project(problem.t0, initial, scene)
     if exact:
         initial, mode = scene_modes(problem.t0, initial, scene, _REST * problem.atol)
-    start = start_code(scene, problem.t0, initial, scene_field(problem.t0, initial, scene, mode))
+    start = start_code(scene, problem.t0, given, scene_field(problem.t0, initial, scene, mode), mode)
     # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
     starts = start == SUCCESS
     ts = None if problem.ts is None else jnp.where(starts, problem.ts, problem.t0)
-    y0, controller, hybrid = flow.start(initial, problem.t0), _controller(problem), _Hybrid(flow, _REST * problem.atol)
+    y0, controller = flow.start(initial, problem.t0, scene, mode), _controller(problem)
+    hybrid = _Hybrid(flow, _REST * problem.atol, projects, sticks)
     if exact:
         solver = EventSolver(
             solver,
             hybrid.guards,
             hybrid.reset,
             hold=hybrid.hold if options.hold_chatter else None,
-            project=hybrid.stick if scene_drifts(scene) else None,
+            project=hybrid.settle if projects or sticks else None,
             insist=True,
             max_events=options.max_events if log is None else min(log, options.max_events),
             log=log is not None,
         )
         y0 = solver.start(problem.t0, y0, mode, scene)
         controller = EventController(controller)
+    elif projects:
+        solver = Projected(solver, hybrid.project)
 
     def keep(t: Any, s: Any, scene: Scene) -> Any:
-        if not exact:
-            return s, None
-        return (hybrid.stick(t, s, scene) if scene_drifts(scene) else s).y, s.mode
+        # Between the ends of steps the state comes from dense output, which obeys neither constraints nor stick.
+        return (hybrid.settle(t, s, scene).y, s.mode) if exact else (hybrid.project(t, s, scene), None)
 
     def keep_end(t: Any, s: Any, scene: Scene) -> Any:
         return keep(t, s, scene), ((s.events, s.trouble, s.fired), s.log) if exact else None
@@ -217,7 +232,7 @@ def _integrate(problem: Problem, options: Options, flow: _Flow, log: int | None)
         )
     )
     solution = dfx.diffeqsolve(
-        dfx.ODETerm(hybrid.rate if exact else flow.rate),
+        dfx.ODETerm(hybrid.rate if exact else flow.rate if not scene.constraints else partial(_rate, flow)),
         solver,
         problem.t0,
         jnp.where(starts, problem.t1, problem.t0),
@@ -239,7 +254,10 @@ def _integrate(problem: Problem, options: Options, flow: _Flow, log: int | None)
         (count, trouble, fired), history = events
         ending, stats["num_events"] = Ending(trouble, fired), count
     rate = scene_field(t_end, end_state, scene, mode)
-    code = jnp.where(starts, end_code(scene, t_end, end_state, rate, solution.result, ending), start)
+    span = jnp.maximum(jnp.abs(problem.t0), jnp.abs(problem.t1))
+    ahead = float(jnp.finfo(span.dtype).eps) ** 0.5 * span if problem.dt is None else problem.dt
+    ended = end_code(scene, t_end, end_state, rate, mode, solution.result, ending, ahead)
+    code = jnp.where(starts, ended, start)
     t, (y, modes) = solution.ts[1], solution.ys[1]
     if problem.ts is not None:
         reached = starts | (problem.ts <= problem.t0)

@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..mechanics import energies
-from ..scene import Scene, State, scene_forces
+from ..scene import Reaction, Scene, State, scene_forces, scene_reactions
 from ..solvers import EventLog
 from ._outcome import Outcome, outcome_messages
 from ._solve import Options, Problem, initial_state, solve_audited, solve_logged
@@ -37,7 +37,8 @@ class Energy(NamedTuple):
 
     - `kinetic`, `potential`: of the Lagrangian; see `jaxmodsim.mechanics.energies`.
     - `stored`: in the states of friction laws (bristles).
-    - `work_in`: brought in since t0 by applied forces, belts and explicit time dependence of the Lagrangian.
+    - `work_in`: brought in since t0 by applied forces, belts, constraints that move in time, and explicit time dependence
+      of the Lagrangian.
     - `dissipated`: lost in friction since t0. Of dynamic laws under a `normal_force` the energy in the state counts as
       lost until it comes back, as under a load that changes it is no function of the state.
     - `balance`: kinetic + potential + stored + dissipated - work_in, less its value at t0: zero but for the error
@@ -104,11 +105,17 @@ class Trajectory:
         return _forces(self.scene, self.t, self._states(), self.modes)
 
     @property
+    def reactions(self) -> dict[str, Reaction]:
+        """What each constraint does along the run, by its name: multipliers, generalised and Cartesian force."""
+        self._one_run("reactions")
+        return _reactions(self.scene, self.t, self._states(), self.modes)
+
+    @property
     def mode(self) -> dict[str, Array]:
         """Mode of each friction element that runs by events, by effect name, shape `[time]`: 0 in stick, else +-1."""
         if self.modes is None:
             return {}
-        return {name: self.modes[..., i] for i, name in enumerate(self.scene.exact_names)}
+        return {name: self.modes[..., i] for i, name in enumerate(self.scene.exact)}
 
     @property
     def events(self) -> Events:
@@ -143,16 +150,25 @@ class Trajectory:
 
 @jax.jit
 def _forces(scene: Scene, t: Array, y: State, mode: Any) -> dict[str, Array]:
-    forces = jax.vmap(lambda t, y, mode: scene_forces(t, y, scene, mode))(t, y, mode)
+    return _reached(t, jax.vmap(lambda t, y, mode: scene_forces(t, y, scene, mode))(t, y, mode))
+
+
+@jax.jit
+def _reactions(scene: Scene, t: Array, y: State, mode: Any) -> dict[str, Reaction]:
+    return _reached(t, jax.vmap(lambda t, y, mode: scene_reactions(t, y, scene, mode))(t, y, mode))
+
+
+def _reached(t: Array, tree: Any) -> Any:
+    """Arrays along a run, infinite at the times that an early end left unreached."""
     reached = jnp.isfinite(t)
-    return {name: jnp.where(jnp.expand_dims(reached, range(1, x.ndim)), x, jnp.inf) for name, x in forces.items()}
+    return jtu.tree_map(lambda x: jnp.where(jnp.expand_dims(reached, range(1, x.ndim)), x, jnp.inf), tree)
 
 
 @jax.jit
 def _events(scene: Scene, log: EventLog) -> Events:
     """One entry for each element that changed its mode, from a log with one for each instant."""
     before, after = log.before[1], log.after[1]
-    indices = jnp.asarray([scene.names.index(name) for name in scene.exact_names])
+    indices = jnp.asarray([scene.names.index(name) for name in scene.exact])
     changed = jnp.ravel((before != after) & jnp.isfinite(log.t)[:, None])
     order = jnp.argsort(~changed, stable=True)
 
@@ -180,6 +196,7 @@ def _energy(problem: Problem, t: Array, y: State, work: Any) -> Energy:
 
     kinetic0, potential0, stored0 = parts(problem.t0, initial_state(problem))
     kinetic, potential, stored = jax.vmap(parts)(t, y)
-    dissipated = work.absorbed - (stored - stored0)
-    total = kinetic + potential + stored + dissipated - work.supplied
-    return Energy(kinetic, potential, stored, work.supplied, dissipated, total - (kinetic0 + potential0 + stored0))
+    supplied = sum(each.supplied for each in work.values())
+    dissipated = sum(each.absorbed for each in work.values()) - (stored - stored0)
+    total = kinetic + potential + stored + dissipated - supplied
+    return Energy(kinetic, potential, stored, supplied, dissipated, total - (kinetic0 + potential0 + stored0))

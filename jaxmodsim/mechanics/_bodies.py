@@ -1,0 +1,207 @@
+"""Lagrangians of bodies whose place is a function of the coordinates."""
+
+import abc
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, PyTree
+
+from ..numerics import Amount, Place, as_amount, as_function, as_place, safe_norm, solve_semidefinite
+
+
+class AbstractBody(eqx.Module):
+    """A Lagrangian that can be added to others: `bead + rod + spring`, the last any function `L(t, q, qd, params)`."""
+
+    @abc.abstractmethod
+    def __call__(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+    ) -> Float[Array, ""]:
+        """Lagrangian [J]."""
+
+    def __add__(self, other: Callable[..., Any]) -> "Bodies":
+        """Both together."""
+        return Bodies((self, as_function(other, name="What is added to a body")))
+
+    def __radd__(self, other: Callable[..., Any] | int) -> "AbstractBody":
+        """Both together; zero, from which `sum` starts, is nothing."""
+        return self if other == 0 else Bodies((as_function(other, name="What is added to a body"), self))
+
+
+class Bodies(AbstractBody):
+    """Several Lagrangians together."""
+
+    parts: tuple[Callable[..., Any], ...]
+
+    def __call__(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+    ) -> Float[Array, ""]:
+        """Sum of the Lagrangians [J]."""
+        total = self.parts[0](t, q, qd, params)
+        for part in self.parts[1:]:
+            total = total + part(t, q, qd, params)
+        return total
+
+
+class PointMass(AbstractBody):
+    """Lagrangian of a point mass; made by `point_mass`."""
+
+    m: Amount = eqx.field(converter=partial(as_amount, name="point_mass m"))
+    position: Place = eqx.field(converter=partial(as_place, name="point_mass position"))
+    gravity: Amount = eqx.field(converter=partial(as_amount, name="point_mass gravity"))
+
+    def __call__(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+    ) -> Float[Array, ""]:
+        """`m v^2/2 - m g z` [J]."""
+        del t
+        x, v = _moving(self.position, q, qd, params, "point_mass")
+        m = self.m(params)
+        return 0.5 * m * jnp.sum(v**2) - m * self.gravity(params) * x[2]
+
+    def reaction(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+    ) -> Float[Array, "3"]:
+        """Force [N] of the path or surface on the mass, normal to it, from curvature and gravity, shape `[3]`.
+
+        It is the normal part of `m (d2x/dt2 + g ez)`, which the accelerations along the path do not enter. Normal
+        components of further forces on the mass are to be taken off: they are not known here.
+        """
+        del t
+
+        def velocity(q: Array) -> Array:
+            return jax.jvp(lambda q: self.position(q, params), (q,), (qd,))[1]
+
+        curved = jax.jvp(velocity, (q,), (qd,))[1]
+        up = jnp.zeros_like(curved).at[2].set(self.gravity(params))
+        load = self.m(params) * (curved + up)
+        tangents = jnp.moveaxis(jax.jacfwd(lambda q: self.position(q, params))(q), 1, 0)
+        gram = jnp.sum(tangents[:, None, :] * tangents[None, :, :], axis=2)
+        length = jnp.sqrt(jnp.where(jnp.diagonal(gram) > 0, jnp.diagonal(gram), 1.0))
+        along = jnp.sum(tangents * load[None, :], axis=1)
+        share = solve_semidefinite(gram, along, 1.0 / length, jnp.ones(q.shape, bool))
+        return load - jnp.sum(tangents * share[:, None], axis=0)
+
+    def normal_force(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+    ) -> Float[Array, ""]:
+        """Magnitude [N] of `reaction`, to be given to `Friction(normal_force=bead.normal_force)`."""
+        return safe_norm(self.reaction(t, q, qd, params))
+
+
+def point_mass(
+    m: ArrayLike | Callable[..., Any],
+    position: Callable[..., Any],
+    gravity: ArrayLike | Callable[..., Any] = 9.81,
+) -> PointMass:
+    """Lagrangian of a point mass whose position is a function of the coordinates.
+
+    ```python
+    bead = jms.point_mass(0.1, lambda q: 0.3 * jnp.stack([jnp.cos(q[0]), jnp.sin(q[0]), 0.0 * q[0]]))
+    scene = jms.Scene(bead)
+    ```
+
+    Bodies add up: `jms.point_mass(...) + jms.rigid_body(...) + spring`, with `spring(t, q, qd, params)` any Lagrangian.
+
+    **Arguments:**
+
+    - `m`: mass [kg], > 0, or `m(params)`, so that a number in `params` serves several functions.
+    - `position`: `position(q)` or `position(q, params)` in space [m], shape `[3]`, z upwards.
+    - `gravity`: acceleration [m/s^2] along -z, or a function of `params`.
+
+    **Returns:**
+
+    A function `L(t, q, qd, params)` [J] with the methods `reaction` and `normal_force`: what a path or surface does to
+    the mass. Its numbers are leaves of the scene.
+
+    **Raises:**
+
+    - `ValueError` for what is no number or no function, and (at the run) if `position` returns another shape.
+    """
+    return PointMass(m, position, gravity)
+
+
+class RigidBody(AbstractBody):
+    """Lagrangian of a rigid body; made by `rigid_body`."""
+
+    m: Amount = eqx.field(converter=partial(as_amount, name="rigid_body m"))
+    inertia: Amount = eqx.field(converter=partial(as_amount, name="rigid_body inertia"))
+    position: Place = eqx.field(converter=partial(as_place, name="rigid_body position"))
+    orientation: Place = eqx.field(converter=partial(as_place, name="rigid_body orientation"))
+    gravity: Amount = eqx.field(converter=partial(as_amount, name="rigid_body gravity"))
+
+    def __call__(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+    ) -> Float[Array, ""]:
+        """`m v^2/2 + w I w/2 - m g z` [J]."""
+        del t
+        x, v = _moving(self.position, q, qd, params, "rigid_body")
+        m, inertia = self.m(params), jnp.asarray(self.inertia(params))
+        turn, rate = jax.jvp(lambda q: self.orientation(q, params), (q,), (qd,))
+        _check_orientation(turn.shape, inertia.shape)
+        if turn.ndim == 0:
+            spin = 0.5 * inertia * rate**2
+        else:
+            w = body_rates(turn, rate)
+            momentum = inertia * w if inertia.ndim < 2 else jnp.sum(inertia * w[None, :], axis=1)
+            spin = 0.5 * jnp.sum(w * momentum)
+        return 0.5 * m * jnp.sum(v**2) + spin - m * self.gravity(params) * x[2]
+
+
+def rigid_body(
+    m: ArrayLike | Callable[..., Any],
+    inertia: ArrayLike | Callable[..., Any],
+    position: Callable[..., Any],
+    orientation: Callable[..., Any],
+    gravity: ArrayLike | Callable[..., Any] = 9.81,
+) -> RigidBody:
+    """Lagrangian of a rigid body by the motion of its centre of mass and of a frame fixed in it.
+
+    **Arguments:**
+
+    - `m`: mass [kg], > 0, or `m(params)`.
+    - `inertia`: moments of inertia [kg m^2] about the centre of mass, or a function of `params`: with an angle the one
+      about its axis; with a matrix the principal ones along the axes of the body frame, shape `[3]`, or the tensor in
+      that frame, shape `[3, 3]`, symmetric.
+    - `position`: `position(q)` or `position(q, params)` of the centre of mass [m], shape `[3]`, z upwards.
+    - `orientation`: `orientation(q)` or `orientation(q, params)`: the rotation matrix, shape `[3, 3]`, whose columns
+      are the axes of the body frame in fixed components; or, for plane motion, the angle [rad] about a fixed axis.
+    - `gravity`: acceleration [m/s^2] along -z, or a function of `params`.
+
+    **Returns:**
+
+    A function `L(t, q, qd, params)` [J], which can be added to others, see `point_mass`.
+
+    **Raises:**
+
+    - `ValueError` for what is no number or no function, and (at the run) for wrong shapes.
+    """
+    return RigidBody(m, inertia, position, orientation, gravity)
+
+
+def body_rates(turn: Float[Array, "3 3"], rate: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """Angular velocity [rad/s] of a frame in its own components, from its rotation matrix and that one's rate."""
+    skew = jnp.sum(turn[:, :, None] * rate[:, None, :], axis=0)
+    return 0.5 * jnp.stack([skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]])
+
+
+def _moving(position: Place, q: Array, qd: Array, params: PyTree, what: str) -> tuple[Array, Array]:
+    x, v = jax.jvp(lambda q: position(q, params), (q,), (qd,))
+    if x.shape != (3,):
+        raise ValueError(
+            f"{what}: position returned the shape {x.shape}, but (3,) is needed: x, y, z [m]. For motion in a plane"
+            " keep the third one zero, with z upwards."
+        )
+    return x, v
+
+
+def _check_orientation(turn: tuple[int, ...], inertia: tuple[int, ...]) -> None:
+    allowed = {(): [()], (3, 3): [(), (3,), (3, 3)]}
+    if turn not in allowed or inertia not in allowed[turn]:
+        raise ValueError(
+            f"rigid_body: orientation returned the shape {turn} with an inertia of shape {inertia}, but an angle () with"
+            " one moment of inertia (), or a matrix (3, 3) with an inertia of shape (3,) or (3, 3) is needed."
+        )

@@ -1,0 +1,192 @@
+"""Constraints: what they say about position and velocity."""
+
+import abc
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from equinox import AbstractVar
+from jaxtyping import Array, Float, PyTree
+
+from ..numerics import Number, Place, as_function, as_place, parameter, safe_norm
+
+
+def _at(value: Any) -> Place | None:
+    return None if value is None else as_place(value, name="Constraint at")
+
+
+class AbstractConstraint(eqx.Module):
+    """One or several equations that the motion obeys, each with a multiplier."""
+
+    # By which the constraint is known in the results and to friction; None for the class's own.
+    if TYPE_CHECKING:
+        name = cast("str | None", None)  # not a field, which would come before those of the constraints
+        one_sided = cast("bool", None)
+        stabilise = cast("Array", None)
+    else:
+        name: AbstractVar[str | None]
+        # Whether the multiplier can only push.
+        one_sided: AbstractVar[bool]
+        # Rate [1/s] at which errors die out.
+        stabilise: AbstractVar[Number]
+
+    @abc.abstractmethod
+    def error(self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree) -> Float[Array, " m"] | None:
+        """What is zero where the position is admissible, shape `[m]`; None where no position is excluded."""
+
+    @abc.abstractmethod
+    def rate(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+    ) -> Float[Array, " m"]:
+        """What is zero where the velocity is admissible, shape `[m]`."""
+
+    @abc.abstractmethod
+    def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
+        """Check shapes while tracing; raises `ValueError` naming the constraint."""
+
+    @abc.abstractmethod
+    def force(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree, multiplier: Float[Array, " m"]
+    ) -> Float[Array, "..."] | None:
+        """Cartesian force [N] at the constrained point; None where no point is known."""
+
+    @abc.abstractmethod
+    def per_multiplier(self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree) -> Float[Array, ""]:
+        """Magnitude [N] of the force at a multiplier of one, for a single equation."""
+
+
+class Constraint(AbstractConstraint):
+    """A holonomic constraint `phi(t, q, params) = 0`, kept by the force of its multiplier.
+
+    The equations of motion are `M qdd = load + Q + J^T lambda` with `J = dphi/dq`: the multiplier is positive where it
+    pushes towards larger phi. Where phi is a length measured along the normal, it is the normal force in newtons.
+
+    **Arguments:**
+
+    - `phi`: `phi(t, q, params)`, a scalar or shape `[m]`, any unit. With `at`, `phi(t, x, params)` of the position x.
+    - `at`: `at(q)` or `at(q, params)`, the position [m] of the constrained point, or of several in an array of any
+      shape. Then the force of constraint is known in space, whatever the unit of phi.
+    - `one_sided`: whether the constraint can only push (a floor, phi >= 0). A run ends where it would have to pull.
+    - `stabilise`: rate [1/s], >= 0, at which an error of position dies out: the accelerations obey
+      `phi'' + 2 stabilise phi' + stabilise^2 phi = 0` (Baumgarte 1972). By default none, as `simulate` projects the
+      state onto the constraint after every step.
+    - `name`: name in `run.reactions`, and for `Friction(normal_force=name)`.
+
+    **Raises:**
+
+    - `ValueError` for functions that are none, numbers out of range, and (at the run) for wrong shapes.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{baumgarte1972stabilization,
+            author={Baumgarte, J.},
+            title={Stabilization of constraints and integrals of motion in dynamical systems},
+            journal={Computer Methods in Applied Mechanics and Engineering}, volume={1}, number={1}, pages={1--16},
+            year={1972},
+        }
+        ```
+    """
+
+    phi: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Constraint phi"))
+    at: Place | None = eqx.field(default=None, converter=_at)
+    one_sided: bool = eqx.field(default=False, static=True)
+    stabilise: Number = parameter("stabilise", "1/s", lower=0.0, default=0.0)
+    name: str | None = eqx.field(default=None, static=True)
+
+    def error(self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree) -> Float[Array, " m"]:
+        """phi, shape `[m]`."""
+        place = q if self.at is None else self.at(q, params)
+        return jnp.ravel(jnp.asarray(self.phi(t, place, params), q.dtype))
+
+    def rate(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+    ) -> Float[Array, " m"]:
+        """Time derivative of phi, shape `[m]`."""
+        return jax.jvp(lambda t, q: self.error(t, q, params), (t, q), (jnp.ones_like(t), qd))[1]
+
+    def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
+        """Check that phi is a number or a vector, not of more entries than there are coordinates can follow."""
+        del qd
+        place = q if self.at is None else jax.eval_shape(self.at, q, params)
+        _check_vector(jax.eval_shape(self.phi, q[0], place, params), f"Constraint {name!r}: phi")
+        if self.one_sided and jax.eval_shape(self.error, q[0], q, params).shape != (1,):
+            raise ValueError(
+                f"Constraint {name!r}: one_sided=True needs phi to be one number, but it returned several. Give each"
+                " contact a Constraint of its own."
+            )
+
+    def force(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree, multiplier: Float[Array, " m"]
+    ) -> Float[Array, "..."] | None:
+        """`(dphi/dx)^T lambda` [N], of the shape of `at`'s positions."""
+        if self.at is None:
+            return None
+        _, pull = jax.vjp(lambda x: jnp.ravel(jnp.asarray(self.phi(t, x, params), q.dtype)), self.at(q, params))
+        return pull(multiplier)[0]
+
+    def per_multiplier(self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree) -> Float[Array, ""]:
+        """Length of dphi/dx; one where `at` is not given, so that phi must be a length along the normal."""
+        force = self.force(t, q, params, jnp.ones(1, q.dtype))
+        return jnp.ones_like(t) if force is None else safe_norm(jnp.ravel(force))
+
+
+class VelocityConstraint(AbstractConstraint):
+    """A constraint on velocities that no function of position expresses: rolling, a blade that does not slip sideways.
+
+    The equations of motion are `M qdd = load + Q + A^T lambda` with `A = dpsi/dqd`.
+
+    **Arguments:**
+
+    - `psi`: `psi(t, q, qd, params)`, zero in admissible motion, a scalar or shape `[m]`; linear in qd. (Where it is
+      not, A as it stands is Chetaev's rule.)
+    - `stabilise`: rate [1/s], >= 0, at which an error of velocity dies out: `psi' + stabilise psi = 0`.
+    - `name`: name in `run.reactions`.
+
+    **Raises:**
+
+    - As `Constraint`.
+    """
+
+    psi: Callable[..., Any] = eqx.field(converter=partial(as_function, name="VelocityConstraint psi"))
+    stabilise: Number = parameter("stabilise", "1/s", lower=0.0, default=0.0)
+    name: str | None = eqx.field(default=None, static=True)
+
+    one_sided: ClassVar[bool] = False
+
+    def error(self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree) -> None:
+        """No position is excluded."""
+        del t, q, params
+
+    def rate(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+    ) -> Float[Array, " m"]:
+        """psi, shape `[m]`."""
+        return jnp.ravel(jnp.asarray(self.psi(t, q, qd, params), q.dtype))
+
+    def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
+        """Check that psi is a number or a vector."""
+        _check_vector(jax.eval_shape(self.psi, q[0], q, qd, params), f"VelocityConstraint {name!r}: psi")
+
+    def force(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree, multiplier: Float[Array, " m"]
+    ) -> None:
+        """The point is not known."""
+        del t, q, params, multiplier
+
+    def per_multiplier(self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree) -> Float[Array, ""]:
+        """One: psi must be a velocity."""
+        del q, params
+        return jnp.ones_like(t)
+
+
+def _check_vector(given: Any, what: str) -> None:
+    shape = getattr(given, "shape", None)
+    if shape is None or len(shape) > 1 or shape == (0,):
+        raise ValueError(
+            f"{what} must return one number or a vector, but it returned {given if shape is None else f'shape {shape}'}"
+            ". Return jnp.array([...]) with one entry for each equation."
+        )

@@ -1,0 +1,157 @@
+"""Multipliers of constraints, and the way back onto them.
+
+With the velocity constraints `w(t, q, qd) = 0` of all constraints together and `J = dw/dqd`, accelerations `a` without
+them become `qdd = a + M^-1 J^T lambda`, where `J M^-1 J^T lambda = -(J a + bias)`. Redundant constraints leave that
+matrix singular: the motion is unique, and of all multipliers the smallest are taken.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from ..numerics import factor_positive_definite, solve_semidefinite
+from ._constraint import AbstractConstraint
+
+# Newton steps of a projection; the error of a step of integration is squared in each.
+_NEWTON = 2
+
+Constraints = Sequence[AbstractConstraint]
+
+
+class Restraint(NamedTuple):
+    """All constraints of a mechanism at one state; m equations.
+
+    - `rows`: J, shape `[m, dof]`.
+    - `bias`: rate of w where qdd = 0, with the stabilising terms, shape `[m]`.
+    - `reach`: rows `M^-1 J_k`, the accelerations of unit multipliers, shape `[m, dof]`.
+    - `matrix`: `J M^-1 J^T`, shape `[m, m]`.
+    """
+
+    rows: Float[Array, "m dof"]
+    bias: Float[Array, " m"]
+    reach: Float[Array, "m dof"]
+    matrix: Float[Array, "m m"]
+
+    def solve(self, rhs: Float[Array, " m"]) -> Float[Array, " m"]:
+        """Solve with `matrix`."""
+        return _solve(self.matrix, rhs)
+
+    def multipliers(self, qdd: Float[Array, " dof"]) -> Float[Array, " m"]:
+        """Multipliers that make accelerations `qdd` admissible."""
+        return -self.solve(_times(self.rows, qdd) + self.bias)
+
+    def yields(self, qdd: Float[Array, " dof"]) -> Float[Array, " m"]:
+        """What multipliers change if the accelerations without constraints change by `qdd`."""
+        return -self.solve(_times(self.rows, qdd))
+
+    def push(self, multipliers: Float[Array, " m"]) -> Float[Array, " dof"]:
+        """Accelerations that multipliers make."""
+        return jnp.sum(self.reach * multipliers[:, None], axis=0)
+
+    def force(self, multipliers: Float[Array, " m"]) -> Float[Array, " dof"]:
+        """Generalised force of multipliers."""
+        return jnp.sum(self.rows * multipliers[:, None], axis=0)
+
+
+def restrain(
+    constraints: Constraints,
+    t: Float[Array, ""],
+    q: Float[Array, " dof"],
+    qd: Float[Array, " dof"],
+    params: PyTree,
+    mass: Float[Array, "dof dof"],
+) -> Restraint:
+    """The constraints at one state of a mechanism with the mass matrix `mass`."""
+
+    def rates(t: Array, q: Array, qd: Array) -> Array:
+        return jnp.concatenate([each.rate(t, q, qd, params) for each in constraints])
+
+    rows = _jacobian(lambda qd: rates(t, q, qd), qd)
+    w, bias = jax.jvp(rates, (t, q, qd), (jnp.ones_like(t), qd, jnp.zeros_like(qd)))
+    start = 0
+    for each in constraints:
+        error = each.error(t, q, params)
+        size = each.rate(t, q, qd, params).shape[0]
+        part, rate = slice(start, start + size), each.stabilise.astype(q.dtype)
+        damped = rate * w[part] if error is None else 2.0 * rate * w[part] + rate**2 * error
+        bias = bias.at[part].add(damped)
+        start += size
+    reach, matrix = _reach(rows, mass)
+    return Restraint(rows, bias, reach, matrix)
+
+
+def sizes(
+    constraints: Constraints,
+    t: Float[Array, ""],
+    q: Float[Array, " dof"],
+    qd: Float[Array, " dof"],
+    params: PyTree,
+) -> list[int]:
+    """Number of equations of each constraint."""
+    return [jax.eval_shape(each.rate, t, q, qd, params).shape[0] for each in constraints]
+
+
+def project_position(
+    constraints: Constraints,
+    t: Float[Array, ""],
+    q: Float[Array, " dof"],
+    params: PyTree,
+    mass: Float[Array, "dof dof"],
+    steps: int = _NEWTON,
+) -> Float[Array, " dof"]:
+    """Coordinates moved onto the holonomic constraints, the shortest way in the metric of the masses.
+
+    Newton's iteration, `steps` times, with the mass matrix held.
+    """
+    holonomic = [each for each in constraints if each.error(t, q, params) is not None]
+    if not holonomic:
+        return q
+
+    def errors(q: Array) -> Array:
+        return jnp.concatenate([e for each in holonomic if (e := each.error(t, q, params)) is not None])
+
+    for _ in range(steps):
+        reach, matrix = _reach(_jacobian(errors, q), mass)
+        q = q - jnp.sum(reach * _solve(matrix, errors(q))[:, None], axis=0)
+    return q
+
+
+def project_velocity(
+    constraints: Constraints,
+    t: Float[Array, ""],
+    q: Float[Array, " dof"],
+    qd: Float[Array, " dof"],
+    params: PyTree,
+    mass: Float[Array, "dof dof"],
+) -> Float[Array, " dof"]:
+    """Velocities moved onto the constraints, by the smallest impulses that do."""
+
+    def rates(qd: Array) -> Array:
+        return jnp.concatenate([each.rate(t, q, qd, params) for each in constraints])
+
+    reach, matrix = _reach(_jacobian(rates, qd), mass)
+    return qd - jnp.sum(reach * _solve(matrix, rates(qd))[:, None], axis=0)
+
+
+def _jacobian(fn: object, x: Float[Array, " dof"]) -> Float[Array, "m dof"]:
+    """Jacobian by rows: there are never more independent constraints than coordinates."""
+    return jax.jacrev(fn)(x)  # pyright: ignore[reportArgumentType]
+
+
+def _reach(rows: Float[Array, "m dof"], mass: Float[Array, "dof dof"]) -> tuple[Array, Array]:
+    """Accelerations of unit multipliers, and what they do to each constraint."""
+    reach = factor_positive_definite(mass)(rows.T).T
+    return reach, jnp.sum(rows[:, None, :] * reach[None, :, :], axis=2)
+
+
+def _solve(matrix: Float[Array, "m m"], rhs: Float[Array, " m"]) -> Float[Array, " m"]:
+    diagonal = jnp.diagonal(matrix)
+    weight = 1.0 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
+    return solve_semidefinite(matrix, rhs, weight, jnp.ones(rhs.shape, bool))
+
+
+def _times(rows: Float[Array, "m dof"], vector: Float[Array, " dof"]) -> Float[Array, " m"]:
+    return jnp.sum(rows * vector[None, :], axis=1)

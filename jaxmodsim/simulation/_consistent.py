@@ -1,0 +1,104 @@
+"""States that obey the constraints."""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from ..mechanics import motion_equations
+from ..numerics import factor_positive_definite, solve_semidefinite
+from ..scene import Scene, State, check_scene
+from ._outcome import SimulationError
+
+# Newton's iteration is long over by then, or will not end.
+_STEPS = 50
+
+
+def consistent(
+    scene: Scene,
+    q0: ArrayLike | list[float],
+    qd0: ArrayLike | list[float],
+    *,
+    t0: ArrayLike = 0.0,
+    hold: Sequence[int] = (),
+) -> tuple[Float[Array, " dof"], Float[Array, " dof"]]:
+    """Find a state near the one given that obeys the constraints of a scene.
+
+    Newton's iteration with the smallest changes in the metric of the masses; then the velocities by the smallest
+    impulses.
+
+    **Arguments:**
+
+    - `scene`: the `Scene`.
+    - `q0`, `qd0`: where to begin, shape `[dof]`.
+    - `t0`: time [s], for constraints that move.
+    - `hold`: indices of the coordinates that keep their position and velocity (the angle of a crank).
+
+    **Returns:**
+
+    `(q0, qd0)`, to be passed to `simulate`.
+
+    **Raises:**
+
+    - `SimulationError` where none is found: a position or velocity that the constraints exclude (a linkage that does not
+      close), or one that `hold` leaves no freedom for.
+    - `ValueError` for shapes and indices that are wrong.
+    """
+    kind = jnp.result_type(float, *jax.tree_util.tree_leaves(scene))
+    q, qd, t = (jnp.asarray(x, kind) for x in (q0, qd0, t0))
+    if q.ndim != 1 or q.shape != qd.shape:
+        raise ValueError(
+            f"q0 and qd0 must both have the shape [dof], but q0 has the shape {q.shape} and qd0 {qd.shape}."
+        )
+    dof = q.shape[0]
+    if any(not 0 <= i < dof for i in hold):
+        raise ValueError(f"hold must be indices of coordinates, 0 to {dof - 1}, but {tuple(hold)} was given.")
+    check_scene(scene, State(q, qd, scene.state0()))
+    if not scene.constraints:
+        return q, qd
+    free = jnp.asarray([float(i not in hold) for i in range(dof)], kind)
+    q, qd, errors = _find(scene, t, q, qd, free)
+    eps = float(jnp.finfo(kind).eps)
+    for error, what in zip(errors, ("position", "velocity"), strict=True):
+        if not float(error) <= 1e3 * eps * max(1.0, float(jnp.max(jnp.abs(q))), float(jnp.max(jnp.abs(qd)))):
+            held = f" with the coordinates {tuple(hold)} held" if hold else ""
+            raise SimulationError(
+                f"No {what} near q0 = {q0}, qd0 = {qd0} obeys the constraints{held}: the nearest found, q = {q},"
+                f" qd = {qd}, is still off by {float(error):.3g}. Begin nearer to a solution, or see whether there is one."
+            )
+    return q, qd
+
+
+@jax.jit
+def _find(
+    scene: Scene, t: Array, q: Array, qd: Array, free: Array
+) -> tuple[Array, Array, tuple[Array, Array]]:
+    """Position, velocity, and by how much the constraints are still violated."""
+    constraints, params = scene.constraints, scene.params
+    mass = motion_equations(scene.lagrangian, t, q, qd, params).mass
+    inverse = factor_positive_definite(mass)(jnp.eye(q.shape[0], dtype=q.dtype))
+    inverse = inverse * free[:, None] * free[None, :]
+
+    def back(fn: Callable[[Array], Array], x: Array) -> Array:
+        """Step that takes `fn` to zero, to first order."""
+        value, rows = fn(x), jax.jacrev(fn)(x)
+        reach = rows @ inverse
+        matrix = reach @ rows.T
+        diagonal = jnp.diagonal(matrix)
+        weight = 1.0 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
+        return reach.T @ solve_semidefinite(matrix, value, weight, jnp.ones(value.shape, bool))
+
+    def position(q: Array) -> Array:
+        errors = [each.error(t, q, params) for each in constraints]
+        return jnp.concatenate([e for e in errors if e is not None])
+
+    def velocity(q: Array, qd: Array) -> Array:
+        return jnp.concatenate([each.rate(t, q, qd, params) for each in constraints])
+
+    off = jnp.zeros_like(t)
+    if any(each.error(t, q, params) is not None for each in constraints):
+        q = jax.lax.fori_loop(0, _STEPS, lambda _, q: q - back(position, q), q)
+        off = jnp.max(jnp.abs(position(q)))
+    qd = qd - back(lambda qd: velocity(q, qd), qd)
+    return q, qd, (off, jnp.max(jnp.abs(velocity(q, qd))))

@@ -1,0 +1,62 @@
+"""A solver wrapper that moves the state back onto what it has to obey."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, cast
+
+import diffrax as dfx
+from jaxtyping import PyTree
+
+
+class Projected(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
+    """Wrap a diffrax solver so that every step ends with a projection.
+
+    The order is that of the wrapped solver, as what a projection takes away is at most the error of the step. Dense
+    output inside a step is that of the wrapped solver, not projected.
+
+    **Arguments:**
+
+    - `solver`: any solver of an `ODETerm`.
+    - `project`: `project(t, y, args)` -> `y`.
+    """
+
+    term_structure: ClassVar = dfx.ODETerm
+    solver: dfx.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
+    project: Callable[..., Any]
+
+    @property
+    def root_finder(self) -> Any:
+        """That of the wrapped solver, if it is implicit."""
+        return cast(Any, self.solver).root_finder
+
+    @property
+    def scan_kind(self) -> Any:
+        """That of the wrapped solver, if it is a Runge-Kutta method."""
+        return cast(Any, self.solver).scan_kind
+
+    @property
+    def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Interpolation of the wrapped solver."""
+        return self.solver.interpolation_cls
+
+    def order(self, terms: PyTree) -> Any:
+        """Order of the wrapped solver."""
+        return self.solver.order(terms)
+
+    def error_order(self, terms: PyTree) -> Any:
+        """Order of the error estimate of the wrapped solver."""
+        return self.solver.error_order(terms)
+
+    def func(self, terms: PyTree, t0: Any, y0: PyTree, args: PyTree) -> PyTree:
+        """The vector field."""
+        return self.solver.func(terms, t0, y0, args)
+
+    def init(self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> Any:
+        """State of the wrapped solver."""
+        return self.solver.init(terms, t0, t1, y0, args)
+
+    def step(
+        self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree, solver_state: Any, made_jump: Any
+    ) -> tuple[PyTree, PyTree, dict[str, Any], Any, dfx.RESULTS]:
+        """A step of the wrapped solver, projected."""
+        y1, error, dense, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        return self.project(t1, y1, args), error, dense, state, result
