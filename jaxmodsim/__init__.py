@@ -19,6 +19,9 @@ from .identify import FitResult as FitResult
 from .identify import Record as Record
 from .identify import fit as fit
 from .identify import fit_law as fit_law
+from .mechanics import Chart as Chart
+from .mechanics import Cylindrical as Cylindrical
+from .mechanics import Spherical as Spherical
 from .scene import Scene as Scene
 from .simulation import SimulationError as SimulationError
 from .simulation import Trajectory as Trajectory

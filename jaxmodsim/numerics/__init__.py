@@ -18,6 +18,7 @@ from ._once import once as once
 from ._once import unit_of as unit_of
 from ._rosenbrock import RosenbrockTableau as RosenbrockTableau
 from ._rosenbrock import rosenbrock_step as rosenbrock_step
+from ._safe import safe_norm as safe_norm
 from ._safe import safe_power as safe_power
 from ._watch import Watch as Watch
 from ._watch import first_root as first_root
