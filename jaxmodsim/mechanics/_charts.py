@@ -117,10 +117,10 @@ class AbstractChart(eqx.Module):
 class Cylindrical(AbstractChart):
     """Cylindrical coordinates (r, theta, z): `x = r cos(theta)`, `y = r sin(theta)`; r and z [m], theta [rad].
 
-    The frame is (e_r, e_theta, e_z), right-handed; scale factors (1, r, 1); angular velocity (0, 0, theta').
+    For r >= 0 the frame is (e_r, e_theta, e_z), right-handed; scale factors (1, r, 1); angular velocity (0, 0, theta').
 
-    On the axis, r = 0, the tangent along theta vanishes; e_theta is completed to `e_z x e_r`, and all of the above
-    holds. For r < 0 that tangent points backwards, and e_theta with it: the frame is left-handed.
+    On the axis, r = 0, the tangent along theta vanishes; e_theta is completed to `e_z x e_r`. For r < 0 that tangent
+    points backwards, and e_theta with it: the frame is left-handed.
     """
 
     def position(self, q: _Triples) -> Float[Array, "... 3"]:
@@ -132,12 +132,14 @@ class Cylindrical(AbstractChart):
 class Spherical(AbstractChart):
     """Spherical coordinates (r, phi, theta), phi from the +z axis and theta about it; r [m], phi and theta [rad].
 
-    `x = r sin(phi) cos(theta)`, `y = r sin(phi) sin(theta)`, `z = r cos(phi)`. The frame is (e_r, e_phi, e_theta),
-    right-handed; scale factors (1, r, r sin(phi)); angular velocity (cos(phi) theta', -sin(phi) theta', phi').
+    `x = r sin(phi) cos(theta)`, `y = r sin(phi) sin(theta)`, `z = r cos(phi)`. For r > 0 and 0 <= phi <= pi the frame
+    is (e_r, e_phi, e_theta), right-handed; scale factors (1, r, r sin(phi)); angular velocity
+    (cos(phi) theta', -sin(phi) theta', phi').
 
     At the pole, phi = 0, the tangent along theta vanishes; e_theta is completed to `e_r x e_phi`, which depends on
     theta, and all of the above holds. (At phi = pi a floating sine is not zero, so no tangent vanishes.) At r = 0
-    there is no frame. Where r sin(phi) < 0 the frame is left-handed, each vector along its tangent.
+    there is no frame. For sin(phi) < 0 the tangent along theta points backwards, and e_theta with it: the frame is
+    left-handed. For r < 0 e_phi and e_theta both turn round.
     """
 
     def position(self, q: _Triples) -> Float[Array, "... 3"]:
