@@ -19,7 +19,10 @@ from .identify import FitResult as FitResult
 from .identify import Record as Record
 from .identify import fit as fit
 from .identify import fit_law as fit_law
+from .mechanics import Chart as Chart
 from .mechanics import Constraint as Constraint
+from .mechanics import Cylindrical as Cylindrical
+from .mechanics import Spherical as Spherical
 from .mechanics import VelocityConstraint as VelocityConstraint
 from .mechanics import point_mass as point_mass
 from .mechanics import rigid_body as rigid_body

@@ -25,8 +25,8 @@ class AppliedForce(AbstractEffect):
     - `fn`: `fn(t, q, qd, params)` returns the force: without `at` the generalised force, shape `[dof]` [N or N m];
       with `at` a Cartesian force [N] of the shape that `at` returns. Numbers that are to be differentiated or
       swept belong into `params` (or into the leaves of an `eqx.Module` passed as `fn`).
-    - `at`: `at(q)` or `at(q, params)` returns the position of the point of attack [m]; the force is mapped to the coordinates by the
-      transposed Jacobian of `at`.
+    - `at`: `at(q)` or `at(q, params)` returns the position of the point of attack [m]; the force is mapped to the
+      coordinates by the transposed Jacobian of `at`.
     - `name`: name in `run.forces`.
 
     **Raises:**

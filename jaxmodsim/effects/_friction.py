@@ -126,8 +126,8 @@ class Friction(AbstractEffect):
             )
         if shape not in ((), (2,), (3,)):
             raise ValueError(
-                f"Friction {name!r}: along(q) returned the shape {shape}, but one number, shape (), or a position, shape"
-                " (2,) or (3,), is needed."
+                f"Friction {name!r}: along(q) returned the shape {shape}, but one number, shape (), or a position,"
+                " shape (2,) or (3,), is needed."
             )
         slip = () if q.shape == (1,) else shape
         if slip != () and not isinstance(self.law, AbstractForceLaw):
@@ -264,9 +264,7 @@ class Friction(AbstractEffect):
         self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, action: Action
     ) -> Power:
         """The belt brings in -F times its velocity; slip absorbs F times the slip velocity."""
-        return Power(
-            -jnp.sum(action.force * self.belt(t)), jnp.sum(action.force * self.slip(t, q, qd, params))
-        )
+        return Power(-jnp.sum(action.force * self.belt(t)), jnp.sum(action.force * self.slip(t, q, qd, params)))
 
     def stored(self, z: PyTree) -> Float[Array, ""] | float:
         """Energy [J] in the law's state, for laws in newtons; under a load of its own it has no fixed energy."""

@@ -1,9 +1,13 @@
-"""From a Lagrangian to equations of motion, with constraints and their reactions."""
+"""From a Lagrangian to equations of motion; constraints and their reactions; coordinates and their frames."""
 
 from ._bodies import PointMass as PointMass
 from ._bodies import RigidBody as RigidBody
 from ._bodies import point_mass as point_mass
 from ._bodies import rigid_body as rigid_body
+from ._charts import AbstractChart as AbstractChart
+from ._charts import Chart as Chart
+from ._charts import Cylindrical as Cylindrical
+from ._charts import Spherical as Spherical
 from ._constraint import AbstractConstraint as AbstractConstraint
 from ._constraint import Constraint as Constraint
 from ._constraint import VelocityConstraint as VelocityConstraint

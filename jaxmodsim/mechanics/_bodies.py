@@ -202,6 +202,6 @@ def _check_orientation(turn: tuple[int, ...], inertia: tuple[int, ...]) -> None:
     allowed = {(): [()], (3, 3): [(), (3,), (3, 3)]}
     if turn not in allowed or inertia not in allowed[turn]:
         raise ValueError(
-            f"rigid_body: orientation returned the shape {turn} with an inertia of shape {inertia}, but an angle () with"
-            " one moment of inertia (), or a matrix (3, 3) with an inertia of shape (3,) or (3, 3) is needed."
+            f"rigid_body: orientation returned the shape {turn} with an inertia of shape {inertia}, but an angle ()"
+            " with one moment of inertia (), or a matrix (3, 3) with an inertia of shape (3,) or (3, 3) is needed."
         )

@@ -1,5 +1,6 @@
 """Functions whose derivatives stay finite at zero."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -14,7 +15,15 @@ def safe_power(base: Float[Array, "..."], exponent: Float[Array, "..."]) -> Floa
     return jnp.where(positive, jnp.where(positive, base, 1.0) ** exponent, 0.0)
 
 
-def safe_norm(x: Float[Array, " n"]) -> Float[Array, ""]:
-    """Euclidean length; value and derivative are zero at zero, where the derivative of a plain square root is NaN."""
-    square = jnp.sum(x * x)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+def safe_norm(x: Float[Array, "..."], *, axis: int = -1) -> Float[Array, "..."]:
+    """Euclidean norm along `axis`; its derivative is zero where `x` vanishes, and NaN there by a plain norm.
+
+    The entries are divided by the largest first, so that no square underflows: only zero has the norm zero.
+    """
+    # The norm does not depend on the divisor, so neither does its derivative.
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True))
+    vanishes = largest == 0
+    scale = jnp.where(vanishes, 1.0, largest)
+    squares = jnp.sum((x / scale) ** 2, axis=axis, keepdims=True)
+    norm = jnp.where(vanishes, 0.0, scale * jnp.sqrt(jnp.where(vanishes, 1.0, squares)))
+    return jnp.squeeze(norm, axis)

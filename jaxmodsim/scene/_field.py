@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..effects import Power
 from ..mechanics import motion_equations, project_position, project_velocity
-from ._contact import Contact, balance, contact_guards, next_modes, overload, stop_slip
+from ._contact import Contact, contact_guards, next_modes, overload, stop_slip
 from ._resolve import Modes, State, by_constraint, resolve
 from ._scene import Scene
 

@@ -8,7 +8,6 @@ from jaxtyping import Array
 from ..numerics import Range, ranges_of
 from ._scene import Scene
 
-
 # Levels of the scene that say nothing about a number.
 _SILENT = ("law", "place", "amount")
 

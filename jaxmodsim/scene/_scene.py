@@ -12,7 +12,6 @@ from ..effects import AbstractEffect, Friction
 from ..mechanics import AbstractConstraint, Lagrangian
 from ..numerics import as_function, as_real
 
-
 # The test of uniqueness looks at every corner of the box of slopes: two to this power.
 _MOST_LOADS = 4
 
@@ -160,8 +159,8 @@ class Scene(eqx.Module):
     def checks(self) -> tuple[str, ...]:
         """What may end the equations of motion, in words, in the order of `Resolved.margins`."""
         words = [
-            f"The constraint {name!r} can only push, and would have to pull: the contact opens. Its motion from there on"
-            " is that of a scene without it."
+            f"The constraint {name!r} can only push, and would have to pull: the contact opens. The motion from there"
+            " on is that of a scene without it."
             for name, each in zip(self.constraint_names, self.constraints, strict=True)
             if each.one_sided
         ]

@@ -41,8 +41,8 @@ def consistent(
 
     **Raises:**
 
-    - `SimulationError` where none is found: a position or velocity that the constraints exclude (a linkage that does not
-      close), or one that `hold` leaves no freedom for.
+    - `SimulationError` where none is found: a position or velocity that the constraints exclude (a linkage that does
+      not close), or one that `hold` leaves no freedom for.
     - `ValueError` for shapes and indices that are wrong.
     """
     kind = jnp.result_type(float, *jax.tree_util.tree_leaves(scene))
@@ -65,15 +65,14 @@ def consistent(
             held = f" with the coordinates {tuple(hold)} held" if hold else ""
             raise SimulationError(
                 f"No {what} near q0 = {q0}, qd0 = {qd0} obeys the constraints{held}: the nearest found, q = {q},"
-                f" qd = {qd}, is still off by {float(error):.3g}. Begin nearer to a solution, or see whether there is one."
+                f" qd = {qd}, is still off by {float(error):.3g}. Begin nearer to a solution, or see whether"
+                " there is one."
             )
     return q, qd
 
 
 @jax.jit
-def _find(
-    scene: Scene, t: Array, q: Array, qd: Array, free: Array
-) -> tuple[Array, Array, tuple[Array, Array]]:
+def _find(scene: Scene, t: Array, q: Array, qd: Array, free: Array) -> tuple[Array, Array, tuple[Array, Array]]:
     """Position, velocity, and by how much the constraints are still violated."""
     constraints, params = scene.constraints, scene.params
     mass = motion_equations(scene.lagrangian, t, q, qd, params).mass

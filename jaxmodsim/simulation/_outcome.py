@@ -43,8 +43,8 @@ _GENERAL = (
     " in stick and the steps grow. Pass dtmax, the longest step that cannot miss it, or a fixed step dt.",
     "The initial state does not obey the constraints: pass q0, qd0 = jaxmodsim.consistent(scene, q0, qd0), which finds"
     " the nearest state that does.",
-    "The constraints are not kept: they contradict each other here, have become dependent (a singular configuration), or"
-    " drift without bound (project=False).",
+    "The constraints are not kept: they contradict each other here, have become dependent (a singular configuration),"
+    " or drift without bound (project=False).",
 )
 
 

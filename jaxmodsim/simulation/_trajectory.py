@@ -37,8 +37,8 @@ class Energy(NamedTuple):
 
     - `kinetic`, `potential`: of the Lagrangian; see `jaxmodsim.mechanics.energies`.
     - `stored`: in the states of friction laws (bristles).
-    - `work_in`: brought in since t0 by applied forces, belts, constraints that move in time, and explicit time dependence
-      of the Lagrangian.
+    - `work_in`: brought in since t0 by applied forces, belts, constraints that move in time, and explicit time
+      dependence of the Lagrangian.
     - `dissipated`: lost in friction since t0. Of dynamic laws under a `normal_force` the energy in the state counts as
       lost until it comes back, as under a load that changes it is no function of the state.
     - `balance`: kinetic + potential + stored + dissipated - work_in, less its value at t0: zero but for the error
