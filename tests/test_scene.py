@@ -138,7 +138,10 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
     "class as law": (lambda: Friction(cast_any(LuGre)), "needs a law object"),
     "belt of text": (lambda: Friction(Viscous(1.0), belt_velocity=cast_any("fast")), "belt_velocity must be a real"),
     "belt of two": (lambda: Friction(Viscous(1.0), belt_velocity=jnp.ones(2)), r"belt_velocity has shape \(2,\)"),
-    "load of text": (lambda: Friction(Viscous(1.0), normal_force=cast_any("heavy")), "normal_force must be a real"),
+    "load of nothing": (
+        lambda: one_friction(normal_force="floor"),
+        "normal_force='floor' names no constraint of the scene; there are: none",
+    ),
     "along is no function": (lambda: Friction(Viscous(1.0), along=cast_any(0)), "along must be a function, but 0"),
     "force is no function": (lambda: AppliedForce(cast_any(2.0)), r"AppliedForce fn must be a function, but 2.0"),
     "at is no function": (lambda: AppliedForce(push, at=cast_any(1)), r"AppliedForce at must be a function, but 1"),

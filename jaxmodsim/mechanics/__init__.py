@@ -11,6 +11,9 @@ from ._charts import Spherical as Spherical
 from ._constraint import AbstractConstraint as AbstractConstraint
 from ._constraint import Constraint as Constraint
 from ._constraint import VelocityConstraint as VelocityConstraint
+from ._hamilton import momentum as momentum
+from ._hamilton import quadratic as quadratic
+from ._hamilton import velocity as velocity
 from ._lagrange import Lagrangian as Lagrangian
 from ._lagrange import MotionEquations as MotionEquations
 from ._lagrange import acceleration as acceleration

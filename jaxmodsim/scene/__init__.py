@@ -2,6 +2,7 @@
 
 from ._field import Reaction as Reaction
 from ._field import check_scene as check_scene
+from ._field import scene_canonical as scene_canonical
 from ._field import scene_drifts as scene_drifts
 from ._field import scene_field as scene_field
 from ._field import scene_forces as scene_forces

@@ -36,6 +36,19 @@ def scene_field(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None)
     return State(y.qd, qdd, {name: resolved.actions[name].rate for name in y.z})
 
 
+def scene_canonical(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> State:
+    """Rates of coordinates and momenta at the state `y`: `p' = dL/dq + Q + J^T lambda`, in the place of qd."""
+    resolved = resolve(scene, t, y, mode)
+    push = jax.grad(scene.lagrangian, argnums=1)(t, y.q, y.qd, scene.params)
+    for action in resolved.actions.values():
+        push = push + action.generalised
+    if resolved.restraint is not None:
+        push = push + resolved.restraint.force(resolved.multipliers)
+    if resolved.margins is not None:
+        push = jnp.where(jnp.all(resolved.margins > 0), push, jnp.nan)
+    return State(y.qd, push, {name: resolved.actions[name].rate for name in y.z})
+
+
 def scene_guards(
     t: Float[Array, ""], y: State, scene: Scene, mode: Modes, rest: Float[Array, ""]
 ) -> Float[Array, " guards"]:

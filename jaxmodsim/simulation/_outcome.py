@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..mechanics import motion_equations
+from ..mechanics import motion_equations, quadratic
 from ..numerics import check_ranges, cholesky_pivots, modules_of, range_checks
 from ..scene import Scene, State, scene_margins, scene_misfit
 from ..solvers import ACCUMULATION, TOO_MANY
@@ -22,8 +22,9 @@ from ..solvers import ACCUMULATION, TOO_MANY
     MISSED_EVENT,
     INCONSISTENT,
     DRIFTED,
+    NOT_QUADRATIC,
     FIRST_MASS,
-) = range(9)
+) = range(10)
 
 # Correction of the initial state, relative to its size or to one, below which it is meant to obey the constraints.
 _CONSISTENT = 1e-6
@@ -45,6 +46,7 @@ _GENERAL = (
     " the nearest state that does.",
     "The constraints are not kept: they contradict each other here, have become dependent (a singular configuration),"
     " or drift without bound (project=False).",
+    "Gauss works with momenta, and needs a Lagrangian that is quadratic in the velocities: use another solver.",
 )
 
 
@@ -119,12 +121,16 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
     return _GENERAL + mass + ranges + chatter + scene.checks
 
 
-def start_code(scene: Scene, t: Float[Array, ""], y: State, rate: State, mode: Any) -> Int[Array, ""]:
+def start_code(
+    scene: Scene, t: Float[Array, ""], y: State, rate: State, mode: Any, canonical: bool
+) -> Int[Array, ""]:
     """What is wrong before the first step: a parameter out of range, a state off the constraints, a field of NaN."""
     dof = y.q.shape[0]
     code = jnp.asarray(SUCCESS)
     finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
     code = jnp.where(finite, code, NOT_FINITE)
+    if canonical:
+        code = jnp.where(quadratic(scene.lagrangian, t, y.q, y.qd, scene.params), code, NOT_QUADRATIC)
     offsets = _offsets(scene, dof)
     code = _blame_margins(code, scene_margins(t, y, scene, mode), offsets.checks, True)
     code = _blame_mass(code, _pivots(scene, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PyTree
 
-from ..mechanics import energies
+from ..mechanics import energies, momentum
 from ..scene import Reaction, Scene, State, scene_forces, scene_reactions
 from ..solvers import EventLog
 from ._outcome import Outcome, outcome_messages
@@ -131,6 +131,12 @@ class Trajectory:
         return _events(self.scene, solve_logged(self.problem, self.options, size))
 
     @property
+    def momentum(self) -> Float[Array, "*time dof"]:
+        """Canonical momenta dL/dqd along the run, shape `[time, dof]` [kg m/s or kg m^2/s]."""
+        self._one_run("momentum")
+        return _momentum(self.scene, self.t, self.q, self.qd)
+
+    @property
     def energy(self) -> Energy:
         """Energies and their balance along the run. Runs the scene once more, with the work integrals beside it."""
         self._one_run("energy")
@@ -156,6 +162,11 @@ def _forces(scene: Scene, t: Array, y: State, mode: Any) -> dict[str, Array]:
 @jax.jit
 def _reactions(scene: Scene, t: Array, y: State, mode: Any) -> dict[str, Reaction]:
     return _reached(t, jax.vmap(lambda t, y, mode: scene_reactions(t, y, scene, mode))(t, y, mode))
+
+
+@jax.jit
+def _momentum(scene: Scene, t: Array, q: Array, qd: Array) -> Array:
+    return _reached(t, jax.vmap(lambda t, q, qd: momentum(scene.lagrangian, t, q, qd, scene.params))(t, q, qd))
 
 
 def _reached(t: Array, tree: Any) -> Any:
