@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Int
 
 from ._layout import Layout, Parts, State
 from ._linalg import MAX_UNROLLED_LU, factor_lu
+from ._once import once, unit_of
 
 MAX_ITERATIONS = 50
 # The increments of a solved step are rounding: below this part of the unknown itself, or below this number of units of
@@ -36,10 +37,10 @@ def _bend(points: np.ndarray, powers: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class GaussCollocation:
-    """Coefficients of the Gauss method with `s` stages, an implicit Runge-Kutta method of order `2 s`.
+    r"""Coefficients of the Gauss method with `s` stages, an implicit Runge-Kutta method of order `2 s`.
 
-    With increments `l_j = dt b_j f(t + c_j dt, y_j)` its stages are `y_i = y + sum_j m_ij l_j`, where `m_ij = a_ij/b_j`,
-    and `y1 = y + sum_j l_j`. In this form the method is symplectic if `m_ij + m_ji = 1`, whatever rounding did to `b`.
+    With increments `l_j = dt b_j f(t + c_j dt, y_j)` its stages are `y_i = y + sum_j m_ij l_j`, `m_ij = a_ij/b_j`, and
+    `y1 = y + sum_j l_j`. In this form the method is symplectic if `m_ij + m_ji = 1`, whatever rounding did to `b`.
     `coupling` meets that exactly, so that the rounding of coefficients makes no drift.
 
     **Arguments:**
@@ -51,7 +52,7 @@ class GaussCollocation:
 
         ```bibtex
         @article{antonana2017reducing,
-            author={Anto\\~nana, Mikel and Makazaga, Joseba and Murua, Ander},
+            author={Anto{\~n}ana, Mikel and Makazaga, Joseba and Murua, Ander},
             title={Reducing and monitoring round-off error propagation for symplectic implicit {R}unge--{K}utta
                    schemes},
             journal={Numerical Algorithms}, volume={76}, year={2017},
@@ -132,6 +133,10 @@ class _Solved(NamedTuple):
     iterations: Array
 
 
+# Of `solved` and `iterations`.
+_NO_TANGENTS: Any = (None, None)
+
+
 class _Search(NamedTuple):
     slopes: list[Parts]
     # The largest change of any stage's slope by the last iteration, and the smallest such change so far but zero.
@@ -198,20 +203,18 @@ def _small(method: GaussCollocation, dt: Array, y: Parts, search: _Search) -> Ar
 
 
 @eqx.filter_custom_jvp
-def _solve(
-    stages: int, rates: Rates, t0: Array, dt: Array, y: Parts, rest: Parts, guess: list[Parts]
-) -> _Solved:
+def _solve(stages: int, rates: Rates, t0: Array, dt: Array, y: Parts, rest: Parts, guess: list[Parts]) -> _Solved:
     """Slopes of the stages by fixed-point iteration; zeros where it does not converge.
 
     The iteration goes on until no unknown changes less than it did before: a tolerance, however small, would leave an
     error of one sign, and energy would drift. Looking only after every second iteration is faster, and takes the end of
     an alternation between positions and momenta for what it is.
     """
-    method = GAUSS[stages]
+    method, unit = GAUSS[stages], unit_of(t0)
 
     def iterate(search: _Search) -> _Search:
-        before = _slopes(method, rates, t0, dt, y, rest, search.slopes)
-        slopes = _slopes(method, rates, t0, dt, y, rest, before)
+        before = once(_slopes(method, rates, t0, dt, y, rest, search.slopes), unit)
+        slopes = once(_slopes(method, rates, t0, dt, y, rest, before), unit)
         change, least, settled = [], [], jnp.array(True)
         for m, smallest in enumerate(search.least):
             size = _largest([jnp.abs(new[m] - old[m]) for new, old in zip(slopes, before, strict=True)])
@@ -261,7 +264,10 @@ def _solve_linear(
             for i in range(s)
             for p in range(n)
         ]
-        x = factor_lu(rows, pivot=True)([b for slope in rhs for b in slope])
+        # Where the fixed-point iteration converged, the spectral radius of what is taken from the unit matrix is well
+        # below one, so that pivots are near one unless the field shears strongly. Swaps would cost a factor of three,
+        # and a minute of compile time at twelve unknowns.
+        x = factor_lu(rows, pivot=False)([b for slope in rhs for b in slope])
         return [x[i * n : (i + 1) * n] for i in range(s)]
     matrix = jnp.eye(s * n, dtype=dtype) - jnp.concatenate([jnp.kron(a[i : i + 1], jacobians[i]) for i in range(s)])
     vector = jnp.concatenate([jnp.ravel(b).astype(dtype) for slope in rhs for b in slope])
@@ -272,20 +278,22 @@ def _solve_linear(
 
 
 @_solve.def_jvp
-def _solve_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Solved, _Solved]:
+def _solve_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Solved, Any]:
     """Implicit function theorem at the solution; the guess and what rounding left have no derivative."""
-    stages, _, t0, dt, y, rest, _ = primals
+    stages, rates, t0, dt, y, rest, guess = primals
     method = GAUSS[stages]
-    solution = _solve(*primals)
-    at_rest = jax.tree.map(lambda x: x is None, tangents[1:5], is_leaf=lambda x: x is None)
-    fixed, moving = eqx.partition(primals[1:5], at_rest)
+    solution = _solve(stages, rates, t0, dt, y, rest, guess)
+    inputs, motions = primals[1:5], tangents[1:5]
+    still = jax.tree.map(lambda x: x is None, motions, is_leaf=lambda x: x is None)
+    fixed, moving = eqx.partition(inputs, still)
 
     def slopes(moving: Any) -> list[Parts]:
-        return _slopes(method, *eqx.combine(moving, fixed), rest, solution.slopes)
+        rates, t0, dt, y = eqx.combine(moving, fixed)
+        return _slopes(method, rates, t0, dt, y, rest, solution.slopes)
 
-    _, rhs = jax.jvp(slopes, (moving,), (tangents[1:5],))
+    _, rhs = jax.jvp(slopes, (moving,), (motions,))
     points = _points(method, dt, y, rest, solution.slopes)
-    return solution, _Solved(_solve_linear(method, primals[1], t0, dt, points, rhs), None, None)  # type: ignore
+    return solution, _Solved(_solve_linear(method, rates, t0, dt, points, rhs), *_NO_TANGENTS)
 
 
 def collocation_start(stages: int, field: Callable[[Array, State], State], t0: Array, y0: State) -> CollocationMemory:
@@ -312,8 +320,8 @@ def collocation_step(
     - `field`: `(t, y) -> dy/dt`, differentiable by JAX.
     - `t0`, `dt`: start and length of the step, scalars.
     - `y0`: state at `t0`, any pytree of real floating arrays.
-    - `memory`: what the step before left, or `collocation_start`. Its slopes only start the iteration; its `rest`, below
-      one unit of rounding, is added to `y0`.
+    - `memory`: what the step before left, or `collocation_start`. Its slopes only start the iteration; its `rest`,
+      below one unit of rounding, is added to `y0`.
 
     **Returns:**
 

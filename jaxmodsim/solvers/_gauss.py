@@ -1,6 +1,6 @@
 """Gauss: symplectic collocation with fixed steps, as a diffrax solver."""
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import diffrax as dfx
 import equinox as eqx
@@ -13,6 +13,47 @@ from ._interpolation import PolynomialInterpolation
 
 
 class Gauss(dfx.AbstractSolver):
+    """Gauss-Legendre collocation with fixed steps, for long runs that shall keep the structure of mechanics.
+
+    An implicit Runge-Kutta method of order `2 stages` (one stage: the implicit midpoint rule). It is symplectic and
+    symmetric: on canonical equations in (q, p) energy does not drift but stays within the method's error, and
+    quadratic invariants (angular momentum, the energy of linear systems) are kept to rounding. On other
+    equations it is an accurate method without damping.
+
+    Usable wherever diffrax takes a solver of an `ODETerm` with constant steps, on any pytree of real floating arrays,
+    in float32 and float64. Adaptive steps would cost the structure: there is no error estimate, and diffrax's adaptive
+    controllers refuse the method. Dense output has the order of the method.
+
+    The stages are found by fixed-point iteration down to rounding, about 12 to 18 evaluations of each stage at 20 steps
+    per period. Its limit is stiffness: `dt` times the fastest rate must stay below about 1, 1.5, 2 for 1, 2, 3 stages.
+    A step whose iteration does not converge within 50 evaluations ends the run with
+    `diffrax.RESULTS.nonlinear_divergence` and NaN.
+
+    Derivatives, forward and reverse, are those of the exact stages by the implicit function theorem. Rounding in the
+    sum of steps is carried along in the solver's state (compensated summation), where derivatives do not see it.
+
+    **Arguments:**
+
+    - `stages`: 1, 2 or 3.
+
+    **Raises:**
+
+    - `ValueError` for another number of stages, and (while tracing) for complex or integer states.
+
+    ??? cite "Reference"
+
+        Collocation: section II.1.3; symplecticity and quadratic invariants: IV.2 and VI.4; rounding: VIII.5.
+
+        ```bibtex
+        @book{hairer2006geometric,
+            author={Hairer, Ernst and Lubich, Christian and Wanner, Gerhard},
+            title={Geometric Numerical Integration: Structure-Preserving Algorithms for Ordinary Differential
+                   Equations},
+            publisher={Springer}, edition={second}, year={2006},
+        }
+        ```
+    """
+
     stages: int = eqx.field(default=3, static=True)
     term_structure: ClassVar = dfx.ODETerm
     interpolation_cls: ClassVar = PolynomialInterpolation
@@ -61,5 +102,6 @@ class Gauss(dfx.AbstractSolver):
             y0,
             solver_state._replace(rest=rest),
         )
-        result = dfx.RESULTS.where(step.solved, dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence)
+        failure = cast(dfx.RESULTS, dfx.RESULTS.nonlinear_divergence)
+        result = dfx.RESULTS.where(step.solved, dfx.RESULTS.successful, failure)
         return step.y1, None, {"y0": y0, "y1": step.y1, "k": step.dense}, step.memory, result
