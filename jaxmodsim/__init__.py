@@ -33,4 +33,5 @@ from .simulation import consistent as consistent
 from .simulation import simulate as simulate
 from .solvers import EventController as EventController
 from .solvers import EventSolver as EventSolver
+from .solvers import Gauss as Gauss
 from .solvers import Rodas5P as Rodas5P
