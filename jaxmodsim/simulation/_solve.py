@@ -226,6 +226,12 @@ def solve_audited(problem: Problem, options: Options) -> Work:
     return _integrate(problem, options, True, None)[0].y[1]
 
 
+@partial(jax.jit, static_argnames=("options",))
+def solve_start(problem: Problem, options: Options) -> State:
+    """The state a run begins with: on the constraints, and at rest where elements stick."""
+    return _prepared(problem, options, False)[0]
+
+
 @partial(jax.jit, static_argnames=("options", "size"))
 def solve_logged(problem: Problem, options: Options, size: int) -> EventLog:
     """Run a scene again with a log of `size` events beside it."""

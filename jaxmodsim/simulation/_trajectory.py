@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PyTree
 
-from ..mechanics import energies, momentum
+from ..mechanics import momentum
 from ..scene import Reaction, Scene, State, scene_forces, scene_reactions
 from ..solvers import EventLog
+from ._ledger import Ledger, event_losses, ledger
 from ._outcome import Outcome, outcome_messages
-from ._solve import Options, Problem, initial_state, solve_audited, solve_logged
+from ._solve import Options, Problem, solve_logged
 
 
 class Events(NamedTuple):
@@ -124,11 +125,7 @@ class Trajectory:
         if self.modes is None:
             none = jnp.zeros(0, int)
             return Events(jnp.zeros(0, self.t.dtype), none, none, none)
-        count, size = self.stats["num_events"], self.options.max_events
-        if not isinstance(count, jax.core.Tracer):
-            # As many as needed, in powers of two: another length compiles anew.
-            size = min(size, 1 << max(int(count), 8).bit_length())
-        return _events(self.scene, solve_logged(self.problem, self.options, size))
+        return _events(self.scene, solve_logged(self.problem, self.options, self._log_size()))
 
     @property
     def momentum(self) -> Float[Array, "*time dof"]:
@@ -137,11 +134,35 @@ class Trajectory:
         return _momentum(self.scene, self.t, self.q, self.qd)
 
     @property
+    def ledger(self) -> Ledger:
+        """Energies by their places, what each effect brought in and lost; `jaxmodsim.energy_audit` adds them up.
+
+        Runs the scene once more, with the work integrals beside it.
+        """
+        self._one_run("ledger")
+        return ledger(self.problem, self.options, self.t, self._states())
+
+    @property
+    def event_losses(self) -> Float[Array, " time"]:
+        """Energy [J] lost since t0 at events; runs the scene once more where it has any."""
+        self._one_run("event_losses")
+        return event_losses(self.problem, self.options, self.t, self._log_size())
+
+    @property
     def energy(self) -> Energy:
         """Energies and their balance along the run. Runs the scene once more, with the work integrals beside it."""
         self._one_run("energy")
-        work = solve_audited(self.problem, self.options)
-        return _energy(self.problem, self.t, self._states(), work)
+        book, zero = self.ledger, jnp.zeros_like(self.t)
+        stored, supplied, dissipated = (
+            sum(each.values(), zero) for each in (book.stored, book.supplied, book.dissipated)
+        )
+        total = book.kinetic + book.potential + stored + dissipated - supplied
+        return Energy(book.kinetic, book.potential, stored, supplied, dissipated, total - book.before)
+
+    def _log_size(self) -> int:
+        """Length of a log that holds all events: as many as needed, in powers of two; another one compiles anew."""
+        count, size = self.stats.get("num_events", 0), self.options.max_events
+        return size if isinstance(count, jax.core.Tracer) else min(size, 1 << max(int(count), 8).bit_length())
 
     def _states(self) -> State:
         return State(self.q, self.qd, self.z)
@@ -192,22 +213,3 @@ def _events(scene: Scene, log: EventLog) -> Events:
         column(before.astype(int), -1),
         column(after.astype(int), -1),
     )
-
-
-@jax.jit
-def _energy(problem: Problem, t: Array, y: State, work: Any) -> Energy:
-    scene = problem.scene
-
-    def parts(t: Array, y: State) -> tuple[Array, Array, Array]:
-        kinetic, potential = energies(scene.lagrangian, t, y.q, y.qd, scene.params)
-        stored = jnp.zeros_like(kinetic)
-        for name, effect in zip(scene.names, scene.effects, strict=True):
-            stored = stored + effect.stored(y.z.get(name))
-        return kinetic, potential, stored
-
-    kinetic0, potential0, stored0 = parts(problem.t0, initial_state(problem))
-    kinetic, potential, stored = jax.vmap(parts)(t, y)
-    supplied = sum(each.supplied for each in work.values())
-    dissipated = sum(each.absorbed for each in work.values()) - (stored - stored0)
-    total = kinetic + potential + stored + dissipated - supplied
-    return Energy(kinetic, potential, stored, supplied, dissipated, total - (kinetic0 + potential0 + stored0))

@@ -1,0 +1,94 @@
+"""Where the energy of a run is, and where it came from and went."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..effects import Power
+from ..mechanics import energies
+from ..scene import Scene, State
+from ..solvers import EventLog
+from ._solve import Options, Problem, initial_state, solve_audited, solve_logged, solve_start
+
+
+class Ledger(NamedTuple):
+    """Energies of a run [J], shape `[time]` each.
+
+    - `kinetic`, `potential`: of the Lagrangian.
+    - `stored`: in the own state of each effect that has one, by name.
+    - `supplied`: brought in since t0, by the names of `scene_power`.
+    - `dissipated`: lost since t0 in each effect, by name: what it absorbed, less what its own state has gained.
+    - `before`: kinetic, potential and stored energy of the state that was given at t0, shape `[]`.
+    """
+
+    kinetic: Float[Array, " time"]
+    potential: Float[Array, " time"]
+    stored: dict[str, Float[Array, " time"]]
+    supplied: dict[str, Float[Array, " time"]]
+    dissipated: dict[str, Float[Array, " time"]]
+    before: Float[Array, ""]
+
+
+def ledger(problem: Problem, options: Options, t: Float[Array, " time"], y: State) -> Ledger:
+    """Ledger of a run whose states at the times `t` are `y`. Runs it once more, with the work integrals beside it."""
+    return _ledger(problem, t, y, solve_audited(problem, options))
+
+
+@jax.jit
+def _ledger(problem: Problem, t: Array, y: State, work: dict[str, Power]) -> Ledger:
+    scene = problem.scene
+
+    def parts(t: Array, y: State) -> tuple[Array, Array, dict[str, Array]]:
+        kinetic, potential = energies(scene.lagrangian, t, y.q, y.qd, scene.params)
+        return kinetic, potential, _stored(scene, y)
+
+    first = initial_state(problem)
+    kinetic, potential, stored = jax.vmap(parts)(t, y)
+    gained = {name: now - _stored(scene, first)[name] for name, now in stored.items()}
+    supplied = {name: each.supplied for name, each in work.items()}
+    dissipated = {name: work[name].absorbed - gained.get(name, 0.0) for name in scene.names}
+    return Ledger(kinetic, potential, stored, supplied, dissipated, _energy(scene, problem.t0, first))
+
+
+def event_losses(problem: Problem, options: Options, t: Float[Array, " time"], events: int) -> Float[Array, " time"]:
+    """Energy [J] that was lost at events up to the times `t`, and at t0 where the state given was not admissible.
+
+    Runs the scene once more with a log of `events` entries beside it, where it has modes.
+    """
+    start, log = solve_start(problem, options), None
+    if problem.scene.exact:
+        log = solve_logged(problem, options, events)
+    return _losses(problem, t, start, log)
+
+
+@jax.jit
+def _losses(problem: Problem, t: Array, start: State, log: EventLog | None) -> Array:
+    scene = problem.scene
+    lost = _energy(scene, problem.t0, initial_state(problem)) - _energy(scene, problem.t0, start)
+    losses = jnp.broadcast_to(lost, t.shape)
+    if log is None:
+        return losses
+
+    def drop(t: Array, before: State, after: State) -> Array:
+        return _energy(scene, t, before) - _energy(scene, t, after)
+
+    happened = jnp.isfinite(log.t)
+    at = jnp.where(happened, log.t, problem.t0)
+    drops = jax.vmap(drop)(at, log.before[0], log.after[0])
+    counts = happened[None, :] & (at[None, :] <= t[:, None])
+    return losses + jnp.sum(jnp.where(counts, drops[None, :], 0.0), axis=1)
+
+
+def _stored(scene: Scene, y: State) -> dict[str, Array]:
+    return {
+        name: jnp.asarray(effect.stored(y.z[name]), y.q.dtype)
+        for name, effect in zip(scene.names, scene.effects, strict=True)
+        if name in y.z
+    }
+
+
+def _energy(scene: Scene, t: Array, y: State) -> Array:
+    kinetic, potential = energies(scene.lagrangian, t, y.q, y.qd, scene.params)
+    return kinetic + potential + sum(_stored(scene, y).values())
