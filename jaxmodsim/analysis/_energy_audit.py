@@ -41,7 +41,7 @@ class EnergyAudit:
         """What there is at the end of the run, a line each."""
         lines = [("kinetic energy", self.kinetic), ("potential energy", self.potential)]
         lines += [(f"stored in {name}", each) for name, each in self.stored.items()]
-        lines += [(f"work of {name}", each) for name, each in self.work.items()]
+        lines += [(f"work of {name}", each) for name, each in self.work.items() if jnp.any(each != 0)]
         lines += [(f"dissipated in {name}", each) for name, each in self.dissipated.items()]
         lines += [("lost at events", self.event_losses), ("closing error", self.closing_error)]
         width = max(len(name) for name, _ in lines)

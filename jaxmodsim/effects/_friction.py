@@ -136,11 +136,6 @@ class Friction(AbstractEffect):
                 f" {type(self.law).__name__} cannot act. Needed is a law that is a function of slip: wrap a set-valued"
                 " one as Regularized(law, width), or give a scalar displacement."
             )
-        if slip != () and not callable(self.belt_velocity) and _known_nonzero(self.belt_velocity):
-            raise ValueError(
-                f"Friction {name!r}: slip is a vector of shape {slip}, so belt_velocity must be a function of t that"
-                f" returns one, but {self.belt_velocity} was given."
-            )
         load = None if self.rests_on is not None else self.normal_force
         for label, fn, args, wanted in (
             ("belt_velocity(t)", self.belt_velocity, (q[0],), slip),
@@ -150,6 +145,19 @@ class Friction(AbstractEffect):
                 raise ValueError(
                     f"Friction {name!r}: {label} returned the shape {result_shape(fn, *args)}, but {wanted} is needed."
                 )
+
+    def check_values(self, q: Float[Array, " dof"], params: PyTree, name: str) -> None:
+        """Check what only known numbers show: that a slip that is a vector is not held against a number."""
+        if self.along is None or q.shape == (1,) or callable(self.belt_velocity):
+            return
+        if isinstance(self.belt_velocity, jax.core.Tracer) or not bool(self.belt_velocity != 0):
+            return
+        slip = result_shape(self.along, q, params)
+        if slip != ():
+            raise ValueError(
+                f"Friction {name!r}: slip is a vector of shape {slip}, so belt_velocity must be a function of t that"
+                f" returns one, but {self.belt_velocity} was given."
+            )
 
     def state0(self) -> PyTree:
         """State of the law; None where it has none."""
@@ -281,7 +289,3 @@ def _against(force: Callable[..., Any], v: Float[Array, " d"]) -> Float[Array, "
     _, slope = jax.jvp(force, (rest,), (jnp.ones_like(speed),))
     moves = speed > 0
     return jnp.where(moves, force(speed) / jnp.where(moves, speed, 1.0), slope) * v
-
-
-def _known_nonzero(value: Any) -> bool:
-    return not isinstance(value, jax.core.Tracer) and bool(jnp.any(value != 0))

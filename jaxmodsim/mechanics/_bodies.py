@@ -8,7 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from ..numerics import Amount, Place, as_amount, as_function, as_place, safe_norm, solve_semidefinite
 
@@ -22,11 +22,11 @@ class AbstractBody(eqx.Module):
     ) -> Float[Array, ""]:
         """Lagrangian [J]."""
 
-    def __add__(self, other: Callable[..., Any]) -> "Bodies":
+    def __add__(self, other: Any) -> "Bodies":
         """Both together."""
         return Bodies((self, as_function(other, name="What is added to a body")))
 
-    def __radd__(self, other: Callable[..., Any] | int) -> "AbstractBody":
+    def __radd__(self, other: Any) -> "AbstractBody":
         """Both together; zero, from which `sum` starts, is nothing."""
         return self if other == 0 else Bodies((as_function(other, name="What is added to a body"), self))
 
@@ -92,11 +92,7 @@ class PointMass(AbstractBody):
         return safe_norm(self.reaction(t, q, qd, params))
 
 
-def point_mass(
-    m: ArrayLike | Callable[..., Any],
-    position: Callable[..., Any],
-    gravity: ArrayLike | Callable[..., Any] = 9.81,
-) -> PointMass:
+def point_mass(m: Any, position: Any, gravity: Any = 9.81) -> PointMass:
     """Lagrangian of a point mass whose position is a function of the coordinates.
 
     ```python
@@ -151,13 +147,7 @@ class RigidBody(AbstractBody):
         return 0.5 * m * jnp.sum(v**2) + spin - m * self.gravity(params) * x[2]
 
 
-def rigid_body(
-    m: ArrayLike | Callable[..., Any],
-    inertia: ArrayLike | Callable[..., Any],
-    position: Callable[..., Any],
-    orientation: Callable[..., Any],
-    gravity: ArrayLike | Callable[..., Any] = 9.81,
-) -> RigidBody:
+def rigid_body(m: Any, inertia: Any, position: Any, orientation: Any, gravity: Any = 9.81) -> RigidBody:
     """Lagrangian of a rigid body by the motion of its centre of mass and of a frame fixed in it.
 
     **Arguments:**

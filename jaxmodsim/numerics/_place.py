@@ -51,7 +51,7 @@ class Amount(eqx.Module):
 
     def __call__(self, params: PyTree) -> Array:
         """The number."""
-        return self.amount(params) if callable(self.amount) else self.amount
+        return jnp.asarray(self.amount(params) if callable(self.amount) else self.amount)
 
 
 def as_amount(value: Any, *, name: str) -> Amount:

@@ -121,9 +121,7 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
     return _GENERAL + mass + ranges + chatter + scene.checks
 
 
-def start_code(
-    scene: Scene, t: Float[Array, ""], y: State, rate: State, mode: Any, canonical: bool
-) -> Int[Array, ""]:
+def start_code(scene: Scene, t: Float[Array, ""], y: State, rate: State, mode: Any, canonical: bool) -> Int[Array, ""]:
     """What is wrong before the first step: a parameter out of range, a state off the constraints, a field of NaN."""
     dof = y.q.shape[0]
     code = jnp.asarray(SUCCESS)

@@ -12,6 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
+from ..effects import Friction
 from ..scene import Scene
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages
 from ._solve import Options, Problem, Solved, solve
@@ -152,6 +153,9 @@ def _problem(
         if name in array and array[name].shape != ():
             raise ValueError(f"{name} must be one number, but has the shape {array[name].shape}.")
     _check_values(array)
+    for name, effect in zip(scene.names, scene.effects, strict=True):
+        if isinstance(effect, Friction):
+            effect.check_values(array["q0"], scene.params, name)
     return Problem(
         scene,
         array["q0"],
