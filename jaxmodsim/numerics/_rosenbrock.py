@@ -2,18 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
-from ._linalg import MAX_UNROLLED_LU, LinearSolver, factor_lu
-
-State: TypeAlias = PyTree[Array]
-Parts: TypeAlias = list[Array]
+from ._layout import Layout, Parts, State
+from ._linalg import LinearSolver, factor_lu
 
 
 @dataclass(frozen=True)
@@ -72,40 +69,8 @@ def _add(a: Parts, b: Parts) -> Parts:
     return [x + y for x, y in zip(a, b, strict=True)]
 
 
-class _Layout:
-    """How a pytree state maps to the parts the step computes with: one scalar per entry, or one long vector."""
-
-    def __init__(self, y: State):
-        leaves, self.structure = jtu.tree_flatten(y)
-        self.shapes = [leaf.shape for leaf in leaves]
-        self.sizes = [leaf.size for leaf in leaves]
-        self.dtype = jnp.result_type(*leaves) if leaves else jnp.result_type(float)
-        self.dtypes = [leaf.dtype for leaf in leaves]
-        self.n = sum(self.sizes)
-        self.unrolled = self.n <= MAX_UNROLLED_LU
-
-    def split(self, y: State) -> Parts:
-        leaves = [jnp.ravel(leaf) for leaf in jtu.tree_leaves(y)]
-        if self.unrolled:
-            return [jnp.reshape(leaf, ()) if leaf.size == 1 else leaf[i] for leaf in leaves for i in range(leaf.size)]
-        return [jnp.concatenate([leaf.astype(self.dtype) for leaf in leaves])]
-
-    def join(self, parts: Parts) -> State:
-        leaves, start = [], 0
-        for shape, size, dtype in zip(self.shapes, self.sizes, self.dtypes, strict=True):
-            if not self.unrolled:
-                leaf = parts[0][start : start + size]
-            elif size == 1:
-                leaf = parts[start]
-            else:
-                leaf = jnp.stack(parts[start : start + size])
-            leaves.append(jnp.reshape(leaf, shape).astype(dtype))
-            start += size
-        return jtu.tree_unflatten(self.structure, leaves)
-
-
 def _linearise(
-    flow: Callable[[Array, Parts], Parts], t: Array, parts: Parts, layout: _Layout
+    flow: Callable[[Array, Parts], Parts], t: Array, parts: Parts, layout: Layout
 ) -> tuple[Parts, Parts, Any]:
     """Field, its time derivative and its Jacobian from one linearisation."""
     f0, push = jax.linearize(flow, t, parts)
@@ -122,7 +87,7 @@ def _linearise(
     return f0, f_t, [[columns[j][i] for j in range(layout.n)] for i in range(layout.n)]
 
 
-def _factor(jacobian: Any, shift: Array, layout: _Layout, pivot: bool) -> LinearSolver:
+def _factor(jacobian: Any, shift: Array, layout: Layout, pivot: bool) -> LinearSolver:
     """Solver of `(shift I - jacobian) x = rhs`."""
     if layout.unrolled:
         rows = [[shift - x if i == j else -x for j, x in enumerate(row)] for i, row in enumerate(jacobian)]
@@ -159,7 +124,7 @@ def rosenbrock_step(
     # their derivatives NaN, and zero times NaN is NaN. A short step in its place keeps them finite.
     short = float(jnp.finfo(dt.dtype).eps) ** 0.5 * jnp.maximum(jnp.abs(t0), 1.0)
     dt = jnp.where(dt == 0, short, dt)
-    layout = _Layout(y0)
+    layout = Layout(y0)
     parts = layout.split(y0)
 
     def flow(t: Array, p: Parts) -> Parts:

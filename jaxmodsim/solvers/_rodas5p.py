@@ -7,9 +7,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from ..numerics import RosenbrockTableau, rosenbrock_step
+from ._interpolation import PolynomialInterpolation
 
 
 def _lower(rows: tuple[tuple[float, ...], ...]) -> np.ndarray:
@@ -125,31 +126,6 @@ _RODAS5P = RosenbrockTableau(
 )
 
 
-class _RodasInterpolation(dfx.AbstractLocalInterpolation):
-    """Dense output of order 4: `y(t0 + s dt) = (1-s) y0 + s (y1 + (1-s) (K1 + s (K2 + s K3)))`."""
-
-    t0: Any
-    t1: Any
-    y0: PyTree[Array]
-    y1: PyTree[Array]
-    k: tuple[PyTree[Array], ...]
-
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> PyTree[Array]:
-        """State at `t0`, or the increment from `t0` to `t1`."""
-        del left
-        if t1 is not None:
-            return jtu.tree_map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
-        # A step of length zero is one of a finished lane under vmap; see `rosenbrock_step`.
-        length = self.t1 - self.t0
-        s = (t0 - self.t0) / jnp.where(length == 0, 1.0, length)
-
-        def at(y0: Array, y1: Array, k1: Array, k2: Array, k3: Array) -> Array:
-            r = s.astype(y0.dtype)
-            return (1 - r) * y0 + r * (y1 + (1 - r) * (k1 + r * (k2 + r * k3)))
-
-        return jtu.tree_map(at, self.y0, self.y1, *self.k)
-
-
 class Rodas5P(dfx.AbstractAdaptiveSolver):
     """Steinebach's Rodas5P for stiff equations: eight stages, order 5, L-stable, no iteration.
 
@@ -180,7 +156,7 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
 
     pivot: bool = eqx.field(default=False, static=True)
     term_structure: ClassVar = dfx.ODETerm
-    interpolation_cls: ClassVar = _RodasInterpolation
+    interpolation_cls: ClassVar = PolynomialInterpolation
 
     def order(self, terms: PyTree) -> int:
         """Order of the solution: 5."""
