@@ -25,4 +25,5 @@ from .simulation import Trajectory as Trajectory
 from .simulation import simulate as simulate
 from .solvers import EventController as EventController
 from .solvers import EventSolver as EventSolver
+from .solvers import Gauss as Gauss
 from .solvers import Rodas5P as Rodas5P

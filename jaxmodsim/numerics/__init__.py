@@ -1,5 +1,9 @@
-"""Numerics that know no mechanics: small linear algebra, Rosenbrock steps, numbers and their ranges."""
+"""Numerics that know no mechanics: small linear algebra, steps of solvers, numbers and their ranges."""
 
+from ._collocation import GAUSS as GAUSS
+from ._collocation import CollocationMemory as CollocationMemory
+from ._collocation import collocation_start as collocation_start
+from ._collocation import collocation_step as collocation_step
 from ._linalg import cholesky_pivots as cholesky_pivots
 from ._linalg import factor_lu as factor_lu
 from ._linalg import solve_positive_definite as solve_positive_definite
