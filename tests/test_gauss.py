@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxmodsim import Gauss
-from jaxmodsim.numerics import GAUSS
+from jaxmodsim.numerics import GAUSS, collocation_start, collocation_step
 from jaxmodsim.solvers import FiniteSteps
 
 from .differences import central_difference
@@ -289,6 +289,38 @@ def test_failure_with_finite_steps_keeps_the_last_state() -> None:
     assert 3 < solution.stats["num_accepted_steps"] < 20
     t = 0.05 * float(solution.stats["num_accepted_steps"])
     np.testing.assert_allclose(solution.ys, np.exp(-40.0 * t**2), rtol=1e-2)
+
+
+def test_the_guess_saves_iterations() -> None:
+    """From the slopes of the step before, against a constant slope."""
+    y0, dt = (jnp.array(1.0), jnp.array(0.3)), jnp.array(jnp.pi / 10.0)
+
+    def field(t: Any, y: Any) -> Any:
+        return turning(t, y, 1.0)
+
+    def step(i: Any, carry: Any) -> Any:
+        y, memory, counts = carry
+        fresh = collocation_start(3, field, jnp.array(0.0), y)
+        ends = [collocation_step(3, field, jnp.array(0.0), dt, y, before) for before in (fresh, memory)]
+        return ends[1].y1, ends[1].memory, counts.at[i].set(jnp.stack([end.iterations for end in ends]))
+
+    start = (y0, collocation_start(3, field, jnp.array(0.0), y0), jnp.zeros((20, 2), int))
+    counts = np.asarray(jax.lax.fori_loop(0, 20, step, start)[2])
+    assert counts.max() <= 20
+    assert counts[:, 1].mean() < counts[:, 0].mean() - 1.0
+
+
+def test_leaves_of_unequal_precision() -> None:
+    """Each keeps its own, also in derivatives."""
+
+    def end(w: Any) -> Any:
+        y0 = (jnp.float32(1.0), jnp.float64(0.0))
+        # Double precision in the times would raise all leaves to it.
+        return solve(turning, y0, jnp.float32(T1), jnp.float32(0.1), w, max_steps=32, adjoint=dfx.ForwardMode()).ys
+
+    (q, p), (dq, dp) = jax.jit(lambda w: jax.jvp(end, (w,), (1.0,)))(1.7)
+    assert (q.dtype, p.dtype) == (dq.dtype, dp.dtype) == (np.float32, np.float64)
+    np.testing.assert_allclose((dq[0], dp[0]), (-T1 * np.sin(1.7 * T1), -T1 * np.cos(1.7 * T1)), rtol=1e-5)
 
 
 @STAGES

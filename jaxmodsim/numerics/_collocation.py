@@ -16,9 +16,9 @@ from ._linalg import MAX_UNROLLED_LU, factor_lu
 from ._once import once, unit_of
 
 MAX_ITERATIONS = 50
-# The increments of a solved step are rounding: below this part of the unknown itself, or below this number of units of
-# rounding of the largest unknown, which is what remains of forces that cancel.
-_SMALL = 0.5
+# The last changes of a solved step are rounding: below this power of the unit of rounding, relative to the unknown
+# itself, or below this number of units of the largest unknown, as where forces cancel.
+_POWER = 0.5
 _UNITS = 256.0
 
 Rates = Callable[[Array, Parts], Parts]
@@ -197,7 +197,7 @@ def _small(method: GaussCollocation, dt: Array, y: Parts, search: _Search) -> Ar
     small = jnp.array(True)
     for scale, change in zip(scales, search.change, strict=True):
         eps = float(jnp.finfo(scale.dtype).eps)
-        bound = jnp.maximum(eps**_SMALL * scale, (_UNITS * eps) * overall.astype(scale.dtype))
+        bound = jnp.maximum(eps**_POWER * scale, (_UNITS * eps) * overall.astype(scale.dtype))
         small &= jnp.all(jnp.abs(dt).astype(scale.dtype) * change <= bound)
     return small
 
@@ -207,8 +207,8 @@ def _solve(stages: int, rates: Rates, t0: Array, dt: Array, y: Parts, rest: Part
     """Slopes of the stages by fixed-point iteration; zeros where it does not converge.
 
     The iteration goes on until no unknown changes less than it did before: a tolerance, however small, would leave an
-    error of one sign, and energy would drift. Looking only after every second iteration is faster, and takes the end of
-    an alternation between positions and momenta for what it is.
+    error of one sign, and energy would drift. To look only after every second iteration is faster, and is not misled
+    where changes of positions and of momenta alternate.
     """
     method, unit = GAUSS[stages], unit_of(t0)
 
@@ -268,7 +268,7 @@ def _solve_linear(
         # below one, so that pivots are near one unless the field shears strongly. Swaps would cost a factor of three,
         # and a minute of compile time at twelve unknowns.
         x = factor_lu(rows, pivot=False)([b for slope in rhs for b in slope])
-        return [x[i * n : (i + 1) * n] for i in range(s)]
+        return [[x[i * n + p].astype(b.dtype) for p, b in enumerate(slope)] for i, slope in enumerate(rhs)]
     matrix = jnp.eye(s * n, dtype=dtype) - jnp.concatenate([jnp.kron(a[i : i + 1], jacobians[i]) for i in range(s)])
     vector = jnp.concatenate([jnp.ravel(b).astype(dtype) for slope in rhs for b in slope])
     x = jnp.reshape(jnp.linalg.solve(matrix, vector), (s, n))
