@@ -24,6 +24,9 @@ from ._box import box_stribeck as box_stribeck
 from ._box import ramped_box as ramped_box
 from ._bristle import slipping_bristle as slipping_bristle
 from ._bristle import slipping_bristle_deflection as slipping_bristle_deflection
+from ._chain import double_pendulum as double_pendulum
+from ._chain import n_link_pendulum as n_link_pendulum
+from ._chain import n_link_pendulum_acceleration as n_link_pendulum_acceleration
 from ._pendulum import spherical_pendulum as spherical_pendulum
 from ._pendulum import spherical_pendulum_acceleration as spherical_pendulum_acceleration
 from ._pendulum import spherical_pendulum_reaction as spherical_pendulum_reaction
