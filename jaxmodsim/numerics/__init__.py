@@ -1,5 +1,6 @@
 """Numerics that know no mechanics: small linear algebra, Rosenbrock steps, numbers and their ranges."""
 
+from ._linalg import MAX_UNROLLED_CHOLESKY as MAX_UNROLLED_CHOLESKY
 from ._linalg import cholesky_pivots as cholesky_pivots
 from ._linalg import factor_lu as factor_lu
 from ._linalg import solve_positive_definite as solve_positive_definite
@@ -19,6 +20,7 @@ from ._once import unit_of as unit_of
 from ._rosenbrock import RosenbrockTableau as RosenbrockTableau
 from ._rosenbrock import rosenbrock_step as rosenbrock_step
 from ._safe import safe_power as safe_power
+from ._scalarise import in_scalars as in_scalars
 from ._watch import Watch as Watch
 from ._watch import first_root as first_root
 from ._watch import watch as watch
