@@ -1,13 +1,14 @@
 """Equations of motion from a Lagrangian, by automatic differentiation."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import solve_positive_definite
+from ..numerics import MAX_UNROLLED_CHOLESKY, in_scalars, solve_positive_definite
 
 Lagrangian: TypeAlias = Callable[[Any, Array, Array, Any], Array]
 
@@ -30,7 +31,8 @@ def motion_equations(
     """Mass matrix and load of `d/dt dL/dqd - dL/dq = Q` at one state.
 
     The momentum dL/dqd is linearised once. Its derivative along (1, qd, 0) gives the bias and along the unit
-    velocities the mass matrix, so the Hessian by q is never formed.
+    velocities the mass matrix, so the Hessian by q is never formed. Up to 8 coordinates all of this is evaluated in
+    scalars (`in_scalars`); above, and where the Lagrangian is too large for that, in arrays as it is written.
 
     **Arguments:**
 
@@ -43,7 +45,13 @@ def motion_equations(
 
     `MotionEquations`.
     """
+    equations = partial(_differentiate, lagrangian)
+    if q.shape[0] > MAX_UNROLLED_CHOLESKY:
+        return equations(t, q, qd, params)
+    return in_scalars(equations, t, q, qd, params, seed=q)
 
+
+def _differentiate(lagrangian: Lagrangian, t: Array, q: Array, qd: Array, params: PyTree) -> MotionEquations:
     def momentum(t: Array, q: Array, qd: Array) -> tuple[Array, Array]:
         by_q, by_qd = jax.grad(lagrangian, argnums=(1, 2))(t, q, qd, params)
         return by_qd, by_q

@@ -4,6 +4,7 @@ from ._collocation import GAUSS as GAUSS
 from ._collocation import CollocationMemory as CollocationMemory
 from ._collocation import collocation_start as collocation_start
 from ._collocation import collocation_step as collocation_step
+from ._linalg import MAX_UNROLLED_CHOLESKY as MAX_UNROLLED_CHOLESKY
 from ._linalg import cholesky_pivots as cholesky_pivots
 from ._linalg import factor_lu as factor_lu
 from ._linalg import factor_positive_definite as factor_positive_definite
@@ -29,6 +30,7 @@ from ._rosenbrock import RosenbrockTableau as RosenbrockTableau
 from ._rosenbrock import rosenbrock_step as rosenbrock_step
 from ._safe import safe_norm as safe_norm
 from ._safe import safe_power as safe_power
+from ._scalarise import in_scalars as in_scalars
 from ._semidefinite import solve_semidefinite as solve_semidefinite
 from ._watch import Watch as Watch
 from ._watch import first_root as first_root
