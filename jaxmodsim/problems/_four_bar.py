@@ -95,8 +95,8 @@ def four_bar(
 
     **Returns:**
 
-    A `Scene` without effects, with the constraint `closure`, two equations: the ends of coupler and rocker meet. Its multipliers
-    are the force [N] of the coupler on the rocker, (x, y). Its exact motion: `four_bar_acceleration`.
+    A `Scene` without effects, with the constraint `closure`, two equations: the ends of coupler and rocker meet. Its
+    multipliers are the force [N] of the coupler on the rocker, (x, y). Its exact motion: `four_bar_acceleration`.
     """
     params = {"a": a, "b": b, "c": c, "d": d, "m1": m1, "m2": m2, "m3": m3, "g": g}
     return Scene(_LAGRANGIAN, params=params, constraints=(Constraint(_gap, at=_ends, name="closure"),))

@@ -154,6 +154,6 @@ def rod_on_rough_floor_acceleration(
     """
     sine, cosine, g = jnp.sin(q[2]), jnp.cos(q[2]), jnp.asarray(g)
     direction = jnp.sign(qd[0] - 0.5 * jnp.asarray(l) * sine * qd[2])
-    push = rod_on_rough_floor_normal_force(q[2], qd[2], direction, m=m, l=l, mu=mu, g=g) / m
+    push = rod_on_rough_floor_normal_force(q[2], qd[2], direction, m=m, l=l, mu=mu, g=g) / jnp.asarray(m)
     turn = 6.0 / jnp.asarray(l) * push * (mu * direction * sine - cosine)
     return jnp.stack([-mu * direction * push, push - g, turn])
