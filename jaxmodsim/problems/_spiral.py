@@ -1,4 +1,4 @@
-"""A bead on a spherical spiral, with or without viscous drag."""
+"""A bead on a spherical spiral, with or without viscous drag and dry friction."""
 
 from typing import Any
 
@@ -7,7 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..effects import AppliedForce
+from ..effects import AppliedForce, Friction
+from ..friction import Coulomb
+from ..mechanics import point_mass
 from ..numerics import Number, parameter
 from ..scene import Scene
 
@@ -26,36 +28,34 @@ class SphericalSpiral(eqx.Module):
 
     def __call__(self, q: Float[Array, "1"]) -> Float[Array, "3"]:
         """Position (x, y, z) [m] at q = [theta] [rad]; phi is the angle from the +z axis."""
-        theta = q[0]
-        slope = self.a * theta
-        sine = 1.0 / jnp.sqrt(1.0 + slope**2)
-        return self.R * jnp.stack([sine * jnp.cos(theta), sine * jnp.sin(theta), sine * slope])
+        return _spiral(q, {"R": self.R, "a": self.a})
 
 
-class _Lagrangian(eqx.Module):
-    curve: SphericalSpiral
-
-    def __call__(self, t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-        del t
-        position, velocity = jax.jvp(self.curve, (q,), (qd,))
-        return 0.5 * p["m"] * jnp.sum(velocity**2) - p["m"] * p["g"] * position[2]
+def _spiral(q: Array, p: dict[str, Array]) -> Array:
+    theta = q[0]
+    slope = p["a"] * theta
+    sine = 1.0 / jnp.sqrt(1.0 + slope**2)
+    return p["R"] * jnp.stack([sine * jnp.cos(theta), sine * jnp.sin(theta), sine * slope])
 
 
-class _Drag(eqx.Module):
-    curve: SphericalSpiral
+def _drag(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del t
+    return -p["k"] * jax.jvp(lambda q: _spiral(q, p), (q,), (qd,))[1]
 
-    def __call__(self, t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-        del t
-        return -p["k"] * jax.jvp(self.curve, (q,), (qd,))[1]
+
+_BEAD = point_mass(lambda p: p["m"], _spiral, lambda p: p["g"])
 
 
 def spiral_bead(
-    *, m: ArrayLike = 1.0, R: ArrayLike = 1.0, a: ArrayLike = 0.5, g: ArrayLike = 9.81, k: ArrayLike | None = None
+    *,
+    m: ArrayLike = 1.0,
+    R: ArrayLike = 1.0,
+    a: ArrayLike = 0.5,
+    g: ArrayLike = 9.81,
+    k: ArrayLike | None = None,
+    mu: ArrayLike | None = None,
 ) -> Scene:
     """Bead on the spiral phi = arccot(a theta) on a sphere, gravity along -z.
-
-    R and a sit in the scene once for each function that uses the curve. To differentiate by them, build the scene
-    inside the differentiated function.
 
     **Arguments:**
 
@@ -64,19 +64,56 @@ def spiral_bead(
     - `a`: parameter of the spiral [1/rad], see `SphericalSpiral`.
     - `g`: gravity [m/s^2].
     - `k`: coefficient of viscous drag [N s/m], >= 0; None for no drag.
+    - `mu`: coefficient of Coulomb friction, >= 0, along the path, under the force of the wire on the bead; None for no
+      friction.
 
     **Returns:**
 
-    A `Scene` with the coordinate theta [rad] and, with `k`, the effect `drag`, a Cartesian force -k v [N] at the bead.
-    Its exact acceleration: `spiral_bead_acceleration`.
+    A `Scene` with the coordinate theta [rad] and, with `k`, the effect `drag`, a Cartesian force -k v [N] at the bead;
+    with `mu`, the effect `friction`, whose law holds `mu`. All other numbers are in its `params`. Its exact
+    acceleration: `spiral_bead_acceleration`.
     """
-    curve = SphericalSpiral(R, a)
-    params: dict[str, Any] = {"m": m, "g": g}
-    if k is None:
-        return Scene(_Lagrangian(curve), params=params)
-    return Scene(
-        _Lagrangian(curve), params={**params, "k": k}, effects=(AppliedForce(_Drag(curve), at=curve, name="drag"),)
-    )
+    params: dict[str, Any] = {"m": m, "R": R, "a": a, "g": g}
+    effects: tuple[Any, ...] = ()
+    if k is not None:
+        params["k"] = k
+        effects = (AppliedForce(_drag, at=_spiral, name="drag"),)
+    if mu is not None:
+        effects = (*effects, Friction(Coulomb(mu), along=_spiral, normal_force=_BEAD.normal_force))
+    return Scene(_BEAD, params=params, effects=effects)
+
+
+def spiral_bead_normal_force(
+    q: Float[Array, "1"],
+    qd: Float[Array, "1"],
+    *,
+    m: ArrayLike = 1.0,
+    R: ArrayLike = 1.0,
+    a: ArrayLike = 0.5,
+    g: ArrayLike = 9.81,
+) -> Float[Array, ""]:
+    """Magnitude [N] of the force of the wire on the bead across the path, in closed form.
+
+    Newton's law in the spherical frame (r, phi, theta), with `sin(phi) = 1/sqrt(1 + u)` and u = a^2 theta^2, so
+    `phi' = -a/(1 + u) theta'` and `phi'' = 2 a^3 theta/(1 + u)^2 theta'^2` for a steady theta', as theta'' acts along
+    the path. What gravity and curvature leave over is `f_r = m (g cos(phi) - R phi'^2 - R sin(phi)^2 theta'^2)`,
+    `f_phi = m (R phi'' - R sin(phi) cos(phi) theta'^2 - g sin(phi))`, `f_theta = 2 m R cos(phi) phi' theta'`; along the
+    surface only its part across the tangent, which is (0, phi', sin(phi) theta') in this frame.
+
+    **Arguments:**
+
+    - `q`, `qd`: theta [rad] and its rate [rad/s], shape `[1]`.
+    - `m`, `R`, `a`, `g`: as for `spiral_bead`.
+    """
+    theta, rate, a = q[0], qd[0], jnp.asarray(a)
+    opened = 1.0 + (a * theta) ** 2
+    sine = 1.0 / jnp.sqrt(opened)
+    cosine, slope, bend = a * theta * sine, -a / opened, 2.0 * a**3 * theta / opened**2
+    radial = g * cosine - R * (slope**2 + sine**2) * rate**2
+    down = R * (bend - sine * cosine) * rate**2 - g * sine
+    around = 2.0 * R * cosine * slope * rate**2
+    across = (down * sine - around * slope) / jnp.sqrt(slope**2 + sine**2)
+    return jnp.asarray(m) * jnp.sqrt(radial**2 + across**2)
 
 
 def spiral_bead_acceleration(
@@ -88,20 +125,24 @@ def spiral_bead_acceleration(
     a: ArrayLike = 0.5,
     g: ArrayLike = 9.81,
     k: ArrayLike = 0.0,
+    mu: ArrayLike = 0.0,
 ) -> Float[Array, "1"]:
-    """Acceleration theta'' [rad/s^2] of the bead in closed form, shape `[1]`.
+    """Acceleration theta'' [rad/s^2] of the moving bead in closed form, shape `[1]`.
 
     With u = a^2 theta^2: `theta'' = a^2 theta (1 + 2 a^2 + u) / ((1 + u)(1 + a^2 + u)) theta'^2
-    - (g/R) a sqrt(1 + u)/(1 + a^2 + u) - (k/m) theta'` (NTNU course TTK4130, exercise 9, problem 1).
+    - (g/R) a sqrt(1 + u)/(1 + a^2 + u) - (k/m) theta'` (NTNU course TTK4130, exercise 9, problem 1), less
+    `mu N/(m s) sign(theta')` for friction, with N by `spiral_bead_normal_force` and the length of the path for each
+    radian `s = R sqrt(1 + a^2 + u)/(1 + u)`.
 
     **Arguments:**
 
     - `q`, `qd`: theta [rad] and its rate [rad/s], shape `[1]`.
-    - `m`, `R`, `a`, `g`, `k`: as for `spiral_bead`.
+    - `m`, `R`, `a`, `g`, `k`, `mu`: as for `spiral_bead`.
     """
     theta, rate, a2 = q[0], qd[0], jnp.square(jnp.asarray(a))
     u = a2 * theta**2
     along = 1.0 + a2 + u
     turning = a2 * theta * (1.0 + 2.0 * a2 + u) / ((1.0 + u) * along) * rate**2
     falling = g / R * a * jnp.sqrt(1.0 + u) / along
-    return jnp.reshape(turning - falling - k / m * rate, (1,))
+    rubbing = mu * spiral_bead_normal_force(q, qd, m=1.0, R=R, a=a, g=g) * (1.0 + u) / (R * jnp.sqrt(along))
+    return jnp.reshape(turning - falling - k / m * rate - rubbing * jnp.sign(rate), (1,))

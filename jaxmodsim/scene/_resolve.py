@@ -157,7 +157,7 @@ def _starts(scene: Scene, t: Array, y: State) -> list[int]:
     return starts
 
 
-def by_constraint(scene: Scene, t: Array, y: State, multipliers: Float[Array, " m"]) -> dict[str, Float[Array, " m"]]:
+def by_constraint(scene: Scene, t: Array, y: State, multipliers: Float[Array, " m"]) -> dict[str, Float[Array, " _"]]:
     """The multipliers of each constraint, by its name."""
     lengths = sizes(scene.constraints, t, y.q, y.qd, scene.params)
     starts = _starts(scene, t, y)

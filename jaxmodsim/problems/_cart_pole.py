@@ -1,0 +1,112 @@
+"""A pole on a cart."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from ..effects import AppliedForce, Friction
+from ..mechanics import rigid_body
+from ..scene import Scene
+
+# Masses of cart and pole [kg], length of the pole [m], gravity [m/s^2].
+CART_POLE = {"M": 1.0, "m": 0.3, "l": 1.2, "g": 9.81}
+
+
+def _cart(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del t, q
+    return 0.5 * p["M"] * qd[0] ** 2
+
+
+def _middle(q: Array, p: dict[str, Array]) -> Array:
+    half = 0.5 * p["l"]
+    return jnp.stack([q[0] + half * jnp.sin(q[1]), 0.0 * q[0], half * jnp.cos(q[1])])
+
+
+def _angle(q: Array) -> Array:
+    return q[1]
+
+
+def _track(q: Array) -> Array:
+    return q[0]
+
+
+def _push(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del t, qd
+    return jnp.stack([p["force"], 0.0 * q[1]])
+
+
+_POLE = rigid_body(lambda p: p["m"], lambda p: p["m"] * p["l"] ** 2 / 12.0, _middle, _angle, lambda p: p["g"])
+_LAGRANGIAN = _POLE + _cart
+
+
+def cart_pole(
+    law: Any = None,
+    *,
+    M: ArrayLike = CART_POLE["M"],
+    m: ArrayLike = CART_POLE["m"],
+    l: ArrayLike = CART_POLE["l"],  # noqa: E741 - the symbol of the length
+    g: ArrayLike = CART_POLE["g"],
+    force: ArrayLike | None = None,
+) -> Scene:
+    """Uniform rod hinged on a cart that moves along a level track, in a vertical plane.
+
+    The coordinates are the place of the cart x [m] and the angle of the pole [rad] from upright, positive where the
+    pole leans towards larger x.
+
+    **Arguments:**
+
+    - `law`: friction law between cart and track, with forces in newtons; None for no friction.
+    - `M`: mass of the cart [kg], > 0.
+    - `m`: mass of the pole [kg], > 0, spread evenly over its length.
+    - `l`: length of the pole [m], > 0.
+    - `g`: gravity [m/s^2].
+    - `force`: constant push on the cart along x [N]; None for none.
+
+    **Returns:**
+
+    A `Scene`, with the effects `push` and `friction` where they are asked for. Its exact accelerations:
+    `cart_pole_acceleration`.
+    """
+    params: dict[str, Any] = {"M": M, "m": m, "l": l, "g": g}
+    effects: tuple[Any, ...] = () if law is None else (Friction(law, along=_track),)
+    if force is not None:
+        params["force"] = force
+        effects = (AppliedForce(_push, name="push"), *effects)
+    return Scene(_LAGRANGIAN, params=params, effects=effects)
+
+
+def cart_pole_acceleration(
+    q: Float[Array, "2"],
+    qd: Float[Array, "2"],
+    *,
+    M: ArrayLike = CART_POLE["M"],
+    m: ArrayLike = CART_POLE["m"],
+    l: ArrayLike = CART_POLE["l"],  # noqa: E741
+    g: ArrayLike = CART_POLE["g"],
+    force: ArrayLike = 0.0,
+) -> Float[Array, "2"]:
+    """Accelerations of cart and pole in closed form.
+
+    With a = l/2 and the angle f, the balance of forces along the track and of moments about the hinge read
+    `(M + m) x'' + m a cos(f) f'' = F + m a sin(f) f'^2` and `cos(f) x'' + (4/3) a f'' = g sin(f)`. Solved:
+    `f'' = (g sin(f) - cos(f) T)/(a (4/3 - m cos(f)^2/(M + m)))`, `x'' = T - m a cos(f) f''/(M + m)` with
+    `T = (F + m a sin(f) f'^2)/(M + m)` (A. G. Barto, R. S. Sutton and C. W. Anderson, Neuronlike adaptive elements that
+    can solve difficult learning control problems, IEEE Transactions on Systems, Man, and Cybernetics 13:834, 1983, the
+    appendix, without friction).
+
+    **Arguments:**
+
+    - `q`, `qd`: (x, f) [m, rad] and their rates, shape `[2]`.
+    - `M`, `m`, `l`, `g`: as for `cart_pole`.
+    - `force`: F [N], of all forces on the cart along x.
+
+    **Returns:**
+
+    (x'', f'') [m/s^2, rad/s^2], shape `[2]`.
+    """
+    sine, cosine, a = jnp.sin(q[1]), jnp.cos(q[1]), 0.5 * jnp.asarray(l)
+    share = m / (jnp.asarray(M) + m)
+    sideways = force / (jnp.asarray(M) + m) + share * a * sine * qd[1] ** 2
+    turn = (g * sine - cosine * sideways) / (a * (4.0 / 3.0 - share * cosine**2))
+    return jnp.stack([sideways - share * a * cosine * turn, turn])

@@ -1,0 +1,98 @@
+"""Pendulums in Cartesian coordinates, held by a constraint: in a plane, and in space, where no pole is in the way."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from ..mechanics import Constraint, point_mass
+from ..scene import Scene
+
+
+def _in_plane(q: Array) -> Array:
+    return jnp.stack([q[0], 0.0 * q[0], q[1]])
+
+
+def _in_space(q: Array) -> Array:
+    return q
+
+
+def _stretch(t: Array, x: Array, p: dict[str, Array]) -> Array:
+    del t
+    return jnp.sqrt(jnp.sum(x**2)) - p["l"]
+
+
+_PLANE_BOB = point_mass(lambda p: p["m"], _in_plane, lambda p: p["g"])
+_SPACE_BOB = point_mass(lambda p: p["m"], _in_space, lambda p: p["g"])
+
+
+def cartesian_pendulum(
+    *,
+    m: ArrayLike = 1.0,
+    l: ArrayLike = 1.0,  # noqa: E741 - the symbol of the length
+    g: ArrayLike = 9.81,
+) -> Scene:
+    """Point mass on a massless rod, by its coordinates (x, z) [m] from the pivot in a vertical plane, z upwards.
+
+    **Arguments:**
+
+    - `m`: mass [kg], > 0.
+    - `l`: length of the rod [m], > 0.
+    - `g`: gravity [m/s^2].
+
+    **Returns:**
+
+    A `Scene` with the constraint `rod`, `sqrt(x^2 + z^2) = l`: its multiplier is the force of the rod on the mass [N],
+    positive outwards, so the tension of `cartesian_pendulum_tension` with a minus sign. Its exact accelerations:
+    `cartesian_pendulum_acceleration`.
+    """
+    rod = Constraint(_stretch, at=_in_plane, name="rod")
+    return Scene(_PLANE_BOB, params={"m": m, "l": l, "g": g}, constraints=(rod,))
+
+
+def cartesian_spherical_pendulum(
+    *,
+    m: ArrayLike = 1.0,
+    l: ArrayLike = 1.0,  # noqa: E741
+    g: ArrayLike = 9.81,
+) -> Scene:
+    """The spherical pendulum by its coordinates (x, y, z) [m] from the pivot, z upwards.
+
+    It passes the top and the bottom as any other place, where the angles of `spherical_pendulum` fail. Arguments and
+    results as for `cartesian_pendulum`; the multiplier is `spherical_pendulum_reaction`.
+    """
+    rod = Constraint(_stretch, at=_in_space, name="rod")
+    return Scene(_SPACE_BOB, params={"m": m, "l": l, "g": g}, constraints=(rod,))
+
+
+def cartesian_pendulum_tension(
+    q: Float[Array, " dim"],
+    qd: Float[Array, " dim"],
+    *,
+    m: ArrayLike = 1.0,
+    l: ArrayLike = 1.0,  # noqa: E741
+    g: ArrayLike = 9.81,
+) -> Float[Array, ""]:
+    """Tension of the rod [N], positive where it pulls the mass inwards: `m (v^2 - g z)/l`.
+
+    In a plane, with the angle f from straight down, that is `m (l f'^2 + g cos(f))`.
+
+    **Arguments:**
+
+    - `q`, `qd`: position [m] and velocity [m/s], (x, z) or (x, y, z), with |q| = l and q . qd = 0.
+    - `m`, `l`, `g`: as for `cartesian_pendulum`.
+    """
+    return jnp.asarray(m) * (jnp.sum(qd**2) - g * q[-1]) / l
+
+
+def cartesian_pendulum_acceleration(
+    q: Float[Array, " dim"],
+    qd: Float[Array, " dim"],
+    *,
+    l: ArrayLike = 1.0,  # noqa: E741
+    g: ArrayLike = 9.81,
+) -> Float[Array, " dim"]:
+    """Accelerations [m/s^2] by Newton's law, from gravity and the tension; the mass drops out.
+
+    Arguments as for `cartesian_pendulum_tension`.
+    """
+    pull = cartesian_pendulum_tension(q, qd, m=1.0, l=l, g=g) / l
+    return jnp.asarray(-pull * q).at[-1].add(-jnp.asarray(g, q.dtype))

@@ -1,0 +1,125 @@
+"""A blade on an inclined plane that cannot slip sideways: instead of sliding down it draws cycloids across."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from ..mechanics import VelocityConstraint, rigid_body
+from ..scene import Scene
+
+# Mass [kg], moment of inertia [kg m^2], slope of the plane [rad], gravity [m/s^2].
+KNIFE_EDGE = {"m": 1.3, "I": 0.2, "slope": 0.4, "g": 9.81}
+
+
+def _place(q: Array, p: dict[str, Array]) -> Array:
+    return jnp.stack([q[0] * jnp.cos(p["slope"]), q[1], -q[0] * jnp.sin(p["slope"])])
+
+
+def _heading(q: Array) -> Array:
+    return q[2]
+
+
+def _sideways(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del t, p
+    return jnp.cos(q[2]) * qd[1] - jnp.sin(q[2]) * qd[0]
+
+
+_BLADE = rigid_body(lambda p: p["m"], lambda p: p["I"], _place, _heading, lambda p: p["g"])
+
+
+def knife_edge(
+    *,
+    m: ArrayLike = KNIFE_EDGE["m"],
+    I: ArrayLike = KNIFE_EDGE["I"],  # noqa: E741 - the symbol of the moment of inertia
+    slope: ArrayLike = KNIFE_EDGE["slope"],
+    g: ArrayLike = KNIFE_EDGE["g"],
+) -> Scene:
+    """Blade on a smooth inclined plane, free to turn and to slide along its edge only.
+
+    The coordinates are the place of its centre of mass, where the edge touches, x down the plane and y across [m], and
+    the heading [rad], in which (cos, sin) is the direction of the edge.
+
+    **Arguments:**
+
+    - `m`: mass [kg], > 0.
+    - `I`: moment of inertia about the normal of the plane [kg m^2], > 0.
+    - `slope`: angle of the plane against the level [rad].
+    - `g`: gravity [m/s^2].
+
+    **Returns:**
+
+    A `Scene` without effects, with the constraint `edge`, whose multiplier is the force [N] of the plane on the blade
+    across the edge, positive to its left; see `knife_edge_force`. Its exact motion: `knife_edge_motion`.
+    """
+    edge = VelocityConstraint(_sideways, name="edge")
+    return Scene(_BLADE, params={"m": m, "I": I, "slope": slope, "g": g}, constraints=(edge,))
+
+
+def knife_edge_motion(
+    t: Float[Array, "..."],
+    *,
+    turn: ArrayLike,
+    speed: ArrayLike = 0.0,
+    slope: ArrayLike = KNIFE_EDGE["slope"],
+    g: ArrayLike = KNIFE_EDGE["g"],
+) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"]]:
+    """Coordinates and velocities at the times `t` [s], started from the origin at t = 0 with the edge down the plane.
+
+    The heading is w t. Along the edge gravity accelerates by `b cos(w t)`, b = g sin(slope), so the speed is
+    `v + (b/w) sin(w t)`, and `x = (b/(2 w^2)) sin(w t)^2 + (v/w) sin(w t)`,
+    `y = (b/(2 w^2)) (w t - sin(w t) cos(w t)) + (v/w) (1 - cos(w t))`: from rest a cycloid, along which the blade
+    moves across the plane by `b/(2 w)` on the average and never down (A. M. Bloch, Nonholonomic Mechanics and Control,
+    2003, section 1.6).
+
+    **Arguments:**
+
+    - `t`: times [s].
+    - `turn`: rate of the heading w [rad/s], not zero.
+    - `speed`: along the edge at t = 0, v [m/s].
+    - `slope`, `g`: as for `knife_edge`.
+
+    **Returns:**
+
+    (q, qd), each of the shape of `t` and one axis of three more.
+    """
+    b, w = g * jnp.sin(jnp.asarray(slope)), jnp.asarray(turn)
+    sine, cosine = jnp.sin(w * t), jnp.cos(w * t)
+    x = b / (2.0 * w**2) * sine**2 + speed / w * sine
+    y = b / (2.0 * w**2) * (w * t - sine * cosine) + speed / w * (1.0 - cosine)
+    along = speed + b / w * sine
+    return jnp.stack([x, y, w * t], axis=-1), jnp.stack([along * cosine, along * sine, w + 0.0 * t], axis=-1)
+
+
+def knife_edge_acceleration(
+    q: Float[Array, "3"],
+    qd: Float[Array, "3"],
+    *,
+    slope: ArrayLike = KNIFE_EDGE["slope"],
+    g: ArrayLike = KNIFE_EDGE["g"],
+) -> Float[Array, "3"]:
+    """Accelerations [m/s^2, rad/s^2] in closed form: `b cos(h)` along the edge and `u h'` across, h'' = 0.
+
+    **Arguments:**
+
+    - `q`, `qd`: (x, y, h) and their rates, shape `[3]`; the velocity u is along the edge.
+    - `slope`, `g`: as for `knife_edge`.
+    """
+    sine, cosine = jnp.sin(q[2]), jnp.cos(q[2])
+    u = cosine * qd[0] + sine * qd[1]
+    along, across = g * jnp.sin(jnp.asarray(slope)) * cosine, u * qd[2]
+    return jnp.stack([along * cosine - across * sine, along * sine + across * cosine, 0.0 * u])
+
+
+def knife_edge_force(
+    q: Float[Array, "3"],
+    qd: Float[Array, "3"],
+    *,
+    m: ArrayLike = KNIFE_EDGE["m"],
+    slope: ArrayLike = KNIFE_EDGE["slope"],
+    g: ArrayLike = KNIFE_EDGE["g"],
+) -> Float[Array, ""]:
+    """Force [N] of the plane across the edge, positive to its left: `m (u h' + g sin(slope) sin(h))`.
+
+    Arguments as for `knife_edge_acceleration`, `m` [kg], > 0.
+    """
+    u = jnp.cos(q[2]) * qd[0] + jnp.sin(q[2]) * qd[1]
+    return jnp.asarray(m) * (u * qd[2] + g * jnp.sin(jnp.asarray(slope)) * jnp.sin(q[2]))
