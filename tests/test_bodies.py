@@ -94,7 +94,7 @@ def test_friction_of_a_bead_acts_along_the_wire_with_the_true_normal_force() -> 
 
 
 def test_a_bead_sticks_on_a_wire_that_is_not_too_steep() -> None:
-    """On a straight wire of slope tan(a) the limit is mu = tan(a); below it the bead accelerates at g (sin - mu cos)."""
+    """On a straight wire of slope tan(a) the limit is mu = tan(a); below, the bead accelerates at g (sin - mu cos)."""
     slope = 0.5
 
     def wire(q: Any) -> Any:

@@ -422,7 +422,7 @@ def test_integers_and_lists() -> None:
         (lambda: jms.Chart(lambda q: q[None]).position(ONES), r"it returned float64\[1, 3\]"),
         (lambda: jms.Chart(lambda q: [q[0], q[1], q[2]]).velocity(ONES, ONES), "a list. Return jnp.stack"),
         (lambda: jms.Chart(lambda q: jnp.arange(3) + 0 * q.astype(int)).basis(ONES), r"it returned int64\[3\]"),
-        (lambda: jms.Chart(lambda q: None).position(ONES), "it returned a NoneType"),  # noqa: ARG005
+        (lambda: jms.Chart(lambda q: None).position(ONES), "it returned a NoneType"),
     ],
 )
 def test_wrong_structure(call: Callable[[], Any], text: str) -> None:

@@ -1,5 +1,5 @@
 """The two plug-ins that let events pass, in plain diffrax; and what diffrax's own terminating events do instead."""
-# ruff: noqa: ARG001, ARG005 (guards and fields have the arguments that diffrax passes, used or not)
+# ruff: noqa: ARG001 (guards and fields have the arguments that diffrax passes, used or not)
 
 import functools
 from typing import Any

@@ -113,7 +113,7 @@ def test_particle_in_a_rotating_frame() -> None:
 def test_mass_matrix_and_force_enter_as_they_should() -> None:
     """Two masses coupled by inertia, L = qd.M.qd/2, and a force: qdd = M^-1 F."""
     mass = jnp.array([[2.0, 0.5], [0.5, 1.0]])
-    free = lambda t, q, qd, p: 0.5 * jnp.sum(qd * (p @ qd))  # noqa: E731, ARG005
+    free = lambda t, q, qd, p: 0.5 * jnp.sum(qd * (p @ qd))  # noqa: E731
     zero = jnp.zeros(2)
     equations = motion_equations(free, jnp.array(0.0), zero, zero, mass)
     np.testing.assert_allclose(equations.mass, mass, rtol=1e-15)

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from jaxmodsim import Scene, problems
-from jaxmodsim.mechanics import energies
 from jaxmodsim.scene import Reaction, State, scene_field, scene_margins, scene_reactions
-from jaxmodsim.simulation import simulate
 
 SAMPLES = 50
 # Each side is a sum of a few terms, right to some roundings: compare with the largest around.

@@ -148,11 +148,11 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
     "at is no function": (lambda: AppliedForce(push, at=cast_any(1)), r"AppliedForce at must be a function, but 1"),
     # The following are found when the run is traced.
     "vector Lagrangian": (
-        lambda: run(Scene(lambda t, q, qd, p: 0.5 * qd**2)),  # noqa: ARG005
+        lambda: run(Scene(lambda t, q, qd, p: 0.5 * qd**2)),
         r"Lagrangian must return one number.*returned.*index the coordinates",
     ),
     "force of a wrong shape": (
-        lambda: run(Scene(free, effects=(AppliedForce(lambda t, q, qd, p: t, name="pull"),))),  # noqa: ARG005
+        lambda: run(Scene(free, effects=(AppliedForce(lambda t, q, qd, p: t, name="pull"),))),
         r"AppliedForce 'pull': fn returned the shape \(\), but \(1,\) is needed.*the coordinates",
     ),
     "Cartesian force of a wrong shape": (
@@ -166,7 +166,7 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
         r"belt_velocity\(t\) returned the shape \(3,\)",
     ),
     "vector load": (
-        lambda: run(one_friction(normal_force=lambda t, q, qd, p: q)),  # noqa: ARG005
+        lambda: run(one_friction(normal_force=lambda t, q, qd, p: q)),
         r"normal_force\(t, q, qd, params\) returned the shape \(1,\)",
     ),
 }

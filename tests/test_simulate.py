@@ -306,7 +306,7 @@ def test_the_page_of_code_that_must_always_work() -> None:
         page_lagrangian,
         params={"m": 2.0},
         effects=(
-            jms.AppliedForce(lambda t, q, qd, p: jnp.array([1.0 * t])),  # noqa: ARG005
+            jms.AppliedForce(lambda t, q, qd, p: jnp.array([1.0 * t])),
             jms.Friction(jms.LuGre(sigma0=750.0, sigma1=0.0, sigma2=0.1, Fc=1.5, Fs=1.75, vs=0.2)),
         ),
     )

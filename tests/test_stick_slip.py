@@ -98,7 +98,7 @@ def stribeck_cycle(numbers: dict[str, float], n: int) -> np.ndarray:
     while len(times) < n:
         t += (p["Fs"] / k - x) / belt
         times.append(t)
-        t, fired, y = solve_to(rate, t, [p["Fs"] / k, belt], t + 5.0, [lambda t, y: belt - y[1]])  # noqa: ARG005
+        t, fired, y = solve_to(rate, t, [p["Fs"] / k, belt], t + 5.0, [lambda t, y: belt - y[1]])
         assert fired == 0
         assert abs(k * y[0]) < p["Fs"]
         x = y[0]
@@ -167,10 +167,10 @@ def coupled_guards(modes: Any) -> list[tuple[int, int, Callable[..., Any]]]:
             return -k[i] * y[i] + (-1 if i == 0 else 1) * c * (y[0] - y[1])
 
         if modes[i] == 0:
-            guards.append((i, 1, lambda t, y, i=i, pull=pull: LAWS[i]["Fs"] - pull(y)))  # noqa: ARG005
-            guards.append((i, -1, lambda t, y, i=i, pull=pull: LAWS[i]["Fs"] + pull(y)))  # noqa: ARG005
+            guards.append((i, 1, lambda t, y, i=i, pull=pull: LAWS[i]["Fs"] - pull(y)))
+            guards.append((i, -1, lambda t, y, i=i, pull=pull: LAWS[i]["Fs"] + pull(y)))
         else:
-            guards.append((i, 0, lambda t, y, i=i, s=modes[i]: s * (y[2 + i] - belt)))  # noqa: ARG005
+            guards.append((i, 0, lambda t, y, i=i, s=modes[i]: s * (y[2 + i] - belt)))
     return guards
 
 
