@@ -142,7 +142,8 @@ def test_rod_on_a_rough_floor(mu: float) -> None:
     compliance = problems.rod_on_rough_floor_compliance(ROD_ANGLE, side, m=m, mu=mu)
     smooth = problems.rod_on_rough_floor_compliance(ROD_ANGLE, m=m, mu=0.0)
     np.testing.assert_allclose(smooth, (1 + 3 * np.cos(ROD_ANGLE) ** 2) / m, rtol=1e-14)
-    np.testing.assert_allclose(margins[:, 1], compliance / smooth, atol=1e-12)
+    # Friction that lifts the tip never takes the solution away.
+    np.testing.assert_allclose(margins[:, 1], np.minimum(compliance / smooth, 1.0), atol=1e-12)
     normal = jax.vmap(lambda f, w, s: problems.rod_on_rough_floor_normal_force(f, w, s, **{**ROD, "mu": mu}))(
         ROD_ANGLE, ROD_RATE, side
     )
@@ -234,21 +235,19 @@ def symbolic_pendulum(names: str) -> Any:
 def symbolic_slider_crank() -> Any:
     (m1, m2, m3, r, l, g, torque), numbers = values("m1 m2 m3 r l g torque", CRANK)  # noqa: E741
     f, b, x, y = dynamicsymbols("f b x y")
-    crank, *tip = bar(m1, r, sympy.Integer(0), sympy.Integer(0), f, g)
-    rod, *end = bar(m2, l, *tip, b, g)
+    crank, x1, z1 = bar(m1, r, sympy.Integer(0), sympy.Integer(0), f, g)
+    rod, x2, z2 = bar(m2, l, x1, z1, b, g)
     energy = crank + rod + m3 * (x.diff() ** 2 + y.diff() ** 2) / 2 - m3 * g * y
-    return symbolic_motion(
-        energy, [f, b, x, y], numbers, forces=[torque, 0, 0, 0], holonomic=[x - end[0], y - end[1], y]
-    )
+    return symbolic_motion(energy, [f, b, x, y], numbers, forces=[torque, 0, 0, 0], holonomic=[x - x2, y - z2, y])
 
 
 def symbolic_four_bar() -> Any:
     (a, b, c, d, m1, m2, m3, g), numbers = values("a b c d m1 m2 m3 g", problems.FOUR_BAR)
     q = list(dynamicsymbols("q1 q2 q3"))
-    crank, *tip = bar(m1, a, sympy.Integer(0), sympy.Integer(0), q[0], g)
-    coupler, *end = bar(m2, b, *tip, q[1], g)
-    rocker, *joint = bar(m3, c, d, sympy.Integer(0), q[2], g)
-    holonomic = [joint[0] - end[0], joint[1] - end[1]]
+    crank, x1, z1 = bar(m1, a, sympy.Integer(0), sympy.Integer(0), q[0], g)
+    coupler, x2, z2 = bar(m2, b, x1, z1, q[1], g)
+    rocker, x3, z3 = bar(m3, c, d, sympy.Integer(0), q[2], g)
+    holonomic = [x3 - x2, z3 - z2]
     return symbolic_motion(crank + coupler + rocker, q, numbers, holonomic=holonomic)
 
 
@@ -325,7 +324,7 @@ def test_symbolic_equations(name: str) -> None:
         ours = said.qdd
     assert_equal(ours, qdd, 1e-10, least=least)
     if one.scene.constraints:
-        multipliers = np.concatenate([each.multiplier for each in said.reactions.values()], axis=1)
+        multipliers = np.concatenate([said.reactions[each].multiplier for each in one.scene.constraint_names], axis=1)
         assert_equal(multipliers, np.stack([each.multipliers for each in exact]), 1e-10)
 
 
@@ -432,8 +431,9 @@ def test_four_bar_stays_closed() -> None:
     ts = jnp.linspace(0.0, 2.0, 41)
     run = simulate(scene, q0, qd0, 2.0, ts=ts, rtol=1e-9, atol=1e-11)
     assert run.q[-1, 0] > 2 * np.pi
-    drift = jax.vmap(lambda q: scene.constraints[0].error(jnp.zeros(()), q, scene.params))(run.q)
-    assert np.abs(drift).max() < 1e-12
+    closure: Any = scene.constraints[0]
+    drift = jax.vmap(lambda q: closure.error(jnp.zeros(()), q, scene.params))(run.q)
+    assert jnp.abs(drift).max() < 1e-12
     q, qd = jax.vmap(problems.four_bar_state)(run.q[:, 0], run.qd[:, 0])
     turned = (np.asarray(run.q - q) + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_allclose(turned, 0.0, atol=1e-12)
@@ -445,14 +445,14 @@ def test_four_bar_stays_closed() -> None:
 def test_runs_of_the_rolling_disc() -> None:
     """A steady circle closes; any other motion rolls on and keeps its energy."""
     scene, turn, lean = problems.rolling_disc(**DISC), -1.3, 0.4
-    spin = problems.rolling_disc_steady_spin(lean, turn, **but(DISC, "m"))
+    spin = float(problems.rolling_disc_steady_spin(lean, turn, **but(DISC, "m")))
     q0 = jnp.array([0.0, 0.0, 0.0, lean, 0.0])
-    qd0 = problems.rolling_disc_velocity(q0, jnp.stack([turn, 0.0, spin]), R=DISC["R"])
+    qd0 = problems.rolling_disc_velocity(q0, jnp.array([turn, 0.0, spin]), R=DISC["R"])
     period = 2 * np.pi / abs(turn)
     how: dict[str, Any] = {"ts": np.linspace(0.0, period, 17), "rtol": 1e-10, "atol": 1e-12}
     run = simulate(scene, q0, qd0, period, **how)
     # On a circle about (0, radius), radius = R w/h'.
-    radius = DISC["R"] * float(spin + turn * np.sin(lean)) / turn
+    radius = DISC["R"] * (spin + turn * np.sin(lean)) / turn
     np.testing.assert_allclose(run.q[:, 3], lean, atol=1e-8)
     np.testing.assert_allclose(np.hypot(run.q[:, 0], run.q[:, 1] - radius), abs(radius), rtol=1e-8)
     np.testing.assert_allclose(run.q[-1], [0.0, 0.0, turn * period, lean, spin * period], atol=1e-7)
@@ -466,24 +466,28 @@ def test_runs_of_the_rolling_disc() -> None:
     np.testing.assert_allclose(run.qd, rolls, atol=1e-13)
 
 
-def slipping_rod(mu: float, state: tuple[float, float, float], end: Callable[..., float]) -> Any:
-    """Time and angle at which `end(angle, rate)` falls through zero, by the closed form of the accelerations."""
-    numbers = {**ROD, "mu": mu}
-    acceleration = jax.jit(lambda q, qd: problems.rod_on_rough_floor_acceleration(q, qd, **numbers))
-
-    def rate(t: float, y: Any) -> Any:
-        del t
-        return np.concatenate([y[3:], acceleration(y[:3], y[3:])])
+def slipping_rod(mu: float, angle: float, rate: float, end: Callable[..., float]) -> tuple[float, float]:
+    """Time and angle at which `end(angle, rate)` falls through zero; in slip the angle moves by itself."""
+    q, qd = problems.rod_on_rough_floor_state(angle, rate, 1e6, l=ROD["l"])
+    turn = jax.jit(
+        lambda f, w: problems.rod_on_rough_floor_acceleration(q.at[2].set(f), qd.at[2].set(w), **{**ROD, "mu": mu})[2]
+    )
 
     def stop(t: float, y: Any) -> float:
         del t
-        return end(y[2], y[5])
+        return end(*y)
 
-    stop.terminal = True
-    q, qd = problems.rod_on_rough_floor_state(*state, l=ROD["l"])
-    solved: Any = solve_ivp(rate, (0.0, 5.0), np.concatenate([q, qd]), events=stop, rtol=1e-10, atol=1e-12)
+    setattr(stop, "terminal", True)  # noqa: B010 (an attribute of a function)
+    solved: Any = solve_ivp(
+        lambda _, y: [y[1], float(turn(*y))], (0.0, 0.5), [angle, rate], events=stop, rtol=1e-10, atol=1e-12
+    )
     assert len(solved.t_events[0]) == 1
-    return solved.t[-1], solved.y[2, -1]
+    return solved.t[-1], solved.y[0, -1]
+
+
+def weight_left(angle: float, rate: float) -> float:
+    """What gravity leaves to press the tip down."""
+    return ROD["g"] - 0.5 * ROD["l"] * np.sin(angle) * rate**2
 
 
 def compliance_left(angle: float, rate: float) -> float:
@@ -500,8 +504,8 @@ def test_the_rod_ends_where_it_lifts_off_and_where_the_paradox_begins() -> None:
         return simulate(scene, q0, qd0, 0.5, ts=ts, rtol=1e-9, atol=1e-11, throw=False)
 
     # Lift-off.
-    state = (1.0, 3.1, 5.0)
-    exact = slipping_rod(0.5, state, lambda f, w: ROD["g"] - 0.5 * ROD["l"] * np.sin(f) * w**2)
+    state = (1.0, 3.3, 5.0)
+    exact = slipping_rod(0.5, *state[:2], weight_left)
     lifted = run(0.5, state)
     assert not lifted.result.ok
     assert "'floor' can only push, and would have to pull: the contact opens" in lifted.result.message
@@ -512,7 +516,7 @@ def test_the_rod_ends_where_it_lifts_off_and_where_the_paradox_begins() -> None:
     np.testing.assert_allclose(lifted.t[kept], ts[: kept.sum()])
     # Into the paradox.
     state = (0.5, 2.0, 20.0)
-    exact = slipping_rod(2.0, state, compliance_left)
+    exact = slipping_rod(2.0, *state[:2], compliance_left)
     jammed = run(2.0, state)
     assert "Friction under the reaction of 'floor' has lost its unique solution" in jammed.result.message
     np.testing.assert_allclose(jammed.t_end, exact[0], atol=1e-4)
