@@ -94,6 +94,5 @@ def foucault_pendulum_acceleration(
 
     Arguments as for `foucault_pendulum`, `q` and `qd` of shape `[2]`.
     """
-    s = Omega * jnp.sin(jnp.asarray(latitude))
-    stiffness = jnp.asarray(g) / l
+    s, stiffness = jnp.asarray(Omega) * jnp.sin(jnp.asarray(latitude)), jnp.asarray(g) / l
     return 2.0 * s * jnp.stack([qd[1], -qd[0]]) - stiffness * q

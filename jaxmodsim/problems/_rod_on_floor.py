@@ -152,8 +152,9 @@ def rod_on_rough_floor_acceleration(
     - `q`, `qd`: (x, y, f) and their rates, shape `[3]`, with the tip on the floor.
     - `m`, `l`, `mu`, `g`: as for `rod_on_rough_floor`.
     """
-    sine, cosine, g = jnp.sin(q[2]), jnp.cos(q[2]), jnp.asarray(g)
-    direction = jnp.sign(qd[0] - 0.5 * jnp.asarray(l) * sine * qd[2])
-    push = rod_on_rough_floor_normal_force(q[2], qd[2], direction, m=m, l=l, mu=mu, g=g) / jnp.asarray(m)
-    turn = 6.0 / jnp.asarray(l) * push * (mu * direction * sine - cosine)
+    sine, cosine = jnp.sin(q[2]), jnp.cos(q[2])
+    m, l, mu, g = (jnp.asarray(x, q.dtype) for x in (m, l, mu, g))  # noqa: E741
+    direction = jnp.sign(qd[0] - 0.5 * l * sine * qd[2])
+    push = rod_on_rough_floor_normal_force(q[2], qd[2], direction, m=m, l=l, mu=mu, g=g) / m
+    turn = 6.0 / l * push * (mu * direction * sine - cosine)
     return jnp.stack([-mu * direction * push, push - g, turn])

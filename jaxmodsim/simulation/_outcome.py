@@ -181,11 +181,15 @@ def end_code(
 
 
 def _blame_margins(code: Int[Array, ""], margins: Any, first: int, known: Array | bool) -> Int[Array, ""]:
-    """Replace `code` by that of the first condition that does not hold, where `known`."""
+    """Replace `code` by that of the last condition that does not hold, where `known`.
+
+    The margin of uniqueness comes last: where it is gone, normal forces change their sign, but no contact opens.
+    """
     if margins is None:
         return code
     bad = ~(margins > 0)
-    return jnp.where(jnp.any(bad) & known, first + jnp.argmax(bad), code)
+    last = margins.shape[0] - 1 - jnp.argmax(bad[::-1])
+    return jnp.where(jnp.any(bad) & known, first + last, code)
 
 
 def _pivots(scene: Scene, t: Float[Array, ""], y: State) -> Float[Array, " dof"]:
