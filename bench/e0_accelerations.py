@@ -38,7 +38,7 @@ SIZES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 MANY = 1024
 OURS, HAND, SYMPY, MUJOCO = "jaxmodsim", "JAX by hand", "sympy", "MuJoCo"
 # Written out in scalars, larger chains take minutes to compile.
-LARGEST_WRITTEN_OUT = 8
+LARGEST_WRITTEN_OUT = 12
 # A derivation by sympy that takes longer [s] is the last one.
 PATIENCE = 15.0
 ALONE, LOOP, BATCH, BATCH_LOOP, PYTHON = "alone", "loop", "many", "many in a loop", "many, loop of Python"
