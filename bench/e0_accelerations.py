@@ -82,7 +82,7 @@ def main() -> None:
 
 
 def _point(n: int, smoke: bool, patience: float) -> dict[str, Any]:
-    many, single, batches = (8, 20, 2) if smoke else (MANY, 2000, max(4, 64 // n))
+    many, single, batches = (8, 20, 2) if smoke else (MANY, max(200, 4000 // n), max(2, 32 // n))
     q, qd = states(n, many)
     exact = np.asarray(jax.vmap(arrays, (0, 0, None))(jnp.asarray(q), jnp.asarray(qd), scene(n)))
     calls: dict[str, Callable[[], Any]] = {}

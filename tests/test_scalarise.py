@@ -62,6 +62,7 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "inner jit": lambda x: jax.jit(lambda y: jnp.tanh(y) @ TABLE)(x) + x,
     "inner vmap": lambda x: jax.vmap(lambda y: jnp.sum(jnp.exp(y * x)))(x),
     "Hessian": jax.hessian(lambda x: jnp.prod(jnp.sin(x)) + jnp.sum(x * (TABLE @ x))),
+    "empty": lambda x: jnp.concatenate([x[:0], x]) + jnp.sum(x[3:]),
     "constant": lambda x: TABLE + 0.0 * x[0],
     "nothing of it": lambda _: TABLE[0],
 }

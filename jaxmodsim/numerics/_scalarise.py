@@ -141,7 +141,7 @@ class _Scalars:
         if name in _CALLS:
             return self.run(params["jaxpr"].jaxpr, params["jaxpr"].consts, inputs)
         kinds = [x.aval for x in (*eqn.invars, *eqn.outvars)]
-        if max(kind.size for kind in kinds) > MAX_ENTRIES:
+        if not all(0 < kind.size <= MAX_ENTRIES for kind in kinds):
             return self.whole(eqn, inputs)
         if name in _ELEMENTWISE:
             arrays = np.broadcast_arrays(*map(self.parts, inputs))
@@ -153,7 +153,8 @@ class _Scalars:
         if name == "split":
             return np.split(self.parts(inputs[0]), np.cumsum(params["sizes"])[:-1], params["axis"])
         if name == "unstack":
-            return list(np.moveaxis(self.parts(inputs[0]), params["axis"], 0)[..., None].squeeze(-1))
+            moved = np.moveaxis(self.parts(inputs[0]), params["axis"], 0)
+            return [moved[i, ...] for i in range(len(moved))]
         if name in _SUMS and len({kind.dtype for kind in kinds}) == 1:
             return [getattr(self, name)(params, *map(self.parts, inputs))]
         return self.whole(eqn, inputs)
