@@ -38,7 +38,7 @@ SIZES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 MANY = 1024
 OURS, HAND, SYMPY, MUJOCO = "jaxmodsim", "JAX by hand", "sympy", "MuJoCo"
 # Written out in scalars, larger chains take minutes to compile.
-LARGEST_WRITTEN_OUT = 8
+LARGEST_WRITTEN_OUT = 12
 # A derivation by sympy that takes longer [s] is the last one.
 PATIENCE = 15.0
 ALONE, LOOP, BATCH, BATCH_LOOP, PYTHON = "alone", "loop", "many", "many in a loop", "many, loop of Python"
@@ -82,7 +82,7 @@ def main() -> None:
 
 
 def _point(n: int, smoke: bool, patience: float) -> dict[str, Any]:
-    many, single, batches = (8, 20, 2) if smoke else (MANY, 2000, max(4, 64 // n))
+    many, single, batches = (8, 20, 2) if smoke else (MANY, max(200, 4000 // n), max(2, 32 // n))
     q, qd = states(n, many)
     exact = np.asarray(jax.vmap(arrays, (0, 0, None))(jnp.asarray(q), jnp.asarray(qd), scene(n)))
     calls: dict[str, Callable[[], Any]] = {}

@@ -62,6 +62,7 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "inner jit": lambda x: jax.jit(lambda y: jnp.tanh(y) @ TABLE)(x) + x,
     "inner vmap": lambda x: jax.vmap(lambda y: jnp.sum(jnp.exp(y * x)))(x),
     "Hessian": jax.hessian(lambda x: jnp.prod(jnp.sin(x)) + jnp.sum(x * (TABLE @ x))),
+    "empty": lambda x: jnp.concatenate([x[:0], x]) + jnp.sum(x[3:]),
     "constant": lambda x: TABLE + 0.0 * x[0],
     "nothing of it": lambda _: TABLE[0],
 }
@@ -124,9 +125,26 @@ def test_equal_terms_are_formed_once() -> None:
 
 
 def test_large_functions_and_single_numbers_stay_as_they_are() -> None:
-    large = jnp.linspace(0.0, 1.0, 5000)
-    for fn, x in ((jnp.sin, large), (lambda x: jnp.sin(x[0]), X[:1])):
+    def long(x: Any) -> Any:
+        for _ in range(100):
+            x = jnp.sin(x)
+        return x
+
+    for fn, x in ((long, jnp.linspace(0.0, 1.0, 100)), (lambda x: jnp.sin(x[0]), X[:1])):
         assert primitives(partial(in_scalars, fn, seed=x), x) == primitives(fn, x)
+
+
+def test_large_arrays_stay_whole() -> None:
+    """A table of a thousand numbers, and the few that are looked up in it."""
+    table = jnp.linspace(0.0, 3.0, 1000)
+
+    def fn(x: Any) -> Any:
+        return jnp.sin(jnp.sum(table) * x) + jnp.interp(x, table, table**2)
+
+    found = primitives(scalar(fn), X)
+    assert found["sin"] == 3
+    assert found.total() < 200
+    np.testing.assert_allclose(jax.jit(scalar(fn))(X), fn(X), rtol=1e-12)
 
 
 def test_outside_of_jit_nothing_is_taken_apart() -> None:

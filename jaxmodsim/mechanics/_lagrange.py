@@ -31,7 +31,7 @@ def motion_equations(
     """Mass matrix and load of `d/dt dL/dqd - dL/dq = Q` at one state.
 
     The momentum dL/dqd is linearised once. Its derivative along (1, qd, 0) gives the bias and along the unit
-    velocities the mass matrix, so the Hessian by q is never formed. Up to 8 coordinates all of this is evaluated in
+    velocities the mass matrix, so the Hessian by q is never formed. Up to 12 coordinates all of this is evaluated in
     scalars (`in_scalars`); above, and where the Lagrangian is too large for that, in arrays as it is written.
 
     **Arguments:**

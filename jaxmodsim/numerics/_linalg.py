@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Inexact
 
-MAX_UNROLLED_CHOLESKY = 8
+MAX_UNROLLED_CHOLESKY = 12
 MAX_UNROLLED_LU = 12
 
 Scalar: TypeAlias = Inexact[Array, ""]
@@ -51,7 +51,7 @@ def cholesky_pivots(matrix: Float[Array, "n n"]) -> Float[Array, " n"]:
 
 
 def solve_positive_definite(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Solve a symmetric positive definite system, by L D L^T written out for n <= 8, by Cholesky of LAPACK above.
+    """Solve a symmetric positive definite system, by L D L^T written out for n <= 12, by Cholesky of LAPACK above.
 
     That is Cholesky without roots: alone it takes a third of the time, as a root and a quotient for each pivot wait
     for each other, and under `jax.vmap` less still, as XLA computes quotients once (see `factor_lu`).

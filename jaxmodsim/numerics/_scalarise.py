@@ -15,8 +15,10 @@ from jaxtyping import Array, Float
 
 from ._once import once, unit_of
 
-# A function whose values have more entries than this in all is left as it is: compilation would take too long.
-MAX_SCALARS = 4000
+# Arrays with more entries stay whole: tables, and what is looked up in them. Twelve coordinates make squares of 144.
+MAX_ENTRIES = 144
+# A function whose other values have more entries than this in all is left as it is: it would take too long to compile.
+MAX_SCALARS = 8000
 
 # Applied to every entry by itself.
 _ELEMENTWISE = {
@@ -57,7 +59,7 @@ def in_scalars(fn: Callable[..., Any], *args: Any, seed: Float[Array, "..."]) ->
     """
     closed, shapes = jax.make_jaxpr(fn, return_shape=True)(*args)
     leaves = jtu.tree_leaves(args)
-    sizes = _sizes(closed.jaxpr)
+    sizes = [size for size in _sizes(closed.jaxpr) if size <= MAX_ENTRIES]
     traced = any(isinstance(x, jax.core.Tracer) for x in leaves)
     if traced and max(sizes, default=0) > 1 and sum(sizes) <= MAX_SCALARS:
         unit = unit_of(jax.lax.stop_gradient(jnp.ravel(seed)[0]))
@@ -138,6 +140,9 @@ class _Scalars:
         name, params = eqn.primitive.name, eqn.params
         if name in _CALLS:
             return self.run(params["jaxpr"].jaxpr, params["jaxpr"].consts, inputs)
+        kinds = [x.aval for x in (*eqn.invars, *eqn.outvars)]
+        if not all(0 < kind.size <= MAX_ENTRIES for kind in kinds):
+            return self.whole(eqn, inputs)
         if name in _ELEMENTWISE:
             arrays = np.broadcast_arrays(*map(self.parts, inputs))
             return [
@@ -148,10 +153,15 @@ class _Scalars:
         if name == "split":
             return np.split(self.parts(inputs[0]), np.cumsum(params["sizes"])[:-1], params["axis"])
         if name == "unstack":
-            return list(np.moveaxis(self.parts(inputs[0]), params["axis"], 0)[..., None].squeeze(-1))
-        if name in _SUMS and len({x.aval.dtype for x in (*eqn.invars, *eqn.outvars)}) == 1:
+            moved = np.moveaxis(self.parts(inputs[0]), params["axis"], 0)
+            return [moved[i, ...] for i in range(len(moved))]
+        if name in _SUMS and len({kind.dtype for kind in kinds}) == 1:
             return [getattr(self, name)(params, *map(self.parts, inputs))]
-        bound = eqn.primitive.get_bind_params(params)
+        return self.whole(eqn, inputs)
+
+    def whole(self, eqn: Any, inputs: list[Any]) -> list[Any]:
+        """Outputs of an equation that gets its arrays whole."""
+        bound = eqn.primitive.get_bind_params(eqn.params)
         functions, params = bound if isinstance(bound, tuple) else ((), bound)
         out = eqn.primitive.bind(*functions, *map(_whole, inputs), **params)
         return list(out) if eqn.primitive.multiple_results else [out]
