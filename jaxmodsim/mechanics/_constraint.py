@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import Number, Place, as_function, as_place, parameter, safe_norm
+from ..numerics import Number, Place, as_function, as_place, check_ranges, parameter, safe_norm
 
 
 def _at(value: Any) -> Place | None:
@@ -32,6 +32,10 @@ class AbstractConstraint(eqx.Module):
         one_sided: AbstractVar[bool]
         # Rate [1/s] at which errors die out.
         stabilise: AbstractVar[Number]
+
+    def __check_init__(self) -> None:
+        """Refuse numbers out of range."""
+        check_ranges(self)
 
     @abc.abstractmethod
     def error(self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree) -> Float[Array, " m"] | None:

@@ -5,7 +5,7 @@ them become `qdd = a + M^-1 J^T lambda`, where `J M^-1 J^T lambda = -(J a + bias
 matrix singular: the motion is unique, and of all multipliers the smallest are taken.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -66,11 +66,11 @@ def restrain(
 ) -> Restraint:
     """The constraints at one state of a mechanism with the mass matrix `mass`."""
 
-    def rates(t: Array, q: Array, qd: Array) -> Array:
-        return jnp.concatenate([each.rate(t, q, qd, params) for each in constraints])
+    def along(t: Array, q: Array) -> Array:
+        return rates(constraints, t, q, params)(qd)
 
-    rows = _jacobian(lambda qd: rates(t, q, qd), qd)
-    w, bias = jax.jvp(rates, (t, q, qd), (jnp.ones_like(t), qd, jnp.zeros_like(qd)))
+    rows = _jacobian(rates(constraints, t, q, params), qd)
+    w, bias = jax.jvp(along, (t, q), (jnp.ones_like(t), qd))
     start = 0
     for each in constraints:
         error = each.error(t, q, params)
@@ -94,28 +94,46 @@ def sizes(
     return [jax.eval_shape(each.rate, t, q, qd, params).shape[0] for each in constraints]
 
 
+def errors(
+    constraints: Constraints, t: Float[Array, ""], params: PyTree
+) -> Callable[[Float[Array, " dof"]], Float[Array, " h"]]:
+    """All that holonomic constraints say about the coordinates, as a function of these; h = 0 where there are none."""
+
+    def at(q: Array) -> Array:
+        parts = [each.error(t, q, params) for each in constraints]
+        return jnp.concatenate([jnp.zeros(0, q.dtype), *(part for part in parts if part is not None)])
+
+    return at
+
+
+def rates(
+    constraints: Constraints, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree
+) -> Callable[[Float[Array, " dof"]], Float[Array, " m"]]:
+    """All that constraints say about the velocities, as a function of these."""
+
+    def at(qd: Array) -> Array:
+        return jnp.concatenate([each.rate(t, q, qd, params) for each in constraints])
+
+    return at
+
+
 def project_position(
     constraints: Constraints,
     t: Float[Array, ""],
     q: Float[Array, " dof"],
     params: PyTree,
     mass: Float[Array, "dof dof"],
-    steps: int = _NEWTON,
 ) -> Float[Array, " dof"]:
     """Coordinates moved onto the holonomic constraints, the shortest way in the metric of the masses.
 
-    Newton's iteration, `steps` times, with the mass matrix held.
+    Two Newton steps, with the mass matrix held.
     """
-    holonomic = [each for each in constraints if each.error(t, q, params) is not None]
-    if not holonomic:
+    error = errors(constraints, t, params)
+    if error(q).shape == (0,):
         return q
-
-    def errors(q: Array) -> Array:
-        return jnp.concatenate([e for each in holonomic if (e := each.error(t, q, params)) is not None])
-
-    for _ in range(steps):
-        reach, matrix = _reach(_jacobian(errors, q), mass)
-        q = q - jnp.sum(reach * _solve(matrix, errors(q))[:, None], axis=0)
+    for _ in range(_NEWTON):
+        reach, matrix = _reach(_jacobian(error, q), mass)
+        q = q - jnp.sum(reach * _solve(matrix, error(q))[:, None], axis=0)
     return q
 
 
@@ -128,12 +146,9 @@ def project_velocity(
     mass: Float[Array, "dof dof"],
 ) -> Float[Array, " dof"]:
     """Velocities moved onto the constraints, by the smallest impulses that do."""
-
-    def rates(qd: Array) -> Array:
-        return jnp.concatenate([each.rate(t, q, qd, params) for each in constraints])
-
-    reach, matrix = _reach(_jacobian(rates, qd), mass)
-    return qd - jnp.sum(reach * _solve(matrix, rates(qd))[:, None], axis=0)
+    rate = rates(constraints, t, q, params)
+    reach, matrix = _reach(_jacobian(rate, qd), mass)
+    return qd - jnp.sum(reach * _solve(matrix, rate(qd))[:, None], axis=0)
 
 
 def _jacobian(fn: object, x: Float[Array, " dof"]) -> Float[Array, "m dof"]:

@@ -76,7 +76,7 @@ def factor_positive_definite(matrix: Float[Array, "n n"]) -> Callable[[Array], A
     """
     n = matrix.shape[0]
     if n == 1:
-        return lambda rhs: rhs / matrix[0]
+        return lambda rhs: rhs / matrix[0, 0]
     if n > MAX_UNROLLED_CHOLESKY:
         lower = jnp.linalg.cholesky(matrix)
         return lambda rhs: jax.scipy.linalg.cho_solve((lower, True), rhs)

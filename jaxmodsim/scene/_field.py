@@ -1,5 +1,6 @@
 """The vector field of a scene, with only the terms the scene holds, and what a run asks beside it."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -7,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..effects import Power
-from ..mechanics import motion_equations, project_position, project_velocity
+from ..mechanics import errors, motion_equations, project_position, project_velocity, rates
+from ..numerics import safe_norm
 from ._contact import Contact, contact_guards, next_modes, overload, stop_slip
 from ._resolve import Modes, State, by_constraint, resolve
 from ._scene import Scene
@@ -103,13 +105,21 @@ def scene_project(t: Float[Array, ""], y: State, scene: Scene) -> State:
 
 
 def scene_misfit(t: Float[Array, ""], y: State, scene: Scene) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """How far coordinates and velocities are from the constraints, relative to their own size or to one."""
-    there = jax.lax.stop_gradient(scene_project(t, y, scene))
+    """How far coordinates and velocities are from the constraints, relative to their own size or to one.
 
-    def far(new: Array, old: Array) -> Array:
-        return jnp.max(jnp.abs(new - old)) / jnp.maximum(1.0, jnp.max(jnp.abs(old)))
+    Each error is divided by the length of its gradient, which makes it a distance from its own surface: constraints
+    that contradict each other show, too.
+    """
+    y = jax.lax.stop_gradient(y)
 
-    return far(there.q, y.q), far(there.qd, y.qd)
+    def far(fn: Callable[[Array], Array], x: Array) -> Array:
+        error, rows = fn(x), jax.jacrev(fn)(x)
+        slope = safe_norm(rows, axis=1)
+        distance = jnp.abs(error) / jnp.where(slope > 0, slope, 1.0)
+        return jnp.max(distance, initial=0.0) / jnp.maximum(1.0, jnp.max(jnp.abs(x)))
+
+    position, velocity = errors(scene.constraints, t, scene.params), rates(scene.constraints, t, y.q, scene.params)
+    return far(position, y.q), far(velocity, y.qd)
 
 
 def scene_margins(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> Float[Array, " checks"] | None:

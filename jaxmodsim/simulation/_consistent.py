@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..mechanics import motion_equations
+from ..mechanics import errors, motion_equations, rates
 from ..numerics import factor_positive_definite, solve_semidefinite
 from ..scene import Scene, State, check_scene
 from ._outcome import SimulationError
@@ -58,9 +58,9 @@ def consistent(
     if not scene.constraints:
         return q, qd
     free = jnp.asarray([float(i not in hold) for i in range(dof)], kind)
-    q, qd, errors = _find(scene, t, q, qd, free)
+    q, qd, off = _find(scene, t, q, qd, free)
     eps = float(jnp.finfo(kind).eps)
-    for error, what in zip(errors, ("position", "velocity"), strict=True):
+    for error, what in zip(off, ("position", "velocity"), strict=True):
         if not float(error) <= 1e3 * eps * max(1.0, float(jnp.max(jnp.abs(q))), float(jnp.max(jnp.abs(qd)))):
             held = f" with the coordinates {tuple(hold)} held" if hold else ""
             raise SimulationError(
@@ -88,16 +88,10 @@ def _find(scene: Scene, t: Array, q: Array, qd: Array, free: Array) -> tuple[Arr
         weight = 1.0 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
         return reach.T @ solve_semidefinite(matrix, value, weight, jnp.ones(value.shape, bool))
 
-    def position(q: Array) -> Array:
-        errors = [each.error(t, q, params) for each in constraints]
-        return jnp.concatenate([e for e in errors if e is not None])
-
-    def velocity(q: Array, qd: Array) -> Array:
-        return jnp.concatenate([each.rate(t, q, qd, params) for each in constraints])
-
-    off = jnp.zeros_like(t)
-    if any(each.error(t, q, params) is not None for each in constraints):
+    position, off = errors(constraints, t, params), jnp.zeros_like(t)
+    if position(q).shape != (0,):
         q = jax.lax.fori_loop(0, _STEPS, lambda _, q: q - back(position, q), q)
         off = jnp.max(jnp.abs(position(q)))
-    qd = qd - back(lambda qd: velocity(q, qd), qd)
-    return q, qd, (off, jnp.max(jnp.abs(velocity(q, qd))))
+    velocity = rates(constraints, t, q, params)
+    qd = qd - back(velocity, qd)
+    return q, qd, (off, jnp.max(jnp.abs(velocity(qd))))
