@@ -209,7 +209,8 @@ def test_bodies_and_springs_add_up() -> None:
 
     line = lambda q: jnp.stack([q[0], 0 * q[0], 0 * q[0]])  # noqa: E731
     mass = point_mass(2.0, line)
-    for together in (mass + mass + spring, sum([mass, mass]) + spring, spring + (mass + mass)):
+    many: Any = sum  # type checkers know of sums of numbers
+    for together in (mass + mass + spring, many([mass, mass, spring]), spring + (mass + mass)):
         qdd = acceleration(together, ZERO, jnp.array([0.5]), jnp.array([0.1]), {})
         np.testing.assert_allclose(qdd, [-3.0 * 0.5 / 4.0], rtol=1e-14)
 

@@ -1,6 +1,7 @@
 """Coordinates that a Lagrangian does not depend on."""
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np

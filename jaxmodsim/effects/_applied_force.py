@@ -69,9 +69,10 @@ class AppliedForce(AbstractEffect):
         """Force as given, and mapped to the coordinates."""
         del z
         force = jnp.asarray(self.fn(t, q, qd, params), q.dtype)
-        if self.at is None:
+        at = self.at
+        if at is None:
             return Action(force, force)
-        _, pull = jax.vjp(lambda q: self.at(q, params), q)
+        _, pull = jax.vjp(lambda q: at(q, params), q)
         return Action(pull(force)[0], force)
 
     def power(

@@ -173,9 +173,14 @@ class Friction(AbstractEffect):
 
     def _pace(self, q: Float[Array, "1"], params: PyTree) -> Float[Array, ""]:
         """Displacement per unit of the one coordinate; of a position the length of its tangent."""
-        assert self.along is not None
-        tangent = jax.jvp(lambda q: self.along(q, params), (q,), (jnp.ones_like(q),))[1]
+        tangent = self._moves(q, jnp.ones_like(q), params)
         return tangent if tangent.ndim == 0 else safe_norm(tangent)
+
+    def _moves(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree) -> Float[Array, "..."]:
+        """Rate of the displacement."""
+        along = self.along
+        assert along is not None
+        return jax.jvp(lambda q: along(q, params), (q,), (qd,))[1]
 
     def belt(self, t: Float[Array, ""]) -> Float[Array, "..."]:
         """Velocity [m/s or rad/s] of the surface."""
@@ -190,7 +195,7 @@ class Friction(AbstractEffect):
             return qd[0] - self.belt(t)
         if q.shape == (1,):
             return self._pace(q, params) * qd[0] - self.belt(t)
-        return jax.jvp(lambda q: self.along(q, params), (q,), (qd,))[1] - self.belt(t)
+        return self._moves(q, qd, params) - self.belt(t)
 
     def slip_and_rate(
         self,
@@ -218,7 +223,8 @@ class Friction(AbstractEffect):
             return jnp.reshape(-force, (1,))
         if force.ndim == 0:
             return -force * self.direction(q, params)
-        _, pull = jax.vjp(lambda q: self.along(q, params), q)
+        along = self.along
+        _, pull = jax.vjp(lambda q: along(q, params), q)
         return pull(-force)[0]
 
     def limit(self, direction: Float[Array, ""], load: Float[Array, ""] | None) -> Float[Array, ""]:

@@ -26,7 +26,7 @@ class Reaction(NamedTuple):
 
     multiplier: Float[Array, "*time m"]
     generalised: Float[Array, "*time dof"]
-    force: Float[Array, "..."] | None
+    force: Any
 
 
 def scene_field(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> State:
@@ -44,7 +44,7 @@ def scene_canonical(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = N
     push = jax.grad(scene.lagrangian, argnums=1)(t, y.q, y.qd, scene.params)
     for action in resolved.actions.values():
         push = push + action.generalised
-    if resolved.restraint is not None:
+    if resolved.restraint is not None and resolved.multipliers is not None:
         push = push + resolved.restraint.force(resolved.multipliers)
     if resolved.margins is not None:
         push = jnp.where(jnp.all(resolved.margins > 0), push, jnp.nan)
@@ -130,7 +130,7 @@ def scene_margins(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = Non
 def scene_reactions(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> dict[str, Reaction]:
     """What each constraint does, by name."""
     resolved = resolve(scene, t, y, mode)
-    if resolved.restraint is None:
+    if resolved.restraint is None or resolved.multipliers is None:
         return {}
     parts = by_constraint(scene, t, y, resolved.multipliers)
     reactions, start = {}, 0

@@ -119,7 +119,7 @@ def resolve(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -> Resolve
         unit, rate = units[name]
         actions[name] = Action(-settled.force[i] * pushes[i - len(scene.exact)], settled.force[i] * unit, rate)
     qdd = qdd - jnp.sum(found.reach * settled.force[:, None], axis=0)
-    if restraint is not None:
+    if restraint is not None and multipliers is not None:
         taken = sum(actions[name].generalised for name in (*scene.exact, *scene.leaning))
         multipliers = multipliers + restraint.yields(solve_positive_definite(equations.mass, jnp.asarray(taken)))
     margins = _margins(scene, t, y, multipliers, settled.margin)
