@@ -108,6 +108,13 @@ def test_trees_go_in_and_out() -> None:
     np.testing.assert_allclose(ours["rest"][0], 2.0 * X[0])
 
 
+def test_numbers_that_are_no_arrays() -> None:
+    """Parameters in a dictionary of Python's numbers, as a user writes them down."""
+    fn = lambda x, p: p["a"] * x + p["n"]  # noqa: E731
+    ours = jax.jit(lambda x: in_scalars(fn, x, {"a": 2.5, "n": 3}, seed=x))(X)
+    np.testing.assert_allclose(ours, 2.5 * X + 3)
+
+
 def test_what_is_known_is_not_computed() -> None:
     """The columns of a linear function by unit vectors are its coefficients: no product is left, and no sum."""
 

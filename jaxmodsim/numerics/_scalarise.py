@@ -50,7 +50,7 @@ def in_scalars(fn: Callable[..., Any], *args: Any, seed: Float[Array, "..."]) ->
 
     - `fn`: a function that JAX can trace. Where its values have one entry each or more than `MAX_SCALARS` in all, and
       outside of `jax.jit` and the like, it is evaluated as it is.
-    - `args`: pytrees of arrays.
+    - `args`: pytrees of arrays and numbers.
     - `seed`: numbers not known while compiling. Where the first of them is not finite, the result may not be, either.
 
     **Returns:**
@@ -58,7 +58,7 @@ def in_scalars(fn: Callable[..., Any], *args: Any, seed: Float[Array, "..."]) ->
     What `fn` returns, equal but for rounding and for zero times infinity, which is zero if that zero is a constant.
     """
     closed, shapes = jax.make_jaxpr(fn, return_shape=True)(*args)
-    leaves = jtu.tree_leaves(args)
+    leaves = [x if hasattr(x, "shape") else jnp.asarray(x) for x in jtu.tree_leaves(args)]
     sizes = [size for size in _sizes(closed.jaxpr) if size <= MAX_ENTRIES]
     traced = any(isinstance(x, jax.core.Tracer) for x in leaves)
     if traced and max(sizes, default=0) > 1 and sum(sizes) <= MAX_SCALARS:
