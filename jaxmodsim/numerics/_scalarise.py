@@ -91,9 +91,8 @@ def _whole(x: Any) -> Any:
     """A value as one array."""
     if not _apart(x):
         return x
-    if x.shape == ():
-        return jnp.asarray(x[()])
-    return jnp.stack([jnp.asarray(entry) for entry in x.flat]).reshape(x.shape)
+    # Row by row: XLA finds the entries of a stack again, but not behind a reshape.
+    return jnp.asarray(x[()]) if x.shape == () else jnp.stack([_whole(x[i, ...]) for i in range(len(x))])
 
 
 def _apart(x: Any) -> bool:
