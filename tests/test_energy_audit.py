@@ -27,18 +27,17 @@ from .mechanisms import CASES, case
 LUGRE = {"sigma0": 750.0, "sigma1": 3.0, "sigma2": 0.1, "Fc": 1.5, "Fs": 1.75, "vs": 0.2}
 
 
-def total_energy(scene: Scene, t: Any, y: State) -> Any:
-    stored = [effect.stored(y.z[name]) for name, effect in zip(scene.names, scene.effects, strict=True) if name in y.z]
-    return sum(stored, sum(energies(scene.lagrangian, t, y.q, y.qd, scene.params)))
-
-
 @jax.jit
 def unaccounted(scene: Scene, t: Any, y: State, mode: Any) -> tuple[Any, Any]:
-    """Rate of the energy less all powers, and the sum of the sizes of these."""
+    """Rate of kinetic and potential energy less all powers, and the size of what that is a sum of."""
 
     def one(t: Any, y: State, mode: Any) -> tuple[Any, Any]:
         rate = scene_field(t, y, scene, mode)
-        change = jax.jvp(lambda t, y: total_energy(scene, t, y), (t, y), (jnp.ones_like(t), rate))[1]
+
+        def energy(t: Any, q: Any, qd: Any) -> Any:
+            return sum(energies(scene.lagrangian, t, q, qd, scene.params))
+
+        change = jax.jvp(energy, (t, y.q, y.qd), (jnp.ones_like(t), rate.q, rate.qd))[1]
         powers = scene_power(t, y, scene, mode).values()
         size = sum(jnp.abs(each.supplied) + jnp.abs(each.absorbed) for each in powers)
         parts = jax.jvp(lambda qd: energies(scene.lagrangian, t, y.q, qd, scene.params), (y.qd,), (rate.qd,))[1]
@@ -69,7 +68,7 @@ def random_states(dof: int, count: int = 20) -> tuple[Any, Any]:
 OTHERS: dict[str, tuple[Any, int, Any]] = {
     "spherical pendulum": (problems.spherical_pendulum, 2, None),
     "double pendulum": (problems.double_pendulum, 2, None),
-    "three links": (lambda: problems.n_link_pendulum([1.0, 0.5, 2.0], [1.0, 0.7, 0.4]), 3, None),
+    "three links": (lambda: problems.n_link_pendulum(3, m=jnp.array([1.0, 0.5, 2.0])), 3, None),
     "box": (lambda: problems.ramped_box(problems.box_coulomb()), 1, [1.0]),
     "box with LuGre": (lambda: problems.ramped_box(LuGre(**LUGRE)), 1, None),
     "braked spring": (problems.braked_spring, 1, [1.0]),
@@ -105,12 +104,15 @@ def test_a_wrong_power_would_show() -> None:
 
 def test_audit_of_a_run_with_events() -> None:
     """Belt oscillator from sticking: what the belt brings in is lost in slip, effect by effect."""
-    run = simulate(problems.belt_oscillator(), [0.05], [0.1], 2.0, ts=jnp.linspace(0.0, 2.0, 21), rtol=1e-9, atol=1e-12)
+    run = simulate(
+        problems.belt_oscillator(), [0.05], [0.1], 2.0, ts=jnp.linspace(0.0, 2.0, 401), rtol=1e-9, atol=1e-12
+    )
     audit = energy_audit(run)
     np.testing.assert_allclose(audit.closing_error, 0.0, atol=1e-7)
     np.testing.assert_allclose(audit.closing_error, run.energy.balance, atol=1e-11)
+    # All that comes in comes from the belt: force times its velocity, by trapezoids across the jumps of the force.
     work = -np.trapezoid(run.forces["friction"] * problems.BELT_OSCILLATOR["belt"], run.t)
-    np.testing.assert_allclose(audit.work["friction"][-1], work, rtol=2e-2)
+    np.testing.assert_allclose(audit.work["friction"][-1], work, rtol=5e-3)
     assert float(audit.dissipated["friction"][-1]) > 0.1
     assert np.all(np.diff(audit.dissipated["friction"]) >= -1e-9)
     text = str(audit)
@@ -118,16 +120,15 @@ def test_audit_of_a_run_with_events() -> None:
         assert line in text
 
 
-def test_what_a_start_takes_away_is_lost_at_events() -> None:
-    """Two blocks that are glued at t0 with different velocities: the impulse takes the energy of their difference."""
+def test_each_effect_has_its_own_account() -> None:
+    """Two blocks that are glued together share what brakes one of them; nothing is lost where nothing jumps."""
     glue = Friction(Coulomb(10.0), along=lambda q: q[0] - q[1], name="glue")
-    scene = Scene(
-        lambda t, q, qd, p: 0.5 * jnp.sum(qd**2), effects=(glue, Friction(Viscous(0.3), along=lambda q: q[0]))
-    )
-    ends = simulate(scene, [0.0, 0.0], [1.0, 1.0 + 1e-13], 0.5, ts=jnp.array([0.0, 0.5]))
-    audit = energy_audit(ends)
+    brake = Friction(Viscous(0.3), along=lambda q: q[0])
+    scene = Scene(lambda t, q, qd, p: 0.5 * jnp.sum(qd**2), effects=(glue, brake))
+    audit = energy_audit(simulate(scene, [0.0, 0.0], [1.0, 1.0], 0.5, ts=jnp.array([0.0, 0.5])))
     assert set(audit.dissipated) == {"glue", "friction"}
     np.testing.assert_allclose(audit.dissipated["friction"][-1], 1.0 - np.exp(-0.3 * 0.5), rtol=1e-5)
+    np.testing.assert_allclose(audit.dissipated["glue"], 0.0, atol=1e-12)
     np.testing.assert_allclose(audit.event_losses, 0.0, atol=1e-12)
     np.testing.assert_allclose(audit.closing_error, 0.0, atol=1e-6)
 
