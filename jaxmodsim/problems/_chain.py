@@ -10,9 +10,11 @@ from ..scene import Scene
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     del t
-    x = jnp.cumsum(p["l"] * jnp.cos(q) * qd)
-    z = jnp.cumsum(p["l"] * jnp.sin(q) * qd)
-    height = -jnp.cumsum(p["l"] * jnp.cos(q))
+    # Sums over the links up to each mass. As products: XLA on CPU has a fast one of those, but not of `jnp.cumsum`.
+    upto = np.tri(q.shape[0], dtype=q.dtype)
+    x = upto @ (p["l"] * jnp.cos(q) * qd)
+    z = upto @ (p["l"] * jnp.sin(q) * qd)
+    height = -upto @ (p["l"] * jnp.cos(q))
     return jnp.sum(p["m"] * (0.5 * (x**2 + z**2) - p["g"] * height))
 
 
