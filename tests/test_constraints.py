@@ -251,7 +251,9 @@ def test_friction_and_its_load_are_solved_together(mu: float, tilt: float) -> No
     np.testing.assert_allclose(scene_reactions(ZERO, state, scene)["floor"].multiplier, [normal], rtol=1e-13)
     np.testing.assert_allclose(scene_forces(ZERO, state, scene)["friction"], mu * normal, rtol=1e-13)
     np.testing.assert_allclose(scene_field(ZERO, state, scene).qd, [(3.0 - mu * normal) / 2.0, 0.0], atol=1e-13)
-    np.testing.assert_allclose(scene_margins(ZERO, state, scene), [normal, min(1.0, 1.0 - mu * tilt)], rtol=1e-13)
+    margins = scene_margins(ZERO, state, scene)
+    assert margins is not None
+    np.testing.assert_allclose(margins, [normal, min(1.0, 1.0 - mu * tilt)], rtol=1e-13)
 
 
 @pytest.mark.parametrize(("one_sided", "tilt", "lost"), [(True, 1.2, True), (True, -1.2, False), (False, -1.2, True)])
@@ -343,8 +345,8 @@ TWO = Constraint(lambda t, q, p: q, name="floor")
             "An effect and a constraint both have the name 'floor'",
         ),
         (
-            lambda: Scene(free, effects=(Friction(Coulomb(1.0), normal_force="flor"),), constraints=(ON,)),
-            "normal_force='flor' names no constraint of the scene; there are: 'floor'",
+            lambda: Scene(free, effects=(Friction(Coulomb(1.0), normal_force="wall"),), constraints=(ON,)),
+            "normal_force='wall' names no constraint of the scene; there are: 'floor'",
         ),
         (
             lambda: Scene(

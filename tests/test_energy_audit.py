@@ -92,8 +92,8 @@ def test_a_wrong_power_would_show() -> None:
     """The balance above is no identity: with the force scaled behind its back it is off."""
 
     class Forgetful(AppliedForce):
-        def power(self, *args: Any) -> Any:
-            power = super().power(*args)
+        def power(self, t: Any, q: Any, qd: Any, params: Any, action: Any) -> Any:
+            power = super().power(t, q, qd, params, action)
             return power._replace(supplied=0.9 * power.supplied)
 
     scene = Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, effects=(Forgetful(lambda t, q, qd, p: jnp.ones(1)),))
