@@ -66,7 +66,8 @@ class Constraint(AbstractConstraint):
     """A holonomic constraint `phi(t, q, params) = 0`, kept by the force of its multiplier.
 
     The equations of motion are `M qdd = load + Q + J^T lambda` with `J = dphi/dq`: the multiplier is positive where it
-    pushes towards larger phi. Where phi is a length measured along the normal, it is the normal force in newtons.
+    pushes towards larger phi (so that of a rod under tension, `phi = |x| - l`, is negative). Where phi is a length
+    measured along the normal, it is the normal force in newtons.
 
     **Arguments:**
 

@@ -66,8 +66,8 @@ class Balance(NamedTuple):
 
     - `force`: friction forces [N].
     - `upper`, `lower`: limits of stick [N].
-    - `margin`: what is left of the uniqueness of loads that are reactions: 1 without friction, not positive where there
-      is no solution, or more than one.
+    - `margin`: what is left of the uniqueness of loads that are reactions: 1 without friction, never more, and not
+      positive where there is no solution, or more than one.
     """
 
     force: Float[Array, " n"]

@@ -103,13 +103,15 @@ class Trajectory:
         `AppliedForce` what its function returns, shape `[time, ...]`.
         """
         self._one_run("forces")
-        return _forces(self.scene, self.t, self._states(), self.modes)
+        forces = _forces(self.scene, self.t, self._states(), self.modes)
+        return {name: forces[name] for name in self.scene.names}  # compiled functions return them sorted by name
 
     @property
     def reactions(self) -> dict[str, Reaction]:
         """What each constraint does along the run, by its name: multipliers, generalised and Cartesian force."""
         self._one_run("reactions")
-        return _reactions(self.scene, self.t, self._states(), self.modes)
+        reactions = _reactions(self.scene, self.t, self._states(), self.modes)
+        return {name: reactions[name] for name in self.scene.constraint_names}
 
     @property
     def mode(self) -> dict[str, Array]:
