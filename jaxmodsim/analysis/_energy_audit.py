@@ -18,8 +18,8 @@ class EnergyAudit:
     - `kinetic`, `potential`: of the Lagrangian; see `jaxmodsim.mechanics.energies`.
     - `stored`: in the own state of each effect that has one (bristles), by name.
     - `work`: brought in from outside since t0, by name (negative for an `AppliedForce` that brakes): of
-      each effect, of each constraint (which works only if it moves in time), and under `lagrangian` of a Lagrangian that
-      depends on time by itself.
+      each effect, of each constraint (which works only if it moves in time), and under `lagrangian` of a Lagrangian
+      that depends on time by itself.
     - `dissipated`: lost since t0 in each effect, by name.
     - `event_losses`: lost since t0 where the velocity jumped: at mode changes, and at t0 if the state that was given
       had to be moved onto constraints or into stick.
@@ -53,8 +53,8 @@ class EnergyAudit:
 def energy_audit(run: Trajectory) -> EnergyAudit:
     """Account for the energy of a run, effect by effect.
 
-    Compiles and runs the scene once more with the work integrals beside the state, and where it has modes once more with
-    a log of the events: an audit that is not asked for costs nothing. Sums of it are in `run.energy`.
+    Compiles and runs the scene once more with the work integrals beside the state, and where it has modes once more
+    with a log of the events: an audit that is not asked for costs nothing. Sums of it are in `run.energy`.
 
     **Arguments:**
 
