@@ -123,6 +123,7 @@ def test_friction_on_a_surface_opposes_the_slip_vector(law: Any) -> None:
     np.testing.assert_allclose(action.force, force, rtol=1e-13)
     np.testing.assert_allclose(action.generalised, -jax.jacobian(bowl)(q).T @ force, rtol=1e-13)
     power = effect.power(ZERO, q, qd, {}, action)
+    assert power.absorbed is not None
     np.testing.assert_allclose(power.absorbed, np.linalg.norm(force) * np.linalg.norm(v), rtol=1e-13)
 
 

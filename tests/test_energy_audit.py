@@ -39,9 +39,10 @@ def unaccounted(scene: Scene, t: Any, y: State, mode: Any) -> tuple[Any, Any]:
 
         change = jax.jvp(energy, (t, y.q, y.qd), (jnp.ones_like(t), rate.q, rate.qd))[1]
         powers = scene_power(t, y, scene, mode).values()
-        size = sum(jnp.abs(each.supplied) + jnp.abs(each.absorbed) for each in powers)
+        supplied, absorbed = [x.supplied for x in powers], [x.absorbed for x in powers if x.absorbed is not None]
+        size = sum(jnp.abs(each) for each in (*supplied, *absorbed))
         parts = jax.jvp(lambda qd: energies(scene.lagrangian, t, y.q, qd, scene.params), (y.qd,), (rate.qd,))[1]
-        return change - sum(each.supplied - each.absorbed for each in powers), size + jnp.abs(parts[0])
+        return change - sum(supplied) + sum(absorbed), size + jnp.abs(parts[0])
 
     return jax.vmap(one)(t, y, mode)
 

@@ -20,7 +20,7 @@ class EnergyAudit:
     - `work`: brought in from outside since t0, by name (negative for an `AppliedForce` that brakes): of
       each effect, of each constraint (which works only if it moves in time), and under `lagrangian` of a Lagrangian
       that depends on time by itself.
-    - `dissipated`: lost since t0 in each effect, by name.
+    - `dissipated`: lost since t0 in each effect that absorbs power, by name.
     - `event_losses`: lost since t0 where the velocity jumped: at mode changes, and at t0 if the state that was given
       had to be moved onto constraints or into stick.
     - `closing_error`: kinetic + potential + stored + dissipated + event losses - work, less the energy of the state

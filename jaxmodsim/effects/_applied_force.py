@@ -80,7 +80,7 @@ class AppliedForce(AbstractEffect):
     ) -> Power:
         """All of it comes from outside."""
         del t, q, params
-        return Power(jnp.sum(action.generalised * qd), jnp.zeros_like(qd[0]))
+        return Power(jnp.sum(action.generalised * qd))
 
     def stored(self, z: PyTree) -> float:
         """Nothing is stored."""

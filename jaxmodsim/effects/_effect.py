@@ -23,10 +23,13 @@ class Action(NamedTuple):
 
 
 class Power(NamedTuple):
-    """Power [W] that an effect brings in from outside, and that it absorbs (loses or stores)."""
+    """Power [W] that an effect brings in from outside, and that it absorbs (loses or stores).
+
+    None for an effect that never absorbs any: what is zero by nature is not integrated.
+    """
 
     supplied: Float[Array, ""]
-    absorbed: Float[Array, ""]
+    absorbed: Float[Array, ""] | None = None
 
 
 class AbstractEffect(eqx.Module):

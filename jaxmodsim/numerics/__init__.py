@@ -4,6 +4,7 @@ from ._collocation import GAUSS as GAUSS
 from ._collocation import CollocationMemory as CollocationMemory
 from ._collocation import collocation_start as collocation_start
 from ._collocation import collocation_step as collocation_step
+from ._depends import depends as depends
 from ._linalg import MAX_UNROLLED_CHOLESKY as MAX_UNROLLED_CHOLESKY
 from ._linalg import cholesky_pivots as cholesky_pivots
 from ._linalg import factor_lu as factor_lu

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..effects import Power
 from ..mechanics import errors, motion_equations, project_position, project_velocity, rates
-from ..numerics import safe_norm
+from ..numerics import depends, safe_norm
 from ._contact import Contact, contact_guards, next_modes, overload, stop_slip
 from ._resolve import Modes, State, by_constraint, resolve
 from ._scene import Scene
@@ -159,18 +159,22 @@ def scene_power(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None)
     """Power [W] from outside into the mechanism and its effects, and absorbed by friction: of each effect by its name.
 
     Besides, under the name of a constraint what its motion in time supplies, and under `lagrangian` what a Lagrangian
-    that depends on time by itself does, `-dL/dt`.
+    does that depends on time by itself, `-dL/dt`; not there where it does not.
     """
     resolved = resolve(scene, t, y, mode)
-    zero = jnp.zeros_like(t)
     powers = {
         name: effect.power(t, y.q, y.qd, scene.params, resolved.actions[name])
         for name, effect in zip(scene.names, scene.effects, strict=True)
     }
     for name, reaction in scene_reactions(t, y, scene, mode).items():
-        powers[name] = Power(jnp.sum(reaction.generalised * y.qd), zero)
-    own = jax.grad(lambda t: scene.lagrangian(t, y.q, y.qd, scene.params))(t)
-    return powers | {"lagrangian": Power(-own, zero)}
+        powers[name] = Power(jnp.sum(reaction.generalised * y.qd))
+
+    def lagrangian(t: Array) -> Array:
+        return scene.lagrangian(t, y.q, y.qd, scene.params)
+
+    if depends(lagrangian, t):
+        powers["lagrangian"] = Power(-jax.grad(lagrangian)(t))
+    return powers
 
 
 def check_scene(scene: Scene, y: State) -> None:

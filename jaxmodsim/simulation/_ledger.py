@@ -19,7 +19,8 @@ class Ledger(NamedTuple):
     - `kinetic`, `potential`: of the Lagrangian.
     - `stored`: in the own state of each effect that has one, by name.
     - `supplied`: brought in since t0, by the names of `scene_power`.
-    - `dissipated`: lost since t0 in each effect, by name: what it absorbed, less what its own state has gained.
+    - `dissipated`: lost since t0 in each effect that absorbs power, by name: what it absorbed, less what its own state
+      has gained.
     - `before`: kinetic, potential and stored energy of the state that was given at t0, shape `[]`.
     """
 
@@ -48,7 +49,9 @@ def _ledger(problem: Problem, t: Array, y: State, work: dict[str, Power]) -> Led
     kinetic, potential, stored = jax.vmap(parts)(t, y)
     gained = {name: now - _stored(scene, first)[name] for name, now in stored.items()}
     supplied = {name: each.supplied for name, each in work.items()}
-    dissipated = {name: work[name].absorbed - gained.get(name, 0.0) for name in scene.names}
+    dissipated = {
+        name: absorbed - gained.get(name, 0.0) for name in scene.names if (absorbed := work[name].absorbed) is not None
+    }
     return Ledger(kinetic, potential, stored, supplied, dissipated, _energy(scene, problem.t0, first))
 
 
