@@ -69,11 +69,13 @@ def energy_audit(run: Trajectory) -> EnergyAudit:
     - `ValueError` for a batch of runs: use `jax.vmap(jaxmodsim.energy_audit)(runs)`.
     """
     book, losses = run.ledger, run.event_losses
-    total = book.kinetic + book.potential + losses - book.before
-    for part in (*book.stored.values(), *book.dissipated.values()):
-        total = total + part
-    for part in book.supplied.values():
-        total = total - part
     return EnergyAudit(
-        run.t, book.kinetic, book.potential, book.stored, book.supplied, book.dissipated, jnp.asarray(losses), total
+        run.t,
+        book.kinetic,
+        book.potential,
+        book.stored,
+        book.supplied,
+        book.dissipated,
+        losses,
+        book.balance + losses,
     )

@@ -21,8 +21,8 @@ from ._lagrange import energies as energies
 from ._lagrange import motion_equations as motion_equations
 from ._restraint import Restraint as Restraint
 from ._restraint import errors as errors
+from ._restraint import parts as parts
 from ._restraint import project_position as project_position
 from ._restraint import project_velocity as project_velocity
 from ._restraint import rates as rates
 from ._restraint import restrain as restrain
-from ._restraint import sizes as sizes

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import Amount, Place, as_amount, as_function, as_place, safe_norm, solve_semidefinite
+from ..numerics import Amount, Place, as_amount, as_function, as_place, safe_norm, solve_balanced
 
 
 class AbstractBody(eqx.Module):
@@ -80,9 +80,8 @@ class PointMass(AbstractBody):
         load = self.m(params) * (curved + up)
         tangents = jnp.moveaxis(jax.jacfwd(lambda q: self.position(q, params))(q), 1, 0)
         gram = jnp.sum(tangents[:, None, :] * tangents[None, :, :], axis=2)
-        length = jnp.sqrt(jnp.where(jnp.diagonal(gram) > 0, jnp.diagonal(gram), 1.0))
         along = jnp.sum(tangents * load[None, :], axis=1)
-        share = solve_semidefinite(gram, along, 1.0 / length, jnp.ones(q.shape, bool))
+        share = solve_balanced(gram, along)
         return load - jnp.sum(tangents * share[:, None], axis=0)
 
     def normal_force(

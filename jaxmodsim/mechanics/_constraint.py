@@ -114,7 +114,7 @@ class Constraint(AbstractConstraint):
         return jax.jvp(lambda t, q: self.error(t, q, params), (t, q), (jnp.ones_like(t), qd))[1]
 
     def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
-        """Check that phi is a number or a vector, not of more entries than there are coordinates can follow."""
+        """Check that phi is a number or a vector, and a number where the constraint is one-sided."""
         del qd
         place = q if self.at is None else jax.eval_shape(self.at, q, params)
         _check_vector(jax.eval_shape(self.phi, q[0], place, params), f"Constraint {name!r}: phi")

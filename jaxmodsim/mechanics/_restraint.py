@@ -6,13 +6,14 @@ matrix singular: the motion is unique, and of all multipliers the smallest are t
 """
 
 from collections.abc import Callable, Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import factor_positive_definite, solve_semidefinite
+from ..numerics import factor_positive_definite, solve_balanced
 from ._constraint import AbstractConstraint
 
 # Newton steps of a projection; the error of a step of integration is squared in each.
@@ -35,17 +36,13 @@ class Restraint(NamedTuple):
     reach: Float[Array, "m dof"]
     matrix: Float[Array, "m m"]
 
-    def solve(self, rhs: Float[Array, " m"]) -> Float[Array, " m"]:
-        """Solve with `matrix`."""
-        return _solve(self.matrix, rhs)
-
     def multipliers(self, qdd: Float[Array, " dof"]) -> Float[Array, " m"]:
         """Multipliers that make accelerations `qdd` admissible."""
-        return -self.solve(_times(self.rows, qdd) + self.bias)
+        return -solve_balanced(self.matrix, _times(self.rows, qdd) + self.bias)
 
     def yields(self, qdd: Float[Array, " dof"]) -> Float[Array, " m"]:
         """What multipliers change if the accelerations without constraints change by `qdd`."""
-        return -self.solve(_times(self.rows, qdd))
+        return -solve_balanced(self.matrix, _times(self.rows, qdd))
 
     def push(self, multipliers: Float[Array, " m"]) -> Float[Array, " dof"]:
         """Accelerations that multipliers make."""
@@ -71,27 +68,24 @@ def restrain(
 
     rows = _jacobian(rates(constraints, t, q, params), qd)
     w, bias = jax.jvp(along, (t, q), (jnp.ones_like(t), qd))
-    start = 0
-    for each in constraints:
-        error = each.error(t, q, params)
-        size = each.rate(t, q, qd, params).shape[0]
-        part, rate = slice(start, start + size), each.stabilise.astype(q.dtype)
+    for each, part in zip(constraints, parts(constraints, t, q, qd, params), strict=True):
+        error, rate = each.error(t, q, params), each.stabilise.astype(q.dtype)
         damped = rate * w[part] if error is None else 2.0 * rate * w[part] + rate**2 * error
         bias = bias.at[part].add(damped)
-        start += size
     reach, matrix = _reach(rows, mass)
     return Restraint(rows, bias, reach, matrix)
 
 
-def sizes(
+def parts(
     constraints: Constraints,
     t: Float[Array, ""],
     q: Float[Array, " dof"],
     qd: Float[Array, " dof"],
     params: PyTree,
-) -> list[int]:
-    """Number of equations of each constraint."""
-    return [jax.eval_shape(each.rate, t, q, qd, params).shape[0] for each in constraints]
+) -> list[slice]:
+    """Where the equations of each constraint stand among those of all."""
+    ends = list(accumulate(jax.eval_shape(each.rate, t, q, qd, params).shape[0] for each in constraints))
+    return [slice(start, end) for start, end in zip([0, *ends], ends, strict=False)]
 
 
 def errors(
@@ -100,8 +94,8 @@ def errors(
     """All that holonomic constraints say about the coordinates, as a function of these; h = 0 where there are none."""
 
     def at(q: Array) -> Array:
-        parts = [each.error(t, q, params) for each in constraints]
-        return jnp.concatenate([jnp.zeros(0, q.dtype), *(part for part in parts if part is not None)])
+        found = [each.error(t, q, params) for each in constraints]
+        return jnp.concatenate([jnp.zeros(0, q.dtype), *(error for error in found if error is not None)])
 
     return at
 
@@ -133,7 +127,7 @@ def project_position(
         return q
     for _ in range(_NEWTON):
         reach, matrix = _reach(_jacobian(error, q), mass)
-        q = q - jnp.sum(reach * _solve(matrix, error(q))[:, None], axis=0)
+        q = q - jnp.sum(reach * solve_balanced(matrix, error(q))[:, None], axis=0)
     return q
 
 
@@ -148,7 +142,7 @@ def project_velocity(
     """Velocities moved onto the constraints, by the smallest impulses that do."""
     rate = rates(constraints, t, q, params)
     reach, matrix = _reach(_jacobian(rate, qd), mass)
-    return qd - jnp.sum(reach * _solve(matrix, rate(qd))[:, None], axis=0)
+    return qd - jnp.sum(reach * solve_balanced(matrix, rate(qd))[:, None], axis=0)
 
 
 def _jacobian(fn: object, x: Float[Array, " dof"]) -> Float[Array, "m dof"]:
@@ -160,12 +154,6 @@ def _reach(rows: Float[Array, "m dof"], mass: Float[Array, "dof dof"]) -> tuple[
     """Accelerations of unit multipliers, and what they do to each constraint."""
     reach = factor_positive_definite(mass)(rows.T).T
     return reach, jnp.sum(rows[:, None, :] * reach[None, :, :], axis=2)
-
-
-def _solve(matrix: Float[Array, "m m"], rhs: Float[Array, " m"]) -> Float[Array, " m"]:
-    diagonal = jnp.diagonal(matrix)
-    weight = 1.0 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
-    return solve_semidefinite(matrix, rhs, weight, jnp.ones(rhs.shape, bool))
 
 
 def _times(rows: Float[Array, "m dof"], vector: Float[Array, " dof"]) -> Float[Array, " m"]:

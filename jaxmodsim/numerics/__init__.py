@@ -32,6 +32,7 @@ from ._rosenbrock import rosenbrock_step as rosenbrock_step
 from ._safe import safe_norm as safe_norm
 from ._safe import safe_power as safe_power
 from ._scalarise import in_scalars as in_scalars
+from ._semidefinite import solve_balanced as solve_balanced
 from ._semidefinite import solve_semidefinite as solve_semidefinite
 from ._watch import Watch as Watch
 from ._watch import first_root as first_root

@@ -10,6 +10,13 @@ from ._linalg import factor_positive_definite
 _REFINEMENTS = 2
 
 
+def solve_balanced(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, " n"]:
+    """As `solve_semidefinite`, all rows active, with the weights that make every diagonal entry one."""
+    diagonal = jnp.diagonal(matrix)
+    weight = 1.0 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
+    return solve_semidefinite(matrix, rhs, weight, jnp.ones(rhs.shape, bool))
+
+
 def solve_semidefinite(
     matrix: Float[Array, "n n"], rhs: Float[Array, " n"], weight: Float[Array, " n"], active: Bool[Array, " n"]
 ) -> Float[Array, " n"]:

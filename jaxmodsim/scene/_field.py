@@ -11,7 +11,7 @@ from ..effects import Power
 from ..mechanics import errors, motion_equations, project_position, project_velocity, rates
 from ..numerics import depends, safe_norm
 from ._contact import Contact, contact_guards, next_modes, overload, stop_slip
-from ._resolve import Modes, State, by_constraint, resolve
+from ._resolve import Modes, Resolved, State, by_constraint, resolve
 from ._scene import Scene
 
 
@@ -129,18 +129,22 @@ def scene_margins(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = Non
 
 def scene_reactions(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> dict[str, Reaction]:
     """What each constraint does, by name."""
-    resolved = resolve(scene, t, y, mode)
+    return _reactions(t, y, scene, resolve(scene, t, y, mode))
+
+
+def _reactions(t: Float[Array, ""], y: State, scene: Scene, resolved: Resolved) -> dict[str, Reaction]:
     if resolved.restraint is None or resolved.multipliers is None:
         return {}
-    parts = by_constraint(scene, t, y, resolved.multipliers)
-    reactions, start = {}, 0
-    for name, each in zip(scene.constraint_names, scene.constraints, strict=True):
-        multiplier = parts[name]
-        rows = resolved.restraint.rows[start : start + multiplier.shape[0]]
-        start += multiplier.shape[0]
-        generalised = jnp.sum(rows * multiplier[:, None], axis=0)
-        reactions[name] = Reaction(multiplier, generalised, each.force(t, y.q, scene.params, multiplier))
-    return reactions
+    multipliers = by_constraint(scene, t, y, resolved.multipliers)
+    rows = by_constraint(scene, t, y, resolved.restraint.rows)
+    return {
+        name: Reaction(
+            multipliers[name],
+            jnp.sum(rows[name] * multipliers[name][:, None], axis=0),
+            each.force(t, y.q, scene.params, multipliers[name]),
+        )
+        for name, each in zip(scene.constraint_names, scene.constraints, strict=True)
+    }
 
 
 def _contact(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Contact:
@@ -166,7 +170,7 @@ def scene_power(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None)
         name: effect.power(t, y.q, y.qd, scene.params, resolved.actions[name])
         for name, effect in zip(scene.names, scene.effects, strict=True)
     }
-    for name, reaction in scene_reactions(t, y, scene, mode).items():
+    for name, reaction in _reactions(t, y, scene, resolved).items():
         powers[name] = Power(jnp.sum(reaction.generalised * y.qd))
 
     def lagrangian(t: Array) -> Array:

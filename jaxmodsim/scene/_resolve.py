@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from ..effects import Action, Friction
-from ..mechanics import MotionEquations, Restraint, motion_equations, restrain, sizes
+from ..mechanics import MotionEquations, Restraint, motion_equations, parts, restrain
 from ..numerics import solve_positive_definite
 from ._contact import Contact, Loads, balance, contact
 from ._hold import hold
@@ -130,14 +130,14 @@ def _loads(
     scene: Scene, mobility: _Mobility, t: Array, y: State, rows: Float[Array, "n dof"], multipliers: Any
 ) -> Loads | None:
     """Normal forces of the constraints that load friction, and what the elements with `rows` take off them."""
-    loaded = [each.rests_on for each in (*scene.exact.values(), *scene.leaning.values())]
-    names = [name for name in scene.constraint_names if name in loaded]
+    names = scene.loaded
     if not names:
         return None
     assert mobility.restraint is not None
-    first = dict(zip(scene.constraint_names, _starts(scene, t, y), strict=True))
+    loaded = [each.rests_on for each in (*scene.exact.values(), *scene.leaning.values())]
+    where = by_constraint(scene, t, y, jnp.arange(multipliers.shape[0]))
     chosen = dict(zip(scene.constraint_names, scene.constraints, strict=True))
-    at = jnp.asarray([first[name] for name in names])
+    at = jnp.concatenate([where[name] for name in names])
     size = jnp.stack([chosen[name].per_multiplier(t, y.q, scene.params) for name in names])
     yields = [mobility.restraint.yields(solve_positive_definite(mobility.mass, row)) for row in rows]
     return Loads(
@@ -148,31 +148,18 @@ def _loads(
     )
 
 
-def _starts(scene: Scene, t: Array, y: State) -> list[int]:
-    """Index of the first multiplier of each constraint."""
-    starts, total = [], 0
-    for size in sizes(scene.constraints, t, y.q, y.qd, scene.params):
-        starts.append(total)
-        total += size
-    return starts
-
-
-def by_constraint(scene: Scene, t: Array, y: State, multipliers: Float[Array, " m"]) -> dict[str, Float[Array, " _"]]:
-    """The multipliers of each constraint, by its name."""
-    lengths = sizes(scene.constraints, t, y.q, y.qd, scene.params)
-    starts = _starts(scene, t, y)
-    return {
-        name: multipliers[start : start + length]
-        for name, start, length in zip(scene.constraint_names, starts, lengths, strict=True)
-    }
+def by_constraint(scene: Scene, t: Array, y: State, values: Array) -> dict[str, Array]:
+    """What there is one of for each equation (multipliers, rows), by the names of the constraints."""
+    where = parts(scene.constraints, t, y.q, y.qd, scene.params)
+    return {name: values[part] for name, part in zip(scene.constraint_names, where, strict=True)}
 
 
 def _margins(scene: Scene, t: Array, y: State, multipliers: Any, unique: Array | None) -> Array | None:
     pushing = [name for name, each in zip(scene.constraint_names, scene.constraints, strict=True) if each.one_sided]
     margins = []
     if pushing:
-        parts = by_constraint(scene, t, y, multipliers)
-        margins += [parts[name][0] for name in pushing]
+        found = by_constraint(scene, t, y, multipliers)
+        margins += [found[name][0] for name in pushing]
     if unique is not None and scene.loaded:
         margins.append(unique)
     return jnp.stack(margins) if margins else None

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..mechanics import errors, motion_equations, rates
-from ..numerics import factor_positive_definite, solve_semidefinite
+from ..numerics import factor_positive_definite, solve_balanced
 from ..scene import Scene, State, check_scene
 from ._outcome import SimulationError
 
@@ -83,10 +83,7 @@ def _find(scene: Scene, t: Array, q: Array, qd: Array, free: Array) -> tuple[Arr
         """Step that takes `fn` to zero, to first order."""
         value, rows = fn(x), jax.jacrev(fn)(x)
         reach = rows @ inverse
-        matrix = reach @ rows.T
-        diagonal = jnp.diagonal(matrix)
-        weight = 1.0 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
-        return reach.T @ solve_semidefinite(matrix, value, weight, jnp.ones(value.shape, bool))
+        return reach.T @ solve_balanced(reach @ rows.T, value)
 
     position, off = errors(constraints, t, params), jnp.zeros_like(t)
     if position(q).shape != (0,):

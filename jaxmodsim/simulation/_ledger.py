@@ -31,6 +31,13 @@ class Ledger(NamedTuple):
     dissipated: dict[str, Float[Array, " time"]]
     before: Float[Array, ""]
 
+    @property
+    def balance(self) -> Float[Array, " time"]:
+        """Energy there is and energy dissipated, less energy supplied and that of the start: what is unaccounted."""
+        total = self.kinetic + self.potential - self.before
+        total = sum((*self.stored.values(), *self.dissipated.values()), total)
+        return total - sum(self.supplied.values(), jnp.zeros_like(total))
+
 
 def ledger(problem: Problem, options: Options, t: Float[Array, " time"], y: State) -> Ledger:
     """Ledger of a run whose states at the times `t` are `y`. Runs it once more, with the work integrals beside it."""

@@ -158,8 +158,7 @@ class Trajectory:
         stored, supplied, dissipated = (
             sum(each.values(), zero) for each in (book.stored, book.supplied, book.dissipated)
         )
-        total = book.kinetic + book.potential + stored + dissipated - supplied
-        return Energy(book.kinetic, book.potential, stored, supplied, dissipated, total - book.before)
+        return Energy(book.kinetic, book.potential, stored, supplied, dissipated, book.balance)
 
     def _log_size(self) -> int:
         """Length of a log that holds all events: as many as needed, in powers of two; another one compiles anew."""
