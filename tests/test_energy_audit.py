@@ -84,7 +84,7 @@ def test_power_of_the_other_named_problems(name: str) -> None:
     build, dof, modes = OTHERS[name]
     scene = build()
     q, qd = random_states(dof)
-    z = {key: jnp.full(q.shape[0], 1e-3) for key in scene.state0()}
+    z = {key: jnp.full(q.shape[0], 1e-3) for key in scene.state0(q[0])}
     mode = None if modes is None else jnp.broadcast_to(jnp.asarray(modes), (q.shape[0], len(modes)))
     assert_accounted(scene, q, qd, z, mode)
 

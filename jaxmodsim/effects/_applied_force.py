@@ -59,8 +59,9 @@ class AppliedForce(AbstractEffect):
                 " Return jnp.array([...]) with one entry for each."
             )
 
-    def state0(self) -> PyTree:
+    def state0(self, q: Float[Array, " dof"], params: PyTree) -> PyTree:
         """An applied force has no state."""
+        del q, params
         return None
 
     def act(

@@ -56,8 +56,8 @@ class AbstractEffect(eqx.Module):
         """Check shapes against the mechanism while tracing; raises `ValueError` naming the effect."""
 
     @abc.abstractmethod
-    def state0(self) -> PyTree:
-        """State at rest; None for an effect without one."""
+    def state0(self, q: Float[Array, " dof"], params: PyTree) -> PyTree:
+        """State at rest and unloaded, at the coordinates `q`; None for an effect without one."""
 
     @abc.abstractmethod
     def act(

@@ -1,7 +1,7 @@
 """Where a friction law acts."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -14,20 +14,36 @@ from ..friction import (
     AbstractForceLaw,
     AbstractHoldingLaw,
     AbstractLaw,
+    AbstractPlanarLaw,
     AbstractSetValuedLaw,
+    Curve,
 )
-from ..numerics import Number, Place, as_function, as_number, as_place, safe_norm
+from ..numerics import (
+    Number,
+    Place,
+    Varying,
+    as_function,
+    as_number,
+    as_place,
+    check_ranges,
+    modules_of,
+    optional_parameter,
+    safe_norm,
+    varies,
+)
 from ._effect import AbstractEffect, Action, Power, result_shape
 
 
 def _law(law: Any) -> AbstractLaw:
-    if not isinstance(law, AbstractLaw):
-        given = repr(law) if isinstance(law, str) else f"a {type(law).__name__}"
-        raise ValueError(
-            f"Friction needs a law object, but {given} was given. Known laws: Viscous, Coulomb, Stribeck, LuGre;"
-            " wrappers: Regularized, DeadZone, Sign."
-        )
-    return law
+    if isinstance(law, AbstractLaw):
+        return law
+    if callable(law) and not isinstance(law, type):
+        return Curve(law)
+    given = repr(law) if isinstance(law, str) else f"the class {law.__name__}" if isinstance(law, type) else repr(law)
+    raise ValueError(
+        f"Friction needs a law or a function of slip velocity, but {given} was given. Known laws: Viscous, Coulomb,"
+        " Stribeck, Dahl, LuGre, ElastoPlastic, MaxwellSlip, Armstrong; wrappers: Regularized, DeadZone, Sign."
+    )
 
 
 def _along(value: Any) -> Place | None:
@@ -64,13 +80,14 @@ class Friction(AbstractEffect):
 
     **Arguments:**
 
-    - `law`: how friction depends on slip. A set-valued law (`Coulomb`, `Stribeck`) runs exactly, by events: in stick
-      the slip velocity is zero and the force is what that takes, up to the law's limit. `Regularized`, `DeadZone` and
-      `Sign` run it in other ways.
+    - `law`: how friction depends on slip; a plain function of slip velocity does, too. A set-valued law (`Coulomb`,
+      `Stribeck`) runs exactly, by events: in stick the slip velocity is zero and the force is what that takes, up to
+      the law's limit. `Regularized`, `DeadZone` and `Sign` run it in other ways.
     - `along`: `along(q)` or `along(q, params)`. A scalar displacement [m or rad]; by default the one coordinate. Or the
       position of the contact [m], shape `[2]` or `[3]`: with one coordinate slip is the velocity along its path,
-      positive for a rising coordinate; with several it is a vector, and the friction force a vector opposite to it, of
-      the magnitude that the law gives at the magnitude of slip (for laws that are functions of slip).
+      positive for a rising coordinate; with several it is a vector, and so is the friction force: of a law that is a
+      function of slip opposite to it, of the magnitude that the law gives at the magnitude of slip; of `LuGre` and
+      `Dahl` with a bristle that is a vector, too.
     - `belt_velocity`: velocity [m/s or rad/s] of the surface, a number or a continuous function of t (a jump would
       carry with it what sticks); where slip is a vector, a function that returns one.
     - `normal_force`: load [N]: a number, `normal_force(t, q, qd, params)`, or the name of a `Constraint`, whose
@@ -78,6 +95,9 @@ class Friction(AbstractEffect):
       load (`Fc` is the coefficient of friction), and a negative load, which is lift-off, gives no friction. By
       default the law's forces are in newtons.
     - `name`: name in `run.forces`.
+    - `ellipse`: where slip is a vector of two components, friction across over friction along the first one, > 0: the
+      limit of friction is an ellipse with these half-axes, and the direction that of greatest dissipation. By
+      default 1, a circle. The law sees the slip (v_1, ellipse v_2), so that the power is what it makes of that.
 
     **Raises:**
 
@@ -90,6 +110,17 @@ class Friction(AbstractEffect):
     belt_velocity: Number | Callable[..., Any] = eqx.field(default=0.0, converter=_belt)
     normal_force: Number | Callable[..., Any] | Reaction | None = eqx.field(default=None, converter=_load)
     name: str | None = eqx.field(default=None, static=True)
+    ellipse: Number | None = optional_parameter("ellipse", "1", lower=0.0, strict=True)
+
+    def __check_init__(self) -> None:
+        """Refuse an ellipse out of range."""
+        check_ranges(self)
+
+    def at(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree) -> Self:
+        """With the law as it is at this state; itself where the law does not depend on that."""
+        if not varies(self.law):
+            return self
+        return eqx.tree_at(lambda x: x.law, self, self.law.at(t, q, qd, params))
 
     @property
     def default_name(self) -> str:
@@ -130,16 +161,26 @@ class Friction(AbstractEffect):
                 " shape (2,) or (3,), is needed."
             )
         slip = () if q.shape == (1,) else shape
-        if slip != () and not isinstance(self.law, AbstractForceLaw):
+        sided = any(hasattr(module, "backward") for _, module in modules_of(self.law))
+        if slip != () and (sided or not isinstance(self.law, AbstractForceLaw | AbstractPlanarLaw)):
             raise ValueError(
                 f"Friction {name!r}: along(q) is a position that moves in several directions, and there"
-                f" {type(self.law).__name__} cannot act. Needed is a law that is a function of slip: wrap a set-valued"
-                " one as Regularized(law, width), or give a scalar displacement."
+                f" {type(self.law).__name__} cannot act. Needed is LuGre, Dahl, or a law that is a function of slip and"
+                " the same in all directions: wrap a set-valued one as Regularized(law, width), or give a scalar"
+                " displacement."
+            )
+        if self.ellipse is not None and slip != (2,):
+            raise ValueError(
+                f"Friction {name!r}: ellipse needs slip that is a vector of two components, but slip has the shape"
+                f" {slip}: return a position of shape (2,) from along."
             )
         load = None if self.rests_on is not None else self.normal_force
+        factors = [x.fn for _, x in modules_of(self.law) if isinstance(x, Varying)]
+        state = (q[0], q, qd, params)
         for label, fn, args, wanted in (
             ("belt_velocity(t)", self.belt_velocity, (q[0],), slip),
-            ("normal_force(t, q, qd, params)", load, (q[0], q, qd, params), ()),
+            ("normal_force(t, q, qd, params)", load, state, ()),
+            *(("scaled_by's fn(t, q, qd, params)", fn, state, ()) for fn in factors),
         ):
             if callable(fn) and result_shape(fn, *args) != wanted:
                 raise ValueError(
@@ -159,9 +200,12 @@ class Friction(AbstractEffect):
                 f" returns one, but {self.belt_velocity} was given."
             )
 
-    def state0(self) -> PyTree:
+    def state0(self, q: Float[Array, " dof"], params: PyTree) -> PyTree:
         """State of the law; None where it has none."""
-        return self.law.state0() if isinstance(self.law, AbstractDynamicLaw) else None
+        if not isinstance(self.law, AbstractDynamicLaw):
+            return None
+        slip = () if self.along is None or q.shape == (1,) else result_shape(self.along, q, params)
+        return self.law.state0(jnp.zeros(slip or (), q.dtype))
 
     def direction(self, q: Float[Array, " dof"], params: PyTree) -> Float[Array, " dof"]:
         """Gradient d along/dq of a scalar slip: the generalised force of a unit force along the displacement."""
@@ -256,14 +300,18 @@ class Friction(AbstractEffect):
         self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
     ) -> tuple[Float[Array, "..."], PyTree]:
         """The law's force, in newtons or per newton of load, and the rate of its state."""
-        v = self.slip(t, q, qd, params)
+        v = self._stretch(self.slip(t, q, qd, params))
         if isinstance(self.law, AbstractDynamicLaw):
-            return self.law.force(v, z), self.law.rate(v, z)
+            return self._stretch(self.law.force(v, z)), self.law.rate(v, z)
         if not isinstance(self.law, AbstractForceLaw | AbstractHoldingLaw):
             raise TypeError(f"{type(self.law).__name__} acts by a mode, or is of no known kind of law.")
         if v.ndim == 0:
             return self.law.force(v), None
-        return _against(self.law.force, v), None
+        return self._stretch(_against(self.law.force, v)), None
+
+    def _stretch(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+        """What the law sees of a slip, and what its force is to the mechanism."""
+        return x if self.ellipse is None else x * jnp.stack([jnp.ones_like(self.ellipse), self.ellipse])
 
     def act(
         self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
@@ -281,8 +329,8 @@ class Friction(AbstractEffect):
         return Power(-jnp.sum(action.force * self.belt(t)), jnp.sum(action.force * self.slip(t, q, qd, params)))
 
     def stored(self, z: PyTree) -> Float[Array, ""] | float:
-        """Energy [J] in the law's state, for laws in newtons; under a load of its own it has no fixed energy."""
-        if isinstance(self.law, AbstractDynamicLaw) and self.normal_force is None:
+        """Energy [J] in the law's state, for laws in newtons; under a load of its own, or varying, it has none."""
+        if isinstance(self.law, AbstractDynamicLaw) and self.normal_force is None and not varies(self.law):
             return self.law.stored(z)
         return 0.0
 

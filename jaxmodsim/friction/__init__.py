@@ -1,15 +1,25 @@
 """Friction laws, one in each file; they know slip velocity and their own state, nothing of mechanisms."""
 
+from ._armstrong import Armstrong as Armstrong
+from ._armstrong import ArmstrongState as ArmstrongState
 from ._asymmetric import asymmetric as asymmetric
 from ._coulomb import Coulomb as Coulomb
+from ._curve import Curve as Curve
+from ._dahl import Dahl as Dahl
 from ._dead_zone import DeadZone as DeadZone
+from ._elasto_plastic import ElastoPlastic as ElastoPlastic
 from ._law import AbstractDynamicLaw as AbstractDynamicLaw
 from ._law import AbstractForceLaw as AbstractForceLaw
 from ._law import AbstractHoldingLaw as AbstractHoldingLaw
 from ._law import AbstractLaw as AbstractLaw
+from ._law import AbstractPlanarLaw as AbstractPlanarLaw
 from ._law import AbstractSetValuedLaw as AbstractSetValuedLaw
 from ._lugre import LuGre as LuGre
+from ._maxwell_slip import MaxwellSlip as MaxwellSlip
 from ._regularized import Regularized as Regularized
+from ._scaled import scaled_by as scaled_by
 from ._sign import Sign as Sign
 from ._stribeck import Stribeck as Stribeck
+from ._stribeck import exponential as exponential
+from ._stribeck import lorentzian as lorentzian
 from ._viscous import Viscous as Viscous

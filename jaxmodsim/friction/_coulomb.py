@@ -2,16 +2,11 @@
 
 from typing import ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Number, Range, as_number, parameter
+from ..numerics import Number, optional_parameter, parameter
 from ._law import AbstractSetValuedLaw
-
-
-def _number_or_none(value: object) -> Number | None:
-    return None if value is None else as_number(value, name="Fs")
 
 
 class Coulomb(AbstractSetValuedLaw):
@@ -28,7 +23,7 @@ class Coulomb(AbstractSetValuedLaw):
     """
 
     Fc: Number = parameter("Fc", "N", lower=0.0)
-    Fs: Number | None = eqx.field(default=None, converter=_number_or_none, metadata={"range": Range("N", "Fc")})
+    Fs: Number | None = optional_parameter("Fs", "N", lower="Fc")
     stiff: ClassVar[bool] = False
 
     def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:

@@ -1,12 +1,12 @@
 """What a friction law is. Sign: the force is positive when it opposes positive slip."""
 
 import abc
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import equinox as eqx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
-from ..numerics import check_ranges
+from ..numerics import check_ranges, settle, varies
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractClassVar
@@ -23,6 +23,10 @@ class AbstractLaw(eqx.Module):
     def __check_init__(self) -> None:
         """Refuse parameters out of range."""
         check_ranges(self)
+
+    def at(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree) -> Self:
+        """The law as it is at a state of the mechanism; another one only where `scaled_by` made it depend on that."""
+        return settle(self, t, q, qd, params) if varies(self) else self
 
 
 class AbstractForceLaw(AbstractLaw):
@@ -75,15 +79,15 @@ class AbstractDynamicLaw(AbstractLaw):
     """A law with a state of its own."""
 
     @abc.abstractmethod
-    def state0(self) -> Any:
-        """State at rest and unloaded."""
+    def state0(self, v: Float[Array, "..."]) -> Any:
+        """State at rest and unloaded, for slip of the shape of `v`."""
 
     @abc.abstractmethod
-    def rate(self, v: Float[Array, ""], z: Any) -> Any:
+    def rate(self, v: Float[Array, "..."], z: Any) -> Any:
         """Time derivative of the state `z` at slip velocity `v` [m/s]."""
 
     @abc.abstractmethod
-    def force(self, v: Float[Array, ""], z: Any) -> Float[Array, ""]:
+    def force(self, v: Float[Array, "..."], z: Any) -> Float[Array, "..."]:
         """Friction force [N] at slip velocity `v` [m/s] and state `z`."""
 
     @abc.abstractmethod
@@ -91,8 +95,12 @@ class AbstractDynamicLaw(AbstractLaw):
         """Energy [J] held in the state `z`."""
 
     @abc.abstractmethod
-    def advance(self, distance: Float[Array, ""], v: Float[Array, ""], z: Any) -> Any:
-        """State after slipping `distance` [m] at constant velocity `v` [m/s], exactly and at any step.
+    def advance(self, v: Float[Array, "..."], z: Any, dt: Float[Array, ""]) -> Any:
+        """State after the time `dt` [s] at constant slip velocity `v` [m/s]: bounded at any step, however stiff."""
 
-        Given the distance apart from the velocity, a measured position needs no differentiation.
-        """
+
+class AbstractPlanarLaw(AbstractDynamicLaw):
+    """A dynamic law whose slip may also be a vector, shape `[2]` or `[3]`; its state then has as many components.
+
+    What depends on speed depends on the magnitude of slip, so that the components are coupled.
+    """

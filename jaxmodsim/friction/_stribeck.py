@@ -1,7 +1,9 @@
 """Coulomb friction with stiction, Stribeck effect and viscous term."""
 
+from collections.abc import Callable
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -9,10 +11,21 @@ from ..numerics import Number, parameter, safe_power
 from ._law import AbstractSetValuedLaw
 
 
+def exponential(x: Float[Array, ""]) -> Float[Array, ""]:
+    """`exp(-x)`, the fall of the Gaussian and the exponential Stribeck curve."""
+    return jnp.exp(-x)
+
+
+def lorentzian(x: Float[Array, ""]) -> Float[Array, ""]:
+    """`1/(1 + x)`, the fall of the Lorentzian Stribeck curve (Hess and Soom 1990, Journal of Tribology 112:147)."""
+    return 1.0 / (1.0 + x)
+
+
 class Stribeck(AbstractSetValuedLaw):
     """Friction that falls from stiction to Coulomb level as slip begins, and then rises viscously.
 
-    In slip `F = (Fc + (Fs - Fc) exp(-(|v|/vs)^exponent)) sign(v) + Fv v`; in stick anything up to `Fs`.
+    In slip `F = (Fc + (Fs - Fc) fall((|v|/vs)^exponent)) sign(v) + Fv v`; in stick anything up to `Fs`. Gaussian by
+    default; exponential with `exponent=1`; Lorentzian with `fall=jaxmodsim.friction.lorentzian`.
 
     **Arguments:**
 
@@ -21,6 +34,8 @@ class Stribeck(AbstractSetValuedLaw):
     - `vs`: Stribeck velocity [m/s], > 0.
     - `Fv`: viscous coefficient [N s/m], >= 0.
     - `exponent`: shape of the fall, > 0: 2 (Gaussian) by default, 1 for the exponential form.
+    - `fall`: `exponential` (`exp(-x)`) or `lorentzian` (`1/(1 + x)`), or another smooth function that falls from 1 at 0
+      to 0.
 
     **Raises:**
 
@@ -43,11 +58,12 @@ class Stribeck(AbstractSetValuedLaw):
     vs: Number = parameter("vs", "m/s", lower=0.0, strict=True)
     Fv: Number = parameter("Fv", "N s/m", lower=0.0, default=0.0)
     exponent: Number = parameter("exponent", "1", lower=0.0, strict=True, default=2.0)
+    fall: Callable[..., Array] = eqx.field(default=exponential, static=True)
     stiff: ClassVar[bool] = False
 
     def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Magnitude [N] of the dry part in slip."""
-        return self.Fc + (self.Fs - self.Fc) * jnp.exp(-safe_power(jnp.abs(v) / self.vs, self.exponent))
+        return self.Fc + (self.Fs - self.Fc) * self.fall(safe_power(jnp.abs(v) / self.vs, self.exponent))
 
     def wet(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Viscous part [N]."""

@@ -104,7 +104,7 @@ def fit(
     velocity = jnp.zeros_like(position) if qd0 is None else jnp.asarray(qd0, float)
     if position.ndim != 1 or position.shape != velocity.shape or not jnp.isfinite(position + velocity).all():
         raise ValueError(f"q0 and qd0 must be finite and of one shape [dof], but q0 = {start} and qd0 = {qd0}.")
-    check_scene(scene, State(position, velocity, scene.state0()))
+    check_scene(scene, State(position, velocity, scene.state0(position)))
     shape = getattr(jax.eval_shape(observe, position, velocity), "shape", None)
     if shape != ():
         raise ValueError(f"observe(q, qd) returned the shape {shape}, but one number, shape (), is needed.")

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from ..effects import Friction
 from ..friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw
-from ..numerics import Range
+from ..numerics import Range, varies
 from ..scene import Scene, replace_numbers, scene_numbers, scene_ranges
 from ._fit_result import FitResult
 from ._least_squares import Progress, least_squares
@@ -49,9 +49,10 @@ def fit_law(
 
     - `ValueError` for unknown names or inputs, or a law that cannot run by itself.
     """
-    if "x" not in record.inputs or not set(record.inputs) <= {"x", "normal"}:
+    if "x" not in record.inputs or not (varies(law) or set(record.inputs) <= {"x", "normal"}):
         raise ValueError(
-            f"fit_law needs the input 'x' [m] and may take 'normal' [N]; the record has: {', '.join(record.inputs)}."
+            "fit_law needs the input 'x' [m] and may take 'normal' [N], and more only for a law that scaled_by lets"
+            f" depend on it; the record has: {', '.join(record.inputs)}."
         )
     # A scene of the law alone gives its numbers their names and ranges.
     holder = Scene(_nothing, effects=(Friction(law, name="law"),))
@@ -74,7 +75,7 @@ def fit_law(
 
     def residual(values: dict[str, Array], data: Any) -> Array:
         t, inputs, measured = data
-        return law_force(with_values(values), t, inputs["x"], inputs.get("normal")) - measured
+        return law_force(with_values(values), t, inputs["x"], inputs.get("normal"), inputs) - measured
 
     data = record.arrays
     estimate = least_squares(residual, parameters, data, rtol=rtol, max_steps=max_steps, progress=progress)
@@ -101,6 +102,7 @@ def law_force(
     t: Float[Array, " samples"],
     x: Float[Array, " samples"],
     normal: Float[Array, " samples"] | None = None,
+    inputs: dict[str, Float[Array, " samples"]] | None = None,
 ) -> Float[Array, " samples"]:
     """Friction force of a law under a sampled motion, from rest and unloaded.
 
@@ -110,6 +112,7 @@ def law_force(
     - `t`: times [s], increasing.
     - `x`: slip displacement [m] at these times; the velocity is constant from sample to sample.
     - `normal`: normal load [N] for laws whose forces are per newton of load.
+    - `inputs`: what the functions of `scaled_by` find in `params`, by name.
 
     **Returns:**
 
@@ -119,22 +122,29 @@ def law_force(
 
     - `ValueError` for a law whose force depends on more than its own motion.
     """
-    distance = jnp.diff(x)
-    v = distance / jnp.diff(t)
-    if isinstance(law, AbstractDynamicLaw):
-
-        def advance(z: Any, interval: tuple[Array, Array]) -> tuple[Any, Array]:
-            z = law.advance(*interval, z)
-            return z, law.force(interval[1], z)
-
-        z0 = law.state0()
-        _, force = jax.lax.scan(advance, z0, (distance, v))
-        first = law.force(jnp.zeros_like(x[0]), z0)
-    elif isinstance(law, AbstractForceLaw):
-        force, first = jax.vmap(law.force)(v), law.force(jnp.zeros_like(x[0]))
-    else:
+    if not isinstance(law, AbstractDynamicLaw | AbstractForceLaw):
         raise ValueError(f"{type(law).__name__} cannot run by itself: its force depends on the load it holds.")
-    force = jnp.concatenate([jnp.reshape(first, (1,)), force])
+    dt = jnp.diff(t)
+    v = jnp.diff(x) / dt
+
+    def at(t: Array, x: Array, v: Array, params: dict[str, Array]) -> Any:
+        return law.at(t, x[None], v[None], params)
+
+    def advance(z: Any, sample: tuple[Array, ...]) -> tuple[Any, Array]:
+        (*state, dt), v = sample, sample[2]
+        here = at(*state)
+        if isinstance(here, AbstractForceLaw):
+            return z, here.force(v)
+        z = here.advance(v, z, dt)
+        return z, here.force(v, z)
+
+    first = at(t[0], x[0], jnp.zeros_like(x[0]), jax.tree.map(lambda each: each[0], inputs or {}))
+    rest = jnp.zeros_like(x[0])
+    z0 = None if isinstance(first, AbstractForceLaw) else first.state0(rest)
+    start = first.force(rest) if z0 is None else first.force(rest, z0)
+    samples = (t[1:], x[1:], v, jax.tree.map(lambda each: each[1:], inputs or {}), dt)
+    _, force = jax.lax.scan(advance, z0, samples)
+    force = jnp.concatenate([jnp.reshape(start, (1,)), force])
     return force if normal is None else force * jnp.maximum(normal, 0.0)
 
 

@@ -69,7 +69,7 @@ def replay(
         y = substep(0, y) if substeps == 1 else jax.lax.fori_loop(0, substeps, substep, y)
         return y, observe(y.q, y.qd)
 
-    y0 = State(q0, qd0, scene.state0())
+    y0 = State(q0, qd0, scene.state0(q0))
     samples = (t[:-1], jnp.diff(t), jtu.tree_map(lambda x: x[:-1], inputs))
     _, observed = jax.lax.scan(advance, y0, samples)
     return jnp.concatenate([jnp.reshape(observe(q0, qd0), (1,)), observed])

@@ -12,26 +12,32 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ._varying import nominal
+
 if TYPE_CHECKING:
     Number: TypeAlias = Any  # a plain number in the call: type checkers do not see the converter of `parameter`
+    Vector: TypeAlias = Any
 else:
     Number: TypeAlias = Float[Array, ""]
+    Vector: TypeAlias = Float[Array, " n"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """Admissible range and unit of a parameter: above (or at) a number, or at least another parameter.
+    """Admissible range and unit of a parameter: above (or at) a number, or another parameter, and below a number.
 
     **Arguments:**
 
     - `unit`: SI unit, as printed.
     - `lower`: lower limit; a string names another parameter of the same object; None for no limit.
-    - `strict`: whether the limit itself is excluded.
+    - `strict`: whether the lower limit itself is excluded.
+    - `upper`: upper limit, included; None for no limit.
     """
 
     unit: str
     lower: float | str | None = None
     strict: bool = False
+    upper: float | None = None
 
     @property
     def text(self) -> str:
@@ -41,7 +47,8 @@ class Range:
             return f"a finite number{unit}"
         relation = ">" if self.strict else ">="
         limit = self.lower if isinstance(self.lower, str) else f"{self.lower:g}"
-        return f"finite and {relation} {limit}{unit}"
+        most = "" if self.upper is None else f" and <= {self.upper:g}"
+        return f"finite and {relation} {limit}{most}{unit}"
 
     def holds(self, value: Float[Array, "..."], others: Mapping[str, Float[Array, "..."]]) -> Bool[Array, "..."]:
         """Whether `value` is in range, elementwise; `others` are the parameters of the same object by name."""
@@ -49,6 +56,8 @@ class Range:
         if self.lower is None:
             return finite
         lower = others[self.lower] if isinstance(self.lower, str) else self.lower
+        if self.upper is not None:
+            finite = finite & (value <= self.upper)
         return finite & ((value > lower) if self.strict else (value >= lower))
 
 
@@ -80,16 +89,61 @@ def as_real(value: Any, *, name: str) -> Float[Array, "..."]:
     raise ValueError(f"{name} must be a real number or an array of real numbers, but {given!r} was given.")
 
 
-def parameter(name: str, unit: str, *, lower: float | str | None = None, strict: bool = False, **field: Any) -> Any:
+def as_vector(value: Any, *, name: str) -> Float[Array, " n"]:
+    """Convert to a vector of real floating numbers, shape `[n]`; one number becomes a vector of length one.
+
+    **Raises:**
+
+    - `ValueError` naming `name`, what was given and what is needed.
+    """
+    if isinstance(value, list | tuple):
+        value = jnp.stack([as_number(x, name=name) for x in value]) if value else jnp.zeros(0)
+    array = as_real(value, name=name)
+    if array.ndim > 1 or array.size == 0:
+        raise ValueError(f"{name} has shape {array.shape}, but numbers in a row, shape [n], are needed.")
+    return jnp.reshape(array, (-1,))
+
+
+def parameter(
+    name: str,
+    unit: str,
+    *,
+    lower: float | str | None = None,
+    strict: bool = False,
+    upper: float | None = None,
+    **field: Any,
+) -> Any:
     """Dataclass field of an `eqx.Module` that holds one number with a unit and an admissible range.
 
     **Arguments:**
 
     - `name`: name of the field, for error messages.
-    - `unit`, `lower`, `strict`: see `Range`.
+    - `unit`, `lower`, `strict`, `upper`: see `Range`.
     - `field`: further arguments of `equinox.field`, such as `default`.
     """
-    return eqx.field(converter=partial(as_number, name=name), metadata={"range": Range(unit, lower, strict)}, **field)
+    allowed = Range(unit, lower, strict, upper)
+    return eqx.field(converter=partial(as_number, name=name), metadata={"range": allowed}, **field)
+
+
+def optional_parameter(name: str, unit: str, *, lower: float | str | None = None, strict: bool = False) -> Any:
+    """A `parameter` that may be left out, and then is None."""
+    convert = partial(_unless_none, convert=as_number, name=name)
+    return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower, strict)})
+
+
+def vector_parameter(name: str, unit: str, *, lower: float | str | None = None, strict: bool = False) -> Any:
+    """A `parameter` of several numbers, shape `[n]`."""
+    return eqx.field(converter=partial(as_vector, name=name), metadata={"range": Range(unit, lower, strict)})
+
+
+def optional_vector_parameter(name: str, unit: str, *, lower: float | str | None = None) -> Any:
+    """A `vector_parameter` that may be left out, and then is None."""
+    convert = partial(_unless_none, convert=as_vector, name=name)
+    return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower)})
+
+
+def _unless_none(value: Any, *, convert: Callable[..., Any], name: str) -> Any:
+    return None if value is None else convert(value, name=name)
 
 
 def ranges_of(module: eqx.Module) -> dict[str, Range]:
@@ -103,10 +157,10 @@ def ranges_of(module: eqx.Module) -> dict[str, Range]:
 
 def range_checks(module: eqx.Module) -> list[tuple[str, Array]]:
     """For each parameter of `module`: the sentence that says what is needed, and whether that holds."""
-    values = {name: getattr(module, name) for name in ranges_of(module)}
+    values = {name: nominal(getattr(module, name)) for name in ranges_of(module)}
     owner = type(module).__name__
     return [
-        (f"{owner}: {name} must be {allowed.text}", allowed.holds(values[name], values))
+        (f"{owner}: {name} must be {allowed.text}", jnp.all(allowed.holds(values[name], values)))
         for name, allowed in ranges_of(module).items()
     ]
 
@@ -118,7 +172,7 @@ def check_ranges(module: eqx.Module) -> None:
 
     - `ValueError` naming the parameter, its range and the value given.
     """
-    values = {name: getattr(module, name) for name in ranges_of(module)}
+    values = {name: nominal(getattr(module, name)) for name in ranges_of(module)}
     for name, allowed in ranges_of(module).items():
         limit = values.get(allowed.lower) if isinstance(allowed.lower, str) else None
         if any(isinstance(x, jax.core.Tracer) for x in (values[name], limit)):

@@ -15,6 +15,18 @@ def safe_power(base: Float[Array, "..."], exponent: Float[Array, "..."]) -> Floa
     return jnp.where(positive, jnp.where(positive, base, 1.0) ** exponent, 0.0)
 
 
+def magnitude(v: Float[Array, "..."]) -> Float[Array, ""]:
+    """Absolute value of a number, Euclidean norm of a vector; the derivative is zero at zero."""
+    return jnp.abs(v) if jnp.ndim(v) == 0 else safe_norm(v)
+
+
+def decay_mean(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """`(1 - exp(-x))/x` for `x >= 0`, the mean of a decay from 1 over x of its time constants; 1 at `x = 0`."""
+    small = x < 1e-4
+    safe = jnp.where(small, 1.0, x)
+    return jnp.where(small, 1.0 - 0.5 * x + x * x / 6.0, -jnp.expm1(-safe) / safe)
+
+
 def safe_norm(x: Float[Array, "..."], *, axis: int = -1) -> Float[Array, "..."]:
     """Euclidean norm along `axis`; its derivative is zero where `x` vanishes, and NaN there by a plain norm.
 

@@ -1,15 +1,16 @@
 """Every number of a scene by a name that a person would type."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from ..numerics import Range, ranges_of
+from ..numerics import Range, Varying, ranges_of
 from ._scene import Scene
 
 # Levels of the scene that say nothing about a number.
-_SILENT = ("law", "place", "amount")
+_SILENT = ("law", "place", "amount", "number")
 
 
 def scene_numbers(scene: Scene) -> dict[str, Array]:
@@ -41,10 +42,12 @@ def scene_ranges(scene: Scene) -> dict[str, Range]:
     leaves, _ = jtu.tree_flatten_with_path(scene)
     ranges: dict[str, Range] = {}
     for path, _ in leaves:
-        owner = scene
+        owners: list[Any] = [scene]
         for key in path[:-1]:
-            owner = _step(owner, key)
-        last = path[-1]
+            owners.append(_step(owners[-1], key))
+        while isinstance(owners[-1], Varying):  # the range is that of the parameter
+            owners, path = owners[:-1], path[:-1]
+        owner, last = owners[-1], path[-1]
         if not isinstance(last, jtu.GetAttrKey):
             continue
         allowed = ranges_of(owner).get(last.name)
@@ -52,7 +55,7 @@ def scene_ranges(scene: Scene) -> dict[str, Range]:
             continue
         if isinstance(allowed.lower, str):
             limit = _name(scene, (*path[:-1], jtu.GetAttrKey(allowed.lower)))
-            allowed = Range(allowed.unit, limit, allowed.strict)
+            allowed = replace(allowed, lower=limit)
         ranges[_name(scene, path)] = allowed
     return ranges
 

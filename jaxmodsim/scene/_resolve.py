@@ -77,6 +77,7 @@ class _Mobility(NamedTuple):
 def resolve(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -> Resolved:
     """Solve for the accelerations, and for the forces that depend on them."""
     q, qd, params = y.q, y.qd, scene.params
+    scene = scene.at(t, q, qd)
     equations = motion_equations(scene.lagrangian, t, q, qd, params)
     restraint = restrain(scene.constraints, t, q, qd, params, equations.mass) if scene.constraints else None
     mobility = _Mobility(equations.mass, restraint)

@@ -6,7 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from ..effects import AbstractEffect, Friction
 from ..mechanics import AbstractConstraint, Lagrangian
@@ -172,7 +172,14 @@ class Scene(eqx.Module):
             )
         return tuple(words)
 
-    def state0(self) -> dict[str, PyTree]:
+    def at(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"]) -> "Scene":
+        """The scene with its laws as they are at this state; itself where none depends on that."""
+        effects = tuple(each.at(t, q, qd, self.params) if isinstance(each, Friction) else each for each in self.effects)
+        if all(a is b for a, b in zip(effects, self.effects, strict=True)):
+            return self
+        return eqx.tree_at(lambda scene: scene.effects, self, effects)
+
+    def state0(self, q: Float[Array, " dof"]) -> dict[str, PyTree]:
         """Own state of each effect that has one, at rest, by effect name."""
-        states = {name: effect.state0() for name, effect in zip(self.names, self.effects, strict=True)}
+        states = {name: effect.state0(q, self.params) for name, effect in zip(self.names, self.effects, strict=True)}
         return {name: state for name, state in states.items() if state is not None}

@@ -54,7 +54,7 @@ def consistent(
     dof = q.shape[0]
     if any(not 0 <= i < dof for i in hold):
         raise ValueError(f"hold must be indices of coordinates, 0 to {dof - 1}, but {tuple(hold)} was given.")
-    check_scene(scene, State(q, qd, scene.state0()))
+    check_scene(scene, State(q, qd, scene.state0(q)))
     if not scene.constraints:
         return q, qd
     free = jnp.asarray([float(i not in hold) for i in range(dof)], kind)

@@ -160,7 +160,7 @@ def _problem(
         scene,
         array["q0"],
         array["qd0"],
-        _own_states(scene, z0, dtype) if z0 else {},
+        _own_states(scene, array["q0"], z0, dtype) if z0 else {},
         array["t0"],
         array["t1"],
         array.get("ts"),
@@ -172,9 +172,9 @@ def _problem(
     )
 
 
-def _own_states(scene: Scene, z0: dict[str, PyTree], dtype: Any) -> dict[str, PyTree]:
+def _own_states(scene: Scene, q0: Any, z0: dict[str, PyTree], dtype: Any) -> dict[str, PyTree]:
     """Convert and check the initial own states that were given."""
-    states = scene.state0()
+    states = scene.state0(jnp.asarray(q0, dtype))
     for name, state in z0.items():
         if name not in states:
             raise ValueError(

@@ -43,7 +43,7 @@ class Problem(NamedTuple):
 
 def initial_state(problem: Problem) -> State:
     """State at t0: effects whose state is not given start at rest."""
-    return State(problem.q0, problem.qd0, problem.scene.state0() | problem.z0)
+    return State(problem.q0, problem.qd0, problem.scene.state0(problem.q0) | problem.z0)
 
 
 @dataclass(frozen=True)

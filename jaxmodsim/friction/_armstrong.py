@@ -1,0 +1,110 @@
+"""Armstrong's seven parameters."""
+
+from typing import ClassVar, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..numerics import Number, parameter
+from ._bristle import follow, yielding
+from ._law import AbstractDynamicLaw
+
+# Part of its limit over which the contact gives way.
+_CORNER = 0.02
+# Slip velocity, in Stribeck velocities, from which on the contact slides and does not rest. The published model needs
+# such a rule, too, and leaves it open.
+_SLIDES = 1e-3
+
+
+class ArmstrongState(NamedTuple):
+    """Deflection `z` [m] of the contact, and how much of the stiction there is, `rise`, from 0 to 1."""
+
+    z: Float[Array, ""]
+    rise: Float[Array, ""]
+
+
+class Armstrong(AbstractDynamicLaw):
+    """Armstrong's model of seven parameters: stiff in stick, Stribeck friction with memory in slip, rising stiction.
+
+    In stick `F = sigma0 z`; in slip `F = (Fc + (Fs - Fc) rise) sign(v) + Fv v`. The Stribeck friction has memory: in
+    slip `rise` goes to `1/(1 + (v/vs)^2)` with the time constant `tau`, in stick it grows to 1 like `t/(t + gamma)`.
+    Two things differ from the paper, so that the model is one set of differential equations: the lag is of first order
+    where the paper has a pure delay of tau, and stiction grows by `rise' = (1 - rise)^2/gamma`, which is the paper's
+    `t/(t + gamma)` if nothing is left at the beginning of stick.
+
+    **Arguments:**
+
+    - `sigma0`: stiffness of the contact in stick [N/m], > 0.
+    - `Fc`: Coulomb force [N], > 0.
+    - `Fs`: stiction force after a long rest [N], >= Fc.
+    - `vs`: Stribeck velocity [m/s], > 0.
+    - `Fv`: viscous coefficient [N s/m], >= 0.
+    - `tau`: time constant of frictional memory [s], > 0.
+    - `gamma`: time of rest after which half of the missing stiction is back [s], > 0.
+
+    **Raises:**
+
+    - `ValueError` if a parameter is out of range or no number.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{armstrong1994survey,
+            author={Armstrong-Helouvry, Brian and Dupont, Pierre and Canudas de Wit, Carlos},
+            title={A survey of models, analysis tools and compensation methods for the control of machines
+                   with friction},
+            journal={Automatica}, volume={30}, number={7}, pages={1083--1138}, year={1994},
+        }
+        ```
+    """
+
+    sigma0: Number = parameter("sigma0", "N/m", lower=0.0, strict=True)
+    Fc: Number = parameter("Fc", "N", lower=0.0, strict=True)
+    Fs: Number = parameter("Fs", "N", lower="Fc")
+    vs: Number = parameter("vs", "m/s", lower=0.0, strict=True)
+    Fv: Number = parameter("Fv", "N s/m", lower=0.0)
+    tau: Number = parameter("tau", "s", lower=0.0, strict=True)
+    gamma: Number = parameter("gamma", "s", lower=0.0, strict=True)
+    stiff: ClassVar[bool] = True
+
+    def _slides(self, v: Float[Array, ""], share: Float[Array, ""]) -> Float[Array, ""]:
+        """How far the contact slides, 0 to 1, where the deflection does not follow that share of `v` [m/s]."""
+        ratio = v / (_SLIDES * self.vs)
+        return jnp.minimum(share, 1.0) * ratio * ratio / (1.0 + ratio * ratio)
+
+    def _steady(self, v: Float[Array, ""]) -> Float[Array, ""]:
+        """`rise` in steady slip at `v` [m/s]."""
+        ratio = v / self.vs
+        return 1.0 / (1.0 + ratio * ratio)
+
+    def state0(self, v: Float[Array, ""]) -> ArmstrongState:
+        """Undeflected after a long rest."""
+        return ArmstrongState(jnp.zeros_like(v), jnp.ones_like(v))
+
+    def rate(self, v: Float[Array, ""], z: ArmstrongState) -> ArmstrongState:
+        """Rates of the state [m/s, 1/s] at slip velocity `v` [m/s]."""
+        u = self.sigma0 * z.z * jnp.sign(v) / (self.Fc + (self.Fs - self.Fc) * z.rise)
+        share = yielding(u, jnp.asarray(_CORNER, u.dtype))
+        slides, missing = self._slides(v, share), 1.0 - z.rise
+        memory = slides * (self._steady(v) - z.rise) / self.tau + (1.0 - slides) * missing * missing / self.gamma
+        return ArmstrongState(v * (1.0 - share), memory)
+
+    def force(self, v: Float[Array, ""], z: ArmstrongState) -> Float[Array, ""]:
+        """Friction force [N] at slip velocity `v` [m/s]."""
+        return self.sigma0 * z.z + self.Fv * v
+
+    def stored(self, z: ArmstrongState) -> Float[Array, ""]:
+        """Elastic energy [J] of the contact."""
+        return 0.5 * self.sigma0 * z.z * z.z
+
+    def advance(self, v: Float[Array, ""], z: ArmstrongState, dt: Float[Array, ""]) -> ArmstrongState:
+        """State after `dt` [s] at constant `v` [m/s]: first the deflection, then the memory, each exactly."""
+        limit = (self.Fc + (self.Fs - self.Fc) * z.rise) / self.sigma0
+        deflection = follow(v, z.z, dt, limit, jnp.asarray(_CORNER, limit.dtype))
+        distance = v * dt
+        moves = distance != 0
+        share = jnp.where(moves, 1.0 - (deflection - z.z) / jnp.where(moves, distance, 1.0), 0.0)
+        slides, steady = self._slides(v, share), self._steady(v)
+        missing = 1.0 - (steady + (z.rise - steady) * jnp.exp(-slides * dt / self.tau))
+        missing = missing / (1.0 + (1.0 - slides) * dt * missing / self.gamma)
+        return ArmstrongState(deflection, 1.0 - missing)

@@ -1,0 +1,41 @@
+"""What laws with elastic elements share: how an element follows the surface and gives way."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..numerics import decay_mean
+
+
+def leak(
+    v: Float[Array, "..."], z: Float[Array, "..."], dt: Float[Array, ""], rate: Float[Array, ""]
+) -> Float[Array, "..."]:
+    """Solution after `dt` [s] of `z' = v - rate z` with constant `v` [m/s] and `rate` [1/s]: exact at any step."""
+    x = rate * dt
+    return z * jnp.exp(-x) + v * dt * decay_mean(x)
+
+
+def yielding(u: Float[Array, "..."], corner: Float[Array, ""]) -> Float[Array, "..."]:
+    """Share of the slip that an element does not follow, at the load `u` in limits towards the slip.
+
+    0 up to `1 - corner`, 1 at the limit, and above 1 beyond it, so that the element falls back.
+    """
+    return jnp.maximum(u - (1.0 - corner), 0.0) / corner
+
+
+def follow(
+    v: Float[Array, "..."],
+    z: Float[Array, "..."],
+    dt: Float[Array, ""],
+    limit: Float[Array, "..."],
+    corner: Float[Array, ""],
+) -> Float[Array, "..."]:
+    """Deflection after `dt` [s] of `z' = v (1 - yielding(z sign(v)/limit))` with constant `v`: exact at any step.
+
+    A straight line up to the corner, and from there a decay towards the limit.
+    """
+    side = jnp.sign(v)
+    u, y = side * z / limit, jnp.abs(v) * dt / limit
+    straight = jnp.minimum(y, jnp.maximum(1.0 - corner - u, 0.0))
+    u = u + straight
+    bent = jnp.where(u >= 1.0 - corner, 1.0 + (u - 1.0) * jnp.exp(-(y - straight) / corner), u)
+    return jnp.where(side == 0, z, side * limit * bent)

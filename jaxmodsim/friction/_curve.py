@@ -1,0 +1,40 @@
+"""A law given as a function."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..numerics import Number, as_function, parameter
+from ._law import AbstractForceLaw
+
+
+class Curve(AbstractForceLaw):
+    """A friction force that is any function of slip velocity, `F = gain fn(v)`.
+
+    `Friction(fn)` makes one of a plain function.
+
+    **Arguments:**
+
+    - `fn`: `fn(v)` returns the force [N] at slip velocity `v` [m/s], one number for one; a pure JAX function, smooth
+      enough for the solver. Numbers that are to be differentiated go into the leaves of an `eqx.Module`.
+    - `gain`: factor [N per unit of fn], >= 0.
+
+    **Raises:**
+
+    - `ValueError` if `fn` is no function or `gain` is out of range.
+    """
+
+    fn: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Curve fn"))
+    gain: Number = parameter("gain", "N", lower=0.0, default=1.0)
+    stiff: ClassVar[bool] = False
+
+    def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+        """Friction force [N] at velocity `v` [m/s]."""
+        value = jnp.asarray(self.fn(v))
+        if value.shape != ():
+            raise ValueError(f"A friction curve must return one number, but fn(v) returned the shape {value.shape}.")
+        return self.gain * value

@@ -1,0 +1,63 @@
+"""The Dahl law."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..numerics import Number, magnitude, parameter
+from ._bristle import leak
+from ._law import AbstractPlanarLaw
+
+
+class Dahl(AbstractPlanarLaw):
+    """The Dahl law: a force that grows with displacement like a stress with strain, up to the Coulomb force.
+
+    `z' = v - sigma0 |v| z/Fc`, `F = sigma0 z`: a function of the displacement alone, whatever the speed. Cycled between
+    +-A the force at reversal is `Fc tanh(sigma0 A/Fc)`, the loss per cycle `4 Fc [A - (Fc/sigma0) tanh(sigma0 A/Fc)]`.
+    The form with exponent one of the paper. Slip in the plane: v, z and F are vectors.
+
+    **Arguments:**
+
+    - `sigma0`: stiffness at rest [N/m], > 0.
+    - `Fc`: Coulomb force [N], > 0.
+
+    **Raises:**
+
+    - `ValueError` if a parameter is out of range or no number.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @techreport{dahl1968solid,
+            author={Dahl, P. R.},
+            title={A solid friction model},
+            institution={The Aerospace Corporation}, number={TOR-0158(3107-18)-1}, year={1968},
+        }
+        ```
+    """
+
+    sigma0: Number = parameter("sigma0", "N/m", lower=0.0, strict=True)
+    Fc: Number = parameter("Fc", "N", lower=0.0, strict=True)
+    stiff: ClassVar[bool] = True
+
+    def state0(self, v: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Undeflected, 0 m."""
+        return jnp.zeros_like(v)
+
+    def rate(self, v: Float[Array, "..."], z: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Z' [m/s] at slip velocity `v` [m/s] and deflection `z` [m]."""
+        return v - self.sigma0 * magnitude(v) / self.Fc * z
+
+    def force(self, v: Float[Array, "..."], z: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Friction force [N] at deflection `z` [m]."""
+        del v
+        return self.sigma0 * z
+
+    def stored(self, z: Float[Array, "..."]) -> Float[Array, ""]:
+        """Elastic energy [J]."""
+        return 0.5 * self.sigma0 * jnp.sum(z * z)
+
+    def advance(self, v: Float[Array, "..."], z: Float[Array, "..."], dt: Float[Array, ""]) -> Float[Array, "..."]:
+        """Deflection [m] after `dt` [s] at constant `v` [m/s], exactly."""
+        return leak(v, z, dt, self.sigma0 * magnitude(v) / self.Fc)

@@ -1,0 +1,122 @@
+"""Generalised Maxwell slip."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..numerics import (
+    Number,
+    Vector,
+    nominal,
+    optional_parameter,
+    optional_vector_parameter,
+    parameter,
+    vector_parameter,
+)
+from ._bristle import follow, yielding
+from ._law import AbstractDynamicLaw
+
+
+class MaxwellSlip(AbstractDynamicLaw):
+    """Elastic elements in parallel, each of which gives way at its own force: hysteresis with non-local memory.
+
+    Element i is a spring of stiffness `k_i` that slips at the force `s_i(v) = Fc_i + (Fs_i - Fc_i) exp(-(v/vs)^2)`, and
+    sticks again when the velocity reverses; `F = sum_i k_i z_i + sigma2 v`. Loops within loops close where they began,
+    as in Leuven's model. With one element and a small `corner` it is a spring in series with Coulomb friction.
+
+    A spring that stopped dead would make the rates jump, and chatter where the limit changes with velocity. So an
+    element follows the surface up to `1 - corner` of its limit and gives way over the rest:
+    `z' = v (1 - max(0, u - 1 + corner)/corner)` with `u = k z sign(v)/s(v)`. With `C` an element beyond its limit (the
+    speed has risen) falls back as in the generalised model, `F_i' = sign(v) C (alpha_i - F_i/s(v))`,
+    `alpha_i = Fc_i/sum Fc`, which is a lag in time.
+
+    **Arguments:**
+
+    - `k`: stiffness of each element [N/m], > 0, shape `[n]`.
+    - `Fc`: Coulomb force of each element [N], > 0, shape `[n]`.
+    - `Fs`: stiction force of each element [N], >= Fc, shape `[n]`; by default Fc.
+    - `vs`: Stribeck velocity [m/s], > 0; needed with Fs.
+    - `C`: attraction to the limit from beyond [N/s], > 0; by default as fast as the corner.
+    - `sigma2`: viscous coefficient [N s/m], >= 0.
+    - `corner`: part of its limit over which an element gives way, > 0 and <= 1.
+
+    **Raises:**
+
+    - `ValueError` if a parameter is out of range or no number, or lengths differ.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{albender2005generalized,
+            author={Al-Bender, Farid and Lampaert, Vincent and Swevers, Jan},
+            title={The generalized Maxwell-slip model: a novel model for friction simulation and compensation},
+            journal={IEEE Transactions on Automatic Control},
+            volume={50}, number={11}, pages={1883--1887}, year={2005},
+        }
+        ```
+    """
+
+    k: Vector = vector_parameter("k", "N/m", lower=0.0, strict=True)
+    Fc: Vector = vector_parameter("Fc", "N", lower=0.0, strict=True)
+    Fs: Vector | None = optional_vector_parameter("Fs", "N", lower="Fc")
+    vs: Number | None = optional_parameter("vs", "m/s", lower=0.0, strict=True)
+    C: Number | None = optional_parameter("C", "N/s", lower=0.0, strict=True)
+    sigma2: Number = parameter("sigma2", "N s/m", lower=0.0, default=0.0)
+    corner: Number = parameter("corner", "1", lower=0.0, strict=True, upper=1.0, default=0.02)
+    stiff: ClassVar[bool] = True
+
+    def __check_init__(self) -> None:
+        """Refuse elements that are not complete."""
+        for name in ("Fc", "Fs"):
+            given = getattr(self, name)
+            if given is not None and jnp.shape(given) != jnp.shape(self.k):
+                raise ValueError(
+                    f"MaxwellSlip: {name} must have one number for each of the {jnp.shape(self.k)[0]} elements of k,"
+                    f" but it has the shape {jnp.shape(given)}."
+                )
+        if (self.Fs is None) != (self.vs is None):
+            raise ValueError("MaxwellSlip: Fs and vs make the Stribeck effect together; give both or none.")
+
+    def limit(self, v: Float[Array, ""]) -> Float[Array, " n"]:
+        """Force [N] at which each element slips at velocity `v` [m/s]."""
+        if self.Fs is None or self.vs is None:
+            return self.Fc
+        ratio = v / self.vs
+        return self.Fc + (self.Fs - self.Fc) * jnp.exp(-ratio * ratio)
+
+    def _attraction(self, limit: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Rate [1/s] at which an element beyond its limit falls back to it."""
+        return self.C * self.Fc / jnp.sum(self.Fc) / limit
+
+    def state0(self, v: Float[Array, ""]) -> Float[Array, " n"]:
+        """Undeflected elements, 0 m."""
+        return jnp.zeros(jnp.shape(nominal(self.k)), v.dtype)
+
+    def rate(self, v: Float[Array, ""], z: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Rates of the deflections [m/s] at slip velocity `v` [m/s] and deflections `z` [m]."""
+        limit, side = self.limit(v), jnp.sign(v)
+        u = self.k * z * side / limit
+        if self.C is None:
+            return v * (1.0 - yielding(u, self.corner))
+        rate = v * (1.0 - yielding(jnp.minimum(u, 1.0), self.corner))
+        return rate - side * self._attraction(limit) * limit / self.k * jnp.maximum(u - 1.0, 0.0)
+
+    def force(self, v: Float[Array, ""], z: Float[Array, " n"]) -> Float[Array, ""]:
+        """Friction force [N] at slip velocity `v` [m/s] and deflections `z` [m]."""
+        return jnp.sum(self.k * z) + self.sigma2 * v
+
+    def stored(self, z: Float[Array, " n"]) -> Float[Array, ""]:
+        """Elastic energy [J] of the elements."""
+        return 0.5 * jnp.sum(self.k * z * z)
+
+    def advance(self, v: Float[Array, ""], z: Float[Array, " n"], dt: Float[Array, ""]) -> Float[Array, " n"]:
+        """Deflections [m] after `dt` [s] at constant `v` [m/s], exactly."""
+        limit = self.limit(v)
+        after = follow(v, z, dt, limit / self.k, self.corner)
+        if self.C is None:
+            return after
+        side = jnp.sign(v)
+        u = self.k * z * side / limit
+        falling = side * limit / self.k * (1.0 + (u - 1.0) * jnp.exp(-self._attraction(limit) * dt))
+        return jnp.where(u > 1.0, falling, after)
