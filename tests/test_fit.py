@@ -155,7 +155,7 @@ def test_law_fit_returns_the_law_it_was_made_from():
     x = 2e-4 * np.sin(2 * np.pi * 0.5 * t) * (1 + t / 8) + 4e-3 * np.clip(t - 5, 0, None) ** 2
     load = 4.0 + np.sin(t)
     truth = jms.LuGre(sigma0=8e3, sigma1=20.0, sigma2=0.4, Fc=0.4, Fs=0.5, vs=5e-3)
-    force = np.asarray(law_force(truth, *map(jnp.asarray, (t, x, load))))
+    force = np.asarray(law_force(truth, jnp.asarray(t), jnp.asarray(x), jnp.asarray(load)))
     record = jms.Record(t, force + 1e-3 * rng.standard_normal(t.size), {"x": x, "normal": load})
     start = jms.LuGre(sigma0=3e3, sigma1=5.0, sigma2=1.0, Fc=0.3, Fs=0.6, vs=1e-2)
     result = jms.fit_law(start, record)

@@ -134,9 +134,9 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "unknown law": (
         lambda: Friction(cast_any("lugre")),
-        r"needs a law object, but 'lugre' was given. Known laws:.*LuGre",
+        r"needs a law or a function of slip velocity, but 'lugre' was given. Known laws:.*LuGre",
     ),
-    "class as law": (lambda: Friction(cast_any(LuGre)), "needs a law object"),
+    "class as law": (lambda: Friction(cast_any(LuGre)), "but the class LuGre was given"),
     "belt of text": (lambda: Friction(Viscous(1.0), belt_velocity=cast_any("fast")), "belt_velocity must be a real"),
     "belt of two": (lambda: Friction(Viscous(1.0), belt_velocity=jnp.ones(2)), r"belt_velocity has shape \(2,\)"),
     "load of nothing": (

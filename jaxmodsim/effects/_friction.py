@@ -1,7 +1,7 @@
 """Where a friction law acts."""
 
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -116,7 +116,7 @@ class Friction(AbstractEffect):
         """Refuse an ellipse out of range."""
         check_ranges(self)
 
-    def at(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree) -> Self:
+    def at(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree) -> "Friction":
         """With the law as it is at this state; itself where the law does not depend on that."""
         if not varies(self.law):
             return self

@@ -72,18 +72,22 @@ class Armstrong(AbstractDynamicLaw):
         ratio = v / (_SLIDES * self.vs)
         return jnp.minimum(share, 1.0) * ratio * ratio / (1.0 + ratio * ratio)
 
+    def _limit(self, rise: Float[Array, ""]) -> Float[Array, ""]:
+        """Deflection [m] at which the contact slides."""
+        return (self.Fc + (self.Fs - self.Fc) * rise) / self.sigma0
+
     def _steady(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """`rise` in steady slip at `v` [m/s]."""
         ratio = v / self.vs
         return 1.0 / (1.0 + ratio * ratio)
 
-    def state0(self, v: Float[Array, ""]) -> ArmstrongState:
+    def state0(self, v: Float[Array, "..."]) -> ArmstrongState:
         """Undeflected after a long rest."""
         return ArmstrongState(jnp.zeros_like(v), jnp.ones_like(v))
 
     def rate(self, v: Float[Array, ""], z: ArmstrongState) -> ArmstrongState:
         """Rates of the state [m/s, 1/s] at slip velocity `v` [m/s]."""
-        u = self.sigma0 * z.z * jnp.sign(v) / (self.Fc + (self.Fs - self.Fc) * z.rise)
+        u = z.z * jnp.sign(v) / self._limit(z.rise)
         share = yielding(u, jnp.asarray(_CORNER, u.dtype))
         slides, missing = self._slides(v, share), 1.0 - z.rise
         memory = slides * (self._steady(v) - z.rise) / self.tau + (1.0 - slides) * missing * missing / self.gamma
@@ -98,13 +102,16 @@ class Armstrong(AbstractDynamicLaw):
         return 0.5 * self.sigma0 * z.z * z.z
 
     def advance(self, v: Float[Array, ""], z: ArmstrongState, dt: Float[Array, ""]) -> ArmstrongState:
-        """State after `dt` [s] at constant `v` [m/s]: first the deflection, then the memory, each exactly."""
-        limit = (self.Fc + (self.Fs - self.Fc) * z.rise) / self.sigma0
-        deflection = follow(v, z.z, dt, limit, jnp.asarray(_CORNER, limit.dtype))
-        distance = v * dt
+        """State after `dt` [s] at constant `v` [m/s], of order 1, right at rest and in steady slip at any step.
+
+        First the memory, by how much of the step the contact slides at the limit there was, then the deflection.
+        """
+        corner, distance = jnp.asarray(_CORNER, z.z.dtype), v * dt
         moves = distance != 0
-        share = jnp.where(moves, 1.0 - (deflection - z.z) / jnp.where(moves, distance, 1.0), 0.0)
+        followed = follow(v, z.z, dt, self._limit(z.rise), corner) - z.z
+        share = jnp.where(moves, 1.0 - followed / jnp.where(moves, distance, 1.0), 0.0)
         slides, steady = self._slides(v, share), self._steady(v)
         missing = 1.0 - (steady + (z.rise - steady) * jnp.exp(-slides * dt / self.tau))
         missing = missing / (1.0 + (1.0 - slides) * dt * missing / self.gamma)
-        return ArmstrongState(deflection, 1.0 - missing)
+        rise = 1.0 - missing
+        return ArmstrongState(follow(v, z.z, dt, self._limit(rise), corner), rise)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ..numerics import Varying, ranges_of
 from ._law import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw
 
-_Law = TypeVar("_Law", bound=AbstractLaw)
+_Law = TypeVar("_Law")
 
 
 def _side(v: Float[Array, ""], forward: _Law, backward: _Law) -> _Law:
@@ -62,7 +62,7 @@ class _AsymmetricDynamic(AbstractDynamicLaw):
         """As the law is."""
         return self.forward.stiff
 
-    def state0(self, v: Float[Array, ""]) -> Any:
+    def state0(self, v: Float[Array, "..."]) -> Any:
         """State at rest and unloaded."""
         return self.forward.state0(v)
 
@@ -110,12 +110,13 @@ def asymmetric(law: _Law, **backward: Any) -> _Law:
     """
     inner = getattr(law, "law", None)
     if isinstance(inner, AbstractLaw):
-        return eqx.tree_at(lambda x: x.law, law, asymmetric(inner, **backward))
+        return eqx.tree_at(lambda x: x.law, cast(Any, law), asymmetric(inner, **backward))
     kinds = [wrapper for kind, wrapper in _KINDS if isinstance(law, kind)]
     if not kinds or hasattr(law, "forward"):
         given = "a law that is asymmetric already" if hasattr(law, "forward") else repr(law)
         raise ValueError(f"asymmetric needs a law with parameters of its own, but {given} was given.")
-    allowed = ranges_of(law)
+    module = cast(eqx.Module, law)
+    allowed = ranges_of(module)
     unknown = sorted(set(backward) - set(allowed))
     if unknown or not backward:
         raise ValueError(
@@ -127,7 +128,7 @@ def asymmetric(law: _Law, **backward: Any) -> _Law:
             raise ValueError(
                 f"asymmetric({type(law).__name__}): {name} stores energy, so it must be the same in both directions."
             )
-    converters = {f.name: f.metadata["converter"] for f in dataclasses.fields(law) if f.name in backward}
+    converters = {f.name: f.metadata["converter"] for f in dataclasses.fields(cast(Any, law)) if f.name in backward}
     values = [_like(getattr(law, name), converters[name](value)) for name, value in backward.items()]
     other = eqx.tree_at(
         lambda x: [getattr(x, name) for name in backward], law, values, is_leaf=lambda x: isinstance(x, Varying)

@@ -36,6 +36,5 @@ def follow(
     side = jnp.sign(v)
     u, y = side * z / limit, jnp.abs(v) * dt / limit
     straight = jnp.minimum(y, jnp.maximum(1.0 - corner - u, 0.0))
-    u = u + straight
-    bent = jnp.where(u >= 1.0 - corner, 1.0 + (u - 1.0) * jnp.exp(-(y - straight) / corner), u)
+    bent = 1.0 + (u + straight - 1.0) * jnp.exp(-(y - straight) / corner)
     return jnp.where(side == 0, z, side * limit * bent)

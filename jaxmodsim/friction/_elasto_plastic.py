@@ -67,7 +67,7 @@ class ElastoPlastic(AbstractDynamicLaw):
         span = jnp.clip((u - elastic) / (1.0 - elastic), 0.0, 1.0)
         return 0.5 - 0.5 * jnp.cos(jnp.pi * span)
 
-    def state0(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def state0(self, v: Float[Array, "..."]) -> Float[Array, "..."]:
         """Undeflected bristle, 0 m."""
         return jnp.zeros_like(v)
 

@@ -1,7 +1,7 @@
 """What a friction law is. Sign: the force is positive when it opposes positive slip."""
 
 import abc
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 from jaxtyping import Array, Bool, Float, PyTree
@@ -24,7 +24,9 @@ class AbstractLaw(eqx.Module):
         """Refuse parameters out of range."""
         check_ranges(self)
 
-    def at(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree) -> Self:
+    def at(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+    ) -> "AbstractLaw":
         """The law as it is at a state of the mechanism; another one only where `scaled_by` made it depend on that."""
         return settle(self, t, q, qd, params) if varies(self) else self
 

@@ -89,7 +89,7 @@ class MaxwellSlip(AbstractDynamicLaw):
         """Rate [1/s] at which an element beyond its limit falls back to it."""
         return self.C * self.Fc / jnp.sum(self.Fc) / limit
 
-    def state0(self, v: Float[Array, ""]) -> Float[Array, " n"]:
+    def state0(self, v: Float[Array, "..."]) -> Float[Array, " n"]:
         """Undeflected elements, 0 m."""
         return jnp.zeros(jnp.shape(nominal(self.k)), v.dtype)
 

@@ -9,10 +9,10 @@ import equinox as eqx
 from ..numerics import Varying, as_function, modules_of, ranges_of
 from ._law import AbstractLaw
 
-_Law = TypeVar("_Law", bound=AbstractLaw)
+_Law = TypeVar("_Law")
 
 
-def scaled_by(law: _Law, fn: Callable[..., Any], parameters: Sequence[str] | None = None) -> _Law:
+def scaled_by(law: _Law, fn: Any, parameters: Sequence[str] | None = None) -> _Law:
     """A law whose force, or some of whose parameters, are multiplied by a function of the mechanism's state.
 
     Friction that depends on position (`lambda t, q, qd, p: 1 + 0.2 * jnp.sin(q[0] / p["pitch"])`), on load or

@@ -1,7 +1,6 @@
 """Coulomb friction with stiction, Stribeck effect and viscous term."""
 
-from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -58,7 +57,7 @@ class Stribeck(AbstractSetValuedLaw):
     vs: Number = parameter("vs", "m/s", lower=0.0, strict=True)
     Fv: Number = parameter("Fv", "N s/m", lower=0.0, default=0.0)
     exponent: Number = parameter("exponent", "1", lower=0.0, strict=True, default=2.0)
-    fall: Callable[..., Array] = eqx.field(default=exponential, static=True)
+    fall: Any = eqx.field(default=exponential, static=True)
     stiff: ClassVar[bool] = False
 
     def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:

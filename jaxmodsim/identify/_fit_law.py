@@ -127,20 +127,20 @@ def law_force(
     dt = jnp.diff(t)
     v = jnp.diff(x) / dt
 
-    def at(t: Array, x: Array, v: Array, params: dict[str, Array]) -> Any:
+    def at(t: Array, x: Array, v: Array, params: Any) -> Any:
         return law.at(t, x[None], v[None], params)
 
-    def advance(z: Any, sample: tuple[Array, ...]) -> tuple[Any, Array]:
-        (*state, dt), v = sample, sample[2]
-        here = at(*state)
+    def advance(z: Any, sample: Any) -> tuple[Any, Array]:
+        t, x, v, params, dt = sample
+        here = at(t, x, v, params)
         if isinstance(here, AbstractForceLaw):
             return z, here.force(v)
         z = here.advance(v, z, dt)
         return z, here.force(v, z)
 
-    first = at(t[0], x[0], jnp.zeros_like(x[0]), jax.tree.map(lambda each: each[0], inputs or {}))
     rest = jnp.zeros_like(x[0])
-    z0 = None if isinstance(first, AbstractForceLaw) else first.state0(rest)
+    z0 = law.state0(rest) if isinstance(law, AbstractDynamicLaw) else None
+    first = at(t[0], x[0], rest, jax.tree.map(lambda each: each[0], inputs or {}))
     start = first.force(rest) if z0 is None else first.force(rest, z0)
     samples = (t[1:], x[1:], v, jax.tree.map(lambda each: each[1:], inputs or {}), dt)
     _, force = jax.lax.scan(advance, z0, samples)
