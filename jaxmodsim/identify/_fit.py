@@ -1,6 +1,7 @@
 """`fit`: numbers of a scene from a measured record."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ from jaxtyping import Array, ArrayLike
 
 from ..numerics import Range, check_ranges, modules_of
 from ..scene import Scene, State, check_scene, replace_numbers, scene_numbers, scene_ranges
+from ._entries import chosen_entries, join_entries, split_entries, split_ranges
 from ._fit_result import FitResult
 from ._least_squares import Progress, least_squares
 from ._parameters import FreeParameters
@@ -45,7 +47,8 @@ def fit(
 
     - `scene`: the model with start values; its `params` must be a dict with an entry for each input of the record.
     - `record`: the `Record`.
-    - `free`: names of the numbers to fit, as `jaxmodsim.scene.scene_numbers` gives them: `("m", "friction.Fc")`.
+    - `free`: names of the numbers to fit, as `jaxmodsim.scene.scene_numbers` gives them: `("m", "friction.Fc")`;
+      the name of an array stands for all its entries, `friction.k[0]` for one.
       Laws' parameters stay in their ranges.
     - `q0`, `qd0`: state at the first sample, shape `[dof]`; by default, for one coordinate, the first measured value
       and rest.
@@ -84,21 +87,22 @@ def fit(
         raise ValueError(f"{driven[0]} is driven by the record and cannot be free.")
     for _, module in modules_of(scene):
         check_ranges(module)
-    numbers = scene_numbers(scene)
+    whole = scene_numbers(scene)
+    numbers = split_entries(whole)
     limits = {name: Range("", limit, strict=True) for name, limit in (lower or {}).items()}
     for name, limit in limits.items():
         if name not in numbers or not bool(limit.holds(numbers[name], {})):
             raise ValueError(
                 f"lower: {name} must be {limit.text}, but it is {numbers.get(name, 'no number of the scene')}."
             )
-    ranges = scene_ranges(scene)
+    ranges = split_ranges(whole, scene_ranges(scene))
     for name, limit in limits.items():
         declared = ranges.get(name, limit)
         if isinstance(declared.lower, str):
             raise ValueError(f"lower: {name} is limited by {declared.lower} already.")
         tighter = declared.lower is None or float(limit.lower or 0.0) >= declared.lower
-        ranges[name] = Range(declared.unit, limit.lower, strict=True) if tighter else declared
-    parameters = FreeParameters.of(numbers, ranges, free)
+        ranges[name] = replace(declared, lower=limit.lower, strict=True) if tighter else declared
+    parameters = FreeParameters.of(numbers, ranges, chosen_entries(whole, free))
     start = [record.measured[0]] if q0 is None else q0
     position = jnp.asarray(start, float)
     velocity = jnp.zeros_like(position) if qd0 is None else jnp.asarray(qd0, float)
@@ -111,13 +115,13 @@ def fit(
 
     def residual(values: dict[str, Array], data: Any) -> Array:
         t, inputs, measured = data
-        model = replace_numbers(scene, values)
+        model = replace_numbers(scene, join_entries(whole, values))
         return replay(model, t, inputs, position, velocity, substeps, observe) - measured
 
     data = record.arrays
     estimate = least_squares(residual, parameters, data, rtol=rtol, max_steps=max_steps, progress=progress)
     units = {name: allowed.unit for name, allowed in ranges.items()}
-    model = replace_numbers(scene, estimate.found)
+    model = replace_numbers(scene, join_entries(whole, estimate.found))
     t, inputs, measured = data
     fine = replay(model, t, inputs, position, velocity, 4 * substeps, observe) - measured
     step_error = float(jnp.sqrt(jnp.mean((fine - estimate.residual) ** 2)))

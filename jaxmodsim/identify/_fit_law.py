@@ -1,6 +1,7 @@
 """`fit_law`: parameters of a friction law from measured motion and force, without a mechanism."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ from ..effects import Friction
 from ..friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw
 from ..numerics import Range, varies
 from ..scene import Scene, replace_numbers, scene_numbers, scene_ranges
+from ._entries import chosen_entries, join_entries, split_entries, split_ranges
 from ._fit_result import FitResult
 from ._least_squares import Progress, least_squares
 from ._parameters import FreeParameters
@@ -37,8 +39,9 @@ def fit_law(
     - `record`: `measured` is the friction force [N], positive when it opposes positive slip; `inputs` holds the slip
       displacement `x` [m] and, if the law's forces are per newton of load, the normal load `normal` [N]. The law
       starts at rest and unloaded.
-    - `free`: names of the law's parameters to fit; by default all but those that start on their limit (`sigma1 = 0`)
-      and the `width` of a wrapper, which is how the law is run and not what it is.
+    - `free`: names of the law's parameters to fit, `k[0]` for one entry of an array; by default all but those that
+      start on their limit (`sigma1 = 0`) and the `width` of a wrapper and the `corner` of Maxwell slip, which are how
+      the law is run and not what it is.
     - `rtol`, `max_steps`, `progress`: see `fit`.
 
     **Returns:**
@@ -65,11 +68,14 @@ def fit_law(
     ranges = {}
     for name, allowed in scene_ranges(holder).items():
         lower = allowed.lower.removeprefix(prefix) if isinstance(allowed.lower, str) else allowed.lower
-        ranges[name.removeprefix(prefix)] = type(allowed)(allowed.unit, lower, allowed.strict)
-    parameters = FreeParameters.of(numbers, ranges, _off_limits(numbers, ranges) if free is None else free)
+        ranges[name.removeprefix(prefix)] = replace(allowed, lower=lower)
+    single, ranges = split_entries(numbers), split_ranges(numbers, ranges)
+    chosen = _off_limits(single, ranges) if free is None else chosen_entries(numbers, free)
+    parameters = FreeParameters.of(single, ranges, chosen)
 
     def with_values(values: dict[str, Array]) -> AbstractLaw:
-        friction = replace_numbers(holder, {prefix + name: value for name, value in values.items()}).effects[0]
+        whole = {prefix + name: value for name, value in join_entries(numbers, values).items()}
+        friction = replace_numbers(holder, whole).effects[0]
         assert isinstance(friction, Friction)
         return friction.law
 
@@ -92,7 +98,7 @@ def _off_limits(numbers: dict[str, Array], ranges: dict[str, Range]) -> tuple[st
     for name, value in numbers.items():
         lower = ranges[name].lower if name in ranges else None
         limit = numbers[lower] if isinstance(lower, str) else lower
-        if name != "width" and (limit is None or bool(value > limit)):
+        if name not in ("width", "corner") and (limit is None or bool(value > limit)):
             free.append(name)
     return tuple(free)
 

@@ -1,5 +1,6 @@
 """Free parameters: kept in their ranges by a transform to numbers without limits."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,21 +14,24 @@ from ..numerics import Range
 
 @dataclass(frozen=True)
 class FreeParameters:
-    """Names, start values and lower limits of the parameters of a fit.
+    """Names, start values and limits of the parameters of a fit.
 
-    A parameter with a lower limit is `limit + (start - limit) exp(x)`, one without is `start + scale x`, with x
-    free and zero at the start. A limit may be another parameter (Fs >= Fc). One that is not free itself, but whose
-    limit is, keeps its distance from the limit: with Fs = Fc at the start, it stays so.
+    A parameter with a lower limit is `limit + (start - limit) exp(x)`, one with an upper limit as well moves between
+    them by a logistic function, one without is `start + scale x`, with x free and zero at the start. A lower limit may
+    be another parameter (Fs >= Fc). One that is not free itself, but whose limit is, keeps its distance from the limit:
+    with Fs = Fc at the start, it stays so.
 
-    - `names`: of the free parameters, each after its limit.
-    - `start`: values at the start, of these and of the ones that follow them.
+    - `names`: of the free parameters, in the order they were given.
+    - `start`: values at the start, of these and of the ones that follow them, each after its limit.
     - `limits`: lower limit of each, if it has one: a number or a name.
+    - `upper`: upper limits of those that have one.
     - `following`: names of the parameters that are not free but follow one that is.
     """
 
     names: tuple[str, ...]
     start: dict[str, float]
     limits: dict[str, float | str | None]
+    upper: dict[str, float]
     following: tuple[str, ...]
 
     @staticmethod
@@ -48,6 +52,11 @@ class FreeParameters:
             if jnp.shape(numbers[name]) != ():
                 raise ValueError(f"{name} is an array of shape {jnp.shape(numbers[name])}; only single numbers fit.")
         values = {name: float(x) for name, x in numbers.items() if jnp.shape(x) == ()}
+        following: list[str] = []
+        while more := [
+            name for name, r in ranges.items() if name not in (*free, *following) and r.lower in (*free, *following)
+        ]:
+            following += more
         limits: dict[str, float | str | None] = {}
         for name in free:
             limit = ranges[name].lower if name in ranges else None
@@ -56,26 +65,39 @@ class FreeParameters:
                 shown = f"{limit} = {lower:g}" if isinstance(limit, str) else f"{lower:g}"
                 raise ValueError(f"The start {name} = {values[name]:g} must lie above its limit {shown}.")
             # A limit that is fixed is a number.
-            limits[name] = limit if limit in free else lower
-        order = sorted(free, key=lambda name: isinstance(limits[name], str))
-        following = tuple(name for name, r in ranges.items() if name not in free and r.lower in free)
+            limits[name] = limit if limit in (*free, *following) else lower
         limits |= {name: ranges[name].lower for name in following}
-        return FreeParameters(tuple(order), {name: values[name] for name in (*order, *following)}, limits, following)
+        order: list[str] = []
+        for name in (*free, *following):
+            chain, limit = [name], limits[name]
+            while isinstance(limit, str) and limit not in order:
+                chain.append(limit)
+                limit = limits[limit]
+            order += [each for each in reversed(chain) if each not in order]
+        upper = {name: ranges[name].upper for name in free if name in ranges and ranges[name].upper is not None}
+        for name, most in upper.items():
+            if values[name] >= most or isinstance(limits[name], str):
+                raise ValueError(f"The start {name} = {values[name]:g} must lie below its limit {most:g}.")
+        return FreeParameters(tuple(free), {name: values[name] for name in order}, limits, upper, tuple(following))
 
     def values(self, x: Float[Array, " free"]) -> dict[str, Array]:
         """The parameters at `x`, and those that follow them."""
         values: dict[str, Array] = {}
-        for i, name in enumerate(self.names):
-            limit, start = self.limits[name], self.start[name]
+        for name, start in self.start.items():
+            limit = self.limits[name]
+            if name in self.following:
+                values[name] = values[str(limit)] + (start - self.start[str(limit)])
+                continue
+            here = x[self.names.index(name)]
             if limit is None:
-                values[name] = start + max(abs(start), 1.0) * x[i]
+                values[name] = start + max(abs(start), 1.0) * here
             elif isinstance(limit, str):
-                values[name] = values[limit] + (start - self.start[limit]) * jnp.exp(x[i])
+                values[name] = values[limit] + (start - self.start[limit]) * jnp.exp(here)
+            elif name in self.upper:
+                span = self.upper[name] - limit
+                values[name] = limit + span * jax.nn.sigmoid(here + math.log((start - limit) / (limit + span - start)))
             else:
-                values[name] = limit + (start - limit) * jnp.exp(x[i])
-        for name in self.following:
-            limit = str(self.limits[name])
-            values[name] = values[limit] + (self.start[name] - self.start[limit])
+                values[name] = limit + (start - limit) * jnp.exp(here)
         return values
 
     def vector(self, x: Float[Array, " free"]) -> Float[Array, " free"]:
