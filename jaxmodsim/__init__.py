@@ -10,6 +10,8 @@ from .analysis import energy_audit as energy_audit
 from .effects import AbstractEffect as AbstractEffect
 from .effects import AppliedForce as AppliedForce
 from .effects import Friction as Friction
+from .export import to_modelica as to_modelica
+from .export import to_mujoco as to_mujoco
 from .friction import Armstrong as Armstrong
 from .friction import Coulomb as Coulomb
 from .friction import Curve as Curve

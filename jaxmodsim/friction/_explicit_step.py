@@ -1,6 +1,7 @@
 """How large a step an explicit solver can take with a law."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
@@ -13,6 +14,8 @@ from jaxtyping import Array, Complex, Float
 from ._law import AbstractDynamicLaw, AbstractForceLaw, AbstractHoldingLaw, AbstractLaw, AbstractSetValuedLaw
 from ._passivity import need_values
 from ._sign import Sign
+
+_Part = Callable[[Array, Array], Array]
 
 # How far the stability functions of all explicit methods in use are searched, and in which steps.
 _REACH, _GRID = 100.0, 20_000
@@ -70,17 +73,7 @@ def explicit_step(
 def _matrix(law: AbstractLaw, m: float | None, v: float, k: float, z: Any) -> Float[np.ndarray, "n n"]:
     """Derivative of the rates of (v, x, z) by these, of what there is of them, at slip velocity `v` [m/s]."""
     speed = jnp.asarray(float(v))
-    if isinstance(law, AbstractDynamicLaw):
-        state = _steady(law, speed) if z is None else z
-        own, unravel = jax.flatten_util.ravel_pytree(state)
-        force = lambda v, own: law.force(v, unravel(own))  # noqa: E731
-        rate = lambda v, own: jax.flatten_util.ravel_pytree(law.rate(v, unravel(own)))[0]  # noqa: E731
-    elif isinstance(law, AbstractForceLaw) and not isinstance(law, Sign):
-        own = jnp.zeros(0)
-        force = lambda v, own: law.force(v)  # noqa: E731
-        rate = lambda v, own: own  # noqa: E731
-    else:
-        raise ValueError(_refusal(law))
+    own, force, rate = _parts(law, speed, z)
     if m is None:
         return np.asarray(jax.jacfwd(lambda own: rate(speed, own))(own), float)
 
@@ -91,6 +84,33 @@ def _matrix(law: AbstractLaw, m: float | None, v: float, k: float, z: Any) -> Fl
 
     matrix = np.asarray(jax.jacfwd(field)(jnp.concatenate([jnp.stack([speed, jnp.zeros_like(speed)]), own])), float)
     return matrix if k > 0 else np.delete(np.delete(matrix, 1, 0), 1, 1)
+
+
+def _parts(law: AbstractLaw, v: Float[Array, ""], z: Any) -> tuple[Array, _Part, _Part]:
+    """The law's own state in a vector, and its force and rate as functions of velocity and that vector."""
+    if isinstance(law, AbstractDynamicLaw):
+        own, unravel = jax.flatten_util.ravel_pytree(_steady(law, v) if z is None else z)
+
+        def force(v: Array, own: Array) -> Array:
+            return law.force(v, unravel(own))
+
+        def rate(v: Array, own: Array) -> Array:
+            return jax.flatten_util.ravel_pytree(law.rate(v, unravel(own)))[0]
+
+    elif isinstance(law, AbstractForceLaw) and not isinstance(law, Sign):
+        own = jnp.zeros(0)
+
+        def force(v: Array, own: Array) -> Array:
+            del own
+            return law.force(v)
+
+        def rate(v: Array, own: Array) -> Array:
+            del v
+            return own
+
+    else:
+        raise ValueError(_refusal(law))
+    return own, force, rate
 
 
 def _steady(law: AbstractDynamicLaw, v: Float[Array, ""]) -> Any:
@@ -125,8 +145,8 @@ def _weights(solver: Any) -> tuple[list[np.ndarray], np.ndarray]:
     tableau = solver if isinstance(solver, dfx.ButcherTableau) else getattr(solver, "tableau", None)
     if not isinstance(tableau, dfx.ButcherTableau) or tableau.implicit:
         raise ValueError(
-            f"explicit_step needs an explicit Runge-Kutta solver, such as diffrax.Heun() or diffrax.Tsit5(), or its"
-            f" ButcherTableau, but {solver!r} was given. Implicit solvers, such as Rodas5P, take stiff laws at any step."
+            "explicit_step needs an explicit Runge-Kutta solver, such as diffrax.Heun() or diffrax.Tsit5(), or its"
+            f" ButcherTableau, but {solver!r} was given. Implicit solvers such as Rodas5P take stiff laws at any step."
         )
     return [np.asarray(row, float) for row in tableau.a_lower], np.asarray(tableau.b_sol, float)
 

@@ -133,6 +133,7 @@ def need_values(law: AbstractLaw, wanted: str) -> None:
 
 @singledispatch
 def _judge(law: Any, v_max: float) -> Passivity:
+    del v_max
     raise ValueError(f"passive knows nothing of laws such as {type(law).__name__}.")
 
 
