@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
@@ -19,6 +20,11 @@ _Part = Callable[[Array, Array], Array]
 
 # How far the stability functions of all explicit methods in use are searched, and in which steps.
 _REACH, _GRID = 100.0, 20_000
+# Slip [m] that brings a law to its steady state, in steps, and steps of Newton's method after that.
+_DISTANCES = np.geomspace(1e-9, 1.0, 10)
+_NEWTON = 5
+# Relative distance from the steady state at which the law is linearised, on either side.
+_BESIDE = 1e-6
 # Growth per step that counts as rounding, and bounds on |h lambda| that count as none at all.
 _ROUNDING, _NOTHING = 1e-12, 1e-2
 
@@ -63,17 +69,23 @@ def explicit_step(
             f"explicit_step needs m > 0 [kg] or None, k >= 0 [N/m] (with a mass); given: {m=}, {k=}, {v=}."
         )
     weights = _weights(dfx.Euler() if solver is None else solver)
-    eigenvalues = np.linalg.eigvals(_matrix(law, m, v, k, z))
-    scale = np.abs(eigenvalues).max(initial=0.0)
-    # Rounding must not make an undamped vibration one that grows.
-    decaying = eigenvalues[(eigenvalues.real <= 1e-12 * scale) & (np.abs(eigenvalues) > 1e-12 * scale)]
-    return min((float(_reach(weights, complex(x)) / abs(x)) for x in decaying), default=math.inf)
-
-
-def _matrix(law: AbstractLaw, m: float | None, v: float, k: float, z: Any) -> Float[np.ndarray, "n n"]:
-    """Derivative of the rates of (v, x, z) by these, of what there is of them, at slip velocity `v` [m/s]."""
     speed = jnp.asarray(float(v))
     own, force, rate = _parts(law, speed, z)
+    steps = [math.inf]
+    # Some laws have a kink at the limit that steady slip tends to: both sides of it count.
+    for beside in (own * (1.0 - _BESIDE), own * (1.0 + _BESIDE)):
+        eigenvalues = np.linalg.eigvals(_matrix(force, rate, m, speed, k, beside))
+        scale = np.abs(eigenvalues).max(initial=0.0)
+        # Rounding must not make an undamped vibration one that grows.
+        decaying = eigenvalues[(eigenvalues.real <= 1e-12 * scale) & (np.abs(eigenvalues) > 1e-12 * scale)]
+        steps += [float(_reach(weights, complex(x)) / abs(x)) for x in decaying]
+    return min(steps)
+
+
+def _matrix(
+    force: _Part, rate: _Part, m: float | None, speed: Float[Array, ""], k: float, own: Float[Array, " state"]
+) -> Float[np.ndarray, "n n"]:
+    """Derivative of the rates of (v, x, own state) by these, of what there is of them."""
     if m is None:
         return np.asarray(jax.jacfwd(lambda own: rate(speed, own))(own), float)
 
@@ -89,7 +101,7 @@ def _matrix(law: AbstractLaw, m: float | None, v: float, k: float, z: Any) -> Fl
 def _parts(law: AbstractLaw, v: Float[Array, ""], z: Any) -> tuple[Array, _Part, _Part]:
     """The law's own state in a vector, and its force and rate as functions of velocity and that vector."""
     if isinstance(law, AbstractDynamicLaw):
-        own, unravel = jax.flatten_util.ravel_pytree(_steady(law, v) if z is None else z)
+        own, unravel = jax.flatten_util.ravel_pytree(_start(law, v) if z is None else z)
 
         def force(v: Array, own: Array) -> Array:
             return law.force(v, unravel(own))
@@ -113,14 +125,28 @@ def _parts(law: AbstractLaw, v: Float[Array, ""], z: Any) -> tuple[Array, _Part,
     return own, force, rate
 
 
-def _steady(law: AbstractDynamicLaw, v: Float[Array, ""]) -> Any:
+def _start(law: AbstractDynamicLaw, v: Float[Array, ""]) -> Any:
     """State of steady slip at `v` [m/s], and at rest the unloaded one."""
+    return law.state0(v) if v == 0 else _steady(law, v)
+
+
+@eqx.filter_jit
+def _steady(law: AbstractDynamicLaw, v: Float[Array, ""]) -> Any:
+    """State of steady slip at `v` [m/s], not zero."""
     z = law.state0(v)
-    if v == 0:
-        return z
-    for _ in range(4):  # once is exact for most laws; those that split their step come close from there
-        z = law.advance(v, z, 1e6 / jnp.abs(v))
-    return z
+    for distance in _DISTANCES:
+        z = law.advance(v, z, distance / jnp.abs(v))
+    # Long steps of laws that split them end beside the steady state: Newton's method closes the rest.
+    own, unravel = jax.flatten_util.ravel_pytree(z)
+
+    def rate(own: Array) -> Array:
+        return jax.flatten_util.ravel_pytree(law.rate(v, unravel(own)))[0]
+
+    for _ in range(_NEWTON):
+        move = jnp.linalg.lstsq(jax.jacfwd(rate)(own), rate(own))[0]
+        better = jnp.max(jnp.abs(rate(own - move))) < jnp.max(jnp.abs(rate(own)))
+        own = jnp.where(better, own - move, own)
+    return unravel(own)
 
 
 def _refusal(law: AbstractLaw) -> str:
