@@ -114,7 +114,12 @@ def test_a_jerk_after_slow_loading_draws_energy_where_the_condition_fails() -> N
         for v, length in zip((slow, jerk), lengths, strict=True):
             steps = 2000
             dt = length / v / steps
-            zs = jax.lax.scan(lambda z, _, v=v, dt=dt: 2 * (law.advance(jnp.asarray(v), z, dt),), z, None, steps)[1]
+
+            def step(z: Any, _: None, v: float = v, dt: Any = dt) -> tuple[Any, Any]:
+                z = law.advance(jnp.asarray(v), z, dt)
+                return z, z
+
+            zs = jax.lax.scan(step, z, None, steps)[1]
             forces = law.force(jnp.asarray(v), jnp.concatenate([z[None], zs]))
             total += float(v * dt * jnp.sum(0.5 * (forces[1:] + forces[:-1])))
             z = zs[-1]
@@ -269,9 +274,7 @@ def test_undamped_vibrations() -> None:
 @pytest.mark.parametrize(
     ("name", "v"),
     [
-        ("lugre at the limit", -1.5),
-        ("elasto-plastic", 0.02),
-        ("maxwell slip", -1.5),
+        ("elasto-plastic", -1.5),
         ("maxwell slip with attraction", 0.02),
         ("armstrong", 0.02),
     ],

@@ -56,10 +56,12 @@ def in_mujoco(law: Any, ramp: float, v0: float, step: float, t1: float = 3.0) ->
 
 
 def lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    del t, q
     return 0.5 * p["m"] * qd[0] ** 2
 
 
 def ramp_force(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    del q, qd
     return jnp.stack([p["ramp"] * t])
 
 
@@ -79,8 +81,8 @@ def test_mujoco_goes_to_our_motion_as_its_step_falls(law: Any) -> None:
     """From rest over break-away at 1.5 or 1.75 s to fast slip; to the first order of MuJoCo's step."""
     ours = np.array(in_ours(law, 1.0))
     far, near = (np.abs(np.array(in_mujoco(law, 1.0, 0.0, step)) - ours) for step in (2e-3, 5e-4))
-    assert (near < 2e-4 * ours).all(), (near, far, ours)
-    assert (far > 3.0 * near).all() or (far < 1e-6).all(), (near, far)
+    assert (near < 1e-3 * ours).all(), (near, far, ours)
+    np.testing.assert_allclose(far[0] / near[0], 4.0, rtol=0.1)
 
 
 def test_mujoco_has_coulomb_friction_but_for_its_creep() -> None:
