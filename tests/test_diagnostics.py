@@ -107,23 +107,21 @@ def test_fading_damping_needs_what_a_search_over_all_states_finds(vd: float) -> 
 def test_a_jerk_after_slow_loading_draws_energy_where_the_condition_fails() -> None:
     """The work done on a law from its unloaded state is never negative if it is passive, and else it can be."""
 
+    @jax.jit
+    def push(law: jms.LuGre, z: jax.Array, v: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """State after the slip `length` at v, and the work for it."""
+        dt = length / v / 2000
+
+        def step(z: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
+            after = law.advance(v, z, dt)
+            return after, 0.5 * v * dt * (law.force(v, z) + law.force(v, after))
+
+        z, works = jax.lax.scan(step, z, None, 2000)
+        return z, jnp.sum(works)
+
     def work(law: jms.LuGre, jerk: float) -> float:
-        slow = 1e-3 * float(law.vs)
-        lengths = [8.0 * law.Fs / law.sigma0, 0.5 * law.Fc / law.sigma0]
-        z, total = jnp.zeros(()), 0.0
-        for v, length in zip((slow, jerk), lengths, strict=True):
-            steps = 2000
-            dt = length / v / steps
-
-            def step(z: Any, _: None, v: float = v, dt: Any = dt) -> tuple[Any, Any]:
-                z = law.advance(jnp.asarray(v), z, dt)
-                return z, z
-
-            zs = jax.lax.scan(step, z, None, steps)[1]
-            forces = law.force(jnp.asarray(v), jnp.concatenate([z[None], zs]))
-            total += float(v * dt * jnp.sum(0.5 * (forces[1:] + forces[:-1])))
-            z = zs[-1]
-        return total
+        z, loading = push(law, jnp.zeros(()), 1e-3 * law.vs, 8.0 * law.Fs / law.sigma0)
+        return float(loading + push(law, z, jnp.asarray(jerk), 0.5 * law.Fc / law.sigma0)[1])
 
     failing = jms.LuGre(**{**BOX, "sigma2": 0.5})
     jerks = [work(failing, jerk) for jerk in (1e3, 1e4)]
@@ -282,19 +280,22 @@ def test_undamped_vibrations() -> None:
 def test_every_bristle_has_a_step_that_runs(name: str, v: float) -> None:
     """Euler at a prescribed velocity, from the steady state and a small deviation."""
     law, speed = BRISTLES[name], jnp.asarray(v)
-    steady = lambda z, _: (law.advance(speed, z, jnp.asarray(1e-4 / abs(v))), None)  # noqa: E731
-    z = jax.lax.scan(steady, law.state0(speed), None, 20_000)[0]
-    h = explicit_step(law, v=v)
-    assert 0 < h < math.inf
 
     @jax.jit
-    def off(step: float) -> jax.Array:
+    def euler(z: Any, step: float, steps: int) -> Any:
+        return jax.lax.fori_loop(
+            0, steps, lambda _, z: jax.tree.map(lambda a, b: a + step * b, z, law.rate(speed, z)), z
+        )
+
+    h = explicit_step(law, v=v)
+    assert 0 < h < math.inf
+    z = euler(law.state0(speed), 0.3 * h, 100_000)
+
+    def off(step: float) -> float:
         """Largest relative deviation of a deflection in the end, from 1e-6 at the beginning."""
-        start = jax.tree.map(lambda z: z * (1.0 - 1e-6), z)
-        move = lambda z, _: (jax.tree.map(lambda a, b: a + step * b, z, law.rate(speed, z)), None)  # noqa: E731
-        end = jax.lax.scan(move, start, None, 400)[0]
+        end = euler(jax.tree.map(lambda z: z * (1.0 - 1e-6), z), step, 400)
         a, b = jax.tree.leaves(end)[0], jax.tree.leaves(z)[0]
-        return jnp.max(jnp.abs(a - b) / jnp.abs(b))
+        return float(jnp.max(jnp.abs(a - b) / jnp.abs(b)))
 
     assert off(0.99 * h) < 5e-7
     # With attraction the step is that of the stiffer side of a kink, and the other side damps.

@@ -70,11 +70,15 @@ def explicit_step(
         )
     weights = _weights(dfx.Euler() if solver is None else solver)
     speed = jnp.asarray(float(v))
-    own, force, rate = _parts(law, speed, z)
+    if isinstance(law, AbstractDynamicLaw) and z is None:
+        z = law.state0(speed) if v == 0 else _steady(law, speed)
+    # As arrays, so that other numbers compile nothing anew.
+    mass = None if m is None else jnp.asarray(float(m))
     steps = [math.inf]
-    # Some laws have a kink at the limit that steady slip tends to: both sides of it count.
-    for beside in (own * (1.0 - _BESIDE), own * (1.0 + _BESIDE)):
-        eigenvalues = np.linalg.eigvals(_matrix(force, rate, m, speed, k, beside))
+    for matrix in np.asarray(_matrices(law, mass, speed, jnp.asarray(float(k)), z), float):
+        # Without a spring the displacement only follows, and its zero eigenvalue counts for nothing.
+        matrix = matrix if k > 0 or m is None else matrix[1:, 1:]
+        eigenvalues = np.linalg.eigvals(matrix)
         scale = np.abs(eigenvalues).max(initial=0.0)
         # Rounding must not make an undamped vibration one that grows.
         decaying = eigenvalues[(eigenvalues.real <= 1e-12 * scale) & (np.abs(eigenvalues) > 1e-12 * scale)]
@@ -82,26 +86,32 @@ def explicit_step(
     return min(steps)
 
 
-def _matrix(
-    force: _Part, rate: _Part, m: float | None, speed: Float[Array, ""], k: float, own: Float[Array, " state"]
-) -> Float[np.ndarray, "n n"]:
-    """Derivative of the rates of (v, x, own state) by these, of what there is of them."""
-    if m is None:
-        return np.asarray(jax.jacfwd(lambda own: rate(speed, own))(own), float)
+@eqx.filter_jit
+def _matrices(
+    law: AbstractLaw, m: Float[Array, ""] | None, v: Float[Array, ""], k: Float[Array, ""], z: Any
+) -> Float[Array, "2 n n"]:
+    """Derivatives of the rates of (x, v, own state) by these, of the own state alone without a mass.
+
+    Some laws have a kink at the limit that steady slip tends to: beside the state `z`, on either side of it.
+    """
+    own, force, rate = _parts(law, z)
 
     def field(y: Float[Array, " n"]) -> Float[Array, " n"]:
-        v, x, own = y[0], y[1], y[2:]
-        # Only the slope counts, so the spring and the force that hold this motion are left out.
-        return jnp.concatenate([jnp.stack([-(k * x + force(v, own)) / m, v]), rate(v, own)])
+        if m is None:
+            return rate(v, y)
+        x, v_, own = y[0], y[1], y[2:]
+        # Only the slope counts, so the force that keeps this motion up is left out.
+        return jnp.concatenate([jnp.stack([v_, -(k * x + force(v_, own)) / m]), rate(v_, own)])
 
-    matrix = np.asarray(jax.jacfwd(field)(jnp.concatenate([jnp.stack([speed, jnp.zeros_like(speed)]), own])), float)
-    return matrix if k > 0 else np.delete(np.delete(matrix, 1, 0), 1, 1)
+    motion = jnp.zeros(0) if m is None else jnp.stack([jnp.zeros_like(v), v])
+    sides = [own * (1.0 - _BESIDE), own * (1.0 + _BESIDE)]
+    return jnp.stack([jax.jacfwd(field)(jnp.concatenate([motion, side])) for side in sides])
 
 
-def _parts(law: AbstractLaw, v: Float[Array, ""], z: Any) -> tuple[Array, _Part, _Part]:
+def _parts(law: AbstractLaw, z: Any) -> tuple[Array, _Part, _Part]:
     """The law's own state in a vector, and its force and rate as functions of velocity and that vector."""
     if isinstance(law, AbstractDynamicLaw):
-        own, unravel = jax.flatten_util.ravel_pytree(_start(law, v) if z is None else z)
+        own, unravel = jax.flatten_util.ravel_pytree(z)
 
         def force(v: Array, own: Array) -> Array:
             return law.force(v, unravel(own))
@@ -125,28 +135,24 @@ def _parts(law: AbstractLaw, v: Float[Array, ""], z: Any) -> tuple[Array, _Part,
     return own, force, rate
 
 
-def _start(law: AbstractDynamicLaw, v: Float[Array, ""]) -> Any:
-    """State of steady slip at `v` [m/s], and at rest the unloaded one."""
-    return law.state0(v) if v == 0 else _steady(law, v)
-
-
 @eqx.filter_jit
 def _steady(law: AbstractDynamicLaw, v: Float[Array, ""]) -> Any:
     """State of steady slip at `v` [m/s], not zero."""
     z = law.state0(v)
-    for distance in _DISTANCES:
-        z = law.advance(v, z, distance / jnp.abs(v))
+    distances = jnp.asarray(_DISTANCES, v.dtype)
+    z = jax.lax.scan(lambda z, distance: (law.advance(v, z, distance / jnp.abs(v)), None), z, distances)[0]
     # Long steps of laws that split them end beside the steady state: Newton's method closes the rest.
     own, unravel = jax.flatten_util.ravel_pytree(z)
 
     def rate(own: Array) -> Array:
         return jax.flatten_util.ravel_pytree(law.rate(v, unravel(own)))[0]
 
-    for _ in range(_NEWTON):
+    def newton(_: Any, own: Array) -> Array:
         move = jnp.linalg.lstsq(jax.jacfwd(rate)(own), rate(own))[0]
         better = jnp.max(jnp.abs(rate(own - move))) < jnp.max(jnp.abs(rate(own)))
-        own = jnp.where(better, own - move, own)
-    return unravel(own)
+        return jnp.where(better, own - move, own)
+
+    return unravel(jax.lax.fori_loop(0, _NEWTON, newton, own))
 
 
 def _refusal(law: AbstractLaw) -> str:
