@@ -19,7 +19,7 @@ from ..friction import (
 )
 from ._numbers import need_numbers
 
-# As hard as MuJoCo's dry friction gets: with its default the joint creeps some five hundred times faster.
+# As hard as MuJoCo's dry friction gets: with its default the joint creeps a thousand times faster.
 _HARD = "0.9999 0.9999 0.001"
 
 # What MuJoCo lacks of the laws that it has not, and what to do.

@@ -25,7 +25,7 @@ _DISTANCES = np.geomspace(1e-9, 1.0, 10)
 _NEWTON = 5
 # Relative distance from the steady state at which the law is linearised, on either side.
 _BESIDE = 1e-6
-# Growth per step that counts as rounding, and bounds on |h lambda| that count as none at all.
+# Growth per step that counts as rounding, and the bound on |h lambda| below which an undamped vibration has no step.
 _ROUNDING, _NOTHING = 1e-12, 1e-2
 
 
@@ -206,4 +206,5 @@ def _reach(weights: tuple[list[np.ndarray], np.ndarray], eigenvalue: complex) ->
         if i == 0:
             break
         grid = np.linspace(grid[i - 1], grid[i], _GRID + 1)
-    return float(grid[0]) if grid[0] > _NOTHING else 0.0
+    undamped = abs(direction.real) < _ROUNDING
+    return 0.0 if undamped and grid[0] < _NOTHING else float(grid[0])
