@@ -10,6 +10,8 @@ from .analysis import energy_audit as energy_audit
 from .effects import AbstractEffect as AbstractEffect
 from .effects import AppliedForce as AppliedForce
 from .effects import Friction as Friction
+from .export import to_modelica as to_modelica
+from .export import to_mujoco as to_mujoco
 from .friction import Armstrong as Armstrong
 from .friction import Coulomb as Coulomb
 from .friction import Curve as Curve
@@ -23,6 +25,10 @@ from .friction import Sign as Sign
 from .friction import Stribeck as Stribeck
 from .friction import Viscous as Viscous
 from .friction import asymmetric as asymmetric
+from .friction import damping_sigma1 as damping_sigma1
+from .friction import explicit_step as explicit_step
+from .friction import passive as passive
+from .friction import regularized_width as regularized_width
 from .friction import scaled_by as scaled_by
 from .identify import FitResult as FitResult
 from .identify import Record as Record

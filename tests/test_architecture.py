@@ -15,6 +15,7 @@ _CORE = ("numerics", "mechanics", "friction", "effects", "scene", "solvers", "si
 # What each layer may import besides itself. The package's own `__init__` and `_speed` stand outside.
 ALLOWED: dict[str, set[str]] = {layer: set(_CORE[:i]) for i, layer in enumerate(_CORE)}
 ALLOWED["problems"] = {"numerics", "mechanics", "friction", "effects", "scene"}
+ALLOWED["export"] = {"numerics", "friction"}
 ALLOWED["analysis"] = set(_CORE)
 ALLOWED["identify"] = set(_CORE)
 ALLOWED["plot"] = {*_CORE, "problems", "identify"}

@@ -8,6 +8,7 @@ from ._curve import Curve as Curve
 from ._dahl import Dahl as Dahl
 from ._dead_zone import DeadZone as DeadZone
 from ._elasto_plastic import ElastoPlastic as ElastoPlastic
+from ._explicit_step import explicit_step as explicit_step
 from ._law import AbstractDynamicLaw as AbstractDynamicLaw
 from ._law import AbstractForceLaw as AbstractForceLaw
 from ._law import AbstractHoldingLaw as AbstractHoldingLaw
@@ -16,10 +17,15 @@ from ._law import AbstractPlanarLaw as AbstractPlanarLaw
 from ._law import AbstractSetValuedLaw as AbstractSetValuedLaw
 from ._lugre import LuGre as LuGre
 from ._maxwell_slip import MaxwellSlip as MaxwellSlip
+from ._passivity import Passivity as Passivity
+from ._passivity import passive as passive
 from ._regularized import Regularized as Regularized
 from ._scaled import scaled_by as scaled_by
 from ._sign import Sign as Sign
 from ._stribeck import Stribeck as Stribeck
 from ._stribeck import exponential as exponential
 from ._stribeck import lorentzian as lorentzian
+from ._tuning import Width as Width
+from ._tuning import damping_sigma1 as damping_sigma1
+from ._tuning import regularized_width as regularized_width
 from ._viscous import Viscous as Viscous

@@ -1,0 +1,138 @@
+"""Laws as the Modelica Standard Library has them."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..friction import (
+    AbstractDynamicLaw,
+    AbstractHoldingLaw,
+    AbstractLaw,
+    AbstractSetValuedLaw,
+    Regularized,
+    Sign,
+    Viscous,
+)
+from ._numbers import need_numbers
+
+# Speeds at which the table is held against the law, spaced evenly in the logarithm over so many decades, and evenly.
+_POINTS, _DECADES = 6000, 12
+# Part of the tolerance that is used, for what lies between those speeds.
+_SHARE = 0.9
+_ONE_WAY = "friction that depends on the direction: export the law of one direction, or the mean of both"
+
+Table = Float[np.ndarray, "row 2"]
+
+
+def to_modelica(
+    law: AbstractLaw, v_max: float, *, name: str = "friction", rtol: float = 1e-3, rotary: bool = False
+) -> str:
+    """Declaration of the Modelica Standard Library's friction component with the numbers of a law.
+
+    `SupportFriction` (translational) and `BearingFriction` (rotational) are set-valued laws, run exactly by
+    events, as here: a table of the force in slip over the speed, interpolated linearly, and the limit of stick as a
+    multiple (`peak`) of the table's first force. The rows are placed where the law bends.
+
+    **Arguments:**
+
+    - `law`: `Coulomb`, `Stribeck` or another set-valued law, the same in both directions, or `Viscous`.
+    - `v_max`: speed up to which the table follows the law [m/s or rad/s], > 0; the component extends its last segment.
+    - `name`: name of the component, a Modelica identifier.
+    - `rtol`: largest error of the interpolated force relative to the law's, > 0 and < 1.
+    - `rotary`: whether for a rotary axis.
+
+    **Returns:**
+
+    One declaration, for a model of the library's versions 3 and 4.
+
+    **Raises:**
+
+    - `ValueError` if the component has not the law, saying what it lacks and what to do; for a law by `scaled_by`; if a
+      number is out of range or the name is no identifier.
+    """
+    need_numbers(law, "to_modelica")
+    if not 0 < v_max < math.inf or not 0 < rtol < 1:
+        raise ValueError(f"to_modelica needs v_max > 0 [m/s] and 0 < rtol < 1; given: {v_max=}, {rtol=}.")
+    if not (name.isidentifier() and name.isascii()):
+        raise ValueError(f"to_modelica: name must be an identifier such as 'friction1', but {name!r} was given.")
+    if not isinstance(law, AbstractSetValuedLaw | Viscous):
+        raise ValueError(f"to_modelica: Modelica's friction components have no {_lacks(law)}.")
+    speeds = np.concatenate(
+        [[0.0], np.geomspace(v_max * 10.0**-_DECADES, v_max, _POINTS), np.linspace(0.0, v_max, _POINTS)[1:-1]]
+    )
+    speeds = np.unique(speeds)
+    forward, backward = _forces(law, speeds), -_forces(law, -speeds)
+    limits = [forward[0], backward[0]]
+    if isinstance(law, AbstractSetValuedLaw):
+        limits = [float(law.limit(jnp.asarray(side))) for side in (1.0, -1.0)]
+    if not np.allclose([limits[0], *forward], [limits[1], *backward], rtol=1e-6, atol=0.0):
+        raise ValueError(f"to_modelica: Modelica's friction components have no {_ONE_WAY}.")
+    level, limit = forward[0], limits[0]
+    if not np.isfinite(forward).all() or limit < level or (level == 0 and limit > 0):
+        raise ValueError(
+            "to_modelica: the limit of stick must be at least the force of slip at v = 0, above zero if it is, and all"
+            f" forces finite; given: {limit:g} N in stick, {level:g} N in slip."
+        )
+    peak = limit / level if level > 0 else 1.0
+    rows = "; ".join(f"{v:.10g}, {f:.10g}" for v, f in _table(speeds, forward, rtol))
+    kind, table = ("Rotational", "tau_pos") if rotary else ("Translational", "f_pos")
+    component = "BearingFriction" if rotary else "SupportFriction"
+    return f"Modelica.Mechanics.{kind}.Components.{component} {name}({table}=[{rows}], peak={peak:.10g});"
+
+
+def _forces(law: AbstractSetValuedLaw | Viscous, v: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Force [N] in slip; at rest its limit from above."""
+    if isinstance(law, Viscous):
+        return np.asarray(jax.vmap(law.force)(jnp.asarray(v)), float)
+    side = np.where(np.signbit(v), -1.0, 1.0)
+    return side * np.asarray(jax.vmap(law.dry)(jnp.asarray(v)), float) + np.asarray(
+        jax.vmap(law.wet)(jnp.asarray(v)), float
+    )
+
+
+def _table(v: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], rtol: float) -> Table:
+    """Rows (v, force), each as far from the last as a straight line between them stays within the tolerance."""
+    rows, last = [0], v.size - 1
+    while rows[-1] < last:
+        start = rows[-1]
+        # The next row lies between `near`, which does, and `far`, which does not.
+        near, far = start + 1, start + 2
+        while far < last and _straight(v, force, start, far, rtol):
+            near, far = far, start + 2 * (far - start)
+        far = min(far, last + 1)
+        if far > last and _straight(v, force, start, last, rtol):
+            near = last
+        while far - near > 1:
+            middle = (near + far) // 2
+            near, far = (middle, far) if _straight(v, force, start, middle, rtol) else (near, middle)
+        rows.append(near)
+    return np.stack([v[rows], force[rows]], axis=1)
+
+
+def _straight(
+    v: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], i: int, j: int, rtol: float
+) -> Bool[np.ndarray, ""] | np.bool_:
+    """Whether the straight line between two rows is within the tolerance of the law."""
+    between = slice(i, j + 1)
+    line = force[i] + (force[j] - force[i]) * ((v[between] - v[i]) / (v[j] - v[i]))
+    return np.all(np.abs(line - force[between]) <= _SHARE * rtol * np.abs(force[between]))
+
+
+def _lacks(law: AbstractLaw) -> str:
+    """What the components lack to express the law, and what to do."""
+    name = type(law).__name__
+    if hasattr(law, "forward"):
+        return _ONE_WAY
+    if isinstance(law, Regularized | AbstractHoldingLaw | Sign):
+        return f"{name}: they run the law inside exactly, by events, so export that"
+    if isinstance(law, AbstractDynamicLaw):
+        return (
+            f"state of their own, which {name} has. Export its force in steady slip, as a Stribeck, or write its"
+            " equations in a model of your own"
+        )
+    return (
+        f"{name}: they take set-valued laws and Viscous. Write the force as a Stribeck, with fit_law, and export that"
+    )

@@ -1,0 +1,20 @@
+"""What every export needs of a law."""
+
+from ..friction import AbstractLaw
+from ..numerics import varies
+
+
+def need_numbers(law: AbstractLaw, wanted: str) -> None:
+    """Refuse what is no law, and a law whose numbers depend on the state of the mechanism.
+
+    **Raises:**
+
+    - `ValueError` that says what to give instead.
+    """
+    if not isinstance(law, AbstractLaw):
+        raise ValueError(f"{wanted} needs a law, but {law!r} was given.")
+    if varies(law):
+        raise ValueError(
+            f"{wanted} writes numbers, but parameters of this {type(law).__name__} depend on the state of the mechanism"
+            " (scaled_by), which the target cannot say: export law.at(t, q, qd, params), the law at one state."
+        )
