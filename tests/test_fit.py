@@ -199,11 +199,13 @@ def test_free_parameters_stay_in_their_ranges_and_followers_keep_their_distance(
 
 
 def test_names_and_ranges_of_the_numbers_of_a_scene():
-    law = jms.Regularized(jms.asymmetric(jms.Stribeck(1.0, 1.5, 0.1), Fc=0.8), 1e-3)
+    law = jms.Regularized(jms.asymmetric(jms.Stribeck(1.0, 1.5, 0.1), Fc=0.8, Fs=1.2), 1e-3)
     scene = jms.Scene(_lagrangian, params={"m": 1.0, "k": 1.0}, effects=(jms.Friction(law),))
     names = set(scene_numbers(scene))
     assert {"m", "k", "friction.forward.Fc", "friction.backward.Fs", "friction.width"} <= names
     assert scene_ranges(scene)["friction.backward.Fs"].lower == "friction.backward.Fc"
+    assert scene_ranges(scene)["friction.forward.Fs"].lower == "friction.forward.Fc"
+    assert "friction.backward.vs" not in names  # one number for both directions
     again = replace_numbers(scene, {"friction.width": jnp.asarray(2e-3)})
     assert float(scene_numbers(again)["friction.width"]) == 2e-3
 

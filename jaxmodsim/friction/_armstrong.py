@@ -102,7 +102,7 @@ class Armstrong(AbstractDynamicLaw):
         return 0.5 * self.sigma0 * z.z * z.z
 
     def advance(self, v: Float[Array, ""], z: ArmstrongState, dt: Float[Array, ""]) -> ArmstrongState:
-        """State after `dt` [s] at constant `v` [m/s], of order 1, right at rest and in steady slip at any step.
+        """State after `dt` [s] at constant `v` [m/s]; of order 1, and right at rest and in steady slip at any step.
 
         First the memory, by how much of the step the contact slides at the limit there was, then the deflection.
         """
@@ -110,8 +110,19 @@ class Armstrong(AbstractDynamicLaw):
         moves = distance != 0
         followed = follow(v, z.z, dt, self._limit(z.rise), corner) - z.z
         share = jnp.where(moves, 1.0 - followed / jnp.where(moves, distance, 1.0), 0.0)
-        slides, steady = self._slides(v, share), self._steady(v)
-        missing = 1.0 - (steady + (z.rise - steady) * jnp.exp(-slides * dt / self.tau))
-        missing = missing / (1.0 + (1.0 - slides) * dt * missing / self.gamma)
-        rise = 1.0 - missing
+        slides = self._slides(v, share)
+        rise = 1.0 - _riccati(1.0 - z.rise, slides / self.tau, (1.0 - slides) / self.gamma, 1.0 - self._steady(v), dt)
         return ArmstrongState(follow(v, z.z, dt, self._limit(rise), corner), rise)
+
+
+def _riccati(
+    m: Float[Array, ""], a: Float[Array, ""], b: Float[Array, ""], goal: Float[Array, ""], t: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Solution at t of `m' = a (goal - m) - b m^2` with constants that are not negative."""
+    c = a * goal
+    square = 0.25 * (a * a + 4.0 * b * c) * t * t
+    # tanh(x)/x by x^2, which is smooth at zero.
+    small = square < 1e-4
+    x = jnp.sqrt(jnp.where(small, 1.0, square))
+    time = 0.5 * t * jnp.where(small, 1.0 - square / 3.0 + 2.0 * square * square / 15.0, jnp.tanh(x) / x)
+    return (m + (2.0 * c - a * m) * time) / (1.0 + (2.0 * b * m + a) * time)

@@ -4,63 +4,86 @@ import dataclasses
 from typing import Any, ClassVar, TypeVar, cast
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Varying, ranges_of
+from ..numerics import Varying, check_ranges, ranges_of
 from ._law import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw
 
 _Law = TypeVar("_Law")
 
 
-def _side(v: Float[Array, ""], forward: _Law, backward: _Law) -> _Law:
+def _toward(v: Float[Array, ""], law: Any) -> Any:
     """The law that holds at velocity `v`."""
-    return jax.tree.map(lambda a, b: jnp.where(v < 0, b, a), forward, backward)
+    names = tuple(law.backward)
+    values = [jnp.where(v < 0, law.backward[name], getattr(law.forward, name)) for name in names]
+    return eqx.tree_at(lambda x: [getattr(x, name) for name in names], law.forward, values)
+
+
+def other_side(law: Any) -> Any:
+    """The whole law for negative slip of an asymmetric one."""
+    names = tuple(law.backward)
+    values = [law.backward[name] for name in names]
+    return eqx.tree_at(lambda x: [getattr(x, name) for name in names], law.forward, values, is_leaf=_is_varying)
+
+
+def _is_varying(x: Any) -> bool:
+    return isinstance(x, Varying)
 
 
 class _AsymmetricForce(AbstractForceLaw):
-    """A function of velocity with a set of parameters for either direction."""
+    """A function of velocity, some of whose parameters differ for negative slip."""
 
     forward: AbstractForceLaw
-    backward: AbstractForceLaw
+    backward: dict[str, Any]
     stiff: ClassVar[bool] = False
+
+    @property
+    def implied(self) -> dict[str, AbstractLaw]:
+        """The law for negative slip, to be checked beside the fields."""
+        return {"backward": other_side(self)}
 
     def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Friction force [N] at velocity `v` [m/s]."""
-        return _side(v, self.forward, self.backward).force(v)
+        return _toward(v, self).force(v)
 
 
 class _AsymmetricSetValued(AbstractSetValuedLaw):
-    """A set-valued law with a set of parameters for either direction."""
+    """A set-valued law, some of whose parameters differ for negative slip."""
 
     forward: AbstractSetValuedLaw
-    backward: AbstractSetValuedLaw
+    backward: dict[str, Any]
     stiff: ClassVar[bool] = False
+
+    @property
+    def implied(self) -> dict[str, AbstractLaw]:
+        """The law for negative slip, to be checked beside the fields."""
+        return {"backward": other_side(self)}
 
     def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Magnitude [N] of the dry part in slip."""
-        return _side(v, self.forward, self.backward).dry(v)
+        return _toward(v, self).dry(v)
 
     def wet(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Smooth part [N]."""
-        return _side(v, self.forward, self.backward).wet(v)
+        return _toward(v, self).wet(v)
 
     def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
         """Largest force in stick [N] against a load towards `direction`."""
-        return _side(direction, self.forward, self.backward).limit(direction)
+        return _toward(direction, self).limit(direction)
 
 
 class _AsymmetricDynamic(AbstractDynamicLaw):
-    """A law with a state, with a set of parameters for either direction."""
+    """A law with a state, some of whose parameters differ for negative slip."""
 
     forward: AbstractDynamicLaw
-    backward: AbstractDynamicLaw
+    backward: dict[str, Any]
+    stiff: ClassVar[bool] = True
 
     @property
-    def stiff(self) -> bool:  # type: ignore[override]
-        """As the law is."""
-        return self.forward.stiff
+    def implied(self) -> dict[str, AbstractLaw]:
+        """The law for negative slip, to be checked beside the fields."""
+        return {"backward": other_side(self)}
 
     def state0(self, v: Float[Array, "..."]) -> Any:
         """State at rest and unloaded."""
@@ -68,11 +91,11 @@ class _AsymmetricDynamic(AbstractDynamicLaw):
 
     def rate(self, v: Float[Array, ""], z: Any) -> Any:
         """Time derivative of the state."""
-        return _side(v, self.forward, self.backward).rate(v, z)
+        return _toward(v, self).rate(v, z)
 
     def force(self, v: Float[Array, ""], z: Any) -> Float[Array, ""]:
         """Friction force [N]."""
-        return _side(v, self.forward, self.backward).force(v, z)
+        return _toward(v, self).force(v, z)
 
     def stored(self, z: Any) -> Float[Array, ""]:
         """Energy [J] in the state: stiffness is one for both directions."""
@@ -80,7 +103,7 @@ class _AsymmetricDynamic(AbstractDynamicLaw):
 
     def advance(self, v: Float[Array, ""], z: Any, dt: Float[Array, ""]) -> Any:
         """State after `dt` [s] at constant velocity."""
-        return _side(v, self.forward, self.backward).advance(v, z, dt)
+        return _toward(v, self).advance(v, z, dt)
 
 
 _KINDS = (
@@ -102,7 +125,8 @@ def asymmetric(law: _Law, **backward: Any) -> _Law:
 
     **Returns:**
 
-    A law of the same kind, for slip along a line.
+    A law of the same kind, for slip along a line: `forward` is the law given, `backward` holds the numbers that differ.
+    All others are the same number in both directions.
 
     **Raises:**
 
@@ -129,12 +153,10 @@ def asymmetric(law: _Law, **backward: Any) -> _Law:
                 f"asymmetric({type(law).__name__}): {name} stores energy, so it must be the same in both directions."
             )
     converters = {f.name: f.metadata["converter"] for f in dataclasses.fields(cast(Any, law)) if f.name in backward}
-    values = [_like(getattr(law, name), converters[name](value)) for name, value in backward.items()]
-    other = eqx.tree_at(
-        lambda x: [getattr(x, name) for name in backward], law, values, is_leaf=lambda x: isinstance(x, Varying)
-    )
-    other.__check_init__()
-    return cast(_Law, kinds[0](cast(Any, law), cast(Any, other)))
+    numbers = {name: _like(getattr(law, name), converters[name](value)) for name, value in backward.items()}
+    both = kinds[0](cast(Any, law), numbers)
+    check_ranges(other_side(both))
+    return cast(_Law, both)
 
 
 def _like(old: Any, number: Any) -> Any:

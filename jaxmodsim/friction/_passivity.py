@@ -249,7 +249,7 @@ def _function(law: AbstractLaw, force: Callable[..., Any], v_max: float) -> Pass
 def _(law: _AsymmetricDynamic, v_max: float) -> Passivity:
     if _judge.dispatch(type(law.forward)) is _judge.dispatch(AbstractDynamicLaw):
         return _sampled(law, v_max)
-    sides = {"positive": _judge(law.forward, v_max), "negative": _judge(law.backward, v_max)}
+    sides = {"positive": _judge(law.forward, v_max), "negative": _judge(law.implied["backward"], v_max)}
     worse = min(sides, key=lambda side: sides[side].margin)
     one = sides[worse]
     speed = min(side.speed for side in sides.values())

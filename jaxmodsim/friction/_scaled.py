@@ -63,10 +63,13 @@ def _vary(module: Any, factor: Callable[..., Any], chosen: list[str]) -> Any:
         elif isinstance(value, AbstractLaw):
             names.append(field.name)
             values.append(_vary(value, factor, chosen))
+        elif field.name == "backward":  # the numbers of an asymmetric law for negative slip
+            names.append(field.name)
+            values.append({n: Varying(x, factor) if n in chosen else x for n, x in value.items()})
     if not names:
         return module
-    return eqx.tree_at(lambda m: [getattr(m, name) for name in names], module, values, is_leaf=_is_varying)
+    return eqx.tree_at(lambda m: [getattr(m, name) for name in names], module, values, is_leaf=_is_whole)
 
 
-def _is_varying(x: Any) -> bool:
-    return isinstance(x, Varying)
+def _is_whole(x: Any) -> bool:
+    return isinstance(x, Varying | dict)

@@ -52,7 +52,7 @@ def join_entries(numbers: Mapping[str, Array], values: Mapping[str, Array]) -> d
     return joined
 
 
-def chosen_entries(numbers: Mapping[str, Array], free: Sequence[str]) -> tuple[str, ...]:
+def chosen_entries(numbers: Mapping[str, Array], free: Sequence[str]) -> Sequence[str]:
     """Entries that `free` names, where the name of an array stands for all of them."""
     if isinstance(free, str):
         return free  # refused where it is used

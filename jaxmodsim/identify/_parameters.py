@@ -74,10 +74,14 @@ class FreeParameters:
                 chain.append(limit)
                 limit = limits[limit]
             order += [each for each in reversed(chain) if each not in order]
-        upper = {name: ranges[name].upper for name in free if name in ranges and ranges[name].upper is not None}
-        for name, most in upper.items():
-            if values[name] >= most or isinstance(limits[name], str):
+        upper: dict[str, float] = {}
+        for name in free:
+            most = ranges[name].upper if name in ranges else None
+            if most is None:
+                continue
+            if values[name] >= most:
                 raise ValueError(f"The start {name} = {values[name]:g} must lie below its limit {most:g}.")
+            upper[name] = most
         return FreeParameters(tuple(free), {name: values[name] for name in order}, limits, upper, tuple(following))
 
     def values(self, x: Float[Array, " free"]) -> dict[str, Array]:

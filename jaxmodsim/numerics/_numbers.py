@@ -208,9 +208,14 @@ def as_function(value: Any, *, name: str) -> Callable[..., Any]:
 
 
 def modules_of(tree: Any, path: str = "") -> Iterator[tuple[str, eqx.Module]]:
-    """Every `eqx.Module` inside `tree` (itself included), with its path such as `.effects[0].law`."""
+    """Every `eqx.Module` inside `tree` (itself included), with its path such as `.effects[0].law`.
+
+    And those that a module says it implies by a property `implied`: modules by name, made from its fields.
+    """
     if isinstance(tree, eqx.Module):
         yield path, tree
+        for name, module in getattr(tree, "implied", {}).items():
+            yield f"{path}.{name}", module
         for field in dataclasses.fields(tree):
             if not field.metadata.get("static", False):
                 yield from modules_of(getattr(tree, field.name), f"{path}.{field.name}")

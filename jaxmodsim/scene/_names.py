@@ -48,14 +48,18 @@ def scene_ranges(scene: Scene) -> dict[str, Range]:
         while isinstance(owners[-1], Varying):  # the range is that of the parameter
             owners, path = owners[:-1], path[:-1]
         owner, last = owners[-1], path[-1]
-        if not isinstance(last, jtu.GetAttrKey):
+        if isinstance(last, jtu.GetAttrKey):
+            allowed, beside = ranges_of(owner).get(last.name), path[:-1]
+        elif "implied" in dir(owners[-2]):  # a number of an asymmetric law for negative slip
+            allowed, beside = ranges_of(owners[-2].forward).get(last.key), (*path[:-2], jtu.GetAttrKey("forward"))
+        else:
             continue
-        allowed = ranges_of(owner).get(last.name)
         if allowed is None:
             continue
         if isinstance(allowed.lower, str):
-            limit = _name(scene, (*path[:-1], jtu.GetAttrKey(allowed.lower)))
-            allowed = replace(allowed, lower=limit)
+            there = isinstance(owner, dict) and allowed.lower in owner
+            limit = (*path[:-1], jtu.DictKey(allowed.lower)) if there else (*beside, jtu.GetAttrKey(allowed.lower))
+            allowed = replace(allowed, lower=_name(scene, limit))
         ranges[_name(scene, path)] = allowed
     return ranges
 
