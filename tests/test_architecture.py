@@ -17,8 +17,9 @@ ALLOWED: dict[str, set[str]] = {layer: set(_CORE[:i]) for i, layer in enumerate(
 ALLOWED["problems"] = {"numerics", "mechanics", "friction", "effects", "scene"}
 ALLOWED["analysis"] = set(_CORE)
 ALLOWED["identify"] = set(_CORE)
-ALLOWED["plot"] = {*_CORE, "problems", "identify"}
-ALLOWED["cli"] = {*_CORE, "problems", "identify", "plot", "_speed"}
+ALLOWED["behaviour"] = set(_CORE)
+ALLOWED["plot"] = {*_CORE, "problems", "identify", "behaviour"}
+ALLOWED["cli"] = {*_CORE, "problems", "identify", "behaviour", "plot", "_speed"}
 ALLOWED["_speed"] = set()
 
 # The command line may also use the package as its users do, by its public names.

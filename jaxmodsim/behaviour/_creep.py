@@ -9,20 +9,18 @@ from ._pulled import move
 
 # Mean load [N], vibration [N] at the frequency [Hz], duration [s]; the load stays below the Coulomb force of 1 N.
 _LOAD, _SHAKE, _FREQUENCY, _T1 = 0.4, 0.2, 5.0, 10.0
-_SETTLED = 1.0
+# Spans of time [s], whole periods each, between whose mean positions the mass drifts.
+_EARLY, _LATE = (1.0, 2.0), (9.0, 10.0)
 
 
 def _measure(specimen: Specimen) -> Finding:
-    """Load a mass at rest and see how far it is from its place of the second 1 at the second 10."""
-    run = move(
-        specimen, _T1, load=_LOAD, shake=_SHAKE, frequency=_FREQUENCY, dtmax=0.1 / _FREQUENCY
-    )
-    # Both times are whole numbers of periods.
-    start = int(np.argmin(np.abs(run.t - _SETTLED)))
-    drift = 1e6 * float(abs(run.q[-1] - run.q[start]))
+    """Load a mass at rest, and see how far it goes once the load has come."""
+    run = move(specimen, _T1, load=_LOAD, shake=_SHAKE, frequency=_FREQUENCY, dtmax=0.1 / _FREQUENCY)
+    early, late = (run.q[(run.t > start) & (run.t <= end)].mean() for start, end in (_EARLY, _LATE))
+    drift = 1e6 * float(abs(late - early))
     return Finding(
         drift,
-        f"Drifts by this way in {_T1 - _SETTLED:g} s under {_LOAD:g} N and a vibration of {_SHAKE:g} N.",
+        f"Drifts by this way in {_LATE[0] - _EARLY[0]:g} s under {_LOAD:g} N and a vibration of {_SHAKE:g} N.",
         (Line("", run.t, 1e6 * run.q),),
     )
 

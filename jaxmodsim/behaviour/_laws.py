@@ -95,12 +95,11 @@ def specimens() -> tuple[Specimen, ...]:
     return (
         Specimen("Viscous", Viscous(FV), lambda v: FV * v),
         Specimen("Curve", Curve(_smooth), gauss),
-        Specimen("Coulomb", Coulomb(FC), flat),
+        Specimen("Coulomb", Coulomb(FC, FC), flat),
         Specimen("Coulomb, stiction", Coulomb(FC, FS), flat),
         Specimen("Stribeck, Gaussian", stribeck, gauss),
         Specimen("Stribeck, exponential", Stribeck(FC, FS, VS, FV, exponent=1.0), _curve(fall=lambda x: np.exp(-x))),
         Specimen("Stribeck, Lorentzian", Stribeck(FC, FS, VS, FV, fall=lorentzian), _curve(fall=_lorentzian)),
-        Specimen("Stribeck, asymmetric", asymmetric(stribeck, Fc=BACKWARD * FC, Fs=BACKWARD * FS), _worn),
         Specimen("Stribeck, scaled", scaled_by(Stribeck(0.5 * FC, 0.5 * FS, VS, 0.5 * FV), _double), gauss),
         Specimen("Regularized", Regularized(stribeck, WIDTH), gauss),
         Specimen("DeadZone", DeadZone(stribeck, BAND), gauss, STEP),

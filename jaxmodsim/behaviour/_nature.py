@@ -33,21 +33,23 @@ class Nature(NamedTuple):
 
 
 _STATELESS = (AbstractForceLaw, AbstractSetValuedLaw, AbstractHoldingLaw)
-_NO_FALL = "Without a Stribeck effect friction does not depend on slip velocity but for the viscous part."
+_FLAT = "Without a Stribeck effect friction does not depend on slip velocity but for the viscous part."
 
 
-def _no_stribeck(law: Any) -> bool:
-    return getattr(law, "Fs", None) is None
+def _no_fall(law: Any) -> bool:
+    """Whether friction does not fall as slip begins."""
+    stiction = getattr(law, "Fs", None)
+    return stiction is None or not bool((stiction > law.Fc).any())
 
 
 BY_NATURE: tuple[Nature, ...] = (
     Nature("presliding", _STATELESS, "The force is a function of velocity and jumps as the velocity reverses."),
     Nature("memory", (Dahl, LuGre, ElastoPlastic), "One state remembers one turning point."),
     Nature("break-away", _STATELESS, "The limit of stick is a number, whatever the load did before."),
-    Nature("break-away", (Dahl, MaxwellSlip), "The force is a function of displacement alone.", _no_stribeck),
+    Nature("break-away", (Dahl, MaxwellSlip), "The force is a function of displacement alone.", _no_fall),
     Nature("lag", _STATELESS, "The force is a function of velocity: no memory, no lag."),
-    Nature("lag", (Dahl, MaxwellSlip), _NO_FALL, _no_stribeck),
-    Nature("stick-slip", (Viscous, Coulomb, Dahl, MaxwellSlip), _NO_FALL, _no_stribeck),
+    Nature("lag", (Dahl, MaxwellSlip), _FLAT, _no_fall),
+    Nature("stick-slip", (Viscous, Coulomb, Dahl, MaxwellSlip), _FLAT, _no_fall),
     Nature("creep", (AbstractForceLaw,), "A function of velocity holds a load only by moving."),
     Nature("creep", (Dahl, LuGre), "The bristle yields at any load, a little more forth than back."),
     Nature(

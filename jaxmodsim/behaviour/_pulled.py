@@ -21,6 +21,8 @@ TIMES = 4001
 _MAX_STEPS = 2**19
 _RTOL, _ATOL = 1e-6, 1e-10
 _QUIET = {"k": 0.0, "pull": 0.0, "ramp": 0.0, "load": 0.0, "shake": 0.0, "frequency": 0.0}
+# Time constant with which load and vibration come [s]: many periods of the mass on its contact.
+_PUT_ON = 0.1
 # Way [m] per sample and number of samples over which a contact that has slid is unloaded.
 _BACK, _BACK_SAMPLES = 0.002 / SIGMA0, 2000
 
@@ -43,7 +45,8 @@ def _load(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     del qd
     spring = p["k"] * (p["pull"] * t - q[0])
     shaken = p["load"] + p["shake"] * jnp.sin(2.0 * jnp.pi * p["frequency"] * t)
-    return jnp.reshape(spring + p["ramp"] * t + shaken, (1,))
+    # Put on so gently that nothing swings beyond it.
+    return jnp.reshape(spring + p["ramp"] * t + shaken * -jnp.expm1(-t / _PUT_ON), (1,))
 
 
 def move(specimen: Specimen, t1: float, *, z0: Any = None, dtmax: float = 1.0, **load: float) -> Motion:
@@ -79,6 +82,7 @@ def move(specimen: Specimen, t1: float, *, z0: Any = None, dtmax: float = 1.0, *
         atol=_ATOL,
         solver=solver,
         max_steps=_MAX_STEPS,
+        adjoint=dfx.ForwardMode(),
         **steps,
     )
     return Motion(
