@@ -202,12 +202,13 @@ def behaviour_figure(experiment: Experiment, outcomes: Mapping[str, Outcome], co
     """
     rows = -(-len(outcomes) // columns)
     figure = Figure(figsize=(3.1 * columns, 0.9 + 2.3 * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False)
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    axes[0, 0].set_ylim(experiment.window)
     for axis in axes.flat[len(outcomes) :]:
         axis.axis("off")
     for i, (axis, (law, outcome)) in enumerate(zip(axes.flat, outcomes.items(), strict=False)):
         _behaviour_panel(axis, experiment, outcome)
-        axis.set_title(law, fontsize=10, loc="left", fontweight="bold")
+        axis.set_title(law, fontsize=9, loc="left", fontweight="bold")
         if i % columns == 0:
             axis.set_ylabel(experiment.axes[1])
         if i + columns >= len(outcomes):
@@ -233,20 +234,17 @@ def _behaviour_panel(axis: Axes, experiment: Experiment, outcome: Outcome) -> No
             continue
         if label not in seen:
             seen[label] = next(colours)
-        axis.plot(line.x, line.y, color=seen[label], lw=1.2, label=label)
+        first = seen[label] == _BLUE
+        axis.plot(line.x, line.y, color=seen[label], lw=1.3, ls="-" if first else (0, (4, 3)), label=label)
+    low, high = experiment.window
+    if not any(((line.y >= low) & (line.y <= high)).any() for line in outcome.finding.lines):
+        axis.text(0.5, 0.5, "outside this range", transform=axis.transAxes, ha="center", fontsize=9, color=_GREY)
     if experiment.log_x:
         axis.set_xscale("log")
     for side in ("top", "right", "bottom", "left"):
         axis.spines[side].set(color=colour, linewidth=1.8)
     axis.tick_params(labelsize=8)
-    number = outcome.finding.number
-    text = outcome.verdict.value + ("" if np.isnan(number) else f" {_rounded(number)}")
-    axis.set_title(text, fontsize=10, loc="right", color=colour)
-
-
-def _rounded(number: float) -> str:
-    """Two digits; what is rounding is zero."""
-    return "0" if abs(number) < 1e-12 else f"{number:.2g}"
+    axis.set_title(f"{outcome.verdict.value} {outcome.finding.rounded}", fontsize=9, loc="right", color=colour)
 
 
 def _small_unit(unit: str) -> tuple[float, str]:

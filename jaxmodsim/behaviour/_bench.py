@@ -15,8 +15,7 @@ from ._presliding import MEMORY, PRESLIDING
 from ._stick_slip import STICK_SLIP
 
 EXPERIMENTS: dict[str, Experiment] = {
-    each.name: each
-    for each in (CHARACTERISTIC, PRESLIDING, MEMORY, BREAK_AWAY, LAG, STICK_SLIP, CREEP, PASSIVITY)
+    each.name: each for each in (CHARACTERISTIC, PRESLIDING, MEMORY, BREAK_AWAY, LAG, STICK_SLIP, CREEP, PASSIVITY)
 }
 # Laws on the bench at a time: nearly all of the time goes into compilation, which does not need the interpreter's lock.
 _WORKERS = 2
@@ -26,7 +25,7 @@ def run_bench(
     laws: Sequence[Specimen] | None = None,
     experiments: Mapping[str, Experiment] = EXPERIMENTS,
     *,
-    progress: Callable[[str], object] = lambda name: None,
+    progress: Callable[[str], object] | None = None,
 ) -> dict[str, dict[str, Outcome]]:
     """Do the experiments on the laws.
 
@@ -43,7 +42,8 @@ def run_bench(
 
     def one(specimen: Specimen) -> dict[str, Outcome]:
         outcomes = {name: experiment(specimen) for name, experiment in experiments.items()}
-        progress(specimen.name)
+        if progress is not None:
+            progress(specimen.name)
         return outcomes
 
     chosen = specimens() if laws is None else laws

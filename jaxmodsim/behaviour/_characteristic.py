@@ -48,6 +48,7 @@ CHARACTERISTIC = Experiment(
     "1",
     Limit(0.01, at_most=True),
     ("speed [m/s]", "friction force [N]"),
+    (-2.1, 2.1),
     _measure,
     log_x=True,
 )

@@ -1,7 +1,5 @@
 """Creep under a small vibration below break-away."""
 
-import numpy as np
-
 from ._experiment import Experiment
 from ._laws import DEFLECTION, Specimen
 from ._outcome import Finding, Limit, Line
@@ -33,5 +31,6 @@ CREEP = Experiment(
     "um",
     Limit(1e4 * DEFLECTION, at_most=True),
     ("time [s]", "displacement [um]"),
+    (-5.0, 225.0),
     _measure,
 )

@@ -1,5 +1,6 @@
 """A law under a prescribed slip velocity, without a mechanism."""
 
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -72,5 +73,5 @@ def _slip_force(law: AbstractLaw, v: Float[Array, ""]) -> Float[Array, ""]:
 
 def path(*places: float, samples: int) -> np.ndarray:
     """Displacements [m] of a way from place to place, each leg with the same number of samples, without the start."""
-    legs = [np.linspace(a, b, samples + 1)[1:] for a, b in zip(places, places[1:], strict=False)]
+    legs = [np.linspace(a, b, samples + 1)[1:] for a, b in pairwise(places)]
     return np.concatenate(legs)

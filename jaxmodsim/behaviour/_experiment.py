@@ -20,6 +20,7 @@ class Experiment:
     - `limit`: what the number must keep to pass.
     - `axes`: labels of the figure's axes, with units.
     - `measure`: does the experiment on one law.
+    - `window`: range of the figure's vertical axis, the same for all laws.
     - `log_x`: whether the horizontal axis is logarithmic.
     """
 
@@ -29,6 +30,7 @@ class Experiment:
     unit: str
     limit: Limit
     axes: tuple[str, str]
+    window: tuple[float, float]
     measure: Callable[[Specimen], Finding]
     log_x: bool = False
 

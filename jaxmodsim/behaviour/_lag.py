@@ -46,5 +46,6 @@ LAG = Experiment(
     "1",
     Limit(0.01, at_most=False),
     ("slip velocity [mm/s]", "friction force [N]"),
+    (0.9, 1.6),
     _measure,
 )

@@ -17,6 +17,11 @@ from ..friction import (
 )
 
 
+def _always(law: Any) -> bool:
+    del law
+    return True
+
+
 class Nature(NamedTuple):
     """That laws of some kinds miss the limit of an experiment, and why.
 
@@ -29,7 +34,7 @@ class Nature(NamedTuple):
     experiment: str
     kinds: tuple[type, ...]
     reason: str
-    when: Callable[[Any], bool] = lambda law: True
+    when: Callable[[Any], bool] = _always
 
 
 _STATELESS = (AbstractForceLaw, AbstractSetValuedLaw, AbstractHoldingLaw)

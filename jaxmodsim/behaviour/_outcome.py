@@ -1,9 +1,13 @@
 """What an experiment finds out about a law."""
 
 import enum
+import math
 from dataclasses import dataclass
 
 import numpy as np
+
+# A number below that is not told from zero: all limits are far above it, or zero but for rounding.
+_NONE = 5e-4
 
 
 class Verdict(enum.Enum):
@@ -58,6 +62,17 @@ class Finding:
     number: float
     sentence: str
     lines: tuple[Line, ...] = ()
+
+    @property
+    def rounded(self) -> str:
+        """The number with two digits, in few characters; empty where there is none, and 0 for what is next to none."""
+        if math.isnan(self.number):
+            return ""
+        if abs(self.number) < _NONE:
+            return "0"
+        if 100.0 <= abs(self.number) < 1e4:
+            return f"{self.number:.0f}"
+        return f"{self.number:.2g}".replace("e+0", "e")
 
 
 @dataclass(frozen=True)

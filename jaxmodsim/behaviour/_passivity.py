@@ -95,5 +95,6 @@ PASSIVITY = Experiment(
     "1",
     Limit(-1e-4, at_most=False),
     ("part of the period", "dissipated / turned over"),
+    (-0.6, 1.1),
     _measure,
 )

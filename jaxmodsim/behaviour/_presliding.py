@@ -12,13 +12,15 @@ _SLOW = 0.01 * VS
 _LEG = 512
 # Turning points of the inner loop, in amplitudes; the outer loop turns at +-1.
 _INNER = (0.8, -0.4)
+# A loop that loses less than this part of swing times way is elastic.
+_ELASTIC = 0.01
 
 
 def _cycles(specimen: Specimen, inner: bool) -> tuple[np.ndarray, np.ndarray]:
     """Displacement [m] and force [N] of eight legs of a loop, the last one with or without an inner loop.
 
-    The last leg rises from -1 to 0.5, turns back to -0.3, comes again to 0.5 and goes on to 1; without the inner loop
-    it waits at 0.5 by going on, so that both ways have the same samples on the outer loop.
+    The last leg rises from -1 to 0.8, turns back to -0.4, comes again to 0.8 and goes on to 1, or goes there without
+    turning: on the outer loop both have the same samples. What follows only fills the drive.
     """
     low, high = -DEFLECTION, DEFLECTION
     turn, back = _INNER[0] * DEFLECTION, _INNER[1] * DEFLECTION
@@ -28,9 +30,17 @@ def _cycles(specimen: Specimen, inner: bool) -> tuple[np.ndarray, np.ndarray]:
         last.append(path(turn, back, turn, samples=_LEG))
     last.append(path(turn, high, samples=_LEG))
     x = np.concatenate([outer, *last])
-    x = np.concatenate([x, path(high, high + DEFLECTION * (SAMPLES - x.size), samples=SAMPLES - x.size)])
+    rest = SAMPLES - x.size
+    x = np.concatenate([x, path(high, high + rest * DEFLECTION / _LEG, samples=rest)])
     dx = np.diff(x, prepend=0.0)
     return x, respond(specimen.law, np.sign(dx) * _SLOW, np.abs(dx) / _SLOW).force
+
+
+def _loss(x: np.ndarray, force: np.ndarray) -> float:
+    """Energy [J] that the last whole cycle loses."""
+    last = slice(8 * _LEG - 1, 10 * _LEG)
+    x, force = x[last], force[last]
+    return float(np.sum(0.5 * (force[1:] + force[:-1]) * np.diff(x)))
 
 
 def _presliding(specimen: Specimen) -> Finding:
@@ -40,29 +50,29 @@ def _presliding(specimen: Specimen) -> Finding:
     turn = 9 * _LEG
     swing = float(np.ptp(force[outer]))
     jump = abs(float(force[turn] - force[turn - 1])) / swing if swing > 0 else float("nan")
-    loss = abs(float(np.sum(0.5 * (force[outer][1:] + force[outer][:-1]) * np.diff(x[outer]))))
     return Finding(
         jump,
         f"After a turn the force changes by this part of its swing within {2e9 * DEFLECTION / _LEG:.0f} nm;"
-        f" the loop loses {1e6 * loss:.3g} uJ.",
+        f" the loop loses {1e6 * _loss(x, force):.3g} uJ.",
         (Line("", 1e6 * x[: 10 * _LEG], force[: 10 * _LEG]),),
     )
 
 
 def _memory(specimen: Specimen) -> Finding:
     """Put a loop inside the loop and look at whether the outer one goes on as if it had not been."""
-    x, with_inner = _cycles(specimen, inner=True)
-    _, without = _cycles(specimen, inner=False)
+    (x_inner, with_inner), (x, without) = _cycles(specimen, inner=True), _cycles(specimen, inner=False)
     swing = float(np.ptp(without[8 * _LEG : 10 * _LEG]))
     start = 11 * _LEG
     # From the closing of the inner loop on; where it closes, and every point up to the next turn.
     rest_with, rest_without = with_inner[start + 2 * _LEG - 1 :][: _LEG + 1], without[start - 1 :][: _LEG + 1]
     lines = (
         Line("without inner loop", 1e6 * x[8 * _LEG : 10 * _LEG], without[8 * _LEG : 10 * _LEG], reference=True),
-        Line("with inner loop", 1e6 * x[10 * _LEG : 14 * _LEG], with_inner[10 * _LEG : 14 * _LEG]),
+        Line("with inner loop", 1e6 * x_inner[10 * _LEG : 14 * _LEG], with_inner[10 * _LEG : 14 * _LEG]),
     )
-    if _presliding(specimen).number > PRESLIDING.limit.value:
+    if not PRESLIDING.limit.keeps(_presliding(specimen).number):
         return Finding(float("nan"), "There is no presliding to remember anything.", lines)
+    if _loss(x, without) < _ELASTIC * swing * 2.0 * DEFLECTION:
+        return Finding(float("nan"), "Presliding is elastic: there is nothing to remember.", lines)
     return Finding(
         float(np.max(np.abs(rest_with - rest_without))) / swing,
         "After an inner loop the outer one goes on with this change, in swings of the force.",
@@ -79,6 +89,7 @@ PRESLIDING = Experiment(
     "1",
     Limit(0.1, at_most=True),
     ("displacement [um]", "friction force [N]"),
+    (-1.7, 1.7),
     _presliding,
 )
 # A two-hundredth of the swing: between elements that give way over a fiftieth of their limit, and laws with one state.
@@ -89,5 +100,6 @@ MEMORY = Experiment(
     "1",
     Limit(0.005, at_most=True),
     ("displacement [um]", "friction force [N]"),
+    (-1.7, 1.7),
     _memory,
 )

@@ -39,5 +39,6 @@ STICK_SLIP = Experiment(
     "1",
     Limit(0.1, at_most=False),
     ("time [s]", "position [m]"),
+    (0.0, 4.2),
     _measure,
 )

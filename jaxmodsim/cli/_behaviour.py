@@ -32,14 +32,8 @@ def _figure(name: str, outcomes: dict[str, dict[str, Outcome]]) -> Any:
 
 
 def _cell(outcome: Outcome) -> str:
-    if outcome.verdict is Verdict.NOT_APPLICABLE:
-        return outcome.verdict.value
-    return f"{outcome.verdict.value} {_short(outcome.finding.number)}"
-
-
-def _short(number: float) -> str:
-    """Two digits; what is rounding is zero."""
-    return "0" if abs(number) < 1e-12 else f"{number:.2g}"
+    word = outcome.verdict.value.removeprefix("by ")
+    return f"{word} {outcome.finding.rounded}".rstrip()
 
 
 def _table(outcomes: dict[str, dict[str, Outcome]]) -> pd.DataFrame:
@@ -54,9 +48,7 @@ def _limits() -> pd.DataFrame:
             "experiment": [each.name for each in EXPERIMENTS.values()],
             "number": [each.quantity for each in EXPERIMENTS.values()],
             "unit": [each.unit for each in EXPERIMENTS.values()],
-            "passes": [
-                f"{'<=' if each.limit.at_most else '>='} {each.limit.value:g}" for each in EXPERIMENTS.values()
-            ],
+            "passes": [f"{'<=' if each.limit.at_most else '>='} {each.limit.value:g}" for each in EXPERIMENTS.values()],
         }
     )
 
