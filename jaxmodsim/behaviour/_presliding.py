@@ -44,7 +44,7 @@ def _loss(x: np.ndarray, force: np.ndarray) -> float:
 
 
 def _presliding(specimen: Specimen) -> Finding:
-    """Go to and fro over the break-away deflection and look at the first step after a turn."""
+    """Go back and forth over the break-away deflection and look at the first step after a turn."""
     x, force = _cycles(specimen, inner=False)
     outer = slice(8 * _LEG - 1, 10 * _LEG)
     turn = 9 * _LEG

@@ -99,14 +99,15 @@ def after_slip(specimen: Specimen) -> Any:
 def _after_slip(law: AbstractDynamicLaw) -> Any:
     """Slide for one second, then go back, and keep the state at which the force at rest is least."""
     rest = jnp.zeros(())
-    law = law.at(rest, rest[None], rest[None], {})
+    here = law.at(rest, rest[None], rest[None], {})
+    assert isinstance(here, AbstractDynamicLaw)
     fast, dt = jnp.full_like(rest, 0.1), jnp.full_like(rest, 0.01)
-    slid = jax.lax.fori_loop(0, 100, lambda _, z: law.advance(fast, z, dt), law.state0(rest))
+    slid = jax.lax.fori_loop(0, 100, lambda _, z: here.advance(fast, z, dt), here.state0(rest))
     slow = -fast * 0.01
 
     def back(z: Any, _: None) -> tuple[Any, tuple[Any, Array]]:
-        z = law.advance(slow, z, _BACK / -slow)
-        return z, (z, jnp.abs(law.force(rest, z)))
+        z = here.advance(slow, z, _BACK / -slow)
+        return z, (z, jnp.abs(here.force(rest, z)))
 
     _, (states, forces) = jax.lax.scan(back, slid, None, length=_BACK_SAMPLES)
     return jax.tree.map(lambda x: x[jnp.argmin(forces)], states)

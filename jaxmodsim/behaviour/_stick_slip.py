@@ -10,15 +10,18 @@ from ._pulled import move
 # Stiffness [N/m], velocity of the spring's end [m/s] and duration [s].
 _K, _PULL, _T1 = 2.0, 0.1, 40.0
 # Velocity that counts as rest, as part of the pull: above the creep of smooth laws and Karnopp's band, and an
-# undamped oscillation that touches zero stays below it for 2 % of its period.
-_REST = 2e-3
+# undamped oscillation that touches zero stays below it for 2 % of its period. A mean over so many samples to either
+# side, of 10 ms, which the vibration of the mass on its contact does not disturb.
+_REST, _SPAN = 2e-3, 5
 
 
 def _measure(specimen: Specimen) -> Finding:
     """Pull, and look at the second half of the run for times of rest."""
     run = move(specimen, _T1, k=_K, pull=_PULL, dtmax=0.1)
     late = run.t >= 0.5 * _T1
-    rests = np.abs(run.v) < _REST * _PULL
+    ahead, behind = np.roll(run.q, -_SPAN), np.roll(run.q, _SPAN)
+    rests = np.abs(ahead - behind) < _REST * _PULL * 2 * _SPAN * (run.t[1] - run.t[0])
+    late &= run.t <= run.t[-_SPAN - 1]
     share = float(np.mean(rests[late]))
     spring = _K * (_PULL * run.t - run.q)
     starts = run.t[1:][~rests[1:] & rests[:-1] & late[1:]]

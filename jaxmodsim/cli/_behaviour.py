@@ -22,8 +22,8 @@ def report_behaviour(out: Path) -> bool:
     files["behaviour.json"] = _nested(outcomes)
     show_paths(write(out, files))
     failed = long[long["verdict"] == Verdict.FAIL.value]
-    for row in failed.itertuples(index=False):
-        console.print(f"FAIL: {row.law}, {row.experiment}: {row.finding}", highlight=False, markup=False)
+    for law, experiment, finding in zip(failed["law"], failed["experiment"], failed["finding"], strict=True):
+        console.print(f"FAIL: {law}, {experiment}: {finding}", highlight=False, markup=False)
     return failed.empty
 
 
