@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ..simulation import SimulationError
 from ._laws import Specimen
 from ._nature import by_nature
 from ._outcome import Finding, Limit, Outcome, Verdict
@@ -38,9 +39,12 @@ class Experiment:
         """Do the experiment on a law and judge what comes out.
 
         A number beyond the limit is a failure, unless the table of `by_nature` says why such a law must miss it. A law
-        of the table that keeps the limit passes.
+        of the table that keeps the limit passes. A run that ends early is a failure.
         """
-        finding = self.measure(specimen)
+        try:
+            finding = self.measure(specimen)
+        except SimulationError as error:
+            return Outcome(Verdict.FAIL, Finding(math.nan, str(error)))
         if math.isnan(finding.number):
             return Outcome(Verdict.NOT_APPLICABLE, finding, finding.sentence)
         if self.limit.keeps(finding.number):
