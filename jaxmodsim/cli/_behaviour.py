@@ -16,15 +16,20 @@ def report_behaviour(out: Path) -> bool:
         outcomes = run_bench(progress=lambda name: status.update(f"{name}: done"))
     show_table(_table(outcomes), "Friction laws in the standard experiments: verdict and number")
     show_table(_limits(), "The numbers and what they must keep to pass")
-    long = _long(outcomes)
     files: dict[str, Any] = {f"behaviour_{name.replace('-', '_')}.png": _figure(name, outcomes) for name in EXPERIMENTS}
-    files["behaviour.csv"] = long
+    files["behaviour.csv"] = _long(outcomes)
     files["behaviour.json"] = _nested(outcomes)
     show_paths(write(out, files))
-    failed = long[long["verdict"] == Verdict.FAIL.value]
-    for law, experiment, finding in zip(failed["law"], failed["experiment"], failed["finding"], strict=True):
-        console.print(f"FAIL: {law}, {experiment}: {finding}", highlight=False, markup=False)
-    return failed.empty
+    failed = [
+        (law, name, outcome.finding)
+        for law, of in outcomes.items()
+        for name, outcome in of.items()
+        if outcome.verdict is Verdict.FAIL
+    ]
+    for law, name, finding in failed:
+        number = f"{finding.rounded} {EXPERIMENTS[name].unit}"
+        console.print(f"FAIL: {law}, {name}, {number}: {finding.sentence}", highlight=False, markup=False)
+    return not failed
 
 
 def _figure(name: str, outcomes: dict[str, dict[str, Outcome]]) -> Any:
