@@ -17,9 +17,9 @@ _ELASTIC = 0.01
 
 
 def _cycles(specimen: Specimen, inner: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Displacement [m] and force [N] of eight legs of a loop, the last one with or without an inner loop.
+    """Displacement [m] and force [N] of a loop of ten legs, and a last leg with or without an inner loop.
 
-    The last leg rises from -1 to 0.8, turns back to -0.4, comes again to 0.8 and goes on to 1, or goes there without
+    That one rises from -1 to 0.8, turns back to -0.4, comes again to 0.8 and goes on to 1, or goes there without
     turning: on the outer loop both have the same samples. What follows only fills the drive.
     """
     low, high = -DEFLECTION, DEFLECTION
