@@ -237,7 +237,7 @@ def _behaviour_panel(axis: Axes, experiment: Experiment, outcome: Outcome) -> No
         first = seen[label] == _BLUE
         axis.plot(line.x, line.y, color=seen[label], lw=1.3, ls="-" if first else (0, (4, 3)), label=label)
     low, high = experiment.window
-    if not any(((line.y >= low) & (line.y <= high)).any() for line in outcome.finding.lines):
+    if outcome.finding.lines and not any(((line.y >= low) & (line.y <= high)).any() for line in outcome.finding.lines):
         axis.text(0.5, 0.5, "outside this range", transform=axis.transAxes, ha="center", fontsize=9, color=_GREY)
     if experiment.log_x:
         axis.set_xscale("log")

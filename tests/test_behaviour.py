@@ -84,6 +84,8 @@ PASS, NATURE, NOT = Verdict.PASS, Verdict.BY_NATURE, Verdict.NOT_APPLICABLE
         ("Stribeck, Gauss", "memory", NOT),
         ("Dahl", "presliding", PASS),
         ("Stribeck, Gauss", "presliding", NATURE),
+        ("DeadZone", "presliding", NOT),
+        ("DeadZone", "passivity", NOT),
         ("LuGre", "break-away", PASS),
         ("Coulomb, stiction", "break-away", NATURE),
         ("LuGre", "lag", PASS),

@@ -71,6 +71,14 @@ def _slip_force(law: AbstractLaw, v: Float[Array, ""]) -> Float[Array, ""]:
     return law.force(v)
 
 
+def needs_load(law: AbstractLaw, v: float) -> bool:
+    """Whether the force at the slip velocity `v` [m/s] is that of the load, so that no motion by itself gives it."""
+    return isinstance(law, AbstractHoldingLaw) and bool(law.holds(jnp.asarray(v)))
+
+
+NEEDS_LOAD = "In its band the force is the load, which a prescribed motion does not say."
+
+
 def path(*places: float, samples: int) -> np.ndarray:
     """Displacements [m] of a way from place to place, each leg with the same number of samples, without the start."""
     legs = [np.linspace(a, b, samples + 1)[1:] for a, b in pairwise(places)]

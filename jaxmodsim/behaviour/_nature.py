@@ -48,7 +48,11 @@ def _no_fall(law: Any) -> bool:
 
 
 BY_NATURE: tuple[Nature, ...] = (
-    Nature("presliding", _STATELESS, "The force is a function of velocity and jumps as the velocity reverses."),
+    Nature(
+        "presliding",
+        (AbstractForceLaw, AbstractSetValuedLaw),
+        "The force is a function of velocity and jumps as the velocity reverses.",
+    ),
     Nature("memory", (Dahl, LuGre, ElastoPlastic), "One state remembers one turning point."),
     Nature("break-away", _STATELESS, "The limit of stick is a number, whatever the load did before."),
     Nature("break-away", (Dahl, MaxwellSlip), "The force is a function of displacement alone.", _no_fall),

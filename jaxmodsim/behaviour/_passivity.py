@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ._drive import SAMPLES, respond
+from ._drive import NEEDS_LOAD, SAMPLES, needs_load, respond
 from ._experiment import Experiment
 from ._laws import DEFLECTION, VS, Specimen
 from ._outcome import Finding, Limit, Line
@@ -71,6 +71,8 @@ def balance(specimen: Specimen, cycle: Cycle) -> tuple[float, np.ndarray]:
 
 def _measure(specimen: Specimen) -> Finding:
     """Go through closed cycles of all kinds; the least that is dissipated in one of them."""
+    if needs_load(specimen.law, 0.0):
+        return Finding(float("nan"), NEEDS_LOAD)
     families = {"sines": sines(), "random": random_cycles(), "pulses": pulses()}
     lines, least = [], {}
     for family, cycles in families.items():

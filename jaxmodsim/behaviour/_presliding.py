@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ._drive import SAMPLES, path, respond
+from ._drive import NEEDS_LOAD, SAMPLES, needs_load, path, respond
 from ._experiment import Experiment
 from ._laws import DEFLECTION, VS, Specimen
 from ._outcome import Finding, Limit, Line
@@ -45,6 +45,8 @@ def _loss(x: np.ndarray, force: np.ndarray) -> float:
 
 def _presliding(specimen: Specimen) -> Finding:
     """Go back and forth over the break-away deflection and look at the first step after a turn."""
+    if needs_load(specimen.law, _SLOW):
+        return Finding(float("nan"), NEEDS_LOAD)
     x, force = _cycles(specimen, inner=False)
     outer = slice(8 * _LEG - 1, 10 * _LEG)
     turn = 9 * _LEG
@@ -60,6 +62,8 @@ def _presliding(specimen: Specimen) -> Finding:
 
 def _memory(specimen: Specimen) -> Finding:
     """Put a loop inside the loop and look at whether the outer one goes on as if it had not been."""
+    if needs_load(specimen.law, _SLOW):
+        return Finding(float("nan"), NEEDS_LOAD)
     (x_inner, with_inner), (x, without) = _cycles(specimen, inner=True), _cycles(specimen, inner=False)
     swing = float(np.ptp(without[8 * _LEG : 10 * _LEG]))
     start = 11 * _LEG
