@@ -18,8 +18,9 @@ ALLOWED["problems"] = {"numerics", "mechanics", "friction", "effects", "scene"}
 ALLOWED["export"] = {"numerics", "friction"}
 ALLOWED["analysis"] = set(_CORE)
 ALLOWED["identify"] = set(_CORE)
-ALLOWED["plot"] = {*_CORE, "problems", "identify"}
-ALLOWED["cli"] = {*_CORE, "problems", "identify", "plot", "_speed"}
+ALLOWED["behaviour"] = set(_CORE)
+ALLOWED["plot"] = {*_CORE, "problems", "identify", "behaviour"}
+ALLOWED["cli"] = {*_CORE, "problems", "identify", "behaviour", "plot", "_speed"}
 ALLOWED["_speed"] = set()
 
 # The command line may also use the package as its users do, by its public names.

@@ -1,0 +1,51 @@
+"""The bench: every law in every experiment."""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+from ._break_away import BREAK_AWAY
+from ._characteristic import CHARACTERISTIC
+from ._creep import CREEP
+from ._experiment import Experiment
+from ._lag import LAG
+from ._laws import Specimen, specimens
+from ._outcome import Outcome
+from ._passivity import PASSIVITY
+from ._presliding import MEMORY, PRESLIDING
+from ._stick_slip import STICK_SLIP
+
+EXPERIMENTS: dict[str, Experiment] = {
+    each.name: each for each in (CHARACTERISTIC, PRESLIDING, MEMORY, BREAK_AWAY, LAG, STICK_SLIP, CREEP, PASSIVITY)
+}
+# Laws on the bench at a time: nearly all of the time goes into compilation, which does not need the interpreter's lock.
+_WORKERS = 2
+
+
+def run_bench(
+    laws: Sequence[Specimen] | None = None,
+    experiments: Mapping[str, Experiment] = EXPERIMENTS,
+    *,
+    progress: Callable[[str], object] | None = None,
+) -> dict[str, dict[str, Outcome]]:
+    """Do the experiments on the laws.
+
+    **Arguments:**
+
+    - `laws`: by default all of `specimens()`.
+    - `experiments`: by name; by default all.
+    - `progress`: called with the name of each law when it is done.
+
+    **Returns:**
+
+    Outcomes by law and experiment.
+    """
+
+    def one(specimen: Specimen) -> dict[str, Outcome]:
+        outcomes = {name: experiment(specimen) for name, experiment in experiments.items()}
+        if progress is not None:
+            progress(specimen.name)
+        return outcomes
+
+    chosen = specimens() if laws is None else laws
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        return dict(zip([each.name for each in chosen], pool.map(one, chosen), strict=True))

@@ -1,0 +1,46 @@
+"""Break-away force against force rate."""
+
+import numpy as np
+
+from ._experiment import Experiment
+from ._laws import FC, FS, VS, Specimen
+from ._outcome import Finding, Limit, Line
+from ._pulled import after_slip, move
+
+# Rates of the load [N/s].
+RATES = np.geomspace(0.1, 100.0, 7)
+# Largest load [N], and the velocity [m/s] from which on the mass slides.
+_LOAD, _SLIDES = 1.7 * FS, 10.0 * VS
+
+
+def _measure(specimen: Specimen) -> Finding:
+    """Pull a mass harder and harder; the largest friction before it slides, at slow and at fast rates."""
+    z0 = after_slip(specimen)
+    found = []
+    for rate in RATES:
+        run = move(specimen, _LOAD / rate, z0=z0, ramp=float(rate), dtmax=0.01 * _LOAD / rate)
+        slides = run.v > _SLIDES
+        end = int(np.argmax(slides)) if slides.any() else run.v.size
+        found.append(float(np.max(run.friction[: max(end, 1)])))
+    lines = (Line("", RATES, np.asarray(found)),)
+    if found[0] < 0.1 * FC:
+        return Finding(float("nan"), "Nothing sticks, so nothing breaks away.", lines)
+    return Finding(
+        (found[0] - found[-1]) / found[0],
+        f"Breaks away at {found[0]:.3g} N under {RATES[0]:g} N/s and at {found[-1]:.3g} N under {RATES[-1]:g} N/s.",
+        lines,
+    )
+
+
+# A twentieth: what measurements of break-away forces resolve.
+BREAK_AWAY = Experiment(
+    "break-away",
+    "Break-away force against the rate of the load, shortly after a slip",
+    "fall of the break-away force from 0.1 N/s to 100 N/s, relative",
+    "1",
+    Limit(0.05, at_most=False),
+    ("force rate [N/s]", "break-away force [N]"),
+    (0.9, 1.6),
+    _measure,
+    log_x=True,
+)

@@ -1,0 +1,86 @@
+"""`jaxmodsim testbench --laws`: every friction law in the standard experiments."""
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from ..behaviour import EXPERIMENTS, Outcome, Verdict, run_bench
+from ..plot import behaviour_figure
+from ._output import console, show_paths, show_table, write
+
+
+def report_behaviour(out: Path) -> bool:
+    """Run the bench, print its table, write everything to `out`; returns whether no law failed."""
+    with console.status("laws") as status:
+        outcomes = run_bench(progress=lambda name: status.update(f"{name}: done"))
+    show_table(_table(outcomes), "Friction laws in the standard experiments: verdict and number")
+    show_table(_limits(), "The numbers and what they must keep to pass")
+    files: dict[str, Any] = {f"behaviour_{name.replace('-', '_')}.png": _figure(name, outcomes) for name in EXPERIMENTS}
+    files["behaviour.csv"] = _long(outcomes)
+    files["behaviour.json"] = _nested(outcomes)
+    show_paths(write(out, files))
+    failed = [
+        (law, name, outcome.finding)
+        for law, of in outcomes.items()
+        for name, outcome in of.items()
+        if outcome.verdict is Verdict.FAIL
+    ]
+    for law, name, finding in failed:
+        number = f"{finding.rounded} {EXPERIMENTS[name].unit}"
+        console.print(f"FAIL: {law}, {name}, {number}: {finding.sentence}", highlight=False, markup=False)
+    return not failed
+
+
+def _figure(name: str, outcomes: dict[str, dict[str, Outcome]]) -> Any:
+    return behaviour_figure(EXPERIMENTS[name], {law: of[name] for law, of in outcomes.items()})
+
+
+def _cell(outcome: Outcome) -> str:
+    word = outcome.verdict.value.removeprefix("by ")
+    return f"{word} {outcome.finding.rounded}".rstrip()
+
+
+def _table(outcomes: dict[str, dict[str, Outcome]]) -> pd.DataFrame:
+    """Laws as rows, experiments as columns."""
+    rows = [{"law": law} | {name: _cell(of[name]) for name in EXPERIMENTS} for law, of in outcomes.items()]
+    return pd.DataFrame(rows)
+
+
+def _limits() -> pd.DataFrame:
+    return pd.DataFrame(
+        {
+            "experiment": [each.name for each in EXPERIMENTS.values()],
+            "number": [each.quantity for each in EXPERIMENTS.values()],
+            "unit": [each.unit for each in EXPERIMENTS.values()],
+            "passes": [f"{'<=' if each.limit.at_most else '>='} {each.limit.value:g}" for each in EXPERIMENTS.values()],
+        }
+    )
+
+
+def _entry(name: str, outcome: Outcome) -> dict[str, Any]:
+    experiment = EXPERIMENTS[name]
+    return {
+        "verdict": outcome.verdict.value,
+        "number": outcome.finding.number,
+        "unit": experiment.unit,
+        "threshold": experiment.limit.value,
+        "side": "at most" if experiment.limit.at_most else "at least",
+        "finding": outcome.finding.sentence,
+        "reason": outcome.reason,
+    }
+
+
+def _long(outcomes: dict[str, dict[str, Outcome]]) -> pd.DataFrame:
+    """One row for each law and experiment."""
+    return pd.DataFrame(
+        [
+            {"law": law, "experiment": name} | _entry(name, outcome)
+            for law, of in outcomes.items()
+            for name, outcome in of.items()
+        ]
+    )
+
+
+def _nested(outcomes: dict[str, dict[str, Outcome]]) -> dict[str, Any]:
+    return {law: {name: _entry(name, outcome) for name, outcome in of.items()} for law, of in outcomes.items()}
