@@ -92,15 +92,20 @@ def test_maxwell_elements_remember_where_they_turned() -> None:
 
 
 def test_armstrong_stiction_comes_back_as_published() -> None:
-    """By t/(t + gamma) from nothing, in steps of any length, and in the differential equation."""
-    law = jms.Armstrong(sigma0=1e5, Fc=1.0, Fs=1.5, vs=1e-3, Fv=0.1, tau=0.01, gamma=0.7)
-    z, zero = ArmstrongState(jnp.array(0.0), jnp.array(0.0)), jnp.array(0.0)
+    """By t/(t + gamma) from nothing, in steps of any length, and in the differential equation; and is kept in slip."""
+    law = jms.Armstrong(sigma0=1e8, Fc=1.0, Fs=1.5, vs=1e-3, Fv=0.1, tau=0.01, gamma=0.7)
+    z, zero = ArmstrongState(jnp.array(0.0), jnp.array(0.0), jnp.array(0.0)), jnp.array(0.0)
     for dt in (1e-3, 0.7, 1e4):
         np.testing.assert_allclose(law.advance(zero, z, jnp.array(dt)).rise, dt / (dt + 0.7), atol=1e-15)
     half = law.advance(zero, law.advance(zero, z, jnp.array(0.3)), jnp.array(0.4))
     np.testing.assert_allclose(half.rise, 0.5, rtol=1e-14)
     slope = law.rate(zero, z._replace(rise=jnp.array(0.4))).rise
     np.testing.assert_allclose(slope, 0.6**2 / 0.7, rtol=1e-14)
+    # After a rest of gamma half of the stiction is there, and no more comes back in slow slip.
+    rested = law.advance(zero, z, jnp.array(0.7))
+    for dt in (0.1, 1e3):
+        slow = law.advance(jnp.array(1e-5), rested, jnp.array(dt))
+        np.testing.assert_allclose(law.force(jnp.array(1e-5), slow), 1.25, rtol=1e-3)
 
 
 def test_armstrong_friction_lags_by_its_time_constant() -> None:

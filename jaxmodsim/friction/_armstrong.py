@@ -11,26 +11,33 @@ from ._law import AbstractDynamicLaw
 
 # Part of its limit over which the contact gives way.
 _CORNER = 0.02
-# Slip velocity, in Stribeck velocities, from which on the contact slides and does not rest. The published model needs
-# such a rule, too, and leaves it open.
+# Slip velocity, in Stribeck velocities, from which on a contact loaded to its Coulomb force slides and does not rest.
+# The published model needs such a rule, too, and leaves it open.
 _SLIDES = 1e-3
 
 
 class ArmstrongState(NamedTuple):
-    """Deflection `z` [m] of the contact, and how much of the stiction there is, `rise`, from 0 to 1."""
+    """Deflection `z` [m] of the contact, the Stribeck friction there is, and what it would be at no speed.
+
+    `rise` and `magnitude` are shares of Fs - Fc, from 0 to 1; in stick they are the same.
+    """
 
     z: Float[Array, ""]
     rise: Float[Array, ""]
+    magnitude: Float[Array, ""]
 
 
 class Armstrong(AbstractDynamicLaw):
     """Armstrong's model of seven parameters: stiff in stick, Stribeck friction with memory in slip, rising stiction.
 
-    In stick `F = sigma0 z`; in slip `F = (Fc + (Fs - Fc) rise) sign(v) + Fv v`. The Stribeck friction has memory: in
-    slip `rise` goes to `1/(1 + (v/vs)^2)` with the time constant `tau`, in stick it grows to 1 like `t/(t + gamma)`.
-    Two things differ from the paper, so that the model is one set of differential equations: the lag is of first order
-    where the paper has a pure delay of tau, and stiction grows by `rise' = (1 - rise)^2/gamma`, which is the paper's
-    `t/(t + gamma)` if nothing is left at the beginning of stick.
+    In stick `F = sigma0 z`; in slip `F = (Fc + (Fs - Fc) rise) sign(v) + Fv v`. In slip `rise` goes to
+    `magnitude/(1 + (v/vs)^2)` with the time constant `tau`, which is frictional memory; in stick it grows to 1 like
+    `t/(t + gamma)` from where it was, and the magnitude of the next slip is what it has become.
+
+    Three things differ from the paper, so that the model is one set of differential equations: the lag is of first
+    order where the paper has a pure delay of tau; stiction grows by `rise' = (1 - rise)^2/gamma`, which is the paper's
+    `t/(t + gamma)` if nothing is left at the beginning of stick; and the magnitude follows the rise in stick with the
+    time constant tau.
 
     **Arguments:**
 
@@ -67,31 +74,33 @@ class Armstrong(AbstractDynamicLaw):
     gamma: Number = parameter("gamma", "s", lower=0.0, strict=True)
     stiff: ClassVar[bool] = True
 
-    def _slides(self, v: Float[Array, ""], share: Float[Array, ""]) -> Float[Array, ""]:
-        """How far the contact slides, 0 to 1, where the deflection does not follow that share of `v` [m/s]."""
-        ratio = v / (_SLIDES * self.vs)
-        return jnp.minimum(share, 1.0) * ratio * ratio / (1.0 + ratio * ratio)
+    def _moves(self, v: Float[Array, ""]) -> Float[Array, ""]:
+        """How far the speed `v` [m/s] is one of sliding, 0 to 1."""
+        return jnp.minimum(jnp.abs(v) / (_SLIDES * self.vs), 1.0)
 
     def _limit(self, rise: Float[Array, ""]) -> Float[Array, ""]:
         """Deflection [m] at which the contact slides."""
         return (self.Fc + (self.Fs - self.Fc) * rise) / self.sigma0
 
     def _steady(self, v: Float[Array, ""]) -> Float[Array, ""]:
-        """`rise` in steady slip at `v` [m/s]."""
+        """What is left of the magnitude in steady slip at `v` [m/s]."""
         ratio = v / self.vs
         return 1.0 / (1.0 + ratio * ratio)
 
     def state0(self, v: Float[Array, "..."]) -> ArmstrongState:
         """Undeflected after a long rest."""
-        return ArmstrongState(jnp.zeros_like(v), jnp.ones_like(v))
+        return ArmstrongState(jnp.zeros_like(v), jnp.ones_like(v), jnp.ones_like(v))
 
     def rate(self, v: Float[Array, ""], z: ArmstrongState) -> ArmstrongState:
-        """Rates of the state [m/s, 1/s] at slip velocity `v` [m/s]."""
+        """Rates of the state [m/s, 1/s, 1/s] at slip velocity `v` [m/s]."""
         u = z.z * jnp.sign(v) / self._limit(z.rise)
         share = yielding(u, jnp.asarray(_CORNER, u.dtype))
-        slides, missing = self._slides(v, share), 1.0 - z.rise
-        memory = slides * (self._steady(v) - z.rise) / self.tau + (1.0 - slides) * missing * missing / self.gamma
-        return ArmstrongState(v * (1.0 - share), memory)
+        # From the Coulomb force on, less the corner: rising stiction lets a contact that slides load up again.
+        loaded = jnp.clip((z.z * jnp.sign(v) * self.sigma0 / self.Fc - 1.0) / _CORNER + 2.0, 0.0, 1.0)
+        slides, missing = loaded * self._moves(v), 1.0 - z.rise
+        falls = (z.magnitude * self._steady(v) - z.rise) / self.tau
+        rise = slides * falls + (1.0 - slides) * missing * missing / self.gamma
+        return ArmstrongState(v * (1.0 - share), rise, (1.0 - slides) * (z.rise - z.magnitude) / self.tau)
 
     def force(self, v: Float[Array, ""], z: ArmstrongState) -> Float[Array, ""]:
         """Friction force [N] at slip velocity `v` [m/s]."""
@@ -104,15 +113,17 @@ class Armstrong(AbstractDynamicLaw):
     def advance(self, v: Float[Array, ""], z: ArmstrongState, dt: Float[Array, ""]) -> ArmstrongState:
         """State after `dt` [s] at constant `v` [m/s]; of order 1, and right at rest and in steady slip at any step.
 
-        First the memory, by how much of the step the contact slides at the limit there was, then the deflection.
+        First the memory, by how much of the step the contact slides, then the deflection at the limit that gives.
         """
-        corner, distance = jnp.asarray(_CORNER, z.z.dtype), v * dt
-        moves = distance != 0
-        followed = follow(v, z.z, dt, self._limit(z.rise), corner) - z.z
-        share = jnp.where(moves, 1.0 - followed / jnp.where(moves, distance, 1.0), 0.0)
-        slides = self._slides(v, share)
-        rise = 1.0 - _riccati(1.0 - z.rise, slides / self.tau, (1.0 - slides) / self.gamma, 1.0 - self._steady(v), dt)
-        return ArmstrongState(follow(v, z.z, dt, self._limit(rise), corner), rise)
+        corner, side = jnp.asarray(_CORNER, z.z.dtype), jnp.sign(v)
+        # Slip before the contact is loaded to its Coulomb force, as a part of the step.
+        distance = jnp.abs(v) * dt
+        before = jnp.maximum((1.0 - 1.5 * corner) * self.Fc / self.sigma0 - side * z.z, 0.0)
+        slides = (1.0 - jnp.minimum(before / jnp.where(distance > 0, distance, 1.0), 1.0)) * self._moves(v)
+        goal = 1.0 - z.magnitude * self._steady(v)
+        rise = 1.0 - _riccati(1.0 - z.rise, slides / self.tau, (1.0 - slides) / self.gamma, goal, dt)
+        magnitude = rise + (z.magnitude - rise) * jnp.exp(-(1.0 - slides) * dt / self.tau)
+        return ArmstrongState(follow(v, z.z, dt, self._limit(rise), corner), rise, magnitude)
 
 
 def _riccati(
