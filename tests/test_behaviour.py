@@ -111,7 +111,7 @@ def test_verdicts(outcomes, law, experiment, verdict):
 def test_every_law_has_its_steady_curve(outcomes):
     for law, of in outcomes.items():
         # Armstrong's stiction is not all back after a reversal; forward its curve is right, too.
-        assert of["characteristic"].verdict is (BY_NATURE if law == "Armstrong" else PASS), law
+        assert of["characteristic"].verdict is (NATURE if law == "Armstrong" else PASS), law
 
 
 def test_numbers_that_are_known(outcomes):
