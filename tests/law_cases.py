@@ -68,7 +68,9 @@ def elements(law: Any, share: Any) -> Any:
 def contact(law: Any, share: Any) -> Any:
     """State of Armstrong's law, part of the stiction back."""
     rise = jnp.asarray(0.6, law.Fc.dtype)
-    return ArmstrongState(share * (law.Fc + (law.Fs - law.Fc) * rise) / law.sigma0, rise, 0.8 * jnp.ones_like(rise))
+    return ArmstrongState(
+        share * (law.Fc + (law.Fs - law.Fc) * rise) / law.sigma0, rise, 0.8 + 0.0 * rise, 0.9 + 0.0 * rise
+    )
 
 
 def forward(loaded: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:

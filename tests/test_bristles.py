@@ -94,7 +94,7 @@ def test_maxwell_elements_remember_where_they_turned() -> None:
 def test_armstrong_stiction_comes_back_as_published() -> None:
     """By t/(t + gamma) from nothing, in steps of any length, and in the differential equation; and is kept in slip."""
     law = jms.Armstrong(sigma0=1e8, Fc=1.0, Fs=1.5, vs=1e-3, Fv=0.1, tau=0.01, gamma=0.7)
-    z, zero = ArmstrongState(jnp.array(0.0), jnp.array(0.0), jnp.array(0.0)), jnp.array(0.0)
+    z, zero = ArmstrongState(*(jnp.array(0.0),) * 4), jnp.array(0.0)
     for dt in (1e-3, 0.7, 1e4):
         np.testing.assert_allclose(law.advance(zero, z, jnp.array(dt)).rise, dt / (dt + 0.7), atol=1e-15)
     half = law.advance(zero, law.advance(zero, z, jnp.array(0.3)), jnp.array(0.4))

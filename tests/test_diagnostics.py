@@ -301,7 +301,7 @@ def test_every_bristle_has_a_step_that_runs(name: str, v: float) -> None:
 
     assert off(0.99 * h) < 5e-7
     # With attraction the step is that of the stiffer side of a kink, and the other side damps.
-    assert off(1.03 * h) > 1e-6 or "attraction" in name
+    assert not off(1.03 * h) <= 1e-6 or "attraction" in name  # NaN has grown, too
 
 
 def test_functions_of_velocity_have_a_step_and_growing_modes_have_none() -> None:

@@ -11,20 +11,23 @@ from ._law import AbstractDynamicLaw
 
 # Part of its limit over which the contact gives way.
 _CORNER = 0.02
-# Slip velocity, in Stribeck velocities, from which on a contact loaded to its Coulomb force slides and does not rest.
-# The published model needs such a rule, too, and leaves it open.
+# Slip velocity, in Stribeck velocities, below which a contact rests wherever it is.
 _SLIDES = 1e-3
 
 
 class ArmstrongState(NamedTuple):
-    """Deflection `z` [m] of the contact, the Stribeck friction there is, and what it would be at no speed.
+    """State of `Armstrong`.
 
-    `rise` and `magnitude` are shares of Fs - Fc, from 0 to 1; in stick they are the same.
+    - `z`: deflection of the contact [m].
+    - `rise`: Stribeck friction there is, as a share of Fs - Fc.
+    - `magnitude`: what it would be at no speed; in stick the same as `rise`.
+    - `slips`: 1 from when the contact has given way until it moves back, 0 from then on.
     """
 
     z: Float[Array, ""]
     rise: Float[Array, ""]
     magnitude: Float[Array, ""]
+    slips: Float[Array, ""]
 
 
 class Armstrong(AbstractDynamicLaw):
@@ -32,7 +35,8 @@ class Armstrong(AbstractDynamicLaw):
 
     In stick `F = sigma0 z`; in slip `F = (Fc + (Fs - Fc) rise) sign(v) + Fv v`. In slip `rise` goes to
     `magnitude/(1 + (v/vs)^2)` with the time constant `tau`, which is frictional memory; in stick it grows to 1 like
-    `t/(t + gamma)` from where it was, and the magnitude of the next slip is what it has become.
+    `t/(t + gamma)` from where it was, and the magnitude of the next slip is what it has become. The contact slips from
+    when it has given way until it moves back or comes to rest: a rule that the paper leaves open.
 
     Three things differ from the paper, so that the model is one set of differential equations: the lag is of first
     order where the paper has a pure delay of tau; stiction grows by `rise' = (1 - rise)^2/gamma`, which is the paper's
@@ -89,18 +93,26 @@ class Armstrong(AbstractDynamicLaw):
 
     def state0(self, v: Float[Array, "..."]) -> ArmstrongState:
         """Undeflected after a long rest."""
-        return ArmstrongState(jnp.zeros_like(v), jnp.ones_like(v), jnp.ones_like(v))
+        return ArmstrongState(jnp.zeros_like(v), jnp.ones_like(v), jnp.ones_like(v), jnp.zeros_like(v))
 
     def rate(self, v: Float[Array, ""], z: ArmstrongState) -> ArmstrongState:
-        """Rates of the state [m/s, 1/s, 1/s] at slip velocity `v` [m/s]."""
+        """Rates of the state [m/s, 1/s, 1/s, 1/s] at slip velocity `v` [m/s]."""
         u = z.z * jnp.sign(v) / self._limit(z.rise)
         share = yielding(u, jnp.asarray(_CORNER, u.dtype))
-        # From the Coulomb force on, less the corner: rising stiction lets a contact that slides load up again.
-        loaded = jnp.clip((z.z * jnp.sign(v) * self.sigma0 / self.Fc - 1.0) / _CORNER + 2.0, 0.0, 1.0)
-        slides, missing = loaded * self._moves(v), 1.0 - z.rise
+        slides, missing = z.slips * self._moves(v), 1.0 - z.rise
         falls = (z.magnitude * self._steady(v) - z.rise) / self.tau
         rise = slides * falls + (1.0 - slides) * missing * missing / self.gamma
-        return ArmstrongState(v * (1.0 - share), rise, (1.0 - slides) * (z.rise - z.magnitude) / self.tau)
+        turns = jnp.where(v * z.z < 0, -z.slips, share * (1.0 - z.slips))
+        return ArmstrongState(
+            v * (1.0 - share),
+            rise,
+            (1.0 - slides) * (z.rise - z.magnitude) / self.tau,
+            jnp.abs(v) / self._turn() * turns,
+        )
+
+    def _turn(self) -> Float[Array, ""]:
+        """Slip [m] over which the contact goes over from stick to slip, and back."""
+        return _CORNER * self.Fc / self.sigma0
 
     def force(self, v: Float[Array, ""], z: ArmstrongState) -> Float[Array, ""]:
         """Friction force [N] at slip velocity `v` [m/s]."""
@@ -115,15 +127,20 @@ class Armstrong(AbstractDynamicLaw):
 
         First the memory, by how much of the step the contact slides, then the deflection at the limit that gives.
         """
-        corner, side = jnp.asarray(_CORNER, z.z.dtype), jnp.sign(v)
-        # Slip before the contact is loaded to its Coulomb force, as a part of the step.
-        distance = jnp.abs(v) * dt
-        before = jnp.maximum((1.0 - 1.5 * corner) * self.Fc / self.sigma0 - side * z.z, 0.0)
-        slides = (1.0 - jnp.minimum(before / jnp.where(distance > 0, distance, 1.0), 1.0)) * self._moves(v)
+        corner, distance = jnp.asarray(_CORNER, z.z.dtype), jnp.abs(v) * dt
+        # Back, then along, and of that what the contact does not follow.
+        back = jnp.minimum(distance, jnp.where(v * z.z < 0, jnp.abs(z.z), 0.0))
+        lost = jnp.maximum(distance - jnp.abs(follow(v, z.z, dt, self._limit(z.rise), corner) - z.z), 0.0)
+        before = z.slips * jnp.exp(-back / self._turn())
+        slips = 1.0 - (1.0 - before) * jnp.exp(-lost / self._turn())
+        # Of the step the part that is slip: all of it if it was so before and did not turn.
+        whole = jnp.where(distance > 0, distance, 1.0)
+        share = jnp.maximum(z.slips * (1.0 - back / whole), lost / whole)
+        slides = jnp.minimum(share, 1.0) * self._moves(v)
         goal = 1.0 - z.magnitude * self._steady(v)
         rise = 1.0 - _riccati(1.0 - z.rise, slides / self.tau, (1.0 - slides) / self.gamma, goal, dt)
         magnitude = rise + (z.magnitude - rise) * jnp.exp(-(1.0 - slides) * dt / self.tau)
-        return ArmstrongState(follow(v, z.z, dt, self._limit(rise), corner), rise, magnitude)
+        return ArmstrongState(follow(v, z.z, dt, self._limit(rise), corner), rise, magnitude, slips)
 
 
 def _riccati(
