@@ -309,6 +309,20 @@ class Friction(AbstractEffect):
             return self.law.force(v), None
         return self._stretch(_against(self.law.force, v)), None
 
+    def after(
+        self, v: Float[Array, "..."], z: PyTree, dt: Float[Array, ""], load: Float[Array, ""] | None
+    ) -> tuple[Float[Array, "..."], PyTree]:
+        """Friction force and state of the law after `dt` [s] at constant slip velocity `v`, from the state `z`."""
+        v = self._stretch(v)
+        if isinstance(self.law, AbstractDynamicLaw):
+            z = self.law.advance(v, z, dt)
+            force = self.law.force(v, z)
+        else:
+            assert isinstance(self.law, AbstractForceLaw)
+            force = self.law.force(v) if v.ndim == 0 else _against(self.law.force, v)
+        force = self._stretch(force)
+        return (force if load is None else load * force), z
+
     def _stretch(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
         """What the law sees of a slip, and what its force is to the mechanism."""
         return x if self.ellipse is None else x * jnp.stack([jnp.ones_like(self.ellipse), self.ellipse])

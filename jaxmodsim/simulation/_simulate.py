@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from ..effects import Friction
-from ..scene import Scene
+from ..scene import Scene, check_step
+from ..solvers import ImplicitFriction
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages
 from ._solve import Options, Problem, Solved, solve
 from ._trajectory import Trajectory
@@ -93,6 +94,12 @@ def simulate(
         if not isinstance(flag, bool):
             raise ValueError(f"{name} must be True or False, but {flag!r} was given.")
     solver_arrays, solver_rest = _split(solver, dfx.AbstractSolver, "solver")
+    if isinstance(solver, ImplicitFriction):
+        if dt is None:
+            raise ValueError(
+                "ImplicitFriction takes fixed steps and has no estimate of its error: pass the step, as in dt=1e-3."
+            )
+        check_step(scene)
     adjoint_arrays, adjoint_rest = _split(adjoint, dfx.AbstractAdjoint, "adjoint")
     problem = problem._replace(plugins=(solver_arrays, adjoint_arrays))
     options = Options(solver_rest, adjoint_rest, int(max_steps), int(max_events), hold_chatter, project)
