@@ -16,7 +16,9 @@ from ._linalg import MAX_UNROLLED_LU, factor_lu
 
 # Evaluations of one search along a line, and Newton steps of several unknowns.
 _MOST_EVALUATIONS = 200
-_MOST_STEPS = 80
+_MOST_STEPS = 200
+# Newton steps after which decreasing parts of p are left out of its model.
+_PATIENCE = 15
 # Every so many evaluations the bracket is halved whatever Newton's method says.
 _HALVES = 4
 # Rounding units of its terms below which a residual counts as zero, and above which a solution is none.
@@ -147,15 +149,12 @@ def _slopes(fn: Callable[[Array], Array], x: Array, blocks: tuple[int, ...]) -> 
     starts = [sum(blocks[:i]) for i in range(len(blocks))]
     value, jacobian = fn(x), jnp.zeros((x.shape[0],) * 2, x.dtype)
     for offset in range(max(blocks)):
-        at = jnp.asarray([start + offset for start, size in zip(starts, blocks, strict=True) if offset < size])
-        value, column = jax.jvp(fn, (x,), (jnp.zeros_like(x).at[at].set(1.0),))
-        rows = [
-            i for start, size in zip(starts, blocks, strict=True) if offset < size for i in range(start, start + size)
-        ]
-        columns = [
-            start + offset for start, size in zip(starts, blocks, strict=True) if offset < size for _ in range(size)
-        ]
-        jacobian = jacobian.at[jnp.asarray(rows), jnp.asarray(columns)].set(column[jnp.asarray(rows)])
+        parts = [(start, size) for start, size in zip(starts, blocks, strict=True) if offset < size]
+        unit = jnp.zeros_like(x).at[jnp.asarray([start + offset for start, _ in parts])].set(1.0)
+        value, column = jax.jvp(fn, (x,), (unit,))
+        rows = jnp.asarray([start + i for start, size in parts for i in range(size)])
+        columns = jnp.asarray([start + offset for start, size in parts for _ in range(size)])
+        jacobian = jacobian.at[rows, columns].set(column[rows])
     return value, jacobian
 
 
@@ -210,8 +209,11 @@ def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, b
     def iterate(s: _Search) -> _Search:
         value, slopes = _slopes(fn, s.x, blocks)
         residual = s.x - free + _times(coupling, value)
-        scale = jnp.abs(s.x) + jnp.abs(free) + _times(jnp.abs(coupling), jnp.abs(value))
+        size = jnp.abs(value) + _times(jnp.abs(slopes), jnp.abs(s.x))
+        scale = jnp.abs(s.x) + jnp.abs(free) + _times(jnp.abs(coupling), size)
         misfit = jnp.max(jnp.abs(residual) / jnp.where(scale > 0, eps * scale, 1.0))
+        # Where p decreases, Newton steps may run in circles, and those of a model that does not decrease do not.
+        slopes = jnp.where(s.count < _PATIENCE, slopes, _increasing(slopes))
         step = _newton(coupling, slopes, residual)
         change = value - s.push + _times(slopes, step)
         descends = jnp.sum(step * (value - s.push)) < 0
@@ -219,8 +221,12 @@ def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, b
         change = jnp.where(descends, change, value - s.push)
         length = _length(fn, s.x, s.push, step, change, blocks)
         still = jnp.all(jnp.abs(step) <= eps * jnp.abs(s.x))
-        settled = (misfit <= _ROUNDING) | still
-        length = jnp.where(settled, 0.0, length)
+        # By how much p itself rounds is not known: where x is as good as found, it ends with the progress.
+        ends = (misfit <= _LOST) & (misfit >= 0.5 * s.misfit)
+        settled = (misfit <= _ROUNDING) | still | ends
+        # Blocks of several unknowns may have no potential, and steps circle there, too, until some are cut short.
+        short = (s.count >= 2 * _PATIENCE) & (s.count % 3 == 0)
+        length = jnp.where(settled, 0.0, jnp.where(short, 0.5, 1.0) * length)
         return _Search(s.x + length * step, s.push + length * change, settled, misfit, s.count + 1)
 
     push = fn(jnp.zeros_like(free))
@@ -228,6 +234,13 @@ def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, b
     start = _Search(free - _times(coupling, push), push, jnp.array(False), never, jnp.array(0))
     end = jax.lax.while_loop(lambda s: ~s.settled & (s.count < _MOST_STEPS), iterate, start)
     return Monotone(end.x, end.settled | (end.misfit <= _LOST), end.count)
+
+
+def _increasing(slopes: Array) -> Array:
+    """Slopes without a decreasing part: the diagonal raised until it dominates."""
+    even = 0.5 * (slopes + slopes.T)
+    beside = jnp.sum(jnp.abs(even), axis=1) - jnp.abs(jnp.diagonal(even))
+    return slopes + jnp.diag(jnp.maximum(beside - jnp.diagonal(even), 0.0))
 
 
 def _length(
