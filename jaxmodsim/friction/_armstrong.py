@@ -93,8 +93,9 @@ class Armstrong(AbstractDynamicLaw):
         memory = slides * (self._steady(v) - z.rise) / self.tau + (1.0 - slides) * missing * missing / self.gamma
         return ArmstrongState(v * (1.0 - share), memory)
 
-    def force(self, v: Float[Array, ""], z: ArmstrongState) -> Float[Array, ""]:
+    def force_at(self, v: Float[Array, ""], z: ArmstrongState, rate: ArmstrongState) -> Float[Array, ""]:
         """Friction force [N] at slip velocity `v` [m/s]."""
+        del rate
         return self.sigma0 * z.z + self.Fv * v
 
     def stored(self, z: ArmstrongState) -> Float[Array, ""]:
