@@ -147,7 +147,7 @@ def _times(matrix: Array, x: Array) -> Array:
 def _slopes(fn: Callable[[Array], Array], x: Array, blocks: tuple[int, ...]) -> tuple[Array, Array]:
     """`fn(x)` and its Jacobian, which has entries within the blocks only."""
     starts = [sum(blocks[:i]) for i in range(len(blocks))]
-    value, jacobian = fn(x), jnp.zeros((x.shape[0],) * 2, x.dtype)
+    value, jacobian = x, jnp.zeros((x.shape[0],) * 2, x.dtype)
     for offset in range(max(blocks)):
         parts = [(start, size) for start, size in zip(starts, blocks, strict=True) if offset < size]
         unit = jnp.zeros_like(x).at[jnp.asarray([start + offset for start, _ in parts])].set(1.0)
@@ -219,11 +219,12 @@ def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, b
         descends = jnp.sum(step * (value - s.push)) < 0
         step = jnp.where(descends, step, -residual)
         change = jnp.where(descends, change, value - s.push)
-        length = _length(fn, s.x, s.push, step, change, blocks)
         still = jnp.all(jnp.abs(step) <= eps * jnp.abs(s.x))
         # By how much p itself rounds is not known: where x is as good as found, it ends with the progress.
         ends = (misfit <= _LOST) & (misfit >= 0.5 * s.misfit)
         settled = (misfit <= _ROUNDING) | still | ends
+        first = jnp.sum(step * (value - s.push))
+        length = _length(fn, s.x, s.push, step, change, blocks, first, settled)
         # Blocks of several unknowns may have no potential, and steps circle there, too, until some are cut short.
         short = (s.count >= 2 * _PATIENCE) & (s.count % 3 == 0)
         length = jnp.where(settled, 0.0, jnp.where(short, 0.5, 1.0) * length)
@@ -244,15 +245,21 @@ def _increasing(slopes: Array) -> Array:
 
 
 def _length(
-    fn: Callable[[Array], Array], x: Array, push: Array, step: Array, change: Array, blocks: tuple[int, ...]
+    fn: Callable[[Array], Array],
+    x: Array,
+    push: Array,
+    step: Array,
+    change: Array,
+    blocks: tuple[int, ...],
+    first: Array,
+    settled: Array,
 ) -> Array:
-    """Length of a Newton step, at most 1."""
+    """Length of a Newton step, at most 1, along which the derivative begins with `first` < 0; 1 where `settled`."""
 
     def along(length: Any) -> Array:
         return jnp.sum(step * (fn(x + length * step) - push - length * change))
 
-    zero, one = jnp.zeros_like(x[0]), jnp.ones_like(x[0])
-    first, last = along(zero), along(one)
+    eps, one = float(jnp.finfo(x.dtype).eps), jnp.ones_like(first)
     enough = -_ENOUGH * first
     kinks, start = [], 0
     for size in blocks:
@@ -262,11 +269,13 @@ def _length(
         start += size
     places = jnp.stack(kinks)
     between = (places > 0) & (places < 1)
-    values = jax.vmap(along)(places)
-    below = jnp.max(jnp.where(between & (values < 0), places, 0.0))
-    above = jnp.min(jnp.where(between & (values >= 0), places, 1.0))
-    width = above - below
-    eps = float(jnp.finfo(x.dtype).eps)
-    least = jnp.where(below > 0, 4.0 * eps * below, width / 64.0)
-    found = rising_root(lambda s: (along(below + s), jnp.abs(enough)), 0.5 * width, width, least)
-    return jnp.where(last <= enough, one, below + found.x)
+
+    def search() -> Array:
+        values = jax.vmap(along)(places)
+        below = jnp.max(jnp.where(between & (values < 0), places, 0.0))
+        above = jnp.min(jnp.where(between & (values >= 0), places, 1.0))
+        width = above - below
+        least = jnp.where(below > 0, 4.0 * eps * below, width / 64.0)
+        return below + rising_root(lambda s: (along(below + s), jnp.abs(enough)), 0.5 * width, width, least).x
+
+    return jax.lax.cond(settled | (along(one) <= enough), lambda: one, search)
