@@ -322,8 +322,8 @@ def test_coupled_steep_equations(blocks: tuple[int, ...]) -> None:
     """Random masses, loads and widths over ten decades, with fewer coordinates than unknowns."""
     n, lanes, rng = sum(blocks), 500, np.random.default_rng(3)
     rows = rng.normal(size=(lanes, n, max(n - 1, 1)))
-    coupling = np.einsum("lik,ljk->lij", rows, rows)
-    free = np.einsum("lik,lk->li", rows, rng.normal(size=rows.shape[::2]) * 10.0 ** rng.uniform(-3, 1, (lanes, 1)))
+    coupling = np.einsum("nik,njk->nij", rows, rows)
+    free = np.einsum("nik,nk->ni", rows, rng.normal(size=rows.shape[::2]) * 10.0 ** rng.uniform(-3, 1, (lanes, 1)))
     widths = 10.0 ** rng.uniform(-9, 1, (lanes, len(blocks)))
 
     def solve(free: Any, coupling: Any, widths: Any) -> Any:

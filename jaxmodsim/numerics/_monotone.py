@@ -1,7 +1,7 @@
 """Equations `x = free - A p(x)` with A positive semidefinite and `p` mostly increasing, however steep it is.
 
 They are what an implicit step leaves of friction: x the slip velocities, p the impulses, A the mobility. Where p is
-steep at x = 0 and level elsewhere, as friction is, plain Newton steps jump to and fro across it. Here they are kept
+steep at x = 0 and level elsewhere, as friction is, plain Newton steps jump back and forth across it. Here they are kept
 between points where the sign is known, so that the search always ends.
 """
 
@@ -41,7 +41,7 @@ class _Bracket(NamedTuple):
     below: Array
     above: Array
     settled: Array
-    count: Array
+    tries: Array
 
 
 def rising_root(
@@ -73,15 +73,15 @@ def rising_root(
         rises = slope > 0
         newton = s.x - value / jnp.where(rises, slope, 1.0)
         inside = rises & (newton > below) & (newton < above)
-        forced = (s.count % _HALVES == _HALVES - 1) & jnp.isfinite(above)
+        forced = (s.tries % _HALVES == _HALVES - 1) & jnp.isfinite(above)
         x = jnp.where(inside & ~forced, newton, _between(below, above, least))
         still = rises & (jnp.abs(newton - s.x) <= eps * s.x)
         settled = (jnp.abs(value) <= small) | still | (above - below <= 2.0 * eps * above)
-        return _Bracket(jnp.where(settled, s.x, x), below, above, settled, s.count + 1)
+        return _Bracket(jnp.where(settled, s.x, x), below, above, settled, s.tries + 1)
 
     start = _Bracket(first, jnp.zeros_like(first), above, jnp.array(False), jnp.array(0))
-    end = jax.lax.while_loop(lambda s: ~s.settled & (s.count < _MOST_EVALUATIONS), iterate, start)
-    return RisingRoot(end.x, end.settled, end.count)
+    end = jax.lax.while_loop(lambda s: ~s.settled & (s.tries < _MOST_EVALUATIONS), iterate, start)
+    return RisingRoot(end.x, end.settled, end.tries)
 
 
 def _between(below: Array, above: Array, least: Array) -> Array:
@@ -196,7 +196,7 @@ class _Search(NamedTuple):
     settled: Array
     # Largest residual in rounding units of its terms.
     misfit: Array
-    count: Array
+    tries: Array
 
 
 def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, blocks: tuple[int, ...]) -> Monotone:
@@ -213,7 +213,7 @@ def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, b
         scale = jnp.abs(s.x) + jnp.abs(free) + _times(jnp.abs(coupling), size)
         misfit = jnp.max(jnp.abs(residual) / jnp.where(scale > 0, eps * scale, 1.0))
         # Where p decreases, Newton steps may run in circles, and those of a model that does not decrease do not.
-        slopes = jnp.where(s.count < _PATIENCE, slopes, _increasing(slopes))
+        slopes = jnp.where(s.tries < _PATIENCE, slopes, _increasing(slopes))
         step = _newton(coupling, slopes, residual)
         change = value - s.push + _times(slopes, step)
         descends = jnp.sum(step * (value - s.push)) < 0
@@ -226,15 +226,15 @@ def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, b
         first = jnp.sum(step * (value - s.push))
         length = _length(fn, s.x, s.push, step, change, blocks, first, settled)
         # Blocks of several unknowns may have no potential, and steps circle there, too, until some are cut short.
-        short = (s.count >= 2 * _PATIENCE) & (s.count % 3 == 0)
+        short = (s.tries >= 2 * _PATIENCE) & (s.tries % 3 == 0)
         length = jnp.where(settled, 0.0, jnp.where(short, 0.5, 1.0) * length)
-        return _Search(s.x + length * step, s.push + length * change, settled, misfit, s.count + 1)
+        return _Search(s.x + length * step, s.push + length * change, settled, misfit, s.tries + 1)
 
     push = fn(jnp.zeros_like(free))
     never = jnp.full_like(free[0], jnp.inf)
     start = _Search(free - _times(coupling, push), push, jnp.array(False), never, jnp.array(0))
-    end = jax.lax.while_loop(lambda s: ~s.settled & (s.count < _MOST_STEPS), iterate, start)
-    return Monotone(end.x, end.settled | (end.misfit <= _LOST), end.count)
+    end = jax.lax.while_loop(lambda s: ~s.settled & (s.tries < _MOST_STEPS), iterate, start)
+    return Monotone(end.x, end.settled | (end.misfit <= _LOST), end.tries)
 
 
 def _increasing(slopes: Array) -> Array:
