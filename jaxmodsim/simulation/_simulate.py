@@ -62,7 +62,8 @@ def simulate(
     - `dtmax`: longest step [s], > 0. In stick nothing moves and steps grow, so that a load that comes in short pulses
       can be stepped over: bound the step by the length of a pulse. Where that shows at a saved time, the run fails.
     - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`) or, on one
-      coordinate, runs by events (set-valued laws); `diffrax.Tsit5` otherwise.
+      coordinate, runs by events (set-valued laws); `diffrax.Tsit5` otherwise. `ImplicitFriction` for fixed steps that
+      may be too long for the stiffness of friction.
     - `adjoint`: how diffrax differentiates the run. By default for reverse mode (`jax.grad`); pass
       `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`.
     - `max_steps`: limit of the number of steps.

@@ -8,22 +8,28 @@ from jaxtyping import PyTree
 
 
 class ImplicitFriction(dfx.AbstractSolver):
-    """Fixed steps that are implicit in friction alone, and hold at any stiffness of it: `simulate(..., dt=1e-3,
-    solver=ImplicitFriction())`.
+    """Fixed steps that are implicit in friction alone, and hold at any stiffness of it.
 
-    For steps that are given, by a control loop or by the sampling of a record. A step from t to t + h takes masses,
-    directions and all other forces as they are at t, and friction as it is at t + h: the state of the law moves by
-    its own solution at constant slip velocity, exactly where that has a closed form, and the slip velocities solve
-    `v = v_free - h D M^-1 D^T F(v)`, by a search in a bracket that always ends. Coordinates follow with the new
-    velocities (semi-implicit Euler). So a bristle deflection stays within its limit, and in stick velocities go to
-    zero, whatever the step and the stiffness, in float32 as in float64.
+    For steps that are given, by a control loop or by the sampling of a record:
+    `simulate(..., dt=1e-3, solver=ImplicitFriction())`. A step from t to t + h takes masses, directions, loads and all
+    other forces as they are at t, and friction as it is at t + h: the state of the law moves by its own solution at
+    constant slip velocity, and the slip velocities solve `v = v_free - h D M^-1 D^T F(v)`, by a search in a bracket
+    that always ends. Coordinates follow with the new velocities (semi-implicit Euler). So a bristle's deflection stays
+    within its limit, and in stick velocities go to zero, whatever the step and the stiffness, in float32 as in float64.
+    Bristles that a step does not resolve cost no accuracy: their damping acts by its impulse over the step.
 
-    Order 1; there is no error estimate. What the mechanism itself has of fast motion (springs of frequency w without
-    friction) must be resolved, `h w < 2`. Friction laws: those with a state of their own, and functions of slip
-    velocity (`Viscous`, `Regularized`, a function of yours); not set-valued ones. Where a step is so long that
-    stick and slip are both solutions, as with the Stribeck effect, it goes on with that which the step began with.
+    Order 1; there is no error estimate. What the mechanism has of fast motion by itself must be resolved: springs of
+    angular frequency w need `h w < 2`. Friction may be any law with a state of its own or function of slip velocity
+    (`Viscous`, `Regularized` of any width, a function of yours), along displacements or in the plane, within
+    constraints; not a set-valued law, and not under the reaction of a constraint. Where a step is so long that stick
+    and slip are both solutions, as with the Stribeck effect, it takes the one near the motion before.
 
-    Derivatives, forward and reverse, are those of the exact step by the implicit function theorem.
+    Several elements, or slip in the plane, are found by Newton steps with a search along each. Equations that these do
+    not solve (rare: in float32, coupled planar contacts whose deflection a step passes 10^7 times) end the run with
+    `diffrax.RESULTS.nonlinear_divergence`.
+
+    `run.forces` gives the law's force at the saved state; between steps states are interpolated linearly. Derivatives,
+    forward and reverse, are those of the exact step by the implicit function theorem.
 
     **Arguments:**
 
