@@ -49,4 +49,5 @@ from .simulation import simulate as simulate
 from .solvers import EventController as EventController
 from .solvers import EventSolver as EventSolver
 from .solvers import Gauss as Gauss
+from .solvers import ImplicitFriction as ImplicitFriction
 from .solvers import Rodas5P as Rodas5P

@@ -56,8 +56,8 @@ class Unknown(AbstractDynamicLaw):
     def rate(self, v: Any, z: Any) -> Any:
         return self.inner.rate(v, z)
 
-    def force(self, v: Any, z: Any) -> Any:
-        return self.inner.force(v, z)
+    def force_at(self, v: Any, z: Any, rate: Any) -> Any:
+        return self.inner.force_at(v, z, rate)
 
     def stored(self, z: Any) -> Any:
         return self.inner.stored(z)

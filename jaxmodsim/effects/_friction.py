@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
 from ..friction import (
@@ -309,6 +310,24 @@ class Friction(AbstractEffect):
             return self.law.force(v), None
         return self._stretch(_against(self.law.force, v)), None
 
+    def after(
+        self, v: Float[Array, "..."], z: PyTree, dt: Float[Array, ""], load: Float[Array, ""] | None
+    ) -> tuple[Float[Array, "..."], PyTree]:
+        """Friction force over, and state of the law after, the time `dt` [s] at constant slip velocity `v`.
+
+        Damping in a bristle is that of its mean rate, so that its impulse is right however far the bristle has gone.
+        """
+        v = self._stretch(v)
+        if isinstance(self.law, AbstractDynamicLaw):
+            after = self.law.advance(v, z, dt)
+            force = self.law.force_at(v, after, _mean_rate(self.law, v, z, after, dt))
+            z = after
+        else:
+            assert isinstance(self.law, AbstractForceLaw)
+            force = self.law.force(v) if v.ndim == 0 else _against(self.law.force, v)
+        force = self._stretch(force)
+        return (force if load is None else load * force), z
+
     def _stretch(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
         """What the law sees of a slip, and what its force is to the mechanism."""
         return x if self.ellipse is None else x * jnp.stack([jnp.ones_like(self.ellipse), self.ellipse])
@@ -333,6 +352,19 @@ class Friction(AbstractEffect):
         if isinstance(self.law, AbstractDynamicLaw) and self.normal_force is None and not varies(self.law):
             return self.law.stored(z)
         return 0.0
+
+
+def _mean_rate(law: AbstractDynamicLaw, v: Float[Array, "..."], z: PyTree, after: PyTree, dt: Array) -> PyTree:
+    """Mean rate of a state that goes from `z` to `after` in `dt` [s] at constant slip velocity.
+
+    It lies between those of the ends: where they differ by less than the quotient is rounded, they say it better.
+    """
+
+    def mean(before: Array, after: Array, first: Array, last: Array) -> Array:
+        quotient = (after - before) / jnp.where(dt == 0, 1.0, dt)
+        return jnp.clip(quotient, jnp.minimum(first, last), jnp.maximum(first, last))
+
+    return jtu.tree_map(mean, z, after, law.rate(v, z), law.rate(v, after))
 
 
 def _against(force: Callable[..., Any], v: Float[Array, " d"]) -> Float[Array, " d"]:

@@ -114,8 +114,9 @@ class Armstrong(AbstractDynamicLaw):
         """Slip [m] over which the contact goes over from stick to slip, and back."""
         return _CORNER * self.Fc / self.sigma0
 
-    def force(self, v: Float[Array, ""], z: ArmstrongState) -> Float[Array, ""]:
+    def force_at(self, v: Float[Array, ""], z: ArmstrongState, rate: ArmstrongState) -> Float[Array, ""]:
         """Friction force [N] at slip velocity `v` [m/s]."""
+        del rate
         return self.sigma0 * z.z + self.Fv * v
 
     def stored(self, z: ArmstrongState) -> Float[Array, ""]:

@@ -93,9 +93,9 @@ class _AsymmetricDynamic(AbstractDynamicLaw):
         """Time derivative of the state."""
         return _toward(v, self).rate(v, z)
 
-    def force(self, v: Float[Array, ""], z: Any) -> Float[Array, ""]:
+    def force_at(self, v: Float[Array, ""], z: Any, rate: Any) -> Float[Array, ""]:
         """Friction force [N]."""
-        return _toward(v, self).force(v, z)
+        return _toward(v, self).force_at(v, z, rate)
 
     def stored(self, z: Any) -> Float[Array, ""]:
         """Energy [J] in the state: stiffness is one for both directions."""

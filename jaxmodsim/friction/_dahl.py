@@ -49,9 +49,11 @@ class Dahl(AbstractPlanarLaw):
         """Z' [m/s] at slip velocity `v` [m/s] and deflection `z` [m]."""
         return v - self.sigma0 * magnitude(v) / self.Fc * z
 
-    def force(self, v: Float[Array, "..."], z: Float[Array, "..."]) -> Float[Array, "..."]:
+    def force_at(
+        self, v: Float[Array, "..."], z: Float[Array, "..."], rate: Float[Array, "..."]
+    ) -> Float[Array, "..."]:
         """Friction force [N] at deflection `z` [m]."""
-        del v
+        del v, rate
         return self.sigma0 * z
 
     def stored(self, z: Float[Array, "..."]) -> Float[Array, ""]:

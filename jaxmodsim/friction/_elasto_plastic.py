@@ -77,9 +77,9 @@ class ElastoPlastic(AbstractDynamicLaw):
         u = self.sigma0 * z * jnp.sign(v) / g
         return v * (1.0 - self._plastic(u, self.Fba / g) * u)
 
-    def force(self, v: Float[Array, ""], z: Float[Array, ""]) -> Float[Array, ""]:
-        """Friction force [N] at slip velocity `v` [m/s] and deflection `z` [m]."""
-        return self.sigma0 * z + self.sigma1 * self.rate(v, z) + self.sigma2 * v
+    def force_at(self, v: Float[Array, ""], z: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
+        """Friction force [N] at slip velocity `v` [m/s], deflection `z` [m] and its `rate` [m/s]."""
+        return self.sigma0 * z + self.sigma1 * rate + self.sigma2 * v
 
     def stored(self, z: Float[Array, ""]) -> Float[Array, ""]:
         """Elastic energy [J] of the bristle."""

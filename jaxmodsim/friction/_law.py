@@ -89,8 +89,12 @@ class AbstractDynamicLaw(AbstractLaw):
         """Time derivative of the state `z` at slip velocity `v` [m/s]."""
 
     @abc.abstractmethod
+    def force_at(self, v: Float[Array, "..."], z: Any, rate: Any) -> Float[Array, "..."]:
+        """Friction force [N] at slip velocity `v` [m/s], the state `z`, and a rate of that: damping in the bristle."""
+
     def force(self, v: Float[Array, "..."], z: Any) -> Float[Array, "..."]:
         """Friction force [N] at slip velocity `v` [m/s] and state `z`."""
+        return self.force_at(v, z, self.rate(v, z))
 
     @abc.abstractmethod
     def stored(self, z: Any) -> Float[Array, ""]:

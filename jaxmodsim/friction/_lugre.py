@@ -70,13 +70,15 @@ class LuGre(AbstractPlanarLaw):
         """Z' [m/s] at slip velocity `v` [m/s] and deflection `z` [m]."""
         return v - self.sigma0 * magnitude(v) / self.level(v) * z
 
-    def force(self, v: Float[Array, "..."], z: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Friction force [N] at slip velocity `v` [m/s] and deflection `z` [m]."""
+    def force_at(
+        self, v: Float[Array, "..."], z: Float[Array, "..."], rate: Float[Array, "..."]
+    ) -> Float[Array, "..."]:
+        """Friction force [N] at slip velocity `v` [m/s], deflection `z` [m] and its `rate` [m/s]."""
         sigma1 = self.sigma1
         if self.vd is not None:
             ratio = magnitude(v) / self.vd
             sigma1 = sigma1 * jnp.exp(-ratio * ratio)
-        return self.sigma0 * z + sigma1 * self.rate(v, z) + self.sigma2 * v
+        return self.sigma0 * z + sigma1 * rate + self.sigma2 * v
 
     def stored(self, z: Float[Array, "..."]) -> Float[Array, ""]:
         """Elastic energy [J] of the bristle."""

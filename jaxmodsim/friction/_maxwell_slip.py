@@ -102,8 +102,9 @@ class MaxwellSlip(AbstractDynamicLaw):
         rate = v * (1.0 - yielding(jnp.minimum(u, 1.0), self.corner))
         return rate - side * self._attraction(limit) * limit / self.k * jnp.maximum(u - 1.0, 0.0)
 
-    def force(self, v: Float[Array, ""], z: Float[Array, " n"]) -> Float[Array, ""]:
+    def force_at(self, v: Float[Array, ""], z: Float[Array, " n"], rate: Float[Array, " n"]) -> Float[Array, ""]:
         """Friction force [N] at slip velocity `v` [m/s] and deflections `z` [m]."""
+        del rate
         return jnp.sum(self.k * z) + self.sigma2 * v
 
     def stored(self, z: Float[Array, " n"]) -> Float[Array, ""]:

@@ -10,6 +10,9 @@ from ._linalg import cholesky_pivots as cholesky_pivots
 from ._linalg import factor_lu as factor_lu
 from ._linalg import factor_positive_definite as factor_positive_definite
 from ._linalg import solve_positive_definite as solve_positive_definite
+from ._monotone import Monotone as Monotone
+from ._monotone import rising_root as rising_root
+from ._monotone import solve_monotone as solve_monotone
 from ._numbers import Function as Function
 from ._numbers import Number as Number
 from ._numbers import Range as Range

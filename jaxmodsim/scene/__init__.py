@@ -16,6 +16,8 @@ from ._field import scene_project as scene_project
 from ._field import scene_reactions as scene_reactions
 from ._field import scene_stick as scene_stick
 from ._field import scene_switch as scene_switch
+from ._implicit import check_step as check_step
+from ._implicit import scene_step as scene_step
 from ._names import replace_numbers as replace_numbers
 from ._names import scene_numbers as scene_numbers
 from ._names import scene_ranges as scene_ranges

@@ -52,7 +52,7 @@ class Resolved(NamedTuple):
     margins: Float[Array, " checks"] | None
 
 
-class _Mobility(NamedTuple):
+class Mobility(NamedTuple):
     """How the mechanism answers forces within its constraints."""
 
     mass: Float[Array, "dof dof"]
@@ -80,7 +80,7 @@ def resolve(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -> Resolve
     scene = scene.at(t, q, qd)
     equations = motion_equations(scene.lagrangian, t, q, qd, params)
     restraint = restrain(scene.constraints, t, q, qd, params, equations.mass) if scene.constraints else None
-    mobility = _Mobility(equations.mass, restraint)
+    mobility = Mobility(equations.mass, restraint)
     actions, rhs = {}, equations.load
     holding = {}
     for name, effect in zip(scene.names, scene.effects, strict=True):
@@ -128,7 +128,7 @@ def resolve(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -> Resolve
 
 
 def _loads(
-    scene: Scene, mobility: _Mobility, t: Array, y: State, rows: Float[Array, "n dof"], multipliers: Any
+    scene: Scene, mobility: Mobility, t: Array, y: State, rows: Float[Array, "n dof"], multipliers: Any
 ) -> Loads | None:
     """Normal forces of the constraints that load friction, and what the elements with `rows` take off them."""
     names = scene.loaded

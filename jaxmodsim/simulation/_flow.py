@@ -18,6 +18,7 @@ from ..scene import (
     scene_guards,
     scene_power,
     scene_project,
+    scene_step,
     scene_stick,
     scene_switch,
 )
@@ -61,6 +62,14 @@ class Flow(NamedTuple):
         state = self.state(t, y, scene)
         rate = (scene_canonical if self.canonical else scene_field)(t, state, scene, mode)
         return (rate, scene_power(t, state, scene, mode)) if self.audited else rate
+
+    def advance(self, t0: Array, t1: Array, y: Any, scene: Scene) -> tuple[Any, Array]:
+        """One step of `ImplicitFriction`, and whether it was solved; work is done at the powers at its end."""
+        state, solved = scene_step(scene, t0, t1, self.state(t0, y, scene))
+        if not self.audited:
+            return state, solved
+        powers = scene_power(t1, state, scene)
+        return (state, jtu.tree_map(lambda work, power: work + (t1 - t0) * power, y[1], powers)), solved
 
     def _inner(self, t: Array, state: State, scene: Scene) -> State:
         if not self.canonical:

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from ..effects import Friction
-from ..scene import Scene
+from ..scene import Scene, check_step
+from ..solvers import ImplicitFriction
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages
 from ._solve import Options, Problem, Solved, solve
 from ._trajectory import Trajectory
@@ -61,7 +62,8 @@ def simulate(
     - `dtmax`: longest step [s], > 0. In stick nothing moves and steps grow, so that a load that comes in short pulses
       can be stepped over: bound the step by the length of a pulse. Where that shows at a saved time, the run fails.
     - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`) or, on one
-      coordinate, runs by events (set-valued laws); `diffrax.Tsit5` otherwise.
+      coordinate, runs by events (set-valued laws); `diffrax.Tsit5` otherwise. `ImplicitFriction` for fixed steps that
+      may be too long for the stiffness of friction.
     - `adjoint`: how diffrax differentiates the run. By default for reverse mode (`jax.grad`); pass
       `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`.
     - `max_steps`: limit of the number of steps.
@@ -93,6 +95,12 @@ def simulate(
         if not isinstance(flag, bool):
             raise ValueError(f"{name} must be True or False, but {flag!r} was given.")
     solver_arrays, solver_rest = _split(solver, dfx.AbstractSolver, "solver")
+    if isinstance(solver, ImplicitFriction):
+        if dt is None:
+            raise ValueError(
+                "ImplicitFriction takes fixed steps and has no estimate of its error: pass the step, as in dt=1e-3."
+            )
+        check_step(scene)
     adjoint_arrays, adjoint_rest = _split(adjoint, dfx.AbstractAdjoint, "adjoint")
     problem = problem._replace(plugins=(solver_arrays, adjoint_arrays))
     options = Options(solver_rest, adjoint_rest, int(max_steps), int(max_events), hold_chatter, project)

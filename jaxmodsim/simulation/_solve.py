@@ -12,7 +12,16 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..scene import Scene, State, check_scene, scene_drifts, scene_field, scene_modes, scene_overload, scene_project
-from ..solvers import EventController, EventLog, EventSolver, FiniteSteps, Gauss, Projected, Rodas5P
+from ..solvers import (
+    EventController,
+    EventLog,
+    EventSolver,
+    FiniteSteps,
+    Gauss,
+    ImplicitFriction,
+    Projected,
+    Rodas5P,
+)
 from ._flow import Flow, Hybrid, Work
 from ._outcome import MISSED_EVENT, SUCCESS, Ending, end_code, start_code
 
@@ -124,6 +133,8 @@ def _integrate(problem: Problem, options: Options, audited: bool, log: int | Non
     scene, exact = problem.scene, bool(problem.scene.exact)
     initial, mode, hybrid, start = _prepared(problem, options, audited)
     solver, adjoint = _plugins(problem, options)
+    if isinstance(solver, ImplicitFriction):
+        solver = ImplicitFriction(hybrid.flow.advance)
     # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
     starts = start == SUCCESS
     ts = None if problem.ts is None else jnp.where(starts, problem.ts, problem.t0)

@@ -8,5 +8,6 @@ from ._event_state import TOO_MANY as TOO_MANY
 from ._event_state import EventLog as EventLog
 from ._event_state import EventState as EventState
 from ._gauss import Gauss as Gauss
+from ._implicit_friction import ImplicitFriction as ImplicitFriction
 from ._projected import Projected as Projected
 from ._rodas5p import Rodas5P as Rodas5P

@@ -1,0 +1,115 @@
+"""A step of a scene that is implicit in friction and explicit in everything else."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from ..effects import Friction
+from ..friction import Sign
+from ..mechanics import motion_equations, restrain
+from ..numerics import solve_monotone
+from ._resolve import Mobility, State
+from ._scene import Scene
+
+
+class _Element(NamedTuple):
+    """A friction element at the beginning of a step.
+
+    - `effect`: with the law as it is there; `load`: its normal load, or None.
+    - `rows`: slip velocities per unit of the velocities, shape `[components, dof]`.
+    - `belt`: velocity of the surface at the end of the step, shape `[components]`.
+    - `planar`: whether slip is a vector.
+    """
+
+    effect: Friction
+    load: Float[Array, ""] | None
+    rows: Float[Array, "components dof"]
+    belt: Float[Array, " components"]
+    planar: bool
+
+    def end(self, v: Float[Array, " components"], z: PyTree, h: Float[Array, ""]) -> tuple[Array, PyTree]:
+        """Force and state at the end of the step at the slip velocity `v` there."""
+        force, z = self.effect.after(v if self.planar else v[0], z, h, self.load)
+        return jnp.atleast_1d(force), z
+
+
+def check_step(scene: Scene) -> None:
+    """Check that `scene_step` can step the scene.
+
+    **Raises:**
+
+    - `ValueError` naming the friction element that it cannot step, and what to do.
+    """
+    for name, effect in zip(scene.names, scene.effects, strict=True):
+        if not isinstance(effect, Friction):
+            continue
+        law, start = type(effect.law).__name__, f"ImplicitFriction: friction {name!r}"
+        if effect.exact or isinstance(effect.law, Sign):
+            raise ValueError(
+                f"{start} has a force that jumps at rest ({law}), so that position and velocity do not tell it: wrap"
+                " the law as Regularized(law, width), however small the width, take a law with bristles (LuGre, Dahl,"
+                " ElastoPlastic), or run it by events, with another solver."
+            )
+        if effect.holding:
+            raise ValueError(
+                f"{start} is a DeadZone, which holds by knowing all other forces: wrap the law as Regularized(law,"
+                " width) instead, or use another solver."
+            )
+        if effect.rests_on is not None:
+            raise ValueError(
+                f"{start} has the reaction of the constraint {effect.rests_on!r} for its load, which this solver does"
+                " not find together with friction: give normal_force as a function, or use another solver."
+            )
+
+
+def scene_step(scene: Scene, t0: Float[Array, ""], t1: Float[Array, ""], y: State) -> tuple[State, Bool[Array, ""]]:
+    """State at `t1` after one step from `y` at `t0`, of order 1, and whether its equations were solved.
+
+    Masses, directions, loads and all forces but friction are those at t0. Friction is that of the slip velocity and the
+    state at t1: `v1 = v_free - h D M^-1 D^T F(v1, advance(v1, z0, h))`. Coordinates follow with the velocities at t1.
+    """
+    q, qd, params, h = y.q, y.qd, scene.params, t1 - t0
+    settled = scene.at(t0, q, qd)
+    equations = motion_equations(scene.lagrangian, t0, q, qd, params)
+    restraint = restrain(scene.constraints, t0, q, qd, params, equations.mass) if scene.constraints else None
+    mobility = Mobility(equations.mass, restraint)
+    rhs, elements = equations.load, {}
+    for name, effect in zip(scene.names, settled.effects, strict=True):
+        if isinstance(effect, Friction):
+            elements[name] = _element(effect, t0, t1, q, qd, params)
+        else:
+            rhs = rhs + effect.act(t0, q, qd, y.z.get(name), params).generalised
+    free = qd + h * mobility.accelerate(rhs)
+    if not elements:
+        return State(q + h * free, free, {}), jnp.array(True)
+
+    def ends(v: Array) -> list[tuple[Array, PyTree]]:
+        parts = jnp.split(v, starts)
+        return [x.end(part, y.z.get(name), h) for part, (name, x) in zip(parts, elements.items(), strict=True)]
+
+    def forces(v: Array) -> Array:
+        return jnp.concatenate([force for force, _ in ends(v)])
+
+    sizes = tuple(each.belt.shape[0] for each in elements.values())
+    starts = [sum(sizes[:i]) for i in range(1, len(sizes))]
+    rows = jnp.concatenate([each.rows for each in elements.values()])
+    reach = jnp.stack([mobility.respond(row) for row in rows])
+    coupling = h * jnp.sum(rows[:, None, :] * reach[None, :, :], axis=2)
+    belts = jnp.concatenate([each.belt for each in elements.values()])
+    found = solve_monotone(forces, jnp.sum(rows * free[None, :], axis=1) - belts, coupling, sizes)
+    after = ends(found.x)
+    force = jnp.concatenate([force for force, _ in after])
+    qd = free - h * jnp.sum(reach * force[:, None], axis=0)
+    z = {name: z for name, (_, z) in zip(elements, after, strict=True) if name in y.z}
+    return State(q + h * qd, qd, z), found.solved
+
+
+def _element(effect: Friction, t0: Array, t1: Array, q: Array, qd: Array, params: PyTree) -> _Element:
+    slip = partial(effect.slip, t0, q, params=params)
+    planar = jnp.ndim(slip(qd)) > 0
+    rows = jax.jacfwd(slip)(qd) if planar else effect.direction(q, params)[None]
+    belt = jnp.broadcast_to(effect.belt(t1), (rows.shape[0],))
+    return _Element(effect, effect.load(t0, q, qd, params), rows, belt, planar)
