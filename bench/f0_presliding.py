@@ -140,10 +140,10 @@ def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def draw(x: Any, force: Any, half: int, drawn: dict[str, Any], rows: list[dict[str, Any]], path: Path) -> None:
     """A few loops of the half that was held back, measured and by each law."""
     mpl.use("Agg")
-    columns = 4 if len(drawn) > 2 else len(drawn)
+    columns = min(3, len(drawn))
     lines = -(-len(drawn) // columns)
     figure, axes = plt.subplots(
-        lines, columns, figsize=(3.5 * columns, 3.3 * lines), sharex=True, sharey=True, squeeze=False,
+        lines, columns, figsize=(4.0 * columns, 3.0 * lines), sharex=True, sharey=True, squeeze=False,
         layout="constrained",
     )  # fmt: skip
     part = slice(half + (len(x) - half) // 3, half + (len(x) - half) // 3 + 2400)
@@ -154,6 +154,8 @@ def draw(x: Any, force: Any, half: int, drawn: dict[str, Any], rows: list[dict[s
         panel.plot(micrometres[part], modelled[part], color="#c2452d", lw=1.1, label="modelled")
         panel.set_title(f"{name}\n{1e3 * errors[name]:.0f} mN", fontsize=9)
         panel.grid(alpha=0.2)
+    for panel in axes.flat[len(drawn) :]:
+        panel.set_visible(False)
     for panel in axes[-1]:
         panel.set_xlabel("displacement [um]")
     for panel in axes[:, 0]:
