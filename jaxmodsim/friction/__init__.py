@@ -1,5 +1,6 @@
 """Friction laws, one in each file; they know slip velocity and their own state, nothing of mechanisms."""
 
+from ..numerics import parameter as parameter  # for laws of one's own
 from ._armstrong import Armstrong as Armstrong
 from ._armstrong import ArmstrongState as ArmstrongState
 from ._asymmetric import asymmetric as asymmetric
