@@ -8,9 +8,6 @@ medians of interleaved repetitions, compilation apart.
     python bench/a0_lugre_testbench.py [--smoke] [--no-tune] [--out DIR]
 """
 
-import argparse
-import tempfile
-from pathlib import Path
 from typing import Any
 
 import diffrax as dfx
@@ -29,6 +26,7 @@ from _lugre import (
     reference_solution,
 )
 from _measure import describe_machine, machine_line, measure, scaled, write_json
+from _options import begin
 
 import jaxmodsim as jms
 
@@ -39,12 +37,9 @@ CHOICES = {"over the run": "v_run", "at the end": "v_end"}
 
 def main() -> None:
     """Measure, and write `lugre_testbench.json`."""
-    options = _arguments()
-    if not options.no_tune:
-        jms.tune_cpu()
-    jax.config.update("jax_enable_x64", True)
+    options = begin("The LuGre testbench, measured side by side.", may_leave_untuned=True)
     smoke = options.smoke
-    name = "lugre_testbench_untuned" if options.no_tune else "lugre_testbench"
+    name = "lugre_testbench" if options.tuned else "lugre_testbench_untuned"
     solvers = peers()
     reference, agreement = reference_solution()
     ladder = {peer.name: error_ladder(peer, reference, LADDER[:5] if smoke else LADDER) for peer in solvers}
@@ -55,7 +50,7 @@ def main() -> None:
         "name": name,
         "smoke": smoke,
         "machine": describe_machine("jax", "jaxlib", "diffrax", "casadi", "scipy", "numpy", "jaxmodsim"),
-        "tuned": not options.no_tune,
+        "tuned": options.tuned,
         "goal": GOAL,
         "atol_over_rtol": ATOL,
         "reference_disagreement": agreement,
@@ -69,17 +64,6 @@ def main() -> None:
     for table in content["tables"]:
         print(table["caption"], *(" | ".join(row) for row in [table["columns"], *table["rows"]]), sep="\n")
     write_json(options.out / f"{name}.json", content)
-
-
-def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="The LuGre testbench, measured side by side.")
-    parser.add_argument("--smoke", action="store_true", help="small configuration that shows that everything runs")
-    parser.add_argument("--no-tune", action="store_true", help="without jaxmodsim.tune_cpu(); a file of its own")
-    parser.add_argument("--out", type=Path, default=None, help="folder of the result; default bench/results")
-    options = parser.parse_args()
-    if options.out is None:
-        options.out = Path(tempfile.mkdtemp()) if options.smoke else Path(__file__).parent / "results"
-    return options
 
 
 def _choose(rows: list[dict[str, Any]], key: str) -> dict[str, Any] | None:

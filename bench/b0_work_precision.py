@@ -3,34 +3,22 @@
 python bench/b0_work_precision.py [--smoke] [--no-tune] [--out DIR]
 """
 
-import argparse
-import tempfile
 from pathlib import Path
 from typing import Any
 
-import jax
 import matplotlib as mpl
 from _lugre import ATOL, error_ladder, peers, reference_solution
 from _measure import describe_machine, machine_line, measure, write_json
+from _options import begin
 from matplotlib import pyplot as plt
-
-import jaxmodsim as jms
 
 LADDER = tuple(10.0**-k for k in range(3, 11))
 
 
 def main() -> None:
     """Measure, and write `lugre_work_precision.json` and `.png`."""
-    parser = argparse.ArgumentParser(description="Work against precision on the LuGre testbench.")
-    parser.add_argument("--smoke", action="store_true", help="small configuration that shows that everything runs")
-    parser.add_argument("--no-tune", action="store_true", help="without jaxmodsim.tune_cpu(); files of their own")
-    parser.add_argument("--out", type=Path, default=None, help="folder of the results; default bench/results")
-    options = parser.parse_args()
-    folder = options.out or (Path(tempfile.mkdtemp()) if options.smoke else Path(__file__).parent / "results")
-    name = "lugre_work_precision_untuned" if options.no_tune else "lugre_work_precision"
-    if not options.no_tune:
-        jms.tune_cpu()
-    jax.config.update("jax_enable_x64", True)
+    options = begin("Work against precision on the LuGre testbench.", may_leave_untuned=True)
+    name = "lugre_work_precision" if options.tuned else "lugre_work_precision_untuned"
     solvers, (reference, agreement) = peers(), reference_solution()
     points = {peer.name: error_ladder(peer, reference, LADDER[:2] if options.smoke else LADDER) for peer in solvers}
     calls = {
@@ -47,7 +35,7 @@ def main() -> None:
         "name": name,
         "smoke": options.smoke,
         "machine": describe_machine("jax", "jaxlib", "diffrax", "casadi", "scipy", "numpy", "jaxmodsim"),
-        "tuned": not options.no_tune,
+        "tuned": options.tuned,
         "atol_over_rtol": ATOL,
         "reference_disagreement": agreement,
         "points": points,
@@ -57,8 +45,8 @@ def main() -> None:
         "Time of one run [ms] and largest error of the velocity over the run, relative to the largest velocity."
         f" {machine_line(content['machine'])}"
     )
-    write_json(folder / f"{name}.json", content)
-    draw(content, folder / f"{name}.png")
+    write_json(options.out / f"{name}.json", content)
+    draw(content, options.out / f"{name}.png")
 
 
 def _table(points: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:

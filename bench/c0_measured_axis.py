@@ -6,7 +6,6 @@ the step. The record is A. Janot, M. Gautier, M. Brunot, "Data set and reference
 System Identification Benchmarks, 2019; it lies beside the repository and not in it.
 """
 
-import argparse
 import json
 import subprocess
 import sys
@@ -19,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from _measure import describe_machine, machine_line, write_json
+from _options import begin
 
 import jaxmodsim as jms
 from jaxmodsim.identify import AXIS_MODELS, axis_scene, first_coordinate, replay, rough_axis
@@ -31,17 +31,14 @@ GOALS = {"coulomb": 2.65, "asymmetric": 1.80}
 
 def main() -> None:
     """Fit, check, and write `measured_axis.json`."""
-    parser = argparse.ArgumentParser(description="jaxmodsim fit on a measured record.")
-    parser.add_argument("--smoke", action="store_true", help="the first model alone, into a temporary folder")
-    parser.add_argument("--record", type=Path, default=RECORD)
-    parser.add_argument("--out", type=Path, default=None, help="folder of the result; default bench/results")
-    options = parser.parse_args()
+    options = begin(
+        "jaxmodsim fit on a measured record.",
+        smoke="the first model alone, into a temporary folder",
+        record=RECORD,
+    )
     if not options.record.exists():
         print(f"skipped: there is no record at {options.record}")
         return
-    out = options.out or (Path(tempfile.mkdtemp()) if options.smoke else HERE / "results")
-    jms.tune_cpu()
-    jax.config.update("jax_enable_x64", True)
     t, q, _, u = np.loadtxt(options.record, delimiter=",", skiprows=1).T
     record = jms.Record(t, q, {"u": DRIVE_GAIN * u}, name="EMPS")
     fits = {}
@@ -55,7 +52,7 @@ def main() -> None:
     content["caption"] = (
         f"EMPS record, 24 841 samples, open-loop simulation error of the position. {machine_line(machine)}"
     )
-    write_json(out / "measured_axis.json", content)
+    write_json(options.out / "measured_axis.json", content)
 
 
 def run_command(record: Path, model: str) -> dict[str, Any]:

@@ -1,14 +1,12 @@
 """The figures of the test bench of friction models, as `jaxmodsim testbench` prints them, for the README."""
 
-import argparse
 import json
 import tempfile
 from pathlib import Path
 
-import jax
 from _measure import describe_machine, machine_line, write_json
+from _options import begin
 
-import jaxmodsim as jms
 from jaxmodsim.cli._report import report_testbench
 
 HERE = Path(__file__).parent
@@ -25,13 +23,10 @@ MODEL_COLUMNS = {
 
 def main() -> None:
     """Run the test bench, and write `friction_models.json`."""
-    parser = argparse.ArgumentParser(description="The test bench of friction models.")
-    parser.add_argument("--smoke", action="store_true", help="into a temporary folder; the bench itself is small")
-    parser.add_argument("--out", type=Path, default=None, help="folder of the result; default bench/results")
-    options = parser.parse_args()
-    out = options.out or (Path(tempfile.mkdtemp()) if options.smoke else HERE / "results")
-    jms.tune_cpu()
-    jax.config.update("jax_enable_x64", True)
+    options = begin(
+        "The test bench of friction models.",
+        smoke="into a temporary folder; the bench itself is small",
+    )
     with tempfile.TemporaryDirectory() as folder:
         report_testbench(Path(folder))
         report = json.loads((Path(folder) / "testbench.json").read_text())
@@ -45,7 +40,7 @@ def main() -> None:
         f" behind the applied force by 0.05 N for good. {machine_line(machine)}"
     )
     found = {"machine": machine, "table": table, "caption": caption, **report}
-    write_json(out / "friction_models.json", {"name": "friction_models", "smoke": options.smoke, **found})
+    write_json(options.out / "friction_models.json", {"name": "friction_models", "smoke": options.smoke, **found})
 
 
 def _cell(value: object) -> str:

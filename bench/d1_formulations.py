@@ -14,18 +14,16 @@ Errors are those of the formulation: runs at rtol 1e-11. Times are those of warm
     python bench/d1_formulations.py [--smoke] [--out DIR]
 """
 
-import argparse
 import itertools
 import math
-import tempfile
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
 import matplotlib as mpl
 import numpy as np
 from _measure import describe_machine, machine_line, measure, write_json
+from _options import begin
 from matplotlib import pyplot as plt
 
 import jaxmodsim as jms
@@ -40,13 +38,7 @@ ERRORS = {"motion": "error of the motion", "rest": "error of the place of rest"}
 
 def main() -> None:
     """Measure, and write `formulations.json` and `.png`."""
-    parser = argparse.ArgumentParser(description="One law in three formulations.")
-    parser.add_argument("--smoke", action="store_true", help="small configuration that shows that everything runs")
-    parser.add_argument("--out", type=Path, default=None, help="folder of the results; default bench/results")
-    options = parser.parse_args()
-    folder = options.out or (Path(tempfile.mkdtemp()) if options.smoke else Path(__file__).parent / "results")
-    jms.tune_cpu()
-    jax.config.update("jax_enable_x64", True)
+    options = begin("One law in three formulations.")
     exact = _positions(jms.Coulomb(COULOMB))
     closed = np.asarray(braked_spring_motion(TIMES, x0=X0, m=M, k=K, Fc=COULOMB)[0])
     disagreement = float(np.max(np.abs(exact - closed)))
@@ -84,8 +76,8 @@ def main() -> None:
         *(" | ".join(row) for row in [content["table"]["columns"], *content["table"]["rows"]]),
         sep="\n",
     )
-    write_json(folder / "formulations.json", content)
-    draw(content, folder / "formulations.png")
+    write_json(options.out / "formulations.json", content)
+    draw(content, options.out / "formulations.png")
 
 
 def regularized(width: float) -> jms.Regularized:

@@ -14,10 +14,8 @@ Times are the shortest of interleaved repetitions, compilation apart: what distu
     python bench/e0_accelerations.py [--smoke] [--out DIR]
 """
 
-import argparse
 import math
 import os
-import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
@@ -30,6 +28,7 @@ import matplotlib as mpl
 import numpy as np
 from _chain import JAX, STEP, Accelerations, Engine, Symbolic, arrays, scene, states
 from _measure import describe_machine, machine_line, measure, scaled, write_json
+from _options import begin
 from matplotlib import pyplot as plt
 
 import jaxmodsim as jms
@@ -47,13 +46,7 @@ LABELS = {ALONE: "called alone", LOOP: "in a loop", BATCH: f"{MANY} at once"}
 
 def main() -> None:
     """Measure, and write `accelerations.json` and `.png`."""
-    parser = argparse.ArgumentParser(description="Accelerations of a chain of n links, measured side by side.")
-    parser.add_argument("--smoke", action="store_true", help="small configuration that shows that everything runs")
-    parser.add_argument("--out", type=Path, default=None, help="folder of the results; default bench/results")
-    options = parser.parse_args()
-    folder = options.out or (Path(tempfile.mkdtemp()) if options.smoke else Path(__file__).parent / "results")
-    jms.tune_cpu()
-    jax.config.update("jax_enable_x64", True)
+    options = begin("Accelerations of a chain of n links, measured side by side.")
     points: dict[str, dict[str, Any]] = {}
     patience = 0.0 if options.smoke else PATIENCE
     for n in (1, 2) if options.smoke else SIZES:
@@ -74,8 +67,8 @@ def main() -> None:
     content["tables"] = [_main_table(content), _other_table(content), _compile_table(content), _target_table(content)]
     for table in content["tables"]:
         print(table["caption"], *(" | ".join(row) for row in [table["columns"], *table["rows"]]), sep="\n")
-    write_json(folder / "accelerations.json", content)
-    draw(content, folder / "accelerations.png")
+    write_json(options.out / "accelerations.json", content)
+    draw(content, options.out / "accelerations.png")
 
 
 # One size of chain: everybody's calls, their compilation, and their errors.

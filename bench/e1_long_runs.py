@@ -15,10 +15,8 @@ Times are those of one run each, compiled before.
     python bench/e1_long_runs.py [--smoke] [--out DIR]
 """
 
-import argparse
 import itertools
 import math
-import tempfile
 import time
 from functools import partial
 from pathlib import Path
@@ -30,6 +28,7 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 from _measure import describe_machine, machine_line, write_json
+from _options import begin
 from matplotlib import pyplot as plt
 from scipy.special import ellipj, ellipk
 
@@ -78,13 +77,7 @@ ORDER_T1 = 4.0
 
 def main() -> None:
     """Measure, and write `long_runs.json` and `.png`."""
-    parser = argparse.ArgumentParser(description="Long runs: energy, momentum and motion, and constraints.")
-    parser.add_argument("--smoke", action="store_true", help="small configuration that shows that everything runs")
-    parser.add_argument("--out", type=Path, default=None, help="folder of the results; default bench/results")
-    options = parser.parse_args()
-    folder = options.out or (Path(tempfile.mkdtemp()) if options.smoke else Path(__file__).parent / "results")
-    jms.tune_cpu()
-    jax.config.update("jax_enable_x64", True)
+    options = begin("Long runs: energy, momentum and motion, and constraints.")
     long, constrained, stages, seconds = LONG, CONSTRAINED, (1, 2, 3), SECONDS
     if options.smoke:
         long, constrained = {name: LONG[name] for name in ("Gauss(1)", "Tsit5, 1e-6")}, CONSTRAINED[:1]
@@ -119,8 +112,8 @@ def main() -> None:
         content["tables"].append(_target_table(content))
     for table in content["tables"]:
         print(table["caption"], *(" | ".join(row) for row in [table["columns"], *table["rows"]]), sep="\n")
-    write_json(folder / "long_runs.json", content)
-    draw(content, folder / "long_runs.png")
+    write_json(options.out / "long_runs.json", content)
+    draw(content, options.out / "long_runs.png")
 
 
 class _Closed:

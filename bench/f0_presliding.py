@@ -5,18 +5,16 @@ half is what counts. The record is `test_data_2.txt` of FrictionModels.jl (J. Ch
 SI; it lies beside the repository and not in it. Forces are per newton of the measured load.
 """
 
-import argparse
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 from _measure import describe_machine, machine_line, write_json
+from _options import begin
 
 import jaxmodsim as jms
 from jaxmodsim.identify import law_force
@@ -64,17 +62,14 @@ def laws() -> dict[str, tuple[Any, tuple[str, ...] | None]]:
 
 def main() -> None:
     """Fit, judge, draw, and write `presliding.json`."""
-    parser = argparse.ArgumentParser(description="Laws on measured presliding loops.")
-    parser.add_argument("--smoke", action="store_true", help="two laws and a part of the record, to a temporary folder")
-    parser.add_argument("--record", type=Path, default=RECORD)
-    parser.add_argument("--out", type=Path, default=None, help="folder of the result; default bench/results")
-    options = parser.parse_args()
+    options = begin(
+        "Laws on measured presliding loops.",
+        smoke="two laws and a part of the record, to a temporary folder",
+        record=RECORD,
+    )
     if not options.record.exists():
         print(f"skipped: there is no record at {options.record}")
         return
-    out = options.out or (Path(tempfile.mkdtemp()) if options.smoke else HERE / "results")
-    jms.tune_cpu()
-    jax.config.update("jax_enable_x64", True)
     columns = np.loadtxt(options.record, delimiter=",", skiprows=1).T
     t, normal, x, force = columns[:, :8000] if options.smoke else columns
     half = len(t) // 2
@@ -91,8 +86,8 @@ def main() -> None:
         "Friction force of measured presliding loops (5 N of load, peaks of 2.6 N): root mean square of the error on"
         f" the half that was fitted and on the other. {machine_line(machine)}"
     )
-    write_json(out / "presliding.json", content)
-    draw(x, force, half, drawn, rows, out / "presliding.png")
+    write_json(options.out / "presliding.json", content)
+    draw(x, force, half, drawn, rows, options.out / "presliding.png")
 
 
 def judge(name: str, law: Any, free: Any, known: jms.Record, columns: tuple[Any, ...]) -> tuple[dict[str, Any], Any]:

@@ -5,8 +5,6 @@ is by velocity, state and every parameter, in reverse mode. A call alone would c
 compiled code and nothing else; so many evaluations run in one loop, each of which depends on the last.
 """
 
-import argparse
-import tempfile
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from _measure import describe_machine, machine_line, measure, write_json
+from _options import begin
 
 import jaxmodsim as jms
 from jaxmodsim.friction import AbstractDynamicLaw, AbstractSetValuedLaw
@@ -98,13 +97,10 @@ def calls(name: str, law: Any) -> dict[str, Any]:
 
 def main() -> None:
     """Time every law in turns with all others, and write `law_cost.json`."""
-    parser = argparse.ArgumentParser(description="Cost of one evaluation of each friction law.")
-    parser.add_argument("--smoke", action="store_true", help="one round, to a temporary folder")
-    parser.add_argument("--out", type=Path, default=None, help="folder of the result; default bench/results")
-    options = parser.parse_args()
-    out = options.out or (Path(tempfile.mkdtemp()) if options.smoke else HERE / "results")
-    jms.tune_cpu()
-    jax.config.update("jax_enable_x64", True)
+    options = begin(
+        "Cost of one evaluation of each friction law.",
+        smoke="one round, to a temporary folder",
+    )
     timed = {name: calls(name, law) for name, law in laws().items()}
     flat = {f"{name}: {kind}": call for name, of in timed.items() for kind, call in of.items()}
     report = measure(flat, rounds=1 if options.smoke else 30)
@@ -124,7 +120,7 @@ def main() -> None:
         "Time of one evaluation (force and rate) and of its gradient, in Coulomb's: one after the other, and per lane"
         f" of vmap({BATCH}) with parameters of its own; medians, all in one process. {machine_line(machine)}"
     )
-    write_json(out / "law_cost.json", content)
+    write_json(options.out / "law_cost.json", content)
     for row in rows:
         print(*row)
 

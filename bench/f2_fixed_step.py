@@ -13,16 +13,13 @@ per step are those of warm runs with steps of 1 ms, compilation apart.
     python bench/f2_fixed_step.py [--smoke] [--out DIR]
 """
 
-import argparse
-import tempfile
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import diffrax as dfx
-import jax
 import numpy as np
 from _measure import describe_machine, machine_line, measure, write_json
+from _options import begin
 
 import jaxmodsim as jms
 from jaxmodsim.problems import box_lugre, ramped_box
@@ -38,13 +35,7 @@ TIMED_STEP, TIMED = 1e-3, (1e3, 1e6, 1e9)
 
 def main() -> None:
     """Measure, and write `fixed_step.json`."""
-    parser = argparse.ArgumentParser(description="Fixed steps whatever the stiffness.")
-    parser.add_argument("--smoke", action="store_true", help="small configuration that shows that everything runs")
-    parser.add_argument("--out", type=Path, default=None, help="folder of the results; default bench/results")
-    options = parser.parse_args()
-    folder = options.out or (Path(tempfile.mkdtemp()) if options.smoke else Path(__file__).parent / "results")
-    jms.tune_cpu()
-    jax.config.update("jax_enable_x64", True)
+    options = begin("Fixed steps whatever the stiffness.")
     stiffnesses, steps = (STIFFNESSES[::4], STEPS[:2]) if options.smoke else (STIFFNESSES, STEPS)
     points = [_point(sigma0, steps) for sigma0 in stiffnesses]
     calls = {
@@ -75,7 +66,7 @@ def main() -> None:
     print(content["caption"])
     for table in (content["table"], content["time_table"]):
         print(*(" | ".join(row) for row in [table["columns"], *table["rows"]]), sep="\n")
-    write_json(folder / "fixed_step.json", content)
+    write_json(options.out / "fixed_step.json", content)
 
 
 def _scene(sigma0: float) -> jms.Scene:
