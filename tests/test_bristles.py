@@ -101,6 +101,9 @@ def test_armstrong_stiction_comes_back_as_published() -> None:
     np.testing.assert_allclose(half.rise, 0.5, rtol=1e-14)
     slope = law.rate(zero, z._replace(rise=jnp.array(0.4))).rise
     np.testing.assert_allclose(slope, 0.6**2 / 0.7, rtol=1e-14)
+    # A step that begins in stick and ends in slip: in slip the magnitude stays what the rest made it.
+    at_once = law.advance(jnp.array(5e-3), law.state0(zero), jnp.array(2.0))
+    np.testing.assert_allclose(law.force(jnp.array(5e-3), at_once), 1.0 + 0.5 / 26.0 + 0.1 * 5e-3, rtol=1e-4)
     # After a rest of gamma half of the stiction is there, and no more comes back in slow slip.
     rested = law.advance(zero, z, jnp.array(0.7))
     for dt in (0.1, 1e3):
@@ -286,3 +289,15 @@ def test_a_plain_function_is_a_law() -> None:
     np.testing.assert_allclose(run.qd[-1, 0], 3.0 * np.exp(-1.0), rtol=1e-8)
     with pytest.raises(ValueError, match="must return one number"):
         jms.simulate(jms.Scene(mass, params={"m": 2.0}, effects=(jms.Friction(lambda v: v[None]),)), [0.0], [1.0], 1.0)
+
+
+def test_a_stribeck_curve_that_is_steep_at_rest_runs_exactly() -> None:
+    """With an exponent below one the slope at rest has no bound; a loaded mass must not freeze there."""
+    law = jms.Stribeck(1.0, 1.5, 0.1, exponent=0.5)
+    exact, near = (
+        ends(jms.Scene(pulled, params=PARAMS, effects=(jms.Friction(each),)))
+        for each in (law, jms.Regularized(law, 1e-7))
+    )
+    assert exact.stats["num_events"] > 0
+    # In stick the smooth law creeps by up to its width a second, and does not slip off at the same instant.
+    np.testing.assert_allclose(exact.q, near.q, atol=3e-6)

@@ -3,8 +3,9 @@
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +24,7 @@ from jaxmodsim import (
     friction,
     scaled_by,
 )
-from jaxmodsim.friction import AbstractDynamicLaw, AbstractLaw
+from jaxmodsim.friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw, parameter
 from jaxmodsim.numerics import modules_of, nominal, ranges_of
 
 from .differences import flat, gradient_by_differences
@@ -269,6 +270,30 @@ def test_values_out_of_range_are_refused(name: str) -> None:
     assert f"{value:g}" in str(info.value)
 
 
+class Number(eqx.Module):
+    value: Any
+
+    def __call__(self, t: Any, q: Any, qd: Any, params: Any) -> Any:
+        del t, q, qd, params
+        return self.value
+
+
+class Most(AbstractForceLaw):
+    """A law of one's own with an upper limit alone."""
+
+    share: Any = parameter("share", "1", upper=1.0)
+    stiff: ClassVar[bool] = False
+
+    def force(self, v: Any) -> Any:
+        return self.share * v
+
+
+def test_an_upper_limit_alone_holds() -> None:
+    assert float(Most(-3.0).force(jnp.array(2.0))) == -6.0
+    with pytest.raises(ValueError, match=r"share must be finite and <= 1 \[1\], but 5.0 was given"):
+        Most(5.0)
+
+
 def test_the_table_covers_every_law_and_every_modifier() -> None:
     """Each concrete law that the package offers is in the table, by itself and under either modifier."""
     offered = {n for n, x in vars(friction).items() if isinstance(x, type) and issubclass(x, AbstractLaw)}
@@ -309,13 +334,16 @@ def test_the_table_covers_every_law_and_every_modifier() -> None:
         (lambda: asymmetric(cast(Any, "coulomb"), Fc=2.0), "asymmetric needs a law .* but 'coulomb'"),
         (lambda: scaled_by(cast(Any, "coulomb"), factor), "scaled_by needs a law, but 'coulomb'"),
         (lambda: scaled_by(Coulomb(1.0), cast(Any, 2.0)), "scaled_by fn must be a function, but 2.0"),
-        (lambda: scaled_by(Coulomb(1.0), factor, ["Fv"]), r"parameters of Coulomb, among Fc; given: \['Fv'\]"),
+        (lambda: scaled_by(Coulomb(1.0), factor, ["Fv"]), r"parameters of Coulomb, among Fc .*given: \['Fv'\]"),
         (lambda: scaled_by(Coulomb(1.0), factor, "Fc"), "scaled_by needs a list"),
+        (lambda: asymmetric(Coulomb(1.0, 2.0), Fs=None), r"Fs must have the shape \(\) .* got None"),
+        (lambda: asymmetric(MaxwellSlip([1.0, 2.0], [1.0, 2.0]), Fc=1.0), r"Fc must have the shape \(2,\)"),
+        (lambda: scaled_by(Coulomb(1.0), Number(jnp.ones(()))), "fn holds numbers of its own"),
         (lambda: MaxwellSlip([1.0, 2.0], [1.0]), r"Fc must have one number for each of the 2 elements of k"),
         (lambda: MaxwellSlip([1.0, 2.0], [1.0, 1.0], Fs=[1.0, 2.0]), "give both or none"),
         (lambda: MaxwellSlip(jnp.ones((2, 2)), 1.0), r"k has shape \(2, 2\), but numbers in a row"),
         (lambda: MaxwellSlip([], []), r"k has shape \(0,\), but numbers in a row"),
-        (lambda: asymmetric(Coulomb(1.0), Fv=2.0), r"among Fc; given: Fv"),
+        (lambda: asymmetric(Coulomb(1.0), Fv=2.0), r"among Fc .*given: Fv"),
         (lambda: asymmetric(Coulomb(1.0)), "given: none"),
         (lambda: asymmetric(Coulomb(1.0), Fc=-2.0), r"Fc must be finite and >= 0 \[N\], but -2.0 was given"),
         (lambda: asymmetric(Stribeck(1.0, 2.0, 0.1), Fc=3.0), r"Fs must be finite and >= Fc \[N\] \(Fc = 3.0\)"),
@@ -365,7 +393,45 @@ def test_scaling_multiplies_the_parameters_that_are_named() -> None:
     here = settled(law)
     ours = [float(x) for x in (here.Fc, here.Fs, here.vs, here.Fv)]
     np.testing.assert_allclose(ours, [1.0, 2.0, 0.1 * 1.4, 1.5 * 1.4])
-    assert float(settled(scaled_by(Coulomb(1.0), lambda *_: -1.0)).Fc) == 0.0
+    # Nothing that is divided by a parameter becomes NaN where the factor vanishes.
+    gone = settled(scaled_by(BRISTLE, lambda *_: -1.0))
+    assert float(gone.Fc) < 1e-29
+    np.testing.assert_allclose(gone.force(jnp.array(0.1), jnp.array(1e-3)), 0.0, atol=1e-25)
+    np.testing.assert_allclose(
+        gone.rate(jnp.array(0.1), jnp.array(1e-3)), BRISTLE.rate(jnp.array(0.1), jnp.array(1e-3))
+    )
+
+
+def test_factors_that_wrap_the_same_function_are_told_apart() -> None:
+    class Gain(eqx.Module):
+        fn: Any
+        gain: float = eqx.field(static=True)
+
+        def __call__(self, *state: Any) -> Any:
+            return self.gain * self.fn(*state)
+
+    law = scaled_by(scaled_by(Coulomb(1.0), Gain(factor, 2.0)), Gain(factor, 3.0))
+    np.testing.assert_allclose(settled(law).Fc, 6.0 * 1.4**2)
+
+
+@every_dynamic_law
+def test_a_step_from_rest_moves_with_the_surface(name: str) -> None:
+    """The derivative by velocity at v = 0 of an unloaded element is the time, times its stiffness."""
+    law = settled(CASES[name].law)
+    zero = jnp.array(0.0)
+
+    def held(v: Any) -> Any:
+        return elastic(law, law.advance(v, law.state0(v), jnp.array(1e-3)), v)
+
+    np.testing.assert_allclose(jax.grad(held)(zero), held(jnp.array(1e-9)) / 1e-9, rtol=1e-5)
+
+
+def test_what_is_limited_by_a_number_that_differs_differs_too() -> None:
+    law = asymmetric(LuGre(100.0, 0.0, 0.0, 1.0, 1.5, 0.1), Fc=1.2)
+    assert set(law.backward) == {"Fc", "Fs"}  # pyright: ignore[reportAttributeAccessIssue]
+    stiff = asymmetric(Regularized(Coulomb(1.0), 0.1), Fc=2.0)
+    assert stiff.stiff
+    assert asymmetric(BRISTLE, Fc=1.2).stiff
 
 
 def test_modifiers_commute() -> None:

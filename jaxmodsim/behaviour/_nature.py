@@ -15,7 +15,9 @@ from ..friction import (
     LuGre,
     MaxwellSlip,
     Viscous,
+    passive,
 )
+from ..numerics import nominal
 
 
 def _always(law: Any) -> bool:
@@ -44,8 +46,8 @@ _FLAT = "Without a Stribeck effect friction does not depend on slip velocity but
 
 def _no_fall(law: Any) -> bool:
     """Whether friction does not fall as slip begins."""
-    stiction = getattr(law, "Fs", None)
-    return stiction is None or not bool((stiction > law.Fc).any())
+    stiction = nominal(getattr(law, "Fs", None))
+    return stiction is None or not bool((stiction > nominal(law.Fc)).any())
 
 
 BY_NATURE: tuple[Nature, ...] = (
@@ -71,7 +73,7 @@ BY_NATURE: tuple[Nature, ...] = (
         "passivity",
         (LuGre, ElastoPlastic),
         "A constant sigma1 gives energy back unless sigma2 > sigma1 (Fs - Fc)/Fc.",
-        lambda law: getattr(law, "vd", None) is None,
+        lambda law: not passive(law),
     ),
 )
 

@@ -33,7 +33,7 @@ class ArmstrongState(NamedTuple):
 class Armstrong(AbstractDynamicLaw):
     """Armstrong's model of seven parameters: stiff in stick, Stribeck friction with memory in slip, rising stiction.
 
-    In stick `F = sigma0 z`; in slip `F = (Fc + (Fs - Fc) rise) sign(v) + Fv v`. In slip `rise` goes to
+    In stick `F = sigma0 z + Fv v`; in slip `F = (Fc + (Fs - Fc) rise) sign(v) + Fv v`. In slip `rise` goes to
     `magnitude/(1 + (v/vs)^2)` with the time constant `tau`, which is frictional memory; in stick it grows to 1 like
     `t/(t + gamma)` from where it was, and the magnitude of the next slip is what it has become. The contact slips from
     when it has given way until it moves back or comes to rest: a rule that the paper leaves open.
@@ -51,7 +51,7 @@ class Armstrong(AbstractDynamicLaw):
     - `vs`: Stribeck velocity [m/s], > 0.
     - `Fv`: viscous coefficient [N s/m], >= 0.
     - `tau`: time constant of frictional memory [s], > 0.
-    - `gamma`: time of rest after which half of the missing stiction is back [s], > 0.
+    - `gamma`: time of rest after which half of the stiction is back if none was left [s], > 0.
 
     **Raises:**
 
@@ -124,34 +124,18 @@ class Armstrong(AbstractDynamicLaw):
         return 0.5 * self.sigma0 * z.z * z.z
 
     def advance(self, v: Float[Array, ""], z: ArmstrongState, dt: Float[Array, ""]) -> ArmstrongState:
-        """State after `dt` [s] at constant `v` [m/s]; of order 1, and right at rest and in steady slip at any step.
-
-        First the memory, by how much of the step the contact slides, then the deflection at the limit that gives.
-        """
+        """State after `dt` [s] at constant `v` [m/s], of any length: first in stick, then in slip, each exactly."""
         corner, distance = jnp.asarray(_CORNER, z.z.dtype), jnp.abs(v) * dt
         # Back, then along, and of that what the contact does not follow.
         back = jnp.minimum(distance, jnp.where(v * z.z < 0, jnp.abs(z.z), 0.0))
         lost = jnp.maximum(distance - jnp.abs(follow(v, z.z, dt, self._limit(z.rise), corner) - z.z), 0.0)
         before = z.slips * jnp.exp(-back / self._turn())
         slips = 1.0 - (1.0 - before) * jnp.exp(-lost / self._turn())
-        # Of the step the part that is slip: all of it if it was so before and did not turn.
-        whole = jnp.where(distance > 0, distance, 1.0)
-        share = jnp.maximum(z.slips * (1.0 - back / whole), lost / whole)
-        slides = jnp.minimum(share, 1.0) * self._moves(v)
-        goal = 1.0 - z.magnitude * self._steady(v)
-        rise = 1.0 - _riccati(1.0 - z.rise, slides / self.tau, (1.0 - slides) / self.gamma, goal, dt)
-        magnitude = rise + (z.magnitude - rise) * jnp.exp(-(1.0 - slides) * dt / self.tau)
+        share = jnp.maximum(before, lost / jnp.where(distance > 0, distance, 1.0))
+        sliding = jnp.minimum(share, 1.0) * self._moves(v) * dt
+        resting = dt - sliding
+        missing = (1.0 - z.rise) / (1.0 + (1.0 - z.rise) * resting / self.gamma)
+        magnitude = 1.0 - missing + (z.magnitude - 1.0 + missing) * jnp.exp(-resting / self.tau)
+        goal = magnitude * self._steady(v)
+        rise = goal + (1.0 - missing - goal) * jnp.exp(-sliding / self.tau)
         return ArmstrongState(follow(v, z.z, dt, self._limit(rise), corner), rise, magnitude, slips)
-
-
-def _riccati(
-    m: Float[Array, ""], a: Float[Array, ""], b: Float[Array, ""], goal: Float[Array, ""], t: Float[Array, ""]
-) -> Float[Array, ""]:
-    """Solution at t of `m' = a (goal - m) - b m^2` with constants that are not negative."""
-    c = a * goal
-    square = 0.25 * (a * a + 4.0 * b * c) * t * t
-    # tanh(x)/x by x^2, which is smooth at zero.
-    small = square < 1e-4
-    x = jnp.sqrt(jnp.where(small, 1.0, square))
-    time = 0.5 * t * jnp.where(small, 1.0 - square / 3.0 + 2.0 * square * square / 15.0, jnp.tanh(x) / x)
-    return (m + (2.0 * c - a * m) * time) / (1.0 + (2.0 * b * m + a) * time)

@@ -1,7 +1,7 @@
 """Laws whose parameters depend on the direction of slip."""
 
 import dataclasses
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -36,7 +36,11 @@ class _AsymmetricForce(AbstractForceLaw):
 
     forward: AbstractForceLaw
     backward: dict[str, Any]
-    stiff: ClassVar[bool] = False
+
+    @property
+    def stiff(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """As the law for positive slip is."""
+        return self.forward.stiff
 
     @property
     def implied(self) -> dict[str, AbstractLaw]:
@@ -53,7 +57,11 @@ class _AsymmetricSetValued(AbstractSetValuedLaw):
 
     forward: AbstractSetValuedLaw
     backward: dict[str, Any]
-    stiff: ClassVar[bool] = False
+
+    @property
+    def stiff(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """As the law for positive slip is."""
+        return self.forward.stiff
 
     @property
     def implied(self) -> dict[str, AbstractLaw]:
@@ -78,7 +86,11 @@ class _AsymmetricDynamic(AbstractDynamicLaw):
 
     forward: AbstractDynamicLaw
     backward: dict[str, Any]
-    stiff: ClassVar[bool] = True
+
+    @property
+    def stiff(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """As the law for positive slip is."""
+        return self.forward.stiff
 
     @property
     def implied(self) -> dict[str, AbstractLaw]:
@@ -137,15 +149,18 @@ def asymmetric(law: _Law, **backward: Any) -> _Law:
         return eqx.tree_at(lambda x: x.law, cast(Any, law), asymmetric(inner, **backward))
     kinds = [wrapper for kind, wrapper in _KINDS if isinstance(law, kind)]
     if not kinds or hasattr(law, "forward"):
-        given = "a law that is asymmetric already" if hasattr(law, "forward") else repr(law)
-        raise ValueError(f"asymmetric needs a law with parameters of its own, but {given} was given.")
+        mend = f"{law!r} was given; of a function of velocity make a Curve(fn)"
+        if hasattr(law, "forward"):
+            mend = "a law that is asymmetric already was given: name all parameters that differ in one call"
+        raise ValueError(f"asymmetric needs a law with parameters of its own, but {mend}.")
     module = cast(eqx.Module, law)
     allowed = ranges_of(module)
     unknown = sorted(set(backward) - set(allowed))
     if unknown or not backward:
         raise ValueError(
             f"asymmetric({type(law).__name__}) needs the parameters that differ for negative slip, among"
-            f" {', '.join(allowed)}; given: {', '.join(unknown) or 'none'}."
+            f" {', '.join(allowed)} (one that was left out must be given to the law first); given:"
+            f" {', '.join(unknown) or 'none'}."
         )
     for name in backward:
         if allowed[name].unit == "N/m":
@@ -153,12 +168,25 @@ def asymmetric(law: _Law, **backward: Any) -> _Law:
                 f"asymmetric({type(law).__name__}): {name} stores energy, so it must be the same in both directions."
             )
     converters = {f.name: f.metadata["converter"] for f in dataclasses.fields(cast(Any, law)) if f.name in backward}
-    numbers = {name: _like(getattr(law, name), converters[name](value)) for name, value in backward.items()}
+    numbers = {name: _like(getattr(law, name), converters[name](value), name) for name, value in backward.items()}
+    # A parameter that is limited by one that differs must differ, too, to stay above it.
+    while above := [n for n, r in allowed.items() if r.lower in numbers and n not in numbers]:
+        numbers |= {name: getattr(law, name) for name in above}
     both = kinds[0](cast(Any, law), numbers)
     check_ranges(other_side(both))
     return cast(_Law, both)
 
 
-def _like(old: Any, number: Any) -> Any:
-    """The new number, varying as the old one does."""
-    return Varying(_like(old.number, number), old.fn) if isinstance(old, Varying) else number
+def _like(old: Any, number: Any, name: str) -> Any:
+    """The new number, varying as the old one does.
+
+    **Raises:**
+
+    - `ValueError` if it is none, or not of the old one's shape.
+    """
+    if isinstance(old, Varying):
+        return Varying(_like(old.number, number, name), old.fn)
+    if number is None or jnp.shape(number) != jnp.shape(old):
+        given = "None" if number is None else f"the shape {jnp.shape(number)}"
+        raise ValueError(f"asymmetric: {name} must have the shape {jnp.shape(old)} for negative slip, but got {given}.")
+    return number

@@ -33,8 +33,9 @@ def follow(
 
     A straight line up to the corner, and from there a decay towards the limit.
     """
-    side = jnp.sign(v)
-    u, y = side * z / limit, jnp.abs(v) * dt / limit
+    # At rest either side will do: nothing moves, but the derivative by v must not be lost.
+    side = jnp.where(v < 0, -1.0, 1.0).astype(z.dtype)
+    u, y = side * z / limit, side * v * dt / limit
     straight = jnp.minimum(y, jnp.maximum(1.0 - corner - u, 0.0))
     bent = 1.0 + (u + straight - 1.0) * jnp.exp(-(y - straight) / corner)
-    return jnp.where(side == 0, z, side * limit * bent)
+    return side * limit * bent

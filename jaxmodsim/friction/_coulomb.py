@@ -37,4 +37,4 @@ class Coulomb(AbstractSetValuedLaw):
     def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
         """Largest force in stick [N]."""
         del direction
-        return self.Fc if self.Fs is None else self.Fs
+        return jnp.asarray(self.Fc if self.Fs is None else self.Fs)

@@ -39,7 +39,7 @@ class DeadZone(AbstractHoldingLaw):
     """
 
     law: AbstractSetValuedLaw = set_valued_law("DeadZone")
-    width: Number = parameter("width", "m/s", lower=0.0, strict=True)
+    width: Number = parameter("width", "m/s", lower=0.0, strict=True, execution=True)
     stiff: ClassVar[bool] = False
 
     def holds(self, v: Float[Array, ""]) -> Bool[Array, ""]:

@@ -90,9 +90,10 @@ class ElastoPlastic(AbstractDynamicLaw):
 
         Exact in the elastic range and beyond the limit; between, steps of order 2 that cannot pass the limit.
         """
-        g, side = self.level(v), jnp.sign(v)
+        # At rest either side will do: nothing moves, but the derivative by v must not be lost.
+        g, side = self.level(v), jnp.where(v < 0, -1.0, 1.0).astype(z.dtype)
         elastic, u = self.Fba / g, side * self.sigma0 * z / g
-        y = jnp.abs(v) * dt * self.sigma0 / g
+        y = side * v * dt * self.sigma0 / g
         straight = jnp.minimum(y, jnp.maximum(elastic - u, 0.0))
         beyond = u > 1.0
         near = jnp.minimum(y - straight, _TRANSITION)
@@ -106,4 +107,4 @@ class ElastoPlastic(AbstractDynamicLaw):
             middle = leak(inner, 0.5 * step, self._plastic(inner, elastic))
             inner = leak(inner, step, self._plastic(middle, elastic))
         outer = 1.0 + (u - 1.0) * jnp.exp(-y)
-        return jnp.where(side == 0, z, side * g / self.sigma0 * jnp.where(beyond, outer, inner))
+        return side * g / self.sigma0 * jnp.where(beyond, outer, inner)

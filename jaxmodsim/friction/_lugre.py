@@ -16,7 +16,8 @@ class LuGre(AbstractPlanarLaw):
     `z' = v - sigma0 |v| z / g(v)`, `F = sigma0 z + sigma1 z' + sigma2 v`,
     `g(v) = Fc + (Fs - Fc) exp(-(v/vs)^2)`. At constant velocity F tends to `g(v) sign(v) + sigma2 v`, and
     `|z| <= Fs/sigma0` is never left. With a constant sigma1 the law is passive from v to F if and only if
-    `sigma2 > sigma1 (Fs - Fc)/Fc`; the stick mode of a mass m is critically damped at `sigma1 = 2 sqrt(m sigma0)`.
+    `sigma2 > sigma1 (Fs - Fc)/Fc`; the stick mode of a mass m is critically damped at
+    `sigma1 + sigma2 = 2 sqrt(m sigma0)`.
     With `vd` the bristle damping fades as the surfaces slip, `sigma1 exp(-(v/vd)^2)`, which takes the condition away
     at high speed.
 

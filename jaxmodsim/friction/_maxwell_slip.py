@@ -27,9 +27,9 @@ class MaxwellSlip(AbstractDynamicLaw):
 
     A spring that stopped dead would make the rates jump, and chatter where the limit changes with velocity. So an
     element follows the surface up to `1 - corner` of its limit and gives way over the rest:
-    `z' = v (1 - max(0, u - 1 + corner)/corner)` with `u = k z sign(v)/s(v)`. With `C` an element beyond its limit (the
-    speed has risen) falls back as in the generalised model, `F_i' = sign(v) C (alpha_i - F_i/s(v))`,
-    `alpha_i = Fc_i/sum Fc`, which is a lag in time.
+    `z' = v (1 - max(0, u - 1 + corner)/corner)` with `u = k z sign(v)/s_i(v)`. With `C` an element beyond its limit
+    (the speed has risen) falls back as in the generalised model, `F_i' = sign(v) C (alpha_i - F_i/s(v))`, s the sum of
+    all s_i and `alpha_i = Fc_i/sum Fc`, which is a lag in time.
 
     **Arguments:**
 
@@ -63,7 +63,7 @@ class MaxwellSlip(AbstractDynamicLaw):
     vs: Number | None = optional_parameter("vs", "m/s", lower=0.0, strict=True)
     C: Number | None = optional_parameter("C", "N/s", lower=0.0, strict=True)
     sigma2: Number = parameter("sigma2", "N s/m", lower=0.0, default=0.0)
-    corner: Number = parameter("corner", "1", lower=0.0, strict=True, upper=1.0, default=0.02)
+    corner: Number = parameter("corner", "1", lower=0.0, strict=True, upper=1.0, execution=True, default=0.02)
     stiff: ClassVar[bool] = True
 
     def __check_init__(self) -> None:

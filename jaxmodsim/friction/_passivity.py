@@ -59,7 +59,7 @@ class Passivity:
         """All of it in a sentence or two."""
         if self.ok:
             return f"Passive, with a margin of {self.margin:g} N s/m. {self.condition}"
-        return f"Not passive above {self.speed:g} m/s; margin {self.margin:g} N s/m. {self.condition}"
+        return f"Not passive from {self.speed:g} m/s on; margin {self.margin:g} N s/m. {self.condition}"
 
 
 def passive(law: AbstractLaw, *, v_max: float = 1e3) -> Passivity:
@@ -112,7 +112,7 @@ def passive(law: AbstractLaw, *, v_max: float = 1e3) -> Passivity:
         ```
     """
     if not isinstance(law, AbstractLaw):
-        raise ValueError(f"passive needs a law, but {law!r} was given.")
+        raise ValueError(f"passive needs a law, but {law!r} was given; of a function of velocity make a Curve(fn).")
     need_values(law, "passive")
     return _judge(law, v_max)
 

@@ -28,11 +28,12 @@ class Regularized(AbstractForceLaw):
     """
 
     law: AbstractSetValuedLaw = set_valued_law("Regularized")
-    width: Number = parameter("width", "m/s", lower=0.0, strict=True)
+    width: Number = parameter("width", "m/s", lower=0.0, strict=True, execution=True)
     stiff: ClassVar[bool] = True
 
     def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Friction force [N] at velocity `v` [m/s]."""
+        v = jnp.asarray(v)
         level, spread = self.law.dry(v), v / (2.0 * self.width)
         direction = jnp.where(v < 0, -1.0, 1.0).astype(v.dtype)
         # At rest, but on the side that v is on: a law may have other parameters for either direction.

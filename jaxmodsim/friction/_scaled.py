@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
+import jax
 
 from ..numerics import Varying, as_function, modules_of, ranges_of
 from ._law import AbstractLaw
@@ -21,9 +22,9 @@ def scaled_by(law: _Law, fn: Any, parameters: Sequence[str] | None = None) -> _L
     **Arguments:**
 
     - `law`: any law.
-    - `fn`: `fn(t, q, qd, params)` returns the factor, one number; below zero it counts as zero. Numbers that are to be
-      differentiated or fitted belong into `params`. In `fit_law`, q and qd are the slip and its velocity, shape `[1]`,
-      and `params` holds the record's inputs.
+    - `fn`: `fn(t, q, qd, params)` returns the factor, one number; zero and below count as 1e-30. Numbers that are to
+      be differentiated or fitted belong into `params`, not into `fn`. In `fit_law`, q and qd are the slip and its
+      velocity, shape `[1]`, and `params` holds the record's inputs.
     - `parameters`: names of the parameters that are multiplied, in all parts of the law that have them; by default all
       those that carry newtons (`Fc`, `sigma0`, ...), which multiplies the force.
 
@@ -38,14 +39,19 @@ def scaled_by(law: _Law, fn: Any, parameters: Sequence[str] | None = None) -> _L
     The factor should keep the parameters in their ranges (Fs >= Fc): that is not checked along a run.
     """
     if not isinstance(law, AbstractLaw):
-        raise ValueError(f"scaled_by needs a law, but {law!r} was given.")
+        raise ValueError(f"scaled_by needs a law, but {law!r} was given; of a function of velocity make a Curve(fn).")
     factor = as_function(fn, name="scaled_by fn")
+    if any(eqx.is_inexact_array(x) for x in jax.tree.leaves(factor)):
+        raise ValueError(
+            "scaled_by: fn holds numbers of its own; put them into the scene's params, and read them there."
+        )
     known = {name: r.unit for _, module in modules_of(law) for name, r in ranges_of(module).items()}
     chosen = [name for name, unit in known.items() if unit.startswith("N")] if parameters is None else [*parameters]
     unknown = [name for name in chosen if name not in known]
     if unknown or not chosen or isinstance(parameters, str):
         raise ValueError(
-            f"scaled_by needs a list of parameters of {type(law).__name__}, among {', '.join(known) or 'none'}; given:"
+            f"scaled_by needs a list of parameters of {type(law).__name__}, among {', '.join(known) or 'none'}"
+            " (those in newtons by default; one that was left out must be given to the law first); given:"
             f" {parameters!r}."
         )
     return _vary(law, factor, chosen)

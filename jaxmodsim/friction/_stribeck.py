@@ -6,8 +6,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Number, optional_parameter, parameter, safe_power
+from ..numerics import Number, optional_parameter, parameter
 from ._law import AbstractSetValuedLaw
+
+# Velocity over vs below which a curve with an exponent is rounded off.
+_ROUNDED = 1e-9
 
 
 def exponential(x: Float[Array, ""]) -> Float[Array, ""]:
@@ -18,6 +21,11 @@ def exponential(x: Float[Array, ""]) -> Float[Array, ""]:
 def lorentzian(x: Float[Array, ""]) -> Float[Array, ""]:
     """`1/(1 + x)`, the fall of the Lorentzian Stribeck curve (Hess and Soom 1990, Journal of Tribology 112:147)."""
     return 1.0 / (1.0 + x)
+
+
+def _rounded_power(x: Float[Array, ""], exponent: Float[Array, ""]) -> Float[Array, ""]:
+    """`x^exponent` with its corner at 0 rounded over `_ROUNDED`: below an exponent of one its slope has no bound."""
+    return (x * x + _ROUNDED * _ROUNDED) ** (0.5 * exponent) - _ROUNDED**exponent
 
 
 class Stribeck(AbstractSetValuedLaw):
@@ -64,7 +72,7 @@ class Stribeck(AbstractSetValuedLaw):
         """Magnitude [N] of the dry part in slip."""
         ratio = jnp.abs(v) / self.vs
         # A square costs a fifth of a power.
-        power = ratio * ratio if self.exponent is None else safe_power(ratio, self.exponent)
+        power = ratio * ratio if self.exponent is None else _rounded_power(ratio, self.exponent)
         return self.Fc + (self.Fs - self.Fc) * self.fall(power)
 
     def wet(self, v: Float[Array, ""]) -> Float[Array, ""]:
@@ -74,4 +82,4 @@ class Stribeck(AbstractSetValuedLaw):
     def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
         """Largest force in stick [N]."""
         del direction
-        return self.Fs
+        return jnp.asarray(self.Fs)

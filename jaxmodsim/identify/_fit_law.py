@@ -98,7 +98,7 @@ def _off_limits(numbers: dict[str, Array], ranges: dict[str, Range]) -> tuple[st
     for name, value in numbers.items():
         lower = ranges[name].lower if name in ranges else None
         limit = numbers[lower] if isinstance(lower, str) else lower
-        if name not in ("width", "corner") and (limit is None or bool(value > limit)):
+        if not (name in ranges and ranges[name].execution) and (limit is None or bool(value > limit)):
             free.append(name)
     return tuple(free)
 

@@ -79,6 +79,8 @@ class FreeParameters:
             most = ranges[name].upper if name in ranges else None
             if most is None:
                 continue
+            if isinstance(limits[name], str):
+                raise ValueError(f"{name} is limited by {limits[name]} and by {most:g}: free only one of the two.")
             if values[name] >= most:
                 raise ValueError(f"The start {name} = {values[name]:g} must lie below its limit {most:g}.")
             upper[name] = most
@@ -93,7 +95,9 @@ class FreeParameters:
                 values[name] = values[str(limit)] + (start - self.start[str(limit)])
                 continue
             here = x[self.names.index(name)]
-            if limit is None:
+            if limit is None and name in self.upper:
+                values[name] = self.upper[name] - (self.upper[name] - start) * jnp.exp(here)
+            elif limit is None:
                 values[name] = start + max(abs(start), 1.0) * here
             elif isinstance(limit, str):
                 values[name] = values[limit] + (start - self.start[limit]) * jnp.exp(here)

@@ -5,6 +5,8 @@ from ._collocation import CollocationMemory as CollocationMemory
 from ._collocation import collocation_start as collocation_start
 from ._collocation import collocation_step as collocation_step
 from ._depends import depends as depends
+from ._function import Function as Function
+from ._function import as_function as as_function
 from ._linalg import MAX_UNROLLED_CHOLESKY as MAX_UNROLLED_CHOLESKY
 from ._linalg import cholesky_pivots as cholesky_pivots
 from ._linalg import factor_lu as factor_lu
@@ -13,11 +15,9 @@ from ._linalg import solve_positive_definite as solve_positive_definite
 from ._monotone import Monotone as Monotone
 from ._monotone import rising_root as rising_root
 from ._monotone import solve_monotone as solve_monotone
-from ._numbers import Function as Function
 from ._numbers import Number as Number
 from ._numbers import Range as Range
 from ._numbers import Vector as Vector
-from ._numbers import as_function as as_function
 from ._numbers import as_number as as_number
 from ._numbers import as_real as as_real
 from ._numbers import check_ranges as check_ranges

@@ -32,32 +32,34 @@ class Range:
     - `lower`: lower limit; a string names another parameter of the same object; None for no limit.
     - `strict`: whether the lower limit itself is excluded.
     - `upper`: upper limit, included; None for no limit.
+    - `execution`: whether the parameter says how a law is run and not what it is; a fit leaves it alone by itself.
     """
 
     unit: str
     lower: float | str | None = None
     strict: bool = False
     upper: float | None = None
+    execution: bool = False
 
     @property
     def text(self) -> str:
         """The range in words, such as `> 0 N/m`."""
         unit = f" [{self.unit}]" if self.unit else ""
-        if self.lower is None:
+        if self.lower is None and self.upper is None:
             return f"a finite number{unit}"
-        relation = ">" if self.strict else ">="
-        limit = self.lower if isinstance(self.lower, str) else f"{self.lower:g}"
+        limit = self.lower if isinstance(self.lower, str) or self.lower is None else f"{self.lower:g}"
+        least = "" if limit is None else f" and {'>' if self.strict else '>='} {limit}"
         most = "" if self.upper is None else f" and <= {self.upper:g}"
-        return f"finite and {relation} {limit}{most}{unit}"
+        return f"finite{least}{most}{unit}"
 
     def holds(self, value: Float[Array, "..."], others: Mapping[str, Float[Array, "..."]]) -> Bool[Array, "..."]:
         """Whether `value` is in range, elementwise; `others` are the parameters of the same object by name."""
         finite = jnp.isfinite(value)
+        if self.upper is not None:
+            finite = finite & (value <= self.upper)
         if self.lower is None:
             return finite
         lower = others[self.lower] if isinstance(self.lower, str) else self.lower
-        if self.upper is not None:
-            finite = finite & (value <= self.upper)
         return finite & ((value > lower) if self.strict else (value >= lower))
 
 
@@ -111,6 +113,7 @@ def parameter(
     lower: float | str | None = None,
     strict: bool = False,
     upper: float | None = None,
+    execution: bool = False,
     **field: Any,
 ) -> Any:
     """Dataclass field of an `eqx.Module` that holds one number with a unit and an admissible range.
@@ -118,10 +121,10 @@ def parameter(
     **Arguments:**
 
     - `name`: name of the field, for error messages.
-    - `unit`, `lower`, `strict`, `upper`: see `Range`.
+    - `unit`, `lower`, `strict`, `upper`, `execution`: see `Range`.
     - `field`: further arguments of `equinox.field`, such as `default`.
     """
-    allowed = Range(unit, lower, strict, upper)
+    allowed = Range(unit, lower, strict, upper, execution)
     return eqx.field(converter=partial(as_number, name=name), metadata={"range": allowed}, **field)
 
 
@@ -182,29 +185,6 @@ def check_ranges(module: eqx.Module) -> None:
             raise ValueError(
                 f"{type(module).__name__}: {name} must be {allowed.text}{against}, but {values[name]} was given."
             )
-
-
-class Function(eqx.Module):
-    """A plain function as part of a pytree: it holds no numbers and is compared by identity."""
-
-    fn: Callable[..., Any] = eqx.field(static=True)
-
-    def __call__(self, *args: Any) -> Any:
-        """Call the function."""
-        return self.fn(*args)
-
-
-def as_function(value: Any, *, name: str) -> Callable[..., Any]:
-    """Make a callable fit to sit in a pytree: an `eqx.Module` stays what it is, anything else is wrapped.
-
-    **Raises:**
-
-    - `ValueError` if `value` cannot be called.
-    """
-    if not callable(value):
-        raise ValueError(f"{name} must be a function, but {value!r} was given.")
-    fn: Callable[..., Any] = value
-    return fn if isinstance(value, eqx.Module) else Function(fn)
 
 
 def modules_of(tree: Any, path: str = "") -> Iterator[tuple[str, eqx.Module]]:

@@ -8,7 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ._numbers import as_function, as_real
+from ._function import as_function
+from ._numbers import as_real
 
 
 class Place(eqx.Module):

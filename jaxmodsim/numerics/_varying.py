@@ -8,6 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ._function import Function
+
+# Least factor: what is divided by a parameter stays finite.
+_LEAST = 1e-30
+
 
 class Varying(eqx.Module):
     """A parameter that changes with the state of the mechanism: a number times `fn(t, q, qd, params)`.
@@ -35,15 +40,15 @@ def varies(tree: Any) -> bool:
 
 
 def settle(tree: _Module, t: Array, q: Array, qd: Array, params: Any) -> _Module:
-    """`tree` with the values of its parameters at a state of the mechanism; factors below zero count as zero."""
+    """`tree` with the values of its parameters at a state of the mechanism; factors below 1e-30 count as that."""
     factors: dict[int, Array] = {}  # by function: parameters that share one evaluate it once
 
     def value(x: Any) -> Any:
         if not isinstance(x, Varying):
             return x
-        key = id(getattr(x.fn, "fn", x.fn))
+        key = id(x.fn.fn if isinstance(x.fn, Function) else x.fn)
         if key not in factors:
-            factors[key] = jnp.maximum(jnp.asarray(x.fn(t, q, qd, params)), 0.0)
+            factors[key] = jnp.maximum(jnp.asarray(x.fn(t, q, qd, params)), _LEAST)
         number = value(x.number)
         return number * factors[key].astype(number.dtype)
 
