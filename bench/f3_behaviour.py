@@ -41,7 +41,7 @@ def main() -> None:
     for name in SHOWN:
         figure = behaviour_figure(EXPERIMENTS[name], {law: of[name] for law, of in outcomes.items()})
         figure.savefig(options.out / f"behaviour_{name}.png", dpi=90)
-        print(f"written: {out / f'behaviour_{name}.png'}")
+        print(f"written: {options.out / f'behaviour_{name}.png'}")
 
 
 def cell(outcome: Outcome) -> str:

@@ -10,8 +10,8 @@ import pytest
 from jaxmodsim import (
     Coulomb,
     DeadZone,
+    ElastoPlastic,
     Friction,
-    LuGre,
     Regularized,
     Scene,
     Viscous,
@@ -149,7 +149,7 @@ def test_a_puck_slides_straight_and_slows_at_mu_g() -> None:
     ("effect", "text"),
     [
         (Friction(Coulomb(1.0), along=bowl), r"Coulomb cannot act.*Regularized\(law, width\)"),
-        (Friction(LuGre(1e3, 1.0, 0.1, 1.0, 1.5, 0.1), along=bowl), "LuGre cannot act"),
+        (Friction(ElastoPlastic(1e3, 1.0, 0.1, 0.5, 1.0, 1.5, 0.1), along=bowl), "ElastoPlastic cannot act"),
         (Friction(DeadZone(Coulomb(1.0), 0.1), along=bowl), "DeadZone cannot act"),
         (Friction(Viscous(1.0), along=bowl, belt_velocity=0.1), "must be a function of t that returns one"),
         (Friction(Viscous(1.0), along=lambda q: jnp.ones(4)), r"returned the shape \(4,\).*\(2,\) or \(3,\)"),
