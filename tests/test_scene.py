@@ -86,8 +86,8 @@ def test_every_number_is_a_leaf() -> None:
 
     leaves, structure = jax.tree.flatten(scene(1.0))
     assert all(isinstance(leaf, jax.Array) and leaf.dtype == jnp.float64 for leaf in leaves)
-    # params 3, spiral 2, regularized Stribeck 6 with belt and load 8, LuGre 6 with belt 7, dead zone 2.
-    assert len(leaves) == 3 + 2 + 8 + 7 + 2
+    # params 3, spiral 2, regularized Stribeck 5 with belt and load 7, LuGre 6 with belt 7, dead zone 2.
+    assert len(leaves) == 3 + 2 + 7 + 7 + 2
     other, same = jax.tree.flatten(scene(2.0))
     assert structure == same
     assert hash(structure) == hash(same)

@@ -137,8 +137,8 @@ def asymmetric(law: _Law, **backward: Any) -> _Law:
 
     **Returns:**
 
-    A law of the same kind, for slip along a line: `forward` is the law given, `backward` holds the numbers that differ.
-    All others are the same number in both directions.
+    A law of the same kind, for slip along a line: `forward` is the law given, `backward` holds the numbers that differ,
+    and those whose limit they are. All others are the same number in both directions.
 
     **Raises:**
 

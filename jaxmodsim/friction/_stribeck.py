@@ -6,11 +6,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Number, optional_parameter, parameter
+from ..numerics import Number, optional_parameter, parameter, safe_power
 from ._law import AbstractSetValuedLaw
 
-# Velocity over vs below which a curve with an exponent is rounded off.
-_ROUNDED = 1e-9
+# Velocity over vs below which a curve with an exponent below one is rounded off.
+_ROUNDED = 1e-12
 
 
 def exponential(x: Float[Array, ""]) -> Float[Array, ""]:
@@ -23,9 +23,10 @@ def lorentzian(x: Float[Array, ""]) -> Float[Array, ""]:
     return 1.0 / (1.0 + x)
 
 
-def _rounded_power(x: Float[Array, ""], exponent: Float[Array, ""]) -> Float[Array, ""]:
-    """`x^exponent` with its corner at 0 rounded over `_ROUNDED`: below an exponent of one its slope has no bound."""
-    return (x * x + _ROUNDED * _ROUNDED) ** (0.5 * exponent) - _ROUNDED**exponent
+def _power(x: Float[Array, ""], exponent: Float[Array, ""]) -> Float[Array, ""]:
+    """`x^exponent`; below an exponent of one its slope at 0 has no bound, and the corner is rounded over `_ROUNDED`."""
+    rounded = (x * x + _ROUNDED * _ROUNDED) ** (0.5 * exponent) - _ROUNDED**exponent
+    return jnp.where(exponent < 1.0, rounded, safe_power(x, exponent))
 
 
 class Stribeck(AbstractSetValuedLaw):
@@ -72,7 +73,7 @@ class Stribeck(AbstractSetValuedLaw):
         """Magnitude [N] of the dry part in slip."""
         ratio = jnp.abs(v) / self.vs
         # A square costs a fifth of a power.
-        power = ratio * ratio if self.exponent is None else _rounded_power(ratio, self.exponent)
+        power = ratio * ratio if self.exponent is None else _power(ratio, self.exponent)
         return self.Fc + (self.Fs - self.Fc) * self.fall(power)
 
     def wet(self, v: Float[Array, ""]) -> Float[Array, ""]:
