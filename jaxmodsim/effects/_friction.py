@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
 from ..friction import (
+    AbstractAsymmetric,
     AbstractDynamicLaw,
     AbstractForceLaw,
     AbstractHoldingLaw,
@@ -162,7 +163,7 @@ class Friction(AbstractEffect):
                 " shape (2,) or (3,), is needed."
             )
         slip = () if q.shape == (1,) else shape
-        sided = any(hasattr(module, "backward") for _, module in modules_of(self.law))
+        sided = any(isinstance(module, AbstractAsymmetric) for _, module in modules_of(self.law))
         if slip != () and (sided or not isinstance(self.law, AbstractForceLaw | AbstractPlanarLaw)):
             raise ValueError(
                 f"Friction {name!r}: along(q) is a position that moves in several directions, and there"
@@ -306,9 +307,7 @@ class Friction(AbstractEffect):
             return self._stretch(self.law.force(v, z)), self.law.rate(v, z)
         if not isinstance(self.law, AbstractForceLaw | AbstractHoldingLaw):
             raise TypeError(f"{type(self.law).__name__} acts by a mode, or is of no known kind of law.")
-        if v.ndim == 0:
-            return self.law.force(v), None
-        return self._stretch(_against(self.law.force, v)), None
+        return self._stretch(_of_slip(self.law.force, v)), None
 
     def after(
         self, v: Float[Array, "..."], z: PyTree, dt: Float[Array, ""], load: Float[Array, ""] | None
@@ -324,7 +323,7 @@ class Friction(AbstractEffect):
             z = after
         else:
             assert isinstance(self.law, AbstractForceLaw)
-            force = self.law.force(v) if v.ndim == 0 else _against(self.law.force, v)
+            force = _of_slip(self.law.force, v)
         force = self._stretch(force)
         return (force if load is None else load * force), z
 
@@ -367,8 +366,10 @@ def _mean_rate(law: AbstractDynamicLaw, v: Float[Array, "..."], z: PyTree, after
     return jtu.tree_map(mean, z, after, law.rate(v, z), law.rate(v, after))
 
 
-def _against(force: Callable[..., Any], v: Float[Array, " d"]) -> Float[Array, " d"]:
-    """A force of the magnitude that a law has at the magnitude of slip, in the direction of slip."""
+def _of_slip(force: Callable[..., Any], v: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Force of a function of slip; where slip is a vector, in its direction and as large as that of its magnitude."""
+    if v.ndim == 0:
+        return force(v)
     speed = safe_norm(v)
     # At rest the force is a linear function of slip; the quotient would be 0/0.
     rest = jnp.zeros_like(speed)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..friction import (
+    AbstractAsymmetric,
     AbstractDynamicLaw,
     AbstractHoldingLaw,
     AbstractLaw,
@@ -124,7 +125,7 @@ def _straight(
 def _lacks(law: AbstractLaw) -> str:
     """What the components lack to express the law, and what to do."""
     name = type(law).__name__
-    if hasattr(law, "forward"):
+    if isinstance(law, AbstractAsymmetric):
         return _ONE_WAY
     if isinstance(law, Regularized | AbstractHoldingLaw | Sign):
         return f"{name}: they run the law inside exactly, by events, so export that"

@@ -4,6 +4,7 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 from ..friction import (
+    AbstractAsymmetric,
     AbstractLaw,
     Armstrong,
     Coulomb,
@@ -98,7 +99,7 @@ def _bristle(joint: str, sigma0: Any, sigma1: Any, Fc: Any, Fs: Any, vs: Any, si
 def _lacks(law: AbstractLaw) -> str:
     """What MuJoCo lacks to express the law, and what to do."""
     name = type(law).__name__
-    if hasattr(law, "forward"):
+    if isinstance(law, AbstractAsymmetric):
         return "friction that depends on the direction: export the law of one direction, or the mean of both"
     if isinstance(law, LuGre):
         return "LuGre whose sigma1 fades (vd): leave vd out, and see passive(law) for what that means"

@@ -3,6 +3,7 @@
 from ..numerics import parameter as parameter  # for laws of one's own
 from ._armstrong import Armstrong as Armstrong
 from ._armstrong import ArmstrongState as ArmstrongState
+from ._asymmetric import AbstractAsymmetric as AbstractAsymmetric
 from ._asymmetric import asymmetric as asymmetric
 from ._coulomb import Coulomb as Coulomb
 from ._curve import Curve as Curve

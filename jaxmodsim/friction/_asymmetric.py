@@ -5,6 +5,7 @@ from typing import Any, TypeVar, cast
 
 import equinox as eqx
 import jax.numpy as jnp
+from equinox import AbstractVar
 from jaxtyping import Array, Float
 
 from ..numerics import Varying, check_ranges, ranges_of
@@ -31,11 +32,12 @@ def _is_varying(x: Any) -> bool:
     return isinstance(x, Varying)
 
 
-class _AsymmetricForce(AbstractForceLaw):
-    """A function of velocity, some of whose parameters differ for negative slip."""
+class AbstractAsymmetric(AbstractLaw):
+    """What laws share some of whose parameters differ for negative slip."""
 
-    forward: AbstractForceLaw
-    backward: dict[str, Any]
+    # The law for positive slip, and the numbers that differ, by name.
+    forward: AbstractVar[Any]
+    backward: AbstractVar[dict[str, Any]]
 
     @property
     def stiff(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -46,27 +48,24 @@ class _AsymmetricForce(AbstractForceLaw):
     def implied(self) -> dict[str, AbstractLaw]:
         """The law for negative slip, to be checked beside the fields."""
         return {"backward": other_side(self)}
+
+
+class _AsymmetricForce(AbstractAsymmetric, AbstractForceLaw):  # pyright: ignore[reportIncompatibleVariableOverride]
+    """A function of velocity, some of whose parameters differ for negative slip."""
+
+    forward: AbstractForceLaw
+    backward: dict[str, Any]
 
     def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Friction force [N] at velocity `v` [m/s]."""
         return _toward(v, self).force(v)
 
 
-class _AsymmetricSetValued(AbstractSetValuedLaw):
+class _AsymmetricSetValued(AbstractAsymmetric, AbstractSetValuedLaw):  # pyright: ignore[reportIncompatibleVariableOverride]
     """A set-valued law, some of whose parameters differ for negative slip."""
 
     forward: AbstractSetValuedLaw
     backward: dict[str, Any]
-
-    @property
-    def stiff(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """As the law for positive slip is."""
-        return self.forward.stiff
-
-    @property
-    def implied(self) -> dict[str, AbstractLaw]:
-        """The law for negative slip, to be checked beside the fields."""
-        return {"backward": other_side(self)}
 
     def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Magnitude [N] of the dry part in slip."""
@@ -81,21 +80,11 @@ class _AsymmetricSetValued(AbstractSetValuedLaw):
         return _toward(direction, self).limit(direction)
 
 
-class _AsymmetricDynamic(AbstractDynamicLaw):
+class _AsymmetricDynamic(AbstractAsymmetric, AbstractDynamicLaw):  # pyright: ignore[reportIncompatibleVariableOverride]
     """A law with a state, some of whose parameters differ for negative slip."""
 
     forward: AbstractDynamicLaw
     backward: dict[str, Any]
-
-    @property
-    def stiff(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """As the law for positive slip is."""
-        return self.forward.stiff
-
-    @property
-    def implied(self) -> dict[str, AbstractLaw]:
-        """The law for negative slip, to be checked beside the fields."""
-        return {"backward": other_side(self)}
 
     def state0(self, v: Float[Array, "..."]) -> Any:
         """State at rest and unloaded."""
@@ -148,9 +137,9 @@ def asymmetric(law: _Law, **backward: Any) -> _Law:
     if isinstance(inner, AbstractLaw):
         return eqx.tree_at(lambda x: x.law, cast(Any, law), asymmetric(inner, **backward))
     kinds = [wrapper for kind, wrapper in _KINDS if isinstance(law, kind)]
-    if not kinds or hasattr(law, "forward"):
+    if not kinds or isinstance(law, AbstractAsymmetric):
         mend = f"{law!r} was given; of a function of velocity make a Curve(fn)"
-        if hasattr(law, "forward"):
+        if isinstance(law, AbstractAsymmetric):
             mend = "a law that is asymmetric already was given: name all parameters that differ in one call"
         raise ValueError(f"asymmetric needs a law with parameters of its own, but {mend}.")
     module = cast(eqx.Module, law)

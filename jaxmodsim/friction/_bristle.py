@@ -6,6 +6,14 @@ from jaxtyping import Array, Float
 from ..numerics import decay_mean
 
 
+def level(
+    v: Float[Array, "..."], Fc: Float[Array, "..."], Fs: Float[Array, "..."], vs: Float[Array, ""]
+) -> Float[Array, "..."]:
+    """Gaussian Stribeck curve `Fc + (Fs - Fc) exp(-(v/vs)^2)` [N]: what steady slip at `v` [m/s] tends to."""
+    ratio = v / vs
+    return Fc + (Fs - Fc) * jnp.exp(-ratio * ratio)
+
+
 def leak(
     v: Float[Array, "..."], z: Float[Array, "..."], dt: Float[Array, ""], rate: Float[Array, ""]
 ) -> Float[Array, "..."]:

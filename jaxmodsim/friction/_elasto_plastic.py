@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..numerics import Number, decay_mean, parameter
+from ._bristle import level
 from ._law import AbstractDynamicLaw
 
 # Steps of order 2 through the transition between elastic and plastic in `advance`, and the slip in limit deflections
@@ -59,8 +60,7 @@ class ElastoPlastic(AbstractDynamicLaw):
 
     def level(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """g(v) [N]: the bristle force that steady slip at `v` [m/s] tends to."""
-        ratio = v / self.vs
-        return self.Fc + (self.Fs - self.Fc) * jnp.exp(-ratio * ratio)
+        return level(v, self.Fc, self.Fs, self.vs)
 
     def _plastic(self, u: Float[Array, ""], elastic: Float[Array, ""]) -> Float[Array, ""]:
         """`alpha` at the load `u`; `elastic` is where it begins to rise. Both in limits."""

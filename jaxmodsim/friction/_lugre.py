@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..numerics import Number, magnitude, optional_parameter, parameter
-from ._bristle import leak
+from ._bristle import leak, level
 from ._law import AbstractPlanarLaw
 
 
@@ -60,8 +60,7 @@ class LuGre(AbstractPlanarLaw):
 
     def level(self, v: Float[Array, "..."]) -> Float[Array, ""]:
         """g(v) [N]: the bristle force that steady slip at `v` [m/s] tends to."""
-        ratio = magnitude(v) / self.vs
-        return self.Fc + (self.Fs - self.Fc) * jnp.exp(-ratio * ratio)
+        return level(magnitude(v), self.Fc, self.Fs, self.vs)
 
     def state0(self, v: Float[Array, "..."]) -> Float[Array, "..."]:
         """Undeflected bristle, 0 m."""

@@ -14,7 +14,7 @@ from ..numerics import (
     parameter,
     vector_parameter,
 )
-from ._bristle import follow, yielding
+from ._bristle import follow, level, yielding
 from ._law import AbstractDynamicLaw
 
 
@@ -82,8 +82,7 @@ class MaxwellSlip(AbstractDynamicLaw):
         """Force [N] at which each element slips at velocity `v` [m/s]."""
         if self.Fs is None or self.vs is None:
             return self.Fc
-        ratio = v / self.vs
-        return self.Fc + (self.Fs - self.Fc) * jnp.exp(-ratio * ratio)
+        return level(v, self.Fc, self.Fs, self.vs)
 
     def _attraction(self, limit: Float[Array, " n"]) -> Float[Array, " n"]:
         """Rate [1/s] at which an element beyond its limit falls back to it."""

@@ -6,6 +6,7 @@ from typing import Any
 import jax.tree_util as jtu
 from jaxtyping import Array
 
+from ..friction import AbstractAsymmetric
 from ..numerics import Range, Varying, ranges_of
 from ._scene import Scene
 
@@ -50,7 +51,7 @@ def scene_ranges(scene: Scene) -> dict[str, Range]:
         owner, last = owners[-1], path[-1]
         if isinstance(last, jtu.GetAttrKey):
             allowed, beside = ranges_of(owner).get(last.name), path[:-1]
-        elif "implied" in dir(owners[-2]):  # a number of an asymmetric law for negative slip
+        elif isinstance(owners[-2], AbstractAsymmetric):  # a number of an asymmetric law for negative slip
             allowed, beside = ranges_of(owners[-2].forward).get(last.key), (*path[:-2], jtu.GetAttrKey("forward"))
         else:
             continue
