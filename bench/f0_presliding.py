@@ -103,7 +103,7 @@ def judge(name: str, law: Any, free: Any, known: jms.Record, columns: tuple[Any,
         "parameters": len(found.values),
         "rmse_fitted": float(np.sqrt(np.mean(error[:half] ** 2))),
         "rmse_held_back": float(np.sqrt(np.mean(error[half:] ** 2))),
-        "iterations": found.iterations,
+        "evaluations": found.evaluations,
         "ending": found.ending,
         "seconds": seconds,
         "values": found.values,
@@ -123,12 +123,12 @@ def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
             f"{1e3 * row['rmse_fitted']:.1f}",
             f"{1e3 * row['rmse_held_back']:.1f}",
             f"{row['rmse_held_back'] / best:.2f}",
-            f"{row['iterations']}, {row['ending'].split(' at ')[0].split(';')[0]}",
+            f"{row['evaluations']}, {row['ending'].split(' at ')[0].split(';')[0]}",
             f"{row['seconds']:.1f}",
         ]
         for row in ranked
     ]
-    names = ["law", "parameters", "fitted half [mN]", "held-back half [mN]", "over the best", "iterations", "fit [s]"]
+    names = ["law", "parameters", "fitted half [mN]", "held-back half [mN]", "over the best", "evaluations", "fit [s]"]
     return {"columns": names, "rows": cells}
 
 

@@ -44,7 +44,7 @@ def main(record_file: Path, out: Path, smoke: bool = False) -> None:
     out.mkdir(parents=True, exist_ok=True)
     for name in ("coulomb",) if smoke else AXIS_MODELS:
         model = AXIS_MODELS[name]
-        result = fit(axis_scene(model, rough), record, model.free, lower={"m": 0.0})
+        result = fit(axis_scene(model, rough), record, model.free, limits={"m": (0.0, None)})
         fine = resimulated(result, 5)
         print(f"\n{name}: {model.words}\n{result}\nwith five steps for every sample: RMSE {1e3 * fine:.4f} mm")
         fit_figure(result, caption=SOURCE).savefig(out / f"b0_emps_{name}.png", dpi=130)

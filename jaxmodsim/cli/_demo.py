@@ -79,7 +79,7 @@ def run_demo(out: Path) -> None:
     )
     show_table(frame, "LuGre fitted to a synthetic record (made by the package, truth known)")
     console.print(
-        f"RMSE {1e6 * result.rmse:.3g} um with noise of {1e6 * NOISE:.3g} um; {result.iterations} iterations,"
+        f"RMSE {1e6 * result.rmse:.3g} um with noise of {1e6 * NOISE:.3g} um; {result.evaluations} evaluations,"
         f" {seconds:.1f} s with compilation",
         highlight=False,
     )

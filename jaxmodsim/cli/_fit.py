@@ -114,7 +114,7 @@ def fit_with_progress(scene: Scene, record: Record, free: tuple[str, ...], **opt
             shown = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
             status.update(f"iteration {step}: RMSE {rms:.6g}  {shown}")
 
-        result = fit(scene, record, free, lower={"m": 0.0}, progress=progress, **options)
+        result = fit(scene, record, free, limits={"m": (0.0, None)}, progress=progress, **options)
     return result, time.perf_counter() - started
 
 
@@ -125,6 +125,6 @@ def show_fit(result: FitResult, title: str, unit: str) -> None:
     pairs = zip(frame["parameter"], frame["unit"], strict=True)
     frame["unit"] = [given or units.get(name, "") for name, given in pairs]
     show_table(frame, title)
-    console.print(f"RMSE {result.rmse:.6g} {unit}; {result.iterations} iterations, {result.ending}", highlight=False)
+    console.print(f"RMSE {result.rmse:.6g} {unit}; {result.evaluations} evaluations, {result.ending}", highlight=False)
     for remark in result.remarks:
         console.print(f"- {remark}", highlight=False)

@@ -1,61 +1,76 @@
-"""`fit`: numbers of a scene from a measured record."""
+"""`fit`: numbers of a scene from measured records."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+from jaxtyping import ArrayLike
 
-from ..numerics import Range, check_ranges, modules_of
-from ..scene import Scene, State, check_scene, replace_numbers, scene_numbers, scene_ranges
-from ._entries import chosen_entries, join_entries, split_entries, split_ranges
-from ._fit_result import FitResult
-from ._least_squares import Progress, least_squares
-from ._parameters import FreeParameters
+from ..scene import Scene
+from ._begin import AbstractBeginning
+from ._engines import with_values
+from ._losses import AbstractLoss, Squares
+from ._observe import Observable, first_coordinate
+from ._prepare import Settings, Shooting, prepare, step_error
 from ._record import Record
-from ._replay import replay
-
-
-def first_coordinate(q: Array, qd: Array) -> Array:
-    """The first coordinate, which is what a position sensor on one axis sees."""
-    del qd
-    return q[0]
+from ._replay import Controller
+from ._result import FitResult, result_of
+from ._solve import Options, Progress, solve_with_noise
 
 
 def fit(
     scene: Scene,
-    record: Record,
+    records: Record | Sequence[Record],
     free: Sequence[str],
     *,
-    q0: ArrayLike | list[float] | None = None,
-    qd0: ArrayLike | list[float] | None = None,
-    observe: Callable[[Array, Array], Array] = first_coordinate,
-    lower: Mapping[str, float] | None = None,
+    observe: Observable | Mapping[str, Observable] = first_coordinate,
+    q0: ArrayLike | list[Any] | None = None,
+    qd0: ArrayLike | list[Any] | None = None,
+    delay: Mapping[str, float] | None = None,
+    limits: Mapping[str, tuple[float | None, float | None]] | None = None,
+    passive: Sequence[str] = (),
+    prior: Mapping[str, tuple[float, float]] | None = None,
+    loss: AbstractLoss | None = None,
+    controller: Controller | None = None,
+    shooting: Shooting | None = None,
+    begin: AbstractBeginning | Sequence[AbstractBeginning] = (),
     substeps: int = 1,
+    accuracy: float = 1e-8,
     rtol: float = 1e-6,
     max_steps: int = 100,
     progress: Progress | None = None,
 ) -> FitResult:
-    """Fit numbers of a scene so that its open-loop simulation follows a record.
+    """Fit numbers of a scene so that its simulation follows measured records.
 
-    The inputs drive the scene, nothing measured is fed back, and the sum of squares of `observe - measured` over all
-    samples is minimised by Levenberg-Marquardt on the exact derivatives of the simulated run.
+    The inputs drive the scene, nothing measured is fed back, and the sum of squares of `observe - measured`, each
+    channel in units of its noise, is minimised over all samples by Levenberg-Marquardt within bounds, on the exact
+    derivatives of the simulated run. Scenes without set-valued laws are run by fixed steps from sample to sample,
+    those with such laws by events.
 
     **Arguments:**
 
-    - `scene`: the model with start values; its `params` must be a dict with an entry for each input of the record.
-    - `record`: the `Record`.
+    - `scene`: the model with start values; its `params` must be a dict with an entry for each input of the records.
+    - `records`: a `Record` or several; each has the same inputs.
     - `free`: names of the numbers to fit, as `jaxmodsim.scene.scene_numbers` gives them: `("m", "friction.Fc")`;
-      the name of an array stands for all its entries, `friction.k[0]` for one.
-      Laws' parameters stay in their ranges.
-    - `q0`, `qd0`: state at the first sample, shape `[dof]`; by default, for one coordinate, the first measured value
-      and rest.
-    - `observe`: `observe(q, qd)`, what the record measured; by default the first coordinate.
-    - `lower`: lower limits, excluded, of numbers that declare none: `{"m": 0.0}`.
+      the name of an array stands for all its entries, `friction.k[0]` for one. Of initial states `q0[0]`, `qd0[0]`,
+      `z0.friction` (or `q0`, `qd0`, `z0` for all), fitted for each record by itself; of the delay [s] of an input
+      `delay.u`. Laws' parameters stay in their ranges.
+    - `observe`: what a record measured: a function `observe(q, qd)` that returns one number, `"q[0]"`, `"qd[0]"`, or
+      the name of an effect, whose force is meant; with several channels a dict of these by channel.
+    - `q0`, `qd0`: state at the first sample, shape `[dof]` or `[records, dof]`; by default the first measured value
+      of each coordinate that was measured, the others 0, and rest. `jaxmodsim.identify.start_state` estimates one.
+    - `delay`: by how much inputs come later than recorded [s], >= 0; where they start if they are free.
+    - `limits`: lower and upper limits of numbers beyond the declared ones, None for none: `{"m": (0.0, 5.0)}`. A lower
+      limit of 0 is excluded.
+    - `passive`: names of the friction effects with a LuGre law that has to be passive, `sigma2 >= sigma1 (Fs - Fc)/Fc`;
+      their sigma2 must be free.
+    - `prior`: what was known before: mean and standard deviation by name, `{"m": (95.0, 5.0)}`.
+    - `loss`: of a residual in noise levels; `Squares` by default, `Huber` and `Cauchy` where there are outliers.
+    - `controller`: a `Controller` that closes a loop around the scene.
+    - `shooting`: `Shooting`, to run in windows.
+    - `begin`: how to find where to begin, one after the other: `Staged()`, `MultiStart(...)`, `Continuation(...)`.
     - `substeps`: integration steps between two samples.
-    - `rtol`: relative tolerance on parameters and loss at which the search ends.
+    - `accuracy`: relative tolerance of runs by events.
+    - `rtol`: relative change of the residual at which the search ends.
     - `max_steps`: limit of iterations.
     - `progress`: called after each iteration with its number, the RMSE and the parameters. Ctrl-C ends the fit
       with the best so far.
@@ -66,63 +81,24 @@ def fit(
 
     **Raises:**
 
-    - `ValueError` for names that are unknown, a start on the limit of its range, inputs the scene has no entry for.
+    - `ValueError` for names that are unknown, a start beyond its limits, inputs the scene has no entry for.
     - `RuntimeError` if the model is not finite at its start values.
     """
-    if not isinstance(scene.params, dict) or not set(record.inputs) <= set(scene.params):
-        have = ", ".join(scene.params) if isinstance(scene.params, dict) else "no dict"
-        raise ValueError(
-            f"The record's inputs ({', '.join(record.inputs)}) must be entries of the scene's params ({have})."
-        )
-    if scene.exact:
-        raise ValueError(
-            f"fit integrates with fixed steps and knows no events, but {', '.join(scene.exact)} would need them:"
-            " wrap the law, as in Regularized(law, width)."
-        )
     for label, count in (("substeps", substeps), ("max_steps", max_steps)):
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise ValueError(f"{label} must be at least 1, an integer, but {count!r} was given.")
-    driven = sorted(set(free) & set(record.inputs))
-    if driven:
-        raise ValueError(f"{driven[0]} is driven by the record and cannot be free.")
-    for _, module in modules_of(scene):
-        check_ranges(module)
-    whole = scene_numbers(scene)
-    numbers = split_entries(whole)
-    limits = {name: Range("", limit, strict=True) for name, limit in (lower or {}).items()}
-    for name, limit in limits.items():
-        if name not in numbers or not bool(limit.holds(numbers[name], {})):
-            raise ValueError(
-                f"lower: {name} must be {limit.text}, but it is {numbers.get(name, 'no number of the scene')}."
-            )
-    ranges = split_ranges(whole, scene_ranges(scene))
-    for name, limit in limits.items():
-        declared = ranges.get(name, limit)
-        if isinstance(declared.lower, str):
-            raise ValueError(f"lower: {name} is limited by {declared.lower} already.")
-        tighter = declared.lower is None or float(limit.lower or 0.0) >= declared.lower
-        ranges[name] = replace(declared, lower=limit.lower, strict=True) if tighter else declared
-    parameters = FreeParameters.of(numbers, ranges, chosen_entries(whole, free))
-    start = [record.measured[0]] if q0 is None else q0
-    position = jnp.asarray(start, float)
-    velocity = jnp.zeros_like(position) if qd0 is None else jnp.asarray(qd0, float)
-    if position.ndim != 1 or position.shape != velocity.shape or not jnp.isfinite(position + velocity).all():
-        raise ValueError(f"q0 and qd0 must be finite and of one shape [dof], but q0 = {start} and qd0 = {qd0}.")
-    check_scene(scene, State(position, velocity, scene.state0(position)))
-    shape = getattr(jax.eval_shape(observe, position, velocity), "shape", None)
-    if shape != ():
-        raise ValueError(f"observe(q, qd) returned the shape {shape}, but one number, shape (), is needed.")
-
-    def residual(values: dict[str, Array], data: Any) -> Array:
-        t, inputs, measured = data
-        model = replace_numbers(scene, join_entries(whole, values))
-        return replay(model, t, inputs, position, velocity, substeps, observe) - measured
-
-    data = record.arrays
-    estimate = least_squares(residual, parameters, data, rtol=rtol, max_steps=max_steps, progress=progress)
-    units = {name: allowed.unit for name, allowed in ranges.items()}
-    model = replace_numbers(scene, join_entries(whole, estimate.found))
-    t, inputs, measured = data
-    fine = replay(model, t, inputs, position, velocity, 4 * substeps, observe) - measured
-    step_error = float(jnp.sqrt(jnp.mean((fine - estimate.residual) ** 2)))
-    return FitResult.of(estimate, model, record, units, step_error)
+    loss = Squares() if loss is None else loss
+    settings = Settings(
+        observe, q0, qd0, delay or {}, limits or {}, tuple(passive), prior or {}, loss, controller, shooting, substeps,
+        accuracy,
+    )  # fmt: skip
+    prepared = prepare(scene, records, free, settings)
+    options, x, starts = Options(rtol, max_steps, progress), prepared.problem.x0, ()
+    for each in (begin,) if isinstance(begin, AbstractBeginning) else begin:
+        x, starts = each.begin(prepared.problem, x, options)
+    found = solve_with_noise(prepared.problem, x, options, prepared.given)
+    values = found.problem.free.values(found.problem.split(found.search.x)[0])
+    error = step_error(found)
+    return result_of(
+        found, prepared.records, prepared.windows, prepared.units, with_values(scene, values), error, tuple(starts)
+    )

@@ -4,26 +4,37 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..effects import Friction
 from ..friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw
 from ..numerics import Range, varies
 from ..scene import Scene, replace_numbers, scene_numbers, scene_ranges
+from ._begin import AbstractBeginning
+from ._engines import Seen
 from ._entries import chosen_entries, join_entries, split_entries, split_ranges
-from ._fit_result import FitResult
-from ._least_squares import Progress, least_squares
+from ._losses import AbstractLoss, Squares
 from ._parameters import FreeParameters
+from ._problem import Prior, Problem
 from ._record import Record
+from ._result import FitResult, result_of
+from ._runs import Runs, cut, runs_of
+from ._solve import Options, Progress, solve_with_noise
+
+PREFIX = "law."
 
 
 def fit_law(
     law: AbstractLaw,
-    record: Record,
+    record: Record | Sequence[Record],
     free: Sequence[str] | None = None,
     *,
+    loss: AbstractLoss | None = None,
+    begin: AbstractBeginning | Sequence[AbstractBeginning] = (),
     rtol: float = 1e-6,
     max_steps: int = 100,
     progress: Progress | None = None,
@@ -36,13 +47,13 @@ def fit_law(
     **Arguments:**
 
     - `law`: the law with start values; a dynamic law such as `LuGre`, or one that is a function of velocity.
-    - `record`: `measured` is the friction force [N], positive when it opposes positive slip; `inputs` holds the slip
-      displacement `x` [m] and, if the law's forces are per newton of load, the normal load `normal` [N]. The law
-      starts at rest and unloaded.
+    - `record`: a record, or several; `measured` is the friction force [N], positive when it opposes positive slip;
+      `inputs` holds the slip displacement `x` [m] and, if the law's forces are per newton of load, the normal load
+      `normal` [N]. The law starts at rest and unloaded.
     - `free`: names of the law's parameters to fit, `k[0]` for one entry of an array; by default all but those that
       start on their limit (`sigma1 = 0`) and the `width` of a wrapper and the `corner` of Maxwell slip, which are how
       the law is run and not what it is.
-    - `rtol`, `max_steps`, `progress`: see `fit`.
+    - `loss`, `begin`, `rtol`, `max_steps`, `progress`: see `fit`.
 
     **Returns:**
 
@@ -52,44 +63,70 @@ def fit_law(
 
     - `ValueError` for unknown names or inputs, or a law that cannot run by itself.
     """
-    if "x" not in record.inputs or not (varies(law) or set(record.inputs) <= {"x", "normal"}):
-        raise ValueError(
-            "fit_law needs the input 'x' [m] and may take 'normal' [N], and more only for a law that scaled_by lets"
-            f" depend on it; the record has: {', '.join(record.inputs)}."
-        )
+    several = (record,) if isinstance(record, Record) else tuple(record)
+    for each in several:
+        if "x" not in each.inputs or not (varies(law) or set(each.inputs) <= {"x", "normal"}):
+            raise ValueError(
+                "fit_law needs the input 'x' [m] and may take 'normal' [N], and more only for a law that scaled_by lets"
+                f" depend on it; the record has: {', '.join(each.inputs)}."
+            )
     # A scene of the law alone gives its numbers their names and ranges.
     holder = Scene(_nothing, effects=(Friction(law, name="law"),))
-    prefix = "law."
     numbers = {
-        name.removeprefix(prefix): value
+        name.removeprefix(PREFIX): value
         for name, value in scene_numbers(holder).items()
-        if name != prefix + "belt_velocity"
+        if name != PREFIX + "belt_velocity"
     }
     ranges = {}
     for name, allowed in scene_ranges(holder).items():
-        lower = allowed.lower.removeprefix(prefix) if isinstance(allowed.lower, str) else allowed.lower
-        ranges[name.removeprefix(prefix)] = replace(allowed, lower=lower)
+        lower = allowed.lower.removeprefix(PREFIX) if isinstance(allowed.lower, str) else allowed.lower
+        ranges[name.removeprefix(PREFIX)] = replace(allowed, lower=lower)
     single, ranges = split_entries(numbers), split_ranges(numbers, ranges)
     chosen = _off_limits(single, ranges) if free is None else chosen_entries(numbers, free)
     parameters = FreeParameters.of(single, ranges, chosen)
-
-    def with_values(values: dict[str, Array]) -> AbstractLaw:
-        whole = {prefix + name: value for name, value in join_entries(numbers, values).items()}
-        friction = replace_numbers(holder, whole).effects[0]
-        assert isinstance(friction, Friction)
-        return friction.law
-
-    def residual(values: dict[str, Array], data: Any) -> Array:
-        t, inputs, measured = data
-        return law_force(with_values(values), t, inputs["x"], inputs.get("normal"), inputs) - measured
-
-    data = record.arrays
-    estimate = least_squares(residual, parameters, data, rtol=rtol, max_steps=max_steps, progress=progress)
-    per_load = " per N" if "normal" in record.inputs else ""
+    windows = cut(several, None)
+    given = {name: level for each in several for name, level in each.noise.items()}
+    size = float(np.std(np.concatenate([each.measured for each in several]))) or 1.0
+    problem = Problem(
+        LawEngine(holder),
+        parameters,
+        (),
+        None,
+        runs_of(several, windows),
+        {name: jnp.asarray(given.get(name, size)) for name in several[0].channels},
+        Squares() if loss is None else loss,
+        Prior(jnp.zeros(len(parameters.names)), jnp.zeros(len(parameters.names))),
+    )
+    options, x, starts = Options(rtol, max_steps, progress), problem.x0, ()
+    for each in (begin,) if isinstance(begin, AbstractBeginning) else begin:
+        x, starts = each.begin(problem, x, options)
+    found = solve_with_noise(problem, x, options, frozenset(given))
+    per_load = " per N" if "normal" in several[0].inputs else ""
     units = {
         name: allowed.unit + (per_load if allowed.unit.startswith("N") else "") for name, allowed in ranges.items()
     }
-    return FitResult.of(estimate, with_values(estimate.found), record, units)
+    fitted = _law(holder, found.problem.free.values(found.search.x))
+    return result_of(found, several, windows, units, fitted, None, tuple(starts))
+
+
+class LawEngine(eqx.Module):
+    """A law under the measured motion; the scene holds nothing but the law."""
+
+    holder: Scene
+
+    def __call__(self, values: dict[str, Array], start: None, run: Runs) -> Seen:
+        """The force of the law with these values."""
+        del start
+        force = law_force(_law(self.holder, values), run.t, run.inputs["x"], run.inputs.get("normal"), run.inputs)
+        return Seen(dict.fromkeys(run.measured, force), {}, None)
+
+
+def _law(holder: Scene, values: dict[str, Array]) -> AbstractLaw:
+    numbers = scene_numbers(holder)
+    whole = join_entries(numbers, {PREFIX + name: value for name, value in values.items()})
+    friction = replace_numbers(holder, whole).effects[0]
+    assert isinstance(friction, Friction)
+    return friction.law
 
 
 def _off_limits(numbers: dict[str, Array], ranges: dict[str, Range]) -> tuple[str, ...]:
@@ -131,7 +168,7 @@ def law_force(
     if not isinstance(law, AbstractDynamicLaw | AbstractForceLaw):
         raise ValueError(f"{type(law).__name__} cannot run by itself: its force depends on the load it holds.")
     dt = jnp.diff(t)
-    v = jnp.diff(x) / dt
+    v = jnp.diff(x) / jnp.where(dt > 0, dt, 1.0)  # records side by side repeat their last time
 
     def at(t: Array, x: Array, v: Array, params: Any) -> Any:
         return law.at(t, x[None], v[None], params)

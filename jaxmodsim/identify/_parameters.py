@@ -1,112 +1,186 @@
-"""Free parameters: kept in their ranges by a transform to numbers without limits."""
+"""Free parameters: names, and coordinates in which their limits are bounds of a box."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..numerics import Range
 
+# What a parameter is measured from: a number, another parameter, or sigma1, Fs and Fc of a law that is to be passive.
+Floor: TypeAlias = float | str | tuple[str, str, str] | None
 
-@dataclass(frozen=True)
-class FreeParameters:
+# Logarithmic coordinates stop short of overflow, and one iteration does not change a parameter by more than this factor
+# to a power: the curvature of a model over more decades is nothing that a linearisation knows.
+_MOST_DECADES, _LONGEST_LOG_STEP = 60.0, 1.5
+
+
+class FreeParameters(eqx.Module):
     """Names, start values and limits of the parameters of a fit.
 
-    A parameter with a lower limit is `limit + (start - limit) exp(x)`, one with an upper limit as well moves between
-    them by a logistic function, one without is `start + scale x`, with x free and zero at the start. A lower limit may
-    be another parameter (Fs >= Fc). One that is not free itself, but whose limit is, keeps its distance from the limit:
-    with Fs = Fc at the start, it stays so.
+    Each has a coordinate x, about 1 in size: a parameter that must be greater than a number is `floor + unit exp(x)`;
+    one that may also reach its lower limit is `floor + unit x` with x >= 0, where the limit may be another parameter
+    (Fs >= Fc); one without is `unit x`. So all limits are bounds of x, and one may be reached exactly. A parameter that
+    is not free, but whose limit is, keeps its distance from it: with Fs = Fc at the start, it stays so.
 
     - `names`: of the free parameters, in the order they were given.
-    - `start`: values at the start, of these and of the ones that follow them, each after its limit.
-    - `limits`: lower limit of each, if it has one: a number or a name.
-    - `upper`: upper limits of those that have one.
     - `following`: names of the parameters that are not free but follow one that is.
     """
 
-    names: tuple[str, ...]
-    start: dict[str, float]
-    limits: dict[str, float | str | None]
-    upper: dict[str, float]
-    following: tuple[str, ...]
+    names: tuple[str, ...] = eqx.field(static=True)
+    following: tuple[str, ...] = eqx.field(static=True)
+    _order: tuple[str, ...] = eqx.field(static=True)
+    _kinds: tuple[str, ...] = eqx.field(static=True)
+    _bases: tuple[str | tuple[str, str, str] | None, ...] = eqx.field(static=True)
+    start: dict[str, Array]
+    _floors: dict[str, Array]
+    _units: dict[str, Array]
+    _upper: dict[str, Array]
 
     @staticmethod
-    def of(numbers: Mapping[str, Any], ranges: Mapping[str, Range], free: Sequence[str]) -> "FreeParameters":
+    def of(
+        numbers: Mapping[str, Any],
+        ranges: Mapping[str, Range],
+        free: Sequence[str],
+        passive: Mapping[str, tuple[str, str, str]] | None = None,
+    ) -> "FreeParameters":
         """Choose `free` among `numbers`.
+
+        **Arguments:**
+
+        - `numbers`: all numbers by name.
+        - `ranges`: their ranges, by name.
+        - `free`: names of those to fit.
+        - `passive`: names of the sigma1, Fs and Fc that the free sigma2 of a LuGre law must go with for it to be
+          passive, `sigma2 >= sigma1 (Fs - Fc)/Fc`, by the name of that sigma2.
 
         **Raises:**
 
-        - `ValueError` for a name that is unknown, given twice or no single number, or a start on its limit.
+        - `ValueError` for a name that is unknown, given twice or no single number, or a start beyond its limits.
         """
-        if isinstance(free, str) or not free:
-            raise ValueError("free must name at least one number, as in free=('m', 'friction.Fc').")
-        for name in free:
-            if name not in numbers:
-                raise ValueError(f"free names {name!r}, but the numbers are: {', '.join(numbers)}.")
-            if list(free).count(name) > 1:
-                raise ValueError(f"free names {name!r} twice.")
-            if jnp.shape(numbers[name]) != ():
-                raise ValueError(f"{name} is an array of shape {jnp.shape(numbers[name])}; only single numbers fit.")
+        _check_names(numbers, free)
         values = {name: float(x) for name, x in numbers.items() if jnp.shape(x) == ()}
         following: list[str] = []
         while more := [
             name for name, r in ranges.items() if name not in (*free, *following) and r.lower in (*free, *following)
         ]:
             following += more
-        limits: dict[str, float | str | None] = {}
-        for name in free:
-            limit = ranges[name].lower if name in ranges else None
-            lower = values[limit] if isinstance(limit, str) else limit
-            if lower is not None and values[name] <= lower:
-                shown = f"{limit} = {lower:g}" if isinstance(limit, str) else f"{lower:g}"
-                raise ValueError(f"The start {name} = {values[name]:g} must lie above its limit {shown}.")
-            # A limit that is fixed is a number.
-            limits[name] = limit if limit in (*free, *following) else lower
-        limits |= {name: ranges[name].lower for name in following}
+        moving = (*free, *following)
+        floors: dict[str, Floor] = {}
+        for name in moving:
+            floors[name] = ranges[name].lower if name in ranges else None
+            if isinstance(floors[name], str) and floors[name] not in moving:
+                floors[name] = values[str(floors[name])]  # a limit that is fixed is a number
+        floors |= {name: names for name, names in (passive or {}).items() if name in free}
         order: list[str] = []
-        for name in (*free, *following):
-            chain, limit = [name], limits[name]
-            while isinstance(limit, str) and limit not in order:
-                chain.append(limit)
-                limit = limits[limit]
-            order += [each for each in reversed(chain) if each not in order]
-        upper: dict[str, float] = {}
+        for name in moving:
+            _append_after(name, floors, order)
+        strict = {name for name in free if name in ranges and ranges[name].strict}
+        upper = {name: ranges[name].upper for name in free if name in ranges and ranges[name].upper is not None}
         for name in free:
-            most = ranges[name].upper if name in ranges else None
-            if most is None:
-                continue
-            if isinstance(limits[name], str):
-                raise ValueError(f"{name} is limited by {limits[name]} and by {most:g}: free only one of the two.")
-            if values[name] >= most:
-                raise ValueError(f"The start {name} = {values[name]:g} must lie below its limit {most:g}.")
-            upper[name] = most
-        return FreeParameters(tuple(free), {name: values[name] for name in order}, limits, upper, tuple(following))
+            _check_start(name, values, floors[name], name in strict, upper.get(name))
+        kinds = {
+            name: "follow"
+            if name in following
+            else "line"
+            if floors[name] is None
+            else "log"
+            if name in strict and isinstance(floors[name], float | int)
+            else "above"
+            for name in order
+        }
+        numeric = {name: x for name, x in floors.items() if isinstance(x, float | int)}
+        units = {name: _unit(kinds[name], values, name, floors[name]) for name in order}
+        beside = {each: values[each] for x in floors.values() if isinstance(x, tuple) for each in x}
+        start = beside | {name: values[name] for name in order}
+        start |= {name: max(values[name], _base(floors[name], values)) for name in free if kinds[name] == "above"}
+        return FreeParameters(
+            names=tuple(free),
+            following=tuple(following),
+            _order=tuple(order),
+            _kinds=tuple(kinds[name] for name in order),
+            _bases=tuple(x if isinstance(x := floors[name], str | tuple) else None for name in order),
+            start={name: jnp.asarray(x) for name, x in start.items()},
+            _floors={name: jnp.asarray(numeric.get(name, 0.0)) for name in order},
+            _units={name: jnp.asarray(x) for name, x in units.items()},
+            _upper={name: jnp.asarray(x) for name, x in upper.items()},
+        )
+
+    def _kind(self, name: str) -> str:
+        return self._kinds[self._order.index(name)]
+
+    def _floor(self, name: str, values: Mapping[str, Array]) -> Array:
+        base = self._bases[self._order.index(name)]
+        if base is None:
+            return self._floors[name]
+        return values[base] if isinstance(base, str) else _passive_floor(*(values[each] for each in base))
 
     def values(self, x: Float[Array, " free"]) -> dict[str, Array]:
         """The parameters at `x`, and those that follow them."""
-        values: dict[str, Array] = {}
-        for name, start in self.start.items():
-            limit = self.limits[name]
-            if name in self.following:
-                values[name] = values[str(limit)] + (start - self.start[str(limit)])
+        values = dict(self.start)  # what a floor names and is not free stays as it is
+        for name, kind in zip(self._order, self._kinds, strict=True):
+            floor = self._floor(name, values)
+            if kind == "follow":
+                start = self._floor(name, self.start)
+                values[name] = floor + (self.start[name] - start)
                 continue
             here = x[self.names.index(name)]
-            if limit is None and name in self.upper:
-                values[name] = self.upper[name] - (self.upper[name] - start) * jnp.exp(here)
-            elif limit is None:
-                values[name] = start + max(abs(start), 1.0) * here
-            elif isinstance(limit, str):
-                values[name] = values[limit] + (start - self.start[limit]) * jnp.exp(here)
-            elif name in self.upper:
-                span = self.upper[name] - limit
-                values[name] = limit + span * jax.nn.sigmoid(here + math.log((start - limit) / (limit + span - start)))
+            values[name] = floor + self._units[name] * (jnp.exp(here) if kind == "log" else here)
+        return {name: values[name] for name in self._order}
+
+    def coordinates(self, values: Mapping[str, Any]) -> Float[Array, " free"]:
+        """The x at which the parameters are these `values`, moved into the limits."""
+        found: dict[str, Array] = {}
+        known = {**self.start, **{name: jnp.asarray(x, float) for name, x in values.items()}}
+        for name in self.names:
+            over = (known[name] - self._floor(name, known)) / self._units[name]
+            found[name] = jnp.log(jnp.maximum(over, 1e-30)) if self._kind(name) == "log" else over
+        lower, upper = self.bounds
+        return jnp.clip(jnp.stack([found[name] for name in self.names]), lower, upper)
+
+    @property
+    def x0(self) -> Float[Array, " free"]:
+        """The coordinates at the start."""
+        return self.coordinates({})
+
+    @property
+    def bounds(self) -> tuple[Float[Array, " free"], Float[Array, " free"]]:
+        """Lower and upper bounds of x."""
+        least = {"line": -jnp.inf, "log": -_MOST_DECADES, "above": 0.0}
+        lower = jnp.stack([jnp.asarray(least[self._kind(name)], float) for name in self.names])
+        upper = []
+        for name in self.names:
+            if name in self._upper:
+                most = (self._upper[name] - self._floors[name]) / self._units[name]
+                upper.append(jnp.log(most) if self._kind(name) == "log" else most)
             else:
-                values[name] = limit + (start - limit) * jnp.exp(here)
-        return values
+                upper.append(jnp.asarray(_MOST_DECADES if self._kind(name) == "log" else jnp.inf, float))
+        return lower, jnp.stack(upper)
+
+    def limits(self, x: Float[Array, " free"]) -> dict[str, tuple[float, float]]:
+        """Lower and upper limit of each parameter where the others are as at `x`."""
+        values = {**self.start, **self.values(x)}
+        return {
+            name: (
+                -math.inf if self._kind(name) == "line" else float(self._floor(name, values)),
+                float(self._upper.get(name, math.inf)),
+            )
+            for name in self.names
+        }
+
+    @property
+    def longest(self) -> Float[Array, " free"]:
+        """Longest change of x in one iteration."""
+        return jnp.asarray([_LONGEST_LOG_STEP if self._kind(name) == "log" else jnp.inf for name in self.names])
+
+    @property
+    def logarithmic(self) -> tuple[bool, ...]:
+        """Which of the parameters are known by their order of magnitude: those that must be positive."""
+        return tuple(self._kind(name) == "log" for name in self.names)
 
     def vector(self, x: Float[Array, " free"]) -> Float[Array, " free"]:
         """The parameters at `x` as a vector in the order of `names`."""
@@ -116,3 +190,61 @@ class FreeParameters:
     def slopes(self, x: Float[Array, " free"]) -> Float[Array, "free free"]:
         """Derivatives of the parameters by x."""
         return jax.jacfwd(self.vector)(x)
+
+
+def _check_names(numbers: Mapping[str, Any], free: Sequence[str]) -> None:
+    if isinstance(free, str) or not free:
+        raise ValueError("free must name at least one number, as in free=('m', 'friction.Fc').")
+    for name in free:
+        if name not in numbers:
+            raise ValueError(f"free names {name!r}, but the numbers are: {', '.join(numbers)}.")
+        if list(free).count(name) > 1:
+            raise ValueError(f"free names {name!r} twice.")
+        if jnp.shape(numbers[name]) != ():
+            raise ValueError(f"{name} is an array of shape {jnp.shape(numbers[name])}; only single numbers fit.")
+
+
+def _check_start(name: str, values: Mapping[str, float], floor: Floor, strict: bool, upper: float | None) -> None:
+    value = values[name]
+    if isinstance(floor, str | float | int):
+        least = values[floor] if isinstance(floor, str) else floor
+        if value < least or (strict and value == least):
+            shown = f"{floor} = {least:g}" if isinstance(floor, str) else f"{floor:g}"
+            raise ValueError(f"The start {name} = {value:g} must lie above its limit {shown}.")
+    if upper is not None:
+        if isinstance(floor, str | tuple):
+            raise ValueError(f"{name} is limited by {floor} and by {upper:g}: free only one of the two.")
+        if value > upper:
+            raise ValueError(f"The start {name} = {value:g} must lie below its limit {upper:g}.")
+
+
+def _append_after(name: str, floors: Mapping[str, Floor], order: list[str]) -> None:
+    """Append a name to the order after all that it is measured from."""
+    if name in order:
+        return
+    floor = floors.get(name)
+    for base in floor if isinstance(floor, tuple) else (floor,):
+        if isinstance(base, str) and base in floors:
+            _append_after(base, floors, order)
+    order.append(name)
+
+
+def _passive_floor(sigma1: Any, Fs: Any, Fc: Any) -> Any:
+    return sigma1 * (Fs - Fc) / Fc
+
+
+def _base(floor: Floor, values: Mapping[str, float]) -> float:
+    if floor is None:
+        return 0.0
+    if isinstance(floor, tuple):
+        return _passive_floor(*(values[name] for name in floor))
+    return values[floor] if isinstance(floor, str) else float(floor)
+
+
+def _unit(kind: str, values: Mapping[str, float], name: str, floor: Floor) -> float:
+    """Size of a step of one in x: the distance from the limit, or where there is none, of the value."""
+    value = values[name]
+    if kind == "line":
+        return max(abs(value), 1e-12) if value else 1.0
+    distance = value - _base(floor, values)
+    return distance if distance > 0 else (abs(value) or 1.0)

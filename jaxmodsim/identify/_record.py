@@ -1,23 +1,31 @@
 """A measured record."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import pairwise
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+# The name of a single channel that was given none.
+SINGLE = "measured"
 
 
 class Record:
-    """Samples of a measurement: one measured output, and the inputs that drove the machine.
+    """Samples of a measurement: what was measured, and the inputs that drove the machine.
 
     **Arguments:**
 
     - `t`: times of the samples [s], increasing, shape `[samples]`, at least two.
-    - `measured`: measured output at these times, shape `[samples]`.
-    - `inputs`: inputs by name, shape `[samples]` each; each sample is held until the next. In a fit an input
-      drives the entry of the scene's `params` of the same name.
+    - `measured`: measured output at these times, shape `[samples]`; or several by name, `{"x": ..., "force": ...}`.
+    - `inputs`: inputs by name, shape `[samples]` each. In a fit an input drives the entry of the scene's `params` of
+      the same name.
     - `name`: for figures and tables.
+    - `linear`: names of the inputs that run in straight lines from sample to sample; the others are held until the
+      next.
+    - `noise`: standard deviation of the noise of each channel by its name, in its unit, > 0; one number where there is
+      one channel. A fit estimates those that are not given. That of slip instants is `"friction slips"`.
+    - `slips`: instants [s] at which friction elements broke away, by the name of the effect in the scene, increasing.
 
     **Raises:**
 
@@ -26,34 +34,126 @@ class Record:
     """
 
     t: Float[np.ndarray, " samples"]
-    measured: Float[np.ndarray, " samples"]
+    channels: dict[str, Float[np.ndarray, " samples"]]
     inputs: dict[str, Float[np.ndarray, " samples"]]
     name: str
+    linear: frozenset[str]
+    noise: dict[str, float]
+    slips: dict[str, Float[np.ndarray, " instants"]]
 
-    def __init__(self, t: Any, measured: Any, inputs: Mapping[str, Any] | None = None, name: str = "record"):
-        arrays = {
-            label: _column(column, label, np.shape(t), name)
-            for label, column in {"t": t, "measured": measured, **(inputs or {})}.items()
-        }
-        stalls = np.flatnonzero(np.diff(arrays["t"]) <= 0)
+    def __init__(
+        self,
+        t: Any,
+        measured: Any,
+        inputs: Mapping[str, Any] | None = None,
+        name: str = "record",
+        *,
+        linear: Iterable[str] = (),
+        noise: float | Mapping[str, float] | None = None,
+        slips: Mapping[str, Any] | None = None,
+    ):
+        outputs = dict(measured) if isinstance(measured, Mapping) else {SINGLE: measured}
+        if not outputs:
+            raise ValueError(f"{name}: measured must hold one channel at least.")
+        shape = np.shape(t)
+        self.t = _column(t, "t", shape, name)
+        self.channels = {label: _column(column, label, shape, name) for label, column in outputs.items()}
+        self.inputs = {label: _column(column, label, shape, name) for label, column in (inputs or {}).items()}
+        self.name, self.linear = name, frozenset(linear)
+        unknown = self.linear - set(self.inputs)
+        if unknown:
+            raise ValueError(f"{name}: linear names {sorted(unknown)}, but the inputs are {list(self.inputs)}.")
+        stalls = np.flatnonzero(np.diff(self.t) <= 0)
         if stalls.size:
             k = int(stalls[0])
             raise ValueError(
-                f"{name}: times must increase, but sample {k + 1} at t = {arrays['t'][k + 1]} s follows sample"
-                f" {k} at t = {arrays['t'][k]} s."
+                f"{name}: times must increase, but sample {k + 1} at t = {self.t[k + 1]} s follows sample {k} at"
+                f" t = {self.t[k]} s."
             )
-        self.t, self.measured = arrays.pop("t"), arrays.pop("measured")
-        self.inputs, self.name = arrays, name
+        self.slips = {effect: _instants(instants, effect, self.t, name) for effect, instants in (slips or {}).items()}
+        self.noise = self._levels(noise)
+
+    def _levels(self, noise: Any) -> dict[str, float]:
+        known = (*self.channels, *(slip_channel(effect) for effect in self.slips))
+        if noise is None:
+            return {}
+        if not isinstance(noise, Mapping):
+            if len(known) > 1:
+                raise ValueError(f"{self.name}: noise must name its channels, {', '.join(known)}; it is {noise!r}.")
+            noise = dict.fromkeys(known, noise)
+        for channel, level in noise.items():
+            if channel not in known:
+                raise ValueError(f"{self.name}: noise names {channel!r}, but the channels are: {', '.join(known)}.")
+            if not (np.isfinite(level) and level > 0):
+                raise ValueError(f"{self.name}: noise of {channel!r} must be finite and > 0, but it is {level!r}.")
+        return {channel: float(level) for channel, level in noise.items()}
 
     @property
-    def arrays(self) -> tuple[Array, dict[str, Array], Array]:
-        """`(t, inputs, measured)` as JAX arrays, for compiled code."""
-        inputs = {name: jnp.asarray(values) for name, values in self.inputs.items()}
-        return jnp.asarray(self.t), inputs, jnp.asarray(self.measured)
+    def measured(self) -> Float[np.ndarray, " samples"]:
+        """The one channel of a record that has one.
+
+        **Raises:**
+
+        - `ValueError` if it has several: take them from `channels`.
+        """
+        if len(self.channels) > 1:
+            raise ValueError(f"{self.name} has the channels {', '.join(self.channels)}: say which.")
+        return next(iter(self.channels.values()))
+
+    def part(self, start: float, end: float, name: str | None = None) -> "Record":
+        """The samples from `start` to `end` [s], both included; times stay as they are.
+
+        **Raises:**
+
+        - `ValueError` if fewer than two samples lie there.
+        """
+        inside = np.flatnonzero((self.t >= start) & (self.t <= end))
+        if inside.size < 2:
+            raise ValueError(f"{self.name} has {inside.size} samples from {start:g} to {end:g} s; two are needed.")
+        return self.samples(int(inside[0]), int(inside[-1]) + 1, name)
+
+    def samples(self, first: int, last: int, name: str | None = None) -> "Record":
+        """Samples `first` up to, and without, `last`."""
+        keep = slice(first, last)
+        t = self.t[keep]
+        slips = {effect: instants[(instants >= t[0]) & (instants <= t[-1])] for effect, instants in self.slips.items()}
+        return Record(
+            t,
+            {label: x[keep] for label, x in self.channels.items()},
+            {label: x[keep] for label, x in self.inputs.items()},
+            name or self.name,
+            linear=self.linear,
+            noise=self.noise,
+            slips=slips,
+        )
+
+    def windows(self, seconds: float) -> tuple["Record", ...]:
+        """Cut into windows of this length [s], the last one shorter; none shorter than a quarter of it.
+
+        **Raises:**
+
+        - `ValueError` if a window would hold fewer than two samples.
+        """
+        count = max(round(float(self.t[-1] - self.t[0]) / seconds), 1) if seconds > 0 else 0
+        if not 0 < 2 * count <= len(self.t):
+            raise ValueError(
+                f"{self.name}: windows of {seconds} s cannot be cut from {len(self.t)} samples over"
+                f" {self.t[-1] - self.t[0]:g} s."
+            )
+        edges = np.linspace(0, len(self.t), count + 1).astype(int)
+        return tuple(self.samples(int(a), int(b), f"{self.name}[{i}]") for i, (a, b) in enumerate(pairwise(edges)))
 
     def __repr__(self) -> str:
-        inputs = ", ".join(self.inputs) or "none"
-        return f"Record({self.name!r}, {len(self.t)} samples, {self.t[0]:g} to {self.t[-1]:g} s, inputs: {inputs})"
+        inputs, channels = ", ".join(self.inputs) or "none", ", ".join(self.channels)
+        return (
+            f"Record({self.name!r}, {len(self.t)} samples, {self.t[0]:g} to {self.t[-1]:g} s, channels: {channels},"
+            f" inputs: {inputs})"
+        )
+
+
+def slip_channel(effect: str) -> str:
+    """Name of the channel of an effect's slip instants."""
+    return f"{effect} slips"
 
 
 def _column(column: Any, label: str, shape: tuple[int, ...], name: str) -> Float[np.ndarray, " samples"]:
@@ -72,5 +172,16 @@ def _column(column: Any, label: str, shape: tuple[int, ...], name: str) -> Float
         raise ValueError(
             f"{name}: column {label!r} has {bad.size} values that are not finite, the first in sample {bad[0]}"
             f" ({array[bad[0]]}). Remove or fill them first."
+        )
+    return array
+
+
+def _instants(instants: Any, effect: str, t: np.ndarray, name: str) -> Float[np.ndarray, " instants"]:
+    array = np.asarray(instants, dtype=float)
+    fine = array.ndim == 1 and bool(np.isfinite(array).all() and (np.diff(array) > 0).all())
+    if not (fine and (array.size == 0 or (array[0] >= t[0] and array[-1] <= t[-1]))):
+        raise ValueError(
+            f"{name}: slips of {effect!r} must be increasing times within [{t[0]:g}, {t[-1]:g}] s, shape [instants],"
+            f" but they are {instants!r}."
         )
     return array

@@ -1,13 +1,14 @@
 """A scene driven by a record: fixed steps from sample to sample."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from ..numerics import RosenbrockTableau, rosenbrock_step
 from ..scene import Scene, State, scene_field
@@ -26,16 +27,38 @@ _RODAS3 = RosenbrockTableau(
 )
 
 
-def replay(
+# `observe(t, y, scene)`, what is seen of a state; the scene is as the inputs drive it.
+Observe: TypeAlias = Callable[[Array, State, Scene], Any]
+Inputs: TypeAlias = dict[str, Float[Array, " samples"]]
+
+
+class Controller(eqx.Module):
+    """A controller that runs once per sample, as a drive does; what it puts out is held until the next sample.
+
+    **Arguments:**
+
+    - `fn`: `fn(t, q, qd, memory, params) -> (outputs, memory)`: the entries of `params` that it sets, by name, and its
+      own state (an integral, a filter) for the next sample. `params` holds the scene's numbers and the inputs of the
+      record, such as the reference, so gains that are entries of it can be fitted.
+    - `memory`: its state at the first sample, a pytree of numbers.
+    """
+
+    fn: Callable[..., Any] = eqx.field(static=True)
+    memory: PyTree[Array] = eqx.field(default=(), converter=lambda tree: jtu.tree_map(jnp.asarray, tree))
+
+
+def run_samples(
     scene: Scene,
     t: Float[Array, " samples"],
-    inputs: dict[str, Float[Array, " samples"]],
-    q0: Float[Array, " dof"],
-    qd0: Float[Array, " dof"],
-    substeps: int,
-    observe: Callable[[Array, Array], Array],
-) -> Float[Array, " samples"]:
-    """Run a scene over the samples of a record, with the inputs held from each sample to the next.
+    inputs: Inputs,
+    y0: State,
+    observe: Observe,
+    *,
+    substeps: int = 1,
+    linear: frozenset[str] = frozenset(),
+    controller: Controller | None = None,
+) -> tuple[PyTree[Array], State]:
+    """Run a scene over the samples of a record.
 
     Linearly implicit steps of fixed length: stable whatever the stiffness of the friction law, and cheap to
     differentiate forwards.
@@ -45,36 +68,82 @@ def replay(
     - `scene`: its `params` must be a dict that has the inputs' names.
     - `t`: times of the samples [s].
     - `inputs`: samples by name of the entry of `params` they drive.
-    - `q0`, `qd0`: state at the first sample.
+    - `y0`: state at the first sample.
+    - `observe`: what is seen of each sample.
     - `substeps`: steps from sample to sample.
-    - `observe`: `observe(q, qd)`, the number that is compared with the record.
+    - `linear`: inputs that run in straight lines from sample to sample; the others are held.
+    - `controller`: what closes a loop around the scene.
 
     **Returns:**
 
-    The observed number at each sample, shape `[samples]`.
+    What was observed at each sample, with a leading axis of samples, and the state at the last one.
     """
 
-    def advance(y: State, sample: tuple[Array, Array, dict[str, Array]]) -> tuple[State, Array]:
-        start, dt, held = sample
-        driven = _drive(scene, held)
+    def advance(carry: tuple[State, Any], sample: Any) -> tuple[tuple[State, Any], Any]:
+        (y, memory), (start, dt, held, slopes) = carry, sample
+        here = _driven(scene, held)
+        outputs: dict[str, Array] = {}
+        if controller is not None:
+            outputs, memory = controller.fn(start, y.q, y.qd, memory, here.params)
+            here = _driven(here, outputs)
+        seen = observe(start, y, here)
 
         def field(t: Array, y: State) -> State:
-            return scene_field(t, y, driven)
+            return scene_field(t, y, _driven(here, {k: held[k] + (t - start) * x for k, x in slopes.items()}))
 
         step = dt / substeps
 
         def substep(k: Any, y: State) -> State:
             return rosenbrock_step(_RODAS3, field, start + k * step, step, y, pivot=True).y1
 
-        y = substep(0, y) if substeps == 1 else jax.lax.fori_loop(0, substeps, substep, y)
-        return y, observe(y.q, y.qd)
+        moved = substep(0, y) if substeps == 1 else jax.lax.fori_loop(0, substeps, substep, y)
+        # Records of different lengths that run side by side repeat their last time.
+        y = jtu.tree_map(lambda new, old: jnp.where(dt > 0, new, old), moved, y)
+        return (y, memory), seen
 
+    dt = jnp.diff(t)
+    slopes = {name: jnp.diff(inputs[name]) / jnp.where(dt > 0, dt, 1.0) for name in sorted(linear)}
+    memory = () if controller is None else controller.memory
+    samples = (t[:-1], dt, jtu.tree_map(lambda x: x[:-1], inputs), slopes)
+    (end, memory), seen = jax.lax.scan(advance, (y0, memory), samples)
+    last = _driven(scene, jtu.tree_map(lambda x: x[-1], inputs))
+    if controller is not None:
+        last = _driven(last, controller.fn(t[-1], end.q, end.qd, memory, last.params)[0])
+    final = observe(t[-1], end, last)
+    return jtu.tree_map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), seen, final), end
+
+
+def replay(
+    scene: Scene,
+    t: Float[Array, " samples"],
+    inputs: Inputs,
+    q0: Float[Array, " dof"],
+    qd0: Float[Array, " dof"],
+    substeps: int,
+    observe: Callable[[Array, Array], Array],
+) -> Float[Array, " samples"]:
+    """Run a scene over the samples of a record, with the inputs held from each sample to the next.
+
+    **Arguments:**
+
+    - `scene`, `t`, `inputs`, `substeps`: see `run_samples`.
+    - `q0`, `qd0`: state at the first sample.
+    - `observe`: `observe(q, qd)`, the number that is compared with the record.
+
+    **Returns:**
+
+    The observed number at each sample, shape `[samples]`.
+    """
     y0 = State(q0, qd0, scene.state0(q0))
-    samples = (t[:-1], jnp.diff(t), jtu.tree_map(lambda x: x[:-1], inputs))
-    _, observed = jax.lax.scan(advance, y0, samples)
-    return jnp.concatenate([jnp.reshape(observe(q0, qd0), (1,)), observed])
+
+    def look(t: Array, y: State, scene: Scene) -> Array:
+        del t, scene
+        return observe(y.q, y.qd)
+
+    return run_samples(scene, t, inputs, y0, look, substeps=substeps)[0]
 
 
-def _drive(scene: Scene, held: dict[str, Array]) -> Scene:
-    params: dict[str, Any] = {**scene.params, **held}
-    return Scene(scene.lagrangian, params=params, effects=scene.effects) if held else scene
+def _driven(scene: Scene, held: dict[str, Array]) -> Scene:
+    if not held:
+        return scene
+    return eqx.tree_at(lambda x: x.params, scene, {**scene.params, **held})

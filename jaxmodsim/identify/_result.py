@@ -1,0 +1,263 @@
+"""What a fit found, with how sure it is."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from ._covariance import BLOCKS
+from ._record import Record
+from ._remarks import remarks_of
+from ._runs import Windows
+from ._solve import Found, by_channel, spread_of
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """A fitted model.
+
+    - `values`, `errors`, `start`: parameters, their standard errors and start values by name. The errors take the
+      correlation of the residual in time into account; they hold for the model being right but for noise.
+    - `units`: unit of each parameter that declares one.
+    - `covariance`, `white`: of the parameters, shape `[free, free]`, in the order of `values`; the second as it would
+      be if the residual were white noise.
+    - `information`: Fisher information of the parameters, shape `[free, free]`, the noise at its level.
+    - `logarithmic`: names of the parameters that must be positive; their intervals are symmetric in the logarithm.
+    - `bounds`: lower and upper limit of each parameter at the estimate.
+    - `model`: the scene or law with the fitted numbers; None in a result that was loaded without one.
+    - `records`: what was fitted. `outputs`: the model's output at their times, by channel, one dict a record.
+    - `noise`: standard deviation of each channel, as given or as estimated.
+    - `rmse_by`: root mean square of output less measured value of each channel.
+    - `evaluations`, `ending`: how often the model and its derivatives were computed, and how the search ended.
+    - `step_error`: root mean square by which the output moves with four times as many integration steps; None where
+      there are none.
+    - `starts`: root mean square, in noise levels, that each of several starts ended with, best first.
+    - `single_precision`: whether it was computed in float32.
+    - `found`: the search, for further questions; None in a result that was loaded.
+    """
+
+    values: dict[str, float]
+    errors: dict[str, float]
+    start: dict[str, float]
+    units: dict[str, str]
+    covariance: Float[np.ndarray, "free free"]
+    white: Float[np.ndarray, "free free"]
+    information: Float[np.ndarray, "free free"]
+    logarithmic: tuple[str, ...]
+    bounds: dict[str, tuple[float, float]]
+    model: eqx.Module | None
+    records: tuple[Record, ...]
+    outputs: tuple[dict[str, Float[np.ndarray, " samples"]], ...]
+    noise: dict[str, float]
+    rmse_by: dict[str, float]
+    evaluations: int
+    ending: str
+    step_error: float | None
+    starts: tuple[float, ...]
+    single_precision: bool
+    found: Found | None
+
+    @property
+    def record(self) -> Record:
+        """The record, where there is one.
+
+        **Raises:**
+
+        - `ValueError` if there are several.
+        """
+        if len(self.records) > 1:
+            raise ValueError(f"{len(self.records)} records were fitted: take them from `records`.")
+        return next(iter(self.records))
+
+    @property
+    def simulated(self) -> Float[np.ndarray, " samples"]:
+        """The model's output along the one channel of the one record.
+
+        **Raises:**
+
+        - `ValueError` if there are several.
+        """
+        residual = next(iter(self.residuals[0].values()))
+        return self.record.measured + residual  # both refuse several
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square of `simulated - measured` of the one channel.
+
+        **Raises:**
+
+        - `ValueError` if there are several.
+        """
+        if len(self.rmse_by) > 1:
+            raise ValueError(f"There are the channels {', '.join(self.rmse_by)}: take theirs from `rmse_by`.")
+        return next(iter(self.rmse_by.values()))
+
+    @property
+    def residuals(self) -> tuple[dict[str, Float[np.ndarray, " samples"]], ...]:
+        """Output less measured value by channel, one dict a record."""
+        return tuple(
+            {name: x - record.channels[name] for name, x in seen.items()}
+            for record, seen in zip(self.records, self.outputs, strict=True)
+        )
+
+    @property
+    def correlation(self) -> Float[np.ndarray, "free free"]:
+        """Correlation of the parameters, in the order of `values`."""
+        errors = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        safe = np.where((errors > 0) & np.isfinite(errors), errors, 1.0)
+        known = np.isfinite(self.covariance) & np.isfinite(np.add.outer(errors, errors))
+        correlation = np.where(known, np.where(known, self.covariance, 0.0) / np.outer(safe, safe), 0.0)
+        np.fill_diagonal(correlation, 1.0)
+        return correlation
+
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Confidence intervals by Student's t with a degree of freedom less than there are blocks of samples.
+
+        Symmetric in the logarithm for parameters that must be positive, cut at the limits for the others.
+
+        **Raises:**
+
+        - `ValueError` unless 0 < level < 1.
+        """
+        if not 0 < level < 1:
+            raise ValueError(f"level must lie between 0 and 1, but it is {level}.")
+        factor = float(stats.t.ppf(0.5 + level / 2, BLOCKS - 1))
+        found = {}
+        for name, value in self.values.items():
+            low, high = self.bounds[name]
+            margin = factor * self.errors[name]
+            if name in self.logarithmic and value > low:
+                with np.errstate(over="ignore"):
+                    ratio = np.exp(margin / (value - low))
+                found[name] = (low + (value - low) / ratio, min(low + (value - low) * ratio, high))
+            else:
+                found[name] = (max(value - margin, low), min(value + margin, high))
+        return {name: (float(a), float(b)) for name, (a, b) in found.items()}
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What the record can not tell, in words."""
+        return remarks_of(self)
+
+    def rows(self) -> list[tuple[str, float, float, float, str]]:
+        """Rows of a table: name, value, standard error, start, unit."""
+        return [
+            (name, value, self.errors[name], self.start[name], self.units[name]) for name, value in self.values.items()
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """All but the samples and the model, of types that JSON knows."""
+        intervals = self.intervals()
+        return {
+            "records": [record.name for record in self.records],
+            "samples": [len(record.t) for record in self.records],
+            "rmse": self.rmse_by,
+            "noise": self.noise,
+            "parameters": {
+                name: {
+                    "value": value,
+                    "standard_error": error,
+                    "interval": list(intervals[name]),
+                    "start": start,
+                    "unit": unit,
+                }
+                for name, value, error, start, unit in self.rows()
+            },
+            "correlation": {"names": list(self.values), "matrix": self.correlation.tolist()},
+            "evaluations": self.evaluations,
+            "ending": self.ending,
+            "step_error": self.step_error,
+            "remarks": list(self.remarks),
+        }
+
+    def __str__(self) -> str:
+        """A table of the parameters, and what the record cannot tell."""
+        width = max(len(name) for name in self.values)
+        lines = [f"{'':{width}}  {'value':>13}  {'std. error':>11}  {'95 % interval':>25}  unit"]
+        for name, value, error, _, unit in self.rows():
+            low, high = self.intervals()[name]
+            lines.append(f"{name:{width}}  {value:13.6g}  {error:11.2g}  {low:12.5g} {high:12.5g}  {unit}")
+        errors = ", ".join(f"{'' if len(self.rmse_by) == 1 else name + ' '}{x:.6g}" for name, x in self.rmse_by.items())
+        return "\n".join([*lines, f"RMSE {errors}; {self.evaluations} evaluations, {self.ending}", *self.remarks])
+
+
+def result_of(
+    found: Found,
+    records: tuple[Record, ...],
+    windows: Windows,
+    units: dict[str, str],
+    model: eqx.Module,
+    step_error: float | None = None,
+    starts: tuple[float, ...] = (),
+) -> FitResult:
+    """What a search found, in the words of those who asked."""
+    problem, search = found.problem, found.search
+    names, at_start, values = list(problem.free.names), [], []
+    shared, own = problem.split(search.x)
+    values += [float(x) for x in problem.free.vector(shared)]
+    at_start += [float(problem.free.start[name]) for name in names]
+    whole = len(set(windows.record)) == len(windows.record)
+    if whole and problem.local:
+        base = _first_states(found)
+        for i, record in enumerate(records):
+            prefix = "" if len(records) == 1 else f"{record.name}/"
+            names += [prefix + name for name in problem.local]
+            at_start += base[i].tolist()
+            values += (base[i] + np.asarray(own[i])).tolist()
+    how_sure = spread_of(problem, search, len(names))
+    errors = np.sqrt(np.maximum(np.diag(np.asarray(how_sure.covariance)), 0.0))
+    seen, rmse = _stitched(found, records, windows)
+    return FitResult(
+        dict(zip(names, values, strict=True)),
+        dict(zip(names, errors.tolist(), strict=True)),
+        dict(zip(names, at_start, strict=True)),
+        {name: units.get(name, "") for name in names},
+        np.asarray(how_sure.covariance),
+        np.asarray(how_sure.white),
+        np.asarray(how_sure.information),
+        tuple(name for name, log in zip(problem.free.names, problem.free.logarithmic, strict=True) if log),
+        problem.free.limits(shared) | {name: (-np.inf, np.inf) for name in names[len(problem.free.names) :]},
+        model,
+        records,
+        seen,
+        {name: float(x) for name, x in problem.noise.items()},
+        rmse,
+        found.iterations,
+        found.ending,
+        step_error,
+        starts,
+        jnp.result_type(float) == jnp.float32,
+        found,
+    )
+
+
+def _first_states(found: Found) -> np.ndarray:
+    """Free numbers of the initial states before the fit, shape `[runs, local]`."""
+    from_base = found.problem.base
+    assert from_base is not None
+    return np.asarray(jax.vmap(found.problem.taken)(from_base))
+
+
+def _stitched(
+    found: Found, records: tuple[Record, ...], windows: Windows
+) -> tuple[tuple[dict[str, np.ndarray], ...], dict[str, float]]:
+    """The model's output along each record, and the root mean squares of the differences."""
+    problem = found.problem
+    split = by_channel(problem, found.search.residual)
+    seen: list[dict[str, np.ndarray]] = [
+        {name: np.array(x) for name, x in record.channels.items()} for record in records
+    ]
+    rmse = {}
+    for name, (residual, weight) in split.items():
+        level = float(problem.noise[name])
+        rmse[name] = level * float(np.sqrt(np.sum(residual[weight > 0] ** 2) / max(np.sum(weight > 0), 1)))
+        for run, (i, first, last) in enumerate(zip(windows.record, windows.first, windows.last, strict=True)):
+            if name in seen[i]:
+                counted = np.flatnonzero(weight[run, : last - first + 1] > 0)
+                seen[i][name][first + counted] += level * residual[run, counted]
+    return tuple(seen), rmse
