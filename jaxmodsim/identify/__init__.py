@@ -4,6 +4,8 @@ from ._axis import AXIS_MODELS as AXIS_MODELS
 from ._axis import AxisModel as AxisModel
 from ._axis import axis_scene as axis_scene
 from ._axis import rough_axis as rough_axis
+from ._begin import Continuation as Continuation
+from ._begin import MultiStart as MultiStart
 from ._fit import fit as fit
 from ._fit_law import fit_law as fit_law
 from ._fit_law import law_force as law_force
@@ -16,4 +18,5 @@ from ._record import Record as Record
 from ._replay import Controller as Controller
 from ._replay import replay as replay
 from ._result import FitResult as FitResult
+from ._staged import Staged as Staged
 from ._starts import start_state as start_state

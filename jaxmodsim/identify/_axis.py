@@ -11,6 +11,7 @@ from ..effects import AbstractEffect, AppliedForce, Friction
 from ..friction import Coulomb, LuGre, Regularized, Stribeck, Viscous, asymmetric
 from ..scene import Scene, replace_numbers
 from ._record import Record
+from ._smooth import differentiate, smooth, smooth_span
 
 
 def _axis_lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
@@ -39,18 +40,9 @@ def rough_axis(record: Record) -> RoughAxis:
 
     Differentiated positions are noisy, so they are smoothed first; the simulation then does the real work.
     """
-    span = max(len(record.t) // 1000, 3)
-    kernel = np.hanning(2 * span + 3)[1:-1]
-    kernel /= kernel.sum()
-    edge = 3 * span
-
-    def smooth(x: np.ndarray) -> np.ndarray:
-        return np.convolve(np.pad(x, span, mode="edge"), kernel, mode="valid")
-
-    velocity = smooth(np.gradient(smooth(record.measured), record.t))
-    acceleration = np.gradient(velocity, record.t)
-    inside = slice(edge, -edge) if len(record.t) > 4 * edge else slice(None)
-    v, a, u = (x[inside] for x in (velocity, acceleration, smooth(record.inputs["u"])))
+    motion, span = differentiate(record.t, record.measured), smooth_span(len(record.t))
+    inside = slice(motion.edge, -motion.edge) if len(record.t) > 4 * motion.edge else slice(None)
+    v, a, u = (x[inside] for x in (motion.v, motion.a, smooth(record.inputs["u"], span)))
     top = float(np.max(np.abs(v)))
     if top == 0.0:
         raise ValueError(f"{record.name}: the position never changes, so nothing can be fitted.")

@@ -110,14 +110,14 @@ def fit_law(
 
 
 class LawEngine(eqx.Module):
-    """A law under the measured motion; the scene holds nothing but the law."""
+    """A law under the measured motion; the scene holds nothing else."""
 
-    holder: Scene
+    scene: Scene
 
     def __call__(self, values: dict[str, Array], start: None, run: Runs) -> Seen:
         """The force of the law with these values."""
         del start
-        force = law_force(_law(self.holder, values), run.t, run.inputs["x"], run.inputs.get("normal"), run.inputs)
+        force = law_force(_law(self.scene, values), run.t, run.inputs["x"], run.inputs.get("normal"), run.inputs)
         return Seen(dict.fromkeys(run.measured, force), {}, None)
 
 

@@ -178,9 +178,9 @@ class FreeParameters(eqx.Module):
         return jnp.asarray([_LONGEST_LOG_STEP if self._kind(name) == "log" else jnp.inf for name in self.names])
 
     @property
-    def logarithmic(self) -> tuple[bool, ...]:
-        """Which of the parameters are known by their order of magnitude: those that must be positive."""
-        return tuple(self._kind(name) == "log" for name in self.names)
+    def kinds(self) -> tuple[str, ...]:
+        """Kind of each coordinate: "line", "above" (a distance from a limit) or "log" (of such a distance)."""
+        return tuple(self._kind(name) for name in self.names)
 
     def vector(self, x: Float[Array, " free"]) -> Float[Array, " free"]:
         """The parameters at `x` as a vector in the order of `names`."""

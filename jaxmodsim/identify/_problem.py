@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ..scene import State
+from ..scene import State, replace_numbers, scene_numbers
 from ._bounded import Box
 from ._losses import AbstractLoss
 from ._parameters import FreeParameters
@@ -155,6 +155,14 @@ class Problem(eqx.Module):
 
     def _pad(self, slope: Float[Array, "rows free"]) -> Float[Array, "rows n"]:
         return jnp.pad(slope, ((0, 0), (0, self.count * len(self.local))))
+
+    def with_number(self, name: str, factor: float) -> "Problem":
+        """The problem with a number of the scene, which is not free, this many times larger."""
+        numbers = scene_numbers(self.engine.scene)
+        if name not in numbers:
+            raise ValueError(f"The scene has no number {name!r}; it has: {', '.join(numbers)}.")
+        scene = replace_numbers(self.engine.scene, {name: factor * numbers[name]})
+        return eqx.tree_at(lambda p: p.engine.scene, self, scene)
 
     @property
     def columns(self) -> dict[str, Float[Array, "runs samples"]]:

@@ -220,7 +220,7 @@ def result_of(
         np.asarray(how_sure.covariance),
         np.asarray(how_sure.white),
         np.asarray(how_sure.information),
-        tuple(name for name, log in zip(problem.free.names, problem.free.logarithmic, strict=True) if log),
+        tuple(name for name, kind in zip(problem.free.names, problem.free.kinds, strict=True) if kind == "log"),
         problem.free.limits(shared) | {name: (-np.inf, np.inf) for name in names[len(problem.free.names) :]},
         model,
         records,

@@ -1,0 +1,265 @@
+"""Start values that need no guess: from dimensions, from the balance of forces in slip, from reversals."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..effects import Friction
+from ..friction import AbstractDynamicLaw, AbstractForceLaw, AbstractSetValuedLaw
+from ..scene import Scene, State, scene_field, scene_ranges
+from ._begin import AbstractBeginning
+from ._bounded import search_start, search_step
+from ._engines import with_values
+from ._losses import Squares
+from ._problem import Problem
+from ._smooth import differentiate, smooth, smooth_span
+from ._solve import Options
+
+# Slip faster than this share of the top speed counts as steady: the states of friction laws have settled.
+_STEADY = 0.02
+_STEPS = 60
+
+# Damping of the bristle to begin with, as a share of what is critical for the mass in stick.
+_DAMPING = 0.3
+
+
+class _Sampled(NamedTuple):
+    """What is known at each sample: time, motion, inputs, and the measured friction force where there is one."""
+
+    t: Float[Array, " samples"]
+    q: Float[Array, " samples"]
+    v: Float[Array, " samples"]
+    a: Float[Array, " samples"]
+    inputs: dict[str, Array]
+    force: Float[Array, " samples"] | None
+
+
+class Staged(AbstractBeginning):
+    """Start values from the record itself, whatever the scene's numbers are, in stages.
+
+    1. Parameters of friction laws get the size that their unit asks for, from the greatest force, speed and travel.
+    2. The balance of forces along the smoothed motion, with the force that friction settles to at constant speed,
+       gives all numbers that show there (mass, offset, Fc, Fs, vs, sigma2) without a simulation.
+    3. The slope of the force over the displacement after reversals gives stiffness (sigma0); the damping of
+       a bristle begins with a share of the critical one.
+
+    The fit that follows determines everything together. For one coordinate whose position is measured, and for laws
+    under a measured motion.
+
+    **Raises:**
+
+    - `ValueError` (at the fit) where there are several coordinates, or no position was measured.
+    """
+
+    def begin(
+        self, problem: Problem, x: Float[Array, " n"], options: Options
+    ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
+        """Coordinates of the values found."""
+        sampled = _sampled(problem)
+        units = _units(problem)
+        values = {name: float(value) for name, value in problem.free.values(x[: len(units)]).items()}
+        sizes = _sizes(problem, sampled, values)
+        values |= {name: sizes[unit] for name, unit in units.items() if unit in sizes}
+        start = problem.free.coordinates(values)
+        balance, known = _fit_balance(problem, sampled, start, options)
+        values |= {name: x for name, x in balance.items() if known[name]}
+        blind = [name for name in units if not known[name]]
+        stiffness = _reversal_slope(problem, sampled, values) or sizes["N/m"]
+        mass = _mass(problem, values)
+        for name in blind:
+            if units[name] == "N/m":
+                values[name] = stiffness
+            elif units[name] == "N s/m" and mass is not None:
+                values[name] = _DAMPING * 2 * float(np.sqrt(mass * stiffness))
+        size = len(problem.free.names)
+        return jnp.concatenate([problem.free.coordinates(values), x[size:]]), ()
+
+
+def _units(problem: Problem) -> dict[str, str]:
+    """Unit of each free parameter, "" for those without."""
+    ranges = {name.removeprefix("law."): allowed for name, allowed in scene_ranges(problem.engine.scene).items()}
+    return {name: ranges[name].unit if name in ranges else "" for name in problem.free.names}
+
+
+def _sampled(problem: Problem) -> _Sampled:
+    """All runs, one after the other, without what the smoothing spoils at their ends."""
+    parts: list[_Sampled] = []
+    law_alone = problem.base is None
+    if not law_alone and problem.base.q.shape[1] != 1:
+        raise ValueError("Staged() needs a scene with one coordinate; give start values, or MultiStart(...).")
+    for run in range(problem.count):
+        samples = jax.tree.map(lambda x, run=run: np.asarray(x[run]), problem.runs)
+        weight = next(iter(samples.weight.values()))
+        count = int(np.flatnonzero(weight)[-1]) + 1
+        t = samples.t[:count]
+        inputs = {name: column[:count] for name, column in samples.inputs.items()}
+        x = inputs["x"] if law_alone else samples.measured[_position(problem)][:count]
+        motion = differentiate(t, x)
+        span = smooth_span(count)
+        force = None
+        if law_alone:
+            force = smooth(next(iter(samples.measured.values()))[:count], span)
+            if "normal" in inputs:
+                force = force / np.maximum(inputs["normal"], 1e-12)
+        inside = slice(motion.edge, -motion.edge) if count > 4 * motion.edge else slice(None)
+        smoothed = {name: smooth(column, span)[inside] for name, column in inputs.items()}
+        parts.append(
+            _Sampled(
+                t[inside],
+                motion.x[inside],
+                motion.v[inside],
+                motion.a[inside],
+                smoothed,
+                None if force is None else force[inside],
+            )
+        )
+    return jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *parts)
+
+
+def _position(problem: Problem) -> str:
+    from_state = [name for name, look in problem.engine.observables if _is_position(look)]
+    if not from_state:
+        raise ValueError(
+            "Staged() needs a channel that is the position, observe='q[0]'; give start values, or MultiStart(...)."
+        )
+    return from_state[0]
+
+
+def _is_position(look: Any) -> bool:
+    if isinstance(look, str):
+        return look == "q[0]"
+    probe = jnp.asarray([0.37]), jnp.asarray([-1.9])
+    return bool(look(*probe) == probe[0][0])
+
+
+def _sizes(problem: Problem, sampled: _Sampled, values: dict[str, float]) -> dict[str, float]:
+    """Sizes that go with a unit."""
+    speed = float(jnp.max(jnp.abs(sampled.v))) or 1.0
+    travel = float(jnp.max(sampled.q) - jnp.min(sampled.q)) or 1.0
+    if sampled.force is not None:
+        force = float(jnp.sqrt(jnp.mean(sampled.force**2)))
+    else:
+        frictionless = _required(problem, values)
+        force = float(jnp.sqrt(jnp.mean(jax.vmap(frictionless)(sampled) ** 2)))
+    force = force or 1.0
+    return {"N": force, "m/s": 0.05 * speed, "N s/m": 0.1 * force / speed, "N/m": 1e2 * force / travel}
+
+
+def _driven(scene: Scene, inputs: dict[str, Array]) -> Scene:
+    return eqx.tree_at(lambda x: x.params, scene, {**scene.params, **inputs}) if inputs else scene
+
+
+def _required(problem: Problem, values: Any) -> Callable[[_Sampled], Array]:
+    """Generalised force that friction must have at a sample, by the equations of motion without friction."""
+    scene = with_values(problem.engine.scene, values)
+    others = tuple(effect for effect in scene.effects if not isinstance(effect, Friction))
+
+    def required(s: _Sampled) -> Array:
+        here = _driven(scene, s.inputs)
+        bare = Scene(here.lagrangian, params=here.params, effects=others)
+        q, qd = s.q[None], s.v[None]
+        free = scene_field(s.t, State(q, qd, bare.state0(q)), bare).qd[0]
+        mass = jax.hessian(lambda qd: here.lagrangian(s.t, q, qd, here.params))(qd)[0, 0]
+        return mass * (free - s.a)
+
+    return required
+
+
+def _settled(law: Any, v: Array) -> Array:
+    """Force of a law at constant velocity, long after it began."""
+    if isinstance(law, AbstractDynamicLaw):
+        # Long against what a bristle needs to yield at any speed that counts as slip.
+        z = law.advance(v, law.state0(v), jnp.asarray(1e6, v.dtype))
+        return law.force(v, z)
+    if isinstance(law, AbstractSetValuedLaw):
+        return jnp.sign(v) * law.dry(v) + law.wet(v)
+    if isinstance(law, AbstractForceLaw):
+        return law.force(v)
+    raise ValueError(f"Staged() does not know the force that {type(law).__name__} settles to; give start values.")
+
+
+def _friction(problem: Problem, values: Any) -> Callable[[_Sampled], Array]:
+    """Generalised friction force at a sample, settled."""
+    scene = with_values(problem.engine.scene, values)
+    elements = [effect for effect in scene.effects if isinstance(effect, Friction)]
+
+    def friction(s: _Sampled) -> Array:
+        here = _driven(scene, s.inputs)
+        q, qd, total = s.q[None], s.v[None], jnp.zeros_like(s.v)
+        for effect in elements:
+            settled = effect.at(s.t, q, qd, here.params)
+            force = _settled(settled.law, settled.slip(s.t, q, qd, here.params))
+            load = settled.load(s.t, q, qd, here.params)
+            total = total - settled.push(q, force if load is None else load * force, here.params)[0]
+        return total
+
+    return friction
+
+
+def _fit_balance(
+    problem: Problem, sampled: _Sampled, x: Float[Array, " free"], options: Options
+) -> tuple[dict[str, float], dict[str, bool]]:
+    """Parameters by the balance of forces in steady slip, and which of them show in it."""
+    top = jnp.max(jnp.abs(sampled.v))
+    steady = (jnp.abs(sampled.v) > _STEADY * top).astype(sampled.v.dtype)
+    law_alone = sampled.force is not None
+
+    def residual(x: Array) -> Array:
+        values = problem.free.values(x)
+        if law_alone:
+            named = {"law." + name: value for name, value in values.items()}
+            return steady * (jax.vmap(_friction(problem, named))(sampled) - sampled.force)
+        return steady * jax.vmap(lambda s: _friction(problem, values)(s) - _required(problem, values)(s))(sampled)
+
+    def evaluate(x: Array) -> tuple[Array, Array]:
+        return residual(x), jax.jacfwd(residual)(x)
+
+    lower, upper = problem.free.bounds
+    box = problem.box._replace(lower=lower, upper=upper, longest=problem.free.longest)
+    step = jax.jit(lambda s: search_step(evaluate, Squares(), box, s, jnp.asarray(options.rtol, x.dtype)))
+    search = search_start(x, sampled.v.shape[0])
+    for _ in range(_STEPS):
+        search = step(search)
+        if int(search.done):
+            break
+    size = jnp.sqrt(jnp.sum(search.jacobian**2, axis=0))
+    shows = np.asarray(size > 1e-6 * jnp.max(size))
+    values = problem.free.values(search.x)
+    return (
+        {name: float(values[name]) for name in problem.free.names},
+        dict(zip(problem.free.names, (bool(x) for x in shows), strict=True)),
+    )
+
+
+def _reversal_slope(problem: Problem, sampled: _Sampled, values: dict[str, float]) -> float | None:
+    """Median slope [N/m] of the friction force over the displacement after reversals, until it has changed its sign."""
+    x = np.asarray(sampled.q)
+    if sampled.force is not None:
+        force = np.asarray(sampled.force)
+    else:
+        force = np.asarray(jax.jit(jax.vmap(_required(problem, values)))(sampled))
+    v = np.asarray(sampled.v)
+    level = np.median(np.abs(force))
+    turns = np.flatnonzero(np.sign(v[1:]) * np.sign(v[:-1]) < 0) + 1
+    slopes = []
+    for start, end in zip(turns, [*turns[1:], len(x)], strict=True):
+        moved, risen = np.abs(x[start:end] - x[start]), np.abs(force[start:end] - force[start])
+        over = np.flatnonzero(risen > level)
+        if over.size and over[0] > 0 and moved[over[0]] > 0:
+            slopes.append(risen[over[0]] / moved[over[0]])
+    return float(np.median(slopes)) if slopes else None
+
+
+def _mass(problem: Problem, values: dict[str, float]) -> float | None:
+    """Mass at the first state; None for a law alone."""
+    if problem.base is None:
+        return None
+    scene = with_values(problem.engine.scene, {name: jnp.asarray(x) for name, x in values.items()})
+    t, q = problem.runs.t[0, 0], problem.base.q[0]
+    params = {**scene.params, **{name: column[0, 0] for name, column in problem.runs.inputs.items()}}
+    return float(jax.hessian(lambda qd: scene.lagrangian(t, q, qd, params))(jnp.zeros_like(q))[0, 0])
