@@ -6,6 +6,8 @@ from ._axis import axis_scene as axis_scene
 from ._axis import rough_axis as rough_axis
 from ._begin import Continuation as Continuation
 from ._begin import MultiStart as MultiStart
+from ._coverage import Coverage as Coverage
+from ._coverage import coverage as coverage
 from ._fit import fit as fit
 from ._fit_law import fit_law as fit_law
 from ._fit_law import law_force as law_force

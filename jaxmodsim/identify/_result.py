@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
 
-from ._covariance import BLOCKS
+from ._interval import interval
 from ._record import Record
 from ._remarks import remarks_of
 from ._runs import Windows
@@ -116,28 +115,16 @@ class FitResult:
         return correlation
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Confidence intervals by Student's t with a degree of freedom less than there are blocks of samples.
-
-        Symmetric in the logarithm for parameters that must be positive, cut at the limits for the others.
+        """Confidence intervals, symmetric in the logarithm for parameters that must be positive.
 
         **Raises:**
 
         - `ValueError` unless 0 < level < 1.
         """
-        if not 0 < level < 1:
-            raise ValueError(f"level must lie between 0 and 1, but it is {level}.")
-        factor = float(stats.t.ppf(0.5 + level / 2, BLOCKS - 1))
-        found = {}
-        for name, value in self.values.items():
-            low, high = self.bounds[name]
-            margin = factor * self.errors[name]
-            if name in self.logarithmic and value > low:
-                with np.errstate(over="ignore"):
-                    ratio = np.exp(margin / (value - low))
-                found[name] = (low + (value - low) / ratio, min(low + (value - low) * ratio, high))
-            else:
-                found[name] = (max(value - margin, low), min(value + margin, high))
-        return {name: (float(a), float(b)) for name, (a, b) in found.items()}
+        return {
+            name: interval(value, self.errors[name], self.bounds[name], name in self.logarithmic, level)
+            for name, value in self.values.items()
+        }
 
     @property
     def remarks(self) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from ..effects import Friction
 from ..friction import AbstractDynamicLaw, AbstractForceLaw, AbstractSetValuedLaw
 from ..scene import Scene, State, scene_field, scene_ranges
 from ._begin import AbstractBeginning
-from ._bounded import search_start, search_step
+from ._bounded import Box, Search, search_start, search_step
 from ._engines import with_values
 from ._losses import Squares
 from ._problem import Problem
@@ -23,6 +23,9 @@ from ._solve import Options
 # Slip faster than this share of the top speed counts as steady: the states of friction laws have settled.
 _STEADY = 0.02
 _STEPS = 60
+
+# A value this many times larger or smaller than its unit asks for is none that a record could show.
+_FAR = 1e3
 
 # Damping of the bristle to begin with, as a share of what is critical for the mass in stick.
 _DAMPING = 0.3
@@ -67,7 +70,7 @@ class Staged(AbstractBeginning):
         values |= {name: sizes[unit] for name, unit in units.items() if unit in sizes}
         start = problem.free.coordinates(values)
         balance, known = _fit_balance(problem, sampled, start, options)
-        values |= {name: x for name, x in balance.items() if known[name]}
+        values |= {name: _within(x, sizes.get(units[name])) for name, x in balance.items() if known[name]}
         blind = [name for name in units if not known[name]]
         stiffness = _reversal_slope(problem, sampled, values) or sizes["N/m"]
         mass = _mass(problem, values)
@@ -78,6 +81,11 @@ class Staged(AbstractBeginning):
                 values[name] = _DAMPING * 2 * float(np.sqrt(mass * stiffness))
         size = len(problem.free.names)
         return jnp.concatenate([problem.free.coordinates(values), x[size:]]), ()
+
+
+def _within(x: float, size: float | None) -> float:
+    """A value, unless the balance of forces took it beyond all proportion."""
+    return x if size is None or x == 0 or size / _FAR < abs(x) < _FAR * size else float(np.copysign(size, x))
 
 
 def _units(problem: Problem) -> dict[str, str]:
@@ -205,26 +213,9 @@ def _fit_balance(
     problem: Problem, sampled: _Sampled, x: Float[Array, " free"], options: Options
 ) -> tuple[dict[str, float], dict[str, bool]]:
     """Parameters by the balance of forces in steady slip, and which of them show in it."""
-    top = jnp.max(jnp.abs(sampled.v))
-    steady = (jnp.abs(sampled.v) > _STEADY * top).astype(sampled.v.dtype)
-    law_alone = sampled.force is not None
-
-    def residual(x: Array) -> Array:
-        values = problem.free.values(x)
-        if law_alone:
-            named = {"law." + name: value for name, value in values.items()}
-            return steady * (jax.vmap(_friction(problem, named))(sampled) - sampled.force)
-        return steady * jax.vmap(lambda s: _friction(problem, values)(s) - _required(problem, values)(s))(sampled)
-
-    def evaluate(x: Array) -> tuple[Array, Array]:
-        return residual(x), jax.jacfwd(residual)(x)
-
-    lower, upper = problem.free.bounds
-    box = problem.box._replace(lower=lower, upper=upper, longest=problem.free.longest)
-    step = jax.jit(lambda s: search_step(evaluate, Squares(), box, s, jnp.asarray(options.rtol, x.dtype)))
     search = search_start(x, sampled.v.shape[0])
     for _ in range(_STEPS):
-        search = step(search)
+        search = _balance_step(problem, sampled, search, jnp.asarray(options.rtol, x.dtype))
         if int(search.done):
             break
     size = jnp.sqrt(jnp.sum(search.jacobian**2, axis=0))
@@ -234,6 +225,23 @@ def _fit_balance(
         {name: float(values[name]) for name in problem.free.names},
         dict(zip(problem.free.names, (bool(x) for x in shows), strict=True)),
     )
+
+
+@eqx.filter_jit
+def _balance_step(problem: Problem, sampled: _Sampled, search: Search, rtol: Array) -> Search:
+    top = jnp.max(jnp.abs(sampled.v))
+    steady = (jnp.abs(sampled.v) > _STEADY * top).astype(sampled.v.dtype)
+
+    def residual(x: Array) -> Array:
+        values = problem.free.values(x)
+        if sampled.force is not None:
+            named = {"law." + name: value for name, value in values.items()}
+            return steady * (jax.vmap(_friction(problem, named))(sampled) - sampled.force)
+        return steady * jax.vmap(lambda s: _friction(problem, values)(s) - _required(problem, values)(s))(sampled)
+
+    lower, upper = problem.free.bounds
+    box = Box(lower, upper, problem.free.longest)
+    return search_step(lambda x: (residual(x), jax.jacfwd(residual)(x)), Squares(), box, search, rtol)
 
 
 def _reversal_slope(problem: Problem, sampled: _Sampled, values: dict[str, float]) -> float | None:
