@@ -41,6 +41,7 @@ from .mechanics import Spherical as Spherical
 from .mechanics import VelocityConstraint as VelocityConstraint
 from .mechanics import point_mass as point_mass
 from .mechanics import rigid_body as rigid_body
+from .numerics import Signal as Signal
 from .scene import Scene as Scene
 from .simulation import SimulationError as SimulationError
 from .simulation import Trajectory as Trajectory

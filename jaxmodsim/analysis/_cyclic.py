@@ -49,4 +49,8 @@ def cyclic_coordinates(scene: Scene, dof: int) -> tuple[int, ...]:
 
 @jax.jit
 def _slopes(scene: Scene, t: Array, q: Array, qd: Array) -> Array:
-    return jax.vmap(lambda t, q, qd: jax.grad(scene.lagrangian, argnums=1)(t, q, qd, scene.params))(t, q, qd)
+    def slopes(t: Array, q: Array, qd: Array) -> Array:
+        now = scene.now(t)
+        return jax.grad(now.lagrangian, argnums=1)(t, q, qd, now.params)
+
+    return jax.vmap(slopes)(t, q, qd)

@@ -43,6 +43,13 @@ from ._safe import safe_power as safe_power
 from ._scalarise import in_scalars as in_scalars
 from ._semidefinite import solve_balanced as solve_balanced
 from ._semidefinite import solve_semidefinite as solve_semidefinite
+from ._signal import Signal as Signal
+from ._signal import after as after
+from ._signal import is_one_of as is_one_of
+from ._signal import sample_times as sample_times
+from ._signal import signals_at as signals_at
+from ._signal import signals_from as signals_from
+from ._signal import signals_of as signals_of
 from ._varying import Varying as Varying
 from ._varying import nominal as nominal
 from ._varying import settle as settle

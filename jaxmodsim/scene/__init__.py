@@ -4,10 +4,12 @@ from ._field import Reaction as Reaction
 from ._field import check_scene as check_scene
 from ._field import scene_canonical as scene_canonical
 from ._field import scene_drifts as scene_drifts
+from ._field import scene_energies as scene_energies
 from ._field import scene_field as scene_field
 from ._field import scene_forces as scene_forces
 from ._field import scene_guards as scene_guards
 from ._field import scene_margins as scene_margins
+from ._field import scene_mass as scene_mass
 from ._field import scene_misfit as scene_misfit
 from ._field import scene_modes as scene_modes
 from ._field import scene_overload as scene_overload

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..effects import Power
-from ..mechanics import errors, motion_equations, project_position, project_velocity, rates
+from ..mechanics import energies, errors, motion_equations, project_position, project_velocity, rates
 from ..numerics import depends, safe_norm
 from ._contact import Contact, contact_guards, next_modes, overload, stop_slip
 from ._resolve import Modes, Resolved, State, by_constraint, resolve
@@ -40,6 +40,7 @@ def scene_field(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None)
 
 def scene_canonical(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> State:
     """Rates of coordinates and momenta at the state `y`: `p' = dL/dq + Q + J^T lambda`, in the place of qd."""
+    scene = scene.now(t)
     resolved = resolve(scene, t, y, mode)
     push = jax.grad(scene.lagrangian, argnums=1)(t, y.q, y.qd, scene.params)
     for action in resolved.actions.values():
@@ -71,6 +72,7 @@ def scene_modes(
     t: Float[Array, ""], y: State, scene: Scene, rest: Float[Array, ""]
 ) -> tuple[State, Float[Array, " n"]]:
     """State and modes to begin with: elements with no more slip velocity than `rest` or rounding stick if they can."""
+    scene = scene.now(t)
     elements = [*scene.exact.values()]
     none = jnp.zeros(len(elements), y.q.dtype)
     found = _contact(t, y, scene, none)
@@ -97,8 +99,21 @@ def scene_drifts(scene: Scene) -> bool:
     return any(each.along is not None or callable(each.belt_velocity) for each in scene.exact.values())
 
 
+def scene_energies(t: Float[Array, ""], y: State, scene: Scene) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Kinetic and potential energy [J] of the Lagrangian."""
+    scene = scene.now(t)
+    return energies(scene.lagrangian, t, y.q, y.qd, scene.params)
+
+
+def scene_mass(t: Float[Array, ""], y: State, scene: Scene) -> Float[Array, "dof dof"]:
+    """Mass matrix [kg for lengths, kg m^2 for angles]."""
+    scene = scene.now(t)
+    return motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass
+
+
 def scene_project(t: Float[Array, ""], y: State, scene: Scene) -> State:
     """State moved onto the constraints: the coordinates, then the velocities there."""
+    scene = scene.now(t)
     mass = motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass
     q = project_position(scene.constraints, t, y.q, scene.params, mass)
     return y._replace(q=q, qd=project_velocity(scene.constraints, t, q, y.qd, scene.params, mass))
@@ -110,6 +125,7 @@ def scene_misfit(t: Float[Array, ""], y: State, scene: Scene) -> tuple[Float[Arr
     Each error is divided by the length of its gradient, which makes it a distance from its own surface: constraints
     that contradict each other show, too.
     """
+    scene = scene.now(t)
     y = jax.lax.stop_gradient(y)
 
     def far(fn: Callable[[Array], Array], x: Array) -> Array:
@@ -133,6 +149,7 @@ def scene_reactions(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = N
 
 
 def _reactions(t: Float[Array, ""], y: State, scene: Scene, resolved: Resolved) -> dict[str, Reaction]:
+    scene = scene.now(t)
     if resolved.restraint is None or resolved.multipliers is None:
         return {}
     multipliers = by_constraint(scene, t, y, resolved.multipliers)
@@ -165,6 +182,7 @@ def scene_power(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None)
     Besides, under the name of a constraint what its motion in time supplies, and under `lagrangian` what a Lagrangian
     does that depends on time by itself, `-dL/dt`; not there where it does not.
     """
+    scene = scene.now(t)
     resolved = resolve(scene, t, y, mode)
     powers = {
         name: effect.power(t, y.q, y.qd, scene.params, resolved.actions[name])
@@ -189,6 +207,7 @@ def check_scene(scene: Scene, y: State) -> None:
     - `ValueError` naming the function, the shape it returned and the shape that is needed.
     """
     t = y.q[0]
+    scene = scene.now(t)
     energy: Any = jax.eval_shape(scene.lagrangian, t, y.q, y.qd, scene.params)
     if getattr(energy, "shape", None) != ():
         raise ValueError(

@@ -71,13 +71,14 @@ def scene_step(scene: Scene, t0: Float[Array, ""], t1: Float[Array, ""], y: Stat
     Masses, directions, loads and all forces but friction are those at t0. Friction is that of the slip velocity and the
     state at t1: `v1 = v_free - h D M^-1 D^T F(v1, advance(v1, z0, h))`. Coordinates follow with the velocities at t1.
     """
-    q, qd, params, h = y.q, y.qd, scene.params, t1 - t0
-    settled = scene.at(t0, q, qd)
+    q, qd, h = y.q, y.qd, t1 - t0
+    scene = scene.at(t0, q, qd)
+    params = scene.params
     equations = motion_equations(scene.lagrangian, t0, q, qd, params)
     restraint = restrain(scene.constraints, t0, q, qd, params, equations.mass) if scene.constraints else None
     mobility = Mobility(equations.mass, restraint)
     rhs, elements = equations.load, {}
-    for name, effect in zip(scene.names, settled.effects, strict=True):
+    for name, effect in zip(scene.names, scene.effects, strict=True):
         if isinstance(effect, Friction):
             elements[name] = _element(effect, t0, t1, q, qd, params)
         else:

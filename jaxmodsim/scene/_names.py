@@ -7,7 +7,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from ..friction import AbstractAsymmetric
-from ..numerics import Range, Varying, ranges_of
+from ..numerics import Range, Signal, Varying, ranges_of
 from ._scene import Scene
 
 # Levels of the scene that say nothing about a number.
@@ -19,20 +19,37 @@ def scene_numbers(scene: Scene) -> dict[str, Array]:
 
     Entries of `params` go by their key (`m`, nested ones `arm.m`), numbers of an effect by `effect.number`
     (`friction.Fc`, `friction.belt_velocity`); wrapped laws add no level of their own (`friction.width`), the two
-    sides of a law that depends on direction do (`friction.forward.Fc`).
+    sides of a law that depends on direction do (`friction.forward.Fc`). Of a `Signal` there are its values
+    (`u.values`); its times are constants.
 
     **Raises:**
 
     - `ValueError` if two numbers come to the same name; give one of the effects a name.
     """
+    return {name: leaf for name, leaf in _named_leaves(scene) if name is not None}
+
+
+def _named_leaves(scene: Scene) -> list[tuple[str | None, Any]]:
+    """All leaves in order; times of signals, which are constants, have no name."""
     leaves, _ = jtu.tree_flatten_with_path(scene)
-    numbers: dict[str, Array] = {}
+    named: list[tuple[str | None, Any]] = []
     for path, leaf in leaves:
+        if isinstance(_owners(scene, path)[-1], Signal) and path[-1].name == "t":
+            named.append((None, leaf))
+            continue
         name = _name(scene, path)
-        if name in numbers:
+        if any(name == other for other, _ in named):
             raise ValueError(f"Two numbers of the scene come to the name {name!r}; give the effect another name.")
-        numbers[name] = leaf
-    return numbers
+        named.append((name, leaf))
+    return named
+
+
+def _owners(scene: Scene, path: tuple[Any, ...]) -> list[Any]:
+    """What holds the leaf at `path`, from the scene inwards."""
+    owners: list[Any] = [scene]
+    for key in path[:-1]:
+        owners.append(_step(owners[-1], key))
+    return owners
 
 
 def scene_ranges(scene: Scene) -> dict[str, Range]:
@@ -43,9 +60,7 @@ def scene_ranges(scene: Scene) -> dict[str, Range]:
     leaves, _ = jtu.tree_flatten_with_path(scene)
     ranges: dict[str, Range] = {}
     for path, _ in leaves:
-        owners: list[Any] = [scene]
-        for key in path[:-1]:
-            owners.append(_step(owners[-1], key))
+        owners = _owners(scene, path)
         while isinstance(owners[-1], Varying):  # the range is that of the parameter
             owners, path = owners[:-1], path[:-1]
         owner, last = owners[-1], path[-1]
@@ -67,9 +82,8 @@ def scene_ranges(scene: Scene) -> dict[str, Range]:
 
 def replace_numbers(scene: Scene, values: dict[str, Any]) -> Scene:
     """The scene with the numbers of these names replaced; the names are those of `scene_numbers`."""
-    names = list(scene_numbers(scene))
-    leaves, structure = jtu.tree_flatten(scene)
-    return jtu.tree_unflatten(structure, [values.get(n, leaf) for n, leaf in zip(names, leaves, strict=True)])
+    leaves = [leaf if name is None else values.get(name, leaf) for name, leaf in _named_leaves(scene)]
+    return jtu.tree_unflatten(jtu.tree_structure(scene), leaves)
 
 
 def _step(node: Any, key: Any) -> Any:

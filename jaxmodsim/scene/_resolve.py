@@ -76,8 +76,9 @@ class Mobility(NamedTuple):
 
 def resolve(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -> Resolved:
     """Solve for the accelerations, and for the forces that depend on them."""
-    q, qd, params = y.q, y.qd, scene.params
+    q, qd = y.q, y.qd
     scene = scene.at(t, q, qd)
+    params = scene.params
     equations = motion_equations(scene.lagrangian, t, q, qd, params)
     restraint = restrain(scene.constraints, t, q, qd, params, equations.mass) if scene.constraints else None
     mobility = Mobility(equations.mass, restraint)

@@ -1,5 +1,6 @@
 """What is in a scene: data only."""
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -10,14 +11,29 @@ from jaxtyping import Array, Float, PyTree
 
 from ..effects import AbstractEffect, Friction
 from ..mechanics import AbstractConstraint, Lagrangian
-from ..numerics import as_function, as_real
+from ..numerics import Signal, as_function, as_real, signals_at, signals_from, signals_of
 
 # The test of uniqueness looks at every corner of the box of slopes: two to this power.
 _MOST_LOADS = 4
 
 
 def _params(params: PyTree) -> PyTree:
-    return jtu.tree_map_with_path(lambda path, leaf: as_real(leaf, name=f"params{jtu.keystr(path)}"), params)
+    def convert(path: Any, leaf: Any) -> Any:
+        return leaf if isinstance(leaf, Signal) else as_real(leaf, name=f"params{jtu.keystr(path)}")
+
+    return jtu.tree_map_with_path(convert, params, is_leaf=lambda x: isinstance(x, Signal))
+
+
+class _Driven(eqx.Module):
+    """A Lagrangian whose parameters change with time, so that its derivative by t counts their rates."""
+
+    lagrangian: Lagrangian
+    params: PyTree
+
+    def __call__(self, t: Any, q: Any, qd: Any, params: PyTree) -> Any:
+        """The Lagrangian with its own parameters as they are at `t`."""
+        del params
+        return self.lagrangian(t, q, qd, signals_at(self.params, t))
 
 
 def _effects(effects: Any) -> tuple[AbstractEffect, ...]:
@@ -67,8 +83,8 @@ class Scene(eqx.Module):
     **Arguments:**
 
     - `lagrangian`: `L(t, q, qd, params)` -> energy [J], a scalar; a pure JAX function, q and qd of shape `[dof]`.
-    - `params`: pytree of real numbers or arrays for the Lagrangian and the applied forces. Integers become
-      floating; what is no number (sizes, options) belongs into the functions.
+    - `params`: pytree of real numbers, arrays or `Signal`s for the Lagrangian and the applied forces. Integers
+      become floating; what is no number (sizes, options) belongs into the functions.
     - `effects`: tuple of `AppliedForce` and `Friction`.
     - `constraints`: tuple of `Constraint` and `VelocityConstraint`, for coordinates that are not independent.
 
@@ -172,8 +188,28 @@ class Scene(eqx.Module):
             )
         return tuple(words)
 
+    def now(self, t: Float[Array, ""]) -> "Scene":
+        """The scene with the numbers of its signals at time `t`; itself where it has none."""
+        if not signals_of(self.params):
+            return self
+        driven = signals_at(self.params, t, linear=False)
+        lagrangian = _Driven(self.lagrangian, driven) if signals_of(driven) else self.lagrangian
+        return self._with(lagrangian=lagrangian, params=signals_at(driven, t))
+
+    def step_from(self, t: Float[Array, ""]) -> "Scene":
+        """The scene for a step from `t` up to the next sample: signals are what they are there, without jumps."""
+        return self._with(params=signals_from(self.params, t)) if signals_of(self.params) else self
+
+    def _with(self, **parts: Any) -> "Scene":
+        scene = object.__new__(Scene)
+        for field in dataclasses.fields(Scene):
+            object.__setattr__(scene, field.name, parts.get(field.name, getattr(self, field.name)))
+        return scene
+
     def at(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"]) -> "Scene":
-        """The scene with its laws as they are at this state; itself where none depends on that."""
+        """The scene with its signals and laws as they are at this state; itself where nothing depends on that."""
+        if (scene := self.now(t)) is not self:
+            return scene.at(t, q, qd)
         effects = tuple(each.at(t, q, qd, self.params) if isinstance(each, Friction) else each for each in self.effects)
         if all(a is b for a, b in zip(effects, self.effects, strict=True)):
             return self
@@ -181,5 +217,6 @@ class Scene(eqx.Module):
 
     def state0(self, q: Float[Array, " dof"]) -> dict[str, PyTree]:
         """Own state of each effect that has one, at rest, by effect name."""
-        states = {name: effect.state0(q, self.params) for name, effect in zip(self.names, self.effects, strict=True)}
+        params = self.now(q[0]).params  # only shapes matter
+        states = {name: effect.state0(q, params) for name, effect in zip(self.names, self.effects, strict=True)}
         return {name: state for name, state in states.items() if state is not None}

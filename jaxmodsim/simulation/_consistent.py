@@ -74,6 +74,7 @@ def consistent(
 @jax.jit
 def _find(scene: Scene, t: Array, q: Array, qd: Array, free: Array) -> tuple[Array, Array, tuple[Array, Array]]:
     """Position, velocity, and by how much the constraints are still violated."""
+    scene = scene.now(t)
     constraints, params = scene.constraints, scene.params
     mass = motion_equations(scene.lagrangian, t, q, qd, params).mass
     inverse = factor_positive_definite(mass)(jnp.eye(q.shape[0], dtype=q.dtype))

@@ -45,7 +45,10 @@ class Flow(NamedTuple):
     def state(self, t: Array, y: Any, scene: Scene) -> State:
         """The state in what is integrated."""
         y = y[0] if self.audited else y
-        return y._replace(qd=velocity(scene.lagrangian, t, y.q, y.qd, scene.params)) if self.canonical else y
+        if not self.canonical:
+            return y
+        scene = scene.now(t)
+        return y._replace(qd=velocity(scene.lagrangian, t, y.q, y.qd, scene.params))
 
     def replace(self, t: Array, y: Any, state: State, scene: Scene) -> Any:
         """With another state."""
@@ -74,6 +77,7 @@ class Flow(NamedTuple):
     def _inner(self, t: Array, state: State, scene: Scene) -> State:
         if not self.canonical:
             return state
+        scene = scene.now(t)
         return state._replace(qd=momentum(scene.lagrangian, t, state.q, state.qd, scene.params))
 
 

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..effects import Power
-from ..mechanics import energies
-from ..scene import Scene, State
+from ..scene import Scene, State, scene_energies
 from ..solvers import EventLog
 from ._solve import Options, Problem, initial_state, solve_audited, solve_logged, solve_start
 
@@ -49,8 +48,7 @@ def _ledger(problem: Problem, t: Array, y: State, work: dict[str, Power]) -> Led
     scene = problem.scene
 
     def parts(t: Array, y: State) -> tuple[Array, Array, dict[str, Array]]:
-        kinetic, potential = energies(scene.lagrangian, t, y.q, y.qd, scene.params)
-        return kinetic, potential, _stored(scene, y)
+        return *scene_energies(t, y, scene), _stored(scene, y)
 
     first = initial_state(problem)
     kinetic, potential, stored = jax.vmap(parts)(t, y)
@@ -100,5 +98,5 @@ def _stored(scene: Scene, y: State) -> dict[str, Array]:
 
 
 def _energy(scene: Scene, t: Array, y: State) -> Array:
-    kinetic, potential = energies(scene.lagrangian, t, y.q, y.qd, scene.params)
+    kinetic, potential = scene_energies(t, y, scene)
     return kinetic + potential + sum(_stored(scene, y).values())

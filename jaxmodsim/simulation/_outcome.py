@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..mechanics import motion_equations, quadratic
+from ..mechanics import quadratic
 from ..numerics import check_ranges, cholesky_pivots, modules_of, range_checks
-from ..scene import Scene, State, scene_margins, scene_misfit
+from ..scene import Scene, State, scene_margins, scene_mass, scene_misfit
 from ..solvers import ACCUMULATION, TOO_MANY
 
 (
@@ -128,7 +128,8 @@ def start_code(scene: Scene, t: Float[Array, ""], y: State, rate: State, mode: A
     finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
     code = jnp.where(finite, code, NOT_FINITE)
     if canonical:
-        code = jnp.where(quadratic(scene.lagrangian, t, y.q, y.qd, scene.params), code, NOT_QUADRATIC)
+        now = scene.now(t)
+        code = jnp.where(quadratic(now.lagrangian, t, y.q, y.qd, now.params), code, NOT_QUADRATIC)
     offsets = _offsets(scene, dof)
     code = _blame_margins(code, scene_margins(t, y, scene, mode), offsets.checks, True)
     code = _blame_mass(code, _pivots(scene, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
@@ -193,7 +194,7 @@ def _blame_margins(code: Int[Array, ""], margins: Any, first: int, known: Array 
 
 
 def _pivots(scene: Scene, t: Float[Array, ""], y: State) -> Float[Array, " dof"]:
-    return cholesky_pivots(motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass)
+    return cholesky_pivots(scene_mass(t, y, scene))
 
 
 def _blame_mass(
@@ -209,7 +210,7 @@ def describe_failure(scene: Scene, t: float, y: State, code: int) -> str:
     dof = y.q.shape[0]
     text = outcome_messages(scene, dof)[code]
     if FIRST_MASS <= code < FIRST_MASS + dof:
-        mass = np.asarray(motion_equations(scene.lagrangian, jnp.asarray(t, y.q.dtype), y.q, y.qd, scene.params).mass)
+        mass = np.asarray(scene_mass(jnp.asarray(t, y.q.dtype), y, scene))
         text += f" Mass matrix {np.array2string(mass, precision=4)}"
         if np.all(np.isfinite(mass)):
             values, vectors = np.linalg.eigh(mass)

@@ -58,7 +58,7 @@ def simulate(
       length one.
     - `z0`: initial own states of effects, by effect name; those left out start at rest.
     - `rtol`, `atol`: relative and absolute tolerance of the local error.
-    - `dt`: fixed step [s], > 0, instead of tolerances.
+    - `dt`: fixed step [s], > 0, instead of tolerances. A sample of a `Signal` in between divides the step.
     - `dtmax`: longest step [s], > 0. In stick nothing moves and steps grow, so that a load that comes in short pulses
       can be stepped over: bound the step by the length of a pulse. Where that shows at a saved time, the run fails.
     - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`) or, on one
@@ -163,7 +163,7 @@ def _problem(
     _check_values(array)
     for name, effect in zip(scene.names, scene.effects, strict=True):
         if isinstance(effect, Friction):
-            effect.check_values(array["q0"], scene.params, name)
+            effect.check_values(array["q0"], scene.now(jnp.asarray(array["t0"])).params, name)
     return Problem(
         scene,
         array["q0"],

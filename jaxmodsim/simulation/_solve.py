@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PyTree
 
+from ..numerics import sample_times, signals_of
 from ..scene import Scene, State, check_scene, scene_drifts, scene_field, scene_modes, scene_overload, scene_project
 from ..solvers import (
     EventController,
@@ -21,6 +22,7 @@ from ..solvers import (
     ImplicitFriction,
     Projected,
     Rodas5P,
+    StepsTo,
 )
 from ._flow import Flow, Hybrid, Work
 from ._outcome import MISSED_EVENT, SUCCESS, Ending, end_code, start_code
@@ -92,12 +94,49 @@ def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolv
     return Rodas5P(pivot=fixed_step) if stiff or (scene.exact and dof == 1) else dfx.Tsit5()
 
 
-def _controller(problem: Problem) -> dfx.AbstractStepSizeController:
+def _error_control(problem: Problem) -> dfx.AbstractStepSizeController:
     if problem.dt is not None:
         return FiniteSteps()
     span = jnp.maximum(jnp.abs(problem.t0), jnp.abs(problem.t1))
     dtmin = float(jnp.finfo(span.dtype).eps) * span
     return dfx.PIDController(problem.rtol, problem.atol, dtmin=dtmin, dtmax=problem.dtmax, force_dtmin=False)
+
+
+def _solver(
+    solver: dfx.AbstractSolver, hybrid: Hybrid, scene: Scene, options: Options, log: int | None
+) -> dfx.AbstractSolver:
+    """`solver`, wrapped in what the scene needs: events, projections, signals."""
+    if isinstance(solver, ImplicitFriction):
+        solver = ImplicitFriction(hybrid.flow.advance)
+    pin = _step_from if signals_of(scene.params) else None
+    if scene.exact:
+        return EventSolver(
+            solver,
+            hybrid.guards,
+            hybrid.reset,
+            hold=hybrid.hold if options.hold_chatter else None,
+            project=hybrid.settle if hybrid.projects or hybrid.sticks else None,
+            pin=pin,
+            jumps=sample_times(scene.params, linear=False),
+            insist=True,
+            max_events=options.max_events if log is None else min(log, options.max_events),
+            log=log is not None,
+        )
+    if hybrid.projects or pin is not None:
+        return Projected(solver, hybrid.project if hybrid.projects else None, pin)
+    return solver
+
+
+def _step_from(t: Array, scene: Scene) -> Scene:
+    return scene.step_from(t)
+
+
+def _controller(problem: Problem) -> dfx.AbstractStepSizeController:
+    controller = _error_control(problem)
+    if problem.scene.exact:
+        controller = EventController(controller)
+    times = sample_times(problem.scene.params, linear=True)
+    return controller if times is None else StepsTo(controller, times)
 
 
 def _plugins(problem: Problem, options: Options) -> tuple[Any, Any]:
@@ -133,27 +172,13 @@ def _integrate(problem: Problem, options: Options, audited: bool, log: int | Non
     scene, exact = problem.scene, bool(problem.scene.exact)
     initial, mode, hybrid, start = _prepared(problem, options, audited)
     solver, adjoint = _plugins(problem, options)
-    if isinstance(solver, ImplicitFriction):
-        solver = ImplicitFriction(hybrid.flow.advance)
+    solver = _solver(solver, hybrid, scene, options, log)
     # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
     starts = start == SUCCESS
     ts = None if problem.ts is None else jnp.where(starts, problem.ts, problem.t0)
     y0, controller = hybrid.flow.start(problem.t0, initial, scene, mode), _controller(problem)
-    if exact:
-        solver = EventSolver(
-            solver,
-            hybrid.guards,
-            hybrid.reset,
-            hold=hybrid.hold if options.hold_chatter else None,
-            project=hybrid.settle if hybrid.projects or hybrid.sticks else None,
-            insist=True,
-            max_events=options.max_events if log is None else min(log, options.max_events),
-            log=log is not None,
-        )
+    if isinstance(solver, EventSolver):
         y0 = solver.start(problem.t0, y0, mode, scene)
-        controller = EventController(controller)
-    elif hybrid.projects:
-        solver = Projected(solver, hybrid.project)
 
     def keep_end(t: Any, y: Any, scene: Scene) -> Any:
         return hybrid.keep(t, y, scene), ((y.events, y.trouble, y.fired), y.log) if exact else None

@@ -188,7 +188,11 @@ def _reactions(scene: Scene, t: Array, y: State, mode: Any) -> dict[str, Reactio
 
 @jax.jit
 def _momentum(scene: Scene, t: Array, q: Array, qd: Array) -> Array:
-    return _reached(t, jax.vmap(lambda t, q, qd: momentum(scene.lagrangian, t, q, qd, scene.params))(t, q, qd))
+    def at(t: Array, q: Array, qd: Array) -> Array:
+        now = scene.now(t)
+        return momentum(now.lagrangian, t, q, qd, now.params)
+
+    return _reached(t, jax.vmap(at)(t, q, qd))
 
 
 def _reached(t: Array, tree: Any) -> Any:

@@ -1,6 +1,7 @@
 """Plug-ins for diffrax."""
 
 from ._controllers import FiniteSteps as FiniteSteps
+from ._controllers import StepsTo as StepsTo
 from ._event_controller import EventController as EventController
 from ._event_solver import EventSolver as EventSolver
 from ._event_state import ACCUMULATION as ACCUMULATION

@@ -1,15 +1,25 @@
-"""Step size control that stops at the first value that is not finite."""
+"""Step size control: that stops at the first value that is not finite, and that ends steps at given times."""
 
 from typing import Any, cast
 
 import diffrax as dfx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import PyTree
+import optimistix as optx
+from jaxtyping import Array, Float, PyTree
+
+from ..numerics import after, is_one_of
+
+# Part of a step by which it may end before or behind the time that is meant.
+_STRETCH = 1e-6
 
 
 class FiniteSteps(dfx.AbstractStepSizeController):
-    """Constant steps that end the run, at its last finite state, instead of carrying NaN to the end."""
+    """Constant steps that end the run, at its last finite state, instead of carrying NaN to the end.
+
+    A step that something else makes shorter (an event, a sample) is followed by one over the rest of it.
+    """
 
     inner: dfx.ConstantStepSize = dfx.ConstantStepSize()
 
@@ -22,7 +32,8 @@ class FiniteSteps(dfx.AbstractStepSizeController):
         self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, dt0: Any, args: PyTree, func: Any, error_order: Any
     ) -> tuple[Any, Any]:
         """As `diffrax.ConstantStepSize`."""
-        return self.inner.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        end, state = self.inner.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return end, (state, end)
 
     def adapt_step_size(
         self,
@@ -36,11 +47,88 @@ class FiniteSteps(dfx.AbstractStepSizeController):
         controller_state: Any,
     ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:
         """Keep the step if all of its result is finite."""
-        _, next_t0, next_t1, jump, state, _ = self.inner.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+        old, target = controller_state
+        _, next_t0, next_t1, jump, new, _ = self.inner.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, old
         )
+        shorter = target - t1 > _STRETCH * (target - t0)
+        next_t1 = jnp.where(shorter, target, next_t1)
+        state = jtu.tree_map(lambda a, b: jnp.where(shorter, a, b), old, new), next_t1
         finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y1_candidate)]).all()
         # diffrax has no code for a value that is not finite; this is the nearest that step control does not use.
         failure = cast(dfx.RESULTS, dfx.RESULTS.nonlinear_divergence)
         result = dfx.RESULTS.where(finite, dfx.RESULTS.successful, failure)
         return finite, jnp.where(finite, next_t0, t0), next_t1, jump, state, result
+
+
+class StepsTo(dfx.AbstractAdaptiveStepSizeController):
+    """Wrap a step size controller so that steps end on given times, and a new start is made there.
+
+    **Arguments:**
+
+    - `controller`: any diffrax step size controller, adaptive or constant.
+    - `times`: increasing, shape `[n]`.
+    """
+
+    controller: dfx.AbstractStepSizeController
+    times: Float[Array, " n"]
+
+    def __init__(self, controller: dfx.AbstractStepSizeController, times: Float[Array, " n"]):
+        self.controller = controller
+        self.times = times
+
+    @property
+    def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Relative tolerance of the wrapped controller, for implicit solvers; NaN if it has none."""
+        return getattr(self.controller, "rtol", float("nan"))
+
+    @property
+    def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Absolute tolerance of the wrapped controller, for implicit solvers; NaN if it has none."""
+        return getattr(self.controller, "atol", float("nan"))
+
+    @property
+    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Norm of the wrapped controller, for implicit solvers."""
+        return getattr(self.controller, "norm", optx.max_norm)
+
+    def wrap(self, direction: Any) -> "StepsTo":
+        """Wrap the controller inside. Time runs forward."""
+        return StepsTo(self.controller.wrap(direction), self.times)
+
+    def init(
+        self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, dt0: Any, args: PyTree, func: Any, error_order: Any
+    ) -> tuple[Any, Any]:
+        """First step of the wrapped controller, at most to the first time."""
+        end, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return self._clip(t0, end), inner
+
+    def adapt_step_size(
+        self,
+        t0: Any,
+        t1: Any,
+        y0: PyTree,
+        y1_candidate: PyTree,
+        args: PyTree,
+        y_error: Any,
+        error_order: Any,
+        controller_state: Any,
+    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:
+        """As the wrapped controller, but no step passes one of the times."""
+        keep, next_t0, next_t1, jump, inner, result = self.controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+        )
+        return (
+            keep,
+            next_t0,
+            self._clip(next_t0, next_t1),
+            jump | is_one_of(self.times, jnp.asarray(next_t0)),
+            inner,
+            result,
+        )
+
+    def _clip(self, t0: Any, t1: Any) -> Any:
+        last = self.times.shape[0] - 1
+        i = after(self.times, t0)
+        time = jax.lax.dynamic_index_in_dim(self.times, jnp.minimum(i, last), keepdims=False).astype(t1.dtype)
+        return jnp.where((i <= last) & (time - t0 <= (1.0 + _STRETCH) * (t1 - t0)), time, t1)

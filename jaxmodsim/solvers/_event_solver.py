@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ..numerics import first_root, once, unit_of, watch
+from ..numerics import first_root, is_one_of, once, unit_of, watch
 from ._event_state import ACCUMULATION, NO_TROUBLE, TOO_MANY, EventLog, EventState, write
 
 # How far beside the root a step may end, as a fraction of the step; from there the state is carried to the root, with
@@ -130,6 +130,10 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     - `hold`: as `reset`, for events that accumulate; by default the run ends there.
     - `project`: `project(t, s, args)` -> `s`, applied after every step, for invariants that drift.
     - `insist`: whether the guards are conditions that have to hold, not crossings that are to be noted.
+    - `pin`: `pin(t0, args)` -> `args` of a step that begins at t0, without what jumps at its end; the reset at the end
+      of the step gets `args` as they are.
+    - `jumps`: times at which fields and guards jump, increasing, shape `[n]`. The controller must end steps there; then
+      `reset` is called, with no guard marked, and what it changes of the modes is an event.
     - `max_events`: limit of the number of events, > 0, and length of the log.
     - `log`: whether the state carries an `EventLog`.
 
@@ -151,6 +155,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     reset: Callable[..., Any]
     hold: Callable[..., Any] | None = None
     project: Callable[..., Any] | None = None
+    pin: Callable[..., Any] | None = None
+    jumps: Float[Array, " n"] | None = None
     insist: bool = eqx.field(default=False, static=True)
     max_events: int = eqx.field(default=128, static=True)
     log: bool = eqx.field(default=True, static=True)
@@ -225,6 +231,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     ) -> tuple[EventState, PyTree, dict[str, Any], Any, dfx.RESULTS]:
         """A step of the wrapped solver, a look at the guards along it, and the reset where it ends on an event."""
         inner, pace, begin = solver_state
+        whole, args = args, args if self.pin is None else self.pin(t0, args)
         y1, error, dense, inner, result = self.solver.step(
             dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0._replace(log=None), args), inner, made_jump
         )
@@ -242,6 +249,9 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         length = _constant(t1 - t0)
         resolution = 4.0 * float(jnp.finfo(length.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
         near = jnp.maximum(_LANDING * jnp.maximum(length, pace), _constant(resolution))
+        jumps = None if self.jumps is None else is_one_of(self.jumps, t1) & (length > 0)
+        if jumps is not None:  # an event before a jump is not one with it
+            near = jnp.where(jumps, _constant(resolution), near)
         near = near / jnp.where(length > 0, length, 1.0)
         shortest = jnp.maximum(_SHORT * pace, 2.0 * _constant(resolution))
         here = seen.armed & (jnp.abs(seen.ahead) <= near)
@@ -264,9 +274,13 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             aim=aim,
             room=once(jnp.cbrt(jnp.min(seen.clarity)), unit),
         )
+        happens = landed if jumps is None else landed | (jumps & ~missed)
+        if jumps is not None:  # what was in sight is no more, and the root of one that fires with a jump is the jump
+            state1 = state1._replace(aim=jnp.where(jumps & ~missed, jnp.inf, aim))
+            near = jnp.where(jumps, 0.0, near)
         state1 = jax.lax.cond(
-            landed,
-            lambda: self._jump(terms, t1, state1, fired, first, (near * length, begin), args),
+            happens,
+            lambda: self._jump(terms, t1, state1, fired, first, (near * length, begin), (args, whole)),
             lambda: state1,
         )
         dense = {"inner": dense, "state0": y0, "state1": state1}
@@ -281,17 +295,17 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         fired: Bool[Array, " guards"],
         first: Bool[Array, " guards"],
         times: tuple[Array, Array],
-        args: PyTree,
+        sides: tuple[PyTree, PyTree],
     ) -> EventState:
         """Carry the state to the root of the first guard, reset it there, and carry it back to `t`.
 
         The way to the root is zero but for the error of the landing; its derivatives are those of the time of the
         event, to second order, so that those of the result are exact.
         """
-        near, begin = times
+        (near, begin), (args, whole) = times, sides
         unit = unit_of(begin)
 
-        def field(t: Any, state: EventState) -> PyTree:
+        def field(t: Any, state: EventState, args: PyTree = args) -> PyTree:
             return terms.vf(t, state, args).y
 
         def guard(t: Any, y: PyTree) -> Array:
@@ -303,19 +317,23 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         spread = _constant(since)
         dense = _accumulates(spread, _constant(t_event), begin) & (state.events >= _FEWEST)
 
-        after = self.reset(t_event, before, args, fired)
+        after = self.reset(t_event, before, whole, fired)
         trouble = jnp.where(dense, jnp.asarray(ACCUMULATION, spread.dtype), NO_TROUBLE)
         if self.hold is not None:
-            held = self.hold(t_event, before, args, fired)
+            held = self.hold(t_event, before, whole, fired)
             after = jtu.tree_map(lambda a, b: jnp.where(dense, a, b), held, after)
             trouble = jnp.zeros_like(spread)
         after = after._replace(y=once(after.y, unit), mode=once(after.mode, unit))
-        events = state.events + 1.0
+        events, index = state.events + 1.0, state.events
+        if self.jumps is not None:  # one at which nothing changes is no event
+            happened = jnp.any(fired) | _differ(before.mode, after.mode)
+            events, index = jnp.where(happened, events, index), jnp.where(happened, index, -1.0)
         trouble = jnp.where((trouble == NO_TROUBLE) & (events > self.max_events), TOO_MANY, trouble)
 
-        middle = field(t_event - 0.5 * way, after._replace(y=_along(after.y, -0.5 * way, field(t_event, after))))
+        halfway = after._replace(y=_along(after.y, -0.5 * way, field(t_event, after, whole)))
+        middle = field(t_event - 0.5 * way, halfway, whole)
         end = after._replace(y=once(_along(after.y, -way, middle), unit))
-        values = self._guards(t, end, args)
+        values = self._guards(t, end, whole)
         clear = _constant(values) > jnp.where(fired, _LATITUDE * jnp.abs(rate) * near, 0.0)
         armed = self.insist | clear | (~fired & (state.armed > 0.5))
         if self.hold is not None:
@@ -324,8 +342,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         log = state.log
         if log is not None:
             entry = EventLog(t_event, flags, (before.y, before.mode), (after.y, after.mode))
-            log = jtu.tree_map(lambda a, b: write(a, state.events, b), log, entry)
-        return state._replace(
+            log = jtu.tree_map(lambda a, b: write(a, index, b), log, entry)
+        found = state._replace(
             y=end.y,
             mode=end.mode,
             t=t_event,
@@ -336,6 +354,13 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             guard=_constant(values),
             armed=jnp.where(armed, 1.0, jnp.zeros_like(values)),
             spread=spread,
+        )
+        if self.jumps is None:
+            return found
+        return jtu.tree_map(
+            lambda a, b: jnp.where(events > state.events, a, b),
+            found,
+            state._replace(y=end.y, guard=found.guard, armed=found.armed),
         )
 
 
@@ -365,6 +390,11 @@ def _accumulates(spread: Array, t: Array, begin: Array) -> Array:
     """Whether intervals between events of `spread` at most are none on the scale of the run, or not resolved at `t`."""
     eps = float(jnp.finfo(spread.dtype).eps)
     return spread <= jnp.maximum(_ACCUMULATION * eps**0.5 * (t - begin), 64.0 * eps * jnp.abs(t))
+
+
+def _differ(one: PyTree, other: PyTree) -> Bool[Array, ""]:
+    different = jtu.tree_map(lambda a, b: jnp.any(a != b), one, other)
+    return jtu.tree_reduce(jnp.logical_or, different, jnp.asarray(False))
 
 
 def _real(x: Any) -> Array:

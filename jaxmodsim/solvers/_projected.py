@@ -1,4 +1,4 @@
-"""A solver wrapper that moves the state back onto what it has to obey."""
+"""A solver wrapper that gives each step its own arguments, and moves the state back onto what it has to obey."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar, cast
@@ -8,7 +8,7 @@ from jaxtyping import PyTree
 
 
 class Projected(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
-    """Wrap a diffrax solver so that every step ends with a projection.
+    """Wrap a diffrax solver so that every step ends with a projection, or has arguments of its own.
 
     The order is that of the wrapped solver, as what a projection takes away is at most the error of the step. Dense
     output inside a step is that of the wrapped solver, not projected.
@@ -16,12 +16,14 @@ class Projected(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     **Arguments:**
 
     - `solver`: any solver of an `ODETerm`.
-    - `project`: `project(t, y, args)` -> `y`.
+    - `project`: `project(t, y, args)` -> `y`; None for no projection.
+    - `pin`: `pin(t0, args)` -> `args` of a step that begins at t0; None for those of the run.
     """
 
     term_structure: ClassVar = dfx.ODETerm
     solver: dfx.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
-    project: Callable[..., Any]
+    project: Callable[..., Any] | None
+    pin: Callable[..., Any] | None = None
 
     @property
     def root_finder(self) -> Any:
@@ -58,5 +60,7 @@ class Projected(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree, solver_state: Any, made_jump: Any
     ) -> tuple[PyTree, PyTree, dict[str, Any], Any, dfx.RESULTS]:
         """A step of the wrapped solver, projected."""
+        args = args if self.pin is None else self.pin(t0, args)
         y1, error, dense, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
-        return self.project(t1, y1, args), error, dense, state, result
+        y1 = y1 if self.project is None else self.project(t1, y1, args)
+        return y1, error, dense, state, result
