@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..numerics import Signal
 from ..scene import Scene, State, replace_numbers, scene_numbers
 from ..simulation import simulate
 from ._entries import join_entries
@@ -69,7 +70,9 @@ class EventEngine(eqx.Module):
         """Run the scene with these values over the samples."""
         scene = with_values(self.scene, values)
         inputs = delayed(run.t, run.inputs, self.linear, self.delays | values)
-        del inputs
+        if inputs:
+            signals = {name: Signal(run.t, x, linear=name in self.linear) for name, x in inputs.items()}
+            scene = eqx.tree_at(lambda x: x.params, scene, {**scene.params, **signals})
         done = simulate(
             scene,
             start.q,
