@@ -19,7 +19,7 @@ ALLOWED["export"] = {"numerics", "friction"}
 ALLOWED["analysis"] = set(_CORE)
 ALLOWED["identify"] = set(_CORE)
 ALLOWED["behaviour"] = set(_CORE)
-ALLOWED["plot"] = {*_CORE, "problems", "identify", "behaviour"}
+ALLOWED["plot"] = {*_CORE, "analysis", "problems", "identify", "behaviour"}
 ALLOWED["cli"] = {*_CORE, "problems", "identify", "behaviour", "plot", "_speed"}
 ALLOWED["_speed"] = set()
 

@@ -14,10 +14,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from ..scene import Scene, replace_numbers, scene_numbers
+from ..scene import Scene
 from ..simulation import Trajectory, simulate
 from . import _words as words
 from ._differences import Estimate, Histories, History, Limits, Probe, Sample, estimate, grazing, kink, probe, usable
+from ._elements import elements, read_element, replace_elements
 
 Verdict = Literal["agree", "part", "modes change", "grazing", "kink", "unclear", "no differences"]
 
@@ -166,7 +167,7 @@ def check_gradients(
         raise ValueError(f"check_gradients works in float32 and float64, but the scene holds {value.dtype}.")
     gradient = jax.grad(fn)(scene, simulate)
     forward = {name: _forward(fn, scene, name) for name in entries}
-    reverse = {name: _read(gradient, name) for name in entries}
+    reverse = {name: read_element(gradient, name) for name in entries}
     scale = {name: (scales or {}).get(name, abs(x) or 1.0) for name, x in entries.items()}
     slopes = [abs(d[name]) * scale[name] for d in (forward, reverse) for name in entries]
     limits = Limits(
@@ -189,31 +190,11 @@ def check_gradients(
     return GradientCheck(float(value), f"float{8 * itemsize}", numbers, tuple(remarks))
 
 
-def _elements(scene: Scene) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Each single number by name: the name of its array, and where it is in there."""
-    return {
-        leaf + (f"[{','.join(map(str, index))}]" if index else ""): (leaf, index)
-        for leaf, array in scene_numbers(scene).items()
-        for index in np.ndindex(array.shape)
-    }
-
-
-def _read(scene: Scene, name: str) -> float:
-    leaf, index = _elements(scene)[name]
-    return float(np.asarray(scene_numbers(scene)[leaf])[index])
-
-
-def _replace(scene: Scene, name: str, value: float) -> Scene:
-    """The scene with one single number replaced."""
-    leaf, index = _elements(scene)[name]
-    return replace_numbers(scene, {leaf: scene_numbers(scene)[leaf].at[index].set(value)})
-
-
 def _entries(scene: Any, names: Sequence[str] | None, scales: Mapping[str, float]) -> dict[str, float]:
     """The numbers to check, by name."""
     if not isinstance(scene, Scene):
         raise ValueError(f"check_gradients needs a Scene, but a {type(scene).__name__} was given.")
-    numbers = {name: _read(scene, name) for name in _elements(scene)}
+    numbers = {name: read_element(scene, name) for name in elements(scene)}
     if not numbers:
         raise ValueError("The scene holds no numbers to differentiate by: give it params or effects.")
     wanted = list(numbers) if names is None else [names] if isinstance(names, str) else list(names)
@@ -276,7 +257,7 @@ def _forward(fn: Callable[..., Any], scene: Scene, name: str) -> float:
     """Derivative in forward mode."""
     zero = jtu.tree_map(jnp.zeros_like, scene)
     try:
-        tangent = jax.jvp(lambda s: fn(s, _forward_simulate), (scene,), (_replace(zero, name, 1.0),))[1]
+        tangent = jax.jvp(lambda s: fn(s, _forward_simulate), (scene,), (replace_elements(zero, {name: 1.0}),))[1]
     except TypeError as error:
         if not any(words in str(error) for words in ("custom_vjp", "adjoint=diffrax.ForwardMode()")):
             raise
@@ -296,8 +277,8 @@ def _evaluate(
     x: float,
 ) -> Sample:
     """The function with one number replaced."""
-    changed_scene = _replace(scene, name, x)
-    x = _read(changed_scene, name)  # as rounded to its type
+    changed_scene = replace_elements(scene, {name: x})
+    x = read_element(changed_scene, name)  # as rounded to its type
     runs.clear()
     try:
         value = float(fn(changed_scene, simulate))

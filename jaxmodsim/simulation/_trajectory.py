@@ -127,7 +127,7 @@ class Trajectory:
         if self.modes is None:
             none = jnp.zeros(0, int)
             return Events(jnp.zeros(0, self.t.dtype), none, none, none)
-        return _events(self.scene, solve_logged(self.problem, self.options, self._log_size()))
+        return _events(self.scene, solve_logged(self.problem, self.options, self.log_size))
 
     @property
     def momentum(self) -> Float[Array, "*time dof"]:
@@ -148,7 +148,7 @@ class Trajectory:
     def event_losses(self) -> Float[Array, " time"]:
         """Energy [J] lost since t0 at events; runs the scene once more where it has any."""
         self._one_run("event_losses")
-        return event_losses(self.problem, self.options, self.t, self._log_size())
+        return event_losses(self.problem, self.options, self.t, self.log_size)
 
     @property
     def energy(self) -> Energy:
@@ -160,7 +160,8 @@ class Trajectory:
         )
         return Energy(book.kinetic, book.potential, stored, supplied, dissipated, book.balance)
 
-    def _log_size(self) -> int:
+    @property
+    def log_size(self) -> int:
         """Length of a log that holds all events: as many as needed, in powers of two; another one compiles anew."""
         count, size = self.stats.get("num_events", 0), self.options.max_events
         return size if isinstance(count, jax.core.Tracer) else min(size, 1 << max(int(count), 8).bit_length())
