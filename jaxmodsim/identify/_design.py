@@ -45,6 +45,7 @@ class _Task(eqx.Module):
     - `inverse`: one by the limits of force, speed and travel, 0 for no limit, shape `[3]`.
     - `weight`: samples of the record for one of these.
     - `prior`: information from before.
+    - `uncertainty`: relative error that the numbers may have now.
     - `goal`: function of the information matrix.
     """
 
@@ -55,6 +56,7 @@ class _Task(eqx.Module):
     inverse: Float[Array, " 3"]
     weight: Float[Array, ""]
     prior: Float[Array, "free free"]
+    uncertainty: Float[Array, ""]
     goal: Goal = eqx.field(static=True)
 
     def motion(self, x: Float[Array, " weights"]) -> tuple[Float[Array, " time"], Float[Array, " time"]]:
@@ -80,6 +82,7 @@ def design_input(
     harmonics: int = 12,
     goal: Goal = d_optimal,
     prior: FitResult | None = None,
+    uncertainty: float = 0.1,
     seed: int = 0,
     max_steps: int = 30,
     progress: DesignProgress | None = None,
@@ -92,6 +95,10 @@ def design_input(
     sequential quadratic programming (SLSQP of scipy) on exact gradients from several starts, on a coarser grid if there
     are many samples. The result is scaled to fill the limits on the full grid, in the reference and in runs of the
     model with one and with four integration steps for every sample.
+
+    Slow motion on the brink of sticking tells most on paper, but a model whose numbers are a little off leaves such a
+    motion altogether, and no fit finds back. So an error of `uncertainty` in any one number may move the simulated
+    record, to first order, by no more than the record's own reach.
 
     A design is the best one for the numbers the scene has: take those of a first fit. Standard errors are those of a
     right model and white noise.
@@ -112,6 +119,7 @@ def design_input(
     - `goal`: function of the information matrix of the relative numbers, the larger the better: `d_optimal`,
       `a_optimal`, `e_optimal` or one's own.
     - `prior`: an earlier fit, whose knowledge of the free numbers is added to that of the record.
+    - `uncertainty`: relative error that the numbers of the scene may have now, > 0: 0.1 for 10 %.
     - `seed`: of the random starts.
     - `max_steps`: limit of iterations from each start.
     - `progress`: called after each iteration with its number and the goal of its motion, which may still be beyond a
@@ -126,7 +134,7 @@ def design_input(
     - `ValueError` for names that are unknown, a scene that has several coordinates or needs events, an input that is
       not in the scene or does not move it, limits that allow no motion.
     """
-    _check(duration, dt, noise, harmonics, max_steps, goal)
+    _check({"duration": duration, "dt": dt}, {"noise": noise, "uncertainty": uncertainty}, harmonics, max_steps, goal)
     axis, parameters, scale = _axis(scene, free, q0, observe, input, noise)
     samples = round(duration / dt) + 1
     stride = max((samples - 1) // _COARSE, 1)
@@ -139,20 +147,28 @@ def design_input(
         shapes, rates = motion_basis(t, harmonics)
         # None is a limit of infinity.
         inverse = [1.0 / (limit or np.inf) / (1.0 - _MARGIN) for limit in (limits.force, limits.speed, limits.travel)]
-        numbers = (t, shapes, rates, inverse, samples / count, prior_information)
-        return _Task(axis, *(jnp.asarray(x, float) for x in numbers), goal)
+        numbers = {
+            "t": t,
+            "shapes": shapes,
+            "rates": rates,
+            "inverse": inverse,
+            "weight": samples / count,
+            "prior": prior_information,
+            "uncertainty": uncertainty,
+        }
+        return _Task(axis=axis, goal=goal, **{name: jnp.asarray(x, float) for name, x in numbers.items()})
 
     fine, coarse = task(samples), task((samples - 1) // stride + 1)
     sines = [_fill(_coarse_share, coarse, column) for column in np.eye(2 * harmonics)[:harmonics]]
-    plain = max(sines, key=lambda x: _goal(coarse, x))
+    plain = max(sines, key=lambda x: _merit(coarse, x))
     best, ending = _improve(coarse, sines, plain, seed, max_steps, progress)
-    excitations = []
-    for x in (best, plain):
-        filled = _fill(_fine_share, fine, x)
-        excitations.append(_excitation(fine, filled, parameters.names, scale))
+    designed, compared = (
+        _excitation(fine, _fill(_fine_share, fine, x), parameters.names, scale) for x in (best, plain)
+    )
     units = {name: allowed.unit for name, allowed in split_ranges(scene_numbers(scene), scene_ranges(scene)).items()}
     return InputDesign(
-        *excitations,
+        designed,
+        compared,
         {name: parameters.start[name] for name in parameters.names},
         {name: units.get(name, "") for name in parameters.names},
         limits,
@@ -162,19 +178,21 @@ def design_input(
     )
 
 
-def _check(duration: float, dt: float, noise: float, harmonics: int, max_steps: int, goal: Any) -> None:
-    for label, number, unit in (("duration", duration, " s"), ("dt", dt, " s"), ("noise", noise, "")):
-        if not np.isfinite(number) or number <= 0:
-            raise ValueError(f"{label} must be finite and > 0{unit}, but {number!r} was given.")
+def _check(times: dict[str, float], numbers: dict[str, float], harmonics: int, max_steps: int, goal: Any) -> None:
+    for unit, given in ((" s", times), ("", numbers)):
+        for label, number in given.items():
+            if not np.isfinite(number) or number <= 0:
+                raise ValueError(f"{label} must be finite and > 0{unit}, but {number!r} was given.")
     for label, count in (("harmonics", harmonics), ("max_steps", max_steps)):
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise ValueError(f"{label} must be at least 1, an integer, but {count!r} was given.")
+    duration, dt = times["duration"], times["dt"]
     samples = min(round(duration / dt) + 1, _COARSE)
     if samples < 20 * harmonics:
         raise ValueError(
-            f"{duration:g} s in steps of {dt:g} s with {harmonics} harmonics leaves {samples / harmonics:.0f} samples in"
-            " a period of the fastest, but 20 are needed: give a longer duration, a shorter dt or fewer harmonics (at"
-            f" most {_COARSE // 20})."
+            f"{duration:g} s in steps of {dt:g} s with {harmonics} harmonics leaves {samples / harmonics:.0f} samples"
+            " in a period of the fastest, but 20 are needed: give a longer duration, a shorter dt or fewer harmonics"
+            f" (at most {_COARSE // 20})."
         )
     if not callable(goal):
         raise ValueError(f"goal must be a function of the information matrix, as d_optimal is, but it is {goal!r}.")
@@ -278,11 +296,11 @@ def _fill(
     low = high = 1.0
     while not fits(low):
         low, high = 0.8 * low, low
-        if low < 1e-9:
+        if low < 1e-13:
             needed = 100.0 * float(share(task, jnp.asarray(low * x, float)))
             raise ValueError(
-                f"No motion keeps the limits: the axis at rest takes {needed:.0f} % of one. Raise the limit of force, or"
-                " take the constant load off the axis."
+                f"No motion keeps the limits: the axis at rest takes {needed:.0f} % of one. Raise the limit of force,"
+                " or take the constant load off the axis."
             )
     while high > (1.0 + 1e-3) * low:
         middle = 0.5 * (low + high)
@@ -290,33 +308,42 @@ def _fill(
     return low * x
 
 
-def _goal_of_force(task: _Task, force: Float[Array, " time"]) -> Float[Array, ""]:
-    columns = sensitivities(task.axis, task.t, force)
+def _worth(task: _Task, force: Float[Array, " time"]) -> Float[Array, " 2"]:
+    """The goal, and the largest deviation of the record, in its reach, by a number that is as wrong as it may be."""
+    record, columns = sensitivities(task.axis, task.t, force)
     information = task.weight * columns.T @ columns + task.prior
     # Rounding must not make a singular matrix indefinite.
     little = 1e3 * jnp.finfo(force.dtype).eps * jnp.diag(information) + 1.0 / _IGNORANCE**2
-    return task.goal(information + jnp.diag(little))
+    deviation = task.uncertainty * columns / jnp.max(jnp.abs(record - record[0]))
+    return jnp.stack([task.goal(information + jnp.diag(little)), _largest(jnp.reshape(deviation, (1, -1)))[0]])
+
+
+def _largest(x: Float[Array, "rows n"]) -> Float[Array, " rows"]:
+    """Smooth largest magnitude of each row."""
+    return jax.nn.logsumexp(_SHARP * jnp.concatenate([x, -x], axis=1), axis=1) / _SHARP
 
 
 @eqx.filter_jit
 def _judge(
     task: _Task, x: Float[Array, " weights"]
-) -> tuple[Float[Array, ""], Float[Array, " weights"], Float[Array, " 3"], Float[Array, "3 weights"]]:
-    """The goal and the smooth largest share of each limit, with their derivatives by the weights."""
+) -> tuple[Float[Array, ""], Float[Array, " weights"], Float[Array, " 4"], Float[Array, "4 weights"]]:
+    """The goal, and the use of what is allowed of force, speed, travel and deviation, with their derivatives."""
     force, pull = jax.vjp(lambda x: feed_forward(task.axis, task.t, *task.motion(x)), x)
-    goal, by_force = jax.value_and_grad(lambda force: _goal_of_force(task, force))(force)
 
-    def peaks(x: Array, force: Array) -> Array:
-        shares = _SHARP * task.shares(x, force)
-        return jax.nn.logsumexp(jnp.concatenate([shares, -shares], axis=1), axis=1) / _SHARP
+    def used(x: Array, force: Array) -> Array:
+        return _largest(task.shares(x, force))
 
-    (direct, through), values = jax.jacrev(peaks, argnums=(0, 1))(x, force), peaks(x, force)
-    pulled = jax.vmap(lambda row: pull(row)[0])(jnp.stack([by_force, through[0]]))
-    return goal, pulled[0], values, direct.at[0].add(pulled[1])
+    (goal, deviation), by_force = _worth(task, force), jax.jacrev(lambda force: _worth(task, force))(force)
+    direct, through = jax.jacrev(used, argnums=(0, 1))(x, force)
+    by_goal, by_deviation, by_peak = jax.vmap(lambda row: pull(row)[0])(jnp.stack([*by_force, through[0]]))
+    rows = jnp.concatenate([direct.at[0].add(by_peak), by_deviation[None]])
+    return goal, by_goal, jnp.append(used(x, force), deviation), rows
 
 
-def _goal(task: _Task, x: Float[np.ndarray, " weights"]) -> float:
-    return float(_judge(task, jnp.asarray(x, float))[0])
+def _merit(task: _Task, x: Float[np.ndarray, " weights"]) -> float:
+    """The goal, less a price of too large a deviation; the limits are held otherwise."""
+    goal, _, used, _ = _judge(task, jnp.asarray(x, float))
+    return float(goal) - 10.0 * max(float(used[3]) - 1.05, 0.0)
 
 
 def _improve(
@@ -332,14 +359,14 @@ def _improve(
     lengths = np.tile([float(np.max(np.abs(x))) for x in sines], 2)
     rng = np.random.default_rng(seed)
     tried = [_fill(_coarse_share, task, lengths * rng.standard_normal(lengths.size)) for _ in range(_TRIED)]
-    tried.sort(key=lambda x: -_goal(task, x))
-    best, best_goal, ending, count = plain, _goal(task, plain), "converged", 0
+    tried.sort(key=lambda x: -_merit(task, x))
+    best, best_merit, ending, count = plain, _merit(task, plain), "converged", 0
     for start in tried[:_IMPROVED]:
         found, how, count = _climb(task, start, lengths, max_steps, progress, count)
         filled = _fill(_coarse_share, task, found)
-        goal = _goal(task, filled)
-        if goal > best_goal:
-            best, best_goal, ending = filled, goal, how
+        merit = _merit(task, filled)
+        if merit > best_merit:
+            best, best_merit, ending = filled, merit, how
         if how.startswith("was interrupted"):
             return best, how
     return best, ending
@@ -371,7 +398,7 @@ def _climb(
         if progress is not None:
             progress(count, float(judged(y)[0]))
 
-    there = np.flatnonzero(np.asarray(task.inverse))
+    there = np.append(np.flatnonzero(np.asarray(task.inverse)), 3)
     within = {
         "type": "ineq",
         "fun": lambda y: 1.0 - judged(y)[2][there],
@@ -413,7 +440,7 @@ def _run(task: _Task, x: Float[Array, " weights"]) -> tuple[Array, ...]:
     """Reference, force, motion of the model and sensitivities."""
     axis, (q_ref, qd_ref) = task.axis, task.motion(x)
     force = feed_forward(axis, task.t, q_ref, qd_ref)
-    return q_ref, qd_ref, force, *driven_motion(axis, task.t, force), sensitivities(axis, task.t, force)
+    return q_ref, qd_ref, force, *driven_motion(axis, task.t, force), sensitivities(axis, task.t, force)[1]
 
 
 def _inverse(information: Float[np.ndarray, "free free"]) -> Float[np.ndarray, "free free"]:

@@ -139,16 +139,17 @@ def driven_motion(
     return jax.vmap(part)(jnp.array([True, False]))
 
 
-def sensitivities(axis: Axis, t: Float[Array, " time"], force: Float[Array, " time"]) -> Float[Array, "time free"]:
-    """Derivatives of the record by the free numbers, in standard deviations of the noise, with the force given."""
+def sensitivities(
+    axis: Axis, t: Float[Array, " time"], force: Float[Array, " time"]
+) -> tuple[Float[Array, " time"], Float[Array, "time free"]]:
+    """What is observed under a force, and its derivatives by the free numbers, in standard deviations of the noise."""
 
     def record(x: Array) -> Array:
-        return _record(axis, axis.at(x), t, force, axis.observe)
+        return _record(axis, axis.at(x), t, force, axis.observe) / axis.noise
 
     size = next(iter(axis.slopes.values())).shape[0]
     zero, units = jnp.zeros(size, force.dtype), jnp.eye(size, dtype=force.dtype)
-    columns = jax.vmap(lambda unit: jax.jvp(record, (zero,), (unit,))[1], out_axes=1)(units)
-    return columns / axis.noise
+    return jax.vmap(lambda unit: jax.jvp(record, (zero,), (unit,)), out_axes=(None, 1))(units)
 
 
 def relative_numbers(

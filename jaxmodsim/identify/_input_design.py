@@ -63,8 +63,8 @@ class Excitation:
     - `q_ref`, `qd_ref`: position [m] and velocity [m/s] that are asked for.
     - `force`: force [N] that leads the model along them, held from each sample to the next.
     - `q`, `qd`: position and velocity of the model under this force alone, with no feedback.
-    - `information`: Fisher information of the free numbers, each in units of itself (of 1 if it is zero): the inverse is
-      the covariance of the relative errors. Of the record alone, without any prior. Shape `[free, free]`.
+    - `information`: Fisher information of the free numbers, each in units of itself (of 1 if it is zero): the inverse
+      is the covariance of the relative errors. Of the record alone, without any prior. Shape `[free, free]`.
     - `errors`: predicted standard errors by name, in the unit of the number; infinite where nothing is learned.
     - `correlation`: of the errors, shape `[free, free]`.
     """
