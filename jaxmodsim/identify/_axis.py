@@ -13,7 +13,6 @@ from ..scene import Scene, replace_numbers
 from ._record import Record
 from ._smooth import differentiate, smooth, smooth_span
 
-
 # Over which time an offset of the drive dies away, where a record does not tell [s]. One of 25 s on a warming drive is
 # followed as well by 8 s as by a straight line.
 _DRIFT_TIME = 20.0

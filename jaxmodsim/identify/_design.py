@@ -97,8 +97,9 @@ def design_input(
     model with one and with four integration steps for every sample.
 
     Slow motion on the brink of sticking tells most on paper, but a model whose numbers are a little off leaves such a
-    motion altogether, and no fit finds back. So an error of `uncertainty` in any one number may move the simulated
-    record, to first order, by no more than the record's own reach.
+    motion altogether. So an error of `uncertainty` in any one number may move the simulated record, to first order, by
+    no more than the record's own reach. That does not promise that a fit converges from numbers which are so far
+    off: start it from the numbers the design was made for, and judge it by its RMSE against the noise.
 
     A design is the best one for the numbers the scene has: take those of a first fit. Standard errors are those of a
     right model and white noise.
@@ -160,7 +161,7 @@ def design_input(
 
     fine, coarse = task(samples), task((samples - 1) // stride + 1)
     sines = [_fill(_coarse_share, coarse, column) for column in np.eye(2 * harmonics)[:harmonics]]
-    plain = max(sines, key=lambda x: _merit(coarse, x))
+    plain = max(sines, key=lambda x: float(_judge(coarse, jnp.asarray(x, float))[0]))
     best, ending = _improve(coarse, sines, plain, seed, max_steps, progress)
     designed, compared = (
         _excitation(fine, _fill(_fine_share, fine, x), parameters.names, scale) for x in (best, plain)
