@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from .analysis import Sensitivity
 from .behaviour import Experiment, Outcome, Verdict
-from .identify import FitResult
+from .identify import FitResult, Record, Score
 
 _BLUE, _RED, _GREY, _GREEN = "#1f5fa8", "#c2452d", "#8a8a8a", "#2e8b57"
 _VERDICTS = {
@@ -117,24 +117,45 @@ def stick_figure(
     return figure
 
 
-def fit_figure(result: FitResult, *, quantity: str = "position", unit: str = "m", caption: str = "") -> Figure:
+def fit_figure(
+    result: FitResult, *, record: int = 0, quantity: str = "position", unit: str = "m", caption: str = ""
+) -> Figure:
     """Measured and simulated against time, and their difference.
 
     **Arguments:**
 
-    - `result`: the fit.
+    - `result`: the fit of one channel.
+    - `record`: number of the record that is drawn.
     - `quantity`, `unit`: what was measured.
     - `caption`: a line for the source of the record.
     """
-    record, figure = result.record, Figure(figsize=(11, 6), layout="constrained")
+    (residual,) = result.residuals[record].values()
+    return _followed(result.records[record], residual, "simulated, open loop", quantity, unit, caption)
+
+
+def score_figure(score: Score, *, quantity: str = "position", unit: str = "m", caption: str = "") -> Figure:
+    """A fitted model on a record that it was not fitted to: measured and simulated, and their difference.
+
+    **Arguments:**
+
+    - `score`: from `FitResult.score`, of one channel.
+    - `quantity`, `unit`: what was measured.
+    - `caption`: a line for the source of the record.
+    """
+    (residual,) = score.residuals.values()
+    return _followed(score.record, residual, "simulated, not fitted to it", quantity, unit, caption)
+
+
+def _followed(record: Record, residual: np.ndarray, label: str, quantity: str, unit: str, caption: str) -> Figure:
+    figure = Figure(figsize=(11, 6), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     above.plot(record.t, record.measured, color=_GREY, lw=2.4, label="measured")
-    above.plot(record.t, result.simulated, color=_RED, lw=1.1, label="simulated, open loop")
+    above.plot(record.t, record.measured + residual, color=_RED, lw=1.1, label=label)
     factor, small = _small_unit(unit)
-    rmse = f"RMSE {factor * result.rmse:.3g} {small}"
+    rmse = f"RMSE {factor * float(np.sqrt(np.mean(residual**2))):.3g} {small}"
     above.set(ylabel=f"{quantity} [{unit}]", title=f"{record.name}: {rmse}")
     above.legend(loc="upper right")
-    below.plot(record.t, factor * (result.simulated - record.measured), color=_BLUE, lw=1.0)
+    below.plot(record.t, factor * residual, color=_BLUE, lw=1.0)
     below.axhline(0.0, color=_GREY, lw=0.6)
     below.set(xlabel="time [s]", ylabel=f"simulated - measured [{small}]")
     if caption:
