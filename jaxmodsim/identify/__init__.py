@@ -8,9 +8,16 @@ from ._begin import Continuation as Continuation
 from ._begin import MultiStart as MultiStart
 from ._coverage import Coverage as Coverage
 from ._coverage import coverage as coverage
+from ._design import design_input as design_input
 from ._fit import fit as fit
 from ._fit_law import fit_law as fit_law
 from ._fit_law import law_force as law_force
+from ._goals import a_optimal as a_optimal
+from ._goals import d_optimal as d_optimal
+from ._goals import e_optimal as e_optimal
+from ._input_design import Excitation as Excitation
+from ._input_design import InputDesign as InputDesign
+from ._input_design import Limits as Limits
 from ._losses import Cauchy as Cauchy
 from ._losses import Huber as Huber
 from ._losses import Squares as Squares

@@ -67,7 +67,7 @@ class MultiStart(AbstractBeginning):
     def starts(self, problem: Problem, x: Float[Array, " n"]) -> Float[np.ndarray, "count n"]:
         """Where the searches start; the first one at `x`."""
         size = len(problem.free.names)
-        points = qmc.Sobol(size, seed=self.seed).random(1 << max(self.count - 1, 1).bit_length())[: self.count]
+        points = qmc.Sobol(size, rng=self.seed).random(1 << max(self.count - 1, 1).bit_length())[: self.count]
         away = 2 * points - 1  # -1 to 1
         here = np.asarray(x[:size])
         lower, upper = (np.asarray(each) for each in problem.free.bounds)

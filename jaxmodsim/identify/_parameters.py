@@ -110,6 +110,12 @@ class FreeParameters(eqx.Module):
             _upper={name: jnp.asarray(x) for name, x in upper.items()},
         )
 
+    @property
+    def followed(self) -> dict[str, str]:
+        """What each parameter follows that is not free but moves with one that is."""
+        bases = dict(zip(self._order, self._bases, strict=True))
+        return {name: str(bases[name]) for name in self.following}
+
     def _kind(self, name: str) -> str:
         return self._kinds[self._order.index(name)]
 

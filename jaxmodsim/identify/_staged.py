@@ -32,14 +32,17 @@ _DAMPING = 0.3
 
 
 class _Sampled(NamedTuple):
-    """What is known at each sample: time, motion, inputs, and the measured friction force where there is one."""
+    """What is known at each sample, shape `[samples]` each; inside `jax.vmap` at one of them.
 
-    t: Float[Array, " samples"]
-    q: Float[Array, " samples"]
-    v: Float[Array, " samples"]
-    a: Float[Array, " samples"]
-    inputs: dict[str, Array]
-    force: Float[Array, " samples"] | None
+    Time, position, velocity, acceleration, inputs, and the measured friction force, or None.
+    """
+
+    t: Any
+    q: Any
+    v: Any
+    a: Any
+    inputs: dict[str, Any]
+    force: Any
 
 
 class Staged(AbstractBeginning):
@@ -98,7 +101,7 @@ def _sampled(problem: Problem) -> _Sampled:
     """All runs, one after the other, without what the smoothing spoils at their ends."""
     parts: list[_Sampled] = []
     law_alone = problem.base is None
-    if not law_alone and problem.base.q.shape[1] != 1:
+    if problem.base is not None and problem.base.q.shape[1] != 1:
         raise ValueError("Staged() needs a scene with one coordinate; give start values, or MultiStart(...).")
     for run in range(problem.count):
         samples = jax.tree.map(lambda x, run=run: np.asarray(x[run]), problem.runs)
