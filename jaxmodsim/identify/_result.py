@@ -1,6 +1,6 @@
 """What a fit found, with how sure it is."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
@@ -10,9 +10,15 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
+from ..friction import AbstractLaw
+from ..scene import Scene
+from ._causes import Cause, causes_of
 from ._covariance import BLOCKS
+from ._model import PREFIX, holder_of, model_numbers
+from ._motion import Motion, coordinates_seen, motion_of
+from ._profile import Profile, profile_of
 from ._record import Record
-from ._remarks import remarks_of
+from ._remarks import remarks_of, uncertain_of
 from ._runs import Windows
 from ._solve import Found, by_channel, spread_of
 
@@ -38,6 +44,9 @@ class FitResult:
       there are none.
     - `starts`: root mean square, in noise levels, that each of several starts ended with, best first.
     - `single_precision`: whether it was computed in float32.
+    - `numbers`: all numbers of the model by name, those that were not fitted included.
+    - `seen`: channels (of a law by itself, inputs) that are a coordinate or a velocity: `q[0]`, `qd[0]`, by name.
+    - `causes`: what the motion lacks, and which parameters that leaves unknown; part of `remarks`.
     - `found`: the search, for further questions; None in a result that was loaded.
     """
 
@@ -60,6 +69,9 @@ class FitResult:
     step_error: float | None
     starts: tuple[float, ...]
     single_precision: bool
+    numbers: dict[str, np.ndarray]
+    seen: dict[str, str]
+    causes: tuple[Cause, ...]
     found: Found | None
 
     @property
@@ -106,6 +118,13 @@ class FitResult:
         )
 
     @property
+    def motions(self) -> tuple[Motion, ...]:
+        """Coordinates and velocities as far as the model's output shows them, one a record."""
+        return tuple(
+            motion_of(record, seen, self.seen) for record, seen in zip(self.records, self.outputs, strict=True)
+        )
+
+    @property
     def correlation(self) -> Float[np.ndarray, "free free"]:
         """Correlation of the parameters, in the order of `values`."""
         errors = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
@@ -138,6 +157,30 @@ class FitResult:
             else:
                 found[name] = (max(value - margin, low), min(value + margin, high))
         return {name: (float(a), float(b)) for name, (a, b) in found.items()}
+
+    def profile(self, name: str, *, points: int = 6, level: float = 0.95) -> Profile:
+        """Profile likelihood of one parameter: all others, and free initial states, are fitted again at each value.
+
+        Unlike `intervals` it holds where the model is far from linear, and shows what the record leaves open: it
+        walks both ways from the estimate, in the logarithm of a parameter that must be positive, until the fit is
+        worse than the level allows. The noise levels stay as they are. Costs a few evaluations a point, and compiles
+        nothing.
+
+        **Arguments:**
+
+        - `name`: of a free parameter that is no initial state.
+        - `points`: about how many on either side, at least 2.
+        - `level`: of the interval, between 0 and 1.
+
+        **Returns:**
+
+        A `Profile`, drawn by `jaxmodsim.plot.profile_figure`.
+
+        **Raises:**
+
+        - `ValueError` for another name or level, or of a result that was loaded.
+        """
+        return profile_of(self, name, points, level)
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -211,8 +254,8 @@ def result_of(
             values += (base[i] + np.asarray(own[i])).tolist()
     how_sure = spread_of(problem, search, len(names))
     errors = np.sqrt(np.maximum(np.diag(np.asarray(how_sure.covariance)), 0.0))
-    seen, rmse = _stitched(found, records, windows)
-    return FitResult(
+    outputs, rmse = _stitched(found, records, windows)
+    result = FitResult(
         dict(zip(names, values, strict=True)),
         dict(zip(names, errors.tolist(), strict=True)),
         dict(zip(names, at_start, strict=True)),
@@ -224,7 +267,7 @@ def result_of(
         problem.free.limits(shared) | {name: (-np.inf, np.inf) for name in names[len(problem.free.names) :]},
         model,
         records,
-        seen,
+        outputs,
         {name: float(x) for name, x in problem.noise.items()},
         rmse,
         found.iterations,
@@ -232,8 +275,34 @@ def result_of(
         step_error,
         starts,
         jnp.result_type(float) == jnp.float32,
+        model_numbers(model),
+        _seen(found),
+        (),
         found,
     )
+    return replace(result, causes=_causes(result))
+
+
+def _seen(found: Found) -> dict[str, str]:
+    """Which channels, or inputs of a law, are coordinates and velocities."""
+    base = found.problem.base
+    if base is None:
+        return {"x": "q[0]"} if "x" in found.problem.runs.inputs else {}
+    return coordinates_seen(found.problem.engine.observables, base.q.shape[-1])
+
+
+def _causes(result: FitResult) -> tuple[Cause, ...]:
+    """Causes in the motion for what the figures call uncertain."""
+    uncertain = uncertain_of(result)
+    assert result.found is not None
+    base, model = result.found.problem.base, result.model
+    law = isinstance(model, AbstractLaw)
+    scene = holder_of(model) if law else model
+    if not uncertain or not isinstance(scene, Scene):
+        return ()
+    dof = 1 if base is None else base.q.shape[-1]
+    free = result.found.problem.free.names
+    return causes_of(scene, PREFIX if law else "", result.motions, dof, result.numbers, free, uncertain)
 
 
 def _first_states(found: Found) -> np.ndarray:
