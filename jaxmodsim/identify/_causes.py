@@ -95,10 +95,8 @@ def presliding(element: Element) -> Cause | None:
     if not element.has(LuGre, Dahl, ElastoPlastic) or sigma0 is None or Fc is None:
         return None
     Fs, vs = element.number("Fs"), element.number("vs")
-    share = max(
-        _bristle_share(slip, float(sigma0), float(Fc), float(Fc if Fs is None else Fs), float(1.0 if vs is None else vs))
-        for slip in element.slips
-    )
+    level = (float(Fc), float(Fc if Fs is None else Fs), float(1.0 if vs is None else vs))
+    share = max(_bristle_share(slip, float(sigma0), *level) for slip in element.slips)
     about = element.own("Fc", "Fs", "vs", "Fba", "vd", "sigma2")
     if share >= _NEAR_LIMIT or not about:
         return None
@@ -106,7 +104,7 @@ def presliding(element: Element) -> Cause | None:
     stroke = max(_largest_stroke(slip.x) for slip in element.slips)
     return Cause(
         f"{element.label}This record never leaves presliding: between reversals it slips {stroke:.2g} at most, and the"
-        f" bristle reaches {100 * share:.0f} % of its limit ({float(Fc if Fs is None else Fs) / float(sigma0):.2g}):"
+        f" bristle reaches {100 * share:.0f} % of its limit ({level[1] / float(sigma0):.2g}):"
         f" {_listed(about)} {rest}.",
         about,
     )

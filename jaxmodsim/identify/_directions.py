@@ -21,8 +21,8 @@ class Direction:
     """A way in which the parameters can change together without the record telling.
 
     - `names`: of the parameters that take part, the strongest first.
-    - `changes`: their relative changes, the largest 1, in this order; absolute ones for a parameter that is 0.
-    - `error`: standard error along it, relative to the strongest parameter.
+    - `changes`: their changes relative to the value or the start, whichever is larger; the largest 1.
+    - `error`: standard error along it, relative in the same way.
     - `sentence`: in words.
     """
 
@@ -42,45 +42,57 @@ def weak_directions(result: "FitResult", left_out: Collection[str]) -> list[Dire
     if len(names) < 2:
         return []
     keep = [list(result.values).index(name) for name in names]
-    size = np.array([abs(result.values[name]) or 1.0 for name in names])
+    size = np.array([max(abs(result.values[name]), abs(result.start[name])) or 1.0 for name in names])
     relative = result.information[np.ix_(keep, keep)] * np.outer(size, size)
-    scale = np.sqrt(np.maximum(np.diag(relative), 1e-300))
     values, vectors = np.linalg.eigh(relative)
-    # The inverse in columns of unit length, where a direction that is not known at all stays finite.
-    own, turned = np.linalg.eigh(relative / np.outer(scale, scale))
-    inverse = turned / np.maximum(own, 1e-14 * max(own[-1], 1.0)) @ turned.T / np.outer(scale, scale)
-    spread = np.diag(result.covariance)[keep] / size**2
-    factor = float(np.median(np.maximum(spread, 0.0) / np.diag(inverse)))
+    factor = _inflation(result, keep)
+    found = []
     found = []
     for value, vector in zip(values, vectors.T, strict=True):
-        error = float(np.sqrt(max(factor, 0.0) / max(value, 1e-14 * values[-1])))
+        error = float(np.sqrt(factor / max(value, 1e-14 * values[-1])))
         vector = vector / vector[np.argmax(np.abs(vector))]
         order = [i for i in np.argsort(-np.abs(vector)) if abs(vector[i]) >= _PART]
         if error < _WEAK or len(order) < 2:
             continue
         parts = tuple(names[i] for i in order)
-        sentence = _sentence(result, parts, vector[order], error)
+        sentence = _sentence(result, parts, vector[order], error, size[order])
         found.append(Direction(parts, tuple(float(vector[i]) for i in order), error, sentence))
     return found
 
 
-def _sentence(result: "FitResult", names: tuple[str, ...], vector: Float[np.ndarray, " parts"], error: float) -> str:
+def _inflation(result: "FitResult", keep: list[int]) -> float:
+    """What correlation in time and the true size of the residual make of a variance by the Fisher information.
+
+    From the parameters that are known well: of the others the covariance is no more than a large number.
+    """
+    level = float(np.mean([(result.rmse_by[name] / noise) ** 2 for name, noise in result.noise.items()]))
+    sizes = np.abs(np.array(list(result.values.values())))[keep]
+    variance, white = np.diag(result.covariance)[keep], np.diag(result.white)[keep]
+    known = (variance < (_WEAK * sizes) ** 2) & (white > 0)
+    return level * float(np.median(variance[known] / white[known])) if known.any() else level
+
+
+def _sentence(
+    result: "FitResult",
+    names: tuple[str, ...],
+    vector: Float[np.ndarray, " parts"],
+    error: float,
+    size: Float[np.ndarray, " parts"],
+) -> str:
     how = f"known to {100 * error:.0f} % only" if error < 10 else "not known at all"
     if len(names) == 2:
-        (a, b), (x, y) = names, vector
-        absolute = [c * (result.values[name] or 1.0) for name, c in zip(names, vector, strict=True)]
+        first = list(result.values).index
+        (a, x, u), (b, y, v) = sorted(zip(names, vector, vector * size, strict=True), key=lambda part: first(part[0]))
         alike = result.units[a] == result.units[b]
         positive = min(result.values[a], result.values[b]) > 0
-        if alike and abs(abs(absolute[0] / absolute[1]) - 1) < _EQUAL:
-            what = f"the sum {a} + {b}" if absolute[0] * absolute[1] < 0 else f"the difference {a} - {b}"
+        if alike and abs(abs(u / v) - 1) < _EQUAL:
+            what = f"the sum {a} + {b}" if u * v < 0 else f"the difference {a} - {b}"
             return f"The record determines only {what}; how it is shared between them is {how}."
         if positive and abs(abs(x / y) - 1) < _EQUAL:
             what, other = ("product {} {}", "ratio") if x * y < 0 else ("ratio {}/{}", "common size")
             return f"The record determines only the {what.format(a, b)}; their {other} is {how}."
     small = 0.1
-    changes = ", ".join(f"{name} by {100 * small * c:+.0f} %" for name, c in zip(names, vector, strict=True))
-    if any(result.values[name] == 0 for name in names):
-        changes = ", ".join(f"{name} by {small * c:+.2g}" for name, c in zip(names, vector, strict=True))
+    changes = ", ".join(f"{name} by {small * c * s:+.2g}" for name, c, s in zip(names, vector, size, strict=True))
     return (
         f"The record determines only combinations of {', '.join(names)}: a change of {changes} together hardly shows"
         f" (this direction is {how})."

@@ -36,8 +36,8 @@ class Profile:
     - `ratio`: by how much the sum of losses is larger than at the estimate, in units of what the covariance of the
       fit makes of one squared standard error; shape `[points]`. It is `((value - estimate)/error)^2` where the model is
       linear. In other words: the logarithm of the likelihood ratio, times two, with the variance of the residual as it
-      was estimated, divided by the ratio of `covariance` to `white`, by which correlated residuals know less than
-      white ones.
+      was estimated, divided by the ratio of `covariance` to `white` (at least 1/2), by which correlated residuals know
+      less than white ones.
     - `cost`: half the sum of losses in noise levels, shape `[points]`.
     - `level`, `threshold`: of the interval, and the ratio at its ends: the quantile of F with 1 and 31 degrees of
       freedom (blocks of samples less one), the square of Student's t in `FitResult.intervals`.
@@ -62,9 +62,13 @@ class Profile:
     def __str__(self) -> str:
         """The interval and why an end of it is open."""
         low, high = self.interval
+        width = min(abs(self.estimate - low), abs(high - self.estimate))
+        # Two digits of the width of the interval.
+        share = width / abs(self.estimate) if self.estimate and math.isfinite(width) else 1.0
+        digits = min(max(6, 2 - math.floor(math.log10(max(share, 1e-15)))), 16)
         head = (
-            f"{self.name} = {self.estimate:.6g} {self.unit}, {100 * self.level:g} % interval by the profile likelihood"
-            f" {low:.5g} to {high:.5g}"
+            f"{self.name} = {self.estimate:.{digits}g} {self.unit or '(no unit)'}, {100 * self.level:g} % interval by"
+            f" the profile likelihood {low:.{digits}g} to {high:.{digits}g}"
         )
         return "\n".join([head, *self.notes])
 
@@ -155,7 +159,7 @@ def profile_of(result: "FitResult", name: str, points: int, level: float) -> Pro
     if isinstance(points, bool) or not isinstance(points, int) or points < 2:
         raise ValueError(f"points must be an integer >= 2, but it is {points!r}.")
     threshold = float(stats.f.ppf(level, 1, BLOCKS - 1))
-    line, tangent = _line_of(result, name, threshold)
+    line, tangent = _line_of(result, name)
     estimate = result.values[name]
     start = _Point(line.coordinate(estimate), np.asarray(result.found.search.x), 0.0, line.best)
     down, up = (_walk(line, start, tangent, side, threshold, points) for side in (-1.0, 1.0))
@@ -188,7 +192,7 @@ def _values(problem: Problem, x: np.ndarray) -> dict[str, np.ndarray]:
     return {name: np.asarray(values[name]) for name in problem.free.names}
 
 
-def _line_of(result: "FitResult", name: str, threshold: float) -> tuple[_Line, np.ndarray]:
+def _line_of(result: "FitResult", name: str) -> tuple[_Line, np.ndarray]:
     """The line, and the derivative of the best x by the parameter as the linear model has it."""
     assert result.found is not None
     problem, search = result.found.problem, result.found.search
@@ -201,9 +205,11 @@ def _line_of(result: "FitResult", name: str, threshold: float) -> tuple[_Line, n
     residual, _ = problem.loss.weighted(search.residual[: problem.samples], search.jacobian[: problem.samples])
     counted = float(np.sum(np.asarray(problem.weights) > 0))
     variance = float(np.sum(np.asarray(residual) ** 2)) / max(counted - search.x.shape[0], 1)
-    # A squared standard error costs error^2 / by_losses; the variance of white residuals where that says nothing.
+    # A squared standard error costs error^2 / by_losses, which is the variance of white residuals. Where one block of
+    # samples decides, the scatter over blocks may say next to nothing by chance, and half of that is the least.
     inflation = error**2 / by_losses if by_losses > 0 else math.nan
-    inflation = inflation if math.isfinite(inflation) and inflation > 0 else max(variance, 1e-300)
+    inflation = max(inflation, 0.5 * variance) if math.isfinite(inflation) else variance
+    inflation = max(inflation, 1e-300)
     floor, limits = None, problem.free.fixed_limits(name)
     if name in result.logarithmic:
         floor = limits[0]
@@ -244,7 +250,9 @@ def _walk(line: _Line, start: _Point, tangent: np.ndarray, side: float, threshol
             return _End(path[1:], last.u, f"{line.name} reaches its limit {line.value(limit):g} within this interval.")
         if abs(last.u - start.u) >= line.reach:
             text = f"{line.name} has no {word} limit from this record"
-            return _End(path[1:], side * math.inf, f"{text}: as far as {line.value(last.u):.3g} nothing speaks against.")
+            return _End(
+                path[1:], side * math.inf, f"{text}: as far as {line.value(last.u):.3g} nothing speaks against."
+            )
         u = last.u + side * pace
         u = limit if side * (limit - u) < 0 else u
         point = _try(line, u, last, slope)

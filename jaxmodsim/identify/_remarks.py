@@ -23,7 +23,9 @@ def remarks_of(result: "FitResult") -> tuple[str, ...]:
     """
     explained = {name for cause in result.causes for name in cause.about}
     remarks = [*_of_the_search(result)]
-    remarks += [f"{name} has no effect on this record." for name in result.values if not np.isfinite(result.errors[name])]
+    remarks += [
+        f"{name} has no effect on this record." for name in result.values if not np.isfinite(result.errors[name])
+    ]
     remarks += [cause.sentence for cause in result.causes]
     for name, value in result.values.items():
         if np.isfinite(result.errors[name]) and value in result.bounds[name]:

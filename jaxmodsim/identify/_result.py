@@ -1,6 +1,8 @@
 """What a fit found, with how sure it is."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from os import PathLike
 from typing import Any
 
 import equinox as eqx
@@ -14,12 +16,15 @@ from ..friction import AbstractLaw
 from ..scene import Scene
 from ._causes import Cause, causes_of
 from ._covariance import BLOCKS
-from ._model import PREFIX, holder_of, model_numbers
+from ._model import PREFIX, holder_of, model_numbers, with_numbers
 from ._motion import Motion, coordinates_seen, motion_of
 from ._profile import Profile, profile_of
 from ._record import Record
 from ._remarks import remarks_of, uncertain_of
+from ._residual_tests import ResidualTests, residual_tests_of
 from ._runs import Windows
+from ._save import read_fields, write_fields
+from ._score import Score, score_of
 from ._solve import Found, by_channel, spread_of
 
 
@@ -181,6 +186,81 @@ class FitResult:
         - `ValueError` for another name or level, or of a result that was loaded.
         """
         return profile_of(self, name, points, level)
+
+    def residual_tests(self) -> ResidualTests:
+        """Whether the residuals are noise, how long they remember, and what they go with.
+
+        Position and velocity are those of the model's output, where a channel shows them.
+        """
+        return residual_tests_of(self)
+
+    def score(self, record: Record, *, q0: Any = None, qd0: Any = None, free_start: bool = True) -> Score:
+        """Run the fitted model on another record, with nothing fitted but its initial state.
+
+        **Arguments:**
+
+        - `record`: with the inputs, and some of the channels, of the records that were fitted. Better a part of the
+          measurement that the fit has not seen.
+        - `q0`, `qd0`: state at the first sample, shape `[dof]`; by default what the record's beginning shows of each
+          coordinate that was measured, the others 0.
+        - `free_start`: whether the state at the first sample is fitted to this record, from `q0` and `qd0`. If not, it
+          is as given, by default the first measured position and rest. A law by itself starts unloaded at rest always.
+
+        **Returns:**
+
+        A `Score`.
+
+        **Raises:**
+
+        - `ValueError` for channels or inputs that the fit does not know, or of a result that was loaded.
+        """
+        return score_of(self, record, q0, qd0, free_start)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write everything but the model's functions and the search into one file, whole or not at all.
+
+        A zip of one JSON text and of arrays (`numpy.load` opens it, too), in which every number stays what it is.
+        """
+        write_fields(path, {field.name: getattr(self, field.name) for field in fields(self)})
+
+    @staticmethod
+    def load(path: str | PathLike[str], model: eqx.Module | None = None) -> "FitResult":
+        """A result that `save` wrote. It can do all but run the model: no `profile` and no `score`.
+
+        **Arguments:**
+
+        - `path`: of the file.
+        - `model`: the scene or law that was fitted, with any numbers; `model` of the result is this one with all its
+          numbers as they were.
+
+        **Raises:**
+
+        - `ValueError` for a file that is damaged or something else, or a model whose numbers have other names.
+        - `OSError` if the file cannot be read.
+        """
+        found = read_fields(path, tuple(field.name for field in fields(FitResult)))
+        given = None if model is None else with_numbers(model, found["numbers"])
+        return FitResult(**found, model=given, found=None)
+
+    def plot(self, record: int = 0, units: Mapping[str, str] | None = None) -> Any:
+        """One figure for a report: record and residual, its autocorrelation, intervals and correlations.
+
+        **Arguments:**
+
+        - `record`: number of the record that is drawn.
+        - `units`: of the channels by name, for the axes: `{"measured": "m"}`.
+
+        **Returns:**
+
+        A `matplotlib.figure.Figure`, as `jaxmodsim.plot.result_figure` draws it.
+
+        **Raises:**
+
+        - `ValueError` if there is no such record or channel.
+        """
+        from ..plot import result_figure
+
+        return result_figure(self, record=record, units=units)
 
     @property
     def remarks(self) -> tuple[str, ...]:
