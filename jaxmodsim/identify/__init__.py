@@ -23,9 +23,12 @@ from ._losses import Huber as Huber
 from ._losses import Squares as Squares
 from ._observe import first_coordinate as first_coordinate
 from ._prepare import Shooting as Shooting
+from ._profile import Profile as Profile
 from ._record import Record as Record
 from ._replay import Controller as Controller
 from ._replay import replay as replay
+from ._residual_tests import ResidualTests as ResidualTests
 from ._result import FitResult as FitResult
+from ._score import Score as Score
 from ._staged import Staged as Staged
 from ._starts import start_state as start_state
