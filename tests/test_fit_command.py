@@ -16,17 +16,22 @@ from jaxmodsim.identify import FitResult, rough_axis
 
 GAIN = 12.0
 COLUMNS = ("--time", "time", "--position", "pos", "--force", "volt", "--force-gain", str(GAIN))
+# Friction as the records have it, and integration steps that follow its changes of sign.
+MODEL = ("--fix", "dry.width=1e-3", "--limit", "m=:50", "--substeps", "2")
 NAMES = AxisColumns("time", "pos", "volt", GAIN)
 TRUTH = {"m": 5.0, "offset": 0.7, "dry.Fc": 3.0, "viscous.Fv": 8.0}
 
 
 def axis_frame(seed: int = 0, v: float = 0.0) -> pd.DataFrame:
-    """A record of an axis with the numbers of TRUTH, from a plain Euler simulation that starts at the velocity `v`."""
-    t = 10.0 + np.arange(0.0, 2.0, 5e-3)
-    u = 0.8 * np.sign(np.sin(5.1 * t + seed)) + 1.5 * np.sin(9.3 * t)
+    """A record of an axis with the numbers of TRUTH, from a plain Euler simulation that starts at the velocity `v`.
+
+    There is no force over the first 20 samples, the parabola through which is to show the velocity.
+    """
+    t = 10.0 + np.arange(0.0, 2.0, 2.5e-3)
+    u = np.where(t > 10.05, 0.8 * np.sign(np.sin(5.1 * t + seed)) + 1.5 * np.sin(9.3 * t), 0.0)
     q = np.zeros_like(t)
     for k in range(1, t.size):
-        for _ in range(50):
+        for _ in range(25):
             v += 1e-4 * (GAIN * u[k - 1] - 0.7 - 3.0 * np.tanh(v / 1e-3) - 8.0 * v) / 5.0
             q[k] += 1e-4 * v
         q[k] += q[k - 1]
@@ -73,7 +78,7 @@ class Page(HTMLParser):
 def fitted(run_command, files, tmp_path_factory):
     """The fit of two records with a third held out, and a report."""
     out = tmp_path_factory.mktemp("fit")
-    command = ("fit", *files[:2], *COLUMNS, "--hold-out", files[2], "--fix", "dry.width=1e-3", "--limit", "m=:50")
+    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--hold-out", files[2])
     code, text, errors = run_command(*command, "--out", str(out), "--report", str(out / "report"))
     assert code == 0, errors
     return out, text
@@ -83,7 +88,7 @@ def test_several_records_are_fitted_together_and_a_held_out_one_is_scored(fitted
     out, text = fitted
     found = json.loads((out / "fit.json").read_text())
     values = {name: entry["value"] for name, entry in found["parameters"].items()}
-    # Steps of 5 ms over a force that jumps and friction that changes its sign within: a per cent or two.
+    # The parabola leaves an error of 0.3 mm/s in the velocity that the second record starts at.
     assert values == pytest.approx(TRUTH, rel=0.03)
     assert found["records"] == ["run <b>1", "run2"]
     assert found["parameters"]["m"]["unit"] == "kg"
@@ -100,7 +105,7 @@ def test_several_records_are_fitted_together_and_a_held_out_one_is_scored(fitted
 def test_samples_and_result_are_kept(fitted):
     out, _ = fitted
     frame = pd.read_csv(out / "fit.csv")
-    assert frame.groupby("record").size().to_dict() == {"run <b>1": 400, "run2": 400, "test": 400}
+    assert frame.groupby("record").size().to_dict() == {"run <b>1": 800, "run2": 800, "test": 800}
     assert set(frame["record"][frame["use"] == "held out"]) == {"test"}
     error = frame["simulated [m]"] - frame["measured [m]"]
     found = json.loads((out / "fit.json").read_text())
@@ -143,7 +148,7 @@ def test_ctrl_c_keeps_what_was_found(run_command, files, tmp_path, monkeypatch):
 
     monkeypatch.setattr(_fit, "fit", stopped)
     out = tmp_path / "out"
-    command = ("fit", *files[:2], *COLUMNS, "--fix", "dry.width=1e-3", "--limit", "m=:50", "--hold-out", files[2])
+    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--hold-out", files[2])
     code, _, errors = run_command(*command, "--out", str(out), "--report", str(out))
     assert code == 130
     assert errors == "jaxmodsim: interrupted; what was found until then is written\n"
@@ -157,7 +162,7 @@ def test_ctrl_c_keeps_what_was_found(run_command, files, tmp_path, monkeypatch):
 def test_models_are_compared(run_command, files, tmp_path):
     out = tmp_path / "out"
     command = ("fit", files[0], *COLUMNS, "--compare", "coulomb,asymmetric", "--folds", "2", "--begin", "staged")
-    code, text, errors = run_command(*command, "--fix", "dry.width=1e-3", "--out", str(out), "--report", str(out))
+    code, text, errors = run_command(*command, *MODEL, "--out", str(out), "--report", str(out))
     assert code == 0, errors
     found = json.loads((out / "fit.json").read_text())
     # Friction is the same in both directions, so the second model has a parameter more for nothing.
@@ -176,7 +181,7 @@ def test_models_are_compared(run_command, files, tmp_path):
 def test_the_next_input_is_written(run_command, files, tmp_path):
     out = tmp_path / "out"
     limits = ("--max-force", "30", "--max-travel", "0.1", "--duration", "1.5")
-    command = ("fit", *files[:2], *COLUMNS, "--fix", "dry.width=1e-3", "--limit", "m=:50", "--hold-out", files[2])
+    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--hold-out", files[2])
     code, text, errors = run_command(*command, "--next", str(out / "next.csv"), *limits, "--out", str(out))
     assert code == 0, errors
     frame = pd.read_csv(out / "next.csv")
@@ -239,7 +244,7 @@ def check_refusal(run_command, out: Path, text: str, *command: str) -> None:
         (("--position", "poss"), "no column 'poss' .*time, pos, volt.* Did you mean --position pos"),
         (("--model", "coulom"), "no model 'coulom'; the models are: coulomb, asymmetric.* Did you mean coulomb"),
         (("--compare", "coulomb,lugr"), "no model 'lugr'.* Did you mean lugre"),
-        (("--compare", "coulomb"), "two models or more, A,B, but 'coulomb'"),
+        (("--compare", "coulomb"), "two models or more, A,B, but 'coulomb' was given"),
         (("--compare", "all", "--free", "m"), "--free does not go with --compare"),
         (("--free", "m,dry.Fs"), "no name 'dry.Fs'; .* Did you mean dry.Fc"),
         (("--free", "m", "--fix", "m=2"), "m stands in --free and in --fix"),
@@ -292,7 +297,7 @@ def test_bad_tables_are_one_sentence_and_exit_code_two(run_command, tmp_path, co
     [
         ("a.parquet", b"PAR1 and no more", "damaged or no Parquet file"),
         ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(105) + b"\x00\x01IM" + bytes(7), "damaged or no MATLAB file"),
-        ("a.mat", b"MATLAB 7.3 MAT-file" + b" " * 105 + b"\x00\x02IM" + bytes(400), "MATLAB 7.3 .*'-v7'"),
+        ("a.mat", b"MATLAB 7.3 MAT-file" + b" " * 105 + b"\x00\x02IM" + bytes(800), "MATLAB 7.3 .*'-v7'"),
         ("a.csv", b"\xff\xfe\x00\x80", "no CSV file"),
         ("a.xlsx", b"PK", "must be one of .csv, .txt, .parquet, .mat"),
         ("axis", b"", "must be one of"),
@@ -307,7 +312,7 @@ def test_damaged_and_unknown_files_are_one_sentence(run_command, tmp_path, name,
 def test_matlab_vectors_of_other_lengths_and_folders_are_refused(run_command, files, tmp_path):
     path, out = tmp_path / "a.mat", tmp_path / "out"
     write_mat(path, {"time": np.arange(3.0), "pos": np.arange(4.0), "volt": np.arange(3.0)})
-    check_refusal(run_command, out, r"'pos' has \(4,\)", str(path), *COLUMNS)
+    check_refusal(run_command, out, r"'t' has \(3,\) and 'measured' has \(4,\)", str(path), *COLUMNS)
     write_mat(path, {"time": np.arange(3.0), "pos": np.eye(3), "volt": np.arange(3.0)})
     check_refusal(run_command, out, "no column 'pos' .*it has: time, volt", str(path), *COLUMNS)
     check_refusal(run_command, out, "is a folder; a file is needed", str(tmp_path))

@@ -7,6 +7,9 @@ from ..friction import AbstractAsymmetric, Coulomb, Dahl, LuGre, Regularized, St
 from ..numerics import ranges_of
 from ..scene import Scene
 
+# What the drive has beside its force, by the name of the param without which it is none.
+_TERMS = {"offset": "offset", "drift": "drift exp(-t/tau)"}
+
 _LEVEL = "g(v) = Fc + (Fs - Fc) exp(-(v/vs)^2)"
 _FORMULAS: dict[type, tuple[str, ...]] = {
     Coulomb: ("Fc sign(v)",),
@@ -25,10 +28,10 @@ def equations(scene: Scene) -> tuple[str, ...]:
     - `scene`: from `jaxmodsim.identify.axis_scene`.
     """
     elements = [effect for effect in scene.effects if isinstance(effect, Friction)]
-    assert isinstance(scene.params, dict)
-    others = [name for name in scene.params if name not in ("m", "u")]
-    offset = "offset" if others == ["offset"] else f"offset(t; {', '.join(others)})"
-    lines = [" - ".join([f"m q'' = u - {offset}", *(f"F_{effect.name}" for effect in elements)]) + ",   v = q'"]
+    params = scene.params
+    assert isinstance(params, dict)
+    terms = [term for name, term in _TERMS.items() if float(params[name]) != 0]
+    lines = [" - ".join(["m q'' = u", *terms, *(f"F_{effect.name}" for effect in elements)]) + ",   v = q'"]
     for effect in elements:
         first, *rest = _force(effect.law)
         lines += [f"F_{effect.name} = {first}", *(f"    {line}" for line in rest)]

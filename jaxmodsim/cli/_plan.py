@@ -13,6 +13,7 @@ from ..identify import (
     AXIS_MODELS,
     Candidate,
     Cauchy,
+    Continuation,
     Huber,
     MultiStart,
     Record,
@@ -27,6 +28,8 @@ from ._read import AxisColumns, read_records
 
 _LOSSES = {"squares": Squares, "huber": Huber, "cauchy": Cauchy}
 _BEGINNINGS = ("rough", "staged")
+# How many times wider friction is regularised at first, and in how many fits it comes down.
+_WIDER, _STAGES = 10.0, 2
 # Beside the numbers of the scene: the state at the first sample of each record, and the delay of the force.
 _ALSO_FREE = ("q0", "qd0", "z0", "delay.u")
 
@@ -93,9 +96,7 @@ def plan_of(request: FitRequest) -> Plan:
     _check(request)
     names = _models(request)
     loss = _LOSSES[_known("--loss", request.loss, _LOSSES)]()
-    begin: list[Any] = [Staged()] if _known("--begin", request.begin, _BEGINNINGS) == "staged" else []
-    if request.starts > 1:
-        begin.append(MultiStart(request.starts))
+    _known("--begin", request.begin, _BEGINNINGS)
     together = read_records([*request.records, *request.hold_out], request.columns)
     records, held_out = together[: len(request.records)], together[len(request.records) :]
     rough = rough_axis(max(records, key=lambda record: len(record.t)))
@@ -115,9 +116,22 @@ def plan_of(request: FitRequest) -> Plan:
         free = tuple(each for each in chosen or model.free if each not in fixed)
         candidates[name] = Candidate(axis_scene(model, rough, *own), free, model.words)
     limits = {"m": (0.0, None)} | _limits(request.limit, numbers)
+    begin = _beginnings(request, candidates, numbers)
     options = {"loss": loss, "begin": begin, "substeps": request.substeps, **start_states(records)}
     compared = request.compare is not None or request.folds is not None
     return Plan(candidates, compared, request.folds, records, held_out, limits, options)
+
+
+def _beginnings(
+    request: FitRequest, candidates: Mapping[str, Candidate], numbers: Mapping[str, Sequence[str]]
+) -> list[Staged | MultiStart | Continuation]:
+    """Where a search begins, with the width of the regularisation coming down at last: narrow at once, it is caught."""
+    begin: list[Staged | MultiStart | Continuation] = [Staged()] if request.begin == "staged" else []
+    if request.starts > 1:
+        begin.append(MultiStart(request.starts))
+    free = {name for candidate in candidates.values() for name in candidate.free or ()}
+    widths = dict.fromkeys(each for own in numbers.values() for each in own if each.endswith(".width"))
+    return [*begin, *(Continuation(each, _WIDER, _STAGES) for each in widths if each not in free)]
 
 
 def _check(request: FitRequest) -> None:
