@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from .analysis import Sensitivity
 from .behaviour import Experiment, Outcome, Verdict
-from .identify import FitResult, InputDesign, Profile, Record, Score
+from .identify import Comparison, FitResult, InputDesign, Profile, Record, Score
 
 _BLUE, _RED, _GREY, _GREEN = "#1f5fa8", "#c2452d", "#8a8a8a", "#2e8b57"
 _VERDICTS = {
@@ -460,6 +460,49 @@ def profile_figure(profile: Profile) -> Figure:
     if ratio > 20:
         above.set_xscale("log")
     axes[-1].set_xlabel(_with_unit(profile.name, profile.unit))
+    return figure
+
+
+def comparison_figure(comparison: Comparison, *, unit: str = "m", caption: str = "") -> Figure:
+    """Models by their error on what was held back, beside the error of the fit to everything.
+
+    **Arguments:**
+
+    - `comparison`: from `compare` or `compare_laws`.
+    - `unit`: of the errors; "1" where several channels were compared, in noise levels.
+    - `caption`: a line for the source of the records.
+    """
+    ranked, (factor, small) = comparison.ranked, _small_unit(unit)
+    figure = Figure(figsize=(9, 1.6 + 0.62 * len(ranked)), layout="constrained")
+    axis: Axes = figure.subplots()
+    for i, each in enumerate(ranked):
+        chosen, label = each.name == comparison.simplest, None if i else "label"
+        bar = axis.barh(i - 0.17, factor * each.held_back, 0.4, color=_GREEN if chosen else _BLUE, alpha=0.75)
+        if not chosen and all(name != "held back" for name in axis.get_legend_handles_labels()[1]):
+            bar.set_label("held back")
+        axis.errorbar(
+            factor * each.held_back, i - 0.17, xerr=factor * each.error, color="black", capsize=4, lw=1.2,
+            label=label and "standard error",
+        )  # fmt: skip
+        axis.plot(
+            factor * each.parts, np.full(len(each.parts), i - 0.17), "o", color="white", mec="black", ms=4, ls="",
+            label=label and "each part that was held back",
+        )  # fmt: skip
+        axis.barh(i + 0.2, factor * each.fitted, 0.24, color=_GREY, label=label and "fitted to everything")
+        if chosen:
+            bar.set_label("held back: simplest that suffices")
+    names = [f"{each.name}\n{each.parameters} parameters{', some not determined' if each.undetermined else ''}"
+             for each in ranked]  # fmt: skip
+    axis.set_yticks(range(len(ranked)), names, fontsize=9)
+    axis.invert_yaxis()
+    errors = np.concatenate([[each.held_back, each.fitted] for each in ranked])
+    if errors.max() > 20 * errors.min() > 0:
+        axis.set_xscale("log")
+    axis.set(xlabel=f"root mean square error [{small}]", title=f"Error on what was held back: {comparison.by}")
+    axis.grid(axis="x", alpha=0.3)
+    axis.legend(fontsize=8, loc="lower right")
+    if caption:
+        figure.supxlabel(caption, fontsize=8, color=_GREY)
     return figure
 
 

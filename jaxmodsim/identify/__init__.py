@@ -6,6 +6,10 @@ from ._axis import axis_scene as axis_scene
 from ._axis import rough_axis as rough_axis
 from ._begin import Continuation as Continuation
 from ._begin import MultiStart as MultiStart
+from ._compare import Candidate as Candidate
+from ._compare import compare as compare
+from ._compare import compare_laws as compare_laws
+from ._comparison import Comparison as Comparison
 from ._coverage import Coverage as Coverage
 from ._coverage import coverage as coverage
 from ._design import design_input as design_input
