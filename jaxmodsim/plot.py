@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from .analysis import Sensitivity
 from .behaviour import Experiment, Outcome, Verdict
-from .identify import FitResult, InputDesign
+from .identify import Comparison, FitResult, InputDesign, Profile, Record, Score
 
 _BLUE, _RED, _GREY, _GREEN = "#1f5fa8", "#c2452d", "#8a8a8a", "#2e8b57"
 _VERDICTS = {
@@ -117,24 +117,45 @@ def stick_figure(
     return figure
 
 
-def fit_figure(result: FitResult, *, quantity: str = "position", unit: str = "m", caption: str = "") -> Figure:
+def fit_figure(
+    result: FitResult, *, record: int = 0, quantity: str = "position", unit: str = "m", caption: str = ""
+) -> Figure:
     """Measured and simulated against time, and their difference.
 
     **Arguments:**
 
-    - `result`: the fit.
+    - `result`: the fit of one channel.
+    - `record`: number of the record that is drawn.
     - `quantity`, `unit`: what was measured.
     - `caption`: a line for the source of the record.
     """
-    record, figure = result.record, Figure(figsize=(11, 6), layout="constrained")
+    (residual,) = result.residuals[record].values()
+    return _followed(result.records[record], residual, "simulated, open loop", quantity, unit, caption)
+
+
+def score_figure(score: Score, *, quantity: str = "position", unit: str = "m", caption: str = "") -> Figure:
+    """A fitted model on a record that it was not fitted to: measured and simulated, and their difference.
+
+    **Arguments:**
+
+    - `score`: from `FitResult.score`, of one channel.
+    - `quantity`, `unit`: what was measured.
+    - `caption`: a line for the source of the record.
+    """
+    (residual,) = score.residuals.values()
+    return _followed(score.record, residual, "simulated, not fitted to it", quantity, unit, caption)
+
+
+def _followed(record: Record, residual: np.ndarray, label: str, quantity: str, unit: str, caption: str) -> Figure:
+    figure = Figure(figsize=(11, 6), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     above.plot(record.t, record.measured, color=_GREY, lw=2.4, label="measured")
-    above.plot(record.t, result.simulated, color=_RED, lw=1.1, label="simulated, open loop")
+    above.plot(record.t, record.measured + residual, color=_RED, lw=1.1, label=label)
     factor, small = _small_unit(unit)
-    rmse = f"RMSE {factor * result.rmse:.3g} {small}"
+    rmse = f"RMSE {factor * float(np.sqrt(np.mean(residual**2))):.3g} {small}"
     above.set(ylabel=f"{quantity} [{unit}]", title=f"{record.name}: {rmse}")
     above.legend(loc="upper right")
-    below.plot(record.t, factor * (result.simulated - record.measured), color=_BLUE, lw=1.0)
+    below.plot(record.t, factor * residual, color=_BLUE, lw=1.0)
     below.axhline(0.0, color=_GREY, lw=0.6)
     below.set(xlabel="time [s]", ylabel=f"simulated - measured [{small}]")
     if caption:
@@ -290,6 +311,199 @@ def _error_bars(axis: Axes, design: InputDesign) -> None:
     axis.set(xlim=(low, high), xlabel="predicted standard error [% of the value]")
     axis.set_title(f"{design.t[-1] - design.t[0]:g} s, noise {design.noise:g}", fontsize=10)
     axis.invert_yaxis()
+
+
+def result_figure(result: FitResult, *, record: int = 0, units: Mapping[str, str] | None = None) -> Figure:
+    """A fit on one page: record and residual, its autocorrelation, how sure the parameters are, and their correlation.
+
+    **Arguments:**
+
+    - `result`: the fit.
+    - `record`: number of the record that is drawn.
+    - `units`: of the channels by name, for the axes.
+
+    **Raises:**
+
+    - `ValueError` if there is no such record or channel.
+    """
+    if not 0 <= record < len(result.records):
+        raise ValueError(f"record must be 0 to {len(result.records) - 1}, but it is {record}.")
+    channels = list(result.outputs[record])
+    units = dict(units or {})
+    if set(units) - set(result.rmse_by):
+        raise ValueError(f"units names {', '.join(units)}, but the channels are: {', '.join(result.rmse_by)}.")
+    figure = Figure(figsize=(14, 3.0 + 3.4 * max(len(channels), 2)), layout="constrained")
+    left, right = np.ravel(figure.subfigures(1, 2, squeeze=False, width_ratios=(1.25, 1)))
+    rows = left.subplots(2 * len(channels), 1, sharex=True, squeeze=False, height_ratios=(2, 1) * len(channels))[:, 0]
+    for channel, above, below in zip(channels, rows[::2], rows[1::2], strict=True):
+        _channel_panels(above, below, result, record, channel, units.get(channel, ""))
+    rows[-1].set_xlabel("time [s]")
+    size = 0.6 + 0.32 * len(result.values)
+    memory, sure, alike = right.subplots(3, 1, height_ratios=(2.0, size, 1.3 * size + 1.0))
+    _memory_panel(memory, result, record)
+    _interval_panel(sure, result)
+    _correlation_panel(alike, result)
+    figure.suptitle(f"{result.records[record].name}: {result.ending}, {result.evaluations} evaluations")
+    return figure
+
+
+def _channel_panels(above: Axes, below: Axes, result: FitResult, number: int, channel: str, unit: str) -> None:
+    record, residual = result.records[number], result.residuals[number][channel]
+    factor, small = _small_unit(unit)
+    name = channel if channel != "measured" else "output"
+    above.plot(record.t, record.channels[channel], color="#b4b4b4", lw=3.2, label="measured")
+    above.plot(record.t, result.outputs[number][channel], color=_RED, lw=1.1, label="simulated")
+    rmse = factor * float(np.sqrt(np.mean(residual**2)))
+    above.set(ylabel=_with_unit(name, unit), title=f"{name}: RMSE {rmse:.3g} {small}".rstrip())
+    above.legend(loc="upper right", fontsize=8)
+    below.plot(record.t, factor * residual, color=_BLUE, lw=0.8)
+    below.axhline(0.0, color=_GREY, lw=0.6)
+    below.set(ylabel=_with_unit("residual", small))
+
+
+def _with_unit(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit else name
+
+
+def _memory_panel(axis: Axes, result: FitResult, number: int) -> None:
+    """Autocorrelation of the residuals with the band that white noise would stay in."""
+    record = result.records[number]
+    interval = float(np.median(np.diff(record.t)))
+    colours = (_BLUE, _RED, _GREEN, "#7b4fa3", "#b8860b")
+    tests = [each for each in result.residual_tests().channels if each.record == record.name]
+    for each, colour in zip(tests, colours * (1 + len(tests) // len(colours)), strict=False):
+        lags = interval * np.arange(len(each.autocorrelation))
+        label = f"{each.channel}: p = {each.whiteness:.2g} (white)"
+        axis.plot(lags, each.autocorrelation, color=colour, marker=".", ms=4, lw=0.8, label=label)
+    band = 1.96 / np.sqrt(len(record.t))
+    axis.axhspan(-band, band, color=_GREY, alpha=0.3, lw=0, label="95 % of white noise")
+    axis.axhline(0.0, color=_GREY, lw=0.6)
+    axis.set(xlabel="lag [s]", ylabel="autocorrelation", title="Residual: autocorrelation")
+    axis.legend(loc="upper right", fontsize=8)
+
+
+def _interval_panel(axis: Axes, result: FitResult) -> None:
+    """Half-widths of the intervals relative to the values, in a logarithm, with the figures beside."""
+    names, intervals = list(result.values), result.intervals()
+    shares = []
+    for name in names:
+        scale = abs(result.values[name]) or abs(result.start[name]) or 1.0
+        low, high = intervals[name]
+        shares.append(100 * max(result.values[name] - low, high - result.values[name]) / scale)
+    known = [x for x in shares if np.isfinite(x) and x > 0]
+    # Bars in the left half, figures in the right one.
+    first, last = (float(np.log10(x)) for x in (min(known, default=1.0), max(known, default=1.0)))
+    first, last = np.floor(first - 0.3), np.ceil(last + 0.1)
+    for i, (name, share) in enumerate(zip(names, shares, strict=True)):
+        open_ = not np.isfinite(share)
+        colour = _RED if open_ or share > 100 else "#b8860b" if share > 20 else _GREEN
+        axis.barh(i, 10.0**last if open_ else max(share, 10.0**first), left=0.0, color=colour, height=0.6)
+        value, (low, high) = result.values[name], intervals[name]
+        text = f"{value:.6g} (-{value - low:.2g}, +{high - value:.2g}) {result.units[name]}"
+        axis.text(0.54, i, "no interval: has no effect" if open_ else text, va="center", fontsize=8,
+                  transform=axis.get_yaxis_transform())  # fmt: skip
+    axis.set_xscale("log")
+    decades = np.arange(first, last + 1, max((last - first) // 4, 1))
+    axis.set_xticks(10.0**decades, [f"{10.0**x:g}" for x in decades])
+    axis.minorticks_off()
+    axis.set_yticks(range(len(names)), names, fontsize=8)
+    edges = 10.0**first, 10.0 ** (last + 0.95 * (last - first))
+    axis.set(xlim=edges, ylim=(len(names) - 0.4, -0.6), xlabel="half-width of the 95 % interval [% of the value]")
+    axis.set_title("Parameters: value and 95 % interval")
+
+
+def _correlation_panel(axis: Axes, result: FitResult) -> None:
+    names, correlation = list(result.values), result.correlation
+    image = axis.imshow(correlation, vmin=-1, vmax=1, cmap="RdBu_r", aspect="auto")
+    axis.set_xticks(range(len(names)), names, rotation=30, ha="right", fontsize=8)
+    axis.set_yticks(range(len(names)), names, fontsize=8)
+    if len(names) <= 12:
+        for i, row in enumerate(correlation):
+            for j, x in enumerate(row):
+                shade = "white" if abs(x) > 0.6 else "black"
+                axis.text(j, i, f"{x:+.2f}", ha="center", va="center", fontsize=8, color=shade)
+    axis.set_title("Correlation of the parameters")
+    axis.figure.colorbar(image, ax=axis, label="correlation")
+
+
+def profile_figure(profile: Profile) -> Figure:
+    """The profile likelihood of a parameter, and the other parameters along it.
+
+    **Arguments:**
+
+    - `profile`: from `FitResult.profile`.
+    """
+    others = {name: x for name, x in profile.others.items() if x.size}
+    figure = Figure(figsize=(8, 4.0 + (2.6 if others else 0.0)), layout="constrained")
+    axes = figure.subplots(2 if others else 1, 1, sharex=True, squeeze=False)[:, 0]
+    above = axes[0]
+    above.plot(profile.values, profile.ratio, color=_BLUE, marker=".", label="profile")
+    if np.isfinite(profile.error) and profile.error > 0:
+        x = np.linspace(profile.values[0], profile.values[-1], 200)
+        parabola = ((x - profile.estimate) / profile.error) ** 2
+        above.plot(x, parabola, color=_GREY, ls="--", lw=1.0, label="linear model (standard error)")
+    above.axhline(profile.threshold, color=_RED, lw=1.0, label=f"{100 * profile.level:g} % level")
+    low, high = (min(max(x, profile.values[0]), profile.values[-1]) for x in profile.interval)
+    above.axvspan(low, high, color=_GREEN, alpha=0.15, lw=0, label="interval")
+    top = max(1.6 * profile.threshold, 1.05 * float(np.min(profile.ratio[[0, -1]])))
+    above.set(ylim=(min(-0.03 * top, float(np.min(profile.ratio))), top), ylabel="likelihood ratio")
+    above.set_title("\n".join([f"Profile of {profile.name}", *profile.notes]), fontsize=10)
+    above.legend(fontsize=8)
+    here = int(np.argmin(np.abs(profile.values - profile.estimate)))
+    for name, x in others.items():
+        scale = abs(x[here]) or 1.0
+        axes[-1].plot(profile.values, 100 * (x - x[here]) / scale, marker=".", ms=4, lw=1.0, label=name)
+    if others:
+        axes[-1].set_ylabel("others, change [%]")
+        axes[-1].legend(fontsize=8)
+    ratio = profile.values[-1] / profile.values[0] if profile.values[0] > 0 else 0.0
+    if ratio > 20:
+        above.set_xscale("log")
+    axes[-1].set_xlabel(_with_unit(profile.name, profile.unit))
+    return figure
+
+
+def comparison_figure(comparison: Comparison, *, unit: str = "m", caption: str = "") -> Figure:
+    """Models by their error on what was held back, beside the error of the fit to everything.
+
+    **Arguments:**
+
+    - `comparison`: from `compare` or `compare_laws`.
+    - `unit`: of the errors; "1" where several channels were compared, in noise levels.
+    - `caption`: a line for the source of the records.
+    """
+    ranked, (factor, small) = comparison.ranked, _small_unit(unit)
+    figure = Figure(figsize=(9, 1.6 + 0.62 * len(ranked)), layout="constrained")
+    axis: Axes = figure.subplots()
+    for i, each in enumerate(ranked):
+        chosen, label = each.name == comparison.simplest, None if i else "label"
+        bar = axis.barh(i - 0.17, factor * each.held_back, 0.4, color=_GREEN if chosen else _BLUE, alpha=0.75)
+        if not chosen and all(name != "held back" for name in axis.get_legend_handles_labels()[1]):
+            bar.set_label("held back")
+        axis.errorbar(
+            factor * each.held_back, i - 0.17, xerr=factor * each.error, color="black", capsize=4, lw=1.2,
+            label=label and "standard error",
+        )  # fmt: skip
+        axis.plot(
+            factor * each.parts, np.full(len(each.parts), i - 0.17), "o", color="white", mec="black", ms=4, ls="",
+            label=label and "each part that was held back",
+        )  # fmt: skip
+        axis.barh(i + 0.2, factor * each.fitted, 0.24, color=_GREY, label=label and "fitted to everything")
+        if chosen:
+            bar.set_label("held back: simplest that suffices")
+    names = [f"{each.name}\n{each.parameters} parameters{', some not determined' if each.undetermined else ''}"
+             for each in ranked]  # fmt: skip
+    axis.set_yticks(range(len(ranked)), names, fontsize=9)
+    axis.invert_yaxis()
+    errors = np.concatenate([[each.held_back, each.fitted] for each in ranked])
+    if errors.max() > 20 * errors.min() > 0:
+        axis.set_xscale("log")
+    axis.set(xlabel=f"root mean square error [{small}]", title=f"Error on what was held back: {comparison.by}")
+    axis.grid(axis="x", alpha=0.3)
+    axis.legend(fontsize=8, loc="lower right")
+    if caption:
+        figure.supxlabel(caption, fontsize=8, color=_GREY)
+    return figure
 
 
 def behaviour_figure(experiment: Experiment, outcomes: Mapping[str, Outcome], columns: int = 5) -> Figure:

@@ -6,6 +6,9 @@ from typing import Annotated
 
 import typer
 
+from . import _options
+from ._options import Out
+
 app = typer.Typer(
     name="jaxmodsim",
     help="Differentiable mechanics with friction: test benches, fits to measured records.",
@@ -14,7 +17,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-Out = Annotated[Path, typer.Option(help="Folder for figures, tables and JSON; made if it is not there.")]
+
+class Interrupted(Exception):
+    """Ctrl-C, after which what had been computed was written; the text says so."""
 
 
 def run() -> None:
@@ -24,6 +29,9 @@ def run() -> None:
     except (ValueError, OSError, RuntimeError) as error:
         sys.stderr.write(f"jaxmodsim: {error}\n")
         sys.exit(2)
+    except Interrupted as ending:
+        sys.stderr.write(f"jaxmodsim: {ending}\n")
+        sys.exit(130)
     except SystemExit as ending:
         if ending.code == 130:  # what typer makes of Ctrl-C
             sys.stderr.write("jaxmodsim: interrupted; nothing was written\n")
@@ -75,21 +83,44 @@ def bench_models(
 
 @app.command()
 def fit(
-    record: Annotated[Path, typer.Argument(help="CSV file with a header line.")],
-    time: Annotated[str, typer.Option(help="Column of time [s].")] = "t",
-    position: Annotated[str, typer.Option(help="Column of measured position [m].")] = "q",
-    force: Annotated[str, typer.Option(help="Column of the applied force or drive signal.")] = "u",
-    force_gain: Annotated[float, typer.Option(help="Newtons per unit of the force column.")] = 1.0,
-    model: Annotated[str, typer.Option(help="coulomb, asymmetric, stribeck or lugre.")] = "coulomb",
-    start: Annotated[
-        list[str] | None, typer.Option(help="Start value, NAME=VALUE; by default estimated from the record.")
-    ] = None,
-    fix: Annotated[list[str] | None, typer.Option(help="Value that is not fitted, NAME=VALUE.")] = None,
-    substeps: Annotated[int, typer.Option(help="Integration steps between two samples.")] = 1,
+    record: _options.Records,
+    time: _options.Time = "t",
+    position: _options.Position = "q",
+    force: _options.Force = "u",
+    force_gain: _options.ForceGain = 1.0,
+    model: _options.Model = "coulomb",
+    compare: _options.Compare = None,
+    free: _options.Free = None,
+    start: _options.Start = None,
+    fix: _options.Fix = None,
+    limit: _options.Limit = None,
+    hold_out: _options.HoldOut = None,
+    folds: _options.Folds = None,
+    loss: _options.Loss = "squares",
+    begin: _options.Begin = "rough",
+    starts: _options.Starts = 1,
+    substeps: _options.Substeps = 1,
     out: Out = Path("jaxmodsim-fit"),
+    report: _options.Report = None,
+    next_input: _options.NextInput = None,
+    max_force: _options.MaxForce = None,
+    max_speed: _options.MaxSpeed = None,
+    max_travel: _options.MaxTravel = None,
+    duration: _options.Duration = None,
 ) -> None:
-    """Fit mass, offset and friction of one axis to a record of position and applied force, by open-loop simulation."""
-    _start()
-    from ._fit import AxisColumns, run_fit
+    """Fit mass, offset and friction of one axis to records of position and applied force, by open-loop simulation.
 
-    run_fit(record, AxisColumns(time, position, force, force_gain), model, start or [], fix or [], substeps, out)
+    Ctrl-C ends the search; what it has found by then is written, and the exit code is 130.
+    """
+    _start()
+    from ._fit import run_fit
+    from ._plan import FitRequest
+    from ._read import AxisColumns
+
+    run_fit(
+        FitRequest(
+            record, AxisColumns(time, position, force, force_gain), model, compare, free or [], start or [], fix or [],
+            limit or [], hold_out or [], folds, loss, begin, starts, substeps, out, report, next_input, max_force,
+            max_speed, max_travel, duration,
+        )
+    )  # fmt: skip

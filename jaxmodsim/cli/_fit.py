@@ -1,130 +1,194 @@
-"""`jaxmodsim fit`: one axis, from a record of position and applied force."""
+"""`jaxmodsim fit`: one axis, from records of position and applied force."""
 
-import difflib
+import re
 import time
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
-from ..identify import AXIS_MODELS, FitResult, Record, axis_scene, fit, rough_axis
-from ..plot import fit_figure
+from ..identify import (
+    Comparison,
+    FitResult,
+    InputDesign,
+    Limits,
+    Profile,
+    Record,
+    compare,
+    design_input,
+    fit,
+    rough_axis,
+)
+from ..plot import comparison_figure, design_figure, fit_figure, score_figure
 from ..scene import Scene, scene_numbers
+from ._app import Interrupted
+from ._fitted import Findings, Fitted, origin, parameter_table, record_table, sample_table, summary
 from ._output import console, show_paths, show_table, write
+from ._plan import FitRequest, Plan, plan_of
+from ._report_html import report_page
+
+# Parameters whose likelihood a report profiles, and about how many points on either side.
+_PROFILED, _POINTS = 2, 4
 
 
-@dataclass(frozen=True)
-class AxisColumns:
-    """Names of the record's columns, and newtons per unit of the force column."""
-
-    time: str
-    position: str
-    force: str
-    force_gain: float
-
-
-def read_record(path: Path, columns: AxisColumns) -> Record:
-    """Read a record from a CSV file.
+def run_fit(request: FitRequest) -> None:
+    """Fit, print, and write what was asked for; each part as soon as it is there.
 
     **Raises:**
 
-    - `ValueError` naming a missing column and those that are there, a column that is no number, NaN, or times that
-      do not increase; `OSError` if the file cannot be read.
+    - `ValueError` as `plan_of` does.
+    - `Interrupted` after Ctrl-C, once all that was computed is written.
     """
-    if not np.isfinite(columns.force_gain) or columns.force_gain == 0:
-        raise ValueError(f"--force-gain must be finite and not zero, but it is {columns.force_gain}.")
-    if not path.is_file():
-        raise ValueError(f"There is no file {path}.")
+    plan = plan_of(request)
+    fitted = _fitted(plan)
+    _show(fitted)
+    findings = Findings(fitted, (), None, origin())
+    paths = write(request.out, _files(findings))
+    interrupted = fitted.interrupted
+    profiles: list[Profile] = []
+    design = None
     try:
-        frame = pd.read_csv(path)
-    except (ValueError, pd.errors.ParserError) as error:
-        raise ValueError(f"{path} is no CSV file with a header line: {error}") from error
-    for option, name in (("time", columns.time), ("position", columns.position), ("force", columns.force)):
-        if name not in frame.columns:
-            near = difflib.get_close_matches(name, map(str, frame.columns), n=1)
-            hint = f" Did you mean --{option} {near[0]}?" if near else ""
-            raise ValueError(
-                f"{path.name} has no column {name!r} (--{option}); it has: {', '.join(map(str, frame.columns))}.{hint}"
-            )
-        if not pd.api.types.is_numeric_dtype(frame[name]):
-            bad = int(np.argmax(np.isnan(np.asarray(pd.to_numeric(frame[name], errors="coerce"), float))))
-            given = frame[name].iloc[bad]
-            raise ValueError(f"{path.name}: column {name!r} holds {given!r} in sample {bad}, which is no number.")
-    force = columns.force_gain * frame[columns.force].to_numpy(float)
-    return Record(
-        frame[columns.time].to_numpy(float), frame[columns.position].to_numpy(float), {"u": force}, name=path.stem
-    )
+        if request.next_input is not None:
+            design = _designed(request, fitted)
+            console.print(f"Next input, for {request.next_input}:\n{design}", highlight=False, markup=False)
+            paths += write(request.next_input.parent, {request.next_input.name: design})
+            paths += write(request.out, {"next.png": design_figure(design), "next.json": design.to_dict()})
+            interrupted = interrupted or design.ending == "was interrupted"
+        if request.report is not None and not interrupted:
+            for name in _least_known(fitted):
+                with console.status(f"profile of {name}"):
+                    profiles.append(fitted.result.profile(name, points=_POINTS))
+    except KeyboardInterrupt:
+        interrupted = True
+    if request.report is not None:
+        findings = Findings(fitted, tuple(profiles), design, findings.origin)
+        paths += write(request.report, {"report.html": report_page(findings)})
+    show_paths(paths)
+    if interrupted:
+        raise Interrupted("interrupted; what was found until then is written")
 
 
-def _assignments(option: str, texts: list[str], known: list[str]) -> dict[str, float]:
-    """Read NAME=VALUE options."""
-    values: dict[str, float] = {}
-    for text in texts:
-        name, equals, number = text.partition("=")
-        try:
-            value = float(number)
-        except ValueError:
-            value = float("nan")
-        if not equals or not np.isfinite(value):
-            raise ValueError(f"{option} needs NAME=VALUE with a number, but {text!r} was given.")
-        if name not in known:
-            raise ValueError(f"{option} names {name!r}, but this model has: {', '.join(known)}.")
-        values[name] = value
-    return values
-
-
-def run_fit(
-    path: Path, columns: AxisColumns, model_name: str, start: list[str], fix: list[str], substeps: int, out: Path
-) -> None:
-    """Fit, print, and write figure, table and JSON to `out`."""
-    if model_name not in AXIS_MODELS:
-        raise ValueError(f"There is no model {model_name!r}; the models are: {', '.join(AXIS_MODELS)}.")
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"--out {out} is a file; a folder is needed.")
-    model = AXIS_MODELS[model_name]
-    record = read_record(path, columns)
-    rough = rough_axis(record)
-    known = [name for name in scene_numbers(axis_scene(model, rough)) if name != "u"]
-    fixed = _assignments("--fix", fix, known)
-    scene = axis_scene(model, rough, _assignments("--start", start, known), fixed)
-    free = tuple(name for name in model.free if name not in fixed)
-    result, seconds = fit_with_progress(scene, record, free, substeps=substeps)
-    show_fit(result, f"{record.name}: {model.words}", "m")
-    console.print(f"{len(record.t)} samples, {seconds:.1f} s with compilation")
-    frame = pd.DataFrame({"t [s]": record.t, "measured [m]": record.measured, "simulated [m]": result.simulated})
-    fitted = result.model
-    assert isinstance(fitted, Scene)
-    held = {
-        name: float(x)
-        for name, x in scene_numbers(fitted).items()
-        if name not in free and name != "u" and not name.endswith("belt_velocity")
-    }
-    report = {"model": model_name, "words": model.words, **result.to_dict(), "held": held, "seconds": seconds}
-    show_paths(write(out, {"fit.png": fit_figure(result), "fit.csv": frame, "fit.json": report}))
-
-
-def fit_with_progress(scene: Scene, record: Record, free: tuple[str, ...], **options: Any) -> tuple[FitResult, float]:
-    """`fit` of an axis with a line that shows how it goes; returns the result and the seconds it took."""
+def _fitted(plan: Plan) -> Fitted:
+    """Fit the one model, or compare several and take the simplest that is as good as the best."""
     started = time.perf_counter()
+    comparison = None
+    if plan.compared:
+        comparison = _compared(plan)
+        model = comparison.simplest
+        result = comparison.results[model]
+    else:
+        ((model, candidate),) = plan.candidates.items()
+        scene, free = candidate.scene, candidate.free
+        assert isinstance(scene, Scene)
+        assert free is not None
+        result = fit_with_progress(scene, plan.records, free, limits=plan.limits, **plan.options)
+    fitted = Fitted(plan, model, result, comparison, (), time.perf_counter() - started)
+    # Whoever pressed Ctrl-C does not wait for more.
+    scores = () if fitted.interrupted else tuple(result.score(record) for record in plan.held_out)
+    return replace(fitted, scores=scores, seconds=time.perf_counter() - started)
+
+
+def _compared(plan: Plan) -> Comparison:
+    judged: dict[str, Any] = {"hold_out": plan.held_out} if plan.folds is None else {"folds": plan.folds}
+    with console.status("compiling") as status:
+
+        def progress(name: str, fold: int | None, step: int, rms: float) -> None:
+            held = "" if fold is None else f", fold {fold + 1} held back"
+            status.update(f"{name}{held}, iteration {step}: RMSE {rms:.6g}")
+
+        return compare(plan.candidates, plan.records, limits=plan.limits, progress=progress, **judged, **plan.options)
+
+
+def fit_with_progress(
+    scene: Scene, records: Record | Sequence[Record], free: Sequence[str], **options: Any
+) -> FitResult:
+    """`fit` with a line that shows how it goes."""
     with console.status("compiling") as status:
 
         def progress(step: int, rms: float, values: dict[str, float]) -> None:
             shown = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
             status.update(f"iteration {step}: RMSE {rms:.6g}  {shown}")
 
-        result = fit(scene, record, free, limits={"m": (0.0, None)}, progress=progress, **options)
-    return result, time.perf_counter() - started
+        return fit(scene, records, free, progress=progress, **options)
 
 
-def show_fit(result: FitResult, title: str, unit: str) -> None:
-    """Print a fit's table and remarks."""
-    units = {"m": "kg", "offset": "N"}
-    frame = pd.DataFrame(result.rows(), columns=["parameter", "value", "standard error", "start", "unit"])
-    pairs = zip(frame["parameter"], frame["unit"], strict=True)
-    frame["unit"] = [given or units.get(name, "") for name, given in pairs]
-    show_table(frame, title)
-    console.print(f"RMSE {result.rmse:.6g} {unit}; {result.evaluations} evaluations, {result.ending}", highlight=False)
+def _show(fitted: Fitted) -> None:
+    result = fitted.result
+    if fitted.comparison is not None:
+        console.print(str(fitted.comparison), highlight=False, markup=False)
+    names = ", ".join(record.name for record in result.records)
+    show_table(parameter_table(result), f"{names}: {fitted.model}, {fitted.words}")
+    if len(result.records) + len(fitted.scores) > 1:
+        show_table(record_table(fitted), "Records")
+    console.print(f"RMSE {result.rmse:.6g} m; {result.evaluations} evaluations, {result.ending}", highlight=False)
     for remark in result.remarks:
-        console.print(f"- {remark}", highlight=False)
+        console.print(f"- {remark}", highlight=False, markup=False)
+    samples = sum(len(record.t) for record in result.records)
+    console.print(f"{samples} samples, {fitted.seconds:.1f} s with compilation", highlight=False)
+
+
+def _files(findings: Findings) -> dict[str, Any]:
+    """Figures, tables, JSON and the result by file name."""
+    fitted, result = findings.fitted, findings.fitted.result
+    files: dict[str, Any] = {}
+    single = len(result.records) == 1
+    for i, record in enumerate(result.records):
+        files["fit.png" if single else f"fit_{_numbered(i, record)}.png"] = fit_figure(result, record=i)
+    for i, score in enumerate(fitted.scores):
+        files[f"held_out_{_numbered(i, score.record)}.png"] = score_figure(score)
+    if fitted.comparison is not None:
+        files["comparison.png"] = comparison_figure(fitted.comparison)
+    return {
+        **files,
+        "fit.csv": sample_table(fitted),
+        "fit.json": summary(findings),
+        "fit.npz": result,
+    }
+
+
+def _numbered(i: int, record: Record) -> str:
+    """A part of a file name that is like the record's, and differs from all others."""
+    alike = re.sub(r"[^\w.-]+", "_", record.name)
+    return f"{i + 1}_{alike}"
+
+
+def _least_known(fitted: Fitted) -> list[str]:
+    """Parameters of the scene with the largest relative standard errors that are finite and off their limits."""
+    result = fitted.result
+    numbers = scene_numbers(fitted.scene)
+    shares = {
+        name: result.errors[name] / abs(value)
+        for name, value in result.values.items()
+        if name in numbers and value and value not in result.bounds[name]
+    }
+    known = [name for name, share in shares.items() if 0 < share < np.inf]
+    return sorted(known, key=lambda name: -shares[name])[:_PROFILED]
+
+
+def _designed(request: FitRequest, fitted: Fitted) -> InputDesign:
+    """An input for the next record: limits and duration by default those of the records, the noise that of the fit."""
+    result, records = fitted.result, fitted.result.records
+    positions = np.concatenate([record.measured for record in records])
+    low, high = float(np.min(positions)), float(np.max(positions))
+    limits = Limits(
+        request.max_force or max(float(np.max(np.abs(record.inputs["u"]))) for record in records),
+        request.max_speed or max(rough_axis(record).top for record in records if np.ptp(record.measured) > 0),
+        request.max_travel or 0.5 * (high - low),
+    )
+    numbers = scene_numbers(fitted.scene)
+    with console.status("designing the next input: compiling") as status:
+
+        def progress(step: int, goal: float) -> None:
+            status.update(f"designing the next input: iteration {step}, goal {goal:.4g}")
+
+        return design_input(
+            fitted.scene,
+            [name for name in result.values if name in numbers],
+            limits,
+            duration=request.duration or max(float(record.t[-1] - record.t[0]) for record in records),
+            noise=result.noise["measured"],
+            dt=float(np.median(np.diff(records[0].t))),
+            q0=[0.5 * (low + high)],
+            progress=progress,
+        )

@@ -14,14 +14,19 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from ..identify import FitResult, InputDesign
 from ..plot import Figure
 
 # Off a terminal (a file, a pipe) there is no width to keep to.
 console = Console() if sys.stdout.isatty() else Console(width=140)
 
 
-def write(out: Path, files: Mapping[str, Figure | pd.DataFrame | dict[str, Any]]) -> list[Path]:
-    """Write figures as PNG, tables as CSV, dicts as JSON into the folder `out`; returns the paths.
+def write(
+    out: Path, files: Mapping[str, Figure | pd.DataFrame | dict[str, Any] | str | FitResult | InputDesign]
+) -> list[Path]:
+    """Write figures as PNG, tables and designed inputs as CSV, dicts as JSON, text, and fits as `FitResult.load` reads.
+
+    Into the folder `out`; returns the paths.
 
     Each file is written under another name first and then renamed, so none is ever half there.
     """
@@ -34,6 +39,12 @@ def write(out: Path, files: Mapping[str, Figure | pd.DataFrame | dict[str, Any]]
                 content.savefig(part, format="png", dpi=130)
             elif isinstance(content, pd.DataFrame):
                 content.to_csv(part, index=False)
+            elif isinstance(content, FitResult):
+                content.save(part)
+            elif isinstance(content, InputDesign):
+                content.to_csv(part)
+            elif isinstance(content, str):
+                part.write_text(content, encoding="utf-8")
             else:
                 part.write_text(json.dumps(_plain(content), indent=2, allow_nan=False) + "\n")
             os.replace(part, path)

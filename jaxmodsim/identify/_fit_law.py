@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..effects import Friction
 from ..friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw
 from ..numerics import Range, varies
 from ..scene import Scene, replace_numbers, scene_numbers, scene_ranges
@@ -18,14 +17,13 @@ from ._begin import AbstractBeginning
 from ._engines import Seen
 from ._entries import chosen_entries, join_entries, split_entries, split_ranges
 from ._losses import AbstractLoss, Squares
+from ._model import PREFIX, holder_of, law_of
 from ._parameters import FreeParameters
 from ._problem import Prior, Problem
 from ._record import Record
 from ._result import FitResult, result_of
 from ._runs import Runs, cut, runs_of
 from ._solve import Options, Progress, solve_with_noise
-
-PREFIX = "law."
 
 
 def fit_law(
@@ -70,8 +68,7 @@ def fit_law(
                 "fit_law needs the input 'x' [m] and may take 'normal' [N], and more only for a law that scaled_by lets"
                 f" depend on it; the record has: {', '.join(each.inputs)}."
             )
-    # A scene of the law alone gives its numbers their names and ranges.
-    holder = Scene(_nothing, effects=(Friction(law, name="law"),))
+    holder = holder_of(law)
     numbers = {
         name.removeprefix(PREFIX): value
         for name, value in scene_numbers(holder).items()
@@ -124,9 +121,7 @@ class LawEngine(eqx.Module):
 def _law(holder: Scene, values: dict[str, Array]) -> AbstractLaw:
     numbers = scene_numbers(holder)
     whole = join_entries(numbers, {PREFIX + name: value for name, value in values.items()})
-    friction = replace_numbers(holder, whole).effects[0]
-    assert isinstance(friction, Friction)
-    return friction.law
+    return law_of(replace_numbers(holder, whole))
 
 
 def _off_limits(numbers: dict[str, Array], ranges: dict[str, Range]) -> tuple[str, ...]:
@@ -189,8 +184,3 @@ def law_force(
     _, force = jax.lax.scan(advance, z0, samples)
     force = jnp.concatenate([jnp.reshape(start, (1,)), force])
     return force if normal is None else force * jnp.maximum(normal, 0.0)
-
-
-def _nothing(t: Array, q: Array, qd: Array, p: Any) -> Array:
-    del t, q, p
-    return 0.0 * qd[0]

@@ -116,6 +116,11 @@ class FreeParameters(eqx.Module):
         bases = dict(zip(self._order, self._bases, strict=True))
         return {name: str(bases[name]) for name in self.following}
 
+    @staticmethod
+    def none() -> "FreeParameters":
+        """Nothing is free."""
+        return FreeParameters((), (), (), (), (), {}, {}, {}, {})
+
     def _kind(self, name: str) -> str:
         return self._kinds[self._order.index(name)]
 
@@ -146,7 +151,7 @@ class FreeParameters(eqx.Module):
             over = (known[name] - self._floor(name, known)) / self._units[name]
             found[name] = jnp.log(jnp.maximum(over, 1e-30)) if self._kind(name) == "log" else over
         lower, upper = self.bounds
-        return jnp.clip(jnp.stack([found[name] for name in self.names]), lower, upper)
+        return jnp.clip(_stack([found[name] for name in self.names]), lower, upper)
 
     @property
     def x0(self) -> Float[Array, " free"]:
@@ -157,7 +162,7 @@ class FreeParameters(eqx.Module):
     def bounds(self) -> tuple[Float[Array, " free"], Float[Array, " free"]]:
         """Lower and upper bounds of x."""
         least = {"line": -jnp.inf, "log": -_MOST_DECADES, "above": 0.0}
-        lower = jnp.stack([jnp.asarray(least[self._kind(name)], float) for name in self.names])
+        lower = _stack([jnp.asarray(least[self._kind(name)], float) for name in self.names])
         upper = []
         for name in self.names:
             if name in self._upper:
@@ -165,7 +170,7 @@ class FreeParameters(eqx.Module):
                 upper.append(jnp.log(most) if self._kind(name) == "log" else most)
             else:
                 upper.append(jnp.asarray(_MOST_DECADES if self._kind(name) == "log" else jnp.inf, float))
-        return lower, jnp.stack(upper)
+        return lower, _stack(upper)
 
     def limits(self, x: Float[Array, " free"]) -> dict[str, tuple[float, float]]:
         """Lower and upper limit of each parameter where the others are as at `x`."""
@@ -177,6 +182,12 @@ class FreeParameters(eqx.Module):
             )
             for name in self.names
         }
+
+    def fixed_limits(self, name: str) -> tuple[float, float]:
+        """Lower and upper limit of a parameter that are numbers, infinite where they are none."""
+        line = self._kind(name) == "line" or self._bases[self._order.index(name)] is not None
+        low = -math.inf if line else float(self._floors[name])
+        return low, float(self._upper.get(name, math.inf))
 
     @property
     def longest(self) -> Float[Array, " free"]:
@@ -191,11 +202,17 @@ class FreeParameters(eqx.Module):
     def vector(self, x: Float[Array, " free"]) -> Float[Array, " free"]:
         """The parameters at `x` as a vector in the order of `names`."""
         values = self.values(x)
-        return jnp.stack([values[name] for name in self.names])
+        return _stack([values[name] for name in self.names])
 
     def slopes(self, x: Float[Array, " free"]) -> Float[Array, "free free"]:
         """Derivatives of the parameters by x."""
+        if not self.names:
+            return jnp.zeros((0, 0), x.dtype)
         return jax.jacfwd(self.vector)(x)
+
+
+def _stack(entries: list[Array]) -> Float[Array, " free"]:
+    return jnp.stack(entries) if entries else jnp.zeros(0)
 
 
 def _check_names(numbers: Mapping[str, Any], free: Sequence[str]) -> None:

@@ -1,6 +1,8 @@
 """What a fit found, with how sure it is."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from os import PathLike
 from typing import Any
 
 import equinox as eqx
@@ -9,10 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..friction import AbstractLaw
+from ..scene import Scene
+from ._causes import Cause, causes_of
 from ._interval import interval
+from ._model import PREFIX, holder_of, model_numbers, with_numbers
+from ._motion import Motion, coordinates_seen, motion_of
+from ._profile import Profile, profile_of
 from ._record import Record
-from ._remarks import remarks_of
+from ._remarks import remarks_of, uncertain_of
+from ._residual_tests import ResidualTests, residual_tests_of
 from ._runs import Windows
+from ._save import read_fields, write_fields
+from ._score import Score, score_of
 from ._solve import Found, by_channel, spread_of
 
 
@@ -37,6 +48,9 @@ class FitResult:
       there are none.
     - `starts`: root mean square, in noise levels, that each of several starts ended with, best first.
     - `single_precision`: whether it was computed in float32.
+    - `numbers`: all numbers of the model by name, those that were not fitted included.
+    - `seen`: channels (of a law by itself, inputs) that are a coordinate or a velocity: `q[0]`, `qd[0]`, by name.
+    - `causes`: what the motion lacks, and which parameters that leaves unknown; part of `remarks`.
     - `found`: the search, for further questions; None in a result that was loaded.
     """
 
@@ -59,6 +73,9 @@ class FitResult:
     step_error: float | None
     starts: tuple[float, ...]
     single_precision: bool
+    numbers: dict[str, np.ndarray]
+    seen: dict[str, str]
+    causes: tuple[Cause, ...]
     found: Found | None
 
     @property
@@ -105,6 +122,13 @@ class FitResult:
         )
 
     @property
+    def motions(self) -> tuple[Motion, ...]:
+        """Coordinates and velocities as far as the model's output shows them, one a record."""
+        return tuple(
+            motion_of(record, seen, self.seen) for record, seen in zip(self.records, self.outputs, strict=True)
+        )
+
+    @property
     def correlation(self) -> Float[np.ndarray, "free free"]:
         """Correlation of the parameters, in the order of `values`."""
         errors = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
@@ -125,6 +149,105 @@ class FitResult:
             name: interval(value, self.errors[name], self.bounds[name], name in self.logarithmic, level)
             for name, value in self.values.items()
         }
+
+    def profile(self, name: str, *, points: int = 6, level: float = 0.95) -> Profile:
+        """Profile likelihood of one parameter: all others, and free initial states, are fitted again at each value.
+
+        Unlike `intervals` it holds where the model is far from linear, and shows what the record leaves open: it
+        walks both ways from the estimate, in the logarithm of a parameter that must be positive, until the fit is
+        worse than the level allows. The noise levels stay as they are. Costs a few evaluations a point, and compiles
+        nothing.
+
+        **Arguments:**
+
+        - `name`: of a free parameter that is no initial state.
+        - `points`: about how many on either side, at least 2.
+        - `level`: of the interval, between 0 and 1.
+
+        **Returns:**
+
+        A `Profile`, drawn by `jaxmodsim.plot.profile_figure`.
+
+        **Raises:**
+
+        - `ValueError` for another name or level, or of a result that was loaded.
+        """
+        return profile_of(self, name, points, level)
+
+    def residual_tests(self) -> ResidualTests:
+        """Whether the residuals are noise, how long they remember, and what they go with.
+
+        Position and velocity are those of the model's output, where a channel shows them.
+        """
+        return residual_tests_of(self)
+
+    def score(self, record: Record, *, q0: Any = None, qd0: Any = None, free_start: bool = True) -> Score:
+        """Run the fitted model on another record, with nothing fitted but its initial state.
+
+        **Arguments:**
+
+        - `record`: with the inputs, and some of the channels, of the records that were fitted. Better a part of the
+          measurement that the fit has not seen.
+        - `q0`, `qd0`: state at the first sample, shape `[dof]`; by default what the record's beginning shows of each
+          coordinate that was measured, the others 0.
+        - `free_start`: whether the state at the first sample is fitted to this record, from `q0` and `qd0`. If not, it
+          is as given, by default the first measured position and rest. A law by itself starts unloaded at rest always.
+
+        **Returns:**
+
+        A `Score`.
+
+        **Raises:**
+
+        - `ValueError` for channels or inputs that the fit does not know, or of a result that was loaded.
+        """
+        return score_of(self, record, q0, qd0, free_start)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write everything but the model's functions and the search into one file, whole or not at all.
+
+        A zip of one JSON text and of arrays (`numpy.load` opens it, too), in which every number stays what it is.
+        """
+        write_fields(path, {field.name: getattr(self, field.name) for field in fields(self)})
+
+    @staticmethod
+    def load(path: str | PathLike[str], model: eqx.Module | None = None) -> "FitResult":
+        """A result that `save` wrote. It can do all but run the model: no `profile` and no `score`.
+
+        **Arguments:**
+
+        - `path`: of the file.
+        - `model`: the scene or law that was fitted, with any numbers; `model` of the result is this one with all its
+          numbers as they were.
+
+        **Raises:**
+
+        - `ValueError` for a file that is damaged or something else, or a model whose numbers have other names.
+        - `OSError` if the file cannot be read.
+        """
+        found = read_fields(path, tuple(field.name for field in fields(FitResult)))
+        given = None if model is None else with_numbers(model, found["numbers"])
+        return FitResult(**found, model=given, found=None)
+
+    def plot(self, record: int = 0, units: Mapping[str, str] | None = None) -> Any:
+        """One figure for a report: record and residual, its autocorrelation, intervals and correlations.
+
+        **Arguments:**
+
+        - `record`: number of the record that is drawn.
+        - `units`: of the channels by name, for the axes: `{"measured": "m"}`.
+
+        **Returns:**
+
+        A `matplotlib.figure.Figure`, as `jaxmodsim.plot.result_figure` draws it.
+
+        **Raises:**
+
+        - `ValueError` if there is no such record or channel.
+        """
+        from ..plot import result_figure
+
+        return result_figure(self, record=record, units=units)
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -198,8 +321,8 @@ def result_of(
             values += (base[i] + np.asarray(own[i])).tolist()
     how_sure = spread_of(problem, search, len(names))
     errors = np.sqrt(np.maximum(np.diag(np.asarray(how_sure.covariance)), 0.0))
-    seen, rmse = _stitched(found, records, windows)
-    return FitResult(
+    outputs, rmse = _stitched(found, records, windows)
+    result = FitResult(
         dict(zip(names, values, strict=True)),
         dict(zip(names, errors.tolist(), strict=True)),
         dict(zip(names, at_start, strict=True)),
@@ -211,7 +334,7 @@ def result_of(
         problem.free.limits(shared) | {name: (-np.inf, np.inf) for name in names[len(problem.free.names) :]},
         model,
         records,
-        seen,
+        outputs,
         {name: float(x) for name, x in problem.noise.items()},
         rmse,
         found.iterations,
@@ -219,8 +342,34 @@ def result_of(
         step_error,
         starts,
         jnp.result_type(float) == jnp.float32,
+        model_numbers(model),
+        _seen(found),
+        (),
         found,
     )
+    return replace(result, causes=_causes(result))
+
+
+def _seen(found: Found) -> dict[str, str]:
+    """Which channels, or inputs of a law, are coordinates and velocities."""
+    base = found.problem.base
+    if base is None:
+        return {"x": "q[0]"} if "x" in found.problem.runs.inputs else {}
+    return coordinates_seen(found.problem.engine.observables, base.q.shape[-1])
+
+
+def _causes(result: FitResult) -> tuple[Cause, ...]:
+    """Causes in the motion for what the figures call uncertain."""
+    uncertain = uncertain_of(result)
+    assert result.found is not None
+    base, model = result.found.problem.base, result.model
+    law = isinstance(model, AbstractLaw)
+    scene = holder_of(model) if law else model
+    if not uncertain or not isinstance(scene, Scene):
+        return ()
+    dof = 1 if base is None else base.q.shape[-1]
+    free = result.found.problem.free.names
+    return causes_of(scene, PREFIX if law else "", result.motions, dof, result.numbers, free, uncertain)
 
 
 def _first_states(found: Found) -> np.ndarray:

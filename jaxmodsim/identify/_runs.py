@@ -73,7 +73,7 @@ def runs_of(records: tuple[Record, ...], windows: Windows) -> Runs:
     channels = list(dict.fromkeys(channel for record in records for channel in record.channels))
     effects = list(dict.fromkeys(effect for record in records for effect in record.slips))
     parts = [records[i].samples(a, b + 1) for i, a, b in zip(windows.record, windows.first, windows.last, strict=True)]
-    continues = [bool(x) for x in (*windows.linked, False)]
+    continues = [*windows.linked.tolist(), False]
     instants = max((len(x) for part in parts for x in part.slips.values()), default=0)
 
     def column(values: Any) -> Array:

@@ -167,7 +167,7 @@ def _driven(scene: Scene, inputs: dict[str, Array]) -> Scene:
 
 def _required(problem: Problem, values: Any) -> Callable[[_Sampled], Array]:
     """Generalised force that friction must have at a sample, by the equations of motion without friction."""
-    scene = with_values(problem.engine.scene, values)
+    scene = with_values(problem.engine.scene, {name: jnp.asarray(x) for name, x in values.items()})
     others = tuple(effect for effect in scene.effects if not isinstance(effect, Friction))
 
     def required(s: _Sampled) -> Array:

@@ -1,0 +1,120 @@
+"""Options of the command line with their help: imported at once, so nothing heavy in here."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Out = Annotated[Path, typer.Option(help="Folder for figures, tables and JSON; made if it is not there.")]
+
+# Panels of `jaxmodsim fit --help`.
+_COLUMNS, _MODEL, _JUDGED, _SEARCH, _NEXT = "Columns", "Model", "Judging it", "Search", "The next record"
+
+Records = Annotated[
+    list[Path], typer.Argument(help="Records, fitted together: .csv with a header line, .parquet or .mat.")
+]
+Time = Annotated[str, typer.Option(help=r"Column of time \[s].", rich_help_panel=_COLUMNS)]
+Position = Annotated[str, typer.Option(help=r"Column of measured position \[m].", rich_help_panel=_COLUMNS)]
+Force = Annotated[str, typer.Option(help="Column of the applied force or drive signal.", rich_help_panel=_COLUMNS)]
+ForceGain = Annotated[float, typer.Option(help="Newtons per unit of the force column.", rich_help_panel=_COLUMNS)]
+Model = Annotated[
+    str, typer.Option(help="Model of the axis: coulomb, asymmetric, drifting, stribeck, lugre.", rich_help_panel=_MODEL)
+]
+Compare = Annotated[
+    str | None,
+    typer.Option(
+        help="Fit several models, `all` or names with commas between, judge them by what was held back, and take"
+        " the simplest that is as good as the best.",
+        metavar="all|A,B,...",
+        rich_help_panel=_MODEL,
+    ),
+]
+Free = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Parameters to fit, names with commas between, repeatable; by default those of the model. Also q0"
+        r" and qd0, the state at the first sample of each record, and delay.u of the force \[s].",
+        metavar="NAME,...",
+        rich_help_panel=_MODEL,
+    ),
+]
+Start = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Start value in SI units; by default estimated from the longest record. Repeatable.",
+        metavar="NAME=VALUE",
+        rich_help_panel=_MODEL,
+    ),
+]
+Fix = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Value in SI units that is not fitted. Repeatable.", metavar="NAME=VALUE", rich_help_panel=_MODEL
+    ),
+]
+Limit = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Limits of a parameter in SI units; either side may be left out: m=80:, vs=:0.1. Repeatable.",
+        metavar="NAME=LOW:HIGH",
+        rich_help_panel=_MODEL,
+    ),
+]
+HoldOut = Annotated[
+    list[Path] | None,
+    typer.Option(help="Record that is never fitted, to judge by. Repeatable.", rich_help_panel=_JUDGED),
+]
+Folds = Annotated[
+    int | None,
+    typer.Option(
+        help="Judge by cross-validation instead: cut each record into so many parts, and hold back one after the"
+        " other. --compare without --hold-out does so with 4.",
+        rich_help_panel=_JUDGED,
+    ),
+]
+Loss = Annotated[
+    str,
+    typer.Option(help="squares; huber or cauchy, where there are outliers.", rich_help_panel=_SEARCH),
+]
+Begin = Annotated[
+    str,
+    typer.Option(
+        help="Where the search begins: rough, by regression of the force on the smoothed motion; staged, by the"
+        " balance of forces with the law itself, and by reversals.",
+        rich_help_panel=_SEARCH,
+    ),
+]
+Starts = Annotated[
+    int,
+    typer.Option(help="Searches from so many starts around it, of which the best is taken.", rich_help_panel=_SEARCH),
+]
+Substeps = Annotated[int, typer.Option(help="Integration steps between two samples.", rich_help_panel=_SEARCH)]
+Report = Annotated[
+    Path | None, typer.Option(help="Folder for report.html: all of it in one file, to attach to a report.")
+]
+NextInput = Annotated[
+    Path | None,
+    typer.Option(
+        "--next",
+        help="CSV file for the motion and force of the next record that would tell most, from the middle of"
+        " the travel that was recorded.",
+        rich_help_panel=_NEXT,
+    ),
+]
+MaxForce = Annotated[
+    float | None, typer.Option(help="Its largest force [N]; by default the records'.", rich_help_panel=_NEXT)
+]
+MaxSpeed = Annotated[
+    float | None, typer.Option(help=r"Its largest speed \[m/s]; by default the records'.", rich_help_panel=_NEXT)
+]
+MaxTravel = Annotated[
+    float | None,
+    typer.Option(
+        help=r"Its largest distance from the start to either side \[m]; by default half the records' travel.",
+        rich_help_panel=_NEXT,
+    ),
+]
+Duration = Annotated[
+    float | None,
+    typer.Option(help=r"Its duration \[s]; by default that of the longest record.", rich_help_panel=_NEXT),
+]

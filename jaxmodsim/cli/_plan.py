@@ -1,0 +1,229 @@
+"""What `jaxmodsim fit` was asked for: as it was typed, and checked."""
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..identify import (
+    AXIS_MODELS,
+    Candidate,
+    Cauchy,
+    Continuation,
+    Huber,
+    MultiStart,
+    Record,
+    Squares,
+    Staged,
+    axis_scene,
+    rough_axis,
+    start_state,
+)
+from ..scene import scene_numbers
+from ._read import AxisColumns, read_records
+
+_LOSSES = {"squares": Squares, "huber": Huber, "cauchy": Cauchy}
+_BEGINNINGS = ("rough", "staged")
+# How many times wider friction is regularised at first, and in how many fits it comes down.
+_WIDER, _STAGES = 10.0, 2
+# Beside the numbers of the scene: the state at the first sample of each record, and the delay of the force.
+_ALSO_FREE = ("q0", "qd0", "z0", "delay.u")
+
+
+@dataclass(frozen=True)
+class FitRequest:
+    """The arguments of `jaxmodsim fit`, as they were typed; see its --help."""
+
+    records: Sequence[Path]
+    columns: AxisColumns
+    model: str
+    compare: str | None
+    free: Sequence[str]
+    start: Sequence[str]
+    fix: Sequence[str]
+    limit: Sequence[str]
+    hold_out: Sequence[Path]
+    folds: int | None
+    loss: str
+    begin: str
+    starts: int
+    substeps: int
+    out: Path
+    report: Path | None
+    next_input: Path | None
+    max_force: float | None
+    max_speed: float | None
+    max_travel: float | None
+    duration: float | None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be fitted.
+
+    - `candidates`: models by name, one where there is nothing to compare.
+    - `compared`: whether they are compared, or one is scored on folds. `folds`: how many, None for the default.
+    - `records`, `held_out`: records that are fitted, and that are not.
+    - `limits`: of parameters, for `fit`. `options`: further arguments of it.
+    """
+
+    candidates: dict[str, Candidate]
+    compared: bool
+    folds: int | None
+    records: tuple[Record, ...]
+    held_out: tuple[Record, ...]
+    limits: dict[str, tuple[float | None, float | None]]
+    options: dict[str, Any]
+
+
+def start_states(records: Sequence[Record]) -> dict[str, np.ndarray]:
+    """`q0` [m] and `qd0` [m/s] at the first samples, shape `[records, 1]` each: a record may begin in motion."""
+    states = np.array([start_state(record) for record in records])
+    return {"q0": states[:, :1], "qd0": states[:, 1:]}
+
+
+def plan_of(request: FitRequest) -> Plan:
+    """Read the records and check everything.
+
+    **Raises:**
+
+    - `ValueError` for an option that names something unknown, or that does not go with another one; as `read_records`.
+    """
+    _check(request)
+    names = _models(request)
+    loss = _LOSSES[_known("--loss", request.loss, _LOSSES)]()
+    _known("--begin", request.begin, _BEGINNINGS)
+    together = read_records([*request.records, *request.hold_out], request.columns)
+    records, held_out = together[: len(request.records)], together[len(request.records) :]
+    rough = rough_axis(max(records, key=lambda record: len(record.t)))
+    numbers = {name: _numbers(axis_scene(AXIS_MODELS[name], rough)) for name in names}
+    fixed, start = _values("--fix", request.fix, numbers), _values("--start", request.start, numbers)
+    chosen = tuple(name.strip() for text in request.free for name in text.split(",") if name.strip())
+    for name in chosen:
+        _known("--free", name, (*next(iter(numbers.values())), *_ALSO_FREE), listed=name.split("[")[0].split(".")[0])
+    for option, others in (("--start", start), ("--free", chosen)):
+        both = sorted(set(fixed) & set(others))
+        if both:
+            raise ValueError(f"{both[0]} stands in {option} and in --fix: it can be fitted or fixed, not both.")
+    candidates = {}
+    for name in names:
+        model = AXIS_MODELS[name]
+        own = [{key: x for key, x in given.items() if key in numbers[name]} for given in (start, fixed)]
+        free = tuple(each for each in chosen or model.free if each not in fixed)
+        candidates[name] = Candidate(axis_scene(model, rough, *own), free, model.words)
+    limits = {"m": (0.0, None)} | _limits(request.limit, numbers)
+    begin = _beginnings(request, candidates, numbers)
+    options = {"loss": loss, "begin": begin, "substeps": request.substeps, **start_states(records)}
+    compared = request.compare is not None or request.folds is not None
+    return Plan(candidates, compared, request.folds, records, held_out, limits, options)
+
+
+def _beginnings(
+    request: FitRequest, candidates: Mapping[str, Candidate], numbers: Mapping[str, Sequence[str]]
+) -> list[Staged | MultiStart | Continuation]:
+    """Where a search begins, with the width of the regularisation coming down at last: narrow at once, it is caught."""
+    begin: list[Staged | MultiStart | Continuation] = [Staged()] if request.begin == "staged" else []
+    if request.starts > 1:
+        begin.append(MultiStart(request.starts))
+    free = {name for candidate in candidates.values() for name in candidate.free or ()}
+    widths = dict.fromkeys(each for own in numbers.values() for each in own if each.endswith(".width"))
+    return [*begin, *(Continuation(each, _WIDER, _STAGES) for each in widths if each not in free)]
+
+
+def _check(request: FitRequest) -> None:
+    for option, path in (("--out", request.out), ("--report", request.report)):
+        if path is not None and path.exists() and not path.is_dir():
+            raise ValueError(f"{option} {path} is a file; a folder is needed.")
+    if request.starts < 1:
+        raise ValueError(f"--starts must be at least 1, but it is {request.starts}.")
+    if request.folds is not None and request.folds < 2:
+        raise ValueError(f"--folds must be at least 2, but it is {request.folds}.")
+    if request.folds is not None and request.hold_out:
+        raise ValueError("--folds and --hold-out do not go together: a model is judged by one of them.")
+    if request.compare is not None and request.free:
+        raise ValueError("--free does not go with --compare, where each model has its own parameters: use --fix.")
+    numbers = {"force": request.max_force, "speed": request.max_speed, "travel": request.max_travel}
+    given = {f"--max-{name}": x for name, x in numbers.items()} | {"--duration": request.duration}
+    for option, number in given.items():
+        if number is not None and request.next_input is None:
+            raise ValueError(f"{option} belongs to --next FILE.csv, which is missing.")
+        if number is not None and not (math.isfinite(number) and number > 0):
+            raise ValueError(f"{option} must be finite and > 0, but it is {number}.")
+    if request.next_input is not None and request.next_input.is_dir():
+        raise ValueError(f"--next {request.next_input} is a folder; a file is needed.")
+
+
+def _models(request: FitRequest) -> tuple[str, ...]:
+    if request.compare is None:
+        return (_known("--model", request.model, AXIS_MODELS, "model"),)
+    if request.compare == "all":
+        return tuple(AXIS_MODELS)
+    names = tuple(dict.fromkeys(name.strip() for name in request.compare.split(",") if name.strip()))
+    for name in names:
+        _known("--compare", name, AXIS_MODELS, "model")
+    if len(names) < 2:
+        raise ValueError(
+            f"--compare needs two models or more, as in --compare coulomb,lugre, or all: {request.compare!r}"
+        )
+    return names
+
+
+def _numbers(scene: Any) -> tuple[str, ...]:
+    """Names of the numbers that may be given: neither the input nor the velocity of a belt, which an axis has not."""
+    return tuple(name for name in scene_numbers(scene) if name != "u" and not name.endswith("belt_velocity"))
+
+
+def _known(option: str, name: str, known: Iterable[str], noun: str = "name", listed: str | None = None) -> str:
+    """The name, if there is such a one."""
+    known = tuple(known)
+    if name in known or listed in known:
+        return name
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f" Did you mean {near[0]}?" if near else ""
+    raise ValueError(f"{option}: there is no {noun} {name!r}; the {noun}s are: {', '.join(known)}.{hint}")
+
+
+def _of_any(option: str, name: str, numbers: Mapping[str, Sequence[str]]) -> str:
+    return _known(option, name, dict.fromkeys(each for own in numbers.values() for each in own), "parameter")
+
+
+def _values(option: str, texts: Sequence[str], numbers: Mapping[str, Sequence[str]]) -> dict[str, float]:
+    """Read NAME=VALUE; a name must be one of a model at least."""
+    values: dict[str, float] = {}
+    for text in texts:
+        name, equals, number = text.partition("=")
+        value = _number(number)
+        if not equals or value is None:
+            raise ValueError(f"{option} needs NAME=VALUE with a number, but {text!r} was given.")
+        values[_of_any(option, name, numbers)] = value
+    return values
+
+
+def _limits(texts: Sequence[str], numbers: Mapping[str, Sequence[str]]) -> dict[str, tuple[float | None, float | None]]:
+    """Read NAME=LOW:HIGH, where either may be left out."""
+    limits: dict[str, tuple[float | None, float | None]] = {}
+    for text in texts:
+        name, _, span = text.partition("=")
+        low, colon, high = span.partition(":")
+        least, most = (_number(side) if side.strip() else None for side in (low, high))
+        wrong = (low.strip() and least is None) or (high.strip() and most is None)
+        if not colon or wrong or (least is None and most is None):
+            raise ValueError(
+                f"--limit needs NAME=LOW:HIGH with numbers, one of which may be left out, but {text!r} was given."
+            )
+        if least is not None and most is not None and not least < most:
+            raise ValueError(f"--limit {text}: the lower limit must be below the upper one.")
+        limits[_of_any("--limit", name, numbers)] = (0.0 if name == "m" and least is None else least, most)
+    return limits
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None

@@ -1,0 +1,314 @@
+"""What a comparison of models found: errors on what was held back, criteria, and the simplest model that suffices."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ._criteria import deviance, effective_samples, penalty
+from ._losses import AbstractLoss
+from ._result import FitResult
+from ._solve import Found
+from ._solve import by_channel as residual_by_channel
+
+# What is left of each channel, in its unit, of one part of the records.
+Part: TypeAlias = dict[str, np.ndarray]
+
+# A standard error beyond this share of the value says that the record does not determine it; so does a value that went
+# further from its start than this factor.
+_SHARE, _FAR = 0.5, 1e6
+
+
+class Judged(NamedTuple):
+    """A fit, and the residuals of what was held back from it."""
+
+    result: FitResult
+    held: tuple[Part, ...]
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """One model of a comparison.
+
+    - `name`, `words`: what it is. `parameters`: number of all that was fitted, initial states included.
+    - `held_back`, `error`: root mean square error on what was held back, and its standard error.
+    - `parts`: the root mean square errors of the parts that were held back, shape `[parts]`.
+    - `over`, `over_error`: how much more than the best model's error it is, and the standard error of this difference,
+      from the differences in each part.
+    - `fitted`: root mean square error of the fit to everything.
+    - `takeuchi`, `bic`: information criteria less the least of all models; see `Comparison`.
+    - `penalty`: effective number of parameters, of Takeuchi's criterion.
+    - `undetermined`: names of parameters that the records do not determine.
+    """
+
+    name: str
+    words: str
+    parameters: int
+    held_back: float
+    error: float
+    parts: Float[np.ndarray, " parts"]
+    over: float
+    over_error: float
+    fitted: float
+    takeuchi: float
+    bic: float
+    penalty: float
+    undetermined: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Models, ranked by their error on what was held back from the fit.
+
+    Errors are root mean squares in the unit of the channel where there is one, in noise levels (as given, or the least
+    that any model found) where there are several; with another loss than squares, roots of the mean loss. The standard
+    error of the mean square comes from its scatter over the parts that were held back. These are few and their fits
+    share samples, so it is a rough one (Bengio, Grandvalet 2004, J. Mach. Learn. Res. 5:1089).
+
+    Two criteria judge by the fit to everything, residuals correlated in time allowed for. With D the deviance
+    `sum of n ln(noise^2) + sum of losses`, k parameters, n samples:
+
+    - Takeuchi's `D + 2 trace(H^-1 S)`, H the information, S the covariance of the scores, which the fit estimates from
+      blocks of samples. For white residuals the trace is k, and this is Akaike's criterion.
+    - BIC with effective samples, `D m/n + k ln(m)`, where m is n over the correlation of the residual, by Geyer's
+      initial positive sequence. It is that of the model which fits best: its residual is nearest to the noise, and
+      with an m of its own for each model different things would be compared.
+
+    - `ranked`: the models, best first. `failures`: reasons, by the name of the model. `left`: names of the models that
+      were not finished when the comparison was interrupted.
+    - `results`: the fits to everything, by name.
+    - `by`: what was held back, in words. `samples`, `effective`: number of samples, and how many independent ones they
+      are worth.
+    """
+
+    ranked: tuple[Ranked, ...]
+    failures: dict[str, str]
+    left: tuple[str, ...]
+    results: dict[str, FitResult]
+    by: str
+    samples: int
+    effective: float
+
+    @property
+    def best(self) -> str:
+        """Name of the model with the least error on what was held back.
+
+        **Raises:**
+
+        - `ValueError` if no model could be fitted.
+        """
+        return self._first.name
+
+    @property
+    def simplest(self) -> str:
+        """Name of the model with the fewest parameters that is no worse than the best by more than one standard error.
+
+        The one-standard-error rule of Breiman et al. (1984, Classification and Regression Trees, section 3.4.3), with
+        the standard error of the difference from the best one, which leaves out what is hard for all of them.
+
+        **Raises:**
+
+        - `ValueError` if no model could be fitted.
+        """
+        near = [each for each in self.ranked if each.over <= each.over_error or each is self._first]
+        return min(near or (self._first,), key=lambda each: (each.parameters, each.held_back)).name
+
+    @property
+    def _first(self) -> Ranked:
+        if not self.ranked:
+            reasons = " ".join(f"{name}: {reason}" for name, reason in self.failures.items())
+            raise ValueError(f"No model could be fitted. {reasons}")
+        return self.ranked[0]
+
+    @property
+    def table(self) -> list[dict[str, Any]]:
+        """Rows by rank, then the models that failed or were not finished, of types that JSON knows."""
+        rows: list[dict[str, Any]] = [
+            {
+                "name": each.name,
+                "words": each.words,
+                "parameters": each.parameters,
+                "held_back": each.held_back,
+                "standard_error": each.error,
+                "parts": each.parts.tolist(),
+                "over_the_best": each.over,
+                "over_the_best_standard_error": each.over_error,
+                "fitted": each.fitted,
+                "takeuchi": each.takeuchi,
+                "bic": each.bic,
+                "penalty": each.penalty,
+                "undetermined": list(each.undetermined),
+                "failed": None,
+            }
+            for each in self.ranked
+        ]
+        rows += [{"name": name, "failed": reason} for name, reason in self.failures.items()]
+        return rows + [{"name": name, "failed": "not finished"} for name in self.left]
+
+    @property
+    def conclusion(self) -> str:
+        """The simplest model that suffices, in a sentence or two."""
+        best, chosen = self._first, self.simplest
+        by_name = {each.name: each for each in self.ranked}
+        simple = by_name[chosen]
+        words = f" ({simple.words})" if simple.words else ""
+        said = (
+            f"The simplest sufficient law is {chosen}{words}: {simple.parameters} parameters, error on what was held"
+            f" back {simple.held_back:.4g}"
+        )
+        if simple is not best:
+            said += (
+                f"; {best.name} with {best.parameters} is better by {simple.over:.2g}, which is within one standard"
+                f" error, {simple.over_error:.2g}."
+            )
+        else:
+            simpler = [each for each in self.ranked if each.parameters < best.parameters]
+            said += ", the least of all"
+            if simpler:
+                said += (
+                    f"; with fewer parameters {simpler[0].name} is worse by {simpler[0].over:.2g}, standard error"
+                    f" {simpler[0].over_error:.2g}"
+                )
+            said += "."
+        for name in dict.fromkeys((chosen, best.name)):
+            if by_name[name].undetermined:
+                names = ", ".join(by_name[name].undetermined)
+                said += f" But the records do not determine {names} of {name}: do not use these values."
+        return said
+
+    def __str__(self) -> str:
+        """A ranked table that ends with the conclusion."""
+        width = max(len(row["name"]) for row in self.table)
+        lines = [
+            f"{'':{width}}  {'param.':>6}  {'held back':>10}  {'std. error':>10}  {'over the best':>21}  {'fitted':>10}"
+            f"  {'Takeuchi':>9}  {'BIC':>9}"
+        ]
+        for each in self.ranked:
+            over = "" if each is self.ranked[0] else f"{each.over:10.3g} +- {each.over_error:7.2g}"
+            lines.append(
+                f"{each.name:{width}}  {each.parameters:6d}  {each.held_back:10.4g}  {each.error:10.2g}  {over:>21}"
+                f"  {each.fitted:10.4g}  {each.takeuchi:9.1f}  {each.bic:9.1f}"
+            )
+        lines += [f"{each.name}: not determined are {', '.join(each.undetermined)}." for each in self.ranked
+                  if each.undetermined]  # fmt: skip
+        lines += [f"{name}: failed. {reason}" for name, reason in self.failures.items()]
+        lines.append(
+            f"Held back: {self.by}. {self.samples} samples, worth {self.effective:.0f} independent ones. Criteria: less"
+            " the least."
+        )
+        if self.left:
+            lines.append(f"Interrupted; not finished: {', '.join(self.left)}.")
+        return "\n".join([*lines, self.conclusion] if self.ranked else lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """All of it but the samples and the models, of types that JSON knows."""
+        return {
+            "held_back": self.by,
+            "samples": self.samples,
+            "effective_samples": self.effective,
+            "models": self.table,
+            "best": self.best if self.ranked else None,
+            "simplest": self.simplest if self.ranked else None,
+            "conclusion": self.conclusion if self.ranked else None,
+            "fits": {name: result.to_dict() for name, result in self.results.items()},
+        }
+
+
+def comparison_of(
+    judged: Mapping[str, Judged], failures: Mapping[str, str], left: tuple[str, ...], words: Mapping[str, str], by: str
+) -> Comparison:
+    """Rank what was judged; what is not finite failed."""
+    failures, kept = dict(failures), {}
+    for name, each in judged.items():
+        finite = all(np.isfinite(x).all() for part in each.held for x in part.values())
+        if finite:
+            kept[name] = each
+        else:
+            failures[name] = "Its error on what was held back is not finite."
+    if not kept:
+        return Comparison((), failures, left, {}, by, 0, 0.0)
+    found = {name: _found(each) for name, each in kept.items()}
+    levels = {
+        channel: min(float(each.problem.noise[channel]) for each in found.values())
+        for channel in next(iter(found.values())).problem.noise
+    }
+    fitted = {name: float(_root(_fitted(each), each.problem.loss, levels)) for name, each in found.items()}
+    samples = int(jnp.sum(next(iter(found.values())).problem.weights > 0))
+    effective = effective_samples(found[min(fitted, key=lambda name: fitted[name])])
+    losses = {name: _losses(each.held, found[name].problem.loss, levels) for name, each in kept.items()}
+    count = np.array([sum(len(x) for x in part.values()) for part in next(iter(kept.values())).held])
+    means = {name: float(np.sum(count * loss) / np.sum(count)) for name, loss in losses.items()}
+    order = sorted(means, key=lambda name: means[name])
+    best = order[0]
+    d = {name: deviance(each) for name, each in found.items()}
+    trace = {name: penalty(each.result) for name, each in kept.items()}
+    size = {name: len(each.result.values) for name, each in kept.items()}
+    takeuchi = {name: d[name] + 2 * trace[name] for name in kept}
+    bic = {name: d[name] * effective / samples + size[name] * np.log(effective) for name in kept}
+    ranked = []
+    for name in order:
+        held_back, least = np.sqrt(means[name]), np.sqrt(means[best])
+        together = held_back + least
+        ranked.append(
+            Ranked(
+                name,
+                words.get(name, ""),
+                size[name],
+                float(held_back),
+                float(_standard_error(losses[name], count) / (2 * held_back)) if held_back > 0 else 0.0,
+                np.sqrt(losses[name]),
+                float(held_back - least),
+                float(_standard_error(losses[name] - losses[best], count) / together) if together > 0 else 0.0,
+                fitted[name],
+                float(takeuchi[name] - min(takeuchi.values())),
+                float(bic[name] - min(bic.values())),
+                trace[name],
+                _undetermined(kept[name].result),
+            )
+        )
+    results = {name: kept[name].result for name in order}
+    return Comparison(tuple(ranked), failures, left, results, by, samples, effective)
+
+
+def _found(judged: Judged) -> Found:
+    assert judged.result.found is not None
+    return judged.result.found
+
+
+def _fitted(found: Found) -> Part:
+    """Residual of all samples that count, in the units of the channels."""
+    split = residual_by_channel(found.problem, found.search.residual)
+    return {name: float(found.problem.noise[name]) * x[weight > 0] for name, (x, weight) in split.items()}
+
+
+def _losses(parts: tuple[Part, ...], loss: AbstractLoss, levels: Mapping[str, float]) -> Float[np.ndarray, " parts"]:
+    """Mean loss of each part, in the squared unit of the channel if there is one."""
+    return np.array([_root(part, loss, levels) ** 2 for part in parts])
+
+
+def _root(part: Part, loss: AbstractLoss, levels: Mapping[str, float]) -> float:
+    """Root of the mean loss: with squares, the root mean square."""
+    total = sum(float(jnp.sum(loss.rho(jnp.asarray((x / levels[name]) ** 2)))) for name, x in part.items())
+    scale = next(iter(levels.values())) if len(levels) == 1 else 1.0
+    return scale * float(np.sqrt(total / sum(len(x) for x in part.values())))
+
+
+def _standard_error(values: np.ndarray, count: np.ndarray) -> float:
+    """Of the mean of parts, weighted by their numbers of samples."""
+    share = count / np.sum(count)
+    around = values - np.sum(share * values)
+    return float(np.sqrt(np.sum((share * around) ** 2) * len(values) / (len(values) - 1)))
+
+
+def _undetermined(result: FitResult) -> tuple[str, ...]:
+    """Names of parameters without effect, with errors of the size of their value, or that ran away."""
+
+    def free_of_doubt(name: str, value: float) -> bool:
+        start = abs(result.start[name])
+        ran = start > 0 and abs(value) > _FAR * start
+        return not ran and (value in result.bounds[name] or result.errors[name] <= _SHARE * abs(value))
+
+    return tuple(name for name, value in result.values.items() if not free_of_doubt(name, value))

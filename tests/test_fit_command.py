@@ -1,0 +1,324 @@
+"""`jaxmodsim fit`, as a user meets it: what it reads, what it writes, how it refuses."""
+
+import base64
+import json
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+
+from jaxmodsim.cli import _fit
+from jaxmodsim.cli._read import AxisColumns, read_record, read_records
+from jaxmodsim.identify import FitResult, rough_axis
+
+GAIN = 12.0
+COLUMNS = ("--time", "time", "--position", "pos", "--force", "volt", "--force-gain", str(GAIN))
+# Friction as the records have it, and integration steps that follow its changes of sign.
+MODEL = ("--fix", "dry.width=1e-3", "--limit", "m=:50", "--substeps", "2")
+NAMES = AxisColumns("time", "pos", "volt", GAIN)
+TRUTH = {"m": 5.0, "offset": 0.7, "dry.Fc": 3.0, "viscous.Fv": 8.0}
+
+
+def axis_frame(seed: int = 0, v: float = 0.0) -> pd.DataFrame:
+    """A record of an axis with the numbers of TRUTH, from a plain Euler simulation that starts at the velocity `v`.
+
+    There is no force over the first 20 samples, the parabola through which is to show the velocity.
+    """
+    t = 10.0 + np.arange(0.0, 2.0, 2.5e-3)
+    u = np.where(t > 10.05, 0.8 * np.sign(np.sin(5.1 * t + seed)) + 1.5 * np.sin(9.3 * t), 0.0)
+    q = np.zeros_like(t)
+    for k in range(1, t.size):
+        for _ in range(25):
+            v += 1e-4 * (GAIN * u[k - 1] - 0.7 - 3.0 * np.tanh(v / 1e-3) - 8.0 * v) / 5.0
+            q[k] += 1e-4 * v
+        q[k] += q[k - 1]
+    noise = 1e-6 * np.random.default_rng(seed).standard_normal(t.size)
+    return pd.DataFrame({"time": t, "pos": q + noise, "volt": u})
+
+
+def write_mat(path: Path, columns: dict[str, np.ndarray]) -> None:
+    scipy.io.savemat(path, columns)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Three records: two in CSV and Parquet, the second of which starts in motion, and one in a MATLAB file."""
+    folder = tmp_path_factory.mktemp("records")
+    paths = [folder / name for name in ("run <b>1.csv", "run2.parquet", "test.mat")]
+    axis_frame(0).to_csv(paths[0], index=False)
+    axis_frame(1, 0.4).to_parquet(paths[1])
+    write_mat(paths[2], {name: column.to_numpy() for name, column in axis_frame(2).items()})
+    return [str(path) for path in paths]
+
+
+class Page(HTMLParser):
+    """Tags, images and text of a page."""
+
+    def __init__(self, page: str):
+        super().__init__()
+        self.tags: list[str] = []
+        self.images: list[str] = []
+        self.links: list[str] = []
+        self.text = ""
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.images += [value for name, value in attrs if name == "src"]
+        self.links += [value for name, value in attrs if name == "href"]
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def fitted(run_command, files, tmp_path_factory):
+    """The fit of two records with a third held out, and a report."""
+    out = tmp_path_factory.mktemp("fit")
+    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--hold-out", files[2])
+    code, text, errors = run_command(*command, "--out", str(out), "--report", str(out / "report"))
+    assert code == 0, errors
+    return out, text
+
+
+def test_several_records_are_fitted_together_and_a_held_out_one_is_scored(fitted):
+    out, text = fitted
+    found = json.loads((out / "fit.json").read_text())
+    values = {name: entry["value"] for name, entry in found["parameters"].items()}
+    # The parabola leaves an error of 0.3 mm/s in the velocity that the second record starts at.
+    assert values == pytest.approx(TRUTH, rel=0.03)
+    assert found["records"] == ["run <b>1", "run2"]
+    assert found["parameters"]["m"]["unit"] == "kg"
+    assert found["held"] == {"dry.width": 1e-3}
+    # From rest the second record would be off by up to 0.4 m/s * m/Fv = 0.25 m.
+    assert found["rmse"]["measured"] < 2e-4
+    assert found["held_out"]["test"]["measured"] < 4e-4
+    assert "held out" in text
+    assert sorted(path.name for path in out.iterdir()) == [
+        "fit.csv", "fit.json", "fit.npz", "fit_1_run_b_1.png", "fit_2_run2.png", "held_out_1_test.png", "report",
+    ]  # fmt: skip
+
+
+def test_samples_and_result_are_kept(fitted):
+    out, _ = fitted
+    frame = pd.read_csv(out / "fit.csv")
+    assert frame.groupby("record").size().to_dict() == {"run <b>1": 800, "run2": 800, "test": 800}
+    assert set(frame["record"][frame["use"] == "held out"]) == {"test"}
+    error = frame["simulated [m]"] - frame["measured [m]"]
+    found = json.loads((out / "fit.json").read_text())
+    assert float(np.sqrt(np.mean(error[frame["use"] == "fitted"] ** 2))) == pytest.approx(found["rmse"]["measured"])
+    loaded = FitResult.load(out / "fit.npz")
+    assert loaded.values == {name: entry["value"] for name, entry in found["parameters"].items()}
+
+
+def test_a_report_is_one_page_that_needs_nothing_else(fitted):
+    out, _ = fitted
+    page = Page((out / "report" / "report.html").read_text())
+    assert not {"script", "link", "b", "iframe"} & set(page.tags)
+    assert not page.links
+    # Two records, one held out, two profiles.
+    assert len(page.images) == 5
+    for source in page.images:
+        kind, data = source.split(",", 1)
+        assert kind == "data:image/png;base64"
+        assert base64.b64decode(data).startswith(b"\x89PNG")
+    for text in ("run <b>1", "run2", "test", "m q'' = u - offset - F_dry - F_viscous", "Fc tanh(v/width)", "N s/m",
+                 "jaxmodsim fit", "jax 0.", "95 %", "held out", "Correlation", "likelihood"):  # fmt: skip
+        assert text in page.text, text
+    result = json.loads((out / "fit.json").read_text())
+    for remark in result["remarks"]:
+        assert remark in page.text
+    for name in TRUTH:
+        assert f"{result['parameters'][name]['value']:.5g}" in page.text
+
+
+def test_ctrl_c_keeps_what_was_found(run_command, files, tmp_path, monkeypatch):
+    fit = _fit.fit
+
+    def stopped(*arguments, progress, **options):
+        def press(step, rms, values):
+            progress(step, rms, values)
+            if step == 2:
+                raise KeyboardInterrupt
+
+        return fit(*arguments, progress=press, **options)
+
+    monkeypatch.setattr(_fit, "fit", stopped)
+    out = tmp_path / "out"
+    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--hold-out", files[2])
+    code, _, errors = run_command(*command, "--out", str(out), "--report", str(out))
+    assert code == 130
+    assert errors == "jaxmodsim: interrupted; what was found until then is written\n"
+    found = json.loads((out / "fit.json").read_text())
+    assert found["ending"].startswith("interrupted")
+    assert found["evaluations"] == 2
+    assert "do not trust" in Page((out / "report.html").read_text()).text
+    assert FitResult.load(out / "fit.npz").evaluations == 2
+
+
+def test_models_are_compared(run_command, files, tmp_path):
+    out = tmp_path / "out"
+    command = ("fit", files[0], *COLUMNS, "--compare", "coulomb,asymmetric", "--folds", "2", "--begin", "staged")
+    code, text, errors = run_command(*command, *MODEL, "--out", str(out), "--report", str(out))
+    assert code == 0, errors
+    found = json.loads((out / "fit.json").read_text())
+    # Friction is the same in both directions, so the second model has a parameter more for nothing.
+    assert found["model"] == found["comparison"]["simplest"] == "coulomb"
+    assert [row["name"] for row in found["comparison"]["models"]] in (
+        ["coulomb", "asymmetric"],
+        ["asymmetric", "coulomb"],
+    )
+    assert found["comparison"]["conclusion"] in text.replace("\n", " ")
+    assert (out / "comparison.png").stat().st_size > 10_000
+    page = Page((out / "report.html").read_text())
+    assert "Comparison of models" in page.text
+    assert found["comparison"]["conclusion"] in page.text
+
+
+def test_the_next_input_is_written(run_command, files, tmp_path):
+    out = tmp_path / "out"
+    limits = ("--max-force", "30", "--max-travel", "0.1", "--duration", "1.5")
+    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--hold-out", files[2])
+    code, text, errors = run_command(*command, "--next", str(out / "next.csv"), *limits, "--out", str(out))
+    assert code == 0, errors
+    frame = pd.read_csv(out / "next.csv")
+    assert list(frame.columns) == ["t", "q_ref", "qd_ref", "force"]
+    assert frame["t"].iloc[-1] == pytest.approx(1.5)
+    assert 0.5 * 30 < frame["force"].abs().max() <= 30 or frame["q_ref"].sub(frame["q_ref"][0]).abs().max() > 0.09
+    assert frame["q_ref"].sub(frame["q_ref"][0]).abs().max() <= 0.1
+    positions = np.concatenate([axis_frame(0)["pos"], axis_frame(1, 0.4)["pos"]])
+    assert frame["q_ref"][0] == pytest.approx(0.5 * (positions.min() + positions.max()), abs=1e-8)
+    assert "plain sine" in text
+    assert (out / "next.png").is_file()
+
+
+@pytest.mark.parametrize("kind", ["csv", "CSV", "txt", "parquet", "column.mat", "row.mat"])
+def test_every_kind_of_file_gives_the_same_record(tmp_path, kind):
+    frame, path = axis_frame(), tmp_path / f"axis.{kind}"
+    if kind == "parquet":
+        frame.to_parquet(path)
+    elif kind.endswith("mat"):
+        turn = (-1, 1) if kind == "column.mat" else (1, -1)
+        columns = {name: column.to_numpy().reshape(turn) for name, column in frame.items()}
+        write_mat(path, {**columns, "matrix": np.eye(3), "label": np.array(["EMPS"])})
+    else:
+        frame.to_csv(path, index=False)
+    record = read_record(path, NAMES)
+    np.testing.assert_allclose(record.t, frame["time"], rtol=1e-15)
+    np.testing.assert_allclose(record.measured, frame["pos"], rtol=1e-12)
+    np.testing.assert_allclose(record.inputs["u"], GAIN * frame["volt"], rtol=1e-12)
+    assert record.name == path.stem
+
+
+def test_records_of_one_name_are_told_apart_by_their_folders(tmp_path):
+    paths = [tmp_path / name / "run.csv" for name in ("a", "b")]
+    for path in paths:
+        path.parent.mkdir()
+        axis_frame().to_csv(path, index=False)
+    assert [record.name for record in read_records(paths, NAMES)] == ["a/run.csv", "b/run.csv"]
+    with pytest.raises(ValueError, match=r"run\.csv is given twice"):
+        read_records([paths[0], tmp_path / "b" / ".." / "a" / "run.csv"], NAMES)
+
+
+def test_rough_values_come_from_the_record(files):
+    rough = rough_axis(read_record(Path(files[0]), NAMES))
+    assert rough.m == pytest.approx(TRUTH["m"], rel=0.2)
+    assert rough.Fc == pytest.approx(TRUTH["dry.Fc"], rel=0.5)
+
+
+def check_refusal(run_command, out: Path, text: str, *command: str) -> None:
+    code, _, errors = run_command("fit", *command, "--out", str(out))
+    assert code == 2
+    assert errors.startswith("jaxmodsim: ")
+    assert errors.count("\n") == 1
+    assert pd.Series([errors]).str.contains(text).all(), errors
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (("--position", "poss"), "no column 'poss' .*time, pos, volt.* Did you mean --position pos"),
+        (("--model", "coulom"), "no model 'coulom'; the models are: coulomb, asymmetric.* Did you mean coulomb"),
+        (("--compare", "coulomb,lugr"), "no model 'lugr'.* Did you mean lugre"),
+        (("--compare", "coulomb"), "two models or more, A,B, but 'coulomb' was given"),
+        (("--compare", "all", "--free", "m"), "--free does not go with --compare"),
+        (("--free", "m,dry.Fs"), "no name 'dry.Fs'; .* Did you mean dry.Fc"),
+        (("--free", "m", "--fix", "m=2"), "m stands in --free and in --fix"),
+        (("--start", "m"), "--start needs NAME=VALUE"),
+        (("--start", "m=heavy"), "--start needs NAME=VALUE"),
+        (("--fix", "mass=2"), "--fix: there is no parameter 'mass'"),
+        (("--fix", "m=-2"), "m must be finite and > 0, but it is -2"),
+        (("--fix", "dry.Fc=-1"), "Fc must be finite and >= 0"),
+        (("--limit", "m=80"), "--limit needs NAME=LOW:HIGH"),
+        (("--limit", "m=:"), "--limit needs NAME=LOW:HIGH"),
+        (("--limit", "m=9:8"), "the lower limit must be below"),
+        (("--limit", "mass=1:9"), "--limit: there is no parameter 'mass'"),
+        (("--limit", "dry.Fc=100:200"), "dry.Fc must be .*but it is"),
+        (("--force-gain", "0"), "--force-gain must be finite and not zero"),
+        (("--substeps", "0"), "substeps must be at least 1"),
+        (("--starts", "0"), "--starts must be at least 1"),
+        (("--folds", "1"), "--folds must be at least 2"),
+        (("--loss", "absolute"), "no name 'absolute'; the names are: squares, huber, cauchy"),
+        (("--begin", "stage"), "no name 'stage'; .* Did you mean staged"),
+        (("--time", "volt"), "times must increase"),
+        (("--max-force", "3"), "--max-force belongs to --next"),
+        (("--next", "n.csv", "--duration", "-1"), "--duration must be finite and > 0"),
+        (("--hold-out", "nowhere.csv"), "There is no file nowhere.csv"),
+    ],
+)
+def test_wrong_options_are_one_sentence_and_exit_code_two(run_command, files, tmp_path, change, text):
+    check_refusal(run_command, tmp_path / "out", text, files[0], *COLUMNS, *change)
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        ("", "no CSV file with a header line"),
+        ("time,pos,volt\n0,1,2\n1,x,2\n", "'pos' holds 'x' in sample 1"),
+        ("time,pos,volt\n0,1,2\n1,,2\n", "not finite, the first in sample 1"),
+        ("time,pos,volt\n0,1,2\n0,1,2\n", "times must increase, but sample 1"),
+        ("time,pos,volt\n0,1,2\n", "two samples or more"),
+        ("time,pos,volt\n0,1,2\n1,1,2\n2,1,3\n", "the position never changes"),
+        ("time;pos;volt\n0;1;2\n1;2;2\n", "no column 'time' .*it has: time;pos;volt"),
+    ],
+)
+def test_bad_tables_are_one_sentence_and_exit_code_two(run_command, tmp_path, content, text):
+    path = tmp_path / "bad.csv"
+    path.write_text(content)
+    check_refusal(run_command, tmp_path / "out", text, str(path), *COLUMNS)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "text"),
+    [
+        ("a.parquet", b"PAR1 and no more", "damaged or no Parquet file"),
+        ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(105) + b"\x00\x01IM" + bytes(7), "damaged or no MATLAB file"),
+        ("a.mat", b"MATLAB 7.3 MAT-file" + b" " * 105 + b"\x00\x02IM" + bytes(800), "MATLAB 7.3 .*'-v7'"),
+        ("a.csv", b"\xff\xfe\x00\x80", "no CSV file"),
+        ("a.xlsx", b"PK", "must be one of .csv, .txt, .parquet, .mat"),
+        ("axis", b"", "must be one of"),
+    ],
+)
+def test_damaged_and_unknown_files_are_one_sentence(run_command, tmp_path, name, content, text):
+    path = tmp_path / name
+    path.write_bytes(content)
+    check_refusal(run_command, tmp_path / "out", text, str(path), *COLUMNS)
+
+
+def test_matlab_vectors_of_other_lengths_and_folders_are_refused(run_command, files, tmp_path):
+    path, out = tmp_path / "a.mat", tmp_path / "out"
+    write_mat(path, {"time": np.arange(3.0), "pos": np.arange(4.0), "volt": np.arange(3.0)})
+    check_refusal(run_command, out, r"'t' has \(3,\) and 'measured' has \(4,\)", str(path), *COLUMNS)
+    write_mat(path, {"time": np.arange(3.0), "pos": np.eye(3), "volt": np.arange(3.0)})
+    check_refusal(run_command, out, "no column 'pos' .*it has: time, volt", str(path), *COLUMNS)
+    check_refusal(run_command, out, "is a folder; a file is needed", str(tmp_path))
+    check_refusal(run_command, out, "There is no file", str(tmp_path / "none.csv"))
+    check_refusal(run_command, out, "is given twice", files[0], files[0], *COLUMNS)
+    check_refusal(run_command, out, "is given twice", files[0], "--hold-out", files[0], *COLUMNS)
+    code, _, errors = run_command("fit", files[0], *COLUMNS, "--out", files[0])
+    assert code == 2
+    assert "is a file; a folder is needed" in errors
