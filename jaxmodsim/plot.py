@@ -277,11 +277,11 @@ def _interval_panel(axis: Axes, result: FitResult) -> None:
         colour = _RED if open_ or share > 100 else "#b8860b" if share > 20 else _GREEN
         axis.barh(i, 10.0**last if open_ else max(share, 10.0**first), left=0.0, color=colour, height=0.6)
         value, (low, high) = result.values[name], intervals[name]
-        text = f"{value:.5g} (-{value - low:.1e}, +{high - value:.1e}) {result.units[name]}"
+        text = f"{value:.5g} (-{value - low:.2g}, +{high - value:.2g}) {result.units[name]}"
         axis.text(0.41, i, "no interval: has no effect" if open_ else text, va="center", fontsize=8,
                   transform=axis.get_yaxis_transform())  # fmt: skip
     axis.set_xscale("log")
-    decades = np.arange(first, last + 1, max((last - first) // 4, 1))
+    decades = np.arange(first, last + 1, max(np.ceil((last - first) / 3), 1))
     axis.set_xticks(10.0**decades, [f"$10^{{{x:.0f}}}$" for x in decades])
     axis.minorticks_off()
     axis.set_yticks(range(len(names)), names, fontsize=8)
