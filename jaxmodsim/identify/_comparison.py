@@ -71,11 +71,14 @@ class Comparison:
     Two criteria judge by the fit to everything, residuals correlated in time allowed for. With D the deviance
     `sum of n ln(noise^2) + sum of losses`, k parameters, n samples:
 
-    - Takeuchi's `D + 2 trace(H^-1 S)`, H the information, S the covariance of the scores, which the fit estimates from
-      blocks of samples. For white residuals the trace is k, and this is Akaike's criterion.
-    - BIC with effective samples, `D m/n + k ln(m)`, where m is n over the correlation of the residual, by Geyer's
-      initial positive sequence. It is that of the model which fits best: its residual is nearest to the noise, and
-      with an m of its own for each model different things would be compared.
+    - Takeuchi's `(D + 2 trace(H^-1 S)) m/n`, H the information, S the covariance of the scores, which the fit estimates
+      from blocks of samples. For white residuals the trace is k and m = n, and this is Akaike's criterion.
+    - BIC with effective samples, `D m/n + k ln(m)`.
+
+    m is the number of effective samples, n over the correlation of the residual, by Geyer's initial positive sequence.
+    It is that of the model which fits best: its residual is nearest to the noise, and with an m of its own for each
+    model different things would be compared. It brings both criteria to one scale: a difference of 2 is little, one of
+    10 much.
 
     - `ranked`: the models, best first. `failures`: reasons, by the name of the model. `left`: names of the models that
       were not finished when the comparison was interrupted.
@@ -246,7 +249,7 @@ def comparison_of(
     d = {name: deviance(each) for name, each in found.items()}
     trace = {name: penalty(each.result) for name, each in kept.items()}
     size = {name: len(each.result.values) for name, each in kept.items()}
-    takeuchi = {name: d[name] + 2 * trace[name] for name in kept}
+    takeuchi = {name: (d[name] + 2 * trace[name]) * effective / samples for name in kept}
     bic = {name: d[name] * effective / samples + size[name] * np.log(effective) for name in kept}
     ranked = []
     for name in order:
