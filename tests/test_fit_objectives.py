@@ -244,7 +244,6 @@ def test_a_gain_of_a_controller_is_found():
 
 def test_a_law_that_must_be_passive_is():
     law = jms.LuGre(sigma0=600.0, sigma1=5.0, sigma2=0.6, Fc=1.5, Fs=2.0, vs=0.1)
-    t = np.arange(300) * DT
     scene = jms.Scene(
         _lagrangian, params={"m": 2.0, "k": 20.0, "gain": 1.0, "u": 0.0}, effects=(DRIVE, jms.Friction(law))
     )
