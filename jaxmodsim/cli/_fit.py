@@ -24,7 +24,7 @@ from ..plot import comparison_figure, design_figure, fit_figure, score_figure
 from ..scene import Scene, scene_numbers
 from ._app import Interrupted
 from ._fitted import Findings, Fitted, origin, parameter_table, record_table, sample_table, summary
-from ._output import console, show_paths, show_table, write
+from ._output import console, say, show_paths, show_table, write
 from ._plan import FitRequest, Plan, plan_of
 from ._report_html import report_page
 
@@ -51,7 +51,7 @@ def run_fit(request: FitRequest) -> None:
     try:
         if request.next_input is not None:
             design = _designed(request, fitted)
-            console.print(f"Next input, for {request.next_input}:\n{design}", highlight=False, markup=False)
+            say(f"Next input, for {request.next_input}:\n{design}")
             paths += write(request.next_input.parent, {request.next_input.name: design})
             paths += write(request.out, {"next.png": design_figure(design), "next.json": design.to_dict()})
             interrupted = interrupted or design.ending == "was interrupted"
@@ -116,16 +116,16 @@ def fit_with_progress(
 def _show(fitted: Fitted) -> None:
     result = fitted.result
     if fitted.comparison is not None:
-        console.print(str(fitted.comparison), highlight=False, markup=False)
+        say(str(fitted.comparison))
     names = ", ".join(record.name for record in result.records)
     show_table(parameter_table(result), f"{names}: {fitted.model}, {fitted.words}")
     if len(result.records) + len(fitted.scores) > 1:
         show_table(record_table(fitted), "Records")
-    console.print(f"RMSE {result.rmse:.6g} m; {result.evaluations} evaluations, {result.ending}", highlight=False)
+    say(f"RMSE {result.rmse:.6g} m; {result.evaluations} evaluations, {result.ending}")
     for remark in result.remarks:
-        console.print(f"- {remark}", highlight=False, markup=False)
+        say(f"- {remark}")
     samples = sum(len(record.t) for record in result.records)
-    console.print(f"{samples} samples, {fitted.seconds:.1f} s with compilation", highlight=False)
+    say(f"{samples} samples, {fitted.seconds:.1f} s with compilation")
 
 
 def _files(findings: Findings) -> dict[str, Any]:
