@@ -1,8 +1,11 @@
 """`jaxmodsim fit`: one axis, from records of position and applied force."""
 
 import re
+import signal
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -89,13 +92,35 @@ def _fitted(plan: Plan) -> Fitted:
     return replace(fitted, scores=scores, seconds=time.perf_counter() - started)
 
 
+@contextmanager
+def _ctrl_c() -> Iterator[Callable[[], None]]:
+    """Ctrl-C ends all searches of a fit, where it would only end the one that goes on; yields what ends the others."""
+    before = signal.getsignal(signal.SIGINT)
+    pressed = threading.Event()
+
+    def press(*_: Any) -> None:
+        pressed.set()
+        raise KeyboardInterrupt
+
+    def end() -> None:
+        if pressed.is_set():
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, press)
+    try:
+        yield end
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def _compared(plan: Plan) -> Comparison:
     judged: dict[str, Any] = {"hold_out": plan.held_out} if plan.folds is None else {"folds": plan.folds}
-    with console.status("compiling") as status:
+    with console.status("compiling") as status, _ctrl_c() as end:
 
         def progress(name: str, fold: int | None, step: int, rms: float) -> None:
             held = "" if fold is None else f", fold {fold + 1} held back"
             status.update(f"{name}{held}, iteration {step}: RMSE {rms:.6g}")
+            end()
 
         return compare(plan.candidates, plan.records, limits=plan.limits, progress=progress, **judged, **plan.options)
 
@@ -104,11 +129,12 @@ def fit_with_progress(
     scene: Scene, records: Record | Sequence[Record], free: Sequence[str], **options: Any
 ) -> FitResult:
     """`fit` with a line that shows how it goes."""
-    with console.status("compiling") as status:
+    with console.status("compiling") as status, _ctrl_c() as end:
 
         def progress(step: int, rms: float, values: dict[str, float]) -> None:
             shown = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
             status.update(f"iteration {step}: RMSE {rms:.6g}  {shown}")
+            end()
 
         return fit(scene, records, free, progress=progress, **options)
 
