@@ -21,7 +21,7 @@ from _measure import describe_machine, machine_line, write_json
 from _options import begin
 
 import jaxmodsim as jms
-from jaxmodsim.identify import AXIS_MODELS, axis_scene, first_coordinate, replay, rough_axis
+from jaxmodsim.identify import AXIS_MODELS, axis_scene, first_coordinate, replay, rough_axis, start_state
 
 HERE = Path(__file__).parent
 RECORD = HERE.parents[1] / "shared" / "data" / "emps" / "train.csv"
@@ -70,9 +70,10 @@ def rmse_with_substeps(record: jms.Record, report: dict[str, Any], substeps: int
     """RMSE [m] of a fitted model with `substeps` integration steps for every sample."""
     values = {name: entry["value"] for name, entry in report["parameters"].items()} | report["held"]
     scene = axis_scene(AXIS_MODELS[report["model"]], rough_axis(record), values)
-    zero, inputs = jnp.zeros(1), {name: jnp.asarray(x) for name, x in record.inputs.items()}
+    inputs = {name: jnp.asarray(x) for name, x in record.inputs.items()}
+    q0, qd0 = (jnp.asarray([x]) for x in start_state(record))
     run = jax.jit(replay, static_argnums=(5, 6))
-    position = run(scene, jnp.asarray(record.t), inputs, zero + record.measured[0], zero, substeps, first_coordinate)
+    position = run(scene, jnp.asarray(record.t), inputs, q0, qd0, substeps, first_coordinate)
     return float(jnp.sqrt(jnp.mean((position - record.measured) ** 2)))
 
 

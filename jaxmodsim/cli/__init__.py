@@ -1,5 +1,6 @@
 """The command line: `jaxmodsim demo | testbench | fit`."""
 
+import os
 import sys
 
 
@@ -14,4 +15,12 @@ def main() -> None:
     del rich, typer
     from ._app import run
 
-    run()
+    try:
+        run()
+    except SystemExit as ending:
+        if ending.code == 130:
+            # XLA may still be compiling what Ctrl-C interrupted, and crashes if the interpreter ends under it.
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(130)
+        raise

@@ -1,8 +1,11 @@
 """`jaxmodsim fit`: one axis, from records of position and applied force."""
 
 import re
+import signal
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +27,7 @@ from ..plot import comparison_figure, design_figure, fit_figure, score_figure
 from ..scene import Scene, scene_numbers
 from ._app import Interrupted
 from ._fitted import Findings, Fitted, origin, parameter_table, record_table, sample_table, summary
-from ._output import console, show_paths, show_table, write
+from ._output import console, say, show_paths, show_table, write
 from ._plan import FitRequest, Plan, plan_of
 from ._report_html import report_page
 
@@ -51,7 +54,7 @@ def run_fit(request: FitRequest) -> None:
     try:
         if request.next_input is not None:
             design = _designed(request, fitted)
-            console.print(f"Next input, for {request.next_input}:\n{design}", highlight=False, markup=False)
+            say(f"Next input, for {request.next_input}:\n{design}")
             paths += write(request.next_input.parent, {request.next_input.name: design})
             paths += write(request.out, {"next.png": design_figure(design), "next.json": design.to_dict()})
             interrupted = interrupted or design.ending == "was interrupted"
@@ -89,13 +92,35 @@ def _fitted(plan: Plan) -> Fitted:
     return replace(fitted, scores=scores, seconds=time.perf_counter() - started)
 
 
+@contextmanager
+def _ctrl_c() -> Iterator[Callable[[], None]]:
+    """Ctrl-C ends all searches of a fit, where it would only end the one that goes on; yields what ends the others."""
+    before = signal.getsignal(signal.SIGINT)
+    pressed = threading.Event()
+
+    def press(*_: Any) -> None:
+        pressed.set()
+        raise KeyboardInterrupt
+
+    def end() -> None:
+        if pressed.is_set():
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, press)
+    try:
+        yield end
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def _compared(plan: Plan) -> Comparison:
     judged: dict[str, Any] = {"hold_out": plan.held_out} if plan.folds is None else {"folds": plan.folds}
-    with console.status("compiling") as status:
+    with console.status("compiling") as status, _ctrl_c() as end:
 
         def progress(name: str, fold: int | None, step: int, rms: float) -> None:
             held = "" if fold is None else f", fold {fold + 1} held back"
             status.update(f"{name}{held}, iteration {step}: RMSE {rms:.6g}")
+            end()
 
         return compare(plan.candidates, plan.records, limits=plan.limits, progress=progress, **judged, **plan.options)
 
@@ -104,11 +129,12 @@ def fit_with_progress(
     scene: Scene, records: Record | Sequence[Record], free: Sequence[str], **options: Any
 ) -> FitResult:
     """`fit` with a line that shows how it goes."""
-    with console.status("compiling") as status:
+    with console.status("compiling") as status, _ctrl_c() as end:
 
         def progress(step: int, rms: float, values: dict[str, float]) -> None:
             shown = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
             status.update(f"iteration {step}: RMSE {rms:.6g}  {shown}")
+            end()
 
         return fit(scene, records, free, progress=progress, **options)
 
@@ -116,16 +142,16 @@ def fit_with_progress(
 def _show(fitted: Fitted) -> None:
     result = fitted.result
     if fitted.comparison is not None:
-        console.print(str(fitted.comparison), highlight=False, markup=False)
+        say(str(fitted.comparison))
     names = ", ".join(record.name for record in result.records)
     show_table(parameter_table(result), f"{names}: {fitted.model}, {fitted.words}")
     if len(result.records) + len(fitted.scores) > 1:
         show_table(record_table(fitted), "Records")
-    console.print(f"RMSE {result.rmse:.6g} m; {result.evaluations} evaluations, {result.ending}", highlight=False)
+    say(f"RMSE {result.rmse:.6g} m; {result.evaluations} evaluations, {result.ending}")
     for remark in result.remarks:
-        console.print(f"- {remark}", highlight=False, markup=False)
+        say(f"- {remark}")
     samples = sum(len(record.t) for record in result.records)
-    console.print(f"{samples} samples, {fitted.seconds:.1f} s with compilation", highlight=False)
+    say(f"{samples} samples, {fitted.seconds:.1f} s with compilation")
 
 
 def _files(findings: Findings) -> dict[str, Any]:

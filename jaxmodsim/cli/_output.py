@@ -82,8 +82,13 @@ def _cell(value: Any) -> str:
     return str(value)
 
 
+def say(text: str) -> None:
+    """Print text as it is."""
+    console.print(text, soft_wrap=True, highlight=False, markup=False)
+
+
 def show_paths(paths: list[Path]) -> None:
     """Print where everything is."""
     console.print("Wrote:")
     for path in paths:
-        console.print(f"  {path.resolve()}", soft_wrap=True, highlight=False, markup=False)
+        say(f"  {path.resolve()}")

@@ -166,9 +166,7 @@ def _models(request: FitRequest) -> tuple[str, ...]:
     for name in names:
         _known("--compare", name, AXIS_MODELS, "model")
     if len(names) < 2:
-        raise ValueError(
-            f"--compare needs two models or more, as in --compare coulomb,lugre, or all: {request.compare!r}"
-        )
+        raise ValueError(f"--compare needs `all` or two models or more, A,B, but {request.compare!r} was given.")
     return names
 
 
