@@ -207,7 +207,13 @@ def many_starts(count: int, rows: list[list[str]]) -> dict[str, Any]:
     _, warm = timed(search)
     reached = int(np.sum(np.array(found.starts) < 1.01 * found.starts[0]))
     rows.append(
-        [f"LuGre, {count} starts", f"{cold:.1f}", f"{warm:.1f}", f"{reached} reach the best", f"{1e6 * found.rmse:.2f} um"]
+        [
+            f"LuGre, {count} starts",
+            f"{cold:.1f}",
+            f"{warm:.1f}",
+            f"{reached} reach the best",
+            f"{1e6 * found.rmse:.2f} um",
+        ]
     )
     return {"starts": count, "starts_cold": cold, "starts_warm": warm, "starts_at_the_best": reached}
 

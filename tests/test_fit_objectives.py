@@ -33,7 +33,8 @@ DRIVE = jms.AppliedForce(_drive, name="drive")
 
 
 def sprung(m=2.0, Fc=1.5, sigma0=600.0):
-    law = jms.LuGre(sigma0=sigma0, sigma1=5.0, sigma2=0.6, Fc=Fc, Fs=2.0, vs=0.1)
+    # Fs is not free in these fits and keeps its distance from Fc.
+    law = jms.LuGre(sigma0=sigma0, sigma1=5.0, sigma2=0.6, Fc=Fc, Fs=Fc + 0.5, vs=0.1)
     return jms.Scene(_lagrangian, params={"m": m, "k": 20.0, "gain": 1.0, "u": 0.0}, effects=(DRIVE, jms.Friction(law)))
 
 
@@ -169,7 +170,7 @@ def test_fit_through_events_finds_back_from_half_wrong(belt):
 
 
 def test_channels_and_records_together(full):
-    start = sprung(1.9, 1.4, 660.0)
+    start = sprung(1.6, 1.2, 900.0)
     other = record(samples=220, seed=3, start=(0.02, -0.1), name="other")
     free = (*TRUTH, "q0[0]", "qd0[0]")
     result = jms.fit(start, [full, other], free, observe=dict(OBSERVED), limits={"m": (0.0, None)})
@@ -209,7 +210,7 @@ def test_outliers_do_not_pull_a_robust_fit(full):
 
 def test_windows_find_what_one_run_finds(full):
     one = jms.fit(sprung(1.8), only_x(full), tuple(TRUTH), q0=[0.0])
-    several = jms.fit(sprung(1.8), only_x(full), tuple(TRUTH), q0=[0.0], shooting=Shooting(0.3, (1e-6, 1e-4)))
+    several = jms.fit(sprung(1.8), only_x(full), tuple(TRUTH), q0=[0.0], shooting=Shooting(0.3, (1e-5, 1e-3)))
     for name in TRUTH:
         assert abs(several.values[name] - one.values[name]) < 3 * several.errors[name]
     assert several.rmse == pytest.approx(one.rmse, rel=0.1)

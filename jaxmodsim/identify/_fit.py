@@ -53,7 +53,8 @@ def fit(
     - `free`: names of the numbers to fit, as `jaxmodsim.scene.scene_numbers` gives them: `("m", "friction.Fc")`;
       the name of an array stands for all its entries, `friction.k[0]` for one. Of initial states `q0[0]`, `qd0[0]`,
       `z0.friction` (or `q0`, `qd0`, `z0` for all), fitted for each record by itself; of the delay [s] of an input
-      `delay.u`. Laws' parameters stay in their ranges.
+      `delay.u`. Laws' parameters stay in their ranges; one that is not free but limited by one that is (Fs by Fc)
+      keeps its distance from it.
     - `observe`: what a record measured: a function `observe(q, qd)` that returns one number, `"q[0]"`, `"qd[0]"`, or
       the name of an effect, whose force is meant; with several channels a dict of these by channel.
     - `q0`, `qd0`: state at the first sample, shape `[dof]` or `[records, dof]`; by default the first measured value

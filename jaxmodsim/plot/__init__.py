@@ -1,0 +1,17 @@
+"""Figures. The only part that imports matplotlib; every function returns a `matplotlib.figure.Figure`."""
+
+from matplotlib.figure import Figure as Figure
+
+from ._behaviour import behaviour_figure as behaviour_figure
+from ._comparison import comparison_figure as comparison_figure
+from ._design import design_figure as design_figure
+from ._profile import profile_figure as profile_figure
+from ._records import fit_figure as fit_figure
+from ._records import loops_figure as loops_figure
+from ._records import score_figure as score_figure
+from ._records import truth_figure as truth_figure
+from ._result import result_figure as result_figure
+from ._sensitivity import sensitivity_figure as sensitivity_figure
+from ._testbench import RampRun as RampRun
+from ._testbench import ramp_figure as ramp_figure
+from ._testbench import stick_figure as stick_figure
