@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from .analysis import Sensitivity
 from .behaviour import Experiment, Outcome, Verdict
@@ -374,7 +375,7 @@ def _memory_panel(axis: Axes, result: FitResult, number: int) -> None:
     for each, colour in zip(tests, colours * (1 + len(tests) // len(colours)), strict=False):
         lags = interval * np.arange(len(each.autocorrelation))
         label = f"{each.channel}: p = {each.whiteness:.2g} (white)"
-        axis.plot(lags, each.autocorrelation, color=colour, marker=".", ms=4, lw=0.8, label=label)
+        axis.plot(lags, each.autocorrelation, color=colour, lw=1.0, label=label)
     band = 1.96 / np.sqrt(len(record.t))
     axis.axhspan(-band, band, color=_GREY, alpha=0.3, lw=0, label="95 % of white noise")
     axis.axhline(0.0, color=_GREY, lw=0.6)
@@ -399,15 +400,15 @@ def _interval_panel(axis: Axes, result: FitResult) -> None:
         colour = _RED if open_ or share > 100 else "#b8860b" if share > 20 else _GREEN
         axis.barh(i, 10.0**last if open_ else max(share, 10.0**first), left=0.0, color=colour, height=0.6)
         value, (low, high) = result.values[name], intervals[name]
-        text = f"{value:.6g} (-{value - low:.2g}, +{high - value:.2g}) {result.units[name]}"
-        axis.text(0.54, i, "no interval: has no effect" if open_ else text, va="center", fontsize=8,
+        text = f"{value:.5g} (-{value - low:.2g}, +{high - value:.2g}) {result.units[name]}"
+        axis.text(0.41, i, "no interval: has no effect" if open_ else text, va="center", fontsize=8,
                   transform=axis.get_yaxis_transform())  # fmt: skip
     axis.set_xscale("log")
-    decades = np.arange(first, last + 1, max((last - first) // 4, 1))
-    axis.set_xticks(10.0**decades, [f"{10.0**x:g}" for x in decades])
+    decades = np.arange(first, last + 1, max(np.ceil((last - first) / 3), 1))
+    axis.set_xticks(10.0**decades, [f"$10^{{{x:.0f}}}$" for x in decades])
     axis.minorticks_off()
     axis.set_yticks(range(len(names)), names, fontsize=8)
-    edges = 10.0**first, 10.0 ** (last + 0.95 * (last - first))
+    edges = 10.0**first, 10.0 ** (last + 1.6 * (last - first))
     axis.set(xlim=edges, ylim=(len(names) - 0.4, -0.6), xlabel="half-width of the 95 % interval [% of the value]")
     axis.set_title("Parameters: value and 95 % interval")
 
@@ -439,9 +440,14 @@ def profile_figure(profile: Profile) -> Figure:
     above = axes[0]
     above.plot(profile.values, profile.ratio, color=_BLUE, marker=".", label="profile")
     if np.isfinite(profile.error) and profile.error > 0:
-        x = np.linspace(profile.values[0], profile.values[-1], 200)
-        parabola = ((x - profile.estimate) / profile.error) ** 2
-        above.plot(x, parabola, color=_GREY, ls="--", lw=1.0, label="linear model (standard error)")
+        low, over = profile.floor or 0.0, profile.estimate - (profile.floor or 0.0)
+        if profile.floor is None:
+            x = np.linspace(profile.values[0], profile.values[-1], 200)
+            shift = x - profile.estimate
+        else:
+            x = low + np.geomspace(profile.values[0] - low, profile.values[-1] - low, 200)
+            shift = over * np.log((x - low) / over)
+        above.plot(x, (shift / profile.error) ** 2, color=_GREY, ls="--", lw=1.0, label="linear model (standard error)")
     above.axhline(profile.threshold, color=_RED, lw=1.0, label=f"{100 * profile.level:g} % level")
     low, high = (min(max(x, profile.values[0]), profile.values[-1]) for x in profile.interval)
     above.axvspan(low, high, color=_GREEN, alpha=0.15, lw=0, label="interval")
@@ -455,6 +461,8 @@ def profile_figure(profile: Profile) -> Figure:
         axes[-1].plot(profile.values, 100 * (x - x[here]) / scale, marker=".", ms=4, lw=1.0, label=name)
     if others:
         axes[-1].set_ylabel("others, change [%]")
+        if max(float(np.max(np.abs(x / (x[here] or 1.0) - 1))) for x in others.values()) > 10:
+            axes[-1].set_yscale("symlog", linthresh=10.0)
         axes[-1].legend(fontsize=8)
     ratio = profile.values[-1] / profile.values[0] if profile.values[0] > 0 else 0.0
     if ratio > 20:
@@ -471,38 +479,38 @@ def comparison_figure(comparison: Comparison, *, unit: str = "m", caption: str =
     - `comparison`: from `compare` or `compare_laws`.
     - `unit`: of the errors; "1" where several channels were compared, in noise levels.
     - `caption`: a line for the source of the records.
+
+    **Raises:**
+
+    - `ValueError` if no model could be fitted.
     """
-    ranked, (factor, small) = comparison.ranked, _small_unit(unit)
-    figure = Figure(figsize=(9, 1.6 + 0.62 * len(ranked)), layout="constrained")
+    ranked, simplest, (factor, small) = comparison.ranked, comparison.simplest, _small_unit(unit)
+    figure = Figure(figsize=(9, 1.9 + 0.62 * len(ranked)), layout="constrained")
     axis: Axes = figure.subplots()
     for i, each in enumerate(ranked):
-        chosen, label = each.name == comparison.simplest, None if i else "label"
-        bar = axis.barh(i - 0.17, factor * each.held_back, 0.4, color=_GREEN if chosen else _BLUE, alpha=0.75)
-        if not chosen and all(name != "held back" for name in axis.get_legend_handles_labels()[1]):
-            bar.set_label("held back")
-        axis.errorbar(
-            factor * each.held_back, i - 0.17, xerr=factor * each.error, color="black", capsize=4, lw=1.2,
-            label=label and "standard error",
-        )  # fmt: skip
-        axis.plot(
-            factor * each.parts, np.full(len(each.parts), i - 0.17), "o", color="white", mec="black", ms=4, ls="",
-            label=label and "each part that was held back",
-        )  # fmt: skip
-        axis.barh(i + 0.2, factor * each.fitted, 0.24, color=_GREY, label=label and "fitted to everything")
-        if chosen:
-            bar.set_label("held back: simplest that suffices")
-    names = [f"{each.name}\n{each.parameters} parameters{', some not determined' if each.undetermined else ''}"
-             for each in ranked]  # fmt: skip
+        height, colour = np.full(len(each.parts), i - 0.17), _GREEN if each.name == simplest else _BLUE
+        axis.barh(i - 0.17, factor * each.held_back, 0.4, color=colour, alpha=0.75)
+        (parts,) = axis.plot(factor * each.parts, height, "o", color="white", mec="black", ms=4)
+        bar = axis.errorbar(
+            factor * each.held_back, i - 0.17, xerr=factor * each.error, color="black", capsize=4, lw=1.2
+        )
+        axis.barh(i + 0.2, factor * each.fitted, 0.24, color=_GREY)
+        parts.set_label("" if i else "each part that was held back")
+        bar.set_label("" if i else "standard error")
+    doubts = [", some not determined" if each.undetermined else "" for each in ranked]
+    names = [f"{x.name}\n{x.parameters} parameters{doubt}" for x, doubt in zip(ranked, doubts, strict=True)]
     axis.set_yticks(range(len(ranked)), names, fontsize=9)
     axis.invert_yaxis()
     errors = np.concatenate([[each.held_back, each.fitted] for each in ranked])
     if errors.max() > 20 * errors.min() > 0:
         axis.set_xscale("log")
-    axis.set(xlabel=f"root mean square error [{small}]", title=f"Error on what was held back: {comparison.by}")
+        axis.set_xlim(left=0.5 * factor * errors.min())
+    below = f"\n{caption}" if caption else ""
+    axis.set(xlabel=f"root mean square error [{small}]{below}", title=f"Error on what was held back: {comparison.by}")
     axis.grid(axis="x", alpha=0.3)
-    axis.legend(fontsize=8, loc="lower right")
-    if caption:
-        figure.supxlabel(caption, fontsize=8, color=_GREY)
+    bars = {"held back": _BLUE, "held back, simplest that suffices": _GREEN, "fitted to everything": _GREY}
+    patches = [Patch(color=colour, label=label) for label, colour in bars.items()]
+    figure.legend(handles=[*patches, *axis.get_legend_handles_labels()[0]], loc="outside lower center", ncols=3)
     return figure
 
 

@@ -18,8 +18,6 @@ from jaxmodsim.friction import AbstractLaw, Dahl, LuGre
 from jaxmodsim.numerics import Varying, modules_of
 from jaxmodsim.plot import behaviour_figure
 
-from .test_cli import command as command
-
 BENCH = {each.name: each for each in specimens()}
 # Experiments with a prescribed motion compile in no time; those with a mass take some seconds for each law.
 WITH_MASS = ("break-away", "stick-slip", "creep")
@@ -188,11 +186,11 @@ def test_figures_have_a_panel_for_each_law_and_labelled_axes(outcomes):
         assert all("[" in label or "/" in label for label in labels)
 
 
-def test_command_writes_figures_table_and_json(command, tmp_path, monkeypatch, outcomes):
+def test_command_writes_figures_table_and_json(run_command, tmp_path, monkeypatch, outcomes):
     found = {law: outcomes[law] for law in ("Coulomb", "LuGre", "ElastoPlastic")}
     monkeypatch.setattr(_behaviour, "run_bench", lambda progress: found)
     out = tmp_path / "out"
-    code, text, _ = command("testbench", "--laws", "--out", str(out))
+    code, text, _ = run_command("testbench", "--laws", "--out", str(out))
     assert code == 0
     pictures = [f"behaviour_{name.replace('-', '_')}.png" for name in EXPERIMENTS]
     assert sorted(path.name for path in out.iterdir()) == sorted([*pictures, "behaviour.csv", "behaviour.json"])
@@ -206,9 +204,9 @@ def test_command_writes_figures_table_and_json(command, tmp_path, monkeypatch, o
     assert "ElastoPlastic" in text
 
 
-def test_a_failure_gives_exit_code_one(command, tmp_path, monkeypatch, outcomes):
+def test_a_failure_gives_exit_code_one(run_command, tmp_path, monkeypatch, outcomes):
     failure = dataclasses.replace(outcomes["Dahl"]["creep"], verdict=Verdict.FAIL, reason="")
     monkeypatch.setattr(_behaviour, "run_bench", lambda progress: {"Dahl": outcomes["Dahl"] | {"creep": failure}})
-    code, text, _ = command("testbench", "--laws", "--out", str(tmp_path))
+    code, text, _ = run_command("testbench", "--laws", "--out", str(tmp_path))
     assert code == 1
     assert "FAIL: Dahl, creep, 1" in text

@@ -71,11 +71,14 @@ class Comparison:
     Two criteria judge by the fit to everything, residuals correlated in time allowed for. With D the deviance
     `sum of n ln(noise^2) + sum of losses`, k parameters, n samples:
 
-    - Takeuchi's `D + 2 trace(H^-1 S)`, H the information, S the covariance of the scores, which the fit estimates from
-      blocks of samples. For white residuals the trace is k, and this is Akaike's criterion.
-    - BIC with effective samples, `D m/n + k ln(m)`, where m is n over the correlation of the residual, by Geyer's
-      initial positive sequence. It is that of the model which fits best: its residual is nearest to the noise, and
-      with an m of its own for each model different things would be compared.
+    - Takeuchi's `(D + 2 trace(H^-1 S)) m/n`, H the information, S the covariance of the scores, from their scatter
+      over blocks of samples. For white residuals the trace is k and m = n, and this is Akaike's criterion.
+    - BIC with effective samples, `D m/n + k ln(m)`.
+
+    m is the number of effective samples, n over the correlation of the residual, by Geyer's initial positive sequence.
+    It is that of the model which fits best: its residual is nearest to the noise, and with an m of its own for each
+    model different things would be compared. It brings both criteria to one scale: a difference of 2 is little, one of
+    10 much.
 
     - `ranked`: the models, best first. `failures`: reasons, by the name of the model. `left`: names of the models that
       were not finished when the comparison was interrupted.
@@ -175,7 +178,7 @@ class Comparison:
             said += "."
         for name in dict.fromkeys((chosen, best.name)):
             if by_name[name].undetermined:
-                names = ", ".join(by_name[name].undetermined)
+                names = _listed(by_name[name].undetermined)
                 said += f" But the records do not determine {names} of {name}: do not use these values."
         return said
 
@@ -192,7 +195,7 @@ class Comparison:
                 f"{each.name:{width}}  {each.parameters:6d}  {each.held_back:10.4g}  {each.error:10.2g}  {over:>21}"
                 f"  {each.fitted:10.4g}  {each.takeuchi:9.1f}  {each.bic:9.1f}"
             )
-        lines += [f"{each.name}: not determined are {', '.join(each.undetermined)}." for each in self.ranked
+        lines += [f"{each.name}: the records do not determine {', '.join(each.undetermined)}." for each in self.ranked
                   if each.undetermined]  # fmt: skip
         lines += [f"{name}: failed. {reason}" for name, reason in self.failures.items()]
         lines.append(
@@ -244,9 +247,9 @@ def comparison_of(
     order = sorted(means, key=lambda name: means[name])
     best = order[0]
     d = {name: deviance(each) for name, each in found.items()}
-    trace = {name: penalty(each.result) for name, each in kept.items()}
+    trace = {name: penalty(each) for name, each in found.items()}
     size = {name: len(each.result.values) for name, each in kept.items()}
-    takeuchi = {name: d[name] + 2 * trace[name] for name in kept}
+    takeuchi = {name: (d[name] + 2 * trace[name]) * effective / samples for name in kept}
     bic = {name: d[name] * effective / samples + size[name] * np.log(effective) for name in kept}
     ranked = []
     for name in order:
@@ -271,6 +274,11 @@ def comparison_of(
         )
     results = {name: kept[name].result for name in order}
     return Comparison(tuple(ranked), failures, left, results, by, samples, effective)
+
+
+def _listed(names: tuple[str, ...], most: int = 4) -> str:
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def _found(judged: Judged) -> Found:

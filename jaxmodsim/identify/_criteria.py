@@ -3,8 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from ._result import FitResult
-from ._solve import Found, by_channel
+from ._solve import Found, by_channel, sample_blocks
 
 # Directions of the parameters known this much worse than the best one are nothing that double precision can weigh.
 _LEAST = 1e-10
@@ -21,23 +20,26 @@ def deviance(found: Found) -> float:
     return levels + 2 * float(problem.loss.cost(found.search.residual[: problem.samples]))
 
 
-def penalty(result: FitResult) -> float:
+def penalty(found: Found) -> float:
     """Trace of `H^-1 S` of Takeuchi (1976, Suri-Kagaku 153:12): information H, covariance S of the scores.
 
-    The number of parameters where the residual is white noise, more where it is correlated. With the covariance
-    `H^-1 S H^-1` of the estimate it is the trace of covariance times information. A direction that the record does not
-    determine counts as one parameter.
+    The number of parameters where the residual is white noise of its level, more where it is correlated. S comes from
+    the scatter of the scores of blocks of samples, as in the covariance of the estimate; that one has H^-1 on both
+    sides, which leaves nothing to be read where parameters are hardly told apart, so the trace is formed in the
+    principal directions of H. A direction that the record does not determine counts as one parameter.
     """
-    covariance, information = result.covariance, result.information
-    size = np.sqrt(np.diag(information))
-    fine = np.isfinite(np.diag(covariance)) & (size > 0)
-    pick, size = np.ix_(fine, fine), size[fine]
-    if not fine.any():
-        return float(len(fine))
-    values, vectors = np.linalg.eigh(information[pick] / np.outer(size, size))
-    scatter = np.einsum("ik,ij,jk->k", vectors, covariance[pick] * np.outer(size, size), vectors) * values
+    rows = found.problem.samples
+    weighted = found.problem.loss.weighted(found.search.residual[:rows], found.search.jacobian[:rows])
+    residual, jacobian = (np.asarray(each) for each in weighted)
+    size = np.linalg.norm(jacobian, axis=0)
+    scaled = jacobian / np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(scaled.T @ scaled)
     known = values > _LEAST * values[-1]
-    return float(np.sum(scatter[known]) + np.sum(~known) + np.sum(~fine))
+    blocks, count = sample_blocks(found.problem)
+    scores = np.zeros((count, len(size)))
+    np.add.at(scores, np.asarray(blocks), scaled * residual[:, None])
+    across = (scores - np.mean(scores, axis=0)) @ vectors[:, known]
+    return float(np.sum(across**2 / values[known]) * count / (count - 1) + np.sum(~known))
 
 
 def effective_samples(found: Found) -> float:

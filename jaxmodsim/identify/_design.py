@@ -32,6 +32,10 @@ _TRIED, _IMPROVED = 16, 2
 _SHARP = 100.0
 # Kept from every limit, so that rounding in a file does no harm.
 _MARGIN = 1e-3
+# Largest weight, in amplitudes of the largest sine of its frequency.
+_WIDEST = 2.0
+# Stands for a goal that is not finite.
+_NO_GOAL = -1e6
 # Relative standard error that the search takes as known beforehand: keeps the goal finite where nothing is learned.
 _IGNORANCE = 100.0
 
@@ -388,16 +392,21 @@ def _climb(
         key = y.tobytes()
         if key not in seen:
             seen.clear()
-            seen[key] = [np.asarray(x, float) for x in _judge(task, jnp.asarray(lengths * y, float))]
+            found = [np.asarray(x, float) for x in _judge(task, jnp.asarray(lengths * y, float))]
+            # A step far beyond the limits, where the model is not finite: bad enough for the line search to turn back.
+            finite = all(np.isfinite(x).all() for x in found)
+            seen[key] = found if finite else [np.full_like(x, _NO_GOAL if i == 0 else 0.0) for i, x in enumerate(found)]
         return seen[key]
 
-    latest = start / lengths
+    latest = np.clip(start / lengths, -_WIDEST, _WIDEST)
 
     def report(y: np.ndarray) -> None:
         nonlocal latest, count
-        latest, count = y.copy(), count + 1
+        count, goal = count + 1, float(judged(y)[0])
+        if goal > _NO_GOAL:
+            latest = y.copy()
         if progress is not None:
-            progress(count, float(judged(y)[0]))
+            progress(count, goal)
 
     there = np.append(np.flatnonzero(np.asarray(task.inverse)), 3)
     within = {
@@ -411,6 +420,8 @@ def _climb(
             latest,
             jac=lambda y: -judged(y)[1] * lengths,
             method="SLSQP",
+            # Far beyond the limits an axis is so sensitive that the goal runs away.
+            bounds=[(-_WIDEST, _WIDEST)] * latest.size,
             constraints=[within],
             callback=report,
             options={"maxiter": max_steps, "ftol": 1e-4},
@@ -418,7 +429,7 @@ def _climb(
     except KeyboardInterrupt:
         return lengths * latest, "was interrupted", count
     ending = "converged" if found.success else f"stopped ({found.message})"
-    return lengths * found.x, ending, count
+    return lengths * (found.x if judged(found.x)[0] > _NO_GOAL else latest), ending, count
 
 
 def _excitation(

@@ -57,7 +57,13 @@ def weak_directions(result: "FitResult", left_out: Collection[str]) -> list[Dire
         parts = tuple(names[i] for i in order)
         sentence = _sentence(result, parts, vector[order], error, size[order])
         found.append(Direction(parts, tuple(float(vector[i]) for i in order), error, sentence))
-    return found
+    return [direction for direction in found if not _covered(direction, found)]
+
+
+def _covered(direction: Direction, found: list[Direction]) -> bool:
+    """Whether every combination of its parameters is weak, so that there is none to be named."""
+    parts = set(direction.names)
+    return sum(set(other.names) <= parts for other in found) >= len(parts)
 
 
 def _inflation(result: "FitResult", keep: list[int]) -> float:

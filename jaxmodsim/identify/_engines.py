@@ -1,5 +1,6 @@
 """What a model makes of a run: scenes by fixed steps or by events, laws under a measured motion."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -112,9 +113,9 @@ class EventEngine(eqx.Module):
         return found
 
 
-def with_values(scene: Scene, values: dict[str, Array]) -> Scene:
+def with_values(scene: Scene, values: Mapping[str, Any]) -> Scene:
     """The scene with numbers of these names replaced; delays are none of them."""
-    own = {name: x for name, x in values.items() if not name.startswith(DELAY)}
+    own = {name: jnp.asarray(x) for name, x in values.items() if not name.startswith(DELAY)}
     return replace_numbers(scene, join_entries(scene_numbers(scene), own))
 
 

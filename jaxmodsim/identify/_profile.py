@@ -22,9 +22,12 @@ if TYPE_CHECKING:
 _STIFF = 1e3
 # How far to walk before an end is called open: by this factor, or by so many sizes of a parameter that has a sign.
 _FAR_FACTOR, _FAR_SIZES = 1e4, 1e3
-_ITERATIONS = 60
+# A ratio of more thresholds than this at the next point is a leap.
+_LEAP = 4.0
+# How well the ratio must be known at a point, and what a search never does without.
+_PRECISE, _LARGEST_RTOL, _ITERATIONS = 2e-3, 1e-4, 40
 # Shorter and longer steps of the walk, and how closely the end of an interval is found, as a share of the distance.
-_SHORTER, _LONGER, _CLOSE = 0.3, 3.0, 3e-3
+_SHORTER, _LONGER, _CLOSE = 0.3, 3.0, 1e-2
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,7 @@ class Profile:
       was estimated, divided by the ratio of `covariance` to `white` (at least 1/2), by which correlated residuals know
       less than white ones.
     - `cost`: half the sum of losses in noise levels, shape `[points]`.
+    - `floor`: the limit of a parameter that must lie above a number, and is walked in the logarithm; None for others.
     - `level`, `threshold`: of the interval, and the ratio at its ends: the quantile of F with 1 and 31 degrees of
       freedom (blocks of samples less one), the square of Student's t in `FitResult.intervals`.
     - `interval`: where the ratio stays below the threshold; infinite or on a limit where the record sets no end.
@@ -50,6 +54,7 @@ class Profile:
     unit: str
     estimate: float
     error: float
+    floor: float | None
     level: float
     threshold: float
     values: Float[np.ndarray, " points"]
@@ -135,7 +140,7 @@ class _Line:
         x = jnp.clip(jnp.asarray(guess, dtype), lower, upper)
         values = {**problem.free.values(problem.split(x)[0]), self.name: jnp.asarray(value, dtype)}
         x = x.at[: len(problem.free.names)].set(problem.free.coordinates(values))
-        rtol = jnp.asarray(min(1e-6, 1e-3 * self.inflation / max(self.best, 1e-300)), dtype)
+        rtol = jnp.asarray(min(_PRECISE * self.inflation / max(self.best, 1e-300), _LARGEST_RTOL), dtype)
         search = search_start(x, problem.rows)
         for _ in range(_ITERATIONS):
             search = step(held, search, rtol)
@@ -176,6 +181,7 @@ def profile_of(result: "FitResult", name: str, points: int, level: float) -> Pro
         result.units[name],
         estimate,
         result.errors[name],
+        line.floor,
         level,
         threshold,
         np.array([line.value(point.u) for point in path]),
@@ -253,9 +259,13 @@ def _walk(line: _Line, start: _Point, tangent: np.ndarray, side: float, threshol
             return _End(
                 path[1:], side * math.inf, f"{text}: as far as {line.value(last.u):.3g} nothing speaks against."
             )
-        u = last.u + side * pace
+        u = start.u + side * min(abs(last.u + side * pace - start.u), line.reach)
         u = limit if side * (limit - u) < 0 else u
         point = _try(line, u, last, slope)
+        if point is not None and point.ratio > _LEAP * threshold:
+            # A leap may be a search that went astray from a guess that was too bold.
+            again = line.refit(point.u, last.x)
+            point = point if again is None or again.ratio > point.ratio else again
         if point is None:
             text = f"The model cannot be run with {line.name} much beyond {line.value(last.u):.4g}: its {word} limit"
             return _End(path[1:], side * math.inf, f"{text} is not known.")
@@ -296,9 +306,9 @@ def _crossing(line: _Line, inner: _Point, outer: _Point, threshold: float) -> tu
     def between(a: _Point, b: _Point) -> float:
         return a.u + (b.u - a.u) * (wanted - _root(a)) / (_root(b) - _root(a))
 
-    for k in range(6):
-        u = between(inner, outer) if k < 4 else 0.5 * (inner.u + outer.u)
-        share = (u - inner.u) / (outer.u - inner.u)
+    for k in range(4):
+        u = between(inner, outer) if k < 3 else 0.5 * (inner.u + outer.u)
+        share = (u - inner.u) / (outer.u - inner.u) if outer.ratio < _LEAP * threshold else 0.0
         point = line.refit(u, inner.x + share * (outer.x - inner.x))
         if point is None:
             break

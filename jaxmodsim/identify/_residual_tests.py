@@ -54,7 +54,8 @@ class ChannelTests:
     - `samples`, `independent`: number of samples, and of independent ones that would tell as much of a mean.
     - `length`: correlation length [s], the sum of the autocorrelation over positive lags times the interval: 0 for
       white noise, the time constant where it decays exponentially.
-    - `whiteness`: p of the test of Ljung and Box over `lags` lags. `autocorrelation`: at lags 0 to `lags`.
+    - `whiteness`: p of the test of Ljung and Box over `lags` lags. `autocorrelation`: at lags from 0 on, at
+      least to `lags`, further where the memory is longer.
     - `skewness`, `kurtosis`: the second in excess of the normal one. `normality`: p of both together by Jarque and
       Bera, for correlated series (Lobato, Velasco 2004, Econometric Theory 20:671).
     - `trends`: over position, velocity and time. `inputs`: by name.
@@ -166,7 +167,7 @@ def channel_tests(
         interval * (tau - 1) / 2,
         lags,
         _ljung_box(correlation, lags, n),
-        correlation[: lags + 1],
+        correlation[: min(max(lags, 4 * memory), n - 1) + 1],
         skewness,
         kurtosis,
         normality,

@@ -212,6 +212,19 @@ def _friction(problem: Problem, values: Any) -> Callable[[_Sampled], Array]:
     return friction
 
 
+def _slip(problem: Problem) -> Callable[[_Sampled], Array]:
+    """The smallest slip velocity of the friction elements at a sample; one that sticks says nothing in slip."""
+    scene = problem.engine.scene
+    elements = [effect for effect in scene.effects if isinstance(effect, Friction)]
+
+    def slip(s: _Sampled) -> Array:
+        here = _driven(scene, s.inputs)
+        speeds = [jnp.abs(each.slip(s.t, s.q[None], s.v[None], here.params)) for each in elements]
+        return jnp.min(jnp.stack(speeds)) if speeds else s.v
+
+    return slip
+
+
 def _fit_balance(
     problem: Problem, sampled: _Sampled, x: Float[Array, " free"], options: Options
 ) -> tuple[dict[str, float], dict[str, bool]]:
@@ -232,8 +245,8 @@ def _fit_balance(
 
 @eqx.filter_jit
 def _balance_step(problem: Problem, sampled: _Sampled, search: Search, rtol: Array) -> Search:
-    top = jnp.max(jnp.abs(sampled.v))
-    steady = (jnp.abs(sampled.v) > _STEADY * top).astype(sampled.v.dtype)
+    slip = jnp.abs(jax.vmap(_slip(problem))(sampled))
+    steady = (slip > _STEADY * jnp.max(slip)).astype(slip.dtype)
 
     def residual(x: Array) -> Array:
         values = problem.free.values(x)
