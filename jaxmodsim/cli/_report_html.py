@@ -22,7 +22,8 @@ _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1c1c1c; max-width: 62rem; margin: 2rem auto; padding: 0 1rem }
 h1 { font-size: 1.6rem; margin-bottom: .2rem }
 h2 { font-size: 1.15rem; margin-top: 2.2rem; border-bottom: 1px solid #ccc }
-table { display: block; overflow-x: auto; border-collapse: collapse; margin: .8rem 0; font-size: .85rem; font-variant-numeric: tabular-nums }
+table { display: block; overflow-x: auto }
+table { border-collapse: collapse; margin: .8rem 0; font-size: .85rem; font-variant-numeric: tabular-nums }
 th, td { padding: .2rem .7rem; border-bottom: 1px solid #e2e2e2; text-align: left }
 td { white-space: nowrap }
 th { border-bottom: 1px solid #888 }
