@@ -26,7 +26,7 @@ from ..identify import (
 from ..plot import comparison_figure, design_figure, fit_figure, score_figure
 from ..scene import Scene, scene_numbers
 from ._app import Interrupted
-from ._fitted import Findings, Fitted, origin, parameter_table, record_table, sample_table, summary
+from ._fitted import Findings, Fitted, origin, parameter_table, record_table, sample_table, summary, with_units
 from ._output import console, say, show_paths, show_table, write
 from ._plan import FitRequest, Plan, plan_of
 from ._report_html import report_page
@@ -86,7 +86,7 @@ def _fitted(plan: Plan) -> Fitted:
         assert isinstance(scene, Scene)
         assert free is not None
         result = fit_with_progress(scene, plan.records, free, limits=plan.limits, **plan.options)
-    fitted = Fitted(plan, model, result, comparison, (), time.perf_counter() - started)
+    fitted = Fitted(plan, model, with_units(result), comparison, (), time.perf_counter() - started)
     # Whoever pressed Ctrl-C does not wait for more.
     scores = () if fitted.interrupted else tuple(result.score(record) for record in plan.held_out)
     return replace(fitted, scores=scores, seconds=time.perf_counter() - started)

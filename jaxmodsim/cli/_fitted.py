@@ -3,7 +3,7 @@
 import math
 import shlex
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib import metadata
 from typing import Any
@@ -74,9 +74,10 @@ class Findings:
     origin: dict[str, str]
 
 
-def unit_of(result: FitResult, name: str) -> str:
-    """Unit of a parameter, "" where none is known."""
-    return result.units.get(name) or _UNITS.get(name.rpartition("/")[2], "")
+def with_units(result: FitResult) -> FitResult:
+    """The result with the units of what declares none."""
+    units = {name: unit or _UNITS.get(name.rpartition("/")[2], "") for name, unit in result.units.items()}
+    return replace(result, units=units)
 
 
 def origin() -> dict[str, str]:
@@ -92,10 +93,7 @@ def origin() -> dict[str, str]:
 def parameter_table(result: FitResult) -> pd.DataFrame:
     """Parameters with standard errors, 95 % intervals, start values and units."""
     intervals = result.intervals()
-    rows = [
-        (name, value, error, *intervals[name], start, unit_of(result, name))
-        for name, value, error, start, _ in result.rows()
-    ]
+    rows = [(name, value, error, *intervals[name], start, unit) for name, value, error, start, unit in result.rows()]
     columns = ["parameter", "value", "standard error", "95 % from", "to", "start", "unit"]
     return pd.DataFrame(rows, columns=pd.Index(columns))
 
@@ -120,6 +118,30 @@ def record_table(fitted: Fitted) -> pd.DataFrame:
             ],
         }
     )
+
+
+def model_table(comparison: Comparison) -> pd.DataFrame:
+    """Compared models, best first."""
+    return pd.DataFrame(
+        {
+            "model": [each.name for each in comparison.ranked],
+            "parameters": [each.parameters for each in comparison.ranked],
+            "held back, RMSE [mm]": [1e3 * each.held_back for each in comparison.ranked],
+            "standard error [mm]": [1e3 * each.error for each in comparison.ranked],
+            "over the best [mm]": [1e3 * each.over for each in comparison.ranked],
+            "its standard error [mm]": [1e3 * each.over_error for each in comparison.ranked],
+            "fitted, RMSE [mm]": [1e3 * each.fitted for each in comparison.ranked],
+            "not determined": [", ".join(each.undetermined) or "-" for each in comparison.ranked],
+        }
+    )
+
+
+def design_table(findings: Findings, design: InputDesign) -> pd.DataFrame:
+    """What the designed input promises."""
+    units = findings.fitted.result.units
+    rows = [(name, value, error, plain, units[name]) for name, value, error, plain, _ in design.rows()]
+    columns = ["parameter", "value", "predicted standard error", "of a plain sine", "unit"]
+    return pd.DataFrame(rows, columns=pd.Index(columns))
 
 
 def sample_table(fitted: Fitted) -> pd.DataFrame:
@@ -147,14 +169,11 @@ def sample_table(fitted: Fitted) -> pd.DataFrame:
 def summary(findings: Findings) -> dict[str, Any]:
     """All but the samples, of types that JSON knows."""
     fitted = findings.fitted
-    found = fitted.result.to_dict()
-    for name, entry in found["parameters"].items():
-        entry["unit"] = unit_of(fitted.result, name)
     return {
         "model": fitted.model,
         "words": fitted.words,
         "equations": list(equations(fitted.scene)),
-        **found,
+        **fitted.result.to_dict(),
         "held": fitted.held,
         "held_out": {score.record.name: score.rmse for score in fitted.scores},
         "comparison": None if fitted.comparison is None else fitted.comparison.to_dict(),

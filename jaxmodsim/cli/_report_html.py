@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ..identify import FitResult, InputDesign, Profile, Score
+from ..identify import Comparison, FitResult, InputDesign, Profile, Score
 from ..plot import Figure, comparison_figure, design_figure, fit_figure, profile_figure, result_figure, score_figure
 from ._equations import equations
-from ._fitted import Findings, Fitted, parameter_table, record_table
+from ._fitted import Findings, Fitted, design_table, model_table, parameter_table, record_table
 
 # Correlations from which on a cell is marked.
 _STRONG = 0.9
@@ -22,8 +22,10 @@ _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1c1c1c; max-width: 62rem; margin: 2rem auto; padding: 0 1rem }
 h1 { font-size: 1.6rem; margin-bottom: .2rem }
 h2 { font-size: 1.15rem; margin-top: 2.2rem; border-bottom: 1px solid #ccc }
-table { border-collapse: collapse; margin: .8rem 0; font-variant-numeric: tabular-nums }
-th, td { padding: .2rem .7rem; border-bottom: 1px solid #e2e2e2; text-align: left; white-space: nowrap }
+table { display: block; overflow-x: auto }
+table { border-collapse: collapse; margin: .8rem 0; font-size: .85rem; font-variant-numeric: tabular-nums }
+th, td { padding: .2rem .7rem; border-bottom: 1px solid #e2e2e2; text-align: left }
+td { white-space: nowrap }
 th { border-bottom: 1px solid #888 }
 td.number, th.number { text-align: right }
 td.strong { background: #f6ddd6; font-weight: 600 }
@@ -54,12 +56,11 @@ def report_page(findings: Findings) -> str:
     if fitted.scores:
         parts.append(_section("Records that were held out", *_held_out(fitted.scores)))
     if fitted.comparison is not None:
-        drawn = _figure(comparison_figure(fitted.comparison), "Comparison of the models")
-        parts.append(_section("Comparison of models", _pre(str(fitted.comparison)), drawn))
+        parts.append(_section("Comparison of models", *_compared(fitted.comparison)))
     if findings.profiles:
         parts.append(_section("Profile likelihood of the least known parameters", *_profiles(findings.profiles)))
     if findings.design is not None:
-        parts.append(_section("The next record", *_next(findings.design)))
+        parts.append(_section("The next record", *_next(findings, findings.design)))
     body = "\n".join(parts)
     return (
         f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'
@@ -137,8 +138,23 @@ def _profiles(profiles: Sequence[Profile]) -> list[str]:
     return [part for each in profiles for part in (_pre(str(each)), _figure(profile_figure(each), each.name))]
 
 
-def _next(design: InputDesign) -> list[str]:
-    return [_pre(str(design)), _figure(design_figure(design), "Designed input: position, velocity and force")]
+def _compared(comparison: Comparison) -> list[str]:
+    told = [comparison.conclusion, f"Held back: {comparison.by}."]
+    told += [f"{name} failed: {reason}" for name, reason in comparison.failures.items()]
+    told += [f"{name} was not finished." for name in comparison.left]
+    drawn = _figure(comparison_figure(comparison), "Root mean square errors of the models")
+    return [_frame(model_table(comparison)), _list(told), drawn]
+
+
+def _next(findings: Findings, design: InputDesign) -> list[str]:
+    used = ", ".join(f"{name} {100 * share:.0f} %" for name, share in design.used.items())
+    told = [
+        f"{len(design.t)} samples over {design.t[-1] - design.t[0]:g} s; limits: {design.limits}; used: {used}.",
+        f"Noise reckoned with: {1e3 * design.noise:.4g} mm, the residual of this fit.",
+        *design.remarks,
+    ]
+    drawn = _figure(design_figure(design), "Designed input: position, velocity and force")
+    return [_frame(design_table(findings, design)), _list(told), drawn]
 
 
 def _section(title: str, *parts: str) -> str:
