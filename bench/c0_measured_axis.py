@@ -70,11 +70,18 @@ def main() -> None:
             ]
         )
     content |= {"comparison": found, "seconds": report["whole_seconds"], "goal_mm": GOAL}
-    columns = ["model", "parameters", "RMSE [mm]", "with 5 steps a sample [mm]", "held back [mm]", "its std. error [mm]"]
+    columns = [
+        "model",
+        "parameters",
+        "RMSE [mm]",
+        "with 5 steps a sample [mm]",
+        "held back [mm]",
+        "its std. error [mm]",
+    ]
     content["table"] = {"columns": [*columns, "not determined by the record"], "rows": rows}
     content["caption"] = (
-        "EMPS record, 24 841 samples, open-loop error of the position over the whole record, and in four parts that were"
-        f" held back one after the other. Asked for: {GOAL} mm with at most 8 parameters. One command,"
+        "EMPS record, 24 841 samples, open-loop error of the position over the whole record, and in four parts"
+        f" that were held back one after the other. Asked for: {GOAL} mm with at most 8 parameters. One command,"
         f" {report['whole_seconds']:.0f} s. {machine_line(machine)}"
     )
     write_json(options.out / "measured_axis.json", content)

@@ -5,10 +5,20 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim.identify import Continuation, MultiStart, Staged, coverage, first_coordinate, law_force, replay
+from jaxmodsim.identify import (
+    Continuation,
+    MultiStart,
+    Staged,
+    Stochastic,
+    coverage,
+    first_coordinate,
+    law_force,
+    replay,
+)
 from jaxmodsim.scene import replace_numbers
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -114,12 +124,31 @@ def test_intervals_hold_the_truth_as_often_as_promised(moved):
     assert all(0.25 < share < 0.75 for share in narrow.shares.values())
 
 
+def test_steps_on_a_few_of_many_records_come_near(moved):
+    rng, truth = np.random.default_rng(5), jms.LuGre(**TRUTH)
+    force = jax.jit(lambda x: law_force(truth, jnp.asarray(moved.t), x))
+    records = []
+    for i in range(12):
+        x = moved.inputs["x"] * (0.6 + 0.1 * i)
+        noisy = np.asarray(force(jnp.asarray(x))) + 0.01 * rng.standard_normal(x.size)
+        records.append(jms.Record(moved.t, noisy, {"x": x}, name=f"run {i}", noise=0.01))
+    start = jms.LuGre(2e4, 40.0, 2.0, 1.5, 2.0, 0.02)
+    steps = Stochastic(optax.adam(0.05), batch=3, steps=120)
+    near = jms.fit_law(start, records, ("sigma0", "Fc"), begin=steps, max_steps=1)
+    for name in near.values:
+        assert near.values[name] == pytest.approx(TRUTH[name], rel=0.2)
+    assert near.rmse < 0.5 * jms.fit_law(start, records, ("sigma0", "Fc"), max_steps=1).rmse
+    with pytest.raises(ValueError, match="draws 20 runs at a time, but there are 12"):
+        jms.fit_law(start, records, ("Fc",), begin=Stochastic(optax.sgd(0.1), batch=20))
+
+
 @pytest.mark.parametrize(
     ("make", "text"),
     [
         (lambda: MultiStart(0), "count >= 1"),
         (lambda: MultiStart(spread=1.0), "spread > 1"),
         (lambda: Continuation("friction.width", factor=0.5), "factor > 1"),
+        (lambda: Stochastic(0.05), "must be one of optax"),
     ],
 )
 @pytest.mark.quick

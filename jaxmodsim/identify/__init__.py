@@ -36,3 +36,4 @@ from ._result import FitResult as FitResult
 from ._score import Score as Score
 from ._staged import Staged as Staged
 from ._starts import start_state as start_state
+from ._stochastic import Stochastic as Stochastic
