@@ -3,8 +3,8 @@
 (a) over the same simulation written by hand in numba, (b) over `scipy.integrate.solve_ivp`, step by step, on a tenth
 of the record; and many starts of a LuGre fit side by side. One process, the same model (Coulomb, regularised with the
 same width, and viscous friction, mass and offset), the same steps (one linearly implicit step of RODAS3 for each
-sample), the same start, bounds and tolerance. Record: A. Janot, M. Gautier, M. Brunot, "Data set and reference models of EMPS",
-Workshop on Nonlinear System Identification Benchmarks, 2019; it lies beside the repository and not in it.
+sample), the same start, bounds and tolerance. Record: A. Janot, M. Gautier, M. Brunot, "Data set and reference models
+of EMPS", Workshop on Nonlinear System Identification Benchmarks, 2019; it lies beside the repository and not in it.
 """
 
 import time

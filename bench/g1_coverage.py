@@ -1,7 +1,8 @@
 """Whether 95 % intervals hold the truth 95 times in 100: LuGre's six parameters from 200 noisy records.
 
 A mass on a spring, driven through stick and slip, 2 000 samples of its position. Every repeat has noise of its own,
-white or with a memory, starts from parameters wrong by up to a factor of ten, and is fitted side by side with the others.
+white or with a memory, starts from parameters wrong by up to a factor of ten, and is fitted side by side with the
+others.
 """
 
 import time

@@ -91,7 +91,9 @@ def test_the_best_of_many_starts_is_the_truth_where_one_start_is_lost(moved):
 
 
 def test_starts_cover_the_box_and_begin_with_the_given_one(moved):
-    problem = jms.fit_law(jms.LuGre(**TRUTH), moved, tuple(TRUTH), max_steps=1).found.problem
+    found = jms.fit_law(jms.LuGre(**TRUTH), moved, tuple(TRUTH), max_steps=1).found
+    assert found is not None
+    problem = found.problem
     drawn = MultiStart(64, spread=10.0).starts(problem, problem.x0)
     np.testing.assert_array_equal(drawn[0], problem.x0)
     sigma0 = np.log10(TRUTH["sigma0"] * np.exp(drawn[:, 0]))
