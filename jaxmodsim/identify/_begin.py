@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.stats import qmc
 
 from ._bounded import Search, search_start
 from ._problem import Problem
@@ -66,6 +65,8 @@ class MultiStart(AbstractBeginning):
 
     def starts(self, problem: Problem, x: Float[Array, " n"]) -> Float[np.ndarray, "count n"]:
         """Where the searches start; the first one at `x`."""
+        from scipy.stats import qmc  # most of a second to import, and only needed here
+
         size = len(problem.free.names)
         points = qmc.Sobol(size, rng=self.seed).random(1 << max(self.count - 1, 1).bit_length())[: self.count]
         away = 2 * points - 1  # -1 to 1

@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 from jaxtyping import Array, ArrayLike, Float
 
 from ..numerics import check_ranges, modules_of
@@ -398,6 +397,8 @@ def _climb(
             seen[key] = found if finite else [np.full_like(x, _NO_GOAL if i == 0 else 0.0) for i, x in enumerate(found)]
         return seen[key]
 
+    from scipy import optimize  # slow to import, and only needed here
+
     latest = np.clip(start / lengths, -_WIDEST, _WIDEST)
 
     def report(y: np.ndarray) -> None:
@@ -415,7 +416,7 @@ def _climb(
         "jac": lambda y: -judged(y)[3][there] * lengths,
     }
     try:
-        found = scipy.optimize.minimize(
+        found = optimize.minimize(
             lambda y: -float(judged(y)[0]),
             latest,
             jac=lambda y: -judged(y)[1] * lengths,

@@ -1,7 +1,7 @@
 """A confidence interval from a value and its standard error."""
 
 import numpy as np
-from scipy import stats
+from scipy import special  # scipy.stats takes most of a second to import
 
 from ._covariance import BLOCKS
 
@@ -28,7 +28,7 @@ def interval(
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1, but it is {level}.")
     low, high = limits
-    margin = float(stats.t.ppf(0.5 + level / 2, BLOCKS - 1)) * error
+    margin = float(special.stdtrit(BLOCKS - 1, 0.5 + level / 2)) * error
     if logarithmic and value > low:
         with np.errstate(over="ignore"):
             ratio = float(np.exp(margin / (value - low)))

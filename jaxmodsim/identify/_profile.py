@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
+from scipy import special  # scipy.stats takes most of a second to import
 
 from ._bounded import search_start
 from ._covariance import BLOCKS
@@ -163,7 +163,7 @@ def profile_of(result: "FitResult", name: str, points: int, level: float) -> Pro
         raise ValueError(f"level must lie between 0 and 1, but it is {level}.")
     if isinstance(points, bool) or not isinstance(points, int) or points < 2:
         raise ValueError(f"points must be an integer >= 2, but it is {points!r}.")
-    threshold = float(stats.f.ppf(level, 1, BLOCKS - 1))
+    threshold = float(special.fdtri(1, BLOCKS - 1, level))
     line, tangent = _line_of(result, name)
     estimate = result.values[name]
     start = _Point(line.coordinate(estimate), np.asarray(result.found.search.x), 0.0, line.best)

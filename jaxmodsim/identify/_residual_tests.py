@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
+from scipy import special  # scipy.stats takes most of a second to import
 
 if TYPE_CHECKING:
     from ._motion import Motion
@@ -211,7 +211,7 @@ def _ljung_box(correlation: np.ndarray, lags: int, n: int) -> float:
     """Ljung, Box 1978, Biometrika 65:297."""
     k = np.arange(1, lags + 1)
     q = n * (n + 2) * float(np.sum(correlation[1 : lags + 1] ** 2 / (n - k)))
-    return float(stats.chi2.sf(q, lags))
+    return float(special.chdtrc(lags, q))
 
 
 def _normality(e: np.ndarray, correlation: np.ndarray, memory: int) -> tuple[float, float, float]:
@@ -221,7 +221,7 @@ def _normality(e: np.ndarray, correlation: np.ndarray, memory: int) -> tuple[flo
     skewness, kurtosis = float(np.mean(e**3)) / variance**1.5, float(np.mean(e**4)) / variance**2 - 3
     cubes, fourths = (1 + 2 * float(np.sum(correlation[1:memory] ** k)) for k in (3, 4))
     statistic = len(e) * (skewness**2 / (6 * max(cubes, 1.0)) + kurtosis**2 / (24 * fourths))
-    return skewness, kurtosis, float(stats.chi2.sf(statistic, 2))
+    return skewness, kurtosis, float(special.chdtrc(2, statistic))
 
 
 def _variance_of_correlation(correlation: np.ndarray, memory: int, other: np.ndarray) -> float:
@@ -245,7 +245,7 @@ def trend_over(name: str, e: Float[np.ndarray, " samples"], x: Float[np.ndarray,
     variance = _variance_of_correlation(correlation, remembered(correlation), x)
     # The correlation under the hypothesis that there is none, in units of what is left.
     score = abs(slope) * math.sqrt(float(x @ x)) / max(math.sqrt(float(left @ left)), 1e-300)
-    return Trend(name, slope, share, float(2 * stats.norm.sf(score / math.sqrt(variance))) if whole > 0 else 1.0)
+    return Trend(name, slope, share, float(2 * special.ndtr(-score / math.sqrt(variance))) if whole > 0 else 1.0)
 
 
 def _cross(e: np.ndarray, u: np.ndarray, correlation: np.ndarray, memory: int, lags: int, interval: float) -> Cross:
@@ -259,7 +259,7 @@ def _cross(e: np.ndarray, u: np.ndarray, correlation: np.ndarray, memory: int, l
     found = _covariances(e, u)[looked_at] / size
     best = int(np.argmax(np.abs(found)))
     deviation = math.sqrt(_variance_of_correlation(correlation, memory, u))
-    p = float(2 * stats.norm.sf(abs(found[best]) / deviation))
+    p = float(2 * special.ndtr(-abs(found[best]) / deviation))
     # As if the lags were independent (Sidak), which is on the safe side.
     chance = -math.expm1(len(looked_at) * math.log1p(-min(p, 1 - 1e-16)))
     return Cross(float(found[best]), interval * float(looked_at[best]), chance)
