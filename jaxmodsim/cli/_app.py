@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from . import _options
+from ._interrupted import Interrupted
 from ._options import Out
 
 app = typer.Typer(
@@ -16,10 +17,6 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-
-
-class Interrupted(Exception):
-    """Ctrl-C, after which what had been computed was written; the text says so."""
 
 
 def run() -> None:
