@@ -176,7 +176,7 @@ def test_limits_hold_also_in_an_independent_run(design):
 
 def test_fits_are_as_good_as_predicted_and_better_than_those_of_a_plain_sine(design, fits):
     *designed, plain = fits
-    assert all(result.ending == "converged" for result in fits)
+    assert all(result.found.converged for result in fits)
     ratios, better = [], 0
     for name in design.values:
         stated = np.mean([result.errors[name] for result in designed])
@@ -307,9 +307,9 @@ def test_wrong_limits_are_refused(limits, text):
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"free": ("mass",)}, "'mass', but the numbers are: m"),
+        ({"free": ("mass",)}, "'mass', but the numbers are: drift, m"),
         ({"free": ("u",)}, "u is the input"),
-        ({"input": "force"}, r"'force' must be a single number in the scene's params \(m, offset, u\)"),
+        ({"input": "force"}, r"'force' must be a single number in the scene's params \(drift, m, offset, tau, u\)"),
         ({"input": "m", "free": ("offset",)}, "does not move the first coordinate"),
         ({"duration": -1.0}, "duration must be finite and > 0 s"),
         ({"noise": 0.0}, "noise must be finite and > 0"),

@@ -65,7 +65,7 @@ class FitResult:
     bounds: dict[str, tuple[float, float]]
     model: eqx.Module | None
     records: tuple[Record, ...]
-    outputs: tuple[dict[str, Float[np.ndarray, " samples"]], ...]
+    outputs: tuple[dict[str, np.ndarray], ...]
     noise: dict[str, float]
     rmse_by: dict[str, float]
     evaluations: int
@@ -114,7 +114,7 @@ class FitResult:
         return next(iter(self.rmse_by.values()))
 
     @property
-    def residuals(self) -> tuple[dict[str, Float[np.ndarray, " samples"]], ...]:
+    def residuals(self) -> tuple[dict[str, np.ndarray], ...]:
         """Output less measured value by channel, one dict a record."""
         return tuple(
             {name: x - record.channels[name] for name, x in seen.items()}
