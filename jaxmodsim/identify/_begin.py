@@ -3,6 +3,7 @@
 import abc
 import os
 import threading
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -31,6 +32,18 @@ class AbstractBeginning(eqx.Module):
         self, problem: Problem, x: Float[Array, " n"], options: Options
     ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
         """A better `x`, and the root mean squares, in noise levels, of all starts that were tried, best first."""
+
+
+def begin_all(
+    begin: AbstractBeginning | Sequence[AbstractBeginning],
+    problem: Problem,
+    options: Options,
+) -> tuple[Float[Array, " n"], tuple[float, ...]]:
+    """Where the search begins after one beginning or several, each from where the one before it ended."""
+    x, starts = problem.x0, ()
+    for each in (begin,) if isinstance(begin, AbstractBeginning) else begin:
+        x, starts = each.begin(problem, x, options)
+    return x, tuple(starts)
 
 
 class MultiStart(AbstractBeginning):
@@ -122,7 +135,7 @@ def side_by_side(problem: Problem, axes: Any, search: Search, options: Options, 
     groups = []
     for first in range(0, lanes, _GROUP):
         rows = jnp.minimum(jnp.arange(first, first + _GROUP), lanes - 1)
-        own = problem if axes is None else _chosen(problem, axes, rows)
+        own = problem if axes is None else chosen_lanes(problem, axes, rows)
         groups.append([own, jtu.tree_map(lambda x, rows=rows: x[rows], search)])
     stopped = threading.Event()
 
@@ -152,7 +165,8 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _chosen(problem: Problem, axes: Any, rows: Array) -> Problem:
+def chosen_lanes(problem: Problem, axes: Any, rows: Array | int) -> Problem:
+    """The problem of some of the lanes, or of one."""
     return jtu.tree_map(
         lambda axis, leaf: leaf if axis is None else leaf[rows], axes, problem, is_leaf=lambda x: x is None
     )

@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._begin import AbstractBeginning, side_by_side, starts_of
+from ._begin import AbstractBeginning, begin_all, chosen_lanes, side_by_side, starts_of
 from ._bounded import Search
 from ._interval import interval
 from ._problem import Problem
@@ -98,10 +98,8 @@ def coverage(
     options = Options(max_steps=steps)
     starts = []
     for measured in truth + noise:
-        one, x = eqx.tree_at(lambda p: p.runs.measured[name], problem, jnp.asarray(measured)), problem.x0
-        for each in (begin,) if isinstance(begin, AbstractBeginning) else begin:
-            x, _ = each.begin(one, x, options)
-        starts.append(x)
+        one = eqx.tree_at(lambda p: p.runs.measured[name], problem, jnp.asarray(measured))
+        starts.append(begin_all(begin, one, options)[0])
     search = side_by_side(several, axes, starts_of(problem, jnp.stack(starts)), options, steps)
     values, errors = _estimates(several, axes, search)
     names, found = problem.free.names, result
@@ -141,10 +139,7 @@ def _estimates(problem: Problem, axes: Problem, search: Search) -> tuple[np.ndar
 
     values, errors = [], []
     for i in range(search.x.shape[0]):
-        one = jtu.tree_map(
-            lambda axis, leaf, i=i: leaf if axis is None else leaf[i], axes, problem, is_leaf=lambda x: x is None
-        )
-        value, error = estimate(one, jtu.tree_map(lambda x, i=i: x[i], search), blocks)
+        value, error = estimate(chosen_lanes(problem, axes, i), jtu.tree_map(lambda x, i=i: x[i], search), blocks)
         values.append(np.asarray(value))
         errors.append(np.asarray(error))
     return np.stack(values), np.stack(errors)

@@ -6,7 +6,7 @@ from typing import Any
 from jaxtyping import ArrayLike
 
 from ..scene import Scene
-from ._begin import AbstractBeginning
+from ._begin import AbstractBeginning, begin_all
 from ._engines import with_values
 from ._losses import AbstractLoss, Squares
 from ._observe import Observable, first_coordinate
@@ -94,12 +94,11 @@ def fit(
         accuracy,
     )  # fmt: skip
     prepared = prepare(scene, records, free, settings)
-    options, x, starts = Options(rtol, max_steps, progress), prepared.problem.x0, ()
-    for each in (begin,) if isinstance(begin, AbstractBeginning) else begin:
-        x, starts = each.begin(prepared.problem, x, options)
+    options = Options(rtol, max_steps, progress)
+    x, starts = begin_all(begin, prepared.problem, options)
     found = solve_with_noise(prepared.problem, x, options, prepared.given)
     values = found.problem.free.values(found.problem.split(found.search.x)[0])
     error = step_error(found)
     return result_of(
-        found, prepared.records, prepared.windows, prepared.units, with_values(scene, values), error, tuple(starts)
+        found, prepared.records, prepared.windows, prepared.units, with_values(scene, values), error, starts
     )

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw
 from ..numerics import Range, varies
 from ..scene import Scene, replace_numbers, scene_numbers, scene_ranges
-from ._begin import AbstractBeginning
+from ._begin import AbstractBeginning, begin_all
 from ._engines import Seen
 from ._entries import chosen_entries, join_entries, split_entries, split_ranges
 from ._losses import AbstractLoss, Squares
@@ -94,16 +94,15 @@ def fit_law(
         Squares() if loss is None else loss,
         Prior(jnp.zeros(len(parameters.names)), jnp.zeros(len(parameters.names))),
     )
-    options, x, starts = Options(rtol, max_steps, progress), problem.x0, ()
-    for each in (begin,) if isinstance(begin, AbstractBeginning) else begin:
-        x, starts = each.begin(problem, x, options)
+    options = Options(rtol, max_steps, progress)
+    x, starts = begin_all(begin, problem, options)
     found = solve_with_noise(problem, x, options, frozenset(given))
     per_load = " per N" if "normal" in several[0].inputs else ""
     units = {
         name: allowed.unit + (per_load if allowed.unit.startswith("N") else "") for name, allowed in ranges.items()
     }
     fitted = _law(holder, found.problem.free.values(found.search.x))
-    return result_of(found, several, windows, units, fitted, None, tuple(starts))
+    return result_of(found, several, windows, units, fitted, None, starts)
 
 
 class LawEngine(eqx.Module):

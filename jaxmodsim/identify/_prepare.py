@@ -22,7 +22,7 @@ from ._problem import Prior, Problem
 from ._record import Record, slip_channel
 from ._replay import Controller
 from ._runs import Windows, cut, runs_of
-from ._solve import Found
+from ._solve import Found, channels_seen
 from ._starts import local_names, measured_start
 
 # Mode changes of one run by events that the arrays of a fit have room for.
@@ -335,13 +335,8 @@ def step_error(found: Found) -> float | None:
     finer = ReplayEngine(
         engine.scene, engine.delays, engine.controller, engine.observables, engine.linear, 4 * engine.substeps
     )
-    fine = _channels(eqx.tree_at(lambda p: p.engine, problem, finer), found.search.x)
+    fine = channels_seen(eqx.tree_at(lambda p: p.engine, problem, finer), found.search.x)
     name, weight = next(iter(problem.columns.items()))
     coarse = jnp.reshape(found.search.residual[: problem.samples], weight.shape) * problem.noise[name]
     moved = jnp.where(weight > 0, fine[name] - problem.runs.measured[name] - coarse, 0.0)
     return float(jnp.sqrt(jnp.sum(moved**2) / jnp.sum(weight)))
-
-
-@eqx.filter_jit
-def _channels(problem: Problem, x: Array) -> dict[str, Array]:
-    return problem.seen(x).channels

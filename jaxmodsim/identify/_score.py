@@ -4,11 +4,10 @@ import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from ..scene import Scene, State
 from ._engines import DELAY, EventEngine, ReplayEngine
@@ -17,7 +16,7 @@ from ._parameters import FreeParameters
 from ._problem import Prior, Problem
 from ._record import Record
 from ._runs import cut, runs_of
-from ._solve import Options, by_channel, solve
+from ._solve import Options, by_channel, channels_seen, solve
 from ._starts import measured_start
 
 if TYPE_CHECKING:
@@ -67,11 +66,11 @@ def score_of(result: "FitResult", record: Record, q0: Any, qd0: Any, free_start:
     if not isinstance(problem.engine, ReplayEngine | EventEngine):
         values, _ = problem.split(result.found.search.x)
         fixed = dataclasses.replace(problem, runs=runs_of((_bare(record),), cut((record,), None)))
-        return _scored(record, _channels(fixed, values), None, None)
+        return _scored(record, channels_seen(fixed, values), None, None)
     alone = _alone(result, record, q0, qd0, free_start)
     if not free_start:
         assert alone.base is not None
-        return _scored(record, _channels(alone, alone.x0), alone.base, None)
+        return _scored(record, channels_seen(alone, alone.x0), alone.base, None)
     found = solve(alone, alone.x0, Options())
     outputs = {
         name: (record.channels[name] + float(alone.noise[name]) * residual[0])[None]
@@ -138,11 +137,6 @@ def _given(given: Any, guess: np.ndarray, dof: int, name: str) -> np.ndarray:
     if array.shape != (dof,) or not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite and of the shape {(dof,)}, but it is {given!r}.")
     return array
-
-
-@eqx.filter_jit
-def _channels(problem: Problem, x: Array) -> dict[str, Array]:
-    return problem.seen(x).channels
 
 
 def _scored(record: Record, outputs: Any, start: State | None, ending: str | None) -> Score:

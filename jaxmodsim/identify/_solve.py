@@ -101,6 +101,12 @@ def solve(problem: Problem, x: Float[Array, " n"], options: Options) -> Found:
     return Found(problem, search, int(search.steps), f"stopped at the limit of {options.max_steps} iterations")
 
 
+@eqx.filter_jit
+def channels_seen(problem: Problem, x: Float[Array, " n"]) -> dict[str, Float[Array, "runs samples"]]:
+    """What the model makes of each channel at `x`."""
+    return problem.seen(x).channels
+
+
 def _rms(problem: Problem, search: Search) -> float:
     """Root mean square of the residual: in the unit of the channel where there is one, in noise levels otherwise."""
     samples = np.asarray(search.residual)[: problem.samples]

@@ -16,6 +16,8 @@ from ._begin import AbstractBeginning
 from ._bounded import Box, Search, search_start, search_step
 from ._engines import with_values
 from ._losses import Squares
+from ._model import PREFIX
+from ._motion import coordinates_seen
 from ._problem import Problem
 from ._smooth import differentiate, smooth, smooth_span
 from ._solve import Options
@@ -93,7 +95,7 @@ def _within(x: float, size: float | None) -> float:
 
 def _units(problem: Problem) -> dict[str, str]:
     """Unit of each free parameter, "" for those without."""
-    ranges = {name.removeprefix("law."): allowed for name, allowed in scene_ranges(problem.engine.scene).items()}
+    ranges = {name.removeprefix(PREFIX): allowed for name, allowed in scene_ranges(problem.engine.scene).items()}
     return {name: ranges[name].unit if name in ranges else "" for name in problem.free.names}
 
 
@@ -133,19 +135,12 @@ def _sampled(problem: Problem) -> _Sampled:
 
 
 def _position(problem: Problem) -> str:
-    from_state = [name for name, look in problem.engine.observables if _is_position(look)]
+    from_state = [name for name, seen in coordinates_seen(problem.engine.observables, 1).items() if seen == "q[0]"]
     if not from_state:
         raise ValueError(
             "Staged() needs a channel that is the position, observe='q[0]'; give start values, or MultiStart(...)."
         )
     return from_state[0]
-
-
-def _is_position(look: Any) -> bool:
-    if isinstance(look, str):
-        return look == "q[0]"
-    probe = jnp.asarray([0.37]), jnp.asarray([-1.9])
-    return bool(look(*probe) == probe[0][0])
 
 
 def _sizes(problem: Problem, sampled: _Sampled, values: dict[str, float]) -> dict[str, float]:
@@ -251,7 +246,7 @@ def _balance_step(problem: Problem, sampled: _Sampled, search: Search, rtol: Arr
     def residual(x: Array) -> Array:
         values = problem.free.values(x)
         if sampled.force is not None:
-            named = {"law." + name: value for name, value in values.items()}
+            named = {PREFIX + name: value for name, value in values.items()}
             return steady * (jax.vmap(_friction(problem, named))(sampled) - sampled.force)
         return steady * jax.vmap(lambda s: _friction(problem, values)(s) - _required(problem, values)(s))(sampled)
 
