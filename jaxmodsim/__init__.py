@@ -54,3 +54,4 @@ from .solvers import EventSolver as EventSolver
 from .solvers import Gauss as Gauss
 from .solvers import ImplicitFriction as ImplicitFriction
 from .solvers import Rodas5P as Rodas5P
+from .sweeps import sweep as sweep

@@ -18,9 +18,10 @@ ALLOWED["problems"] = {"numerics", "mechanics", "friction", "effects", "scene"}
 ALLOWED["export"] = {"numerics", "friction"}
 ALLOWED["analysis"] = set(_CORE)
 ALLOWED["identify"] = set(_CORE)
+ALLOWED["sweeps"] = set(_CORE)
 ALLOWED["behaviour"] = set(_CORE)
-ALLOWED["plot"] = {*_CORE, "analysis", "problems", "identify", "behaviour"}
-ALLOWED["cli"] = {*_CORE, "problems", "identify", "behaviour", "plot", "_speed"}
+ALLOWED["plot"] = {*_CORE, "analysis", "problems", "identify", "behaviour", "sweeps"}
+ALLOWED["cli"] = {*_CORE, "problems", "identify", "behaviour", "sweeps", "plot", "_speed"}
 ALLOWED["_speed"] = set()
 
 # The command line may also use the package as its users do, by its public names.

@@ -14,11 +14,10 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from ..scene import Scene
+from ..scene import Scene, elements, read_element, replace_elements
 from ..simulation import Trajectory, simulate
 from . import _words as words
 from ._differences import Estimate, Histories, History, Limits, Probe, Sample, estimate, grazing, kink, probe, usable
-from ._elements import elements, read_element, replace_elements
 
 Verdict = Literal["agree", "part", "modes change", "grazing", "kink", "unclear", "no differences"]
 

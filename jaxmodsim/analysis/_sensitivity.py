@@ -1,6 +1,5 @@
 """`sensitivity`: how much each number of a scene matters to what is observed along a run."""
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,9 +11,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..numerics import signals_of
-from ..scene import Scene, scene_numbers, scene_ranges
-from ..simulation import Trajectory, simulate
-from ._elements import elements, read_element, replace_elements
+from ..scene import Scene, elements, read_element, replace_elements, scene_numbers, scene_ranges
+from ..simulation import Trajectory, named_observable, simulate
 
 _MODES = ("forward", "reverse")
 
@@ -23,8 +21,6 @@ _MODES = ("forward", "reverse")
 # after `tune_cpu`), 4.5 to 18 for four; it compiles two to three times as long.
 _FORWARD, _PER_PARAMETER = 2.0, 0.1
 _REVERSE, _PER_OUTPUT = 8.0, 1.0
-
-_NAMED = re.compile(r"(.+?)(?:\[(\d+)\])?")
 
 
 @dataclass(frozen=True)
@@ -203,30 +199,16 @@ def _replaced(scene: Scene, start: dict[str, Any], x: Mapping[str, Array]) -> tu
 
 def _observable(observable: Any, run: Trajectory) -> tuple[Callable[[Trajectory], Any], str, str]:
     """What is observed, its label and its unit."""
-    if not isinstance(observable, str):
-        if not callable(observable):
-            raise ValueError(
-                "observable must be a function of the Trajectory, as in lambda run: run.q[:, 0], or a name such as"
-                f" 'q[0]', but {observable!r} was given."
-            )
-        name = getattr(observable, "__name__", "observable")
-        return observable, "observable" if name == "<lambda>" else name, ""
-    dof = run.q.shape[1]
-    states = {f"{name}[{i}]": (name, i) for name in ("q", "qd") for i in range(dof)}
-    if observable in states:
-        name, i = states[observable]
-        return lambda run: getattr(run, name)[:, i], observable, "m or rad" if name == "q" else "m/s or rad/s"
-    match = _NAMED.fullmatch(observable)
-    name, index = (observable, None) if observable in run.scene.names or match is None else match.groups()
-    shape = run.forces[name].shape[1:] if name in run.scene.names else None
-    if shape is None or len(shape) != (index is not None) or (index is not None and int(index) >= shape[0]):
-        names = [*states]
-        for effect, force in run.forces.items():
-            names += [f"{effect}[{i}]" for i in range(force.shape[1])] if force.ndim == 2 else [effect]
-        raise ValueError(f"No observable has the name {observable!r}; there are: {', '.join(names)}; or a function.")
-    if index is None:
-        return lambda run: run.forces[name], observable, "N or N m"
-    return lambda run: run.forces[name][:, int(index)], observable, "N or N m"
+    if isinstance(observable, str):
+        function, unit = named_observable(observable, run)
+        return function, observable, unit
+    if not callable(observable):
+        raise ValueError(
+            "observable must be a function of the Trajectory, as in lambda run: run.q[:, 0], or a name such as"
+            f" 'q[0]', but {observable!r} was given."
+        )
+    name = getattr(observable, "__name__", "observable")
+    return observable, "observable" if name == "<lambda>" else name, ""
 
 
 def _observed(y: Any) -> Array:

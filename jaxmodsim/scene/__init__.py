@@ -1,5 +1,8 @@
 """Scenes: what is in them, and the vector field that follows."""
 
+from ._elements import elements as elements
+from ._elements import read_element as read_element
+from ._elements import replace_elements as replace_elements
 from ._field import Reaction as Reaction
 from ._field import check_scene as check_scene
 from ._field import scene_canonical as scene_canonical

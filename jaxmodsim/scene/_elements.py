@@ -6,7 +6,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..scene import Scene, replace_numbers, scene_numbers
+from ._names import replace_numbers, scene_numbers
+from ._scene import Scene
 
 
 def elements(scene: Scene) -> dict[str, tuple[str, tuple[int, ...]]]:

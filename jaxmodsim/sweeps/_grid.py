@@ -1,0 +1,157 @@
+"""What a sweep goes over: dimensions, and the numbers of each lane."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import prod
+from typing import Any
+
+import numpy as np
+
+# Names of variables that every result has.
+RESERVED = ("result", "num_steps", "time")
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One dimension: its name, and the numbers that change along it, by name, with the dimension as first axis."""
+
+    name: str
+    values: dict[str, np.ndarray]
+
+    @property
+    def size(self) -> int:
+        """Number of places along the dimension."""
+        return next(iter(self.values.values())).shape[0]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The product of all dimensions. Lanes are counted with the last dimension fastest."""
+
+    axes: tuple[Axis, ...]
+
+    @cached_property
+    def shape(self) -> tuple[int, ...]:
+        """Size of each dimension."""
+        return tuple(axis.size for axis in self.axes)
+
+    @property
+    def size(self) -> int:
+        """Number of lanes."""
+        return prod(self.shape)
+
+    @property
+    def values(self) -> dict[str, np.ndarray]:
+        """All numbers that change, each along its own dimension."""
+        return {name: values for axis in self.axes for name, values in axis.values.items()}
+
+    def lanes(self, index: np.ndarray) -> dict[str, np.ndarray]:
+        """The numbers of the lanes of these indices, by name, each with the lanes as first axis."""
+        places = np.unravel_index(index, self.shape)
+        return {
+            name: values[place]
+            for axis, place in zip(self.axes, places, strict=True)
+            for name, values in axis.values.items()
+        }
+
+
+def grid(over: Any) -> Grid:
+    """Read what a sweep is to go over.
+
+    **Raises:**
+
+    - `ValueError` for what is no mapping of names to numbers, is empty, of unequal length, not finite, or named twice.
+    """
+    if not isinstance(over, Mapping) or not over:
+        raise ValueError(
+            "over must say what to sweep, as in over={'m': [1.0, 2.0]}, or over={'sample': {'m': [...], 'k': [...]}}"
+            f" for numbers that change together, but {over!r} was given."
+        )
+    axes = tuple(_axis(name, given) for name, given in over.items())
+    seen: set[str] = set()
+    for axis in axes:
+        for name in {axis.name, *axis.values}:
+            if name in seen:
+                raise ValueError(f"over names {name!r} twice.")
+            if name in RESERVED:
+                raise ValueError(f"over cannot have the name {name!r}: every result has a variable of that name.")
+            seen.add(name)
+    return Grid(axes)
+
+
+def _axis(name: Any, given: Any) -> Axis:
+    if not isinstance(name, str):
+        raise ValueError(f"over must map names to values, but {name!r} is no name.")
+    # A table of pandas is no Mapping, but is read like one.
+    zipped = isinstance(given, Mapping) or hasattr(given, "columns")
+    values = {each: _numbers(each, given[each]) for each in given} if zipped else {name: _numbers(name, given)}
+    if not values:
+        raise ValueError(f"over[{name!r}] is empty: name at least one number that changes along it.")
+    lengths = {each: x.shape[0] for each, x in values.items()}
+    if len(set(lengths.values())) > 1:
+        raise ValueError(
+            f"Numbers that change together must be equally many, but over[{name!r}] has {lengths}. Give each a"
+            " dimension of its own for all their combinations."
+        )
+    return Axis(name, values)
+
+
+def _numbers(name: Any, given: Any) -> np.ndarray:
+    if not isinstance(name, str):
+        raise ValueError(f"over must map names to values, but {name!r} is no name.")
+    try:
+        values = np.asarray(given)
+    except ValueError as error:
+        raise ValueError(f"{name!r} in over must be an array of numbers: {error}") from error
+    if values.dtype.kind not in "iuf":
+        raise ValueError(
+            f"{name!r} in over must hold real numbers, but {given!r} was given. What is compiled in (solver, max_steps)"
+            " cannot be swept: call sweep once for each, and put the results together by xarray.concat."
+        )
+    if values.ndim == 0 or values.shape[0] == 0:
+        raise ValueError(f"{name!r} in over must be a sequence of at least one value, but {given!r} was given.")
+    if not np.isfinite(values).all():
+        where = np.argwhere(~np.isfinite(values))[0].tolist()
+        raise ValueError(f"{name!r} in over must be finite, but at {where} it is {values[tuple(where)]}.")
+    return values
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """A grid cut into blocks that are computed and stored as one.
+
+    All have the shape `extent`, but for those at the far edges.
+    """
+
+    shape: tuple[int, ...]
+    extent: tuple[int, ...]
+
+    @cached_property
+    def counts(self) -> tuple[int, ...]:
+        """Number of blocks along each dimension."""
+        return tuple(-(-n // m) for n, m in zip(self.shape, self.extent, strict=True))
+
+    def __len__(self) -> int:
+        """Number of blocks."""
+        return prod(self.counts)
+
+    def place(self, block: int) -> tuple[slice, ...]:
+        """Where a block lies."""
+        where = np.unravel_index(block, self.counts)
+        return tuple(
+            slice(int(i) * m, min((int(i) + 1) * m, n)) for i, m, n in zip(where, self.extent, self.shape, strict=True)
+        )
+
+    def index(self, block: int) -> np.ndarray:
+        """Indices of the lanes of a block, in the shape of the block."""
+        return np.ravel_multi_index(np.ix_(*(np.arange(p.start, p.stop) for p in self.place(block))), self.shape)
+
+
+def blocks(shape: Sequence[int], lanes: int) -> Blocks:
+    """Cut a grid into blocks of at most so many lanes, whole along the last dimensions and even along the one cut."""
+    extent: list[int] = []
+    for n in reversed(shape):
+        most = max(lanes // prod(extent), 1)
+        extent.insert(0, -(-n // -(-n // most)))
+    return Blocks(tuple(shape), tuple(extent))

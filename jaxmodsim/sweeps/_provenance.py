@@ -1,0 +1,93 @@
+"""Where numbers come from: what was asked, of what code, by which versions."""
+
+import hashlib
+import importlib.metadata
+import subprocess
+from typing import Any
+
+import jax
+import jax.tree_util as jtu
+import numpy as np
+
+from ..scene import scene_numbers
+from ._compute import Work, program
+from ._request import Request
+
+_PACKAGES = ("jaxmodsim", "jax", "jaxlib", "diffrax", "equinox", "numpy")
+# Arrays of more numbers than these are told apart by a checksum.
+_SHORT = 16
+
+
+def provenance(request: Request, work: Work, extent: tuple[int, ...]) -> dict[str, Any]:
+    """All that the numbers of a sweep follow from, as values for JSON: where it is the same, so are they."""
+    scene, arguments = request.fixed or (None, {})
+    numbers = {} if scene is None else scene_numbers(scene)
+    choices = dict(getattr(work.lane, "choices", ()))
+    swept = request.grid.values
+    return {
+        "over": {name: f"{x.shape} {x.dtype} {_digest(x)}" for name, x in swept.items()},
+        "numbers": {name: _value(x) for name, x in numbers.items() if name not in swept},
+        "arguments": {
+            jtu.keystr(path): _value(x)
+            for name, value in sorted(arguments.items())
+            if name not in swept
+            for path, x in jtu.tree_leaves_with_path({name: value})
+        },
+        "options": {name: repr(value) for name, value in sorted(choices.items())},
+        "program": hashlib.sha256(program(work, request.grid.lanes(np.zeros(1, int))).encode()).hexdigest(),
+        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
+        "backend": jax.default_backend(),
+        "chunks": list(extent),
+        "lanes in a group": work.group,
+    }
+
+
+def describe(request: Request) -> str:
+    """The system that is swept, in words."""
+    if request.fixed:
+        scene = request.fixed[0]
+        return f"{_called(scene.lagrangian)}; " + ", ".join(
+            f"{name}: {type(getattr(effect, 'law', effect)).__name__}"
+            for name, effect in zip(scene.names, scene.effects, strict=True)
+        )
+    return _called(getattr(request.lane, "function", None))
+
+
+def commit() -> str:
+    """The commit of the repository in the working directory, if it is one, and whether there are changes beside it."""
+    try:
+        head, state = (
+            subprocess.run(["git", *words], capture_output=True, text=True, check=True, timeout=20).stdout.strip()
+            for words in (("rev-parse", "HEAD"), ("status", "--porcelain", "--untracked-files=no"))
+        )
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return head + (" with uncommitted changes" if state else "")
+
+
+def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """What is not the same in two provenances, in words."""
+    found = []
+    for part in [*then, *(name for name in now if name not in then)]:
+        old, new = then.get(part), now.get(part)
+        if isinstance(old, dict) and isinstance(new, dict):
+            for name in [*old, *(name for name in new if name not in old)]:
+                if old.get(name) != new.get(name):
+                    found.append(f"{part}: {name} was {old.get(name, 'not there')}, is {new.get(name, 'not there')}")
+        elif old != new:
+            what = "the code of the scene, the observables, or this library" if part == "program" else None
+            found.append(f"{what} has changed" if what else f"{part} was {old}, is {new}")
+    return found
+
+
+def _called(function: Any) -> str:
+    return str(getattr(function, "__qualname__", type(function).__name__))
+
+
+def _digest(x: Any) -> str:
+    return hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest()[:16]
+
+
+def _value(x: Any) -> Any:
+    x = np.asarray(x)
+    return x.tolist() if x.size <= _SHORT else f"{x.shape} {x.dtype} {_digest(x)}"

@@ -1,0 +1,171 @@
+"""What the caller of `sweep` asks for, checked and converted."""
+
+import difflib
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from ..scene import Scene, elements, scene_numbers, scene_ranges
+from ..simulation import simulate
+from ._grid import Axis, Grid
+from ._lane import AbstractLane, Found, FunctionLane, SceneLane, number_of, rehearsed
+from ._observe import Derivative, Observation, observations
+
+# Arguments of `simulate` that are numbers. All others are compiled in.
+_NUMBERS = ("q0", "qd0", "t1", "t0", "ts", "z0", "rtol", "atol", "dt", "dtmax")
+# Those of them that can be swept.
+_SWEPT = tuple(name for name in _NUMBERS if name not in ("ts", "z0"))
+_UNITS = {"t0": "s", "t1": "s", "dt": "s", "dtmax": "s"}
+_OPTIONS = {name: x.default for name, x in inspect.signature(simulate).parameters.items()}
+
+
+@dataclass(frozen=True)
+class Request:
+    """A sweep, ready to run.
+
+    - `lane`: what is computed for each lane, and `fixed` the numbers common to all.
+    - `grid`: the numbers that differ, in the floating type they are used in.
+    - `shapes`: of what a lane gives.
+    - `units`: of the numbers that are swept, as far as they are known.
+    """
+
+    lane: AbstractLane
+    fixed: PyTree
+    grid: Grid
+    shapes: Found
+    units: dict[str, str]
+
+    @property
+    def observe(self) -> tuple[Observation, ...]:
+        """What is kept of each lane."""
+        asked = getattr(self.lane, "observe", None)
+        return asked if asked is not None else tuple(Observation(name, name, "") for name in self.shapes.values)
+
+
+def request(system: Any, grid: Grid, observe: Any, arguments: Mapping[str, Any]) -> Request:
+    """Check and convert what a sweep is asked for.
+
+    **Raises:**
+
+    - `ValueError` for what does not go together, before anything is compiled.
+    """
+    if isinstance(system, Scene):
+        return _of_scene(system, grid, observe, dict(arguments))
+    if not callable(system):
+        raise ValueError(f"sweep needs a Scene or a function, but a {type(system).__name__} was given.")
+    given = [name for name, value in arguments.items() if value is not None]
+    if given:
+        raise ValueError(
+            f"{', '.join(given)} has no place beside a function: only a Scene is run by sweep itself. Pass it to"
+            " simulate inside the function."
+        )
+    lane = FunctionLane(system, None if observe is None else observations(observe))
+    for what in lane.observe or ():
+        if isinstance(what.of, Derivative):
+            raise ValueError(f"observe[{what.name!r}]: derivatives are for a Scene; differentiate inside the function.")
+    floating = jnp.result_type(float)
+    converted = Grid(tuple(Axis(a.name, {n: x.astype(floating) for n, x in a.values.items()}) for a in grid.axes))
+    return Request(lane, (), converted, _shapes(lane, (), converted), {})
+
+
+def _of_scene(scene: Scene, grid: Grid, observe: Any, arguments: dict[str, Any]) -> Request:
+    arguments = {name: value for name, value in arguments.items() if value is not None}
+    for name in arguments:
+        if name in ("throw", "adjoint", "scene") or name not in _OPTIONS:
+            hint = ": a lane that fails gets its code" if name == "throw" else ""
+            raise ValueError(f"sweep takes no argument {name!r}{hint}.")
+    swept = grid.values
+    for name in ("q0", "qd0", "t1"):
+        if name not in arguments and name not in swept:
+            raise ValueError(f"sweep of a scene needs {name}, as simulate does, or {name!r} in over.")
+        if name in arguments and name in swept:
+            raise ValueError(f"{name} is given, and {name!r} is in over: leave one of them out.")
+    numbers, dtype = _fixed(scene, arguments, swept)
+    _check_names(scene, numbers, swept)
+    lane = SceneLane(observations(observe), _choices(arguments))
+    for what in lane.observe:
+        if isinstance(what.of, Derivative):
+            _check_names(scene, numbers, dict.fromkeys(what.of.names), f"observe[{what.name!r}]")
+    converted = Grid(
+        tuple(
+            Axis(axis.name, {name: _converted(scene, numbers, name, x, dtype) for name, x in axis.values.items()})
+            for axis in grid.axes
+        )
+    )
+    first = {name: value[0] for name, value in converted.lanes(np.zeros(1, int)).items()}
+    _rehearse(scene, numbers, first, rehearsed(lane))
+    ranges, known = scene_ranges(scene), elements(scene)
+    units = dict(_UNITS)
+    for name in swept:
+        leaf = known[name][0] if name in known else name
+        if leaf in ranges and ranges[leaf].unit:
+            units[name] = ranges[leaf].unit
+    return Request(lane, (scene, numbers), converted, _shapes(lane, (scene, numbers), converted), units)
+
+
+def _fixed(scene: Scene, arguments: dict[str, Any], swept: Mapping[str, np.ndarray]) -> tuple[dict[str, Any], Any]:
+    """Arguments of `simulate` that are numbers, one value of those that are swept; and the floating type."""
+    numbers = {name: arguments[name] for name in _NUMBERS if name in arguments}
+    numbers |= {name: swept[name][0] for name in _SWEPT if name in swept}
+    numbers = {"rtol": _OPTIONS["rtol"], "atol": _OPTIONS["atol"], "t0": _OPTIONS["t0"]} | numbers
+    states = [x for x in (*scene_numbers(scene).values(), numbers["q0"], numbers["qd0"]) if hasattr(x, "dtype")]
+    dtype = jnp.result_type(*(x.dtype for x in states)) if states else jnp.result_type(float)
+    if not jnp.issubdtype(dtype, jnp.floating):
+        dtype = jnp.result_type(float)
+    z0 = {"z0": numbers.pop("z0")} if "z0" in numbers else {}
+    return {name: np.asarray(value, dtype) for name, value in numbers.items()} | z0, dtype
+
+
+def _choices(arguments: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
+    """Arguments that are compiled in."""
+    given = {name: value for name, value in arguments.items() if name not in _NUMBERS}
+    for name, value in given.items():
+        try:
+            hash(value)
+        except TypeError:
+            raise ValueError(f"{name} is compiled in and must be hashable, but {value!r} is not.") from None
+    return tuple(({"max_steps": _OPTIONS["max_steps"]} | given).items())
+
+
+def _check_names(scene: Scene, numbers: Mapping[str, Any], names: Mapping[str, Any], where: str = "over") -> None:
+    """Refuse names of nothing, or of two things."""
+    inside = {*scene_numbers(scene), *elements(scene)}
+    outside = {name for name in _SWEPT if name in numbers}
+    outside |= {f"{name}[{i}]" for name in ("q0", "qd0") for i in range(np.size(numbers[name]))}
+    for name in names:
+        if name in inside and name in outside:
+            raise ValueError(f"{where} names {name!r}, which is a number of the scene and an argument: rename the one.")
+        if name not in inside and name not in outside:
+            known = [*sorted(inside), *sorted(outside)]
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f" Did you mean {near[0]!r}?" if near else ""
+            extra = " Give a value of dt or dtmax to sweep it." if name in ("dt", "dtmax") else ""
+            raise ValueError(f"{where} names {name!r}, but the numbers are: {', '.join(known)}.{hint}{extra}")
+
+
+def _converted(scene: Scene, numbers: Mapping[str, Any], name: str, values: np.ndarray, dtype: Any) -> np.ndarray:
+    """Values in the type of the number they replace, if they have its shape."""
+    here = number_of(scene, numbers, name)
+    if values.shape[1:] != here.shape:
+        raise ValueError(
+            f"{name!r} in over must have the shape [{', '.join(['n', *map(str, here.shape)])}], as the number has the"
+            f" shape {here.shape}, but it has {values.shape}."
+        )
+    return values.astype(here.dtype if name in scene_numbers(scene) else dtype)
+
+
+def _rehearse(scene: Scene, numbers: Mapping[str, Any], first: Mapping[str, np.ndarray], lane: Any) -> None:
+    """Let `simulate` look at the arguments of the first lane while their values are known, without running it."""
+    given = dict(numbers) | {name: value for name, value in first.items() if name in numbers}
+    jax.eval_shape(lambda: simulate(scene, **given, **dict(lane.choices), throw=False).code)
+
+
+def _shapes(lane: AbstractLane, fixed: PyTree, grid: Grid) -> Found:
+    numbers = {name: value[0] for name, value in grid.lanes(np.zeros(1, int)).items()}
+    return jax.eval_shape(rehearsed(lane).run, fixed, numbers)
