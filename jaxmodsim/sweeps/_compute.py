@@ -15,7 +15,7 @@ from ._lane import AbstractLane, Found, out_of_steps, rehearsed
 # cache of 32 kB, for LuGre's test bench, the belt oscillator by events and the double pendulum, in float32 and float64:
 # from 32 to 128 lanes cost the same within a quarter, 16 and 256 up to twice as much; a call of less than 500 lanes
 # pays up to a tenth for its start.
-GROUP, _GROUPS = 64, 16
+GROUP, GROUPS = 64, 16
 # Lanes of a group of those that take many more steps than the others: in narrow ones they hold up few.
 _NARROW = 8
 
@@ -72,7 +72,7 @@ def compute(work: Work, numbers: dict[str, np.ndarray], order: np.ndarray, devic
 
 def _groups_of(lanes: int, group: int) -> int:
     """Groups in one call: no more than there are, in powers of two so that few shapes are compiled."""
-    return min(_GROUPS, 1 << max(-(-lanes // group) - 1, 0).bit_length()) if group == GROUP else 1
+    return min(GROUPS, 1 << max(-(-lanes // group) - 1, 0).bit_length()) if group == GROUP else 1
 
 
 def _in_groups(

@@ -23,7 +23,7 @@ class Variable:
     dims: tuple[str, ...]
     shape: tuple[int, ...]
     dtype: np.dtype
-    fill: float
+    fill: float | int
     attrs: dict[str, Any]
 
 

@@ -160,7 +160,7 @@ def _converted(scene: Scene, numbers: Mapping[str, Any], name: str, values: np.n
     return values.astype(here.dtype if name in scene_numbers(scene) else dtype)
 
 
-def _rehearse(scene: Scene, numbers: Mapping[str, Any], first: Mapping[str, np.ndarray], lane: Any) -> None:
+def _rehearse(scene: Scene, numbers: Mapping[str, Any], first: Mapping[str, Any], lane: Any) -> None:
     """Let `simulate` look at the arguments of the first lane while their values are known, without running it."""
     given = dict(numbers) | {name: value for name, value in first.items() if name in numbers}
     jax.eval_shape(lambda: simulate(scene, **given, **dict(lane.choices), throw=False).code)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from ..scene import Scene
-from ._compute import GROUP, Work
+from ._compute import GROUP, GROUPS, Work
 from ._execute import Task, elsewhere, in_threads
 from ._grid import Blocks, blocks, grid
 from ._layout import layout
@@ -134,7 +134,9 @@ def _lanes(asked: Request, platform: str, chunk: int | None) -> int:
     room = sum(np.prod(x.shape, initial=1.0) * x.dtype.itemsize for x in asked.shapes.values.values())
     if platform != "cpu":
         return max(min(_LANES_OF_ACCELERATOR, int(_ROOM / room)), 1)
-    even = -(-asked.grid.size // (_BLOCKS * GROUP)) * GROUP
+    # Whole calls of compiled code, where there are enough lanes for that.
+    call = GROUP * GROUPS if asked.grid.size > _BLOCKS * GROUP * GROUPS else GROUP
+    even = -(-asked.grid.size // (_BLOCKS * call)) * call
     return max(min(_LANES, even, int(_ROOM / room)), 1)
 
 
