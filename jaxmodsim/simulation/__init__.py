@@ -5,6 +5,7 @@ from ._observe import named_observable as named_observable
 from ._outcome import MAX_STEPS as MAX_STEPS
 from ._outcome import Outcome as Outcome
 from ._outcome import SimulationError as SimulationError
+from ._simulate import prepare as prepare
 from ._simulate import simulate as simulate
 from ._trajectory import Energy as Energy
 from ._trajectory import Events as Events

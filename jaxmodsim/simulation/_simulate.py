@@ -87,6 +87,60 @@ def simulate(
     - `SimulationError` if the run ended early and `throw` is set. Inside `jax.jit`, `jax.vmap` or `jax.grad` the
       same sentence comes as equinox's run-time error.
     """
+    problem, options = prepare(
+        scene,
+        q0,
+        qd0,
+        t1,
+        t0,
+        ts,
+        z0,
+        rtol,
+        atol,
+        dt,
+        dtmax,
+        solver,
+        adjoint,
+        max_steps,
+        max_events,
+        hold_chatter,
+        project,
+    )
+    try:
+        solved = solve(problem, options)
+    except TypeError as error:
+        if "custom_vjp" in str(error) and adjoint is None:
+            raise TypeError(
+                "Forward-mode derivatives of simulate need adjoint=diffrax.ForwardMode(); the default adjoint is for"
+                " reverse mode (jax.grad)."
+            ) from error
+        raise
+    if throw:
+        solved = _raise_early_end(problem, solved)
+    y, end = solved.y, None if solved.end is None else solved.end[0]
+    return Trajectory(solved.t, y.q, y.qd, y.z, solved.mode, solved.stats, solved.code, end, problem, options)
+
+
+def prepare(
+    scene: Any,
+    q0: Any,
+    qd0: Any,
+    t1: Any,
+    t0: Any = 0.0,
+    ts: Any = None,
+    z0: Any = None,
+    rtol: Any = 1e-6,
+    atol: Any = 1e-9,
+    dt: Any = None,
+    dtmax: Any = None,
+    solver: Any = None,
+    adjoint: Any = None,
+    max_steps: Any = 16384,
+    max_events: Any = 1024,
+    hold_chatter: Any = False,
+    project: Any = True,
+) -> tuple[Problem, Options]:
+    """Convert and check the arguments of `simulate`: its numbers, and what is compiled in."""
     problem = _problem(scene, q0, qd0, t1, t0, ts, z0, rtol, atol, dt, dtmax)
     for name, limit in (("max_steps", max_steps), ("max_events", max_events)):
         if isinstance(limit, bool) or not isinstance(limit, int | np.integer) or limit < 1:
@@ -104,19 +158,7 @@ def simulate(
     adjoint_arrays, adjoint_rest = _split(adjoint, dfx.AbstractAdjoint, "adjoint")
     problem = problem._replace(plugins=(solver_arrays, adjoint_arrays))
     options = Options(solver_rest, adjoint_rest, int(max_steps), int(max_events), hold_chatter, project)
-    try:
-        solved = solve(problem, options)
-    except TypeError as error:
-        if "custom_vjp" in str(error) and adjoint is None:
-            raise TypeError(
-                "Forward-mode derivatives of simulate need adjoint=diffrax.ForwardMode(); the default adjoint is for"
-                " reverse mode (jax.grad)."
-            ) from error
-        raise
-    if throw:
-        solved = _raise_early_end(problem, solved)
-    y, end = solved.y, None if solved.end is None else solved.end[0]
-    return Trajectory(solved.t, y.q, y.qd, y.z, solved.mode, solved.stats, solved.code, end, problem, options)
+    return problem, options
 
 
 def _known(*values: Any) -> bool:

@@ -1,8 +1,9 @@
 """The lanes of a block, computed: in groups that fit the cache, slow lanes apart."""
 
+import hashlib
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, NamedTuple
+from functools import lru_cache, partial
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.tree_util as jtu
@@ -70,6 +71,11 @@ def compute(work: Work, numbers: dict[str, np.ndarray], order: np.ndarray, devic
     return found
 
 
+def lanes_of_call(lanes: int, group: int) -> int:
+    """Lanes of one call of compiled code in blocks of so many lanes."""
+    return _groups_of(lanes, group) * group
+
+
 def _groups_of(lanes: int, group: int) -> int:
     """Groups in one call: no more than there are, in powers of two so that few shapes are compiled."""
     return min(GROUPS, 1 << max(-(-lanes // group) - 1, 0).bit_length()) if group == GROUP else 1
@@ -114,10 +120,38 @@ def _call(lane: AbstractLane, fixed: PyTree, numbers: dict[str, Array]) -> Found
     return jax.lax.map(lambda group: jax.vmap(partial(lane.run, fixed))(group), numbers)
 
 
-def program(work: Work, numbers: dict[str, np.ndarray]) -> str:
-    """What is computed, in the intermediate language that XLA compiles: the same if and only if that is.
+def shapes(lane: AbstractLane, fixed: PyTree, numbers: PyTree) -> Found:
+    """Shapes and types of what a lane gives, traced but not run."""
+    return _shapes(rehearsed(lane), *_abstract(fixed, numbers))
+
+
+def program(lane: AbstractLane, fixed: PyTree, numbers: PyTree) -> str:
+    """A checksum of what is computed, in the language that XLA compiles: the same if and only if that is.
 
     But for the step limit, which is that of `rehearsed`.
     """
-    given = {name: x[:1] for name, x in numbers.items()}
-    return jax.jit(jax.vmap(rehearsed(work.lane).run, in_axes=(None, 0))).lower(work.fixed, given).as_text()
+    return _program(rehearsed(lane), *_abstract(fixed, numbers))
+
+
+_Abstract: TypeAlias = tuple[Any, tuple[tuple[tuple[int, ...], Any], ...]]
+
+
+def _abstract(*given: PyTree) -> _Abstract:
+    """Structure, shapes and types: all that a trace depends on."""
+    leaves, structure = jtu.tree_flatten(given)
+    return structure, tuple((np.shape(x), np.result_type(x)) for x in leaves)
+
+
+def _concrete(structure: Any, avals: Any) -> Any:
+    return jtu.tree_unflatten(structure, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in avals])
+
+
+@lru_cache(maxsize=32)
+def _shapes(lane: AbstractLane, structure: Any, avals: Any) -> Found:
+    return jax.eval_shape(lane.run, *_concrete(structure, avals))
+
+
+@lru_cache(maxsize=32)
+def _program(lane: AbstractLane, structure: Any, avals: Any) -> str:
+    text = jax.jit(lane.run).lower(*_concrete(structure, avals)).as_text()
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -46,6 +46,11 @@ class Grid:
         """All numbers that change, each along its own dimension."""
         return {name: values for axis in self.axes for name, values in axis.values.items()}
 
+    @property
+    def first(self) -> dict[str, np.ndarray]:
+        """The numbers of the first lane."""
+        return {name: values[0] for name, values in self.values.items()}
+
     def lanes(self, index: np.ndarray) -> dict[str, np.ndarray]:
         """The numbers of the lanes of these indices, by name, each with the lanes as first axis."""
         places = np.unravel_index(index, self.shape)

@@ -5,14 +5,14 @@ from math import comb
 
 import numpy as np
 
-from ._compute import Work, compute
+from ._compute import Work, compute, lanes_of_call
 from ._grid import Grid
 from ._lane import CAP, out_of_steps
 
 # By what the number of steps grows that lanes may take before they are set aside.
 _GROWTH = 8
-# Sweeps of fewer lanes are run without a look ahead, and of more of them so many lanes are looked at.
-_SMALL, _LEAST, _MOST = 1024, 64, 512
+# Sweeps of fewer lanes are run without a look ahead.
+_SMALL = 1024
 # Part of the lanes that may come to the cap.
 _LATE = 0.05
 # Lanes of the trial for each coefficient of the prediction.
@@ -42,10 +42,11 @@ class Prediction:
         return np.argsort(_products(x, self.degree) @ self.coefficients, kind="stable")
 
 
-def plan(work: Work, grid: Grid) -> tuple[Work, Prediction | None]:
+def plan(work: Work, grid: Grid, lanes: int) -> tuple[Work, Prediction | None]:
     """Choose after how many steps lanes are set aside, and how to sort them; neither where the limit is not known.
 
-    A trial runs up to 512 lanes drawn at random, always the same ones. The results do not depend on it.
+    A trial runs as many lanes as one call of compiled code takes in blocks of so many `lanes`: drawn at random, but
+    always the same ones. The results do not depend on it.
     """
     limit = work.lane.max_steps
     if limit is None:
@@ -53,7 +54,7 @@ def plan(work: Work, grid: Grid) -> tuple[Work, Prediction | None]:
     cap = min(CAP, limit)
     if grid.size < _SMALL:
         return replace(work, cap=cap), None
-    count = min(max(grid.size // 32, _LEAST), _MOST)
+    count = min(lanes_of_call(lanes, work.group), grid.size)
     drawn = np.unique(np.random.default_rng(0).integers(grid.size, size=count))
     numbers = grid.lanes(drawn)
     while True:

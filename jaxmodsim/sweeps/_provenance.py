@@ -2,7 +2,9 @@
 
 import hashlib
 import importlib.metadata
+import os
 import subprocess
+from functools import cache, lru_cache
 from typing import Any
 
 import jax
@@ -34,12 +36,18 @@ def provenance(request: Request, work: Work, extent: tuple[int, ...]) -> dict[st
             for path, x in jtu.tree_leaves_with_path({name: value})
         },
         "options": {name: repr(value) for name, value in sorted(choices.items())},
-        "program": hashlib.sha256(program(work, request.grid.lanes(np.zeros(1, int))).encode()).hexdigest(),
-        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
+        "program": program(work.lane, work.fixed, request.grid.first),
+        "versions": versions(),
         "backend": jax.default_backend(),
         "chunks": list(extent),
         "lanes in a group": work.group,
     }
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Versions of the packages that numbers depend on."""
+    return {name: importlib.metadata.version(name) for name in _PACKAGES}
 
 
 def describe(request: Request) -> str:
@@ -55,9 +63,16 @@ def describe(request: Request) -> str:
 
 def commit() -> str:
     """The commit of the repository in the working directory, if it is one, and whether there are changes beside it."""
+    return _commit(os.getcwd())
+
+
+@lru_cache(maxsize=4)
+def _commit(folder: str) -> str:
     try:
         head, state = (
-            subprocess.run(["git", *words], capture_output=True, text=True, check=True, timeout=20).stdout.strip()
+            subprocess.run(
+                ["git", *words], cwd=folder, capture_output=True, text=True, check=True, timeout=20
+            ).stdout.strip()
             for words in (("rev-parse", "HEAD"), ("status", "--porcelain", "--untracked-files=no"))
         )
     except (OSError, subprocess.SubprocessError):

@@ -6,15 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
 from ..scene import Scene, elements, scene_numbers, scene_ranges
-from ..simulation import simulate
+from ..simulation import prepare, simulate
+from ._compute import shapes
 from ._grid import Axis, Grid
-from ._lane import AbstractLane, Found, FunctionLane, SceneLane, number_of, rehearsed
+from ._lane import AbstractLane, Found, FunctionLane, SceneLane, number_of
 from ._observe import Derivative, Observation, observations
 
 # Arguments of `simulate` that are numbers. All others are compiled in.
@@ -71,7 +71,7 @@ def request(system: Any, grid: Grid, observe: Any, arguments: Mapping[str, Any])
             raise ValueError(f"observe[{what.name!r}]: derivatives are for a Scene; differentiate inside the function.")
     floating = jnp.result_type(float)
     converted = Grid(tuple(Axis(a.name, {n: x.astype(floating) for n, x in a.values.items()}) for a in grid.axes))
-    return Request(lane, (), converted, _shapes(lane, (), converted), {})
+    return Request(lane, (), converted, shapes(lane, (), converted.first), {})
 
 
 def _of_scene(scene: Scene, grid: Grid, observe: Any, arguments: dict[str, Any]) -> Request:
@@ -98,15 +98,16 @@ def _of_scene(scene: Scene, grid: Grid, observe: Any, arguments: dict[str, Any])
             for axis in grid.axes
         )
     )
-    first = {name: value[0] for name, value in converted.lanes(np.zeros(1, int)).items()}
-    _rehearse(scene, numbers, first, rehearsed(lane))
+    # Let `simulate` look at the arguments of the first lane while their values are known.
+    given = numbers | {name: value for name, value in converted.first.items() if name in numbers}
+    prepare(scene, **given, **dict(lane.choices))
     ranges, known = scene_ranges(scene), elements(scene)
     units = dict(_UNITS)
     for name in swept:
         leaf = known[name][0] if name in known else name
         if leaf in ranges and ranges[leaf].unit:
             units[name] = ranges[leaf].unit
-    return Request(lane, (scene, numbers), converted, _shapes(lane, (scene, numbers), converted), units)
+    return Request(lane, (scene, numbers), converted, shapes(lane, (scene, numbers), converted.first), units)
 
 
 def _fixed(scene: Scene, arguments: dict[str, Any], swept: Mapping[str, np.ndarray]) -> tuple[dict[str, Any], Any]:
@@ -158,14 +159,3 @@ def _converted(scene: Scene, numbers: Mapping[str, Any], name: str, values: np.n
             f" shape {here.shape}, but it has {values.shape}."
         )
     return values.astype(here.dtype if name in scene_numbers(scene) else dtype)
-
-
-def _rehearse(scene: Scene, numbers: Mapping[str, Any], first: Mapping[str, Any], lane: Any) -> None:
-    """Let `simulate` look at the arguments of the first lane while their values are known, without running it."""
-    given = dict(numbers) | {name: value for name, value in first.items() if name in numbers}
-    jax.eval_shape(lambda: simulate(scene, **given, **dict(lane.choices), throw=False).code)
-
-
-def _shapes(lane: AbstractLane, fixed: PyTree, grid: Grid) -> Found:
-    numbers = {name: value[0] for name, value in grid.lanes(np.zeros(1, int)).items()}
-    return jax.eval_shape(rehearsed(lane).run, fixed, numbers)

@@ -1,8 +1,8 @@
 """`sweep`: a scene, or any function, run for many numbers."""
 
-import importlib.metadata
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from math import prod
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from ..scene import Scene
-from ._compute import GROUP, GROUPS, Work
+from ._compute import GROUP, Work, lanes_of_call
 from ._execute import Task, elsewhere, in_threads
 from ._grid import Blocks, blocks, grid
 from ._layout import layout
 from ._plan import Prediction, plan
 from ._progress import Progress, SweepProgress, reporter
-from ._provenance import commit, describe, provenance
+from ._provenance import commit, describe, provenance, versions
 from ._request import Request, request
 from ._results import AbstractResults, Memory, Store
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 # Lanes of a block: that many take a fraction of a second of short runs, and little room.
 _LANES = 16384
 # A sweep is cut into at least so many blocks, as far as each keeps a group of lanes.
-_BLOCKS = 64
+_BLOCKS = 16
 # Room that the results of a block may take [bytes].
 _ROOM = 64_000_000
 # Lanes of a block on an accelerator, which runs all of them as one.
@@ -134,9 +134,10 @@ def _lanes(asked: Request, platform: str, chunk: int | None) -> int:
     room = sum(np.prod(x.shape, initial=1.0) * x.dtype.itemsize for x in asked.shapes.values.values())
     if platform != "cpu":
         return max(min(_LANES_OF_ACCELERATOR, int(_ROOM / room)), 1)
+    even = -(-asked.grid.size // (_BLOCKS * GROUP)) * GROUP
     # Whole calls of compiled code, where there are enough lanes for that.
-    call = GROUP * GROUPS if asked.grid.size > _BLOCKS * GROUP * GROUPS else GROUP
-    even = -(-asked.grid.size // (_BLOCKS * call)) * call
+    call = lanes_of_call(even, GROUP)
+    even = -(-even // call) * call
     return max(min(_LANES, even, int(_ROOM / room)), 1)
 
 
@@ -144,7 +145,7 @@ def _results(asked: Request, work: Work, cut: Blocks, out: Any) -> AbstractResul
     laid = layout(asked)
     attrs = {
         "system": describe(asked),
-        "made_by": f"jaxmodsim {importlib.metadata.version('jaxmodsim')}",
+        "made_by": f"jaxmodsim {versions()['jaxmodsim']}",
         "commit": commit(),
     }
     about = provenance(asked, work, cut.extent)
@@ -171,7 +172,7 @@ def _run(
     report(SweepProgress(done, asked.grid.size, failed))
     if not left:
         return
-    work, prediction = plan(work, asked.grid)
+    work, prediction = plan(work, asked.grid, prod(cut.extent))
     tasks = _tasks(asked, cut, left, prediction)
     came = in_threads(work, tasks, devices) if executor is None else elsewhere(work, tasks, executor)
     for block, computed in came:
