@@ -6,6 +6,7 @@ from functools import lru_cache, partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
@@ -139,7 +140,7 @@ _Abstract: TypeAlias = tuple[Any, tuple[tuple[tuple[int, ...], Any], ...]]
 def _abstract(*given: PyTree) -> _Abstract:
     """Structure, shapes and types: all that a trace depends on."""
     leaves, structure = jtu.tree_flatten(given)
-    return structure, tuple((np.shape(x), np.result_type(x)) for x in leaves)
+    return structure, tuple((jnp.shape(x), jnp.result_type(x)) for x in leaves)
 
 
 def _concrete(structure: Any, avals: Any) -> Any:

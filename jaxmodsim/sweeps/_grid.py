@@ -47,7 +47,7 @@ class Grid:
         return {name: values for axis in self.axes for name, values in axis.values.items()}
 
     @property
-    def first(self) -> dict[str, np.ndarray]:
+    def first(self) -> dict[str, Any]:
         """The numbers of the first lane."""
         return {name: values[0] for name, values in self.values.items()}
 
