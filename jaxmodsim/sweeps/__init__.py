@@ -2,4 +2,7 @@
 
 from ._observe import Derivative as Derivative
 from ._progress import SweepProgress as SweepProgress
+from ._samples import Span as Span
+from ._samples import latin_hypercube as latin_hypercube
+from ._samples import sobol as sobol
 from ._sweep import sweep as sweep
