@@ -119,7 +119,7 @@ def spread(ranges: Mapping[str, Span], unit: Float[np.ndarray, "count names"]) -
     return columns
 
 
-def _scaled(span: Span, x: np.ndarray) -> np.ndarray:
+def _scaled(span: Any, x: np.ndarray) -> np.ndarray:
     if hasattr(span, "ppf"):
         return np.asarray(span.ppf(x), float)
     low, high = span[:2]
