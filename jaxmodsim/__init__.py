@@ -1,5 +1,6 @@
 """Differentiable mechanics with friction: Lagrangians in, motion, figures and fits out."""
 
+from . import features as features
 from . import problems as problems
 from ._speed import tune_cpu as tune_cpu
 from .analysis import EnergyAudit as EnergyAudit

@@ -1,12 +1,14 @@
 """The result of a run."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..mechanics import momentum
@@ -15,6 +17,8 @@ from ..solvers import EventLog
 from ._ledger import Ledger, event_losses, ledger
 from ._outcome import Outcome, outcome_messages
 from ._solve import Options, Problem, solve_logged
+
+_Value = TypeVar("_Value")
 
 
 class Events(NamedTuple):
@@ -127,7 +131,9 @@ class Trajectory:
         if self.modes is None:
             none = jnp.zeros(0, int)
             return Events(jnp.zeros(0, self.t.dtype), none, none, none)
-        return _events(self.scene, solve_logged(self.problem, self.options, self.log_size))
+        return self._once(
+            "events", lambda: _events(self.scene, solve_logged(self.problem, self.options, self.log_size))
+        )
 
     @property
     def momentum(self) -> Float[Array, "*time dof"]:
@@ -142,7 +148,7 @@ class Trajectory:
         Runs the scene once more, with the work integrals beside it.
         """
         self._one_run("ledger")
-        return ledger(self.problem, self.options, self.t, self._states())
+        return self._once("ledger", lambda: ledger(self.problem, self.options, self.t, self._states()))
 
     @property
     def event_losses(self) -> Float[Array, " time"]:
@@ -165,6 +171,13 @@ class Trajectory:
         """Length of a log that holds all events: as many as needed, in powers of two; another one compiles anew."""
         count, size = self.stats.get("num_events", 0), self.options.max_events
         return size if isinstance(count, jax.core.Tracer) else min(size, 1 << max(int(count), 8).bit_length())
+
+    def _once(self, name: str, make: Callable[[], _Value]) -> _Value:
+        """What costs another run, made once; anew inside another `jax.jit`, `jax.vmap` or `jax.grad` than before."""
+        made, now = self.__dict__.setdefault("_made", {}), get_opaque_trace_state()
+        if name not in made or made[name][0] != now:
+            made[name] = now, make()
+        return made[name][1]
 
     def _states(self) -> State:
         return State(self.q, self.qd, self.z)

@@ -1,0 +1,13 @@
+"""Numbers of a run as a whole: when it breaks away, its period, its peaks, what it loses, how it moves."""
+
+from ._amounts import dissipated as dissipated
+from ._amounts import final as final
+from ._amounts import peak as peak
+from ._feature import Feature as Feature
+from ._feature import classes as classes
+from ._motion import mode_changes as mode_changes
+from ._motion import mode_sequence as mode_sequence
+from ._motion import motion_kind as motion_kind
+from ._motion import stick_share as stick_share
+from ._times import break_away as break_away
+from ._times import period as period

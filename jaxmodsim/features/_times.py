@@ -1,0 +1,141 @@
+"""When something happens in a run."""
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..simulation import Trajectory
+from ._feature import Feature
+from ._names import changes_of, is_exact, last_two, magnitude_of, series, slip_of
+
+# Periods since the last return after which a cycle has ended.
+_ALIVE = 1.5
+
+
+def break_away(element: str = "friction", *, distance: float | None = None) -> Feature:
+    """Time [s] at which a friction element breaks away; NaN where it never does.
+
+    Of a law that runs by events the first event in which it leaves stick. Other laws creep from the start on: there it
+    is the instant at which the slip since t0 first exceeds `distance`, interpolated between the saved times `ts`. Slip
+    is the integral of the slip velocity by trapezoids over them, so the time is right to the square of their distance.
+    With `distance`, laws that run by events are measured in the same way.
+
+    ```python
+    features.break_away("friction", distance=5e-3)(run)
+    ```
+
+    **Arguments:**
+
+    - `element`: name of the friction element.
+    - `distance`: slip that counts as broken away [m or rad], > 0: well above the deflection of a bristle at its
+      limit, `Fs/sigma0`. To be given for laws that do not run by events.
+
+    **Raises:**
+
+    - `ValueError` if `distance` is not positive; when called, if the run has no such element, or needs a `distance`.
+    """
+    if distance is not None and not (math.isfinite(distance) and distance > 0):
+        raise ValueError(f"distance must be a positive number of metres or radians, but {distance!r} was given.")
+    return Feature(f"break-away of {element}", "s", _break_away, (element, distance))
+
+
+def _break_away(run: Trajectory, element: str, distance: float | None) -> Array:
+    if distance is not None:
+        return _slipped(run, element, distance)
+    if not is_exact(run, element):
+        raise ValueError(
+            f"The law of {element!r} does not run by events and creeps from the start on: say which slip counts as"
+            " broken away, as in break_away(distance=1e-3)."
+        )
+    events, own = changes_of(run, element)
+    leaves = own & (events.before == 0)
+    t = jnp.sum(jnp.where(leaves & (jnp.cumsum(leaves) == 1), events.t, 0.0))
+    return jnp.where(jnp.any(leaves), t, jnp.nan)
+
+
+def _slipped(run: Trajectory, element: str, distance: float) -> Array:
+    """First time at which the slip since t0 exceeds a distance."""
+    t, v = slip_of(run, element)
+    steps = jnp.diff(t)
+    steps = jnp.reshape(jnp.where(jnp.isfinite(steps), steps, 0.0), (-1, *(1,) * (v.ndim - 1)))
+    pieces = 0.5 * steps * (v[1:] + v[:-1])
+    slip = jnp.concatenate([jnp.zeros_like(v[:1]), jnp.cumsum(jnp.where(steps > 0, pieces, 0.0), axis=0)])
+    return _first(t, magnitude_of(slip) - distance)
+
+
+def _first(t: Float[Array, " n"], x: Float[Array, " n"]) -> Array:
+    """Time at which x first crosses zero upwards, by straight lines; NaN where it does not."""
+    times, crosses = _crossings(t, x)
+    return jnp.where(jnp.any(crosses), times[jnp.argmax(crosses)], jnp.nan)
+
+
+def _crossings(t: Float[Array, " n"], x: Float[Array, " n"]) -> tuple[Array, Array]:
+    """Where x crosses zero upwards between two samples, by straight lines, and whether it does."""
+    crosses = (x[:-1] < 0) & (x[1:] >= 0) & jnp.isfinite(t[1:])
+    rise = jnp.where(crosses, x[1:] - x[:-1], 1.0)
+    step, before = (jnp.where(crosses, each, 0.0) for each in (t[1:] - t[:-1], x[:-1]))
+    return jnp.where(crosses, t[:-1], 0.0) - before / rise * step, crosses
+
+
+def period(of: str = "friction", *, since: float | None = None, swing: float = 1e-3) -> Feature:
+    """Period [s] of a limit cycle; NaN where there is none.
+
+    Of a friction element that runs by events the time between its last two events into stick. Of a coordinate or
+    velocity (or a force) the mean time between its upward crossings of its mean, interpolated between the saved times
+    `ts`. A cycle that returns in other than the same time each time has no single one: then this is one of them, or
+    their mean. A cycle that has not returned for one and a half periods at the end of the run has ended, and counts as
+    none.
+
+    ```python
+    features.period("friction")(run), features.period("q[0]", since=20.0)(run)
+    ```
+
+    **Arguments:**
+
+    - `of`: name of a friction element, or `q[0]`, `qd[0]`.
+    - `since`: time [s] from which on saved times count; by default the middle of the run, so that the transient is
+      over. Unused for events.
+    - `swing`: least part of its swing in the whole run that a series has since then to count as a cycle. Unused for
+      events.
+
+    **Raises:**
+
+    - `ValueError` if `swing` is not between 0 and 1; when called, if the run has nothing of that name.
+    """
+    if not 0 <= swing < 1:
+        raise ValueError(f"swing must be a part of one, 0 <= swing < 1, but {swing!r} was given.")
+    return Feature(f"period of {of}", "s", _period, (of, since, swing))
+
+
+def _period(run: Trajectory, of: str, since: float | None, swing: float) -> Array:
+    if of in run.scene.exact:
+        gap, alive = cycle_of(run, of)
+        return jnp.where(alive, gap, jnp.nan)
+    x = series(run, of)
+    begin = 0.5 * (run.problem.t0 + run.t_end) if since is None else since
+    counts = jnp.isfinite(run.t) & (run.t >= begin)
+    x = jnp.where(jnp.isfinite(run.t), x, 0.0)
+    mean = jnp.sum(jnp.where(counts, x, 0.0)) / jnp.maximum(jnp.sum(counts), 1)
+    times, crosses = _crossings(run.t, x - mean)
+    crosses = crosses & counts[:-1]
+    count = jnp.sum(crosses)
+    latest = jnp.max(jnp.where(crosses, times, -jnp.inf), initial=-jnp.inf)
+    earliest = jnp.min(jnp.where(crosses, times, jnp.inf), initial=jnp.inf)
+    several = count >= 2
+    mean_gap = jnp.where(several, latest - earliest, 0.0) / jnp.maximum(count - 1, 1)
+    swings = _swing(x, counts) > swing * _swing(x, jnp.isfinite(run.t))
+    alive = several & swings & (run.t_end - latest <= _ALIVE * mean_gap)
+    return jnp.where(alive, mean_gap, jnp.nan)
+
+
+def _swing(x: Float[Array, " n"], these: Array) -> Any:
+    return jnp.max(jnp.where(these, x, -jnp.inf)) - jnp.min(jnp.where(these, x, jnp.inf))
+
+
+def cycle_of(run: Trajectory, element: str) -> tuple[Array, Array]:
+    """Time [s] between the last two events into stick of an element, and whether that goes on to the end."""
+    events, own = changes_of(run, element)
+    last, gap, two = last_two(events.t, own & (events.after == 0))
+    return gap, two & (run.t_end - last <= _ALIVE * gap)

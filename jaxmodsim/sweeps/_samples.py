@@ -1,0 +1,126 @@
+"""Samples that fill a box of parameters evenly."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+
+# (low, high), (low, high, "log"), or a frozen distribution of scipy.stats.
+Span: TypeAlias = tuple[float, float] | tuple[float, float, str] | Any
+
+
+def latin_hypercube(ranges: Mapping[str, Span], count: int, *, seed: int = 0) -> dict[str, np.ndarray]:
+    """Random samples with one in each of `count` equally likely strata of every parameter.
+
+    ```python
+    columns = sweeps.latin_hypercube({"m": (1.0, 2.0), "friction.Fc": (0.1, 10.0, "log")}, 200)
+    jaxmodsim.sweep(scene, {"sample": columns}, {"end": "q[0]"}, q0=[0.0], qd0=[0.0], t1=5.0)
+    ```
+
+    **Arguments:**
+
+    - `ranges`: by the name of a parameter `(low, high)` for a uniform distribution between them, `(low, high, "log")`
+      for one whose logarithm is uniform, or a frozen distribution such as `scipy.stats.norm(2.0, 0.1)`.
+    - `count`: number of samples, > 0.
+    - `seed`: of the random numbers.
+
+    **Returns:**
+
+    The samples of each parameter, shape `[count]`, in its own unit.
+
+    **Raises:**
+
+    - `ValueError` for a range that is none, with its name, and for a count below one.
+    """
+    check_ranges(ranges)
+    _check_count(count)
+    from scipy.stats import qmc  # half a second, for those who sample
+
+    return spread(ranges, qmc.LatinHypercube(len(ranges), rng=np.random.default_rng(seed)).random(count))
+
+
+def sobol(ranges: Mapping[str, Span], count: int, *, seed: int = 0) -> dict[str, np.ndarray]:
+    """Scrambled Sobol' points: more even than `latin_hypercube` in several parameters at once.
+
+    Their balance rests on a number of points that is a power of two; with others, means are worse than with fewer
+    points (Owen 2020, arXiv:2008.08051), so others are refused.
+
+    ```python
+    columns = sweeps.sobol({"m": (1.0, 2.0), "friction.Fc": (0.1, 10.0, "log")}, 256)
+    ```
+
+    **Arguments:**
+
+    - `ranges`, `seed`: as for `latin_hypercube`.
+    - `count`: number of samples, a power of two.
+
+    **Returns:**
+
+    The samples of each parameter, shape `[count]`, in its own unit.
+
+    **Raises:**
+
+    - `ValueError` for a range that is none, with its name, and a count that is no power of two.
+    """
+    check_ranges(ranges)
+    check_power(count)
+    from scipy.stats import qmc  # half a second, for those who sample
+
+    return spread(ranges, qmc.Sobol(len(ranges), rng=np.random.default_rng(seed)).random(count))
+
+
+def check_ranges(ranges: Mapping[str, Span]) -> None:
+    """Refuse ranges that are none."""
+    if not isinstance(ranges, Mapping) or not ranges:
+        raise ValueError(
+            f"ranges must name at least one parameter, as in {{'m': (1.0, 2.0)}}, but {ranges!r} was given."
+        )
+    for name, span in ranges.items():
+        if hasattr(span, "ppf"):
+            continue
+        log = isinstance(span, tuple | list) and len(span) == 3
+        if not isinstance(span, tuple | list) or not (len(span) == 2 or (log and span[2] == "log")):
+            raise ValueError(
+                f"The range of {name!r} must be (low, high), (low, high, 'log') or a frozen distribution of"
+                f" scipy.stats, but {span!r} was given."
+            )
+        low, high = span[:2]
+        real = all(isinstance(x, int | float | np.number) and math.isfinite(x) for x in (low, high))
+        if not real or not low < high:
+            raise ValueError(f"The range of {name!r} must go from a finite number to a larger one, but is {span!r}.")
+        if log and not low > 0:
+            raise ValueError(f"The logarithmic range of {name!r} must begin above zero, but is {span!r}.")
+
+
+def _check_count(count: int) -> None:
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+        raise ValueError(f"count must be a positive integer, but {count!r} was given.")
+
+
+def check_power(count: int) -> None:
+    """Refuse a number of Sobol' points that is no power of two."""
+    _check_count(count)
+    if count & (count - 1):
+        below = 1 << (int(count).bit_length() - 1)
+        raise ValueError(f"Sobol' points come in powers of two, but count={count}: take {below} or {2 * below}.")
+
+
+def spread(ranges: Mapping[str, Span], unit: Float[np.ndarray, "count names"]) -> dict[str, np.ndarray]:
+    """Samples of each parameter from those of the unit cube."""
+    columns = {name: _scaled(span, x) for (name, span), x in zip(ranges.items(), unit.T, strict=True)}
+    for name, column in columns.items():
+        if not np.isfinite(column).all():
+            raise ValueError(
+                f"The distribution of {name!r} has samples that are not finite, where the method goes to its ends: give"
+                " it ends, as in scipy.stats.truncnorm, or a range (low, high)."
+            )
+    return columns
+
+
+def _scaled(span: Any, x: np.ndarray) -> np.ndarray:
+    if hasattr(span, "ppf"):
+        return np.asarray(span.ppf(x), float)
+    low, high = span[:2]
+    return low * (high / low) ** x if len(span) == 3 else low + (high - low) * x
