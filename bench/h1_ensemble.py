@@ -8,14 +8,12 @@ a V100 and the largest adaptive one: 2611 ms by JAX `vmap`, 49 to 70 ms by a ker
 The limit is stated in operations: a step of Tsit5 evaluates the field six times (9 operations each), combines stages
 (3 components, 27 products and sums of two operations in all) and estimates the error (about 25): 240 operations, 215
 without the estimate; LuGre's testbench counts the operations that XLA reports for one step of Rodas5P. Peak rates of
-arithmetic and of memory are measured here, by chains of multiply-adds and by a copy.
+arithmetic and of memory are measured here, by a product of matrices and by a copy.
 
     python bench/h1_ensemble.py [--smoke] [--out DIR]
 """
 
-import os
 import time
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import diffrax as dfx
@@ -29,7 +27,6 @@ from _options import begin
 import jaxmodsim as jms
 from jaxmodsim.problems import box_lugre, ramped_box
 
-_DEPTH = 1 << 16
 SIGMA, BETA = 10.0, 8.0 / 3.0
 ADAPTIVE_OPERATIONS, FIXED_OPERATIONS = 240, 215
 RTOL = 1e-5
@@ -141,39 +138,24 @@ def step_operations() -> float:
 
 
 def peak_rates() -> dict[str, float]:
-    """Operations per second by chains of multiply-adds, bytes per second by a copy; on a CPU one on each core."""
-    cpu = jax.default_backend() == "cpu"
-    workers, rates = (os.cpu_count() or 1) if cpu else 1, {}
-    with ThreadPoolExecutor(workers) as pool:
-
-        def seconds(call: Any) -> float:
-            taken = []
-            for _ in range(9):
-                start = time.perf_counter()
-                list(pool.map(lambda _: call().block_until_ready(), range(workers)))
-                taken.append(time.perf_counter() - start)
-            return min(taken)
-
-        for dtype in (jnp.float32, jnp.float64):
-            # Few enough that they stay in the cache of a core.
-            x = jnp.ones(1 << (10 if cpu else 22), dtype)
-            chains = jax.jit(_chains)
-            rates[f"flops_{jnp.dtype(dtype).name}"] = (
-                2.0 * _DEPTH * x.size * workers / seconds(lambda f=chains, x=x: f(x))
-            )
-        big = jnp.ones(1 << (24 if cpu else 28), jnp.float32)
-        copy = jax.jit(lambda x: x + 1.0)
-        rates["bytes_per_second"] = 8.0 * big.size * workers / seconds(lambda: copy(big))
+    """Operations per second by a product of matrices, close to what is possible; bytes per second by a copy."""
+    size, rates = 1 << (11 if jax.default_backend() == "cpu" else 13), {}
+    product = jax.jit(lambda x: jnp.matmul(x, x, precision="highest"))
+    for dtype in (jnp.float32, jnp.float64):
+        x = jnp.ones((size, size), dtype)
+        rates[f"flops_{jnp.dtype(dtype).name}"] = 2.0 * size**3 / _shortest(lambda x=x: product(x))
+    big, copy = jnp.ones(size * size * 8, jnp.float32), jax.jit(lambda x: x + 1.0)
+    rates["bytes_per_second"] = 8.0 * big.size / _shortest(lambda: copy(big))
     return rates
 
 
-def _chains(x: Any) -> Any:
-    def block(_: Any, y: Any) -> Any:
-        for _ in range(64):
-            y = y * 0.999 + 1e-3
-        return y
-
-    return jax.lax.fori_loop(0, _DEPTH // 64, block, x)
+def _shortest(call: Any) -> float:
+    taken = []
+    for _ in range(9):
+        start = time.perf_counter()
+        call().block_until_ready()
+        taken.append(time.perf_counter() - start)
+    return min(taken)
 
 
 def _table(content: dict[str, Any]) -> dict[str, Any]:

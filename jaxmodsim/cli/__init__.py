@@ -1,4 +1,4 @@
-"""The command line: `jaxmodsim demo | testbench | fit`."""
+"""The command line: `jaxmodsim demo | testbench | fit | sweep`."""
 
 import os
 import sys

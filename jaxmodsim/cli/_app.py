@@ -12,7 +12,7 @@ from ._options import Out
 
 app = typer.Typer(
     name="jaxmodsim",
-    help="Differentiable mechanics with friction: test benches, fits to measured records.",
+    help="Differentiable mechanics with friction: test benches, fits to measured records, sweeps.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -121,3 +121,42 @@ def fit(
             max_speed, max_travel, duration,
         )
     )  # fmt: skip
+
+
+@app.command()
+def sweep(
+    spec: _options.Spec,
+    out: _options.Store = None,
+    figure: _options.FigureFile = None,
+    chunk: _options.Chunk = None,
+    workers: _options.Workers = None,
+    scheduler: _options.Scheduler = None,
+    dry_run: _options.DryRun = False,
+) -> None:
+    r"""Run a scene for many numbers, as a SPEC says, into a Zarr store; the same command goes on where one ended.
+
+    SPEC is a TOML file of four tables; names with dots or brackets stand in
+    quotes.
+
+    \[scene] is problem = "belt_oscillator" (any of jaxmodsim.problems) with its
+    numbers, and a table law with kind = "LuGre" and its numbers. Or it is
+    file = "model.py" and object = "scene", a Scene or a function of that file,
+    which is run: use only files that you trust.
+
+    \[run] has q0, qd0, t1; ts, a list or {start, stop, count}; t0, rtol, atol,
+    dt, dtmax, max_steps, max_events, hold_chatter, project.
+
+    \[over] has an entry for each dimension, all combinations of which are run:
+    a list; {from, to, count, spacing = "linear" or "log"}; a table of lists
+    that change together; or {latin_hypercube = {m = \[1, 2],
+    k = \[10, 1e4, "log"]}, count, seed}, or the same with sobol.
+
+    \[observe] has an entry for each thing to keep: "q\[0]", "qd\[0]", or the name
+    of an effect for its force; or {of = "qd\[0]", take = "max", unit = "m/s"},
+    where take is end, max, min, mean, rms, peak (the largest magnitude) or ptp
+    (from the lowest to the highest).
+    """
+    _start()
+    from ._sweep import SweepRequest, run_sweep
+
+    run_sweep(SweepRequest(spec, out, figure, chunk, workers, scheduler, dry_run))

@@ -118,3 +118,21 @@ Duration = Annotated[
     float | None,
     typer.Option(help=r"Its duration \[s]; by default that of the longest record.", rich_help_panel=_NEXT),
 ]
+
+Spec = Annotated[Path, typer.Argument(help="TOML file that says what to run; see above.")]
+Store = Annotated[
+    Path | None,
+    typer.Option(help="Folder of the Zarr store; made if it is not there, gone on with if it is.", metavar="STORE"),
+]
+FigureFile = Annotated[
+    Path | None, typer.Option(help="Map of the first variable, where there are two dimensions.", metavar="PNG")
+]
+Chunk = Annotated[int | None, typer.Option(help="Largest number of runs that are computed and written as one.", min=1)]
+Workers = Annotated[
+    int | None,
+    typer.Option(help="Processes of a local Dask cluster; by default threads of this process.", min=1),
+]
+Scheduler = Annotated[
+    str | None, typer.Option(help="Address of the scheduler of a Dask cluster that is there.", metavar="ADDRESS")
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be run, and run nothing.")]

@@ -6,6 +6,7 @@ from ._behaviour import behaviour_figure as behaviour_figure
 from ._comparison import comparison_figure as comparison_figure
 from ._design import design_figure as design_figure
 from ._indices import indices_figure as indices_figure
+from ._map import map2d as map2d
 from ._profile import profile_figure as profile_figure
 from ._records import fit_figure as fit_figure
 from ._records import loops_figure as loops_figure

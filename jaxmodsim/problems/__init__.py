@@ -8,6 +8,7 @@ from ._belt import BELT_OSCILLATOR as BELT_OSCILLATOR
 from ._belt import BELT_STRIBECK as BELT_STRIBECK
 from ._belt import BeltCycle as BeltCycle
 from ._belt import belt_coulomb as belt_coulomb
+from ._belt import belt_onset_speed as belt_onset_speed
 from ._belt import belt_oscillator as belt_oscillator
 from ._belt import belt_oscillator_cycle as belt_oscillator_cycle
 from ._belt import belt_stribeck as belt_stribeck

@@ -2,11 +2,12 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..effects import Friction
-from ..friction import Coulomb, Stribeck
+from ..friction import Coulomb, Stribeck, Viscous
 from ..scene import Scene
 from ._spring import braked_spring
 
@@ -40,6 +41,7 @@ def belt_oscillator(
     m: ArrayLike = BELT_OSCILLATOR["m"],
     k: ArrayLike = BELT_OSCILLATOR["k"],
     belt: ArrayLike = BELT_OSCILLATOR["belt"],
+    c: ArrayLike | None = None,
 ) -> Scene:
     """The mass and spring of `braked_spring`, on a belt that moves at constant velocity.
 
@@ -49,15 +51,17 @@ def belt_oscillator(
     - `m`: mass [kg], > 0.
     - `k`: stiffness of the spring to the ground [N/m], > 0, relaxed at q = 0.
     - `belt`: velocity of the belt [m/s].
+    - `c`: damping coefficient of a damper beside the spring [N s/m], >= 0; by default there is none.
 
     **Returns:**
 
-    A `Scene` with one coordinate [m] and the effect `friction`. Under Coulomb friction it follows
-    `belt_oscillator_cycle`.
+    A `Scene` with one coordinate [m] and the effect `friction`; with `c` also `damper`. Under Coulomb friction it
+    follows `belt_oscillator_cycle`, if there is no damper; with one, `belt_onset_speed` says whether it sticks again.
     """
     spring = braked_spring(m=m, k=k)
     friction = Friction(belt_coulomb() if law is None else law, belt_velocity=belt)
-    return Scene(spring.lagrangian, params=spring.params, effects=(friction,))
+    damper = () if c is None else (Friction(Viscous(c), name="damper"),)
+    return Scene(spring.lagrangian, params=spring.params, effects=(friction, *damper))
 
 
 def belt_coulomb() -> Coulomb:
@@ -97,3 +101,60 @@ def belt_oscillator_cycle(*, m: ArrayLike, k: ArrayLike, belt: ArrayLike, Fc: Ar
     stick, slip = 2.0 * d / belt, 2.0 / w * (jnp.pi - jnp.arctan(d * w / belt))
     reach = jnp.sqrt(d**2 + (belt / w) ** 2)
     return BeltCycle(stick + slip, stick, slip, middle + d, middle - d, middle - reach, middle + reach)
+
+
+def belt_onset_speed(*, m: ArrayLike, k: ArrayLike, c: ArrayLike, Fc: ArrayLike, Fs: ArrayLike) -> Float[Array, "..."]:
+    """Velocity of the belt [m/s] below which `belt_oscillator` with a damper sticks and slips for ever.
+
+    It breaks away at the velocity of the belt, where `k x + c belt = Fs`, and then swings freely about `Fc/k` while
+    friction pushes with Fc. With `w = sqrt(k/m)`, `zeta = c/(2 m w)`, `u = sqrt(1 - zeta^2)`, time `s = w t` and
+    `d = (Fs - Fc)/(belt sqrt(k m))`, the velocity in units of that of the belt is
+    `V = exp(-zeta s) (cos(u s) + (zeta - d)/u sin(u s))`, as V(0) = 1 and V'(0) = -d. It has its first maximum at
+    `u s = 2 pi - atan2(d u, 1 - zeta d)`, and if V comes to 1 by then, the mass sticks again; as every slip begins in
+    the same state, it will do so after every slip. If V stays below 1, it slips until it rests. As
+    `V^2 + 2 zeta V V' + V'^2` falls by `exp(-2 zeta s)`, the limit between them, V = 1 at V' = 0, is
+
+        1 - 2 zeta d + d^2 = exp(2 zeta/u (2 pi - atan2(d u, 1 - zeta d))),
+
+    which has one root d > 2 zeta. For small zeta it is `d = sqrt(4 pi zeta)`, so
+    `belt = (Fs - Fc)/sqrt(4 pi zeta k m)`.
+
+    **Arguments:** (arrays of shapes that broadcast)
+
+    - `m`: mass [kg], > 0.
+    - `k`: stiffness [N/m], > 0.
+    - `c`: damping coefficient [N s/m], > 0.
+    - `Fc`: force in slip [N], >= 0.
+    - `Fs`: largest force in stick [N], > Fc.
+
+    **Returns:**
+
+    The velocity, 0 for c >= 2 sqrt(k m): critically damped it never sticks again. Differentiable.
+    """
+    m, k, c, Fc, Fs = (jnp.asarray(x) for x in (m, k, c, Fc, Fs))
+    zeta = c / (2.0 * jnp.sqrt(k * m))
+    light = zeta < 1.0
+    zeta = jnp.where(light, zeta, 0.5)
+
+    def gap(log_d: Array, zeta: Array) -> Array:
+        """Logarithm of the left-hand side over the right-hand side; it rises from -inf at d = 2 zeta."""
+        # Over max(1, d), and the left-hand side over its square: d is beyond all numbers as zeta comes to 1.
+        one, d, u = jnp.exp(-jnp.maximum(log_d, 0.0)), jnp.exp(jnp.minimum(log_d, 0.0)), jnp.sqrt(1.0 - zeta**2)
+        angle = 2.0 * jnp.pi - jnp.arctan2(d * u, one - zeta * d)
+        left = 2.0 * jnp.maximum(log_d, 0.0) + jnp.log1p(one * d * (one * d - 2.0 * zeta))
+        return left - 2.0 * zeta / u * angle
+
+    def halve(_: Any, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+        middle = 0.5 * (bracket[0] + bracket[1])
+        below = gap(middle, fixed) < 0
+        return jnp.where(below, middle, bracket[0]), jnp.where(below, bracket[1], middle)
+
+    fixed = jax.lax.stop_gradient(zeta)
+    # The left-hand side is above (d - zeta)^2, the right-hand side below exp(4 pi zeta/u).
+    whole = 2.0 * jnp.pi * fixed / jnp.sqrt(1.0 - fixed**2)
+    bracket = (jnp.log(2.0 * fixed), jnp.logaddexp(whole, jnp.log(fixed)))
+    root, _ = jax.lax.fori_loop(0, 60, halve, bracket)
+    # One step of Newton, which also carries the derivatives.
+    slope = jax.jvp(lambda x: gap(x, fixed), (root,), (jnp.ones_like(root),))[1]
+    log_d = root - gap(root, zeta) / jax.lax.stop_gradient(slope)
+    return jnp.where(light, (Fs - Fc) / jnp.sqrt(k * m) * jnp.exp(-log_d), 0.0)

@@ -32,7 +32,7 @@ def reporter(progress: bool | Progress) -> Iterator[Progress]:
     elif callable(progress):
         yield progress
     else:
-        with _bar() as report:
+        with progress_bar() as report:
             yield report
 
 
@@ -41,12 +41,17 @@ def _silent(now: SweepProgress) -> None:
 
 
 @contextmanager
-def _bar() -> Iterator[Progress]:
+def progress_bar() -> Iterator[Progress]:
+    """A bar on the terminal, shown while the context is open; yields what to call with a `SweepProgress`.
+
+    **Raises:**
+
+    - `ImportError` where rich is not installed.
+    """
     rich = extra("rich.progress")
     columns = (
-        rich.TextColumn("sweep"),
-        rich.BarColumn(),
-        rich.TextColumn("{task.completed:,.0f} of {task.total:,.0f} runs, {task.fields[rate]}"),
+        rich.BarColumn(bar_width=16),
+        rich.TextColumn("{task.completed:,.0f} of {task.total:,.0f} runs{task.fields[rate]}"),
         rich.TextColumn("{task.fields[failed]:,} failed"),
         rich.TimeElapsedColumn(),
         rich.TextColumn("left"),
@@ -61,7 +66,7 @@ def _bar() -> Iterator[Progress]:
                 before.append(now.done)
                 bar.reset(task, total=now.total, completed=now.done)
             seconds = bar.tasks[0].elapsed or 0.0
-            rate = f"{(now.done - before[0]) / seconds:,.0f} a second" if seconds > 0 and now.done > before[0] else ""
+            rate = f", {(now.done - before[0]) / seconds:,.0f}/s" if seconds > 0 and now.done > before[0] else ""
             bar.update(task, completed=now.done, total=now.total, failed=now.failed, rate=rate)
 
         yield report

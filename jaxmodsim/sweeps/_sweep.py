@@ -106,13 +106,11 @@ def sweep(
       another scene, other numbers, code, or versions.
     - `ImportError` where the extra `sweep` is not installed.
     """
-    if chunk is not None and (isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1):
-        raise ValueError(f"chunk must be a positive integer, but {chunk!r} was given.")
     if not (callable(progress) or isinstance(progress, bool)):
         raise ValueError(f"progress must be True, False or a function, but {progress!r} was given.")
     asked = request(system, grid(over), observe, {"q0": q0, "qd0": qd0, "t1": t1, **options})
     places = list(devices) if devices is not None else jax.local_devices()
-    lanes = _lanes(asked, places[0].platform, chunk)
+    lanes = lanes_of_block(asked, places[0].platform, chunk)
     cut = blocks(asked.grid.shape, lanes)
     group = GROUP if places[0].platform == "cpu" else lanes
     work = Work(asked.lane, asked.fixed, None, group, jnp.result_type(float) == jnp.float64)
@@ -127,8 +125,15 @@ def sweep(
     return results.dataset()
 
 
-def _lanes(asked: Request, platform: str, chunk: int | None) -> int:
-    """Lanes of a block."""
+def lanes_of_block(asked: Request, platform: str, chunk: int | None) -> int:
+    """Lanes of a block.
+
+    **Raises:**
+
+    - `ValueError` if `chunk` is no positive integer.
+    """
+    if chunk is not None and (isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1):
+        raise ValueError(f"chunk must be a positive integer, but {chunk!r} was given.")
     if chunk is not None:
         return int(chunk)
     room = sum(np.prod(x.shape, initial=1.0) * x.dtype.itemsize for x in asked.shapes.values.values())
