@@ -105,7 +105,7 @@ def test_a_lane_that_fails_stays_alone(found: xr.Dataset) -> None:
     assert "mass matrix" in sentences[int(broken["result"][0, 3])].lower()
 
 
-def test_a_lane_of_many_steps_is_run_again_among_its_like(found: xr.Dataset) -> None:
+def test_a_lane_of_many_steps_is_run_again_among_its_like() -> None:
     """One lane needs more steps than lanes get at first, one more than it may have at all."""
     tolerance = np.full(14, 1e-6)
     tolerance[4], tolerance[9] = 1e-12, 1e-16

@@ -129,7 +129,7 @@ def other_curve(a: Any, b: Any) -> dict[str, Any]:
 
 
 def test_results_of_something_else_are_refused(whole: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="over: b was .* is "):
+    with pytest.raises(ValueError, match=r"over: b was .* is "):
         store(whole, over=OVER | {"b": np.linspace(0.0, 2.0, 26)})
     with pytest.raises(ValueError, match=r"chunks was \[1, 7\], is \[1, 13\]"):
         store(whole, chunk=13)
