@@ -251,6 +251,15 @@ def test_mistakes_are_named(monkeypatch: pytest.MonkeyPatch, changes: dict[str, 
         box_sweep(**changes)
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_a_function_that_raises_says_how_it_should_not() -> None:
+    def end(m: Any) -> Any:
+        return jms.simulate(ramped_box(box_lugre(), m=m), **START).qd[-1, 0]
+
+    with pytest.raises(RuntimeError, match=r"mass matrix .* Pass throw=False"):
+        jms.sweep(end, {"m": [1.0, -2.0]})
+
+
 def test_mistakes_with_a_function(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # as users have it
     with pytest.raises(ValueError, match="needs a Scene or a function"):

@@ -1,6 +1,7 @@
 """The lanes of a block, computed: in groups that fit the cache, slow lanes apart."""
 
 import hashlib
+import re
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, NamedTuple, TypeAlias
@@ -99,7 +100,7 @@ def _in_groups(
         full = np.concatenate([rows, np.repeat(rows[-1:], size - rows.size)])
         given = {name: x[full].reshape(*shape, *x.shape[1:]) for name, x in numbers.items()}
         given = given if device is None else jax.device_put(given, device)
-        part = _call(lane, fixed, given)
+        part = _answer(lane, fixed, given)
         code, steps, values = (jtu.tree_map(_flat, x) for x in (part.code, part.num_steps, part.values))
         if found is None:
             empty = partial(jtu.tree_map, lambda x: np.zeros((lanes, *x.shape[1:]), x.dtype))
@@ -109,6 +110,20 @@ def _in_groups(
             found.values[name][rows] = x[: rows.size]
     assert found is not None
     return found
+
+
+def _answer(lane: AbstractLane, fixed: PyTree, given: dict[str, Any]) -> Found:
+    """What compiled code gives, when it is there."""
+    try:
+        return jax.block_until_ready(_call(lane, fixed, given))
+    except jax.errors.JaxRuntimeError as error:
+        found = re.search(r"_EquinoxRuntimeError: (.*)", str(error))
+        if found is None:
+            raise
+        raise RuntimeError(
+            f"One of the lanes raised an error, which ends all of them: {found[1]} Pass throw=False to simulate in the"
+            " function that is swept, and return the run or what is known of it: a lane that fails then stays alone."
+        ) from error
 
 
 def _flat(x: Array) -> np.ndarray:

@@ -15,6 +15,7 @@ from jaxtyping import ArrayLike
 from ..scene import Scene
 from ._compute import GROUP, Work, lanes_of_call
 from ._execute import Task, elsewhere, in_threads
+from ._extra import extra
 from ._grid import Blocks, blocks, grid
 from ._layout import layout
 from ._plan import Prediction, plan
@@ -108,6 +109,7 @@ def sweep(
     """
     if not (callable(progress) or isinstance(progress, bool)):
         raise ValueError(f"progress must be True, False or a function, but {progress!r} was given.")
+    extra("xarray"), extra("zarr")  # rather now than after the runs
     asked = request(system, grid(over), observe, {"q0": q0, "qd0": qd0, "t1": t1, **options})
     places = list(devices) if devices is not None else jax.local_devices()
     lanes = lanes_of_block(asked, places[0].platform, chunk)
