@@ -247,10 +247,9 @@ def test_garbage_is_refused(more: dict[str, Any], text: str) -> None:
         global_sensitivity(linear, None, given.pop("ranges"), **given)
 
 
-def test_garbage_of_scenes_is_refused() -> None:
+def test_what_is_no_number_is_refused() -> None:
     scene, ranges = problems.ramped_box(jms.Viscous(0.1)), {"m": (1.0, 3.0)}
-    given: dict[str, Any] = {"count": 2, "q0": [0.0], "qd0": [0.0], "t1": 0.1}
     with pytest.raises(ValueError, match="observed is: v"):
-        global_sensitivity(scene, {"v": "qd[0]"}, ranges, by="kind", **given)
-    with pytest.raises(ValueError, match=r"features.final\('qd\[0\]'\)"):
-        global_sensitivity(scene, "qd[0]", ranges, ts=[0.0, 0.1], **given)
+        global_sensitivity(scene, {"v": "qd[0]"}, ranges, by="kind", q0=[0.0], qd0=[0.0], t1=0.1)
+    with pytest.raises(ValueError, match="one number of each run, but 'value' has the dimensions"):
+        global_sensitivity(lambda m: jnp.stack([m, m]), None, ranges, count=2)

@@ -9,7 +9,10 @@ from ._names import series, unit_of
 
 
 def peak(of: str) -> Feature:
-    """Largest magnitude of a coordinate, velocity or force at the saved times `ts` of a run.
+    """Largest magnitude of a coordinate, velocity or force in a run.
+
+    At the saved times `ts`; of a coordinate also where it turns between two of them, by a cubic, and of friction that
+    runs by events also just before and after each of these, where it has its peaks.
 
     ```python
     features.peak("friction")(run), features.peak("qd[0]")(run)
@@ -27,7 +30,24 @@ def peak(of: str) -> Feature:
 
 
 def _peak(run: Trajectory, of: str) -> Array:
-    return jnp.max(jnp.where(jnp.isfinite(run.t), jnp.abs(series(run, of)), 0.0))
+    x = series(run, of)
+    peak = jnp.max(jnp.where(jnp.isfinite(run.t), jnp.abs(x), 0.0))
+    if of in run.scene.exact:
+        sides = jnp.abs(run.event_forces[of])
+        return jnp.max(jnp.where(jnp.isnan(sides), 0.0, sides), initial=peak)
+    if of.startswith("q[") and run.t.shape[0] > 1:
+        return jnp.maximum(peak, jnp.max(jnp.abs(_turns(run.t, x, series(run, f"qd{of[1:]}")))))
+    return peak
+
+
+def _turns(t: Array, x: Array, v: Array) -> Array:
+    """Where x turns between two samples by the cubic through both with their slopes `v`; else zero, `[time - 1]`."""
+    turns = (v[:-1] * v[1:] < 0) & jnp.isfinite(t[1:])
+    step = jnp.where(turns, t[1:] - t[:-1], 0.0)
+    x0, x1, v0, v1 = (jnp.where(turns, each, 0.0) for each in (x[:-1], x[1:], v[:-1], v[1:]))
+    s = v0 / jnp.where(turns, v0 - v1, 1.0)
+    cubic = (1 - s) ** 2 * ((1 + 2 * s) * x0 + s * step * v0) + s**2 * ((3 - 2 * s) * x1 - (1 - s) * step * v1)
+    return jnp.where(turns, cubic, 0.0)
 
 
 def final(of: str) -> Feature:

@@ -18,9 +18,10 @@ def break_away(element: str = "friction", *, distance: float | None = None) -> F
     """Time [s] at which a friction element breaks away; NaN where it never does.
 
     Of a law that runs by events the first event in which it leaves stick. Other laws creep from the start on: there it
-    is the instant at which the slip since t0 first exceeds `distance`, interpolated between the saved times `ts`. Slip
-    is the integral of the slip velocity by trapezoids over them, so the time is right to the square of their distance.
-    With `distance`, laws that run by events are measured in the same way.
+    is the instant at which the slip since t0 first exceeds `distance`. Slip is the integral of the slip velocity, which
+    counts as a straight line between the saved times `ts`, so the time is right to the square of their distance. With
+    `distance`, laws that run by events are measured in the same way; there the slip has a corner between two samples,
+    and derivatives are right to no more than their distance over the time since the corner.
 
     ```python
     features.break_away("friction", distance=5e-3)(run)
@@ -56,19 +57,22 @@ def _break_away(run: Trajectory, element: str, distance: float | None) -> Array:
 
 
 def _slipped(run: Trajectory, element: str, distance: float) -> Array:
-    """First time at which the slip since t0 exceeds a distance."""
+    """First time at which the slip since t0 exceeds a distance, by parabolas between the samples."""
     t, v = slip_of(run, element)
-    steps = jnp.diff(t)
-    steps = jnp.reshape(jnp.where(jnp.isfinite(steps), steps, 0.0), (-1, *(1,) * (v.ndim - 1)))
-    pieces = 0.5 * steps * (v[1:] + v[:-1])
-    slip = jnp.concatenate([jnp.zeros_like(v[:1]), jnp.cumsum(jnp.where(steps > 0, pieces, 0.0), axis=0)])
-    return _first(t, magnitude_of(slip) - distance)
-
-
-def _first(t: Float[Array, " n"], x: Float[Array, " n"]) -> Array:
-    """Time at which x first crosses zero upwards, by straight lines; NaN where it does not."""
-    times, crosses = _crossings(t, x)
-    return jnp.where(jnp.any(crosses), times[jnp.argmax(crosses)], jnp.nan)
+    steps = jnp.where(jnp.isfinite(t[1:]), jnp.diff(t), 0.0)
+    pieces = 0.5 * jnp.expand_dims(steps, range(1, v.ndim)) * (v[1:] + v[:-1])
+    slip = jnp.concatenate([jnp.zeros_like(v[:1]), jnp.cumsum(jnp.where(jnp.isfinite(pieces), pieces, 0.0), axis=0)])
+    x = magnitude_of(slip)
+    crosses = (x[:-1] < distance) & (x[1:] >= distance) & (steps > 0)
+    happens, k = jnp.any(crosses), jnp.argmax(crosses)
+    dot = jnp.sum(jnp.reshape(slip[k] * v[k], -1))
+    pace = jnp.where(x[k] > 0, dot / jnp.where(x[k] > 0, x[k], 1.0), magnitude_of(v[k][None])[0])
+    step, left, rise = (jnp.where(happens, y, 1.0) for y in (steps[k], distance - x[k], x[k + 1] - x[k]))
+    pace = jnp.where(happens, pace, 1.0)
+    # left = pace tau + bend tau^2/2, which is rise at the end of the step.
+    bend = 2.0 * (rise - pace * step) / step**2
+    tau = 2.0 * left / (pace + jnp.sqrt(pace**2 + 2.0 * bend * left))
+    return jnp.where(happens, t[k] + tau, jnp.nan)
 
 
 def _crossings(t: Float[Array, " n"], x: Float[Array, " n"]) -> tuple[Array, Array]:

@@ -33,7 +33,7 @@ def indices_figure(found: GlobalSensitivity, *, caption: str = "") -> Figure:
             panels[name][kind] = estimate
     if found.membership:
         panels = {"kind of motion": dict(found.membership)} | panels
-    colours = dict(zip(found.shares, _CLASSES * len(found.shares), strict=False))
+    colours: dict[str, str] = dict(zip(found.shares, _CLASSES * len(found.shares), strict=False))
     colours["all runs"] = GREY if len(found.shares) > 1 else BLUE
     rows = [len(found.names) * len(groups) for groups in panels.values()]
     figure = Figure(figsize=(9, 1.2 + sum(0.6 + 0.24 * n for n in rows)), layout="constrained")

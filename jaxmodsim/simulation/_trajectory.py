@@ -131,9 +131,19 @@ class Trajectory:
         if self.modes is None:
             none = jnp.zeros(0, int)
             return Events(jnp.zeros(0, self.t.dtype), none, none, none)
-        return self._once(
-            "events", lambda: _events(self.scene, solve_logged(self.problem, self.options, self.log_size))
-        )
+        return self._once("events", lambda: _events(self.scene, self._log()))
+
+    @property
+    def event_forces(self) -> dict[str, Array]:
+        """Force of each effect just before and after each instant at which a mode changes, by effect name.
+
+        Shape `[instants, 2, ...]`, padded with NaN. At a break-away the force before is the limit in stick. Found with
+        `events`; several elements that change at one instant have one entry here.
+        """
+        self._one_run("event_forces")
+        if self.modes is None:
+            return {name: jnp.zeros((0, 2, *force.shape[1:]), force.dtype) for name, force in self.forces.items()}
+        return self._once("event_forces", lambda: _event_forces(self.scene, self._log()))
 
     @property
     def momentum(self) -> Float[Array, "*time dof"]:
@@ -172,6 +182,12 @@ class Trajectory:
         count, size = self.stats.get("num_events", 0), self.options.max_events
         return size if isinstance(count, jax.core.Tracer) else min(size, 1 << max(int(count), 8).bit_length())
 
+    def _log(self) -> EventLog:
+        return self._once("log", lambda: solve_logged(self.problem, self.options, self.log_size))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_made"}
+
     def _once(self, name: str, make: Callable[[], _Value]) -> _Value:
         """What costs another run, made once; anew inside another `jax.jit`, `jax.vmap` or `jax.grad` than before."""
         made, now = self.__dict__.setdefault("_made", {}), get_opaque_trace_state()
@@ -207,6 +223,15 @@ def _momentum(scene: Scene, t: Array, q: Array, qd: Array) -> Array:
         return momentum(now.lagrangian, t, q, qd, now.params)
 
     return _reached(t, jax.vmap(at)(t, q, qd))
+
+
+@jax.jit
+def _event_forces(scene: Scene, log: EventLog) -> dict[str, Array]:
+    happened = jnp.isfinite(log.t)
+    t = jnp.where(happened, log.t, 0.0)
+    sides = [jax.vmap(lambda t, y, mode: scene_forces(t, y, scene, mode))(t, *side) for side in (log.before, log.after)]
+    both = jtu.tree_map(lambda *each: jnp.stack(each, axis=1), *sides)
+    return jtu.tree_map(lambda x: jnp.where(jnp.expand_dims(happened, range(1, x.ndim)), x, jnp.nan), both)
 
 
 def _reached(t: Array, tree: Any) -> Any:

@@ -56,7 +56,8 @@ class SobolDesign:
         found = extra("SALib.analyze.sobol").analyze(
             _problem(d), y, calc_second_order=False, conf_level=self.confidence, seed=self.seed + 1
         )
-        return Estimate(*({x: found[f"{x}{of}"] for x in ("S1", "ST")} for of in ("", "_conf")), samples)
+        indices, errors = ({x: found[f"{x}{of}"] for x in ("S1", "ST")} for of in ("", "_conf"))
+        return Estimate(indices, errors, samples)
 
     def within(self, y: Float[np.ndarray, " runs"], use: Bool[np.ndarray, " runs"]) -> Estimate:
         """First indices from the independent points, the first and last of each block, that are used.

@@ -158,8 +158,8 @@ def _values(runs: Any, by: str | None) -> dict[str, np.ndarray]:
     for name, value in values.items():
         if value.ndim != 1:
             raise ValueError(
-                f"Indices are of one number of each run, but {name!r} has the dimensions {value.dims[1:]} beside: take"
-                f" one of them, as features.final({name!r}) does."
+                f"Indices are of one number of each run, but {name!r} has the dimensions {value.dims[1:]} beside:"
+                " observe one of them, as features.final('q[0]') does."
             )
     return {name: np.asarray(value, float) for name, value in values.items()}
 
