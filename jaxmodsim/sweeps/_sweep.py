@@ -109,7 +109,8 @@ def sweep(
     """
     if not (callable(progress) or isinstance(progress, bool)):
         raise ValueError(f"progress must be True, False or a function, but {progress!r} was given.")
-    extra("xarray"), extra("zarr")  # rather now than after the runs
+    for needed in ("xarray", "zarr"):  # rather now than after the runs
+        extra(needed)
     asked = request(system, grid(over), observe, {"q0": q0, "qd0": qd0, "t1": t1, **options})
     places = list(devices) if devices is not None else jax.local_devices()
     lanes = lanes_of_block(asked, places[0].platform, chunk)
