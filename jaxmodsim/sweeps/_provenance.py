@@ -96,6 +96,7 @@ def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
 
 
 def _called(function: Any) -> str:
+    function = getattr(function, "fn", function)  # a plain function in a scene is wrapped
     return str(getattr(function, "__qualname__", type(function).__name__))
 
 
