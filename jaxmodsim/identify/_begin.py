@@ -1,7 +1,6 @@
 """Where a search begins: many starts side by side, or an easier problem first."""
 
 import abc
-import os
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -13,6 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..numerics import cores
 from ._bounded import Search, search_start
 from ._problem import Problem
 from ._solve import Options, solve, steps_side_by_side
@@ -145,7 +145,7 @@ def side_by_side(problem: Problem, axes: Any, search: Search, options: Options, 
                 return
             group[1] = steps_side_by_side(group[0], axes, group[1], rtol)
 
-    with ThreadPoolExecutor(_cores()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         try:
             run(groups[0], 1)  # compiles; the others find it done
             list(pool.map(run, groups, [steps - 1, *(steps for _ in groups[1:])]))
@@ -159,10 +159,6 @@ def side_by_side(problem: Problem, axes: Any, search: Search, options: Options, 
 def starts_of(problem: Problem, x: Float[Array, "lanes n"]) -> Search:
     """Searches that start at the rows of `x`."""
     return eqx.filter_vmap(lambda x: search_start(x, problem.rows))(x)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def chosen_lanes(problem: Problem, axes: Any, rows: Array | int) -> Problem:

@@ -4,6 +4,7 @@ from ._collocation import GAUSS as GAUSS
 from ._collocation import CollocationMemory as CollocationMemory
 from ._collocation import collocation_start as collocation_start
 from ._collocation import collocation_step as collocation_step
+from ._cores import cores as cores
 from ._depends import depends as depends
 from ._function import Function as Function
 from ._function import as_function as as_function

@@ -2,7 +2,6 @@
 
 import concurrent.futures as cf
 import hashlib
-import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
@@ -11,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from ..numerics import cores
 from ._compute import Computed, Work, compute
 from ._extra import extra
 
@@ -33,8 +33,8 @@ def in_threads(work: Work, tasks: Iterable[Task], devices: list[Any]) -> Iterato
 
     A compiled loop over small states uses one core, and lets other threads run.
     """
-    cores = _cores() if len(devices) == 1 and devices[0].platform == "cpu" else 1
-    places = [device if len(devices) > 1 else None for device in devices for _ in range(cores)]
+    each = cores() if len(devices) == 1 and devices[0].platform == "cpu" else 1
+    places = [device if len(devices) > 1 else None for device in devices for _ in range(each)]
     free = list(places)
 
     def run(task: Task) -> tuple[int, Computed]:
@@ -107,7 +107,3 @@ def _as_completed(
     finally:
         for future in waiting:
             future.cancel()
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
