@@ -225,6 +225,7 @@ def each_mistake() -> Iterator[tuple[str, str, str, str]]:
     yield "run", "rtol =", "rtoll =", r"\[run\]: there is no key 'rtoll'.*Did you mean 'rtol'"
     yield "state", "q0 = [0.05]", "q0 = 0.05", "q0 must be a list of numbers, but 0.05"
     yield "ts", "stop = 0.5", "end = 0.5", r"\[run.ts\]: stop is missing"
+    yield "misspelt", "count = 11", "cuont = 11", r"\[run.ts\]: count is missing.*'cuont' is there instead"
     yield "count", "count = 11", "count = 11.5", r"\[run.ts\]: count must be a whole number > 0, but 11.5"
     yield "no end", "t1 = 0.5\n", "", "needs t1"
     yield "zipped", "k = [50, 80, 120]", "k = 50", r"\[over.pair\]: k must be a list"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from jaxmodsim import sweep
+from jaxmodsim import sweep, tune_cpu
 
 from ..plot import map2d
 from ..sweeps import Outline, SweepProgress, outline, progress_bar
@@ -147,6 +147,7 @@ def _executor(request: SweepRequest) -> Iterator[Any]:
     finally:
         signal.signal(signal.SIGINT, before)
     with cluster, Client(cluster) as client:
+        client.run(tune_cpu)  # as in this process
         yield client
 
 
