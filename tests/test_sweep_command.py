@@ -1,5 +1,7 @@
 """`jaxmodsim sweep`, as a user meets it: what it runs, what it keeps, how it refuses."""
 
+import re
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,9 +15,11 @@ import jaxmodsim as jms
 from jaxmodsim.cli import _sweep
 from jaxmodsim.cli._spec import Reduced, read_spec
 from jaxmodsim.cli._spec_scene import LAWS, PROBLEMS
+from jaxmodsim.plot import map2d
 from jaxmodsim.problems import belt_oscillator
 from jaxmodsim.sweeps import SweepProgress, latin_hypercube, outline, sobol
 
+EXAMPLE = Path(__file__).parents[1] / "examples" / "d1_belt.toml"
 MODEL = """
 import jax.numpy as jnp
 import jaxmodsim as jms
@@ -100,8 +104,15 @@ def test_a_problem_is_run_as_sweep_runs_it(run_command: Command, spec: Callable[
 
 
 def test_a_function_of_a_file_is_drawn_and_failures_are_told(
-    run_command: Command, spec: Callable[[str], str], tmp_path: Path
+    run_command: Command, spec: Callable[[str], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    drawn: list[str] = []
+
+    def draw(found: xr.Dataset, name: str, **options: Any) -> Any:
+        drawn.append(name)
+        return map2d(found, name, **options)
+
+    monkeypatch.setattr(_sweep, "map2d", draw)
     command = ("sweep", spec(ROOT), "--out", str(tmp_path / "root.zarr"), "--figure", str(tmp_path / "map" / "a.png"))
     code, text, errors = run_command(*command, "--chunk", "6")
     assert code == 0, errors
@@ -111,6 +122,7 @@ def test_a_function_of_a_file_is_drawn_and_failures_are_told(
     assert "27 " in text
     assert "30 run in" in text
     assert (tmp_path / "map" / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert drawn == ["root"]
     again = run_command(*command, "--chunk", "6")
     assert again[0] == 0
     assert "All were there before." in again[1]
@@ -125,6 +137,12 @@ def test_a_dry_run_says_what_would_be_run(run_command: Command, spec: Callable[[
     for part in ("6 runs, in 2 chunks of up to 4", "k, friction.Fc", "pair x qd0[0] x time", "m/s"):
         assert part in text
     assert not (tmp_path / "no").exists()
+
+
+def test_the_example_is_a_spec(run_command: Command) -> None:
+    code, text, errors = run_command("sweep", str(EXAMPLE), "--dry-run", "--figure", "a.png")
+    assert code == 0, errors
+    assert "1,920 runs" in text
 
 
 def test_ctrl_c_says_what_is_kept_and_the_same_command_goes_on(
@@ -151,6 +169,17 @@ def test_ctrl_c_says_what_is_kept_and_the_same_command_goes_on(
     assert "24 run in" in text
     assert "6 were there before" in text
     assert np.isfinite(xr.open_zarr(tmp_path / "root.zarr", consolidated=False)["root"]).sum() == 27
+
+
+def test_processes_get_the_model_by_value(run_command: Command, spec: Callable[[str], str], tmp_path: Path) -> None:
+    """A worker has no module of the name that the file goes by here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the cluster's own
+        code, text, errors = run_command("sweep", spec(ROOT), "--out", str(tmp_path / "root.zarr"), "--workers", "1")
+    assert code == 0, errors
+    assert "30 run in" in text
+    found = xr.open_zarr(tmp_path / "root.zarr", consolidated=False)
+    np.testing.assert_allclose(found["root"][5], 2.0 + np.array([1.0, 10.0, 100.0]))
 
 
 def test_samples_are_those_of_the_library(spec: Callable[[str], str]) -> None:
@@ -196,6 +225,7 @@ def each_mistake() -> Iterator[tuple[str, str, str, str]]:
     yield "run", "rtol =", "rtoll =", r"\[run\]: there is no key 'rtoll'.*Did you mean 'rtol'"
     yield "state", "q0 = [0.05]", "q0 = 0.05", "q0 must be a list of numbers, but 0.05"
     yield "ts", "stop = 0.5", "end = 0.5", r"\[run.ts\]: stop is missing"
+    yield "misspelt", "count = 11", "cuont = 11", r"\[run.ts\]: count is missing.*'cuont' is there instead"
     yield "count", "count = 11", "count = 11.5", r"\[run.ts\]: count must be a whole number > 0, but 11.5"
     yield "no end", "t1 = 0.5\n", "", "needs t1"
     yield "zipped", "k = [50, 80, 120]", "k = 50", r"\[over.pair\]: k must be a list"
@@ -227,7 +257,7 @@ def test_mistakes_in_a_spec_are_named(
     code, _, errors = run_command("sweep", spec(BELT.replace(old, new, 1)), "--dry-run")
     assert code == 2
     (line,) = errors.splitlines()
-    assert pytest.RaisesExc(ValueError, match=text).matches(ValueError(line)), line
+    assert re.search(text, line), line
 
 
 def each_mistake_with_a_file() -> Iterator[tuple[str, str, str, str]]:
@@ -249,7 +279,7 @@ def test_mistakes_with_a_file_are_named(
     (tmp_path / "broken.py").write_text("1 / 0")
     code, _, errors = run_command("sweep", spec(ROOT.replace(old, new, 1)), "--dry-run")
     assert code == 2
-    assert pytest.RaisesExc(ValueError, match=text).matches(ValueError(errors)), errors
+    assert re.search(text, errors), errors
 
 
 def test_mistakes_in_the_command_line(run_command: Command, spec: Callable[[str], str], tmp_path: Path) -> None:

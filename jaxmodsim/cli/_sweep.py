@@ -1,5 +1,7 @@
 """`jaxmodsim sweep`: many runs by a SPEC, into a store."""
 
+import logging
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -11,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from jaxmodsim import sweep
+from jaxmodsim import sweep, tune_cpu
 
 from ..plot import map2d
 from ..sweeps import Outline, SweepProgress, outline, progress_bar
@@ -60,10 +62,12 @@ def _check(request: SweepRequest) -> None:
 
 def _run(request: SweepRequest, spec: Spec) -> None:
     arguments: dict[str, Any] = {"chunk": request.chunk, **spec.run}
+    drawn = ""
     if request.dry_run or request.figure is not None:
         laid = outline(spec.system, spec.over, spec.observe, **arguments)
+        drawn = next(iter(laid.variables))
         if request.figure is not None:
-            _check_figure(spec, laid)
+            _check_figure(spec, laid, drawn)
         if request.dry_run:
             _show_outline(laid)
             return
@@ -96,14 +100,13 @@ def _run(request: SweepRequest, spec: Spec) -> None:
             ) from None
     _show_summary(found, seen, time.perf_counter() - started, request.out)
     if request.figure is not None:
-        name = next(iter(found.data_vars))
-        figure = map2d(found, str(name), title=request.spec.stem)
+        figure = map2d(found, drawn, title=request.spec.stem)
         show_paths(write(request.figure.parent, {request.figure.name: figure}))
 
 
-def _check_figure(spec: Spec, laid: Outline) -> None:
+def _check_figure(spec: Spec, laid: Outline, name: str) -> None:
     """Refuse what cannot be drawn before hours are spent on it."""
-    name, (dims, _) = next(iter(laid.variables.items()))
+    dims, _ = laid.variables[name]
     if len(dims) != 2 or len(laid.dims) != 2:
         raise ValueError(f"--figure needs a first variable over two dimensions, but {name!r} has {', '.join(dims)}.")
     for dim, swept in laid.swept.items():
@@ -136,8 +139,15 @@ def _executor(request: SweepRequest) -> Iterator[Any]:
         with client:
             yield client
         return
-    options: dict[str, Any] = {"n_workers": request.workers, "threads_per_worker": 1, "dashboard_address": None}
-    with LocalCluster(**options) as cluster, Client(cluster) as client:
+    # Ctrl-C reaches every process of the terminal; it is this one that ends the others, and what ends late is killed.
+    options: dict[str, Any] = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.ERROR}
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        cluster = LocalCluster(n_workers=request.workers, **options)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    with cluster, Client(cluster) as client:
+        client.run(tune_cpu)  # as in this process
         yield client
 
 

@@ -75,7 +75,10 @@ class Table:
         words = " or ".join(kind.words for kind in kinds)
         if key not in self._content:
             if needed:
-                raise self.refusal(f"{key} is missing; it must be {words}.")
+                left = [name for name in self._content if name not in self._taken]
+                misspelt = difflib.get_close_matches(key, left, n=1)
+                hint = f" {misspelt[0]!r} is there instead." if misspelt else ""
+                raise self.refusal(f"{key} is missing; it must be {words}.{hint}")
             return None
         value = self._content[key]
         if not any(kind.fits(value) for kind in kinds):
