@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from jaxmodsim import Armstrong, Coulomb, Dahl, ElastoPlastic, LuGre, MaxwellSlip, Regularized, Stribeck
@@ -128,7 +128,14 @@ def test_dissipation_bound_and_symmetry_over_the_parameter_space(name: str, dtyp
         for i in np.flatnonzero(bad)[:1]:
             pytest.fail(f"{drawn[i]} gives { ({key: float(x[i]) for key, x in found.items()}) }")
 
-    @settings(max_examples=10, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+    # Not shrunk: that takes minutes for so many numbers, and the message has the few that matter.
+    @settings(
+        max_examples=10,
+        deadline=None,
+        derandomize=True,
+        phases=[Phase.generate],
+        suppress_health_check=[HealthCheck.too_slow],
+    )
     @given(draws)
     def check(drawn: list[Draw]) -> None:
         found = {key: np.asarray(x) for key, x in look(name, jnp.asarray(drawn, dtype)).items()}
