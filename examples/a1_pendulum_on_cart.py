@@ -56,8 +56,8 @@ def main(out: Path, smoke: bool = False) -> None:
     def place(scene):
         return jms.simulate(scene, [0.0, 0.0], [0.0, 0.0], t1).q[-1, 0]
 
-    gradient = jax.grad(place)(scene)
-    print(f"The cart ends at {1e3 * place(scene):.2f} mm; by the rail's Fc that changes")
+    end, gradient = jax.value_and_grad(place)(scene)
+    print(f"The cart ends at {1e3 * end:.2f} mm; by the rail's Fc that changes")
     print(f"by {1e3 * float(gradient.effects[1].law.law.Fc):.1f} mm/N.")
 
     figure = Figure(figsize=(11, 5.5), layout="constrained")

@@ -2,10 +2,13 @@ import io
 import os
 import sys
 from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any
 
 import jax
 import jaxlib.version
 import pytest
+from xdist.scheduler import LoadScopeScheduling
 
 # Nearly all of the time goes into tracing and compiling. XLA's older way to emit fused loops, straight as LLVM code,
 # compiles in 60 % of the time. XLA ends the process over an option that it does not know: only where it was tried.
@@ -17,6 +20,22 @@ if jaxlib.version.__version_info__[:2] == (0, 10) and _OPTION not in _FLAGS:
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+# Tests of a module share what they have compiled and computed, so a module stays in one process. Those of these modules
+# share nothing: they are given out one by one, and last, which keeps all processes busy to the end.
+_APART = {"test_belt", "test_constraints", "test_contact", "test_gauss", "test_implicit_friction", "test_stick_slip"}
+
+
+class ByModule(LoadScopeScheduling):
+    def _split_scope(self, nodeid: str) -> str:
+        module = nodeid.split("::")[0]
+        return nodeid if Path(module).stem in _APART else module
+
+
+@pytest.hookimpl(optionalhook=True)  # there is no such hook without processes
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> ByModule:
+    return ByModule(config, log)
 
 
 @pytest.fixture(scope="module")

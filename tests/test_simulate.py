@@ -343,7 +343,9 @@ def test_gradients_under_vmap_are_right_in_lanes_that_finish_early(ts: Any) -> N
         return run.q[-1, 0]
 
     masses = jnp.array([1.0, 3.0, 2.0])
-    together = jax.jit(jax.vmap(jax.grad(position)))(masses)
-    alone = jax.jit(jax.grad(position))
+    gradients = jax.jit(jax.vmap(jax.grad(position)))
+    together = gradients(masses)
+    # By the program for one lane; with times, whose derivatives are the same there, by lanes that are all alike.
+    alone = jax.jit(jax.grad(position)) if ts is None else lambda m: gradients(jnp.full(3, m))[0]
     # Lanes of one batch take the same steps as alone, so only rounding differs.
     np.testing.assert_allclose(together, [alone(m) for m in masses], rtol=1e-8)

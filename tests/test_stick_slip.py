@@ -21,13 +21,10 @@ TIGHT: dict[str, Any] = {"rtol": 1e-12, "atol": 1e-14, "max_events": 16}
 
 def box(x: Any) -> Any:
     """The first event, to be differentiated by the numbers of the run, and the run."""
-
-    def simulate(x: Any, **options: Any) -> jms.Trajectory:
-        law, ramp = x
-        return jms.simulate(problems.ramped_box(law, ramp=ramp), [0.0], [0.0], 3.0, throw=False, **TIGHT, **options)
-
-    events = simulate(x, adjoint=dfx.ForwardMode()).events
-    run = simulate(jax.lax.stop_gradient(x), ts=jnp.linspace(0.0, 3.0, 32), adjoint=dfx.ForwardMode())
+    law, ramp = x
+    arguments: dict[str, Any] = {"ts": jnp.linspace(0.0, 3.0, 32), "adjoint": dfx.ForwardMode(), **TIGHT}
+    run = jms.simulate(problems.ramped_box(law, ramp=ramp), [0.0], [0.0], 3.0, throw=False, **arguments)
+    events = run.events
     seen = run.t, run.q[:, 0], run.qd[:, 0], run.mode["friction"], run.forces, events, run.stats["num_events"]
     return events.t[0], seen
 
