@@ -65,6 +65,7 @@ def test_a_store_holds_what_memory_would(whole: Path) -> None:
     assert stored["power"].dims == ("a", "b")
     assert stored["result"].attrs["flag_meanings"] == kept["result"].attrs["flag_meanings"]
     assert stored.attrs["system"] == "curve"
+    assert list(store(whole).data_vars) == ["power", "waves", "num_steps", "result"]
 
 
 def test_an_interrupted_sweep_goes_on(whole: Path, tmp_path: Path) -> None:

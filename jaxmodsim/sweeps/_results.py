@@ -109,12 +109,8 @@ class Store(AbstractResults):
 
     def dataset(self) -> "xr.Dataset":
         """All results, read when they are asked for."""
-        return open_store(self._path)
-
-
-def open_store(path: Path) -> "xr.Dataset":
-    """A store as a dataset whose values are read when they are asked for."""
-    return extra("xarray").open_zarr(path, consolidated=False, chunks=None)
+        found = extra("xarray").open_zarr(self._path, consolidated=False, chunks=None)
+        return found[[x.name for x in self._layout.variables]]  # a store keeps no order
 
 
 def parts(layout: Layout, blocks: Blocks, block: int, computed: Computed) -> Iterator[tuple[str, np.ndarray]]:
