@@ -15,10 +15,12 @@ import os
 import random
 import resource
 import signal
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,7 @@ import numpy as np
 from _lugre import ATOL, PARAMETERS, T1, Peer, error_ladder, parameter_sets, peers, reference_solution
 from _measure import describe_machine, machine_line, measure, scaled, write_json
 from _options import begin
+from _workload import numpy_workload_s
 
 import jaxmodsim as jms
 from jaxmodsim.problems import box_lugre, ramped_box
@@ -67,14 +70,20 @@ def _loosest(peer: Peer, reference: np.ndarray) -> float:
     return next(row["rtol"] for row in error_ladder(peer, reference, LADDER) if row.get("v_run", np.inf) <= GOAL)
 
 
+@cache
+def testbench() -> jms.Scene:
+    """The scene: made once, and not before JAX has its settings."""
+    return ramped_box(box_lugre())
+
+
 def run_sweep(sets: np.ndarray, rtol: float | np.ndarray, **options: Any) -> Any:
     """The sets of parameters, run by `sweep`, with one tolerance for all or one for each."""
     over = {f"friction.{name}": sets[:, i] for i, name in enumerate(PARAMETERS)}
     tolerance = {"rtol": rtol, "atol": ATOL * rtol}
     start: dict[str, Any] = {"q0": [0.0], "qd0": [0.0], "t1": T1}
     if np.ndim(rtol) == 0:
-        return jms.sweep(ramped_box(box_lugre()), {"set": over}, OBSERVE, **(start | tolerance | options))
-    return jms.sweep(ramped_box(box_lugre()), {"set": over | tolerance}, OBSERVE, **(start | options))
+        return jms.sweep(testbench(), {"set": over}, OBSERVE, **(start | tolerance | options))
+    return jms.sweep(testbench(), {"set": over | tolerance}, OBSERVE, **(start | options))
 
 
 def cvodes_velocities(rtol: float, sets: np.ndarray) -> np.ndarray:
@@ -123,7 +132,19 @@ def _cores(rtol: float, count: int, rounds: int) -> dict[str, Any]:
             "all cores, into a store": lambda: run_sweep(sets, rtol, out=Path(folder) / str(next(fresh))),
         }
         report = {name: scaled(row, count) for name, row in measure(calls, rounds, limit_s=120.0).items()}
-    return report | {"scaling": report["one core"]["median_s"] / report["all cores"]["median_s"]}
+    scaling = report["one core"]["median_s"] / report["all cores"]["median_s"]
+    return report | {"scaling": scaling, "scaling_of_the_machine": _scaling_of_the_machine()}
+
+
+def _scaling_of_the_machine() -> float:
+    """What processes that share nothing gain from all cores: on shared machines less than the number of them."""
+    cores, found = os.cpu_count() or 1, []
+    with cf.ProcessPoolExecutor(cores, multiprocessing.get_context("spawn")) as pool:
+        list(pool.map(numpy_workload_s, [1] * cores))
+        for _ in range(5):
+            one = pool.submit(numpy_workload_s).result()
+            found.append(cores * one / statistics.mean(pool.map(numpy_workload_s, [25] * cores)))
+    return statistics.median(found)
 
 
 def _spread(rtol: float, count: int, rounds: int) -> dict[str, Any]:
@@ -134,7 +155,7 @@ def _spread(rtol: float, count: int, rounds: int) -> dict[str, Any]:
     start: dict[str, Any] = {"q0": [0.0], "qd0": [0.0], "t1": T1, "rtol": rtol, "atol": ATOL * rtol}
 
     def run() -> Any:
-        return jms.sweep(ramped_box(box_lugre()), {"set": sets}, OBSERVE, **start)
+        return jms.sweep(testbench(), {"set": sets}, OBSERVE, **start)
 
     def lane(values: Any) -> Any:
         scene = ramped_box(box_lugre(**{name.split(".")[1]: x for name, x in values.items()}))
@@ -236,6 +257,7 @@ def _target_table(content: dict[str, Any]) -> dict[str, Any]:
         ("against our own solver under plain `vmap`", "", against(f"{OURS}, plain"), None),
         (f"the same, runs of {spread['steps'][0]} to {spread['steps'][-1]} steps", "", plain, None),
         ("one core, to all cores", ">= 1.7", cores["scaling"], 1.7),
+        ("the same of processes of NumPy that share nothing", "", cores["scaling_of_the_machine"], None),
         ("into a store, to in memory", "", store, None),
         ("one lane of 10 000 that never ends, to none", "< 2", bad["ratio"], -2.0),
         (f"{million['runs']:,} runs into a store: runs per second", "", million["runs"] / million["seconds"], None),

@@ -9,6 +9,8 @@ from ._compute import Work, compute, lanes_of_call
 from ._grid import Grid
 from ._lane import CAP, out_of_steps
 
+# Part of all lanes that the trial takes at most.
+_SHARE = 16
 # By what the number of steps grows that lanes may take before they are set aside.
 _GROWTH = 8
 # Sweeps of fewer lanes are run without a look ahead.
@@ -17,6 +19,8 @@ _SMALL = 1024
 _LATE = 0.05
 # Lanes of the trial for each coefficient of the prediction.
 _PER_COEFFICIENT = 4
+# Part of the trace that is added to the normal equations, which may be singular.
+_RIDGE = 1e-10
 # Ratio of the largest to the smallest of values that are all positive from which their logarithm counts.
 _WIDE = 5.0
 
@@ -39,7 +43,8 @@ class Prediction:
     def order(self, numbers: dict[str, np.ndarray]) -> np.ndarray:
         """The lanes, those of the fewest steps first."""
         x = (_columns(numbers, self.names, self.logs) - self.centre) / self.scale
-        return np.argsort(_products(x, self.degree) @ self.coefficients, kind="stable")
+        steps = np.einsum("nk,k->n", _products(x, self.degree), self.coefficients)
+        return np.argsort(steps, kind="stable")
 
 
 def plan(work: Work, grid: Grid, lanes: int) -> tuple[Work, Prediction | None]:
@@ -54,7 +59,7 @@ def plan(work: Work, grid: Grid, lanes: int) -> tuple[Work, Prediction | None]:
     cap = min(CAP, limit)
     if grid.size < _SMALL:
         return replace(work, cap=cap), None
-    count = min(lanes_of_call(lanes, work.group), grid.size)
+    count = min(lanes_of_call(lanes, work.group), grid.size // _SHARE)
     drawn = np.unique(np.random.default_rng(0).integers(grid.size, size=count))
     numbers = grid.lanes(drawn)
     while True:
@@ -73,7 +78,11 @@ def _prediction(numbers: dict[str, np.ndarray], steps: np.ndarray) -> Prediction
     centre, scale = x.mean(axis=0), np.where(np.ptp(x, axis=0) > 0, np.ptp(x, axis=0), 1.0)
     x = (x - centre) / scale
     degree = max(d for d in (0, 1, 2, 3) if comb(x.shape[1] + d, d) * _PER_COEFFICIENT <= steps.size)
-    coefficients = np.linalg.lstsq(_products(x, degree), np.log(np.maximum(steps, 1)), rcond=None)[0]
+    products = _products(x, degree)
+    # Sums by einsum: threads of a BLAS go on spinning when their work is done, and take the cores from the lanes.
+    square = np.einsum("ni,nj->ij", products, products)
+    square += _RIDGE * np.trace(square) * np.eye(square.shape[0])
+    coefficients = np.linalg.solve(square, np.einsum("ni,n->i", products, np.log(np.maximum(steps, 1))))
     return Prediction(names, logs, centre, scale, degree, coefficients)
 
 

@@ -2,7 +2,7 @@
 
 import difflib
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,7 @@ from ..scene import Scene, elements, scene_numbers, scene_ranges
 from ..simulation import prepare, simulate
 from ._compute import shapes
 from ._grid import Axis, Grid
-from ._lane import AbstractLane, Found, FunctionLane, SceneLane, number_of
+from ._lane import AbstractLane, Found, FunctionLane, SceneLane
 from ._observe import Derivative, Observation, observations
 
 # Arguments of `simulate` that are numbers. All others are compiled in.
@@ -87,27 +87,48 @@ def _of_scene(scene: Scene, grid: Grid, observe: Any, arguments: dict[str, Any])
         if name in arguments and name in swept:
             raise ValueError(f"{name} is given, and {name!r} is in over: leave one of them out.")
     numbers, dtype = _fixed(scene, arguments, swept)
-    _check_names(scene, numbers, swept)
+    inside, outside = _inside(scene), _outside(numbers)
+    _check_names(inside, outside, swept)
     lane = SceneLane(observations(observe), _choices(arguments))
     for what in lane.observe:
         if isinstance(what.of, Derivative):
-            _check_names(scene, numbers, dict.fromkeys(what.of.names), f"observe[{what.name!r}]")
+            _check_names(inside, outside, what.of.names, f"observe[{what.name!r}]")
+
+    def convert(name: str, values: np.ndarray) -> np.ndarray:
+        """Values in the type of the number they replace, if they have its shape."""
+        shape = inside[name][0] if name in inside else outside[name]
+        if values.shape[1:] != shape:
+            raise ValueError(
+                f"{name!r} in over must have the shape [{', '.join(['n', *map(str, shape)])}], as the number has the"
+                f" shape {shape}, but it has {values.shape}."
+            )
+        return values.astype(inside[name][1] if name in inside else dtype)
+
     converted = Grid(
-        tuple(
-            Axis(axis.name, {name: _converted(scene, numbers, name, x, dtype) for name, x in axis.values.items()})
-            for axis in grid.axes
-        )
+        tuple(Axis(a.name, {name: convert(name, x) for name, x in a.values.items()}) for a in grid.axes),
     )
     # Let `simulate` look at the arguments of the first lane while their values are known.
     given = numbers | {name: value for name, value in converted.first.items() if name in numbers}
     prepare(scene, **given, **dict(lane.choices))
-    ranges, known = scene_ranges(scene), elements(scene)
-    units = dict(_UNITS)
+    ranges, units = scene_ranges(scene), dict(_UNITS)
     for name in swept:
-        leaf = known[name][0] if name in known else name
+        leaf = inside[name][2] if name in inside else name
         if leaf in ranges and ranges[leaf].unit:
             units[name] = ranges[leaf].unit
     return Request(lane, (scene, numbers), converted, shapes(lane, (scene, numbers), converted.first), units)
+
+
+def _inside(scene: Scene) -> dict[str, tuple[tuple[int, ...], Any, str]]:
+    """Shape, type and array of each number of a scene, arrays and their single entries alike, by name."""
+    leaves = scene_numbers(scene)
+    single = {name: ((), leaves[leaf].dtype, leaf) for name, (leaf, _) in elements(scene).items()}
+    return single | {name: (leaf.shape, leaf.dtype, name) for name, leaf in leaves.items()}
+
+
+def _outside(numbers: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+    """Shape of each argument of `simulate` that may be swept, vectors and their entries alike, by name."""
+    known = {name: np.shape(numbers[name]) for name in _SWEPT if name in numbers}
+    return known | {f"{name}[{i}]": () for name in ("q0", "qd0") for i in range(np.size(numbers[name]))}
 
 
 def _fixed(scene: Scene, arguments: dict[str, Any], swept: Mapping[str, np.ndarray]) -> tuple[dict[str, Any], Any]:
@@ -134,11 +155,10 @@ def _choices(arguments: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
     return tuple(({"max_steps": _OPTIONS["max_steps"]} | given).items())
 
 
-def _check_names(scene: Scene, numbers: Mapping[str, Any], names: Mapping[str, Any], where: str = "over") -> None:
+def _check_names(
+    inside: Mapping[str, Any], outside: Mapping[str, Any], names: Iterable[str], where: str = "over"
+) -> None:
     """Refuse names of nothing, or of two things."""
-    inside = {*scene_numbers(scene), *elements(scene)}
-    outside = {name for name in _SWEPT if name in numbers}
-    outside |= {f"{name}[{i}]" for name in ("q0", "qd0") for i in range(np.size(numbers[name]))}
     for name in names:
         if name in inside and name in outside:
             raise ValueError(f"{where} names {name!r}, which is a number of the scene and an argument: rename the one.")
@@ -148,14 +168,3 @@ def _check_names(scene: Scene, numbers: Mapping[str, Any], names: Mapping[str, A
             hint = f" Did you mean {near[0]!r}?" if near else ""
             extra = " Give a value of dt or dtmax to sweep it." if name in ("dt", "dtmax") else ""
             raise ValueError(f"{where} names {name!r}, but the numbers are: {', '.join(known)}.{hint}{extra}")
-
-
-def _converted(scene: Scene, numbers: Mapping[str, Any], name: str, values: np.ndarray, dtype: Any) -> np.ndarray:
-    """Values in the type of the number they replace, if they have its shape."""
-    here = number_of(scene, numbers, name)
-    if values.shape[1:] != here.shape:
-        raise ValueError(
-            f"{name!r} in over must have the shape [{', '.join(['n', *map(str, here.shape)])}], as the number has the"
-            f" shape {here.shape}, but it has {values.shape}."
-        )
-    return values.astype(here.dtype if name in scene_numbers(scene) else dtype)
