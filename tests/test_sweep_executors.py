@@ -48,8 +48,18 @@ def test_two_devices(found: xr.Dataset, tmp_path: Path) -> None:
         "import jax; jax.config.update('jax_enable_x64', True)\n"
         "from tests.test_sweep_executors import box_sweep\n"
         "assert jax.local_device_count() == 2\n"
+        "import jaxmodsim.sweeps._compute as compute\n"
+        "call, places = compute._call, set()\n"
+        "def watched(lane, fixed, numbers):\n"
+        "    found = call(lane, fixed, numbers)\n"
+        "    places.update(found.code.devices())\n"
+        "    return found\n"
+        "compute._call = watched\n"
         f"found = box_sweep(out={str(tmp_path / 'two.zarr')!r})\n"
+        "assert places == set(jax.devices()), places\n"
+        "places.clear()\n"
         f"other = box_sweep(out={str(tmp_path / 'second.zarr')!r}, devices=jax.devices()[1:])\n"
+        "assert places == {jax.devices()[1]}, places\n"
     )
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
     subprocess.run([sys.executable, "-c", script], check=True, env=os.environ | {"XLA_FLAGS": flags})

@@ -34,7 +34,9 @@ def in_threads(work: Work, tasks: Iterable[Task], devices: list[Any]) -> Iterato
     A compiled loop over small states uses one core, and lets other threads run.
     """
     each = cores() if len(devices) == 1 and devices[0].platform == "cpu" else 1
-    places = [device if len(devices) > 1 else None for device in devices for _ in range(each)]
+    # Numbers that are not sent anywhere go to the first device, which is cheaper.
+    sent = devices != jax.local_devices()[:1]
+    places = [device if sent else None for device in devices for _ in range(each)]
     free = list(places)
 
     def run(task: Task) -> tuple[int, Computed]:

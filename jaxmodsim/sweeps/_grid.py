@@ -79,6 +79,8 @@ def grid(over: Any) -> Grid:
         for name in {axis.name, *axis.values}:
             if name in seen:
                 raise ValueError(f"over names {name!r} twice.")
+            if "/" in name:
+                raise ValueError(f"over needs names without a slash, which parts of a store have, but has {name!r}.")
             if name in RESERVED:
                 raise ValueError(f"over cannot have the name {name!r}: every result has a variable of that name.")
             seen.add(name)

@@ -85,10 +85,10 @@ def _observation(name: Any, given: Any) -> Observation:
     unit = None
     if isinstance(given, tuple) and len(given) == 2 and isinstance(given[1], str):
         given, unit = given
-    if not isinstance(name, str) or name in RESERVED:
-        raise ValueError(
-            f"observe cannot have the name {name!r}" + (": every result has it." if name in RESERVED else ".")
-        )
+    if not isinstance(name, str) or "/" in name:
+        raise ValueError(f"observe needs names without a slash, which parts of a store have, but {name!r} was given.")
+    if name in RESERVED:
+        raise ValueError(f"observe cannot have the name {name!r}: every result has it.")
     if not (isinstance(given, str | Derivative) or callable(given)):
         raise ValueError(
             f"observe[{name!r}] must be a function of the run, a name such as 'q[0]', or one of these with its unit, as"

@@ -107,6 +107,7 @@ def _of_scene(scene: Scene, grid: Grid, observe: Any, arguments: dict[str, Any])
     converted = Grid(
         tuple(Axis(a.name, {name: convert(name, x) for name, x in a.values.items()}) for a in grid.axes),
     )
+    _check_lanes(converted, numbers)
     # Let `simulate` look at the arguments of the first lane while their values are known.
     given = numbers | {name: value for name, value in converted.first.items() if name in numbers}
     prepare(scene, **given, **dict(lane.choices))
@@ -116,6 +117,27 @@ def _of_scene(scene: Scene, grid: Grid, observe: Any, arguments: dict[str, Any])
         if leaf in ranges and ranges[leaf].unit:
             units[name] = ranges[leaf].unit
     return Request(lane, (scene, numbers), converted, shapes(lane, (scene, numbers), converted.first), units)
+
+
+def _check_lanes(grid: Grid, numbers: Mapping[str, Any]) -> None:
+    """Refuse tolerances, steps and times that no lane can run with: compiled code would end all of them over one."""
+    swept = grid.values
+    for names, least in ((("rtol", "atol"), "not be negative"), (("dt", "dtmax"), "be positive")):
+        for name in names:
+            if name in swept and not (swept[name] >= 0 if "not" in least else swept[name] > 0).all():
+                raise ValueError(f"{name!r} in over must {least}, but there is {swept[name].min():g}.")
+    if "t0" not in swept and "t1" not in swept:
+        return
+    t0, t1 = (np.atleast_1d(swept[name] if name in swept else numbers[name]) for name in ("t0", "t1"))
+    together = any({"t0", "t1"} <= set(axis.values) for axis in grid.axes)
+    if (t1 - t0 if together else t1.min() - t0.max()).min() < 0:
+        raise ValueError("t1 must not be before t0 in any lane; numbers that go together share one dimension of over.")
+    ts = numbers.get("ts")
+    if ts is not None and not (t0.max() <= ts[0] and ts[-1] <= t1.min()):
+        raise ValueError(
+            f"ts must lie within [t0, t1] of every lane, from {t0.max():g} to {t1.min():g}, but runs from {ts[0]:g} to"
+            f" {ts[-1]:g}. Observe the motion at the end, or times as a part of t1 inside a function."
+        )
 
 
 def _inside(scene: Scene) -> dict[str, tuple[tuple[int, ...], Any, str]]:
