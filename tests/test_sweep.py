@@ -64,8 +64,9 @@ def test_dimensions_units_and_origin(found: xr.Dataset) -> None:
     assert origin["numbers"]["friction.Fc"] == 1.5
     assert "friction.sigma0" not in origin["numbers"]
     assert origin["versions"]["jax"] == jax.__version__
-    assert origin["arguments"]["['rtol']"] == 1e-6
+    assert origin["arguments"]["rtol"] == 1e-6
     assert "LuGre" in found.attrs["system"]
+    assert "Rodas5P" in found.attrs["solver"]
 
 
 @pytest.mark.parametrize("chunk", [1000, 14, 5])

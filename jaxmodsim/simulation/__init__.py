@@ -7,6 +7,7 @@ from ._outcome import Outcome as Outcome
 from ._outcome import SimulationError as SimulationError
 from ._simulate import prepare as prepare
 from ._simulate import simulate as simulate
+from ._solve import default_solver as default_solver
 from ._trajectory import Energy as Energy
 from ._trajectory import Events as Events
 from ._trajectory import Trajectory as Trajectory

@@ -12,6 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from ..scene import scene_numbers
+from ..simulation import default_solver
 from ._compute import Work, program
 from ._request import Request
 
@@ -30,7 +31,7 @@ def provenance(request: Request, work: Work, extent: tuple[int, ...]) -> dict[st
         "over": {name: f"{x.shape} {x.dtype} {_digest(x)}" for name, x in swept.items()},
         "numbers": {name: _value(x) for name, x in numbers.items() if name not in swept},
         "arguments": {
-            jtu.keystr(path): _value(x)
+            jtu.keystr(path, simple=True, separator="."): _value(x)
             for name, value in sorted(arguments.items())
             if name not in swept
             for path, x in jtu.tree_leaves_with_path({name: value})
@@ -59,6 +60,15 @@ def describe(request: Request) -> str:
             for name, effect in zip(scene.names, scene.effects, strict=True)
         )
     return _called(getattr(request.lane, "function", None))
+
+
+def solver_of(request: Request) -> str:
+    """The solver that runs a scene, given or chosen for it; "" where a function chooses its own."""
+    if not request.fixed:
+        return ""
+    scene, arguments = request.fixed
+    chosen = dict(getattr(request.lane, "choices", ())).get("solver")
+    return repr(default_solver(scene, np.size(arguments["q0"]), "dt" in arguments) if chosen is None else chosen)
 
 
 def commit() -> str:

@@ -20,7 +20,7 @@ from ._grid import Blocks, blocks, grid
 from ._layout import layout
 from ._plan import Prediction, plan
 from ._progress import Progress, SweepProgress, reporter
-from ._provenance import commit, describe, provenance, versions
+from ._provenance import commit, describe, provenance, solver_of, versions
 from ._request import Request, request
 from ._results import AbstractResults, Memory, Store
 
@@ -153,6 +153,7 @@ def _results(asked: Request, work: Work, cut: Blocks, out: Any) -> AbstractResul
     laid = layout(asked)
     attrs = {
         "system": describe(asked),
+        "solver": solver_of(asked),
         "made_by": f"jaxmodsim {versions()['jaxmodsim']}",
         "commit": commit(),
     }
