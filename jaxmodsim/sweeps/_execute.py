@@ -70,11 +70,10 @@ def elsewhere(work: Work, tasks: Iterable[Task], executor: Any) -> Iterator[tupl
             "executor must be a dask.distributed.Client or a concurrent.futures.Executor, but a"
             f" {type(executor).__name__} was given."
         )
-    # Sent to each worker once, and not with every block.
-    common = executor.scatter(packed, broadcast=True, hash=False)
+    # Sent with every block: what is scattered to the workers is gone with the last one that holds it.
     with executor.get_executor(pure=False) as pool:
         workers = sum(executor.nthreads().values()) or _UNKNOWN_WORKERS
-        yield from _as_completed(lambda task: pool.submit(run_packed, key, common, task), tasks, _AHEAD * workers)
+        yield from _as_completed(lambda task: pool.submit(run_packed, key, packed, task), tasks, _AHEAD * workers)
 
 
 def run_packed(key: str, packed: bytes, task: Task) -> tuple[int, Computed]:
