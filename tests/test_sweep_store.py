@@ -59,7 +59,6 @@ def stop_after(lanes: int) -> Any:
     return stop
 
 
-@pytest.mark.quick
 def test_a_store_holds_what_memory_would(whole: Path) -> None:
     stored, kept = xr.open_zarr(whole, consolidated=False), jms.sweep(curve, OVER)
     xr.testing.assert_equal(stored.drop_attrs().load(), kept.drop_attrs())
