@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import diffrax as dfx
@@ -12,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..numerics import signals_of
 from ..scene import Scene, elements, read_element, replace_elements, scene_numbers, scene_ranges
-from ..simulation import Trajectory, named_observable, simulate
+from ..simulation import Trajectory, named_series, named_unit, simulate
 
 _MODES = ("forward", "reverse")
 
@@ -135,7 +136,7 @@ def sensitivity(
     run = simulate(scene, q0, qd0, t1, ts=ts, **options)
     if run.modes is not None:  # a traced run would hold room for all events that are allowed
         options["max_events"] = run.log_size
-    observe, label, unit = _observable(observable, run)
+    observe, label, unit = _observable(observable)
     y = _observed(observe(run))
     if mode is None:
         forward, reverse = _FORWARD + _PER_PARAMETER * len(values), _REVERSE + _PER_OUTPUT * y.size
@@ -197,11 +198,10 @@ def _replaced(scene: Scene, start: dict[str, Any], x: Mapping[str, Array]) -> tu
     return replace_elements(scene, {name: value for name, value in x.items() if name in known}), start
 
 
-def _observable(observable: Any, run: Trajectory) -> tuple[Callable[[Trajectory], Any], str, str]:
+def _observable(observable: Any) -> tuple[Callable[[Trajectory], Any], str, str]:
     """What is observed, its label and its unit."""
     if isinstance(observable, str):
-        function, unit = named_observable(observable, run)
-        return function, observable, unit
+        return partial(named_series, name=observable), observable, named_unit(observable)
     if not callable(observable):
         raise ValueError(
             "observable must be a function of the Trajectory, as in lambda run: run.q[:, 0], or a name such as"

@@ -1,6 +1,5 @@
 """What `jaxmodsim fit` was asked for: as it was typed, and checked."""
 
-import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from ..identify import (
     rough_axis,
     start_state,
 )
+from ..numerics import nearest
 from ..scene import scene_numbers
 from ._read import AxisColumns, read_records
 
@@ -180,8 +180,8 @@ def _known(option: str, name: str, known: Iterable[str], noun: str = "name", lis
     known = tuple(known)
     if name in known or listed in known:
         return name
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f" Did you mean {near[0]}?" if near else ""
+    near = nearest(name, known)
+    hint = f" Did you mean {near}?" if near else ""
     raise ValueError(f"{option}: there is no {noun} {name!r}; the {noun}s are: {', '.join(known)}.{hint}")
 
 

@@ -1,6 +1,5 @@
 """Records from files: CSV, Parquet, MATLAB."""
 
-import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import pandas as pd
 import scipy.io
 
 from ..identify import Record
+from ..numerics import nearest
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ def read_record(path: Path, columns: AxisColumns, name: str | None = None) -> Re
 
 def _column(table: Mapping[str, Any], path: Path, option: str, name: str) -> np.ndarray:
     if name not in table:
-        near = difflib.get_close_matches(name, list(table), n=1)
-        hint = f" Did you mean --{option} {near[0]}?" if near else ""
+        near = nearest(name, table)
+        hint = f" Did you mean --{option} {near}?" if near else ""
         raise ValueError(
             f"{path.name} has no column {name!r} (--{option}); it has: {', '.join(table) or 'none'}.{hint}"
         )

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..scene import Scene
-from ..simulation import Trajectory, named_observable
+from ..simulation import Trajectory, named_series
 from ..sweeps import latin_hypercube, sobol
 from ._spec_scene import read_system
 from ._table import LIST, NUMBER, NUMBERS, SEED, SWITCH, TABLE, TEXT, WHOLE, Kind, Table, one_of, read_table
@@ -140,7 +140,7 @@ class Reduced:
 
     def __call__(self, run: Trajectory) -> Array:
         """The number."""
-        x, t = named_observable(self.of, run)[0](run), run.t
+        x, t = named_series(run, self.of), run.t
         if self.take == "end":
             return x[-1]
         if self.take in ("mean", "rms"):

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from .. import friction, problems
+from ..numerics import did_you_mean
 from ..scene import Scene
-from ._table import TEXT, VALUES, WHOLE, Table, near
+from ._table import TEXT, VALUES, WHOLE, Table
 
 # Under which the file of a SPEC is known as a module.
 MODEL = "jaxmodsim_model"
@@ -65,7 +66,9 @@ def read_system(table: Table, folder: Path) -> Scene | Callable[..., Any]:
 
 def _check_known(table: Table, key: str, name: str, known: dict[str, Any]) -> None:
     if name not in known:
-        raise table.refusal(f"{key} must be one of {', '.join(known)}, but {name!r} was given.{near(name, known)}")
+        raise table.refusal(
+            f"{key} must be one of {', '.join(known)}, but {name!r} was given.{did_you_mean(name, known)}"
+        )
 
 
 def _made(table: Table, maker: Callable[..., Any]) -> Any:
@@ -121,6 +124,6 @@ def _from_file(table: Table, path: Path, name: str) -> Scene | Callable[..., Any
         there = f"it defines {', '.join(objects)}" if objects else "it defines neither"
         raise table.refusal(
             f"object must be a Scene or a function of {path.name}, but {name!r} was given, and {there}."
-            f"{near(name, objects)}"
+            f"{did_you_mean(name, objects)}"
         )
     return objects[name]

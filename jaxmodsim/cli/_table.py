@@ -1,12 +1,13 @@
 """Tables of a TOML file, with keys that are checked."""
 
-import difflib
 import math
 import tomllib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from ..numerics import did_you_mean, nearest
 
 
 @dataclass(frozen=True)
@@ -36,12 +37,6 @@ def one_of(words: Iterable[str]) -> Kind:
     """One of these words."""
     known = tuple(words)
     return Kind(f"one of {', '.join(known)}", lambda x: isinstance(x, str) and x in known)
-
-
-def near(name: str, known: Iterable[str]) -> str:
-    """A question whether the nearest of the known names was meant; nothing where none is near."""
-    found = difflib.get_close_matches(name, list(known), n=1)
-    return f" Did you mean {found[0]!r}?" if found else ""
 
 
 class Table:
@@ -76,13 +71,13 @@ class Table:
         if key not in self._content:
             if needed:
                 left = [name for name in self._content if name not in self._taken]
-                misspelt = difflib.get_close_matches(key, left, n=1)
-                hint = f" {misspelt[0]!r} is there instead." if misspelt else ""
+                misspelt = nearest(key, left)
+                hint = f" {misspelt!r} is there instead." if misspelt else ""
                 raise self.refusal(f"{key} is missing; it must be {words}.{hint}")
             return None
         value = self._content[key]
         if not any(kind.fits(value) for kind in kinds):
-            hint = near(value, words.replace(",", "").split()) if isinstance(value, str) else ""
+            hint = did_you_mean(value, words.replace(",", "").split()) if isinstance(value, str) else ""
             raise self.refusal(f"{key} must be {words}, but {value!r} was given.{hint}")
         return value
 
@@ -108,7 +103,7 @@ class Table:
         for key in self._content:
             if key not in known:
                 allowed = f"; there may be {', '.join(known)}." if known else "."
-                raise self.refusal(f"there is no key {key!r}{allowed}{near(key, known)}")
+                raise self.refusal(f"there is no key {key!r}{allowed}{did_you_mean(key, known)}")
 
 
 def read_table(path: Path) -> Table:

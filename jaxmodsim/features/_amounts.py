@@ -3,9 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..simulation import Trajectory
+from ..simulation import Trajectory, named_series, named_unit
 from ._feature import Feature
-from ._names import series, unit_of
 
 
 def peak(of: str) -> Feature:
@@ -26,17 +25,17 @@ def peak(of: str) -> Feature:
 
     - `ValueError` when called, if the run has nothing of that name.
     """
-    return Feature(f"peak |{of}|", unit_of(of), _peak, (of,))
+    return Feature(f"peak |{of}|", named_unit(of), _peak, (of,))
 
 
 def _peak(run: Trajectory, of: str) -> Array:
-    x = series(run, of)
+    x = named_series(run, of)
     peak = jnp.max(jnp.where(jnp.isfinite(run.t), jnp.abs(x), 0.0))
     if of in run.scene.exact:
         sides = jnp.abs(run.event_forces[of])
         return jnp.max(jnp.where(jnp.isnan(sides), 0.0, sides), initial=peak)
     if of.startswith("q[") and run.t.shape[0] > 1:
-        return jnp.maximum(peak, jnp.max(jnp.abs(_turns(run.t, x, series(run, f"qd{of[1:]}")))))
+        return jnp.maximum(peak, jnp.max(jnp.abs(_turns(run.t, x, named_series(run, f"qd{of[1:]}")))))
     return peak
 
 
@@ -65,11 +64,11 @@ def final(of: str) -> Feature:
 
     - `ValueError` when called, if the run has nothing of that name.
     """
-    return Feature(f"final {of}", unit_of(of), _final, (of,))
+    return Feature(f"final {of}", named_unit(of), _final, (of,))
 
 
 def _final(run: Trajectory, of: str) -> Array:
-    return series(run, of)[-1]
+    return named_series(run, of)[-1]
 
 
 def dissipated(effect: str | None = None) -> Feature:

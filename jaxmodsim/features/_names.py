@@ -6,17 +6,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..effects import Friction
 from ..numerics import safe_norm
-from ..simulation import Events, Trajectory, named_observable
-
-
-def series(run: Trajectory, name: str) -> Float[Array, " time"]:
-    """A coordinate, velocity or component of a force along a run, at its saved times."""
-    return named_observable(name, run)[0](run)
-
-
-def unit_of(name: str) -> str:
-    """Unit of a series; whether a coordinate is a length or an angle, its user knows."""
-    return {"q": "m or rad", "qd": "m/s or rad/s"}.get(name.partition("[")[0], "N or N m")
+from ..simulation import Events, Trajectory
 
 
 def magnitude_of(x: Float[Array, "time ..."]) -> Float[Array, " time"]:

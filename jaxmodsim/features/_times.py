@@ -6,9 +6,9 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..simulation import Trajectory
+from ..simulation import Trajectory, named_series
 from ._feature import Feature
-from ._names import changes_of, is_exact, last_two, magnitude_of, series, slip_of
+from ._names import changes_of, is_exact, last_two, magnitude_of, slip_of
 
 # Periods since the last return after which a cycle has ended.
 _ALIVE = 1.5
@@ -117,7 +117,7 @@ def _period(run: Trajectory, of: str, since: float | None, swing: float) -> Arra
     if of in run.scene.exact:
         gap, alive = cycle_of(run, of)
         return jnp.where(alive, gap, jnp.nan)
-    x = series(run, of)
+    x = named_series(run, of)
     begin = 0.5 * (run.problem.t0 + run.t_end) if since is None else since
     counts = jnp.isfinite(run.t) & (run.t >= begin)
     x = jnp.where(jnp.isfinite(run.t), x, 0.0)

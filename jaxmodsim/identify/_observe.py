@@ -1,6 +1,5 @@
 """What a record measured: functions of the motion, or names."""
 
-import difflib
 import re
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
@@ -9,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..numerics import did_you_mean
 from ..scene import Scene, State, scene_forces
 from ._record import Record
 
@@ -61,8 +61,7 @@ def check_observables(observables: tuple[tuple[str, Observable], ...], scene: Sc
             entry = _STATE.fullmatch(observable)
             known = [f"{x}[{i}]" for x in ("q", "qd") for i in range(y.q.shape[0])] + list(scene.names)
             if observable not in known:
-                near = difflib.get_close_matches(observable, known, n=1)
-                hint = f" Did you mean {near[0]!r}?" if near and not entry else ""
+                hint = "" if entry else did_you_mean(observable, known)
                 raise ValueError(f"{channel} observes {observable!r}, but there are: {', '.join(known)}.{hint}")
         shape = _shape(observable, y, scene)
         if shape != ():

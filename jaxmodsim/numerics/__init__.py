@@ -16,6 +16,8 @@ from ._linalg import solve_positive_definite as solve_positive_definite
 from ._monotone import Monotone as Monotone
 from ._monotone import rising_root as rising_root
 from ._monotone import solve_monotone as solve_monotone
+from ._near import did_you_mean as did_you_mean
+from ._near import nearest as nearest
 from ._numbers import Number as Number
 from ._numbers import Range as Range
 from ._numbers import Vector as Vector

@@ -1,6 +1,5 @@
 """A map of a sweep."""
 
-import difflib
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, StrMethodFormatter
 
+from ..numerics import did_you_mean
 from ._style import BLUE, GREEN, RED, with_unit
 
 if TYPE_CHECKING:
@@ -144,8 +144,7 @@ def _read(dataset: Any, name: str, x: str | None, y: str | None) -> tuple[Any, _
 def _check_known(kind: str, name: Any, known: Any) -> None:
     known = [str(each) for each in known]
     if name not in known:
-        near = difflib.get_close_matches(str(name), known, n=1)
-        hint = f" Did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(str(name), known)
         raise ValueError(f"There is no {kind} {name!r}; there are: {', '.join(known)}.{hint}")
 
 

@@ -1,7 +1,8 @@
 """Runs of scenes."""
 
 from ._consistent import consistent as consistent
-from ._observe import named_observable as named_observable
+from ._observe import named_series as named_series
+from ._observe import named_unit as named_unit
 from ._outcome import MAX_STEPS as MAX_STEPS
 from ._outcome import Outcome as Outcome
 from ._outcome import SimulationError as SimulationError

@@ -70,8 +70,7 @@ def layout(request: Request) -> Layout:
     codes = {"long_name": "how the run ended", "flag_values": [*range(len(sentences))], "flag_meanings": sentences}
     for name, attrs in (("num_steps", {"long_name": "number of steps of the run"}), ("result", codes)):
         variables.append(Variable(name, (), (), np.dtype(np.int32), NOT_RUN, attrs))
-    taken = [*dims, *(variable.name for variable in variables)]
-    for name in (*(x.name for x in variables), "time"):
-        if taken.count(name) > 1 or (name in coordinates and name in [x.name for x in variables]):
-            raise ValueError(f"{name!r} names both what is observed and what is swept: rename the former.")
+    for variable in variables:
+        if variable.name in dims or variable.name in coordinates:
+            raise ValueError(f"{variable.name!r} names both what is observed and what is swept: rename the former.")
     return Layout(dims, tuple(request.grid.shape), coordinates, tuple(variables))

@@ -7,10 +7,10 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..simulation import Trajectory, named_observable
+from ..simulation import Trajectory, named_series
 from ._grid import RESERVED
 
-# A function of the run that returns real numbers, or a name as in `simulation.named_observable`.
+# A function of the run that returns real numbers, or a name as in `simulation.named_series`.
 Observable: TypeAlias = Callable[[Trajectory], Any] | str
 
 
@@ -102,7 +102,7 @@ def _observation(name: Any, given: Any) -> Observation:
 def observed(what: Observation, run: Trajectory, alone: bool) -> Array:
     """The value of an observable; of a named one without the time axis where the run keeps its end `alone`."""
     if isinstance(what.value, str):
-        value = named_observable(what.value, run)[0](run)
+        value = named_series(run, what.value)
         return value[-1] if alone else value
     return real(what.name, what.value(run))
 

@@ -76,6 +76,7 @@ def commit() -> str:
     return _commit(os.getcwd())
 
 
+# Looked up once: code, too, is loaded once.
 @lru_cache(maxsize=4)
 def _commit(folder: str) -> str:
     try:

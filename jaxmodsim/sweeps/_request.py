@@ -1,6 +1,5 @@
 """What the caller of `sweep` asks for, checked and converted."""
 
-import difflib
 import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from ..numerics import did_you_mean
 from ..scene import Scene, elements, scene_numbers, scene_ranges
 from ..simulation import prepare, simulate
 from ._compute import shapes
@@ -186,7 +186,6 @@ def _check_names(
             raise ValueError(f"{where} names {name!r}, which is a number of the scene and an argument: rename the one.")
         if name not in inside and name not in outside:
             known = [*sorted(inside), *sorted(outside)]
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f" Did you mean {near[0]!r}?" if near else ""
+            hint = did_you_mean(name, known)
             extra = " Give a value of dt or dtmax to sweep it." if name in ("dt", "dtmax") else ""
             raise ValueError(f"{where} names {name!r}, but the numbers are: {', '.join(known)}.{hint}{extra}")

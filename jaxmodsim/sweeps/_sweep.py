@@ -192,6 +192,6 @@ def _run(
 
 def _tasks(asked: Request, cut: Blocks, left: list[int], prediction: Prediction | None) -> Iterator[Task]:
     for block in left:
-        numbers = asked.grid.lanes(cut.index(block).ravel())
-        size = next(iter(numbers.values())).shape[0]
-        yield block, numbers, np.arange(size) if prediction is None else prediction.order(numbers)
+        index = cut.index(block).ravel()
+        numbers = asked.grid.lanes(index)
+        yield block, numbers, np.arange(index.size) if prediction is None else prediction.order(numbers)
