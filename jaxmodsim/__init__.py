@@ -1,20 +1,13 @@
 """Differentiable mechanics with friction: Lagrangians in, motion, figures and fits out."""
 
-from . import features as features
-from . import problems as problems
+from importlib import import_module as _import_module
+from typing import TYPE_CHECKING
+from typing import Any as _Any
+
 from ._speed import tune_cpu as tune_cpu
-from .analysis import EnergyAudit as EnergyAudit
-from .analysis import GradientCheck as GradientCheck
-from .analysis import Sensitivity as Sensitivity
-from .analysis import check_gradients as check_gradients
-from .analysis import cyclic_coordinates as cyclic_coordinates
-from .analysis import energy_audit as energy_audit
-from .analysis import sensitivity as sensitivity
 from .effects import AbstractEffect as AbstractEffect
 from .effects import AppliedForce as AppliedForce
 from .effects import Friction as Friction
-from .export import to_modelica as to_modelica
-from .export import to_mujoco as to_mujoco
 from .friction import Armstrong as Armstrong
 from .friction import Coulomb as Coulomb
 from .friction import Curve as Curve
@@ -33,10 +26,6 @@ from .friction import explicit_step as explicit_step
 from .friction import passive as passive
 from .friction import regularized_width as regularized_width
 from .friction import scaled_by as scaled_by
-from .identify import FitResult as FitResult
-from .identify import Record as Record
-from .identify import fit as fit
-from .identify import fit_law as fit_law
 from .mechanics import Chart as Chart
 from .mechanics import Constraint as Constraint
 from .mechanics import Cylindrical as Cylindrical
@@ -55,4 +44,59 @@ from .solvers import EventSolver as EventSolver
 from .solvers import Gauss as Gauss
 from .solvers import ImplicitFriction as ImplicitFriction
 from .solvers import Rodas5P as Rodas5P
-from .sweeps import sweep as sweep
+
+if TYPE_CHECKING:
+    from . import behaviour as behaviour
+    from . import features as features
+    from . import plot as plot
+    from . import problems as problems
+    from . import sweeps as sweeps
+    from .analysis import EnergyAudit as EnergyAudit
+    from .analysis import GradientCheck as GradientCheck
+    from .analysis import Sensitivity as Sensitivity
+    from .analysis import check_gradients as check_gradients
+    from .analysis import cyclic_coordinates as cyclic_coordinates
+    from .analysis import energy_audit as energy_audit
+    from .analysis import sensitivity as sensitivity
+    from .export import to_modelica as to_modelica
+    from .export import to_mujoco as to_mujoco
+    from .identify import FitResult as FitResult
+    from .identify import Record as Record
+    from .identify import fit as fit
+    from .identify import fit_law as fit_law
+    from .sweeps import sweep as sweep
+
+# What a simulation does not need is loaded when it is first asked for: it takes longer than the rest. The same names
+# as above, which is for type checkers.
+_LATER = {
+    "analysis": (
+        "EnergyAudit",
+        "GradientCheck",
+        "Sensitivity",
+        "check_gradients",
+        "cyclic_coordinates",
+        "energy_audit",
+        "sensitivity",
+    ),
+    "behaviour": (),
+    "export": ("to_modelica", "to_mujoco"),
+    "features": (),
+    "identify": ("FitResult", "Record", "fit", "fit_law"),
+    "plot": (),
+    "problems": (),
+    "sweeps": ("sweep",),
+}
+_FOLDERS = {name: folder for folder, names in _LATER.items() for name in names}
+
+
+def __getattr__(name: str) -> _Any:
+    if name in _LATER:
+        return _import_module(f"{__name__}.{name}")
+    if name not in _FOLDERS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = globals()[name] = getattr(_import_module(f"{__name__}.{_FOLDERS[name]}"), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LATER, *_FOLDERS})

@@ -1,6 +1,8 @@
 """The rules of the code base that a reader cannot be expected to check by eye."""
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,7 +28,7 @@ ALLOWED["cli"] = {*_CORE, "problems", "identify", "behaviour", "sweeps", "plot",
 ALLOWED["_speed"] = set()
 
 # The command line may also use the package as its users do, by its public names.
-PUBLIC = {name for name in vars(jaxmodsim) if not name.startswith("_")}
+PUBLIC = {name for name in dir(jaxmodsim) if not name.startswith("_")}
 
 # The command line imports inside its commands, so that `--help` does not wait for JAX.
 LAZY_IMPORTS = {"cli"}
@@ -87,6 +89,27 @@ def each_file(paths: list[Path]) -> pytest.MarkDecorator:
 def test_every_part_has_its_layer() -> None:
     parts = {layer_of(path) for path in FILES} - {"__init__"}
     assert parts <= set(ALLOWED), f"say in ALLOWED where {sorted(parts - set(ALLOWED))} belong"
+
+
+@pytest.mark.quick
+def test_names_that_load_later_are_those_that_type_checkers_see() -> None:
+    branch = next(node for node in ast.parse((ROOT / "__init__.py").read_text()).body if isinstance(node, ast.If))
+    imports = [node for node in branch.body if isinstance(node, ast.ImportFrom)]
+    seen = {(node.module, alias.name) for node in imports for alias in node.names}
+    later = {(folder, name) for folder, names in jaxmodsim._LATER.items() for name in names}
+    folders = {(None, name) for name in ("behaviour", "features", "plot", "problems", "sweeps")}
+    assert seen == later | folders
+    for _, name in seen:
+        assert getattr(jaxmodsim, name) is not None
+
+
+@pytest.mark.quick
+def test_the_import_loads_no_more_than_a_simulation_needs() -> None:
+    code = (
+        "import sys, jaxmodsim; print(*{name.split('.')[1] for name in sys.modules if name.startswith('jaxmodsim.')})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) == {*_CORE, "_speed"}
 
 
 @each_file([path for path in FILES if path != ROOT / "__init__.py"])

@@ -189,12 +189,9 @@ class Friction(AbstractEffect):
                     f"Friction {name!r}: {label} returned the shape {result_shape(fn, *args)}, but {wanted} is needed."
                 )
 
-    def check_values(self, q: Any, params: PyTree, name: str) -> None:
-        """Check what only known numbers show: that a slip that is a vector is not held against a number."""
-        if self.along is None or q.shape == (1,) or callable(self.belt_velocity):
-            return
-        if isinstance(self.belt_velocity, jax.core.Tracer) or not bool(self.belt_velocity != 0):
-            return
+    def check_belt(self, q: Any, params: PyTree, name: str) -> None:
+        """Refuse a slip that is a vector beside the velocity of a belt that is a number other than zero."""
+        assert self.along is not None
         slip = result_shape(self.along, q, params)
         if slip != ():
             raise ValueError(

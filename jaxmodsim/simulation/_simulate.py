@@ -189,7 +189,7 @@ def _problem(
         if type(value) is not float:
             _check_real(name, value)
     kinds = {x.dtype for x in (*jtu.tree_leaves(scene), q0, qd0) if hasattr(x, "dtype")}
-    dtype = jnp.result_type(*kinds) if kinds else jnp.result_type(float)
+    dtype = kinds.pop() if len(kinds) == 1 else jnp.result_type(*kinds) if kinds else jnp.result_type(float)
     if not jnp.issubdtype(dtype, jnp.floating):
         dtype = jnp.result_type(float)
     array = {name: _array(value, dtype) for name, value in given.items()}
@@ -203,9 +203,8 @@ def _problem(
         if name in array and array[name].shape != ():
             raise ValueError(f"{name} must be one number, but has the shape {array[name].shape}.")
     _check_values(array)
-    for name, effect in zip(scene.names, scene.effects, strict=True):
-        if isinstance(effect, Friction):
-            effect.check_values(array["q0"], scene.now(jnp.asarray(array["t0"])).params, name)
+    if array["q0"].shape != (1,):
+        _check_slips(scene, array["q0"], array["t0"])
     return Problem(
         scene,
         array["q0"],
@@ -220,6 +219,15 @@ def _problem(
         array.get("dtmax"),
         None,
     )
+
+
+def _check_slips(scene: Scene, q0: Any, t0: Any) -> None:
+    """Refuse the velocity of a belt that is a number where slip is a vector."""
+    for i, effect in enumerate(scene.effects):
+        belt = effect.belt_velocity if isinstance(effect, Friction) and effect.along is not None else None
+        # Anything but the zero that most have; asked first, as the rest takes time.
+        if belt is not None and not callable(belt) and _known(belt) and np.any(np.asarray(belt) != 0):
+            effect.check_belt(q0, scene.now(jnp.asarray(t0)).params, scene.names[i])
 
 
 def _own_states(scene: Scene, q0: Any, z0: dict[str, PyTree], dtype: Any) -> dict[str, PyTree]:
