@@ -182,3 +182,62 @@ def test_gradient_of_lu_by_every_entry() -> None:
             # Step 1e-3 of entries near one: truncation 1e-12 times derivatives up to 1e2, rounding 1e-12.
             slope = central_difference(lambda x, i=i, j=j: solve(matrix.at[i, j].add(x)), 0.0, 1e-3)
             np.testing.assert_allclose(gradient[i, j], slope, rtol=1e-8, atol=1e-8)
+
+
+def sparse(n: int, seed: int) -> tuple[np.ndarray, list[list[Any]]]:
+    """A matrix like that of a mechanism with bristles, and its rows with the zeros and ones of its structure known."""
+    rng = np.random.default_rng(seed)
+    eye, full = np.eye(n), rng.standard_normal((n, n))
+    blocks = [
+        [3.0 * eye, -eye, 0 * eye],
+        [full, 6.0 * eye + full, rng.standard_normal((n, n))],
+        [0 * eye, -2 * eye, 4 * eye],
+    ]
+    matrix = np.block(blocks)
+    known = np.isin(matrix, (0.0, -1.0))
+    rows = [
+        [np.float64(x) if k else jnp.asarray(x) for x, k in zip(*each, strict=True)]
+        for each in zip(matrix, known, strict=True)
+    ]
+    return matrix, rows
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("pivot", [False, True])
+def test_lu_of_a_matrix_whose_zeros_are_known(pivot: bool) -> None:
+    matrix, rows = sparse(3, 5)
+    rhs = np.random.default_rng(6).standard_normal(9)
+    x = factor_lu(rows, pivot=pivot)(list(jnp.asarray(rhs)))
+    np.testing.assert_allclose(jnp.stack(x), np.linalg.solve(matrix, rhs), rtol=ROUNDING, atol=ROUNDING)
+
+
+def test_lu_leaves_out_what_is_known_to_be_zero() -> None:
+    """Coordinates and bristles first: what is left to eliminate are the velocities alone."""
+    matrix, rows = sparse(3, 5)
+    dense = [[jnp.asarray(x) for x in row] for row in matrix]
+
+    def products(rows: list[list[Any]]) -> int:
+        """In two substitutions."""
+        solve = factor_lu(rows, pivot=False)
+        return str(jax.make_jaxpr(lambda b: solve(list(b)))(jnp.ones(9))).count(" mul ")
+
+    # Of two dense triangles of 9 rows all; of these each velocity with both others, and with all coordinates and
+    # bristles below, with its own alone above.
+    assert (products(dense), products(rows)) == (72, 6 + 18 + 6)
+
+
+@pytest.mark.parametrize("entry", [(3, 0), (4, 4), (3, 7), (0, 0)])
+def test_derivatives_of_lu_with_known_zeros(entry: tuple[int, int]) -> None:
+    matrix, rows = sparse(3, 5)
+    rhs = jnp.asarray(np.random.default_rng(6).standard_normal(9))
+    i, j = entry
+
+    def solve(value: jax.Array) -> jax.Array:
+        changed = [[value if (a, b) == entry else x for b, x in enumerate(row)] for a, row in enumerate(rows)]
+        return jnp.stack(factor_lu(changed, pivot=False)(list(rhs)))
+
+    inverse = np.linalg.inv(matrix)
+    expected = -inverse[:, i] * (inverse @ rhs)[j]
+    value = jnp.asarray(matrix[i, j])
+    np.testing.assert_allclose(jax.jacfwd(solve)(value), expected, rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(jax.jacrev(solve)(value), expected, rtol=1e-11, atol=1e-13)

@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from jaxmodsim import Rodas5P
-from jaxmodsim.numerics import _linalg
+from jaxmodsim.numerics import _lu
 
 from .differences import central_difference
 
@@ -156,7 +156,7 @@ def library_calls(compiled: Any) -> list[str]:
 
 def test_unrolled_and_lapack_paths_agree() -> None:
     """Twelve states are solved in scalars, with no call into LAPACK; thirteen by LAPACK, to the same numbers."""
-    assert _linalg.MAX_UNROLLED_LU == 12
+    assert _lu.MAX_UNROLLED_LU == 12
     y0 = jnp.linspace(-1.0, 1.5, 12)
     small, large = compiled_ring(12), compiled_ring(13)
     assert library_calls(small) == []

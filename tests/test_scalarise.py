@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmodsim.numerics import in_scalars
+from jaxmodsim.numerics import columns_of, in_scalars, unit_of
 
 TABLE = np.array([[0.0, 1.0, 2.0], [0.0, 0.0, 0.5], [1.0, -1.0, 3.0]])
 
@@ -165,3 +165,22 @@ def test_values_from_around_are_seen() -> None:
         return scalar(lambda x: a * x * x)(X * a)[1]
 
     np.testing.assert_allclose(jax.jit(jax.grad(outer))(2.0), 3 * 2.0**2 * 0.7**2)
+
+
+def test_columns_of_a_linear_function_know_their_zeros_and_ones() -> None:
+    def field(q: Any, v: Any, z: Any) -> list[Any]:
+        return [v, jnp.sin(q) * v - 3.0 * z, v - jnp.abs(v) * z]
+
+    at = [jnp.asarray(x) for x in (0.3, -0.7, 0.2)]
+    found: list[Any] = []
+
+    def run(*at: Any) -> list[Any]:
+        _, push = jax.linearize(field, *at)
+        found.extend(columns_of(push, unit_of(at[0]), *at))
+        return [[jnp.asarray(x) for x in column] for column in found]
+
+    columns = jax.jit(run)(*at)
+    expected = jnp.stack([jnp.stack(row) for row in jax.jacfwd(lambda x: field(*x))(at)]).T
+    np.testing.assert_allclose(np.array(columns), expected, rtol=1e-14)
+    known = [[float(x) if isinstance(x, np.generic) else None for x in column] for column in found]
+    assert known == [[0.0, None, 0.0], [1.0, None, None], [0.0, -3.0, None]]

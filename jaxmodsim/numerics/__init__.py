@@ -10,9 +10,9 @@ from ._function import Function as Function
 from ._function import as_function as as_function
 from ._linalg import MAX_UNROLLED_CHOLESKY as MAX_UNROLLED_CHOLESKY
 from ._linalg import cholesky_pivots as cholesky_pivots
-from ._linalg import factor_lu as factor_lu
 from ._linalg import factor_positive_definite as factor_positive_definite
 from ._linalg import solve_positive_definite as solve_positive_definite
+from ._lu import factor_lu as factor_lu
 from ._monotone import Monotone as Monotone
 from ._monotone import rising_root as rising_root
 from ._monotone import solve_monotone as solve_monotone
@@ -43,6 +43,7 @@ from ._safe import decay_mean as decay_mean
 from ._safe import magnitude as magnitude
 from ._safe import safe_norm as safe_norm
 from ._safe import safe_power as safe_power
+from ._scalarise import columns_of as columns_of
 from ._scalarise import in_scalars as in_scalars
 from ._semidefinite import solve_balanced as solve_balanced
 from ._semidefinite import solve_semidefinite as solve_semidefinite

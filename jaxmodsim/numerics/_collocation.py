@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from ._layout import Layout, Parts, State
-from ._linalg import MAX_UNROLLED_LU, factor_lu
+from ._lu import MAX_UNROLLED_LU, factor_lu
 from ._once import once, unit_of
 
 MAX_ITERATIONS = 50

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
-from ._linalg import MAX_UNROLLED_LU
+from ._lu import MAX_UNROLLED_LU
 
 State: TypeAlias = PyTree[Array]
 Parts: TypeAlias = list[Array]

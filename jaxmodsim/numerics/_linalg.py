@@ -4,19 +4,13 @@ XLA fuses scalar operations across a whole solver step, but a call into LAPACK i
 above the sizes given here go to LAPACK, where its own speed pays for the call.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Inexact
+from jaxtyping import Array, Float
 
 MAX_UNROLLED_CHOLESKY = 12
-MAX_UNROLLED_LU = 12
-
-Scalar: TypeAlias = Inexact[Array, ""]
-Factors: TypeAlias = tuple[list[list[Scalar]], list[Array]]
-LinearSolver: TypeAlias = Callable[[Sequence[Scalar]], list[Scalar]]
 
 
 def cholesky_pivots(matrix: Float[Array, "n n"]) -> Float[Array, " n"]:
@@ -101,84 +95,3 @@ def factor_positive_definite(matrix: Float[Array, "n n"]) -> Callable[[Array], A
         return jnp.stack(x)
 
     return solve
-
-
-def factor_lu(rows: Sequence[Sequence[Scalar]], *, pivot: bool) -> LinearSolver:
-    """LU factorisation written out in scalars; returns the solver of the factored system.
-
-    Pivoting is a bubble of conditional row swaps, without a branch. Still it costs a factor of 2.7 under `jax.vmap`,
-    because the swapped rows enter so many sums that XLA computes them over and over. Without it the elimination is
-    stable where the symmetric part of the matrix, in some scaling of the unknowns, is positive: so for
-    `I/(gamma dt) - J` of a dissipative system, and of any system whose growing modes the step resolves.
-
-    Quotients are kept as divisions: XLA never recomputes a division in several kernels, as it does sums and
-    products, and that alone is worth a factor of three under `jax.vmap`.
-
-    **Arguments:**
-
-    - `rows`: the matrix as n rows of n scalars.
-    - `pivot`: whether to swap rows so that every pivot is the largest in its column.
-
-    **Returns:**
-
-    A function from a right-hand side (n scalars) to the solution (n scalars), differentiable in the matrix and the
-    right-hand side. A singular matrix, or without pivoting a zero pivot, gives values that are not finite.
-    """
-    # The factors stay differentiable although the rule of `_solve_lu` ignores their tangents: transposed in reverse
-    # mode, a solve is plain arithmetic on the factors, and derivatives of that (Hessians) go through the elimination.
-    factors = _eliminate([list(row) for row in rows], pivot)
-    return lambda rhs: _solve_lu([list(row) for row in rows], factors, list(rhs))
-
-
-def _eliminate(rows: list[list[Scalar]], pivot: bool) -> Factors:
-    n = len(rows)
-    table, swaps = [list(row) for row in rows], []
-    for k in range(n):
-        for i in range(k + 1, n if pivot else 0):
-            swap = jnp.abs(table[i][k]) > jnp.abs(table[k][k])
-            swaps.append(swap)
-            above, below = table[k], table[i]
-            table[k] = [jnp.where(swap, b, a) for a, b in zip(above, below, strict=True)]
-            table[i] = [jnp.where(swap, a, b) for a, b in zip(above, below, strict=True)]
-        for i in range(k + 1, n):
-            table[i][k] = table[i][k] / table[k][k]
-            for j in range(k + 1, n):
-                table[i][j] = table[i][j] - table[i][k] * table[k][j]
-    return table, swaps
-
-
-def _substitute(factors: Factors, rhs: list[Scalar]) -> list[Scalar]:
-    table, swaps = factors
-    n = len(table)
-    x = list(rhs)
-    pairs = [(k, i) for k in range(n) for i in range(k + 1, n)]
-    for (k, i), swap in zip(pairs if swaps else (), swaps, strict=True):
-        x[k], x[i] = jnp.where(swap, x[i], x[k]), jnp.where(swap, x[k], x[i])
-    for i in range(n):
-        for k in range(i):
-            x[i] = x[i] - table[i][k] * x[k]
-    for i in reversed(range(n)):
-        for k in range(i + 1, n):
-            x[i] = x[i] - table[i][k] * x[k]
-        x[i] = x[i] / table[i][i]
-    return x
-
-
-@jax.custom_jvp
-def _solve_lu(rows: list[list[Scalar]], factors: Factors, rhs: list[Scalar]) -> list[Scalar]:
-    """Solve with factors at hand; the rule below spares the derivative a pass through the elimination."""
-    del rows
-    return _substitute(factors, rhs)
-
-
-@_solve_lu.defjvp
-def _solve_lu_jvp(primals: tuple[Any, Any, Any], tangents: tuple[Any, Any, Any]) -> tuple[Any, Any]:
-    """A x = b gives A dx = db - dA x."""
-    rows, factors, rhs = primals
-    rows_dot, _, rhs_dot = tangents
-    x = _solve_lu(rows, factors, rhs)
-    residual = [
-        b_dot - sum(a_dot * xj for a_dot, xj in zip(row_dot, x, strict=True))
-        for row_dot, b_dot in zip(rows_dot, rhs_dot, strict=True)
-    ]
-    return x, _solve_lu(rows, factors, residual)

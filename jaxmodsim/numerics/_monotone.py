@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._linalg import MAX_UNROLLED_LU, factor_lu
+from ._lu import MAX_UNROLLED_LU, factor_lu
 
 # Evaluations of one search along a line, and Newton steps of several unknowns.
 _MOST_EVALUATIONS = 200

@@ -10,7 +10,9 @@ import numpy as np
 from jaxtyping import Array
 
 from ._layout import Layout, Parts, State
-from ._linalg import LinearSolver, factor_lu
+from ._lu import LinearSolver, factor_lu, is_zero
+from ._once import once, unit_of
+from ._scalarise import columns_of
 
 
 @dataclass(frozen=True)
@@ -69,28 +71,23 @@ def _add(a: Parts, b: Parts) -> Parts:
     return [x + y for x, y in zip(a, b, strict=True)]
 
 
-def _linearise(
-    flow: Callable[[Array, Parts], Parts], t: Array, parts: Parts, layout: Layout
-) -> tuple[Parts, Parts, Any]:
-    """Field, its time derivative and its Jacobian from one linearisation."""
-    f0, push = jax.linearize(flow, t, parts)
-    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
-    still = [jnp.zeros_like(p) for p in parts]
-    f_t = push(one, still)
-    if not layout.unrolled:
-        basis = jnp.eye(layout.n, dtype=layout.dtype)
-        return f0, f_t, jax.vmap(lambda e: push(zero, [e])[0], out_axes=1)(basis)
-    columns = [
-        push(zero, [jnp.ones_like(p) if i == j else s for i, (p, s) in enumerate(zip(parts, still, strict=True))])
-        for j in range(layout.n)
-    ]
-    return f0, f_t, [[columns[j][i] for j in range(layout.n)] for i in range(layout.n)]
+def _linearise(flow: Callable[[Array, Parts], Parts], t: Array, parts: Parts, layout: Layout) -> tuple[Parts, Any, Any]:
+    """Field, its time derivative and its Jacobian from one linearisation; what is known of the latter as NumPy's."""
+    f0, push = jax.linearize(lambda t, *parts: flow(t, list(parts)), t, *parts)
+    if layout.unrolled:
+        f_t, *columns = columns_of(push, unit_of(t), t, *parts)
+        return f0, f_t, [list(row) for row in zip(*columns, strict=True)]
+    f_t = push(jnp.ones_like(t), jnp.zeros_like(parts[0]))
+    basis = jnp.eye(layout.n, dtype=layout.dtype)
+    return f0, f_t, jax.vmap(lambda e: push(jnp.zeros_like(t), e)[0], out_axes=1)(basis)
 
 
 def _factor(jacobian: Any, shift: Array, layout: Layout, pivot: bool) -> LinearSolver:
     """Solver of `(shift I - jacobian) x = rhs`."""
     if layout.unrolled:
-        rows = [[shift - x if i == j else -x for j, x in enumerate(row)] for i, row in enumerate(jacobian)]
+        rows = [[-x for x in row] for row in jacobian]
+        for i, row in enumerate(rows):
+            row[i] = shift if is_zero(row[i]) else shift + row[i]
         return factor_lu(rows, pivot=pivot)
     lu = jax.scipy.linalg.lu_factor(shift * jnp.eye(layout.n, dtype=layout.dtype) - jacobian)
     return lambda rhs: [jax.scipy.linalg.lu_solve(lu, rhs[0])]
@@ -140,12 +137,14 @@ def rosenbrock_step(
         moved = i > 0 and (tableau.nodes[i] != tableau.nodes[i - 1] or np.any(tableau.stage[i] != tableau.stage[i - 1]))
         if moved:
             point = _add(parts, _combine(tableau.stage[i], stages)) if np.any(tableau.stage[i]) else parts
+            # As vectors: every entry of the field would compute its own sum of stages.
+            point = point if layout.unrolled else once(point, unit_of(t0))
             slope = flow(t0 + float(tableau.nodes[i]) * dt, point)
         rhs = slope
         if np.any(tableau.coupling[i]):
             rhs = [a + inverse_dt * b for a, b in zip(rhs, _combine(tableau.coupling[i], stages), strict=True)]
         if tableau.time[i] != 0.0:
-            rhs = [a + (float(tableau.time[i]) * dt) * b for a, b in zip(rhs, f_t, strict=True)]
+            rhs = [a if is_zero(b) else a + (float(tableau.time[i]) * dt) * b for a, b in zip(rhs, f_t, strict=True)]
         stages.append(solve(rhs))
 
     y1 = layout.join(_add(parts, _combine(tableau.solution, stages)))

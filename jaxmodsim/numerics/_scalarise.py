@@ -69,6 +69,30 @@ def in_scalars(fn: Callable[..., Any], *args: Any, seed: Float[Array, "..."]) ->
     return jtu.tree_unflatten(jtu.tree_structure(shapes), out)
 
 
+def columns_of(linear: Callable[..., list[Any]], unit: Float[Array, ""], *like: Any) -> list[list[Any]]:
+    """The matrix of a linear function of scalars, column by column; zeros and ones that its structure shows are known.
+
+    **Arguments:**
+
+    - `linear`: takes scalars and returns a list of them, as the second result of `jax.linearize` does.
+    - `unit`: a one from `unit_of`.
+    - `like`: scalars of the types of its arguments.
+
+    **Returns:**
+
+    For each argument the values for it alone being one: NumPy's scalars where they are known while tracing (zeros of
+    what does not depend on it, ones of what it is itself), arrays elsewhere.
+    """
+    closed, scalars = jax.make_jaxpr(linear)(*like), _Scalars(unit)
+    types = [jnp.result_type(x) for x in like]
+    columns = []
+    for j in range(len(like)):
+        basis = [np.asarray(i == j, kind) for i, kind in enumerate(types)]
+        out = scalars.run(closed.jaxpr, closed.consts, basis)
+        columns.append([x[()] if isinstance(x, np.ndarray) else x for x in out])
+    return columns
+
+
 def _sizes(jaxpr: Any) -> list[int]:
     """Number of entries of each value of a traced function."""
     inner = [eqn.params["jaxpr"].jaxpr for eqn in jaxpr.eqns if eqn.primitive.name in _CALLS]
@@ -216,15 +240,22 @@ def _constant(x: Any) -> Any:
 
 
 def _shorten(name: str, operands: list[Any]) -> Any:
-    """Sums and products with zero or one, and choices that are known; None for anything else."""
+    """Sums, products and quotients with zero or one, and choices that are known or make no difference; else None."""
     if name in ("add", "add_any", "mul"):
         for a, b in (operands, operands[::-1]):
             if _known(a) and a == 0:
                 return a if name == "mul" else b
             if _known(a) and a == 1 and name == "mul":
                 return b
-    if name == "select_n" and _known(operands[0]):
-        return operands[1 + int(operands[0])]
+    if name == "select_n":
+        chosen, *cases = operands
+        if _known(chosen):
+            return cases[int(chosen)]
+        # The derivative of |v| by anything else is zero on either side.
+        if all(map(_known, cases)) and all(x == cases[0] for x in cases):
+            return cases[0]
+    if name == "div" and _known(operands[0]) and operands[0] == 0:
+        return operands[0]
     if name == "sub" and _known(operands[1]) and operands[1] == 0:
         return operands[0]
     return None
