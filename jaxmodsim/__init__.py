@@ -5,11 +5,15 @@ from . import problems as problems
 from ._speed import tune_cpu as tune_cpu
 from .analysis import EnergyAudit as EnergyAudit
 from .analysis import GradientCheck as GradientCheck
+from .analysis import Method as Method
 from .analysis import Sensitivity as Sensitivity
+from .analysis import WorkPrecision as WorkPrecision
 from .analysis import check_gradients as check_gradients
 from .analysis import cyclic_coordinates as cyclic_coordinates
 from .analysis import energy_audit as energy_audit
+from .analysis import formulations as formulations
 from .analysis import sensitivity as sensitivity
+from .analysis import work_precision as work_precision
 from .effects import AbstractEffect as AbstractEffect
 from .effects import AppliedForce as AppliedForce
 from .effects import Friction as Friction
