@@ -16,6 +16,8 @@ from ..simulation import SimulationError, Trajectory, simulate
 from ..solvers import Rodas5P
 from ._sensitivity import observed, with_values
 
+# Absolute tolerance for a relative one, as in the defaults of `simulate`.
+ATOL = 1e-3
 # Steps that a reference may take, in those that a method may.
 _PATIENCE = 20
 
@@ -40,15 +42,18 @@ class Question:
     values: dict[str, float]
     max_steps: int
 
-    def run(self, scene: Scene, q0: Any, solver: Any, setting: dict[str, Any], **options: Any) -> Trajectory:
-        """A run; `setting` holds tolerances or a step."""
-        options = {"max_steps": self.max_steps, "solver": solver, **setting, **options}
-        return simulate(scene, q0, jnp.asarray(self.qd0, q0.dtype), self.t1, ts=self.ts, **options)
+    def start(self, dtype: Any) -> dict[str, Array]:
+        """Initial coordinates and velocities in a floating type."""
+        return {"q0": jnp.asarray(self.q0, dtype), "qd0": jnp.asarray(self.qd0, dtype)}
 
-    def last(self, scene: Scene, q0: Any, x: dict[str, Any], solver: Any, setting: Any, **options: Any) -> Array:
+    def run(self, scene: Scene, start: dict[str, Array], setting: dict[str, Any], **options: Any) -> Trajectory:
+        """A run; `setting` holds tolerances or a step."""
+        return simulate(scene, **start, t1=self.t1, ts=self.ts, **{"max_steps": self.max_steps, **setting, **options})
+
+    def last(self, x: dict[str, Array], scene: Scene, start: Any, setting: dict[str, Any], **options: Any) -> Array:
         """The last value of the observable, as a function of the numbers `x`."""
-        scene, start = with_values(scene, {"q0": q0}, x)
-        return jnp.ravel(self.observe(self.run(scene, start["q0"], solver, setting, throw=False, **options)))[-1]
+        scene, start = with_values(scene, start, x)
+        return jnp.ravel(self.observe(self.run(scene, start, setting, throw=False, **options)))[-1]
 
 
 class Happened(NamedTuple):
@@ -141,8 +146,8 @@ def converged(
         raise RuntimeError(
             f"The references disagree: {question.label} is {np.ravel(ys[0])[at]:.12g} by {how[0]} and"
             f" {np.ravel(ys[1])[at]:.12g} by {how[1]}, {disagreement:.1e} of its scale, where {agreement:.1e} is"
-            " allowed. End earlier if the motion is chaotic, ask for looser tolerances, pass a closed form as reference, or"
-            " allow more by agreement."
+            " allowed. End earlier if the motion is chaotic, ask for looser tolerances, pass a closed form as"
+            " reference, or allow more by agreement."
         )
     events, other = found[0][1], found[-1][1]
     times = None if events is None or other is None else event_error(events, other)
@@ -162,10 +167,10 @@ def _tight(
     scene: Scene, question: Question, solver: Any, rtol: float
 ) -> tuple[np.ndarray, Happened | None, dict[str, float] | None]:
     """Observable, mode changes and gradient at a tight tolerance."""
-    setting, steps = {"rtol": rtol, "atol": 1e-3 * rtol}, _PATIENCE * question.max_steps
-    q0 = jnp.asarray(question.q0, jnp.float64)
+    setting, start = {"rtol": rtol, "atol": ATOL * rtol}, question.start(jnp.float64)
+    options = {"solver": solver, "max_steps": _PATIENCE * question.max_steps}
     try:
-        run = question.run(scene, q0, solver, setting, max_steps=steps)
+        run = question.run(scene, start, setting, **options)
     except SimulationError as error:
         raise RuntimeError(
             f"The reference by {type(solver).__name__} at rtol = {rtol:.0e} failed: {error} Its limit of steps is"
@@ -173,9 +178,7 @@ def _tight(
         ) from error
     y, gradient = np.asarray(observed(question.observe(run))), None
     if question.values:
-        forward = jax.jacfwd(
-            lambda x: question.last(scene, q0, x, solver, setting, max_steps=steps, adjoint=dfx.ForwardMode())
-        )
-        found = forward({name: jnp.asarray(x, jnp.float64) for name, x in question.values.items()})
+        x = {name: jnp.asarray(value, jnp.float64) for name, value in question.values.items()}
+        found = jax.jacfwd(question.last)(x, scene, start, setting, adjoint=dfx.ForwardMode(), **options)
         gradient = {name: float(found[name]) for name in question.values}
     return y, happened(run), gradient

@@ -1,5 +1,6 @@
 """`work_precision`: what an extra digit costs, method by method."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -13,16 +14,18 @@ from jaxtyping import Array, ArrayLike
 
 from ..numerics import describe_machine, measure
 from ..problems import Case
-from ..scene import Scene
+from ..scene import Scene, elements
 from ..simulation import Trajectory, default_solver
 from ._methods import Method, default_methods, evaluations
-from ._reference import Limit, Question, converged, event_error, gradient_error, happened, in_type, scale_of
+from ._reference import ATOL, Limit, Question, converged, event_error, gradient_error, happened, in_type, scale_of
 from ._sensitivity import chosen_numbers, observable_of, observed
 from ._work_rows import Row, Timing, WorkPrecision
 
+# Numbers of a gradient that are none of the scene.
+_START = ("q0[", "qd0[")
 COSTS = ("run", "vmap", "forward", "reverse")
-# Absolute tolerance for a relative one, as in the defaults of `simulate`.
-_ATOL = 1e-3
+# Limit of a run, but for problems that say they need more.
+_MAX_STEPS = 100_000
 # Tolerance of the references: so much tighter than the tightest asked for, down to what rounding allows.
 _TIGHTER, _TIGHTEST = 1e-3, 1e-12
 _PACKAGES = ("jaxmodsim", "jax", "jaxlib", "diffrax", "equinox", "numpy")
@@ -82,7 +85,8 @@ def work_precision(
     - `costs`: what is timed, of `run`, `vmap`, `forward`, `reverse` (gradients).
     - `lanes`: runs of the vmap.
     - `rounds`, `limit_s`: how often each call is timed, and after how many seconds in all no more.
-    - `max_steps`: limit of a run; by default that of the `Case`, or 100 000.
+    - `max_steps`: limit of a run; by default 100 000, or as many as the `Case` needs. Of fixed steps as many
+      as they make are allowed.
 
     **Returns:**
 
@@ -133,6 +137,7 @@ def work_precision(
         title,
         question.label,
         question.unit,
+        f"at t = {question.t1:g} s" if question.ts is None else f"at {len(question.ts)} times to {question.t1:g} s",
         scale,
         target.how,
         target.disagreement,
@@ -149,13 +154,14 @@ def _question(
     problem: Any, q0: Any, qd0: Any, t1: Any, ts: Any, observable: Any, reference: Any, max_steps: int | None
 ) -> tuple[Scene, Question, np.ndarray | None, str]:
     """What is asked, of which scene; its closed form, and the name of the problem."""
-    steps = 100_000
+    steps = _MAX_STEPS
     if isinstance(problem, Case):
         if not (q0 is None and qd0 is None and t1 is None):
             raise ValueError("A Case brings q0, qd0 and t1 with it: leave them out, or pass its scene with others.")
         if reference is None and observable is None and ts is None and problem.exact is not None:
             reference = problem.exact
-        scene, q0, qd0, t1, steps = problem.scene, problem.q0, problem.qd0, problem.t1, problem.max_steps
+        scene, q0, qd0, t1 = problem.scene, problem.q0, problem.qd0, problem.t1
+        steps = max(steps, problem.max_steps)
         observable, name = problem.observable if observable is None else observable, problem.name
     elif isinstance(problem, Scene):
         if q0 is None or qd0 is None or t1 is None:
@@ -207,7 +213,7 @@ def _check(methods: dict[str, Method], tolerances: list[float], costs: Any, lane
 def _settings(method: Method, tolerances: Sequence[float]) -> list[dict[str, float]]:
     if method.steps is not None:
         return [{"dt": float(dt)} for dt in method.steps]
-    return [{"rtol": rtol, "atol": _ATOL * rtol} for rtol in tolerances]
+    return [{"rtol": rtol, "atol": ATOL * rtol} for rtol in tolerances]
 
 
 class _Prepared(NamedTuple):
@@ -223,25 +229,31 @@ class _Prepared(NamedTuple):
 def _prepared(name: str, method: Method, scene: Scene, question: Question, lanes: int) -> _Prepared:
     scene = scene if method.scene is None else method.scene
     dtype = jnp.dtype(method.dtype) if method.dtype is not None else jnp.result_type(float, *jax.tree.leaves(scene))
-    scene, q0 = in_type(scene, dtype), jnp.asarray(question.q0, dtype)
-    solver = default_solver(scene, q0.size, method.steps is not None) if method.solver is None else method.solver
+    scene, start, fixed = in_type(scene, dtype), question.start(dtype), method.steps is not None
+    lacking = [one for one in question.values if not one.startswith(_START) and one not in elements(scene)]
+    if lacking:
+        raise ValueError(
+            f"The scene of methods[{name!r}] has no number {', '.join(lacking)}: name in wrt what all of them have."
+        )
+    solver = default_solver(scene, start["q0"].size, fixed) if method.solver is None else method.solver
+    # All steps of a ladder that was asked for are allowed.
+    allowed = max(question.max_steps, *(math.ceil(question.t1 / dt) + 1 for dt in method.steps or ()), 1)
+    options: dict[str, Any] = {"solver": solver, "max_steps": allowed}
 
-    def end(q0: Array, scene: Scene, setting: dict[str, Any]) -> Any:
-        run = question.run(scene, q0, solver, setting, throw=False)
+    def end(start: dict[str, Array], scene: Scene, setting: dict[str, Any]) -> Any:
+        run = question.run(scene, start, setting, throw=False, **options)
         return run.q, run.qd, run.code
 
-    def last(x: dict[str, Array], scene: Scene, setting: dict[str, Any], adjoint: Any = None) -> Array:
-        return question.last(scene, q0, x, solver, setting, adjoint=adjoint)
-
     x = {name: jnp.asarray(value, dtype) for name, value in question.values.items()}
-    batch = jnp.broadcast_to(q0, (lanes, q0.size))
+    batch = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (lanes, *leaf.shape)), start)
     many = jax.jit(jax.vmap(end, in_axes=(0, None, None)))
-    forward, reverse = jax.jit(jax.jacfwd(partial(last, adjoint=dfx.ForwardMode()))), jax.jit(jax.grad(last))
+    forward = jax.jit(jax.jacfwd(partial(question.last, adjoint=dfx.ForwardMode(), **options)))
+    reverse = jax.jit(jax.grad(partial(question.last, **options)))
     calls = {
-        "run": lambda setting: jax.block_until_ready(question.run(scene, q0, solver, setting)),
+        "run": lambda setting: jax.block_until_ready(question.run(scene, start, setting, **options)),
         "vmap": lambda setting: jax.block_until_ready(many(batch, scene, setting)),
-        "forward": lambda setting: jax.block_until_ready(forward(x, scene, setting)),
-        "reverse": lambda setting: jax.block_until_ready(reverse(x, scene, setting)),
+        "forward": lambda setting: jax.block_until_ready(forward(x, scene, start, setting)),
+        "reverse": lambda setting: jax.block_until_ready(reverse(x, scene, start, setting)),
     }
     return _Prepared(name, method, solver, dtype, calls)
 

@@ -79,8 +79,8 @@ class Row:
 class WorkPrecision:
     """Error against work, method by method; print it, draw it, keep it.
 
-    - `problem`: what was run, in words; `observable`, `unit`: what was asked of it, `scale`: what errors of it are
-      relative to, in that unit.
+    - `problem`: what was run, in words; `observable`, `unit`, `when`: what was asked of it; `scale`: what errors of it
+      are relative to, in that unit.
     - `reference`: how the reference was found. `disagreement`: of the references, relative to the scale; errors below
       it say no more than that they are. `events_disagreement` [s], `gradient_disagreement`: likewise.
     - `costs`: what was timed; `lanes`: of the vmap.
@@ -91,6 +91,7 @@ class WorkPrecision:
     problem: str
     observable: str
     unit: str
+    when: str
     scale: float
     reference: str
     disagreement: float
@@ -175,8 +176,8 @@ class WorkPrecision:
 
     def __str__(self) -> str:
         """A table, and what it is about."""
-        heads = ["method", "setting", "error", "numerical", "model", "events [s]", "gradient", "steps"]
-        heads += [f"{_COSTS[cost]} [ms]" for cost in self.costs]
+        heads = ["method", "setting", "error", "numerical", "model", "events [s]", "gradient", "steps", "evaluations"]
+        heads += [f"{_COSTS[cost]} [ms]" for cost in self.costs] + ["compile [s]"]
         floors = {"error": self.disagreement, "numerical": self.disagreement, "model": self.disagreement}
         floors |= {"events [s]": self.events_disagreement, "gradient": self.gradient_disagreement}
         cells = [[_cell(row, head, floors, self.costs) for head in heads] for row in self.rows if not row.failed]
@@ -185,7 +186,7 @@ class WorkPrecision:
         unit = f" {self.unit}" if self.unit else ""
         return "\n".join(
             [
-                f"{self.problem}: {self.observable}, errors relative to {self.scale:.4g}{unit}",
+                f"{self.problem}: {self.observable} {self.when}, errors relative to {self.scale:.4g}{unit}",
                 *_aligned(lines),
                 *(f"failed: {row.method} at {row.setting}: {row.failed}" for row in self.rows if row.failed),
                 *(f"{row.method} at {row.setting}: {remark}" for row in self.rows for remark in row.remarks),
@@ -201,14 +202,18 @@ def _cell(row: Row, head: str, floors: dict[str, float], costs: Sequence[str]) -
     if head in ("method", "setting"):
         return str(getattr(row, head))
     name = head.split(" ")[0]
-    if name == "steps":
-        return str(row.steps)
+    if name == "compile":
+        return f"{sum(timing.compile for timing in (row.times or {}).values()):.1f}"
+    if name in ("steps", "evaluations"):
+        return str(getattr(row, name) or "")
     for cost in costs:
         if head == f"{_COSTS[cost]} [ms]":
             return f"{1e3 * row.time(cost):.3g}"
     value = getattr(row, name)
     if value is None:
         return ""
+    if value == 0.0 and name == "model":
+        return "0"
     return f"<{floors[head]:.0e}" if value < floors[head] else f"{value:.1e}"
 
 

@@ -34,7 +34,7 @@ def measure(calls: dict[str, Callable[[], Any]], rounds: int, limit_s: float = 3
             first = _seconds(call)
             second = _seconds(call)
         except Exception as error:  # a peer that fails is a result
-            report[name] = {"failed": f"{type(error).__name__}: {str(error).strip().splitlines()[0][:200]}"}
+            report[name] = {"failed": f"{type(error).__name__}: {str(error).strip().splitlines()[0][:400]}"}
             continue
         report[name] = {"first_s": first, "slow": second > _SLOW}
         seconds[name] = []

@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..analysis import Row, WorkPrecision
-from ._style import GREY, with_unit
+from ._style import GREY, RED, with_unit
 
 _MARKERS = "osD^vPX*"
 _LABELS = {
@@ -39,18 +39,21 @@ def work_precision_figure(found: WorkPrecision, *, cost: str = "run") -> Figure:
     figure = Figure(figsize=(10, height), layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True)
     counted = all(row.evaluations is not None for row in found.rows if not row.failed)
-    methods = dict.fromkeys(row.method for row in found.rows)
+    methods, handles = dict.fromkeys(row.method for row in found.rows), []
     for i, method in enumerate(methods):
-        rows = [row for row in found.rows if row.method == method and row.error is not None]
+        tried = [row for row in found.rows if row.method == method]
+        rows = [row for row in tried if row.error is not None]
+        label = method if len(rows) == len(tried) else f"{method} ({len(tried) - len(rows)} of {len(tried)} failed)"
         if not rows:
-            left.plot([], [], color=GREY, marker="x", ls="", label=f"{method}: failed")
+            handles += left.plot([], [], color=RED, marker="x", ls="", label=label)
             continue
         style = {"color": f"C{i}", "marker": _MARKERS[i % len(_MARKERS)], "ms": 6.0, "lw": 1.4}
         errors = [_shown(row, found) for row in rows]
         timings = [row.times[cost] for row in rows if row.times is not None]
         median = 1e3 * np.array([x.median for x in timings])
         bars = 1e3 * np.array([[x.median - x.low for x in timings], [x.high - x.median for x in timings]])
-        left.errorbar(errors, median, yerr=np.maximum(bars, 0.0), capsize=2.0, elinewidth=0.8, **style, label=method)
+        bars = np.maximum(bars, 0.0)
+        handles.append(left.errorbar(errors, median, yerr=bars, capsize=2.0, elinewidth=0.8, **style, label=label))
         right.plot(errors, [row.evaluations if counted else row.steps for row in rows], **style)
         _mark_model(left, right, rows, f"C{i}")
     for axes in (left, right):
@@ -59,10 +62,12 @@ def work_precision_figure(found: WorkPrecision, *, cost: str = "run") -> Figure:
         _mark_floor(axes, found.disagreement)
     left.set(ylabel=_LABELS[cost].format(lanes=found.lanes), title="Time: lower left is better")
     right.set(ylabel="evaluations of the field [1]" if counted else "steps [1]", title="Work")
-    left.legend(fontsize=8)
-    figure.suptitle(f"{found.problem}: {found.observable}", fontsize=11)
+    if any(row.model for row in found.rows):
+        handles += left.plot([], [], color=GREY, ls=":", label="error of the model")
+    left.legend(handles=handles, fontsize=8)
+    figure.suptitle(f"{found.problem}: {found.observable} {found.when}", fontsize=11)
     if failures:
-        figure.supxlabel("\n".join(failures), fontsize=7, color="C3", x=0.01, ha="left")
+        figure.supxlabel("\n".join(failures), fontsize=7, color=RED, x=0.01, ha="left")
     return figure
 
 
