@@ -141,7 +141,7 @@ def test_files_that_are_something_else(found: WorkPrecision, tmp_path: Path) -> 
 def test_the_figure_shows_every_method(found: WorkPrecision) -> None:
     figure = found.plot()
     left, right = figure.axes
-    labels = [text.get_text() for text in left.get_legend().get_texts()]
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels == ["Rodas5P", "Tsit5", "wide", "narrow", "Euler (1 of 2 failed)", "error of the model"]
     assert "failed: Euler, dt = 0.1 s: SimulationError" in figure.get_supxlabel()
     assert "[ms]" in left.get_ylabel()
@@ -218,11 +218,12 @@ def test_formulations() -> None:
     found = jms.formulations(scene, width=1e-3, sigma0=1e5, sigma1=3.0)
     assert list(found) == ["Regularized", "DeadZone", "LuGre"]
     assert not any(other.exact for other in found.values())
-    one, two, three = found["LuGre"].effects
+    one, two, three = (effect for effect in found["LuGre"].effects if isinstance(effect, jms.Friction))
     assert isinstance(one.law, jms.LuGre)
     assert (float(one.law.Fs), float(one.law.vs), float(one.law.sigma1)) == (1.5, 1e-3, 3.0)
     assert isinstance(two.law, jms.Viscous)
-    assert (float(three.law.vs), float(three.law.sigma2), float(three.belt_velocity)) == (0.2, 0.3, 0.2)
+    assert isinstance(three.law, jms.LuGre)
+    assert (float(three.law.vs), float(three.law.sigma2), float(jnp.asarray(three.belt_velocity))) == (0.2, 0.3, 0.2)
     assert set(jms.formulations(scene, width=1e-3)) == {"Regularized", "DeadZone"}
     with pytest.raises(ValueError, match="Gaussian Stribeck"):
         jms.formulations(

@@ -244,13 +244,18 @@ def _prepared(name: str, method: Method, scene: Scene, question: Question, lanes
         run = question.run(scene, start, setting, throw=False, **options)
         return run.q, run.qd, run.code
 
+    def run(setting: dict[str, float]) -> Trajectory:
+        done = question.run(scene, start, setting, **options)
+        done.q.block_until_ready()
+        return done
+
     x = {name: jnp.asarray(value, dtype) for name, value in question.values.items()}
     batch = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (lanes, *leaf.shape)), start)
     many = jax.jit(jax.vmap(end, in_axes=(0, None, None)))
     forward = jax.jit(jax.jacfwd(partial(question.last, adjoint=dfx.ForwardMode(), **options)))
     reverse = jax.jit(jax.grad(partial(question.last, **options)))
     calls = {
-        "run": lambda setting: jax.block_until_ready(question.run(scene, start, setting, **options)),
+        "run": run,
         "vmap": lambda setting: jax.block_until_ready(many(batch, scene, setting)),
         "forward": lambda setting: jax.block_until_ready(forward(x, scene, start, setting)),
         "reverse": lambda setting: jax.block_until_ready(reverse(x, scene, start, setting)),

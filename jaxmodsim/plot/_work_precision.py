@@ -36,7 +36,7 @@ def work_precision_figure(found: WorkPrecision, *, cost: str = "run") -> Figure:
         raise ValueError(f"cost is {cost!r}, but measured were: {', '.join(found.costs)}.")
     failures = _failures(found)
     height = 4.4 + 0.2 * len(failures)
-    figure = Figure(figsize=(10, height), layout="constrained")
+    figure = Figure(figsize=(11.5, height), layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True)
     counted = all(row.evaluations is not None for row in found.rows if not row.failed)
     methods, handles = dict.fromkeys(row.method for row in found.rows), []
@@ -64,7 +64,7 @@ def work_precision_figure(found: WorkPrecision, *, cost: str = "run") -> Figure:
     right.set(ylabel="evaluations of the field [1]" if counted else "steps [1]", title="Work")
     if any(row.model for row in found.rows):
         handles += left.plot([], [], color=GREY, ls=":", label="error of the model")
-    left.legend(handles=handles, fontsize=8)
+    figure.legend(handles=handles, fontsize=8, loc="outside right upper")
     figure.suptitle(f"{found.problem}: {found.observable} {found.when}", fontsize=11)
     if failures:
         figure.supxlabel("\n".join(failures), fontsize=7, color=RED, x=0.01, ha="left")
