@@ -53,11 +53,15 @@ if TYPE_CHECKING:
     from . import sweeps as sweeps
     from .analysis import EnergyAudit as EnergyAudit
     from .analysis import GradientCheck as GradientCheck
+    from .analysis import Method as Method
     from .analysis import Sensitivity as Sensitivity
+    from .analysis import WorkPrecision as WorkPrecision
     from .analysis import check_gradients as check_gradients
     from .analysis import cyclic_coordinates as cyclic_coordinates
     from .analysis import energy_audit as energy_audit
+    from .analysis import formulations as formulations
     from .analysis import sensitivity as sensitivity
+    from .analysis import work_precision as work_precision
     from .export import to_modelica as to_modelica
     from .export import to_mujoco as to_mujoco
     from .identify import FitResult as FitResult
@@ -72,11 +76,15 @@ _LATER = {
     "analysis": (
         "EnergyAudit",
         "GradientCheck",
+        "Method",
         "Sensitivity",
+        "WorkPrecision",
         "check_gradients",
         "cyclic_coordinates",
         "energy_audit",
+        "formulations",
         "sensitivity",
+        "work_precision",
     ),
     "behaviour": (),
     "export": ("to_modelica", "to_mujoco"),

@@ -19,7 +19,7 @@ ALLOWED: dict[str, set[str]] = {layer: set(_CORE[:i]) for i, layer in enumerate(
 ALLOWED["problems"] = {"numerics", "mechanics", "friction", "effects", "scene"}
 ALLOWED["export"] = {"numerics", "friction"}
 ALLOWED["features"] = set(_CORE)
-ALLOWED["analysis"] = set(_CORE)
+ALLOWED["analysis"] = {*_CORE, "problems"}
 ALLOWED["identify"] = set(_CORE)
 ALLOWED["sweeps"] = {*_CORE, "features"}
 ALLOWED["behaviour"] = set(_CORE)
@@ -33,7 +33,10 @@ PUBLIC = {name for name in dir(jaxmodsim) if not name.startswith("_")}
 # The command line imports inside its commands, so that `--help` does not wait for JAX.
 LAZY_IMPORTS = {"cli"}
 # Single files that do, what they import, and why.
-LAZY_FILES = {"identify/_result.py": ("plot", "FitResult.plot draws itself; matplotlib is loaded when it is called")}
+LAZY_FILES = {
+    "identify/_result.py": ("plot", "FitResult.plot draws itself; matplotlib is loaded when it is called"),
+    "analysis/_work_rows.py": ("plot", "WorkPrecision.plot likewise"),
+}
 
 MAX_FILE_LINES = 500
 MAX_FUNCTION_LINES = 80

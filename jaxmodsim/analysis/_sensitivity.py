@@ -132,19 +132,19 @@ def sensitivity(
             )
     if mode not in (None, *_MODES):
         raise ValueError(f"mode must be 'forward', 'reverse' or left out for the cheaper one, but {mode!r} was given.")
-    values = _chosen(scene, q0, qd0, wrt)
+    values = chosen_numbers(scene, q0, qd0, wrt)
     run = simulate(scene, q0, qd0, t1, ts=ts, **options)
     if run.modes is not None:  # a traced run would hold room for all events that are allowed
         options["max_events"] = run.log_size
-    observe, label, unit = _observable(observable)
-    y = _observed(observe(run))
+    observe, label, unit = observable_of(observable)
+    y = observed(observe(run))
     if mode is None:
         forward, reverse = _FORWARD + _PER_PARAMETER * len(values), _REVERSE + _PER_OUTPUT * y.size
         mode = "forward" if forward <= reverse else "reverse"
     adjoint = dfx.ForwardMode() if mode == "forward" else None
 
     def at(x: dict[str, Array]) -> Array:
-        changed, start = _replaced(scene, {"q0": run.problem.q0, "qd0": run.problem.qd0}, x)
+        changed, start = with_values(scene, {"q0": run.problem.q0, "qd0": run.problem.qd0}, x)
         return jnp.asarray(observe(simulate(changed, **start, t1=t1, ts=ts, adjoint=adjoint, throw=False, **options)))
 
     differentiate = jax.jacfwd if mode == "forward" else jax.jacrev
@@ -159,7 +159,7 @@ def sensitivity(
     return Sensitivity(label, unit, run.t, y, values, units, derivatives, normalised, ranking, mode, remarks)
 
 
-def _chosen(scene: Scene, q0: Any, qd0: Any, wrt: Sequence[str] | str | None) -> dict[str, float]:
+def chosen_numbers(scene: Scene, q0: Any, qd0: Any, wrt: Sequence[str] | str | None) -> dict[str, float]:
     """The parameters and their values, by name."""
     known = {name: read_element(scene, name) for name in elements(scene)}
     numbers, ranges = scene_numbers(scene), scene_ranges(scene)
@@ -187,7 +187,7 @@ def _chosen(scene: Scene, q0: Any, qd0: Any, wrt: Sequence[str] | str | None) ->
     return {name: known[name] for name in chosen}
 
 
-def _replaced(scene: Scene, start: dict[str, Any], x: Mapping[str, Array]) -> tuple[Scene, dict[str, Array]]:
+def with_values(scene: Scene, start: dict[str, Any], x: Mapping[str, Array]) -> tuple[Scene, dict[str, Array]]:
     """Scene and initial state with the parameters `x`."""
     known = elements(scene)
     start = {name: jnp.asarray(value) for name, value in start.items()}
@@ -198,7 +198,7 @@ def _replaced(scene: Scene, start: dict[str, Any], x: Mapping[str, Array]) -> tu
     return replace_elements(scene, {name: value for name, value in x.items() if name in known}), start
 
 
-def _observable(observable: Any) -> tuple[Callable[[Trajectory], Any], str, str]:
+def observable_of(observable: Any) -> tuple[Callable[[Trajectory], Any], str, str]:
     """What is observed, its label and its unit."""
     if isinstance(observable, str):
         return partial(named_series, name=observable), observable, named_unit(observable)
@@ -211,7 +211,7 @@ def _observable(observable: Any) -> tuple[Callable[[Trajectory], Any], str, str]
     return observable, "observable" if name == "<lambda>" else name, ""
 
 
-def _observed(y: Any) -> Array:
+def observed(y: Any) -> Array:
     """What the observable gave, if that can be differentiated."""
     dtype, shape = getattr(y, "dtype", None), getattr(y, "shape", None)
     if dtype is None or shape is None or not jnp.issubdtype(dtype, jnp.floating) or len(shape) > 1 or 0 in shape:

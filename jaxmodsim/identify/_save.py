@@ -8,11 +8,11 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..numerics import written_whole
 from ._causes import Cause
 from ._record import Record
 
@@ -27,20 +27,10 @@ def write_fields(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> Non
     body = {name: _packed(x, name, arrays) for name, x in fields.items() if name not in _LEFT_OUT}
     head = {"kind": _KIND, "format": _VERSION, "jaxmodsim": metadata.version("jaxmodsim")}
     text = json.dumps({**head, "fields": body}, indent=1, allow_nan=False)
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        with open(temporary, "xb") as file:
-            with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-                archive.writestr(_TEXT, text)
-                for name, array in arrays.items():
-                    archive.writestr(f"{name}.npy", _bytes(array))
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with written_whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(_TEXT, text)
+        for name, array in arrays.items():
+            archive.writestr(f"{name}.npy", _bytes(array))
 
 
 def read_fields(path: str | os.PathLike[str], names: tuple[str, ...]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from ._collocation import collocation_start as collocation_start
 from ._collocation import collocation_step as collocation_step
 from ._cores import cores as cores
 from ._depends import depends as depends
+from ._files import written_whole as written_whole
 from ._function import Function as Function
 from ._function import as_function as as_function
 from ._linalg import MAX_UNROLLED_CHOLESKY as MAX_UNROLLED_CHOLESKY
@@ -33,6 +34,9 @@ from ._numbers import ranges_of as ranges_of
 from ._numbers import vector_parameter as vector_parameter
 from ._once import once as once
 from ._once import unit_of as unit_of
+from ._origin import commit as commit
+from ._origin import describe_machine as describe_machine
+from ._origin import versions as versions
 from ._place import Amount as Amount
 from ._place import Place as Place
 from ._place import as_amount as as_amount
@@ -54,6 +58,7 @@ from ._signal import sample_times as sample_times
 from ._signal import signals_at as signals_at
 from ._signal import signals_from as signals_from
 from ._signal import signals_of as signals_of
+from ._timing import measure as measure
 from ._varying import Varying as Varying
 from ._varying import nominal as nominal
 from ._varying import settle as settle

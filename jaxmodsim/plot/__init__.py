@@ -17,3 +17,4 @@ from ._sensitivity import sensitivity_figure as sensitivity_figure
 from ._testbench import RampRun as RampRun
 from ._testbench import ramp_figure as ramp_figure
 from ._testbench import stick_figure as stick_figure
+from ._work_precision import work_precision_figure as work_precision_figure

@@ -11,6 +11,7 @@ from ._belt import belt_coulomb as belt_coulomb
 from ._belt import belt_onset_speed as belt_onset_speed
 from ._belt import belt_oscillator as belt_oscillator
 from ._belt import belt_oscillator_cycle as belt_oscillator_cycle
+from ._belt import belt_oscillator_motion as belt_oscillator_motion
 from ._belt import belt_stribeck as belt_stribeck
 from ._belts import COUPLED_BELTS as COUPLED_BELTS
 from ._belts import COUPLED_BELTS_LAWS as COUPLED_BELTS_LAWS
@@ -53,9 +54,16 @@ from ._knife_edge import knife_edge as knife_edge
 from ._knife_edge import knife_edge_acceleration as knife_edge_acceleration
 from ._knife_edge import knife_edge_force as knife_edge_force
 from ._knife_edge import knife_edge_motion as knife_edge_motion
+from ._named import Case as Case
+from ._named import named_problems as named_problems
 from ._pendulum import spherical_pendulum as spherical_pendulum
 from ._pendulum import spherical_pendulum_acceleration as spherical_pendulum_acceleration
+from ._pendulum import spherical_pendulum_motion as spherical_pendulum_motion
 from ._pendulum import spherical_pendulum_reaction as spherical_pendulum_reaction
+from ._pulled_box import PULLED_BOX as PULLED_BOX
+from ._pulled_box import PULLED_BOX_LUGRE as PULLED_BOX_LUGRE
+from ._pulled_box import pulled_box as pulled_box
+from ._pulled_box import pulled_box_lugre as pulled_box_lugre
 from ._rod_on_floor import ROD_ON_ROUGH_FLOOR as ROD_ON_ROUGH_FLOOR
 from ._rod_on_floor import rod_on_rough_floor as rod_on_rough_floor
 from ._rod_on_floor import rod_on_rough_floor_acceleration as rod_on_rough_floor_acceleration

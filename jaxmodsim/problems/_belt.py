@@ -103,6 +103,26 @@ def belt_oscillator_cycle(*, m: ArrayLike, k: ArrayLike, belt: ArrayLike, Fc: Ar
     return BeltCycle(stick + slip, stick, slip, middle + d, middle - d, middle - reach, middle + reach)
 
 
+def belt_oscillator_motion(
+    t: Float[Array, "..."], *, m: ArrayLike, k: ArrayLike, belt: ArrayLike, Fc: ArrayLike, Fs: ArrayLike
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Position [m] and velocity [m/s] at the times `t` [s], started in stick from q = 0 at t = 0; shape as `t`.
+
+    The cycle of `belt_oscillator_cycle` from the first slip, at `Fs/(k belt)`, on; until then the mass goes with the
+    belt. Arguments as there, t >= 0.
+    """
+    cycle = belt_oscillator_cycle(m=m, k=k, belt=belt, Fc=Fc, Fs=Fs)
+    w, middle = jnp.sqrt(k / jnp.asarray(m)), Fc / jnp.asarray(k)
+    since = t - cycle.begins / belt
+    phase = jnp.where(since > 0, since % cycle.period, since)
+    slips = (phase > 0) & (phase < cycle.slip)
+    place = middle + (cycle.begins - middle) * jnp.cos(w * phase) + belt / w * jnp.sin(w * phase)
+    speed = belt * jnp.cos(w * phase) - (cycle.begins - middle) * w * jnp.sin(w * phase)
+    # In stick, counted from the slip that follows.
+    carried = cycle.begins + belt * jnp.where(since > 0, phase - cycle.period, since)
+    return jnp.where(slips, place, carried), jnp.where(slips, speed, belt)
+
+
 def belt_onset_speed(*, m: ArrayLike, k: ArrayLike, c: ArrayLike, Fc: ArrayLike, Fs: ArrayLike) -> Float[Array, "..."]:
     """Velocity of the belt [m/s] below which `belt_oscillator` with a damper sticks and slips for ever.
 

@@ -1,7 +1,9 @@
 """The spherical pendulum: a point mass that slides without friction on a sphere."""
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
+from scipy.special import ellipj
 
 from ..scene import Scene
 
@@ -64,3 +66,34 @@ def spherical_pendulum_reaction(
     `spherical_pendulum`, coordinates and rates as for `spherical_pendulum_acceleration`.
     """
     return jnp.asarray(m) * (g * jnp.cos(q[0]) - R * qd[0] ** 2 - R * (jnp.sin(q[0]) * qd[1]) ** 2)
+
+
+def spherical_pendulum_motion(
+    t: Float[np.ndarray, "..."] | float, phi: float, turn: float, *, R: float = 1.0, g: float = 9.81
+) -> Float[np.ndarray, "..."]:
+    """Angle phi [rad] at the times `t` [s], from a turning point at t = 0, in closed form; NumPy, float64.
+
+    With u = cos(phi), c = g/R and `l = sin(phi)^2 theta'` [1/s], energy and angular momentum give
+    `u'^2 = 2 c (u - a) (u - b) (u - w)`, whose root `a` is the u of the start and whose others obey, with
+    `s = l^2/(2 c (1 - a^2))`, `x^2 - s x - 1 - a s = 0`; the larger, w, is above 1. Between a and b it swings as
+    `u = b + (a - b) cn(n t)^2/dn(n t)^2` if the start is the upper turning point (a > b), and as
+    `u = a + (b - a) sn(n t)^2` if it is the lower one, where with the lower one, a', and the upper one, b',
+    `n = sqrt(c (w - a')/2)`, and the parameter of Jacobi's functions is `(b' - a')/(w - a')` (E. T. Whittaker, A
+    Treatise on the Analytical Dynamics of Particles and Rigid Bodies, section 55).
+
+    **Arguments:**
+
+    - `t`: times [s].
+    - `phi`: angle from the +z axis at t = 0 [rad], where phi' = 0; 0 < phi < pi.
+    - `turn`: theta' at t = 0 [rad/s], not zero.
+    - `R`: radius [m], > 0.
+    - `g`: gravity [m/s^2], > 0.
+    """
+    start, c = np.cos(phi), g / R
+    share = (turn * np.sin(phi)) ** 2 / (2.0 * c)
+    root = np.sqrt(0.25 * share**2 + 1.0 + start * share)
+    other, beyond = 0.5 * share - root, 0.5 * share + root
+    low, high = min(start, other), max(start, other)
+    sn, cn, dn, _ = ellipj(np.sqrt(0.5 * c * (beyond - low)) * np.asarray(t), (high - low) / (beyond - low))
+    swung = (cn / dn) ** 2 if start > other else sn**2
+    return np.asarray(np.arccos(low + (high - low) * swung))

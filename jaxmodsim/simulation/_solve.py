@@ -32,9 +32,9 @@ _REST = 1e-3
 # Part of its limit by which a sticking element's force may exceed it at a saved time, for the error of dense output.
 _OVERLOAD = 1e-2
 
-# Gains of the step size control, proportional and integral: diffrax's own, and those for Rosenbrock methods. Of 16 pairs
-# on four problems (LuGre's box, the 1995 set on a spring, the belt oscillator, the spherical pendulum; tolerances of
-# 1e-4 to 1e-8) these made about half of the error in as many steps, with a third fewer of them rejected.
+# Gains of the step size control, proportional and integral: diffrax's own, and those for Rosenbrock methods. Of 16
+# pairs on four problems (LuGre's box, the 1995 set on a spring, the belt oscillator, the spherical pendulum;
+# tolerances of 1e-4 to 1e-8) these made about half of the error in as many steps, with a third fewer of them rejected.
 _GAINS = (0.0, 1.0)
 _ROSENBROCK_GAINS = (0.25, 0.5)
 

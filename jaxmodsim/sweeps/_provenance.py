@@ -1,16 +1,14 @@
 """Where numbers come from: what was asked, of what code, by which versions."""
 
 import hashlib
-import importlib.metadata
-import os
-import subprocess
-from functools import cache, lru_cache
+from functools import cache
 from typing import Any
 
 import jax
 import jax.tree_util as jtu
 import numpy as np
 
+from ..numerics import versions
 from ..scene import scene_numbers
 from ..simulation import default_solver
 from ._compute import Work, program
@@ -38,7 +36,7 @@ def provenance(request: Request, work: Work, extent: tuple[int, ...]) -> dict[st
         },
         "options": {name: repr(value) for name, value in sorted(choices.items())},
         "program": program(work.lane, work.fixed, request.grid.first),
-        "versions": versions(),
+        "versions": package_versions(),
         "backend": jax.default_backend(),
         "chunks": list(extent),
         "lanes in a group": work.group,
@@ -46,9 +44,9 @@ def provenance(request: Request, work: Work, extent: tuple[int, ...]) -> dict[st
 
 
 @cache
-def versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """Versions of the packages that numbers depend on."""
-    return {name: importlib.metadata.version(name) for name in _PACKAGES}
+    return versions(*_PACKAGES)
 
 
 def describe(request: Request) -> str:
@@ -69,26 +67,6 @@ def solver_of(request: Request) -> str:
     scene, arguments = request.fixed
     chosen = dict(getattr(request.lane, "choices", ())).get("solver")
     return repr(default_solver(scene, np.size(arguments["q0"]), "dt" in arguments) if chosen is None else chosen)
-
-
-def commit() -> str:
-    """The commit of the repository in the working directory, if it is one, and whether there are changes beside it."""
-    return _commit(os.getcwd())
-
-
-# Looked up once: code, too, is loaded once.
-@lru_cache(maxsize=4)
-def _commit(folder: str) -> str:
-    try:
-        head, state = (
-            subprocess.run(
-                ["git", *words], cwd=folder, capture_output=True, text=True, check=True, timeout=20
-            ).stdout.strip()
-            for words in (("rev-parse", "HEAD"), ("status", "--porcelain", "--untracked-files=no"))
-        )
-    except (OSError, subprocess.SubprocessError):
-        return ""
-    return head + (" with uncommitted changes" if state else "")
 
 
 def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:

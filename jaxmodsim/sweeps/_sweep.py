@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
+from ..numerics import commit
 from ..scene import Scene
 from ._compute import GROUP, Work, lanes_of_call
 from ._execute import Task, elsewhere, in_threads
@@ -20,7 +21,7 @@ from ._grid import Blocks, blocks, grid
 from ._layout import layout
 from ._plan import Prediction, plan
 from ._progress import Progress, SweepProgress, reporter
-from ._provenance import commit, describe, provenance, solver_of, versions
+from ._provenance import describe, package_versions, provenance, solver_of
 from ._request import Request, request
 from ._results import AbstractResults, Memory, Store
 
@@ -154,7 +155,7 @@ def _results(asked: Request, work: Work, cut: Blocks, out: Any) -> AbstractResul
     attrs = {
         "system": describe(asked),
         "solver": solver_of(asked),
-        "made_by": f"jaxmodsim {versions()['jaxmodsim']}",
+        "made_by": f"jaxmodsim {package_versions()['jaxmodsim']}",
         "commit": commit(),
     }
     about = provenance(asked, work, cut.extent)

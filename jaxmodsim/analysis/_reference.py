@@ -1,0 +1,184 @@
+"""What the runs of a problem converge to: the reference that errors are measured against."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..scene import Scene
+from ..simulation import SimulationError, Trajectory, simulate
+from ..solvers import Rodas5P
+from ._sensitivity import observed, with_values
+
+# Absolute tolerance for a relative one, as in the defaults of `simulate`.
+ATOL = 1e-3
+# Steps that a reference may take, in those that a method may.
+_PATIENCE = 20
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked of every run.
+
+    - `q0`, `qd0`, `t1`, `ts`: as for `simulate`.
+    - `observe`, `label`, `unit`: the observable.
+    - `values`: of the numbers by which the last value of the observable is differentiated.
+    - `max_steps`: limit of a run.
+    """
+
+    q0: np.ndarray
+    qd0: np.ndarray
+    t1: float
+    ts: np.ndarray | None
+    observe: Callable[[Trajectory], Any]
+    label: str
+    unit: str
+    values: dict[str, float]
+    max_steps: int
+
+    def start(self, dtype: Any) -> dict[str, Array]:
+        """Initial coordinates and velocities in a floating type."""
+        return {"q0": jnp.asarray(self.q0, dtype), "qd0": jnp.asarray(self.qd0, dtype)}
+
+    def run(self, scene: Scene, start: dict[str, Array], setting: dict[str, Any], **options: Any) -> Trajectory:
+        """A run; `setting` holds tolerances or a step."""
+        return simulate(scene, **start, t1=self.t1, ts=self.ts, **{"max_steps": self.max_steps, **setting, **options})
+
+    def last(self, x: dict[str, Array], scene: Scene, start: Any, setting: dict[str, Any], **options: Any) -> Array:
+        """The last value of the observable, as a function of the numbers `x`."""
+        scene, start = with_values(scene, start, x)
+        return jnp.ravel(self.observe(self.run(scene, start, setting, throw=False, **options)))[-1]
+
+
+class Happened(NamedTuple):
+    """Mode changes of a run: when [s], of which effect, and into which mode."""
+
+    t: Float[np.ndarray, " events"]
+    what: Int[np.ndarray, "events 2"]
+
+
+class Limit(NamedTuple):
+    """What runs of a scene converge to.
+
+    - `y`: the observable.
+    - `events`: mode changes; None of a scene that has none.
+    - `gradient`: of the observable's last value, by name; None where it is not asked for.
+    - `disagreement`: of the observable between two references, relative to its scale; `events_disagreement` [s] and
+      `gradient_disagreement` likewise, zero where there is nothing to compare.
+    - `how`: how it was found, in words.
+    """
+
+    y: np.ndarray
+    events: Happened | None
+    gradient: dict[str, float] | None
+    disagreement: float
+    events_disagreement: float
+    gradient_disagreement: float
+    how: str
+
+
+def in_type(scene: Scene, dtype: Any) -> Scene:
+    """The scene with all its numbers in a floating type."""
+    return jtu.tree_map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, scene)
+
+
+def happened(run: Trajectory) -> Happened | None:
+    """Mode changes of a run; None where there are no modes."""
+    if run.modes is None:
+        return None
+    events = run.events
+    there = np.isfinite(events.t)
+    return Happened(np.asarray(events.t)[there], np.stack([events.effect, events.after], axis=1)[there])
+
+
+def event_error(one: Happened, other: Happened) -> float | None:
+    """Largest difference of times [s]; None where other events happened."""
+    if one.what.shape != other.what.shape or (one.what != other.what).any():
+        return None
+    return float(np.max(np.abs(one.t - other.t), initial=0.0))
+
+
+def gradient_error(one: dict[str, float], other: dict[str, float]) -> float:
+    """Largest relative difference of a derivative, of those that are not zero."""
+    return max(abs(one[name] - x) / (abs(x) or 1.0) for name, x in other.items())
+
+
+def scale_of(y: np.ndarray) -> float:
+    """Largest magnitude, or one."""
+    return float(np.max(np.abs(y))) or 1.0
+
+
+def converged(
+    scene: Scene, question: Question, rtol: float, *, closed: np.ndarray | None, scale: float | None, agreement: float
+) -> Limit:
+    """Runs of two solvers at a tight tolerance, or one beside a closed form, that must agree.
+
+    **Raises:**
+
+    - `RuntimeError` if they disagree by more than `agreement`, or a run fails.
+    """
+    scene, stiff = in_type(scene, jnp.float64), any(effect.stiff for effect in scene.effects)
+    solvers: tuple[Any, ...] = (Rodas5P(), dfx.Tsit5() if scene.exact or stiff else dfx.Dopri8())
+    if closed is not None and not scene.exact and not question.values:
+        solvers = solvers[:1]
+    found = [_tight(scene, question, solver, rtol) for solver in solvers]
+    names = [f"{type(solver).__name__} at rtol = {rtol:.0e}" for solver in solvers]
+    ys = [y for y, _, _ in found]
+    if closed is not None:
+        if closed.size != ys[0].size:
+            raise ValueError(
+                f"reference has the shape {closed.shape}, but {question.label} has the shape {ys[0].shape}."
+            )
+        ys, how = [np.reshape(closed, ys[0].shape), ys[0]], ["the closed form", names[0]]
+    else:
+        how = names
+    scale = scale_of(ys[0]) if scale is None else scale
+    apart = np.abs(ys[0] - ys[1])
+    disagreement = float(apart.max()) / scale
+    if not disagreement <= agreement:
+        at = int(np.argmax(apart))
+        raise RuntimeError(
+            f"The references disagree: {question.label} is {np.ravel(ys[0])[at]:.12g} by {how[0]} and"
+            f" {np.ravel(ys[1])[at]:.12g} by {how[1]}, {disagreement:.1e} of its scale, where {agreement:.1e} is"
+            " allowed. End earlier if the motion is chaotic, ask for looser tolerances, pass a closed form as"
+            " reference, or allow more by agreement."
+        )
+    events, other = found[0][1], found[-1][1]
+    times = None if events is None or other is None else event_error(events, other)
+    gradient, second = found[0][2], found[-1][2]
+    return Limit(
+        ys[0],
+        events if times is not None else None,
+        gradient,
+        disagreement,
+        times or 0.0,
+        0.0 if gradient is None or second is None else gradient_error(gradient, second),
+        " and ".join(how),
+    )
+
+
+def _tight(
+    scene: Scene, question: Question, solver: Any, rtol: float
+) -> tuple[np.ndarray, Happened | None, dict[str, float] | None]:
+    """Observable, mode changes and gradient at a tight tolerance."""
+    setting, start = {"rtol": rtol, "atol": ATOL * rtol}, question.start(jnp.float64)
+    options = {"solver": solver, "max_steps": _PATIENCE * question.max_steps}
+    try:
+        run = question.run(scene, start, setting, **options)
+    except SimulationError as error:
+        raise RuntimeError(
+            f"The reference by {type(solver).__name__} at rtol = {rtol:.0e} failed: {error} Its limit of steps is"
+            f" {_PATIENCE} times max_steps."
+        ) from error
+    y, gradient = np.asarray(observed(question.observe(run))), None
+    if question.values:
+        x = {name: jnp.asarray(value, jnp.float64) for name, value in question.values.items()}
+        found = jax.jacfwd(question.last)(x, scene, start, setting, adjoint=dfx.ForwardMode(), **options)
+        gradient = {name: float(found[name]) for name in question.values}
+    return y, happened(run), gradient

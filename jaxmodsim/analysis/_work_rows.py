@@ -1,0 +1,281 @@
+"""What `work_precision` gives: rows, a table, a figure, a file."""
+
+import importlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..numerics import written_whole
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_KIND, _VERSION = "jaxmodsim work precision", 1
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Time of a call [s]: what compiling it took, then median and quartiles of warm ones.
+
+    `compile` is what the first call of the method took beyond a warm one; next to nothing where this process has
+    compiled the same before.
+    """
+
+    compile: float
+    median: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method at one setting. None stands for what does not apply.
+
+    - `method`: its name.
+    - `rtol` or `dt`: the relative tolerance, or the fixed step [s].
+    - `dtype`: floating type of the run.
+    - `failed`: why there is no result; empty where there is one.
+    - `error`: largest error of the observable over the saved times, relative to its scale. Of this `numerical` is the
+      distance from what the formulation itself converges to, and `model` that limit's distance from the reference.
+    - `events`: largest error of the time of an event [s], where the same events happen as in the reference.
+    - `gradient`: largest relative error of a derivative of the observable's last value.
+    - `steps`, `rejected`: all steps, and how many of them were rejected.
+    - `evaluations`: of the vector field, by the stages of all steps; None for methods that iterate.
+    - `times`: a `Timing` for each of the costs: `run`, `vmap` (for each lane), `forward`, `reverse`.
+    - `remarks`: in sentences.
+    """
+
+    method: str
+    rtol: float | None
+    dt: float | None
+    dtype: str
+    failed: str = ""
+    error: float | None = None
+    numerical: float | None = None
+    model: float | None = None
+    events: float | None = None
+    gradient: float | None = None
+    steps: int | None = None
+    rejected: int | None = None
+    evaluations: int | None = None
+    times: dict[str, Timing] | None = None
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def setting(self) -> str:
+        """Tolerance or step in words."""
+        return f"rtol = {self.rtol:.0e}" if self.dt is None else f"dt = {self.dt:.3g} s"
+
+    def time(self, cost: str = "run") -> float:
+        """Median time [s] of a cost; NaN where it was not measured."""
+        timing = (self.times or {}).get(cost)
+        return float("nan") if timing is None else timing.median
+
+
+@dataclass(frozen=True)
+class WorkPrecision:
+    """Error against work, method by method; print it, draw it, keep it.
+
+    - `problem`: what was run, in words; `observable`, `unit`, `when`: what was asked of it; `scale`: what errors of it
+      are relative to, in that unit.
+    - `reference`: how the reference was found. `disagreement`: of the references, relative to the scale; errors below
+      it say no more than that they are. `events_disagreement` [s], `gradient_disagreement`: likewise.
+    - `costs`: what was timed; `lanes`: of the vmap.
+    - `rows`: a `Row` for each method and setting, failures among them.
+    - `machine`: processor, versions, date, commit.
+    """
+
+    problem: str
+    observable: str
+    unit: str
+    when: str
+    scale: float
+    reference: str
+    disagreement: float
+    events_disagreement: float
+    gradient_disagreement: float
+    costs: tuple[str, ...]
+    lanes: int
+    rows: tuple[Row, ...]
+    machine: dict[str, Any]
+
+    def cheapest(self, error: float, *, cost: str = "run") -> Row:
+        """The row with the least time among those whose error is no larger.
+
+        **Arguments:**
+
+        - `error`: relative to the scale, > 0.
+        - `cost`: one of `costs`.
+
+        **Raises:**
+
+        - `ValueError` if no row is that exact; it says which one comes next. Or if the cost was not measured, or the
+          error is below what the references can tell.
+        """
+        if cost not in self.costs:
+            raise ValueError(f"cost is {cost!r}, but measured were: {', '.join(self.costs)}.")
+        done = [row for row in self.rows if row.error is not None]
+        if not done:
+            raise ValueError("Every method failed: " + "; ".join(f"{row.method}: {row.failed}" for row in self.rows))
+        if not error >= self.disagreement:
+            raise ValueError(
+                f"error = {error:.1e} is below {self.disagreement:.1e}, by which the references disagree: no row can"
+                " be shown to be that exact."
+            )
+        enough = [row for row in done if row.error is not None and row.error <= error]
+        if not enough:
+            best = min(done, key=lambda row: row.error if row.error is not None else float("inf"))
+            raise ValueError(
+                f"No row has an error of {error:.1e} or less: the best is {best.error:.1e}, of {best.method} at"
+                f" {best.setting}. Ask for tighter tolerances or shorter steps."
+            )
+        return min(enough, key=lambda row: row.time(cost))
+
+    def table(self) -> "pd.DataFrame":
+        """The rows as a pandas `DataFrame`, for sorting and files.
+
+        **Raises:**
+
+        - `ImportError` if pandas is not installed.
+        """
+        try:
+            pandas = importlib.import_module("pandas")
+        except ModuleNotFoundError as error:
+            raise ImportError('table needs pandas: pip install "jaxmodsim[cli]".') from error
+        return pandas.DataFrame([_columns(row, self.costs) for row in self.rows])
+
+    def plot(self, cost: str = "run") -> Any:
+        """Work-precision diagram: time, and evaluations or steps, over the error.
+
+        **Returns:**
+
+        A `matplotlib.figure.Figure`, as `jaxmodsim.plot.work_precision_figure` draws it.
+
+        **Raises:**
+
+        - `ValueError` if the cost was not measured.
+        """
+        from ..plot import work_precision_figure
+
+        return work_precision_figure(self, cost=cost)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write all of it as JSON, whole or not at all; `load_work_precision` reads it.
+
+        **Raises:**
+
+        - `OSError` if the file cannot be written.
+        """
+        head = {"kind": _KIND, "format": _VERSION}
+        text = json.dumps(head | asdict(self), indent=1, allow_nan=False)
+        with written_whole(path) as file:
+            file.write(text.encode() + b"\n")
+
+    def __str__(self) -> str:
+        """A table, and what it is about."""
+        heads = ["method", "setting", "error", "numerical", "model", "events [s]", "gradient", "steps", "evaluations"]
+        heads += [f"{_COSTS[cost]} [ms]" for cost in self.costs] + ["compile [s]"]
+        floors = {"error": self.disagreement, "numerical": self.disagreement, "model": self.disagreement}
+        floors |= {"events [s]": self.events_disagreement, "gradient": self.gradient_disagreement}
+        cells = [[_cell(row, head, floors, self.costs) for head in heads] for row in self.rows if not row.failed]
+        kept = [i for i, _ in enumerate(heads) if any(line[i] for line in cells)]
+        lines = [[heads[i] for i in kept], *([line[i] for i in kept] for line in cells)]
+        unit = f" {self.unit}" if self.unit else ""
+        return "\n".join(
+            [
+                f"{self.problem}: {self.observable} {self.when}, errors relative to {self.scale:.4g}{unit}",
+                *_aligned(lines),
+                *(f"failed: {row.method} at {row.setting}: {row.failed}" for row in self.rows if row.failed),
+                *(f"{row.method} at {row.setting}: {remark}" for row in self.rows for remark in row.remarks),
+                f"Reference: {self.reference}, which agree to {self.disagreement:.1e}.",
+            ]
+        )
+
+
+_COSTS = {"run": "run", "vmap": "lane", "forward": "forward", "reverse": "reverse"}
+
+
+def _cell(row: Row, head: str, floors: dict[str, float], costs: Sequence[str]) -> str:
+    if head in ("method", "setting"):
+        return str(getattr(row, head))
+    name = head.split(" ")[0]
+    if name == "compile":
+        return f"{sum(timing.compile for timing in (row.times or {}).values()):.1f}"
+    if name in ("steps", "evaluations"):
+        return str(getattr(row, name) or "")
+    for cost in costs:
+        if head == f"{_COSTS[cost]} [ms]":
+            return f"{1e3 * row.time(cost):.3g}"
+    value = getattr(row, name)
+    if value is None:
+        return ""
+    if value == 0.0 and name == "model":
+        return "0"
+    return f"<{floors[head]:.0e}" if value < floors[head] else f"{value:.1e}"
+
+
+def _aligned(lines: list[list[str]]) -> list[str]:
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+    return [
+        "  ".join(
+            cell.ljust(width) if i < 2 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        )
+        for line in lines
+    ]
+
+
+def _columns(row: Row, costs: Sequence[str]) -> dict[str, Any]:
+    """A row of the table."""
+    columns: dict[str, Any] = {
+        "method": row.method,
+        "rtol": row.rtol,
+        "dt [s]": row.dt,
+        "dtype": row.dtype,
+        "error": row.error,
+        "numerical error": row.numerical,
+        "model error": row.model,
+        "event error [s]": row.events,
+        "gradient error": row.gradient,
+        "steps": row.steps,
+        "rejected": row.rejected,
+        "evaluations": row.evaluations,
+    }
+    for cost in costs:
+        timing = (row.times or {}).get(cost)
+        for name in ("compile", "median", "low", "high"):
+            columns[f"{cost} {name} [s]"] = None if timing is None else getattr(timing, name)
+    return {**columns, "failed": row.failed}
+
+
+def load_work_precision(path: str | os.PathLike[str]) -> WorkPrecision:
+    """Read what `WorkPrecision.save` wrote.
+
+    **Raises:**
+
+    - `ValueError` for a file that is damaged or something else.
+    - `OSError` if it cannot be read.
+    """
+    try:
+        body = json.loads(Path(path).read_bytes())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is damaged, or no JSON: {error}") from error
+    if not isinstance(body, dict) or body.pop("kind", None) != _KIND:
+        raise ValueError(f"{path} was not written by WorkPrecision.save: it does not say {_KIND!r}.")
+    version = body.pop("format", None)
+    if version != _VERSION:
+        raise ValueError(f"{path} has the format {version!r}, but this version reads format {_VERSION}.")
+    try:
+        rows = tuple(_row(row) for row in body.pop("rows"))
+        return WorkPrecision(**{**body, "costs": tuple(body["costs"]), "rows": rows})
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path} is damaged: {error!r}") from error
+
+
+def _row(row: dict[str, Any]) -> Row:
+    times = row["times"]
+    timings = None if times is None else {cost: Timing(**timing) for cost, timing in times.items()}
+    return Row(**{**row, "times": timings, "remarks": tuple(row["remarks"])})

@@ -1,0 +1,76 @@
+"""Side-by-side timing."""
+
+import gc
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+_SLOW = 0.02
+_BURST = 5
+
+
+def measure(calls: dict[str, Callable[[], Any]], rounds: int, limit_s: float = 30.0) -> dict[str, dict[str, Any]]:
+    """Time several calls in turns, so that a drift of the machine's speed meets them all alike.
+
+    The first call of each, which compiles, is timed apart. Then in every round each call has its turn: a fast one
+    (below 20 ms) is called once to warm the caches that the others have emptied, then timed five times in a row; a
+    slow one is timed once. Each call must wait for its own result.
+
+    **Arguments:**
+
+    - `calls`: functions without arguments, by name.
+    - `rounds`: number of turns of each.
+    - `limit_s`: a call that has taken this long in all [s] sits out the remaining rounds, but has at least one.
+
+    **Returns:**
+
+    For each name `first_s`, `median_s`, `quartiles_s`, `minimum_s`, `repetitions`; or `failed`, the reason.
+    """
+    report: dict[str, dict[str, Any]] = {}
+    seconds: dict[str, list[float]] = {}
+    for name, call in calls.items():
+        try:
+            first = _seconds(call)
+            second = _seconds(call)
+        except Exception as error:  # a peer that fails is a result
+            report[name] = {"failed": f"{type(error).__name__}: {str(error).strip().splitlines()[0][:400]}"}
+            continue
+        report[name] = {"first_s": first, "slow": second > _SLOW}
+        seconds[name] = []
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(rounds):
+            for name, taken in seconds.items():
+                if sum(taken) < limit_s:
+                    taken += _turn(calls[name], report[name]["slow"])
+    finally:
+        gc.enable()
+    for name, taken in seconds.items():
+        del report[name]["slow"]
+        report[name] |= _summary(taken)
+    return report
+
+
+def _turn(call: Callable[[], Any], slow: bool) -> list[float]:
+    if slow:
+        return [_seconds(call)]
+    call()
+    return [_seconds(call) for _ in range(_BURST)]
+
+
+def _seconds(call: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
+
+
+def _summary(taken: list[float]) -> dict[str, Any]:
+    quartiles = statistics.quantiles(taken, n=4) if len(taken) > 1 else [taken[0]] * 3
+    return {
+        "median_s": statistics.median(taken),
+        "quartiles_s": [quartiles[0], quartiles[2]],
+        "minimum_s": min(taken),
+        "repetitions": len(taken),
+    }

@@ -1,0 +1,182 @@
+"""Runs of the reference systems by name: what a solver can be tried on."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from ..friction import Coulomb
+from ..scene import Scene
+from ._belt import BELT_OSCILLATOR, belt_oscillator, belt_oscillator_motion, belt_stribeck
+from ._belts import COUPLED_BELTS, coupled_belts
+from ._box import box_coulomb, box_lugre, ramped_box
+from ._bristle import slipping_bristle, slipping_bristle_deflection
+from ._cart_pole import cart_pole
+from ._cartesian_pendulum import cartesian_spherical_pendulum
+from ._chain import double_pendulum
+from ._charged_particle import CHARGED_PARTICLE, charged_particle, charged_particle_motion
+from ._four_bar import four_bar, four_bar_state
+from ._knife_edge import knife_edge, knife_edge_motion
+from ._pendulum import spherical_pendulum, spherical_pendulum_motion
+from ._pulled_box import pulled_box
+from ._spring import BRAKED_SPRING, braked_spring, braked_spring_law, braked_spring_motion
+from ._stick_slip_pendulum import STICK_SLIP_PENDULUM, stick_slip_pendulum, stick_slip_pendulum_turn
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A run of a named problem.
+
+    - `name`: as in `named_problems`.
+    - `scene`: the `Scene`.
+    - `q0`, `qd0`: coordinates and velocities at t = 0, shape `[dof]`.
+    - `t1`: end [s].
+    - `observable`: what is asked, at t1: `q[0]`, `qd[0]`, or an effect's name for its force.
+    - `exact`: its value by a closed form, in the precision JAX runs in; None where there is none.
+    - `max_steps`: that a run at a relative tolerance of 1e-10 may need.
+    """
+
+    name: str
+    scene: Scene
+    q0: Float[np.ndarray, " dof"]
+    qd0: Float[np.ndarray, " dof"]
+    t1: float
+    observable: str
+    exact: float | None = None
+    max_steps: int = 16384
+
+
+def named_problems() -> dict[str, Callable[[], Case]]:
+    """Functions that make each `Case`, by its name. Nothing is computed before one is called.
+
+    ```python
+    case = named_problems()["braked_spring"]()
+    run = jaxmodsim.simulate(case.scene, case.q0, case.qd0, case.t1, max_steps=case.max_steps)
+    run.q[-1, 0] - case.exact
+    ```
+
+    Set-valued friction with a closed form: `coulomb_box`, `braked_spring`, `belt_oscillator`, `stick_slip_pendulum`;
+    without: `stribeck_belt`, `coupled_belts`, `cart_pole`. Bristles: `lugre_box`, `pulled_box` (stiff),
+    `slipping_bristle` (closed form). Smooth: `spherical_pendulum` and `charged_particle` (closed forms),
+    `double_pendulum`. With constraints: `cartesian_spherical_pendulum` and `knife_edge` (closed forms), `four_bar`.
+    """
+    return dict(_CASES)
+
+
+def _case(
+    name: str, scene: Scene, q0: ArrayLike | list[float], qd0: ArrayLike | list[float], *rest: Any, **more: Any
+) -> Case:
+    return Case(name, scene, np.asarray(q0, float), np.asarray(qd0, float), *rest, **more)
+
+
+def _coulomb_box() -> Case:
+    # At rest until the force reaches Fc = 1.5 N at t = 1.5 s, then v = (t - 1.5)^2/(2 m) under a ramp of 1 N/s.
+    exact = (10.0 - 1.5) ** 2 / 4.0
+    return _case("coulomb_box", ramped_box(box_coulomb()), [0.0], [0.0], 10.0, "qd[0]", exact)
+
+
+def _lugre_box() -> Case:
+    return _case("lugre_box", ramped_box(box_lugre()), [0.0], [0.0], 10.0, "qd[0]")
+
+
+def _pulled_box() -> Case:
+    return _case("pulled_box", pulled_box(), [0.0], [0.0], 20.0, "q[0]", max_steps=200_000)
+
+
+def _slipping_bristle() -> Case:
+    law, v, t1 = box_lugre(), 0.1, 0.05
+    force = law.sigma0 * slipping_bristle_deflection(jnp.asarray(t1), law, v) + law.sigma2 * v
+    return _case("slipping_bristle", slipping_bristle(law, v), [0.0], [0.0], t1, "friction", float(force))
+
+
+def _braked_spring() -> Case:
+    t1, x0 = 20.0, BRAKED_SPRING["x0"]
+    exact = float(braked_spring_motion(jnp.asarray(t1), **BRAKED_SPRING)[0])
+    return _case("braked_spring", braked_spring(braked_spring_law()), [x0], [0.0], t1, "q[0]", exact)
+
+
+def _belt_oscillator() -> Case:
+    t1 = 5.0
+    exact = float(belt_oscillator_motion(jnp.asarray(t1), **BELT_OSCILLATOR)[0])
+    return _case("belt_oscillator", belt_oscillator(), [0.0], [BELT_OSCILLATOR["belt"]], t1, "q[0]", exact)
+
+
+def _stribeck_belt() -> Case:
+    return _case("stribeck_belt", belt_oscillator(belt_stribeck()), [0.0], [BELT_OSCILLATOR["belt"]], 5.0, "q[0]")
+
+
+def _coupled_belts() -> Case:
+    belt = COUPLED_BELTS["belt"]
+    return _case("coupled_belts", coupled_belts(), [0.0, 0.0], [belt, belt], 4.0, "q[0]")
+
+
+def _stick_slip_pendulum() -> Case:
+    """From turn to turn until it sticks, where its weight cannot overcome the friction."""
+    p, start = STICK_SLIP_PENDULUM, 1.2
+    place, numbers = start, {name: p[name] for name in ("m", "l", "g", "Fc")}
+    while p["m"] * p["g"] * p["l"] * abs(np.sin(place)) > p["Fs"]:
+        place = float(stick_slip_pendulum_turn(place, **numbers))
+    return _case("stick_slip_pendulum", stick_slip_pendulum(), [start], [0.0], 10.0, "q[0]", place)
+
+
+def _cart_pole() -> Case:
+    return _case("cart_pole", cart_pole(Coulomb(Fc=0.3, Fs=0.4)), [0.0, 2.0], [0.0, 0.0], 3.0, "q[1]")
+
+
+def _spherical_pendulum() -> Case:
+    phi, turn, t1 = 1.8, 2.0, 5.0
+    exact = float(spherical_pendulum_motion(t1, phi, turn))
+    return _case("spherical_pendulum", spherical_pendulum(), [phi, 0.0], [0.0, turn], t1, "q[0]", exact)
+
+
+def _cartesian_spherical_pendulum() -> Case:
+    """The spherical pendulum again, its place held on the sphere by a constraint."""
+    phi, turn, t1 = 1.8, 2.0, 5.0
+    q0, qd0 = [np.sin(phi), 0.0, np.cos(phi)], [0.0, turn * np.sin(phi), 0.0]
+    exact = float(np.cos(spherical_pendulum_motion(t1, phi, turn)))
+    return _case("cartesian_spherical_pendulum", cartesian_spherical_pendulum(), q0, qd0, t1, "q[2]", exact)
+
+
+def _double_pendulum() -> Case:
+    return _case("double_pendulum", double_pendulum(), [2.0, 1.5], [0.0, 0.0], 3.0, "q[1]")
+
+
+def _charged_particle() -> Case:
+    q0, qd0, t1 = [0.3, -0.8, 0.5], [1.2, 0.4, -0.7], 10.0
+    motion = charged_particle_motion(jnp.asarray(t1), jnp.asarray(q0), jnp.asarray(qd0), **CHARGED_PARTICLE)
+    scene = charged_particle(E=CHARGED_PARTICLE["E"])
+    return _case("charged_particle", scene, q0, qd0, t1, "q[0]", float(motion[0][0]))
+
+
+def _knife_edge() -> Case:
+    turn, speed, t1 = 1.7, 0.9, 6.0
+    exact = float(knife_edge_motion(jnp.asarray(t1), turn=turn, speed=speed)[0][1])
+    return _case("knife_edge", knife_edge(), [0.0, 0.0, 0.0], [speed, 0.0, turn], t1, "q[1]", exact)
+
+
+def _four_bar() -> Case:
+    q0, qd0 = four_bar_state(0.7, 8.0)
+    return _case("four_bar", four_bar(), q0, qd0, 2.0, "q[2]")
+
+
+_CASES: dict[str, Callable[[], Case]] = {
+    "lugre_box": _lugre_box,
+    "pulled_box": _pulled_box,
+    "slipping_bristle": _slipping_bristle,
+    "coulomb_box": _coulomb_box,
+    "braked_spring": _braked_spring,
+    "belt_oscillator": _belt_oscillator,
+    "stribeck_belt": _stribeck_belt,
+    "coupled_belts": _coupled_belts,
+    "stick_slip_pendulum": _stick_slip_pendulum,
+    "cart_pole": _cart_pole,
+    "spherical_pendulum": _spherical_pendulum,
+    "cartesian_spherical_pendulum": _cartesian_spherical_pendulum,
+    "double_pendulum": _double_pendulum,
+    "charged_particle": _charged_particle,
+    "knife_edge": _knife_edge,
+    "four_bar": _four_bar,
+}
