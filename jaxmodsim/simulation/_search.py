@@ -26,15 +26,16 @@ _ACCURACIES = (1e-12, 1e-1)
 # part of relative ones, as by default.
 _TIGHTEST, _LOOSEST, _ABSOLUTE = 50.0, 0.1, 1e-3
 # Errors are differences to two references, runs by different methods. As parts of the accuracy: the tolerance at which
-# these are tried first, and how far they may be apart.
-_AHEAD, _AGREE = 1e-2, 0.25
+# these are tried first, and how far they may be apart; and how far they may be from two more of ten times looser ones.
+_AHEAD, _AGREE, _NEAR = 1e-2, 0.25, 0.5
 # Difference of the whole state at which two runs have nothing to do with each other, whatever is observed.
-_APART = 0.3
+_APART = 0.1
 # Fall of the difference of two runs from tolerances this many times looser below which they do not converge.
 _LOOSER, _FALL = 1e3, 30.0
-# Magnitude of an observable below which errors are relative to this instead, and how many times show its magnitude
-# where only the end is kept.
-_SMALLEST, _TIMES = 1e-6, 101
+# Magnitude of an observable below which errors are relative to this instead.
+_SMALLEST = 1e-6
+# Saved times that are too few to show magnitudes and chaos, and how many do.
+_FEW, _TIMES = 11, 101
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,7 @@ class _Made:
     """A run of the search, with what is compared: the observable and the state, of the shape `[..., columns]`."""
 
     run: Trajectory
+    which: int
     solver: dfx.AbstractSolver
     rtol: float
     atol: float
@@ -69,6 +71,7 @@ class _Search:
     observe: Callable[[Trajectory], Any]
     solvers: tuple[dfx.AbstractSolver, ...]
     made: dict[tuple[float, int], _Made] = field(default_factory=dict)
+    seen: dict[tuple[float, int], _Made] = field(default_factory=dict)
 
     @property
     def tightest(self) -> float:
@@ -79,6 +82,19 @@ class _Search:
         if (rtol, which) not in self.made:
             self.made[rtol, which] = self.make(rtol, which, self.problem)
         return self.made[rtol, which]
+
+    def along(self, rtol: float, which: int) -> _Made:
+        """The same run, kept at more times where few are saved."""
+        if self.problem.ts is not None and self.problem.ts.shape[0] >= _FEW:
+            return self.run(rtol, which)
+        if (rtol, which) not in self.seen:
+            ts = np.linspace(self.problem.t0, self.problem.t1, _TIMES).astype(self.problem.q0.dtype)
+            self.seen[rtol, which] = self.make(rtol, which, self.problem._replace(ts=ts))
+        return self.seen[rtol, which]
+
+    def failure(self, rtol: float, which: int) -> str:
+        """How the run by one of the methods at a tolerance ended early; nothing if it did not."""
+        return self.run(rtol, which).failure or self.along(rtol, which).failure
 
     def make(self, rtol: float, which: int, problem: Problem) -> _Made:
         solver, dtype = self.solvers[which], self.problem.q0.dtype
@@ -96,48 +112,43 @@ class _Search:
             )
         run, failure = trajectory(problem, options, solved), _failure(problem, solved)
         observed = np.zeros(0) if failure else _observed(self.observe, run)
-        return _Made(run, solver, rtol, atol, observed, _states(run), failure)
+        return _Made(run, which, solver, rtol, atol, observed, _states(run), failure)
 
     def pair(self, rtol: float) -> tuple[_Made, ...]:
         """Runs by both methods; by one of them at two tolerances where the other does not reach the end."""
-        good = [which for which in (0, 1) if self.run(rtol, which).ok]
+        good = [which for which in (0, 1) if not self.failure(rtol, which)]
         found = tuple(self.run(rtol, which) for which in good)
         if len(good) != 1:
             return found
-        other = self.run(_round(rtol / 10 if rtol / 10 >= self.tightest else rtol * 10), good[0])
-        return (*found, other) if other.ok and other.num_steps != found[0].num_steps else found
-
-
-@dataclass(frozen=True)
-class _Measure:
-    """Largest magnitudes of the columns of the observable and of the state."""
-
-    observed: np.ndarray
-    state: np.ndarray
-
-    def error(self, one: _Made, other: _Made) -> float:
-        """Difference of two runs in what is observed."""
-        return float(np.max(np.abs(one.observed - other.observed) / self.observed))
-
-    def apart(self, one: _Made, other: _Made) -> float:
-        """Difference of their whole states."""
-        return float(np.max(np.abs(one.state - other.state) / self.state))
+        other = _round(rtol / 10 if rtol / 10 >= self.tightest else rtol * 10), good[0]
+        if self.failure(*other) or self.run(*other).num_steps == found[0].num_steps:
+            return found
+        return (*found, self.run(*other))
 
 
 @dataclass(frozen=True)
 class _References:
-    """Two runs that errors are taken against, and how far they are apart; a remark if that is too far."""
+    """Two runs that errors are taken against, how far they are apart, and the magnitudes of what is observed.
+
+    And a remark if they are too far apart.
+    """
 
     runs: tuple[_Made, ...]
-    measure: _Measure
+    size: np.ndarray
     gap: float
     remark: str
 
+    def error(self, made: _Made) -> float:
+        """Difference to the farther one."""
+        return max(_error(made, each, self.size) for each in self.runs)
+
     def estimate(self, made: _Made) -> float:
-        """Of the error of a run: the difference to the farther one, and what is uncertain of it."""
-        if not made.ok:
-            return math.inf
-        return max(self.measure.error(made, each) for each in self.runs) + self.gap
+        """Of the error of a run: its difference, and what is uncertain of that."""
+        return self.error(made) + self.gap if made.ok else math.inf
+
+
+def _error(one: _Made, other: _Made, size: np.ndarray) -> float:
+    return float(np.max(np.abs(one.observed - other.observed) / size))
 
 
 def reach(
@@ -153,9 +164,8 @@ def reach(
     rtol = _round(max(_AHEAD * asked, search.tightest))
     first = search.pair(rtol)
     if len(first) < 2:
-        return _early(search, search.run(rtol, 0), throw)
-    measure = _measure(search, first[0], callable(observable))
-    references = _references(search, measure, rtol)
+        return _early(search, rtol, throw)
+    references = _references(search, rtol, callable(observable))
     if references.remark:
         if throw:
             raise SimulationError(references.remark)
@@ -226,36 +236,41 @@ def _observed(observe: Callable[[Trajectory], Any], run: Trajectory) -> np.ndarr
     return values.astype(float)
 
 
-def _measure(search: _Search, made: _Made, own: bool) -> _Measure:
-    """Magnitudes along the run; where the end alone is kept, of a run that keeps more, for what is known by name."""
-    along, problem = made, search.problem
-    if problem.ts is None:
-        ts = np.linspace(problem.t0, problem.t1, _TIMES).astype(problem.q0.dtype)
-        along = search.make(made.rtol, search.solvers.index(made.solver), problem._replace(ts=ts))
-        if not along.ok:
-            raise SimulationError(along.failure)
-    observed = made.observed if own else along.observed
-    sizes = (np.max(np.abs(x), axis=0) if x.ndim else np.abs(x) for x in (observed, along.state))
-    return _Measure(*(np.maximum(size, _SMALLEST) for size in sizes))
+def _size(values: np.ndarray) -> np.ndarray:
+    """Largest magnitudes of columns."""
+    return np.maximum(np.max(np.abs(values), axis=0) if values.ndim else np.abs(values), _SMALLEST)
 
 
-def _references(search: _Search, measure: _Measure, rtol: float) -> _References:
-    """The first two runs, from a tolerance downwards, that agree; if none do, the nearest."""
+def _references(search: _Search, rtol: float, own: bool) -> _References:
+    """The first two runs, from a tolerance downwards, that agree; if none do, the nearest.
+
+    Magnitudes are those along the run, of a function (`own`) those of what it returns.
+    """
     nearest = None
     while True:
         pair = search.pair(rtol)
         if len(pair) < 2:
             break
-        gap, together = measure.error(*pair), measure.apart(*pair) <= _APART
-        if together and gap <= _AGREE * search.asked:
-            return _References(pair, measure, gap, "")
-        if nearest is None or gap < nearest.gap:
-            nearest = _References(pair, measure, gap if together else max(gap, _APART), "")
+        one, other = (search.along(made.rtol, made.which) for made in pair)
+        size = _size(pair[0].observed if own else one.observed)
+        found = _References(pair, size, _error(pair[0], pair[1], size), "")
+        if np.max(np.abs(one.state - other.state) / _size(one.state)) > _APART:
+            found = replace(found, gap=max(found.gap, _APART))
+        elif found.gap <= _AGREE * search.asked and _confirmed(search, found, rtol):
+            return found
+        if nearest is None or found.gap < nearest.gap:
+            nearest = found
         if rtol <= search.tightest:
             break
         rtol = _round(max(rtol / 10, search.tightest))
     assert nearest is not None
     return replace(nearest, remark=_remark(search, nearest, rtol))
+
+
+def _confirmed(search: _Search, found: _References, rtol: float) -> bool:
+    """Whether a pair from a looser tolerance is near, too: in chaos two runs may meet in one number by accident."""
+    looser = search.pair(_round(10 * rtol))
+    return len(looser) == 2 and max(map(found.error, looser)) <= _NEAR * search.asked
 
 
 def _remark(search: _Search, nearest: _References, rtol: float) -> str:
@@ -265,11 +280,11 @@ def _remark(search: _Search, nearest: _References, rtol: float) -> str:
         f"accuracy={search.asked:g} was not reached: the best two runs, by {names} at rtol {nearest.runs[0].rtol:g},"
         f" differ by {nearest.gap:.2g}."
     )
-    ended = [each for each in (search.run(rtol, 0), search.run(rtol, 1)) if not each.ok]
+    ended = [text for text in (search.failure(rtol, 0), search.failure(rtol, 1)) if text]
     looser = search.pair(_round(_LOOSER * nearest.runs[0].rtol))
-    falls = len(looser) == 2 and nearest.gap < nearest.measure.error(*looser) / _FALL
+    falls = len(looser) == 2 and nearest.gap < _error(looser[0], looser[1], nearest.size) / _FALL
     if len(ended) == 2:
-        return f"{text} At rtol {rtol:g} none reached the end. {ended[0].failure}"
+        return f"{text} At rtol {rtol:g} none reached the end. {ended[0]}"
     if search.problem.q0.dtype == jnp.float32:
         return (
             f"{text} The numbers are in float32, whose rounding is {float(jnp.finfo(jnp.float32).eps):.1g}: set"
@@ -287,13 +302,12 @@ def _remark(search: _Search, nearest: _References, rtol: float) -> str:
     )
 
 
-def _early(search: _Search, made: _Made, throw: bool) -> Trajectory:
+def _early(search: _Search, rtol: float, throw: bool) -> Trajectory:
     """What becomes of runs that end early: the sentence of the first."""
     if throw:
-        raise SimulationError(
-            f"For accuracy={search.asked:g} runs at rtol {made.rtol:g} were made to check by. {made.failure}"
-        )
-    return made.run
+        failure = search.failure(rtol, 0) or search.failure(rtol, 1)
+        raise SimulationError(f"For accuracy={search.asked:g} runs at rtol {rtol:g} were made to check by. {failure}")
+    return search.run(rtol, 0).run
 
 
 def _failure(problem: Problem, solved: Solved) -> str:
@@ -337,7 +351,7 @@ def _tenfold(tried: tuple[Tried, ...], solver: str, rtol: float) -> Tenfold:
 
 def _evaluations(made: _Made) -> int | None:
     """Evaluations of the vector field in one step, the Jacobian counted as one for each entry of the state."""
-    if isinstance(made.solver, dfx.AbstractERK):
+    if isinstance(made.solver, dfx.AbstractERK) and isinstance(made.solver.tableau, dfx.ButcherTableau):
         return made.solver.tableau.num_stages - bool(made.solver.tableau.fsal)
     if isinstance(made.solver, Rodas5P):
         own = sum(np.size(x) for x in jtu.tree_leaves(made.run.scene.state0(made.run.problem.q0)))

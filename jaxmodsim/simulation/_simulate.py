@@ -82,10 +82,11 @@ def simulate(
       is kept. Likewise for an accuracy that is not reached, of which `run.accuracy.remark` says why.
     - `accuracy`: largest error of `observable`, from 1e-12 to 0.1, instead of `rtol`, `atol` and `dt`. Solver and
       tolerances are searched for, by about ten runs of two methods, so that numbers must be known (not traced): the
-      run with the least work is taken whose difference to tighter runs by either method is within the accuracy.
+      run with the least work is taken whose difference to tighter runs by either method is within the accuracy. What
+      steps over a short pulse in all of them is not seen: `dtmax`.
       `run.accuracy` reports it, and `run.accuracy.options` are the arguments for more such runs. With `solver` given
       the tolerances alone are chosen. Errors are relative to the largest magnitude of the observable at the saved
-      times (if the end alone is kept, at 101 times along the run), or to 1e-6 of its unit where it stays below that.
+      times (of fewer than 11, at 101 times along the run), or to 1e-6 of its unit where it stays below that.
     - `observable`: what `accuracy` is of: `"q[0]"`, `"qd[0]"`, the name of an effect for its force (`[i]` behind for a
       component), or a function of the `Trajectory` that returns numbers of shape `[]`, `[time]` or `[time, k]`, each
       column relative to its own largest magnitude among the numbers returned. By default all coordinates and
