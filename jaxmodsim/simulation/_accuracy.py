@@ -9,8 +9,8 @@ import diffrax as dfx
 class Tenfold(NamedTuple):
     """Predicted steps for another accuracy, as multiples of those that were made.
 
-    - `better`: for an error ten times smaller.
-    - `worse`: for an error ten times larger.
+    - `better`: for an error ten times smaller, >= 1.
+    - `worse`: for an error ten times larger, <= 1.
     """
 
     better: float

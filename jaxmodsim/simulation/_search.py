@@ -32,6 +32,8 @@ _AHEAD, _AGREE, _NEAR = 1e-2, 0.25, 0.5
 _APART = 0.1
 # Fall of the difference of two runs from tolerances this many times looser below which they do not converge.
 _LOOSER, _FALL = 1e3, 30.0
+# An estimate this many times what is uncertain of it says how the error follows the tolerance.
+_KNOWN = 4.0
 # Magnitude of an observable below which errors are relative to this instead.
 _SMALLEST = 1e-6
 # Saved times that are too few to show magnitudes and chaos, and how many do.
@@ -104,12 +106,7 @@ class _Search:
         problem = problem._replace(rtol=np.asarray(rtol, dtype), atol=np.asarray(atol, dtype), plugins=plugins)
         options = replace(self.options, solver=rest)
         solved = solve(problem, options)
-        if isinstance(solved.code, jax.core.Tracer):
-            raise ValueError(
-                "accuracy is a search by several runs, which needs numbers that are known, but here some are traced"
-                " (jax.jit, jax.vmap or jax.grad): run simulate(..., accuracy=...) once outside, and pass"
-                " **run.accuracy.options, its solver, rtol and atol, instead of accuracy here."
-            )
+        _check_known(solved)
         run, failure = trajectory(problem, options, solved), _failure(problem, solved)
         observed = np.zeros(0) if failure else _observed(self.observe, run)
         return _Made(run, which, solver, rtol, atol, observed, _states(run), failure)
@@ -175,14 +172,24 @@ def reach(
         while looser <= _LOOSEST and references.estimate(search.run(looser, which)) <= asked:
             looser = _round(10 * looser)
     good = [made for (_, which), made in search.made.items() if which in choices and references.estimate(made) <= asked]
-    best = min(good, key=lambda made: made.num_steps * (_evaluations(made) or 1))
+    best = min(good, key=lambda made: (made.num_steps * (_evaluations(made) or 1), references.estimate(made)))
     return _chosen(search, references, best, references.estimate(best))
+
+
+def _check_known(tree: Any) -> None:
+    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(tree)):
+        raise ValueError(
+            "accuracy is a search by several runs, which needs numbers that are known, but here some are traced"
+            " (jax.jit, jax.vmap or jax.grad): run simulate(..., accuracy=...) once outside, and pass"
+            " **run.accuracy.options, its solver, rtol and atol, instead of accuracy here."
+        )
 
 
 def _asked(problem: Problem, accuracy: Any, observable: Any, tolerances: tuple[Any, Any]) -> float:
     """The accuracy, if it and what goes with it can be searched for."""
     if accuracy is None:
         raise ValueError("observable says what accuracy= is of: pass accuracy, too, or leave observable out.")
+    _check_known((problem, accuracy))
     if isinstance(accuracy, bool) or not isinstance(accuracy, int | float | np.number):
         raise ValueError(f"accuracy must be a known number, as in accuracy=1e-6, but {accuracy!r} was given.")
     if not _ACCURACIES[0] <= accuracy <= _ACCURACIES[1]:
@@ -238,7 +245,7 @@ def _observed(observe: Callable[[Trajectory], Any], run: Trajectory) -> np.ndarr
 
 def _size(values: np.ndarray) -> np.ndarray:
     """Largest magnitudes of columns."""
-    return np.maximum(np.max(np.abs(values), axis=0) if values.ndim else np.abs(values), _SMALLEST)
+    return np.maximum(np.max(np.abs(np.atleast_1d(values)), axis=0, keepdims=True), _SMALLEST)
 
 
 def _references(search: _Search, rtol: float, own: bool) -> _References:
@@ -331,22 +338,27 @@ def _chosen(search: _Search, references: _References, best: _Made, estimate: flo
         best.rtol,
         best.atol,
         best.num_steps,
-        _tenfold(tried, type(best.solver).__name__, best.rtol),
+        _tenfold(tried, type(best.solver).__name__, best.rtol, references.gap),
         tried,
         references.remark,
     )
     return replace(best.run, accuracy=accuracy)
 
 
-def _tenfold(tried: tuple[Tried, ...], solver: str, rtol: float) -> Tenfold:
+def _tenfold(tried: tuple[Tried, ...], solver: str, rtol: float, gap: float) -> Tenfold:
     """Steps for ten times better and worse, from the next tighter and the next looser run of the same method."""
     runs = sorted((run for run in tried if run.solver == solver and math.isfinite(run.estimate)), key=lambda r: r.rtol)
     place = [run.rtol for run in runs].index(rtol)
-    # Powers of ten in steps for one in the tolerance, which the error follows.
+    # Powers of ten in steps for one in the tolerance, and in the tolerance for one in the error, where that is known.
     slopes = [math.log10(a.num_steps / b.num_steps) / math.log10(b.rtol / a.rtol) for a, b in pairwise(runs)]
+    known = [run for run in runs if run.estimate > _KNOWN * gap]
+    order = 1.0
+    if len(known) > 1 and known[-1].estimate > known[0].estimate:
+        order = math.log(known[-1].estimate / known[0].estimate) / math.log(known[-1].rtol / known[0].rtol)
+    per = min(max(1.0 / order, 0.5), 2.0)
     better = slopes[max(place - 1, 0)] if slopes else 0.0
     worse = slopes[min(place, len(slopes) - 1)] if slopes else 0.0
-    return Tenfold(10**better, 10**-worse)
+    return Tenfold(max(10 ** (per * better), 1.0), min(10 ** (-per * worse), 1.0))
 
 
 def _evaluations(made: _Made) -> int | None:
@@ -354,8 +366,8 @@ def _evaluations(made: _Made) -> int | None:
     if isinstance(made.solver, dfx.AbstractERK) and isinstance(made.solver.tableau, dfx.ButcherTableau):
         return made.solver.tableau.num_stages - bool(made.solver.tableau.fsal)
     if isinstance(made.solver, Rodas5P):
-        own = sum(np.size(x) for x in jtu.tree_leaves(made.run.scene.state0(made.run.problem.q0)))
-        return 8 + 1 + 2 * made.run.problem.q0.shape[0] + own
+        run = made.run
+        return 8 + 1 + sum(np.size(x) for x in jtu.tree_leaves((run.q, run.qd, run.z))) // run.t.shape[0]
     return None
 
 

@@ -11,7 +11,7 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, PyTree
+from jaxtyping import ArrayLike, PyTree
 
 from ..effects import Friction
 from ..scene import Scene, check_step
@@ -43,7 +43,7 @@ def simulate(
     project: bool = True,
     throw: bool = True,
     accuracy: float | None = None,
-    observable: str | Callable[[Trajectory], Array] | None = None,
+    observable: str | Callable[[Trajectory], Any] | None = None,
 ) -> Trajectory:
     """Run a scene from `t0` to `t1`.
 
