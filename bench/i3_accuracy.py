@@ -1,7 +1,7 @@
 """`simulate(..., accuracy=...)` on every named problem: what was asked, estimated and met, and at what cost.
 
-The observable of each problem, at eleven times. The true error is that against a run by a method that was not chosen, at
-a relative tolerance of 1e-12, and at the end against the closed form, where there is one.
+The observable of each problem, at eleven times. The true error is that against a run by a method that was not chosen,
+at a relative tolerance of 1e-12, and at the end against the closed form, where there is one.
 
     python bench/i3_accuracy.py [--smoke] [--out DIR]
 """
