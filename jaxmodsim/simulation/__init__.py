@@ -1,5 +1,8 @@
 """Runs of scenes."""
 
+from ._accuracy import Accuracy as Accuracy
+from ._accuracy import Tenfold as Tenfold
+from ._accuracy import Tried as Tried
 from ._consistent import consistent as consistent
 from ._observe import named_series as named_series
 from ._observe import named_unit as named_unit

@@ -1,6 +1,7 @@
 """`simulate`: a scene in, a trajectory out."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
@@ -16,8 +17,9 @@ from ..effects import Friction
 from ..scene import Scene, check_step
 from ..solvers import ImplicitFriction
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages
+from ._search import reach
 from ._solve import Options, Problem, Solved, solve
-from ._trajectory import Trajectory
+from ._trajectory import Trajectory, trajectory
 
 
 def simulate(
@@ -40,6 +42,8 @@ def simulate(
     hold_chatter: bool = False,
     project: bool = True,
     throw: bool = True,
+    accuracy: float | None = None,
+    observable: str | Callable[[Trajectory], Any] | None = None,
 ) -> Trajectory:
     """Run a scene from `t0` to `t1`.
 
@@ -75,7 +79,18 @@ def simulate(
       smallest changes in the metric of the masses. Without, constraints hold for the accelerations alone and drift with
       the error of integration, but for their own `stabilise`.
     - `throw`: whether a run that ends early raises; otherwise `run.result` says how it ended, and what was computed
-      is kept.
+      is kept. Likewise for an accuracy that is not reached, of which `run.accuracy.remark` says why.
+    - `accuracy`: largest error of `observable`, from 1e-12 to 0.1, instead of `rtol`, `atol` and `dt`. Solver and
+      tolerances are searched for, by about ten runs of two methods, so that numbers must be known (not traced): the
+      run with the least work is taken whose difference to tighter runs by either method is within the accuracy. What
+      steps over a short pulse in all of them is not seen: `dtmax`.
+      `run.accuracy` reports it, and `run.accuracy.options` are the arguments for more such runs. With `solver` given
+      the tolerances alone are chosen. Errors are relative to the largest magnitude of the observable at the saved
+      times (of fewer than 11, at 101 times along the run), or to 1e-6 of its unit where it stays below that.
+    - `observable`: what `accuracy` is of: `"q[0]"`, `"qd[0]"`, the name of an effect for its force (`[i]` behind for a
+      component), or a function of the `Trajectory` that returns numbers of shape `[]`, `[time]` or `[time, k]`, each
+      column relative to its own largest magnitude among the numbers returned. By default all coordinates and
+      velocities, each relative to its own.
 
     **Returns:**
 
@@ -83,9 +98,9 @@ def simulate(
 
     **Raises:**
 
-    - `ValueError` for wrong shapes, types or ranges, before anything runs.
-    - `SimulationError` if the run ended early and `throw` is set. Inside `jax.jit`, `jax.vmap` or `jax.grad` the
-      same sentence comes as equinox's run-time error.
+    - `ValueError` for wrong shapes, types or ranges, before anything runs; for `accuracy` where numbers are traced.
+    - `SimulationError` if the run ended early, or no run of the accuracy was found, and `throw` is set. Inside
+      `jax.jit`, `jax.vmap` or `jax.grad` the same sentence comes as equinox's run-time error.
     """
     problem, options = prepare(
         scene,
@@ -106,6 +121,8 @@ def simulate(
         hold_chatter,
         project,
     )
+    if accuracy is not None or observable is not None:
+        return reach(problem, options, accuracy, observable, (rtol, atol), throw)
     try:
         solved = solve(problem, options)
     except TypeError as error:
@@ -117,8 +134,7 @@ def simulate(
         raise
     if throw:
         solved = _raise_early_end(problem, solved)
-    y, end = solved.y, None if solved.end is None else solved.end[0]
-    return Trajectory(solved.t, y.q, y.qd, y.z, solved.mode, solved.stats, solved.code, end, problem, options)
+    return trajectory(problem, options, solved)
 
 
 def prepare(

@@ -14,9 +14,10 @@ from jaxtyping import Array, Float, Int, PyTree
 from ..mechanics import momentum
 from ..scene import Reaction, Scene, State, scene_forces, scene_reactions
 from ..solvers import EventLog
+from ._accuracy import Accuracy
 from ._ledger import Ledger, event_losses, ledger
 from ._outcome import Outcome, outcome_messages
-from ._solve import Options, Problem, solve_logged
+from ._solve import Options, Problem, Solved, solve_logged
 
 _Value = TypeVar("_Value")
 
@@ -69,6 +70,7 @@ class Trajectory:
     - `modes`: of the friction elements that run by events, shape `[time, elements]`; None where there are none. By
       name: `mode`.
     - `stats`: `num_steps`, `num_rejected_steps` of these, and `num_events` where laws run by events.
+    - `accuracy`: what was chosen for the accuracy that was asked for; None where none was.
 
     A run inside `jax.vmap` is read inside it, or by `jax.vmap(lambda run: run.forces)(runs)`.
     """
@@ -83,6 +85,7 @@ class Trajectory:
     end: Float[Array, "..."] | None
     problem: Problem
     options: Options = field(metadata={"static": True})
+    accuracy: Accuracy | None = field(default=None, metadata={"static": True})
 
     @property
     def scene(self) -> Scene:
@@ -204,6 +207,12 @@ class Trajectory:
                 f"This Trajectory holds a batch of runs (times of shape {self.t.shape}); {what} reads one run:"
                 f" use jax.vmap(lambda run: run.{what})(runs)."
             )
+
+
+def trajectory(problem: Problem, options: Options, solved: Solved) -> Trajectory:
+    """The run that was solved."""
+    y, end = solved.y, None if solved.end is None else solved.end[0]
+    return Trajectory(solved.t, y.q, y.qd, y.z, solved.mode, solved.stats, solved.code, end, problem, options)
 
 
 @jax.jit

@@ -22,6 +22,7 @@ _NUMBERS = ("q0", "qd0", "t1", "t0", "ts", "z0", "rtol", "atol", "dt", "dtmax")
 # Those of them that can be swept.
 _SWEPT = tuple(name for name in _NUMBERS if name not in ("ts", "z0"))
 _UNITS = {"t0": "s", "t1": "s", "dt": "s", "dtmax": "s"}
+_SEARCH = ("accuracy", "observable")
 _OPTIONS = {name: x.default for name, x in inspect.signature(simulate).parameters.items()}
 
 
@@ -77,8 +78,9 @@ def request(system: Any, grid: Grid, observe: Any, arguments: Mapping[str, Any])
 def _of_scene(scene: Scene, grid: Grid, observe: Any, arguments: dict[str, Any]) -> Request:
     arguments = {name: value for name, value in arguments.items() if value is not None}
     for name in arguments:
-        if name in ("throw", "adjoint", "scene") or name not in _OPTIONS:
+        if name in ("throw", "adjoint", "scene", *_SEARCH) or name not in _OPTIONS:
             hint = ": a lane that fails gets its code" if name == "throw" else ""
+            hint = ": search for one lane, and pass **run.accuracy.options" if name in _SEARCH else hint
             raise ValueError(f"sweep takes no argument {name!r}{hint}.")
     swept = grid.values
     for name in ("q0", "qd0", "t1"):
