@@ -41,6 +41,7 @@ from ._place import Amount as Amount
 from ._place import Place as Place
 from ._place import as_amount as as_amount
 from ._place import as_place as as_place
+from ._rosenbrock import RosenbrockStep as RosenbrockStep
 from ._rosenbrock import RosenbrockTableau as RosenbrockTableau
 from ._rosenbrock import rosenbrock_step as rosenbrock_step
 from ._safe import decay_mean as decay_mean

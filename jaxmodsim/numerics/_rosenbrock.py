@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -45,8 +45,7 @@ class RosenbrockTableau:
     dense: np.ndarray | None = None
 
 
-@dataclass(frozen=True)
-class RosenbrockStep:
+class RosenbrockStep(NamedTuple):
     """What one step gives: the state at its end, the error estimate, and the vectors `K` of the dense output."""
 
     y1: State

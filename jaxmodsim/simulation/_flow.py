@@ -99,7 +99,7 @@ class Hybrid(NamedTuple):
 
     def plain_rate(self, t: Any, y: Any, scene: Scene) -> Any:
         """Right-hand side of a run without modes."""
-        return _rate(self.flow, t, y, scene) if scene.constraints else self.flow.rate(t, y, scene)
+        return _rate(self.flow, t, y, scene)
 
     def rate(self, t: Any, s: EventState, scene: Scene) -> EventState:
         """Right-hand side."""

@@ -240,9 +240,10 @@ def _problem(
 def _check_slips(scene: Scene, q0: Any, t0: Any) -> None:
     """Refuse the velocity of a belt that is a number where slip is a vector."""
     for i, effect in enumerate(scene.effects):
-        belt = effect.belt_velocity if isinstance(effect, Friction) and effect.along is not None else None
-        # Anything but the zero that most have; asked first, as the rest takes time.
-        if belt is not None and not callable(belt) and _known(belt) and np.any(np.asarray(belt) != 0):
+        if not isinstance(effect, Friction) or effect.along is None or callable(effect.belt_velocity):
+            continue
+        # Asked first, as the rest takes time.
+        if _known(effect.belt_velocity) and np.any(np.asarray(effect.belt_velocity) != 0):
             effect.check_belt(q0, scene.now(jnp.asarray(t0)).params, scene.names[i])
 
 

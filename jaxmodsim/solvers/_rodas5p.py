@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from ..numerics import RosenbrockTableau, rosenbrock_step
+from ..numerics import RosenbrockStep, RosenbrockTableau, rosenbrock_step
 from ._interpolation import PolynomialInterpolation
 
 
@@ -126,6 +126,12 @@ _RODAS5P = RosenbrockTableau(
 )
 
 
+# diffrax asks for a step several times over. As one function it is traced, linearised and transposed once.
+@eqx.filter_jit
+def _step(terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree, pivot: bool) -> RosenbrockStep:
+    return rosenbrock_step(_RODAS5P, lambda t, y: terms.vf(t, y, args), t0, t1 - t0, y0, pivot=pivot)
+
+
 class Rodas5P(dfx.AbstractAdaptiveSolver):
     """Steinebach's Rodas5P for stiff equations: eight stages, order 5, L-stable, no iteration.
 
@@ -187,5 +193,5 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
     ) -> tuple[PyTree, PyTree, dict[str, PyTree], None, dfx.RESULTS]:
         """One step; see `jaxmodsim.numerics.rosenbrock_step`."""
         del solver_state, made_jump
-        step = rosenbrock_step(_RODAS5P, lambda t, y: terms.vf(t, y, args), t0, t1 - t0, y0, pivot=self.pivot)
+        step = _step(terms, t0, t1, y0, args, self.pivot)
         return step.y1, step.error, {"y0": y0, "y1": step.y1, "k": step.dense}, None, dfx.RESULTS.successful
