@@ -2,7 +2,6 @@
 
 import gc
 import importlib.metadata
-import json
 import os
 import platform
 import statistics
@@ -15,6 +14,8 @@ from typing import Any
 
 _SLOW = 0.02
 _BURST = 5
+# All but what benches write: the results of one are no change to the next.
+_WHAT_IS_MEASURED = (":/", ":(top,exclude)bench/results", ":(top,exclude)README.md")
 
 
 def describe_machine(*packages: str) -> dict[str, Any]:
@@ -27,7 +28,7 @@ def describe_machine(*packages: str) -> dict[str, Any]:
         "versions": {name: importlib.metadata.version(name) for name in packages},
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
         "commit": _git("rev-parse", "HEAD"),
-        "uncommitted_changes": bool(_git("status", "--porcelain", "--untracked-files=no")),
+        "uncommitted_changes": bool(_git("status", "--porcelain", "--untracked-files=no", "--", *_WHAT_IS_MEASURED)),
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
     }
 
@@ -135,10 +136,3 @@ def machine_line(machine: dict[str, Any]) -> str:
         f"{machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, {versions};"
         f" {machine['date']}, commit {machine['commit'][:10] or 'unknown'}{state}."
     )
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a result, creating its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=1) + "\n")
-    print(f"written: {path}")
