@@ -136,7 +136,7 @@ def _time_table(content: dict[str, Any]) -> dict[str, Any]:
             rows.append([f"{OURS}, jitted", *rows[-1][1:5], show(taken, 1e3), ratio])
     caption = (
         f"The same to relative errors of at most {content['goal']:g}, of velocity and friction force both, over the"
-        " run, medians, all in one process, with `jaxmodsim.tune_cpu()`. Ours is a whole call of `simulate`, or one of a"
+        " run, medians, all in one process, with `jaxmodsim.tune_cpu()`. Ours: a whole call of `simulate`, or one of a"
         f" jitted function, as those of diffrax are. {machine_line(content['machine'])}"
     )
     columns = ["solver", "rtol", "steps", "error of v", "error of F", "one run [ms]", "in ours"]
