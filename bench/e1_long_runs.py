@@ -90,13 +90,13 @@ def main() -> None:
     }
     if options.smoke:
         cases = dict(itertools.islice(cases.items(), 1))
-    swing = math.acos(_Closed().lower) - PHI0
+    swing = math.acos(Closed().lower) - PHI0
     content = new_result("long_runs", options, "diffrax", "scipy", "numpy") | {
         "problem": {
             "g": G,
             "phi0": PHI0,
             "spin0": SPIN0,
-            "period_s": _Closed().period,
+            "period_s": Closed().period,
             "angle0": ANGLE0,
             "swing": swing,
         },
@@ -112,7 +112,7 @@ def main() -> None:
     draw(content, options.out / "long_runs.png")
 
 
-class _Closed:
+class Closed:
     """Closed form of the spherical pendulum let go at a turning point of phi, unit mass and radius.
 
     `u = cos(phi)` obeys `u'^2 = 2 g (u - u1)(u - u2)(u - u3)` and moves between u1 and u2, the start.
@@ -140,7 +140,7 @@ class _Closed:
 
 def _windows(periods: int) -> np.ndarray:
     """Times of saving, shape `[windows, SAMPLES]`: windows of a period, spread evenly over the logarithm of time."""
-    period = _Closed().period
+    period = Closed().period
     last = int(periods * period / DT) - SAMPLES
     starts = np.unique(np.geomspace(period / DT, last, 36).astype(int))
     kept = [starts[0]]
@@ -168,7 +168,7 @@ def _growth(t: np.ndarray, error: np.ndarray, lost: float = math.inf) -> float |
 
 def long_runs(runs: dict[str, dict[str, Any]], periods: int) -> list[dict[str, Any]]:
     """The spherical pendulum by each solver."""
-    closed, windows = _Closed(), _windows(periods)
+    closed, windows = Closed(), _windows(periods)
     scene, times = spherical_pendulum(m=1.0, R=1.0, g=G), windows.ravel()
     rows = []
     for name, keywords in runs.items():

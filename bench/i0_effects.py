@@ -410,8 +410,8 @@ def _run_table(content: dict[str, Any]) -> dict[str, Any]:
         )
     caption = (
         f"A run of {T1:g} s and its compilation: of nothing what there is, of each effect what it adds to the case in"
-        " the second column; steps, events and time per step are its own. XLA counts the body of a loop once, so operations"
-        f" are about those of a step. {_caption(content)}"
+        " the second column; steps, events and time per step are its own. XLA counts the body of a loop once, so"
+        f" operations are about those of a step. {_caption(content)}"
     )
     columns = ["effect", "against", "operations", "transcendental", "bytes", "steps", "events", "run [us]", "step [us]"]
     return {"columns": [*columns, "trace and lower [s]", "compile [s]"], "rows": rows, "caption": caption}
