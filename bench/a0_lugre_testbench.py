@@ -16,6 +16,7 @@ import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _elsewhere import ask
 from _ladder import half_decades, loosest
 from _lugre import (
     CVODES,
@@ -45,9 +46,8 @@ CHOICES = {"over the run": "v_run", "at the end": "v_end"}
 # Of derivatives; Kvaerno5 is the stiff solver that diffrax recommends.
 DIFFERENTIATED = (OURS, KVAERNO5)
 ABSENT = {
-    "MuJoCo": "its friction is a limit on a constraint force (frictionloss) that slips from the first newton on; it has"
-    " no bristle state, so its motion is that of another law",
-    "jaxonomy": "no environment of it was given (--jaxonomy)",
+    "MuJoCo": "its friction is a soft limit on a constraint force (frictionloss); it has no bristle, so its motion is"
+    " that of another law, at any tolerance",
 }
 
 
@@ -72,6 +72,9 @@ def main() -> None:
         "ladder": ladder,
         "chosen": chosen,
         "not_measured": ABSENT,
+        "jaxonomy": {"missing": "a smoke run"}
+        if smoke
+        else _jaxonomy(options.jaxonomy, options.tuned, float(reference[-1, 1])),
         "one_run": {label: _one_run(solvers, picks, 2 if smoke else 60) for label, picks in chosen.items()},
         "many_runs": _many_runs(solvers, chosen["over the run"], 128 if smoke else 1024, 1 if smoke else 7),
         "derivatives": _derivatives(solvers, chosen["over the run"], 2 if smoke else 40),
@@ -151,6 +154,15 @@ def _derivatives(solvers: list[Peer], picks: dict[str, Any], rounds: int) -> dic
     return {"parameters": PARAMETERS, "finite_differences": exact.tolist(), "measured": report}
 
 
+def _jaxonomy(interpreter: str | None, tuned: bool, v_end: float) -> dict[str, Any]:
+    """Its two solvers at the loosest tolerance that keeps the end velocity, as its results are recorded at steps."""
+    if interpreter is None:
+        return {"missing": "no environment of it was given (--jaxonomy)"}
+    task = {"parameters": PARAMETERS, "nominal": list(TESTBENCH.numbers), "mass": TESTBENCH.mass, "t1": TESTBENCH.t1}
+    task |= {"ladder": LADDER, "atol": TESTBENCH.atol, "goal": GOAL, "v_end": v_end, "rounds": 25}
+    return ask(interpreter, "_jaxonomy_lugre.py", task, tuned=tuned)
+
+
 def _bind(velocity: Any, rtol: float, adjoint: Any) -> Any:
     return lambda p: velocity(p, rtol, adjoint)
 
@@ -203,9 +215,18 @@ def _main_table(content: dict[str, Any]) -> dict[str, Any]:
                 f"{gradient['error_in_the_largest']:.1e}" if "error_in_the_largest" in gradient else "-",
             ]
         )
+    other = content["jaxonomy"]
+    for label, row in other.get("times", {}).items():
+        method, rtol = label.split()
+        rows.append([f"jaxonomy {method}", *["-"] * 4, f"{show(row, 1e3)} (rtol {float(rtol):.0e})", *["-"] * 4])
     columns = ["solver", "rtol", "steps", "error of v", "one run [ms]", "one run, error at the end only [ms]"]
     columns += ["plain run, jitted [ms]", "Jacobian, 6 parameters [ms]", "reverse gradient [ms]", "its error"]
     caption = f"LuGre testbench at an error of at most {content['goal']:g}, medians, {_caption(content)}"
+    if "missing" in other:
+        caption += f" jaxonomy is missing: {other['missing']}."
+    else:
+        caption += f" jaxonomy {other['versions']['jaxonomy']} with jax {other['versions']['jax']} in an environment of"
+        caption += " its own, times scaled by those of the same NumPy work."
     return {"caption": caption, "columns": columns, "rows": rows}
 
 

@@ -13,9 +13,6 @@ own, with and without the XLA option of `tune_cpu`, and its times are scaled by 
     python bench/d0_stick_slip.py [--smoke] [--no-tune] [--jaxonomy PYTHON] [--out DIR]
 """
 
-import json
-import os
-import subprocess
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -28,6 +25,7 @@ import jax
 import jax.extend
 import jax.numpy as jnp
 import numpy as np
+from _elsewhere import ask
 from _ladder import loosest
 from _measure import machine_line, measure, scaled
 from _options import begin
@@ -50,7 +48,6 @@ from _stick_slip import (
     parameter_sets,
     scipy_end,
 )
-from _workload import numpy_workload_s
 from matplotlib import pyplot as plt
 
 import jaxmodsim as jms
@@ -308,44 +305,18 @@ def _jaxonomy(interpreter: str | None) -> dict[str, Any]:
     """What its script measured, with times scaled to this environment; or why it is missing."""
     if interpreter is None:
         return {"missing": "no environment of it was given (--jaxonomy)"}
-    sets, option = _sets(), "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000"
+    sets = _sets()
     exact, slopes = np.asarray(jax.vmap(exact_end)(jnp.asarray(sets))), np.asarray(jax.grad(exact_end)(NOMINAL))
+    task = {"nominal": NOMINAL.tolist(), "sets": sets.tolist(), "ladder": LADDER, "rtol": RTOL}
+    task |= {"t1": T1, "atol": ATOL, "max_events": events_until(T1) + 32, "rounds": 25}
     found: dict[str, Any] = {}
     for label, tuned in ((SHIPPED, False), (TUNED, True)):
-        task = {"tuned": tuned, "nominal": NOMINAL.tolist(), "sets": sets.tolist(), "ladder": LADDER, "rtol": RTOL}
-        task |= {"t1": T1, "atol": ATOL, "max_events": events_until(T1) + 32, "rounds": 25}
-        before = numpy_workload_s()
-        done = subprocess.run(
-            [interpreter, str(Path(__file__).parent / "_jaxonomy_stick_slip.py")],
-            input=json.dumps(task),
-            env=os.environ | {"XLA_FLAGS": option if tuned else ""},
-            capture_output=True,
-            text=True,
-        )
-        lines = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
-        if not lines:
-            reason = (done.stderr.strip().splitlines() or ["no output"])[-1]
-            return {"missing": f"its script failed: {reason[:200]}"}
-        row = json.loads(lines[0].removeprefix("RESULT "))
-        ours = min(before, numpy_workload_s())
-        scale = ours / row["numpy_workload_s"]
+        found[label] = row = ask(interpreter, "_jaxonomy_stick_slip.py", task, tuned=tuned)
+        if "missing" in row:
+            return row
         row["ladder"] = [{"rtol": rtol, "error": _largest(ends, exact)} for rtol, ends in row.pop("ends")]
-        row["times"] = {name: _rescaled(each, scale) for name, each in row["times"].items()}
-        row |= {
-            "numpy_workload_here_s": ours,
-            "scale": scale,
-            "largest_relative_error": _relative(row["gradient"], slopes),
-        }
-        found[label] = row
+        row["largest_relative_error"] = _relative(row["gradient"], slopes)
     return found
-
-
-def _rescaled(row: dict[str, Any], scale: float) -> dict[str, Any]:
-    return (
-        row
-        if "failed" in row
-        else scaled(row, 1) | {"unscaled_s": row["median_s"], "median_s": row["median_s"] * scale}
-    )
 
 
 # Tables.
