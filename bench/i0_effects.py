@@ -120,10 +120,10 @@ def everything() -> dict[str, Case]:
         "kept at 100 times": Case(bare, NOTHING, options=hundred, read=lambda run: run.qd),
         "kept at 1000 times": Case(bare, NOTHING, options={"ts": np.linspace(0.0, T1, 1000)}, read=lambda run: run.qd),
         AUDITED: Case(viscous, AUDITED, options=hundred, read=lambda run: run.qd),
-        "its run.energy": Case(
+        "run.energy, at 100 times": Case(
             viscous, AUDITED, options=hundred, read=lambda run: (run.qd, run.energy.balance)
         ),
-        "its energy_audit": Case(
+        "energy_audit, at 100 times": Case(
             viscous, AUDITED, options=hundred, read=lambda run: (run.qd, jms.energy_audit(run).closing_error)
         ),
     }  # fmt: skip
@@ -387,7 +387,7 @@ def _field_table(content: dict[str, Any]) -> dict[str, Any]:
 
 def _is_how(name: str) -> bool:
     """Whether a case differs in what is done with a run, not in its field."""
-    return name.startswith(("kept", "its", AUDITED))
+    return "times" in name
 
 
 def _run_table(content: dict[str, Any]) -> dict[str, Any]:
@@ -443,6 +443,10 @@ PANELS = (
 )
 
 
+def _short(value: float) -> str:
+    return f"{value:.0f}" if value >= 100.0 else f"{value:.2g}"
+
+
 def draw(content: dict[str, Any], path: Path) -> None:
     """What each effect adds, a bar each on a logarithmic scale; a line shows what there is with nothing."""
     for case in content["cases"].values():
@@ -457,14 +461,15 @@ def draw(content: dict[str, Any], path: Path) -> None:
         least = 10.0 ** np.floor(np.log10(min(there, *values[values > 0.02 * there]))) if (values > 0).any() else there
         panel.barh(names, np.where(values > least, values - least, 0.0), left=least, color="C0", height=0.66)
         for place, value in enumerate(values):
-            text = "-" if np.isnan(value) else f"{value:.3g}" if value > least else "~ 0"
+            text = "-" if np.isnan(value) else _short(value) if value > least else "about 0"
             panel.annotate(
                 text, (max(value, least) if value > least else least, place), xytext=(4, 0),
-                textcoords="offset points", va="center", fontsize=8,
+                textcoords="offset points", va="center", fontsize=8, zorder=4,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6},
             )  # fmt: skip
         panel.axvline(there, color="C1", lw=1.2, ls="--")
         panel.annotate(
-            f"nothing: {there:.3g}", (there, len(names) - 0.45), xytext=(3, 0), textcoords="offset points",
+            f"nothing: {_short(there)}", (there, len(names) - 0.45), xytext=(3, 0), textcoords="offset points",
             color="C1", fontsize=8, annotation_clip=False,
         )  # fmt: skip
         panel.set_xscale("log")
