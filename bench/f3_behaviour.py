@@ -33,6 +33,7 @@ def main() -> None:
             [each.name, each.quantity, each.unit, f"{'<=' if each.limit.at_most else '>='} {each.limit.value:g}"]
             for each in EXPERIMENTS.values()
         ],
+        "caption": "What the experiments find, and their limits.",
     }
     content["tables"] = [verdicts, limits]
     write_result(content, options)

@@ -179,8 +179,8 @@ def draw(content: dict[str, Any], reference: np.ndarray, path: Path) -> None:
     confirmed = content["rk4"][-1]["F_newtons"]
     right.axhline(confirmed, color="0.5", lw=1.0, ls=":")
     right.annotate(
-        "RK4 confirms the reference to here", (4e6, confirmed), xytext=(-4, 4), textcoords="offset points",
-        ha="right", fontsize=8, color="0.4",
+        "RK4 confirms the reference to here", (3e3, confirmed), xytext=(0, 4), textcoords="offset points",
+        fontsize=8, color="0.4",
     )  # fmt: skip
     right.set_xlim(min(row["steps"] for row in rows) / 1.5, 4e6)
     right.set_xlabel("steps [1]")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from bench import render
 from jaxmodsim.cli import _bench
 
 ROOT = Path(__file__).parents[1]
@@ -119,16 +120,7 @@ def test_every_bench_says_what_it_is():
     assert all(run.says.endswith((".", ":")) for run in known)
 
 
-@pytest.fixture
-def measuring(monkeypatch):
-    """Modules beside the benches."""
-    monkeypatch.syspath_prepend(str(ROOT / "bench"))
-
-
-def test_tables_are_rendered_into_their_blocks(measuring, tmp_path):
-    del measuring
-    import render
-
+def test_tables_are_rendered_into_their_blocks(tmp_path):
     table = {"columns": ["a", "b"], "rows": [["x|y", 1]], "caption": "what"}
     (tmp_path / "one.json").write_text(json.dumps({"tables": [table]}))
     text = "before\n<!-- bench:one -->\nold\n<!-- /bench -->\nafter\n"
