@@ -1,10 +1,7 @@
-"""The record of where and with what a result was made, shared by all benches."""
+"""Timing, and in one line where and with what a result was made: shared by all benches."""
 
-import json
-from pathlib import Path
 from typing import Any
 
-from jaxmodsim.numerics import describe_machine as describe_machine
 from jaxmodsim.numerics import measure as measure
 
 
@@ -28,10 +25,3 @@ def machine_line(machine: dict[str, Any]) -> str:
         f"{machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, {versions};"
         f" {machine['date']}, commit {machine['commit'][:10] or 'unknown'}{state}."
     )
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a result, creating its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=1) + "\n")
-    print(f"written: {path}")

@@ -6,13 +6,14 @@ python bench/b0_work_precision.py [--smoke] [--no-tune] [--out DIR]
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
-from _lugre import ATOL, error_ladder, peers, reference_solution
-from _measure import describe_machine, machine_line, measure, write_json
+from _ladder import half_decades
+from _lugre import TESTBENCH, error_ladder, peers, reference_solution
+from _measure import machine_line, measure
 from _options import begin
+from _report import new_result, write_figure, write_result
 from matplotlib import pyplot as plt
 
-LADDER = tuple(10.0**-k for k in range(3, 11))
+LADDER = half_decades(-3, -10)
 
 
 def main() -> None:
@@ -27,42 +28,37 @@ def main() -> None:
         for row in points[peer.name]
         if "failed" not in row
     }
-    times = measure(calls, 1 if options.smoke else 20)
+    times = measure(calls, 1 if options.smoke else 20, limit_s=3.0)
     for peer, rows in points.items():
         for row in rows:
             row |= times.get(f"{peer} {row['rtol']:.0e}", {})
-    content = {
-        "name": name,
-        "smoke": options.smoke,
-        "machine": describe_machine("jax", "jaxlib", "diffrax", "casadi", "scipy", "numpy", "jaxmodsim"),
-        "tuned": options.tuned,
-        "atol_over_rtol": ATOL,
+    content = new_result(name, options, "diffrax", "casadi", "scikit-sundae", "scipy", "numpy") | {
+        "atol_over_rtol": TESTBENCH.atol,
         "reference_disagreement": agreement,
         "points": points,
     }
-    content["table"] = _table(points)
-    content["caption"] = (
-        "Time of one run [ms] and largest error of the velocity over the run, relative to the largest velocity."
-        f" {machine_line(content['machine'])}"
-    )
-    write_json(options.out / f"{name}.json", content)
+    content["tables"] = [_table(content)]
+    write_result(content, options)
     draw(content, options.out / f"{name}.png")
 
 
-def _table(points: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+def _table(content: dict[str, Any]) -> dict[str, Any]:
     def cell(row: dict[str, Any]) -> str:
         return "failed" if "failed" in row else f"{1e3 * row['median_s']:.2f} ms, {row['v_run']:.0e}"
 
-    tolerances = [f"rtol {row['rtol']:.0e}" for row in next(iter(points.values()))]
-    rows = [[peer, *(cell(row) for row in found)] for peer, found in points.items()]
-    return {"columns": ["solver", *tolerances], "rows": rows}
+    points = content["points"]
+    rows = [[f"{same[0]['rtol']:.0e}", *(cell(row) for row in same)] for same in zip(*points.values(), strict=True)]
+    caption = (
+        "Time of one run [ms] and largest error of the velocity over the run, relative to the largest velocity."
+        f" {machine_line(content['machine'])}"
+    )
+    return {"columns": ["rtol", *points], "rows": rows, "caption": caption}
 
 
 def draw(content: dict[str, Any], path: Path) -> None:
     """Work-precision diagram: the lower left is the better place."""
-    mpl.use("Agg")
     figure, axes = plt.subplots(figsize=(7.0, 4.6), layout="constrained")
-    for marker, (peer, rows) in zip("osD^v", content["points"].items(), strict=False):
+    for marker, (peer, rows) in zip("osD^v<>PX*", content["points"].items(), strict=False):
         kept = [row for row in rows if "failed" not in row]
         axes.loglog(
             [row["v_run"] for row in kept], [1e3 * row["median_s"] for row in kept], marker=marker, ms=4.5, label=peer
@@ -72,9 +68,7 @@ def draw(content: dict[str, Any], path: Path) -> None:
     axes.set_title("LuGre testbench, 10 s: one point for each relative tolerance")
     axes.grid(which="both", alpha=0.25)
     axes.legend()
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
-    print(f"written: {path}")
+    write_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -18,8 +18,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _measure import describe_machine, machine_line, write_json
+from _measure import machine_line
 from _options import begin
+from _report import new_result, write_result
 
 import jaxmodsim as jms
 from jaxmodsim.identify import AXIS_MODELS, axis_scene, first_coordinate, replay, rough_axis, start_state
@@ -43,13 +44,12 @@ def main() -> None:
         return
     t, q, _, u = np.loadtxt(options.record, delimiter=",", skiprows=1).T
     record = jms.Record(t, q, {"u": DRIVE_GAIN * u}, name="EMPS")
-    machine = describe_machine("jax", "jaxlib", "scipy", "jaxmodsim")
-    content: dict[str, Any] = {"name": "measured_axis", "smoke": options.smoke, "machine": machine}
+    content = new_result("measured_axis", options, "scipy") | {"tables": []}
     if options.smoke:
         report = run_command(options.record, "--model", "coulomb")
         content["fits"] = {"coulomb": report["rmse"]["measured"]}
         print(content["fits"], rmse_with_substeps(record, "coulomb", report["parameters"], 2))
-        write_json(options.out / "measured_axis.json", content)
+        write_result(content, options)
         return
     report = run_command(options.record, "--compare", "all")
     found = report["comparison"]
@@ -78,13 +78,14 @@ def main() -> None:
         "held back [mm]",
         "its std. error [mm]",
     ]
-    content["table"] = {"columns": [*columns, "not determined by the record"], "rows": rows}
-    content["caption"] = (
+    caption = (
         "EMPS record, 24 841 samples, open-loop error of the position over the whole record, and in four parts"
         f" that were held back one after the other. Asked for: {GOAL} mm with at most 8 parameters. One command,"
-        f" {report['whole_seconds']:.0f} s. {machine_line(machine)}"
+        f" {report['whole_seconds']:.0f} s. {machine_line(content['machine'])}"
     )
-    write_json(options.out / "measured_axis.json", content)
+    columns.append("not determined by the record")
+    content["tables"] = [{"columns": columns, "rows": rows, "caption": caption}]
+    write_result(content, options)
 
 
 def run_command(record: Path, *how: str) -> dict[str, Any]:

@@ -4,12 +4,12 @@ import json
 import tempfile
 from pathlib import Path
 
-from _measure import describe_machine, machine_line, write_json
+from _measure import machine_line
 from _options import begin
+from _report import new_result, write_result
 
 from jaxmodsim.cli._report import report_testbench
 
-HERE = Path(__file__).parent
 MODEL_COLUMNS = {
     "model": "model",
     "part": "part",
@@ -30,17 +30,15 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         report_testbench(Path(folder))
         report = json.loads((Path(folder) / "testbench.json").read_text())
-    machine = describe_machine("jax", "jaxlib", "diffrax", "jaxmodsim")
+    content = new_result("friction_models", options, "diffrax") | report
     table = {
         "columns": list(MODEL_COLUMNS.values()),
         "rows": [[_cell(row[key]) for key in MODEL_COLUMNS] for row in report["models"]],
+        "caption": "A box of 2 kg under a force rising by 1 N/s (where not said otherwise), 10 s. Break-away: friction"
+        f" falls behind the applied force by 0.05 N for good. {machine_line(content['machine'])}",
     }
-    caption = (
-        "A box of 2 kg under a force rising by 1 N/s (where not said otherwise), 10 s. Break-away: friction falls"
-        f" behind the applied force by 0.05 N for good. {machine_line(machine)}"
-    )
-    found = {"machine": machine, "table": table, "caption": caption, **report}
-    write_json(options.out / "friction_models.json", {"name": "friction_models", "smoke": options.smoke, **found})
+    content["tables"] = [table]
+    write_result(content, options)
 
 
 def _cell(value: object) -> str:

@@ -13,11 +13,6 @@ own, with and without the XLA option of `tune_cpu`, and its times are scaled by 
     python bench/d0_stick_slip.py [--smoke] [--no-tune] [--jaxonomy PYTHON] [--out DIR]
 """
 
-import argparse
-import json
-import os
-import subprocess
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -29,9 +24,12 @@ import equinox as eqx
 import jax
 import jax.extend
 import jax.numpy as jnp
-import matplotlib as mpl
 import numpy as np
-from _measure import describe_machine, machine_line, measure, scaled, write_json
+from _elsewhere import ask
+from _ladder import loosest
+from _measure import machine_line, measure, scaled
+from _options import begin
+from _report import new_result, write_figure, write_result
 from _stick_slip import (
     ATOL,
     NOMINAL,
@@ -50,7 +48,6 @@ from _stick_slip import (
     parameter_sets,
     scipy_end,
 )
-from _workload import numpy_workload_s
 from matplotlib import pyplot as plt
 
 import jaxmodsim as jms
@@ -69,16 +66,9 @@ TUNED, SHIPPED = "jaxonomy, XLA option set", "jaxonomy as shipped"
 
 def main() -> None:
     """Measure, and write `stick_slip.json` and `stick_slip_work_precision.png`."""
-    options = _arguments()
-    if not options.no_tune:
-        jms.tune_cpu()
-    jax.config.update("jax_enable_x64", True)
-    smoke, name = options.smoke, "stick_slip_untuned" if options.no_tune else "stick_slip"
-    content: dict[str, Any] = {
-        "name": name,
-        "smoke": smoke,
-        "machine": describe_machine("jax", "jaxlib", "diffrax", "optimistix", "scipy", "numpy", "jaxmodsim"),
-        "tuned": not options.no_tune,
+    options = begin("A minute of stick and slip, measured side by side.", may_leave_untuned=True, with_jaxonomy=True)
+    smoke, name = options.smoke, "stick_slip" if options.tuned else "stick_slip_untuned"
+    content = new_result(name, options, "diffrax", "optimistix", "scipy", "numpy") | {
         "problem": {"parameters": PARAMETERS, "values": NOMINAL.tolist(), "t1": T1, "events": events_until(T1)},
         "atol_over_rtol": ATOL,
         "compile": _compile_times(smoke),
@@ -92,23 +82,9 @@ def main() -> None:
     content["period"] = _periods(smoke)
     content["jaxonomy"] = {"missing": "a smoke run"} if smoke else _jaxonomy(options.jaxonomy)
     content["tables"] = [_main_table(content), _compile_table(content), _target_table(content)]
-    for table in content["tables"]:
-        print(table["caption"], *(" | ".join(row) for row in [table["columns"], *table["rows"]]), sep="\n")
-    write_json(options.out / f"{name}.json", content)
-    if not options.no_tune:
+    write_result(content, options)
+    if options.tuned:
         draw(content, options.out / "stick_slip_work_precision.png")
-
-
-def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="A minute of stick and slip, measured side by side.")
-    parser.add_argument("--smoke", action="store_true", help="small configuration that shows that everything runs")
-    parser.add_argument("--no-tune", action="store_true", help="without jaxmodsim.tune_cpu(); a file of its own")
-    parser.add_argument("--jaxonomy", default=None, help="Python interpreter of an environment that has jaxonomy")
-    parser.add_argument("--out", type=Path, default=None, help="folder of the result; default bench/results")
-    options = parser.parse_args()
-    if options.out is None:
-        options.out = Path(tempfile.mkdtemp()) if options.smoke else Path(__file__).parent / "results"
-    return options
 
 
 def _sets() -> np.ndarray:
@@ -149,7 +125,7 @@ def _largest(ends: Any, exact: np.ndarray) -> float:
 
 def _choose(rows: list[dict[str, Any]], goal: float) -> dict[str, Any] | None:
     """The loosest tolerance at which the error is no larger than the goal (but for 5 %)."""
-    return next((row for row in rows if row["error"] <= 1.05 * goal), None)
+    return loosest(rows, "error", 1.05 * goal)
 
 
 def _at(rows: list[dict[str, Any]], rtol: float) -> dict[str, Any]:
@@ -305,7 +281,6 @@ def _periods(smoke: bool) -> list[dict[str, Any]]:
 
 def draw(content: dict[str, Any], path: Path) -> None:
     """Two panels over the tolerance: error of the period, time of a run."""
-    mpl.use("Agg")
     rows = content["period"]
     rtol = [row["rtol"] for row in rows]
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.8), layout="constrained")
@@ -320,9 +295,7 @@ def draw(content: dict[str, Any], path: Path) -> None:
         axes.invert_xaxis()
         axes.grid(which="major", alpha=0.3)
     figure.suptitle("Belt oscillator: period of the stick-slip cycle against the tolerance")
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
-    print(f"written: {path}")
+    write_figure(figure, path)
 
 
 # jaxonomy, in its own environment.
@@ -332,44 +305,18 @@ def _jaxonomy(interpreter: str | None) -> dict[str, Any]:
     """What its script measured, with times scaled to this environment; or why it is missing."""
     if interpreter is None:
         return {"missing": "no environment of it was given (--jaxonomy)"}
-    sets, option = _sets(), "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000"
+    sets = _sets()
     exact, slopes = np.asarray(jax.vmap(exact_end)(jnp.asarray(sets))), np.asarray(jax.grad(exact_end)(NOMINAL))
+    task = {"nominal": NOMINAL.tolist(), "sets": sets.tolist(), "ladder": LADDER, "rtol": RTOL}
+    task |= {"t1": T1, "atol": ATOL, "max_events": events_until(T1) + 32, "rounds": 25}
     found: dict[str, Any] = {}
     for label, tuned in ((SHIPPED, False), (TUNED, True)):
-        task = {"tuned": tuned, "nominal": NOMINAL.tolist(), "sets": sets.tolist(), "ladder": LADDER, "rtol": RTOL}
-        task |= {"t1": T1, "atol": ATOL, "max_events": events_until(T1) + 32, "rounds": 25}
-        before = numpy_workload_s()
-        done = subprocess.run(
-            [interpreter, str(Path(__file__).parent / "_jaxonomy_stick_slip.py")],
-            input=json.dumps(task),
-            env=os.environ | {"XLA_FLAGS": option if tuned else ""},
-            capture_output=True,
-            text=True,
-        )
-        lines = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
-        if not lines:
-            reason = (done.stderr.strip().splitlines() or ["no output"])[-1]
-            return {"missing": f"its script failed: {reason[:200]}"}
-        row = json.loads(lines[0].removeprefix("RESULT "))
-        ours = min(before, numpy_workload_s())
-        scale = ours / row["numpy_workload_s"]
+        found[label] = row = ask(interpreter, "_jaxonomy_stick_slip.py", task, tuned=tuned)
+        if "missing" in row:
+            return row
         row["ladder"] = [{"rtol": rtol, "error": _largest(ends, exact)} for rtol, ends in row.pop("ends")]
-        row["times"] = {name: _rescaled(each, scale) for name, each in row["times"].items()}
-        row |= {
-            "numpy_workload_here_s": ours,
-            "scale": scale,
-            "largest_relative_error": _relative(row["gradient"], slopes),
-        }
-        found[label] = row
+        row["largest_relative_error"] = _relative(row["gradient"], slopes)
     return found
-
-
-def _rescaled(row: dict[str, Any], scale: float) -> dict[str, Any]:
-    return (
-        row
-        if "failed" in row
-        else scaled(row, 1) | {"unscaled_s": row["median_s"], "median_s": row["median_s"] * scale}
-    )
 
 
 # Tables.

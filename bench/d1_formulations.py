@@ -20,10 +20,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from _measure import describe_machine, machine_line, measure, write_json
+from _measure import machine_line, measure
 from _options import begin
+from _report import new_result, write_figure, write_result
 from matplotlib import pyplot as plt
 
 import jaxmodsim as jms
@@ -57,26 +57,18 @@ def main() -> None:
         _add_orders(rows)
         for row in rows:
             row |= times[f"{name} {row['parameter']:g}"]
-    content: dict[str, Any] = {
-        "name": "formulations",
-        "smoke": options.smoke,
-        "machine": describe_machine("jax", "jaxlib", "diffrax", "jaxmodsim"),
+    content = new_result("formulations", options, "diffrax") | {
         "problem": {"m": M, "k": K, "Fc": COULOMB, "x0": X0, "t1": T1},
         "exact": times["exact"] | {"error": disagreement, "steps": _steps(jms.Coulomb(COULOMB))},
         "points": points,
     }
-    content["table"] = _table(content)
-    content["caption"] = (
+    caption = (
         f"Mass of {M:g} kg on a spring of {K:g} N/m with {COULOMB:g} N of Coulomb friction, let go at {X0:g} m,"
         f" {T1:g} s; exact: against the closed form, the others against exact. Errors at rtol 1e-11, orders from row to"
         f" row, steps and times at rtol 1e-6. {machine_line(content['machine'])}"
     )
-    print(
-        content["caption"],
-        *(" | ".join(row) for row in [content["table"]["columns"], *content["table"]["rows"]]),
-        sep="\n",
-    )
-    write_json(options.out / "formulations.json", content)
+    content["tables"] = [_table(content) | {"caption": caption}]
+    write_result(content, options)
     draw(content, options.out / "formulations.png")
 
 
@@ -148,7 +140,6 @@ def _ms(row: dict[str, Any]) -> str:
 
 def draw(content: dict[str, Any], path: Path) -> None:
     """Errors against the width and against the stiffness, with the lines of their orders."""
-    mpl.use("Agg")
     figure, axes = plt.subplots(1, 2, figsize=(9.0, 4.0), sharey=True, layout="constrained")
     labels = {"Regularized": "width [m/s]", "LuGre": "bristle stiffness sigma0 [N/m]"}
     for panel, (name, rows) in zip(axes, content["points"].items(), strict=True):
@@ -165,9 +156,7 @@ def draw(content: dict[str, Any], path: Path) -> None:
         panel.legend()
     axes[0].invert_xaxis()
     axes[0].set_ylabel("distance from the exact run [m]")
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
-    print(f"written: {path}")
+    write_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -24,11 +24,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib as mpl
 import numpy as np
 from _chain import JAX, STEP, Accelerations, Engine, Symbolic, arrays, scene, states
-from _measure import describe_machine, machine_line, measure, scaled, write_json
+from _measure import machine_line, measure, scaled
 from _options import begin
+from _report import new_result, write_figure, write_result
 from matplotlib import pyplot as plt
 
 import jaxmodsim as jms
@@ -56,18 +56,13 @@ def main() -> None:
         print(
             f"n = {n}: {', '.join(f'{name} {_ns(found, LOOP)}' for name, found in point['times'].items())} ns in a loop"
         )
-    content: dict[str, Any] = {
-        "name": "accelerations",
-        "smoke": options.smoke,
-        "machine": describe_machine("jax", "jaxlib", "mujoco", "sympy", "numpy", "jaxmodsim"),
+    content = new_result("accelerations", options, "mujoco", "sympy", "numpy") | {
         "euler_step_s": STEP,
         "points": points,
         "exponents": _exponents(points),
     }
     content["tables"] = [_main_table(content), _other_table(content), _compile_table(content), _target_table(content)]
-    for table in content["tables"]:
-        print(table["caption"], *(" | ".join(row) for row in [table["columns"], *table["rows"]]), sep="\n")
-    write_json(options.out / "accelerations.json", content)
+    write_result(content, options)
     draw(content, options.out / "accelerations.png")
 
 
@@ -279,7 +274,6 @@ def _met(fulfilled: bool) -> str:
 
 def draw(content: dict[str, Any], path: Path) -> None:
     """Time over the number of links, one panel for each way to measure."""
-    mpl.use("Agg")
     figure, axes = plt.subplots(1, 3, figsize=(12.0, 4.3), sharey=True, layout="constrained")
     for panel, (mode, label) in zip(axes, LABELS.items(), strict=True):
         for i, (marker, name) in enumerate(zip("osD^", (OURS, HAND, SYMPY, MUJOCO), strict=True)):
@@ -293,9 +287,7 @@ def draw(content: dict[str, Any], path: Path) -> None:
         panel.grid(which="major", alpha=0.25)
     axes[0].set_ylabel("time of one evaluation of the accelerations [ns]")
     axes[0].legend()
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
-    print(f"written: {path}")
+    write_figure(figure, path)
 
 
 if __name__ == "__main__":

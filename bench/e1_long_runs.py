@@ -27,8 +27,9 @@ import jax
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
-from _measure import describe_machine, machine_line, write_json
+from _measure import machine_line
 from _options import begin
+from _report import new_result, write_figure, write_result
 from matplotlib import pyplot as plt
 from scipy.special import ellipj, ellipk
 
@@ -89,16 +90,13 @@ def main() -> None:
     }
     if options.smoke:
         cases = dict(itertools.islice(cases.items(), 1))
-    swing = math.acos(_Closed().lower) - PHI0
-    content: dict[str, Any] = {
-        "name": "long_runs",
-        "smoke": options.smoke,
-        "machine": describe_machine("jax", "jaxlib", "diffrax", "scipy", "numpy", "jaxmodsim"),
+    swing = math.acos(Closed().lower) - PHI0
+    content = new_result("long_runs", options, "diffrax", "scipy", "numpy") | {
         "problem": {
             "g": G,
             "phi0": PHI0,
             "spin0": SPIN0,
-            "period_s": _Closed().period,
+            "period_s": Closed().period,
             "angle0": ANGLE0,
             "swing": swing,
         },
@@ -110,13 +108,11 @@ def main() -> None:
     content["tables"] = [_long_table(content), _constraint_table(content), _order_table(content)]
     if not options.smoke:
         content["tables"].append(_target_table(content))
-    for table in content["tables"]:
-        print(table["caption"], *(" | ".join(row) for row in [table["columns"], *table["rows"]]), sep="\n")
-    write_json(options.out / "long_runs.json", content)
+    write_result(content, options)
     draw(content, options.out / "long_runs.png")
 
 
-class _Closed:
+class Closed:
     """Closed form of the spherical pendulum let go at a turning point of phi, unit mass and radius.
 
     `u = cos(phi)` obeys `u'^2 = 2 g (u - u1)(u - u2)(u - u3)` and moves between u1 and u2, the start.
@@ -144,7 +140,7 @@ class _Closed:
 
 def _windows(periods: int) -> np.ndarray:
     """Times of saving, shape `[windows, SAMPLES]`: windows of a period, spread evenly over the logarithm of time."""
-    period = _Closed().period
+    period = Closed().period
     last = int(periods * period / DT) - SAMPLES
     starts = np.unique(np.geomspace(period / DT, last, 36).astype(int))
     kept = [starts[0]]
@@ -172,7 +168,7 @@ def _growth(t: np.ndarray, error: np.ndarray, lost: float = math.inf) -> float |
 
 def long_runs(runs: dict[str, dict[str, Any]], periods: int) -> list[dict[str, Any]]:
     """The spherical pendulum by each solver."""
-    closed, windows = _Closed(), _windows(periods)
+    closed, windows = Closed(), _windows(periods)
     scene, times = spherical_pendulum(m=1.0, R=1.0, g=G), windows.ravel()
     rows = []
     for name, keywords in runs.items():
@@ -448,7 +444,6 @@ def _spread(places: np.ndarray, gap: float, top: float) -> np.ndarray:
 
 def draw(content: dict[str, Any], path: Path) -> None:
     """Errors of the energy and of the angle over periods, one line for each solver, named at its end."""
-    mpl.use("Agg")
     figure, axes = plt.subplots(1, 2, figsize=(13.0, 5.4), layout="constrained")
     rows = content["long_runs"]
     gauss, others = [row for row in rows if "dt" in row], [row for row in rows if "dt" not in row]
@@ -484,9 +479,7 @@ def draw(content: dict[str, Any], path: Path) -> None:
     axes[1].set_ylabel("error of the angle phi [rad], largest in a period")
     axes[0].set_title("Energy: no drift with Gauss (solid), linear with the others", loc="left")
     axes[1].set_title("Angle: linear in time with Gauss, quadratic with the others", loc="left")
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
-    print(f"written: {path}")
+    write_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
-from _measure import describe_machine, machine_line, write_json
+from _measure import machine_line
 from _options import begin
+from _report import new_result, write_figure, write_result
 
 import jaxmodsim as jms
 from jaxmodsim.identify import law_force
@@ -79,14 +79,9 @@ def main() -> None:
         row, drawn[name] = judge(name, law, free, known, (t, normal, x, force))
         rows.append(row)
         print(row)
-    machine = describe_machine("jax", "jaxlib", "optimistix", "jaxmodsim")
-    content: dict[str, Any] = {"name": "presliding", "smoke": options.smoke, "machine": machine, "laws": rows}
-    content["table"] = table(rows)
-    content["caption"] = (
-        "Friction force of measured presliding loops (5 N of load, peaks of 2.6 N): root mean square of the error on"
-        f" the half that was fitted and on the other. {machine_line(machine)}"
-    )
-    write_json(options.out / "presliding.json", content)
+    content = new_result("presliding", options, "optimistix") | {"laws": rows}
+    content["tables"] = [table(rows, machine_line(content["machine"]))]
+    write_result(content, options)
     draw(x, force, half, drawn, rows, options.out / "presliding.png")
 
 
@@ -112,7 +107,7 @@ def judge(name: str, law: Any, free: Any, known: jms.Record, columns: tuple[Any,
     return row, modelled
 
 
-def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def table(rows: list[dict[str, Any]], machine: str) -> dict[str, Any]:
     """Laws by their error on the half that was held back, and how much more than the best that is."""
     ranked = sorted(rows, key=lambda row: row["rmse_held_back"])
     best = ranked[0]["rmse_held_back"]
@@ -129,12 +124,15 @@ def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
         for row in ranked
     ]
     names = ["law", "parameters", "fitted half [mN]", "held-back half [mN]", "over the best", "evaluations", "fit [s]"]
-    return {"columns": names, "rows": cells}
+    caption = (
+        "Friction force of measured presliding loops (5 N of load, peaks of 2.6 N): root mean square of the error on"
+        f" the half that was fitted and on the other. {machine}"
+    )
+    return {"columns": names, "rows": cells, "caption": caption}
 
 
 def draw(x: Any, force: Any, half: int, drawn: dict[str, Any], rows: list[dict[str, Any]], path: Path) -> None:
     """A few loops of the half that was held back, measured and by each law."""
-    mpl.use("Agg")
     columns = min(3, len(drawn))
     lines = -(-len(drawn) // columns)
     figure, axes = plt.subplots(
@@ -157,10 +155,7 @@ def draw(x: Any, force: Any, half: int, drawn: dict[str, Any], rows: list[dict[s
         panel.set_ylabel("friction force [N]")
     axes[0, 0].legend(fontsize=8)
     figure.suptitle("Loops that no law was fitted to")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    print(f"written: {path}")
+    write_figure(figure, path, dpi=110)
 
 
 if __name__ == "__main__":

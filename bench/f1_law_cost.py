@@ -6,18 +6,17 @@ compiled code and nothing else; so many evaluations run in one loop, each of whi
 """
 
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from _measure import describe_machine, machine_line, measure, write_json
+from _measure import machine_line, measure
 from _options import begin
+from _report import new_result, write_result
 
 import jaxmodsim as jms
 from jaxmodsim.friction import AbstractDynamicLaw, AbstractSetValuedLaw
 
-HERE = Path(__file__).parent
 BATCH, LOOP = 4096, 2000
 NUMBERS = {"sigma0": 1e4, "sigma1": 20.0, "sigma2": 0.4, "Fc": 1.0, "Fs": 1.5, "vs": 0.01}
 
@@ -113,16 +112,13 @@ def main() -> None:
     base = seconds["Coulomb"]
     rows = [[name, *(f"{of[kind] / base[kind]:.2g}" for kind in kinds)] for name, of in seconds.items()]
     rows.append(["Coulomb [ns]", *(f"{1e9 * base[kind]:.3g}" for kind in kinds)])
-    machine = describe_machine("jax", "jaxlib", "jaxmodsim")
-    content = {"name": "law_cost", "smoke": options.smoke, "machine": machine, "seconds": seconds}
-    content["table"] = {"columns": ["law", *kinds], "rows": rows}
-    content["caption"] = (
+    content = new_result("law_cost", options) | {"seconds": seconds}
+    caption = (
         "Time of one evaluation (force and rate) and of its gradient, in Coulomb's: one after the other, and per lane"
-        f" of vmap({BATCH}) with parameters of its own; medians, all in one process. {machine_line(machine)}"
+        f" of vmap({BATCH}) with parameters of its own; medians, all in one process. {machine_line(content['machine'])}"
     )
-    write_json(options.out / "law_cost.json", content)
-    for row in rows:
-        print(*row)
+    content["tables"] = [{"columns": ["law", *kinds], "rows": rows, "caption": caption}]
+    write_result(content, options)
 
 
 if __name__ == "__main__":

@@ -18,8 +18,9 @@ from typing import Any
 
 import diffrax as dfx
 import numpy as np
-from _measure import describe_machine, machine_line, measure, write_json
+from _measure import machine_line, measure
 from _options import begin
+from _report import new_result, write_result
 
 import jaxmodsim as jms
 from jaxmodsim.problems import box_lugre, ramped_box
@@ -46,27 +47,23 @@ def main() -> None:
     }
     times = measure(calls, 1 if options.smoke else 20)
     count = round(T1 / TIMED_STEP)
-    content: dict[str, Any] = {
-        "name": "fixed_step",
-        "smoke": options.smoke,
-        "machine": describe_machine("jax", "jaxlib", "diffrax", "jaxmodsim"),
+    content = new_result("fixed_step", options, "diffrax") | {
         "problem": {"m": M, "t1": T1, "sigma1": "2 sqrt(m sigma0)"},
         "points": points,
         "times": {"step": TIMED_STEP, "steps": count, "runs": times},
     }
-    content["table"] = _table(points, steps)
-    content["time_table"] = {
+    machine = machine_line(content["machine"])
+    errors = _table(points, steps) | {
+        "caption": f"Box of {M:g} kg on a LuGre bristle with critical damping, pulled by 1 N/s for {T1:g} s: error of"
+        f" the last velocity [m/s] by stiffness and step. {machine}",
+    }
+    costs = {
         "columns": ["run", "time per step [us]"],
         "rows": [[name, _microseconds(row, count)] for name, row in times.items()],
+        "caption": f"Time per step with steps of 1 ms, by stiffness [N/m]: medians of warm runs. {machine}",
     }
-    content["caption"] = (
-        f"Box of {M:g} kg on a LuGre bristle with critical damping, pulled by 1 N/s for {T1:g} s: error of the last"
-        f" velocity [m/s] by stiffness and step. {machine_line(content['machine'])}"
-    )
-    print(content["caption"])
-    for table in (content["table"], content["time_table"]):
-        print(*(" | ".join(row) for row in [table["columns"], *table["rows"]]), sep="\n")
-    write_json(options.out / "fixed_step.json", content)
+    content["tables"] = [errors, costs]
+    write_result(content, options)
 
 
 def _scene(sigma0: float) -> jms.Scene:

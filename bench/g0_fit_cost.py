@@ -14,8 +14,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _measure import describe_machine, machine_line, write_json
+from _measure import machine_line
 from _options import begin
+from _report import new_result, write_result
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
@@ -33,20 +34,20 @@ def main() -> None:
     """Measure, and write `fit_cost.json`."""
     options = begin("Cost of fits.", smoke="a short record, few starts, into a temporary folder", record=RECORD)
     rows: list[list[str]] = []
-    content: dict[str, Any] = {"name": "fit_cost", "smoke": options.smoke}
+    content = new_result("fit_cost", options, "scipy", "numba")
     if options.record.exists():
         content |= axis_costs(options.record, options.smoke, rows)
     else:
         print(f"without the measured axis: there is no record at {options.record}")
     content |= many_starts(8 if options.smoke else 256, rows)
-    machine = describe_machine("jax", "jaxlib", "scipy", "numba", "jaxmodsim")
-    content["machine"] = machine
-    content["table"] = {"columns": ["fit", "cold [s]", "warm [s]", "evaluations", "RMSE"], "rows": rows}
-    content["caption"] = (
+    caption = (
         "Four numbers of the EMPS axis by open-loop simulation, and 256 starts of LuGre's six on 2 000 samples; one"
-        f" process. An evaluation of ours is a run with all derivatives, of the others a run. {machine_line(machine)}"
+        " process. An evaluation of ours is a run with all derivatives, of the others a run."
+        f" {machine_line(content['machine'])}"
     )
-    write_json(options.out / "fit_cost.json", content)
+    columns = ["fit", "cold [s]", "warm [s]", "evaluations", "RMSE"]
+    content["tables"] = [{"columns": columns, "rows": rows, "caption": caption}]
+    write_result(content, options)
 
 
 def timed(work: Any) -> tuple[Any, float]:

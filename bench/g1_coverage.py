@@ -6,13 +6,13 @@ others.
 """
 
 import time
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _measure import describe_machine, machine_line, write_json
+from _measure import machine_line
 from _options import begin
+from _report import new_result, write_result
 from g0_fit_cost import NAMES, sprung
 
 import jaxmodsim as jms
@@ -34,7 +34,7 @@ def main() -> None:
     q = run(sprung(*TRUTH), jnp.asarray(t), {"u": jnp.asarray(u)}, zero, zero, 1, first_coordinate)
     record = jms.Record(t, np.asarray(q), {"u": u}, noise=NOISE)
     fitted = jms.fit(sprung(*WRONG), record, tuple(f"friction.{x}" for x in NAMES), q0=[0.0], begin=Staged())
-    content: dict[str, Any] = {"name": "coverage", "smoke": options.smoke, "repeats": repeats}
+    content = new_result("coverage", options) | {"repeats": repeats}
     rows = []
     for label, memory in (("white", 0.0), ("correlation 0.9 from sample to sample", 0.9)):
         started = time.perf_counter()
@@ -44,15 +44,13 @@ def main() -> None:
         shares = [found.shares[f"friction.{name}"] for name in NAMES]
         rows.append([label, *(f"{100 * share:.1f}" for share in shares), f"{found.converged}", f"{seconds:.0f}"])
         content[label] = {"shares": found.shares, "converged": found.converged, "seconds": seconds}
-    machine = describe_machine("jax", "jaxlib", "jaxmodsim")
-    content["machine"] = machine
-    columns = ["noise", *(f"{name} [%]" for name in NAMES), "converged", "time [s]"]
-    content["table"] = {"columns": columns, "rows": rows}
-    content["caption"] = (
+    caption = (
         f"Share of {repeats} repeats whose 95 % interval held the truth; starts wrong by up to a factor of ten."
-        f" {machine_line(machine)}"
+        f" {machine_line(content['machine'])}"
     )
-    write_json(options.out / "coverage.json", content)
+    columns = ["noise", *(f"{name} [%]" for name in NAMES), "converged", "time [s]"]
+    content["tables"] = [{"columns": columns, "rows": rows, "caption": caption}]
+    write_result(content, options)
 
 
 if __name__ == "__main__":

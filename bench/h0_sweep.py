@@ -20,24 +20,38 @@ import subprocess
 import sys
 import tempfile
 import time
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from _lugre import ATOL, PARAMETERS, T1, Peer, error_ladder, parameter_sets, peers, reference_solution
-from _measure import describe_machine, machine_line, measure, scaled, write_json
+from _ladder import half_decades, loosest
+from _lugre import (
+    CVODES,
+    KVAERNO5,
+    LOOP,
+    OBSERVE,
+    OURS,
+    TESTBENCH,
+    VMAP,
+    Peer,
+    error_ladder,
+    parameter_sets,
+    peers,
+    reference_solution,
+    run_sweep,
+    testbench,
+)
+from _measure import machine_line, measure, scaled
 from _options import begin
+from _report import new_result, target_rows, write_result
 from _workload import numpy_workload_s
 
 import jaxmodsim as jms
 from jaxmodsim.problems import box_lugre, ramped_box
 
 GOAL = 1e-6
-LADDER = tuple(10.0**-k for k in range(3, 9))
-OBSERVE = {"v": (lambda run: run.qd[-1, 0], "m/s")}
-OURS, KVAERNO5, CVODES = "jaxmodsim", "diffrax Kvaerno5", "CVODES (CasADi)"
+LADDER = half_decades(-3, -8)
 
 
 def main() -> None:
@@ -45,13 +59,10 @@ def main() -> None:
     options = begin("Sweeps, measured side by side.")
     smoke = options.smoke
     reference, _ = reference_solution()
-    solvers = {peer.name: peer for peer in peers() if peer.name in (OURS, KVAERNO5, CVODES)}
+    solvers = {peer.name: peer for peer in peers(only=(OURS, KVAERNO5, CVODES))}
     rtol = {name: _loosest(peer, reference) for name, peer in solvers.items()}
     print("tolerances", rtol)
-    content: dict[str, Any] = {
-        "name": "sweep",
-        "smoke": smoke,
-        "machine": describe_machine("jax", "jaxlib", "diffrax", "casadi", "xarray", "zarr", "numpy", "jaxmodsim"),
+    content = new_result("sweep", options, "diffrax", "casadi", "xarray", "zarr", "numpy") | {
         "rtol": rtol,
         "side_by_side": _side_by_side(solvers, rtol, 64 if smoke else 4096, 1 if smoke else 5),
         "cores": _cores(rtol[OURS], 512 if smoke else 65536, 1 if smoke else 5),
@@ -61,34 +72,18 @@ def main() -> None:
         "killed": _killed(rtol[OURS], 1 if smoke else 20),
     }
     content["tables"] = [_table(content), _target_table(content)]
-    for table in content["tables"]:
-        print(table["caption"], *(" | ".join(row) for row in [table["columns"], *table["rows"]]), sep="\n")
-    write_json(options.out / "sweep.json", content)
+    write_result(content, options)
 
 
 def _loosest(peer: Peer, reference: np.ndarray) -> float:
-    return next(row["rtol"] for row in error_ladder(peer, reference, LADDER) if row.get("v_run", np.inf) <= GOAL)
-
-
-@cache
-def testbench() -> jms.Scene:
-    """The scene: made once, and not before JAX has its settings."""
-    return ramped_box(box_lugre())
-
-
-def run_sweep(sets: np.ndarray, rtol: float | np.ndarray, **options: Any) -> Any:
-    """The sets of parameters, run by `sweep`, with one tolerance for all or one for each."""
-    over = {f"friction.{name}": sets[:, i] for i, name in enumerate(PARAMETERS)}
-    tolerance = {"rtol": rtol, "atol": ATOL * rtol}
-    start: dict[str, Any] = {"q0": [0.0], "qd0": [0.0], "t1": T1}
-    if np.ndim(rtol) == 0:
-        return jms.sweep(testbench(), {"set": over}, OBSERVE, **(start | tolerance | options))
-    return jms.sweep(testbench(), {"set": over | tolerance}, OBSERVE, **(start | options))
+    row = loosest(error_ladder(peer, reference, LADDER), "v_run", GOAL)
+    assert row is not None, f"{peer.name} does not reach {GOAL:g}"
+    return row["rtol"]
 
 
 def cvodes_velocities(rtol: float, sets: np.ndarray) -> np.ndarray:
     """End velocities by CVODES, one after another; run in a process of its own."""
-    return next(peer for peer in peers() if peer.name == CVODES).many(rtol, sets)()
+    return peers(only=(CVODES,))[0].many[LOOP](rtol, sets)()
 
 
 def _side_by_side(solvers: dict[str, Peer], rtol: dict[str, float], count: int, rounds: int) -> dict[str, Any]:
@@ -97,10 +92,10 @@ def _side_by_side(solvers: dict[str, Peer], rtol: dict[str, float], count: int, 
     with cf.ProcessPoolExecutor(cores, multiprocessing.get_context("spawn")) as pool:
         parts = np.array_split(sets, 4 * cores)
         list(pool.map(cvodes_velocities, [1e-3] * cores, [sets[:2]] * cores))
-        kvaerno = solvers[KVAERNO5].many(rtol[KVAERNO5], sets)
+        kvaerno = solvers[KVAERNO5].many[VMAP](rtol[KVAERNO5], sets)
         calls = {
             OURS: lambda: run_sweep(sets, rtol[OURS])["v"].values,
-            f"{OURS}, plain vmap": solvers[OURS].many(rtol[OURS], sets),
+            f"{OURS}, plain vmap": solvers[OURS].many[VMAP](rtol[OURS], sets),
             f"{CVODES}, {cores} processes": lambda: np.concatenate(
                 list(pool.map(cvodes_velocities, [rtol[CVODES]] * len(parts), parts))
             ),
@@ -152,7 +147,8 @@ def _spread(rtol: float, count: int, rounds: int) -> dict[str, Any]:
     ranges = {"sigma0": (1e2, 1e6), "sigma1": (0.1, 1e2), "vs": (1e-3, 0.2)}
     drawn = np.random.default_rng(1).uniform(size=(len(ranges), count))
     sets = {f"friction.{n}": a * (b / a) ** u for (n, (a, b)), u in zip(ranges.items(), drawn, strict=True)}
-    start: dict[str, Any] = {"q0": [0.0], "qd0": [0.0], "t1": T1, "rtol": rtol, "atol": ATOL * rtol}
+    tolerance = {"rtol": rtol, "atol": TESTBENCH.atol * rtol}
+    start: dict[str, Any] = {"q0": [0.0], "qd0": [0.0], "t1": TESTBENCH.t1, **tolerance}
 
     def run() -> Any:
         return jms.sweep(testbench(), {"set": sets}, OBSERVE, **start)
@@ -252,26 +248,22 @@ def _target_table(content: dict[str, Any]) -> dict[str, Any]:
     store = cores["all cores, into a store"]["median_s"] / cores["all cores"]["median_s"]
     plain = spread["plain vmap"]["median_s"] / spread["sweep"]["median_s"]
     found = [
-        ("against CVODES on all cores", ">= 60", against(CVODES), 60.0),
-        ("against Kvaerno5 under plain `vmap`", ">= 100", against(KVAERNO5), 100.0),
-        ("against our own solver under plain `vmap`", "", against(f"{OURS}, plain"), None),
-        (f"the same, runs of {spread['steps'][0]} to {spread['steps'][-1]} steps", "", plain, None),
-        ("one core, to all cores", ">= 1.7", cores["scaling"], 1.7),
-        ("the same of processes of NumPy that share nothing", "", cores["scaling_of_the_machine"], None),
-        ("into a store, to in memory", "", store, None),
-        ("one lane of 10 000 that never ends, to none", "< 2", bad["ratio"], -2.0),
-        (f"{million['runs']:,} runs into a store: runs per second", "", million["runs"] / million["seconds"], None),
-        ("the same: peak memory [GiB]", "< 2", million["peak_bytes"] / 2**30, -2.0),
-        (f"killed {killed['kills']} times: the same store, bit for bit", "1", float(killed["same"]), 1.0),
+        ("against CVODES on all cores", ">= 60", against(CVODES)),
+        ("against Kvaerno5 under plain `vmap`", ">= 100", against(KVAERNO5)),
+        ("against our own solver under plain `vmap`", "", against(f"{OURS}, plain")),
+        (f"the same, runs of {spread['steps'][0]} to {spread['steps'][-1]} steps", "", plain),
+        ("one core, to all cores", ">= 1.7", cores["scaling"]),
+        ("the same of processes of NumPy that share nothing", "", cores["scaling_of_the_machine"]),
+        ("into a store, to in memory", "", store),
+        ("one lane of 10 000 that never ends, to none", "< 2", bad["ratio"]),
+        (f"{million['runs']:,} runs into a store: runs per second", "", million["runs"] / million["seconds"]),
+        ("the same: peak memory [GiB]", "< 2", million["peak_bytes"] / 2**30),
+        (f"killed {killed['kills']} times: the same store, bit for bit", ">= 1", float(killed["same"])),
     ]
-    rows = []
-    for label, target, value, limit in found:
-        met = "" if limit is None else "yes" if (value >= limit if limit > 0 else value < -limit) else "no"
-        rows.append([label, target, f"{value:,.3g}" if value < 1e4 else f"{value:,.0f}", met])
     return {
         "caption": f"Targets on sweeps. {machine_line(content['machine'])}",
         "columns": ["ratio of times, unless said", "target", "measured", "met"],
-        "rows": rows,
+        "rows": target_rows(found),
     }
 
 

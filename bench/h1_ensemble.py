@@ -13,19 +13,18 @@ arithmetic and of memory are measured here, by a product of matrices and by a co
     python bench/h1_ensemble.py [--smoke] [--out DIR]
 """
 
-import time
 from typing import Any
 
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _lugre import ATOL, NOMINAL, PARAMETERS, T1, lugre_field, parameter_sets
-from _measure import describe_machine, machine_line, measure, scaled, write_json
+from _lugre import TESTBENCH, lugre_field, parameter_sets, run_sweep
+from _measure import machine_line, measure, scaled
 from _options import begin
+from _report import new_result, write_result
 
 import jaxmodsim as jms
-from jaxmodsim.problems import box_lugre, ramped_box
 
 SIGMA, BETA = 10.0, 8.0 / 3.0
 ADAPTIVE_OPERATIONS, FIXED_OPERATIONS = 240, 215
@@ -41,19 +40,14 @@ def main() -> None:
     counts += [largest] if counts[-1] != largest else []
     peak = peak_rates()
     name = "ensemble" if platform == "cpu" else f"ensemble_{platform}"
-    content: dict[str, Any] = {
-        "name": name,
-        "smoke": smoke,
-        "machine": describe_machine("jax", "jaxlib", "diffrax", "numpy", "jaxmodsim"),
+    content = new_result(name, options, "diffrax", "numpy") | {
         "devices": [str(device) for device in jax.local_devices()],
         "peak": peak,
         "lorenz": _lorenz(counts, peak, 1 if smoke else 5),
         "lugre": _lugre([512] if smoke else [1 << 12, 1 << 16, *([1 << 20] if platform != "cpu" else [])], peak),
     }
     content["tables"] = [_table(content)]
-    for table in content["tables"]:
-        print(table["caption"], *(" | ".join(row) for row in [table["columns"], *table["rows"]]), sep="\n")
-    write_json(options.out / f"{name}.json", content)
+    write_result(content, options)
 
 
 def lorenz_field(t: Any, y: Any, rho: Any) -> Any:
@@ -113,9 +107,7 @@ def _lugre(counts: list[int], peak: dict[str, float]) -> list[dict[str, Any]]:
     rows = []
     for count in counts:
         sets = parameter_sets(count)
-        over = {"set": {f"friction.{name}": sets[:, i] for i, name in enumerate(PARAMETERS)}}
-        start: dict[str, Any] = {"q0": [0.0], "qd0": [0.0], "t1": T1, "rtol": RTOL, "atol": ATOL * RTOL}
-        call = lambda over=over, start=start: jms.sweep(ramped_box(box_lugre()), over, ["qd[0]"], **start)  # noqa: E731
+        call = lambda sets=sets: run_sweep(sets, RTOL)  # noqa: E731
         row = scaled(measure({"lugre": call}, 5, limit_s=30.0)["lugre"], count)
         steps = float(call()["num_steps"].mean())
         row |= {"kind": "LuGre, Rodas5P 1e-5, float64", "count": count, "steps": steps}
@@ -134,28 +126,19 @@ def step_operations() -> float:
         state = solver.init(term, t0, t1, y, p)
         return solver.step(term, t0, t1, y, p, state, made_jump=jnp.asarray(False))[:2]
 
-    return float(jax.jit(step).lower(y, jnp.asarray(NOMINAL)).compile().cost_analysis()["flops"])
+    return float(jax.jit(step).lower(y, jnp.asarray(TESTBENCH.nominal)).compile().cost_analysis()["flops"])
 
 
 def peak_rates() -> dict[str, float]:
     """Operations per second by a product of matrices, close to what is possible; bytes per second by a copy."""
-    size, rates = 1 << (11 if jax.default_backend() == "cpu" else 13), {}
-    product = jax.jit(lambda x: jnp.matmul(x, x, precision="highest"))
-    for dtype in (jnp.float32, jnp.float64):
-        x = jnp.ones((size, size), dtype)
-        rates[f"flops_{jnp.dtype(dtype).name}"] = 2.0 * size**3 / _shortest(lambda x=x: product(x))
-    big, copy = jnp.ones(size * size * 8, jnp.float32), jax.jit(lambda x: x + 1.0)
-    rates["bytes_per_second"] = 8.0 * big.size / _shortest(lambda: copy(big))
-    return rates
-
-
-def _shortest(call: Any) -> float:
-    taken = []
-    for _ in range(9):
-        start = time.perf_counter()
-        call().block_until_ready()
-        taken.append(time.perf_counter() - start)
-    return min(taken)
+    size = 1 << (11 if jax.default_backend() == "cpu" else 13)
+    product, copy = jax.jit(lambda x: jnp.matmul(x, x, precision="highest")), jax.jit(lambda x: x + 1.0)
+    squares = {kind: jnp.ones((size, size), kind) for kind in ("float32", "float64")}
+    big = jnp.ones(size * size * 8, jnp.float32)
+    calls = {f"flops_{kind}": lambda x=x: product(x).block_until_ready() for kind, x in squares.items()}
+    calls["bytes_per_second"] = lambda: copy(big).block_until_ready()
+    work = {"flops_float32": 2.0 * size**3, "flops_float64": 2.0 * size**3, "bytes_per_second": 8.0 * big.size}
+    return {name: work[name] / row["minimum_s"] for name, row in measure(calls, 9).items()}
 
 
 def _table(content: dict[str, Any]) -> dict[str, Any]:

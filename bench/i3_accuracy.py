@@ -11,8 +11,9 @@ from typing import Any
 
 import diffrax as dfx
 import numpy as np
-from _measure import describe_machine, machine_line, write_json
+from _measure import machine_line
 from _options import begin
+from _report import new_result, write_result
 
 import jaxmodsim as jms
 from jaxmodsim.problems import Case, named_problems
@@ -30,18 +31,14 @@ def main() -> None:
     for name, make in named_problems().items():
         if not options.smoke or name in SMOKE:
             points += _points(make(), ASKED[:1] if options.smoke else ASKED)
-    content: dict[str, Any] = {
-        "name": "accuracy",
-        "smoke": options.smoke,
-        "machine": describe_machine("jax", "jaxlib", "diffrax", "numpy", "jaxmodsim"),
-        "points": points,
-    }
-    content["table"] = _table(points)
-    content["caption"] = (
+    content = new_result("accuracy", options, "diffrax", "numpy")
+    content["points"] = points
+    caption = (
         "Errors relative to the largest magnitude over the run. Ten times better and worse: steps as predicted, in"
         f" those made. {machine_line(content['machine'])}"
     )
-    write_json(options.out / "accuracy.json", content)
+    content["tables"] = [_table(points) | {"caption": caption}]
+    write_result(content, options)
 
 
 def _points(case: Case, asked: tuple[float, ...]) -> list[dict[str, Any]]:

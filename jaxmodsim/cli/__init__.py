@@ -1,4 +1,4 @@
-"""The command line: `jaxmodsim demo | testbench | fit | sweep`."""
+"""The command line: `jaxmodsim demo | testbench | fit | sweep | bench`."""
 
 import os
 import sys

@@ -160,3 +160,20 @@ def sweep(
     from ._sweep import SweepRequest, run_sweep
 
     run_sweep(SweepRequest(spec, out, figure, chunk, workers, scheduler, dry_run))
+
+
+@app.command("bench", context_settings={"ignore_unknown_options": True})
+def run_benches(
+    arguments: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="NAME", help="Benches, such as a0, and options of python -m bench; all without."),
+    ] = None,
+) -> None:
+    """Run the benches of a clone of the repository: what things cost and how near they come, measured side by side.
+
+    They are no part of the installed package: this is `python -m bench` in a clone, and takes its options --list,
+    --smoke, --jobs, --out and --jaxonomy.
+    """
+    from ._bench import run_bench_suite
+
+    raise typer.Exit(run_bench_suite(arguments or []))

@@ -10,9 +10,12 @@ from pathlib import Path
 from typing import Any
 
 
-def describe_machine(*packages: str) -> dict[str, Any]:
-    """Processor, versions of the packages, date and, of the repository in the working directory, the commit."""
-    head, changed = _commit(os.getcwd())
+def describe_machine(*packages: str, beside: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Processor, versions of the packages, date and, of the repository in the working directory, the commit.
+
+    Changes to the paths `beside`, from the root of the repository, do not count as uncommitted changes.
+    """
+    head, changed = _commit(os.getcwd(), beside)
     return {
         "cpu": _cpu_model(),
         "cores": os.cpu_count(),
@@ -33,19 +36,20 @@ def versions(*packages: str) -> dict[str, str]:
 
 def commit() -> str:
     """The commit of the repository in the working directory, if it is one, and whether there are changes beside it."""
-    head, changed = _commit(os.getcwd())
+    head, changed = _commit(os.getcwd(), ())
     return head + (" with uncommitted changes" if changed else "")
 
 
 # Looked up once: code, too, is loaded once.
 @lru_cache(maxsize=4)
-def _commit(folder: str) -> tuple[str, bool]:
+def _commit(folder: str, beside: tuple[str, ...]) -> tuple[str, bool]:
+    paths = (":/", *(f":(top,exclude){path}" for path in beside))
     try:
         head, state = (
             subprocess.run(
                 ["git", *words], cwd=folder, capture_output=True, text=True, check=True, timeout=20
             ).stdout.strip()
-            for words in (("rev-parse", "HEAD"), ("status", "--porcelain", "--untracked-files=no"))
+            for words in (("rev-parse", "HEAD"), ("status", "--porcelain", "--untracked-files=no", "--", *paths))
         )
     except (OSError, subprocess.SubprocessError):
         return "", False
