@@ -11,4 +11,5 @@ from ._event_state import EventState as EventState
 from ._gauss import Gauss as Gauss
 from ._implicit_friction import ImplicitFriction as ImplicitFriction
 from ._projected import Projected as Projected
+from ._rodas5p import RODAS5P as RODAS5P
 from ._rodas5p import Rodas5P as Rodas5P

@@ -41,7 +41,7 @@ _STAGE = _lower(
         ),
     ),
 )
-_RODAS5P = RosenbrockTableau(
+RODAS5P = RosenbrockTableau(
     gamma=0.21193756319429014,
     stage=_STAGE,
     coupling=_lower(
@@ -129,7 +129,7 @@ _RODAS5P = RosenbrockTableau(
 # diffrax asks for a step several times over. As one function it is traced, linearised and transposed once.
 @eqx.filter_jit
 def _step(terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree, pivot: bool) -> RosenbrockStep:
-    return rosenbrock_step(_RODAS5P, lambda t, y: terms.vf(t, y, args), t0, t1 - t0, y0, pivot=pivot)
+    return rosenbrock_step(RODAS5P, lambda t, y: terms.vf(t, y, args), t0, t1 - t0, y0, pivot=pivot)
 
 
 class Rodas5P(dfx.AbstractAdaptiveSolver):
