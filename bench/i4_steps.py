@@ -186,7 +186,7 @@ WAYS, SOLVERS = ("the scene", "by hand"), ("Rodas5P", "Tsit5")
 
 
 def _by_hand(t: Any, y: Any, p: Any) -> Any:
-    """Double pendulum with LuGre's law in its joints, in scalars: unit masses and lengths, angles from straight down."""
+    """Double pendulum, LuGre's law in its joints, scalars; unit masses and lengths, angles from straight down."""
     del t
     a, b, va, vb, za, zb = y
     unit = unit_of(jax.lax.stop_gradient(a))
@@ -226,7 +226,7 @@ def _joints(count: int, rounds: int) -> dict[str, Any]:
     runs = dict(zip(WAYS, (jax.jit(jax.vmap(ours)), jax.jit(jax.vmap(hand))), strict=True))
     one, other = (np.asarray(run(start)[0]) for run in runs.values())
     if not np.allclose(one, other, rtol=0.0, atol=1e-4):
-        raise AssertionError(f"The scene and its equations by hand differ by {np.max(np.abs(one - other)):.1e}.")
+        raise AssertionError(f"The scene and its equations differ by {np.max(np.abs(one - other)):.1e}.")
     times = measure({way: lambda run=run: jax.block_until_ready(run(start)) for way, run in runs.items()}, rounds)
     found: dict[str, Any] = {}
     for way, run in runs.items():
