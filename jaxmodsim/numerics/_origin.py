@@ -1,9 +1,7 @@
 """Where a result comes from: machine, versions and commit."""
 
-import importlib.metadata
 import os
 import platform
-import subprocess
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
@@ -31,7 +29,9 @@ def describe_machine(*packages: str, beside: tuple[str, ...] = ()) -> dict[str, 
 
 def versions(*packages: str) -> dict[str, str]:
     """Installed versions of packages, by name."""
-    return {name: importlib.metadata.version(name) for name in packages}
+    from importlib.metadata import version  # slow to import, as subprocess is below
+
+    return {name: version(name) for name in packages}
 
 
 def commit() -> str:
@@ -43,6 +43,8 @@ def commit() -> str:
 # Looked up once: code, too, is loaded once.
 @lru_cache(maxsize=4)
 def _commit(folder: str, beside: tuple[str, ...]) -> tuple[str, bool]:
+    import subprocess
+
     paths = (":/", *(f":(top,exclude){path}" for path in beside))
     try:
         head, state = (

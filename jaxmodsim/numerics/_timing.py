@@ -1,7 +1,6 @@
 """Side-by-side timing."""
 
 import gc
-import statistics
 import time
 from collections.abc import Callable
 from typing import Any
@@ -67,6 +66,8 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 def _summary(taken: list[float]) -> dict[str, Any]:
+    import statistics  # slow to import
+
     quartiles = statistics.quantiles(taken, n=4) if len(taken) > 1 else [taken[0]] * 3
     return {
         "median_s": statistics.median(taken),
