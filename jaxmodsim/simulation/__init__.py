@@ -9,6 +9,7 @@ from ._observe import named_unit as named_unit
 from ._outcome import MAX_STEPS as MAX_STEPS
 from ._outcome import Outcome as Outcome
 from ._outcome import SimulationError as SimulationError
+from ._outcome import outcome_messages as outcome_messages
 from ._simulate import prepare as prepare
 from ._simulate import simulate as simulate
 from ._solve import default_solver as default_solver

@@ -13,6 +13,7 @@ from ..mechanics import momentum, velocity
 from ..scene import (
     Scene,
     State,
+    scene_belts,
     scene_canonical,
     scene_field,
     scene_guards,
@@ -22,29 +23,48 @@ from ..scene import (
     scene_stick,
     scene_switch,
 )
-from ..solvers import EventState
+from ..solvers import EventLog, EventState
 
 # Energy [J] that went through a scene since t0, by the names of `scene_power`: supplied from outside, and absorbed.
 Work: TypeAlias = dict[str, Power]
 
 
+class Beside(NamedTuple):
+    """What is integrated beside the motion.
+
+    - `motion`: a `State`, with momenta in the place of velocities where the run is canonical.
+    - `belts`: velocities [m/s or rad/s] of the belts that are functions of time, shape `[belts]`; None without any.
+    - `work`: in an audited run; None in others.
+    """
+
+    motion: State
+    belts: Float[Array, " belts"] | None
+    work: Work | None
+
+
 class Flow(NamedTuple):
     """What is integrated: a `State`, with momenta in the place of velocities where `canonical`.
 
-    In an `audited` run a pair of it and `Work`.
+    In an `audited` run, and where a belt under an element that runs by events moves as a function of time (`belted`),
+    it is `Beside` others. The belts are known without integration, but friction in slip does not depend on how fast
+    slip is: the error control would see nothing of a belt that turns many times in a step, and with it the slip.
     """
 
     audited: bool
     canonical: bool
+    belted: bool = False
 
     def start(self, t: Array, state: State, scene: Scene, mode: Any) -> Any:
         """What the run starts from."""
         y = self._inner(t, state, scene)
-        return (y, jtu.tree_map(jnp.zeros_like, scene_power(t, state, scene, mode))) if self.audited else y
+        if not (self.audited or self.belted):
+            return y
+        work = jtu.tree_map(jnp.zeros_like, scene_power(t, state, scene, mode)) if self.audited else None
+        return Beside(y, scene_belts(t, scene) if self.belted else None, work)
 
     def state(self, t: Array, y: Any, scene: Scene) -> State:
         """The state in what is integrated."""
-        y = y[0] if self.audited else y
+        y = y.motion if isinstance(y, Beside) else y
         if not self.canonical:
             return y
         scene = scene.now(t)
@@ -53,26 +73,36 @@ class Flow(NamedTuple):
     def replace(self, t: Array, y: Any, state: State, scene: Scene) -> Any:
         """With another state."""
         inner = self._inner(t, state, scene)
-        return (inner, y[1]) if self.audited else inner
+        return y._replace(motion=inner) if isinstance(y, Beside) else inner
 
     def result(self, t: Array, y: Any, scene: Scene) -> Any:
         """What is kept of it: the state, in an audited run a pair of it and `Work`."""
         state = self.state(t, y, scene)
-        return (state, y[1]) if self.audited else state
+        return (state, y.work) if self.audited else state
 
     def rate(self, t: Any, y: Any, scene: Scene, mode: Any = None) -> Any:
         """Right-hand side."""
         state = self.state(t, y, scene)
         rate = (scene_canonical if self.canonical else scene_field)(t, state, scene, mode)
-        return (rate, scene_power(t, state, scene, mode)) if self.audited else rate
+        if not isinstance(y, Beside):
+            return rate
+        belts = jax.jvp(lambda t: scene_belts(t, scene), (t,), (jnp.ones_like(t),))[1] if self.belted else None
+        return Beside(rate, belts, scene_power(t, state, scene, mode) if self.audited else None)
+
+    def logged(self, log: EventLog) -> EventLog:
+        """A log of states alone."""
+        if not self.belted:
+            return log
+        before, after = ((side[0].motion, side[1]) for side in (log.before, log.after))
+        return log._replace(before=before, after=after)
 
     def advance(self, t0: Array, t1: Array, y: Any, scene: Scene) -> tuple[Any, Array]:
         """One step of `ImplicitFriction`, and whether it was solved; work is done at the powers at its end."""
         state, solved = scene_step(scene, t0, t1, self.state(t0, y, scene))
         if not self.audited:
             return state, solved
-        powers = scene_power(t1, state, scene)
-        return (state, jtu.tree_map(lambda work, power: work + (t1 - t0) * power, y[1], powers)), solved
+        work = jtu.tree_map(lambda work, power: work + (t1 - t0) * power, y.work, scene_power(t1, state, scene))
+        return Beside(state, None, work), solved
 
     def _inner(self, t: Array, state: State, scene: Scene) -> State:
         if not self.canonical:

@@ -174,7 +174,8 @@ def _prepared(problem: Problem, options: Options, audited: bool) -> tuple[State,
     canonical = isinstance(options.solver, Gauss)
     start = start_code(scene, t0, given, scene_field(t0, initial, scene, mode), mode, canonical)
     sticks = bool(scene.exact) and scene_drifts(scene)
-    return initial, mode, Hybrid(Flow(audited, canonical), rest, projects, sticks), start
+    belts = any(callable(each.belt_velocity) for each in scene.exact.values())
+    return initial, mode, Hybrid(Flow(audited, canonical, belts), rest, projects, sticks), start
 
 
 def _integrate(problem: Problem, options: Options, audited: bool, log: int | None) -> tuple[Solved, EventLog | None]:
@@ -221,6 +222,7 @@ def _integrate(problem: Problem, options: Options, audited: bool, log: int | Non
     if exact:
         (count, trouble, fired), history = events
         ending, stats["num_events"] = Ending(trouble, fired), count
+        history = None if history is None else hybrid.flow.logged(history)
     ended = _ended(problem, t_end, end_state, mode, solution.result, ending)
     t, y, modes, missed = _kept(problem, starts, solution.ts[1], solution.ys[1])
     code = jnp.where(starts, ended, start)

@@ -1,0 +1,215 @@
+"""What a hard case is: something to compute, what is right, and why it is hard."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from ...scene import Scene, read_element, replace_elements
+from ...simulation import Trajectory, simulate
+
+# In float32 rounding leaves tighter tolerances nothing to work with.
+_LEAST = {"float64": {"rtol": 0.0, "atol": 0.0}, "float32": {"rtol": 3e-6, "atol": 1e-8}}
+
+
+class Answer(NamedTuple):
+    """What a task gives: 0 or the code of an early end, and the number that is asked for."""
+
+    code: Int[Array, ""]
+    value: Float[Array, ""]
+
+
+class Motion(eqx.Module):
+    """A run of a scene.
+
+    - `scene`, `q0`, `qd0`, `t1`: as for `simulate`.
+    - `by`: the number that the answer is a function of: one of the scene as `sensitivity` calls it, `q0[i]` or
+      `qd0[i]`.
+    - `read`: the number asked for, of the `Trajectory`.
+    - `numbers`: numbers for `simulate` by name: `rtol`, `atol`, `t0`, `ts`, `dt`, `dtmax`.
+    - `choices`: what else is passed on: `solver`, `max_steps`, `max_events`, `hold_chatter`.
+    """
+
+    scene: Scene
+    q0: Float[Array, " dof"]
+    qd0: Float[Array, " dof"]
+    t1: Float[Array, ""]
+    by: str = eqx.field(static=True)
+    read: Callable[[Trajectory], Array] = eqx.field(static=True)
+    numbers: dict[str, Array]
+    choices: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+
+    @property
+    def x(self) -> float:
+        """Value of the number `by`."""
+        for name in ("q0", "qd0"):
+            if self.by.startswith(f"{name}["):
+                return float(getattr(self, name)[_index(self.by)])
+        return read_element(self.scene, self.by)
+
+    def cast(self, dtype: str) -> "Motion":
+        """The same in another floating type, and no tighter tolerance than that carries."""
+        cast = jtu.tree_map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, self)
+        numbers = cast.numbers | {
+            name: jnp.maximum(cast.numbers[name], least) if self.numbers[name] > 0 else cast.numbers[name]
+            for name, least in _LEAST[dtype].items()
+        }
+        return eqx.tree_at(lambda task: task.numbers, cast, numbers)
+
+    def run(self, x: Float[Array, ""], adjoint: Any = None) -> Trajectory:
+        """The run for another value of the number `by`."""
+        scene, q0, qd0 = self.scene, self.q0, self.qd0
+        if self.by.startswith("q0["):
+            q0 = q0.at[_index(self.by)].set(x)
+        elif self.by.startswith("qd0["):
+            qd0 = qd0.at[_index(self.by)].set(x)
+        else:
+            scene = replace_elements(scene, {self.by: x})
+        return simulate(
+            scene, q0, qd0, self.t1, **self.numbers, **dict(self.choices), adjoint=adjoint, throw=False
+        )
+
+    def answer(self, x: Float[Array, ""], adjoint: Any = None) -> Answer:
+        """The number asked for."""
+        run = self.run(x, adjoint)
+        return Answer(run.code, self.read(run))
+
+
+class Program(eqx.Module):
+    """Another computation of one number from one number: with the event solver alone, or with charts.
+
+    - `fn`: `fn(x, adjoint)` -> an `Answer`; `adjoint` is None for the default.
+    - `x`: the number that it is a function of.
+    - `by`: what that is.
+    """
+
+    fn: Callable[[Array, Any], Answer] = eqx.field(static=True)
+    x: float = eqx.field(static=True)
+    by: str = eqx.field(static=True)
+
+    def cast(self, dtype: str) -> "Program":
+        """Itself: it computes in the floating type of its number."""
+        del dtype
+        return self
+
+    def answer(self, x: Float[Array, ""], adjoint: Any = None) -> Answer:
+        """The number asked for."""
+        return self.fn(x, adjoint)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A number that is found by many runs, in double precision.
+
+    - `fn`: finds it.
+    """
+
+    fn: Callable[[], float]
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Calls that must raise an error that names what is wrong.
+
+    - `calls`: what is called, by name.
+    - `match`: regular expression that the error's text of each must match, by name.
+    """
+
+    calls: dict[str, Callable[[], Any]]
+    match: dict[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class HardCase:
+    """A case in which simulations go wrong.
+
+    - `name`, `family`: as in `hard_cases`.
+    - `why`: the reason it is hard.
+    - `naive`: what a plain simulation does.
+    - `asks`: what is asked for, with its unit.
+    - `task`: a `Motion`, a `Program`, `Measured` or `Refused`.
+    - `exact`: the right answer as a function of the number the task is a function of, in closed form.
+    - `second`: the right answer by a second solver, where there is no closed form; the derivative is then held against
+      finite differences of the answer.
+    - `scale`: what errors are relative to, in the unit of the answer; by default the right answer's magnitude.
+    - `tolerance`: admissible relative error in float64; of derivatives ten times that, relative to `scale` over the
+      number, or to the derivative where that is larger.
+    - `single`: the same in float32; None where it makes no sense there.
+    - `ends`: part of the sentence with which the run must end; empty for one that reaches t1.
+    - `single_ends`: the same in float32.
+    - `undefined`: why there is no derivative; empty where there is one. Then `check_gradients` must say so.
+    - `conserves`: whether the energy balance has to close: not where the run fails, or where fixed steps are long.
+    - `leaves`: ways that make no sense, of those in `WAYS`, with the reason.
+    """
+
+    name: str
+    family: str
+    why: str
+    naive: str
+    asks: str
+    task: Motion | Program | Measured | Refused
+    exact: Callable[[float], float] | None = None
+    second: Callable[[], float] | None = None
+    scale: float | None = None
+    tolerance: float = 1e-6
+    single: float | None = 1e-3
+    ends: str = ""
+    single_ends: str = ""
+    undefined: str = ""
+    conserves: bool = True
+    leaves: Mapping[str, str] = field(default_factory=dict)
+
+
+def motion(
+    scene: Scene,
+    q0: Any,
+    qd0: Any,
+    t1: float,
+    *,
+    by: str,
+    read: Callable[[Trajectory], Array],
+    numbers: dict[str, ArrayLike | list[float]] | None = None,
+    **choices: Any,
+) -> Motion:
+    """A `Motion` from plain numbers; by default at `rtol=1e-9, atol=1e-11`."""
+    given = {"rtol": 1e-9, "atol": 1e-11} | (numbers or {})
+    arrays = {name: jnp.asarray(np.asarray(value, float)) for name, value in given.items()}
+    state = (jnp.asarray(np.asarray(x, float)) for x in (q0, qd0, t1))
+    return Motion(scene, *state, by, read, arrays, tuple(sorted(choices.items(), key=lambda item: item[0])))
+
+
+def position(run: Trajectory) -> Array:
+    """The first coordinate at the end."""
+    return run.q[-1, 0]
+
+
+def velocity(run: Trajectory) -> Array:
+    """The first velocity at the end."""
+    return run.qd[-1, 0]
+
+
+def end_time(run: Trajectory) -> Array:
+    """How far the run came."""
+    return run.t_end
+
+
+def _index(name: str) -> int:
+    return int(name[name.index("[") + 1 : -1])
+
+
+def differentiate(fn: Callable[[float], float], x: float, step: float = 1e-4) -> float:
+    """Derivative by central differences of relative steps `step` and half of it, extrapolated once.
+
+    Its error is that of `fn` over the step, and the step's fourth power.
+    """
+    h = step * (abs(x) or 1.0)
+
+    def slope(h: float) -> float:
+        return (float(fn(x + h)) - float(fn(x - h))) / (2.0 * h)
+
+    return (4.0 * slope(0.5 * h) - slope(h)) / 3.0

@@ -1,0 +1,291 @@
+"""Hard cases put to the test: every way of running them, in both floating types."""
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ...analysis import check_gradients
+from ...scene import Scene
+from ...simulation import SimulationError, outcome_messages
+from ._case import Answer, HardCase, Measured, Motion, Program, Refused, differentiate
+
+WAYS = ("alone", "jit", "vmap", "forward", "reverse", "energy")
+DTYPES = ("float64", "float32")
+
+# Derivatives may be this much less accurate than values.
+_SLOPE = 10.0
+# The energy balance closes to this many times the tolerance of the answer, relative to the energies there are.
+_BALANCE = 10.0
+# Relative step of finite differences of answers, whose error is 1e-9 or so.
+_STEP = 1e-3
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one way of running a case gave.
+
+    - `way`, `dtype`: of `WAYS` and `DTYPES`.
+    - `error`: relative to what is asked, so that 1 is the limit; NaN where there is no number to compare.
+    - `ok`: whether it is as it should be.
+    - `sentence`: what was found.
+    """
+
+    way: str
+    dtype: str
+    error: float
+    ok: bool
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What was found on a case.
+
+    - `case`: the `HardCase`.
+    - `findings`: in the order of the types, and of the ways in each.
+    """
+
+    case: HardCase
+    findings: tuple[Finding, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether every way is as it should be."""
+        return all(finding.ok for finding in self.findings)
+
+    def worst(self, dtype: str, ways: Sequence[str] = WAYS) -> float:
+        """Largest error in these ways, 1 being the limit; NaN where there is none."""
+        errors = [each.error for each in self.findings if each.dtype == dtype and each.way in ways]
+        return max((error for error in errors if not math.isnan(error)), default=math.nan)
+
+
+def check(case: HardCase, ways: Sequence[str] = WAYS, dtypes: Sequence[str] = DTYPES) -> Verdict:
+    """Run a hard case and compare it with what is right.
+
+    - `alone`, `jit`, `vmap`: the answer, or the sentence with which the run ends. Under `vmap` one of three lanes gets
+      NaN for its number: it must say that it failed, and the others be right.
+    - `forward`, `reverse`: the derivative by the number of the case; where there is none, it must be finite, and
+      `check_gradients` must not approve it (checked with `reverse`).
+    - `energy`: the energy balance of the run, in float64.
+
+    **Arguments:**
+
+    - `case`: the `HardCase`.
+    - `ways`: which of `WAYS`.
+    - `dtypes`: which of `DTYPES`; what a case leaves out is left out.
+
+    **Returns:**
+
+    A `Verdict`.
+
+    **Raises:**
+
+    - `ValueError` for ways or types that are none, and without double precision, which float64 needs.
+    """
+    for name, given, known in (("ways", ways, WAYS), ("dtypes", dtypes, DTYPES)):
+        if unknown := [each for each in given if each not in known]:
+            raise ValueError(f"{name} must be of {', '.join(known)}, but {unknown[0]!r} was given.")
+    if jnp.result_type(float) != jnp.float64:
+        raise ValueError('Hard cases need double precision: jax.config.update("jax_enable_x64", True).')
+    if isinstance(case.task, Refused):
+        return Verdict(case, tuple(_refusals(case.task)))
+    if isinstance(case.task, Measured):
+        return Verdict(case, (_measured(case, case.task),))
+    findings = []
+    for dtype in dtypes:
+        if dtype == "float32" and case.single is None:
+            continue
+        trial = _Trial(case, case.task.cast(dtype), dtype)
+        findings += [trial.look(way) for way in ways if trial.applies(way)]
+    return Verdict(case, tuple(findings))
+
+
+def _refusals(task: Refused) -> list[Finding]:
+    findings = []
+    for name, call in task.calls.items():
+        try:
+            call()
+            ok, text = False, "nothing was raised"
+        except (ValueError, SimulationError, eqx.EquinoxRuntimeError) as error:
+            ok, text = re.search(task.match[name], str(error)) is not None, str(error)
+        findings.append(Finding("alone", "float64", math.nan, ok, f"{name}: {text}"))
+    return findings
+
+
+def _measured(case: HardCase, task: Measured) -> Finding:
+    assert case.exact is not None
+    value, right = task.fn(), case.exact(0.0)
+    error = abs(value - right) / (case.scale or abs(right)) / case.tolerance
+    return Finding("alone", "float64", error, error <= 1.0, f"{value:.9g}, right is {right:.9g}.")
+
+
+# Compiled once for all cases of one structure.
+@eqx.filter_jit
+def _jit(task: Motion | Program, x: Any) -> Answer:
+    return task.answer(x)
+
+
+@eqx.filter_jit
+def _vmap(task: Motion | Program, x: Any) -> Answer:
+    return jax.vmap(task.answer)(x)
+
+
+@eqx.filter_jit
+def _forward(task: Motion | Program, x: Any) -> tuple[Answer, Any]:
+    def value(x: Any) -> tuple[Any, Answer]:
+        answer = task.answer(x, dfx.ForwardMode())
+        return answer.value, answer
+
+    _, slope, answer = jax.jvp(value, (x,), (jnp.ones_like(x),), has_aux=True)
+    return answer, slope
+
+
+@eqx.filter_jit
+def _reverse(task: Motion | Program, x: Any) -> tuple[Answer, Any]:
+    def value(x: Any) -> tuple[Any, Answer]:
+        answer = task.answer(x)
+        return answer.value, answer
+
+    (_, answer), slope = jax.value_and_grad(value, has_aux=True)(x)
+    return answer, slope
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A case in one floating type."""
+
+    case: HardCase
+    task: Motion | Program
+    dtype: str
+
+    @property
+    def x(self) -> Any:
+        return jnp.asarray(self.task.x, self.dtype)
+
+    @property
+    def ends(self) -> str:
+        return self.case.single_ends if self.dtype == "float32" and self.case.single_ends else self.case.ends
+
+    @cached_property
+    def right(self) -> float | None:
+        """The answer; None where the run ends early and says so, which is all that is asked."""
+        case = self.case
+        if self.dtype == "float32" and case.single_ends:
+            return None
+        if case.exact is not None:
+            return float(case.exact(float(self.x)))
+        return None if case.second is None else case.second()
+
+    @property
+    def scale(self) -> float:
+        return self.case.scale if self.case.scale is not None else abs(self.right or 0.0) or 1.0
+
+    @property
+    def tolerance(self) -> float:
+        single = self.case.single
+        return self.case.tolerance if self.dtype == "float64" or single is None else single
+
+    def applies(self, way: str) -> bool:
+        if way in self.case.leaves:
+            return False
+        if way == "energy":
+            runs = isinstance(self.task, Motion) and not self.ends and self.case.conserves
+            return runs and self.dtype == "float64"
+        return way not in ("forward", "reverse") or not (self.ends and self.right is None)
+
+    def look(self, way: str) -> Finding:
+        """One way."""
+        if way == "energy":
+            return self.energy()
+        if way in ("forward", "reverse"):
+            return self.derivative(way)
+        if way == "vmap":
+            return self.batch()
+        return self.finding(way, self.task.answer(self.x) if way == "alone" else _jit(self.task, self.x))
+
+    def finding(self, way: str, answer: Answer) -> Finding:
+        """An answer, compared."""
+        code, value = int(answer.code), float(answer.value)
+        sentence = self.messages[code]
+        ended = re.search(self.ends, sentence) is not None if self.ends else code == 0
+        if self.right is None:
+            return Finding(way, self.dtype, math.nan, ended and code != 0, sentence)
+        error = abs(value - self.right) / self.scale / self.tolerance
+        right = math.isfinite(value) and error <= 1.0
+        return Finding(way, self.dtype, error, ended and right, f"{value:.12g}, right is {self.right:.12g}. {sentence}")
+
+    def batch(self) -> Finding:
+        """One of three lanes is sick."""
+        lanes = jnp.stack([self.x, jnp.full_like(self.x, jnp.nan), self.x])
+        answers = _vmap(self.task, lanes)
+        first, sick, last = (Answer(answers.code[i], answers.value[i]) for i in range(3))
+        found = self.finding("vmap", first)
+        if isinstance(self.task, Motion) and int(sick.code) == 0:
+            return Finding("vmap", self.dtype, found.error, False, "A lane whose number is NaN says that all is well.")
+        same = np.array_equal(first.value, last.value, equal_nan=True)
+        return found if same else Finding("vmap", self.dtype, found.error, False, "Two equal lanes differ.")
+
+    def derivative(self, way: str) -> Finding:
+        """A derivative, compared."""
+        answer, slope = (_forward if way == "forward" else _reverse)(self.task, self.x)
+        found, slope = self.finding(way, answer), float(slope)
+        if not found.ok:
+            return found
+        if not math.isfinite(slope):
+            return Finding(way, self.dtype, math.inf, False, f"The derivative is {slope}.")
+        if self.case.undefined:
+            return self.flagged(way, slope)
+        right = self.slope()
+        size = max(abs(right), self.scale / (abs(self.task.x) or 1.0))
+        error = abs(slope - right) / size / (_SLOPE * self.tolerance)
+        return Finding(way, self.dtype, error, error <= 1.0, f"{slope:.9g}, right is {right:.9g}.")
+
+    def slope(self) -> float:
+        """The right derivative: of the closed form, or by finite differences of answers in double precision."""
+        if self.case.exact is not None:
+            return differentiate(self.case.exact, float(self.x))
+        task = self.case.task
+        assert isinstance(task, Motion | Program)
+        return differentiate(lambda x: float(_jit(task, jnp.asarray(x, float)).value), task.x, _STEP)
+
+    def flagged(self, way: str, slope: float) -> Finding:
+        """Where there is no derivative: that of the modes as they are, and a warning."""
+        if way == "forward" or not isinstance(self.task, Motion):
+            return Finding(way, self.dtype, math.nan, True, f"{slope:.9g}, and there is none: {self.case.undefined}")
+        found = _watched(self.task)
+        sentence = f"check_gradients says: {found}"
+        return Finding(way, self.dtype, math.nan, found != "agree", sentence)
+
+    def energy(self) -> Finding:
+        """The energy balance at the end, relative to the largest energy there is."""
+        assert isinstance(self.task, Motion)
+        book = self.task.run(self.x).energy
+        parts = (book.kinetic, book.potential, book.stored, book.work_in, book.dissipated)
+        # Without any energy there is nothing to lose.
+        size = max(float(jnp.max(jnp.abs(part))) for part in parts) or 1.0
+        error = float(jnp.max(jnp.abs(book.balance))) / size / (_BALANCE * self.tolerance)
+        return Finding("energy", self.dtype, error, error <= 1.0, f"{error * _BALANCE * self.tolerance:.2g} of {size:.3g} J")
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        if isinstance(self.task, Motion):
+            return outcome_messages(self.task.scene, self.task.q0.shape[0])
+        return ("The run reached t1.", "The run ended early.")
+
+
+def _watched(task: Motion) -> str:
+    """The verdict of `check_gradients` on the number of a case."""
+    def fn(scene: Scene, simulate: Callable[..., Any]) -> Any:
+        run = simulate(scene, task.q0, task.qd0, task.t1, **task.numbers, **dict(task.choices))
+        return task.read(run)
+
+    return check_gradients(fn, task.scene, names=[task.by]).numbers[task.by].verdict
