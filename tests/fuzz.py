@@ -35,6 +35,11 @@ def fuzz(share: float, *strategies: Any) -> Callable[[Callable[..., None]], Call
     return lambda check: many(given(*strategies)(check))
 
 
+def is_deep() -> bool:
+    """Whether many examples are drawn."""
+    return settings.default.max_examples > PROFILES["suite"]
+
+
 def decades(low: float, high: float) -> st.SearchStrategy[float]:
     """Ten to a power that is drawn."""
     return st.floats(low, high).map(lambda x: 10.0**x)
