@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import Place, as_function, as_place
+from ..numerics import Place, as_function, as_label, as_place
 from ._effect import AbstractEffect, Action, Power, result_shape
 
 
@@ -36,7 +36,7 @@ class AppliedForce(AbstractEffect):
 
     fn: Callable[..., Any] = eqx.field(converter=partial(as_function, name="AppliedForce fn"))
     at: Place | None = eqx.field(default=None, converter=_at)
-    name: str | None = eqx.field(default=None, static=True)
+    name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="AppliedForce name"))
 
     @property
     def default_name(self) -> str:

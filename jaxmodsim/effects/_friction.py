@@ -1,6 +1,7 @@
 """Where a friction law acts."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -25,6 +26,7 @@ from ..numerics import (
     Place,
     Varying,
     as_function,
+    as_label,
     as_number,
     as_place,
     check_ranges,
@@ -111,7 +113,7 @@ class Friction(AbstractEffect):
     along: Place | None = eqx.field(default=None, converter=_along)
     belt_velocity: Number | Callable[..., Any] = eqx.field(default=0.0, converter=_belt)
     normal_force: Number | Callable[..., Any] | Reaction | None = eqx.field(default=None, converter=_load)
-    name: str | None = eqx.field(default=None, static=True)
+    name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Friction name"))
     ellipse: Number | None = optional_parameter("ellipse", "1", lower=0.0, strict=True)
 
     def __check_init__(self) -> None:

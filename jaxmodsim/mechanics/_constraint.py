@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import Number, Place, as_function, as_place, check_ranges, parameter, safe_norm
+from ..numerics import Number, Place, as_flag, as_function, as_label, as_place, check_ranges, parameter, safe_norm
 
 
 def _at(value: Any) -> Place | None:
@@ -98,9 +98,11 @@ class Constraint(AbstractConstraint):
 
     phi: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Constraint phi"))
     at: Place | None = eqx.field(default=None, converter=_at)
-    one_sided: bool = eqx.field(default=False, static=True)
+    one_sided: bool = eqx.field(
+        default=False, static=True, converter=partial(as_flag, name="Constraint one_sided")
+    )
     stabilise: Number = parameter("stabilise", "1/s", lower=0.0, default=0.0)
-    name: str | None = eqx.field(default=None, static=True)
+    name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Constraint name"))
 
     def error(self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree) -> Float[Array, " m"]:
         """phi, shape `[m]`."""
@@ -158,7 +160,9 @@ class VelocityConstraint(AbstractConstraint):
 
     psi: Callable[..., Any] = eqx.field(converter=partial(as_function, name="VelocityConstraint psi"))
     stabilise: Number = parameter("stabilise", "1/s", lower=0.0, default=0.0)
-    name: str | None = eqx.field(default=None, static=True)
+    name: str | None = eqx.field(
+        default=None, static=True, converter=partial(as_label, name="VelocityConstraint name")
+    )
 
     one_sided: ClassVar[bool] = False
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from ..numerics import did_you_mean
+from ..numerics import check_real, did_you_mean
 from ..scene import Scene, elements, scene_numbers, scene_ranges
 from ..simulation import prepare, simulate
 from ._compute import shapes
@@ -59,7 +59,7 @@ def request(system: Any, grid: Grid, observe: Any, arguments: Mapping[str, Any])
     if isinstance(system, Scene):
         return _of_scene(system, grid, observe, dict(arguments))
     if not callable(system):
-        raise ValueError(f"sweep needs a Scene or a function, but a {type(system).__name__} was given.")
+        raise ValueError(f"sweep needs a Scene or a function as system, but a {type(system).__name__} was given.")
     given = [name for name, value in arguments.items() if value is not None]
     if given:
         raise ValueError(
@@ -160,6 +160,9 @@ def _fixed(scene: Scene, arguments: dict[str, Any], swept: Mapping[str, np.ndarr
     numbers = {name: arguments[name] for name in _NUMBERS if name in arguments}
     numbers |= {name: swept[name][0] for name in _SWEPT if name in swept}
     numbers = {"rtol": _OPTIONS["rtol"], "atol": _OPTIONS["atol"], "t0": _OPTIONS["t0"]} | numbers
+    for name, value in numbers.items():
+        if name != "z0":
+            check_real(value, name=name)
     states = [x for x in (*scene_numbers(scene).values(), numbers["q0"], numbers["qd0"]) if hasattr(x, "dtype")]
     dtype = jnp.result_type(*(x.dtype for x in states)) if states else jnp.result_type(float)
     if not jnp.issubdtype(dtype, jnp.floating):
