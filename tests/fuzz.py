@@ -7,7 +7,7 @@ same ones each time.
 from collections.abc import Callable
 from typing import Any
 
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 # Examples of all these tests together, by profile: what conftest.py registers.
@@ -23,6 +23,7 @@ def register() -> None:
             deadline=None,  # the first example of a scene compiles it
             derandomize=True,
             database=None,
+            phases=(Phase.explicit, Phase.generate, Phase.shrink),
             suppress_health_check=list(HealthCheck),
             print_blob=False,
         )

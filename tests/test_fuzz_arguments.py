@@ -7,10 +7,11 @@ import datetime
 import re
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -52,7 +53,7 @@ class Call(NamedTuple):
 
     make: Callable[..., Any]
     arguments: dict[str, Any]
-    also: dict[str, str] = {}
+    also: Mapping[str, str] = MappingProxyType({})
 
 
 def law(kind: Any, *more: str, **numbers: Any) -> Call:
@@ -101,7 +102,8 @@ CALLS = {
     "part": Call(RECORD.part, {"start": 0.0, "end": 1.0, "name": None}),
     "windows": Call(RECORD.windows, {"seconds": 0.5}),
     "sweep": Call(
-        sweeps.outline, {"system": SCENE, "over": {"m": [1.0, 2.0]}, "observe": ["q[0]"], **MOTION, "t1": 1.0, "chunk": 1},
+        sweeps.outline,
+        {"system": SCENE, "over": {"m": [1.0, 2.0]}, "observe": ["q[0]"], **MOTION, "t1": 1.0, "chunk": 1},
         {"system": "system|function", "observe": "observe|observable"},
     ),
     "latin_hypercube": Call(sweeps.latin_hypercube, {"ranges": {"m": (1.0, 2.0)}, "count": 2, "seed": 0}),
@@ -203,7 +205,7 @@ def refusal(call: Call, argument: str, garbage: Any) -> str | None:
         text, frames = str(error), traceback.extract_tb(error.__traceback__)
         if not frames[-1].filename.startswith(PACKAGE):
             return f"{type(error).__name__} from {frames[-1].filename}:{frames[-1].lineno}: {text[:300]}"
-        if not re.search(rf"\b({call.also.get(argument, argument)})\b", text):
+        if not re.search(rf"(?i)\b({call.also.get(argument, argument)})\b", text):
             return f"does not name it: {text[:300]}"
         return None
     except jms.SimulationError:

@@ -19,6 +19,8 @@ import jaxmodsim as jms
 from .fuzz import ODD, decades, fuzz, is_deep, signed
 
 STEPS, EVENTS = 3000, 64
+# Below that XLA takes numbers for zero.
+TINY = 1e-307
 
 
 def box(t: Any, q: Any, qd: Any, p: Any) -> Any:
@@ -62,11 +64,12 @@ class Drawn:
     @property
     def ts(self) -> np.ndarray:
         """Saved times [s]."""
-        return np.clip(self.t0 + np.asarray(self.shares) * self.span, self.t0, self.t1)
+        with np.errstate(all="ignore"):
+            return np.clip(self.t0 + np.asarray(self.shares) * self.span, self.t0, self.t1)
 
 
 # Exactly at rest, hardly moving, and beyond all machines.
-states = st.one_of(st.just(0.0), signed(decades(-9, 4)), st.sampled_from([5e-324, -1e-300, 1e12, -1e150]))
+states = st.one_of(st.just(0.0), signed(decades(-9, 4)), st.sampled_from([5e-324, -1e-300, 1e12, -1e100]))
 forces = signed(decades(-6, 6))
 shares = st.lists(st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.5, 0.9, 1.0]), min_size=4, max_size=4).map(sorted).map(tuple)
 numbers = st.builds(
@@ -135,7 +138,7 @@ def check_whole(found: jms.Trajectory, ts: np.ndarray) -> bool:
     t, code = np.asarray(found.t), int(found.code)
     reached = np.isfinite(t)
     assert (np.diff(reached.astype(int)) <= 0).all(), t
-    np.testing.assert_array_equal(t[reached], ts[reached])
+    np.testing.assert_allclose(t[reached], ts[reached], rtol=0, atol=TINY)
     assert np.isinf(t[~reached]).all(), t
     for x in jtu.tree_leaves((found.q, found.qd, found.z, found.modes)):
         assert np.isfinite(np.asarray(x)[reached]).all(), x
@@ -144,7 +147,7 @@ def check_whole(found: jms.Trajectory, ts: np.ndarray) -> bool:
     assert found.result.message.endswith(".")
     if code == 0:
         assert reached.all()
-        assert float(found.t_end) == float(found.problem.t1)
+        assert abs(float(found.t_end) - float(found.problem.t1)) <= TINY
     else:
         assert float(found.problem.t0) <= float(found.t_end) <= float(found.problem.t1)
     return code == 0
@@ -242,7 +245,13 @@ def check_tighter(law: str, found: jms.Trajectory, x: Drawn) -> None:
     size, n = scales(found, x), int(found.stats["num_steps"]) + 1
     for a, b, top in ((found.q, again.q, size.q), (found.qd, again.qd, size.v)):
         off = np.abs(np.asarray(a) - np.asarray(b)).max()
-        assert off <= 100 * n * (max(x.rtol, 1e-13) * top + x.atol), (off, top, np.asarray(a)[:,0], np.asarray(b)[:,0], int(again.stats["num_steps"]))
+        assert off <= 100 * n * (max(x.rtol, 1e-13) * top + x.atol), (
+            off,
+            top,
+            np.asarray(a)[:, 0],
+            np.asarray(b)[:, 0],
+            int(again.stats["num_steps"]),
+        )
 
 
 def check_closed_form(law: str, found: jms.Trajectory, x: Drawn) -> None:
@@ -255,7 +264,7 @@ def check_closed_form(law: str, found: jms.Trajectory, x: Drawn) -> None:
     off = abs(np.asarray(found.qd)[:, 0] - v).max()
     # A time is rounded where it is far from zero.
     late = 1e-15 * abs(x.t0) * (abs(x.F) + x.Fs + x.damping * top) / x.m
-    assert off <= 10 * n * (max(x.rtol, 1e-13) * top + x.atol) + late, (off, v)
+    assert off <= 10 * n * (max(x.rtol, 1e-13) * top + x.atol) + late + TINY, (off, v)
 
 
 def viscous(x: Drawn, t: np.ndarray) -> np.ndarray:
@@ -301,14 +310,12 @@ NAMED = "|".join(["q0", "qd0", "t0", "t1", "ts", "rtol", "atol", "Fc", "Fs", "wi
 @fuzz(0.15, numbers, st.lists(st.tuples(st.sampled_from(FIELDS), ODD), min_size=1, max_size=3))
 def test_numbers_that_are_none_or_hardly_one(x: Drawn, changes: list[tuple[str, float]]) -> None:
     x = replace(x, **dict(changes))
-    with np.errstate(all="ignore"):
-        ts = x.ts
+    words = ""
     try:
-        found = run("regularized", x)
+        check_whole(run("regularized", x), x.ts)
     except ValueError as refusal:
-        assert re.search(rf"\b({NAMED})\b", str(refusal)), refusal
-        return
-    check_whole(found, ts)
+        words = str(refusal)
+    assert not words or re.search(rf"\b({NAMED})\b", words), words
 
 
 @fuzz(0.15, numbers)
@@ -330,8 +337,12 @@ def test_kinds_of_numbers(start: int, span: int, state: Any, rate: Any, begin: A
     """Whole numbers of any kind are the same ones."""
     scene = scene_of("regularized", PLAIN)
     given = [state(start)], [rate(1)], end(start + span)
-    found = jms.simulate(scene, *given, t0=begin(start), ts=np.full(4, start), max_steps=STEPS, max_events=EVENTS, throw=False)
+    found = jms.simulate(
+        scene, *given, t0=begin(start), ts=np.full(4, start), max_steps=STEPS, max_events=EVENTS, throw=False
+    )
     usual = [float(start)], [1.0], float(start + span)
-    wanted = jms.simulate(scene, *usual, t0=float(start), ts=np.full(4, float(start)), max_steps=STEPS, max_events=EVENTS, throw=False)
+    wanted = jms.simulate(
+        scene, *usual, t0=float(start), ts=np.full(4, float(start)), max_steps=STEPS, max_events=EVENTS, throw=False
+    )
     np.testing.assert_array_equal(found.q, wanted.q)
     assert int(found.code) == int(wanted.code)

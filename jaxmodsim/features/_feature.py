@@ -65,7 +65,7 @@ def classes(fn: Callable[[Trajectory], Any], names: tuple[str, ...] | list[str])
     """
     names = as_names(names, name="names")
     if not names:
-        raise ValueError("names must hold one for each class, as in ('rests', 'moves'), but it is empty.")
+        raise ValueError("names must hold a name for each class, as in ('rests', 'moves'), but it is empty.")
     if not callable(fn):
         raise ValueError(f"fn must be a function of a Trajectory, but {fn!r} was given.")
     return Feature("kind of motion", "1", _class_of, (fn, names), _class_name)

@@ -67,7 +67,9 @@ def check_observables(observables: tuple[tuple[str, Observable], ...], scene: Sc
             known = [f"{x}[{i}]" for x in ("q", "qd") for i in range(y.q.shape[0])] + list(scene.names)
             if observable not in known:
                 hint = "" if entry else did_you_mean(observable, known)
-                raise ValueError(f"observe: {channel} observes {observable!r}, but there are: {', '.join(known)}.{hint}")
+                raise ValueError(
+                    f"observe: {channel} observes {observable!r}, but there are: {', '.join(known)}.{hint}"
+                )
         shape = _shape(observable, y, scene)
         if shape != ():
             what = "observe(q, qd)" if not isinstance(observable, str) else f"{observable!r}"

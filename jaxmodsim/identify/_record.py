@@ -86,7 +86,7 @@ class Record:
             if len(known) > 1:
                 raise ValueError(f"{self.name}: noise must name its channels, {', '.join(known)}; it is {noise!r}.")
             noise = dict.fromkeys(known, noise)
-        for channel, level in noise.items():
+        for channel in noise:
             if channel not in known:
                 raise ValueError(f"{self.name}: noise names {channel!r}, but the channels are: {', '.join(known)}.")
         return {
@@ -116,7 +116,9 @@ class Record:
         start, end = as_float(start, name="start"), as_float(end, name="end")
         inside = np.flatnonzero((self.t >= start) & (self.t <= end))
         if inside.size < 2:
-            raise ValueError(f"{self.name} has {inside.size} samples from start = {start:g} to end = {end:g} s; two are needed.")
+            raise ValueError(
+                f"{self.name} has {inside.size} samples from start = {start:g} to end = {end:g} s; two are needed."
+            )
         return self.samples(int(inside[0]), int(inside[-1]) + 1, name)
 
     def samples(self, first: int, last: int, name: str | None = None) -> "Record":

@@ -17,6 +17,8 @@ from ._depends import depends as depends
 from ._files import written_whole as written_whole
 from ._function import Function as Function
 from ._function import as_function as as_function
+from ._function import real_array as real_array
+from ._function import result_shape as result_shape
 from ._linalg import MAX_UNROLLED_CHOLESKY as MAX_UNROLLED_CHOLESKY
 from ._linalg import cholesky_pivots as cholesky_pivots
 from ._linalg import factor_positive_definite as factor_positive_definite

@@ -86,7 +86,7 @@ def check_ranges(ranges: Mapping[str, Span]) -> None:
         log = isinstance(span, tuple | list) and len(span) == 3
         if not isinstance(span, tuple | list) or not (len(span) == 2 or (log and span[2] == "log")):
             raise ValueError(
-                f"The range of {name!r} in ranges must be (low, high), (low, high, 'log') or a frozen distribution of"
+                f"In ranges the range of {name!r} must be (low, high), (low, high, 'log') or a frozen distribution of"
                 f" scipy.stats, but {span!r} was given."
             )
         low, high = span[:2]
