@@ -202,7 +202,8 @@ class VelocityConstraint(AbstractConstraint):
 def _check_vector(what: str, fn: Callable[..., Any], *args: Any) -> None:
     shape = result_shape(fn, *args, name=what)
     if shape is None or len(shape) > 1 or shape == (0,):
-        given = "something that is no array" if shape is None else f"shape {shape}"
+        given = "no array" if shape is None else f"shape {shape}"
         raise ValueError(
-            f"{what} must return one number or a vector, but it returned {given}. Return jnp.array([...]) with one entry for each equation."
+            f"{what} must return one number or a vector, but it returned {given}. Return jnp.array([...]) with one"
+            " entry for each equation."
         )
