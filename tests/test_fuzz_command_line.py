@@ -72,7 +72,7 @@ def check_ending(ending: tuple[int, str, str]) -> None:
     if errors.startswith("jaxmodsim: "):
         # One line, of words.
         assert errors.count("\n") == 1, errors
-        assert len(errors.split()) >= (2 if PLANNED in errors else 5), errors
+        assert len(errors.split()) >= (2 if PLANNED in errors else 4), errors
 
 
 FIT_OPTIONS = (
