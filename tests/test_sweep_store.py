@@ -186,7 +186,7 @@ def test_a_damaged_chunk_is_refused(tmp_path: Path) -> None:
     store(out)
     chunk = out / "power" / "c" / "0" / "0"
     whole = chunk.read_bytes()
-    for place in range(len(whole)):
+    for place in range(0, len(whole), len(whole) // 6):
         chunk.write_bytes(whole[:place] + bytes([whole[place] ^ 0x10]) + whole[place + 1 :])
         with pytest.raises(ValueError, match="checksum"):
             xr.open_zarr(out, consolidated=False)["power"][0, 0].load()

@@ -148,7 +148,7 @@ class Record:
         count = max(round(parts), 1)
         if 2 * count > len(self.t):
             raise ValueError(
-                f"{self.name}: windows of seconds = {seconds} cannot be cut from {len(self.t)} samples over"
+                f"{self.name}: windows of {seconds} s cannot be cut from {len(self.t)} samples over"
                 f" {self.t[-1] - self.t[0]:g} s."
             )
         edges = np.linspace(0, len(self.t), count + 1).astype(int)

@@ -46,7 +46,7 @@ def consistent(
     - `ValueError` for shapes and indices that are wrong.
     """
     if not isinstance(scene, Scene):
-        raise ValueError(f"consistent needs a Scene as scene, but a {type(scene).__name__} was given.")
+        raise ValueError(f"consistent needs a Scene, but a {type(scene).__name__} was given.")
     for name, value in (("q0", q0), ("qd0", qd0), ("t0", t0)):
         check_real(value, name=name)
     kind = jnp.result_type(float, *jax.tree_util.tree_leaves(scene))

@@ -191,7 +191,7 @@ def _problem(
 ) -> Problem:
     """Convert and check all numbers of a run."""
     if not isinstance(scene, Scene):
-        raise ValueError(f"simulate needs a Scene as scene, but a {type(scene).__name__} was given.")
+        raise ValueError(f"simulate needs a Scene, but a {type(scene).__name__} was given.")
     # A list may hold numbers that are traced, as in qd0=[scene.params["v"]].
     q0, qd0, ts = (
         jnp.asarray(value) if isinstance(value, list | tuple) and not _known(*value) else value

@@ -59,7 +59,7 @@ def request(system: Any, grid: Grid, observe: Any, arguments: Mapping[str, Any])
     if isinstance(system, Scene):
         return _of_scene(system, grid, observe, dict(arguments))
     if not callable(system):
-        raise ValueError(f"sweep needs a Scene or a function as system, but a {type(system).__name__} was given.")
+        raise ValueError(f"sweep needs a Scene or a function, but a {type(system).__name__} was given.")
     given = [name for name, value in arguments.items() if value is not None]
     if given:
         raise ValueError(
