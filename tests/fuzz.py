@@ -32,13 +32,13 @@ def register() -> None:
 
 def fuzz(share: float, *strategies: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """A test that takes `share` of all examples."""
-    many = settings(max_examples=max(round(share * settings.default.max_examples), 1))
+    many = settings(max_examples=max(round(share * settings().max_examples), 1))
     return lambda check: many(given(*strategies)(check))
 
 
 def is_deep() -> bool:
     """Whether many examples are drawn."""
-    return settings.default.max_examples > PROFILES["suite"]
+    return settings().max_examples > PROFILES["suite"]
 
 
 def decades(low: float, high: float) -> st.SearchStrategy[float]:

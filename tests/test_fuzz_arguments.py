@@ -218,7 +218,7 @@ def refusal(call: Call, argument: str, garbage: Any) -> str | None:
 EACH = [(name, argument) for name, call in CALLS.items() for argument in call.arguments]
 
 
-@fuzz(0.3, st.sampled_from(EACH), st.sampled_from(list(GARBAGE)))
+@fuzz(0.2, st.sampled_from(EACH), st.sampled_from(list(GARBAGE)))
 def test_garbage_is_refused_by_name(where: tuple[str, str], kind: str) -> None:
     name, argument = where
     wrong = refusal(CALLS[name], argument, GARBAGE[kind]())
@@ -249,7 +249,7 @@ FUNCTIONS: dict[str, tuple[Callable[[Any], Any], str]] = {
 }
 
 
-@fuzz(0.05, st.sampled_from(list(FUNCTIONS)), st.sampled_from(list(GARBAGE)))
+@fuzz(0.03, st.sampled_from(list(FUNCTIONS)), st.sampled_from(list(GARBAGE)))
 def test_functions_that_return_garbage_are_refused_by_name(name: str, kind: str) -> None:
     run, words = FUNCTIONS[name]
     call = Call(run, {"fn": None}, {"fn": words})

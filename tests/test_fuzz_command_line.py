@@ -96,7 +96,7 @@ def words(options: tuple[str, ...]) -> st.SearchStrategy[list[str]]:
 
 
 @pytest.mark.parametrize(
-    ("command", "share"), [(("fit", "good.csv"), 0.04), (("sweep", "root.toml", "--dry-run"), 0.04), ((), 0.02)]
+    ("command", "share"), [(("fit", "good.csv"), 0.03), (("sweep", "root.toml", "--dry-run"), 0.03), ((), 0.01)]
 )
 def test_any_command_line(run: Command, command: tuple[str, ...], share: float) -> None:
     options = {"fit": FIT_OPTIONS, "sweep": SWEEP_OPTIONS}.get(command[0] if command else "", ("--help", "--version"))
@@ -144,7 +144,7 @@ def tables(draw: st.DrawFn) -> bytes:
 
 
 def test_any_table(run: Command, place: Path) -> None:
-    @fuzz(0.05, st.one_of(tables(), st.binary(max_size=60)))
+    @fuzz(0.04, st.one_of(tables(), st.binary(max_size=60)))
     def check(content: bytes) -> None:
         (place / "drawn.csv").write_bytes(content)
         ending = run("fit", "drawn.csv")
@@ -182,7 +182,7 @@ def specs(draw: st.DrawFn) -> bytes:
 
 
 def test_any_spec(run: Command, place: Path) -> None:
-    @fuzz(0.08, st.one_of(specs(), specs(), st.binary(max_size=60)))
+    @fuzz(0.06, st.one_of(specs(), specs(), st.binary(max_size=60)))
     def check(content: bytes) -> None:
         (place / "drawn.toml").write_bytes(content)
         check_ending(run("sweep", "drawn.toml", "--dry-run"))

@@ -291,7 +291,7 @@ def _as_users_have_it(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("law", DEEP if is_deep() else SUITE)
 def test_any_numbers_give_the_right_motion_or_a_code(law: str) -> None:
-    @fuzz(0.06, numbers)
+    @fuzz(0.03, numbers)
     def check(x: Drawn) -> None:
         found = run(law, x)
         if check_whole(found, x.ts):
@@ -307,7 +307,7 @@ FIELDS = [field.name for field in fields(Drawn) if field.name != "shares"]
 NAMED = "|".join(["q0", "qd0", "t0", "t1", "ts", "rtol", "atol", "Fc", "Fs", "width"])
 
 
-@fuzz(0.15, numbers, st.lists(st.tuples(st.sampled_from(FIELDS), ODD), min_size=1, max_size=3))
+@fuzz(0.1, numbers, st.lists(st.tuples(st.sampled_from(FIELDS), ODD), min_size=1, max_size=3))
 def test_numbers_that_are_none_or_hardly_one(x: Drawn, changes: list[tuple[str, float]]) -> None:
     x = replace(x, **dict(changes))
     words = ""
@@ -318,7 +318,7 @@ def test_numbers_that_are_none_or_hardly_one(x: Drawn, changes: list[tuple[str, 
     assert not words or re.search(rf"\b({NAMED})\b", words), words
 
 
-@fuzz(0.15, numbers)
+@fuzz(0.08, numbers)
 def test_single_precision(x: Drawn) -> None:
     scene = jtu.tree_map(lambda leaf: leaf.astype("float32"), scene_of("regularized", x))
     q0, qd0 = (np.array([y], "float32") if abs(y) < 1e30 else np.zeros(1, "float32") for y in (x.q0, x.qd0))
@@ -332,7 +332,7 @@ def test_single_precision(x: Drawn) -> None:
 KINDS = (float, np.float64, np.asarray, np.float32, lambda y: np.asarray(y, "float32"), jax.numpy.asarray)
 
 
-@fuzz(0.05, st.integers(-3, 3), st.integers(0, 2), *(st.sampled_from([int, np.int32, *KINDS]) for _ in range(4)))
+@fuzz(0.03, st.integers(-3, 3), st.integers(0, 2), *(st.sampled_from([int, np.int32, *KINDS]) for _ in range(4)))
 def test_kinds_of_numbers(start: int, span: int, state: Any, rate: Any, begin: Any, end: Any) -> None:
     """Whole numbers of any kind are the same ones."""
     scene = scene_of("regularized", PLAIN)
