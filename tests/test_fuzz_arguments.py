@@ -256,3 +256,55 @@ def test_functions_that_return_garbage_are_refused_by_name(name: str, kind: str)
     garbage = GARBAGE[kind]()
     wrong = refusal(call, "fn", (lambda q: garbage) if name in ("at", "along") else lambda *state: garbage)
     assert wrong is None, f"{name} returning {kind}: {wrong}"
+
+
+# What was an error from deep inside, or was taken, when it was found.
+FOUND = [
+    ("LuGre", "Fc", "huge", "Fc is a number beyond all that a float64 can hold"),
+    ("Coulomb", "Fs", "array of text", "Fs must be a real number"),
+    ("Stribeck", "fall", "text", "fall must be a function"),
+    ("Friction", "name", "matrix", "Friction name must be a text"),
+    ("Constraint", "one_sided", "empty list", "one_sided must be True or False"),
+    ("Signal", "linear", "None", "Signal linear must be True or False"),
+    ("scaled_by", "parameters", "object", "scaled_by parameters must be a list of names"),
+    ("simulate", "z0", "text", "z0 must be a mapping by names"),
+    ("simulate", "throw", "matrix", "throw must be True or False"),
+    ("simulate", "max_steps", "huge", "max_steps must be a positive integer, but one of 401 digits"),
+    ("consistent", "q0", "complex array", "q0 must hold real numbers"),
+    ("consistent", "scene", "None", "consistent needs a Scene"),
+    ("Record", "inputs", "True", "inputs must be a mapping by names"),
+    ("Record", "t", "complex array", "column 't' must hold real numbers"),
+    ("part", "start", "text", "start must hold real numbers"),
+    ("windows", "seconds", "None", "seconds must hold real numbers"),
+    ("sweep", "q0", "text", "q0 must hold real numbers"),
+    ("sobol", "seed", "negative", "seed must be an integer >= 0"),
+    ("fit", "scene", "None", "scene must be a Scene"),
+    ("fit", "records", "None", "records must be a Record or several"),
+    ("fit", "loss", "text", "loss must be a loss such as"),
+    ("fit", "begin", "text", "begin must be a beginning"),
+    ("fit", "rtol", "complex", "rtol must hold real numbers"),
+]
+
+
+@pytest.mark.parametrize(("name", "argument", "kind", "text"), FOUND)
+def test_what_was_not_refused_by_name(name: str, argument: str, kind: str, text: str) -> None:
+    call = CALLS[name]
+    with pytest.raises(ValueError, match=text):
+        call.make(**(call.arguments | {argument: GARBAGE[kind]()}))
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "text"),
+    [
+        ("lagrangian", "zero", "The Lagrangian must return one number .* that depends on the state"),
+        ("lagrangian", "text", "What the Lagrangian returns must hold real numbers, but 'text'"),
+        ("applied force", "complex array", "What fn of AppliedForce 'applied' returns must hold real numbers"),
+        ("along", "None", "What Friction along returns must be an array of real numbers, but it is None"),
+        ("normal_force", "complex", "normal_force.* returns must hold real numbers"),
+        ("phi", "text", "What phi of Constraint 'constraint' returns must hold real numbers"),
+    ],
+)
+def test_what_a_function_returned_was_not_refused_by_name(name: str, kind: str, text: str) -> None:
+    garbage = GARBAGE[kind]()
+    with pytest.raises(ValueError, match=text):
+        FUNCTIONS[name][0]((lambda q: garbage) if name == "along" else lambda *state: garbage)
