@@ -170,7 +170,8 @@ def scales(found: jms.Trajectory, x: Drawn) -> Scales:
     q, v = (np.asarray(y)[np.isfinite(t), 0] for y in (found.q, found.qd))
     top = float(np.max(np.abs([*v, x.qd0, x.belt])))
     far = float(np.max(np.abs([*q, x.q0]))) + top * (float(found.t_end) - x.t0)
-    energy = 0.5 * x.m * v**2 + 0.5 * x.k * q**2 - x.F * q
+    with np.errstate(over="ignore"):  # of fixed steps that are far too long
+        energy = 0.5 * x.m * v**2 + 0.5 * x.k * q**2 - x.F * q
     rtol = max(x.rtol, 1e-13)
     each = (x.m * top) * (rtol * top + x.atol) + (x.k * far + abs(x.F)) * (rtol * far + x.atol)
     rounding = 1e-15 * (most("stribeck", x) + abs(x.F) + x.k * far) * (float(found.t_end) - x.t0) / x.m
