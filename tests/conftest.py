@@ -10,6 +10,8 @@ import jaxlib.version
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
+from . import fuzz
+
 # Nearly all of the time goes into tracing and compiling. XLA's older way to emit fused loops, straight as LLVM code,
 # compiles in 60 % of the time. XLA ends the process over an option that it does not know: only where it was tried.
 # For the way that users have: XLA_FLAGS=--xla_cpu_use_fusion_emitters=true.
@@ -20,6 +22,7 @@ if jaxlib.version.__version_info__[:2] == (0, 10) and _OPTION not in _FLAGS:
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
+fuzz.register()
 
 
 # Tests of a module share what they have compiled and computed, so a module stays in one process. Those of these modules

@@ -276,8 +276,8 @@ def test_a_step_too_long_for_the_friction_is_remarked(clean):
         ({"q0": [0.0], "qd0": [0.0, 0.0]}, "of one shape"),
         ({"q0": [float("nan")]}, "must be finite"),
         ({"observe": lambda q, qd: q + 0 * qd}, r"observe\(q, qd\) returned the shape \(1,\)"),
-        ({"substeps": 1.5}, "substeps must be at least 1, an integer"),
-        ({"max_steps": 0}, "max_steps must be at least 1"),
+        ({"substeps": 1.5}, "substeps must be a positive integer, but 1.5"),
+        ({"max_steps": 0}, "max_steps must be a positive integer"),
     ],
 )
 def test_wrong_options_are_refused(clean, options, text):
@@ -315,7 +315,7 @@ def test_ctrl_c_keeps_the_best_so_far(clean):
         ([0.0, 1.0, 2.0], [0.0, np.nan, 2.0], {}, "'measured' has 1 values that are not finite, the first in sample 1"),
         ([0.0, 1.0, 2.0], [0.0, 1.0, 2.0], {"u": [0.0, 1.0]}, r"'u' has \(2,\)"),
         ([0.0], [0.0], {}, "two samples or more"),
-        (["a", "b"], [0.0, 1.0], {}, "'t' holds something that is no number"),
+        (["a", "b"], [0.0, 1.0], {}, "column 't' must hold real numbers"),
     ],
 )
 @pytest.mark.quick

@@ -270,7 +270,7 @@ def check_refusal(run_command, out: Path, text: str, *command: str) -> None:
         (("--limit", "mass=1:9"), "--limit: there is no parameter 'mass'"),
         (("--limit", "dry.Fc=100:200"), "dry.Fc must be .*but it is"),
         (("--force-gain", "0"), "--force-gain must be finite and not zero"),
-        (("--substeps", "0"), "substeps must be at least 1"),
+        (("--substeps", "0"), "substeps must be a positive integer"),
         (("--starts", "0"), "--starts must be at least 1"),
         (("--folds", "1"), "--folds must be at least 2"),
         (("--loss", "absolute"), "no name 'absolute'; the names are: squares, huber, cauchy"),

@@ -280,7 +280,7 @@ def test_records_refuse_what_cannot_be():
     t, x = [0.0, 1.0, 2.0], [0.0, 1.0, 2.0]
     with pytest.raises(ValueError, match="noise names 'v', but the channels are: measured"):
         jms.Record(t, x, noise={"v": 1.0})
-    with pytest.raises(ValueError, match="noise of 'measured' must be finite and > 0"):
+    with pytest.raises(ValueError, match="noise of 'measured' must be one finite number > 0"):
         jms.Record(t, x, noise=0.0)
     with pytest.raises(ValueError, match="linear names"):
         jms.Record(t, x, linear=("u",))

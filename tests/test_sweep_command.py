@@ -31,6 +31,9 @@ scene = jms.Scene(lagrangian, params={"m": 1.0})
 
 def root(a, b):
     return {"root": jnp.sqrt(a) + b}
+
+def fails(a, b):
+    return {"root": 1 / 0}
 """
 ROOT = """
 [scene]
@@ -266,6 +269,8 @@ def each_mistake_with_a_file() -> Iterator[tuple[str, str, str, str]]:
     yield "broken", '"model.py"', '"broken.py"', "running broken.py failed with ZeroDivisionError"
     yield "key", "[over]", "m = 1\n[over]", "no key 'm'; there may be problem, file, object"
     yield "run", "[over]", "[run]\nt1 = 1\n[over]", "t1 has no place beside a function"
+    yield "arguments", "a = {", "c = {", r"over must name what the function takes, \(a, b\), but it names c, b"
+    yield "failing", '"root"', '"fails"', r"model.py, line \d+: ZeroDivisionError: division by zero"
 
 
 @pytest.mark.parametrize(

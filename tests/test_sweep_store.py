@@ -178,3 +178,23 @@ def test_a_disk_that_is_full_loses_nothing(whole: Path, tmp_path: Path, monkeypa
     store(out, progress=lambda now: begun.append(now.done))
     assert begun[0] == done
     assert_same_bytes(out, whole)
+
+
+def test_a_damaged_chunk_is_refused(tmp_path: Path) -> None:
+    """No other numbers come out of it, wherever it is damaged."""
+    out = tmp_path / "store.zarr"
+    store(out)
+    chunk = out / "power" / "c" / "0" / "0"
+    whole = chunk.read_bytes()
+    for place in range(0, len(whole), len(whole) // 6):
+        chunk.write_bytes(whole[:place] + bytes([whole[place] ^ 0x10]) + whole[place + 1 :])
+        with pytest.raises(ValueError, match="checksum"):
+            xr.open_zarr(out, consolidated=False)["power"][0, 0].load()
+    chunk.write_bytes(whole)
+    assert float(xr.open_zarr(out, consolidated=False)["power"][0, 0]) == 1.0
+    chunk = out / "result" / "c" / "0" / "0"
+    chunk.write_bytes(chunk.read_bytes()[:-1])
+    with pytest.raises(ValueError, match=r"store.zarr is damaged: chunk 0 of result cannot be read .* Remove its file"):
+        store(out)
+    chunk.unlink()
+    store(out)

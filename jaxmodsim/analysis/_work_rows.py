@@ -1,5 +1,6 @@
 """What `work_precision` gives: rows, a table, a figure, a file."""
 
+import hashlib
 import importlib
 import json
 import os
@@ -13,7 +14,7 @@ from ..numerics import written_whole
 if TYPE_CHECKING:
     import pandas as pd
 
-_KIND, _VERSION = "jaxmodsim work precision", 1
+_KIND, _VERSION = "jaxmodsim work precision", 2
 
 
 @dataclass(frozen=True)
@@ -169,8 +170,9 @@ class WorkPrecision:
 
         - `OSError` if the file cannot be written.
         """
-        head = {"kind": _KIND, "format": _VERSION}
-        text = json.dumps(head | asdict(self), indent=1, allow_nan=False)
+        body = asdict(self)
+        head = {"kind": _KIND, "format": _VERSION, "sha256": _digest(body)}
+        text = json.dumps(head | body, indent=1, allow_nan=False)
         with written_whole(path) as file:
             file.write(text.encode() + b"\n")
 
@@ -251,6 +253,11 @@ def _columns(row: Row, costs: Sequence[str]) -> dict[str, Any]:
     return {**columns, "failed": row.failed}
 
 
+def _digest(body: dict[str, Any]) -> str:
+    """Tells whether a number has changed, which JSON itself does not."""
+    return hashlib.sha256(json.dumps(body).encode()).hexdigest()
+
+
 def load_work_precision(path: str | os.PathLike[str]) -> WorkPrecision:
     """Read what `WorkPrecision.save` wrote.
 
@@ -261,13 +268,15 @@ def load_work_precision(path: str | os.PathLike[str]) -> WorkPrecision:
     """
     try:
         body = json.loads(Path(path).read_bytes())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged, or no JSON: {error}") from error
     if not isinstance(body, dict) or body.pop("kind", None) != _KIND:
         raise ValueError(f"{path} was not written by WorkPrecision.save: it does not say {_KIND!r}.")
     version = body.pop("format", None)
     if version != _VERSION:
         raise ValueError(f"{path} has the format {version!r}, but this version reads format {_VERSION}.")
+    if body.pop("sha256", None) != _digest(body):
+        raise ValueError(f"{path} is damaged, or was changed by hand: its checksum is another one.")
     try:
         rows = tuple(_row(row) for row in body.pop("rows"))
         return WorkPrecision(**{**body, "costs": tuple(body["costs"]), "rows": rows})

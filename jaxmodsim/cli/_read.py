@@ -1,5 +1,8 @@
 """Records from files: CSV, Parquet, MATLAB."""
 
+import io
+import subprocess
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import scipy.io
 
 from ..identify import Record
 from ..numerics import nearest
@@ -75,6 +77,8 @@ def _column(table: Mapping[str, Any], path: Path, option: str, name: str) -> np.
             f"{path.name} has no column {name!r} (--{option}); it has: {', '.join(table) or 'none'}.{hint}"
         )
     given = pd.Series(table[name])
+    if given.empty:
+        return np.zeros(0)
     if pd.api.types.is_numeric_dtype(given) and not pd.api.types.is_complex_dtype(given):
         return given.to_numpy(float, na_value=np.nan)
     bad = int(np.argmax(np.isnan(np.asarray(pd.to_numeric(given, errors="coerce"), float))))
@@ -94,23 +98,40 @@ def _parquet(path: Path) -> dict[str, Any]:
         frame = pd.read_parquet(path)
     except ImportError as error:
         raise ValueError("Reading Parquet needs pyarrow: pip install 'jaxmodsim[cli]'.") from error
-    except (ValueError, OSError) as error:
+    except Exception as error:  # whatever the bytes of a damaged file lead the reader into
         raise ValueError(f"{path} is damaged or no Parquet file: {_one_line(error)}") from error
     return {str(name): frame[name] for name in frame.columns}
 
 
 def _mat(path: Path) -> dict[str, Any]:
-    try:
-        found = scipy.io.loadmat(path)
-    except NotImplementedError as error:
+    # In a process of its own: some damaged files end the one that reads them.
+    reading = subprocess.run([sys.executable, "-c", _MAT, str(path.resolve())], capture_output=True, check=False)
+    if reading.returncode == _HDF5:
         raise ValueError(
             f"{path.name} is a MATLAB 7.3 file (HDF5), which is not read here: save it in MATLAB with"
             f" save('{path.name}', ..., '-v7'), or as CSV or Parquet."
-        ) from error
-    except Exception as error:  # whatever the bytes of a damaged file lead the reader into
-        raise ValueError(f"{path} is damaged or no MATLAB file: {_one_line(error)}") from error
-    # MATLAB knows no vectors: a row or a column of a matrix is one.
-    return {name: np.ravel(x) for name, x in found.items() if not name.startswith("__") and np.size(x) == max(x.shape)}
+        )
+    if reading.returncode != 0:
+        last = reading.stderr.decode(errors="replace").strip().splitlines()[-1:]
+        why = " ".join(last) if reading.returncode > 0 else "reading it ends the process that reads"
+        raise ValueError(f"{path} is damaged or no MATLAB file: {why}")
+    with np.load(io.BytesIO(reading.stdout), allow_pickle=False) as found:
+        # MATLAB knows no vectors: a row or a column of a matrix is one.
+        vectors = {name[1:]: np.ravel(x) for name, x in found.items() if x.size == max(x.shape, default=0)}
+    return {name: x for name, x in vectors.items() if not name.startswith("__")}
+
+
+# What is neither numbers nor text is left out.
+_HDF5 = 3
+_MAT = f"""
+import sys, numpy, scipy.io
+try:
+    found = scipy.io.loadmat(sys.argv[1])
+except NotImplementedError:
+    sys.exit({_HDF5})
+kept = {{"_" + name: x for name, x in found.items() if getattr(getattr(x, "dtype", None), "kind", "O") in "biufcU"}}
+numpy.savez(sys.stdout.buffer, **kept)
+"""
 
 
 def _one_line(error: Exception) -> str:

@@ -4,6 +4,7 @@ import logging
 import signal
 import sys
 import time
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -49,6 +50,19 @@ def run_sweep(request: SweepRequest) -> None:
         _run(request, read_spec(request.spec))
     except ImportError as error:  # of the extra
         raise ValueError(str(error)) from error
+    except Exception as error:  # whatever the functions of a file do
+        line = _line_of_model(error)
+        if line is None:
+            raise
+        raise ValueError(f"{line}: {type(error).__name__}: {error}") from error
+
+
+def _line_of_model(error: Exception) -> str | None:
+    """Where in the file of a SPEC an error comes from; None where it does not."""
+    file = getattr(sys.modules.get(MODEL), "__file__", None)
+    frames = traceback.extract_tb(error.__traceback__)
+    found = [frame for frame in frames if frame.filename == file]
+    return f"{Path(file).name}, line {found[-1].lineno}" if file is not None and found else None
 
 
 def _check(request: SweepRequest) -> None:

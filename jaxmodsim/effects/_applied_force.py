@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import Place, as_function, as_place
-from ._effect import AbstractEffect, Action, Power, result_shape
+from ..numerics import Place, as_function, as_label, as_place, result_shape
+from ._effect import AbstractEffect, Action, Power
 
 
 def _at(value: Any) -> Place | None:
@@ -36,7 +36,7 @@ class AppliedForce(AbstractEffect):
 
     fn: Callable[..., Any] = eqx.field(converter=partial(as_function, name="AppliedForce fn"))
     at: Place | None = eqx.field(default=None, converter=_at)
-    name: str | None = eqx.field(default=None, static=True)
+    name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="AppliedForce name"))
 
     @property
     def default_name(self) -> str:
@@ -50,8 +50,8 @@ class AppliedForce(AbstractEffect):
 
     def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
         """Check the shape that `fn` returns."""
-        given = result_shape(self.fn, q[0], q, qd, params)
-        wanted = q.shape if self.at is None else result_shape(self.at, q, params)
+        given = result_shape(self.fn, q[0], q, qd, params, name=f"fn of AppliedForce {name!r}")
+        wanted = q.shape if self.at is None else result_shape(self.at, q, params, name=f"at of AppliedForce {name!r}")
         if given != wanted:
             where = "the coordinates" if self.at is None else "what `at` returns"
             raise ValueError(

@@ -1,10 +1,9 @@
 """What an effect is: something that puts a force on the mechanism."""
 
 import abc
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import equinox as eqx
-import jax
 from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
@@ -74,9 +73,3 @@ class AbstractEffect(eqx.Module):
     @abc.abstractmethod
     def stored(self, z: PyTree) -> Float[Array, ""] | float:
         """Energy [J] held in the own state."""
-
-
-def result_shape(fn: Any, *args: Any) -> tuple[int, ...] | None:
-    """Shape of what `fn(*args)` returns, or None where that is not one array."""
-    out = jax.eval_shape(fn, *args)
-    return getattr(out, "shape", None)

@@ -1,6 +1,7 @@
 """Where a friction law acts."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -25,15 +26,17 @@ from ..numerics import (
     Place,
     Varying,
     as_function,
+    as_label,
     as_number,
     as_place,
     check_ranges,
     modules_of,
     optional_parameter,
+    result_shape,
     safe_norm,
     varies,
 )
-from ._effect import AbstractEffect, Action, Power, result_shape
+from ._effect import AbstractEffect, Action, Power
 
 
 def _law(law: Any) -> AbstractLaw:
@@ -111,7 +114,7 @@ class Friction(AbstractEffect):
     along: Place | None = eqx.field(default=None, converter=_along)
     belt_velocity: Number | Callable[..., Any] = eqx.field(default=0.0, converter=_belt)
     normal_force: Number | Callable[..., Any] | Reaction | None = eqx.field(default=None, converter=_load)
-    name: str | None = eqx.field(default=None, static=True)
+    name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Friction name"))
     ellipse: Number | None = optional_parameter("ellipse", "1", lower=0.0, strict=True)
 
     def __check_init__(self) -> None:
@@ -151,7 +154,7 @@ class Friction(AbstractEffect):
 
     def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
         """Check that displacement, belt velocity and load have the shapes they need."""
-        shape = () if self.along is None else result_shape(self.along, q, params)
+        shape = self._shape(q, params)
         if self.along is None and q.shape != (1,):
             raise ValueError(
                 f"Friction {name!r} acts on a mechanism with {q.shape[0]} coordinates: say along which"
@@ -184,15 +187,18 @@ class Friction(AbstractEffect):
             ("normal_force(t, q, qd, params)", load, state, ()),
             *(("scaled_by's fn(t, q, qd, params)", fn, state, ()) for fn in factors),
         ):
-            if callable(fn) and result_shape(fn, *args) != wanted:
-                raise ValueError(
-                    f"Friction {name!r}: {label} returned the shape {result_shape(fn, *args)}, but {wanted} is needed."
-                )
+            given = result_shape(fn, *args, name=f"{label} of Friction {name!r}") if callable(fn) else wanted
+            if given != wanted:
+                raise ValueError(f"Friction {name!r}: {label} returned the shape {given}, but {wanted} is needed.")
+
+    def _shape(self, q: Any, params: PyTree) -> tuple[int, ...] | None:
+        """Shape of the displacement."""
+        return () if self.along is None else result_shape(self.along, q, params, name="Friction along")
 
     def check_belt(self, q: Any, params: PyTree, name: str) -> None:
         """Refuse a slip that is a vector beside the velocity of a belt that is a number other than zero."""
         assert self.along is not None
-        slip = result_shape(self.along, q, params)
+        slip = self._shape(q, params)
         if slip != ():
             raise ValueError(
                 f"Friction {name!r}: slip is a vector of shape {slip}, so belt_velocity must be a function of t that"
@@ -203,7 +209,7 @@ class Friction(AbstractEffect):
         """State of the law; None where it has none."""
         if not isinstance(self.law, AbstractDynamicLaw):
             return None
-        slip = () if self.along is None or q.shape == (1,) else result_shape(self.along, q, params)
+        slip = () if q.shape == (1,) else self._shape(q, params)
         return self.law.state0(jnp.zeros(slip or (), q.dtype))
 
     def direction(self, q: Float[Array, " dof"], params: PyTree) -> Float[Array, " dof"]:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from ..numerics import as_names
 from ..simulation import Trajectory
 
 
@@ -62,9 +63,12 @@ def classes(fn: Callable[[Trajectory], Any], names: tuple[str, ...] | list[str])
 
     - `ValueError` if `names` is empty.
     """
-    if isinstance(names, str) or not names or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"classes needs a name for each class, as in ('rests', 'moves'), but {names!r} was given.")
-    return Feature("kind of motion", "1", _class_of, (fn, tuple(names)), _class_name)
+    names = as_names(names, name="names")
+    if not names:
+        raise ValueError("names must hold a name for each class, as in ('rests', 'moves'), but it is empty.")
+    if not callable(fn):
+        raise ValueError(f"fn must be a function of a Trajectory, but {fn!r} was given.")
+    return Feature("kind of motion", "1", _class_of, (fn, names), _class_name)
 
 
 def _class_of(run: Trajectory, fn: Callable[[Trajectory], Any], names: tuple[str, ...]) -> Any:

@@ -5,10 +5,9 @@ from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Number, as_function, parameter
+from ..numerics import Number, as_function, parameter, real_array
 from ._law import AbstractForceLaw
 
 
@@ -34,7 +33,7 @@ class Curve(AbstractForceLaw):
 
     def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Friction force [N] at velocity `v` [m/s]."""
-        value = jnp.asarray(self.fn(v))
+        value = real_array(self.fn(v), name="Curve fn")
         if value.shape != ():
             raise ValueError(f"A friction curve must return one number, but fn(v) returned the shape {value.shape}.")
         return self.gain * value

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 
-from ..numerics import Varying, as_function, modules_of, ranges_of
+from ..numerics import Varying, as_function, as_names, modules_of, ranges_of
 from ._law import AbstractLaw
 
 _Law = TypeVar("_Law")
@@ -46,7 +46,11 @@ def scaled_by(law: _Law, fn: Any, parameters: Sequence[str] | None = None) -> _L
             "scaled_by: fn holds numbers of its own; put them into the scene's params, and read them there."
         )
     known = {name: r.unit for _, module in modules_of(law) for name, r in ranges_of(module).items()}
-    chosen = [name for name, unit in known.items() if unit.startswith("N")] if parameters is None else [*parameters]
+    chosen = (
+        [name for name, unit in known.items() if unit.startswith("N")]
+        if parameters is None
+        else list(as_names(parameters, name="scaled_by parameters"))
+    )
     unknown = [name for name in chosen if name not in known]
     if unknown or not chosen or isinstance(parameters, str):
         raise ValueError(

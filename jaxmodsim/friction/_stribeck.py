@@ -29,6 +29,14 @@ def _power(x: Float[Array, ""], exponent: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.where(exponent < 1.0, rounded, safe_power(x, exponent))
 
 
+def _fall(value: Any) -> Any:
+    if not callable(value):
+        raise ValueError(
+            f"Stribeck: fall must be a function such as jaxmodsim.friction.lorentzian, but {value!r} was given."
+        )
+    return value
+
+
 class Stribeck(AbstractSetValuedLaw):
     """Friction that falls from stiction to Coulomb level as slip begins, and then rises viscously.
 
@@ -66,7 +74,7 @@ class Stribeck(AbstractSetValuedLaw):
     vs: Number = parameter("vs", "m/s", lower=0.0, strict=True)
     Fv: Number = parameter("Fv", "N s/m", lower=0.0, default=0.0)
     exponent: Number | None = optional_parameter("exponent", "1", lower=0.0, strict=True)
-    fall: Any = eqx.field(default=exponential, static=True)
+    fall: Any = eqx.field(default=exponential, static=True, converter=_fall)
     stiff: ClassVar[bool] = False
 
     def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:

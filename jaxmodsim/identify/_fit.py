@@ -5,6 +5,7 @@ from typing import Any
 
 from jaxtyping import ArrayLike
 
+from ..numerics import as_float, as_mapping, as_names, as_whole
 from ..scene import Scene
 from ._begin import AbstractBeginning, begin_all
 from ._engines import with_values
@@ -15,6 +16,13 @@ from ._record import Record
 from ._replay import Controller
 from ._result import FitResult, result_of
 from ._solve import Options, Progress, solve_with_noise
+
+_WORDS = {
+    "scene": "a Scene",
+    "loss": "a loss such as Huber()",
+    "controller": "a Controller",
+    "shooting": "a Shooting",
+}
 
 
 def fit(
@@ -85,16 +93,25 @@ def fit(
     - `ValueError` for names that are unknown, a start beyond its limits, inputs the scene has no entry for.
     - `RuntimeError` if the model is not finite at its start values.
     """
-    for label, count in (("substeps", substeps), ("max_steps", max_steps)):
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise ValueError(f"{label} must be at least 1, an integer, but {count!r} was given.")
     loss = Squares() if loss is None else loss
+    _check_kinds(scene, loss, controller, shooting, progress)
+    begin = _beginnings(begin)
     settings = Settings(
-        observe, q0, qd0, delay or {}, limits or {}, tuple(passive), prior or {}, loss, controller, shooting, substeps,
-        accuracy,
-    )  # fmt: skip
+        observe,
+        q0,
+        qd0,
+        as_mapping(delay, name="delay", example="{'u': 1e-3}"),
+        as_mapping(limits, name="limits", example="{'m': (0.0, 5.0)}"),
+        as_names(passive, name="passive"),
+        as_mapping(prior, name="prior", example="{'m': (95.0, 5.0)}"),
+        loss,
+        controller,
+        shooting,
+        as_whole(substeps, name="substeps"),
+        as_float(accuracy, name="accuracy", lower=0.0),
+    )
+    options = Options(as_float(rtol, name="rtol", lower=0.0), as_whole(max_steps, name="max_steps"), progress)
     prepared = prepare(scene, records, free, settings)
-    options = Options(rtol, max_steps, progress)
     x, starts = begin_all(begin, prepared.problem, options)
     found = solve_with_noise(prepared.problem, x, options, prepared.given)
     values = found.problem.free.values(found.problem.split(found.search.x)[0])
@@ -102,3 +119,24 @@ def fit(
     return result_of(
         found, prepared.records, prepared.windows, prepared.units, with_values(scene, values), error, starts
     )
+
+
+def _check_kinds(scene: Any, loss: Any, controller: Any, shooting: Any, progress: Any) -> None:
+    """Refuse objects of another kind."""
+    for name, value, kind in (
+        ("scene", scene, Scene),
+        ("loss", loss, AbstractLoss),
+        ("controller", controller, Controller | None),
+        ("shooting", shooting, Shooting | None),
+    ):
+        if not isinstance(value, kind):
+            raise ValueError(f"{name} must be {_WORDS[name]}, but {value!r} was given.")
+    if not (progress is None or callable(progress)):
+        raise ValueError(f"progress must be a function, but {progress!r} was given.")
+
+
+def _beginnings(begin: Any) -> tuple[AbstractBeginning, ...]:
+    several = (begin,) if isinstance(begin, AbstractBeginning) else begin
+    if not isinstance(several, tuple | list) or not all(isinstance(each, AbstractBeginning) for each in several):
+        raise ValueError(f"begin must be a beginning such as Staged(), or several of them, but {begin!r} was given.")
+    return tuple(several)

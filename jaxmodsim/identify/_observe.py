@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..numerics import did_you_mean
+from ..numerics import as_mapping, did_you_mean
 from ..scene import Scene, State, scene_forces
 from ._record import Record
 
@@ -41,6 +41,7 @@ def by_channel(
                 f" observe={{{channels[0]!r}: 'q[0]', ...}}."
             )
         return ((channels[0], observe),)
+    observe = as_mapping(observe, name="observe", example=f"{{{channels[0]!r}: 'q[0]'}}")
     missing, unknown = set(channels) - set(observe), set(observe) - set(channels)
     if missing or unknown:
         raise ValueError(
@@ -57,12 +58,18 @@ def check_observables(observables: tuple[tuple[str, Observable], ...], scene: Sc
     - `ValueError` for a name that is neither an entry of q or qd nor an effect, or a function that returns no number.
     """
     for channel, observable in observables:
+        if not isinstance(observable, str) and not callable(observable):
+            raise ValueError(
+                f"observe must be a function of q and qd, or a name such as 'q[0]', but {channel} has {observable!r}."
+            )
         if isinstance(observable, str):
             entry = _STATE.fullmatch(observable)
             known = [f"{x}[{i}]" for x in ("q", "qd") for i in range(y.q.shape[0])] + list(scene.names)
             if observable not in known:
                 hint = "" if entry else did_you_mean(observable, known)
-                raise ValueError(f"{channel} observes {observable!r}, but there are: {', '.join(known)}.{hint}")
+                raise ValueError(
+                    f"observe: {channel} observes {observable!r}, but there are: {', '.join(known)}.{hint}"
+                )
         shape = _shape(observable, y, scene)
         if shape != ():
             what = "observe(q, qd)" if not isinstance(observable, str) else f"{observable!r}"

@@ -11,7 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from ..numerics import Range, check_ranges, modules_of
+from ..numerics import Range, as_float, as_names, as_reals, check_ranges, modules_of
 from ..scene import Scene, State, check_scene, scene_numbers, scene_ranges
 from ._engines import DELAY, EventEngine, ReplayEngine
 from ._entries import chosen_entries, split_entries, split_ranges
@@ -131,8 +131,8 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
 
 
 def _several(records: Any) -> tuple[Record, ...]:
-    several = (records,) if isinstance(records, Record) else tuple(records)
-    if not several or not all(isinstance(x, Record) for x in several):
+    several = (records,) if isinstance(records, Record) else records
+    if not isinstance(several, tuple | list) or not several or not all(isinstance(x, Record) for x in several):
         raise ValueError(f"records must be a Record or several of them, but {records!r} was given.")
     names = [record.name for record in several]
     for name in names:
@@ -145,7 +145,7 @@ def _several(records: Any) -> tuple[Record, ...]:
                 f"All records need the same inputs: {first.name} has {list(first.inputs)}, {record.name} has"
                 f" {list(record.inputs)}."
             )
-    return several
+    return tuple(several)
 
 
 def _check_inputs(scene: Scene, records: tuple[Record, ...]) -> None:
@@ -166,6 +166,7 @@ def _states(scene: Scene, records: tuple[Record, ...], settings: Settings) -> St
     """Initial states of the records, with a leading axis of records."""
     count = len(records)
     given = {"q0": settings.q0, "qd0": settings.qd0}
+    given = {name: x if x is None else as_reals(x, name=name) for name, x in given.items()}
     sizes = {np.shape(x)[-1] for x in given.values() if x is not None and np.ndim(x) > 0}
     dof = max(sizes, default=1)
     observables = by_channel(settings.observe, records)
@@ -173,7 +174,7 @@ def _states(scene: Scene, records: tuple[Record, ...], settings: Settings) -> St
     for name, value in given.items():
         if value is None and name == "q0":
             value = np.stack([measured_start(record, observables, dof, exact=True)[0] for record in records])
-        array = np.zeros(dof) if value is None else np.asarray(value, float)
+        array = np.zeros(dof) if value is None else value
         fine = array.shape in ((dof,), (count, dof)) and np.isfinite(array).all()
         if not fine:
             raise ValueError(
@@ -191,6 +192,7 @@ def _sorted_out(free: Sequence[str], own: tuple[str, ...]) -> tuple[tuple[str, .
     """Names of initial states among `free`, and the others."""
     if isinstance(free, str):
         return (), free  # refused where it is used
+    free = as_names(free, name="free")
     local: list[str] = []
     shared: list[str] = []
     for name in free:
@@ -206,15 +208,17 @@ def _numbers(
     whole = scene_numbers(scene)
     ranges = split_ranges(whole, scene_ranges(scene))
     delays = {name: settings.delay.get(name, 0.0) for name in records[0].inputs}
-    for name, late in settings.delay.items():
-        if name not in delays or not (np.isfinite(late) and late >= 0):
+    for name, given in settings.delay.items():
+        late = as_float(given, name=f"delay of {name!r}")
+        if name not in delays or late < 0:
             raise ValueError(
                 f"delay of {name!r} is {late!r}, but it must be a time >= 0 of one of the inputs"
                 f" {', '.join(delays) or '(there are none)'}."
             )
     numbers = split_entries(whole) | {DELAY + name: jnp.asarray(late, float) for name, late in delays.items()}
     ranges |= {DELAY + name: Range("s", 0.0) for name in delays}
-    for name, (low, high) in settings.limits.items():
+    for name, span in settings.limits.items():
+        low, high = _limits(name, span)
         if name not in numbers:
             raise ValueError(f"limits: {name} is no number of the scene; there are: {', '.join(numbers)}.")
         declared = ranges.get(name, Range(""))
@@ -297,11 +301,23 @@ def _level(channel: str, records: tuple[Record, ...]) -> float:
     return size or 1.0
 
 
+def _limits(name: str, span: Any) -> tuple[float | None, float | None]:
+    """Lower and upper limit of a number, either of which may be None."""
+    if not isinstance(span, tuple | list) or len(span) != 2:
+        raise ValueError(
+            f"limits of {name!r} must be (lower, upper), None for none, as in (0.0, None), but {span!r} was given."
+        )
+    low, high = (None if x is None else as_float(x, name=f"limits of {name!r}") for x in span)
+    return low, high
+
+
 def _prior(prior: Mapping[str, tuple[float, float]], names: tuple[str, ...]) -> Prior:
-    for name, (mean, deviation) in prior.items():
+    for name, given in prior.items():
         if name not in names:
             raise ValueError(f"prior names {name!r}, but the free parameters are: {', '.join(names)}.")
-        if not (np.isfinite(mean) and np.isfinite(deviation) and deviation > 0):
+        pair = isinstance(given, tuple | list) and len(given) == 2
+        deviation = [as_float(x, name=f"prior of {name!r}") for x in given][1] if pair else 0.0
+        if not deviation > 0:
             raise ValueError(f"prior of {name} must be a mean and a standard deviation > 0, but it is {prior[name]}.")
     return Prior(
         jnp.asarray([float(prior[name][0]) if name in prior else 0.0 for name in names]),

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from ..numerics import as_float, as_label, as_mapping, as_names, as_reals
+
 # The name of a single channel that was given none.
 SINGLE = "measured"
 
@@ -52,14 +54,17 @@ class Record:
         noise: float | Mapping[str, float] | None = None,
         slips: Mapping[str, Any] | None = None,
     ):
+        name = as_label(name, name="name") or "record"
         outputs = dict(measured) if isinstance(measured, Mapping) else {SINGLE: measured}
+        inputs = as_mapping(inputs, name="inputs", example="{'u': force}")
+        slips = as_mapping(slips, name="slips", example="{'friction': [0.5, 1.5]}")
         if not outputs:
             raise ValueError(f"{name}: measured must hold one channel at least.")
-        shape = np.shape(t)
-        self.t = _column(t, "t", shape, name)
+        self.t = _column(t, "t", None, name)
+        shape = self.t.shape
         self.channels = {label: _column(column, label, shape, name) for label, column in outputs.items()}
-        self.inputs = {label: _column(column, label, shape, name) for label, column in (inputs or {}).items()}
-        self.name, self.linear = name, frozenset(linear)
+        self.inputs = {label: _column(column, label, shape, name) for label, column in inputs.items()}
+        self.name, self.linear = name, frozenset(as_names(linear, name="linear"))
         unknown = self.linear - set(self.inputs)
         if unknown:
             raise ValueError(f"{name}: linear names {sorted(unknown)}, but the inputs are {list(self.inputs)}.")
@@ -70,7 +75,7 @@ class Record:
                 f"{name}: times must increase, but sample {k + 1} at t = {self.t[k + 1]} s follows sample {k} at"
                 f" t = {self.t[k]} s."
             )
-        self.slips = {effect: _instants(instants, effect, self.t, name) for effect, instants in (slips or {}).items()}
+        self.slips = {effect: _instants(instants, effect, self.t, name) for effect, instants in slips.items()}
         self.noise = self._levels(noise)
 
     def _levels(self, noise: Any) -> dict[str, float]:
@@ -81,12 +86,13 @@ class Record:
             if len(known) > 1:
                 raise ValueError(f"{self.name}: noise must name its channels, {', '.join(known)}; it is {noise!r}.")
             noise = dict.fromkeys(known, noise)
-        for channel, level in noise.items():
+        for channel in noise:
             if channel not in known:
                 raise ValueError(f"{self.name}: noise names {channel!r}, but the channels are: {', '.join(known)}.")
-            if not (np.isfinite(level) and level > 0):
-                raise ValueError(f"{self.name}: noise of {channel!r} must be finite and > 0, but it is {level!r}.")
-        return {channel: float(level) for channel, level in noise.items()}
+        return {
+            channel: as_float(level, name=f"{self.name}: noise of {channel!r}", lower=0.0)
+            for channel, level in noise.items()
+        }
 
     @property
     def measured(self) -> Float[np.ndarray, " samples"]:
@@ -107,9 +113,12 @@ class Record:
 
         - `ValueError` if fewer than two samples lie there.
         """
+        start, end = as_float(start, name="start"), as_float(end, name="end")
         inside = np.flatnonzero((self.t >= start) & (self.t <= end))
         if inside.size < 2:
-            raise ValueError(f"{self.name} has {inside.size} samples from {start:g} to {end:g} s; two are needed.")
+            raise ValueError(
+                f"{self.name} has {inside.size} samples from start = {start:g} to end = {end:g} s; two are needed."
+            )
         return self.samples(int(inside[0]), int(inside[-1]) + 1, name)
 
     def samples(self, first: int, last: int, name: str | None = None) -> "Record":
@@ -121,7 +130,7 @@ class Record:
             t,
             {label: x[keep] for label, x in self.channels.items()},
             {label: x[keep] for label, x in self.inputs.items()},
-            name or self.name,
+            as_label(name, name="name") or self.name,
             linear=self.linear,
             noise=self.noise,
             slips=slips,
@@ -134,8 +143,10 @@ class Record:
 
         - `ValueError` if a window would hold fewer than two samples.
         """
-        count = max(round(float(self.t[-1] - self.t[0]) / seconds), 1) if seconds > 0 else 0
-        if not 0 < 2 * count <= len(self.t):
+        seconds = as_float(seconds, name="seconds", lower=0.0)
+        parts = min(float(self.t[-1] - self.t[0]) / seconds, float(len(self.t)))  # which is too many already
+        count = max(round(parts), 1)
+        if 2 * count > len(self.t):
             raise ValueError(
                 f"{self.name}: windows of {seconds} s cannot be cut from {len(self.t)} samples over"
                 f" {self.t[-1] - self.t[0]:g} s."
@@ -156,16 +167,14 @@ def slip_channel(effect: str) -> str:
     return f"{effect} slips"
 
 
-def _column(column: Any, label: str, shape: tuple[int, ...], name: str) -> Float[np.ndarray, " samples"]:
+def _column(column: Any, label: str, shape: tuple[int, ...] | None, name: str) -> Float[np.ndarray, " samples"]:
     """One column, converted and checked."""
-    try:
-        array = np.asarray(column, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: column {label!r} holds something that is no number.") from error
-    if array.ndim != 1 or array.shape != shape or array.shape[0] < 2:
+    array = as_reals(column, name=f"{name}: column {label!r}")
+    if array.ndim != 1 or array.shape[0] < 2 or shape not in (None, array.shape):
+        others = "" if shape is None else f" 't' has {shape} and"
         raise ValueError(
-            f"{name}: columns must have one shape [samples] with two samples or more, but 't' has {shape} and"
-            f" {label!r} has {array.shape}."
+            f"{name}: columns must have one shape [samples] with two samples or more, but{others} {label!r} has"
+            f" {array.shape}."
         )
     bad = np.flatnonzero(~np.isfinite(array))
     if bad.size:
@@ -177,7 +186,7 @@ def _column(column: Any, label: str, shape: tuple[int, ...], name: str) -> Float
 
 
 def _instants(instants: Any, effect: str, t: np.ndarray, name: str) -> Float[np.ndarray, " instants"]:
-    array = np.asarray(instants, dtype=float)
+    array = as_reals(instants, name=f"{name}: slips of {effect!r}") if np.size(instants) else np.zeros(0)
     fine = array.ndim == 1 and bool(np.isfinite(array).all() and (np.diff(array) > 0).all())
     if not (fine and (array.size == 0 or (array[0] >= t[0] and array[-1] <= t[-1]))):
         raise ValueError(

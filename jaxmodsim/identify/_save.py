@@ -5,9 +5,9 @@ import json
 import math
 import os
 import zipfile
-import zlib
 from collections.abc import Mapping
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,20 +41,19 @@ def read_fields(path: str | os.PathLike[str], names: tuple[str, ...]) -> dict[st
     - `ValueError` for a file that is damaged or something else.
     - `OSError` if there is none.
     """
+    content = io.BytesIO(Path(path).read_bytes())
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(content) as archive:
             if _TEXT not in archive.namelist():
-                raise ValueError(f"{path} holds no {_TEXT}: it was not written by FitResult.save.")
+                raise ValueError(f"it holds no {_TEXT}")
             text = json.loads(archive.read(_TEXT))
             arrays = {
                 name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(archive.read(name)), allow_pickle=False)
                 for name in archive.namelist()
                 if name.endswith(".npy")
             }
-    except zipfile.BadZipFile as error:
+    except Exception as error:  # whatever the bytes of a damaged file lead the reader into
         raise ValueError(f"{path} is no result that FitResult.save wrote, or it is damaged: {error}") from error
-    except (json.JSONDecodeError, UnicodeDecodeError, EOFError, zlib.error) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
     if not isinstance(text, dict) or text.get("kind") != _KIND:
         raise ValueError(f"{path} is no result of a fit: it does not say {_KIND!r}.")
     if text.get("format") != _VERSION:
@@ -69,7 +68,7 @@ def read_fields(path: str | os.PathLike[str], names: tuple[str, ...]) -> dict[st
         raise ValueError(f"{path} is damaged: it lacks {', '.join(lacks) or 'nothing, but holds more than it should'}.")
     try:
         return {name: _unpacked(body[name], arrays) for name in wanted}
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"{path} is damaged: {error!r}") from error
 
 

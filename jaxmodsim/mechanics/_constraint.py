@@ -11,7 +11,18 @@ import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import Number, Place, as_function, as_place, check_ranges, parameter, safe_norm
+from ..numerics import (
+    Number,
+    Place,
+    as_flag,
+    as_function,
+    as_label,
+    as_place,
+    check_ranges,
+    parameter,
+    result_shape,
+    safe_norm,
+)
 
 
 def _at(value: Any) -> Place | None:
@@ -98,9 +109,9 @@ class Constraint(AbstractConstraint):
 
     phi: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Constraint phi"))
     at: Place | None = eqx.field(default=None, converter=_at)
-    one_sided: bool = eqx.field(default=False, static=True)
+    one_sided: bool = eqx.field(default=False, static=True, converter=partial(as_flag, name="Constraint one_sided"))
     stabilise: Number = parameter("stabilise", "1/s", lower=0.0, default=0.0)
-    name: str | None = eqx.field(default=None, static=True)
+    name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Constraint name"))
 
     def error(self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree) -> Float[Array, " m"]:
         """phi, shape `[m]`."""
@@ -117,7 +128,7 @@ class Constraint(AbstractConstraint):
         """Check that phi is a number or a vector, and a number where the constraint is one-sided."""
         del qd
         place = q if self.at is None else jax.eval_shape(self.at, q, params)
-        _check_vector(jax.eval_shape(self.phi, q[0], place, params), f"Constraint {name!r}: phi")
+        _check_vector(f"phi of Constraint {name!r}", self.phi, q[0], place, params)
         if self.one_sided and jax.eval_shape(self.error, q[0], q, params).shape != (1,):
             raise ValueError(
                 f"Constraint {name!r}: one_sided=True needs phi to be one number, but it returned several. Give each"
@@ -158,7 +169,7 @@ class VelocityConstraint(AbstractConstraint):
 
     psi: Callable[..., Any] = eqx.field(converter=partial(as_function, name="VelocityConstraint psi"))
     stabilise: Number = parameter("stabilise", "1/s", lower=0.0, default=0.0)
-    name: str | None = eqx.field(default=None, static=True)
+    name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="VelocityConstraint name"))
 
     one_sided: ClassVar[bool] = False
 
@@ -174,7 +185,7 @@ class VelocityConstraint(AbstractConstraint):
 
     def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
         """Check that psi is a number or a vector."""
-        _check_vector(jax.eval_shape(self.psi, q[0], q, qd, params), f"VelocityConstraint {name!r}: psi")
+        _check_vector(f"psi of VelocityConstraint {name!r}", self.psi, q[0], q, qd, params)
 
     def force(
         self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree, multiplier: Float[Array, " m"]
@@ -188,10 +199,11 @@ class VelocityConstraint(AbstractConstraint):
         return jnp.ones_like(t)
 
 
-def _check_vector(given: Any, what: str) -> None:
-    shape = getattr(given, "shape", None)
+def _check_vector(what: str, fn: Callable[..., Any], *args: Any) -> None:
+    shape = result_shape(fn, *args, name=what)
     if shape is None or len(shape) > 1 or shape == (0,):
+        given = "no array" if shape is None else f"shape {shape}"
         raise ValueError(
-            f"{what} must return one number or a vector, but it returned {given if shape is None else f'shape {shape}'}"
-            ". Return jnp.array([...]) with one entry for each equation."
+            f"{what} must return one number or a vector, but it returned {given}. Return jnp.array([...]) with one"
+            " entry for each equation."
         )

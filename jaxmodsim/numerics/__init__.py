@@ -1,5 +1,13 @@
 """Numerics that know no mechanics: small linear algebra, steps of solvers, numbers and their ranges."""
 
+from ._arguments import as_flag as as_flag
+from ._arguments import as_float as as_float
+from ._arguments import as_label as as_label
+from ._arguments import as_mapping as as_mapping
+from ._arguments import as_names as as_names
+from ._arguments import as_reals as as_reals
+from ._arguments import as_whole as as_whole
+from ._arguments import check_real as check_real
 from ._collocation import GAUSS as GAUSS
 from ._collocation import CollocationMemory as CollocationMemory
 from ._collocation import collocation_start as collocation_start
@@ -9,6 +17,8 @@ from ._depends import depends as depends
 from ._files import written_whole as written_whole
 from ._function import Function as Function
 from ._function import as_function as as_function
+from ._function import real_array as real_array
+from ._function import result_shape as result_shape
 from ._linalg import MAX_UNROLLED_CHOLESKY as MAX_UNROLLED_CHOLESKY
 from ._linalg import cholesky_pivots as cholesky_pivots
 from ._linalg import factor_positive_definite as factor_positive_definite

@@ -4,6 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from ._arguments import check_real
 
 
 class Function(eqx.Module):
@@ -14,6 +20,40 @@ class Function(eqx.Module):
     def __call__(self, *args: Any) -> Any:
         """Call the function."""
         return self.fn(*args)
+
+
+def result_shape(fn: Callable[..., Any], *args: Any, name: str) -> tuple[int, ...] | None:
+    """Shape of what `fn(*args)` returns, or None where that is not one array.
+
+    **Raises:**
+
+    - `ValueError` naming `name` where it holds anything but real numbers.
+    """
+    shapes: list[tuple[int, ...] | None] = []
+
+    def look(*args: Any) -> None:
+        value = fn(*args)
+        for leaf in jtu.tree_leaves(value):
+            check_real(leaf, name=f"What {name} returns")
+        shapes.append(getattr(value, "shape", () if isinstance(value, int | float) else None))
+
+    jax.eval_shape(look, *args)
+    return shapes[0]
+
+
+def real_array(value: Any, *, name: str) -> Array:
+    """What a function has returned, as an array; lists of numbers become one.
+
+    **Raises:**
+
+    - `ValueError` naming `name` where it holds anything but real numbers.
+    """
+    for leaf in jtu.tree_leaves(value):
+        check_real(leaf, name=f"What {name} returns")
+    try:
+        return jnp.asarray(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"What {name} returns must be an array of real numbers, but it is {value!r}.") from error
 
 
 def as_function(value: Any, *, name: str) -> Callable[..., Any]:

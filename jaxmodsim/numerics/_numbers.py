@@ -82,11 +82,14 @@ def as_number(value: Any, *, name: str) -> Float[Array, ""]:
 def as_real(value: Any, *, name: str) -> Float[Array, "..."]:
     """Convert to a real floating array of any shape; see `as_number`."""
     if isinstance(value, jax.Array | np.ndarray | np.number | int | float) and not isinstance(value, bool):
-        dtype = jnp.result_type(value)
-        if jnp.issubdtype(dtype, jnp.integer):
-            dtype = jnp.result_type(float)
-        if jnp.issubdtype(dtype, jnp.floating):
-            return jnp.asarray(value, dtype=dtype)  # a stated dtype also makes a weak type strong
+        kind = getattr(value, "dtype", np.dtype(type(value)))
+        whole = jnp.issubdtype(kind, jnp.integer)
+        if whole or jnp.issubdtype(kind, jnp.floating):
+            dtype = jnp.result_type(float) if whole else jnp.result_type(value)
+            try:
+                return jnp.asarray(value, dtype=dtype)  # a stated dtype also makes a weak type strong
+            except OverflowError as error:
+                raise ValueError(f"{name} is a number beyond all that a {dtype} can hold.") from error
     given = value if isinstance(value, str | bool) else getattr(value, "dtype", type(value).__name__)
     raise ValueError(f"{name} must be a real number or an array of real numbers, but {given!r} was given.")
 

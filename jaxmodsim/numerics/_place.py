@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ._function import as_function
+from ._function import as_function, real_array
 from ._numbers import as_real
 
 
@@ -17,10 +17,12 @@ class Place(eqx.Module):
 
     place: Callable[..., Any]
     with_params: bool = eqx.field(static=True)
+    name: str = eqx.field(static=True)
 
     def __call__(self, q: Float[Array, " dof"], params: PyTree) -> Array:
         """What the function gives."""
-        return jnp.asarray(self.place(q, params) if self.with_params else self.place(q))
+        value = real_array(self.place(q, params) if self.with_params else self.place(q), name=self.name)
+        return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(q.dtype)
 
 
 def as_place(value: Any, *, name: str) -> Place:
@@ -38,11 +40,11 @@ def as_place(value: Any, *, name: str) -> Place:
     try:
         taken = inspect.signature(value).parameters.values()
     except (TypeError, ValueError):  # a function written in C does not say
-        return Place(function, False)
+        return Place(function, False, name)
     needed = [x for x in taken if x.default is x.empty and x.kind in (x.POSITIONAL_ONLY, x.POSITIONAL_OR_KEYWORD)]
     if len(needed) > 2:
         raise ValueError(f"{name} must be a function of q, or of q and params, but it takes {len(needed)} arguments.")
-    return Place(function, len(needed) == 2)
+    return Place(function, len(needed) == 2, name)
 
 
 class Amount(eqx.Module):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ._arguments import as_flag
 from ._numbers import as_vector
 
 
@@ -41,7 +42,7 @@ class Signal(eqx.Module):
 
     t: Any = eqx.field(converter=lambda x: as_vector(x, name="Signal t"))
     values: Any = eqx.field(converter=lambda x: as_vector(x, name="Signal values"))
-    linear: bool = eqx.field(default=False, static=True)
+    linear: bool = eqx.field(default=False, static=True, converter=lambda x: as_flag(x, name="Signal linear"))
 
     def __check_init__(self) -> None:
         """Refuse what is no function of time."""

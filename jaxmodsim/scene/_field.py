@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..effects import Power
 from ..mechanics import energies, errors, motion_equations, project_position, project_velocity, rates
-from ..numerics import depends, safe_norm
+from ..numerics import depends, real_array, safe_norm
 from ._contact import Contact, contact_guards, next_modes, overload, stop_slip
 from ._resolve import Modes, Resolved, State, by_constraint, resolve
 from ._scene import Scene
@@ -213,11 +213,15 @@ def check_scene(scene: Scene, y: State) -> None:
     """
     t = y.q[0]
     scene = scene.now(t)
-    energy: Any = jax.eval_shape(scene.lagrangian, t, y.q, y.qd, scene.params)
-    if getattr(energy, "shape", None) != ():
+
+    def energy(*state: Any) -> Array:
+        return real_array(scene.lagrangian(*state), name="the Lagrangian")
+
+    given = jax.eval_shape(energy, t, y.q, y.qd, scene.params)
+    if given.shape != () or not jnp.issubdtype(given.dtype, jnp.floating):
         raise ValueError(
-            f"The Lagrangian must return one number [J], shape (), but it returned {energy}. With q and qd of shape"
-            f" {y.q.shape}, index the coordinates (qd[0]) or sum over them."
+            f"The Lagrangian must return one number [J], shape (), that depends on the state, but it returned {given}."
+            f" With q and qd of shape {y.q.shape}, index the coordinates (qd[0]) or sum over them."
         )
     for name, effect in zip(scene.names, scene.effects, strict=True):
         effect.check(y.q, y.qd, scene.params, name)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..mechanics import errors, motion_equations, rates
-from ..numerics import factor_positive_definite, solve_balanced
+from ..numerics import check_real, factor_positive_definite, solve_balanced
 from ..scene import Scene, State, check_scene
 from ._outcome import SimulationError
 
@@ -45,6 +45,10 @@ def consistent(
       not close), or one that `hold` leaves no freedom for.
     - `ValueError` for shapes and indices that are wrong.
     """
+    if not isinstance(scene, Scene):
+        raise ValueError(f"consistent needs a Scene, but a {type(scene).__name__} was given.")
+    for name, value in (("q0", q0), ("qd0", qd0), ("t0", t0)):
+        check_real(value, name=name)
     kind = jnp.result_type(float, *jax.tree_util.tree_leaves(scene))
     q, qd, t = (jnp.asarray(x, kind) for x in (q0, qd0, t0))
     if q.ndim != 1 or q.shape != qd.shape:
@@ -52,8 +56,10 @@ def consistent(
             f"q0 and qd0 must both have the shape [dof], but q0 has the shape {q.shape} and qd0 {qd.shape}."
         )
     dof = q.shape[0]
-    if any(not 0 <= i < dof for i in hold):
-        raise ValueError(f"hold must be indices of coordinates, 0 to {dof - 1}, but {tuple(hold)} was given.")
+    if t.shape != ():
+        raise ValueError(f"t0 must be one number, but has the shape {t.shape}.")
+    if not isinstance(hold, list | tuple | range) or not all(isinstance(i, int) and 0 <= i < dof for i in hold):
+        raise ValueError(f"hold must be indices of coordinates, 0 to {dof - 1}, as in (0,), but {hold!r} was given.")
     check_scene(scene, State(q, qd, scene.state0(q)))
     if not scene.constraints:
         return q, qd

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from ..effects import Friction
+from ..numerics import as_flag, as_mapping, as_whole, check_real
 from ..scene import Scene, check_step
 from ..solvers import ImplicitFriction
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages
@@ -102,6 +103,7 @@ def simulate(
     - `SimulationError` if the run ended early, or no run of the accuracy was found, and `throw` is set. Inside
       `jax.jit`, `jax.vmap` or `jax.grad` the same sentence comes as equinox's run-time error.
     """
+    throw = as_flag(throw, name="throw")
     problem, options = prepare(
         scene,
         q0,
@@ -158,12 +160,8 @@ def prepare(
 ) -> tuple[Problem, Options]:
     """Convert and check the arguments of `simulate`: its numbers, and what is compiled in."""
     problem = _problem(scene, q0, qd0, t1, t0, ts, z0, rtol, atol, dt, dtmax)
-    for name, limit in (("max_steps", max_steps), ("max_events", max_events)):
-        if isinstance(limit, bool) or not isinstance(limit, int | np.integer) or limit < 1:
-            raise ValueError(f"{name} must be a positive integer, but {limit!r} was given.")
-    for name, flag in (("hold_chatter", hold_chatter), ("project", project)):
-        if not isinstance(flag, bool):
-            raise ValueError(f"{name} must be True or False, but {flag!r} was given.")
+    max_steps, max_events = as_whole(max_steps, name="max_steps"), as_whole(max_events, name="max_events")
+    hold_chatter, project = as_flag(hold_chatter, name="hold_chatter"), as_flag(project, name="project")
     solver_arrays, solver_rest = _split(solver, dfx.AbstractSolver, "solver")
     if isinstance(solver, ImplicitFriction):
         if dt is None:
@@ -173,7 +171,7 @@ def prepare(
         check_step(scene)
     adjoint_arrays, adjoint_rest = _split(adjoint, dfx.AbstractAdjoint, "adjoint")
     problem = problem._replace(plugins=(solver_arrays, adjoint_arrays))
-    options = Options(solver_rest, adjoint_rest, int(max_steps), int(max_events), hold_chatter, project)
+    options = Options(solver_rest, adjoint_rest, max_steps, max_events, hold_chatter, project)
     return problem, options
 
 
@@ -203,7 +201,7 @@ def _problem(
     given |= {name: value for name, value in (("ts", ts), ("dt", dt), ("dtmax", dtmax)) if value is not None}
     for name, value in given.items():
         if type(value) is not float:
-            _check_real(name, value)
+            check_real(value, name=name)
     kinds = {x.dtype for x in (*jtu.tree_leaves(scene), q0, qd0) if hasattr(x, "dtype")}
     dtype = kinds.pop() if len(kinds) == 1 else jnp.result_type(*kinds) if kinds else jnp.result_type(float)
     if not jnp.issubdtype(dtype, jnp.floating):
@@ -225,7 +223,7 @@ def _problem(
         scene,
         array["q0"],
         array["qd0"],
-        _own_states(scene, array["q0"], z0, dtype) if z0 else {},
+        {} if z0 is None else _own_states(scene, array["q0"], z0, dtype),
         array["t0"],
         array["t1"],
         array.get("ts"),
@@ -249,6 +247,7 @@ def _check_slips(scene: Scene, q0: Any, t0: Any) -> None:
 
 def _own_states(scene: Scene, q0: Any, z0: dict[str, PyTree], dtype: Any) -> dict[str, PyTree]:
     """Convert and check the initial own states that were given."""
+    z0 = as_mapping(z0, name="z0", example="{'friction': 0.0}")
     states = scene.state0(jnp.asarray(q0, dtype))
     for name, state in z0.items():
         if name not in states:
@@ -260,17 +259,6 @@ def _own_states(scene: Scene, q0: Any, z0: dict[str, PyTree], dtype: Any) -> dic
         if [jnp.shape(x) for x in jtu.tree_leaves(state)] != [jnp.shape(x) for x in jtu.tree_leaves(states[name])]:
             raise ValueError(f"z0[{name!r}] must have the shapes of {states[name]}, but {state} was given.")
     return {name: jtu.tree_map(lambda x: _array(x, dtype), state) for name, state in z0.items()}
-
-
-def _check_real(name: str, value: Any) -> None:
-    kind = getattr(value, "dtype", None)
-    if kind is None:
-        try:
-            kind = np.asarray(value).dtype
-        except ValueError:
-            kind = np.dtype(object)
-    if kind is not None and not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
-        raise ValueError(f"{name} must hold real numbers, but {value!r} was given.")
 
 
 def _check_values(array: dict[str, Any]) -> None:

@@ -7,6 +7,7 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..numerics import as_names
 from ..simulation import Trajectory, named_series
 from ._grid import RESERVED
 
@@ -37,8 +38,8 @@ class Derivative:
 
     def __post_init__(self) -> None:
         """Refuse what is no name."""
-        names = self.names
-        if not names or not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
+        names = (self.wrt,) if isinstance(self.wrt, str) else as_names(self.wrt, name="wrt")
+        if not names or len(set(names)) < len(names):
             raise ValueError(f"wrt must be a name or a tuple of different names, but {self.wrt!r} was given.")
         object.__setattr__(self, "wrt", self.wrt if isinstance(self.wrt, str) else names)
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from ..numerics import did_you_mean
+from ..numerics import check_real, did_you_mean
 from ..scene import Scene, elements, scene_numbers, scene_ranges
 from ..simulation import prepare, simulate
 from ._compute import shapes
@@ -66,6 +66,7 @@ def request(system: Any, grid: Grid, observe: Any, arguments: Mapping[str, Any])
             f"{', '.join(given)} has no place beside a function: only a Scene is run by sweep itself. Pass it to"
             " simulate inside the function."
         )
+    _check_taken(system, grid.values)
     lane = FunctionLane(system, None if observe is None else observations(observe))
     for what in lane.observe or ():
         if isinstance(what.of, Derivative):
@@ -73,6 +74,20 @@ def request(system: Any, grid: Grid, observe: Any, arguments: Mapping[str, Any])
     floating = jnp.result_type(float)
     converted = Grid(tuple(Axis(a.name, {n: x.astype(floating) for n, x in a.values.items()}) for a in grid.axes))
     return Request(lane, (), converted, shapes(lane, (), converted.first), {})
+
+
+def _check_taken(function: Any, names: Iterable[str]) -> None:
+    """Refuse names that a function does not take, and those that are missing."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # a function written in C does not say
+        return
+    try:
+        signature.bind(**dict.fromkeys(names))
+    except TypeError as error:
+        raise ValueError(
+            f"over must name what the function takes, {signature}, but it names {', '.join(names)}: {error}."
+        ) from error
 
 
 def _of_scene(scene: Scene, grid: Grid, observe: Any, arguments: dict[str, Any]) -> Request:
@@ -160,6 +175,9 @@ def _fixed(scene: Scene, arguments: dict[str, Any], swept: Mapping[str, np.ndarr
     numbers = {name: arguments[name] for name in _NUMBERS if name in arguments}
     numbers |= {name: swept[name][0] for name in _SWEPT if name in swept}
     numbers = {"rtol": _OPTIONS["rtol"], "atol": _OPTIONS["atol"], "t0": _OPTIONS["t0"]} | numbers
+    for name, value in numbers.items():
+        if name != "z0":
+            check_real(value, name=name)
     states = [x for x in (*scene_numbers(scene).values(), numbers["q0"], numbers["qd0"]) if hasattr(x, "dtype")]
     dtype = jnp.result_type(*(x.dtype for x in states)) if states else jnp.result_type(float)
     if not jnp.issubdtype(dtype, jnp.floating):

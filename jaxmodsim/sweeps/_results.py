@@ -2,6 +2,7 @@
 
 import abc
 import contextlib
+import importlib
 import json
 import os
 import shutil
@@ -98,7 +99,13 @@ class Store(AbstractResults):
 
     def done(self, block: int) -> np.ndarray | None:
         """Codes of a block whose last chunk is there."""
-        codes = np.asarray(self._group["result"][self._blocks.place(block)])
+        try:
+            codes = np.asarray(self._group["result"][self._blocks.place(block)])
+        except (ValueError, RuntimeError) as error:
+            raise ValueError(
+                f"{self._path} is damaged: chunk {block} of result cannot be read ({error}). Remove its file, and it is"
+                " run again."
+            ) from error
         return None if (codes == NOT_RUN).any() else codes
 
     def write(self, block: int, computed: Computed) -> None:
@@ -148,7 +155,9 @@ def _create(path: Path, layout: Layout, blocks: Blocks, attrs: dict[str, Any]) -
         for name, (dims, values, about) in layout.coordinates.items():
             # Text of fixed length is no settled part of the format, text of any length is.
             dtype = "string" if values.dtype.kind == "U" else values.dtype
-            array = group.create_array(name, shape=values.shape, dtype=dtype, dimension_names=dims, attributes=about)
+            array = group.create_array(
+                name, shape=values.shape, dtype=dtype, dimension_names=dims, attributes=about, compressors=_codecs()
+            )
             array[...] = values.astype(object) if dtype == "string" else values
         for x in layout.variables:
             _create_variable(group, x, layout, blocks)
@@ -167,4 +176,11 @@ def _create_variable(group: Any, x: Variable, layout: Layout, blocks: Blocks) ->
         fill_value=x.fill,
         dimension_names=(*layout.dims, *x.dims),
         attributes=x.attrs,
+        compressors=_codecs(),
     )
+
+
+def _codecs() -> tuple[Any, ...]:
+    """How chunks are packed: with a checksum behind, as a damaged one could hold other numbers."""
+    codecs = importlib.import_module("zarr.codecs")
+    return codecs.ZstdCodec(), codecs.Crc32cCodec()

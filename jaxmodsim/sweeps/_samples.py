@@ -7,6 +7,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
+from ..numerics import as_whole
+
 # (low, high), (low, high, "log"), or a frozen distribution of scipy.stats.
 Span: TypeAlias = tuple[float, float] | tuple[float, float, str] | Any
 
@@ -35,7 +37,7 @@ def latin_hypercube(ranges: Mapping[str, Span], count: int, *, seed: int = 0) ->
     - `ValueError` for a range that is none, with its name, and for a count below one.
     """
     check_ranges(ranges)
-    _check_count(count)
+    count, seed = as_whole(count, name="count"), as_whole(seed, name="seed", least=0)
     from scipy.stats import qmc  # half a second, for those who sample
 
     return spread(ranges, qmc.LatinHypercube(len(ranges), rng=np.random.default_rng(seed)).random(count))
@@ -66,6 +68,7 @@ def sobol(ranges: Mapping[str, Span], count: int, *, seed: int = 0) -> dict[str,
     """
     check_ranges(ranges)
     check_power(count)
+    seed = as_whole(seed, name="seed", least=0)
     from scipy.stats import qmc  # half a second, for those who sample
 
     return spread(ranges, qmc.Sobol(len(ranges), rng=np.random.default_rng(seed)).random(count))
@@ -83,7 +86,7 @@ def check_ranges(ranges: Mapping[str, Span]) -> None:
         log = isinstance(span, tuple | list) and len(span) == 3
         if not isinstance(span, tuple | list) or not (len(span) == 2 or (log and span[2] == "log")):
             raise ValueError(
-                f"The range of {name!r} must be (low, high), (low, high, 'log') or a frozen distribution of"
+                f"In ranges the range of {name!r} must be (low, high), (low, high, 'log') or a frozen distribution of"
                 f" scipy.stats, but {span!r} was given."
             )
         low, high = span[:2]
@@ -94,14 +97,9 @@ def check_ranges(ranges: Mapping[str, Span]) -> None:
             raise ValueError(f"The logarithmic range of {name!r} must begin above zero, but is {span!r}.")
 
 
-def _check_count(count: int) -> None:
-    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-        raise ValueError(f"count must be a positive integer, but {count!r} was given.")
-
-
 def check_power(count: int) -> None:
     """Refuse a number of Sobol' points that is no power of two."""
-    _check_count(count)
+    count = as_whole(count, name="count")
     if count & (count - 1):
         below = 1 << (int(count).bit_length() - 1)
         raise ValueError(f"Sobol' points come in powers of two, but count={count}: take {below} or {2 * below}.")

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from ..numerics import commit
+from ..numerics import as_whole, commit
 from ..scene import Scene
 from ._compute import GROUP, Work, lanes_of_call
 from ._execute import Task, elsewhere, in_threads
@@ -136,10 +136,8 @@ def lanes_of_block(asked: Request, platform: str, chunk: int | None) -> int:
 
     - `ValueError` if `chunk` is no positive integer.
     """
-    if chunk is not None and (isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1):
-        raise ValueError(f"chunk must be a positive integer, but {chunk!r} was given.")
     if chunk is not None:
-        return int(chunk)
+        return as_whole(chunk, name="chunk")
     room = sum(np.prod(x.shape, initial=1.0) * x.dtype.itemsize for x in asked.shapes.values.values())
     if platform != "cpu":
         return max(min(_LANES_OF_ACCELERATOR, int(_ROOM / room)), 1)

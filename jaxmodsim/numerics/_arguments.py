@@ -1,0 +1,116 @@
+"""Arguments that are no numbers of a scene: converted, or refused by their name."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+
+def check_real(value: Any, *, name: str) -> None:
+    """Refuse what holds anything but real numbers.
+
+    **Raises:**
+
+    - `ValueError` naming `name` and what was given.
+    """
+    kind = getattr(value, "dtype", None)
+    if kind is None:
+        try:
+            kind = np.asarray(value).dtype
+        except ValueError:  # of lists of unequal length
+            kind = np.dtype(object)
+    # What merely calls something its dtype is no array.
+    if not isinstance(kind, np.dtype) or not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
+        raise ValueError(f"{name} must hold real numbers, but {value!r} was given.")
+
+
+def as_reals(value: Any, *, name: str) -> Float[np.ndarray, "..."]:
+    """Real numbers that are known, as an array of NumPy.
+
+    **Raises:**
+
+    - `ValueError` as `check_real` does.
+    """
+    check_real(value, name=name)
+    return np.asarray(value, float)
+
+
+def as_float(value: Any, *, name: str, lower: float | None = None) -> float:
+    """One finite number that is known, above `lower`.
+
+    **Raises:**
+
+    - `ValueError` naming `name`, what was given and what is needed.
+    """
+    array = as_reals(value, name=name)
+    if array.shape != () or not math.isfinite(array) or not (lower is None or array > lower):
+        above = "" if lower is None else f" > {lower:g}"
+        raise ValueError(f"{name} must be one finite number{above}, but {value!r} was given.")
+    return float(array)
+
+
+def as_whole(value: Any, *, name: str, least: int = 1) -> int:
+    """A whole number, `least` or more, that fits into 63 bits.
+
+    **Raises:**
+
+    - `ValueError` naming `name`, what was given and what is needed.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value < 2**63:
+        need = {0: "an integer >= 0", 1: "a positive integer"}.get(least, f"an integer >= {least}")
+        given = f"one of {len(str(value))} digits" if isinstance(value, int) and value >= 2**63 else repr(value)
+        raise ValueError(f"{name} must be {need}, but {given} was given.")
+    return int(value)
+
+
+def as_flag(value: Any, *, name: str) -> bool:
+    """True or False, no number that stands for it.
+
+    **Raises:**
+
+    - `ValueError` naming `name` and what was given.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False, but {value!r} was given.")
+    return bool(value)
+
+
+def as_label(value: Any, *, name: str) -> str | None:
+    """A text that is not empty, or None.
+
+    **Raises:**
+
+    - `ValueError` naming `name` and what was given.
+    """
+    if not (value is None or (isinstance(value, str) and value)):
+        raise ValueError(f"{name} must be a text that is not empty, or None, but {value!r} was given.")
+    return value
+
+
+def as_names(value: Any, *, name: str) -> tuple[str, ...]:
+    """Names in a list, a tuple or a set.
+
+    **Raises:**
+
+    - `ValueError` naming `name` and what was given.
+    """
+    if not isinstance(value, tuple | list | set | frozenset) or not all(isinstance(each, str) for each in value):
+        raise ValueError(f"{name} must be a list of names, as in ['m'], but {value!r} was given.")
+    return tuple(value)
+
+
+def as_mapping(value: Any, *, name: str, example: str) -> dict[str, Any]:
+    """A mapping by names; None is an empty one.
+
+    **Raises:**
+
+    - `ValueError` naming `name`, what was given, and an `example` of what is needed.
+    """
+    if value is None:
+        return {}
+    if not isinstance(value, Mapping) or not all(isinstance(each, str) for each in value):
+        raise ValueError(f"{name} must be a mapping by names, as in {example}, but {value!r} was given.")
+    return dict(value)
