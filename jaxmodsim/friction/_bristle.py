@@ -3,14 +3,14 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import decay_mean
+from ..numerics import bounded_ratio, decay_mean
 
 
 def level(
     v: Float[Array, "..."], Fc: Float[Array, "..."], Fs: Float[Array, "..."], vs: Float[Array, ""]
 ) -> Float[Array, "..."]:
     """Gaussian Stribeck curve `Fc + (Fs - Fc) exp(-(v/vs)^2)` [N]: what steady slip at `v` [m/s] tends to."""
-    ratio = v / vs
+    ratio = bounded_ratio(v, vs)
     return Fc + (Fs - Fc) * jnp.exp(-ratio * ratio)
 
 

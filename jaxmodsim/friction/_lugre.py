@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Number, magnitude, optional_parameter, parameter
+from ..numerics import Number, bounded_ratio, magnitude, optional_parameter, parameter
 from ._bristle import leak, level
 from ._law import AbstractPlanarLaw
 
@@ -76,7 +76,7 @@ class LuGre(AbstractPlanarLaw):
         """Friction force [N] at slip velocity `v` [m/s], deflection `z` [m] and its `rate` [m/s]."""
         sigma1 = self.sigma1
         if self.vd is not None:
-            ratio = magnitude(v) / self.vd
+            ratio = bounded_ratio(magnitude(v), self.vd)
             sigma1 = sigma1 * jnp.exp(-ratio * ratio)
         return self.sigma0 * z + sigma1 * rate + self.sigma2 * v
 

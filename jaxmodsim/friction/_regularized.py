@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Number, parameter
+from ..numerics import Number, bounded_ratio, parameter
 from ._law import AbstractForceLaw, AbstractSetValuedLaw
 from ._refuse import set_valued_law
 
@@ -34,7 +34,7 @@ class Regularized(AbstractForceLaw):
     def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Friction force [N] at velocity `v` [m/s]."""
         v = jnp.asarray(v)
-        level, spread = self.law.dry(v), v / (2.0 * self.width)
+        level, spread = self.law.dry(v), 0.5 * bounded_ratio(v, self.width)
         direction = jnp.where(v < 0, -1.0, 1.0).astype(v.dtype)
         # At rest, but on the side that v is on: a law may have other parameters for either direction.
         rest = direction * float(jnp.finfo(v.dtype).tiny)

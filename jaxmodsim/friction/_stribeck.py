@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Number, optional_parameter, parameter, safe_power
+from ..numerics import Number, bounded_ratio, optional_parameter, parameter, safe_power
 from ._law import AbstractSetValuedLaw
 
 # Velocity over vs below which a curve with an exponent below one is rounded off.
@@ -79,7 +79,7 @@ class Stribeck(AbstractSetValuedLaw):
 
     def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Magnitude [N] of the dry part in slip."""
-        ratio = jnp.abs(v) / self.vs
+        ratio = bounded_ratio(v, self.vs)
         # A square costs a fifth of a power.
         power = ratio * ratio if self.exponent is None else _power(ratio, self.exponent)
         return self.Fc + (self.Fs - self.Fc) * self.fall(power)

@@ -54,6 +54,7 @@ from ._place import as_place as as_place
 from ._rosenbrock import RosenbrockStep as RosenbrockStep
 from ._rosenbrock import RosenbrockTableau as RosenbrockTableau
 from ._rosenbrock import rosenbrock_step as rosenbrock_step
+from ._safe import bounded_ratio as bounded_ratio
 from ._safe import decay_mean as decay_mean
 from ._safe import magnitude as magnitude
 from ._safe import safe_norm as safe_norm

@@ -20,6 +20,15 @@ def magnitude(v: Float[Array, "..."]) -> Float[Array, ""]:
     return jnp.abs(v) if jnp.ndim(v) == 0 else safe_norm(v)
 
 
+def bounded_ratio(v: Float[Array, "..."], scale: Float[Array, ""]) -> Float[Array, "..."]:
+    """`|v|/scale`, but no more than the fourth root of the largest number: powers up to four do not overflow.
+
+    What falls with that ratio is long gone there; without the bound its derivative is zero times infinity.
+    """
+    most = float(jnp.finfo(jnp.result_type(v)).max) ** 0.25
+    return jnp.minimum(jnp.abs(v), most * scale) / scale
+
+
 def decay_mean(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """`(1 - exp(-x))/x` for `x >= 0`, the mean of a decay from 1 over x of its time constants; 1 at `x = 0`."""
     small = x < 1e-4

@@ -56,6 +56,11 @@ class Signal(eqx.Module):
         t = np.asarray(self.t)
         if not (np.isfinite(t).all() and (np.diff(t) > 0).all()):
             raise ValueError("Signal: t must be finite and increase from sample to sample.")
+        if not isinstance(self.values, jax.core.Tracer) and (bad := np.flatnonzero(~np.isfinite(self.values))).size:
+            raise ValueError(
+                f"Signal: values must be finite, but the one at t = {t[bad[0]]:g} is {self.values[bad[0]]}"
+                f" ({bad.size} such of {t.size}). Leave such samples out."
+            )
 
     def piece(self, t: Float[Array, ""]) -> "Piece":
         """What the signal is from the last sample at or before `t` on, up to the next one."""

@@ -1,4 +1,8 @@
-"""Reference systems by name, each with its exact or reference solution."""
+"""Reference systems by name, each with its exact or reference solution; `problems.hard`: where simulations go wrong."""
+
+from importlib import import_module as _import_module
+from typing import TYPE_CHECKING
+from typing import Any as _Any
 
 from ._ball import BouncingBall as BouncingBall
 from ._ball import bouncing_ball_bounces as bouncing_ball_bounces
@@ -95,3 +99,13 @@ from ._spring import braked_spring_rest as braked_spring_rest
 from ._stick_slip_pendulum import STICK_SLIP_PENDULUM as STICK_SLIP_PENDULUM
 from ._stick_slip_pendulum import stick_slip_pendulum as stick_slip_pendulum
 from ._stick_slip_pendulum import stick_slip_pendulum_turn as stick_slip_pendulum_turn
+
+if TYPE_CHECKING:
+    from . import hard as hard
+
+
+def __getattr__(name: str) -> _Any:
+    # It runs scenes and checks gradients, which the reference systems themselves do not need.
+    if name == "hard":
+        return _import_module(f"{__name__}.hard")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -127,9 +127,9 @@ class Hybrid(NamedTuple):
     projects: bool
     sticks: bool
 
-    def plain_rate(self, t: Any, y: Any, scene: Scene) -> Any:
-        """Right-hand side of a run without modes."""
-        return _rate(self.flow, t, y, scene)
+    def plain_rate(self, t: Any, y: Any, scene: Scene, mode: Any = None) -> Any:
+        """Right-hand side in these modes; None in a run without."""
+        return _rate(self.flow, t, y, scene, mode)
 
     def rate(self, t: Any, s: EventState, scene: Scene) -> EventState:
         """Right-hand side."""

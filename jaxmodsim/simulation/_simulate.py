@@ -66,6 +66,8 @@ def simulate(
     - `dt`: fixed step [s], > 0, instead of tolerances. A sample of a `Signal` in between divides the step.
     - `dtmax`: longest step [s], > 0. In stick nothing moves and steps grow, so that a load that comes in short pulses
       can be stepped over: bound the step by the length of a pulse. Where that shows at a saved time, the run fails.
+      Derivatives are those of the steps that were made: of a run in which nothing moves, such as one that starts and
+      stays in equilibrium, they need a bound, too, that resolves what would move. `check_gradients` tells.
     - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`) or, on one
       coordinate, runs by events (set-valued laws); `diffrax.Tsit5` otherwise. `ImplicitFriction` for fixed steps that
       may be too long for the stiffness of friction.
@@ -217,6 +219,7 @@ def _problem(
         if name in array and array[name].shape != ():
             raise ValueError(f"{name} must be one number, but has the shape {array[name].shape}.")
     _check_values(array)
+    _check_span(t0, t1, array)
     if array["q0"].shape != (1,):
         _check_slips(scene, array["q0"], array["t0"])
     return Problem(
@@ -233,6 +236,15 @@ def _problem(
         array.get("dtmax"),
         None,
     )
+
+
+def _check_span(t0: Any, t1: Any, array: dict[str, Any]) -> None:
+    """Refuse times that differ, but not in the type the run has: it would end where it begins, and all be well."""
+    if _known(t0, t1) and array["t0"] == array["t1"] and t0 != t1:
+        raise ValueError(
+            f"t0 = {t0} and t1 = {t1} are the same number in {array['t0'].dtype}: count the time from another moment,"
+            " or pass q0 in float64."
+        )
 
 
 def _check_slips(scene: Scene, q0: Any, t0: Any) -> None:

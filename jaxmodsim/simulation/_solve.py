@@ -23,6 +23,7 @@ from ..solvers import (
     Projected,
     Rodas5P,
     StepsTo,
+    first_step,
 )
 from ._flow import Flow, Hybrid, Work
 from ._outcome import MISSED_EVENT, SUCCESS, Ending, end_code, start_code
@@ -101,15 +102,39 @@ def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolv
     return Rodas5P(pivot=fixed_step) if stiff or (scene.exact and dof == 1) else dfx.Tsit5()
 
 
+def _shortest(problem: Problem) -> Float[Array, ""]:
+    """Shortest step [s]: what time resolves."""
+    span = jnp.maximum(jnp.abs(problem.t0), jnp.abs(problem.t1))
+    return float(jnp.finfo(span.dtype).eps) * span
+
+
+def _tolerances(problem: Problem) -> tuple[Array, Array]:
+    """Relative and absolute; of what is zero and stays so, the error is zero and not 0/0."""
+    return problem.rtol, jnp.maximum(problem.atol, float(jnp.finfo(problem.atol.dtype).tiny))
+
+
+def _first(problem: Problem, method: dfx.AbstractSolver, rate: Any, y0: Any) -> Array:
+    """First step [s]."""
+    if problem.dt is not None:
+        return problem.dt
+    scene = jax.lax.stop_gradient(problem.scene)
+    step = first_step(
+        lambda t, y: rate(t, y, scene),
+        problem.t0,
+        y0,
+        method.error_order(dfx.ODETerm(rate)),
+        _tolerances(problem),
+        _shortest(problem),
+    )
+    return step if problem.dtmax is None else jnp.minimum(step, problem.dtmax)
+
+
 def _error_control(problem: Problem, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
     if problem.dt is not None:
         return FiniteSteps()
-    span = jnp.maximum(jnp.abs(problem.t0), jnp.abs(problem.t1))
-    dtmin = float(jnp.finfo(span.dtype).eps) * span
+    (rtol, atol), dtmin = _tolerances(problem), _shortest(problem)
     p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not problem.scene.exact else _GAINS
-    return dfx.PIDController(
-        problem.rtol, problem.atol, pcoeff=p, icoeff=i, dtmin=dtmin, dtmax=problem.dtmax, force_dtmin=False
-    )
+    return dfx.PIDController(rtol, atol, pcoeff=p, icoeff=i, dtmin=dtmin, dtmax=problem.dtmax, force_dtmin=False)
 
 
 def _solver(
@@ -188,6 +213,7 @@ def _integrate(problem: Problem, options: Options, audited: bool, log: int | Non
     starts = start == SUCCESS
     ts = None if problem.ts is None else jnp.where(starts, problem.ts, problem.t0)
     y0, controller = hybrid.flow.start(problem.t0, initial, scene, mode), _controller(problem, method)
+    first = _first(problem, method, partial(hybrid.plain_rate, mode=mode), y0)
     if isinstance(solver, EventSolver):
         y0 = solver.start(problem.t0, y0, mode, scene)
 
@@ -205,7 +231,7 @@ def _integrate(problem: Problem, options: Options, audited: bool, log: int | Non
         solver,
         problem.t0,
         jnp.where(starts, problem.t1, problem.t0),
-        problem.dt,
+        first,
         y0,
         args=scene,
         saveat=saveat,

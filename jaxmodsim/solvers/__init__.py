@@ -8,6 +8,7 @@ from ._event_state import ACCUMULATION as ACCUMULATION
 from ._event_state import TOO_MANY as TOO_MANY
 from ._event_state import EventLog as EventLog
 from ._event_state import EventState as EventState
+from ._first_step import first_step as first_step
 from ._gauss import Gauss as Gauss
 from ._implicit_friction import ImplicitFriction as ImplicitFriction
 from ._projected import Projected as Projected

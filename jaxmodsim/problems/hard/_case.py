@@ -70,9 +70,7 @@ class Motion(eqx.Module):
             qd0 = qd0.at[_index(self.by)].set(x)
         else:
             scene = replace_elements(scene, {self.by: x})
-        return simulate(
-            scene, q0, qd0, self.t1, **self.numbers, **dict(self.choices), adjoint=adjoint, throw=False
-        )
+        return simulate(scene, q0, qd0, self.t1, **self.numbers, **dict(self.choices), adjoint=adjoint, throw=False)
 
     def answer(self, x: Float[Array, ""], adjoint: Any = None) -> Answer:
         """The number asked for."""

@@ -273,7 +273,9 @@ class _Trial:
         # Without any energy there is nothing to lose.
         size = max(float(jnp.max(jnp.abs(part))) for part in parts) or 1.0
         error = float(jnp.max(jnp.abs(book.balance))) / size / (_BALANCE * self.tolerance)
-        return Finding("energy", self.dtype, error, error <= 1.0, f"{error * _BALANCE * self.tolerance:.2g} of {size:.3g} J")
+        return Finding(
+            "energy", self.dtype, error, error <= 1.0, f"{error * _BALANCE * self.tolerance:.2g} of {size:.3g} J"
+        )
 
     @property
     def messages(self) -> tuple[str, ...]:
@@ -284,6 +286,7 @@ class _Trial:
 
 def _watched(task: Motion) -> str:
     """The verdict of `check_gradients` on the number of a case."""
+
     def fn(scene: Scene, simulate: Callable[..., Any]) -> Any:
         run = simulate(scene, task.q0, task.qd0, task.t1, **task.numbers, **dict(task.choices))
         return task.read(run)

@@ -221,7 +221,9 @@ def _linkages() -> list[HardCase]:
     once, t1 = four_bar(), 0.5
     (closure,) = once.constraints
     assert isinstance(closure, Constraint)
-    twice = Scene(once.lagrangian, params=once.params, constraints=(closure, Constraint(closure.phi, at=closure.at, name="again")))
+    twice = Scene(
+        once.lagrangian, params=once.params, constraints=(closure, Constraint(closure.phi, at=closure.at, name="again"))
+    )
     flat = four_bar(a=0.3, b=0.6, c=0.3, d=0.6)
     before, speed = (np.asarray(x) for x in four_bar_state(0.3, -8.0, a=0.3, b=0.6, c=0.3, d=0.6))
     return [
@@ -293,7 +295,7 @@ def _jams() -> list[HardCase]:
         HardCase(
             "painleve_rod",
             FAMILY,
-            "A rod slides on its tip at an angle where friction presses it into the floor faster than the floor yields.",
+            "A rod slides on its tip at an angle where friction presses it ever harder into the floor.",
             "A negative normal force, or an acceleration through the floor.",
             "the sentence, at the start [s]",
             motion(rod, q0, qd0, 1.0, by="g", read=end_time),

@@ -45,11 +45,50 @@ def _planar() -> HardCase:
         "Friction in the plane at zero slip, unloaded: the direction of slip is 0/0.",
         "NaN from the norm of a zero vector.",
         "position at 5 s [m], and its derivative by the force, 1/sigma0",
-        motion(scene, [0.0, 0.0], [0.0, 0.0], 5.0, by="F", read=position),
+        motion(scene, [0.0, 0.0], [0.0, 0.0], 5.0, by="F", read=position, numbers={"dtmax": 0.05}),
         lambda F: F / 100.0,
         scale=0.01,
         conserves=False,
     )
+
+
+def _equilibrium() -> list[HardCase]:
+    def exact(x0: float) -> float:
+        return x0 * math.cos(5.0)
+
+    why = "A mass on a spring, at rest where it is relaxed: nothing moves, so nothing limits the steps."
+    naive = "The derivative of one step of five seconds: a polynomial where a cosine should be."
+    shifted = Scene(_held, params={"x0": 0.0}, effects=())
+    return [
+        HardCase(
+            "equilibrium",
+            FAMILY,
+            why,
+            naive,
+            "position at 5 s [m], and its derivative by the place of rest, with dtmax",
+            motion(shifted, [0.0], [0.0], 5.0, by="x0", read=position, numbers={"dtmax": 0.05}),
+            lambda x0: x0 - exact(x0),
+            scale=1.0,
+            conserves=False,
+        ),
+        HardCase(
+            "equilibrium_unbounded",
+            FAMILY,
+            why,
+            naive,
+            "position at 5 s [m], and a warning of check_gradients",
+            motion(shifted, [0.0], [0.0], 5.0, by="x0", read=position),
+            lambda _: 0.0,
+            scale=1.0,
+            undefined="the run makes steps of seconds, and the derivative is theirs",
+            conserves=False,
+        ),
+    ]
+
+
+def _held(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del t
+    return 0.5 * qd[0] ** 2 - 0.5 * (q[0] - p["x0"]) ** 2
 
 
 def _resting_place() -> HardCase:
@@ -73,6 +112,7 @@ def cases() -> list[HardCase]:
     falling = ramped_box(Stribeck(Fc=1.5, Fs=1.75, vs=0.2, exponent=1.0))
     return [
         _planar(),
+        *_equilibrium(),
         _resting_place(),
         HardCase(
             "event_at_the_end",
@@ -87,13 +127,12 @@ def cases() -> list[HardCase]:
         HardCase(
             "start_at_rest",
             FAMILY,
-            "The derivative by a velocity that stick takes away at once.",
-            "One, as if nothing stuck.",
+            "The derivative by a velocity that stick takes away at once: x = m v0^2/(2 Fc), so zero.",
+            "One second, as if nothing stuck.",
             "position at 1 s [m]",
             motion(box, [0.0], [0.0], 1.0, by="qd0[0]", read=position),
             lambda _: 0.0,
             scale=1.0,
-            undefined="at the start any velocity, however small, is slip",
         ),
         HardCase(
             "cusp_of_stribeck",

@@ -112,9 +112,7 @@ def _shrinking_swing() -> HardCase:
 
     friction = Friction(Coulomb(mu), normal_force=_load_of_deflection)
     scene = Scene(braked_spring().lagrangian, params={"m": m, "k": 1.0}, effects=(friction,))
-    task = motion(
-        scene, [1.0], [0.0], t1, by="m", read=position, numbers={"rtol": 1e-10, "atol": 0.0}, max_steps=65536
-    )
+    task = motion(scene, [1.0], [0.0], t1, by="m", read=position, numbers={"rtol": 1e-10, "atol": 0.0}, max_steps=65536)
     return HardCase(
         "shrinking_swing",
         FAMILY,
@@ -248,15 +246,20 @@ def _grazing() -> HardCase:
     )
 
 
+def _below_ceiling(t: Any, s: Any, args: Any) -> Array:
+    del t, args
+    return 1.0 - s.y[:1]
+
+
+def _caught(t: Any, s: Any, args: Any, fired: Any) -> Any:
+    del t, args, fired
+    return s._replace(y=0.0 * s.y + 1.0, mode=jnp.ones_like(s.mode))
+
+
 def _throw(v0: Array, adjoint: Any) -> Answer:
     """A ball is thrown up and caught where it touches the ceiling, one metre above."""
     one = jnp.ones((), v0.dtype)
-    solver = EventSolver(
-        dfx.Tsit5(),
-        lambda t, s, args: one - s.y[:1],
-        lambda t, s, args, fired: s._replace(y=0.0 * s.y + 1.0, mode=one),
-        log=False,
-    )
+    solver = EventSolver(dfx.Tsit5(), _below_ceiling, _caught, log=False)
     start = solver.start(0.0 * one, jnp.stack([0.0 * one, v0]), mode=0.0 * one)
 
     def field(t: Any, s: Any, args: Any) -> Any:

@@ -170,5 +170,3 @@ def _extremes() -> list[HardCase]:
 def cases() -> list[HardCase]:
     """The cases of this family."""
     return [*_garbage(), *_extremes()]
-
-

@@ -1,6 +1,5 @@
 """Rest and reversal: velocities that are zero, come to zero, or pass it."""
 
-
 import math
 
 import jax.numpy as jnp
@@ -316,5 +315,3 @@ def cases() -> list[HardCase]:
         _belt_through_zero(),
         _shaken(),
     ]
-
-

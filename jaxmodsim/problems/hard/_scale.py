@@ -4,19 +4,20 @@ import math
 from typing import Any
 
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
 from ...friction import Coulomb
+from ...scene import Scene
 from ...simulation import Trajectory, simulate
 from ...solvers import Gauss
 from .._box import ramped_box
 from .._spring import BRAKED_SPRING, braked_spring, braked_spring_law, braked_spring_motion
-from ._case import HardCase, Measured, motion, position, velocity
+from ._case import HardCase, Measured, Refused, motion, position, velocity
 
 FAMILY = "scale and time"
 _LATE = 1e9
-_TOO_FINE = "step size fell below what the time can resolve"
 
 
 def _at(t: float, x0: float) -> float:
@@ -73,9 +74,12 @@ def _sampled_at(i: int) -> Any:
 _middle = _sampled_at(50)
 
 
-def _times() -> list[HardCase]:
+def _single(scene: Scene) -> Scene:
+    return jtu.tree_map(lambda x: x.astype(np.float32), scene)
+
+
+def _late() -> list[HardCase]:
     spring = braked_spring(braked_spring_law())
-    fine = 1.0 + np.arange(101) * 2.0**-54
     return [
         HardCase(
             "late_start",
@@ -84,12 +88,37 @@ def _times() -> list[HardCase]:
             "Steps below the resolution of time: an endless loop, or events that are never met.",
             "position 30 s later [m]",
             motion(
-                spring, [1.0], [0.0], _LATE + 30.0, by="q0[0]", read=position, numbers={"t0": _LATE, "rtol": 1e-8, "atol": 1e-9}
+                spring,
+                [1.0],
+                [0.0],
+                _LATE + 30.0,
+                by="q0[0]",
+                read=position,
+                numbers={"t0": _LATE, "rtol": 1e-8, "atol": 1e-9},
             ),
             lambda x0: _at(30.0, x0),
             tolerance=1e-5,
-            single_ends=_TOO_FINE,
+            # Refused: see the next.
+            single=None,
         ),
+        HardCase(
+            "late_start_single",
+            FAMILY,
+            "The same in float32, where the next number after 1e9 is 1e9 + 64.",
+            "A run of no length: the initial state, under a success code.",
+            "an error that names it",
+            Refused(
+                {"clock": lambda: simulate(_single(spring), np.ones(1, np.float32), [0.0], _LATE + 30.0, t0=_LATE)},
+                {"clock": "are the same number in float32"},
+            ),
+        ),
+    ]
+
+
+def _times() -> list[HardCase]:
+    spring = braked_spring(braked_spring_law())
+    fine = 1.0 + np.arange(101) * 2.0**-54
+    return [
         HardCase(
             "no_absolute_tolerance",
             FAMILY,
@@ -98,6 +127,8 @@ def _times() -> list[HardCase]:
             "velocity at 10 s [m/s]",
             motion(ramped_box(Coulomb(1.5)), [0.0], [0.0], 10.0, by="ramp", read=velocity, numbers={"atol": 0.0}),
             lambda ramp: ramp * (10.0 - 1.5 / ramp) ** 2 / 4.0,
+            # At break-away the net force is rounding, and so is all of a velocity that comes from it.
+            single_ends="step size fell below what the time can resolve",
         ),
         HardCase(
             "sampled_below_rounding",
@@ -183,6 +214,4 @@ def _periods() -> HardCase:
 
 def cases() -> list[HardCase]:
     """The cases of this family."""
-    return [*_units(), *_times(), _periods()]
-
-
+    return [*_units(), *_late(), *_times(), _periods()]

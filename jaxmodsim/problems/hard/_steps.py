@@ -101,7 +101,13 @@ def formulations() -> dict[str, Formulation]:
     return {formulation.name: formulation for formulation in each}
 
 
-EXPLICIT = {"Euler": dfx.Euler(), "Heun": dfx.Heun(), "Bosh3": dfx.Bosh3(), "Tsit5": dfx.Tsit5(), "Dopri8": dfx.Dopri8()}
+EXPLICIT = {
+    "Euler": dfx.Euler(),
+    "Heun": dfx.Heun(),
+    "Bosh3": dfx.Bosh3(),
+    "Tsit5": dfx.Tsit5(),
+    "Dopri8": dfx.Dopri8(),
+}
 IMPLICIT = {"Rodas5P": Rodas5P(pivot=True), "ImplicitFriction": ImplicitFriction()}
 
 

@@ -122,7 +122,16 @@ def _ratio() -> HardCase:
         return math.cos(math.sqrt(w2) * 5.0)
 
     scene = Scene(_two_masses, params={"m": 1.0, "k": 1.0, "link": 1e12})
-    task = motion(scene, [1.0, 1.0], [0.0, 0.0], 5.0, by="k", read=position, numbers={"rtol": 1e-7, "atol": 1e-8}, solver=Rodas5P())
+    task = motion(
+        scene,
+        [1.0, 1.0],
+        [0.0, 0.0],
+        5.0,
+        by="k",
+        read=position,
+        numbers={"rtol": 1e-7, "atol": 1e-8},
+        solver=Rodas5P(),
+    )
     return HardCase(
         "stiffness_ratio",
         FAMILY,
@@ -233,5 +242,3 @@ def cases() -> list[HardCase]:
         _viscous_explicit(),
         *step_limits(FAMILY),
     ]
-
-
