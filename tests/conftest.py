@@ -11,15 +11,15 @@ import jaxlib.version
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
-# Nearly all of the time goes into tracing and compiling, hardly any into running. XLA's older way to emit fused loops,
-# straight as LLVM code, and machine code that LLVM did not optimize are compiled in a third of the time. XLA ends the
-# process over an option that it does not know: only where it was tried. For the way that users have:
-# XLA_FLAGS="--xla_cpu_use_fusion_emitters=true --xla_backend_optimization_level=3".
-_OPTIONS = {"xla_cpu_use_fusion_emitters": "false", "xla_backend_optimization_level": "0"}
-_FLAGS = os.environ.get("XLA_FLAGS", "")
-if jaxlib.version.__version_info__[:2] == (0, 10):
-    _ours = [f"--{option}={value}" for option, value in _OPTIONS.items() if option not in _FLAGS]
-    os.environ["XLA_FLAGS"] = " ".join([_FLAGS, *_ours]).strip()
+# Nearly all of the time goes into tracing and compiling, hardly any into running. Code that LLVM has not optimized, and
+# XLA's older way to emit fused loops, straight as LLVM code, are compiled soonest. XLA ends the process over an option
+# that it does not know: only where it was tried. What needs the last digits asks for `optimized`.
+# For the way that users have: XLA_FLAGS=--xla_cpu_use_fusion_emitters=true JAX_DISABLE_MOST_OPTIMIZATIONS=0.
+_OPTION, _FLAGS = "xla_cpu_use_fusion_emitters", os.environ.get("XLA_FLAGS", "")
+if jaxlib.version.__version_info__[:2] == (0, 10) and _OPTION not in _FLAGS:
+    os.environ["XLA_FLAGS"] = f"{_FLAGS} --{_OPTION}=false".strip()
+if "JAX_DISABLE_MOST_OPTIMIZATIONS" not in os.environ:
+    jax.config.update("jax_disable_most_optimizations", True)
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -29,8 +29,8 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 gc.set_threshold(50_000, 20, 100)
 
 
-def pytest_collection_finish() -> None:
-    gc.collect()
+@pytest.fixture(scope="module", autouse=True)
+def what_other_modules_made_is_left_alone() -> None:
     gc.freeze()
 
 
