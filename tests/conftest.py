@@ -1,9 +1,10 @@
+import gc
 import io
 import os
 import sys
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, no_type_check
 
 import jax
 import jaxlib.version
@@ -12,17 +13,44 @@ from xdist.scheduler import LoadScopeScheduling
 
 from . import fuzz
 
-# Nearly all of the time goes into tracing and compiling. XLA's older way to emit fused loops, straight as LLVM code,
-# compiles in 60 % of the time. XLA ends the process over an option that it does not know: only where it was tried.
-# For the way that users have: XLA_FLAGS=--xla_cpu_use_fusion_emitters=true.
+# Nearly all of the time goes into tracing and compiling, hardly any into running. Code that LLVM has not optimized, and
+# XLA's older way to emit fused loops, straight as LLVM code, are compiled soonest. XLA ends the process over an option
+# that it does not know: only where it was tried. What needs the last digits asks for `optimized`.
+# For the way that users have: XLA_FLAGS=--xla_cpu_use_fusion_emitters=true JAX_DISABLE_MOST_OPTIMIZATIONS=0.
 _OPTION, _FLAGS = "xla_cpu_use_fusion_emitters", os.environ.get("XLA_FLAGS", "")
 if jaxlib.version.__version_info__[:2] == (0, 10) and _OPTION not in _FLAGS:
     os.environ["XLA_FLAGS"] = f"{_FLAGS} --{_OPTION}=false".strip()
-
+if "JAX_DISABLE_MOST_OPTIMIZATIONS" not in os.environ:
+    jax.config.update("jax_disable_most_optimizations", True)
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 fuzz.register()
+
+# Programs keep millions of objects that never become garbage. Looking at all of them again and again costs a tenth of
+# the time.
+gc.set_threshold(50_000, 20, 100)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def what_other_modules_made_is_left_alone() -> None:
+    gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_checks_for_each_scalar() -> None:
+    """Check types of what takes arrays apart where it is called, not again for every scalar.
+
+    Of all calls whose types would be checked nine in ten are such, and most of their types are `Any`.
+    """
+    from jaxmodsim.numerics import _scalarise
+
+    for each in vars(_scalarise).values():
+        if getattr(each, "__module__", None) == _scalarise.__name__ and each.__name__ not in (
+            "in_scalars",
+            "columns_of",
+        ):
+            no_type_check(each)
 
 
 # Tests of a module share what they have compiled and computed, so a module stays in one process. Those of these modules

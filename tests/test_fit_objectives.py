@@ -15,6 +15,8 @@ from jaxmodsim.identify._replay import run_samples
 from jaxmodsim.problems import BELT_STRIBECK, belt_oscillator
 from jaxmodsim.scene import State, replace_numbers
 
+from .optimized import optimized
+
 DT = 4e-3
 TRUTH = {"m": 2.0, "friction.Fc": 1.5, "friction.sigma0": 600.0}
 
@@ -87,6 +89,7 @@ def full():
 
 
 @pytest.fixture(scope="module")
+@optimized()
 def belt():
     scene = belt_oscillator(jms.Stribeck(**BELT_STRIBECK))
     t = np.linspace(0.0, 3.2, 321)
@@ -160,6 +163,7 @@ def test_gradient_of_a_fit_through_events_equals_finite_differences(belt):
     np.testing.assert_allclose(exact, differences, rtol=1e-4)
 
 
+@optimized()
 def test_fit_through_events_finds_back_from_half_wrong(belt):
     start = belt_oscillator(jms.Stribeck(Fc=2.5, Fs=12.0, vs=0.1, Fv=0.3), k=150.0)
     result = jms.fit(start, belt, ("friction.Fc", "friction.Fs", "friction.vs", "k"), q0=[0.0], begin=Staged())

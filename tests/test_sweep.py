@@ -15,6 +15,8 @@ import jaxmodsim as jms
 from jaxmodsim.problems import box_lugre, ramped_box
 from jaxmodsim.sweeps import Derivative, SweepProgress
 
+from .optimized import optimized
+
 SIGMA0 = np.geomspace(200.0, 2e4, 9)
 MASS = np.linspace(1.0, 3.0, 14)
 OVER = {"friction.sigma0": SIGMA0, "m": MASS}
@@ -36,6 +38,7 @@ def box_sweep(**changes: Any) -> xr.Dataset:
 
 
 @pytest.fixture(scope="module")
+@optimized()
 def found() -> xr.Dataset:
     return box_sweep()
 
@@ -70,6 +73,7 @@ def test_dimensions_units_and_origin(found: xr.Dataset) -> None:
 
 
 @pytest.mark.parametrize("chunk", [1000, 14, 5])
+@optimized()
 def test_any_cut_gives_the_same_numbers(found: xr.Dataset, chunk: int) -> None:
     other = box_sweep(chunk=chunk)
     for name in ("v", "friction", "peak"):

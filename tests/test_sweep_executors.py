@@ -18,6 +18,8 @@ import jaxmodsim as jms
 from jaxmodsim.problems import box_lugre, ramped_box
 from jaxmodsim.sweeps import SweepProgress
 
+from .optimized import optimized
+
 SCENE = ramped_box(box_lugre())
 OVER = {"m": np.linspace(1.0, 3.0, 80), "friction.Fc": [1.2, 1.5, 1.7]}
 CHUNK = 12
@@ -30,6 +32,7 @@ def box_sweep(**changes: Any) -> xr.Dataset:
 
 
 @pytest.fixture(scope="module")
+@optimized()  # as it is in the other processes
 def found() -> xr.Dataset:
     return box_sweep()
 

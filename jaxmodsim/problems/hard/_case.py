@@ -177,8 +177,8 @@ def motion(
     """A `Motion` from plain numbers; by default at `rtol=1e-9, atol=1e-11`."""
     given = {"rtol": 1e-9, "atol": 1e-11} | (numbers or {})
     arrays = {name: jnp.asarray(np.asarray(value, float)) for name, value in given.items()}
-    state = (jnp.asarray(np.asarray(x, float)) for x in (q0, qd0, t1))
-    return Motion(scene, *state, by, read, arrays, tuple(sorted(choices.items(), key=lambda item: item[0])))
+    q, qd, end = (jnp.asarray(np.asarray(x, float)) for x in (q0, qd0, t1))
+    return Motion(scene, q, qd, end, by, read, arrays, tuple(choices.items()))
 
 
 def position(run: Trajectory) -> Array:

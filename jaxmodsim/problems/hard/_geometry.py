@@ -184,21 +184,19 @@ def _gimbal_lock() -> list[HardCase]:
 
 
 @cache
-def four_bar_by_scipy(angle: float, rate: float, t1: float, **changes: float) -> float:
+def four_bar_by_scipy(angle: float, rate: float, t1: float) -> float:
     """Angle of the rocker [rad] after `t1` [s], from the equation of the crank angle alone, by DOP853 of scipy."""
-    numbers = FOUR_BAR | changes
 
     @jax.jit
     def acceleration(angle: Array, rate: Array) -> Array:
-        return four_bar_acceleration(angle, rate, **numbers)[0]
+        return four_bar_acceleration(angle, rate)[0]
 
     def field(t: float, y: np.ndarray) -> list[float]:
         del t
         return [y[1], float(acceleration(y[0], y[1]))]
 
     solution = solve_ivp(field, (0.0, t1), [angle, rate], method="DOP853", rtol=1e-9, atol=1e-11)
-    lengths = {name: numbers[name] for name in "abcd"}
-    return float(four_bar_state(solution.y[0, -1], 0.0, **lengths)[0][2])
+    return float(four_bar_state(solution.y[0, -1], 0.0)[0][2])
 
 
 def parallelogram_by_scipy(angle: float, rate: float, t1: float) -> float:

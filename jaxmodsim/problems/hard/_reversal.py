@@ -12,7 +12,7 @@ from ...scene import Scene
 from .._belt import BELT_OSCILLATOR, belt_coulomb, belt_oscillator, belt_oscillator_motion
 from .._box import ramped_box
 from .._spring import BRAKED_SPRING, braked_spring, braked_spring_law, braked_spring_motion, braked_spring_rest
-from ._case import HardCase, Motion, motion, position, velocity
+from ._case import HardCase, motion, position, velocity
 
 FAMILY = "rest and reversal"
 _M = 2.0
@@ -132,7 +132,7 @@ def _thrice() -> HardCase:
         while True:
             # In slip the velocity is the smooth one and a straight line.
             part = smooth - float(smooth(t)) + v - np.poly1d([sign * 0.25, -sign * 0.25 * t])
-            roots = part.roots[np.abs(part.roots.imag) < 1e-9].real
+            roots = np.real(part.roots[np.abs(np.imag(part.roots)) < 1e-9])
             later = roots[(roots > t + 1e-6) & (roots < 10.0)]
             if not later.size:
                 return float(part(10.0))
@@ -159,24 +159,21 @@ def _vanishing() -> HardCase:
         return float(braked_spring_rest(x0=1.0, Fc=Fc, **numbers).x)
 
     Fc = 2.7 / 2.0 / 2000.3
-    task = motion(braked_spring(Coulomb(Fc), **numbers), [1.0], [0.0], 5000.0, by="friction.Fc", read=position)
+    task = motion(
+        braked_spring(Coulomb(Fc), **numbers), [1.0], [0.0], 5000.0, by="friction.Fc", read=position,
+        max_steps=262144, max_events=4096,
+    )  # fmt: skip
     return HardCase(
         "vanishing_friction",
         FAMILY,
         "2000 reversals before rest; each must lose just the right amount, or the number of half cycles is wrong.",
         "An answer that is off by half cycles, or no rest at all.",
         "resting place [m]",
-        _with(task, max_steps=262144, max_events=4096),
+        task,
         exact,
         # The resting place is 2000 differences of x0; float32 carries 7 digits of those.
         scale=1.0,
         single=3e-2,
-    )
-
-
-def _with(task: Motion, **choices: object) -> Motion:
-    return Motion(
-        task.scene, task.q0, task.qd0, task.t1, task.by, task.read, task.numbers, tuple(sorted(choices.items()))
     )
 
 
