@@ -12,7 +12,7 @@ from ._options import Out
 
 app = typer.Typer(
     name="jaxmodsim",
-    help="Differentiable mechanics with friction: test benches, fits to measured records, sweeps.",
+    help="Differentiable mechanics with friction: test benches, fits to measured records, sweeps, hard cases.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -160,6 +160,31 @@ def sweep(
     from ._sweep import SweepRequest, run_sweep
 
     run_sweep(SweepRequest(spec, out, figure, chunk, workers, scheduler, dry_run))
+
+
+@app.command()
+def hard(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="NAME", help="Cases or families; all without.", show_default=False)
+    ] = None,
+    list_only: Annotated[bool, typer.Option("--list", help="Say what the cases are, and run nothing.")] = False,
+    ways: Annotated[
+        str,
+        typer.Option(help="Ways of running, with commas between: alone, jit, vmap, forward, reverse, energy; or all."),
+    ] = "all",
+    jobs: Annotated[int, typer.Option(help="Processes.", min=1)] = 1,
+    out: Out = Path("jaxmodsim-hard"),
+) -> None:
+    """Cases in which simulations go wrong, run in every way and compared with what is right; exit code 1 if one fails.
+
+    Each case alone, under jit and vmap, with forward and reverse derivatives, in float64 and float32, and its energy
+    balance. All of it takes most of an hour on one core; --ways alone a few minutes.
+    """
+    _start()
+    from ._hard import HardRequest, report_hard
+
+    if not report_hard(HardRequest(tuple(names or ()), list_only, ways, jobs, out)):
+        raise typer.Exit(1)
 
 
 @app.command("bench", context_settings={"ignore_unknown_options": True})

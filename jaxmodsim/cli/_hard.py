@@ -1,0 +1,128 @@
+"""`jaxmodsim hard`: the hard cases, run and judged."""
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from ..plot import hard_figure, step_limits_figure
+from ..problems.hard import WAYS, HardCase, Verdict, check_many, choose
+from ._interrupted import Interrupted
+from ._output import console, show_paths, show_table, write
+
+_VALUES, _SLOPES = ("alone", "jit", "vmap"), ("forward", "reverse")
+
+
+@dataclass(frozen=True)
+class HardRequest:
+    """What the command was given."""
+
+    names: tuple[str, ...]
+    list_only: bool
+    ways: str
+    jobs: int
+    out: Path
+
+
+def report_hard(request: HardRequest) -> bool:
+    """Check the cases, print the table, write everything; returns whether all pass.
+
+    **Raises:**
+
+    - `ValueError` for names and ways that are none.
+    - `Interrupted` after Ctrl-C, once what was found is written.
+    """
+    cases = choose(request.names)
+    if request.list_only:
+        show_table(_catalogue(list(cases.values())), f"{len(cases)} hard cases")
+        return True
+    ways = WAYS if request.ways == "all" else tuple(request.ways.split(","))
+    verdicts: dict[str, Verdict] = {}
+    stopped = False
+    with console.status("hard cases") as status:
+        try:
+            for verdict in check_many(request.names, ways=ways, jobs=request.jobs):
+                verdicts[verdict.case.name] = verdict
+                status.update(f"{len(verdicts)} of {len(cases)}: {verdict.case.name}")
+        except KeyboardInterrupt:
+            stopped = True
+    found = [verdicts[name] for name in cases if name in verdicts]
+    _report(found, request.out, whole=not request.names and not stopped)
+    if stopped:
+        raise Interrupted(f"interrupted; what was found on {len(found)} of {len(cases)} cases is written")
+    return all(verdict.ok for verdict in found)
+
+
+def _report(found: list[Verdict], out: Path, *, whole: bool) -> None:
+    if not found:
+        return
+    table = hard_table(found)
+    show_table(table.drop(columns="asked"), "Hard cases: errors in what is admissible, so that 1 is the limit")
+    files: dict[str, Any] = {
+        "hard.csv": table,
+        "hard.json": {verdict.case.name: _entry(verdict) for verdict in found},
+        "hard.png": hard_figure(found),
+    }
+    if whole:
+        files["hard_steps.png"] = step_limits_figure()
+    show_paths(write(out, files))
+    for verdict in found:
+        for finding in verdict.findings:
+            if not finding.ok:
+                text = f"FAIL: {verdict.case.name}, {finding.way}, {finding.dtype}: {finding.sentence}"
+                console.print(text, highlight=False, markup=False, soft_wrap=True)
+    passed = sum(verdict.ok for verdict in found)
+    console.print(f"{passed} of {len(found)} cases pass.")
+
+
+def hard_table(found: list[Verdict]) -> pd.DataFrame:
+    """A row for each case: the worst errors of values, derivatives and energy, 1 being the limit."""
+    return pd.DataFrame(
+        [
+            {
+                "family": verdict.case.family,
+                "case": verdict.case.name,
+                "value": _worst(verdict, "float64", _VALUES),
+                "derivative": _worst(verdict, "float64", _SLOPES),
+                "energy": _worst(verdict, "float64", ("energy",)),
+                "value, float32": _worst(verdict, "float32", _VALUES),
+                "derivative, float32": _worst(verdict, "float32", _SLOPES),
+                "asked": verdict.case.asks,
+                "verdict": "pass" if verdict.ok else "FAIL",
+            }
+            for verdict in found
+        ]
+    )
+
+
+def _worst(verdict: Verdict, dtype: str, ways: tuple[str, ...]) -> str:
+    """Largest error; in words where there is none to compute."""
+    ran = [each for each in verdict.findings if each.dtype == dtype and each.way in ways]
+    if not ran:
+        return "-"
+    error = verdict.worst(dtype, ways)
+    if not math.isnan(error):
+        return f"{error:.1g}"
+    if verdict.case.undefined and ways == _SLOPES:
+        return "flagged"
+    return "named" if all(each.ok for each in ran) else "FAIL"
+
+
+def _entry(verdict: Verdict) -> dict[str, Any]:
+    case = verdict.case
+    return {
+        "family": case.family,
+        "why": case.why,
+        "naive": case.naive,
+        "asks": case.asks,
+        "tolerance": case.tolerance,
+        "ok": verdict.ok,
+        "left out": dict(case.leaves),
+        "findings": [asdict(finding) for finding in verdict.findings],
+    }
+
+
+def _catalogue(cases: list[HardCase]) -> pd.DataFrame:
+    return pd.DataFrame([{"family": each.family, "case": each.name, "why it is hard": each.why} for each in cases])

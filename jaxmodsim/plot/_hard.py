@@ -1,0 +1,79 @@
+"""Hard cases: errors in what is admissible, and the largest stable steps."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..problems.hard import EXPLICIT, Verdict, formulations, largest_step, theory
+from ._style import BLUE, GREEN, GREY, RED
+
+_KINDS = {
+    "value, float64": ("float64", ("alone", "jit", "vmap"), BLUE, "o"),
+    "derivative, float64": ("float64", ("forward", "reverse"), GREEN, "s"),
+    "energy balance": ("float64", ("energy",), "#7b4fa3", "D"),
+    "value or derivative, float32": ("float32", ("alone", "jit", "vmap", "forward", "reverse"), GREY, "v"),
+}
+# What is exact is drawn at the edge.
+_LEAST = 1e-12
+
+
+def hard_figure(verdicts: Sequence[Verdict]) -> Figure:
+    """Errors of hard cases in what is admissible, so that 1 is the limit; cases that end by name have none.
+
+    **Arguments:**
+
+    - `verdicts`: of `jaxmodsim.problems.hard.check`.
+    """
+    figure = Figure(figsize=(10.0, 1.4 + 0.2 * len(verdicts)), layout="constrained")
+    axis = figure.subplots()
+    rows = np.arange(len(verdicts))
+    for label, (dtype, ways, colour, marker) in _KINDS.items():
+        errors = np.array([verdict.worst(dtype, ways) for verdict in verdicts])
+        axis.plot(np.maximum(errors, _LEAST), rows, marker, color=colour, ms=5, label=label, alpha=0.85)
+    for row, verdict in zip(rows, verdicts, strict=True):
+        if not verdict.ok:
+            axis.axhspan(row - 0.5, row + 0.5, color=RED, alpha=0.2, lw=0)
+        elif all(math.isnan(each.error) for each in verdict.findings):
+            axis.text(_LEAST, float(row), " ends, or is refused, by name", va="center", fontsize=7, color=GREY)
+    axis.axvline(1.0, color=RED, lw=1.2)
+    axis.set(xscale="log", xlabel="error over what is admissible [1]", yticks=rows, xlim=(0.5 * _LEAST, 30.0))
+    axis.set_yticklabels([verdict.case.name for verdict in verdicts], fontsize=7)
+    axis.set_ylim(len(verdicts) - 0.4, -0.6)
+    axis.grid(axis="x", color="#e4e4e4", lw=0.6)
+    _families(axis, verdicts)
+    passed = sum(verdict.ok for verdict in verdicts)
+    figure.suptitle(f"Hard cases: {passed} of {len(verdicts)} pass (red line: the limit)", fontsize=11)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=8)
+    return figure
+
+
+def _families(axis: Axes, verdicts: Sequence[Verdict]) -> None:
+    """Lines between families, and their names at the right."""
+    names = [verdict.case.family for verdict in verdicts]
+    for row, name in enumerate(names):
+        if row == 0 or names[row - 1] != name:
+            axis.axhline(row - 0.5, color="black", lw=0.6)
+            axis.text(25.0, row - 0.3, name, ha="right", va="top", fontsize=8, fontweight="bold")
+
+
+def step_limits_figure() -> Figure:
+    """Largest stable fixed steps, found by running, over those of theory; runs the cases."""
+    figure = Figure(figsize=(7.5, 4.2), layout="constrained")
+    axis = figure.subplots()
+    limits = [
+        (name, each, theory(formulation, solver), largest_step(formulation, solver))
+        for name, formulation in formulations().items()
+        for each, solver in EXPLICIT.items()
+    ]
+    for colour, marker, name in zip((BLUE, RED, GREEN, "#7b4fa3"), "osDv", formulations(), strict=True):
+        here = [(predicted, found) for formulation, _, predicted, found in limits if formulation == name]
+        axis.plot(*zip(*here, strict=True), marker, color=colour, label=name, ms=7, alpha=0.8)
+    span = [0.5 * min(x[2] for x in limits), 2.0 * max(x[2] for x in limits)]
+    axis.plot(span, span, color="#c8c8c8", lw=3, zorder=0, label="equal")
+    axis.set(xscale="log", yscale="log", xlabel="largest stable step by theory [s]", ylabel="found by bisection [s]")
+    axis.set_title(f"Stability of fixed explicit steps: {', '.join(EXPLICIT)}", fontsize=10)
+    axis.legend(fontsize=8)
+    return figure

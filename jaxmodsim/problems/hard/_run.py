@@ -1,0 +1,78 @@
+"""Many hard cases, in several processes."""
+
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import cache
+
+import jax
+
+from ...numerics import did_you_mean
+from ._case import HardCase
+from ._cases import FAMILIES, hard_cases
+from ._check import DTYPES, WAYS, Finding, Verdict, check
+
+# Of these the runs themselves take minutes: begun first, they do not hold up the end.
+_LONG = ("periods_1000000", "cycles_100000", "dead_points", "redundant_constraints")
+
+
+def choose(names: Sequence[str]) -> dict[str, HardCase]:
+    """The hard cases of these names or families; all without.
+
+    **Raises:**
+
+    - `ValueError` for a name that is neither.
+    """
+    known = hard_cases()
+    chosen: dict[str, HardCase] = {}
+    for name in names:
+        if name not in known and name not in FAMILIES:
+            raise ValueError(
+                f"there is no hard case or family {name!r}; the families are: {', '.join(FAMILIES)}."
+                f"{did_you_mean(name, (*known, *FAMILIES))}"
+            )
+        chosen |= {each.name: each for each in known.values() if name in (each.name, each.family)}
+    return chosen or known
+
+
+def check_many(
+    names: Sequence[str] = (), *, ways: Sequence[str] = WAYS, dtypes: Sequence[str] = DTYPES, jobs: int = 1
+) -> Iterator[Verdict]:
+    """`check` many hard cases; each verdict comes as it is found.
+
+    **Arguments:**
+
+    - `names`: of cases or families; all without.
+    - `ways`, `dtypes`: as for `check`.
+    - `jobs`: processes, > 0; with one, this process does it all.
+
+    **Raises:**
+
+    - `ValueError` as `choose` and `check`.
+    """
+    cases = choose(names)
+    if jobs == 1:
+        yield from (check(case, ways, dtypes) for case in cases.values())
+        return
+    order = sorted(cases, key=lambda name: name not in _LONG)
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(jobs, context, initializer=_begin)
+    try:
+        futures = {pool.submit(_found, name, tuple(ways), tuple(dtypes)): name for name in order}
+        for future in as_completed(futures):
+            yield Verdict(cases[futures[future]], future.result())
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _begin() -> None:
+    """A process of our own is in double precision."""
+    jax.config.update("jax_enable_x64", True)
+
+
+# Cases of one structure share what is compiled, and a process makes them once.
+_cases = cache(hard_cases)
+
+
+def _found(name: str, ways: tuple[str, ...], dtypes: tuple[str, ...]) -> tuple[Finding, ...]:
+    return check(_cases()[name], ways, dtypes).findings
