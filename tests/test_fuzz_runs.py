@@ -222,8 +222,8 @@ def check_limits(law: str, found: jms.Trajectory, x: Drawn) -> None:
         (z,) = found.z.values()
         force = sum(np.abs(np.asarray(y)).reshape(len(q), -1) @ k for y, k in pulls(law, z, x))
         limit = limit + 10 * x.sigma * x.atol * (int(found.stats["num_steps"]) + 1)
-        # Dense output swings past its ends where a step is far longer than the bristle takes to load.
-        assert (force <= np.where(found.t == x.t1, 1.0, 1.5) * limit).all(), (force, limit)
+        # Between the ends of steps there is dense output, with an error of its own.
+        assert (force <= np.where(found.t == x.t1, 1.0, 1.01) * limit).all(), (force, limit)
     if law in ("regularized", *FIXED):
         force = np.asarray(found.forces["friction"])
         assert (abs(force) <= x.Fs * (1 + 1e-12)).all(), force
@@ -324,6 +324,10 @@ def test_single_precision(x: Drawn) -> None:
     scene = jtu.tree_map(lambda leaf: leaf.astype("float32"), scene_of("regularized", x))
     q0, qd0 = (np.array([y], "float32") if abs(y) < 1e30 else np.zeros(1, "float32") for y in (x.q0, x.qd0))
     numbers = {"t0": x.t0, "ts": x.ts, "rtol": x.rtol, "atol": x.atol}
+    if x.t0 != x.t1 and np.float32(x.t0) == np.float32(x.t1):
+        with pytest.raises(ValueError, match="are the same number in float32"):
+            jms.simulate(scene, q0, qd0, x.t1, **numbers)
+        return
     found = jms.simulate(scene, q0, qd0, x.t1, max_steps=STEPS, max_events=EVENTS, throw=False, **numbers)
     assert found.q.dtype == np.float32
     check_whole(found, x.ts.astype("float32"))

@@ -36,7 +36,7 @@ _GENERAL = (
     "The step limit was reached before t1: pass a larger max_steps, a larger dt or looser tolerances. A law that"
     " chatters (Sign) never gets through its zero crossings with adaptive steps.",
     "The step size fell below what the time can resolve: the vector field jumps or is singular there. Run DeadZone"
-    " and Sign with a fixed step (dt=...).",
+    " and Sign with a fixed step (dt=...); pass atol > 0 where something comes to rest.",
     "The vector field gave a value that is not finite (NaN or infinity). With a fixed step this is also how a"
     " step too long for the stiffness ends: pass a smaller dt, or solver=jaxmodsim.Rodas5P().",
     "The limit of mode changes was reached before t1: pass a larger max_events.",
