@@ -66,7 +66,7 @@ def _ramps() -> list[HardCase]:
             1.0,
             10.0,
             "Velocity exactly zero at the start, where friction has no sign.",
-            "sign(v) throws the box to and fro: a variable step ends in ever smaller steps, a fixed one shakes.",
+            "sign(v) throws the box back and forth: a variable step ends in ever smaller steps, a fixed one shakes.",
         ),
         ramped(
             "tiny_ramp",
