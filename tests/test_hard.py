@@ -39,6 +39,7 @@ def test_every_case_says_why_it_is_hard_and_what_is_right():
         ("units_nanometres", ("alone",)),
         ("bouncing_ball_unheld", ("alone", "vmap")),
         ("equilibrium_unbounded", ("reverse",)),
+        ("smooth_break_away", ("alone",)),  # steps that ended in front of an event where slip only touches rest
         ("reversals_in_a_step", ("alone",)),
         ("step_limit_regularised", ("alone",)),
     ],

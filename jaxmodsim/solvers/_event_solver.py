@@ -16,6 +16,9 @@ from ._event_state import ACCUMULATION, NO_TROUBLE, TOO_MANY, EventLog, EventSta
 # How far beside the root a step may end, as a fraction of the step; from there the state is carried to the root, with
 # an error of the third power of that distance.
 _LANDING = 1e-5
+# Where a step is to end if conditions have to hold after it, in landing distances behind the root: in front of it the
+# motion after the event is none. A slip that begins without a jump of the force touches rest there, and would end again.
+_BEYOND = 0.3
 # What the step and the jump measure of the way to a root may differ by this factor.
 _LATITUDE = 4.0
 # A step this much shorter than the last ones has no length.
@@ -264,7 +267,10 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         landed = jnp.any(here) & ~missed & (length > 0)
         fired = here & landed
         first = jnp.arange(fired.shape[0]) == jnp.argmin(jnp.where(fired, seen.ahead, jnp.inf))
-        aim = once(jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0)), unit)
+        aim = jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0))
+        if self.insist:
+            aim = jnp.where(missed, jnp.minimum(aim, 1.0 - near), aim) + _BEYOND * near
+        aim = once(aim, unit)
         landed = once(jnp.where(landed, 1.0, jnp.zeros_like(aim)), unit) > 0.5
         state1 = y0._replace(
             y=y1,

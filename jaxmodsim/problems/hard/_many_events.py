@@ -10,9 +10,10 @@ from jaxtyping import Array, Float
 from ...effects import AppliedForce, Friction
 from ...friction import AbstractSetValuedLaw, Coulomb
 from ...scene import Scene
+from ...simulation import Trajectory
 from ...solvers import EventController, EventSolver
 from .._ball import BouncingBall, bouncing_ball_rest
-from .._belt import BELT_OSCILLATOR, belt_oscillator, belt_oscillator_cycle, belt_oscillator_motion
+from .._belt import BELT_OSCILLATOR, belt_oscillator, belt_oscillator_cycle, belt_oscillator_motion, belt_stribeck
 from .._belts import coupled_belts
 from .._box import ramped_box
 from .._spring import braked_spring
@@ -217,6 +218,28 @@ def _cycles() -> list[HardCase]:
     ]
 
 
+def _changes(run: Trajectory) -> Array:
+    return run.stats["num_events"]
+
+
+def _smooth_break_away() -> HardCase:
+    belt = BELT_OSCILLATOR["belt"]
+    task = motion(
+        belt_oscillator(belt_stribeck()), [0.0], [belt], 5.0, by="k", read=_changes,
+        numbers={"rtol": 1e-12, "atol": 1e-14}, max_steps=65536,
+    )  # fmt: skip
+    return HardCase(
+        "smooth_break_away",
+        FAMILY,
+        "Friction goes on from Fs without a jump as slip begins: at break-away slip, its rate and the net force vanish.",
+        "It sticks and breaks away again a few times within a microsecond, as rounding has it.",
+        "number of mode changes in 5 s [1]",
+        task,
+        # Four cycles of break-away and stick.
+        lambda _: 8.0,
+    )
+
+
 def _swell(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     del q, qd
     return jnp.reshape(p["F"] * jnp.sin(t), (1,))
@@ -291,4 +314,4 @@ def _ceiling() -> HardCase:
 
 def cases() -> list[HardCase]:
     """The cases of this family."""
-    return [*_zeno(), _shrinking_swing(), *_chatter(), *_cycles(), _grazing(), _ceiling()]
+    return [*_zeno(), _shrinking_swing(), *_chatter(), *_cycles(), _smooth_break_away(), _grazing(), _ceiling()]
