@@ -61,9 +61,9 @@ def _summary(found: dict[str, dict[str, dict[str, Any]]], content: dict[str, Any
     limit = content["settings"]["limit_s"]
     caption = (
         f"How many hard cases each program was asked, and what came of them. diffrax and scipy: `Fc sign(v)` for dry"
-        f" friction, rtol {RTOL:g}, atol {ATOL:g}; Kvaerno5 where rates are high; MuJoCo what it can express. Admissible"
-        f" is for `jaxmodsim` the tolerance of the case, for the others {GENEROUS:g} times that and at least {LEAST:g}."
-        f" Where a case has no answer, an error is right. No answer: in {limit:g} s, compilation included."
+        f" friction, rtol {RTOL:g}, atol {ATOL:g}; Kvaerno5 where rates are high; MuJoCo what it can express."
+        f" Admissible is for `jaxmodsim` the tolerance of the case, for the others {GENEROUS:g} times that and at"
+        f" least {LEAST:g}. Where a case has no answer, an error is right. No answer: in {limit:g} s, compilation included."
         f" {machine_line(content['machine'])}"
     )
     return {"columns": ["program", "cases", *VERDICTS], "rows": rows, "caption": caption}
