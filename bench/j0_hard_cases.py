@@ -2,9 +2,9 @@
 
 diffrax and scipy get the same equations of motion, with `Fc sign(v)` for dry friction, at rtol 1e-6 and atol 1e-9, all
 else as they come; MuJoCo the cases that it can express, at its own step. `jaxmodsim` gets every case as it is defined,
-and is held to the tolerance of the case, the others to a hundred times that, or 1e-3 if it is more. Where no number is
-right but an end with a name, any error is right. Every program runs every case in a process of its own, with 60 s for
-it, compilation included.
+and is held to the tolerance of the case, the others to a hundred times that, and no tighter than 1e-3, MuJoCo than
+1e-2. Where no number is right but an end with a name, any error is right, whatever it says. Every program runs every
+case in a process of its own, with 60 s for it, compilation included.
 
     python bench/j0_hard_cases.py [--smoke] [--out DIR]
 """
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _hard_one import ERROR, GENEROUS, LEAST, NONE, PROGRAMS, RIGHT, WRONG, ask, asked, is_nan, seconds
+from _hard_one import COARSE, ERROR, GENEROUS, LEAST, NONE, PROGRAMS, RIGHT, WRONG, ask, asked, is_nan, seconds
 from _hard_plain import ATOL, RTOL
 from _measure import machine_line
 from _options import begin
@@ -45,7 +45,8 @@ def main() -> None:
                 found[name][program] = entry = ask(name, program, limit)
                 print(f"{name}, {program}: {entry['verdict']}: {entry['says']}", flush=True)
     content = new_result("hard_cases", options, "diffrax", "scipy", "mujoco", "numpy")
-    content["settings"] = {"rtol": RTOL, "atol": ATOL, "limit_s": limit, "generous": GENEROUS, "least": LEAST}
+    content["settings"] = {"rtol": RTOL, "atol": ATOL, "limit_s": limit, "generous": GENEROUS}
+    content["settings"] |= {"least": LEAST, "least_mujoco": COARSE}
     content["found"] = [entry for row in found.values() for entry in row.values()]
     families = {name: case.family for name, case in cases.items()}
     content["tables"] = [_summary(found, content), _every(found, families)]
@@ -63,8 +64,8 @@ def _summary(found: dict[str, dict[str, dict[str, Any]]], content: dict[str, Any
         f"How many hard cases each program was asked, and what came of them. diffrax and scipy: `Fc sign(v)` for dry"
         f" friction, rtol {RTOL:g}, atol {ATOL:g}; Kvaerno5 where rates are high; MuJoCo what it can express."
         f" Admissible is for `jaxmodsim` the tolerance of the case, for the others {GENEROUS:g} times that and at"
-        f" least {LEAST:g}. Where a case has no answer, an error is right. No answer: in {limit:g} s, compilation included."
-        f" {machine_line(content['machine'])}"
+        f" least {LEAST:g}, and {COARSE:g} for MuJoCo, whose step is fixed. Where a case has no answer, an error is"
+        f" right, whatever it says. No answer: in {limit:g} s, compilation included. {machine_line(content['machine'])}"
     )
     return {"columns": ["program", "cases", *VERDICTS], "rows": rows, "caption": caption}
 
