@@ -28,8 +28,7 @@ _BISECTIONS = 12
 _FAR = 1e6
 
 _V = 0.1
-_BRISTLE = LuGre(sigma0=1e5, sigma1=0.0, sigma2=0.1, Fc=1.5, Fs=1.75, vs=0.2)
-_DAMPED = LuGre(sigma0=1e5, sigma1=300.0, sigma2=0.1, Fc=1.5, Fs=1.75, vs=0.2)
+_BRISTLE = {"sigma0": 1e5, "sigma2": 0.1, "Fc": 1.5, "Fs": 1.75, "vs": 0.2}
 _M = 2.0
 
 
@@ -54,25 +53,26 @@ class Formulation:
 
 def formulations() -> dict[str, Formulation]:
     """A bristle in slip and in stick, friction smoothed over 1e-6 m/s, viscous friction."""
+    bristle, damped = LuGre(**_BRISTLE, sigma1=0.0), LuGre(**_BRISTLE, sigma1=300.0)
     steady = (1.5 + 0.25 * math.exp(-((_V / 0.2) ** 2))) / 1e5
     smooth = Regularized(box_coulomb(), width=1e-6)
     each = [
         Formulation(
             "bristle in slip",
-            slipping_bristle(_BRISTLE, _V),
+            slipping_bristle(bristle, _V),
             {"friction": jnp.asarray(steady * (1.0 + 1e-6))},
             0.0,
-            _BRISTLE,
+            bristle,
             None,
             _V,
             lambda run: (run.z["friction"][-1] - steady) / (1e-6 * steady),
         ),
         Formulation(
             "bristle in stick",
-            ramped_box(_DAMPED, ramp=0.0, m=_M),
+            ramped_box(damped, ramp=0.0, m=_M),
             {"friction": jnp.asarray(1e-12)},
             0.0,
-            _DAMPED,
+            damped,
             _M,
             0.0,
             lambda run: run.z["friction"][-1] / 1e-12,
