@@ -30,6 +30,8 @@ OURS_ALONE = (
     *("step_limit_slip", "step_limit_stick", "step_limit_regularised", "step_limit_none"),
     # No law by the sign of slip holds less than it resists with.
     *("chatter_named", "chatter_held"),
+    # A number of mode changes.
+    "smooth_break_away",
 )
 
 

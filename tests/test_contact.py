@@ -220,7 +220,8 @@ def test_chatter_is_named_or_held() -> None:
     np.testing.assert_allclose(early.t_end, 1.0, atol=1e-5)
     np.testing.assert_allclose(early.forces["pad"][0], 0.5)
     held = simulate(law, [0.0], [0.0], 1.8, hold_chatter=True)
-    np.testing.assert_allclose(held.q, 0.0, atol=1e-12)
+    # To the absolute tolerance of the run.
+    np.testing.assert_allclose(held.q, 0.0, atol=1e-9)
     np.testing.assert_array_equal(held.modes, [[0.0]])
     # In a batch the others go on.
     ramp = lambda r: simulate(scene(Friction(Contradictory()), r=r), [0.0], [0.0], 1.8, throw=False)  # noqa: E731

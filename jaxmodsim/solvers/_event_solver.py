@@ -16,8 +16,8 @@ from ._event_state import ACCUMULATION, NO_TROUBLE, TOO_MANY, EventLog, EventSta
 # How far beside the root a step may end, as a fraction of the step; from there the state is carried to the root, with
 # an error of the third power of that distance.
 _LANDING = 1e-5
-# Where a step is to end if conditions have to hold after it, in landing distances behind the root: in front of it the
-# motion after the event is none. A slip that begins without a jump of the force touches rest there, and would end again.
+# Where a step is to end if conditions have to hold after it, in landing distances behind the root: in front of it is no
+# motion after the event. A slip that begins without a jump of the force touches rest there, and would end again.
 _BEYOND = 0.3
 # What the step and the jump measure of the way to a root may differ by this factor.
 _LATITUDE = 4.0

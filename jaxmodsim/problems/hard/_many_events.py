@@ -231,7 +231,7 @@ def _smooth_break_away() -> HardCase:
     return HardCase(
         "smooth_break_away",
         FAMILY,
-        "Friction goes on from Fs without a jump as slip begins: at break-away slip, its rate and the net force vanish.",
+        "Friction goes on from Fs without a jump as slip begins: at break-away slip and the net force both vanish.",
         "It sticks and breaks away again a few times within a microsecond, as rounding has it.",
         "number of mode changes in 5 s [1]",
         task,
