@@ -72,7 +72,8 @@ def _summary(found: dict[str, dict[str, dict[str, Any]]], content: dict[str, Any
     limit = content["settings"]["limit_s"]
     caption = (
         f"How many of {len(found)} hard cases each program was asked, and what came of them. diffrax and scipy:"
-        f" `Fc sign(v)` for dry friction, rtol {RTOL:g}, atol {ATOL:g}; Kvaerno5 where rates are high; MuJoCo what it can express."
+        f" `Fc sign(v)` for dry friction, rtol {RTOL:g}, atol {ATOL:g}; Kvaerno5 where rates are high; MuJoCo what it"
+        " can express."
         f" Admissible is for `jaxmodsim` the tolerance of the case, for the others {GENEROUS:g} times that and at"
         f" least {LEAST:g}, and {COARSE:g} for MuJoCo, whose step is fixed. Where a case has no answer, an error is"
         f" right, whatever it says. No answer: in {limit:g} s, compilation included. {machine_line(content['machine'])}"
