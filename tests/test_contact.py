@@ -2,16 +2,15 @@
 # ruff: noqa: ARG001 (Lagrangians and forces have their four arguments, used or not)
 
 import itertools
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxtyping import Array, Float
 
 from jaxmodsim import AppliedForce, Coulomb, Friction, LuGre, Regularized, Scene, SimulationError, Stribeck, simulate
-from jaxmodsim.friction import AbstractSetValuedLaw
+from jaxmodsim.problems.hard import Contradictory
 from jaxmodsim.scene._contact import Contact, balance, next_modes
 
 
@@ -193,21 +192,6 @@ def test_exact_and_bristle_laws_in_one_scene() -> None:
         atol=1e-12,
     )
     np.testing.assert_allclose(run.q[0, 1], other.q[0, 0], atol=1e-8)
-
-
-class Contradictory(AbstractSetValuedLaw):
-    """Holds 1 N at most, but resists slip with 2 N: between the two it can neither stick nor slip."""
-
-    stiff: ClassVar[bool] = False
-
-    def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:
-        return jnp.full_like(v, 2.0)
-
-    def wet(self, v: Float[Array, ""]) -> Float[Array, ""]:
-        return jnp.zeros_like(v)
-
-    def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
-        return jnp.ones_like(direction)
 
 
 def test_chatter_is_named_or_held() -> None:

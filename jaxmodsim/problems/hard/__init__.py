@@ -13,6 +13,7 @@ from ._check import WAYS as WAYS
 from ._check import Finding as Finding
 from ._check import Verdict as Verdict
 from ._check import check as check
+from ._many_events import Contradictory as Contradictory
 from ._run import check_many as check_many
 from ._run import choose as choose
 from ._steps import EXPLICIT as EXPLICIT

@@ -125,7 +125,7 @@ def _shrinking_swing() -> HardCase:
     )
 
 
-class _Contradictory(AbstractSetValuedLaw):
+class Contradictory(AbstractSetValuedLaw):
     """Holds 1 N at most, but resists slip with 2 N: between the two it can neither stick nor slip."""
 
     stiff: ClassVar[bool] = False
@@ -144,7 +144,7 @@ class _Contradictory(AbstractSetValuedLaw):
 
 
 def _chatter() -> list[HardCase]:
-    scene = ramped_box(_Contradictory())
+    scene = ramped_box(Contradictory())
     why = "A law that holds 1 N but resists slip with 2 N: in between it can neither stick nor slip."
     naive = "Ever smaller steps; a fixed step averages to something."
     return [
