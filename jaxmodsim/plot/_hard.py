@@ -39,7 +39,7 @@ def hard_figure(verdicts: Sequence[Verdict]) -> Figure:
         elif all(math.isnan(each.error) for each in verdict.findings):
             axis.text(_LEAST, float(row), " ends, or is refused, by name", va="center", fontsize=7, color=GREY)
     axis.axvline(1.0, color=RED, lw=1.2)
-    axis.set(xscale="log", xlabel="error over what is admissible [1]", yticks=rows, xlim=(0.5 * _LEAST, 30.0))
+    axis.set(xscale="log", xlabel="error over what is admissible [1]", yticks=rows, xlim=(0.5 * _LEAST, 10.0))
     axis.set_yticklabels([verdict.case.name for verdict in verdicts], fontsize=7)
     axis.set_ylim(len(verdicts) - 0.4, -0.6)
     axis.grid(axis="x", color="#e4e4e4", lw=0.6)
@@ -56,7 +56,9 @@ def _families(axis: Axes, verdicts: Sequence[Verdict]) -> None:
     for row, name in enumerate(names):
         if row == 0 or names[row - 1] != name:
             axis.axhline(row - 0.5, color="black", lw=0.6)
-            axis.text(25.0, row - 0.3, name, ha="right", va="top", fontsize=8, fontweight="bold")
+            axis.text(
+                1.01, row - 0.4, name, transform=axis.get_yaxis_transform(), va="top", fontsize=8, fontweight="bold"
+            )
 
 
 def step_limits_figure() -> Figure:
