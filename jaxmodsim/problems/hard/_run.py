@@ -1,8 +1,10 @@
 """Many hard cases, in several processes."""
 
+import math
 import multiprocessing
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from functools import cache
 
 import jax
@@ -14,6 +16,10 @@ from ._check import DTYPES, WAYS, Finding, Verdict, check
 
 # Of these the runs themselves take minutes: begun first, they do not hold up the end.
 _LONG = ("periods_1000000", "cycles_100000", "dead_points", "redundant_constraints")
+
+# Cases that a process checks. Each compiles tens of programs, a program takes several maps of memory, and Linux gives a
+# process no more than 65 530 of those.
+_PORTION = 12
 
 
 def choose(names: Sequence[str]) -> dict[str, HardCase]:
@@ -38,31 +44,38 @@ def choose(names: Sequence[str]) -> dict[str, HardCase]:
 def check_many(
     names: Sequence[str] = (), *, ways: Sequence[str] = WAYS, dtypes: Sequence[str] = DTYPES, jobs: int = 1
 ) -> Iterator[Verdict]:
-    """`check` many hard cases; each verdict comes as it is found.
+    """`check` many hard cases; each verdict comes as it is found, also where its process was killed.
 
     **Arguments:**
 
     - `names`: of cases or families; all without.
     - `ways`, `dtypes`: as for `check`.
-    - `jobs`: processes, > 0; with one, this process does it all.
+    - `jobs`: processes at a time, > 0, besides this one.
 
     **Raises:**
 
     - `ValueError` as `choose` and `check`.
     """
     cases = choose(names)
-    if jobs == 1:
-        yield from (check(case, ways, dtypes) for case in cases.values())
-        return
     order = sorted(cases, key=lambda name: name not in _LONG)
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, context, initializer=_begin)
+    for first in range(0, len(order), jobs * _PORTION):
+        pool = ProcessPoolExecutor(jobs, context, initializer=_begin)
+        portion = order[first : first + jobs * _PORTION]
+        try:
+            futures = {pool.submit(_found, name, tuple(ways), tuple(dtypes)): name for name in portion}
+            for future in as_completed(futures):
+                yield Verdict(cases[futures[future]], _result(future))
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _result(future: Future[tuple[Finding, ...]]) -> tuple[Finding, ...]:
     try:
-        futures = {pool.submit(_found, name, tuple(ways), tuple(dtypes)): name for name in order}
-        for future in as_completed(futures):
-            yield Verdict(cases[futures[future]], future.result())
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        return future.result()
+    except BrokenProcessPool as error:
+        # That of this case, or of another one that was begun with it.
+        return (Finding("alone", "float64", math.nan, False, f"A process was killed: {error}"),)
 
 
 def _begin() -> None:
