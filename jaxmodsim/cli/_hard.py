@@ -10,7 +10,7 @@ import pandas as pd
 from ..plot import hard_figure, step_limits_figure
 from ..problems.hard import WAYS, HardCase, Verdict, check_many, choose
 from ._interrupted import Interrupted
-from ._output import console, show_paths, show_table, write
+from ._output import console, say, show_paths, show_table, write
 
 _VALUES, _SLOPES = ("alone", "jit", "vmap"), ("forward", "reverse")
 
@@ -45,7 +45,10 @@ def report_hard(request: HardRequest) -> bool:
         try:
             for verdict in check_many(request.names, ways=ways, jobs=request.jobs):
                 verdicts[verdict.case.name] = verdict
-                status.update(f"{len(verdicts)} of {len(cases)}: {verdict.case.name}")
+                done = f"{len(verdicts)} of {len(cases)}: {verdict.case.name}: {'pass' if verdict.ok else 'FAIL'}"
+                status.update(done)
+                if not console.is_terminal:
+                    say(done)
         except KeyboardInterrupt:
             stopped = True
     found = [verdicts[name] for name in cases if name in verdicts]

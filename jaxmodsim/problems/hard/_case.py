@@ -132,6 +132,7 @@ class HardCase:
     - `asks`: what is asked for, with its unit.
     - `task`: a `Motion`, a `Program`, `Measured` or `Refused`.
     - `exact`: the right answer as a function of the number the task is a function of, in closed form.
+    - `slope`: its derivative in closed form, where differences of `exact` do not give it.
     - `second`: the right answer by a second solver, where there is no closed form; the derivative is then held against
       finite differences of the answer.
     - `scale`: what errors are relative to, in the unit of the answer; by default the right answer's magnitude.
@@ -152,6 +153,7 @@ class HardCase:
     asks: str
     task: Motion | Program | Measured | Refused
     exact: Callable[[float], float] | None = None
+    slope: Callable[[float], float] | None = None
     second: Callable[[], float] | None = None
     scale: float | None = None
     tolerance: float = 1e-6

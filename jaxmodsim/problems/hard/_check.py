@@ -91,11 +91,7 @@ def check(case: HardCase, ways: Sequence[str] = WAYS, dtypes: Sequence[str] = DT
 
     - `ValueError` for ways or types that are none, and without double precision, which float64 needs.
     """
-    for name, given, known in (("ways", ways, WAYS), ("dtypes", dtypes, DTYPES)):
-        if unknown := [each for each in given if each not in known]:
-            raise ValueError(f"{name} must be of {', '.join(known)}, but {unknown[0]!r} was given.")
-    if jnp.result_type(float) != jnp.float64:
-        raise ValueError('Hard cases need double precision: jax.config.update("jax_enable_x64", True).')
+    check_choice(ways, dtypes)
     if isinstance(case.task, Refused):
         return Verdict(case, tuple(_refusals(case.task)))
     if isinstance(case.task, Measured):
@@ -107,6 +103,20 @@ def check(case: HardCase, ways: Sequence[str] = WAYS, dtypes: Sequence[str] = DT
         trial = _Trial(case, case.task.cast(dtype), dtype)
         findings += [trial.look(way) for way in ways if trial.applies(way)]
     return Verdict(case, tuple(findings))
+
+
+def check_choice(ways: Sequence[str], dtypes: Sequence[str]) -> None:
+    """Refuse ways and types that are none, and single precision.
+
+    **Raises:**
+
+    - `ValueError` that names what there is.
+    """
+    for name, given, known in (("ways", ways, WAYS), ("dtypes", dtypes, DTYPES)):
+        if unknown := [each for each in given if each not in known]:
+            raise ValueError(f"{name} must be of {', '.join(known)}, but {unknown[0]!r} was given.")
+    if jnp.result_type(float) != jnp.float64:
+        raise ValueError('Hard cases need double precision: jax.config.update("jax_enable_x64", True).')
 
 
 def _refusals(task: Refused) -> list[Finding]:
@@ -251,6 +261,8 @@ class _Trial:
 
     def slope(self) -> float:
         """The right derivative: of the closed form, or by finite differences of answers in double precision."""
+        if self.case.slope is not None:
+            return self.case.slope(float(self.x))
         if self.case.exact is not None:
             return differentiate(self.case.exact, float(self.x))
         task = self.case.task

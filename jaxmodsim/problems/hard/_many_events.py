@@ -297,6 +297,10 @@ def _ceiling() -> HardCase:
     def exact(v0: float) -> float:
         return 2.0 / (v0 + math.sqrt(v0**2 - 2.0 * _G))
 
+    def slope(v0: float) -> float:
+        left = math.sqrt(v0**2 - 2.0 * _G)
+        return -2.0 / (v0 + left) ** 2 * (1.0 + v0 / left)
+
     v0 = math.sqrt(2.0 * _G) * (1.0 + 1e-8)
     return HardCase(
         "grazing_ceiling",
@@ -306,6 +310,7 @@ def _ceiling() -> HardCase:
         "time of touching [s]",
         Program(_throw, v0, "initial velocity [m/s]"),
         exact,
+        slope,
         tolerance=1e-5,
         # In float32 the ball does not reach the ceiling: 1e-8 is below its rounding.
         single=None,

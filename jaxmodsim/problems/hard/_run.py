@@ -12,7 +12,7 @@ import jax
 from ...numerics import did_you_mean
 from ._case import HardCase
 from ._cases import FAMILIES, hard_cases
-from ._check import DTYPES, WAYS, Finding, Verdict, check
+from ._check import DTYPES, WAYS, Finding, Verdict, check, check_choice
 
 # Of these the runs themselves take minutes: begun first, they do not hold up the end.
 _LONG = ("periods_1000000", "cycles_100000", "dead_points", "redundant_constraints")
@@ -57,6 +57,7 @@ def check_many(
     - `ValueError` as `choose` and `check`.
     """
     cases = choose(names)
+    check_choice(ways, dtypes)
     order = sorted(cases, key=lambda name: name not in _LONG)
     context = multiprocessing.get_context("spawn")
     for first in range(0, len(order), jobs * _PORTION):
@@ -88,4 +89,8 @@ _cases = cache(hard_cases)
 
 
 def _found(name: str, ways: tuple[str, ...], dtypes: tuple[str, ...]) -> tuple[Finding, ...]:
-    return check(_cases()[name], ways, dtypes).findings
+    try:
+        return check(_cases()[name], ways, dtypes).findings
+    except Exception as error:
+        # Whatever it is, the other cases go on.
+        return (Finding("alone", "float64", math.nan, False, f"{type(error).__name__}: {error}"),)
