@@ -20,7 +20,7 @@ class Regularized(AbstractForceLaw):
     **Arguments:**
 
     - `law`: `Coulomb`, `Stribeck` or another set-valued law.
-    - `width`: velocity at which the force has 76 % of its level [m/s], > 0.
+    - `width`: velocity at which the force has 76 % of its level [m/s], > 0; in runs with tolerances, >= `atol`.
 
     **Raises:**
 

@@ -3,12 +3,14 @@
 from typing import NamedTuple
 
 import jax
+import jax.core
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..effects import Power
 from ..scene import Scene, State, scene_energies
 from ..solvers import EventLog
+from ._outcome import SUCCESS, SimulationError, outcome_messages
 from ._solve import Options, Problem, initial_state, solve_audited, solve_logged, solve_start
 
 
@@ -38,9 +40,27 @@ class Ledger(NamedTuple):
         return total - sum(self.supplied.values(), jnp.zeros_like(total))
 
 
-def ledger(problem: Problem, options: Options, t: Float[Array, " time"], y: State) -> Ledger:
-    """Ledger of a run whose states at the times `t` are `y`. Runs it once more, with the work integrals beside it."""
-    return _ledger(problem, t, y, solve_audited(problem, options))
+def ledger(problem: Problem, options: Options, t: Float[Array, " time"], y: State, code: Int[Array, ""]) -> Ledger:
+    """Ledger of a run whose states at the times `t` are `y`. Runs it once more, with the work integrals beside it.
+
+    **Arguments:**
+
+    - `code`: how the run ended.
+
+    **Raises:**
+
+    - `SimulationError` if the run reached t1 and that with the integrals does not, where rounding decides. Inside
+      compiled code the energies are infinite from there on instead.
+    """
+    work, ended = solve_audited(problem, options)
+    known = not isinstance(code, jax.core.Tracer) and not isinstance(ended, jax.core.Tracer)
+    if known and int(code) == SUCCESS != int(ended):
+        reason = outcome_messages(problem.scene, problem.q0.shape[0])[int(ended)]
+        raise SimulationError(
+            "The run reached t1, but repeated with the work integrals beside it, it does not, so its energies are not"
+            f" known: {reason}"
+        )
+    return _ledger(problem, t, y, work)
 
 
 @jax.jit

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..friction import Regularized
 from ..mechanics import quadratic
 from ..numerics import check_ranges, cholesky_pivots, modules_of, range_checks
 from ..scene import Scene, State, scene_margins, scene_mass, scene_misfit
@@ -23,8 +24,9 @@ from ..solvers import ACCUMULATION, TOO_MANY
     INCONSISTENT,
     DRIFTED,
     NOT_QUADRATIC,
+    TOO_NARROW,
     FIRST_MASS,
-) = range(10)
+) = range(11)
 
 # Correction of the initial state, relative to its size or to one, below which it is meant to obey the constraints.
 _CONSISTENT = 1e-6
@@ -47,6 +49,8 @@ _GENERAL = (
     "The constraints are not kept: they contradict each other here, have become dependent (a singular configuration),"
     " or drift without bound (project=False).",
     "Gauss works with momenta, and needs a Lagrangian that is quadratic in the velocities: use another solver.",
+    "atol is above the width [m/s] of a Regularized law: what happens within the width is below what the error control"
+    " sees, and a break-away comes late. Pass atol no larger than the width.",
 )
 
 
@@ -121,8 +125,19 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
     return _GENERAL + mass + ranges + chatter + scene.checks
 
 
-def start_code(scene: Scene, t: Float[Array, ""], y: State, rate: State, mode: Any, canonical: bool) -> Int[Array, ""]:
-    """What is wrong before the first step: a parameter out of range, a state off the constraints, a field of NaN."""
+def start_code(
+    scene: Scene,
+    t: Float[Array, ""],
+    y: State,
+    rate: State,
+    mode: Any,
+    atol: Float[Array, ""] | None,
+    canonical: bool,
+) -> Int[Array, ""]:
+    """What is wrong before the first step: a parameter out of range, a state off the constraints, a field of NaN.
+
+    `atol` is None in a run of fixed steps.
+    """
     dof = y.q.shape[0]
     code = jnp.asarray(SUCCESS)
     finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
@@ -136,6 +151,9 @@ def start_code(scene: Scene, t: Float[Array, ""], y: State, rate: State, mode: A
     if scene.constraints:
         off, turned = scene_misfit(t, y, scene)
         code = jnp.where((off <= _CONSISTENT) & (turned <= _CONSISTENT), code, INCONSISTENT)
+    widths = [module.width for _, module in modules_of(scene) if isinstance(module, Regularized)]
+    if atol is not None and widths:
+        code = jnp.where(atol <= jnp.min(jnp.stack([jnp.min(width) for width in widths])), code, TOO_NARROW)
     checks = [ok for _, module in modules_of(scene) for _, ok in range_checks(module)]
     for i, ok in reversed(list(enumerate(checks))):
         code = jnp.where(ok, code, offsets.ranges + i)

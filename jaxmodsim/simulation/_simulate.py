@@ -62,7 +62,9 @@ def simulate(
     - `ts`: times [s] at which the run is kept, increasing, within `[t0, t1]`; by default the end alone, in arrays of
       length one.
     - `z0`: initial own states of effects, by effect name; those left out start at rest.
-    - `rtol`, `atol`: relative and absolute tolerance of the local error.
+    - `rtol`, `atol`: relative and absolute tolerance of the local error. What is smaller than `atol` is not resolved:
+      let it lie below the smallest velocity [m/s] and deflection [m] that decide anything. Above the width of a
+      `Regularized` law it is refused.
     - `dt`: fixed step [s], > 0, instead of tolerances. A sample of a `Signal` in between divides the step.
     - `dtmax`: longest step [s], > 0. In stick nothing moves and steps grow, so that a load that comes in short pulses
       can be stepped over: bound the step by the length of a pulse. Where that shows at a saved time, the run fails.

@@ -197,7 +197,8 @@ def _prepared(problem: Problem, options: Options, audited: bool) -> tuple[State,
     if scene.exact:
         initial, mode = scene_modes(t0, initial, scene, rest)
     canonical = isinstance(options.solver, Gauss)
-    start = start_code(scene, t0, given, scene_field(t0, initial, scene, mode), mode, canonical)
+    atol = None if problem.dt is not None else problem.atol
+    start = start_code(scene, t0, given, scene_field(t0, initial, scene, mode), mode, atol, canonical)
     sticks = bool(scene.exact) and scene_drifts(scene)
     belts = any(callable(each.belt_velocity) for each in scene.exact.values())
     return initial, mode, Hybrid(Flow(audited, canonical, belts), rest, projects, sticks), start
@@ -295,9 +296,10 @@ def solve(problem: Problem, options: Options) -> Solved:
 
 
 @partial(jax.jit, static_argnames=("options",))
-def solve_audited(problem: Problem, options: Options) -> Work:
-    """Run a scene again with the integrals of power beside it; returns the work at the saved times."""
-    return _integrate(problem, options, True, None)[0].y[1]
+def solve_audited(problem: Problem, options: Options) -> tuple[Work, Int[Array, ""]]:
+    """Run a scene again with the integrals of power beside it: the work at the saved times, and how that run ended."""
+    solved = _integrate(problem, options, True, None)[0]
+    return solved.y[1], solved.code
 
 
 @partial(jax.jit, static_argnames=("options",))

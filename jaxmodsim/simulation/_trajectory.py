@@ -161,7 +161,7 @@ class Trajectory:
         Runs the scene once more, with the work integrals beside it.
         """
         self._one_run("ledger")
-        return self._once("ledger", lambda: ledger(self.problem, self.options, self.t, self._states()))
+        return self._once("ledger", lambda: ledger(self.problem, self.options, self.t, self._states(), self.code))
 
     @property
     def event_losses(self) -> Float[Array, " time"]:

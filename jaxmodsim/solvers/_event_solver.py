@@ -12,9 +12,10 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from ..numerics import first_root, is_one_of, once, unit_of, watch
 from ._event_state import ACCUMULATION, NO_TROUBLE, TOO_MANY, EventLog, EventState, write
+from ._projected import projected
 
-# How far beside the root a step may end, as a fraction of the step; from there the state is carried to the root, with
-# an error of the third power of that distance.
+# How far beside the root a step may end, as a fraction of the last steps; from there the state is carried to the root,
+# with an error of the third power of that distance.
 _LANDING = 1e-5
 # Where a step is to end if conditions have to hold after it, in landing distances behind the root: in front of it is no
 # motion after the event. A slip that begins without a jump of the force touches rest there, and would end again.
@@ -28,6 +29,8 @@ _SHORT = 1e-6
 _ACCUMULATION = 1e-3
 # Weight that the last intervals between events, and the last steps, keep at each new one.
 _FORGET = 0.25
+# A step counts as no longer than this many of those before it.
+_GROW = 2.0
 # Events that few do not accumulate.
 _FEWEST = 8
 
@@ -239,7 +242,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0._replace(log=None), args), inner, made_jump
         )
         if self.project is not None:
-            y1 = self.project(t1, y0._replace(y=y1), args).y
+            y1, error = projected(y1, error, self.project(t1, y0._replace(y=y1), args).y)
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
         t_one, t_two = t0 + (t1 - t0) / 3.0, t0 + (t1 - t0) * (2.0 / 3.0)
         inside = [self._guards(t, y0._replace(y=path.evaluate(t)), args) for t in (t_one, t_two)]
@@ -251,7 +254,9 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         # Around t0 = 0 the resolution of time is that of the step itself.
         length = _constant(t1 - t0)
         resolution = 4.0 * float(jnp.finfo(length.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-        near = jnp.maximum(_LANDING * jnp.maximum(length, pace), _constant(resolution))
+        # Where nothing moves steps grow without measure, and tell nothing of the motion that the event begins.
+        measure = jnp.minimum(length, _GROW * pace)
+        near = jnp.maximum(_LANDING * jnp.maximum(measure, pace), _constant(resolution))
         jumps = None if self.jumps is None else is_one_of(self.jumps, t1) & (length > 0)
         if jumps is not None:  # an event before a jump is not one with it
             near = jnp.where(jumps, _constant(resolution), near)
@@ -290,7 +295,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             lambda: state1,
         )
         dense = {"inner": dense, "state0": y0, "state1": state1}
-        pace = jnp.maximum(length, _FORGET * pace)
+        pace = jnp.maximum(measure, _FORGET * pace)
         return state1, error, dense, (inner, pace, begin), result
 
     def _jump(
@@ -342,6 +347,12 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         values = self._guards(t, end, whole)
         clear = _constant(values) > jnp.where(fired, _LATITUDE * jnp.abs(rate) * near, 0.0)
         armed = self.insist | clear | (~fired & (state.armed > 0.5))
+        if not self.insist:  # what rises from the reset will fall again, be it as low as rounding
+            times, slope = jnp.ones_like(t_event), field(t_event, after, whole)
+            _, rise = jax.jvp(
+                lambda t, y: self._guards(t, after._replace(y=y), whole), (t_event, after.y), (times, slope)
+            )
+            armed = armed | (fired & (_constant(rise) > 0))
         if self.hold is not None:
             armed = jnp.where(dense, values > 0, armed)
         flags = jnp.where(fired, 1.0, jnp.zeros_like(values))

@@ -11,7 +11,6 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from ...analysis import check_gradients
 from ...scene import Scene
@@ -181,16 +180,15 @@ class _Trial:
     def x(self) -> Any:
         return jnp.asarray(self.task.x, self.dtype)
 
-    @property
-    def ends(self) -> str:
-        return self.case.single_ends if self.dtype == "float32" and self.case.single_ends else self.case.ends
+    def gives_up(self, answer: Answer) -> bool:
+        """Whether the run ends with the sentence that it may end with in float32."""
+        may = self.case.single_ends if self.dtype == "float32" else ""
+        return bool(may) and int(answer.code) != 0 and re.search(may, self.messages[int(answer.code)]) is not None
 
     @cached_property
     def right(self) -> float | None:
         """The answer; None where the run ends early and says so, which is all that is asked."""
         case = self.case
-        if self.dtype == "float32" and case.single_ends:
-            return None
         if case.exact is not None:
             return float(case.exact(float(self.x)))
         return None if case.second is None else case.second()
@@ -208,9 +206,9 @@ class _Trial:
         if way in self.case.leaves:
             return False
         if way == "energy":
-            runs = isinstance(self.task, Motion) and not self.ends and self.case.conserves
+            runs = isinstance(self.task, Motion) and not self.case.ends and self.case.conserves
             return runs and self.dtype == "float64"
-        return way not in ("forward", "reverse") or not (self.ends and self.right is None)
+        return way not in ("forward", "reverse") or not (self.case.ends and self.right is None)
 
     def look(self, way: str) -> Finding:
         """One way."""
@@ -225,8 +223,10 @@ class _Trial:
     def finding(self, way: str, answer: Answer) -> Finding:
         """An answer, compared."""
         code, value = int(answer.code), float(answer.value)
-        sentence = self.messages[code]
-        ended = re.search(self.ends, sentence) is not None if self.ends else code == 0
+        sentence, ends = self.messages[code], self.case.ends
+        if self.gives_up(answer):
+            return Finding(way, self.dtype, math.nan, True, sentence)
+        ended = re.search(ends, sentence) is not None if ends else code == 0
         if self.right is None:
             return Finding(way, self.dtype, math.nan, ended and code != 0, sentence)
         error = abs(value - self.right) / self.scale / self.tolerance
@@ -238,17 +238,17 @@ class _Trial:
         lanes = jnp.stack([self.x, jnp.full_like(self.x, jnp.nan), self.x])
         answers = _vmap(self.task, lanes)
         first, sick, last = (Answer(answers.code[i], answers.value[i]) for i in range(3))
-        found = self.finding("vmap", first)
+        found, other = (self.finding("vmap", each) for each in (first, last))
         if isinstance(self.task, Motion) and int(sick.code) == 0:
             return Finding("vmap", self.dtype, found.error, False, "A lane whose number is NaN says that all is well.")
-        same = np.array_equal(first.value, last.value, equal_nan=True)
-        return found if same else Finding("vmap", self.dtype, found.error, False, "Two equal lanes differ.")
+        # Where rounding differs from lane to lane of the processor's vectors, so do they, but both are right.
+        return found if other.ok else other
 
     def derivative(self, way: str) -> Finding:
         """A derivative, compared."""
         answer, slope = (_forward if way == "forward" else _reverse)(self.task, self.x)
         found, slope = self.finding(way, answer), float(slope)
-        if not found.ok:
+        if not found.ok or self.gives_up(answer):
             return found
         if not math.isfinite(slope):
             return Finding(way, self.dtype, math.inf, False, f"The derivative is {slope}.")
