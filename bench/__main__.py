@@ -24,7 +24,7 @@ RESULTS = HERE / "results"
 # What else a bench is run with, each time as a run of its own.
 ALSO: dict[str, tuple[str, ...]] = {"a0_lugre_testbench": ("--no-tune",)}
 # Benches that measure jaxonomy.
-WITH_JAXONOMY = ("a0_lugre_testbench", "d0_stick_slip")
+WITH_JAXONOMY = ("a0_lugre_testbench", "d0_stick_slip", "j0_hard_cases")
 INTERRUPTED = 130
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)

@@ -91,6 +91,16 @@ def ask(name: str, program: str, limit: float) -> dict[str, Any]:
     return {"case": name, "program": program} | found
 
 
+def judged_elsewhere(case: HardCase, answer: dict[str, Any]) -> dict[str, Any]:
+    """What an answer is worth that came from another environment: `value`, `error` or neither."""
+    if "error" in answer:
+        return {"verdict": ERROR, "says": answer["error"]}
+    if "value" not in answer:
+        return {"verdict": NONE, "says": "no answer in time"}
+    right, says = _judge(case, LEAST)(float(answer["value"]))
+    return {"verdict": RIGHT if right else WRONG, "says": says, "seconds": answer["seconds"]}
+
+
 def _work(name: str, program: str, send: Any) -> None:
     """The process: answers go into the pipe, with what comes later after them."""
     jms.tune_cpu()

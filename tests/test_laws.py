@@ -335,7 +335,7 @@ def test_the_table_covers_every_law_and_every_modifier() -> None:
         (lambda: scaled_by(cast(Any, "coulomb"), factor), "scaled_by needs a law, but 'coulomb'"),
         (lambda: scaled_by(Coulomb(1.0), cast(Any, 2.0)), "scaled_by fn must be a function, but 2.0"),
         (lambda: scaled_by(Coulomb(1.0), factor, ["Fv"]), r"parameters of Coulomb, among Fc .*given: \['Fv'\]"),
-        (lambda: scaled_by(Coulomb(1.0), factor, "Fc"), "scaled_by needs a list"),
+        (lambda: scaled_by(Coulomb(1.0), factor, "Fc"), "scaled_by parameters must be a list"),
         (lambda: asymmetric(Coulomb(1.0, 2.0), Fs=None), r"Fs must have the shape \(\) .* got None"),
         (lambda: asymmetric(MaxwellSlip([1.0, 2.0], [1.0, 2.0]), Fc=1.0), r"Fc must have the shape \(2,\)"),
         (lambda: scaled_by(Coulomb(1.0), Number(jnp.ones(()))), "fn holds numbers of its own"),

@@ -44,6 +44,7 @@ def found() -> xr.Dataset:
 
 
 @pytest.mark.quick
+@optimized()
 def test_numbers_are_those_of_single_runs(found: xr.Dataset) -> None:
     assert dict(found.sizes) == {"friction.sigma0": 9, "m": 14, "time": 5}
     assert found["v"].dims == ("friction.sigma0", "m", "time")

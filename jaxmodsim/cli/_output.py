@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from ..identify import FitResult, InputDesign
+from ..numerics import jsonable
 from ..plot import Figure
 
 # Off a terminal (a file, a pipe) there is no width to keep to.
@@ -46,23 +47,12 @@ def write(
             elif isinstance(content, str):
                 part.write_text(content, encoding="utf-8")
             else:
-                part.write_text(json.dumps(_plain(content), indent=2, allow_nan=False) + "\n")
+                part.write_text(json.dumps(jsonable(content), indent=2, allow_nan=False) + "\n")
             os.replace(part, path)
         finally:
             part.unlink(missing_ok=True)
         paths.append(path)
     return paths
-
-
-def _plain(value: Any) -> Any:
-    """As JSON knows it: numbers that are not finite become null."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def show_table(frame: pd.DataFrame, title: str) -> None:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..numerics import jsonable
 from ._criteria import deviance, effective_samples, penalty
 from ._losses import AbstractLoss
 from ._result import FitResult
@@ -207,17 +208,19 @@ class Comparison:
         return "\n".join([*lines, self.conclusion] if self.ranked else lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """All of it but the samples and the models, of types that JSON knows."""
-        return {
-            "held_back": self.by,
-            "samples": self.samples,
-            "effective_samples": self.effective,
-            "models": self.table,
-            "best": self.best if self.ranked else None,
-            "simplest": self.simplest if self.ranked else None,
-            "conclusion": self.conclusion if self.ranked else None,
-            "fits": {name: result.to_dict() for name, result in self.results.items()},
-        }
+        """All of it but the samples and the models, as JSON knows it: numbers that are not finite are None."""
+        return jsonable(
+            {
+                "held_back": self.by,
+                "samples": self.samples,
+                "effective_samples": self.effective,
+                "models": self.table,
+                "best": self.best if self.ranked else None,
+                "simplest": self.simplest if self.ranked else None,
+                "conclusion": self.conclusion if self.ranked else None,
+                "fits": {name: result.to_dict() for name, result in self.results.items()},
+            }
+        )
 
 
 def comparison_of(

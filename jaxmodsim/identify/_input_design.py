@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from ..numerics import jsonable
+
 # Of the relative standard error, above which a number counts as not determined, and of the correlation.
 _VAGUE, _ALIKE = 0.5, 0.98
 
@@ -188,21 +190,23 @@ class InputDesign:
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """All but the samples, of types that JSON knows, except that an error may be infinite."""
-        return {
-            "duration": float(self.t[-1] - self.t[0]),
-            "samples": len(self.t),
-            "noise": self.noise,
-            "limits": {name: value for name, (value, _) in self.limits.given.items()},
-            "used": self.used,
-            "parameters": {
-                name: {"value": value, "standard_error": error, "standard_error_of_a_sine": plain, "unit": unit}
-                for name, value, error, plain, unit in self.rows()
-            },
-            "information": {"names": list(self.values), "matrix": self.information.tolist()},
-            "ending": self.ending,
-            "remarks": list(self.remarks),
-        }
+        """All but the samples, as JSON knows it: errors that are infinite are None."""
+        return jsonable(
+            {
+                "duration": float(self.t[-1] - self.t[0]),
+                "samples": len(self.t),
+                "noise": self.noise,
+                "limits": {name: value for name, (value, _) in self.limits.given.items()},
+                "used": self.used,
+                "parameters": {
+                    name: {"value": value, "standard_error": error, "standard_error_of_a_sine": plain, "unit": unit}
+                    for name, value, error, plain, unit in self.rows()
+                },
+                "information": {"names": list(self.values), "matrix": self.information.tolist()},
+                "ending": self.ending,
+                "remarks": list(self.remarks),
+            }
+        )
 
     def to_csv(self, path: str | Path) -> None:
         """Write `t` [s], `q_ref` [m], `qd_ref` [m/s], `force` [N] with a header line: the whole file or none.

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..friction import AbstractLaw
+from ..numerics import jsonable
 from ..scene import Scene
 from ._causes import Cause, causes_of
 from ._interval import interval
@@ -261,29 +262,31 @@ class FitResult:
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """All but the samples and the model, of types that JSON knows."""
+        """All but the samples and the model, as JSON knows it: numbers that are not finite are None."""
         intervals = self.intervals()
-        return {
-            "records": [record.name for record in self.records],
-            "samples": [len(record.t) for record in self.records],
-            "rmse": self.rmse_by,
-            "noise": self.noise,
-            "parameters": {
-                name: {
-                    "value": value,
-                    "standard_error": error,
-                    "interval": list(intervals[name]),
-                    "start": start,
-                    "unit": unit,
-                }
-                for name, value, error, start, unit in self.rows()
-            },
-            "correlation": {"names": list(self.values), "matrix": self.correlation.tolist()},
-            "evaluations": self.evaluations,
-            "ending": self.ending,
-            "step_error": self.step_error,
-            "remarks": list(self.remarks),
-        }
+        return jsonable(
+            {
+                "records": [record.name for record in self.records],
+                "samples": [len(record.t) for record in self.records],
+                "rmse": self.rmse_by,
+                "noise": self.noise,
+                "parameters": {
+                    name: {
+                        "value": value,
+                        "standard_error": error,
+                        "interval": list(intervals[name]),
+                        "start": start,
+                        "unit": unit,
+                    }
+                    for name, value, error, start, unit in self.rows()
+                },
+                "correlation": {"names": list(self.values), "matrix": self.correlation.tolist()},
+                "evaluations": self.evaluations,
+                "ending": self.ending,
+                "step_error": self.step_error,
+                "remarks": list(self.remarks),
+            }
+        )
 
     def __str__(self) -> str:
         """A table of the parameters, and what the record cannot tell."""

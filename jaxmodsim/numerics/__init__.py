@@ -19,6 +19,7 @@ from ._function import Function as Function
 from ._function import as_function as as_function
 from ._function import real_array as real_array
 from ._function import result_shape as result_shape
+from ._jsonable import jsonable as jsonable
 from ._linalg import MAX_UNROLLED_CHOLESKY as MAX_UNROLLED_CHOLESKY
 from ._linalg import cholesky_pivots as cholesky_pivots
 from ._linalg import factor_positive_definite as factor_positive_definite

@@ -348,10 +348,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         clear = _constant(values) > jnp.where(fired, _LATITUDE * jnp.abs(rate) * near, 0.0)
         armed = self.insist | clear | (~fired & (state.armed > 0.5))
         if not self.insist:  # what rises from the reset will fall again, be it as low as rounding
-            times, slope = jnp.ones_like(t_event), field(t_event, after, whole)
-            _, rise = jax.jvp(
-                lambda t, y: self._guards(t, after._replace(y=y), whole), (t_event, after.y), (times, slope)
-            )
+            ahead = jnp.ones_like(t_event), field(t_event, after, whole)
+            _, rise = jax.jvp(lambda t, y: self._guards(t, after._replace(y=y), whole), (t_event, after.y), ahead)
             armed = armed | (fired & (_constant(rise) > 0))
         if self.hold is not None:
             armed = jnp.where(dense, values > 0, armed)
