@@ -164,7 +164,7 @@ def _regularized() -> list[HardCase]:
             "regularized_unresolved",
             FAMILY,
             "The same with an absolute tolerance of 1e-6 m/s: stick lies within it as a whole.",
-            "Break-away comes half a second late, the velocity is 3 % low, and the error control sees nothing.",
+            "Break-away comes late, the velocity is 3 % low, and the error control sees nothing of it.",
             "the sentence",
             motion(scene, [0.0], [0.0], _T1, by="friction.Fc", read=velocity, numbers={"atol": 1e-6}),
             ends="above the width",
