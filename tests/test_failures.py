@@ -135,9 +135,9 @@ def test_a_tolerance_above_the_width_of_a_smoothed_law_is_refused() -> None:
 
 def test_energies_of_a_run_that_cannot_be_repeated_with_the_work_beside_it() -> None:
     """The push does nothing to so heavy a mass, but its work swings, and needs more steps than the motion."""
-    push = jms.AppliedForce(lambda t, q, qd, p: jnp.sin(50.0 * t)[None], name="push")  # noqa: ARG005
-    heavy = jms.Scene(lambda t, q, qd, p: 0.5e6 * qd[0] ** 2, effects=(push,))  # noqa: ARG005
+    push = jms.AppliedForce(lambda t, q, qd, p: jnp.sin(50.0 * t)[None], name="push")
+    heavy = jms.Scene(lambda t, q, qd, p: 0.5e6 * qd[0] ** 2, effects=(push,))
     steps = int(jms.simulate(heavy, [0.0], [1.0], 1.0).stats["num_steps"])
     run = jms.simulate(heavy, [0.0], [1.0], 1.0, max_steps=steps + 1)
-    with pytest.raises(jms.SimulationError, match="work integrals beside it, it does not.*step limit"):
+    with pytest.raises(jms.SimulationError, match=r"work integrals beside it, it does not.*step limit"):
         _ = run.energy

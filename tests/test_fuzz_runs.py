@@ -281,7 +281,7 @@ def coulomb(x: Drawn, t: np.ndarray) -> np.ndarray:
     if slip == 0:
         return x.belt + away * t
     rate = (x.F - np.sign(slip) * x.Fc) / x.m
-    stop = -slip / rate if rate * slip < 0 else np.inf
+    stop = -slip / rate if np.sign(rate) * np.sign(slip) < 0 else np.inf
     return x.belt + np.where(t < stop, slip + rate * t, away * np.where(t < stop, 0.0, t - stop))
 
 

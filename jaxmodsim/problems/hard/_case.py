@@ -141,7 +141,7 @@ class HardCase:
       either right or says so, as rounding has it.
     - `undefined`: why there is no derivative; empty where there is one. Then `check_gradients` must say so.
     - `conserves`: whether the energy balance has to close: not where the run fails, or where fixed steps are long.
-    - `leaves`: ways that make no sense, of those in `WAYS`, with the reason.
+    - `leaves`: ways that are left out, of those in `WAYS` or in one type ("reverse float32"), with the reason.
     """
 
     name: str

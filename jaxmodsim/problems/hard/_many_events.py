@@ -106,15 +106,14 @@ def _shrinking_swing() -> HardCase:
 
     t1 = n * 0.5 * math.pi * (1.0 / math.sqrt(1.0 - mu) + 1.0 / math.sqrt(1.0 + mu))
 
-    def exact(m: float) -> float:
-        """At a turn, where the motion is a cosine of the inner spring from there on, and of the outer one before."""
-        late = t1 - t1 * math.sqrt(m)
-        inner = math.sqrt((1.0 - mu if late > 0 else 1.0 + mu) / m)
-        return factor(mu) ** n * math.cos(inner * late)
+    def slope(mu: float) -> float:
+        # The times of the turns move, too, but at a turn that is nothing.
+        return -n / (1.0 - mu**2) * factor(mu) ** n
 
     friction = Friction(Coulomb(mu), normal_force=_load_of_deflection)
     scene = Scene(braked_spring().lagrangian, params={"m": m, "k": 1.0}, effects=(friction,))
-    task = motion(scene, [1.0], [0.0], t1, by="m", read=position, numbers={"rtol": 1e-10, "atol": 0.0}, max_steps=65536)
+    numbers = {"rtol": 1e-10, "atol": 0.0}
+    task = motion(scene, [1.0], [0.0], t1, by="friction.Fc", read=position, numbers=numbers, max_steps=65536)
     return HardCase(
         "shrinking_swing",
         FAMILY,
@@ -122,7 +121,11 @@ def _shrinking_swing() -> HardCase:
         "Absolute tolerances stop it at their own size; thresholds in SI units take it for rest.",
         "position at the 100th turn [m]",
         task,
-        exact,
+        lambda mu: factor(mu) ** n,
+        slope,
+        # At the last turn an error of its time, 1e-4 s of 321 s, is seen in the derivative alone.
+        tolerance=1e-5,
+        single=1e-2,
     )
 
 
