@@ -171,11 +171,11 @@ def motion(
     *,
     by: str,
     read: Callable[[Trajectory], Array],
-    numbers: dict[str, ArrayLike | list[float]] | None = None,
+    numbers: Mapping[str, ArrayLike | list[float]] | None = None,
     **choices: Any,
 ) -> Motion:
     """A `Motion` from plain numbers; by default at `rtol=1e-9, atol=1e-11`."""
-    given = {"rtol": 1e-9, "atol": 1e-11} | (numbers or {})
+    given = {"rtol": 1e-9, "atol": 1e-11, **(numbers or {})}
     arrays = {name: jnp.asarray(np.asarray(value, float)) for name, value in given.items()}
     q, qd, end = (jnp.asarray(np.asarray(x, float)) for x in (q0, qd0, t1))
     return Motion(scene, q, qd, end, by, read, arrays, tuple(choices.items()))
