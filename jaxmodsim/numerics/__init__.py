@@ -19,6 +19,9 @@ from ._function import Function as Function
 from ._function import as_function as as_function
 from ._function import real_array as real_array
 from ._function import result_shape as result_shape
+from ._guard_scan import GuardScan as GuardScan
+from ._guard_scan import first_root as first_root
+from ._guard_scan import scan_guards as scan_guards
 from ._jsonable import jsonable as jsonable
 from ._linalg import MAX_UNROLLED_CHOLESKY as MAX_UNROLLED_CHOLESKY
 from ._linalg import cholesky_pivots as cholesky_pivots
@@ -76,6 +79,3 @@ from ._varying import Varying as Varying
 from ._varying import nominal as nominal
 from ._varying import settle as settle
 from ._varying import varies as varies
-from ._watch import Watch as Watch
-from ._watch import first_root as first_root
-from ._watch import watch as watch

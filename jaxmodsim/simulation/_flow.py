@@ -140,9 +140,11 @@ class Hybrid(NamedTuple):
         return _guards(t, self.flow.state(t, s.y, scene), scene, s.mode, self.rest)
 
     def reset(self, t: Any, s: EventState, scene: Scene, fired: Array) -> EventState:
-        """Change of modes."""
+        """Change of modes; the state as it is where none changes."""
         state, mode = scene_switch(t, self.flow.state(t, s.y, scene), scene, s.mode, fired)
-        return s._replace(y=self.flow.replace(t, s.y, state, scene), mode=mode)
+        after = self.flow.replace(t, s.y, state, scene)
+        changed = jnp.any(mode != s.mode)
+        return s._replace(y=jtu.tree_map(lambda a, b: jnp.where(changed, a, b), after, s.y), mode=mode)
 
     def hold(self, t: Any, s: EventState, scene: Scene, fired: Array) -> EventState:
         """Stick of what chatters."""

@@ -138,9 +138,10 @@ def _error_control(problem: Problem, solver: dfx.AbstractSolver) -> dfx.Abstract
 
 
 def _solver(
-    solver: dfx.AbstractSolver, hybrid: Hybrid, scene: Scene, options: Options, log: int | None
+    solver: dfx.AbstractSolver, hybrid: Hybrid, problem: Problem, options: Options, log: int | None
 ) -> dfx.AbstractSolver:
     """`solver`, wrapped in what the scene needs: events, projections, signals."""
+    scene = problem.scene
     if isinstance(solver, ImplicitFriction):
         solver = ImplicitFriction(hybrid.flow.advance)
     pin = _step_from if signals_of(scene.params) else None
@@ -153,6 +154,7 @@ def _solver(
             project=hybrid.settle if hybrid.projects or hybrid.sticks else None,
             pin=pin,
             jumps=sample_times(scene.params, linear=False),
+            rtol=problem.rtol,
             insist=True,
             max_events=options.max_events if log is None else min(log, options.max_events),
             log=log is not None,
@@ -168,9 +170,9 @@ def _step_from(t: Array, scene: Scene) -> Scene:
 
 def _controller(problem: Problem, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
     controller = _error_control(problem, solver)
-    if problem.scene.exact:
-        controller = EventController(controller)
     times = sample_times(problem.scene.params, linear=True)
+    if problem.scene.exact:
+        return EventController(controller, times)
     return controller if times is None else StepsTo(controller, times)
 
 
@@ -209,7 +211,7 @@ def _integrate(problem: Problem, options: Options, audited: bool, log: int | Non
     scene, exact = problem.scene, bool(problem.scene.exact)
     initial, mode, hybrid, start = _prepared(problem, options, audited)
     method, adjoint = _plugins(problem, options)
-    solver = _solver(method, hybrid, scene, options, log)
+    solver = _solver(method, hybrid, problem, options, log)
     # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
     starts = start == SUCCESS
     ts = None if problem.ts is None else jnp.where(starts, problem.ts, problem.t0)

@@ -61,8 +61,22 @@ class FiniteSteps(dfx.AbstractStepSizeController):
         return finite, jnp.where(finite, next_t0, t0), next_t1, jump, state, result
 
 
+def end_at(times: Float[Array, " n"], t0: Any, t1: Any, stretch: Any = True) -> Any:
+    """End of a step from `t0` that is to end at `t1`, with the next one of `times` in the place of what lies behind it.
+
+    With `stretch` also in the place of what lies just before it, so that no step over a tiny rest is left.
+    """
+    last = times.shape[0] - 1
+    i = after(times, t0)
+    time = jax.lax.dynamic_index_in_dim(times, jnp.minimum(i, last), keepdims=False).astype(t1.dtype)
+    longest = jnp.where(stretch, 1.0 + _STRETCH, 1.0) * (t1 - t0)
+    return jnp.where((i <= last) & (time - t0 <= longest), time, t1)
+
+
 class StepsTo(dfx.AbstractAdaptiveStepSizeController):
     """Wrap a step size controller so that steps end on given times, and a new start is made there.
+
+    For runs with events `EventController` does the same, so that one place decides where a step ends.
 
     **Arguments:**
 
@@ -101,7 +115,7 @@ class StepsTo(dfx.AbstractAdaptiveStepSizeController):
     ) -> tuple[Any, Any]:
         """First step of the wrapped controller, at most to the first time."""
         end, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        return self._clip(t0, end), inner
+        return end_at(self.times, t0, end), inner
 
     def adapt_step_size(
         self,
@@ -121,14 +135,8 @@ class StepsTo(dfx.AbstractAdaptiveStepSizeController):
         return (
             keep,
             next_t0,
-            self._clip(next_t0, next_t1),
+            end_at(self.times, next_t0, next_t1),
             jump | is_one_of(self.times, jnp.asarray(next_t0)),
             inner,
             result,
         )
-
-    def _clip(self, t0: Any, t1: Any) -> Any:
-        last = self.times.shape[0] - 1
-        i = after(self.times, t0)
-        time = jax.lax.dynamic_index_in_dim(self.times, jnp.minimum(i, last), keepdims=False).astype(t1.dtype)
-        return jnp.where((i <= last) & (time - t0 <= (1.0 + _STRETCH) * (t1 - t0)), time, t1)

@@ -9,7 +9,8 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import once, unit_of
+from ..numerics import is_one_of, once, unit_of
+from ._controllers import end_at
 from ._event_state import ACCUMULATION, TOO_MANY, EventState
 
 # How often a step may shrink only because its guards are not resolved.
@@ -47,15 +48,21 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
     long as the error last allowed. A step that does not resolve the guards is made smaller. Everything else is the
     wrapped controller's.
 
+    A step ends at a root before it ends at one of the given `times`, and there before it ends at the end of the run:
+    a step that is aimed at a root is never made longer to reach a time that is close behind the root.
+
     **Arguments:**
 
     - `controller`: any diffrax step size controller, adaptive or constant.
+    - `times`: increasing times at which a step shall end and a new start be made, shape `[n]`; None for none.
     """
 
     controller: dfx.AbstractStepSizeController
+    times: Float[Array, " n"] | None
 
-    def __init__(self, controller: dfx.AbstractStepSizeController):
+    def __init__(self, controller: dfx.AbstractStepSizeController, times: Float[Array, " n"] | None = None):
         self.controller = controller
+        self.times = times
 
     @property
     def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -74,7 +81,7 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
 
     def wrap(self, direction: Any) -> "EventController":
         """Wrap the controller inside."""
-        return EventController(self.controller.wrap(direction))
+        return EventController(self.controller.wrap(direction), self.times)
 
     def init(
         self, terms: PyTree, t0: Any, t1: Any, y0: EventState, dt0: Any, args: PyTree, func: Any, error_order: Any
@@ -90,6 +97,7 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
         usual = (_UNLIMITED if adaptive else 1.0) * (first - t0)
         longest = getattr(self.controller, "dtmax", None)
         usual = usual if longest is None else jnp.minimum(usual, longest)
+        first = first if self.times is None else end_at(self.times, t0, first)
         return _constant(first), _ControllerState(inner, _constant(usual), zero)
 
     def adapt_step_size(
@@ -109,10 +117,10 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
             t0, t1, y0.y, seen.y, args, y_error, error_order, old.inner
         )
         length = _constant(t1 - t0)
-        aim, room, landed = _constant(seen.aim), _constant(seen.room), _constant(seen.landed) > 0.5
+        aim, factor, landed = _constant(seen.next_root), _constant(seen.step_factor), _constant(seen.landed) > 0.5
         proposed = inner_t1 - inner_t0
         passed = keep & (aim < 1.0) & ~landed
-        doubtful = keep & ~passed & (room < 0.9) & (old.doubts < _MAX_DOUBTS) & ~landed
+        doubtful = keep & ~passed & (factor < 0.9) & (old.doubts < _MAX_DOUBTS)
         accept = keep & ~passed & ~doubtful
         accept = once(jnp.where(accept, 1.0, jnp.zeros_like(length)), unit_of(length)) > 0.5
         landed = landed & accept
@@ -120,15 +128,21 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
         shortest = jnp.maximum(4.0 * float(jnp.finfo(length.dtype).eps) * jnp.abs(t0), _SHORTEST * length)
         unlimited = proposed > _UNLIMITED * length
         usual = jnp.where(accept & ~unlimited, proposed, old.usual)
-        step = jnp.minimum(proposed, jnp.clip(0.9 * room, 0.2, 10.0) * length)
+        step = jnp.minimum(proposed, jnp.clip(0.9 * factor, 0.2, 10.0) * length)
         # A step that failed by little still knows where the event is.
         near = proposed > _MILD * length
         step = jnp.where(keep, step, jnp.where(near, jnp.minimum(proposed, aim * length), proposed))
         # Just in front of an event, go straight to it.
-        step = jnp.where(accept & (aim - 1.0 < _CLOSE), jnp.minimum(step, (aim - 1.0) * length), step)
+        ahead = (aim - 1.0) * length
+        close = accept & ~landed & (aim - 1.0 < _CLOSE) & (ahead < step)
+        step = jnp.where(close, ahead, step)
         step = jnp.where(landed, usual, step)
         step = jnp.where(passed, jnp.maximum(aim * length, shortest), step)
         next_t0 = jnp.where(accept, t1, t0)
+        next_t1 = next_t0 + step
+        if self.times is not None:
+            next_t1 = end_at(self.times, next_t0, next_t1, stretch=~(close | passed))
+            jump = jump | is_one_of(self.times, next_t0)
         state = _ControllerState(
             jtu.tree_map(lambda a, b: jnp.where(accept | ~keep, a, b), inner, old.inner),
             _constant(usual),
@@ -138,4 +152,4 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
         ended = cast(dfx.RESULTS, dfx.RESULTS.where(landed, dfx.RESULTS.successful, result))
         ended = dfx.RESULTS.where(trouble == ACCUMULATION, dfx.RESULTS.dt_min_reached, ended)
         ended = dfx.RESULTS.where(trouble == TOO_MANY, dfx.RESULTS.max_steps_reached, ended)
-        return accept, next_t0, _constant(next_t0 + step), landed | jump, state, ended
+        return accept, next_t0, _constant(next_t1), landed | jump, state, ended

@@ -1,6 +1,7 @@
 """A solver wrapper that makes events non-terminating."""
 
 from collections.abc import Callable
+from functools import reduce
 from typing import Any, ClassVar, cast
 
 import diffrax as dfx
@@ -10,16 +11,17 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ..numerics import first_root, is_one_of, once, unit_of, watch
+from ..numerics import first_root, is_one_of, once, scan_guards, unit_of
 from ._event_state import ACCUMULATION, NO_TROUBLE, TOO_MANY, EventLog, EventState, write
 from ._projected import projected
 
 # How far beside the root a step may end, as a fraction of the last steps; from there the state is carried to the root,
 # with an error of the third power of that distance.
 _LANDING = 1e-5
-# Where a step is to end if conditions have to hold after it, in landing distances behind the root: in front of it is no
-# motion after the event. A slip that begins without a jump of the force touches rest there, and would end again.
-_BEYOND = 0.3
+# Where a step is to end if conditions have to hold after it, in landing distances behind the root, and at most this part
+# of what is left of the step: in front of it is no motion after the event. A slip that begins touches rest there, and
+# would end again.
+_BEYOND, _BEYOND_OF_REST = 0.3, 0.5
 # What the step and the jump measure of the way to a root may differ by this factor.
 _LATITUDE = 4.0
 # A step this much shorter than the last ones has no length.
@@ -31,6 +33,8 @@ _ACCUMULATION = 1e-3
 _FORGET = 0.25
 # A step counts as no longer than this many of those before it.
 _GROW = 2.0
+# Rounding units in a guard, of its largest magnitude since the last event.
+_ROUNDING = 1e3
 # Events that few do not accumulate.
 _FEWEST = 8
 
@@ -108,10 +112,13 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
       call is exact.
     - *With `insist`* all guards are armed at all times: one that is violated at the start fires at once, and one that
       its own reset leaves violated fires again and again, until the events accumulate.
-    - *Within a step* a guard is the cubic through its values at 0, 1/3, 2/3 (from dense output) and 1. A crossing and
-      its return inside one step are found if the cubic sees them. A step whose cubic share is large is made smaller
-      (up to twelve times), so that guards that vary within a step are resolved, but a guard may still do between four
-      points what no cubic does: a spike there is missed.
+    - *Within a step* a guard is the cubic through its values at 0, 1/3, 2/3 (from dense output) and 1. Its value at 1/2
+      tells the error of the cubic, and a step in which error or cubic share are not small beside the variation of the
+      guard and its distance from zero is made smaller (up to twelve times, which is where a guard that jumps is taken
+      as it is). So a guard that is smooth on the scale of the steps is resolved to `rtol` where it comes near to zero,
+      whether or not anything that is integrated moves. What remains undetectable is what happens between the five
+      points and shows at none of them: a spike in a guard that was at rest before. Let a step end there (`dtmax`, or
+      `times` of the controller).
 
     The event is located on steps of the solver, not on its dense output: a step that passes a root is
     rejected and ends on it. The saved value at an event, and at t1 if that is one, is the one after the reset.
@@ -140,6 +147,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
       of the step gets `args` as they are.
     - `jumps`: times at which fields and guards jump, increasing, shape `[n]`. The controller must end steps there; then
       `reset` is called, with no guard marked, and what it changes of the modes is an event.
+    - `rtol`: the part of its largest magnitude since the last event by which a guard may fall below zero, and return, unseen.
     - `max_events`: limit of the number of events, > 0, and length of the log.
     - `log`: whether the state carries an `EventLog`.
 
@@ -163,6 +171,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     project: Callable[..., Any] | None = None
     pin: Callable[..., Any] | None = None
     jumps: Float[Array, " n"] | None = None
+    rtol: Any = 1e-6
     insist: bool = eqx.field(default=False, static=True)
     max_events: int = eqx.field(default=128, static=True)
     log: bool = eqx.field(default=True, static=True)
@@ -207,7 +216,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         y0, mode = jtu.tree_map(_real, (y0, mode))
         zero = jnp.zeros((), jnp.result_type(t0, *jtu.tree_leaves(y0)))
         t0 = jnp.asarray(t0, zero.dtype)
-        state = EventState(y0, mode, t0, zero, zero, zero, None, zero, zero, zero, zero, zero + 1.0, zero + 1.0)
+        one = zero + 1.0
+        state = EventState(y0, mode, t0, zero, zero, zero, None, zero, zero, zero, zero, zero, zero, one, one)
         guard = self._guards(t0, state, args)
         log = None
         if self.log:
@@ -218,7 +228,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             pair = jtu.tree_map(rows, (y0, mode))
             log = EventLog(jnp.full(self.max_events, jnp.inf, zero.dtype), rows(guard), pair, pair)
         ready = jnp.ones_like(guard) if self.insist else jnp.where(guard > 0, 1.0, jnp.zeros_like(guard))
-        return state._replace(fired=jnp.zeros_like(guard), log=log, guard=guard, armed=ready)
+        return state._replace(fired=jnp.zeros_like(guard), log=log, guard=guard, armed=ready, size=jnp.abs(guard))
 
     def _guards(self, t: Any, state: EventState, args: PyTree) -> Float[Array, " guards"]:
         return jnp.asarray(self.guards(t, state, args))
@@ -244,25 +254,30 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         if self.project is not None:
             y1, error = projected(y1, error, self.project(t1, y0._replace(y=y1), args).y)
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
-        t_one, t_two = t0 + (t1 - t0) / 3.0, t0 + (t1 - t0) * (2.0 / 3.0)
-        inside = [self._guards(t, y0._replace(y=path.evaluate(t)), args) for t in (t_one, t_two)]
+        places = [t0 + (t1 - t0) * part for part in (1 / 3, 1 / 2, 2 / 3)]
+        inside = [self._guards(t, y0._replace(y=path.evaluate(t)), args) for t in places]
         end = self._guards(t1, y0._replace(y=y1), args)
         unit = unit_of(_constant(t1 - t0))
-        one, two, end = once(_constant((*inside, end)), unit)
-        seen = watch((y0.guard, one, two, end), y0.armed > 0.5, unit)
-
+        one, middle, two, end = once(_constant((*inside, end)), unit)
+        size = reduce(jnp.maximum, (y0.size, jnp.abs(one), jnp.abs(middle), jnp.abs(two), jnp.abs(end)))
+        least = jnp.maximum(_constant(self.rtol), _ROUNDING * float(jnp.finfo(end.dtype).eps)).astype(end.dtype)
         # Around t0 = 0 the resolution of time is that of the step itself.
         length = _constant(t1 - t0)
         resolution = 4.0 * float(jnp.finfo(length.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+        blur = _constant(resolution) / jnp.where(length > 0, length, 1.0)
+        seen = scan_guards((y0.guard, one, two, end), middle, y0.armed > 0.5, least * size, blur, unit)
         # Where nothing moves steps grow without measure, and tell nothing of the motion that the event begins.
         measure = jnp.minimum(length, _GROW * pace)
         near = jnp.maximum(_LANDING * jnp.maximum(measure, pace), _constant(resolution))
+        beyond = _BEYOND * near / jnp.where(length > 0, length, 1.0)
         jumps = None if self.jumps is None else is_one_of(self.jumps, t1) & (length > 0)
         if jumps is not None:  # an event before a jump is not one with it
             near = jnp.where(jumps, _constant(resolution), near)
         near = near / jnp.where(length > 0, length, 1.0)
         shortest = jnp.maximum(_SHORT * pace, 2.0 * _constant(resolution))
         here = seen.armed & (jnp.abs(seen.ahead) <= near)
+        if self.insist:  # in front of the root is no motion after the event
+            here = here & (end <= 0)
         # One that fires at the start of the step does so where the step is the shortest.
         here = here | (seen.crosses & (seen.root * length <= resolution) & (length <= shortest))
         passed = seen.crosses & ~here
@@ -274,20 +289,21 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         first = jnp.arange(fired.shape[0]) == jnp.argmin(jnp.where(fired, seen.ahead, jnp.inf))
         aim = jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0))
         if self.insist:
-            aim = jnp.where(missed, jnp.minimum(aim, 1.0 - near), aim) + _BEYOND * near
+            aim = aim + jnp.where(missed, jnp.minimum(beyond, _BEYOND_OF_REST * (1.0 - aim)), beyond)
         aim = once(aim, unit)
         landed = once(jnp.where(landed, 1.0, jnp.zeros_like(aim)), unit) > 0.5
         state1 = y0._replace(
             y=y1,
             guard=end,
+            size=size,
             armed=jnp.where(seen.armed, 1.0, jnp.zeros_like(end)),
             landed=jnp.where(landed, 1.0, jnp.zeros_like(aim)),
-            aim=aim,
-            room=once(jnp.cbrt(jnp.min(seen.clarity)), unit),
+            next_root=aim,
+            step_factor=once(jnp.min(jnp.where(fired, seen.landing_factor, seen.step_factor)), unit),
         )
         happens = landed if jumps is None else landed | (jumps & ~missed)
         if jumps is not None:  # what was in sight is no more, and the root of one that fires with a jump is the jump
-            state1 = state1._replace(aim=jnp.where(jumps & ~missed, jnp.inf, aim))
+            state1 = state1._replace(next_root=jnp.where(jumps & ~missed, jnp.inf, aim))
             near = jnp.where(jumps, 0.0, near)
         state1 = jax.lax.cond(
             happens,
@@ -324,9 +340,9 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
 
         way, rate, before = _to_root(field, guard, t, state, near)
         t_event, before = t + way, before._replace(y=once(before.y, unit))
-        since = jnp.where(state.events == 0, t_event - state.t, jnp.maximum(t_event - state.t, _FORGET * state.spread))
+        since = jnp.where(state.resets == 0, t_event - state.t, jnp.maximum(t_event - state.t, _FORGET * state.spread))
         spread = _constant(since)
-        dense = _accumulates(spread, _constant(t_event), begin) & (state.events >= _FEWEST)
+        dense = _accumulates(spread, _constant(t_event), begin) & (state.resets >= _FEWEST)
 
         after = self.reset(t_event, before, whole, fired)
         trouble = jnp.where(dense, jnp.asarray(ACCUMULATION, spread.dtype), NO_TROUBLE)
@@ -335,10 +351,9 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             after = jtu.tree_map(lambda a, b: jnp.where(dense, a, b), held, after)
             trouble = jnp.zeros_like(spread)
         after = after._replace(y=once(after.y, unit), mode=once(after.mode, unit))
-        events, index = state.events + 1.0, state.events
-        if self.jumps is not None:  # one at which nothing changes is no event
-            happened = jnp.any(fired) | _differ(before.mode, after.mode)
-            events, index = jnp.where(happened, events, index), jnp.where(happened, index, -1.0)
+        # A reset that changes nothing is no event.
+        happened = _differ((before.y, before.mode), (after.y, after.mode))
+        events, index = jnp.where(happened, state.events + 1.0, state.events), jnp.where(happened, state.events, -1.0)
         trouble = jnp.where((trouble == NO_TROUBLE) & (events > self.max_events), TOO_MANY, trouble)
 
         halfway = after._replace(y=_along(after.y, -0.5 * way, field(t_event, after, whole)))
@@ -358,7 +373,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         if log is not None:
             entry = EventLog(t_event, flags, (before.y, before.mode), (after.y, after.mode))
             log = jtu.tree_map(lambda a, b: write(a, index, b), log, entry)
-        found = state._replace(
+        after_reset = state._replace(
             y=end.y,
             mode=end.mode,
             t=t_event,
@@ -368,14 +383,17 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             log=log,
             guard=_constant(values),
             armed=jnp.where(armed, 1.0, jnp.zeros_like(values)),
+            size=_constant(jnp.where(happened, jnp.abs(values), jnp.maximum(state.size, jnp.abs(values)))),
+            resets=state.resets + 1.0,
             spread=spread,
         )
         if self.jumps is None:
-            return found
+            return after_reset
+        # Samples at which nothing happens say nothing of whether events accumulate.
         return jtu.tree_map(
-            lambda a, b: jnp.where(events > state.events, a, b),
-            found,
-            state._replace(y=end.y, guard=found.guard, armed=found.armed),
+            lambda a, b: jnp.where(happened | jnp.any(fired), a, b),
+            after_reset,
+            state._replace(y=end.y, guard=after_reset.guard, armed=after_reset.armed, size=after_reset.size),
         )
 
 
@@ -392,13 +410,18 @@ def _to_root(
     rate = _constant(rate)
     rate = jnp.where(rate == 0, 1.0, rate)
     way = -height / rate
-    # A guard that a reset has violated fires where it stands; it has no root here.
-    on_root = (state.landed > 0.5) & (jnp.abs(_constant(way)) <= _LATITUDE * near)
+    # A guard that a reset has violated fires where it stands: it has no root here, or one before that reset.
+    on_root = (state.landed > 0.5) & (jnp.abs(_constant(way)) <= _LATITUDE * near) & _constant(t + way >= state.t)
     way = jnp.where(on_root, way, 0.0)
     middle = field(t + 0.5 * way, state._replace(y=_along(state.y, 0.5 * way, slope)))
     there = _along(state.y, way, middle)
     rest = jnp.where(on_root, -guard(t + way, there) / rate, 0.0)
-    return way + rest, rate, state._replace(y=_along(there, rest, middle))
+    way = way + rest
+    return (
+        jnp.where(_constant(t + way < state.t), _constant(state.t - t), way),
+        rate,
+        state._replace(y=_along(there, rest, middle)),
+    )
 
 
 def _accumulates(spread: Array, t: Array, begin: Array) -> Array:

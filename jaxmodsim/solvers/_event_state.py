@@ -30,14 +30,14 @@ class EventState(NamedTuple):
     - `y`: what the vector field integrates.
     - `mode`: what is constant between events.
     - `t`: time of the last event, or of the start.
-    - `events`: number of events so far.
+    - `events`: number of events so far: of resets that changed something.
     - `trouble`: 0; 1 where events accumulate; 2 where there were more than allowed.
     - `fired`: 1 for each guard that fired in the last event, shape `[guards]`.
     - `log`: an `EventLog`, or None.
 
-    The rest is how `EventSolver` tells `EventController` what it saw: `guard` and `armed` at this state, `spread` the
-    longest of the last intervals between events, `landed` whether the step ended
-    on an event, `aim` where the next event is or seems to be, in steps from the start of this one, `room` by
+    The rest is how `EventSolver` tells `EventController` what it saw: `guard` and `armed` at this state, `size` the
+    largest magnitude of each guard since the last event, `resets` the number of calls of `reset`, `spread` the longest of the last intervals between them, `landed` whether the step ended
+    on a root, `next_root` where the next root is or seems to be, in steps from the start of this one, `step_factor` by
     which factor the step may change before the guards are not resolved.
     """
 
@@ -50,10 +50,12 @@ class EventState(NamedTuple):
     log: EventLog | None
     guard: Float[Array, "*s guards"]
     armed: Float[Array, "*s guards"]
+    size: Float[Array, "*s guards"]
+    resets: Float[Array, "..."]
     spread: Float[Array, "..."]
     landed: Float[Array, "..."]
-    aim: Float[Array, "..."]
-    room: Float[Array, "..."]
+    next_root: Float[Array, "..."]
+    step_factor: Float[Array, "..."]
 
     def rate(self, dy: PyTree) -> "EventState":
         """What a vector field returns: `dy` for `y`, and zero for everything else, which is constant in a step."""

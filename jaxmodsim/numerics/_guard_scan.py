@@ -1,4 +1,4 @@
-"""Where functions of time that are known at four points of a step fall through zero."""
+"""Where functions of time that are known at five points of a step fall through zero, and how well that is known."""
 
 from functools import reduce
 from typing import NamedTuple
@@ -12,21 +12,30 @@ from ._once import once
 _REFINEMENTS = 4
 # A root this close to the start of a step, in steps, is at the start.
 _ZERO = 1e-3
+# Largest error of the cubic through the values at 0, 1/3, 2/3, 1 over its error at 1/2: s (s - 1/3) (s - 2/3) (s - 1)
+# is 1/81 at most, and 1/144 there.
+_LARGEST = 144 / 81
+# A step is resolved if the third difference is below these parts of the range of the values and of the headroom ...
+_CUBIC_OF_RANGE, _CUBIC_OF_HEADROOM = 0.3, 3.0
+# ... and the error of the cubic below these.
+_ERROR_OF_RANGE, _ERROR_OF_HEADROOM = 0.05, 0.3
+# Where a step ends on a root the error of the cubic is below this many of the tolerances.
+_ERROR_AT_ROOT = 10.0
 
 Numbers = Float[Array, " n"]
 Flags = Bool[Array, " n"]
 
 
-class Watch(NamedTuple):
-    """What four values of a function in a step say about it, elementwise.
+class GuardScan(NamedTuple):
+    """What five values of a function in a step say about it, elementwise.
 
     - `armed`: whether it counts as positive at some time of the step.
     - `crosses`: whether it falls through zero after it was positive or armed.
     - `root`: where it does so first, as a fraction of the step, roughly; 1 where it does not.
     - `ahead`: how far behind the end it would do so if it went on straight, or how far before the end it would have
       done so (negative), in steps; infinite where it does not fall.
-    - `clarity`: the cubic share that is allowed over the one there is: below 1 the four values say too little. The
-      share goes with the third power of the step.
+    - `step_factor`: by which factor the length of the step may change before the values say too little.
+    - `landing_factor`: the same for a step that ends on a root of the function.
     - `cubic`: the coefficients of the cubic through the values.
     """
 
@@ -34,28 +43,41 @@ class Watch(NamedTuple):
     crosses: Flags
     root: Numbers
     ahead: Numbers
-    clarity: Numbers
+    step_factor: Numbers
+    landing_factor: Numbers
     cubic: tuple[Numbers, Numbers, Numbers, Numbers]
 
 
-def watch(values: tuple[Numbers, Numbers, Numbers, Numbers], armed: Flags, unit: Float[Array, ""]) -> Watch:
-    """First fall through zero of functions known at 0, 1/3, 2/3 and 1 of a step.
+def scan_guards(
+    values: tuple[Numbers, Numbers, Numbers, Numbers],
+    middle: Numbers,
+    armed: Flags,
+    tolerance: Numbers,
+    blur: Float[Array, ""],
+    unit: Float[Array, ""],
+) -> GuardScan:
+    """First fall through zero of functions known at 0, 1/3, 1/2, 2/3 and 1 of a step.
 
-    Between the points each is the cubic through them, whose own minimum counts as a fifth point. If it is not armed, it
-    must be seen positive, or rise from zero at the start, before it can fall. The third difference of the four values,
-    the cubic's share in them, is held below 0.3 of their range and 10 times the height of the minimum: more could hide
-    a crossing.
+    Between the points each is the cubic through the first, second, fourth and fifth, whose own minimum counts as
+    another point. If it is not armed, it must be seen positive, or rise from zero at the start, before it can fall.
+
+    The value in the middle gives the error of the cubic. A step is resolved if third difference and error are small
+    beside the range of the values, so that no oscillation is taken for a slow change, and beside the headroom: the
+    least distance from zero inside the step.
 
     **Arguments:**
 
-    - `values`: at the four points, shape `[n]` each.
+    - `values`: at 0, 1/3, 2/3 and 1, shape `[n]` each.
+    - `middle`: at 1/2, shape `[n]`.
     - `armed`: whether a function counts as positive at the start, whatever its value there. If it is armed, not
       positive and does not rise, it falls at once.
+    - `tolerance`: size of what need not be seen, above rounding.
+    - `blur`: rounding error of the places in the step.
     - `unit`: a one, see `once`.
 
     **Returns:**
 
-    A `Watch`.
+    A `GuardScan`.
     """
     g0, g1, g2, g3 = values
     c1 = -5.5 * g0 + 9.0 * g1 - 4.5 * g2 + g3
@@ -74,8 +96,15 @@ def watch(values: tuple[Numbers, Numbers, Numbers, Numbers], armed: Flags, unit:
     # Points in the order of time, the minimum among them; the first one below zero closes the bracket.
     rises = (c1 > 0) & (g0 >= -_ZERO * c1)
     high1 = armed | rises
-    high2, high3 = high1 | (g1 > 0), high1 | (g1 > 0) | (g2 > 0)
-    dips = inside & (bottom < 0) & jnp.where(lowest < 1 / 3, high1, jnp.where(lowest < 2 / 3, high2, high3))
+    high_middle = high1 | (g1 > 0)
+    high2 = high_middle | (middle > 0)
+    high3 = high2 | (g2 > 0)
+    high_lowest = jnp.where(
+        lowest < 1 / 3,
+        high1,
+        jnp.where(lowest < 1 / 2, high_middle, jnp.where(lowest < 2 / 3, high2, high3)),
+    )
+    dips = inside & (bottom < 0) & high_lowest
     end, low = jnp.ones_like(g0), g3
     crosses = jnp.zeros_like(armed)
     for point, value, below in (
@@ -83,12 +112,14 @@ def watch(values: tuple[Numbers, Numbers, Numbers, Numbers], armed: Flags, unit:
         (lowest, bottom, dips),
         (2 / 3, g2, high2 & (g2 < 0)),
         (lowest, bottom, dips & (lowest < 2 / 3)),
+        (1 / 2, middle, high_middle & (middle < 0)),
+        (lowest, bottom, dips & (lowest < 1 / 2)),
         (1 / 3, g1, high1 & (g1 < 0)),
         (lowest, bottom, dips & (lowest < 1 / 3)),
     ):
         end, low, crosses = jnp.where(below, point, end), jnp.where(below, value, low), crosses | below
     start, high = jnp.zeros_like(g0), g0
-    for point, value in ((1 / 3, g1), (2 / 3, g2)):
+    for point, value in ((1 / 3, g1), (1 / 2, middle), (2 / 3, g2)):
         later = (point < end) & (value > 0)
         start, high = jnp.where(later, point, start), jnp.where(later, value, high)
     # Not left of the middle: a function that rises from zero at the start has a root there that is not meant.
@@ -99,26 +130,42 @@ def watch(values: tuple[Numbers, Numbers, Numbers, Numbers], armed: Flags, unit:
 
     falls = c1 + 2.0 * c2 + 3.0 * c3
     ahead = jnp.where(falls < 0, -g3 / jnp.where(falls < 0, falls, 1.0), jnp.inf)
-    high = reduce(jnp.maximum, values)
-    low = reduce(jnp.minimum, values)
-    noise = 1e3 * float(jnp.finfo(third.dtype).eps) * jnp.maximum(jnp.abs(high), jnp.abs(low))
-    allowed = 0.3 * (high - low)
-    allowed = jnp.where(inside & (bottom > 0), jnp.minimum(allowed, 10.0 * bottom), allowed) + noise
-    size = jnp.abs(third)
-    clarity = allowed / jnp.where(size > 0, size, 1.0)
-    clarity = jnp.where(size > 0, clarity, jnp.inf)
-    return Watch(high3 | (g3 > 0), crosses, root, ahead, clarity, (g0, c1, c2, c3))
+    error = _LARGEST * jnp.abs(middle - (g0 + 0.5 * (c1 + 0.5 * (c2 + 0.5 * c3))))
+    headroom = reduce(jnp.minimum, (jnp.abs(g1), jnp.abs(middle), jnp.abs(g2)))
+    headroom = jnp.where(inside & (bottom > 0), jnp.minimum(headroom, bottom), headroom)
+    everything = (*values, middle)
+    high, low = reduce(jnp.maximum, everything), reduce(jnp.minimum, everything)
+    spread = high - low
+    tolerance = tolerance + blur * spread
+    cubic = jnp.cbrt(
+        _ratio(jnp.minimum(_CUBIC_OF_RANGE * spread, _CUBIC_OF_HEADROOM * headroom) + tolerance, jnp.abs(third))
+    )
+    quartic = _ratio(jnp.minimum(_ERROR_OF_RANGE * spread, _ERROR_OF_HEADROOM * headroom) + tolerance, error)
+    landing = _ratio(_ERROR_AT_ROOT * tolerance, error)
+    return GuardScan(
+        high3 | (g3 > 0),
+        crosses,
+        root,
+        ahead,
+        jnp.minimum(cubic, jnp.sqrt(jnp.sqrt(quartic))),
+        jnp.sqrt(jnp.sqrt(landing)),
+        (g0, c1, c2, c3),
+    )
 
 
-def first_root(watched: Watch, passed: Flags) -> Float[Array, ""]:
+def _ratio(allowed: Numbers, size: Numbers) -> Numbers:
+    return jnp.where(size > 0, allowed / jnp.where(size > 0, size, 1.0), jnp.inf)
+
+
+def first_root(scan: GuardScan, passed: Flags) -> Float[Array, ""]:
     """The earliest root in a step among the functions that `passed` marks; 1 if it marks none.
 
     Which function is the first is judged by the rough roots; its own is then refined by Newton's iteration.
     """
-    rough = jnp.where(passed, watched.root, 1.0)
+    rough = jnp.where(passed, scan.root, 1.0)
     first = jnp.min(rough)
     only = jnp.arange(rough.shape[0]) == jnp.argmin(rough)  # one, also where several are equal
-    c0, c1, c2, c3 = (jnp.max(jnp.where(only, c, -jnp.inf)) for c in watched.cubic)
+    c0, c1, c2, c3 = (jnp.max(jnp.where(only, c, -jnp.inf)) for c in scan.cubic)
     root = first
     for _ in range(_REFINEMENTS):
         slope = c1 + root * (2.0 * c2 + root * 3.0 * c3)
