@@ -17,11 +17,6 @@ def tune_cpu(while_loop_bytes: int = 1_000_000) -> None:
     dispatch on CPU (`jax_cpu_enable_async_dispatch`), whose hand-over to another thread costs more than a short
     run takes. Nothing in the library calls this for you, except the command line.
 
-    Reverse-mode gradients of runs of more than about 150 steps of `Rodas5P` lose digits under this option, where
-    diffrax computes steps again from a checkpoint (jaxlib 0.10.2): 5e-8 of them at 350 steps, 5e-7 at 830. Forward
-    mode does not, nor does `adjoint=diffrax.RecursiveCheckpointAdjoint(checkpoints=n)` with n above the number of
-    steps.
-
     **Arguments:**
 
     - `while_loop_bytes`: loops with buffers up to this size are compiled as one function [bytes], > 0.

@@ -36,6 +36,9 @@ _LOOSER, _FALL = 1e3, 30.0
 _KNOWN = 4.0
 # Magnitude of an observable below which errors are relative to this instead.
 _SMALLEST = 1e-6
+# In stick nothing that is integrated moves, and methods that are left to themselves make the same steps. Those of the
+# second one are no longer than this part of the run, so that it looks at the loads in other places.
+_PART = 127.0
 # Saved times that are too few to show magnitudes and chaos, and how many do.
 _FEW, _TIMES = 11, 101
 
@@ -104,6 +107,9 @@ class _Search:
         arrays, rest = eqx.partition(solver, eqx.is_array)
         plugins = (arrays, None if problem.plugins is None else problem.plugins[1])
         problem = problem._replace(rtol=np.asarray(rtol, dtype), atol=np.asarray(atol, dtype), plugins=plugins)
+        if which == 1 and problem.scene.exact:
+            longest = np.asarray(problem.t1 - problem.t0, dtype) / _PART
+            problem = problem._replace(dtmax=longest if problem.dtmax is None else np.minimum(problem.dtmax, longest))
         options = replace(self.options, solver=rest)
         solved = solve(problem, options)
         _check_known(solved)
@@ -209,13 +215,14 @@ def _solvers(problem: Problem, options: Options) -> tuple[tuple[dfx.AbstractSolv
     """Two methods, and which of them may be chosen.
 
     Where nothing is stiff a method of order 8 is cheaper at tight tolerances. Of stiff scenes all other methods at hand
-    take far more work, so that one of them serves as a check only; so does any beside a method that was given.
+    take far more work, so that one of them serves as a check only; so does one of bounded steps in scenes with events,
+    and any beside a method that was given.
     """
     default = default_solver(problem.scene, problem.q0.shape[0], False)
     stiff = any(effect.stiff for effect in problem.scene.effects)
     other = dfx.Kvaerno5() if stiff else dfx.Dopri8()
     if options.solver is None:
-        return (default, other), (0,) if stiff else (0, 1)
+        return (default, other), (0,) if stiff or problem.scene.exact else (0, 1)
     given = eqx.combine(options.solver, problem.plugins[0])
     if not isinstance(given, dfx.AbstractAdaptiveSolver):
         raise ValueError(

@@ -66,16 +66,19 @@ def simulate(
       let it lie below the smallest velocity [m/s] and deflection [m] that decide anything. Above the width of a
       `Regularized` law it is refused.
     - `dt`: fixed step [s], > 0, instead of tolerances. A sample of a `Signal` in between divides the step.
-    - `dtmax`: longest step [s], > 0. In stick nothing moves and steps grow, so that a load that comes in short pulses
-      can be stepped over: bound the step by the length of a pulse. Where that shows at a saved time, the run fails.
+    - `dtmax`: longest step [s], > 0. Steps resolve the load of what sticks to `rtol` of its limit, as long as the load
+      is smooth on the scale of its own derivatives. What cannot be seen is a pulse out of rest that is shorter than a
+      step: give it as a `Signal`, on whose samples steps end, or bound the step by its length. Where a missed pulse
+      shows at a saved time, the run fails.
       Derivatives are those of the steps that were made: of a run in which nothing moves, such as one that starts and
       stays in equilibrium, they need a bound, too, that resolves what would move. `check_gradients` tells.
     - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`) or, on one
       coordinate, runs by events (set-valued laws); `diffrax.Tsit5` otherwise. `ImplicitFriction` for fixed steps that
       may be too long for the stiffness of friction.
-    - `adjoint`: how diffrax differentiates the run. By default for reverse mode (`jax.grad`); pass
-      `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`.
-    - `max_steps`: limit of the number of steps.
+    - `adjoint`: how diffrax differentiates the run. By default for reverse mode (`jax.grad`), by
+      `diffrax.RecursiveCheckpointAdjoint(checkpoints=max_steps)`, which keeps the state before each step; with fewer
+      checkpoints derivatives through events lose digits. Pass `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`.
+    - `max_steps`: limit of the number of steps. In reverse mode memory is set aside for the state before each of them.
     - `max_events`: limit of the number of instants at which set-valued laws change modes. Inside `jax.jit`
       `run.events` has as many entries for each such law, so a smaller one is faster there.
     - `hold_chatter`: whether an element whose mode changes accumulate is held in stick, with whatever force that takes,
@@ -87,8 +90,9 @@ def simulate(
       is kept. Likewise for an accuracy that is not reached, of which `run.accuracy.remark` says why.
     - `accuracy`: largest error of `observable`, from 1e-12 to 0.1, instead of `rtol`, `atol` and `dt`. Solver and
       tolerances are searched for, by about ten runs of two methods, so that numbers must be known (not traced): the
-      run with the least work is taken whose difference to tighter runs by either method is within the accuracy. What
-      steps over a short pulse in all of them is not seen: `dtmax`.
+      run with the least work is taken whose difference to tighter runs by either method is within the accuracy. In
+      scenes with events the second method makes steps of at most 1/127 of the run, so that the two look at different
+      places. What steps over a short pulse in all of them is not seen: `dtmax`.
       `run.accuracy` reports it, and `run.accuracy.options` are the arguments for more such runs. With `solver` given
       the tolerances alone are chosen. Errors are relative to the largest magnitude of the observable at the saved
       times (of fewer than 11, at 101 times along the run), or to 1e-6 of its unit where it stays below that.

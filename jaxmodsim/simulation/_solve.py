@@ -179,7 +179,9 @@ def _controller(problem: Problem, solver: dfx.AbstractSolver) -> dfx.AbstractSte
 def _plugins(problem: Problem, options: Options) -> tuple[Any, Any]:
     """Solver and adjoint: those that were given, or the defaults."""
     solver = default_solver(problem.scene, problem.q0.shape[0], problem.dt is not None)
-    adjoint = dfx.RecursiveCheckpointAdjoint()
+    # With fewer checkpoints than steps, steps are made again from states that differ by rounding from those of the run,
+    # which events and error control enlarge: derivatives lose half of their digits, or all but two.
+    adjoint = dfx.RecursiveCheckpointAdjoint(checkpoints=options.max_steps)
     if options.solver is not None:
         solver = eqx.combine(options.solver, problem.plugins[0])
     if options.adjoint is not None:

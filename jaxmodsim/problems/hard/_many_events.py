@@ -126,7 +126,6 @@ def _shrinking_swing() -> HardCase:
         # At the last turn an error of its time, 1e-4 s of 321 s, is seen in the derivative alone.
         tolerance=1e-5,
         single=1e-2,
-        leaves={"reverse": "recomputed from checkpoints over so many steps it is 3 % off; `forward` is right"},
     )
 
 
