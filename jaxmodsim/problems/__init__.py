@@ -67,6 +67,7 @@ from ._pendulum import spherical_pendulum_reaction as spherical_pendulum_reactio
 from ._piecewise import LinearStickSlip as LinearStickSlip
 from ._piecewise import StickSlipMotion as StickSlipMotion
 from ._piecewise import stick_slip_motion as stick_slip_motion
+from ._piecewise_scene import linear_stick_slip as linear_stick_slip
 from ._pulled_box import PULLED_BOX as PULLED_BOX
 from ._pulled_box import PULLED_BOX_LUGRE as PULLED_BOX_LUGRE
 from ._pulled_box import pulled_box as pulled_box

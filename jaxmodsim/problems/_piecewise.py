@@ -1,9 +1,9 @@
 """Reference for systems that are linear between stick-slip events: matrix exponentials in NumPy, without JAX.
 
 `M q'' + C q' + K q = L w(t) - D^T f` with dry friction forces f along the rows of D. In each combination of stick and
-slip the system is linear, and the loads w(t) (polynomials, harmonics, harmonics that grow in proportion to time, and one
-sampled signal) obey a linear differential equation of their own. State and loads together are therefore propagated by
-matrix exponentials, which are exact but for rounding.
+slip the system is linear, and the loads w(t) (polynomials, harmonics, harmonics that grow with time, a sampled signal)
+obey a linear differential equation of their own. State and loads together are therefore propagated by matrix
+exponentials, which are exact but for rounding.
 """
 
 import math
@@ -21,8 +21,8 @@ _PER_PERIOD, _PER_RUN = 64, 2000
 _CHUNK, _TERMS = 64, 20
 # Points at which a guard is looked at within a grid step that may hold an event.
 _FINE = 64
-# What is zero to rounding, relative to the limits of friction or to the velocities there are.
-_ZERO = 1e-9
+# What is zero to rounding, relative to the limits of friction; slip velocities relative to the largest.
+_ZERO, _STILL = 1e-9, 1e-12
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,9 @@ class StickSlipMotion:
     - `modes`: modes from t0 and from each of these instants on, shape `[1 + instants, m]`; 0 in stick, else the sign of
       the slip velocity.
     - `margin`: how far the run is from one with other events: the smallest distance from its limit, over the limit, of
-      a force in stick that has an extremum near it (on either side) or that must hold an element at the end of its slip;
-      the smallest slip velocity, over the largest, at which an element turns without coming to rest.
-    - `spacing`: shortest time between two instants, and between an instant and t0, a sample or t1 [s].
+      a force in stick that has an extremum near it (on either side) or must hold an element at the end of its slip; the
+      smallest slip velocity, over the largest, at which an element turns without coming to rest.
+    - `spacing`: shortest time between two instants, and between an instant and t0 or t1 [s].
     """
 
     q: np.ndarray
@@ -207,8 +207,12 @@ def _first_crossing(coefficients: np.ndarray, length: float) -> float | None:
         return None
     i = int(np.argmax(values[1:] < 0)) + 1
     low, high = at[i - 1], at[i]
-    if i == 1 and _polynomial(coefficients, 0.5 * high) < 0 and values[0] <= abs(values[1]):
-        raise ArithmeticError("A mode that was found consistent is left at once.")
+    if i == 1 and values[0] < _ZERO * np.abs(values).max():
+        # From zero the guard rises first.
+        rising = [s for s in high * 0.5 ** np.arange(1, 30) if _polynomial(coefficients, s) > 0]
+        if not rising:
+            raise ArithmeticError("A mode that was found consistent is left at once.")
+        low = rising[0]
     for _ in range(80):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if _polynomial(coefficients, middle) < 0 else (middle, high)
@@ -235,16 +239,16 @@ class _Run:
             self.known[sigma] = _Mode(self.system, sigma, self.step)
         return self.known[sigma]
 
-    def next_mode(self, x: np.ndarray, before: np.ndarray | None) -> _Mode:
+    def next_mode(self, x: np.ndarray, before: _Mode | None) -> _Mode:
         """The modes from this state on: of those that are consistent one with the most elements in stick.
 
         Without stiction all of them give the same motion. Where they differ by elements at their limit that others keep
         from moving, the one is taken that is furthest from its limits.
         """
         slip = self.mode((0,) * len(self.system.Fs)).slip @ x
-        still = np.abs(slip) <= _ZERO * np.maximum(self.slip_scale, 1e-12)
+        still = np.abs(slip) <= _STILL * np.maximum(self.slip_scale, self.acceleration_scale * self.step)
         if before is not None:
-            still |= before == 0
+            still |= before.stick | before.held
         choices = [(0, 1, -1) if s else (int(np.sign(v)),) for s, v in zip(still, slip, strict=True)]
         best, found = (-1, -math.inf), None
         for sigma in sorted(product(*choices), key=lambda each: -each.count(0)):
@@ -397,14 +401,14 @@ def stick_slip_motion(
     mode = run.next_mode(x, None)
     x = _stop_slip(system, mode, x)
     stops = [s for s in system.sample_times if t0 < s < t1] + [float(t1)]
-    times, modes, near = [], [mode.mode], [t0]
+    times, modes = [], [mode.mode]
     for stop in stops:
         while t < stop:
             x, t, fired = run.advance(mode, x, t, stop)
             if t == t1:
                 break
             x = np.concatenate([x[: 2 * n], system.loads(t)])
-            after = run.next_mode(x, mode.mode)
+            after = run.next_mode(x, mode)
             if fired is not None and not mode.stick[fired] and not mode.held[fired]:
                 run.note_stop(x, fired, after)
             if (after.mode != mode.mode).any():
@@ -413,12 +417,9 @@ def stick_slip_motion(
             if len(times) > max_events:
                 raise ArithmeticError(f"There are more than {max_events} events by t = {t}.")
             mode, x = after, _stop_slip(system, after, x)
-        near.append(stop)
     turns = [d / run.slip_scale[i] for i, d in run.turns if math.isfinite(d) and run.slip_scale[i] > 0]
     instants = np.array(times)
-    # An event that a sample brings about is at the sample, not near it.
-    ends = np.concatenate([np.diff(instants), *(np.abs(instants - s) for s in near)])
-    spacing = float(np.min(ends[ends > 0], initial=math.inf))
+    spacing = float(np.min(np.diff([t0, *instants, t1]), initial=math.inf))
     return StickSlipMotion(
         x[:n], x[n : 2 * n], run.scale[:n], run.scale[n:], instants, np.array(modes), min([run.force_margin, *turns]),
         spacing,
