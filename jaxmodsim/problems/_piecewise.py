@@ -21,8 +21,9 @@ _PER_PERIOD, _PER_RUN = 64, 2000
 _CHUNK, _TERMS = 64, 20
 # Points at which a guard is looked at within a grid step that may hold an event.
 _FINE = 64
-# What is zero to rounding, relative to the limits of friction; slip velocities relative to the largest.
-_ZERO, _STILL = 1e-9, 1e-12
+# What is zero to rounding, relative to the limits of friction; slip velocities relative to the largest; and how far
+# guards have to pass zero.
+_ZERO, _STILL, _ROUNDING = 1e-9, 1e-12, 1e-14
 
 
 @dataclass(frozen=True)
@@ -209,10 +210,7 @@ def _first_crossing(coefficients: np.ndarray, length: float) -> float | None:
     low, high = at[i - 1], at[i]
     if i == 1 and values[0] < _ZERO * np.abs(values).max():
         # From zero the guard rises first.
-        rising = [s for s in high * 0.5 ** np.arange(1, 30) if _polynomial(coefficients, s) > 0]
-        if not rising:
-            raise ArithmeticError("A mode that was found consistent is left at once.")
-        low = rising[0]
+        low = next((s for s in high * 0.5 ** np.arange(1, 30) if _polynomial(coefficients, s) > 0), low)
     for _ in range(80):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if _polynomial(coefficients, middle) < 0 else (middle, high)
@@ -246,7 +244,7 @@ class _Run:
         from moving, the one is taken that is furthest from its limits.
         """
         slip = self.mode((0,) * len(self.system.Fs)).slip @ x
-        still = np.abs(slip) <= _STILL * np.maximum(self.slip_scale, self.acceleration_scale * self.step)
+        still = np.abs(slip) <= self.still_slip
         if before is not None:
             still |= before.stick | before.held
         choices = [(0, 1, -1) if s else (int(np.sign(v)),) for s, v in zip(still, slip, strict=True)]
@@ -285,6 +283,11 @@ class _Run:
         """Accelerations that the elements' limits give [m/s^2]."""
         rows = self.system.directions
         return np.sum(rows @ np.linalg.inv(self.system.mass) * rows, axis=1) * self.system.Fs
+
+    @property
+    def still_slip(self) -> np.ndarray:
+        """Slip velocities that are none [m/s]."""
+        return _STILL * np.maximum(self.slip_scale, self.acceleration_scale * self.step)
 
     def advance(self, mode: _Mode, x: np.ndarray, t: float, stop: float) -> tuple[np.ndarray, float, int | None]:
         """To the first event before `stop`, or there; returns state, time and the element of the event."""
@@ -330,7 +333,8 @@ class _Run:
         series, found = mode.series(x), []
         for row, i in zip(mode.guards, mode.of, strict=True):
             guard = series @ row
-            s = _first_crossing(guard, length)
+            level = self.system.Fs[i] if mode.stick[i] else self.still_slip[i] / _STILL
+            s = _first_crossing(guard + np.eye(1, _TERMS)[0] * _ROUNDING * level, length)
             if s is not None:
                 found.append((s, int(i), row))
                 continue
@@ -401,7 +405,7 @@ def stick_slip_motion(
     mode = run.next_mode(x, None)
     x = _stop_slip(system, mode, x)
     stops = [s for s in system.sample_times if t0 < s < t1] + [float(t1)]
-    times, modes = [], [mode.mode]
+    times, modes, passes = [], [mode.mode], 0
     for stop in stops:
         while t < stop:
             x, t, fired = run.advance(mode, x, t, stop)
@@ -414,7 +418,8 @@ def stick_slip_motion(
             if (after.mode != mode.mode).any():
                 times.append(t)
                 modes.append(after.mode)
-            if len(times) > max_events:
+            passes += 1
+            if passes > max_events + len(stops):
                 raise ArithmeticError(f"There are more than {max_events} events by t = {t}.")
             mode, x = after, _stop_slip(system, after, x)
     turns = [d / run.slip_scale[i] for i, d in run.turns if math.isfinite(d) and run.slip_scale[i] > 0]
