@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import jaxmodsim as jms
 from jaxmodsim.problems import LinearStickSlip, StickSlipMotion, linear_stick_slip, stick_slip_motion
 
 MARGIN, SPACING = 1e-4, 1e-4
@@ -80,8 +79,8 @@ def system(
     surface = np.zeros((len(rows), count))
     if belt is not None:
         surface[:, : np.shape(belt)[1]] = belt
-    matrices = [x * np.eye(n) if np.ndim(x) == 0 else np.asarray(x, float) for x in (mass, damping, stiffness)]
-    return LinearStickSlip(*matrices, rows, limits[:, 0], limits[:, 1], np.array(frequencies), full, surface)
+    M, C, K = (x * np.eye(n) if np.ndim(x) == 0 else np.asarray(x, float) for x in (mass, damping, stiffness))
+    return LinearStickSlip(M, C, K, rows, limits[:, 0], limits[:, 1], np.array(frequencies), full, surface)
 
 
 def harmonic(amplitude: float, growth: float, phase: float) -> np.ndarray:
@@ -274,7 +273,3 @@ def draw_family(name: str, count: int, seed: int = 0) -> Family:
     """`count` well-conditioned members of a family."""
     one, options = FAMILIES[name]
     return _draw(name, one, seed, count, **options)
-
-
-def run(scene: Any, q0: jax.Array, qd0: jax.Array, t1: jax.Array) -> jms.Trajectory:
-    return jms.simulate(scene, q0, qd0, t1, max_events=512, throw=False)

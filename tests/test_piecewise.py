@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 from jaxmodsim.problems import LinearStickSlip, stick_slip_motion
 
@@ -103,7 +103,7 @@ def integrate(system: LinearStickSlip, t1: float) -> tuple[float, int]:
             if not any(over[1:]):
                 return offset + belt_position(system, t1), events
             i = max(over.index(True), 1)
-            t = brentq(lambda s: abs(force(s)) - Fs, times[i - 1], times[i], xtol=1e-14)
+            t = float(root_scalar(lambda s: abs(force(s)) - Fs, bracket=(times[i - 1], times[i]), xtol=1e-14).root)
             q, v, mode = offset + belt_position(system, t), belt(t), int(np.sign(force(times[i])))
         else:
             sign, start = mode, t + 1e-6

@@ -109,7 +109,7 @@ def test_elements_that_change_at_one_instant_count_each(name: str) -> None:
 
     def count(scene: Any, q0: Any, qd0: Any, t1: Any) -> Any:
         events = jms.simulate(scene, q0, qd0, t1, max_events=512, throw=False).events
-        return np.isfinite(1.0) * (events.effect >= 0).sum()
+        return (events.effect >= 0).sum()
 
     found = np.asarray(eqx.filter_jit(jax.vmap(count))(scenes, q0, qd0, t1))
     np.testing.assert_array_equal(found, [each.motion.num_events for each in family.members])
