@@ -36,13 +36,11 @@ class Family:
     """Members whose scenes have one structure.
 
     - `left_out`: number of members that were drawn and left out as ill-conditioned.
-    - `counts`: whether the number of events is unique.
     """
 
     name: str
     members: list[Member]
     left_out: int
-    counts: bool = True
 
     @property
     def batch(self) -> tuple[Any, jax.Array, jax.Array, jax.Array]:
@@ -153,17 +151,29 @@ def belt(rng: np.random.Generator) -> Drawn:
     return drawn, np.zeros(1), np.array([b0]), rng.uniform(4.0, 12.0)
 
 
-def chain(rng: np.random.Generator) -> Drawn:
-    """Three masses in a row with friction on the ground and between neighbours; a force shakes the first one."""
-    limits, w = np.stack([limit(rng, False) * s for s in (1, 1, 1, 0.7, 0.7)]), decades(rng, 0.5, 4.0)
-    k = w**2 * rng.uniform(0.3, 3.0, 3)
-    stiffness = np.array([[k[0] + k[1], -k[1], 0.0], [-k[1], k[1] + k[2], -k[2]], [0.0, -k[2], k[2]]])
-    wave = harmonic(rng.uniform(2.0, 6.0), rng.uniform(0.0, 0.1), rng.uniform(0.0, 2.0 * math.pi))
-    load = np.zeros((3, 7))
-    load[0, 3:], load[2, 0] = wave, rng.uniform(-0.4, 0.4)
-    rows = [[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 1, 0], [0, -1, 1]]
-    drawn = system(load, limits, [w], mass=np.diag(rng.uniform(0.7, 1.5, 3)), stiffness=stiffness, directions=rows)
-    return at_rest(drawn, rng.uniform(1.0, 2.0) * 2.0 * math.pi / w)
+def shaken_row(directions: list[list[int]]) -> Draw:
+    """Three masses in a row, on springs; the elements act without stiction, and a force shakes the first mass."""
+
+    def draw(rng: np.random.Generator) -> Drawn:
+        rows = np.array(directions, float)
+        limits = np.stack([limit(rng, False) * (0.7 if len(rows) > 3 and i > 2 else 1.0) for i in range(len(rows))])
+        w = decades(rng, 0.5, 4.0)
+        k = w**2 * rng.uniform(0.3, 3.0, 3)
+        stiffness = np.array([[k[0] + k[1], -k[1], 0.0], [-k[1], k[1] + k[2], -k[2]], [0.0, -k[2], k[2]]])
+        load = np.zeros((3, 7))
+        load[0, 3:] = harmonic(rng.uniform(2.0, 6.0), rng.uniform(0.0, 0.1), rng.uniform(0.0, 2.0 * math.pi))
+        load[2, 0] = rng.uniform(-0.4, 0.4)
+        mass = np.diag(rng.uniform(0.7, 1.5, 3))
+        drawn = system(load, limits, [w], mass=mass, stiffness=stiffness, directions=rows)
+        return at_rest(drawn, rng.uniform(1.0, 2.0) * 2.0 * math.pi / w)
+
+    return draw
+
+
+# Friction of the first mass on the ground, and between neighbours; or of all masses on the ground, and between
+# neighbours: then elements are redundant, and which of them hold is not unique, but the motion is.
+stack = shaken_row([[1, 0, 0], [-1, 1, 0], [0, -1, 1]])
+chain = shaken_row([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 1, 0], [0, -1, 1]])
 
 
 def together(rng: np.random.Generator) -> Drawn:
@@ -200,6 +210,10 @@ def touching(rng: np.random.Generator) -> Drawn:
     return at_rest(system(start, limits[None], [w]), rng.uniform(1.0, 4.0) * 2.0 * math.pi / w)
 
 
+# Pairs of samples.
+_PAIRS = 3
+
+
 def sampled(linear: bool) -> Draw:
     """A shaken box with a signal whose samples lie at its break-aways and near them, and away from its stops.
 
@@ -213,7 +227,7 @@ def sampled(linear: bool) -> Draw:
         load[0, -2] = 1.0
         times, values = [0.0], [0.0]
         drawn = replace(drawn, load=load, linear=linear)
-        for _ in range(_SAMPLES // 2):
+        for _ in range(_PAIRS):
             drawn = replace(drawn, sample_times=np.array(times), sample_values=np.array(values))
             motion = stick_slip_motion(drawn, q0, qd0, t1)
             leaves = [
@@ -221,15 +235,15 @@ def sampled(linear: bool) -> Draw:
                 for t, before, after in zip(motion.times, motion.modes[:-1], motion.modes[1:], strict=True)
                 if before[0] == 0 and t > times[-1] + 2e-3 * t1
             ]
-            off = rng.choice([0.0, 1e-12, 1e-9, 1e-6, 1e-3]) * rng.choice([-1.0, 1.0])
-            t, out = leaves[0] if leaves else (0.5 * (times[-1] + t1), rng.choice([-1.0, 1.0]))
+            off = rng.choice([0.0, 1e-12, 1e-9, 1e-6, 1e-3 * t1]) * rng.choice([-1.0, 1.0])
+            # Where there is none, anywhere later, which may be beyond the end.
+            t, out = leaves[0] if leaves else (times[-1] + 0.1 * t1, rng.choice([-1.0, 1.0]))
             t, out = t + off, out if abs(off) < 1e-9 else rng.choice([-1.0, 1.0])
             step = out * rng.uniform(0.02, 0.3) * Fs
+            times += [t, t + rng.uniform(0.01, 0.1) * t1]
             if linear:
-                times += [t, t + rng.uniform(0.01, 0.1) * t1]
                 values += [values[-1], values[-1] + step]
             else:
-                times += [t, t + rng.uniform(0.01, 0.1) * t1]
                 values += [values[-1] + step, values[-1] + step * rng.uniform(-0.5, 0.5)]
         drawn = replace(drawn, sample_times=np.array(times), sample_values=np.array(values))
         return drawn, q0, qd0, t1
@@ -237,10 +251,7 @@ def sampled(linear: bool) -> Draw:
     return draw
 
 
-_SAMPLES = 6
-
-
-def _draw(name: str, one: Draw, seed: int, count: int, margin: float = MARGIN, counts: bool = True) -> Family:
+def _draw(name: str, one: Draw, seed: int, count: int, margin: float = MARGIN) -> Family:
     rng, members, left_out = np.random.default_rng(seed), [], 0
     while len(members) < count:
         drawn, q0, qd0, t1 = one(rng)
@@ -249,7 +260,7 @@ def _draw(name: str, one: Draw, seed: int, count: int, margin: float = MARGIN, c
             left_out += 1
         else:
             members.append(Member(drawn, q0, qd0, t1, motion))
-    return Family(name, members, left_out, counts)
+    return Family(name, members, left_out)
 
 
 # By name: how a member is drawn, and what is special.
@@ -259,8 +270,8 @@ FAMILIES: dict[str, tuple[Draw, dict[str, Any]]] = {
     "two_elements": (two_elements, {}),
     "two_boxes": (two_boxes, {}),
     "belt": (belt, {}),
-    # Which of five elements on three coordinates hold is not unique.
-    "chain": (chain, {"counts": False}),
+    "stack": (stack, {}),
+    "chain": (chain, {}),
     "together": (together, {}),
     "slow": (slow, {}),
     "touching": (touching, {"margin": 0.99 * TOUCH}),

@@ -20,6 +20,8 @@ from .fuzz import is_deep
 from .stick_slip_families import FAMILIES, Family, Member, draw_family
 
 COUNT, DEEP = 24, 400
+# What takes minutes to compile is left to the deep profile.
+NAMES = [name for name in FAMILIES if is_deep() or name != "chain"]
 # What is asked for by default, and how many times that ends may be off.
 RTOL, ATOL, TIMES = 1e-6, 1e-9, 10.0
 
@@ -76,7 +78,7 @@ def compared(name: str) -> Compared:
     return Compared(family, codes, np.max(np.abs(ends - right) / admissible, axis=1), instants)
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", NAMES)
 def test_runs_reach_the_end(name: str) -> None:
     found = compared(name)
     messages = outcome_messages(linear_stick_slip(found.family.members[0].system), found.family.members[0].system.size)
@@ -84,19 +86,17 @@ def test_runs_reach_the_end(name: str) -> None:
     assert not failed.any(), found.describe(failed) + "\n" + messages[found.codes[failed][0]]
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", NAMES)
 def test_ends_are_right(name: str) -> None:
     found = compared(name)
     wrong = ~(found.errors <= 1.0)
     assert not wrong.any(), found.describe(wrong)
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "chain"])
 def test_events_are_all_there(name: str) -> None:
+    """But for the chain, where they are not unique."""
     found = compared(name)
-    if not found.family.counts:
-        # Which elements hold others at rest is not unique, but something must change where slip begins or ends.
-        return
     right = np.array([len(each.motion.times) for each in found.family.members])
     wrong = found.instants != right
     assert not wrong.any(), found.describe(wrong)
@@ -115,7 +115,7 @@ def test_elements_that_change_at_one_instant_count_each(name: str) -> None:
     np.testing.assert_array_equal(found, [each.motion.num_events for each in family.members])
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", NAMES)
 def test_few_members_are_left_out(name: str) -> None:
     """What is ill-conditioned is the exception."""
     family = compared(name).family
