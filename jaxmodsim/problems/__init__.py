@@ -64,6 +64,10 @@ from ._pendulum import spherical_pendulum as spherical_pendulum
 from ._pendulum import spherical_pendulum_acceleration as spherical_pendulum_acceleration
 from ._pendulum import spherical_pendulum_motion as spherical_pendulum_motion
 from ._pendulum import spherical_pendulum_reaction as spherical_pendulum_reaction
+from ._piecewise import LinearStickSlip as LinearStickSlip
+from ._piecewise import StickSlipMotion as StickSlipMotion
+from ._piecewise import stick_slip_motion as stick_slip_motion
+from ._piecewise_scene import linear_stick_slip as linear_stick_slip
 from ._pulled_box import PULLED_BOX as PULLED_BOX
 from ._pulled_box import PULLED_BOX_LUGRE as PULLED_BOX_LUGRE
 from ._pulled_box import pulled_box as pulled_box
