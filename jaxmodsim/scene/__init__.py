@@ -5,7 +5,6 @@ from ._elements import read_element as read_element
 from ._elements import replace_elements as replace_elements
 from ._field import Reaction as Reaction
 from ._field import check_scene as check_scene
-from ._field import scene_belts as scene_belts
 from ._field import scene_canonical as scene_canonical
 from ._field import scene_drifts as scene_drifts
 from ._field import scene_energies as scene_energies

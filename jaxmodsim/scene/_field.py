@@ -94,11 +94,6 @@ def scene_stick(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Sta
     return y._replace(qd=stop_slip(_contact(t, y, scene, mode), y.qd, mode == 0))
 
 
-def scene_belts(t: Float[Array, ""], scene: Scene) -> Float[Array, " belts"]:
-    """Velocities [m/s or rad/s] of the belts that are functions of time, under elements that run by events."""
-    return jnp.stack([each.belt(t) for each in scene.exact.values() if callable(each.belt_velocity)])
-
-
 def scene_drifts(scene: Scene) -> bool:
     """Whether stick drifts with the error of integration: not where it holds one coordinate at a constant speed."""
     return any(each.along is not None or callable(each.belt_velocity) for each in scene.exact.values())

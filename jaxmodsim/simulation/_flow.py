@@ -13,7 +13,6 @@ from ..mechanics import momentum, velocity
 from ..scene import (
     Scene,
     State,
-    scene_belts,
     scene_canonical,
     scene_field,
     scene_guards,
@@ -23,7 +22,7 @@ from ..scene import (
     scene_stick,
     scene_switch,
 )
-from ..solvers import EventLog, EventState
+from ..solvers import EventState
 
 # Energy [J] that went through a scene since t0, by the names of `scene_power`: supplied from outside, and absorbed.
 Work: TypeAlias = dict[str, Power]
@@ -33,34 +32,28 @@ class Beside(NamedTuple):
     """What is integrated beside the motion.
 
     - `motion`: a `State`, with momenta in the place of velocities where the run is canonical.
-    - `belts`: velocities [m/s or rad/s] of the belts that are functions of time, shape `[belts]`; None without any.
-    - `work`: in an audited run; None in others.
+    - `work`: the energy that went through the scene.
     """
 
     motion: State
-    belts: Float[Array, " belts"] | None
-    work: Work | None
+    work: Work
 
 
 class Flow(NamedTuple):
     """What is integrated: a `State`, with momenta in the place of velocities where `canonical`.
 
-    In an `audited` run, and where a belt under an element that runs by events moves as a function of time (`belted`),
-    it is `Beside` others. The belts are known without integration, but friction in slip does not depend on how fast
-    slip is: the error control would see nothing of a belt that turns many times in a step, and with it the slip.
+    In an `audited` run it is `Beside` the work.
     """
 
     audited: bool
     canonical: bool
-    belted: bool = False
 
     def start(self, t: Array, state: State, scene: Scene, mode: Any) -> Any:
         """What the run starts from."""
         y = self._inner(t, state, scene)
-        if not (self.audited or self.belted):
+        if not self.audited:
             return y
-        work = jtu.tree_map(jnp.zeros_like, scene_power(t, state, scene, mode)) if self.audited else None
-        return Beside(y, scene_belts(t, scene) if self.belted else None, work)
+        return Beside(y, jtu.tree_map(jnp.zeros_like, scene_power(t, state, scene, mode)))
 
     def state(self, t: Array, y: Any, scene: Scene) -> State:
         """The state in what is integrated."""
@@ -86,15 +79,7 @@ class Flow(NamedTuple):
         rate = (scene_canonical if self.canonical else scene_field)(t, state, scene, mode)
         if not isinstance(y, Beside):
             return rate
-        belts = jax.jvp(lambda t: scene_belts(t, scene), (t,), (jnp.ones_like(t),))[1] if self.belted else None
-        return Beside(rate, belts, scene_power(t, state, scene, mode) if self.audited else None)
-
-    def logged(self, log: EventLog) -> EventLog:
-        """A log of states alone."""
-        if not self.belted:
-            return log
-        before, after = ((side[0].motion, side[1]) for side in (log.before, log.after))
-        return log._replace(before=before, after=after)
+        return Beside(rate, scene_power(t, state, scene, mode))
 
     def advance(self, t0: Array, t1: Array, y: Any, scene: Scene) -> tuple[Any, Array]:
         """One step of `ImplicitFriction`, and whether it was solved; work is done at the powers at its end."""
@@ -102,7 +87,7 @@ class Flow(NamedTuple):
         if not self.audited:
             return state, solved
         work = jtu.tree_map(lambda work, power: work + (t1 - t0) * power, y.work, scene_power(t1, state, scene))
-        return Beside(state, None, work), solved
+        return Beside(state, work), solved
 
     def _inner(self, t: Array, state: State, scene: Scene) -> State:
         if not self.canonical:

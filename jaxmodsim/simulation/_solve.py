@@ -204,8 +204,7 @@ def _prepared(problem: Problem, options: Options, audited: bool) -> tuple[State,
     atol = None if problem.dt is not None else problem.atol
     start = start_code(scene, t0, given, scene_field(t0, initial, scene, mode), mode, atol, canonical)
     sticks = bool(scene.exact) and scene_drifts(scene)
-    belts = any(callable(each.belt_velocity) for each in scene.exact.values())
-    return initial, mode, Hybrid(Flow(audited, canonical, belts), rest, projects, sticks), start
+    return initial, mode, Hybrid(Flow(audited, canonical), rest, projects, sticks), start
 
 
 def _integrate(problem: Problem, options: Options, audited: bool, log: int | None) -> tuple[Solved, EventLog | None]:
@@ -253,7 +252,6 @@ def _integrate(problem: Problem, options: Options, audited: bool, log: int | Non
     if exact:
         (count, trouble, fired), history = events
         ending, stats["num_events"] = Ending(trouble, fired), count
-        history = None if history is None else hybrid.flow.logged(history)
     ended = _ended(problem, t_end, end_state, mode, solution.result, ending)
     t, y, modes, missed = _kept(problem, starts, solution.ts[1], solution.ys[1])
     code = jnp.where(starts, ended, start)

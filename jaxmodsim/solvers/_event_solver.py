@@ -24,6 +24,8 @@ _LANDING = 1e-5
 _BEYOND, _BEYOND_OF_REST = 0.3, 0.5
 # What the step and the jump measure of the way to a root may differ by this factor.
 _LATITUDE = 4.0
+# Within 100 rounding units of time before the end of a run diffrax ends no step.
+_UNPLACED = 128.0
 # A step this much shorter than the last ones has no length.
 _SHORT = 1e-6
 # Events accumulate where the longest of the last intervals is below this part of the time since the start, times the
@@ -263,7 +265,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         least = jnp.maximum(_constant(self.rtol), _ROUNDING * float(jnp.finfo(end.dtype).eps)).astype(end.dtype)
         # Around t0 = 0 the resolution of time is that of the step itself.
         length = _constant(t1 - t0)
-        resolution = 4.0 * float(jnp.finfo(length.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+        eps = float(jnp.finfo(length.dtype).eps)
+        resolution = 4.0 * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
         blur = _constant(resolution) / jnp.where(length > 0, length, 1.0)
         seen = scan_guards((y0.guard, one, two, end), middle, y0.armed > 0.5, least * size, blur, unit)
         # Where nothing moves steps grow without measure, and tell nothing of the motion that the event begins.
@@ -277,7 +280,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         shortest = jnp.maximum(_SHORT * pace, 2.0 * _constant(resolution))
         here = seen.armed & (jnp.abs(seen.ahead) <= near)
         if self.insist:  # in front of the root is no motion after the event
-            here = here & (end <= 0)
+            here = (here | (seen.crosses & (length <= _UNPLACED * eps * jnp.abs(t1)))) & (end <= 0)
         # One that fires at the start of the step does so where the step is the shortest.
         here = here | (seen.crosses & (seen.root * length <= resolution) & (length <= shortest))
         passed = seen.crosses & ~here
