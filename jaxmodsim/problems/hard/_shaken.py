@@ -132,7 +132,6 @@ def _several() -> list[HardCase]:
             together,
             _system([[0.0, 0.0, 0.0, 2.0], [0.0, 0.0, 0.0, -2.0]], [(1.0, 1.3)] * 2, [2.0], stiffness=pair),
             8.0,
-            undefined="another force of one of the elements takes instants apart that are one",
         ),
         _case(
             "belt_that_swings",
