@@ -102,14 +102,17 @@ def at_rest(drawn: LinearStickSlip, t1: float) -> Drawn:
 
 
 def shaken_box(stiction: bool) -> Draw:
-    """A box at rest under A (1 + g t) sin(w t + phi) with a drift, around its limit."""
+    """A box at rest under A (1 + g t) sin(w t + phi) with a drift: around its limit, or growing towards it in stick."""
 
     def draw(rng: np.random.Generator) -> Drawn:
         limits, w = limit(rng, stiction), decades(rng, 0.3, 30.0)
-        t1 = rng.uniform(1.0, 6.0) * 2.0 * math.pi / w
-        wave = harmonic(rng.uniform(0.5, 2.0) * limits[1], rng.uniform(-0.3, 1.0) / t1, rng.uniform(0.0, 2.0 * math.pi))
-        drift = limits[1] * rng.uniform(-0.2, 0.2, 2) / np.array([1.0, t1])
-        return at_rest(system(np.array([[*drift, 0.0, *wave]]), limits[None], [w]), t1)
+        grows = rng.random() < 0.5
+        t1 = rng.uniform(*((3.0, 15.0) if grows else (1.0, 6.0))) * 2.0 * math.pi / w
+        start = rng.uniform(*((0.3, 0.9) if grows else (0.5, 2.0)))
+        growth = rng.uniform(1.0, 1.5) / start - 1.0 if grows else rng.uniform(-0.3, 1.0)
+        drift = 0.0 if grows else limits[1] * rng.uniform(-0.2, 0.2, 2) / np.array([1.0, t1])
+        wave = harmonic(start * limits[1], growth / t1, rng.uniform(0.0, 2.0 * math.pi))
+        return at_rest(system(np.array([[*(drift * np.ones(2)), 0.0, *wave]]), limits[None], [w]), t1)
 
     return draw
 

@@ -43,6 +43,8 @@ def test_every_case_says_why_it_is_hard_and_what_is_right():
         ("smooth_break_away", ("alone",)),  # steps that ended in front of an event where slip only touches rest
         ("reversals_in_a_step", ("alone",)),
         ("step_limit_regularised", ("alone",)),
+        ("growing_load", ("alone",)),  # steps that grow in stick pass over break-aways
+        ("sample_after_break_away", ("alone",)),  # a sample of a signal next to an event
     ],
 )
 def test_cases_that_found_something_and_one_of_each_kind(name: str, ways: tuple[str, ...]):
