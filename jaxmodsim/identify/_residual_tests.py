@@ -92,7 +92,7 @@ class ChannelTests:
         if self.whiteness < _CHANCE and self.length == 0:
             lag = 1 + int(np.argmax(np.abs(self.autocorrelation[1:])))
             found.append(
-                f"It is not white, but has no memory that would make samples tell less: its autocorrelation is"
+                "It is not white, but has no memory that would make samples tell less: its autocorrelation is"
                 f" {self.autocorrelation[lag]:+.2f} at lag {lag}."
             )
         elif self.whiteness < _CHANCE:

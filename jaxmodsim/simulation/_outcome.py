@@ -52,8 +52,8 @@ _GENERAL = (
     "Gauss works with momenta, and needs a Lagrangian that is quadratic in the velocities: use another solver.",
     "atol is above the width [m/s] of a Regularized law: what happens within the width is below what the error control"
     " sees, and a break-away comes late. Pass atol no larger than the width.",
-    "The times or tolerances do not make a run: t1 must not be before t0, ts must increase within [t0, t1], dt and dtmax"
-    " must be positive, rtol and atol not negative and not both zero, and all of them finite.",
+    "The times or tolerances do not make a run: t1 must not be before t0, ts must increase within [t0, t1], dt and"
+    " dtmax must be positive, rtol and atol not negative and not both zero, and all of them finite.",
 )
 
 
