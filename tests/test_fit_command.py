@@ -15,7 +15,8 @@ import scipy.io
 
 from jaxmodsim.cli import _fit
 from jaxmodsim.cli._read import AxisColumns, read_record, read_records
-from jaxmodsim.identify import FitResult, rough_axis
+from jaxmodsim.identify import AXIS_MODELS, FitResult, Record, axis_scene, fit, rough_axis
+from jaxmodsim.identify._axis import RoughAxis
 
 GAIN = 12.0
 COLUMNS = ("--time", "time", "--position", "pos", "--force", "volt", "--force-gain", str(GAIN))
@@ -238,6 +239,78 @@ def test_rough_values_come_from_the_record(files):
     rough = rough_axis(read_record(Path(files[0]), NAMES))
     assert rough.m == pytest.approx(TRUTH["m"], rel=0.2)
     assert rough.Fc == pytest.approx(TRUTH["dry.Fc"], rel=0.5)
+
+
+def record_of(frame: pd.DataFrame, **columns: Any) -> Record:
+    t, q, u = (columns.get(name, frame[name].to_numpy()) for name in ("time", "pos", "volt"))
+    return Record(t, q, {"u": GAIN * u})
+
+
+FRAME = axis_frame()
+STILL = np.zeros(len(FRAME))
+
+
+@pytest.mark.parametrize(
+    ("columns", "text"),
+    [
+        ({"volt": -FRAME["volt"].to_numpy()}, "force goes against the motion.*change the sign of one"),
+        ({"pos": -FRAME["pos"].to_numpy()}, "force goes against the motion.*change the sign of one"),
+        ({"volt": STILL}, r"the force never changes \(it is 0 throughout\).* Is it the right column"),
+        ({"volt": STILL + 0.5}, r"the force never changes \(it is 6 throughout\)"),
+        ({"pos": STILL}, r"the position never changes \(it is 0 throughout\)"),
+        ({"pos": STILL + 1.3}, r"the position never changes \(it is 1.3 throughout\)"),
+    ],
+    ids=["sign", "sign of position", "no force", "constant force", "still", "still elsewhere"],
+)
+def test_records_from_which_no_axis_can_be_told_are_refused(run_command, tmp_path, columns, text):
+    with pytest.raises(ValueError, match=text):
+        rough_axis(record_of(FRAME, **columns))
+    FRAME.assign(**columns).to_csv(tmp_path / "run.csv", index=False)
+    check_refusal(run_command, tmp_path / "out", text, str(tmp_path / "run.csv"), *COLUMNS)
+
+
+def test_every_record_is_checked_for_its_sign(run_command, files, tmp_path):
+    FRAME.assign(volt=-FRAME["volt"]).to_csv(tmp_path / "other.csv", index=False)
+    text = "other: the force goes against the motion"
+    check_refusal(run_command, tmp_path / "out", text, files[0], str(tmp_path / "other.csv"), *COLUMNS)
+
+
+@pytest.mark.parametrize("kind", ["noise", "slow", "forward"])
+def test_records_that_tell_little_are_not_refused_for_their_sign(kind):
+    """The force has nothing to do with the motion, or the motion is slow, or goes one way only."""
+    rng, t = np.random.default_rng(3), FRAME["time"].to_numpy() - 10.0
+    q = {"noise": np.sin(3.0 * t), "slow": 1e-3 * np.sin(0.5 * t), "forward": 0.1 * t + 1e-3 * np.sin(2.0 * t)}[kind]
+    v = np.gradient(q, t)
+    friction = 3.0 * np.sign(v) + 8.0 * v
+    u = rng.standard_normal(t.size) if kind == "noise" else friction + 5.0 * np.gradient(v, t) + 0.7
+    rough = rough_axis(Record(t, q + 1e-7 * rng.standard_normal(t.size), {"u": u}))
+    assert min(rough.m, rough.Fc, rough.Fv) > 0
+
+
+@pytest.mark.parametrize("volt", [-FRAME["volt"].to_numpy(), STILL], ids=["sign", "no force"])
+def test_a_fit_that_follows_nothing_says_so(volt):
+    """With start values of one's own the search goes on, to a model that stands still."""
+    record, rough = record_of(FRAME, volt=volt), RoughAxis(5.0, 8.0, 3.0, 0.7, 0.5)
+    model = AXIS_MODELS["coulomb"]
+    result = fit(axis_scene(model, rough, {"dry.width": 0.05}), record, model.free, limits={"m": (0.0, 50.0)})
+    assert any("the model follows nothing of the record" in remark for remark in result.remarks)
+    assert str(result)
+
+
+@pytest.mark.parametrize("name", AXIS_MODELS)
+def test_the_clock_of_a_record_makes_no_difference(name):
+    """A drift dies away from the first sample on, whatever the clock says there."""
+    model, t = AXIS_MODELS[name], FRAME["time"].to_numpy() - 10.0
+
+    def values(start: float) -> dict[str, float]:
+        record = record_of(FRAME, time=t + start)
+        scene = axis_scene(model, rough_axis(record), {"tau": 1.0})
+        limits = {"m": (0.0, 50.0)}
+        return fit(scene, record, model.free, limits=limits, substeps=2, max_steps=4).values
+
+    expected = values(0.0)
+    for start in (1300.0, -40.0):
+        assert values(start) == pytest.approx(expected, rel=1e-5, abs=1e-8)
 
 
 def check_refusal(run_command, out: Path, text: str, *command: str) -> None:

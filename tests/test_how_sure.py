@@ -372,6 +372,43 @@ def test_correlated_residuals_are_measured_and_do_not_fool_the_other_tests():
         assert np.mean([p(each) < 0.05 for each in found]) < 0.13
 
 
+ALTERNATING = (-1.0) ** np.arange(T.size)
+
+
+@pytest.mark.parametrize(
+    "residual",
+    [
+        ALTERNATING,
+        ALTERNATING * np.exp(-T),
+        correlated(np.random.default_rng(9), T.size, -0.3),
+        correlated(np.random.default_rng(9), T.size, -0.6),
+        correlated(np.random.default_rng(9), T.size, -0.99),
+        np.diff(np.random.default_rng(9).standard_normal(T.size + 1)),
+    ],
+    ids=["alternating", "fading", "weak", "medium", "strong", "differences"],
+)
+def test_residuals_that_alternate_have_no_negative_memory(residual):
+    """The sum of their autocorrelation over positive lags is negative, down to -1."""
+    each = judged(residual, {"u": SINE})
+    assert each.length == 0.0
+    assert each.independent == T.size
+    assert each.whiteness < 1e-6
+    assert 0 <= each.normality <= 1
+    assert any("not white, but has no memory" in remark for remark in each.remarks)
+    assert not any("remembers" in remark for remark in each.remarks)
+
+
+@pytest.mark.parametrize("n", [2, 3, 5, 20])
+@pytest.mark.parametrize("kind", ["zero", "constant", "one", "line"])
+def test_residuals_of_few_samples_and_of_no_scatter(n, kind):
+    t = np.linspace(0.0, 1.0, n)
+    residual = {"zero": 0 * t, "constant": 0 * t + 3.0, "one": np.eye(1, n)[0], "line": t}[kind]
+    each = judged(residual, {"u": t}, t=t)
+    assert each.length >= 0.0
+    assert 0 < each.independent <= n
+    assert all(0 <= p <= 1 for p in (each.whiteness, each.normality, each.trends[0].p, each.inputs["u"].p))
+
+
 def test_a_residual_with_a_cause_names_it():
     rng, noise = np.random.default_rng(10), 0.1 * np.random.default_rng(11).standard_normal(T.size)
     motion = Motion(T, {0: SLOW_SINE}, {0: np.cos(np.pi * T)})

@@ -8,7 +8,7 @@ from ..numerics import ranges_of
 from ..scene import Scene
 
 # What the drive has beside its force, by the name of the param without which it is none.
-_TERMS = {"offset": "offset", "drift": "drift exp(-t/tau)"}
+_TERMS = {"offset": "offset", "drift": "drift exp(-(t - t0)/tau)"}
 
 _LEVEL = "g(v) = Fc + (Fs - Fc) exp(-(v/vs)^2)"
 _FORMULAS: dict[type, tuple[str, ...]] = {

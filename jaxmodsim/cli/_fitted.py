@@ -17,7 +17,7 @@ from ._equations import equations
 from ._plan import Plan
 
 # Units of what declares none: the params of an axis, and initial states.
-_UNITS = {"m": "kg", "offset": "N", "drift": "N", "tau": "s", "q0[0]": "m", "qd0[0]": "m/s"}
+_UNITS = {"m": "kg", "offset": "N", "drift": "N", "tau": "s", "t0": "s", "q0[0]": "m", "qd0[0]": "m/s"}
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +99,12 @@ def plan_of(request: FitRequest) -> Plan:
     _known("--begin", request.begin, _BEGINNINGS)
     together = read_records([*request.records, *request.hold_out], request.columns)
     records, held_out = together[: len(request.records)], together[len(request.records) :]
+    # A record that stands still, or that nothing drives, may go beside others that do not.
+    driven = [record for record in together if np.ptp(record.measured) > 0 and np.ptp(record.inputs["u"]) > 0]
+    for record in driven:
+        rough_axis(record)
     rough = rough_axis(max(records, key=lambda record: len(record.t)))
+    rough = replace(rough, start=min(float(record.t[0]) for record in records))
     numbers = {name: _numbers(axis_scene(AXIS_MODELS[name], rough)) for name in names}
     fixed, start = _values("--fix", request.fix, numbers), _values("--start", request.start, numbers)
     chosen = tuple(name.strip() for text in request.free for name in text.split(",") if name.strip())

@@ -17,6 +17,9 @@ from ._smooth import differentiate, smooth, smooth_span
 # followed as well by 8 s as by a straight line.
 _DRIFT_TIME = 20.0
 
+# Share of the variance of a force below which a regression explains it well enough to tell that its sign is wrong.
+_EXPLAINED = 0.5
+
 # Width of the regularisation in top speeds. Fits that come down to it from a wider one do not get caught on the way.
 _WIDTH = 1e-3
 
@@ -28,34 +31,56 @@ def _axis_lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Arra
 
 def _drive(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     del q, qd
-    return jnp.reshape(p["u"] - p["offset"] - p["drift"] * jnp.exp(-t / p["tau"]), (1,))
+    since = jnp.maximum(t - p["t0"], 0.0)
+    return jnp.reshape(p["u"] - p["offset"] - p["drift"] * jnp.exp(-since / p["tau"]), (1,))
 
 
 @dataclass(frozen=True)
 class RoughAxis:
-    """A first idea of an axis: mass [kg], viscous [N s/m] and dry friction [N], offset [N], top speed [m/s]."""
+    """A first idea of an axis: mass [kg], viscous [N s/m] and dry friction [N], offset [N], top speed [m/s].
+
+    And when it starts [s], on the clock of the record.
+    """
 
     m: float
     Fv: float
     Fc: float
     offset: float
     top: float
+    start: float = 0.0
 
 
 def rough_axis(record: Record) -> RoughAxis:
     """Start values by linear regression of the force on acceleration, velocity and its sign.
 
     Differentiated positions are noisy, so they are smoothed first; the simulation then does the real work.
+
+    **Raises:**
+
+    - `ValueError` naming the record, where the position or the force never changes, and where the force has the wrong
+      sign: mass and friction that explain it would be negative.
     """
+    for column, what in ((record.measured, "position"), (record.inputs["u"], "force")):
+        if np.ptp(column) == 0.0:
+            raise ValueError(
+                f"{record.name}: the {what} never changes (it is {column[0]:g} throughout), so nothing can be fitted:"
+                " mass and friction show in the motion under a force that changes. Is it the right column?"
+            )
     motion, span = differentiate(record.t, record.measured), smooth_span(len(record.t))
     inside = slice(motion.edge, -motion.edge) if len(record.t) > 4 * motion.edge else slice(None)
     v, a, u = (x[inside] for x in (motion.v, motion.a, smooth(record.inputs["u"], span)))
     top = float(np.max(np.abs(v)))
-    if top == 0.0:
-        raise ValueError(f"{record.name}: the position never changes, so nothing can be fitted.")
     moving = np.abs(v) > 0.05 * top
     columns = np.column_stack([a, v, np.sign(v), np.ones_like(v)])[moving]
-    m, Fv, Fc, offset = np.linalg.lstsq(columns, u[moving], rcond=None)[0]
+    m, Fv, Fc, offset = weights = np.linalg.lstsq(columns, u[moving], rcond=None)[0]
+    dissipated = Fv * float(np.mean(v**2)) + Fc * float(np.mean(np.abs(v)))
+    left = float(np.sum((u[moving] - columns @ weights) ** 2))
+    if m < 0 and dissipated < 0 and left < _EXPLAINED * (len(columns) - 4) * np.var(u[moving]):
+        raise ValueError(
+            f"{record.name}: the force goes against the motion: it is that of a mass of {m:.3g} kg and of friction that"
+            f" drives with {-dissipated:.3g} W. Force and position count in opposite directions: change the sign of one"
+            " of them (on the command line, that of --force-gain)."
+        )
     scale = float(np.sqrt(np.mean(u**2))) or 1.0
     return RoughAxis(
         m if m > 0 else scale / max(float(np.max(np.abs(a))), 1e-12),
@@ -63,6 +88,7 @@ def rough_axis(record: Record) -> RoughAxis:
         Fc if Fc > 0 else 0.1 * scale,
         float(offset),
         top,
+        float(record.t[0]),
     )
 
 
@@ -121,7 +147,7 @@ AXIS_MODELS = {
     "drifting": AxisModel(
         _asymmetric,
         ("m", "drift", "dry.forward.Fc", "dry.backward.Fc", "viscous.forward.Fv", "viscous.backward.Fv"),
-        "as asymmetric, with a part of the drive's offset that dies away over the time tau from t = 0",
+        "as asymmetric, with a part of the drive's offset that dies away over the time tau from the first sample on",
     ),
     "stribeck": AxisModel(
         _stribeck,
@@ -142,7 +168,7 @@ def axis_scene(
     start: Mapping[str, float] | None = None,
     fixed: Mapping[str, float] | None = None,
 ) -> Scene:
-    """Scene of an axis, `m q'' = u - offset - drift exp(-t/tau) - friction`, ready to be fitted.
+    """Scene of an axis, `m q'' = u - offset - drift exp(-(t - t0)/tau) - friction`, ready to be fitted.
 
     **Arguments:**
 
@@ -152,10 +178,11 @@ def axis_scene(
 
     **Returns:**
 
-    A `Scene` whose `params` are `m` [kg], `offset` [N], `drift` [N], `tau` [s] and the input `u` [N].
+    A `Scene` whose `params` are `m` [kg], `offset` [N], `drift` [N], `tau` [s], `t0` [s], from which on the drift
+    dies away, and the input `u` [N].
     """
     offset = rough.offset if "offset" in model.free else 0.0
-    params = {"m": rough.m, "offset": offset, "drift": 0.0, "tau": _DRIFT_TIME, "u": 0.0}
+    params = {"m": rough.m, "offset": offset, "drift": 0.0, "tau": _DRIFT_TIME, "t0": rough.start, "u": 0.0}
     scene = Scene(_axis_lagrangian, params=params, effects=(AppliedForce(_drive, name="drive"), *model.effects(rough)))
     given = {**(start or {}), **(fixed or {})}
     return replace_numbers(scene, {name: jnp.asarray(x, float) for name, x in given.items()})

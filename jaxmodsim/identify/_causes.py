@@ -202,14 +202,17 @@ def one_direction(element: Element) -> Cause | None:
         return None
     if element.has(AbstractAsymmetric):
         unseen = "backward" if forwards else "forward"
-        about = tuple(f for f in element.free if f.startswith(f"{element.name}.{unseen}." if element.name else unseen))
-        text = f"nothing is seen of {_listed(about)}"
+        level = about = tuple(
+            f for f in element.free if f.startswith(f"{element.name}.{unseen}." if element.name else unseen)
+        )
+        text = "nothing is seen of {}"
     else:
         level = element.own("Fc")
         about = tuple(dict.fromkeys([*level, *(other for name in level for other in element.alike.get(name, ()))]))
-        text = f"a constant force and {_listed(level)} look the same"
+        text = "a constant force and {} look the same"
     if not about:
         return None
+    text = text.format(_listed(level))
     return Cause(f"{element.label}This record moves in one direction only: {text}.", about)
 
 

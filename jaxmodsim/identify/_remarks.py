@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 _UNCERTAIN, _ALIKE = 0.1, 0.98
 # Standard error against the value from which on a parameter is called not determined, and how many pairs are named.
 _UNKNOWN, _PAIRS = 0.5, 4
+# Share of the scatter of a channel from which on an RMSE says that nothing is followed.
+_FOLLOWS = 0.95
 
 
 def remarks_of(result: "FitResult") -> tuple[str, ...]:
@@ -68,6 +70,14 @@ def _of_the_search(result: "FitResult") -> list[str]:
             f"The integration step shows: with four times as many the output moves by {result.step_error:.2g} (root"
             f" mean square) against an RMSE of {result.rmse:.2g}. Raise substeps."
         )
+    for channel, rmse in result.rmse_by.items():
+        columns = [record.channels[channel] for record in result.records if channel in record.channels]
+        scatter = np.sqrt(np.mean(np.concatenate([x - np.mean(x) for x in columns]) ** 2)) if columns else 0.0
+        if columns and rmse > _FOLLOWS * scatter > 0:
+            remarks.append(
+                f"{channel}: the model follows nothing of the record; its RMSE of {rmse:.2g} is no less than that of a"
+                f" constant, {scatter:.2g}. Is the input the right column, has it the right sign and unit?"
+            )
     return remarks
 
 

@@ -53,7 +53,7 @@ class ChannelTests:
 
     - `samples`, `independent`: number of samples, and of independent ones that would tell as much of a mean.
     - `length`: correlation length [s], the sum of the autocorrelation over positive lags times the interval: 0 for
-      white noise, the time constant where it decays exponentially.
+      white noise and where that sum is negative, the time constant where it decays exponentially.
     - `whiteness`: p of the test of Ljung and Box over `lags` lags. `autocorrelation`: at lags from 0 on, at
       least to `lags`, further where the memory is longer.
     - `skewness`, `kurtosis`: the second in excess of the normal one. `normality`: p of both together by Jarque and
@@ -89,7 +89,13 @@ class ChannelTests:
                     f"It goes with the input {name} of {cross.lag:.3g} s before (correlation {cross.correlation:+.2f}):"
                     " the model leaves some of its effect unexplained."
                 )
-        if self.whiteness < _CHANCE:
+        if self.whiteness < _CHANCE and self.length == 0:
+            lag = 1 + int(np.argmax(np.abs(self.autocorrelation[1:])))
+            found.append(
+                "It is not white, but has no memory that would make samples tell less: its autocorrelation is"
+                f" {self.autocorrelation[lag]:+.2f} at lag {lag}."
+            )
+        elif self.whiteness < _CHANCE:
             found.append(
                 f"It is not white: it remembers over {self.length:.3g} s, so that {self.samples} samples tell as much"
                 f" as {self.independent:.0f} independent ones."
@@ -153,7 +159,8 @@ def channel_tests(
     lags = lag_number(n)
     correlation = autocorrelation(e)
     memory = remembered(correlation)
-    tau = 1 + 2 * float(np.sum(correlation[1:memory]))
+    # Negative correlation makes samples tell more of a mean, but of nothing else: they are not counted as more than n.
+    tau = max(1 + 2 * float(np.sum(correlation[1:memory])), 1.0)
     skewness, kurtosis, normality = _normality(e, correlation, memory)
     regressors = {f"q[{i}]": x for i, x in motion.q.items()} | {f"qd[{i}]": x for i, x in motion.qd.items()}
     regressors["t"] = motion.t
@@ -163,7 +170,7 @@ def channel_tests(
         record,
         channel,
         n,
-        min(n / tau, float(n)),
+        n / tau,
         interval * (tau - 1) / 2,
         lags,
         _ljung_box(correlation, lags, n),

@@ -75,6 +75,8 @@ from ._signal import signals_at as signals_at
 from ._signal import signals_from as signals_from
 from ._signal import signals_of as signals_of
 from ._timing import measure as measure
+from ._unchecked import calls_back as calls_back
+from ._unchecked import unchecked as unchecked
 from ._varying import Varying as Varying
 from ._varying import nominal as nominal
 from ._varying import settle as settle

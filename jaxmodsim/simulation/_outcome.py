@@ -25,8 +25,9 @@ from ..solvers import ACCUMULATION, TOO_MANY
     DRIFTED,
     NOT_QUADRATIC,
     TOO_NARROW,
+    ILL_POSED,
     FIRST_MASS,
-) = range(11)
+) = range(12)
 
 # Correction of the initial state, relative to its size or to one, below which it is meant to obey the constraints.
 _CONSISTENT = 1e-6
@@ -51,6 +52,8 @@ _GENERAL = (
     "Gauss works with momenta, and needs a Lagrangian that is quadratic in the velocities: use another solver.",
     "atol is above the width [m/s] of a Regularized law: what happens within the width is below what the error control"
     " sees, and a break-away comes late. Pass atol no larger than the width.",
+    "The times or tolerances do not make a run: t1 must not be before t0, ts must increase within [t0, t1], dt and"
+    " dtmax must be positive, rtol and atol not negative and not both zero, and all of them finite.",
 )
 
 

@@ -109,7 +109,8 @@ def simulate(
 
     - `ValueError` for wrong shapes, types or ranges, before anything runs; for `accuracy` where numbers are traced.
     - `SimulationError` if the run ended early, or no run of the accuracy was found, and `throw` is set. Inside
-      `jax.jit`, `jax.vmap` or `jax.grad` the same sentence comes as equinox's run-time error.
+      `jax.jit`, `jax.vmap` or `jax.grad` the same sentence comes as equinox's run-time error. That calls Python, and
+      JAX keeps no compiled program that does in its persistent cache: pass `throw=False` there, and read `run.result`.
     """
     throw = as_flag(throw, name="throw")
     problem, options = prepare(

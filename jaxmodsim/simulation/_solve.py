@@ -9,9 +9,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..numerics import sample_times, signals_of
+from ..numerics import sample_times, signals_of, unchecked
 from ..scene import Scene, State, check_scene, scene_drifts, scene_field, scene_modes, scene_overload, scene_project
 from ..solvers import (
     EventController,
@@ -26,7 +26,7 @@ from ..solvers import (
     first_step,
 )
 from ._flow import Flow, Hybrid, Work
-from ._outcome import MISSED_EVENT, SUCCESS, Ending, end_code, start_code
+from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, end_code, start_code
 
 # Part of the absolute tolerance below which a slip velocity counts as none.
 _REST = 1e-3
@@ -189,6 +189,19 @@ def _plugins(problem: Problem, options: Options) -> tuple[Any, Any]:
     return solver, adjoint
 
 
+def _well_posed(problem: Problem) -> Bool[Array, ""]:
+    """Whether times and tolerances make a run; known ones are checked before, with a sentence of their own."""
+    t0, t1, ts, rtol, atol = problem.t0, problem.t1, problem.ts, problem.rtol, problem.atol
+    steps = [step for step in (problem.dt, problem.dtmax) if step is not None]
+    fine = (t0 <= t1) & (rtol >= 0) & (atol >= 0) & (rtol + atol > 0)
+    for step in steps:
+        fine &= step > 0
+    if ts is not None:
+        fine &= (t0 <= ts[0]) & jnp.all(ts[1:] >= ts[:-1]) & (ts[-1] <= t1)
+    # With ends that are finite and order, ts are so, too.
+    return fine & jnp.isfinite(jnp.stack([t0, t1, rtol, atol, *steps])).all()
+
+
 def _prepared(problem: Problem, options: Options, audited: bool) -> tuple[State, Any, Hybrid, Int[Array, ""]]:
     """State and modes to begin with, the functions of the run, and what is wrong with the start."""
     scene, t0 = problem.scene, problem.t0
@@ -203,6 +216,7 @@ def _prepared(problem: Problem, options: Options, audited: bool) -> tuple[State,
     canonical = isinstance(options.solver, Gauss)
     atol = None if problem.dt is not None else problem.atol
     start = start_code(scene, t0, given, scene_field(t0, initial, scene, mode), mode, atol, canonical)
+    start = jnp.where(_well_posed(problem), start, ILL_POSED)
     sticks = bool(scene.exact) and scene_drifts(scene)
     return initial, mode, Hybrid(Flow(audited, canonical), rest, projects, sticks), start
 
@@ -224,26 +238,26 @@ def _integrate(problem: Problem, options: Options, audited: bool, log: int | Non
     def keep_end(t: Any, y: Any, scene: Scene) -> Any:
         return hybrid.keep(t, y, scene), ((y.events, y.trouble, y.fired), y.log) if exact else None
 
-    saveat = dfx.SaveAt(
-        subs=(
-            dfx.SubSaveAt(t1=True, fn=keep_end),
-            dfx.SubSaveAt(t1=True, fn=hybrid.keep) if ts is None else dfx.SubSaveAt(ts=ts, fn=hybrid.keep),
+    def integrate(first: Array, ts: Array | None) -> dfx.Solution:
+        end = dfx.SubSaveAt(t1=True, fn=keep_end)
+        saved = dfx.SubSaveAt(t1=ts is None, ts=ts, fn=hybrid.keep)
+        return dfx.diffeqsolve(
+            dfx.ODETerm(hybrid.rate if exact else hybrid.plain_rate),
+            solver,
+            problem.t0,
+            jnp.where(starts, problem.t1, problem.t0),
+            first,
+            y0,
+            args=scene,
+            saveat=dfx.SaveAt(subs=(end, saved)),
+            stepsize_controller=controller,
+            adjoint=adjoint,
+            max_steps=options.max_steps,
+            throw=False,
         )
-    )
-    solution = dfx.diffeqsolve(
-        dfx.ODETerm(hybrid.rate if exact else hybrid.plain_rate),
-        solver,
-        problem.t0,
-        jnp.where(starts, problem.t1, problem.t0),
-        first,
-        y0,
-        args=scene,
-        saveat=saveat,
-        stepsize_controller=controller,
-        adjoint=adjoint,
-        max_steps=options.max_steps,
-        throw=False,
-    )
+
+    # What diffrax checks of them, that they point forward, increase and lie within the run, `_well_posed` has.
+    solution = unchecked(integrate, first, ts)
     assert solution.ts is not None
     assert solution.ys is not None
     (last, mode), events = jtu.tree_map(lambda x: x[0], solution.ys[0])

@@ -1,0 +1,76 @@
+"""Calls without the run-time checks that a library makes of its arguments."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.core
+import jax.tree_util as jtu
+from jax.extend.core import ClosedJaxpr, Literal
+from jaxtyping import Array
+
+
+def unchecked(fn: Callable[..., Any], *args: Array | None) -> Any:
+    """`fn(*args)` without the checks by `equinox.error_if` of the arguments themselves.
+
+    Such a check calls back to Python if it fails. JAX does not keep a program with a callback in its persistent
+    compilation cache, and inside of `jax.vmap` one failed check ends the whole batch. So the caller makes the same
+    checks, and says by numbers how they ended.
+
+    Only checks that hand through one of `args`, a copy or a multiple of it (times where they run backward) are left
+    out. Those of values computed from them otherwise stay, and so do all in loops and in functions with a derivative of
+    their own: checks that belong to others are kept. Derivatives are those of `fn`, as a check is an identity.
+
+    **Arguments:**
+
+    - `fn`: a function of arrays that returns a pytree of arrays. It may close over traced values.
+    - `args`: arrays, or None. If none of them is traced, nothing is compiled, and `fn` is called as it is.
+    """
+    if not any(isinstance(x, jax.core.Tracer) for x in args):
+        return fn(*args)
+    closed, shapes = jax.make_jaxpr(fn, return_shape=True)(*args)
+    given = jtu.tree_leaves(args)
+    return jtu.tree_unflatten(jtu.tree_structure(shapes), _run(closed, given, list(given)))
+
+
+def _run(closed: ClosedJaxpr, inputs: list[Any], given: list[Any]) -> list[Any]:
+    """Evaluate a traced function; `given` are the values whose checks are left out; it grows by their multiples."""
+    jaxpr = closed.jaxpr
+    values: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *inputs], strict=True))
+
+    def read(atom: Any) -> Any:
+        return atom.val if isinstance(atom, Literal) else values[atom]
+
+    for eqn in jaxpr.eqns:
+        operands = [read(x) for x in eqn.invars]
+        values.update(zip(eqn.outvars, _step(eqn, operands, given), strict=True))
+    return [read(x) for x in jaxpr.outvars]
+
+
+def _step(eqn: Any, operands: list[Any], given: list[Any]) -> list[Any]:
+    """Outputs of one equation."""
+    name = eqn.primitive.name
+    if name == "jit" and calls_back(eqn.params["jaxpr"].jaxpr):
+        return _run(eqn.params["jaxpr"], operands, given)
+    own = [any(x is each for each in given) for x in operands]
+    checks = name == "custom_jvp_call" and len(eqn.outvars) == 1 and calls_back(eqn.params["call_jaxpr"].jaxpr)
+    if checks and own[0]:
+        return operands[:1]
+    bound = eqn.primitive.get_bind_params(eqn.params)
+    functions, params = bound if isinstance(bound, tuple) else ((), bound)
+    out = eqn.primitive.bind(*functions, *operands, **params)
+    out = list(out) if eqn.primitive.multiple_results else [out]
+    if name in ("copy", "mul") and any(own):
+        given += out
+    return out
+
+
+def calls_back(jaxpr: Any) -> bool:
+    """Whether a traced function calls Python anywhere while it runs."""
+    return any("callback" in eqn.primitive.name or any(map(calls_back, _inner(eqn))) for eqn in jaxpr.eqns)
+
+
+def _inner(eqn: Any) -> list[Any]:
+    """Traced functions inside of an equation: bodies, branches, and functions with a derivative of their own."""
+    inside = [x for value in eqn.params.values() for x in (value if isinstance(value, tuple | list) else (value,))]
+    return [getattr(x, "jaxpr", x) for x in inside if hasattr(getattr(x, "jaxpr", x), "eqns")]
