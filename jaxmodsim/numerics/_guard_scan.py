@@ -19,6 +19,8 @@ _LARGEST = 144 / 81
 _CUBIC_OF_RANGE, _CUBIC_OF_HEADROOM = 0.3, 3.0
 # ... and the error of the cubic below these.
 _ERROR_OF_RANGE, _ERROR_OF_HEADROOM = 0.05, 0.3
+# Rounding units in the values.
+_ROUNDING = 1e3
 # Where a step ends on a root the error of the cubic is below this many of the tolerances.
 _ERROR_AT_ROOT = 10.0
 
@@ -52,14 +54,14 @@ def scan_guards(
     values: tuple[Numbers, Numbers, Numbers, Numbers],
     middle: Numbers,
     armed: Flags,
-    tolerance: Numbers,
+    tolerances: tuple[Float[Array, ""], Numbers],
     blur: Float[Array, ""],
     unit: Float[Array, ""],
 ) -> GuardScan:
     """First fall through zero of functions known at 0, 1/3, 1/2, 2/3 and 1 of a step.
 
-    Between the points each is the cubic through the first, second, fourth and fifth, whose own minimum counts as
-    another point. If it is not armed, it must be seen positive, or rise from zero at the start, before it can fall.
+    Between the points each is the cubic through the first, second, fourth and fifth, whose own minimum, if
+    it is lower than the tolerance, counts as another point. If it is not armed, it must be seen positive, or rise from zero at the start, before it can fall.
 
     The value in the middle gives the error of the cubic. A step is resolved if third difference and error are small
     beside the range of the values, so that no oscillation is taken for a slow change, and beside the headroom: the
@@ -71,7 +73,7 @@ def scan_guards(
     - `middle`: at 1/2, shape `[n]`.
     - `armed`: whether a function counts as positive at the start, whatever its value there. If it is armed, not
       positive and does not rise, it falls at once.
-    - `tolerance`: size of what need not be seen, above rounding.
+    - `tolerances`: size of what need not be seen, relative to the largest magnitude in the step, and absolute.
     - `blur`: rounding error of the places in the step.
     - `unit`: a one, see `once`.
 
@@ -85,6 +87,12 @@ def scan_guards(
     third = g3 - 3.0 * g2 + 3.0 * g1 - g0
     c1, c2, third = once((c1, c2, third), unit)
     c3 = 4.5 * third
+    everything = (*values, middle)
+    high, low = reduce(jnp.maximum, everything), reduce(jnp.minimum, everything)
+    spread = high - low
+    rtol, atol = tolerances
+    rtol = jnp.maximum(rtol, _ROUNDING * float(jnp.finfo(third.dtype).eps))
+    tolerance = rtol * jnp.maximum(jnp.abs(high), jnp.abs(low)) + atol + blur * spread
 
     # The minimum of a cubic, in the form of the quadratic formula that stays exact as c3 goes to zero.
     discriminant = c2 * c2 - 3.0 * c1 * c3
@@ -104,7 +112,7 @@ def scan_guards(
         high1,
         jnp.where(lowest < 1 / 2, high_middle, jnp.where(lowest < 2 / 3, high2, high3)),
     )
-    dips = inside & (bottom < 0) & high_lowest
+    dips = inside & (bottom < -tolerance) & high_lowest
     end, low = jnp.ones_like(g0), g3
     crosses = jnp.zeros_like(armed)
     for point, value, below in (
@@ -133,10 +141,6 @@ def scan_guards(
     error = _LARGEST * jnp.abs(middle - (g0 + 0.5 * (c1 + 0.5 * (c2 + 0.5 * c3))))
     headroom = reduce(jnp.minimum, (jnp.abs(g1), jnp.abs(middle), jnp.abs(g2)))
     headroom = jnp.where(inside & (bottom > 0), jnp.minimum(headroom, bottom), headroom)
-    everything = (*values, middle)
-    high, low = reduce(jnp.maximum, everything), reduce(jnp.minimum, everything)
-    spread = high - low
-    tolerance = tolerance + blur * spread
     cubic = jnp.cbrt(
         _ratio(jnp.minimum(_CUBIC_OF_RANGE * spread, _CUBIC_OF_HEADROOM * headroom) + tolerance, jnp.abs(third))
     )

@@ -205,8 +205,8 @@ def _multipliers(found: Contact, drive: Float[Array, " n"], sticks: Bool[Array, 
 def contact_guards(found: Contact, mode: Float[Array, " modes"], rest: Float[Array, ""]) -> Float[Array, " modes"]:
     """One guard for each element with a mode, positive while its mode holds.
 
-    In stick `(upper - f)(lower + f)/(upper + lower)` [N], which falls through zero at either limit with the slope of
-    the force; in slip the velocity in its direction [m/s]. What differs by rounding must not flicker: the limits are
+    In stick `(upper - f)(lower + f)/(upper + lower)^2`, which is 1/4 without a load and falls through zero at either
+    limit with the slope of the load in limits; in slip the velocity in its direction [m/s]. What differs by rounding must not flicker: the limits are
     16 rounding units further out, and a slip has to turn by `rest` [m/s] before it ends (an element may be in slip, at
     its limit, while others hold it).
     """
@@ -214,7 +214,8 @@ def contact_guards(found: Contact, mode: Float[Array, " modes"], rest: Float[Arr
     force, upper, lower = (x[:n] for x in balance(found, mode)[:3])
     wider = 1.0 + 16.0 * float(jnp.finfo(force.dtype).eps)
     span = upper + lower
-    inside = (wider * upper - force) * (wider * lower + force) / jnp.where(span > 0, span, 1.0)
+    span = jnp.where(span > 0, span, 1.0)
+    inside = ((wider * upper - force) / span) * ((wider * lower + force) / span)
     return jnp.where(mode == 0, inside, mode * found.v[:n] + rest)
 
 

@@ -17,6 +17,7 @@ from ..solvers import (
     EventController,
     EventLog,
     EventSolver,
+    EventState,
     FiniteSteps,
     Gauss,
     ImplicitFriction,
@@ -30,6 +31,8 @@ from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, end_code, start_
 
 # Part of the absolute tolerance below which a slip velocity counts as none.
 _REST = 1e-3
+# Rounding units in the load of a sticking element, of its limit.
+_ROUNDING = 100.0
 # Part of its limit by which a sticking element's force may exceed it at a saved time, for the error of dense output.
 _OVERLOAD = 1e-2
 
@@ -155,6 +158,7 @@ def _solver(
             pin=pin,
             jumps=sample_times(scene.params, linear=False),
             rtol=problem.rtol,
+            atol=partial(_guard_atol, problem),
             insist=True,
             max_events=options.max_events if log is None else min(log, options.max_events),
             log=log is not None,
@@ -162,6 +166,12 @@ def _solver(
     if hybrid.projects or pin is not None:
         return Projected(solver, hybrid.project if hybrid.projects else None, pin)
     return solver
+
+
+def _guard_atol(problem: Problem, s: EventState) -> Array:
+    """By how much guards may be wrong: those of stick by `rtol` of their limits, those of slip by `atol` [m/s]."""
+    rtol = jnp.maximum(problem.rtol, _ROUNDING * float(jnp.finfo(problem.rtol.dtype).eps))
+    return jnp.where(s.mode == 0, rtol, problem.atol)
 
 
 def _step_from(t: Array, scene: Scene) -> Scene:

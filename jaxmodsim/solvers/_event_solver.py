@@ -1,7 +1,6 @@
 """A solver wrapper that makes events non-terminating."""
 
 from collections.abc import Callable
-from functools import reduce
 from typing import Any, ClassVar, cast
 
 import diffrax as dfx
@@ -35,8 +34,6 @@ _ACCUMULATION = 1e-3
 _FORGET = 0.25
 # A step counts as no longer than this many of those before it.
 _GROW = 2.0
-# Rounding units in a guard, of its largest magnitude since the last event.
-_ROUNDING = 1e3
 # Events that few do not accumulate.
 _FEWEST = 8
 
@@ -149,7 +146,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
       of the step gets `args` as they are.
     - `jumps`: times at which fields and guards jump, increasing, shape `[n]`. The controller must end steps there; then
       `reset` is called, with no guard marked, and what it changes of the modes is an event.
-    - `rtol`: the part of its largest magnitude since the last event by which a guard may fall below zero, and return, unseen.
+    - `rtol`, `atol`: relative to the largest magnitude of a guard in a step, and absolute: by the sum of both it may
+      fall below zero, and return, unseen. `atol` is a number, one for each guard, or a function of the state.
     - `max_events`: limit of the number of events, > 0, and length of the log.
     - `log`: whether the state carries an `EventLog`.
 
@@ -174,6 +172,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     pin: Callable[..., Any] | None = None
     jumps: Float[Array, " n"] | None = None
     rtol: Any = 1e-6
+    atol: Any = 0.0
     insist: bool = eqx.field(default=False, static=True)
     max_events: int = eqx.field(default=128, static=True)
     log: bool = eqx.field(default=True, static=True)
@@ -219,7 +218,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         zero = jnp.zeros((), jnp.result_type(t0, *jtu.tree_leaves(y0)))
         t0 = jnp.asarray(t0, zero.dtype)
         one = zero + 1.0
-        state = EventState(y0, mode, t0, zero, zero, zero, None, zero, zero, zero, zero, zero, zero, one, one)
+        state = EventState(y0, mode, t0, zero, zero, zero, None, zero, zero, zero, zero, zero, one, one)
         guard = self._guards(t0, state, args)
         log = None
         if self.log:
@@ -230,7 +229,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             pair = jtu.tree_map(rows, (y0, mode))
             log = EventLog(jnp.full(self.max_events, jnp.inf, zero.dtype), rows(guard), pair, pair)
         ready = jnp.ones_like(guard) if self.insist else jnp.where(guard > 0, 1.0, jnp.zeros_like(guard))
-        return state._replace(fired=jnp.zeros_like(guard), log=log, guard=guard, armed=ready, size=jnp.abs(guard))
+        return state._replace(fired=jnp.zeros_like(guard), log=log, guard=guard, armed=ready)
 
     def _guards(self, t: Any, state: EventState, args: PyTree) -> Float[Array, " guards"]:
         return jnp.asarray(self.guards(t, state, args))
@@ -261,14 +260,14 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         end = self._guards(t1, y0._replace(y=y1), args)
         unit = unit_of(_constant(t1 - t0))
         one, middle, two, end = once(_constant((*inside, end)), unit)
-        size = reduce(jnp.maximum, (y0.size, jnp.abs(one), jnp.abs(middle), jnp.abs(two), jnp.abs(end)))
-        least = jnp.maximum(_constant(self.rtol), _ROUNDING * float(jnp.finfo(end.dtype).eps)).astype(end.dtype)
+        atol = self.atol(y0) if callable(self.atol) else self.atol
+        tolerances = jnp.asarray(_constant(self.rtol), end.dtype), jnp.asarray(_constant(atol), end.dtype)
         # Around t0 = 0 the resolution of time is that of the step itself.
         length = _constant(t1 - t0)
         eps = float(jnp.finfo(length.dtype).eps)
         resolution = 4.0 * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
         blur = _constant(resolution) / jnp.where(length > 0, length, 1.0)
-        seen = scan_guards((y0.guard, one, two, end), middle, y0.armed > 0.5, least * size, blur, unit)
+        seen = scan_guards((y0.guard, one, two, end), middle, y0.armed > 0.5, tolerances, blur, unit)
         # Where nothing moves steps grow without measure, and tell nothing of the motion that the event begins.
         measure = jnp.minimum(length, _GROW * pace)
         near = jnp.maximum(_LANDING * jnp.maximum(measure, pace), _constant(resolution))
@@ -298,7 +297,6 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         state1 = y0._replace(
             y=y1,
             guard=end,
-            size=size,
             armed=jnp.where(seen.armed, 1.0, jnp.zeros_like(end)),
             landed=jnp.where(landed, 1.0, jnp.zeros_like(aim)),
             next_root=aim,
@@ -386,7 +384,6 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             log=log,
             guard=_constant(values),
             armed=jnp.where(armed, 1.0, jnp.zeros_like(values)),
-            size=_constant(jnp.where(happened, jnp.abs(values), jnp.maximum(state.size, jnp.abs(values)))),
             resets=state.resets + 1.0,
             spread=spread,
         )
@@ -396,7 +393,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         return jtu.tree_map(
             lambda a, b: jnp.where(happened | jnp.any(fired), a, b),
             after_reset,
-            state._replace(y=end.y, guard=after_reset.guard, armed=after_reset.armed, size=after_reset.size),
+            state._replace(y=end.y, guard=after_reset.guard, armed=after_reset.armed),
         )
 
 

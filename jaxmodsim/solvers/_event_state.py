@@ -35,8 +35,8 @@ class EventState(NamedTuple):
     - `fired`: 1 for each guard that fired in the last event, shape `[guards]`.
     - `log`: an `EventLog`, or None.
 
-    The rest is how `EventSolver` tells `EventController` what it saw: `guard` and `armed` at this state, `size` the
-    largest magnitude of each guard since the last event, `resets` the number of calls of `reset`, `spread` the longest of the last intervals between them, `landed` whether the step ended
+    The rest is how `EventSolver` tells `EventController` what it saw: `guard` and `armed` at this state, `resets` the
+    number of calls of `reset`, `spread` the longest of the last intervals between them, `landed` whether the step ended
     on a root, `next_root` where the next root is or seems to be, in steps from the start of this one, `step_factor` by
     which factor the step may change before the guards are not resolved.
     """
@@ -50,7 +50,6 @@ class EventState(NamedTuple):
     log: EventLog | None
     guard: Float[Array, "*s guards"]
     armed: Float[Array, "*s guards"]
-    size: Float[Array, "*s guards"]
     resets: Float[Array, "..."]
     spread: Float[Array, "..."]
     landed: Float[Array, "..."]
