@@ -60,8 +60,9 @@ def scan_guards(
 ) -> GuardScan:
     """First fall through zero of functions known at 0, 1/3, 1/2, 2/3 and 1 of a step.
 
-    Between the points each is the cubic through the first, second, fourth and fifth, whose own minimum, if
-    it is lower than the tolerance, counts as another point. If it is not armed, it must be seen positive, or rise from zero at the start, before it can fall.
+    Between the points each is the cubic through the first, second, fourth and fifth, whose own minimum, if it is lower
+    than the tolerance, counts as another point. A function that is not armed must be seen positive, or rise from zero
+    at the start, before it can fall.
 
     The value in the middle gives the error of the cubic. A step is resolved if third difference and error are small
     beside the range of the values, so that no oscillation is taken for a slow change, and beside the headroom: the
@@ -141,20 +142,29 @@ def scan_guards(
     error = _LARGEST * jnp.abs(middle - (g0 + 0.5 * (c1 + 0.5 * (c2 + 0.5 * c3))))
     headroom = reduce(jnp.minimum, (jnp.abs(g1), jnp.abs(middle), jnp.abs(g2)))
     headroom = jnp.where(inside & (bottom > 0), jnp.minimum(headroom, bottom), headroom)
-    cubic = jnp.cbrt(
-        _ratio(jnp.minimum(_CUBIC_OF_RANGE * spread, _CUBIC_OF_HEADROOM * headroom) + tolerance, jnp.abs(third))
-    )
-    quartic = _ratio(jnp.minimum(_ERROR_OF_RANGE * spread, _ERROR_OF_HEADROOM * headroom) + tolerance, error)
-    landing = _ratio(_ERROR_AT_ROOT * tolerance, error)
+    step_factor, landing_factor = _step_factors(jnp.abs(third), error, spread, headroom, tolerance)
     return GuardScan(
         high3 | (g3 > 0),
         crosses,
         root,
         ahead,
-        jnp.minimum(cubic, jnp.sqrt(jnp.sqrt(quartic))),
-        jnp.sqrt(jnp.sqrt(landing)),
+        step_factor,
+        landing_factor,
         (g0, c1, c2, c3),
     )
+
+
+def _step_factors(
+    third: Numbers, error: Numbers, spread: Numbers, headroom: Numbers, tolerance: Numbers
+) -> tuple[Numbers, Numbers]:
+    """By which factors the length of the step may change: anyhow, and where it ends on a root.
+
+    The third difference goes with the third power of the step, the error of the cubic with the fourth.
+    """
+    cubic = jnp.minimum(_CUBIC_OF_RANGE * spread, _CUBIC_OF_HEADROOM * headroom) + tolerance
+    quartic = jnp.minimum(_ERROR_OF_RANGE * spread, _ERROR_OF_HEADROOM * headroom) + tolerance
+    landing = jnp.sqrt(jnp.sqrt(_ratio(_ERROR_AT_ROOT * tolerance, error)))
+    return jnp.minimum(jnp.cbrt(_ratio(cubic, third)), jnp.sqrt(jnp.sqrt(_ratio(quartic, error)))), landing
 
 
 def _ratio(allowed: Numbers, size: Numbers) -> Numbers:

@@ -33,7 +33,7 @@ def solve_semidefinite(
     **Returns:**
 
     The solution, shape `[n]`: right to rounding where the matrix, scaled to a largest entry of one by the weights, has
-    no eigenvalue below 1e-4; how redundant unknowns share, to the square root of the rounding unit.
+    no eigenvalue below 1e-4 but those of zero.
     """
     n = rhs.shape[0]
     if n == 1:
@@ -53,4 +53,7 @@ def solve_semidefinite(
     solution = solve(right)
     for _ in range(_REFINEMENTS):
         solution = solution + solve(right - jnp.sum(scaled * solution[None, :], axis=1))
+    # Rounding, divided by the shift, is left in the directions that the matrix does not see. These two solves return
+    # them as they are, and what it sees times the square of the shift over an eigenvalue.
+    solution = solution - shift**2 * solve(solve(solution))
     return jnp.where(active, weight * solution, 0.0)

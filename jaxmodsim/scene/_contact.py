@@ -206,9 +206,9 @@ def contact_guards(found: Contact, mode: Float[Array, " modes"], rest: Float[Arr
     """One guard for each element with a mode, positive while its mode holds.
 
     In stick `(upper - f)(lower + f)/(upper + lower)^2`, which is 1/4 without a load and falls through zero at either
-    limit with the slope of the load in limits; in slip the velocity in its direction [m/s]. What differs by rounding must not flicker: the limits are
-    16 rounding units further out, and a slip has to turn by `rest` [m/s] before it ends (an element may be in slip, at
-    its limit, while others hold it).
+    limit with the slope of the load in limits; in slip the velocity in its direction [m/s]. What differs by rounding
+    must not flicker: the limits are 16 rounding units further out, and a slip has to turn by `rest` [m/s] before it
+    ends (an element may be in slip, at its limit, while others hold it).
     """
     n = mode.shape[0]
     force, upper, lower = (x[:n] for x in balance(found, mode)[:3])

@@ -17,9 +17,9 @@ from ._projected import projected
 # How far beside the root a step may end, as a fraction of the last steps; from there the state is carried to the root,
 # with an error of the third power of that distance.
 _LANDING = 1e-5
-# Where a step is to end if conditions have to hold after it, in landing distances behind the root, and at most this part
-# of what is left of the step: in front of it is no motion after the event. A slip that begins touches rest there, and
-# would end again.
+# Where a step is to end if conditions have to hold after it, in landing distances behind the root, and at most this
+# part of what is left of the step: in front of it is no motion after the event. A slip that begins touches rest there,
+# and would end again.
 _BEYOND, _BEYOND_OF_REST = 0.3, 0.5
 # What the step and the jump measure of the way to a root may differ by this factor.
 _LATITUDE = 4.0
