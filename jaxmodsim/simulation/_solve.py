@@ -158,7 +158,7 @@ def _solver(
             pin=pin,
             jumps=sample_times(scene.params, linear=False),
             rtol=problem.rtol,
-            atol=partial(_guard_atol, problem),
+            atol=jtu.Partial(_guard_atol, problem.rtol, problem.atol),
             insist=True,
             max_events=options.max_events if log is None else min(log, options.max_events),
             log=log is not None,
@@ -168,10 +168,10 @@ def _solver(
     return solver
 
 
-def _guard_atol(problem: Problem, s: EventState) -> Array:
+def _guard_atol(rtol: Array, atol: Array, s: EventState) -> Array:
     """By how much guards may be wrong: those of stick by `rtol` of their limits, those of slip by `atol` [m/s]."""
-    rtol = jnp.maximum(problem.rtol, _ROUNDING * float(jnp.finfo(problem.rtol.dtype).eps))
-    return jnp.where(s.mode == 0, rtol, problem.atol)
+    rtol = jnp.maximum(rtol, _ROUNDING * float(jnp.finfo(rtol.dtype).eps))
+    return jnp.where(s.mode == 0, rtol, atol)
 
 
 def _step_from(t: Array, scene: Scene) -> Scene:
