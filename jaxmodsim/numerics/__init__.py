@@ -19,6 +19,8 @@ from ._function import Function as Function
 from ._function import as_function as as_function
 from ._function import real_array as real_array
 from ._function import result_shape as result_shape
+from ._indices import check_indices as check_indices
+from ._indices import traced as traced
 from ._jsonable import jsonable as jsonable
 from ._linalg import MAX_UNROLLED_CHOLESKY as MAX_UNROLLED_CHOLESKY
 from ._linalg import cholesky_pivots as cholesky_pivots
