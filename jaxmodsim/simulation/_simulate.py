@@ -74,7 +74,7 @@ def simulate(
       coordinate, runs by events (set-valued laws); `diffrax.Tsit5` otherwise. `ImplicitFriction` for fixed steps that
       may be too long for the stiffness of friction.
     - `adjoint`: how diffrax differentiates the run. By default for reverse mode (`jax.grad`); pass
-      `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`.
+      `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`. Not `diffrax.BacksolveAdjoint`.
     - `max_steps`: limit of the number of steps.
     - `max_events`: limit of the number of instants at which set-valued laws change modes. Inside `jax.jit`
       `run.events` has as many entries for each such law, so a smaller one is faster there.
@@ -173,6 +173,11 @@ def prepare(
                 "ImplicitFriction takes fixed steps and has no estimate of its error: pass the step, as in dt=1e-3."
             )
         check_step(scene)
+    if isinstance(adjoint, dfx.BacksolveAdjoint):
+        raise ValueError(
+            "simulate cannot use diffrax.BacksolveAdjoint, which knows neither events nor projections nor what is kept"
+            " of a run. Leave adjoint out: diffrax.RecursiveCheckpointAdjoint needs little memory, too."
+        )
     adjoint_arrays, adjoint_rest = _split(adjoint, dfx.AbstractAdjoint, "adjoint")
     problem = problem._replace(plugins=(solver_arrays, adjoint_arrays))
     options = Options(solver_rest, adjoint_rest, max_steps, max_events, hold_chatter, project)

@@ -169,7 +169,7 @@ def _step_from(t: Array, scene: Scene) -> Scene:
 def _controller(problem: Problem, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
     controller = _error_control(problem, solver)
     if problem.scene.exact:
-        controller = EventController(controller)
+        controller = EventController(controller, direction=1)
     times = sample_times(problem.scene.params, linear=True)
     return controller if times is None else StepsTo(controller, times)
 

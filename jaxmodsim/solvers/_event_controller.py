@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple, cast
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -10,6 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
 from ..numerics import once, unit_of
+from ._equation import check_ode
 from ._event_state import ACCUMULATION, TOO_MANY, EventState
 
 # How often a step may shrink only because its guards are not resolved.
@@ -23,6 +25,8 @@ _SHORTEST = 1e-9
 _CLOSE = 0.1
 # A step whose successor is at least this much of it was wrong by little.
 _MILD = 0.3
+
+_BACKWARD = "EventSolver runs forward in time, but t1 < t0: count time the other way, and negate the vector field."
 
 _constant = jax.lax.stop_gradient
 
@@ -50,12 +54,20 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
     **Arguments:**
 
     - `controller`: any diffrax step size controller, adaptive or constant.
+    - `direction`: 1 where time is known to run forward; by default the run looks at it.
+
+    **Raises:**
+
+    - `ValueError` where the state is not from `EventSolver.start`, as under `diffrax.BacksolveAdjoint`.
+    - `RuntimeError` at run time, by `equinox.error_if`, where t1 < t0.
     """
 
     controller: dfx.AbstractStepSizeController
+    direction: Any
 
-    def __init__(self, controller: dfx.AbstractStepSizeController):
+    def __init__(self, controller: dfx.AbstractStepSizeController, direction: Any = None):
         self.controller = controller
+        self.direction = direction
 
     @property
     def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -74,12 +86,22 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
 
     def wrap(self, direction: Any) -> "EventController":
         """Wrap the controller inside."""
-        return EventController(self.controller.wrap(direction))
+        known = direction if self.direction is None else self.direction
+        return EventController(self.controller.wrap(direction), known)
 
     def init(
-        self, terms: PyTree, t0: Any, t1: Any, y0: EventState, dt0: Any, args: PyTree, func: Any, error_order: Any
+        self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, dt0: Any, args: PyTree, func: Any, error_order: Any
     ) -> tuple[Any, _ControllerState]:
         """First step of the wrapped controller, on the part of the state that is integrated."""
+        check_ode(terms, method="EventSolver")
+        if not isinstance(y0, EventState):
+            raise ValueError(
+                "EventController needs y0=solver.start(t0, y0) of its EventSolver. diffrax.BacksolveAdjoint does not"
+                " pass events: leave the adjoint out, or take diffrax.ForwardMode()."
+            )
+        if not isinstance(self.direction, int):
+            # diffrax has turned the times where t1 < t0; the direction of a run of no length is -1, too.
+            t0 = eqx.error_if(t0, (self.direction < 0) & (t0 < t1), _BACKWARD)
 
         def inner_func(terms: PyTree, t: Any, y: PyTree, args: PyTree) -> PyTree:
             return func(terms, t, y0._replace(y=y), args)
