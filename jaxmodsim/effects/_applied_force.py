@@ -50,8 +50,10 @@ class AppliedForce(AbstractEffect):
 
     def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
         """Check the shape that `fn` returns."""
-        given = result_shape(self.fn, q[0], q, qd, params, name=f"fn of AppliedForce {name!r}")
-        wanted = q.shape if self.at is None else result_shape(self.at, q, params, name=f"at of AppliedForce {name!r}")
+        given = result_shape(self.fn, t=q[0], q=q, qd=qd, params=params, name=f"fn of AppliedForce {name!r}")
+        wanted = q.shape
+        if self.at is not None:
+            wanted = result_shape(self.at, q=q, params=params, name=f"at of AppliedForce {name!r}")
         if given != wanted:
             where = "the coordinates" if self.at is None else "what `at` returns"
             raise ValueError(

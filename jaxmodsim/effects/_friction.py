@@ -154,7 +154,7 @@ class Friction(AbstractEffect):
 
     def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
         """Check that displacement, belt velocity and load have the shapes they need."""
-        shape = self._shape(q, params)
+        shape = self._shape(q, params, name)
         if self.along is None and q.shape != (1,):
             raise ValueError(
                 f"Friction {name!r} acts on a mechanism with {q.shape[0]} coordinates: say along which"
@@ -181,24 +181,26 @@ class Friction(AbstractEffect):
             )
         load = None if self.rests_on is not None else self.normal_force
         factors = [x.fn for _, x in modules_of(self.law) if isinstance(x, Varying)]
-        state = (q[0], q, qd, params)
+        state = {"t": q[0], "q": q, "qd": qd, "params": params}
         for label, fn, args, wanted in (
-            ("belt_velocity(t)", self.belt_velocity, (q[0],), slip),
+            ("belt_velocity(t)", self.belt_velocity, {"t": q[0]}, slip),
             ("normal_force(t, q, qd, params)", load, state, ()),
             *(("scaled_by's fn(t, q, qd, params)", fn, state, ()) for fn in factors),
         ):
-            given = result_shape(fn, *args, name=f"{label} of Friction {name!r}") if callable(fn) else wanted
+            given = result_shape(fn, **args, name=f"{label} of Friction {name!r}") if callable(fn) else wanted
             if given != wanted:
                 raise ValueError(f"Friction {name!r}: {label} returned the shape {given}, but {wanted} is needed.")
 
-    def _shape(self, q: Any, params: PyTree) -> tuple[int, ...] | None:
+    def _shape(self, q: Any, params: PyTree, name: str) -> tuple[int, ...] | None:
         """Shape of the displacement."""
-        return () if self.along is None else result_shape(self.along, q, params, name="Friction along")
+        if self.along is None:
+            return ()
+        return result_shape(self.along, q=q, params=params, name=f"along of Friction {name!r}")
 
     def check_belt(self, q: Any, params: PyTree, name: str) -> None:
         """Refuse a slip that is a vector beside the velocity of a belt that is a number other than zero."""
         assert self.along is not None
-        slip = self._shape(q, params)
+        slip = self._shape(q, params, name)
         if slip != ():
             raise ValueError(
                 f"Friction {name!r}: slip is a vector of shape {slip}, so belt_velocity must be a function of t that"
@@ -209,7 +211,7 @@ class Friction(AbstractEffect):
         """State of the law; None where it has none."""
         if not isinstance(self.law, AbstractDynamicLaw):
             return None
-        slip = () if q.shape == (1,) else self._shape(q, params)
+        slip = () if q.shape == (1,) else self._shape(q, params, self.name or self.default_name)
         return self.law.state0(jnp.zeros(slip or (), q.dtype))
 
     def direction(self, q: Float[Array, " dof"], params: PyTree) -> Float[Array, " dof"]:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..numerics import check_ranges, modules_of
+from ..numerics import check_ranges, modules_of, traced
 from ..scene import Scene, State, check_scene, scene_numbers, scene_ranges
 from ._entries import chosen_entries, split_entries, split_ranges
 from ._excitation import Axis, driven_motion, feed_forward, motion_basis, relative_numbers, sensitivities
@@ -233,7 +233,7 @@ def _axis(
         check_ranges(module)
     rest = State(position, jnp.zeros_like(position), scene.state0(position))
     check_scene(scene, rest)
-    shape = getattr(jax.eval_shape(observe, rest.q, rest.qd), "shape", None)
+    shape = getattr(traced(observe, name="observe(q, qd)", q=rest.q, qd=rest.qd), "shape", None)
     if shape != ():
         raise ValueError(f"observe(q, qd) returned the shape {shape}, but one number, shape (), is needed.")
     whole = scene_numbers(scene)

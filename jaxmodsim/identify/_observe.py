@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..numerics import as_mapping, did_you_mean
+from ..numerics import as_mapping, did_you_mean, traced
 from ..scene import Scene, State, scene_forces
 from ._record import Record
 
@@ -55,7 +55,8 @@ def check_observables(observables: tuple[tuple[str, Observable], ...], scene: Sc
 
     **Raises:**
 
-    - `ValueError` for a name that is neither an entry of q or qd nor an effect, or a function that returns no number.
+    - `ValueError` for a name that is neither an entry of q or qd nor an effect, or a function that returns no number or
+      uses an index out of range.
     """
     for channel, observable in observables:
         if not isinstance(observable, str) and not callable(observable):
@@ -77,6 +78,8 @@ def check_observables(observables: tuple[tuple[str, Observable], ...], scene: Sc
 
 
 def _shape(observable: Observable, y: State, scene: Scene) -> Any:
+    if callable(observable):
+        return getattr(traced(observable, name="observe(q, qd)", q=y.q, qd=y.qd), "shape", None)
     look = lambda: observer(((".", observable),))(jnp.zeros((), y.q.dtype), y, scene)["."]  # noqa: E731
     return getattr(jax.eval_shape(look), "shape", None)
 

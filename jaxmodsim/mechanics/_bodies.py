@@ -7,10 +7,11 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import Amount, Place, as_amount, as_function, as_place, safe_norm, solve_balanced
+from ..numerics import Amount, Place, as_amount, as_function, as_place, check_indices, safe_norm, solve_balanced
 
 
 class AbstractBody(eqx.Module):
@@ -71,6 +72,7 @@ class PointMass(AbstractBody):
         components of further forces on the mass are to be taken off: they are not known here.
         """
         del t
+        _check_indices(self.position, q, params)
 
         def velocity(q: Array) -> Array:
             return jax.jvp(lambda q: self.position(q, params), (q,), (qd,))[1]
@@ -114,7 +116,8 @@ def point_mass(m: Any, position: Any, gravity: Any = 9.81) -> PointMass:
 
     **Raises:**
 
-    - `ValueError` for what is no number or no function, and (at the run) if `position` returns another shape.
+    - `ValueError` for what is no number or no function, and (at the run) if `position` returns another shape or uses an
+      index beyond the coordinates.
     """
     return PointMass(m, position, gravity)
 
@@ -135,6 +138,7 @@ class RigidBody(AbstractBody):
         del t
         x, v = _moving(self.position, q, qd, params, "rigid_body")
         m, inertia = self.m(params), jnp.asarray(self.inertia(params))
+        _check_indices(self.orientation, q, params)
         turn, rate = jax.jvp(lambda q: self.orientation(q, params), (q,), (qd,))
         _check_orientation(turn.shape, inertia.shape)
         if turn.ndim == 0:
@@ -166,7 +170,8 @@ def rigid_body(m: Any, inertia: Any, position: Any, orientation: Any, gravity: A
 
     **Raises:**
 
-    - `ValueError` for what is no number or no function, and (at the run) for wrong shapes.
+    - `ValueError` for what is no number or no function, and (at the run) for wrong shapes and for
+      indices beyond the coordinates.
     """
     return RigidBody(m, inertia, position, orientation, gravity)
 
@@ -178,6 +183,7 @@ def body_rates(turn: Float[Array, "3 3"], rate: Float[Array, "3 3"]) -> Float[Ar
 
 
 def _moving(position: Place, q: Array, qd: Array, params: PyTree, what: str) -> tuple[Array, Array]:
+    _check_indices(position, q, params)
     x, v = jax.jvp(lambda q: position(q, params), (q,), (qd,))
     if x.shape != (3,):
         raise ValueError(
@@ -185,6 +191,12 @@ def _moving(position: Place, q: Array, qd: Array, params: PyTree, what: str) -> 
             " keep the third one zero, with z upwards."
         )
     return x, v
+
+
+def _check_indices(place: Place, q: Array, params: PyTree) -> None:
+    """Refuse indices out of range where a body is called by itself; a scene looks at its whole Lagrangian."""
+    if not isinstance(q, jax.core.Tracer):
+        check_indices(place, q, params, name=place.name)
 
 
 def _check_orientation(turn: tuple[int, ...], inertia: tuple[int, ...]) -> None:

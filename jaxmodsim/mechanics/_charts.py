@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ..numerics import as_function, as_real, safe_norm
+from ..numerics import as_function, as_real, check_indices, safe_norm
 from ._frame import is_right_handed, orthonormal_frame, resolve
 
 _Triples: TypeAlias = ArrayLike | Sequence[Any]
@@ -162,13 +162,15 @@ class Chart(AbstractChart):
 
     **Raises:**
 
-    - `ValueError` if `position` is no function, or (from every method) returns anything but three real numbers.
+    - `ValueError` if `position` is no function or uses an index beyond the three coordinates, or (from every method)
+      returns anything but three real numbers.
     """
 
     function: Callable[..., Any]
 
     def __init__(self, position: Any) -> None:
         self.function = as_function(position, name="Chart position")
+        check_indices(self.function, jax.ShapeDtypeStruct((3,), jnp.result_type(float)), name="Chart position")
 
     def position(self, q: _Triples) -> Float[Array, "... 3"]:
         """What the given function returns [m], shape `[..., 3]`."""

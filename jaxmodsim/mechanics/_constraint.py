@@ -22,6 +22,7 @@ from ..numerics import (
     parameter,
     result_shape,
     safe_norm,
+    traced,
 )
 
 
@@ -127,8 +128,10 @@ class Constraint(AbstractConstraint):
     def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
         """Check that phi is a number or a vector, and a number where the constraint is one-sided."""
         del qd
-        place = q if self.at is None else jax.eval_shape(self.at, q, params)
-        _check_vector(f"phi of Constraint {name!r}", self.phi, q[0], place, params)
+        place = {"q": q}
+        if self.at is not None:
+            place = {"x": traced(self.at, q=q, params=params, name=f"at of Constraint {name!r}")}
+        _check_vector(f"phi of Constraint {name!r}", self.phi, t=q[0], **place, params=params)
         if self.one_sided and jax.eval_shape(self.error, q[0], q, params).shape != (1,):
             raise ValueError(
                 f"Constraint {name!r}: one_sided=True needs phi to be one number, but it returned several. Give each"
@@ -185,7 +188,7 @@ class VelocityConstraint(AbstractConstraint):
 
     def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
         """Check that psi is a number or a vector."""
-        _check_vector(f"psi of VelocityConstraint {name!r}", self.psi, q[0], q, qd, params)
+        _check_vector(f"psi of VelocityConstraint {name!r}", self.psi, t=q[0], q=q, qd=qd, params=params)
 
     def force(
         self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree, multiplier: Float[Array, " m"]
@@ -199,8 +202,8 @@ class VelocityConstraint(AbstractConstraint):
         return jnp.ones_like(t)
 
 
-def _check_vector(what: str, fn: Callable[..., Any], *args: Any) -> None:
-    shape = result_shape(fn, *args, name=what)
+def _check_vector(what: str, fn: Callable[..., Any], **args: Any) -> None:
+    shape = result_shape(fn, **args, name=what)
     if shape is None or len(shape) > 1 or shape == (0,):
         given = "no array" if shape is None else f"shape {shape}"
         raise ValueError(

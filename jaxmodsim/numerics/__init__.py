@@ -22,6 +22,8 @@ from ._function import result_shape as result_shape
 from ._guard_scan import GuardScan as GuardScan
 from ._guard_scan import first_root as first_root
 from ._guard_scan import scan_guards as scan_guards
+from ._indices import check_indices as check_indices
+from ._indices import traced as traced
 from ._jsonable import jsonable as jsonable
 from ._linalg import MAX_UNROLLED_CHOLESKY as MAX_UNROLLED_CHOLESKY
 from ._linalg import cholesky_pivots as cholesky_pivots

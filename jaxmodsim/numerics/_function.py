@@ -4,12 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
 from ._arguments import check_real
+from ._indices import traced
 
 
 class Function(eqx.Module):
@@ -22,12 +22,13 @@ class Function(eqx.Module):
         return self.fn(*args)
 
 
-def result_shape(fn: Callable[..., Any], *args: Any, name: str) -> tuple[int, ...] | None:
-    """Shape of what `fn(*args)` returns, or None where that is not one array.
+def result_shape(fn: Callable[..., Any], *, name: str, **args: Any) -> tuple[int, ...] | None:
+    """Shape of what `fn(*args.values())` returns, or None where that is not one array.
 
     **Raises:**
 
-    - `ValueError` naming `name` where it holds anything but real numbers.
+    - `ValueError` naming `name` where it holds anything but real numbers, or `fn` uses an index out of range of one of
+      `args`, which are named as they are here; see `traced`.
     """
     shapes: list[tuple[int, ...] | None] = []
 
@@ -37,7 +38,7 @@ def result_shape(fn: Callable[..., Any], *args: Any, name: str) -> tuple[int, ..
             check_real(leaf, name=f"What {name} returns")
         shapes.append(getattr(value, "shape", () if isinstance(value, int | float) else None))
 
-    jax.eval_shape(look, *args)
+    traced(look, name=name, **args)
     return shapes[0]
 
 

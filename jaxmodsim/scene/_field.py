@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..effects import Power
 from ..mechanics import energies, errors, motion_equations, project_position, project_velocity, rates
-from ..numerics import depends, real_array, safe_norm
+from ..numerics import depends, real_array, safe_norm, traced
 from ._contact import Contact, contact_guards, next_modes, overload, stop_slip
 from ._resolve import Modes, Resolved, State, by_constraint, resolve
 from ._scene import Scene
@@ -200,11 +200,12 @@ def scene_power(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None)
 
 
 def check_scene(scene: Scene, y: State) -> None:
-    """Check shapes of everything the scene's functions return.
+    """Check shapes of everything the scene's functions return, and the indices that they use.
 
     **Raises:**
 
-    - `ValueError` naming the function, the shape it returned and the shape that is needed.
+    - `ValueError` naming the function, the shape it returned and the shape that is needed, or the index that is out of
+      range; see `numerics.traced` for those that are seen.
     """
     t = y.q[0]
     scene = scene.now(t)
@@ -212,7 +213,7 @@ def check_scene(scene: Scene, y: State) -> None:
     def energy(*state: Any) -> Array:
         return real_array(scene.lagrangian(*state), name="the Lagrangian")
 
-    given = jax.eval_shape(energy, t, y.q, y.qd, scene.params)
+    given = traced(energy, t=t, q=y.q, qd=y.qd, params=scene.params, name="the Lagrangian")
     if given.shape != () or not jnp.issubdtype(given.dtype, jnp.floating):
         raise ValueError(
             f"The Lagrangian must return one number [J], shape (), that depends on the state, but it returned {given}."

@@ -82,7 +82,10 @@ class Scene(eqx.Module):
 
     **Arguments:**
 
-    - `lagrangian`: `L(t, q, qd, params)` -> energy [J], a scalar; a pure JAX function, q and qd of shape `[dof]`.
+    - `lagrangian`: `L(t, q, qd, params)` -> energy [J], a scalar; a pure JAX function, q and qd of shape `[dof]`. An
+      index beyond that is refused at the run, here and in the functions of effects and constraints, where it is a
+      number or an array of numbers. JAX itself takes another entry in silence: so it is with an index that is computed
+      from q, qd or `params`, or that counts a loop of `jax.lax`.
     - `params`: pytree of real numbers, arrays or `Signal`s for the Lagrangian and the applied forces. Integers
       become floating; what is no number (sizes, options) belongs into the functions.
     - `effects`: tuple of `AppliedForce` and `Friction`.

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from ..numerics import check_indices
 from ..solvers import Rodas5P
 from ._accuracy import Accuracy, Tenfold, Tried
 from ._observe import named_series
@@ -236,6 +237,7 @@ def _states(run: Trajectory) -> np.ndarray:
 
 
 def _observed(observe: Callable[[Trajectory], Any], run: Trajectory) -> np.ndarray:
+    check_indices(lambda: observe(run), name="observable")
     values = np.asarray(observe(run))
     if not np.issubdtype(values.dtype, np.floating) or values.ndim > 2 or not values.size:
         raise ValueError(

@@ -78,6 +78,7 @@ def simulate(
     - `adjoint`: how diffrax differentiates the run. By default for reverse mode (`jax.grad`), by
       `diffrax.RecursiveCheckpointAdjoint(checkpoints=max_steps)`, which keeps the state before each step; with fewer
       checkpoints derivatives through events lose digits. Pass `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`.
+      Not `diffrax.BacksolveAdjoint`.
     - `max_steps`: limit of the number of steps. In reverse mode memory is set aside for the state before each of them.
     - `max_events`: limit of the number of instants at which set-valued laws change modes. Inside `jax.jit`
       `run.events` has as many entries for each such law, so a smaller one is faster there.
@@ -178,6 +179,11 @@ def prepare(
                 "ImplicitFriction takes fixed steps and has no estimate of its error: pass the step, as in dt=1e-3."
             )
         check_step(scene)
+    if isinstance(adjoint, dfx.BacksolveAdjoint):
+        raise ValueError(
+            "simulate cannot use diffrax.BacksolveAdjoint, which knows neither events nor projections nor what is kept"
+            " of a run. Leave adjoint out, or pass diffrax.ForwardMode()."
+        )
     adjoint_arrays, adjoint_rest = _split(adjoint, dfx.AbstractAdjoint, "adjoint")
     problem = problem._replace(plugins=(solver_arrays, adjoint_arrays))
     options = Options(solver_rest, adjoint_rest, max_steps, max_events, hold_chatter, project)

@@ -182,7 +182,7 @@ def _controller(problem: Problem, solver: dfx.AbstractSolver) -> dfx.AbstractSte
     controller = _error_control(problem, solver)
     times = sample_times(problem.scene.params, linear=True)
     if problem.scene.exact:
-        return EventController(controller, times)
+        return EventController(controller, times, direction=1)
     return controller if times is None else StepsTo(controller, times)
 
 

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple, cast
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -11,6 +12,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ..numerics import is_one_of, once, unit_of
 from ._controllers import end_at
+from ._equation import check_ode
 from ._event_state import ACCUMULATION, TOO_MANY, EventState
 
 # How often a step may shrink only because its guards are not resolved.
@@ -24,6 +26,8 @@ _SHORTEST = 1e-9
 _CLOSE = 0.1
 # A step whose successor is at least this much of it was wrong by little.
 _MILD = 0.3
+
+_BACKWARD = "EventSolver runs forward in time, but t1 < t0: count time the other way, and negate the vector field."
 
 _constant = jax.lax.stop_gradient
 
@@ -55,14 +59,27 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
 
     - `controller`: any diffrax step size controller, adaptive or constant.
     - `times`: increasing times at which a step shall end and a new start be made, shape `[n]`; None for none.
+    - `direction`: 1 where time is known to run forward; by default the run looks at it.
+
+    **Raises:**
+
+    - `ValueError` where the state is not from `EventSolver.start`, as under `diffrax.BacksolveAdjoint`.
+    - `RuntimeError` at run time, by `equinox.error_if`, where t1 < t0.
     """
 
     controller: dfx.AbstractStepSizeController
     times: Float[Array, " n"] | None
+    direction: Any
 
-    def __init__(self, controller: dfx.AbstractStepSizeController, times: Float[Array, " n"] | None = None):
+    def __init__(
+        self,
+        controller: dfx.AbstractStepSizeController,
+        times: Float[Array, " n"] | None = None,
+        direction: Any = None,
+    ):
         self.controller = controller
         self.times = times
+        self.direction = direction
 
     @property
     def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -81,12 +98,22 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
 
     def wrap(self, direction: Any) -> "EventController":
         """Wrap the controller inside."""
-        return EventController(self.controller.wrap(direction), self.times)
+        known = direction if self.direction is None else self.direction
+        return EventController(self.controller.wrap(direction), self.times, known)
 
     def init(
-        self, terms: PyTree, t0: Any, t1: Any, y0: EventState, dt0: Any, args: PyTree, func: Any, error_order: Any
+        self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, dt0: Any, args: PyTree, func: Any, error_order: Any
     ) -> tuple[Any, _ControllerState]:
         """First step of the wrapped controller, on the part of the state that is integrated."""
+        check_ode(terms, method="EventSolver")
+        if not isinstance(y0, EventState):
+            raise ValueError(
+                "EventController needs y0=solver.start(t0, y0) of its EventSolver. diffrax.BacksolveAdjoint does not"
+                " pass events: leave the adjoint out, or take diffrax.ForwardMode()."
+            )
+        if not isinstance(self.direction, int):
+            # diffrax has turned the times where t1 < t0; the direction of a run of no length is -1, too.
+            t0 = eqx.error_if(t0, (self.direction < 0) & (t0 < t1), _BACKWARD)
 
         def inner_func(terms: PyTree, t: Any, y: PyTree, args: PyTree) -> PyTree:
             return func(terms, t, y0._replace(y=y), args)

@@ -92,7 +92,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     solution.ys.y, solution.ys.log.t
     ```
 
-    Saving, dense output, progress meters and adjoints of diffrax work as without events. Time runs forward.
+    Saving, dense output, progress meters and adjoints of diffrax work as without events, but for `BacksolveAdjoint`,
+    whose adjoint equation knows of no resets. Time runs forward.
 
     **What an event is.** Let `g_i(t)` be guard i along the solution on `[t0, t1]`. A guard is *armed* or waits. It
     fires at the first `t_event > t0` where it is armed, `g_i(t_event) = 0`, and `g_i < 0` right after: events are
@@ -163,7 +164,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         ```
     """
 
-    term_structure: ClassVar = dfx.ODETerm
+    # Wider than `ODETerm`, so that `EventController` refuses other terms by a sentence.
+    term_structure: ClassVar = dfx.AbstractTerm
     solver: dfx.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
     guards: Callable[..., Any]
     reset: Callable[..., Any]

@@ -5,10 +5,10 @@ from typing import Any, ClassVar, cast
 import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import PyTree
 
 from ..numerics import CollocationMemory, collocation_start, collocation_step
+from ._equation import check_floating, check_ode, in_own_time
 from ._interpolation import PolynomialInterpolation
 
 
@@ -20,9 +20,9 @@ class Gauss(dfx.AbstractSolver):
     quadratic invariants (angular momentum, the energy of linear systems) are kept to rounding. On other
     equations it is an accurate method without damping.
 
-    Usable wherever diffrax takes a solver of an `ODETerm` with constant steps, on any pytree of real floating arrays,
-    in float32 and float64. Adaptive steps would cost the structure: there is no error estimate, and diffrax's adaptive
-    controllers refuse the method. Dense output has the order of the method.
+    Usable wherever diffrax takes a solver of an `ODETerm` with constant steps, forward and backward in time, on any
+    pytree of real floating arrays, in float32 and float64. Adaptive steps would cost the structure: there is no error
+    estimate, and diffrax's adaptive controllers refuse the method. Dense output has the order of the method.
 
     The stages are found by fixed-point iteration down to rounding, about 12 to 18 evaluations of each stage at 20 steps
     per period. Its limit is stiffness: `dt` times the fastest rate must stay below about 1, 1.5, 2 for 1, 2, 3 stages.
@@ -38,7 +38,8 @@ class Gauss(dfx.AbstractSolver):
 
     **Raises:**
 
-    - `ValueError` for another number of stages, and (while tracing) for complex or integer states.
+    - `ValueError` for another number of stages, and (while tracing) for complex or integer states, and for
+      terms other than an `ODETerm`.
 
     ??? cite "Reference"
 
@@ -55,7 +56,8 @@ class Gauss(dfx.AbstractSolver):
     """
 
     stages: int = eqx.field(default=3, static=True)
-    term_structure: ClassVar = dfx.ODETerm
+    # Not `ODETerm`: `diffrax.BacksolveAdjoint` solves its adjoint equation, a term of another class.
+    term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar = PolynomialInterpolation
 
     def __check_init__(self) -> None:
@@ -68,15 +70,11 @@ class Gauss(dfx.AbstractSolver):
         return 2 * self.stages
 
     def init(self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> CollocationMemory:
-        """What the first step starts from; states of a wrong type are refused here."""
-        del t1
-        for leaf in jtu.tree_leaves(y0):
-            if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
-                raise ValueError(
-                    f"Gauss needs a state of real floating numbers, but one of its arrays has the type"
-                    f" {jnp.result_type(leaf)}. Split complex numbers into real and imaginary parts."
-                )
-        return collocation_start(self.stages, lambda t, y: terms.vf(t, y, args), jnp.asarray(t0), y0)
+        """What the first step starts from; terms and states of a wrong type are refused here."""
+        check_ode(terms, method="Gauss")
+        check_floating(y0, method="Gauss")
+        field, start, _ = in_own_time(terms, t0, t1, args)
+        return collocation_start(self.stages, field, start, y0)
 
     def func(self, terms: PyTree, t0: Any, y0: PyTree, args: PyTree) -> PyTree:
         """The vector field."""
@@ -94,14 +92,8 @@ class Gauss(dfx.AbstractSolver):
     ) -> tuple[PyTree, None, dict[str, PyTree], CollocationMemory, dfx.RESULTS]:
         """One step; see `jaxmodsim.numerics.collocation_step`."""
         rest = [jnp.where(made_jump, 0.0, x) for x in solver_state.rest]
-        step = collocation_step(
-            self.stages,
-            lambda t, y: terms.vf(t, y, args),
-            jnp.asarray(t0),
-            jnp.asarray(t1 - t0),
-            y0,
-            solver_state._replace(rest=rest),
-        )
+        field, start, length = in_own_time(terms, t0, t1, args)
+        step = collocation_step(self.stages, field, start, length, y0, solver_state._replace(rest=rest))
         failure = cast(dfx.RESULTS, dfx.RESULTS.nonlinear_divergence)
         result = dfx.RESULTS.where(step.solved, dfx.RESULTS.successful, failure)
         return step.y1, None, {"y0": y0, "y1": step.y1, "k": step.dense}, step.memory, result

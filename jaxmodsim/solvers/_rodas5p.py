@@ -4,12 +4,11 @@ from typing import Any, ClassVar
 
 import diffrax as dfx
 import equinox as eqx
-import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
 from ..numerics import RosenbrockStep, RosenbrockTableau, rosenbrock_step
+from ._equation import check_floating, check_ode, in_own_time
 from ._interpolation import PolynomialInterpolation
 
 
@@ -129,15 +128,17 @@ RODAS5P = RosenbrockTableau(
 # diffrax asks for a step several times over. As one function it is traced, linearised and transposed once.
 @eqx.filter_jit
 def _step(terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree, pivot: bool) -> RosenbrockStep:
-    return rosenbrock_step(RODAS5P, lambda t, y: terms.vf(t, y, args), t0, t1 - t0, y0, pivot=pivot)
+    field, start, length = in_own_time(terms, t0, t1, args)
+    return rosenbrock_step(RODAS5P, field, start, length, y0, pivot=pivot)
 
 
 class Rodas5P(dfx.AbstractAdaptiveSolver):
     """Steinebach's Rodas5P for stiff equations: eight stages, order 5, L-stable, no iteration.
 
-    Usable wherever diffrax takes a solver of an `ODETerm`, with adaptive or fixed steps, on any pytree of real
-    floating arrays, in float32 and float64. Up to 12 state entries the linear algebra is written out in
-    scalars, so that a whole step becomes one fused computation; above, LAPACK is called. Dense output has order 4.
+    Usable wherever diffrax takes a solver of an `ODETerm`, forward and backward in time, with adaptive or fixed steps
+    and any adjoint, on any pytree of real floating arrays, in float32 and float64. Up to 12 state entries the linear
+    algebra is written out in scalars, so that a whole step becomes one fused computation; above, LAPACK is called.
+    Dense output has order 4.
 
     **Arguments:**
 
@@ -146,7 +147,7 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
 
     **Raises:**
 
-    - `ValueError` (while tracing) for complex or integer states.
+    - `ValueError` (while tracing) for complex or integer states, and for terms other than an `ODETerm`.
 
     ??? cite "Reference"
 
@@ -161,7 +162,8 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
     """
 
     pivot: bool = eqx.field(default=False, static=True)
-    term_structure: ClassVar = dfx.ODETerm
+    # Not `ODETerm`: `diffrax.BacksolveAdjoint` solves its adjoint equation, a term of another class.
+    term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar = PolynomialInterpolation
 
     def order(self, terms: PyTree) -> int:
@@ -175,14 +177,10 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
         return 5
 
     def init(self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> None:
-        """The method keeps nothing from step to step; states of a wrong type are refused here."""
-        del terms, t0, t1, args
-        for leaf in jtu.tree_leaves(y0):
-            if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
-                raise ValueError(
-                    f"Rodas5P needs a state of real floating numbers, but one of its arrays has the type"
-                    f" {jnp.result_type(leaf)}. Split complex numbers into real and imaginary parts."
-                )
+        """The method keeps nothing from step to step; terms and states of a wrong type are refused here."""
+        del t0, t1, args
+        check_ode(terms, method="Rodas5P")
+        check_floating(y0, method="Rodas5P")
 
     def func(self, terms: PyTree, t0: Any, y0: PyTree, args: PyTree) -> PyTree:
         """The vector field."""

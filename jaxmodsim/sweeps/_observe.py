@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..numerics import as_names
+from ..numerics import as_names, check_indices
 from ..simulation import Trajectory, named_series
 from ._grid import RESERVED
 
@@ -101,11 +101,18 @@ def _observation(name: Any, given: Any) -> Observation:
 
 
 def observed(what: Observation, run: Trajectory, alone: bool) -> Array:
-    """The value of an observable; of a named one without the time axis where the run keeps its end `alone`."""
-    if isinstance(what.value, str):
-        value = named_series(run, what.value)
+    """The value of an observable; of a named one without the time axis where the run keeps its end `alone`.
+
+    **Raises:**
+
+    - `ValueError` for what is no array of real numbers, and for an index out of range; see `numerics.traced`.
+    """
+    of = what.value
+    if isinstance(of, str):
+        value = named_series(run, of)
         return value[-1] if alone else value
-    return real(what.name, what.value(run))
+    check_indices(lambda: of(run), name=f"observe[{what.name!r}]")
+    return real(what.name, of(run))
 
 
 def real(name: str, value: Any) -> Array:
