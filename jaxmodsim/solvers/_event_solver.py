@@ -263,7 +263,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         unit = unit_of(_constant(t1 - t0))
         one, middle, two, end = once(_constant((*inside, end)), unit)
         atol = self.atol(y0) if callable(self.atol) else self.atol
-        tolerances = jnp.asarray(_constant(self.rtol), end.dtype), jnp.asarray(_constant(atol), end.dtype)
+        rtol, atol = (jnp.asarray(_constant(x), end.dtype) for x in (self.rtol, atol))
+        tolerances = rtol, jnp.broadcast_to(atol, end.shape)
         # Around t0 = 0 the resolution of time is that of the step itself.
         length = _constant(t1 - t0)
         eps = float(jnp.finfo(length.dtype).eps)
