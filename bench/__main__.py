@@ -1,4 +1,4 @@
-"""The benches as one suite: each in a process of its own, one after the other, then the tables of the README.
+"""The benches as one suite: each in a process of its own, one after the other, then the tables of the documentation.
 
 python -m bench [NAME ...] [--list] [--smoke [--jobs N]] [--out DIR] [--jaxonomy PYTHON]
 """
@@ -98,13 +98,13 @@ def main(
     ] = False,
     jobs: Annotated[int, typer.Option(min=1, help="Benches at a time; more than one only with --smoke.")] = 1,
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the results; by default bench/results, and the README is rendered.")
+        Path | None, typer.Option(help="Folder of the results; by default bench/results, and the pages are rendered.")
     ] = None,
     jaxonomy: Annotated[
         Path | None, typer.Option(help="Python of an environment that has jaxonomy, whose pins are its own.")
     ] = None,
 ) -> None:
-    """Run the benches one after the other, and render the README's tables from what they found.
+    """Run the benches one after the other, and render the tables of the documentation.
 
     The results of a bench take their place when it has ended well; Ctrl-C leaves those of the finished ones.
     """

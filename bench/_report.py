@@ -16,7 +16,7 @@ from jaxmodsim.numerics import describe_machine
 mpl.use("Agg")
 
 # What benches write: the results of one are no change to the next.
-_WRITTEN = ("bench/results", "README.md")
+_WRITTEN = ("bench/results", "README.md", "docs")
 _COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
 
 

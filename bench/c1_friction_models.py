@@ -1,4 +1,4 @@
-"""The figures of the test bench of friction models, as `jaxmodsim testbench` prints them, for the README."""
+"""The figures of the test bench of friction models, as `jaxmodsim testbench` prints them, for its table."""
 
 import json
 import tempfile

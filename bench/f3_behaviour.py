@@ -1,4 +1,4 @@
-"""What each friction law does in the standard experiments, as `jaxmodsim testbench --laws` finds it, for the README."""
+"""What each friction law does in the standard experiments, as `jaxmodsim testbench --laws` finds it, for its tables."""
 
 from _measure import machine_line
 from _options import begin
@@ -7,7 +7,7 @@ from _report import new_result, write_figure, write_result
 from jaxmodsim.behaviour import EXPERIMENTS, Outcome, run_bench, specimens
 from jaxmodsim.plot import behaviour_figure
 
-# The figures that the README shows.
+# The figures that docs/laws.md shows.
 SHOWN = ("memory", "creep")
 WORDS = {"pass": "yes", "by nature": "**no**", "n/a": "-", "FAIL": "FAILS"}
 

@@ -1,14 +1,14 @@
-"""Put the tables of the results into the README, between the comments that name them.
+"""Put the tables of the results into the pages, between the comments that name them.
 
 A result `bench/results/NAME.json` holds its tables ready, as
 `{"table": {"columns": [...], "rows": [[...]]}, "caption": "..."}`, or several as
-`{"tables": [{"columns": ..., "rows": ..., "caption": ...}, ...]}`. The README says where they go:
+`{"tables": [{"columns": ..., "rows": ..., "caption": ...}, ...]}`. README.md and docs/*.md say where they go:
 
     <!-- bench:NAME -->
     <!-- /bench -->
 
-    python bench/render.py            writes the README
-    python bench/render.py --check    changes nothing, exits with 1 if the README is out of date
+    python bench/render.py            writes the pages
+    python bench/render.py --check    changes nothing, exits with 1 if a page is out of date
 """
 
 import argparse
@@ -19,34 +19,42 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
+ROOT = HERE.parent
 _BLOCK = re.compile(r"(<!-- bench:([\w-]+) -->\n)(.*?)(<!-- /bench -->)", re.DOTALL)
 
 
 def main() -> None:
     """Render, or check."""
-    parser = argparse.ArgumentParser(description="Put the tables of the results into the README.")
-    parser.add_argument("--check", action="store_true", help="only say whether the README is up to date")
-    parser.add_argument("--readme", type=Path, default=HERE.parent / "README.md")
-    parser.add_argument("--results", type=Path, default=HERE / "results")
-    options = parser.parse_args()
-    before = options.readme.read_text()
-    after = render(before, options.results)
-    if before == after:
-        print("The README is up to date.")
-    elif options.check:
-        sys.exit("The README is out of date: run python bench/render.py.")
+    parser = argparse.ArgumentParser(description="Put the tables of the results into README.md and docs/*.md.")
+    parser.add_argument("--check", action="store_true", help="only say whether the pages are up to date")
+    check = parser.parse_args().check
+    # All before the first is written: an error leaves every page as it was.
+    rendered = {page: render(page, HERE / "results") for page in pages()}
+    outdated = [page for page, text in rendered.items() if page.read_text() != text]
+    names = ", ".join(page.relative_to(ROOT).as_posix() for page in outdated)
+    if not outdated:
+        print("The pages are up to date.")
+    elif check:
+        sys.exit(f"Out of date: {names}. Run python bench/render.py.")
     else:
-        options.readme.write_text(after)
-        print(f"written: {options.readme}")
+        for page in outdated:
+            page.write_text(rendered[page])
+        print(f"written: {names}")
 
 
-def render(text: str, results: Path) -> str:
-    """`text` with every marked block replaced by the tables of the result it names."""
+def pages() -> list[Path]:
+    """README.md and the pages under docs/."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def render(page: Path, results: Path) -> str:
+    """Text of `page` with every marked block replaced by the tables of the result it names."""
+    text = page.read_text()
 
     def block(found: re.Match[str]) -> str:
         path = results / f"{found[2]}.json"
         if not path.exists():
-            sys.exit(f"The README asks for bench:{found[2]}, but there is no {path.name} among the results.")
+            sys.exit(f"{page.name} asks for bench:{found[2]}, but there is no {path.name} among the results.")
         content = json.loads(path.read_text())
         if content.get("smoke"):
             sys.exit(f"{path.name} comes from a smoke run, which measures nothing.")
@@ -54,7 +62,7 @@ def render(text: str, results: Path) -> str:
 
     opened, closed = text.count("<!-- bench:"), text.count("<!-- /bench -->")
     if not opened == closed == len(_BLOCK.findall(text)):
-        sys.exit(f"The README has {opened} comments that open a block and {closed} that close one; they must pair.")
+        sys.exit(f"{page.name} has {opened} comments that open a block and {closed} that close one; they must pair.")
     return _BLOCK.sub(block, text)
 
 

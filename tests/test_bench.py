@@ -1,4 +1,4 @@
-"""The suite of benches: what it runs, what it keeps, and the tables of the README."""
+"""The suite of benches: what it runs, what it keeps, and the tables of the documentation."""
 
 import json
 import runpy
@@ -123,11 +123,17 @@ def test_every_bench_says_what_it_is():
 def test_tables_are_rendered_into_their_blocks(tmp_path):
     table = {"columns": ["a", "b"], "rows": [["x|y", 1]], "caption": "what"}
     (tmp_path / "one.json").write_text(json.dumps({"tables": [table]}))
-    text = "before\n<!-- bench:one -->\nold\n<!-- /bench -->\nafter\n"
-    rendered = render.render(text, tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- bench:one -->\nold\n<!-- /bench -->\nafter\n")
+    rendered = render.render(page, tmp_path)
     assert "| x\\|y | 1 |" in rendered
     assert "*what*" in rendered
     assert "old" not in rendered
-    assert render.render(rendered, tmp_path) == rendered
-    with pytest.raises(SystemExit, match=r"no two\.json among the results"):
-        render.render(text.replace("one", "two"), tmp_path)
+    page.write_text(rendered)
+    assert render.render(page, tmp_path) == rendered
+    page.write_text(rendered.replace("one", "two"))
+    with pytest.raises(SystemExit, match=r"page\.md asks for bench:two.*no two\.json"):
+        render.render(page, tmp_path)
+    page.write_text("<!-- bench:one -->\n")
+    with pytest.raises(SystemExit, match=r"page\.md has 1 comments that open a block and 0"):
+        render.render(page, tmp_path)

@@ -1,0 +1,87 @@
+"""README.md, CONTRIBUTING.md and the pages under docs/: links, size, and figures that the README takes from tables."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bench import render
+
+ROOT = Path(__file__).parents[1]
+PAGES = [*render.pages(), ROOT / "CONTRIBUTING.md"]
+README = (ROOT / "README.md").read_text()
+_CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.DOTALL | re.MULTILINE)
+_LINK = re.compile(r"\]\(([^)\s]+)\)")
+
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of the headings of a page, as GitHub and mkdocs make them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\s-]", "", heading).strip().lower().replace(" ", "-") for heading in headings}
+
+
+def broken_links(page: Path) -> list[str]:
+    """Relative links and figures of a page that lead nowhere."""
+    found = []
+    for link in _LINK.findall(_CODE.sub("", page.read_text())):
+        if re.match(r"[a-z]+:", link):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            found.append(link)
+    return found
+
+
+@each_page
+def test_links_and_figures_exist(page: Path) -> None:
+    assert not broken_links(page)
+
+
+def test_broken_links_are_seen(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("# A (b) c\n[x](#a-b-c) [x](#a) ![x](no.png) [x](page.md#d) `[x](y)` [x](https://z.org)\n")
+    assert broken_links(page) == ["#a", "no.png", "page.md#d"]
+
+
+def test_the_index_lists_every_page() -> None:
+    index = ROOT / "docs" / "index.md"
+    linked = set(re.findall(r"\]\((\w+\.md)\)", index.read_text()))
+    assert linked == {page.name for page in index.parent.glob("*.md")} - {"index.md"}
+
+
+def test_every_figure_is_shown() -> None:
+    shown = {Path(link).name for page in PAGES for link in _LINK.findall(page.read_text())}
+    drawn = [*(ROOT / "docs" / "figures").iterdir(), *(ROOT / "bench" / "results").glob("*.png")]
+    assert {path.name for path in drawn} <= shown
+
+
+def test_the_readme_is_short() -> None:
+    assert len(README.encode()) <= 6000
+
+
+def test_figures_of_the_readme_are_those_of_the_tables() -> None:
+    """Bold figures of a list item stand in a table of the page that the item links to."""
+    checked = 0
+    for item in re.findall(r"^- .*?(?=^- |^$)", README, re.DOTALL | re.MULTILINE):
+        figures = re.findall(r"\*\*([\d.,e-]+)\*\*", item)
+        if not figures:
+            continue
+        (link,) = _LINK.findall(item)
+        rows = [row for row in (ROOT / link).read_text().splitlines() if row.startswith("|")]
+        cells = {cell.strip() for row in rows for cell in row.split("|")}
+        assert set(figures) <= cells, f"{link} has none of {sorted(set(figures) - cells)}"
+        checked += len(figures)
+    assert checked >= 10
+
+
+def test_the_code_of_the_readme_runs(tmp_path: Path) -> None:
+    (code,) = re.findall(r"^```python\n(.*?)^```", README, re.DOTALL | re.MULTILINE)
+    script = tmp_path / "page.py"
+    script.write_text(code + 'assert run.result.ok and run.q.shape == (1001, 1) and "friction" in run.forces\n')
+    subprocess.run([sys.executable, str(script)], cwd=ROOT, check=True)
