@@ -321,7 +321,7 @@ def test_wrong_limits_are_refused(limits, text):
     [
         ({"free": ("mass",)}, "'mass', but the numbers are: drift, m"),
         ({"free": ("u",)}, "u is the input"),
-        ({"input": "force"}, r"'force' must be a single number in the scene's params \(drift, m, offset, tau, u\)"),
+        ({"input": "force"}, r"'force' must be a single number in the scene's params \(drift, m, offset, t0, tau, u\)"),
         ({"input": "m", "free": ("offset",)}, "does not move the first coordinate"),
         ({"duration": -1.0}, "duration must be finite and > 0 s"),
         ({"noise": 0.0}, "noise must be finite and > 0"),

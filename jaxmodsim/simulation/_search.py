@@ -298,7 +298,9 @@ def _remark(search: _Search, nearest: _References, rtol: float) -> str:
     )
     ended = [text for text in (search.failure(rtol, 0), search.failure(rtol, 1)) if text]
     looser = search.pair(_round(_LOOSER * nearest.runs[0].rtol))
-    falls = len(looser) == 2 and nearest.gap < _error(looser[0], looser[1], nearest.size) / _FALL
+    # Runs that are apart do not converge, be it that a single number of them differs less than that of others.
+    converges = nearest.gap < _APART and len(looser) == 2
+    falls = converges and nearest.gap < _error(looser[0], looser[1], nearest.size) / _FALL
     if len(ended) == 2:
         return f"{text} At rtol {rtol:g} none reached the end. {ended[0]}"
     if search.problem.q0.dtype == jnp.float32:
