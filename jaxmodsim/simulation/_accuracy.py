@@ -21,7 +21,7 @@ class Tenfold(NamedTuple):
 class Tried:
     """One run of the search.
 
-    - `solver`: name of its method.
+    - `solver`: name of its method, with "bounded" behind it where the search bounded the step.
     - `rtol`, `atol`: its tolerances.
     - `num_steps`: its steps, rejected ones included.
     - `evaluations`: evaluations of the vector field in one step, the Jacobian of a Rosenbrock method counted as one for
@@ -48,6 +48,7 @@ class Accuracy:
     - `tenfold`: steps for ten times better and ten times worse, as multiples of `num_steps`, by the observed slope.
     - `tried`: all runs of the search, in the order in which they were made.
     - `remark`: what kept the search from the accuracy, in a sentence; empty where it was reached.
+    - `dtmax`: longest step [s] where the search has bounded it; it is among the `options` then.
     """
 
     asked: float
@@ -59,6 +60,7 @@ class Accuracy:
     tenfold: Tenfold
     tried: tuple[Tried, ...]
     remark: str = ""
+    dtmax: float | None = None
 
     @property
     def reached(self) -> bool:
@@ -68,7 +70,8 @@ class Accuracy:
     @property
     def options(self) -> dict[str, Any]:
         """Arguments for `simulate` that make this run again, also where its numbers are traced."""
-        return {"solver": self.solver, "rtol": self.rtol, "atol": self.atol}
+        bound = {} if self.dtmax is None else {"dtmax": self.dtmax}
+        return {"solver": self.solver, "rtol": self.rtol, "atol": self.atol, **bound}
 
     def __str__(self) -> str:
         """The choice in a sentence, what ten times better and worse would cost, and a table of the runs."""
@@ -77,9 +80,9 @@ class Accuracy:
             f"accuracy {self.asked:.3g}: {name} at rtol {self.rtol:.3g}, {self.num_steps} steps, error about"
             f" {self.estimate:.2g}",
             f"ten times better: {self.tenfold.better:.2f} times the steps; ten times worse: {self.tenfold.worse:.2f}",
-            f"{'solver':10}  {'rtol':>8}  {'steps':>8}  {'evaluations':>12}  {'error':>8}",
+            f"{'solver':15}  {'rtol':>8}  {'steps':>8}  {'evaluations':>12}  {'error':>8}",
         ]
         for run in self.tried:
             work = "" if run.evaluations is None else str(run.num_steps * run.evaluations)
-            lines.append(f"{run.solver:10}  {run.rtol:8.1e}  {run.num_steps:8}  {work:>12}  {run.estimate:8.1e}")
+            lines.append(f"{run.solver:15}  {run.rtol:8.1e}  {run.num_steps:8}  {work:>12}  {run.estimate:8.1e}")
         return "\n".join([*lines, *([self.remark] if self.remark else [])])

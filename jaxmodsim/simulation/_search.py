@@ -38,8 +38,9 @@ _KNOWN = 4.0
 # Magnitude of an observable below which errors are relative to this instead.
 _SMALLEST = 1e-6
 # In stick nothing that is integrated moves, and methods that are left to themselves make the same steps. Those of the
-# second one are no longer than this part of the run, so that it looks at the loads in other places.
-_PART = 127.0
+# one that is compared with are no longer than this part of the run, so that it looks at the loads in other places; and
+# its place among the methods.
+_PART, _BOUNDED = 127.0, 2
 # Saved times that are too few to show magnitudes and chaos, and how many do.
 _FEW, _TIMES = 11, 101
 
@@ -63,6 +64,15 @@ class _Made:
         return not self.failure
 
     @property
+    def bounded(self) -> bool:
+        """Whether the search has bounded its steps."""
+        return self.which == _BOUNDED
+
+    @property
+    def name(self) -> str:
+        return type(self.solver).__name__ + (", bounded" if self.bounded else "")
+
+    @property
     def num_steps(self) -> int:
         return int(self.run.stats["num_steps"])
 
@@ -82,6 +92,11 @@ class _Search:
     @property
     def tightest(self) -> float:
         return _round(_TIGHTEST * float(jnp.finfo(self.problem.q0.dtype).eps))
+
+    @property
+    def second(self) -> int:
+        """Place of the method that the first one is compared with."""
+        return len(self.solvers) - 1
 
     def run(self, rtol: float, which: int) -> _Made:
         """The run by one of the methods at a tolerance; made once."""
@@ -108,9 +123,8 @@ class _Search:
         arrays, rest = eqx.partition(solver, eqx.is_array)
         plugins = (arrays, None if problem.plugins is None else problem.plugins[1])
         problem = problem._replace(rtol=np.asarray(rtol, dtype), atol=np.asarray(atol, dtype), plugins=plugins)
-        if which == 1 and problem.scene.exact:
-            longest = np.asarray(problem.t1 - problem.t0, dtype) / _PART
-            problem = problem._replace(dtmax=longest if problem.dtmax is None else np.minimum(problem.dtmax, longest))
+        if which == _BOUNDED:
+            problem = problem._replace(dtmax=np.asarray((problem.t1 - problem.t0) / _PART, dtype))
         options = replace(self.options, solver=rest)
         solved = solve(problem, options)
         _check_known(solved)
@@ -120,7 +134,7 @@ class _Search:
 
     def pair(self, rtol: float) -> tuple[_Made, ...]:
         """Runs by both methods; by one of them at two tolerances where the other does not reach the end."""
-        good = [which for which in (0, 1) if not self.failure(rtol, which)]
+        good = [which for which in (0, self.second) if not self.failure(rtol, which)]
         found = tuple(self.run(rtol, which) for which in good)
         if len(good) != 1:
             return found
@@ -179,7 +193,10 @@ def reach(
         while looser <= _LOOSEST and references.estimate(search.run(looser, which)) <= asked:
             looser = _round(10 * looser)
     good = [made for (_, which), made in search.made.items() if which in choices and references.estimate(made) <= asked]
-    best = min(good, key=lambda made: (made.num_steps * (_evaluations(made) or 1), references.estimate(made)))
+    best = min(
+        good or references.runs,
+        key=lambda made: (made.num_steps * (_evaluations(made) or 1), references.estimate(made)),
+    )
     return _chosen(search, references, best, references.estimate(best))
 
 
@@ -213,23 +230,26 @@ def _asked(problem: Problem, accuracy: Any, observable: Any, tolerances: tuple[A
 
 
 def _solvers(problem: Problem, options: Options) -> tuple[tuple[dfx.AbstractSolver, ...], tuple[int, ...]]:
-    """Two methods, and which of them may be chosen.
+    """Two methods, and which of them may be chosen; in scenes with events the second one again, for bounded steps.
 
     Where nothing is stiff a method of order 8 is cheaper at tight tolerances. Of stiff scenes all other methods at hand
-    take far more work, so that one of them serves as a check only; so does one of bounded steps in scenes with events,
-    and any beside a method that was given.
+    take far more work, so that one of them serves as a check only; so does any beside a method that was given.
     """
     default = default_solver(problem.scene, problem.q0.shape[0], False)
     stiff = any(effect.stiff for effect in problem.scene.effects)
     other = dfx.Kvaerno5() if stiff else dfx.Dopri8()
+    bounds = bool(problem.scene.exact) and problem.dtmax is None
     if options.solver is None:
-        return (default, other), (0,) if stiff or problem.scene.exact else (0, 1)
+        bounded = (other,) if bounds else ()
+        return (default, other, *bounded), (0,) if stiff else (0, 1)
     given = eqx.combine(options.solver, problem.plugins[0])
     if not isinstance(given, dfx.AbstractAdaptiveSolver):
         raise ValueError(
             f"accuracy= chooses tolerances, but {type(given).__name__} takes fixed steps: pass another solver, or none."
         )
-    return (given, other if type(given) is type(default) else default), (0,)
+    other = other if type(given) is type(default) else default
+    bounded = (other,) if bounds else ()
+    return (given, other, *bounded), (0,)
 
 
 def _states(run: Trajectory) -> np.ndarray:
@@ -291,12 +311,12 @@ def _confirmed(search: _Search, found: _References, rtol: float) -> bool:
 
 def _remark(search: _Search, nearest: _References, rtol: float) -> str:
     """Why two runs do not agree, and what to do."""
-    names = " and ".join(dict.fromkeys(type(each.solver).__name__ for each in nearest.runs))
+    names = " and ".join(dict.fromkeys(each.name for each in nearest.runs))
     text = (
         f"accuracy={search.asked:g} was not reached: the best two runs, by {names} at rtol {nearest.runs[0].rtol:g},"
         f" differ by {nearest.gap:.2g}."
     )
-    ended = [text for text in (search.failure(rtol, 0), search.failure(rtol, 1)) if text]
+    ended = [text for text in (search.failure(rtol, 0), search.failure(rtol, search.second)) if text]
     looser = search.pair(_round(_LOOSER * nearest.runs[0].rtol))
     # Runs that are apart do not converge, be it that a single number of them differs less than that of others.
     converges = nearest.gap < _APART and len(looser) == 2
@@ -323,7 +343,7 @@ def _remark(search: _Search, nearest: _References, rtol: float) -> str:
 def _early(search: _Search, rtol: float, throw: bool) -> Trajectory:
     """What becomes of runs that end early: the sentence of the first."""
     if throw:
-        failure = search.failure(rtol, 0) or search.failure(rtol, 1)
+        failure = search.failure(rtol, 0) or search.failure(rtol, search.second)
         raise SimulationError(f"For accuracy={search.asked:g} runs at rtol {rtol:g} were made to check by. {failure}")
     return search.run(rtol, 0).run
 
@@ -338,10 +358,10 @@ def _failure(problem: Problem, solved: Solved) -> str:
 
 def _chosen(search: _Search, references: _References, best: _Made, estimate: float) -> Trajectory:
     """A run with the report of the search."""
-    tried = tuple(
-        Tried(type(x.solver).__name__, x.rtol, x.atol, x.num_steps, _evaluations(x), references.estimate(x))
+    tried = {
+        x: Tried(x.name, x.rtol, x.atol, x.num_steps, _evaluations(x), references.estimate(x))
         for x in search.made.values()
-    )
+    }
     accuracy = Accuracy(
         search.asked,
         estimate,
@@ -349,16 +369,17 @@ def _chosen(search: _Search, references: _References, best: _Made, estimate: flo
         best.rtol,
         best.atol,
         best.num_steps,
-        _tenfold(tried, type(best.solver).__name__, best.rtol, references.gap),
-        tried,
+        _tenfold([tried[x] for x in tried if x.which == best.which], best.rtol, references.gap),
+        tuple(tried.values()),
         references.remark,
+        float(np.asarray(best.run.problem.dtmax)) if best.bounded else None,
     )
     return replace(best.run, accuracy=accuracy)
 
 
-def _tenfold(tried: tuple[Tried, ...], solver: str, rtol: float, gap: float) -> Tenfold:
+def _tenfold(tried: list[Tried], rtol: float, gap: float) -> Tenfold:
     """Steps for ten times better and worse, from the next tighter and the next looser run of the same method."""
-    runs = sorted((run for run in tried if run.solver == solver and math.isfinite(run.estimate)), key=lambda r: r.rtol)
+    runs = sorted((run for run in tried if math.isfinite(run.estimate)), key=lambda r: r.rtol)
     place = [run.rtol for run in runs].index(rtol)
     # Powers of ten in steps for one in the tolerance, and in the tolerance for one in the error, where that is known.
     slopes = [math.log10(a.num_steps / b.num_steps) / math.log10(b.rtol / a.rtol) for a, b in pairwise(runs)]

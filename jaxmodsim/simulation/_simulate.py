@@ -92,8 +92,8 @@ def simulate(
     - `accuracy`: largest error of `observable`, from 1e-12 to 0.1, instead of `rtol`, `atol` and `dt`. Solver and
       tolerances are searched for, by about ten runs of two methods, so that numbers must be known (not traced): the
       run with the least work is taken whose difference to tighter runs by either method is within the accuracy. In
-      scenes with events the second method makes steps of at most 1/127 of the run, so that the two look at different
-      places. What steps over a short pulse in all of them is not seen: `dtmax`.
+      scenes with events the second method makes steps of at most 1/127 of the run, unless `dtmax` bounds both, so that
+      the two look at different places. What steps over a short pulse in all of them is not seen: `dtmax`.
       `run.accuracy` reports it, and `run.accuracy.options` are the arguments for more such runs. With `solver` given
       the tolerances alone are chosen. Errors are relative to the largest magnitude of the observable at the saved
       times (of fewer than 11, at 101 times along the run), or to 1e-6 of its unit where it stays below that.
