@@ -181,7 +181,8 @@ def _counts(case: Case) -> dict[str, Any]:
         "run": counted(jax.jit(case.run).lower(case.scene).compile()),
     }
     if mode is not None:
-        guards = jax.jit(lambda t, y, scene: scene_guards(t, y, scene, mode, jnp.asarray(1e-9)))
+        tolerances = jnp.asarray(1e-6), jnp.asarray(1e-9)
+        guards = jax.jit(lambda t, y, scene: scene_guards(t, y, scene, mode, jnp.asarray(1e-12), tolerances)[0])
         found["guards"] = counted(guards.lower(t, state, case.scene).compile())
     run = jms.simulate(case.scene, list(case.q0), list(case.qd0), T1, **case.options)
     found["run"]["steps"] = int(run.stats["num_steps"])

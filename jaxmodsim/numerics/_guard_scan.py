@@ -60,9 +60,9 @@ def scan_guards(
 ) -> GuardScan:
     """First fall through zero of functions known at 0, 1/3, 1/2, 2/3 and 1 of a step.
 
-    Between the points each is the cubic through the first, second, fourth and fifth, whose own minimum, if it is lower
-    than the tolerance, counts as another point. A function that is not armed must be seen positive, or rise from zero
-    at the start, before it can fall.
+    Between the points each is the cubic through the first, second, fourth and fifth, whose own minimum, unless it may
+    be due to the error of the cubic, counts as another point. A function that is not armed must be seen positive, or
+    rise from zero at the start, before it can fall.
 
     The value in the middle gives the error of the cubic. A step is resolved if third difference and error are small
     beside the range of the values, so that no oscillation is taken for a slow change, and beside the headroom: the
@@ -102,6 +102,8 @@ def scan_guards(
     lowest = -c1 / jnp.where(inside, denominator, 1.0)
     bottom = jnp.where(inside, g0 + lowest * (c1 + lowest * (c2 + lowest * c3)), g3)
 
+    error = _LARGEST * jnp.abs(middle - (g0 + 0.5 * (c1 + 0.5 * (c2 + 0.5 * c3))))
+
     # Points in the order of time, the minimum among them; the first one below zero closes the bracket.
     rises = (c1 > 0) & (g0 >= -_ZERO * c1)
     high1 = armed | rises
@@ -113,7 +115,7 @@ def scan_guards(
         high1,
         jnp.where(lowest < 1 / 2, high_middle, jnp.where(lowest < 2 / 3, high2, high3)),
     )
-    dips = inside & (bottom < -tolerance) & high_lowest
+    dips = inside & (bottom < -jnp.minimum(error, tolerance)) & high_lowest
     end, low = jnp.ones_like(g0), g3
     crosses = jnp.zeros_like(armed)
     for point, value, below in (
@@ -139,7 +141,6 @@ def scan_guards(
 
     falls = c1 + 2.0 * c2 + 3.0 * c3
     ahead = jnp.where(falls < 0, -g3 / jnp.where(falls < 0, falls, 1.0), jnp.inf)
-    error = _LARGEST * jnp.abs(middle - (g0 + 0.5 * (c1 + 0.5 * (c2 + 0.5 * c3))))
     headroom = reduce(jnp.minimum, (jnp.abs(g1), jnp.abs(middle), jnp.abs(g2)))
     headroom = jnp.where(inside & (bottom > 0), jnp.minimum(headroom, bottom), headroom)
     step_factor, landing_factor = _step_factors(jnp.abs(third), error, spread, headroom, tolerance)

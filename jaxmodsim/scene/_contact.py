@@ -20,6 +20,9 @@ from jaxtyping import Array, Bool, Float
 from ..effects import Friction
 from ..numerics import factor_lu, solve_semidefinite
 
+# Rounding units in the load of a sticking element, of its limits.
+_LOAD_ROUNDING = 100.0
+
 _constant = jax.lax.stop_gradient
 
 
@@ -202,21 +205,25 @@ def _multipliers(found: Contact, drive: Float[Array, " n"], sticks: Bool[Array, 
     return solve_semidefinite(found.coupling, drive, jnp.sqrt(jnp.where(largest > 0, weight, 1.0)), sticks)
 
 
-def contact_guards(found: Contact, mode: Float[Array, " modes"], rest: Float[Array, ""]) -> Float[Array, " modes"]:
-    """One guard for each element with a mode, positive while its mode holds.
+def contact_guards(
+    found: Contact, mode: Float[Array, " modes"], rest: Float[Array, ""], tolerances: tuple[Array, Array]
+) -> tuple[Float[Array, " modes"], Float[Array, " modes"]]:
+    """One guard for each element with a mode, positive while its mode holds, and by how much each may be wrong.
 
-    In stick `(upper - f)(lower + f)/(upper + lower)^2`, which is 1/4 without a load and falls through zero at either
-    limit with the slope of the load in limits; in slip the velocity in its direction [m/s]. What differs by rounding
-    must not flicker: the limits are 16 rounding units further out, and a slip has to turn by `rest` [m/s] before it
-    ends (an element may be in slip, at its limit, while others hold it).
+    In stick `(upper - f)(lower + f)/(upper + lower)` [N], which falls through zero at either limit with the slope of
+    the force, and may be wrong by the relative one of `tolerances` of its limits; in slip the velocity in its direction
+    [m/s], and the absolute one. What differs by rounding must not flicker: the limits are 16 rounding units further
+    out, and a slip has to turn by `rest` [m/s] before it ends (an element may be in slip, at its limit, while others
+    hold it).
     """
-    n = mode.shape[0]
+    n, (rtol, atol) = mode.shape[0], tolerances
     force, upper, lower = (x[:n] for x in balance(found, mode)[:3])
-    wider = 1.0 + 16.0 * float(jnp.finfo(force.dtype).eps)
+    eps = float(jnp.finfo(force.dtype).eps)
+    wider = 1.0 + 16.0 * eps
     span = upper + lower
-    span = jnp.where(span > 0, span, 1.0)
-    inside = ((wider * upper - force) / span) * ((wider * lower + force) / span)
-    return jnp.where(mode == 0, inside, mode * found.v[:n] + rest)
+    inside = (wider * upper - force) * (wider * lower + force) / jnp.where(span > 0, span, 1.0)
+    resolved = jnp.maximum(rtol, _LOAD_ROUNDING * eps) * span
+    return jnp.where(mode == 0, inside, mode * found.v[:n] + rest), jnp.where(mode == 0, resolved, atol)
 
 
 def overload(found: Contact, mode: Float[Array, " modes"]) -> Float[Array, " modes"]:

@@ -53,10 +53,10 @@ def scene_canonical(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = N
 
 
 def scene_guards(
-    t: Float[Array, ""], y: State, scene: Scene, mode: Modes, rest: Float[Array, ""]
-) -> Float[Array, " guards"]:
-    """Guards that are positive while the modes hold; see `contact_guards`."""
-    return contact_guards(_contact(t, y, scene, mode), mode, rest)
+    t: Float[Array, ""], y: State, scene: Scene, mode: Modes, rest: Float[Array, ""], tolerances: tuple[Array, Array]
+) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
+    """Guards that are positive while the modes hold, and their tolerances; see `contact_guards`."""
+    return contact_guards(_contact(t, y, scene, mode), mode, rest, tolerances)
 
 
 def scene_switch(

@@ -108,6 +108,8 @@ class Hybrid(NamedTuple):
     flow: Flow
     # Slip velocity [m/s] that counts as none.
     rest: Float[Array, ""]
+    # Relative and absolute, of the limits of stick and of slip velocities.
+    tolerances: tuple[Float[Array, ""], Float[Array, ""]]
     # What drifts with the error of integration and is put right after every step: off the constraints, out of stick.
     projects: bool
     sticks: bool
@@ -120,9 +122,9 @@ class Hybrid(NamedTuple):
         """Right-hand side."""
         return s.rate(_rate(self.flow, t, s.y, scene, s.mode))
 
-    def guards(self, t: Any, s: EventState, scene: Scene) -> Array:
-        """Guards of the modes."""
-        return _guards(t, self.flow.state(t, s.y, scene), scene, s.mode, self.rest)
+    def guards(self, t: Any, s: EventState, scene: Scene) -> tuple[Array, Array]:
+        """Guards of the modes, and their tolerances."""
+        return _guards(t, self.flow.state(t, s.y, scene), scene, s.mode, self.rest, self.tolerances)
 
     def reset(self, t: Any, s: EventState, scene: Scene, fired: Array) -> EventState:
         """Change of modes; the state as it is where none changes."""

@@ -17,7 +17,6 @@ from ..solvers import (
     EventController,
     EventLog,
     EventSolver,
-    EventState,
     FiniteSteps,
     Gauss,
     ImplicitFriction,
@@ -31,8 +30,6 @@ from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, end_code, start_
 
 # Part of the absolute tolerance below which a slip velocity counts as none.
 _REST = 1e-3
-# Rounding units in the load of a sticking element, of its limit.
-_ROUNDING = 100.0
 # Part of its limit by which a sticking element's force may exceed it at a saved time, for the error of dense output.
 _OVERLOAD = 1e-2
 
@@ -141,10 +138,9 @@ def _error_control(problem: Problem, solver: dfx.AbstractSolver) -> dfx.Abstract
 
 
 def _solver(
-    solver: dfx.AbstractSolver, hybrid: Hybrid, problem: Problem, options: Options, log: int | None
+    solver: dfx.AbstractSolver, hybrid: Hybrid, scene: Scene, options: Options, log: int | None
 ) -> dfx.AbstractSolver:
     """`solver`, wrapped in what the scene needs: events, projections, signals."""
-    scene = problem.scene
     if isinstance(solver, ImplicitFriction):
         solver = ImplicitFriction(hybrid.flow.advance)
     pin = _step_from if signals_of(scene.params) else None
@@ -157,8 +153,7 @@ def _solver(
             project=hybrid.settle if hybrid.projects or hybrid.sticks else None,
             pin=pin,
             jumps=sample_times(scene.params, linear=False),
-            rtol=problem.rtol,
-            atol=jtu.Partial(_guard_atol, problem.rtol, problem.atol),
+            rtol=hybrid.tolerances[0],
             insist=True,
             max_events=options.max_events if log is None else min(log, options.max_events),
             log=log is not None,
@@ -166,12 +161,6 @@ def _solver(
     if hybrid.projects or pin is not None:
         return Projected(solver, hybrid.project if hybrid.projects else None, pin)
     return solver
-
-
-def _guard_atol(rtol: Array, atol: Array, s: EventState) -> Array:
-    """By how much guards may be wrong: those of stick by `rtol` of their limits, those of slip by `atol` [m/s]."""
-    rtol = jnp.maximum(rtol, _ROUNDING * float(jnp.finfo(rtol.dtype).eps))
-    return jnp.where(s.mode == 0, rtol, atol)
 
 
 def _step_from(t: Array, scene: Scene) -> Scene:
@@ -228,7 +217,7 @@ def _prepared(problem: Problem, options: Options, audited: bool) -> tuple[State,
     start = start_code(scene, t0, given, scene_field(t0, initial, scene, mode), mode, atol, canonical)
     start = jnp.where(_well_posed(problem), start, ILL_POSED)
     sticks = bool(scene.exact) and scene_drifts(scene)
-    return initial, mode, Hybrid(Flow(audited, canonical), rest, projects, sticks), start
+    return initial, mode, Hybrid(Flow(audited, canonical), rest, (problem.rtol, problem.atol), projects, sticks), start
 
 
 def _integrate(problem: Problem, options: Options, audited: bool, log: int | None) -> tuple[Solved, EventLog | None]:
@@ -236,7 +225,7 @@ def _integrate(problem: Problem, options: Options, audited: bool, log: int | Non
     scene, exact = problem.scene, bool(problem.scene.exact)
     initial, mode, hybrid, start = _prepared(problem, options, audited)
     method, adjoint = _plugins(problem, options)
-    solver = _solver(method, hybrid, problem, options, log)
+    solver = _solver(method, hybrid, scene, options, log)
     # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
     starts = start == SUCCESS
     ts = None if problem.ts is None else jnp.where(starts, problem.ts, problem.t0)

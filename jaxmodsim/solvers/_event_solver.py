@@ -138,6 +138,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
 
     - `solver`: the diffrax solver of an `ODETerm`: explicit, `Rodas5P`, `diffrax.Kvaerno5`.
     - `guards`: `guards(t, s, args)` -> shape `[guards]`; `s` is an `EventState` of which `s.y` and `s.mode` are yours.
+      Or a pair of that and, of the same shape, by how much each guard may be wrong beside `rtol` of its magnitude.
     - `reset`: `reset(t, s, args, fired)` -> `s` with another `y` or `mode` (by `s._replace`); `fired` are booleans,
       shape `[guards]`.
     - `hold`: as `reset`, for events that accumulate; by default the run ends there.
@@ -147,8 +148,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
       of the step gets `args` as they are.
     - `jumps`: times at which fields and guards jump, increasing, shape `[n]`. The controller must end steps there; then
       `reset` is called, with no guard marked, and what it changes of the modes is an event.
-    - `rtol`, `atol`: relative to the largest magnitude of a guard in a step, and absolute: by the sum of both it may
-      fall below zero, and return, unseen. `atol` is a number, one for each guard, or a function of the state.
+    - `rtol`: the part of its largest magnitude in a step by which a guard may fall below zero, and return, unseen.
     - `max_events`: limit of the number of events, > 0, and length of the log.
     - `log`: whether the state carries an `EventLog`.
 
@@ -174,7 +174,6 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     pin: Callable[..., Any] | None = None
     jumps: Float[Array, " n"] | None = None
     rtol: Any = 1e-6
-    atol: Any = 0.0
     insist: bool = eqx.field(default=False, static=True)
     max_events: int = eqx.field(default=128, static=True)
     log: bool = eqx.field(default=True, static=True)
@@ -234,7 +233,15 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         return state._replace(fired=jnp.zeros_like(guard), log=log, guard=guard, armed=ready)
 
     def _guards(self, t: Any, state: EventState, args: PyTree) -> Float[Array, " guards"]:
-        return jnp.asarray(self.guards(t, state, args))
+        return self._guards_and_atol(t, state, args)[0]
+
+    def _guards_and_atol(
+        self, t: Any, state: EventState, args: PyTree
+    ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
+        found = self.guards(t, state, args)
+        values, atol = found if isinstance(found, tuple) else (found, None)
+        values = jnp.asarray(values)
+        return values, jnp.zeros_like(values) if atol is None else atol
 
     def func(self, terms: PyTree, t0: Any, y0: EventState, args: PyTree) -> PyTree:
         """The vector field of the wrapped solver."""
@@ -258,13 +265,12 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             y1, error = projected(y1, error, self.project(t1, y0._replace(y=y1), args).y)
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
         places = [t0 + (t1 - t0) * part for part in (1 / 3, 1 / 2, 2 / 3)]
-        inside = [self._guards(t, y0._replace(y=path.evaluate(t)), args) for t in places]
-        end = self._guards(t1, y0._replace(y=y1), args)
+        states = [y0._replace(y=y) for y in (*map(path.evaluate, places), y1)]
+        looks = [self._guards_and_atol(t, s, args) for t, s in zip((*places, t1), states, strict=True)]
         unit = unit_of(_constant(t1 - t0))
-        one, middle, two, end = once(_constant((*inside, end)), unit)
-        atol = self.atol(y0) if callable(self.atol) else self.atol
-        rtol, atol = (jnp.asarray(_constant(x), end.dtype) for x in (self.rtol, atol))
-        tolerances = rtol, jnp.broadcast_to(atol, end.shape)
+        one, middle, two, end = once(_constant([values for values, _ in looks]), unit)
+        # Where limits vanish at one end of the step, the other tells their size.
+        tolerances = jnp.asarray(_constant(self.rtol), end.dtype), _constant(jnp.maximum(looks[0][1], looks[-1][1]))
         # Around t0 = 0 the resolution of time is that of the step itself.
         length = _constant(t1 - t0)
         eps = float(jnp.finfo(length.dtype).eps)
