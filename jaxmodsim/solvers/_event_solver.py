@@ -286,7 +286,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             near = jnp.where(jumps, _constant(resolution), near)
         near = near / jnp.where(length > 0, length, 1.0)
         shortest = jnp.maximum(_SHORT * pace, 2.0 * _constant(resolution))
-        here = seen.armed & (jnp.abs(seen.ahead) <= near)
+        # One that has just fallen through zero may look flat, or rising, to the cubic.
+        here = (seen.armed & (jnp.abs(seen.ahead) <= near)) | (seen.crosses & (1.0 - seen.root <= near))
         if self.insist:  # in front of the root is no motion after the event
             here = (here | (seen.crosses & (length <= _UNPLACED * eps * jnp.abs(t1)))) & (end <= 0)
         # One that fires at the start of the step does so where the step is the shortest.

@@ -150,6 +150,8 @@ def _several() -> list[HardCase]:
             ),
             5.0,
             tolerance=1e-5,
+            # Elements that hold nothing, at their limits, are told from those that slip by 1e-14 m/s.
+            single_ends="step size fell below what the time can resolve",
         ),
     ]
 
