@@ -146,8 +146,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     - `insist`: whether the guards are conditions that have to hold, not crossings that are to be noted.
     - `pin`: `pin(t0, args)` -> `args` of a step that begins at t0, without what jumps at its end; the reset at the end
       of the step gets `args` as they are.
-    - `jumps`: times at which fields and guards jump, increasing, shape `[n]`. The controller must end steps there; then
-      `reset` is called, with no guard marked, and what it changes of the modes is an event.
+    - `jumps`: times at which fields and guards jump, increasing, shape `[n]`, among the `times` of the controller.
+      There `reset` is called, with no guard marked, and what it changes of the modes is an event.
     - `rtol`: the part of its largest magnitude in a step by which a guard may fall below zero, and return, unseen.
     - `max_events`: limit of the number of events, > 0, and length of the log.
     - `log`: whether the state carries an `EventLog`.
