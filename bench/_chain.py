@@ -17,7 +17,8 @@ from mujoco.rollout import Rollout
 from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols, msubs
 
 import jaxmodsim as jms
-from jaxmodsim.numerics import once, solve_positive_definite, unit_of
+from jaxmodsim._core.cholesky import solve_positive_definite
+from jaxmodsim._core.fusion import once, unit_of
 from jaxmodsim.problems import n_link_pendulum, n_link_pendulum_acceleration
 from jaxmodsim.scene import State, scene_field
 

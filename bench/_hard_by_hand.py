@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 
 import jaxmodsim as jms
 from jaxmodsim import problems
-from jaxmodsim.problems.hard import Motion
+from jaxmodsim.validation.hard import Motion
 
 G = 9.81
 # Units of length, time and mass of the cases `units_...`.

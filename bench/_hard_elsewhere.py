@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from _hard_plain import ATOL, RTOL
 
-from jaxmodsim.problems.hard import HardCase, Motion
+from jaxmodsim.validation.hard import HardCase, Motion
 
 G = 9.81
 # How jaxonomy is asked: by the method it takes by itself, and by the one for stiff systems.

@@ -16,7 +16,7 @@ from _hard_plain import IMPLICIT, PLAIN
 
 import jaxmodsim as jms
 from jaxmodsim.problems import BRAKED_SPRING, braked_spring_motion
-from jaxmodsim.problems.hard import HardCase, Motion, Refused, check, hard_cases
+from jaxmodsim.validation.hard import HardCase, Motion, Refused, check, hard_cases
 
 OURS, MUJOCO = "jaxmodsim", "MuJoCo"
 PROGRAMS = (OURS, *PLAIN, MUJOCO)

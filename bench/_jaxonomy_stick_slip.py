@@ -17,8 +17,8 @@ import numpy as np
 from _workload import numpy_workload_s
 
 # jaxmodsim is not there; its timing needs nothing but Python.
-sys.path.append(str(Path(__file__).parents[1] / "jaxmodsim" / "numerics"))
-from _timing import measure
+sys.path.append(str(Path(__file__).parents[1] / "jaxmodsim" / "_core"))
+from timing import measure
 
 
 class BeltOscillator(jaxonomy.LeafSystem):

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from jaxmodsim.numerics import measure as measure
+from jaxmodsim._core.timing import measure as measure
 
 
 def scaled(report: dict[str, Any], count: int) -> dict[str, Any]:

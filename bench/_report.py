@@ -11,7 +11,7 @@ from _options import Options
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
-from jaxmodsim.numerics import describe_machine
+from jaxmodsim._core.provenance import describe_machine
 
 mpl.use("Agg")
 

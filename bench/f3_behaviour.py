@@ -4,8 +4,8 @@ from _measure import machine_line
 from _options import begin
 from _report import new_result, write_figure, write_result
 
-from jaxmodsim.behaviour import EXPERIMENTS, Outcome, run_bench, specimens
 from jaxmodsim.plot import behaviour_figure
+from jaxmodsim.validation.behaviour import EXPERIMENTS, Outcome, run_bench, specimens
 
 # The figures that docs/laws.md shows.
 SHOWN = ("memory", "creep")

@@ -27,9 +27,9 @@ from _options import begin
 from _report import new_result, target_rows, write_result
 
 import jaxmodsim as jms
-from jaxmodsim.numerics import once, rosenbrock_step, unit_of
+from jaxmodsim._core.fusion import once, unit_of
 from jaxmodsim.problems import n_link_pendulum
-from jaxmodsim.solvers import RODAS5P
+from jaxmodsim.solvers import RODAS5P, rosenbrock_step
 
 RTOL = 1e-4
 KINDS = {"add": "sum", "sub": "sum", "add_any": "sum", "mul": "sum", "neg": "sum", "abs": "sum", "max": "sum"}

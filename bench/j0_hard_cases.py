@@ -40,7 +40,7 @@ from matplotlib import pyplot as plt
 from matplotlib.colors import ListedColormap
 from matplotlib.patches import Patch
 
-from jaxmodsim.problems.hard import HardCase, hard_cases
+from jaxmodsim.validation.hard import HardCase, hard_cases
 
 LIMIT = 60.0
 SMOKE_LIMIT = 10.0

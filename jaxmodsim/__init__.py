@@ -4,10 +4,7 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 from typing import Any as _Any
 
-from ._speed import tune_cpu as tune_cpu
-from .effects import AbstractEffect as AbstractEffect
-from .effects import AppliedForce as AppliedForce
-from .effects import Friction as Friction
+from ._core.speed import tune_cpu as tune_cpu
 from .friction import Armstrong as Armstrong
 from .friction import Coulomb as Coulomb
 from .friction import Curve as Curve
@@ -33,8 +30,11 @@ from .mechanics import Spherical as Spherical
 from .mechanics import VelocityConstraint as VelocityConstraint
 from .mechanics import point_mass as point_mass
 from .mechanics import rigid_body as rigid_body
-from .numerics import Signal as Signal
+from .scene import AbstractEffect as AbstractEffect
+from .scene import AppliedForce as AppliedForce
+from .scene import Friction as Friction
 from .scene import Scene as Scene
+from .scene import Signal as Signal
 from .simulation import SimulationError as SimulationError
 from .simulation import Trajectory as Trajectory
 from .simulation import consistent as consistent
@@ -46,11 +46,11 @@ from .solvers import ImplicitFriction as ImplicitFriction
 from .solvers import Rodas5P as Rodas5P
 
 if TYPE_CHECKING:
-    from . import behaviour as behaviour
-    from . import features as features
+    from . import metrics as metrics
     from . import plot as plot
     from . import problems as problems
     from . import sweeps as sweeps
+    from . import validation as validation
     from .analysis import EnergyAudit as EnergyAudit
     from .analysis import GradientCheck as GradientCheck
     from .analysis import Method as Method
@@ -86,13 +86,13 @@ _LATER = {
         "sensitivity",
         "work_precision",
     ),
-    "behaviour": (),
     "export": ("to_modelica", "to_mujoco"),
-    "features": (),
     "identify": ("FitResult", "Record", "fit", "fit_law"),
+    "metrics": (),
     "plot": (),
     "problems": (),
     "sweeps": ("sweep",),
+    "validation": (),
 }
 _FOLDERS = {name: folder for folder, names in _LATER.items() for name in names}
 

@@ -11,7 +11,7 @@ import jaxlib.version
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
-from . import fuzz
+from .helpers import fuzz
 
 # Nearly all of the time goes into tracing and compiling, hardly any into running. Code that LLVM has not optimized, and
 # XLA's older way to emit fused loops, straight as LLVM code, are compiled soonest. XLA ends the process over an option
@@ -52,7 +52,7 @@ def no_checks_for_each_scalar() -> None:
 
     Of all calls whose types would be checked nine in ten are such, and most of their types are `Any`.
     """
-    from jaxmodsim.numerics import _scalarise
+    from jaxmodsim._core import scalarise as _scalarise
 
     for each in vars(_scalarise).values():
         if getattr(each, "__module__", None) == _scalarise.__name__ and each.__name__ not in (

@@ -13,54 +13,36 @@ import jaxmodsim
 ROOT = Path(jaxmodsim.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
 
-_CORE = ("numerics", "mechanics", "friction", "effects", "scene", "solvers", "simulation")
-# What each layer may import besides itself. The package's own `__init__` and `_speed` stand outside.
-ALLOWED: dict[str, set[str]] = {layer: set(_CORE[:i]) for i, layer in enumerate(_CORE)}
-ALLOWED["problems"] = {"numerics", "mechanics", "friction", "effects", "scene"}
-ALLOWED["problems.hard"] = {*_CORE, "problems", "analysis", "identify"}
-ALLOWED["export"] = {"numerics", "friction"}
-ALLOWED["features"] = set(_CORE)
-ALLOWED["analysis"] = {*_CORE, "problems"}
-ALLOWED["identify"] = set(_CORE)
-ALLOWED["sweeps"] = {*_CORE, "features"}
-ALLOWED["behaviour"] = set(_CORE)
-ALLOWED["plot"] = {*_CORE, "analysis", "problems", "problems.hard", "identify", "behaviour", "sweeps"}
-ALLOWED["cli"] = {*_CORE, "problems", "problems.hard", "identify", "behaviour", "sweeps", "plot", "_speed"}
-ALLOWED["_speed"] = set()
-
-# The command line may also use the package as its users do, by its public names.
-PUBLIC = {name for name in dir(jaxmodsim) if not name.startswith("_")}
-
-# The command line imports inside its commands, so that `--help` does not wait for JAX.
-LAZY_IMPORTS = {"cli"}
-# Single files that do, what they import, and why.
-LAZY_FILES = {
-    "identify/_result.py": ("plot", "FitResult.plot draws itself; matplotlib is loaded when it is called"),
-    "analysis/_work_rows.py": ("plot", "WorkPrecision.plot likewise"),
-}
+# The rooms of the house. A room imports only rooms above it, imports for type checkers included; what it takes from
+# another room is among that room's public names. `_core` has none: all of it is private to the package.
+ROOMS = (
+    "_core",
+    "mechanics",
+    "friction",
+    "scene",
+    "solvers",
+    "simulation",
+    "metrics",
+    "analysis",
+    "identify",
+    "sweeps",
+    "export",
+    "problems",
+    "validation",
+    "plot",
+    "cli",
+)
+NEEDED_TO_SIMULATE = set(ROOMS[: ROOMS.index("simulation") + 1])
+# Folders of a room with public names of their own.
+PARTS = ("validation.behaviour", "validation.hard")
 
 MAX_FILE_LINES = 500
 MAX_FUNCTION_LINES = 80
 LONG_FUNCTIONS: dict[str, str] = {}  # "file:function" -> reason
 
 
-def layer_of(path: Path) -> str:
-    return layer_in(path.relative_to(ROOT).with_suffix("").parts)
-
-
-def layer_in(parts: tuple[str, ...]) -> str:
-    """The layer of a module: its folder; the hard cases, which run scenes, are one of their own."""
-    return "problems.hard" if parts[:2] == ("problems", "hard") else parts[0]
-
-
-def name_of(path: Path) -> str:
-    return path.relative_to(ROOT).as_posix()
-
-
-def is_lazy(path: Path, statement: ast.AST) -> bool:
-    """Whether an import stands inside a function of a file that may do so."""
-    lazy = name_of(path) in LAZY_FILES and isinstance(statement, ast.Import | ast.ImportFrom)
-    return lazy and getattr(statement, "col_offset", 0) > 0
+def room_of(path: Path) -> str:
+    return path.relative_to(ROOT).with_suffix("").parts[0]
 
 
 def own_imports(path: Path, node: ast.AST) -> Iterator[str]:
@@ -94,9 +76,8 @@ def each_file(paths: list[Path]) -> pytest.MarkDecorator:
 
 
 @pytest.mark.quick
-def test_every_part_has_its_layer() -> None:
-    parts = {layer_of(path) for path in FILES} - {"__init__"}
-    assert parts <= set(ALLOWED), f"say in ALLOWED where {sorted(parts - set(ALLOWED))} belong"
+def test_every_file_stands_in_a_room() -> None:
+    assert {room_of(path) for path in FILES} - {"__init__"} == set(ROOMS)
 
 
 @pytest.mark.quick
@@ -105,7 +86,7 @@ def test_names_that_load_later_are_those_that_type_checkers_see() -> None:
     imports = [node for node in branch.body if isinstance(node, ast.ImportFrom)]
     seen = {(node.module, alias.name) for node in imports for alias in node.names}
     later = {(folder, name) for folder, names in jaxmodsim._LATER.items() for name in names}
-    folders = {(None, name) for name in ("behaviour", "features", "plot", "problems", "sweeps")}
+    folders = {(None, name) for name in ("metrics", "plot", "problems", "sweeps", "validation")}
     assert seen == later | folders
     for _, name in seen:
         assert getattr(jaxmodsim, name) is not None
@@ -117,25 +98,27 @@ def test_the_import_loads_no_more_than_a_simulation_needs() -> None:
         "import sys, jaxmodsim; print(*{name.split('.')[1] for name in sys.modules if name.startswith('jaxmodsim.')})"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert set(done.stdout.split()) == {*_CORE, "_speed"}
+    assert set(done.stdout.split()) == NEEDED_TO_SIMULATE
 
 
 @each_file([path for path in FILES if path != ROOT / "__init__.py"])
-def test_layers_import_only_those_above(path: Path) -> None:
-    layer = layer_of(path)
+def test_rooms_import_only_those_above(path: Path) -> None:
+    room = room_of(path)
     for node in statements(path, (ast.Import, ast.ImportFrom)):
         for module in own_imports(path, node):
-            target = layer_in(tuple(module.split(".")))
-            if layer == "cli" and module in PUBLIC:
-                continue
-            if is_lazy(path, node) and target == LAZY_FILES[name_of(path)][0]:
-                continue
-            assert target == layer or target in ALLOWED[layer], f"{layer} imports {module}"
-            # Hard cases are made of the reference systems they stand beside.
-            beside = (layer, target) == ("problems.hard", "problems")
-            assert target == layer or beside or "._" not in module, (
-                f"{layer} reaches into {module}; import it from {target}"
-            )
+            target = module.split(".")[0]
+            assert target in ROOMS[: ROOMS.index(room) + 1], f"{room} imports {module}"
+            public = target == "_core" or "._" not in module
+            assert target == room or public, f"{room} reaches into {module}; import it from {target}"
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_parts_of_a_room_meet_by_their_public_names(part: str) -> None:
+    for path in ROOT.joinpath(*part.split(".")).glob("*.py"):
+        for node in statements(path, (ast.Import, ast.ImportFrom)):
+            for module in own_imports(path, node):
+                other = module.startswith("validation.") and not module.startswith(part)
+                assert not (other and "._" in module), f"{part} reaches into {module}"
 
 
 @each_file(FILES)
@@ -143,15 +126,14 @@ def test_only_plot_imports_matplotlib(path: Path) -> None:
     for node in statements(path, (ast.Import, ast.ImportFrom)):
         names = [a.name for a in node.names] if isinstance(node, ast.Import) else [getattr(node, "module", None) or ""]
         if any(name.split(".")[0] == "matplotlib" for name in names):
-            assert layer_of(path) == "plot"
+            assert room_of(path) == "plot"
 
 
-@each_file([path for path in FILES if layer_of(path) not in LAZY_IMPORTS])
+@each_file([path for path in FILES if room_of(path) != ROOMS[-1]])
 def test_no_import_of_our_own_inside_functions(path: Path) -> None:
+    """The last room may: its `--help` does not wait for JAX, and since nothing imports it, no circle can hide there."""
     for function in statements(path, (ast.FunctionDef, ast.AsyncFunctionDef)):
         for node in ast.walk(function):
-            if name_of(path) in LAZY_FILES and list(own_imports(path, node)) == [LAZY_FILES[name_of(path)][0]]:
-                continue
             assert not list(own_imports(path, node)), f"line {getattr(node, 'lineno', '?')}"
 
 
@@ -189,8 +171,8 @@ def test_the_rules_can_be_broken(tmp_path: Path) -> None:
     del tmp_path
     inside = ROOT / "friction" / "_law.py"
     cases = {
-        "from ..numerics import x": ["numerics"],
-        "from ..numerics._safe import x": ["numerics._safe"],
+        "from ..mechanics import x": ["mechanics"],
+        "from .._core.safe import x": ["_core.safe"],
         "from ._law import x": ["friction._law"],
         "from .. import scene": ["scene"],
         "import jaxmodsim.scene": ["scene"],

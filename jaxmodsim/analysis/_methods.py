@@ -8,9 +8,8 @@ import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..effects import Friction
 from ..friction import Coulomb, DeadZone, LuGre, Regularized, Stribeck, exponential
-from ..scene import Scene
+from ..scene import Friction, Scene
 from ..solvers import Gauss, Rodas5P
 
 _DTYPES = ("float32", "float64")

@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..numerics import signals_of
-from ..scene import Scene, elements, read_element, replace_elements, scene_numbers, scene_ranges
+from ..scene import Scene, elements, read_element, replace_elements, scene_numbers, scene_ranges, signals_of
 from ..simulation import Trajectory, named_series, named_unit, simulate
 
 _MODES = ("forward", "reverse")

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..numerics import describe_machine, measure
+from .._core.provenance import describe_machine
+from .._core.timing import measure
 from ..problems import Case
 from ..scene import Scene, elements
 from ..simulation import Trajectory, default_solver

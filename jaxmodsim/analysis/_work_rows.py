@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..numerics import written_whole
+from .._core.files import written_whole
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -39,7 +39,7 @@ def _start() -> None:
     """An application may set what a library must not: double precision, and XLA's treatment of small loops."""
     import jax
 
-    from jaxmodsim import tune_cpu
+    from .._core.speed import tune_cpu
 
     tune_cpu()
     jax.config.update("jax_enable_x64", True)

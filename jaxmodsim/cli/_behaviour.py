@@ -5,8 +5,8 @@ from typing import Any
 
 import pandas as pd
 
-from ..behaviour import EXPERIMENTS, Outcome, Verdict, run_bench
 from ..plot import behaviour_figure
+from ..validation.behaviour import EXPERIMENTS, Outcome, Verdict, run_bench
 from ._output import console, show_paths, show_table, write
 
 

@@ -8,11 +8,10 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array
 
-from ..effects import AppliedForce, Friction
 from ..friction import LuGre
 from ..identify import Record, first_coordinate, replay
 from ..plot import fit_figure, truth_figure
-from ..scene import Scene
+from ..scene import AppliedForce, Friction, Scene
 from ._fit import fit_with_progress
 from ._output import console, show_paths, show_table, write
 from ._report import testbench_files

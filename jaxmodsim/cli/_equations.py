@@ -2,10 +2,9 @@
 
 from typing import Any
 
-from ..effects import Friction
+from .._core.parameters import ranges_of
 from ..friction import AbstractAsymmetric, Coulomb, Dahl, LuGre, Regularized, Stribeck, Viscous
-from ..numerics import ranges_of
-from ..scene import Scene
+from ..scene import Friction, Scene
 
 # What the drive has beside its force, by the name of the param without which it is none.
 _TERMS = {"offset": "offset", "drift": "drift exp(-(t - t0)/tau)"}

@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from ..plot import hard_figure, step_limits_figure
-from ..problems.hard import WAYS, HardCase, Verdict, check_many, choose
+from ..validation.hard import WAYS, HardCase, Verdict, check_many, choose
 from ._interrupted import Interrupted
 from ._output import console, say, show_paths, show_table, write
 

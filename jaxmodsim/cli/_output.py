@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from .._core.jsonable import jsonable
 from ..identify import FitResult, InputDesign
-from ..numerics import jsonable
 from ..plot import Figure
 
 # Off a terminal (a file, a pipe) there is no width to keep to.

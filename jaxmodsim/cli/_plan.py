@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from .._core.suggest import nearest
 from ..identify import (
     AXIS_MODELS,
     Candidate,
@@ -22,7 +23,6 @@ from ..identify import (
     rough_axis,
     start_state,
 )
-from ..numerics import nearest
 from ..scene import scene_numbers
 from ._read import AxisColumns, read_records
 

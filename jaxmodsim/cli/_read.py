@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from .._core.suggest import nearest
 from ..identify import Record
-from ..numerics import nearest
 
 
 @dataclass(frozen=True)

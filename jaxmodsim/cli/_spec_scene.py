@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .. import friction, problems
-from ..numerics import did_you_mean
+from .._core.suggest import did_you_mean
 from ..scene import Scene
 from ._table import TEXT, VALUES, WHOLE, Table
 

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from jaxmodsim import sweep, tune_cpu
-
+from .._core.speed import tune_cpu
 from ..plot import map2d
-from ..sweeps import Outline, SweepProgress, outline, progress_bar
+from ..sweeps import Outline, SweepProgress, outline, progress_bar, sweep
 from ._interrupted import Interrupted
 from ._output import say, show_paths, show_table, write
 from ._spec import Spec, read_spec

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..numerics import did_you_mean, nearest
+from .._core.suggest import did_you_mean, nearest
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """What every export needs of a law."""
 
+from .._core.state_dependent import varies
 from ..friction import AbstractLaw
-from ..numerics import varies
 
 
 def need_numbers(law: AbstractLaw, wanted: str) -> None:

@@ -5,7 +5,7 @@ from typing import ClassVar, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Number, parameter
+from .._core.parameters import Number, parameter
 from ._bristle import follow, yielding
 from ._law import AbstractDynamicLaw
 

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import bounded_ratio, decay_mean
+from .._core.safe import bounded_ratio, decay_mean
 
 
 def level(

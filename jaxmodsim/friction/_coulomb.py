@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Number, optional_parameter, parameter
+from .._core.parameters import Number, optional_parameter, parameter
 from ._law import AbstractSetValuedLaw
 
 

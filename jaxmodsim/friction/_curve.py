@@ -7,7 +7,8 @@ from typing import Any, ClassVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from ..numerics import Number, as_function, parameter, real_array
+from .._core.functions import as_function, real_array
+from .._core.parameters import Number, parameter
 from ._law import AbstractForceLaw
 
 

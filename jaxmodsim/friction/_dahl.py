@@ -5,7 +5,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Number, magnitude, parameter
+from .._core.parameters import Number, parameter
+from .._core.safe import magnitude
 from ._bristle import leak
 from ._law import AbstractPlanarLaw
 

@@ -5,7 +5,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Number, decay_mean, parameter
+from .._core.parameters import Number, parameter
+from .._core.safe import decay_mean
 from ._bristle import level
 from ._law import AbstractDynamicLaw
 

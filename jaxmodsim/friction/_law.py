@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ..numerics import check_ranges, settle, varies
+from .._core.parameters import check_ranges
+from .._core.state_dependent import settle, varies
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractClassVar

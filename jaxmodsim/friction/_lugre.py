@@ -5,7 +5,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Number, bounded_ratio, magnitude, optional_parameter, parameter
+from .._core.parameters import Number, optional_parameter, parameter
+from .._core.safe import bounded_ratio, magnitude
 from ._bristle import leak, level
 from ._law import AbstractPlanarLaw
 

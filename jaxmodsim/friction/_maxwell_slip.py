@@ -5,15 +5,15 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import (
+from .._core.parameters import (
     Number,
     Vector,
-    nominal,
     optional_parameter,
     optional_vector_parameter,
     parameter,
     vector_parameter,
 )
+from .._core.state_dependent import nominal
 from ._bristle import follow, level, yielding
 from ._law import AbstractDynamicLaw
 

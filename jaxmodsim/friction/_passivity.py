@@ -11,19 +11,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..numerics import modules_of, nominal, varies
+from .._core.parameters import modules_of
+from .._core.state_dependent import nominal, varies
 from ._armstrong import Armstrong
-from ._asymmetric import _AsymmetricDynamic, _AsymmetricForce, _AsymmetricSetValued
 from ._coulomb import Coulomb
 from ._dahl import Dahl
 from ._elasto_plastic import ElastoPlastic
 from ._law import AbstractDynamicLaw, AbstractForceLaw, AbstractHoldingLaw, AbstractLaw, AbstractSetValuedLaw
 from ._lugre import LuGre
 from ._maxwell_slip import MaxwellSlip
-from ._regularized import Regularized
-from ._sign import Sign
 from ._stribeck import Stribeck
 from ._viscous import Viscous
+from .modifiers._asymmetric import _AsymmetricDynamic, _AsymmetricForce, _AsymmetricSetValued
+from .wrappers._regularized import Regularized
+from .wrappers._sign import Sign
 
 # Laws that are evaluated at any speed without harm, so that the limit of high speeds may be taken.
 _TAME = (

@@ -6,7 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Number, bounded_ratio, optional_parameter, parameter, safe_power
+from .._core.parameters import Number, optional_parameter, parameter
+from .._core.safe import bounded_ratio, safe_power
 from ._law import AbstractSetValuedLaw
 
 # Velocity over vs below which a curve with an exponent below one is rounded off.

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._explicit_step import explicit_step
 from ._law import AbstractSetValuedLaw
+from ._max_stable_step import explicit_step
 from ._passivity import need_values
-from ._regularized import Regularized
+from .wrappers._regularized import Regularized
 
 # Velocities below the creep speed at which the force must stay below the load, and halvings of the width's bracket.
 _SPEEDS, _HALVINGS = 2000, 200

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 from jaxtyping import Array, Float
 
-from ..numerics import Number, parameter
+from .._core.parameters import Number, parameter
 from ._law import AbstractForceLaw
 
 

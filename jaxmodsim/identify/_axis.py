@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..effects import AbstractEffect, AppliedForce, Friction
 from ..friction import Coulomb, LuGre, Regularized, Stribeck, Viscous, asymmetric
-from ..scene import Scene, replace_numbers
+from ..scene import AbstractEffect, AppliedForce, Friction, Scene, replace_numbers
 from ._record import Record
 from ._smooth import differentiate, smooth, smooth_span
 

@@ -9,10 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..effects import Friction
+from .._core.parameters import modules_of
 from ..friction import AbstractAsymmetric, Dahl, ElastoPlastic, LuGre, MaxwellSlip
-from ..numerics import modules_of
-from ..scene import Scene, replace_numbers, scene_numbers
+from ..scene import Friction, Scene, replace_numbers, scene_numbers
 from ._motion import Motion, Slip, slip_of
 
 # A bristle below this share of its limit is in presliding.

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..numerics import check_ranges, modules_of, traced
+from .._core.index_check import traced
+from .._core.parameters import check_ranges, modules_of
 from ..scene import Scene, State, check_scene, scene_numbers, scene_ranges
 from ._entries import chosen_entries, split_entries, split_ranges
 from ._excitation import Axis, driven_motion, feed_forward, motion_basis, relative_numbers, sensitivities

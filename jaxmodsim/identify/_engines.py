@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Signal
-from ..scene import Scene, State, replace_numbers, scene_numbers
+from ..scene import Scene, Signal, State, replace_numbers, scene_numbers
 from ..simulation import simulate
 from ._entries import join_entries
 from ._observe import Observable, needs_forces, observed, observer

@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..numerics import Range
+from .._core.parameters import Range
 
 
 def entry_names(name: str, number: Any) -> tuple[str, ...]:

@@ -10,8 +10,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..numerics import rosenbrock_step
 from ..scene import Scene, State, replace_numbers, scene_field, scene_numbers
+from ..solvers import rosenbrock_step
 from ._entries import join_entries
 from ._replay import _RODAS3, replay
 

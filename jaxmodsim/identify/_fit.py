@@ -5,7 +5,7 @@ from typing import Any
 
 from jaxtyping import ArrayLike
 
-from ..numerics import as_float, as_mapping, as_names, as_whole
+from .._core.arguments import as_float, as_mapping, as_names, as_whole
 from ..scene import Scene
 from ._begin import AbstractBeginning, begin_all
 from ._engines import with_values

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core.parameters import Range
+from .._core.state_dependent import varies
 from ..friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw
-from ..numerics import Range, varies
 from ..scene import Scene, replace_numbers, scene_numbers, scene_ranges
 from ._begin import AbstractBeginning, begin_all
 from ._engines import Seen

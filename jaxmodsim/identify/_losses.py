@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Number, check_ranges, parameter
+from .._core.parameters import Number, check_ranges, parameter
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractClassVar

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..effects import Friction
 from ..friction import AbstractLaw
-from ..scene import Scene, replace_numbers, scene_numbers
+from ..scene import Friction, Scene, replace_numbers, scene_numbers
 
 PREFIX = "law."
 

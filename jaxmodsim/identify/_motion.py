@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import Friction
+from ..scene import Friction
 from ._observe import Observable, first_coordinate
 from ._record import Record
 

@@ -8,7 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..numerics import as_mapping, did_you_mean, traced
+from .._core.arguments import as_mapping
+from .._core.index_check import traced
+from .._core.suggest import did_you_mean
 from ..scene import Scene, State, scene_forces
 from ._record import Record
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import Range
+from .._core.parameters import Range
 
 # What a parameter is measured from: a number, another parameter, or sigma1, Fs and Fc of a law that is to be passive.
 Floor: TypeAlias = float | str | tuple[str, str, str] | None

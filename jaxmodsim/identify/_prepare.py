@@ -11,7 +11,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from ..numerics import Range, as_float, as_names, as_reals, check_ranges, modules_of
+from .._core.arguments import as_float, as_names, as_reals
+from .._core.parameters import Range, check_ranges, modules_of
 from ..scene import Scene, State, check_scene, scene_numbers, scene_ranges
 from ._engines import DELAY, EventEngine, ReplayEngine
 from ._entries import chosen_entries, split_entries, split_ranges

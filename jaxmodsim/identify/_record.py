@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..numerics import as_float, as_label, as_mapping, as_names, as_reals
+from .._core.arguments import as_float, as_label, as_mapping, as_names, as_reals
 
 # The name of a single channel that was given none.
 SINGLE = "measured"

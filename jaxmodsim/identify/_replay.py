@@ -10,8 +10,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import RosenbrockTableau, rosenbrock_step
 from ..scene import Scene, State, scene_field
+from ..solvers import RosenbrockTableau, rosenbrock_step
 
 # Order 3, L-stable, stiffly accurate, three field evaluations (Sandu et al. 1997, Atmospheric Environment 31:3459).
 # Of order 3 because a held input has no more smoothness between samples than its samples carry, and three evaluations

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .._core.jsonable import jsonable
 from ..friction import AbstractLaw
-from ..numerics import jsonable
 from ..scene import Scene
 from ._causes import Cause, causes_of
 from ._interval import interval

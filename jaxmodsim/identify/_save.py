@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..numerics import written_whole
+from .._core.files import written_whole
 from ._causes import Cause
 from ._record import Record
 

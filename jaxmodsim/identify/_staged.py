@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..effects import Friction
 from ..friction import AbstractDynamicLaw, AbstractForceLaw, AbstractSetValuedLaw
-from ..scene import Scene, State, scene_field, scene_ranges
+from ..scene import Friction, Scene, State, scene_field, scene_ranges
 from ._begin import AbstractBeginning
 from ._bounded import Box, Search, search_start, search_step
 from ._engines import with_values

@@ -11,7 +11,11 @@ import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import Amount, Place, as_amount, as_function, as_place, check_indices, safe_norm, solve_balanced
+from .._core.functions import as_function
+from .._core.index_check import check_indices
+from .._core.position import Amount, Place, as_amount, as_place
+from .._core.safe import safe_norm
+from .._core.semidefinite import solve_balanced
 
 
 class AbstractBody(eqx.Module):

@@ -10,7 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ..numerics import as_function, as_real, check_indices, safe_norm
+from .._core.functions import as_function
+from .._core.index_check import check_indices
+from .._core.parameters import as_real
+from .._core.safe import safe_norm
 from ._frame import is_right_handed, orthonormal_frame, resolve
 
 _Triples: TypeAlias = ArrayLike | Sequence[Any]

@@ -11,19 +11,12 @@ import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import (
-    Number,
-    Place,
-    as_flag,
-    as_function,
-    as_label,
-    as_place,
-    check_ranges,
-    parameter,
-    result_shape,
-    safe_norm,
-    traced,
-)
+from .._core.arguments import as_flag, as_label
+from .._core.functions import as_function, result_shape
+from .._core.index_check import traced
+from .._core.parameters import Number, check_ranges, parameter
+from .._core.position import Place, as_place
+from .._core.safe import safe_norm
 
 
 def _at(value: Any) -> Place | None:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..numerics import safe_norm
+from .._core.safe import safe_norm
 
 # Unit tangents whose volume is below this many roundings count as dependent: their own roundings would leave fewer
 # than about two right digits of the frame. Lengths do not enter, so a tangent may be short, as it is close to a pole.

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import solve_positive_definite
+from .._core.cholesky import solve_positive_definite
 from ._lagrange import Lagrangian, motion_equations
 
 

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import MAX_UNROLLED_CHOLESKY, in_scalars, solve_positive_definite
+from .._core.cholesky import MAX_UNROLLED_CHOLESKY, solve_positive_definite
+from .._core.scalarise import in_scalars
 
 Lagrangian: TypeAlias = Callable[[Any, Array, Array, Any], Array]
 

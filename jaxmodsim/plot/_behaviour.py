@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..behaviour import Experiment, Outcome
+from ..validation.behaviour import Experiment, Outcome
 from ._style import BLUE, GREEN, GREY, RED, VERDICTS
 
 
@@ -14,7 +14,7 @@ def behaviour_figure(experiment: Experiment, outcomes: Mapping[str, Outcome], co
 
     **Arguments:**
 
-    - `experiment`: from `jaxmodsim.behaviour.EXPERIMENTS`.
+    - `experiment`: from `jaxmodsim.validation.behaviour.EXPERIMENTS`.
     - `outcomes`: what it found, by the name of the law.
     - `columns`: panels in a row.
     """

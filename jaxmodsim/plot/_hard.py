@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..problems.hard import EXPLICIT, Verdict, formulations, largest_step, theory
+from ..validation.hard import EXPLICIT, Verdict, formulations, largest_step, theory
 from ._style import BLUE, GREEN, GREY, RED
 
 _KINDS = {
@@ -25,7 +25,7 @@ def hard_figure(verdicts: Sequence[Verdict]) -> Figure:
 
     **Arguments:**
 
-    - `verdicts`: of `jaxmodsim.problems.hard.check`.
+    - `verdicts`: of `jaxmodsim.validation.hard.check`.
     """
     figure = Figure(figsize=(10.0, 1.4 + 0.2 * len(verdicts)), layout="constrained")
     axis = figure.subplots()

@@ -1,6 +1,6 @@
 """Colours and units that all figures share."""
 
-from ..behaviour import Verdict
+from ..validation.behaviour import Verdict
 
 BLUE, RED, GREY, GREEN = "#1f5fa8", "#c2452d", "#8a8a8a", "#2e8b57"
 VERDICTS = {

@@ -1,8 +1,4 @@
-"""Reference systems by name, each with its exact or reference solution; `problems.hard`: where simulations go wrong."""
-
-from importlib import import_module as _import_module
-from typing import TYPE_CHECKING
-from typing import Any as _Any
+"""Reference systems by name, each with its exact or reference solution."""
 
 from ._ball import BouncingBall as BouncingBall
 from ._ball import bouncing_ball_bounces as bouncing_ball_bounces
@@ -22,6 +18,7 @@ from ._belts import COUPLED_BELTS_LAWS as COUPLED_BELTS_LAWS
 from ._belts import FirstSlip as FirstSlip
 from ._belts import coupled_belts as coupled_belts
 from ._belts import coupled_belts_first_slip as coupled_belts_first_slip
+from ._box import BOX_LUGRE as BOX_LUGRE
 from ._box import BOX_LUGRE_V10 as BOX_LUGRE_V10
 from ._box import BOX_LUGRE_Z10 as BOX_LUGRE_Z10
 from ._box import box_coulomb as box_coulomb
@@ -103,13 +100,3 @@ from ._spring import braked_spring_rest as braked_spring_rest
 from ._stick_slip_pendulum import STICK_SLIP_PENDULUM as STICK_SLIP_PENDULUM
 from ._stick_slip_pendulum import stick_slip_pendulum as stick_slip_pendulum
 from ._stick_slip_pendulum import stick_slip_pendulum_turn as stick_slip_pendulum_turn
-
-if TYPE_CHECKING:
-    from . import hard as hard
-
-
-def __getattr__(name: str) -> _Any:
-    # It runs scenes and checks gradients, which the reference systems themselves do not need.
-    if name == "hard":
-        return _import_module(f"{__name__}.hard")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ..numerics import Number, check_ranges, parameter
+from .._core.parameters import Number, check_ranges, parameter
 
 
 class BouncingBall(eqx.Module):

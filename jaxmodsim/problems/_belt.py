@@ -6,9 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..effects import Friction
 from ..friction import Coulomb, Stribeck, Viscous
-from ..scene import Scene
+from ..scene import Friction, Scene
 from ._spring import braked_spring
 
 # A machine that sticks and slips about once a second: mass [kg], stiffness [N/m], belt [m/s], forces [N].

@@ -5,9 +5,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from ..effects import Friction
 from ..friction import Coulomb
-from ..scene import Scene
+from ..scene import Friction, Scene
 
 # Masses [kg], stiffnesses [N/m] to the ground and between the masses, belt [m/s].
 COUPLED_BELTS = {"m1": 1.0, "m2": 1.6, "k1": 100.0, "k2": 130.0, "coupling": 35.0, "belt": 0.1}

@@ -8,9 +8,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from ..effects import AppliedForce, Friction
 from ..friction import Coulomb, LuGre, Stribeck
-from ..scene import Scene
+from ..scene import AppliedForce, Friction, Scene
 
 BOX_COULOMB = {"Fc": 1.5}
 BOX_STRIBECK = {"Fc": 1.5, "Fs": 1.75, "vs": 0.2, "Fv": 0.1}

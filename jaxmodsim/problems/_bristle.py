@@ -3,9 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..effects import Friction
 from ..friction import LuGre
-from ..scene import Scene
+from ..scene import Friction, Scene
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:

@@ -5,9 +5,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..effects import AppliedForce, Friction
 from ..mechanics import rigid_body
-from ..scene import Scene
+from ..scene import AppliedForce, Friction, Scene
 
 # Masses of cart and pole [kg], length of the pole [m], gravity [m/s^2].
 CART_POLE = {"M": 1.0, "m": 0.3, "l": 1.2, "g": 9.81}

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..numerics import solve_positive_definite
+from .._core.cholesky import solve_positive_definite
 from ..scene import Scene
 
 

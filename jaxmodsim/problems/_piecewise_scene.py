@@ -5,10 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..effects import AppliedForce, Friction
 from ..friction import Coulomb
-from ..numerics import Signal
-from ..scene import Scene
+from ..scene import AppliedForce, Friction, Scene, Signal
 from ._piecewise import LinearStickSlip
 
 

@@ -4,9 +4,8 @@ from typing import Any
 
 from jaxtyping import Array, ArrayLike
 
-from ..effects import Friction
 from ..friction import LuGre
-from ..scene import Scene
+from ..scene import Friction, Scene
 
 # Mass [kg], stiffness of the spring [N/m], velocity of its end [m/s]; and the law: C. Canudas de Wit, H. Olsson,
 # K. J. Astrom and P. Lischinsky, A new model for control of systems with friction, IEEE Transactions on Automatic

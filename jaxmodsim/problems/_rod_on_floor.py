@@ -3,10 +3,9 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..effects import Friction
 from ..friction import Coulomb
 from ..mechanics import Constraint, rigid_body
-from ..scene import Scene
+from ..scene import Friction, Scene
 
 # Mass [kg], length [m], coefficient of friction and gravity [m/s^2].
 ROD_ON_ROUGH_FLOOR = {"m": 1.0, "l": 2.0, "mu": 0.5, "g": 9.81}

@@ -5,10 +5,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..effects import AppliedForce, Friction
 from ..friction import Coulomb
 from ..mechanics import Constraint, rigid_body
-from ..scene import Scene
+from ..scene import AppliedForce, Friction, Scene
 
 # Masses of crank, rod and slider [kg], lengths of crank and rod [m], gravity [m/s^2].
 SLIDER_CRANK = {"m1": 0.6, "m2": 0.9, "m3": 1.4, "r": 0.3, "l": 0.8, "g": 9.81}

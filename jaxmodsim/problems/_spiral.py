@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..effects import AppliedForce, Friction
+from .._core.parameters import Number, parameter
 from ..friction import Coulomb
 from ..mechanics import point_mass
-from ..numerics import Number, parameter
-from ..scene import Scene
+from ..scene import AppliedForce, Friction, Scene
 
 
 class SphericalSpiral(eqx.Module):

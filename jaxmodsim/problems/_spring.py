@@ -5,9 +5,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..effects import Friction
 from ..friction import Coulomb
-from ..scene import Scene
+from ..scene import Friction, Scene
 
 # A set of numbers with stiction, and what follows from it: 12 half cycles, at rest [s] from BRAKED_SPRING_STOP on.
 BRAKED_SPRING = {"m": 1.3, "k": 2.7, "Fc": 0.11, "Fs": 0.15, "x0": 1.0}

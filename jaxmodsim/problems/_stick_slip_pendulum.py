@@ -6,9 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..effects import Friction
 from ..friction import Coulomb
-from ..scene import Scene
+from ..scene import Friction, Scene
 
 # Mass [kg], length [m], gravity [m/s^2] and the torques of the joint [N m] in slip and at most in stick.
 STICK_SLIP_PENDULUM = {"m": 1.0, "l": 0.5, "g": 9.81, "Fc": 0.4, "Fs": 0.6}

@@ -7,12 +7,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..effects import Power
+from .._core.depends import depends
+from .._core.functions import real_array
+from .._core.index_check import traced
+from .._core.safe import safe_norm
 from ..mechanics import energies, errors, motion_equations, project_position, project_velocity, rates
-from ..numerics import depends, real_array, safe_norm, traced
-from ._contact import Contact, contact_guards, next_modes, overload, stop_slip
-from ._resolve import Modes, Resolved, State, by_constraint, resolve
+from ._event_driven import Contact, contact_guards, next_modes, overload, stop_slip
+from ._forward_dynamics import Modes, Resolved, State, by_constraint, resolve
 from ._scene import Scene
+from .forces._effect import Power
 
 
 class Reaction(NamedTuple):
@@ -205,7 +208,7 @@ def check_scene(scene: Scene, y: State) -> None:
     **Raises:**
 
     - `ValueError` naming the function, the shape it returned and the shape that is needed, or the index that is out of
-      range; see `numerics.traced` for those that are seen.
+      range; see `traced` for those that are seen.
     """
     t = y.q[0]
     scene = scene.now(t)

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ..effects import Friction
+from .._core.monotone import solve_monotone
 from ..friction import Sign
 from ..mechanics import motion_equations, restrain
-from ..numerics import solve_monotone
-from ._resolve import Mobility, State
+from ._forward_dynamics import Mobility, State
 from ._scene import Scene
+from .forces._friction import Friction
 
 
 class _Element(NamedTuple):

@@ -6,9 +6,11 @@ from typing import Any
 import jax.tree_util as jtu
 from jaxtyping import Array
 
+from .._core.parameters import Range, ranges_of
+from .._core.state_dependent import Varying
 from ..friction import AbstractAsymmetric
-from ..numerics import Range, Signal, Varying, ranges_of
 from ._scene import Scene
+from ._signal import Signal
 
 # Levels of the scene that say nothing about a number.
 _SILENT = ("law", "place", "amount", "number")

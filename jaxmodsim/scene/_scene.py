@@ -9,9 +9,12 @@ import equinox as eqx
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
-from ..effects import AbstractEffect, Friction
+from .._core.functions import as_function
+from .._core.parameters import as_real
 from ..mechanics import AbstractConstraint, Lagrangian
-from ..numerics import Signal, as_function, as_real, signals_at, signals_from, signals_of
+from ._signal import Signal, signals_at, signals_from, signals_of
+from .forces._effect import AbstractEffect
+from .forces._friction import Friction
 
 # The test of uniqueness looks at every corner of the box of slopes: two to this power.
 _MOST_LOADS = 4

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .._core.cholesky import cholesky_pivots
+from .._core.parameters import check_ranges, modules_of, range_checks
 from ..friction import Regularized
 from ..mechanics import quadratic
-from ..numerics import check_ranges, cholesky_pivots, modules_of, range_checks
 from ..scene import Scene, State, scene_margins, scene_mass, scene_misfit
 from ..solvers import ACCUMULATION, TOO_MANY
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from ..numerics import check_indices
+from .._core.index_check import check_indices
 from ..solvers import Rodas5P
 from ._accuracy import Accuracy, Tenfold, Tried
 from ._observe import named_series

@@ -13,9 +13,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
-from ..effects import Friction
-from ..numerics import as_flag, as_mapping, as_whole, check_real
-from ..scene import Scene, check_step
+from .._core.arguments import as_flag, as_mapping, as_whole, check_real
+from ..scene import Friction, Scene, check_step
 from ..solvers import ImplicitFriction
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages
 from ._search import reach

@@ -11,8 +11,18 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..numerics import sample_times, signals_of, unchecked
-from ..scene import Scene, State, check_scene, scene_drifts, scene_field, scene_modes, scene_overload, scene_project
+from ..scene import (
+    Scene,
+    State,
+    check_scene,
+    sample_times,
+    scene_drifts,
+    scene_field,
+    scene_modes,
+    scene_overload,
+    scene_project,
+    signals_of,
+)
 from ..solvers import (
     EventController,
     EventLog,
@@ -24,8 +34,9 @@ from ..solvers import (
     Rodas5P,
     StepsTo,
     first_step,
+    unchecked,
 )
-from ._flow import Flow, Hybrid, Work
+from ._integrated_system import Flow, Hybrid, Work
 from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, end_code, start_code
 
 # Part of the absolute tolerance below which a slip velocity counts as none.

@@ -15,7 +15,7 @@ from ..mechanics import momentum
 from ..scene import Reaction, Scene, State, scene_forces, scene_reactions
 from ..solvers import EventLog
 from ._accuracy import Accuracy
-from ._ledger import Ledger, event_losses, ledger
+from ._energy_ledger import Ledger, event_losses, ledger
 from ._outcome import Outcome, outcome_messages
 from ._solve import Options, Problem, Solved, solve_logged
 

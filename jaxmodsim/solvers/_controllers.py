@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
-from ..numerics import after, is_one_of
+from ..scene import after, is_one_of
 
 # Part of a step by which it may end before or behind the time that is meant.
 _STRETCH = 1e-6

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from ..numerics import CollocationMemory, collocation_start, collocation_step
+from ._collocation import CollocationMemory, collocation_start, collocation_step
 from ._equation import check_floating, check_ode, in_own_time
 from ._interpolation import PolynomialInterpolation
 
@@ -90,7 +90,7 @@ class Gauss(dfx.AbstractSolver):
         solver_state: CollocationMemory,
         made_jump: Any,
     ) -> tuple[PyTree, None, dict[str, PyTree], CollocationMemory, dfx.RESULTS]:
-        """One step; see `jaxmodsim.numerics.collocation_step`."""
+        """One step; see `collocation_step`."""
         rest = [jnp.where(made_jump, 0.0, x) for x in solver_state.rest]
         field, start, length = in_own_time(terms, t0, t1, args)
         step = collocation_step(self.stages, field, start, length, y0, solver_state._replace(rest=rest))

@@ -7,9 +7,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import PyTree
 
-from ..numerics import RosenbrockStep, RosenbrockTableau, rosenbrock_step
 from ._equation import check_floating, check_ode, in_own_time
 from ._interpolation import PolynomialInterpolation
+from ._rosenbrock import RosenbrockStep, RosenbrockTableau, rosenbrock_step
 
 
 def _lower(rows: tuple[tuple[float, ...], ...]) -> np.ndarray:
@@ -189,7 +189,7 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
     def step(
         self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree, solver_state: None, made_jump: Any
     ) -> tuple[PyTree, PyTree, dict[str, PyTree], None, dfx.RESULTS]:
-        """One step; see `jaxmodsim.numerics.rosenbrock_step`."""
+        """One step; see `rosenbrock_step`."""
         del solver_state, made_jump
         step = _step(terms, t0, t1, y0, args, self.pivot)
         return step.y1, step.error, {"y0": y0, "y1": step.y1, "k": step.dense}, None, dfx.RESULTS.successful

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..features import motion_kind
+from ..metrics import motion_kind
 from ..scene import Scene
 from ._estimates import Estimate, MorrisDesign, SobolDesign, constant, morris_design, sobol_design
 from ._global import GlobalSensitivity
@@ -84,7 +84,7 @@ def global_sensitivity(
     **Arguments:**
 
     - `system`: a `Scene`, or a function, as for `sweep`.
-    - `observe`: what is observed, one number of each run, as for `sweep`; see `jaxmodsim.features`. None for a function
+    - `observe`: what is observed, one number of each run, as for `sweep`; see `jaxmodsim.metrics`. None for a function
       that returns numbers.
     - `ranges`: of each parameter, by names as in `over` of `sweep`: `(low, high)`, `(low, high, "log")` or a frozen
       distribution of `scipy.stats` (by elementary effects one with ends).

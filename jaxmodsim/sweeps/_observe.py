@@ -7,7 +7,8 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..numerics import as_names, check_indices
+from .._core.arguments import as_names
+from .._core.index_check import check_indices
 from ..simulation import Trajectory, named_series
 from ._grid import RESERVED
 
@@ -105,7 +106,7 @@ def observed(what: Observation, run: Trajectory, alone: bool) -> Array:
 
     **Raises:**
 
-    - `ValueError` for what is no array of real numbers, and for an index out of range; see `numerics.traced`.
+    - `ValueError` for what is no array of real numbers, and for an index out of range; see `traced`.
     """
     of = what.value
     if isinstance(of, str):

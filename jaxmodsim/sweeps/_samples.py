@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from ..numerics import as_whole
+from .._core.arguments import as_whole
 
 # (low, high), (low, high, "log"), or a frozen distribution of scipy.stats.
 Span: TypeAlias = tuple[float, float] | tuple[float, float, str] | Any

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from ..numerics import as_whole, commit
+from .._core.arguments import as_whole
+from .._core.provenance import commit
 from ..scene import Scene
 from ._compute import GROUP, Work, lanes_of_call
 from ._execute import Task, elsewhere, in_threads

@@ -1,0 +1,70 @@
+"""Functions as parts of pytrees."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from .arguments import check_real
+from .index_check import traced
+
+
+class Function(eqx.Module):
+    """A plain function as part of a pytree: it holds no numbers and is compared by identity."""
+
+    fn: Callable[..., Any] = eqx.field(static=True)
+
+    def __call__(self, *args: Any) -> Any:
+        """Call the function."""
+        return self.fn(*args)
+
+
+def result_shape(fn: Callable[..., Any], *, name: str, **args: Any) -> tuple[int, ...] | None:
+    """Shape of what `fn(*args.values())` returns, or None where that is not one array.
+
+    **Raises:**
+
+    - `ValueError` naming `name` where it holds anything but real numbers, or `fn` uses an index out of range of one of
+      `args`, which are named as they are here; see `traced`.
+    """
+    shapes: list[tuple[int, ...] | None] = []
+
+    def look(*args: Any) -> None:
+        value = fn(*args)
+        for leaf in jtu.tree_leaves(value):
+            check_real(leaf, name=f"What {name} returns")
+        shapes.append(getattr(value, "shape", () if isinstance(value, int | float) else None))
+
+    traced(look, name=name, **args)
+    return shapes[0]
+
+
+def real_array(value: Any, *, name: str) -> Array:
+    """What a function has returned, as an array; lists of numbers become one.
+
+    **Raises:**
+
+    - `ValueError` naming `name` where it holds anything but real numbers.
+    """
+    for leaf in jtu.tree_leaves(value):
+        check_real(leaf, name=f"What {name} returns")
+    try:
+        return jnp.asarray(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"What {name} returns must be an array of real numbers, but it is {value!r}.") from error
+
+
+def as_function(value: Any, *, name: str) -> Callable[..., Any]:
+    """Make a callable fit to sit in a pytree: an `eqx.Module` stays what it is, anything else is wrapped.
+
+    **Raises:**
+
+    - `ValueError` if `value` cannot be called.
+    """
+    if not callable(value):
+        raise ValueError(f"{name} must be a function, but {value!r} was given.")
+    fn: Callable[..., Any] = value
+    return fn if isinstance(value, eqx.Module) else Function(fn)

@@ -1,0 +1,210 @@
+"""Numbers of a scene: how they are converted, in which range they are allowed, and how both are reported."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .state_dependent import nominal
+
+if TYPE_CHECKING:
+    Number: TypeAlias = Any  # a plain number in the call: type checkers do not see the converter of `parameter`
+    Vector: TypeAlias = Any
+else:
+    Number: TypeAlias = Float[Array, ""]
+    Vector: TypeAlias = Float[Array, " n"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Range:
+    """Admissible range and unit of a parameter: above (or at) a number, or another parameter, and below a number.
+
+    **Arguments:**
+
+    - `unit`: SI unit, as printed.
+    - `lower`: lower limit; a string names another parameter of the same object; None for no limit.
+    - `strict`: whether the lower limit itself is excluded.
+    - `upper`: upper limit, included; None for no limit.
+    - `execution`: whether the parameter says how a law is run and not what it is; a fit leaves it alone by itself.
+    """
+
+    unit: str
+    lower: float | str | None = None
+    strict: bool = False
+    upper: float | None = None
+    execution: bool = False
+
+    @property
+    def text(self) -> str:
+        """The range in words, such as `> 0 N/m`."""
+        unit = f" [{self.unit}]" if self.unit else ""
+        if self.lower is None and self.upper is None:
+            return f"a finite number{unit}"
+        limit = self.lower if isinstance(self.lower, str) or self.lower is None else f"{self.lower:g}"
+        least = "" if limit is None else f" and {'>' if self.strict else '>='} {limit}"
+        most = "" if self.upper is None else f" and <= {self.upper:g}"
+        return f"finite{least}{most}{unit}"
+
+    def holds(self, value: Float[Array, "..."], others: Mapping[str, Float[Array, "..."]]) -> Bool[Array, "..."]:
+        """Whether `value` is in range, elementwise; `others` are the parameters of the same object by name."""
+        finite = jnp.isfinite(value)
+        if self.upper is not None:
+            finite = finite & (value <= self.upper)
+        if self.lower is None:
+            return finite
+        lower = others[self.lower] if isinstance(self.lower, str) else self.lower
+        return finite & ((value > lower) if self.strict else (value >= lower))
+
+
+def as_number(value: Any, *, name: str) -> Float[Array, ""]:
+    """Convert to a real floating scalar; integers become floating, a dtype that is given is kept.
+
+    **Raises:**
+
+    - `ValueError` naming `name`, what was given and what is needed.
+    """
+    array = as_real(value, name=name)
+    if array.shape != ():
+        raise ValueError(
+            f"{name} has shape {array.shape}, but one number is needed. To run many values at once, build one scene"
+            " and batch its numbers with jax.vmap."
+        )
+    return array
+
+
+def as_real(value: Any, *, name: str) -> Float[Array, "..."]:
+    """Convert to a real floating array of any shape; see `as_number`."""
+    if isinstance(value, jax.Array | np.ndarray | np.number | int | float) and not isinstance(value, bool):
+        kind = getattr(value, "dtype", np.dtype(type(value)))
+        whole = jnp.issubdtype(kind, jnp.integer)
+        if whole or jnp.issubdtype(kind, jnp.floating):
+            dtype = jnp.result_type(float) if whole else jnp.result_type(value)
+            try:
+                return jnp.asarray(value, dtype=dtype)  # a stated dtype also makes a weak type strong
+            except OverflowError as error:
+                raise ValueError(f"{name} is a number beyond all that a {dtype} can hold.") from error
+    given = value if isinstance(value, str | bool) else getattr(value, "dtype", type(value).__name__)
+    raise ValueError(f"{name} must be a real number or an array of real numbers, but {given!r} was given.")
+
+
+def as_vector(value: Any, *, name: str) -> Float[Array, " n"]:
+    """Convert to a vector of real floating numbers, shape `[n]`; one number becomes a vector of length one.
+
+    **Raises:**
+
+    - `ValueError` naming `name`, what was given and what is needed.
+    """
+    if isinstance(value, list | tuple):
+        value = jnp.stack([as_number(x, name=name) for x in value]) if value else jnp.zeros(0)
+    array = as_real(value, name=name)
+    if array.ndim > 1 or array.size == 0:
+        raise ValueError(f"{name} has shape {array.shape}, but numbers in a row, shape [n], are needed.")
+    return jnp.reshape(array, (-1,))
+
+
+def parameter(
+    name: str,
+    unit: str,
+    *,
+    lower: float | str | None = None,
+    strict: bool = False,
+    upper: float | None = None,
+    execution: bool = False,
+    **field: Any,
+) -> Any:
+    """Dataclass field of an `eqx.Module` that holds one number with a unit and an admissible range.
+
+    **Arguments:**
+
+    - `name`: name of the field, for error messages.
+    - `unit`, `lower`, `strict`, `upper`, `execution`: see `Range`.
+    - `field`: further arguments of `equinox.field`, such as `default`.
+    """
+    allowed = Range(unit, lower, strict, upper, execution)
+    return eqx.field(converter=partial(as_number, name=name), metadata={"range": allowed}, **field)
+
+
+def optional_parameter(name: str, unit: str, *, lower: float | str | None = None, strict: bool = False) -> Any:
+    """A `parameter` that may be left out, and then is None."""
+    convert = partial(_unless_none, convert=as_number, name=name)
+    return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower, strict)})
+
+
+def vector_parameter(name: str, unit: str, *, lower: float | str | None = None, strict: bool = False) -> Any:
+    """A `parameter` of several numbers, shape `[n]`."""
+    return eqx.field(converter=partial(as_vector, name=name), metadata={"range": Range(unit, lower, strict)})
+
+
+def optional_vector_parameter(name: str, unit: str, *, lower: float | str | None = None) -> Any:
+    """A `vector_parameter` that may be left out, and then is None."""
+    convert = partial(_unless_none, convert=as_vector, name=name)
+    return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower)})
+
+
+def _unless_none(value: Any, *, convert: Callable[..., Any], name: str) -> Any:
+    return None if value is None else convert(value, name=name)
+
+
+def ranges_of(module: eqx.Module) -> dict[str, Range]:
+    """Ranges of the parameters that `module` holds, by name; an optional one that was not given has none."""
+    return {
+        f.name: f.metadata["range"]
+        for f in dataclasses.fields(module)
+        if "range" in f.metadata and getattr(module, f.name) is not None
+    }
+
+
+def range_checks(module: eqx.Module) -> list[tuple[str, Array]]:
+    """For each parameter of `module`: the sentence that says what is needed, and whether that holds."""
+    values = {name: nominal(getattr(module, name)) for name in ranges_of(module)}
+    owner = type(module).__name__
+    return [
+        (f"{owner}: {name} must be {allowed.text}", jnp.all(allowed.holds(values[name], values)))
+        for name, allowed in ranges_of(module).items()
+    ]
+
+
+def check_ranges(module: eqx.Module) -> None:
+    """Check the parameters of `module` that are known now (not being traced).
+
+    **Raises:**
+
+    - `ValueError` naming the parameter, its range and the value given.
+    """
+    values = {name: nominal(getattr(module, name)) for name in ranges_of(module)}
+    for name, allowed in ranges_of(module).items():
+        limit = values.get(allowed.lower) if isinstance(allowed.lower, str) else None
+        if any(isinstance(x, jax.core.Tracer) for x in (values[name], limit)):
+            continue
+        if not bool(jnp.all(allowed.holds(values[name], values))):
+            against = "" if limit is None else f" ({allowed.lower} = {limit})"
+            raise ValueError(
+                f"{type(module).__name__}: {name} must be {allowed.text}{against}, but {values[name]} was given."
+            )
+
+
+def modules_of(tree: Any, path: str = "") -> Iterator[tuple[str, eqx.Module]]:
+    """Every `eqx.Module` inside `tree` (itself included), with its path such as `.effects[0].law`.
+
+    And those that a module says it implies by a property `implied`: modules by name, made from its fields.
+    """
+    if isinstance(tree, eqx.Module):
+        yield path, tree
+        for name, module in getattr(tree, "implied", {}).items():
+            yield f"{path}.{name}", module
+        for field in dataclasses.fields(tree):
+            if not field.metadata.get("static", False):
+                yield from modules_of(getattr(tree, field.name), f"{path}.{field.name}")
+    elif isinstance(tree, tuple | list):
+        for i, item in enumerate(tree):
+            yield from modules_of(item, f"{path}[{i}]")
+    elif isinstance(tree, dict):
+        for key, item in tree.items():
+            yield from modules_of(item, f"{path}[{key!r}]")

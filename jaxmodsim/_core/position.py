@@ -1,0 +1,69 @@
+"""Functions of the coordinates that may also ask for the parameters."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from .functions import as_function, real_array
+from .parameters import as_real
+
+
+class Place(eqx.Module):
+    """A function `place(q)` or `place(q, params)`, called as the latter."""
+
+    place: Callable[..., Any]
+    with_params: bool = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+
+    def __call__(self, q: Float[Array, " dof"], params: PyTree) -> Array:
+        """What the function gives."""
+        value = real_array(self.place(q, params) if self.with_params else self.place(q), name=self.name)
+        return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(q.dtype)
+
+
+def as_place(value: Any, *, name: str) -> Place:
+    """Make a function of `q`, or of `q` and `params`, fit to sit in a pytree.
+
+    Which of the two it is follows from the arguments without a default that it takes.
+
+    **Raises:**
+
+    - `ValueError` if `value` cannot be called, or takes neither one nor two arguments.
+    """
+    if isinstance(value, Place):
+        return value
+    function = as_function(value, name=name)
+    try:
+        taken = inspect.signature(value).parameters.values()
+    except (TypeError, ValueError):  # a function written in C does not say
+        return Place(function, False, name)
+    needed = [x for x in taken if x.default is x.empty and x.kind in (x.POSITIONAL_ONLY, x.POSITIONAL_OR_KEYWORD)]
+    if len(needed) > 2:
+        raise ValueError(f"{name} must be a function of q, or of q and params, but it takes {len(needed)} arguments.")
+    return Place(function, len(needed) == 2, name)
+
+
+class Amount(eqx.Module):
+    """A number, or a function of the parameters that returns one."""
+
+    amount: Any
+
+    def __call__(self, params: PyTree) -> Array:
+        """The number."""
+        return jnp.asarray(self.amount(params) if callable(self.amount) else self.amount)
+
+
+def as_amount(value: Any, *, name: str) -> Amount:
+    """Make a number, an array of numbers, or a function of `params` fit to sit in a pytree.
+
+    **Raises:**
+
+    - `ValueError` if it is none of these.
+    """
+    if isinstance(value, Amount):
+        return value
+    return Amount(as_function(value, name=name) if callable(value) else as_real(value, name=name))

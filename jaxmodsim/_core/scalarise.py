@@ -1,0 +1,317 @@
+"""Small arrays taken apart: a function of arrays, evaluated in scalars."""
+
+import functools
+import itertools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.core
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.extend.core import Literal, jaxpr_as_fun
+from jaxtyping import Array, Float
+
+from .fusion import once, unit_of
+
+# Arrays with more entries stay whole: tables, and what is looked up in them. Twelve coordinates make squares of 144.
+MAX_ENTRIES = 144
+# A function whose other values have more entries than this in all is left as it is: it would take too long to compile.
+MAX_SCALARS = 8000
+
+# Applied to every entry by itself.
+_ELEMENTWISE = {
+    *("add", "add_any", "sub", "mul", "div", "neg", "abs", "sign", "max", "min", "rem", "square", "integer_pow", "pow"),
+    *("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
+    *("exp", "exp2", "expm1", "log", "log1p", "logistic", "sqrt", "rsqrt", "cbrt", "erf", "erfc", "floor", "ceil"),
+    *("eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "xor", "select_n", "is_finite", "convert_element_type"),
+    *("copy", "stop_gradient", "clamp", "round"),
+}
+# Costly functions that XLA counts as cheap and computes again wherever their result is needed.
+_REPEATED = {"sin", "cos", "tan"}
+_SUMS = {"reduce_sum", "cumsum", "dot_general"}
+_CALLS = {"jit", "pjit", "closed_call", "core_call"}
+
+# Entries of an array: scalars, those known while tracing as NumPy's. Every other value is one array, not taken apart.
+_Parts = np.ndarray
+
+
+def in_scalars(fn: Callable[..., Any], *args: Any, seed: Float[Array, "..."]) -> Any:
+    """`fn(*args)`, with every small array on the way taken apart into scalars.
+
+    XLA on CPU fuses operations on arrays of two to eight entries badly, and computes what they share over and over; of
+    scalars it makes one function, and under `jax.vmap` a few kernels over the batch. Besides, what is known while
+    tracing (the zeros and ones of unit vectors) is carried through sums and products, equal terms are formed once,
+    and so are sines and cosines (see `once`). Functions with a derivative of their own, loops and whatever else is
+    not known here get their arrays whole.
+
+    **Arguments:**
+
+    - `fn`: a function that JAX can trace. Where its values have one entry each or more than `MAX_SCALARS` in all, and
+      outside of `jax.jit` and the like, it is evaluated as it is.
+    - `args`: pytrees of arrays and numbers.
+    - `seed`: numbers not known while compiling. Where the first of them is not finite, the result may not be, either.
+
+    **Returns:**
+
+    What `fn` returns, equal but for rounding and for zero times infinity, which is zero if that zero is a constant.
+    """
+    closed, shapes = jax.make_jaxpr(fn, return_shape=True)(*args)
+    leaves = [x if hasattr(x, "shape") else jnp.asarray(x) for x in jtu.tree_leaves(args)]
+    sizes = [size for size in _sizes(closed.jaxpr) if size <= MAX_ENTRIES]
+    traced = any(isinstance(x, jax.core.Tracer) for x in leaves)
+    if traced and max(sizes, default=0) > 1 and sum(sizes) <= MAX_SCALARS:
+        unit = unit_of(jax.lax.stop_gradient(jnp.ravel(seed)[0]))
+        out = [_whole(x) for x in _Scalars(unit).run(closed.jaxpr, closed.consts, leaves)]
+    else:
+        out = jaxpr_as_fun(closed)(*leaves)
+    return jtu.tree_unflatten(jtu.tree_structure(shapes), out)
+
+
+def columns_of(linear: Callable[..., list[Any]], unit: Float[Array, ""], *like: Any) -> list[list[Any]]:
+    """The matrix of a linear function of scalars, column by column; zeros and ones that its structure shows are known.
+
+    **Arguments:**
+
+    - `linear`: takes scalars and returns a list of them, as the second result of `jax.linearize` does.
+    - `unit`: a one from `unit_of`.
+    - `like`: scalars of the types of its arguments.
+
+    **Returns:**
+
+    For each argument the values for it alone being one: NumPy's scalars where they are known while tracing (zeros of
+    what does not depend on it, ones of what it is itself), arrays elsewhere.
+    """
+    closed, scalars = jax.make_jaxpr(linear)(*like), _Scalars(unit)
+    types = [jnp.result_type(x) for x in like]
+    columns = []
+    for j in range(len(like)):
+        basis = [np.asarray(i == j, kind) for i, kind in enumerate(types)]
+        out = scalars.run(closed.jaxpr, closed.consts, basis)
+        columns.append([x[()] if isinstance(x, np.ndarray) else x for x in out])
+    return columns
+
+
+def _sizes(jaxpr: Any) -> list[int]:
+    """Number of entries of each value of a traced function."""
+    inner = [eqn.params["jaxpr"].jaxpr for eqn in jaxpr.eqns if eqn.primitive.name in _CALLS]
+    own = [var.aval.size for eqn in jaxpr.eqns for var in eqn.outvars]
+    return own + [size for each in inner for size in _sizes(each)]
+
+
+def _entries(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+    return itertools.product(*map(range, shape))
+
+
+def _array(shape: tuple[int, ...], entry: Callable[[tuple[int, ...]], Any]) -> _Parts:
+    out = np.empty(shape, object)
+    for index in _entries(shape):
+        out[index] = entry(index)
+    return out
+
+
+def _whole(x: Any) -> Any:
+    """A value as one array."""
+    if not _apart(x):
+        return x
+    # Row by row: XLA finds the entries of a stack again, but not behind a reshape.
+    return jnp.asarray(x[()]) if x.shape == () else jnp.stack([_whole(x[i, ...]) for i in range(len(x))])
+
+
+def _apart(x: Any) -> bool:
+    return isinstance(x, np.ndarray) and x.dtype == object
+
+
+def _known(x: Any) -> bool:
+    return isinstance(x, np.generic)
+
+
+class _Scalars:
+    """Evaluates a traced function entry by entry; remembers what it has computed."""
+
+    def __init__(self, unit: Array) -> None:
+        self.unit = unit
+        self.memory: dict[Any, tuple[Any, Any]] = {}
+
+    def parts(self, x: Any) -> _Parts:
+        """A value taken apart."""
+        if _apart(x):
+            return x
+        if isinstance(x, np.ndarray):
+            return _array(x.shape, lambda index: x[index])
+        if id(x) not in self.memory:
+            flat = jnp.reshape(x, -1)
+            entries = iter([jax.lax.index_in_dim(flat, i, keepdims=False) for i in range(flat.size)])
+            self.memory[id(x)] = x, _array(x.shape, lambda _: next(entries))
+        return self.memory[id(x)][1]
+
+    def run(self, jaxpr: Any, consts: Any, args: Any) -> list[Any]:
+        """Values of the outputs, apart or whole."""
+        values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(_constant, consts), *args], strict=True))
+
+        def read(atom: Any) -> Any:
+            kind: Any = atom.aval
+            return np.asarray(atom.val, kind.dtype) if isinstance(atom, Literal) else values[atom]
+
+        for eqn in jaxpr.eqns:
+            values.update(zip(eqn.outvars, self.step(eqn, [read(x) for x in eqn.invars]), strict=True))
+        return [read(x) for x in jaxpr.outvars]
+
+    def step(self, eqn: Any, inputs: list[Any]) -> list[Any]:
+        """Outputs of one equation."""
+        name, params = eqn.primitive.name, eqn.params
+        if name in _CALLS:
+            return self.run(params["jaxpr"].jaxpr, params["jaxpr"].consts, inputs)
+        kinds = [x.aval for x in (*eqn.invars, *eqn.outvars)]
+        if not all(0 < kind.size <= MAX_ENTRIES for kind in kinds):
+            return self.whole(eqn, inputs)
+        if name in _ELEMENTWISE:
+            arrays = np.broadcast_arrays(*map(self.parts, inputs))
+            return [
+                _array(arrays[0].shape, lambda i: self.apply(eqn.primitive.bind, name, params, [x[i] for x in arrays]))
+            ]
+        if name in _MOVES:
+            return [_MOVES[name](params, *map(self.parts, inputs))]
+        if name == "split":
+            return np.split(self.parts(inputs[0]), np.cumsum(params["sizes"])[:-1], params["axis"])
+        if name == "unstack":
+            moved = np.moveaxis(self.parts(inputs[0]), params["axis"], 0)
+            return [moved[i, ...] for i in range(len(moved))]
+        if name in _SUMS and len({kind.dtype for kind in kinds}) == 1:
+            return [getattr(self, name)(params, *map(self.parts, inputs))]
+        return self.whole(eqn, inputs)
+
+    def whole(self, eqn: Any, inputs: list[Any]) -> list[Any]:
+        """Outputs of an equation that gets its arrays whole."""
+        bound = eqn.primitive.get_bind_params(eqn.params)
+        functions, params = bound if isinstance(bound, tuple) else ((), bound)
+        out = eqn.primitive.bind(*functions, *map(_whole, inputs), **params)
+        return list(out) if eqn.primitive.multiple_results else [out]
+
+    def apply(self, compute: Callable[..., Any], name: str, params: dict[str, Any], operands: list[Any]) -> Any:
+        """One scalar from scalars."""
+        if all(map(_known, operands)) and name in _KNOWN:
+            return np.asarray(_KNOWN[name](params, *operands))[()]
+        short = _shorten(name, operands)
+        if short is not None:
+            return short
+        key = (name, str(params), *(x.tobytes() + x.dtype.str.encode() if _known(x) else id(x) for x in operands))
+        if key not in self.memory:
+            out = compute(*operands, **params)
+            # The operands are kept, for an id is that of one object only while it lives.
+            self.memory[key] = operands, once(out, self.unit) if name in _REPEATED else out
+        return self.memory[key][1]
+
+    def add(self, a: Any, b: Any) -> Any:
+        return self.apply(jax.lax.add, "add", {}, [a, b])
+
+    def reduce_sum(self, params: dict[str, Any], x: _Parts) -> _Parts:
+        axes = params["axes"]
+        x = np.moveaxis(x, axes, range(len(axes)))
+        x = x.reshape(-1, *x.shape[len(axes) :])
+        return _array(x.shape[1:], lambda i: functools.reduce(self.add, x[(slice(None), *i)]))
+
+    def cumsum(self, params: dict[str, Any], x: _Parts) -> _Parts:
+        step = -1 if params["reverse"] else 1
+        x = np.moveaxis(x, params["axis"], 0)[::step].copy()
+        for k in range(1, x.shape[0]):
+            for i in _entries(x.shape[1:]):
+                x[(k, *i)] = self.add(x[(k - 1, *i)], x[(k, *i)])
+        return np.moveaxis(x[::step], 0, params["axis"])
+
+    def dot_general(self, params: dict[str, Any], a: _Parts, b: _Parts) -> _Parts:
+        (sum_a, sum_b), (batch_a, batch_b) = params["dimension_numbers"]
+        free_a = [i for i in range(a.ndim) if i not in (*sum_a, *batch_a)]
+        free_b = [i for i in range(b.ndim) if i not in (*sum_b, *batch_b)]
+        a, b = a.transpose(*batch_a, *free_a, *sum_a), b.transpose(*batch_b, *free_b, *sum_b)
+        batch, rows, columns = len(batch_a), len(free_a), len(free_b)
+
+        def entry(i: tuple[int, ...]) -> Any:
+            left, right = a[(*i[: batch + rows], ...)], b[(*i[:batch], *i[batch + rows :], ...)]
+            pairs = zip(left.flat, right.flat, strict=True)
+            return functools.reduce(self.add, [self.apply(jax.lax.mul, "mul", {}, [x, y]) for x, y in pairs])
+
+        return _array((*a.shape[: batch + rows], *b.shape[batch : batch + columns]), entry)
+
+
+def _constant(x: Any) -> Any:
+    return x if isinstance(x, jax.core.Tracer) else np.asarray(x)
+
+
+def _shorten(name: str, operands: list[Any]) -> Any:
+    """Sums, products and quotients with zero or one, and choices that are known or make no difference; else None."""
+    if name in ("add", "add_any", "mul"):
+        for a, b in (operands, operands[::-1]):
+            if _known(a) and a == 0:
+                return a if name == "mul" else b
+            if _known(a) and a == 1 and name == "mul":
+                return b
+    if name == "select_n":
+        chosen, *cases = operands
+        if _known(chosen):
+            return cases[int(chosen)]
+        # The derivative of |v| by anything else is zero on either side.
+        if all(map(_known, cases)) and all(x == cases[0] for x in cases):
+            return cases[0]
+    if name == "div" and _known(operands[0]) and operands[0] == 0:
+        return operands[0]
+    if name == "sub" and _known(operands[1]) and operands[1] == 0:
+        return operands[0]
+    return None
+
+
+def _pad(params: dict[str, Any], x: _Parts, filling: _Parts) -> _Parts:
+    config = [tuple(map(int, sizes)) for sizes in params["padding_config"]]
+    shape = tuple(
+        low + high + size + inner * max(size - 1, 0) for size, (low, high, inner) in zip(x.shape, config, strict=True)
+    )
+    out = _array(shape, lambda _: filling[()])
+    for i in _entries(x.shape):
+        to = tuple(low + k * (inner + 1) for k, (low, _, inner) in zip(i, config, strict=True))
+        if all(0 <= k < size for k, size in zip(to, shape, strict=True)):
+            out[to] = x[i]
+    return out
+
+
+def _broadcast(params: dict[str, Any], x: _Parts) -> _Parts:
+    shape = [1] * len(params["shape"])
+    for dimension, size in zip(params["broadcast_dimensions"], x.shape, strict=True):
+        shape[dimension] = size
+    return np.broadcast_to(x.reshape(shape), params["shape"])
+
+
+def _slice(params: dict[str, Any], x: _Parts) -> _Parts:
+    strides = params["strides"] or (1,) * x.ndim
+    return x[tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]
+
+
+def _iota(params: dict[str, Any]) -> _Parts:
+    shape, dimension = params["shape"], params["dimension"]
+    return _array(shape, lambda i: np.dtype(params["dtype"]).type(i[dimension]))
+
+
+# Which entry goes where.
+_MOVES: dict[str, Callable[..., _Parts]] = {
+    "broadcast_in_dim": _broadcast,
+    "concatenate": lambda params, *xs: np.concatenate(xs, params["dimension"]),
+    "iota": _iota,
+    "pad": _pad,
+    "reshape": lambda params, x: x.reshape(params["new_sizes"]),
+    "rev": lambda params, x: np.flip(x, params["dimensions"]),
+    "slice": _slice,
+    "stack": lambda params, *xs: np.stack(xs, params["axis"]),
+    "squeeze": lambda params, x: np.squeeze(x, params["dimensions"]),
+    "transpose": lambda params, x: x.transpose(params["permutation"]),
+}
+
+# What is computed while tracing if the operands are known.
+_KNOWN: dict[str, Callable[..., Any]] = {
+    "add": lambda _, a, b: a + b,
+    "add_any": lambda _, a, b: a + b,
+    "convert_element_type": lambda params, x: x.astype(params["new_dtype"]),
+    "eq": lambda _, a, b: a == b,
+    "mul": lambda _, a, b: a * b,
+    "neg": lambda _, x: -x,
+    "sub": lambda _, a, b: a - b,
+}

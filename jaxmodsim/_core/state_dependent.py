@@ -1,0 +1,60 @@
+"""Parameters that change with the state of the mechanism."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .functions import Function
+
+# Least factor: what is divided by a parameter stays finite.
+_LEAST = 1e-30
+
+
+class Varying(eqx.Module):
+    """A parameter that changes with the state of the mechanism: a number times `fn(t, q, qd, params)`.
+
+    It takes the number's place in its module, which keeps its kind; `settle` puts the product there.
+    """
+
+    number: Any
+    fn: Callable[..., Any]
+
+    def __jax_array__(self) -> Array:
+        """Refuse to be taken for a number."""
+        raise TypeError(
+            "This parameter depends on the state of the mechanism (scaled_by), so it has no value by itself: ask"
+            " law.at(t, q, qd, params) for the law at a state."
+        )
+
+
+_Module = TypeVar("_Module", bound=eqx.Module)
+
+
+def varies(tree: Any) -> bool:
+    """Whether a parameter in `tree` depends on the state of the mechanism."""
+    return any(isinstance(x, Varying) for x in jax.tree.leaves(tree, is_leaf=lambda x: isinstance(x, Varying)))
+
+
+def settle(tree: _Module, t: Array, q: Array, qd: Array, params: Any) -> _Module:
+    """`tree` with the values of its parameters at a state of the mechanism; factors below 1e-30 count as that."""
+    factors: dict[int, Array] = {}  # by function: parameters that share one evaluate it once
+
+    def value(x: Any) -> Any:
+        if not isinstance(x, Varying):
+            return x
+        key = id(x.fn.fn if isinstance(x.fn, Function) else x.fn)
+        if key not in factors:
+            factors[key] = jnp.maximum(jnp.asarray(x.fn(t, q, qd, params)), _LEAST)
+        number = value(x.number)
+        return number * factors[key].astype(number.dtype)
+
+    return jax.tree.map(value, tree, is_leaf=lambda x: isinstance(x, Varying))
+
+
+def nominal(value: Any) -> Any:
+    """The number of a parameter, without the factor it varies by."""
+    return nominal(value.number) if isinstance(value, Varying) else value

@@ -1,0 +1,1 @@
+"""Laws that depend on direction, or on the state of the mechanism."""

@@ -1,0 +1,182 @@
+"""Laws whose parameters depend on the direction of slip."""
+
+import dataclasses
+from typing import Any, TypeVar, cast
+
+import equinox as eqx
+import jax.numpy as jnp
+from equinox import AbstractVar
+from jaxtyping import Array, Float
+
+from ..._core.parameters import check_ranges, ranges_of
+from ..._core.state_dependent import Varying
+from .._law import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw
+
+_Law = TypeVar("_Law")
+
+
+def _toward(v: Float[Array, ""], law: Any) -> Any:
+    """The law that holds at velocity `v`."""
+    names = tuple(law.backward)
+    values = [jnp.where(v < 0, law.backward[name], getattr(law.forward, name)) for name in names]
+    return eqx.tree_at(lambda x: [getattr(x, name) for name in names], law.forward, values)
+
+
+def other_side(law: Any) -> Any:
+    """The whole law for negative slip of an asymmetric one."""
+    names = tuple(law.backward)
+    values = [law.backward[name] for name in names]
+    return eqx.tree_at(lambda x: [getattr(x, name) for name in names], law.forward, values, is_leaf=_is_varying)
+
+
+def _is_varying(x: Any) -> bool:
+    return isinstance(x, Varying)
+
+
+class AbstractAsymmetric(AbstractLaw):
+    """What laws share some of whose parameters differ for negative slip."""
+
+    # The law for positive slip, and the numbers that differ, by name.
+    forward: AbstractVar[Any]
+    backward: AbstractVar[dict[str, Any]]
+
+    @property
+    def stiff(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """As the law for positive slip is."""
+        return self.forward.stiff
+
+    @property
+    def implied(self) -> dict[str, AbstractLaw]:
+        """The law for negative slip, to be checked beside the fields."""
+        return {"backward": other_side(self)}
+
+
+class _AsymmetricForce(AbstractAsymmetric, AbstractForceLaw):  # pyright: ignore[reportIncompatibleVariableOverride]
+    """A function of velocity, some of whose parameters differ for negative slip."""
+
+    forward: AbstractForceLaw
+    backward: dict[str, Any]
+
+    def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+        """Friction force [N] at velocity `v` [m/s]."""
+        return _toward(v, self).force(v)
+
+
+class _AsymmetricSetValued(AbstractAsymmetric, AbstractSetValuedLaw):  # pyright: ignore[reportIncompatibleVariableOverride]
+    """A set-valued law, some of whose parameters differ for negative slip."""
+
+    forward: AbstractSetValuedLaw
+    backward: dict[str, Any]
+
+    def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:
+        """Magnitude [N] of the dry part in slip."""
+        return _toward(v, self).dry(v)
+
+    def wet(self, v: Float[Array, ""]) -> Float[Array, ""]:
+        """Smooth part [N]."""
+        return _toward(v, self).wet(v)
+
+    def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+        """Largest force in stick [N] against a load towards `direction`."""
+        return _toward(direction, self).limit(direction)
+
+
+class _AsymmetricDynamic(AbstractAsymmetric, AbstractDynamicLaw):  # pyright: ignore[reportIncompatibleVariableOverride]
+    """A law with a state, some of whose parameters differ for negative slip."""
+
+    forward: AbstractDynamicLaw
+    backward: dict[str, Any]
+
+    def state0(self, v: Float[Array, "..."]) -> Any:
+        """State at rest and unloaded."""
+        return self.forward.state0(v)
+
+    def rate(self, v: Float[Array, ""], z: Any) -> Any:
+        """Time derivative of the state."""
+        return _toward(v, self).rate(v, z)
+
+    def force_at(self, v: Float[Array, ""], z: Any, rate: Any) -> Float[Array, ""]:
+        """Friction force [N]."""
+        return _toward(v, self).force_at(v, z, rate)
+
+    def stored(self, z: Any) -> Float[Array, ""]:
+        """Energy [J] in the state: stiffness is one for both directions."""
+        return self.forward.stored(z)
+
+    def advance(self, v: Float[Array, ""], z: Any, dt: Float[Array, ""]) -> Any:
+        """State after `dt` [s] at constant velocity."""
+        return _toward(v, self).advance(v, z, dt)
+
+
+_KINDS = (
+    (AbstractSetValuedLaw, _AsymmetricSetValued),
+    (AbstractForceLaw, _AsymmetricForce),
+    (AbstractDynamicLaw, _AsymmetricDynamic),
+)
+
+
+def asymmetric(law: _Law, **backward: Any) -> _Law:
+    """A law with other parameters for negative slip velocities.
+
+    **Arguments:**
+
+    - `law`: the law for positive slip, any one with named parameters. Of a wrapped law the law inside is meant:
+      `asymmetric(Regularized(Coulomb(20.0), width=1e-3), Fc=24.0)`.
+    - `backward`: the parameters that differ for negative slip, by name, in the law's own units. Not the stiffness of
+      an elastic element: what is stored in one direction comes back in the other.
+
+    **Returns:**
+
+    A law of the same kind, for slip along a line: `forward` is the law given, `backward` holds the numbers that differ,
+    and those whose limit they are. All others are the same number in both directions.
+
+    **Raises:**
+
+    - `ValueError` for a name that the law has not, a value out of range, or what is no such law.
+    """
+    inner = getattr(law, "law", None)
+    if isinstance(inner, AbstractLaw):
+        return eqx.tree_at(lambda x: x.law, cast(Any, law), asymmetric(inner, **backward))
+    kinds = [wrapper for kind, wrapper in _KINDS if isinstance(law, kind)]
+    if not kinds or isinstance(law, AbstractAsymmetric):
+        mend = f"{law!r} was given; of a function of velocity make a Curve(fn)"
+        if isinstance(law, AbstractAsymmetric):
+            mend = "a law that is asymmetric already was given: name all parameters that differ in one call"
+        raise ValueError(f"asymmetric needs a law with parameters of its own, but {mend}.")
+    module = cast(eqx.Module, law)
+    allowed = ranges_of(module)
+    unknown = sorted(set(backward) - set(allowed))
+    if unknown or not backward:
+        raise ValueError(
+            f"asymmetric({type(law).__name__}) needs the parameters that differ for negative slip, among"
+            f" {', '.join(allowed)} (one that was left out must be given to the law first); given:"
+            f" {', '.join(unknown) or 'none'}."
+        )
+    for name in backward:
+        if allowed[name].unit == "N/m":
+            raise ValueError(
+                f"asymmetric({type(law).__name__}): {name} stores energy, so it must be the same in both directions."
+            )
+    converters = {f.name: f.metadata["converter"] for f in dataclasses.fields(cast(Any, law)) if f.name in backward}
+    numbers = {name: _like(getattr(law, name), converters[name](value), name) for name, value in backward.items()}
+    # A parameter that is limited by one that differs must differ, too, to stay above it.
+    while above := [n for n, r in allowed.items() if r.lower in numbers and n not in numbers]:
+        numbers |= {name: getattr(law, name) for name in above}
+    both = kinds[0](cast(Any, law), numbers)
+    check_ranges(other_side(both))
+    return cast(_Law, both)
+
+
+def _like(old: Any, number: Any, name: str) -> Any:
+    """The new number, varying as the old one does.
+
+    **Raises:**
+
+    - `ValueError` if it is none, or not of the old one's shape.
+    """
+    if isinstance(old, Varying):
+        return Varying(_like(old.number, number, name), old.fn)
+    if number is None or jnp.shape(number) != jnp.shape(old):
+        given = "None" if number is None else f"the shape {jnp.shape(number)}"
+        raise ValueError(f"asymmetric: {name} must have the shape {jnp.shape(old)} for negative slip, but got {given}.")
+    return number

@@ -1,0 +1,55 @@
+"""Karnopp's execution of a set-valued law."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..._core.parameters import Number, parameter
+from .._law import AbstractHoldingLaw, AbstractSetValuedLaw
+from .._refuse import set_valued_law
+
+
+class DeadZone(AbstractHoldingLaw):
+    """A set-valued law run by Karnopp's rule: velocities up to `width` count as rest.
+
+    In the band friction equals the load, up to the limit of stick, so that the velocity keeps its value, which need
+    not be zero; outside it the law's slip force acts. Meant for a fixed step: the field jumps at the edges of the
+    band, and a band narrower than one step's change of velocity is stepped over.
+
+    **Arguments:**
+
+    - `law`: `Coulomb`, `Stribeck` or another set-valued law.
+    - `width`: half-width of the band [m/s], > 0.
+
+    **Raises:**
+
+    - `ValueError` if `law` is not set-valued or `width` is out of range.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{karnopp1985computer,
+            author={Karnopp, Dean},
+            title={Computer simulation of stick-slip friction in mechanical dynamic systems},
+            journal={Journal of Dynamic Systems, Measurement, and Control},
+            volume={107}, number={1}, pages={100--103}, year={1985},
+        }
+        ```
+    """
+
+    law: AbstractSetValuedLaw = set_valued_law("DeadZone")
+    width: Number = parameter("width", "m/s", lower=0.0, strict=True, execution=True)
+    stiff: ClassVar[bool] = False
+
+    def holds(self, v: Float[Array, ""]) -> Bool[Array, ""]:
+        """Whether `v` [m/s] lies in the band, edges included."""
+        return jnp.abs(v) <= self.width
+
+    def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+        """Largest holding force [N]."""
+        return self.law.limit(direction)
+
+    def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+        """Slip force [N] at velocity `v` [m/s]."""
+        return self.law.dry(v) * jnp.sign(v) + self.law.wet(v)

@@ -1,0 +1,143 @@
+"""Sampled functions of time among the numbers of a scene."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._core.arguments import as_flag
+from .._core.parameters import as_vector
+
+
+class Signal(eqx.Module):
+    """A sampled function of time, as an entry of `Scene` parameters: functions find its number at time t there.
+
+    ```python
+    scene = jaxmodsim.Scene(L, params={"m": 2.0, "u": jaxmodsim.Signal(t, u)},
+                            effects=(jaxmodsim.AppliedForce(lambda t, q, qd, p: p["u"][None]),))
+    ```
+
+    Each value is held from its sample to the next one, so that the signal jumps at its samples and has the new value
+    there; or, with `linear`, neighbours are joined by straight lines. Before the first sample it has the first value,
+    after the last one the last. Steps of `simulate` end on the samples.
+
+    Derivatives are those by `values`; the times are constants. In a Lagrangian a linear signal counts with its rate,
+    while a held one that energy depends on changes it by a jump that `run.energy` has no work for. Displacements
+    (`along`, `at`) and constraints see the number, but not that it moves: give what moves them as a function of t.
+
+    **Arguments:**
+
+    - `t`: times of the samples [s], increasing, shape `[samples]`.
+    - `values`: values there, any unit, shape `[samples]`.
+    - `linear`: whether values are interpolated and not held.
+
+    **Raises:**
+
+    - `ValueError` for shapes that differ, and times that are not finite or do not increase.
+    """
+
+    t: Any = eqx.field(converter=lambda x: as_vector(x, name="Signal t"))
+    values: Any = eqx.field(converter=lambda x: as_vector(x, name="Signal values"))
+    linear: bool = eqx.field(default=False, static=True, converter=lambda x: as_flag(x, name="Signal linear"))
+
+    def __check_init__(self) -> None:
+        """Refuse what is no function of time."""
+        if self.t.shape != self.values.shape:
+            raise ValueError(
+                f"Signal needs one value for each time, but t has the shape {self.t.shape} and values"
+                f" {self.values.shape}."
+            )
+        if isinstance(self.t, jax.core.Tracer):
+            return
+        t = np.asarray(self.t)
+        if not (np.isfinite(t).all() and (np.diff(t) > 0).all()):
+            raise ValueError("Signal: t must be finite and increase from sample to sample.")
+        if not isinstance(self.values, jax.core.Tracer) and (bad := np.flatnonzero(~np.isfinite(self.values))).size:
+            raise ValueError(
+                f"Signal: values must be finite, but the one at t = {t[bad[0]]:g} is {self.values[bad[0]]}"
+                f" ({bad.size} such of {t.size}). Leave such samples out."
+            )
+
+    def piece(self, t: Float[Array, ""]) -> "Piece":
+        """What the signal is from the last sample at or before `t` on, up to the next one."""
+        times = jax.lax.stop_gradient(self.t)
+        last = times.shape[0] - 1
+        i = after(times, t) - 1
+        here = jnp.maximum(i, 0)
+        start, value = _entry(times, here), _entry(self.values, here)
+        if not self.linear:
+            return Piece(self, value, None, None)
+        there = jnp.minimum(i + 1, last)
+        length = _entry(times, there) - start
+        slope = (_entry(self.values, there) - value) / jnp.where(length > 0, length, 1.0).astype(value.dtype)
+        return Piece(self, value, slope, start)
+
+
+class Piece(eqx.Module):
+    """A signal between two of its samples: a number, or a straight line that goes on beyond them."""
+
+    signal: Signal
+    value: Float[Array, ""]
+    slope: Float[Array, ""] | None
+    start: Float[Array, ""] | None
+
+    def at(self, t: Float[Array, ""]) -> Float[Array, ""]:
+        """Value at `t`."""
+        if self.slope is None or self.start is None:
+            return self.value
+        return self.value + self.slope * (t - self.start).astype(self.value.dtype)
+
+
+def after(times: Float[Array, " n"], t: Float[Array, ""]) -> Int[Array, ""]:
+    """Number of the increasing `times` that are not after `t`: the index of the first one that is."""
+    # Unrolled: a loop inside the loop of a run would keep XLA from fusing a step.
+    return jnp.searchsorted(times, t.astype(times.dtype), side="right", method="scan_unrolled")
+
+
+def is_one_of(times: Float[Array, " n"], t: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether `t` is one of the increasing `times`."""
+    return _entry(times, jnp.maximum(after(times, t) - 1, 0)) == t
+
+
+def _entry(x: Array, i: Int[Array, ""]) -> Array:
+    return jax.lax.dynamic_index_in_dim(x, i, keepdims=False)
+
+
+def _is_signal(x: Any) -> bool:
+    return isinstance(x, Signal | Piece)
+
+
+def signals_of(tree: Any) -> list[Any]:
+    """The signals in `tree`."""
+    return [x for x in jax.tree.leaves(tree, is_leaf=_is_signal) if _is_signal(x)]
+
+
+def signals_at(tree: Any, t: Float[Array, ""], *, held: bool = True, linear: bool = True) -> Any:
+    """`tree` with the number at `t` in the place of each signal that is held, or linear."""
+
+    def value(x: Any) -> Any:
+        if not _is_signal(x):
+            return x
+        signal = x.signal if isinstance(x, Piece) else x
+        if not (linear if signal.linear else held):
+            return x
+        return (x if isinstance(x, Piece) else x.piece(t)).at(t)
+
+    return jax.tree.map(value, tree, is_leaf=_is_signal)
+
+
+def signals_from(tree: Any, t: Float[Array, ""]) -> Any:
+    """`tree` with the piece that each signal begins or is in at `t`, for a step from there."""
+    return jax.tree.map(lambda x: x.piece(t) if isinstance(x, Signal) else x, tree, is_leaf=_is_signal)
+
+
+def sample_times(tree: Any, *, linear: bool) -> Float[Array, " n"] | None:
+    """Times of all samples in `tree` in order, those of linear signals where wanted; None for none."""
+    times = [jax.lax.stop_gradient(x.t) for x in signals_of(tree) if linear or not x.linear]
+    if len(times) < 2:
+        return times[0] if times else None
+    return jnp.sort(jnp.concatenate(times))

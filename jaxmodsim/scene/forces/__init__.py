@@ -1,0 +1,1 @@
+"""Where forces act on the mechanism."""

@@ -1,0 +1,93 @@
+"""A force from outside."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from ..._core.arguments import as_label
+from ..._core.functions import as_function, result_shape
+from ..._core.position import Place, as_place
+from ._effect import AbstractEffect, Action, Power
+
+
+def _at(value: Any) -> Place | None:
+    return None if value is None else as_place(value, name="AppliedForce at")
+
+
+class AppliedForce(AbstractEffect):
+    """A force given as a function, on the coordinates or at a point.
+
+    **Arguments:**
+
+    - `fn`: `fn(t, q, qd, params)` returns the force: without `at` the generalised force, shape `[dof]` [N or N m];
+      with `at` a Cartesian force [N] of the shape that `at` returns. Numbers that are to be differentiated or
+      swept belong into `params` (or into the leaves of an `eqx.Module` passed as `fn`).
+    - `at`: `at(q)` or `at(q, params)` returns the position of the point of attack [m]; the force is mapped to the
+      coordinates by the transposed Jacobian of `at`.
+    - `name`: name in `run.forces`.
+
+    **Raises:**
+
+    - `ValueError` if `fn` or `at` is no function, or (at the run) returns a wrong shape.
+    """
+
+    fn: Callable[..., Any] = eqx.field(converter=partial(as_function, name="AppliedForce fn"))
+    at: Place | None = eqx.field(default=None, converter=_at)
+    name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="AppliedForce name"))
+
+    @property
+    def default_name(self) -> str:
+        """Name in the results."""
+        return "applied"
+
+    @property
+    def stiff(self) -> bool:
+        """Applied forces are taken to be smooth."""
+        return False
+
+    def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
+        """Check the shape that `fn` returns."""
+        given = result_shape(self.fn, t=q[0], q=q, qd=qd, params=params, name=f"fn of AppliedForce {name!r}")
+        wanted = q.shape
+        if self.at is not None:
+            wanted = result_shape(self.at, q=q, params=params, name=f"at of AppliedForce {name!r}")
+        if given != wanted:
+            where = "the coordinates" if self.at is None else "what `at` returns"
+            raise ValueError(
+                f"AppliedForce {name!r}: fn returned the shape {given}, but {wanted} is needed (that of {where})."
+                " Return jnp.array([...]) with one entry for each."
+            )
+
+    def state0(self, q: Float[Array, " dof"], params: PyTree) -> PyTree:
+        """An applied force has no state."""
+        del q, params
+        return None
+
+    def act(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
+    ) -> Action:
+        """Force as given, and mapped to the coordinates."""
+        del z
+        force = jnp.asarray(self.fn(t, q, qd, params), q.dtype)
+        at = self.at
+        if at is None:
+            return Action(force, force)
+        _, pull = jax.vjp(lambda q: at(q, params), q)
+        return Action(pull(force)[0], force)
+
+    def power(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, action: Action
+    ) -> Power:
+        """All of it comes from outside."""
+        del t, q, params
+        return Power(jnp.sum(action.generalised * qd))
+
+    def stored(self, z: PyTree) -> float:
+        """Nothing is stored."""
+        del z
+        return 0.0

@@ -1,0 +1,374 @@
+"""Where a friction law acts."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float, PyTree
+
+from ..._core.arguments import as_label
+from ..._core.functions import as_function, result_shape
+from ..._core.parameters import Number, as_number, check_ranges, modules_of, optional_parameter
+from ..._core.position import Place, as_place
+from ..._core.safe import safe_norm
+from ..._core.state_dependent import Varying, varies
+from ...friction import (
+    AbstractAsymmetric,
+    AbstractDynamicLaw,
+    AbstractForceLaw,
+    AbstractHoldingLaw,
+    AbstractLaw,
+    AbstractPlanarLaw,
+    AbstractSetValuedLaw,
+    Curve,
+)
+from ._effect import AbstractEffect, Action, Power
+
+
+def _law(law: Any) -> AbstractLaw:
+    if isinstance(law, AbstractLaw):
+        return law
+    if callable(law) and not isinstance(law, type):
+        return Curve(law)
+    given = repr(law) if isinstance(law, str) else f"the class {law.__name__}" if isinstance(law, type) else repr(law)
+    raise ValueError(
+        f"Friction needs a law or a function of slip velocity, but {given} was given. Known laws: Viscous, Coulomb,"
+        " Stribeck, Dahl, LuGre, ElastoPlastic, MaxwellSlip, Armstrong; wrappers: Regularized, DeadZone, Sign."
+    )
+
+
+def _along(value: Any) -> Place | None:
+    return None if value is None else as_place(value, name="Friction along")
+
+
+def _belt(value: Any) -> Any:
+    if callable(value):
+        return as_function(value, name="Friction belt_velocity")
+    return as_number(value, name="Friction belt_velocity")
+
+
+class Reaction(eqx.Module):
+    """The load is the force of the constraint of this name."""
+
+    constraint: str = eqx.field(static=True)
+
+
+def _load(value: Any) -> Any:
+    if value is None or isinstance(value, Reaction):
+        return value
+    if isinstance(value, str):
+        return Reaction(value)
+    if callable(value):
+        return as_function(value, name="Friction normal_force")
+    return as_number(value, name="Friction normal_force")
+
+
+class Friction(AbstractEffect):
+    """A friction law acting along a displacement of the mechanism.
+
+    The slip velocity is `v = d/dt along(q) - belt_velocity`, and the friction force F, positive when it opposes
+    positive slip, enters the equations of motion as `-F d along/dq`.
+
+    **Arguments:**
+
+    - `law`: how friction depends on slip; a plain function of slip velocity does, too. A set-valued law (`Coulomb`,
+      `Stribeck`) runs exactly, by events: in stick the slip velocity is zero and the force is what that takes, up to
+      the law's limit. `Regularized`, `DeadZone` and `Sign` run it in other ways.
+    - `along`: `along(q)` or `along(q, params)`. A scalar displacement [m or rad]; by default the one coordinate. Or the
+      position of the contact [m], shape `[2]` or `[3]`: with one coordinate slip is the velocity along its path,
+      positive for a rising coordinate; with several it is a vector, and so is the friction force: of a law that is a
+      function of slip opposite to it, of the magnitude that the law gives at the magnitude of slip; of `LuGre` and
+      `Dahl` with a bristle that is a vector, too.
+    - `belt_velocity`: velocity [m/s or rad/s] of the surface, a number or a continuous function of t (a jump would
+      carry with it what sticks); where slip is a vector, a function that returns one.
+    - `normal_force`: load [N]: a number, `normal_force(t, q, qd, params)`, or the name of a `Constraint`, whose
+      reaction is the load; friction and reaction are then solved together. The law's forces are per newton of
+      load (`Fc` is the coefficient of friction), and a negative load, which is lift-off, gives no friction. By
+      default the law's forces are in newtons.
+    - `name`: name in `run.forces`.
+    - `ellipse`: where slip is a vector of two components, friction across over friction along the first one, > 0: the
+      limit of friction is an ellipse with these half-axes, and the direction that of greatest dissipation. By
+      default 1, a circle. The law sees the slip (v_1, ellipse v_2), so that the power is what it makes of that.
+
+    **Raises:**
+
+    - `ValueError` for a law that is none, and (at the run) for wrong shapes or for `along` missing where there are
+      several coordinates.
+    """
+
+    law: AbstractLaw = eqx.field(converter=_law)
+    along: Place | None = eqx.field(default=None, converter=_along)
+    belt_velocity: Number | Callable[..., Any] = eqx.field(default=0.0, converter=_belt)
+    normal_force: Number | Callable[..., Any] | Reaction | None = eqx.field(default=None, converter=_load)
+    name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Friction name"))
+    ellipse: Number | None = optional_parameter("ellipse", "1", lower=0.0, strict=True)
+
+    def __check_init__(self) -> None:
+        """Refuse an ellipse out of range."""
+        check_ranges(self)
+
+    def at(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree) -> "Friction":
+        """With the law as it is at this state; itself where the law does not depend on that."""
+        if not varies(self.law):
+            return self
+        return eqx.tree_at(lambda x: x.law, self, self.law.at(t, q, qd, params))
+
+    @property
+    def default_name(self) -> str:
+        """Name in the results."""
+        return "friction"
+
+    @property
+    def stiff(self) -> bool:
+        """As the law says."""
+        return self.law.stiff
+
+    @property
+    def holding(self) -> bool:
+        """Whether the law needs to know the other forces (`DeadZone`)."""
+        return isinstance(self.law, AbstractHoldingLaw)
+
+    @property
+    def exact(self) -> bool:
+        """Whether the law runs by events: its force depends on a mode, and in stick on the other forces."""
+        return isinstance(self.law, AbstractSetValuedLaw)
+
+    @property
+    def rests_on(self) -> str | None:
+        """Name of the constraint whose reaction is the load; None for other loads."""
+        return self.normal_force.constraint if isinstance(self.normal_force, Reaction) else None
+
+    def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
+        """Check that displacement, belt velocity and load have the shapes they need."""
+        shape = self._shape(q, params, name)
+        if self.along is None and q.shape != (1,):
+            raise ValueError(
+                f"Friction {name!r} acts on a mechanism with {q.shape[0]} coordinates: say along which"
+                " displacement, as in Friction(law, along=lambda q: q[0])."
+            )
+        if shape not in ((), (2,), (3,)):
+            raise ValueError(
+                f"Friction {name!r}: along(q) returned the shape {shape}, but one number, shape (), or a position,"
+                " shape (2,) or (3,), is needed."
+            )
+        slip = () if q.shape == (1,) else shape
+        sided = any(isinstance(module, AbstractAsymmetric) for _, module in modules_of(self.law))
+        if slip != () and (sided or not isinstance(self.law, AbstractForceLaw | AbstractPlanarLaw)):
+            raise ValueError(
+                f"Friction {name!r}: along(q) is a position that moves in several directions, and there"
+                f" {type(self.law).__name__} cannot act. Needed is LuGre, Dahl, or a law that is a function of slip and"
+                " the same in all directions: wrap a set-valued one as Regularized(law, width), or give a scalar"
+                " displacement."
+            )
+        if self.ellipse is not None and slip != (2,):
+            raise ValueError(
+                f"Friction {name!r}: ellipse needs slip that is a vector of two components, but slip has the shape"
+                f" {slip}: return a position of shape (2,) from along."
+            )
+        load = None if self.rests_on is not None else self.normal_force
+        factors = [x.fn for _, x in modules_of(self.law) if isinstance(x, Varying)]
+        state = {"t": q[0], "q": q, "qd": qd, "params": params}
+        for label, fn, args, wanted in (
+            ("belt_velocity(t)", self.belt_velocity, {"t": q[0]}, slip),
+            ("normal_force(t, q, qd, params)", load, state, ()),
+            *(("scaled_by's fn(t, q, qd, params)", fn, state, ()) for fn in factors),
+        ):
+            given = result_shape(fn, **args, name=f"{label} of Friction {name!r}") if callable(fn) else wanted
+            if given != wanted:
+                raise ValueError(f"Friction {name!r}: {label} returned the shape {given}, but {wanted} is needed.")
+
+    def _shape(self, q: Any, params: PyTree, name: str) -> tuple[int, ...] | None:
+        """Shape of the displacement."""
+        if self.along is None:
+            return ()
+        return result_shape(self.along, q=q, params=params, name=f"along of Friction {name!r}")
+
+    def check_belt(self, q: Any, params: PyTree, name: str) -> None:
+        """Refuse a slip that is a vector beside the velocity of a belt that is a number other than zero."""
+        assert self.along is not None
+        slip = self._shape(q, params, name)
+        if slip != ():
+            raise ValueError(
+                f"Friction {name!r}: slip is a vector of shape {slip}, so belt_velocity must be a function of t that"
+                f" returns one, but {self.belt_velocity} was given."
+            )
+
+    def state0(self, q: Float[Array, " dof"], params: PyTree) -> PyTree:
+        """State of the law; None where it has none."""
+        if not isinstance(self.law, AbstractDynamicLaw):
+            return None
+        slip = () if q.shape == (1,) else self._shape(q, params, self.name or self.default_name)
+        return self.law.state0(jnp.zeros(slip or (), q.dtype))
+
+    def direction(self, q: Float[Array, " dof"], params: PyTree) -> Float[Array, " dof"]:
+        """Gradient d along/dq of a scalar slip: the generalised force of a unit force along the displacement."""
+        if self.along is None:
+            return jnp.ones_like(q)
+        if q.shape == (1,):
+            return jnp.reshape(self._pace(q, params), (1,))
+        return jax.grad(self.along)(q, params)
+
+    def _pace(self, q: Float[Array, "1"], params: PyTree) -> Float[Array, ""]:
+        """Displacement per unit of the one coordinate; of a position the length of its tangent."""
+        tangent = self._moves(q, jnp.ones_like(q), params)
+        return tangent if tangent.ndim == 0 else safe_norm(tangent)
+
+    def _moves(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree) -> Float[Array, "..."]:
+        """Rate of the displacement."""
+        along = self.along
+        assert along is not None
+        return jax.jvp(lambda q: along(q, params), (q,), (qd,))[1]
+
+    def belt(self, t: Float[Array, ""]) -> Float[Array, "..."]:
+        """Velocity [m/s or rad/s] of the surface."""
+        fn = self.belt_velocity
+        return jnp.asarray(fn(t), t.dtype) if callable(fn) else fn
+
+    def slip(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+    ) -> Float[Array, "..."]:
+        """Slip velocity [m/s or rad/s], a scalar, or a vector where `along` is a position that moves freely."""
+        if self.along is None:
+            return qd[0] - self.belt(t)
+        if q.shape == (1,):
+            return self._pace(q, params) * qd[0] - self.belt(t)
+        return self._moves(q, qd, params) - self.belt(t)
+
+    def slip_and_rate(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " dof"],
+        qd: Float[Array, " dof"],
+        qdd: Float[Array, " dof"],
+        params: PyTree,
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Slip velocity, and its rate where the accelerations are `qdd`."""
+        return jax.jvp(lambda t, q, qd: self.slip(t, q, qd, params), (t, q, qd), (jnp.ones_like(t), qd, qdd))
+
+    def load(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+    ) -> Float[Array, ""] | None:
+        """Normal load [N], never negative; None where the law's forces are in newtons, or per newton of a reaction."""
+        fn = self.normal_force
+        if fn is None or isinstance(fn, Reaction):
+            return None
+        return jnp.maximum(jnp.asarray(fn(t, q, qd, params) if callable(fn) else fn), 0.0)
+
+    def push(self, q: Float[Array, " dof"], force: Float[Array, "..."], params: PyTree) -> Float[Array, " dof"]:
+        """Generalised force of the friction force `force`."""
+        if self.along is None:
+            return jnp.reshape(-force, (1,))
+        if force.ndim == 0:
+            return -force * self.direction(q, params)
+        along = self.along
+        _, pull = jax.vjp(lambda q: along(q, params), q)
+        return pull(-force)[0]
+
+    def limit(self, direction: Float[Array, ""], load: Float[Array, ""] | None) -> Float[Array, ""]:
+        """Largest force [N] in stick against a load towards `direction` (+1 or -1)."""
+        assert isinstance(self.law, AbstractSetValuedLaw | AbstractHoldingLaw)
+        limit = self.law.limit(direction)
+        return limit if load is None else load * limit
+
+    def slip_force(
+        self, v: Float[Array, ""], direction: Float[Array, ""], load: Float[Array, ""] | None
+    ) -> Float[Array, ""]:
+        """Force [N] of a set-valued law in slip at velocity `v` towards `direction` (+1 or -1).
+
+        A trial step may run past the end of the slip. There the law goes on as a straight line, so that the field is
+        smooth in the step.
+        """
+        assert isinstance(self.law, AbstractSetValuedLaw)
+        law, speed = self.law, direction * v
+        # On the side of the slip even at zero: a law may have other parameters for either direction.
+        rest = direction * float(jnp.finfo(v.dtype).tiny)
+        _, slope = jax.jvp(law.dry, (rest,), (direction,))
+        slope = jnp.where(jnp.isfinite(slope), slope, 0.0)
+        level = law.dry(direction * jnp.where(speed >= 0, speed, 0.0) + rest)
+        level = level + slope * jnp.where(speed >= 0, 0.0, speed)
+        force = direction * level + law.wet(v)
+        return force if load is None else load * force
+
+    def unloaded(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
+    ) -> tuple[Float[Array, "..."], PyTree]:
+        """The law's force, in newtons or per newton of load, and the rate of its state."""
+        v = self._stretch(self.slip(t, q, qd, params))
+        if isinstance(self.law, AbstractDynamicLaw):
+            return self._stretch(self.law.force(v, z)), self.law.rate(v, z)
+        if not isinstance(self.law, AbstractForceLaw | AbstractHoldingLaw):
+            raise TypeError(f"{type(self.law).__name__} acts by a mode, or is of no known kind of law.")
+        return self._stretch(_of_slip(self.law.force, v)), None
+
+    def after(
+        self, v: Float[Array, "..."], z: PyTree, dt: Float[Array, ""], load: Float[Array, ""] | None
+    ) -> tuple[Float[Array, "..."], PyTree]:
+        """Friction force over, and state of the law after, the time `dt` [s] at constant slip velocity `v`.
+
+        Damping in a bristle is that of its mean rate, so that its impulse is right however far the bristle has gone.
+        """
+        v = self._stretch(v)
+        if isinstance(self.law, AbstractDynamicLaw):
+            after = self.law.advance(v, z, dt)
+            force = self.law.force_at(v, after, _mean_rate(self.law, v, z, after, dt))
+            z = after
+        else:
+            assert isinstance(self.law, AbstractForceLaw)
+            force = _of_slip(self.law.force, v)
+        force = self._stretch(force)
+        return (force if load is None else load * force), z
+
+    def _stretch(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+        """What the law sees of a slip, and what its force is to the mechanism."""
+        return x if self.ellipse is None else x * jnp.stack([jnp.ones_like(self.ellipse), self.ellipse])
+
+    def act(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
+    ) -> Action:
+        """Friction force, its generalised force and the rate of the law's state."""
+        force, rate = self.unloaded(t, q, qd, z, params)
+        load = self.load(t, q, qd, params)
+        force = force if load is None else load * force
+        return Action(self.push(q, force, params), force, rate)
+
+    def power(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, action: Action
+    ) -> Power:
+        """The belt brings in -F times its velocity; slip absorbs F times the slip velocity."""
+        return Power(-jnp.sum(action.force * self.belt(t)), jnp.sum(action.force * self.slip(t, q, qd, params)))
+
+    def stored(self, z: PyTree) -> Float[Array, ""] | float:
+        """Energy [J] in the law's state, for laws in newtons; under a load of its own, or varying, it has none."""
+        if isinstance(self.law, AbstractDynamicLaw) and self.normal_force is None and not varies(self.law):
+            return self.law.stored(z)
+        return 0.0
+
+
+def _mean_rate(law: AbstractDynamicLaw, v: Float[Array, "..."], z: PyTree, after: PyTree, dt: Array) -> PyTree:
+    """Mean rate of a state that goes from `z` to `after` in `dt` [s] at constant slip velocity.
+
+    It lies between those of the ends: where they differ by less than the quotient is rounded, they say it better.
+    """
+
+    def mean(before: Array, after: Array, first: Array, last: Array) -> Array:
+        quotient = (after - before) / jnp.where(dt == 0, 1.0, dt)
+        return jnp.clip(quotient, jnp.minimum(first, last), jnp.maximum(first, last))
+
+    return jtu.tree_map(mean, z, after, law.rate(v, z), law.rate(v, after))
+
+
+def _of_slip(force: Callable[..., Any], v: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Force of a function of slip; where slip is a vector, in its direction and as large as that of its magnitude."""
+    if v.ndim == 0:
+        return force(v)
+    speed = safe_norm(v)
+    # At rest the force is a linear function of slip; the quotient would be 0/0.
+    rest = jnp.zeros_like(speed)
+    _, slope = jax.jvp(force, (rest,), (jnp.ones_like(speed),))
+    moves = speed > 0
+    return jnp.where(moves, force(speed) / jnp.where(moves, speed, 1.0), slope) * v

@@ -1,0 +1,159 @@
+"""What a run integrates, and the functions that diffrax is given for it."""
+
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float
+
+from ..mechanics import momentum, velocity
+from ..scene import (
+    Power,
+    Scene,
+    State,
+    scene_canonical,
+    scene_field,
+    scene_guards,
+    scene_power,
+    scene_project,
+    scene_step,
+    scene_stick,
+    scene_switch,
+)
+from ..solvers import EventState
+
+# Energy [J] that went through a scene since t0, by the names of `scene_power`: supplied from outside, and absorbed.
+Work: TypeAlias = dict[str, Power]
+
+
+class Beside(NamedTuple):
+    """What is integrated beside the motion.
+
+    - `motion`: a `State`, with momenta in the place of velocities where the run is canonical.
+    - `work`: the energy that went through the scene.
+    """
+
+    motion: State
+    work: Work
+
+
+class Flow(NamedTuple):
+    """What is integrated: a `State`, with momenta in the place of velocities where `canonical`.
+
+    In an `audited` run it is `Beside` the work.
+    """
+
+    audited: bool
+    canonical: bool
+
+    def start(self, t: Array, state: State, scene: Scene, mode: Any) -> Any:
+        """What the run starts from."""
+        y = self._inner(t, state, scene)
+        if not self.audited:
+            return y
+        return Beside(y, jtu.tree_map(jnp.zeros_like, scene_power(t, state, scene, mode)))
+
+    def state(self, t: Array, y: Any, scene: Scene) -> State:
+        """The state in what is integrated."""
+        y = y.motion if isinstance(y, Beside) else y
+        if not self.canonical:
+            return y
+        scene = scene.now(t)
+        return y._replace(qd=velocity(scene.lagrangian, t, y.q, y.qd, scene.params))
+
+    def replace(self, t: Array, y: Any, state: State, scene: Scene) -> Any:
+        """With another state."""
+        inner = self._inner(t, state, scene)
+        return y._replace(motion=inner) if isinstance(y, Beside) else inner
+
+    def result(self, t: Array, y: Any, scene: Scene) -> Any:
+        """What is kept of it: the state, in an audited run a pair of it and `Work`."""
+        state = self.state(t, y, scene)
+        return (state, y.work) if self.audited else state
+
+    def rate(self, t: Any, y: Any, scene: Scene, mode: Any = None) -> Any:
+        """Right-hand side."""
+        state = self.state(t, y, scene)
+        rate = (scene_canonical if self.canonical else scene_field)(t, state, scene, mode)
+        if not isinstance(y, Beside):
+            return rate
+        return Beside(rate, scene_power(t, state, scene, mode))
+
+    def advance(self, t0: Array, t1: Array, y: Any, scene: Scene) -> tuple[Any, Array]:
+        """One step of `ImplicitFriction`, and whether it was solved; work is done at the powers at its end."""
+        state, solved = scene_step(scene, t0, t1, self.state(t0, y, scene))
+        if not self.audited:
+            return state, solved
+        work = jtu.tree_map(lambda work, power: work + (t1 - t0) * power, y.work, scene_power(t1, state, scene))
+        return Beside(state, work), solved
+
+    def _inner(self, t: Array, state: State, scene: Scene) -> State:
+        if not self.canonical:
+            return state
+        scene = scene.now(t)
+        return state._replace(qd=momentum(scene.lagrangian, t, state.q, state.qd, scene.params))
+
+
+# A step of a scene with events or constraints evaluates large fields a dozen times. Traced as one function each, they
+# are traced, linearised and transposed once.
+_rate = partial(jax.jit, static_argnums=0)(Flow.rate)
+_guards = jax.jit(scene_guards)
+
+
+class Hybrid(NamedTuple):
+    """The functions of a run; those of a state `s` in the form that `EventSolver` takes, for runs with modes."""
+
+    flow: Flow
+    # Slip velocity [m/s] that counts as none.
+    rest: Float[Array, ""]
+    # Relative and absolute, of the limits of stick and of slip velocities.
+    tolerances: tuple[Float[Array, ""], Float[Array, ""]]
+    # What drifts with the error of integration and is put right after every step: off the constraints, out of stick.
+    projects: bool
+    sticks: bool
+
+    def plain_rate(self, t: Any, y: Any, scene: Scene, mode: Any = None) -> Any:
+        """Right-hand side in these modes; None in a run without."""
+        return _rate(self.flow, t, y, scene, mode)
+
+    def rate(self, t: Any, s: EventState, scene: Scene) -> EventState:
+        """Right-hand side."""
+        return s.rate(_rate(self.flow, t, s.y, scene, s.mode))
+
+    def guards(self, t: Any, s: EventState, scene: Scene) -> tuple[Array, Array]:
+        """Guards of the modes, and their tolerances."""
+        return _guards(t, self.flow.state(t, s.y, scene), scene, s.mode, self.rest, self.tolerances)
+
+    def reset(self, t: Any, s: EventState, scene: Scene, fired: Array) -> EventState:
+        """Change of modes; the state as it is where none changes."""
+        state, mode = scene_switch(t, self.flow.state(t, s.y, scene), scene, s.mode, fired)
+        after = self.flow.replace(t, s.y, state, scene)
+        changed = jnp.any(mode != s.mode)
+        return s._replace(y=jtu.tree_map(lambda a, b: jnp.where(changed, a, b), after, s.y), mode=mode)
+
+    def hold(self, t: Any, s: EventState, scene: Scene, fired: Array) -> EventState:
+        """Stick of what chatters."""
+        return self._stick(t, s._replace(mode=jnp.where(fired, 0.0, s.mode)), scene)
+
+    def _stick(self, t: Any, s: EventState, scene: Scene) -> EventState:
+        state = scene_stick(t, self.flow.state(t, s.y, scene), scene, s.mode)
+        return s._replace(y=self.flow.replace(t, s.y, state, scene))
+
+    def project(self, t: Any, y: Any, scene: Scene) -> Any:
+        """Back onto the constraints."""
+        if not self.projects:
+            return y
+        return self.flow.replace(t, y, scene_project(t, self.flow.state(t, y, scene), scene), scene)
+
+    def settle(self, t: Any, s: EventState, scene: Scene) -> EventState:
+        """Back onto the constraints, and into stick."""
+        s = s._replace(y=self.project(t, s.y, scene))
+        return self._stick(t, s, scene) if self.sticks else s
+
+    def keep(self, t: Any, y: Any, scene: Scene) -> Any:
+        """What is kept at a saved time, where the state comes from dense output and obeys nothing: result and mode."""
+        if isinstance(y, EventState):
+            return self.flow.result(t, self.settle(t, y, scene).y, scene), y.mode
+        return self.flow.result(t, self.project(t, y, scene), scene), None

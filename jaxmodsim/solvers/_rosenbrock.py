@@ -1,0 +1,152 @@
+"""One step of a Rosenbrock method, for any tableau, on pytree states."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._core.fusion import once, unit_of
+from .._core.lu import LinearSolver, factor_lu, is_zero
+from .._core.scalarise import columns_of
+from ._state_layout import Layout, Parts, State
+
+
+@dataclass(frozen=True)
+class RosenbrockTableau:
+    """Coefficients of a Rosenbrock method in the form that needs no product with the Jacobian.
+
+    With `W = I/(dt gamma) - J`, stage i solves
+    `W k_i = f(t + c_i dt, y + sum_j a_ij k_j) + (1/dt) sum_j c_ij k_j + dt d_i f_t`, and
+    `y1 = y + sum_j b_j k_j`, error estimate `sum_j e_j k_j`. Rows that are equal share one field evaluation.
+
+    **Arguments:**
+
+    - `gamma`: diagonal coefficient.
+    - `stage`: strictly lower triangular `a`, shape `[stages, stages]`.
+    - `coupling`: strictly lower triangular `c`, shape `[stages, stages]`.
+    - `nodes`: `c_i`, shape `[stages]`.
+    - `time`: `d_i`, shape `[stages]`.
+    - `solution`, `error`: `b`, `e`, shape `[stages]`.
+    - `dense`: `H` of the dense output `y(t + s dt) = (1-s) y0 + s (y1 + (1-s) (K_1 + s (K_2 + s K_3)))`,
+      `K = H k`, shape `[3, stages]`; None where the method has none.
+    """
+
+    gamma: float
+    stage: np.ndarray
+    coupling: np.ndarray
+    nodes: np.ndarray
+    time: np.ndarray
+    solution: np.ndarray
+    error: np.ndarray
+    dense: np.ndarray | None = None
+
+
+class RosenbrockStep(NamedTuple):
+    """What one step gives: the state at its end, the error estimate, and the vectors `K` of the dense output."""
+
+    y1: State
+    error: State
+    dense: tuple[State, ...]
+
+
+def _combine(weights: np.ndarray, terms: list[Parts]) -> Parts:
+    """`sum_j weights_j terms_j`, with zero weights left out and unit weights not multiplied; one must not be zero."""
+    scaled = [
+        term if weight == 1.0 else [float(weight) * x for x in term]
+        for weight, term in zip(weights, terms, strict=False)
+        if weight != 0.0
+    ]
+    total = scaled[0]
+    for term in scaled[1:]:
+        total = _add(total, term)
+    return total
+
+
+def _add(a: Parts, b: Parts) -> Parts:
+    return [x + y for x, y in zip(a, b, strict=True)]
+
+
+def _linearise(flow: Callable[[Array, Parts], Parts], t: Array, parts: Parts, layout: Layout) -> tuple[Parts, Any, Any]:
+    """Field, its time derivative and its Jacobian from one linearisation; what is known of the latter as NumPy's."""
+    f0, push = jax.linearize(lambda t, *parts: flow(t, list(parts)), t, *parts)
+    if layout.unrolled:
+        f_t, *columns = columns_of(push, unit_of(t), t, *parts)
+        return f0, f_t, [list(row) for row in zip(*columns, strict=True)]
+    f_t = push(jnp.ones_like(t), jnp.zeros_like(parts[0]))
+    basis = jnp.eye(layout.n, dtype=layout.dtype)
+    return f0, f_t, jax.vmap(lambda e: push(jnp.zeros_like(t), e)[0], out_axes=1)(basis)
+
+
+def _factor(jacobian: Any, shift: Array, layout: Layout, pivot: bool) -> LinearSolver:
+    """Solver of `(shift I - jacobian) x = rhs`."""
+    if layout.unrolled:
+        rows = [[-x for x in row] for row in jacobian]
+        for i, row in enumerate(rows):
+            row[i] = shift if is_zero(row[i]) else shift + row[i]
+        return factor_lu(rows, pivot=pivot)
+    lu = jax.scipy.linalg.lu_factor(shift * jnp.eye(layout.n, dtype=layout.dtype) - jacobian)
+    return lambda rhs: [jax.scipy.linalg.lu_solve(lu, rhs[0])]
+
+
+def rosenbrock_step(
+    tableau: RosenbrockTableau,
+    field: Callable[[Array, State], State],
+    t0: Array,
+    dt: Array,
+    y0: State,
+    *,
+    pivot: bool,
+) -> RosenbrockStep:
+    """Advance `y' = field(t, y)` from `t0` by `dt`.
+
+    **Arguments:**
+
+    - `tableau`: the method.
+    - `field`: `(t, y) -> dy/dt`, differentiable by JAX.
+    - `t0`, `dt`: start and length of the step, scalars.
+    - `y0`: state at `t0`, any pytree of real floating arrays.
+    - `pivot`: whether the elimination in systems of up to 12 unknowns swaps rows; see `factor_lu`. Under error
+      control it need not: a step that a bad pivot spoils is rejected, and the next has other pivots.
+
+    **Returns:**
+
+    A `RosenbrockStep`.
+    """
+    # Under vmap and reverse mode, lanes that have finished make steps of length zero that nobody uses; 1/dt would make
+    # their derivatives NaN, and zero times NaN is NaN. A short step in its place keeps them finite.
+    short = float(jnp.finfo(dt.dtype).eps) ** 0.5 * jnp.maximum(jnp.abs(t0), 1.0)
+    dt = jnp.where(dt == 0, short, dt)
+    layout = Layout(y0)
+    parts = layout.split(y0)
+
+    def flow(t: Array, p: Parts) -> Parts:
+        return layout.split(field(t, layout.join(p)))
+
+    f0, f_t, jacobian = _linearise(flow, t0, parts, layout)
+    inverse_dt = 1.0 / dt
+    solve = _factor(jacobian, inverse_dt / tableau.gamma, layout, pivot)
+
+    stages: list[Parts] = []
+    slope = f0
+    for i in range(len(tableau.nodes)):
+        moved = i > 0 and (tableau.nodes[i] != tableau.nodes[i - 1] or np.any(tableau.stage[i] != tableau.stage[i - 1]))
+        if moved:
+            point = _add(parts, _combine(tableau.stage[i], stages)) if np.any(tableau.stage[i]) else parts
+            # As vectors: every entry of the field would compute its own sum of stages.
+            point = point if layout.unrolled else once(point, unit_of(t0))
+            slope = flow(t0 + float(tableau.nodes[i]) * dt, point)
+        rhs = slope
+        if np.any(tableau.coupling[i]):
+            rhs = [a + inverse_dt * b for a, b in zip(rhs, _combine(tableau.coupling[i], stages), strict=True)]
+        if tableau.time[i] != 0.0:
+            rhs = [a if is_zero(b) else a + (float(tableau.time[i]) * dt) * b for a, b in zip(rhs, f_t, strict=True)]
+        stages.append(solve(rhs))
+
+    y1 = layout.join(_add(parts, _combine(tableau.solution, stages)))
+    error = layout.join(_combine(tableau.error, stages))
+    dense = () if tableau.dense is None else tuple(layout.join(_combine(row, stages)) for row in tableau.dense)
+    return RosenbrockStep(y1, error, dense)

@@ -1,0 +1,1 @@
+"""Events inside one `diffeqsolve`: the solver, its controller and the guards."""

@@ -1,0 +1,183 @@
+"""A step size controller that ends steps on events."""
+
+from typing import Any, NamedTuple, cast
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import optimistix as optx
+from jaxtyping import Array, Float, PyTree
+
+from ..._core.fusion import once, unit_of
+from ...scene import is_one_of
+from .._controllers import end_at
+from .._equation import check_ode
+from ._state import ACCUMULATION, TOO_MANY, EventState
+
+# How often a step may shrink only because its guards are not resolved.
+_MAX_DOUBTS = 12
+# A step whose successor may be this much longer was not limited by its error.
+_UNLIMITED = 5.0
+
+# The shortest step towards an event, in steps.
+_SHORTEST = 1e-9
+# An event this close ahead, in steps, is where the next step shall end.
+_CLOSE = 0.1
+# A step whose successor is at least this much of it was wrong by little.
+_MILD = 0.3
+
+_BACKWARD = "EventSolver runs forward in time, but t1 < t0: count time the other way, and negate the vector field."
+
+_constant = jax.lax.stop_gradient
+
+
+class _ControllerState(NamedTuple):
+    """What the controller keeps.
+
+    - `inner`: state of the wrapped controller.
+    - `usual`: step that the error last allowed where it was the error that limited it.
+    - `doubts`: how many attempts since the last accepted step were rejected because the guards were not resolved.
+    """
+
+    inner: Any
+    usual: Float[Array, ""]
+    doubts: Float[Array, ""]
+
+
+class EventController(dfx.AbstractAdaptiveStepSizeController):
+    """Wrap a step size controller so that steps end on the events that `EventSolver` sees.
+
+    A step that passes a root of a guard is rejected and aimed at it, until one lands; the step after an event is as
+    long as the error last allowed. A step that does not resolve the guards is made smaller. Everything else is the
+    wrapped controller's.
+
+    A step ends at a root before it ends at one of the given `times`, and there before it ends at the end of the run:
+    a step that is aimed at a root is never made longer to reach a time that is close behind the root.
+
+    **Arguments:**
+
+    - `controller`: any diffrax step size controller, adaptive or constant.
+    - `times`: increasing times at which a step shall end and a new start be made, shape `[n]`; None for none.
+    - `direction`: 1 where time is known to run forward; by default the run looks at it.
+
+    **Raises:**
+
+    - `ValueError` where the state is not from `EventSolver.start`, as under `diffrax.BacksolveAdjoint`.
+    - `RuntimeError` at run time, by `equinox.error_if`, where t1 < t0.
+    """
+
+    controller: dfx.AbstractStepSizeController
+    times: Float[Array, " n"] | None
+    direction: Any
+
+    def __init__(
+        self,
+        controller: dfx.AbstractStepSizeController,
+        times: Float[Array, " n"] | None = None,
+        direction: Any = None,
+    ):
+        self.controller = controller
+        self.times = times
+        self.direction = direction
+
+    @property
+    def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Relative tolerance of the wrapped controller, for implicit solvers; NaN if it has none."""
+        return getattr(self.controller, "rtol", float("nan"))
+
+    @property
+    def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Absolute tolerance of the wrapped controller, for implicit solvers; NaN if it has none."""
+        return getattr(self.controller, "atol", float("nan"))
+
+    @property
+    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Norm of the wrapped controller, for implicit solvers."""
+        return getattr(self.controller, "norm", optx.max_norm)
+
+    def wrap(self, direction: Any) -> "EventController":
+        """Wrap the controller inside."""
+        known = direction if self.direction is None else self.direction
+        return EventController(self.controller.wrap(direction), self.times, known)
+
+    def init(
+        self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, dt0: Any, args: PyTree, func: Any, error_order: Any
+    ) -> tuple[Any, _ControllerState]:
+        """First step of the wrapped controller, on the part of the state that is integrated."""
+        check_ode(terms, method="EventSolver")
+        if not isinstance(y0, EventState):
+            raise ValueError(
+                "EventController needs y0=solver.start(t0, y0) of its EventSolver. diffrax.BacksolveAdjoint does not"
+                " pass events: leave the adjoint out, or take diffrax.ForwardMode()."
+            )
+        if not isinstance(self.direction, int):
+            # diffrax has turned the times where t1 < t0; the direction of a run of no length is -1, too.
+            t0 = eqx.error_if(t0, (self.direction < 0) & (t0 < t1), _BACKWARD)
+
+        def inner_func(terms: PyTree, t: Any, y: PyTree, args: PyTree) -> PyTree:
+            return func(terms, t, y0._replace(y=y), args)
+
+        first, inner = self.controller.init(terms, t0, t1, y0.y, dt0, args, inner_func, error_order)
+        zero = jnp.zeros_like(t0)
+        adaptive = isinstance(self.controller, dfx.AbstractAdaptiveStepSizeController)
+        usual = (_UNLIMITED if adaptive else 1.0) * (first - t0)
+        longest = getattr(self.controller, "dtmax", None)
+        usual = usual if longest is None else jnp.minimum(usual, longest)
+        first = first if self.times is None else end_at(self.times, t0, first)
+        return _constant(first), _ControllerState(inner, _constant(usual), zero)
+
+    def adapt_step_size(
+        self,
+        t0: Any,
+        t1: Any,
+        y0: EventState,
+        y1_candidate: EventState,
+        args: PyTree,
+        y_error: PyTree,
+        error_order: Any,
+        controller_state: _ControllerState,
+    ) -> tuple[Any, Any, Any, Any, _ControllerState, dfx.RESULTS]:
+        """As the wrapped controller, but reject a step that passes an event or does not resolve the guards."""
+        old, seen = controller_state, y1_candidate
+        keep, inner_t0, inner_t1, jump, inner, result = self.controller.adapt_step_size(
+            t0, t1, y0.y, seen.y, args, y_error, error_order, old.inner
+        )
+        length = _constant(t1 - t0)
+        aim, factor, landed = _constant(seen.next_root), _constant(seen.step_factor), _constant(seen.landed) > 0.5
+        proposed = inner_t1 - inner_t0
+        passed = keep & (aim < 1.0) & ~landed
+        doubtful = keep & ~passed & (factor < 0.9) & (old.doubts < _MAX_DOUBTS)
+        accept = keep & ~passed & ~doubtful
+        accept = once(jnp.where(accept, 1.0, jnp.zeros_like(length)), unit_of(length)) > 0.5
+        landed = landed & accept
+
+        shortest = jnp.maximum(4.0 * float(jnp.finfo(length.dtype).eps) * jnp.abs(t0), _SHORTEST * length)
+        unlimited = proposed > _UNLIMITED * length
+        usual = jnp.where(accept & ~unlimited, proposed, old.usual)
+        step = jnp.minimum(proposed, jnp.clip(0.9 * factor, 0.2, 10.0) * length)
+        # A step that failed by little still knows where the event is.
+        near = proposed > _MILD * length
+        step = jnp.where(keep, step, jnp.where(near, jnp.minimum(proposed, aim * length), proposed))
+        # Just in front of an event, go straight to it.
+        ahead = (aim - 1.0) * length
+        close = accept & ~landed & (aim - 1.0 < _CLOSE) & (ahead < step)
+        step = jnp.where(close, ahead, step)
+        step = jnp.where(landed, usual, step)
+        step = jnp.where(passed, jnp.maximum(aim * length, shortest), step)
+        next_t0 = jnp.where(accept, t1, t0)
+        next_t1 = next_t0 + step
+        if self.times is not None:
+            next_t1 = end_at(self.times, next_t0, next_t1, stretch=~(close | passed))
+            jump = jump | is_one_of(self.times, next_t0)
+        state = _ControllerState(
+            jtu.tree_map(lambda a, b: jnp.where(accept | ~keep, a, b), inner, old.inner),
+            _constant(usual),
+            _constant(jnp.where(accept, 0.0, old.doubts + doubtful)),
+        )
+        trouble = jnp.where(landed, seen.trouble, 0.0)
+        ended = cast(dfx.RESULTS, dfx.RESULTS.where(landed, dfx.RESULTS.successful, result))
+        ended = dfx.RESULTS.where(trouble == ACCUMULATION, dfx.RESULTS.dt_min_reached, ended)
+        ended = dfx.RESULTS.where(trouble == TOO_MANY, dfx.RESULTS.max_steps_reached, ended)
+        return accept, next_t0, _constant(next_t1), landed | jump, state, ended

@@ -1,0 +1,189 @@
+"""Where functions of time that are known at five points of a step fall through zero, and how well that is known."""
+
+from functools import reduce
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..._core.fusion import once
+
+# Refinements of a root. It only says where the next attempt of a step shall end.
+_REFINEMENTS = 4
+# A root this close to the start of a step, in steps, is at the start.
+_ZERO = 1e-3
+# Largest error of the cubic through the values at 0, 1/3, 2/3, 1 over its error at 1/2: s (s - 1/3) (s - 2/3) (s - 1)
+# is 1/81 at most, and 1/144 there.
+_LARGEST = 144 / 81
+# A step is resolved if the third difference is below these parts of the range of the values and of the headroom ...
+_CUBIC_OF_RANGE, _CUBIC_OF_HEADROOM = 0.3, 3.0
+# ... and the error of the cubic below these.
+_ERROR_OF_RANGE, _ERROR_OF_HEADROOM = 0.05, 0.3
+# Rounding units in the values.
+_ROUNDING = 1e3
+# Where a step ends on a root the error of the cubic is below this many of the tolerances.
+_ERROR_AT_ROOT = 10.0
+
+Numbers = Float[Array, " n"]
+Flags = Bool[Array, " n"]
+
+
+class GuardScan(NamedTuple):
+    """What five values of a function in a step say about it, elementwise.
+
+    - `armed`: whether it counts as positive at some time of the step.
+    - `crosses`: whether it falls through zero after it was positive or armed.
+    - `root`: where it does so first, as a fraction of the step, roughly; 1 where it does not.
+    - `ahead`: how far behind the end it would do so if it went on straight, or how far before the end it would have
+      done so (negative), in steps; infinite where it does not fall.
+    - `step_factor`: by which factor the length of the step may change before the values say too little.
+    - `landing_factor`: the same for a step that ends on a root of the function.
+    - `cubic`: the coefficients of the cubic through the values.
+    """
+
+    armed: Flags
+    crosses: Flags
+    root: Numbers
+    ahead: Numbers
+    step_factor: Numbers
+    landing_factor: Numbers
+    cubic: tuple[Numbers, Numbers, Numbers, Numbers]
+
+
+def scan_guards(
+    values: tuple[Numbers, Numbers, Numbers, Numbers],
+    middle: Numbers,
+    armed: Flags,
+    tolerances: tuple[Float[Array, ""], Numbers],
+    blur: Float[Array, ""],
+    unit: Float[Array, ""],
+) -> GuardScan:
+    """First fall through zero of functions known at 0, 1/3, 1/2, 2/3 and 1 of a step.
+
+    Between the points each is the cubic through the first, second, fourth and fifth, whose own minimum, unless it may
+    be due to the error of the cubic, counts as another point. A function that is not armed must be seen positive, or
+    rise from zero at the start, before it can fall.
+
+    The value in the middle gives the error of the cubic. A step is resolved if third difference and error are small
+    beside the range of the values, so that no oscillation is taken for a slow change, and beside the headroom: the
+    least distance from zero inside the step.
+
+    **Arguments:**
+
+    - `values`: at 0, 1/3, 2/3 and 1, shape `[n]` each.
+    - `middle`: at 1/2, shape `[n]`.
+    - `armed`: whether a function counts as positive at the start, whatever its value there. If it is armed, not
+      positive and does not rise, it falls at once.
+    - `tolerances`: size of what need not be seen, relative to the largest magnitude in the step, and absolute.
+    - `blur`: rounding error of the places in the step.
+    - `unit`: a one, see `once`.
+
+    **Returns:**
+
+    A `GuardScan`.
+    """
+    g0, g1, g2, g3 = values
+    c1 = -5.5 * g0 + 9.0 * g1 - 4.5 * g2 + g3
+    c2 = 9.0 * g0 - 22.5 * g1 + 18.0 * g2 - 4.5 * g3
+    third = g3 - 3.0 * g2 + 3.0 * g1 - g0
+    c1, c2, third = once((c1, c2, third), unit)
+    c3 = 4.5 * third
+    everything = (*values, middle)
+    high, low = reduce(jnp.maximum, everything), reduce(jnp.minimum, everything)
+    spread = high - low
+    rtol, atol = tolerances
+    rtol = jnp.maximum(rtol, _ROUNDING * float(jnp.finfo(third.dtype).eps))
+    tolerance = rtol * jnp.maximum(jnp.abs(high), jnp.abs(low)) + atol + blur * spread
+
+    # The minimum of a cubic, in the form of the quadratic formula that stays exact as c3 goes to zero.
+    discriminant = c2 * c2 - 3.0 * c1 * c3
+    denominator = c2 + jnp.sqrt(jnp.where(discriminant > 0, discriminant, 1.0))
+    inside = (discriminant > 0) & (denominator > 0) & (c1 < 0) & (-c1 < denominator)
+    lowest = -c1 / jnp.where(inside, denominator, 1.0)
+    bottom = jnp.where(inside, g0 + lowest * (c1 + lowest * (c2 + lowest * c3)), g3)
+
+    error = _LARGEST * jnp.abs(middle - (g0 + 0.5 * (c1 + 0.5 * (c2 + 0.5 * c3))))
+
+    # Points in the order of time, the minimum among them; the first one below zero closes the bracket.
+    rises = (c1 > 0) & (g0 >= -_ZERO * c1)
+    high1 = armed | rises
+    high_middle = high1 | (g1 > 0)
+    high2 = high_middle | (middle > 0)
+    high3 = high2 | (g2 > 0)
+    high_lowest = jnp.where(
+        lowest < 1 / 3,
+        high1,
+        jnp.where(lowest < 1 / 2, high_middle, jnp.where(lowest < 2 / 3, high2, high3)),
+    )
+    dips = inside & (bottom < -jnp.minimum(error, tolerance)) & high_lowest
+    end, low = jnp.ones_like(g0), g3
+    crosses = jnp.zeros_like(armed)
+    for point, value, below in (
+        (1.0, g3, high3 & (g3 < 0)),
+        (lowest, bottom, dips),
+        (2 / 3, g2, high2 & (g2 < 0)),
+        (lowest, bottom, dips & (lowest < 2 / 3)),
+        (1 / 2, middle, high_middle & (middle < 0)),
+        (lowest, bottom, dips & (lowest < 1 / 2)),
+        (1 / 3, g1, high1 & (g1 < 0)),
+        (lowest, bottom, dips & (lowest < 1 / 3)),
+    ):
+        end, low, crosses = jnp.where(below, point, end), jnp.where(below, value, low), crosses | below
+    start, high = jnp.zeros_like(g0), g0
+    for point, value in ((1 / 3, g1), (1 / 2, middle), (2 / 3, g2)):
+        later = (point < end) & (value > 0)
+        start, high = jnp.where(later, point, start), jnp.where(later, value, high)
+    # Not left of the middle: a function that rises from zero at the start has a root there that is not meant.
+    secant = start + (end - start) * jnp.clip(high / jnp.where(high > low, high - low, 1.0), 0.5, 1.0)
+    at_once = armed & (g0 <= 0) & (g1 < 0) & (c1 <= 0)
+    root = once(jnp.where(crosses, jnp.where(at_once, 0.0, secant), 1.0), unit)
+    crosses = root < 1.0
+
+    falls = c1 + 2.0 * c2 + 3.0 * c3
+    ahead = jnp.where(falls < 0, -g3 / jnp.where(falls < 0, falls, 1.0), jnp.inf)
+    headroom = reduce(jnp.minimum, (jnp.abs(g1), jnp.abs(middle), jnp.abs(g2)))
+    headroom = jnp.where(inside & (bottom > 0), jnp.minimum(headroom, bottom), headroom)
+    step_factor, landing_factor = _step_factors(jnp.abs(third), error, spread, headroom, tolerance)
+    return GuardScan(
+        high3 | (g3 > 0),
+        crosses,
+        root,
+        ahead,
+        step_factor,
+        landing_factor,
+        (g0, c1, c2, c3),
+    )
+
+
+def _step_factors(
+    third: Numbers, error: Numbers, spread: Numbers, headroom: Numbers, tolerance: Numbers
+) -> tuple[Numbers, Numbers]:
+    """By which factors the length of the step may change: anyhow, and where it ends on a root.
+
+    The third difference goes with the third power of the step, the error of the cubic with the fourth.
+    """
+    cubic = jnp.minimum(_CUBIC_OF_RANGE * spread, _CUBIC_OF_HEADROOM * headroom) + tolerance
+    quartic = jnp.minimum(_ERROR_OF_RANGE * spread, _ERROR_OF_HEADROOM * headroom) + tolerance
+    landing = jnp.sqrt(jnp.sqrt(_ratio(_ERROR_AT_ROOT * tolerance, error)))
+    return jnp.minimum(jnp.cbrt(_ratio(cubic, third)), jnp.sqrt(jnp.sqrt(_ratio(quartic, error)))), landing
+
+
+def _ratio(allowed: Numbers, size: Numbers) -> Numbers:
+    return jnp.where(size > 0, allowed / jnp.where(size > 0, size, 1.0), jnp.inf)
+
+
+def first_root(scan: GuardScan, passed: Flags) -> Float[Array, ""]:
+    """The earliest root in a step among the functions that `passed` marks; 1 if it marks none.
+
+    Which function is the first is judged by the rough roots; its own is then refined by Newton's iteration.
+    """
+    rough = jnp.where(passed, scan.root, 1.0)
+    first = jnp.min(rough)
+    only = jnp.arange(rough.shape[0]) == jnp.argmin(rough)  # one, also where several are equal
+    c0, c1, c2, c3 = (jnp.max(jnp.where(only, c, -jnp.inf)) for c in scan.cubic)
+    root = first
+    for _ in range(_REFINEMENTS):
+        slope = c1 + root * (2.0 * c2 + root * 3.0 * c3)
+        root = root - (c0 + root * (c1 + root * (c2 + root * c3))) / jnp.where(slope < 0, slope, -jnp.inf)
+        root = jnp.clip(root, 0.0, 1.0)
+    return jnp.where((first > 0) & (first < 1), root, first)

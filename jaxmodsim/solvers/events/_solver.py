@@ -1,0 +1,456 @@
+"""A solver wrapper that makes events non-terminating."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, cast
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Float, PyTree
+
+from ..._core.fusion import once, unit_of
+from ...scene import is_one_of
+from .._projected import projected
+from ._guard_scan import first_root, scan_guards
+from ._state import ACCUMULATION, NO_TROUBLE, TOO_MANY, EventLog, EventState, write
+
+# How far beside the root a step may end, as a fraction of the last steps; from there the state is carried to the root,
+# with an error of the third power of that distance.
+_LANDING = 1e-5
+# Where a step is to end if conditions have to hold after it, in landing distances behind the root, and at most this
+# part of what is left of the step: in front of it is no motion after the event. A slip that begins touches rest there,
+# and would end again.
+_BEYOND, _BEYOND_OF_REST = 0.3, 0.5
+# What the step and the jump measure of the way to a root may differ by this factor.
+_LATITUDE = 4.0
+# Within 100 rounding units of time before the end of a run diffrax ends no step.
+_UNPLACED = 128.0
+# A step this much shorter than the last ones has no length.
+_SHORT = 1e-6
+# Events accumulate where the longest of the last intervals is below this part of the time since the start, times the
+# square root of the rounding unit.
+_ACCUMULATION = 1e-3
+# Weight that the last intervals between events, and the last steps, keep at each new one.
+_FORGET = 0.25
+# A step counts as no longer than this many of those before it.
+_GROW = 2.0
+# Events that few do not accumulate.
+_FEWEST = 8
+
+_constant = jax.lax.stop_gradient
+
+
+class _EventInterpolation(dfx.AbstractLocalInterpolation):
+    """Dense output of the wrapped solver inside a step; at its end the state after the event."""
+
+    t0: Any
+    t1: Any
+    inner: dfx.AbstractLocalInterpolation
+    state0: EventState
+    state1: EventState
+
+    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> EventState:
+        """State at `t0`, or the increment from `t0` to `t1`."""
+        del left
+        if t1 is not None:
+            return jtu.tree_map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
+        inside = self.state0._replace(y=self.inner.evaluate(t0))
+        return jtu.tree_map(lambda a, b: jnp.where(t0 >= self.t1, b, a), inside, self.state1)
+
+
+class _Field(eqx.Module):
+    """Vector field of the part that is integrated; the state it belongs to comes with the arguments."""
+
+    terms: PyTree
+
+    def __call__(self, t: Any, y: PyTree, args: tuple[EventState, PyTree]) -> PyTree:
+        """Rate of `y`."""
+        return self.terms.vf(t, args[0]._replace(y=y), args[1]).y
+
+
+class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
+    """Wrap a diffrax solver so that the solution passes through events: resets, changes of mode, counters.
+
+    To be used together with `EventController`:
+
+    ```python
+    def field(t, s, args):  # s.y is integrated, s.mode is constant between events
+        return s.rate(jnp.array([s.y[1], -9.81]))
+
+    def guards(t, s, args):
+        return s.y[:1]
+
+    def reset(t, s, args, fired):
+        return s._replace(y=jnp.array([0.0, -0.8 * s.y[1]]))
+
+    solver = EventSolver(diffrax.Tsit5(), guards, reset)
+    controller = EventController(diffrax.PIDController(rtol=1e-8, atol=1e-8))
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(field), solver, 0.0, 1.0, None, solver.start(0.0, jnp.array([1.0, 0.0])),
+        stepsize_controller=controller,
+    )
+    solution.ys.y, solution.ys.log.t
+    ```
+
+    Saving, dense output, progress meters and adjoints of diffrax work as without events, but for `BacksolveAdjoint`,
+    whose adjoint equation knows of no resets. Time runs forward.
+
+    **What an event is.** Let `g_i(t)` be guard i along the solution on `[t0, t1]`. A guard is *armed* or waits. It
+    fires at the first `t_event > t0` where it is armed, `g_i(t_event) = 0`, and `g_i < 0` right after: events are
+    crossings from above to below (give `-g` for the other direction, both for both). An event at `t0` itself does not
+    fire, one at `t1` does, so that runs over `[t0, t1]` and `[t1, t2]` together have the events of one over
+    `[t0, t2]`.
+
+    - *At the start* the guards with `g_i(t0) > 0` are armed. The others wait until they are positive: a guard that is
+      violated on entry, or zero and falling, does not fire; one that is zero and rising is armed as it rises.
+    - *At an event* all armed guards whose roots lie within the landing distance (1e-5 of a step) of the first one
+      fire together, in one call of `reset` with all of them marked in `fired`. Later roots in the same step are looked
+      for again after the reset.
+    - *After an event* the guards that fired wait until they are positive, so that each crossing fires once; those that
+      were armed stay so. A guard that the reset has made negative therefore fires at once. In such a chain
+      the derivatives take the times of the later events for fixed; a `reset` that settles everything in one
+      call is exact.
+    - *With `insist`* all guards are armed at all times: one that is violated at the start fires at once, and one that
+      its own reset leaves violated fires again and again, until the events accumulate.
+    - *Within a step* a guard is the cubic through its values at 0, 1/3, 2/3 (from dense output) and 1. Its value at 1/2
+      tells the error of the cubic, and a step in which error or cubic share are not small beside the variation of the
+      guard and its distance from zero is made smaller (up to twelve times, which is where a guard that jumps is taken
+      as it is). So a guard that is smooth on the scale of the steps is resolved to `rtol` where it comes near to zero,
+      whether or not anything that is integrated moves. What remains undetectable is what happens between the five
+      points and shows at none of them: a spike in a guard that was at rest before. Let a step end there (`dtmax`, or
+      `times` of the controller).
+
+    The event is located on steps of the solver, not on its dense output: a step that passes a root is
+    rejected and ends on it. The saved value at an event, and at t1 if that is one, is the one after the reset.
+
+    **Derivatives.** From the end of the step the state is carried to the root, reset there, and carried back with the
+    new field. The way is zero but for the landing error, while its derivative is that of the event's time: the result
+    is the saltation matrix `DR + (f_plus - DR f_minus - D_t R) (x) Dg / (D_t g + Dg f_minus)`, and times in the log are
+    differentiable. Second derivatives hold too, where the adjoint gives any. A guard that touches zero without crossing
+    (grazing) has no derivative.
+
+    **Where events accumulate** (a ball coming to rest, chatter): if the last intervals between events shrink below 1e-3
+    sqrt(eps) of the time since the start, the run ends with `trouble = 1` in the state and diffrax's result
+    `dt_min_reached`; with `hold`, that function takes the place of `reset` there, and the guards that are not positive
+    after it wait. After `max_events` events the next one ends the run with `trouble = 2` and `max_steps_reached`.
+
+    **Arguments:**
+
+    - `solver`: the diffrax solver of an `ODETerm`: explicit, `Rodas5P`, `diffrax.Kvaerno5`.
+    - `guards`: `guards(t, s, args)` -> shape `[guards]`; `s` is an `EventState` of which `s.y` and `s.mode` are yours.
+      Or a pair of that and, of the same shape, by how much each guard may be wrong beside `rtol` of its magnitude.
+    - `reset`: `reset(t, s, args, fired)` -> `s` with another `y` or `mode` (by `s._replace`); `fired` are booleans,
+      shape `[guards]`.
+    - `hold`: as `reset`, for events that accumulate; by default the run ends there.
+    - `project`: `project(t, s, args)` -> `s`, applied after every step, for invariants that drift.
+    - `insist`: whether the guards are conditions that have to hold, not crossings that are to be noted.
+    - `pin`: `pin(t0, args)` -> `args` of a step that begins at t0, without what jumps at its end; the reset at the end
+      of the step gets `args` as they are.
+    - `jumps`: times at which fields and guards jump, increasing, shape `[n]`, among the `times` of the controller.
+      There `reset` is called, with no guard marked, and what it changes of the modes is an event.
+    - `rtol`: the part of its largest magnitude in a step by which a guard may fall below zero, and return, unseen.
+    - `max_events`: limit of the number of events, > 0, and length of the log.
+    - `log`: whether the state carries an `EventLog`.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{aizerman1958stability,
+            author={Aizerman, M. A. and Gantmacher, F. R.},
+            title={On the stability of periodic motions},
+            journal={Journal of Applied Mathematics and Mechanics}, volume={22}, number={6},
+            pages={1065--1078}, year={1958},
+        }
+        ```
+    """
+
+    # Wider than `ODETerm`, so that `EventController` refuses other terms by a sentence.
+    term_structure: ClassVar = dfx.AbstractTerm
+    solver: dfx.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
+    guards: Callable[..., Any]
+    reset: Callable[..., Any]
+    hold: Callable[..., Any] | None = None
+    project: Callable[..., Any] | None = None
+    pin: Callable[..., Any] | None = None
+    jumps: Float[Array, " n"] | None = None
+    rtol: Any = 1e-6
+    insist: bool = eqx.field(default=False, static=True)
+    max_events: int = eqx.field(default=128, static=True)
+    log: bool = eqx.field(default=True, static=True)
+
+    @property
+    def root_finder(self) -> Any:
+        """That of the wrapped solver, if it is implicit: diffrax gives it the tolerances of the controller."""
+        return cast(Any, self.solver).root_finder
+
+    @property
+    def scan_kind(self) -> Any:
+        """That of the wrapped solver, if it is a Runge-Kutta method: diffrax sets it for the kind of derivative."""
+        return cast(Any, self.solver).scan_kind
+
+    @property
+    def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Interpolation of the wrapped solver, with the event at the end of the step."""
+
+        def interpolation(*, t0: Any, t1: Any, inner: Any, state0: Any, state1: Any) -> _EventInterpolation:
+            return _EventInterpolation(t0, t1, self.solver.interpolation_cls(t0=t0, t1=t1, **inner), state0, state1)
+
+        return interpolation
+
+    def order(self, terms: PyTree) -> Any:
+        """Order of the wrapped solver, which events keep."""
+        return self.solver.order(terms)
+
+    def error_order(self, terms: PyTree) -> Any:
+        """Order of the error estimate of the wrapped solver."""
+        return self.solver.error_order(terms)
+
+    def start(self, t0: Any, y0: PyTree, mode: PyTree = None, args: PyTree = None) -> EventState:
+        """State to begin with, to be passed to `diffeqsolve` as `y0`.
+
+        **Arguments:**
+
+        - `t0`: start time.
+        - `y0`: what the vector field integrates, any pytree.
+        - `mode`: what is constant between events (modes, counters), any pytree of numbers; they become floating.
+        - `args`: as for `diffeqsolve`.
+        """
+        y0, mode = jtu.tree_map(_real, (y0, mode))
+        zero = jnp.zeros((), jnp.result_type(t0, *jtu.tree_leaves(y0)))
+        t0 = jnp.asarray(t0, zero.dtype)
+        one = zero + 1.0
+        state = EventState(y0, mode, t0, zero, zero, zero, None, zero, zero, zero, zero, zero, one, one)
+        guard = self._guards(t0, state, args)
+        log = None
+        if self.log:
+
+            def rows(x: Array) -> Array:
+                return jnp.zeros((self.max_events, *x.shape), x.dtype)
+
+            pair = jtu.tree_map(rows, (y0, mode))
+            log = EventLog(jnp.full(self.max_events, jnp.inf, zero.dtype), rows(guard), pair, pair)
+        ready = jnp.ones_like(guard) if self.insist else jnp.where(guard > 0, 1.0, jnp.zeros_like(guard))
+        return state._replace(fired=jnp.zeros_like(guard), log=log, guard=guard, armed=ready)
+
+    def _guards(self, t: Any, state: EventState, args: PyTree) -> Float[Array, " guards"]:
+        return self._guards_and_atol(t, state, args)[0]
+
+    def _guards_and_atol(
+        self, t: Any, state: EventState, args: PyTree
+    ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
+        found = self.guards(t, state, args)
+        values, atol = found if isinstance(found, tuple) else (found, None)
+        values = jnp.asarray(values)
+        return values, jnp.zeros_like(values) if atol is None else atol
+
+    def func(self, terms: PyTree, t0: Any, y0: EventState, args: PyTree) -> PyTree:
+        """The vector field of the wrapped solver."""
+        return self.solver.func(dfx.ODETerm(_Field(terms)), t0, y0.y, (y0, args))
+
+    def init(self, terms: PyTree, t0: Any, t1: Any, y0: EventState, args: PyTree) -> Any:
+        """State of the wrapped solver, the longest of the last steps, and a time one first step before the start."""
+        inner = self.solver.init(dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0, args))
+        return inner, _constant(t1 - t0), _constant(t0 - (t1 - t0))
+
+    def step(
+        self, terms: PyTree, t0: Any, t1: Any, y0: EventState, args: PyTree, solver_state: Any, made_jump: Any
+    ) -> tuple[EventState, PyTree, dict[str, Any], Any, dfx.RESULTS]:
+        """A step of the wrapped solver, a look at the guards along it, and the reset where it ends on an event."""
+        inner, pace, begin = solver_state
+        whole, args = args, args if self.pin is None else self.pin(t0, args)
+        y1, error, dense, inner, result = self.solver.step(
+            dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0._replace(log=None), args), inner, made_jump
+        )
+        if self.project is not None:
+            y1, error = projected(y1, error, self.project(t1, y0._replace(y=y1), args).y)
+        path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
+        places = [t0 + (t1 - t0) * part for part in (1 / 3, 1 / 2, 2 / 3)]
+        states = [y0._replace(y=y) for y in (*map(path.evaluate, places), y1)]
+        looks = [self._guards_and_atol(t, s, args) for t, s in zip((*places, t1), states, strict=True)]
+        unit = unit_of(_constant(t1 - t0))
+        one, middle, two, end = once(_constant([values for values, _ in looks]), unit)
+        # Where limits vanish at one end of the step, the other tells their size.
+        tolerances = jnp.asarray(_constant(self.rtol), end.dtype), _constant(jnp.maximum(looks[0][1], looks[-1][1]))
+        # Around t0 = 0 the resolution of time is that of the step itself.
+        length = _constant(t1 - t0)
+        eps = float(jnp.finfo(length.dtype).eps)
+        resolution = 4.0 * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+        blur = _constant(resolution) / jnp.where(length > 0, length, 1.0)
+        seen = scan_guards((y0.guard, one, two, end), middle, y0.armed > 0.5, tolerances, blur, unit)
+        # Where nothing moves steps grow without measure, and tell nothing of the motion that the event begins.
+        measure = jnp.minimum(length, _GROW * pace)
+        near = jnp.maximum(_LANDING * jnp.maximum(measure, pace), _constant(resolution))
+        beyond = _BEYOND * near / jnp.where(length > 0, length, 1.0)
+        jumps = None if self.jumps is None else is_one_of(self.jumps, t1) & (length > 0)
+        if jumps is not None:  # an event before a jump is not one with it
+            near = jnp.where(jumps, _constant(resolution), near)
+        near = near / jnp.where(length > 0, length, 1.0)
+        shortest = jnp.maximum(_SHORT * pace, 2.0 * _constant(resolution))
+        # One that has just fallen through zero may look flat, or rising, to the cubic.
+        here = (seen.armed & (jnp.abs(seen.ahead) <= near)) | (seen.crosses & (1.0 - seen.root <= near))
+        if self.insist:  # in front of the root is no motion after the event
+            here = (here | (seen.crosses & (length <= _UNPLACED * eps * jnp.abs(t1)))) & (end <= 0)
+        # One that fires at the start of the step does so where the step is the shortest.
+        here = here | (seen.crosses & (seen.root * length <= resolution) & (length <= shortest))
+        passed = seen.crosses & ~here
+        # Without a root inside, the next one may be in sight: then the next step shall end there.
+        sight = jnp.min(jnp.where(seen.armed, seen.ahead, jnp.inf))
+        missed = jnp.any(passed)
+        landed = jnp.any(here) & ~missed & (length > 0)
+        fired = here & landed
+        first = jnp.arange(fired.shape[0]) == jnp.argmin(jnp.where(fired, seen.ahead, jnp.inf))
+        aim = jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0))
+        if self.insist:
+            aim = aim + jnp.where(missed, jnp.minimum(beyond, _BEYOND_OF_REST * (1.0 - aim)), beyond)
+        aim = once(aim, unit)
+        landed = once(jnp.where(landed, 1.0, jnp.zeros_like(aim)), unit) > 0.5
+        state1 = y0._replace(
+            y=y1,
+            guard=end,
+            armed=jnp.where(seen.armed, 1.0, jnp.zeros_like(end)),
+            landed=jnp.where(landed, 1.0, jnp.zeros_like(aim)),
+            next_root=aim,
+            step_factor=once(jnp.min(jnp.where(fired, seen.landing_factor, seen.step_factor)), unit),
+        )
+        happens = landed if jumps is None else landed | (jumps & ~missed)
+        if jumps is not None:  # what was in sight is no more, and the root of one that fires with a jump is the jump
+            state1 = state1._replace(next_root=jnp.where(jumps & ~missed, jnp.inf, aim))
+            near = jnp.where(jumps, 0.0, near)
+        state1 = jax.lax.cond(
+            happens,
+            lambda: self._jump(terms, t1, state1, fired, first, (near * length, begin), (args, whole)),
+            lambda: state1,
+        )
+        dense = {"inner": dense, "state0": y0, "state1": state1}
+        pace = jnp.maximum(measure, _FORGET * pace)
+        return state1, error, dense, (inner, pace, begin), result
+
+    def _jump(
+        self,
+        terms: PyTree,
+        t: Any,
+        state: EventState,
+        fired: Bool[Array, " guards"],
+        first: Bool[Array, " guards"],
+        times: tuple[Array, Array],
+        sides: tuple[PyTree, PyTree],
+    ) -> EventState:
+        """Carry the state to the root of the first guard, reset it there, and carry it back to `t`.
+
+        The way to the root is zero but for the error of the landing; its derivatives are those of the time of the
+        event, to second order, so that those of the result are exact.
+        """
+        (near, begin), (args, whole) = times, sides
+        unit = unit_of(begin)
+
+        def field(t: Any, state: EventState, args: PyTree = args) -> PyTree:
+            return terms.vf(t, state, args).y
+
+        def guard(t: Any, y: PyTree) -> Array:
+            return jnp.sum(jnp.where(first, self._guards(t, state._replace(y=y), args), 0.0))
+
+        way, rate, before = _to_root(field, guard, t, state, near)
+        t_event, before = t + way, before._replace(y=once(before.y, unit))
+        since = jnp.where(state.resets == 0, t_event - state.t, jnp.maximum(t_event - state.t, _FORGET * state.spread))
+        spread = _constant(since)
+        dense = _accumulates(spread, _constant(t_event), begin) & (state.resets >= _FEWEST)
+
+        after = self.reset(t_event, before, whole, fired)
+        trouble = jnp.where(dense, jnp.asarray(ACCUMULATION, spread.dtype), NO_TROUBLE)
+        if self.hold is not None:
+            held = self.hold(t_event, before, whole, fired)
+            after = jtu.tree_map(lambda a, b: jnp.where(dense, a, b), held, after)
+            trouble = jnp.zeros_like(spread)
+        after = after._replace(y=once(after.y, unit), mode=once(after.mode, unit))
+        # A reset that changes nothing is no event.
+        happened = _differ((before.y, before.mode), (after.y, after.mode))
+        events, index = jnp.where(happened, state.events + 1.0, state.events), jnp.where(happened, state.events, -1.0)
+        trouble = jnp.where((trouble == NO_TROUBLE) & (events > self.max_events), TOO_MANY, trouble)
+
+        halfway = after._replace(y=_along(after.y, -0.5 * way, field(t_event, after, whole)))
+        middle = field(t_event - 0.5 * way, halfway, whole)
+        end = after._replace(y=once(_along(after.y, -way, middle), unit))
+        values = self._guards(t, end, whole)
+        clear = _constant(values) > jnp.where(fired, _LATITUDE * jnp.abs(rate) * near, 0.0)
+        armed = self.insist | clear | (~fired & (state.armed > 0.5))
+        if not self.insist:  # what rises from the reset will fall again, be it as low as rounding
+            ahead = jnp.ones_like(t_event), field(t_event, after, whole)
+            _, rise = jax.jvp(lambda t, y: self._guards(t, after._replace(y=y), whole), (t_event, after.y), ahead)
+            armed = armed | (fired & (_constant(rise) > 0))
+        if self.hold is not None:
+            armed = jnp.where(dense, values > 0, armed)
+        flags = jnp.where(fired, 1.0, jnp.zeros_like(values))
+        log = state.log
+        if log is not None:
+            entry = EventLog(t_event, flags, (before.y, before.mode), (after.y, after.mode))
+            log = jtu.tree_map(lambda a, b: write(a, index, b), log, entry)
+        after_reset = state._replace(
+            y=end.y,
+            mode=end.mode,
+            t=t_event,
+            events=events,
+            trouble=trouble,
+            fired=flags,
+            log=log,
+            guard=_constant(values),
+            armed=jnp.where(armed, 1.0, jnp.zeros_like(values)),
+            resets=state.resets + 1.0,
+            spread=spread,
+        )
+        if self.jumps is None:
+            return after_reset
+        # Samples at which nothing happens say nothing of whether events accumulate.
+        return jtu.tree_map(
+            lambda a, b: jnp.where(happened | jnp.any(fired), a, b),
+            after_reset,
+            state._replace(y=end.y, guard=after_reset.guard, armed=after_reset.armed),
+        )
+
+
+def _to_root(
+    field: Callable[..., Any], guard: Callable[..., Array], t: Any, state: EventState, near: Array
+) -> tuple[Array, Array, EventState]:
+    """The time from `t` to the root of `guard`, the rate of the guard, and the state at the root.
+
+    Two Newton steps with one rate on a flow of second order: right to second order in the perturbation of anything that
+    the root depends on, as `way` itself is next to zero.
+    """
+    slope = field(t, state)
+    height, rate = jax.jvp(guard, (t, state.y), (jnp.ones_like(t), slope))
+    rate = _constant(rate)
+    rate = jnp.where(rate == 0, 1.0, rate)
+    way = -height / rate
+    # A guard that a reset has violated fires where it stands: it has no root here, or one before that reset.
+    on_root = (state.landed > 0.5) & (jnp.abs(_constant(way)) <= _LATITUDE * near) & _constant(t + way >= state.t)
+    way = jnp.where(on_root, way, 0.0)
+    middle = field(t + 0.5 * way, state._replace(y=_along(state.y, 0.5 * way, slope)))
+    there = _along(state.y, way, middle)
+    rest = jnp.where(on_root, -guard(t + way, there) / rate, 0.0)
+    way = way + rest
+    return (
+        jnp.where(_constant(t + way < state.t), _constant(state.t - t), way),
+        rate,
+        state._replace(y=_along(there, rest, middle)),
+    )
+
+
+def _accumulates(spread: Array, t: Array, begin: Array) -> Array:
+    """Whether intervals between events of `spread` at most are none on the scale of the run, or not resolved at `t`."""
+    eps = float(jnp.finfo(spread.dtype).eps)
+    return spread <= jnp.maximum(_ACCUMULATION * eps**0.5 * (t - begin), 64.0 * eps * jnp.abs(t))
+
+
+def _differ(one: PyTree, other: PyTree) -> Bool[Array, ""]:
+    different = jtu.tree_map(lambda a, b: jnp.any(a != b), one, other)
+    return jtu.tree_reduce(jnp.logical_or, different, jnp.asarray(False))
+
+
+def _real(x: Any) -> Array:
+    x = jnp.asarray(x)
+    return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(jnp.result_type(float))
+
+
+def _along(y: PyTree, s: Array, slope: PyTree) -> PyTree:
+    return jtu.tree_map(lambda a, b: a + (s * b).astype(a.dtype), y, slope)

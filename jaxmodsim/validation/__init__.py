@@ -1,0 +1,1 @@
+"""Above everything: hard cases with their answers, and the behaviour bench of the friction laws."""

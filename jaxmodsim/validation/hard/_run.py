@@ -1,0 +1,96 @@
+"""Many hard cases, in several processes."""
+
+import math
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from functools import cache
+
+import jax
+
+from ..._core.suggest import did_you_mean
+from ._case import HardCase
+from ._cases import FAMILIES, hard_cases
+from ._check import DTYPES, WAYS, Finding, Verdict, check, check_choice
+
+# Of these the runs themselves take minutes: begun first, they do not hold up the end.
+_LONG = ("periods_1000000", "cycles_100000", "dead_points", "redundant_constraints")
+
+# Cases that a process checks. Each compiles tens of programs, a program takes several maps of memory, and Linux gives a
+# process no more than 65 530 of those.
+_PORTION = 12
+
+
+def choose(names: Sequence[str]) -> dict[str, HardCase]:
+    """The hard cases of these names or families; all without.
+
+    **Raises:**
+
+    - `ValueError` for a name that is neither.
+    """
+    known = hard_cases()
+    chosen: dict[str, HardCase] = {}
+    for name in names:
+        if name not in known and name not in FAMILIES:
+            raise ValueError(
+                f"there is no hard case or family {name!r}; the families are: {', '.join(FAMILIES)}."
+                f"{did_you_mean(name, (*known, *FAMILIES))}"
+            )
+        chosen |= {each.name: each for each in known.values() if name in (each.name, each.family)}
+    return chosen or known
+
+
+def check_many(
+    names: Sequence[str] = (), *, ways: Sequence[str] = WAYS, dtypes: Sequence[str] = DTYPES, jobs: int = 1
+) -> Iterator[Verdict]:
+    """`check` many hard cases; each verdict comes as it is found, also where its process was killed.
+
+    **Arguments:**
+
+    - `names`: of cases or families; all without.
+    - `ways`, `dtypes`: as for `check`.
+    - `jobs`: processes at a time, > 0, besides this one.
+
+    **Raises:**
+
+    - `ValueError` as `choose` and `check`.
+    """
+    cases = choose(names)
+    check_choice(ways, dtypes)
+    order = sorted(cases, key=lambda name: name not in _LONG)
+    context = multiprocessing.get_context("spawn")
+    for first in range(0, len(order), jobs * _PORTION):
+        pool = ProcessPoolExecutor(jobs, context, initializer=_begin)
+        portion = order[first : first + jobs * _PORTION]
+        try:
+            futures = {pool.submit(_found, name, tuple(ways), tuple(dtypes)): name for name in portion}
+            for future in as_completed(futures):
+                yield Verdict(cases[futures[future]], _result(future))
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _result(future: Future[tuple[Finding, ...]]) -> tuple[Finding, ...]:
+    try:
+        return future.result()
+    except BrokenProcessPool as error:
+        # That of this case, or of another one that was begun with it.
+        return (Finding("alone", "float64", math.nan, False, f"A process was killed: {error}"),)
+
+
+def _begin() -> None:
+    """A process of our own is in double precision."""
+    jax.config.update("jax_enable_x64", True)
+
+
+# Cases of one structure share what is compiled, and a process makes them once.
+_cases = cache(hard_cases)
+
+
+def _found(name: str, ways: tuple[str, ...], dtypes: tuple[str, ...]) -> tuple[Finding, ...]:
+    try:
+        return check(_cases()[name], ways, dtypes).findings
+    except Exception as error:
+        # Whatever it is, the other cases go on.
+        return (Finding("alone", "float64", math.nan, False, f"{type(error).__name__}: {error}"),)

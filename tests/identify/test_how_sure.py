@@ -1,0 +1,589 @@
+"""How sure a fit is: profiles, combinations and causes in words, tests of residuals, other records, files, figures."""
+
+import json
+import zipfile
+from dataclasses import fields, replace
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import jaxmodsim as jms
+from jaxmodsim._core.parameters import Range
+from jaxmodsim.identify import FitResult, law_force, replay
+from jaxmodsim.identify._causes import RULES, Cause, Element, causes_of, slow
+from jaxmodsim.identify._engines import Seen
+from jaxmodsim.identify._losses import Squares
+from jaxmodsim.identify._motion import Motion, Slip
+from jaxmodsim.identify._parameters import FreeParameters
+from jaxmodsim.identify._problem import Prior, Problem
+from jaxmodsim.identify._residual_tests import channel_tests, trend_over
+from jaxmodsim.identify._result import result_of
+from jaxmodsim.identify._runs import cut, runs_of
+from jaxmodsim.identify._solve import Options, solve_with_noise
+from jaxmodsim.plot import profile_figure, result_figure
+from jaxmodsim.scene import Friction, scene_numbers
+
+DT = 4e-3
+ABOVE_ZERO = Range("N", 0.0, strict=True)
+
+
+# Models of two or three parameters by a formula: they compile in no time, and their likelihood can be scanned.
+class Line(eqx.Module):
+    def __call__(self, values, start, run):
+        del start
+        return Seen({"measured": values["a"] + values["b"] * run.t}, {}, None)
+
+
+class Decay(eqx.Module):
+    def __call__(self, values, start, run):
+        del start
+        return Seen({"measured": values["A"] * jnp.exp(-values["k"] * run.t)}, {}, None)
+
+
+class Saturation(eqx.Module):
+    """1 - exp(-stiffness t): above a certain stiffness all are alike."""
+
+    def __call__(self, values, start, run):
+        del start
+        return Seen({"measured": values["level"] * (1 - jnp.exp(-values["stiffness"] * run.t))}, {}, None)
+
+
+class Product(eqx.Module):
+    def __call__(self, values, start, run):
+        del start
+        return Seen({"measured": values["gain"] * values["area"] * jnp.sin(run.t) + values["c"] * run.t}, {}, None)
+
+
+class Sum(eqx.Module):
+    def __call__(self, values, start, run):
+        del start
+        return Seen({"measured": (values["F1"] + values["F2"]) * jnp.sin(run.t) + values["c"] * run.t}, {}, None)
+
+
+def fitted(engine, t, measured, start, ranges=None, prior=None) -> FitResult:
+    record = jms.Record(t, measured)
+    free = FreeParameters.of(start, ranges or {}, tuple(start))
+    windows = cut((record,), None)
+    means = jnp.asarray([(prior or {}).get(name, (0.0, jnp.inf))[0] for name in start])
+    weights = jnp.asarray([1 / (prior or {}).get(name, (0.0, jnp.inf))[1] for name in start])
+    problem = Problem(
+        engine, free, (), None, runs_of((record,), windows), {"measured": jnp.asarray(1.0)}, Squares(),
+        Prior(means, weights),
+    )  # fmt: skip
+    found = solve_with_noise(problem, problem.x0, Options(rtol=1e-10), frozenset())
+    return result_of(found, (record,), windows, dict.fromkeys(start, "N"), engine)
+
+
+def correlated(rng, n, memory=0.8):
+    e = rng.standard_normal(n)
+    for i in range(1, n):
+        e[i] += memory * e[i - 1]
+    return e
+
+
+def test_the_profile_of_a_linear_model_is_the_interval_of_student():
+    rng, t = np.random.default_rng(0), np.linspace(0.0, 3.0, 600)
+    # Correlated noise, so that the interval is right only if the correlation is in the ratio, too.
+    result = fitted(Line(), t, 2.0 - 0.7 * t + 0.1 * correlated(rng, t.size), {"a": 1.0, "b": 0.0})
+    assert result.errors["b"] > 1.5 * np.sqrt(result.white[1, 1])
+    for name in ("a", "b"):
+        profile = result.profile(name, points=3)
+        np.testing.assert_allclose(profile.interval, result.intervals()[name], rtol=2e-4)
+        np.testing.assert_allclose(
+            profile.ratio, ((profile.values - profile.estimate) / profile.error) ** 2, rtol=2e-3, atol=1e-6
+        )
+        assert not profile.notes
+    # What the other parameter does along it, by the covariance: cov(a, b)/var(b) of white noise.
+    along = result.profile("b", points=2)
+    slope = np.polyfit(along.values, along.others["a"], 1)[0]
+    assert slope == pytest.approx(result.white[0, 1] / result.white[1, 1], rel=1e-3)
+
+
+def test_the_profile_of_a_decay_is_what_a_scan_finds():
+    rng, t = np.random.default_rng(12), np.linspace(0.0, 6.0, 200)
+    y = np.exp(-0.5 * t) + 0.5 * rng.standard_normal(t.size)
+    result = fitted(Decay(), t, y, {"A": 2.0, "k": 1.0}, {"k": Range("1/s", 0.0, strict=True)})
+    profile = result.profile("k", points=4)
+
+    def squares(k):
+        shape = np.exp(-k * t)
+        return np.sum((y - shape * (shape @ y) / (shape @ shape)) ** 2)
+
+    # Squared standard error of k in units of the sum of squares: the last of the normal equations, by hand.
+    k, A = result.values["k"], result.values["A"]
+    jacobian = np.column_stack([np.exp(-k * t), -A * t * np.exp(-k * t)])
+    assert result.errors["k"] ** 2 > 0.5 * result.white[1, 1]
+    unit = result.errors["k"] ** 2 / np.linalg.inv(jacobian.T @ jacobian)[1, 1]
+    level = lambda x: (squares(x) - squares(k)) / unit - profile.threshold  # noqa: E731
+    assert profile.interval[0] == pytest.approx(brentq(level, 1e-3, k), rel=2e-3)
+    assert profile.interval[1] == pytest.approx(brentq(level, k, 10.0), rel=2e-3)
+    # Far from symmetric, which neither the value nor its logarithm would give.
+    assert profile.interval[1] - k != pytest.approx(k - profile.interval[0], rel=0.05)
+
+
+def test_a_parameter_that_is_not_determined_has_an_open_profile():
+    rng, t = np.random.default_rng(2), np.linspace(0.05, 2.0, 200)
+    y = 1 - np.exp(-200.0 * t) + 0.02 * rng.standard_normal(t.size)
+    result = fitted(Saturation(), t, y, {"level": 0.5, "stiffness": 50.0}, {"stiffness": ABOVE_ZERO})
+    profile = result.profile("stiffness", points=3)
+    assert profile.interval[1] == np.inf
+    assert 10.0 < profile.interval[0] < 200.0
+    assert any("stiffness has no upper limit from this record" in note for note in profile.notes)
+    assert len(profile.notes) == 1
+    assert "inf" in str(profile)
+    assert result.profile("level", points=2).interval[1] < 1.1
+    figure = profile_figure(profile)
+    assert "stiffness [N]" in [axis.get_xlabel() for axis in figure.axes]
+
+
+def test_what_was_known_before_counts_in_a_profile_and_limits_end_it():
+    t = np.linspace(0.0, 1.0, 50)
+    y = 0.05 + t + 0.1 * np.random.default_rng(3).standard_normal(t.size)
+    free = fitted(Line(), t, y, {"a": 1.0, "b": 0.5}, {"a": Range("N", 0.0)})
+    profile = free.profile("a", points=2)
+    assert profile.interval[0] == 0.0
+    assert any("reaches its limit 0" in note for note in profile.notes)
+    known = fitted(Line(), t, y, {"a": 1.0, "b": 0.5}, prior={"a": (0.05, 1e-3)})
+    low, high = known.profile("a", points=2).interval
+    assert high - low < 0.1 * (profile.interval[1] - profile.interval[0])
+
+
+@pytest.mark.parametrize(
+    ("engine", "start", "sentence"),
+    [
+        (Product(), {"gain": 2.0, "area": 0.5, "c": 1.0}, "only the product gain area; their ratio is not known"),
+        (Sum(), {"F1": 2.0, "F2": 2.6, "c": 1.0}, "only the sum F1 + F2; how it is shared"),
+    ],
+)
+def test_a_direction_that_is_not_determined_is_named(engine, start, sentence):
+    t = np.linspace(0.0, 6.0, 200)
+    y = 3.0 * np.sin(t) + 0.5 * t + 0.01 * np.random.default_rng(4).standard_normal(t.size)
+    result = fitted(engine, t, y, start)
+    assert any(sentence in remark for remark in result.remarks), result.remarks
+    # The pair is explained, so it is not named a second time.
+    assert not any("hardly told apart" in remark for remark in result.remarks)
+
+
+def test_nothing_is_said_of_parameters_that_are_determined():
+    t = np.linspace(0.0, 3.0, 100)
+    y = 1.0 + t + 0.01 * np.random.default_rng(5).standard_normal(t.size)
+    assert not fitted(Line(), t, y, {"a": 1.0, "b": 0.5}).remarks
+
+
+# Motions that show what a rule looks for, and nearly the same that do not.
+T = np.linspace(0.0, 4.0, 2001)
+LUGRE = {"sigma0": 1e4, "sigma1": 10.0, "sigma2": 1.0, "Fc": 1.0, "Fs": 1.5, "vs": 0.01}
+SINE, SLOW_SINE = np.sin(2 * np.pi * T), np.sin(2 * np.pi * 0.5 * T)
+
+
+def element(law, x, numbers=None, alike=None):
+    slip = Slip(T, x, np.gradient(x, T))
+    own = numbers or {k: float(v) for k, v in LUGRE.items()}
+    return Element("", Friction(law), (slip,), {k: np.asarray(v) for k, v in own.items()}, tuple(own), alike or {})
+
+
+def lugre(x, **alike):
+    return element(jms.LuGre(**LUGRE), x, None, alike)
+
+
+STRIBECK = {"Fc": 1.0, "Fs": 1.5, "vs": 0.01, "Fv": 0.5}
+SIDES = {"forward.Fc": 1.0, "backward.Fc": 1.2}
+MAXWELL = {"k": np.array([1e4, 1e4]), "Fc": np.array([0.1, 1.0])}
+
+
+def stribeck(x):
+    return element(jms.Regularized(jms.Stribeck(**STRIBECK), 1e-4), x, STRIBECK)
+
+
+def sided(x):
+    return element(jms.asymmetric(jms.Dahl(1e4, 1.0), Fc=1.2), x, SIDES)
+
+
+def maxwell(x):
+    found = element(jms.MaxwellSlip(**MAXWELL), x, MAXWELL)
+    return found._replace(free=("Fc[0]", "Fc[1]"))
+
+
+CASES = {
+    "presliding": (lugre(2e-5 * SINE), lugre(1e-2 * SINE), ("sigma2", "Fc", "Fs", "vs"), "never leaves presliding"),
+    "elements": (maxwell(2e-5 * SINE), maxwell(4e-4 * SINE), ("Fc[1]",), "never slip"),
+    "never_sticks": (lugre(0.1 * T), lugre(0.1 * SINE), ("sigma0", "sigma1", "Fs", "vs"), "never sticks"),
+    "one_direction": (lugre(0.1 * T, Fc=("offset",)), lugre(0.1 * SINE), ("Fc", "offset"), "one direction only"),
+    "sides": (sided(0.1 * T), sided(0.1 * SINE), ("backward.Fc",), "nothing is seen of backward.Fc"),
+    "stribeck_not_passed": (
+        stribeck(1e-3 * SINE), stribeck(0.1 * SINE), ("Fc", "Fs", "vs", "Fv"), "speed never exceeds"
+    ),
+    "stribeck_unseen": (stribeck(0.1 * T), stribeck(0.1 * SLOW_SINE), ("Fs", "vs"), "Only 0 samples"),
+    "one_speed": (stribeck(0.1 * T), stribeck(0.1 * SINE), ("Fc", "Fv"), "nearly one speed"),
+}  # fmt: skip
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("case", CASES)
+def test_causes_are_seen_in_the_motion(case):
+    triggers, fine, about, sentence = CASES[case]
+    found, others = ([cause for rule in RULES if (cause := rule(x))] for x in (triggers, fine))
+    assert [set(cause.about) for cause in found if sentence in cause.sentence] == [set(about)]
+    assert not any(sentence in cause.sentence for cause in others)
+
+
+def _lagrangian(t, q, qd, p):
+    del t
+    return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
+
+
+def _drive(t, q, qd, p):
+    del t, q, qd
+    return jnp.reshape(p["u"], (1,))
+
+
+def sprung(m=2.0, Fc=1.5, Fv=0.6):
+    friction = jms.Friction(jms.Regularized(jms.Coulomb(Fc), 1e-2))
+    viscous = jms.Friction(jms.Viscous(Fv), name="viscous")
+    params = {"m": m, "k": 20.0, "u": 0.0}
+    return jms.Scene(_lagrangian, params=params, effects=(jms.AppliedForce(_drive), friction, viscous))
+
+
+def test_slow_motion_does_not_show_the_mass():
+    scene = sprung()
+    numbers = {name: np.asarray(x) for name, x in scene_numbers(scene).items()}
+
+    def motion(size):
+        return (Motion(T, {0: size * SINE}, {0: size * 2 * np.pi * np.cos(2 * np.pi * T)}),)
+
+    cause = slow(scene, motion(1e-4), numbers, ("m", "k"))
+    assert cause is not None
+    assert cause.about == ("m",)  # not the stiffness, which is no part of the mass
+    assert "Inertia hardly shows" in cause.sentence
+    assert slow(scene, motion(0.1), numbers, ("m", "k")) is None
+    # Nothing is said of a parameter that the figures call certain.
+    assert not causes_of(scene, "", motion(1e-4), 1, numbers, ("m", "k"), {"k": ()})
+    assert causes_of(scene, "", motion(1e-4), 1, numbers, ("m", "k"), {"m": ()}) == (cause,)
+
+
+@pytest.fixture(scope="module")
+def presliding() -> FitResult:
+    t = np.arange(0.0, 2.0, 5e-3)
+    x = 3e-5 * np.sin(2 * np.pi * t)
+    truth = jms.LuGre(**LUGRE)
+    force = np.asarray(law_force(truth, jnp.asarray(t), jnp.asarray(x)))
+    noise = 2e-2 * np.random.default_rng(6).standard_normal(t.size)
+    start = replace(truth, Fc=0.9, Fs=1.7, vs=0.02)
+    return jms.fit_law(start, jms.Record(t, force + noise, {"x": x}), ("sigma0", "Fc", "Fs", "vs"), max_steps=30)
+
+
+def test_a_record_in_presliding_says_so_once(presliding):
+    about = [remark for remark in presliding.remarks if "presliding" in remark]
+    assert len(about) == 1, presliding.remarks
+    assert "Fc, Fs and vs cannot be told apart" in about[0]
+    assert not any("Fs and" in remark and "hardly told apart" in remark for remark in presliding.remarks)
+    assert presliding.causes[0].about == ("Fc", "Fs", "vs")
+
+
+@pytest.fixture(scope="module")
+def clean():
+    t = np.arange(0.0, 5.0, DT)
+    u = 4.0 * np.sin(2 * np.pi * 0.5 * t) + 2.0 * np.sin(2 * np.pi * 1.3 * t)
+    start = jnp.asarray([0.05]), jnp.asarray([0.1])
+    q = replay(sprung(), jnp.asarray(t), {"u": jnp.asarray(u)}, *start, 1, lambda q, qd: q[0])
+    return t, u, np.asarray(q)
+
+
+@pytest.fixture(scope="module")
+def parts(clean) -> tuple[jms.Record, jms.Record]:
+    t, u, q = clean
+    noise = 1e-4 * np.random.default_rng(7).standard_normal(t.size)
+    whole = jms.Record(t, {"x": q + noise}, {"u": u})
+    return whole.samples(0, 750, "first part"), whole.samples(750, len(t), "second part")
+
+
+TRACED = []
+
+
+def position(q, qd):
+    TRACED.append(qd)
+    return q[0]
+
+
+@pytest.fixture(scope="module")
+def result(parts) -> FitResult:
+    free = ("m", "friction.Fc", "viscous.Fv")
+    start, limits = sprung(1.5, 1.0, 1.0), {"m": (0.0, None)}
+    return jms.fit(start, parts[0], free, observe=position, q0=[0.05], qd0=[0.1], limits=limits)
+
+
+@pytest.fixture(scope="module")
+def scored(result, parts):
+    return result.score(parts[1])
+
+
+def test_a_profile_of_a_simulated_record_compiles_nothing(result):
+    before = len(TRACED)
+    profile = result.profile("friction.Fc", points=2)
+    assert before > 0
+    assert len(TRACED) == before  # nothing was traced again
+    np.testing.assert_allclose(profile.interval, result.intervals()["friction.Fc"], rtol=1e-4)
+    assert set(profile.others) == {"m", "viscous.Fv"}
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "text"),
+    [
+        ("q0[0]", {}, "no profile; the parameters that have one are: m, friction.Fc"),
+        ("m", {"level": 1.0}, "level must lie between"),
+        ("m", {"points": 1}, "points must be an integer >= 2"),
+    ],
+)
+def test_wrong_profiles_are_refused(result, name, options, text):
+    with pytest.raises(ValueError, match=text):
+        result.profile(name, **options)
+
+
+def judged(residual, inputs=None, motion=None, t=T):
+    return channel_tests("record", "x", residual, inputs or {}, motion or Motion(t, {}, {}))
+
+
+def test_white_residuals_are_called_white():
+    # 200 series: p-values of a right test are uniform, so 5 % of them lie below 0.05, give or take 1.5 %.
+    rng = np.random.default_rng(8)
+    found = [judged(rng.standard_normal(T.size), {"u": SINE}) for _ in range(200)]
+    for p in (lambda x: x.whiteness, lambda x: x.normality, lambda x: x.trends[0].p):
+        assert np.mean([p(each) < 0.05 for each in found]) == pytest.approx(0.05, abs=0.046)
+    assert np.mean([each.inputs["u"].p < 0.05 for each in found]) < 0.1
+    assert np.median([each.independent for each in found]) == pytest.approx(T.size, rel=0.02)
+    assert not found[0].remarks
+
+
+def test_correlated_residuals_are_measured_and_do_not_fool_the_other_tests():
+    rng = np.random.default_rng(9)
+    found = [judged(correlated(rng, T.size, 0.9), {"u": SINE}) for _ in range(100)]
+    interval = T[1] - T[0]
+    assert all(each.whiteness < 1e-6 for each in found)
+    # The sum of 0.9^k is 9, and the mean of such a series knows as much as a nineteenth of the samples.
+    assert np.mean([each.length for each in found]) == pytest.approx(9 * interval, rel=0.15)
+    assert np.mean([T.size / each.independent for each in found]) == pytest.approx(19, rel=0.15)
+    # Twice what would be right is allowed; without the correlation it would be more than half of them.
+    for p in (lambda x: x.trends[0].p, lambda x: x.normality, lambda x: x.inputs["u"].p):
+        assert np.mean([p(each) < 0.05 for each in found]) < 0.13
+
+
+ALTERNATING = (-1.0) ** np.arange(T.size)
+
+
+@pytest.mark.parametrize(
+    "residual",
+    [
+        ALTERNATING,
+        ALTERNATING * np.exp(-T),
+        correlated(np.random.default_rng(9), T.size, -0.3),
+        correlated(np.random.default_rng(9), T.size, -0.6),
+        correlated(np.random.default_rng(9), T.size, -0.99),
+        np.diff(np.random.default_rng(9).standard_normal(T.size + 1)),
+    ],
+    ids=["alternating", "fading", "weak", "medium", "strong", "differences"],
+)
+def test_residuals_that_alternate_have_no_negative_memory(residual):
+    """The sum of their autocorrelation over positive lags is negative, down to -1."""
+    each = judged(residual, {"u": SINE})
+    assert each.length == 0.0
+    assert each.independent == T.size
+    assert each.whiteness < 1e-6
+    assert 0 <= each.normality <= 1
+    assert any("not white, but has no memory" in remark for remark in each.remarks)
+    assert not any("remembers" in remark for remark in each.remarks)
+
+
+@pytest.mark.parametrize("n", [2, 3, 5, 20])
+@pytest.mark.parametrize("kind", ["zero", "constant", "one", "line"])
+def test_residuals_of_few_samples_and_of_no_scatter(n, kind):
+    t = np.linspace(0.0, 1.0, n)
+    residual = {"zero": 0 * t, "constant": 0 * t + 3.0, "one": np.eye(1, n)[0], "line": t}[kind]
+    each = judged(residual, {"u": t}, t=t)
+    assert each.length >= 0.0
+    assert 0 < each.independent <= n
+    assert all(0 <= p <= 1 for p in (each.whiteness, each.normality, each.trends[0].p, each.inputs["u"].p))
+
+
+def test_a_residual_with_a_cause_names_it():
+    rng, noise = np.random.default_rng(10), 0.1 * np.random.default_rng(11).standard_normal(T.size)
+    motion = Motion(T, {0: SLOW_SINE}, {0: np.cos(np.pi * T)})
+    position = judged(noise + 0.1 * SLOW_SINE, {"u": SINE}, motion)
+    share = {trend.over: trend.share for trend in position.trends}
+    assert share["q[0]"] == pytest.approx(1 / 3, abs=0.05)  # variance 0.005 of 0.015
+    assert any("goes with q[0]: something that depends on position" in remark for remark in position.remarks)
+    assert not any("qd[0]" in remark for remark in position.remarks)
+    drift = judged(noise + 0.1 * T, {}, motion)
+    assert any("drifts" in remark for remark in drift.remarks)
+    late = np.roll(rng.standard_normal(T.size), 0)
+    follows = judged(noise + 0.05 * np.roll(late, 7), {"u": late}, motion)
+    assert follows.inputs["u"].lag == pytest.approx(7 * (T[1] - T[0]))
+    assert any("goes with the input u" in remark for remark in follows.remarks)
+    heavy = judged(rng.standard_t(4, T.size), {}, motion)
+    assert any("tails are heavy" in remark for remark in heavy.remarks)
+    assert trend_over("t", np.zeros(T.size), T).p == 1.0
+
+
+def test_residuals_of_a_fit_are_tested_against_its_motion(result):
+    (each,) = result.residual_tests().channels
+    assert [trend.over for trend in each.trends] == ["q[0]", "qd[0]", "t"]
+    assert set(each.inputs) == {"u"}
+    assert each.whiteness > 1e-3
+    text = str(result.residual_tests())
+    assert "first part, x: 750 samples" in text
+    assert "no trend over qd[0]" in text
+
+
+def test_a_record_that_was_not_fitted_is_scored(scored, parts, clean):
+    t, _, q = clean
+    assert scored.ending == "converged"
+    assert scored.rmse["x"] == pytest.approx(1e-4, rel=0.15)
+    assert scored.fit["x"] == pytest.approx(100 * (1 - scored.rmse["x"] / np.std(parts[1].channels["x"])))
+    # The initial state comes out as it was, the velocity of the true motion by difference.
+    assert scored.q0 == pytest.approx(q[750], abs=1e-4)
+    assert scored.qd0 == pytest.approx(np.gradient(q, t)[750], abs=1e-2)
+    np.testing.assert_allclose(scored.residuals["x"], scored.outputs["x"] - parts[1].channels["x"])
+    assert "fit 99.9" in str(scored)
+
+
+def test_a_start_that_is_given_is_not_moved(result, parts):
+    given = result.score(parts[0], q0=[0.05], qd0=[0.1], free_start=False)
+    assert given.ending is None
+    np.testing.assert_allclose(given.outputs["x"], result.outputs[0]["x"], rtol=0, atol=1e-12)
+    assert result.score(parts[0], free_start=False).rmse["x"] > 10 * given.rmse["x"]  # from rest, which it was not
+    with pytest.raises(ValueError, match=r"q0 must be finite and of the shape \(1,\)"):
+        result.score(parts[0], q0=[0.0, 0.0])
+    other = jms.Record(parts[0].t, {"y": parts[0].channels["x"]}, parts[0].inputs)
+    with pytest.raises(ValueError, match="has the channel 'y', but the fit observed: x"):
+        result.score(other)
+    with pytest.raises(ValueError, match="has the inputs none"):
+        result.score(jms.Record(parts[0].t, parts[0].channels))
+
+
+def test_a_law_is_scored_on_another_motion(presliding):
+    t = np.arange(0.0, 1.0, 5e-3)
+    x = 2e-5 * np.sin(2 * np.pi * 2 * t)
+    force = np.asarray(law_force(jms.LuGre(**LUGRE), jnp.asarray(t), jnp.asarray(x)))
+    score = presliding.score(jms.Record(t, force, {"x": x}, "other"))
+    assert score.q0 is None
+    assert score.rmse["measured"] < 0.02
+    assert score.fit["measured"] > 85
+
+
+def same(a, b):
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and a.tobytes() == b.tobytes()
+    if isinstance(a, jms.Record):
+        return same(vars(a), vars(b))
+    if isinstance(a, dict):
+        return list(a) == list(b) and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, tuple) and not isinstance(a, Cause):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return type(a) is type(b) and (a == b or (a != a and b != b))
+
+
+@pytest.fixture(scope="module")
+def odd(result) -> FitResult:
+    """With what JSON does not know, and numbers whose decimals are long."""
+    errors = {**result.errors, "m": np.inf, "friction.Fc": np.nan}
+    return replace(result, errors=errors, step_error=0.1 + 0.2, causes=(Cause("Too slow.", ("m",)),))
+
+
+def test_a_file_gives_back_every_bit(odd, tmp_path):
+    path = tmp_path / "axis.fit"
+    odd.save(path)
+    assert [x.name for x in tmp_path.iterdir()] == ["axis.fit"]
+    again = FitResult.load(path)
+    for field in fields(FitResult):
+        if field.name not in ("model", "found"):
+            assert same(getattr(odd, field.name), getattr(again, field.name)), field.name
+    assert again.found is None
+    assert again.model is None
+    assert again.remarks == odd.remarks
+    assert str(again.residual_tests()) == str(odd.residual_tests())
+    result_figure(again)
+    with pytest.raises(ValueError, match="loaded result"):
+        again.profile("m")
+    with pytest.raises(ValueError, match="loaded result"):
+        again.score(odd.records[0])
+    again.save(path)  # what was loaded can be kept again
+    assert same(FitResult.load(path).numbers, odd.numbers)
+
+
+def test_a_file_puts_its_numbers_into_a_model(result, presliding, tmp_path):
+    path = tmp_path / "axis.fit"
+    result.save(path)
+    scene = FitResult.load(path, sprung(9.0, 9.0, 9.0)).model
+    assert same(
+        {k: np.asarray(x) for k, x in scene_numbers(scene).items()},  # pyright: ignore[reportArgumentType]
+        {k: np.asarray(x) for k, x in scene_numbers(result.model).items()},  # pyright: ignore[reportArgumentType]
+    )
+    other = jms.Scene(_lagrangian, params={"m": 1.0, "k": 1.0}, effects=(jms.Friction(jms.Coulomb(1.0)),))
+    with pytest.raises(ValueError, match=r"not the one that was fitted: it lacks .*viscous.Fv"):
+        FitResult.load(path, other)
+    presliding.save(path)
+    law = FitResult.load(path, jms.LuGre(**{**LUGRE, "sigma0": 1.0})).model
+    assert isinstance(law, jms.LuGre)
+    assert float(law.sigma0) == presliding.values["sigma0"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "text"),
+    [
+        (lambda path: path.write_text("m = 2.0"), "no result that FitResult.save wrote, or it is damaged"),
+        (lambda path: path.write_bytes(path.read_bytes()[:2000]), "no result that FitResult.save wrote"),
+        (lambda path: flip(path), "damaged"),
+        (lambda path: rewrite(path, {"kind": "other"}), "is no result of a fit"),
+        (lambda path: rewrite(path, {"format": 99}), "has the format 99, written by jaxmodsim"),
+        (lambda path: rewrite(path, {"fields": {}}), "lacks bounds, causes"),
+        (lambda path: rewrite(path, {}, "other.json"), r"holds no result\.json"),
+    ],
+)
+def test_files_that_are_something_else_are_refused(result, tmp_path, spoil, text):
+    path = tmp_path / "axis.fit"
+    result.save(path)
+    spoil(path)
+    with pytest.raises(ValueError, match=text):
+        FitResult.load(path)
+
+
+def flip(path: Path) -> None:
+    """Change one bit in the middle of the samples."""
+    body = bytearray(path.read_bytes())
+    body[len(body) // 2] ^= 1
+    path.write_bytes(bytes(body))
+
+
+def rewrite(path: Path, change, name: str = "result.json") -> None:
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    parts[name] = json.dumps({**json.loads(parts.pop("result.json")), **change}).encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, part in parts.items():
+            archive.writestr(name, part)
+
+
+def test_a_save_that_fails_leaves_the_old_file(result, tmp_path):
+    path = tmp_path / "axis.fit"
+    result.save(path)
+    before = path.read_bytes()
+    with pytest.raises(TypeError, match="units"):
+        replace(result, units={"m": object()}).save(path)
+    assert path.read_bytes() == before
+    assert [x.name for x in tmp_path.iterdir()] == ["axis.fit"]
+
+
+def test_the_figure_of_a_result_has_axes_with_units(result, presliding):
+    figure = result.plot(units={"x": "m"})
+    labels = {axis.get_ylabel() for axis in figure.axes} | {axis.get_xlabel() for axis in figure.axes}
+    assert {"x [m]", "residual [mm]", "time [s]", "lag [s]", "autocorrelation"} <= labels
+    assert "half-width of the 95 % interval [% of the value]" in labels
+    figure.canvas.draw()  # layout and texts, warnings being errors
+    presliding.plot().canvas.draw()  # with parameters that are not determined
+    with pytest.raises(ValueError, match="record must be 0 to 0"):
+        result.plot(record=1)
+    with pytest.raises(ValueError, match="units names y"):
+        result.plot(units={"y": "m"})

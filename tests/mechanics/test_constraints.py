@@ -1,0 +1,376 @@
+"""Constraints: multipliers, drift, consistent states, and loads that are reactions."""
+
+import itertools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmodsim import (
+    AppliedForce,
+    Constraint,
+    Coulomb,
+    DeadZone,
+    Friction,
+    Gauss,
+    Regularized,
+    Scene,
+    SimulationError,
+    VelocityConstraint,
+    consistent,
+    point_mass,
+    simulate,
+)
+from jaxmodsim._core.semidefinite import solve_semidefinite
+from jaxmodsim.scene import State, scene_field, scene_forces, scene_margins, scene_reactions
+from jaxmodsim.scene._event_driven import _loads
+
+ZERO = jnp.array(0.0)
+G, LENGTH = 9.81, 2.0
+
+
+def place(q: Any) -> Any:
+    return jnp.stack([q[0], 0.0 * q[0], q[1]])
+
+
+def circle(t: Any, x: Any, p: Any) -> Any:
+    """In a unit that is no length, so that the force must come from the gradient."""
+    del t, p
+    return jnp.sum(x**2) - LENGTH**2
+
+
+def free(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    del t, q, p
+    return 0.5 * jnp.sum(qd**2)
+
+
+BOB = point_mass(1.3, place)
+PENDULUM = Scene(BOB, constraints=(Constraint(circle, at=lambda q: q, name="rod"),))
+
+
+def hanging(angle: float, rate: float) -> tuple[Any, Any]:
+    q = LENGTH * jnp.array([np.sin(angle), -np.cos(angle)])
+    return q, LENGTH * rate * jnp.array([np.cos(angle), np.sin(angle)])
+
+
+@pytest.mark.quick
+def test_pendulum_in_cartesian_coordinates() -> None:
+    q, qd = hanging(0.7, 1.1)
+    along, inwards = np.array([np.cos(0.7), np.sin(0.7)]), np.array([-np.sin(0.7), np.cos(0.7)])
+    exact = -G * np.sin(0.7) * along + LENGTH * 1.1**2 * inwards
+    state = State(q, qd, {})
+    np.testing.assert_allclose(scene_field(ZERO, state, PENDULUM).qd, exact, atol=1e-13)
+    tension = 1.3 * (LENGTH * 1.1**2 + G * np.cos(0.7))
+    reaction = scene_reactions(ZERO, state, PENDULUM)["rod"]
+    np.testing.assert_allclose(reaction.force, tension * inwards, rtol=1e-13)
+    np.testing.assert_allclose(reaction.generalised, tension * inwards, rtol=1e-13)
+    np.testing.assert_allclose(reaction.multiplier, [-tension / (2 * LENGTH)], rtol=1e-13)
+
+
+@pytest.mark.parametrize("copies", [2, 3])
+def test_redundant_constraints_share_and_leave_the_motion_as_it_is(copies: int) -> None:
+    q, qd = hanging(0.7, 1.1)
+    again = Scene(BOB, constraints=tuple(Constraint(circle, at=lambda q: q) for _ in range(copies)))
+    state = State(q, qd, {})
+    one = scene_field(ZERO, state, PENDULUM).qd
+    np.testing.assert_allclose(scene_field(ZERO, state, again).qd, one, rtol=1e-12)
+    parts = [each.force for each in scene_reactions(ZERO, state, again).values()]
+    np.testing.assert_allclose(parts[0], parts[-1], rtol=1e-6)
+    np.testing.assert_allclose(sum(parts), scene_reactions(ZERO, state, PENDULUM)["rod"].force, rtol=1e-12)
+
+
+def test_smallest_solution_of_a_singular_system() -> None:
+    """Against the pseudo-inverse: three equations of rank two, two of them alike."""
+    rows = np.array([[1.0, 2.0], [1.0, 2.0], [0.5, -1.0]])
+    matrix, rhs = jnp.asarray(rows @ rows.T), jnp.asarray(rows @ np.array([0.3, -0.7]))
+    ones = jnp.ones(3)
+    ours = solve_semidefinite(matrix, rhs, ones, jnp.ones(3, bool))
+    np.testing.assert_allclose(matrix @ ours, rhs, atol=1e-13)
+    np.testing.assert_allclose(ours, np.linalg.pinv(np.asarray(matrix)) @ np.asarray(rhs), atol=1e-7)
+    part = solve_semidefinite(matrix, rhs, ones, jnp.array([True, False, True]))
+    np.testing.assert_allclose(part[jnp.array([0, 2])], np.linalg.solve(matrix[::2, ::2], rhs[::2]), rtol=1e-12)
+    assert float(part[1]) == 0.0
+
+
+def drift(run: Any) -> float:
+    """Largest error of length and of velocity along it."""
+    length = jnp.abs(jnp.sum(run.q**2, axis=1) - LENGTH**2)
+    return float(jnp.maximum(length, jnp.abs(jnp.sum(run.q * run.qd, axis=1))).max())
+
+
+def test_drift_with_projection_with_stabilisation_and_without() -> None:
+    q, qd = hanging(1.2, 0.0)
+    ts = jnp.linspace(0.0, 30.0, 301)
+    damped = Scene(BOB, constraints=(Constraint(circle, at=lambda q: q, stabilise=20.0),))
+    projected = simulate(PENDULUM, q, qd, 30.0, ts=ts)
+    assert drift(projected) < 1e-13
+    left, held = (drift(simulate(each, q, qd, 30.0, ts=ts, project=False)) for each in (PENDULUM, damped))
+    assert 1e-5 < left < 1e-2
+    assert held < 0.01 * left
+    # The pendulum in its angle, by the conserved energy at the lowest point: speed^2 = 2 g l (1 - cos(1.2)).
+    speed = jnp.sqrt(jnp.sum(projected.qd**2, axis=1))
+    height = projected.q[:, 1] + LENGTH * np.cos(1.2)
+    np.testing.assert_allclose(0.5 * speed**2 + G * height, 0.0, atol=1e-3)
+
+
+def test_reactions_along_a_run_and_derivatives_through_it() -> None:
+    """The multiplier differentiates like anything else: at the lowest point the tension is m g (3 - 2 cos(start))."""
+    q, qd = hanging(1.2, 0.0)
+
+    def tension(gravity: Any) -> Any:
+        scene = Scene(point_mass(1.3, place, gravity), constraints=PENDULUM.constraints)
+        run = simulate(scene, q, qd, 0.4, rtol=1e-9, atol=1e-11)
+        return jnp.sqrt(jnp.sum(run.reactions["rod"].force[-1] ** 2))
+
+    value, slope = jax.value_and_grad(tension)(9.81)
+    step = 1e-4
+    differences = (tension(9.81 + step) - tension(9.81 - step)) / (2 * step)
+    np.testing.assert_allclose(slope, differences, rtol=1e-6)
+    run = simulate(PENDULUM, q, qd, 0.4, rtol=1e-9, atol=1e-11)
+    cosine = float(-run.q[-1, 1] / LENGTH)
+    np.testing.assert_allclose(value, 1.3 * G * (3 * cosine - 2 * np.cos(1.2)), rtol=1e-8)
+
+
+def test_lanes_of_a_batch_and_single_precision() -> None:
+    angles = [0.4, 1.2]
+    starts = [hanging(angle, 0.3) for angle in angles]
+    q, qd = (jnp.stack(each) for each in zip(*starts, strict=True))
+    many = jax.vmap(lambda q, qd: simulate(PENDULUM, q, qd, 1.0).q[-1])(q, qd)
+    for i in range(2):
+        np.testing.assert_allclose(many[i], simulate(PENDULUM, q[i], qd[i], 1.0).q[-1], rtol=1e-10)
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), PENDULUM)
+    run = simulate(single, q[0].astype(jnp.float32), qd[0].astype(jnp.float32), 1.0, rtol=1e-5, atol=1e-6)
+    assert run.q.dtype == jnp.float32
+    np.testing.assert_allclose(run.q[-1], many[0], atol=1e-4)
+
+
+def test_gauss_keeps_the_energy_of_a_constrained_scene_better_than_its_tolerance() -> None:
+    q, qd = hanging(1.2, 0.0)
+    run = simulate(PENDULUM, q, qd, 30.0, ts=jnp.linspace(0.0, 30.0, 31), dt=0.05, solver=Gauss(3))
+    assert drift(run) < 1e-13
+    energy = 0.5 * jnp.sum(run.qd**2, axis=1) + G * run.q[:, 1]
+    assert float(jnp.abs(energy - energy[0]).max()) < 1e-6
+
+
+def moving(t: Any, q: Any, p: Any) -> Any:
+    del p
+    return q[0] - 0.5 * t**2
+
+
+def test_a_constraint_that_moves_works() -> None:
+    """A mass of 1 kg pushed at 1 m/s^2: the force is 1 N, and the work is the kinetic energy."""
+    scene = Scene(free, constraints=(Constraint(moving, name="push"),))
+    run = simulate(scene, [0.0], [0.0], 2.0, ts=jnp.array([1.0, 2.0]))
+    np.testing.assert_allclose(run.q[:, 0], [0.5, 2.0], atol=1e-12)
+    np.testing.assert_allclose(run.reactions["push"].multiplier, 1.0, rtol=1e-12)
+    np.testing.assert_allclose(run.energy.work_in, [0.5, 2.0], rtol=1e-6)
+    np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-6)
+
+
+def blade(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    """No sideways motion of a blade at q = (x, y, heading)."""
+    del t, p
+    return jnp.sin(q[2]) * qd[0] - jnp.cos(q[2]) * qd[1]
+
+
+def test_a_blade_that_turns_steadily_goes_in_a_circle() -> None:
+    """Free of forces it keeps its speed and its turn; the sideways force is m v w."""
+    scene = Scene(free, constraints=(VelocityConstraint(blade, name="blade"),))
+    run = simulate(scene, [0.0, 0.0, 0.0], [1.5, 0.0, 0.5], 3.0, ts=jnp.array([1.0, 3.0]), rtol=1e-9, atol=1e-11)
+    heading = 0.5 * run.t
+    radius = 1.5 / 0.5
+    np.testing.assert_allclose(run.q[:, 0], radius * jnp.sin(heading), atol=1e-8)
+    np.testing.assert_allclose(run.q[:, 1], radius * (1 - jnp.cos(heading)), atol=1e-8)
+    np.testing.assert_allclose(jnp.abs(run.reactions["blade"].multiplier), 1.5 * 0.5, rtol=1e-8)
+    np.testing.assert_allclose(jax.vmap(lambda q, qd: blade(0.0, q, qd, {}))(run.q, run.qd), 0.0, atol=1e-14)
+
+
+def test_consistent_states_are_found() -> None:
+    q, qd = consistent(PENDULUM, [1.5, -1.0], [1.0, 1.0])
+    np.testing.assert_allclose(q, LENGTH * np.array([1.5, -1.0]) / np.hypot(1.5, 1.0), rtol=1e-12)
+    np.testing.assert_allclose(q @ qd, 0.0, atol=1e-13)
+    np.testing.assert_allclose(qd, np.array([1.0, 1.0]) - q * (q @ np.ones(2)) / LENGTH**2, atol=1e-12)
+    held, rate = consistent(PENDULUM, [1.5, -1.0], [1.0, 0.0], hold=[0])
+    np.testing.assert_allclose(held, [1.5, -np.sqrt(LENGTH**2 - 1.5**2)], rtol=1e-12)
+    np.testing.assert_allclose(rate, [1.0, 1.5 / np.sqrt(LENGTH**2 - 1.5**2)], rtol=1e-12)
+
+
+def test_inconsistent_states_are_refused() -> None:
+    with pytest.raises(SimulationError, match=r"does not obey the constraints: pass q0, qd0 = jaxmodsim.consistent"):
+        simulate(PENDULUM, [1.5, -1.0], [0.0, 0.0], 1.0)
+    with pytest.raises(SimulationError, match="does not obey the constraints"):
+        simulate(PENDULUM, [0.0, -2.0], [0.1, 0.1], 1.0)
+    with pytest.raises(SimulationError, match=r"No position near .* with the coordinates \(0,\) held.*still off by"):
+        consistent(PENDULUM, [2.5, -1.0], [0.0, 0.0], hold=[0])
+    with pytest.raises(ValueError, match=r"hold must be indices of coordinates, 0 to 1, .*but \[2\]"):
+        consistent(PENDULUM, [2.5, -1.0], [0.0, 0.0], hold=[2])
+
+
+def test_constraints_that_contradict_each_other_end_the_run() -> None:
+    """Two rods of which one grows: at t = 0 they agree."""
+    grows = Constraint(lambda t, q, p: jnp.sqrt(jnp.sum(q**2)) - 2.0 - 0.1 * t**3)
+    scene = Scene(BOB, constraints=(*PENDULUM.constraints, grows))
+    q, qd = hanging(0.3, 0.0)
+    run = simulate(scene, q, qd, 3.0, ts=jnp.array([0.0, 3.0]), throw=False)
+    assert not bool(run.result.ok)
+    assert "constraints are not kept" in run.result.message
+
+
+# --- Loads that are reactions ---------------------------------------------------------------------------------------
+
+
+def floor_scene(mu: float, tilt: float, one_sided: bool = True) -> Scene:
+    """A block of 2 kg on a floor, pushed by 3 N along it and 4 N + tilt times friction's own side force.
+
+    The block's height is a coordinate; a lever of slope `tilt` turns sliding into pressing: the direction of friction
+    is x + tilt z, so each newton of friction changes the load by tilt.
+    """
+
+    def push(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t, q, qd
+        return jnp.stack([p["side"], -p["down"]])
+
+    return Scene(
+        lambda t, q, qd, p: 0.5 * 2.0 * jnp.sum(qd**2) + 0.0 * (t + q[0] + p["down"]),
+        params={"side": 3.0, "down": 4.0},
+        effects=(
+            AppliedForce(push),
+            Friction(Regularized(Coulomb(mu), 1e-6), along=lambda q: q[0] + tilt * q[1], normal_force="floor"),
+        ),
+        constraints=(Constraint(lambda t, q, p: q[1], one_sided=one_sided, name="floor"),),
+    )
+
+
+@pytest.mark.parametrize(("mu", "tilt"), [(0.3, 0.0), (0.3, 0.5), (0.3, -0.5), (0.9, 1.0)])
+def test_friction_and_its_load_are_solved_together(mu: float, tilt: float) -> None:
+    """Upright: N = down + tilt F with F = mu N, so N = down/(1 - mu tilt)."""
+    scene, state = floor_scene(mu, tilt), State(jnp.zeros(2), jnp.array([1.0, 0.0]), {})
+    normal = 4.0 / (1.0 - mu * tilt)
+    np.testing.assert_allclose(scene_reactions(ZERO, state, scene)["floor"].multiplier, [normal], rtol=1e-13)
+    np.testing.assert_allclose(scene_forces(ZERO, state, scene)["friction"], mu * normal, rtol=1e-13)
+    np.testing.assert_allclose(scene_field(ZERO, state, scene).qd, [(3.0 - mu * normal) / 2.0, 0.0], atol=1e-13)
+    margins = scene_margins(ZERO, state, scene)
+    assert margins is not None
+    np.testing.assert_allclose(margins, [normal, min(1.0, 1.0 - mu * tilt)], rtol=1e-13)
+
+
+@pytest.mark.parametrize(("one_sided", "tilt", "lost"), [(True, 1.2, True), (True, -1.2, False), (False, -1.2, True)])
+def test_loss_of_uniqueness_is_named(one_sided: bool, tilt: float, lost: bool) -> None:
+    """mu tilt = 1.2: friction raises its own load without bound. A guide that also pulls loses it for either sign."""
+    scene = floor_scene(1.0, tilt, one_sided)
+    run = simulate(scene, [0.0, 0.0], [1.0, 0.0], 0.1, throw=False)
+    assert bool(run.result.ok) == (not lost)
+    if lost:
+        assert "lost its unique solution" in run.result.message
+        assert "'floor'" in run.result.message
+
+
+def test_a_contact_that_would_have_to_pull_opens() -> None:
+    """Pressed by 1 N - t: the floor lets go at t = 1, and the run stops there with all that was computed."""
+    scene = Scene(
+        free,
+        effects=(AppliedForce(lambda t, q, qd, p: jnp.stack([0.0 * t, t - 1.0])),),
+        constraints=(Constraint(lambda t, q, p: q[1], one_sided=True, name="floor"),),
+    )
+    run = simulate(scene, [0.0, 0.0], [1.0, 0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 31), throw=False)
+    assert "'floor' can only push, and would have to pull" in run.result.message
+    np.testing.assert_allclose(run.t_end, 1.0, rtol=1e-6)
+    np.testing.assert_allclose(run.q[:10, 0], run.t[:10], rtol=1e-6)
+
+
+def test_a_load_of_a_reaction_sticks_and_slides_exactly() -> None:
+    """A block pressed by 4 N and pulled by 0.5 N/s sticks until 0.4 * 4 N, then slides against 0.3 * 4 N."""
+
+    def push(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del q, qd, p
+        return jnp.stack([0.5 * t, -4.0 + 0.0 * t])
+
+    scene = Scene(
+        free,
+        effects=(AppliedForce(push), Friction(Coulomb(0.3, 0.4), along=lambda q: q[0], normal_force="floor")),
+        constraints=(Constraint(lambda t, q, p: q[1], name="floor"),),
+    )
+    run = simulate(scene, [0.0, 0.0], [0.0, 0.0], 5.0, ts=jnp.array([2.0, 5.0]), rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(run.events.t[0], 3.2, rtol=1e-9)
+    np.testing.assert_allclose(run.forces["friction"], [1.0, 1.2], rtol=1e-9)
+    since = 5.0 - 3.2
+    np.testing.assert_allclose(run.qd[1, 0], 0.25 * since**2 + (1.6 - 1.2) * since, rtol=1e-8)
+
+
+def all_loads(normal: Any, gain: Any, pulls: Any) -> list[Any]:
+    """Every solution of n + gain load(n) = normal, by trying all signs."""
+    found = []
+    for signs in itertools.product((1.0, 0.0), repeat=len(normal)):
+        slope = np.where(np.array(signs) > 0, 1.0, pulls)
+        n = np.linalg.solve(np.eye(len(normal)) + gain * slope[None, :], normal)
+        if np.all((n > 0) == (np.array(signs) > 0)):
+            found.append(slope * n)
+    return found
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_loads_that_depend_on_each_other(k: int) -> None:
+    """Against all sign patterns: where the margin is positive there is one solution, and it is found."""
+    rng = np.random.default_rng(k)
+    solve = jax.jit(_loads)
+    counts = {True: 0, False: 0}
+    for _ in range(200):
+        gain, normal = rng.normal(scale=0.6, size=(k, k)), rng.normal(size=k)
+        pulls = rng.choice([0.0, -1.0], size=k)
+        load, margin = solve(jnp.asarray(normal), jnp.asarray(gain), jnp.asarray(pulls))
+        solutions = all_loads(normal, gain, pulls)
+        counts[bool(margin > 0)] += 1
+        if margin > 0:
+            assert len(solutions) == 1
+            np.testing.assert_allclose(load, solutions[0], atol=1e-10)
+    assert min(counts.values()) > 10
+
+
+# --- What is refused ------------------------------------------------------------------------------------------------
+
+ON = Constraint(lambda t, q, p: q[1], name="floor")
+TWO = Constraint(lambda t, q, p: q, name="floor")
+
+
+@pytest.mark.parametrize(
+    ("build", "text"),
+    [
+        (lambda: Scene(free, constraints=ON), r"constraints must be a tuple, as in constraints=\(constraint,\)"),
+        (lambda: Scene(free, constraints=(Coulomb(1.0),)), "must hold Constraint or VelocityConstraint objects"),
+        (lambda: Scene(free, constraints=(ON, ON)), "Two constraints have the name 'floor'"),
+        (
+            lambda: Scene(free, effects=(Friction(Coulomb(1.0), name="floor"),), constraints=(ON,)),
+            "An effect and a constraint both have the name 'floor'",
+        ),
+        (
+            lambda: Scene(free, effects=(Friction(Coulomb(1.0), normal_force="wall"),), constraints=(ON,)),
+            "normal_force='wall' names no constraint of the scene; there are: 'floor'",
+        ),
+        (
+            lambda: Scene(
+                free, effects=(Friction(DeadZone(Coulomb(1.0), 0.1), normal_force="floor"),), constraints=(ON,)
+            ),
+            "under the load of a constraint DeadZone cannot run",
+        ),
+        (
+            lambda: Scene(
+                free,
+                effects=(Friction(Coulomb(1.0), along=lambda q: q[0], normal_force="floor"),),
+                constraints=(TWO,),
+            ),
+            "loads friction .* so it must be one equation, but it has 2",
+        ),
+        (lambda: Constraint(3.0), "phi must be a function, but 3.0"),
+        (lambda: Constraint(circle, stabilise=-1.0), "stabilise must be finite and >= 0"),
+        (lambda: Scene(free, constraints=(Constraint(lambda t, q, p: jnp.eye(2)),)), r"it returned shape \(2, 2\)"),
+        (
+            lambda: Scene(free, constraints=(Constraint(lambda t, q, p: q, one_sided=True),)),
+            "one_sided=True needs phi to be one number",
+        ),
+    ],
+)
+def test_wrong_constraints_are_refused(build: Any, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        simulate(build(), [0.0, 0.0], [0.0, 0.0], 1.0)

@@ -1,0 +1,334 @@
+"""Features of runs against closed forms, compiled and in batches, with their derivatives."""
+
+import dataclasses
+import pickle
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmodsim as jms
+from jaxmodsim import metrics, problems
+from jaxmodsim.metrics import Feature
+from jaxmodsim.simulation import Events, _trajectory
+
+BELT = problems.BELT_OSCILLATOR
+TIGHT: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-12, "max_events": 32}
+OF_EVENTS = (
+    metrics.break_away(),
+    metrics.period(),
+    metrics.mode_changes(),
+    metrics.stick_share(),
+    metrics.motion_kind(),
+    metrics.mode_sequence(most=20),
+    metrics.peak("friction"),
+)
+BREAK_AWAY, PERIOD, CHANGES, SHARE, KIND, SEQUENCE, PEAK = range(7)
+BELTS = jnp.array([0.08, 0.1, 0.16])
+# For differences by Fs. The runs are right to about 1e-9: with this step the differences are to 1e-6.
+STEP = 1e-3
+
+
+def on_belt(belt: Any, fs: Any = BELT["Fs"], **more: Any) -> Any:
+    """A run in stick from the start on."""
+    scene = problems.belt_oscillator(jms.Coulomb(BELT["Fc"], fs), belt=belt)
+    return jms.simulate(scene, [0.0], jnp.stack([jnp.asarray(belt)]), 6.0, throw=False, **TIGHT, **more)
+
+
+def values(belt: Any, fs: Any) -> list[Any]:
+    run = on_belt(belt, fs)
+    return [feature(run) for feature in OF_EVENTS]
+
+
+@pytest.fixture(scope="module")
+def lanes() -> list[np.ndarray]:
+    """Of three belts, and of one belt with Fs less and more by a step."""
+    belts, fs = jnp.append(BELTS, jnp.full(2, 0.1)), 8.0 + STEP * jnp.array([0.0, 0.0, 0.0, -1.0, 1.0])
+    return [np.asarray(x) for x in jax.jit(jax.vmap(values))(belts, fs)]
+
+
+@pytest.fixture(scope="module")
+def batch(lanes: list[np.ndarray]) -> list[np.ndarray]:
+    return [x[:3] for x in lanes]
+
+
+def cycle(belt: Any, fs: Any = BELT["Fs"]) -> Any:
+    return problems.belt_oscillator_cycle(**{**BELT, "belt": belt, "Fs": fs})
+
+
+def test_belt_oscillator_keeps_its_closed_form(batch: list[np.ndarray]) -> None:
+    exact = cycle(BELTS)
+    begins = exact.begins / BELTS
+    np.testing.assert_allclose(batch[BREAK_AWAY], begins, rtol=1e-9)
+    np.testing.assert_allclose(batch[PERIOD], exact.period, rtol=1e-8)
+    np.testing.assert_allclose(batch[PEAK], BELT["Fs"], rtol=1e-9)
+    cycles, rest = np.divmod(6.0 - begins, exact.period)
+    np.testing.assert_array_equal(batch[CHANGES], 2 * cycles + 1 + (rest > exact.slip))
+    stuck = begins + cycles * exact.stick + np.maximum(rest - exact.slip, 0.0)
+    np.testing.assert_allclose(batch[SHARE], stuck / 6.0, rtol=1e-8)
+    for kind, sequence, count in zip(batch[KIND], batch[SEQUENCE], batch[CHANGES], strict=True):
+        assert OF_EVENTS[KIND].words(kind) == "stick-slip cycle"
+        words = OF_EVENTS[SEQUENCE].words(sequence).split(" > ")
+        assert words == (["stick", "slip-"] * int(count))[: int(count) + 1]
+
+
+@pytest.fixture(scope="module")
+def alone() -> Any:
+    """A run of the middle belt, not compiled by its user."""
+    return on_belt(BELTS[1])
+
+
+def test_eager_as_compiled_and_mapped(alone: Any, batch: list[np.ndarray]) -> None:
+    for feature, mapped in zip(OF_EVENTS, batch, strict=True):
+        np.testing.assert_allclose(feature(alone), mapped[1], rtol=1e-9, err_msg=feature.label)
+
+
+def test_derivatives_of_break_away_and_period(lanes: list[np.ndarray]) -> None:
+    """Against the closed form, and against differences."""
+    chosen = (BREAK_AWAY, PERIOD, PEAK, SHARE)
+
+    def some(fs: Any) -> Any:
+        run = on_belt(0.1, fs, adjoint=dfx.ForwardMode())
+        return jnp.stack([OF_EVENTS[i](run) for i in chosen])
+
+    slopes = jax.jit(jax.jacfwd(some))(8.0)
+    exact = jax.jacfwd(lambda fs: jnp.stack([cycle(0.1, fs).begins / 0.1, cycle(0.1, fs).period, fs]))(8.0)
+    np.testing.assert_allclose(slopes[:3], exact, rtol=1e-7)
+    differences = [(lanes[i][4] - lanes[i][3]) / (2 * STEP) for i in chosen]
+    np.testing.assert_allclose(slopes, differences, rtol=1e-5)
+
+
+def test_events_of_a_run_are_found_once(alone: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, calls = dataclasses.replace(alone), []
+    solve_logged = _trajectory.solve_logged
+    monkeypatch.setattr(_trajectory, "solve_logged", lambda *args: (calls.append(1), solve_logged(*args))[1])
+    first = [feature(run) for feature in OF_EVENTS]
+    assert len(calls) == 1
+    assert pickle.loads(pickle.dumps(run)).events.t.shape == run.events.t.shape
+    calls.clear()
+    # What was found while tracing stays there.
+    traced = jax.jit(lambda: [feature(run) for feature in OF_EVENTS])()
+    assert len(calls) == 1
+    again = [feature(run) for feature in OF_EVENTS]
+    np.testing.assert_allclose(np.array(traced), np.array(first))
+    np.testing.assert_array_equal(np.array(again), np.array(first))
+
+
+def test_features_of_equal_arguments_compile_once(alone: Any) -> None:
+    count = []
+
+    def applied(feature: Feature, run: Any) -> Any:
+        count.append(feature)
+        return feature(run)
+
+    compiled = jax.jit(applied, static_argnums=0)
+    compiled(metrics.peak("q[0]"), alone)
+    compiled(metrics.peak("q[0]"), alone)
+    assert len(count) == 1
+    assert metrics.period("q[0]") != metrics.period("qd[0]")
+
+
+def box(law: Any) -> Any:
+    """Pulled by 0.5 t, a mass of 2 kg."""
+    ts = jnp.linspace(0.0, 5.0, 2001)
+    return jms.simulate(problems.ramped_box(law, ramp=0.5), [0.0], [0.0], 5.0, ts=ts, rtol=1e-9, atol=1e-12)
+
+
+def made(run: Any, scene: Any = None, **fields: Any) -> Any:
+    """A run with some of it replaced by what is given."""
+    problem = run.problem if scene is None else run.problem._replace(scene=scene)
+    return dataclasses.replace(run, problem=problem, **fields)
+
+
+def bristle() -> Any:
+    """So stiff that it breaks away at Fs, but for what it creeps before."""
+    return box(jms.LuGre(sigma0=1e5, sigma1=100.0, sigma2=0.0, Fc=1.5, Fs=1.5, vs=0.1))
+
+
+def free(coefficient: float = 0.0) -> Any:
+    """The run of a box that nothing holds, of which viscous friction is measured but does not act."""
+    run = bristle()
+    q, qd = 0.5 * run.t[:, None] ** 3 / 12.0, 0.5 * run.t[:, None] ** 2 / 4.0
+    return made(run, problems.ramped_box(jms.Viscous(coefficient), ramp=0.5), q=q, qd=qd, z={})
+
+
+def test_break_away_of_a_pulled_box() -> None:
+    """At t = Fs/ramp; a slip d later by (6 m d/ramp)^(1/3), as the force is over what is needed by ramp t."""
+    run = box(jms.Coulomb(1.5))
+    np.testing.assert_allclose(metrics.break_away()(run), 3.0, rtol=1e-9)
+    later = (6.0 * 2.0 * 1e-2 / 0.5) ** (1 / 3)
+    np.testing.assert_allclose(metrics.break_away(distance=1e-2)(run), 3.0 + later, rtol=2e-6)
+    # Without friction it slips from the start on.
+    np.testing.assert_allclose(metrics.break_away(distance=1e-2)(free()), later, rtol=1e-5)
+    assert np.isnan(metrics.break_away(distance=1e3)(free()))
+    assert np.isnan(metrics.break_away()(box(jms.Coulomb(3.0))))
+    np.testing.assert_allclose(metrics.break_away(distance=1e-2)(bristle()), 3.0 + later, rtol=3e-3)
+
+
+def test_break_away_counts_slip_and_not_motion() -> None:
+    """A mass at rest beside a belt of -0.1 m/s slips by 0.1 t, from t0 and not from the first saved time on."""
+    run = free()
+    scene = run.scene
+    effect = eqx.tree_at(lambda friction: friction.belt_velocity, scene.effects[1], jnp.asarray(-0.1))
+    scene = jms.Scene(scene.lagrangian, params=scene.params, effects=(scene.effects[0], effect))
+    rest = jnp.zeros((4, 1))
+    run = made(run, scene, t=jnp.linspace(0.5, 2.0, 4), q=rest, qd=rest, end=jnp.asarray(2.0))
+    np.testing.assert_allclose(metrics.break_away(distance=0.12)(run), 1.2, rtol=1e-12)
+    np.testing.assert_allclose(metrics.stick_share(rest=0.09)(run), 0.0)
+    np.testing.assert_allclose(metrics.stick_share(rest=0.11)(run), 1.0)
+
+
+def test_a_spring_that_stops() -> None:
+    """BRAKED_SPRING from 0.3 m: so many half cycles, and at rest."""
+    numbers = {"m": 1.3, "k": 2.7, "Fc": 0.11, "Fs": 0.15}
+    rest = problems.braked_spring_rest(x0=0.3, **numbers)
+    scene = problems.braked_spring(problems.braked_spring_law())
+    half = float(rest.t / rest.half_cycles)
+
+    def kind(t1: float, x0: float = 0.3) -> tuple[str, str]:
+        run = jms.simulate(scene, [x0], [0.0], t1, **TIGHT)
+        what, how = metrics.motion_kind(), metrics.mode_sequence()
+        return what.words(what(run)), how.words(how(run))
+
+    assert int(rest.half_cycles) == 3
+    assert kind(float(rest.t) + 1.0) == ("sticks for good", "slip- > slip+ > slip- > stick")
+    assert kind(2.5 * half) == ("slips back and forth", "slip- > slip+ > slip-")
+    assert kind(0.5 * half) == ("slips for good", "slip-")
+    assert kind(3.0, x0=0.01) == ("never slips", "stick")
+    run = jms.simulate(scene, [0.3], [0.0], 2.0 * float(rest.t), **TIGHT)
+    np.testing.assert_allclose(metrics.stick_share()(run), 0.5, rtol=1e-9)
+    np.testing.assert_allclose(metrics.stick_share(since=0.5 * float(rest.t))(run), 2 / 3, rtol=1e-9)
+    assert np.isnan(metrics.period()(run))
+
+
+def test_several_elements(alone: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Changes of each as they are given: `first` leaves stick for good, `second` at the same time, and comes back."""
+    columns = [jnp.array(x) for x in ([1.0, 1.0, 2.0, jnp.inf], [0, 1, 1, -1], [0, 0, 1, -1], [-1, 1, 0, -1])]
+    monkeypatch.setattr(jms.Trajectory, "events", property(lambda run: Events(*columns)))
+    run = made(alone, problems.coupled_belts(), modes=jnp.array([[-1.0, 0.0]]), end=jnp.asarray(4.0))
+    names = ("first", "second")
+    sequence, kind = metrics.mode_sequence(*names), metrics.motion_kind(*names)
+    assert sequence.words(sequence(run)) == "first stick, second stick > first slip- > second slip+ > second stick"
+    assert kind.words(kind(run)) == "first slips for good, second sticks for good"
+    assert [int(metrics.mode_changes(name)(run)) for name in names] == [1, 2]
+    assert [float(metrics.stick_share(name)(run)) for name in names] == [0.25, 0.75]
+    assert metrics.mode_sequence("second").words(metrics.mode_sequence("second")(run)) == "stick > slip+ > stick"
+
+
+def test_sequences_that_are_too_long_are_one_class(alone: Any) -> None:
+    short = metrics.mode_sequence(most=3)
+    assert short.words(short(alone)) == "more than 3 changes"
+    assert int(metrics.mode_sequence()(alone)) == int(metrics.mode_sequence(most=20)(alone)) > 2**20
+
+
+def test_single_precision(alone: Any) -> None:
+    single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32) if x.dtype == jnp.float64 else x, alone)
+    problem = single.problem._replace(rtol=jnp.asarray(1e-5, jnp.float32), atol=jnp.asarray(1e-6, jnp.float32))
+    single = dataclasses.replace(single, problem=problem)
+    assert metrics.period()(single).dtype == metrics.break_away()(single).dtype == jnp.float32
+    np.testing.assert_allclose(metrics.period()(single), metrics.period()(alone), rtol=1e-4)
+    # Of the sequence, all digits; it has 11 changes or fewer.
+    sequence = metrics.mode_sequence()
+    assert int(np.float32(sequence(single))) == int(sequence(alone))
+    with pytest.raises(ValueError, match="pass most=11"):
+        metrics.mode_sequence(most=20)(single)
+
+
+def test_periods_by_crossings() -> None:
+    """A swing cos(w t) about any mean has the period 2 pi/w; what dies away or has ended has none."""
+    t, run = jnp.linspace(0.0, 40.0, 4001), free()
+
+    def swing(w: Any, x: Any = None) -> Any:
+        x = 3.0 + jnp.cos(w * t) if x is None else x
+        return made(run, t=t, q=x[:, None], qd=-w * jnp.sin(w * t)[:, None], end=jnp.asarray(40.0))
+
+    for name in ("q[0]", "qd[0]"):
+        np.testing.assert_allclose(metrics.period(name)(swing(1.7)), 2 * np.pi / 1.7, rtol=1e-5)
+    slope = jax.grad(lambda w: metrics.period("q[0]")(swing(w)))(1.7)
+    np.testing.assert_allclose(slope, -2 * np.pi / 1.7**2, rtol=1e-3)
+    np.testing.assert_allclose(metrics.peak("q[0]")(swing(1.7)), 4.0, rtol=1e-9)
+    # A sample every tenth of a period, with turning points between them; samples alone are off by 0.05.
+    few = made(run, t=t[::40], q=jnp.cos(1.7 * t[::40, None]), qd=-1.7 * jnp.sin(1.7 * t[::40, None]))
+    few = dataclasses.replace(few, q=few.q.at[0].set(0.0))
+    np.testing.assert_allclose(metrics.peak("q[0]")(few), 1.0, atol=1e-3)
+    np.testing.assert_allclose(metrics.final("qd[0]")(swing(1.7)), -1.7 * np.sin(1.7 * 40.0), rtol=1e-9)
+    late = jnp.where(t > 19.0, 1e-4, 1.0) * jnp.cos(1.7 * t)
+    assert np.isnan(metrics.period("q[0]")(swing(1.7, late)))
+    np.testing.assert_allclose(metrics.period("q[0]", swing=1e-5)(swing(1.7, late)), 2 * np.pi / 1.7, rtol=1e-5)
+    ended = jnp.where(t > 30.0, 0.0, jnp.cos(1.7 * t))
+    assert np.isnan(metrics.period("q[0]")(swing(1.7, ended)))
+    assert np.isnan(metrics.period("q[0]")(swing(1.7, t)))
+
+
+def test_dahl_loses_its_closed_form_in_each_cycle() -> None:
+    """`4 Fc [A - Fc/sigma0 tanh(sigma0 A/Fc)]`, with a mass so heavy that friction does not disturb its swing."""
+    sigma0, fc, amplitude = 750.0, 1.5, 2e-2
+    scene = problems.braked_spring(jms.Dahl(sigma0, fc), m=1e9, k=1e9)
+    lost = []
+    for cycles in (2, 3):
+        run = jms.simulate(scene, [amplitude], [0.0], 2 * np.pi * cycles, rtol=1e-9, atol=1e-12)
+        lost.append(metrics.dissipated("friction")(run))
+        np.testing.assert_allclose(metrics.dissipated()(run), lost[-1], rtol=1e-12)
+    expected = 4 * fc * (amplitude - fc / sigma0 * np.tanh(sigma0 * amplitude / fc))
+    np.testing.assert_allclose(lost[1] - lost[0], expected, rtol=1e-6)
+    with pytest.raises(ValueError, match="lose some are: friction"):
+        metrics.dissipated("brake")(run)
+
+
+def test_rest_of_laws_without_modes() -> None:
+    """Up to which share of its limit a bristle creeps slower than 1e-4 m/s, and when a box that sticks gets faster."""
+    share = metrics.stick_share(rest=1e-4)
+    # A bristle under a ramp creeps at v = (ramp/sigma0)/(1 - F/Fc).
+    np.testing.assert_allclose(share(bristle()), 3.0 * (1 - 0.5 / 1e5 / 1e-4) / 5.0, atol=3e-3)
+    # A box that slips after 3 s has v = ramp (t - 3)^2/(2 m).
+    np.testing.assert_allclose(share(box(jms.Coulomb(1.5))), (3.0 + np.sqrt(4 * 1e-4 / 0.5)) / 5.0, atol=1e-3)
+    still = metrics.classes(lambda run: jnp.where(jnp.abs(run.qd[-1, 0]) < 1e-3, 0, 1), ("rests", "moves"))
+    assert still.words(still(bristle())) == "moves"
+
+
+def test_peak_of_a_force() -> None:
+    run = free(0.3)
+    np.testing.assert_allclose(metrics.peak("friction")(run), 0.3 * run.qd[-1, 0], rtol=1e-12)
+    np.testing.assert_allclose(metrics.peak("pull[0]")(run), 2.5, rtol=1e-12)
+    np.testing.assert_allclose(metrics.final("pull[0]")(run), 2.5, rtol=1e-12)
+    assert metrics.peak("pull[0]").words(2.5) == "2.5 N or N m"
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: metrics.break_away(distance=-1.0), "positive number of metres"),
+        (lambda: metrics.stick_share(rest=0.0), "positive speed"),
+        (lambda: metrics.period(swing=1.0), "swing"),
+        (lambda: metrics.mode_sequence(most=26), "from 1 to 25"),
+        (lambda: metrics.mode_sequence("a", "a"), "once"),
+        (lambda: metrics.motion_kind(*(str(i) for i in range(11))), "up to 10"),
+        (lambda: metrics.classes(lambda run: 0, ()), "name for each class"),
+    ],
+)
+def test_garbage_is_refused_when_made(make: Any, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("feature", "text"),
+    [
+        (metrics.break_away(), r"break_away\(distance=1e-3\)"),
+        (metrics.break_away("brake"), "'brake'; there are: friction"),
+        (metrics.mode_changes(), "does not run by events"),
+        (metrics.stick_share(), "rest=1e-4"),
+        (metrics.motion_kind(), "classes"),
+        (metrics.mode_sequence(), "classes"),
+        (metrics.peak("q[1]"), r"'q\[1\]'; there are: q\[0\], qd\[0\], pull\[0\], friction"),
+        (metrics.final("pull"), "No observable"),
+        (metrics.period("brake"), "No observable"),
+    ],
+)
+def test_garbage_is_refused_when_called(feature: Feature, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        feature(bristle())

@@ -1,0 +1,324 @@
+"""Scenes: names, leaves, refusals, and that the traced field holds only what the scene does."""
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.extend
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmodsim import (
+    AppliedForce,
+    Coulomb,
+    DeadZone,
+    Friction,
+    LuGre,
+    Regularized,
+    Scene,
+    Sign,
+    Stribeck,
+    Viscous,
+    problems,
+    simulate,
+)
+from jaxmodsim._core.scalarise import in_scalars
+from jaxmodsim.scene import State, scene_field
+
+
+def free(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    del t, q, p
+    return 0.5 * jnp.sum(qd**2)
+
+
+def push(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    del qd, p
+    return jnp.sin(t) * q
+
+
+def pull(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    del q, p
+    return jnp.ones(3) * t * qd[0]
+
+
+LUGRE = {"sigma0": 750.0, "sigma1": 1.0, "sigma2": 0.1, "Fc": 1.5, "Fs": 1.75, "vs": 0.2}
+
+
+@pytest.mark.quick
+def test_names_are_given_or_counted() -> None:
+    scene = Scene(
+        free,
+        effects=(
+            AppliedForce(push),
+            Friction(Viscous(1.0)),
+            AppliedForce(push, name="applied_2"),
+            Friction(Viscous(1.0), name="guide"),
+            AppliedForce(push),
+            Friction(LuGre(**LUGRE)),
+        ),
+    )
+    assert scene.names == ("applied", "friction", "applied_2", "guide", "applied_3", "friction_2")
+    assert set(scene.state0(jnp.zeros(1))) == {"friction_2"}
+
+
+def test_a_default_name_gives_way_to_a_given_one() -> None:
+    scene = Scene(free, effects=(Friction(Viscous(1.0)), Friction(Viscous(1.0), name="friction")))
+    assert scene.names == ("friction_2", "friction")
+
+
+def test_every_number_is_a_leaf() -> None:
+    """And nothing else is: two scenes that differ in numbers alone have one structure, hence one compilation."""
+
+    def scene(x: float) -> Scene:
+        return Scene(
+            free,
+            params={"m": x, "table": np.arange(3.0) + x, "count": 3},
+            effects=(
+                AppliedForce(problems.SphericalSpiral(R=1.0 + x, a=0.2)),
+                Friction(regularized(x), belt_velocity=0.1 * x, normal_force=3 + x),
+                Friction(LuGre(**LUGRE)),
+                Friction(DeadZone(Coulomb(1.5), width=x), belt_velocity=jnp.sin),
+            ),
+        )
+
+    leaves, structure = jax.tree.flatten(scene(1.0))
+    assert all(isinstance(leaf, jax.Array) and leaf.dtype == jnp.float64 for leaf in leaves)
+    # params 3, spiral 2, regularized Stribeck 5 with belt and load 7, LuGre 6 with belt 7, dead zone 2.
+    assert len(leaves) == 3 + 2 + 7 + 7 + 2
+    other, same = jax.tree.flatten(scene(2.0))
+    assert structure == same
+    assert hash(structure) == hash(same)
+    assert sum(bool((a != b).any()) for a, b in zip(leaves, other, strict=True)) == 7
+
+
+def regularized(x: float) -> Regularized:
+    return Regularized(Stribeck(Fc=1.0, Fs=1.0 + x, vs=0.1), width=1e-3)
+
+
+def test_numbers_can_be_replaced() -> None:
+    scene = problems.ramped_box(problems.box_lugre())
+    changed = eqx.tree_at(lambda s: s.effects[1].law.sigma0, scene, jnp.array(10.0))
+    assert {10.0} == {float(x) for x in jax.tree.leaves(changed)} - {float(x) for x in jax.tree.leaves(scene)}
+    assert 750.0 not in jax.tree.leaves(changed)
+
+
+def run(scene: Any, dof: int = 1) -> Any:
+    return simulate(scene, [0.0] * dof, [0.0] * dof, 1.0)
+
+
+one_friction: Callable[..., Any] = lambda **k: Scene(free, effects=(Friction(Viscous(1.0), **k),))  # noqa: E731
+
+REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
+    "string in params": (lambda: Scene(free, params={"m": "2"}), r"params\['m'\] must be a real number.*'2' was given"),
+    "flag in params": (lambda: Scene(free, params={"a": {"on": True}}), r"params\['a'\]\['on'\] must be a real number"),
+    "complex in params": (lambda: Scene(free, params=[1.0, 2j]), r"params\[1\] must be a real number"),
+    "no Lagrangian": (lambda: Scene(cast_any(3.0)), r"lagrangian must be a function, but 3.0 was given"),
+    "effect not in a tuple": (
+        lambda: Scene(free, effects=cast_any(Friction(Viscous(1.0)))),
+        r"effects must be a tuple of effects, as in effects=\(effect,\)",
+    ),
+    "law without Friction": (
+        lambda: Scene(free, effects=cast_any((Viscous(1.0),))),
+        r"effects must hold AppliedForce or Friction objects.*goes into Friction\(law\)",
+    ),
+    "same name": (
+        lambda: Scene(free, effects=(AppliedForce(push, name="x"), Friction(Viscous(1.0), name="x"))),
+        "Two effects have the name 'x'",
+    ),
+    "exact beside dead zone": (
+        lambda: Scene(free, effects=(Friction(Coulomb(1.0)), Friction(DeadZone(Coulomb(1.0), 0.1)))),
+        r"friction: set-valued laws of one scene run either all by events or all by DeadZone",
+    ),
+    "unknown law": (
+        lambda: Friction(cast_any("lugre")),
+        r"needs a law or a function of slip velocity, but 'lugre' was given. Known laws:.*LuGre",
+    ),
+    "class as law": (lambda: Friction(cast_any(LuGre)), "but the class LuGre was given"),
+    "belt of text": (lambda: Friction(Viscous(1.0), belt_velocity=cast_any("fast")), "belt_velocity must be a real"),
+    "belt of two": (lambda: Friction(Viscous(1.0), belt_velocity=jnp.ones(2)), r"belt_velocity has shape \(2,\)"),
+    "load of nothing": (
+        lambda: one_friction(normal_force="floor"),
+        "normal_force='floor' names no constraint of the scene; there are: none",
+    ),
+    "along is no function": (lambda: Friction(Viscous(1.0), along=cast_any(0)), "along must be a function, but 0"),
+    "force is no function": (lambda: AppliedForce(cast_any(2.0)), r"AppliedForce fn must be a function, but 2.0"),
+    "at is no function": (lambda: AppliedForce(push, at=cast_any(1)), r"AppliedForce at must be a function, but 1"),
+    # The following are found when the run is traced.
+    "vector Lagrangian": (
+        lambda: run(Scene(lambda t, q, qd, p: 0.5 * qd**2)),
+        r"Lagrangian must return one number.*returned.*index the coordinates",
+    ),
+    "force of a wrong shape": (
+        lambda: run(Scene(free, effects=(AppliedForce(lambda t, q, qd, p: t, name="pull"),))),
+        r"AppliedForce 'pull': fn returned the shape \(\), but \(1,\) is needed.*the coordinates",
+    ),
+    "Cartesian force of a wrong shape": (
+        lambda: run(Scene(free, effects=(AppliedForce(push, at=lambda q: jnp.ones(3) * q[0]),))),
+        r"fn returned the shape \(1,\), but \(3,\) is needed.*what `at` returns",
+    ),
+    "friction on two coordinates": (lambda: run(one_friction(), 2), "2 coordinates: say along which displacement"),
+    "vector displacement": (lambda: run(one_friction(along=lambda q: q)), r"along\(q\) returned the shape \(1,\)"),
+    "vector belt": (
+        lambda: run(one_friction(belt_velocity=lambda t: jnp.ones(3) * t)),
+        r"belt_velocity\(t\) returned the shape \(3,\)",
+    ),
+    "vector load": (
+        lambda: run(one_friction(normal_force=lambda t, q, qd, p: q)),
+        r"normal_force\(t, q, qd, params\) returned the shape \(1,\)",
+    ),
+}
+
+
+def cast_any(x: Any) -> Any:
+    return x
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("name", REFUSALS)
+def test_wrong_structure_is_refused(name: str) -> None:
+    build, text = REFUSALS[name]
+    with pytest.raises(ValueError, match=text):
+        build()
+
+
+# Primitives in a traced function, with those inside of called functions and without the calls themselves.
+
+
+def primitives(fn: Callable[..., Any], *args: Any) -> Counter[str]:
+    return _count(jax.make_jaxpr(fn)(*args).jaxpr)
+
+
+def _count(jaxpr: Any) -> Counter[str]:
+    total: Counter[str] = Counter()
+    for equation in jaxpr.eqns:
+        inner = [x.jaxpr for x in equation.params.values() if isinstance(x, jax.extend.core.ClosedJaxpr)]
+        if inner:
+            total += sum((_count(x) for x in inner), Counter())
+        else:
+            total[equation.primitive.name] += 1
+    return total
+
+
+def state(scene: Scene, dof: int) -> State:
+    return State(jnp.linspace(0.5, 0.9, dof), jnp.linspace(1.0, -1.0, dof), scene.state0(jnp.zeros(dof)))
+
+
+def euler_lagrange(lagrangian: Any, t: Any, q: Any, qd: Any, p: Any) -> Any:
+    """The equations as one writes them by hand: d/dt dL/dqd = dL/dq, for one and for two coordinates."""
+
+    def equations(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        def momentum(t: Any, q: Any, qd: Any) -> Any:
+            by_q, by_qd = jax.grad(lagrangian, argnums=(1, 2))(t, q, qd, p)
+            return by_qd, by_q
+
+        _, push, by_q = jax.linearize(momentum, t, q, qd, has_aux=True)
+        still, rest = jnp.zeros_like(t), jnp.zeros_like(q)
+        if q.shape == (1,):
+            m = push(still, rest, jnp.ones_like(qd))[None]
+        else:
+            m = jax.vmap(lambda e: push(still, rest, e), out_axes=1)(jnp.eye(2))
+        return m, by_q - push(jnp.ones_like(t), qd, rest)
+
+    m, load = in_scalars(equations, t, q, qd, p, seed=q)
+    if q.shape == (1,):
+        return qd, load / m[0]
+    m00, m10, m11, r0, r1 = m[0, 0], m[1, 0], m[1, 1], load[0], load[1]
+    m00 = jnp.where(m00 > 0, m00, jnp.nan)
+    ratio = m10 / m00
+    pivot = m11 - ratio * m10
+    x1 = (r1 - ratio * r0) / jnp.where(pivot > 0, pivot, jnp.nan)
+    return qd, jnp.stack([(r0 - m10 * x1) / m00, x1])
+
+
+MECHANISMS = {
+    "box": (problems.ramped_box(), 1),
+    "spring": (problems.braked_spring(), 1),
+    "bead": (problems.spiral_bead(), 1),
+    "pendulum": (problems.spherical_pendulum(), 2),
+}
+
+
+@pytest.mark.parametrize("name", MECHANISMS)
+def test_a_scene_without_effects_traces_to_the_equations_by_hand(name: str) -> None:
+    scene, dof = MECHANISMS[name]
+    scene = eqx.tree_at(lambda s: s.effects, scene, ())
+    t, y = jnp.array(0.3), state(scene, dof)
+    ours = primitives(lambda t, y, s: scene_field(t, y, s), t, y, scene)
+    by_hand = primitives(
+        lambda t, q, qd, p, fn: euler_lagrange(fn, t, q, qd, p), t, y.q, y.qd, scene.params, scene.lagrangian
+    )
+    assert ours == by_hand
+
+
+# What differentiating and stacking bring along; none of them computes anything the equations do not hold.
+BOOKKEEPING = {
+    *("broadcast_in_dim", "convert_element_type", "squeeze", "slice", "dynamic_slice", "pad", "concatenate"),
+    *("reshape", "transpose", "select_n", "lt", "ge", "iota", "eq", "add_any", "copy", "full", "mul", "neg", "sub"),
+    *("reduce_sum", "sign", "square", "integer_pow", "gt", "stop_gradient"),
+}
+
+
+def test_frictionless_pendulum_has_only_the_functions_of_its_closed_form() -> None:
+    """Sines and cosines of the Lagrangian, the quotients of the elimination; no factorisation, no loop."""
+    scene = problems.spherical_pendulum()
+    y = state(scene, 2)
+    ours = primitives(lambda t, y, s: scene_field(t, y, s), jnp.array(0.3), y, scene)
+    closed = primitives(lambda q, qd: problems.spherical_pendulum_acceleration(q, qd), y.q, y.qd)
+    assert {"sin", "cos"} <= set(closed)
+    assert set(ours) - set(closed) <= BOOKKEEPING
+    # The Lagrangian's sine and cosine, which are their own slopes and curvatures: each is formed once.
+    assert ours["sin"] + ours["cos"] <= 2
+
+
+EFFECTS = {
+    "force": AppliedForce(push),
+    "force at a point": AppliedForce(pull, at=problems.SphericalSpiral(1.0, 0.2)),
+    "viscous": Friction(Viscous(0.3)),
+    "viscous under load": Friction(Viscous(0.3), normal_force=2.0, belt_velocity=jnp.sin),
+    "regularized": Friction(Regularized(Coulomb(1.0), 1e-3)),
+    "sign": Friction(Sign(Coulomb(1.0))),
+    "lugre": Friction(LuGre(**LUGRE)),
+}
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_an_effect_adds_only_its_own_terms(name: str) -> None:
+    """Its own action and one addition to the right-hand side; and a state only if the law has one."""
+    effect = EFFECTS[name]
+    bare, scene = problems.braked_spring(), eqx.tree_at(lambda s: s.effects, problems.braked_spring(), (effect,))
+    t = jnp.array(0.3)
+    without = primitives(lambda t, y, s: scene_field(t, y, s), t, state(bare, 1), bare)
+    with_it = primitives(lambda t, y, s: scene_field(t, y, s), t, state(scene, 1), scene)
+    q, qd = state(scene, 1)[:2]
+    z = scene.state0(q).get(scene.names[0])
+    own = primitives(lambda e, p: effect_action(e, t, q, qd, z, p), effect, scene.params)
+    assert with_it == without + own + Counter({"add": 1})
+    assert len(jax.tree.leaves(scene.state0(q))) == (1 if name == "lugre" else 0)
+    if name == "viscous":
+        # Its own terms are the velocity, a product, a sign and the shape; nothing from other laws.
+        assert {n for n in own if n not in BOOKKEEPING} == set()
+        assert own["mul"] == 1
+
+
+def effect_action(effect: Any, *args: Any) -> Any:
+    action = effect.act(*args)
+    return action.generalised, action.rate
+
+
+def test_only_a_dead_zone_brings_the_holding_force() -> None:
+    """Mass matrix and load are solved for a second and third time only where something is to be held."""
+
+    def pivots(law: Any) -> int:
+        scene = Scene(
+            problems.spherical_pendulum().lagrangian,
+            params={"m": 1.0, "R": 1.0, "g": 9.81},
+            effects=(Friction(law, along=lambda q: q[1]),),
+        )
+        return primitives(lambda t, y, s: scene_field(t, y, s), jnp.array(0.3), state(scene, 2), scene)["gt"]
+
+    # Each pivot is compared with zero.
+    assert pivots(Sign(Coulomb(1.0))) == 2
+    assert pivots(DeadZone(Coulomb(1.0), 1e-3)) == 6

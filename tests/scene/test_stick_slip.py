@@ -1,0 +1,352 @@
+"""Exact events of the box, belts with other laws, a pendulum and a bouncing ball against references."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import jaxmodsim as jms
+from jaxmodsim import problems
+
+from ..helpers.differences import central_difference
+
+TIGHT: dict[str, Any] = {"rtol": 1e-12, "atol": 1e-14, "max_events": 16}
+
+
+def box(x: Any) -> Any:
+    """The first event, to be differentiated by the numbers of the run, and the run."""
+    law, ramp = x
+    arguments: dict[str, Any] = {"ts": jnp.linspace(0.0, 3.0, 32), "adjoint": dfx.ForwardMode(), **TIGHT}
+    run = jms.simulate(problems.ramped_box(law, ramp=ramp), [0.0], [0.0], 3.0, throw=False, **arguments)
+    events = run.events
+    seen = run.t, run.q[:, 0], run.qd[:, 0], run.mode["friction"], run.forces, events, run.stats["num_events"]
+    return events.t[0], seen
+
+
+@pytest.mark.parametrize(
+    ("law", "ramp"), [(jms.Coulomb(1.5, 1.75), 1.3), (problems.box_stribeck(), 1.0)], ids=["coulomb", "stribeck"]
+)
+def test_box_breaks_away_when_the_pull_reaches_the_limit(law: Any, ramp: float) -> None:
+    slopes, seen = jax.jit(jax.jacfwd(box, has_aux=True))((law, jnp.array(ramp)))
+    t, q, qd, mode, forces, events, count = jax.tree.map(np.asarray, seen)
+    release = 1.75 / ramp
+    np.testing.assert_allclose(events.t[0], release, atol=1e-10)
+    np.testing.assert_allclose(slopes[0].Fs, 1 / ramp, atol=1e-8)
+    np.testing.assert_allclose(slopes[0].Fc, 0.0, atol=1e-8)
+    np.testing.assert_allclose(slopes[1], -1.75 / ramp**2, atol=1e-8)
+    assert count == 1
+    assert (events.effect[0], events.before[0], events.after[0]) == (1, 0, 1)
+    sticks = t < release
+    np.testing.assert_array_equal(mode, np.where(sticks, 0, 1))
+    np.testing.assert_array_equal(qd[sticks], 0.0)
+    np.testing.assert_array_equal(q[sticks], 0.0)
+    np.testing.assert_allclose(forces["friction"][sticks], ramp * t[sticks], rtol=1e-15)
+    t, q, qd = t[~sticks], q[~sticks], qd[~sticks]
+    if isinstance(law, jms.Coulomb):
+        # m v' = ramp t - Fc after the release, with a mass of 2 kg.
+        v = (ramp * (t**2 - release**2) / 2 - 1.5 * (t - release)) / 2
+        x = (ramp * ((t**3 - release**3) / 6 - release**2 * (t - release) / 2) - 1.5 * (t - release) ** 2 / 2) / 2
+        np.testing.assert_allclose(qd, v, atol=1e-11)
+        np.testing.assert_allclose(q, x, atol=1e-11)
+    else:
+        exact = solve_ivp(
+            lambda t, y: [y[1], (ramp * t - 1.5 - 0.25 * np.exp(-((y[1] / 0.2) ** 2)) - 0.1 * y[1]) / 2],
+            (release, 3.0),
+            [0.0, 0.0],
+            "DOP853",
+            t,
+            rtol=1e-13,
+            atol=1e-15,
+        )
+        np.testing.assert_allclose(q, exact.y[0], atol=1e-9)
+        np.testing.assert_allclose(qd, exact.y[1], atol=1e-9)
+
+
+def solve_to(rate: Callable[..., Any], t0: float, y0: Any, t1: float, guards: list[Callable[..., Any]]) -> Any:
+    """scipy's solution up to the first guard that falls through zero: its time, its index (or None) and the state."""
+    events = []
+    for guard in guards:
+
+        def event(t: float, y: Any, guard: Any = guard) -> float:
+            return guard(t, y)
+
+        event.terminal, event.direction = True, -1.0  # pyright: ignore[reportFunctionMemberAccess]
+        events.append(event)
+    # Short steps, so that the event is as exact on the dense output as the steps are.
+    found = solve_ivp(rate, (t0, t1), y0, "DOP853", rtol=1e-13, atol=1e-15, events=events, max_step=0.05)
+    fired = [i for i, t in enumerate(found.t_events) if len(t)]
+    return found.t[-1], fired[0] if fired else None, found.y[:, -1]
+
+
+def stribeck_cycle(numbers: dict[str, float], n: int) -> np.ndarray:
+    """Times of the first n events of a mass that starts in stick at q = 0, by scipy."""
+    m, k, belt, p = numbers["m"], numbers["k"], numbers["belt"], numbers
+
+    def rate(t: float, y: Any) -> list[float]:
+        del t
+        v = belt - y[1]
+        force = p["Fc"] + (p["Fs"] - p["Fc"]) * np.exp(-((np.maximum(v, 0.0) / p["vs"]) ** p["exponent"])) + p["Fv"] * v
+        return [y[1], (-k * y[0] + force) / m]
+
+    t, x, times = 0.0, 0.0, []
+    while len(times) < n:
+        t += (p["Fs"] / k - x) / belt
+        times.append(t)
+        t, fired, y = solve_to(rate, t, [p["Fs"] / k, belt], t + 5.0, [lambda t, y: belt - y[1]])
+        assert fired == 0
+        assert abs(k * y[0]) < p["Fs"]
+        x = y[0]
+        times.append(t)
+    return np.array(times[:n])
+
+
+def changed_cycle(numbers: dict[str, float], name: str, x: float) -> np.ndarray:
+    return stribeck_cycle({**numbers, name: x}, 3)
+
+
+def stribeck_times(numbers: dict[str, Any], adjoint: Any) -> Any:
+    p = dict(numbers)
+    oscillator = {name: p.pop(name) for name in ("m", "k", "belt")}
+    scene = problems.belt_oscillator(jms.Stribeck(**p), **oscillator)
+    # The law's second derivatives are singular at rest for exponents below 2. They enter the derivatives of an implicit
+    # step, but not those of an explicit one.
+    arguments = {"adjoint": adjoint, "throw": False, "solver": dfx.Tsit5(), **TIGHT}
+    return jms.simulate(scene, jnp.zeros(1), jnp.reshape(oscillator["belt"], (1,)), 3.5, **arguments).events.t[:4]
+
+
+@jax.jit
+def stribeck_slopes(numbers: dict[str, Any]) -> Any:
+    def times(x: Any) -> Any:
+        t = stribeck_times(x, dfx.ForwardMode())
+        return t, t
+
+    return jax.jacfwd(times, has_aux=True)(numbers)
+
+
+def test_belt_oscillator_under_a_law_that_falls() -> None:
+    for exponent in (1.0, 2.0):
+        numbers = {**problems.BELT_OSCILLATOR, **problems.BELT_STRIBECK, "exponent": exponent}
+        slopes, times = stribeck_slopes({name: jnp.asarray(x) for name, x in numbers.items()})
+        np.testing.assert_allclose(times, stribeck_cycle(numbers, 4), atol=1e-9)
+        for name, x in numbers.items():
+            step = 1e-3 * x
+            exact = central_difference(partial(changed_cycle, numbers, name), x, step)
+            np.testing.assert_allclose(slopes[name][:3], exact, rtol=1e-6, atol=1e-7, err_msg=name)
+
+
+BELTS = {**problems.COUPLED_BELTS}
+LAWS = problems.COUPLED_BELTS_LAWS
+
+
+def coupled_rate(modes: Any) -> Callable[..., Any]:
+    """Two masses on the belt by Newton's law, with friction forces (on the mass) by modes."""
+    c, m, k = BELTS["coupling"], (BELTS["m1"], BELTS["m2"]), (BELTS["k1"], BELTS["k2"])
+
+    def rate(t: float, y: Any) -> list[float]:
+        del t
+        pull = -k[0] * y[0] - c * (y[0] - y[1]), -k[1] * y[1] + c * (y[0] - y[1])
+        a = [0.0 if modes[i] == 0 else (pull[i] - modes[i] * LAWS[i]["Fc"]) / m[i] for i in (0, 1)]
+        return [y[2], y[3], *a]
+
+    return rate
+
+
+def coupled_guards(modes: Any) -> list[tuple[int, int, Callable[..., Any]]]:
+    """Element, its mode after, and the guard, for everything that may end these modes."""
+    c, k, belt = BELTS["coupling"], (BELTS["k1"], BELTS["k2"]), BELTS["belt"]
+    guards = []
+    for i in (0, 1):
+
+        def pull(y: Any, i: int = i) -> float:
+            return -k[i] * y[i] + (-1 if i == 0 else 1) * c * (y[0] - y[1])
+
+        if modes[i] == 0:
+            guards.append((i, 1, lambda t, y, i=i, pull=pull: LAWS[i]["Fs"] - pull(y)))
+            guards.append((i, -1, lambda t, y, i=i, pull=pull: LAWS[i]["Fs"] + pull(y)))
+        else:
+            guards.append((i, 0, lambda t, y, i=i, s=modes[i]: s * (y[2 + i] - belt)))
+    return guards
+
+
+COUPLED_STARTS = [([0.0, 0.0], [0.1, 0.1]), ([0.02, -0.05], [0.1, 0.1]), ([0.05, 0.05], [-0.3, 0.1])]
+
+
+def test_coupled_belts_follow_scipy_through_their_modes() -> None:
+    """Events are taken from the run; the reference finds the same ones first, at the same times."""
+
+    longer: dict[str, Any] = TIGHT | {"max_events": 32}
+
+    @jax.jit
+    def observe(q0: Any, qd0: Any) -> Any:
+        run = jms.simulate(problems.coupled_belts(), q0, qd0, 4.0, throw=False, **longer)
+        return run.events, run.q[-1], run.qd[-1]
+
+    seen = set()
+    for q0, qd0 in COUPLED_STARTS:
+        events, q, qd = observe(jnp.array(q0), jnp.array(qd0))
+        n = int(np.isfinite(events.t).sum())
+        assert 10 < n < 32
+        modes = [int(np.sign(round(v - BELTS["belt"], 12))) for v in qd0]
+        t, y = 0.0, np.array([*q0, *qd0])
+        for i in range(n):
+            guards = coupled_guards(modes)
+            t, fired, y = solve_to(coupled_rate(modes), t, y, 4.0, [guard for *_, guard in guards])
+            assert fired is not None
+            element, after, _ = guards[fired]
+            assert (int(events.effect[i]), int(events.before[i])) == (element, modes[element])
+            np.testing.assert_allclose(events.t[i], t, atol=1e-9)
+            modes[element] = int(events.after[i])
+            assert modes[element] == after
+            if after == 0:
+                y[2 + element] = BELTS["belt"]
+            seen.add(tuple(modes))
+        t, fired, y = solve_to(coupled_rate(modes), t, y, 4.0, [guard for *_, guard in coupled_guards(modes)])
+        assert fired is None
+        np.testing.assert_allclose([*q, *qd], y, atol=1e-8)
+        if q0 == [0.0, 0.0]:
+            limits = {"Fs1": LAWS[0]["Fs"], "Fs2": LAWS[1]["Fs"]}
+            first = problems.coupled_belts_first_slip(**{k: BELTS[k] for k in ("k1", "k2", "belt")}, **limits)
+            np.testing.assert_allclose(events.t[0], first.t, atol=1e-12)
+            assert int(events.effect[0]) == int(first.which)
+    assert {(0, 0), (-1, 0), (0, -1), (-1, -1)} <= seen
+
+
+def test_pendulum_loses_torque_times_angle_and_rests_within_the_range() -> None:
+    numbers = {**problems.STICK_SLIP_PENDULUM}
+    fs, weight = numbers.pop("Fs"), numbers["m"] * numbers["g"] * numbers["l"]
+
+    @jax.jit
+    def observe(q0: Any, ts: Any) -> Any:
+        scene = problems.stick_slip_pendulum()
+        run = jms.simulate(scene, q0, jnp.zeros(1), 12.0, ts=ts, throw=False, **TIGHT)
+        return run.events, run.q[:, 0], run.qd[:, 0], run.mode["friction"], run.forces["friction"]
+
+    rests = []
+    for q0 in (1.4, -1.1, 0.75, 0.3, 0.1):
+        ends = jnp.full(17, 12.0)
+        events, *_ = observe(jnp.array([q0]), ends)
+        n = int(np.isfinite(events.t).sum())
+        # Again, with the angle kept at the reversals.
+        _, q, qd, mode, force = observe(jnp.array([q0]), ends.at[:16].set(jnp.minimum(events.t, 12.0)))
+        turns = [q0]
+        while weight * abs(np.sin(turns[-1])) > fs:
+            turns.append(float(problems.stick_slip_pendulum_turn(turns[-1], **numbers)))
+        assert len(turns) == n + 1
+        np.testing.assert_allclose(q[:n], turns[1:], atol=1e-10)
+        np.testing.assert_allclose(qd[:n], 0.0, atol=1e-12)
+        np.testing.assert_array_equal(events.after[: max(n - 1, 0)], np.sign(np.diff(turns))[1:])
+        assert mode[-1] == 0
+        np.testing.assert_allclose(q[-1], turns[-1], atol=1e-10)
+        np.testing.assert_allclose(force[-1], -weight * np.sin(turns[-1]), atol=1e-9)
+        # The energy that the angles lose, swing by swing, without the closed form.
+        lost = weight * (np.cos(turns[1:]) - np.cos(turns[:-1]))
+        np.testing.assert_allclose(lost, numbers["Fc"] * np.abs(np.diff(turns)), atol=1e-12)
+        rests.append(weight * np.sin(turns[-1]))
+    assert np.abs(rests).max() <= fs
+    assert np.abs(rests).max() > 0.2 * fs
+    slope = jax.grad(lambda fc: problems.stick_slip_pendulum_turn(1.4, **{**numbers, "Fc": fc}))(numbers["Fc"])
+    by_steps = central_difference(
+        lambda fc: problems.stick_slip_pendulum_turn(1.4, **{**numbers, "Fc": fc}), numbers["Fc"], 1e-3
+    )
+    np.testing.assert_allclose(slope, by_steps, rtol=1e-10)
+
+
+def drop(ball: problems.BouncingBall, y0: Any, t1: Any, adjoint: Any = None, **options: Any) -> Any:
+    hold, tol = ball.hold if options.pop("hold", False) else None, options.pop("tol", 1e-12)
+    solver = jms.EventSolver(dfx.Tsit5(), ball.guards, ball.reset, hold=hold, max_events=options.pop("max_events", 16))
+    return dfx.diffeqsolve(
+        dfx.ODETerm(ball.field),
+        solver,
+        0.0,
+        t1,
+        None,
+        solver.start(0.0, y0, 0.0),
+        stepsize_controller=jms.EventController(dfx.PIDController(rtol=tol, atol=1e-2 * tol)),
+        adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        throw=False,
+        **options,
+    )
+
+
+def bounces(x: Any, t1: Any, adjoint: Any = None) -> Any:
+    ys = drop(problems.BouncingBall(e=x["e"], g=x["g"]), x["y0"], t1, adjoint).ys
+    t = ys.log.t[0, :5]
+    return jnp.where(jnp.isfinite(t), t, 0.0), ys.y[0]
+
+
+@partial(jax.jacfwd, argnums=(0, 1, 2))
+def exact_slopes(e: Any, h: Any, g: Any) -> Any:
+    return problems.bouncing_ball_bounces(5, h=h, e=e, g=g)
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_derivatives_of_bounces(mode: str) -> None:
+    if mode == "forward":
+        slopes = jax.jit(jax.jacfwd(partial(bounces, adjoint=dfx.ForwardMode())))
+    else:
+        slopes = jax.jit(jax.jacrev(bounces))
+    x = {"e": jnp.array(0.7), "g": jnp.array(9.81), "y0": jnp.array([1.3, 0.0])}
+    times, _ = slopes(x, 2.4)
+    by_e, by_h, by_g = exact_slopes(0.7, 1.3, 9.81)
+    np.testing.assert_allclose(times["e"], by_e, atol=1e-9)
+    np.testing.assert_allclose(times["y0"][:, 0], by_h, atol=1e-9)
+    np.testing.assert_allclose(times["g"], by_g, atol=1e-9)
+
+    # The saltation matrix: the state after one bounce by the state before, less the free flights.
+    fall = float(np.sqrt(2 * 1.3 / 9.81))
+    _, jump = slopes(x, fall + 0.2)
+    flight = [np.array([[1.0, t], [0.0, 1.0]]) for t in (fall, 0.2)]
+    saltation = np.linalg.solve(flight[1], jump["y0"]) @ np.linalg.inv(flight[0])
+    speed = -9.81 * fall
+    np.testing.assert_allclose(saltation, [[-0.7, 0.0], [-9.81 * 1.7 / speed, -0.7]], atol=1e-9)
+
+
+def test_bouncing_ball_to_the_end_of_all_bounces() -> None:
+    for e in (0.5, 0.8):
+        ball = problems.BouncingBall(e=e)
+        stop = problems.bouncing_ball_rest(h=1.0, e=e)
+        solution = drop(ball, ball.dropped(1.0), 1.5 * stop, max_events=128)
+        assert float(solution.ys.trouble[0]) == 1.0
+        assert solution.result == dfx.RESULTS.dt_min_reached
+        np.testing.assert_allclose(solution.ys.t[0], stop, atol=1e-8)
+        np.testing.assert_allclose(solution.ts[0], stop, atol=1e-8)
+        n = int(solution.ys.events[0])
+        exact = problems.bouncing_ball_bounces(n, h=1.0, e=e)
+        np.testing.assert_allclose(solution.ys.log.t[0, :n], exact, atol=1e-10)
+
+
+def test_bouncing_ball_comes_to_rest_where_it_may() -> None:
+    e = 0.5
+    ball, stop = problems.BouncingBall(e=e), float(problems.bouncing_ball_rest(h=1.0, e=e))
+    ts = jnp.linspace(0.0, 1.5 * stop, 301)
+    solution = drop(ball, ball.dropped(1.0), ts[-1], max_events=128, hold=True, saveat=dfx.SaveAt(ts=ts))
+    assert solution.result == dfx.RESULTS.successful
+    height, velocity = problems.bouncing_ball_motion(ts, h=1.0, e=e)
+    np.testing.assert_allclose(solution.ys.y[:, 0], height, atol=1e-9)
+    np.testing.assert_allclose(solution.ys.y[:, 1], velocity, atol=1e-9)
+    resting = np.asarray(ts) > stop
+    np.testing.assert_array_equal(solution.ys.mode, resting)
+    np.testing.assert_array_equal(solution.ys.y[resting], 0.0)
+    assert float(solution.ys.trouble[-1]) == 0.0
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_no_bouncing_ball_falls_through_the_floor(dtype: str) -> None:
+    """The last bounces are so low that they are rounding, however large the steps are that look for the next one."""
+    es = jnp.linspace(0.05, 0.9, 60).astype(dtype)
+
+    def run(e: Any) -> Any:
+        ball, t1 = problems.BouncingBall(e=e, g=jnp.asarray(9.81, dtype)), jnp.asarray(20.0, dtype)
+        return drop(ball, ball.dropped(1.0), t1, max_events=256, tol=1e-6).ys
+
+    last = jax.jit(jax.vmap(run))(es)
+    np.testing.assert_array_equal(last.trouble[:, 0], 1.0)
+    np.testing.assert_allclose(last.y[:, 0, 0], 0.0, atol=1e-8)
+    rest = jax.vmap(lambda e: problems.bouncing_ball_rest(h=1.0, e=e))(es.astype(float))
+    np.testing.assert_allclose(last.t[:, 0], rest, rtol=1e-4 if dtype == "float32" else 1e-8)

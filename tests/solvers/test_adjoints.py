@@ -1,0 +1,202 @@
+"""The solvers under all adjoints of diffrax, and in both directions of time: right, or refused by a sentence."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmodsim import Coulomb, EventController, EventSolver, Friction, Gauss, Regularized, Rodas5P, Scene, simulate
+
+from ..helpers.differences import central_difference
+
+X = jnp.array([3.0, 2.0, -0.5])
+METHODS: dict[str, tuple[Any, Any]] = {
+    "Rodas5P": (Rodas5P(), dfx.PIDController(1e-9, 1e-9)),
+    "Gauss": (Gauss(), dfx.ConstantStepSize()),
+}
+ADJOINTS = {
+    "checkpoints": dfx.RecursiveCheckpointAdjoint(),
+    "direct": dfx.DirectAdjoint(),
+    "backsolve": dfx.BacksolveAdjoint(),
+    "backsolve by another solver": dfx.BacksolveAdjoint(
+        solver=dfx.Tsit5(), stepsize_controller=dfx.PIDController(1e-9, 1e-9)
+    ),
+    "forward": dfx.ForwardMode(),
+}
+TS = jnp.array([0.5, 1.3, 2.0])
+
+
+def van_der_pol(t: Any, y: Any, mu: Any) -> Any:
+    return y[1], mu * (1 - y[0] ** 2) * y[1] - y[0] + 0.1 * jnp.sin(t)
+
+
+def total(x: Any, method: str, adjoint: Any) -> Any:
+    """Sum of the positions at `TS` of an oscillator with mu = x[0] that starts at x[1:]."""
+    solver, controller = METHODS[method]
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(van_der_pol),
+        solver,
+        0.0,
+        2.0,
+        0.01,
+        (x[1], x[2]),
+        args=x[0],
+        saveat=dfx.SaveAt(ts=TS),
+        stepsize_controller=controller,
+        adjoint=adjoint,
+        max_steps=1024,
+    )
+    ys: Any = solution.ys
+    return jnp.sum(ys[0])
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("adjoint", ADJOINTS)
+def test_every_adjoint_gives_the_gradient(method: str, adjoint: str) -> None:
+    """Against differences of the run by another method, whose own error is 1e-11: step 1e-3, rounding 1e-9."""
+    way = jax.jacfwd if adjoint == "forward" else jax.grad
+    gradient = jax.jit(way(lambda x: total(x, method, ADJOINTS[adjoint])))(X)
+    value = jax.jit(lambda x: total(x, "Gauss", dfx.DirectAdjoint()))
+    for i in range(3):
+        slope = central_difference(lambda x, i=i: value(X.at[i].set(x)), float(X[i]), 1e-3)
+        np.testing.assert_allclose(gradient[i], slope, rtol=1e-6)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_time_may_run_backward(method: str) -> None:
+    """There and back again, and against the closed form of an equation that depends on time."""
+    solver, controller = METHODS[method]
+
+    def solve(field: Any, t0: float, t1: float, y0: Any) -> Any:
+        dt0 = 0.01 if t1 > t0 else -0.01
+        return dfx.diffeqsolve(dfx.ODETerm(field), solver, t0, t1, dt0, y0, X[0], stepsize_controller=controller).ys
+
+    start = jnp.array([2.0, -0.5])
+    there = solve(lambda t, y, mu: jnp.stack(van_der_pol(t, y, mu)), 0.0, 1.0, start)[0]
+    back = solve(lambda t, y, mu: jnp.stack(van_der_pol(t, y, mu)), 1.0, 0.0, there)[0]
+    np.testing.assert_allclose(back, start, rtol=1e-6)
+    decay = solve(lambda t, y, _: -0.5 * t * y, 1.0, -2.0, jnp.ones(1))
+    np.testing.assert_allclose(decay, [[np.exp(0.25 * (1.0 - 4.0))]], rtol=1e-8)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_dense_output_backward(method: str) -> None:
+    """What is saved between the steps, of exp(-t) from t = 1 back to 0."""
+    solver, controller = METHODS[method]
+    ts = jnp.linspace(1.0, 0.0, 23)
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(lambda t, y, args: -y),
+        solver,
+        1.0,
+        0.0,
+        -0.03,
+        jnp.exp(-1.0),
+        saveat=dfx.SaveAt(ts=ts),
+        stepsize_controller=controller,
+    )
+    ys: Any = solution.ys
+    np.testing.assert_allclose(ys, np.exp(-ts), rtol=1e-7)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_terms_of_no_ordinary_differential_equation_are_refused(method: str) -> None:
+    control = dfx.ControlTerm(lambda t, y, args: -y, lambda t0, t1: t1**2 - t0**2)
+    for terms, kind in ((control, "ControlTerm"), (dfx.MultiTerm(dfx.ODETerm(lambda t, y, a: -y), control), "Multi")):
+        with pytest.raises(ValueError, match=f"{method} solves ordinary differential equations, but a {kind}"):
+            dfx.diffeqsolve(terms, METHODS[method][0], 0.0, 1.0, 0.1, jnp.ones(1))
+
+
+def fall(t: Any, s: Any, g: Any) -> Any:
+    del t
+    return s.rate(jnp.stack([s.y[1], -g]))
+
+
+def bounced(g: Any, t0: Any = 0.0, t1: Any = 1.0, adjoint: Any = None) -> Any:
+    """Height [m] of a ball dropped from 1 m at t0, which bounces once."""
+    solver = EventSolver(
+        dfx.Tsit5(),
+        lambda t, s, args: s.y[:1],
+        lambda t, s, args, fired: s._replace(y=s.y * jnp.array([0.0, -0.8])),
+        log=False,
+    )
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(fall),
+        solver,
+        t0,
+        t1,
+        None,
+        solver.start(t0, jnp.array([1.0, 0.0])),
+        args=g,
+        stepsize_controller=EventController(dfx.PIDController(1e-8, 1e-10)),
+        adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        max_steps=256,
+    )
+    ys: Any = solution.ys
+    return ys.y[0, 0]
+
+
+G = jnp.asarray(9.81)
+
+
+def test_events_in_time_that_runs_backward_are_refused() -> None:
+    with pytest.raises(RuntimeError, match="EventSolver runs forward in time, but t1 < t0: count time the other way"):
+        bounced(G, 1.0, 0.0)
+    run = eqx.filter_jit(bounced)
+    assert run(G, 0.0, 1.0) > 0
+    with pytest.raises(RuntimeError, match="EventSolver runs forward in time, but t1 < t0"):
+        run(G, jnp.asarray(1.0), jnp.asarray(0.0))
+    # A run of no length runs in no direction.
+    assert bounced(G, 1.0, 1.0) == run(G, jnp.asarray(1.0), jnp.asarray(1.0)) == 1.0
+
+
+def test_events_under_backsolve_are_refused() -> None:
+    for transform in (jax.grad, lambda fn: jax.jit(jax.grad(fn))):
+        with pytest.raises(ValueError, match=r"diffrax.BacksolveAdjoint does not pass events: leave the adjoint out"):
+            transform(lambda g: bounced(g, adjoint=dfx.BacksolveAdjoint()))(G)
+
+
+SPRING = Scene(
+    lambda t, q, qd, p: 0.5 * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2,
+    params={"k": 4.0},
+    effects=(Friction(Regularized(Coulomb(Fc=0.1), 0.5)),),
+)
+BRAKED = Scene(SPRING.lagrangian, params={"k": 4.0}, effects=(Friction(Coulomb(Fc=0.1)),))
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("scene", [SPRING, BRAKED], ids=["smooth", "events"])
+def test_simulate_refuses_backsolve(scene: Scene) -> None:
+    with pytest.raises(ValueError, match=r"simulate cannot use diffrax.BacksolveAdjoint, .*Leave adjoint out"):
+        simulate(scene, [1.0], [0.0], 1.0, adjoint=dfx.BacksolveAdjoint())
+
+
+@pytest.mark.parametrize("scene", [SPRING, BRAKED], ids=["smooth", "events"])
+def test_simulate_takes_the_other_adjoints(scene: Scene) -> None:
+    def end(k: Any, adjoint: Any, rtol: float = 1e-6) -> Any:
+        changed = eqx.tree_at(lambda s: s.params["k"], scene, k)
+        options: dict[str, Any] = {"rtol": rtol, "atol": 1e-2 * rtol, "max_steps": 1024}
+        return simulate(changed, [1.0], [0.0], 2.0, adjoint=adjoint, **options).q[-1, 0]
+
+    k = jnp.asarray(4.0)
+    forward = jax.jacfwd(end)(k, dfx.ForwardMode())
+    # Steps of another size make another error, here of 1e-10 over a difference of 0.02.
+    slope = central_difference(lambda x: end(jnp.asarray(x), None, 1e-10), 4.0, 2e-2)
+    np.testing.assert_allclose(forward, slope, rtol=1e-4)
+    # With fewer checkpoints than steps some are made again, and their error estimate with another rounding: the steps
+    # differ a little, the more the tighter the tolerance.
+    for adjoint in (dfx.RecursiveCheckpointAdjoint(), dfx.DirectAdjoint()):
+        np.testing.assert_allclose(jax.grad(end)(k, adjoint), forward, rtol=1e-5)
+    tight = jax.jacfwd(end)(k, dfx.ForwardMode(), 1e-9)
+    np.testing.assert_allclose(jax.grad(end)(k, None, 1e-9), tight, rtol=1e-11)
+
+
+def test_simulate_looks_at_no_direction_of_time_in_the_run() -> None:
+    """It checks the times itself: a look in the run would call back to Python, and keep the run out of JAX's cache."""
+    run = lambda t1: simulate(BRAKED, [1.0], [0.0], t1, throw=False).q  # noqa: E731
+    assert "forward in time" not in str(jax.make_jaxpr(run)(1.0))
+    plain = jax.make_jaxpr(lambda t1: bounced(G, 0.0, t1))(1.0)
+    assert "callback" in str(plain)

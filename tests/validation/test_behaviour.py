@@ -1,0 +1,213 @@
+"""The behaviour bench: what laws do in the standard experiments, by numbers and closed forms."""
+
+import dataclasses
+import inspect
+import json
+from typing import TypeVar
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from jaxmodsim import SimulationError, friction
+from jaxmodsim._core.parameters import modules_of
+from jaxmodsim._core.state_dependent import Varying
+from jaxmodsim.cli import _behaviour
+from jaxmodsim.friction import AbstractLaw, Dahl, LuGre
+from jaxmodsim.plot import behaviour_figure
+from jaxmodsim.validation.behaviour import BY_NATURE, EXPERIMENTS, Finding, Verdict, by_nature, run_bench, specimens
+from jaxmodsim.validation.behaviour._drive import SAMPLES, path, respond
+from jaxmodsim.validation.behaviour._laws import DEFLECTION, FC, FS, SIGMA0, WIDTH, Specimen
+
+BENCH = {each.name: each for each in specimens()}
+# Experiments with a prescribed motion compile in no time; those with a mass take some seconds for each law.
+WITH_MASS = ("break-away", "stick-slip", "creep")
+PRESCRIBED = {name: each for name, each in EXPERIMENTS.items() if name not in WITH_MASS}
+# These stand for all: the command runs the others, too.
+KINDS = ("Coulomb", "Coulomb, stiction", "Regularized", "Dahl", "LuGre", "ElastoPlastic", "MaxwellSlip, 4, C")
+
+
+@pytest.fixture(scope="module")
+def outcomes():
+    prescribed = run_bench(experiments=PRESCRIBED)
+    with_mass = run_bench([BENCH[name] for name in KINDS], {name: EXPERIMENTS[name] for name in WITH_MASS})
+    return {name: prescribed[name] | with_mass.get(name, {}) for name in prescribed}
+
+
+@pytest.mark.quick
+def test_every_law_and_wrapper_is_on_the_bench():
+    shown = set()
+    for specimen in BENCH.values():
+        parts = [module for _, module in modules_of(specimen.law)]
+        shown |= {type(part).__name__ for part in parts}
+        shown |= {"asymmetric" for part in parts if hasattr(part, "forward")}
+        shown |= {"scaled_by" for part in parts if isinstance(part, Varying)}
+        shown |= {fall.__name__ for part in parts if (fall := getattr(part, "fall", None)) is not None}
+    public = {name: value for name, value in vars(friction).items() if not name.startswith(("_", "Abstract"))}
+    laws = {name for name, value in public.items() if inspect.isclass(value) and issubclass(value, AbstractLaw)}
+    functions = {name: inspect.signature(value) for name, value in public.items() if inspect.isfunction(value)}
+    # A function that wraps a law returns one of the kind that it was given.
+    wrappers = {name for name, signature in functions.items() if isinstance(signature.return_annotation, TypeVar)}
+    wanted = laws | wrappers | {"exponential", "lorentzian"}
+    assert len(laws) >= 12
+    assert wrappers >= {"asymmetric", "scaled_by"}
+    assert wanted <= shown, f"not on the bench: {sorted(wanted - shown)}"
+
+
+def test_no_law_fails_but_by_nature(outcomes):
+    failed = [
+        f"{law}, {name}: {outcome.finding.number:.3g}. {outcome.finding.sentence}"
+        for law, of in outcomes.items()
+        for name, outcome in of.items()
+        if outcome.verdict is Verdict.FAIL
+    ]
+    assert not failed, "\n".join(failed)
+
+
+PASS, NATURE, NOT = Verdict.PASS, Verdict.BY_NATURE, Verdict.NOT_APPLICABLE
+
+
+@pytest.mark.parametrize(
+    ("law", "experiment", "verdict"),
+    [
+        ("LuGre", "creep", NATURE),
+        ("Dahl", "creep", NATURE),
+        ("Regularized", "creep", NATURE),
+        ("ElastoPlastic", "creep", PASS),
+        ("MaxwellSlip, 4, C", "creep", PASS),
+        ("Coulomb", "creep", PASS),
+        ("MaxwellSlip, 4", "memory", PASS),
+        ("MaxwellSlip, 4, C", "memory", PASS),
+        ("LuGre", "memory", NATURE),
+        ("ElastoPlastic", "memory", NATURE),
+        ("Stribeck, Gauss", "memory", NOT),
+        ("Dahl", "presliding", PASS),
+        ("Stribeck, Gauss", "presliding", NATURE),
+        ("DeadZone", "presliding", NOT),
+        ("DeadZone", "passivity", NOT),
+        ("LuGre", "break-away", PASS),
+        ("Coulomb, stiction", "break-away", NATURE),
+        ("LuGre", "lag", PASS),
+        ("Armstrong", "lag", PASS),
+        ("Stribeck, Gauss", "lag", NATURE),
+        ("Dahl", "lag", NATURE),
+        ("LuGre", "stick-slip", PASS),
+        ("Coulomb, stiction", "stick-slip", PASS),
+        ("Coulomb", "stick-slip", NATURE),
+        ("Dahl", "stick-slip", NATURE),
+        ("LuGre", "passivity", NATURE),
+        ("LuGre, vd", "passivity", PASS),
+        ("Dahl", "passivity", PASS),
+        ("MaxwellSlip, 4, C", "passivity", PASS),
+    ],
+)
+def test_verdicts(outcomes, law, experiment, verdict):
+    outcome = outcomes[law][experiment]
+    assert outcome.verdict is verdict, outcome.finding.sentence
+    assert (verdict is PASS) == (outcome.reason == "")
+
+
+def test_every_law_has_its_steady_curve(outcomes):
+    for law, of in outcomes.items():
+        # Armstrong's stiction is not all back after a reversal; forward its curve is right, too.
+        assert of["characteristic"].verdict is (NATURE if law == "Armstrong" else PASS), law
+
+
+def test_numbers_that_are_known(outcomes):
+    # Without rate dependence the break-away force is the stiction, seen in samples of the load, 0.64 mN apart.
+    stiction = outcomes["Coulomb, stiction"]["break-away"].finding.lines[0].y
+    np.testing.assert_allclose(stiction, FS, atol=7e-4)
+    # Slowly loaded, LuGre comes near its stiction force; fast, all that is left is the Coulomb force.
+    lugre = outcomes["LuGre"]["break-away"].finding.lines[0].y
+    assert (np.diff(lugre[:-1]) < 0).all()
+    assert (lugre[-2:] > FC).all()
+    assert (lugre[-2:] < 1.1 * FC).all()
+    assert 0.97 * FS < lugre[0] < FS
+    # A smooth law moves at the velocity at which it balances the load, between means that are 8 s apart.
+    load = 0.4 + 0.2 * np.sin(2.0 * np.pi * np.arange(1000) / 1000)
+    expected = 8e6 * WIDTH * np.mean(np.arctanh(load / FS))
+    assert outcomes["Regularized"]["creep"].finding.number == pytest.approx(expected, rel=1e-3)
+
+
+def test_dahl_keeps_its_closed_forms():
+    amplitude, leg = 1.3 * DEFLECTION, SAMPLES // 16
+    x = path(0.0, *(amplitude, -amplitude) * 8, samples=leg)
+    dx = np.diff(x, prepend=0.0)
+    run = respond(Dahl(SIGMA0, FC), np.sign(dx), np.abs(dx))
+    saturation = FC * np.tanh(SIGMA0 * amplitude / FC)
+    # The last leg but one ends at the upper turn.
+    assert run.force[-leg - 1] == pytest.approx(saturation, rel=1e-9)
+    assert run.force[-1] == pytest.approx(-saturation, rel=1e-9)
+    loss = 4.0 * FC * (amplitude - FC / SIGMA0 * np.tanh(SIGMA0 * amplitude / FC))
+    # The trapezoidal rule over legs of 512 samples.
+    assert float(np.sum(run.work[-2 * leg :])) == pytest.approx(loss, rel=1e-4)
+
+
+def test_a_passive_lugre_passes_and_a_miss_that_nothing_explains_fails():
+    bristle = BENCH["LuGre"].law
+    assert isinstance(bristle, LuGre)
+    passivity = EXPERIMENTS["passivity"]
+    # The condition of the class: sigma2 > sigma1 (Fs - Fc)/Fc = 0.5 sigma1.
+    damped = dataclasses.replace(bristle, sigma2=0.6 * bristle.sigma1)
+    assert passivity(Specimen("passive", damped, BENCH["LuGre"].steady)).verdict is PASS
+    fake = dataclasses.replace(passivity, measure=lambda specimen: Finding(-1.0, "gives energy"))
+    assert fake(BENCH["LuGre"]).verdict is NATURE
+    assert fake(BENCH["Dahl"]).verdict is Verdict.FAIL
+    assert fake(BENCH["LuGre, vd"]).verdict is Verdict.FAIL
+    none = dataclasses.replace(passivity, measure=lambda specimen: Finding(float("nan"), "nothing to see"))
+    assert none(BENCH["LuGre"]).verdict is NOT
+
+
+def test_a_run_that_ends_early_fails():
+    def stop(specimen):
+        del specimen
+        raise SimulationError("The step limit was reached.")
+
+    outcome = dataclasses.replace(EXPERIMENTS["creep"], measure=stop)(BENCH["LuGre"])
+    assert outcome.verdict is Verdict.FAIL
+    assert "step limit" in outcome.finding.sentence
+
+
+def test_the_table_of_natures_names_experiments_and_has_no_idle_entry(outcomes):
+    assert {nature.experiment for nature in BY_NATURE} <= set(EXPERIMENTS)
+    earned = {outcome.reason for of in outcomes.values() for outcome in of.values() if outcome.verdict is NATURE}
+    assert {nature.reason for nature in BY_NATURE} <= earned
+    assert by_nature("passivity", BENCH["LuGre, vd"].law) is None
+    assert by_nature("creep", BENCH["LuGre, asymmetric"].law) is not None
+
+
+def test_figures_have_a_panel_for_each_law_and_labelled_axes(outcomes):
+    for name, experiment in PRESCRIBED.items():
+        of = {law: found[name] for law, found in outcomes.items()}
+        figure = behaviour_figure(experiment, of)
+        titles = [axis.get_title(loc="left") for axis in figure.axes]
+        assert [title for title in titles if title] == list(of)
+        labels = [axis.get_ylabel() for axis in figure.axes if axis.get_ylabel()]
+        assert labels
+        assert all("[" in label or "/" in label for label in labels)
+
+
+def test_command_writes_figures_table_and_json(run_command, tmp_path, monkeypatch, outcomes):
+    found = {law: outcomes[law] for law in ("Coulomb", "LuGre", "ElastoPlastic")}
+    monkeypatch.setattr(_behaviour, "run_bench", lambda progress: found)
+    out = tmp_path / "out"
+    code, text, _ = run_command("testbench", "--laws", "--out", str(out))
+    assert code == 0
+    pictures = [f"behaviour_{name.replace('-', '_')}.png" for name in EXPERIMENTS]
+    assert sorted(path.name for path in out.iterdir()) == sorted([*pictures, "behaviour.csv", "behaviour.json"])
+    table = pd.read_csv(out / "behaviour.csv")
+    assert len(table) == 3 * len(EXPERIMENTS)
+    assert {"law", "experiment", "verdict", "number", "unit", "threshold"} <= set(table.columns)
+    report = json.loads((out / "behaviour.json").read_text())
+    assert report["LuGre"]["creep"]["verdict"] == "by nature"
+    assert "yields" in report["LuGre"]["creep"]["reason"]
+    assert "nature" in text
+    assert "ElastoPlastic" in text
+
+
+def test_a_failure_gives_exit_code_one(run_command, tmp_path, monkeypatch, outcomes):
+    failure = dataclasses.replace(outcomes["Dahl"]["creep"], verdict=Verdict.FAIL, reason="")
+    monkeypatch.setattr(_behaviour, "run_bench", lambda progress: {"Dahl": outcomes["Dahl"] | {"creep": failure}})
+    code, text, _ = run_command("testbench", "--laws", "--out", str(tmp_path))
+    assert code == 1
+    assert "FAIL: Dahl, creep, 1" in text

@@ -1,0 +1,125 @@
+"""Hard cases: those that found something to mend, and that the checks themselves can fail."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmodsim as jms
+from jaxmodsim.cli import _hard
+from jaxmodsim.plot import hard_figure
+from jaxmodsim.problems import ramped_box
+from jaxmodsim.validation import hard
+from jaxmodsim.validation.hard import Finding, HardCase, Measured, Refused, Verdict
+
+CASES = hard.hard_cases()
+
+
+def test_every_case_says_why_it_is_hard_and_what_is_right():
+    assert len(CASES) >= 40
+    assert {case.family for case in CASES.values()} == set(hard.FAMILIES)
+    for name, case in CASES.items():
+        assert case.name == name
+        assert min(len(case.why), len(case.naive), len(case.asks)) > 5
+        if not isinstance(case.task, Refused):
+            assert case.exact or case.second or case.ends
+        # A way, or a way in one type.
+        assert set(case.leaves) <= {*hard.WAYS, *(f"{way} {dtype}" for way in hard.WAYS for dtype in hard.DTYPES)}
+        assert all(case.leaves.values())
+
+
+@pytest.mark.parametrize(
+    ("name", "ways"),
+    [
+        ("shaken_table", ("alone",)),  # steps over many periods of the belt
+        ("no_absolute_tolerance", ("alone",)),  # 0/0 in the norm of the error
+        ("overflow_in_stribeck", ("alone", "forward")),  # infinity times zero in the derivative
+        ("late_start_single", ("alone",)),  # a run of no length
+        ("nan_records", ("alone",)),
+        ("units_nanometres", ("alone",)),
+        ("bouncing_ball_unheld", ("alone", "vmap")),
+        ("equilibrium_unbounded", ("reverse",)),
+        ("smooth_break_away", ("alone",)),  # steps that ended in front of an event where slip only touches rest
+        ("reversals_in_a_step", ("alone",)),
+        ("step_limit_regularised", ("alone",)),
+        ("growing_load", ("alone",)),  # steps that grow in stick pass over break-aways
+        ("sample_after_break_away", ("alone",)),  # a sample of a signal next to an event
+    ],
+)
+def test_cases_that_found_something_and_one_of_each_kind(name: str, ways: tuple[str, ...]):
+    verdict = hard.check(CASES[name], ways, ["float64"])
+    assert verdict.findings
+    assert verdict.ok, [finding.sentence for finding in verdict.findings if not finding.ok]
+
+
+def test_friction_keeps_its_limit_at_all_times_of_a_bristle_that_is_loaded_at_once():
+    """At 10 m/s the bristle is at its limit within 2e-11 s, which a stiff step of 1e-3 s passes over."""
+    law = jms.LuGre(sigma0=1e8, sigma1=0.0, sigma2=0.0, Fc=0.02, Fs=0.02, vs=0.1)
+    ts = np.concatenate([[0.0], np.geomspace(1e-12, 1.0, 60)])
+    run = jms.simulate(ramped_box(law), [0.0], [10.0], 1.0, ts=ts)
+    assert float(jnp.max(run.forces["friction"])) < 0.02 * (1.0 + 1e-3)
+
+
+STEP = CASES["step_longer_than_run"]
+
+
+def test_checks_fail_where_something_is_wrong():
+    assert hard.check(STEP, ["alone", "vmap", "forward", "energy"], ["float64"]).ok
+    wrong = {
+        "value": replace(STEP, exact=lambda ramp: ramp / 4.0 + 1e-5),
+        "end": replace(STEP, ends="step limit"),
+        "derivative": replace(STEP, exact=lambda ramp: 0.25 + 0.0 * ramp),
+        "measured": HardCase("m", "numbers", "", "", "", Measured(lambda: 1.0), lambda _: 2.0),
+        "refused": HardCase("r", "numbers", "", "", "", Refused({"x": lambda: None}, {"x": "anything"})),
+        "other text": HardCase("r", "numbers", "", "", "", Refused({"x": lambda: jms.Coulomb(-1.0)}, {"x": "Fs must"})),
+    }
+    for what, case in wrong.items():
+        ways = ["forward"] if what == "derivative" else ["alone"]
+        assert not hard.check(case, ways, ["float64"]).ok, what
+    # A derivative that exists is not flagged.
+    claims = replace(CASES["equilibrium"], undefined="none, it is said")
+    assert not hard.check(claims, ["reverse"], ["float64"]).ok
+
+
+def test_what_is_asked_for_must_be_there():
+    with pytest.raises(ValueError, match=r"ways must be of alone, jit, .*, but 'alonee' was given"):
+        hard.check(STEP, ["alonee"])
+    with pytest.raises(ValueError, match=r"no hard case or family 'bristle_stif'.*Did you mean 'bristle_stiff'"):
+        list(hard.check_many(["bristle_stif"]))
+
+
+def test_command(run_command: Any, tmp_path: Any, monkeypatch: pytest.MonkeyPatch):
+    assert "bristle_stiff" in run_command("hard", "stiffness", "--list")[1]
+    code, out, _ = run_command("hard", "times_unfit", "--out", str(tmp_path / "hard"))
+    assert code == 0
+    assert "1 of 1 cases pass" in out
+    assert {path.name for path in (tmp_path / "hard").iterdir()} == {"hard.csv", "hard.json", "hard.png"}
+    code, _, errors = run_command("hard", "nonsense", "--out", str(tmp_path / "none"))
+    assert (code, (tmp_path / "none").exists()) == (2, False)
+    assert "no hard case or family 'nonsense'" in errors
+
+    failed = Verdict(STEP, (Finding("alone", "float64", 3.0, False, "0.75, right is 0.25."),))
+
+    def fails(*arguments: Any, **options: Any) -> Any:
+        del arguments, options
+        yield failed
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_hard, "check_many", lambda *arguments, **options: iter([failed]))
+    code, out, _ = run_command("hard", "step_longer_than_run", "--out", str(tmp_path / "fails"))
+    assert code == 1
+    assert "FAIL: step_longer_than_run, alone, float64: 0.75, right is 0.25." in out
+    monkeypatch.setattr(_hard, "check_many", fails)
+    code, _, errors = run_command("hard", "step_longer_than_run", "--out", str(tmp_path / "stopped"))
+    assert code == 130
+    assert "what was found on 1 of 1 cases is written" in errors
+    assert (tmp_path / "stopped" / "hard.json").exists()
+
+
+def test_figure_has_units():
+    verdict = hard.check(STEP, ["alone"], ["float64"])
+    (axis,) = hard_figure([verdict]).axes
+    assert axis.get_xlabel() == "error over what is admissible [1]"
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["step_longer_than_run"]
