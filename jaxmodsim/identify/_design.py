@@ -218,8 +218,8 @@ def _axis(
         raise ValueError(f"The input {input!r} must be a single number in the scene's params ({have}).")
     if scene.event_driven:
         raise ValueError(
-            f"design_input differentiates a run with fixed steps, but {', '.join(scene.event_driven)} would need events:"
-            " wrap the law, as in Regularized(law, width)."
+            f"design_input differentiates a run with fixed steps, but {', '.join(scene.event_driven)} would need"
+            " events: wrap the law, as in Regularized(law, width)."
         )
     if input in free:
         raise ValueError(f"{input} is the input and cannot be free.")
