@@ -1,4 +1,4 @@
-"""`simulate(..., accuracy=...)` on every named problem: what was asked, estimated and met, and at what cost.
+"""`simulate_to_accuracy` on every named problem: what was asked, estimated and met, and at what cost.
 
 The observable of each problem, at eleven times. The true error is that against a run by a method that was not chosen,
 at a relative tolerance of 1e-12, and at the end against the closed form, where there is one.
@@ -49,7 +49,7 @@ def _points(case: Case, asked: tuple[float, ...]) -> list[dict[str, Any]]:
         point: dict[str, Any] = {"problem": case.name, "asked": accuracy}
         began = time.perf_counter()
         try:
-            run = jms.simulate(
+            run = jms.simulate_to_accuracy(
                 case.scene, case.q0, case.qd0, case.t1, accuracy=accuracy, observable=case.observable, **settings
             )
         except jms.SimulationError as error:  # an accuracy that is not met is a result
@@ -68,11 +68,11 @@ def _points(case: Case, asked: tuple[float, ...]) -> list[dict[str, Any]]:
             "solver": type(found.solver).__name__,
             "rtol": found.rtol,
             "steps": found.num_steps,
-            "runs": len(found.tried),
+            "runs": len(found.attempts),
             "estimate": found.estimate,
             "error": _error(case, run, references[name]),
-            "better": found.tenfold.better,
-            "worse": found.tenfold.worse,
+            "better": found.cost_scaling.better,
+            "worse": found.cost_scaling.worse,
         }
         points.append(point)
         print(point, flush=True)

@@ -52,7 +52,7 @@ _GAINS = (0.0, 1.0)
 _ROSENBROCK_GAINS = (0.25, 0.5)
 
 
-class Problem(NamedTuple):
+class RunInputs(NamedTuple):
     """All numbers of a run."""
 
     scene: Scene
@@ -71,13 +71,13 @@ class Problem(NamedTuple):
     plugins: PyTree
 
 
-def initial_state(problem: Problem) -> State:
+def initial_state(inputs: RunInputs) -> State:
     """State at t0: effects whose state is not given start at rest."""
-    return State(problem.q0, problem.qd0, problem.scene.initial_state(problem.q0) | problem.z0)
+    return State(inputs.q0, inputs.qd0, inputs.scene.initial_state(inputs.q0) | inputs.z0)
 
 
 @dataclass(frozen=True)
-class Options:
+class RunOptions:
     """All choices of a run that are compiled in."""
 
     solver: Any
@@ -88,7 +88,7 @@ class Options:
     project: bool
 
 
-class Solved(NamedTuple):
+class RunOutput(NamedTuple):
     """What a run gives: saved times and states, the outcome, the end that was reached, and the numbers of steps."""
 
     t: Float[Array, " time"]
@@ -113,43 +113,43 @@ def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolv
     return Rodas5P(pivot=fixed_step) if stiff or (scene.event_driven and dof == 1) else dfx.Tsit5()
 
 
-def _shortest(problem: Problem) -> Float[Array, ""]:
+def _shortest(inputs: RunInputs) -> Float[Array, ""]:
     """Shortest step [s]: what time resolves."""
-    span = jnp.maximum(jnp.abs(problem.t0), jnp.abs(problem.t1))
+    span = jnp.maximum(jnp.abs(inputs.t0), jnp.abs(inputs.t1))
     return float(jnp.finfo(span.dtype).eps) * span
 
 
-def _tolerances(problem: Problem) -> tuple[Array, Array]:
+def _tolerances(inputs: RunInputs) -> tuple[Array, Array]:
     """Relative and absolute; of what is zero and stays so, the error is zero and not 0/0."""
-    return problem.rtol, jnp.maximum(problem.atol, float(jnp.finfo(problem.atol.dtype).tiny))
+    return inputs.rtol, jnp.maximum(inputs.atol, float(jnp.finfo(inputs.atol.dtype).tiny))
 
 
-def _first(problem: Problem, method: dfx.AbstractSolver, rate: Any, y0: Any) -> Array:
+def _first(inputs: RunInputs, method: dfx.AbstractSolver, rate: Any, y0: Any) -> Array:
     """First step [s]."""
-    if problem.dt is not None:
-        return problem.dt
-    scene = jax.lax.stop_gradient(problem.scene)
+    if inputs.dt is not None:
+        return inputs.dt
+    scene = jax.lax.stop_gradient(inputs.scene)
     step = first_step(
         lambda t, y: rate(t, y, scene),
-        problem.t0,
+        inputs.t0,
         y0,
         method.error_order(dfx.ODETerm(rate)),
-        _tolerances(problem),
-        _shortest(problem),
+        _tolerances(inputs),
+        _shortest(inputs),
     )
-    return step if problem.dtmax is None else jnp.minimum(step, problem.dtmax)
+    return step if inputs.dtmax is None else jnp.minimum(step, inputs.dtmax)
 
 
-def _error_control(problem: Problem, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
-    if problem.dt is not None:
+def _error_control(inputs: RunInputs, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
+    if inputs.dt is not None:
         return FiniteSteps()
-    (rtol, atol), dtmin = _tolerances(problem), _shortest(problem)
-    p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not problem.scene.event_driven else _GAINS
-    return dfx.PIDController(rtol, atol, pcoeff=p, icoeff=i, dtmin=dtmin, dtmax=problem.dtmax, force_dtmin=False)
+    (rtol, atol), dtmin = _tolerances(inputs), _shortest(inputs)
+    p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not inputs.scene.event_driven else _GAINS
+    return dfx.PIDController(rtol, atol, pcoeff=p, icoeff=i, dtmin=dtmin, dtmax=inputs.dtmax, force_dtmin=False)
 
 
 def _solver(
-    solver: dfx.AbstractSolver, hybrid: Hybrid, scene: Scene, options: Options, log: int | None
+    solver: dfx.AbstractSolver, hybrid: Hybrid, scene: Scene, options: RunOptions, log: int | None
 ) -> dfx.AbstractSolver:
     """`solver`, wrapped in what the scene needs: events, projections, signals."""
     if isinstance(solver, ImplicitFriction):
@@ -178,31 +178,31 @@ def _step_from(t: Array, scene: Scene) -> Scene:
     return scene.step_from(t)
 
 
-def _controller(problem: Problem, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
-    controller = _error_control(problem, solver)
-    times = sample_times(problem.scene.params, linear=True)
-    if problem.scene.event_driven:
+def _controller(inputs: RunInputs, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
+    controller = _error_control(inputs, solver)
+    times = sample_times(inputs.scene.params, linear=True)
+    if inputs.scene.event_driven:
         return EventController(controller, times, direction=1)
     return controller if times is None else StepsTo(controller, times)
 
 
-def _plugins(problem: Problem, options: Options) -> tuple[Any, Any]:
+def _plugins(inputs: RunInputs, options: RunOptions) -> tuple[Any, Any]:
     """Solver and adjoint: those that were given, or the defaults."""
-    solver = default_solver(problem.scene, problem.q0.shape[0], problem.dt is not None)
+    solver = default_solver(inputs.scene, inputs.q0.shape[0], inputs.dt is not None)
     # With fewer checkpoints than steps, steps are made again from states that differ by rounding from those of the run,
     # which events and error control enlarge: derivatives lose half of their digits, or all but two.
     adjoint = dfx.RecursiveCheckpointAdjoint(checkpoints=options.max_steps)
     if options.solver is not None:
-        solver = eqx.combine(options.solver, problem.plugins[0])
+        solver = eqx.combine(options.solver, inputs.plugins[0])
     if options.adjoint is not None:
-        adjoint = eqx.combine(options.adjoint, problem.plugins[1])
+        adjoint = eqx.combine(options.adjoint, inputs.plugins[1])
     return solver, adjoint
 
 
-def _well_posed(problem: Problem) -> Bool[Array, ""]:
+def _well_posed(inputs: RunInputs) -> Bool[Array, ""]:
     """Whether times and tolerances make a run; known ones are checked before, with a sentence of their own."""
-    t0, t1, ts, rtol, atol = problem.t0, problem.t1, problem.ts, problem.rtol, problem.atol
-    steps = [step for step in (problem.dt, problem.dtmax) if step is not None]
+    t0, t1, ts, rtol, atol = inputs.t0, inputs.t1, inputs.ts, inputs.rtol, inputs.atol
+    steps = [step for step in (inputs.dt, inputs.dtmax) if step is not None]
     fine = (t0 <= t1) & (rtol >= 0) & (atol >= 0) & (rtol + atol > 0)
     for step in steps:
         fine &= step > 0
@@ -212,43 +212,45 @@ def _well_posed(problem: Problem) -> Bool[Array, ""]:
     return fine & jnp.isfinite(jnp.stack([t0, t1, rtol, atol, *steps])).all()
 
 
-def _prepared(problem: Problem, options: Options, audited: bool) -> tuple[State, Any, Hybrid, Int[Array, ""]]:
+def _prepared(inputs: RunInputs, options: RunOptions, audited: bool) -> tuple[State, Any, Hybrid, Int[Array, ""]]:
     """State and modes to begin with, the functions of the run, and what is wrong with the start."""
-    scene, t0 = problem.scene, problem.t0
-    given = initial = initial_state(problem)
+    scene, t0 = inputs.scene, inputs.t0
+    given = initial = initial_state(inputs)
     check_scene(scene, initial)
-    projects, rest = bool(scene.constraints) and options.project, _REST * problem.atol
+    projects, rest = bool(scene.constraints) and options.project, _REST * inputs.atol
     mode = None
     if projects:
         initial = scene_project(t0, initial, scene)
     if scene.event_driven:
         initial, mode = scene_modes(t0, initial, scene, rest)
     canonical = isinstance(options.solver, Gauss)
-    atol = None if problem.dt is not None else problem.atol
+    atol = None if inputs.dt is not None else inputs.atol
     start = start_code(scene, t0, given, vector_field(t0, initial, scene, mode), mode, atol, canonical)
-    start = jnp.where(_well_posed(problem), start, ILL_POSED)
+    start = jnp.where(_well_posed(inputs), start, ILL_POSED)
     sticks = bool(scene.event_driven) and scene_drifts(scene)
     return (
         initial,
         mode,
-        Hybrid(IntegratedSystem(audited, canonical), rest, (problem.rtol, problem.atol), projects, sticks),
+        Hybrid(IntegratedSystem(audited, canonical), rest, (inputs.rtol, inputs.atol), projects, sticks),
         start,
     )
 
 
-def _integrate(problem: Problem, options: Options, audited: bool, log: int | None) -> tuple[Solved, EventLog | None]:
+def _integrate(
+    inputs: RunInputs, options: RunOptions, audited: bool, log: int | None
+) -> tuple[RunOutput, EventLog | None]:
     """Run diffrax; with modes only where the scene has them, with a log of that many events where one is wanted."""
-    scene, exact = problem.scene, bool(problem.scene.event_driven)
-    initial, mode, hybrid, start = _prepared(problem, options, audited)
-    method, adjoint = _plugins(problem, options)
+    scene, exact = inputs.scene, bool(inputs.scene.event_driven)
+    initial, mode, hybrid, start = _prepared(inputs, options, audited)
+    method, adjoint = _plugins(inputs, options)
     solver = _solver(method, hybrid, scene, options, log)
     # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
     starts = start == SUCCESS
-    ts = None if problem.ts is None else jnp.where(starts, problem.ts, problem.t0)
-    y0, controller = hybrid.flow.start(problem.t0, initial, scene, mode), _controller(problem, method)
-    first = _first(problem, method, partial(hybrid.plain_rate, mode=mode), y0)
+    ts = None if inputs.ts is None else jnp.where(starts, inputs.ts, inputs.t0)
+    y0, controller = hybrid.flow.start(inputs.t0, initial, scene, mode), _controller(inputs, method)
+    first = _first(inputs, method, partial(hybrid.plain_rate, mode=mode), y0)
     if isinstance(solver, EventSolver):
-        y0 = solver.start(problem.t0, y0, mode, scene)
+        y0 = solver.start(inputs.t0, y0, mode, scene)
 
     def keep_end(t: Any, y: Any, scene: Scene) -> Any:
         return hybrid.keep(t, y, scene), ((y.events, y.status, y.fired), y.log) if exact else None
@@ -259,8 +261,8 @@ def _integrate(problem: Problem, options: Options, audited: bool, log: int | Non
         return dfx.diffeqsolve(
             dfx.ODETerm(hybrid.rate if exact else hybrid.plain_rate),
             solver,
-            problem.t0,
-            jnp.where(starts, problem.t1, problem.t0),
+            inputs.t0,
+            jnp.where(starts, inputs.t1, inputs.t0),
             first,
             y0,
             args=scene,
@@ -281,31 +283,31 @@ def _integrate(problem: Problem, options: Options, audited: bool, log: int | Non
     if exact:
         (count, status, fired), history = events
         ending, stats["num_events"] = Ending(status, fired), count
-    ended = _ended(problem, t_end, end_state, mode, solution.result, ending)
-    t, y, modes, missed = _kept(problem, starts, solution.ts[1], solution.ys[1])
+    ended = _ended(inputs, t_end, end_state, mode, solution.result, ending)
+    t, y, modes, missed = _kept(inputs, starts, solution.ts[1], solution.ys[1])
     code = jnp.where(starts, ended, start)
     if exact and not options.hold_chatter:
         code = jnp.where((code == SUCCESS) & missed, MISSED_EVENT, code)
-    return Solved(t, y, modes, code, None if problem.ts is None else (t_end, end_state), stats), history
+    return RunOutput(t, y, modes, code, None if inputs.ts is None else (t_end, end_state), stats), history
 
 
-def _ended(problem: Problem, t: Array, y: State, mode: Any, result: dfx.RESULTS, ending: Ending | None) -> Array:
+def _ended(inputs: RunInputs, t: Array, y: State, mode: Any, result: dfx.RESULTS, ending: Ending | None) -> Array:
     """How the run ended, if it began."""
-    span = jnp.maximum(jnp.abs(problem.t0), jnp.abs(problem.t1))
-    ahead = float(jnp.finfo(span.dtype).eps) ** 0.5 * span if problem.dt is None else problem.dt
-    rate = vector_field(t, y, problem.scene, mode)
-    return end_code(problem.scene, t, y, rate, mode, result, ending, ahead)
+    span = jnp.maximum(jnp.abs(inputs.t0), jnp.abs(inputs.t1))
+    ahead = float(jnp.finfo(span.dtype).eps) ** 0.5 * span if inputs.dt is None else inputs.dt
+    rate = vector_field(t, y, inputs.scene, mode)
+    return end_code(inputs.scene, t, y, rate, mode, result, ending, ahead)
 
 
-def _kept(problem: Problem, starts: Array, t: Array, kept: Any) -> tuple[Array, Any, Any, Array]:
+def _kept(inputs: RunInputs, starts: Array, t: Array, kept: Any) -> tuple[Array, Any, Any, Array]:
     """Saved times, results and modes, infinite where a run that did not start would have kept them.
 
     And whether an element sticks at one of them under a load beyond its limit: then an event was stepped over.
     """
-    scene, (y, modes) = problem.scene, kept
-    if problem.ts is None:
+    scene, (y, modes) = inputs.scene, kept
+    if inputs.ts is None:
         return t, y, modes, jnp.asarray(False)
-    reached = starts | (problem.ts <= problem.t0)
+    reached = starts | (inputs.ts <= inputs.t0)
     t = jnp.where(reached, t, jnp.inf)
     y, modes = jtu.tree_map(
         lambda x: jnp.where(jnp.expand_dims(reached, tuple(range(1, x.ndim))), x, jnp.inf), (y, modes)
@@ -321,27 +323,27 @@ def _kept(problem: Problem, starts: Array, t: Array, kept: Any) -> tuple[Array, 
 
 
 @partial(jax.jit, static_argnames=("options",))
-def solve(problem: Problem, options: Options) -> Solved:
+def solve(inputs: RunInputs, options: RunOptions) -> RunOutput:
     """Run a scene."""
-    return _integrate(problem, options, False, None)[0]
+    return _integrate(inputs, options, False, None)[0]
 
 
 @partial(jax.jit, static_argnames=("options",))
-def solve_audited(problem: Problem, options: Options) -> tuple[Work, Int[Array, ""]]:
+def solve_audited(inputs: RunInputs, options: RunOptions) -> tuple[Work, Int[Array, ""]]:
     """Run a scene again with the integrals of power beside it: the work at the saved times, and how that run ended."""
-    solved = _integrate(problem, options, True, None)[0]
+    solved = _integrate(inputs, options, True, None)[0]
     return solved.y[1], solved.code
 
 
 @partial(jax.jit, static_argnames=("options",))
-def solve_start(problem: Problem, options: Options) -> State:
+def solve_start(inputs: RunInputs, options: RunOptions) -> State:
     """The state a run begins with: on the constraints, and at rest where elements stick."""
-    return _prepared(problem, options, False)[0]
+    return _prepared(inputs, options, False)[0]
 
 
 @partial(jax.jit, static_argnames=("options", "size"))
-def solve_logged(problem: Problem, options: Options, size: int) -> EventLog:
+def solve_logged(inputs: RunInputs, options: RunOptions, size: int) -> EventLog:
     """Run a scene again with a log of `size` events beside it."""
-    log = _integrate(problem, options, False, size)[1]
+    log = _integrate(inputs, options, False, size)[1]
     assert log is not None
     return log
