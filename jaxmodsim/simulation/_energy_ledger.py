@@ -68,7 +68,7 @@ def _ledger(inputs: RunInputs, t: Array, y: State, work: dict[str, Power]) -> En
     scene = inputs.scene
 
     def parts(t: Array, y: State) -> tuple[Array, Array, dict[str, Array]]:
-        return *scene_energies(t, y, scene), _stored(scene, y)
+        return *scene_energies(t, y, scene.bind_time(t)), _stored(scene, y)
 
     first = initial_state(inputs)
     kinetic, potential, stored = jax.vmap(parts)(t, y)
@@ -119,5 +119,5 @@ def _stored(scene: Scene, y: State) -> dict[str, Array]:
 
 
 def _energy(scene: Scene, t: Array, y: State) -> Array:
-    kinetic, potential = scene_energies(t, y, scene)
+    kinetic, potential = scene_energies(t, y, scene.bind_time(t))
     return kinetic + potential + sum(_stored(scene, y).values())

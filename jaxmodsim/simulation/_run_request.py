@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
@@ -75,7 +75,7 @@ def is_known(*values: object) -> bool:
     return not any(isinstance(value, jax.core.Tracer) for value in values)
 
 
-def _array(value: ArrayLike, dtype: np.dtype) -> jax.Array | np.ndarray:
+def _array(value: PyTree, dtype: np.dtype) -> Any:
     """As an array of `dtype`: NumPy for what is known (cheaper to hand over), JAX for what is traced or on a device."""
     if isinstance(value, jax.Array):
         return value if value.dtype == dtype else value.astype(dtype)
@@ -99,7 +99,8 @@ def _inputs(asked: RunRequest) -> RunInputs:
     for name, value in given.items():
         if type(value) is not float:
             check_real(value, name=name)
-    kinds = {x.dtype for x in (*jtu.tree_leaves(scene), q0, qd0) if hasattr(x, "dtype")}
+    leaves: list[Any] = [*jtu.tree_leaves(scene), q0, qd0]
+    kinds = {x.dtype for x in leaves if hasattr(x, "dtype")}
     dtype = kinds.pop() if len(kinds) == 1 else jnp.result_type(*kinds) if kinds else jnp.result_type(float)
     if not jnp.issubdtype(dtype, jnp.floating):
         dtype = jnp.result_type(float)
@@ -133,7 +134,7 @@ def _inputs(asked: RunRequest) -> RunInputs:
     )
 
 
-def _check_span(t0: ArrayLike, t1: ArrayLike, array: dict[str, jax.Array | np.ndarray]) -> None:
+def _check_span(t0: ArrayLike, t1: ArrayLike, array: dict[str, Any]) -> None:
     """Refuse times that differ, but not in the type the run has: it would end where it begins, and all be well."""
     if is_known(t0, t1) and array["t0"] == array["t1"] and t0 != t1:
         raise ValueError(
@@ -168,7 +169,7 @@ def _own_states(scene: Scene, q0: jax.Array | np.ndarray, z0: dict[str, PyTree],
     return {name: jtu.tree_map(lambda x: _array(x, dtype), state) for name, state in z0.items()}
 
 
-def _check_values(array: dict[str, jax.Array | np.ndarray]) -> None:
+def _check_values(array: dict[str, Any]) -> None:
     """Check the values that are known now; those that are traced are checked in the run."""
     known = {name: np.asarray(value) for name, value in array.items() if is_known(value)}
     for name, value in known.items():

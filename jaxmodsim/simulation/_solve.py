@@ -32,11 +32,12 @@ from ..solvers import (
     ImplicitFriction,
     Projected,
     Rodas5P,
+    SampledJumps,
     StepsTo,
     first_step,
     unchecked,
 )
-from ._integrated_system import Hybrid, IntegratedSystem, Work
+from ._integrated_system import IntegratedSystem, RunFunctions, Work
 from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, end_code, start_code
 
 # Part of the absolute tolerance below which a slip velocity counts as none.
@@ -93,9 +94,9 @@ class RunOutput(NamedTuple):
 
     t: Float[Array, " time"]
     # A `State`; in an audited run a pair of it and `Work`.
-    y: Any
+    y: PyTree
     # Of the set-valued friction elements, shape `[time, elements]`; None where there are none.
-    mode: Any
+    mode: Array | None
     code: Int[Array, ""]
     # None where the end alone is kept, and so is in `t` and `y` already: every output of compiled code costs time.
     end: tuple[Float[Array, ""], State] | None
@@ -124,7 +125,7 @@ def _tolerances(inputs: RunInputs) -> tuple[Array, Array]:
     return inputs.rtol, jnp.maximum(inputs.atol, float(jnp.finfo(inputs.atol.dtype).tiny))
 
 
-def _first(inputs: RunInputs, method: dfx.AbstractSolver, rate: Any, y0: Any) -> Array:
+def _first(inputs: RunInputs, method: dfx.AbstractSolver, rate: Any, y0: PyTree) -> Array:
     """First step [s]."""
     if inputs.dt is not None:
         return inputs.dt
@@ -149,28 +150,30 @@ def _error_control(inputs: RunInputs, solver: dfx.AbstractSolver) -> dfx.Abstrac
 
 
 def _solver(
-    solver: dfx.AbstractSolver, hybrid: Hybrid, scene: Scene, options: RunOptions, log: int | None
+    solver: dfx.AbstractSolver, functions: RunFunctions, scene: Scene, options: RunOptions, log: int | None
 ) -> dfx.AbstractSolver:
     """`solver`, wrapped in what the scene needs: events, projections, signals."""
     if isinstance(solver, ImplicitFriction):
-        solver = ImplicitFriction(hybrid.flow.advance)
-    pin = _step_from if signals_of(scene.params) else None
+        solver = ImplicitFriction(functions.system.advance)
+    freeze_args, samples = None, None
+    if signals_of(scene.params):
+        freeze_args = _step_from
+        samples = SampledJumps(freeze_args, sample_times(scene.params, linear=False))
     if scene.event_driven:
         return EventSolver(
             solver,
-            hybrid.guards,
-            hybrid.reset,
-            on_zeno=hybrid.on_zeno if options.hold_chatter else None,
-            project=hybrid.project_and_stick if hybrid.projects or hybrid.sticks else None,
-            freeze_args=pin,
-            jump_ts=sample_times(scene.params, linear=False),
-            rtol=hybrid.tolerances[0],
+            functions.guards,
+            functions.reset,
+            on_zeno=functions.on_zeno if options.hold_chatter else None,
+            project=functions.project_and_stick if functions.projects or functions.sticks else None,
+            samples=samples,
+            rtol=functions.tolerances[0],
             enforce=True,
             max_events=options.max_events if log is None else min(log, options.max_events),
             log=log is not None,
         )
-    if hybrid.projects or pin is not None:
-        return Projected(solver, hybrid.project if hybrid.projects else None, pin)
+    if functions.projects or freeze_args is not None:
+        return Projected(solver, functions.project if functions.projects else None, freeze_args)
     return solver
 
 
@@ -212,7 +215,7 @@ def _well_posed(inputs: RunInputs) -> Bool[Array, ""]:
     return fine & jnp.isfinite(jnp.stack([t0, t1, rtol, atol, *steps])).all()
 
 
-def _prepared(inputs: RunInputs, options: RunOptions, audited: bool) -> tuple[State, Any, Hybrid, Int[Array, ""]]:
+def _prepared(inputs: RunInputs, options: RunOptions, audited: bool) -> tuple[State, Any, RunFunctions, Int[Array, ""]]:
     """State and modes to begin with, the functions of the run, and what is wrong with the start."""
     scene, t0 = inputs.scene, inputs.t0
     given = initial = initial_state(inputs)
@@ -220,7 +223,7 @@ def _prepared(inputs: RunInputs, options: RunOptions, audited: bool) -> tuple[St
     projects, rest = bool(scene.constraints) and options.project, _REST * inputs.atol
     mode = None
     if projects:
-        initial = scene_project(t0, initial, scene)
+        initial = scene_project(t0, initial, scene.bind_time(t0))
     if scene.event_driven:
         initial, mode = scene_modes(t0, initial, scene, rest)
     canonical = isinstance(options.solver, Gauss)
@@ -231,7 +234,7 @@ def _prepared(inputs: RunInputs, options: RunOptions, audited: bool) -> tuple[St
     return (
         initial,
         mode,
-        Hybrid(IntegratedSystem(audited, canonical), rest, (inputs.rtol, inputs.atol), projects, sticks),
+        RunFunctions(IntegratedSystem(audited, canonical), rest, (inputs.rtol, inputs.atol), projects, sticks),
         start,
     )
 
@@ -241,25 +244,25 @@ def _integrate(
 ) -> tuple[RunOutput, EventLog | None]:
     """Run diffrax; with modes only where the scene has them, with a log of that many events where one is wanted."""
     scene, exact = inputs.scene, bool(inputs.scene.event_driven)
-    initial, mode, hybrid, start = _prepared(inputs, options, audited)
+    initial, mode, functions, start = _prepared(inputs, options, audited)
     method, adjoint = _plugins(inputs, options)
-    solver = _solver(method, hybrid, scene, options, log)
+    solver = _solver(method, functions, scene, options, log)
     # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
     starts = start == SUCCESS
     ts = None if inputs.ts is None else jnp.where(starts, inputs.ts, inputs.t0)
-    y0, controller = hybrid.flow.start(inputs.t0, initial, scene, mode), _controller(inputs, method)
-    first = _first(inputs, method, partial(hybrid.plain_rate, mode=mode), y0)
+    y0, controller = functions.system.start(inputs.t0, initial, scene, mode), _controller(inputs, method)
+    first = _first(inputs, method, partial(functions.plain_derivative, mode=mode), y0)
     if isinstance(solver, EventSolver):
         y0 = solver.start(inputs.t0, y0, mode, scene)
 
-    def keep_end(t: Any, y: Any, scene: Scene) -> Any:
-        return hybrid.keep(t, y, scene), ((y.events, y.status, y.fired), y.log) if exact else None
+    def keep_end(t: Array, y: PyTree, scene: Scene) -> Any:
+        return functions.keep(t, y, scene), ((y.events, y.status, y.fired), y.log) if exact else None
 
     def integrate(first: Array, ts: Array | None) -> dfx.Solution:
         end = dfx.SubSaveAt(t1=True, fn=keep_end)
-        saved = dfx.SubSaveAt(t1=ts is None, ts=ts, fn=hybrid.keep)
+        saved = dfx.SubSaveAt(t1=ts is None, ts=ts, fn=functions.keep)
         return dfx.diffeqsolve(
-            dfx.ODETerm(hybrid.rate if exact else hybrid.plain_rate),
+            dfx.ODETerm(functions.derivative if exact else functions.plain_derivative),
             solver,
             inputs.t0,
             jnp.where(starts, inputs.t1, inputs.t0),
@@ -291,7 +294,9 @@ def _integrate(
     return RunOutput(t, y, modes, code, None if inputs.ts is None else (t_end, end_state), stats), history
 
 
-def _ended(inputs: RunInputs, t: Array, y: State, mode: Any, result: dfx.RESULTS, ending: Ending | None) -> Array:
+def _ended(
+    inputs: RunInputs, t: Array, y: State, mode: Array | None, result: dfx.RESULTS, ending: Ending | None
+) -> Array:
     """How the run ended, if it began."""
     span = jnp.maximum(jnp.abs(inputs.t0), jnp.abs(inputs.t1))
     ahead = float(jnp.finfo(span.dtype).eps) ** 0.5 * span if inputs.dt is None else inputs.dt
@@ -299,7 +304,7 @@ def _ended(inputs: RunInputs, t: Array, y: State, mode: Any, result: dfx.RESULTS
     return end_code(inputs.scene, t, y, rate, mode, result, ending, ahead)
 
 
-def _kept(inputs: RunInputs, starts: Array, t: Array, kept: Any) -> tuple[Array, Any, Any, Array]:
+def _kept(inputs: RunInputs, starts: Array, t: Array, kept: PyTree) -> tuple[Array, PyTree, PyTree, Array]:
     """Saved times, results and modes, infinite where a run that did not start would have kept them.
 
     And whether an element sticks at one of them under a load beyond its limit: then an event was stepped over.

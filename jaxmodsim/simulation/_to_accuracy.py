@@ -145,13 +145,13 @@ class _AccuracySearch:
     def pair(self, rtol: float) -> tuple[_TrialRun, ...]:
         """Runs by both methods; by one of them at two tolerances where the other does not reach the end."""
         good = [which for which in (0, self.second) if not self.failure(rtol, which)]
-        found = tuple(self.run(rtol, which) for which in good)
+        runs = tuple(self.run(rtol, which) for which in good)
         if len(good) != 1:
-            return found
+            return runs
         other = _round(rtol / 10 if rtol / 10 >= self.tightest else rtol * 10), good[0]
-        if self.failure(*other) or self.run(*other).num_steps == found[0].num_steps:
-            return found
-        return (*found, self.run(*other))
+        if self.failure(*other) or self.run(*other).num_steps == runs[0].num_steps:
+            return runs
+        return (*runs, self.run(*other))
 
 
 @dataclass(frozen=True)
@@ -374,13 +374,13 @@ def _references(search: _AccuracySearch, rtol: float, own: bool) -> _References:
             break
         one, other = (search.along(made.rtol, made.which) for made in pair)
         size = _size(pair[0].observed if own else one.observed)
-        found = _References(pair, size, _error(pair[0], pair[1], size), "")
+        references = _References(pair, size, _error(pair[0], pair[1], size), "")
         if np.max(np.abs(one.state - other.state) / _size(one.state)) > _APART:
-            found = replace(found, gap=max(found.gap, _APART))
-        elif found.gap <= _AGREE * search.asked and _confirmed(search, found, rtol):
-            return found
-        if nearest is None or found.gap < nearest.gap:
-            nearest = found
+            references = replace(references, gap=max(references.gap, _APART))
+        elif references.gap <= _AGREE * search.asked and _confirmed(search, references, rtol):
+            return references
+        if nearest is None or references.gap < nearest.gap:
+            nearest = references
         if rtol <= search.tightest:
             break
         rtol = _round(max(rtol / 10, search.tightest))
@@ -388,10 +388,10 @@ def _references(search: _AccuracySearch, rtol: float, own: bool) -> _References:
     return replace(nearest, remark=_remark(search, nearest, rtol))
 
 
-def _confirmed(search: _AccuracySearch, found: _References, rtol: float) -> bool:
+def _confirmed(search: _AccuracySearch, references: _References, rtol: float) -> bool:
     """Whether a pair from a looser tolerance is near, too: in chaos two runs may meet in one number by accident."""
     looser = search.pair(_round(10 * rtol))
-    return len(looser) == 2 and max(map(found.error, looser)) <= _NEAR * search.asked
+    return len(looser) == 2 and max(map(references.error, looser)) <= _NEAR * search.asked
 
 
 def _remark(search: _AccuracySearch, nearest: _References, rtol: float) -> str:

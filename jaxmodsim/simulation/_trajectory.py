@@ -173,9 +173,7 @@ class Trajectory:
         What each effect brought in and lost; `jaxmodsim.energy_audit` adds them up.
         """
         self._one_run("ledger")
-        return self._repeats.get(
-            "ledger", lambda: ledger(self.inputs, self.options, self.t, self._states(), self.code), self
-        )
+        return self._once("ledger", lambda: ledger(self.inputs, self.options, self.t, self._states(), self.code))
 
     @property
     def event_losses(self) -> Float[Array, " time"]:
@@ -229,12 +227,12 @@ def trajectory(inputs: RunInputs, options: RunOptions, solved: RunOutput) -> Tra
 
 
 @jax.jit
-def _forces(scene: Scene, t: Array, y: State, mode: Any) -> dict[str, Array]:
+def _forces(scene: Scene, t: Array, y: State, mode: Array | None) -> dict[str, Array]:
     return _reached(t, jax.vmap(lambda t, y, mode: scene_forces(t, y, scene, mode))(t, y, mode))
 
 
 @jax.jit
-def _reactions(scene: Scene, t: Array, y: State, mode: Any) -> dict[str, ConstraintReaction]:
+def _reactions(scene: Scene, t: Array, y: State, mode: Array | None) -> dict[str, ConstraintReaction]:
     return _reached(t, jax.vmap(lambda t, y, mode: scene_reactions(t, y, scene, mode))(t, y, mode))
 
 
@@ -256,7 +254,7 @@ def _event_forces(scene: Scene, log: EventLog) -> dict[str, Array]:
     return jtu.tree_map(lambda x: jnp.where(jnp.expand_dims(happened, range(1, x.ndim)), x, jnp.nan), both)
 
 
-def _reached(t: Array, tree: Any) -> Any:
+def _reached(t: Array, tree: PyTree) -> PyTree:
     """Arrays along a run, infinite at the times that an early end left unreached."""
     reached = jnp.isfinite(t)
     return jtu.tree_map(lambda x: jnp.where(jnp.expand_dims(reached, range(1, x.ndim)), x, jnp.inf), tree)
@@ -270,7 +268,7 @@ def _events(scene: Scene, log: EventLog) -> Events:
     changed = jnp.ravel((before != after) & jnp.isfinite(log.t)[:, None])
     order = jnp.argsort(~changed, stable=True)
 
-    def column(x: Array, filler: Any) -> Array:
+    def column(x: Array, filler: float) -> Array:
         return jnp.where(changed, jnp.ravel(jnp.broadcast_to(x, before.shape)), filler)[order]
 
     return Events(
