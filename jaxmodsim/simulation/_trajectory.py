@@ -268,7 +268,7 @@ def _events(scene: Scene, log: EventLog) -> Events:
     changed = jnp.ravel((before != after) & jnp.isfinite(log.t)[:, None])
     order = jnp.argsort(~changed, stable=True)
 
-    def column(x: Array, filler: float) -> Array:
+    def column(x: Array, filler: float | int) -> Array:
         return jnp.where(changed, jnp.ravel(jnp.broadcast_to(x, before.shape)), filler)[order]
 
     return Events(
