@@ -16,7 +16,7 @@ from _options import begin
 from _report import new_result, write_result
 
 import jaxmodsim as jms
-from jaxmodsim.problems import Case, named_problems
+from jaxmodsim.problems import NamedProblem, named_problems
 from jaxmodsim.simulation import Accuracy, named_series
 
 ASKED = (1e-3, 1e-5, 1e-8)
@@ -41,7 +41,7 @@ def main() -> None:
     write_result(content, options)
 
 
-def _points(case: Case, asked: tuple[float, ...]) -> list[dict[str, Any]]:
+def _points(case: NamedProblem, asked: tuple[float, ...]) -> list[dict[str, Any]]:
     settings: dict[str, Any] = {"ts": np.linspace(0.0, case.t1, TIMES), "max_steps": case.max_steps}
     points: list[dict[str, Any]] = []
     references: dict[str, jms.Trajectory] = {}
@@ -79,14 +79,14 @@ def _points(case: Case, asked: tuple[float, ...]) -> list[dict[str, Any]]:
     return points
 
 
-def _other(case: Case, found: Accuracy) -> dfx.AbstractSolver:
+def _other(case: NamedProblem, found: Accuracy) -> dfx.AbstractSolver:
     """A method that was not chosen."""
     if any(effect.stiff for effect in case.scene.effects):
         return dfx.Kvaerno5()
     return jms.Rodas5P() if isinstance(found.solver, dfx.Dopri8) and len(case.q0) == 1 else dfx.Dopri8()
 
 
-def _error(case: Case, run: jms.Trajectory, reference: jms.Trajectory) -> float | None:
+def _error(case: NamedProblem, run: jms.Trajectory, reference: jms.Trajectory) -> float | None:
     """Largest error of the observable, against the reference where that reached the end, and the closed form."""
     one, other = (np.asarray(named_series(each, case.observable)) for each in (run, reference))
     errors = [float(np.max(np.abs(one - other)))] if bool(reference.result.ok) else []

@@ -55,7 +55,7 @@ from ._knife_edge import knife_edge as knife_edge
 from ._knife_edge import knife_edge_acceleration as knife_edge_acceleration
 from ._knife_edge import knife_edge_force as knife_edge_force
 from ._knife_edge import knife_edge_motion as knife_edge_motion
-from ._named import Case as Case
+from ._named import NamedProblem as NamedProblem
 from ._named import named_problems as named_problems
 from ._pendulum import spherical_pendulum as spherical_pendulum
 from ._pendulum import spherical_pendulum_acceleration as spherical_pendulum_acceleration
