@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 
 import jaxmodsim as jms
 from jaxmodsim import problems
-from jaxmodsim.validation.hard import Motion
+from jaxmodsim.validation.hard import SceneTask
 
 G = 9.81
 # Units of length, time and mass of the cases `units_...`.
@@ -128,7 +128,7 @@ def _twice(program: str) -> float:
 
 
 def by_hand(program: str) -> dict[str, Callable[[], float]]:
-    """What gives the answer of the cases that are no `Motion`, by name."""
+    """What gives the answer of the cases that are no `SceneTask`, by name."""
     units = {name: lambda name=name: _in_units(program, name) for name in UNITS}
     return units | {
         "bouncing_ball": lambda: _ball(program)[0],
@@ -225,7 +225,7 @@ def _advance(model: Any, data: Any, t1: float, ramp: float) -> None:
         raise RuntimeError("MuJoCo warns: nan, inf or huge value, the simulation is unstable.")
 
 
-def _slider(task: Motion) -> float:
+def _slider(task: SceneTask) -> float:
     """A mass on a slide, on a spring or under a force that rises; friction as `to_mujoco` writes it."""
     scene, params = task.scene, task.scene.params
     model, element = ET.fromstring(_SLIDE), ET.fromstring(jms.to_mujoco(scene.effects[-1].law, "slide"))
@@ -270,7 +270,7 @@ _PENDULUMS = ("pole_passed", "pole_cartesian")
 IN_MUJOCO = (*_SLIDERS, *_PENDULUMS)
 
 
-def by_mujoco(name: str, task: Motion) -> float:
+def by_mujoco(name: str, task: SceneTask) -> float:
     """The answer of one of the cases `IN_MUJOCO`."""
     if name == "pole_passed":
         return math.acos(_pendulum(float(task.qd0[1])))

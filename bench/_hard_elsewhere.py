@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from _hard_plain import ATOL, RTOL
 
-from jaxmodsim.validation.hard import HardCase, Motion
+from jaxmodsim.validation.hard import HardCase, SceneTask
 
 G = 9.81
 # How jaxonomy is asked: by the method it takes by itself, and by the one for stiff systems.
@@ -33,12 +33,12 @@ def _task(case: HardCase) -> tuple[dict[str, float], float]:
     """Numbers of a case by name, and its end [s]."""
     if case.name == "grazing_ceiling":
         numbers, t1 = _BALLS[case.name]
-        assert not isinstance(case.task, Motion)
+        assert not isinstance(case.task, SceneTask)
         return numbers | {"g": G, "v0": getattr(case.task, "x", np.nan)}, t1
     if case.name in _BALLS:
         numbers, t1 = _BALLS[case.name]
         return numbers | {"g": G}, t1
-    assert isinstance(case.task, Motion)
+    assert isinstance(case.task, SceneTask)
     scene = case.task.scene
     law = {name: float(value) for name, value in vars(scene.effects[-1].law).items() if np.ndim(value) == 0}
     return law | {name: float(value) for name, value in scene.params.items()}, float(case.task.t1)

@@ -16,7 +16,7 @@ from _hard_plain import IMPLICIT, PLAIN
 
 import jaxmodsim as jms
 from jaxmodsim.problems import BRAKED_SPRING, braked_spring_motion
-from jaxmodsim.validation.hard import HardCase, Motion, Refused, check, hard_cases
+from jaxmodsim.validation.hard import HardCase, RefusedCalls, SceneTask, check, hard_cases
 
 OURS, MUJOCO = "jaxmodsim", "MuJoCo"
 PROGRAMS = (OURS, *PLAIN, MUJOCO)
@@ -58,7 +58,7 @@ def asked(case: HardCase, program: str) -> bool:
         return case.name in IN_MUJOCO
     if case.name in OURS_ALONE:
         return False
-    stiff = isinstance(case.task, Motion) and any(effect.stiff for effect in case.task.scene.effects)
+    stiff = isinstance(case.task, SceneTask) and any(effect.stiff for effect in case.task.scene.effects)
     return program != IMPLICIT or stiff or case.family == "stiffness"
 
 
@@ -109,7 +109,7 @@ def _work(name: str, program: str, send: Any) -> None:
     case = hard_cases()[name]
     judge = (
         None
-        if program == OURS or isinstance(case.task, Refused)
+        if program == OURS or isinstance(case.task, RefusedCalls)
         else _judge(case, COARSE if program == MUJOCO else LEAST)
     )
     send.send({})
@@ -121,7 +121,7 @@ def _work(name: str, program: str, send: Any) -> None:
     else:
         found = _judged(judge, lambda: _value(case, program), refusal_is_right=bool(case.ends))
     send.send(found | {"seconds": time.perf_counter() - began})
-    if program == OURS and isinstance(case.task, Motion):
+    if program == OURS and isinstance(case.task, SceneTask):
         x = jnp.asarray(case.task.x)
         began = time.perf_counter()
         jax.block_until_ready(case.task.run(x).q)
@@ -130,17 +130,17 @@ def _work(name: str, program: str, send: Any) -> None:
 
 def _ours(case: HardCase) -> dict[str, Any]:
     """By `check`, alone in float64, to the tolerance of the case."""
-    verdict = check(case, ways=("alone",), dtypes=("float64",))
+    verdict = check(case, transforms=("alone",), dtypes=("float64",))
     sentences = "; ".join(finding.sentence for finding in verdict.findings)
     if verdict.ok:
         return {"verdict": RIGHT, "says": sentences}
-    refused = isinstance(case.task, Motion) and "The run reached t1" not in sentences
+    refused = isinstance(case.task, SceneTask) and "The run reached t1" not in sentences
     return {"verdict": ERROR if refused else WRONG, "says": sentences}
 
 
 def _value(case: HardCase, program: str) -> float:
     task = case.task
-    if not isinstance(task, Motion):
+    if not isinstance(task, SceneTask):
         return by_hand(program)[case.name]()
     if program == MUJOCO:
         return by_mujoco(case.name, task)

@@ -5,11 +5,11 @@ from _options import begin
 from _report import new_result, write_figure, write_result
 
 from jaxmodsim.plot import behaviour_figure
-from jaxmodsim.validation.behaviour import EXPERIMENTS, Outcome, run_bench, specimens
+from jaxmodsim.validation.behaviour import EXPERIMENTS, ExperimentResult, law_cases, run_bench
 
 # The figures that docs/laws.md shows.
 SHOWN = ("memory", "creep")
-WORDS = {"pass": "yes", "by nature": "**no**", "n/a": "-", "FAIL": "FAILS"}
+WORDS = {"pass": "yes", "known limitation": "**no**", "n/a": "-", "FAIL": "FAILS"}
 
 
 def main() -> None:
@@ -18,7 +18,7 @@ def main() -> None:
         "Friction laws in the standard experiments.",
         smoke="two laws, to a temporary folder",
     )
-    chosen = [each for each in specimens() if not options.smoke or each.name in ("Viscous", "Dahl")]
+    chosen = [each for each in law_cases() if not options.smoke or each.name in ("Viscous", "Dahl")]
     outcomes = run_bench(chosen, progress=print)
     content = new_result("behaviour", options, "diffrax")
     verdicts = {
@@ -30,7 +30,12 @@ def main() -> None:
     limits = {
         "columns": ["experiment", "number", "unit", "yes if"],
         "rows": [
-            [each.name, each.quantity, each.unit, f"{'<=' if each.limit.at_most else '>='} {each.limit.value:g}"]
+            [
+                each.name,
+                each.quantity,
+                each.unit,
+                f"{'<=' if each.threshold.at_most else '>='} {each.threshold.value:g}",
+            ]
             for each in EXPERIMENTS.values()
         ],
         "caption": "What the experiments find, and their limits.",
@@ -42,9 +47,9 @@ def main() -> None:
         write_figure(figure, options.out / f"behaviour_{name}.png", dpi=90)
 
 
-def cell(outcome: Outcome) -> str:
+def cell(outcome: ExperimentResult) -> str:
     """Verdict and number."""
-    return f"{WORDS[outcome.verdict.value]} {outcome.finding.rounded}".rstrip()
+    return f"{WORDS[outcome.verdict.value]} {outcome.measured.rounded}".rstrip()
 
 
 if __name__ == "__main__":

@@ -63,7 +63,7 @@ class Happened(NamedTuple):
     what: Int[np.ndarray, "events 2"]
 
 
-class Limit(NamedTuple):
+class Converged(NamedTuple):
     """What runs of a scene converge to.
 
     - `y`: the observable.
@@ -116,7 +116,7 @@ def scale_of(y: np.ndarray) -> float:
 
 def converged(
     scene: Scene, question: Question, rtol: float, *, closed: np.ndarray | None, scale: float | None, agreement: float
-) -> Limit:
+) -> Converged:
     """Runs of two solvers at a tight tolerance, or one beside a closed form, that must agree.
 
     **Raises:**
@@ -152,7 +152,7 @@ def converged(
     events, other = found[0][1], found[-1][1]
     times = None if events is None or other is None else event_error(events, other)
     gradient, second = found[0][2], found[-1][2]
-    return Limit(
+    return Converged(
         ys[0],
         events if times is not None else None,
         gradient,

@@ -17,7 +17,7 @@ from .._core.timing import measure
 from ..scene import Scene, elements
 from ..simulation import Trajectory, default_solver
 from ._methods import Method, default_methods, evaluations
-from ._reference import ATOL, Limit, Question, converged, event_error, gradient_error, happened, in_type, scale_of
+from ._reference import ATOL, Converged, Question, converged, event_error, gradient_error, happened, in_type, scale_of
 from ._sensitivity import chosen_numbers, observable_of, observed
 from ._work_rows import Row, Timing, WorkPrecision
 
@@ -72,7 +72,8 @@ def work_precision(
     **Arguments:**
 
     - `scene`, `q0`, `qd0`, `t1`, `ts`: as for `simulate`.
-    - `observable`: what errors are of: a name, as in `"q[0]"`, or of an effect for its force; or a function of the `Trajectory` that returns real numbers of shape `[time]`, `[k]` or `[]`.
+    - `observable`: what errors are of: a name, as in `"q[0]"`, or of an effect for its force; or a function of the
+      `Trajectory` that returns real numbers of shape `[time]`, `[k]` or `[]`.
     - `methods`: a `Method` for each name; by default solvers that suit the scene.
     - `tolerances`: relative ones, > 0; absolute ones are a thousandth of them.
     - `reference`: a closed form of the observable: numbers of its shape, or a function of the times.
@@ -117,7 +118,7 @@ def work_precision(
     rtol, agreement = max(_TIGHTER * smallest, _TIGHTEST), smallest if agreement is None else agreement
     target = converged(scene, question, rtol, closed=closed, scale=None, agreement=agreement)
     scale = scale_of(target.y)
-    limits: dict[int, Limit | str] = {}
+    limits: dict[int, Converged | str] = {}
     for method in methods.values():
         if method.scene is not None and id(method.scene) not in limits:
             try:
@@ -285,8 +286,8 @@ def _row(
     outcome: _Timed,
     timings: dict[str, Timing],
     question: Question,
-    target: Limit,
-    limit: Limit | str | None,
+    target: Converged,
+    limit: Converged | str | None,
     scale: float,
 ) -> Row:
     """Errors of a candidate beside its times."""

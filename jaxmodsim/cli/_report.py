@@ -8,7 +8,7 @@ import pandas as pd
 
 from ..plot import ramp_figure, stick_figure
 from ._output import console, show_paths, show_table, write
-from ._testbench import Measured, cases, run_case, stick_sweep
+from ._testbench import RampResult, cases, run_case, stick_sweep
 
 PARTS = {
     "a": "a: Coulomb friction by sign(v)",
@@ -56,7 +56,7 @@ def testbench_files() -> dict[str, Any]:
     return files
 
 
-def _table(measured: list[Measured]) -> pd.DataFrame:
+def _table(measured: list[RampResult]) -> pd.DataFrame:
     return pd.DataFrame(
         {
             "part": [m.case.part for m in measured],
@@ -85,7 +85,7 @@ def _grid(sweep: dict[str, Any]) -> pd.DataFrame:
     )
 
 
-def _curves(measured: list[Measured]) -> pd.DataFrame:
+def _curves(measured: list[RampResult]) -> pd.DataFrame:
     """Every curve of the figures, one row for each model and time."""
     return pd.concat(
         pd.DataFrame(

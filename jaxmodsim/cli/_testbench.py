@@ -28,7 +28,7 @@ SIGMA1 = (0.0, 5.0, 20.0, 80.0)
 
 
 @dataclass(frozen=True)
-class Case:
+class RampCase:
     """One run of the bench.
 
     - `part`: part of the exercise, a to e.
@@ -50,10 +50,10 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Measured:
+class RampResult:
     """A case that was run, with the numbers of its line in the table."""
 
-    case: Case
+    case: RampCase
     run: RampRun
     break_away: float
     crossings: int
@@ -63,18 +63,18 @@ class Measured:
     ending: str
 
 
-def cases() -> list[Case]:
+def cases() -> list[RampCase]:
     """The runs of the exercise's parts a to e; b and d exactly, by events, and in their regularised form."""
     coulomb, stribeck = box_coulomb(), box_stribeck()
     return [
-        Case("a", "sign, 1 N/s, adaptive", Sign(coulomb)),
-        Case("a", "sign, 1 N/s, Euler 10 ms", Sign(coulomb), dt=FIXED_STEP, solver=dfx.Euler()),
-        Case("a", "sign, 3 N/s, Euler 10 ms", Sign(coulomb), ramp=3.0, dt=FIXED_STEP, solver=dfx.Euler()),
-        Case("b", "Coulomb, exact", coulomb),
-        Case("b", "Coulomb, regularised 1 mm/s", Regularized(coulomb, REGULARISED_WIDTH)),
-        Case("c", "dead zone 1 m/s, v0 = 0", DeadZone(coulomb, 1.0), dt=FIXED_STEP),
-        Case("c", "dead zone 1 m/s, v0 = -2 m/s", DeadZone(coulomb, 1.0), v0=-2.0, dt=FIXED_STEP),
-        Case(
+        RampCase("a", "sign, 1 N/s, adaptive", Sign(coulomb)),
+        RampCase("a", "sign, 1 N/s, Euler 10 ms", Sign(coulomb), dt=FIXED_STEP, solver=dfx.Euler()),
+        RampCase("a", "sign, 3 N/s, Euler 10 ms", Sign(coulomb), ramp=3.0, dt=FIXED_STEP, solver=dfx.Euler()),
+        RampCase("b", "Coulomb, exact", coulomb),
+        RampCase("b", "Coulomb, regularised 1 mm/s", Regularized(coulomb, REGULARISED_WIDTH)),
+        RampCase("c", "dead zone 1 m/s, v0 = 0", DeadZone(coulomb, 1.0), dt=FIXED_STEP),
+        RampCase("c", "dead zone 1 m/s, v0 = -2 m/s", DeadZone(coulomb, 1.0), v0=-2.0, dt=FIXED_STEP),
+        RampCase(
             "c",
             "dead zone 0.1 mm/s, v0 = -1 m/s",
             DeadZone(coulomb, 1e-4),
@@ -82,14 +82,14 @@ def cases() -> list[Case]:
             dt=FIXED_STEP,
             solver=dfx.Euler(),
         ),
-        Case("d", "Stribeck, exact", stribeck),
-        Case("d", "Stribeck, regularised 1 mm/s", Regularized(stribeck, REGULARISED_WIDTH)),
-        Case("e", "LuGre, sigma0 750, sigma1 0", box_lugre()),
-        Case("e", "LuGre, sigma0 7500, sigma1 80", box_lugre(sigma0=7500.0, sigma1=80.0)),
+        RampCase("d", "Stribeck, exact", stribeck),
+        RampCase("d", "Stribeck, regularised 1 mm/s", Regularized(stribeck, REGULARISED_WIDTH)),
+        RampCase("e", "LuGre, sigma0 750, sigma1 0", box_lugre()),
+        RampCase("e", "LuGre, sigma0 7500, sigma1 80", box_lugre(sigma0=7500.0, sigma1=80.0)),
     ]
 
 
-def run_case(case: Case) -> Measured:
+def run_case(case: RampCase) -> RampResult:
     """Run a case and take its numbers; the second, warm run is timed."""
     scene = ramped_box(case.law, ramp=case.ramp, m=MASS)
     # With a fixed step every step is seen, which is where a chattering velocity shows.
@@ -108,7 +108,7 @@ def run_case(case: Case) -> Measured:
     ok = bool(run.result.ok)
     note = "" if ok else f"{int(run.stats['num_steps'])} steps used up at t = {1e3 * float(run.t_end):.3g} ms"
     drawn = RampRun(case.label, t, v, forces["pull"][:, 0], forces["friction"], note)
-    return Measured(
+    return RampResult(
         case,
         drawn,
         _break_away(run, drawn) if ok and not isinstance(case.law, Sign) else float("nan"),

@@ -1,6 +1,9 @@
 """Figures. The only part that imports matplotlib; every function returns a `matplotlib.figure.Figure`."""
 
-from matplotlib.figure import Figure as Figure
+try:
+    from matplotlib.figure import Figure as Figure
+except ModuleNotFoundError as error:
+    raise ImportError('jaxmodsim.plot needs matplotlib: pip install "jaxmodsim[plot]".') from error
 
 from ._behaviour import behaviour_figure as behaviour_figure
 from ._comparison import comparison_figure as comparison_figure

@@ -1,4 +1,4 @@
-"""What a sweep observes in each lane."""
+"""What a sweep observes in each run."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ Observable: TypeAlias = Callable[[Trajectory], Any] | str
 
 @dataclass(frozen=True)
 class Derivative:
-    """Derivatives of an observable by numbers of the lane, for `observe` of `sweep`.
+    """Derivatives of an observable by numbers of the run, for `observe` of `sweep`.
 
     ```python
     slopes = jaxmodsim.sweeps.Derivative("qd[0]", ("m", "friction.Fc"))

@@ -41,9 +41,7 @@ def found() -> WorkPrecision:
         # Explicit Euler is unstable with the longer step, beyond all numbers.
         "Euler": jms.Method(dfx.Euler(), braked_spring(jms.Viscous(1e3)), steps=(0.1, 1e-3)),
     }
-    return jms.work_precision(
-        **CASE.arguments, methods=methods, tolerances=(LOOSE, TIGHT), rounds=1, max_steps=3000
-    )
+    return jms.work_precision(**CASE.arguments, methods=methods, tolerances=(LOOSE, TIGHT), rounds=1, max_steps=3000)
 
 
 def test_errors_fall_with_the_tolerance(found: WorkPrecision) -> None:

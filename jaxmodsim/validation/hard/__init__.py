@@ -1,17 +1,17 @@
 """Cases in which simulations go wrong, each with the reason, the right answer, and a check of it."""
 
 from ._case import Answer as Answer
+from ._case import FunctionTask as FunctionTask
 from ._case import HardCase as HardCase
-from ._case import Measured as Measured
-from ._case import Motion as Motion
-from ._case import Program as Program
-from ._case import Refused as Refused
+from ._case import MeasuredNumber as MeasuredNumber
+from ._case import RefusedCalls as RefusedCalls
+from ._case import SceneTask as SceneTask
 from ._cases import FAMILIES as FAMILIES
 from ._cases import hard_cases as hard_cases
 from ._check import DTYPES as DTYPES
-from ._check import WAYS as WAYS
-from ._check import Finding as Finding
-from ._check import Verdict as Verdict
+from ._check import TRANSFORMS as TRANSFORMS
+from ._check import CaseReport as CaseReport
+from ._check import CheckFinding as CheckFinding
 from ._check import check as check
 from ._many_events import Contradictory as Contradictory
 from ._run import check_many as check_many

@@ -1,4 +1,4 @@
-"""One lane of a sweep: numbers in, the outcome and what is observed out."""
+"""One run of a sweep: numbers in, the outcome and what is observed out."""
 
 import abc
 from collections.abc import Callable, Mapping
@@ -16,15 +16,15 @@ from ..scene import Scene, elements, replace_elements, replace_numbers, scene_nu
 from ..simulation import MAX_STEPS, Trajectory, simulate
 from ._observe import Derivative, Observation, observed, real
 
-# Steps that lanes may take before they are set aside, where nothing is known of them.
+# Steps that runs may take before they are set aside, where nothing is known of them.
 CAP = 1024
 
 # What a function that returns numbers ends with.
 _FUNCTION_MESSAGES = ("The function gave numbers.", "The function gave NaN.")
 
 
-class Found(eqx.Module):
-    """What a lane gives.
+class RunOutcome(eqx.Module):
+    """What a run gives.
 
     - `code`: 0 where all went well, else an index into `messages`.
     - `num_steps`: steps of the run; 0 of a function that returns no run.
@@ -37,15 +37,15 @@ class Found(eqx.Module):
     messages: tuple[str, ...] = eqx.field(static=True)
 
 
-class AbstractLane(abc.ABC):
-    """What is computed for each lane. Compared by value: it is compiled in."""
+class AbstractRun(abc.ABC):
+    """What is computed of one run. Compared by value: it is compiled in."""
 
     @abc.abstractmethod
-    def run(self, fixed: PyTree, numbers: Mapping[str, Array]) -> Found:
-        """Compute one lane from what is common to all and its own numbers."""
+    def evaluate(self, fixed: PyTree, numbers: Mapping[str, Array]) -> RunOutcome:
+        """Compute one run from what is common to all and its own numbers."""
 
     @abc.abstractmethod
-    def within(self, max_steps: int) -> "AbstractLane":
+    def within(self, max_steps: int) -> "AbstractRun":
         """The same, with runs that give up after so many steps."""
 
     @property
@@ -55,7 +55,7 @@ class AbstractLane(abc.ABC):
 
 
 @dataclass(frozen=True)
-class SceneLane(AbstractLane):
+class SceneRun(AbstractRun):
     """A run of a scene; `fixed` is the scene and those arguments of `simulate` that are numbers.
 
     - `observe`: what is kept.
@@ -65,18 +65,18 @@ class SceneLane(AbstractLane):
     observe: tuple[Observation, ...]
     choices: tuple[tuple[str, Any], ...]
 
-    def run(self, fixed: PyTree, numbers: Mapping[str, Array]) -> Found:
+    def evaluate(self, fixed: PyTree, numbers: Mapping[str, Array]) -> RunOutcome:
         """Run the scene; in forward mode by the numbers that derivatives are wanted by."""
         scene, given = fixed
         scene, arguments = replaced(scene, given, numbers)
         wrt = list(dict.fromkeys(n for what in self.observe if isinstance(what.of, Derivative) for n in what.of.names))
         choices: dict[str, Any] = dict(self.choices) | ({"adjoint": dfx.ForwardMode()} if wrt else {})
 
-        def at(x: dict[str, Array]) -> tuple[dict[str, Array], Found]:
+        def at(x: dict[str, Array]) -> tuple[dict[str, Array], RunOutcome]:
             changed, called = replaced(scene, arguments, x)
             run = simulate(changed, **called, **choices, throw=False)
             values = {what.name: observed(what, run, "ts" not in given) for what in self.observe}
-            return values, Found(run.code, run.stats["num_steps"], values, run.result.messages)
+            return values, RunOutcome(run.code, run.stats["num_steps"], values, run.result.messages)
 
         if not wrt:
             return at({})[1]
@@ -91,9 +91,9 @@ class SceneLane(AbstractLane):
                 chosen[what.name] = by[0] if isinstance(what.of.wrt, str) else jnp.stack(by)
         return chosen
 
-    def within(self, max_steps: int) -> AbstractLane:
+    def within(self, max_steps: int) -> AbstractRun:
         """The same with another step limit."""
-        return SceneLane(self.observe, tuple({**dict(self.choices), "max_steps": max_steps}.items()))
+        return SceneRun(self.observe, tuple({**dict(self.choices), "max_steps": max_steps}.items()))
 
     @property
     def max_steps(self) -> int | None:
@@ -102,13 +102,13 @@ class SceneLane(AbstractLane):
 
 
 @dataclass(frozen=True)
-class FunctionLane(AbstractLane):
-    """A function of the numbers of the lane that returns numbers, or a run that is then observed."""
+class FunctionRun(AbstractRun):
+    """A function of the numbers of the run that returns numbers, or a run that is then observed."""
 
     function: Callable[..., Any]
     observe: tuple[Observation, ...] | None
 
-    def run(self, fixed: PyTree, numbers: Mapping[str, Array]) -> Found:
+    def evaluate(self, fixed: PyTree, numbers: Mapping[str, Array]) -> RunOutcome:
         """Call the function."""
         del fixed
         given = self.function(**numbers)
@@ -116,7 +116,7 @@ class FunctionLane(AbstractLane):
             if self.observe is None:
                 raise ValueError("The function returns a run: say by observe= what to keep of it.")
             values = {what.name: observed(what, given, given.end is None) for what in self.observe}
-            return Found(given.code, given.stats["num_steps"], values, given.result.messages)
+            return RunOutcome(given.code, given.stats["num_steps"], values, given.result.messages)
         if self.observe is not None:
             raise ValueError(
                 f"observe reads a run, but the function returned a {type(given).__name__}: leave observe out, and"
@@ -125,9 +125,9 @@ class FunctionLane(AbstractLane):
         values = dict(given) if isinstance(given, Mapping) else {"value": given}
         values = {str(name): real(str(name), value) for name, value in values.items()}
         nan = jnp.any(jnp.stack([jnp.any(jnp.isnan(x)) for x in values.values()]))
-        return Found(nan.astype(int), jnp.zeros((), int), values, _FUNCTION_MESSAGES)
+        return RunOutcome(nan.astype(int), jnp.zeros((), int), values, _FUNCTION_MESSAGES)
 
-    def within(self, max_steps: int) -> AbstractLane:
+    def within(self, max_steps: int) -> AbstractRun:
         """The function itself says how many steps it allows."""
         del max_steps
         return self
@@ -138,13 +138,13 @@ class FunctionLane(AbstractLane):
         return None
 
 
-def rehearsed(lane: AbstractLane) -> AbstractLane:
-    """The lane as it is looked at before anything runs: as most lanes are run first, to be traced once."""
-    return lane if lane.max_steps is None else lane.within(min(CAP, lane.max_steps))
+def rehearsed(run: AbstractRun) -> AbstractRun:
+    """The run with the step limit that most runs get first: looked at with it, it is traced only once."""
+    return run if run.max_steps is None else run.within(min(CAP, run.max_steps))
 
 
 def out_of_steps(code: np.ndarray) -> np.ndarray:
-    """Lanes that came to the end of the steps they were allowed."""
+    """Runs that came to the end of the steps they were allowed."""
     return code == MAX_STEPS
 
 

@@ -1,4 +1,4 @@
-"""What an experiment finds out about a law."""
+"""Results of an experiment on a law."""
 
 import enum
 import math
@@ -15,12 +15,12 @@ class Verdict(enum.Enum):
 
     PASS = "pass"
     FAIL = "FAIL"
-    BY_NATURE = "by nature"
+    KNOWN_LIMITATION = "known limitation"
     NOT_APPLICABLE = "n/a"
 
 
 @dataclass(frozen=True)
-class Limit:
+class Threshold:
     """What a number must keep to pass.
 
     - `value`: the threshold, in the unit of the number.
@@ -31,12 +31,12 @@ class Limit:
     at_most: bool
 
     def keeps(self, number: float) -> bool:
-        """Whether `number` keeps the limit; NaN never does."""
+        """Whether `number` keeps the threshold; NaN never does."""
         return number <= self.value if self.at_most else number >= self.value
 
 
 @dataclass(frozen=True)
-class Line:
+class FigureLine:
     """A curve of a figure.
 
     - `label`: what it is.
@@ -51,7 +51,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Finding:
+class LawMeasurement:
     """What was measured on one law.
 
     - `number`: in the unit of the experiment; NaN where the experiment does not apply.
@@ -61,7 +61,7 @@ class Finding:
 
     number: float
     sentence: str
-    lines: tuple[Line, ...] = ()
+    lines: tuple[FigureLine, ...] = ()
 
     @property
     def rounded(self) -> str:
@@ -76,14 +76,14 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """A finding and its verdict.
+class ExperimentResult:
+    """A measurement and its verdict.
 
-    - `verdict`: `PASS`, `FAIL`, `BY_NATURE` (misses the limit, as such laws are known to) or `NOT_APPLICABLE`.
-    - `finding`: number, sentence and curves.
-    - `reason`: why such a law misses the limit, or why the experiment does not apply; empty otherwise.
+    - `verdict`: `PASS`, `FAIL`, `KNOWN_LIMITATION` (misses the threshold, as is known of such laws), `NOT_APPLICABLE`.
+    - `measured`: number, sentence and curves.
+    - `reason`: why such a law misses the threshold, or why the experiment does not apply; empty otherwise.
     """
 
     verdict: Verdict
-    finding: Finding
+    measured: LawMeasurement
     reason: str = ""

@@ -25,8 +25,8 @@ def _always(law: Any) -> bool:
     return True
 
 
-class Nature(NamedTuple):
-    """That laws of some kinds miss the limit of an experiment, and why.
+class KnownLimitation(NamedTuple):
+    """That laws of some kinds miss the threshold of an experiment, and why.
 
     - `experiment`: its name.
     - `kinds`: abstract or final classes of laws.
@@ -50,26 +50,26 @@ def _no_fall(law: Any) -> bool:
     return stiction is None or not bool((stiction > nominal(law.Fc)).any())
 
 
-BY_NATURE: tuple[Nature, ...] = (
-    Nature(
+KNOWN_LIMITATIONS: tuple[KnownLimitation, ...] = (
+    KnownLimitation(
         "presliding",
         (AbstractForceLaw, AbstractSetValuedLaw),
         "The force is a function of velocity and jumps as the velocity reverses.",
     ),
-    Nature(
+    KnownLimitation(
         "characteristic",
         (Armstrong,),
         "After a reversal there is as much Stribeck friction as the slip left and the rest brought back.",
     ),
-    Nature("memory", (Dahl, LuGre, ElastoPlastic), "One state remembers one turning point."),
-    Nature("break-away", _STATELESS, "The limit of stick is a number, whatever the load did before."),
-    Nature("break-away", (Dahl, MaxwellSlip), "The force is a function of displacement alone.", _no_fall),
-    Nature("lag", _STATELESS, "The force is a function of velocity: no memory, no lag."),
-    Nature("lag", (Dahl, MaxwellSlip), _FLAT, _no_fall),
-    Nature("stick-slip", (Viscous, Coulomb, Dahl, MaxwellSlip), _FLAT, _no_fall),
-    Nature("creep", (AbstractForceLaw,), "A function of velocity holds a load only by moving."),
-    Nature("creep", (Dahl, LuGre), "The bristle yields at any load, a little more forth than back."),
-    Nature(
+    KnownLimitation("memory", (Dahl, LuGre, ElastoPlastic), "One state remembers one turning point."),
+    KnownLimitation("break-away", _STATELESS, "The limit of stick is a number, whatever the load did before."),
+    KnownLimitation("break-away", (Dahl, MaxwellSlip), "The force is a function of displacement alone.", _no_fall),
+    KnownLimitation("lag", _STATELESS, "The force is a function of velocity: no memory, no lag."),
+    KnownLimitation("lag", (Dahl, MaxwellSlip), _FLAT, _no_fall),
+    KnownLimitation("stick-slip", (Viscous, Coulomb, Dahl, MaxwellSlip), _FLAT, _no_fall),
+    KnownLimitation("creep", (AbstractForceLaw,), "A function of velocity holds a load only by moving."),
+    KnownLimitation("creep", (Dahl, LuGre), "The bristle yields at any load, a little more forth than back."),
+    KnownLimitation(
         "passivity",
         (LuGre, ElastoPlastic),
         "A constant sigma1 gives energy back unless sigma2 > sigma1 (Fs - Fc)/Fc.",
@@ -78,10 +78,10 @@ BY_NATURE: tuple[Nature, ...] = (
 )
 
 
-def by_nature(experiment: str, law: AbstractLaw) -> str | None:
-    """Why such a law misses the limit of that experiment; None if it is not known to."""
+def known_limitation(experiment: str, law: AbstractLaw) -> str | None:
+    """Why such a law misses the threshold of that experiment; None if it is not known to."""
     plain = getattr(law, "forward", law)
-    for nature in BY_NATURE:
-        if nature.experiment == experiment and isinstance(plain, nature.kinds) and nature.when(plain):
-            return nature.reason
+    for known in KNOWN_LIMITATIONS:
+        if known.experiment == experiment and isinstance(plain, known.kinds) and known.when(plain):
+            return known.reason
     return None

@@ -1,4 +1,4 @@
-"""What a feature of a run is."""
+"""What a metric of a run is."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from ..simulation import Trajectory
 
 
 @dataclass(frozen=True)
-class Feature:
+class Metric:
     """A function of a `Trajectory` that gives one number; two of equal fields are equal, and compile once.
 
     Works under `jax.jit`, `jax.vmap` and `jax.grad`, on runs with events and without. NaN where a run has no such
@@ -35,7 +35,7 @@ class Feature:
         """The number, shape `[]`."""
         return jnp.asarray(self.measure(run, *self.arguments))
 
-    def words(self, value: ArrayLike) -> str:
+    def describe(self, value: ArrayLike) -> str:
         """What a value stands for: of a class of motion its name, of a quantity the number with its unit."""
         number = float(np.asarray(value))
         if self.read is not None:
@@ -43,11 +43,11 @@ class Feature:
         return f"{number:.6g}" if self.unit == "1" else f"{number:.6g} {self.unit}"
 
 
-def classes(fn: Callable[[Trajectory], Any], names: tuple[str, ...] | list[str]) -> Feature:
+def classes(fn: Callable[[Trajectory], Any], names: tuple[str, ...] | list[str]) -> Metric:
     """Classes of motion by a function of your own, as for laws without modes.
 
     ```python
-    kind = features.classes(lambda run: jnp.where(jnp.abs(run.qd[-1, 0]) < 1e-3, 0, 1), ("rests", "moves"))
+    kind = metrics.classes(lambda run: jnp.where(jnp.abs(run.qd[-1, 0]) < 1e-3, 0, 1), ("rests", "moves"))
     ```
 
     **Arguments:**
@@ -57,7 +57,7 @@ def classes(fn: Callable[[Trajectory], Any], names: tuple[str, ...] | list[str])
 
     **Returns:**
 
-    A `Feature` whose `words(i)` is `names[i]`.
+    A `Metric` whose `describe(i)` is `names[i]`.
 
     **Raises:**
 
@@ -68,7 +68,7 @@ def classes(fn: Callable[[Trajectory], Any], names: tuple[str, ...] | list[str])
         raise ValueError("names must hold a name for each class, as in ('rests', 'moves'), but it is empty.")
     if not callable(fn):
         raise ValueError(f"fn must be a function of a Trajectory, but {fn!r} was given.")
-    return Feature("kind of motion", "1", _class_of, (fn, names), _class_name)
+    return Metric("kind of motion", "1", _class_of, (fn, names), _class_name)
 
 
 def _class_of(run: Trajectory, fn: Callable[[Trajectory], Any], names: tuple[str, ...]) -> Any:
