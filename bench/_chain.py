@@ -18,9 +18,9 @@ from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols, msubs
 
 import jaxmodsim as jms
 from jaxmodsim._core.cholesky import solve_positive_definite
-from jaxmodsim._core.fusion import once, unit_of
+from jaxmodsim._core.fusion import fusion_barrier, opaque_one
 from jaxmodsim.problems import n_link_pendulum, n_link_pendulum_acceleration
-from jaxmodsim.scene import State, scene_field
+from jaxmodsim.scene import State, vector_field
 
 G = 9.81
 # Of the Euler steps in a loop [s].
@@ -46,7 +46,7 @@ def scene(n: int) -> jms.Scene:
 
 def ours(q: Any, qd: Any, scene: jms.Scene) -> Any:
     """Accelerations from the Lagrangian."""
-    return scene_field(jnp.zeros_like(q[0]), State(q, qd, {}), scene).qd
+    return vector_field(jnp.zeros_like(q[0]), State(q, qd, {}), scene).qd
 
 
 def arrays(q: Any, qd: Any, scene: jms.Scene) -> Any:
@@ -56,9 +56,12 @@ def arrays(q: Any, qd: Any, scene: jms.Scene) -> Any:
 
 def scalars(q: Any, qd: Any, scene: jms.Scene) -> Any:
     """Closed form in scalars."""
-    n, p, unit = q.shape[0], scene.params, unit_of(q[0])
+    n, p, unit = q.shape[0], scene.params, opaque_one(q[0])
     m, l, w = ([x[i] for i in range(n)] for x in (p["m"], p["l"], qd))  # noqa: E741
-    s, c = [once(jnp.sin(q[i]), unit) for i in range(n)], [once(jnp.cos(q[i]), unit) for i in range(n)]
+    s, c = (
+        [fusion_barrier(jnp.sin(q[i]), unit) for i in range(n)],
+        [fusion_barrier(jnp.cos(q[i]), unit) for i in range(n)],
+    )
     below = [sum(m[i + 1 :], m[i]) for i in range(n)]
     mass: list[list[Any]] = [[None] * n for _ in range(n)]
     load = [-below[i] * p["g"] * l[i] * s[i] for i in range(n)]

@@ -1,6 +1,6 @@
 """Scenes as people run them without `simulate`: by diffrax and scipy, with friction by the sign of slip.
 
-The right-hand side is that of `scene_field`, which is more than most would write: mass matrices are solved with care,
+The right-hand side is that of `vector_field`, which is more than most would write: mass matrices are solved with care,
 constraints are differentiated twice. Missing are the events, and the projection onto the constraints.
 """
 
@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 
 import jaxmodsim as jms
 from jaxmodsim.friction import AbstractSetValuedLaw
-from jaxmodsim.scene import State, scene_field
+from jaxmodsim.scene import State, vector_field
 
 RTOL, ATOL = 1e-6, 1e-9
 MAX_STEPS = 1_000_000
@@ -39,11 +39,11 @@ def _with_sign(effect: Any) -> Any:
 def _start(scene: jms.Scene, q0: Any, qd0: Any) -> State:
     q, qd = jnp.asarray(q0), jnp.asarray(qd0)
     dtype = jnp.result_type(q, float) if q.dtype != jnp.float32 else q.dtype
-    return State(q.astype(dtype), qd.astype(dtype), scene.state0(q.astype(dtype)))
+    return State(q.astype(dtype), qd.astype(dtype), scene.initial_state(q.astype(dtype)))
 
 
 def _rate(t: Any, y: State, scene: jms.Scene) -> State:
-    return scene_field(t, y, scene, None)
+    return vector_field(t, y, scene, None)
 
 
 def _run(t_end: Any, states: State) -> SimpleNamespace:

@@ -51,7 +51,7 @@ from _stick_slip import (
 from matplotlib import pyplot as plt
 
 import jaxmodsim as jms
-from jaxmodsim.scene import State, scene_field
+from jaxmodsim.scene import State, vector_field
 
 RTOL = 1e-6
 LADDER = tuple(10.0**-k for k in range(4, 10))
@@ -234,11 +234,11 @@ def _primitives() -> dict[str, Any]:
         mass = push(still, rest, jnp.ones_like(qd))[None]
         return qd, (by_q - push(jnp.ones_like(t), qd, rest)) / mass[0]
 
-    ours = _count(jax.make_jaxpr(lambda t, y, s: scene_field(t, y, s))(t, y, scene).jaxpr)
+    ours = _count(jax.make_jaxpr(lambda t, y, s: vector_field(t, y, s))(t, y, scene).jaxpr)
     hand = _count(jax.make_jaxpr(by_hand)(t, y.q, y.qd, scene.params).jaxpr)
     with_law = belt_oscillator(jnp.asarray(NOMINAL))
     mode = jnp.zeros(1)
-    full = _count(jax.make_jaxpr(lambda t, y, s: scene_field(t, y, s, mode))(t, y, with_law).jaxpr)
+    full = _count(jax.make_jaxpr(lambda t, y, s: vector_field(t, y, s, mode))(t, y, with_law).jaxpr)
     return {
         "ours": sum(ours.values()),
         "by_hand": sum(hand.values()),

@@ -53,12 +53,12 @@ def laws() -> dict[str, Any]:
 
 def evaluate(law: Any, v: Any, z: Any) -> Any:
     """Force and rate at one state, in one number."""
-    law = law.at(jnp.zeros(()), jnp.reshape(jnp.ravel(v)[0], (1,)), jnp.zeros(1), {})
+    law = law.bind_state(jnp.zeros(()), jnp.reshape(jnp.ravel(v)[0], (1,)), jnp.zeros(1), {})
     if isinstance(law, AbstractSetValuedLaw):
-        return law.dry(v) * jnp.sign(v) + law.wet(v)
+        return law.sliding_force(v) * jnp.sign(v) + law.viscous_force(v)
     if not isinstance(law, AbstractDynamicLaw):
         return law.force(v)
-    rates = jax.tree.leaves(law.rate(v, z))
+    rates = jax.tree.leaves(law.zdot(v, z))
     return jnp.sum(law.force(v, z)) + sum(jnp.sum(rate) for rate in rates)
 
 
@@ -85,7 +85,7 @@ def batch(differentiate: bool, law: Any, v: Any, z: Any) -> Any:
 def calls(name: str, law: Any) -> dict[str, Any]:
     """What is timed of a law."""
     v = jnp.full((2,), 0.013) if "plane" in name else jnp.asarray(0.013)
-    z = law.state0(v) if isinstance(law, AbstractDynamicLaw) else jnp.zeros(())
+    z = law.initial_state(v) if isinstance(law, AbstractDynamicLaw) else jnp.zeros(())
     many = jax.tree.map(lambda x: jnp.broadcast_to(x, (BATCH, *jnp.shape(x))) * 1.0, (law, v, z))
     found = {}
     for kind, differentiate in (("force", False), ("gradient", True)):

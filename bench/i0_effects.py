@@ -42,7 +42,7 @@ from jaxmodsim.problems import (
     spherical_pendulum,
     spherical_pendulum_acceleration,
 )
-from jaxmodsim.scene import State, scene_field, scene_guards
+from jaxmodsim.scene import State, scene_guards, vector_field
 
 T1, LOOP = 10.0, 2000
 COUNTED = {"flops": "operations", "transcendentals": "transcendental", "bytes accessed": "bytes"}
@@ -81,7 +81,9 @@ class Case:
     def state(self) -> tuple[State, Any]:
         """A state within the run, and its modes where there are any: in slip, slower than the belt."""
         q, qd = jnp.asarray(self.q0), 0.5 * jnp.asarray(self.qd0)
-        return State(q, qd, self.scene.state0(q)), -jnp.ones(len(self.scene.exact)) if self.scene.exact else None
+        return State(q, qd, self.scene.initial_state(q)), -jnp.ones(
+            len(self.scene.event_driven)
+        ) if self.scene.event_driven else None
 
 
 def spring(*effects: Any) -> jms.Scene:
@@ -170,7 +172,7 @@ def counted(compiled: Any) -> dict[str, float]:
 
 def _field(case: Case) -> Callable[..., Any]:
     mode = case.state[1]
-    return lambda t, y, scene: scene_field(t, y, scene, mode)
+    return lambda t, y, scene: vector_field(t, y, scene, mode)
 
 
 def _counts(case: Case) -> dict[str, Any]:
@@ -186,7 +188,7 @@ def _counts(case: Case) -> dict[str, Any]:
         found["guards"] = counted(guards.lower(t, state, case.scene).compile())
     run = jms.simulate(case.scene, list(case.q0), list(case.qd0), T1, **case.options)
     found["run"]["steps"] = int(run.stats["num_steps"])
-    found["run"]["events"] = int(np.isfinite(run.events.t).sum()) if case.scene.exact else 0
+    found["run"]["events"] = int(np.isfinite(run.events.t).sum()) if case.scene.event_driven else 0
     return found
 
 
@@ -269,7 +271,7 @@ OURS = "jaxmodsim"
 
 
 def _ways(row: dict[str, Any]) -> dict[str, Callable[..., Any]]:
-    return {OURS: scene_field} | {way: function for way, function in row.items() if way.startswith("by ")}
+    return {OURS: vector_field} | {way: function for way, function in row.items() if way.startswith("by ")}
 
 
 def hand_run(function: Callable[..., Any], y: State, scene: jms.Scene) -> Any:

@@ -27,7 +27,7 @@ from _options import begin
 from _report import new_result, target_rows, write_result
 
 import jaxmodsim as jms
-from jaxmodsim._core.fusion import once, unit_of
+from jaxmodsim._core.fusion import fusion_barrier, opaque_one
 from jaxmodsim.problems import n_link_pendulum
 from jaxmodsim.solvers import RODAS5P, rosenbrock_step
 
@@ -192,8 +192,8 @@ def _by_hand(t: Any, y: Any, p: Any) -> Any:
     """Double pendulum, LuGre's law in its joints, scalars; unit masses and lengths, angles from straight down."""
     del t
     a, b, va, vb, za, zb = y
-    unit = unit_of(jax.lax.stop_gradient(a))
-    c, s = once((jnp.cos(a - b), jnp.sin(a - b)), unit)
+    unit = opaque_one(jax.lax.stop_gradient(a))
+    c, s = fusion_barrier((jnp.cos(a - b), jnp.sin(a - b)), unit)
     slip = (va, vb - va)
     rates, forces = [], []
     for v, z in zip(slip, (za, zb), strict=True):
@@ -202,8 +202,8 @@ def _by_hand(t: Any, y: Any, p: Any) -> Any:
         rate = v - p["sigma0"] * jnp.abs(v) / level * z
         rates.append(rate)
         forces.append(p["sigma0"] * z + p["sigma1"] * rate + p["sigma2"] * v)
-    first = -s * vb * vb - 2.0 * G * once(jnp.sin(a), unit) - forces[0] + forces[1]
-    second = s * va * va - G * once(jnp.sin(b), unit) - forces[1]
+    first = -s * vb * vb - 2.0 * G * fusion_barrier(jnp.sin(a), unit) - forces[0] + forces[1]
+    second = s * va * va - G * fusion_barrier(jnp.sin(b), unit) - forces[1]
     determinant = 2.0 - c * c
     return va, vb, (first - c * second) / determinant, (2.0 * second - c * first) / determinant, *rates
 
