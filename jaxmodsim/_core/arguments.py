@@ -1,7 +1,8 @@
 """Arguments that are no numbers of a scene: converted, or refused by their name."""
 
+import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -114,3 +115,15 @@ def as_mapping(value: Any, *, name: str, example: str) -> dict[str, Any]:
     if not isinstance(value, Mapping) or not all(isinstance(each, str) for each in value):
         raise ValueError(f"{name} must be a mapping by names, as in {example}, but {value!r} was given.")
     return dict(value)
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """The known name that is most like this one; None where none is."""
+    found = difflib.get_close_matches(name, list(known), n=1)
+    return found[0] if found else None
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """A question whether the nearest of the known names was meant, to end a sentence with; "" where none is near."""
+    near = nearest(name, known)
+    return f" Did you mean {near!r}?" if near else ""

@@ -4,9 +4,10 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .arguments import check_real
 from .index_check import traced
@@ -68,3 +69,13 @@ def as_function(value: Any, *, name: str) -> Callable[..., Any]:
         raise ValueError(f"{name} must be a function, but {value!r} was given.")
     fn: Callable[..., Any] = value
     return fn if isinstance(value, eqx.Module) else Function(fn)
+
+
+def depends_on(fn: Callable[[Array], Array], x: Float[Array, "..."]) -> bool:
+    """Whether anything that `fn` returns is computed from `x`, be it by a product with zero."""
+    traced = jax.make_jaxpr(fn)(x).jaxpr
+    reached = set(traced.invars)
+    for equation in traced.eqns:
+        if any(var in reached for var in equation.invars if not hasattr(var, "val")):
+            reached.update(equation.outvars)
+    return any(var in reached for var in traced.outvars if not hasattr(var, "val"))

@@ -7,8 +7,7 @@ from typing import Annotated
 import typer
 
 from . import _options
-from ._interrupted import Interrupted
-from ._options import Out
+from ._options import Interrupted, Out
 
 app = typer.Typer(
     name="jaxmodsim",

@@ -9,7 +9,7 @@ import pandas as pd
 
 from ..plot import hard_figure, step_limits_figure
 from ..validation.hard import TRANSFORMS, CaseReport, HardCase, check_many, choose
-from ._interrupted import Interrupted
+from ._options import Interrupted
 from ._output import console, say, show_paths, show_table, write
 
 _VALUES, _SLOPES = ("alone", "jit", "vmap"), ("forward", "reverse")

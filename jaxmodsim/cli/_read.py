@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from .._core.suggest import nearest
+from .._core.arguments import nearest
 from ..identify import Record
 
 

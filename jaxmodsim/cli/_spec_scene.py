@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import create_model
 
 from .. import friction, problems
-from .._core.suggest import did_you_mean
+from .._core.arguments import did_you_mean
 from ..scene import Scene
 from ._table import Table, TableModel, Text, Values, Whole, inner, read_table
 

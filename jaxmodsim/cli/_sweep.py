@@ -17,7 +17,7 @@ import pandas as pd
 from .._core.speed import tune_cpu
 from ..plot import map2d
 from ..sweeps import SweepPlan, SweepProgress, plan_sweep, progress_bar, sweep
-from ._interrupted import Interrupted
+from ._options import Interrupted
 from ._output import say, show_paths, show_table, write
 from ._spec import Spec, read_spec
 from ._spec_scene import MODEL

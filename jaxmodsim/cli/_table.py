@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from .._core.suggest import did_you_mean, nearest
+from .._core.arguments import did_you_mean, nearest
 
 # Types of values; errors call them by the text beside them.
 Number = Annotated[float, "a finite number"]

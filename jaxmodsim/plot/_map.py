@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, StrMethodFormatter
 
-from .._core.suggest import did_you_mean
+from .._core.arguments import did_you_mean
 from ._style import BLUE, GREEN, RED, with_unit
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._core.cores import cores
+from .._core.speed import cores
 from ._compute import Computed, Work, compute
 from ._extra import extra
 

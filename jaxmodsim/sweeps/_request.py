@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from .._core.arguments import check_real
-from .._core.suggest import did_you_mean
+from .._core.arguments import check_real, did_you_mean
 from ..scene import Scene, elements, scene_numbers, scene_ranges
 from ..simulation import prepare, simulate
 from ._compute import shapes

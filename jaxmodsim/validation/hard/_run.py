@@ -1,4 +1,4 @@
-"""Many hard cases, in several processes."""
+"""All hard cases, and checks of many of them in several processes."""
 
 import math
 import multiprocessing
@@ -9,10 +9,30 @@ from functools import cache
 
 import jax
 
-from ..._core.suggest import did_you_mean
+from ..._core.arguments import did_you_mean
+from . import _geometry, _gradients, _many_events, _numbers, _reversal, _scale, _shaken, _stiffness
 from ._case import HardCase
-from ._cases import FAMILIES, hard_cases
 from ._check import DTYPES, TRANSFORMS, CaseReport, CheckFinding, check, check_choice
+
+_MODULES = (_stiffness, _reversal, _shaken, _many_events, _geometry, _scale, _numbers, _gradients)
+
+FAMILIES = tuple(module.FAMILY for module in _MODULES)
+
+
+def hard_cases() -> dict[str, HardCase]:
+    """All hard cases by name, family after family.
+
+    ```python
+    case = hard.hard_cases()["bristle_stiff"]
+    verdict = hard.check(case)
+    verdict.ok, [finding.sentence for finding in verdict.findings]
+    ```
+
+    Families: stiffness, rest and reversal, loads in stick, many events, geometry, scale and time, numbers,
+    gradients.
+    """
+    return {case.name: case for module in _MODULES for case in module.cases()}
+
 
 # Of these the runs themselves take minutes: begun first, they do not hold up the end.
 _LONG = ("periods_1000000", "cycles_100000", "dead_points", "redundant_constraints")
