@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from ..friction import Coulomb, DeadZone, LuGre, Regularized, Stribeck, exponential
 from ..scene import Friction, Scene
-from ..solvers import Gauss, Rodas5P
+from ..solvers import Rodas5P
 
 _DTYPES = ("float32", "float64")
 
@@ -53,22 +53,6 @@ def default_methods(scene: Scene) -> dict[str, Method]:
     else:
         solvers = (dfx.Tsit5(), dfx.Dopri8(), Rodas5P())
     return {type(solver).__name__: Method(solver) for solver in solvers}
-
-
-def evaluations(solver: dfx.AbstractSolver, steps: int) -> int | None:
-    """Evaluations of the vector field in as many steps, rejected ones among them: those of the stages.
-
-    A stage that is the last one of the step before counts once (`diffrax.Tsit5`). Jacobians of `Rodas5P` are not
-    counted. None for methods that iterate (`Kvaerno5`, `Gauss`), as their number of iterations is not known.
-    """
-    if isinstance(solver, Rodas5P):
-        return 8 * steps
-    if isinstance(solver, dfx.Euler):
-        return steps
-    tableau = getattr(solver, "tableau", None)
-    if isinstance(solver, dfx.AbstractImplicitSolver | Gauss) or not isinstance(tableau, dfx.ButcherTableau):
-        return None
-    return (tableau.num_stages - tableau.fsal) * steps + tableau.fsal
 
 
 def formulations(scene: Scene, *, width: float, sigma0: float | None = None, sigma1: float = 0.0) -> dict[str, Scene]:

@@ -15,8 +15,8 @@ from jaxtyping import Array, ArrayLike
 from .._core.provenance import describe_machine
 from .._core.timing import measure
 from ..scene import Scene, elements
-from ..simulation import Trajectory, default_solver
-from ._methods import Method, default_methods, evaluations
+from ..simulation import Trajectory, default_solver, evaluations_per_step
+from ._methods import Method, default_methods
 from ._reference import ATOL, Converged, Question, converged, event_error, gradient_error, happened, in_type, scale_of
 from ._sensitivity import chosen_numbers, observable_of, observed
 from ._work_rows import Row, Timing, WorkPrecision
@@ -318,7 +318,7 @@ def _row(
     gradient = None
     if derivatives and target.gradient is not None:
         gradient = max(gradient_error({n: float(x) for n, x in each.items()}, target.gradient) for each in derivatives)
-    steps = int(run.stats["num_steps"])
+    steps, each = int(run.stats["num_steps"]), evaluations_per_step(prepared.solver, run)
     return replace(
         row,
         error=error,
@@ -328,7 +328,7 @@ def _row(
         gradient=gradient,
         steps=steps,
         rejected=int(run.stats["num_rejected_steps"]),
-        evaluations=evaluations(prepared.solver, steps),
+        evaluations=None if each is None else each * steps,
         times=timings,
         remarks=tuple(remarks),
     )

@@ -44,7 +44,7 @@ class Row:
     - `events`: largest error of the time of an event [s], where the same events happen as in the reference.
     - `gradient`: largest relative error of a derivative of the observable's last value.
     - `steps`, `rejected`: all steps, and how many of them were rejected.
-    - `evaluations`: of the vector field, by the stages of all steps; None for methods that iterate.
+    - `evaluations`: of the vector field in all steps, Jacobians among them; None for methods that iterate.
     - `times`: a `Timing` for each of the costs: `run`, `vmap` (for each run of the batch), `forward`, `reverse`.
     - `remarks`: in sentences.
     """

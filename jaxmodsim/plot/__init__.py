@@ -19,7 +19,6 @@ from ._records import score_figure as score_figure
 from ._records import truth_figure as truth_figure
 from ._result import result_figure as result_figure
 from ._sensitivity import sensitivity_figure as sensitivity_figure
-from ._testbench import RampRun as RampRun
 from ._testbench import ramp_figure as ramp_figure
 from ._testbench import stick_figure as stick_figure
 from ._work_precision import work_precision_figure as work_precision_figure

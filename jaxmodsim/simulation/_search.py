@@ -15,8 +15,8 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._core.index_check import check_indices
-from ..solvers import Rodas5P
 from ._accuracy import Accuracy, Tenfold, Tried
+from ._evaluations import evaluations_per_step
 from ._observe import named_series
 from ._outcome import SUCCESS, SimulationError, describe_failure
 from ._solve import Options, Problem, Solved, default_solver, solve
@@ -195,7 +195,10 @@ def reach(
     good = [made for (_, which), made in search.made.items() if which in choices and references.estimate(made) <= asked]
     best = min(
         good or references.runs,
-        key=lambda made: (made.num_steps * (_evaluations(made) or 1), references.estimate(made)),
+        key=lambda made: (
+            made.num_steps * (evaluations_per_step(made.solver, made.run) or 1),
+            references.estimate(made),
+        ),
     )
     return _chosen(search, references, best, references.estimate(best))
 
@@ -359,7 +362,7 @@ def _failure(problem: Problem, solved: Solved) -> str:
 def _chosen(search: _Search, references: _References, best: _Made, estimate: float) -> Trajectory:
     """A run with the report of the search."""
     tried = {
-        x: Tried(x.name, x.rtol, x.atol, x.num_steps, _evaluations(x), references.estimate(x))
+        x: Tried(x.name, x.rtol, x.atol, x.num_steps, evaluations_per_step(x.solver, x.run), references.estimate(x))
         for x in search.made.values()
     }
     accuracy = Accuracy(
@@ -391,16 +394,6 @@ def _tenfold(tried: list[Tried], rtol: float, gap: float) -> Tenfold:
     better = slopes[max(place - 1, 0)] if slopes else 0.0
     worse = slopes[min(place, len(slopes) - 1)] if slopes else 0.0
     return Tenfold(max(10 ** (per * better), 1.0), min(10 ** (-per * worse), 1.0))
-
-
-def _evaluations(made: _Made) -> int | None:
-    """Evaluations of the vector field in one step, the Jacobian counted as one for each entry of the state."""
-    if isinstance(made.solver, dfx.AbstractERK) and isinstance(made.solver.tableau, dfx.ButcherTableau):
-        return made.solver.tableau.num_stages - bool(made.solver.tableau.fsal)
-    if isinstance(made.solver, Rodas5P):
-        run = made.run
-        return 8 + 1 + sum(np.size(x) for x in jtu.tree_leaves((run.q, run.qd, run.z))) // run.t.shape[0]
-    return None
 
 
 def _round(x: float) -> float:

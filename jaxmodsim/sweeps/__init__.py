@@ -8,7 +8,6 @@ from ._plan import SweepPlan as SweepPlan
 from ._plan import plan_sweep as plan_sweep
 from ._progress import SweepProgress as SweepProgress
 from ._progress import progress_bar as progress_bar
-from ._samples import Span as Span
 from ._samples import latin_hypercube as latin_hypercube
 from ._samples import sobol as sobol
 from ._sweep import sweep as sweep

@@ -8,7 +8,5 @@ from ._laws import law_cases as law_cases
 from ._limitations import KNOWN_LIMITATIONS as KNOWN_LIMITATIONS
 from ._limitations import known_limitation as known_limitation
 from ._result import ExperimentResult as ExperimentResult
-from ._result import FigureLine as FigureLine
 from ._result import LawMeasurement as LawMeasurement
-from ._result import Threshold as Threshold
 from ._result import Verdict as Verdict

@@ -1,7 +1,6 @@
 """Cases in which simulations go wrong, each with the reason, the right answer, and a check of it."""
 
 from ._case import Answer as Answer
-from ._case import FunctionTask as FunctionTask
 from ._case import HardCase as HardCase
 from ._case import MeasuredNumber as MeasuredNumber
 from ._case import RefusedCalls as RefusedCalls

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..friction import AbstractLaw, DeadZone, Regularized, Sign
-from ..plot import RampRun
-from ..problems import box_coulomb, box_lugre, box_stribeck, ramped_box
-from ..simulation import Trajectory, simulate
+from ...friction import AbstractLaw, DeadZone, Regularized, Sign
+from ...metrics import break_away
+from ...problems import box_coulomb, box_lugre, box_stribeck, ramped_box
+from ...simulation import Trajectory, simulate
 
 T1 = 10.0
 MASS = 2.0
@@ -50,6 +50,25 @@ class RampCase:
 
 
 @dataclass(frozen=True)
+class RampRun:
+    """A run of the ramped box, ready to be drawn.
+
+    - `label`: what was run.
+    - `t`: times [s].
+    - `velocity`: velocity of the box [m/s].
+    - `applied`, `friction`: forces [N].
+    - `note`: a sentence for the figure, such as how the run ended.
+    """
+
+    label: str
+    t: np.ndarray
+    velocity: np.ndarray
+    applied: np.ndarray
+    friction: np.ndarray
+    note: str = ""
+
+
+@dataclass(frozen=True)
 class RampResult:
     """A case that was run, with the numbers of its line in the table."""
 
@@ -63,7 +82,7 @@ class RampResult:
     ending: str
 
 
-def cases() -> list[RampCase]:
+def ramp_cases() -> list[RampCase]:
     """The runs of the exercise's parts a to e; b and d exactly, by events, and in their regularised form."""
     coulomb, stribeck = box_coulomb(), box_stribeck()
     return [
@@ -89,7 +108,7 @@ def cases() -> list[RampCase]:
     ]
 
 
-def run_case(case: RampCase) -> RampResult:
+def run_ramp(case: RampCase) -> RampResult:
     """Run a case and take its numbers; the second, warm run is timed."""
     scene = ramped_box(case.law, ramp=case.ramp, m=MASS)
     # With a fixed step every step is seen, which is where a chattering velocity shows.
@@ -123,7 +142,7 @@ def run_case(case: RampCase) -> RampResult:
 def _break_away(result: Trajectory, run: RampRun) -> float:
     """Time of the event, or that after which friction stays behind the applied force; NaN where it never equals it."""
     if result.mode:
-        return float(result.events.t[0])
+        return float(break_away()(result))
     stuck = np.flatnonzero(np.abs(run.applied - run.friction) <= BREAK_AWAY_GAP)
     if stuck.size < 2 or stuck[-1] + 1 >= run.t.size:
         return float("nan")
