@@ -105,7 +105,7 @@ class GradientCheck:
 
 
 def check_gradients(
-    fn: Callable[..., Any],
+    fn: Callable[..., object],
     scene: Scene,
     *,
     names: Sequence[str] | None = None,
@@ -201,7 +201,7 @@ def check_gradients(
     return GradientCheck(float(value), f"float{8 * itemsize}", numbers, tuple(remarks))
 
 
-def _entries(scene: Any, names: Sequence[str] | None, scales: Mapping[str, float]) -> dict[str, float]:
+def _entries(scene: object, names: Sequence[str] | None, scales: Mapping[str, float]) -> dict[str, float]:
     """The numbers to check, by name."""
     if not isinstance(scene, Scene):
         raise ValueError(f"check_gradients needs a Scene, but a {type(scene).__name__} was given.")
@@ -264,7 +264,7 @@ def _traced(tree: PyTree) -> bool:
     return any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(tree))
 
 
-def _forward(fn: Callable[..., Any], scene: Scene, name: str) -> float:
+def _forward(fn: Callable[..., object], scene: Scene, name: str) -> float:
     """Derivative in forward mode."""
     zero = jtu.tree_map(jnp.zeros_like, scene)
     try:

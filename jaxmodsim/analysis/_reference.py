@@ -46,7 +46,7 @@ class Question:
         """Initial coordinates and velocities in a floating type."""
         return {"q0": jnp.asarray(self.q0, dtype), "qd0": jnp.asarray(self.qd0, dtype)}
 
-    def run(self, scene: Scene, start: dict[str, Array], setting: dict[str, Any], **options: Any) -> Trajectory:
+    def run(self, scene: Scene, start: dict[str, Array], setting: dict[str, Any], **options: object) -> Trajectory:
         """A run; `setting` holds tolerances or a step."""
         return simulate(scene, **start, t1=self.t1, ts=self.ts, **{"max_steps": self.max_steps, **setting, **options})
 
@@ -83,7 +83,7 @@ class Converged(NamedTuple):
     how: str
 
 
-def in_type(scene: Scene, dtype: Any) -> Scene:
+def in_type(scene: Scene, dtype: object) -> Scene:
     """The scene with all its numbers in a floating type."""
     return jtu.tree_map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, scene)
 
@@ -164,7 +164,7 @@ def converged(
 
 
 def _tight(
-    scene: Scene, question: Question, solver: Any, rtol: float
+    scene: Scene, question: Question, solver: object, rtol: float
 ) -> tuple[np.ndarray, Happened | None, dict[str, float] | None]:
     """Observable, mode changes and gradient at a tight tolerance."""
     setting, start = {"rtol": rtol, "atol": ATOL * rtol}, question.start(jnp.float64)

@@ -19,14 +19,14 @@ from ._spec_scene import read_system
 _SAMPLERS: dict[str, Callable[..., dict[str, np.ndarray]]] = {"latin_hypercube": latin_hypercube, "sobol": sobol}
 
 
-class _Whole(_table.TableModel):
+class _SpecTable(_table.AbstractTable):
     scene: _table.Table
     over: _table.Table
     run: _table.Table = Field({})
     observe: _table.Table | None = None
 
 
-class _Run(_table.TableModel):
+class _RunTable(_table.AbstractTable):
     q0: _table.Numbers | None = None
     qd0: _table.Numbers | None = None
     t0: _table.Number | None = None
@@ -42,33 +42,33 @@ class _Run(_table.TableModel):
     project: _table.Switch | None = None
 
 
-class _Times(_table.TableModel):
+class _TimesTable(_table.AbstractTable):
     start: _table.Number
     stop: _table.Number
     count: _table.Whole
 
 
-class _Span(_table.TableModel):
+class _SpanTable(_table.AbstractTable):
     low: _table.Number = Field(alias="from")
     to: _table.Number
     count: _table.Whole
     spacing: Literal["linear", "log"] = "linear"
 
 
-class _Samples(_table.TableModel):
+class _SamplesTable(_table.AbstractTable):
     latin_hypercube: _table.Table | None = None
     sobol: _table.Table | None = None
     count: _table.Whole
     seed: _table.Seed = 0
 
 
-class _Observed(_table.TableModel):
+class _ObservedTable(_table.AbstractTable):
     of: _table.Text
     take: Literal["end", "max", "min", "mean", "rms", "peak", "ptp"] | None = None
     unit: _table.Text | None = None
 
 
-_SPAN = tuple(field.alias or name for name, field in _Span.model_fields.items())
+_SPAN = tuple(field.alias or name for name, field in _SpanTable.model_fields.items())
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def read_spec(path: Path) -> Spec:
     - `ValueError` for a mistake in it, as one sentence with the table and the key.
     """
     file, name = _table.read_toml(path), path.name
-    whole = _table.read_table(_Whole, file, name)
+    whole = _table.read_table(_SpecTable, file, name)
     arguments = _run(whole.run, _table.inner(name, "run"))
     system = read_system(whole.scene, _table.inner(name, "scene"), path.parent)
     over = _table.inner(name, "over")
@@ -103,15 +103,15 @@ def read_spec(path: Path) -> Spec:
 
 
 def _run(content: dict[str, Any], where: str) -> dict[str, Any]:
-    arguments = _table.read_table(_Run, content, where).model_dump(exclude_none=True)
+    arguments = _table.read_table(_RunTable, content, where).model_dump(exclude_none=True)
     ts = arguments.get("ts")
     if isinstance(ts, dict):
-        times = _table.read_table(_Times, ts, _table.inner(where, "ts"))
+        times = _table.read_table(_TimesTable, ts, _table.inner(where, "ts"))
         ts = np.linspace(times.start, times.stop, times.count)
     return arguments if ts is None else {**arguments, "ts": np.asarray(ts, float)}
 
 
-def _dimension(name: str, given: Any, over: str) -> Any:
+def _dimension(name: str, given: object, over: str) -> Any:
     """Values of a dimension, or of several numbers that change along it."""
     if isinstance(given, list):
         return given
@@ -119,9 +119,9 @@ def _dimension(name: str, given: Any, over: str) -> Any:
         raise ValueError(f"{over}: {name} must be a list or a table, but {given!r} was given.")
     where = _table.inner(over, name)
     if any(sampler in given for sampler in _SAMPLERS):
-        return _sample(_table.read_table(_Samples, given, where), where)
+        return _sample(_table.read_table(_SamplesTable, given, where), where)
     if any(key in given for key in _SPAN):
-        return _span(_table.read_table(_Span, given, where), where)
+        return _span(_table.read_table(_SpanTable, given, where), where)
     for each, values in given.items():
         if not isinstance(values, list):
             raise ValueError(
@@ -131,7 +131,7 @@ def _dimension(name: str, given: Any, over: str) -> Any:
     return given
 
 
-def _span(span: _Span, where: str) -> np.ndarray:
+def _span(span: _SpanTable, where: str) -> np.ndarray:
     if span.spacing == "linear":
         return np.linspace(span.low, span.to, span.count)
     if min(span.low, span.to) <= 0:
@@ -141,7 +141,7 @@ def _span(span: _Span, where: str) -> np.ndarray:
     return np.geomspace(span.low, span.to, span.count)
 
 
-def _sample(samples: _Samples, where: str) -> dict[str, np.ndarray]:
+def _sample(samples: _SamplesTable, where: str) -> dict[str, np.ndarray]:
     chosen = {name: ranges for name in _SAMPLERS if (ranges := getattr(samples, name)) is not None}
     if len(chosen) > 1:
         raise ValueError(f"{where}: {' and '.join(chosen)} are given; one of them draws the samples.")
@@ -157,7 +157,7 @@ def _sample(samples: _Samples, where: str) -> dict[str, np.ndarray]:
 class Reduced:
     """One number of an observable along a run.
 
-    - `of`: its name; `take`: which number, as in `_Observed`. Means are over time, by the trapezoidal rule.
+    - `of`: its name; `take`: which number, as in `_ObservedTable`. Means are over time, by the trapezoidal rule.
     """
 
     of: str
@@ -185,7 +185,7 @@ def _observe(content: dict[str, Any], where: str, along: bool) -> dict[str, Any]
             continue
         if not isinstance(given, dict):
             raise ValueError(f"{where}: {name} must be text or a table, but {given!r} was given.")
-        asked = _table.read_table(_Observed, given, _table.inner(where, name))
+        asked = _table.read_table(_ObservedTable, given, _table.inner(where, name))
         if asked.take not in (None, "end") and not along:
             raise ValueError(
                 f"{_table.inner(where, name)}: take = {asked.take!r} needs the run over time, but [run] has no ts."

@@ -13,7 +13,7 @@ from pydantic import create_model
 from .. import friction, problems
 from .._core.arguments import did_you_mean
 from ..scene import Scene
-from ._table import Table, TableModel, Text, Values, Whole, inner, read_table
+from ._table import AbstractTable, Table, Text, Values, Whole, inner, read_table
 
 # Under which the file of a SPEC is known as a module.
 MODEL = "jaxmodsim_model"
@@ -41,7 +41,7 @@ LAWS: dict[str, type] = {
 }
 
 
-class _FileScene(TableModel):
+class _FileScene(AbstractTable):
     problem: Text | None = None
     file: Text
     object: Text
@@ -69,12 +69,12 @@ def read_system(content: dict[str, Any], where: str, folder: Path) -> Scene | Ca
     return _from_file(where, folder / asked.file, asked.object)
 
 
-def _made(content: dict[str, Any], where: str, key: str, makers: Mapping[str, Callable[..., Any]]) -> Any:
+def _made(content: dict[str, Any], where: str, key: str, makers: Mapping[str, Callable[..., object]]) -> Any:
     """What the constructor that a table names by `key` makes of the numbers and the law of the table."""
     name = content.get(key)
     fields: dict[str, Any] = {key: (Literal[*makers], ...)}
     if not isinstance(name, str) or name not in makers:
-        read_table(create_model("Kind", __base__=TableModel, **fields), content, where)
+        read_table(create_model("Kind", __base__=AbstractTable, **fields), content, where)
     maker = makers[str(name)]
     for field, parameter in inspect.signature(maker).parameters.items():
         needed = parameter.default is inspect.Parameter.empty
@@ -82,7 +82,7 @@ def _made(content: dict[str, Any], where: str, key: str, makers: Mapping[str, Ca
             continue  # functions, and laws of several places: those need a file
         kind: Any = Table if field == "law" else Whole if parameter.annotation is int else Values
         fields[field] = (kind, ...) if needed else (kind | None, None)
-    model = create_model("Made", __base__=TableModel, **fields)
+    model = create_model("Made", __base__=AbstractTable, **fields)
     given = read_table(model, content, where).model_dump(exclude={key}, exclude_none=True)
     if "law" in given:
         given["law"] = _made(given["law"], inner(where, "law"), "kind", LAWS)

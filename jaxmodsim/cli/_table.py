@@ -20,16 +20,16 @@ Values = Annotated[float | Annotated[list[float], Field(min_length=1)], "a numbe
 Table = Annotated[dict[str, Any], "a table"]
 
 
-class TableModel(BaseModel):
+class AbstractTable(BaseModel):
     """What a table may hold: keys that are fields, values of their types as they are, no others."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
-Model = TypeVar("Model", bound=TableModel)
+Model = TypeVar("Model", bound=AbstractTable)
 
 
-def read_table(model: type[Model], content: Mapping[str, Any], where: str) -> Model:
+def read_table(model: type[Model], content: Mapping[str, object], where: str) -> Model:
     """A table as a model.
 
     - `where`: the table as errors call it, such as `sweep.toml [over.k]`.
@@ -45,7 +45,7 @@ def read_table(model: type[Model], content: Mapping[str, Any], where: str) -> Mo
         raise ValueError(f"{where}: {_sentence(model, content, str(first['loc'][0]), first['type'])}") from None
 
 
-def _sentence(model: type[TableModel], content: Mapping[str, Any], key: str, kind: str) -> str:
+def _sentence(model: type[AbstractTable], content: Mapping[str, object], key: str, kind: str) -> str:
     fields = {field.alias or name: field for name, field in model.model_fields.items()}
     if key not in fields:
         return f"there is no key {key!r}; there may be {', '.join(fields)}.{did_you_mean(key, fields)}"

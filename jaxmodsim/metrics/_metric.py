@@ -43,7 +43,7 @@ class Metric:
         return f"{number:.6g}" if self.unit == "1" else f"{number:.6g} {self.unit}"
 
 
-def classes(fn: Callable[[Trajectory], Any], names: tuple[str, ...] | list[str]) -> Metric:
+def classes(fn: Callable[[Trajectory], object], names: tuple[str, ...] | list[str]) -> Metric:
     """Classes of motion by a function of your own, as for laws without modes.
 
     ```python
@@ -71,11 +71,11 @@ def classes(fn: Callable[[Trajectory], Any], names: tuple[str, ...] | list[str])
     return Metric("kind of motion", "1", _class_of, (fn, names), _class_name)
 
 
-def _class_of(run: Trajectory, fn: Callable[[Trajectory], Any], names: tuple[str, ...]) -> Any:
+def _class_of(run: Trajectory, fn: Callable[[Trajectory], object], names: tuple[str, ...]) -> Any:
     del names
     return fn(run)
 
 
-def _class_name(value: int, fn: Callable[[Trajectory], Any], names: tuple[str, ...]) -> str:
+def _class_name(value: int, fn: Callable[[Trajectory], object], names: tuple[str, ...]) -> str:
     del fn
     return names[value] if 0 <= value < len(names) else f"class {value}"

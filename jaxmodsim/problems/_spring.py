@@ -1,6 +1,6 @@
 """A mass on a spring with Coulomb friction: it stops after a whole number of half cycles."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -31,7 +31,7 @@ def braked_spring_law() -> Coulomb:
     return Coulomb(Fc=BRAKED_SPRING["Fc"], Fs=BRAKED_SPRING["Fs"])
 
 
-def braked_spring(law: Any = None, *, m: ArrayLike = BRAKED_SPRING["m"], k: ArrayLike = BRAKED_SPRING["k"]) -> Scene:
+def braked_spring(law: object = None, *, m: ArrayLike = BRAKED_SPRING["m"], k: ArrayLike = BRAKED_SPRING["k"]) -> Scene:
     """Mass on a spring on a rough table.
 
     **Arguments:**
@@ -55,7 +55,7 @@ def _drive(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     return jnp.reshape(p["u"], (1,))
 
 
-def driven_spring(law: Any, *, m: ArrayLike = 2.0, k: ArrayLike = 20.0) -> Scene:
+def driven_spring(law: object, *, m: ArrayLike = 2.0, k: ArrayLike = 20.0) -> Scene:
     """Mass on a spring on a rough table under a force, as records are made with.
 
     **Arguments:**

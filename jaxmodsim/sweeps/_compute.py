@@ -48,7 +48,7 @@ class Work:
     x64: bool
 
 
-def compute(work: Work, numbers: dict[str, np.ndarray], order: np.ndarray, device: Any | None = None) -> Computed:
+def compute(work: Work, numbers: dict[str, np.ndarray], order: np.ndarray, device: object | None = None) -> Computed:
     """Compute the runs of a block on one device.
 
     **Arguments:**
@@ -89,7 +89,7 @@ def _in_groups(
     numbers: dict[str, np.ndarray],
     chosen: np.ndarray,
     shape: tuple[int, int],
-    device: Any | None,
+    device: object | None,
 ) -> Computed:
     """Compute the chosen runs, in calls of compiled code for `shape` groups and runs each; the others stay empty."""
     runs, size = next(iter(numbers.values())).shape[0], shape[0] * shape[1]
@@ -163,11 +163,11 @@ def _concrete(structure: Any, avals: Any) -> Any:
 
 
 @lru_cache(maxsize=32)
-def _shapes(run: AbstractRun, structure: Any, avals: Any) -> RunOutcome:
+def _shapes(run: AbstractRun, structure: object, avals: object) -> RunOutcome:
     return jax.eval_shape(run.evaluate, *_concrete(structure, avals))
 
 
 @lru_cache(maxsize=32)
-def _program(run: AbstractRun, structure: Any, avals: Any) -> str:
+def _program(run: AbstractRun, structure: object, avals: object) -> str:
     text = jax.jit(run.evaluate).lower(*_concrete(structure, avals)).as_text()
     return hashlib.sha256(text.encode()).hexdigest()

@@ -61,7 +61,7 @@ class Grid:
         }
 
 
-def grid(over: Any) -> Grid:
+def grid(over: object) -> Grid:
     """Read what a sweep is to go over.
 
     **Raises:**
@@ -104,7 +104,7 @@ def _axis(name: Any, given: Any) -> GridAxis:
     return GridAxis(name, values)
 
 
-def _numbers(name: Any, given: Any) -> np.ndarray:
+def _numbers(name: object, given: object) -> np.ndarray:
     if not isinstance(name, str):
         raise ValueError(f"over must map names to values, but {name!r} is no name.")
     try:

@@ -35,8 +35,8 @@ class _Classes(NamedTuple):
 
 
 def global_sensitivity(
-    system: Scene | Callable[..., Any],
-    observe: Mapping[str, Any] | Sequence[str] | str | None,
+    system: Scene | Callable[..., object],
+    observe: Mapping[str, object] | Sequence[str] | str | None,
     ranges: Mapping[str, Span],
     *,
     method: str = "sobol",
@@ -177,7 +177,7 @@ def _check_losses(runs: Any, ok: np.ndarray, use: np.ndarray) -> None:
     )
 
 
-def _classes(labels: np.ndarray, use: np.ndarray, describe: Callable[[Any], str] | None, by: str) -> _Classes:
+def _classes(labels: np.ndarray, use: np.ndarray, describe: Callable[[object], str] | None, by: str) -> _Classes:
     if not np.isfinite(labels[use]).all():
         raise ValueError(f"by={by!r} is not a number in some runs: it must say a class for each.")
     found, counts = np.unique(labels[use], return_counts=True)

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
-from typing import Any
 
 import jax
 
@@ -33,12 +32,12 @@ class SweepPlan:
 
 
 def plan_sweep(
-    system: Scene | Callable[..., Any],
-    over: Mapping[str, Any],
-    observe: Mapping[str, Any] | Sequence[str] | str | None = None,
+    system: Scene | Callable[..., object],
+    over: Mapping[str, object],
+    observe: Mapping[str, object] | Sequence[str] | str | None = None,
     *,
     chunk: int | None = None,
-    **arguments: Any,
+    **arguments: object,
 ) -> SweepPlan:
     """Check the arguments of a sweep as `sweep` does, and say what it would run.
 

@@ -84,15 +84,15 @@ def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
     return found
 
 
-def _called(function: Any) -> str:
+def _called(function: object) -> str:
     function = getattr(function, "fn", function)  # a plain function in a scene is wrapped
     return str(getattr(function, "__qualname__", type(function).__name__))
 
 
-def _digest(x: Any) -> str:
+def _digest(x: object) -> str:
     return hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest()[:16]
 
 
-def _value(x: Any) -> Any:
+def _value(x: object) -> Any:
     x = np.asarray(x)
     return x.tolist() if x.size <= _SHORT else f"{x.shape} {x.dtype} {_digest(x)}"

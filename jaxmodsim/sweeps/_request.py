@@ -49,7 +49,7 @@ class Request:
         return asked if asked is not None else tuple(Observation(name, name, "") for name in self.shapes.values)
 
 
-def request(system: Any, grid: Grid, observe: Any, arguments: Mapping[str, Any]) -> Request:
+def request(system: object, grid: Grid, observe: object, arguments: Mapping[str, object]) -> Request:
     """Check and convert what a sweep is asked for.
 
     **Raises:**
@@ -90,7 +90,7 @@ def _check_taken(function: Any, names: Iterable[str]) -> None:
         ) from error
 
 
-def _of_scene(scene: Scene, grid: Grid, observe: Any, arguments: dict[str, Any]) -> Request:
+def _of_scene(scene: Scene, grid: Grid, observe: object, arguments: dict[str, Any]) -> Request:
     arguments = {name: value for name, value in arguments.items() if value is not None}
     for name in arguments:
         if name in ("throw", "adjoint", "scene", *_SEARCH) or name not in _OPTIONS:
@@ -186,7 +186,7 @@ def _fixed(scene: Scene, arguments: dict[str, Any], swept: Mapping[str, np.ndarr
     return {name: np.asarray(value, dtype) for name, value in numbers.items()} | z0, dtype
 
 
-def _choices(arguments: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
+def _choices(arguments: Mapping[str, object]) -> tuple[tuple[str, Any], ...]:
     """Arguments that are compiled in."""
     given = {name: value for name, value in arguments.items() if name not in _NUMBERS}
     for name, value in given.items():
@@ -198,7 +198,7 @@ def _choices(arguments: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
 
 
 def _check_names(
-    inside: Mapping[str, Any], outside: Mapping[str, Any], names: Iterable[str], where: str = "over"
+    inside: Mapping[str, object], outside: Mapping[str, object], names: Iterable[str], where: str = "over"
 ) -> None:
     """Refuse names of nothing, or of two things."""
     for name in names:

@@ -148,7 +148,9 @@ def out_of_steps(code: np.ndarray) -> np.ndarray:
     return code == MAX_STEPS
 
 
-def replaced(scene: Scene, arguments: Mapping[str, Any], numbers: Mapping[str, Any]) -> tuple[Scene, dict[str, Any]]:
+def replaced(
+    scene: Scene, arguments: Mapping[str, object], numbers: Mapping[str, object]
+) -> tuple[Scene, dict[str, Any]]:
     """Scene and arguments of `simulate` with these numbers replaced, which are whole arrays or single entries."""
     given, whole, single = dict(arguments), {}, {}
     known = scene_numbers(scene)
@@ -165,7 +167,7 @@ def replaced(scene: Scene, arguments: Mapping[str, Any], numbers: Mapping[str, A
     return replace_elements(replace_numbers(scene, whole), single), given
 
 
-def number_of(scene: Scene, arguments: Mapping[str, Any], name: str) -> Array:
+def number_of(scene: Scene, arguments: Mapping[str, object], name: str) -> Array:
     """The number that `replaced` would replace."""
     known = scene_numbers(scene)
     if name in known:

@@ -40,19 +40,19 @@ _RUNS_ON_ACCELERATOR = 1 << 18
 
 
 def sweep(
-    system: Scene | Callable[..., Any],
-    over: Mapping[str, Any],
-    observe: Mapping[str, Any] | Sequence[str] | str | None = None,
+    system: Scene | Callable[..., object],
+    over: Mapping[str, object],
+    observe: Mapping[str, object] | Sequence[str] | str | None = None,
     *,
     q0: ArrayLike | list[float] | None = None,
     qd0: ArrayLike | list[float] | None = None,
     t1: ArrayLike | None = None,
     out: str | PathLike[str] | None = None,
-    executor: Any = None,
-    devices: Sequence[Any] | None = None,
+    executor: object = None,
+    devices: Sequence[object] | None = None,
     chunk: int | None = None,
     progress: bool | Progress = False,
-    **options: Any,
+    **options: object,
 ) -> "xr.Dataset":
     """Run a scene, or any function, for many numbers, on all cores, in bounded memory.
 
@@ -114,7 +114,7 @@ def sweep(
     for needed in ("xarray", "zarr"):  # rather now than after the runs
         extra(needed)
     asked = request(system, grid(over), observe, {"q0": q0, "qd0": qd0, "t1": t1, **options})
-    places = list(devices) if devices is not None else jax.local_devices()
+    places: list[Any] = list(devices) if devices is not None else jax.local_devices()
     runs = runs_per_block(asked, places[0].platform, chunk)
     cut = blocks(asked.grid.shape, runs)
     group = GROUP if places[0].platform == "cpu" else runs
@@ -166,7 +166,7 @@ def _run(
     work: Work,
     cut: Blocks,
     results: AbstractResults,
-    executor: Any,
+    executor: object,
     devices: list[Any],
     report: Progress,
 ) -> None:

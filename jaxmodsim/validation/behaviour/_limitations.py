@@ -20,7 +20,7 @@ from ...friction import (
 )
 
 
-def _always(law: Any) -> bool:
+def _always(law: object) -> bool:
     del law
     return True
 

@@ -48,7 +48,7 @@ def _load(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     return jnp.reshape(spring + p["ramp"] * t + shaken * -jnp.expm1(-t / _PUT_ON), (1,))
 
 
-def move(case: LawCase, t1: float, *, z0: Any = None, dtmax: float = 1.0, **load: float) -> PulledRun:
+def move(case: LawCase, t1: float, *, z0: object = None, dtmax: float = 1.0, **load: float) -> PulledRun:
     """Run the mass from rest.
 
     **Arguments:**
@@ -104,7 +104,7 @@ def _after_slip(law: AbstractDynamicLaw) -> Any:
     slid = jax.lax.fori_loop(0, 100, lambda _, z: here.step_exact(fast, z, dt), here.initial_state(rest))
     slow = -fast * 0.01
 
-    def back(z: Any, _: None) -> tuple[Any, tuple[Any, Array]]:
+    def back(z: object, _: None) -> tuple[Any, tuple[Any, Array]]:
         z = here.step_exact(slow, z, _BACK / -slow)
         return z, (z, jnp.abs(here.force(rest, z)))
 

@@ -69,7 +69,7 @@ class SceneTask(eqx.Module):
             scene = replace_elements(scene, {self.by: x})
         return simulate(scene, q0, qd0, self.t1, **self.numbers, **dict(self.choices), adjoint=adjoint, throw=False)
 
-    def answer(self, x: Float[Array, ""], adjoint: Any = None) -> Answer:
+    def answer(self, x: Float[Array, ""], adjoint: object = None) -> Answer:
         """The number asked for."""
         run = self.run(x, adjoint)
         return Answer(run.code, self.read(run))
@@ -92,7 +92,7 @@ class FunctionTask(eqx.Module):
         del dtype
         return self
 
-    def answer(self, x: Float[Array, ""], adjoint: Any = None) -> Answer:
+    def answer(self, x: Float[Array, ""], adjoint: object = None) -> Answer:
         """The number asked for."""
         return self.fn(x, adjoint)
 
@@ -165,14 +165,14 @@ class HardCase:
 
 def motion(
     scene: Scene,
-    q0: Any,
-    qd0: Any,
+    q0: object,
+    qd0: object,
     t1: float,
     *,
     by: str,
     read: Callable[[Trajectory], Array],
     numbers: Mapping[str, ArrayLike | list[float]] | None = None,
-    **choices: Any,
+    **choices: object,
 ) -> SceneTask:
     """A `SceneTask` from plain numbers; by default at `rtol=1e-9, atol=1e-11`."""
     given = {"rtol": 1e-9, "atol": 1e-11, **(numbers or {})}

@@ -51,7 +51,7 @@ def _solve(field: Any, solver: EventSolver, t1: float, start: Any, adjoint: Any)
     return code, solution.ys
 
 
-def _bounce(e: Array, adjoint: Any, held: bool) -> Answer:
+def _bounce(e: Array, adjoint: object, held: bool) -> Answer:
     ball = BouncingBall(e=e, g=jnp.asarray(_G, e.dtype))
     hold = ball.hold if held else None
     solver = EventSolver(dfx.Tsit5(), ball.guards, ball.reset, on_zeno=hold, max_events=512, log=False)
@@ -60,11 +60,11 @@ def _bounce(e: Array, adjoint: Any, held: bool) -> Answer:
     return Answer(code, ys.t[-1])
 
 
-def _bounce_to_rest(e: Array, adjoint: Any) -> Answer:
+def _bounce_to_rest(e: Array, adjoint: object) -> Answer:
     return _bounce(e, adjoint, held=True)
 
 
-def _bounce_unheld(e: Array, adjoint: Any) -> Answer:
+def _bounce_unheld(e: Array, adjoint: object) -> Answer:
     return _bounce(e, adjoint, held=False)
 
 

@@ -29,7 +29,7 @@ def _poisoned(value: float) -> Any:
     return simulate(scene, [1.0], [0.0], 1.0)
 
 
-def _refused(name: str, why: str, naive: str, calls: dict[str, tuple[Callable[[], Any], str]]) -> HardCase:
+def _refused(name: str, why: str, naive: str, calls: dict[str, tuple[Callable[[], object], str]]) -> HardCase:
     task = RefusedCalls(
         {key: call for key, (call, _) in calls.items()}, {key: text for key, (_, text) in calls.items()}
     )

@@ -131,7 +131,7 @@ def grows(formulation: Formulation, solver: Any, h: float) -> bool:
     return not (bool(run.result.ok) and abs(float(formulation.off(run))) < _GROWS)
 
 
-def largest_step(formulation: Formulation, solver: Any) -> float:
+def largest_step(formulation: Formulation, solver: object) -> float:
     """Largest stable step [s], by bisection."""
     low, high = 0.5 * theory(formulation, solver), 2.0 * theory(formulation, solver)
     if grows(formulation, solver, low) or not grows(formulation, solver, high):
