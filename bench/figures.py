@@ -3,14 +3,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 from matplotlib import pyplot as plt
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
 from bench.layout import OURS, Recorded
-from bench.tables import HAND, VERDICTS
+from bench.tables import HAND
 
 
 def save(figure: Figure, path: Path, dpi: int = 150) -> None:
@@ -72,28 +69,8 @@ def long_runs(r: Recorded) -> Figure:
     return figure
 
 
-def hard_cases(r: Recorded) -> Figure:
-    """Cases over programs, coloured by verdict; white where a program was not asked."""
-    cases, programs = r.all_of("verdict", "case"), r.all_of("verdict", "peer")
-    colours, grid = ("#3f8f5b", "#c2452d", "#e0a83a", "#8a8a8a"), np.full((len(cases), len(programs)), np.nan)
-    for i, case in enumerate(cases):
-        for j, program in enumerate(programs):
-            verdict = r.get("verdict", case=case, peer=program)
-            if isinstance(verdict, str):
-                grid[i, j] = VERDICTS.index(verdict.removesuffix(" (NaN)"))
-    figure, axes = plt.subplots(figsize=(8.5, 1.5 + 0.25 * len(cases)), layout="constrained")
-    axes.pcolormesh(grid, cmap=ListedColormap(colours), vmin=-0.5, vmax=len(colours) - 0.5, edgecolors="w", linewidth=1)
-    axes.invert_yaxis()
-    axes.xaxis.tick_top()
-    axes.set_xticks(np.arange(len(programs)) + 0.5, programs, rotation=30, ha="left")
-    axes.set_yticks(np.arange(len(cases)) + 0.5, [case.replace("`", "") for case in cases], fontsize=7)
-    handles = [Patch(color=colour, label=word) for colour, word in zip(colours, VERDICTS, strict=True)]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(VERDICTS))
-    return figure
-
-
 FIGURES: dict[str, Callable[[Recorded], Figure]] = {
-    each.__name__: each for each in (accelerations, lugre_work_precision, long_runs, hard_cases)
+    each.__name__: each for each in (accelerations, lugre_work_precision, long_runs)
 }
 
 

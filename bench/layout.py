@@ -106,11 +106,10 @@ def _scale(rows: list[dict[str, Any]]) -> tuple[float, str]:
     numbers = [abs(row["value"]) for row in rows if isinstance(row["value"], float) and row["value"]]
     if rows[0]["unit"] != "s" or not numbers:
         return 1.0, rows[0]["unit"]
-    middle = sorted(numbers)[len(numbers) // 2]
-    return next((scale, unit) for least, scale, unit in _TIMES if middle >= least)
+    return next((scale, unit) for least, scale, unit in _TIMES if min(numbers) >= least)
 
 
-_TIMES = ((0.2, 1.0, "s"), (2e-4, 1e3, "ms"), (2e-7, 1e6, "us"), (0.0, 1e9, "ns"))
+_TIMES = ((0.1, 1.0, "s"), (1e-4, 1e3, "ms"), (1e-7, 1e6, "us"), (0.0, 1e9, "ns"))
 
 
 def _text(value: Value, scale: float) -> str:

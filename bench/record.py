@@ -16,6 +16,7 @@ WRITTEN = ("bench/results", "README.md", "docs")
 OURS = "jaxmodsim"
 
 Call = Callable[[], Any]
+Value = float | str | None
 
 
 @dataclass
@@ -38,14 +39,7 @@ class Result:
     not_run: dict[str, str] = field(default_factory=dict)
 
     def add(
-        self,
-        quantity: str,
-        value: float | str | None,
-        unit: str = "1",
-        *,
-        case: str = "",
-        peer: str = OURS,
-        at: Any = "",
+        self, quantity: str, value: Value, unit: str = "1", *, case: str = "", peer: str = OURS, at: Any = ""
     ) -> None:
         """Add a row; nothing for a value that is None."""
         if value is not None:

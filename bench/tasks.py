@@ -20,13 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxmodsim as jms
-from jaxmodsim.problems import (
-    belt_oscillator,
-    belt_oscillator_cycle,
-    belt_oscillator_motion,
-    pulled_box,
-    ramped_box,
-)
+from jaxmodsim.problems import belt_oscillator, belt_oscillator_motion, pulled_box, ramped_box
 
 LUGRE = ("sigma0", "sigma1", "sigma2", "Fc", "Fs", "vs")
 MAX_STEPS = 1_000_000
@@ -203,12 +197,6 @@ class Belt:
     def exact_end(self, p: Any) -> Any:
         """Position [m] at `t1`, in closed form."""
         return belt_oscillator_motion(jnp.asarray(self.t1), **self.named(p))[0]
-
-    def events(self, t1: float) -> int:
-        """Number of events until `t1`."""
-        cycle = belt_oscillator_cycle(**self.named(self.numbers))
-        whole, rest = divmod(t1 - float(cycle.begins) / self.numbers[4], float(cycle.period))
-        return 2 * math.floor(whole) + (2 if rest >= float(cycle.slip) else 1)
 
     def sets(self, count: int) -> np.ndarray:
         """Sets of the five parameters, within 3 % of the nominal ones; always the same."""

@@ -6,7 +6,6 @@ each followed by a step of Euler, as a single evaluation takes less time than ca
 """
 
 import os
-import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,8 +24,8 @@ from jaxmodsim.scene import State, scene_field
 HAND = ("JAX by hand, arrays", "JAX by hand, scalars")
 LOOP, BATCH, BATCH_LOOP = "loop", "many", "many in a loop"
 STEP, G = 1e-4, 9.81
-# Calls by way, the accelerations at the many states, and the seconds to compile by way.
-Made = tuple[dict[str, Call], Any, dict[str, float]]
+# Calls by way, and the accelerations at the many states.
+Made = tuple[dict[str, Call], Any]
 # Written out in scalars, larger chains take minutes to compile.
 LARGEST_WRITTEN_OUT = 12
 
@@ -56,11 +55,9 @@ def _size(n: int, result: Result, smoke: bool) -> None:
         del makers[HAND[1]]
     counts = {LOOP: single, BATCH: many, BATCH_LOOP: many * batches}
     calls, sizes, case = {}, {}, f"{n}"
-    for name, (ways, found, seconds) in importable(result, makers).items():
+    for name, (ways, found) in importable(result, makers).items():
         error = np.max(np.abs(found - exact[: len(found)]) / np.abs(exact[: len(found)]).max(axis=1, keepdims=True))
         result.add("disagreement", float(error), case=case, peer=name)
-        for way, taken in seconds.items():
-            result.add("compilation", taken, "s", case=case, peer=name, at=way)
         calls |= {(name, way): call for way, call in ways.items()}
         sizes |= {(name, way): counts[way] for way in ways}
     report = timed(calls, 1 if smoke else 12, per=sizes, limit_s=10.0)
@@ -106,20 +103,18 @@ def _scalars(q: Any, qd: Any, scene: jms.Scene) -> Any:
 
 
 def _compiled(fn: Any, n: int, q: Any, qd: Any, single: int, batches: int) -> Made:
-    """Calls by way, the accelerations at the many states, and the seconds to trace and compile each."""
+    """By JAX, compiled."""
     chain, many = n_link_pendulum(n, **chain_numbers(n)), jax.vmap(fn, (0, 0, None))
     one, all_of_them = (jnp.asarray(q[0]), jnp.asarray(qd[0])), (jnp.asarray(q), jnp.asarray(qd))
     programs = {
         LOOP: (partial(_euler, fn, single), one),
         BATCH: (many, all_of_them), BATCH_LOOP: (partial(_euler, many, batches), all_of_them),
     }  # fmt: skip
-    calls, seconds = {}, {}
+    calls = {}
     for way, (program, state) in programs.items():
-        start = time.perf_counter()
         compiled = jax.jit(program).lower(*state, chain).compile()
-        seconds[way] = time.perf_counter() - start
         calls[way] = lambda compiled=compiled, state=state: jax.block_until_ready(compiled(*state, chain))
-    return calls, np.asarray(calls[BATCH]()), seconds
+    return calls, np.asarray(calls[BATCH]())
 
 
 def _euler(fn: Any, count: int, q: Any, qd: Any, chain: jms.Scene) -> Any:
@@ -165,4 +160,4 @@ def _mujoco(n: int, q: np.ndarray, qd: np.ndarray, single: int) -> Made:
     mujoco.mj_forward(model, data)
     found = np.cumsum(data.qacc)[None]
     many = lambda: pool.rollout(model, workers, states, nstep=1, skip_checks=False)  # noqa: E731
-    return {LOOP: loop, BATCH: many}, found, {}
+    return {LOOP: loop, BATCH: many}, found

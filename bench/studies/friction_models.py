@@ -1,29 +1,23 @@
-"""The figures of the test bench of friction models, as `jaxmodsim testbench` prints them."""
+"""Friction models on the test bench, as `jaxmodsim testbench` runs them."""
 
-import json
-import tempfile
+import math
 from pathlib import Path
+from typing import Any
 
 from bench.record import Result
-from jaxmodsim.cli._report import report_testbench
-
-QUANTITIES = {
-    "away [s]": ("break-away", "s"),
-    "crossings": ("zero crossings", "1"),
-    "steps": ("steps", "1"),
-    "run [ms]": ("run", "ms"),
-    "ending": ("ending", "1"),
-}
+from jaxmodsim.cli._testbench import cases, run_case
 
 
 def main(smoke: bool, out: Path) -> Result:
-    """Run the test bench, which is small."""
-    del smoke, out
+    """Run every model; a small run one."""
+    del out
     result = Result("friction_models", ("diffrax",))
-    with tempfile.TemporaryDirectory() as folder:
-        report_testbench(Path(folder))
-        report = json.loads((Path(folder) / "testbench.json").read_text())
-    for row in report["models"]:
-        for name, (quantity, unit) in QUANTITIES.items():
-            result.add(quantity, row[name], unit, case=row["part"], peer=row["model"])
+    for case in cases()[: 1 if smoke else None]:
+        found = run_case(case)
+        about: dict[str, Any] = {"case": case.part, "peer": case.label}
+        result.add("break-away", None if math.isnan(found.break_away) else found.break_away, "s", **about)
+        result.add("zero crossings", found.crossings, **about)
+        result.add("steps", found.steps, **about)
+        result.add("run", 1e-3 * found.milliseconds, "s", **about)
+        result.add("ending", found.ending, **about)
     return result

@@ -33,12 +33,11 @@ def main(smoke: bool, out: Path) -> Result | None:
         print(f"skipped: there is no record at {EMPS}")
         return None
     result = Result("measured_axis", ("scipy",), {"goal": 1.65})
-    columns = np.loadtxt(EMPS, delimiter=",", skiprows=1)[: 1500 if smoke else None]
-    t, q, _, u = columns.T
-    record = jms.Record(t, q, {"u": EMPS_GAIN * u}, name="EMPS")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "record.csv"
-        path.write_text(EMPS.read_text() if not smoke else "".join(EMPS.read_text().splitlines(keepends=True)[:1501]))
+        path.write_text("".join(EMPS.read_text().splitlines(keepends=True)[: 1501 if smoke else None]))
+        t, q, _, u = np.loadtxt(path, delimiter=",", skiprows=1).T
+        record = jms.Record(t, q, {"u": EMPS_GAIN * u}, name="EMPS")
         result.settings["samples"] = len(t)
         how = ("--model", "coulomb") if smoke else ("--compare", "all")
         command = [sys.executable, "-c", "from jaxmodsim.cli import main; main()", "fit", str(path), *how]
