@@ -5,7 +5,6 @@ python -m bench [NAME ...] [--list] [--smoke [--jobs N]] [--out DIR]
 
 import concurrent.futures as cf
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -67,7 +66,6 @@ def main(
         return
     if jobs > 1 and not smoke:
         raise typer.BadParameter("benches that run at the same time disturb each other: --jobs needs --smoke")
-    os.environ |= {"PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
     interrupted = _run_all(runs, jobs, smoke, out)
     for run in runs:
         ended = "not finished" if run.code is None else f"exit code {run.code}, {run.seconds:.0f} s"
@@ -90,16 +88,14 @@ def _run_all(runs: list[Run], jobs: int, smoke: bool, out: Path | None) -> bool:
             quiet = {"stdout": log, "stderr": subprocess.STDOUT} if jobs > 1 else {}
             began = time.perf_counter()
             # Of Ctrl-C this process hears first, and hands it on.
-            started.append(process := subprocess.Popen(command, start_new_session=True, **quiet))  # pyright: ignore
+            started.append(process := subprocess.Popen(command, start_new_session=True, cwd=ROOT, **quiet))  # pyright: ignore
             code = process.wait()
-            if code < 0 or stopped:
+            if stopped:
                 return
             run.code, run.seconds = code, time.perf_counter() - began
             log.seek(0)
-            print(
-                f"=== {run.name}: exit code {code}, {run.seconds:.0f} s\n{log.read().decode(errors='replace')}",
-                flush=True,
-            )
+            said = log.read().decode(errors="replace")
+            print(f"=== {run.name}: exit code {code}, {run.seconds:.0f} s\n{said}", flush=True)
             if code == 0:
                 _keep(run.name, Path(scratch), smoke, out)
 

@@ -68,21 +68,15 @@ def makers(task: Box | Belt) -> dict[str, Callable[[], Any]]:
     }
 
 
-def batched(traced: Callable[..., Any], *ways: str) -> dict[str, Callable[[float, np.ndarray], Call]]:
-    """One call over many sets, in each of the ways."""
+def batched(traced: Callable[..., Any]) -> dict[str, Callable[[float, np.ndarray], Call]]:
+    """One call over many sets, at once and in groups."""
 
-    def jitted(over: Callable[[Any, Any], Any]) -> Callable[[float, np.ndarray], Call]:
-        def many(rtol: float, sets: np.ndarray) -> Call:
-            run, given = jax.jit(lambda sets: over(lambda p: traced(p, rtol), sets)), jnp.asarray(sets)
-            return lambda: np.asarray(run(given))
+    def many(over: Callable[..., Any], rtol: float, sets: np.ndarray) -> Call:
+        run, given = jax.jit(lambda sets: over(lambda p: traced(p, rtol), sets)), jnp.asarray(sets)
+        return lambda: np.asarray(run(given))
 
-        return many
-
-    known = {
-        VMAP: jitted(lambda one, sets: jax.vmap(one)(sets)),
-        GROUPS: jitted(lambda one, sets: jax.lax.map(one, sets, batch_size=64)),
-    }
-    return {way: known[way] for way in ways}
+    groups = partial(jax.lax.map, batch_size=64)
+    return {VMAP: partial(many, lambda one, sets: jax.vmap(one)(sets)), GROUPS: partial(many, groups)}
 
 
 def our_box(task: Box) -> Peer:
@@ -96,21 +90,15 @@ def our_box(task: Box) -> Peer:
     def traced(p: Any, rtol: Any, adjoint: Any = None) -> Any:
         return task.simulate(p, rtol, adjoint=adjoint).qd[-1, 0]
 
-    many = batched(traced, VMAP, GROUPS) | {
-        SWEEP: lambda rtol, sets: lambda: run_sweep(task, sets, rtol)["v"].values,
-    }
+    many = batched(traced) | {SWEEP: lambda rtol, sets: lambda: run_sweep(task, sets, rtol)["v"].values}
     return Peer(once, lambda rtol: task.our_states(rtol, task.atol * rtol), many, traced, True)
 
 
-def run_sweep(task: Box, sets: np.ndarray, rtol: float | np.ndarray, **options: Any) -> Any:
-    """Sets of the six parameters by `sweep`, with one tolerance for all or one for each."""
-    over = {f"friction.{name}": sets[:, i] for i, name in enumerate(LUGRE)}
-    tolerance = {"rtol": rtol, "atol": task.atol * rtol}
-    start: dict[str, Any] = {"q0": [0.0], "qd0": [0.0], "t1": task.t1}
-    observe, scene = {"v": (_end_velocity, "m/s")}, task.scene(task.numbers)
-    if np.ndim(rtol) == 0:
-        return jms.sweep(scene, {"set": over}, observe, **(start | tolerance | options))
-    return jms.sweep(scene, {"set": over | tolerance}, observe, **(start | options))
+def run_sweep(task: Box, sets: np.ndarray, rtol: float, **options: Any) -> Any:
+    """Sets of the six parameters by `sweep`."""
+    over = {"set": {f"friction.{name}": sets[:, i] for i, name in enumerate(LUGRE)}}
+    start: dict[str, Any] = {"q0": [0.0], "qd0": [0.0], "t1": task.t1, "rtol": rtol, "atol": task.atol * rtol}
+    return jms.sweep(task.scene(task.numbers), over, {"v": (_end_velocity, "m/s")}, **(start | options))
 
 
 def _end_velocity(run: jms.Trajectory) -> Any:
@@ -119,7 +107,7 @@ def _end_velocity(run: jms.Trajectory) -> Any:
 
 def diffrax_run(
     task: Box, p: Any, rtol: Any, solver: Any, *, ts: Any = None, stacked: bool = False, adjoint: Any = None
-):
+) -> Any:
     """A run by plain diffrax with its default controller; the state is a tuple of scalars, or one vector."""
 
     def stacked_field(t: Any, y: Any, p: Any) -> Any:
@@ -162,7 +150,7 @@ def by_diffrax(task: Box, solver: Any, *, stacked: bool = False, differentiated:
     def in_scalars(p: Any, rtol: Any) -> Any:
         return diffrax_run(task, p, rtol, solver).ys[1][-1]
 
-    return Peer(once, record, batched(in_scalars, VMAP, GROUPS), traced, differentiated)
+    return Peer(once, record, batched(in_scalars), traced, differentiated)
 
 
 def looped(task: Box, solver: Callable[[float, Any], Callable[[np.ndarray], Any]]) -> Peer:
@@ -282,11 +270,11 @@ def our_belt(task: Belt) -> Peer:
         return task.simulate(p, rtol, adjoint=adjoint, max_steps=262_144, max_events=4096).q[-1, 0]
 
     run = jax.jit(traced)
-    return Peer(once, _judged(task, lambda p, rtol: float(run(p, rtol))), batched(traced, VMAP), traced, True)
+    return Peer(once, _judged(task, lambda p, rtol: float(run(p, rtol))), batched(traced), traced, True)
 
 
-def _leg(task: Belt, t: Any, y: Any, p: Any, rtol: Any, t1: float, *, sticks: bool) -> tuple[Any, Any]:
-    """Time and state at the end of one leg by plain diffrax: the next event, with the velocity reset there, or `t1`."""
+def _leg(task: Belt, t: Any, y: Any, p: Any, rtol: Any, *, sticks: bool) -> tuple[Any, Any]:
+    """Time and state at the end of one leg by plain diffrax: the next event, with the velocity reset, or `t1`."""
 
     def field(t: Any, y: Any, p: Any) -> Any:
         del t
@@ -299,13 +287,13 @@ def _leg(task: Belt, t: Any, y: Any, p: Any, rtol: Any, t1: float, *, sticks: bo
     # The load that is left falls through zero; the slip velocity starts at zero, is negative, and rises through it.
     event = dfx.Event(guard, optx.Newton(rtol, task.atol * rtol, optx.rms_norm), direction=not sticks)
     done = dfx.diffeqsolve(
-        dfx.ODETerm(field), dfx.Tsit5(), t, t1, None, y, args=p, event=event, max_steps=4096, throw=False,
+        dfx.ODETerm(field), dfx.Tsit5(), t, task.t1, None, y, args=p, event=event, max_steps=4096, throw=False,
         stepsize_controller=dfx.PIDController(rtol=rtol, atol=task.atol * rtol),
     )  # fmt: skip
     assert done.ys is not None
     assert done.ts is not None
     x, v = (values[-1] for values in done.ys)
-    return done.ts[-1], (x, v if sticks else jnp.where(done.ts[-1] < t1, p[4], v))
+    return done.ts[-1], (x, v if sticks else jnp.where(done.ts[-1] < task.t1, p[4], v))
 
 
 def legs_scanned(task: Belt) -> Peer:
@@ -316,14 +304,14 @@ def legs_scanned(task: Belt) -> Peer:
 
         def cycle(carry: Any, _: None) -> tuple[Any, None]:
             for sticks in (True, False):
-                carry = _leg(task, *carry, p, rtol, task.t1, sticks=sticks)
+                carry = _leg(task, *carry, p, rtol, sticks=sticks)
             return carry, None
 
         return jax.lax.scan(cycle, (jnp.zeros(()), (jnp.zeros(()), p[4])), length=68)[0][1][0]
 
     run, p = jax.jit(traced), jnp.asarray(task.numbers)
     judged = _judged(task, lambda p, rtol: float(run(p, rtol)))
-    return Peer(lambda rtol: lambda: float(run(p, rtol)), judged, batched(traced, VMAP), traced, True)
+    return Peer(lambda rtol: lambda: float(run(p, rtol)), judged, batched(traced), traced, True)
 
 
 def scipy_legs(task: Belt, method: str) -> Peer:
@@ -338,9 +326,8 @@ def scipy_legs(task: Belt, method: str) -> Peer:
             guard.terminal, guard.direction = True, direction
         t, y, sticks = 0.0, (0.0, vb), True
         while True:
-            done = solve_ivp(
-                fields[sticks], (t, task.t1), y, method, events=guards[sticks], rtol=rtol, atol=task.atol * rtol
-            )
+            ends = {"events": guards[sticks], "rtol": rtol, "atol": task.atol * rtol}
+            done = solve_ivp(fields[sticks], (t, task.t1), y, method, **ends)
             if not done.success:
                 raise RuntimeError(done.message)
             if done.status == 0:

@@ -135,12 +135,10 @@ def derivatives(m: Matrix) -> None:
     """
     task, calls = m.case.task, {}
     p, exact = jnp.asarray(task.numbers), task.exact_gradient()
-    kinds = ("gradient",) if m.smoke else ("run", "jacobian", "gradient")
+    kinds = ("run", "jacobian", "gradient") if isinstance(task, Box) else ("run", "gradient")
     for name, peer in m.able().items():
-        if not (peer.differentiated and peer.traced) or (m.smoke and name != OURS):
-            continue
-        for kind in kinds:
-            if kind == "jacobian" and not isinstance(task, Box):
+        for kind in kinds[-1:] if m.smoke else kinds:
+            if not peer.differentiated or (m.smoke and name != OURS):
                 continue
             function = partial(_at, peer.traced, m.chosen[name], dfx.ForwardMode() if kind == "jacobian" else None)
             wrap = {"run": lambda f: f, "jacobian": jax.jacfwd, "gradient": jax.grad}[kind]
@@ -158,8 +156,9 @@ def _wait(function: Any, *given: Any) -> Any:
 
 def time_at_each_tolerance(m: Matrix, only: tuple[str, ...] = ()) -> None:
     """One run at every tolerance that the errors were taken at."""
-    done = {(row["peer"], row["at"]) for row in m.result.rows if row["quantity"] == "steps" and row["at"] != CHOSEN}
-    calls = {(name, rtol): m.peers[name].once(rtol) for name, rtol in done if not only or name in only}
+    rows = [row for row in m.result.rows if row["quantity"] == "steps" and row["at"] != CHOSEN]
+    done = [(row["peer"], row["at"]) for row in rows if row["peer"] in (only or m.peers)]
+    calls = {(name, rtol): m.peers[name].once(rtol) for name, rtol in done}
     for (name, rtol), found in timed(calls, m.rounds(20), limit_s=3.0).items():
         m.result.add_time("run", found, peer=name, at=rtol)
 

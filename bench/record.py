@@ -55,9 +55,8 @@ class Result:
             self.rows.append(row | {"value": f"failed: {found['failed']}", "unit": "s"})
             return
         row |= {"value": found["median_s"], "unit": "s", "quartiles": found["quartiles_s"]}
-        self.rows.append(row | {name: found[f"{name}_s"] for name in ("minimum", "first")} | {
-            "repetitions": found["repetitions"]
-        })  # fmt: skip
+        row |= {name: found[f"{name}_s"] for name in ("minimum", "first")}
+        self.rows.append(row | {"repetitions": found["repetitions"]})
 
     def write(self, folder: Path, *, smoke: bool) -> None:
         """Write `NAME.json` with a line for each row."""
@@ -66,17 +65,13 @@ class Result:
         head = {"name": self.name, "smoke": smoke, "provenance": machine}
         head |= {"settings": self.settings, "not_run": self.not_run}
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{self.name}.json").write_text(as_text(head, self.rows))
+        lines = ",\n".join("  " + json.dumps(row) for row in self.rows)
+        text = json.dumps(head, indent=1)[:-2] + f',\n "rows": [\n{lines}\n ]\n}}\n'
+        (folder / f"{self.name}.json").write_text(text)
 
 
 def _row(case: str, peer: str, quantity: str, at: Any) -> dict[str, Any]:
     return {"case": case, "peer": peer, "quantity": quantity, "at": at}
-
-
-def as_text(head: dict[str, Any], rows: list[dict[str, Any]]) -> str:
-    """JSON with a line for each row."""
-    lines = ",\n".join("  " + json.dumps(row) for row in rows)
-    return json.dumps(head, indent=1)[:-2] + f',\n "rows": [\n{lines}\n ]\n}}\n'
 
 
 def timed(calls: Mapping[Any, Call], rounds: int, *, per: Mapping[Any, int] | int = 1, limit_s: float = 30.0) -> Any:

@@ -44,12 +44,42 @@ LONG: dict[str, dict[str, Any]] = {
 def main(smoke: bool, out: Path) -> Result:
     """All solvers; a small run takes one."""
     del out
-    closed = Closed()
-    result = Result("long_runs", ("diffrax", "scipy", "numpy"))
-    result.settings |= {"period": closed.period, "swing": math.acos(closed.lower) - PHI0}
-    result.settings["periods"] = 300 if smoke else PERIODS
-    names = ("Gauss(1), dt 1/32 s", "Tsit5, rtol 1e-06")
-    _spherical_runs(result, closed, {name: LONG[name] for name in (names[:1] if smoke else LONG)})
+    closed, periods = Closed(), 300 if smoke else PERIODS
+    result = Result("long_runs", ("diffrax", "scipy", "numpy"), {"period": closed.period, "periods": periods})
+    result.settings["swing"] = math.acos(closed.lower) - PHI0
+    scene, windows = spherical_pendulum(m=1.0, R=1.0, g=G), _windows(periods, closed.period)
+    times = windows.ravel()
+    for name, how in list(LONG.items())[: 1 if smoke else None]:
+
+        def simulate(ts: np.ndarray, how: dict[str, Any] = how) -> jms.Trajectory:
+            return jms.simulate(scene, [PHI0, 0.0], [0.0, SPIN0], ts[-1], ts=ts, max_steps=LIMIT, **how)
+
+        jax.block_until_ready(simulate(times * (1.0 / 1024.0)).q)  # compiles
+        start = time.perf_counter()
+        run = simulate(times)
+        jax.block_until_ready(run.q)
+        seconds = time.perf_counter() - start
+        (phi, _), (phi_rate, theta_rate) = np.asarray(run.q).T, np.asarray(run.qd).T
+        momentum = np.sin(phi) ** 2 * theta_rate
+        energy = 0.5 * phi_rate**2 + 0.5 * np.sin(phi) ** 2 * theta_rate**2 + G * np.cos(phi)
+        errors = {
+            "energy": np.abs(energy - closed.energy) / (closed.energy + G),
+            "momentum": np.abs(momentum / closed.momentum - 1.0),
+            "phi": np.abs(phi - closed.phi(times)),
+        }
+        about: dict[str, Any] = {"case": "spherical pendulum", "peer": name}
+        result.add("steps", int(run.stats["num_steps"]), **about)
+        result.add("run", seconds, "s", **about)
+        for quantity, values in errors.items():
+            over, unit = values.reshape(windows.shape).max(axis=1), "rad" if quantity == "phi" else "1"
+            result.add(f"error of {quantity}, largest", float(over.max()), unit, **about)
+            result.add(f"error of {quantity}, at the end", float(over[-1]), unit, **about)
+            growth = _growth(windows[:, -1], over, LOST if quantity == "phi" else math.inf)
+            result.add(f"growth of the error of {quantity}", growth, **about)
+            if quantity != "momentum":
+                for end, value in zip(windows[:, -1] / closed.period, over, strict=True):
+                    result.add(f"error of {quantity}", float(value), unit, **about, at=float(end))
+        print(f"{name}: {seconds:.1f} s")
     return result
 
 
@@ -88,50 +118,8 @@ def _windows(periods: int, period: float) -> np.ndarray:
     return DT * (np.array(kept)[:, None] + np.arange(SAMPLES)[None, :])
 
 
-def _timed(run: Any, ts: np.ndarray) -> tuple[jms.Trajectory, float]:
-    """A run and its time [s], after a short one, which compiles."""
-    jax.block_until_ready(run(ts * (1.0 / 1024.0)).q)
-    start = time.perf_counter()
-    result = run(ts)
-    jax.block_until_ready(result.q)
-    return result, time.perf_counter() - start
-
-
 def _growth(t: np.ndarray, error: np.ndarray, lost: float = math.inf) -> float | None:
     """Slope of log error over log t in the last two decades; None where errors are beyond `lost` in most of them."""
     late = t >= 0.01 * t[-1]
     use = late & (error > 0) & (np.maximum.accumulate(error) < lost)
     return float(np.polyfit(np.log(t[use]), np.log(error[use]), 1)[0]) if 2 * use.sum() > late.sum() else None
-
-
-def _spherical_runs(result: Result, closed: Closed, solvers: dict[str, dict[str, Any]]) -> None:
-    windows = _windows(result.settings["periods"], closed.period)
-    scene, times = spherical_pendulum(m=1.0, R=1.0, g=G), windows.ravel()
-    for name, how in solvers.items():
-        run, seconds = _timed(
-            lambda ts, how=how: jms.simulate(
-                scene, [PHI0, 0.0], [0.0, SPIN0], ts[-1], ts=ts, max_steps=LIMIT, **how
-            ),
-            times,
-        )  # fmt: skip
-        (phi, _), (phi_rate, theta_rate) = np.asarray(run.q).T, np.asarray(run.qd).T
-        momentum = np.sin(phi) ** 2 * theta_rate
-        energy = 0.5 * phi_rate**2 + 0.5 * np.sin(phi) ** 2 * theta_rate**2 + G * np.cos(phi)
-        errors = {
-            "energy": np.abs(energy - closed.energy) / (closed.energy + G),
-            "momentum": np.abs(momentum / closed.momentum - 1.0),
-            "phi": np.abs(phi - closed.phi(times)),
-        }
-        about: dict[str, Any] = {"case": "spherical pendulum", "peer": name}
-        result.add("steps", int(run.stats["num_steps"]), **about)
-        result.add("run", seconds, "s", **about)
-        for quantity, values in errors.items():
-            over, unit = values.reshape(windows.shape).max(axis=1), "rad" if quantity == "phi" else "1"
-            result.add(f"error of {quantity}, largest", float(over.max()), unit, **about)
-            result.add(f"error of {quantity}, at the end", float(over[-1]), unit, **about)
-            growth = _growth(windows[:, -1], over, LOST if quantity == "phi" else math.inf)
-            result.add(f"growth of the error of {quantity}", growth, **about)
-            if quantity != "momentum":
-                for end, value in zip(windows[:, -1] / closed.period, over, strict=True):
-                    result.add(f"error of {quantity}", float(value), unit, **about, at=float(end))
-        print(f"{name}: {seconds:.1f} s")

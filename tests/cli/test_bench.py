@@ -172,15 +172,8 @@ def recorded(tmp_path):
     row = {"case": "a", "peer": "jaxmodsim", "quantity": "run", "at": "", "unit": "s"}
     rows = [row | {"value": 2e-3}, row | {"peer": "x|y", "value": 3e-3}, row | {"peer": "z", "value": "failed: why"}]
     rows.append(row | {"quantity": "steps", "unit": "1", "value": 7})
-    machine = {
-        "cpu": "C",
-        "cores": 2,
-        "python": "3",
-        "versions": {"jax": "1"},
-        "date": "now",
-        "commit": "",
-        "clean": True,
-    }
+    machine = {"cpu": "C", "cores": 2, "python": "3", "versions": {"jax": "1"}, "date": "now", "commit": ""}
+    machine["clean"] = True
     content = {"name": "coverage", "smoke": False, "provenance": machine, "settings": {"repeats": 3}, "rows": rows}
     path = tmp_path / "coverage.json"
     path.write_text(json.dumps(content | {"not_run": {"w": "no module"}}))
