@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 import jaxmodsim as jms
 from jaxmodsim.mechanics import acceleration, energies
-from jaxmodsim.scene import State, scene_field, scene_reactions
+from jaxmodsim.scene import State, scene_reactions, vector_field
 
 # Before any array is made, and the scenes below hold some.
 jms.tune_cpu()
@@ -261,7 +261,9 @@ def spiral():
     print("(j) The same with drag, and with dry friction under the force of the wire")
 
     def rate(scene, direction=None):
-        return at_states(lambda q, qd, mode: scene_field(NOW, State(q, qd, {}), scene, mode).qd, q, qd, direction)[:, 0]
+        return at_states(lambda q, qd, mode: vector_field(NOW, State(q, qd, {}), scene, mode).qd, q, qd, direction)[
+            :, 0
+        ]
 
     claim("a drag -k v adds -(k/m) theta' to theta''", rate(bead(jms.Viscous(k))), free - k / M * theta1)
     slowed = free - mu * newton / (M * pace) * np.sign(theta1)

@@ -18,9 +18,9 @@ from .friction import Sign as Sign
 from .friction import Stribeck as Stribeck
 from .friction import Viscous as Viscous
 from .friction import asymmetric as asymmetric
+from .friction import check_passivity as check_passivity
 from .friction import damping_sigma1 as damping_sigma1
-from .friction import explicit_step as explicit_step
-from .friction import passive as passive
+from .friction import max_stable_step as max_stable_step
 from .friction import regularized_width as regularized_width
 from .friction import scaled_by as scaled_by
 from .mechanics import Chart as Chart

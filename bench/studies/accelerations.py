@@ -17,9 +17,9 @@ import numpy as np
 import jaxmodsim as jms
 from bench.record import OURS, Call, Result, importable, timed
 from jaxmodsim._core.cholesky import solve_positive_definite
-from jaxmodsim._core.fusion import once, unit_of
+from jaxmodsim._core.fusion import fusion_barrier, opaque_one
 from jaxmodsim.problems import n_link_pendulum, n_link_pendulum_acceleration
-from jaxmodsim.scene import State, scene_field
+from jaxmodsim.scene import State, vector_field
 
 HAND = ("JAX by hand, arrays", "JAX by hand, scalars")
 LOOP, BATCH, BATCH_LOOP = "loop", "many", "many in a loop"
@@ -77,7 +77,7 @@ def chain_numbers(n: int) -> dict[str, Any]:
 
 def _ours(q: Any, qd: Any, scene: jms.Scene) -> Any:
     """From the Lagrangian."""
-    return scene_field(jnp.zeros_like(q[0]), State(q, qd, {}), scene).qd
+    return vector_field(jnp.zeros_like(q[0]), State(q, qd, {}), scene).qd
 
 
 def _arrays(q: Any, qd: Any, scene: jms.Scene) -> Any:
@@ -86,9 +86,9 @@ def _arrays(q: Any, qd: Any, scene: jms.Scene) -> Any:
 
 def _scalars(q: Any, qd: Any, scene: jms.Scene) -> Any:
     """Sines formed once, an elimination in quotients."""
-    n, p, unit = q.shape[0], scene.params, unit_of(q[0])
+    n, p, unit = q.shape[0], scene.params, opaque_one(q[0])
     m, l, w = ([x[i] for i in range(n)] for x in (p["m"], p["l"], qd))  # noqa: E741
-    s, c = [once(jnp.sin(q[i]), unit) for i in range(n)], [once(jnp.cos(q[i]), unit) for i in range(n)]
+    s, c = ([fusion_barrier(fn(q[i]), unit) for i in range(n)] for fn in (jnp.sin, jnp.cos))
     below = [sum(m[i + 1 :], m[i]) for i in range(n)]
     mass: list[list[Any]] = [[None] * n for _ in range(n)]
     load = [-below[i] * p["g"] * l[i] * s[i] for i in range(n)]

@@ -28,7 +28,7 @@ from scipy.integrate import solve_ivp
 import jaxmodsim as jms
 from bench.record import OURS, Result
 from jaxmodsim.friction import AbstractSetValuedLaw
-from jaxmodsim.scene import State, scene_field
+from jaxmodsim.scene import State, vector_field
 from jaxmodsim.validation.hard import HardCase, Motion, check, hard_cases
 
 RIGHT, WRONG, ERROR, NONE = "right", "wrong without a word", "error", "no answer"
@@ -171,11 +171,11 @@ def _with_signs(scene: jms.Scene) -> jms.Scene:
 
 def _start(scene: jms.Scene, q0: Any, qd0: Any) -> State:
     q, qd = (jnp.asarray(x).astype(float) for x in (q0, qd0))
-    return State(q, qd, scene.state0(q))
+    return State(q, qd, scene.initial_state(q))
 
 
 def _rate(t: Any, y: State, scene: jms.Scene) -> State:
-    return scene_field(t, y, scene, None)
+    return vector_field(t, y, scene, None)
 
 
 def _run(t_end: Any, states: State) -> SimpleNamespace:

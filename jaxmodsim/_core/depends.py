@@ -6,7 +6,7 @@ import jax
 from jaxtyping import Array, Float
 
 
-def depends(fn: Callable[[Array], Array], x: Float[Array, "..."]) -> bool:
+def depends_on(fn: Callable[[Array], Array], x: Float[Array, "..."]) -> bool:
     """Whether anything that `fn` returns is computed from `x`, be it by a product with zero."""
     traced = jax.make_jaxpr(fn)(x).jaxpr
     reached = set(traced.invars)

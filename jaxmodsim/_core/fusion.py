@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 _Tree = TypeVar("_Tree")
 
 
-def once(tree: _Tree, unit: Float[Array, ""]) -> _Tree:
+def fusion_barrier(tree: _Tree, unit: Float[Array, ""]) -> _Tree:
     """The arrays of `tree`, divided by one.
 
     XLA on CPU puts cheap operations into every kernel that needs their result, so that under `jax.vmap` a long chain is
@@ -18,11 +18,11 @@ def once(tree: _Tree, unit: Float[Array, ""]) -> _Tree:
     **Arguments:**
 
     - `tree`: arrays of any shape.
-    - `unit`: a one that XLA cannot know to be one, from `unit_of`.
+    - `unit`: a one that XLA cannot know to be one, from `opaque_one`.
     """
     return jax.tree.map(lambda x: x / unit.astype(x.dtype), tree)
 
 
-def unit_of(x: Float[Array, ""]) -> Float[Array, ""]:
+def opaque_one(x: Float[Array, ""]) -> Float[Array, ""]:
     """One, made from any finite number that is not known while compiling."""
     return 1.0 + 0.0 * x

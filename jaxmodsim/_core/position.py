@@ -12,7 +12,7 @@ from .functions import as_function, real_array
 from .parameters import as_real
 
 
-class Place(eqx.Module):
+class PositionFn(eqx.Module):
     """A function `place(q)` or `place(q, params)`, called as the latter."""
 
     place: Callable[..., Any]
@@ -25,7 +25,7 @@ class Place(eqx.Module):
         return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(q.dtype)
 
 
-def as_place(value: Any, *, name: str) -> Place:
+def as_position_fn(value: Any, *, name: str) -> PositionFn:
     """Make a function of `q`, or of `q` and `params`, fit to sit in a pytree.
 
     Which of the two it is follows from the arguments without a default that it takes.
@@ -34,20 +34,20 @@ def as_place(value: Any, *, name: str) -> Place:
 
     - `ValueError` if `value` cannot be called, or takes neither one nor two arguments.
     """
-    if isinstance(value, Place):
+    if isinstance(value, PositionFn):
         return value
     function = as_function(value, name=name)
     try:
         taken = inspect.signature(value).parameters.values()
     except (TypeError, ValueError):  # a function written in C does not say
-        return Place(function, False, name)
+        return PositionFn(function, False, name)
     needed = [x for x in taken if x.default is x.empty and x.kind in (x.POSITIONAL_ONLY, x.POSITIONAL_OR_KEYWORD)]
     if len(needed) > 2:
         raise ValueError(f"{name} must be a function of q, or of q and params, but it takes {len(needed)} arguments.")
-    return Place(function, len(needed) == 2, name)
+    return PositionFn(function, len(needed) == 2, name)
 
 
-class Amount(eqx.Module):
+class ScalarOrFn(eqx.Module):
     """A number, or a function of the parameters that returns one."""
 
     amount: Any
@@ -57,13 +57,13 @@ class Amount(eqx.Module):
         return jnp.asarray(self.amount(params) if callable(self.amount) else self.amount)
 
 
-def as_amount(value: Any, *, name: str) -> Amount:
+def as_scalar_or_fn(value: Any, *, name: str) -> ScalarOrFn:
     """Make a number, an array of numbers, or a function of `params` fit to sit in a pytree.
 
     **Raises:**
 
     - `ValueError` if it is none of these.
     """
-    if isinstance(value, Amount):
+    if isinstance(value, ScalarOrFn):
         return value
-    return Amount(as_function(value, name=name) if callable(value) else as_real(value, name=name))
+    return ScalarOrFn(as_function(value, name=name) if callable(value) else as_real(value, name=name))

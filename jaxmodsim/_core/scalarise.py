@@ -13,7 +13,7 @@ import numpy as np
 from jax.extend.core import Literal, jaxpr_as_fun
 from jaxtyping import Array, Float
 
-from .fusion import once, unit_of
+from .fusion import fusion_barrier, opaque_one
 
 # Arrays with more entries stay whole: tables, and what is looked up in them. Twelve coordinates make squares of 144.
 MAX_ENTRIES = 144
@@ -62,7 +62,7 @@ def in_scalars(fn: Callable[..., Any], *args: Any, seed: Float[Array, "..."]) ->
     sizes = [size for size in _sizes(closed.jaxpr) if size <= MAX_ENTRIES]
     traced = any(isinstance(x, jax.core.Tracer) for x in leaves)
     if traced and max(sizes, default=0) > 1 and sum(sizes) <= MAX_SCALARS:
-        unit = unit_of(jax.lax.stop_gradient(jnp.ravel(seed)[0]))
+        unit = opaque_one(jax.lax.stop_gradient(jnp.ravel(seed)[0]))
         out = [_whole(x) for x in _Scalars(unit).run(closed.jaxpr, closed.consts, leaves)]
     else:
         out = jaxpr_as_fun(closed)(*leaves)
@@ -75,7 +75,7 @@ def columns_of(linear: Callable[..., list[Any]], unit: Float[Array, ""], *like: 
     **Arguments:**
 
     - `linear`: takes scalars and returns a list of them, as the second result of `jax.linearize` does.
-    - `unit`: a one from `unit_of`.
+    - `unit`: a one from `opaque_one`.
     - `like`: scalars of the types of its arguments.
 
     **Returns:**
@@ -200,7 +200,7 @@ class _Scalars:
         if key not in self.memory:
             out = compute(*operands, **params)
             # The operands are kept, for an id is that of one object only while it lives.
-            self.memory[key] = operands, once(out, self.unit) if name in _REPEATED else out
+            self.memory[key] = operands, fusion_barrier(out, self.unit) if name in _REPEATED else out
         return self.memory[key][1]
 
     def add(self, a: Any, b: Any) -> Any:

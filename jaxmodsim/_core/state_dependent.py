@@ -14,7 +14,7 @@ from .functions import Function
 _LEAST = 1e-30
 
 
-class Varying(eqx.Module):
+class StateDependent(eqx.Module):
     """A parameter that changes with the state of the mechanism: a number times `fn(t, q, qd, params)`.
 
     It takes the number's place in its module, which keeps its kind; `settle` puts the product there.
@@ -27,24 +27,26 @@ class Varying(eqx.Module):
         """Refuse to be taken for a number."""
         raise TypeError(
             "This parameter depends on the state of the mechanism (scaled_by), so it has no value by itself: ask"
-            " law.at(t, q, qd, params) for the law at a state."
+            " law.bind_state(t, q, qd, params) for the law at a state."
         )
 
 
 _Module = TypeVar("_Module", bound=eqx.Module)
 
 
-def varies(tree: Any) -> bool:
+def is_state_dependent(tree: Any) -> bool:
     """Whether a parameter in `tree` depends on the state of the mechanism."""
-    return any(isinstance(x, Varying) for x in jax.tree.leaves(tree, is_leaf=lambda x: isinstance(x, Varying)))
+    return any(
+        isinstance(x, StateDependent) for x in jax.tree.leaves(tree, is_leaf=lambda x: isinstance(x, StateDependent))
+    )
 
 
-def settle(tree: _Module, t: Array, q: Array, qd: Array, params: Any) -> _Module:
+def bind_state(tree: _Module, t: Array, q: Array, qd: Array, params: Any) -> _Module:
     """`tree` with the values of its parameters at a state of the mechanism; factors below 1e-30 count as that."""
     factors: dict[int, Array] = {}  # by function: parameters that share one evaluate it once
 
     def value(x: Any) -> Any:
-        if not isinstance(x, Varying):
+        if not isinstance(x, StateDependent):
             return x
         key = id(x.fn.fn if isinstance(x.fn, Function) else x.fn)
         if key not in factors:
@@ -52,9 +54,9 @@ def settle(tree: _Module, t: Array, q: Array, qd: Array, params: Any) -> _Module
         number = value(x.number)
         return number * factors[key].astype(number.dtype)
 
-    return jax.tree.map(value, tree, is_leaf=lambda x: isinstance(x, Varying))
+    return jax.tree.map(value, tree, is_leaf=lambda x: isinstance(x, StateDependent))
 
 
 def nominal(value: Any) -> Any:
     """The number of a parameter, without the factor it varies by."""
-    return nominal(value.number) if isinstance(value, Varying) else value
+    return nominal(value.number) if isinstance(value, StateDependent) else value

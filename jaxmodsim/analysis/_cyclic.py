@@ -50,7 +50,7 @@ def cyclic_coordinates(scene: Scene, dof: int) -> tuple[int, ...]:
 @jax.jit
 def _slopes(scene: Scene, t: Array, q: Array, qd: Array) -> Array:
     def slopes(t: Array, q: Array, qd: Array) -> Array:
-        now = scene.now(t)
+        now = scene.bind_time(t)
         return jax.grad(now.lagrangian, argnums=1)(t, q, qd, now.params)
 
     return jax.vmap(slopes)(t, q, qd)

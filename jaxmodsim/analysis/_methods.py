@@ -46,7 +46,7 @@ class Method:
 
 def default_methods(scene: Scene) -> dict[str, Method]:
     """Solvers that a careful user would try on the scene."""
-    if scene.exact:
+    if scene.event_driven:
         solvers = (Rodas5P(), dfx.Tsit5())
     elif any(effect.stiff for effect in scene.effects):
         solvers = (Rodas5P(), dfx.Kvaerno5(), dfx.Tsit5())
@@ -101,7 +101,7 @@ def formulations(scene: Scene, *, width: float, sigma0: float | None = None, sig
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"formulations needs a Scene, but a {type(scene).__name__} was given.")
-    at = [i for i, effect in enumerate(scene.effects) if isinstance(effect, Friction) and effect.exact]
+    at = [i for i, effect in enumerate(scene.effects) if isinstance(effect, Friction) and effect.event_driven]
     if not at:
         raise ValueError(
             "No law of this scene is set-valued: other formulations are there for Coulomb, Stribeck and laws made of"

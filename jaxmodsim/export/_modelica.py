@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from ..friction import (
     AbstractAsymmetric,
     AbstractDynamicLaw,
-    AbstractHoldingLaw,
+    AbstractKarnoppLaw,
     AbstractLaw,
     AbstractSetValuedLaw,
     Regularized,
@@ -68,7 +68,7 @@ def to_modelica(
     forward, backward = _forces(law, speeds), -_forces(law, -speeds)
     limits = [forward[0], backward[0]]
     if isinstance(law, AbstractSetValuedLaw):
-        limits = [float(law.limit(jnp.asarray(side))) for side in (1.0, -1.0)]
+        limits = [float(law.static_limit(jnp.asarray(side))) for side in (1.0, -1.0)]
     if not np.allclose([limits[0], *forward], [limits[1], *backward], rtol=1e-6, atol=0.0):
         raise ValueError(f"to_modelica: Modelica's friction components have no {_ONE_WAY}.")
     level, limit = forward[0], limits[0]
@@ -89,8 +89,8 @@ def _forces(law: AbstractSetValuedLaw | Viscous, v: Float[np.ndarray, " n"]) -> 
     if isinstance(law, Viscous):
         return np.asarray(jax.vmap(law.force)(jnp.asarray(v)), float)
     side = np.where(np.signbit(v), -1.0, 1.0)
-    return side * np.asarray(jax.vmap(law.dry)(jnp.asarray(v)), float) + np.asarray(
-        jax.vmap(law.wet)(jnp.asarray(v)), float
+    return side * np.asarray(jax.vmap(law.sliding_force)(jnp.asarray(v)), float) + np.asarray(
+        jax.vmap(law.viscous_force)(jnp.asarray(v)), float
     )
 
 
@@ -127,7 +127,7 @@ def _lacks(law: AbstractLaw) -> str:
     name = type(law).__name__
     if isinstance(law, AbstractAsymmetric):
         return _ONE_WAY
-    if isinstance(law, Regularized | AbstractHoldingLaw | Sign):
+    if isinstance(law, Regularized | AbstractKarnoppLaw | Sign):
         return f"{name}: they run the law inside exactly, by events, so export that"
     if isinstance(law, AbstractDynamicLaw):
         return (

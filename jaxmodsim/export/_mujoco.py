@@ -102,7 +102,7 @@ def _lacks(law: AbstractLaw) -> str:
     if isinstance(law, AbstractAsymmetric):
         return "friction that depends on the direction: export the law of one direction, or the mean of both"
     if isinstance(law, LuGre):
-        return "LuGre whose sigma1 fades (vd): leave vd out, and see passive(law) for what that means"
+        return "LuGre whose sigma1 fades (vd): leave vd out, and see check_passivity(law) for what that means"
     if isinstance(law, Coulomb | Stribeck):
         return (
             f"{name} with Fs > Fc: its dry friction is one force, in stick and in slip. Export a LuGre with the same Fc"

@@ -1,6 +1,6 @@
 """What every export needs of a law."""
 
-from .._core.state_dependent import varies
+from .._core.state_dependent import is_state_dependent
 from ..friction import AbstractLaw
 
 
@@ -13,8 +13,8 @@ def need_numbers(law: AbstractLaw, wanted: str) -> None:
     """
     if not isinstance(law, AbstractLaw):
         raise ValueError(f"{wanted} needs a law, but {law!r} was given.")
-    if varies(law):
+    if is_state_dependent(law):
         raise ValueError(
             f"{wanted} writes numbers, but parameters of this {type(law).__name__} depend on the state of the mechanism"
-            " (scaled_by), which the target cannot say: export law.at(t, q, qd, params), the law at one state."
+            " (scaled_by), which the target cannot say: export law.bind_state(t, q, qd, params), the law at one state."
         )

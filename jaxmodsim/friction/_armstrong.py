@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.parameters import Number, parameter
-from ._bristle import follow, yielding
+from ._bristle import advance_elastoplastic, slip_fraction
 from ._law import AbstractDynamicLaw
 
 # Part of its limit over which the contact gives way.
@@ -91,14 +91,14 @@ class Armstrong(AbstractDynamicLaw):
         ratio = v / self.vs
         return 1.0 / (1.0 + ratio * ratio)
 
-    def state0(self, v: Float[Array, "..."]) -> ArmstrongState:
+    def initial_state(self, v: Float[Array, "..."]) -> ArmstrongState:
         """Undeflected after a long rest."""
         return ArmstrongState(jnp.zeros_like(v), jnp.ones_like(v), jnp.ones_like(v), jnp.zeros_like(v))
 
-    def rate(self, v: Float[Array, ""], z: ArmstrongState) -> ArmstrongState:
+    def zdot(self, v: Float[Array, ""], z: ArmstrongState) -> ArmstrongState:
         """Rates of the state [m/s, 1/s, 1/s, 1/s] at slip velocity `v` [m/s]."""
         u = z.z * jnp.sign(v) / self._limit(z.rise)
-        share = yielding(u, jnp.asarray(_CORNER, u.dtype))
+        share = slip_fraction(u, jnp.asarray(_CORNER, u.dtype))
         slides, missing = z.slips * self._moves(v), 1.0 - z.rise
         falls = (z.magnitude * self._steady(v) - z.rise) / self.tau
         rise = slides * falls + (1.0 - slides) * missing * missing / self.gamma
@@ -114,21 +114,23 @@ class Armstrong(AbstractDynamicLaw):
         """Slip [m] over which the contact goes over from stick to slip, and back."""
         return _CORNER * self.Fc / self.sigma0
 
-    def force_at(self, v: Float[Array, ""], z: ArmstrongState, rate: ArmstrongState) -> Float[Array, ""]:
+    def force_given_zdot(self, v: Float[Array, ""], z: ArmstrongState, rate: ArmstrongState) -> Float[Array, ""]:
         """Friction force [N] at slip velocity `v` [m/s]."""
         del rate
         return self.sigma0 * z.z + self.Fv * v
 
-    def stored(self, z: ArmstrongState) -> Float[Array, ""]:
+    def stored_energy(self, z: ArmstrongState) -> Float[Array, ""]:
         """Elastic energy [J] of the contact."""
         return 0.5 * self.sigma0 * z.z * z.z
 
-    def advance(self, v: Float[Array, ""], z: ArmstrongState, dt: Float[Array, ""]) -> ArmstrongState:
+    def step_exact(self, v: Float[Array, ""], z: ArmstrongState, dt: Float[Array, ""]) -> ArmstrongState:
         """State after `dt` [s] at constant `v` [m/s], of any length: first in stick, then in slip, each exactly."""
         corner, distance = jnp.asarray(_CORNER, z.z.dtype), jnp.abs(v) * dt
         # Back, then along, and of that what the contact does not follow.
         back = jnp.minimum(distance, jnp.where(v * z.z < 0, jnp.abs(z.z), 0.0))
-        lost = jnp.maximum(distance - jnp.abs(follow(v, z.z, dt, self._limit(z.rise), corner) - z.z), 0.0)
+        lost = jnp.maximum(
+            distance - jnp.abs(advance_elastoplastic(v, z.z, dt, self._limit(z.rise), corner) - z.z), 0.0
+        )
         before = z.slips * jnp.exp(-back / self._turn())
         slips = 1.0 - (1.0 - before) * jnp.exp(-lost / self._turn())
         share = jnp.maximum(before, lost / jnp.where(distance > 0, distance, 1.0))
@@ -138,4 +140,4 @@ class Armstrong(AbstractDynamicLaw):
         magnitude = 1.0 - missing + (z.magnitude - 1.0 + missing) * jnp.exp(-resting / self.tau)
         goal = magnitude * self._steady(v)
         rise = goal + (1.0 - missing - goal) * jnp.exp(-sliding / self.tau)
-        return ArmstrongState(follow(v, z.z, dt, self._limit(rise), corner), rise, magnitude, slips)
+        return ArmstrongState(advance_elastoplastic(v, z.z, dt, self._limit(rise), corner), rise, magnitude, slips)

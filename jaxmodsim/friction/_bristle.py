@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 from .._core.safe import bounded_ratio, decay_mean
 
 
-def level(
+def stribeck_curve(
     v: Float[Array, "..."], Fc: Float[Array, "..."], Fs: Float[Array, "..."], vs: Float[Array, ""]
 ) -> Float[Array, "..."]:
     """Gaussian Stribeck curve `Fc + (Fs - Fc) exp(-(v/vs)^2)` [N]: what steady slip at `v` [m/s] tends to."""
@@ -14,7 +14,7 @@ def level(
     return Fc + (Fs - Fc) * jnp.exp(-ratio * ratio)
 
 
-def leak(
+def relax_exact(
     v: Float[Array, "..."], z: Float[Array, "..."], dt: Float[Array, ""], rate: Float[Array, ""]
 ) -> Float[Array, "..."]:
     """Solution after `dt` [s] of `z' = v - rate z` with constant `v` [m/s] and `rate` [1/s]: exact at any step."""
@@ -22,7 +22,7 @@ def leak(
     return z * jnp.exp(-x) + v * dt * decay_mean(x)
 
 
-def yielding(u: Float[Array, "..."], corner: Float[Array, ""]) -> Float[Array, "..."]:
+def slip_fraction(u: Float[Array, "..."], corner: Float[Array, ""]) -> Float[Array, "..."]:
     """Share of the slip that an element does not follow, at the load `u` in limits towards the slip.
 
     0 up to `1 - corner`, 1 at the limit, and above 1 beyond it, so that the element falls back.
@@ -30,7 +30,7 @@ def yielding(u: Float[Array, "..."], corner: Float[Array, ""]) -> Float[Array, "
     return jnp.maximum(u - (1.0 - corner), 0.0) / corner
 
 
-def follow(
+def advance_elastoplastic(
     v: Float[Array, "..."],
     z: Float[Array, "..."],
     dt: Float[Array, ""],

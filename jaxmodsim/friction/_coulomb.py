@@ -26,15 +26,15 @@ class Coulomb(AbstractSetValuedLaw):
     Fs: Number | None = optional_parameter("Fs", "N", lower="Fc")
     stiff: ClassVar[bool] = False
 
-    def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def sliding_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Magnitude [N] of the force in slip."""
         return jnp.broadcast_to(self.Fc, jnp.shape(v))
 
-    def wet(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def viscous_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Coulomb friction has no viscous part: 0 N."""
         return jnp.zeros_like(v)
 
-    def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+    def static_limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
         """Largest force in stick [N]."""
         del direction
         return jnp.asarray(self.Fc if self.Fs is None else self.Fs)

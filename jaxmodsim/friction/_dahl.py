@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from .._core.parameters import Number, parameter
 from .._core.safe import magnitude
-from ._bristle import leak
+from ._bristle import relax_exact
 from ._law import AbstractPlanarLaw
 
 
@@ -42,25 +42,25 @@ class Dahl(AbstractPlanarLaw):
     Fc: Number = parameter("Fc", "N", lower=0.0, strict=True)
     stiff: ClassVar[bool] = True
 
-    def state0(self, v: Float[Array, "..."]) -> Float[Array, "..."]:
+    def initial_state(self, v: Float[Array, "..."]) -> Float[Array, "..."]:
         """Undeflected, 0 m."""
         return jnp.zeros_like(v)
 
-    def rate(self, v: Float[Array, "..."], z: Float[Array, "..."]) -> Float[Array, "..."]:
+    def zdot(self, v: Float[Array, "..."], z: Float[Array, "..."]) -> Float[Array, "..."]:
         """Z' [m/s] at slip velocity `v` [m/s] and deflection `z` [m]."""
         return v - self.sigma0 * magnitude(v) / self.Fc * z
 
-    def force_at(
+    def force_given_zdot(
         self, v: Float[Array, "..."], z: Float[Array, "..."], rate: Float[Array, "..."]
     ) -> Float[Array, "..."]:
         """Friction force [N] at deflection `z` [m]."""
         del v, rate
         return self.sigma0 * z
 
-    def stored(self, z: Float[Array, "..."]) -> Float[Array, ""]:
+    def stored_energy(self, z: Float[Array, "..."]) -> Float[Array, ""]:
         """Elastic energy [J]."""
         return 0.5 * self.sigma0 * jnp.sum(z * z)
 
-    def advance(self, v: Float[Array, "..."], z: Float[Array, "..."], dt: Float[Array, ""]) -> Float[Array, "..."]:
+    def step_exact(self, v: Float[Array, "..."], z: Float[Array, "..."], dt: Float[Array, ""]) -> Float[Array, "..."]:
         """Deflection [m] after `dt` [s] at constant `v` [m/s], exactly."""
-        return leak(v, z, dt, self.sigma0 * magnitude(v) / self.Fc)
+        return relax_exact(v, z, dt, self.sigma0 * magnitude(v) / self.Fc)

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from .._core.parameters import Number, parameter
 from .._core.safe import decay_mean
-from ._bristle import level
+from ._bristle import stribeck_curve
 from ._law import AbstractDynamicLaw
 
 # Steps of order 2 through the transition between elastic and plastic in `advance`, and the slip in limit deflections
@@ -59,40 +59,40 @@ class ElastoPlastic(AbstractDynamicLaw):
     vs: Number = parameter("vs", "m/s", lower=0.0, strict=True)
     stiff: ClassVar[bool] = True
 
-    def level(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def stribeck_curve(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """g(v) [N]: the bristle force that steady slip at `v` [m/s] tends to."""
-        return level(v, self.Fc, self.Fs, self.vs)
+        return stribeck_curve(v, self.Fc, self.Fs, self.vs)
 
     def _plastic(self, u: Float[Array, ""], elastic: Float[Array, ""]) -> Float[Array, ""]:
         """`alpha` at the load `u`; `elastic` is where it begins to rise. Both in limits."""
         span = jnp.clip((u - elastic) / (1.0 - elastic), 0.0, 1.0)
         return 0.5 - 0.5 * jnp.cos(jnp.pi * span)
 
-    def state0(self, v: Float[Array, "..."]) -> Float[Array, "..."]:
+    def initial_state(self, v: Float[Array, "..."]) -> Float[Array, "..."]:
         """Undeflected bristle, 0 m."""
         return jnp.zeros_like(v)
 
-    def rate(self, v: Float[Array, ""], z: Float[Array, ""]) -> Float[Array, ""]:
+    def zdot(self, v: Float[Array, ""], z: Float[Array, ""]) -> Float[Array, ""]:
         """Z' [m/s] at slip velocity `v` [m/s] and deflection `z` [m]."""
-        g = self.level(v)
+        g = self.stribeck_curve(v)
         u = self.sigma0 * z * jnp.sign(v) / g
         return v * (1.0 - self._plastic(u, self.Fba / g) * u)
 
-    def force_at(self, v: Float[Array, ""], z: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
+    def force_given_zdot(self, v: Float[Array, ""], z: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
         """Friction force [N] at slip velocity `v` [m/s], deflection `z` [m] and its `rate` [m/s]."""
         return self.sigma0 * z + self.sigma1 * rate + self.sigma2 * v
 
-    def stored(self, z: Float[Array, ""]) -> Float[Array, ""]:
+    def stored_energy(self, z: Float[Array, ""]) -> Float[Array, ""]:
         """Elastic energy [J] of the bristle."""
         return 0.5 * self.sigma0 * z * z
 
-    def advance(self, v: Float[Array, ""], z: Float[Array, ""], dt: Float[Array, ""]) -> Float[Array, ""]:
+    def step_exact(self, v: Float[Array, ""], z: Float[Array, ""], dt: Float[Array, ""]) -> Float[Array, ""]:
         """Deflection [m] after `dt` [s] at constant `v` [m/s].
 
         Exact in the elastic range and beyond the limit; between, steps of order 2 that cannot pass the limit.
         """
         # At rest either side will do: nothing moves, but the derivative by v must not be lost.
-        g, side = self.level(v), jnp.where(v < 0, -1.0, 1.0).astype(z.dtype)
+        g, side = self.stribeck_curve(v), jnp.where(v < 0, -1.0, 1.0).astype(z.dtype)
         elastic, u = self.Fba / g, side * self.sigma0 * z / g
         y = side * v * dt * self.sigma0 / g
         straight = jnp.minimum(y, jnp.maximum(elastic - u, 0.0))

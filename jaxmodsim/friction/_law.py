@@ -7,7 +7,7 @@ import equinox as eqx
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._core.parameters import check_ranges
-from .._core.state_dependent import settle, varies
+from .._core.state_dependent import bind_state, is_state_dependent
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractClassVar
@@ -25,11 +25,11 @@ class AbstractLaw(eqx.Module):
         """Refuse parameters out of range."""
         check_ranges(self)
 
-    def at(
+    def bind_state(
         self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
     ) -> "AbstractLaw":
         """The law as it is at a state of the mechanism; another one only where `scaled_by` made it depend on that."""
-        return settle(self, t, q, qd, params) if varies(self) else self
+        return bind_state(self, t, q, qd, params) if is_state_dependent(self) else self
 
 
 class AbstractForceLaw(AbstractLaw):
@@ -47,22 +47,22 @@ class AbstractSetValuedLaw(AbstractLaw):
     """
 
     @abc.abstractmethod
-    def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def sliding_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Magnitude [N] of the dry part of the force in slip at velocity `v` [m/s], never negative.
 
         At `v = 0` its limit from above.
         """
 
     @abc.abstractmethod
-    def wet(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def viscous_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Part of the force [N] that is a smooth function of `v` [m/s], zero at rest."""
 
     @abc.abstractmethod
-    def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+    def static_limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
         """Largest force [N] in stick against a load that pulls towards `direction` (+1 or -1)."""
 
 
-class AbstractHoldingLaw(AbstractLaw):
+class AbstractKarnoppLaw(AbstractLaw):
     """A law that balances the load in a band about rest: its force there depends on the other forces."""
 
     @abc.abstractmethod
@@ -70,7 +70,7 @@ class AbstractHoldingLaw(AbstractLaw):
         """Whether velocity `v` [m/s] counts as rest."""
 
     @abc.abstractmethod
-    def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+    def static_limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
         """Largest holding force [N] against a load that pulls towards `direction` (+1 or -1)."""
 
     @abc.abstractmethod
@@ -82,27 +82,27 @@ class AbstractDynamicLaw(AbstractLaw):
     """A law with a state of its own."""
 
     @abc.abstractmethod
-    def state0(self, v: Float[Array, "..."]) -> Any:
+    def initial_state(self, v: Float[Array, "..."]) -> Any:
         """State at rest and unloaded, for slip of the shape of `v`."""
 
     @abc.abstractmethod
-    def rate(self, v: Float[Array, "..."], z: Any) -> Any:
+    def zdot(self, v: Float[Array, "..."], z: Any) -> Any:
         """Time derivative of the state `z` at slip velocity `v` [m/s]."""
 
     @abc.abstractmethod
-    def force_at(self, v: Float[Array, "..."], z: Any, rate: Any) -> Float[Array, "..."]:
+    def force_given_zdot(self, v: Float[Array, "..."], z: Any, rate: Any) -> Float[Array, "..."]:
         """Friction force [N] at slip velocity `v` [m/s], the state `z`, and a rate of that: damping in the bristle."""
 
     def force(self, v: Float[Array, "..."], z: Any) -> Float[Array, "..."]:
         """Friction force [N] at slip velocity `v` [m/s] and state `z`."""
-        return self.force_at(v, z, self.rate(v, z))
+        return self.force_given_zdot(v, z, self.zdot(v, z))
 
     @abc.abstractmethod
-    def stored(self, z: Any) -> Float[Array, ""]:
+    def stored_energy(self, z: Any) -> Float[Array, ""]:
         """Energy [J] held in the state `z`."""
 
     @abc.abstractmethod
-    def advance(self, v: Float[Array, "..."], z: Any, dt: Float[Array, ""]) -> Any:
+    def step_exact(self, v: Float[Array, "..."], z: Any, dt: Float[Array, ""]) -> Any:
         """State after the time `dt` [s] at constant slip velocity `v` [m/s]: bounded at any step, however stiff."""
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from .._core.parameters import Number, optional_parameter, parameter
 from .._core.safe import bounded_ratio, magnitude
-from ._bristle import leak, level
+from ._bristle import relax_exact, stribeck_curve
 from ._law import AbstractPlanarLaw
 
 
@@ -59,19 +59,19 @@ class LuGre(AbstractPlanarLaw):
     vd: Number | None = optional_parameter("vd", "m/s", lower=0.0, strict=True)
     stiff: ClassVar[bool] = True
 
-    def level(self, v: Float[Array, "..."]) -> Float[Array, ""]:
+    def stribeck_curve(self, v: Float[Array, "..."]) -> Float[Array, ""]:
         """g(v) [N]: the bristle force that steady slip at `v` [m/s] tends to."""
-        return level(magnitude(v), self.Fc, self.Fs, self.vs)
+        return stribeck_curve(magnitude(v), self.Fc, self.Fs, self.vs)
 
-    def state0(self, v: Float[Array, "..."]) -> Float[Array, "..."]:
+    def initial_state(self, v: Float[Array, "..."]) -> Float[Array, "..."]:
         """Undeflected bristle, 0 m."""
         return jnp.zeros_like(v)
 
-    def rate(self, v: Float[Array, "..."], z: Float[Array, "..."]) -> Float[Array, "..."]:
+    def zdot(self, v: Float[Array, "..."], z: Float[Array, "..."]) -> Float[Array, "..."]:
         """Z' [m/s] at slip velocity `v` [m/s] and deflection `z` [m]."""
-        return v - self.sigma0 * magnitude(v) / self.level(v) * z
+        return v - self.sigma0 * magnitude(v) / self.stribeck_curve(v) * z
 
-    def force_at(
+    def force_given_zdot(
         self, v: Float[Array, "..."], z: Float[Array, "..."], rate: Float[Array, "..."]
     ) -> Float[Array, "..."]:
         """Friction force [N] at slip velocity `v` [m/s], deflection `z` [m] and its `rate` [m/s]."""
@@ -81,10 +81,10 @@ class LuGre(AbstractPlanarLaw):
             sigma1 = sigma1 * jnp.exp(-ratio * ratio)
         return self.sigma0 * z + sigma1 * rate + self.sigma2 * v
 
-    def stored(self, z: Float[Array, "..."]) -> Float[Array, ""]:
+    def stored_energy(self, z: Float[Array, "..."]) -> Float[Array, ""]:
         """Elastic energy [J] of the bristle."""
         return 0.5 * self.sigma0 * jnp.sum(z * z)
 
-    def advance(self, v: Float[Array, "..."], z: Float[Array, "..."], dt: Float[Array, ""]) -> Float[Array, "..."]:
+    def step_exact(self, v: Float[Array, "..."], z: Float[Array, "..."], dt: Float[Array, ""]) -> Float[Array, "..."]:
         """Deflection [m] after `dt` [s] at constant `v` [m/s], exactly: the rate is linear in z."""
-        return leak(v, z, dt, self.sigma0 * magnitude(v) / self.level(v))
+        return relax_exact(v, z, dt, self.sigma0 * magnitude(v) / self.stribeck_curve(v))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from ._law import AbstractDynamicLaw, AbstractForceLaw, AbstractHoldingLaw, AbstractLaw, AbstractSetValuedLaw
+from ._law import AbstractDynamicLaw, AbstractForceLaw, AbstractKarnoppLaw, AbstractLaw, AbstractSetValuedLaw
 from ._passivity import need_values
 from .wrappers._sign import Sign
 
@@ -29,7 +29,7 @@ _BESIDE = 1e-6
 _ROUNDING, _NOTHING = 1e-12, 1e-2
 
 
-def explicit_step(
+def max_stable_step(
     law: AbstractLaw,
     m: float | None = None,
     *,
@@ -63,15 +63,15 @@ def explicit_step(
 
     - `ValueError` for a law whose force jumps, a law by `scaled_by`, an implicit solver, or a number out of range.
     """
-    need_values(law, "explicit_step")
+    need_values(law, "max_stable_step")
     if not (m is None or m > 0) or not 0 <= k < math.inf or not math.isfinite(v) or (m is None and k > 0):
         raise ValueError(
-            f"explicit_step needs m > 0 [kg] or None, k >= 0 [N/m] (with a mass); given: {m=}, {k=}, {v=}."
+            f"max_stable_step needs m > 0 [kg] or None, k >= 0 [N/m] (with a mass); given: {m=}, {k=}, {v=}."
         )
     weights = _weights(dfx.Euler() if solver is None else solver)
     speed = jnp.asarray(float(v))
     if isinstance(law, AbstractDynamicLaw) and z is None:
-        z = law.state0(speed) if v == 0 else _steady(law, speed)
+        z = law.initial_state(speed) if v == 0 else _steady(law, speed)
     # As arrays, so that other numbers compile nothing anew.
     mass = None if m is None else jnp.asarray(float(m))
     steps = [math.inf]
@@ -117,7 +117,7 @@ def _parts(law: AbstractLaw, z: Any) -> tuple[Array, _Part, _Part]:
             return law.force(v, unravel(own))
 
         def rate(v: Array, own: Array) -> Array:
-            return jax.flatten_util.ravel_pytree(law.rate(v, unravel(own)))[0]
+            return jax.flatten_util.ravel_pytree(law.zdot(v, unravel(own)))[0]
 
     elif isinstance(law, AbstractForceLaw) and not isinstance(law, Sign):
         own = jnp.zeros(0)
@@ -138,14 +138,14 @@ def _parts(law: AbstractLaw, z: Any) -> tuple[Array, _Part, _Part]:
 @eqx.filter_jit
 def _steady(law: AbstractDynamicLaw, v: Float[Array, ""]) -> Any:
     """State of steady slip at `v` [m/s], not zero."""
-    z = law.state0(v)
+    z = law.initial_state(v)
     distances = jnp.asarray(_DISTANCES, v.dtype)
-    z = jax.lax.scan(lambda z, distance: (law.advance(v, z, distance / jnp.abs(v)), None), z, distances)[0]
+    z = jax.lax.scan(lambda z, distance: (law.step_exact(v, z, distance / jnp.abs(v)), None), z, distances)[0]
     # Long steps of laws that split them end beside the steady state: Newton's method closes the rest.
     own, unravel = jax.flatten_util.ravel_pytree(z)
 
     def rate(own: Array) -> Array:
-        return jax.flatten_util.ravel_pytree(law.rate(v, unravel(own)))[0]
+        return jax.flatten_util.ravel_pytree(law.zdot(v, unravel(own)))[0]
 
     def newton(_: Any, own: Array) -> Array:
         move = jnp.linalg.lstsq(jax.jacfwd(rate)(own), rate(own))[0]
@@ -159,15 +159,15 @@ def _refusal(law: AbstractLaw) -> str:
     name = type(law).__name__
     if isinstance(law, AbstractSetValuedLaw | Sign):
         return (
-            f"explicit_step: the force of {name} jumps at v = 0, where every step chatters. simulate runs Coulomb and"
+            f"max_stable_step: the force of {name} jumps at v = 0, where every step chatters. simulate runs Coulomb and"
             " Stribeck by events, whatever the step; Regularized(law, width) makes them smooth and has a largest step."
         )
-    if isinstance(law, AbstractHoldingLaw):
+    if isinstance(law, AbstractKarnoppLaw):
         return (
-            f"explicit_step: {name} has no slope in its band and jumps at the edges. Its step is bounded otherwise: the"
-            " velocity must not change by more than the band in one step."
+            f"max_stable_step: {name} has no slope in its band and jumps at the edges. Its step is bounded otherwise:"
+            " the velocity must not change by more than the band in one step."
         )
-    return f"explicit_step knows nothing of laws such as {name}."
+    return f"max_stable_step knows nothing of laws such as {name}."
 
 
 def _weights(solver: Any) -> tuple[list[np.ndarray], np.ndarray]:
@@ -177,7 +177,7 @@ def _weights(solver: Any) -> tuple[list[np.ndarray], np.ndarray]:
     tableau = solver if isinstance(solver, dfx.ButcherTableau) else getattr(solver, "tableau", None)
     if not isinstance(tableau, dfx.ButcherTableau) or tableau.implicit:
         raise ValueError(
-            "explicit_step needs an explicit Runge-Kutta solver, such as diffrax.Heun() or diffrax.Tsit5(), or its"
+            "max_stable_step needs an explicit Runge-Kutta solver, such as diffrax.Heun() or diffrax.Tsit5(), or its"
             f" ButcherTableau, but {solver!r} was given. Implicit solvers such as Rodas5P take stiff laws at any step."
         )
     return [np.asarray(row, float) for row in tableau.a_lower], np.asarray(tableau.b_sol, float)

@@ -14,7 +14,7 @@ from .._core.parameters import (
     vector_parameter,
 )
 from .._core.state_dependent import nominal
-from ._bristle import follow, level, yielding
+from ._bristle import advance_elastoplastic, slip_fraction, stribeck_curve
 from ._law import AbstractDynamicLaw
 
 
@@ -82,38 +82,40 @@ class MaxwellSlip(AbstractDynamicLaw):
         """Force [N] at which each element slips at velocity `v` [m/s]."""
         if self.Fs is None or self.vs is None:
             return self.Fc
-        return level(v, self.Fc, self.Fs, self.vs)
+        return stribeck_curve(v, self.Fc, self.Fs, self.vs)
 
     def _attraction(self, limit: Float[Array, " n"]) -> Float[Array, " n"]:
         """Rate [1/s] at which an element beyond its limit falls back to it."""
         return self.C * self.Fc / jnp.sum(self.Fc) / limit
 
-    def state0(self, v: Float[Array, "..."]) -> Float[Array, " n"]:
+    def initial_state(self, v: Float[Array, "..."]) -> Float[Array, " n"]:
         """Undeflected elements, 0 m."""
         return jnp.zeros(jnp.shape(nominal(self.k)), v.dtype)
 
-    def rate(self, v: Float[Array, ""], z: Float[Array, " n"]) -> Float[Array, " n"]:
+    def zdot(self, v: Float[Array, ""], z: Float[Array, " n"]) -> Float[Array, " n"]:
         """Rates of the deflections [m/s] at slip velocity `v` [m/s] and deflections `z` [m]."""
         limit, side = self.limit(v), jnp.sign(v)
         u = self.k * z * side / limit
         if self.C is None:
-            return v * (1.0 - yielding(u, self.corner))
-        rate = v * (1.0 - yielding(jnp.minimum(u, 1.0), self.corner))
+            return v * (1.0 - slip_fraction(u, self.corner))
+        rate = v * (1.0 - slip_fraction(jnp.minimum(u, 1.0), self.corner))
         return rate - side * self._attraction(limit) * limit / self.k * jnp.maximum(u - 1.0, 0.0)
 
-    def force_at(self, v: Float[Array, ""], z: Float[Array, " n"], rate: Float[Array, " n"]) -> Float[Array, ""]:
+    def force_given_zdot(
+        self, v: Float[Array, ""], z: Float[Array, " n"], rate: Float[Array, " n"]
+    ) -> Float[Array, ""]:
         """Friction force [N] at slip velocity `v` [m/s] and deflections `z` [m]."""
         del rate
         return jnp.sum(self.k * z) + self.sigma2 * v
 
-    def stored(self, z: Float[Array, " n"]) -> Float[Array, ""]:
+    def stored_energy(self, z: Float[Array, " n"]) -> Float[Array, ""]:
         """Elastic energy [J] of the elements."""
         return 0.5 * jnp.sum(self.k * z * z)
 
-    def advance(self, v: Float[Array, ""], z: Float[Array, " n"], dt: Float[Array, ""]) -> Float[Array, " n"]:
+    def step_exact(self, v: Float[Array, ""], z: Float[Array, " n"], dt: Float[Array, ""]) -> Float[Array, " n"]:
         """Deflections [m] after `dt` [s] at constant `v` [m/s], exactly."""
         limit = self.limit(v)
-        after = follow(v, z, dt, limit / self.k, self.corner)
+        after = advance_elastoplastic(v, z, dt, limit / self.k, self.corner)
         if self.C is None:
             return after
         side = jnp.sign(v)

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._core.parameters import modules_of
-from .._core.state_dependent import nominal, varies
+from .._core.state_dependent import is_state_dependent, nominal
 from ._armstrong import Armstrong
 from ._coulomb import Coulomb
 from ._dahl import Dahl
 from ._elasto_plastic import ElastoPlastic
-from ._law import AbstractDynamicLaw, AbstractForceLaw, AbstractHoldingLaw, AbstractLaw, AbstractSetValuedLaw
+from ._law import AbstractDynamicLaw, AbstractForceLaw, AbstractKarnoppLaw, AbstractLaw, AbstractSetValuedLaw
 from ._lugre import LuGre
 from ._maxwell_slip import MaxwellSlip
 from ._stribeck import Stribeck
@@ -39,7 +39,7 @@ Array = np.ndarray
 
 @dataclass(frozen=True)
 class Passivity:
-    """What `passive` found; true where the law is passive. `print(passive(law))` shows it as a sentence.
+    """Answer of `check_passivity`; true where the law is passive, and printed as a sentence.
 
     - `ok`: whether the law is passive.
     - `margin`: viscous coefficient [N s/m] that could be taken away before the law stops being passive; below zero,
@@ -63,10 +63,10 @@ class Passivity:
         return f"Not passive from {self.speed:g} m/s on; margin {self.margin:g} N s/m. {self.condition}"
 
 
-def passive(law: AbstractLaw, *, v_max: float = 1e3) -> Passivity:
+def check_passivity(law: AbstractLaw, *, v_max: float = 1e3) -> Passivity:
     """Whether a law is passive from slip velocity to force: it never returns more energy than it was given.
 
-    The energy in its state, `law.stored`, is the storage, so the question is whether the dissipation
+    The energy in its state, `law.stored_energy`, is the storage, so the question is whether the dissipation
     `D = v F(v, z) - d/dt stored(z)` is >= 0 at all velocities and all states that can be reached. The margin is
     the least `D/v^2`: a term `sigma v` more in the force adds `sigma v^2` to D.
 
@@ -89,8 +89,8 @@ def passive(law: AbstractLaw, *, v_max: float = 1e3) -> Passivity:
     **Arguments:**
 
     - `law`: any law that has values by itself. What `scaled_by` made depend on the mechanism is judged at one state,
-      `passive(law.at(t, q, qd, params))`; that says nothing about the energy that a change of the load brings into a
-      bristle whose stiffness follows it.
+      `check_passivity(law.bind_state(t, q, qd, params))`; that says nothing about the energy that a change of the load
+      brings into a bristle whose stiffness follows it.
     - `v_max`: largest speed searched [m/s], > 0, for functions and laws of your own; others are judged at all speeds.
 
     **Returns:**
@@ -125,10 +125,10 @@ def need_values(law: AbstractLaw, wanted: str) -> None:
 
     - `ValueError` that says how to get the law at a state.
     """
-    if varies(law):
+    if is_state_dependent(law):
         raise ValueError(
             f"{wanted} needs the numbers of the law, but parameters of this {type(law).__name__} depend on the state of"
-            " the mechanism (scaled_by): ask law.at(t, q, qd, params) for the law at a state, and give that."
+            " the mechanism (scaled_by): ask law.bind_state(t, q, qd, params) for the law at a state, and give that."
         )
 
 
@@ -199,9 +199,9 @@ def _(law: Armstrong, v_max: float) -> Passivity:
 
 
 @_judge.register
-def _(law: AbstractHoldingLaw, v_max: float) -> Passivity:
+def _(law: AbstractKarnoppLaw, v_max: float) -> Passivity:
     del v_max
-    worst = max(float(law.limit(jnp.asarray(side))) for side in (1.0, -1.0))
+    worst = max(float(law.static_limit(jnp.asarray(side))) for side in (1.0, -1.0))
     words = (
         f"In the band about rest the force of {type(law).__name__} is the load, up to {worst:g} N in either direction:"
         " a load that brakes is cancelled, by a force that pushes along the motion. The law inside, run by events, does"
@@ -217,7 +217,7 @@ def _(law: AbstractForceLaw, v_max: float) -> Passivity:
 
 @_judge.register
 def _(law: AbstractSetValuedLaw, v_max: float) -> Passivity:
-    return _function(law, lambda law, v: jnp.sign(v) * law.dry(v) + law.wet(v), v_max)
+    return _function(law, lambda law, v: jnp.sign(v) * law.sliding_force(v) + law.viscous_force(v), v_max)
 
 
 def _function(law: AbstractLaw, force: Callable[..., Any], v_max: float) -> Passivity:
@@ -284,14 +284,14 @@ def _losses(law: AbstractDynamicLaw, slips: jax.Array, times: jax.Array, speeds:
     """Dissipation [W] at each state along the slip and each speed, shape `[state, speed]`; 0 where it is rounding."""
 
     def step(z: Any, x: tuple[jax.Array, jax.Array]) -> tuple[Any, Any]:
-        z = law.advance(x[0], z, x[1])
+        z = law.step_exact(x[0], z, x[1])
         return z, z
 
-    states = jax.lax.scan(step, law.state0(jnp.zeros((), slips.dtype)), (slips, times))[1]
+    states = jax.lax.scan(step, law.initial_state(jnp.zeros((), slips.dtype)), (slips, times))[1]
 
     def lost(z: Any, v: jax.Array) -> jax.Array:
         given = v * law.force(v, z)
-        parts = jax.tree.map(lambda slope, rate: jnp.vdot(slope, rate), jax.grad(law.stored)(z), law.rate(v, z))
+        parts = jax.tree.map(lambda slope, rate: jnp.vdot(slope, rate), jax.grad(law.stored_energy)(z), law.zdot(v, z))
         kept = jnp.stack(jax.tree.leaves(parts))
         rounding = 64.0 * jnp.finfo(v.dtype).eps * (jnp.abs(given) + jnp.sum(jnp.abs(kept)))
         net = given - jnp.sum(kept)

@@ -78,18 +78,18 @@ class Stribeck(AbstractSetValuedLaw):
     fall: Any = eqx.field(default=exponential, static=True, converter=_fall)
     stiff: ClassVar[bool] = False
 
-    def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def sliding_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Magnitude [N] of the dry part in slip."""
         ratio = bounded_ratio(v, self.vs)
         # A square costs a fifth of a power.
         power = ratio * ratio if self.exponent is None else _power(ratio, self.exponent)
         return self.Fc + (self.Fs - self.Fc) * self.fall(power)
 
-    def wet(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def viscous_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Viscous part [N]."""
         return self.Fv * v
 
-    def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+    def static_limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
         """Largest force in stick [N]."""
         del direction
         return jnp.asarray(self.Fs)

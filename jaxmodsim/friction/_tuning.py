@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._law import AbstractSetValuedLaw
-from ._max_stable_step import explicit_step
+from ._max_stable_step import max_stable_step
 from ._passivity import need_values
 from .wrappers._regularized import Regularized
 
@@ -107,7 +107,7 @@ def regularized_width(law: AbstractSetValuedLaw, creep: float, load: float, m: f
         if not 0 < value < math.inf:
             raise ValueError(f"regularized_width: {name} must be finite and > 0, but {value} was given.")
     side = math.copysign(1.0, load)
-    limit = float(law.limit(jnp.asarray(side)))
+    limit = float(law.static_limit(jnp.asarray(side)))
     if not 0 < abs(load) < limit:
         raise ValueError(
             f"regularized_width: the load must be above 0 and below the limit of stick, {limit:g} N, but {load} N was"
@@ -138,7 +138,7 @@ def regularized_width(law: AbstractSetValuedLaw, creep: float, load: float, m: f
     crept = creep if first == _SPEEDS - 1 else float(near[int(np.argmax(crossed))])
     smooth = Regularized(law, narrow)
     # A law with other parameters for either direction has a kink at zero: the slope is that of the load's side.
-    step = explicit_step(smooth, m, v=side * narrow * 1e-9)
+    step = max_stable_step(smooth, m, v=side * narrow * 1e-9)
     return Width(narrow, side * crept, load, 2.0 / step, step, smooth)
 
 

@@ -421,4 +421,6 @@ def _measured_starts(found: Found, asked: _Asked) -> State:
         q.append(np.where(start[0] != 0, start[0], base.q[0]))
         qd.append(np.where(start[1] != 0, start[1], base.qd[0]))
     scene = found.problem.engine.scene
-    return jax.vmap(lambda q, qd: State(q, qd, scene.state0(q)))(jnp.asarray(np.stack(q)), jnp.asarray(np.stack(qd)))
+    return jax.vmap(lambda q, qd: State(q, qd, scene.initial_state(q)))(
+        jnp.asarray(np.stack(q)), jnp.asarray(np.stack(qd))
+    )

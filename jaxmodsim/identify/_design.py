@@ -216,10 +216,10 @@ def _axis(
     if not isinstance(params, dict) or input not in params or jnp.shape(params[input]) != ():
         have = ", ".join(params) if isinstance(params, dict) else "no dict"
         raise ValueError(f"The input {input!r} must be a single number in the scene's params ({have}).")
-    if scene.exact:
+    if scene.event_driven:
         raise ValueError(
-            f"design_input differentiates a run with fixed steps, but {', '.join(scene.exact)} would need events: wrap"
-            " the law, as in Regularized(law, width)."
+            f"design_input differentiates a run with fixed steps, but {', '.join(scene.event_driven)} would need"
+            " events: wrap the law, as in Regularized(law, width)."
         )
     if input in free:
         raise ValueError(f"{input} is the input and cannot be free.")
@@ -232,7 +232,7 @@ def _axis(
         )
     for _, module in modules_of(scene):
         check_ranges(module)
-    rest = State(position, jnp.zeros_like(position), scene.state0(position))
+    rest = State(position, jnp.zeros_like(position), scene.initial_state(position))
     check_scene(scene, rest)
     shape = getattr(traced(observe, name="observe(q, qd)", q=rest.q, qd=rest.qd), "shape", None)
     if shape != ():

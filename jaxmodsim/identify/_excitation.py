@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..scene import Scene, State, replace_numbers, scene_field, scene_numbers
+from ..scene import Scene, State, replace_numbers, scene_numbers, vector_field
 from ..solvers import rosenbrock_step
 from ._entries import join_entries
 from ._replay import _RODAS3, replay
@@ -92,7 +92,7 @@ def feed_forward(
     def acceleration(force: float, t: Array, y: State) -> Array:
         params: dict[str, Any] = {**scene.params, axis.input: jnp.full((), force, q.dtype)}
         driven = Scene(scene.lagrangian, params=params, effects=scene.effects)
-        return scene_field(t, y, driven).qd[0]
+        return vector_field(t, y, driven).qd[0]
 
     def advance(z: dict[str, Any], sample: tuple[Array, ...]) -> tuple[dict[str, Any], Array]:
         start, step, q0, qd0, q1, qd1 = sample
@@ -104,7 +104,7 @@ def feed_forward(
         end = z
         if jtu.tree_leaves(z):
             end = rosenbrock_step(
-                _RODAS3, lambda t, z: scene_field(t, state(t, z), scene).z, start, step, z, pivot=True
+                _RODAS3, lambda t, z: vector_field(t, state(t, z), scene).z, start, step, z, pivot=True
             ).y1
         middle = start + 0.5 * step
         y = state(middle, jtu.tree_map(lambda a, b: 0.5 * (a + b), z, end))
@@ -112,7 +112,7 @@ def feed_forward(
         return end, ((qd1 - qd0) / step - free) / (acceleration(1.0, middle, y) - free)
 
     samples = (t[:-1], jnp.diff(t), q[:-1], qd[:-1], q[1:], qd[1:])
-    _, force = jax.lax.scan(advance, scene.state0(q[:1]), samples)
+    _, force = jax.lax.scan(advance, scene.initial_state(q[:1]), samples)
     return jnp.concatenate([force, force[-1:]])
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.parameters import Range
-from .._core.state_dependent import varies
+from .._core.state_dependent import is_state_dependent
 from ..friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw
 from ..scene import Scene, replace_numbers, scene_numbers, scene_ranges
 from ._begin import AbstractBeginning, begin_all
@@ -64,7 +64,7 @@ def fit_law(
     """
     several = (record,) if isinstance(record, Record) else tuple(record)
     for each in several:
-        if "x" not in each.inputs or not (varies(law) or set(each.inputs) <= {"x", "normal"}):
+        if "x" not in each.inputs or not (is_state_dependent(law) or set(each.inputs) <= {"x", "normal"}):
             raise ValueError(
                 "fit_law needs the input 'x' [m] and may take 'normal' [N], and more only for a law that scaled_by lets"
                 f" depend on it; the record has: {', '.join(each.inputs)}."
@@ -166,18 +166,18 @@ def law_force(
     v = jnp.diff(x) / jnp.where(dt > 0, dt, 1.0)  # records side by side repeat their last time
 
     def at(t: Array, x: Array, v: Array, params: Any) -> Any:
-        return law.at(t, x[None], v[None], params)
+        return law.bind_state(t, x[None], v[None], params)
 
     def advance(z: Any, sample: Any) -> tuple[Any, Array]:
         t, x, v, params, dt = sample
         here = at(t, x, v, params)
         if isinstance(here, AbstractForceLaw):
             return z, here.force(v)
-        z = here.advance(v, z, dt)
+        z = here.step_exact(v, z, dt)
         return z, here.force(v, z)
 
     rest = jnp.zeros_like(x[0])
-    z0 = law.state0(rest) if isinstance(law, AbstractDynamicLaw) else None
+    z0 = law.initial_state(rest) if isinstance(law, AbstractDynamicLaw) else None
     first = at(t[0], x[0], rest, jax.tree.map(lambda each: each[0], inputs or {}))
     start = first.force(rest) if z0 is None else first.force(rest, z0)
     samples = (t[1:], x[1:], v, jax.tree.map(lambda each: each[1:], inputs or {}), dt)

@@ -156,10 +156,10 @@ def _check_inputs(scene: Scene, records: tuple[Record, ...]) -> None:
         raise ValueError(f"The record's inputs ({', '.join(inputs)}) must be entries of the scene's params ({have}).")
     for record in records:
         for effect in record.slips:
-            if effect not in scene.exact:
+            if effect not in scene.event_driven:
                 raise ValueError(
                     f"{record.name} has slip instants of {effect!r}, but the effects that run by events are:"
-                    f" {', '.join(scene.exact) or 'none'}."
+                    f" {', '.join(scene.event_driven) or 'none'}."
                 )
 
 
@@ -184,9 +184,9 @@ def _states(scene: Scene, records: tuple[Record, ...], settings: Settings) -> St
             )
         starts.append(np.broadcast_to(array, (count, dof)))
     q, qd = (jnp.asarray(x, float) for x in starts)
-    state = State(q[0], qd[0], scene.state0(q[0]))
+    state = State(q[0], qd[0], scene.initial_state(q[0]))
     check_scene(scene, state)
-    return jax.vmap(lambda q, qd: State(q, qd, scene.state0(q)))(q, qd)
+    return jax.vmap(lambda q, qd: State(q, qd, scene.initial_state(q)))(q, qd)
 
 
 def _sorted_out(free: Sequence[str], own: tuple[str, ...]) -> tuple[tuple[str, ...], Any]:
@@ -265,7 +265,9 @@ def _bases(
         start = measured_start(rest, observables, dof, exact=False)
         q.append(start[0])
         qd.append(start[1])
-    return jax.vmap(lambda q, qd: State(q, qd, scene.state0(q)))(jnp.asarray(np.stack(q)), jnp.asarray(np.stack(qd)))
+    return jax.vmap(lambda q, qd: State(q, qd, scene.initial_state(q)))(
+        jnp.asarray(np.stack(q)), jnp.asarray(np.stack(qd))
+    )
 
 
 def _engine(
@@ -276,12 +278,12 @@ def _engine(
 ) -> Any:
     linear = records[0].linear
     delays = {DELAY + name: jnp.asarray(late, float) for name, late in settings.delay.items()}
-    if not scene.exact:
+    if not scene.event_driven:
         return ReplayEngine(scene, delays, settings.controller, observables, linear, settings.substeps)
     if settings.controller is not None:
         raise ValueError(
-            f"A controller runs with fixed steps, but {', '.join(scene.exact)} runs by events: wrap the law, as in"
-            " Regularized(law, width)."
+            f"A controller runs with fixed steps, but {', '.join(scene.event_driven)} runs by events: wrap the law,"
+            " as in Regularized(law, width)."
         )
     slips = tuple(dict.fromkeys(effect for record in records for effect in record.slips))
     return EventEngine(

@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ..scene import Scene, State, scene_field
+from ..scene import Scene, State, vector_field
 from ..solvers import RosenbrockTableau, rosenbrock_step
 
 # Order 3, L-stable, stiffly accurate, three field evaluations (Sandu et al. 1997, Atmospheric Environment 31:3459).
@@ -89,7 +89,7 @@ def run_samples(
         seen = observe(start, y, here)
 
         def field(t: Array, y: State) -> State:
-            return scene_field(t, y, _driven(here, {k: held[k] + (t - start) * x for k, x in slopes.items()}))
+            return vector_field(t, y, _driven(here, {k: held[k] + (t - start) * x for k, x in slopes.items()}))
 
         step = dt / substeps
 
@@ -134,7 +134,7 @@ def replay(
 
     The observed number at each sample, shape `[samples]`.
     """
-    y0 = State(q0, qd0, scene.state0(q0))
+    y0 = State(q0, qd0, scene.initial_state(q0))
 
     def look(t: Array, y: State, scene: Scene) -> Array:
         del t, scene

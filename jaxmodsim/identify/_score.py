@@ -115,7 +115,7 @@ def _alone(result: "FitResult", record: Record, q0: Any, qd0: Any, free_start: b
     guessed = measured_start(record, observables, dof, exact=not free_start)
     start = [_given(x, guess, dof, name) for x, guess, name in zip((q0, qd0), guessed, ("q0", "qd0"), strict=True)]
     q, qd = (jnp.asarray(x, float)[None] for x in start)
-    z = scene.state0(q[0])
+    z = scene.initial_state(q[0])
     base = State(q, qd, jax.tree.map(lambda x: jnp.asarray(x)[None], z))
     local = tuple(f"{x}[{i}]" for x in ("q0", "qd0") for i in range(dof)) if free_start else ()
     return Problem(

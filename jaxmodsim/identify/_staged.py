@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..friction import AbstractDynamicLaw, AbstractForceLaw, AbstractSetValuedLaw
-from ..scene import Friction, Scene, State, scene_field, scene_ranges
+from ..scene import Friction, Scene, State, scene_ranges, vector_field
 from ._begin import AbstractBeginning
 from ._bounded import Box, Search, search_start, search_step
 from ._engines import with_values
@@ -168,7 +168,7 @@ def _required(problem: Problem, values: Any) -> Callable[[_Sampled], Array]:
         here = _driven(scene, s.inputs)
         bare = Scene(here.lagrangian, params=here.params, effects=others)
         q, qd = s.q[None], s.v[None]
-        free = scene_field(s.t, State(q, qd, bare.state0(q)), bare).qd[0]
+        free = vector_field(s.t, State(q, qd, bare.initial_state(q)), bare).qd[0]
         mass = jax.hessian(lambda qd: here.lagrangian(s.t, q, qd, here.params))(qd)[0, 0]
         return mass * (free - s.a)
 
@@ -179,10 +179,10 @@ def _settled(law: Any, v: Array) -> Array:
     """Force of a law at constant velocity, long after it began."""
     if isinstance(law, AbstractDynamicLaw):
         # Long against what a bristle needs to yield at any speed that counts as slip.
-        z = law.advance(v, law.state0(v), jnp.asarray(1e6, v.dtype))
+        z = law.step_exact(v, law.initial_state(v), jnp.asarray(1e6, v.dtype))
         return law.force(v, z)
     if isinstance(law, AbstractSetValuedLaw):
-        return jnp.sign(v) * law.dry(v) + law.wet(v)
+        return jnp.sign(v) * law.sliding_force(v) + law.viscous_force(v)
     if isinstance(law, AbstractForceLaw):
         return law.force(v)
     raise ValueError(f"Staged() does not know the force that {type(law).__name__} settles to; give start values.")
@@ -197,10 +197,10 @@ def _friction(problem: Problem, values: Any) -> Callable[[_Sampled], Array]:
         here = _driven(scene, s.inputs)
         q, qd, total = s.q[None], s.v[None], jnp.zeros_like(s.v)
         for effect in elements:
-            settled = effect.at(s.t, q, qd, here.params)
+            settled = effect.bind_state(s.t, q, qd, here.params)
             force = _settled(settled.law, settled.slip(s.t, q, qd, here.params))
             load = settled.load(s.t, q, qd, here.params)
-            total = total - settled.push(q, force if load is None else load * force, here.params)[0]
+            total = total - settled.apply_force(q, force if load is None else load * force, here.params)[0]
         return total
 
     return friction

@@ -19,10 +19,10 @@ from ._lagrange import MotionEquations as MotionEquations
 from ._lagrange import acceleration as acceleration
 from ._lagrange import energies as energies
 from ._lagrange import motion_equations as motion_equations
-from ._linearized_constraints import Restraint as Restraint
+from ._linearized_constraints import LinearizedConstraints as LinearizedConstraints
 from ._linearized_constraints import errors as errors
+from ._linearized_constraints import linearize_constraints as linearize_constraints
 from ._linearized_constraints import parts as parts
 from ._linearized_constraints import project_position as project_position
 from ._linearized_constraints import project_velocity as project_velocity
 from ._linearized_constraints import rates as rates
-from ._linearized_constraints import restrain as restrain

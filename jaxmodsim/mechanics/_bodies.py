@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._core.functions import as_function
 from .._core.index_check import check_indices
-from .._core.position import Amount, Place, as_amount, as_place
+from .._core.position import PositionFn, ScalarOrFn, as_position_fn, as_scalar_or_fn
 from .._core.safe import safe_norm
 from .._core.semidefinite import solve_balanced
 
@@ -54,9 +54,9 @@ class Bodies(AbstractBody):
 class PointMass(AbstractBody):
     """Lagrangian of a point mass; made by `point_mass`."""
 
-    m: Amount = eqx.field(converter=partial(as_amount, name="point_mass m"))
-    position: Place = eqx.field(converter=partial(as_place, name="point_mass position"))
-    gravity: Amount = eqx.field(converter=partial(as_amount, name="point_mass gravity"))
+    m: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="point_mass m"))
+    position: PositionFn = eqx.field(converter=partial(as_position_fn, name="point_mass position"))
+    gravity: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="point_mass gravity"))
 
     def __call__(
         self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
@@ -129,11 +129,11 @@ def point_mass(m: Any, position: Any, gravity: Any = 9.81) -> PointMass:
 class RigidBody(AbstractBody):
     """Lagrangian of a rigid body; made by `rigid_body`."""
 
-    m: Amount = eqx.field(converter=partial(as_amount, name="rigid_body m"))
-    inertia: Amount = eqx.field(converter=partial(as_amount, name="rigid_body inertia"))
-    position: Place = eqx.field(converter=partial(as_place, name="rigid_body position"))
-    orientation: Place = eqx.field(converter=partial(as_place, name="rigid_body orientation"))
-    gravity: Amount = eqx.field(converter=partial(as_amount, name="rigid_body gravity"))
+    m: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="rigid_body m"))
+    inertia: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="rigid_body inertia"))
+    position: PositionFn = eqx.field(converter=partial(as_position_fn, name="rigid_body position"))
+    orientation: PositionFn = eqx.field(converter=partial(as_position_fn, name="rigid_body orientation"))
+    gravity: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="rigid_body gravity"))
 
     def __call__(
         self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
@@ -186,7 +186,7 @@ def body_rates(turn: Float[Array, "3 3"], rate: Float[Array, "3 3"]) -> Float[Ar
     return 0.5 * jnp.stack([skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]])
 
 
-def _moving(position: Place, q: Array, qd: Array, params: PyTree, what: str) -> tuple[Array, Array]:
+def _moving(position: PositionFn, q: Array, qd: Array, params: PyTree, what: str) -> tuple[Array, Array]:
     _check_indices(position, q, params)
     x, v = jax.jvp(lambda q: position(q, params), (q,), (qd,))
     if x.shape != (3,):
@@ -197,7 +197,7 @@ def _moving(position: Place, q: Array, qd: Array, params: PyTree, what: str) -> 
     return x, v
 
 
-def _check_indices(place: Place, q: Array, params: PyTree) -> None:
+def _check_indices(place: PositionFn, q: Array, params: PyTree) -> None:
     """Refuse indices out of range where a body is called by itself; a scene looks at its whole Lagrangian."""
     if not isinstance(q, jax.core.Tracer):
         check_indices(place, q, params, name=place.name)

@@ -15,12 +15,12 @@ from .._core.arguments import as_flag, as_label
 from .._core.functions import as_function, result_shape
 from .._core.index_check import traced
 from .._core.parameters import Number, check_ranges, parameter
-from .._core.position import Place, as_place
+from .._core.position import PositionFn, as_position_fn
 from .._core.safe import safe_norm
 
 
-def _at(value: Any) -> Place | None:
-    return None if value is None else as_place(value, name="Constraint at")
+def _at(value: Any) -> PositionFn | None:
+    return None if value is None else as_position_fn(value, name="Constraint at")
 
 
 class AbstractConstraint(eqx.Module):
@@ -102,7 +102,7 @@ class Constraint(AbstractConstraint):
     """
 
     phi: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Constraint phi"))
-    at: Place | None = eqx.field(default=None, converter=_at)
+    at: PositionFn | None = eqx.field(default=None, converter=_at)
     one_sided: bool = eqx.field(default=False, static=True, converter=partial(as_flag, name="Constraint one_sided"))
     stabilise: Number = parameter("stabilise", "1/s", lower=0.0, default=0.0)
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Constraint name"))

@@ -23,7 +23,7 @@ _NEWTON = 2
 Constraints = Sequence[AbstractConstraint]
 
 
-class Restraint(NamedTuple):
+class LinearizedConstraints(NamedTuple):
     """All constraints of a mechanism at one state; m equations.
 
     - `rows`: J, shape `[m, dof]`.
@@ -34,34 +34,34 @@ class Restraint(NamedTuple):
 
     rows: Float[Array, "m dof"]
     bias: Float[Array, " m"]
-    reach: Float[Array, "m dof"]
+    minv_jt: Float[Array, "m dof"]
     matrix: Float[Array, "m m"]
 
     def multipliers(self, qdd: Float[Array, " dof"]) -> Float[Array, " m"]:
         """Multipliers that make accelerations `qdd` admissible."""
         return -solve_balanced(self.matrix, _times(self.rows, qdd) + self.bias)
 
-    def yields(self, qdd: Float[Array, " dof"]) -> Float[Array, " m"]:
+    def multiplier_response(self, qdd: Float[Array, " dof"]) -> Float[Array, " m"]:
         """What multipliers change if the accelerations without constraints change by `qdd`."""
         return -solve_balanced(self.matrix, _times(self.rows, qdd))
 
-    def push(self, multipliers: Float[Array, " m"]) -> Float[Array, " dof"]:
+    def apply_force(self, multipliers: Float[Array, " m"]) -> Float[Array, " dof"]:
         """Accelerations that multipliers make."""
-        return jnp.sum(self.reach * multipliers[:, None], axis=0)
+        return jnp.sum(self.minv_jt * multipliers[:, None], axis=0)
 
     def force(self, multipliers: Float[Array, " m"]) -> Float[Array, " dof"]:
         """Generalised force of multipliers."""
         return jnp.sum(self.rows * multipliers[:, None], axis=0)
 
 
-def restrain(
+def linearize_constraints(
     constraints: Constraints,
     t: Float[Array, ""],
     q: Float[Array, " dof"],
     qd: Float[Array, " dof"],
     params: PyTree,
     mass: Float[Array, "dof dof"],
-) -> Restraint:
+) -> LinearizedConstraints:
     """The constraints at one state of a mechanism with the mass matrix `mass`."""
 
     def along(t: Array, q: Array) -> Array:
@@ -74,7 +74,7 @@ def restrain(
         damped = rate * w[part] if error is None else 2.0 * rate * w[part] + rate**2 * error
         bias = bias.at[part].add(damped)
     reach, matrix = _reach(rows, mass)
-    return Restraint(rows, bias, reach, matrix)
+    return LinearizedConstraints(rows, bias, reach, matrix)
 
 
 def parts(

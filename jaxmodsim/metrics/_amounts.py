@@ -31,7 +31,7 @@ def peak(of: str) -> Feature:
 def _peak(run: Trajectory, of: str) -> Array:
     x = named_series(run, of)
     peak = jnp.max(jnp.where(jnp.isfinite(run.t), jnp.abs(x), 0.0))
-    if of in run.scene.exact:
+    if of in run.scene.event_driven:
         sides = jnp.abs(run.event_forces[of])
         return jnp.max(jnp.where(jnp.isnan(sides), 0.0, sides), initial=peak)
     if of.startswith("q[") and run.t.shape[0] > 1:

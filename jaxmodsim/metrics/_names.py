@@ -28,7 +28,7 @@ def slip_of(run: Trajectory, name: str) -> tuple[Float[Array, " nodes"], Float[A
     element, problem = element_of(run, name), run.problem
 
     def slip(t: Array, q: Array, qd: Array) -> Array:
-        return element.slip(t, q, qd, run.scene.now(t).params)
+        return element.slip(t, q, qd, run.scene.bind_time(t).params)
 
     def joined(first: ArrayLike, rest: Array) -> Array:
         return jnp.concatenate([jnp.asarray(first, rest.dtype)[None], rest])
@@ -40,7 +40,7 @@ def slip_of(run: Trajectory, name: str) -> tuple[Float[Array, " nodes"], Float[A
 def is_exact(run: Trajectory, name: str) -> bool:
     """Whether a friction element runs by events."""
     element_of(run, name)
-    return name in run.scene.exact
+    return name in run.scene.event_driven
 
 
 def needs_modes(run: Trajectory, name: str, what: str, mend: str) -> None:
@@ -60,7 +60,7 @@ def changes_of(run: Trajectory, name: str) -> tuple[Events, Array]:
 def modes_at_ends(run: Trajectory, name: str, events: Events, own: Array) -> tuple[Array, Array]:
     """Mode of an element at t0 and at the end of a run: 0 in stick, else the sign of its slip velocity."""
     assert run.modes is not None
-    kept = run.modes[-1, list(run.scene.exact).index(name)].astype(int)
+    kept = run.modes[-1, list(run.scene.event_driven).index(name)].astype(int)
     first, last = jnp.argmax(own), own.shape[0] - 1 - jnp.argmax(own[::-1])
     changed = jnp.any(own)
     return jnp.where(changed, events.before[first], kept), jnp.where(changed, events.after[last], kept)

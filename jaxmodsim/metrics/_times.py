@@ -114,7 +114,7 @@ def period(of: str = "friction", *, since: float | None = None, swing: float = 1
 
 
 def _period(run: Trajectory, of: str, since: float | None, swing: float) -> Array:
-    if of in run.scene.exact:
+    if of in run.scene.event_driven:
         gap, alive = cycle_of(run, of)
         return jnp.where(alive, gap, jnp.nan)
     x = named_series(run, of)

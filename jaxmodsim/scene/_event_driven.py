@@ -38,7 +38,7 @@ class Loads(NamedTuple):
 
     on: Float[Array, "n k"]
     normal: Float[Array, " k"]
-    fall: Float[Array, "k n"]
+    normal_coupling: Float[Array, "k n"]
     pulls: Float[Array, " k"]
 
 
@@ -55,9 +55,9 @@ class Contact(NamedTuple):
     """
 
     v: Float[Array, " n"]
-    base: Float[Array, " n"]
-    coupling: Float[Array, "n n"]
-    reach: Float[Array, "n dof"]
+    free_slip_acceleration: Float[Array, " n"]
+    delassus: Float[Array, "n n"]
+    minv_jt: Float[Array, "n dof"]
     forward: Float[Array, " n"]
     backward: Float[Array, " n"]
     upper: Float[Array, " n"]
@@ -65,7 +65,7 @@ class Contact(NamedTuple):
     loads: Loads | None
 
 
-class Balance(NamedTuple):
+class FrictionForces(NamedTuple):
     """Forces in given modes.
 
     - `force`: friction forces [N].
@@ -112,7 +112,8 @@ def contact(
         for sign in (1.0, -1.0)
     ]
     limits = [
-        [element.limit(sign * one, load) for element, load in zip(elements, given, strict=True)] for sign in (1.0, -1.0)
+        [element.static_limit(sign * one, load) for element, load in zip(elements, given, strict=True)]
+        for sign in (1.0, -1.0)
     ]
     coupling = jnp.stack([jnp.stack([jnp.sum(row * each) for each in reach]) for row in rows])
     if floor is not None:
@@ -132,7 +133,7 @@ def contact(
     )
 
 
-def balance(found: Contact, mode: Float[Array, " modes"]) -> Balance:
+def solve_friction_forces(found: Contact, mode: Float[Array, " modes"]) -> FrictionForces:
     """Friction forces [N] in the modes given: the slip force, or the multiplier of stick."""
     extra = found.v.shape[0] - mode.shape[0]
     mode = jnp.concatenate([mode, jnp.ones(extra, mode.dtype)]) if extra else mode
@@ -140,22 +141,24 @@ def balance(found: Contact, mode: Float[Array, " modes"]) -> Balance:
     slipping = jnp.where(mode > 0, found.forward, found.backward)
 
     def settled(slipping: Array, base: Array | float) -> Array:
-        drive = base - jnp.sum(found.coupling * jnp.where(sticks, 0.0, slipping)[None, :], axis=1)
+        drive = base - jnp.sum(found.delassus * jnp.where(sticks, 0.0, slipping)[None, :], axis=1)
         return jnp.where(sticks, _multipliers(found, drive, sticks), slipping)
 
     if found.loads is None:
-        return Balance(settled(slipping, found.base), found.upper, found.lower, jnp.ones_like(found.v[0]))
-    on, fall = found.loads.on, found.loads.fall
+        return FrictionForces(
+            settled(slipping, found.free_slip_acceleration), found.upper, found.lower, jnp.ones_like(found.v[0])
+        )
+    on, fall = found.loads.on, found.loads.normal_coupling
     count = on.shape[1]
     loaded = jnp.sum(on, axis=1)
-    fixed = settled(jnp.where(loaded > 0, 0.0, slipping), found.base)
+    fixed = settled(jnp.where(loaded > 0, 0.0, slipping), found.free_slip_acceleration)
     per_load = jnp.stack([settled(on[:, k] * slipping, 0.0) for k in range(count)])
     normal = found.loads.normal - jnp.sum(fall * fixed[None, :], axis=1)
     gain = jnp.sum(fall[:, None, :] * per_load[None, :, :], axis=2)
     load, margin = _loads(normal, gain, found.loads.pulls)
     factor = jnp.where(loaded > 0, jnp.sum(on * load[None, :], axis=1), 1.0)
     force = fixed + jnp.sum(per_load * load[:, None], axis=0)
-    return Balance(force, factor * found.upper, factor * found.lower, margin)
+    return FrictionForces(force, factor * found.upper, factor * found.lower, margin)
 
 
 def _loads(
@@ -203,7 +206,7 @@ def _multipliers(found: Contact, drive: Float[Array, " n"], sticks: Bool[Array, 
     weight = 0.5 * (found.upper + found.lower)
     largest = jnp.max(weight)
     weight = jnp.maximum(weight / jnp.where(largest > 0, largest, 1.0), 1e-6)
-    return solve_semidefinite(found.coupling, drive, jnp.sqrt(jnp.where(largest > 0, weight, 1.0)), sticks)
+    return solve_semidefinite(found.delassus, drive, jnp.sqrt(jnp.where(largest > 0, weight, 1.0)), sticks)
 
 
 def contact_guards(
@@ -218,7 +221,7 @@ def contact_guards(
     hold it).
     """
     n, (rtol, atol) = mode.shape[0], tolerances
-    force, upper, lower = (x[:n] for x in balance(found, mode)[:3])
+    force, upper, lower = (x[:n] for x in solve_friction_forces(found, mode)[:3])
     eps = float(jnp.finfo(force.dtype).eps)
     wider = 1.0 + 16.0 * eps
     span = upper + lower
@@ -227,10 +230,10 @@ def contact_guards(
     return jnp.where(mode == 0, inside, mode * found.v[:n] + rest), jnp.where(mode == 0, resolved, atol)
 
 
-def overload(found: Contact, mode: Float[Array, " modes"]) -> Float[Array, " modes"]:
+def stick_violation(found: Contact, mode: Float[Array, " modes"]) -> Float[Array, " modes"]:
     """By how much the force of each sticking element exceeds its limit, in limits; 0 in slip."""
     n = mode.shape[0]
-    force, upper, lower = (x[:n] for x in balance(found, mode)[:3])
+    force, upper, lower = (x[:n] for x in solve_friction_forces(found, mode)[:3])
     limit = jnp.where(force > 0, upper, lower)
     excess = (jnp.abs(force) - limit) / jnp.where(limit > 0, limit, 1.0)
     return jnp.where(mode == 0, excess, 0.0)
@@ -257,19 +260,19 @@ def next_modes(
     found = jax.tree.map(_constant, found)
     n = mode.shape[0]
     wider = 1.0 + 16.0 * float(jnp.finfo(mode.dtype).eps)
-    before = balance(found, mode)
+    before = solve_friction_forces(found, mode)
     load = jnp.sign(before.force[:n])
     mode = jnp.where(still, jnp.where(at_limit, load, jnp.zeros_like(mode)), mode)
-    scale = 1e-6 * jnp.max(jnp.abs(found.coupling) * jnp.maximum(before.upper, before.lower)[None, :], axis=1)[:n]
+    scale = 1e-6 * jnp.max(jnp.abs(found.delassus) * jnp.maximum(before.upper, before.lower)[None, :], axis=1)[:n]
 
     def settle(i: Array, mode: Array) -> Array:
-        all_forces, upper, lower, _ = balance(found, mode)
+        all_forces, upper, lower, _ = solve_friction_forces(found, mode)
         force = all_forces[:n]
         limit = jnp.where(force > 0, upper[:n], lower[:n])
         least = float(jnp.finfo(limit.dtype).tiny)
         use = jnp.where(mode == 0, jnp.abs(force) / jnp.maximum(limit, least), 0.0)
         worst = (use == jnp.max(use)) & (use > wider)
-        acceleration = (found.base - jnp.sum(found.coupling * all_forces[None, :], axis=1))[:n]
+        acceleration = (found.free_slip_acceleration - jnp.sum(found.delassus * all_forces[None, :], axis=1))[:n]
         # Where nothing is consistent, the last word is rather a slip that ends at once, which shows as chatter, than a
         # stick above its limit.
         against = still & (mode * acceleration < -scale) & ~jnp.any(worst) & (i < 3 * n)
@@ -282,4 +285,4 @@ def stop_slip(found: Contact, qd: Float[Array, " dof"], sticks: Bool[Array, " mo
     """Velocities with the slip of the sticking elements taken away, by the smallest impulses that do."""
     sticks = jnp.concatenate([sticks, jnp.zeros(found.v.shape[0] - sticks.shape[0], bool)])
     impulse = _multipliers(found, jnp.where(sticks, found.v, 0.0), sticks)
-    return qd - jnp.sum(found.reach * impulse[:, None], axis=0)
+    return qd - jnp.sum(found.minv_jt * impulse[:, None], axis=0)

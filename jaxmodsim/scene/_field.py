@@ -7,18 +7,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._core.depends import depends
+from .._core.depends import depends_on
 from .._core.functions import real_array
 from .._core.index_check import traced
 from .._core.safe import safe_norm
 from ..mechanics import energies, errors, motion_equations, project_position, project_velocity, rates
-from ._event_driven import Contact, contact_guards, next_modes, overload, stop_slip
-from ._forward_dynamics import Modes, Resolved, State, by_constraint, resolve
+from ._event_driven import Contact, contact_guards, next_modes, stick_violation, stop_slip
+from ._forward_dynamics import Dynamics, Modes, State, by_constraint, forward_dynamics
 from ._scene import Scene
 from .forces._effect import Power
 
 
-class Reaction(NamedTuple):
+class ConstraintReaction(NamedTuple):
     """What a constraint does; along a run with a leading axis of time.
 
     - `multiplier`: multipliers, shape `[m]`.
@@ -32,26 +32,26 @@ class Reaction(NamedTuple):
     force: Any
 
 
-def scene_field(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> State:
-    """Right-hand side of `y' = field(t, y)`; NaN where the equations do not hold, see `scene_margins`."""
-    resolved = resolve(scene, t, y, mode)
+def vector_field(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> State:
+    """Right-hand side of `y' = field(t, y)`; NaN where the equations do not hold, see `scene_validity_margins`."""
+    resolved = forward_dynamics(scene, t, y, mode)
     qdd = resolved.qdd
-    if resolved.margins is not None:
-        qdd = jnp.where(jnp.all(resolved.margins > 0), qdd, jnp.nan)
+    if resolved.validity_margins is not None:
+        qdd = jnp.where(jnp.all(resolved.validity_margins > 0), qdd, jnp.nan)
     return State(y.qd, qdd, {name: resolved.actions[name].rate for name in y.z})
 
 
 def scene_canonical(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> State:
     """Rates of coordinates and momenta at the state `y`: `p' = dL/dq + Q + J^T lambda`, in the place of qd."""
-    scene = scene.now(t)
-    resolved = resolve(scene, t, y, mode)
+    scene = scene.bind_time(t)
+    resolved = forward_dynamics(scene, t, y, mode)
     push = jax.grad(scene.lagrangian, argnums=1)(t, y.q, y.qd, scene.params)
     for action in resolved.actions.values():
         push = push + action.generalised
     if resolved.restraint is not None and resolved.multipliers is not None:
         push = push + resolved.restraint.force(resolved.multipliers)
-    if resolved.margins is not None:
-        push = jnp.where(jnp.all(resolved.margins > 0), push, jnp.nan)
+    if resolved.validity_margins is not None:
+        push = jnp.where(jnp.all(resolved.validity_margins > 0), push, jnp.nan)
     return State(y.qd, push, {name: resolved.actions[name].rate for name in y.z})
 
 
@@ -75,8 +75,8 @@ def scene_modes(
     t: Float[Array, ""], y: State, scene: Scene, rest: Float[Array, ""]
 ) -> tuple[State, Float[Array, " n"]]:
     """State and modes to begin with: elements with no more slip velocity than `rest` or rounding stick if they can."""
-    scene = scene.now(t)
-    elements = [*scene.exact.values()]
+    scene = scene.bind_time(t)
+    elements = [*scene.event_driven.values()]
     none = jnp.zeros(len(elements), y.q.dtype)
     found = _contact(t, y, scene, none)
     speed = jnp.stack([jnp.sum(jnp.abs(e.direction(y.q, scene.params) * y.qd)) + jnp.abs(e.belt(t)) for e in elements])
@@ -87,9 +87,9 @@ def scene_modes(
     return y._replace(qd=stop_slip(found, y.qd, mode == 0)), mode
 
 
-def scene_overload(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Float[Array, " n"]:
+def scene_stick_violation(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Float[Array, " n"]:
     """By how much the force of each sticking element exceeds its limit, in limits; 0 in slip."""
-    return overload(_contact(t, y, scene, mode), mode)
+    return stick_violation(_contact(t, y, scene, mode), mode)
 
 
 def scene_stick(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> State:
@@ -99,36 +99,36 @@ def scene_stick(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Sta
 
 def scene_drifts(scene: Scene) -> bool:
     """Whether stick drifts with the error of integration: not where it holds one coordinate at a constant speed."""
-    return any(each.along is not None or callable(each.belt_velocity) for each in scene.exact.values())
+    return any(each.along is not None or callable(each.belt_velocity) for each in scene.event_driven.values())
 
 
 def scene_energies(t: Float[Array, ""], y: State, scene: Scene) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Kinetic and potential energy [J] of the Lagrangian."""
-    scene = scene.now(t)
+    scene = scene.bind_time(t)
     return energies(scene.lagrangian, t, y.q, y.qd, scene.params)
 
 
 def scene_mass(t: Float[Array, ""], y: State, scene: Scene) -> Float[Array, "dof dof"]:
     """Mass matrix [kg for lengths, kg m^2 for angles]."""
-    scene = scene.now(t)
+    scene = scene.bind_time(t)
     return motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass
 
 
 def scene_project(t: Float[Array, ""], y: State, scene: Scene) -> State:
     """State moved onto the constraints: the coordinates, then the velocities there."""
-    scene = scene.now(t)
+    scene = scene.bind_time(t)
     mass = motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass
     q = project_position(scene.constraints, t, y.q, scene.params, mass)
     return y._replace(q=q, qd=project_velocity(scene.constraints, t, q, y.qd, scene.params, mass))
 
 
-def scene_misfit(t: Float[Array, ""], y: State, scene: Scene) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def scene_constraint_residual(t: Float[Array, ""], y: State, scene: Scene) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """How far coordinates and velocities are from the constraints, relative to their own size or to one.
 
     Each error is divided by the length of its gradient, which makes it a distance from its own surface: constraints
     that contradict each other show, too.
     """
-    scene = scene.now(t)
+    scene = scene.bind_time(t)
     y = jax.lax.stop_gradient(y)
 
     def far(fn: Callable[[Array], Array], x: Array) -> Array:
@@ -141,24 +141,26 @@ def scene_misfit(t: Float[Array, ""], y: State, scene: Scene) -> tuple[Float[Arr
     return far(position, y.q), far(velocity, y.qd)
 
 
-def scene_margins(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> Float[Array, " checks"] | None:
+def scene_validity_margins(
+    t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None
+) -> Float[Array, " checks"] | None:
     """What has to be positive for the equations to hold, in the order of `Scene.checks`; None for nothing."""
-    return resolve(scene, t, y, mode).margins
+    return forward_dynamics(scene, t, y, mode).validity_margins
 
 
-def scene_reactions(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> dict[str, Reaction]:
+def scene_reactions(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> dict[str, ConstraintReaction]:
     """What each constraint does, by name."""
-    return _reactions(t, y, scene, resolve(scene, t, y, mode))
+    return _reactions(t, y, scene, forward_dynamics(scene, t, y, mode))
 
 
-def _reactions(t: Float[Array, ""], y: State, scene: Scene, resolved: Resolved) -> dict[str, Reaction]:
-    scene = scene.now(t)
+def _reactions(t: Float[Array, ""], y: State, scene: Scene, resolved: Dynamics) -> dict[str, ConstraintReaction]:
+    scene = scene.bind_time(t)
     if resolved.restraint is None or resolved.multipliers is None:
         return {}
     multipliers = by_constraint(scene, t, y, resolved.multipliers)
     rows = by_constraint(scene, t, y, resolved.restraint.rows)
     return {
-        name: Reaction(
+        name: ConstraintReaction(
             multipliers[name],
             jnp.sum(rows[name] * multipliers[name][:, None], axis=0),
             each.force(t, y.q, scene.params, multipliers[name]),
@@ -168,14 +170,14 @@ def _reactions(t: Float[Array, ""], y: State, scene: Scene, resolved: Resolved) 
 
 
 def _contact(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Contact:
-    found = resolve(scene, t, y, mode).found
+    found = forward_dynamics(scene, t, y, mode).found
     assert found is not None
     return found
 
 
 def scene_forces(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> dict[str, Array]:
     """Force of each effect in its own terms, by name."""
-    actions = resolve(scene, t, y, mode).actions
+    actions = forward_dynamics(scene, t, y, mode).actions
     return {name: actions[name].force for name in scene.names}
 
 
@@ -185,8 +187,8 @@ def scene_power(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None)
     Besides, under the name of a constraint what its motion in time supplies, and under `lagrangian` what a Lagrangian
     does that depends on time by itself, `-dL/dt`; not there where it does not.
     """
-    scene = scene.now(t)
-    resolved = resolve(scene, t, y, mode)
+    scene = scene.bind_time(t)
+    resolved = forward_dynamics(scene, t, y, mode)
     powers = {
         name: effect.power(t, y.q, y.qd, scene.params, resolved.actions[name])
         for name, effect in zip(scene.names, scene.effects, strict=True)
@@ -197,7 +199,7 @@ def scene_power(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None)
     def lagrangian(t: Array) -> Array:
         return scene.lagrangian(t, y.q, y.qd, scene.params)
 
-    if depends(lagrangian, t):
+    if depends_on(lagrangian, t):
         powers["lagrangian"] = Power(-jax.grad(lagrangian)(t))
     return powers
 
@@ -211,7 +213,7 @@ def check_scene(scene: Scene, y: State) -> None:
       range; see `traced` for those that are seen.
     """
     t = y.q[0]
-    scene = scene.now(t)
+    scene = scene.bind_time(t)
 
     def energy(*state: Any) -> Array:
         return real_array(scene.lagrangian(*state), name="the Lagrangian")

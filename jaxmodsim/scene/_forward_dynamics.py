@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._core.cholesky import solve_positive_definite
-from ..mechanics import MotionEquations, Restraint, motion_equations, parts, restrain
-from ._event_driven import Contact, Loads, balance, contact
-from ._karnopp import hold
+from ..mechanics import LinearizedConstraints, MotionEquations, linearize_constraints, motion_equations, parts
+from ._event_driven import Contact, Loads, contact, solve_friction_forces
+from ._karnopp import karnopp_forces
 from ._scene import Scene
 from .forces._effect import Action
 from .forces._friction import Friction
@@ -32,7 +32,7 @@ class State(NamedTuple):
     z: dict[str, PyTree]
 
 
-class Resolved(NamedTuple):
+class Dynamics(NamedTuple):
     """What happens at one state.
 
     - `equations`: the equations of motion.
@@ -48,26 +48,34 @@ class Resolved(NamedTuple):
     actions: dict[str, Action]
     qdd: Float[Array, " dof"]
     found: Contact | None
-    restraint: Restraint | None
+    restraint: LinearizedConstraints | None
     multipliers: Float[Array, " m"] | None
-    margins: Float[Array, " checks"] | None
+    validity_margins: Float[Array, " checks"] | None
 
 
 class Mobility(NamedTuple):
     """How the mechanism answers forces within its constraints."""
 
     mass: Float[Array, "dof dof"]
-    restraint: Restraint | None
+    constraints: LinearizedConstraints | None
 
     def accelerate(self, force: Float[Array, " dof"]) -> Float[Array, " dof"]:
         """Accelerations under the generalised force `force`."""
         free = solve_positive_definite(self.mass, force)
-        return free if self.restraint is None else free + self.restraint.push(self.restraint.multipliers(free))
+        return (
+            free
+            if self.constraints is None
+            else free + self.constraints.apply_force(self.constraints.multipliers(free))
+        )
 
     def respond(self, force: Float[Array, " dof"]) -> Float[Array, " dof"]:
         """Change of the accelerations with the generalised force."""
         free = solve_positive_definite(self.mass, force)
-        return free if self.restraint is None else free + self.restraint.push(self.restraint.yields(free))
+        return (
+            free
+            if self.constraints is None
+            else free + self.constraints.apply_force(self.constraints.multiplier_response(free))
+        )
 
     def least(self, row: Float[Array, " dof"]) -> Float[Array, ""]:
         """Mobility [1/kg] along a direction that rounding can tell from none, where constraints take it away."""
@@ -75,26 +83,28 @@ class Mobility(NamedTuple):
         return _ROUNDING * eps * jnp.sum(row * solve_positive_definite(self.mass, row))
 
 
-def resolve(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -> Resolved:
+def forward_dynamics(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -> Dynamics:
     """Solve for the accelerations, and for the forces that depend on them."""
     q, qd = y.q, y.qd
-    scene = scene.at(t, q, qd)
+    scene = scene.bind_state(t, q, qd)
     params = scene.params
     equations = motion_equations(scene.lagrangian, t, q, qd, params)
-    restraint = restrain(scene.constraints, t, q, qd, params, equations.mass) if scene.constraints else None
+    restraint = (
+        linearize_constraints(scene.constraints, t, q, qd, params, equations.mass) if scene.constraints else None
+    )
     mobility = Mobility(equations.mass, restraint)
     actions, rhs = {}, equations.load
     holding = {}
     for name, effect in zip(scene.names, scene.effects, strict=True):
-        if name in scene.exact or name in scene.leaning:
+        if name in scene.event_driven or name in scene.reaction_loaded:
             continue
         action = effect.act(t, q, qd, y.z.get(name), params)
         actions[name] = action
         rhs = rhs + action.generalised
-        if isinstance(effect, Friction) and effect.holding:
+        if isinstance(effect, Friction) and effect.karnopp:
             holding[name] = effect
     if holding:
-        held = hold(holding, actions, mobility.accelerate, mobility.respond, rhs, t, q, qd, params)
+        held = karnopp_forces(holding, actions, mobility.accelerate, mobility.respond, rhs, t, q, qd, params)
         for name, action in held.items():
             rhs = rhs + action.generalised - actions[name].generalised
             actions[name] = action
@@ -102,31 +112,33 @@ def resolve(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -> Resolve
     multipliers = None
     if restraint is not None:
         multipliers = restraint.multipliers(qdd)
-        qdd = qdd + restraint.push(multipliers)
-    if not (scene.exact or scene.leaning):
+        qdd = qdd + restraint.apply_force(multipliers)
+    if not (scene.event_driven or scene.reaction_loaded):
         margins = _margins(scene, t, y, multipliers, None)
-        return Resolved(equations, actions, qdd, None, restraint, multipliers, margins)
+        return Dynamics(equations, actions, qdd, None, restraint, multipliers, margins)
 
-    units = {name: each.unloaded(t, q, qd, y.z.get(name), params) for name, each in scene.leaning.items()}
-    pushes = [-each.push(q, units[name][0], params) for name, each in scene.leaning.items()]
+    units = {name: each.force_per_load(t, q, qd, y.z.get(name), params) for name, each in scene.reaction_loaded.items()}
+    pushes = [-each.apply_force(q, units[name][0], params) for name, each in scene.reaction_loaded.items()]
 
     def loads(rows: Array) -> Loads | None:
         return _loads(scene, mobility, t, y, rows, multipliers)
 
     floor = mobility.least if restraint is not None else None
-    found = contact([*scene.exact.values()], pushes, mobility.respond, floor, loads, t, q, qd, params, qdd)
-    settled = balance(found, jnp.zeros(0, q.dtype) if mode is None else mode)
-    for i, (name, effect) in enumerate(scene.exact.items()):
-        actions[name] = Action(effect.push(q, settled.force[i], params), settled.force[i])
-    for i, name in enumerate(scene.leaning, start=len(scene.exact)):
+    found = contact([*scene.event_driven.values()], pushes, mobility.respond, floor, loads, t, q, qd, params, qdd)
+    settled = solve_friction_forces(found, jnp.zeros(0, q.dtype) if mode is None else mode)
+    for i, (name, effect) in enumerate(scene.event_driven.items()):
+        actions[name] = Action(effect.apply_force(q, settled.force[i], params), settled.force[i])
+    for i, name in enumerate(scene.reaction_loaded, start=len(scene.event_driven)):
         unit, rate = units[name]
-        actions[name] = Action(-settled.force[i] * pushes[i - len(scene.exact)], settled.force[i] * unit, rate)
-    qdd = qdd - jnp.sum(found.reach * settled.force[:, None], axis=0)
+        actions[name] = Action(-settled.force[i] * pushes[i - len(scene.event_driven)], settled.force[i] * unit, rate)
+    qdd = qdd - jnp.sum(found.minv_jt * settled.force[:, None], axis=0)
     if restraint is not None and multipliers is not None:
-        taken = sum(actions[name].generalised for name in (*scene.exact, *scene.leaning))
-        multipliers = multipliers + restraint.yields(solve_positive_definite(equations.mass, jnp.asarray(taken)))
+        taken = sum(actions[name].generalised for name in (*scene.event_driven, *scene.reaction_loaded))
+        multipliers = multipliers + restraint.multiplier_response(
+            solve_positive_definite(equations.mass, jnp.asarray(taken))
+        )
     margins = _margins(scene, t, y, multipliers, settled.margin)
-    return Resolved(equations, actions, qdd, found, restraint, multipliers, margins)
+    return Dynamics(equations, actions, qdd, found, restraint, multipliers, margins)
 
 
 def _loads(
@@ -136,13 +148,13 @@ def _loads(
     names = scene.loaded
     if not names:
         return None
-    assert mobility.restraint is not None
-    loaded = [each.rests_on for each in (*scene.exact.values(), *scene.leaning.values())]
+    assert mobility.constraints is not None
+    loaded = [each.load_constraint for each in (*scene.event_driven.values(), *scene.reaction_loaded.values())]
     where = by_constraint(scene, t, y, jnp.arange(multipliers.shape[0]))
     chosen = dict(zip(scene.constraint_names, scene.constraints, strict=True))
     at = jnp.concatenate([where[name] for name in names])
     size = jnp.stack([chosen[name].per_multiplier(t, y.q, scene.params) for name in names])
-    yields = [mobility.restraint.yields(solve_positive_definite(mobility.mass, row)) for row in rows]
+    yields = [mobility.constraints.multiplier_response(solve_positive_definite(mobility.mass, row)) for row in rows]
     return Loads(
         jnp.asarray([[float(name == each) for name in names] for each in loaded], y.q.dtype),
         size * multipliers[at],

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .._core.monotone import solve_monotone
 from ..friction import Sign
-from ..mechanics import motion_equations, restrain
+from ..mechanics import linearize_constraints, motion_equations
 from ._forward_dynamics import Mobility, State
 from ._scene import Scene
 from .forces._friction import Friction
@@ -32,7 +32,7 @@ class _Element(NamedTuple):
 
     def end(self, v: Float[Array, " components"], z: PyTree, h: Float[Array, ""]) -> tuple[Array, PyTree]:
         """Force and state at the end of the step at the slip velocity `v` there."""
-        force, z = self.effect.after(v if self.planar else v[0], z, h, self.load)
+        force, z = self.effect.step_exact(v if self.planar else v[0], z, h, self.load)
         return jnp.atleast_1d(force), z
 
 
@@ -47,21 +47,21 @@ def check_step(scene: Scene) -> None:
         if not isinstance(effect, Friction):
             continue
         law, start = type(effect.law).__name__, f"ImplicitFriction: friction {name!r}"
-        if effect.exact or isinstance(effect.law, Sign):
+        if effect.event_driven or isinstance(effect.law, Sign):
             raise ValueError(
                 f"{start} has a force that jumps at rest ({law}), so that position and velocity do not tell it: wrap"
                 " the law as Regularized(law, width), however small the width, take a law with bristles (LuGre, Dahl,"
                 " ElastoPlastic), or run it by events, with another solver."
             )
-        if effect.holding:
+        if effect.karnopp:
             raise ValueError(
                 f"{start} is a DeadZone, which holds by knowing all other forces: wrap the law as Regularized(law,"
                 " width) instead, or use another solver."
             )
-        if effect.rests_on is not None:
+        if effect.load_constraint is not None:
             raise ValueError(
-                f"{start} has the reaction of the constraint {effect.rests_on!r} for its load, which this solver does"
-                " not find together with friction: give normal_force as a function, or use another solver."
+                f"{start} has the reaction of the constraint {effect.load_constraint!r} for its load, which this solver"
+                " does not find together with friction: give normal_force as a function, or use another solver."
             )
 
 
@@ -72,10 +72,12 @@ def scene_step(scene: Scene, t0: Float[Array, ""], t1: Float[Array, ""], y: Stat
     state at t1: `v1 = v_free - h D M^-1 D^T F(v1, advance(v1, z0, h))`. Coordinates follow with the velocities at t1.
     """
     q, qd, h = y.q, y.qd, t1 - t0
-    scene = scene.at(t0, q, qd)
+    scene = scene.bind_state(t0, q, qd)
     params = scene.params
     equations = motion_equations(scene.lagrangian, t0, q, qd, params)
-    restraint = restrain(scene.constraints, t0, q, qd, params, equations.mass) if scene.constraints else None
+    restraint = (
+        linearize_constraints(scene.constraints, t0, q, qd, params, equations.mass) if scene.constraints else None
+    )
     mobility = Mobility(equations.mass, restraint)
     rhs, elements = equations.load, {}
     for name, effect in zip(scene.names, scene.effects, strict=True):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..friction import AbstractHoldingLaw
+from ..friction import AbstractKarnoppLaw
 from .forces._effect import Action
 from .forces._friction import Friction
 
@@ -14,7 +14,7 @@ from .forces._friction import Friction
 _SWEEPS = 50
 
 
-def hold(
+def karnopp_forces(
     elements: dict[str, Friction],
     slipping: dict[str, Action],
     accelerate: Callable[[Array], Array],
@@ -44,11 +44,11 @@ def hold(
     free, one = rhs, jnp.ones_like(t)
     for name in names:
         effect, law = elements[name], elements[name].law
-        assert isinstance(law, AbstractHoldingLaw)
+        assert isinstance(law, AbstractKarnoppLaw)
         holds = law.holds(effect.slip(t, q, qd, params))
         free = free - jnp.where(holds, slipping[name].generalised, 0.0)
         load = effect.load(t, q, qd, params)
-        limits.append([effect.limit(-one, load), effect.limit(one, load)])
+        limits.append([effect.static_limit(-one, load), effect.static_limit(one, load)])
         active.append(holds)
         rows.append(effect.direction(q, params))
     reach = [respond(row) for row in rows]
@@ -69,7 +69,7 @@ def hold(
         forces = jax.lax.fori_loop(0, _SWEEPS, lambda _, f: sweep(f), forces)
     return {
         name: Action(
-            jnp.where(on, elements[name].push(q, force, params), slipping[name].generalised),
+            jnp.where(on, elements[name].apply_force(q, force, params), slipping[name].generalised),
             jnp.where(on, force, slipping[name].force),
         )
         for name, on, force in zip(names, active, forces, strict=True)

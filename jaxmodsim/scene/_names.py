@@ -7,7 +7,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from .._core.parameters import Range, ranges_of
-from .._core.state_dependent import Varying
+from .._core.state_dependent import StateDependent
 from ..friction import AbstractAsymmetric
 from ._scene import Scene
 from ._signal import Signal
@@ -63,7 +63,7 @@ def scene_ranges(scene: Scene) -> dict[str, Range]:
     ranges: dict[str, Range] = {}
     for path, _ in leaves:
         owners = _owners(scene, path)
-        while isinstance(owners[-1], Varying):  # the range is that of the parameter
+        while isinstance(owners[-1], StateDependent):  # the range is that of the parameter
             owners, path = owners[:-1], path[:-1]
         owner, last = owners[-1], path[-1]
         if isinstance(last, jtu.GetAttrKey):

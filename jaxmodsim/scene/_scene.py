@@ -118,21 +118,21 @@ class Scene(eqx.Module):
                 raise ValueError(f"Two constraints have the name {name!r}; names of constraints must differ.")
         for name in set(self.names) & set(self.constraint_names):
             raise ValueError(f"An effect and a constraint both have the name {name!r}; give one of them another name.")
-        if self.exact and any(isinstance(x, Friction) and x.holding for x in self.effects):
+        if self.event_driven and any(isinstance(x, Friction) and x.karnopp for x in self.effects):
             raise ValueError(
-                f"{', '.join(self.exact)}: set-valued laws of one scene run either all by events or all by"
+                f"{', '.join(self.event_driven)}: set-valued laws of one scene run either all by events or all by"
                 " DeadZone, as each must know the forces of the others. Wrap all of them in DeadZone, or none."
             )
         for name, effect in zip(self.names, self.effects, strict=True):
-            if not isinstance(effect, Friction) or effect.rests_on is None:
+            if not isinstance(effect, Friction) or effect.load_constraint is None:
                 continue
-            if effect.rests_on not in self.constraint_names:
+            if effect.load_constraint not in self.constraint_names:
                 known = ", ".join(repr(x) for x in self.constraint_names) or "none"
                 raise ValueError(
-                    f"Friction {name!r}: normal_force={effect.rests_on!r} names no constraint of the scene; there are:"
-                    f" {known}."
+                    f"Friction {name!r}: normal_force={effect.load_constraint!r} names no constraint of the scene;"
+                    f" there are: {known}."
                 )
-            if effect.holding:
+            if effect.karnopp:
                 raise ValueError(
                     f"Friction {name!r}: under the load of a constraint DeadZone cannot run; let the law run by events,"
                     " or wrap it as Regularized(law, width)."
@@ -154,27 +154,27 @@ class Scene(eqx.Module):
         return _names(self.constraints, lambda _: "constraint")
 
     @property
-    def exact(self) -> dict[str, Friction]:
+    def event_driven(self) -> dict[str, Friction]:
         """The friction elements that run by events, by name, in the order of their modes."""
         return {
             name: effect
             for name, effect in zip(self.names, self.effects, strict=True)
-            if isinstance(effect, Friction) and effect.exact
+            if isinstance(effect, Friction) and effect.event_driven
         }
 
     @property
-    def leaning(self) -> dict[str, Friction]:
+    def reaction_loaded(self) -> dict[str, Friction]:
         """The other friction elements whose load is the reaction of a constraint, by name."""
         return {
             name: effect
             for name, effect in zip(self.names, self.effects, strict=True)
-            if isinstance(effect, Friction) and not effect.exact and effect.rests_on is not None
+            if isinstance(effect, Friction) and not effect.event_driven and effect.load_constraint is not None
         }
 
     @property
     def loaded(self) -> tuple[str, ...]:
         """Names of the constraints whose reactions are loads of friction."""
-        resting = {each.rests_on for each in (*self.exact.values(), *self.leaning.values())}
+        resting = {each.load_constraint for each in (*self.event_driven.values(), *self.reaction_loaded.values())}
         return tuple(name for name in self.constraint_names if name in resting)
 
     @property
@@ -194,7 +194,7 @@ class Scene(eqx.Module):
             )
         return tuple(words)
 
-    def now(self, t: Float[Array, ""]) -> "Scene":
+    def bind_time(self, t: Float[Array, ""]) -> "Scene":
         """The scene with the numbers of its signals at time `t`; itself where it has none."""
         if not signals_of(self.params):
             return self
@@ -212,17 +212,19 @@ class Scene(eqx.Module):
             object.__setattr__(scene, field.name, parts.get(field.name, getattr(self, field.name)))
         return scene
 
-    def at(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"]) -> "Scene":
+    def bind_state(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"]) -> "Scene":
         """The scene with its signals and laws as they are at this state; itself where nothing depends on that."""
-        if (scene := self.now(t)) is not self:
-            return scene.at(t, q, qd)
-        effects = tuple(each.at(t, q, qd, self.params) if isinstance(each, Friction) else each for each in self.effects)
+        if (scene := self.bind_time(t)) is not self:
+            return scene.bind_state(t, q, qd)
+        effects = tuple(
+            each.bind_state(t, q, qd, self.params) if isinstance(each, Friction) else each for each in self.effects
+        )
         if all(a is b for a, b in zip(effects, self.effects, strict=True)):
             return self
         return eqx.tree_at(lambda scene: scene.effects, self, effects)
 
-    def state0(self, q: Float[Array, " dof"]) -> dict[str, PyTree]:
+    def initial_state(self, q: Float[Array, " dof"]) -> dict[str, PyTree]:
         """Own state of each effect that has one, at rest, by effect name."""
-        params = self.now(q[0]).params  # only shapes matter
-        states = {name: effect.state0(q, params) for name, effect in zip(self.names, self.effects, strict=True)}
+        params = self.bind_time(q[0]).params  # only shapes matter
+        states = {name: effect.initial_state(q, params) for name, effect in zip(self.names, self.effects, strict=True)}
         return {name: state for name, state in states.items() if state is not None}

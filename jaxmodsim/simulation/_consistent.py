@@ -62,7 +62,7 @@ def consistent(
         raise ValueError(f"t0 must be one number, but has the shape {t.shape}.")
     if not isinstance(hold, list | tuple | range) or not all(isinstance(i, int) and 0 <= i < dof for i in hold):
         raise ValueError(f"hold must be indices of coordinates, 0 to {dof - 1}, as in (0,), but {hold!r} was given.")
-    check_scene(scene, State(q, qd, scene.state0(q)))
+    check_scene(scene, State(q, qd, scene.initial_state(q)))
     if not scene.constraints:
         return q, qd
     free = jnp.asarray([float(i not in hold) for i in range(dof)], kind)
@@ -82,7 +82,7 @@ def consistent(
 @jax.jit
 def _find(scene: Scene, t: Array, q: Array, qd: Array, free: Array) -> tuple[Array, Array, tuple[Array, Array]]:
     """Position, velocity, and by how much the constraints are still violated."""
-    scene = scene.now(t)
+    scene = scene.bind_time(t)
     constraints, params = scene.constraints, scene.params
     mass = motion_equations(scene.lagrangian, t, q, qd, params).mass
     inverse = factor_positive_definite(mass)(jnp.eye(q.shape[0], dtype=q.dtype))

@@ -13,7 +13,7 @@ from ._outcome import SUCCESS, SimulationError, outcome_messages
 from ._solve import Options, Problem, initial_state, solve_audited, solve_logged, solve_start
 
 
-class Ledger(NamedTuple):
+class EnergyLedger(NamedTuple):
     """Energies of a run [J], shape `[time]` each.
 
     - `kinetic`, `potential`: of the Lagrangian.
@@ -39,7 +39,9 @@ class Ledger(NamedTuple):
         return total - sum(self.supplied.values(), jnp.zeros_like(total))
 
 
-def ledger(problem: Problem, options: Options, t: Float[Array, " time"], y: State, code: Int[Array, ""]) -> Ledger:
+def ledger(
+    problem: Problem, options: Options, t: Float[Array, " time"], y: State, code: Int[Array, ""]
+) -> EnergyLedger:
     """Ledger of a run whose states at the times `t` are `y`. Runs it once more, with the work integrals beside it.
 
     **Arguments:**
@@ -63,7 +65,7 @@ def ledger(problem: Problem, options: Options, t: Float[Array, " time"], y: Stat
 
 
 @jax.jit
-def _ledger(problem: Problem, t: Array, y: State, work: dict[str, Power]) -> Ledger:
+def _ledger(problem: Problem, t: Array, y: State, work: dict[str, Power]) -> EnergyLedger:
     scene = problem.scene
 
     def parts(t: Array, y: State) -> tuple[Array, Array, dict[str, Array]]:
@@ -76,7 +78,7 @@ def _ledger(problem: Problem, t: Array, y: State, work: dict[str, Power]) -> Led
     dissipated = {
         name: absorbed - gained.get(name, 0.0) for name in scene.names if (absorbed := work[name].absorbed) is not None
     }
-    return Ledger(kinetic, potential, stored, supplied, dissipated, _energy(scene, problem.t0, first))
+    return EnergyLedger(kinetic, potential, stored, supplied, dissipated, _energy(scene, problem.t0, first))
 
 
 def event_losses(problem: Problem, options: Options, t: Float[Array, " time"], events: int) -> Float[Array, " time"]:
@@ -85,7 +87,7 @@ def event_losses(problem: Problem, options: Options, t: Float[Array, " time"], e
     Runs the scene once more with a log of `events` entries beside it, where it has modes.
     """
     start, log = solve_start(problem, options), None
-    if problem.scene.exact:
+    if problem.scene.event_driven:
         log = solve_logged(problem, options, events)
     return _losses(problem, t, start, log)
 
@@ -110,7 +112,7 @@ def _losses(problem: Problem, t: Array, start: State, log: EventLog | None) -> A
 
 def _stored(scene: Scene, y: State) -> dict[str, Array]:
     return {
-        name: jnp.asarray(effect.stored(y.z[name]), y.q.dtype)
+        name: jnp.asarray(effect.stored_energy(y.z[name]), y.q.dtype)
         for name, effect in zip(scene.names, scene.effects, strict=True)
         if name in y.z
     }

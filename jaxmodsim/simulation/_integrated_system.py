@@ -14,13 +14,13 @@ from ..scene import (
     Scene,
     State,
     scene_canonical,
-    scene_field,
     scene_guards,
     scene_power,
     scene_project,
     scene_step,
     scene_stick,
     scene_switch,
+    vector_field,
 )
 from ..solvers import EventState
 
@@ -28,7 +28,7 @@ from ..solvers import EventState
 Work: TypeAlias = dict[str, Power]
 
 
-class Beside(NamedTuple):
+class AugmentedState(NamedTuple):
     """What is integrated beside the motion.
 
     - `motion`: a `State`, with momenta in the place of velocities where the run is canonical.
@@ -39,7 +39,7 @@ class Beside(NamedTuple):
     work: Work
 
 
-class Flow(NamedTuple):
+class IntegratedSystem(NamedTuple):
     """What is integrated: a `State`, with momenta in the place of velocities where `canonical`.
 
     In an `audited` run it is `Beside` the work.
@@ -53,20 +53,20 @@ class Flow(NamedTuple):
         y = self._inner(t, state, scene)
         if not self.audited:
             return y
-        return Beside(y, jtu.tree_map(jnp.zeros_like, scene_power(t, state, scene, mode)))
+        return AugmentedState(y, jtu.tree_map(jnp.zeros_like, scene_power(t, state, scene, mode)))
 
     def state(self, t: Array, y: Any, scene: Scene) -> State:
         """The state in what is integrated."""
-        y = y.motion if isinstance(y, Beside) else y
+        y = y.motion if isinstance(y, AugmentedState) else y
         if not self.canonical:
             return y
-        scene = scene.now(t)
+        scene = scene.bind_time(t)
         return y._replace(qd=velocity(scene.lagrangian, t, y.q, y.qd, scene.params))
 
     def replace(self, t: Array, y: Any, state: State, scene: Scene) -> Any:
         """With another state."""
         inner = self._inner(t, state, scene)
-        return y._replace(motion=inner) if isinstance(y, Beside) else inner
+        return y._replace(motion=inner) if isinstance(y, AugmentedState) else inner
 
     def result(self, t: Array, y: Any, scene: Scene) -> Any:
         """What is kept of it: the state, in an audited run a pair of it and `Work`."""
@@ -76,10 +76,10 @@ class Flow(NamedTuple):
     def rate(self, t: Any, y: Any, scene: Scene, mode: Any = None) -> Any:
         """Right-hand side."""
         state = self.state(t, y, scene)
-        rate = (scene_canonical if self.canonical else scene_field)(t, state, scene, mode)
-        if not isinstance(y, Beside):
+        rate = (scene_canonical if self.canonical else vector_field)(t, state, scene, mode)
+        if not isinstance(y, AugmentedState):
             return rate
-        return Beside(rate, scene_power(t, state, scene, mode))
+        return AugmentedState(rate, scene_power(t, state, scene, mode))
 
     def advance(self, t0: Array, t1: Array, y: Any, scene: Scene) -> tuple[Any, Array]:
         """One step of `ImplicitFriction`, and whether it was solved; work is done at the powers at its end."""
@@ -87,25 +87,25 @@ class Flow(NamedTuple):
         if not self.audited:
             return state, solved
         work = jtu.tree_map(lambda work, power: work + (t1 - t0) * power, y.work, scene_power(t1, state, scene))
-        return Beside(state, work), solved
+        return AugmentedState(state, work), solved
 
     def _inner(self, t: Array, state: State, scene: Scene) -> State:
         if not self.canonical:
             return state
-        scene = scene.now(t)
+        scene = scene.bind_time(t)
         return state._replace(qd=momentum(scene.lagrangian, t, state.q, state.qd, scene.params))
 
 
 # A step of a scene with events or constraints evaluates large fields a dozen times. Traced as one function each, they
 # are traced, linearised and transposed once.
-_rate = partial(jax.jit, static_argnums=0)(Flow.rate)
+_rate = partial(jax.jit, static_argnums=0)(IntegratedSystem.rate)
 _guards = jax.jit(scene_guards)
 
 
 class Hybrid(NamedTuple):
     """The functions of a run; those of a state `s` in the form that `EventSolver` takes, for runs with modes."""
 
-    flow: Flow
+    flow: IntegratedSystem
     # Slip velocity [m/s] that counts as none.
     rest: Float[Array, ""]
     # Relative and absolute, of the limits of stick and of slip velocities.
@@ -133,7 +133,7 @@ class Hybrid(NamedTuple):
         changed = jnp.any(mode != s.mode)
         return s._replace(y=jtu.tree_map(lambda a, b: jnp.where(changed, a, b), after, s.y), mode=mode)
 
-    def hold(self, t: Any, s: EventState, scene: Scene, fired: Array) -> EventState:
+    def on_zeno(self, t: Any, s: EventState, scene: Scene, fired: Array) -> EventState:
         """Stick of what chatters."""
         return self._stick(t, s._replace(mode=jnp.where(fired, 0.0, s.mode)), scene)
 
@@ -147,7 +147,7 @@ class Hybrid(NamedTuple):
             return y
         return self.flow.replace(t, y, scene_project(t, self.flow.state(t, y, scene), scene), scene)
 
-    def settle(self, t: Any, s: EventState, scene: Scene) -> EventState:
+    def project_and_stick(self, t: Any, s: EventState, scene: Scene) -> EventState:
         """Back onto the constraints, and into stick."""
         s = s._replace(y=self.project(t, s.y, scene))
         return self._stick(t, s, scene) if self.sticks else s
@@ -155,5 +155,5 @@ class Hybrid(NamedTuple):
     def keep(self, t: Any, y: Any, scene: Scene) -> Any:
         """What is kept at a saved time, where the state comes from dense output and obeys nothing: result and mode."""
         if isinstance(y, EventState):
-            return self.flow.result(t, self.settle(t, y, scene).y, scene), y.mode
+            return self.flow.result(t, self.project_and_stick(t, y, scene).y, scene), y.mode
         return self.flow.result(t, self.project(t, y, scene), scene), None

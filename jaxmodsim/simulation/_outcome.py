@@ -12,7 +12,7 @@ from .._core.cholesky import cholesky_pivots
 from .._core.parameters import check_ranges, modules_of, range_checks
 from ..friction import Regularized
 from ..mechanics import quadratic
-from ..scene import Scene, State, scene_margins, scene_mass, scene_misfit
+from ..scene import Scene, State, scene_constraint_residual, scene_mass, scene_validity_margins
 from ..solvers import ACCUMULATION, TOO_MANY
 
 (
@@ -69,13 +69,13 @@ class _Offsets(NamedTuple):
 def _offsets(scene: Scene, dof: int) -> _Offsets:
     ranges = FIRST_MASS + dof
     chatter = ranges + sum(len(range_checks(module)) for _, module in modules_of(scene))
-    return _Offsets(ranges, chatter, chatter + len(scene.exact))
+    return _Offsets(ranges, chatter, chatter + len(scene.event_driven))
 
 
 class Ending(NamedTuple):
     """What the last event says: whether events ended the run, and which guards fired in it."""
 
-    trouble: Float[Array, ""]
+    status: Float[Array, ""]
     fired: Float[Array, " guards"]
 
 
@@ -124,7 +124,7 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
     chatter = tuple(
         f"The mode changes of {name!r} accumulate: chatter between stick and slip. Pass hold_chatter=True to hold it in"
         " stick from there on."
-        for name in scene.exact
+        for name in scene.event_driven
     )
     return _GENERAL + mass + ranges + chatter + scene.checks
 
@@ -147,13 +147,13 @@ def start_code(
     finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
     code = jnp.where(finite, code, NOT_FINITE)
     if canonical:
-        now = scene.now(t)
+        now = scene.bind_time(t)
         code = jnp.where(quadratic(now.lagrangian, t, y.q, y.qd, now.params), code, NOT_QUADRATIC)
     offsets = _offsets(scene, dof)
-    code = _blame_margins(code, scene_margins(t, y, scene, mode), offsets.checks, True)
+    code = _blame_margins(code, scene_validity_margins(t, y, scene, mode), offsets.checks, True)
     code = _blame_mass(code, _pivots(scene, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
     if scene.constraints:
-        off, turned = scene_misfit(t, y, scene)
+        off, turned = scene_constraint_residual(t, y, scene)
         code = jnp.where((off <= _CONSISTENT) & (turned <= _CONSISTENT), code, INCONSISTENT)
     widths = [module.width for _, module in modules_of(scene) if isinstance(module, Regularized)]
     if atol is not None and widths:
@@ -185,17 +185,17 @@ def end_code(
     offsets = _offsets(scene, y.q.shape[0])
     if ending is not None:
         element = jnp.argmax(ending.fired)
-        chatters, full = ending.trouble == ACCUMULATION, ending.trouble == TOO_MANY
+        chatters, full = ending.status == ACCUMULATION, ending.status == TOO_MANY
         code = jnp.where(early & chatters, offsets.chatter + element, jnp.where(early & full, MAX_EVENTS, code))
     finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
     code = jnp.where(early & ~finite, NOT_FINITE, code)
     if scene.checks:
         # The run ends in front of the place where the equations cease to hold: look a little further.
         beyond = y._replace(q=y.q + ahead * y.qd, qd=y.qd + ahead * rate.qd)
-        code = _blame_margins(code, scene_margins(t + ahead, beyond, scene, mode), offsets.checks, early)
-        code = _blame_margins(code, scene_margins(t, y, scene, mode), offsets.checks, early)
+        code = _blame_margins(code, scene_validity_margins(t + ahead, beyond, scene, mode), offsets.checks, early)
+        code = _blame_margins(code, scene_validity_margins(t, y, scene, mode), offsets.checks, early)
     if scene.constraints:
-        kept = scene_misfit(t, y, scene)[0] <= _KEPT
+        kept = scene_constraint_residual(t, y, scene)[0] <= _KEPT
         code = jnp.where(kept | ~finite, code, DRIFTED)
     eps = float(jnp.finfo(y.q.dtype).eps)
     # A run that stopped in front of a singular mass matrix cannot have come closer than its smallest step.

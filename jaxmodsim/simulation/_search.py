@@ -238,7 +238,7 @@ def _solvers(problem: Problem, options: Options) -> tuple[tuple[dfx.AbstractSolv
     default = default_solver(problem.scene, problem.q0.shape[0], False)
     stiff = any(effect.stiff for effect in problem.scene.effects)
     other = dfx.Kvaerno5() if stiff else dfx.Dopri8()
-    bounds = bool(problem.scene.exact) and problem.dtmax is None
+    bounds = bool(problem.scene.event_driven) and problem.dtmax is None
     if options.solver is None:
         bounded = (other,) if bounds else ()
         return (default, other, *bounded), (0,) if stiff else (0, 1)

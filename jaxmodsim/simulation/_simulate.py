@@ -266,13 +266,13 @@ def _check_slips(scene: Scene, q0: Any, t0: Any) -> None:
             continue
         # Asked first, as the rest takes time.
         if _known(effect.belt_velocity) and np.any(np.asarray(effect.belt_velocity) != 0):
-            effect.check_belt(q0, scene.now(jnp.asarray(t0)).params, scene.names[i])
+            effect.check_belt(q0, scene.bind_time(jnp.asarray(t0)).params, scene.names[i])
 
 
 def _own_states(scene: Scene, q0: Any, z0: dict[str, PyTree], dtype: Any) -> dict[str, PyTree]:
     """Convert and check the initial own states that were given."""
     z0 = as_mapping(z0, name="z0", example="{'friction': 0.0}")
-    states = scene.state0(jnp.asarray(q0, dtype))
+    states = scene.initial_state(jnp.asarray(q0, dtype))
     for name, state in z0.items():
         if name not in states:
             raise ValueError(

@@ -17,11 +17,11 @@ from ..scene import (
     check_scene,
     sample_times,
     scene_drifts,
-    scene_field,
     scene_modes,
-    scene_overload,
     scene_project,
+    scene_stick_violation,
     signals_of,
+    vector_field,
 )
 from ..solvers import (
     EventController,
@@ -36,7 +36,7 @@ from ..solvers import (
     first_step,
     unchecked,
 )
-from ._integrated_system import Flow, Hybrid, Work
+from ._integrated_system import Hybrid, IntegratedSystem, Work
 from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, end_code, start_code
 
 # Part of the absolute tolerance below which a slip velocity counts as none.
@@ -73,7 +73,7 @@ class Problem(NamedTuple):
 
 def initial_state(problem: Problem) -> State:
     """State at t0: effects whose state is not given start at rest."""
-    return State(problem.q0, problem.qd0, problem.scene.state0(problem.q0) | problem.z0)
+    return State(problem.q0, problem.qd0, problem.scene.initial_state(problem.q0) | problem.z0)
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolv
     Jacobian costs more than that, most of all in compile time.
     """
     stiff = any(effect.stiff for effect in scene.effects)
-    return Rodas5P(pivot=fixed_step) if stiff or (scene.exact and dof == 1) else dfx.Tsit5()
+    return Rodas5P(pivot=fixed_step) if stiff or (scene.event_driven and dof == 1) else dfx.Tsit5()
 
 
 def _shortest(problem: Problem) -> Float[Array, ""]:
@@ -144,7 +144,7 @@ def _error_control(problem: Problem, solver: dfx.AbstractSolver) -> dfx.Abstract
     if problem.dt is not None:
         return FiniteSteps()
     (rtol, atol), dtmin = _tolerances(problem), _shortest(problem)
-    p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not problem.scene.exact else _GAINS
+    p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not problem.scene.event_driven else _GAINS
     return dfx.PIDController(rtol, atol, pcoeff=p, icoeff=i, dtmin=dtmin, dtmax=problem.dtmax, force_dtmin=False)
 
 
@@ -155,17 +155,17 @@ def _solver(
     if isinstance(solver, ImplicitFriction):
         solver = ImplicitFriction(hybrid.flow.advance)
     pin = _step_from if signals_of(scene.params) else None
-    if scene.exact:
+    if scene.event_driven:
         return EventSolver(
             solver,
             hybrid.guards,
             hybrid.reset,
-            hold=hybrid.hold if options.hold_chatter else None,
-            project=hybrid.settle if hybrid.projects or hybrid.sticks else None,
-            pin=pin,
-            jumps=sample_times(scene.params, linear=False),
+            on_zeno=hybrid.on_zeno if options.hold_chatter else None,
+            project=hybrid.project_and_stick if hybrid.projects or hybrid.sticks else None,
+            freeze_args=pin,
+            jump_ts=sample_times(scene.params, linear=False),
             rtol=hybrid.tolerances[0],
-            insist=True,
+            enforce=True,
             max_events=options.max_events if log is None else min(log, options.max_events),
             log=log is not None,
         )
@@ -181,7 +181,7 @@ def _step_from(t: Array, scene: Scene) -> Scene:
 def _controller(problem: Problem, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
     controller = _error_control(problem, solver)
     times = sample_times(problem.scene.params, linear=True)
-    if problem.scene.exact:
+    if problem.scene.event_driven:
         return EventController(controller, times, direction=1)
     return controller if times is None else StepsTo(controller, times)
 
@@ -221,19 +221,24 @@ def _prepared(problem: Problem, options: Options, audited: bool) -> tuple[State,
     mode = None
     if projects:
         initial = scene_project(t0, initial, scene)
-    if scene.exact:
+    if scene.event_driven:
         initial, mode = scene_modes(t0, initial, scene, rest)
     canonical = isinstance(options.solver, Gauss)
     atol = None if problem.dt is not None else problem.atol
-    start = start_code(scene, t0, given, scene_field(t0, initial, scene, mode), mode, atol, canonical)
+    start = start_code(scene, t0, given, vector_field(t0, initial, scene, mode), mode, atol, canonical)
     start = jnp.where(_well_posed(problem), start, ILL_POSED)
-    sticks = bool(scene.exact) and scene_drifts(scene)
-    return initial, mode, Hybrid(Flow(audited, canonical), rest, (problem.rtol, problem.atol), projects, sticks), start
+    sticks = bool(scene.event_driven) and scene_drifts(scene)
+    return (
+        initial,
+        mode,
+        Hybrid(IntegratedSystem(audited, canonical), rest, (problem.rtol, problem.atol), projects, sticks),
+        start,
+    )
 
 
 def _integrate(problem: Problem, options: Options, audited: bool, log: int | None) -> tuple[Solved, EventLog | None]:
     """Run diffrax; with modes only where the scene has them, with a log of that many events where one is wanted."""
-    scene, exact = problem.scene, bool(problem.scene.exact)
+    scene, exact = problem.scene, bool(problem.scene.event_driven)
     initial, mode, hybrid, start = _prepared(problem, options, audited)
     method, adjoint = _plugins(problem, options)
     solver = _solver(method, hybrid, scene, options, log)
@@ -246,7 +251,7 @@ def _integrate(problem: Problem, options: Options, audited: bool, log: int | Non
         y0 = solver.start(problem.t0, y0, mode, scene)
 
     def keep_end(t: Any, y: Any, scene: Scene) -> Any:
-        return hybrid.keep(t, y, scene), ((y.events, y.trouble, y.fired), y.log) if exact else None
+        return hybrid.keep(t, y, scene), ((y.events, y.status, y.fired), y.log) if exact else None
 
     def integrate(first: Array, ts: Array | None) -> dfx.Solution:
         end = dfx.SubSaveAt(t1=True, fn=keep_end)
@@ -274,8 +279,8 @@ def _integrate(problem: Problem, options: Options, audited: bool, log: int | Non
     t_end, end_state, ending, history = solution.ts[0][0], last[0] if audited else last, None, None
     stats = {name: solution.stats[name] for name in ("num_steps", "num_rejected_steps")}
     if exact:
-        (count, trouble, fired), history = events
-        ending, stats["num_events"] = Ending(trouble, fired), count
+        (count, status, fired), history = events
+        ending, stats["num_events"] = Ending(status, fired), count
     ended = _ended(problem, t_end, end_state, mode, solution.result, ending)
     t, y, modes, missed = _kept(problem, starts, solution.ts[1], solution.ys[1])
     code = jnp.where(starts, ended, start)
@@ -288,7 +293,7 @@ def _ended(problem: Problem, t: Array, y: State, mode: Any, result: dfx.RESULTS,
     """How the run ended, if it began."""
     span = jnp.maximum(jnp.abs(problem.t0), jnp.abs(problem.t1))
     ahead = float(jnp.finfo(span.dtype).eps) ** 0.5 * span if problem.dt is None else problem.dt
-    rate = scene_field(t, y, problem.scene, mode)
+    rate = vector_field(t, y, problem.scene, mode)
     return end_code(problem.scene, t, y, rate, mode, result, ending, ahead)
 
 
@@ -305,11 +310,11 @@ def _kept(problem: Problem, starts: Array, t: Array, kept: Any) -> tuple[Array, 
     y, modes = jtu.tree_map(
         lambda x: jnp.where(jnp.expand_dims(reached, tuple(range(1, x.ndim))), x, jnp.inf), (y, modes)
     )
-    if not scene.exact:
+    if not scene.event_driven:
         return t, y, modes, jnp.asarray(False)
 
     def beyond(t: Array, y: State, mode: Array) -> Array:
-        return jnp.any(scene_overload(t, y, scene, mode) > _OVERLOAD) & jnp.isfinite(t)
+        return jnp.any(scene_stick_violation(t, y, scene, mode) > _OVERLOAD) & jnp.isfinite(t)
 
     states = y if isinstance(y, State) else y[0]
     return t, y, modes, jnp.any(jax.vmap(beyond)(*jax.lax.stop_gradient((t, states, modes))))

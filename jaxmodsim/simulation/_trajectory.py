@@ -12,10 +12,10 @@ from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..mechanics import momentum
-from ..scene import Reaction, Scene, State, scene_forces, scene_reactions
+from ..scene import ConstraintReaction, Scene, State, scene_forces, scene_reactions
 from ..solvers import EventLog
 from ._accuracy import Accuracy
-from ._energy_ledger import Ledger, event_losses, ledger
+from ._energy_ledger import EnergyLedger, event_losses, ledger
 from ._outcome import Outcome, outcome_messages
 from ._solve import Options, Problem, Solved, solve_logged
 
@@ -114,7 +114,7 @@ class Trajectory:
         return {name: forces[name] for name in self.scene.names}  # compiled functions return them sorted by name
 
     @property
-    def reactions(self) -> dict[str, Reaction]:
+    def reactions(self) -> dict[str, ConstraintReaction]:
         """What each constraint does along the run, by its name: multipliers, generalised and Cartesian force."""
         self._one_run("reactions")
         reactions = _reactions(self.scene, self.t, self._states(), self.modes)
@@ -125,7 +125,7 @@ class Trajectory:
         """Mode of each friction element that runs by events, by effect name, shape `[time]`: 0 in stick, else +-1."""
         if self.modes is None:
             return {}
-        return {name: self.modes[..., i] for i, name in enumerate(self.scene.exact)}
+        return {name: self.modes[..., i] for i, name in enumerate(self.scene.event_driven)}
 
     @property
     def events(self) -> Events:
@@ -155,7 +155,7 @@ class Trajectory:
         return _momentum(self.scene, self.t, self.q, self.qd)
 
     @property
-    def ledger(self) -> Ledger:
+    def ledger(self) -> EnergyLedger:
         """Energies by their places, what each effect brought in and lost; `jaxmodsim.energy_audit` adds them up.
 
         Runs the scene once more, with the work integrals beside it.
@@ -221,14 +221,14 @@ def _forces(scene: Scene, t: Array, y: State, mode: Any) -> dict[str, Array]:
 
 
 @jax.jit
-def _reactions(scene: Scene, t: Array, y: State, mode: Any) -> dict[str, Reaction]:
+def _reactions(scene: Scene, t: Array, y: State, mode: Any) -> dict[str, ConstraintReaction]:
     return _reached(t, jax.vmap(lambda t, y, mode: scene_reactions(t, y, scene, mode))(t, y, mode))
 
 
 @jax.jit
 def _momentum(scene: Scene, t: Array, q: Array, qd: Array) -> Array:
     def at(t: Array, q: Array, qd: Array) -> Array:
-        now = scene.now(t)
+        now = scene.bind_time(t)
         return momentum(now.lagrangian, t, q, qd, now.params)
 
     return _reached(t, jax.vmap(at)(t, q, qd))
@@ -253,7 +253,7 @@ def _reached(t: Array, tree: Any) -> Any:
 def _events(scene: Scene, log: EventLog) -> Events:
     """One entry for each element that changed its mode, from a log with one for each instant."""
     before, after = log.before[1], log.after[1]
-    indices = jnp.asarray([scene.names.index(name) for name in scene.exact])
+    indices = jnp.asarray([scene.names.index(name) for name in scene.event_driven])
     changed = jnp.ravel((before != after) & jnp.isfinite(log.t)[:, None])
     order = jnp.argsort(~changed, stable=True)
 

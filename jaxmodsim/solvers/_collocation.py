@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from .._core.fusion import once, unit_of
+from .._core.fusion import fusion_barrier, opaque_one
 from .._core.lu import MAX_UNROLLED_LU, factor_lu
 from ._state_layout import Layout, Parts, State
 
@@ -210,11 +210,11 @@ def _solve(stages: int, rates: Rates, t0: Array, dt: Array, y: Parts, rest: Part
     error of one sign, and energy would drift. To look only after every second iteration is faster, and is not misled
     where changes of positions and of momenta alternate.
     """
-    method, unit = GAUSS[stages], unit_of(t0)
+    method, unit = GAUSS[stages], opaque_one(t0)
 
     def iterate(search: _Search) -> _Search:
-        before = once(_slopes(method, rates, t0, dt, y, rest, search.slopes), unit)
-        slopes = once(_slopes(method, rates, t0, dt, y, rest, before), unit)
+        before = fusion_barrier(_slopes(method, rates, t0, dt, y, rest, search.slopes), unit)
+        slopes = fusion_barrier(_slopes(method, rates, t0, dt, y, rest, before), unit)
         change, least, settled = [], [], jnp.array(True)
         for m, smallest in enumerate(search.least):
             size = _largest([jnp.abs(new[m] - old[m]) for new, old in zip(slopes, before, strict=True)])

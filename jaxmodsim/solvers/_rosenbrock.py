@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._core.fusion import once, unit_of
+from .._core.fusion import fusion_barrier, opaque_one
 from .._core.lu import LinearSolver, factor_lu, is_zero
 from .._core.scalarise import columns_of
 from ._state_layout import Layout, Parts, State
@@ -74,7 +74,7 @@ def _linearise(flow: Callable[[Array, Parts], Parts], t: Array, parts: Parts, la
     """Field, its time derivative and its Jacobian from one linearisation; what is known of the latter as NumPy's."""
     f0, push = jax.linearize(lambda t, *parts: flow(t, list(parts)), t, *parts)
     if layout.unrolled:
-        f_t, *columns = columns_of(push, unit_of(t), t, *parts)
+        f_t, *columns = columns_of(push, opaque_one(t), t, *parts)
         return f0, f_t, [list(row) for row in zip(*columns, strict=True)]
     f_t = push(jnp.ones_like(t), jnp.zeros_like(parts[0]))
     basis = jnp.eye(layout.n, dtype=layout.dtype)
@@ -137,7 +137,7 @@ def rosenbrock_step(
         if moved:
             point = _add(parts, _combine(tableau.stage[i], stages)) if np.any(tableau.stage[i]) else parts
             # As vectors: every entry of the field would compute its own sum of stages.
-            point = point if layout.unrolled else once(point, unit_of(t0))
+            point = point if layout.unrolled else fusion_barrier(point, opaque_one(t0))
             slope = flow(t0 + float(tableau.nodes[i]) * dt, point)
         rhs = slope
         if np.any(tableau.coupling[i]):

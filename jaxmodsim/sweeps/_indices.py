@@ -137,8 +137,8 @@ def _asked(system: Any, observe: Any, by: str | None) -> tuple[Any, str | None]:
     asked = {name: name for name in ([observe] if isinstance(observe, str) else observe)}
     if isinstance(observe, Mapping):
         asked = dict(observe)
-    if by is None and isinstance(system, Scene) and system.exact:
-        kind = motion_kind(*system.exact)
+    if by is None and isinstance(system, Scene) and system.event_driven:
+        kind = motion_kind(*system.event_driven)
         return asked | {kind.label: kind}, kind.label
     if by is not None and by not in asked:
         raise ValueError(f"by names {by!r}, but what is observed is: {', '.join(asked)}.")

@@ -20,7 +20,7 @@ from jaxmodsim import (
     simulate,
 )
 from jaxmodsim.mechanics import energies, momentum
-from jaxmodsim.scene import State, scene_field, scene_power
+from jaxmodsim.scene import State, scene_power, vector_field
 
 from ..helpers.mechanisms import CASES, case
 
@@ -32,7 +32,7 @@ def unaccounted(scene: Scene, t: Any, y: State, mode: Any) -> tuple[Any, Any]:
     """Rate of kinetic and potential energy less all powers, and the size of what that is a sum of."""
 
     def one(t: Any, y: State, mode: Any) -> tuple[Any, Any]:
-        rate = scene_field(t, y, scene, mode)
+        rate = vector_field(t, y, scene, mode)
 
         def energy(t: Any, q: Any, qd: Any) -> Any:
             return sum(energies(scene.lagrangian, t, q, qd, scene.params))
@@ -84,7 +84,7 @@ def test_power_of_the_other_named_problems(name: str) -> None:
     build, dof, modes = OTHERS[name]
     scene = build()
     q, qd = random_states(dof)
-    z = {key: jnp.full(q.shape[0], 1e-3) for key in scene.state0(q[0])}
+    z = {key: jnp.full(q.shape[0], 1e-3) for key in scene.initial_state(q[0])}
     mode = None if modes is None else jnp.broadcast_to(jnp.asarray(modes), (q.shape[0], len(modes)))
     assert_accounted(scene, q, qd, z, mode)
 

@@ -217,7 +217,7 @@ def test_formulations() -> None:
     )
     found = jms.formulations(scene, width=1e-3, sigma0=1e5, sigma1=3.0)
     assert list(found) == ["Regularized", "DeadZone", "LuGre"]
-    assert not any(other.exact for other in found.values())
+    assert not any(other.event_driven for other in found.values())
     one, two, three = (effect for effect in found["LuGre"].effects if isinstance(effect, jms.Friction))
     assert isinstance(one.law, jms.LuGre)
     assert (float(one.law.Fs), float(one.law.vs), float(one.law.sigma1)) == (1.5, 1e-3, 3.0)

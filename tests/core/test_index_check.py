@@ -213,7 +213,7 @@ def test_seen_inside_transformations(way: Any) -> None:
 def test_no_named_problem_is_refused(name: str) -> None:
     case = named_problems()[name]()
     q, qd = jnp.asarray(case.q0), jnp.asarray(case.qd0)
-    check_scene(case.scene, State(q, qd, case.scene.state0(q)))
+    check_scene(case.scene, State(q, qd, case.scene.initial_state(q)))
 
 
 def test_positions_that_are_called_by_hand() -> None:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmodsim._core.fusion import unit_of
+from jaxmodsim._core.fusion import opaque_one
 from jaxmodsim._core.scalarise import columns_of, in_scalars
 
 TABLE = np.array([[0.0, 1.0, 2.0], [0.0, 0.0, 0.5], [1.0, -1.0, 3.0]])
@@ -177,7 +177,7 @@ def test_columns_of_a_linear_function_know_their_zeros_and_ones() -> None:
 
     def run(*at: Any) -> list[Any]:
         _, push = jax.linearize(field, *at)
-        found.extend(columns_of(push, unit_of(at[0]), *at))
+        found.extend(columns_of(push, opaque_one(at[0]), *at))
         return [[jnp.asarray(x) for x in column] for column in found]
 
     columns = jax.jit(run)(*at)

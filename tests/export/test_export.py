@@ -146,9 +146,9 @@ def test_modelica_tables_follow_the_law(name: str, rtol: float) -> None:
     if isinstance(law, jms.Viscous):
         force = np.asarray(jax.vmap(law.force)(jnp.asarray(v)))
     else:
-        force = np.asarray(jax.vmap(lambda v: law.dry(v) + law.wet(v))(jnp.asarray(v)))
+        force = np.asarray(jax.vmap(lambda v: law.sliding_force(v) + law.viscous_force(v))(jnp.asarray(v)))
         # The limit of stick.
-        np.testing.assert_allclose(peak * rows[0, 1], law.limit(jnp.ones(())), rtol=1e-9)
+        np.testing.assert_allclose(peak * rows[0, 1], law.static_limit(jnp.ones(())), rtol=1e-9)
     assert (np.abs(np.interp(v, *rows.T) - force) <= rtol * force + 1e-300).all()
     # No more rows than it needs: straight laws have two, others some hundreds at most.
     assert len(rows) == 2 if name in ("viscous", "coulomb", "coulomb with stiction") else 2 < len(rows) < 300

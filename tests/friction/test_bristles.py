@@ -96,18 +96,18 @@ def test_armstrong_stiction_comes_back_as_published() -> None:
     law = jms.Armstrong(sigma0=1e8, Fc=1.0, Fs=1.5, vs=1e-3, Fv=0.1, tau=0.01, gamma=0.7)
     z, zero = ArmstrongState(*(jnp.array(0.0),) * 4), jnp.array(0.0)
     for dt in (1e-3, 0.7, 1e4):
-        np.testing.assert_allclose(law.advance(zero, z, jnp.array(dt)).rise, dt / (dt + 0.7), atol=1e-15)
-    half = law.advance(zero, law.advance(zero, z, jnp.array(0.3)), jnp.array(0.4))
+        np.testing.assert_allclose(law.step_exact(zero, z, jnp.array(dt)).rise, dt / (dt + 0.7), atol=1e-15)
+    half = law.step_exact(zero, law.step_exact(zero, z, jnp.array(0.3)), jnp.array(0.4))
     np.testing.assert_allclose(half.rise, 0.5, rtol=1e-14)
-    slope = law.rate(zero, z._replace(rise=jnp.array(0.4))).rise
+    slope = law.zdot(zero, z._replace(rise=jnp.array(0.4))).rise
     np.testing.assert_allclose(slope, 0.6**2 / 0.7, rtol=1e-14)
     # A step that begins in stick and ends in slip: in slip the magnitude stays what the rest made it.
-    at_once = law.advance(jnp.array(5e-3), law.state0(zero), jnp.array(2.0))
+    at_once = law.step_exact(jnp.array(5e-3), law.initial_state(zero), jnp.array(2.0))
     np.testing.assert_allclose(law.force(jnp.array(5e-3), at_once), 1.0 + 0.5 / 26.0 + 0.1 * 5e-3, rtol=1e-4)
     # After a rest of gamma half of the stiction is there, and no more comes back in slow slip.
-    rested = law.advance(zero, z, jnp.array(0.7))
+    rested = law.step_exact(zero, z, jnp.array(0.7))
     for dt in (0.1, 1e3):
-        slow = law.advance(jnp.array(1e-5), rested, jnp.array(dt))
+        slow = law.step_exact(jnp.array(1e-5), rested, jnp.array(dt))
         np.testing.assert_allclose(law.force(jnp.array(1e-5), slow), 1.25, rtol=1e-3)
 
 
@@ -116,8 +116,8 @@ def test_armstrong_friction_lags_by_its_time_constant() -> None:
     law = jms.Armstrong(sigma0=1e6, Fc=1.0, Fs=1.5, vs=1e-2, Fv=0.0, tau=0.02, gamma=1.0)
     t = jnp.linspace(0.0, 0.1, 2001)
     slow, fast = 5e-3, 4e-2
-    settled = law.advance(jnp.array(slow), law.state0(jnp.array(0.0)), jnp.array(1e3))
-    force = jax.vmap(lambda t: law.force(jnp.array(fast), law.advance(jnp.array(fast), settled, t)))(t)
+    settled = law.step_exact(jnp.array(slow), law.initial_state(jnp.array(0.0)), jnp.array(1e3))
+    force = jax.vmap(lambda t: law.force(jnp.array(fast), law.step_exact(jnp.array(fast), settled, t)))(t)
     levels = [1.0 + 0.5 / (1 + (v / 1e-2) ** 2) for v in (slow, fast)]
     np.testing.assert_allclose(force, levels[1] + (levels[0] - levels[1]) * np.exp(-t / 0.02), rtol=2e-3)
 
@@ -179,11 +179,11 @@ def test_slip_in_the_plane_along_a_line_is_slip_on_it(name: str) -> None:
     for v, z, dt in ((0.05, 1e-3, 0.01), (0.4, -5e-4, 0.2)):
         v, z, dt = jnp.array(v), jnp.array(z), jnp.array(dt)
         for direction in (line, other):
-            np.testing.assert_allclose(law.rate(v * direction, z * direction), law.rate(v, z) * direction, rtol=1e-14)
+            np.testing.assert_allclose(law.zdot(v * direction, z * direction), law.zdot(v, z) * direction, rtol=1e-14)
             np.testing.assert_allclose(law.force(v * direction, z * direction), law.force(v, z) * direction, rtol=1e-14)
-            step = law.advance(v * direction, z * direction, dt)
-            np.testing.assert_allclose(step, law.advance(v, z, dt) * direction, rtol=1e-14)
-        np.testing.assert_allclose(law.stored(z * line), law.stored(z), rtol=1e-14)
+            step = law.step_exact(v * direction, z * direction, dt)
+            np.testing.assert_allclose(step, law.step_exact(v, z, dt) * direction, rtol=1e-14)
+        np.testing.assert_allclose(law.stored_energy(z * line), law.stored_energy(z), rtol=1e-14)
 
 
 def disc(law: Any, **friction: Any) -> jms.Scene:

@@ -80,7 +80,7 @@ def look(name: str, drawn: Any) -> dict[str, Any]:
     build, loaded = LAWS[name]
     law = build(*numbers)
     if not isinstance(law, AbstractDynamicLaw):
-        force, back, wet, limit = law.force(v), law.force(-v), law.law.wet(v), limit_of(law)
+        force, back, wet, limit = law.force(v), law.force(-v), law.law.viscous_force(v), limit_of(law)
         return {
             "loss": force * v,
             "scale": 0.0 * v,
@@ -93,8 +93,8 @@ def look(name: str, drawn: Any) -> dict[str, Any]:
         }
     assert loaded is not None
     z = loaded(law, share)
-    rate, force = law.rate(v, z), law.force(v, z)
-    stored = jax.jvp(law.stored, (z,), (rate,))[1]
+    rate, force = law.zdot(v, z), law.force(v, z)
+    stored = jax.jvp(law.stored_energy, (z,), (rate,))[1]
     spring = elastic(law, z, v)
     return {
         "loss": v * force - stored,
@@ -102,7 +102,7 @@ def look(name: str, drawn: Any) -> dict[str, Any]:
         "force": force,
         "back": law.force(-v, mirrored(z)),
         "parts": jnp.abs(spring) + jnp.abs(force - spring),
-        "held": elastic(law, law.advance(v, z, dt), v) / limit_of(law),
+        "held": elastic(law, law.step_exact(v, z, dt), v) / limit_of(law),
         "held_parts": 1.0 + 0.0 * v,
     }
 

@@ -175,14 +175,14 @@ CASES |= {
 
 def settled(law: Any) -> Any:
     """The law at the state of the table."""
-    return law.at(TIME, POSITION, VELOCITY, PARAMS)
+    return law.bind_state(TIME, POSITION, VELOCITY, PARAMS)
 
 
 def force(name: str, law: Any, v: Any, share: Any = 0.5) -> Any:
     """Force of the law of a case; a dynamic one is loaded to `share` of its limit, to the side of the slip."""
     law, case = settled(law), CASES[name]
     if isinstance(law, AbstractSetValuedLaw):
-        return law.dry(v) * jnp.sign(v) + law.wet(v)
+        return law.sliding_force(v) * jnp.sign(v) + law.viscous_force(v)
     if not isinstance(law, AbstractDynamicLaw):
         return law.force(v)
     assert case.loaded is not None

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodsim import Scene, problems
-from jaxmodsim.scene import Reaction, State, scene_field, scene_margins, scene_reactions
+from jaxmodsim.scene import ConstraintReaction, State, scene_reactions, scene_validity_margins, vector_field
 
 SAMPLES = 50
 # Each side is a sum of a few terms, right to some roundings: compare with the largest around.
@@ -40,7 +40,7 @@ class Found(NamedTuple):
     """What the library says at those states."""
 
     qdd: np.ndarray
-    reactions: dict[str, Reaction]
+    reactions: dict[str, ConstraintReaction]
     margins: Any
 
 
@@ -173,7 +173,11 @@ def look(scene: Scene, q: Any, qd: Any, mode: Any) -> Any:
     def one(q: Any, qd: Any, mode: Any) -> Any:
         t, y = jnp.zeros(()), State(q, qd, {})
         reactions = scene_reactions(t, y, scene, mode) if scene.constraints else {}
-        return scene_field(t, y, scene, mode).qd, reactions, scene_margins(t, y, scene, mode) if scene.checks else None
+        return (
+            vector_field(t, y, scene, mode).qd,
+            reactions,
+            scene_validity_margins(t, y, scene, mode) if scene.checks else None,
+        )
 
     return jax.vmap(one)(q, qd, mode)
 

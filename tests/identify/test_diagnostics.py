@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim import asymmetric, damping_sigma1, explicit_step, passive, regularized_width, scaled_by
+from jaxmodsim import asymmetric, check_passivity, damping_sigma1, max_stable_step, regularized_width, scaled_by
 from jaxmodsim.friction import AbstractDynamicLaw, AbstractForceLaw
-from jaxmodsim.scene import State, scene_field
+from jaxmodsim.scene import State, vector_field
 
 # Canudas de Wit, Olsson, Astrom, Lischinsky 1995, and the box on the table.
 SET_1995 = {"sigma0": 1e5, "sigma1": math.sqrt(1e5), "sigma2": 0.4, "Fc": 1.0, "Fs": 1.5, "vs": 1e-3}
@@ -50,25 +50,25 @@ class Unknown(AbstractDynamicLaw):
     inner: AbstractDynamicLaw
     stiff: ClassVar[bool] = True
 
-    def state0(self, v: Any) -> Any:
-        return self.inner.state0(v)
+    def initial_state(self, v: Any) -> Any:
+        return self.inner.initial_state(v)
 
-    def rate(self, v: Any, z: Any) -> Any:
-        return self.inner.rate(v, z)
+    def zdot(self, v: Any, z: Any) -> Any:
+        return self.inner.zdot(v, z)
 
-    def force_at(self, v: Any, z: Any, rate: Any) -> Any:
-        return self.inner.force_at(v, z, rate)
+    def force_given_zdot(self, v: Any, z: Any, rate: Any) -> Any:
+        return self.inner.force_given_zdot(v, z, rate)
 
-    def stored(self, z: Any) -> Any:
-        return self.inner.stored(z)
+    def stored_energy(self, z: Any) -> Any:
+        return self.inner.stored_energy(z)
 
-    def advance(self, v: Any, z: Any, dt: Any) -> Any:
-        return self.inner.advance(v, z, dt)
+    def step_exact(self, v: Any, z: Any, dt: Any) -> Any:
+        return self.inner.step_exact(v, z, dt)
 
 
 @pytest.mark.parametrize("name", BRISTLES)
 def test_conditions_agree_with_the_dissipation_at_sampled_states(name: str) -> None:
-    known, sampled = passive(BRISTLES[name]), passive(Unknown(BRISTLES[name]))
+    known, sampled = check_passivity(BRISTLES[name]), check_passivity(Unknown(BRISTLES[name]))
     assert bool(known) == known.ok == sampled.ok
     assert known.ok == (known.margin >= 0) == math.isinf(known.speed)
     # Samples are never worse than the bound, and near it at the highest speed, where 1/v is left of the dry part.
@@ -82,14 +82,14 @@ def test_conditions_agree_with_the_dissipation_at_sampled_states(name: str) -> N
 
 @pytest.mark.quick
 def test_lugre_by_its_published_condition() -> None:
-    found = passive(BRISTLES["lugre 1995"])
+    found = check_passivity(BRISTLES["lugre 1995"])
     assert not found
     np.testing.assert_allclose(SET_1995["sigma2"] - found.margin, 0.5 * math.sqrt(1e5), rtol=1e-12)
     assert "0.4 against 158.114 N s/m" in str(found)
-    assert passive(BRISTLES["lugre at the limit"]).margin == 0.0
-    assert not passive(jms.LuGre(**{**BOX, "sigma2": 1.999}))
+    assert check_passivity(BRISTLES["lugre at the limit"]).margin == 0.0
+    assert not check_passivity(jms.LuGre(**{**BOX, "sigma2": 1.999}))
     # Fading with vs is passive: the bristle falls back before the speed is high.
-    assert passive(BRISTLES["lugre 1995, vd = vs"]).margin == SET_1995["sigma2"]
+    assert check_passivity(BRISTLES["lugre 1995, vd = vs"]).margin == SET_1995["sigma2"]
 
 
 @pytest.mark.parametrize("vd", [0.03, 1.0])
@@ -98,10 +98,10 @@ def test_fading_damping_needs_what_a_search_over_all_states_finds(vd: float) -> 
     v, z = jnp.geomspace(1e-4, 1e3, 2001), jnp.linspace(0.0, 1.0, 1001) * law.Fs / law.sigma0
 
     def index(v: jax.Array, z: jax.Array) -> jax.Array:
-        return (v * law.force(v, z) - jax.grad(law.stored)(z) * law.rate(v, z)) / (v * v)
+        return (v * law.force(v, z) - jax.grad(law.stored_energy)(z) * law.zdot(v, z)) / (v * v)
 
     least = float(jnp.min(jax.vmap(jax.vmap(index, (None, 0)), (0, None))(v, z)))
-    np.testing.assert_allclose(passive(law).margin, least, rtol=1e-4)
+    np.testing.assert_allclose(check_passivity(law).margin, least, rtol=1e-4)
 
 
 def test_a_jerk_after_slow_loading_draws_energy_where_the_condition_fails() -> None:
@@ -113,7 +113,7 @@ def test_a_jerk_after_slow_loading_draws_energy_where_the_condition_fails() -> N
         dt = length / v / 2000
 
         def step(z: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
-            after = law.advance(v, z, dt)
+            after = law.step_exact(v, z, dt)
             return after, 0.5 * v * dt * (law.force(v, z) + law.force(v, after))
 
         z, works = jax.lax.scan(step, z, None, 2000)
@@ -147,22 +147,22 @@ def test_a_jerk_after_slow_loading_draws_energy_where_the_condition_fails() -> N
     ],
 )
 def test_functions_of_velocity(law: Any, ok: bool, margin: float) -> None:
-    found = passive(law)
+    found = check_passivity(law)
     assert found.ok == ok
     np.testing.assert_allclose(found.margin, margin, rtol=1e-9, atol=1e-15)
 
 
 def test_the_speed_from_which_a_curve_gives_energy() -> None:
     """F/v = v^2 - 0.2 |v| + 0.005 is negative between 0.1 -+ sqrt(0.005)."""
-    found = passive(jms.Curve(lambda v: v * (v * v - 0.2 * jnp.abs(v) + 0.005)))
+    found = check_passivity(jms.Curve(lambda v: v * (v * v - 0.2 * jnp.abs(v) + 0.005)))
     np.testing.assert_allclose(found.speed, 0.1 - math.sqrt(0.005), rtol=1e-6)
     assert "0.1 m/s" in found.condition
 
 
 def test_in_single_precision() -> None:
     law = jax.tree.map(lambda x: x.astype(jnp.float32), jms.LuGre(**BOX))
-    assert passive(law)
-    assert passive(jax.tree.map(lambda x: x.astype(jnp.float32), STRIBECK))
+    assert check_passivity(law)
+    assert check_passivity(jax.tree.map(lambda x: x.astype(jnp.float32), STRIBECK))
 
 
 def test_damping_in_stick_has_the_ratio_asked_for() -> None:
@@ -172,7 +172,7 @@ def test_damping_in_stick_has_the_ratio_asked_for() -> None:
     zero = jnp.zeros(())
 
     def rates(y: jax.Array) -> jax.Array:
-        rate = scene_field(zero, State(jnp.zeros(1), y[:1], {"friction": y[1]}), scene)
+        rate = vector_field(zero, State(jnp.zeros(1), y[:1], {"friction": y[1]}), scene)
         return jnp.concatenate([rate.qd, rate.z["friction"][None]])
 
     eigenvalues = np.linalg.eigvals(np.asarray(jax.jacfwd(rates)(jnp.zeros(2))))
@@ -205,7 +205,7 @@ def test_a_width_for_a_creep_speed(name: str) -> None:
         assert abs(found.creep) < creep
     else:
         np.testing.assert_allclose(abs(found.creep), creep, rtol=1e-9)
-    limit = float(law.limit(jnp.asarray(side)))
+    limit = float(law.static_limit(jnp.asarray(side)))
     np.testing.assert_allclose(found.rate, (limit / found.width + getattr(law, "Fv", 0.0)) / m, rtol=1e-6)
     np.testing.assert_allclose(found.step, 2.0 / found.rate, rtol=1e-6)
     assert f"{found.width:.4g} m/s" in str(found)
@@ -226,18 +226,18 @@ def test_coulomb_creeps_as_the_inverse_of_tanh_says_and_a_run_shows() -> None:
 def test_steps_of_a_bristle_at_a_prescribed_velocity(v: float) -> None:
     """Closed forms: 2 g/(sigma0 |v|) with Euler, 2.785 g/(sigma0 |v|) with RK4."""
     law = jms.LuGre(**SET_1995)
-    unit = float(law.level(jnp.asarray(v))) / (1e5 * abs(v))
+    unit = float(law.stribeck_curve(jnp.asarray(v))) / (1e5 * abs(v))
     for solver, reach in ((None, 2.0), (dfx.Heun(), 2.0), (RK4, 2.785293563405), (dfx.Bosh3(), 2.512745326618)):
-        np.testing.assert_allclose(explicit_step(law, v=v, solver=solver), reach * unit, rtol=1e-9)
+        np.testing.assert_allclose(max_stable_step(law, v=v, solver=solver), reach * unit, rtol=1e-9)
 
 
 def test_steps_below_are_stable_and_steps_above_are_not() -> None:
     """LuGre under a prescribed velocity, by diffrax itself."""
     solver = dfx.Tsit5()
     law, v = jms.LuGre(**SET_1995), jnp.asarray(0.1)
-    h = explicit_step(law, v=0.1, solver=solver)
-    term = dfx.ODETerm(lambda t, z, args: law.rate(v, z))
-    steady = float(law.level(v) / law.sigma0)
+    h = max_stable_step(law, v=0.1, solver=solver)
+    term = dfx.ODETerm(lambda t, z, args: law.zdot(v, z))
+    steady = float(law.stribeck_curve(v) / law.sigma0)
 
     def off(step: float) -> float:
         end = dfx.diffeqsolve(
@@ -252,7 +252,7 @@ def test_steps_below_are_stable_and_steps_above_are_not() -> None:
 def test_steps_of_a_mass_in_stick() -> None:
     """In `simulate`: below the step the vibration dies out, above it grows until the bristle gives way."""
     law, m = jms.LuGre(**{**BOX, "sigma1": 60.0}), 2.0
-    h = explicit_step(law, m, solver=dfx.Heun())
+    h = max_stable_step(law, m, solver=dfx.Heun())
     scene = jms.Scene(lambda t, q, qd, p: 0.5 * p["m"] * qd[0] ** 2, params={"m": m}, effects=(jms.Friction(law),))
     ends = [
         jms.simulate(scene, [0.0], [1e-9], 60.5 * h, dt=factor * h, solver=dfx.Heun()).qd[-1, 0]
@@ -260,15 +260,15 @@ def test_steps_of_a_mass_in_stick() -> None:
     ]
     assert abs(float(ends[0])) < 1e-9 < abs(float(ends[1]))
     # A spring beside it stiffens it, a hundredth of sigma0 by about as much.
-    assert 0.9 * h < explicit_step(law, m, k=7.5, solver=dfx.Heun()) < h
+    assert 0.9 * h < max_stable_step(law, m, k=7.5, solver=dfx.Heun()) < h
 
 
 def test_undamped_vibrations() -> None:
     law = jms.LuGre(**{**BOX, "sigma1": 0.0, "sigma2": 0.0})
-    assert explicit_step(law, 2.0) == explicit_step(law, 2.0, solver=dfx.Heun()) == 0.0
+    assert max_stable_step(law, 2.0) == max_stable_step(law, 2.0, solver=dfx.Heun()) == 0.0
     # With a little damping Euler's method has its step, the damping over the stiffness.
-    assert explicit_step(BRISTLES["armstrong"], 2.0) == pytest.approx(0.2 / 1e4, rel=1e-4)
-    np.testing.assert_allclose(explicit_step(law, 2.0, solver=RK4), math.sqrt(8.0 * 2.0 / 750.0), rtol=1e-6)
+    assert max_stable_step(BRISTLES["armstrong"], 2.0) == pytest.approx(0.2 / 1e4, rel=1e-4)
+    np.testing.assert_allclose(max_stable_step(law, 2.0, solver=RK4), math.sqrt(8.0 * 2.0 / 750.0), rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -286,12 +286,12 @@ def test_every_bristle_has_a_step_that_runs(name: str, v: float) -> None:
     @jax.jit
     def euler(z: Any, step: float, steps: int) -> Any:
         return jax.lax.fori_loop(
-            0, steps, lambda _, z: jax.tree.map(lambda a, b: a + step * b, z, law.rate(speed, z)), z
+            0, steps, lambda _, z: jax.tree.map(lambda a, b: a + step * b, z, law.zdot(speed, z)), z
         )
 
-    h = explicit_step(law, v=v)
+    h = max_stable_step(law, v=v)
     assert 0 < h < math.inf
-    z = euler(law.state0(speed), 0.3 * h, 100_000)
+    z = euler(law.initial_state(speed), 0.3 * h, 100_000)
 
     def off(step: float) -> float:
         """Largest relative deviation of a deflection in the end, from 1e-6 at the beginning."""
@@ -305,9 +305,9 @@ def test_every_bristle_has_a_step_that_runs(name: str, v: float) -> None:
 
 
 def test_functions_of_velocity_have_a_step_and_growing_modes_have_none() -> None:
-    assert explicit_step(jms.Viscous(0.5), 2.0) == pytest.approx(8.0)
-    assert explicit_step(jms.Viscous(0.5), v=1.0) == math.inf
-    assert explicit_step(jms.Curve(lambda v: -v), 2.0) == math.inf
+    assert max_stable_step(jms.Viscous(0.5), 2.0) == pytest.approx(8.0)
+    assert max_stable_step(jms.Viscous(0.5), v=1.0) == math.inf
+    assert max_stable_step(jms.Curve(lambda v: -v), 2.0) == math.inf
 
 
 VARYING: Any = scaled_by(jms.LuGre(**BOX), lambda t, q, qd, p: 2.0)
@@ -323,10 +323,10 @@ class NotFinite(AbstractForceLaw):
 @pytest.mark.parametrize(
     ("call", "text"),
     [
-        (lambda: passive(VARYING), r"ask law.at\(t, q, qd, params\)"),
-        (lambda: explicit_step(VARYING), r"ask law.at\(t, q, qd, params\)"),
-        (lambda: passive(jms.Viscous(1.0), v_max=0.0), "v_max must be finite"),
-        (lambda: passive(NotFinite()), "not finite at v = 1000 m/s"),
+        (lambda: check_passivity(VARYING), r"ask law.at\(t, q, qd, params\)"),
+        (lambda: max_stable_step(VARYING), r"ask law.at\(t, q, qd, params\)"),
+        (lambda: check_passivity(jms.Viscous(1.0), v_max=0.0), "v_max must be finite"),
+        (lambda: check_passivity(NotFinite()), "not finite at v = 1000 m/s"),
         (lambda: damping_sigma1(0.0, 1.0), "m must be finite and > 0"),
         (lambda: damping_sigma1(1.0, 1.0, sigma2=-1.0), "sigma2 must be finite and >= 0"),
         (lambda: damping_sigma1(1.0, 1.0, sigma2=3.0), "alone gives the damping ratio 1.5"),
@@ -334,13 +334,13 @@ class NotFinite(AbstractForceLaw):
         (lambda: regularized_width(jms.Coulomb(1.5), 1e-3, 1.5, 1.0), "below the limit of stick, 1.5 N"),
         (lambda: regularized_width(jms.Coulomb(1.5, 2.5), 1e-3, 2.4, 1.0), "reaches 1.87354 N at most"),
         (lambda: regularized_width(jms.Stribeck(1.5, 1.6, 0.1, 9.0), 1.0, 1.0, 1.0), "any width will do"),
-        (lambda: explicit_step(jms.Coulomb(1.0), 1.0), "the force of Coulomb jumps"),
-        (lambda: explicit_step(jms.Sign(jms.Coulomb(1.0)), 1.0), "the force of Sign jumps"),
-        (lambda: explicit_step(jms.DeadZone(jms.Coulomb(1.0), 0.1), 1.0), "no slope in its band"),
-        (lambda: explicit_step(jms.Viscous(1.0), 1.0, solver=dfx.Kvaerno3()), "explicit Runge-Kutta"),
-        (lambda: explicit_step(jms.Viscous(1.0), 1.0, solver=jms.Rodas5P()), "explicit Runge-Kutta"),
-        (lambda: explicit_step(jms.Viscous(1.0), k=1.0), "with a mass"),
-        (lambda: explicit_step(jms.Viscous(1.0), -1.0), "m > 0"),
+        (lambda: max_stable_step(jms.Coulomb(1.0), 1.0), "the force of Coulomb jumps"),
+        (lambda: max_stable_step(jms.Sign(jms.Coulomb(1.0)), 1.0), "the force of Sign jumps"),
+        (lambda: max_stable_step(jms.DeadZone(jms.Coulomb(1.0), 0.1), 1.0), "no slope in its band"),
+        (lambda: max_stable_step(jms.Viscous(1.0), 1.0, solver=dfx.Kvaerno3()), "explicit Runge-Kutta"),
+        (lambda: max_stable_step(jms.Viscous(1.0), 1.0, solver=jms.Rodas5P()), "explicit Runge-Kutta"),
+        (lambda: max_stable_step(jms.Viscous(1.0), k=1.0), "with a mass"),
+        (lambda: max_stable_step(jms.Viscous(1.0), -1.0), "m > 0"),
     ],
 )
 def test_what_is_refused(call: Any, text: str) -> None:

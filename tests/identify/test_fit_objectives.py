@@ -68,7 +68,7 @@ def record(samples=300, seed=0, late=0.0, linear=(), noise=1.0, start=(0.0, 0.0)
     u = 4.0 * np.sin(2 * np.pi * 0.9 * t + seed) + 2.0 * np.sin(2 * np.pi * 2.3 * t)
     scene = sprung()
     inputs = delayed(jnp.asarray(t), {"u": jnp.asarray(u)}, frozenset(linear), {"delay.u": jnp.asarray(late)})
-    y0 = State(jnp.asarray([start[0]]), jnp.asarray([start[1]]), scene.state0(jnp.zeros(1)))
+    y0 = State(jnp.asarray([start[0]]), jnp.asarray([start[1]]), scene.initial_state(jnp.zeros(1)))
     run = jax.jit(
         lambda inputs: run_samples(
             scene, jnp.asarray(t), inputs, y0, observer(OBSERVED), linear=frozenset(linear), controller=controller
@@ -236,7 +236,7 @@ def test_what_was_known_before_weighs_by_its_deviation(full):
 def test_a_gain_of_a_controller_is_found():
     run = record(controller=Controller(lambda *x: ({}, ()), ()))
     scene = held()
-    y0 = State(jnp.zeros(1), jnp.zeros(1), scene.state0(jnp.zeros(1)))
+    y0 = State(jnp.zeros(1), jnp.zeros(1), scene.initial_state(jnp.zeros(1)))
     loop = Controller(_hold, 0.0)
     x, _ = run_samples(
         scene, jnp.asarray(run.t), {"u": jnp.asarray(run.inputs["u"])}, y0, observer(OBSERVED), controller=loop
@@ -254,7 +254,7 @@ def test_a_law_that_must_be_passive_is():
     scene = jms.Scene(
         _lagrangian, params={"m": 2.0, "k": 20.0, "gain": 1.0, "u": 0.0}, effects=(DRIVE, jms.Friction(law))
     )
-    assert not jms.passive(law).ok
+    assert not jms.check_passivity(law).ok
     result = jms.fit(scene, only_x(record()), ("friction.sigma2", "friction.Fs"), passive=("friction",))
     fitted = result.model.effects[1].law  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
     assert float(fitted.sigma2) >= float(fitted.sigma1 * (fitted.Fs - fitted.Fc) / fitted.Fc) - 1e-12

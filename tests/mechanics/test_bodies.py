@@ -20,7 +20,7 @@ from jaxmodsim import (
     simulate,
 )
 from jaxmodsim.mechanics import acceleration
-from jaxmodsim.scene import State, scene_field, scene_forces, scene_numbers
+from jaxmodsim.scene import State, scene_forces, scene_numbers, vector_field
 
 ZERO = jnp.array(0.0)
 
@@ -45,7 +45,7 @@ def test_a_number_in_params_serves_every_function() -> None:
     scene = Scene(BEAD, params=HELIX)
 
     def turn(scene: Scene) -> Any:
-        return scene_field(ZERO, State(jnp.array([0.4]), jnp.array([1.7]), {}), scene).qd[0]
+        return vector_field(ZERO, State(jnp.array([0.4]), jnp.array([1.7]), {}), scene).qd[0]
 
     R, h, g = HELIX["R"], HELIX["h"], 9.7
     np.testing.assert_allclose(turn(scene), -g * h / (R**2 + h**2), rtol=1e-14)
@@ -90,7 +90,7 @@ def test_friction_of_a_bead_acts_along_the_wire_with_the_true_normal_force() -> 
     np.testing.assert_allclose(effect.slip(ZERO, q, qd, scene.params), 1.7 * s, rtol=1e-14)
     np.testing.assert_allclose(scene_forces(ZERO, State(q, qd, {}), scene)["friction"], 0.3 * normal, rtol=1e-13)
     exact = -9.7 * HELIX["h"] / s**2 - 0.3 * normal / (HELIX["m"] * s)
-    np.testing.assert_allclose(scene_field(ZERO, State(q, qd, {}), scene).qd, [exact], rtol=1e-13)
+    np.testing.assert_allclose(vector_field(ZERO, State(q, qd, {}), scene).qd, [exact], rtol=1e-13)
 
 
 def test_a_bead_sticks_on_a_wire_that_is_not_too_steep() -> None:

@@ -24,7 +24,7 @@ from jaxmodsim import (
     simulate,
 )
 from jaxmodsim._core.semidefinite import solve_semidefinite
-from jaxmodsim.scene import State, scene_field, scene_forces, scene_margins, scene_reactions
+from jaxmodsim.scene import State, scene_forces, scene_reactions, scene_validity_margins, vector_field
 from jaxmodsim.scene._event_driven import _loads
 
 ZERO = jnp.array(0.0)
@@ -61,7 +61,7 @@ def test_pendulum_in_cartesian_coordinates() -> None:
     along, inwards = np.array([np.cos(0.7), np.sin(0.7)]), np.array([-np.sin(0.7), np.cos(0.7)])
     exact = -G * np.sin(0.7) * along + LENGTH * 1.1**2 * inwards
     state = State(q, qd, {})
-    np.testing.assert_allclose(scene_field(ZERO, state, PENDULUM).qd, exact, atol=1e-13)
+    np.testing.assert_allclose(vector_field(ZERO, state, PENDULUM).qd, exact, atol=1e-13)
     tension = 1.3 * (LENGTH * 1.1**2 + G * np.cos(0.7))
     reaction = scene_reactions(ZERO, state, PENDULUM)["rod"]
     np.testing.assert_allclose(reaction.force, tension * inwards, rtol=1e-13)
@@ -74,8 +74,8 @@ def test_redundant_constraints_share_and_leave_the_motion_as_it_is(copies: int) 
     q, qd = hanging(0.7, 1.1)
     again = Scene(BOB, constraints=tuple(Constraint(circle, at=lambda q: q) for _ in range(copies)))
     state = State(q, qd, {})
-    one = scene_field(ZERO, state, PENDULUM).qd
-    np.testing.assert_allclose(scene_field(ZERO, state, again).qd, one, rtol=1e-12)
+    one = vector_field(ZERO, state, PENDULUM).qd
+    np.testing.assert_allclose(vector_field(ZERO, state, again).qd, one, rtol=1e-12)
     parts = [each.force for each in scene_reactions(ZERO, state, again).values()]
     np.testing.assert_allclose(parts[0], parts[-1], rtol=1e-6)
     np.testing.assert_allclose(sum(parts), scene_reactions(ZERO, state, PENDULUM)["rod"].force, rtol=1e-12)
@@ -250,8 +250,8 @@ def test_friction_and_its_load_are_solved_together(mu: float, tilt: float) -> No
     normal = 4.0 / (1.0 - mu * tilt)
     np.testing.assert_allclose(scene_reactions(ZERO, state, scene)["floor"].multiplier, [normal], rtol=1e-13)
     np.testing.assert_allclose(scene_forces(ZERO, state, scene)["friction"], mu * normal, rtol=1e-13)
-    np.testing.assert_allclose(scene_field(ZERO, state, scene).qd, [(3.0 - mu * normal) / 2.0, 0.0], atol=1e-13)
-    margins = scene_margins(ZERO, state, scene)
+    np.testing.assert_allclose(vector_field(ZERO, state, scene).qd, [(3.0 - mu * normal) / 2.0, 0.0], atol=1e-13)
+    margins = scene_validity_margins(ZERO, state, scene)
     assert margins is not None
     np.testing.assert_allclose(margins, [normal, min(1.0, 1.0 - mu * tilt)], rtol=1e-13)
 

@@ -10,7 +10,7 @@ import pytest
 
 from jaxmodsim import AppliedForce, Friction, Scene, Viscous, problems
 from jaxmodsim.mechanics import acceleration, energies, motion_equations
-from jaxmodsim.scene import State, scene_field, scene_forces
+from jaxmodsim.scene import State, scene_forces, vector_field
 
 SAMPLES = 200
 
@@ -24,7 +24,7 @@ def draw(low: float, high: float, *shape: int, seed: int = 11) -> jax.Array:
 
 def assert_equal_motion(scene: Scene, closed: Callable[..., Any], q: Any, qd: Any, t: Any = None) -> None:
     t = jnp.zeros(q.shape[0]) if t is None else t
-    ours = jax.jit(jax.vmap(lambda t, q, qd: scene_field(t, State(q, qd, {}), scene).qd))(t, q, qd)
+    ours = jax.jit(jax.vmap(lambda t, q, qd: vector_field(t, State(q, qd, {}), scene).qd))(t, q, qd)
     exact = np.asarray(jax.vmap(closed)(t, q, qd))
     scale = np.abs(exact).max(axis=1, keepdims=True) + np.abs(np.asarray(qd)).max(axis=1, keepdims=True) ** 2
     assert ours.shape == exact.shape
@@ -180,7 +180,7 @@ def test_friction_along_a_displacement() -> None:
     gradient = np.array([np.cos(0.7) - 0.6, 0.7])
     force = (2.0 * 9.81 - 0.66 + 0.4) * 0.3 * (gradient @ np.array([1.1, 0.2]) - 0.04)
     np.testing.assert_allclose(scene_forces(t, State(q, qd, {}), scene)["friction"], force, rtol=1e-14)
-    np.testing.assert_allclose(scene_field(t, State(q, qd, {}), scene).qd, -force * gradient / 2.0, rtol=1e-14)
+    np.testing.assert_allclose(vector_field(t, State(q, qd, {}), scene).qd, -force * gradient / 2.0, rtol=1e-14)
 
 
 @pytest.mark.parametrize(("load", "expected"), [(-3.0, 0.0), (0.0, 0.0), (2.0, 2.0 * 0.3 * 0.5)])

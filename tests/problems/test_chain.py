@@ -11,7 +11,7 @@ from sympy.physics.mechanics import dynamicsymbols
 
 from jaxmodsim import problems, simulate
 from jaxmodsim.mechanics import energies
-from jaxmodsim.scene import State, scene_field
+from jaxmodsim.scene import State, vector_field
 
 from ..helpers.symbolic import TIME, symbolic_motion
 
@@ -31,7 +31,7 @@ def states(n: int, samples: int = SAMPLES) -> tuple[np.ndarray, np.ndarray]:
 
 def ours(n: int, q: Any, qd: Any) -> np.ndarray:
     scene, zero = problems.n_link_pendulum(n, **numbers(n)), jnp.array(0.0)
-    return np.asarray(jax.jit(jax.vmap(lambda q, qd: scene_field(zero, State(q, qd, {}), scene).qd))(q, qd))
+    return np.asarray(jax.jit(jax.vmap(lambda q, qd: vector_field(zero, State(q, qd, {}), scene).qd))(q, qd))
 
 
 def closed(n: int, q: Any, qd: Any) -> np.ndarray:

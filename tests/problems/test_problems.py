@@ -14,7 +14,7 @@ from sympy.physics.mechanics import dynamicsymbols
 
 from jaxmodsim import problems, simulate
 from jaxmodsim.mechanics import energies
-from jaxmodsim.scene import State, scene_field
+from jaxmodsim.scene import State, vector_field
 
 from ..helpers.mechanisms import (
     ANGLE_RATES,
@@ -175,7 +175,7 @@ def test_each_number_of_the_bead_sits_in_one_place() -> None:
         # The scene is built from its numbers anew, by its own leaves.
         changed = problems.spiral_bead(**params, mu=mu)
         assert jax.tree.structure(changed) == jax.tree.structure(scene)
-        return scene_field(jnp.array(0.0), State(q, qd, {}), changed, mode).qd[0]
+        return vector_field(jnp.array(0.0), State(q, qd, {}), changed, mode).qd[0]
 
     def exact(params: Any, mu: Any) -> Any:
         return problems.spiral_bead_acceleration(q, qd, **params, mu=mu)[0]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxmodsim import AppliedForce, Coulomb, Friction, LuGre, Regularized, Scene, SimulationError, Stribeck, simulate
-from jaxmodsim.scene._event_driven import Contact, balance, next_modes
+from jaxmodsim.scene._event_driven import Contact, next_modes, solve_friction_forces
 from jaxmodsim.validation.hard import Contradictory
 
 
@@ -48,13 +48,13 @@ def choose(found: Contact) -> Any:
 
 @jax.jit
 def forces(found: Contact, modes: Any) -> Any:
-    return jax.vmap(lambda mode: balance(found, mode).force)(modes)
+    return jax.vmap(lambda mode: solve_friction_forces(found, mode).force)(modes)
 
 
 def consistent(found: Contact, modes: np.ndarray) -> np.ndarray:
     """Of sets of modes: stick within limits and without acceleration, slip not accelerated against its direction."""
     force = np.asarray(forces(found, modes))
-    acceleration = np.asarray(found.base) - force @ np.asarray(found.coupling).T
+    acceleration = np.asarray(found.free_slip_acceleration) - force @ np.asarray(found.delassus).T
     held = (np.abs(force) <= np.asarray(found.upper) * (1 + 1e-9)) & (np.abs(acceleration) < 1e-7)
     return np.all(np.where(modes == 0, held, modes * acceleration > -1e-9), axis=1)
 

@@ -26,7 +26,7 @@ from jaxmodsim import (
     simulate,
 )
 from jaxmodsim._core.scalarise import in_scalars
-from jaxmodsim.scene import State, scene_field
+from jaxmodsim.scene import State, vector_field
 
 
 def free(t: Any, q: Any, qd: Any, p: Any) -> Any:
@@ -61,7 +61,7 @@ def test_names_are_given_or_counted() -> None:
         ),
     )
     assert scene.names == ("applied", "friction", "applied_2", "guide", "applied_3", "friction_2")
-    assert set(scene.state0(jnp.zeros(1))) == {"friction_2"}
+    assert set(scene.initial_state(jnp.zeros(1))) == {"friction_2"}
 
 
 def test_a_default_name_gives_way_to_a_given_one() -> None:
@@ -203,7 +203,7 @@ def _count(jaxpr: Any) -> Counter[str]:
 
 
 def state(scene: Scene, dof: int) -> State:
-    return State(jnp.linspace(0.5, 0.9, dof), jnp.linspace(1.0, -1.0, dof), scene.state0(jnp.zeros(dof)))
+    return State(jnp.linspace(0.5, 0.9, dof), jnp.linspace(1.0, -1.0, dof), scene.initial_state(jnp.zeros(dof)))
 
 
 def euler_lagrange(lagrangian: Any, t: Any, q: Any, qd: Any, p: Any) -> Any:
@@ -246,7 +246,7 @@ def test_a_scene_without_effects_traces_to_the_equations_by_hand(name: str) -> N
     scene, dof = MECHANISMS[name]
     scene = eqx.tree_at(lambda s: s.effects, scene, ())
     t, y = jnp.array(0.3), state(scene, dof)
-    ours = primitives(lambda t, y, s: scene_field(t, y, s), t, y, scene)
+    ours = primitives(lambda t, y, s: vector_field(t, y, s), t, y, scene)
     by_hand = primitives(
         lambda t, q, qd, p, fn: euler_lagrange(fn, t, q, qd, p), t, y.q, y.qd, scene.params, scene.lagrangian
     )
@@ -265,7 +265,7 @@ def test_frictionless_pendulum_has_only_the_functions_of_its_closed_form() -> No
     """Sines and cosines of the Lagrangian, the quotients of the elimination; no factorisation, no loop."""
     scene = problems.spherical_pendulum()
     y = state(scene, 2)
-    ours = primitives(lambda t, y, s: scene_field(t, y, s), jnp.array(0.3), y, scene)
+    ours = primitives(lambda t, y, s: vector_field(t, y, s), jnp.array(0.3), y, scene)
     closed = primitives(lambda q, qd: problems.spherical_pendulum_acceleration(q, qd), y.q, y.qd)
     assert {"sin", "cos"} <= set(closed)
     assert set(ours) - set(closed) <= BOOKKEEPING
@@ -290,13 +290,13 @@ def test_an_effect_adds_only_its_own_terms(name: str) -> None:
     effect = EFFECTS[name]
     bare, scene = problems.braked_spring(), eqx.tree_at(lambda s: s.effects, problems.braked_spring(), (effect,))
     t = jnp.array(0.3)
-    without = primitives(lambda t, y, s: scene_field(t, y, s), t, state(bare, 1), bare)
-    with_it = primitives(lambda t, y, s: scene_field(t, y, s), t, state(scene, 1), scene)
+    without = primitives(lambda t, y, s: vector_field(t, y, s), t, state(bare, 1), bare)
+    with_it = primitives(lambda t, y, s: vector_field(t, y, s), t, state(scene, 1), scene)
     q, qd = state(scene, 1)[:2]
-    z = scene.state0(q).get(scene.names[0])
+    z = scene.initial_state(q).get(scene.names[0])
     own = primitives(lambda e, p: effect_action(e, t, q, qd, z, p), effect, scene.params)
     assert with_it == without + own + Counter({"add": 1})
-    assert len(jax.tree.leaves(scene.state0(q))) == (1 if name == "lugre" else 0)
+    assert len(jax.tree.leaves(scene.initial_state(q))) == (1 if name == "lugre" else 0)
     if name == "viscous":
         # Its own terms are the velocity, a product, a sign and the shape; nothing from other laws.
         assert {n for n in own if n not in BOOKKEEPING} == set()
@@ -317,7 +317,7 @@ def test_only_a_dead_zone_brings_the_holding_force() -> None:
             params={"m": 1.0, "R": 1.0, "g": 9.81},
             effects=(Friction(law, along=lambda q: q[1]),),
         )
-        return primitives(lambda t, y, s: scene_field(t, y, s), jnp.array(0.3), state(scene, 2), scene)["gt"]
+        return primitives(lambda t, y, s: vector_field(t, y, s), jnp.array(0.3), state(scene, 2), scene)["gt"]
 
     # Each pivot is compared with zero.
     assert pivots(Sign(Coulomb(1.0))) == 2

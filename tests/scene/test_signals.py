@@ -133,10 +133,10 @@ def test_numbers_of_a_signal() -> None:
     scene = jms.Scene(lagrangian, params={"m": 1, "in": {"u": jms.Signal([0, 1], [2, 3])}}, effects=(coulomb,))
     numbers = scene_numbers(scene)
     assert set(numbers) == {"m", "in.u.values", "friction.Fc", "friction.belt_velocity"}
-    other = replace_numbers(scene, {"in.u.values": jnp.array([5.0, 6.0])}).now(jnp.array(1.0))
+    other = replace_numbers(scene, {"in.u.values": jnp.array([5.0, 6.0])}).bind_time(jnp.array(1.0))
     assert float(other.params["in"]["u"]) == 6.0
     plain = box(1.0)
-    assert plain.now(jnp.array(0.0)) is plain
+    assert plain.bind_time(jnp.array(0.0)) is plain
 
 
 @pytest.mark.parametrize(

@@ -259,7 +259,9 @@ def test_pendulum_loses_torque_times_angle_and_rests_within_the_range() -> None:
 
 def drop(ball: problems.BouncingBall, y0: Any, t1: Any, adjoint: Any = None, **options: Any) -> Any:
     hold, tol = ball.hold if options.pop("hold", False) else None, options.pop("tol", 1e-12)
-    solver = jms.EventSolver(dfx.Tsit5(), ball.guards, ball.reset, hold=hold, max_events=options.pop("max_events", 16))
+    solver = jms.EventSolver(
+        dfx.Tsit5(), ball.guards, ball.reset, on_zeno=hold, max_events=options.pop("max_events", 16)
+    )
     return dfx.diffeqsolve(
         dfx.ODETerm(ball.field),
         solver,
@@ -312,7 +314,7 @@ def test_bouncing_ball_to_the_end_of_all_bounces() -> None:
         ball = problems.BouncingBall(e=e)
         stop = problems.bouncing_ball_rest(h=1.0, e=e)
         solution = drop(ball, ball.dropped(1.0), 1.5 * stop, max_events=128)
-        assert float(solution.ys.trouble[0]) == 1.0
+        assert float(solution.ys.status[0]) == 1.0
         assert solution.result == dfx.RESULTS.dt_min_reached
         np.testing.assert_allclose(solution.ys.t[0], stop, atol=1e-8)
         np.testing.assert_allclose(solution.ts[0], stop, atol=1e-8)
@@ -333,7 +335,7 @@ def test_bouncing_ball_comes_to_rest_where_it_may() -> None:
     resting = np.asarray(ts) > stop
     np.testing.assert_array_equal(solution.ys.mode, resting)
     np.testing.assert_array_equal(solution.ys.y[resting], 0.0)
-    assert float(solution.ys.trouble[-1]) == 0.0
+    assert float(solution.ys.status[-1]) == 0.0
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -346,7 +348,7 @@ def test_no_bouncing_ball_falls_through_the_floor(dtype: str) -> None:
         return drop(ball, ball.dropped(1.0), t1, max_events=256, tol=1e-6).ys
 
     last = jax.jit(jax.vmap(run))(es)
-    np.testing.assert_array_equal(last.trouble[:, 0], 1.0)
+    np.testing.assert_array_equal(last.status[:, 0], 1.0)
     np.testing.assert_allclose(last.y[:, 0, 0], 0.0, atol=1e-8)
     rest = jax.vmap(lambda e: problems.bouncing_ball_rest(h=1.0, e=e))(es.astype(float))
     np.testing.assert_allclose(last.t[:, 0], rest, rtol=1e-4 if dtype == "float32" else 1e-8)

@@ -203,7 +203,7 @@ def stored(found: jms.Trajectory) -> Any:
     if not found.z:
         return 0.0
     (effect,), (z,) = found.scene.effects, found.z.values()
-    return np.asarray(jax.vmap(effect.stored)(z))
+    return np.asarray(jax.vmap(effect.stored_energy)(z))
 
 
 def check_limits(law: str, found: jms.Trajectory, x: Drawn) -> None:

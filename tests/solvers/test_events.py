@@ -46,7 +46,7 @@ def solve(field: Any, guards: Any, reset: Any, y0: Any, t1: Any, **how: Any) -> 
         how.get("solver", dfx.Tsit5()),
         guards,
         reset,
-        insist=how.get("insist", False),
+        enforce=how.get("enforce", False),
         max_events=how.get("max_events", 16),
     )
     start = events.start(how.get("t0", 0.0), y0, how.get("mode"))
@@ -122,7 +122,7 @@ def test_an_event_at_t1_belongs_to_the_run_that_ends_there() -> None:
 
 
 @pytest.mark.parametrize(
-    ("y0", "insist", "events"),
+    ("y0", "enforce", "events"),
     [
         ([0.0, 3.0], False, 0),  # zero and rising: not back within 0.3 s
         ([0.0, 3.0], True, 0),
@@ -131,8 +131,8 @@ def test_an_event_at_t1_belongs_to_the_run_that_ends_there() -> None:
         ([-0.1, 0.0], False, 0),  # violated on entry
     ],
 )
-def test_guards_at_the_start(y0: list[float], insist: bool, events: int) -> None:
-    run = solve(fall, floor, bounce, jnp.array(y0), 0.3, insist=insist)
+def test_guards_at_the_start(y0: list[float], enforce: bool, events: int) -> None:
+    run = solve(fall, floor, bounce, jnp.array(y0), 0.3, enforce=enforce)
     np.testing.assert_array_equal(run.ys.events, [float(events)])
     assert run.result == dfx.RESULTS.successful
     if events:
@@ -141,8 +141,8 @@ def test_guards_at_the_start(y0: list[float], insist: bool, events: int) -> None
 
 def test_a_violated_guard_that_has_to_hold_and_cannot_is_named() -> None:
     """A ball below the floor is not lifted by a bounce."""
-    run = solve(fall, floor, bounce, jnp.array([-0.1, 0.0]), 0.3, insist=True, max_events=64)
-    np.testing.assert_array_equal(run.ys.trouble, [1.0])
+    run = solve(fall, floor, bounce, jnp.array([-0.1, 0.0]), 0.3, enforce=True, max_events=64)
+    np.testing.assert_array_equal(run.ys.status, [1.0])
     assert run.result == dfx.RESULTS.dt_min_reached
 
 
@@ -204,7 +204,7 @@ def test_a_double_crossing_inside_a_step_is_found_if_a_cubic_sees_it() -> None:
 def test_the_limit_of_events_ends_the_run_and_keeps_what_it_has() -> None:
     run = solve(fall, floor, bounce, jnp.array([1.0, 0.0]), 5.0, max_events=3)
     assert run.result == dfx.RESULTS.max_steps_reached
-    np.testing.assert_array_equal(run.ys.trouble, [2.0])
+    np.testing.assert_array_equal(run.ys.status, [2.0])
     # The run ends on the step that landed, within the landing distance; the log has the root.
     np.testing.assert_allclose(run.ts, bounces(4)[-1:], atol=1e-5)
     np.testing.assert_allclose(run.ys.log.t[0], bounces(3), rtol=1e-12)
@@ -303,12 +303,12 @@ def test_batches_with_different_numbers_of_events_do_not_disturb_each_other() ->
         )
         state: Any = solution.ys
         times: Any = solution.ts
-        return state.y[0, 1], (state.trouble[0], times[0])
+        return state.y[0, 1], (state.status[0], times[0])
 
     both = jax.jit(jax.value_and_grad(end, argnums=(0, 1), has_aux=True))
     e, v = jnp.array([0.8, 0.3, 0.5]), jnp.array([0.0, 0.5, -1.0])
-    (value, (trouble, t)), gradient = jax.jit(jax.vmap(both))(e, v)
-    np.testing.assert_array_equal(trouble, [0.0, 1.0, 1.0])
+    (value, (status, t)), gradient = jax.jit(jax.vmap(both))(e, v)
+    np.testing.assert_array_equal(status, [0.0, 1.0, 1.0])
     assert t[0] == 1.7
     assert np.all(np.asarray(t[1:]) < 1.7)
     for i in range(3):

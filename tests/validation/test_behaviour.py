@@ -11,7 +11,7 @@ import pytest
 
 from jaxmodsim import SimulationError, friction
 from jaxmodsim._core.parameters import modules_of
-from jaxmodsim._core.state_dependent import Varying
+from jaxmodsim._core.state_dependent import StateDependent
 from jaxmodsim.cli import _behaviour
 from jaxmodsim.friction import AbstractLaw, Dahl, LuGre
 from jaxmodsim.plot import behaviour_figure
@@ -41,7 +41,7 @@ def test_every_law_and_wrapper_is_on_the_bench():
         parts = [module for _, module in modules_of(specimen.law)]
         shown |= {type(part).__name__ for part in parts}
         shown |= {"asymmetric" for part in parts if hasattr(part, "forward")}
-        shown |= {"scaled_by" for part in parts if isinstance(part, Varying)}
+        shown |= {"scaled_by" for part in parts if isinstance(part, StateDependent)}
         shown |= {fall.__name__ for part in parts if (fall := getattr(part, "fall", None)) is not None}
     public = {name: value for name, value in vars(friction).items() if not name.startswith(("_", "Abstract"))}
     laws = {name for name, value in public.items() if inspect.isclass(value) and issubclass(value, AbstractLaw)}

@@ -9,7 +9,7 @@ from equinox import AbstractVar
 from jaxtyping import Array, Float
 
 from ..._core.parameters import check_ranges, ranges_of
-from ..._core.state_dependent import Varying
+from ..._core.state_dependent import StateDependent
 from .._law import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw
 
 _Law = TypeVar("_Law")
@@ -30,7 +30,7 @@ def other_side(law: Any) -> Any:
 
 
 def _is_varying(x: Any) -> bool:
-    return isinstance(x, Varying)
+    return isinstance(x, StateDependent)
 
 
 class AbstractAsymmetric(AbstractLaw):
@@ -68,17 +68,17 @@ class _AsymmetricSetValued(AbstractAsymmetric, AbstractSetValuedLaw):  # pyright
     forward: AbstractSetValuedLaw
     backward: dict[str, Any]
 
-    def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def sliding_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Magnitude [N] of the dry part in slip."""
-        return _toward(v, self).dry(v)
+        return _toward(v, self).sliding_force(v)
 
-    def wet(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def viscous_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Smooth part [N]."""
-        return _toward(v, self).wet(v)
+        return _toward(v, self).viscous_force(v)
 
-    def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+    def static_limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
         """Largest force in stick [N] against a load towards `direction`."""
-        return _toward(direction, self).limit(direction)
+        return _toward(direction, self).static_limit(direction)
 
 
 class _AsymmetricDynamic(AbstractAsymmetric, AbstractDynamicLaw):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -87,25 +87,25 @@ class _AsymmetricDynamic(AbstractAsymmetric, AbstractDynamicLaw):  # pyright: ig
     forward: AbstractDynamicLaw
     backward: dict[str, Any]
 
-    def state0(self, v: Float[Array, "..."]) -> Any:
+    def initial_state(self, v: Float[Array, "..."]) -> Any:
         """State at rest and unloaded."""
-        return self.forward.state0(v)
+        return self.forward.initial_state(v)
 
-    def rate(self, v: Float[Array, ""], z: Any) -> Any:
+    def zdot(self, v: Float[Array, ""], z: Any) -> Any:
         """Time derivative of the state."""
-        return _toward(v, self).rate(v, z)
+        return _toward(v, self).zdot(v, z)
 
-    def force_at(self, v: Float[Array, ""], z: Any, rate: Any) -> Float[Array, ""]:
+    def force_given_zdot(self, v: Float[Array, ""], z: Any, rate: Any) -> Float[Array, ""]:
         """Friction force [N]."""
-        return _toward(v, self).force_at(v, z, rate)
+        return _toward(v, self).force_given_zdot(v, z, rate)
 
-    def stored(self, z: Any) -> Float[Array, ""]:
+    def stored_energy(self, z: Any) -> Float[Array, ""]:
         """Energy [J] in the state: stiffness is one for both directions."""
-        return self.forward.stored(z)
+        return self.forward.stored_energy(z)
 
-    def advance(self, v: Float[Array, ""], z: Any, dt: Float[Array, ""]) -> Any:
+    def step_exact(self, v: Float[Array, ""], z: Any, dt: Float[Array, ""]) -> Any:
         """State after `dt` [s] at constant velocity."""
-        return _toward(v, self).advance(v, z, dt)
+        return _toward(v, self).step_exact(v, z, dt)
 
 
 _KINDS = (
@@ -174,8 +174,8 @@ def _like(old: Any, number: Any, name: str) -> Any:
 
     - `ValueError` if it is none, or not of the old one's shape.
     """
-    if isinstance(old, Varying):
-        return Varying(_like(old.number, number, name), old.fn)
+    if isinstance(old, StateDependent):
+        return StateDependent(_like(old.number, number, name), old.fn)
     if number is None or jnp.shape(number) != jnp.shape(old):
         given = "None" if number is None else f"the shape {jnp.shape(number)}"
         raise ValueError(f"asymmetric: {name} must have the shape {jnp.shape(old)} for negative slip, but got {given}.")

@@ -10,7 +10,7 @@ import jax
 from ..._core.arguments import as_names
 from ..._core.functions import as_function
 from ..._core.parameters import modules_of, ranges_of
-from ..._core.state_dependent import Varying
+from ..._core.state_dependent import StateDependent
 from .._law import AbstractLaw
 
 _Law = TypeVar("_Law")
@@ -33,7 +33,7 @@ def scaled_by(law: _Law, fn: Any, parameters: Sequence[str] | None = None) -> _L
 
     **Returns:**
 
-    A law of the same kind. It has values only at a state: `law.at(t, q, qd, params)`.
+    A law of the same kind. It has values only at a state: `law.bind_state(t, q, qd, params)`.
 
     **Raises:**
 
@@ -72,17 +72,17 @@ def _vary(module: Any, factor: Callable[..., Any], chosen: list[str]) -> Any:
         if field.name in ranges_of(module):
             if field.name in chosen:
                 names.append(field.name)
-                values.append(Varying(value, factor))
+                values.append(StateDependent(value, factor))
         elif isinstance(value, AbstractLaw):
             names.append(field.name)
             values.append(_vary(value, factor, chosen))
         elif field.name == "backward":  # the numbers of an asymmetric law for negative slip
             names.append(field.name)
-            values.append({n: Varying(x, factor) if n in chosen else x for n, x in value.items()})
+            values.append({n: StateDependent(x, factor) if n in chosen else x for n, x in value.items()})
     if not names:
         return module
     return eqx.tree_at(lambda m: [getattr(m, name) for name in names], module, values, is_leaf=_is_whole)
 
 
 def _is_whole(x: Any) -> bool:
-    return isinstance(x, Varying | dict)
+    return isinstance(x, StateDependent | dict)

@@ -6,11 +6,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..._core.parameters import Number, parameter
-from .._law import AbstractHoldingLaw, AbstractSetValuedLaw
+from .._law import AbstractKarnoppLaw, AbstractSetValuedLaw
 from .._refuse import set_valued_law
 
 
-class DeadZone(AbstractHoldingLaw):
+class DeadZone(AbstractKarnoppLaw):
     """A set-valued law run by Karnopp's rule: velocities up to `width` count as rest.
 
     In the band friction equals the load, up to the limit of stick, so that the velocity keeps its value, which need
@@ -46,10 +46,10 @@ class DeadZone(AbstractHoldingLaw):
         """Whether `v` [m/s] lies in the band, edges included."""
         return jnp.abs(v) <= self.width
 
-    def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+    def static_limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
         """Largest holding force [N]."""
-        return self.law.limit(direction)
+        return self.law.static_limit(direction)
 
     def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Slip force [N] at velocity `v` [m/s]."""
-        return self.law.dry(v) * jnp.sign(v) + self.law.wet(v)
+        return self.law.sliding_force(v) * jnp.sign(v) + self.law.viscous_force(v)

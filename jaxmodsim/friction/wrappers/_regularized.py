@@ -35,9 +35,9 @@ class Regularized(AbstractForceLaw):
     def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Friction force [N] at velocity `v` [m/s]."""
         v = jnp.asarray(v)
-        level, spread = self.law.dry(v), 0.5 * bounded_ratio(v, self.width)
+        level, spread = self.law.sliding_force(v), 0.5 * bounded_ratio(v, self.width)
         direction = jnp.where(v < 0, -1.0, 1.0).astype(v.dtype)
         # At rest, but on the side that v is on: a law may have other parameters for either direction.
         rest = direction * float(jnp.finfo(v.dtype).tiny)
-        excess = self.law.limit(direction) - self.law.dry(rest)
-        return (level + excess * jnp.exp(-spread * spread)) * jnp.tanh(v / self.width) + self.law.wet(v)
+        excess = self.law.static_limit(direction) - self.law.sliding_force(rest)
+        return (level + excess * jnp.exp(-spread * spread)) * jnp.tanh(v / self.width) + self.law.viscous_force(v)

@@ -28,4 +28,4 @@ class Sign(AbstractForceLaw):
 
     def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Friction force [N] at velocity `v` [m/s]; exactly zero at `v = 0`."""
-        return self.law.dry(v) * jnp.sign(v) + self.law.wet(v)
+        return self.law.sliding_force(v) * jnp.sign(v) + self.law.viscous_force(v)

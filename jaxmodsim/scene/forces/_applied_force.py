@@ -11,12 +11,12 @@ from jaxtyping import Array, Float, PyTree
 
 from ..._core.arguments import as_label
 from ..._core.functions import as_function, result_shape
-from ..._core.position import Place, as_place
+from ..._core.position import PositionFn, as_position_fn
 from ._effect import AbstractEffect, Action, Power
 
 
-def _at(value: Any) -> Place | None:
-    return None if value is None else as_place(value, name="AppliedForce at")
+def _at(value: Any) -> PositionFn | None:
+    return None if value is None else as_position_fn(value, name="AppliedForce at")
 
 
 class AppliedForce(AbstractEffect):
@@ -37,7 +37,7 @@ class AppliedForce(AbstractEffect):
     """
 
     fn: Callable[..., Any] = eqx.field(converter=partial(as_function, name="AppliedForce fn"))
-    at: Place | None = eqx.field(default=None, converter=_at)
+    at: PositionFn | None = eqx.field(default=None, converter=_at)
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="AppliedForce name"))
 
     @property
@@ -63,7 +63,7 @@ class AppliedForce(AbstractEffect):
                 " Return jnp.array([...]) with one entry for each."
             )
 
-    def state0(self, q: Float[Array, " dof"], params: PyTree) -> PyTree:
+    def initial_state(self, q: Float[Array, " dof"], params: PyTree) -> PyTree:
         """An applied force has no state."""
         del q, params
         return None
@@ -87,7 +87,7 @@ class AppliedForce(AbstractEffect):
         del t, q, params
         return Power(jnp.sum(action.generalised * qd))
 
-    def stored(self, z: PyTree) -> float:
+    def stored_energy(self, z: PyTree) -> float:
         """Nothing is stored."""
         del z
         return 0.0

@@ -55,7 +55,7 @@ class AbstractEffect(eqx.Module):
         """Check shapes against the mechanism while tracing; raises `ValueError` naming the effect."""
 
     @abc.abstractmethod
-    def state0(self, q: Float[Array, " dof"], params: PyTree) -> PyTree:
+    def initial_state(self, q: Float[Array, " dof"], params: PyTree) -> PyTree:
         """State at rest and unloaded, at the coordinates `q`; None for an effect without one."""
 
     @abc.abstractmethod
@@ -71,5 +71,5 @@ class AbstractEffect(eqx.Module):
         """Power of an action of this effect."""
 
     @abc.abstractmethod
-    def stored(self, z: PyTree) -> Float[Array, ""] | float:
+    def stored_energy(self, z: PyTree) -> Float[Array, ""] | float:
         """Energy [J] held in the own state."""

@@ -14,14 +14,14 @@ from jaxtyping import Array, Float, PyTree
 from ..._core.arguments import as_label
 from ..._core.functions import as_function, result_shape
 from ..._core.parameters import Number, as_number, check_ranges, modules_of, optional_parameter
-from ..._core.position import Place, as_place
+from ..._core.position import PositionFn, as_position_fn
 from ..._core.safe import safe_norm
-from ..._core.state_dependent import Varying, varies
+from ..._core.state_dependent import StateDependent, is_state_dependent
 from ...friction import (
     AbstractAsymmetric,
     AbstractDynamicLaw,
     AbstractForceLaw,
-    AbstractHoldingLaw,
+    AbstractKarnoppLaw,
     AbstractLaw,
     AbstractPlanarLaw,
     AbstractSetValuedLaw,
@@ -42,8 +42,8 @@ def _law(law: Any) -> AbstractLaw:
     )
 
 
-def _along(value: Any) -> Place | None:
-    return None if value is None else as_place(value, name="Friction along")
+def _along(value: Any) -> PositionFn | None:
+    return None if value is None else as_position_fn(value, name="Friction along")
 
 
 def _belt(value: Any) -> Any:
@@ -52,17 +52,17 @@ def _belt(value: Any) -> Any:
     return as_number(value, name="Friction belt_velocity")
 
 
-class Reaction(eqx.Module):
+class ReactionLoad(eqx.Module):
     """The load is the force of the constraint of this name."""
 
     constraint: str = eqx.field(static=True)
 
 
 def _load(value: Any) -> Any:
-    if value is None or isinstance(value, Reaction):
+    if value is None or isinstance(value, ReactionLoad):
         return value
     if isinstance(value, str):
-        return Reaction(value)
+        return ReactionLoad(value)
     if callable(value):
         return as_function(value, name="Friction normal_force")
     return as_number(value, name="Friction normal_force")
@@ -102,9 +102,9 @@ class Friction(AbstractEffect):
     """
 
     law: AbstractLaw = eqx.field(converter=_law)
-    along: Place | None = eqx.field(default=None, converter=_along)
+    along: PositionFn | None = eqx.field(default=None, converter=_along)
     belt_velocity: Number | Callable[..., Any] = eqx.field(default=0.0, converter=_belt)
-    normal_force: Number | Callable[..., Any] | Reaction | None = eqx.field(default=None, converter=_load)
+    normal_force: Number | Callable[..., Any] | ReactionLoad | None = eqx.field(default=None, converter=_load)
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Friction name"))
     ellipse: Number | None = optional_parameter("ellipse", "1", lower=0.0, strict=True)
 
@@ -112,11 +112,13 @@ class Friction(AbstractEffect):
         """Refuse an ellipse out of range."""
         check_ranges(self)
 
-    def at(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree) -> "Friction":
+    def bind_state(
+        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
+    ) -> "Friction":
         """With the law as it is at this state; itself where the law does not depend on that."""
-        if not varies(self.law):
+        if not is_state_dependent(self.law):
             return self
-        return eqx.tree_at(lambda x: x.law, self, self.law.at(t, q, qd, params))
+        return eqx.tree_at(lambda x: x.law, self, self.law.bind_state(t, q, qd, params))
 
     @property
     def default_name(self) -> str:
@@ -129,19 +131,19 @@ class Friction(AbstractEffect):
         return self.law.stiff
 
     @property
-    def holding(self) -> bool:
+    def karnopp(self) -> bool:
         """Whether the law needs to know the other forces (`DeadZone`)."""
-        return isinstance(self.law, AbstractHoldingLaw)
+        return isinstance(self.law, AbstractKarnoppLaw)
 
     @property
-    def exact(self) -> bool:
+    def event_driven(self) -> bool:
         """Whether the law runs by events: its force depends on a mode, and in stick on the other forces."""
         return isinstance(self.law, AbstractSetValuedLaw)
 
     @property
-    def rests_on(self) -> str | None:
+    def load_constraint(self) -> str | None:
         """Name of the constraint whose reaction is the load; None for other loads."""
-        return self.normal_force.constraint if isinstance(self.normal_force, Reaction) else None
+        return self.normal_force.constraint if isinstance(self.normal_force, ReactionLoad) else None
 
     def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
         """Check that displacement, belt velocity and load have the shapes they need."""
@@ -170,8 +172,8 @@ class Friction(AbstractEffect):
                 f"Friction {name!r}: ellipse needs slip that is a vector of two components, but slip has the shape"
                 f" {slip}: return a position of shape (2,) from along."
             )
-        load = None if self.rests_on is not None else self.normal_force
-        factors = [x.fn for _, x in modules_of(self.law) if isinstance(x, Varying)]
+        load = None if self.load_constraint is not None else self.normal_force
+        factors = [x.fn for _, x in modules_of(self.law) if isinstance(x, StateDependent)]
         state = {"t": q[0], "q": q, "qd": qd, "params": params}
         for label, fn, args, wanted in (
             ("belt_velocity(t)", self.belt_velocity, {"t": q[0]}, slip),
@@ -198,12 +200,12 @@ class Friction(AbstractEffect):
                 f" returns one, but {self.belt_velocity} was given."
             )
 
-    def state0(self, q: Float[Array, " dof"], params: PyTree) -> PyTree:
+    def initial_state(self, q: Float[Array, " dof"], params: PyTree) -> PyTree:
         """State of the law; None where it has none."""
         if not isinstance(self.law, AbstractDynamicLaw):
             return None
         slip = () if q.shape == (1,) else self._shape(q, params, self.name or self.default_name)
-        return self.law.state0(jnp.zeros(slip or (), q.dtype))
+        return self.law.initial_state(jnp.zeros(slip or (), q.dtype))
 
     def direction(self, q: Float[Array, " dof"], params: PyTree) -> Float[Array, " dof"]:
         """Gradient d along/dq of a scalar slip: the generalised force of a unit force along the displacement."""
@@ -255,11 +257,11 @@ class Friction(AbstractEffect):
     ) -> Float[Array, ""] | None:
         """Normal load [N], never negative; None where the law's forces are in newtons, or per newton of a reaction."""
         fn = self.normal_force
-        if fn is None or isinstance(fn, Reaction):
+        if fn is None or isinstance(fn, ReactionLoad):
             return None
         return jnp.maximum(jnp.asarray(fn(t, q, qd, params) if callable(fn) else fn), 0.0)
 
-    def push(self, q: Float[Array, " dof"], force: Float[Array, "..."], params: PyTree) -> Float[Array, " dof"]:
+    def apply_force(self, q: Float[Array, " dof"], force: Float[Array, "..."], params: PyTree) -> Float[Array, " dof"]:
         """Generalised force of the friction force `force`."""
         if self.along is None:
             return jnp.reshape(-force, (1,))
@@ -269,10 +271,10 @@ class Friction(AbstractEffect):
         _, pull = jax.vjp(lambda q: along(q, params), q)
         return pull(-force)[0]
 
-    def limit(self, direction: Float[Array, ""], load: Float[Array, ""] | None) -> Float[Array, ""]:
+    def static_limit(self, direction: Float[Array, ""], load: Float[Array, ""] | None) -> Float[Array, ""]:
         """Largest force [N] in stick against a load towards `direction` (+1 or -1)."""
-        assert isinstance(self.law, AbstractSetValuedLaw | AbstractHoldingLaw)
-        limit = self.law.limit(direction)
+        assert isinstance(self.law, AbstractSetValuedLaw | AbstractKarnoppLaw)
+        limit = self.law.static_limit(direction)
         return limit if load is None else load * limit
 
     def slip_force(
@@ -287,25 +289,25 @@ class Friction(AbstractEffect):
         law, speed = self.law, direction * v
         # On the side of the slip even at zero: a law may have other parameters for either direction.
         rest = direction * float(jnp.finfo(v.dtype).tiny)
-        _, slope = jax.jvp(law.dry, (rest,), (direction,))
+        _, slope = jax.jvp(law.sliding_force, (rest,), (direction,))
         slope = jnp.where(jnp.isfinite(slope), slope, 0.0)
-        level = law.dry(direction * jnp.where(speed >= 0, speed, 0.0) + rest)
+        level = law.sliding_force(direction * jnp.where(speed >= 0, speed, 0.0) + rest)
         level = level + slope * jnp.where(speed >= 0, 0.0, speed)
-        force = direction * level + law.wet(v)
+        force = direction * level + law.viscous_force(v)
         return force if load is None else load * force
 
-    def unloaded(
+    def force_per_load(
         self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
     ) -> tuple[Float[Array, "..."], PyTree]:
         """The law's force, in newtons or per newton of load, and the rate of its state."""
         v = self._stretch(self.slip(t, q, qd, params))
         if isinstance(self.law, AbstractDynamicLaw):
-            return self._stretch(self.law.force(v, z)), self.law.rate(v, z)
-        if not isinstance(self.law, AbstractForceLaw | AbstractHoldingLaw):
+            return self._stretch(self.law.force(v, z)), self.law.zdot(v, z)
+        if not isinstance(self.law, AbstractForceLaw | AbstractKarnoppLaw):
             raise TypeError(f"{type(self.law).__name__} acts by a mode, or is of no known kind of law.")
         return self._stretch(_of_slip(self.law.force, v)), None
 
-    def after(
+    def step_exact(
         self, v: Float[Array, "..."], z: PyTree, dt: Float[Array, ""], load: Float[Array, ""] | None
     ) -> tuple[Float[Array, "..."], PyTree]:
         """Friction force over, and state of the law after, the time `dt` [s] at constant slip velocity `v`.
@@ -314,8 +316,8 @@ class Friction(AbstractEffect):
         """
         v = self._stretch(v)
         if isinstance(self.law, AbstractDynamicLaw):
-            after = self.law.advance(v, z, dt)
-            force = self.law.force_at(v, after, _mean_rate(self.law, v, z, after, dt))
+            after = self.law.step_exact(v, z, dt)
+            force = self.law.force_given_zdot(v, after, _mean_rate(self.law, v, z, after, dt))
             z = after
         else:
             assert isinstance(self.law, AbstractForceLaw)
@@ -331,10 +333,10 @@ class Friction(AbstractEffect):
         self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
     ) -> Action:
         """Friction force, its generalised force and the rate of the law's state."""
-        force, rate = self.unloaded(t, q, qd, z, params)
+        force, rate = self.force_per_load(t, q, qd, z, params)
         load = self.load(t, q, qd, params)
         force = force if load is None else load * force
-        return Action(self.push(q, force, params), force, rate)
+        return Action(self.apply_force(q, force, params), force, rate)
 
     def power(
         self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, action: Action
@@ -342,10 +344,10 @@ class Friction(AbstractEffect):
         """The belt brings in -F times its velocity; slip absorbs F times the slip velocity."""
         return Power(-jnp.sum(action.force * self.belt(t)), jnp.sum(action.force * self.slip(t, q, qd, params)))
 
-    def stored(self, z: PyTree) -> Float[Array, ""] | float:
+    def stored_energy(self, z: PyTree) -> Float[Array, ""] | float:
         """Energy [J] in the law's state, for laws in newtons; under a load of its own, or varying, it has none."""
-        if isinstance(self.law, AbstractDynamicLaw) and self.normal_force is None and not varies(self.law):
-            return self.law.stored(z)
+        if isinstance(self.law, AbstractDynamicLaw) and self.normal_force is None and not is_state_dependent(self.law):
+            return self.law.stored_energy(z)
         return 0.0
 
 
@@ -359,7 +361,7 @@ def _mean_rate(law: AbstractDynamicLaw, v: Float[Array, "..."], z: PyTree, after
         quotient = (after - before) / jnp.where(dt == 0, 1.0, dt)
         return jnp.clip(quotient, jnp.minimum(first, last), jnp.maximum(first, last))
 
-    return jtu.tree_map(mean, z, after, law.rate(v, z), law.rate(v, after))
+    return jtu.tree_map(mean, z, after, law.zdot(v, z), law.zdot(v, after))
 
 
 def _of_slip(force: Callable[..., Any], v: Float[Array, "..."]) -> Float[Array, "..."]:

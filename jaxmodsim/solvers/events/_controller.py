@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
-from ..._core.fusion import once, unit_of
+from ..._core.fusion import fusion_barrier, opaque_one
 from ...scene import is_one_of
 from .._controllers import end_at
 from .._equation import check_ode
@@ -150,7 +150,7 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
         passed = keep & (aim < 1.0) & ~landed
         doubtful = keep & ~passed & (factor < 0.9) & (old.doubts < _MAX_DOUBTS)
         accept = keep & ~passed & ~doubtful
-        accept = once(jnp.where(accept, 1.0, jnp.zeros_like(length)), unit_of(length)) > 0.5
+        accept = fusion_barrier(jnp.where(accept, 1.0, jnp.zeros_like(length)), opaque_one(length)) > 0.5
         landed = landed & accept
 
         shortest = jnp.maximum(4.0 * float(jnp.finfo(length.dtype).eps) * jnp.abs(t0), _SHORTEST * length)
@@ -176,8 +176,8 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
             _constant(usual),
             _constant(jnp.where(accept, 0.0, old.doubts + doubtful)),
         )
-        trouble = jnp.where(landed, seen.trouble, 0.0)
+        status = jnp.where(landed, seen.status, 0.0)
         ended = cast(dfx.RESULTS, dfx.RESULTS.where(landed, dfx.RESULTS.successful, result))
-        ended = dfx.RESULTS.where(trouble == ACCUMULATION, dfx.RESULTS.dt_min_reached, ended)
-        ended = dfx.RESULTS.where(trouble == TOO_MANY, dfx.RESULTS.max_steps_reached, ended)
+        ended = dfx.RESULTS.where(status == ACCUMULATION, dfx.RESULTS.dt_min_reached, ended)
+        ended = dfx.RESULTS.where(status == TOO_MANY, dfx.RESULTS.max_steps_reached, ended)
         return accept, next_t0, _constant(next_t1), landed | jump, state, ended

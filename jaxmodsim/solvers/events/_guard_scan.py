@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..._core.fusion import once
+from ..._core.fusion import fusion_barrier
 
 # Refinements of a root. It only says where the next attempt of a step shall end.
 _REFINEMENTS = 4
@@ -86,7 +86,7 @@ def scan_guards(
     c1 = -5.5 * g0 + 9.0 * g1 - 4.5 * g2 + g3
     c2 = 9.0 * g0 - 22.5 * g1 + 18.0 * g2 - 4.5 * g3
     third = g3 - 3.0 * g2 + 3.0 * g1 - g0
-    c1, c2, third = once((c1, c2, third), unit)
+    c1, c2, third = fusion_barrier((c1, c2, third), unit)
     c3 = 4.5 * third
     everything = (*values, middle)
     high, low = reduce(jnp.maximum, everything), reduce(jnp.minimum, everything)
@@ -136,7 +136,7 @@ def scan_guards(
     # Not left of the middle: a function that rises from zero at the start has a root there that is not meant.
     secant = start + (end - start) * jnp.clip(high / jnp.where(high > low, high - low, 1.0), 0.5, 1.0)
     at_once = armed & (g0 <= 0) & (g1 < 0) & (c1 <= 0)
-    root = once(jnp.where(crosses, jnp.where(at_once, 0.0, secant), 1.0), unit)
+    root = fusion_barrier(jnp.where(crosses, jnp.where(at_once, 0.0, secant), 1.0), unit)
     crosses = root < 1.0
 
     falls = c1 + 2.0 * c2 + 3.0 * c3

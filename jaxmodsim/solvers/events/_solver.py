@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ..._core.fusion import once, unit_of
+from ..._core.fusion import fusion_barrier, opaque_one
 from ...scene import is_one_of
 from .._projected import projected
 from ._guard_scan import first_root, scan_guards
-from ._state import ACCUMULATION, NO_TROUBLE, TOO_MANY, EventLog, EventState, write
+from ._state import ACCUMULATION, ONGOING, TOO_MANY, EventLog, EventState, write
 
 # How far beside the root a step may end, as a fraction of the last steps; from there the state is carried to the root,
 # with an error of the third power of that distance.
@@ -112,7 +112,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
       were armed stay so. A guard that the reset has made negative therefore fires at once. In such a chain
       the derivatives take the times of the later events for fixed; a `reset` that settles everything in one
       call is exact.
-    - *With `insist`* all guards are armed at all times: one that is violated at the start fires at once, and one that
+    - *With `enforce`* all guards are armed at all times: one that is violated at the start fires at once, and one that
       its own reset leaves violated fires again and again, until the events accumulate.
     - *Within a step* a guard is the cubic through its values at 0, 1/3, 2/3 (from dense output) and 1. Its value at 1/2
       tells the error of the cubic, and a step in which error or cubic share are not small beside the variation of the
@@ -132,9 +132,9 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     (grazing) has no derivative.
 
     **Where events accumulate** (a ball coming to rest, chatter): if the last intervals between events shrink below 1e-3
-    sqrt(eps) of the time since the start, the run ends with `trouble = 1` in the state and diffrax's result
-    `dt_min_reached`; with `hold`, that function takes the place of `reset` there, and the guards that are not positive
-    after it wait. After `max_events` events the next one ends the run with `trouble = 2` and `max_steps_reached`.
+    sqrt(eps) of the time since the start, the run ends with `status = 1` in the state and diffrax's result
+    `dt_min_reached`; with `on_zeno`, that function takes the place of `reset` there, and guards that are not positive
+    after it wait. After `max_events` events the next one ends the run with `status = 2` and `max_steps_reached`.
 
     **Arguments:**
 
@@ -143,12 +143,12 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
       Or a pair of that and, of the same shape, by how much each guard may be wrong beside `rtol` of its magnitude.
     - `reset`: `reset(t, s, args, fired)` -> `s` with another `y` or `mode` (by `s._replace`); `fired` are booleans,
       shape `[guards]`.
-    - `hold`: as `reset`, for events that accumulate; by default the run ends there.
+    - `on_zeno`: as `reset`, for events that accumulate; by default the run ends there.
     - `project`: `project(t, s, args)` -> `s`, applied after every step, for invariants that drift.
-    - `insist`: whether the guards are conditions that have to hold, not crossings that are to be noted.
-    - `pin`: `pin(t0, args)` -> `args` of a step that begins at t0, without what jumps at its end; the reset at the end
-      of the step gets `args` as they are.
-    - `jumps`: times at which fields and guards jump, increasing, shape `[n]`, among the `times` of the controller.
+    - `enforce`: whether the guards are conditions that have to hold, not crossings that are to be noted.
+    - `freeze_args`: `freeze_args(t0, args)` -> `args` of a step that begins at t0, without what jumps at its end;
+      the reset at the end of the step gets `args` as they are.
+    - `jump_ts`: times at which fields and guards jump, increasing, shape `[n]`, among the `times` of the controller.
       There `reset` is called, with no guard marked, and what it changes of the modes is an event.
     - `rtol`: the part of its largest magnitude in a step by which a guard may fall below zero, and return, unseen.
     - `max_events`: limit of the number of events, > 0, and length of the log.
@@ -171,12 +171,12 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     solver: dfx.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
     guards: Callable[..., Any]
     reset: Callable[..., Any]
-    hold: Callable[..., Any] | None = None
+    on_zeno: Callable[..., Any] | None = None
     project: Callable[..., Any] | None = None
-    pin: Callable[..., Any] | None = None
-    jumps: Float[Array, " n"] | None = None
+    freeze_args: Callable[..., Any] | None = None
+    jump_ts: Float[Array, " n"] | None = None
     rtol: Any = 1e-6
-    insist: bool = eqx.field(default=False, static=True)
+    enforce: bool = eqx.field(default=False, static=True)
     max_events: int = eqx.field(default=128, static=True)
     log: bool = eqx.field(default=True, static=True)
 
@@ -231,7 +231,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
 
             pair = jtu.tree_map(rows, (y0, mode))
             log = EventLog(jnp.full(self.max_events, jnp.inf, zero.dtype), rows(guard), pair, pair)
-        ready = jnp.ones_like(guard) if self.insist else jnp.where(guard > 0, 1.0, jnp.zeros_like(guard))
+        ready = jnp.ones_like(guard) if self.enforce else jnp.where(guard > 0, 1.0, jnp.zeros_like(guard))
         return state._replace(fired=jnp.zeros_like(guard), log=log, guard=guard, armed=ready)
 
     def _guards(self, t: Any, state: EventState, args: PyTree) -> Float[Array, " guards"]:
@@ -259,7 +259,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     ) -> tuple[EventState, PyTree, dict[str, Any], Any, dfx.RESULTS]:
         """A step of the wrapped solver, a look at the guards along it, and the reset where it ends on an event."""
         inner, pace, begin = solver_state
-        whole, args = args, args if self.pin is None else self.pin(t0, args)
+        whole, args = args, args if self.freeze_args is None else self.freeze_args(t0, args)
         y1, error, dense, inner, result = self.solver.step(
             dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0._replace(log=None), args), inner, made_jump
         )
@@ -269,8 +269,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         places = [t0 + (t1 - t0) * part for part in (1 / 3, 1 / 2, 2 / 3)]
         states = [y0._replace(y=y) for y in (*map(path.evaluate, places), y1)]
         looks = [self._guards_and_atol(t, s, args) for t, s in zip((*places, t1), states, strict=True)]
-        unit = unit_of(_constant(t1 - t0))
-        one, middle, two, end = once(_constant([values for values, _ in looks]), unit)
+        unit = opaque_one(_constant(t1 - t0))
+        one, middle, two, end = fusion_barrier(_constant([values for values, _ in looks]), unit)
         # Where limits vanish at one end of the step, the other tells their size.
         tolerances = jnp.asarray(_constant(self.rtol), end.dtype), _constant(jnp.maximum(looks[0][1], looks[-1][1]))
         # Around t0 = 0 the resolution of time is that of the step itself.
@@ -283,14 +283,14 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         measure = jnp.minimum(length, _GROW * pace)
         near = jnp.maximum(_LANDING * jnp.maximum(measure, pace), _constant(resolution))
         beyond = _BEYOND * near / jnp.where(length > 0, length, 1.0)
-        jumps = None if self.jumps is None else is_one_of(self.jumps, t1) & (length > 0)
+        jumps = None if self.jump_ts is None else is_one_of(self.jump_ts, t1) & (length > 0)
         if jumps is not None:  # an event before a jump is not one with it
             near = jnp.where(jumps, _constant(resolution), near)
         near = near / jnp.where(length > 0, length, 1.0)
         shortest = jnp.maximum(_SHORT * pace, 2.0 * _constant(resolution))
         # One that has just fallen through zero may look flat, or rising, to the cubic.
         here = (seen.armed & (jnp.abs(seen.ahead) <= near)) | (seen.crosses & (1.0 - seen.root <= near))
-        if self.insist:  # in front of the root is no motion after the event
+        if self.enforce:  # in front of the root is no motion after the event
             here = (here | (seen.crosses & (length <= _UNPLACED * eps * jnp.abs(t1)))) & (end <= 0)
         # One that fires at the start of the step does so where the step is the shortest.
         here = here | (seen.crosses & (seen.root * length <= resolution) & (length <= shortest))
@@ -302,17 +302,17 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         fired = here & landed
         first = jnp.arange(fired.shape[0]) == jnp.argmin(jnp.where(fired, seen.ahead, jnp.inf))
         aim = jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0))
-        if self.insist:
+        if self.enforce:
             aim = aim + jnp.where(missed, jnp.minimum(beyond, _BEYOND_OF_REST * (1.0 - aim)), beyond)
-        aim = once(aim, unit)
-        landed = once(jnp.where(landed, 1.0, jnp.zeros_like(aim)), unit) > 0.5
+        aim = fusion_barrier(aim, unit)
+        landed = fusion_barrier(jnp.where(landed, 1.0, jnp.zeros_like(aim)), unit) > 0.5
         state1 = y0._replace(
             y=y1,
             guard=end,
             armed=jnp.where(seen.armed, 1.0, jnp.zeros_like(end)),
             landed=jnp.where(landed, 1.0, jnp.zeros_like(aim)),
             next_root=aim,
-            step_factor=once(jnp.min(jnp.where(fired, seen.landing_factor, seen.step_factor)), unit),
+            step_factor=fusion_barrier(jnp.min(jnp.where(fired, seen.landing_factor, seen.step_factor)), unit),
         )
         happens = landed if jumps is None else landed | (jumps & ~missed)
         if jumps is not None:  # what was in sight is no more, and the root of one that fires with a jump is the jump
@@ -343,7 +343,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         event, to second order, so that those of the result are exact.
         """
         (near, begin), (args, whole) = times, sides
-        unit = unit_of(begin)
+        unit = opaque_one(begin)
 
         def field(t: Any, state: EventState, args: PyTree = args) -> PyTree:
             return terms.vf(t, state, args).y
@@ -352,34 +352,34 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             return jnp.sum(jnp.where(first, self._guards(t, state._replace(y=y), args), 0.0))
 
         way, rate, before = _to_root(field, guard, t, state, near)
-        t_event, before = t + way, before._replace(y=once(before.y, unit))
+        t_event, before = t + way, before._replace(y=fusion_barrier(before.y, unit))
         since = jnp.where(state.resets == 0, t_event - state.t, jnp.maximum(t_event - state.t, _FORGET * state.spread))
         spread = _constant(since)
         dense = _accumulates(spread, _constant(t_event), begin) & (state.resets >= _FEWEST)
 
         after = self.reset(t_event, before, whole, fired)
-        trouble = jnp.where(dense, jnp.asarray(ACCUMULATION, spread.dtype), NO_TROUBLE)
-        if self.hold is not None:
-            held = self.hold(t_event, before, whole, fired)
+        status = jnp.where(dense, jnp.asarray(ACCUMULATION, spread.dtype), ONGOING)
+        if self.on_zeno is not None:
+            held = self.on_zeno(t_event, before, whole, fired)
             after = jtu.tree_map(lambda a, b: jnp.where(dense, a, b), held, after)
-            trouble = jnp.zeros_like(spread)
-        after = after._replace(y=once(after.y, unit), mode=once(after.mode, unit))
+            status = jnp.zeros_like(spread)
+        after = after._replace(y=fusion_barrier(after.y, unit), mode=fusion_barrier(after.mode, unit))
         # A reset that changes nothing is no event.
         happened = _differ((before.y, before.mode), (after.y, after.mode))
         events, index = jnp.where(happened, state.events + 1.0, state.events), jnp.where(happened, state.events, -1.0)
-        trouble = jnp.where((trouble == NO_TROUBLE) & (events > self.max_events), TOO_MANY, trouble)
+        status = jnp.where((status == ONGOING) & (events > self.max_events), TOO_MANY, status)
 
         halfway = after._replace(y=_along(after.y, -0.5 * way, field(t_event, after, whole)))
         middle = field(t_event - 0.5 * way, halfway, whole)
-        end = after._replace(y=once(_along(after.y, -way, middle), unit))
+        end = after._replace(y=fusion_barrier(_along(after.y, -way, middle), unit))
         values = self._guards(t, end, whole)
         clear = _constant(values) > jnp.where(fired, _LATITUDE * jnp.abs(rate) * near, 0.0)
-        armed = self.insist | clear | (~fired & (state.armed > 0.5))
-        if not self.insist:  # what rises from the reset will fall again, be it as low as rounding
+        armed = self.enforce | clear | (~fired & (state.armed > 0.5))
+        if not self.enforce:  # what rises from the reset will fall again, be it as low as rounding
             ahead = jnp.ones_like(t_event), field(t_event, after, whole)
             _, rise = jax.jvp(lambda t, y: self._guards(t, after._replace(y=y), whole), (t_event, after.y), ahead)
             armed = armed | (fired & (_constant(rise) > 0))
-        if self.hold is not None:
+        if self.on_zeno is not None:
             armed = jnp.where(dense, values > 0, armed)
         flags = jnp.where(fired, 1.0, jnp.zeros_like(values))
         log = state.log
@@ -391,7 +391,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             mode=end.mode,
             t=t_event,
             events=events,
-            trouble=trouble,
+            status=status,
             fired=flags,
             log=log,
             guard=_constant(values),
@@ -399,7 +399,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             resets=state.resets + 1.0,
             spread=spread,
         )
-        if self.jumps is None:
+        if self.jump_ts is None:
             return after_reset
         # Samples at which nothing happens say nothing of whether events accumulate.
         return jtu.tree_map(

@@ -7,7 +7,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
 # Why events ended a run: they accumulate (Zeno, chatter), or there were more than allowed.
-NO_TROUBLE, ACCUMULATION, TOO_MANY = 0.0, 1.0, 2.0
+ONGOING, ACCUMULATION, TOO_MANY = 0.0, 1.0, 2.0
 
 
 class EventLog(NamedTuple):
@@ -31,7 +31,7 @@ class EventState(NamedTuple):
     - `mode`: what is constant between events.
     - `t`: time of the last event, or of the start.
     - `events`: number of events so far: of resets that changed something.
-    - `trouble`: 0; 1 where events accumulate; 2 where there were more than allowed.
+    - `status`: 0; 1 where events accumulate; 2 where there were more than allowed.
     - `fired`: 1 for each guard that fired in the last event, shape `[guards]`.
     - `log`: an `EventLog`, or None.
 
@@ -45,7 +45,7 @@ class EventState(NamedTuple):
     mode: PyTree
     t: Float[Array, "..."]
     events: Float[Array, "..."]
-    trouble: Float[Array, "..."]
+    status: Float[Array, "..."]
     fired: Float[Array, "*s guards"]
     log: EventLog | None
     guard: Float[Array, "*s guards"]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...friction import AbstractDynamicLaw, AbstractForceLaw, AbstractHoldingLaw, AbstractLaw, AbstractSetValuedLaw
+from ...friction import AbstractDynamicLaw, AbstractForceLaw, AbstractKarnoppLaw, AbstractLaw, AbstractSetValuedLaw
 
 # Samples of every drive: of one length, so that each law is compiled once for all experiments.
 SAMPLES = 8192
@@ -49,31 +49,31 @@ def _respond(law: AbstractLaw, v: Array, dt: Array) -> tuple[Array, Array, Array
     def over(carry: Any, sample: tuple[Array, Array]) -> tuple[Any, tuple[Array, Array, Array]]:
         (t, x, z), (v, dt) = carry, sample
         t, x = t + dt, x + v * dt
-        here = law.at(t, x[None], v[None], {})
+        here = law.bind_state(t, x[None], v[None], {})
         if not isinstance(here, AbstractDynamicLaw):
             force = _slip_force(here, v)
             return (t, x, z), (force, force * v * dt, jnp.zeros_like(v))
-        before, z = here.force(v, z), here.advance(v, z, dt)
+        before, z = here.force(v, z), here.step_exact(v, z, dt)
         after = here.force(v, z)
-        return (t, x, z), (after, 0.5 * (before + after) * v * dt, here.stored(z))
+        return (t, x, z), (after, 0.5 * (before + after) * v * dt, here.stored_energy(z))
 
     rest = jnp.zeros_like(v[0])
-    first = law.at(rest, rest[None], rest[None], {})
-    z = first.state0(rest) if isinstance(first, AbstractDynamicLaw) else None
+    first = law.bind_state(rest, rest[None], rest[None], {})
+    z = first.initial_state(rest) if isinstance(first, AbstractDynamicLaw) else None
     return jax.lax.scan(over, (rest, rest, z), (v, dt))[1]
 
 
 def _slip_force(law: AbstractLaw, v: Float[Array, ""]) -> Float[Array, ""]:
     """Force [N] in slip of a law without a state."""
     if isinstance(law, AbstractSetValuedLaw):
-        return law.dry(v) * jnp.sign(v) + law.wet(v)
-    assert isinstance(law, AbstractForceLaw | AbstractHoldingLaw)
+        return law.sliding_force(v) * jnp.sign(v) + law.viscous_force(v)
+    assert isinstance(law, AbstractForceLaw | AbstractKarnoppLaw)
     return law.force(v)
 
 
 def needs_load(law: AbstractLaw, v: float) -> bool:
     """Whether the force at the slip velocity `v` [m/s] is that of the load, so that no motion by itself gives it."""
-    return isinstance(law, AbstractHoldingLaw) and bool(law.holds(jnp.asarray(v)))
+    return isinstance(law, AbstractKarnoppLaw) and bool(law.holds(jnp.asarray(v)))
 
 
 NEEDS_LOAD = "In its band the force is the load, which a prescribed motion does not say."

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from ..._core.state_dependent import nominal
 from ...friction import (
     AbstractForceLaw,
-    AbstractHoldingLaw,
+    AbstractKarnoppLaw,
     AbstractLaw,
     AbstractSetValuedLaw,
     Armstrong,
@@ -16,7 +16,7 @@ from ...friction import (
     LuGre,
     MaxwellSlip,
     Viscous,
-    passive,
+    check_passivity,
 )
 
 
@@ -40,7 +40,7 @@ class Nature(NamedTuple):
     when: Callable[[Any], bool] = _always
 
 
-_STATELESS = (AbstractForceLaw, AbstractSetValuedLaw, AbstractHoldingLaw)
+_STATELESS = (AbstractForceLaw, AbstractSetValuedLaw, AbstractKarnoppLaw)
 _FLAT = "Without a Stribeck effect friction does not depend on slip velocity but for the viscous part."
 
 
@@ -73,7 +73,7 @@ BY_NATURE: tuple[Nature, ...] = (
         "passivity",
         (LuGre, ElastoPlastic),
         "A constant sigma1 gives energy back unless sigma2 > sigma1 (Fs - Fc)/Fc.",
-        lambda law: not passive(law),
+        lambda law: not check_passivity(law),
     ),
 )
 

@@ -64,7 +64,7 @@ def move(specimen: Specimen, t1: float, *, z0: Any = None, dtmax: float = 1.0, *
     effects = (AppliedForce(_load), Friction(law))
     scene = Scene(_lagrangian, params={"m": MASS} | _QUIET | load, effects=effects)
     if isinstance(law, AbstractDynamicLaw):
-        start = {"friction": law.state0(jnp.zeros(())) if z0 is None else z0}
+        start = {"friction": law.initial_state(jnp.zeros(())) if z0 is None else z0}
     else:
         start = None
     # Heun's method sees the jumps of the laws that need a fixed step twice in a step, and no more often.
@@ -98,14 +98,14 @@ def after_slip(specimen: Specimen) -> Any:
 def _after_slip(law: AbstractDynamicLaw) -> Any:
     """Slide for one second, then go back, and keep the state at which the force at rest is least."""
     rest = jnp.zeros(())
-    here = law.at(rest, rest[None], rest[None], {})
+    here = law.bind_state(rest, rest[None], rest[None], {})
     assert isinstance(here, AbstractDynamicLaw)
     fast, dt = jnp.full_like(rest, 0.1), jnp.full_like(rest, 0.01)
-    slid = jax.lax.fori_loop(0, 100, lambda _, z: here.advance(fast, z, dt), here.state0(rest))
+    slid = jax.lax.fori_loop(0, 100, lambda _, z: here.step_exact(fast, z, dt), here.initial_state(rest))
     slow = -fast * 0.01
 
     def back(z: Any, _: None) -> tuple[Any, tuple[Any, Array]]:
-        z = here.advance(slow, z, _BACK / -slow)
+        z = here.step_exact(slow, z, _BACK / -slow)
         return z, (z, jnp.abs(here.force(rest, z)))
 
     _, (states, forces) = jax.lax.scan(back, slid, None, length=_BACK_SAMPLES)

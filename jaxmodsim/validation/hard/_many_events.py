@@ -54,7 +54,7 @@ def _solve(field: Any, solver: EventSolver, t1: float, start: Any, adjoint: Any)
 def _bounce(e: Array, adjoint: Any, held: bool) -> Answer:
     ball = BouncingBall(e=e, g=jnp.asarray(_G, e.dtype))
     hold = ball.hold if held else None
-    solver = EventSolver(dfx.Tsit5(), ball.guards, ball.reset, hold=hold, max_events=512, log=False)
+    solver = EventSolver(dfx.Tsit5(), ball.guards, ball.reset, on_zeno=hold, max_events=512, log=False)
     start = solver.start(jnp.zeros((), e.dtype), ball.dropped(1.0), mode=jnp.zeros((), e.dtype))
     code, ys = _solve(ball.field, solver, 2.0, start, adjoint)
     return Answer(code, ys.t[-1])
@@ -140,15 +140,15 @@ class Contradictory(AbstractSetValuedLaw):
 
     stiff: ClassVar[bool] = False
 
-    def dry(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def sliding_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Friction in slip [N]."""
         return jnp.full_like(v, 2.0)
 
-    def wet(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def viscous_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """No viscous part."""
         return jnp.zeros_like(v)
 
-    def limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+    def static_limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
         """Largest force in stick [N]."""
         return jnp.ones_like(direction)
 

@@ -10,7 +10,7 @@ import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
 
-from ...friction import AbstractLaw, LuGre, Regularized, Viscous, explicit_step
+from ...friction import AbstractLaw, LuGre, Regularized, Viscous, max_stable_step
 from ...problems import box_coulomb, ramped_box, slipping_bristle
 from ...scene import Scene
 from ...simulation import simulate
@@ -36,7 +36,7 @@ class Formulation:
     """A law in the state at which it is the stiffest, disturbed a little.
 
     - `scene`, `z0`, `qd0`: the motion.
-    - `law`, `m`, `v`: for `explicit_step`.
+    - `law`, `m`, `v`: for `max_stable_step`.
     - `off`: how far from rest a run ended, relative to the disturbance.
     """
 
@@ -111,8 +111,8 @@ IMPLICIT = {"Rodas5P": Rodas5P(pivot=True), "ImplicitFriction": ImplicitFriction
 
 
 def theory(formulation: Formulation, solver: Any) -> float:
-    """Largest stable step [s] by `explicit_step`: the stability function at the eigenvalues."""
-    return explicit_step(formulation.law, formulation.m, v=formulation.v, solver=solver)
+    """Largest stable step [s] by `max_stable_step`: the stability function at the eigenvalues."""
+    return max_stable_step(formulation.law, formulation.m, v=formulation.v, solver=solver)
 
 
 def grows(formulation: Formulation, solver: Any, h: float) -> bool:
