@@ -326,7 +326,7 @@ def scipy_legs(task: Belt, method: str) -> Peer:
             guard.terminal, guard.direction = True, direction
         t, y, sticks = 0.0, (0.0, vb), True
         while True:
-            ends = {"events": guards[sticks], "rtol": rtol, "atol": task.atol * rtol}
+            ends: dict[str, Any] = {"events": guards[sticks], "rtol": rtol, "atol": task.atol * rtol}
             done = solve_ivp(fields[sticks], (t, task.t1), y, method, **ends)
             if not done.success:
                 raise RuntimeError(done.message)

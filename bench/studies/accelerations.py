@@ -129,9 +129,10 @@ def _euler(fn: Any, count: int, q: Any, qd: Any, chain: jms.Scene) -> Any:
 
 def _mujoco(n: int, q: np.ndarray, qd: np.ndarray, single: int) -> Made:
     """Nested bodies on hinges, without contacts and constraints; its angles are those from link to link."""
-    import mujoco
+    import mujoco as engine
     from mujoco.rollout import Rollout
 
+    mujoco: Any = engine  # its names are made at run time
     p, bodies = chain_numbers(n), ""
     for i in range(n):
         above = 0.0 if i == 0 else p["l"][i - 1]

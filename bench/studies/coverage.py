@@ -28,8 +28,7 @@ def main(smoke: bool, out: Path) -> Result:
     free = tuple(f"friction.{name}" for name in ("sigma0", "sigma1", "sigma2", "Fc", "Fs", "vs"))
     fitted = jms.fit(sprung(*WRONG), driven_record(), free, q0=[0.0], begin=Staged())
     result = Result("coverage", (), {"repeats": repeats})
-    memories = {"white": 0.0, "correlation 0.9 from sample to sample": 0.9}
-    for label, memory in list(memories.items())[: 1 if smoke else 2]:
+    for label, memory in (("white", 0.0), ("correlation 0.9 from sample to sample", 0.9))[: 1 if smoke else 2]:
         started = time.perf_counter()
         found = coverage(fitted, repeats, memory=memory, begin=Staged())
         result.add("time", time.perf_counter() - started, "s", case=label)

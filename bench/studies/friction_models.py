@@ -2,7 +2,6 @@
 
 import math
 from pathlib import Path
-from typing import Any
 
 from bench.record import Result
 from jaxmodsim.cli._testbench import cases, run_case
@@ -14,7 +13,7 @@ def main(smoke: bool, out: Path) -> Result:
     result = Result("friction_models", ("diffrax",))
     for case in cases()[: 1 if smoke else None]:
         found = run_case(case)
-        about: dict[str, Any] = {"case": case.part, "peer": case.label}
+        about = {"case": case.part, "peer": case.label}
         result.add("break-away", None if math.isnan(found.break_away) else found.break_away, "s", **about)
         result.add("zero crossings", found.crossings, **about)
         result.add("steps", found.steps, **about)
