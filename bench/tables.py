@@ -76,7 +76,7 @@ def _accelerations(r: Recorded) -> list[tuple[str, str, float]]:
 
 
 def _sweep(r: Recorded) -> list[tuple[str, str, float]]:
-    ours, kills, count = r.number("run", at=SWEEP), r.settings["kills"], r.settings["many"]
+    ours, kills, count = r.number("run", at=SWEEP), r.settings.get("kills", 0), r.settings["many"]
     processes = next(iter(r.all_of("run", "at", peer=CVODES)), "")
     return [
         ("against CVODES on all cores", ">= 60", r.number("run", peer=CVODES, at=processes) / ours),

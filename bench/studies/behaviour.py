@@ -7,8 +7,6 @@ from bench.record import Result
 from jaxmodsim.plot import behaviour_figure
 from jaxmodsim.validation.behaviour import EXPERIMENTS, run_bench, specimens
 
-# The figures that docs/laws.md shows.
-SHOWN = ("memory", "creep")
 WORDS = {"pass": "yes", "by nature": "**no**", "n/a": "-", "FAIL": "FAILS"}
 
 
@@ -24,7 +22,7 @@ def main(smoke: bool, out: Path) -> Result:
         result.add("number", each.quantity, case=each.name)
         result.add("unit", each.unit, case=each.name)
         result.add("limit", f"{'<=' if each.limit.at_most else '>='} {each.limit.value:g}", case=each.name)
-    for name in SHOWN:
+    for name in ("memory", "creep"):  # those that docs/laws.md shows
         figure = behaviour_figure(EXPERIMENTS[name], {law: of[name] for law, of in outcomes.items()})
         save(figure, out / f"behaviour_{name}.png", dpi=90)
     return result

@@ -46,7 +46,7 @@ def main(smoke: bool, out: Path) -> Result | None:
         result.settings["seconds"] = round(time.perf_counter() - started)
         report = json.loads((Path(folder) / "fit.json").read_text())
     if smoke:
-        result.add("RMSE with 5 steps", _rmse(record, "coulomb", report["parameters"], 2), "m", peer="coulomb")
+        result.add("RMSE with 5 steps a sample", _rmse(record, "coulomb", report["parameters"], 2), "m", peer="coulomb")
         return result
     for each in report["comparison"]["models"]:
         name = each["name"]
