@@ -34,11 +34,13 @@ ROOMS = (
 )
 NEEDED_TO_SIMULATE = set(ROOMS[: ROOMS.index("simulation") + 1])
 # Folders of a room with public names of their own.
-PARTS = ("validation.behaviour", "validation.hard")
+PARTS = ("validation.behaviour", "validation.hard", "validation.testbench")
 
 MAX_FILE_LINES = 500
 MAX_FUNCTION_LINES = 80
 LONG_FUNCTIONS: dict[str, str] = {}  # "file:function" -> reason
+# Classes that wait for a name of their own.
+NAMED_TWICE = {"Motion"}
 
 
 def room_of(path: Path) -> str:
@@ -164,6 +166,17 @@ def test_classes_are_abstract_or_final() -> None:
         if base in bases and not base.lstrip("_").startswith("Abstract")
     }
     assert not derived, f"derived from a concrete class: {derived}"
+
+
+def test_a_class_has_one_meaning() -> None:
+    """No two classes have one name, private ones included."""
+    files: dict[str, set[str]] = {}
+    for path in FILES:
+        for node in statements(path, (ast.ClassDef,)):
+            assert isinstance(node, ast.ClassDef)
+            files.setdefault(node.name.lstrip("_"), set()).add(str(path.relative_to(ROOT)))
+    twice = {name: where for name, where in files.items() if len(where) > 1 and name not in NAMED_TWICE}
+    assert not twice, f"classes of one name: {twice}"
 
 
 def test_the_rules_can_be_broken(tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
 """Arguments that are no numbers of a scene: converted, or refused by their name."""
 
+import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 
-def check_real(value: Any, *, name: str) -> None:
+def check_real(value: object, *, name: str) -> None:
     """Refuse what holds anything but real numbers.
 
     **Raises:**
@@ -27,7 +28,7 @@ def check_real(value: Any, *, name: str) -> None:
         raise ValueError(f"{name} must hold real numbers, but {value!r} was given.")
 
 
-def as_reals(value: Any, *, name: str) -> Float[np.ndarray, "..."]:
+def as_reals(value: object, *, name: str) -> Float[np.ndarray, "..."]:
     """Real numbers that are known, as an array of NumPy.
 
     **Raises:**
@@ -38,7 +39,7 @@ def as_reals(value: Any, *, name: str) -> Float[np.ndarray, "..."]:
     return np.asarray(value, float)
 
 
-def as_float(value: Any, *, name: str, lower: float | None = None) -> float:
+def as_float(value: object, *, name: str, lower: float | None = None) -> float:
     """One finite number that is known, above `lower`.
 
     **Raises:**
@@ -52,7 +53,7 @@ def as_float(value: Any, *, name: str, lower: float | None = None) -> float:
     return float(array)
 
 
-def as_whole(value: Any, *, name: str, least: int = 1) -> int:
+def as_whole(value: object, *, name: str, least: int = 1) -> int:
     """A whole number, `least` or more, that fits into 63 bits.
 
     **Raises:**
@@ -66,7 +67,7 @@ def as_whole(value: Any, *, name: str, least: int = 1) -> int:
     return int(value)
 
 
-def as_flag(value: Any, *, name: str) -> bool:
+def as_flag(value: object, *, name: str) -> bool:
     """True or False, no number that stands for it.
 
     **Raises:**
@@ -78,7 +79,7 @@ def as_flag(value: Any, *, name: str) -> bool:
     return bool(value)
 
 
-def as_label(value: Any, *, name: str) -> str | None:
+def as_label(value: object, *, name: str) -> str | None:
     """A text that is not empty, or None.
 
     **Raises:**
@@ -90,7 +91,7 @@ def as_label(value: Any, *, name: str) -> str | None:
     return value
 
 
-def as_names(value: Any, *, name: str) -> tuple[str, ...]:
+def as_names(value: object, *, name: str) -> tuple[str, ...]:
     """Names in a list, a tuple or a set.
 
     **Raises:**
@@ -102,7 +103,7 @@ def as_names(value: Any, *, name: str) -> tuple[str, ...]:
     return tuple(value)
 
 
-def as_mapping(value: Any, *, name: str, example: str) -> dict[str, Any]:
+def as_mapping(value: object, *, name: str, example: str) -> dict[str, Any]:
     """A mapping by names; None is an empty one.
 
     **Raises:**
@@ -114,3 +115,15 @@ def as_mapping(value: Any, *, name: str, example: str) -> dict[str, Any]:
     if not isinstance(value, Mapping) or not all(isinstance(each, str) for each in value):
         raise ValueError(f"{name} must be a mapping by names, as in {example}, but {value!r} was given.")
     return dict(value)
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """The known name that is most like this one; None where none is."""
+    found = difflib.get_close_matches(name, list(known), n=1)
+    return found[0] if found else None
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """A question whether the nearest of the known names was meant, to end a sentence with; "" where none is near."""
+    near = nearest(name, known)
+    return f" Did you mean {near!r}?" if near else ""

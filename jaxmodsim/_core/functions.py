@@ -4,9 +4,10 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .arguments import check_real
 from .index_check import traced
@@ -17,12 +18,12 @@ class Function(eqx.Module):
 
     fn: Callable[..., Any] = eqx.field(static=True)
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: object) -> Any:
         """Call the function."""
         return self.fn(*args)
 
 
-def result_shape(fn: Callable[..., Any], *, name: str, **args: Any) -> tuple[int, ...] | None:
+def result_shape(fn: Callable[..., object], *, name: str, **args: object) -> tuple[int, ...] | None:
     """Shape of what `fn(*args.values())` returns, or None where that is not one array.
 
     **Raises:**
@@ -32,7 +33,7 @@ def result_shape(fn: Callable[..., Any], *, name: str, **args: Any) -> tuple[int
     """
     shapes: list[tuple[int, ...] | None] = []
 
-    def look(*args: Any) -> None:
+    def look(*args: object) -> None:
         value = fn(*args)
         for leaf in jtu.tree_leaves(value):
             check_real(leaf, name=f"What {name} returns")
@@ -42,7 +43,7 @@ def result_shape(fn: Callable[..., Any], *, name: str, **args: Any) -> tuple[int
     return shapes[0]
 
 
-def real_array(value: Any, *, name: str) -> Array:
+def real_array(value: object, *, name: str) -> Array:
     """What a function has returned, as an array; lists of numbers become one.
 
     **Raises:**
@@ -57,7 +58,7 @@ def real_array(value: Any, *, name: str) -> Array:
         raise ValueError(f"What {name} returns must be an array of real numbers, but it is {value!r}.") from error
 
 
-def as_function(value: Any, *, name: str) -> Callable[..., Any]:
+def as_function(value: object, *, name: str) -> Callable[..., Any]:
     """Make a callable fit to sit in a pytree: an `eqx.Module` stays what it is, anything else is wrapped.
 
     **Raises:**
@@ -68,3 +69,13 @@ def as_function(value: Any, *, name: str) -> Callable[..., Any]:
         raise ValueError(f"{name} must be a function, but {value!r} was given.")
     fn: Callable[..., Any] = value
     return fn if isinstance(value, eqx.Module) else Function(fn)
+
+
+def depends_on(fn: Callable[[Array], Array], x: Float[Array, "..."]) -> bool:
+    """Whether anything that `fn` returns is computed from `x`, be it by a product with zero."""
+    traced = jax.make_jaxpr(fn)(x).jaxpr
+    reached = set(traced.invars)
+    for equation in traced.eqns:
+        if any(var in reached for var in equation.invars if not hasattr(var, "val")):
+            reached.update(equation.outvars)
+    return any(var in reached for var in traced.outvars if not hasattr(var, "val"))

@@ -18,7 +18,7 @@ _Known: TypeAlias = np.ndarray | str | None
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call"}
 
 
-def traced(fn: Callable[..., Any], *, name: str, **args: Any) -> Any:
+def traced(fn: Callable[..., object], *, name: str, **args: object) -> Any:
     """Shapes and types of what a function returns, from one trace that also looks at its indices.
 
     An index is seen where it is known while tracing: a number, or an array of numbers. Passed over are indices that
@@ -45,7 +45,7 @@ def traced(fn: Callable[..., Any], *, name: str, **args: Any) -> Any:
     return shapes
 
 
-def check_indices(fn: Callable[..., Any], *args: Any, name: str) -> None:
+def check_indices(fn: Callable[..., object], *args: object, name: str) -> None:
     """As `traced`, for a function that need not be traceable: one that is not is passed over.
 
     **Raises:**
@@ -114,7 +114,7 @@ def _follow(closed: Any, inputs: Sequence[_Known], name: str) -> list[_Known]:
     known: dict[Any, _Known] = dict(zip(jaxpr.invars, inputs, strict=True))
     known.update(zip(jaxpr.constvars, map(_constant, consts), strict=False))
 
-    def read(x: Any) -> _Known:
+    def read(x: object) -> _Known:
         return _constant(x.val) if isinstance(x, Literal) else known.get(x)
 
     for eqn in jaxpr.eqns:
@@ -135,7 +135,7 @@ def _follow(closed: Any, inputs: Sequence[_Known], name: str) -> list[_Known]:
     return [read(x) for x in jaxpr.outvars]
 
 
-def _constant(value: Any) -> np.ndarray | None:
+def _constant(value: object) -> np.ndarray | None:
     """Integers and booleans that are known."""
     if isinstance(value, jax.core.Tracer):
         return None
@@ -202,20 +202,22 @@ def _access(eqn: JaxprEqn, given: list[_Known]) -> _Access | None:
     )
 
 
-def _broadcast(x: np.ndarray, *, shape: tuple[int, ...], broadcast_dimensions: tuple[int, ...], **_: Any) -> np.ndarray:
+def _broadcast(
+    x: np.ndarray, *, shape: tuple[int, ...], broadcast_dimensions: tuple[int, ...], **_: object
+) -> np.ndarray:
     sizes = [1] * len(shape)
     for axis, size in zip(broadcast_dimensions, x.shape, strict=True):
         sizes[axis] = size
     return np.broadcast_to(x.reshape(sizes), shape)
 
 
-def _iota(*, shape: tuple[int, ...], dimension: int, **_: Any) -> np.ndarray:
+def _iota(*, shape: tuple[int, ...], dimension: int, **_: object) -> np.ndarray:
     return np.broadcast_to(
         np.arange(shape[dimension]).reshape([-1 if i == dimension else 1 for i in range(len(shape))]), shape
     )
 
 
-def _elementwise(fn: Callable[..., Any]) -> Callable[..., Any]:
+def _elementwise(fn: Callable[..., object]) -> Callable[..., Any]:
     return lambda *values, **_: fn(*values)
 
 

@@ -28,7 +28,7 @@ class _Pattern(NamedTuple):
         pattern = cls(tuple(tuple(x if is_known(x) else None for x in row) for row in rows))
         return pattern, [x for row in rows for x in row if not is_known(x)]
 
-    def fill(self, unknown: list[Array], known: Any = None) -> _Rows:
+    def fill(self, unknown: list[Array], known: object = None) -> _Rows:
         """The matrix again; with the known entries in it replaced by another number, if one is given."""
         left = iter(unknown)
         return [[next(left) if x is None else x if known is None else known for x in row] for row in self.rows]
@@ -43,12 +43,12 @@ class _Shape(NamedTuple):
     pairs: tuple[tuple[int, int], ...]
 
 
-def is_known(x: Any) -> bool:
+def is_known(x: object) -> bool:
     """Whether a number is known while tracing."""
     return isinstance(x, np.generic)
 
 
-def is_zero(x: Any) -> bool:
+def is_zero(x: object) -> bool:
     """Whether a number is known to be zero while tracing."""
     return is_known(x) and bool(x == 0)
 

@@ -189,7 +189,7 @@ def _solve_one(fn: Callable[[Array], Array], free: Array, coupling: Array, block
     return Monotone((side * root.x)[None], root.solved, root.evaluations)
 
 
-class _Search(NamedTuple):
+class _RootIterate(NamedTuple):
     x: Array
     # With `x = free - A push` but for rounding.
     push: Array
@@ -206,7 +206,7 @@ def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, b
     """
     eps = float(jnp.finfo(free.dtype).eps)
 
-    def iterate(s: _Search) -> _Search:
+    def iterate(s: _RootIterate) -> _RootIterate:
         value, slopes = _slopes(fn, s.x, blocks)
         residual = s.x - free + _times(coupling, value)
         size = jnp.abs(value) + _times(jnp.abs(slopes), jnp.abs(s.x))
@@ -228,11 +228,11 @@ def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, b
         # Blocks of several unknowns may have no potential, and steps circle there, too, until some are cut short.
         short = (s.tries >= 2 * _PATIENCE) & (s.tries % 3 == 0)
         length = jnp.where(settled, 0.0, jnp.where(short, 0.5, 1.0) * length)
-        return _Search(s.x + length * step, s.push + length * change, settled, misfit, s.tries + 1)
+        return _RootIterate(s.x + length * step, s.push + length * change, settled, misfit, s.tries + 1)
 
     push = fn(jnp.zeros_like(free))
     never = jnp.full_like(free[0], jnp.inf)
-    start = _Search(free - _times(coupling, push), push, jnp.array(False), never, jnp.array(0))
+    start = _RootIterate(free - _times(coupling, push), push, jnp.array(False), never, jnp.array(0))
     end = jax.lax.while_loop(lambda s: ~s.settled & (s.tries < _MOST_STEPS), iterate, start)
     return Monotone(end.x, end.settled | (end.misfit <= _LOST), end.tries)
 

@@ -63,7 +63,7 @@ class Range:
         return finite & ((value > lower) if self.strict else (value >= lower))
 
 
-def as_number(value: Any, *, name: str) -> Float[Array, ""]:
+def as_number(value: object, *, name: str) -> Float[Array, ""]:
     """Convert to a real floating scalar; integers become floating, a dtype that is given is kept.
 
     **Raises:**
@@ -79,7 +79,7 @@ def as_number(value: Any, *, name: str) -> Float[Array, ""]:
     return array
 
 
-def as_real(value: Any, *, name: str) -> Float[Array, "..."]:
+def as_real(value: object, *, name: str) -> Float[Array, "..."]:
     """Convert to a real floating array of any shape; see `as_number`."""
     if isinstance(value, jax.Array | np.ndarray | np.number | int | float) and not isinstance(value, bool):
         kind = getattr(value, "dtype", np.dtype(type(value)))
@@ -94,7 +94,7 @@ def as_real(value: Any, *, name: str) -> Float[Array, "..."]:
     raise ValueError(f"{name} must be a real number or an array of real numbers, but {given!r} was given.")
 
 
-def as_vector(value: Any, *, name: str) -> Float[Array, " n"]:
+def as_vector(value: object, *, name: str) -> Float[Array, " n"]:
     """Convert to a vector of real floating numbers, shape `[n]`; one number becomes a vector of length one.
 
     **Raises:**
@@ -148,7 +148,7 @@ def optional_vector_parameter(name: str, unit: str, *, lower: float | str | None
     return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower)})
 
 
-def _unless_none(value: Any, *, convert: Callable[..., Any], name: str) -> Any:
+def _unless_none(value: object, *, convert: Callable[..., object], name: str) -> Any:
     return None if value is None else convert(value, name=name)
 
 
@@ -190,7 +190,7 @@ def check_ranges(module: eqx.Module) -> None:
             )
 
 
-def modules_of(tree: Any, path: str = "") -> Iterator[tuple[str, eqx.Module]]:
+def modules_of(tree: object, path: str = "") -> Iterator[tuple[str, eqx.Module]]:
     """Every `eqx.Module` inside `tree` (itself included), with its path such as `.effects[0].law`.
 
     And those that a module says it implies by a property `implied`: modules by name, made from its fields.

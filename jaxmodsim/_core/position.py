@@ -57,7 +57,7 @@ class ScalarOrFn(eqx.Module):
         return jnp.asarray(self.amount(params) if callable(self.amount) else self.amount)
 
 
-def as_scalar_or_fn(value: Any, *, name: str) -> ScalarOrFn:
+def as_scalar_or_fn(value: object, *, name: str) -> ScalarOrFn:
     """Make a number, an array of numbers, or a function of `params` fit to sit in a pytree.
 
     **Raises:**

@@ -1,4 +1,4 @@
-"""The one opt-in that changes how XLA compiles."""
+"""Cores at hand, and the one opt-in that changes how XLA compiles."""
 
 import os
 
@@ -37,3 +37,8 @@ def tune_cpu(while_loop_bytes: int = 1_000_000) -> None:
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if _OPTION not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_backend_extra_options={_OPTION}={while_loop_bytes}".strip()
+
+
+def cores() -> int:
+    """Cores that this thread may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -34,18 +34,18 @@ class StateDependent(eqx.Module):
 _Module = TypeVar("_Module", bound=eqx.Module)
 
 
-def is_state_dependent(tree: Any) -> bool:
+def is_state_dependent(tree: object) -> bool:
     """Whether a parameter in `tree` depends on the state of the mechanism."""
     return any(
         isinstance(x, StateDependent) for x in jax.tree.leaves(tree, is_leaf=lambda x: isinstance(x, StateDependent))
     )
 
 
-def bind_state(tree: _Module, t: Array, q: Array, qd: Array, params: Any) -> _Module:
+def bind_state(tree: _Module, t: Array, q: Array, qd: Array, params: object) -> _Module:
     """`tree` with the values of its parameters at a state of the mechanism; factors below 1e-30 count as that."""
     factors: dict[int, Array] = {}  # by function: parameters that share one evaluate it once
 
-    def value(x: Any) -> Any:
+    def value(x: object) -> Any:
         if not isinstance(x, StateDependent):
             return x
         key = id(x.fn.fn if isinstance(x.fn, Function) else x.fn)
@@ -57,6 +57,6 @@ def bind_state(tree: _Module, t: Array, q: Array, qd: Array, params: Any) -> _Mo
     return jax.tree.map(value, tree, is_leaf=lambda x: isinstance(x, StateDependent))
 
 
-def nominal(value: Any) -> Any:
+def nominal(value: object) -> Any:
     """The number of a parameter, without the factor it varies by."""
     return nominal(value.number) if isinstance(value, StateDependent) else value

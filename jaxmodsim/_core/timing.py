@@ -9,7 +9,7 @@ _SLOW = 0.02
 _BURST = 5
 
 
-def measure(calls: dict[str, Callable[[], Any]], rounds: int, limit_s: float = 30.0) -> dict[str, dict[str, Any]]:
+def measure(calls: dict[str, Callable[[], object]], rounds: int, limit_s: float = 30.0) -> dict[str, dict[str, Any]]:
     """Time several calls in turns, so that a drift of the machine's speed meets them all alike.
 
     The first call of each, which compiles, is timed apart. Then in every round each call has its turn: a fast one
@@ -52,14 +52,14 @@ def measure(calls: dict[str, Callable[[], Any]], rounds: int, limit_s: float = 3
     return report
 
 
-def _turn(call: Callable[[], Any], slow: bool) -> list[float]:
+def _turn(call: Callable[[], object], slow: bool) -> list[float]:
     if slow:
         return [_seconds(call)]
     call()
     return [_seconds(call) for _ in range(_BURST)]
 
 
-def _seconds(call: Callable[[], Any]) -> float:
+def _seconds(call: Callable[[], object]) -> float:
     start = time.perf_counter()
     call()
     return time.perf_counter() - start

@@ -17,7 +17,19 @@ from jaxtyping import Array, PyTree
 from ..scene import Scene, elements, read_element, replace_elements
 from ..simulation import Trajectory, simulate
 from . import _words as words
-from ._differences import Estimate, Histories, History, Limits, Probe, Sample, estimate, grazing, kink, probe, usable
+from ._differences import (
+    Agreement,
+    DerivativeEstimate,
+    Histories,
+    History,
+    Probe,
+    Sample,
+    estimate,
+    grazing,
+    kink,
+    probe,
+    usable,
+)
 
 Verdict = Literal["agree", "part", "modes change", "grazing", "kink", "unclear", "no differences"]
 
@@ -93,7 +105,7 @@ class GradientCheck:
 
 
 def check_gradients(
-    fn: Callable[..., Any],
+    fn: Callable[..., object],
     scene: Scene,
     *,
     names: Sequence[str] | None = None,
@@ -169,7 +181,7 @@ def check_gradients(
     reverse = {name: read_element(gradient, name) for name in entries}
     scale = {name: (scales or {}).get(name, abs(x) or 1.0) for name, x in entries.items()}
     slopes = [abs(d[name]) * scale[name] for d in (forward, reverse) for name in entries]
-    limits = Limits(
+    limits = Agreement(
         itemsize,
         float(np.finfo(f"f{itemsize}").eps),
         _RTOL[itemsize] if rtol is None else rtol,
@@ -189,7 +201,7 @@ def check_gradients(
     return GradientCheck(float(value), f"float{8 * itemsize}", numbers, tuple(remarks))
 
 
-def _entries(scene: Any, names: Sequence[str] | None, scales: Mapping[str, float]) -> dict[str, float]:
+def _entries(scene: object, names: Sequence[str] | None, scales: Mapping[str, float]) -> dict[str, float]:
     """The numbers to check, by name."""
     if not isinstance(scene, Scene):
         raise ValueError(f"check_gradients needs a Scene, but a {type(scene).__name__} was given.")
@@ -252,7 +264,7 @@ def _traced(tree: PyTree) -> bool:
     return any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(tree))
 
 
-def _forward(fn: Callable[..., Any], scene: Scene, name: str) -> float:
+def _forward(fn: Callable[..., object], scene: Scene, name: str) -> float:
     """Derivative in forward mode."""
     zero = jtu.tree_map(jnp.zeros_like, scene)
     try:
@@ -301,10 +313,10 @@ def _histories(run: Trajectory) -> dict[str, History]:
     return found
 
 
-def _judge(name: str, found: Probe, forward: float, reverse: float, scale: float, limits: Limits) -> NumberCheck:
+def _judge(name: str, found: Probe, forward: float, reverse: float, scale: float, limits: Agreement) -> NumberCheck:
     """The verdict on one number, and the sentences that go with it."""
     center, guess = found.center, estimate(found, limits.eps)
-    shown = guess or Estimate(float("nan"), float("nan"), float("nan"), "")
+    shown = guess or DerivativeEstimate(float("nan"), float("nan"), float("nan"), "")
     number = functools.partial(NumberCheck, name, center.x, forward, reverse, shown.value, shown.error, shown.step)
     sides = [(side, usable(center, side)) for side in (found.below, found.above)]
     ends = tuple(words.end(name, center, side[first - 1]) for side, first in sides if first)

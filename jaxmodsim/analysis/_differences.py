@@ -43,7 +43,7 @@ class Probe(NamedTuple):
     above: list[Sample]
 
 
-class Estimate(NamedTuple):
+class DerivativeEstimate(NamedTuple):
     """A derivative by differences: value, estimated error, smaller one of the two steps it is from, and its sides."""
 
     value: float
@@ -52,7 +52,7 @@ class Estimate(NamedTuple):
     sides: str
 
 
-class Limits(NamedTuple):
+class Agreement(NamedTuple):
     """What counts as equal.
 
     - `itemsize`, `eps`: bytes and rounding unit of the floating type.
@@ -111,7 +111,7 @@ def first_difference(one: History, other: History) -> int:
     return next((k for k, (a, b) in enumerate(pairs) if a != b), shorter)
 
 
-def estimate(found: Probe, eps: float) -> Estimate | None:
+def estimate(found: Probe, eps: float) -> DerivativeEstimate | None:
     """Derivative by Richardson's extrapolation of the pair of steps with the smallest estimated error.
 
     The error is that of the smaller step before it is extrapolated, plus the noise of the evaluations over that
@@ -135,7 +135,7 @@ def estimate(found: Probe, eps: float) -> Estimate | None:
     changes = [0.0, *np.diff(slopes)][-2:]
     noise = 4 * eps * abs(center.value) + abs(bends[1] - bends[0] / _RATIO**2)
     noise += steps[-1] * abs(changes[1] - changes[0] / _RATIO**order)
-    best: Estimate | None = None
+    best: DerivativeEstimate | None = None
     found_smaller: list[tuple[float, float]] = []
     for j in range(len(pairs) - 1, 0, -1):
         change = (slopes[j] - slopes[j - 1]) / (_RATIO**order - 1)
@@ -144,7 +144,7 @@ def estimate(found: Probe, eps: float) -> Estimate | None:
         error = max([error, *(abs(value - v) - e for v, e in found_smaller)])
         found_smaller.append((value, error))
         if best is None or error < best.error:
-            best = Estimate(value, error, steps[j], sides)
+            best = DerivativeEstimate(value, error, steps[j], sides)
     return best
 
 

@@ -46,7 +46,7 @@ class Question:
         """Initial coordinates and velocities in a floating type."""
         return {"q0": jnp.asarray(self.q0, dtype), "qd0": jnp.asarray(self.qd0, dtype)}
 
-    def run(self, scene: Scene, start: dict[str, Array], setting: dict[str, Any], **options: Any) -> Trajectory:
+    def run(self, scene: Scene, start: dict[str, Array], setting: dict[str, Any], **options: object) -> Trajectory:
         """A run; `setting` holds tolerances or a step."""
         return simulate(scene, **start, t1=self.t1, ts=self.ts, **{"max_steps": self.max_steps, **setting, **options})
 
@@ -63,7 +63,7 @@ class Happened(NamedTuple):
     what: Int[np.ndarray, "events 2"]
 
 
-class Limit(NamedTuple):
+class Converged(NamedTuple):
     """What runs of a scene converge to.
 
     - `y`: the observable.
@@ -83,7 +83,7 @@ class Limit(NamedTuple):
     how: str
 
 
-def in_type(scene: Scene, dtype: Any) -> Scene:
+def in_type(scene: Scene, dtype: object) -> Scene:
     """The scene with all its numbers in a floating type."""
     return jtu.tree_map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, scene)
 
@@ -116,7 +116,7 @@ def scale_of(y: np.ndarray) -> float:
 
 def converged(
     scene: Scene, question: Question, rtol: float, *, closed: np.ndarray | None, scale: float | None, agreement: float
-) -> Limit:
+) -> Converged:
     """Runs of two solvers at a tight tolerance, or one beside a closed form, that must agree.
 
     **Raises:**
@@ -152,7 +152,7 @@ def converged(
     events, other = found[0][1], found[-1][1]
     times = None if events is None or other is None else event_error(events, other)
     gradient, second = found[0][2], found[-1][2]
-    return Limit(
+    return Converged(
         ys[0],
         events if times is not None else None,
         gradient,
@@ -164,7 +164,7 @@ def converged(
 
 
 def _tight(
-    scene: Scene, question: Question, solver: Any, rtol: float
+    scene: Scene, question: Question, solver: object, rtol: float
 ) -> tuple[np.ndarray, Happened | None, dict[str, float] | None]:
     """Observable, mode changes and gradient at a tight tolerance."""
     setting, start = {"rtol": rtol, "atol": ATOL * rtol}, question.start(jnp.float64)

@@ -76,7 +76,7 @@ class Sensitivity:
 
 def sensitivity(
     scene: Scene,
-    observable: Callable[[Trajectory], Any] | str,
+    observable: Callable[[Trajectory], ArrayLike] | str,
     wrt: Sequence[str] | str | None = None,
     *,
     q0: ArrayLike | list[float],
@@ -158,7 +158,7 @@ def sensitivity(
     return Sensitivity(label, unit, run.t, y, values, units, derivatives, normalised, ranking, mode, remarks)
 
 
-def chosen_numbers(scene: Scene, q0: Any, qd0: Any, wrt: Sequence[str] | str | None) -> dict[str, float]:
+def chosen_numbers(scene: Scene, q0: object, qd0: object, wrt: Sequence[str] | str | None) -> dict[str, float]:
     """The parameters and their values, by name."""
     known = {name: read_element(scene, name) for name in elements(scene)}
     numbers, ranges = scene_numbers(scene), scene_ranges(scene)
@@ -197,7 +197,9 @@ def with_values(scene: Scene, start: dict[str, Any], x: Mapping[str, Array]) -> 
     return replace_elements(scene, {name: value for name, value in x.items() if name in known}), start
 
 
-def observable_of(observable: Any) -> tuple[Callable[[Trajectory], Any], str, str]:
+def observable_of(
+    observable: str | Callable[[Trajectory], ArrayLike],
+) -> tuple[Callable[[Trajectory], ArrayLike], str, str]:
     """What is observed, its label and its unit."""
     if isinstance(observable, str):
         return partial(named_series, name=observable), observable, named_unit(observable)

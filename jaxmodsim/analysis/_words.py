@@ -2,7 +2,7 @@
 
 import math
 
-from ._differences import Estimate, Grazing, History, Limits, Sample, changed, first_difference
+from ._differences import Agreement, DerivativeEstimate, Grazing, History, Sample, changed, first_difference
 
 # Part of the largest derivative, per relative change of a number, below which others count as zero.
 _TINY = 1e-3
@@ -43,7 +43,7 @@ def no_differences(name: str) -> str:
     )
 
 
-def one_sided(name: str, guess: Estimate) -> str:
+def one_sided(name: str, guess: DerivativeEstimate) -> str:
     """Where the differences are from."""
     return f"{name}: the differences are from {guess.sides} only."
 
@@ -65,7 +65,7 @@ def grazing(name: str, x: float, near: Grazing) -> str:
     )
 
 
-def unclear(name: str, guess: Estimate) -> str:
+def unclear(name: str, guess: DerivativeEstimate) -> str:
     """What to do if the differences are too noisy."""
     return (
         f"{name}: the differences are uncertain by {guess.error:.1g} and tell nothing. Tighten rtol and atol of"
@@ -74,7 +74,7 @@ def unclear(name: str, guess: Estimate) -> str:
 
 
 def parting(
-    name: str, forward: float, reverse: float, guess: Estimate, limits: Limits, scale: float
+    name: str, forward: float, reverse: float, guess: DerivativeEstimate, limits: Agreement, scale: float
 ) -> tuple[str, ...]:
     """Where the three derivatives differ, and by how much; empty if they agree."""
     found = {"forward mode": forward, "reverse mode": reverse}

@@ -14,51 +14,49 @@ from jaxtyping import Array, ArrayLike
 
 from .._core.provenance import describe_machine
 from .._core.timing import measure
-from ..problems import Case
 from ..scene import Scene, elements
 from ..simulation import Trajectory, default_solver, evaluations_per_step
 from ._methods import Method, default_methods
-from ._reference import ATOL, Limit, Question, converged, event_error, gradient_error, happened, in_type, scale_of
+from ._reference import ATOL, Converged, Question, converged, event_error, gradient_error, happened, in_type, scale_of
 from ._sensitivity import chosen_numbers, observable_of, observed
 from ._work_rows import Row, Timing, WorkPrecision
 
 # Numbers of a gradient that are none of the scene.
 _START = ("q0[", "qd0[")
 COSTS = ("run", "vmap", "forward", "reverse")
-# Limit of a run, but for problems that say they need more.
-_MAX_STEPS = 100_000
 # Tolerance of the references: so much tighter than the tightest asked for, down to what rounding allows.
 _TIGHTER, _TIGHTEST = 1e-3, 1e-12
 _PACKAGES = ("jaxmodsim", "jax", "jaxlib", "diffrax", "equinox", "numpy")
 
 
 def work_precision(
-    problem: Scene | Case,
-    q0: ArrayLike | list[float] | None = None,
-    qd0: ArrayLike | list[float] | None = None,
-    t1: float | None = None,
+    scene: Scene,
+    q0: ArrayLike | list[float],
+    qd0: ArrayLike | list[float],
+    t1: float,
     *,
     ts: ArrayLike | list[float] | None = None,
-    observable: str | Callable[[Trajectory], Any] | None = None,
+    observable: str | Callable[[Trajectory], ArrayLike] = "q[0]",
     methods: Mapping[str, Method] | None = None,
     tolerances: Sequence[float] = (1e-3, 1e-5, 1e-7, 1e-9),
-    reference: float | ArrayLike | Callable[[Any], Any] | None = None,
+    reference: float | ArrayLike | Callable[[np.ndarray], ArrayLike] | None = None,
     agreement: float | None = None,
     wrt: Sequence[str] | str | None = None,
     costs: Sequence[str] = ("run",),
-    lanes: int = 64,
+    batch: int = 64,
     rounds: int = 10,
     limit_s: float = 10.0,
-    max_steps: int | None = None,
+    max_steps: int = 100_000,
+    name: str = "scene",
 ) -> WorkPrecision:
-    """Run a problem by several methods at several tolerances: errors against times and steps.
+    """Run a scene by several methods at several tolerances: errors against times and steps.
 
     ```python
-    case = jaxmodsim.problems.named_problems()["lugre_box"]()
-    found = jaxmodsim.work_precision(case)
+    problem = jaxmodsim.problems.named_problems()["lugre_box"]()
+    found = jaxmodsim.work_precision(**problem.arguments)
     print(found)
     found.cheapest(1e-6)
-    found.plot().savefig("lugre_box.png")
+    jaxmodsim.plot.work_precision_figure(found).savefig("lugre_box.png")
     ```
 
     **Reference.** Two solvers at a tolerance a thousand times tighter than the tightest asked for (1e-12 at the
@@ -68,26 +66,24 @@ def work_precision(
     found (a field that jumps), the error stays whole.
 
     **Times** are of warm calls of `simulate`, or of compiled functions of it, all methods in turns, with compiling
-    apart. All lanes of a vmap are alike, which is the best case: a batch waits for its slowest lane. Gradients are
+    apart. All runs of a vmap are alike, which is the best case: a batch waits for its slowest run. Gradients are
     those of the last value of the observable.
 
     **Arguments:**
 
-    - `problem`: a `Scene`, or a `Case` of `jaxmodsim.problems.named_problems`, which knows the rest.
-    - `q0`, `qd0`, `t1`, `ts`: as for `simulate`; of a `Case` only `ts` may be given.
-    - `observable`: what errors are of: a name, as in `"q[0]"` (the default for a `Scene`), or of an effect for its
-      force; or a function of the `Trajectory` that returns real numbers of shape `[time]`, `[k]` or `[]`.
+    - `scene`, `q0`, `qd0`, `t1`, `ts`: as for `simulate`.
+    - `observable`: what errors are of: a name, as in `"q[0]"`, or of an effect for its force; or a function of the
+      `Trajectory` that returns real numbers of shape `[time]`, `[k]` or `[]`.
     - `methods`: a `Method` for each name; by default solvers that suit the scene.
     - `tolerances`: relative ones, > 0; absolute ones are a thousandth of them.
-    - `reference`: a closed form of the observable: numbers of its shape, or a function of the times. A `Case` without
-      `ts` and `observable` knows it.
+    - `reference`: a closed form of the observable: numbers of its shape, or a function of the times.
     - `agreement`: largest disagreement of the references, relative to the scale; by default the tightest tolerance.
     - `wrt`: numbers for the gradient, as for `sensitivity`; by default, if a gradient is timed, all that are not zero.
     - `costs`: what is timed, of `run`, `vmap`, `forward`, `reverse` (gradients).
-    - `lanes`: runs of the vmap.
+    - `batch`: runs of the vmap.
     - `rounds`, `limit_s`: how often each call is timed, and after how many seconds in all no more.
-    - `max_steps`: limit of a run; by default 100 000, or as many as the `Case` needs. Of fixed steps as many
-      as they make are allowed.
+    - `max_steps`: limit of a run. Of fixed steps as many as they make are allowed.
+    - `name`: of the problem, for table and figure.
 
     **Returns:**
 
@@ -104,10 +100,17 @@ def work_precision(
             "work_precision needs references in double precision: call jax.config.update('jax_enable_x64', True) first,"
             " and give methods that run in single precision Method(dtype='float32')."
         )
-    scene, question, closed, title = _question(problem, q0, qd0, t1, ts, observable, reference, max_steps)
+    if not isinstance(scene, Scene):
+        raise ValueError(f"work_precision needs a Scene, but {scene!r} was given.")
+    observe, label, unit = observable_of(observable)
+    ts = None if ts is None else np.asarray(ts, float)
+    question = Question(
+        np.asarray(q0, float), np.asarray(qd0, float), float(t1), ts, observe, label, unit, {}, max_steps
+    )
+    closed = _closed_form(reference, np.array([question.t1]) if ts is None else ts)
     methods = default_methods(scene) if methods is None else dict(methods)
     tolerances = [float(x) for x in tolerances]
-    _check(methods, tolerances, costs, lanes, rounds)
+    _check(methods, tolerances, costs, batch, rounds)
     if {"forward", "reverse"} & set(costs) or wrt is not None:
         question = replace(question, values=chosen_numbers(scene, question.q0, question.qd0, wrt))
         costs = tuple(costs) if {"forward", "reverse"} & set(costs) else (*costs, "forward")
@@ -115,7 +118,7 @@ def work_precision(
     rtol, agreement = max(_TIGHTER * smallest, _TIGHTEST), smallest if agreement is None else agreement
     target = converged(scene, question, rtol, closed=closed, scale=None, agreement=agreement)
     scale = scale_of(target.y)
-    limits: dict[int, Limit | str] = {}
+    limits: dict[int, Converged | str] = {}
     for method in methods.values():
         if method.scene is not None and id(method.scene) not in limits:
             try:
@@ -126,16 +129,16 @@ def work_precision(
                 limits[id(method.scene)] = f"No limit of this formulation was found: {error}"
     candidates = [
         (prepared, setting)
-        for prepared in [_prepared(name, method, scene, question, lanes) for name, method in methods.items()]
+        for prepared in [_prepared(name, method, scene, question, batch) for name, method in methods.items()]
         for setting in _settings(prepared.method, tolerances)
     ]
     outcomes = _measured(candidates, costs, rounds, limit_s)
     rows = [
         _row(one, outcome, timings, question, target, limits.get(id(one[0].method.scene)), scale)
-        for one, outcome, timings in zip(candidates, outcomes, _timings(candidates, outcomes, lanes), strict=True)
+        for one, outcome, timings in zip(candidates, outcomes, _timings(candidates, outcomes, batch), strict=True)
     ]
     return WorkPrecision(
-        title,
+        name,
         question.label,
         question.unit,
         f"at t = {question.t1:g} s" if question.ts is None else f"at {len(question.ts)} times to {question.t1:g} s",
@@ -145,54 +148,24 @@ def work_precision(
         target.events_disagreement,
         target.gradient_disagreement,
         tuple(costs),
-        lanes,
+        batch,
         tuple(rows),
         describe_machine(*_PACKAGES),
     )
 
 
-def _question(
-    problem: Any, q0: Any, qd0: Any, t1: Any, ts: Any, observable: Any, reference: Any, max_steps: int | None
-) -> tuple[Scene, Question, np.ndarray | None, str]:
-    """What is asked, of which scene; its closed form, and the name of the problem."""
-    steps = _MAX_STEPS
-    if isinstance(problem, Case):
-        if not (q0 is None and qd0 is None and t1 is None):
-            raise ValueError("A Case brings q0, qd0 and t1 with it: leave them out, or pass its scene with others.")
-        if reference is None and observable is None and ts is None and problem.exact is not None:
-            reference = problem.exact
-        scene, q0, qd0, t1 = problem.scene, problem.q0, problem.qd0, problem.t1
-        steps = max(steps, problem.max_steps)
-        observable, name = problem.observable if observable is None else observable, problem.name
-    elif isinstance(problem, Scene):
-        if q0 is None or qd0 is None or t1 is None:
-            raise ValueError("A Scene needs its start and end: work_precision(scene, q0, qd0, t1).")
-        scene, observable, name = problem, "q[0]" if observable is None else observable, "scene"
-    else:
-        raise ValueError(f"work_precision needs a Scene or a problems.Case, but {problem!r} was given.")
-    observe, label, unit = observable_of(observable)
-    ts = None if ts is None else np.asarray(ts, float)
-    times = np.array([float(t1)]) if ts is None else ts
-    closed = None
-    if reference is not None:
-        closed = np.asarray(reference(times) if callable(reference) else reference, float)
-        if not np.isfinite(closed).all():
-            raise ValueError(f"reference must be finite, but it is {closed}.")
-    question = Question(
-        np.asarray(q0, float),
-        np.asarray(qd0, float),
-        float(t1),
-        ts,
-        observe,
-        label,
-        unit,
-        {},
-        steps if max_steps is None else max_steps,
-    )
-    return scene, question, closed, name
+def _closed_form(
+    reference: float | ArrayLike | Callable[[np.ndarray], ArrayLike] | None, times: np.ndarray
+) -> np.ndarray | None:
+    if reference is None:
+        return None
+    closed = np.asarray(reference(times) if callable(reference) else reference, float)
+    if not np.isfinite(closed).all():
+        raise ValueError(f"reference must be finite, but it is {closed}.")
+    return closed
 
 
-def _check(methods: dict[str, Method], tolerances: list[float], costs: Any, lanes: int, rounds: int) -> None:
+def _check(methods: dict[str, Method], tolerances: list[float], costs: Sequence[str], batch: int, rounds: int) -> None:
     for name, method in methods.items():
         if not isinstance(method, Method):
             raise ValueError(
@@ -206,7 +179,7 @@ def _check(methods: dict[str, Method], tolerances: list[float], costs: Any, lane
         raise ValueError("tolerances is empty: give some, or every method its steps.")
     if isinstance(costs, str) or "run" not in costs or not set(costs) <= set(COSTS):
         raise ValueError(f"costs must be 'run' and others of {', '.join(COSTS)}, but {costs!r} was given.")
-    for name, number in (("lanes", lanes), ("rounds", rounds)):
+    for name, number in (("batch", batch), ("rounds", rounds)):
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:
             raise ValueError(f"{name} must be a positive integer, but {number!r} was given.")
 
@@ -217,7 +190,7 @@ def _settings(method: Method, tolerances: Sequence[float]) -> list[dict[str, flo
     return [{"rtol": rtol, "atol": ATOL * rtol} for rtol in tolerances]
 
 
-class _Prepared(NamedTuple):
+class _PreparedMethod(NamedTuple):
     """A method, ready to run: what makes each of the costs at a setting, compiled once for all settings."""
 
     name: str
@@ -227,7 +200,7 @@ class _Prepared(NamedTuple):
     calls: dict[str, Callable[[dict[str, float]], Any]]
 
 
-def _prepared(name: str, method: Method, scene: Scene, question: Question, lanes: int) -> _Prepared:
+def _prepared(name: str, method: Method, scene: Scene, question: Question, batch: int) -> _PreparedMethod:
     scene = scene if method.scene is None else method.scene
     dtype = jnp.dtype(method.dtype) if method.dtype is not None else jnp.result_type(float, *jax.tree.leaves(scene))
     scene, start, fixed = in_type(scene, dtype), question.start(dtype), method.steps is not None
@@ -251,20 +224,20 @@ def _prepared(name: str, method: Method, scene: Scene, question: Question, lanes
         return done
 
     x = {name: jnp.asarray(value, dtype) for name, value in question.values.items()}
-    batch = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (lanes, *leaf.shape)), start)
+    starts = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (batch, *leaf.shape)), start)
     many = jax.jit(jax.vmap(end, in_axes=(0, None, None)))
     forward = jax.jit(jax.jacfwd(partial(question.last, adjoint=dfx.ForwardMode(), **options)))
     reverse = jax.jit(jax.grad(partial(question.last, **options)))
     calls = {
         "run": run,
-        "vmap": lambda setting: jax.block_until_ready(many(batch, scene, setting)),
+        "vmap": lambda setting: jax.block_until_ready(many(starts, scene, setting)),
         "forward": lambda setting: jax.block_until_ready(forward(x, scene, start, setting)),
         "reverse": lambda setting: jax.block_until_ready(reverse(x, scene, start, setting)),
     }
-    return _Prepared(name, method, solver, dtype, calls)
+    return _PreparedMethod(name, method, solver, dtype, calls)
 
 
-class _Outcome(NamedTuple):
+class _Timed(NamedTuple):
     """What a method gave at a setting, by the costs, and the times of that or why it failed."""
 
     given: dict[str, Any]
@@ -272,10 +245,10 @@ class _Outcome(NamedTuple):
 
 
 def _measured(
-    candidates: list[tuple[_Prepared, dict[str, float]]], costs: Sequence[str], rounds: int, limit_s: float
-) -> list[_Outcome]:
+    candidates: list[tuple[_PreparedMethod, dict[str, float]]], costs: Sequence[str], rounds: int, limit_s: float
+) -> list[_Timed]:
     """Everything timed, cost after cost, all candidates in turns; those that cannot run are left out of the rest."""
-    outcomes = [_Outcome({}, {}) for _ in candidates]
+    outcomes = [_Timed({}, {}) for _ in candidates]
 
     def call(i: int, cost: str) -> None:
         prepared, setting = candidates[i]
@@ -290,7 +263,7 @@ def _measured(
 
 
 def _timings(
-    candidates: list[tuple[_Prepared, dict[str, float]]], outcomes: list[_Outcome], lanes: int
+    candidates: list[tuple[_PreparedMethod, dict[str, float]]], outcomes: list[_Timed], batch: int
 ) -> list[dict[str, Timing]]:
     """Timings of each candidate; what is compiled for the first setting of a method serves the others."""
     compiled: dict[tuple[str, str], float] = {}
@@ -301,7 +274,7 @@ def _timings(
             if "failed" in report:
                 continue
             first = max(report["first_s"] - report["median_s"], 0.0)
-            share, (low, high) = lanes if cost == "vmap" else 1, report["quartiles_s"]
+            share, (low, high) = batch if cost == "vmap" else 1, report["quartiles_s"]
             timings[-1][cost] = Timing(
                 compiled.setdefault((prepared.name, cost), first), report["median_s"] / share, low / share, high / share
             )
@@ -309,12 +282,12 @@ def _timings(
 
 
 def _row(
-    candidate: tuple[_Prepared, dict[str, float]],
-    outcome: _Outcome,
+    candidate: tuple[_PreparedMethod, dict[str, float]],
+    outcome: _Timed,
     timings: dict[str, Timing],
     question: Question,
-    target: Limit,
-    limit: Limit | str | None,
+    target: Converged,
+    limit: Converged | str | None,
     scale: float,
 ) -> Row:
     """Errors of a candidate beside its times."""
@@ -345,8 +318,7 @@ def _row(
     gradient = None
     if derivatives and target.gradient is not None:
         gradient = max(gradient_error({n: float(x) for n, x in each.items()}, target.gradient) for each in derivatives)
-    steps = int(run.stats["num_steps"])
-    each = evaluations_per_step(run, prepared.solver)
+    steps, each = int(run.stats["num_steps"]), evaluations_per_step(prepared.solver, run)
     return replace(
         row,
         error=error,

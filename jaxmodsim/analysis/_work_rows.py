@@ -1,4 +1,4 @@
-"""What `work_precision` gives: rows, a table, a figure, a file."""
+"""What `work_precision` returns: rows, a table, a file."""
 
 import hashlib
 import importlib
@@ -14,7 +14,7 @@ from .._core.files import written_whole
 if TYPE_CHECKING:
     import pandas as pd
 
-_KIND, _VERSION = "jaxmodsim work precision", 2
+_KIND, _VERSION = "jaxmodsim work precision", 3
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class Row:
     - `events`: largest error of the time of an event [s], where the same events happen as in the reference.
     - `gradient`: largest relative error of a derivative of the observable's last value.
     - `steps`, `rejected`: all steps, and how many of them were rejected.
-    - `evaluations`: of the vector field in all steps, with those of the Jacobian; None for methods that iterate.
-    - `times`: a `Timing` for each of the costs: `run`, `vmap` (for each lane), `forward`, `reverse`.
+    - `evaluations`: of the vector field in all steps, Jacobians among them; None for methods that iterate.
+    - `times`: a `Timing` for each of the costs: `run`, `vmap` (for each run of the batch), `forward`, `reverse`.
     - `remarks`: in sentences.
     """
 
@@ -78,13 +78,13 @@ class Row:
 
 @dataclass(frozen=True)
 class WorkPrecision:
-    """Error against work, method by method; print it, draw it, keep it.
+    """Error against work, method by method; print it, keep it, draw it by `jaxmodsim.plot.work_precision_figure`.
 
-    - `problem`: what was run, in words; `observable`, `unit`, `when`: what was asked of it; `scale`: what errors of it
+    - `problem`: name of what was run; `observable`, `unit`, `when`: what was asked of it; `scale`: what errors of it
       are relative to, in that unit.
     - `reference`: how the reference was found. `disagreement`: of the references, relative to the scale; errors below
       it say no more than that they are. `events_disagreement` [s], `gradient_disagreement`: likewise.
-    - `costs`: what was timed; `lanes`: of the vmap.
+    - `costs`: what was timed; `batch`: runs of the vmap.
     - `rows`: a `Row` for each method and setting, failures among them.
     - `machine`: processor, versions, date, commit.
     """
@@ -99,7 +99,7 @@ class WorkPrecision:
     events_disagreement: float
     gradient_disagreement: float
     costs: tuple[str, ...]
-    lanes: int
+    batch: int
     rows: tuple[Row, ...]
     machine: dict[str, Any]
 
@@ -148,21 +148,6 @@ class WorkPrecision:
             raise ImportError('table needs pandas: pip install "jaxmodsim[cli]".') from error
         return pandas.DataFrame([_columns(row, self.costs) for row in self.rows])
 
-    def plot(self, cost: str = "run") -> Any:
-        """Work-precision diagram: time, and evaluations or steps, over the error.
-
-        **Returns:**
-
-        A `matplotlib.figure.Figure`, as `jaxmodsim.plot.work_precision_figure` draws it.
-
-        **Raises:**
-
-        - `ValueError` if the cost was not measured.
-        """
-        from ..plot import work_precision_figure
-
-        return work_precision_figure(self, cost=cost)
-
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all of it as JSON, whole or not at all; `load_work_precision` reads it.
 
@@ -197,7 +182,7 @@ class WorkPrecision:
         )
 
 
-_COSTS = {"run": "run", "vmap": "lane", "forward": "forward", "reverse": "reverse"}
+_COSTS = {"run": "run", "vmap": "vmap", "forward": "forward", "reverse": "reverse"}
 
 
 def _cell(row: Row, head: str, floors: dict[str, float], costs: Sequence[str]) -> str:

@@ -7,8 +7,7 @@ from typing import Annotated
 import typer
 
 from . import _options
-from ._interrupted import Interrupted
-from ._options import Out
+from ._options import Interrupted, Out
 
 app = typer.Typer(
     name="jaxmodsim",
@@ -168,22 +167,22 @@ def hard(
         list[str] | None, typer.Argument(metavar="NAME", help="Cases or families; all without.", show_default=False)
     ] = None,
     list_only: Annotated[bool, typer.Option("--list", help="Say what the cases are, and run nothing.")] = False,
-    ways: Annotated[
+    transforms: Annotated[
         str,
-        typer.Option(help="Ways of running, with commas between: alone, jit, vmap, forward, reverse, energy; or all."),
+        typer.Option(help="Transforms, with commas between: alone, jit, vmap, forward, reverse, energy; or all."),
     ] = "all",
     jobs: Annotated[int, typer.Option(help="Processes.", min=1)] = 1,
     out: Out = Path("jaxmodsim-hard"),
 ) -> None:
-    """Cases in which simulations go wrong, run in every way and compared with what is right; exit code 1 if one fails.
+    """Cases in which simulations go wrong, run under every transform and compared with what is right.
 
     Each case alone, under jit and vmap, with forward and reverse derivatives, in float64 and float32, and its energy
-    balance. All of it takes most of an hour on one core; --ways alone a few minutes.
+    balance; exit code 1 if one fails. All of it takes most of an hour on one core; --transforms alone a few minutes.
     """
     _start()
     from ._hard import HardRequest, report_hard
 
-    if not report_hard(HardRequest(tuple(names or ()), list_only, ways, jobs, out)):
+    if not report_hard(HardRequest(tuple(names or ()), list_only, transforms, jobs, out)):
         raise typer.Exit(1)
 
 

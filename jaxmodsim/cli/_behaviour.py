@@ -6,7 +6,7 @@ from typing import Any
 import pandas as pd
 
 from ..plot import behaviour_figure
-from ..validation.behaviour import EXPERIMENTS, Outcome, Verdict, run_bench
+from ..validation.behaviour import EXPERIMENTS, ExperimentResult, Verdict, run_bench
 from ._output import console, show_paths, show_table, write
 
 
@@ -21,7 +21,7 @@ def report_behaviour(out: Path) -> bool:
     files["behaviour.json"] = _nested(outcomes)
     show_paths(write(out, files))
     failed = [
-        (law, name, outcome.finding)
+        (law, name, outcome.measured)
         for law, of in outcomes.items()
         for name, outcome in of.items()
         if outcome.verdict is Verdict.FAIL
@@ -32,16 +32,16 @@ def report_behaviour(out: Path) -> bool:
     return not failed
 
 
-def _figure(name: str, outcomes: dict[str, dict[str, Outcome]]) -> Any:
+def _figure(name: str, outcomes: dict[str, dict[str, ExperimentResult]]) -> Any:
     return behaviour_figure(EXPERIMENTS[name], {law: of[name] for law, of in outcomes.items()})
 
 
-def _cell(outcome: Outcome) -> str:
-    word = outcome.verdict.value.removeprefix("by ")
-    return f"{word} {outcome.finding.rounded}".rstrip()
+def _cell(outcome: ExperimentResult) -> str:
+    word = outcome.verdict.value.removesuffix(" limitation")
+    return f"{word} {outcome.measured.rounded}".rstrip()
 
 
-def _table(outcomes: dict[str, dict[str, Outcome]]) -> pd.DataFrame:
+def _table(outcomes: dict[str, dict[str, ExperimentResult]]) -> pd.DataFrame:
     """Laws as rows, experiments as columns."""
     rows = [{"law": law} | {name: _cell(of[name]) for name in EXPERIMENTS} for law, of in outcomes.items()]
     return pd.DataFrame(rows)
@@ -53,25 +53,27 @@ def _limits() -> pd.DataFrame:
             "experiment": [each.name for each in EXPERIMENTS.values()],
             "number": [each.quantity for each in EXPERIMENTS.values()],
             "unit": [each.unit for each in EXPERIMENTS.values()],
-            "passes": [f"{'<=' if each.limit.at_most else '>='} {each.limit.value:g}" for each in EXPERIMENTS.values()],
+            "passes": [
+                f"{'<=' if each.threshold.at_most else '>='} {each.threshold.value:g}" for each in EXPERIMENTS.values()
+            ],
         }
     )
 
 
-def _entry(name: str, outcome: Outcome) -> dict[str, Any]:
+def _entry(name: str, outcome: ExperimentResult) -> dict[str, Any]:
     experiment = EXPERIMENTS[name]
     return {
         "verdict": outcome.verdict.value,
-        "number": outcome.finding.number,
+        "number": outcome.measured.number,
         "unit": experiment.unit,
-        "threshold": experiment.limit.value,
-        "side": "at most" if experiment.limit.at_most else "at least",
-        "finding": outcome.finding.sentence,
+        "threshold": experiment.threshold.value,
+        "side": "at most" if experiment.threshold.at_most else "at least",
+        "finding": outcome.measured.sentence,
         "reason": outcome.reason,
     }
 
 
-def _long(outcomes: dict[str, dict[str, Outcome]]) -> pd.DataFrame:
+def _long(outcomes: dict[str, dict[str, ExperimentResult]]) -> pd.DataFrame:
     """One row for each law and experiment."""
     return pd.DataFrame(
         [
@@ -82,5 +84,5 @@ def _long(outcomes: dict[str, dict[str, Outcome]]) -> pd.DataFrame:
     )
 
 
-def _nested(outcomes: dict[str, dict[str, Outcome]]) -> dict[str, Any]:
+def _nested(outcomes: dict[str, dict[str, ExperimentResult]]) -> dict[str, Any]:
     return {law: {name: _entry(name, outcome) for name, outcome in of.items()} for law, of in outcomes.items()}

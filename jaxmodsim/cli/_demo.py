@@ -6,12 +6,11 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from jaxtyping import Array
 
 from ..friction import LuGre
 from ..identify import Record, first_coordinate, replay
 from ..plot import fit_figure, truth_figure
-from ..scene import AppliedForce, Friction, Scene
+from ..problems import driven_spring
 from ._fit import fit_with_progress
 from ._output import console, show_paths, show_table, write
 from ._report import testbench_files
@@ -20,22 +19,6 @@ TRUTH = {"sigma0": 750.0, "sigma1": 10.0, "sigma2": 0.4, "Fc": 1.5, "Fs": 2.0, "
 START = {"sigma0": 400.0, "sigma1": 3.0, "sigma2": 1.0, "Fc": 1.0, "Fs": 1.2, "vs": 0.1}
 NOISE = 2e-4
 SAMPLE = 2e-3
-
-
-def _sprung_mass(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
-    return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
-
-
-def _drive(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q, qd
-    return jnp.reshape(p["u"], (1,))
-
-
-def sprung_scene(law: LuGre) -> Scene:
-    """A mass of 2 kg on a spring of 20 N/m, driven by a force, with friction."""
-    params = {"m": 2.0, "k": 20.0, "u": 0.0}
-    return Scene(_sprung_mass, params=params, effects=(AppliedForce(_drive, name="drive"), Friction(law)))
 
 
 def synthetic_record() -> Record:
@@ -50,7 +33,7 @@ def synthetic_record() -> Record:
     u = amplitude * np.sin(2 * np.pi * np.cumsum(frequency) * SAMPLE)
     zero = jnp.zeros(1)
     clean = replay(
-        sprung_scene(LuGre(**TRUTH)), jnp.asarray(t), {"u": jnp.asarray(u)}, zero, zero, 10, first_coordinate
+        driven_spring(LuGre(**TRUTH)), jnp.asarray(t), {"u": jnp.asarray(u)}, zero, zero, 10, first_coordinate
     )
     noise = NOISE * np.random.default_rng(1).standard_normal(t.size)
     return Record(t, np.asarray(clean) + noise, {"u": u}, name="synthetic record")
@@ -62,7 +45,7 @@ def run_demo(out: Path) -> None:
     record = synthetic_record()
     free = tuple(f"friction.{name}" for name in TRUTH)
     started = time.perf_counter()
-    result = fit_with_progress(sprung_scene(LuGre(**START)), record, free, q0=[0.0])
+    result = fit_with_progress(driven_spring(LuGre(**START)), record, free, q0=[0.0])
     truth = {f"friction.{name}": value for name, value in TRUTH.items()}
     frame = pd.DataFrame(
         [

@@ -26,7 +26,7 @@ from ..identify import (
 from ..plot import comparison_figure, design_figure, fit_figure, score_figure
 from ..scene import Scene, scene_numbers
 from ._fitted import Findings, Fitted, origin, parameter_table, record_table, sample_table, summary, with_units
-from ._interrupted import Interrupted
+from ._options import Interrupted
 from ._output import console, say, show_paths, show_table, write
 from ._plan import FitRequest, Plan, plan_of
 from ._report_html import report_page

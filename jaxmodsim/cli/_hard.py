@@ -8,8 +8,8 @@ from typing import Any
 import pandas as pd
 
 from ..plot import hard_figure, step_limits_figure
-from ..validation.hard import WAYS, HardCase, Verdict, check_many, choose
-from ._interrupted import Interrupted
+from ..validation.hard import TRANSFORMS, CaseReport, HardCase, check_many, choose
+from ._options import Interrupted
 from ._output import console, say, show_paths, show_table, write
 
 _VALUES, _SLOPES = ("alone", "jit", "vmap"), ("forward", "reverse")
@@ -21,7 +21,7 @@ class HardRequest:
 
     names: tuple[str, ...]
     list_only: bool
-    ways: str
+    transforms: str
     jobs: int
     out: Path
 
@@ -31,19 +31,19 @@ def report_hard(request: HardRequest) -> bool:
 
     **Raises:**
 
-    - `ValueError` for names and ways that are none.
+    - `ValueError` for names and transforms that are none.
     - `Interrupted` after Ctrl-C, once what was found is written.
     """
     cases = choose(request.names)
     if request.list_only:
         show_table(_catalogue(list(cases.values())), f"{len(cases)} hard cases")
         return True
-    ways = WAYS if request.ways == "all" else tuple(request.ways.split(","))
-    verdicts: dict[str, Verdict] = {}
+    transforms = TRANSFORMS if request.transforms == "all" else tuple(request.transforms.split(","))
+    verdicts: dict[str, CaseReport] = {}
     stopped = False
     with console.status("hard cases") as status:
         try:
-            for verdict in check_many(request.names, ways=ways, jobs=request.jobs):
+            for verdict in check_many(request.names, transforms=transforms, jobs=request.jobs):
                 verdicts[verdict.case.name] = verdict
                 done = f"{len(verdicts)} of {len(cases)}: {verdict.case.name}: {'pass' if verdict.ok else 'FAIL'}"
                 status.update(done)
@@ -58,7 +58,7 @@ def report_hard(request: HardRequest) -> bool:
     return all(verdict.ok for verdict in found)
 
 
-def _report(found: list[Verdict], out: Path, *, whole: bool) -> None:
+def _report(found: list[CaseReport], out: Path, *, whole: bool) -> None:
     if not found:
         return
     table = hard_table(found)
@@ -74,13 +74,13 @@ def _report(found: list[Verdict], out: Path, *, whole: bool) -> None:
     for verdict in found:
         for finding in verdict.findings:
             if not finding.ok:
-                text = f"FAIL: {verdict.case.name}, {finding.way}, {finding.dtype}: {finding.sentence}"
+                text = f"FAIL: {verdict.case.name}, {finding.transform}, {finding.dtype}: {finding.sentence}"
                 console.print(text, highlight=False, markup=False, soft_wrap=True)
     passed = sum(verdict.ok for verdict in found)
     console.print(f"{passed} of {len(found)} cases pass.")
 
 
-def hard_table(found: list[Verdict]) -> pd.DataFrame:
+def hard_table(found: list[CaseReport]) -> pd.DataFrame:
     """A row for each case: the worst errors of values, derivatives and energy, 1 being the limit."""
     return pd.DataFrame(
         [
@@ -100,20 +100,20 @@ def hard_table(found: list[Verdict]) -> pd.DataFrame:
     )
 
 
-def _worst(verdict: Verdict, dtype: str, ways: tuple[str, ...]) -> str:
+def _worst(verdict: CaseReport, dtype: str, transforms: tuple[str, ...]) -> str:
     """Largest error; in words where there is none to compute."""
-    ran = [each for each in verdict.findings if each.dtype == dtype and each.way in ways]
+    ran = [each for each in verdict.findings if each.dtype == dtype and each.transform in transforms]
     if not ran:
         return "-"
-    error = verdict.worst(dtype, ways)
+    error = verdict.worst(dtype, transforms)
     if not math.isnan(error):
         return f"{error:.1g}"
-    if verdict.case.undefined and ways == _SLOPES:
+    if verdict.case.undefined and transforms == _SLOPES:
         return "flagged"
     return "named" if all(each.ok for each in ran) else "FAIL"
 
 
-def _entry(verdict: Verdict) -> dict[str, Any]:
+def _entry(verdict: CaseReport) -> dict[str, Any]:
     case = verdict.case
     return {
         "family": case.family,
@@ -122,7 +122,7 @@ def _entry(verdict: Verdict) -> dict[str, Any]:
         "asks": case.asks,
         "tolerance": case.tolerance,
         "ok": verdict.ok,
-        "left out": dict(case.leaves),
+        "left out": dict(case.skips),
         "findings": [asdict(finding) for finding in verdict.findings],
     }
 

@@ -5,6 +5,11 @@ from typing import Annotated
 
 import typer
 
+
+class Interrupted(Exception):
+    """Ctrl-C, after which what had been computed was written; the text says so."""
+
+
 Out = Annotated[Path, typer.Option(help="Folder for figures, tables and JSON; made if it is not there.")]
 
 # Panels of `jaxmodsim fit --help`.

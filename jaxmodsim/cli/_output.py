@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from .._core.jsonable import jsonable
+from .._core.files import jsonable
 from ..identify import FitResult, InputDesign
 from ..plot import Figure
 
@@ -62,11 +62,12 @@ def show_table(frame: pd.DataFrame, title: str) -> None:
         words = not pd.api.types.is_numeric_dtype(frame[column])
         table.add_column(escape(str(column)), justify="left" if words else "right", overflow="fold")
     for row in frame.itertuples(index=False):
-        table.add_row(*(escape(_cell(value)) for value in row))
+        table.add_row(*(escape(cell(value)) for value in row))
     console.print(table)
 
 
-def _cell(value: Any) -> str:
+def cell(value: object) -> str:
+    """A value as tables show it: five digits, a dash for NaN."""
     if isinstance(value, float):
         return "-" if math.isnan(value) else f"{value:.5g}"
     return str(value)

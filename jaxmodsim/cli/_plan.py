@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .._core.suggest import nearest
+from .._core.arguments import nearest
 from ..identify import (
     AXIS_MODELS,
     Candidate,

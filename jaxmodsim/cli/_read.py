@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from .._core.suggest import nearest
+from .._core.arguments import nearest
 from ..identify import Record
 
 
@@ -69,7 +69,7 @@ def read_record(path: Path, columns: AxisColumns, name: str | None = None) -> Re
     return Record(t, q, {"u": columns.force_gain * u}, name=name or path.stem)
 
 
-def _column(table: Mapping[str, Any], path: Path, option: str, name: str) -> np.ndarray:
+def _column(table: Mapping[str, object], path: Path, option: str, name: str) -> np.ndarray:
     if name not in table:
         near = nearest(name, table)
         hint = f" Did you mean --{option} {near}?" if near else ""

@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 
 from ..plot import ramp_figure, stick_figure
+from ..validation.testbench import RampResult, ramp_cases, run_ramp, stick_sweep
 from ._output import console, show_paths, show_table, write
-from ._testbench import Measured, cases, run_case, stick_sweep
 
 PARTS = {
     "a": "a: Coulomb friction by sign(v)",
@@ -28,9 +28,9 @@ def testbench_files() -> dict[str, Any]:
     """Run the bench and print its tables; returns figures, tables and JSON by file name."""
     measured = []
     with console.status("") as status:
-        for case in cases():
+        for case in ramp_cases():
             status.update(f"{case.part}: {case.label}")
-            measured.append(run_case(case))
+            measured.append(run_ramp(case))
         status.update("LuGre over sigma0 and sigma1")
         sweep = stick_sweep()
     table, grid = _table(measured), _grid(sweep)
@@ -56,7 +56,7 @@ def testbench_files() -> dict[str, Any]:
     return files
 
 
-def _table(measured: list[Measured]) -> pd.DataFrame:
+def _table(measured: list[RampResult]) -> pd.DataFrame:
     return pd.DataFrame(
         {
             "part": [m.case.part for m in measured],
@@ -85,7 +85,7 @@ def _grid(sweep: dict[str, Any]) -> pd.DataFrame:
     )
 
 
-def _curves(measured: list[Measured]) -> pd.DataFrame:
+def _curves(measured: list[RampResult]) -> pd.DataFrame:
     """Every curve of the figures, one row for each model and time."""
     return pd.concat(
         pd.DataFrame(

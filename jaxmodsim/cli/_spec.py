@@ -3,34 +3,72 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from pydantic import Field
 
 from ..scene import Scene
 from ..simulation import Trajectory, named_series
 from ..sweeps import latin_hypercube, sobol
+from . import _table
 from ._spec_scene import read_system
-from ._table import LIST, NUMBER, NUMBERS, SEED, SWITCH, TABLE, TEXT, WHOLE, Kind, Table, one_of, read_table
 
-_RUN: dict[str, Kind] = {
-    "q0": NUMBERS,
-    "qd0": NUMBERS,
-    "t0": NUMBER,
-    "t1": NUMBER,
-    "rtol": NUMBER,
-    "atol": NUMBER,
-    "dt": NUMBER,
-    "dtmax": NUMBER,
-    "max_steps": WHOLE,
-    "max_events": WHOLE,
-    "hold_chatter": SWITCH,
-    "project": SWITCH,
-}
-_SPAN = ("from", "to", "count", "spacing")
 _SAMPLERS: dict[str, Callable[..., dict[str, np.ndarray]]] = {"latin_hypercube": latin_hypercube, "sobol": sobol}
+
+
+class _SpecTable(_table.AbstractTable):
+    scene: _table.Table
+    over: _table.Table
+    run: _table.Table = Field({})
+    observe: _table.Table | None = None
+
+
+class _RunTable(_table.AbstractTable):
+    q0: _table.Numbers | None = None
+    qd0: _table.Numbers | None = None
+    t0: _table.Number | None = None
+    t1: _table.Number | None = None
+    ts: _table.Numbers | _table.Table | None = None
+    rtol: _table.Number | None = None
+    atol: _table.Number | None = None
+    dt: _table.Number | None = None
+    dtmax: _table.Number | None = None
+    max_steps: _table.Whole | None = None
+    max_events: _table.Whole | None = None
+    hold_chatter: _table.Switch | None = None
+    project: _table.Switch | None = None
+
+
+class _TimesTable(_table.AbstractTable):
+    start: _table.Number
+    stop: _table.Number
+    count: _table.Whole
+
+
+class _SpanTable(_table.AbstractTable):
+    low: _table.Number = Field(alias="from")
+    to: _table.Number
+    count: _table.Whole
+    spacing: Literal["linear", "log"] = "linear"
+
+
+class _SamplesTable(_table.AbstractTable):
+    latin_hypercube: _table.Table | None = None
+    sobol: _table.Table | None = None
+    count: _table.Whole
+    seed: _table.Seed = 0
+
+
+class _ObservedTable(_table.AbstractTable):
+    of: _table.Text
+    take: Literal["end", "max", "min", "mean", "rms", "peak", "ptp"] | None = None
+    unit: _table.Text | None = None
+
+
+_SPAN = tuple(field.alias or name for name, field in _SpanTable.model_fields.items())
 
 
 @dataclass(frozen=True)
@@ -53,87 +91,74 @@ def read_spec(path: Path) -> Spec:
 
     - `ValueError` for a mistake in it, as one sentence with the table and the key.
     """
-    whole = read_table(path)
-    scene, over = whole.table("scene", needed=True), whole.table("over", needed=True)
-    run, observe = whole.table("run"), whole.table("observe")
-    whole.close()
-    assert scene is not None
-    assert over is not None
-    arguments = {} if run is None else _run(run)
-    system = read_system(scene, path.parent)
-    kept = None if observe is None else _observe(observe, "ts" in arguments or not isinstance(system, Scene))
-    return Spec(system, {name: _dimension(over, name) for name in over.keys}, kept, arguments)
+    file, name = _table.read_toml(path), path.name
+    whole = _table.read_table(_SpecTable, file, name)
+    arguments = _run(whole.run, _table.inner(name, "run"))
+    system = read_system(whole.scene, _table.inner(name, "scene"), path.parent)
+    over = _table.inner(name, "over")
+    dimensions = {key: _dimension(key, given, over) for key, given in whole.over.items()}
+    along = "ts" in arguments or not isinstance(system, Scene)
+    kept = None if whole.observe is None else _observe(whole.observe, _table.inner(name, "observe"), along)
+    return Spec(system, dimensions, kept, arguments)
 
 
-def _run(table: Table) -> dict[str, Any]:
-    given = {name: table.take(name, kind) for name, kind in _RUN.items()}
-    ts = table.take("ts", NUMBERS, TABLE)
-    table.close()
+def _run(content: dict[str, Any], where: str) -> dict[str, Any]:
+    arguments = _table.read_table(_RunTable, content, where).model_dump(exclude_none=True)
+    ts = arguments.get("ts")
     if isinstance(ts, dict):
-        even = table.inner("ts", ts)
-        start, stop = (even.take(name, NUMBER, needed=True) for name in ("start", "stop"))
-        count = even.take("count", WHOLE, needed=True)
-        even.close()
-        ts = np.linspace(start, stop, count)
-    if ts is not None:
-        given["ts"] = np.asarray(ts, float)
-    return {name: value for name, value in given.items() if value is not None}
+        times = _table.read_table(_TimesTable, ts, _table.inner(where, "ts"))
+        ts = np.linspace(times.start, times.stop, times.count)
+    return arguments if ts is None else {**arguments, "ts": np.asarray(ts, float)}
 
 
-def _dimension(over: Table, name: str) -> Any:
+def _dimension(name: str, given: object, over: str) -> Any:
     """Values of a dimension, or of several numbers that change along it."""
-    given = over.take(name, LIST, TABLE)
     if isinstance(given, list):
         return given
-    table = over.inner(name, given)
+    if not isinstance(given, dict):
+        raise ValueError(f"{over}: {name} must be a list or a table, but {given!r} was given.")
+    where = _table.inner(over, name)
     if any(sampler in given for sampler in _SAMPLERS):
-        return _sample(table)
+        return _sample(_table.read_table(_SamplesTable, given, where), where)
     if any(key in given for key in _SPAN):
-        return _span(table)
+        return _span(_table.read_table(_SpanTable, given, where), where)
     for each, values in given.items():
         if not isinstance(values, list):
-            raise table.refusal(
-                f"{each} must be a list, as numbers that change together are, but {values!r} was given; a dimension has"
-                f" {', '.join(_SPAN)} or latin_hypercube, and names with a dot stand in quotes."
+            raise ValueError(
+                f"{where}: {each} must be a list, as numbers that change together are, but {values!r} was given; a"
+                f" dimension has {', '.join(_SPAN)} or latin_hypercube, and names with a dot stand in quotes."
             )
     return given
 
 
-def _span(table: Table) -> np.ndarray:
-    low, high = (table.take(key, NUMBER, needed=True) for key in ("from", "to"))
-    count = table.take("count", WHOLE, needed=True)
-    spacing = table.take("spacing", one_of(("linear", "log")))
-    table.close()
-    if spacing != "log":
-        return np.linspace(low, high, count)
-    if min(low, high) <= 0:
-        raise table.refusal(f"from and to must be > 0 for spacing = 'log', but they are {low:g} and {high:g}.")
-    return np.geomspace(low, high, count)
+def _span(span: _SpanTable, where: str) -> np.ndarray:
+    if span.spacing == "linear":
+        return np.linspace(span.low, span.to, span.count)
+    if min(span.low, span.to) <= 0:
+        raise ValueError(
+            f"{where}: from and to must be > 0 for spacing = 'log', but they are {span.low:g} and {span.to:g}."
+        )
+    return np.geomspace(span.low, span.to, span.count)
 
 
-def _sample(table: Table) -> dict[str, np.ndarray]:
-    kinds = {name: table.take(name, TABLE) for name in _SAMPLERS}
-    count, seed = table.take("count", WHOLE, needed=True), table.take("seed", SEED)
-    table.close()
-    chosen = {name: ranges for name, ranges in kinds.items() if ranges is not None}
+def _sample(samples: _SamplesTable, where: str) -> dict[str, np.ndarray]:
+    chosen = {name: ranges for name in _SAMPLERS if (ranges := getattr(samples, name)) is not None}
     if len(chosen) > 1:
-        raise table.refusal(f"{' and '.join(chosen)} are given; one of them draws the samples.")
+        raise ValueError(f"{where}: {' and '.join(chosen)} are given; one of them draws the samples.")
     ((name, ranges),) = chosen.items()
     spans = {key: tuple(span) if isinstance(span, list) else span for key, span in ranges.items()}
     try:
-        return _SAMPLERS[name](spans, count, seed=seed or 0)
+        return _SAMPLERS[name](spans, samples.count, seed=samples.seed)
     except ValueError as error:
-        raise table.refusal(f"{name}: {error}") from error
+        raise ValueError(f"{where}: {name}: {error}") from error
 
 
 @dataclass(frozen=True)
 class Reduced:
     """One number of an observable along a run.
 
-    - `of`: its name; `take`: which number, one of `WORDS`. Means are over time, by the trapezoidal rule.
+    - `of`: its name; `take`: which number, as in `_ObservedTable`. Means are over time, by the trapezoidal rule.
     """
-
-    WORDS: ClassVar[tuple[str, ...]] = ("end", "max", "min", "mean", "rms", "peak", "ptp")
 
     of: str
     take: str
@@ -151,22 +176,22 @@ class Reduced:
         return {"max": jnp.max, "min": jnp.min, "ptp": jnp.ptp}[self.take](x)
 
 
-def _observe(table: Table, along: bool) -> dict[str, Any]:
+def _observe(content: dict[str, Any], where: str, along: bool) -> dict[str, Any]:
     """What is kept of each run; `along` says whether the run may be known over time."""
     kept: dict[str, Any] = {}
-    for name in table.keys:
-        given = table.take(name, TEXT, TABLE)
+    for name, given in content.items():
         if isinstance(given, str):
             kept[name] = given
             continue
-        each = table.inner(name, given)
-        of, take = each.take("of", TEXT, needed=True), each.take("take", one_of(Reduced.WORDS))
-        unit = each.take("unit", TEXT)
-        each.close()
-        if take not in (None, "end") and not along:
-            raise each.refusal(f"take = {take!r} needs the run over time, but [run] has no ts.")
-        what = of if take is None else Reduced(of, take)
-        kept[name] = what if unit is None else (what, unit)
+        if not isinstance(given, dict):
+            raise ValueError(f"{where}: {name} must be text or a table, but {given!r} was given.")
+        asked = _table.read_table(_ObservedTable, given, _table.inner(where, name))
+        if asked.take not in (None, "end") and not along:
+            raise ValueError(
+                f"{_table.inner(where, name)}: take = {asked.take!r} needs the run over time, but [run] has no ts."
+            )
+        what = asked.of if asked.take is None else Reduced(asked.of, asked.take)
+        kept[name] = what if asked.unit is None else (what, asked.unit)
     if not kept:
-        raise table.refusal('it is empty; name what to keep, as in v_end = "qd[0]".')
+        raise ValueError(f'{where}: it is empty; name what to keep, as in v_end = "qd[0]".')
     return kept

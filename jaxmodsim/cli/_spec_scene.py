@@ -3,16 +3,17 @@
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import create_model
 
 from .. import friction, problems
-from .._core.suggest import did_you_mean
+from .._core.arguments import did_you_mean
 from ..scene import Scene
-from ._table import TEXT, VALUES, WHOLE, Table
+from ._table import AbstractTable, Table, Text, Values, Whole, inner, read_table
 
 # Under which the file of a SPEC is known as a module.
 MODEL = "jaxmodsim_model"
@@ -40,81 +41,72 @@ LAWS: dict[str, type] = {
 }
 
 
-def read_system(table: Table, folder: Path) -> Scene | Callable[..., Any]:
+class _FileScene(AbstractTable):
+    problem: Text | None = None
+    file: Text
+    object: Text
+
+
+def read_system(content: dict[str, Any], where: str, folder: Path) -> Scene | Callable[..., Any]:
     """The scene, or the function, that a table names. A file that it names is run.
 
     **Arguments:**
 
-    - `table`: with `problem`, its numbers and `law`; or with `file` and `object`.
+    - `content`: with `problem`, its numbers and `law`; or with `file` and `object`.
+    - `where`: the table as errors call it.
     - `folder`: that of the SPEC, to which `file` is relative.
 
     **Raises:**
 
     - `ValueError` for unknown names and wrong numbers, and where the file cannot be run.
     """
-    problem, file = table.take("problem", TEXT), table.take("file", TEXT)
-    if (problem is None) == (file is None):
-        both = "both are given" if problem else "neither is given"
-        raise table.refusal(f"either problem or file says what to sweep, but {both}.")
-    if file is not None:
-        name = table.take("object", TEXT, needed=True)
-        table.close()
-        return _from_file(table, folder / file, name)
-    _check_known(table, "problem", problem, PROBLEMS)
-    return _made(table, PROBLEMS[problem])
+    if ("problem" in content) == ("file" in content):
+        both = "both are given" if "problem" in content else "neither is given"
+        raise ValueError(f"{where}: either problem or file says what to sweep, but {both}.")
+    if "problem" in content:
+        return _made(content, where, "problem", PROBLEMS)
+    asked = read_table(_FileScene, content, where)
+    return _from_file(where, folder / asked.file, asked.object)
 
 
-def _check_known(table: Table, key: str, name: str, known: dict[str, Any]) -> None:
-    if name not in known:
-        raise table.refusal(
-            f"{key} must be one of {', '.join(known)}, but {name!r} was given.{did_you_mean(name, known)}"
-        )
-
-
-def _made(table: Table, maker: Callable[..., Any]) -> Any:
-    """What a constructor makes of the numbers and the law of a table."""
-    given: dict[str, Any] = {}
-    for name, parameter in inspect.signature(maker).parameters.items():
+def _made(content: dict[str, Any], where: str, key: str, makers: Mapping[str, Callable[..., object]]) -> Any:
+    """What the constructor that a table names by `key` makes of the numbers and the law of the table."""
+    name = content.get(key)
+    fields: dict[str, Any] = {key: (Literal[*makers], ...)}
+    if not isinstance(name, str) or name not in makers:
+        read_table(create_model("Kind", __base__=AbstractTable, **fields), content, where)
+    maker = makers[str(name)]
+    for field, parameter in inspect.signature(maker).parameters.items():
         needed = parameter.default is inspect.Parameter.empty
-        if (callable(parameter.default) and not needed) or name == "laws":
+        if (callable(parameter.default) and not needed) or field == "laws":
             continue  # functions, and laws of several places: those need a file
-        if name == "law":
-            inner = table.table(name, needed=needed)
-            value = None if inner is None else _law(inner)
-        elif parameter.annotation is int:
-            value = table.take(name, WHOLE, needed=needed)
-        else:
-            value = table.take(name, VALUES, needed=needed)
-            value = None if value is None else np.asarray(value, float)
-        if value is not None:
-            given[name] = value
-    table.close()
+        kind: Any = Table if field == "law" else Whole if parameter.annotation is int else Values
+        fields[field] = (kind, ...) if needed else (kind | None, None)
+    model = create_model("Made", __base__=AbstractTable, **fields)
+    given = read_table(model, content, where).model_dump(exclude={key}, exclude_none=True)
+    if "law" in given:
+        given["law"] = _made(given["law"], inner(where, "law"), "kind", LAWS)
+    numbers = {field: np.asarray(x, float) if isinstance(x, float | list) else x for field, x in given.items()}
     try:
-        return maker(**given)
+        return maker(**numbers)
     except (ValueError, TypeError) as error:
-        raise table.refusal(str(error)) from error
+        raise ValueError(f"{where}: {error}") from error
 
 
-def _law(table: Table) -> Any:
-    kind = table.take("kind", TEXT, needed=True)
-    _check_known(table, "kind", kind, LAWS)
-    return _made(table, LAWS[kind])
-
-
-def _from_file(table: Table, path: Path, name: str) -> Scene | Callable[..., Any]:
+def _from_file(where: str, path: Path, name: str) -> Scene | Callable[..., Any]:
     """Run a Python file and take an object of it."""
     if not path.is_file():
-        raise table.refusal(f"file {str(path)!r} is not there; it is looked for beside the SPEC.")
+        raise ValueError(f"{where}: file {str(path)!r} is not there; it is looked for beside the SPEC.")
     found = importlib.util.spec_from_file_location(MODEL, path)
     if found is None or found.loader is None:
-        raise table.refusal(f"file must be a Python file, whose name ends in .py, but {path.name!r} was given.")
+        raise ValueError(f"{where}: file must be a Python file, whose name ends in .py, but {path.name!r} was given.")
     module = importlib.util.module_from_spec(found)
     # Some decorators of classes look their module up.
     sys.modules[MODEL] = module
     try:
         found.loader.exec_module(module)
     except Exception as error:  # whatever the file does
-        raise table.refusal(f"running {path.name} failed with {type(error).__name__}: {error}") from error
+        raise ValueError(f"{where}: running {path.name} failed with {type(error).__name__}: {error}") from error
     objects = {
         key: x
         for key, x in vars(module).items()
@@ -122,8 +114,8 @@ def _from_file(table: Table, path: Path, name: str) -> Scene | Callable[..., Any
     }
     if name not in objects:
         there = f"it defines {', '.join(objects)}" if objects else "it defines neither"
-        raise table.refusal(
-            f"object must be a Scene or a function of {path.name}, but {name!r} was given, and {there}."
+        raise ValueError(
+            f"{where}: object must be a Scene or a function of {path.name}, but {name!r} was given, and {there}."
             f"{did_you_mean(name, objects)}"
         )
     return objects[name]

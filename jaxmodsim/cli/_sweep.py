@@ -16,8 +16,8 @@ import pandas as pd
 
 from .._core.speed import tune_cpu
 from ..plot import map2d
-from ..sweeps import Outline, SweepProgress, outline, progress_bar, sweep
-from ._interrupted import Interrupted
+from ..sweeps import SweepPlan, SweepProgress, plan_sweep, progress_bar, sweep
+from ._options import Interrupted
 from ._output import say, show_paths, show_table, write
 from ._spec import Spec, read_spec
 from ._spec_scene import MODEL
@@ -77,12 +77,12 @@ def _run(request: SweepRequest, spec: Spec) -> None:
     arguments: dict[str, Any] = {"chunk": request.chunk, **spec.run}
     drawn = ""
     if request.dry_run or request.figure is not None:
-        laid = outline(spec.system, spec.over, spec.observe, **arguments)
+        laid = plan_sweep(spec.system, spec.over, spec.observe, **arguments)
         drawn = next(iter(laid.variables))
         if request.figure is not None:
             _check_figure(spec, laid, drawn)
         if request.dry_run:
-            _show_outline(laid)
+            _show_plan(laid)
             return
     assert request.out is not None
     seen: list[SweepProgress] = []
@@ -117,7 +117,7 @@ def _run(request: SweepRequest, spec: Spec) -> None:
         show_paths(write(request.figure.parent, {request.figure.name: figure}))
 
 
-def _check_figure(spec: Spec, laid: Outline, name: str) -> None:
+def _check_figure(spec: Spec, laid: SweepPlan, name: str) -> None:
     """Refuse what cannot be drawn before hours are spent on it."""
     dims, _ = laid.variables[name]
     if len(dims) != 2 or len(laid.dims) != 2:
@@ -164,12 +164,12 @@ def _executor(request: SweepRequest) -> Iterator[Any]:
         yield client
 
 
-def _show_outline(laid: Outline) -> None:
+def _show_plan(laid: SweepPlan) -> None:
     dims = [(name, size, ", ".join(laid.swept[name])) for name, size in laid.dims.items()]
     show_table(pd.DataFrame(dims, columns=["dimension", "values", "what changes"]), "What would be swept")
     kept = [(name, " x ".join(dims), unit or "-") for name, (dims, unit) in laid.variables.items()]
     show_table(pd.DataFrame(kept, columns=["variable", "over", "unit"]), "What would be kept")
-    say(f"{laid.lanes:,} runs, in {laid.chunks:,} chunks of up to {laid.lanes_of_chunk:,}; nothing was run.")
+    say(f"{laid.runs:,} runs, in {laid.chunks:,} chunks of up to {laid.runs_per_chunk:,}; nothing was run.")
 
 
 def _show_summary(found: Any, seen: list[SweepProgress], seconds: float, out: Path) -> None:

@@ -1,124 +1,90 @@
-"""Tables of a TOML file, with keys that are checked."""
+"""Tables of a TOML file, read into pydantic models; a mistake is one sentence with the table, the key and the value."""
 
-import math
 import tomllib
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
-from .._core.suggest import did_you_mean, nearest
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from .._core.arguments import did_you_mean, nearest
 
-@dataclass(frozen=True)
-class Kind:
-    """What a value must be, in words and as a test."""
-
-    words: str
-    fits: Callable[[Any], bool]
-
-
-def _is_number(x: Any) -> bool:
-    return isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x)
-
-
-NUMBER = Kind("a finite number", _is_number)
-WHOLE = Kind("a whole number > 0", lambda x: isinstance(x, int) and not isinstance(x, bool) and x > 0)
-SEED = Kind("a whole number >= 0", lambda x: isinstance(x, int) and not isinstance(x, bool) and x >= 0)
-TEXT = Kind("text", lambda x: isinstance(x, str))
-SWITCH = Kind("true or false", lambda x: isinstance(x, bool))
-NUMBERS = Kind("a list of numbers", lambda x: isinstance(x, list) and bool(x) and all(map(_is_number, x)))
-VALUES = Kind("a number or a list of numbers", lambda x: _is_number(x) or NUMBERS.fits(x))
-LIST = Kind("a list", lambda x: isinstance(x, list))
-TABLE = Kind("a table", lambda x: isinstance(x, dict))
+# Types of values; errors call them by the text beside them.
+Number = Annotated[float, "a finite number"]
+Whole = Annotated[int, Field(gt=0), "a whole number > 0"]
+Seed = Annotated[int, Field(ge=0), "a whole number >= 0"]
+Text = Annotated[str, "text"]
+Switch = Annotated[bool, "true or false"]
+Numbers = Annotated[list[float], Field(min_length=1), "a list of numbers"]
+Values = Annotated[float | Annotated[list[float], Field(min_length=1)], "a number or a list of numbers"]
+Table = Annotated[dict[str, Any], "a table"]
 
 
-def one_of(words: Iterable[str]) -> Kind:
-    """One of these words."""
-    known = tuple(words)
-    return Kind(f"one of {', '.join(known)}", lambda x: isinstance(x, str) and x in known)
+class AbstractTable(BaseModel):
+    """What a table may hold: keys that are fields, values of their types as they are, no others."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
-class Table:
-    """A table whose keys are taken one by one; what nobody takes is refused.
+Model = TypeVar("Model", bound=AbstractTable)
+
+
+def read_table(model: type[Model], content: Mapping[str, object], where: str) -> Model:
+    """A table as a model.
 
     - `where`: the table as errors call it, such as `sweep.toml [over.k]`.
-    - `keys`: the keys that are there.
+
+    **Raises:**
+
+    - `ValueError` for an unknown key, a missing one, and a value of another kind.
     """
-
-    def __init__(self, where: str, content: dict[str, Any]) -> None:
-        """Nothing is taken yet."""
-        self.where, self._content, self._taken = where, content, list[str]()
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """The keys that are there."""
-        return tuple(self._content)
-
-    def refusal(self, text: str) -> ValueError:
-        """An error in this table."""
-        return ValueError(f"{self.where}: {text}")
-
-    def take(self, key: str, *kinds: Kind, needed: bool = False) -> Any:
-        """The value of a key, of one of these kinds; None where it is not there.
-
-        **Raises:**
-
-        - `ValueError` if it is of another kind, or missing though `needed`.
-        """
-        self._taken.append(key)
-        words = " or ".join(kind.words for kind in kinds)
-        if key not in self._content:
-            if needed:
-                left = [name for name in self._content if name not in self._taken]
-                misspelt = nearest(key, left)
-                hint = f" {misspelt!r} is there instead." if misspelt else ""
-                raise self.refusal(f"{key} is missing; it must be {words}.{hint}")
-            return None
-        value = self._content[key]
-        if not any(kind.fits(value) for kind in kinds):
-            hint = did_you_mean(value, words.replace(",", "").split()) if isinstance(value, str) else ""
-            raise self.refusal(f"{key} must be {words}, but {value!r} was given.{hint}")
-        return value
-
-    def table(self, key: str, *, needed: bool = False) -> "Table | None":
-        """The table of a key; None where it is not there."""
-        content = self.take(key, TABLE, needed=needed)
-        return None if content is None else self.inner(key, content)
-
-    def inner(self, key: str, content: dict[str, Any]) -> "Table":
-        """A table inside this one."""
-        head, _, inside = self.where.partition(" [")
-        name = f'"{key}"' if not key.replace("_", "").replace("-", "").isalnum() else key
-        return Table(f"{head} [{inside[:-1]}.{name}]" if inside else f"{head} [{name}]", content)
-
-    def close(self) -> None:
-        """Refuse keys that nobody has taken.
-
-        **Raises:**
-
-        - `ValueError` that names one, and the keys that there may be.
-        """
-        known = tuple(dict.fromkeys(self._taken))
-        for key in self._content:
-            if key not in known:
-                allowed = f"; there may be {', '.join(known)}." if known else "."
-                raise self.refusal(f"there is no key {key!r}{allowed}{did_you_mean(key, known)}")
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ValueError(f"{where}: {_sentence(model, content, str(first['loc'][0]), first['type'])}") from None
 
 
-def read_table(path: Path) -> Table:
-    """A TOML file.
+def _sentence(model: type[AbstractTable], content: Mapping[str, object], key: str, kind: str) -> str:
+    fields = {field.alias or name: field for name, field in model.model_fields.items()}
+    if key not in fields:
+        return f"there is no key {key!r}; there may be {', '.join(fields)}.{did_you_mean(key, fields)}"
+    words = _kind_of(fields[key].rebuild_annotation())
+    if kind == "missing":
+        misspelt = nearest(key, [name for name in content if name not in fields])
+        return f"{key} is missing; it must be {words}." + (f" {misspelt!r} is there instead." if misspelt else "")
+    value = content[key]
+    hint = did_you_mean(value, words.replace(",", "").split()) if isinstance(value, str) else ""
+    return f"{key} must be {words}, but {value!r} was given.{hint}"
+
+
+def _kind_of(annotation: Any) -> str:
+    """What a type of values is called."""
+    if get_origin(annotation) is Annotated:
+        return next(text for text in annotation.__metadata__ if isinstance(text, str))
+    if get_origin(annotation) is Literal:
+        return f"one of {', '.join(get_args(annotation))}"
+    return " or ".join(filter(None, map(_kind_of, get_args(annotation))))
+
+
+def inner(where: str, key: str) -> str:
+    """What errors call a table inside the table `where`."""
+    file, _, inside = where.partition(" [")
+    name = key if key.replace("_", "").replace("-", "").isalnum() else f'"{key}"'
+    return f"{file} [{inside[:-1]}.{name}]" if inside else f"{file} [{name}]"
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The content of a TOML file.
 
     **Raises:**
 
     - `ValueError` if it cannot be read.
     """
     try:
-        content = path.read_text(encoding="utf-8")
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path.name} is no TOML: {error}. Names with dots or brackets stand in quotes.") from error
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is no text in UTF-8"
         raise ValueError(f"{path} cannot be read: {reason}.") from error
-    try:
-        return Table(path.name, tomllib.loads(content))
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path.name} is no TOML: {error}. Names with dots or brackets stand in quotes.") from error

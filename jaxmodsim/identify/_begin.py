@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.cores import cores
+from .._core.speed import cores
 from ._bounded import Search, search_start
 from ._problem import Problem
 from ._solve import Options, solve, steps_side_by_side

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .._core.jsonable import jsonable
+from .._core.files import jsonable
 from ._criteria import deviance, effective_samples, penalty
 from ._losses import AbstractLoss
 from ._result import FitResult

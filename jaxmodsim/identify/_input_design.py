@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .._core.jsonable import jsonable
+from .._core.files import jsonable
 
 # Of the relative standard error, above which a number counts as not determined, and of the correlation.
 _VAGUE, _ALIKE = 0.5, 0.98

@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._core.arguments import as_mapping
+from .._core.arguments import as_mapping, did_you_mean
 from .._core.index_check import traced
-from .._core.suggest import did_you_mean
 from ..scene import Scene, State, scene_forces
 from ._record import Record
 

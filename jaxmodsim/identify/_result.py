@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .._core.jsonable import jsonable
+from .._core.files import jsonable
 from ..friction import AbstractLaw
 from ..scene import Scene
 from ._causes import Cause, causes_of

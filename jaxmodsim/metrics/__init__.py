@@ -3,8 +3,8 @@
 from ._amounts import dissipated as dissipated
 from ._amounts import final as final
 from ._amounts import peak as peak
-from ._feature import Feature as Feature
-from ._feature import classes as classes
+from ._metric import Metric as Metric
+from ._metric import classes as classes
 from ._motion import mode_changes as mode_changes
 from ._motion import mode_sequence as mode_sequence
 from ._motion import motion_kind as motion_kind

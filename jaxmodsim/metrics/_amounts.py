@@ -4,17 +4,17 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..simulation import Trajectory, named_series, named_unit
-from ._feature import Feature
+from ._metric import Metric
 
 
-def peak(of: str) -> Feature:
+def peak(of: str) -> Metric:
     """Largest magnitude of a coordinate, velocity or force in a run.
 
     At the saved times `ts`; of a coordinate also where it turns between two of them, by a cubic, and of friction that
     runs by events also just before and after each of these, where it has its peaks.
 
     ```python
-    features.peak("friction")(run), features.peak("qd[0]")(run)
+    metrics.peak("friction")(run), metrics.peak("qd[0]")(run)
     ```
 
     **Arguments:**
@@ -25,7 +25,7 @@ def peak(of: str) -> Feature:
 
     - `ValueError` when called, if the run has nothing of that name.
     """
-    return Feature(f"peak |{of}|", named_unit(of), _peak, (of,))
+    return Metric(f"peak |{of}|", named_unit(of), _peak, (of,))
 
 
 def _peak(run: Trajectory, of: str) -> Array:
@@ -49,11 +49,11 @@ def _turns(t: Array, x: Array, v: Array) -> Array:
     return jnp.where(turns, cubic, 0.0)
 
 
-def final(of: str) -> Feature:
+def final(of: str) -> Metric:
     """Value of a coordinate, velocity or force at the last saved time of a run.
 
     ```python
-    features.final("q[0]")(run)
+    metrics.final("q[0]")(run)
     ```
 
     **Arguments:**
@@ -64,20 +64,20 @@ def final(of: str) -> Feature:
 
     - `ValueError` when called, if the run has nothing of that name.
     """
-    return Feature(f"final {of}", named_unit(of), _final, (of,))
+    return Metric(f"final {of}", named_unit(of), _final, (of,))
 
 
 def _final(run: Trajectory, of: str) -> Array:
     return named_series(run, of)[-1]
 
 
-def dissipated(effect: str | None = None) -> Feature:
+def dissipated(effect: str | None = None) -> Metric:
     """Energy [J] lost in friction from t0 to the last saved time; see `Trajectory.energy`.
 
     Runs the scene once more, with the work integrals beside it.
 
     ```python
-    features.dissipated("friction")(run), features.dissipated()(run)
+    metrics.dissipated("friction")(run), metrics.dissipated()(run)
     ```
 
     **Arguments:**
@@ -88,7 +88,7 @@ def dissipated(effect: str | None = None) -> Feature:
 
     - `ValueError` when called, if the run has no such effect.
     """
-    return Feature("dissipated" if effect is None else f"dissipated in {effect}", "J", _dissipated, (effect,))
+    return Metric("dissipated" if effect is None else f"dissipated in {effect}", "J", _dissipated, (effect,))
 
 
 def _dissipated(run: Trajectory, effect: str | None) -> Array:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..simulation import Trajectory
-from ._feature import Feature
+from ._metric import Metric
 from ._names import changes_of, last_two, magnitude_of, modes_at_ends, needs_modes, slip_of
 from ._times import cycle_of
 
@@ -20,11 +20,11 @@ _LONGER = -1
 _MEND = "tell motions apart by a function of your own, as in classes(fn, names)"
 
 
-def mode_changes(element: str = "friction") -> Feature:
+def mode_changes(element: str = "friction") -> Metric:
     """Number of mode changes of a friction element that runs by events.
 
     ```python
-    features.mode_changes("friction")(run)
+    metrics.mode_changes("friction")(run)
     ```
 
     **Arguments:**
@@ -35,7 +35,7 @@ def mode_changes(element: str = "friction") -> Feature:
 
     - `ValueError` when called, if the run has no such element, or its law does not run by events.
     """
-    return Feature(f"mode changes of {element}", "1", _mode_changes, (element,))
+    return Metric(f"mode changes of {element}", "1", _mode_changes, (element,))
 
 
 def _mode_changes(run: Trajectory, element: str) -> Array:
@@ -43,14 +43,14 @@ def _mode_changes(run: Trajectory, element: str) -> Array:
     return jnp.sum(changes_of(run, element)[1])
 
 
-def stick_share(element: str = "friction", *, since: float | None = None, rest: float | None = None) -> Feature:
+def stick_share(element: str = "friction", *, since: float | None = None, rest: float | None = None) -> Metric:
     """Part of the time that a friction element sticks, between 0 and 1.
 
     Of a law that runs by events from the times of these. Of other laws, or with `rest`, the part of the time between
     saved times `ts` in which the mean slip speed, by trapezoids, is at most `rest`: a step function of all numbers.
 
     ```python
-    features.stick_share("friction", since=10.0)(run), features.stick_share("friction", rest=1e-4)(run)
+    metrics.stick_share("friction", since=10.0)(run), metrics.stick_share("friction", rest=1e-4)(run)
     ```
 
     **Arguments:**
@@ -66,7 +66,7 @@ def stick_share(element: str = "friction", *, since: float | None = None, rest: 
     """
     if rest is not None and not rest > 0:
         raise ValueError(f"rest must be a positive speed, but {rest!r} was given.")
-    return Feature(f"stick share of {element}", "1", _stick_share, (element, since, rest))
+    return Metric(f"stick share of {element}", "1", _stick_share, (element, since, rest))
 
 
 def _stick_share(run: Trajectory, element: str, since: float | None, rest: float | None) -> Array:
@@ -86,10 +86,10 @@ def _stick_share(run: Trajectory, element: str, since: float | None, rest: float
     return stuck / (run.t_end - begin)
 
 
-def mode_sequence(*elements: str, most: int | None = None) -> Feature:
+def mode_sequence(*elements: str, most: int | None = None) -> Metric:
     """An integer for the modes at t0 and the changes that follow; `words` reads it back.
 
-    `mode_sequence("friction").words(value)` is "stick > slip+ > stick"; of several elements "a stick, b slip+ > a
+    `mode_sequence("friction").describe(value)` is "stick > slip+ > stick"; of several elements "a stick, b slip+ > a
     slip-". With E elements, a change is a digit `1 + 3 e + 1 + mode`, and the value `start + 3^E sum of digit_i
     (3 E + 1)^i`, `start` from the modes at t0 in base 3. All runs with more than `most` changes have the value -1; for
     what becomes of them see `motion_kind`.
@@ -115,7 +115,7 @@ def mode_sequence(*elements: str, most: int | None = None) -> Feature:
             f"most must be a number of changes from 1 to {fits}, which is what float64 holds exactly for"
             f" {len(elements)} elements, but {most!r} was given."
         )
-    return Feature(f"mode sequence of {', '.join(elements)}", "1", _sequence, (elements, most), _read_sequence)
+    return Metric(f"mode sequence of {', '.join(elements)}", "1", _sequence, (elements, most), _read_sequence)
 
 
 def _distinct(elements: tuple[str, ...]) -> None:
@@ -168,7 +168,7 @@ def _read_sequence(value: int, elements: tuple[str, ...], most: int) -> str:
     return " > ".join(steps)
 
 
-def motion_kind(*elements: str) -> Feature:
+def motion_kind(*elements: str) -> Metric:
     """What becomes of friction elements in a run, as an integer; `words` reads it back.
 
     - "never slips".
@@ -181,8 +181,8 @@ def motion_kind(*elements: str) -> Feature:
     A run that holds fewer than three cycles is judged by how it ends.
 
     ```python
-    kind = features.motion_kind("friction")
-    kind.words(kind(run))
+    kind = metrics.motion_kind("friction")
+    kind.describe(kind(run))
     ```
 
     **Arguments:**
@@ -199,7 +199,7 @@ def motion_kind(*elements: str) -> Feature:
     _distinct(elements)
     if len(elements) > 10:
         raise ValueError(f"motion_kind tells apart what up to 10 elements do, but {len(elements)} were given.")
-    return Feature(f"motion of {', '.join(elements)}", "1", _kind, elements, _read_kind)
+    return Metric(f"motion of {', '.join(elements)}", "1", _kind, elements, _read_kind)
 
 
 def _kind(run: Trajectory, *elements: str) -> Array:

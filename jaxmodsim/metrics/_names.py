@@ -1,4 +1,4 @@
-"""What features are taken of, by name."""
+"""What metrics are taken of, by name."""
 
 import jax
 import jax.numpy as jnp

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..simulation import Trajectory, named_series
-from ._feature import Feature
+from ._metric import Metric
 from ._names import changes_of, is_exact, last_two, magnitude_of, slip_of
 
 # Periods since the last return after which a cycle has ended.
 _ALIVE = 1.5
 
 
-def break_away(element: str = "friction", *, distance: float | None = None) -> Feature:
+def break_away(element: str = "friction", *, distance: float | None = None) -> Metric:
     """Time [s] at which a friction element breaks away; NaN where it never does.
 
     Of a law that runs by events the first event in which it leaves stick. Other laws creep from the start on: there it
@@ -24,7 +24,7 @@ def break_away(element: str = "friction", *, distance: float | None = None) -> F
     and derivatives are right to no more than their distance over the time since the corner.
 
     ```python
-    features.break_away("friction", distance=5e-3)(run)
+    metrics.break_away("friction", distance=5e-3)(run)
     ```
 
     **Arguments:**
@@ -39,7 +39,7 @@ def break_away(element: str = "friction", *, distance: float | None = None) -> F
     """
     if distance is not None and not (math.isfinite(distance) and distance > 0):
         raise ValueError(f"distance must be a positive number of metres or radians, but {distance!r} was given.")
-    return Feature(f"break-away of {element}", "s", _break_away, (element, distance))
+    return Metric(f"break-away of {element}", "s", _break_away, (element, distance))
 
 
 def _break_away(run: Trajectory, element: str, distance: float | None) -> Array:
@@ -83,7 +83,7 @@ def _crossings(t: Float[Array, " n"], x: Float[Array, " n"]) -> tuple[Array, Arr
     return jnp.where(crosses, t[:-1], 0.0) - before / rise * step, crosses
 
 
-def period(of: str = "friction", *, since: float | None = None, swing: float = 1e-3) -> Feature:
+def period(of: str = "friction", *, since: float | None = None, swing: float = 1e-3) -> Metric:
     """Period [s] of a limit cycle; NaN where there is none.
 
     Of a friction element that runs by events the time between its last two events into stick. Of a coordinate or
@@ -93,7 +93,7 @@ def period(of: str = "friction", *, since: float | None = None, swing: float = 1
     none.
 
     ```python
-    features.period("friction")(run), features.period("q[0]", since=20.0)(run)
+    metrics.period("friction")(run), metrics.period("q[0]", since=20.0)(run)
     ```
 
     **Arguments:**
@@ -110,7 +110,7 @@ def period(of: str = "friction", *, since: float | None = None, swing: float = 1
     """
     if not 0 <= swing < 1:
         raise ValueError(f"swing must be a part of one, 0 <= swing < 1, but {swing!r} was given.")
-    return Feature(f"period of {of}", "s", _period, (of, since, swing))
+    return Metric(f"period of {of}", "s", _period, (of, since, swing))
 
 
 def _period(run: Trajectory, of: str, since: float | None, swing: float) -> Array:

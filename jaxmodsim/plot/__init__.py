@@ -1,6 +1,9 @@
 """Figures. The only part that imports matplotlib; every function returns a `matplotlib.figure.Figure`."""
 
-from matplotlib.figure import Figure as Figure
+try:
+    from matplotlib.figure import Figure as Figure
+except ModuleNotFoundError as error:
+    raise ImportError('jaxmodsim.plot needs matplotlib: pip install "jaxmodsim[plot]".') from error
 
 from ._behaviour import behaviour_figure as behaviour_figure
 from ._comparison import comparison_figure as comparison_figure
@@ -16,7 +19,6 @@ from ._records import score_figure as score_figure
 from ._records import truth_figure as truth_figure
 from ._result import result_figure as result_figure
 from ._sensitivity import sensitivity_figure as sensitivity_figure
-from ._testbench import RampRun as RampRun
 from ._testbench import ramp_figure as ramp_figure
 from ._testbench import stick_figure as stick_figure
 from ._work_precision import work_precision_figure as work_precision_figure

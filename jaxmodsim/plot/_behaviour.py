@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..validation.behaviour import Experiment, Outcome
+from ..validation.behaviour import Experiment, ExperimentResult
 from ._style import BLUE, GREEN, GREY, RED, VERDICTS
 
 
-def behaviour_figure(experiment: Experiment, outcomes: Mapping[str, Outcome], columns: int = 5) -> Figure:
+def behaviour_figure(experiment: Experiment, outcomes: Mapping[str, ExperimentResult], columns: int = 5) -> Figure:
     """An experiment on all laws, a panel for each: its curves, its verdict and its number.
 
     **Arguments:**
@@ -35,17 +35,17 @@ def behaviour_figure(experiment: Experiment, outcomes: Mapping[str, Outcome], co
     shown = {label: line for label, line in handles.items() if not str(label).startswith("_")}
     if shown:
         figure.legend(list(shown.values()), [str(label) for label in shown], loc="outside lower right", ncols=5)
-    limit = f"{'at most' if experiment.limit.at_most else 'at least'} {experiment.limit.value:g}"
+    limit = f"{'at most' if experiment.threshold.at_most else 'at least'} {experiment.threshold.value:g}"
     unit = "" if experiment.unit == "1" else f" [{experiment.unit}]"
     figure.suptitle(f"{experiment.title}\n{experiment.quantity}{unit}: passes with {limit}", fontsize=12)
     return figure
 
 
-def _behaviour_panel(axis: Axes, experiment: Experiment, outcome: Outcome) -> None:
+def _behaviour_panel(axis: Axes, experiment: Experiment, outcome: ExperimentResult) -> None:
     colour = VERDICTS[outcome.verdict]
     colours = iter((BLUE, RED, GREEN, "#7b4fa3") * 2)
     seen: dict[str, str] = {}
-    for line in outcome.finding.lines:
+    for line in outcome.measured.lines:
         label = line.label or "_"
         if line.reference:
             axis.plot(line.x, line.y, color="#c8c8c8", lw=4, label=label, solid_capstyle="round")
@@ -55,11 +55,13 @@ def _behaviour_panel(axis: Axes, experiment: Experiment, outcome: Outcome) -> No
         first = seen[label] == BLUE
         axis.plot(line.x, line.y, color=seen[label], lw=1.3, ls="-" if first else (0, (4, 3)), label=label)
     low, high = experiment.window
-    if outcome.finding.lines and not any(((line.y >= low) & (line.y <= high)).any() for line in outcome.finding.lines):
+    if outcome.measured.lines and not any(
+        ((line.y >= low) & (line.y <= high)).any() for line in outcome.measured.lines
+    ):
         axis.text(0.5, 0.5, "outside this range", transform=axis.transAxes, ha="center", fontsize=9, color=GREY)
     if experiment.log_x:
         axis.set_xscale("log")
     for side in ("top", "right", "bottom", "left"):
         axis.spines[side].set(color=colour, linewidth=1.8)
     axis.tick_params(labelsize=8)
-    axis.set_title(f"{outcome.verdict.value} {outcome.finding.rounded}", fontsize=9, loc="right", color=colour)
+    axis.set_title(f"{outcome.verdict.value} {outcome.measured.rounded}", fontsize=9, loc="right", color=colour)

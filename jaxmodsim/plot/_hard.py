@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..validation.hard import EXPLICIT, Verdict, formulations, largest_step, theory
+from ..validation.hard import EXPLICIT, CaseReport, formulations, largest_step, theory
 from ._style import BLUE, GREEN, GREY, RED
 
 _KINDS = {
@@ -20,7 +20,7 @@ _KINDS = {
 _LEAST = 1e-12
 
 
-def hard_figure(verdicts: Sequence[Verdict]) -> Figure:
+def hard_figure(verdicts: Sequence[CaseReport]) -> Figure:
     """Errors of hard cases in what is admissible, so that 1 is the limit; cases that end by name have none.
 
     **Arguments:**
@@ -30,8 +30,8 @@ def hard_figure(verdicts: Sequence[Verdict]) -> Figure:
     figure = Figure(figsize=(10.0, 1.4 + 0.2 * len(verdicts)), layout="constrained")
     axis = figure.subplots()
     rows = np.arange(len(verdicts))
-    for label, (dtype, ways, colour, marker) in _KINDS.items():
-        errors = np.array([verdict.worst(dtype, ways) for verdict in verdicts])
+    for label, (dtype, transforms, colour, marker) in _KINDS.items():
+        errors = np.array([verdict.worst(dtype, transforms) for verdict in verdicts])
         axis.plot(np.maximum(errors, _LEAST), rows, marker, color=colour, ms=5, label=label, alpha=0.85)
     for row, verdict in zip(rows, verdicts, strict=True):
         if not verdict.ok:
@@ -50,7 +50,7 @@ def hard_figure(verdicts: Sequence[Verdict]) -> Figure:
     return figure
 
 
-def _families(axis: Axes, verdicts: Sequence[Verdict]) -> None:
+def _families(axis: Axes, verdicts: Sequence[CaseReport]) -> None:
     """Lines between families, and their names at the right."""
     names = [verdict.case.family for verdict in verdicts]
     for row, name in enumerate(names):

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, StrMethodFormatter
 
-from .._core.suggest import did_you_mean
+from .._core.arguments import did_you_mean
 from ._style import BLUE, GREEN, RED, with_unit
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _CLASSES = ("#cfdceb", BLUE, "#e3a73f", GREEN, "#8c6bb1", "#5ab4ac", "#b15928", "#666666")
 # Integers without names that are few enough to have an entry of the legend each.
 _FEW = len(_CLASSES)
-# Lanes that failed, by reason, those of the most lanes first; lanes that were not run.
+# Runs that failed, by reason, the most frequent first; runs that were not computed.
 _FAILED, _NOT_RUN = ("#1a1a1a", "#6b4a2b", "#8a8a8a"), "#f6f1dc"
 _CURVES = ("-", "--", ":", "-.")
 # Ratio of the ends of a logarithmic axis up to which its numbers are written out.
@@ -32,7 +32,7 @@ _FEW_DECADES = 300.0
 # A map of more cells than these is an image inside vector graphics.
 _CELLS = 2500
 
-# Codes beside those of runs that failed: a lane that was not run, as in `result`; one that gave no number all the same.
+# Codes beside those of failed runs: a run that was not computed, as in `result`; one that gave no number all the same.
 _UNRUN, _NAN = -1, -2
 
 # Curves over a map: label to x and y.
@@ -68,8 +68,8 @@ def map2d(
 ) -> Figure:
     """A variable of a sweep over two dimensions.
 
-    An axis is logarithmic where its values are more evenly spaced in their logarithms than as they are. Lanes that
-    failed and lanes that were not run have colours of their own, and the legend says how many they are, and why.
+    An axis is logarithmic where its values are more evenly spaced in their logarithms than as they are. Runs that
+    failed and runs that were not computed have colours of their own, and the legend says how many they are, and why.
 
     **Arguments:**
 
@@ -201,7 +201,7 @@ def _scale(axis: Axis, side: _Side) -> None:
 
 
 def _codes(dataset: Any, values: Any) -> np.ndarray:
-    """How each lane of a map ended; of a map of that itself, whether it was run."""
+    """How each run of a map ended; of a map of that itself, whether it was run."""
     result = dataset["result"] if "result" in dataset.data_vars else None
     if result is None or not set(result.dims) <= set(values.dims):
         return np.zeros(values.shape, int)
@@ -249,7 +249,7 @@ def _draw_classes(axes: Axes, across: _Side, up: _Side, cells: np.ndarray, names
 def _draw_failures(
     axes: Axes, across: _Side, up: _Side, codes: np.ndarray, sentences: Mapping[int, str]
 ) -> list[Patch]:
-    """Lanes that have no number, by reason; `codes` are 0 for all others."""
+    """Runs that have no number, by reason; `codes` are 0 for all others."""
     reasons, counts = np.unique(codes[codes != 0], return_counts=True)
     place, entries = np.full(codes.shape, np.nan), []
     failed = sorted(((n, code) for code, n in zip(reasons, counts, strict=True) if code != _UNRUN), reverse=True)

@@ -6,7 +6,7 @@ BLUE, RED, GREY, GREEN = "#1f5fa8", "#c2452d", "#8a8a8a", "#2e8b57"
 VERDICTS = {
     Verdict.PASS: GREEN,
     Verdict.FAIL: RED,
-    Verdict.BY_NATURE: "#b8860b",
+    Verdict.KNOWN_LIMITATION: "#b8860b",
     Verdict.NOT_APPLICABLE: GREY,
 }
 

@@ -1,31 +1,12 @@
 """Figures of the test bench."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from ..validation.testbench import RampRun
 from ._style import BLUE, GREY, RED
-
-
-@dataclass(frozen=True)
-class RampRun:
-    """A run of the ramped box, ready to be drawn.
-
-    - `label`: what was run.
-    - `t`: times [s].
-    - `velocity`: velocity of the box [m/s].
-    - `applied`, `friction`: forces [N].
-    - `note`: a sentence for the figure, such as how the run ended.
-    """
-
-    label: str
-    t: np.ndarray
-    velocity: np.ndarray
-    applied: np.ndarray
-    friction: np.ndarray
-    note: str = ""
 
 
 def ramp_figure(title: str, runs: Sequence[RampRun], zoom: tuple[float, float] = (0.0, 3.0)) -> Figure:

@@ -10,7 +10,7 @@ from ._style import GREY, RED, with_unit
 _MARKERS = "osD^vPX*"
 _LABELS = {
     "run": "time of one run [ms]",
-    "vmap": "time of one run in a vmap of {lanes} [ms]",
+    "vmap": "time of one run in a vmap of {batch} [ms]",
     "forward": "time of the gradient, forward [ms]",
     "reverse": "time of the gradient, reverse [ms]",
 }
@@ -60,7 +60,7 @@ def work_precision_figure(found: WorkPrecision, *, cost: str = "run") -> Figure:
         axes.set(xscale="log", yscale="log", xlabel=f"error of {found.observable}, relative to {_scale(found)} [1]")
         axes.grid(which="major", alpha=0.3)
         _mark_floor(axes, found.disagreement)
-    left.set(ylabel=_LABELS[cost].format(lanes=found.lanes), title="Time: lower left is better")
+    left.set(ylabel=_LABELS[cost].format(batch=found.batch), title="Time: lower left is better")
     right.set(ylabel="evaluations of the field [1]" if counted else "steps [1]", title="Work")
     if any(row.model for row in found.rows):
         handles += left.plot([], [], color=GREY, ls=":", label="error of the model")

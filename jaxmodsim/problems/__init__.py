@@ -6,7 +6,6 @@ from ._ball import bouncing_ball_motion as bouncing_ball_motion
 from ._ball import bouncing_ball_rest as bouncing_ball_rest
 from ._belt import BELT_OSCILLATOR as BELT_OSCILLATOR
 from ._belt import BELT_STRIBECK as BELT_STRIBECK
-from ._belt import BeltCycle as BeltCycle
 from ._belt import belt_coulomb as belt_coulomb
 from ._belt import belt_onset_speed as belt_onset_speed
 from ._belt import belt_oscillator as belt_oscillator
@@ -15,7 +14,6 @@ from ._belt import belt_oscillator_motion as belt_oscillator_motion
 from ._belt import belt_stribeck as belt_stribeck
 from ._belts import COUPLED_BELTS as COUPLED_BELTS
 from ._belts import COUPLED_BELTS_LAWS as COUPLED_BELTS_LAWS
-from ._belts import FirstSlip as FirstSlip
 from ._belts import coupled_belts as coupled_belts
 from ._belts import coupled_belts_first_slip as coupled_belts_first_slip
 from ._box import BOX_LUGRE as BOX_LUGRE
@@ -41,7 +39,6 @@ from ._charged_particle import CHARGED_PARTICLE as CHARGED_PARTICLE
 from ._charged_particle import charged_particle as charged_particle
 from ._charged_particle import charged_particle_acceleration as charged_particle_acceleration
 from ._charged_particle import charged_particle_motion as charged_particle_motion
-from ._foucault import FOUCAULT_PENDULUM as FOUCAULT_PENDULUM
 from ._foucault import foucault_pendulum as foucault_pendulum
 from ._foucault import foucault_pendulum_acceleration as foucault_pendulum_acceleration
 from ._foucault import foucault_pendulum_motion as foucault_pendulum_motion
@@ -55,7 +52,7 @@ from ._knife_edge import knife_edge as knife_edge
 from ._knife_edge import knife_edge_acceleration as knife_edge_acceleration
 from ._knife_edge import knife_edge_force as knife_edge_force
 from ._knife_edge import knife_edge_motion as knife_edge_motion
-from ._named import Case as Case
+from ._named import NamedProblem as NamedProblem
 from ._named import named_problems as named_problems
 from ._pendulum import spherical_pendulum as spherical_pendulum
 from ._pendulum import spherical_pendulum_acceleration as spherical_pendulum_acceleration
@@ -65,10 +62,7 @@ from ._piecewise import LinearStickSlip as LinearStickSlip
 from ._piecewise import StickSlipMotion as StickSlipMotion
 from ._piecewise import stick_slip_motion as stick_slip_motion
 from ._piecewise_scene import linear_stick_slip as linear_stick_slip
-from ._pulled_box import PULLED_BOX as PULLED_BOX
-from ._pulled_box import PULLED_BOX_LUGRE as PULLED_BOX_LUGRE
 from ._pulled_box import pulled_box as pulled_box
-from ._pulled_box import pulled_box_lugre as pulled_box_lugre
 from ._rod_on_floor import ROD_ON_ROUGH_FLOOR as ROD_ON_ROUGH_FLOOR
 from ._rod_on_floor import rod_on_rough_floor as rod_on_rough_floor
 from ._rod_on_floor import rod_on_rough_floor_acceleration as rod_on_rough_floor_acceleration
@@ -81,7 +75,6 @@ from ._rolling_disc import rolling_disc_acceleration as rolling_disc_acceleratio
 from ._rolling_disc import rolling_disc_steady_spin as rolling_disc_steady_spin
 from ._rolling_disc import rolling_disc_velocity as rolling_disc_velocity
 from ._slider_crank import SLIDER_CRANK as SLIDER_CRANK
-from ._slider_crank import SliderCrankForces as SliderCrankForces
 from ._slider_crank import slider_crank as slider_crank
 from ._slider_crank import slider_crank_acceleration as slider_crank_acceleration
 from ._slider_crank import slider_crank_forces as slider_crank_forces
@@ -97,6 +90,7 @@ from ._spring import braked_spring as braked_spring
 from ._spring import braked_spring_law as braked_spring_law
 from ._spring import braked_spring_motion as braked_spring_motion
 from ._spring import braked_spring_rest as braked_spring_rest
+from ._spring import driven_spring as driven_spring
 from ._stick_slip_pendulum import STICK_SLIP_PENDULUM as STICK_SLIP_PENDULUM
 from ._stick_slip_pendulum import stick_slip_pendulum as stick_slip_pendulum
 from ._stick_slip_pendulum import stick_slip_pendulum_turn as stick_slip_pendulum_turn

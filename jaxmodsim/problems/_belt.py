@@ -1,6 +1,6 @@
 """A mass on a spring, carried along by a belt until it slips back, again and again: the stick-slip oscillator."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ class BeltCycle(NamedTuple):
 
 
 def belt_oscillator(
-    law: Any = None,
+    law: object = None,
     *,
     m: ArrayLike = BELT_OSCILLATOR["m"],
     k: ArrayLike = BELT_OSCILLATOR["k"],
@@ -163,7 +163,7 @@ def belt_onset_speed(*, m: ArrayLike, k: ArrayLike, c: ArrayLike, Fc: ArrayLike,
         left = 2.0 * jnp.maximum(log_d, 0.0) + jnp.log1p(one * d * (one * d - 2.0 * zeta))
         return left - 2.0 * zeta / u * angle
 
-    def halve(_: Any, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halve(_: object, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
         middle = 0.5 * (bracket[0] + bracket[1])
         below = gap(middle, fixed) < 0
         return jnp.where(below, middle, bracket[0]), jnp.where(below, bracket[1], middle)

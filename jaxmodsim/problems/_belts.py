@@ -1,6 +1,6 @@
 """Two masses on one belt, each on a spring of its own and coupled by a third."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
@@ -38,7 +38,7 @@ def _second(q: Array) -> Array:
 
 
 def coupled_belts(
-    laws: tuple[Any, Any] | None = None,
+    laws: tuple[object, object] | None = None,
     *,
     m1: ArrayLike = COUPLED_BELTS["m1"],
     m2: ArrayLike = COUPLED_BELTS["m2"],

@@ -3,8 +3,6 @@
 Mass 2 kg, force `ramp * t`, at rest at t = 0, ten seconds (NTNU course TTK4130, exercise 9, problem 2).
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
@@ -31,7 +29,7 @@ def _pull(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     return jnp.reshape(p["ramp"] * t, (1,))
 
 
-def ramped_box(law: Any = None, *, ramp: ArrayLike = 1.0, m: ArrayLike = 2.0) -> Scene:
+def ramped_box(law: object = None, *, ramp: ArrayLike = 1.0, m: ArrayLike = 2.0) -> Scene:
     """Box on a table pulled by the force `ramp * t`.
 
     **Arguments:**

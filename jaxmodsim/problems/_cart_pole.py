@@ -40,7 +40,7 @@ _LAGRANGIAN = _POLE + _cart
 
 
 def cart_pole(
-    law: Any = None,
+    law: object = None,
     *,
     M: ArrayLike = CART_POLE["M"],
     m: ArrayLike = CART_POLE["m"],

@@ -27,7 +27,7 @@ from ._stick_slip_pendulum import STICK_SLIP_PENDULUM, stick_slip_pendulum, stic
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class NamedProblem:
     """A run of a named problem.
 
     - `name`: as in `named_problems`.
@@ -48,9 +48,15 @@ class Case:
     exact: float | None = None
     max_steps: int = 16384
 
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Keyword arguments of `jaxmodsim.work_precision`."""
+        start = {"scene": self.scene, "q0": self.q0, "qd0": self.qd0, "t1": self.t1}
+        return {**start, "observable": self.observable, "reference": self.exact, "name": self.name}
 
-def named_problems() -> dict[str, Callable[[], Case]]:
-    """Functions that make each `Case`, by its name. Nothing is computed before one is called.
+
+def named_problems() -> dict[str, Callable[[], NamedProblem]]:
+    """Functions that make each `NamedProblem`, by its name. Nothing is computed before one is called.
 
     ```python
     case = named_problems()["braked_spring"]()
@@ -68,52 +74,52 @@ def named_problems() -> dict[str, Callable[[], Case]]:
 
 def _case(
     name: str, scene: Scene, q0: ArrayLike | list[float], qd0: ArrayLike | list[float], *rest: Any, **more: Any
-) -> Case:
-    return Case(name, scene, np.asarray(q0, float), np.asarray(qd0, float), *rest, **more)
+) -> NamedProblem:
+    return NamedProblem(name, scene, np.asarray(q0, float), np.asarray(qd0, float), *rest, **more)
 
 
-def _coulomb_box() -> Case:
+def _coulomb_box() -> NamedProblem:
     # At rest until the force reaches Fc = 1.5 N at t = 1.5 s, then v = (t - 1.5)^2/(2 m) under a ramp of 1 N/s.
     exact = (10.0 - 1.5) ** 2 / 4.0
     return _case("coulomb_box", ramped_box(box_coulomb()), [0.0], [0.0], 10.0, "qd[0]", exact)
 
 
-def _lugre_box() -> Case:
+def _lugre_box() -> NamedProblem:
     return _case("lugre_box", ramped_box(box_lugre()), [0.0], [0.0], 10.0, "qd[0]")
 
 
-def _pulled_box() -> Case:
+def _pulled_box() -> NamedProblem:
     return _case("pulled_box", pulled_box(), [0.0], [0.0], 20.0, "q[0]", max_steps=200_000)
 
 
-def _slipping_bristle() -> Case:
+def _slipping_bristle() -> NamedProblem:
     law, v, t1 = box_lugre(), 0.1, 0.05
     force = law.sigma0 * slipping_bristle_deflection(jnp.asarray(t1), law, v) + law.sigma2 * v
     return _case("slipping_bristle", slipping_bristle(law, v), [0.0], [0.0], t1, "friction", float(force))
 
 
-def _braked_spring() -> Case:
+def _braked_spring() -> NamedProblem:
     t1, x0 = 20.0, BRAKED_SPRING["x0"]
     exact = float(braked_spring_motion(jnp.asarray(t1), **BRAKED_SPRING)[0])
     return _case("braked_spring", braked_spring(braked_spring_law()), [x0], [0.0], t1, "q[0]", exact)
 
 
-def _belt_oscillator() -> Case:
+def _belt_oscillator() -> NamedProblem:
     t1 = 5.0
     exact = float(belt_oscillator_motion(jnp.asarray(t1), **BELT_OSCILLATOR)[0])
     return _case("belt_oscillator", belt_oscillator(), [0.0], [BELT_OSCILLATOR["belt"]], t1, "q[0]", exact)
 
 
-def _stribeck_belt() -> Case:
+def _stribeck_belt() -> NamedProblem:
     return _case("stribeck_belt", belt_oscillator(belt_stribeck()), [0.0], [BELT_OSCILLATOR["belt"]], 5.0, "q[0]")
 
 
-def _coupled_belts() -> Case:
+def _coupled_belts() -> NamedProblem:
     belt = COUPLED_BELTS["belt"]
     return _case("coupled_belts", coupled_belts(), [0.0, 0.0], [belt, belt], 4.0, "q[0]")
 
 
-def _stick_slip_pendulum() -> Case:
+def _stick_slip_pendulum() -> NamedProblem:
     """From turn to turn until it sticks, where its weight cannot overcome the friction."""
     p, start = STICK_SLIP_PENDULUM, 1.2
     place, numbers = start, {name: p[name] for name in ("m", "l", "g", "Fc")}
@@ -122,17 +128,17 @@ def _stick_slip_pendulum() -> Case:
     return _case("stick_slip_pendulum", stick_slip_pendulum(), [start], [0.0], 10.0, "q[0]", place)
 
 
-def _cart_pole() -> Case:
+def _cart_pole() -> NamedProblem:
     return _case("cart_pole", cart_pole(Coulomb(Fc=0.3, Fs=0.4)), [0.0, 2.0], [0.0, 0.0], 3.0, "q[1]")
 
 
-def _spherical_pendulum() -> Case:
+def _spherical_pendulum() -> NamedProblem:
     phi, turn, t1 = 1.8, 2.0, 5.0
     exact = float(spherical_pendulum_motion(t1, phi, turn))
     return _case("spherical_pendulum", spherical_pendulum(), [phi, 0.0], [0.0, turn], t1, "q[0]", exact)
 
 
-def _cartesian_spherical_pendulum() -> Case:
+def _cartesian_spherical_pendulum() -> NamedProblem:
     """The spherical pendulum again, its place held on the sphere by a constraint."""
     phi, turn, t1 = 1.8, 2.0, 5.0
     q0, qd0 = [np.sin(phi), 0.0, np.cos(phi)], [0.0, turn * np.sin(phi), 0.0]
@@ -140,29 +146,29 @@ def _cartesian_spherical_pendulum() -> Case:
     return _case("cartesian_spherical_pendulum", cartesian_spherical_pendulum(), q0, qd0, t1, "q[2]", exact)
 
 
-def _double_pendulum() -> Case:
+def _double_pendulum() -> NamedProblem:
     return _case("double_pendulum", double_pendulum(), [2.0, 1.5], [0.0, 0.0], 3.0, "q[1]")
 
 
-def _charged_particle() -> Case:
+def _charged_particle() -> NamedProblem:
     q0, qd0, t1 = [0.3, -0.8, 0.5], [1.2, 0.4, -0.7], 10.0
     motion = charged_particle_motion(jnp.asarray(t1), jnp.asarray(q0), jnp.asarray(qd0), **CHARGED_PARTICLE)
     scene = charged_particle(E=CHARGED_PARTICLE["E"])
     return _case("charged_particle", scene, q0, qd0, t1, "q[0]", float(motion[0][0]))
 
 
-def _knife_edge() -> Case:
+def _knife_edge() -> NamedProblem:
     turn, speed, t1 = 1.7, 0.9, 6.0
     exact = float(knife_edge_motion(jnp.asarray(t1), turn=turn, speed=speed)[0][1])
     return _case("knife_edge", knife_edge(), [0.0, 0.0, 0.0], [speed, 0.0, turn], t1, "q[1]", exact)
 
 
-def _four_bar() -> Case:
+def _four_bar() -> NamedProblem:
     q0, qd0 = four_bar_state(0.7, 8.0)
     return _case("four_bar", four_bar(), q0, qd0, 2.0, "q[2]")
 
 
-_CASES: dict[str, Callable[[], Case]] = {
+_CASES: dict[str, Callable[[], NamedProblem]] = {
     "lugre_box": _lugre_box,
     "pulled_box": _pulled_box,
     "slipping_bristle": _slipping_bristle,

@@ -1,7 +1,5 @@
 """A box on a table, pulled through a spring whose end moves evenly: stick-slip by a bristle."""
 
-from typing import Any
-
 from jaxtyping import Array, ArrayLike
 
 from ..friction import LuGre
@@ -19,7 +17,7 @@ def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
 
 
 def pulled_box(
-    law: Any = None,
+    law: object = None,
     *,
     m: ArrayLike = PULLED_BOX["m"],
     k: ArrayLike = PULLED_BOX["k"],

@@ -1,12 +1,12 @@
 """A mass on a spring with Coulomb friction: it stops after a whole number of half cycles."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..friction import Coulomb
-from ..scene import Friction, Scene
+from ..scene import AppliedForce, Friction, Scene
 
 # A set of numbers with stiction, and what follows from it: 12 half cycles, at rest [s] from BRAKED_SPRING_STOP on.
 BRAKED_SPRING = {"m": 1.3, "k": 2.7, "Fc": 0.11, "Fs": 0.15, "x0": 1.0}
@@ -31,7 +31,7 @@ def braked_spring_law() -> Coulomb:
     return Coulomb(Fc=BRAKED_SPRING["Fc"], Fs=BRAKED_SPRING["Fs"])
 
 
-def braked_spring(law: Any = None, *, m: ArrayLike = BRAKED_SPRING["m"], k: ArrayLike = BRAKED_SPRING["k"]) -> Scene:
+def braked_spring(law: object = None, *, m: ArrayLike = BRAKED_SPRING["m"], k: ArrayLike = BRAKED_SPRING["k"]) -> Scene:
     """Mass on a spring on a rough table.
 
     **Arguments:**
@@ -48,6 +48,29 @@ def braked_spring(law: Any = None, *, m: ArrayLike = BRAKED_SPRING["m"], k: Arra
     """
     friction = () if law is None else (Friction(law),)
     return Scene(_lagrangian, params={"m": m, "k": k}, effects=friction)
+
+
+def _drive(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del t, q, qd
+    return jnp.reshape(p["u"], (1,))
+
+
+def driven_spring(law: object, *, m: ArrayLike = 2.0, k: ArrayLike = 20.0) -> Scene:
+    """Mass on a spring on a rough table under a force, as records are made with.
+
+    **Arguments:**
+
+    - `law`: friction law between mass and table.
+    - `m`: mass [kg], > 0.
+    - `k`: stiffness of the spring [N/m], > 0, relaxed at q = 0.
+
+    **Returns:**
+
+    A `Scene` with one coordinate [m] and the effects `drive`, the force `u` [N] (0 by default; a `Signal` or the input
+    of a `Record` takes its place), and `friction`.
+    """
+    effects = (AppliedForce(_drive, name="drive"), Friction(law))
+    return Scene(_lagrangian, params={"m": m, "k": k, "u": 0.0}, effects=effects)
 
 
 def braked_spring_rest(

@@ -1,7 +1,5 @@
 """A pendulum with dry friction in its joint: it comes to rest anywhere in a range about the bottom."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -19,7 +17,7 @@ def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
 
 
 def stick_slip_pendulum(
-    law: Any = None,
+    law: object = None,
     *,
     m: ArrayLike = STICK_SLIP_PENDULUM["m"],
     l: ArrayLike = STICK_SLIP_PENDULUM["l"],  # noqa: E741 - the symbol of the length
@@ -77,7 +75,7 @@ def stick_slip_pendulum_turn(
     def lack(s: Array, a: Array, ratio: Array) -> Array:
         return ratio - jnp.sin(a - s) * jnp.sinc(s / jnp.pi)
 
-    def halve(_: Any, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halve(_: object, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
         middle = 0.5 * (bracket[0] + bracket[1])
         below = lack(middle, fixed, ratio) < 0
         return jnp.where(below, middle, bracket[0]), jnp.where(below, bracket[1], middle)

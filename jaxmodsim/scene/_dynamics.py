@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._core.cholesky import solve_positive_definite
-from .._core.depends import depends_on
-from .._core.functions import real_array
+from .._core.functions import depends_on, real_array
 from .._core.index_check import traced
 from .._core.safe import safe_norm
 from ..mechanics import (

@@ -15,7 +15,7 @@ from ._scene import Scene
 from .forces._friction import Friction
 
 
-class _Element(NamedTuple):
+class _StepElement(NamedTuple):
     """A friction element at the beginning of a step.
 
     - `effect`: with the law as it is there; `load`: its normal load, or None.
@@ -110,9 +110,9 @@ def scene_step(scene: Scene, t0: Float[Array, ""], t1: Float[Array, ""], y: Stat
     return State(q + h * qd, qd, z), solution.solved
 
 
-def _element(effect: Friction, t0: Array, t1: Array, q: Array, qd: Array, params: PyTree) -> _Element:
+def _element(effect: Friction, t0: Array, t1: Array, q: Array, qd: Array, params: PyTree) -> _StepElement:
     slip = partial(effect.slip, t0, q, params=params)
     planar = jnp.ndim(slip(qd)) > 0
     rows = jax.jacfwd(slip)(qd) if planar else effect.direction(q, params)[None]
     belt = jnp.broadcast_to(effect.belt(t1), (rows.shape[0],))
-    return _Element(effect, effect.load(t0, q, qd, params), rows, belt, planar)
+    return _StepElement(effect, effect.load(t0, q, qd, params), rows, belt, planar)

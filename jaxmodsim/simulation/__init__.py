@@ -2,7 +2,7 @@
 
 from ._accuracy import Accuracy as Accuracy
 from ._consistent import consistent as consistent
-from ._observe import evaluations_per_step as evaluations_per_step
+from ._evaluations import evaluations_per_step as evaluations_per_step
 from ._observe import named_series as named_series
 from ._observe import named_unit as named_unit
 from ._outcome import MAX_STEPS as MAX_STEPS

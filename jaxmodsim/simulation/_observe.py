@@ -2,11 +2,8 @@
 
 import re
 
-import diffrax as dfx
-import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from ..solvers import RODAS5P, Rodas5P
 from ._trajectory import Trajectory
 
 _STATE = re.compile(r"(q|qd)\[(\d+)\]")
@@ -43,18 +40,3 @@ def named_unit(name: str) -> str:
     """Unit of a series; whether a coordinate is a length or an angle, its user knows."""
     state = _STATE.fullmatch(name)
     return "N or N m" if state is None else "m or rad" if state[1] == "q" else "m/s or rad/s"
-
-
-def evaluations_per_step(run: Trajectory, solver: dfx.AbstractSolver) -> int | None:
-    """Evaluations of the vector field in one step of a run; None for methods that iterate, of which it is not fixed.
-
-    Of `Rodas5P` those of its stages, one for the derivative by time, and one for each column of the Jacobian. A stage
-    that is the last one of the step before counts once (`diffrax.Tsit5`).
-    """
-    if isinstance(solver, Rodas5P):
-        return RODAS5P.nodes.size + 1 + sum(x[0].size for x in jtu.tree_leaves((run.q, run.qd, run.z)))
-    if isinstance(solver, dfx.Euler):
-        return 1
-    if not isinstance(solver, dfx.AbstractERK) or not isinstance(solver.tableau, dfx.ButcherTableau):
-        return None
-    return solver.tableau.num_stages - bool(solver.tableau.fsal)

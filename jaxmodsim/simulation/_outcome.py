@@ -83,7 +83,7 @@ class SimulationError(RuntimeError):
     """A run that ended early; the message says how, when, and what to do."""
 
 
-class RunOutcome(eqx.Module):
+class RunResult(eqx.Module):
     """How a run ended.
 
     - `code`: 0 for a run that reached t1; an index into `messages` otherwise. Under `jax.vmap` one per lane.

@@ -18,7 +18,8 @@ from .._core.arguments import as_flag
 from .._core.index_check import check_indices
 from ..scene import Scene
 from ._accuracy import Accuracy, Attempt, CostScaling
-from ._observe import evaluations_per_step, named_series
+from ._evaluations import evaluations_per_step
+from ._observe import named_series
 from ._outcome import SUCCESS, SimulationError, describe_failure
 from ._run_request import RunRequest, is_known
 from ._solve import RunInputs, RunOptions, RunOutput, default_solver, solve
@@ -84,7 +85,7 @@ class _TrialRun:
     @property
     def evaluations(self) -> int | None:
         """Evaluations of the vector field in one step."""
-        return evaluations_per_step(self.run, self.solver)
+        return evaluations_per_step(self.solver, self.run)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ..scene import ConstraintReaction, Scene, State, scene_forces, scene_reacti
 from ..solvers import EventLog
 from ._accuracy import Accuracy
 from ._energy_ledger import EnergyLedger, event_losses, ledger
-from ._outcome import RunOutcome, outcome_messages
+from ._outcome import RunResult, outcome_messages
 from ._run_request import is_known
 from ._solve import RunInputs, RunOptions, RunOutput, solve_logged
 
@@ -110,9 +110,9 @@ class Trajectory:
         return self.t[..., -1] if self.end is None else self.end
 
     @property
-    def result(self) -> RunOutcome:
+    def result(self) -> RunResult:
         """How the run ended: `run.result.ok`, `run.result.message`."""
-        return RunOutcome(self.code, outcome_messages(self.scene, self.q.shape[-1]))
+        return RunResult(self.code, outcome_messages(self.scene, self.q.shape[-1]))
 
     @property
     def forces(self) -> dict[str, Array]:

@@ -4,11 +4,10 @@ from ._estimates import Estimate as Estimate
 from ._global import GlobalSensitivity as GlobalSensitivity
 from ._indices import global_sensitivity as global_sensitivity
 from ._observe import Derivative as Derivative
-from ._outline import Outline as Outline
-from ._outline import outline as outline
+from ._plan import SweepPlan as SweepPlan
+from ._plan import plan_sweep as plan_sweep
 from ._progress import SweepProgress as SweepProgress
 from ._progress import progress_bar as progress_bar
-from ._samples import Span as Span
 from ._samples import latin_hypercube as latin_hypercube
 from ._samples import sobol as sobol
 from ._sweep import sweep as sweep

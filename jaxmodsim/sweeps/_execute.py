@@ -10,11 +10,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._core.cores import cores
+from .._core.speed import cores
 from ._compute import Computed, Work, compute
 from ._extra import extra
 
-# A block: its number, the numbers of its lanes, and the order in which they are run.
+# A block: its number, the numbers of its runs, and the order in which they are run.
 Task = tuple[int, dict[str, np.ndarray], np.ndarray]
 # Tasks handed out for each worker: one at work, one waiting.
 _AHEAD = 2
@@ -53,7 +53,7 @@ def in_threads(work: Work, tasks: Iterable[Task], devices: list[Any]) -> Iterato
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def elsewhere(work: Work, tasks: Iterable[Task], executor: Any) -> Iterator[tuple[int, Computed]]:
+def run_on_executor(work: Work, tasks: Iterable[Task], executor: Any) -> Iterator[tuple[int, Computed]]:
     """Run blocks by a `concurrent.futures.Executor` or a `dask.distributed.Client`.
 
     The latter runs those of a lost worker again.

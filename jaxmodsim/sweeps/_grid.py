@@ -1,4 +1,4 @@
-"""What a sweep goes over: dimensions, and the numbers of each lane."""
+"""What a sweep goes over: dimensions, and the numbers of each run."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ RESERVED = ("result", "num_steps", "time")
 
 
 @dataclass(frozen=True)
-class Axis:
+class GridAxis:
     """One dimension: its name, and the numbers that change along it, by name, with the dimension as first axis."""
 
     name: str
@@ -27,9 +27,9 @@ class Axis:
 
 @dataclass(frozen=True)
 class Grid:
-    """The product of all dimensions. Lanes are counted with the last dimension fastest."""
+    """The product of all dimensions. Runs are counted with the last dimension fastest."""
 
-    axes: tuple[Axis, ...]
+    axes: tuple[GridAxis, ...]
 
     @cached_property
     def shape(self) -> tuple[int, ...]:
@@ -38,7 +38,7 @@ class Grid:
 
     @property
     def size(self) -> int:
-        """Number of lanes."""
+        """Number of runs."""
         return prod(self.shape)
 
     @property
@@ -48,11 +48,11 @@ class Grid:
 
     @property
     def first(self) -> dict[str, Any]:
-        """The numbers of the first lane."""
+        """The numbers of the first run."""
         return {name: values[0] for name, values in self.values.items()}
 
-    def lanes(self, index: np.ndarray) -> dict[str, np.ndarray]:
-        """The numbers of the lanes of these indices, by name, each with the lanes as first axis."""
+    def numbers_at(self, index: np.ndarray) -> dict[str, np.ndarray]:
+        """The numbers of the runs of these indices, by name, each with the runs as first axis."""
         places = np.unravel_index(index, self.shape)
         return {
             name: values[place]
@@ -61,7 +61,7 @@ class Grid:
         }
 
 
-def grid(over: Any) -> Grid:
+def grid(over: object) -> Grid:
     """Read what a sweep is to go over.
 
     **Raises:**
@@ -87,7 +87,7 @@ def grid(over: Any) -> Grid:
     return Grid(axes)
 
 
-def _axis(name: Any, given: Any) -> Axis:
+def _axis(name: Any, given: Any) -> GridAxis:
     if not isinstance(name, str):
         raise ValueError(f"over must map names to values, but {name!r} is no name.")
     # A table of pandas is no Mapping, but is read like one.
@@ -101,10 +101,10 @@ def _axis(name: Any, given: Any) -> Axis:
             f"Numbers that change together must be equally many, but over[{name!r}] has {lengths}. Give each a"
             " dimension of its own for all their combinations."
         )
-    return Axis(name, values)
+    return GridAxis(name, values)
 
 
-def _numbers(name: Any, given: Any) -> np.ndarray:
+def _numbers(name: object, given: object) -> np.ndarray:
     if not isinstance(name, str):
         raise ValueError(f"over must map names to values, but {name!r} is no name.")
     try:
@@ -151,14 +151,14 @@ class Blocks:
         )
 
     def index(self, block: int) -> np.ndarray:
-        """Indices of the lanes of a block, in the shape of the block."""
+        """Indices of the runs of a block, in the shape of the block."""
         return np.ravel_multi_index(np.ix_(*(np.arange(p.start, p.stop) for p in self.place(block))), self.shape)
 
 
-def blocks(shape: Sequence[int], lanes: int) -> Blocks:
-    """Cut a grid into blocks of at most so many lanes, whole along the last dimensions and even along the one cut."""
+def blocks(shape: Sequence[int], runs: int) -> Blocks:
+    """Cut a grid into blocks of at most so many runs, whole along the last dimensions and even along the one cut."""
     extent: list[int] = []
     for n in reversed(shape):
-        most = max(lanes // prod(extent), 1)
+        most = max(runs // prod(extent), 1)
         extent.insert(0, -(-n // -(-n // most)))
     return Blocks(tuple(shape), tuple(extent))

@@ -22,10 +22,10 @@ _FEWEST = 8
 
 
 class _Classes(NamedTuple):
-    """Kinds of motion: of each run its label, and of each label its words and its share of the runs, largest first."""
+    """Kinds of motion: of each run its label, and of each label its name and its share of the runs, largest first."""
 
     labels: np.ndarray
-    words: dict[float, str]
+    names: dict[float, str]
     shares: dict[float, float]
 
     @property
@@ -35,8 +35,8 @@ class _Classes(NamedTuple):
 
 
 def global_sensitivity(
-    system: Scene | Callable[..., Any],
-    observe: Mapping[str, Any] | Sequence[str] | str | None,
+    system: Scene | Callable[..., object],
+    observe: Mapping[str, object] | Sequence[str] | str | None,
     ranges: Mapping[str, Span],
     *,
     method: str = "sobol",
@@ -51,7 +51,7 @@ def global_sensitivity(
     ```python
     found = sweeps.global_sensitivity(
         scene,
-        {"period": features.period(), "peak": features.peak("friction")},
+        {"period": metrics.period(), "peak": metrics.peak("friction")},
         {"friction.Fs": (5.0, 9.0), "k": (50.0, 200.0, "log")},
         q0=[0.0], qd0=[0.1], t1=10.0, ts=jnp.linspace(0.0, 10.0, 201), max_events=64,
     )
@@ -90,8 +90,8 @@ def global_sensitivity(
       distribution of `scipy.stats` (by elementary effects one with ends).
     - `method`: `"sobol"` or `"morris"`.
     - `count`: blocks of the design: for Sobol' indices a power of two; for elementary effects, of trajectories, >= 8.
-    - `by`: the name of an observable that says which kind of motion a run has, as `features.motion_kind` or
-      `features.classes` do. By default `motion_kind` of all elements of a scene that run by events; without such, runs
+    - `by`: the name of an observable that says which kind of motion a run has, as `metrics.motion_kind` or
+      `metrics.classes` do. By default `motion_kind` of all elements of a scene that run by events; without such, runs
       are not put into classes.
     - `seed`: of the random numbers.
     - `confidence`: of the intervals, between 0 and 1.
@@ -124,7 +124,7 @@ def global_sensitivity(
     ok = np.asarray(runs["result"]) == 0
     use = np.repeat(ok.reshape(-1, design.block).all(axis=1), design.block)
     _check_losses(runs, ok, use)
-    classes = _classes(values.pop(by), use, getattr(_given(asked, by), "words", None), by) if by else None
+    classes = _classes(values.pop(by), use, getattr(_given(asked, by), "describe", None), by) if by else None
     if not values:
         raise ValueError(f"There is nothing to observe but {by!r}, which says the kind of motion: name a quantity.")
     return _result(method, design, tuple(ranges), runs, values, use, classes, confidence)
@@ -159,7 +159,7 @@ def _values(runs: Any, by: str | None) -> dict[str, np.ndarray]:
         if value.ndim != 1:
             raise ValueError(
                 f"Indices are of one number of each run, but {name!r} has the dimensions {value.dims[1:]} beside:"
-                " observe one of them, as features.final('q[0]') does."
+                " observe one of them, as metrics.final('q[0]') does."
             )
     return {name: np.asarray(value, float) for name, value in values.items()}
 
@@ -170,19 +170,19 @@ def _check_losses(runs: Any, ok: np.ndarray, use: np.ndarray) -> None:
         return
     codes, counts = np.unique(np.asarray(runs["result"])[~ok], return_counts=True)
     sentences = list(runs["result"].attrs.get("flag_meanings", ()))
-    words = [f"{n} x {sentences[c] if 0 <= c < len(sentences) else c}" for c, n in zip(codes, counts, strict=True)]
+    reasons = [f"{n} x {sentences[c] if 0 <= c < len(sentences) else c}" for c, n in zip(codes, counts, strict=True)]
     raise ValueError(
         f"{(~ok).sum()} of {ok.size} runs failed, with which {100 * lost:.0f} % of the design is lost, more than"
-        f" {100 * _LOSS:.0f} %: {' '.join(words)} Narrow the ranges, or mend these runs."
+        f" {100 * _LOSS:.0f} %: {' '.join(reasons)} Narrow the ranges, or mend these runs."
     )
 
 
-def _classes(labels: np.ndarray, use: np.ndarray, words: Callable[[Any], str] | None, by: str) -> _Classes:
+def _classes(labels: np.ndarray, use: np.ndarray, describe: Callable[[object], str] | None, by: str) -> _Classes:
     if not np.isfinite(labels[use]).all():
         raise ValueError(f"by={by!r} is not a number in some runs: it must say a class for each.")
     found, counts = np.unique(labels[use], return_counts=True)
     order = np.argsort(-counts, kind="stable")
-    names = {float(x): f"{by} = {x:g}" if words is None else words(x) for x in found}
+    names = {float(x): f"{by} = {x:g}" if describe is None else describe(x) for x in found}
     return _Classes(labels, names, {float(found[i]): float(counts[i] / use.sum()) for i in order})
 
 
@@ -210,10 +210,10 @@ def _result(
     if classes is not None and several:
         common = classes.common
         for label in common[:1] if len(classes.shares) == 2 else common:
-            membership[classes.words[label]] = design.overall((classes.labels == label).astype(float), use)
+            membership[classes.names[label]] = design.overall((classes.labels == label).astype(float), use)
         for label in common:
             there = use & (classes.labels == label)
-            within[classes.words[label]] = {
+            within[classes.names[label]] = {
                 name: design.within(y, there & np.isfinite(y)) for name, y in values.items()
             }
         crossings = design.crossings(classes.labels, use) if isinstance(design, MorrisDesign) else None
@@ -223,7 +223,7 @@ def _result(
         names,
         confidence,
         overall,
-        {} if classes is None else {classes.words[label]: share for label, share in classes.shares.items()},
+        {} if classes is None else {classes.names[label]: share for label, share in classes.shares.items()},
         membership,
         within,
         crossings,
@@ -256,7 +256,7 @@ def _of_classes(classes: _Classes) -> list[str]:
         f"MORE THAN ONE KIND OF MOTION ({len(classes.shares)}): indices over all runs mix the change from one to"
         " another with changes within them. Read which parameters decide the motion, and the indices within each."
     ]
-    rare = [classes.words[label] for label in classes.shares if label not in classes.common]
+    rare = [classes.names[label] for label in classes.shares if label not in classes.common]
     if rare:
         share = sum(classes.shares[label] for label in classes.shares if label not in classes.common)
         remarks.append(f"Rare, and without indices of their own ({100 * share:.1f} % of the runs): {len(rare)} kinds.")

@@ -8,15 +8,15 @@ import numpy as np
 from ._observe import Derivative
 from ._request import Request
 
-# Of lanes that have not been run.
+# Of runs that have not been run.
 NOT_RUN = -1
 
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable over all lanes.
+    """A variable over all runs.
 
-    - `dims`, `shape`: of what one lane gives, behind those of the sweep.
+    - `dims`, `shape`: of what one run gives, behind those of the sweep.
     """
 
     name: str
@@ -28,7 +28,7 @@ class Variable:
 
 
 @dataclass(frozen=True)
-class Layout:
+class ResultLayout:
     """What a result holds.
 
     - `dims`, `shape`: of the sweep.
@@ -42,7 +42,7 @@ class Layout:
     variables: tuple[Variable, ...]
 
 
-def layout(request: Request) -> Layout:
+def layout(request: Request) -> ResultLayout:
     """Lay out the result of a sweep."""
     dims = tuple(axis.name for axis in request.grid.axes)
     coordinates: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]] = {}
@@ -73,4 +73,4 @@ def layout(request: Request) -> Layout:
     for variable in variables:
         if variable.name in dims or variable.name in coordinates:
             raise ValueError(f"{variable.name!r} names both what is observed and what is swept: rename the former.")
-    return Layout(dims, tuple(request.grid.shape), coordinates, tuple(variables))
+    return ResultLayout(dims, tuple(request.grid.shape), coordinates, tuple(variables))

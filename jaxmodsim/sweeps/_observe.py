@@ -1,4 +1,4 @@
-"""What a sweep observes in each lane."""
+"""What a sweep observes in each run."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ Observable: TypeAlias = Callable[[Trajectory], Any] | str
 
 @dataclass(frozen=True)
 class Derivative:
-    """Derivatives of an observable by numbers of the lane, for `observe` of `sweep`.
+    """Derivatives of an observable by numbers of the run, for `observe` of `sweep`.
 
     ```python
     slopes = jaxmodsim.sweeps.Derivative("qd[0]", ("m", "friction.Fc"))
@@ -64,7 +64,7 @@ class Observation:
         return self.of.of if isinstance(self.of, Derivative) else self.of
 
 
-def observations(observe: Any) -> tuple[Observation, ...]:
+def observations(observe: object) -> tuple[Observation, ...]:
     """Read what a sweep is to observe.
 
     **Raises:**
@@ -83,7 +83,7 @@ def observations(observe: Any) -> tuple[Observation, ...]:
     return tuple(_observation(name, given) for name, given in observe.items())
 
 
-def _observation(name: Any, given: Any) -> Observation:
+def _observation(name: object, given: object) -> Observation:
     unit = None
     if isinstance(given, tuple) and len(given) == 2 and isinstance(given[1], str):
         given, unit = given
@@ -116,7 +116,7 @@ def observed(what: Observation, run: Trajectory, alone: bool) -> Array:
     return real(what.name, of(run))
 
 
-def real(name: str, value: Any) -> Array:
+def real(name: str, value: object) -> Array:
     """As a floating array.
 
     **Raises:**

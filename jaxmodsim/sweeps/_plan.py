@@ -1,100 +1,63 @@
-"""How many steps the lanes of a sweep take, found out by running a few of them first."""
+"""What a sweep would run, without running it."""
 
-from dataclasses import dataclass, replace
-from math import comb
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import prod
 
-import numpy as np
+import jax
 
-from ._compute import Work, compute, lanes_of_call
-from ._grid import Grid
-from ._lane import CAP, out_of_steps
-
-# Part of all lanes that the trial takes at most.
-_SHARE = 16
-# By what the number of steps grows that lanes may take before they are set aside.
-_GROWTH = 8
-# Sweeps of fewer lanes are run without a look ahead.
-_SMALL = 1024
-# Part of the lanes that may come to the cap.
-_LATE = 0.05
-# Lanes of the trial for each coefficient of the prediction.
-_PER_COEFFICIENT = 4
-# Part of the trace that is added to the normal equations, which may be singular.
-_RIDGE = 1e-10
-# Ratio of the largest to the smallest of values that are all positive from which their logarithm counts.
-_WIDE = 5.0
+from ..scene import Scene
+from ._grid import blocks, grid
+from ._layout import layout
+from ._request import request
+from ._sweep import runs_per_block
 
 
 @dataclass(frozen=True)
-class Prediction:
-    """Logarithm of the number of steps as a polynomial in the numbers of a lane.
+class SweepPlan:
+    """What a sweep would run.
 
-    - `names`: of the numbers; `logs`: whether the logarithm is taken; `centre`, `scale`: of each.
-    - `coefficients`: of all products of up to `degree` of them.
+    - `dims`: number of places along each dimension of the sweep.
+    - `swept`: the numbers that change along each.
+    - `runs`: number of runs; `chunks`: in how many chunks, of up to `runs_per_chunk` runs each.
+    - `variables`: dimensions and unit of each variable that would be kept, unit "" where it has none.
     """
 
-    names: tuple[str, ...]
-    logs: tuple[bool, ...]
-    centre: np.ndarray
-    scale: np.ndarray
-    degree: int
-    coefficients: np.ndarray
-
-    def order(self, numbers: dict[str, np.ndarray]) -> np.ndarray:
-        """The lanes, those of the fewest steps first."""
-        x = (_columns(numbers, self.names, self.logs) - self.centre) / self.scale
-        steps = np.einsum("nk,k->n", _products(x, self.degree), self.coefficients)
-        return np.argsort(steps, kind="stable")
+    dims: dict[str, int]
+    swept: dict[str, tuple[str, ...]]
+    runs: int
+    chunks: int
+    runs_per_chunk: int
+    variables: dict[str, tuple[tuple[str, ...], str]]
 
 
-def plan(work: Work, grid: Grid, lanes: int) -> tuple[Work, Prediction | None]:
-    """Choose after how many steps lanes are set aside, and how to sort them; neither where the limit is not known.
+def plan_sweep(
+    system: Scene | Callable[..., object],
+    over: Mapping[str, object],
+    observe: Mapping[str, object] | Sequence[str] | str | None = None,
+    *,
+    chunk: int | None = None,
+    **arguments: object,
+) -> SweepPlan:
+    """Check the arguments of a sweep as `sweep` does, and say what it would run.
 
-    A trial runs as many lanes as one call of compiled code takes in blocks of so many `lanes`: drawn at random, but
-    always the same ones. The results do not depend on it.
+    **Arguments:**
+
+    - `system`, `over`, `observe`, `chunk`: as for `sweep`.
+    - `arguments`: further ones of `sweep` that it passes to `simulate`.
+
+    **Raises:**
+
+    - `ValueError` as `sweep` does, before anything runs.
     """
-    limit = work.lane.max_steps
-    if limit is None:
-        return replace(work, cap=None), None
-    cap = min(CAP, limit)
-    if grid.size < _SMALL:
-        return replace(work, cap=cap), None
-    count = min(lanes_of_call(lanes, work.group), grid.size // _SHARE)
-    drawn = np.unique(np.random.default_rng(0).integers(grid.size, size=count))
-    numbers = grid.lanes(drawn)
-    while True:
-        # Lanes that come to the cap are not run again here.
-        trial = compute(replace(work, lane=work.lane.within(cap), cap=None), numbers, np.arange(drawn.size))
-        if cap == limit or out_of_steps(trial.code).mean() <= _LATE:
-            break
-        cap = min(cap * _GROWTH, limit)
-    return replace(work, cap=cap), _prediction(numbers, trial.num_steps)
-
-
-def _prediction(numbers: dict[str, np.ndarray], steps: np.ndarray) -> Prediction:
-    names = tuple(numbers)
-    logs = tuple(bool(x.min() > 0 and x.max() > _WIDE * x.min()) for x in numbers.values())
-    x = _columns(numbers, names, logs)
-    centre, scale = x.mean(axis=0), np.where(np.ptp(x, axis=0) > 0, np.ptp(x, axis=0), 1.0)
-    x = (x - centre) / scale
-    degree = max(d for d in (0, 1, 2, 3) if comb(x.shape[1] + d, d) * _PER_COEFFICIENT <= steps.size)
-    products = _products(x, degree)
-    # Sums by einsum: threads of a BLAS go on spinning when their work is done, and take the cores from the lanes.
-    square = np.einsum("ni,nj->ij", products, products)
-    square += _RIDGE * np.trace(square) * np.eye(square.shape[0])
-    coefficients = np.linalg.solve(square, np.einsum("ni,n->i", products, np.log(np.maximum(steps, 1))))
-    return Prediction(names, logs, centre, scale, degree, coefficients)
-
-
-def _columns(numbers: dict[str, np.ndarray], names: tuple[str, ...], logs: tuple[bool, ...]) -> np.ndarray:
-    columns = [numbers[name].reshape(numbers[name].shape[0], -1).astype(float) for name in names]
-    return np.concatenate([np.log(x) if log else x for x, log in zip(columns, logs, strict=True)], axis=1)
-
-
-def _products(x: np.ndarray, degree: int) -> np.ndarray:
-    """All products of up to `degree` columns."""
-    parts, last = [np.ones((x.shape[0], 1))], [(np.ones(x.shape[0]), 0)]
-    for _ in range(degree):
-        last = [(product * x[:, i], i) for product, first in last for i in range(first, x.shape[1])]
-        parts += [product[:, None] for product, _ in last]
-    return np.concatenate(parts, axis=1)
+    asked = request(system, grid(over), observe, arguments)
+    cut = blocks(asked.grid.shape, runs_per_block(asked, jax.local_devices()[0].platform, chunk))
+    laid = layout(asked)
+    return SweepPlan(
+        {axis.name: axis.size for axis in asked.grid.axes},
+        {axis.name: tuple(axis.values) for axis in asked.grid.axes},
+        asked.grid.size,
+        len(cut),
+        prod(cut.extent),
+        {x.name: ((*laid.dims, *x.dims), str(x.attrs.get("units", ""))) for x in laid.variables},
+    )

@@ -12,7 +12,7 @@ from ._extra import extra
 class SweepProgress:
     """How far a sweep has come.
 
-    - `done`, `total`: lanes; those that were there already count as done.
+    - `done`, `total`: runs; those that were there already count as done.
     - `failed`: of those done, the ones that ended early.
     """
 

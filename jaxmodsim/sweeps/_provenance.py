@@ -23,7 +23,7 @@ def provenance(request: Request, work: Work, extent: tuple[int, ...]) -> dict[st
     """All that the numbers of a sweep follow from, as values for JSON: where it is the same, so are they."""
     scene, arguments = request.fixed or (None, {})
     numbers = {} if scene is None else scene_numbers(scene)
-    choices = dict(getattr(work.lane, "choices", ()))
+    choices = dict(getattr(work.run, "choices", ()))
     swept = request.grid.values
     return {
         "over": {name: f"{x.shape} {x.dtype} {_digest(x)}" for name, x in swept.items()},
@@ -35,11 +35,11 @@ def provenance(request: Request, work: Work, extent: tuple[int, ...]) -> dict[st
             for path, x in jtu.tree_leaves_with_path({name: value})
         },
         "options": {name: repr(value) for name, value in sorted(choices.items())},
-        "program": program(work.lane, work.fixed, request.grid.first),
+        "program": program(work.run, work.fixed, request.grid.first),
         "versions": package_versions(),
         "backend": jax.default_backend(),
         "chunks": list(extent),
-        "lanes in a group": work.group,
+        "runs in a group": work.group,
     }
 
 
@@ -57,7 +57,7 @@ def describe(request: Request) -> str:
             f"{name}: {type(getattr(effect, 'law', effect)).__name__}"
             for name, effect in zip(scene.names, scene.effects, strict=True)
         )
-    return _called(getattr(request.lane, "function", None))
+    return _called(getattr(request.run, "function", None))
 
 
 def solver_of(request: Request) -> str:
@@ -65,7 +65,7 @@ def solver_of(request: Request) -> str:
     if not request.fixed:
         return ""
     scene, arguments = request.fixed
-    chosen = dict(getattr(request.lane, "choices", ())).get("solver")
+    chosen = dict(getattr(request.run, "choices", ())).get("solver")
     return repr(default_solver(scene, np.size(arguments["q0"]), "dt" in arguments) if chosen is None else chosen)
 
 
@@ -84,15 +84,15 @@ def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
     return found
 
 
-def _called(function: Any) -> str:
+def _called(function: object) -> str:
     function = getattr(function, "fn", function)  # a plain function in a scene is wrapped
     return str(getattr(function, "__qualname__", type(function).__name__))
 
 
-def _digest(x: Any) -> str:
+def _digest(x: object) -> str:
     return hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest()[:16]
 
 
-def _value(x: Any) -> Any:
+def _value(x: object) -> Any:
     x = np.asarray(x)
     return x.tolist() if x.size <= _SHORT else f"{x.shape} {x.dtype} {_digest(x)}"

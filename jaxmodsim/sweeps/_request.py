@@ -9,14 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from .._core.arguments import check_real
-from .._core.suggest import did_you_mean
+from .._core.arguments import check_real, did_you_mean
 from ..scene import Scene, elements, scene_numbers, scene_ranges
 from ..simulation import RunRequest, simulate
 from ._compute import shapes
-from ._grid import Axis, Grid
-from ._lane import AbstractLane, Found, FunctionLane, SceneLane
+from ._grid import Grid, GridAxis
 from ._observe import Derivative, Observation, observations
+from ._run import AbstractRun, FunctionRun, RunOutcome, SceneRun
 
 # Arguments of `simulate` that are numbers. All others are compiled in.
 _NUMBERS = ("q0", "qd0", "t1", "t0", "ts", "z0", "rtol", "atol", "dt", "dtmax")
@@ -30,26 +29,26 @@ _OPTIONS = {name: x.default for name, x in inspect.signature(simulate).parameter
 class Request:
     """A sweep, ready to run.
 
-    - `lane`: what is computed for each lane, and `fixed` the numbers common to all.
+    - `run`: what is computed of one run, and `fixed` the numbers common to all.
     - `grid`: the numbers that differ, in the floating type they are used in.
-    - `shapes`: of what a lane gives.
+    - `shapes`: of what a run gives.
     - `units`: of the numbers that are swept, as far as they are known.
     """
 
-    lane: AbstractLane
+    run: AbstractRun
     fixed: PyTree
     grid: Grid
-    shapes: Found
+    shapes: RunOutcome
     units: dict[str, str]
 
     @property
     def observe(self) -> tuple[Observation, ...]:
-        """What is kept of each lane."""
-        asked = getattr(self.lane, "observe", None)
+        """What is kept of each run."""
+        asked = getattr(self.run, "observe", None)
         return asked if asked is not None else tuple(Observation(name, name, "") for name in self.shapes.values)
 
 
-def request(system: Any, grid: Grid, observe: Any, arguments: Mapping[str, Any]) -> Request:
+def request(system: object, grid: Grid, observe: object, arguments: Mapping[str, object]) -> Request:
     """Check and convert what a sweep is asked for.
 
     **Raises:**
@@ -67,13 +66,13 @@ def request(system: Any, grid: Grid, observe: Any, arguments: Mapping[str, Any])
             " simulate inside the function."
         )
     _check_taken(system, grid.values)
-    lane = FunctionLane(system, None if observe is None else observations(observe))
-    for what in lane.observe or ():
+    run = FunctionRun(system, None if observe is None else observations(observe))
+    for what in run.observe or ():
         if isinstance(what.of, Derivative):
             raise ValueError(f"observe[{what.name!r}]: derivatives are for a Scene; differentiate inside the function.")
     floating = jnp.result_type(float)
-    converted = Grid(tuple(Axis(a.name, {n: x.astype(floating) for n, x in a.values.items()}) for a in grid.axes))
-    return Request(lane, (), converted, shapes(lane, (), converted.first), {})
+    converted = Grid(tuple(GridAxis(a.name, {n: x.astype(floating) for n, x in a.values.items()}) for a in grid.axes))
+    return Request(run, (), converted, shapes(run, (), converted.first), {})
 
 
 def _check_taken(function: Any, names: Iterable[str]) -> None:
@@ -90,11 +89,11 @@ def _check_taken(function: Any, names: Iterable[str]) -> None:
         ) from error
 
 
-def _of_scene(scene: Scene, grid: Grid, observe: Any, arguments: dict[str, Any]) -> Request:
+def _of_scene(scene: Scene, grid: Grid, observe: object, arguments: dict[str, Any]) -> Request:
     arguments = {name: value for name, value in arguments.items() if value is not None}
     for name in arguments:
         if name in ("throw", "adjoint", "scene") or name not in _OPTIONS:
-            hint = ": a lane that fails gets its code" if name == "throw" else ""
+            hint = ": a run that fails gets its code" if name == "throw" else ""
             raise ValueError(f"sweep takes no argument {name!r}{hint}.")
     swept = grid.values
     for name in ("q0", "qd0", "t1"):
@@ -105,8 +104,8 @@ def _of_scene(scene: Scene, grid: Grid, observe: Any, arguments: dict[str, Any])
     numbers, dtype = _fixed(scene, arguments, swept)
     inside, outside = _inside(scene), _outside(numbers)
     _check_names(inside, outside, swept)
-    lane = SceneLane(observations(observe), _choices(arguments))
-    for what in lane.observe:
+    run = SceneRun(observations(observe), _choices(arguments))
+    for what in run.observe:
         if isinstance(what.of, Derivative):
             _check_names(inside, outside, what.of.names, f"observe[{what.name!r}]")
 
@@ -121,22 +120,22 @@ def _of_scene(scene: Scene, grid: Grid, observe: Any, arguments: dict[str, Any])
         return values.astype(inside[name][1] if name in inside else dtype)
 
     converted = Grid(
-        tuple(Axis(a.name, {name: convert(name, x) for name, x in a.values.items()}) for a in grid.axes),
+        tuple(GridAxis(a.name, {name: convert(name, x) for name, x in a.values.items()}) for a in grid.axes),
     )
-    _check_lanes(converted, numbers)
-    # Let `simulate` look at the arguments of the first lane while their values are known.
+    _check_runs(converted, numbers)
+    # Let `simulate` look at the arguments of the first run while their values are known.
     given = numbers | {name: value for name, value in converted.first.items() if name in numbers}
-    RunRequest(scene, **given, **dict(lane.choices)).checked()
+    RunRequest(scene, **given, **dict(run.choices)).checked()
     ranges, units = scene_ranges(scene), dict(_UNITS)
     for name in swept:
         leaf = inside[name][2] if name in inside else name
         if leaf in ranges and ranges[leaf].unit:
             units[name] = ranges[leaf].unit
-    return Request(lane, (scene, numbers), converted, shapes(lane, (scene, numbers), converted.first), units)
+    return Request(run, (scene, numbers), converted, shapes(run, (scene, numbers), converted.first), units)
 
 
-def _check_lanes(grid: Grid, numbers: Mapping[str, Any]) -> None:
-    """Refuse tolerances, steps and times that no lane can run with: compiled code would end all of them over one."""
+def _check_runs(grid: Grid, numbers: Mapping[str, Any]) -> None:
+    """Refuse tolerances, steps and times that no run works with: compiled code would end all of them over one."""
     swept = grid.values
     for names, least in ((("rtol", "atol"), "not be negative"), (("dt", "dtmax"), "be positive")):
         for name in names:
@@ -147,11 +146,11 @@ def _check_lanes(grid: Grid, numbers: Mapping[str, Any]) -> None:
     t0, t1 = (np.atleast_1d(swept[name] if name in swept else numbers[name]) for name in ("t0", "t1"))
     together = any({"t0", "t1"} <= set(axis.values) for axis in grid.axes)
     if (t1 - t0 if together else t1.min() - t0.max()).min() < 0:
-        raise ValueError("t1 must not be before t0 in any lane; numbers that go together share one dimension of over.")
+        raise ValueError("t1 must not be before t0 in any run; numbers that go together share one dimension of over.")
     ts = numbers.get("ts")
     if ts is not None and not (t0.max() <= ts[0] and ts[-1] <= t1.min()):
         raise ValueError(
-            f"ts must lie within [t0, t1] of every lane, from {t0.max():g} to {t1.min():g}, but runs from {ts[0]:g} to"
+            f"ts must lie within [t0, t1] of every run, from {t0.max():g} to {t1.min():g}, but runs from {ts[0]:g} to"
             f" {ts[-1]:g}. Observe the motion at the end, or times as a part of t1 inside a function."
         )
 
@@ -185,7 +184,7 @@ def _fixed(scene: Scene, arguments: dict[str, Any], swept: Mapping[str, np.ndarr
     return {name: np.asarray(value, dtype) for name, value in numbers.items()} | z0, dtype
 
 
-def _choices(arguments: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
+def _choices(arguments: Mapping[str, object]) -> tuple[tuple[str, Any], ...]:
     """Arguments that are compiled in."""
     given = {name: value for name, value in arguments.items() if name not in _NUMBERS}
     for name, value in given.items():
@@ -197,7 +196,7 @@ def _choices(arguments: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
 
 
 def _check_names(
-    inside: Mapping[str, Any], outside: Mapping[str, Any], names: Iterable[str], where: str = "over"
+    inside: Mapping[str, object], outside: Mapping[str, object], names: Iterable[str], where: str = "over"
 ) -> None:
     """Refuse names of nothing, or of two things."""
     for name in names:

@@ -16,7 +16,7 @@ import numpy as np
 from ._compute import Computed
 from ._extra import extra
 from ._grid import Blocks
-from ._layout import NOT_RUN, Layout, Variable
+from ._layout import NOT_RUN, ResultLayout, Variable
 from ._provenance import differences
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class AbstractResults(abc.ABC):
 
     @abc.abstractmethod
     def done(self, block: int) -> np.ndarray | None:
-        """Codes of the lanes of a block that is there already; None where it is not."""
+        """Codes of the runs of a block that is there already; None where it is not."""
 
     @abc.abstractmethod
     def write(self, block: int, computed: Computed) -> None:
@@ -47,7 +47,7 @@ class AbstractResults(abc.ABC):
 class Memory(AbstractResults):
     """Results in the memory of this process."""
 
-    def __init__(self, layout: Layout, blocks: Blocks, attrs: dict[str, Any], provenance: dict[str, Any]) -> None:
+    def __init__(self, layout: ResultLayout, blocks: Blocks, attrs: dict[str, Any], provenance: dict[str, Any]) -> None:
         """Make room for all of them."""
         self._layout, self._blocks = layout, blocks
         self._attrs = attrs | {_ATTRIBUTE: json.dumps(provenance)}
@@ -84,7 +84,7 @@ class Store(AbstractResults):
     """
 
     def __init__(
-        self, path: Path, layout: Layout, blocks: Blocks, attrs: dict[str, Any], provenance: dict[str, Any]
+        self, path: Path, layout: ResultLayout, blocks: Blocks, attrs: dict[str, Any], provenance: dict[str, Any]
     ) -> None:
         """Make the store, or go on with the one that is there."""
         self._path, self._layout, self._blocks = path, layout, blocks
@@ -120,7 +120,7 @@ class Store(AbstractResults):
         return found[[x.name for x in self._layout.variables]]  # a store keeps no order
 
 
-def parts(layout: Layout, blocks: Blocks, block: int, computed: Computed) -> Iterator[tuple[str, np.ndarray]]:
+def parts(layout: ResultLayout, blocks: Blocks, block: int, computed: Computed) -> Iterator[tuple[str, np.ndarray]]:
     """Results of a block by variable, in the shape of the block, `result` last."""
     shape = tuple(place.stop - place.start for place in blocks.place(block))
     for variable in layout.variables:
@@ -145,7 +145,7 @@ def _check_same(path: Path, provenance: dict[str, Any]) -> None:
         )
 
 
-def _create(path: Path, layout: Layout, blocks: Blocks, attrs: dict[str, Any]) -> None:
+def _create(path: Path, layout: ResultLayout, blocks: Blocks, attrs: dict[str, Any]) -> None:
     """Make an empty store, which appears whole."""
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
@@ -167,7 +167,7 @@ def _create(path: Path, layout: Layout, blocks: Blocks, attrs: dict[str, Any]) -
             shutil.rmtree(scratch)
 
 
-def _create_variable(group: Any, x: Variable, layout: Layout, blocks: Blocks) -> None:
+def _create_variable(group: Any, x: Variable, layout: ResultLayout, blocks: Blocks) -> None:
     group.create_array(
         x.name,
         shape=(*layout.shape, *x.shape),

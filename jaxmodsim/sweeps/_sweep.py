@@ -15,12 +15,12 @@ from jaxtyping import ArrayLike
 from .._core.arguments import as_whole
 from .._core.provenance import commit
 from ..scene import Scene
-from ._compute import GROUP, Work, lanes_of_call
-from ._execute import Task, elsewhere, in_threads
+from ._compute import GROUP, Work, runs_per_call
+from ._execute import Task, in_threads, run_on_executor
 from ._extra import extra
 from ._grid import Blocks, blocks, grid
 from ._layout import layout
-from ._plan import Prediction, plan
+from ._predict import Prediction, predict_steps
 from ._progress import Progress, SweepProgress, reporter
 from ._provenance import describe, package_versions, provenance, solver_of
 from ._request import Request, request
@@ -29,30 +29,30 @@ from ._results import AbstractResults, Memory, Store
 if TYPE_CHECKING:
     import xarray as xr
 
-# Lanes of a block: that many take a fraction of a second of short runs, and little room.
-_LANES = 16384
-# A sweep is cut into at least so many blocks, as far as each keeps a group of lanes.
+# Runs of a block: that many take a fraction of a second of short runs, and little room.
+_RUNS = 16384
+# A sweep is cut into at least so many blocks, as far as each keeps a group of runs.
 _BLOCKS = 16
 # Room that the results of a block may take [bytes].
 _ROOM = 64_000_000
-# Lanes of a block on an accelerator, which runs all of them as one.
-_LANES_OF_ACCELERATOR = 1 << 18
+# Runs of a block on an accelerator, which runs all of them as one.
+_RUNS_ON_ACCELERATOR = 1 << 18
 
 
 def sweep(
-    system: Scene | Callable[..., Any],
-    over: Mapping[str, Any],
-    observe: Mapping[str, Any] | Sequence[str] | str | None = None,
+    system: Scene | Callable[..., object],
+    over: Mapping[str, object],
+    observe: Mapping[str, object] | Sequence[str] | str | None = None,
     *,
     q0: ArrayLike | list[float] | None = None,
     qd0: ArrayLike | list[float] | None = None,
     t1: ArrayLike | None = None,
     out: str | PathLike[str] | None = None,
-    executor: Any = None,
-    devices: Sequence[Any] | None = None,
+    executor: object = None,
+    devices: Sequence[object] | None = None,
     chunk: int | None = None,
     progress: bool | Progress = False,
-    **options: Any,
+    **options: object,
 ) -> "xr.Dataset":
     """Run a scene, or any function, for many numbers, on all cores, in bounded memory.
 
@@ -66,14 +66,14 @@ def sweep(
     runs["amplitude"].sel(k=100.0, method="nearest")
     ```
 
-    Lanes are computed in narrow groups that fit the cache, one thread for each core; where a sweep has more than 1024
-    of them, a few are run first, to sort the others by the number of steps that they will take. A lane that takes many
+    Runs are computed in narrow groups that fit the cache, one thread for each core; where a sweep has more than 1024
+    of them, a few are run first, to sort the others by the number of steps that they will take. A run that takes many
     more steps than its neighbours leaves them, and is run again among others like it. The numbers are those of single
     calls of `simulate` to rounding.
 
     **Arguments:**
 
-    - `system`: a `Scene`; or a function that is called with the numbers of a lane by name and returns real numbers, a
+    - `system`: a `Scene`; or a function that is called with the numbers of a run by name and returns real numbers, a
       dictionary of them, or a run (`simulate(..., throw=False)`) that is then observed. Functions must be traceable by
       JAX, and are compared by identity: define them once.
     - `over`: what changes. A name with an array of values is a dimension; all combinations of the dimensions are run. A
@@ -90,14 +90,14 @@ def sweep(
     - `executor`: a `dask.distributed.Client` or a `concurrent.futures.Executor`, to whose workers chunks are sent; by
       default threads of this process.
     - `devices`: JAX devices to share the chunks among; by default all of this process.
-    - `chunk`: largest number of lanes that are computed, sent and written as one; by default up to 16384, fewer where
+    - `chunk`: largest number of runs that are computed, sent and written as one; by default up to 16384, fewer where
       results are large.
     - `progress`: True for a bar, or a function that is called with a `jaxmodsim.sweeps.SweepProgress` after each chunk.
     - `options`: further arguments of `simulate`, `ts` among them, but not `throw` and `adjoint`.
 
     **Returns:**
 
-    An `xarray.Dataset`: what is observed over the dimensions of the sweep (and `time`), NaN where a lane failed;
+    An `xarray.Dataset`: what is observed over the dimensions of the sweep (and `time`), NaN where a run failed;
     `result`, how each ended (0 where all went well; the sentences are in its attribute `flag_meanings`; -1 where it has
     not been run); `num_steps`; and as attributes all that the numbers follow from. With `out` values are read when they
     are asked for. Ctrl-C ends a sweep in memory with what has been run; with `out` it raises, and the next call goes
@@ -114,11 +114,11 @@ def sweep(
     for needed in ("xarray", "zarr"):  # rather now than after the runs
         extra(needed)
     asked = request(system, grid(over), observe, {"q0": q0, "qd0": qd0, "t1": t1, **options})
-    places = list(devices) if devices is not None else jax.local_devices()
-    lanes = lanes_of_block(asked, places[0].platform, chunk)
-    cut = blocks(asked.grid.shape, lanes)
-    group = GROUP if places[0].platform == "cpu" else lanes
-    work = Work(asked.lane, asked.fixed, None, group, jnp.result_type(float) == jnp.float64)
+    places: list[Any] = list(devices) if devices is not None else jax.local_devices()
+    runs = runs_per_block(asked, places[0].platform, chunk)
+    cut = blocks(asked.grid.shape, runs)
+    group = GROUP if places[0].platform == "cpu" else runs
+    work = Work(asked.run, asked.fixed, None, group, jnp.result_type(float) == jnp.float64)
     results = _results(asked, work, cut, out)
     with reporter(progress) as report:
         try:
@@ -126,12 +126,12 @@ def sweep(
         except KeyboardInterrupt:
             if out is not None:
                 raise KeyboardInterrupt(f"Interrupted; call sweep again with out={str(out)!r} to go on.") from None
-            warnings.warn("sweep was interrupted: lanes that have not been run have the result -1.", stacklevel=2)
+            warnings.warn("sweep was interrupted: runs that have not been run have the result -1.", stacklevel=2)
     return results.dataset()
 
 
-def lanes_of_block(asked: Request, platform: str, chunk: int | None) -> int:
-    """Lanes of a block.
+def runs_per_block(asked: Request, platform: str, chunk: int | None) -> int:
+    """Runs of a block.
 
     **Raises:**
 
@@ -141,12 +141,12 @@ def lanes_of_block(asked: Request, platform: str, chunk: int | None) -> int:
         return as_whole(chunk, name="chunk")
     room = sum(np.prod(x.shape, initial=1.0) * x.dtype.itemsize for x in asked.shapes.values.values())
     if platform != "cpu":
-        return max(min(_LANES_OF_ACCELERATOR, int(_ROOM / room)), 1)
+        return max(min(_RUNS_ON_ACCELERATOR, int(_ROOM / room)), 1)
     even = -(-asked.grid.size // (_BLOCKS * GROUP)) * GROUP
-    # Whole calls of compiled code, where there are enough lanes for that.
-    call = lanes_of_call(even, GROUP)
+    # Whole calls of compiled code, where there are enough runs for that.
+    call = runs_per_call(even, GROUP)
     even = -(-even // call) * call
-    return max(min(_LANES, even, int(_ROOM / room)), 1)
+    return max(min(_RUNS, even, int(_ROOM / room)), 1)
 
 
 def _results(asked: Request, work: Work, cut: Blocks, out: Any) -> AbstractResults:
@@ -166,7 +166,7 @@ def _run(
     work: Work,
     cut: Blocks,
     results: AbstractResults,
-    executor: Any,
+    executor: object,
     devices: list[Any],
     report: Progress,
 ) -> None:
@@ -181,9 +181,9 @@ def _run(
     report(SweepProgress(done, asked.grid.size, failed))
     if not left:
         return
-    work, prediction = plan(work, asked.grid, prod(cut.extent))
+    work, prediction = predict_steps(work, asked.grid, prod(cut.extent))
     tasks = _tasks(asked, cut, left, prediction)
-    came = in_threads(work, tasks, devices) if executor is None else elsewhere(work, tasks, executor)
+    came = in_threads(work, tasks, devices) if executor is None else run_on_executor(work, tasks, executor)
     for block, computed in came:
         results.write(block, computed)
         done, failed = done + computed.code.size, failed + int((computed.code != 0).sum())
@@ -193,5 +193,5 @@ def _run(
 def _tasks(asked: Request, cut: Blocks, left: list[int], prediction: Prediction | None) -> Iterator[Task]:
     for block in left:
         index = cut.index(block).ravel()
-        numbers = asked.grid.lanes(index)
+        numbers = asked.grid.numbers_at(index)
         yield block, numbers, np.arange(index.size) if prediction is None else prediction.order(numbers)

@@ -7,11 +7,12 @@ import pytest
 from matplotlib.figure import Figure
 
 from jaxmodsim.cli import _output
-from jaxmodsim.cli._demo import START, TRUTH, sprung_scene, synthetic_record
-from jaxmodsim.cli._testbench import cases, run_case, stick_sweep
+from jaxmodsim.cli._demo import START, TRUTH, synthetic_record
 from jaxmodsim.friction import LuGre
 from jaxmodsim.identify import fit
 from jaxmodsim.plot import fit_figure, ramp_figure, truth_figure
+from jaxmodsim.problems import driven_spring
+from jaxmodsim.validation.testbench import ramp_cases, run_ramp, stick_sweep
 
 
 def test_help_and_usage_errors(run_command):
@@ -34,7 +35,7 @@ def test_an_output_that_fails_leaves_nothing_half_written(tmp_path, monkeypatch)
 
 @pytest.fixture(scope="module")
 def measured():
-    return {case.label: run_case(case) for case in cases()}
+    return {case.label: run_ramp(case) for case in ramp_cases()}
 
 
 def test_testbench_models_do_what_the_exercise_says(measured):
@@ -70,7 +71,7 @@ def test_larger_sigma1_damps_the_oscillation_in_stick():
 
 def test_demo_fit_covers_the_truth_and_figures_have_labelled_axes(measured):
     names = tuple(f"friction.{name}" for name in TRUTH)
-    result = fit(sprung_scene(LuGre(**START)), synthetic_record(), names, q0=[0.0])
+    result = fit(driven_spring(LuGre(**START)), synthetic_record(), names, q0=[0.0])
     for name, true in TRUTH.items():
         # Beyond four standard errors one draw in 16 000.
         assert abs(result.values[f"friction.{name}"] - true) < 4 * result.errors[f"friction.{name}"]

@@ -17,7 +17,7 @@ from jaxmodsim.cli._spec import Reduced, read_spec
 from jaxmodsim.cli._spec_scene import LAWS, PROBLEMS
 from jaxmodsim.plot import map2d
 from jaxmodsim.problems import belt_oscillator
-from jaxmodsim.sweeps import SweepProgress, latin_hypercube, outline, sobol
+from jaxmodsim.sweeps import SweepProgress, latin_hypercube, plan_sweep, sobol
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "d1_belt.toml"
 MODEL = """
@@ -194,15 +194,15 @@ def test_samples_are_those_of_the_library(spec: Callable[[str], str]) -> None:
             np.testing.assert_array_equal(found[name], values)
 
 
-def test_outline_is_what_sweep_gives(spec: Callable[[str], str]) -> None:
+def test_the_plan_is_what_sweep_gives(spec: Callable[[str], str]) -> None:
     asked = read_spec(Path(spec(ROOT)))
-    laid = outline(asked.system, asked.over, chunk=3)
+    laid = plan_sweep(asked.system, asked.over, chunk=3)
     found = jms.sweep(asked.system, asked.over, chunk=3)
     assert laid.dims == dict(found.sizes) == {"a": 10, "b": 3}
     assert {name: dims for name, (dims, _) in laid.variables.items()} == {n: x.dims for n, x in found.items()}
-    assert (laid.lanes, laid.chunks, laid.lanes_of_chunk) == (30, 10, 3)
+    assert (laid.runs, laid.chunks, laid.runs_per_chunk) == (30, 10, 3)
     with pytest.raises(ValueError, match="chunk must be a positive integer"):
-        outline(asked.system, asked.over, chunk=0)
+        plan_sweep(asked.system, asked.over, chunk=0)
 
 
 def test_problems_and_laws_that_a_spec_may_name() -> None:

@@ -14,26 +14,11 @@ from jaxmodsim.identify._covariance import BLOCKS, spread
 from jaxmodsim.identify._parameters import FreeParameters
 from jaxmodsim.scene import replace_numbers, scene_numbers, scene_ranges
 
+from ..helpers.sprung import lagrangian, sprung
+
 DATA = Path(__file__).parents[3] / "shared" / "data"
 DT = 2e-3
 TRUTH = {"m": 2.0, "friction.Fc": 1.5, "viscous.Fv": 0.6}
-
-
-def _lagrangian(t, q, qd, p):
-    del t
-    return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
-
-
-def _drive(t, q, qd, p):
-    del t, q, qd
-    return jnp.reshape(p["u"], (1,))
-
-
-def sprung(m=2.0, Fc=1.5, Fv=0.6):
-    friction = jms.Friction(jms.Regularized(jms.Coulomb(Fc), 1e-2))
-    viscous = jms.Friction(jms.Viscous(Fv), name="viscous")
-    params = {"m": m, "k": 20.0, "u": 0.0}
-    return jms.Scene(_lagrangian, params=params, effects=(jms.AppliedForce(_drive), friction, viscous))
 
 
 def first(q, qd):
@@ -205,7 +190,7 @@ def test_free_parameters_stay_in_their_ranges_and_followers_keep_their_distance(
 
 def test_names_and_ranges_of_the_numbers_of_a_scene():
     law = jms.Regularized(jms.asymmetric(jms.Stribeck(1.0, 1.5, 0.1), Fc=0.8, Fs=1.2), 1e-3)
-    scene = jms.Scene(_lagrangian, params={"m": 1.0, "k": 1.0}, effects=(jms.Friction(law),))
+    scene = jms.Scene(lagrangian, params={"m": 1.0, "k": 1.0}, effects=(jms.Friction(law),))
     names = set(scene_numbers(scene))
     assert {"m", "k", "friction.forward.Fc", "friction.backward.Fs", "friction.width"} <= names
     assert scene_ranges(scene)["friction.backward.Fs"].lower == "friction.backward.Fc"

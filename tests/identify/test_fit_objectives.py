@@ -16,14 +16,10 @@ from jaxmodsim.problems import BELT_STRIBECK, belt_oscillator
 from jaxmodsim.scene import State, replace_numbers
 
 from ..helpers.optimized import optimized
+from ..helpers.sprung import lagrangian, sprung_mass
 
 DT = 4e-3
 TRUTH = {"m": 2.0, "friction.Fc": 1.5, "friction.sigma0": 600.0}
-
-
-def _lagrangian(t, q, qd, p):
-    del t
-    return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
 
 
 def _drive(t, q, qd, p):
@@ -37,7 +33,7 @@ DRIVE = jms.AppliedForce(_drive, name="drive")
 def sprung(m=2.0, Fc=1.5, sigma0=600.0):
     # Fs is not free in these fits and keeps its distance from Fc.
     law = jms.LuGre(sigma0=sigma0, sigma1=5.0, sigma2=0.6, Fc=Fc, Fs=Fc + 0.5, vs=0.1)
-    return jms.Scene(_lagrangian, params={"m": m, "k": 20.0, "gain": 1.0, "u": 0.0}, effects=(DRIVE, jms.Friction(law)))
+    return sprung_mass(DRIVE, jms.Friction(law), m=m, gain=1.0)
 
 
 def settings(**asked):
@@ -252,7 +248,7 @@ def test_a_gain_of_a_controller_is_found():
 def test_a_law_that_must_be_passive_is():
     law = jms.LuGre(sigma0=600.0, sigma1=5.0, sigma2=0.6, Fc=1.5, Fs=2.0, vs=0.1)
     scene = jms.Scene(
-        _lagrangian, params={"m": 2.0, "k": 20.0, "gain": 1.0, "u": 0.0}, effects=(DRIVE, jms.Friction(law))
+        lagrangian, params={"m": 2.0, "k": 20.0, "gain": 1.0, "u": 0.0}, effects=(DRIVE, jms.Friction(law))
     )
     assert not jms.check_passivity(law).ok
     result = jms.fit(scene, only_x(record()), ("friction.sigma2", "friction.Fs"), passive=("friction",))

@@ -27,6 +27,8 @@ from jaxmodsim.identify._solve import Options, solve_with_noise
 from jaxmodsim.plot import profile_figure, result_figure
 from jaxmodsim.scene import Friction, scene_numbers
 
+from ..helpers.sprung import lagrangian, sprung
+
 DT = 4e-3
 ABOVE_ZERO = Range("N", 0.0, strict=True)
 
@@ -229,23 +231,6 @@ def test_causes_are_seen_in_the_motion(case):
     found, others = ([cause for rule in RULES if (cause := rule(x))] for x in (triggers, fine))
     assert [set(cause.about) for cause in found if sentence in cause.sentence] == [set(about)]
     assert not any(sentence in cause.sentence for cause in others)
-
-
-def _lagrangian(t, q, qd, p):
-    del t
-    return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
-
-
-def _drive(t, q, qd, p):
-    del t, q, qd
-    return jnp.reshape(p["u"], (1,))
-
-
-def sprung(m=2.0, Fc=1.5, Fv=0.6):
-    friction = jms.Friction(jms.Regularized(jms.Coulomb(Fc), 1e-2))
-    viscous = jms.Friction(jms.Viscous(Fv), name="viscous")
-    params = {"m": m, "k": 20.0, "u": 0.0}
-    return jms.Scene(_lagrangian, params=params, effects=(jms.AppliedForce(_drive), friction, viscous))
 
 
 def test_slow_motion_does_not_show_the_mass():
@@ -521,7 +506,7 @@ def test_a_file_puts_its_numbers_into_a_model(result, presliding, tmp_path):
         {k: np.asarray(x) for k, x in scene_numbers(scene).items()},  # pyright: ignore[reportArgumentType]
         {k: np.asarray(x) for k, x in scene_numbers(result.model).items()},  # pyright: ignore[reportArgumentType]
     )
-    other = jms.Scene(_lagrangian, params={"m": 1.0, "k": 1.0}, effects=(jms.Friction(jms.Coulomb(1.0)),))
+    other = jms.Scene(lagrangian, params={"m": 1.0, "k": 1.0}, effects=(jms.Friction(jms.Coulomb(1.0)),))
     with pytest.raises(ValueError, match=r"not the one that was fitted: it lacks .*viscous.Fv"):
         FitResult.load(path, other)
     presliding.save(path)

@@ -21,6 +21,8 @@ from jaxmodsim.identify import (
 )
 from jaxmodsim.scene import replace_numbers
 
+from ..helpers.sprung import DRIVE, sprung_mass
+
 DATA = Path(__file__).parents[3] / "shared" / "data"
 TRUTH = {"sigma0": 1e4, "sigma1": 40.0, "sigma2": 2.0, "Fc": 1.0, "Fs": 1.5, "vs": 0.02}
 # Each wrong by a factor of ten, Fs as far as Fc lets it.
@@ -28,21 +30,8 @@ WRONG = {"sigma0": 1e5, "sigma1": 4.0, "sigma2": 0.2, "Fc": 10.0, "Fs": 15.0, "v
 NOISE = 1e-5
 
 
-def _lagrangian(t, q, qd, p):
-    del t
-    return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
-
-
-def _drive(t, q, qd, p):
-    del t, q, qd
-    return jnp.reshape(p["u"], (1,))
-
-
-DRIVE = jms.AppliedForce(_drive)
-
-
 def sprung(law, m=1.0):
-    return jms.Scene(_lagrangian, params={"m": m, "k": 200.0, "u": 0.0}, effects=(DRIVE, jms.Friction(law)))
+    return sprung_mass(DRIVE, jms.Friction(law), m=m, k=200.0)
 
 
 @pytest.fixture(scope="module")

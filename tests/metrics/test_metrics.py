@@ -13,7 +13,7 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim import metrics, problems
-from jaxmodsim.metrics import Feature
+from jaxmodsim.metrics import Metric
 from jaxmodsim.simulation import Events, _trajectory
 
 BELT = problems.BELT_OSCILLATOR
@@ -41,7 +41,7 @@ def on_belt(belt: Any, fs: Any = BELT["Fs"], **more: Any) -> Any:
 
 def values(belt: Any, fs: Any) -> list[Any]:
     run = on_belt(belt, fs)
-    return [feature(run) for feature in OF_EVENTS]
+    return [metric(run) for metric in OF_EVENTS]
 
 
 @pytest.fixture(scope="module")
@@ -71,8 +71,8 @@ def test_belt_oscillator_keeps_its_closed_form(batch: list[np.ndarray]) -> None:
     stuck = begins + cycles * exact.stick + np.maximum(rest - exact.slip, 0.0)
     np.testing.assert_allclose(batch[SHARE], stuck / 6.0, rtol=1e-8)
     for kind, sequence, count in zip(batch[KIND], batch[SEQUENCE], batch[CHANGES], strict=True):
-        assert OF_EVENTS[KIND].words(kind) == "stick-slip cycle"
-        words = OF_EVENTS[SEQUENCE].words(sequence).split(" > ")
+        assert OF_EVENTS[KIND].describe(kind) == "stick-slip cycle"
+        words = OF_EVENTS[SEQUENCE].describe(sequence).split(" > ")
         assert words == (["stick", "slip-"] * int(count))[: int(count) + 1]
 
 
@@ -83,8 +83,8 @@ def alone() -> Any:
 
 
 def test_eager_as_compiled_and_mapped(alone: Any, batch: list[np.ndarray]) -> None:
-    for feature, mapped in zip(OF_EVENTS, batch, strict=True):
-        np.testing.assert_allclose(feature(alone), mapped[1], rtol=1e-9, err_msg=feature.label)
+    for metric, mapped in zip(OF_EVENTS, batch, strict=True):
+        np.testing.assert_allclose(metric(alone), mapped[1], rtol=1e-9, err_msg=metric.label)
 
 
 def test_derivatives_of_break_away_and_period(lanes: list[np.ndarray]) -> None:
@@ -106,27 +106,27 @@ def test_events_of_a_run_are_found_once(alone: Any, monkeypatch: pytest.MonkeyPa
     run, calls = dataclasses.replace(alone), []
     solve_logged = _trajectory.solve_logged
     monkeypatch.setattr(_trajectory, "solve_logged", lambda *args: (calls.append(1), solve_logged(*args))[1])
-    first = [feature(run) for feature in OF_EVENTS]
+    first = [metric(run) for metric in OF_EVENTS]
     assert len(calls) == 1
     assert pickle.loads(pickle.dumps(run)).events.t.shape == run.events.t.shape
     calls.clear()
-    traced = jax.jit(lambda: [feature(run) for feature in OF_EVENTS])()
+    traced = jax.jit(lambda: [metric(run) for metric in OF_EVENTS])()
     assert not calls
     # A run whose numbers are known is repeated with known numbers, also where it is read while tracing.
     run = dataclasses.replace(alone)
     jax.jit(lambda: run.events.t)()
     assert len(calls) == 1
-    again = [feature(run) for feature in OF_EVENTS]
+    again = [metric(run) for metric in OF_EVENTS]
     np.testing.assert_allclose(np.array(traced), np.array(first))
     np.testing.assert_array_equal(np.array(again), np.array(first))
 
 
-def test_features_of_equal_arguments_compile_once(alone: Any) -> None:
+def test_metrics_of_equal_arguments_compile_once(alone: Any) -> None:
     count = []
 
-    def applied(feature: Feature, run: Any) -> Any:
-        count.append(feature)
-        return feature(run)
+    def applied(metric: Metric, run: Any) -> Any:
+        count.append(metric)
+        return metric(run)
 
     compiled = jax.jit(applied, static_argnums=0)
     compiled(metrics.peak("q[0]"), alone)
@@ -195,7 +195,7 @@ def test_a_spring_that_stops() -> None:
     def kind(t1: float, x0: float = 0.3) -> tuple[str, str]:
         run = jms.simulate(scene, [x0], [0.0], t1, **TIGHT)
         what, how = metrics.motion_kind(), metrics.mode_sequence()
-        return what.words(what(run)), how.words(how(run))
+        return what.describe(what(run)), how.describe(how(run))
 
     assert int(rest.half_cycles) == 3
     assert kind(float(rest.t) + 1.0) == ("sticks for good", "slip- > slip+ > slip- > stick")
@@ -215,16 +215,16 @@ def test_several_elements(alone: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     run = made(alone, problems.coupled_belts(), modes=jnp.array([[-1.0, 0.0]]), end=jnp.asarray(4.0))
     names = ("first", "second")
     sequence, kind = metrics.mode_sequence(*names), metrics.motion_kind(*names)
-    assert sequence.words(sequence(run)) == "first stick, second stick > first slip- > second slip+ > second stick"
-    assert kind.words(kind(run)) == "first slips for good, second sticks for good"
+    assert sequence.describe(sequence(run)) == "first stick, second stick > first slip- > second slip+ > second stick"
+    assert kind.describe(kind(run)) == "first slips for good, second sticks for good"
     assert [int(metrics.mode_changes(name)(run)) for name in names] == [1, 2]
     assert [float(metrics.stick_share(name)(run)) for name in names] == [0.25, 0.75]
-    assert metrics.mode_sequence("second").words(metrics.mode_sequence("second")(run)) == "stick > slip+ > stick"
+    assert metrics.mode_sequence("second").describe(metrics.mode_sequence("second")(run)) == "stick > slip+ > stick"
 
 
 def test_sequences_that_are_too_long_are_one_class(alone: Any) -> None:
     short = metrics.mode_sequence(most=3)
-    assert short.words(short(alone)) == "more than 3 changes"
+    assert short.describe(short(alone)) == "more than 3 changes"
     assert int(metrics.mode_sequence()(alone)) == int(metrics.mode_sequence(most=20)(alone)) > 2**20
 
 
@@ -290,7 +290,7 @@ def test_rest_of_laws_without_modes() -> None:
     # A box that slips after 3 s has v = ramp (t - 3)^2/(2 m).
     np.testing.assert_allclose(share(box(jms.Coulomb(1.5))), (3.0 + np.sqrt(4 * 1e-4 / 0.5)) / 5.0, atol=1e-3)
     still = metrics.classes(lambda run: jnp.where(jnp.abs(run.qd[-1, 0]) < 1e-3, 0, 1), ("rests", "moves"))
-    assert still.words(still(bristle())) == "moves"
+    assert still.describe(still(bristle())) == "moves"
 
 
 def test_peak_of_a_force() -> None:
@@ -298,7 +298,7 @@ def test_peak_of_a_force() -> None:
     np.testing.assert_allclose(metrics.peak("friction")(run), 0.3 * run.qd[-1, 0], rtol=1e-12)
     np.testing.assert_allclose(metrics.peak("pull[0]")(run), 2.5, rtol=1e-12)
     np.testing.assert_allclose(metrics.final("pull[0]")(run), 2.5, rtol=1e-12)
-    assert metrics.peak("pull[0]").words(2.5) == "2.5 N or N m"
+    assert metrics.peak("pull[0]").describe(2.5) == "2.5 N or N m"
 
 
 @pytest.mark.parametrize(
@@ -319,7 +319,7 @@ def test_garbage_is_refused_when_made(make: Any, text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("feature", "text"),
+    ("metric", "text"),
     [
         (metrics.break_away(), r"break_away\(distance=1e-3\)"),
         (metrics.break_away("brake"), "'brake'; there are: friction"),
@@ -332,6 +332,6 @@ def test_garbage_is_refused_when_made(make: Any, text: str) -> None:
         (metrics.period("brake"), "No observable"),
     ],
 )
-def test_garbage_is_refused_when_called(feature: Feature, text: str) -> None:
+def test_garbage_is_refused_when_called(metric: Metric, text: str) -> None:
     with pytest.raises(ValueError, match=text):
-        feature(bristle())
+        metric(bristle())

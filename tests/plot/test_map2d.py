@@ -1,4 +1,4 @@
-"""Maps of sweeps: axes, colours, lanes that failed; and the boundary of stick-slip against runs and its closed form."""
+"""Maps of sweeps: axes, colours, runs that failed; and the boundary of stick-slip against runs and its closed form."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -20,7 +20,7 @@ NUMBERS = {"m": 1.3, "c": 1.7, "Fc": 4.0, "Fs": 7.0}
 
 
 def dataset(**changes: Any) -> xr.Dataset:
-    """Over k (geometric) and v (even): amplitude, a class, a count, and something over time; three lanes are bad."""
+    """Over k (geometric) and v (even): amplitude, a class, a count, and something over time; three runs are bad."""
     amplitude = np.arange(20.0).reshape(5, 4) / 7.0
     result = np.zeros((5, 4), int)
     result[0, 0], result[0, 1], result[4, 3] = 1, 1, -1

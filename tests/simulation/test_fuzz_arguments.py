@@ -106,7 +106,7 @@ CALLS = {
     "part": Call(RECORD.part, {"start": 0.0, "end": 1.0, "name": None}),
     "windows": Call(RECORD.windows, {"seconds": 0.5}, {"seconds": "seconds|windows"}),
     "sweep": Call(
-        sweeps.outline,
+        sweeps.plan_sweep,
         {"system": SCENE, "over": {"m": [1.0, 2.0]}, "observe": ["q[0]"], **MOTION, "t1": 1.0, "chunk": 1},
         {"system": "system|function", "observe": "observe|observable"},
     ),

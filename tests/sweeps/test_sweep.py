@@ -83,7 +83,7 @@ def test_any_cut_gives_the_same_numbers(found: xr.Dataset, chunk: int) -> None:
 
 
 def test_many_lanes_are_sorted_and_put_back() -> None:
-    """More lanes than are run without a look ahead, in an order that is not that of their steps."""
+    """More runs than are run without a look ahead, in an order that is not that of their steps."""
     rng = np.random.default_rng(3)
     drawn = {"friction.sigma0": 10 ** rng.uniform(2.0, 5.0, 1500), "m": rng.uniform(1.0, 3.0, 1500)}
     whole = box_sweep(over={"sample": drawn})
@@ -96,7 +96,7 @@ def test_many_lanes_are_sorted_and_put_back() -> None:
 
 
 def test_a_lane_that_fails_stays_alone(found: xr.Dataset) -> None:
-    """One lane with a negative mass, one whose parameter is out of range: codes with sentences, and NaN."""
+    """One run with a negative mass, one whose parameter is out of range: codes with sentences, and NaN."""
     mass, sigma0 = MASS.copy(), SIGMA0.copy()
     mass[3], sigma0[2] = -1.0, -5.0
     broken = box_sweep(over={"friction.sigma0": sigma0, "m": mass})
@@ -112,20 +112,20 @@ def test_a_lane_that_fails_stays_alone(found: xr.Dataset) -> None:
 
 
 def test_a_lane_of_many_steps_is_run_again_among_its_like() -> None:
-    """One lane needs more steps than lanes get at first, one more than it may have at all."""
+    """One run needs more steps than runs get at first, one more than it may have at all."""
     tolerance = np.full(14, 1e-6)
     tolerance[4], tolerance[9] = 1e-12, 1e-16
-    lanes = box_sweep(over={"lane": {"m": MASS, "rtol": tolerance, "atol": 1e-3 * tolerance}}, max_steps=2500)
-    steps = lanes["num_steps"].values
+    runs = box_sweep(over={"run": {"m": MASS, "rtol": tolerance, "atol": 1e-3 * tolerance}}, max_steps=2500)
+    steps = runs["num_steps"].values
     assert 1024 < steps[4] < 2500
     assert steps[9] == 2500
-    assert lanes["result"][4] == 0
-    assert "step limit" in lanes["result"].attrs["flag_meanings"][int(lanes["result"][9])]
+    assert runs["result"][4] == 0
+    assert "step limit" in runs["result"].attrs["flag_meanings"][int(runs["result"][9])]
     others = [i for i in range(14) if i not in (4, 9)]
     scene = ramped_box(box_lugre(), m=MASS[4])
     run = jms.simulate(scene, ts=TS, rtol=1e-12, atol=1e-15, **START)
-    np.testing.assert_allclose(lanes["v"][4], run.qd[:, 0], rtol=1e-11, atol=1e-14)
-    assert (lanes["result"][others] == 0).all()
+    np.testing.assert_allclose(runs["v"][4], run.qd[:, 0], rtol=1e-11, atol=1e-14)
+    assert (runs["result"][others] == 0).all()
     assert (steps[others] < 200).all()
 
 
@@ -244,10 +244,10 @@ def each_mistake() -> Iterator[tuple[str, dict[str, Any], str]]:
     yield "option", {"max_step": 3}, "no argument 'max_step'"
     yield "value", {"t1": -1.0}, "t1 must not be before t0"
     yield "ts", {"ts": [0.0, 99.0]}, "ts must lie within"
-    yield "t1 of a lane", {"over": {"t1": [4.0, 2.0]}, "t1": None}, "ts must lie within .* every lane, from 0 to 2"
-    yield "t0 of a lane", {"over": {"t0": [0.0, 5.0]}, "ts": None}, "t1 must not be before t0 in any lane"
-    yield "rtol of a lane", {"over": {"rtol": [1e-6, -1e-6]}}, "'rtol' in over must not be negative"
-    yield "dt of a lane", {"over": {"dt": [1e-3, 0.0]}}, "'dt' in over must be positive"
+    yield "t1 of a run", {"over": {"t1": [4.0, 2.0]}, "t1": None}, "ts must lie within .* every run, from 0 to 2"
+    yield "t0 of a run", {"over": {"t0": [0.0, 5.0]}, "ts": None}, "t1 must not be before t0 in any run"
+    yield "rtol of a run", {"over": {"rtol": [1e-6, -1e-6]}}, "'rtol' in over must not be negative"
+    yield "dt of a run", {"over": {"dt": [1e-3, 0.0]}}, "'dt' in over must be positive"
     yield "slash", {"observe": {"F/Fc": "friction"}}, "without a slash"
     yield "slash in over", {"over": {"a/b": {"m": [1.0]}}}, "without a slash"
     yield "chunk", {"chunk": 0}, "chunk must be a positive integer"

@@ -51,9 +51,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def stop_after(lanes: int) -> Any:
+def stop_after(runs: int) -> Any:
     def stop(now: SweepProgress) -> None:
-        if now.done >= lanes:
+        if now.done >= runs:
             raise KeyboardInterrupt
 
     return stop
@@ -70,9 +70,9 @@ def test_a_store_holds_what_memory_would(whole: Path) -> None:
 
 def test_an_interrupted_sweep_goes_on(whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "store.zarr"
-    for lanes in (100, 500):
+    for runs in (100, 500):
         with pytest.raises(KeyboardInterrupt, match="call sweep again"):
-            store(out, progress=stop_after(lanes))
+            store(out, progress=stop_after(runs))
     partly = xr.open_zarr(out, consolidated=False)["result"].values
     assert 500 <= (partly == 0).sum() < 1040
     assert (partly[partly != 0] == -1).all()
@@ -97,7 +97,7 @@ def test_killed_at_random_moments(whole: Path, tmp_path: Path) -> None:
         f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r})\n"
         "import jax; jax.config.update('jax_enable_x64', True)\n"
         "from pathlib import Path\n"
-        "from tests.test_sweep_store import store\n"
+        "from tests.sweeps.test_sweep_store import store\n"
         f"store(Path({str(out)!r}), progress=lambda now: print(now.done, flush=True))\n"
     )
     for _ in range(4):

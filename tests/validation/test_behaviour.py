@@ -15,11 +15,19 @@ from jaxmodsim._core.state_dependent import StateDependent
 from jaxmodsim.cli import _behaviour
 from jaxmodsim.friction import AbstractLaw, Dahl, LuGre
 from jaxmodsim.plot import behaviour_figure
-from jaxmodsim.validation.behaviour import BY_NATURE, EXPERIMENTS, Finding, Verdict, by_nature, run_bench, specimens
+from jaxmodsim.validation.behaviour import (
+    EXPERIMENTS,
+    KNOWN_LIMITATIONS,
+    LawMeasurement,
+    Verdict,
+    known_limitation,
+    law_cases,
+    run_bench,
+)
 from jaxmodsim.validation.behaviour._drive import SAMPLES, path, respond
-from jaxmodsim.validation.behaviour._laws import DEFLECTION, FC, FS, SIGMA0, WIDTH, Specimen
+from jaxmodsim.validation.behaviour._laws import DEFLECTION, FC, FS, SIGMA0, WIDTH, LawCase
 
-BENCH = {each.name: each for each in specimens()}
+BENCH = {each.name: each for each in law_cases()}
 # Experiments with a prescribed motion compile in no time; those with a mass take some seconds for each law.
 WITH_MASS = ("break-away", "stick-slip", "creep")
 PRESCRIBED = {name: each for name, each in EXPERIMENTS.items() if name not in WITH_MASS}
@@ -37,8 +45,8 @@ def outcomes():
 @pytest.mark.quick
 def test_every_law_and_wrapper_is_on_the_bench():
     shown = set()
-    for specimen in BENCH.values():
-        parts = [module for _, module in modules_of(specimen.law)]
+    for case in BENCH.values():
+        parts = [module for _, module in modules_of(case.law)]
         shown |= {type(part).__name__ for part in parts}
         shown |= {"asymmetric" for part in parts if hasattr(part, "forward")}
         shown |= {"scaled_by" for part in parts if isinstance(part, StateDependent)}
@@ -54,9 +62,9 @@ def test_every_law_and_wrapper_is_on_the_bench():
     assert wanted <= shown, f"not on the bench: {sorted(wanted - shown)}"
 
 
-def test_no_law_fails_but_by_nature(outcomes):
+def test_no_law_fails_but_by_a_known_limitation(outcomes):
     failed = [
-        f"{law}, {name}: {outcome.finding.number:.3g}. {outcome.finding.sentence}"
+        f"{law}, {name}: {outcome.measured.number:.3g}. {outcome.measured.sentence}"
         for law, of in outcomes.items()
         for name, outcome in of.items()
         if outcome.verdict is Verdict.FAIL
@@ -64,38 +72,38 @@ def test_no_law_fails_but_by_nature(outcomes):
     assert not failed, "\n".join(failed)
 
 
-PASS, NATURE, NOT = Verdict.PASS, Verdict.BY_NATURE, Verdict.NOT_APPLICABLE
+PASS, KNOWN, NOT = Verdict.PASS, Verdict.KNOWN_LIMITATION, Verdict.NOT_APPLICABLE
 
 
 @pytest.mark.parametrize(
     ("law", "experiment", "verdict"),
     [
-        ("LuGre", "creep", NATURE),
-        ("Dahl", "creep", NATURE),
-        ("Regularized", "creep", NATURE),
+        ("LuGre", "creep", KNOWN),
+        ("Dahl", "creep", KNOWN),
+        ("Regularized", "creep", KNOWN),
         ("ElastoPlastic", "creep", PASS),
         ("MaxwellSlip, 4, C", "creep", PASS),
         ("Coulomb", "creep", PASS),
         ("MaxwellSlip, 4", "memory", PASS),
         ("MaxwellSlip, 4, C", "memory", PASS),
-        ("LuGre", "memory", NATURE),
-        ("ElastoPlastic", "memory", NATURE),
+        ("LuGre", "memory", KNOWN),
+        ("ElastoPlastic", "memory", KNOWN),
         ("Stribeck, Gauss", "memory", NOT),
         ("Dahl", "presliding", PASS),
-        ("Stribeck, Gauss", "presliding", NATURE),
+        ("Stribeck, Gauss", "presliding", KNOWN),
         ("DeadZone", "presliding", NOT),
         ("DeadZone", "passivity", NOT),
         ("LuGre", "break-away", PASS),
-        ("Coulomb, stiction", "break-away", NATURE),
+        ("Coulomb, stiction", "break-away", KNOWN),
         ("LuGre", "lag", PASS),
         ("Armstrong", "lag", PASS),
-        ("Stribeck, Gauss", "lag", NATURE),
-        ("Dahl", "lag", NATURE),
+        ("Stribeck, Gauss", "lag", KNOWN),
+        ("Dahl", "lag", KNOWN),
         ("LuGre", "stick-slip", PASS),
         ("Coulomb, stiction", "stick-slip", PASS),
-        ("Coulomb", "stick-slip", NATURE),
-        ("Dahl", "stick-slip", NATURE),
-        ("LuGre", "passivity", NATURE),
+        ("Coulomb", "stick-slip", KNOWN),
+        ("Dahl", "stick-slip", KNOWN),
+        ("LuGre", "passivity", KNOWN),
         ("LuGre, vd", "passivity", PASS),
         ("Dahl", "passivity", PASS),
         ("MaxwellSlip, 4, C", "passivity", PASS),
@@ -103,22 +111,22 @@ PASS, NATURE, NOT = Verdict.PASS, Verdict.BY_NATURE, Verdict.NOT_APPLICABLE
 )
 def test_verdicts(outcomes, law, experiment, verdict):
     outcome = outcomes[law][experiment]
-    assert outcome.verdict is verdict, outcome.finding.sentence
+    assert outcome.verdict is verdict, outcome.measured.sentence
     assert (verdict is PASS) == (outcome.reason == "")
 
 
 def test_every_law_has_its_steady_curve(outcomes):
     for law, of in outcomes.items():
         # Armstrong's stiction is not all back after a reversal; forward its curve is right, too.
-        assert of["characteristic"].verdict is (NATURE if law == "Armstrong" else PASS), law
+        assert of["characteristic"].verdict is (KNOWN if law == "Armstrong" else PASS), law
 
 
 def test_numbers_that_are_known(outcomes):
     # Without rate dependence the break-away force is the stiction, seen in samples of the load, 0.64 mN apart.
-    stiction = outcomes["Coulomb, stiction"]["break-away"].finding.lines[0].y
+    stiction = outcomes["Coulomb, stiction"]["break-away"].measured.lines[0].y
     np.testing.assert_allclose(stiction, FS, atol=7e-4)
     # Slowly loaded, LuGre comes near its stiction force; fast, all that is left is the Coulomb force.
-    lugre = outcomes["LuGre"]["break-away"].finding.lines[0].y
+    lugre = outcomes["LuGre"]["break-away"].measured.lines[0].y
     assert (np.diff(lugre[:-1]) < 0).all()
     assert (lugre[-2:] > FC).all()
     assert (lugre[-2:] < 1.1 * FC).all()
@@ -126,7 +134,7 @@ def test_numbers_that_are_known(outcomes):
     # A smooth law moves at the velocity at which it balances the load, between means that are 8 s apart.
     load = 0.4 + 0.2 * np.sin(2.0 * np.pi * np.arange(1000) / 1000)
     expected = 8e6 * WIDTH * np.mean(np.arctanh(load / FS))
-    assert outcomes["Regularized"]["creep"].finding.number == pytest.approx(expected, rel=1e-3)
+    assert outcomes["Regularized"]["creep"].measured.number == pytest.approx(expected, rel=1e-3)
 
 
 def test_dahl_keeps_its_closed_forms():
@@ -149,31 +157,31 @@ def test_a_passive_lugre_passes_and_a_miss_that_nothing_explains_fails():
     passivity = EXPERIMENTS["passivity"]
     # The condition of the class: sigma2 > sigma1 (Fs - Fc)/Fc = 0.5 sigma1.
     damped = dataclasses.replace(bristle, sigma2=0.6 * bristle.sigma1)
-    assert passivity(Specimen("passive", damped, BENCH["LuGre"].steady)).verdict is PASS
-    fake = dataclasses.replace(passivity, measure=lambda specimen: Finding(-1.0, "gives energy"))
-    assert fake(BENCH["LuGre"]).verdict is NATURE
+    assert passivity(LawCase("passive", damped, BENCH["LuGre"].steady)).verdict is PASS
+    fake = dataclasses.replace(passivity, measure=lambda case: LawMeasurement(-1.0, "gives energy"))
+    assert fake(BENCH["LuGre"]).verdict is KNOWN
     assert fake(BENCH["Dahl"]).verdict is Verdict.FAIL
     assert fake(BENCH["LuGre, vd"]).verdict is Verdict.FAIL
-    none = dataclasses.replace(passivity, measure=lambda specimen: Finding(float("nan"), "nothing to see"))
+    none = dataclasses.replace(passivity, measure=lambda case: LawMeasurement(float("nan"), "nothing to see"))
     assert none(BENCH["LuGre"]).verdict is NOT
 
 
 def test_a_run_that_ends_early_fails():
-    def stop(specimen):
-        del specimen
+    def stop(case):
+        del case
         raise SimulationError("The step limit was reached.")
 
     outcome = dataclasses.replace(EXPERIMENTS["creep"], measure=stop)(BENCH["LuGre"])
     assert outcome.verdict is Verdict.FAIL
-    assert "step limit" in outcome.finding.sentence
+    assert "step limit" in outcome.measured.sentence
 
 
-def test_the_table_of_natures_names_experiments_and_has_no_idle_entry(outcomes):
-    assert {nature.experiment for nature in BY_NATURE} <= set(EXPERIMENTS)
-    earned = {outcome.reason for of in outcomes.values() for outcome in of.values() if outcome.verdict is NATURE}
-    assert {nature.reason for nature in BY_NATURE} <= earned
-    assert by_nature("passivity", BENCH["LuGre, vd"].law) is None
-    assert by_nature("creep", BENCH["LuGre, asymmetric"].law) is not None
+def test_the_table_of_limitations_names_experiments_and_has_no_idle_entry(outcomes):
+    assert {known.experiment for known in KNOWN_LIMITATIONS} <= set(EXPERIMENTS)
+    earned = {outcome.reason for of in outcomes.values() for outcome in of.values() if outcome.verdict is KNOWN}
+    assert {known.reason for known in KNOWN_LIMITATIONS} <= earned
+    assert known_limitation("passivity", BENCH["LuGre, vd"].law) is None
+    assert known_limitation("creep", BENCH["LuGre, asymmetric"].law) is not None
 
 
 def test_figures_have_a_panel_for_each_law_and_labelled_axes(outcomes):
@@ -199,9 +207,9 @@ def test_command_writes_figures_table_and_json(run_command, tmp_path, monkeypatc
     assert len(table) == 3 * len(EXPERIMENTS)
     assert {"law", "experiment", "verdict", "number", "unit", "threshold"} <= set(table.columns)
     report = json.loads((out / "behaviour.json").read_text())
-    assert report["LuGre"]["creep"]["verdict"] == "by nature"
+    assert report["LuGre"]["creep"]["verdict"] == "known limitation"
     assert "yields" in report["LuGre"]["creep"]["reason"]
-    assert "nature" in text
+    assert "known" in text
     assert "ElastoPlastic" in text
 
 

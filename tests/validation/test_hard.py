@@ -12,7 +12,7 @@ from jaxmodsim.cli import _hard
 from jaxmodsim.plot import hard_figure
 from jaxmodsim.problems import ramped_box
 from jaxmodsim.validation import hard
-from jaxmodsim.validation.hard import Finding, HardCase, Measured, Refused, Verdict
+from jaxmodsim.validation.hard import CaseReport, CheckFinding, HardCase, MeasuredNumber, RefusedCalls
 
 CASES = hard.hard_cases()
 
@@ -23,15 +23,18 @@ def test_every_case_says_why_it_is_hard_and_what_is_right():
     for name, case in CASES.items():
         assert case.name == name
         assert min(len(case.why), len(case.naive), len(case.asks)) > 5
-        if not isinstance(case.task, Refused):
+        if not isinstance(case.task, RefusedCalls):
             assert case.exact or case.second or case.ends
-        # A way, or a way in one type.
-        assert set(case.leaves) <= {*hard.WAYS, *(f"{way} {dtype}" for way in hard.WAYS for dtype in hard.DTYPES)}
-        assert all(case.leaves.values())
+        # A transform, or a transform in one type.
+        assert set(case.skips) <= {
+            *hard.TRANSFORMS,
+            *(f"{transform} {dtype}" for transform in hard.TRANSFORMS for dtype in hard.DTYPES),
+        }
+        assert all(case.skips.values())
 
 
 @pytest.mark.parametrize(
-    ("name", "ways"),
+    ("name", "transforms"),
     [
         ("shaken_table", ("alone",)),  # steps over many periods of the belt
         ("no_absolute_tolerance", ("alone",)),  # 0/0 in the norm of the error
@@ -48,8 +51,8 @@ def test_every_case_says_why_it_is_hard_and_what_is_right():
         ("sample_after_break_away", ("alone",)),  # a sample of a signal next to an event
     ],
 )
-def test_cases_that_found_something_and_one_of_each_kind(name: str, ways: tuple[str, ...]):
-    verdict = hard.check(CASES[name], ways, ["float64"])
+def test_cases_that_found_something_and_one_of_each_kind(name: str, transforms: tuple[str, ...]):
+    verdict = hard.check(CASES[name], transforms, ["float64"])
     assert verdict.findings
     assert verdict.ok, [finding.sentence for finding in verdict.findings if not finding.ok]
 
@@ -71,20 +74,22 @@ def test_checks_fail_where_something_is_wrong():
         "value": replace(STEP, exact=lambda ramp: ramp / 4.0 + 1e-5),
         "end": replace(STEP, ends="step limit"),
         "derivative": replace(STEP, exact=lambda ramp: 0.25 + 0.0 * ramp),
-        "measured": HardCase("m", "numbers", "", "", "", Measured(lambda: 1.0), lambda _: 2.0),
-        "refused": HardCase("r", "numbers", "", "", "", Refused({"x": lambda: None}, {"x": "anything"})),
-        "other text": HardCase("r", "numbers", "", "", "", Refused({"x": lambda: jms.Coulomb(-1.0)}, {"x": "Fs must"})),
+        "measured": HardCase("m", "numbers", "", "", "", MeasuredNumber(lambda: 1.0), lambda _: 2.0),
+        "refused": HardCase("r", "numbers", "", "", "", RefusedCalls({"x": lambda: None}, {"x": "anything"})),
+        "other text": HardCase(
+            "r", "numbers", "", "", "", RefusedCalls({"x": lambda: jms.Coulomb(-1.0)}, {"x": "Fs must"})
+        ),
     }
     for what, case in wrong.items():
-        ways = ["forward"] if what == "derivative" else ["alone"]
-        assert not hard.check(case, ways, ["float64"]).ok, what
+        transforms = ["forward"] if what == "derivative" else ["alone"]
+        assert not hard.check(case, transforms, ["float64"]).ok, what
     # A derivative that exists is not flagged.
     claims = replace(CASES["equilibrium"], undefined="none, it is said")
     assert not hard.check(claims, ["reverse"], ["float64"]).ok
 
 
 def test_what_is_asked_for_must_be_there():
-    with pytest.raises(ValueError, match=r"ways must be of alone, jit, .*, but 'alonee' was given"):
+    with pytest.raises(ValueError, match=r"transforms must be of alone, jit, .*, but 'alonee' was given"):
         hard.check(STEP, ["alonee"])
     with pytest.raises(ValueError, match=r"no hard case or family 'bristle_stif'.*Did you mean 'bristle_stiff'"):
         list(hard.check_many(["bristle_stif"]))
@@ -100,7 +105,7 @@ def test_command(run_command: Any, tmp_path: Any, monkeypatch: pytest.MonkeyPatc
     assert (code, (tmp_path / "none").exists()) == (2, False)
     assert "no hard case or family 'nonsense'" in errors
 
-    failed = Verdict(STEP, (Finding("alone", "float64", 3.0, False, "0.75, right is 0.25."),))
+    failed = CaseReport(STEP, (CheckFinding("alone", "float64", 3.0, False, "0.75, right is 0.25."),))
 
     def fails(*arguments: Any, **options: Any) -> Any:
         del arguments, options

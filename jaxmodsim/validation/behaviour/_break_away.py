@@ -3,9 +3,9 @@
 import numpy as np
 
 from ._experiment import Experiment
-from ._laws import FC, FS, VS, Specimen
-from ._outcome import Finding, Limit, Line
+from ._laws import FC, FS, VS, LawCase
 from ._pulled import after_slip, move
+from ._result import FigureLine, LawMeasurement, Threshold
 
 # Rates of the load [N/s].
 RATES = np.geomspace(0.1, 100.0, 7)
@@ -13,19 +13,19 @@ RATES = np.geomspace(0.1, 100.0, 7)
 _LOAD, _SLIDES = 1.7 * FS, 10.0 * VS
 
 
-def _measure(specimen: Specimen) -> Finding:
+def _measure(case: LawCase) -> LawMeasurement:
     """Pull a mass harder and harder; the largest friction before it slides, at slow and at fast rates."""
-    z0 = after_slip(specimen)
+    z0 = after_slip(case)
     found = []
     for rate in RATES:
-        run = move(specimen, _LOAD / rate, z0=z0, ramp=float(rate), dtmax=0.01 * _LOAD / rate)
+        run = move(case, _LOAD / rate, z0=z0, ramp=float(rate), dtmax=0.01 * _LOAD / rate)
         slides = run.v > _SLIDES
         end = int(np.argmax(slides)) if slides.any() else run.v.size
         found.append(float(np.max(run.friction[: max(end, 1)])))
-    lines = (Line("", RATES, np.asarray(found)),)
+    lines = (FigureLine("", RATES, np.asarray(found)),)
     if found[0] < 0.1 * FC:
-        return Finding(float("nan"), "Nothing sticks, so nothing breaks away.", lines)
-    return Finding(
+        return LawMeasurement(float("nan"), "Nothing sticks, so nothing breaks away.", lines)
+    return LawMeasurement(
         (found[0] - found[-1]) / found[0],
         f"Breaks away at {found[0]:.3g} N under {RATES[0]:g} N/s and at {found[-1]:.3g} N under {RATES[-1]:g} N/s.",
         lines,
@@ -38,7 +38,7 @@ BREAK_AWAY = Experiment(
     "Break-away force against the rate of the load, shortly after a slip",
     "fall of the break-away force from 0.1 N/s to 100 N/s, relative",
     "1",
-    Limit(0.05, at_most=False),
+    Threshold(0.05, at_most=False),
     ("force rate [N/s]", "break-away force [N]"),
     (0.9, 1.6),
     _measure,

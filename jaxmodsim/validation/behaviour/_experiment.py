@@ -1,13 +1,13 @@
-"""An experiment: a measurement and the limit that makes a verdict of it."""
+"""An experiment: a measurement and the threshold that makes a verdict of it."""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from ...simulation import SimulationError
-from ._laws import Specimen
-from ._nature import by_nature
-from ._outcome import Finding, Limit, Outcome, Verdict
+from ._laws import LawCase
+from ._limitations import known_limitation
+from ._result import ExperimentResult, LawMeasurement, Threshold, Verdict
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Experiment:
     - `title`: what is looked at, for the figure.
     - `quantity`: what the number is.
     - `unit`: of the number.
-    - `limit`: what the number must keep to pass.
+    - `threshold`: what the number must keep to pass.
     - `axes`: labels of the figure's axes, with units.
     - `measure`: does the experiment on one law.
     - `window`: range of the figure's vertical axis, the same for all laws.
@@ -29,25 +29,25 @@ class Experiment:
     title: str
     quantity: str
     unit: str
-    limit: Limit
+    threshold: Threshold
     axes: tuple[str, str]
     window: tuple[float, float]
-    measure: Callable[[Specimen], Finding]
+    measure: Callable[[LawCase], LawMeasurement]
     log_x: bool = False
 
-    def __call__(self, specimen: Specimen) -> Outcome:
+    def __call__(self, case: LawCase) -> ExperimentResult:
         """Do the experiment on a law and judge what comes out.
 
-        A number beyond the limit is a failure, unless the table of `by_nature` says why such a law must miss it. A law
-        of the table that keeps the limit passes. A run that ends early is a failure.
+        A number beyond the threshold is a failure, unless `KNOWN_LIMITATIONS` says why such a law must miss it. A law
+        of that table that keeps the threshold passes. A run that ends early is a failure.
         """
         try:
-            finding = self.measure(specimen)
+            measured = self.measure(case)
         except SimulationError as error:
-            return Outcome(Verdict.FAIL, Finding(math.nan, str(error)))
-        if math.isnan(finding.number):
-            return Outcome(Verdict.NOT_APPLICABLE, finding, finding.sentence)
-        if self.limit.keeps(finding.number):
-            return Outcome(Verdict.PASS, finding)
-        reason = by_nature(self.name, specimen.law)
-        return Outcome(Verdict.FAIL if reason is None else Verdict.BY_NATURE, finding, reason or "")
+            return ExperimentResult(Verdict.FAIL, LawMeasurement(math.nan, str(error)))
+        if math.isnan(measured.number):
+            return ExperimentResult(Verdict.NOT_APPLICABLE, measured, measured.sentence)
+        if self.threshold.keeps(measured.number):
+            return ExperimentResult(Verdict.PASS, measured)
+        reason = known_limitation(self.name, case.law)
+        return ExperimentResult(Verdict.FAIL if reason is None else Verdict.KNOWN_LIMITATION, measured, reason or "")

@@ -42,7 +42,7 @@ BAND, STEP = 1e-4, 1e-4
 STIFFNESS_SHARES, FORCE_SHARES = np.array([0.4, 0.3, 0.2, 0.1]), np.array([0.1, 0.2, 0.3, 0.4])
 
 
-class Specimen(NamedTuple):
+class LawCase(NamedTuple):
     """A law on the bench.
 
     - `name`: in tables and figures.
@@ -86,31 +86,31 @@ def _double(t: Array, q: Array, qd: Array, p: object) -> float:
     return 2.0
 
 
-def specimens() -> tuple[Specimen, ...]:
+def law_cases() -> tuple[LawCase, ...]:
     """All laws and wrappers of `jaxmodsim.friction`, in families."""
     gauss, flat = _curve(), _curve(Fs=FC, Fv=0.0)
     stribeck = Stribeck(FC, FS, VS, FV)
     bristle = {"sigma0": SIGMA0, "sigma1": SIGMA1, "sigma2": FV, "Fc": FC, "Fs": FS, "vs": VS}
     elements = {"k": SIGMA0 * STIFFNESS_SHARES, "Fc": FC * FORCE_SHARES, "sigma2": FV}
     return (
-        Specimen("Viscous", Viscous(FV), lambda v: FV * v),
-        Specimen("Curve", Curve(_smooth), gauss),
-        Specimen("Coulomb", Coulomb(FC, FC), flat),
-        Specimen("Coulomb, stiction", Coulomb(FC, FS), flat),
-        Specimen("Stribeck, Gauss", stribeck, gauss),
-        Specimen("Stribeck, exp", Stribeck(FC, FS, VS, FV, exponent=1.0), _curve(fall=lambda x: np.exp(-x))),
-        Specimen("Stribeck, Lorentz", Stribeck(FC, FS, VS, FV, fall=lorentzian), _curve(fall=_lorentzian)),
-        Specimen("Stribeck, scaled", scaled_by(Stribeck(0.5 * FC, 0.5 * FS, VS, 0.5 * FV), _double), gauss),
-        Specimen("Regularized", Regularized(stribeck, WIDTH), gauss),
-        Specimen("DeadZone", DeadZone(stribeck, BAND), gauss, STEP),
-        Specimen("Sign", Sign(stribeck), gauss, STEP),
-        Specimen("Dahl", Dahl(SIGMA0, FC), flat),
-        Specimen("LuGre", LuGre(**bristle), gauss),
-        Specimen("LuGre, vd", LuGre(**bristle, vd=VS), gauss),
-        Specimen("LuGre, asymmetric", asymmetric(LuGre(**bristle), Fc=BACKWARD * FC, Fs=BACKWARD * FS), _worn),
-        Specimen("ElastoPlastic", ElastoPlastic(**bristle, Fba=0.7 * FC), gauss),
-        Specimen("MaxwellSlip, 1", MaxwellSlip(k=[SIGMA0], Fc=[FC], sigma2=FV), _curve(Fs=FC)),
-        Specimen("MaxwellSlip, 4", MaxwellSlip(**elements), _curve(Fs=FC)),
-        Specimen("MaxwellSlip, 4, C", MaxwellSlip(**elements, Fs=FS * FORCE_SHARES, vs=VS, C=50.0), gauss),
-        Specimen("Armstrong", Armstrong(SIGMA0, FC, FS, VS, FV, tau=0.01, gamma=1.0), _curve(fall=_lorentzian)),
+        LawCase("Viscous", Viscous(FV), lambda v: FV * v),
+        LawCase("Curve", Curve(_smooth), gauss),
+        LawCase("Coulomb", Coulomb(FC, FC), flat),
+        LawCase("Coulomb, stiction", Coulomb(FC, FS), flat),
+        LawCase("Stribeck, Gauss", stribeck, gauss),
+        LawCase("Stribeck, exp", Stribeck(FC, FS, VS, FV, exponent=1.0), _curve(fall=lambda x: np.exp(-x))),
+        LawCase("Stribeck, Lorentz", Stribeck(FC, FS, VS, FV, fall=lorentzian), _curve(fall=_lorentzian)),
+        LawCase("Stribeck, scaled", scaled_by(Stribeck(0.5 * FC, 0.5 * FS, VS, 0.5 * FV), _double), gauss),
+        LawCase("Regularized", Regularized(stribeck, WIDTH), gauss),
+        LawCase("DeadZone", DeadZone(stribeck, BAND), gauss, STEP),
+        LawCase("Sign", Sign(stribeck), gauss, STEP),
+        LawCase("Dahl", Dahl(SIGMA0, FC), flat),
+        LawCase("LuGre", LuGre(**bristle), gauss),
+        LawCase("LuGre, vd", LuGre(**bristle, vd=VS), gauss),
+        LawCase("LuGre, asymmetric", asymmetric(LuGre(**bristle), Fc=BACKWARD * FC, Fs=BACKWARD * FS), _worn),
+        LawCase("ElastoPlastic", ElastoPlastic(**bristle, Fba=0.7 * FC), gauss),
+        LawCase("MaxwellSlip, 1", MaxwellSlip(k=[SIGMA0], Fc=[FC], sigma2=FV), _curve(Fs=FC)),
+        LawCase("MaxwellSlip, 4", MaxwellSlip(**elements), _curve(Fs=FC)),
+        LawCase("MaxwellSlip, 4, C", MaxwellSlip(**elements, Fs=FS * FORCE_SHARES, vs=VS, C=50.0), gauss),
+        LawCase("Armstrong", Armstrong(SIGMA0, FC, FS, VS, FV, tau=0.01, gamma=1.0), _curve(fall=_lorentzian)),
     )

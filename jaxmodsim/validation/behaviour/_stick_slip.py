@@ -3,9 +3,9 @@
 import numpy as np
 
 from ._experiment import Experiment
-from ._laws import Specimen
-from ._outcome import Finding, Limit, Line
+from ._laws import LawCase
 from ._pulled import move
+from ._result import FigureLine, LawMeasurement, Threshold
 
 # Stiffness [N/m], velocity of the spring's end [m/s] and duration [s].
 _K, _PULL, _T1 = 2.0, 0.1, 40.0
@@ -15,9 +15,9 @@ _K, _PULL, _T1 = 2.0, 0.1, 40.0
 _REST, _SPAN = 2e-3, 5
 
 
-def _measure(specimen: Specimen) -> Finding:
+def _measure(case: LawCase) -> LawMeasurement:
     """Pull, and look at the second half of the run for times of rest."""
-    run = move(specimen, _T1, k=_K, pull=_PULL, dtmax=0.1)
+    run = move(case, _T1, k=_K, pull=_PULL, dtmax=0.1)
     late = run.t >= 0.5 * _T1
     ahead, behind = np.roll(run.q, -_SPAN), np.roll(run.q, _SPAN)
     rests = np.abs(ahead - behind) < _REST * _PULL * 2 * _SPAN * (run.t[1] - run.t[0])
@@ -26,11 +26,11 @@ def _measure(specimen: Specimen) -> Finding:
     spring = _K * (_PULL * run.t - run.q)
     starts = run.t[1:][~rests[1:] & rests[:-1] & late[1:]]
     period = f"period {np.mean(np.diff(starts)):.3g} s, " if starts.size > 1 else ""
-    return Finding(
+    return LawMeasurement(
         share,
         f"In the second half of the run the mass rests for this part of the time: {period}spring force from"
         f" {spring[late].min():.3g} N to {spring[late].max():.3g} N.",
-        (Line("end of the spring", run.t, _PULL * run.t, reference=True), Line("mass", run.t, run.q)),
+        (FigureLine("end of the spring", run.t, _PULL * run.t, reference=True), FigureLine("mass", run.t, run.q)),
     )
 
 
@@ -40,7 +40,7 @@ STICK_SLIP = Experiment(
     "Stick-slip: a mass of 1 kg pulled through a spring of 2 N/m at 0.1 m/s",
     "time at rest over time",
     "1",
-    Limit(0.1, at_most=False),
+    Threshold(0.1, at_most=False),
     ("time [s]", "position [m]"),
     (0.0, 4.2),
     _measure,

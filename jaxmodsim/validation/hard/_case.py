@@ -24,7 +24,7 @@ class Answer(NamedTuple):
     value: Float[Array, ""]
 
 
-class Motion(eqx.Module):
+class SceneTask(eqx.Module):
     """A run of a scene.
 
     - `scene`, `q0`, `qd0`, `t1`: as for `simulate`.
@@ -52,7 +52,7 @@ class Motion(eqx.Module):
                 return float(getattr(self, name)[_index(self.by)])
         return read_element(self.scene, self.by)
 
-    def cast(self, dtype: str) -> "Motion":
+    def cast(self, dtype: str) -> "SceneTask":
         """The same in another floating type, and no tighter tolerance than that carries."""
         cast = jtu.tree_map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, self)
         numbers = cast.numbers | {"rtol": jnp.maximum(cast.numbers["rtol"], _LEAST_RTOL[dtype])}
@@ -69,13 +69,13 @@ class Motion(eqx.Module):
             scene = replace_elements(scene, {self.by: x})
         return simulate(scene, q0, qd0, self.t1, **self.numbers, **dict(self.choices), adjoint=adjoint, throw=False)
 
-    def answer(self, x: Float[Array, ""], adjoint: Any = None) -> Answer:
+    def answer(self, x: Float[Array, ""], adjoint: object = None) -> Answer:
         """The number asked for."""
         run = self.run(x, adjoint)
         return Answer(run.code, self.read(run))
 
 
-class Program(eqx.Module):
+class FunctionTask(eqx.Module):
     """Another computation of one number from one number: with the event solver alone, or with charts.
 
     - `fn`: `fn(x, adjoint)` -> an `Answer`; `adjoint` is None for the default.
@@ -87,18 +87,18 @@ class Program(eqx.Module):
     x: float = eqx.field(static=True)
     by: str = eqx.field(static=True)
 
-    def cast(self, dtype: str) -> "Program":
+    def cast(self, dtype: str) -> "FunctionTask":
         """Itself: it computes in the floating type of its number."""
         del dtype
         return self
 
-    def answer(self, x: Float[Array, ""], adjoint: Any = None) -> Answer:
+    def answer(self, x: Float[Array, ""], adjoint: object = None) -> Answer:
         """The number asked for."""
         return self.fn(x, adjoint)
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredNumber:
     """A number that is found by many runs, in double precision.
 
     - `fn`: finds it.
@@ -108,7 +108,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Refused:
+class RefusedCalls:
     """Calls that must raise an error that names what is wrong.
 
     - `calls`: what is called, by name.
@@ -127,7 +127,7 @@ class HardCase:
     - `why`: the reason it is hard.
     - `naive`: what a plain simulation does.
     - `asks`: what is asked for, with its unit.
-    - `task`: a `Motion`, a `Program`, `Measured` or `Refused`.
+    - `task`: a `SceneTask`, a `FunctionTask`, `MeasuredNumber` or `RefusedCalls`.
     - `exact`: the right answer as a function of the number the task is a function of, in closed form.
     - `slope`: its derivative in closed form, where differences of `exact` do not give it.
     - `second`: the right answer by a second solver, where there is no closed form; the derivative is then held against
@@ -141,7 +141,7 @@ class HardCase:
       either right or says so, as rounding has it.
     - `undefined`: why there is no derivative; empty where there is one. Then `check_gradients` must say so.
     - `conserves`: whether the energy balance has to close: not where the run fails, or where fixed steps are long.
-    - `leaves`: ways that are left out, of those in `WAYS` or in one type ("reverse float32"), with the reason.
+    - `skips`: entries of `TRANSFORMS` that are not run, in both types or in one ("reverse float32"), and the reason.
     """
 
     name: str
@@ -149,7 +149,7 @@ class HardCase:
     why: str
     naive: str
     asks: str
-    task: Motion | Program | Measured | Refused
+    task: SceneTask | FunctionTask | MeasuredNumber | RefusedCalls
     exact: Callable[[float], float] | None = None
     slope: Callable[[float], float] | None = None
     second: Callable[[], float] | None = None
@@ -160,25 +160,25 @@ class HardCase:
     single_ends: str = ""
     undefined: str = ""
     conserves: bool = True
-    leaves: Mapping[str, str] = field(default_factory=dict)
+    skips: Mapping[str, str] = field(default_factory=dict)
 
 
 def motion(
     scene: Scene,
-    q0: Any,
-    qd0: Any,
+    q0: object,
+    qd0: object,
     t1: float,
     *,
     by: str,
     read: Callable[[Trajectory], Array],
     numbers: Mapping[str, ArrayLike | list[float]] | None = None,
-    **choices: Any,
-) -> Motion:
-    """A `Motion` from plain numbers; by default at `rtol=1e-9, atol=1e-11`."""
+    **choices: object,
+) -> SceneTask:
+    """A `SceneTask` from plain numbers; by default at `rtol=1e-9, atol=1e-11`."""
     given = {"rtol": 1e-9, "atol": 1e-11, **(numbers or {})}
     arrays = {name: jnp.asarray(np.asarray(value, float)) for name, value in given.items()}
     q, qd, end = (jnp.asarray(np.asarray(x, float)) for x in (q0, qd0, t1))
-    return Motion(scene, q, qd, end, by, read, arrays, tuple(choices.items()))
+    return SceneTask(scene, q, qd, end, by, read, arrays, tuple(choices.items()))
 
 
 def position(run: Trajectory) -> Array:

@@ -1,4 +1,4 @@
-"""Hard cases put to the test: every way of running them, in both floating types."""
+"""Checks of hard cases under every transform, in both floating types."""
 
 import math
 import re
@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from ...analysis import check_gradients
 from ...scene import Scene
 from ...simulation import SimulationError, outcome_messages
-from ._case import Answer, HardCase, Measured, Motion, Program, Refused, differentiate
+from ._case import Answer, FunctionTask, HardCase, MeasuredNumber, RefusedCalls, SceneTask, differentiate
 
-WAYS = ("alone", "jit", "vmap", "forward", "reverse", "energy")
+TRANSFORMS = ("alone", "jit", "vmap", "forward", "reverse", "energy")
 DTYPES = ("float64", "float32")
 
 # Derivatives may be this much less accurate than values.
@@ -31,16 +31,16 @@ _STEP = 1e-3
 
 
 @dataclass(frozen=True)
-class Finding:
-    """What one way of running a case gave.
+class CheckFinding:
+    """The result of a case under one transform.
 
-    - `way`, `dtype`: of `WAYS` and `DTYPES`.
+    - `transform`, `dtype`: of `TRANSFORMS` and `DTYPES`.
     - `error`: relative to what is asked, so that 1 is the limit; NaN where there is no number to compare.
     - `ok`: whether it is as it should be.
     - `sentence`: what was found.
     """
 
-    way: str
+    transform: str
     dtype: str
     error: float
     ok: bool
@@ -48,31 +48,31 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class CaseReport:
     """What was found on a case.
 
     - `case`: the `HardCase`.
-    - `findings`: in the order of the types, and of the ways in each.
+    - `findings`: in the order of the types, and of the transforms in each.
     """
 
     case: HardCase
-    findings: tuple[Finding, ...]
+    findings: tuple[CheckFinding, ...]
 
     @property
     def ok(self) -> bool:
-        """Whether every way is as it should be."""
+        """Whether every transform is as it should be."""
         return all(finding.ok for finding in self.findings)
 
-    def worst(self, dtype: str, ways: Sequence[str] = WAYS) -> float:
-        """Largest error in these ways, 1 being the limit; NaN where there is none."""
-        errors = [each.error for each in self.findings if each.dtype == dtype and each.way in ways]
+    def worst(self, dtype: str, transforms: Sequence[str] = TRANSFORMS) -> float:
+        """Largest error in these transforms, 1 being the limit; NaN where there is none."""
+        errors = [each.error for each in self.findings if each.dtype == dtype and each.transform in transforms]
         return max((error for error in errors if not math.isnan(error)), default=math.nan)
 
 
-def check(case: HardCase, ways: Sequence[str] = WAYS, dtypes: Sequence[str] = DTYPES) -> Verdict:
+def check(case: HardCase, transforms: Sequence[str] = TRANSFORMS, dtypes: Sequence[str] = DTYPES) -> CaseReport:
     """Run a hard case and compare it with what is right.
 
-    - `alone`, `jit`, `vmap`: the answer, or the sentence with which the run ends. Under `vmap` one of three lanes gets
+    - `alone`, `jit`, `vmap`: the answer, or the sentence with which the run ends. Under `vmap` one of three runs gets
       NaN for its number: it must say that it failed, and the others be right.
     - `forward`, `reverse`: the derivative by the number of the case; where there is none, it must be finite, and
       `check_gradients` must not approve it (checked with `reverse`).
@@ -81,46 +81,46 @@ def check(case: HardCase, ways: Sequence[str] = WAYS, dtypes: Sequence[str] = DT
     **Arguments:**
 
     - `case`: the `HardCase`.
-    - `ways`: which of `WAYS`.
+    - `transforms`: which of `TRANSFORMS`.
     - `dtypes`: which of `DTYPES`; what a case leaves out is left out.
 
     **Returns:**
 
-    A `Verdict`.
+    A `CaseReport`.
 
     **Raises:**
 
-    - `ValueError` for ways or types that are none, and without double precision, which float64 needs.
+    - `ValueError` for transforms or types that are none, and without double precision, which float64 needs.
     """
-    check_choice(ways, dtypes)
-    if isinstance(case.task, Refused):
-        return Verdict(case, tuple(_refusals(case.task)))
-    if isinstance(case.task, Measured):
-        return Verdict(case, (_measured(case, case.task),))
+    check_choice(transforms, dtypes)
+    if isinstance(case.task, RefusedCalls):
+        return CaseReport(case, tuple(_refusals(case.task)))
+    if isinstance(case.task, MeasuredNumber):
+        return CaseReport(case, (_measured(case, case.task),))
     findings = []
     for dtype in dtypes:
         if dtype == "float32" and case.single is None:
             continue
         trial = _Trial(case, case.task.cast(dtype), dtype)
-        findings += [trial.look(way) for way in ways if trial.applies(way)]
-    return Verdict(case, tuple(findings))
+        findings += [trial.look(transform) for transform in transforms if trial.applies(transform)]
+    return CaseReport(case, tuple(findings))
 
 
-def check_choice(ways: Sequence[str], dtypes: Sequence[str]) -> None:
-    """Refuse ways and types that are none, and single precision.
+def check_choice(transforms: Sequence[str], dtypes: Sequence[str]) -> None:
+    """Refuse transforms and types that are none, and single precision.
 
     **Raises:**
 
     - `ValueError` that names what there is.
     """
-    for name, given, known in (("ways", ways, WAYS), ("dtypes", dtypes, DTYPES)):
+    for name, given, known in (("transforms", transforms, TRANSFORMS), ("dtypes", dtypes, DTYPES)):
         if unknown := [each for each in given if each not in known]:
             raise ValueError(f"{name} must be of {', '.join(known)}, but {unknown[0]!r} was given.")
     if jnp.result_type(float) != jnp.float64:
         raise ValueError('Hard cases need double precision: jax.config.update("jax_enable_x64", True).')
 
 
-def _refusals(task: Refused) -> list[Finding]:
+def _refusals(task: RefusedCalls) -> list[CheckFinding]:
     findings = []
     for name, call in task.calls.items():
         try:
@@ -128,30 +128,30 @@ def _refusals(task: Refused) -> list[Finding]:
             ok, text = False, "nothing was raised"
         except (ValueError, SimulationError, eqx.EquinoxRuntimeError) as error:
             ok, text = re.search(task.match[name], str(error)) is not None, str(error)
-        findings.append(Finding("alone", "float64", math.nan, ok, f"{name}: {text}"))
+        findings.append(CheckFinding("alone", "float64", math.nan, ok, f"{name}: {text}"))
     return findings
 
 
-def _measured(case: HardCase, task: Measured) -> Finding:
+def _measured(case: HardCase, task: MeasuredNumber) -> CheckFinding:
     assert case.exact is not None
     value, right = task.fn(), case.exact(0.0)
     error = abs(value - right) / (case.scale or abs(right)) / case.tolerance
-    return Finding("alone", "float64", error, error <= 1.0, f"{value:.9g}, right is {right:.9g}.")
+    return CheckFinding("alone", "float64", error, error <= 1.0, f"{value:.9g}, right is {right:.9g}.")
 
 
 # Compiled once for all cases of one structure.
 @eqx.filter_jit
-def _jit(task: Motion | Program, x: Any) -> Answer:
+def _jit(task: SceneTask | FunctionTask, x: Any) -> Answer:
     return task.answer(x)
 
 
 @eqx.filter_jit
-def _vmap(task: Motion | Program, x: Any) -> Answer:
+def _vmap(task: SceneTask | FunctionTask, x: Any) -> Answer:
     return jax.vmap(task.answer)(x)
 
 
 @eqx.filter_jit
-def _forward(task: Motion | Program, x: Any) -> tuple[Answer, Any]:
+def _forward(task: SceneTask | FunctionTask, x: Any) -> tuple[Answer, Any]:
     def value(x: Any) -> tuple[Any, Answer]:
         answer = task.answer(x, dfx.ForwardMode())
         return answer.value, answer
@@ -161,7 +161,7 @@ def _forward(task: Motion | Program, x: Any) -> tuple[Answer, Any]:
 
 
 @eqx.filter_jit
-def _reverse(task: Motion | Program, x: Any) -> tuple[Answer, Any]:
+def _reverse(task: SceneTask | FunctionTask, x: Any) -> tuple[Answer, Any]:
     def value(x: Any) -> tuple[Any, Answer]:
         answer = task.answer(x)
         return answer.value, answer
@@ -175,7 +175,7 @@ class _Trial:
     """A case in one floating type."""
 
     case: HardCase
-    task: Motion | Program
+    task: SceneTask | FunctionTask
     dtype: str
 
     @property
@@ -204,62 +204,66 @@ class _Trial:
         single = self.case.single
         return self.case.tolerance if self.dtype == "float64" or single is None else single
 
-    def applies(self, way: str) -> bool:
-        if way in self.case.leaves or f"{way} {self.dtype}" in self.case.leaves:
+    def applies(self, transform: str) -> bool:
+        if transform in self.case.skips or f"{transform} {self.dtype}" in self.case.skips:
             return False
-        if way == "energy":
-            runs = isinstance(self.task, Motion) and not self.case.ends and self.case.conserves
+        if transform == "energy":
+            runs = isinstance(self.task, SceneTask) and not self.case.ends and self.case.conserves
             return runs and self.dtype == "float64"
-        return way not in ("forward", "reverse") or not (self.case.ends and self.right is None)
+        return transform not in ("forward", "reverse") or not (self.case.ends and self.right is None)
 
-    def look(self, way: str) -> Finding:
-        """One way."""
-        if way == "energy":
+    def look(self, transform: str) -> CheckFinding:
+        """One transform."""
+        if transform == "energy":
             return self.energy()
-        if way in ("forward", "reverse"):
-            return self.derivative(way)
-        if way == "vmap":
+        if transform in ("forward", "reverse"):
+            return self.derivative(transform)
+        if transform == "vmap":
             return self.batch()
-        return self.finding(way, self.task.answer(self.x) if way == "alone" else _jit(self.task, self.x))
+        return self.finding(transform, self.task.answer(self.x) if transform == "alone" else _jit(self.task, self.x))
 
-    def finding(self, way: str, answer: Answer) -> Finding:
+    def finding(self, transform: str, answer: Answer) -> CheckFinding:
         """An answer, compared."""
         code, value = int(answer.code), float(answer.value)
         sentence, ends = self.messages[code], self.case.ends
         if self.gives_up(answer):
-            return Finding(way, self.dtype, math.nan, True, sentence)
+            return CheckFinding(transform, self.dtype, math.nan, True, sentence)
         ended = re.search(ends, sentence) is not None if ends else code == 0
         if self.right is None:
-            return Finding(way, self.dtype, math.nan, ended and code != 0, sentence)
+            return CheckFinding(transform, self.dtype, math.nan, ended and code != 0, sentence)
         error = abs(value - self.right) / self.scale / self.tolerance
         right = math.isfinite(value) and error <= 1.0
-        return Finding(way, self.dtype, error, ended and right, f"{value:.12g}, right is {self.right:.12g}. {sentence}")
+        return CheckFinding(
+            transform, self.dtype, error, ended and right, f"{value:.12g}, right is {self.right:.12g}. {sentence}"
+        )
 
-    def batch(self) -> Finding:
-        """One of three lanes is sick."""
-        lanes = jnp.stack([self.x, jnp.full_like(self.x, jnp.nan), self.x])
-        answers = _vmap(self.task, lanes)
+    def batch(self) -> CheckFinding:
+        """Three runs under `vmap`, of which the second gets NaN."""
+        numbers = jnp.stack([self.x, jnp.full_like(self.x, jnp.nan), self.x])
+        answers = _vmap(self.task, numbers)
         first, sick, last = (Answer(answers.code[i], answers.value[i]) for i in range(3))
         found, other = (self.finding("vmap", each) for each in (first, last))
-        if isinstance(self.task, Motion) and int(sick.code) == 0:
-            return Finding("vmap", self.dtype, found.error, False, "A lane whose number is NaN says that all is well.")
-        # Where rounding differs from lane to lane of the processor's vectors, so do they, but both are right.
+        if isinstance(self.task, SceneTask) and int(sick.code) == 0:
+            return CheckFinding(
+                "vmap", self.dtype, found.error, False, "A run whose number is NaN says that all is well."
+            )
+        # Rounding may differ between the lanes of the processor's vectors: the two differ then, but both are right.
         return found if other.ok else other
 
-    def derivative(self, way: str) -> Finding:
+    def derivative(self, transform: str) -> CheckFinding:
         """A derivative, compared."""
-        answer, slope = (_forward if way == "forward" else _reverse)(self.task, self.x)
-        found, slope = self.finding(way, answer), float(slope)
+        answer, slope = (_forward if transform == "forward" else _reverse)(self.task, self.x)
+        found, slope = self.finding(transform, answer), float(slope)
         if not found.ok or self.gives_up(answer):
             return found
         if not math.isfinite(slope):
-            return Finding(way, self.dtype, math.inf, False, f"The derivative is {slope}.")
+            return CheckFinding(transform, self.dtype, math.inf, False, f"The derivative is {slope}.")
         if self.case.undefined:
-            return self.flagged(way, slope)
+            return self.flagged(transform, slope)
         right = self.slope()
         size = max(abs(right), self.scale / (abs(self.task.x) or 1.0))
         error = abs(slope - right) / size / (_SLOPE * self.tolerance)
-        return Finding(way, self.dtype, error, error <= 1.0, f"{slope:.9g}, right is {right:.9g}.")
+        return CheckFinding(transform, self.dtype, error, error <= 1.0, f"{slope:.9g}, right is {right:.9g}.")
 
     def slope(self) -> float:
         """The right derivative: of the closed form, or by finite differences of answers in double precision."""
@@ -268,38 +272,40 @@ class _Trial:
         if self.case.exact is not None:
             return differentiate(self.case.exact, float(self.x))
         task = self.case.task
-        assert isinstance(task, Motion | Program)
+        assert isinstance(task, SceneTask | FunctionTask)
         return differentiate(lambda x: float(_jit(task, jnp.asarray(x, float)).value), task.x, _STEP)
 
-    def flagged(self, way: str, slope: float) -> Finding:
+    def flagged(self, transform: str, slope: float) -> CheckFinding:
         """Where there is no derivative: that of the modes as they are, and a warning."""
-        if way == "forward" or not isinstance(self.task, Motion):
-            return Finding(way, self.dtype, math.nan, True, f"{slope:.9g}, and there is none: {self.case.undefined}")
+        if transform == "forward" or not isinstance(self.task, SceneTask):
+            return CheckFinding(
+                transform, self.dtype, math.nan, True, f"{slope:.9g}, and there is none: {self.case.undefined}"
+            )
         found = _watched(self.task)
         sentence = f"check_gradients says: {found}"
-        return Finding(way, self.dtype, math.nan, found != "agree", sentence)
+        return CheckFinding(transform, self.dtype, math.nan, found != "agree", sentence)
 
-    def energy(self) -> Finding:
+    def energy(self) -> CheckFinding:
         """The energy balance at the end, relative to the largest energy there is."""
-        assert isinstance(self.task, Motion)
+        assert isinstance(self.task, SceneTask)
         book = self.task.run(self.x).energy
         parts = (book.kinetic, book.potential, book.stored, book.work_in, book.dissipated)
         # Without any energy there is nothing to lose.
         size = max(float(jnp.max(jnp.abs(part))) for part in parts)
         size = size if size > _NO_ENERGY else 1.0
         error = float(jnp.max(jnp.abs(book.balance))) / size / (_BALANCE * self.tolerance)
-        return Finding(
+        return CheckFinding(
             "energy", self.dtype, error, error <= 1.0, f"{error * _BALANCE * self.tolerance:.2g} of {size:.3g} J"
         )
 
     @property
     def messages(self) -> tuple[str, ...]:
-        if isinstance(self.task, Motion):
+        if isinstance(self.task, SceneTask):
             return outcome_messages(self.task.scene, self.task.q0.shape[0])
         return ("The run reached t1.", "The run ended early.")
 
 
-def _watched(task: Motion) -> str:
+def _watched(task: SceneTask) -> str:
     """The verdict of `check_gradients` on the number of a case."""
 
     def fn(scene: Scene, simulate: Callable[..., Any]) -> Any:

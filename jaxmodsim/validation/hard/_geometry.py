@@ -25,7 +25,7 @@ from ...problems import (
 )
 from ...scene import AppliedForce, Friction, Scene
 from ...simulation import Trajectory
-from ._case import Answer, HardCase, Program, end_time, motion, position
+from ._case import Answer, FunctionTask, HardCase, end_time, motion, position
 
 FAMILY = "geometry"
 _G = 9.81
@@ -95,13 +95,13 @@ def _poles() -> list[HardCase]:
             "Acceleration in spherical components at the pole itself, where the basis has no direction of theta.",
             "0/0 in scale factors and Christoffel symbols.",
             "component along theta, 2 r phi' theta' [m/s^2]",
-            Program(_at_pole, 0.5, "phi' [rad/s]"),
+            FunctionTask(_at_pole, 0.5, "phi' [rad/s]"),
             lambda rate: 2.0 * 2.0 * rate * 0.7,
         ),
     ]
 
 
-def _at_pole(rate: Array, adjoint: Any) -> Answer:
+def _at_pole(rate: Array, adjoint: object) -> Answer:
     del adjoint
     q = jnp.asarray([2.0, 0.0, 0.3], rate.dtype)
     qd = jnp.stack([jnp.asarray(0.1, rate.dtype), rate, jnp.asarray(0.7, rate.dtype)])

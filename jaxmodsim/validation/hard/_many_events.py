@@ -24,7 +24,7 @@ from ...problems import (
 from ...scene import AppliedForce, Friction, Scene
 from ...simulation import Trajectory
 from ...solvers import EventController, EventSolver
-from ._case import Answer, HardCase, Program, motion, position
+from ._case import Answer, FunctionTask, HardCase, motion, position
 
 FAMILY = "many events"
 _G = 9.81
@@ -51,7 +51,7 @@ def _solve(field: Any, solver: EventSolver, t1: float, start: Any, adjoint: Any)
     return code, solution.ys
 
 
-def _bounce(e: Array, adjoint: Any, held: bool) -> Answer:
+def _bounce(e: Array, adjoint: object, held: bool) -> Answer:
     ball = BouncingBall(e=e, g=jnp.asarray(_G, e.dtype))
     hold = ball.hold if held else None
     solver = EventSolver(dfx.Tsit5(), ball.guards, ball.reset, on_zeno=hold, max_events=512, log=False)
@@ -60,11 +60,11 @@ def _bounce(e: Array, adjoint: Any, held: bool) -> Answer:
     return Answer(code, ys.t[-1])
 
 
-def _bounce_to_rest(e: Array, adjoint: Any) -> Answer:
+def _bounce_to_rest(e: Array, adjoint: object) -> Answer:
     return _bounce(e, adjoint, held=True)
 
 
-def _bounce_unheld(e: Array, adjoint: Any) -> Answer:
+def _bounce_unheld(e: Array, adjoint: object) -> Answer:
     return _bounce(e, adjoint, held=False)
 
 
@@ -79,7 +79,7 @@ def _zeno() -> list[HardCase]:
             "A ball comes to rest after infinitely many bounces in 1.35 s.",
             "It falls through the floor when the bounces come closer than the event search resolves.",
             "time of rest [s]",
-            Program(_bounce_to_rest, 0.5, "coefficient of restitution"),
+            FunctionTask(_bounce_to_rest, 0.5, "coefficient of restitution"),
             rest,
         ),
         HardCase(
@@ -88,7 +88,7 @@ def _zeno() -> list[HardCase]:
             "The same without a state of rest to go to.",
             "Smaller and smaller steps without end.",
             "a named end, at the time of rest [s]",
-            Program(_bounce_unheld, 0.5, "coefficient of restitution"),
+            FunctionTask(_bounce_unheld, 0.5, "coefficient of restitution"),
             rest,
             ends="ended early",
         ),
@@ -226,7 +226,7 @@ def _cycles() -> list[HardCase]:
             tolerance=1e-4,
             # Times of 1e5 s are known to 8 ms in float32.
             single=None,
-            leaves={
+            skips={
                 "vmap": "as alone, and it takes as long for every lane",
                 "reverse": "checkpoints of 2e6 steps take minutes; `forward` has the same saltation matrices",
                 "energy": "sums over 1e5 cycles; audited on one cycle elsewhere",
@@ -325,7 +325,7 @@ def _ceiling() -> HardCase:
         "A ball touches the ceiling at 6e-4 m/s: the time of touching goes as a square root of what is left.",
         "The touch lies between two steps and is missed; the derivative, -700, is off by as much.",
         "time of touching [s]",
-        Program(_throw, v0, "initial velocity [m/s]"),
+        FunctionTask(_throw, v0, "initial velocity [m/s]"),
         exact,
         slope,
         tolerance=1e-5,

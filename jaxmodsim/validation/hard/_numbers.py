@@ -13,7 +13,7 @@ from ...identify import Record
 from ...problems import box_lugre, braked_spring, braked_spring_law, ramped_box
 from ...scene import Signal
 from ...simulation import simulate
-from ._case import HardCase, Measured, Refused, motion, position, velocity
+from ._case import HardCase, MeasuredNumber, RefusedCalls, motion, position, velocity
 
 FAMILY = "numbers"
 _NAN, _INF = float("nan"), float("inf")
@@ -29,8 +29,10 @@ def _poisoned(value: float) -> Any:
     return simulate(scene, [1.0], [0.0], 1.0)
 
 
-def _refused(name: str, why: str, naive: str, calls: dict[str, tuple[Callable[[], Any], str]]) -> HardCase:
-    task = Refused({key: call for key, (call, _) in calls.items()}, {key: text for key, (_, text) in calls.items()})
+def _refused(name: str, why: str, naive: str, calls: dict[str, tuple[Callable[[], object], str]]) -> HardCase:
+    task = RefusedCalls(
+        {key: call for key, (call, _) in calls.items()}, {key: text for key, (_, text) in calls.items()}
+    )
     return HardCase(name, FAMILY, why, naive, "errors that name what is wrong", task)
 
 
@@ -147,7 +149,7 @@ def _extremes() -> list[HardCase]:
             "Whole numbers, Python's, NumPy's and JAX's, for masses, states and times.",
             "Integer arrays that round the motion off, or an error from a loop whose types differ.",
             "largest difference between the runs [m]",
-            Measured(_same_types),
+            MeasuredNumber(_same_types),
             lambda _: 0.0,
             scale=1.0,
             tolerance=1e-15,
@@ -158,7 +160,7 @@ def _extremes() -> list[HardCase]:
             "Times given twice, and a single one.",
             "Rows of NaN for the second of two.",
             "largest difference between what must be equal [m]",
-            Measured(_same_times),
+            MeasuredNumber(_same_times),
             lambda _: 0.0,
             scale=1.0,
             tolerance=1e-15,

@@ -1,4 +1,4 @@
-"""Many hard cases, in several processes."""
+"""All hard cases, and checks of many of them in several processes."""
 
 import math
 import multiprocessing
@@ -9,10 +9,30 @@ from functools import cache
 
 import jax
 
-from ..._core.suggest import did_you_mean
+from ..._core.arguments import did_you_mean
+from . import _geometry, _gradients, _many_events, _numbers, _reversal, _scale, _shaken, _stiffness
 from ._case import HardCase
-from ._cases import FAMILIES, hard_cases
-from ._check import DTYPES, WAYS, Finding, Verdict, check, check_choice
+from ._check import DTYPES, TRANSFORMS, CaseReport, CheckFinding, check, check_choice
+
+_MODULES = (_stiffness, _reversal, _shaken, _many_events, _geometry, _scale, _numbers, _gradients)
+
+FAMILIES = tuple(module.FAMILY for module in _MODULES)
+
+
+def hard_cases() -> dict[str, HardCase]:
+    """All hard cases by name, family after family.
+
+    ```python
+    case = hard.hard_cases()["bristle_stiff"]
+    verdict = hard.check(case)
+    verdict.ok, [finding.sentence for finding in verdict.findings]
+    ```
+
+    Families: stiffness, rest and reversal, loads in stick, many events, geometry, scale and time, numbers,
+    gradients.
+    """
+    return {case.name: case for module in _MODULES for case in module.cases()}
+
 
 # Of these the runs themselves take minutes: begun first, they do not hold up the end.
 _LONG = ("periods_1000000", "cycles_100000", "dead_points", "redundant_constraints")
@@ -42,14 +62,14 @@ def choose(names: Sequence[str]) -> dict[str, HardCase]:
 
 
 def check_many(
-    names: Sequence[str] = (), *, ways: Sequence[str] = WAYS, dtypes: Sequence[str] = DTYPES, jobs: int = 1
-) -> Iterator[Verdict]:
+    names: Sequence[str] = (), *, transforms: Sequence[str] = TRANSFORMS, dtypes: Sequence[str] = DTYPES, jobs: int = 1
+) -> Iterator[CaseReport]:
     """`check` many hard cases; each verdict comes as it is found, also where its process was killed.
 
     **Arguments:**
 
     - `names`: of cases or families; all without.
-    - `ways`, `dtypes`: as for `check`.
+    - `transforms`, `dtypes`: as for `check`.
     - `jobs`: processes at a time, > 0, besides this one.
 
     **Raises:**
@@ -57,26 +77,26 @@ def check_many(
     - `ValueError` as `choose` and `check`.
     """
     cases = choose(names)
-    check_choice(ways, dtypes)
+    check_choice(transforms, dtypes)
     order = sorted(cases, key=lambda name: name not in _LONG)
     context = multiprocessing.get_context("spawn")
     for first in range(0, len(order), jobs * _PORTION):
         pool = ProcessPoolExecutor(jobs, context, initializer=_begin)
         portion = order[first : first + jobs * _PORTION]
         try:
-            futures = {pool.submit(_found, name, tuple(ways), tuple(dtypes)): name for name in portion}
+            futures = {pool.submit(_found, name, tuple(transforms), tuple(dtypes)): name for name in portion}
             for future in as_completed(futures):
-                yield Verdict(cases[futures[future]], _result(future))
+                yield CaseReport(cases[futures[future]], _result(future))
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _result(future: Future[tuple[Finding, ...]]) -> tuple[Finding, ...]:
+def _result(future: Future[tuple[CheckFinding, ...]]) -> tuple[CheckFinding, ...]:
     try:
         return future.result()
     except BrokenProcessPool as error:
         # That of this case, or of another one that was begun with it.
-        return (Finding("alone", "float64", math.nan, False, f"A process was killed: {error}"),)
+        return (CheckFinding("alone", "float64", math.nan, False, f"A process was killed: {error}"),)
 
 
 def _begin() -> None:
@@ -88,9 +108,9 @@ def _begin() -> None:
 _cases = cache(hard_cases)
 
 
-def _found(name: str, ways: tuple[str, ...], dtypes: tuple[str, ...]) -> tuple[Finding, ...]:
+def _found(name: str, transforms: tuple[str, ...], dtypes: tuple[str, ...]) -> tuple[CheckFinding, ...]:
     try:
-        return check(_cases()[name], ways, dtypes).findings
+        return check(_cases()[name], transforms, dtypes).findings
     except Exception as error:
         # Whatever it is, the other cases go on.
-        return (Finding("alone", "float64", math.nan, False, f"{type(error).__name__}: {error}"),)
+        return (CheckFinding("alone", "float64", math.nan, False, f"{type(error).__name__}: {error}"),)

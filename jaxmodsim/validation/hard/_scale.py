@@ -13,7 +13,7 @@ from ...problems import BRAKED_SPRING, braked_spring, braked_spring_law, braked_
 from ...scene import Scene
 from ...simulation import Trajectory, simulate
 from ...solvers import Gauss
-from ._case import HardCase, Measured, Refused, motion, position, velocity
+from ._case import HardCase, MeasuredNumber, RefusedCalls, motion, position, velocity
 
 FAMILY = "scale and time"
 _LATE = 1e9
@@ -54,7 +54,7 @@ def _units() -> list[HardCase]:
             f"The mass on a spring with friction, 11 reversals, on the scale of {words}.",
             "Tolerances, smoothing widths and thresholds in SI units: nothing moves, or nothing stops.",
             "difference to the run in metres, after conversion [m, m/s]",
-            Measured(lambda scales=(length, time, mass): in_other_units(*scales)),
+            MeasuredNumber(lambda scales=(length, time, mass): in_other_units(*scales)),
             lambda _: 0.0,
             scale=1.0,
             # Not one digit may differ.
@@ -98,7 +98,7 @@ def _late() -> list[HardCase]:
             ),
             lambda x0: _at(30.0, x0),
             tolerance=1e-5,
-            # Refused: see the next.
+            # RefusedCalls: see the next.
             single=None,
         ),
         HardCase(
@@ -107,7 +107,7 @@ def _late() -> list[HardCase]:
             "The same in float32, where the next number after 1e9 is 1e9 + 64.",
             "A run of no length: the initial state, under a success code.",
             "an error that names it",
-            Refused(
+            RefusedCalls(
                 {"clock": lambda: simulate(_single(spring), np.ones(1, np.float32), [0.0], _LATE + 30.0, t0=_LATE)},
                 {"clock": "are the same number in float32"},
             ),
@@ -204,7 +204,7 @@ def _periods() -> HardCase:
         scale=1.0,
         tolerance=1e-6,
         single=None,
-        leaves={
+        skips={
             "vmap": "as alone",
             "forward": "minutes; the derivative after few periods is that of `reversals`",
             "reverse": "checkpoints of 1.6e7 steps take an hour",

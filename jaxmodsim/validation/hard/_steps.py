@@ -15,7 +15,7 @@ from ...problems import box_coulomb, ramped_box, slipping_bristle
 from ...scene import Scene
 from ...simulation import simulate
 from ...solvers import ImplicitFriction, Rodas5P
-from ._case import HardCase, Measured
+from ._case import HardCase, MeasuredNumber
 
 # Steps of a trial: at half a percent beyond the limit a disturbance grows thousandfold in them.
 _STEPS = 3000
@@ -131,7 +131,7 @@ def grows(formulation: Formulation, solver: Any, h: float) -> bool:
     return not (bool(run.result.ok) and abs(float(formulation.off(run))) < _GROWS)
 
 
-def largest_step(formulation: Formulation, solver: Any) -> float:
+def largest_step(formulation: Formulation, solver: object) -> float:
     """Largest stable step [s], by bisection."""
     low, high = 0.5 * theory(formulation, solver), 2.0 * theory(formulation, solver)
     if grows(formulation, solver, low) or not grows(formulation, solver, high):
@@ -170,7 +170,7 @@ def step_limits(family: str) -> list[HardCase]:
             f"Explicit steps end at the edge of the stability region; the eigenvalue is {value}.",
             "Below the limit all is well, just above it the bristle swings up within a thousand steps.",
             "largest stable step over that of theory, the farthest of Euler, Heun, Bosh3, Tsit5, Dopri8 [1]",
-            Measured(partial(_ratio, formulation, EXPLICIT)),
+            MeasuredNumber(partial(_ratio, formulation, EXPLICIT)),
             lambda _: 1.0,
             tolerance=1e-2,
             single=None,
@@ -183,7 +183,7 @@ def step_limits(family: str) -> list[HardCase]:
         "Fixed steps of 1e6 times what explicit methods can take, on all four formulations.",
         "Overflow within ten steps.",
         "runs of Rodas5P and ImplicitFriction in which a disturbance does not grow, of 8 [1]",
-        Measured(_unlimited),
+        MeasuredNumber(_unlimited),
         lambda _: 8.0,
         tolerance=1e-2,
         single=None,

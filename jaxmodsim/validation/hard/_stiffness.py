@@ -46,7 +46,7 @@ def _box(
     why: str,
     naive: str,
     single_ends: str = "",
-    leaves: dict[str, str] | None = None,
+    skips: dict[str, str] | None = None,
     **changes: float,
 ) -> HardCase:
     m = changes.pop("m", 2.0)
@@ -60,7 +60,7 @@ def _box(
         motion(scene, [0.0], [0.0], _T1, by="friction.Fc", read=velocity, max_steps=65536),
         second=lambda: box_by_scipy(m=m, **changes),
         single_ends=single_ends,
-        leaves=leaves or {},
+        skips=skips or {},
     )
 
 
@@ -82,7 +82,7 @@ def _boxes() -> list[HardCase]:
             "bristle_overdamped",
             "sigma1 = 1e6 N s/m on 2 kg: a rate of 5e5/s beside one of 0.1/s that decides the motion.",
             "Explicit steps of 4e-6 s; LuGre is not passive there, so that a wrong step also feeds energy in.",
-            leaves=dict.fromkeys(("forward float32", "reverse float32"), "keeps a digit: 0.1 to 9 % off"),
+            skips=dict.fromkeys(("forward float32", "reverse float32"), "keeps a digit: 0.1 to 9 % off"),
             sigma0=1e5,
             sigma1=1e6,
         ),

@@ -1,0 +1,100 @@
+"""How many steps the runs of a sweep take, found out by running a few of them first."""
+
+from dataclasses import dataclass, replace
+from math import comb
+
+import numpy as np
+
+from ._compute import Work, compute, runs_per_call
+from ._grid import Grid
+from ._run import CAP, out_of_steps
+
+# Part of all runs that the trial takes at most.
+_SHARE = 16
+# By what the number of steps grows that runs may take before they are set aside.
+_GROWTH = 8
+# Sweeps of fewer runs are run without a look ahead.
+_SMALL = 1024
+# Part of the runs that may come to the cap.
+_LATE = 0.05
+# Runs of the trial for each coefficient of the prediction.
+_PER_COEFFICIENT = 4
+# Part of the trace that is added to the normal equations, which may be singular.
+_RIDGE = 1e-10
+# Ratio of the largest to the smallest of values that are all positive from which their logarithm counts.
+_WIDE = 5.0
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Logarithm of the number of steps as a polynomial in the numbers of a run.
+
+    - `names`: of the numbers; `logs`: whether the logarithm is taken; `centre`, `scale`: of each.
+    - `coefficients`: of all products of up to `degree` of them.
+    """
+
+    names: tuple[str, ...]
+    logs: tuple[bool, ...]
+    centre: np.ndarray
+    scale: np.ndarray
+    degree: int
+    coefficients: np.ndarray
+
+    def order(self, numbers: dict[str, np.ndarray]) -> np.ndarray:
+        """The runs, those of the fewest steps first."""
+        x = (_columns(numbers, self.names, self.logs) - self.centre) / self.scale
+        steps = np.einsum("nk,k->n", _products(x, self.degree), self.coefficients)
+        return np.argsort(steps, kind="stable")
+
+
+def predict_steps(work: Work, grid: Grid, runs: int) -> tuple[Work, Prediction | None]:
+    """Choose after how many steps runs are set aside, and how to sort them; neither where the limit is not known.
+
+    The trial has as many runs as one call of compiled code takes in blocks of so many `runs`: drawn at random, but
+    always the same ones. The results do not depend on it.
+    """
+    limit = work.run.max_steps
+    if limit is None:
+        return replace(work, cap=None), None
+    cap = min(CAP, limit)
+    if grid.size < _SMALL:
+        return replace(work, cap=cap), None
+    count = min(runs_per_call(runs, work.group), grid.size // _SHARE)
+    drawn = np.unique(np.random.default_rng(0).integers(grid.size, size=count))
+    numbers = grid.numbers_at(drawn)
+    while True:
+        # Runs that come to the cap are not run again here.
+        trial = compute(replace(work, run=work.run.within(cap), cap=None), numbers, np.arange(drawn.size))
+        if cap == limit or out_of_steps(trial.code).mean() <= _LATE:
+            break
+        cap = min(cap * _GROWTH, limit)
+    return replace(work, cap=cap), _prediction(numbers, trial.num_steps)
+
+
+def _prediction(numbers: dict[str, np.ndarray], steps: np.ndarray) -> Prediction:
+    names = tuple(numbers)
+    logs = tuple(bool(x.min() > 0 and x.max() > _WIDE * x.min()) for x in numbers.values())
+    x = _columns(numbers, names, logs)
+    centre, scale = x.mean(axis=0), np.where(np.ptp(x, axis=0) > 0, np.ptp(x, axis=0), 1.0)
+    x = (x - centre) / scale
+    degree = max(d for d in (0, 1, 2, 3) if comb(x.shape[1] + d, d) * _PER_COEFFICIENT <= steps.size)
+    products = _products(x, degree)
+    # Sums by einsum: threads of a BLAS go on spinning when their work is done, and take the cores from the runs.
+    square = np.einsum("ni,nj->ij", products, products)
+    square += _RIDGE * np.trace(square) * np.eye(square.shape[0])
+    coefficients = np.linalg.solve(square, np.einsum("ni,n->i", products, np.log(np.maximum(steps, 1))))
+    return Prediction(names, logs, centre, scale, degree, coefficients)
+
+
+def _columns(numbers: dict[str, np.ndarray], names: tuple[str, ...], logs: tuple[bool, ...]) -> np.ndarray:
+    columns = [numbers[name].reshape(numbers[name].shape[0], -1).astype(float) for name in names]
+    return np.concatenate([np.log(x) if log else x for x, log in zip(columns, logs, strict=True)], axis=1)
+
+
+def _products(x: np.ndarray, degree: int) -> np.ndarray:
+    """All products of up to `degree` columns."""
+    parts, last = [np.ones((x.shape[0], 1))], [(np.ones(x.shape[0]), 0)]
+    for _ in range(degree):
+        last = [(product * x[:, i], i) for product, first in last for i in range(first, x.shape[1])]
+        parts += [product[:, None] for product, _ in last]
+    return np.concatenate(parts, axis=1)
