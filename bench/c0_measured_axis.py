@@ -23,7 +23,7 @@ from _options import begin
 from _report import new_result, write_result
 
 import jaxmodsim as jms
-from jaxmodsim.identify import AXIS_MODELS, axis_scene, first_coordinate, replay, rough_axis, start_state
+from jaxmodsim.identify import axis_models, axis_scene, first_coordinate, replay, rough_axis, start_state
 
 HERE = Path(__file__).parent
 RECORD = HERE.parents[1] / "shared" / "data" / "emps" / "train.csv"
@@ -102,7 +102,7 @@ def run_command(record: Path, *how: str) -> dict[str, Any]:
 def rmse_with_substeps(record: jms.Record, model: str, parameters: dict[str, Any], substeps: int) -> float:
     """RMSE [m] of a fitted model with `substeps` integration steps for every sample."""
     values = {name: entry["value"] for name, entry in parameters.items()}
-    scene = axis_scene(AXIS_MODELS[model], rough_axis(record), values)
+    scene = axis_scene(axis_models()[model], rough_axis(record), values)
     inputs = {name: jnp.asarray(x) for name, x in record.inputs.items()}
     q0, qd0 = (jnp.asarray([x]) for x in start_state(record))
     run = jax.jit(replay, static_argnums=(5, 6))

@@ -5,7 +5,7 @@ from _options import begin
 from _report import new_result, write_figure, write_result
 
 from jaxmodsim.plot import behaviour_figure
-from jaxmodsim.validation.behaviour import EXPERIMENTS, Outcome, run_bench, specimens
+from jaxmodsim.validation.behaviour import EXPERIMENTS, Outcome, law_cases, run_bench
 
 # The figures that docs/laws.md shows.
 SHOWN = ("memory", "creep")
@@ -18,7 +18,7 @@ def main() -> None:
         "Friction laws in the standard experiments.",
         smoke="two laws, to a temporary folder",
     )
-    chosen = [each for each in specimens() if not options.smoke or each.name in ("Viscous", "Dahl")]
+    chosen = [each for each in law_cases() if not options.smoke or each.name in ("Viscous", "Dahl")]
     outcomes = run_bench(chosen, progress=print)
     content = new_result("behaviour", options, "diffrax")
     verdicts = {

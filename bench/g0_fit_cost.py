@@ -21,11 +21,11 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import jaxmodsim as jms
-from jaxmodsim.identify import AXIS_MODELS, MultiStart, axis_scene, first_coordinate, replay, rough_axis
+from jaxmodsim.identify import MultiStart, axis_models, axis_scene, first_coordinate, replay, rough_axis
 
 RECORD = Path(__file__).parents[2] / "shared" / "data" / "emps" / "train.csv"
 DRIVE_GAIN = 35.15065188248547
-FREE = AXIS_MODELS["coulomb"].free
+FREE = axis_models()["coulomb"].free
 RTOL = 1e-6
 NAMES = ("sigma0", "sigma1", "sigma2", "Fc", "Fs", "vs")
 
@@ -65,7 +65,7 @@ def axis_costs(path: Path, smoke: bool, rows: list[list[str]]) -> dict[str, Any]
     force = DRIVE_GAIN * u
     record = jms.Record(t, q, {"u": force}, name="EMPS")
     rough = rough_axis(record)
-    scene = axis_scene(AXIS_MODELS["coulomb"], rough)
+    scene = axis_scene(axis_models()["coulomb"], rough)
     width = float(scene.effects[1].law.width)  # pyright: ignore[reportAttributeAccessIssue]
     start = np.array([rough.m, rough.offset, rough.Fc, rough.Fv])
 

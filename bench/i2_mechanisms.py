@@ -30,7 +30,7 @@ from e1_long_runs import PHI0, SPIN0, Closed, G
 from g0_fit_cost import DRIVE_GAIN, RECORD, numba_axis
 
 import jaxmodsim as jms
-from jaxmodsim.identify import AXIS_MODELS, axis_scene, first_coordinate, replay, rough_axis
+from jaxmodsim.identify import axis_models, axis_scene, first_coordinate, replay, rough_axis
 from jaxmodsim.problems import (
     n_link_pendulum,
     n_link_pendulum_acceleration,
@@ -141,7 +141,7 @@ def axis(path: Path, smoke: bool) -> dict[str, Callable[[], Any]]:
     t, q, _, u = np.loadtxt(path, delimiter=",", skiprows=1).T[:, : 2000 if smoke else None]
     force = DRIVE_GAIN * u
     rough = rough_axis(jms.Record(t, q, {"u": force}, name="EMPS"))
-    model = AXIS_MODELS["coulomb"]
+    model = axis_models()["coulomb"]
     width = float(axis_scene(model, rough).effects[1].law.width)  # pyright: ignore[reportAttributeAccessIssue]
     times, inputs, measured = jnp.asarray(t), {"u": jnp.asarray(force)}, jnp.asarray(q)
     base = axis_scene(model, rough)

@@ -1,16 +1,18 @@
 """The scene of a SPEC: a named problem with numbers, or an object of a Python file."""
 
+import dataclasses
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .. import friction, problems
+from .. import problems
 from .._core.suggest import did_you_mean
+from ..friction import AbstractLaw, laws
 from ..scene import Scene
 from ._table import TEXT, VALUES, WHOLE, Table
 
@@ -21,22 +23,6 @@ PROBLEMS: dict[str, Callable[..., Scene]] = {
     name: made
     for name, made in vars(problems).items()
     if inspect.isfunction(made) and inspect.signature(made).return_annotation is Scene
-}
-LAWS: dict[str, type] = {
-    name: getattr(friction, name)
-    for name in (
-        "Viscous",
-        "Coulomb",
-        "Stribeck",
-        "Dahl",
-        "LuGre",
-        "ElastoPlastic",
-        "MaxwellSlip",
-        "Armstrong",
-        "Regularized",
-        "DeadZone",
-        "Sign",
-    )
 }
 
 
@@ -64,7 +50,7 @@ def read_system(table: Table, folder: Path) -> Scene | Callable[..., Any]:
     return _made(table, PROBLEMS[problem])
 
 
-def _check_known(table: Table, key: str, name: str, known: dict[str, Any]) -> None:
+def _check_known(table: Table, key: str, name: str, known: Mapping[str, Any]) -> None:
     if name not in known:
         raise table.refusal(
             f"{key} must be one of {', '.join(known)}, but {name!r} was given.{did_you_mean(name, known)}"
@@ -97,8 +83,22 @@ def _made(table: Table, maker: Callable[..., Any]) -> Any:
 
 def _law(table: Table) -> Any:
     kind = table.take("kind", TEXT, needed=True)
-    _check_known(table, "kind", kind, LAWS)
-    return _made(table, LAWS[kind])
+    known = known_laws()
+    _check_known(table, "kind", kind, known)
+    return _made(table, known[kind])
+
+
+def known_laws() -> dict[str, type[AbstractLaw]]:
+    """Registered laws that need nothing but numbers and another law, which is what a file can say."""
+
+    def needed(law: type[AbstractLaw]) -> list[dataclasses.Field[Any]]:
+        return [field for field in dataclasses.fields(law) if field.default is dataclasses.MISSING]
+
+    return {
+        name: law
+        for name, law in laws().items()
+        if all("range" in field.metadata or field.name == "law" for field in needed(law))
+    }
 
 
 def _from_file(table: Table, path: Path, name: str) -> Scene | Callable[..., Any]:

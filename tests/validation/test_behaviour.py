@@ -15,11 +15,11 @@ from jaxmodsim._core.state_dependent import StateDependent
 from jaxmodsim.cli import _behaviour
 from jaxmodsim.friction import AbstractLaw, Dahl, LuGre
 from jaxmodsim.plot import behaviour_figure
-from jaxmodsim.validation.behaviour import BY_NATURE, EXPERIMENTS, Finding, Verdict, by_nature, run_bench, specimens
+from jaxmodsim.validation.behaviour import EXPERIMENTS, Finding, Verdict, law_cases, run_bench
 from jaxmodsim.validation.behaviour._drive import SAMPLES, path, respond
-from jaxmodsim.validation.behaviour._laws import DEFLECTION, FC, FS, SIGMA0, WIDTH, Specimen
+from jaxmodsim.validation.behaviour._laws import DEFLECTION, FC, FS, SIGMA0, WIDTH, LawCase
 
-BENCH = {each.name: each for each in specimens()}
+BENCH = {each.name: each for each in law_cases()}
 # Experiments with a prescribed motion compile in no time; those with a mass take some seconds for each law.
 WITH_MASS = ("break-away", "stick-slip", "creep")
 PRESCRIBED = {name: each for name, each in EXPERIMENTS.items() if name not in WITH_MASS}
@@ -37,8 +37,8 @@ def outcomes():
 @pytest.mark.quick
 def test_every_law_and_wrapper_is_on_the_bench():
     shown = set()
-    for specimen in BENCH.values():
-        parts = [module for _, module in modules_of(specimen.law)]
+    for case in BENCH.values():
+        parts = [module for _, module in modules_of(case.law)]
         shown |= {type(part).__name__ for part in parts}
         shown |= {"asymmetric" for part in parts if hasattr(part, "forward")}
         shown |= {"scaled_by" for part in parts if isinstance(part, StateDependent)}
@@ -149,18 +149,18 @@ def test_a_passive_lugre_passes_and_a_miss_that_nothing_explains_fails():
     passivity = EXPERIMENTS["passivity"]
     # The condition of the class: sigma2 > sigma1 (Fs - Fc)/Fc = 0.5 sigma1.
     damped = dataclasses.replace(bristle, sigma2=0.6 * bristle.sigma1)
-    assert passivity(Specimen("passive", damped, BENCH["LuGre"].steady)).verdict is PASS
-    fake = dataclasses.replace(passivity, measure=lambda specimen: Finding(-1.0, "gives energy"))
+    assert passivity(LawCase("passive", damped, BENCH["LuGre"].steady)).verdict is PASS
+    fake = dataclasses.replace(passivity, measure=lambda case: Finding(-1.0, "gives energy"))
     assert fake(BENCH["LuGre"]).verdict is NATURE
     assert fake(BENCH["Dahl"]).verdict is Verdict.FAIL
     assert fake(BENCH["LuGre, vd"]).verdict is Verdict.FAIL
-    none = dataclasses.replace(passivity, measure=lambda specimen: Finding(float("nan"), "nothing to see"))
+    none = dataclasses.replace(passivity, measure=lambda case: Finding(float("nan"), "nothing to see"))
     assert none(BENCH["LuGre"]).verdict is NOT
 
 
 def test_a_run_that_ends_early_fails():
-    def stop(specimen):
-        del specimen
+    def stop(case):
+        del case
         raise SimulationError("The step limit was reached.")
 
     outcome = dataclasses.replace(EXPERIMENTS["creep"], measure=stop)(BENCH["LuGre"])
@@ -168,12 +168,14 @@ def test_a_run_that_ends_early_fails():
     assert "step limit" in outcome.finding.sentence
 
 
-def test_the_table_of_natures_names_experiments_and_has_no_idle_entry(outcomes):
-    assert {nature.experiment for nature in BY_NATURE} <= set(EXPERIMENTS)
-    earned = {outcome.reason for of in outcomes.values() for outcome in of.values() if outcome.verdict is NATURE}
-    assert {nature.reason for nature in BY_NATURE} <= earned
-    assert by_nature("passivity", BENCH["LuGre, vd"].law) is None
-    assert by_nature("creep", BENCH["LuGre, asymmetric"].law) is not None
+def test_limitations_name_experiments_and_every_one_is_missed(outcomes):
+    for name, case in BENCH.items():
+        limitations = case.law.known_limitations()
+        assert set(limitations) <= set(EXPERIMENTS)
+        for experiment in set(limitations) & set(outcomes[name]):
+            assert outcomes[name][experiment].verdict in (NATURE, NOT), f"{name} keeps the limit of {experiment}"
+    assert "passivity" not in BENCH["LuGre, vd"].law.known_limitations()
+    assert "creep" in BENCH["LuGre, asymmetric"].law.known_limitations()
 
 
 def test_figures_have_a_panel_for_each_law_and_labelled_axes(outcomes):

@@ -3,10 +3,8 @@
 from ._bench import EXPERIMENTS as EXPERIMENTS
 from ._bench import run_bench as run_bench
 from ._experiment import Experiment as Experiment
-from ._laws import Specimen as Specimen
-from ._laws import specimens as specimens
-from ._nature import BY_NATURE as BY_NATURE
-from ._nature import by_nature as by_nature
+from ._laws import LawCase as LawCase
+from ._laws import law_cases as law_cases
 from ._outcome import Finding as Finding
 from ._outcome import Limit as Limit
 from ._outcome import Line as Line

@@ -8,7 +8,7 @@ from ._characteristic import CHARACTERISTIC
 from ._creep import CREEP
 from ._experiment import Experiment
 from ._lag import LAG
-from ._laws import Specimen, specimens
+from ._laws import LawCase, law_cases
 from ._outcome import Outcome
 from ._passivity import PASSIVITY
 from ._presliding import MEMORY, PRESLIDING
@@ -22,7 +22,7 @@ _WORKERS = 2
 
 
 def run_bench(
-    laws: Sequence[Specimen] | None = None,
+    laws: Sequence[LawCase] | None = None,
     experiments: Mapping[str, Experiment] = EXPERIMENTS,
     *,
     progress: Callable[[str], object] | None = None,
@@ -31,7 +31,7 @@ def run_bench(
 
     **Arguments:**
 
-    - `laws`: by default all of `specimens()`.
+    - `laws`: by default all of `law_cases()`.
     - `experiments`: by name; by default all.
     - `progress`: called with the name of each law when it is done.
 
@@ -40,12 +40,12 @@ def run_bench(
     Outcomes by law and experiment.
     """
 
-    def one(specimen: Specimen) -> dict[str, Outcome]:
-        outcomes = {name: experiment(specimen) for name, experiment in experiments.items()}
+    def one(case: LawCase) -> dict[str, Outcome]:
+        outcomes = {name: experiment(case) for name, experiment in experiments.items()}
         if progress is not None:
-            progress(specimen.name)
+            progress(case.name)
         return outcomes
 
-    chosen = specimens() if laws is None else laws
+    chosen = law_cases() if laws is None else laws
     with ThreadPoolExecutor(_WORKERS) as pool:
         return dict(zip([each.name for each in chosen], pool.map(one, chosen), strict=True))

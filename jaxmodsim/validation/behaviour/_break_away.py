@@ -3,7 +3,7 @@
 import numpy as np
 
 from ._experiment import Experiment
-from ._laws import FC, FS, VS, Specimen
+from ._laws import FC, FS, VS, LawCase
 from ._outcome import Finding, Limit, Line
 from ._pulled import after_slip, move
 
@@ -13,12 +13,12 @@ RATES = np.geomspace(0.1, 100.0, 7)
 _LOAD, _SLIDES = 1.7 * FS, 10.0 * VS
 
 
-def _measure(specimen: Specimen) -> Finding:
+def _measure(case: LawCase) -> Finding:
     """Pull a mass harder and harder; the largest friction before it slides, at slow and at fast rates."""
-    z0 = after_slip(specimen)
+    z0 = after_slip(case)
     found = []
     for rate in RATES:
-        run = move(specimen, _LOAD / rate, z0=z0, ramp=float(rate), dtmax=0.01 * _LOAD / rate)
+        run = move(case, _LOAD / rate, z0=z0, ramp=float(rate), dtmax=0.01 * _LOAD / rate)
         slides = run.v > _SLIDES
         end = int(np.argmax(slides)) if slides.any() else run.v.size
         found.append(float(np.max(run.friction[: max(end, 1)])))

@@ -4,7 +4,7 @@ import numpy as np
 
 from ._drive import SAMPLES, respond
 from ._experiment import Experiment
-from ._laws import DEFLECTION, FC, VS, Specimen
+from ._laws import DEFLECTION, FC, VS, LawCase
 from ._outcome import Finding, Limit, Line
 
 _SPEEDS, _HELD = 64, 32
@@ -12,16 +12,16 @@ _SPEEDS, _HELD = 64, 32
 _WAY, _TIME = 40.0 * DEFLECTION, 1.0
 
 
-def _measure(specimen: Specimen) -> Finding:
+def _measure(case: LawCase) -> Finding:
     """Slide at speeds that rise and fall again, in steps, forward and then backward."""
     speeds = np.geomspace(0.2 * VS, 100.0 * VS, _SPEEDS)
     sweep = np.concatenate([speeds, speeds[::-1]])
     held = np.concatenate([sweep, -sweep])
     v = np.repeat(held, _HELD)
-    force = respond(specimen.law, v, (_WAY / np.abs(v) + _TIME) / _HELD).force
+    force = respond(case.law, v, (_WAY / np.abs(v) + _TIME) / _HELD).force
     assert v.size == SAMPLES
     steady = force.reshape(-1, _HELD)[:, -1]
-    expected = specimen.steady(held)
+    expected = case.steady(held)
     up, down, forth, back = steady.reshape(4, _SPEEDS)
     lines = (
         Line("steady curve", speeds, expected[:_SPEEDS], reference=True),

@@ -1,7 +1,7 @@
 """Creep under a small vibration below break-away."""
 
 from ._experiment import Experiment
-from ._laws import DEFLECTION, Specimen
+from ._laws import DEFLECTION, LawCase
 from ._outcome import Finding, Limit, Line
 from ._pulled import move
 
@@ -11,9 +11,9 @@ _LOAD, _SHAKE, _FREQUENCY, _T1 = 0.4, 0.2, 5.0, 10.0
 _EARLY, _LATE = (1.0, 2.0), (9.0, 10.0)
 
 
-def _measure(specimen: Specimen) -> Finding:
+def _measure(case: LawCase) -> Finding:
     """Load a mass at rest, and see how far it goes once the load has come."""
-    run = move(specimen, _T1, load=_LOAD, shake=_SHAKE, frequency=_FREQUENCY, dtmax=0.1 / _FREQUENCY)
+    run = move(case, _T1, load=_LOAD, shake=_SHAKE, frequency=_FREQUENCY, dtmax=0.1 / _FREQUENCY)
     early, late = (run.q[(run.t > start) & (run.t <= end)].mean() for start, end in (_EARLY, _LATE))
     drift = 1e6 * float(abs(late - early))
     return Finding(

@@ -5,8 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ...simulation import SimulationError
-from ._laws import Specimen
-from ._nature import by_nature
+from ._laws import LawCase
 from ._outcome import Finding, Limit, Outcome, Verdict
 
 
@@ -32,22 +31,22 @@ class Experiment:
     limit: Limit
     axes: tuple[str, str]
     window: tuple[float, float]
-    measure: Callable[[Specimen], Finding]
+    measure: Callable[[LawCase], Finding]
     log_x: bool = False
 
-    def __call__(self, specimen: Specimen) -> Outcome:
+    def __call__(self, case: LawCase) -> Outcome:
         """Do the experiment on a law and judge what comes out.
 
-        A number beyond the limit is a failure, unless the table of `by_nature` says why such a law must miss it. A law
-        of the table that keeps the limit passes. A run that ends early is a failure.
+        A number beyond the limit is a failure, unless the law says why it must miss it (`known_limitations`). A law
+        that says so and keeps the limit passes. A run that ends early is a failure.
         """
         try:
-            finding = self.measure(specimen)
+            finding = self.measure(case)
         except SimulationError as error:
             return Outcome(Verdict.FAIL, Finding(math.nan, str(error)))
         if math.isnan(finding.number):
             return Outcome(Verdict.NOT_APPLICABLE, finding, finding.sentence)
         if self.limit.keeps(finding.number):
             return Outcome(Verdict.PASS, finding)
-        reason = by_nature(self.name, specimen.law)
+        reason = case.law.known_limitations().get(self.name)
         return Outcome(Verdict.FAIL if reason is None else Verdict.BY_NATURE, finding, reason or "")

@@ -6,7 +6,7 @@ import numpy as np
 
 from ._drive import NEEDS_LOAD, SAMPLES, needs_load, respond
 from ._experiment import Experiment
-from ._laws import DEFLECTION, VS, Specimen
+from ._laws import DEFLECTION, VS, LawCase
 from ._outcome import Finding, Limit, Line
 
 _PERIODS = 4
@@ -58,25 +58,25 @@ def pulses() -> list[Cycle]:
     return cycles
 
 
-def balance(specimen: Specimen, cycle: Cycle) -> tuple[float, np.ndarray]:
+def balance(case: LawCase, cycle: Cycle) -> tuple[float, np.ndarray]:
     """Dissipated energy over turned over energy in the last period, and the energy taken up in it so far [J]."""
     v = np.tile(np.concatenate([cycle.v, -cycle.v]), _PERIODS)
     dt = np.tile(cycle.dt, 2 * _PERIODS)
-    run = respond(specimen.law, v, dt)
+    run = respond(case.law, v, dt)
     last = slice(SAMPLES - 2 * _HALF, SAMPLES)
     taken = np.cumsum(run.work[last]) - (run.stored[last] - run.stored[last.start - 1])
     turned = float(np.sum(np.abs(run.work[last])))
     return float(taken[-1]) / turned, taken / turned
 
 
-def _measure(specimen: Specimen) -> Finding:
+def _measure(case: LawCase) -> Finding:
     """Go through closed cycles of all kinds; the least that is dissipated in one of them."""
-    if needs_load(specimen.law, 0.0):
+    if needs_load(case.law, 0.0):
         return Finding(float("nan"), NEEDS_LOAD)
     families = {"sines": sines(), "random": random_cycles(), "pulses": pulses()}
     lines, least = [], {}
     for family, cycles in families.items():
-        found = [balance(specimen, cycle) for cycle in cycles]
+        found = [balance(case, cycle) for cycle in cycles]
         share, taken = min(found, key=lambda each: each[0])
         least[family] = share
         lines.append(Line(family, np.linspace(0.0, 1.0, taken.size), taken))

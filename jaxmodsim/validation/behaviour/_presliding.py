@@ -4,7 +4,7 @@ import numpy as np
 
 from ._drive import NEEDS_LOAD, SAMPLES, needs_load, path, respond
 from ._experiment import Experiment
-from ._laws import DEFLECTION, VS, Specimen
+from ._laws import DEFLECTION, VS, LawCase
 from ._outcome import Finding, Limit, Line
 
 # Velocity of the motion [m/s]: so slow that friction depends on displacement alone.
@@ -16,7 +16,7 @@ _INNER = (0.8, -0.4)
 _ELASTIC = 0.01
 
 
-def _cycles(specimen: Specimen, inner: bool) -> tuple[np.ndarray, np.ndarray]:
+def _cycles(case: LawCase, inner: bool) -> tuple[np.ndarray, np.ndarray]:
     """Displacement [m] and force [N] of a loop of ten legs, and a last leg with or without an inner loop.
 
     That one rises from -1 to 0.8, turns back to -0.4, comes again to 0.8 and goes on to 1, or goes there without
@@ -33,7 +33,7 @@ def _cycles(specimen: Specimen, inner: bool) -> tuple[np.ndarray, np.ndarray]:
     rest = SAMPLES - x.size
     x = np.concatenate([x, path(high, high + rest * DEFLECTION / _LEG, samples=rest)])
     dx = np.diff(x, prepend=0.0)
-    return x, respond(specimen.law, np.sign(dx) * _SLOW, np.abs(dx) / _SLOW).force
+    return x, respond(case.law, np.sign(dx) * _SLOW, np.abs(dx) / _SLOW).force
 
 
 def _loss(x: np.ndarray, force: np.ndarray) -> float:
@@ -43,11 +43,11 @@ def _loss(x: np.ndarray, force: np.ndarray) -> float:
     return float(np.sum(0.5 * (force[1:] + force[:-1]) * np.diff(x)))
 
 
-def _presliding(specimen: Specimen) -> Finding:
+def _presliding(case: LawCase) -> Finding:
     """Go back and forth over the break-away deflection and look at the first step after a turn."""
-    if needs_load(specimen.law, _SLOW):
+    if needs_load(case.law, _SLOW):
         return Finding(float("nan"), NEEDS_LOAD)
-    x, force = _cycles(specimen, inner=False)
+    x, force = _cycles(case, inner=False)
     outer = slice(8 * _LEG - 1, 10 * _LEG)
     turn = 9 * _LEG
     swing = float(np.ptp(force[outer]))
@@ -60,11 +60,11 @@ def _presliding(specimen: Specimen) -> Finding:
     )
 
 
-def _memory(specimen: Specimen) -> Finding:
+def _memory(case: LawCase) -> Finding:
     """Put a loop inside the loop and look at whether the outer one goes on as if it had not been."""
-    if needs_load(specimen.law, _SLOW):
+    if needs_load(case.law, _SLOW):
         return Finding(float("nan"), NEEDS_LOAD)
-    (x_inner, with_inner), (x, without) = _cycles(specimen, inner=True), _cycles(specimen, inner=False)
+    (x_inner, with_inner), (x, without) = _cycles(case, inner=True), _cycles(case, inner=False)
     swing = float(np.ptp(without[8 * _LEG : 10 * _LEG]))
     start = 11 * _LEG
     # From the closing of the inner loop on; where it closes, and every point up to the next turn.
@@ -73,7 +73,7 @@ def _memory(specimen: Specimen) -> Finding:
         Line("without inner loop", 1e6 * x[8 * _LEG : 10 * _LEG], without[8 * _LEG : 10 * _LEG], reference=True),
         Line("with inner loop", 1e6 * x_inner[10 * _LEG : 14 * _LEG], with_inner[10 * _LEG : 14 * _LEG]),
     )
-    if not PRESLIDING.limit.keeps(_presliding(specimen).number):
+    if not PRESLIDING.limit.keeps(_presliding(case).number):
         return Finding(float("nan"), "There is no presliding to remember anything.", lines)
     if _loss(x, without) < _ELASTIC * swing * 2.0 * DEFLECTION:
         return Finding(float("nan"), "Presliding is elastic: there is nothing to remember.", lines)

@@ -12,7 +12,7 @@ from ...friction import AbstractDynamicLaw, AbstractSetValuedLaw
 from ...scene import AppliedForce, Friction, Scene
 from ...simulation import simulate
 from ...solvers import Rodas5P
-from ._laws import SIGMA0, Specimen
+from ._laws import SIGMA0, LawCase
 
 MASS = 1.0
 # Saved times of every run: of one length, so that each law is compiled once for all experiments.
@@ -48,19 +48,19 @@ def _load(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     return jnp.reshape(spring + p["ramp"] * t + shaken * -jnp.expm1(-t / _PUT_ON), (1,))
 
 
-def move(specimen: Specimen, t1: float, *, z0: Any = None, dtmax: float = 1.0, **load: float) -> Motion:
+def move(case: LawCase, t1: float, *, z0: Any = None, dtmax: float = 1.0, **load: float) -> Motion:
     """Run the mass from rest.
 
     **Arguments:**
 
-    - `specimen`: the law.
+    - `case`: the law.
     - `t1`: end of the run [s].
     - `z0`: state of the law at the start; by default at rest and unloaded.
     - `dtmax`: longest adaptive step [s].
     - `load`: numbers of the load: `k` [N/m] of a spring whose end moves at `pull` [m/s], `ramp` [N/s], `load` [N],
       `shake` [N] at the `frequency` [Hz]; those left out are zero.
     """
-    law, fixed = specimen.law, specimen.dt is not None
+    law, fixed = case.law, case.dt is not None
     effects = (AppliedForce(_load), Friction(law))
     scene = Scene(_lagrangian, params={"m": MASS} | _QUIET | load, effects=effects)
     if isinstance(law, AbstractDynamicLaw):
@@ -69,7 +69,7 @@ def move(specimen: Specimen, t1: float, *, z0: Any = None, dtmax: float = 1.0, *
         start = None
     # Heun's method sees the jumps of the laws that need a fixed step twice in a step, and no more often.
     solver = dfx.Heun() if fixed else None if isinstance(law, AbstractSetValuedLaw) else Rodas5P()
-    steps: dict[str, Any] = {"dt": specimen.dt} if fixed else {"dtmax": dtmax}
+    steps: dict[str, Any] = {"dt": case.dt} if fixed else {"dtmax": dtmax}
     run = simulate(
         scene,
         [0.0],
@@ -89,9 +89,9 @@ def move(specimen: Specimen, t1: float, *, z0: Any = None, dtmax: float = 1.0, *
     )
 
 
-def after_slip(specimen: Specimen) -> Any:
+def after_slip(case: LawCase) -> Any:
     """State of a dynamic law that has just slid fast and was unloaded; None of laws without a state."""
-    return _after_slip(specimen.law) if isinstance(specimen.law, AbstractDynamicLaw) else None
+    return _after_slip(case.law) if isinstance(case.law, AbstractDynamicLaw) else None
 
 
 @jax.jit

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ._experiment import Experiment
-from ._laws import Specimen
+from ._laws import LawCase
 from ._outcome import Finding, Limit, Line
 from ._pulled import move
 
@@ -15,9 +15,9 @@ _K, _PULL, _T1 = 2.0, 0.1, 40.0
 _REST, _SPAN = 2e-3, 5
 
 
-def _measure(specimen: Specimen) -> Finding:
+def _measure(case: LawCase) -> Finding:
     """Pull, and look at the second half of the run for times of rest."""
-    run = move(specimen, _T1, k=_K, pull=_PULL, dtmax=0.1)
+    run = move(case, _T1, k=_K, pull=_PULL, dtmax=0.1)
     late = run.t >= 0.5 * _T1
     ahead, behind = np.roll(run.q, -_SPAN), np.roll(run.q, _SPAN)
     rests = np.abs(ahead - behind) < _REST * _PULL * 2 * _SPAN * (run.t[1] - run.t[0])
