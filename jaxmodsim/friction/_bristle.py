@@ -60,7 +60,7 @@ def advance_elastoplastic(
     return side * limit * bent
 
 
-def bristle_passivity(law: Any) -> Passivity:
+def bristle_passivity(self: Any) -> Passivity:
     """Passivity of a bristle with damping, `F = sigma0 z + sigma1 z' + sigma2 v`, which fades over `vd` if it has one.
 
     At v > 0 with the bristle force `g u`, `u <= Fs/g`, the dissipation D has
@@ -72,9 +72,9 @@ def bristle_passivity(law: Any) -> Passivity:
     above the largest `sigma1 exp(-(v/vd)^2) (u - 1) - g u^2/v`, searched over v; u = v sigma1(v)/(2 g) is the worst,
     within 1 and Fs/g.
     """
-    fade = nominal(getattr(law, "vd", None))
+    fade = nominal(getattr(self, "vd", None))
     vd = None if fade is None else float(fade)
-    s1, s2, fc, fs, vs = (float(nominal(x)) for x in (law.sigma1, law.sigma2, law.Fc, law.Fs, law.vs))
+    s1, s2, fc, fs, vs = (float(nominal(x)) for x in (self.sigma1, self.sigma2, self.Fc, self.Fs, self.vs))
 
     def least(v: np.ndarray) -> np.ndarray:
         """Least `D/v^2` [N s/m] over the deflections from the limit on, at the speeds v > 0."""
@@ -90,10 +90,10 @@ def bristle_passivity(law: Any) -> Passivity:
     else:
         grid = logarithmic(1e-3 * min(scales), 1e3 * max(scales))
         margin, words = min(least_on(least, grid)[0], s2), "the largest sigma1 exp(-(v/vd)^2) (u - 1) - g(v) u^2/v"
-    if abs(margin) <= 8.0 * float(jnp.finfo(nominal(law.Fc).dtype).eps) * s2:
+    if abs(margin) <= 8.0 * float(jnp.finfo(nominal(self.Fc).dtype).eps) * s2:
         margin = 0.0  # equality, but for rounding of the product
     condition = (
-        f"{type(law).__name__} is passive if and only if sigma2 >= {words}: {s2:g} against {s2 - margin:g} N s/m."
+        f"{type(self).__name__} is passive if and only if sigma2 >= {words}: {s2:g} against {s2 - margin:g} N s/m."
     )
     speed = math.inf
     if margin < 0:

@@ -64,6 +64,7 @@ class ElastoPlastic(AbstractDynamicLaw):
     equations: ClassVar[tuple[str, ...]] = (
         "sigma0 z + sigma1 z' + sigma2 v",
         "z' = v (1 - alpha u)",
+        "alpha = 0 for u <= Fba/g(v), half a sine up to 1 at u = 1",
         "u = sigma0 z sign(v)/g(v)",
         STRIBECK_CURVE,
     )

@@ -6,7 +6,7 @@ import inspect
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 else:
     from equinox import AbstractClassVar
 
+
+_Law = TypeVar("_Law", bound="AbstractLaw")
 
 # Limitation of laws whose friction does not fall as slip begins.
 NO_STRIBECK_EFFECT = "Without a Stribeck effect friction does not depend on slip velocity but for the viscous part."
@@ -90,7 +92,7 @@ class AbstractLaw(eqx.Module):
         """Whether the law is passive, from a closed form; None to have `check_passivity` search."""
         return None
 
-    def mujoco(self) -> Mapping[str, Any] | str:
+    def mujoco(self) -> dict[str, Any] | str:
         """The law in MuJoCo: attributes with their numbers; or what MuJoCo lacks, and what to do.
 
         Of a `joint`, `frictionloss` [N] and `damping` [N s/m]; of a motor, `damping` and `lugre`, the numbers sigma0,
@@ -109,7 +111,7 @@ class AbstractLaw(eqx.Module):
         )
 
     @classmethod
-    def standard(cls, **others: Any) -> Self:
+    def standard(cls: type[_Law], **others: Any) -> _Law:
         """The law with the standard parameters, as far as it has them, and others."""
         names = [field.name for field in dataclasses.fields(cls)]
         return cls(**{name: STANDARD[name] for name in names if name in STANDARD} | dict(cls.example) | others)
@@ -130,7 +132,7 @@ class AbstractLaw(eqx.Module):
         return (LawCase(cls.__name__, law, steady, cls.example_step),)
 
     @classmethod
-    def fit_start(cls, m: float, Fc: float, Fv: float, v_max: float) -> Self | None:
+    def fit_start(cls, m: float, Fc: float, Fv: float, v_max: float) -> "AbstractLaw | None":
         """The law with which a fit of an axis starts; None, and it is no candidate.
 
         **Arguments:**
@@ -269,7 +271,6 @@ class AbstractPlanarLaw(AbstractDynamicLaw):
     execution: ClassVar[str] = "as it is, in the plane too"
 
 
-_Law = TypeVar("_Law", bound=AbstractLaw)
 # Registered laws by name.
 _LAWS: dict[str, type[AbstractLaw]] = {}
 

@@ -1,7 +1,7 @@
 """The LuGre law."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -128,7 +128,7 @@ class LuGre(AbstractPlanarLaw):
         return stribeck_case("LuGre", cls.standard()), stribeck_case("LuGre, vd", fading)
 
     @classmethod
-    def fit_start(cls, m: float, Fc: float, Fv: float, v_max: float) -> Self:
+    def fit_start(cls, m: float, Fc: float, Fv: float, v_max: float) -> "LuGre":
         """A stiff bristle that is lightly damped."""
         sigma0 = Fc / (_BREAK_AWAY_TIME * v_max)
         sigma1 = 2.0 * _DAMPING * np.sqrt(m * sigma0)

@@ -1,6 +1,6 @@
 """Coulomb friction with stiction, Stribeck effect and viscous term."""
 
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -124,7 +124,7 @@ class Stribeck(AbstractSetValuedLaw):
         )
 
     @classmethod
-    def fit_start(cls, m: float, Fc: float, Fv: float, v_max: float) -> Self:
+    def fit_start(cls, m: float, Fc: float, Fv: float, v_max: float) -> "Stribeck":
         """A break-away force of 1.2 Fc, and a fall over a twentieth of the speed."""
         del m
         return cls(Fc=Fc, Fs=1.2 * Fc, vs=0.05 * v_max, Fv=Fv)

@@ -145,7 +145,7 @@ def regularized_width(law: AbstractSetValuedLaw, creep: float, load: float, m: f
 def _no_width(law: AbstractSetValuedLaw, load: float, creep: float, limit: float, most: float, least: float) -> str:
     name = type(law).__name__
     if least >= abs(load):
-        return f"regularized_width: the viscous force of {name} carries {load:g} N at {creep:g} m/s: any width does."
+        return f"regularized_width: {name} carries {load:g} N at {creep:g} m/s by its viscous part: any width will do."
     return (
         f"regularized_width: no width of {name} carries {load:g} N below {creep:g} m/s. The smooth force reaches"
         f" {most:g} N at most, below the limit of {limit:g} N; the law run by events holds the load at rest."

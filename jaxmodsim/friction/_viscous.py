@@ -27,7 +27,7 @@ class Viscous(AbstractForceLaw):
     description: ClassVar[str] = "in proportion to velocity"
     equations: ClassVar[tuple[str, ...]] = ("Fv v",)
     valid_at_any_speed: ClassVar[bool] = True
-    limitations: ClassVar[Mapping[str, str]] = AbstractForceLaw.limitations | {"stick-slip": NO_STRIBECK_EFFECT}
+    limitations: ClassVar[Mapping[str, str]] = {**AbstractForceLaw.limitations, "stick-slip": NO_STRIBECK_EFFECT}
 
     def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Friction force [N] at velocity `v` [m/s]."""

@@ -44,7 +44,7 @@ class DeadZone(AbstractWrapper, AbstractKarnoppLaw):
     width: Number = parameter("width", "m/s", lower=0.0, strict=True, execution=True)
     stiff: ClassVar[bool] = False
     description: ClassVar[str] = "Karnopp: velocities up to `width` count as rest"
-    equations: ClassVar[tuple[str, ...]] = ("that of the law for |v| > width, the load up to its limit within",)
+    equations: ClassVar[tuple[str, ...]] = ("sliding_force(v) sign(v) + viscous_force(v) beyond the band",)
     execution: ClassVar[str] = "fixed step `dt=`"
     # One step changes the velocity of 1 kg under 1 N by half of the band, which is twice the width.
     example: ClassVar[Mapping[str, float]] = {"width": 1e-4}

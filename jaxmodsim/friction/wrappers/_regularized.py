@@ -33,7 +33,7 @@ class Regularized(AbstractWrapper, AbstractForceLaw):
     width: Number = parameter("width", "m/s", lower=0.0, strict=True, execution=True)
     stiff: ClassVar[bool] = True
     description: ClassVar[str] = "smooth over `width`; creeps below the limit"
-    equations: ClassVar[tuple[str, ...]] = ("that of the law with tanh(v/width) for sign(v)",)
+    equations: ClassVar[tuple[str, ...]] = ("sliding_force(v) tanh(v/width) + viscous_force(v)",)
     execution: ClassVar[str] = "default solver `Rodas5P`"
     valid_at_any_speed: ClassVar[bool] = True
 

@@ -27,7 +27,7 @@ class Sign(AbstractWrapper, AbstractForceLaw):
     law: AbstractSetValuedLaw = set_valued_law("Sign")
     stiff: ClassVar[bool] = False
     description: ClassVar[str] = "plain `sign(v)`, kept to show why it fails"
-    equations: ClassVar[tuple[str, ...]] = ("that of the law, 0 at v = 0",)
+    equations: ClassVar[tuple[str, ...]] = ("sliding_force(v) sign(v) + viscous_force(v)",)
     execution: ClassVar[str] = "fixed step `dt=`"
     valid_at_any_speed: ClassVar[bool] = True
     jumps: ClassVar[bool] = True
