@@ -1,7 +1,8 @@
 """Laws as MuJoCo has them."""
 
-from typing import Any
 from xml.sax.saxutils import quoteattr
+
+from jaxtyping import Array
 
 from .._core.state_dependent import need_values
 from ..friction import AbstractLaw
@@ -43,7 +44,7 @@ def to_mujoco(law: AbstractLaw, joint: str = "joint") -> str:
     return _motor(joint, **numbers) if "lugre" in numbers else _joint(joint, **numbers)
 
 
-def _joint(name: str, **numbers: Any) -> str:
+def _joint(name: str, **numbers: Array) -> str:
     values = {key: float(value) for key, value in numbers.items()}
     attributes = [f'{key}="{value!r}"' for key, value in values.items()]
     if values.get("frictionloss"):
@@ -51,7 +52,7 @@ def _joint(name: str, **numbers: Any) -> str:
     return f"<joint name={quoteattr(name)} {' '.join(attributes)}/>"
 
 
-def _motor(joint: str, damping: Any, lugre: Any) -> str:
+def _motor(joint: str, damping: float | Array, lugre: tuple[float | Array, ...]) -> str:
     bristle = " ".join(repr(float(x)) for x in lugre)
     return (
         "<actuator>\n"

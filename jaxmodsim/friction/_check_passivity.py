@@ -73,7 +73,7 @@ def check_passivity(law: AbstractLaw, *, v_max: float = 1e3) -> Passivity:
     raise ValueError(f"check_passivity knows nothing of laws such as {type(law).__name__}.")
 
 
-def _function(law: AbstractLaw, force: Callable[..., Any], v_max: float) -> Passivity:
+def _function(law: AbstractLaw, force: Callable[..., jax.Array], v_max: float) -> Passivity:
     """A force that is a function of the velocity."""
     dtype = _dtype(law)
     forces = jax.jit(jax.vmap(force, in_axes=(None, 0)))
@@ -143,6 +143,6 @@ def _losses(law: AbstractDynamicLaw, slips: jax.Array, times: jax.Array, speeds:
     return jax.vmap(jax.vmap(lost, in_axes=(None, 0)), in_axes=(0, None))(states, speeds)
 
 
-def _dtype(law: AbstractLaw) -> Any:
+def _dtype(law: AbstractLaw) -> np.dtype:
     """Floating type of the law's numbers."""
     return jnp.result_type(float, *[x.dtype for x in jax.tree.leaves(law) if eqx.is_inexact_array(x)][:1])

@@ -1,6 +1,6 @@
 """Coulomb friction with stiction."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -45,11 +45,11 @@ class Coulomb(AbstractSetValuedLaw):
         del direction
         return jnp.asarray(self.Fc if self.Fs is None else self.Fs)
 
-    def lugre_numbers(self, vs: Number) -> dict[str, Number]:
+    def lugre_numbers(self, vs: float) -> dict[str, Any]:
         """With stiction that falls over the velocity `vs`."""
         return {"Fc": self.Fc, "Fs": self.Fc if self.Fs is None else self.Fs, "vs": vs, "sigma2": 0.0}
 
-    def mujoco(self) -> dict[str, Number] | str:
+    def mujoco(self) -> dict[str, Any] | str:
         """Dry friction of a joint, which is one force."""
         stiction = self.Fs is not None and float(self.Fs) > float(self.Fc)
         return AbstractSetValuedLaw.mujoco(self) if stiction else {"frictionloss": self.Fc}

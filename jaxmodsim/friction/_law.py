@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._core.parameters import Number, check_ranges, ranges_of
+from .._core.parameters import check_ranges, ranges_of
 from .._core.state_dependent import bind_state, is_state_dependent, nominal
 from ._law_case import STANDARD, LawCase, steady_curve
 from ._passivity import Passivity
@@ -188,7 +188,7 @@ class AbstractSetValuedLaw(AbstractLaw):
         """Modelica's friction components are such laws."""
         return ""
 
-    def lugre_numbers(self, vs: Number) -> dict[str, Number] | None:
+    def lugre_numbers(self, vs: float) -> dict[str, Any] | None:
         """Parameters of LuGre but sigma0 and sigma1 that give its steady force; None where it has no such force.
 
         **Arguments:**

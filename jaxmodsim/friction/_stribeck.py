@@ -102,7 +102,7 @@ class Stribeck(AbstractSetValuedLaw):
         del direction
         return jnp.asarray(self.Fs)
 
-    def lugre_numbers(self, vs: Number) -> dict[str, Number] | None:
+    def lugre_numbers(self, vs: float) -> dict[str, Any] | None:
         """Of the Gaussian curve its own."""
         del vs
         gaussian = self.fall is exponential and (self.exponent is None or bool(jnp.all(self.exponent == 2.0)))

@@ -181,7 +181,7 @@ def from_example(example: LawCase) -> Case:
         abs(example.steady(side * speeds) - side * slope * speeds) for side, slope in zip((1, -1), viscous, strict=True)
     ]
     level = (float(dry[0][-1]), float(dry[1][-1]))
-    return Case(example.law, float(np.max(dry)), level, viscous, odd=np.allclose(*dry), smooth=False)
+    return Case(example.law, float(np.max(dry)), level, viscous, odd=np.allclose(dry[0], dry[1]), smooth=False)
 
 
 # Of each kind one, wrapped and asymmetric ones among them.
