@@ -80,7 +80,6 @@ class _AsymmetricForce(AbstractAsymmetric, AbstractForceLaw):  # pyright: ignore
     backward: dict[str, Any]
 
     def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
-        """Friction force [N] at velocity `v` [m/s]."""
         return _toward(v, self).force(v)
 
 
@@ -91,15 +90,12 @@ class _AsymmetricSetValued(AbstractAsymmetric, AbstractSetValuedLaw):  # pyright
     backward: dict[str, Any]
 
     def sliding_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
-        """Magnitude [N] of the dry part in slip."""
         return _toward(v, self).sliding_force(v)
 
     def viscous_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
-        """Smooth part [N]."""
         return _toward(v, self).viscous_force(v)
 
     def static_limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
-        """Largest force in stick [N] against a load towards `direction`."""
         return _toward(direction, self).static_limit(direction)
 
 
@@ -110,15 +106,12 @@ class _AsymmetricDynamic(AbstractAsymmetric, AbstractDynamicLaw):  # pyright: ig
     backward: dict[str, Any]
 
     def initial_state(self, v: Float[Array, "..."]) -> Any:
-        """State at rest and unloaded."""
         return self.forward.initial_state(v)
 
     def zdot(self, v: Float[Array, ""], z: Any) -> Any:
-        """Time derivative of the state."""
         return _toward(v, self).zdot(v, z)
 
     def force_given_zdot(self, v: Float[Array, ""], z: Any, rate: Any) -> Float[Array, ""]:
-        """Friction force [N]."""
         return _toward(v, self).force_given_zdot(v, z, rate)
 
     def stored_energy(self, z: Any) -> Float[Array, ""]:
@@ -126,7 +119,6 @@ class _AsymmetricDynamic(AbstractAsymmetric, AbstractDynamicLaw):  # pyright: ig
         return self.forward.stored_energy(z)
 
     def step_exact(self, v: Float[Array, ""], z: Any, dt: Float[Array, ""]) -> Any:
-        """State after `dt` [s] at constant velocity."""
         return _toward(v, self).step_exact(v, z, dt)
 
     def passivity(self) -> Passivity | None:
