@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
 
 # The set of Canudas de Wit and others 1995, IEEE TAC 40:419: forces [N], Stribeck velocity [m/s], stiffness [N/m],
@@ -36,6 +37,8 @@ def steady_curve(
     return lambda v: (Fc + (Fs - Fc) * fall(np.abs(v) / STANDARD["vs"])) * np.sign(v) + Fv * v
 
 
-def stribeck_case(name: str, law: Any, fall: Callable[[np.ndarray], np.ndarray] = lambda x: np.exp(-x * x)) -> LawCase:
+def stribeck_case(
+    name: str, law: eqx.Module, fall: Callable[[np.ndarray], np.ndarray] = lambda x: np.exp(-x * x)
+) -> LawCase:
     """An example whose force in steady slip is the standard Stribeck curve with its viscous part."""
     return LawCase(name, law, steady_curve(STANDARD["Fc"], STANDARD["Fs"], STANDARD["Fv"], fall))

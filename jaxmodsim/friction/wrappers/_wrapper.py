@@ -41,7 +41,7 @@ def set_valued_law(wrapper: str) -> Any:
     return eqx.field(converter=partial(_need_set_valued, wrapper=wrapper))
 
 
-def _need_set_valued(law: Any, wrapper: str) -> AbstractSetValuedLaw:
+def _need_set_valued(law: object, wrapper: str) -> AbstractSetValuedLaw:
     if not isinstance(law, AbstractSetValuedLaw):
         given = law if isinstance(law, str) else type(law).__name__
         raise ValueError(
