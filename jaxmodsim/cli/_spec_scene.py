@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.util
-import dataclasses
 import inspect
 import sys
 from collections.abc import Callable, Mapping
