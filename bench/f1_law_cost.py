@@ -53,7 +53,7 @@ def laws() -> dict[str, Any]:
 
 def evaluate(law: Any, v: Any, z: Any) -> Any:
     """Force and rate at one state, in one number."""
-    law = law.at(jnp.zeros(()), jnp.reshape(jnp.ravel(v)[0], (1,)), jnp.zeros(1), {})
+    law = law.bind_state(jnp.zeros(()), jnp.reshape(jnp.ravel(v)[0], (1,)), jnp.zeros(1), {})
     if isinstance(law, AbstractSetValuedLaw):
         return law.sliding_force(v) * jnp.sign(v) + law.viscous_force(v)
     if not isinstance(law, AbstractDynamicLaw):

@@ -66,7 +66,7 @@ class Passivity:
 def check_passivity(law: AbstractLaw, *, v_max: float = 1e3) -> Passivity:
     """Whether a law is passive from slip velocity to force: it never returns more energy than it was given.
 
-    The energy in its state, `law.stored`, is the storage, so the question is whether the dissipation
+    The energy in its state, `law.stored_energy`, is the storage, so the question is whether the dissipation
     `D = v F(v, z) - d/dt stored(z)` is >= 0 at all velocities and all states that can be reached. The margin is
     the least `D/v^2`: a term `sigma v` more in the force adds `sigma v^2` to D.
 

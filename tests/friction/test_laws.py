@@ -51,7 +51,7 @@ def loss(name: str, law: Any, v: Any, share: Any) -> Any:
     """Power that is lost: what goes in, less what goes into the elastic elements."""
     law, z = settled(law), cast(Any, CASES[name].loaded)(settled(law), share)
     rate = law.zdot(v, z)
-    stored = jax.jvp(law.stored, (z,), (rate,))[1]
+    stored = jax.jvp(law.stored_energy, (z,), (rate,))[1]
     return v * law.force(v, z) - stored
 
 
@@ -213,7 +213,7 @@ def test_at_rest_everything_is_finite_and_keeps_its_dtype(name: str, dtype: Any)
 
     def at_rest(x: Any) -> Any:
         law, v = x
-        law = law.at(v, *state)
+        law = law.bind_state(v, *state)
         if not isinstance(law, AbstractDynamicLaw):
             return force(name, law, v)
         z = law.initial_state(v)

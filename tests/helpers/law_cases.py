@@ -175,7 +175,7 @@ CASES |= {
 
 def settled(law: Any) -> Any:
     """The law at the state of the table."""
-    return law.at(TIME, POSITION, VELOCITY, PARAMS)
+    return law.bind_state(TIME, POSITION, VELOCITY, PARAMS)
 
 
 def force(name: str, law: Any, v: Any, share: Any = 0.5) -> Any:

@@ -133,7 +133,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
 
     **Where events accumulate** (a ball coming to rest, chatter): if the last intervals between events shrink below 1e-3
     sqrt(eps) of the time since the start, the run ends with `status = 1` in the state and diffrax's result
-    `dt_min_reached`; with `on_zeno`, that function takes the place of `reset` there, and the guards that are not positive
+    `dt_min_reached`; with `on_zeno`, that function takes the place of `reset` there, and guards that are not positive
     after it wait. After `max_events` events the next one ends the run with `status = 2` and `max_steps_reached`.
 
     **Arguments:**
@@ -146,8 +146,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     - `on_zeno`: as `reset`, for events that accumulate; by default the run ends there.
     - `project`: `project(t, s, args)` -> `s`, applied after every step, for invariants that drift.
     - `enforce`: whether the guards are conditions that have to hold, not crossings that are to be noted.
-    - `freeze_args`: `freeze_args(t0, args)` -> `args` of a step that begins at t0, without what jumps at its end; the reset at the end
-      of the step gets `args` as they are.
+    - `freeze_args`: `freeze_args(t0, args)` -> `args` of a step that begins at t0, without what jumps at its end;
+      the reset at the end of the step gets `args` as they are.
     - `jump_ts`: times at which fields and guards jump, increasing, shape `[n]`, among the `times` of the controller.
       There `reset` is called, with no guard marked, and what it changes of the modes is an event.
     - `rtol`: the part of its largest magnitude in a step by which a guard may fall below zero, and return, unseen.
