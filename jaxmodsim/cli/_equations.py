@@ -6,9 +6,6 @@ from .._core.parameters import ranges_of
 from ..friction import AbstractAsymmetric, Coulomb, Dahl, LuGre, Regularized, Stribeck, Viscous
 from ..scene import Friction, Scene
 
-# What the drive has beside its force, by the name of the param without which it is none.
-_TERMS = {"offset": "offset", "drift": "drift exp(-(t - t0)/tau)"}
-
 _LEVEL = "g(v) = Fc + (Fs - Fc) exp(-(v/vs)^2)"
 _FORMULAS: dict[type, tuple[str, ...]] = {
     Coulomb: ("Fc sign(v)",),
@@ -29,7 +26,7 @@ def equations(scene: Scene) -> tuple[str, ...]:
     elements = [effect for effect in scene.effects if isinstance(effect, Friction)]
     params = scene.params
     assert isinstance(params, dict)
-    terms = [term for name, term in _TERMS.items() if float(params[name]) != 0]
+    terms = ["offset"] if float(params["offset"]) != 0 else []
     lines = [" - ".join(["m q'' = u", *terms, *(f"F_{effect.name}" for effect in elements)]) + ",   v = q'"]
     for effect in elements:
         first, *rest = _force(effect.law)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ..identify import Comparison, FitResult, InputDesign, Profile, Score
+from ..identify import Comparison, FitResult, InputDesign, Profile, Score, remarks, residual_tests
 from ..plot import Figure, comparison_figure, design_figure, fit_figure, profile_figure, result_figure, score_figure
 from ._equations import equations
 from ._fitted import Findings, Fitted, design_table, model_table, parameter_table, record_table
@@ -42,13 +42,13 @@ def report_page(findings: Findings) -> str:
     """The page. All that comes from files or the command line is escaped."""
     fitted = findings.fitted
     result = fitted.result
-    title = f"Fit of {', '.join(record.name for record in result.records)}: {fitted.model}"
+    title = f"Fit of {', '.join(record.name for record in result.provenance.records)}: {fitted.model}"
     parts = [
         _head(findings),
         _section("Records", _frame(record_table(fitted)), _note(_start_words(fitted))),
         _section("Model", *_model(fitted)),
         _section("Parameters", _frame(parameter_table(result)), _note(_sure_words(result))),
-        _section("What the records cannot tell", _list(result.remarks, "Nothing to remark.")),
+        _section("What the records cannot tell", _list(remarks(result), "Nothing to remark.")),
         _section("Measured and simulated", *_followed(result)),
         _section("What is left in the residual", *_residuals(result)),
         _section("Correlation of the parameters", _correlation(result)),
@@ -70,7 +70,9 @@ def report_page(findings: Findings) -> str:
 
 def _head(findings: Findings) -> str:
     result, origin = findings.fitted.result, findings.origin
-    rmse = f"RMSE {1e3 * result.rmse:.4g} mm; {result.evaluations} evaluations, {result.ending}."
+    rmse = (
+        f"RMSE {1e3 * result.rmse:.4g} mm; {result.diagnostics.evaluations} evaluations, {result.diagnostics.ending}."
+    )
     lines = [f"<p><strong>{escape(rmse)}</strong></p>", _pre(origin["command"])]
     return "\n".join([*lines, f'<p class="small">{escape(origin["date"])}. {escape(origin["versions"])}.</p>'])
 
@@ -88,12 +90,12 @@ def _start_words(fitted: Fitted) -> str:
 def _sure_words(result: FitResult) -> str:
     return (
         "Standard errors allow for the correlation of the residual in time; they hold if the model is right but for"
-        f" noise. Noise level: {1e3 * result.noise['measured']:.4g} mm."
+        f" noise. Noise level: {1e3 * result.diagnostics.noise['measured']:.4g} mm."
     )
 
 
 def _model(fitted: Fitted) -> list[str]:
-    words = f"{fitted.words[:1].upper()}{fitted.words[1:]}."
+    words = f"{fitted.description[:1].upper()}{fitted.description[1:]}."
     held = ", ".join(f"{name} = {value:.6g}" for name, value in fitted.held.items())
     equation = _pre("\n".join(equations(fitted.scene)))
     return [f"<p>{escape(words)}</p>", equation, _note(f"Not fitted: {held or 'nothing'}.")]
@@ -101,22 +103,22 @@ def _model(fitted: Fitted) -> list[str]:
 
 def _followed(result: FitResult) -> list[str]:
     """The first record with all that belongs to a fit, the others with their residuals."""
-    first = _figure(result_figure(result, units={"measured": "m"}), result.records[0].name)
-    others = range(1, len(result.records))
-    return [first, *(_figure(fit_figure(result, record=i), result.records[i].name) for i in others)]
+    first = _figure(result_figure(result, units={"measured": "m"}), result.provenance.records[0].name)
+    others = range(1, len(result.provenance.records))
+    return [first, *(_figure(fit_figure(result, record=i), result.provenance.records[i].name) for i in others)]
 
 
 def _residuals(result: FitResult) -> list[str]:
-    tests = result.residual_tests()
-    words = []
+    tests = residual_tests(result)
+    parts = []
     for each in tests.channels:
-        remarks = each.remarks or ("It looks like noise.",)
-        words.append(f"<p>{escape(each.record)}:</p>{_list(remarks)}")
-    return [*words, f"<details><summary>All tests</summary>{_pre(str(tests))}</details>"]
+        sentences = each.remarks or ("It looks like noise.",)
+        parts.append(f"<p>{escape(each.record)}:</p>{_list(sentences)}")
+    return [*parts, f"<details><summary>All tests</summary>{_pre(str(tests))}</details>"]
 
 
 def _correlation(result: FitResult) -> str:
-    names, matrix = list(result.values), result.correlation
+    names, matrix = list(result.values), result.estimate.correlation
     head = "".join(f'<th class="number">{escape(name)}</th>' for name in names)
     rows = []
     for i, name in enumerate(names):

@@ -24,7 +24,7 @@ def scene_numbers(scene: eqx.Module) -> dict[str, Array]:
 
     Entries of `params` go by their key (`m`, nested ones `arm.m`), numbers of an effect by `effect.number`
     (`friction.Fc`, `friction.belt_velocity`); wrapped laws add no level of their own (`friction.width`), the two
-    sides of a law that depends on direction do (`friction.forward.Fc`). Numbers of a law alone go by what is left of that
+    sides of a law that depends on direction do (`friction.forward.Fc`). Those of a law alone go by what is left of that
     (`Fc`, `forward.Fc`). Of a `Signal` there are its values (`u.values`); its times are constants.
 
     **Raises:**

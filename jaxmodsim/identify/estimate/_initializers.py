@@ -4,7 +4,7 @@ import abc
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -208,6 +208,7 @@ class Continuation(AbstractInitializer):
         return x, ()
 
 
+@runtime_checkable
 class GradientTransformation(Protocol):
     """What `Stochastic` asks of an optimiser; those of optax have it."""
 

@@ -242,7 +242,7 @@ def floored_inverse(matrix: Array | np.ndarray, least: float) -> Any:
     """
     xp = jnp if isinstance(matrix, jax.Array) else np
     values, vectors = xp.linalg.eigh(matrix)
-    return vectors / xp.maximum(values, least * xp.maximum(values[-1], 1.0)) @ vectors.T
+    return vectors / xp.maximum(values, least * xp.maximum(values[-1], 1.0))[None, :] @ vectors.T
 
 
 def correlation_of(covariance: Float[np.ndarray, "free free"]) -> Float[np.ndarray, "free free"]:
