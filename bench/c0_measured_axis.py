@@ -23,7 +23,7 @@ from _options import begin
 from _report import new_result, write_result
 
 import jaxmodsim as jms
-from jaxmodsim.identify import AXIS_MODELS, axis_scene, first_coordinate, replay, rough_axis, start_state
+from jaxmodsim.identify import AXIS_MODELS, axis_scene, replay, rough_axis, start_state
 
 HERE = Path(__file__).parent
 RECORD = HERE.parents[1] / "shared" / "data" / "emps" / "train.csv"
@@ -106,7 +106,7 @@ def rmse_with_substeps(record: jms.Record, model: str, parameters: dict[str, Any
     inputs = {name: jnp.asarray(x) for name, x in record.inputs.items()}
     q0, qd0 = (jnp.asarray([x]) for x in start_state(record))
     run = jax.jit(replay, static_argnums=(5, 6))
-    position = run(scene, jnp.asarray(record.t), inputs, q0, qd0, substeps, first_coordinate)
+    position = run(scene, jnp.asarray(record.t), inputs, q0, qd0, substeps)
     return float(jnp.sqrt(jnp.mean((position - record.measured) ** 2)))
 
 

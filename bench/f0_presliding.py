@@ -17,7 +17,7 @@ from _options import begin
 from _report import new_result, write_figure, write_result
 
 import jaxmodsim as jms
-from jaxmodsim.identify import law_force
+from jaxmodsim.identify import law_force, remarks
 
 HERE = Path(__file__).parent
 RECORD = HERE.parents[1] / "shared" / "data" / "presliding" / "hysteresis.csv"
@@ -98,11 +98,11 @@ def judge(name: str, law: Any, free: Any, known: jms.Record, columns: tuple[Any,
         "parameters": len(found.values),
         "rmse_fitted": float(np.sqrt(np.mean(error[:half] ** 2))),
         "rmse_held_back": float(np.sqrt(np.mean(error[half:] ** 2))),
-        "evaluations": found.evaluations,
+        "evaluations": found.diagnostics.evaluations,
         "ending": found.ending,
         "seconds": seconds,
         "values": found.values,
-        "remarks": list(found.remarks),
+        "remarks": list(remarks(found)),
     }
     return row, modelled
 

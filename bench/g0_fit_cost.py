@@ -21,7 +21,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import jaxmodsim as jms
-from jaxmodsim.identify import AXIS_MODELS, MultiStart, axis_scene, first_coordinate, replay, rough_axis
+from jaxmodsim.identify import AXIS_MODELS, MultiStart, axis_scene, replay, rough_axis
 
 RECORD = Path(__file__).parents[2] / "shared" / "data" / "emps" / "train.csv"
 DRIVE_GAIN = 35.15065188248547
@@ -74,7 +74,9 @@ def axis_costs(path: Path, smoke: bool, rows: list[list[str]]) -> dict[str, Any]
 
     found, cold = timed(lambda: ours(record))
     warm = float(np.median([timed(lambda: ours(record))[1] for _ in range(3)]))
-    rows.append(["jaxmodsim", f"{cold:.1f}", f"{warm:.2f}", f"{found.evaluations}", f"{1e3 * found.rmse:.3f} mm"])
+    rows.append(
+        ["jaxmodsim", f"{cold:.1f}", f"{warm:.2f}", f"{found.diagnostics.evaluations}", f"{1e3 * found.rmse:.3f} mm"]
+    )
 
     run = numba_axis(width)
     by_hand, cold_hand = timed(lambda: differences(lambda p: run(t, force, q[0], *p) - q, start))
@@ -93,7 +95,15 @@ def axis_costs(path: Path, smoke: bool, rows: list[list[str]]) -> dict[str, Any]
     measured = q[tenth][:200] if smoke else q[tenth]
     limit = 1 if smoke else None
     scipy_fit, slow = timed(lambda: differences(lambda p: sample(*p) - measured, start, limit))
-    rows.append(["jaxmodsim, a tenth", "", f"{warm_short:.3f}", f"{short.evaluations}", f"{1e3 * short.rmse:.3f} mm"])
+    rows.append(
+        [
+            "jaxmodsim, a tenth",
+            "",
+            f"{warm_short:.3f}",
+            f"{short.diagnostics.evaluations}",
+            f"{1e3 * short.rmse:.3f} mm",
+        ]
+    )
     calls = scipy_fit.nfev + scipy_fit.njev * start.size
     rmse_slow = float(np.sqrt(2 * scipy_fit.cost / measured.size))
     rows.append(["solve_ivp + least_squares, a tenth", "", f"{slow:.1f}", f"{calls}", f"{1e3 * rmse_slow:.3f} mm"])
@@ -193,16 +203,14 @@ def many_starts(count: int, rows: list[list[str]]) -> dict[str, Any]:
     u = 3 * np.sin(2 * np.pi * 0.7 * t) + 2 * np.sin(2 * np.pi * 1.9 * t) + 1.2 * np.sin(2 * np.pi * 0.31 * t)
     zero = jnp.zeros(1)
     truth = sprung(1e4, 40.0, 2.0, 1.0, 1.5, 0.02)
-    q = jax.jit(replay, static_argnums=(5, 6))(
-        truth, jnp.asarray(t), {"u": jnp.asarray(u)}, zero, zero, 1, first_coordinate
-    )
+    q = jax.jit(replay, static_argnums=(5, 6))(truth, jnp.asarray(t), {"u": jnp.asarray(u)}, zero, zero)
     noise = 1e-5
     record = jms.Record(t, np.asarray(q) + noise * np.random.default_rng(0).standard_normal(t.size), {"u": u})
     start = sprung(1e5, 4.0, 0.2, 0.3, 2.0, 0.1)
     free = tuple(f"friction.{name}" for name in NAMES)
 
     def search() -> Any:
-        return jms.fit(start, record, free, begin=MultiStart(count), q0=[0.0])
+        return jms.fit(start, record, free, initializer=MultiStart(count), q0=[0.0])
 
     found, cold = timed(search)
     _, warm = timed(search)

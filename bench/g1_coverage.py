@@ -16,7 +16,7 @@ from _report import new_result, write_result
 from g0_fit_cost import NAMES, sprung
 
 import jaxmodsim as jms
-from jaxmodsim.identify import Staged, coverage, first_coordinate, replay
+from jaxmodsim.identify import Staged, coverage, replay
 
 TRUTH = (1e4, 40.0, 2.0, 1.0, 1.5, 0.02)
 WRONG = (1e5, 4.0, 0.2, 0.3, 2.0, 0.1)
@@ -31,14 +31,14 @@ def main() -> None:
     u = 3 * np.sin(2 * np.pi * 0.7 * t) + 2 * np.sin(2 * np.pi * 1.9 * t) + 1.2 * np.sin(2 * np.pi * 0.31 * t)
     zero = jnp.zeros(1)
     run = jax.jit(replay, static_argnums=(5, 6))
-    q = run(sprung(*TRUTH), jnp.asarray(t), {"u": jnp.asarray(u)}, zero, zero, 1, first_coordinate)
+    q = run(sprung(*TRUTH), jnp.asarray(t), {"u": jnp.asarray(u)}, zero, zero)
     record = jms.Record(t, np.asarray(q), {"u": u}, noise=NOISE)
-    fitted = jms.fit(sprung(*WRONG), record, tuple(f"friction.{x}" for x in NAMES), q0=[0.0], begin=Staged())
+    fitted = jms.fit(sprung(*WRONG), record, tuple(f"friction.{x}" for x in NAMES), q0=[0.0], initializer=Staged())
     content = new_result("coverage", options) | {"repeats": repeats}
     rows = []
     for label, memory in (("white", 0.0), ("correlation 0.9 from sample to sample", 0.9)):
         started = time.perf_counter()
-        found = coverage(fitted, repeats, memory=memory, begin=Staged())
+        found = coverage(fitted, repeats, memory=memory, initializer=Staged())
         seconds = time.perf_counter() - started
         print(label, found, f"{seconds:.0f} s", sep="\n")
         shares = [found.shares[f"friction.{name}"] for name in NAMES]

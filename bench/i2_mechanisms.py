@@ -30,7 +30,7 @@ from e1_long_runs import PHI0, SPIN0, Closed, G
 from g0_fit_cost import DRIVE_GAIN, RECORD, numba_axis
 
 import jaxmodsim as jms
-from jaxmodsim.identify import AXIS_MODELS, axis_scene, first_coordinate, replay, rough_axis
+from jaxmodsim.identify import AXIS_MODELS, axis_scene, replay, rough_axis
 from jaxmodsim.problems import (
     n_link_pendulum,
     n_link_pendulum_acceleration,
@@ -148,7 +148,7 @@ def axis(path: Path, smoke: bool) -> dict[str, Callable[[], Any]]:
 
     def error(p: Any) -> Any:
         scene = replace_numbers(base, dict(zip(model.free, p, strict=True)))
-        moved = replay(scene, times, inputs, measured[:1], jnp.zeros(1), 1, first_coordinate)
+        moved = replay(scene, times, inputs, measured[:1], jnp.zeros(1))
         return jnp.mean((moved - measured) ** 2)
 
     by_numba = numba_axis(width)

@@ -169,7 +169,9 @@ def _given(given: _Start, guess: np.ndarray, dof: int, name: str) -> np.ndarray:
     return array
 
 
-def _scored(record: Record, outputs: Mapping[str, Array | np.ndarray], start: State | None, ending: str | None) -> Score:
+def _scored(
+    record: Record, outputs: Mapping[str, Array | np.ndarray], start: State | None, ending: str | None
+) -> Score:
     seen = {name: np.asarray(outputs[name], float)[0] for name in record.channels}
     rmse = {name: float(np.sqrt(np.mean((x - record.channels[name]) ** 2))) for name, x in seen.items()}
     changes = {name: float(np.std(x)) for name, x in record.channels.items()}
