@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from ..._core.arguments import as_float, as_label, as_mapping, as_names, as_reals
 
 # Samples of one channel, shape `[samples]`.
-Column: TypeAlias = ArrayLike | Sequence[float]
+Column: TypeAlias = ArrayLike | Sequence[object]
 # Name of a single channel that was given none.
 SINGLE = "measured"
 # Samples at the beginning of a record, from which position and velocity are estimated.
