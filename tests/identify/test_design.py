@@ -188,7 +188,7 @@ def test_limits_hold_also_in_an_independent_run(design):
 
 def test_fits_are_as_good_as_predicted_and_better_than_those_of_a_plain_sine(design, fits):
     *designed, plain = fits
-    assert all(result.found.converged for result in fits)
+    assert all(result.search.converged for result in fits)
     ratios, better = [], 0
     for name in design.values:
         stated = np.mean([result.errors[name] for result in designed])
@@ -240,7 +240,7 @@ def test_a_prior_is_the_inverse_of_its_covariance(fits):
     information = _known(fits[0], names, np.array([8.0, 10.0]))
     errors = np.array([fits[0].errors[name] for name in names]) / np.array([8.0, 10.0])
     places = [list(fits[0].values).index(name) for name in names]
-    r = fits[0].correlation[places[0], places[1]]
+    r = fits[0].estimate.correlation[places[0], places[1]]
     expected = np.linalg.inv(np.outer(errors, errors) * np.array([[1.0, r], [r, 1.0]]))
     np.testing.assert_allclose(information, expected, rtol=1e-6)
     with pytest.raises(ValueError, match="prior knows none of spring; it fitted m, offset"):
@@ -346,7 +346,7 @@ def test_scenes_that_need_events_and_criteria_that_are_words_are_refused():
     with pytest.raises(ValueError, match=r"friction would need events.*Regularized\(law, width\)"):
         design_input(exact, ("m",), LIMITS, **OPTIONS)
     # Run-time type checks of the tests may come before our own; both name the argument.
-    with pytest.raises((ValueError, TypeError), match="goal"):
+    with pytest.raises((ValueError, TypeError), match="criterion"):
         design_input(box(), ("m",), LIMITS, criterion="D", **OPTIONS)  # pyright: ignore[reportArgumentType]
 
 

@@ -149,7 +149,7 @@ def test_steps_on_a_few_of_many_records_come_near(moved):
         (lambda: MultiStart(0), "count >= 1"),
         (lambda: MultiStart(spread=1.0), "spread > 1"),
         (lambda: Continuation("friction.width", factor=0.5), "factor > 1"),
-        (lambda: Stochastic(0.05), "must be one of optax"),  # pyright: ignore[reportArgumentType]
+        (lambda: Stochastic(0.05), "must be one of optax"),
     ],
 )
 @pytest.mark.quick

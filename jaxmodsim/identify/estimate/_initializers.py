@@ -2,9 +2,9 @@
 
 import abc
 import threading
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -208,19 +208,6 @@ class Continuation(AbstractInitializer):
         return x, ()
 
 
-@runtime_checkable
-class GradientTransformation(Protocol):
-    """What `Stochastic` asks of an optimiser; those of optax have it."""
-
-    def init(self, params: Array, /) -> PyTree:
-        """State before the first step."""
-        ...
-
-    def update(self, updates: Array, state: PyTree, params: Array, /) -> tuple[PyTree, PyTree]:
-        """Change of the parameters by their gradient, and the state for the next step."""
-        ...
-
-
 class Stochastic(AbstractInitializer):
     """Gradient steps on a few runs at a time, for more records than one would run in every iteration.
 
@@ -241,7 +228,7 @@ class Stochastic(AbstractInitializer):
       there are.
     """
 
-    optimiser: GradientTransformation = eqx.field(static=True)
+    optimiser: Hashable = eqx.field(static=True)
     batch: int = eqx.field(static=True, default=4)
     steps: int = eqx.field(static=True, default=200)
     seed: int = eqx.field(static=True, default=0)
@@ -264,7 +251,8 @@ class Stochastic(AbstractInitializer):
         if self.batch > problem.count:
             raise ValueError(f"Stochastic() draws {self.batch} runs at a time, but there are {problem.count}.")
         rng, box = np.random.default_rng(self.seed), problem.box
-        state, order = self.optimiser.init(x), np.zeros(0, int)
+        optimiser: Any = self.optimiser
+        state, order = optimiser.init(x), np.zeros(0, int)
         try:
             for number in range(self.steps):
                 if order.size < self.batch:
@@ -273,7 +261,7 @@ class Stochastic(AbstractInitializer):
                 cost, gradient = _gradient(problem, x, drawn)
                 if not bool(jnp.isfinite(cost)):
                     raise RuntimeError(f"The loss is not finite in step {number + 1}: take a smaller learning rate.")
-                update, state = self.optimiser.update(gradient, state, x)
+                update, state = optimiser.update(gradient, state, x)
                 x = jnp.clip(x + update, box.lower, box.upper)
                 if options.progress is not None:
                     values = problem.free.values(problem.split(x)[0])
