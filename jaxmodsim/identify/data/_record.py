@@ -193,7 +193,11 @@ def _column(column: Column, label: str, shape: tuple[int, ...] | None, name: str
 
 
 def _instants(instants: Column, effect: str, t: np.ndarray, name: str) -> Float[np.ndarray, " instants"]:
-    array = as_reals(instants, name=f"{name}: slips of {effect!r}") if np.size(instants) else np.zeros(0)
+    array = (
+        as_reals(instants, name=f"{name}: slips of {effect!r}")
+        if np.size(np.asarray(instants, object))
+        else np.zeros(0)
+    )
     fine = array.ndim == 1 and bool(np.isfinite(array).all() and (np.diff(array) > 0).all())
     if not (fine and (array.size == 0 or (array[0] >= t[0] and array[-1] <= t[-1]))):
         raise ValueError(
