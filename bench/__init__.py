@@ -1,1 +1,1 @@
-"""The benches. Each is a script that runs alone; `python -m bench` runs them all."""
+"""Benches: a matrix of case x peer x quantity, and a few studies; `python -m bench --list` says what there is."""

@@ -1,8 +1,6 @@
-"""Put the tables of the results into the pages, between the comments that name them.
+"""The one report: tables of recorded results, in the layouts of `tables.py`, put into the pages that name them.
 
-A result `bench/results/NAME.json` holds its tables ready, as
-`{"table": {"columns": [...], "rows": [[...]]}, "caption": "..."}`, or several as
-`{"tables": [{"columns": ..., "rows": ..., "caption": ...}, ...]}`. README.md and docs/*.md say where they go:
+README.md and docs/*.md say where the tables of `bench/results/NAME.json` go:
 
     <!-- bench:NAME -->
     <!-- /bench -->
@@ -12,15 +10,64 @@ A result `bench/results/NAME.json` holds its tables ready, as
 """
 
 import argparse
-import json
 import re
 import sys
 from pathlib import Path
-from typing import Any
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
+sys.path.insert(0, str(ROOT))  # for `bench`, where this file is run as a script
+
+from bench.layout import Recorded, machine_line  # noqa: E402
+from bench.tables import REPORTS  # noqa: E402
+
 _BLOCK = re.compile(r"(<!-- bench:([\w-]+) -->\n)(.*?)(<!-- /bench -->)", re.DOTALL)
+
+
+def report(found: Recorded) -> str:
+    """All tables of a result in Markdown; the last caption says where they were made and what was not run."""
+    shown = REPORTS[found.name].tables
+    parts = []
+    for number, table in enumerate(shown):
+        caption = table.caption.format(**{name.replace(" ", "_"): value for name, value in found.settings.items()})
+        if number + 1 == len(shown):
+            missing = "; ".join(f"{name} ({why})" for name, why in found.not_run.items())
+            caption += f" {machine_line(found.provenance)}" + (f" Not run: {missing}." if missing else "")
+        parts.append(f"{_markdown(table.cells(found))}\n*{caption.strip()}*\n")
+    return "\n".join(parts)
+
+
+def _markdown(lines: list[list[str]]) -> str:
+    """The first column is text and the others are aligned to the right."""
+    heading, *rows = lines
+    escaped = [[text.replace("|", "\\|") for text in row] for row in rows]
+    return "".join(
+        "| " + " | ".join(line) + " |\n" for line in (heading, ["---", *("---:" for _ in heading[1:])], *escaped)
+    )
+
+
+def pages() -> list[Path]:
+    """README.md and the pages under docs/."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def render(page: Path, results: Path) -> str:
+    """Text of `page` with every marked block replaced by the tables of the result it names."""
+    text = page.read_text()
+
+    def block(match: re.Match[str]) -> str:
+        path = results / f"{match[2]}.json"
+        if not path.exists():
+            sys.exit(f"{page.name} asks for bench:{match[2]}, but there is no {path.name} among the results.")
+        found = Recorded.read(path)
+        if found.smoke:
+            sys.exit(f"{path.name} comes from a smoke run, which measures nothing.")
+        return f"{match[1]}\n{report(found)}\n{match[4]}"
+
+    opened, closed = text.count("<!-- bench:"), text.count("<!-- /bench -->")
+    if not opened == closed == len(_BLOCK.findall(text)):
+        sys.exit(f"{page.name} has {opened} comments that open a block and {closed} that close one; they must pair.")
+    return _BLOCK.sub(block, text)
 
 
 def main() -> None:
@@ -40,51 +87,6 @@ def main() -> None:
         for page in outdated:
             page.write_text(rendered[page])
         print(f"written: {names}")
-
-
-def pages() -> list[Path]:
-    """README.md and the pages under docs/."""
-    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-
-
-def render(page: Path, results: Path) -> str:
-    """Text of `page` with every marked block replaced by the tables of the result it names."""
-    text = page.read_text()
-
-    def block(found: re.Match[str]) -> str:
-        path = results / f"{found[2]}.json"
-        if not path.exists():
-            sys.exit(f"{page.name} asks for bench:{found[2]}, but there is no {path.name} among the results.")
-        content = json.loads(path.read_text())
-        if content.get("smoke"):
-            sys.exit(f"{path.name} comes from a smoke run, which measures nothing.")
-        return f"{found[1]}\n{tables_of(content)}\n{found[4]}"
-
-    opened, closed = text.count("<!-- bench:"), text.count("<!-- /bench -->")
-    if not opened == closed == len(_BLOCK.findall(text)):
-        sys.exit(f"{page.name} has {opened} comments that open a block and {closed} that close one; they must pair.")
-    return _BLOCK.sub(block, text)
-
-
-def tables_of(content: dict[str, Any]) -> str:
-    """All tables of a result in markdown, each followed by its caption."""
-    tables = content.get("tables") or [content["table"] | {"caption": content.get("caption", "")}]
-    return "\n".join(f"{markdown(table)}\n{_caption(table)}" for table in tables)
-
-
-def _caption(table: dict[str, Any]) -> str:
-    return f"*{table['caption']}*\n" if table.get("caption") else ""
-
-
-def markdown(table: dict[str, Any]) -> str:
-    """One table; the first column is text and the others are aligned to the right."""
-    columns = [str(cell) for cell in table["columns"]]
-    lines = [columns, ["---", *("---:" for _ in columns[1:])]]
-    for row in table["rows"]:
-        if len(row) != len(columns):
-            sys.exit(f"A row has {len(row)} cells under {len(columns)} columns: {row}")
-        lines.append([str(cell).replace("|", "\\|") for cell in row])
-    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
 if __name__ == "__main__":

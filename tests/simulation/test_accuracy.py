@@ -15,7 +15,7 @@ import jaxmodsim as jms
 from jaxmodsim.problems import double_pendulum, named_problems
 from jaxmodsim.simulation import named_series
 
-# Each problem compiles two methods. Of alike ones the cheaper to compile is here; bench/i3_accuracy.py runs them all.
+# Each problem compiles two methods. Of alike ones the cheaper to compile is here.
 NAMES = (
     "lugre_box",
     "slipping_bristle",

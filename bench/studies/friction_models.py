@@ -1,0 +1,22 @@
+"""Friction models on the test bench, as `jaxmodsim testbench` runs them."""
+
+import math
+from pathlib import Path
+
+from bench.record import Result
+from jaxmodsim.cli._testbench import cases, run_case
+
+
+def main(smoke: bool, out: Path) -> Result:
+    """Run every model; a small run one."""
+    del out
+    result = Result("friction_models", ("diffrax",))
+    for case in cases()[: 1 if smoke else None]:
+        found = run_case(case)
+        about = {"case": case.part, "peer": case.label}
+        result.add("break-away", None if math.isnan(found.break_away) else found.break_away, "s", **about)
+        result.add("zero crossings", found.crossings, **about)
+        result.add("steps", found.steps, **about)
+        result.add("run", 1e-3 * found.milliseconds, "s", **about)
+        result.add("ending", found.ending, **about)
+    return result

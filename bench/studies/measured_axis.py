@@ -1,0 +1,69 @@
+"""`jaxmodsim fit` on the measured EMPS record of a positioning axis: error, held-back error, and what is left open.
+
+One command fits all models to the whole record and to what is left when one of four parts is held back, start-up and
+compilation included. Each fitted model is then run once more with five integration steps for every sample: an error
+that changed would be an artefact of the step.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxmodsim as jms
+from bench.record import Result
+from jaxmodsim.identify import AXIS_MODELS, axis_scene, replay, rough_axis, start_state
+
+# Beside the repository and not in it: A. Janot, M. Gautier, M. Brunot, "Data set and reference models of EMPS",
+# Workshop on Nonlinear System Identification Benchmarks, 2019.
+EMPS, EMPS_GAIN = Path(__file__).parents[3] / "shared" / "data" / "emps" / "train.csv", 35.15065188248547
+
+
+def main(smoke: bool, out: Path) -> Result | None:
+    """Fit and check; a small run fits one model to a part, and without the record there is nothing to do."""
+    del out
+    if not EMPS.exists():
+        print(f"skipped: there is no record at {EMPS}")
+        return None
+    result = Result("measured_axis", ("scipy",), {"goal": 1.65})
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "record.csv"
+        path.write_text("".join(EMPS.read_text().splitlines(keepends=True)[: 1501 if smoke else None]))
+        t, q, _, u = np.loadtxt(path, delimiter=",", skiprows=1).T
+        record = jms.Record(t, q, {"u": EMPS_GAIN * u}, name="EMPS")
+        result.settings["samples"] = len(t)
+        how = ("--model", "coulomb") if smoke else ("--compare", "all")
+        command = [sys.executable, "-c", "from jaxmodsim.cli import main; main()", "fit", str(path), *how]
+        started = time.perf_counter()
+        subprocess.run([*command, "--force-gain", str(EMPS_GAIN), "--out", folder], check=True, capture_output=True)
+        result.settings["seconds"] = round(time.perf_counter() - started)
+        report = json.loads((Path(folder) / "fit.json").read_text())
+    if smoke:
+        result.add("RMSE with 5 steps a sample", _rmse(record, "coulomb", report["parameters"], 2), "m", peer="coulomb")
+        return result
+    for each in report["comparison"]["models"]:
+        name = each["name"]
+        result.add("parameters", each["parameters"], peer=name)
+        for quantity, key in (("RMSE", "fitted"), ("held back", "held_back"), ("standard error", "standard_error")):
+            result.add(quantity, each[key], "m", peer=name)
+        fine = _rmse(record, name, report["comparison"]["fits"][name]["parameters"], 5)
+        result.add("RMSE with 5 steps a sample", fine, "m", peer=name)
+        result.add("not determined", ", ".join(each["undetermined"]) or "-", peer=name)
+    return result
+
+
+def _rmse(record: jms.Record, model: str, parameters: dict[str, Any], substeps: int) -> float:
+    """RMSE [m] of a fitted model with `substeps` integration steps for every sample."""
+    scene = axis_scene(AXIS_MODELS[model], rough_axis(record), {name: x["value"] for name, x in parameters.items()})
+    inputs = {name: jnp.asarray(x) for name, x in record.inputs.items()}
+    q0, qd0 = (jnp.asarray([x]) for x in start_state(record))
+    run = jax.jit(replay, static_argnums=5)
+    position = run(scene, jnp.asarray(record.t), inputs, q0, qd0, substeps)
+    return float(jnp.sqrt(jnp.mean((position - record.measured) ** 2)))

@@ -1,0 +1,225 @@
+"""What each bench measures, in a sentence, and the layouts of its tables."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from bench.layout import OURS, Recorded, Table, Targets
+
+CHOSEN: dict[str, Any] = {"at": "chosen"}
+TIGHT: dict[str, Any] = {"at": 1e-6}
+CVODES, KVAERNO5, SCANNED = "CVODES (CasADi)", "diffrax Kvaerno5", "legs in `lax.scan`"
+VMAP, GROUPS, SWEEP, HAND = "vmap", "lax.map, 64 at a time", "sweep", "JAX by hand"
+MANY = ("run of many", "error of many")
+
+
+@dataclass(frozen=True)
+class Report:
+    """A bench in the pages: what it measures, its page and its tables."""
+
+    says: str
+    page: str
+    tables: tuple[Table | Targets, ...]
+
+
+def _lugre(setting: str) -> tuple[Table | Targets, ...]:
+    one = Table(
+        f"LuGre test bench at an error of at most 1e-6, medians, all in one process, {setting} `jaxmodsim.tune_cpu()`."
+        " Run: of jaxmodsim a whole call of `simulate`, of diffrax one of a jitted function, of CVODES one of CasADi's"
+        " integrator. Differentiated run: the jitted function of six parameters whose derivatives are measured.",
+        ("rtol", "steps", "error of v", "run", "differentiated run", "jacobian", "gradient", "error of the gradient"),
+        where=CHOSEN,
+    )
+    many = Table(
+        "{runs} runs of it with different parameters (in loops {runs_of_a_loop}), error of the end velocity.",
+        MANY, ("peer", "at"),
+    )  # fmt: skip
+
+    def targets(r: Recorded) -> list[tuple[str, str, float]]:
+        own, loop = r.number("run", **CHOSEN), r.number("run of many", peer=CVODES, at="loop")
+        jitted, cvodes = r.number("differentiated run", **CHOSEN), r.number("run", peer=CVODES, **CHOSEN)
+        fastest = min(r.number("run", peer=name, **CHOSEN) for name in r.all_of("run", "peer") if "diffrax" in name)
+        return [
+            ("one run against CVODES", ">= 8", cvodes / own),
+            ("the same, ours jitted", ">= 8", cvodes / jitted),
+            ("one run against the fastest of diffrax", ">= 20", fastest / own),
+            ("the same, ours jitted as it is", ">= 20", fastest / jitted),
+            ("one run against Kvaerno5", "", r.number("run", peer=KVAERNO5, **CHOSEN) / own),
+            *(
+                (f"many runs by `{way}` against CVODES one by one", ">= 200", loop / r.number("run of many", at=way))
+                for way in (VMAP, GROUPS, SWEEP)
+            ),
+            ("Jacobian in runs", "<= 2.5", r.number("jacobian", **CHOSEN) / jitted),
+            ("reverse gradient in runs", "<= 4", r.number("gradient", **CHOSEN) / jitted),
+        ]
+
+    return one, many, Targets("Targets on the LuGre test bench.", targets)
+
+
+def _stick_slip(r: Recorded) -> list[tuple[str, str, float]]:
+    jitted, call = r.number("run in `jax.jit`", **TIGHT), r.number("run", **TIGHT)
+    scipy = [r.number("run", peer=name, **CHOSEN) for name in r.all_of("run", "peer") if name.startswith("scipy")]
+    return [
+        ("scipy RK45, against a whole call", ">= 200", r.number("run", peer="scipy RK45", **TIGHT) / call),
+        ("fastest method of scipy at our error", ">= 200", min(scipy, default=float("nan")) / call),
+        ("legs in `lax.scan`, against a jitted run", ">= 1", r.number("run", peer=SCANNED, **TIGHT) / jitted),
+        ("one run alone, to one of many", ">= 15", jitted / r.number(MANY[0], at=VMAP)),
+    ]
+
+
+def _accelerations(r: Recorded) -> list[tuple[str, str, float]]:
+    def ratio(n: str, way: str, peer: str) -> float:
+        return r.number(way, case=n, key="minimum") / r.number(way, case=n, peer=peer, key="minimum")
+
+    sizes, ways = r.all_of("loop", "case"), ("loop", "many", "many in a loop")
+    hand = [(f"time by hand, n = {n}, {way}", "<= 1.3", ratio(n, way, HAND)) for n in sizes[:3] for way in ways]
+    return hand + [(f"time of MuJoCo, n = {n}, many", "< 1", ratio(n, "many", "MuJoCo")) for n in sizes if int(n) <= 6]
+
+
+def _sweep(r: Recorded) -> list[tuple[str, str, float]]:
+    ours, kills, count = r.number("run", at=SWEEP), r.settings.get("kills", 0), r.settings["many"]
+    processes = next(iter(r.all_of("run", "at", peer=CVODES)), "")
+    return [
+        ("against CVODES on all cores", ">= 60", r.number("run", peer=CVODES, at=processes) / ours),
+        ("against Kvaerno5 under plain `vmap`", ">= 100", r.number("run", peer=KVAERNO5, at="plain vmap") / ours),
+        ("against our own solver under plain `vmap`", "", r.number("run", at="plain vmap") / ours),
+        (f"{count:,} runs into a store: runs per second", "", count / r.number("many runs into a store")),
+        ("the same: peak memory [GiB]", "< 2", r.number("peak memory of many runs") / 2**30),
+        (f"killed {kills} times: the same store, bit for bit", ">= 1", r.number("same store after kills")),
+    ]
+
+
+def _errors(of: str) -> tuple[str, ...]:
+    return f"error of {of}, largest", f"error of {of}, at the end", f"growth of the error of {of}"
+
+
+REPORTS = {
+    "lugre_testbench": Report("LuGre's test bench: one run, many, derivatives.", "speed", _lugre("with")),
+    "lugre_testbench_untuned": Report("The same without `tune_cpu`.", "speed", _lugre("without")),
+    "lugre_work_precision": Report(
+        "LuGre's test bench: time against error, tolerance by tolerance.", "accuracy",
+        (Table("Time of one run at each rtol, medians.", ("run",), ("at",), ("peer",)),),
+    ),
+    "pulled_spring": Report(
+        "LuGre's law of 1995, pulled through a spring: error against steps, time of a run.", "speed",
+        (
+            Table(
+                "LuGre friction of 1995 pulled through a spring, {t1:g} s: largest error of the friction force, of"
+                " which"
+                " the largest is 1.5 N, by rtol; of RK4, whose steps of 10 us confirm the reference, by step [s].",
+                ("steps", "error of F in newtons", "run"), ("peer", "at"), where={"peer": (OURS, "RK4, here")},
+            ),
+            Table(
+                "The same to relative errors of at most 1e-6, of velocity and friction force both, over the run,"
+                " medians, all in one process, with `jaxmodsim.tune_cpu()`.",
+                ("rtol", "steps", "error of v", "error of F", "run", "run in `jax.jit`"), where=CHOSEN,
+            ),
+        ),
+    ),
+    "stick_slip": Report(
+        "A minute of stick and slip, 122 events: one run, many, gradient, compilation.", "stick_slip",
+        (
+            Table(
+                "Belt oscillator, {t1:g} s and {events} events, at rtol 1e-6; error of the position at the end (it"
+                " moves"
+                " by 0.06 m) against the closed form; medians, all in one process, with `jaxmodsim.tune_cpu()`.",
+                ("error of x", "run", "run in `jax.jit`"), where=TIGHT,
+            ),
+            Table(
+                "The same at the loosest tolerance that makes the error no larger than ours; reverse gradient by Fc,"
+                " Fs,"
+                " k, m, vb; a whole call of `simulate`.",
+                ("rtol", "run", "gradient", "error of the gradient"), where=CHOSEN,
+            ),
+            Table("{runs} runs with different parameters, error of the position at the end.", MANY, ("peer", "at")),
+            Table("Time to trace and compile.", ("compilation", "compilation of the gradient")),
+            Targets("Targets on stick-slip: time of the other in ours.", _stick_slip),
+        ),
+    ),
+    "accelerations": Report(
+        "Accelerations of a chain of n links: in a loop, and many at once.", "accelerations",
+        (
+            Table(
+                "Accelerations of a chain of n links, per evaluation: shortest of interleaved repetitions, all in one"
+                " process, with `jaxmodsim.tune_cpu()`. By hand: the faster of arrays and scalars. Loop: dependent"
+                " evaluations with a step of Euler. Many: 1024 states in one call; MuJoCo's over all cores.",
+                ("loop", "many", "many in a loop"), ("case",), ("quantity", "peer"), shown="minimum",
+            ),
+            Targets("Targets: time of jaxmodsim in that of its peers.", _accelerations),
+        ),
+    ),
+    "long_runs": Report(
+        "Energy, momentum and motion over 100 000 periods.", "long_runs",
+        (
+            Table(
+                "Spherical pendulum, {periods} periods of {period:.2f} s: relative errors of the energy and of the"
+                " angular momentum about the vertical, error of the angle phi against its closed form. Growth: exponent"
+                " of time over the last two decades, where the angle is not lost (swing {swing:.2f} rad). One run"
+                " each.",
+                ("steps", "run", *_errors("energy"), _errors("momentum")[0], *_errors("phi")[1:]),
+                where={"case": "spherical pendulum", "at": ""},
+            ),
+        ),
+    ),
+    "hard_cases": Report(
+        "Hard cases by this and by other programs.", "hard_cases",
+        (
+            Table(
+                "How many of the hard cases below each program was asked, and what came of them. diffrax and scipy:"
+                " `Fc sign(v)` for dry friction, rtol {rtol:g}, atol {atol:g}; Kvaerno5 where rates are high."
+                " Admissible"
+                " is for `jaxmodsim` the tolerance of the case, for the others {generous:g} times that and at least"
+                " {least:g}. Where a case has no answer, an error is right, whatever it says. No answer: in {limit:g}"
+                " s,"
+                " compilation included.",
+                ("cases",), columns=("at",),
+            ),
+            Table("Case by case.", ("verdict",), ("case",), ("peer",)),
+        ),
+    ),
+    "sweep": Report(
+        "Many runs: on all cores, into a store, killed and begun again.", "sweeps",
+        (
+            Table(
+                "{runs} runs of the LuGre test bench with different parameters, {t1:g} s each, all in turns; error of"
+                " the end velocity. Tolerances: the loosest at which the nominal run stays within 1e-6. With"
+                " `jaxmodsim.tune_cpu()`.",
+                ("rtol", "run", "error"), ("peer", "at"),
+            ),
+            Targets("Targets on sweeps: ratios of times, unless said.", _sweep),
+        ),
+    ),
+    "behaviour": Report(
+        "Friction laws in the standard experiments.", "laws",
+        (
+            Table("What the experiments find, and their limits.", ("number", "unit", "limit"), ("case",)),
+            Table(
+                "Whether each law keeps the limit of each experiment, and its number; **no**: a known limitation.",
+                ("verdict",), columns=("case",),
+            ),
+        ),
+    ),
+    "friction_models": Report(
+        "Friction models on the test bench.", "laws",
+        (Table(
+            "A box of 2 kg under a force rising by 1 N/s (where not said otherwise), 10 s. Break-away: friction falls"
+            " behind the applied force by 0.05 N for good.",
+            ("break-away", "zero crossings", "steps", "run", "ending"), ("peer", "case"),
+        ),),
+    ),
+    "measured_axis": Report(
+        "`jaxmodsim fit` on a measured axis.", "measured_record",
+        (Table(
+            "EMPS record, {samples:,} samples, open-loop error of the position over the whole record, and in four parts"
+            " that were held back one after the other. Asked for: {goal} mm with at most 8 parameters. One command,"
+            " {seconds} s.",
+            ("parameters", "RMSE", "RMSE with 5 steps a sample", "held back", "standard error", "not determined"),
+        ),),
+    ),
+    "coverage": Report(
+        "How often 95 % intervals hold the truth.", "identification",
+        (Table(
+            "Share of {repeats} repeats whose 95 % interval held the truth; starts wrong by up to a factor of ten.",
+            ("share", "converged", "time"), ("case",), ("quantity", "at"),
+        ),),
+    ),
+}  # fmt: skip
