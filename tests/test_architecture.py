@@ -33,6 +33,8 @@ ROOMS = (
     "cli",
 )
 NEEDED_TO_SIMULATE = set(ROOMS[: ROOMS.index("simulation") + 1])
+# Folders of identification in the order of the flow of data: one imports only those before it.
+STAGES = ("data", "model", "estimate", "uncertainty", "selection", "design")
 # Folders of a room with public names of their own.
 PARTS = ("validation.behaviour", "validation.hard", "validation.testbench")
 
@@ -121,6 +123,16 @@ def test_parts_of_a_room_meet_by_their_public_names(part: str) -> None:
             for module in own_imports(path, node):
                 other = module.startswith("validation.") and not module.startswith(part)
                 assert not (other and "._" in module), f"{part} reaches into {module}"
+
+
+@each_file(sorted(ROOT.joinpath("identify").glob("*/*.py")))
+def test_data_flow_one_way_through_identification(path: Path) -> None:
+    stage = path.parent.name
+    for node in statements(path, (ast.Import, ast.ImportFrom)):
+        for module in own_imports(path, node):
+            room, _, inside = module.partition(".")
+            allowed = STAGES[: STAGES.index(stage) + 1]
+            assert room != "identify" or inside.split(".")[0] in allowed, f"{stage} imports {module}"
 
 
 @each_file(FILES)
