@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 import jaxmodsim as jms
-from jaxmodsim.identify import AXIS_MODELS, Continuation, FitResult, axis_scene, fit, rough_axis, start_state
+from jaxmodsim.identify import Continuation, FitResult, axis_models, axis_scene, fit, rough_axis, start_state
 from jaxmodsim.plot import fit_figure
 
 RECORD = Path(__file__).parents[2] / "shared" / "data" / "emps" / "train.csv"
@@ -41,7 +41,7 @@ def main(record_file: Path, out: Path, smoke: bool = False) -> None:
     rough, (q0, qd0) = rough_axis(record), start_state(record)
     out.mkdir(parents=True, exist_ok=True)
     for name in ("coulomb",) if smoke else ("coulomb", "asymmetric", "drifting"):
-        model = AXIS_MODELS[name]
+        model = axis_models()[name]
         # The record starts in motion. A width that comes down from a large one does not get caught on the way.
         result = fit(
             axis_scene(model, rough),

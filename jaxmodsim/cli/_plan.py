@@ -10,7 +10,6 @@ import numpy as np
 
 from .._core.arguments import nearest
 from ..identify import (
-    AXIS_MODELS,
     Candidate,
     Cauchy,
     Continuation,
@@ -19,6 +18,7 @@ from ..identify import (
     Record,
     Squares,
     Staged,
+    axis_models,
     axis_scene,
     rough_axis,
     start_state,
@@ -105,7 +105,7 @@ def plan_of(request: FitRequest) -> Plan:
         rough_axis(record)
     rough = rough_axis(max(records, key=lambda record: len(record.t)))
     rough = replace(rough, start=min(float(record.t[0]) for record in records))
-    numbers = {name: _numbers(axis_scene(AXIS_MODELS[name], rough)) for name in names}
+    numbers = {name: _numbers(axis_scene(axis_models()[name], rough)) for name in names}
     fixed, start = _values("--fix", request.fix, numbers), _values("--start", request.start, numbers)
     chosen = tuple(name.strip() for text in request.free for name in text.split(",") if name.strip())
     for name in chosen:
@@ -116,7 +116,7 @@ def plan_of(request: FitRequest) -> Plan:
             raise ValueError(f"{both[0]} stands in {option} and in --fix: it can be fitted or fixed, not both.")
     candidates = {}
     for name in names:
-        model = AXIS_MODELS[name]
+        model = axis_models()[name]
         own = [{key: x for key, x in given.items() if key in numbers[name]} for given in (start, fixed)]
         free = tuple(each for each in chosen or model.free if each not in fixed)
         candidates[name] = Candidate(axis_scene(model, rough, *own), free, model.words)
@@ -164,12 +164,12 @@ def _check(request: FitRequest) -> None:
 
 def _models(request: FitRequest) -> tuple[str, ...]:
     if request.compare is None:
-        return (_known("--model", request.model, AXIS_MODELS, "model"),)
+        return (_known("--model", request.model, axis_models(), "model"),)
     if request.compare == "all":
-        return tuple(AXIS_MODELS)
+        return tuple(axis_models())
     names = tuple(dict.fromkeys(name.strip() for name in request.compare.split(",") if name.strip()))
     for name in names:
-        _known("--compare", name, AXIS_MODELS, "model")
+        _known("--compare", name, axis_models(), "model")
     if len(names) < 2:
         raise ValueError(f"--compare needs `all` or two models or more, A,B, but {request.compare!r} was given.")
     return names

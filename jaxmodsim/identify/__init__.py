@@ -1,7 +1,7 @@
 """Identification: numbers of scenes and laws from measured records."""
 
-from ._axis import AXIS_MODELS as AXIS_MODELS
 from ._axis import AxisModel as AxisModel
+from ._axis import axis_models as axis_models
 from ._axis import axis_scene as axis_scene
 from ._axis import rough_axis as rough_axis
 from ._begin import Continuation as Continuation

@@ -2,12 +2,14 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..friction import Coulomb, LuGre, Regularized, Stribeck, Viscous, asymmetric
+from .._core.parameters import ranges_of
+from ..friction import AbstractLaw, AbstractSetValuedLaw, Coulomb, Regularized, Viscous, asymmetric, laws
 from ..scene import AbstractEffect, AppliedForce, Friction, Scene, replace_numbers
 from ._record import Record
 from ._smooth import differentiate, smooth, smooth_span
@@ -105,25 +107,6 @@ def _asymmetric(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
     )
 
 
-def _stribeck(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
-    law = Stribeck(Fc=rough.Fc, Fs=1.2 * rough.Fc, vs=0.05 * rough.top, Fv=rough.Fv)
-    return (Friction(Regularized(law, _WIDTH * rough.top), name="friction"),)
-
-
-def _lugre(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
-    # A break-away distance of a few milliseconds at top speed, and a tenth of critical damping in stick.
-    sigma0 = rough.Fc / (2e-3 * rough.top)
-    law = LuGre(
-        sigma0=sigma0,
-        sigma1=0.2 * np.sqrt(rough.m * sigma0),
-        sigma2=rough.Fv,
-        Fc=rough.Fc,
-        Fs=1.1 * rough.Fc,
-        vs=0.05 * rough.top,
-    )
-    return (Friction(law, name="friction"),)
-
-
 @dataclass(frozen=True)
 class AxisModel:
     """A model of the axis: its effects from rough values, what of it is fitted, and what it is in words."""
@@ -133,7 +116,8 @@ class AxisModel:
     words: str
 
 
-AXIS_MODELS = {
+# Models of more than one friction element.
+_COMBINATIONS = {
     "coulomb": AxisModel(
         _coulomb, ("m", "offset", "dry.Fc", "viscous.Fv"), "Coulomb friction (regularised) and viscous friction"
     ),
@@ -148,17 +132,29 @@ AXIS_MODELS = {
         ("m", "drift", "dry.forward.Fc", "dry.backward.Fc", "viscous.forward.Fv", "viscous.backward.Fv"),
         "as asymmetric, with a part of the drive's offset that dies away over the time tau from the first sample on",
     ),
-    "stribeck": AxisModel(
-        _stribeck,
-        ("m", "offset", "friction.Fc", "friction.Fs", "friction.vs", "friction.Fv"),
-        "stiction, Stribeck effect and viscous friction (regularised)",
-    ),
-    "lugre": AxisModel(
-        _lugre,
-        ("m", "offset", *(f"friction.{x}" for x in ("sigma0", "sigma1", "sigma2", "Fc", "Fs", "vs"))),
-        "LuGre",
-    ),
 }
+
+
+def axis_models() -> dict[str, AxisModel]:
+    """Models of an axis by name: combinations of simple laws, and each registered law that says where a fit starts."""
+    models = {name.lower(): _one_law(law) for name, law in laws().items()}
+    return _COMBINATIONS | {name: model for name, model in models.items() if model is not None}
+
+
+def _one_law(kind: type[AbstractLaw]) -> AxisModel | None:
+    """The axis with one friction law, a set-valued one made smooth; None where it does not say a start."""
+    example = kind.fit_start(1.0, 1.0, 1.0, 1.0)
+    if example is None:
+        return None
+    smooth = isinstance(example, AbstractSetValuedLaw)
+
+    def effects(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
+        law: Any = kind.fit_start(rough.m, rough.Fc, rough.Fv, rough.top)
+        return (Friction(Regularized(law, _WIDTH * rough.top) if smooth else law, name="friction"),)
+
+    numbers = [f"friction.{name}" for name, allowed in ranges_of(example).items() if not allowed.execution]
+    words = f"{kind.__name__}: {kind.description}" + (" (regularised)" if smooth else "")
+    return AxisModel(effects, ("m", "offset", *numbers), words)
 
 
 def axis_scene(
@@ -171,7 +167,7 @@ def axis_scene(
 
     **Arguments:**
 
-    - `model`: one of `AXIS_MODELS`.
+    - `model`: one of `axis_models()`.
     - `rough`: values to start from, as `rough_axis` finds them.
     - `start`, `fixed`: other values by the names of `jaxmodsim.scene.scene_numbers`.
 

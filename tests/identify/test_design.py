@@ -9,11 +9,11 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim.identify import (
-    AXIS_MODELS,
     InputDesign,
     Limits,
     _design,
     a_optimal,
+    axis_models,
     axis_scene,
     d_optimal,
     design_input,
@@ -25,7 +25,7 @@ from jaxmodsim.identify._excitation import driven_motion, feed_forward, motion_b
 from jaxmodsim.plot import design_figure
 from jaxmodsim.scene import replace_numbers
 
-MODEL = AXIS_MODELS["lugre"]
+MODEL = axis_models()["lugre"]
 LIMITS = Limits(force=40.0, speed=0.1, travel=0.02)
 DT, DURATION, HARMONICS, NOISE = 2e-3, 2.0, 5, 1e-6
 OPTIONS = {"duration": DURATION, "noise": NOISE, "dt": DT, "harmonics": HARMONICS}
@@ -136,7 +136,7 @@ def every_goal(information):
 
 def test_gradients_of_goals_and_limits_equal_finite_differences():
     # A smooth law: the kink of LuGre at rest would be seen by the differences and not by the derivative.
-    scene = axis_scene(AXIS_MODELS["coulomb"], RoughAxis(10.0, 40.0, 8.0, -1.0, 0.1), {"dry.width": 0.02})
+    scene = axis_scene(axis_models()["coulomb"], RoughAxis(10.0, 40.0, 8.0, -1.0, 0.1), {"dry.width": 0.02})
     axis, parameters, _ = _axis(scene, ("m", "dry.Fc", "viscous.Fv"), None, lambda q, qd: q[0], "u", NOISE)
     t = np.linspace(0.0, 1.0, 101)
     shapes, rates = motion_basis(t, 2)
