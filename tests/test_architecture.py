@@ -33,14 +33,14 @@ ROOMS = (
     "cli",
 )
 NEEDED_TO_SIMULATE = set(ROOMS[: ROOMS.index("simulation") + 1])
+# Folders of identification in the order of the flow of data: one imports only those before it.
+STAGES = ("data", "model", "estimate", "uncertainty", "selection", "design")
 # Folders of a room with public names of their own.
 PARTS = ("validation.behaviour", "validation.hard", "validation.testbench")
 
 MAX_FILE_LINES = 500
 MAX_FUNCTION_LINES = 80
 LONG_FUNCTIONS: dict[str, str] = {}  # "file:function" -> reason
-# Classes that wait for a name of their own.
-NAMED_TWICE = {"Motion"}
 
 
 def room_of(path: Path) -> str:
@@ -123,6 +123,16 @@ def test_parts_of_a_room_meet_by_their_public_names(part: str) -> None:
                 assert not (other and "._" in module), f"{part} reaches into {module}"
 
 
+@each_file(sorted(ROOT.joinpath("identify").glob("*/*.py")))
+def test_data_flow_one_way_through_identification(path: Path) -> None:
+    stage = path.parent.name
+    for node in statements(path, (ast.Import, ast.ImportFrom)):
+        for module in own_imports(path, node):
+            room, _, inside = module.partition(".")
+            allowed = STAGES[: STAGES.index(stage) + 1]
+            assert room != "identify" or inside.split(".")[0] in allowed, f"{stage} imports {module}"
+
+
 @each_file(FILES)
 def test_only_plot_imports_matplotlib(path: Path) -> None:
     for node in statements(path, (ast.Import, ast.ImportFrom)):
@@ -175,7 +185,7 @@ def test_a_class_has_one_meaning() -> None:
         for node in statements(path, (ast.ClassDef,)):
             assert isinstance(node, ast.ClassDef)
             files.setdefault(node.name.lstrip("_"), set()).add(str(path.relative_to(ROOT)))
-    twice = {name: where for name, where in files.items() if len(where) > 1 and name not in NAMED_TWICE}
+    twice = {name: where for name, where in files.items() if len(where) > 1}
     assert not twice, f"classes of one name: {twice}"
 
 

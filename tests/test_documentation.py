@@ -9,6 +9,8 @@ import pytest
 
 from bench import render
 
+from .helpers import law_table
+
 ROOT = Path(__file__).parents[1]
 PAGES = [*render.pages(), ROOT / "CONTRIBUTING.md"]
 README = (ROOT / "README.md").read_text()
@@ -58,6 +60,11 @@ def test_the_index_lists_every_page() -> None:
 def test_every_figure_is_shown() -> None:
     shown = {Path(link).name for page in PAGES for link in _LINK.findall(page.read_text())}
     assert {path.name for path in (ROOT / "docs" / "figures").iterdir()} <= shown
+
+
+def test_the_table_of_laws_is_what_the_laws_say() -> None:
+    """Written by `python -m tests.helpers.law_table`."""
+    assert law_table.PAGE.read_text() == law_table.with_table(law_table.PAGE.read_text())
 
 
 def test_the_readme_is_short() -> None:

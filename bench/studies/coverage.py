@@ -15,7 +15,7 @@ import numpy as np
 
 import jaxmodsim as jms
 from bench.record import Result
-from jaxmodsim.identify import Staged, coverage, first_coordinate, replay
+from jaxmodsim.identify import Staged, coverage, replay
 
 NOISE = 1e-5
 TRUTH, WRONG = (1e4, 40.0, 2.0, 1.0, 1.5, 0.02), (1e5, 4.0, 0.2, 0.3, 2.0, 0.1)
@@ -26,11 +26,11 @@ def main(smoke: bool, out: Path) -> Result:
     del out
     repeats = 4 if smoke else 200
     free = tuple(f"friction.{name}" for name in ("sigma0", "sigma1", "sigma2", "Fc", "Fs", "vs"))
-    fitted = jms.fit(sprung(*WRONG), driven_record(), free, q0=[0.0], begin=Staged())
+    fitted = jms.fit(sprung(*WRONG), driven_record(), free, q0=[0.0], initializer=Staged())
     result = Result("coverage", (), {"repeats": repeats})
     for label, memory in (("white", 0.0), ("correlation 0.9 from sample to sample", 0.9))[: 1 if smoke else 2]:
         started = time.perf_counter()
-        found = coverage(fitted, repeats, memory=memory, begin=Staged())
+        found = coverage(fitted, repeats, memory=memory, initializer=Staged())
         result.add("time", time.perf_counter() - started, "s", case=label)
         result.add("converged", found.converged, case=label)
         for name, share in found.shares.items():
@@ -62,5 +62,5 @@ def driven_record() -> jms.Record:
     t, zero = np.arange(2000) * 2e-3, jnp.zeros(1)
     u = 3 * np.sin(2 * np.pi * 0.7 * t) + 2 * np.sin(2 * np.pi * 1.9 * t) + 1.2 * np.sin(2 * np.pi * 0.31 * t)
     run = jax.jit(replay, static_argnums=(5, 6))
-    q = run(sprung(*TRUTH), jnp.asarray(t), {"u": jnp.asarray(u)}, zero, zero, 1, first_coordinate)
+    q = run(sprung(*TRUTH), jnp.asarray(t), {"u": jnp.asarray(u)}, zero, zero)
     return jms.Record(t, np.asarray(q), {"u": u}, noise=NOISE)

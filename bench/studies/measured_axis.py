@@ -19,7 +19,7 @@ import numpy as np
 
 import jaxmodsim as jms
 from bench.record import Result
-from jaxmodsim.identify import AXIS_MODELS, axis_scene, first_coordinate, replay, rough_axis, start_state
+from jaxmodsim.identify import axis_models, axis_scene, replay, rough_axis, start_state
 
 # Beside the repository and not in it: A. Janot, M. Gautier, M. Brunot, "Data set and reference models of EMPS",
 # Workshop on Nonlinear System Identification Benchmarks, 2019.
@@ -61,9 +61,9 @@ def main(smoke: bool, out: Path) -> Result | None:
 
 def _rmse(record: jms.Record, model: str, parameters: dict[str, Any], substeps: int) -> float:
     """RMSE [m] of a fitted model with `substeps` integration steps for every sample."""
-    scene = axis_scene(AXIS_MODELS[model], rough_axis(record), {name: x["value"] for name, x in parameters.items()})
+    scene = axis_scene(axis_models()[model], rough_axis(record), {name: x["value"] for name, x in parameters.items()})
     inputs = {name: jnp.asarray(x) for name, x in record.inputs.items()}
     q0, qd0 = (jnp.asarray([x]) for x in start_state(record))
-    run = jax.jit(replay, static_argnums=(5, 6))
-    position = run(scene, jnp.asarray(record.t), inputs, q0, qd0, substeps, first_coordinate)
+    run = jax.jit(replay, static_argnums=5)
+    position = run(scene, jnp.asarray(record.t), inputs, q0, qd0, substeps)
     return float(jnp.sqrt(jnp.mean((position - record.measured) ** 2)))

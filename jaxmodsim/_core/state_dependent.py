@@ -17,7 +17,7 @@ _LEAST = 1e-30
 class StateDependent(eqx.Module):
     """A parameter that changes with the state of the mechanism: a number times `fn(t, q, qd, params)`.
 
-    It takes the number's place in its module, which keeps its kind; `settle` puts the product there.
+    It takes the number's place in its module, which keeps its kind; `bind_state` puts the product there.
     """
 
     number: Any
@@ -39,6 +39,20 @@ def is_state_dependent(tree: object) -> bool:
     return any(
         isinstance(x, StateDependent) for x in jax.tree.leaves(tree, is_leaf=lambda x: isinstance(x, StateDependent))
     )
+
+
+def need_values(tree: eqx.Module, wanted: str) -> None:
+    """Refuse a law that has values only at a state of the mechanism.
+
+    **Raises:**
+
+    - `ValueError` that says how to get the law at a state.
+    """
+    if is_state_dependent(tree):
+        raise ValueError(
+            f"{wanted} needs the numbers of the law, but parameters of this {type(tree).__name__} depend on the state"
+            " of the mechanism (scaled_by): ask law.bind_state(t, q, qd, params) for the law at a state, and give that."
+        )
 
 
 def bind_state(tree: _Module, t: Array, q: Array, qd: Array, params: object) -> _Module:

@@ -6,9 +6,8 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
-import jax.numpy as jnp
 
-from ..friction import Coulomb, DeadZone, LuGre, Regularized, Stribeck, exponential
+from ..friction import AbstractSetValuedLaw, DeadZone, LuGre, Regularized
 from ..scene import Friction, Scene
 from ..solvers import Rodas5P
 
@@ -104,14 +103,11 @@ def formulations(scene: Scene, *, width: float, sigma0: float | None = None, sig
     return found
 
 
-def _bristle(law: Any, width: float, sigma0: float, sigma1: float) -> LuGre:
-    if isinstance(law, Coulomb):
-        limit = law.Fc if law.Fs is None else law.Fs
-        return LuGre(sigma0=sigma0, sigma1=sigma1, sigma2=0.0, Fc=law.Fc, Fs=limit, vs=width)
-    gaussian = isinstance(law, Stribeck) and law.fall is exponential
-    if gaussian and (law.exponent is None or bool(jnp.all(law.exponent == 2.0))):
-        return LuGre(sigma0=sigma0, sigma1=sigma1, sigma2=law.Fv, Fc=law.Fc, Fs=law.Fs, vs=law.vs)
-    raise ValueError(
-        f"LuGre takes the place of Coulomb and of the Gaussian Stribeck, but the law is {law}. Leave out sigma0, and"
-        " build the bristle's scene yourself."
-    )
+def _bristle(law: AbstractSetValuedLaw, width: float, sigma0: float, sigma1: float) -> LuGre:
+    numbers = law.lugre_numbers(width)
+    if numbers is None:
+        raise ValueError(
+            "LuGre takes the place of Coulomb and of the Gaussian Stribeck, but the law is"
+            f" {law}. Leave out sigma0, and build the bristle's scene yourself."
+        )
+    return LuGre(sigma0=sigma0, sigma1=sigma1, **numbers)

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from ..friction import LuGre
-from ..identify import Record, first_coordinate, replay
+from ..identify import Record, replay
 from ..plot import fit_figure, truth_figure
 from ..problems import driven_spring
 from ._fit import fit_with_progress
@@ -32,9 +32,7 @@ def synthetic_record() -> Record:
     frequency = np.interp(t, [0.0, 3.0, 4.0, 9.0, 10.0, 16.0], [1.0, 1.0, 0.4, 0.4, 0.8, 0.8])
     u = amplitude * np.sin(2 * np.pi * np.cumsum(frequency) * SAMPLE)
     zero = jnp.zeros(1)
-    clean = replay(
-        driven_spring(LuGre(**TRUTH)), jnp.asarray(t), {"u": jnp.asarray(u)}, zero, zero, 10, first_coordinate
-    )
+    clean = replay(driven_spring(LuGre(**TRUTH)), jnp.asarray(t), {"u": jnp.asarray(u)}, zero, zero, 10)
     noise = NOISE * np.random.default_rng(1).standard_normal(t.size)
     return Record(t, np.asarray(clean) + noise, {"u": u}, name="synthetic record")
 
@@ -55,7 +53,7 @@ def run_demo(out: Path) -> None:
                 result.values[name],
                 result.values[name] - 1.96 * result.errors[name],
                 result.values[name] + 1.96 * result.errors[name],
-                result.units[name],
+                result.estimate.units[name],
             )
             for name, true in truth.items()
         ],
@@ -63,8 +61,8 @@ def run_demo(out: Path) -> None:
     )
     show_table(frame, "LuGre fitted to a synthetic record (made by the package, truth known)")
     console.print(
-        f"RMSE {1e6 * result.rmse:.3g} um with noise of {1e6 * NOISE:.3g} um; {result.evaluations} evaluations,"
-        f" {time.perf_counter() - started:.1f} s with compilation",
+        f"RMSE {1e6 * result.rmse:.3g} um with noise of {1e6 * NOISE:.3g} um;"
+        f" {result.diagnostics.evaluations} evaluations, {time.perf_counter() - started:.1f} s with compilation",
         highlight=False,
     )
     files["demo_fit.png"] = fit_figure(result, caption="Synthetic record, made by the package")

@@ -12,16 +12,19 @@ from typing import Any
 import numpy as np
 
 from ..identify import (
+    AxisLimits,
     Comparison,
     FitResult,
     InputDesign,
-    Limits,
     Profile,
     Record,
     compare,
     design_input,
     fit,
+    profile,
+    remarks,
     rough_axis,
+    score,
 )
 from ..plot import comparison_figure, design_figure, fit_figure, score_figure
 from ..scene import Scene, scene_numbers
@@ -61,7 +64,7 @@ def run_fit(request: FitRequest) -> None:
         if request.report is not None and not interrupted:
             for name in _least_known(fitted):
                 with console.status(f"profile of {name}"):
-                    profiles.append(fitted.result.profile(name, points=_POINTS))
+                    profiles.append(profile(fitted.result, name, points=_POINTS))
     except KeyboardInterrupt:
         interrupted = True
     if request.report is not None:
@@ -88,7 +91,7 @@ def _fitted(plan: Plan) -> Fitted:
         result = fit_with_progress(scene, plan.records, free, limits=plan.limits, **plan.options)
     fitted = Fitted(plan, model, with_units(result), comparison, (), time.perf_counter() - started)
     # Whoever pressed Ctrl-C does not wait for more.
-    scores = () if fitted.interrupted else tuple(result.score(record) for record in plan.held_out)
+    scores = () if fitted.interrupted else tuple(score(result, record) for record in plan.held_out)
     return replace(fitted, scores=scores, seconds=time.perf_counter() - started)
 
 
@@ -143,14 +146,14 @@ def _show(fitted: Fitted) -> None:
     result = fitted.result
     if fitted.comparison is not None:
         say(str(fitted.comparison))
-    names = ", ".join(record.name for record in result.records)
-    show_table(parameter_table(result), f"{names}: {fitted.model}, {fitted.words}")
-    if len(result.records) + len(fitted.scores) > 1:
+    names = ", ".join(record.name for record in result.provenance.records)
+    show_table(parameter_table(result), f"{names}: {fitted.model}, {fitted.description}")
+    if len(result.provenance.records) + len(fitted.scores) > 1:
         show_table(record_table(fitted), "Records")
-    say(f"RMSE {result.rmse:.6g} m; {result.evaluations} evaluations, {result.ending}")
-    for remark in result.remarks:
+    say(f"RMSE {result.rmse:.6g} m; {result.diagnostics.evaluations} evaluations, {result.diagnostics.ending}")
+    for remark in remarks(result):
         say(f"- {remark}")
-    samples = sum(len(record.t) for record in result.records)
+    samples = sum(len(record.t) for record in result.provenance.records)
     say(f"{samples} samples, {fitted.seconds:.1f} s with compilation")
 
 
@@ -158,11 +161,11 @@ def _files(findings: Findings) -> dict[str, Any]:
     """Figures, tables, JSON and the result by file name."""
     fitted, result = findings.fitted, findings.fitted.result
     files: dict[str, Any] = {}
-    single = len(result.records) == 1
-    for i, record in enumerate(result.records):
+    single = len(result.provenance.records) == 1
+    for i, record in enumerate(result.provenance.records):
         files["fit.png" if single else f"fit_{_numbered(i, record)}.png"] = fit_figure(result, record=i)
-    for i, score in enumerate(fitted.scores):
-        files[f"held_out_{_numbered(i, score.record)}.png"] = score_figure(score)
+    for i, held_out in enumerate(fitted.scores):
+        files[f"held_out_{_numbered(i, held_out.record)}.png"] = score_figure(held_out)
     if fitted.comparison is not None:
         files["comparison.png"] = comparison_figure(fitted.comparison)
     return {
@@ -186,7 +189,7 @@ def _least_known(fitted: Fitted) -> list[str]:
     shares = {
         name: result.errors[name] / abs(value)
         for name, value in result.values.items()
-        if name in numbers and value and value not in result.bounds[name]
+        if name in numbers and value and value not in result.estimate.bounds[name]
     }
     known = [name for name, share in shares.items() if 0 < share < np.inf]
     return sorted(known, key=lambda name: -shares[name])[:_PROFILED]
@@ -194,10 +197,10 @@ def _least_known(fitted: Fitted) -> list[str]:
 
 def _designed(request: FitRequest, fitted: Fitted) -> InputDesign:
     """An input for the next record: limits and duration by default those of the records, the noise that of the fit."""
-    result, records = fitted.result, fitted.result.records
+    result, records = fitted.result, fitted.result.provenance.records
     positions = np.concatenate([record.measured for record in records])
     low, high = float(np.min(positions)), float(np.max(positions))
-    limits = Limits(
+    limits = AxisLimits(
         request.max_force or max(float(np.max(np.abs(record.inputs["u"]))) for record in records),
         request.max_speed or max(rough_axis(record).top for record in records if np.ptp(record.measured) > 0),
         request.max_travel or 0.5 * (high - low),
@@ -213,7 +216,7 @@ def _designed(request: FitRequest, fitted: Fitted) -> InputDesign:
             [name for name in result.values if name in numbers],
             limits,
             duration=request.duration or max(float(record.t[-1] - record.t[0]) for record in records),
-            noise=result.noise["measured"],
+            noise=result.diagnostics.noise["measured"],
             dt=float(np.median(np.diff(records[0].t))),
             q0=[0.5 * (low + high)],
             progress=progress,

@@ -17,7 +17,7 @@ from ._equations import equations
 from ._plan import Plan
 
 # Units of what declares none: the params of an axis, and initial states.
-_UNITS = {"m": "kg", "offset": "N", "drift": "N", "tau": "s", "t0": "s", "q0[0]": "m", "qd0[0]": "m/s"}
+_UNITS = {"m": "kg", "offset": "N", "q0[0]": "m", "qd0[0]": "m/s"}
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,16 @@ class Fitted:
         return self.result.model
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """The model in words."""
-        return self.plan.candidates[self.model].words
+        return self.plan.candidates[self.model].description
 
     @property
     def interrupted(self) -> bool:
         """Whether Ctrl-C ended the search, or the comparison before all models were fitted."""
-        return self.result.ending.startswith("interrupted") or bool(self.comparison and self.comparison.left)
+        return self.result.diagnostics.ending.startswith("interrupted") or bool(
+            self.comparison and self.comparison.left
+        )
 
     @property
     def held(self) -> dict[str, float]:
@@ -76,8 +78,8 @@ class Findings:
 
 def with_units(result: FitResult) -> FitResult:
     """The result with the units of what declares none."""
-    units = {name: unit or _UNITS.get(name.rpartition("/")[2], "") for name, unit in result.units.items()}
-    return replace(result, units=units)
+    units = {name: unit or _UNITS.get(name.rpartition("/")[2], "") for name, unit in result.estimate.units.items()}
+    return replace(result, estimate=replace(result.estimate, units=units))
 
 
 def origin() -> dict[str, str]:
@@ -92,8 +94,11 @@ def origin() -> dict[str, str]:
 
 def parameter_table(result: FitResult) -> pd.DataFrame:
     """Parameters with standard errors, 95 % intervals, start values and units."""
-    intervals = result.intervals()
-    rows = [(name, value, error, *intervals[name], start, unit) for name, value, error, start, unit in result.rows()]
+    intervals = result.estimate.intervals()
+    rows = [
+        (name, value, error, *intervals[name], start, unit)
+        for name, value, error, start, unit in result.estimate.rows()
+    ]
     columns = ["parameter", "value", "standard error", "95 % from", "to", "start", "unit"]
     return pd.DataFrame(rows, columns=pd.Index(columns))
 
@@ -101,7 +106,7 @@ def parameter_table(result: FitResult) -> pd.DataFrame:
 def record_table(fitted: Fitted) -> pd.DataFrame:
     """Records, fitted and held out, with the root mean square of what the model misses."""
     rows = []
-    for record, residuals in zip(fitted.result.records, fitted.result.residuals, strict=True):
+    for record, residuals in zip(fitted.result.provenance.records, fitted.result.residuals, strict=True):
         rows.append((record, "fitted", residuals["measured"]))
     for score in fitted.scores:
         rows.append((score.record, "held out", score.residuals["measured"]))
@@ -138,7 +143,7 @@ def model_table(comparison: Comparison) -> pd.DataFrame:
 
 def design_table(findings: Findings, design: InputDesign) -> pd.DataFrame:
     """What the designed input promises."""
-    units = findings.fitted.result.units
+    units = findings.fitted.result.estimate.units
     rows = [(name, value, error, plain, units[name]) for name, value, error, plain, _ in design.rows()]
     columns = ["parameter", "value", "predicted standard error", "of a plain sine", "unit"]
     return pd.DataFrame(rows, columns=pd.Index(columns))
@@ -146,9 +151,8 @@ def design_table(findings: Findings, design: InputDesign) -> pd.DataFrame:
 
 def sample_table(fitted: Fitted) -> pd.DataFrame:
     """All samples of all records, measured and simulated."""
-    outputs = [
-        (record, seen["measured"]) for record, seen in zip(fitted.result.records, fitted.result.outputs, strict=True)
-    ]
+    provenance = fitted.result.provenance
+    outputs = [(record, seen["measured"]) for record, seen in zip(provenance.records, provenance.outputs, strict=True)]
     outputs += [(score.record, score.outputs["measured"]) for score in fitted.scores]
     held_out = {score.record.name for score in fitted.scores}
     return pd.concat(
@@ -171,7 +175,7 @@ def summary(findings: Findings) -> dict[str, Any]:
     fitted = findings.fitted
     return {
         "model": fitted.model,
-        "words": fitted.words,
+        "description": fitted.description,
         "equations": list(equations(fitted.scene)),
         **fitted.result.to_dict(),
         "held": fitted.held,

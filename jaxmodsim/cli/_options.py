@@ -23,7 +23,7 @@ Position = Annotated[str, typer.Option(help=r"Column of measured position \[m]."
 Force = Annotated[str, typer.Option(help="Column of the applied force or drive signal.", rich_help_panel=_COLUMNS)]
 ForceGain = Annotated[float, typer.Option(help="Newtons per unit of the force column.", rich_help_panel=_COLUMNS)]
 Model = Annotated[
-    str, typer.Option(help="Model of the axis: coulomb, asymmetric, drifting, stribeck, lugre.", rich_help_panel=_MODEL)
+    str, typer.Option(help="Model of the axis: coulomb, asymmetric, stribeck, lugre.", rich_help_panel=_MODEL)
 ]
 Compare = Annotated[
     str | None,

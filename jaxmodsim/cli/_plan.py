@@ -10,15 +10,15 @@ import numpy as np
 
 from .._core.arguments import nearest
 from ..identify import (
-    AXIS_MODELS,
     Candidate,
     Cauchy,
     Continuation,
     Huber,
     MultiStart,
     Record,
-    Squares,
+    SquaredLoss,
     Staged,
+    axis_models,
     axis_scene,
     rough_axis,
     start_state,
@@ -26,8 +26,8 @@ from ..identify import (
 from ..scene import scene_numbers
 from ._read import AxisColumns, read_records
 
-_LOSSES = {"squares": Squares, "huber": Huber, "cauchy": Cauchy}
-_BEGINNINGS = ("rough", "staged")
+_LOSSES = {"squares": SquaredLoss, "huber": Huber, "cauchy": Cauchy}
+_INITIALIZERS = ("rough", "staged")
 # How many times wider friction is regularised at first, and in how many fits it comes down.
 _WIDER, _STAGES = 10.0, 2
 # Beside the numbers of the scene: the state at the first sample of each record, and the delay of the force.
@@ -96,7 +96,7 @@ def plan_of(request: FitRequest) -> Plan:
     _check(request)
     names = _models(request)
     loss = _LOSSES[_known("--loss", request.loss, _LOSSES)]()
-    _known("--begin", request.begin, _BEGINNINGS)
+    _known("--begin", request.begin, _INITIALIZERS)
     together = read_records([*request.records, *request.hold_out], request.columns)
     records, held_out = together[: len(request.records)], together[len(request.records) :]
     # A record that stands still, or that nothing drives, may go beside others that do not.
@@ -105,7 +105,7 @@ def plan_of(request: FitRequest) -> Plan:
         rough_axis(record)
     rough = rough_axis(max(records, key=lambda record: len(record.t)))
     rough = replace(rough, start=min(float(record.t[0]) for record in records))
-    numbers = {name: _numbers(axis_scene(AXIS_MODELS[name], rough)) for name in names}
+    numbers = {name: _numbers(axis_scene(axis_models()[name], rough)) for name in names}
     fixed, start = _values("--fix", request.fix, numbers), _values("--start", request.start, numbers)
     chosen = tuple(name.strip() for text in request.free for name in text.split(",") if name.strip())
     for name in chosen:
@@ -116,27 +116,27 @@ def plan_of(request: FitRequest) -> Plan:
             raise ValueError(f"{both[0]} stands in {option} and in --fix: it can be fitted or fixed, not both.")
     candidates = {}
     for name in names:
-        model = AXIS_MODELS[name]
+        model = axis_models()[name]
         own = [{key: x for key, x in given.items() if key in numbers[name]} for given in (start, fixed)]
         free = tuple(each for each in chosen or model.free if each not in fixed)
-        candidates[name] = Candidate(axis_scene(model, rough, *own), free, model.words)
+        candidates[name] = Candidate(axis_scene(model, rough, *own), free, model.description)
     limits = {"m": (0.0, None)} | _limits(request.limit, numbers)
-    begin = _beginnings(request, candidates, numbers)
-    options = {"loss": loss, "begin": begin, "substeps": request.substeps, **start_states(records)}
+    initializer = _initializers(request, candidates, numbers)
+    options = {"loss": loss, "initializer": initializer, "substeps": request.substeps, **start_states(records)}
     compared = request.compare is not None or request.folds is not None
     return Plan(candidates, compared, request.folds, records, held_out, limits, options)
 
 
-def _beginnings(
+def _initializers(
     request: FitRequest, candidates: Mapping[str, Candidate], numbers: Mapping[str, Sequence[str]]
 ) -> list[Staged | MultiStart | Continuation]:
-    """Where a search begins, with the width of the regularisation coming down at last: narrow at once, it is caught."""
-    begin: list[Staged | MultiStart | Continuation] = [Staged()] if request.begin == "staged" else []
+    """Where a search starts, with the width of the regularisation coming down at last: narrow at once, it is caught."""
+    initializers: list[Staged | MultiStart | Continuation] = [Staged()] if request.begin == "staged" else []
     if request.starts > 1:
-        begin.append(MultiStart(request.starts))
+        initializers.append(MultiStart(request.starts))
     free = {name for candidate in candidates.values() for name in candidate.free or ()}
     widths = dict.fromkeys(each for own in numbers.values() for each in own if each.endswith(".width"))
-    return [*begin, *(Continuation(each, _WIDER, _STAGES) for each in widths if each not in free)]
+    return [*initializers, *(Continuation(each, _WIDER, _STAGES) for each in widths if each not in free)]
 
 
 def _check(request: FitRequest) -> None:
@@ -164,12 +164,12 @@ def _check(request: FitRequest) -> None:
 
 def _models(request: FitRequest) -> tuple[str, ...]:
     if request.compare is None:
-        return (_known("--model", request.model, AXIS_MODELS, "model"),)
+        return (_known("--model", request.model, axis_models(), "model"),)
     if request.compare == "all":
-        return tuple(AXIS_MODELS)
+        return tuple(axis_models())
     names = tuple(dict.fromkeys(name.strip() for name in request.compare.split(",") if name.strip()))
     for name in names:
-        _known("--compare", name, AXIS_MODELS, "model")
+        _known("--compare", name, axis_models(), "model")
     if len(names) < 2:
         raise ValueError(f"--compare needs `all` or two models or more, A,B, but {request.compare!r} was given.")
     return names

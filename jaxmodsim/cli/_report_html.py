@@ -8,7 +8,7 @@ import jinja2
 import pandas as pd
 from markupsafe import Markup
 
-from ..identify import Comparison, InputDesign
+from ..identify import Comparison, InputDesign, remarks, residual_tests
 from ..plot import Figure, comparison_figure, design_figure, fit_figure, profile_figure, result_figure, score_figure
 from ._equations import equations
 from ._fitted import Findings, Fitted, design_table, model_table, parameter_table, record_table
@@ -27,16 +27,17 @@ def report_page(findings: Findings) -> str:
     fitted = findings.fitted
     result = fitted.result
     return environment.get_template("report.html.jinja").render(
-        title=f"Fit of {', '.join(record.name for record in result.records)}: {fitted.model}",
+        title=f"Fit of {', '.join(record.name for record in result.provenance.records)}: {fitted.model}",
         result=result,
         origin=findings.origin,
         records=record_table(fitted),
         parameters=parameter_table(result),
-        model=f"{fitted.words[:1].upper()}{fitted.words[1:]}.",
+        model=f"{fitted.description[:1].upper()}{fitted.description[1:]}.",
+        remarks=remarks(result),
         equations=equations(fitted.scene),
         held=", ".join(f"{name} = {value:.6g}" for name, value in fitted.held.items()),
         simulated=list(_simulated(fitted)),
-        residual_tests=result.residual_tests(),
+        residual_tests=residual_tests(result),
         strong=_STRONG,
         scores=[(f"{score.record.name}, never fitted", score_figure(score)) for score in fitted.scores],
         comparison=None if fitted.comparison is None else _compared(fitted.comparison),
@@ -47,7 +48,7 @@ def report_page(findings: Findings) -> str:
 
 def _simulated(fitted: Fitted) -> Iterator[tuple[str, Figure]]:
     """The first record with all that belongs to a fit, the others with their residuals."""
-    first, *others = fitted.result.records
+    first, *others = fitted.result.provenance.records
     yield first.name, result_figure(fitted.result, units={"measured": "m"})
     for i, record in enumerate(others, 1):
         yield record.name, fit_figure(fitted.result, record=i)

@@ -1,5 +1,6 @@
 """The scene of a SPEC: a named problem with numbers, or an object of a Python file."""
 
+import dataclasses
 import importlib.util
 import inspect
 import sys
@@ -10,8 +11,9 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import create_model
 
-from .. import friction, problems
+from .. import problems
 from .._core.arguments import did_you_mean
+from ..friction import AbstractLaw, laws
 from ..scene import Scene
 from ._table import AbstractTable, Table, Text, Values, Whole, inner, read_table
 
@@ -22,22 +24,6 @@ PROBLEMS: dict[str, Callable[..., Scene]] = {
     name: made
     for name, made in vars(problems).items()
     if inspect.isfunction(made) and inspect.signature(made).return_annotation is Scene
-}
-LAWS: dict[str, type] = {
-    name: getattr(friction, name)
-    for name in (
-        "Viscous",
-        "Coulomb",
-        "Stribeck",
-        "Dahl",
-        "LuGre",
-        "ElastoPlastic",
-        "MaxwellSlip",
-        "Armstrong",
-        "Regularized",
-        "DeadZone",
-        "Sign",
-    )
 }
 
 
@@ -85,12 +71,25 @@ def _made(content: dict[str, Any], where: str, key: str, makers: Mapping[str, Ca
     model = create_model("Made", __base__=AbstractTable, **fields)
     given = read_table(model, content, where).model_dump(exclude={key}, exclude_none=True)
     if "law" in given:
-        given["law"] = _made(given["law"], inner(where, "law"), "kind", LAWS)
+        given["law"] = _made(given["law"], inner(where, "law"), "kind", known_laws())
     numbers = {field: np.asarray(x, float) if isinstance(x, float | list) else x for field, x in given.items()}
     try:
         return maker(**numbers)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{where}: {error}") from error
+
+
+def known_laws() -> dict[str, type[AbstractLaw]]:
+    """Registered laws that need nothing but numbers and another law, which is what a file can say."""
+
+    def needed(law: type[AbstractLaw]) -> list[dataclasses.Field[object]]:
+        return [field for field in dataclasses.fields(law) if field.default is dataclasses.MISSING]
+
+    return {
+        name: law
+        for name, law in laws().items()
+        if all("range" in field.metadata or field.name == "law" for field in needed(law))
+    }
 
 
 def _from_file(where: str, path: Path, name: str) -> Scene | Callable[..., Any]:

@@ -7,23 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..friction import (
-    AbstractAsymmetric,
-    AbstractDynamicLaw,
-    AbstractKarnoppLaw,
-    AbstractLaw,
-    AbstractSetValuedLaw,
-    Regularized,
-    Sign,
-    Viscous,
-)
-from ._numbers import need_numbers
+from .._core.state_dependent import need_values
+from ..friction import AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw
 
 # Speeds at which the table is held against the law, spaced evenly in the logarithm over so many decades, and evenly.
 _POINTS, _DECADES = 6000, 12
 # Part of the tolerance that is used, for what lies between those speeds.
 _SHARE = 0.9
-_ONE_WAY = "friction that depends on the direction: export the law of one direction, or the mean of both"
 
 Table = Float[np.ndarray, "row 2"]
 
@@ -54,13 +44,16 @@ def to_modelica(
     - `ValueError` if the component has not the law, saying what it lacks and what to do; for a law by `scaled_by`; if a
       number is out of range or the name is no identifier.
     """
-    need_numbers(law, "to_modelica")
+    if not isinstance(law, AbstractLaw):
+        raise ValueError(f"to_modelica needs a law, but {law!r} was given.")
+    need_values(law, "to_modelica")
     if not 0 < v_max < math.inf or not 0 < rtol < 1:
         raise ValueError(f"to_modelica needs v_max > 0 [m/s] and 0 < rtol < 1; given: {v_max=}, {rtol=}.")
     if not (name.isidentifier() and name.isascii()):
         raise ValueError(f"to_modelica: name must be an identifier such as 'friction1', but {name!r} was given.")
-    if not isinstance(law, AbstractSetValuedLaw | Viscous):
-        raise ValueError(f"to_modelica: Modelica's friction components have no {_lacks(law)}.")
+    lacks = law.modelica()
+    if lacks or not isinstance(law, AbstractSetValuedLaw | AbstractForceLaw):
+        raise ValueError(f"to_modelica: Modelica's friction components have no {lacks or type(law).__name__}.")
     speeds = np.concatenate(
         [[0.0], np.geomspace(v_max * 10.0**-_DECADES, v_max, _POINTS), np.linspace(0.0, v_max, _POINTS)[1:-1]]
     )
@@ -70,7 +63,10 @@ def to_modelica(
     if isinstance(law, AbstractSetValuedLaw):
         limits = [float(law.static_limit(jnp.asarray(side))) for side in (1.0, -1.0)]
     if not np.allclose([limits[0], *forward], [limits[1], *backward], rtol=1e-6, atol=0.0):
-        raise ValueError(f"to_modelica: Modelica's friction components have no {_ONE_WAY}.")
+        raise ValueError(
+            "to_modelica: Modelica's friction components have no friction that depends on the direction: export the law"
+            " of one direction, or the mean of both."
+        )
     level, limit = forward[0], limits[0]
     if not np.isfinite(forward).all() or limit < level or (level == 0 and limit > 0):
         raise ValueError(
@@ -84,9 +80,9 @@ def to_modelica(
     return f"Modelica.Mechanics.{kind}.Components.{component} {name}({table}=[{rows}], peak={peak:.10g});"
 
 
-def _forces(law: AbstractSetValuedLaw | Viscous, v: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def _forces(law: AbstractSetValuedLaw | AbstractForceLaw, v: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Force [N] in slip; at rest its limit from above."""
-    if isinstance(law, Viscous):
+    if isinstance(law, AbstractForceLaw):
         return np.asarray(jax.vmap(law.force)(jnp.asarray(v)), float)
     side = np.where(np.signbit(v), -1.0, 1.0)
     return side * np.asarray(jax.vmap(law.sliding_force)(jnp.asarray(v)), float) + np.asarray(
@@ -120,20 +116,3 @@ def _straight(
     between = slice(i, j + 1)
     line = force[i] + (force[j] - force[i]) * ((v[between] - v[i]) / (v[j] - v[i]))
     return np.all(np.abs(line - force[between]) <= _SHARE * rtol * np.abs(force[between]))
-
-
-def _lacks(law: AbstractLaw) -> str:
-    """What the components lack to express the law, and what to do."""
-    name = type(law).__name__
-    if isinstance(law, AbstractAsymmetric):
-        return _ONE_WAY
-    if isinstance(law, Regularized | AbstractKarnoppLaw | Sign):
-        return f"{name}: they run the law inside exactly, by events, so export that"
-    if isinstance(law, AbstractDynamicLaw):
-        return (
-            f"state of their own, which {name} has. Export its force in steady slip, as a Stribeck, or write its"
-            " equations in a model of your own"
-        )
-    return (
-        f"{name}: they take set-valued laws and Viscous. Write the force as a Stribeck, with fit_law, and export that"
-    )

@@ -1,13 +1,18 @@
 """Armstrong's seven parameters."""
 
+import math
+from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.parameters import Number, parameter
+from .._core.state_dependent import nominal
 from ._bristle import advance_elastoplastic, slip_fraction
-from ._law import AbstractDynamicLaw
+from ._law import AbstractDynamicLaw, register_law
+from ._law_case import LawCase, stribeck_case
+from ._passivity import Passivity
 
 # Part of its limit over which the contact gives way.
 _CORNER = 0.02
@@ -30,6 +35,7 @@ class ArmstrongState(NamedTuple):
     slips: Float[Array, ""]
 
 
+@register_law
 class Armstrong(AbstractDynamicLaw):
     """Armstrong's model of seven parameters: stiff in stick, Stribeck friction with memory in slip, rising stiction.
 
@@ -77,6 +83,19 @@ class Armstrong(AbstractDynamicLaw):
     tau: Number = parameter("tau", "s", lower=0.0, strict=True)
     gamma: Number = parameter("gamma", "s", lower=0.0, strict=True)
     stiff: ClassVar[bool] = True
+    description: ClassVar[str] = "frictional memory, stiction that rises with time at rest"
+    equations: ClassVar[tuple[str, ...]] = (
+        "sigma0 z + Fv v in stick, (Fc + (Fs - Fc) rise) sign(v) + Fv v in slip",
+        "rise' = (1 - rise)^2/gamma in stick, (magnitude/(1 + (v/vs)^2) - rise)/tau in slip",
+        "magnitude' = (rise - magnitude)/tau in stick, 0 in slip",
+    )
+    limitations: ClassVar[Mapping[str, str]] = {
+        "characteristic": "After a reversal there is as much Stribeck friction as the slip left and the rest brought"
+        " back."
+    }
+    mujoco_lacks: ClassVar[str] = (
+        ", for the stiction of its bristle neither rises with time nor has a memory: fit a LuGre and export that"
+    )
 
     def _moves(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """How far the speed `v` [m/s] is one of sliding, 0 to 1."""
@@ -141,3 +160,13 @@ class Armstrong(AbstractDynamicLaw):
         goal = magnitude * self._steady(v)
         rise = goal + (1.0 - missing - goal) * jnp.exp(-sliding / self.tau)
         return ArmstrongState(advance_elastoplastic(v, z.z, dt, self._limit(rise), corner), rise, magnitude, slips)
+
+    def passivity(self) -> Passivity:
+        """Always passive: an element lags only towards the side that it is loaded on, so `sigma0 z (v - z') >= 0`."""
+        words = "Armstrong is always passive: the contact gives way only towards the side that it is loaded on."
+        return Passivity(True, float(nominal(self.Fv)), math.inf, words)
+
+    @classmethod
+    def cases(cls) -> tuple[LawCase, ...]:
+        """A stiction that is half back after a second."""
+        return (stribeck_case("Armstrong", cls.standard(tau=0.01, gamma=1.0), lambda x: 1.0 / (1.0 + x * x)),)

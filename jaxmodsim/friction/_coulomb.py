@@ -1,14 +1,16 @@
 """Coulomb friction with stiction."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.parameters import Number, optional_parameter, parameter
-from ._law import AbstractSetValuedLaw
+from ._law import NO_STICTION_IN_MUJOCO, AbstractSetValuedLaw, register_law
+from ._law_case import STANDARD, LawCase, steady_curve
 
 
+@register_law
 class Coulomb(AbstractSetValuedLaw):
     """Coulomb friction: `Fc sign(v)` in slip, anything up to `Fs` in stick.
 
@@ -25,6 +27,10 @@ class Coulomb(AbstractSetValuedLaw):
     Fc: Number = parameter("Fc", "N", lower=0.0)
     Fs: Number | None = optional_parameter("Fs", "N", lower="Fc")
     stiff: ClassVar[bool] = False
+    description: ClassVar[str] = "one force in slip, stiction up to `Fs`"
+    equations: ClassVar[tuple[str, ...]] = ("Fc sign(v)",)
+    valid_at_any_speed: ClassVar[bool] = True
+    mujoco_lacks: ClassVar[str] = NO_STICTION_IN_MUJOCO
 
     def sliding_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Magnitude [N] of the force in slip."""
@@ -38,3 +44,21 @@ class Coulomb(AbstractSetValuedLaw):
         """Largest force in stick [N]."""
         del direction
         return jnp.asarray(self.Fc if self.Fs is None else self.Fs)
+
+    def lugre_numbers(self, vs: float) -> dict[str, Any]:
+        """With stiction that falls over the velocity `vs`."""
+        return {"Fc": self.Fc, "Fs": self.Fc if self.Fs is None else self.Fs, "vs": vs, "sigma2": 0.0}
+
+    def mujoco(self) -> dict[str, Any] | str:
+        """Dry friction of a joint, which is one force."""
+        stiction = self.Fs is not None and float(self.Fs) > float(self.Fc)
+        return AbstractSetValuedLaw.mujoco(self) if stiction else {"frictionloss": self.Fc}
+
+    @classmethod
+    def cases(cls) -> tuple[LawCase, ...]:
+        """Without and with stiction."""
+        flat = steady_curve(STANDARD["Fc"], STANDARD["Fc"], 0.0)
+        return (
+            LawCase("Coulomb", cls.standard(Fs=STANDARD["Fc"]), flat),
+            LawCase("Coulomb, stiction", cls.standard(), flat),
+        )

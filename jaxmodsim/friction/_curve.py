@@ -5,13 +5,22 @@ from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.functions import as_function, real_array
 from .._core.parameters import Number, parameter
-from ._law import AbstractForceLaw
+from ._law import AbstractForceLaw, register_law
+from ._law_case import STANDARD, LawCase, stribeck_case
 
 
+def _stribeck(v: Array) -> Array:
+    """A smooth Stribeck curve."""
+    Fc, Fs, vs = STANDARD["Fc"], STANDARD["Fs"], STANDARD["vs"]
+    return (Fc + (Fs - Fc) * jnp.exp(-((v / vs) ** 2))) * jnp.tanh(v / STANDARD["width"]) + STANDARD["Fv"] * v
+
+
+@register_law
 class Curve(AbstractForceLaw):
     """A friction force that is any function of slip velocity, `F = gain fn(v)`.
 
@@ -31,6 +40,8 @@ class Curve(AbstractForceLaw):
     fn: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Curve fn"))
     gain: Number = parameter("gain", "N", lower=0.0, default=1.0)
     stiff: ClassVar[bool] = False
+    description: ClassVar[str] = "any function of slip velocity; `Friction(fn)` makes one"
+    equations: ClassVar[tuple[str, ...]] = ("gain fn(v)",)
 
     def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Friction force [N] at velocity `v` [m/s]."""
@@ -38,3 +49,8 @@ class Curve(AbstractForceLaw):
         if value.shape != ():
             raise ValueError(f"A friction curve must return one number, but fn(v) returned the shape {value.shape}.")
         return self.gain * value
+
+    @classmethod
+    def cases(cls) -> tuple[LawCase, ...]:
+        """A smooth Stribeck curve."""
+        return (stribeck_case("Curve", cls(_stribeck)),)

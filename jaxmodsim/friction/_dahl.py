@@ -1,16 +1,20 @@
 """The Dahl law."""
 
-from typing import ClassVar
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.parameters import Number, parameter
 from .._core.safe import magnitude
-from ._bristle import relax_exact
-from ._law import AbstractPlanarLaw
+from ._bristle import ONE_STATE, YIELDS, relax_exact
+from ._law import AbstractPlanarLaw, register_law
+from ._passivity import Passivity
 
 
+@register_law
 class Dahl(AbstractPlanarLaw):
     """The Dahl law: a force that grows with displacement like a stress with strain, up to the Coulomb force.
 
@@ -41,6 +45,9 @@ class Dahl(AbstractPlanarLaw):
     sigma0: Number = parameter("sigma0", "N/m", lower=0.0, strict=True)
     Fc: Number = parameter("Fc", "N", lower=0.0, strict=True)
     stiff: ClassVar[bool] = True
+    description: ClassVar[str] = "force grows with displacement up to `Fc`"
+    equations: ClassVar[tuple[str, ...]] = ("sigma0 z", "z' = v - sigma0 |v| z/Fc")
+    limitations: ClassVar[Mapping[str, str]] = ONE_STATE | YIELDS
 
     def initial_state(self, v: Float[Array, "..."]) -> Float[Array, "..."]:
         """Undeflected, 0 m."""
@@ -64,3 +71,11 @@ class Dahl(AbstractPlanarLaw):
     def step_exact(self, v: Float[Array, "..."], z: Float[Array, "..."], dt: Float[Array, ""]) -> Float[Array, "..."]:
         """Deflection [m] after `dt` [s] at constant `v` [m/s], exactly."""
         return relax_exact(v, z, dt, self.sigma0 * magnitude(v) / self.Fc)
+
+    def passivity(self) -> Passivity:
+        """Always passive: with the bristle force `Fc u` the dissipation is `|v| Fc u^2`."""
+        return Passivity(True, 0.0, math.inf, "Dahl is always passive: it dissipates |v| (sigma0 z)^2/Fc.")
+
+    def mujoco(self) -> dict[str, Any]:
+        """LuGre without damping and Stribeck effect, at any Stribeck velocity."""
+        return {"damping": 0.0, "lugre": (self.sigma0, 0.0, self.Fc, self.Fc, 1.0)}

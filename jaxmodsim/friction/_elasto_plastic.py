@@ -1,5 +1,6 @@
 """The elasto-plastic law."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -7,15 +8,16 @@ from jaxtyping import Array, Float
 
 from .._core.parameters import Number, parameter
 from .._core.safe import decay_mean
-from ._bristle import stribeck_curve
-from ._law import AbstractDynamicLaw
+from ._bristle import ONE_STATE, STRIBECK_CURVE, bristle_passivity, stribeck_curve
+from ._law import AbstractDynamicLaw, register_law
 
-# Steps of order 2 through the transition between elastic and plastic in `advance`, and the slip in limit deflections
+# Steps of order 2 through the transition between elastic and plastic in `step_exact`, and the slip in limit deflections
 # that they cover; after that the bristle is all but at its limit, and one step does the rest.
 _SUBSTEPS = 6
 _TRANSITION = 2.0
 
 
+@register_law
 class ElastoPlastic(AbstractDynamicLaw):
     """The elasto-plastic law: LuGre whose bristle gives way only beyond a break-away deflection.
 
@@ -58,6 +60,21 @@ class ElastoPlastic(AbstractDynamicLaw):
     Fs: Number = parameter("Fs", "N", lower="Fc")
     vs: Number = parameter("vs", "m/s", lower=0.0, strict=True)
     stiff: ClassVar[bool] = True
+    description: ClassVar[str] = "bristle that is elastic below `Fba`: no creep"
+    equations: ClassVar[tuple[str, ...]] = (
+        "sigma0 z + sigma1 z' + sigma2 v",
+        "z' = v (1 - alpha u)",
+        "alpha = 0 for u <= Fba/g(v), half a sine up to 1 at u = 1",
+        "u = sigma0 z sign(v)/g(v)",
+        STRIBECK_CURVE,
+    )
+    limitations: ClassVar[Mapping[str, str]] = ONE_STATE
+    mujoco_lacks: ClassVar[str] = (
+        ", for its bristle has no break-away force: LuGre with the same sigma0, sigma1, sigma2, Fc, Fs and vs is the"
+        " nearest, and creeps under a vibrating load"
+    )
+    example: ClassVar[Mapping[str, float]] = {"Fba": 0.7}
+    passivity = bristle_passivity
 
     def stribeck_curve(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """g(v) [N]: the bristle force that steady slip at `v` [m/s] tends to."""

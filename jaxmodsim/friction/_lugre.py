@@ -1,16 +1,31 @@
 """The LuGre law."""
 
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.parameters import Number, optional_parameter, parameter
 from .._core.safe import bounded_ratio, magnitude
-from ._bristle import relax_exact, stribeck_curve
-from ._law import AbstractPlanarLaw
+from ._bristle import (
+    ONE_STATE,
+    STRIBECK_CURVE,
+    YIELDS,
+    bristle_passivity,
+    relax_exact,
+    stribeck_curve,
+)
+from ._law import AbstractPlanarLaw, register_law
+from ._law_case import STANDARD, LawCase, stribeck_case
+
+# A fit starts with a break-away distance of two milliseconds at top speed, a tenth of critical damping in stick, and a
+# break-away force of 1.1 Fc that falls over a twentieth of the speed.
+_BREAK_AWAY_TIME, _DAMPING, _BREAK_AWAY, _FALL = 2e-3, 0.1, 1.1, 0.05
 
 
+@register_law
 class LuGre(AbstractPlanarLaw):
     """The LuGre law: an elastic bristle of mean deflection z [m] that yields as the surfaces slip.
 
@@ -58,6 +73,17 @@ class LuGre(AbstractPlanarLaw):
     vs: Number = parameter("vs", "m/s", lower=0.0, strict=True)
     vd: Number | None = optional_parameter("vd", "m/s", lower=0.0, strict=True)
     stiff: ClassVar[bool] = True
+    description: ClassVar[str] = "bristle with a Stribeck effect; `vd` lets its damping fade with speed"
+    equations: ClassVar[tuple[str, ...]] = (
+        "sigma0 z + sigma1 z' + sigma2 v",
+        "z' = v - sigma0 |v| z/g(v)",
+        STRIBECK_CURVE,
+    )
+    limitations: ClassVar[Mapping[str, str]] = ONE_STATE | YIELDS
+    mujoco_lacks: ClassVar[str] = (
+        " whose sigma1 fades (vd): leave vd out, and see check_passivity(law) for what that means"
+    )
+    passivity = bristle_passivity
 
     def stribeck_curve(self, v: Float[Array, "..."]) -> Float[Array, ""]:
         """g(v) [N]: the bristle force that steady slip at `v` [m/s] tends to."""
@@ -88,3 +114,22 @@ class LuGre(AbstractPlanarLaw):
     def step_exact(self, v: Float[Array, "..."], z: Float[Array, "..."], dt: Float[Array, ""]) -> Float[Array, "..."]:
         """Deflection [m] after `dt` [s] at constant `v` [m/s], exactly: the rate is linear in z."""
         return relax_exact(v, z, dt, self.sigma0 * magnitude(v) / self.stribeck_curve(v))
+
+    def mujoco(self) -> dict[str, Any] | str:
+        """MuJoCo's motor has the bristle with a constant sigma1."""
+        if self.vd is not None:
+            return AbstractPlanarLaw.mujoco(self)
+        return {"damping": self.sigma2, "lugre": (self.sigma0, self.sigma1, self.Fc, self.Fs, self.vs)}
+
+    @classmethod
+    def cases(cls) -> tuple[LawCase, ...]:
+        """With constant damping, which is not passive, and with damping that fades."""
+        fading = cls.standard(vd=STANDARD["vs"])
+        return stribeck_case("LuGre", cls.standard()), stribeck_case("LuGre, vd", fading)
+
+    @classmethod
+    def fit_start(cls, m: float, Fc: float, Fv: float, v_max: float) -> "LuGre":
+        """A stiff bristle that is lightly damped."""
+        sigma0 = Fc / (_BREAK_AWAY_TIME * v_max)
+        sigma1 = 2.0 * _DAMPING * np.sqrt(m * sigma0)
+        return cls(sigma0=sigma0, sigma1=sigma1, sigma2=Fv, Fc=Fc, Fs=_BREAK_AWAY * Fc, vs=_FALL * v_max)

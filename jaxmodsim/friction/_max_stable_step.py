@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from .._core.state_dependent import need_values
 from ._law import AbstractDynamicLaw, AbstractForceLaw, AbstractKarnoppLaw, AbstractLaw, AbstractSetValuedLaw
-from ._passivity import need_values
-from .wrappers._sign import Sign
 
 _Part = Callable[[Array, Array], Array]
 
@@ -119,7 +118,7 @@ def _parts(law: AbstractLaw, z: Any) -> tuple[Array, _Part, _Part]:
         def rate(v: Array, own: Array) -> Array:
             return jax.flatten_util.ravel_pytree(law.zdot(v, unravel(own)))[0]
 
-    elif isinstance(law, AbstractForceLaw) and not isinstance(law, Sign):
+    elif isinstance(law, AbstractForceLaw) and not law.jumps:
         own = jnp.zeros(0)
 
         def force(v: Array, own: Array) -> Array:
@@ -157,7 +156,7 @@ def _steady(law: AbstractDynamicLaw, v: Float[Array, ""]) -> Any:
 
 def _refusal(law: AbstractLaw) -> str:
     name = type(law).__name__
-    if isinstance(law, AbstractSetValuedLaw | Sign):
+    if isinstance(law, AbstractForceLaw | AbstractSetValuedLaw):
         return (
             f"max_stable_step: the force of {name} jumps at v = 0, where every step chatters. simulate runs Coulomb and"
             " Stribeck by events, whatever the step; Regularized(law, width) makes them smooth and has a largest step."

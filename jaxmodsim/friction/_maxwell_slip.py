@@ -1,8 +1,10 @@
 """Generalised Maxwell slip."""
 
+import math
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.parameters import (
@@ -15,9 +17,12 @@ from .._core.parameters import (
 )
 from .._core.state_dependent import nominal
 from ._bristle import advance_elastoplastic, slip_fraction, stribeck_curve
-from ._law import AbstractDynamicLaw
+from ._law import AbstractDynamicLaw, register_law
+from ._law_case import STANDARD, LawCase, steady_curve, stribeck_case
+from ._passivity import Passivity
 
 
+@register_law
 class MaxwellSlip(AbstractDynamicLaw):
     """Elastic elements in parallel, each of which gives way at its own force: hysteresis with non-local memory.
 
@@ -65,6 +70,16 @@ class MaxwellSlip(AbstractDynamicLaw):
     sigma2: Number = parameter("sigma2", "N s/m", lower=0.0, default=0.0)
     corner: Number = parameter("corner", "1", lower=0.0, strict=True, upper=1.0, execution=True, default=0.02)
     stiff: ClassVar[bool] = True
+    description: ClassVar[str] = "any number of elements: non-local memory"
+    equations: ClassVar[tuple[str, ...]] = (
+        "sum(k z) + sigma2 v",
+        "z' = v (1 - max(0, u - 1 + corner)/corner)",
+        "u = k z sign(v)/s(v)",
+        "s(v) = Fc + (Fs - Fc) exp(-(v/vs)^2)",
+    )
+    mujoco_lacks: ClassVar[str] = (
+        ", for its bristle yields all the way, and not at a limit: fit a Dahl or LuGre and export that"
+    )
 
     def __check_init__(self) -> None:
         """Refuse elements that are not complete."""
@@ -122,3 +137,22 @@ class MaxwellSlip(AbstractDynamicLaw):
         u = self.k * z * side / limit
         falling = side * limit / self.k * (1.0 + (u - 1.0) * jnp.exp(-self._attraction(limit) * dt))
         return jnp.where(u > 1.0, falling, after)
+
+    def passivity(self) -> Passivity:
+        """Always passive: an element lags only towards the side that it is loaded on, so `k z (v - z') >= 0`."""
+        words = "MaxwellSlip is always passive: an element lags only towards the side that it is loaded on."
+        return Passivity(True, float(nominal(self.sigma2)), math.inf, words)
+
+    @classmethod
+    def cases(cls) -> tuple[LawCase, ...]:
+        """One element; four, the first of which gives way at a sixth of the deflection of all; and with lag."""
+        # Shares of the elements in stiffness and in force.
+        stiffness, force = np.array([0.4, 0.3, 0.2, 0.1]), np.array([0.1, 0.2, 0.3, 0.4])
+        sigma0, Fc, Fs, Fv = (STANDARD[name] for name in ("sigma0", "Fc", "Fs", "Fv"))
+        four = {"k": sigma0 * stiffness, "Fc": Fc * force, "sigma2": Fv}
+        flat = steady_curve(Fc, Fc, Fv)
+        return (
+            LawCase("MaxwellSlip, 1", cls(k=[sigma0], Fc=[Fc], sigma2=Fv), flat),
+            LawCase("MaxwellSlip, 4", cls(**four), flat),
+            stribeck_case("MaxwellSlip, 4, C", cls(**four, Fs=Fs * force, vs=STANDARD["vs"], C=50.0)),
+        )

@@ -4,11 +4,14 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.parameters import Number, optional_parameter, parameter
 from .._core.safe import bounded_ratio, safe_power
-from ._law import AbstractSetValuedLaw
+from ._bristle import STRIBECK_CURVE
+from ._law import NO_STICTION_IN_MUJOCO, AbstractSetValuedLaw, register_law
+from ._law_case import LawCase, stribeck_case
 
 # Velocity over vs below which a curve with an exponent below one is rounded off.
 _ROUNDED = 1e-12
@@ -38,6 +41,7 @@ def _fall(value: Any) -> Any:
     return value
 
 
+@register_law
 class Stribeck(AbstractSetValuedLaw):
     """Friction that falls from stiction to Coulomb level as slip begins, and then rises viscously.
 
@@ -51,7 +55,7 @@ class Stribeck(AbstractSetValuedLaw):
     - `vs`: Stribeck velocity [m/s], > 0.
     - `Fv`: viscous coefficient [N s/m], >= 0.
     - `exponent`: shape of the fall, > 0: by default the square (Gaussian), 1 for the exponential form.
-    - `fall`: `exponential` (`exp(-x)`) or `lorentzian` (`1/(1 + x)`), or another smooth function that falls from 1 at 0
+    - `fall`: by default `exp(-x)`; `lorentzian` (`1/(1 + x)`), or another smooth function that falls from 1 at 0
       to 0.
 
     **Raises:**
@@ -77,6 +81,10 @@ class Stribeck(AbstractSetValuedLaw):
     exponent: Number | None = optional_parameter("exponent", "1", lower=0.0, strict=True)
     fall: Any = eqx.field(default=exponential, static=True, converter=_fall)
     stiff: ClassVar[bool] = False
+    description: ClassVar[str] = "stiction, Stribeck effect and viscous friction; Gaussian, exponential, Lorentzian"
+    equations: ClassVar[tuple[str, ...]] = ("g(v) sign(v) + Fv v", STRIBECK_CURVE)
+    valid_at_any_speed: ClassVar[bool] = True
+    mujoco_lacks: ClassVar[str] = NO_STICTION_IN_MUJOCO
 
     def sliding_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Magnitude [N] of the dry part in slip."""
@@ -93,3 +101,30 @@ class Stribeck(AbstractSetValuedLaw):
         """Largest force in stick [N]."""
         del direction
         return jnp.asarray(self.Fs)
+
+    def lugre_numbers(self, vs: float) -> dict[str, Any] | None:
+        """Of the Gaussian curve its own."""
+        del vs
+        gaussian = self.fall is exponential and (self.exponent is None or bool(jnp.all(self.exponent == 2.0)))
+        return {"Fc": self.Fc, "Fs": self.Fs, "vs": self.vs, "sigma2": self.Fv} if gaussian else None
+
+    def mujoco(self) -> dict[str, Number] | str:
+        """Dry friction of a joint, which is one force, and its damping."""
+        if float(self.Fs) > float(self.Fc):
+            return AbstractSetValuedLaw.mujoco(self)
+        return {"frictionloss": self.Fc, "damping": self.Fv}
+
+    @classmethod
+    def cases(cls) -> tuple[LawCase, ...]:
+        """The three curves."""
+        return (
+            stribeck_case("Stribeck, Gauss", cls.standard()),
+            stribeck_case("Stribeck, exp", cls.standard(exponent=1.0), lambda x: np.exp(-x)),
+            stribeck_case("Stribeck, Lorentz", cls.standard(fall=lorentzian), lambda x: 1.0 / (1.0 + x * x)),
+        )
+
+    @classmethod
+    def fit_start(cls, m: float, Fc: float, Fv: float, v_max: float) -> "Stribeck":
+        """A break-away force of 1.2 Fc, and a fall over a twentieth of the speed."""
+        del m
+        return cls(Fc=Fc, Fs=1.2 * Fc, vs=0.05 * v_max, Fv=Fv)

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core.state_dependent import need_values
 from ._law import AbstractSetValuedLaw
 from ._max_stable_step import max_stable_step
-from ._passivity import need_values
 from .wrappers._regularized import Regularized
 
 # Velocities below the creep speed at which the force must stay below the load, and halvings of the width's bracket.
@@ -21,8 +21,8 @@ def damping_sigma1(m: float, sigma0: float, ratio: float = 1.0, sigma2: float = 
     """Bristle damping [N s/m] with which a mass in stick vibrates with a given damping ratio.
 
     In stick `z' = v`, so `m v' = -sigma0 z - (sigma1 + sigma2) v`, for LuGre and ElastoPlastic alike, and
-    `sigma1 = 2 ratio sqrt(m sigma0) - sigma2`. Where Fs > Fc, a sigma1 above `sigma2 Fc/(Fs - Fc)` costs passivity (see
-    `passive`), and stiff bristles soon get there; LuGre with a `vd` of about vs keeps the damping in stick alone.
+    `sigma1 = 2 ratio sqrt(m sigma0) - sigma2`. Where Fs > Fc, a sigma1 above `sigma2 Fc/(Fs - Fc)` costs passivity
+    (`check_passivity`), and stiff bristles soon get there; LuGre with a `vd` of about vs keeps the damping in stick.
 
     **Arguments:**
 
@@ -57,7 +57,7 @@ class Width:
     - `width`: the width [m/s].
     - `creep`: velocity [m/s] at which the mass creeps under the load, below zero under a load below zero.
     - `load`: the load [N] it is for.
-    - `rate`: fastest decay [1/s] of the mass's velocity, at rest: `(limit/width + slope of the wet part)/m`.
+    - `rate`: fastest decay [1/s] of the mass's velocity, at rest: `(static limit/width + slope of the viscous part)/m`.
     - `step`: largest stable step [s] of Euler's method at that rate.
     - `law`: the law with that width.
     """
@@ -145,9 +145,7 @@ def regularized_width(law: AbstractSetValuedLaw, creep: float, load: float, m: f
 def _no_width(law: AbstractSetValuedLaw, load: float, creep: float, limit: float, most: float, least: float) -> str:
     name = type(law).__name__
     if least >= abs(load):
-        return (
-            f"regularized_width: the wet part of {name} alone carries {load:g} N at {creep:g} m/s: any width will do."
-        )
+        return f"regularized_width: {name} carries {load:g} N at {creep:g} m/s by its viscous part: any width will do."
     return (
         f"regularized_width: no width of {name} carries {load:g} N below {creep:g} m/s. The smooth force reaches"
         f" {most:g} N at most, below the limit of {limit:g} N; the law run by events holds the load at rest."

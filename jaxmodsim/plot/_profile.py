@@ -12,7 +12,7 @@ def profile_figure(profile: Profile) -> Figure:
 
     **Arguments:**
 
-    - `profile`: from `FitResult.profile`.
+    - `profile`: from `jaxmodsim.identify.profile`.
     """
     others = {name: x for name, x in profile.others.items() if x.size}
     figure = Figure(figsize=(8, 4.0 + (2.6 if others else 0.0)), layout="constrained")

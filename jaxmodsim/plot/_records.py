@@ -23,7 +23,7 @@ def fit_figure(
     - `caption`: a line for the source of the record.
     """
     (residual,) = result.residuals[record].values()
-    return _followed(result.records[record], residual, "simulated, open loop", quantity, unit, caption)
+    return _followed(result.provenance.records[record], residual, "simulated, open loop", quantity, unit, caption)
 
 
 def score_figure(score: Score, *, quantity: str = "position", unit: str = "m", caption: str = "") -> Figure:
@@ -31,7 +31,7 @@ def score_figure(score: Score, *, quantity: str = "position", unit: str = "m", c
 
     **Arguments:**
 
-    - `score`: from `FitResult.score`, of one channel.
+    - `score`: from `jaxmodsim.identify.score`, of one channel.
     - `quantity`, `unit`: what was measured.
     - `caption`: a line for the source of the record.
     """

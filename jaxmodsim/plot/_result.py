@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..identify import FitResult
+from ..identify import FitResult, residual_tests
 from ._style import BLUE, GREEN, GREY, RED, small_unit, with_unit
 
 
@@ -23,12 +23,12 @@ def result_figure(result: FitResult, *, record: int = 0, units: Mapping[str, str
 
     - `ValueError` if there is no such record or channel.
     """
-    if not 0 <= record < len(result.records):
-        raise ValueError(f"record must be 0 to {len(result.records) - 1}, but it is {record}.")
-    channels = list(result.outputs[record])
+    if not 0 <= record < len(result.provenance.records):
+        raise ValueError(f"record must be 0 to {len(result.provenance.records) - 1}, but it is {record}.")
+    channels = list(result.provenance.outputs[record])
     units = dict(units or {})
-    if set(units) - set(result.rmse_by):
-        raise ValueError(f"units names {', '.join(units)}, but the channels are: {', '.join(result.rmse_by)}.")
+    if set(units) - set(result.diagnostics.rmse):
+        raise ValueError(f"units names {', '.join(units)}, but the channels are: {', '.join(result.diagnostics.rmse)}.")
     figure = Figure(figsize=(14, 3.0 + 3.4 * max(len(channels), 2)), layout="constrained")
     left, right = np.ravel(figure.subfigures(1, 2, squeeze=False, width_ratios=(1.25, 1)))
     rows = left.subplots(2 * len(channels), 1, sharex=True, squeeze=False, height_ratios=(2, 1) * len(channels))[:, 0]
@@ -40,16 +40,17 @@ def result_figure(result: FitResult, *, record: int = 0, units: Mapping[str, str
     _memory_panel(memory, result, record)
     _interval_panel(sure, result)
     _correlation_panel(alike, result)
-    figure.suptitle(f"{result.records[record].name}: {result.ending}, {result.evaluations} evaluations")
+    ending = f"{result.diagnostics.ending}, {result.diagnostics.evaluations} evaluations"
+    figure.suptitle(f"{result.provenance.records[record].name}: {ending}")
     return figure
 
 
 def _channel_panels(above: Axes, below: Axes, result: FitResult, number: int, channel: str, unit: str) -> None:
-    record, residual = result.records[number], result.residuals[number][channel]
+    record, residual = result.provenance.records[number], result.residuals[number][channel]
     factor, small = small_unit(unit)
     name = channel if channel != "measured" else "output"
     above.plot(record.t, record.channels[channel], color="#b4b4b4", lw=3.2, label="measured")
-    above.plot(record.t, result.outputs[number][channel], color=RED, lw=1.1, label="simulated")
+    above.plot(record.t, result.provenance.outputs[number][channel], color=RED, lw=1.1, label="simulated")
     rmse = factor * float(np.sqrt(np.mean(residual**2)))
     above.set(ylabel=with_unit(name, unit), title=f"{name}: RMSE {rmse:.3g} {small}".rstrip())
     above.legend(loc="upper right", fontsize=8)
@@ -60,10 +61,10 @@ def _channel_panels(above: Axes, below: Axes, result: FitResult, number: int, ch
 
 def _memory_panel(axis: Axes, result: FitResult, number: int) -> None:
     """Autocorrelation of the residuals with the band that white noise would stay in."""
-    record = result.records[number]
+    record = result.provenance.records[number]
     interval = float(np.median(np.diff(record.t)))
     colours = (BLUE, RED, GREEN, "#7b4fa3", "#b8860b")
-    tests = [each for each in result.residual_tests().channels if each.record == record.name]
+    tests = [each for each in residual_tests(result).channels if each.record == record.name]
     for each, colour in zip(tests, colours * (1 + len(tests) // len(colours)), strict=False):
         lags = interval * np.arange(len(each.autocorrelation))
         label = f"{each.channel}: p = {each.whiteness:.2g} (white)"
@@ -77,10 +78,10 @@ def _memory_panel(axis: Axes, result: FitResult, number: int) -> None:
 
 def _interval_panel(axis: Axes, result: FitResult) -> None:
     """Half-widths of the intervals relative to the values, in a logarithm, with the figures beside."""
-    names, intervals = list(result.values), result.intervals()
+    names, intervals = list(result.values), result.estimate.intervals()
     shares = []
     for name in names:
-        scale = abs(result.values[name]) or abs(result.start[name]) or 1.0
+        scale = abs(result.values[name]) or abs(result.estimate.start[name]) or 1.0
         low, high = intervals[name]
         shares.append(100 * max(result.values[name] - low, high - result.values[name]) / scale)
     known = [x for x in shares if np.isfinite(x) and x > 0]
@@ -92,7 +93,7 @@ def _interval_panel(axis: Axes, result: FitResult) -> None:
         colour = RED if open_ or share > 100 else "#b8860b" if share > 20 else GREEN
         axis.barh(i, 10.0**last if open_ else max(share, 10.0**first), left=0.0, color=colour, height=0.6)
         value, (low, high) = result.values[name], intervals[name]
-        text = f"{value:.5g} (-{value - low:.2g}, +{high - value:.2g}) {result.units[name]}"
+        text = f"{value:.5g} (-{value - low:.2g}, +{high - value:.2g}) {result.estimate.units[name]}"
         axis.text(0.41, i, "no interval: has no effect" if open_ else text, va="center", fontsize=8,
                   transform=axis.get_yaxis_transform())  # fmt: skip
     axis.set_xscale("log")
@@ -106,7 +107,7 @@ def _interval_panel(axis: Axes, result: FitResult) -> None:
 
 
 def _correlation_panel(axis: Axes, result: FitResult) -> None:
-    names, correlation = list(result.values), result.correlation
+    names, correlation = list(result.values), result.estimate.correlation
     image = axis.imshow(correlation, vmin=-1, vmax=1, cmap="RdBu_r", aspect="auto")
     axis.set_xticks(range(len(names)), names, rotation=30, ha="right", fontsize=8)
     axis.set_yticks(range(len(names)), names, fontsize=8)

@@ -1,9 +1,10 @@
-"""Every number of a scene by a name that a person would type."""
+"""Every number of a scene, or of a law alone, by a name that a person would type."""
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
+import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -18,14 +19,16 @@ from ._signal import Signal
 # Levels of the scene that say nothing about a number.
 _SILENT = ("law", "place", "amount", "number")
 
+_Module = TypeVar("_Module", bound=eqx.Module)
 
-def scene_numbers(scene: Scene) -> dict[str, Array]:
-    """All numbers of a scene by name.
+
+def scene_numbers(scene: eqx.Module) -> dict[str, Array]:
+    """All numbers of a scene, or of another module such as a law, by name.
 
     Entries of `params` go by their key (`m`, nested ones `arm.m`), numbers of an effect by `effect.number`
     (`friction.Fc`, `friction.belt_velocity`); wrapped laws add no level of their own (`friction.width`), the two
-    sides of a law that depends on direction do (`friction.forward.Fc`). Of a `Signal` there are its values
-    (`u.values`); its times are constants.
+    sides of a law that depends on direction do (`friction.forward.Fc`). Those of a law alone go by what is left of that
+    (`Fc`, `forward.Fc`). Of a `Signal` there are its values (`u.values`); its times are constants.
 
     **Raises:**
 
@@ -34,7 +37,7 @@ def scene_numbers(scene: Scene) -> dict[str, Array]:
     return {name: leaf for name, leaf in _named_leaves(scene) if name is not None}
 
 
-def _named_leaves(scene: Scene) -> list[tuple[str | None, Any]]:
+def _named_leaves(scene: eqx.Module) -> list[tuple[str | None, Any]]:
     """All leaves in order; times of signals, which are constants, have no name."""
     leaves, _ = jtu.tree_flatten_with_path(scene)
     named: list[tuple[str | None, Any]] = []
@@ -49,7 +52,7 @@ def _named_leaves(scene: Scene) -> list[tuple[str | None, Any]]:
     return named
 
 
-def _owners(scene: Scene, path: tuple[Any, ...]) -> list[Any]:
+def _owners(scene: eqx.Module, path: tuple[Any, ...]) -> list[Any]:
     """What holds the leaf at `path`, from the scene inwards."""
     owners: list[Any] = [scene]
     for key in path[:-1]:
@@ -57,7 +60,7 @@ def _owners(scene: Scene, path: tuple[Any, ...]) -> list[Any]:
     return owners
 
 
-def scene_ranges(scene: Scene) -> dict[str, Range]:
+def scene_ranges(scene: eqx.Module) -> dict[str, Range]:
     """Admissible range of each number that has one, by the names of `scene_numbers`.
 
     A limit by another number carries that number's full name.
@@ -85,8 +88,8 @@ def scene_ranges(scene: Scene) -> dict[str, Range]:
     return ranges
 
 
-def replace_numbers(scene: Scene, values: dict[str, Any]) -> Scene:
-    """The scene with the numbers of these names replaced; the names are those of `scene_numbers`."""
+def replace_numbers(scene: _Module, values: dict[str, Any]) -> _Module:
+    """The scene or law with the numbers of these names replaced; the names are those of `scene_numbers`."""
     leaves = [leaf if name is None else values.get(name, leaf) for name, leaf in _named_leaves(scene)]
     return jtu.tree_unflatten(jtu.tree_structure(scene), leaves)
 
@@ -97,8 +100,10 @@ def _step(node: Any, key: Any) -> Any:
     return node[key.idx if isinstance(key, jtu.SequenceKey) else key.key]
 
 
-def _name(scene: Scene, path: tuple[Any, ...]) -> str:
+def _name(scene: eqx.Module, path: tuple[Any, ...]) -> str:
     words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]
+    if not isinstance(scene, Scene):
+        return ".".join(_telling(words))
     if words[0] == "effects":
         words = [scene.names[int(words[1])], *_telling(words[2:])]
     elif words[0] == "constraints":

@@ -14,7 +14,7 @@ import xarray as xr
 import jaxmodsim as jms
 from jaxmodsim.cli import _sweep
 from jaxmodsim.cli._spec import Reduced, read_spec
-from jaxmodsim.cli._spec_scene import LAWS, PROBLEMS
+from jaxmodsim.cli._spec_scene import PROBLEMS, known_laws
 from jaxmodsim.plot import map2d
 from jaxmodsim.problems import belt_oscillator
 from jaxmodsim.sweeps import SweepProgress, latin_hypercube, plan_sweep, sobol
@@ -208,7 +208,7 @@ def test_the_plan_is_what_sweep_gives(spec: Callable[[str], str]) -> None:
 def test_problems_and_laws_that_a_spec_may_name() -> None:
     assert {"belt_oscillator", "ramped_box", "cart_pole", "n_link_pendulum"} <= set(PROBLEMS)
     named = {name for name in vars(jms.friction) if name in jms.__dict__ and name[0].isupper()}
-    assert set(LAWS) == {name for name in named if isinstance(getattr(jms, name), type)} - {"Curve"}
+    assert set(known_laws()) == {name for name in named if isinstance(getattr(jms, name), type)} - {"Curve"}
 
 
 def each_mistake() -> Iterator[tuple[str, str, str, str]]:

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxmodsim import (
     Armstrong,
@@ -22,7 +23,8 @@ from jaxmodsim import (
     asymmetric,
     scaled_by,
 )
-from jaxmodsim.friction import AbstractDynamicLaw, AbstractSetValuedLaw, ArmstrongState, lorentzian
+from jaxmodsim._core.parameters import modules_of
+from jaxmodsim.friction import AbstractDynamicLaw, AbstractSetValuedLaw, ArmstrongState, LawCase, laws, lorentzian
 
 # The state at which laws of scaled_by are looked at, and their factor there.
 TIME, POSITION, VELOCITY = jnp.array(0.7), jnp.array([0.3]), jnp.array([0.9])
@@ -161,6 +163,25 @@ def scaled(case: Case) -> Case:
         level=level,
         viscous=(forward * FACTOR, backward * FACTOR),
     )
+
+
+def cases_of_registered_laws() -> dict[str, Case]:
+    """The table, and of each registered law that is not in it the first example, with what its closed form claims."""
+    by_hand = {type(module) for case in CASES.values() for _, module in modules_of(case.law)}
+    new = {name: law.cases()[0] for name, law in laws().items() if law not in by_hand and law.cases()}
+    return CASES | {name.lower(): from_example(example) for name, example in new.items()}
+
+
+def from_example(example: LawCase) -> Case:
+    """What the force in steady slip claims, of a law without a state."""
+    speeds = np.geomspace(1e-6, 1e6, 2001)
+    far = example.steady(np.array([1e6, 2e6, -1e6, -2e6]))
+    viscous = (float(far[1] - far[0]) / 1e6, float(far[2] - far[3]) / 1e6)
+    dry = [
+        abs(example.steady(side * speeds) - side * slope * speeds) for side, slope in zip((1, -1), viscous, strict=True)
+    ]
+    level = (float(dry[0][-1]), float(dry[1][-1]))
+    return Case(example.law, float(np.max(dry)), level, viscous, odd=np.allclose(dry[0], dry[1]), smooth=False)
 
 
 # Of each kind one, wrapped and asymmetric ones among them.

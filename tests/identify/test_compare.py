@@ -9,9 +9,9 @@ import pytest
 import jaxmodsim as jms
 from jaxmodsim import plot
 from jaxmodsim.identify import Candidate, Comparison, Continuation, compare, compare_laws, law_force, replay
-from jaxmodsim.identify._compare import _blocks
-from jaxmodsim.identify._criteria import correlation_time
-from jaxmodsim.identify._runs import cut, runs_of
+from jaxmodsim.identify.data._record import cut, runs_of
+from jaxmodsim.identify.selection._compare import _blocks
+from jaxmodsim.identify.selection._comparison import correlation_time
 
 DT, NOISE, WIDTH = 5e-3, 2e-5, 5e-3
 
@@ -92,7 +92,7 @@ def test_table_text_and_dictionary(comparison):
     again = json.loads(json.dumps(comparison.to_dict(), allow_nan=False))
     assert again["simplest"] == "stribeck"
     assert len(again["models"][0]["parts"]) == 4
-    assert again["models"][-1]["words"] == "viscous friction alone"
+    assert again["models"][-1]["description"] == "viscous friction alone"
 
 
 def test_the_figure_shows_every_model(comparison):
@@ -135,7 +135,7 @@ def test_a_model_that_fails_stays_with_its_reason_and_interruption_keeps_what_is
     ("options", "text"),
     [
         ({"limits": {"mass": (0.0, None)}}, "mass is no number of any candidate"),
-        ({"begin": Continuation("friction.wide")}, "friction.wide is no number"),
+        ({"initializer": Continuation("friction.wide")}, "friction.wide is no number"),
         ({"folds": 1}, "folds must be at least 2"),
     ],
 )

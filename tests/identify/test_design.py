@@ -9,24 +9,24 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim.identify import (
-    AXIS_MODELS,
+    AxisLimits,
     InputDesign,
-    Limits,
-    _design,
     a_optimal,
+    axis_models,
     axis_scene,
     d_optimal,
     design_input,
     e_optimal,
 )
-from jaxmodsim.identify._axis import RoughAxis
-from jaxmodsim.identify._design import _axis, _coarse_share, _judge, _known, _Task
-from jaxmodsim.identify._excitation import driven_motion, feed_forward, motion_basis, sensitivities
+from jaxmodsim.identify.design import _design_input
+from jaxmodsim.identify.design._design_input import _axis, _coarse_share, _judge, _known, _Task
+from jaxmodsim.identify.design._excitation import driven_motion, feed_forward, motion_basis, sensitivities
+from jaxmodsim.identify.model._axis import RoughAxis
 from jaxmodsim.plot import design_figure
 from jaxmodsim.scene import replace_numbers
 
-MODEL = AXIS_MODELS["lugre"]
-LIMITS = Limits(force=40.0, speed=0.1, travel=0.02)
+MODEL = axis_models()["lugre"]
+LIMITS = AxisLimits(force=40.0, speed=0.1, travel=0.02)
 DT, DURATION, HARMONICS, NOISE = 2e-3, 2.0, 5, 1e-6
 OPTIONS = {"duration": DURATION, "noise": NOISE, "dt": DT, "harmonics": HARMONICS}
 # A box of 10 kg whose bristle gives way after a tenth of a millimetre.
@@ -39,9 +39,9 @@ def box():
 
 def shorten(patch, tried, improved):
     """A search on fewer samples from fewer starts, because each of its steps is a run with its derivatives."""
-    patch.setattr(_design, "_COARSE", 500)
-    patch.setattr(_design, "_TRIED", tried)
-    patch.setattr(_design, "_IMPROVED", improved)
+    patch.setattr(_design_input, "_COARSE", 500)
+    patch.setattr(_design_input, "_TRIED", tried)
+    patch.setattr(_design_input, "_IMPROVED", improved)
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +136,7 @@ def every_goal(information):
 
 def test_gradients_of_goals_and_limits_equal_finite_differences():
     # A smooth law: the kink of LuGre at rest would be seen by the differences and not by the derivative.
-    scene = axis_scene(AXIS_MODELS["coulomb"], RoughAxis(10.0, 40.0, 8.0, -1.0, 0.1), {"dry.width": 0.02})
+    scene = axis_scene(axis_models()["coulomb"], RoughAxis(10.0, 40.0, 8.0, -1.0, 0.1), {"dry.width": 0.02})
     axis, parameters, _ = _axis(scene, ("m", "dry.Fc", "viscous.Fv"), None, lambda q, qd: q[0], "u", NOISE)
     t = np.linspace(0.0, 1.0, 101)
     shapes, rates = motion_basis(t, 2)
@@ -188,7 +188,7 @@ def test_limits_hold_also_in_an_independent_run(design):
 
 def test_fits_are_as_good_as_predicted_and_better_than_those_of_a_plain_sine(design, fits):
     *designed, plain = fits
-    assert all(result.found.converged for result in fits)
+    assert all(result.search.converged for result in fits)
     ratios, better = [], 0
     for name in design.values:
         stated = np.mean([result.errors[name] for result in designed])
@@ -240,7 +240,7 @@ def test_a_prior_is_the_inverse_of_its_covariance(fits):
     information = _known(fits[0], names, np.array([8.0, 10.0]))
     errors = np.array([fits[0].errors[name] for name in names]) / np.array([8.0, 10.0])
     places = [list(fits[0].values).index(name) for name in names]
-    r = fits[0].correlation[places[0], places[1]]
+    r = fits[0].estimate.correlation[places[0], places[1]]
     expected = np.linalg.inv(np.outer(errors, errors) * np.array([[1.0, r], [r, 1.0]]))
     np.testing.assert_allclose(information, expected, rtol=1e-6)
     with pytest.raises(ValueError, match="prior knows none of spring; it fitted m, offset"):
@@ -263,7 +263,7 @@ def test_ctrl_c_keeps_the_best_so_far(design):
 @pytest.mark.usefixtures("hasty")
 def test_what_cannot_be_learned_is_said_and_keeps_the_goal_finite(design):
     # Far below break-away nothing slides, and what is left is a spring; the shapes are those of the other designs.
-    tiny = Limits(force=40.0, speed=0.1, travel=1e-6)
+    tiny = AxisLimits(force=40.0, speed=0.1, travel=1e-6)
     still = design_input(box(), MODEL.free, tiny, max_steps=1, **OPTIONS)
     assert np.isfinite(still.errors["friction.sigma0"])
     text = " ".join(still.remarks)
@@ -313,15 +313,15 @@ def test_the_result_prints_goes_to_json_and_is_drawn(design):
 @pytest.mark.quick
 def test_wrong_limits_are_refused(limits, text):
     with pytest.raises(ValueError, match=text):
-        Limits(**limits)
+        AxisLimits(**limits)
 
 
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"free": ("mass",)}, "'mass', but the numbers are: drift, m"),
+        ({"free": ("mass",)}, "'mass', but the numbers are: m, offset"),
         ({"free": ("u",)}, "u is the input"),
-        ({"input": "force"}, r"'force' must be a single number in the scene's params \(drift, m, offset, t0, tau, u\)"),
+        ({"input": "force"}, r"'force' must be a single number in the scene's params \(m, offset, u\)"),
         ({"input": "m", "free": ("offset",)}, "does not move the first coordinate"),
         ({"duration": -1.0}, "duration must be finite and > 0 s"),
         ({"noise": 0.0}, "noise must be finite and > 0"),
@@ -329,7 +329,7 @@ def test_wrong_limits_are_refused(limits, text):
         ({"harmonics": 100}, "6 samples in a period of the fastest, but 20 are needed"),
         ({"q0": [0.0, 0.0]}, r"q0 has the shape \(2,\)"),
         ({"observe": lambda q, qd: q}, r"observe\(q, qd\) returned the shape \(1,\)"),
-        ({"limits": Limits(force=0.5)}, "the axis at rest takes 2[0-9][0-9] % of one"),
+        ({"limits": AxisLimits(force=0.5)}, "the axis at rest takes 2[0-9][0-9] % of one"),
     ],
 )
 def test_wrong_options_are_refused(changes, text):
@@ -340,14 +340,14 @@ def test_wrong_options_are_refused(changes, text):
         design_input(**given)
 
 
-def test_scenes_that_need_events_and_goals_that_are_words_are_refused():
+def test_scenes_that_need_events_and_criteria_that_are_words_are_refused():
     drive = box().effects[0]
     exact = jms.Scene(box().lagrangian, params=box().params, effects=(drive, jms.Friction(jms.Coulomb(8.0))))
     with pytest.raises(ValueError, match=r"friction would need events.*Regularized\(law, width\)"):
         design_input(exact, ("m",), LIMITS, **OPTIONS)
     # Run-time type checks of the tests may come before our own; both name the argument.
-    with pytest.raises((ValueError, TypeError), match="goal"):
-        design_input(box(), ("m",), LIMITS, goal="D", **OPTIONS)  # pyright: ignore[reportArgumentType]
+    with pytest.raises((ValueError, TypeError), match="criterion"):
+        design_input(box(), ("m",), LIMITS, criterion="D", **OPTIONS)  # pyright: ignore[reportArgumentType]
 
 
 def test_gradients_are_finite_where_an_axis_rests():

@@ -9,9 +9,9 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim._core.parameters import Range
-from jaxmodsim.identify import FitResult, law_force, replay
-from jaxmodsim.identify._covariance import BLOCKS, spread
-from jaxmodsim.identify._parameters import FreeParameters
+from jaxmodsim.identify import FitResult, law_force, remarks, replay
+from jaxmodsim.identify.model._parameters import FreeParameters
+from jaxmodsim.identify.uncertainty._estimate import BLOCKS, covariance_estimate
 from jaxmodsim.scene import replace_numbers, scene_numbers, scene_ranges
 
 from ..helpers.sprung import lagrangian, sprung
@@ -48,7 +48,7 @@ def fits(clean) -> list[FitResult]:
 
 def test_fit_finds_the_truth_within_its_errors(fits):
     for result in fits:
-        assert result.ending == "converged"
+        assert result.diagnostics.ending == "converged"
         assert 0.9e-4 < result.rmse < 1.1e-4
         for name, true in TRUTH.items():
             # Four fits of three parameters: none of twelve draws should lie beyond 4.5 of its own standard errors.
@@ -89,7 +89,7 @@ def test_covariance_of_correlated_residuals_is_larger_than_for_white_ones():
         series -= series.mean()
         white = series.var() / n
         one, blocks = jnp.ones((n, 1)), jnp.arange(n) * BLOCKS // n
-        sure = spread(jnp.asarray(series), one, jnp.zeros((0, 1)), jnp.eye(1), blocks, BLOCKS, 1)
+        sure = covariance_estimate(jnp.asarray(series), one, jnp.zeros((0, 1)), jnp.eye(1), blocks, BLOCKS, 1)
         assert float(sure.white[0, 0]) == pytest.approx(white, rel=1e-3)
         ratios.append(float(sure.covariance[0, 0]) / white)
     # 31 degrees of freedom in each of 20 estimates: the mean is good to 6 %, three of those are allowed.
@@ -104,7 +104,7 @@ def test_a_parameter_without_effect_is_reported_and_not_given_an_error_of_zero(c
     start = jms.LuGre(sigma0=1e4, sigma1=0.0, sigma2=0.5, Fc=0.8, Fs=1.0, vs=1e-9)
     result = jms.fit_law(start, jms.Record(t, force, motion), ("Fc", "Fs"))
     assert np.isinf(result.errors["Fs"])
-    assert any("Fs has no effect" in remark for remark in result.remarks)
+    assert any("Fs has no effect" in remark for remark in remarks(result))
     assert result.values["Fc"] == pytest.approx(1.0, rel=1e-3)
 
 
@@ -150,7 +150,7 @@ def test_law_fit_returns_the_law_it_was_made_from():
     assert set(result.values) == {"sigma0", "sigma1", "sigma2", "Fc", "Fs", "vs"}
     for name, value in result.values.items():
         assert abs(value - float(getattr(truth, name))) < 4.5 * result.errors[name]
-    assert result.units["sigma0"] == "N/m per N"
+    assert result.estimate.units["sigma0"] == "N/m per N"
     assert isinstance(result.model, jms.LuGre)
 
 
@@ -225,7 +225,7 @@ def test_a_start_beyond_its_limit_is_refused(clean):
 def test_a_limit_is_reached_exactly_and_said(clean):
     result = jms.fit(sprung(1.2, Fv=0.0), noisy(clean, 0), ("friction.Fc", "m"), q0=[0.0], limits={"m": (0.0, 1.5)})
     assert result.values["m"] == 1.5
-    assert "m ended on its limit 1.5." in result.remarks
+    assert "m ended on its limit 1.5." in remarks(result)
 
 
 def test_inputs_that_the_scene_does_not_know_are_refused(clean):
@@ -250,9 +250,9 @@ def test_a_step_too_long_for_the_friction_is_remarked(clean):
     coarse = jms.Record(t[::10], q[::10], {"u": u[::10]})
     start = replace_numbers(sprung(), {"friction.width": jnp.asarray(1e-3)})
     result = jms.fit(start, coarse, ("friction.Fc",), q0=[0.0])
-    assert result.step_error is not None
-    assert result.step_error > 0.1 * result.rmse
-    assert any("Raise substeps" in remark for remark in result.remarks)
+    assert result.diagnostics.step_error is not None
+    assert result.diagnostics.step_error > 0.1 * result.rmse
+    assert any("Raise substeps" in remark for remark in remarks(result))
 
 
 @pytest.mark.parametrize(
@@ -288,9 +288,9 @@ def test_ctrl_c_keeps_the_best_so_far(clean):
             raise KeyboardInterrupt
 
     result = jms.fit(sprung(1.0, 0.5, 1.5), noisy(clean, 0), tuple(TRUTH), q0=[0.0], progress=impatient)
-    assert result.ending.startswith("interrupted")
-    assert result.evaluations == 4
-    assert any("interrupted" in remark for remark in result.remarks)
+    assert result.diagnostics.ending.startswith("interrupted")
+    assert result.diagnostics.evaluations == 4
+    assert any("interrupted" in remark for remark in remarks(result))
 
 
 @pytest.mark.parametrize(

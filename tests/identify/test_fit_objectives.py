@@ -7,11 +7,18 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim.identify import Cauchy, Controller, Huber, Shooting, Squares, Staged, first_coordinate, start_state
-from jaxmodsim.identify._engines import delayed
-from jaxmodsim.identify._observe import observer
-from jaxmodsim.identify._prepare import Settings, prepare
-from jaxmodsim.identify._replay import run_samples
+from jaxmodsim.identify import (
+    Cauchy,
+    Controller,
+    Huber,
+    MultipleShooting,
+    SquaredLoss,
+    Staged,
+    start_state,
+)
+from jaxmodsim.identify.estimate._prepare import Settings, prepare
+from jaxmodsim.identify.model._engines import delayed, run_samples
+from jaxmodsim.identify.model._observe import observer
 from jaxmodsim.problems import BELT_STRIBECK, belt_oscillator
 from jaxmodsim.scene import State, replace_numbers
 
@@ -38,14 +45,14 @@ def sprung(m=2.0, Fc=1.5, sigma0=600.0):
 
 def settings(**asked):
     plain = {
-        "observe": first_coordinate,
+        "observe": "q[0]",
         "q0": None,
         "qd0": None,
         "delay": {},
         "limits": {},
         "passive": (),
         "prior": {},
-        "loss": Squares(),
+        "loss": SquaredLoss(),
         "controller": None,
         "shooting": None,
         "substeps": 1,
@@ -116,7 +123,7 @@ OBJECTIVES = {
     "initial state": (sprung, "x", ("gain", "q0", "qd0[0]", "z0.friction"), {}),
     "delay of a held input": (sprung, "x", ("delay.u", "m"), {"delay": {"u": 0.0031}}),
     "outliers": (sprung, "x", ("m", "friction.Fc"), {"loss": Huber(1.0)}),
-    "windows": (sprung, "x", ("m", "friction.Fc"), {"shooting": Shooting(0.4, (1e-4, 1e-2))}),
+    "windows": (sprung, "x", ("m", "friction.Fc"), {"shooting": MultipleShooting(0.4, (1e-4, 1e-2))}),
     "known before": (sprung, "x", ("m", "friction.Fc"), {"prior": {"m": (1.9, 0.01)}}),
     "in a loop": (held, "x", ("P", "m"), {"controller": Controller(_hold, 0.0)}),
 }
@@ -162,11 +169,11 @@ def test_gradient_of_a_fit_through_events_equals_finite_differences(belt):
 @optimized()
 def test_fit_through_events_finds_back_from_half_wrong(belt):
     start = belt_oscillator(jms.Stribeck(Fc=2.5, Fs=12.0, vs=0.1, Fv=0.3), k=150.0)
-    result = jms.fit(start, belt, ("friction.Fc", "friction.Fs", "friction.vs", "k"), q0=[0.0], begin=Staged())
-    assert result.ending == "converged"
+    result = jms.fit(start, belt, ("friction.Fc", "friction.Fs", "friction.vs", "k"), q0=[0.0], initializer=Staged())
+    assert result.diagnostics.ending == "converged"
     for name, true in {"friction.Fc": 5.0, "friction.Fs": 8.0, "friction.vs": 0.2, "k": 100.0}.items():
         assert abs(result.values[name] - true) < 4.5 * result.errors[name] < 0.1 * true
-    assert result.rmse_by["measured"] == pytest.approx(1e-4, rel=0.15)
+    assert result.diagnostics.rmse["measured"] == pytest.approx(1e-4, rel=0.15)
 
 
 def test_channels_and_records_together(full):
@@ -174,21 +181,21 @@ def test_channels_and_records_together(full):
     other = record(samples=220, seed=3, start=(0.02, -0.1), name="other")
     free = (*TRUTH, "q0[0]", "qd0[0]")
     result = jms.fit(start, [full, other], free, observe=dict(OBSERVED), limits={"m": (0.0, None)})
-    assert result.ending == "converged"
+    assert result.diagnostics.ending == "converged"
     truth = TRUTH | {"record/qd0[0]": 0.0, "other/q0[0]": 0.02, "other/qd0[0]": -0.1}
     for name, true in truth.items():
         assert abs(result.values[name] - true) < 4.5 * result.errors[name]
-    assert set(result.rmse_by) == {"x", "v", "F"}
+    assert set(result.diagnostics.rmse) == {"x", "v", "F"}
     for name, level in NOISE.items():
-        assert result.rmse_by[name] == pytest.approx(level, rel=0.15)
-    assert [len(each["x"]) for each in result.outputs] == [300, 220]
+        assert result.diagnostics.rmse[name] == pytest.approx(level, rel=0.15)
+    assert [len(each["x"]) for each in result.provenance.outputs] == [300, 220]
 
 
 def test_noise_levels_are_estimated_where_none_are_given(full):
     bare = jms.Record(full.t, full.channels, full.inputs)
     result = jms.fit(sprung(1.9, 1.4), bare, tuple(TRUTH), q0=[0.0], observe=dict(OBSERVED), limits={"m": (0.0, None)})
     for name, level in NOISE.items():
-        assert result.noise[name] == pytest.approx(level, rel=0.15)
+        assert result.diagnostics.noise[name] == pytest.approx(level, rel=0.15)
 
 
 @pytest.mark.parametrize("linear", [(), ("u",)])
@@ -196,25 +203,27 @@ def test_a_delay_of_a_fraction_of_a_sample_is_found(linear):
     late = record(late=0.0062, linear=linear)
     result = jms.fit(sprung(), only_x(late), ("delay.u", "m"), q0=[0.0])
     assert abs(result.values["delay.u"] - 0.0062) < 4.5 * result.errors["delay.u"] < 1e-3
-    assert result.units["delay.u"] == "s"
+    assert result.estimate.units["delay.u"] == "s"
 
 
 def test_outliers_do_not_pull_a_robust_fit(full):
     spoilt = full.channels["x"].copy()
     spoilt[::20] += 0.02
     bad = jms.Record(full.t, spoilt, full.inputs, noise=NOISE["x"])
-    squares, cauchy = (jms.fit(sprung(1.8), bad, tuple(TRUTH), q0=[0.0], loss=loss) for loss in (Squares(), Cauchy()))
+    squares, cauchy = (
+        jms.fit(sprung(1.8), bad, tuple(TRUTH), q0=[0.0], loss=loss) for loss in (SquaredLoss(), Cauchy())
+    )
     off = [max(abs(r.values[name] / true - 1) for name, true in TRUTH.items()) for r in (squares, cauchy)]
     assert off[1] < 0.1 * off[0]
 
 
 def test_windows_find_what_one_run_finds(full):
     one = jms.fit(sprung(1.8), only_x(full), tuple(TRUTH), q0=[0.0])
-    several = jms.fit(sprung(1.8), only_x(full), tuple(TRUTH), q0=[0.0], shooting=Shooting(0.3, (1e-5, 1e-3)))
+    several = jms.fit(sprung(1.8), only_x(full), tuple(TRUTH), q0=[0.0], shooting=MultipleShooting(0.3, (1e-5, 1e-3)))
     for name in TRUTH:
         assert abs(several.values[name] - one.values[name]) < 3 * several.errors[name]
     assert several.rmse == pytest.approx(one.rmse, rel=0.1)
-    apart = jms.fit(sprung(1.8), only_x(full), ("m", "friction.Fc"), shooting=Shooting(0.3))
+    apart = jms.fit(sprung(1.8), only_x(full), ("m", "friction.Fc"), shooting=MultipleShooting(0.3))
     # Each window begins with a bristle that is not deflected, which the truth's is.
     for name in apart.values:
         assert apart.values[name] == pytest.approx(TRUTH[name], rel=0.03)
@@ -266,7 +275,7 @@ def test_a_law_that_must_be_passive_is():
         ({"limits": {"mass": (0.0, None)}}, "limits: mass is no number"),
         ({"prior": {"k": (1.0, 1.0)}}, "prior names 'k'"),
         ({"passive": ("drive",)}, "passive names 'drive'"),
-        ({"shooting": Shooting(1e-9)}, "A window must be at least two samples"),
+        ({"shooting": MultipleShooting(1e-9)}, "A window must be at least two samples"),
     ],
 )
 def test_wrong_requests_are_refused(full, asked, text):

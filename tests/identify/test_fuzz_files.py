@@ -13,7 +13,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +29,10 @@ from jaxmodsim._core.files import written_whole
 from jaxmodsim.analysis import Row, WorkPrecision, load_work_precision
 from jaxmodsim.cli import _output, _read
 from jaxmodsim.identify import FitResult
+from jaxmodsim.identify.uncertainty._estimate import FitDiagnostics, FitProvenance, ParameterEstimate
 
 from ..helpers.fuzz import fuzz
-from .test_how_sure import same
+from .test_how_sure import PARTS, same
 
 PACKAGE = Path(jms.__file__).parent
 T = np.linspace(0.0, 1.0, 9)
@@ -42,19 +42,23 @@ def fit_result() -> FitResult:
     """A result that no fit has found, with something of each kind in it."""
     record = jms.Record(T, {"x": np.sin(T), "f": T}, {"u": np.cos(T)}, "drive", noise={"x": 0.1})
     numbers = {"m": 2.0, "friction.Fc": 0.1 + 0.2}
-    values: dict[str, Any] = {
-        "values": numbers, "errors": {"m": float("inf"), "friction.Fc": 1e-3}, "start": numbers,
-        "units": {"m": "kg", "friction.Fc": "N"}, "covariance": np.eye(2), "white": np.eye(2),
-        "information": np.eye(2), "logarithmic": ("m",), "bounds": {"m": (0.0, float("inf"))}, "records": (record,),
-        "outputs": ({"x": np.sin(T)},), "noise": {"x": 0.1}, "rmse_by": {"x": 0.1}, "evaluations": 3,
-        "ending": "converged", "step_error": None, "starts": (1.0,), "single_precision": False,
-        "numbers": {"m": np.asarray(2.0)}, "seen": {"x": "q[0]"}, "causes": (), "model": None, "found": None,
-    }  # fmt: skip
-    return FitResult(**{field.name: values[field.name] for field in fields(FitResult)})
+    estimate = ParameterEstimate(
+        values=numbers, start=numbers, units={"m": "kg", "friction.Fc": "N"}, covariance=np.diag([np.inf, 1e-6]),
+        white=np.eye(2), information=np.eye(2), logarithmic=("m",), bounds={"m": (0.0, float("inf"))},
+    )  # fmt: skip
+    diagnostics = FitDiagnostics(
+        rmse={"x": 0.1}, noise={"x": 0.1}, ending="converged", evaluations=3, step_error=None, starts=(1.0,),
+        single_precision=False, issues=(),
+    )  # fmt: skip
+    provenance = FitProvenance(
+        records=(record,), outputs=({"x": np.sin(T)},), coordinates={"x": "q[0]"}, numbers={"m": np.asarray(2.0)},
+        model=None,
+    )  # fmt: skip
+    return FitResult(estimate=estimate, diagnostics=diagnostics, provenance=provenance, search=None)
 
 
 def same_result(a: FitResult, b: FitResult) -> bool:
-    return all(same(getattr(a, field.name), getattr(b, field.name)) for field in fields(FitResult))
+    return all(same(vars(getattr(a, part)), vars(getattr(b, part))) for part in PARTS)
 
 
 def work() -> WorkPrecision:

@@ -15,7 +15,6 @@ from jaxmodsim.identify import (
     Staged,
     Stochastic,
     coverage,
-    first_coordinate,
     law_force,
     replay,
 )
@@ -41,7 +40,7 @@ def driven():
     u = 3 * np.sin(2 * np.pi * 0.7 * t) + 2 * np.sin(2 * np.pi * 1.9 * t) + 1.2 * np.sin(2 * np.pi * 0.31 * t)
     zero = jnp.zeros(1)
     run = jax.jit(replay, static_argnums=(5, 6))
-    q = run(sprung(jms.LuGre(**TRUTH)), jnp.asarray(t), {"u": jnp.asarray(u)}, zero, zero, 1, first_coordinate)
+    q = run(sprung(jms.LuGre(**TRUTH)), jnp.asarray(t), {"u": jnp.asarray(u)}, zero, zero)
     return jms.Record(t, np.asarray(q) + NOISE * np.random.default_rng(0).standard_normal(t.size), {"u": u})
 
 
@@ -63,8 +62,8 @@ def near_truth(result, prefix=""):
 def test_staged_needs_no_start_values(driven):
     free = (*(f"friction.{name}" for name in TRUTH), "m")
     nonsense = sprung(jms.LuGre(1.0, 1.0, 1.0, 1.0, 1.0, 1.0), m=50.0)
-    result = jms.fit(nonsense, driven, free, q0=[0.0], begin=Staged(), limits={"m": (0.0, None)})
-    assert result.ending == "converged"
+    result = jms.fit(nonsense, driven, free, q0=[0.0], initializer=Staged(), limits={"m": (0.0, None)})
+    assert result.diagnostics.ending == "converged"
     assert near_truth(result, "friction.")
     assert result.values["m"] == pytest.approx(1.0, abs=4.5 * result.errors["m"])
     assert result.rmse == pytest.approx(NOISE, rel=0.1)
@@ -72,17 +71,17 @@ def test_staged_needs_no_start_values(driven):
 
 def test_the_best_of_many_starts_is_the_truth_where_one_start_is_lost(moved):
     wrong = jms.LuGre(**WRONG)
-    result = jms.fit_law(wrong, moved, tuple(TRUTH), begin=MultiStart(48, steps=24))
+    result = jms.fit_law(wrong, moved, tuple(TRUTH), initializer=MultiStart(48, steps=24))
     assert near_truth(result)
-    assert len(result.starts) == 48
-    assert list(result.starts) == sorted(result.starts)
-    assert result.starts[-1] > 2 * result.starts[0]  # others were not as lucky
+    assert len(result.diagnostics.starts) == 48
+    assert list(result.diagnostics.starts) == sorted(result.diagnostics.starts)
+    assert result.diagnostics.starts[-1] > 2 * result.diagnostics.starts[0]  # others were not as lucky
 
 
 def test_starts_cover_the_box_and_begin_with_the_given_one(moved):
-    found = jms.fit_law(jms.LuGre(**TRUTH), moved, tuple(TRUTH), max_steps=1).found
-    assert found is not None
-    problem = found.problem
+    search = jms.fit_law(jms.LuGre(**TRUTH), moved, tuple(TRUTH), max_steps=1).search
+    assert search is not None
+    problem = search.problem
     drawn = MultiStart(64, spread=10.0).starts(problem, problem.x0)
     np.testing.assert_array_equal(drawn[0], problem.x0)
     sigma0 = np.log10(TRUTH["sigma0"] * np.exp(drawn[:, 0]))
@@ -93,8 +92,8 @@ def test_starts_cover_the_box_and_begin_with_the_given_one(moved):
 
 
 def test_a_width_that_comes_down_leads_to_the_fit_with_the_small_one(driven):
-    law = jms.Regularized(jms.Coulomb(0.4), 1e-3)
-    result = jms.fit(sprung(law, 1.3), driven, ("m", "friction.Fc"), q0=[0.0], begin=Continuation("friction.width"))
+    law, narrowing = jms.Regularized(jms.Coulomb(0.4), 1e-3), Continuation("friction.width")
+    result = jms.fit(sprung(law, 1.3), driven, ("m", "friction.Fc"), q0=[0.0], initializer=narrowing)
     assert float(result.model.effects[1].law.width) == pytest.approx(1e-3)  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
     alone = jms.fit(
         replace_numbers(sprung(law), {k: jnp.asarray(x) for k, x in result.values.items()}),
@@ -106,12 +105,12 @@ def test_a_width_that_comes_down_leads_to_the_fit_with_the_small_one(driven):
 
 
 def test_intervals_hold_the_truth_as_often_as_promised(moved):
-    result = jms.fit_law(jms.LuGre(**WRONG), moved, tuple(TRUTH), begin=Staged())
-    covered = coverage(result, 60, begin=Staged())
+    result = jms.fit_law(jms.LuGre(**WRONG), moved, tuple(TRUTH), initializer=Staged())
+    covered = coverage(result, 60, initializer=Staged())
     assert covered.converged >= 58
     # Of 60 draws with 95 % each, fewer than 51 come in one of 2000 cases.
     assert all(share >= 51 / 60 for share in covered.shares.values())
-    narrow = coverage(result, 60, begin=Staged(), level=0.5)
+    narrow = coverage(result, 60, initializer=Staged(), level=0.5)
     assert all(0.25 < share < 0.75 for share in narrow.shares.values())
 
 
@@ -125,12 +124,12 @@ def test_steps_on_a_few_of_many_records_come_near(moved):
         records.append(jms.Record(moved.t, noisy, {"x": x}, name=f"run {i}", noise=0.01))
     start = jms.LuGre(2e4, 40.0, 2.0, 1.5, 2.0, 0.02)
     steps = Stochastic(optax.adam(0.05), batch=3, steps=120)
-    near = jms.fit_law(start, records, ("sigma0", "Fc"), begin=steps, max_steps=1)
+    near = jms.fit_law(start, records, ("sigma0", "Fc"), initializer=steps, max_steps=1)
     for name in near.values:
         assert near.values[name] == pytest.approx(TRUTH[name], rel=0.2)
     assert near.rmse < 0.5 * jms.fit_law(start, records, ("sigma0", "Fc"), max_steps=1).rmse
     with pytest.raises(ValueError, match="draws 20 runs at a time, but there are 12"):
-        jms.fit_law(start, records, ("Fc",), begin=Stochastic(optax.sgd(0.1), batch=20))
+        jms.fit_law(start, records, ("Fc",), initializer=Stochastic(optax.sgd(0.1), batch=20))
 
 
 @pytest.mark.parametrize(
@@ -157,7 +156,7 @@ def test_stiffness_of_measured_loops_agrees_between_halves_of_the_record():
     half, intervals = len(t) // 2, []
     for part in (slice(0, half), slice(half, 2 * half)):
         record = jms.Record(t[part], force[part], {"x": x[part], "normal": normal[part]})
-        intervals.append(jms.fit_law(law, record, ("sigma0", "Fc", "Fba")).intervals()["sigma0"])
+        intervals.append(jms.fit_law(law, record, ("sigma0", "Fc", "Fba")).estimate.intervals()["sigma0"])
     (low, high), (low_2, high_2) = intervals
     assert max(low, low_2) < min(high, high_2)
     assert high - low < 0.03 * low

@@ -117,8 +117,8 @@ CALLS = {
     "fit": Call(
         identify.fit,
         {"scene": SCENE, "records": RECORD, "free": ("m",), "observe": "q[0]", **MOTION, "delay": None, "limits": None,
-         "passive": (), "prior": None, "loss": None, "controller": None, "shooting": None, "begin": (), "substeps": 1,
-         "accuracy": 1e-8, "rtol": 1e-6, "max_steps": 1, "progress": None},
+         "passive": (), "prior": None, "loss": None, "controller": None, "shooting": None, "initializer": (),
+         "substeps": 1, "accuracy": 1e-8, "rtol": 1e-6, "max_steps": 1, "progress": None},
         {"observe": f"observe|{ARITY}", "progress": f"progress|{ARITY}"},
     ),
 }  # fmt: skip
@@ -285,7 +285,7 @@ FOUND = [
     ("fit", "scene", "None", "scene must be a Scene"),
     ("fit", "records", "None", "records must be a Record or several"),
     ("fit", "loss", "text", "loss must be a loss such as"),
-    ("fit", "begin", "text", "begin must be a beginning"),
+    ("fit", "initializer", "text", "initializer must be one such as"),
     ("fit", "rtol", "complex", "rtol must hold real numbers"),
 ]
 

@@ -15,15 +15,7 @@ from jaxmodsim._core.state_dependent import StateDependent
 from jaxmodsim.cli import _behaviour
 from jaxmodsim.friction import AbstractLaw, Dahl, LuGre
 from jaxmodsim.plot import behaviour_figure
-from jaxmodsim.validation.behaviour import (
-    EXPERIMENTS,
-    KNOWN_LIMITATIONS,
-    LawMeasurement,
-    Verdict,
-    known_limitation,
-    law_cases,
-    run_bench,
-)
+from jaxmodsim.validation.behaviour import EXPERIMENTS, LawMeasurement, Verdict, law_cases, run_bench
 from jaxmodsim.validation.behaviour._drive import SAMPLES, path, respond
 from jaxmodsim.validation.behaviour._laws import DEFLECTION, FC, FS, SIGMA0, WIDTH, LawCase
 
@@ -176,12 +168,14 @@ def test_a_run_that_ends_early_fails():
     assert "step limit" in outcome.measured.sentence
 
 
-def test_the_table_of_limitations_names_experiments_and_has_no_idle_entry(outcomes):
-    assert {known.experiment for known in KNOWN_LIMITATIONS} <= set(EXPERIMENTS)
-    earned = {outcome.reason for of in outcomes.values() for outcome in of.values() if outcome.verdict is KNOWN}
-    assert {known.reason for known in KNOWN_LIMITATIONS} <= earned
-    assert known_limitation("passivity", BENCH["LuGre, vd"].law) is None
-    assert known_limitation("creep", BENCH["LuGre, asymmetric"].law) is not None
+def test_limitations_name_experiments_and_every_one_is_missed(outcomes):
+    for name, case in BENCH.items():
+        limitations = case.law.known_limitations()
+        assert set(limitations) <= set(EXPERIMENTS)
+        for experiment in set(limitations) & set(outcomes[name]):
+            assert outcomes[name][experiment].verdict in (KNOWN, NOT), f"{name} keeps the limit of {experiment}"
+    assert "passivity" not in BENCH["LuGre, vd"].law.known_limitations()
+    assert "creep" in BENCH["LuGre, asymmetric"].law.known_limitations()
 
 
 def test_figures_have_a_panel_for_each_law_and_labelled_axes(outcomes):

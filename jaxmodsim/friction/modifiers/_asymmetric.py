@@ -1,7 +1,7 @@
 """Laws whose parameters depend on the direction of slip."""
 
 import dataclasses
-from typing import Any, TypeVar, cast
+from typing import Any, ClassVar, TypeVar, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,8 +11,12 @@ from jaxtyping import Array, Float
 from ..._core.parameters import check_ranges, ranges_of
 from ..._core.state_dependent import StateDependent
 from .._law import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw
+from .._passivity import Passivity
 
 _Law = TypeVar("_Law")
+
+# What other programs lack of an asymmetric law, and what to do.
+_ONE_WAY = "friction that depends on the direction: export the law of one direction, or the mean of both"
 
 
 def _toward(v: Float[Array, ""], law: Any) -> Any:
@@ -45,10 +49,28 @@ class AbstractAsymmetric(AbstractLaw):
         """As the law for positive slip is."""
         return self.forward.stiff
 
+    valid_at_any_speed: ClassVar[bool] = True
+
     @property
     def implied(self) -> dict[str, AbstractLaw]:
         """The law for negative slip, to be checked beside the fields."""
         return {"backward": other_side(self)}
+
+    def formulas(self) -> tuple[str, ...]:
+        """Of the law for positive slip, and what differs for negative slip."""
+        return *self.forward.formulas(), f"{', '.join(self.backward)}: forward for v > 0, backward for v < 0"
+
+    def known_limitations(self) -> dict[str, str]:
+        """Those of the law for positive slip."""
+        return self.forward.known_limitations()
+
+    def mujoco(self) -> str:
+        """MuJoCo's friction is the same in both directions."""
+        return _ONE_WAY
+
+    def modelica(self) -> str:
+        """Modelica's friction is the same in both directions: where the law fits, its table shows whether it is."""
+        return self.forward.modelica() and _ONE_WAY
 
 
 class _AsymmetricForce(AbstractAsymmetric, AbstractForceLaw):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -58,7 +80,6 @@ class _AsymmetricForce(AbstractAsymmetric, AbstractForceLaw):  # pyright: ignore
     backward: dict[str, Any]
 
     def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
-        """Friction force [N] at velocity `v` [m/s]."""
         return _toward(v, self).force(v)
 
 
@@ -69,15 +90,12 @@ class _AsymmetricSetValued(AbstractAsymmetric, AbstractSetValuedLaw):  # pyright
     backward: dict[str, Any]
 
     def sliding_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
-        """Magnitude [N] of the dry part in slip."""
         return _toward(v, self).sliding_force(v)
 
     def viscous_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
-        """Smooth part [N]."""
         return _toward(v, self).viscous_force(v)
 
     def static_limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
-        """Largest force in stick [N] against a load towards `direction`."""
         return _toward(direction, self).static_limit(direction)
 
 
@@ -88,15 +106,12 @@ class _AsymmetricDynamic(AbstractAsymmetric, AbstractDynamicLaw):  # pyright: ig
     backward: dict[str, Any]
 
     def initial_state(self, v: Float[Array, "..."]) -> Any:
-        """State at rest and unloaded."""
         return self.forward.initial_state(v)
 
     def zdot(self, v: Float[Array, ""], z: Any) -> Any:
-        """Time derivative of the state."""
         return _toward(v, self).zdot(v, z)
 
     def force_given_zdot(self, v: Float[Array, ""], z: Any, rate: Any) -> Float[Array, ""]:
-        """Friction force [N]."""
         return _toward(v, self).force_given_zdot(v, z, rate)
 
     def stored_energy(self, z: Any) -> Float[Array, ""]:
@@ -104,8 +119,18 @@ class _AsymmetricDynamic(AbstractAsymmetric, AbstractDynamicLaw):  # pyright: ig
         return self.forward.stored_energy(z)
 
     def step_exact(self, v: Float[Array, ""], z: Any, dt: Float[Array, ""]) -> Any:
-        """State after `dt` [s] at constant velocity."""
         return _toward(v, self).step_exact(v, z, dt)
+
+    def passivity(self) -> Passivity | None:
+        """Each direction by itself, since a deflection towards one side was reached in that direction."""
+        sides = {"positive": self.forward.passivity(), "negative": other_side(self).passivity()}
+        known = {side: answer for side, answer in sides.items() if answer is not None}
+        if not known:
+            return None
+        worse = min(known, key=lambda side: known[side].margin)
+        speed = min(answer.speed for answer in known.values())
+        condition = f"For {worse} slip, the worse direction: {known[worse].condition}"
+        return Passivity(known[worse].ok, known[worse].margin, speed, condition)
 
 
 _KINDS = (

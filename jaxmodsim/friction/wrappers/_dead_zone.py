@@ -1,16 +1,18 @@
 """Karnopp's execution of a set-valued law."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..._core.parameters import Number, parameter
-from .._law import AbstractKarnoppLaw, AbstractSetValuedLaw
-from .._refuse import set_valued_law
+from .._law import AbstractKarnoppLaw, AbstractSetValuedLaw, register_law
+from ._wrapper import AbstractWrapper, set_valued_law
 
 
-class DeadZone(AbstractKarnoppLaw):
+@register_law
+class DeadZone(AbstractWrapper, AbstractKarnoppLaw):
     """A set-valued law run by Karnopp's rule: velocities up to `width` count as rest.
 
     In the band friction equals the load, up to the limit of stick, so that the velocity keeps its value, which need
@@ -41,6 +43,12 @@ class DeadZone(AbstractKarnoppLaw):
     law: AbstractSetValuedLaw = set_valued_law("DeadZone")
     width: Number = parameter("width", "m/s", lower=0.0, strict=True, execution=True)
     stiff: ClassVar[bool] = False
+    description: ClassVar[str] = "Karnopp: velocities up to `width` count as rest"
+    equations: ClassVar[tuple[str, ...]] = ("sliding_force(v) sign(v) + viscous_force(v) beyond the band",)
+    execution: ClassVar[str] = "fixed step `dt=`"
+    # One step changes the velocity of 1 kg under 1 N by half of the band, which is twice the width.
+    example: ClassVar[Mapping[str, float]] = {"width": 1e-4}
+    example_step: ClassVar[float | None] = 1e-4
 
     def holds(self, v: Float[Array, ""]) -> Bool[Array, ""]:
         """Whether `v` [m/s] lies in the band, edges included."""

@@ -7,16 +7,17 @@ from jaxtyping import Array, Float
 
 from ..._core.parameters import Number, parameter
 from ..._core.safe import bounded_ratio
-from .._law import AbstractForceLaw, AbstractSetValuedLaw
-from .._refuse import set_valued_law
+from .._law import AbstractForceLaw, AbstractSetValuedLaw, register_law
+from ._wrapper import AbstractWrapper, set_valued_law
 
 
-class Regularized(AbstractForceLaw):
-    """A set-valued law made smooth over a stated width: `F = dry(v) tanh(v/width) + wet(v)`.
+@register_law
+class Regularized(AbstractWrapper, AbstractForceLaw):
+    """A set-valued law made smooth over a stated width: `F = sliding_force(v) tanh(v/width) + viscous_force(v)`.
 
-    A load below the limit creeps at about `width * load/limit` instead of resting, and the equations become
-    stiff at the rate `dry(0)/(m width)`. Where the limit of stick is above the slip force at zero velocity (`Coulomb`
-    with `Fs`), the force passes through a smooth hump about `2 width` wide.
+    A load below the limit creeps at about `width * load/static_limit` instead of resting, and the equations become
+    stiff at the rate `sliding_force(0)/(m width)`. Where the limit of stick is above the slip force at zero velocity
+    (`Coulomb` with `Fs`), the force passes through a smooth hump about `2 width` wide.
 
     **Arguments:**
 
@@ -31,6 +32,15 @@ class Regularized(AbstractForceLaw):
     law: AbstractSetValuedLaw = set_valued_law("Regularized")
     width: Number = parameter("width", "m/s", lower=0.0, strict=True, execution=True)
     stiff: ClassVar[bool] = True
+    description: ClassVar[str] = "smooth over `width`; creeps below the limit"
+    equations: ClassVar[tuple[str, ...]] = ("sliding_force(v) tanh(v/width) + viscous_force(v)",)
+    execution: ClassVar[str] = "default solver `Rodas5P`"
+    valid_at_any_speed: ClassVar[bool] = True
+
+    def formulas(self) -> tuple[str, ...]:
+        """Of the law inside, with its sign made smooth."""
+        first, *rest = self.law.formulas()
+        return first.replace("sign(v)", "tanh(v/width)"), *rest, f"width = {float(self.width):.4g} m/s"
 
     def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         """Friction force [N] at velocity `v` [m/s]."""

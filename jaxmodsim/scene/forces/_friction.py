@@ -26,6 +26,7 @@ from ...friction import (
     AbstractPlanarLaw,
     AbstractSetValuedLaw,
     Curve,
+    laws,
 )
 from ._effect import AbstractEffect, Action, Power
 
@@ -37,8 +38,7 @@ def _law(law: Any) -> AbstractLaw:
         return Curve(law)
     given = repr(law) if isinstance(law, str) else f"the class {law.__name__}" if isinstance(law, type) else repr(law)
     raise ValueError(
-        f"Friction needs a law or a function of slip velocity, but {given} was given. Known laws: Viscous, Coulomb,"
-        " Stribeck, Dahl, LuGre, ElastoPlastic, MaxwellSlip, Armstrong; wrappers: Regularized, DeadZone, Sign."
+        f"Friction needs a law or a function of slip velocity, but {given} was given. Known laws: {', '.join(laws())}."
     )
 
 

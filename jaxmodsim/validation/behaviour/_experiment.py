@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from ...simulation import SimulationError
 from ._laws import LawCase
-from ._limitations import known_limitation
 from ._result import ExperimentResult, LawMeasurement, Threshold, Verdict
 
 
@@ -38,8 +37,8 @@ class Experiment:
     def __call__(self, case: LawCase) -> ExperimentResult:
         """Do the experiment on a law and judge what comes out.
 
-        A number beyond the threshold is a failure, unless `KNOWN_LIMITATIONS` says why such a law must miss it. A law
-        of that table that keeps the threshold passes. A run that ends early is a failure.
+        A number beyond the threshold is a failure, unless the law says why it must miss it (`known_limitations`). A law
+        that says so and keeps the threshold passes. A run that ends early is a failure.
         """
         try:
             measured = self.measure(case)
@@ -49,5 +48,5 @@ class Experiment:
             return ExperimentResult(Verdict.NOT_APPLICABLE, measured, measured.sentence)
         if self.threshold.keeps(measured.number):
             return ExperimentResult(Verdict.PASS, measured)
-        reason = known_limitation(self.name, case.law)
+        reason = case.law.known_limitations().get(self.name)
         return ExperimentResult(Verdict.FAIL if reason is None else Verdict.KNOWN_LIMITATION, measured, reason or "")

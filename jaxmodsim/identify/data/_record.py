@@ -1,0 +1,354 @@
+"""Measured records: samples, windows as arrays of one shape, and positions differentiated."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
+from typing import NamedTuple, TypeAlias
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from ..._core.arguments import as_float, as_label, as_mapping, as_names, as_reals
+
+# Samples of one channel, shape `[samples]`.
+Column: TypeAlias = ArrayLike | Sequence[object]
+# Name of a single channel that was given none.
+SINGLE = "measured"
+# Samples at the beginning of a record, from which position and velocity are estimated.
+_SAMPLES = 20
+# Smoothing: one sample to either side for so many of the record, and never fewer than so many to either side.
+_SAMPLES_A_SIDE, _LEAST_SPAN = 1000, 3
+
+
+class Record:
+    """Samples of a measurement: what was measured, and the inputs that drove the machine.
+
+    **Arguments:**
+
+    - `t`: times of the samples [s], increasing, shape `[samples]`, at least two.
+    - `measured`: measured output at these times, shape `[samples]`; or several by name, `{"x": ..., "force": ...}`.
+    - `inputs`: inputs by name, shape `[samples]` each. In a fit an input drives the entry of the scene's `params` of
+      the same name.
+    - `name`: for figures and tables.
+    - `linear`: names of the inputs that run in straight lines from sample to sample; the others are held until the
+      next.
+    - `noise`: standard deviation of the noise of each channel by its name, in its unit, > 0; one number where there is
+      one channel. A fit estimates those that are not given. That of slip instants is `"friction slips"`.
+    - `slips`: instants [s] at which friction elements broke away, by the name of the effect in the scene, increasing.
+
+    **Raises:**
+
+    - `ValueError` naming the column and the first sample at fault, for NaN, times that do not increase, or lengths
+      that differ.
+    """
+
+    t: Float[np.ndarray, " samples"]
+    channels: dict[str, Float[np.ndarray, " samples"]]
+    inputs: dict[str, Float[np.ndarray, " samples"]]
+    name: str
+    linear: frozenset[str]
+    noise: dict[str, float]
+    slips: dict[str, Float[np.ndarray, " instants"]]
+
+    def __init__(
+        self,
+        t: Column,
+        measured: Column | Mapping[str, Column],
+        inputs: Mapping[str, Column] | None = None,
+        name: str = "record",
+        *,
+        linear: Iterable[str] = (),
+        noise: float | Mapping[str, float] | None = None,
+        slips: Mapping[str, Column] | None = None,
+    ):
+        name = as_label(name, name="name") or "record"
+        outputs = dict(measured) if isinstance(measured, Mapping) else {SINGLE: measured}
+        inputs = as_mapping(inputs, name="inputs", example="{'u': force}")
+        slips = as_mapping(slips, name="slips", example="{'friction': [0.5, 1.5]}")
+        if not outputs:
+            raise ValueError(f"{name}: measured must hold one channel at least.")
+        self.t = _column(t, "t", None, name)
+        shape = self.t.shape
+        self.channels = {label: _column(column, label, shape, name) for label, column in outputs.items()}
+        self.inputs = {label: _column(column, label, shape, name) for label, column in inputs.items()}
+        self.name, self.linear = name, frozenset(as_names(linear, name="linear"))
+        unknown = self.linear - set(self.inputs)
+        if unknown:
+            raise ValueError(f"{name}: linear names {sorted(unknown)}, but the inputs are {list(self.inputs)}.")
+        stalls = np.flatnonzero(np.diff(self.t) <= 0)
+        if stalls.size:
+            k = int(stalls[0])
+            raise ValueError(
+                f"{name}: times must increase, but sample {k + 1} at t = {self.t[k + 1]} s follows sample {k} at"
+                f" t = {self.t[k]} s."
+            )
+        self.slips = {effect: _instants(instants, effect, self.t, name) for effect, instants in slips.items()}
+        self.noise = self._levels(noise)
+
+    def _levels(self, noise: float | Mapping[str, float] | None) -> dict[str, float]:
+        known = (*self.channels, *(slip_channel(effect) for effect in self.slips))
+        if noise is None:
+            return {}
+        if not isinstance(noise, Mapping):
+            if len(known) > 1:
+                raise ValueError(f"{self.name}: noise must name its channels, {', '.join(known)}; it is {noise!r}.")
+            noise = dict.fromkeys(known, noise)
+        for channel in noise:
+            if channel not in known:
+                raise ValueError(f"{self.name}: noise names {channel!r}, but the channels are: {', '.join(known)}.")
+        return {
+            channel: as_float(level, name=f"{self.name}: noise of {channel!r}", lower=0.0)
+            for channel, level in noise.items()
+        }
+
+    @property
+    def measured(self) -> Float[np.ndarray, " samples"]:
+        """The one channel of a record that has one.
+
+        **Raises:**
+
+        - `ValueError` if it has several: take them from `channels`.
+        """
+        if len(self.channels) > 1:
+            raise ValueError(f"{self.name} has the channels {', '.join(self.channels)}: say which.")
+        return next(iter(self.channels.values()))
+
+    def part(self, start: float, end: float, name: str | None = None) -> "Record":
+        """The samples from `start` to `end` [s], both included; times stay as they are.
+
+        **Raises:**
+
+        - `ValueError` if fewer than two samples lie there.
+        """
+        start, end = as_float(start, name="start"), as_float(end, name="end")
+        inside = np.flatnonzero((self.t >= start) & (self.t <= end))
+        if inside.size < 2:
+            raise ValueError(
+                f"{self.name} has {inside.size} samples from start = {start:g} to end = {end:g} s; two are needed."
+            )
+        return self.samples(int(inside[0]), int(inside[-1]) + 1, name)
+
+    def samples(self, first: int, last: int, name: str | None = None) -> "Record":
+        """Samples `first` up to, and without, `last`."""
+        keep = slice(first, last)
+        t = self.t[keep]
+        slips = {effect: instants[(instants >= t[0]) & (instants <= t[-1])] for effect, instants in self.slips.items()}
+        return Record(
+            t,
+            {label: x[keep] for label, x in self.channels.items()},
+            {label: x[keep] for label, x in self.inputs.items()},
+            as_label(name, name="name") or self.name,
+            linear=self.linear,
+            noise=self.noise,
+            slips=slips,
+        )
+
+    def windows(self, seconds: float) -> tuple["Record", ...]:
+        """Cut into windows of this length [s], the last one shorter; none shorter than a quarter of it.
+
+        **Raises:**
+
+        - `ValueError` if a window would hold fewer than two samples.
+        """
+        seconds = as_float(seconds, name="seconds", lower=0.0)
+        parts = min(float(self.t[-1] - self.t[0]) / seconds, float(len(self.t)))  # which is too many already
+        count = max(round(parts), 1)
+        if 2 * count > len(self.t):
+            raise ValueError(
+                f"{self.name}: windows of {seconds} s cannot be cut from {len(self.t)} samples over"
+                f" {self.t[-1] - self.t[0]:g} s."
+            )
+        edges = np.linspace(0, len(self.t), count + 1).astype(int)
+        return tuple(self.samples(int(a), int(b), f"{self.name}[{i}]") for i, (a, b) in enumerate(pairwise(edges)))
+
+    def __repr__(self) -> str:
+        inputs, channels = ", ".join(self.inputs) or "none", ", ".join(self.channels)
+        return (
+            f"Record({self.name!r}, {len(self.t)} samples, {self.t[0]:g} to {self.t[-1]:g} s, channels: {channels},"
+            f" inputs: {inputs})"
+        )
+
+
+def slip_channel(effect: str) -> str:
+    """Name of the channel of an effect's slip instants."""
+    return f"{effect} slips"
+
+
+def _column(column: Column, label: str, shape: tuple[int, ...] | None, name: str) -> Float[np.ndarray, " samples"]:
+    """One column, converted and checked."""
+    array = as_reals(column, name=f"{name}: column {label!r}")
+    if array.ndim != 1 or array.shape[0] < 2 or shape not in (None, array.shape):
+        others = "" if shape is None else f" 't' has {shape} and"
+        raise ValueError(
+            f"{name}: columns must have one shape [samples] with two samples or more, but{others} {label!r} has"
+            f" {array.shape}."
+        )
+    bad = np.flatnonzero(~np.isfinite(array))
+    if bad.size:
+        raise ValueError(
+            f"{name}: column {label!r} has {bad.size} values that are not finite, the first in sample {bad[0]}"
+            f" ({array[bad[0]]}). Remove or fill them first."
+        )
+    return array
+
+
+def _instants(instants: Column, effect: str, t: np.ndarray, name: str) -> Float[np.ndarray, " instants"]:
+    array = (
+        as_reals(instants, name=f"{name}: slips of {effect!r}")
+        if np.size(np.asarray(instants, object))
+        else np.zeros(0)
+    )
+    fine = array.ndim == 1 and bool(np.isfinite(array).all() and (np.diff(array) > 0).all())
+    if not (fine and (array.size == 0 or (array[0] >= t[0] and array[-1] <= t[-1]))):
+        raise ValueError(
+            f"{name}: slips of {effect!r} must be increasing times within [{t[0]:g}, {t[-1]:g}] s, shape [instants],"
+            f" but they are {instants!r}."
+        )
+    return array
+
+
+class Runs(NamedTuple):
+    """Records, or windows of them, padded to the same length, with a leading axis of runs.
+
+    - `t`: times [s]; the last one is repeated where a run is shorter than the longest.
+    - `inputs`, `measured`: by name. `weight`: 1 where a sample counts, 0 where not, by channel.
+    - `slips`: instants by effect, `slip_weight` their weights.
+    """
+
+    t: Float[Array, "runs samples"]
+    inputs: dict[str, Float[Array, "runs samples"]]
+    measured: dict[str, Float[Array, "runs samples"]]
+    weight: dict[str, Float[Array, "runs samples"]]
+    slips: dict[str, Float[Array, "runs instants"]]
+    slip_weight: dict[str, Float[Array, "runs instants"]]
+
+
+class Windows(NamedTuple):
+    """Where the runs come from.
+
+    - `record`, `first`, `last`: index of the record and its samples `first` to `last`, of each run; the last sample
+      is also the first of the next run where `linked`.
+    - `linked`: whether the next run goes on from the end of this one, shape `[runs - 1]`.
+    """
+
+    record: tuple[int, ...]
+    first: tuple[int, ...]
+    last: tuple[int, ...]
+    linked: Bool[np.ndarray, " links"]
+
+
+def cut(records: tuple[Record, ...], window: float | None) -> Windows:
+    """Whole records, or windows of nearly this length [s]; each ends with the first sample of the next.
+
+    **Raises:**
+
+    - `ValueError` if the window is shorter than two samples.
+    """
+    record, first, last, linked = [], [], [], []
+    steps = None
+    if window is not None:
+        span = max(float(np.median(np.diff(each.t))) for each in records)
+        if not (np.isfinite(window) and window >= 2 * span):
+            raise ValueError(f"A window must be at least two samples, {2 * span:g} s, long, but it is {window} s.")
+        steps = round(window / span)
+    for i, each in enumerate(records):
+        samples = len(each.t)
+        edges = [0, samples - 1] if steps is None else [*range(0, samples - 1, steps), samples - 1]
+        if len(edges) > 2 and edges[-1] - edges[-2] < (steps or 0) // 4:
+            del edges[-2]  # too short to say anything about its own start
+        for a, b in pairwise(edges):
+            record.append(i)
+            first.append(a)
+            last.append(b)
+            linked.append(b != edges[-1])
+    return Windows(tuple(record), tuple(first), tuple(last), np.array(linked[:-1], bool))
+
+
+def runs_of(records: tuple[Record, ...], windows: Windows) -> Runs:
+    """The samples of the windows as arrays of one shape."""
+    longest = max(b - a for a, b in zip(windows.first, windows.last, strict=True)) + 1
+    channels = list(dict.fromkeys(channel for record in records for channel in record.channels))
+    effects = list(dict.fromkeys(effect for record in records for effect in record.slips))
+    parts = [records[i].samples(a, b + 1) for i, a, b in zip(windows.record, windows.first, windows.last, strict=True)]
+    continues = [*windows.linked.tolist(), False]
+    instants = max((len(x) for part in parts for x in part.slips.values()), default=0)
+
+    def column(values: Sequence[np.ndarray] | np.ndarray) -> Array:
+        return jnp.asarray(np.stack(list(values)))
+
+    def pad(x: np.ndarray) -> np.ndarray:
+        return np.pad(x, (0, longest - len(x)), mode="edge")
+
+    def counts(part: Record, channel: str, goes_on: bool) -> np.ndarray:
+        # The sample that two windows share counts in the later one.
+        own = len(part.t) - int(goes_on)
+        return np.where(np.arange(longest) < own, float(channel in part.channels), 0.0)
+
+    def times(part: Record, effect: str) -> np.ndarray:
+        instants_by_effect = part.slips.get(effect, np.zeros(0))
+        return np.pad(instants_by_effect, (0, instants - len(instants_by_effect)), constant_values=np.inf)
+
+    instants_by_effect = {effect: np.stack([times(part, effect) for part in parts]) for effect in effects}
+    zero = np.zeros(longest)
+    return Runs(
+        column([pad(part.t) for part in parts]),
+        {name: column([pad(part.inputs[name]) for part in parts]) for name in parts[0].inputs},
+        {
+            name: column([pad(part.channels[name]) if name in part.channels else zero for part in parts])
+            for name in channels
+        },
+        {
+            name: column([counts(part, name, goes_on) for part, goes_on in zip(parts, continues, strict=True)])
+            for name in channels
+        },
+        {name: column(np.where(np.isfinite(x), x, 0.0)) for name, x in instants_by_effect.items()},
+        {name: column(np.isfinite(x).astype(float)) for name, x in instants_by_effect.items()},
+    )
+
+
+class SmoothedMotion(NamedTuple):
+    """A smoothed motion, shape `[samples]` each, and how many samples at either end the smoothing spoils."""
+
+    x: Float[np.ndarray, " samples"]
+    v: Float[np.ndarray, " samples"]
+    a: Float[np.ndarray, " samples"]
+    edge: int
+
+
+def smooth(x: Float[np.ndarray, " samples"], span: int) -> Float[np.ndarray, " samples"]:
+    """Weighted mean over `span` samples to either side."""
+    from scipy.signal import convolve, windows  # most of a second to import, and only needed here
+
+    kernel = windows.hann(2 * span + 3)[1:-1]
+    return convolve(np.pad(x, span, mode="edge"), kernel / kernel.sum(), mode="valid", method="direct")
+
+
+def smooth_span(samples: int) -> int:
+    """Samples to either side over which a record of so many is smoothed."""
+    return max(samples // _SAMPLES_A_SIDE, _LEAST_SPAN)
+
+
+def differentiate(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> SmoothedMotion:
+    """Velocity and acceleration of a position, smoothed before either differentiation."""
+    span = smooth_span(len(t))
+    position = smooth(x, span)
+    v = smooth(np.gradient(position, t), span)
+    return SmoothedMotion(position, v, np.gradient(v, t), 3 * span)
+
+
+def start_state(record: Record, channel: str | None = None) -> tuple[float, float]:
+    """Position and velocity at the first sample, by a parabola through the first 20.
+
+    **Arguments:**
+
+    - `record`: its `channel`, by default the only one, is a position [m or rad].
+
+    **Returns:**
+
+    Position and velocity.
+    """
+    x = record.measured if channel is None else record.channels[channel]
+    count = min(_SAMPLES, len(record.t))
+    t = record.t[:count] - record.t[0]
+    coefficients = np.polynomial.polynomial.polyfit(t, x[:count], min(2, count - 1))
+    return float(coefficients[0]), float(coefficients[1])

@@ -1,0 +1,384 @@
+"""From a scene, records and what is asked to the arrays of a `FitProblem`."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, ArrayLike
+
+from ..._core.arguments import as_float, as_names, as_reals
+from ..._core.parameters import Range, check_ranges, modules_of
+from ...scene import Scene, State, check_scene, scene_numbers, scene_ranges
+from ..data._record import Record, Windows, cut, runs_of, slip_channel, start_state
+from ..model._engines import DELAY, Controller, EventEngine, ReplayEngine
+from ..model._observe import Observable, by_channel, check_observables, first_coordinate
+from ..model._parameters import FreeParameters, chosen_entries, split_entries, split_ranges
+from ._problem import AbstractLoss, FitProblem, Prior, local_names
+from ._search import SearchResult, channels_seen
+
+# Mode changes of one run by events that the arrays of a fit have room for.
+_MAX_EVENTS = 1024
+# Absolute tolerance of runs by events against the relative one.
+_ATOL_SHARE = 1e-3
+# How many times more integration steps show what the step makes of the output.
+_FINER = 4
+
+# Coordinates or velocities at the first sample, shape `[dof]` or `[records, dof]`.
+StartState: TypeAlias = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]]
+
+
+@dataclass(frozen=True)
+class MultipleShooting:
+    """Multiple shooting: a record is run in windows, each from a state of its own that is fitted, too.
+
+    For records so long, or motions so unstable, that a run from the first sample to the last loses its way.
+
+    **Arguments:**
+
+    - `window`: length [s].
+    - `jump`: standard deviations of the jumps of positions [m or rad] and of velocities [m/s or rad/s] from the end of
+      one window to the start of the next, both > 0: what the model may have wrong over one window, and what is given
+      to disturbances. The states of friction laws count as positions. None: the windows know nothing of each other, and
+      friction laws start unloaded.
+    """
+
+    window: float
+    jump: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse jumps that are not positive."""
+        if self.jump is not None and not (len(self.jump) == 2 and all(np.isfinite(x) and x > 0 for x in self.jump)):
+            raise ValueError(f"jump must be two numbers > 0, of positions and of velocities, but it is {self.jump!r}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What `fit` was asked for, beside scene, records and names; see there."""
+
+    observe: Observable | Mapping[str, Observable]
+    q0: StartState | None
+    qd0: StartState | None
+    limits: Mapping[str, tuple[float | None, float | None]]
+    loss: AbstractLoss
+    substeps: int
+    accuracy: float
+    delay: Mapping[str, float] = field(default_factory=dict)
+    passive: tuple[str, ...] = ()
+    prior: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    controller: Controller | None = None
+    shooting: MultipleShooting | None = None
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A problem, the records and windows behind it, units by name, and the channels whose noise was given."""
+
+    problem: FitProblem
+    records: tuple[Record, ...]
+    windows: Windows
+    units: dict[str, str]
+    given: frozenset[str]
+
+
+def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str], settings: Settings) -> Prepared:
+    """Check everything and build the problem.
+
+    **Raises:**
+
+    - `ValueError` as `fit` does.
+    """
+    several = _several(records)
+    _check_inputs(scene, several)
+    for _, module in modules_of(scene):
+        check_ranges(module)
+    states = _states(scene, several, settings)
+    observables = by_channel(settings.observe, several)
+    check_observables(observables, scene, jax.tree.map(lambda x: x[0], states))
+    own = local_names(jax.tree.map(lambda x: x[0], states))
+    local, shared = _sorted_out(free, own)
+    if settings.shooting is not None:
+        shot = settings.shooting
+        local = tuple(name for name in own if shot.jump is not None or not name.startswith("z0"))
+    numbers, ranges = _numbers(scene, several, settings)
+    single = split_entries(numbers)
+    whole = scene_numbers(scene)
+    chosen = shared if isinstance(shared, str) else chosen_entries({**whole, **numbers}, shared)
+    driven = sorted(set(chosen) & set(several[0].inputs))
+    if driven:
+        raise ValueError(f"{driven[0]} is driven by the record and cannot be free.")
+    parameters = FreeParameters.of(single, ranges, chosen, _passive(settings.passive, numbers))
+    windows = cut(several, None if settings.shooting is None else settings.shooting.window)
+    base = _bases(scene, several, windows, states, observables)
+    engine = _engine(scene, several, settings, observables)
+    names = (*dict(observables), *(slip_channel(x) for x in dict.fromkeys(e for r in several for e in r.slips)))
+    noise = {name: jnp.asarray(_level(name, several)) for name in names}
+    problem = FitProblem(
+        engine,
+        parameters,
+        local,
+        base,
+        runs_of(several, windows),
+        noise,
+        settings.loss,
+        _prior(settings.prior, parameters.names),
+        _jump(settings.shooting, windows, base),
+    )
+    given = frozenset(name for record in several for name in record.noise)
+    units = {name: allowed.unit for name, allowed in ranges.items()}
+    return Prepared(problem, several, windows, units, given)
+
+
+def _several(records: object) -> tuple[Record, ...]:
+    several = (records,) if isinstance(records, Record) else records
+    if not isinstance(several, tuple | list) or not several or not all(isinstance(x, Record) for x in several):
+        raise ValueError(f"records must be a Record or several of them, but {records!r} was given.")
+    names = [record.name for record in several]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"Two records have the name {name!r}; pass name= to tell them apart.")
+    first = several[0]
+    for record in several[1:]:
+        if set(record.inputs) != set(first.inputs) or record.linear != first.linear:
+            raise ValueError(
+                f"All records need the same inputs: {first.name} has {list(first.inputs)}, {record.name} has"
+                f" {list(record.inputs)}."
+            )
+    return tuple(several)
+
+
+def _check_inputs(scene: Scene, records: tuple[Record, ...]) -> None:
+    inputs = records[0].inputs
+    if inputs and (not isinstance(scene.params, dict) or not set(inputs) <= set(scene.params)):
+        have = ", ".join(scene.params) if isinstance(scene.params, dict) else "no dict"
+        raise ValueError(f"The record's inputs ({', '.join(inputs)}) must be entries of the scene's params ({have}).")
+    for record in records:
+        for effect in record.slips:
+            if effect not in scene.event_driven:
+                raise ValueError(
+                    f"{record.name} has slip instants of {effect!r}, but the effects that run by events are:"
+                    f" {', '.join(scene.event_driven) or 'none'}."
+                )
+
+
+def _states(scene: Scene, records: tuple[Record, ...], settings: Settings) -> State:
+    """Initial states of the records, with a leading axis of records."""
+    count = len(records)
+    given = {"q0": settings.q0, "qd0": settings.qd0}
+    given = {name: x if x is None else as_reals(x, name=name) for name, x in given.items()}
+    sizes = {np.shape(x)[-1] for x in given.values() if x is not None and np.ndim(x) > 0}
+    dof = max(sizes, default=1)
+    observables = by_channel(settings.observe, records)
+    starts = []
+    for name, value in given.items():
+        if value is None and name == "q0":
+            value = np.stack([measured_start(record, observables, dof, exact=True)[0] for record in records])
+        array = np.zeros(dof) if value is None else value
+        fine = array.shape in ((dof,), (count, dof)) and np.isfinite(array).all()
+        if not fine:
+            raise ValueError(
+                f"q0 and qd0 must be finite and of one shape [dof] or [records, dof], but q0 = {settings.q0} and"
+                f" qd0 = {settings.qd0}."
+            )
+        starts.append(np.broadcast_to(array, (count, dof)))
+    q, qd = (jnp.asarray(x, float) for x in starts)
+    state = State(q[0], qd[0], scene.initial_state(q[0]))
+    check_scene(scene, state)
+    return jax.vmap(lambda q, qd: State(q, qd, scene.initial_state(q)))(q, qd)
+
+
+def _sorted_out(free: Sequence[str], own: tuple[str, ...]) -> tuple[tuple[str, ...], Sequence[str]]:
+    """Names of initial states among `free`, and the others."""
+    if isinstance(free, str):
+        return (), free  # refused where it is used
+    free = as_names(free, name="free")
+    local: list[str] = []
+    shared: list[str] = []
+    for name in free:
+        entries = [each for each in own if each == name or each.split("[")[0].split(".")[0] == name]
+        (local.extend(entries) if entries else shared.append(name))
+    return tuple(local), tuple(shared)
+
+
+def _numbers(
+    scene: Scene, records: tuple[Record, ...], settings: Settings
+) -> tuple[dict[str, Array], dict[str, Range]]:
+    """All numbers that may be free, delays included, and their ranges, entry by entry."""
+    whole = scene_numbers(scene)
+    ranges = split_ranges(whole, scene_ranges(scene))
+    delays = {name: settings.delay.get(name, 0.0) for name in records[0].inputs}
+    for name, given in settings.delay.items():
+        late = as_float(given, name=f"delay of {name!r}")
+        if name not in delays or late < 0:
+            raise ValueError(
+                f"delay of {name!r} is {late!r}, but it must be a time >= 0 of one of the inputs"
+                f" {', '.join(delays) or '(there are none)'}."
+            )
+    numbers = split_entries(whole) | {DELAY + name: jnp.asarray(late, float) for name, late in delays.items()}
+    ranges |= {DELAY + name: Range("s", 0.0) for name in delays}
+    for name, span in settings.limits.items():
+        low, high = _limits(name, span)
+        if name not in numbers:
+            raise ValueError(f"limits: {name} is no number of the scene; there are: {', '.join(numbers)}.")
+        declared = ranges.get(name, Range(""))
+        if isinstance(declared.lower, str) and low is not None:
+            raise ValueError(f"limits: {name} is limited by {declared.lower} already.")
+        if low is not None and (declared.lower is None or float(low) >= float(declared.lower)):
+            declared = replace(declared, lower=float(low), strict=low == 0)
+        if high is not None and (declared.upper is None or float(high) <= declared.upper):
+            declared = replace(declared, upper=float(high))
+        ranges[name] = declared
+        if not isinstance(declared.lower, str) and not bool(declared.holds(numbers[name], {})):
+            raise ValueError(f"limits: {name} must be {declared.text}, but it is {numbers[name]}.")
+    return numbers, ranges
+
+
+def _passive(effects: tuple[str, ...], numbers: Mapping[str, Array]) -> dict[str, tuple[str, str, str]]:
+    floors = {}
+    for effect in effects:
+        sigma1, Fs, Fc = (f"{effect}.{name}" for name in ("sigma1", "Fs", "Fc"))
+        missing = [name for name in (f"{effect}.sigma2", sigma1, Fs, Fc) if name not in numbers]
+        if missing:
+            raise ValueError(f"passive names {effect!r}, but there is no {missing[0]}: it must have a LuGre law.")
+        floors[f"{effect}.sigma2"] = (sigma1, Fs, Fc)
+    return floors
+
+
+def _bases(
+    scene: Scene,
+    records: tuple[Record, ...],
+    windows: Windows,
+    states: State,
+    observables: tuple[tuple[str, Observable], ...],
+) -> State:
+    """Initial state of each run: that of its record, or what was measured where a window begins."""
+    dof = states.q.shape[1]
+    q, qd = [], []
+    for i, first in zip(windows.record, windows.first, strict=True):
+        if first == 0:
+            q.append(np.asarray(states.q[i]))
+            qd.append(np.asarray(states.qd[i]))
+            continue
+        rest = records[i].samples(first, len(records[i].t))
+        start = measured_start(rest, observables, dof, exact=False)
+        q.append(start[0])
+        qd.append(start[1])
+    return jax.vmap(lambda q, qd: State(q, qd, scene.initial_state(q)))(
+        jnp.asarray(np.stack(q)), jnp.asarray(np.stack(qd))
+    )
+
+
+def _engine(
+    scene: Scene,
+    records: tuple[Record, ...],
+    settings: Settings,
+    observables: tuple[tuple[str, Observable], ...],
+) -> ReplayEngine | EventEngine:
+    linear = records[0].linear
+    delays = {DELAY + name: jnp.asarray(late, float) for name, late in settings.delay.items()}
+    if not scene.event_driven:
+        return ReplayEngine(scene, delays, settings.controller, observables, linear, settings.substeps)
+    if settings.controller is not None:
+        raise ValueError(
+            f"A controller runs with fixed steps, but {', '.join(scene.event_driven)} runs by events: wrap the law,"
+            " as in Regularized(law, width)."
+        )
+    slips = tuple(dict.fromkeys(effect for record in records for effect in record.slips))
+    return EventEngine(
+        scene, delays, observables, linear, slips, settings.accuracy, _ATOL_SHARE * settings.accuracy, _MAX_EVENTS
+    )
+
+
+def _level(channel: str, records: tuple[Record, ...]) -> float:
+    """Noise level that was given, or to begin with how much the channel changes at all."""
+    given = [record.noise[channel] for record in records if channel in record.noise]
+    if given:
+        if len(set(given)) > 1:
+            raise ValueError(f"noise of {channel!r} differs between the records: {given}. Give one for all of them.")
+        return given[0]
+    values = [record.channels[channel] for record in records if channel in record.channels]
+    # Of instants, what they would be off by if each came one sample late.
+    size = float(np.std(np.concatenate(values))) if values else float(np.median(np.diff(records[0].t)))
+    return size or 1.0
+
+
+def _limits(name: str, span: object) -> tuple[float | None, float | None]:
+    """Lower and upper limit of a number, either of which may be None."""
+    if not isinstance(span, tuple | list) or len(span) != 2:
+        raise ValueError(
+            f"limits of {name!r} must be (lower, upper), None for none, as in (0.0, None), but {span!r} was given."
+        )
+    low, high = (None if x is None else as_float(x, name=f"limits of {name!r}") for x in span)
+    return low, high
+
+
+def _prior(prior: Mapping[str, tuple[float, float]], names: tuple[str, ...]) -> Prior:
+    for name, given in prior.items():
+        if name not in names:
+            raise ValueError(f"prior names {name!r}, but the free parameters are: {', '.join(names)}.")
+        pair = isinstance(given, tuple | list) and len(given) == 2
+        deviation = [as_float(x, name=f"prior of {name!r}") for x in given][1] if pair else 0.0
+        if not deviation > 0:
+            raise ValueError(f"prior of {name} must be a mean and a standard deviation > 0, but it is {prior[name]}.")
+    return Prior(
+        jnp.asarray([float(prior[name][0]) if name in prior else 0.0 for name in names]),
+        jnp.asarray([1 / float(prior[name][1]) if name in prior else 0.0 for name in names]),
+    )
+
+
+def _jump(shooting: MultipleShooting | None, windows: Windows, base: State) -> Array | None:
+    if shooting is None or shooting.jump is None or not windows.linked.size:
+        return None
+    position, velocity = shooting.jump
+    first = jax.tree.map(lambda x: x[0], base)
+    sizes = State(
+        jnp.full_like(first.q, position),
+        jnp.full_like(first.qd, velocity),
+        jax.tree.map(lambda x: jnp.full_like(x, position), first.z),
+    )
+    flat, _ = ravel_pytree(sizes)
+    return jnp.asarray(windows.linked, float)[:, None] / flat[None, :]
+
+
+def step_error(search: SearchResult) -> float | None:
+    """Root mean square by which the model's output moves with four times as many integration steps, over the noise.
+
+    None where there are no such steps, or several channels.
+    """
+    problem = search.problem
+    if not isinstance(problem.engine, ReplayEngine) or len(problem.noise) > 1:
+        return None
+    engine = problem.engine
+    finer = ReplayEngine(
+        engine.model, engine.delays, engine.controller, engine.observables, engine.linear, _FINER * engine.substeps
+    )
+    fine = channels_seen(eqx.tree_at(lambda p: p.engine, problem, finer), search.state.x)
+    name, weight = next(iter(problem.columns.items()))
+    coarse = jnp.reshape(search.state.residual[: problem.samples], weight.shape) * problem.noise[name]
+    moved = jnp.where(weight > 0, fine[name] - problem.runs.measured[name] - coarse, 0.0)
+    return float(jnp.sqrt(jnp.sum(moved**2) / jnp.sum(weight)))
+
+
+def measured_start(
+    record: Record, observables: tuple[tuple[str, Observable], ...], dof: int, *, exact: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates and velocities at the first sample, as far as they were measured; the others are zero.
+
+    With `exact` the position is the first sample and the velocity zero.
+    """
+    q, qd = np.zeros(dof), np.zeros(dof)
+    for channel, observable in observables:
+        if channel not in record.channels:
+            continue
+        for i in range(dof):
+            if observable == f"q[{i}]" or (i == 0 and observable is first_coordinate):
+                q[i], qd[i] = (record.channels[channel][0], 0.0) if exact else start_state(record, channel)
+    for channel, observable in observables:
+        for i in range(dof):
+            if channel in record.channels and observable == f"qd[{i}]":
+                qd[i] = record.channels[channel][0]
+    return q, qd

@@ -1,0 +1,321 @@
+"""The problem of a fit as arrays: coordinates in, weighted residuals and their Jacobian out; what residuals cost."""
+
+import abc
+import re
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from ..._core.parameters import Number, check_ranges, parameter
+from ...scene import State, replace_numbers, scene_numbers
+from ..data._record import Runs, slip_channel
+from ..model._engines import ModelOutput
+from ..model._parameters import FreeParameters
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractClassVar
+else:
+    from equinox import AbstractClassVar
+
+_LOCAL = re.compile(r"(q0|qd0)\[(\d+)\]|z0\.(.+?)(?:\[(\d+)\])?")
+
+
+class AbstractLoss(eqx.Module):
+    """Loss of a residual in units of its noise level, as a function of its square: `rho(s)`, rho = s for small s."""
+
+    robust: AbstractClassVar[bool]
+
+    @abc.abstractmethod
+    def rho(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The loss where the square of the residual is `s`."""
+
+    def cost(self, residual: Float[Array, " m"]) -> Float[Array, ""]:
+        """Half the sum of the losses."""
+        return 0.5 * jnp.sum(self.rho(residual**2))
+
+    def weighted(
+        self, residual: Float[Array, " m"], jacobian: Float[Array, "m n"]
+    ) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
+        """Residual and Jacobian whose least squares have the gradient of the cost and nearly its curvature.
+
+        Triggs et al. 2000, Bundle adjustment, section 4.3, without the second derivative of rho, which is negative
+        and may take the definiteness away.
+        """
+        if not self.robust:
+            return residual, jacobian
+        weight = jnp.sqrt(jax.vmap(jax.grad(self.rho))(residual**2))
+        return weight * residual, weight[:, None] * jacobian
+
+
+class SquaredLoss(AbstractLoss):
+    """Least squares: the maximum likelihood of normal noise."""
+
+    robust: ClassVar[bool] = False
+
+    def rho(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The loss where the square of the residual is `s`."""
+        return s
+
+
+class Huber(AbstractLoss):
+    """Squares up to `limit` noise levels and the distance beyond: outliers pull with a bounded force.
+
+    **Arguments:**
+
+    - `limit`: in noise levels, > 0; 1.345 keeps 95 % of the efficiency of least squares on normal noise (Huber 1964).
+    """
+
+    limit: Number = parameter("limit", "1", lower=0.0, strict=True, default=1.345)
+    robust: ClassVar[bool] = True
+
+    def __check_init__(self) -> None:
+        """Refuse a limit out of range."""
+        check_ranges(self)
+
+    def rho(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The loss where the square of the residual is `s`."""
+        inside = s <= self.limit**2
+        return jnp.where(inside, s, 2 * self.limit * jnp.sqrt(jnp.where(inside, 1.0, s)) - self.limit**2)
+
+
+class Cauchy(AbstractLoss):
+    """`limit^2 log(1 + s/limit^2)`: far outliers have no pull at all.
+
+    **Arguments:**
+
+    - `limit`: in noise levels, > 0; 2.385 keeps 95 % of the efficiency of least squares on normal noise.
+    """
+
+    limit: Number = parameter("limit", "1", lower=0.0, strict=True, default=2.385)
+    robust: ClassVar[bool] = True
+
+    def __check_init__(self) -> None:
+        """Refuse a limit out of range."""
+        check_ranges(self)
+
+    def rho(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The loss where the square of the residual is `s`."""
+        return self.limit**2 * jnp.log1p(s / self.limit**2)
+
+
+class Box(NamedTuple):
+    """Bounds of x, and the longest change of each in one iteration, shape `[n]` each."""
+
+    lower: Float[Array, " n"]
+    upper: Float[Array, " n"]
+    longest: Float[Array, " n"]
+
+
+def local_names(y: State) -> tuple[str, ...]:
+    """Names of the numbers of an initial state: `q0[0]`, `qd0[0]`, `z0.friction`."""
+    dof = y.q.shape[0]
+    names = [f"q0[{i}]" for i in range(dof)] + [f"qd0[{i}]" for i in range(dof)]
+    for effect, z in y.z.items():
+        if isinstance(z, jnp.ndarray):
+            names += [f"z0.{effect}"] if z.ndim == 0 else [f"z0.{effect}[{i}]" for i in range(z.shape[0])]
+    return tuple(names)
+
+
+def placed(base: State, names: tuple[str, ...], values: Float[Array, " local"]) -> State:
+    """The state with the numbers of these names replaced."""
+    q, qd, z = base.q, base.qd, dict(base.z)
+    for i, name in enumerate(names):
+        match = _LOCAL.fullmatch(name)
+        assert match is not None
+        if match[1] == "q0":
+            q = q.at[int(match[2])].set(values[i])
+        elif match[1] == "qd0":
+            qd = qd.at[int(match[2])].set(values[i])
+        else:
+            effect = match[3]
+            z[effect] = values[i] if match[4] is None else z[effect].at[int(match[4])].set(values[i])
+    return State(q, qd, z)
+
+
+def taken(state: State, names: tuple[str, ...]) -> Float[Array, " local"]:
+    """The numbers of these names; the inverse of `placed`."""
+    numbers = []
+    for name in names:
+        match = _LOCAL.fullmatch(name)
+        assert match is not None
+        if match[1] is not None:
+            numbers.append((state.q if match[1] == "q0" else state.qd)[int(match[2])])
+        else:
+            z = state.z[match[3]]
+            numbers.append(z if match[4] is None else z[int(match[4])])
+    return jnp.stack(numbers) if numbers else jnp.zeros(0)
+
+
+class Prior(eqx.Module):
+    """What was known before: a mean and the inverse of a standard deviation for each parameter, 0 where nothing was."""
+
+    mean: Float[Array, " free"]
+    weight: Float[Array, " free"]
+
+
+class FitProblem(eqx.Module):
+    """Everything that the residual of a fit depends on.
+
+    The vector x holds the coordinates of the free parameters, then, run by run, the free numbers of the initial states
+    as differences from `base`.
+
+    - `engine`: `engine(values, start, run)`, what the model sees.
+    - `free`: the parameters. `local`: names of the free numbers of each initial state.
+    - `base`: initial states, with a leading axis of runs; None where a model has none.
+    - `runs`: the samples. `noise`: standard deviation of each channel.
+    - `jump`: inverse standard deviation of the jump of each number of the state from one window to the next, 0 where
+      windows do not go on; shape `[runs - 1, numbers]`; None where there are no windows.
+    """
+
+    engine: Any
+    free: FreeParameters
+    local: tuple[str, ...] = eqx.field(static=True)
+    base: State | None
+    runs: Runs
+    noise: dict[str, Array]
+    loss: AbstractLoss
+    prior: Prior
+    jump: Float[Array, "links numbers"] | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of runs."""
+        return self.runs.t.shape[0]
+
+    @property
+    def x0(self) -> Float[Array, " n"]:
+        """Where the search starts."""
+        return jnp.concatenate([self.free.x0, jnp.zeros(self.count * len(self.local), self.free.x0.dtype)])
+
+    @property
+    def box(self) -> Box:
+        """Bounds of x: those of the parameters; initial states are not limited."""
+        lower, upper = self.free.bounds
+        open_ = jnp.full(self.count * len(self.local), jnp.inf, lower.dtype)
+        return Box(
+            jnp.concatenate([lower, -open_]),
+            jnp.concatenate([upper, open_]),
+            jnp.concatenate([self.free.longest, open_]),
+        )
+
+    def split(self, x: Float[Array, " n"]) -> tuple[Float[Array, " free"], Float[Array, "runs local"]]:
+        """Coordinates of the parameters, and those of the initial states."""
+        size = len(self.free.names)
+        return x[:size], jnp.reshape(x[size:], (self.count, len(self.local)))
+
+    def start_of(self, base: State | None, moved: Float[Array, " local"]) -> State | None:
+        """Initial state of one run."""
+        if base is None or not self.local:
+            return base
+        return placed(base, self.local, self.taken(base) + moved)
+
+    def taken(self, state: State) -> Float[Array, " local"]:
+        """The free numbers of an initial state."""
+        return taken(state, self.local)
+
+    def starts(self, x: Float[Array, " n"]) -> State | None:
+        """Initial states at `x`, with a leading axis of runs."""
+        return jax.vmap(self.start_of)(self.base, self.split(x)[1])
+
+    def seen(self, x: Float[Array, " n"]) -> ModelOutput:
+        """What the model makes of each run, with a leading axis of runs."""
+        values = self.free.values(self.split(x)[0])
+        return jax.vmap(lambda start, run: self.engine(values, start, run))(self.starts(x), self.runs)
+
+    def _weigh(self, seen: ModelOutput, run: Runs) -> Float[Array, " samples"]:
+        """Differences in noise levels, channel after channel; 0 where a sample does not count."""
+        parts = []
+        for name in sorted(run.measured):
+            difference = (seen.channels[name] - run.measured[name]) / self.noise[name]
+            parts.append(jnp.where(run.weight[name] > 0, difference, 0.0))
+        for effect in sorted(run.slips):
+            difference = (seen.slips[effect] - run.slips[effect]) / self.noise[slip_channel(effect)]
+            parts.append(jnp.where(run.slip_weight[effect] > 0, difference, 0.0))
+        return jnp.concatenate(parts)
+
+    def _one(self, base: State | None, run: Runs, x: Float[Array, " m"]) -> tuple[Array, Array, Array]:
+        """Residual, initial and last state of one run; x holds the parameters' coordinates and the run's own."""
+        size = len(self.free.names)
+        start = self.start_of(base, x[size:])
+        seen = self.engine(self.free.values(x[:size]), start, run)
+        if self.jump is None:
+            return self._weigh(seen, run), jnp.zeros(0, x.dtype), jnp.zeros(0, x.dtype)
+        return self._weigh(seen, run), ravel_pytree(start)[0], ravel_pytree(seen.end)[0]
+
+    def evaluate(self, x: Float[Array, " n"]) -> tuple[Float[Array, " rows"], Float[Array, "rows n"]]:
+        """Residual and Jacobian: of all samples, of the links between windows, of what was known before.
+
+        All columns of a run go side by side in one forward sweep, which keeps nothing of its steps.
+        """
+        shared, own = self.split(x)
+
+        def run(base: State | None, run: Runs, own: Array) -> tuple[Any, Any]:
+            point = jnp.concatenate([shared, own])
+            unit = jnp.eye(point.shape[0], dtype=point.dtype)
+            push = lambda e: jax.jvp(lambda x: self._one(base, run, x), (point,), (e,))  # noqa: E731
+            return jax.vmap(push, out_axes=(None, -1))(unit)
+
+        if self.count == 1:
+            first = jtu.tree_map(lambda x: x[0], (self.base, self.runs, own))
+            value, slope = jtu.tree_map(lambda x: x[None], run(*first))
+        else:
+            value, slope = jax.vmap(run)(self.base, self.runs, own)
+        rows = [jnp.reshape(value[0], (-1,)), self.prior.weight * (self.free.vector(shared) - self.prior.mean)]
+        columns = [self._spread(slope[0]), self._pad(self.prior.weight[:, None] * self.free.slopes(shared))]
+        if self.jump is not None:
+            rows.append(jnp.reshape(self.jump * (value[2][:-1] - value[1][1:]), (-1,)))
+            here = self._spread(self.jump[:, :, None] * slope[2][:-1])
+            there = self._spread(self.jump[:, :, None] * slope[1][1:], first=1)
+            columns.append(here - there)
+        return jnp.concatenate(rows), jnp.concatenate(columns)
+
+    def _spread(self, slope: Float[Array, "some m k"], first: int = 0) -> Float[Array, "rows n"]:
+        """Derivatives of runs `first` and on by their own x, as rows by all of x."""
+        some, rows, _ = slope.shape
+        size, own = len(self.free.names), len(self.local)
+        shared = jnp.reshape(slope[..., :size], (some * rows, size))
+        if not own:
+            return shared
+        place = jnp.arange(some)
+        block = jnp.zeros((some, rows, self.count, own), slope.dtype)
+        block = block.at[place, :, place + first, :].set(slope[..., size:])
+        return jnp.concatenate([shared, jnp.reshape(block, (some * rows, self.count * own))], axis=1)
+
+    def _pad(self, slope: Float[Array, "rows free"]) -> Float[Array, "rows n"]:
+        return jnp.pad(slope, ((0, 0), (0, self.count * len(self.local))))
+
+    def with_number(self, name: str, factor: float) -> "FitProblem":
+        """The problem with a number of the model, which is not free, this many times larger."""
+        numbers = scene_numbers(self.engine.model)
+        if name not in numbers:
+            raise ValueError(f"The model has no number {name!r}; it has: {', '.join(numbers)}.")
+        model = replace_numbers(self.engine.model, {name: factor * numbers[name]})
+        return eqx.tree_at(lambda p: p.engine.model, self, model)
+
+    @property
+    def columns(self) -> dict[str, Float[Array, "runs samples"]]:
+        """Weight of each channel by name, slip instants last, in the order of the residual."""
+        # Compiled code sorts the entries of a dict, so the order is that of the names everywhere.
+        columns = {name: self.runs.weight[name] for name in sorted(self.runs.weight)}
+        return columns | {slip_channel(name): self.runs.slip_weight[name] for name in sorted(self.runs.slip_weight)}
+
+    @property
+    def samples(self) -> int:
+        """Number of rows of the residual that are samples, those without weight included."""
+        return sum(weight.size for weight in self.columns.values())
+
+    @property
+    def rows(self) -> int:
+        """Number of all rows of the residual."""
+        links = 0 if self.jump is None else self.jump.size
+        return self.samples + len(self.free.names) + links
+
+    @property
+    def weights(self) -> Float[Array, " samples"]:
+        """1 for each sample row that counts, 0 for the others."""
+        return jnp.reshape(jnp.concatenate([*self.columns.values()], axis=1), (-1,))

@@ -1,0 +1,272 @@
+"""Levenberg-Marquardt within a box, one visible iteration after the other, alone or many side by side."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from ._problem import AbstractLoss, Box, FitProblem
+
+# `x` -> residual and its Jacobian.
+Evaluate: TypeAlias = Callable[[Float[Array, " n"]], tuple[Float[Array, " m"], Float[Array, "m n"]]]
+# A step whose effect on the residual is smaller than this against the residual itself is lost in rounding.
+_ROUNDING = 8.0
+_LARGEST_DAMPING = 1e14
+# The cost is flat to second order around its minimum, so it must be known better than the parameters.
+_FLAT = 0.1
+# Models that stick and slip by fixed steps have a cost with small steps in it, on which a search never ends by itself:
+# it has settled after so many evaluations in a row that each lowered the cost by less than so many `rtol` of itself.
+_PATIENCE, _SLOW = 8, 10.0
+# Called after each iteration with its number, the root mean square of the residual and the parameters by name.
+Progress: TypeAlias = Callable[[int, float, dict[str, float]], None]
+# Noise levels that are estimated are estimated again until they settle.
+_NOISE_ROUNDS, _NOISE_SETTLED = 6, 0.02
+ENDINGS = {1: "converged", 2: "settled where the cost is no smoother than the steps of the model"}
+
+
+class SearchState(NamedTuple):
+    """Where the search stands.
+
+    - `x`, `residual`, `jacobian`, `cost`: the best so far; the cost is half the sum of losses.
+    - `damping`, `growth`: of the next step, and what a refused one multiplies it by.
+    - `steps`: number of evaluations; `slow`: of these, the last ones that changed little.
+    - `done`: 1 where it converged, 2 where it settled on a cost that is not smooth, else 0.
+    """
+
+    x: Float[Array, " n"]
+    residual: Float[Array, " m"]
+    jacobian: Float[Array, "m n"]
+    cost: Float[Array, ""]
+    damping: Float[Array, ""]
+    growth: Float[Array, ""]
+    steps: Int[Array, ""]
+    slow: Int[Array, ""]
+    done: Int[Array, ""]
+
+
+def start_search(x: Float[Array, " n"], rows: int) -> SearchState:
+    """A search that knows nothing yet: its first iteration evaluates `x`."""
+    inf, zero = jnp.asarray(jnp.inf, x.dtype), jnp.asarray(0.0, x.dtype)
+    return SearchState(
+        x,
+        jnp.zeros(rows, x.dtype),
+        jnp.zeros((rows, x.shape[0]), x.dtype),
+        inf,
+        zero + 1e-3,
+        zero + 2.0,
+        jnp.asarray(0),
+        jnp.asarray(0),
+        jnp.asarray(0),
+    )
+
+
+def levenberg_marquardt_step(
+    evaluate: Evaluate, loss: AbstractLoss, box: Box, state: SearchState, rtol: Float[Array, ""]
+) -> SearchState:
+    """One iteration: a trial point, which is taken if it is better.
+
+    Normal equations in columns of unit length; parameters on a bound that the gradient pushes outwards stay there,
+    the others move and are clipped (Kanzow, Yamashita, Fukushima 2004, J. Comput. Appl. Math. 172:375). The damping
+    follows Nielsen (1999, IMM-REP-1999-05). The search is done when the linear model promises to lower the cost by no
+    more than a tenth of `rtol` and the trial does not do better, or when only rounding is left.
+    """
+    x, eps = state.x, jnp.finfo(state.x.dtype).eps
+    r, jacobian = loss.weighted(state.residual, state.jacobian)
+    gradient, matrix = jacobian.T @ r, jacobian.T @ jacobian
+    size = jnp.sqrt(jnp.diagonal(matrix))
+    size = jnp.where(size > 0, size, 1.0)
+    held = ((x <= box.lower) & (gradient > 0)) | ((x >= box.upper) & (gradient < 0))
+    moves = ~held
+    normal = jnp.where(jnp.outer(moves, moves), matrix / jnp.outer(size, size), 0.0)
+    normal = normal + jnp.diag(jnp.where(moves, state.damping, 1.0))
+    step = -jnp.linalg.solve(normal, jnp.where(moves, gradient / size, 0.0)) / size
+    trial = jnp.clip(x + jnp.clip(step, -box.longest, box.longest), box.lower, box.upper)
+    step = trial - x
+
+    residual, trial_jacobian = evaluate(trial)
+    cost = loss.cost(residual)
+    finite = jnp.isfinite(cost) & jnp.isfinite(trial_jacobian).all()
+    first = state.steps == 0
+    better = finite & (first | (cost < state.cost))
+
+    predicted = -(gradient @ step + 0.5 * step @ matrix @ step)
+    gain = jnp.where(predicted > 0, (state.cost - cost) / jnp.where(predicted > 0, predicted, 1.0), 0.0)
+    gain = jnp.clip(jnp.where(jnp.isfinite(gain), gain, 0.0), -1.0, 2.0)
+    shrink = jnp.maximum(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
+    damping = jnp.where(better, state.damping * shrink, state.damping * state.growth)
+    damping = jnp.where(first, state.damping, jnp.maximum(damping, eps))
+
+    little = _FLAT * rtol * state.cost
+    flat = (predicted >= 0) & (predicted <= little) & (~better | (state.cost - cost <= little))
+    still = jnp.sqrt(step @ matrix @ step) <= _ROUNDING * eps * jnp.sqrt(2 * state.cost)
+    converged = ~first & (flat | still | (damping > _LARGEST_DAMPING)) | (better & (cost == 0))
+    fell = jnp.where(better, state.cost - cost, 0.0)
+    slow = jnp.where(fell <= _SLOW * rtol * state.cost, state.slow + 1, 0)
+    done = jnp.where(converged, 1, jnp.where(slow >= _PATIENCE, 2, 0))
+    return SearchState(
+        jnp.where(better, trial, x),
+        jnp.where(better, residual, state.residual),
+        jnp.where(better, trial_jacobian, state.jacobian),
+        jnp.where(better, cost, state.cost),
+        damping,
+        jnp.where(better, 2.0, 2.0 * state.growth),
+        state.steps + 1,
+        slow,
+        jnp.where(state.done > 0, state.done, done),
+    )
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """How a search is run: relative tolerance, limit of iterations, who is told."""
+
+    rtol: float = 1e-6
+    max_steps: int = 100
+    progress: Progress | None = None
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """Where a search ended: the problem with the noise levels it ended with, the last iterate, and how it ended."""
+
+    problem: FitProblem
+    state: SearchState
+    iterations: int
+    ending: str
+
+    @property
+    def converged(self) -> bool:
+        """Whether it ended by itself."""
+        return self.ending in ENDINGS.values()
+
+
+@eqx.filter_jit
+def step(problem: FitProblem, state: SearchState, rtol: Array) -> SearchState:
+    """One iteration."""
+    return levenberg_marquardt_step(problem.evaluate, problem.loss, problem.box, state, rtol)
+
+
+@eqx.filter_jit
+def steps_side_by_side(problem: FitProblem, axes: PyTree[int | None], states: SearchState, rtol: Array) -> SearchState:
+    """One iteration of many searches; `axes` says which numbers of the problem differ."""
+    one = lambda problem, state: levenberg_marquardt_step(problem.evaluate, problem.loss, problem.box, state, rtol)  # noqa: E731
+    moved = eqx.filter_vmap(one, in_axes=(axes, 0))(problem, states)
+    return jax.tree.map(lambda new, old: jnp.where(_beside(states.done > 0, old), old, new), moved, states)
+
+
+def _beside(done: Array, like: Array) -> Array:
+    return jnp.reshape(done, done.shape + (1,) * (like.ndim - 1))
+
+
+def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> SearchResult:
+    """Search from `x`.
+
+    **Raises:**
+
+    - `ValueError` if there are no more samples than free parameters.
+    - `RuntimeError` if the model is not finite at the start.
+    """
+    counted, unknown = int(jnp.sum(problem.weights > 0)), x.shape[0]
+    if counted <= unknown:
+        raise ValueError(f"{counted} samples are too few for {unknown} free parameters.")
+    rtol = jnp.asarray(options.rtol, x.dtype)
+    state, best = start_search(x, problem.rows), None
+    try:
+        for iteration in range(1, options.max_steps + 1):
+            state = step(problem, state, rtol)
+            if iteration == 1 and not np.isfinite(float(state.cost)):
+                raise RuntimeError(
+                    "The model gives values that are not finite at the start of the fit: check the start values, or"
+                    " take more substeps."
+                )
+            best = state
+            if options.progress is not None:
+                values = problem.free.values(problem.split(state.x)[0])
+                shown = {name: float(values[name]) for name in problem.free.names}
+                options.progress(iteration, _rms(problem, state), shown)
+            if int(state.done):
+                return SearchResult(problem, state, int(state.steps), ENDINGS[int(state.done)])
+    except KeyboardInterrupt:
+        if best is None:
+            raise  # nothing was computed yet
+        return SearchResult(problem, best, int(best.steps), "interrupted; these are the best values so far")
+    return SearchResult(problem, state, int(state.steps), f"stopped at the limit of {options.max_steps} iterations")
+
+
+@eqx.filter_jit
+def channels_seen(problem: FitProblem, x: Float[Array, " n"]) -> dict[str, Float[Array, "runs samples"]]:
+    """What the model makes of each channel at `x`."""
+    return problem.seen(x).channels
+
+
+def _rms(problem: FitProblem, state: SearchState) -> float:
+    """Root mean square of the residual: in the unit of the channel where there is one, in noise levels otherwise."""
+    samples = np.asarray(state.residual)[: problem.samples]
+    rms = float(np.sqrt(np.sum(samples**2) / max(float(jnp.sum(problem.weights)), 1.0)))
+    return rms * float(next(iter(problem.noise.values()))) if len(problem.noise) == 1 else rms
+
+
+def solve_with_noise(
+    problem: FitProblem, x: Float[Array, " n"], options: SearchOptions, given: frozenset[str]
+) -> SearchResult:
+    """Search, then estimate the noise levels that were not `given` from what is left, until both settle.
+
+    The maximum of the likelihood over parameters and unknown noise levels, one after the other. Where there is one
+    channel and squares are summed, the level does not move the optimum.
+    """
+    search = solve(problem, x, options)
+    if not set(problem.noise) - given:
+        return search
+    single = len(problem.noise) == 1 and not problem.loss.robust and float(jnp.max(problem.prior.weight)) == 0
+    single = single and problem.jump is None
+    for _ in range(_NOISE_ROUNDS):
+        levels = estimated_noise(search, given)
+        changes = [abs(float(levels[k] / search.problem.noise[k]) - 1) for k in levels]
+        problem = eqx.tree_at(lambda p: p.noise, search.problem, levels)
+        if single or search.ending.startswith("interrupted") or max(changes) < _NOISE_SETTLED:
+            return _rescaled(search, problem)
+        again = solve(problem, search.state.x, options)
+        search = SearchResult(problem, again.state, search.iterations + again.iterations, again.ending)
+    return search
+
+
+def estimated_noise(search: SearchResult, given: frozenset[str]) -> dict[str, Array]:
+    """Standard deviation of what is left of each channel; the median's, where a loss must not hear outliers."""
+    problem, levels = search.problem, dict(search.problem.noise)
+    for name, (residual, weight) in by_channel(problem, search.state.residual).items():
+        if name in given:
+            continue
+        own = residual[weight > 0]
+        size = 1.4826 * np.median(np.abs(own)) if problem.loss.robust else np.sqrt(np.mean(own**2))
+        floor = 10 * float(jnp.finfo(levels[name].dtype).eps)  # of a model that is exact
+        levels[name] = levels[name] * max(float(size), floor)
+    return levels
+
+
+def by_channel(problem: FitProblem, residual: Array) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Residual in noise levels and weight of each channel, shape `[runs, samples]`."""
+    rows, split = np.asarray(residual)[: problem.samples].reshape(problem.count, -1), {}
+    at = 0
+    for name, weight in problem.columns.items():
+        width = weight.shape[1]
+        split[name] = rows[:, at : at + width], np.asarray(weight)
+        at += width
+    return split
+
+
+def _rescaled(search: SearchResult, problem: FitProblem) -> SearchResult:
+    """The same iterate in the noise levels of `problem`."""
+    old = search.problem
+    factors = [jnp.full(weight.shape, old.noise[name] / problem.noise[name]) for name, weight in old.columns.items()]
+    factor = jnp.reshape(jnp.concatenate(factors, axis=1), (-1,))
+    factor = jnp.concatenate([factor, jnp.ones(old.rows - old.samples, factor.dtype)])
+    residual = search.state.residual * factor
+    state = search.state._replace(
+        residual=residual, jacobian=search.state.jacobian * factor[:, None], cost=old.loss.cost(residual)
+    )
+    return SearchResult(problem, state, search.iterations, search.ending)

@@ -1,0 +1,284 @@
+"""Start values that need no guess: from dimensions, from the balance of forces in slip, from reversals."""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from ...friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw
+from ...scene import Friction, Scene, State, scene_ranges, vector_field
+from ..data._record import differentiate, smooth, smooth_span
+from ..model._engines import with_values
+from ..model._observe import coordinates_seen
+from ._initializers import AbstractInitializer
+from ._problem import Box, FitProblem, SquaredLoss
+from ._search import SearchOptions, SearchState, levenberg_marquardt_step, start_search
+
+# Slip faster than this share of the top speed counts as steady: the states of friction laws have settled.
+_STEADY = 0.02
+_STEPS = 60
+# A value this many times larger or smaller than its unit asks for is none that a record could show.
+_FAR = 1e3
+# Damping of the bristle at the start, as a share of what is critical for the mass in stick.
+_DAMPING = 0.3
+# Time [s] that is long against what a bristle needs to yield at any speed that counts as slip.
+_LONG = 1e6
+# A parameter shows in the balance of forces if its column is at least this share of the longest.
+_SHOWS = 1e-6
+
+
+class _Sampled(NamedTuple):
+    """What is known at each sample, shape `[samples]` each; inside `jax.vmap` at one of them.
+
+    Time, position, velocity, acceleration, inputs, and the measured friction force, or None.
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    a: Array
+    inputs: dict[str, Array]
+    force: Array | None
+
+
+class Staged(AbstractInitializer):
+    """Start values from the record itself, whatever the scene's numbers are, in stages.
+
+    1. Parameters of friction laws get the size that their unit asks for, from the greatest force, speed and travel.
+    2. The balance of forces along the smoothed motion, with the force that friction settles to at constant speed,
+       gives all numbers that show there (mass, offset, Fc, Fs, vs, sigma2) without a simulation.
+    3. The slope of the force over the displacement after reversals gives stiffness (sigma0); the damping of
+       a bristle starts with a share of the critical one.
+
+    The fit that follows determines everything together. For one coordinate whose position is measured, and for laws
+    under a measured motion.
+
+    **Raises:**
+
+    - `ValueError` (at the fit) where there are several coordinates, or no position was measured.
+    """
+
+    def initialize(
+        self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions
+    ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
+        """Coordinates of the values found."""
+        sampled = _sampled(problem)
+        units = _units(problem)
+        values = {name: float(value) for name, value in problem.free.values(x[: len(units)]).items()}
+        sizes = _sizes(problem, sampled, values)
+        values |= {name: sizes[unit] for name, unit in units.items() if unit in sizes}
+        start = problem.free.coordinates(values)
+        balance, known = _fit_balance(problem, sampled, start, options)
+        values |= {name: _within(x, sizes.get(units[name])) for name, x in balance.items() if known[name]}
+        blind = [name for name in units if not known[name]]
+        stiffness = _reversal_slope(problem, sampled, values) or sizes["N/m"]
+        mass = _mass(problem, values)
+        for name in blind:
+            if units[name] == "N/m":
+                values[name] = stiffness
+            elif units[name] == "N s/m" and mass is not None:
+                values[name] = _DAMPING * 2 * float(np.sqrt(mass * stiffness))
+        size = len(problem.free.names)
+        return jnp.concatenate([problem.free.coordinates(values), x[size:]]), ()
+
+
+def _within(x: float, size: float | None) -> float:
+    """A value, unless the balance of forces took it beyond all proportion."""
+    return x if size is None or x == 0 or size / _FAR < abs(x) < _FAR * size else float(np.copysign(size, x))
+
+
+def _units(problem: FitProblem) -> dict[str, str]:
+    """Unit of each free parameter, "" for those without."""
+    ranges = scene_ranges(problem.engine.model)
+    return {name: ranges[name].unit if name in ranges else "" for name in problem.free.names}
+
+
+def _sampled(problem: FitProblem) -> _Sampled:
+    """All runs, one after the other, without what the smoothing spoils at their ends."""
+    parts = []
+    law_alone = problem.base is None
+    if problem.base is not None and problem.base.q.shape[1] != 1:
+        raise ValueError("Staged() needs a scene with one coordinate; give start values, or MultiStart(...).")
+    for run in range(problem.count):
+        samples = jax.tree.map(lambda x, run=run: np.asarray(x[run]), problem.runs)
+        weight = next(iter(samples.weight.values()))
+        count = int(np.flatnonzero(weight)[-1]) + 1
+        t = samples.t[:count]
+        inputs = {name: column[:count] for name, column in samples.inputs.items()}
+        x = inputs["x"] if law_alone else samples.measured[_position(problem)][:count]
+        motion = differentiate(t, x)
+        span = smooth_span(count)
+        force = None
+        if law_alone:
+            force = smooth(next(iter(samples.measured.values()))[:count], span)
+            if "normal" in inputs:
+                force = force / np.maximum(inputs["normal"], 1e-12)
+        inside = slice(motion.edge, -motion.edge) if count > 4 * motion.edge else slice(None)
+        smoothed = {name: smooth(column, span)[inside] for name, column in inputs.items()}
+        parts.append(
+            (
+                t[inside],
+                motion.x[inside],
+                motion.v[inside],
+                motion.a[inside],
+                smoothed,
+                None if force is None else force[inside],
+            )
+        )
+    return _Sampled(*jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *parts))
+
+
+def _position(problem: FitProblem) -> str:
+    from_state = [name for name, seen in coordinates_seen(problem.engine.observables, 1).items() if seen == "q[0]"]
+    if not from_state:
+        raise ValueError(
+            "Staged() needs a channel that is the position, observe='q[0]'; give start values, or MultiStart(...)."
+        )
+    return from_state[0]
+
+
+def _sizes(problem: FitProblem, sampled: _Sampled, values: dict[str, float]) -> dict[str, float]:
+    """Sizes that go with a unit."""
+    speed = float(jnp.max(jnp.abs(sampled.v))) or 1.0
+    travel = float(jnp.max(sampled.q) - jnp.min(sampled.q)) or 1.0
+    if sampled.force is not None:
+        force = float(jnp.sqrt(jnp.mean(sampled.force**2)))
+    else:
+        frictionless = _required(problem, values)
+        force = float(jnp.sqrt(jnp.mean(jax.vmap(frictionless)(sampled) ** 2)))
+    force = force or 1.0
+    return {"N": force, "m/s": 0.05 * speed, "N s/m": 0.1 * force / speed, "N/m": 1e2 * force / travel}
+
+
+def _driven(scene: Scene, inputs: dict[str, Array]) -> Scene:
+    return eqx.tree_at(lambda x: x.params, scene, {**scene.params, **inputs}) if inputs else scene
+
+
+def _required(problem: FitProblem, values: Mapping[str, ArrayLike]) -> Callable[[_Sampled], Array]:
+    """Generalised force that friction must have at a sample, by the equations of motion without friction."""
+    scene = with_values(problem.engine.model, {name: jnp.asarray(x) for name, x in values.items()})
+    others = tuple(effect for effect in scene.effects if not isinstance(effect, Friction))
+
+    def required(s: _Sampled) -> Array:
+        here = _driven(scene, s.inputs)
+        bare = Scene(here.lagrangian, params=here.params, effects=others)
+        q, qd = s.q[None], s.v[None]
+        free = vector_field(s.t, State(q, qd, bare.initial_state(q)), bare).qd[0]
+        mass = jax.hessian(lambda qd: here.lagrangian(s.t, q, qd, here.params))(qd)[0, 0]
+        return mass * (free - s.a)
+
+    return required
+
+
+def _settled(law: AbstractLaw, v: Array) -> Array:
+    """Force of a law at constant velocity, long after it began."""
+    if isinstance(law, AbstractDynamicLaw):
+        z = law.step_exact(v, law.initial_state(v), jnp.asarray(_LONG, v.dtype))
+        return law.force(v, z)
+    if isinstance(law, AbstractSetValuedLaw):
+        return jnp.sign(v) * law.sliding_force(v) + law.viscous_force(v)
+    if isinstance(law, AbstractForceLaw):
+        return law.force(v)
+    raise ValueError(f"Staged() does not know the force that {type(law).__name__} settles to; give start values.")
+
+
+def _friction(problem: FitProblem, values: Mapping[str, ArrayLike]) -> Callable[[_Sampled], Array]:
+    """Generalised friction force at a sample, settled."""
+    scene = with_values(problem.engine.model, values)
+    if isinstance(scene, AbstractLaw):
+        return lambda s: _settled(scene.bind_state(s.t, s.q[None], s.v[None], s.inputs), s.v)
+    elements = [effect for effect in scene.effects if isinstance(effect, Friction)]
+
+    def friction(s: _Sampled) -> Array:
+        here = _driven(scene, s.inputs)
+        q, qd, total = s.q[None], s.v[None], jnp.zeros_like(s.v)
+        for effect in elements:
+            settled = effect.bind_state(s.t, q, qd, here.params)
+            force = _settled(settled.law, settled.slip(s.t, q, qd, here.params))
+            load = settled.load(s.t, q, qd, here.params)
+            total = total - settled.apply_force(q, force if load is None else load * force, here.params)[0]
+        return total
+
+    return friction
+
+
+def _slip(problem: FitProblem) -> Callable[[_Sampled], Array]:
+    """The smallest slip velocity of the friction elements at a sample; one that sticks says nothing in slip."""
+    scene = problem.engine.model
+    if isinstance(scene, AbstractLaw):
+        return lambda s: jnp.abs(s.v)
+    elements = [effect for effect in scene.effects if isinstance(effect, Friction)]
+
+    def slip(s: _Sampled) -> Array:
+        here = _driven(scene, s.inputs)
+        speeds = [jnp.abs(each.slip(s.t, s.q[None], s.v[None], here.params)) for each in elements]
+        return jnp.min(jnp.stack(speeds)) if speeds else s.v
+
+    return slip
+
+
+def _fit_balance(
+    problem: FitProblem, sampled: _Sampled, x: Float[Array, " free"], options: SearchOptions
+) -> tuple[dict[str, float], dict[str, bool]]:
+    """Parameters by the balance of forces in steady slip, and which of them show in it."""
+    state = start_search(x, sampled.v.shape[0])
+    for _ in range(_STEPS):
+        state = _balance_step(problem, sampled, state, jnp.asarray(options.rtol, x.dtype))
+        if int(state.done):
+            break
+    size = jnp.sqrt(jnp.sum(state.jacobian**2, axis=0))
+    shows = np.asarray(size > _SHOWS * jnp.max(size))
+    values = problem.free.values(state.x)
+    return (
+        {name: float(values[name]) for name in problem.free.names},
+        dict(zip(problem.free.names, (bool(x) for x in shows), strict=True)),
+    )
+
+
+@eqx.filter_jit
+def _balance_step(problem: FitProblem, sampled: _Sampled, state: SearchState, rtol: Array) -> SearchState:
+    slip = jnp.abs(jax.vmap(_slip(problem))(sampled))
+    steady = (slip > _STEADY * jnp.max(slip)).astype(slip.dtype)
+
+    def residual(x: Array) -> Array:
+        values = problem.free.values(x)
+        if sampled.force is not None:
+            return steady * (jax.vmap(_friction(problem, values))(sampled) - sampled.force)
+        return steady * jax.vmap(lambda s: _friction(problem, values)(s) - _required(problem, values)(s))(sampled)
+
+    lower, upper = problem.free.bounds
+    box = Box(lower, upper, problem.free.longest)
+    return levenberg_marquardt_step(lambda x: (residual(x), jax.jacfwd(residual)(x)), SquaredLoss(), box, state, rtol)
+
+
+def _reversal_slope(problem: FitProblem, sampled: _Sampled, values: dict[str, float]) -> float | None:
+    """Median slope [N/m] of the friction force over the displacement after reversals, until it has changed its sign."""
+    x = np.asarray(sampled.q)
+    if sampled.force is not None:
+        force = np.asarray(sampled.force)
+    else:
+        force = np.asarray(jax.jit(jax.vmap(_required(problem, values)))(sampled))
+    v = np.asarray(sampled.v)
+    level = np.median(np.abs(force))
+    turns = np.flatnonzero(np.sign(v[1:]) * np.sign(v[:-1]) < 0) + 1
+    slopes = []
+    for start, end in zip(turns, [*turns[1:], len(x)], strict=True):
+        moved, risen = np.abs(x[start:end] - x[start]), np.abs(force[start:end] - force[start])
+        over = np.flatnonzero(risen > level)
+        if over.size and over[0] > 0 and moved[over[0]] > 0:
+            slopes.append(risen[over[0]] / moved[over[0]])
+    return float(np.median(slopes)) if slopes else None
+
+
+def _mass(problem: FitProblem, values: dict[str, float]) -> float | None:
+    """Mass at the first state; None for a law alone."""
+    if problem.base is None:
+        return None
+    scene = with_values(problem.engine.model, {name: jnp.asarray(x) for name, x in values.items()})
+    t, q = problem.runs.t[0, 0], problem.base.q[0]
+    params = {**scene.params, **{name: column[0, 0] for name, column in problem.runs.inputs.items()}}
+    return float(jax.hessian(lambda qd: scene.lagrangian(t, q, qd, params))(jnp.zeros_like(q))[0, 0])

@@ -1,0 +1,1 @@
+"""What a model makes of a record, and which of its numbers a fit may change."""

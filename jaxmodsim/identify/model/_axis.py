@@ -1,0 +1,188 @@
+"""Models of one axis: mass, offset and friction, with start values from the record itself."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..._core.parameters import ranges_of
+from ...friction import AbstractLaw, AbstractSetValuedLaw, Coulomb, Regularized, Viscous, asymmetric, laws
+from ...scene import AbstractEffect, AppliedForce, Friction, Scene, replace_numbers
+from ..data._record import Record, differentiate, smooth, smooth_span
+
+# Share of the variance of a force below which a regression explains it well enough to tell that its sign is wrong.
+_EXPLAINED = 0.5
+# Width of the regularisation in top speeds. Fits that come down to it from a wider one do not get caught on the way.
+_WIDTH = 1e-3
+# Slower than this share of the top speed a sample says little of friction in slip.
+_MOVING = 0.05
+# Where the regression gives no positive number: friction as a share of the root mean square of the force.
+_FRICTION_SHARE = 0.1
+
+
+def _axis_lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del t, q
+    return 0.5 * p["m"] * qd[0] ** 2
+
+
+def _drive(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del t, q, qd
+    return jnp.reshape(p["u"] - p["offset"], (1,))
+
+
+@dataclass(frozen=True)
+class RoughAxis:
+    """A first idea of an axis: mass [kg], viscous [N s/m] and Coulomb friction [N], offset [N], top speed [m/s].
+
+    And when it starts [s], on the clock of the record.
+    """
+
+    m: float
+    Fv: float
+    Fc: float
+    offset: float
+    top: float
+    start: float = 0.0
+
+
+def rough_axis(record: Record) -> RoughAxis:
+    """Start values by linear regression of the force on acceleration, velocity and its sign.
+
+    Differentiated positions are noisy, so they are smoothed first; the simulation then does the real work.
+
+    **Raises:**
+
+    - `ValueError` naming the record, where the position or the force never changes, and where the force has the wrong
+      sign: mass and friction that explain it would be negative.
+    """
+    for column, what in ((record.measured, "position"), (record.inputs["u"], "force")):
+        if np.ptp(column) == 0.0:
+            raise ValueError(
+                f"{record.name}: the {what} never changes (it is {column[0]:g} throughout), so nothing can be fitted:"
+                " mass and friction show in the motion under a force that changes. Is it the right column?"
+            )
+    motion, span = differentiate(record.t, record.measured), smooth_span(len(record.t))
+    inside = slice(motion.edge, -motion.edge) if len(record.t) > 4 * motion.edge else slice(None)
+    v, a, u = (x[inside] for x in (motion.v, motion.a, smooth(record.inputs["u"], span)))
+    top = float(np.max(np.abs(v)))
+    moving = np.abs(v) > _MOVING * top
+    columns = np.column_stack([a, v, np.sign(v), np.ones_like(v)])[moving]
+    m, Fv, Fc, offset = weights = np.linalg.lstsq(columns, u[moving], rcond=None)[0]
+    dissipated = Fv * float(np.mean(v**2)) + Fc * float(np.mean(np.abs(v)))
+    left = float(np.sum((u[moving] - columns @ weights) ** 2))
+    if m < 0 and dissipated < 0 and left < _EXPLAINED * (len(columns) - 4) * np.var(u[moving]):
+        raise ValueError(
+            f"{record.name}: the force goes against the motion: it is that of a mass of {m:.3g} kg and of friction that"
+            f" drives with {-dissipated:.3g} W. Force and position count in opposite directions: change the sign of one"
+            " of them (on the command line, that of --force-gain)."
+        )
+    scale = float(np.sqrt(np.mean(u**2))) or 1.0
+    return RoughAxis(
+        m if m > 0 else scale / max(float(np.max(np.abs(a))), 1e-12),
+        Fv if Fv > 0 else _FRICTION_SHARE * scale / top,
+        Fc if Fc > 0 else _FRICTION_SHARE * scale,
+        float(offset),
+        top,
+        float(record.t[0]),
+    )
+
+
+def _coulomb(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
+    return (
+        Friction(Regularized(Coulomb(rough.Fc), _WIDTH * rough.top), name="dry"),
+        Friction(Viscous(rough.Fv), name="viscous"),
+    )
+
+
+def _asymmetric(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
+    return (
+        Friction(Regularized(asymmetric(Coulomb(rough.Fc), Fc=rough.Fc), _WIDTH * rough.top), name="dry"),
+        Friction(asymmetric(Viscous(rough.Fv), Fv=rough.Fv), name="viscous"),
+    )
+
+
+def _no_params(rough: RoughAxis) -> dict[str, float]:
+    del rough
+    return {}
+
+
+@dataclass(frozen=True)
+class AxisModel:
+    """A model of the axis, `m q'' = u - offset + forces of its effects`.
+
+    **Arguments:**
+
+    - `effects`: what acts on the axis beside the drive, with start values from the rough ones.
+    - `free`: names of the numbers that are fitted.
+    - `description`: for tables.
+    - `params`: further entries of the scene's params that the effects read, from the rough values, by name.
+    """
+
+    effects: Callable[[RoughAxis], tuple[AbstractEffect, ...]]
+    free: tuple[str, ...]
+    description: str
+    params: Callable[[RoughAxis], dict[str, float]] = _no_params
+
+
+# Models of more than one friction element.
+_COMBINATIONS = {
+    "coulomb": AxisModel(
+        _coulomb, ("m", "offset", "dry.Fc", "viscous.Fv"), "Coulomb friction (regularised) and viscous friction"
+    ),
+    "asymmetric": AxisModel(
+        _asymmetric,
+        ("m", "dry.forward.Fc", "dry.backward.Fc", "viscous.forward.Fv", "viscous.backward.Fv"),
+        "Coulomb (regularised) and viscous friction, each with a value for either direction; a constant offset is part"
+        " of the difference of the Coulomb forces and held at zero",
+    ),
+}
+
+
+def axis_models() -> dict[str, AxisModel]:
+    """Models of an axis by name: combinations of simple laws, and each registered law that says where a fit starts."""
+    models = {name.lower(): _one_law(law) for name, law in laws().items()}
+    return _COMBINATIONS | {name: model for name, model in models.items() if model is not None}
+
+
+def _one_law(kind: type[AbstractLaw]) -> AxisModel | None:
+    """The axis with one friction law, a set-valued one made smooth; None where it does not say a start."""
+    example = kind.fit_start(1.0, 1.0, 1.0, 1.0)
+    if example is None:
+        return None
+    smooth = isinstance(example, AbstractSetValuedLaw)
+
+    def effects(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
+        law: Any = kind.fit_start(rough.m, rough.Fc, rough.Fv, rough.top)
+        return (Friction(Regularized(law, _WIDTH * rough.top) if smooth else law, name="friction"),)
+
+    numbers = [f"friction.{name}" for name, allowed in ranges_of(example).items() if not allowed.execution]
+    words = f"{kind.__name__}: {kind.description}" + (" (regularised)" if smooth else "")
+    return AxisModel(effects, ("m", "offset", *numbers), words)
+
+
+def axis_scene(
+    model: AxisModel,
+    rough: RoughAxis,
+    start: Mapping[str, float] | None = None,
+    fixed: Mapping[str, float] | None = None,
+) -> Scene:
+    """Scene of an axis, `m q'' = u - offset - friction`, ready to be fitted.
+
+    **Arguments:**
+
+    - `model`: one of `axis_models()`.
+    - `rough`: values to start from, as `rough_axis` finds them.
+    - `start`, `fixed`: other values by the names of `jaxmodsim.scene.scene_numbers`.
+
+    **Returns:**
+
+    A `Scene` whose `params` are `m` [kg], `offset` [N], the input `u` [N], and those of the model.
+    """
+    offset = rough.offset if "offset" in model.free else 0.0
+    params = {"m": rough.m, "offset": offset, "u": 0.0, **model.params(rough)}
+    scene = Scene(_axis_lagrangian, params=params, effects=(AppliedForce(_drive, name="drive"), *model.effects(rough)))
+    given = {**(start or {}), **(fixed or {})}
+    return replace_numbers(scene, {name: jnp.asarray(x, float) for name, x in given.items()})

@@ -1,0 +1,349 @@
+"""What a model makes of a record: a scene by fixed steps or by events, a law under a measured motion."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeAlias, TypeVar
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, PyTree
+
+from ...friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw
+from ...scene import Scene, Signal, State, replace_numbers, scene_numbers, vector_field
+from ...simulation import Trajectory, simulate
+from ...solvers import RosenbrockTableau, rosenbrock_step
+from ..data._record import Runs
+from ._observe import Observable, first_coordinate, needs_forces, observed, observer
+from ._parameters import join_entries
+
+# Order 3, L-stable, stiffly accurate, three field evaluations (Sandu et al. 1997, Atmospheric Environment 31:3459).
+# Of order 3 because a held input has no more smoothness between samples than its samples carry, and three evaluations
+# instead of eight make the replay of a long record three times cheaper.
+RODAS3 = RosenbrockTableau(
+    gamma=0.5,
+    stage=np.array([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0], [2.0, 0.0, 1.0, 0.0]]),
+    coupling=np.array([[0.0, 0.0, 0.0, 0.0], [4.0, 0.0, 0.0, 0.0], [1.0, -1.0, 0.0, 0.0], [1.0, -1.0, -8 / 3, 0.0]]),
+    nodes=np.array([0.0, 0.0, 1.0, 1.0]),
+    time=np.array([0.5, 1.5, 0.0, 0.0]),
+    solution=np.array([2.0, 0.0, 1.0, 1.0]),
+    error=np.array([0.0, 0.0, 0.0, 1.0]),
+)
+# `observe(t, y, scene)`, what is seen of a state; the scene is as the inputs drive it.
+Observe: TypeAlias = Callable[[Array, State, Scene], PyTree[Array]]
+Inputs: TypeAlias = dict[str, Float[Array, " samples"]]
+# What names of delays of inputs start with.
+DELAY = "delay."
+_Model = TypeVar("_Model", bound=eqx.Module)
+
+
+class Controller(eqx.Module):
+    """A controller that runs once per sample, as a drive does; what it puts out is held until the next sample.
+
+    **Arguments:**
+
+    - `fn`: `fn(t, q, qd, memory, params) -> (outputs, memory)`: the entries of `params` that it sets, by name, and its
+      own state (an integral, a filter) for the next sample. `params` holds the scene's numbers and the inputs of the
+      record, such as the reference, so gains that are entries of it can be fitted.
+    - `memory`: its state at the first sample, a pytree of numbers.
+    """
+
+    fn: Callable[..., Any] = eqx.field(static=True)
+    memory: PyTree[Array] = eqx.field(default=(), converter=lambda tree: jtu.tree_map(jnp.asarray, tree))
+
+
+def run_samples(
+    scene: Scene,
+    t: Float[Array, " samples"],
+    inputs: Inputs,
+    y0: State,
+    observe: Observe,
+    *,
+    substeps: int = 1,
+    linear: frozenset[str] = frozenset(),
+    controller: Controller | None = None,
+) -> tuple[PyTree[Array], State]:
+    """Run a scene over the samples of a record.
+
+    Linearly implicit steps of fixed length: stable whatever the stiffness of the friction law, and cheap to
+    differentiate forwards.
+
+    **Arguments:**
+
+    - `scene`: its `params` must be a dict that has the inputs' names.
+    - `t`: times of the samples [s].
+    - `inputs`: samples by name of the entry of `params` they drive.
+    - `y0`: state at the first sample.
+    - `observe`: what is seen of each sample.
+    - `substeps`: steps from sample to sample.
+    - `linear`: inputs that run in straight lines from sample to sample; the others are held.
+    - `controller`: what closes a loop around the scene.
+
+    **Returns:**
+
+    What was observed at each sample, with a leading axis of samples, and the state at the last one.
+    """
+
+    def advance(carry: tuple[State, Any], sample: Any) -> tuple[tuple[State, Any], Any]:
+        (y, memory), (start, dt, held, slopes) = carry, sample
+        here = _driven(scene, held)
+        outputs: dict[str, Array] = {}
+        if controller is not None:
+            outputs, memory = controller.fn(start, y.q, y.qd, memory, here.params)
+            here = _driven(here, outputs)
+        seen = observe(start, y, here)
+
+        def field(t: Array, y: State) -> State:
+            return vector_field(t, y, _driven(here, {k: held[k] + (t - start) * x for k, x in slopes.items()}))
+
+        step = dt / substeps
+
+        def substep(k: Any, y: State) -> State:
+            return rosenbrock_step(RODAS3, field, start + k * step, step, y, pivot=True).y1
+
+        moved = substep(0, y) if substeps == 1 else jax.lax.fori_loop(0, substeps, substep, y)
+        # Records of different lengths that run side by side repeat their last time.
+        y = jtu.tree_map(lambda new, old: jnp.where(dt > 0, new, old), moved, y)
+        return (y, memory), seen
+
+    dt = jnp.diff(t)
+    slopes = {name: jnp.diff(inputs[name]) / jnp.where(dt > 0, dt, 1.0) for name in sorted(linear)}
+    memory = () if controller is None else controller.memory
+    samples = (t[:-1], dt, jtu.tree_map(lambda x: x[:-1], inputs), slopes)
+    (end, memory), seen = jax.lax.scan(advance, (y0, memory), samples)
+    last = _driven(scene, jtu.tree_map(lambda x: x[-1], inputs))
+    if controller is not None:
+        last = _driven(last, controller.fn(t[-1], end.q, end.qd, memory, last.params)[0])
+    final = observe(t[-1], end, last)
+    return jtu.tree_map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), seen, final), end
+
+
+def replay(
+    scene: Scene,
+    t: Float[Array, " samples"],
+    inputs: Inputs,
+    q0: Float[Array, " dof"],
+    qd0: Float[Array, " dof"],
+    substeps: int = 1,
+    observe: Callable[[Array, Array], Array] = first_coordinate,
+) -> Float[Array, " samples"]:
+    """Run a scene over the samples of a record, with the inputs held from each sample to the next.
+
+    **Arguments:**
+
+    - `scene`, `t`, `inputs`, `substeps`: see `run_samples`.
+    - `q0`, `qd0`: state at the first sample.
+    - `observe`: `observe(q, qd)`, the number that is compared with the record; by default the first coordinate.
+
+    **Returns:**
+
+    The observed number at each sample, shape `[samples]`.
+    """
+    y0 = State(q0, qd0, scene.initial_state(q0))
+
+    def look(t: Array, y: State, scene: Scene) -> Array:
+        del t, scene
+        return observe(y.q, y.qd)
+
+    return run_samples(scene, t, inputs, y0, look, substeps=substeps)[0]
+
+
+def _driven(scene: Scene, held: dict[str, Array]) -> Scene:
+    if not held:
+        return scene
+    return eqx.tree_at(lambda x: x.params, scene, {**scene.params, **held})
+
+
+class ModelOutput(NamedTuple):
+    """What a model gives for one run: channels, slip instants, and the state at the last sample."""
+
+    channels: dict[str, Float[Array, " samples"]]
+    slips: dict[str, Float[Array, " instants"]]
+    end: State | None
+
+
+class ReplayEngine(eqx.Module):
+    """A scene without events, by fixed steps from sample to sample."""
+
+    model: Scene
+    delays: dict[str, Array]
+    controller: Controller | None
+    observables: tuple[tuple[str, Observable], ...] = eqx.field(static=True)
+    linear: frozenset[str] = eqx.field(static=True)
+    substeps: int = eqx.field(static=True)
+
+    def __call__(self, values: dict[str, Array], start: State, run: Runs) -> ModelOutput:
+        """Run the scene with these values over the samples."""
+        scene = with_values(self.model, values)
+        inputs = delayed(run.t, run.inputs, self.linear, self.delays | values)
+        seen, end = run_samples(
+            scene,
+            run.t,
+            inputs,
+            start,
+            observer(self.observables),
+            substeps=self.substeps,
+            linear=self.linear,
+            controller=self.controller,
+        )
+        return ModelOutput(seen, {}, end)
+
+
+class EventEngine(eqx.Module):
+    """A scene with set-valued laws, by events; NaN where the run ends early."""
+
+    model: Scene
+    delays: dict[str, Array]
+    observables: tuple[tuple[str, Observable], ...] = eqx.field(static=True)
+    linear: frozenset[str] = eqx.field(static=True)
+    slips: tuple[str, ...] = eqx.field(static=True)
+    rtol: float = eqx.field(static=True)
+    atol: float = eqx.field(static=True)
+    max_events: int = eqx.field(static=True)
+
+    def __call__(self, values: dict[str, Array], start: State, run: Runs) -> ModelOutput:
+        """Run the scene with these values over the samples."""
+        scene = with_values(self.model, values)
+        inputs = delayed(run.t, run.inputs, self.linear, self.delays | values)
+        if inputs:
+            signals = {name: Signal(run.t, x, linear=name in self.linear) for name, x in inputs.items()}
+            scene = eqx.tree_at(lambda x: x.params, scene, {**scene.params, **signals})
+        done = simulate(
+            scene,
+            start.q,
+            start.qd,
+            run.t[-1],
+            t0=run.t[0],
+            ts=run.t,
+            z0=start.z,
+            rtol=self.rtol,
+            atol=self.atol,
+            adjoint=dfx.ForwardMode(),
+            max_events=self.max_events,
+            throw=False,
+        )
+        fine = done.code == 0
+        forces = done.forces if any(needs_forces(x) for _, x in self.observables) else {}
+        channels = {
+            name: jnp.where(
+                fine, jax.vmap(lambda q, qd, f, x=x: observed(x, q, qd, f))(done.q, done.qd, forces), jnp.nan
+            )
+            for name, x in self.observables
+        }
+        end = State(done.q[-1], done.qd[-1], jax.tree.map(lambda x: x[-1], done.z))
+        return ModelOutput(channels, self._slips(scene, done, run), end)
+
+    def _slips(self, scene: Scene, done: Trajectory, run: Runs) -> dict[str, Array]:
+        """The first instants at which elements broke away; the end of the run for those that did not come."""
+        if not self.slips:
+            return {}
+        events, instants = done.events, {}
+        for effect in self.slips:
+            broke = (events.effect == scene.names.index(effect)) & (events.before == 0)
+            times = jnp.sort(jnp.where(broke, events.t, jnp.inf))[: run.slips[effect].shape[0]]
+            short = run.slips[effect].shape[0] - times.shape[0]
+            times = jnp.pad(times, (0, max(short, 0)), constant_values=jnp.inf)
+            instants[effect] = jnp.where(jnp.isfinite(times), times, run.t[-1])
+        return instants
+
+
+def with_values(model: _Model, values: Mapping[str, ArrayLike]) -> _Model:
+    """The scene or law with numbers of these names replaced; delays are none of them."""
+    own = {name: jnp.asarray(x) for name, x in values.items() if not name.startswith(DELAY)}
+    return replace_numbers(model, join_entries(scene_numbers(model), own))
+
+
+def delayed(
+    t: Float[Array, " samples"],
+    inputs: dict[str, Float[Array, " samples"]],
+    linear: frozenset[str],
+    values: dict[str, Array],
+) -> dict[str, Float[Array, " samples"]]:
+    """Inputs that come later by the `delay.*` [s] among the values, which may be a fraction of a sample.
+
+    A held input that jumps between two samples is replaced by its mean over the interval: the impulse is exact, and
+    the derivative by the delay exists.
+    """
+    shifted = dict(inputs)
+    for name, x in inputs.items():
+        if DELAY + name not in values:
+            continue
+        tau = values[DELAY + name]
+        if name in linear:
+            shifted[name] = jnp.interp(t - tau, t, x)
+            continue
+        dt = jnp.diff(t)
+        impulse = jnp.concatenate([jnp.zeros(1, x.dtype), jnp.cumsum(dt * x[:-1])])
+        # Outside the record the first and the last sample go on.
+        late = t - tau
+        at = (
+            jnp.interp(late, t, impulse) + x[0] * jnp.minimum(late - t[0], 0.0) + x[-1] * jnp.maximum(late - t[-1], 0.0)
+        )
+        mean = jnp.diff(at) / jnp.where(dt > 0, dt, 1.0)
+        shifted[name] = jnp.concatenate([jnp.where(dt > 0, mean, x[:-1]), x[-1:]])
+    return shifted
+
+
+class LawEngine(eqx.Module):
+    """A law under the measured motion."""
+
+    model: AbstractLaw
+
+    def __call__(self, values: dict[str, Array], start: None, run: Runs) -> ModelOutput:
+        """The force of the law with these values."""
+        del start
+        force = law_force(with_values(self.model, values), run.t, run.inputs["x"], run.inputs.get("normal"), run.inputs)
+        return ModelOutput(dict.fromkeys(run.measured, force), {}, None)
+
+
+def law_force(
+    law: AbstractLaw,
+    t: Float[Array, " samples"],
+    x: Float[Array, " samples"],
+    normal: Float[Array, " samples"] | None = None,
+    inputs: dict[str, Float[Array, " samples"]] | None = None,
+) -> Float[Array, " samples"]:
+    """Friction force of a law under a sampled motion, from rest and unloaded.
+
+    **Arguments:**
+
+    - `law`: a dynamic law, or one that is a function of velocity.
+    - `t`: times [s], increasing.
+    - `x`: slip displacement [m] at these times; the velocity is constant from sample to sample.
+    - `normal`: normal load [N] for laws whose forces are per newton of load.
+    - `inputs`: what the functions of `scaled_by` find in `params`, by name.
+
+    **Returns:**
+
+    The force [N] at each sample, with the velocity of the interval that ends there (0 at the first).
+
+    **Raises:**
+
+    - `ValueError` for a law whose force depends on more than its own motion.
+    """
+    if not isinstance(law, AbstractDynamicLaw | AbstractForceLaw):
+        raise ValueError(f"{type(law).__name__} cannot run by itself: its force depends on the load it holds.")
+    dt = jnp.diff(t)
+    v = jnp.diff(x) / jnp.where(dt > 0, dt, 1.0)  # records side by side repeat their last time
+
+    def at(t: Array, x: Array, v: Array, params: Any) -> Any:
+        return law.bind_state(t, x[None], v[None], params)
+
+    def advance(z: Any, sample: Any) -> tuple[Any, Array]:
+        t, x, v, params, dt = sample
+        here = at(t, x, v, params)
+        if isinstance(here, AbstractForceLaw):
+            return z, here.force(v)
+        z = here.step_exact(v, z, dt)
+        return z, here.force(v, z)
+
+    rest = jnp.zeros_like(x[0])
+    z0 = law.initial_state(rest) if isinstance(law, AbstractDynamicLaw) else None
+    first = at(t[0], x[0], rest, jax.tree.map(lambda each: each[0], inputs or {}))
+    start = first.force(rest) if z0 is None else first.force(rest, z0)
+    samples = (t[1:], x[1:], v, jax.tree.map(lambda each: each[1:], inputs or {}), dt)
+    _, force = jax.lax.scan(advance, z0, samples)
+    force = jnp.concatenate([jnp.reshape(start, (1,)), force])
+    return force if normal is None else force * jnp.maximum(normal, 0.0)

@@ -1,0 +1,442 @@
+"""`compare`, `compare_laws`: which of several models, judged by what was held back from the fit."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ...friction import AbstractLaw
+from ...scene import Scene, State, scene_numbers
+from ..data._record import Record, Runs, cut, runs_of
+from ..estimate._initializers import AbstractInitializer, Continuation
+from ..estimate._prepare import Settings, StartState, measured_start, prepare
+from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
+from ..estimate._search import Progress, SearchOptions, SearchResult, solve
+from ..estimate._search import by_channel as residual_by_channel
+from ..model._engines import DELAY
+from ..model._observe import Observable, by_channel, first_coordinate
+from ..model._parameters import split_entries
+from ..uncertainty._fit import fit, fit_law
+from ..uncertainty._result import FitResult
+from ._comparison import Comparison, CrossValidated, Part, comparison_of
+
+# Called after each iteration with the name of the model, the number of the fold that is held back (None: nothing is),
+# the number of the iteration and the root mean square of the residual.
+CompareProgress: TypeAlias = Callable[[str, int | None, int, float], None]
+# Relative tolerance of runs by events, as in `fit`.
+_ACCURACY = 1e-8
+# Relative tolerance of the fits with something held back: their errors are wanted to three digits, and start close.
+_ENOUGH = 1e-4
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model that is to be compared.
+
+    **Arguments:**
+
+    - `scene`: with start values; for `compare_laws` a law.
+    - `free`: names of the numbers to fit, as for `fit`; for a law None for those that `fit_law` takes by itself.
+    - `description`: for tables.
+    """
+
+    scene: Scene | AbstractLaw
+    free: Sequence[str] | None
+    description: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Asked:
+    """What `compare` was asked for that is the same for all candidates; see there."""
+
+    records: tuple[Record, ...]
+    hold_out: tuple[Record, ...]
+    folds: int
+    observe: Observable | Mapping[str, Observable]
+    q0: StartState | None
+    qd0: StartState | None
+    limits: Mapping[str, tuple[float | None, float | None]]
+    loss: AbstractLoss
+    initializer: tuple[AbstractInitializer, ...]
+    substeps: int
+    max_steps: int
+    progress: CompareProgress | None
+
+    def settings(self, scene: Scene, q0: StartState | None, qd0: StartState | None) -> Settings:
+        """As `prepare` wants them, with the limits that are for this scene."""
+        limits = {name: each for name, each in self.limits.items() if name in _names(scene, self.records)}
+        return Settings(
+            observe=self.observe,
+            q0=q0,
+            qd0=qd0,
+            limits=limits,
+            loss=self.loss,
+            substeps=self.substeps,
+            accuracy=_ACCURACY,
+        )
+
+    def options(self, name: str, fold: int | None) -> SearchOptions:
+        """Of a search in which this fold is held back."""
+        return SearchOptions(_ENOUGH, self.max_steps, _told(self.progress, name, fold))
+
+
+def compare(
+    candidates: Mapping[str, Candidate],
+    records: Record | Sequence[Record],
+    *,
+    folds: int = 4,
+    hold_out: Record | Sequence[Record] = (),
+    observe: Observable | Mapping[str, Observable] = first_coordinate,
+    q0: StartState | None = None,
+    qd0: StartState | None = None,
+    limits: Mapping[str, tuple[float | None, float | None]] | None = None,
+    loss: AbstractLoss | None = None,
+    initializer: AbstractInitializer | Sequence[AbstractInitializer] = (),
+    substeps: int = 1,
+    max_steps: int = 100,
+    progress: CompareProgress | None = None,
+) -> Comparison:
+    """Fit several models to the same records, and judge each by its error on what it was not fitted to.
+
+    Each record is cut into `folds` windows. In turn one window of each record is held back: the model is fitted to the
+    others, every window from a start state (q0, qd0) of its own, then run over the window that was held back with these
+    parameters, for which only the start state is fitted. The states of friction laws where a window begins are those of
+    the fit to whole records. With `hold_out` the model is fitted to `records` and run over the whole of each of those,
+    again with its start state fitted.
+
+    **Arguments:**
+
+    - `candidates`: the models by name.
+    - `records`: a record or several, as for `fit`.
+    - `folds`: windows of each record, >= 2; of a record in `hold_out` the parts from which the standard error comes.
+    - `hold_out`: records that are kept for the judgement; then `records` are not cut.
+    - `observe`, `q0`, `qd0`, `loss`, `substeps`, `max_steps`: see `fit`.
+    - `limits`, `initializer`: see `fit`; a limit of, or a `Continuation` in, a number that a candidate does not have is
+      none for it.
+    - `progress`: called after each iteration with the model's name, the fold that is held back (None: the fit to
+      everything), the iteration and the RMSE. Ctrl-C ends the comparison with the models that were finished.
+
+    **Returns:**
+
+    A `Comparison`. A model whose fit fails stays in it with the reason.
+
+    **Raises:**
+
+    - `ValueError` for fewer than two folds, no candidates, limits that no candidate has, and as `fit` does.
+    """
+    several = (records,) if isinstance(records, Record) else tuple(records)
+    others = (hold_out,) if isinstance(hold_out, Record) else tuple(hold_out)
+    initializers = (initializer,) if isinstance(initializer, AbstractInitializer) else tuple(initializer)
+    loss = SquaredLoss() if loss is None else loss
+    asked = _Asked(
+        records=several,
+        hold_out=others,
+        folds=folds,
+        observe=observe,
+        q0=q0,
+        qd0=qd0,
+        limits=limits or {},
+        loss=loss,
+        initializer=initializers,
+        substeps=substeps,
+        max_steps=max_steps,
+        progress=progress,
+    )
+    _check(candidates, folds)
+    known = set()
+    for name, candidate in candidates.items():
+        if not isinstance(candidate.scene, Scene) or candidate.free is None:
+            raise ValueError(
+                f"{name}: compare needs a scene and the names of its free numbers; for laws, compare_laws."
+            )
+        known |= _names(candidate.scene, several)
+        # Wrong names show before the first model has taken its time.
+        prepare(candidate.scene, several, candidate.free, asked.settings(candidate.scene, q0, qd0))
+    unknown = [name for name in asked.limits if name not in known]
+    unknown += [each.name for each in initializers if isinstance(each, Continuation) and each.name not in known]
+    if unknown:
+        raise ValueError(f"{unknown[0]} is no number of any candidate; there are: {', '.join(sorted(known))}.")
+    judges = {name: partial(_validate_scene, name, candidate, asked) for name, candidate in candidates.items()}
+    description = {name: candidate.description for name, candidate in candidates.items()}
+    by = f"{folds} folds" if not others else ", ".join(record.name for record in others)
+    return _compared(judges, description, by)
+
+
+def compare_laws(
+    laws: Mapping[str, AbstractLaw | Candidate],
+    records: Record | Sequence[Record],
+    *,
+    folds: int = 4,
+    loss: AbstractLoss | None = None,
+    initializer: AbstractInitializer | Sequence[AbstractInitializer] = (),
+    max_steps: int = 100,
+    progress: CompareProgress | None = None,
+) -> Comparison:
+    """Fit several friction laws to a measured force under a measured motion, and judge each by what was held back.
+
+    Each record is cut into `folds` blocks in time. In turn one is held back: the law runs through the whole record,
+    from rest and unloaded, but the samples of the block do not count in the fit.
+
+    **Arguments:**
+
+    - `laws`: the laws by name, with start values; `Candidate(law, free)` says which of its parameters are free.
+    - `records`, `loss`, `initializer`, `max_steps`: see `fit_law`.
+    - `folds`: blocks of each record, >= 2.
+    - `progress`: see `compare`.
+
+    **Returns:**
+
+    A `Comparison`.
+
+    **Raises:**
+
+    - `ValueError` for fewer than two folds, no laws, and as `fit_law` does.
+    """
+    _check(laws, folds)
+    candidates = {name: x if isinstance(x, Candidate) else Candidate(x, None) for name, x in laws.items()}
+
+    def judge(name: str, candidate: Candidate) -> CrossValidated:
+        law = candidate.scene
+        if not isinstance(law, AbstractLaw):
+            raise ValueError(f"{name}: compare_laws needs friction laws; for scenes, compare.")
+        told = _told(progress, name, None)
+        result = fit_law(
+            law, records, candidate.free, loss=loss, initializer=initializer, max_steps=max_steps, progress=told
+        )  # fmt: skip
+        search = _finished(result.search)
+        problem, held = search.problem, []
+        block = _blocks(problem.runs, folds)
+        for fold in range(folds):
+            options = SearchOptions(_ENOUGH, max_steps, _told(progress, name, fold))
+            held += _held_back(problem, search.state.x, result, block == fold, block, options)
+        return CrossValidated(result, tuple(held))
+
+    judges = {name: partial(judge, name, candidate) for name, candidate in candidates.items()}
+    return _compared(judges, {name: each.description for name, each in candidates.items()}, f"{folds} folds")
+
+
+def _check(candidates: Mapping[str, object], folds: int) -> None:
+    if not candidates:
+        raise ValueError("There must be one candidate at least.")
+    if isinstance(folds, bool) or folds < 2:
+        raise ValueError(f"folds must be at least 2, an integer, but {folds!r} was given.")
+
+
+def _names(scene: Scene, records: tuple[Record, ...]) -> set[str]:
+    """Names of all that can have a limit."""
+    return {*split_entries(scene_numbers(scene)), *(DELAY + name for record in records for name in record.inputs)}
+
+
+def _told(progress: CompareProgress | None, name: str, fold: int | None) -> Progress | None:
+    if progress is None:
+        return None
+
+    def told(iteration: int, rms: float, values: dict[str, float]) -> None:
+        del values
+        progress(name, fold, iteration, rms)
+
+    return told
+
+
+def _compared(
+    judges: Mapping[str, Callable[[], CrossValidated]], description: Mapping[str, str], by: str
+) -> Comparison:
+    """All candidates one after the other, whatever becomes of each."""
+    judged: dict[str, CrossValidated] = {}
+    failures: dict[str, str] = {}
+    for name, judge in judges.items():
+        try:
+            judged[name] = judge()
+        except KeyboardInterrupt:
+            if not judged:
+                raise  # nothing is finished
+            break
+        except RuntimeError as error:
+            failures[name] = str(error).splitlines()[0]
+    left = tuple(name for name in judges if name not in judged and name not in failures)
+    return comparison_of(judged, failures, left, description, by)
+
+
+def _finished(search: SearchResult | None) -> SearchResult:
+    """A search that was not interrupted, and whose end is finite."""
+    assert search is not None
+    if search.ending.startswith("interrupted"):
+        raise KeyboardInterrupt
+    if not bool(jnp.isfinite(search.state.cost)):
+        raise RuntimeError("The fit ended with values that are not finite.")
+    return search
+
+
+def _validate_scene(name: str, candidate: Candidate, asked: _Asked) -> CrossValidated:
+    """The fit to everything, then what each held-back part makes of a fit without it."""
+    scene, free = candidate.scene, candidate.free
+    assert isinstance(scene, Scene)
+    assert free is not None
+    numbers = _names(scene, asked.records)
+    settings = asked.settings(scene, asked.q0, asked.qd0)
+    result = fit(
+        scene,
+        asked.records,
+        free,
+        observe=asked.observe,
+        q0=asked.q0,
+        qd0=asked.qd0,
+        limits=settings.limits,
+        loss=asked.loss,
+        initializer=[each for each in asked.initializer if not isinstance(each, Continuation) or each.name in numbers],
+        substeps=asked.substeps,
+        max_steps=asked.max_steps,
+        progress=_told(asked.progress, name, None),
+    )
+    search = _finished(result.search)
+    if asked.hold_out:
+        problem = _apart(scene, asked.hold_out, _measured_starts(search, asked), search, asked)
+        block = _blocks(problem.runs, asked.folds)
+        x = _at(problem, search)
+        return CrossValidated(result, tuple(_evaluated(problem, x, result, block, asked.options(name, 0))))
+    windows = [each for record in asked.records for each in record.windows(_span(record) / asked.folds)]
+    problem = _apart(scene, tuple(windows), _reached(search, asked.records, asked.folds), search, asked)
+    fold = np.arange(problem.count) % asked.folds
+    block = np.broadcast_to(fold[:, None], problem.runs.t.shape)
+    everything = _finished(solve(problem, _at(problem, search), asked.options(name, None)))
+    held: list[Part] = []
+    for k in range(asked.folds):
+        held += _held_back(problem, everything.state.x, result, block == k, block, asked.options(name, k))
+    return CrossValidated(result, tuple(held))
+
+
+def _held_back(
+    problem: FitProblem,
+    x: Float[Array, " n"],
+    result: FitResult,
+    mask: np.ndarray,
+    block: Int[np.ndarray, "runs samples"],
+    options: SearchOptions,
+) -> list[Part]:
+    """Fit from `x` without the samples in the mask; what is left of these."""
+    fitted = _finished(solve(_counting(problem, ~mask), x, options)).state.x
+    return _evaluated(_counting(problem, mask), fitted, result, block, options)
+
+
+def _evaluated(
+    problem: FitProblem,
+    x: Float[Array, " n"],
+    result: FitResult,
+    block: Int[np.ndarray, "runs samples"],
+    options: SearchOptions,
+) -> list[Part]:
+    """Residual of the samples that count with the parameters at `x` and the start states that fit best."""
+    search = _finished(solve(_pinned(problem, x, result), x, options))
+    return _parts(search, block)
+
+
+def _counting(problem: FitProblem, mask: np.ndarray) -> FitProblem:
+    """The problem in which only the samples in the mask count, and slip instants of runs that have any."""
+    runs, own = problem.runs, np.any(mask, axis=1, keepdims=True)
+    runs = runs._replace(
+        weight={name: jnp.where(mask, weight, 0.0) for name, weight in runs.weight.items()},
+        slip_weight={name: jnp.where(own, weight, 0.0) for name, weight in runs.slip_weight.items()},
+    )
+    return eqx.tree_at(lambda p: p.runs, problem, runs)
+
+
+def _pinned(problem: FitProblem, x: Float[Array, " n"], result: FitResult) -> FitProblem:
+    """The problem with the parameters held where they are, by a prior: arrays alone, so nothing compiles again.
+
+    A quarter of the digits beyond what the records know of each parameter: it moves by no more than a
+    millionth of its standard error, and the normal equations are still well scaled.
+    """
+    mean = problem.free.vector(problem.split(x)[0])
+    stiff = float(jnp.finfo(mean.dtype).eps) ** -0.25
+    known = np.sqrt(np.diag(result.estimate.information)[: len(mean)])
+    size = np.abs(np.asarray(mean))
+    weight = stiff * np.maximum(known, 1 / np.where(size > 0, size, 1.0))
+    return eqx.tree_at(lambda p: p.prior, problem, Prior(mean, jnp.asarray(weight, mean.dtype)))
+
+
+def _parts(search: SearchResult, block: Int[np.ndarray, "runs samples"]) -> list[Part]:
+    """Residuals in the units of their channels, for each run and block that has samples that count."""
+    problem, parts = search.problem, {}
+    for name, (residual, weight) in residual_by_channel(problem, search.state.residual).items():
+        level = float(problem.noise[name])
+        # Slip instants all go with the first sample of their run.
+        number = block if block.shape == weight.shape else np.broadcast_to(block[:, :1], weight.shape)
+        for run in range(problem.count):
+            for k in np.unique(number[run][weight[run] > 0]):
+                chosen = (number[run] == k) & (weight[run] > 0)
+                parts.setdefault((run, int(k)), {})[name] = level * residual[run, chosen]
+    return list(parts.values())
+
+
+def _blocks(runs: Runs, folds: int) -> Int[np.ndarray, "runs samples"]:
+    """Number of the block of each sample, with nearly the same number of samples in each block of a run."""
+    weight = np.max(np.stack([np.asarray(x) for x in runs.weight.values()]), axis=0)
+    counts = np.sum(weight > 0, axis=1, keepdims=True)
+    return np.minimum(np.arange(weight.shape[1])[None, :] * folds // np.maximum(counts, 1), folds - 1)
+
+
+def _span(record: Record) -> float:
+    return float(record.t[-1] - record.t[0])
+
+
+def _at(problem: FitProblem, search: SearchResult) -> Float[Array, " n"]:
+    """The parameters that were found, and the start states of the problem as they are."""
+    size = len(problem.free.names)
+    return jnp.concatenate([search.state.x[:size], problem.x0[size:]])
+
+
+def _apart(scene: Scene, records: tuple[Record, ...], starts: State, search: SearchResult, asked: _Asked) -> FitProblem:
+    """Records that each run from a free state of their own, with the noise levels that were found."""
+    free = (*search.problem.free.names, "q0", "qd0")
+    problem = prepare(scene, records, free, asked.settings(scene, starts.q, starts.qd)).problem
+    noise = {name: search.problem.noise.get(name, level) for name, level in problem.noise.items()}
+    return eqx.tree_at(lambda p: (p.base, p.noise), problem, (starts, noise))
+
+
+def _reached(search: SearchResult, records: tuple[Record, ...], folds: int) -> State:
+    """States of the fit where windows begin, with a leading axis of windows: runs that end there."""
+    problem, x = search.problem, search.state.x
+    first = problem.starts(x)
+    before = []
+    for i, record in enumerate(records):
+        edges = np.cumsum([len(window.t) for window in record.windows(_span(record) / folds)])[:-1]
+        before += [record.samples(0, int(edge) + 1, f"{i} {edge}") for edge in edges]
+    runs = runs_of(tuple(before), cut(tuple(before), None))
+    own = jnp.repeat(jnp.arange(len(records)), folds - 1)
+    ends = _ends(problem, x, jax.tree.map(lambda x: x[own], first), runs)
+
+    def merge(start: Array, end: Array) -> Array:
+        later = jnp.reshape(end, (len(records), folds - 1, *end.shape[1:]))
+        both = jnp.concatenate([start[:, None], later], axis=1)
+        return jnp.reshape(both, (len(records) * folds, *end.shape[1:]))
+
+    return jax.tree.map(merge, first, ends)
+
+
+@eqx.filter_jit
+def _ends(problem: FitProblem, x: Array, starts: State, runs: Runs) -> State:
+    values = problem.free.values(problem.split(x)[0])
+    return jax.vmap(lambda start, run: problem.engine(values, start, run).end)(starts, runs)
+
+
+def _measured_starts(search: SearchResult, asked: _Asked) -> State:
+    """States where the records that are held out begin: what was measured, else where the first record begins."""
+    base = search.problem.base
+    assert base is not None
+    observables = by_channel(asked.observe, asked.hold_out)
+    q, qd = [], []
+    for record in asked.hold_out:
+        start = measured_start(record, observables, base.q.shape[1], exact=False)
+        # What was not measured comes as zero.
+        q.append(np.where(start[0] != 0, start[0], base.q[0]))
+        qd.append(np.where(start[1] != 0, start[1], base.qd[0]))
+    scene = search.problem.engine.model
+    return jax.vmap(lambda q, qd: State(q, qd, scene.initial_state(q)))(
+        jnp.asarray(np.stack(q)), jnp.asarray(np.stack(qd))
+    )

@@ -1,0 +1,1 @@
+"""How sure the numbers are: covariance, the result of a fit, profiles, tests of residuals, coverage."""

@@ -1,0 +1,337 @@
+"""`fit` and `fit_law`: numbers of a scene, or of a law by itself, from measured records."""
+
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..._core.arguments import as_float, as_mapping, as_names, as_whole
+from ..._core.parameters import Range
+from ..._core.state_dependent import is_state_dependent
+from ...friction import AbstractLaw
+from ...scene import Scene, scene_numbers, scene_ranges
+from ..data._record import Record, Windows, cut, runs_of
+from ..estimate._initializers import AbstractInitializer, run_initializers
+from ..estimate._prepare import MultipleShooting, Settings, StartState, prepare, step_error
+from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
+from ..estimate._search import Progress, SearchOptions, SearchResult, by_channel, solve_with_noise
+from ..model._engines import Controller, LawEngine, with_values
+from ..model._observe import Observable, coordinates_seen, first_coordinate
+from ..model._parameters import FreeParameters, chosen_entries, split_entries, split_ranges
+from ._estimate import FitDiagnostics, FitProvenance, IdentifiabilityIssue, ParameterEstimate, covariance_of
+from ._identifiability import identifiability_issues
+from ._result import FitResult, uncertain_of
+
+_KINDS = {
+    "scene": "a Scene",
+    "loss": "a loss such as Huber()",
+    "controller": "a Controller",
+    "shooting": "a MultipleShooting",
+}
+
+
+def fit(
+    scene: Scene,
+    records: Record | Sequence[Record],
+    free: Sequence[str],
+    *,
+    observe: Observable | Mapping[str, Observable] = first_coordinate,
+    q0: StartState | None = None,
+    qd0: StartState | None = None,
+    delay: Mapping[str, float] | None = None,
+    limits: Mapping[str, tuple[float | None, float | None]] | None = None,
+    passive: Sequence[str] = (),
+    prior: Mapping[str, tuple[float, float]] | None = None,
+    loss: AbstractLoss | None = None,
+    controller: Controller | None = None,
+    shooting: MultipleShooting | None = None,
+    initializer: AbstractInitializer | Sequence[AbstractInitializer] = (),
+    substeps: int = 1,
+    accuracy: float = 1e-8,
+    rtol: float = 1e-6,
+    max_steps: int = 100,
+    progress: Progress | None = None,
+) -> FitResult:
+    """Fit numbers of a scene so that its simulation follows measured records.
+
+    The inputs drive the scene, nothing measured is fed back, and the sum of squares of `observe - measured`, each
+    channel in units of its noise, is minimised over all samples by Levenberg-Marquardt within bounds, on the exact
+    derivatives of the simulated run. Scenes without set-valued laws are run by fixed steps from sample to sample,
+    those with such laws by events.
+
+    **Arguments:**
+
+    - `scene`: the model with start values; its `params` must be a dict with an entry for each input of the records.
+    - `records`: a `Record` or several; each has the same inputs.
+    - `free`: names of the numbers to fit, as `jaxmodsim.scene.scene_numbers` gives them: `("m", "friction.Fc")`;
+      the name of an array stands for all its entries, `friction.k[0]` for one. Of initial states `q0[0]`, `qd0[0]`,
+      `z0.friction` (or `q0`, `qd0`, `z0` for all), fitted for each record by itself; of the delay [s] of an input
+      `delay.u`. Laws' parameters stay in their ranges; one that is not free but limited by one that is (Fs by Fc)
+      keeps its distance from it.
+    - `observe`: what a record measured: a function `observe(q, qd)` that returns one number, `"q[0]"`, `"qd[0]"`, or
+      the name of an effect, whose force is meant; with several channels a dict of these by channel.
+    - `q0`, `qd0`: state at the first sample, shape `[dof]` or `[records, dof]`; by default the first measured value
+      of each coordinate that was measured, the others 0, and rest. `jaxmodsim.identify.start_state` estimates one.
+    - `delay`: by how much inputs come later than recorded [s], >= 0; where they start if they are free.
+    - `limits`: lower and upper limits of numbers beyond the declared ones, None for none: `{"m": (0.0, 5.0)}`. A lower
+      limit of 0 is excluded.
+    - `passive`: names of the friction effects with a LuGre law that has to be passive, `sigma2 >= sigma1 (Fs - Fc)/Fc`;
+      their sigma2 must be free.
+    - `prior`: what was known before: mean and standard deviation by name, `{"m": (95.0, 5.0)}`.
+    - `loss`: of a residual in noise levels; `SquaredLoss` by default, `Huber` and `Cauchy` where there are outliers.
+    - `controller`: a `Controller` that closes a loop around the scene.
+    - `shooting`: `MultipleShooting`, to run in windows.
+    - `initializer`: how to find where the search starts, one after the other: `Staged()`, `MultiStart(...)`,
+      `Continuation(...)`.
+    - `substeps`: integration steps between two samples.
+    - `accuracy`: relative tolerance of runs by events.
+    - `rtol`: relative change of the residual at which the search ends.
+    - `max_steps`: limit of iterations.
+    - `progress`: called after each iteration with its number, the RMSE and the parameters. Ctrl-C ends the fit
+      with the best so far.
+
+    **Returns:**
+
+    A `FitResult`.
+
+    **Raises:**
+
+    - `ValueError` for names that are unknown, a start beyond its limits, inputs the scene has no entry for.
+    - `RuntimeError` if the model is not finite at its start values.
+    """
+    loss = SquaredLoss() if loss is None else loss
+    _check_kinds(scene, loss, controller, shooting, progress)
+    initializer = _initializers(initializer)
+    settings = Settings(
+        observe=observe,
+        q0=q0,
+        qd0=qd0,
+        delay=as_mapping(delay, name="delay", example="{'u': 1e-3}"),
+        limits=as_mapping(limits, name="limits", example="{'m': (0.0, 5.0)}"),
+        passive=as_names(passive, name="passive"),
+        prior=as_mapping(prior, name="prior", example="{'m': (95.0, 5.0)}"),
+        loss=loss,
+        controller=controller,
+        shooting=shooting,
+        substeps=as_whole(substeps, name="substeps"),
+        accuracy=as_float(accuracy, name="accuracy", lower=0.0),
+    )
+    options = SearchOptions(as_float(rtol, name="rtol", lower=0.0), as_whole(max_steps, name="max_steps"), progress)
+    prepared = prepare(scene, records, free, settings)
+    x, starts = run_initializers(initializer, prepared.problem, options)
+    search = solve_with_noise(prepared.problem, x, options, prepared.given)
+    values = search.problem.free.values(search.problem.split(search.state.x)[0])
+    error = step_error(search)
+    return result_of(
+        search, prepared.records, prepared.windows, prepared.units, with_values(scene, values), error, starts
+    )
+
+
+def _check_kinds(scene: object, loss: object, controller: object, shooting: object, progress: object) -> None:
+    """Refuse objects of another kind."""
+    for name, value, kind in (
+        ("scene", scene, Scene),
+        ("loss", loss, AbstractLoss),
+        ("controller", controller, Controller | None),
+        ("shooting", shooting, MultipleShooting | None),
+    ):
+        if not isinstance(value, kind):
+            raise ValueError(f"{name} must be {_KINDS[name]}, but {value!r} was given.")
+    if not (progress is None or callable(progress)):
+        raise ValueError(f"progress must be a function, but {progress!r} was given.")
+
+
+def _initializers(initializer: object) -> tuple[AbstractInitializer, ...]:
+    several = (initializer,) if isinstance(initializer, AbstractInitializer) else initializer
+    if not isinstance(several, tuple | list) or not all(isinstance(each, AbstractInitializer) for each in several):
+        raise ValueError(
+            f"initializer must be one such as Staged(), or several of them, but {initializer!r} was given."
+        )
+    return tuple(several)
+
+
+def fit_law(
+    law: AbstractLaw,
+    record: Record | Sequence[Record],
+    free: Sequence[str] | None = None,
+    *,
+    loss: AbstractLoss | None = None,
+    initializer: AbstractInitializer | Sequence[AbstractInitializer] = (),
+    rtol: float = 1e-6,
+    max_steps: int = 100,
+    progress: Progress | None = None,
+) -> FitResult:
+    """Fit a friction law to a measured friction force under a measured motion.
+
+    The law's state is advanced exactly over each sample at constant velocity, so any sampling rate is stable and
+    the measured position needs no differentiation but in viscous terms.
+
+    **Arguments:**
+
+    - `law`: the law with start values; a dynamic law such as `LuGre`, or one that is a function of velocity.
+    - `record`: a record, or several; `measured` is the friction force [N], positive when it opposes positive slip;
+      `inputs` holds the slip displacement `x` [m] and, if the law's forces are per newton of load, the normal load
+      `normal` [N]. The law starts at rest and unloaded.
+    - `free`: names of the law's parameters to fit, `k[0]` for one entry of an array; by default all but those that
+      start on their limit (`sigma1 = 0`) and the `width` of a wrapper and the `corner` of Maxwell slip, which are how
+      the law is run and not what it is.
+    - `loss`, `initializer`, `rtol`, `max_steps`, `progress`: see `fit`.
+
+    **Returns:**
+
+    A `FitResult` whose `model` is the law.
+
+    **Raises:**
+
+    - `ValueError` for unknown names or inputs, or a law that cannot run by itself.
+    """
+    several = (record,) if isinstance(record, Record) else tuple(record)
+    for each in several:
+        if "x" not in each.inputs or not (is_state_dependent(law) or set(each.inputs) <= {"x", "normal"}):
+            raise ValueError(
+                "fit_law needs the input 'x' [m] and may take 'normal' [N], and more only for a law that scaled_by lets"
+                f" depend on it; the record has: {', '.join(each.inputs)}."
+            )
+    numbers, ranges = scene_numbers(law), scene_ranges(law)
+    single, ranges = split_entries(numbers), split_ranges(numbers, ranges)
+    chosen = _off_limits(single, ranges) if free is None else chosen_entries(numbers, free)
+    parameters = FreeParameters.of(single, ranges, chosen)
+    windows = cut(several, None)
+    given = {name: level for each in several for name, level in each.noise.items()}
+    size = float(np.std(np.concatenate([each.measured for each in several]))) or 1.0
+    problem = FitProblem(
+        LawEngine(law),
+        parameters,
+        (),
+        None,
+        runs_of(several, windows),
+        {name: jnp.asarray(given.get(name, size)) for name in several[0].channels},
+        SquaredLoss() if loss is None else loss,
+        Prior(jnp.zeros(len(parameters.names)), jnp.zeros(len(parameters.names))),
+    )
+    options = SearchOptions(rtol, max_steps, progress)
+    x, starts = run_initializers(initializer, problem, options)
+    search = solve_with_noise(problem, x, options, frozenset(given))
+    per_load = " per N" if "normal" in several[0].inputs else ""
+    units = {
+        name: allowed.unit + (per_load if allowed.unit.startswith("N") else "") for name, allowed in ranges.items()
+    }
+    fitted = with_values(law, search.problem.free.values(search.state.x))
+    return result_of(search, several, windows, units, fitted, None, starts)
+
+
+def _off_limits(numbers: dict[str, Array], ranges: dict[str, Range]) -> tuple[str, ...]:
+    """Names of the parameters that can be free where they start."""
+    free = []
+    for name, value in numbers.items():
+        lower = ranges[name].lower if name in ranges else None
+        limit = numbers[lower] if isinstance(lower, str) else lower
+        if not (name in ranges and ranges[name].execution) and (limit is None or bool(value > limit)):
+            free.append(name)
+    return tuple(free)
+
+
+def result_of(
+    search: SearchResult,
+    records: tuple[Record, ...],
+    windows: Windows,
+    units: dict[str, str],
+    model: eqx.Module,
+    step_error: float | None = None,
+    starts: tuple[float, ...] = (),
+) -> FitResult:
+    """The result of a search: estimate, diagnostics, provenance."""
+    problem, state = search.problem, search.state
+    names, at_start, values = list(problem.free.names), [], []
+    shared, own = problem.split(state.x)
+    values += [float(x) for x in problem.free.vector(shared)]
+    at_start += [float(problem.free.start[name]) for name in names]
+    whole = len(set(windows.record)) == len(windows.record)
+    if whole and problem.local:
+        base = _first_states(search)
+        for i, record in enumerate(records):
+            prefix = "" if len(records) == 1 else f"{record.name}/"
+            names += [prefix + name for name in problem.local]
+            at_start += base[i].tolist()
+            values += (base[i] + np.asarray(own[i])).tolist()
+    covariance = covariance_of(problem, state, len(names))
+    outputs, rmse = _stitched(search, records, windows)
+    free = problem.free
+    estimate = ParameterEstimate(
+        values=dict(zip(names, values, strict=True)),
+        start=dict(zip(names, at_start, strict=True)),
+        units={name: units.get(name, "") for name in names},
+        covariance=np.asarray(covariance.covariance),
+        white=np.asarray(covariance.white),
+        information=np.asarray(covariance.information),
+        logarithmic=tuple(name for name, kind in zip(free.names, free.kinds, strict=True) if kind == "log"),
+        bounds=free.limits(shared) | {name: (-np.inf, np.inf) for name in names[len(free.names) :]},
+    )
+    provenance = FitProvenance(
+        records=records,
+        outputs=outputs,
+        coordinates=_coordinates(search),
+        numbers={name: np.asarray(x) for name, x in scene_numbers(model).items()},
+        model=model,
+    )
+    diagnostics = FitDiagnostics(
+        rmse=rmse,
+        noise={name: float(x) for name, x in problem.noise.items()},
+        ending=search.ending,
+        evaluations=search.iterations,
+        step_error=step_error,
+        starts=starts,
+        single_precision=jnp.result_type(float) == jnp.float32,
+        issues=_issues(estimate, provenance, search),
+    )
+    return FitResult(estimate=estimate, diagnostics=diagnostics, provenance=provenance, search=search)
+
+
+def _coordinates(search: SearchResult) -> dict[str, str]:
+    """Which channels, or inputs of a law, are coordinates and velocities."""
+    base = search.problem.base
+    if base is None:
+        return {"x": "q[0]"} if "x" in search.problem.runs.inputs else {}
+    return coordinates_seen(search.problem.engine.observables, base.q.shape[-1])
+
+
+def _issues(
+    estimate: ParameterEstimate, provenance: FitProvenance, search: SearchResult
+) -> tuple[IdentifiabilityIssue, ...]:
+    """Causes in the motion for what the figures call uncertain."""
+    uncertain, model, base = uncertain_of(estimate), provenance.model, search.problem.base
+    if not uncertain or not isinstance(model, Scene | AbstractLaw):
+        return ()
+    dof = 1 if base is None else base.q.shape[-1]
+    free = search.problem.free.names
+    return identifiability_issues(model, provenance.motions, dof, provenance.numbers, free, uncertain)
+
+
+def _first_states(search: SearchResult) -> np.ndarray:
+    """Free numbers of the initial states before the fit, shape `[runs, local]`."""
+    base = search.problem.base
+    assert base is not None
+    return np.asarray(jax.vmap(search.problem.taken)(base))
+
+
+def _stitched(
+    search: SearchResult, records: tuple[Record, ...], windows: Windows
+) -> tuple[tuple[dict[str, np.ndarray], ...], dict[str, float]]:
+    """The model's output along each record, and the root mean squares of the differences."""
+    problem = search.problem
+    split = by_channel(problem, search.state.residual)
+    outputs: list[dict[str, np.ndarray]] = [
+        {name: np.array(x) for name, x in record.channels.items()} for record in records
+    ]
+    rmse = {}
+    for name, (residual, weight) in split.items():
+        level = float(problem.noise[name])
+        rmse[name] = level * float(np.sqrt(np.sum(residual[weight > 0] ** 2) / max(np.sum(weight > 0), 1)))
+        for run, (i, first, last) in enumerate(zip(windows.record, windows.first, windows.last, strict=True)):
+            if name in outputs[i]:
+                counted = np.flatnonzero(weight[run, : last - first + 1] > 0)
+                outputs[i][name][first + counted] += level * residual[run, counted]
+    return tuple(outputs), rmse

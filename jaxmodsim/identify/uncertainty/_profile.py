@@ -1,0 +1,345 @@
+"""Profile likelihood: how badly the best fit does where one parameter is held at other values."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy import special  # scipy.stats takes most of a second to import
+
+from ..estimate._problem import FitProblem, Prior
+from ..estimate._search import SearchResult, start_search, step
+from ._estimate import BLOCKS, ROUNDING, ParameterEstimate, floored_inverse
+from ._result import FitResult
+
+# Weight of what holds the parameter, in its standard errors: it gives way by a millionth of one.
+_STIFF = 1e3
+# How far to walk before an end is called open: by this factor, or by so many sizes of a parameter that has a sign.
+_FAR_FACTOR, _FAR_SIZES = 1e4, 1e3
+# A ratio of more thresholds than this at the next point is a leap.
+_LEAP = 4.0
+# How well the ratio must be known at a point, and what a search never does without.
+_PRECISE, _LARGEST_RTOL, _ITERATIONS = 2e-3, 1e-4, 40
+# Shorter and longer steps of the walk, and how closely the end of an interval is found, as a share of the distance.
+_SHORTER, _LONGER, _CLOSE = 0.3, 3.0, 1e-2
+# A point that fits better than the estimate by this share of the threshold says that the search had ended early.
+_BELOW = 0.1
+# Scatter over blocks below this share of the residual's variance says next to nothing.
+_LEAST_INFLATION = 0.5
+# Unit of the walk where there is no standard error, as a share of the value.
+_UNKNOWN_UNIT = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Profile:
+    """The likelihood along one parameter, all others fitted again at each of its values.
+
+    - `name`, `unit`: of the parameter. `estimate`, `error`: as the fit gave them.
+    - `values`: of the parameter, increasing, shape `[points]`.
+    - `ratio`: by how much the sum of losses is larger than at the estimate, in units of what the covariance of the
+      fit makes of one squared standard error; shape `[points]`. It is `((value - estimate)/error)^2` where the model is
+      linear. In other words: the logarithm of the likelihood ratio, times two, with the variance of the residual as it
+      was estimated, divided by the ratio of `covariance` to `white` (at least 1/2), by which correlated residuals know
+      less than white ones.
+    - `cost`: half the sum of losses in noise levels, shape `[points]`.
+    - `floor`: the limit of a parameter that must lie above a number, and is walked in the logarithm; None for others.
+    - `level`, `threshold`: of the interval, and the ratio at its ends: the quantile of F with 1 and 31 degrees of
+      freedom (blocks of samples less one), the square of Student's t in the intervals of the estimate.
+    - `interval`: where the ratio stays below the threshold; infinite or on a limit where the record sets no end.
+    - `notes`: why an end is open, in words.
+    - `others`: the other parameters along it by name, shape `[points]` each.
+    """
+
+    name: str
+    unit: str
+    estimate: float
+    error: float
+    floor: float | None
+    level: float
+    threshold: float
+    values: Float[np.ndarray, " points"]
+    ratio: Float[np.ndarray, " points"]
+    cost: Float[np.ndarray, " points"]
+    interval: tuple[float, float]
+    notes: tuple[str, ...]
+    others: dict[str, Float[np.ndarray, " points"]]
+
+    def __str__(self) -> str:
+        """The interval and why an end of it is open."""
+        low, high = self.interval
+        width = min(abs(self.estimate - low), abs(high - self.estimate))
+        # Two digits of the width of the interval.
+        share = width / abs(self.estimate) if self.estimate and math.isfinite(width) else 1.0
+        digits = min(max(6, 2 - math.floor(math.log10(max(share, 1e-15)))), 16)
+        head = (
+            f"{self.name} = {self.estimate:.{digits}g} {self.unit or '(no unit)'}, {100 * self.level:g} % interval by"
+            f" the profile likelihood {low:.{digits}g} to {high:.{digits}g}"
+        )
+        return "\n".join([head, *self.notes])
+
+
+class _Point(NamedTuple):
+    """A value of the parameter in the coordinate of the walk, x of the best fit there, its ratio and cost."""
+
+    u: float
+    x: np.ndarray
+    ratio: float
+    cost: float
+
+
+class _End(NamedTuple):
+    """The points of one side, away from the estimate, the coordinate of its end and why it is open."""
+
+    points: list[_Point]
+    u: float
+    note: str
+
+
+@dataclass(frozen=True)
+class _Line:
+    """One parameter and the coordinate `u` in which its values are walked: its logarithm if it must be positive.
+
+    - `unit`: standard error in u, or a guess where there is none.
+    - `inflation`: sum of losses that one squared standard error costs.
+    - `reach`: how far to walk in u; `limits`: of u.
+    - `best`: cost of the fit. `known`: mean and weight of what was known of the parameter before.
+    """
+
+    name: str
+    problem: FitProblem
+    index: int
+    floor: float | None
+    unit: float
+    reach: float
+    limits: tuple[float, float]
+    inflation: float
+    best: float
+    known: tuple[float, float]
+
+    def value(self, u: float) -> float:
+        return u if self.floor is None else self.floor + math.exp(u)
+
+    def coordinate(self, value: float) -> float:
+        return value if self.floor is None else math.log(value - self.floor)
+
+    def cost(self, residual: np.ndarray, value: float) -> float:
+        """Cost without the row that holds the parameter, and with what was known of it before."""
+        rows = np.array(residual)
+        rows[self.problem.samples + self.index] = self.known[1] * (value - self.known[0])
+        return float(self.problem.loss.cost(jnp.asarray(rows)))
+
+    def refit(self, u: float, guess: np.ndarray) -> _Point | None:
+        """The best fit with the parameter at u; None where the model is not finite."""
+        problem, i = self.problem, self.index
+        value = self.value(u)
+        slope = 1.0 if self.floor is None else value - self.floor
+        dtype = problem.prior.mean.dtype
+        weight = problem.prior.weight.at[i].set(_STIFF / (self.unit * slope))
+        held = eqx.tree_at(lambda p: p.prior, problem, Prior(problem.prior.mean.at[i].set(value), weight))
+        lower, upper, _ = problem.box
+        x = jnp.clip(jnp.asarray(guess, dtype), lower, upper)
+        values = {**problem.free.values(problem.split(x)[0]), self.name: jnp.asarray(value, dtype)}
+        x = x.at[: len(problem.free.names)].set(problem.free.coordinates(values))
+        rtol = jnp.asarray(min(_PRECISE * self.inflation / max(self.best, 1e-300), _LARGEST_RTOL), dtype)
+        state = start_search(x, problem.rows)
+        for _ in range(_ITERATIONS):
+            state = step(held, state, rtol)
+            if not np.isfinite(float(state.cost)):
+                return None
+            if int(state.done):
+                break
+        cost = self.cost(np.asarray(state.residual), value)
+        return _Point(u, np.asarray(state.x), 2 * (cost - self.best) / self.inflation, cost)
+
+
+def profile(result: FitResult, name: str, *, points: int = 6, level: float = 0.95) -> Profile:
+    """Profile likelihood of one parameter: all others, and free initial states, are fitted again at each value.
+
+    Unlike the intervals of the estimate it holds where the model is far from linear, and shows what the record leaves
+    open: it walks both ways from the estimate, in the logarithm of a parameter that must be positive, until the fit is
+    worse than the level allows. The noise levels stay as they are. Costs a few evaluations a point, and compiles
+    nothing.
+
+    **Arguments:**
+
+    - `result`: a fit that was not loaded from a file.
+    - `name`: of a free parameter that is no initial state.
+    - `points`: about how many on either side, at least 2.
+    - `level`: of the interval, between 0 and 1.
+
+    **Returns:**
+
+    A `Profile`, drawn by `jaxmodsim.plot.profile_figure`.
+
+    **Raises:**
+
+    - `ValueError` for another name or level, or of a result that was loaded.
+    """
+    search = result.search
+    if search is None:
+        raise ValueError("A profile needs the search, which a loaded result does not have: fit again.")
+    names = search.problem.free.names
+    if name not in names:
+        raise ValueError(f"{name!r} has no profile; the parameters that have one are: {', '.join(names)}.")
+    if not 0 < level < 1:
+        raise ValueError(f"level must lie between 0 and 1, but it is {level}.")
+    if isinstance(points, bool) or not isinstance(points, int) or points < 2:
+        raise ValueError(f"points must be an integer >= 2, but it is {points!r}.")
+    threshold = float(special.fdtri(1, BLOCKS - 1, level))
+    line, tangent = _line_of(result.estimate, search, name)
+    estimate = result.values[name]
+    start = _Point(line.coordinate(estimate), np.asarray(search.state.x), 0.0, line.best)
+    down, up = (_walk(line, start, tangent, side, threshold, points) for side in (-1.0, 1.0))
+    path = [*reversed(down.points), start, *up.points]
+    others = [{k: float(x) for k, x in _values(line.problem, point.x).items()} for point in path]
+    ends = [end.u if math.isinf(end.u) else line.value(end.u) for end in (down, up)]
+    if line.floor is not None and math.isinf(ends[0]):
+        ends[0] = line.floor
+    notes = [end.note for end in (down, up) if end.note]
+    if min(point.ratio for point in path) < -_BELOW * threshold:
+        notes.append(f"Some value of {name} fits better than the estimate: the search had ended early, fit again.")
+    return Profile(
+        name=name,
+        unit=result.estimate.units[name],
+        estimate=estimate,
+        error=result.errors[name],
+        floor=line.floor,
+        level=level,
+        threshold=threshold,
+        values=np.array([line.value(point.u) for point in path]),
+        ratio=np.array([point.ratio for point in path]),
+        cost=np.array([point.cost for point in path]),
+        interval=(ends[0], ends[1]),
+        notes=tuple(notes),
+        others={k: np.array([values[k] for values in others]) for k in names if k != name},
+    )
+
+
+def _values(problem: FitProblem, x: np.ndarray) -> dict[str, np.ndarray]:
+    values = problem.free.values(problem.split(jnp.asarray(x))[0])
+    return {name: np.asarray(values[name]) for name in problem.free.names}
+
+
+def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tuple[_Line, np.ndarray]:
+    """The line, and the derivative of the best x by the parameter as the linear model has it."""
+    problem, state = search.problem, search.state
+    i, size = problem.free.names.index(name), len(problem.free.names)
+    value, error = estimate.values[name], estimate.errors[name]
+    slopes = np.zeros(state.x.shape[0])
+    slopes[:size] = np.asarray(problem.free.slopes(state.x[:size]))[i]
+    sensitivity = _inverse_normal(problem, state.residual, state.jacobian) @ slopes
+    by_losses = float(slopes @ sensitivity)
+    residual, _ = problem.loss.weighted(state.residual[: problem.samples], state.jacobian[: problem.samples])
+    counted = float(np.sum(np.asarray(problem.weights) > 0))
+    variance = float(np.sum(np.asarray(residual) ** 2)) / max(counted - state.x.shape[0], 1)
+    # A squared standard error costs error^2 / by_losses, which is the variance of white residuals. Where one block of
+    # samples decides, the scatter over blocks may say next to nothing by chance, and half of that is the least.
+    inflation = error**2 / by_losses if by_losses > 0 else math.nan
+    inflation = max(inflation, _LEAST_INFLATION * variance) if math.isfinite(inflation) else variance
+    inflation = max(inflation, 1e-300)
+    floor, limits = None, problem.free.fixed_limits(name)
+    if name in estimate.logarithmic:
+        floor = limits[0]
+    size_of = abs(value) if floor is None else value - floor
+    unit = error if math.isfinite(error) and error > 0 else _UNKNOWN_UNIT * (size_of or 1.0)
+    if floor is None:
+        reach = _FAR_SIZES * max(abs(value), unit)
+        unit = min(unit, reach / _FAR_SIZES)
+    else:
+        unit, reach = min(unit / size_of, 1.0), math.log(_FAR_FACTOR)
+        limits = (-math.inf, math.log(limits[1] - floor) if math.isfinite(limits[1]) else math.inf)
+    known = float(problem.prior.mean[i]), float(problem.prior.weight[i])
+    line = _Line(name, problem, i, floor, unit, reach, limits, inflation, 0.0, known)
+    line = replace(line, best=line.cost(np.asarray(state.residual), value))
+    return line, sensitivity / by_losses * (1.0 if floor is None else size_of)
+
+
+def _inverse_normal(problem: FitProblem, residual: Array, jacobian: Array) -> np.ndarray:
+    """Inverse of the normal matrix of the fit by x, with directions that nothing is known of made very long."""
+    _, weighted = problem.loss.weighted(residual, jacobian)
+    matrix = np.asarray(weighted, float).T @ np.asarray(weighted, float)
+    scale = np.sqrt(np.diag(matrix))
+    scale = np.where(scale > 0, scale, 1.0)
+    size = np.outer(scale, scale)
+    return floored_inverse(matrix / size, ROUNDING * float(jnp.finfo(problem.prior.mean.dtype).eps)) / size
+
+
+def _walk(line: _Line, start: _Point, tangent: np.ndarray, side: float, threshold: float, points: int) -> _End:
+    """Walk away from the estimate until the ratio reaches the threshold, or there is nothing more to see."""
+    aim = math.sqrt(threshold) / points
+    pace, slope, path = aim * line.unit, tangent, [start]
+    limit = line.limits[0] if side < 0 else line.limits[1]
+    word = "lower" if side < 0 else "upper"
+    while len(path) <= 6 * points:
+        last = path[-1]
+        if side * (limit - last.u) <= 0:
+            return _End(path[1:], last.u, f"{line.name} reaches its limit {line.value(limit):g} within this interval.")
+        if abs(last.u - start.u) >= line.reach:
+            text = f"{line.name} has no {word} limit from this record"
+            return _End(
+                path[1:], side * math.inf, f"{text}: as far as {line.value(last.u):.3g} nothing speaks against."
+            )
+        u = start.u + side * min(abs(last.u + side * pace - start.u), line.reach)
+        u = limit if side * (limit - u) < 0 else u
+        point = _try(line, u, last, slope)
+        if point is not None and point.ratio > _LEAP * threshold:
+            # A leap may be a search that went astray from a guess that was too bold.
+            again = line.refit(point.u, last.x)
+            point = point if again is None or again.ratio > point.ratio else again
+        if point is None:
+            text = f"The model cannot be run with {line.name} much beyond {line.value(last.u):.4g}: its {word} limit"
+            return _End(path[1:], side * math.inf, f"{text} is not known.")
+        path.append(point)
+        if point.ratio > threshold:
+            inside, crossing = _crossing(line, last, point, threshold)
+            path[-1:] = [*inside, point] if inside else [point]
+            return _End(sorted(path[1:], key=lambda p: side * p.u), crossing, "")
+        grown = _root(point) - _root(last)
+        pace *= min(max(aim / grown, _SHORTER), _LONGER) if grown > 0 else _LONGER
+        slope = (point.x - last.x) / (point.u - last.u)
+    text = f"{line.name} has no {word} limit from this record as far as {line.value(path[-1].u):.4g}"
+    return _End(path[1:], side * math.inf, f"{text}, where the walk ended.")
+
+
+def _try(line: _Line, u: float, last: _Point, slope: np.ndarray) -> _Point | None:
+    """A point at u, or nearer to the last one where the model is not finite there."""
+    for _ in range(5):
+        for guess in (last.x + slope * (u - last.u), last.x):
+            point = line.refit(u, guess)
+            if point is not None:
+                return point
+        u = last.u + 0.3 * (u - last.u)
+    return None
+
+
+def _root(point: _Point) -> float:
+    return math.sqrt(max(point.ratio, 0.0))
+
+
+def _crossing(line: _Line, inner: _Point, outer: _Point, threshold: float) -> tuple[list[_Point], float]:
+    """Points on the way to where the ratio is the threshold, between two that lie on either side, and that place.
+
+    The root of the ratio is a straight line for a linear model, so it is what is interpolated.
+    """
+    wanted, added = math.sqrt(threshold), []
+
+    def between(a: _Point, b: _Point) -> float:
+        return a.u + (b.u - a.u) * (wanted - _root(a)) / (_root(b) - _root(a))
+
+    for k in range(4):
+        u = between(inner, outer) if k < 3 else 0.5 * (inner.u + outer.u)
+        share = (u - inner.u) / (outer.u - inner.u) if outer.ratio < _LEAP * threshold else 0.0
+        point = line.refit(u, inner.x + share * (outer.x - inner.x))
+        if point is None:
+            break
+        added.append(point)
+        if point.ratio > threshold:
+            outer = point
+        else:
+            inner = point
+        if abs(_root(point) - wanted) < _CLOSE * wanted:
+            break
+    return added, between(inner, outer)

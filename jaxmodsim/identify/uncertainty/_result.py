@@ -1,0 +1,350 @@
+"""A fitted model, with how sure it is, what its records cannot tell, and files of it."""
+
+import io
+import json
+import math
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from importlib import metadata
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ..._core.files import jsonable, written_whole
+from ..data._record import Record
+from ..estimate._search import ENDINGS, SearchResult
+from ..model._parameters import with_numbers
+from ._estimate import FitDiagnostics, FitProvenance, IdentifiabilityIssue, ParameterEstimate
+from ._identifiability import sloppy_directions
+
+# Relative errors and correlations from which on a parameter is called uncertain, in looking for a cause.
+_UNCERTAIN, _ALIKE = 0.1, 0.98
+# Standard error against the value from which on a parameter is called not determined, and how many pairs are named.
+_UNKNOWN, _PAIRS = 0.5, 4
+# Share of the scatter of a channel from which on an RMSE says that nothing is followed.
+_FOLLOWS = 0.95
+# Share of the RMSE from which on the effect of the integration step is reported.
+_STEP_SHOWS = 0.1
+
+_KIND, _VERSION, _TEXT = "jaxmodsim fit result", 1, "result.json"
+_PARTS = {"estimate": ParameterEstimate, "diagnostics": FitDiagnostics, "provenance": FitProvenance}
+# What is not kept in a file: functions.
+_LEFT_OUT = ("model",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitResult:
+    """A fitted model.
+
+    - `estimate`: parameters with their covariance. `diagnostics`: how the fit went. `provenance`: records and model.
+    - `search`: where the search ended, for further questions; None in a result that was loaded.
+    """
+
+    estimate: ParameterEstimate
+    diagnostics: FitDiagnostics
+    provenance: FitProvenance
+    search: SearchResult | None
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameters by name."""
+        return self.estimate.values
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Standard errors by name."""
+        return self.estimate.errors
+
+    @property
+    def model(self) -> eqx.Module | None:
+        """The scene or law with the fitted numbers; None in a result that was loaded without one."""
+        return self.provenance.model
+
+    @property
+    def record(self) -> Record:
+        """The record, where there is one.
+
+        **Raises:**
+
+        - `ValueError` if there are several.
+        """
+        records = self.provenance.records
+        if len(records) > 1:
+            raise ValueError(f"{len(records)} records were fitted: take them from `provenance.records`.")
+        return next(iter(records))
+
+    @property
+    def residuals(self) -> tuple[dict[str, np.ndarray], ...]:
+        """Output less measured value by channel, one dict a record."""
+        return self.provenance.residuals
+
+    @property
+    def simulated(self) -> Float[np.ndarray, " samples"]:
+        """The model's output along the one channel of the one record.
+
+        **Raises:**
+
+        - `ValueError` if there are several.
+        """
+        residual = next(iter(self.residuals[0].values()))
+        return self.record.measured + residual  # both refuse several
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square of `simulated - measured` of the one channel.
+
+        **Raises:**
+
+        - `ValueError` if there are several.
+        """
+        rmse = self.diagnostics.rmse
+        if len(rmse) > 1:
+            raise ValueError(f"There are the channels {', '.join(rmse)}: take theirs from `diagnostics.rmse`.")
+        return next(iter(rmse.values()))
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write everything but the model's functions and the search into one file, whole or not at all.
+
+        A zip of one JSON text and of arrays (`numpy.load` opens it, too), in which every number stays what it is.
+        """
+        arrays: dict[str, np.ndarray] = {}
+        parts = {name: value for part in _PARTS for name, value in vars(getattr(self, part)).items()}
+        body = {name: _packed(x, name, arrays) for name, x in parts.items() if name not in _LEFT_OUT}
+        head = {"kind": _KIND, "format": _VERSION, "jaxmodsim": metadata.version("jaxmodsim")}
+        text = json.dumps({**head, "fields": body}, indent=1, allow_nan=False)
+        with written_whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr(_TEXT, text)
+            for name, array in arrays.items():
+                archive.writestr(f"{name}.npy", _bytes(array))
+
+    @staticmethod
+    def load(path: str | PathLike[str], model: eqx.Module | None = None) -> "FitResult":
+        """A result that `save` wrote. It can do all but run the model: no `profile` and no `score`.
+
+        **Arguments:**
+
+        - `path`: of the file.
+        - `model`: the scene or law that was fitted, with any numbers; `model` of the result is this one with all its
+          numbers as they were.
+
+        **Raises:**
+
+        - `ValueError` for a file that is damaged or something else, or a model whose numbers have other names.
+        - `OSError` if the file cannot be read.
+        """
+        names = {part: [field.name for field in fields(kind)] for part, kind in _PARTS.items()}
+        stored = _read_fields(path, [name for own in names.values() for name in own if name not in _LEFT_OUT])
+        stored["model"] = None if model is None else with_numbers(model, stored["numbers"])
+        parts = {part: kind(**{name: stored[name] for name in names[part]}) for part, kind in _PARTS.items()}
+        return FitResult(**parts, search=None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """All but the samples and the model, as JSON knows it: numbers that are not finite are None."""
+        estimate, diagnostics, intervals = self.estimate, self.diagnostics, self.estimate.intervals()
+        return jsonable(
+            {
+                "records": [record.name for record in self.provenance.records],
+                "samples": [len(record.t) for record in self.provenance.records],
+                "rmse": diagnostics.rmse,
+                "noise": diagnostics.noise,
+                "parameters": {
+                    name: {
+                        "value": value,
+                        "standard_error": error,
+                        "interval": list(intervals[name]),
+                        "start": start,
+                        "unit": unit,
+                    }
+                    for name, value, error, start, unit in estimate.rows()
+                },
+                "correlation": {"names": list(estimate.values), "matrix": estimate.correlation.tolist()},
+                "evaluations": diagnostics.evaluations,
+                "ending": diagnostics.ending,
+                "step_error": diagnostics.step_error,
+                "remarks": list(remarks(self)),
+            }
+        )
+
+    def __str__(self) -> str:
+        """A table of the parameters, and what the record cannot tell."""
+        estimate, rmse, intervals = self.estimate, self.diagnostics.rmse, self.estimate.intervals()
+        width = max(len(name) for name in estimate.values)
+        lines = [f"{'':{width}}  {'value':>13}  {'std. error':>11}  {'95 % interval':>25}  unit"]
+        for name, value, error, _, unit in estimate.rows():
+            low, high = intervals[name]
+            lines.append(f"{name:{width}}  {value:13.6g}  {error:11.2g}  {low:12.5g} {high:12.5g}  {unit}")
+        errors = ", ".join(f"{'' if len(rmse) == 1 else name + ' '}{x:.6g}" for name, x in rmse.items())
+        ending = f"RMSE {errors}; {self.diagnostics.evaluations} evaluations, {self.diagnostics.ending}"
+        return "\n".join([*lines, ending, *remarks(self)])
+
+
+def remarks(result: FitResult) -> tuple[str, ...]:
+    """What the records of a fit cannot tell, in sentences: what spoils the figures, what is not determined, and why.
+
+    What an issue of the motion, or a weak combination, has explained is not said again of each parameter and pair.
+    """
+    estimate, diagnostics = result.estimate, result.diagnostics
+    errors, bounds = estimate.errors, estimate.bounds
+    explained = {name for issue in diagnostics.issues for name in issue.about}
+    sentences = _of_the_search(diagnostics, result.provenance.records)
+    sentences += [f"{name} has no effect on this record." for name in estimate.values if not np.isfinite(errors[name])]
+    sentences += [issue.sentence for issue in diagnostics.issues]
+    for name, value in estimate.values.items():
+        if np.isfinite(errors[name]) and value in bounds[name]:
+            sentences.append(f"{name} ended on its limit {value:g}.")
+    directions = sloppy_directions(estimate, diagnostics, explained)
+    sentences += [direction.sentence for direction in directions]
+    told = explained | {name for direction in directions for name in direction.names}
+    for name, value in estimate.values.items():
+        share = errors[name] / abs(value) if value else np.inf
+        if _UNKNOWN < share < np.inf and value not in bounds[name] and name not in told:
+            sentences.append(
+                f"{name} is not determined by this record: its standard error is {100 * share:.0f} % of its value."
+            )
+    pairs = [(a, b, c) for a, b, c in _alike(estimate) if not {a, b} <= told]
+    for a, b, c in pairs[:_PAIRS]:
+        sentences.append(f"{a} and {b} are hardly told apart (correlation {c:+.3f}).")
+    if len(pairs) > _PAIRS:
+        sentences.append(f"{len(pairs) - _PAIRS} more pairs have correlations as large: see `estimate.correlation`.")
+    if diagnostics.single_precision:
+        sentences.append("Computed in single precision: enable jax_enable_x64 for numbers that you mean to use.")
+    return tuple(sentences)
+
+
+def uncertain_of(estimate: ParameterEstimate) -> dict[str, tuple[str, ...]]:
+    """Parameters that are not well known, each with those that it is hardly told apart from."""
+    pairs, errors, uncertain = _alike(estimate), estimate.errors, {}
+    for name, value in estimate.values.items():
+        others = tuple(b if a == name else a for a, b, _ in pairs if name in (a, b))
+        if others or not errors[name] < _UNCERTAIN * abs(value) or value in estimate.bounds[name]:
+            uncertain[name] = others
+    return uncertain
+
+
+def _of_the_search(diagnostics: FitDiagnostics, records: tuple[Record, ...]) -> list[str]:
+    sentences = []
+    if diagnostics.ending not in ENDINGS.values():
+        sentences.append(f"The search {diagnostics.ending}: do not trust the standard errors.")
+    errors, moved = list(diagnostics.rmse.values()), diagnostics.step_error
+    if moved is not None and len(errors) == 1 and moved > _STEP_SHOWS * errors[0]:
+        sentences.append(
+            f"The integration step shows: with four times as many the output moves by {moved:.2g} (root mean square)"
+            f" against an RMSE of {errors[0]:.2g}. Raise substeps."
+        )
+    for channel, rmse in diagnostics.rmse.items():
+        columns = [record.channels[channel] for record in records if channel in record.channels]
+        scatter = np.sqrt(np.mean(np.concatenate([x - np.mean(x) for x in columns]) ** 2)) if columns else 0.0
+        if columns and rmse > _FOLLOWS * scatter > 0:
+            sentences.append(
+                f"{channel}: the model follows nothing of the record; its RMSE of {rmse:.2g} is no less than that of a"
+                f" constant, {scatter:.2g}. Is the input the right column, has it the right sign and unit?"
+            )
+    return sentences
+
+
+def _alike(estimate: ParameterEstimate) -> list[tuple[str, str, float]]:
+    """Pairs of parameters with a large correlation, the largest first."""
+    names, correlation = list(estimate.values), estimate.correlation
+    pairs = [
+        (names[j], names[i], float(correlation[i, j]))
+        for i in range(len(names))
+        for j in range(i)
+        if abs(correlation[i, j]) > _ALIKE
+    ]
+    return sorted(pairs, key=lambda pair: -abs(pair[2]))
+
+
+def _read_fields(path: str | PathLike[str], wanted: list[str]) -> dict[str, Any]:
+    """The fields of a result by name, all but those that files do not keep.
+
+    **Raises:**
+
+    - `ValueError` for a file that is damaged or something else.
+    - `OSError` if there is none.
+    """
+    content = io.BytesIO(Path(path).read_bytes())
+    try:
+        with zipfile.ZipFile(content) as archive:
+            if _TEXT not in archive.namelist():
+                raise ValueError(f"it holds no {_TEXT}")
+            text = json.loads(archive.read(_TEXT))
+            arrays = {
+                name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(archive.read(name)), allow_pickle=False)
+                for name in archive.namelist()
+                if name.endswith(".npy")
+            }
+    except Exception as error:  # whatever the bytes of a damaged file lead the reader into
+        raise ValueError(f"{path} is no result that FitResult.save wrote, or it is damaged: {error}") from error
+    if not isinstance(text, dict) or text.get("kind") != _KIND:
+        raise ValueError(f"{path} is no result of a fit: it does not say {_KIND!r}.")
+    if text.get("format") != _VERSION:
+        raise ValueError(
+            f"{path} has the format {text.get('format')!r}, written by jaxmodsim {text.get('jaxmodsim')}, but this"
+            f" version reads format {_VERSION}."
+        )
+    body = text.get("fields")
+    if not isinstance(body, dict) or set(body) != set(wanted):
+        lacks = sorted(set(wanted) - set(body or {}))
+        raise ValueError(f"{path} is damaged: it lacks {', '.join(lacks) or 'nothing, but holds more than it should'}.")
+    try:
+        return {name: _unpacked(body[name], arrays) for name in wanted}
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged: {error!r}") from error
+
+
+def _bytes(array: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, array, allow_pickle=False)
+    return buffer.getvalue()
+
+
+def _packed(x: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
+    """As JSON knows it; arrays aside, numbers that JSON does not know as words."""
+    if isinstance(x, Record):
+        parts = {
+            "t": x.t, "channels": x.channels, "inputs": x.inputs, "name": x.name, "linear": tuple(sorted(x.linear)),
+            "noise": x.noise, "slips": x.slips,
+        }  # fmt: skip
+        return {"record": _packed(parts, name, arrays)}
+    if isinstance(x, IdentifiabilityIssue):
+        return {"issue": [x.sentence, list(x.about)]}
+    if isinstance(x, Mapping):
+        return {"dict": {k: _packed(each, f"{name}/{k}", arrays) for k, each in x.items()}}
+    if isinstance(x, tuple):
+        return {"tuple": [_packed(each, f"{name}/{i}", arrays) for i, each in enumerate(x)]}
+    if isinstance(x, np.ndarray):
+        arrays[name] = x
+        return {"array": name}
+    if isinstance(x, float) and not math.isfinite(x):
+        return {"float": str(x)}
+    if isinstance(x, np.generic) or not (x is None or isinstance(x, str | bool | int | float)):
+        raise TypeError(f"{name} is a {type(x).__name__}, which no file of a result has room for.")
+    return x
+
+
+def _unpacked(x: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    if not isinstance(x, dict):
+        return x
+    ((kind, inside),) = x.items()
+    if kind == "record":
+        parts = _unpacked(inside, arrays)
+        return Record(
+            parts["t"], parts["channels"], parts["inputs"], parts["name"], linear=parts["linear"],
+            noise=parts["noise"] or None, slips=parts["slips"],
+        )  # fmt: skip
+    if kind == "issue":
+        return IdentifiabilityIssue(inside[0], tuple(inside[1]))
+    if kind == "dict":
+        return {k: _unpacked(each, arrays) for k, each in inside.items()}
+    if kind == "tuple":
+        return tuple(_unpacked(each, arrays) for each in inside)
+    if kind == "array":
+        return arrays[inside]
+    if kind == "float":
+        return float(inside)
+    raise KeyError(kind)
