@@ -15,7 +15,7 @@ class AbstractSolverWrapper(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolve
         return cast(dfx.AbstractImplicitSolver, self.solver).root_finder
 
     @property
-    def scan_kind(self) -> str | None:
+    def scan_kind(self) -> PyTree:
         """That of the wrapped solver, if it is a Runge-Kutta method: diffrax sets it for the kind of derivative."""
         return cast(dfx.AbstractRungeKutta, self.solver).scan_kind
 
