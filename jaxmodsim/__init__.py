@@ -39,6 +39,7 @@ from .simulation import SimulationError as SimulationError
 from .simulation import Trajectory as Trajectory
 from .simulation import consistent as consistent
 from .simulation import simulate as simulate
+from .simulation import simulate_to_accuracy as simulate_to_accuracy
 from .solvers import EventController as EventController
 from .solvers import EventSolver as EventSolver
 from .solvers import Gauss as Gauss

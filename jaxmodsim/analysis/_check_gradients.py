@@ -254,7 +254,7 @@ def _first(fn: Callable[..., Any], scene: Scene, runs: list[Trajectory]) -> tupl
     if not np.isfinite(value):
         raise ValueError(f"fn gives {value} at this scene, which has no derivative.")
     watched = [run for run in runs if not _traced(run)]
-    atol = max((float(run.problem.atol) for run in watched), default=0.0)
+    atol = max((float(run.inputs.atol) for run in watched), default=0.0)
     complete = len(watched) == len(runs)
     runs.clear()
     return jnp.asarray(value), complete, atol
@@ -309,7 +309,7 @@ def _histories(run: Trajectory) -> dict[str, History]:
         mine = (events.effect == i) & np.isfinite(events.t)
         if mine.any():
             pairs = zip(events.before[mine].tolist(), events.after[mine].tolist(), strict=True)
-            found[effect] = History(float(run.problem.t0), events.t[mine].astype(float), tuple(pairs))
+            found[effect] = History(float(run.inputs.t0), events.t[mine].astype(float), tuple(pairs))
     return found
 
 

@@ -143,7 +143,7 @@ def sensitivity(
     adjoint = dfx.ForwardMode() if mode == "forward" else None
 
     def at(x: dict[str, Array]) -> Array:
-        changed, start = with_values(scene, {"q0": run.problem.q0, "qd0": run.problem.qd0}, x)
+        changed, start = with_values(scene, {"q0": run.inputs.q0, "qd0": run.inputs.qd0}, x)
         return jnp.asarray(observe(simulate(changed, **start, t1=t1, ts=ts, adjoint=adjoint, throw=False, **options)))
 
     differentiate = jax.jacfwd if mode == "forward" else jax.jacrev

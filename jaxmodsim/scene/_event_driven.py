@@ -133,32 +133,35 @@ def contact(
     )
 
 
-def solve_friction_forces(found: Contact, mode: Float[Array, " modes"]) -> FrictionForces:
+def solve_friction_forces(contacts: Contact, mode: Float[Array, " modes"]) -> FrictionForces:
     """Friction forces [N] in the modes given: the slip force, or the multiplier of stick."""
-    extra = found.v.shape[0] - mode.shape[0]
+    extra = contacts.v.shape[0] - mode.shape[0]
     mode = jnp.concatenate([mode, jnp.ones(extra, mode.dtype)]) if extra else mode
     sticks = mode == 0
-    slipping = jnp.where(mode > 0, found.forward, found.backward)
+    slipping = jnp.where(mode > 0, contacts.forward, contacts.backward)
 
     def settled(slipping: Array, base: Array | float) -> Array:
-        drive = base - jnp.sum(found.delassus * jnp.where(sticks, 0.0, slipping)[None, :], axis=1)
-        return jnp.where(sticks, _multipliers(found, drive, sticks), slipping)
+        drive = base - jnp.sum(contacts.delassus * jnp.where(sticks, 0.0, slipping)[None, :], axis=1)
+        return jnp.where(sticks, _multipliers(contacts, drive, sticks), slipping)
 
-    if found.loads is None:
+    if contacts.loads is None:
         return FrictionForces(
-            settled(slipping, found.free_slip_acceleration), found.upper, found.lower, jnp.ones_like(found.v[0])
+            settled(slipping, contacts.free_slip_acceleration),
+            contacts.upper,
+            contacts.lower,
+            jnp.ones_like(contacts.v[0]),
         )
-    on, fall = found.loads.on, found.loads.normal_coupling
+    on, fall = contacts.loads.on, contacts.loads.normal_coupling
     count = on.shape[1]
     loaded = jnp.sum(on, axis=1)
-    fixed = settled(jnp.where(loaded > 0, 0.0, slipping), found.free_slip_acceleration)
+    fixed = settled(jnp.where(loaded > 0, 0.0, slipping), contacts.free_slip_acceleration)
     per_load = jnp.stack([settled(on[:, k] * slipping, 0.0) for k in range(count)])
-    normal = found.loads.normal - jnp.sum(fall * fixed[None, :], axis=1)
+    normal = contacts.loads.normal - jnp.sum(fall * fixed[None, :], axis=1)
     gain = jnp.sum(fall[:, None, :] * per_load[None, :, :], axis=2)
-    load, margin = _loads(normal, gain, found.loads.pulls)
+    load, margin = _loads(normal, gain, contacts.loads.pulls)
     factor = jnp.where(loaded > 0, jnp.sum(on * load[None, :], axis=1), 1.0)
     force = fixed + jnp.sum(per_load * load[:, None], axis=0)
-    return FrictionForces(force, factor * found.upper, factor * found.lower, margin)
+    return FrictionForces(force, factor * contacts.upper, factor * contacts.lower, margin)
 
 
 def _loads(
@@ -196,21 +199,21 @@ def _determinant(rows: list[list[Array]]) -> Array:
     return jnp.sum(jnp.stack([s * a * m for s, a, m in zip(signs, rows[0], minors, strict=True)]))
 
 
-def _multipliers(found: Contact, drive: Float[Array, " n"], sticks: Bool[Array, " n"]) -> Float[Array, " n"]:
+def _multipliers(contacts: Contact, drive: Float[Array, " n"], sticks: Bool[Array, " n"]) -> Float[Array, " n"]:
     """Forces of the sticking elements that take their slip accelerations away; others get zero.
 
     Where sticking elements are redundant (two on one coordinate), the equations leave the share of each open. The one
     with the smallest sum of `f_i^2/limit_i` is taken: elements in parallel then share in proportion to their
     limits and reach them together.
     """
-    weight = 0.5 * (found.upper + found.lower)
+    weight = 0.5 * (contacts.upper + contacts.lower)
     largest = jnp.max(weight)
     weight = jnp.maximum(weight / jnp.where(largest > 0, largest, 1.0), 1e-6)
-    return solve_semidefinite(found.delassus, drive, jnp.sqrt(jnp.where(largest > 0, weight, 1.0)), sticks)
+    return solve_semidefinite(contacts.delassus, drive, jnp.sqrt(jnp.where(largest > 0, weight, 1.0)), sticks)
 
 
 def contact_guards(
-    found: Contact, mode: Float[Array, " modes"], rest: Float[Array, ""], tolerances: tuple[Array, Array]
+    contacts: Contact, mode: Float[Array, " modes"], rest: Float[Array, ""], tolerances: tuple[Array, Array]
 ) -> tuple[Float[Array, " modes"], Float[Array, " modes"]]:
     """One guard for each element with a mode, positive while its mode holds, and by how much each may be wrong.
 
@@ -221,58 +224,58 @@ def contact_guards(
     hold it).
     """
     n, (rtol, atol) = mode.shape[0], tolerances
-    force, upper, lower = (x[:n] for x in solve_friction_forces(found, mode)[:3])
+    force, upper, lower = (x[:n] for x in solve_friction_forces(contacts, mode)[:3])
     eps = float(jnp.finfo(force.dtype).eps)
     wider = 1.0 + 16.0 * eps
     span = upper + lower
     inside = (wider * upper - force) * (wider * lower + force) / jnp.where(span > 0, span, 1.0)
     resolved = jnp.maximum(rtol, _LOAD_ROUNDING * eps) * span
-    return jnp.where(mode == 0, inside, mode * found.v[:n] + rest), jnp.where(mode == 0, resolved, atol)
+    return jnp.where(mode == 0, inside, mode * contacts.v[:n] + rest), jnp.where(mode == 0, resolved, atol)
 
 
-def stick_violation(found: Contact, mode: Float[Array, " modes"]) -> Float[Array, " modes"]:
+def stick_violation(contacts: Contact, mode: Float[Array, " modes"]) -> Float[Array, " modes"]:
     """By how much the force of each sticking element exceeds its limit, in limits; 0 in slip."""
     n = mode.shape[0]
-    force, upper, lower = (x[:n] for x in solve_friction_forces(found, mode)[:3])
+    force, upper, lower = (x[:n] for x in solve_friction_forces(contacts, mode)[:3])
     limit = jnp.where(force > 0, upper, lower)
     excess = (jnp.abs(force) - limit) / jnp.where(limit > 0, limit, 1.0)
     return jnp.where(mode == 0, excess, 0.0)
 
 
 def next_modes(
-    found: Contact, mode: Float[Array, " modes"], still: Bool[Array, " modes"], at_limit: Bool[Array, " modes"]
+    contacts: Contact, mode: Float[Array, " modes"], still: Bool[Array, " modes"], at_limit: Bool[Array, " modes"]
 ) -> Float[Array, " modes"]:
     """Modes after an instant at which the elements `still` have no slip velocity; the others go on as they are.
 
     All of them stick if they can. If limits are exceeded, the element that exceeds its own by the largest factor
     slips in the direction of its load, and the rest is solved again. An element that would then be accelerated
-    against its direction sticks again. Without stiction the modes that satisfy everything are unique, and found;
+    against its direction sticks again. Without stiction the modes that satisfy everything are unique, and these result;
     with it there may be several, and the search is a heuristic: where it fails, an element slips that is pushed back at
     once, and the run ends as chatter.
 
     **Arguments:**
 
-    - `found`: at this instant.
+    - `contacts`: at this instant.
     - `mode`: modes before.
     - `still`: elements that may stick or change direction.
     - `at_limit`: sticking elements that have reached a limit, and slip in the direction of their load.
     """
-    found = jax.tree.map(_constant, found)
+    contacts = jax.tree.map(_constant, contacts)
     n = mode.shape[0]
     wider = 1.0 + 16.0 * float(jnp.finfo(mode.dtype).eps)
-    before = solve_friction_forces(found, mode)
+    before = solve_friction_forces(contacts, mode)
     load = jnp.sign(before.force[:n])
     mode = jnp.where(still, jnp.where(at_limit, load, jnp.zeros_like(mode)), mode)
-    scale = 1e-6 * jnp.max(jnp.abs(found.delassus) * jnp.maximum(before.upper, before.lower)[None, :], axis=1)[:n]
+    scale = 1e-6 * jnp.max(jnp.abs(contacts.delassus) * jnp.maximum(before.upper, before.lower)[None, :], axis=1)[:n]
 
     def settle(i: Array, mode: Array) -> Array:
-        all_forces, upper, lower, _ = solve_friction_forces(found, mode)
+        all_forces, upper, lower, _ = solve_friction_forces(contacts, mode)
         force = all_forces[:n]
         limit = jnp.where(force > 0, upper[:n], lower[:n])
         least = float(jnp.finfo(limit.dtype).tiny)
         use = jnp.where(mode == 0, jnp.abs(force) / jnp.maximum(limit, least), 0.0)
         worst = (use == jnp.max(use)) & (use > wider)
-        acceleration = (found.free_slip_acceleration - jnp.sum(found.delassus * all_forces[None, :], axis=1))[:n]
+        acceleration = (contacts.free_slip_acceleration - jnp.sum(contacts.delassus * all_forces[None, :], axis=1))[:n]
         # Where nothing is consistent, the last word is rather a slip that ends at once, which shows as chatter, than a
         # stick above its limit.
         against = still & (mode * acceleration < -scale) & ~jnp.any(worst) & (i < 3 * n)
@@ -281,8 +284,8 @@ def next_modes(
     return settle(jnp.asarray(3), mode) if n == 1 else jax.lax.fori_loop(0, 4 * n, settle, mode)
 
 
-def stop_slip(found: Contact, qd: Float[Array, " dof"], sticks: Bool[Array, " modes"]) -> Float[Array, " dof"]:
+def stop_slip(contacts: Contact, qd: Float[Array, " dof"], sticks: Bool[Array, " modes"]) -> Float[Array, " dof"]:
     """Velocities with the slip of the sticking elements taken away, by the smallest impulses that do."""
-    sticks = jnp.concatenate([sticks, jnp.zeros(found.v.shape[0] - sticks.shape[0], bool)])
-    impulse = _multipliers(found, jnp.where(sticks, found.v, 0.0), sticks)
-    return qd - jnp.sum(found.minv_jt * impulse[:, None], axis=0)
+    sticks = jnp.concatenate([sticks, jnp.zeros(contacts.v.shape[0] - sticks.shape[0], bool)])
+    impulse = _multipliers(contacts, jnp.where(sticks, contacts.v, 0.0), sticks)
+    return qd - jnp.sum(contacts.minv_jt * impulse[:, None], axis=0)

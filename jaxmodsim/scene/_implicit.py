@@ -10,12 +10,12 @@ from jaxtyping import Array, Bool, Float, PyTree
 from .._core.monotone import solve_monotone
 from ..friction import Sign
 from ..mechanics import linearize_constraints, motion_equations
-from ._forward_dynamics import Mobility, State
+from ._dynamics import Mobility, State
 from ._scene import Scene
 from .forces._friction import Friction
 
 
-class _Element(NamedTuple):
+class _StepElement(NamedTuple):
     """A friction element at the beginning of a step.
 
     - `effect`: with the law as it is there; `load`: its normal load, or None.
@@ -75,10 +75,10 @@ def scene_step(scene: Scene, t0: Float[Array, ""], t1: Float[Array, ""], y: Stat
     scene = scene.bind_state(t0, q, qd)
     params = scene.params
     equations = motion_equations(scene.lagrangian, t0, q, qd, params)
-    restraint = (
+    linearized = (
         linearize_constraints(scene.constraints, t0, q, qd, params, equations.mass) if scene.constraints else None
     )
-    mobility = Mobility(equations.mass, restraint)
+    mobility = Mobility(equations.mass, linearized)
     rhs, elements = equations.load, {}
     for name, effect in zip(scene.names, scene.effects, strict=True):
         if isinstance(effect, Friction):
@@ -102,17 +102,17 @@ def scene_step(scene: Scene, t0: Float[Array, ""], t1: Float[Array, ""], y: Stat
     reach = jnp.stack([mobility.respond(row) for row in rows])
     coupling = h * jnp.sum(rows[:, None, :] * reach[None, :, :], axis=2)
     belts = jnp.concatenate([each.belt for each in elements.values()])
-    found = solve_monotone(forces, jnp.sum(rows * free[None, :], axis=1) - belts, coupling, sizes)
-    after = ends(found.x)
+    solution = solve_monotone(forces, jnp.sum(rows * free[None, :], axis=1) - belts, coupling, sizes)
+    after = ends(solution.x)
     force = jnp.concatenate([force for force, _ in after])
     qd = free - h * jnp.sum(reach * force[:, None], axis=0)
     z = {name: z for name, (_, z) in zip(elements, after, strict=True) if name in y.z}
-    return State(q + h * qd, qd, z), found.solved
+    return State(q + h * qd, qd, z), solution.solved
 
 
-def _element(effect: Friction, t0: Array, t1: Array, q: Array, qd: Array, params: PyTree) -> _Element:
+def _element(effect: Friction, t0: Array, t1: Array, q: Array, qd: Array, params: PyTree) -> _StepElement:
     slip = partial(effect.slip, t0, q, params=params)
     planar = jnp.ndim(slip(qd)) > 0
     rows = jax.jacfwd(slip)(qd) if planar else effect.direction(q, params)[None]
     belt = jnp.broadcast_to(effect.belt(t1), (rows.shape[0],))
-    return _Element(effect, effect.load(t0, q, qd, params), rows, belt, planar)
+    return _StepElement(effect, effect.load(t0, q, qd, params), rows, belt, planar)

@@ -1,10 +1,13 @@
 """Every number of a scene, or of a law alone, by a name that a person would type."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, TypeVar
 
 import equinox as eqx
+import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array
 
 from .._core.parameters import Range, ranges_of
@@ -114,3 +117,27 @@ def _name(scene: eqx.Module, path: tuple[Any, ...]) -> str:
 
 def _telling(words: list[str]) -> list[str]:
     return [word for word in words if word not in _SILENT]
+
+
+def elements(scene: Scene) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Each single number by name: the name of its array, and where it is in there."""
+    return {
+        leaf + (f"[{','.join(map(str, index))}]" if index else ""): (leaf, index)
+        for leaf, array in scene_numbers(scene).items()
+        for index in np.ndindex(array.shape)
+    }
+
+
+def read_element(scene: Scene, name: str) -> float:
+    """A single number."""
+    leaf, index = elements(scene)[name]
+    return float(np.asarray(scene_numbers(scene)[leaf])[index])
+
+
+def replace_elements(scene: Scene, values: Mapping[str, Any]) -> Scene:
+    """The scene with these single numbers replaced."""
+    known, numbers, changed = elements(scene), scene_numbers(scene), {}
+    for name, value in values.items():
+        leaf, index = known[name]
+        changed[leaf] = jnp.asarray(changed.get(leaf, numbers[leaf])).at[index].set(value)
+    return replace_numbers(scene, changed)

@@ -1,19 +1,16 @@
 """Runs of scenes."""
 
 from ._accuracy import Accuracy as Accuracy
-from ._accuracy import Tenfold as Tenfold
-from ._accuracy import Tried as Tried
 from ._consistent import consistent as consistent
 from ._evaluations import evaluations_per_step as evaluations_per_step
 from ._observe import named_series as named_series
 from ._observe import named_unit as named_unit
 from ._outcome import MAX_STEPS as MAX_STEPS
-from ._outcome import Outcome as Outcome
 from ._outcome import SimulationError as SimulationError
 from ._outcome import outcome_messages as outcome_messages
-from ._simulate import prepare as prepare
+from ._run_request import RunRequest as RunRequest
 from ._simulate import simulate as simulate
 from ._solve import default_solver as default_solver
-from ._trajectory import Energy as Energy
+from ._to_accuracy import simulate_to_accuracy as simulate_to_accuracy
 from ._trajectory import Events as Events
 from ._trajectory import Trajectory as Trajectory

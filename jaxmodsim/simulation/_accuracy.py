@@ -1,12 +1,12 @@
-"""What `simulate(..., accuracy=...)` chose, and what it went by."""
+"""What `simulate_to_accuracy` chose, and what it went by."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax as dfx
 
 
-class Tenfold(NamedTuple):
+class CostScaling(NamedTuple):
     """Predicted steps for another accuracy, as multiples of those that were made.
 
     - `better`: for an error ten times smaller, >= 1.
@@ -18,7 +18,7 @@ class Tenfold(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Tried:
+class Attempt:
     """One run of the search.
 
     - `solver`: name of its method, with "bounded" behind it where the search bounded the step.
@@ -45,8 +45,9 @@ class Accuracy:
     - `estimate`: of the error of the run, in the same measure; at most `asked` where that was reached.
     - `solver`, `rtol`, `atol`: what the run was made with; `options` holds them as arguments of `simulate`.
     - `num_steps`: steps of the run.
-    - `tenfold`: steps for ten times better and ten times worse, as multiples of `num_steps`, by the observed slope.
-    - `tried`: all runs of the search, in the order in which they were made.
+    - `cost_scaling`: steps for ten times better and ten times worse, as multiples of `num_steps`, by the
+      observed slope.
+    - `attempts`: all runs of the search, in the order in which they were made.
     - `remark`: what kept the search from the accuracy, in a sentence; empty where it was reached.
     - `dtmax`: longest step [s] where the search has bounded it; it is among the `options` then.
     """
@@ -57,8 +58,8 @@ class Accuracy:
     rtol: float
     atol: float
     num_steps: int
-    tenfold: Tenfold
-    tried: tuple[Tried, ...]
+    cost_scaling: CostScaling
+    attempts: tuple[Attempt, ...]
     remark: str = ""
     dtmax: float | None = None
 
@@ -68,7 +69,7 @@ class Accuracy:
         return not self.remark
 
     @property
-    def options(self) -> dict[str, Any]:
+    def options(self) -> dict[str, dfx.AbstractSolver | float]:
         """Arguments for `simulate` that make this run again, also where its numbers are traced."""
         bound = {} if self.dtmax is None else {"dtmax": self.dtmax}
         return {"solver": self.solver, "rtol": self.rtol, "atol": self.atol, **bound}
@@ -79,10 +80,11 @@ class Accuracy:
         lines = [
             f"accuracy {self.asked:.3g}: {name} at rtol {self.rtol:.3g}, {self.num_steps} steps, error about"
             f" {self.estimate:.2g}",
-            f"ten times better: {self.tenfold.better:.2f} times the steps; ten times worse: {self.tenfold.worse:.2f}",
+            f"ten times better: {self.cost_scaling.better:.2f} times the steps; ten times worse:"
+            f" {self.cost_scaling.worse:.2f}",
             f"{'solver':15}  {'rtol':>8}  {'steps':>8}  {'evaluations':>12}  {'error':>8}",
         ]
-        for run in self.tried:
+        for run in self.attempts:
             work = "" if run.evaluations is None else str(run.num_steps * run.evaluations)
             lines.append(f"{run.solver:15}  {run.rtol:8.1e}  {run.num_steps:8}  {work:>12}  {run.estimate:8.1e}")
         return "\n".join([*lines, *([self.remark] if self.remark else [])])

@@ -3,14 +3,14 @@
 from typing import NamedTuple
 
 import jax
-import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ..scene import Power, Scene, State, scene_energies
 from ..solvers import EventLog
 from ._outcome import SUCCESS, SimulationError, outcome_messages
-from ._solve import Options, Problem, initial_state, solve_audited, solve_logged, solve_start
+from ._run_request import is_known
+from ._solve import RunInputs, RunOptions, initial_state, solve_audited, solve_start
 
 
 class EnergyLedger(NamedTuple):
@@ -40,7 +40,7 @@ class EnergyLedger(NamedTuple):
 
 
 def ledger(
-    problem: Problem, options: Options, t: Float[Array, " time"], y: State, code: Int[Array, ""]
+    inputs: RunInputs, options: RunOptions, t: Float[Array, " time"], y: State, code: Int[Array, ""]
 ) -> EnergyLedger:
     """Ledger of a run whose states at the times `t` are `y`. Runs it once more, with the work integrals beside it.
 
@@ -53,49 +53,49 @@ def ledger(
     - `SimulationError` if the run reached t1 and that with the integrals does not, where rounding decides. Inside
       compiled code the energies are infinite from there on instead.
     """
-    work, ended = solve_audited(problem, options)
-    known = not isinstance(code, jax.core.Tracer) and not isinstance(ended, jax.core.Tracer)
-    if known and int(code) == SUCCESS != int(ended):
-        reason = outcome_messages(problem.scene, problem.q0.shape[0])[int(ended)]
+    work, ended = solve_audited(inputs, options)
+    if is_known(code, ended) and int(code) == SUCCESS != int(ended):
+        reason = outcome_messages(inputs.scene, inputs.q0.shape[0])[int(ended)]
         raise SimulationError(
             "The run reached t1, but repeated with the work integrals beside it, it does not, so its energies are not"
             f" known: {reason}"
         )
-    return _ledger(problem, t, y, work)
+    return _ledger(inputs, t, y, work)
 
 
 @jax.jit
-def _ledger(problem: Problem, t: Array, y: State, work: dict[str, Power]) -> EnergyLedger:
-    scene = problem.scene
+def _ledger(inputs: RunInputs, t: Array, y: State, work: dict[str, Power]) -> EnergyLedger:
+    scene = inputs.scene
 
     def parts(t: Array, y: State) -> tuple[Array, Array, dict[str, Array]]:
-        return *scene_energies(t, y, scene), _stored(scene, y)
+        return *scene_energies(t, y, scene.bind_time(t)), _stored(scene, y)
 
-    first = initial_state(problem)
+    first = initial_state(inputs)
     kinetic, potential, stored = jax.vmap(parts)(t, y)
     gained = {name: now - _stored(scene, first)[name] for name, now in stored.items()}
     supplied = {name: each.supplied for name, each in work.items()}
     dissipated = {
         name: absorbed - gained.get(name, 0.0) for name in scene.names if (absorbed := work[name].absorbed) is not None
     }
-    return EnergyLedger(kinetic, potential, stored, supplied, dissipated, _energy(scene, problem.t0, first))
+    return EnergyLedger(kinetic, potential, stored, supplied, dissipated, _energy(scene, inputs.t0, first))
 
 
-def event_losses(problem: Problem, options: Options, t: Float[Array, " time"], events: int) -> Float[Array, " time"]:
+def event_losses(
+    inputs: RunInputs, options: RunOptions, t: Float[Array, " time"], log: EventLog | None
+) -> Float[Array, " time"]:
     """Energy [J] that was lost at events up to the times `t`, and at t0 where the state given was not admissible.
 
-    Runs the scene once more with a log of `events` entries beside it, where it has modes.
+    **Arguments:**
+
+    - `log`: of the events; None for a scene without modes.
     """
-    start, log = solve_start(problem, options), None
-    if problem.scene.event_driven:
-        log = solve_logged(problem, options, events)
-    return _losses(problem, t, start, log)
+    return _losses(inputs, t, solve_start(inputs, options), log)
 
 
 @jax.jit
-def _losses(problem: Problem, t: Array, start: State, log: EventLog | None) -> Array:
-    scene = problem.scene
-    lost = _energy(scene, problem.t0, initial_state(problem)) - _energy(scene, problem.t0, start)
+def _losses(inputs: RunInputs, t: Array, start: State, log: EventLog | None) -> Array:
+    scene = inputs.scene
+    lost = _energy(scene, inputs.t0, initial_state(inputs)) - _energy(scene, inputs.t0, start)
     losses = jnp.broadcast_to(lost, t.shape)
     if log is None:
         return losses
@@ -104,7 +104,7 @@ def _losses(problem: Problem, t: Array, start: State, log: EventLog | None) -> A
         return _energy(scene, t, before) - _energy(scene, t, after)
 
     happened = jnp.isfinite(log.t)
-    at = jnp.where(happened, log.t, problem.t0)
+    at = jnp.where(happened, log.t, inputs.t0)
     drops = jax.vmap(drop)(at, log.before[0], log.after[0])
     counts = happened[None, :] & (at[None, :] <= t[:, None])
     return losses + jnp.sum(jnp.where(counts, drops[None, :], 0.0), axis=1)
@@ -119,5 +119,5 @@ def _stored(scene: Scene, y: State) -> dict[str, Array]:
 
 
 def _energy(scene: Scene, t: Array, y: State) -> Array:
-    kinetic, potential = scene_energies(t, y, scene)
+    kinetic, potential = scene_energies(t, y, scene.bind_time(t))
     return kinetic + potential + sum(_stored(scene, y).values())

@@ -1,12 +1,13 @@
 """What a run integrates, and the functions that diffrax is given for it."""
 
-from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from collections.abc import Callable
+from functools import partial, wraps
+from typing import Any, NamedTuple, TypeAlias, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from ..mechanics import momentum, velocity
 from ..scene import (
@@ -23,6 +24,22 @@ from ..scene import (
     vector_field,
 )
 from ..solvers import EventState
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def at_time(fn: _Function) -> _Function:
+    """`fn(self, t, y, scene, ...)` with the signals of the scene as they are at `t`.
+
+    diffrax gives the time beside the scene: here, where its calls arrive, the one is bound into the other.
+    """
+
+    @wraps(fn)
+    def bound(self: object, t: Array, y: PyTree, scene: Scene, *more: PyTree) -> PyTree:
+        return fn(self, t, y, scene.bind_time(t), *more)
+
+    return cast(_Function, bound)
+
 
 # Energy [J] that went through a scene since t0, by the names of `scene_power`: supplied from outside, and absorbed.
 Work: TypeAlias = dict[str, Power]
@@ -42,38 +59,38 @@ class AugmentedState(NamedTuple):
 class IntegratedSystem(NamedTuple):
     """What is integrated: a `State`, with momenta in the place of velocities where `canonical`.
 
-    In an `audited` run it is `Beside` the work.
+    In an `audited` run it is an `AugmentedState`. Scenes are those of the time that stands before them, see `at_time`.
     """
 
     audited: bool
     canonical: bool
 
-    def start(self, t: Array, state: State, scene: Scene, mode: Any) -> Any:
+    @at_time
+    def start(self, t: Array, state: State, scene: Scene, mode: Array | None) -> PyTree:
         """What the run starts from."""
         y = self._inner(t, state, scene)
         if not self.audited:
             return y
         return AugmentedState(y, jtu.tree_map(jnp.zeros_like, scene_power(t, state, scene, mode)))
 
-    def state(self, t: Array, y: Any, scene: Scene) -> State:
+    def state(self, t: Array, y: PyTree, scene: Scene) -> State:
         """The state in what is integrated."""
         y = y.motion if isinstance(y, AugmentedState) else y
         if not self.canonical:
             return y
-        scene = scene.bind_time(t)
         return y._replace(qd=velocity(scene.lagrangian, t, y.q, y.qd, scene.params))
 
-    def replace(self, t: Array, y: Any, state: State, scene: Scene) -> Any:
+    def replace(self, t: Array, y: PyTree, state: State, scene: Scene) -> PyTree:
         """With another state."""
         inner = self._inner(t, state, scene)
         return y._replace(motion=inner) if isinstance(y, AugmentedState) else inner
 
-    def result(self, t: Array, y: Any, scene: Scene) -> Any:
+    def result(self, t: Array, y: PyTree, scene: Scene) -> PyTree:
         """What is kept of it: the state, in an audited run a pair of it and `Work`."""
         state = self.state(t, y, scene)
         return (state, y.work) if self.audited else state
 
-    def rate(self, t: Any, y: Any, scene: Scene, mode: Any = None) -> Any:
+    def derivative(self, t: Array, y: PyTree, scene: Scene, mode: Array | None = None) -> PyTree:
         """Right-hand side."""
         state = self.state(t, y, scene)
         rate = (scene_canonical if self.canonical else vector_field)(t, state, scene, mode)
@@ -81,7 +98,7 @@ class IntegratedSystem(NamedTuple):
             return rate
         return AugmentedState(rate, scene_power(t, state, scene, mode))
 
-    def advance(self, t0: Array, t1: Array, y: Any, scene: Scene) -> tuple[Any, Array]:
+    def advance(self, t0: Array, t1: Array, y: PyTree, scene: Scene) -> tuple[PyTree, Array]:
         """One step of `ImplicitFriction`, and whether it was solved; work is done at the powers at its end."""
         state, solved = scene_step(scene, t0, t1, self.state(t0, y, scene))
         if not self.audited:
@@ -92,20 +109,19 @@ class IntegratedSystem(NamedTuple):
     def _inner(self, t: Array, state: State, scene: Scene) -> State:
         if not self.canonical:
             return state
-        scene = scene.bind_time(t)
         return state._replace(qd=momentum(scene.lagrangian, t, state.q, state.qd, scene.params))
 
 
 # A step of a scene with events or constraints evaluates large fields a dozen times. Traced as one function each, they
 # are traced, linearised and transposed once.
-_rate = partial(jax.jit, static_argnums=0)(IntegratedSystem.rate)
+_derivative = partial(jax.jit, static_argnums=0)(at_time(IntegratedSystem.derivative))
 _guards = jax.jit(scene_guards)
 
 
-class Hybrid(NamedTuple):
+class RunFunctions(NamedTuple):
     """The functions of a run; those of a state `s` in the form that `EventSolver` takes, for runs with modes."""
 
-    flow: IntegratedSystem
+    system: IntegratedSystem
     # Slip velocity [m/s] that counts as none.
     rest: Float[Array, ""]
     # Relative and absolute, of the limits of stick and of slip velocities.
@@ -114,46 +130,52 @@ class Hybrid(NamedTuple):
     projects: bool
     sticks: bool
 
-    def plain_rate(self, t: Any, y: Any, scene: Scene, mode: Any = None) -> Any:
+    def plain_derivative(self, t: Any, y: PyTree, scene: Scene, mode: Array | None = None) -> PyTree:
         """Right-hand side in these modes; None in a run without."""
-        return _rate(self.flow, t, y, scene, mode)
+        return _derivative(self.system, t, y, scene, mode)
 
-    def rate(self, t: Any, s: EventState, scene: Scene) -> EventState:
+    def derivative(self, t: Any, s: EventState, scene: Scene) -> EventState:
         """Right-hand side."""
-        return s.rate(_rate(self.flow, t, s.y, scene, s.mode))
+        return s.rate(_derivative(self.system, t, s.y, scene, s.mode))
 
-    def guards(self, t: Any, s: EventState, scene: Scene) -> tuple[Array, Array]:
+    @at_time
+    def guards(self, t: Array, s: EventState, scene: Scene) -> tuple[Array, Array]:
         """Guards of the modes, and their tolerances."""
-        return _guards(t, self.flow.state(t, s.y, scene), scene, s.mode, self.rest, self.tolerances)
+        return _guards(t, self.system.state(t, s.y, scene), scene, s.mode, self.rest, self.tolerances)
 
-    def reset(self, t: Any, s: EventState, scene: Scene, fired: Array) -> EventState:
+    @at_time
+    def reset(self, t: Array, s: EventState, scene: Scene, fired: Array) -> EventState:
         """Change of modes; the state as it is where none changes."""
-        state, mode = scene_switch(t, self.flow.state(t, s.y, scene), scene, s.mode, fired)
-        after = self.flow.replace(t, s.y, state, scene)
+        state, mode = scene_switch(t, self.system.state(t, s.y, scene), scene, s.mode, fired)
+        after = self.system.replace(t, s.y, state, scene)
         changed = jnp.any(mode != s.mode)
         return s._replace(y=jtu.tree_map(lambda a, b: jnp.where(changed, a, b), after, s.y), mode=mode)
 
-    def on_zeno(self, t: Any, s: EventState, scene: Scene, fired: Array) -> EventState:
+    @at_time
+    def on_zeno(self, t: Array, s: EventState, scene: Scene, fired: Array) -> EventState:
         """Stick of what chatters."""
         return self._stick(t, s._replace(mode=jnp.where(fired, 0.0, s.mode)), scene)
 
-    def _stick(self, t: Any, s: EventState, scene: Scene) -> EventState:
-        state = scene_stick(t, self.flow.state(t, s.y, scene), scene, s.mode)
-        return s._replace(y=self.flow.replace(t, s.y, state, scene))
+    def _stick(self, t: Array, s: EventState, scene: Scene) -> EventState:
+        state = scene_stick(t, self.system.state(t, s.y, scene), scene, s.mode)
+        return s._replace(y=self.system.replace(t, s.y, state, scene))
 
-    def project(self, t: Any, y: Any, scene: Scene) -> Any:
+    @at_time
+    def project(self, t: Array, y: PyTree, scene: Scene) -> PyTree:
         """Back onto the constraints."""
         if not self.projects:
             return y
-        return self.flow.replace(t, y, scene_project(t, self.flow.state(t, y, scene), scene), scene)
+        return self.system.replace(t, y, scene_project(t, self.system.state(t, y, scene), scene), scene)
 
-    def project_and_stick(self, t: Any, s: EventState, scene: Scene) -> EventState:
+    @at_time
+    def project_and_stick(self, t: Array, s: EventState, scene: Scene) -> EventState:
         """Back onto the constraints, and into stick."""
         s = s._replace(y=self.project(t, s.y, scene))
         return self._stick(t, s, scene) if self.sticks else s
 
-    def keep(self, t: Any, y: Any, scene: Scene) -> Any:
+    @at_time
+    def keep(self, t: Array, y: PyTree, scene: Scene) -> PyTree:
         """What is kept at a saved time, where the state comes from dense output and obeys nothing: result and mode."""
         if isinstance(y, EventState):
-            return self.flow.result(t, self.project_and_stick(t, y, scene).y, scene), y.mode
-        return self.flow.result(t, self.project(t, y, scene), scene), None
+            return self.system.result(t, self.project_and_stick(t, y, scene).y, scene), y.mode
+        return self.system.result(t, self.project(t, y, scene), scene), None

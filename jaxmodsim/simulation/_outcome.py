@@ -1,6 +1,6 @@
 """How a run ended: a code inside compiled code, a sentence outside."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -83,7 +83,7 @@ class SimulationError(RuntimeError):
     """A run that ended early; the message says how, when, and what to do."""
 
 
-class Outcome(eqx.Module):
+class RunResult(eqx.Module):
     """How a run ended.
 
     - `code`: 0 for a run that reached t1; an index into `messages` otherwise. Under `jax.vmap` one per lane.
@@ -134,7 +134,7 @@ def start_code(
     t: Float[Array, ""],
     y: State,
     rate: State,
-    mode: Any,
+    mode: Array | None,
     atol: Float[Array, ""] | None,
     canonical: bool,
 ) -> Int[Array, ""]:
@@ -142,18 +142,17 @@ def start_code(
 
     `atol` is None in a run of fixed steps.
     """
-    dof = y.q.shape[0]
+    dof, now = y.q.shape[0], scene.bind_time(t)
     code = jnp.asarray(SUCCESS)
     finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
     code = jnp.where(finite, code, NOT_FINITE)
     if canonical:
-        now = scene.bind_time(t)
         code = jnp.where(quadratic(now.lagrangian, t, y.q, y.qd, now.params), code, NOT_QUADRATIC)
     offsets = _offsets(scene, dof)
-    code = _blame_margins(code, scene_validity_margins(t, y, scene, mode), offsets.checks, True)
-    code = _blame_mass(code, _pivots(scene, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
+    code = _blame_margins(code, scene_validity_margins(t, y, now, mode), offsets.checks, True)
+    code = _blame_mass(code, _pivots(now, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
     if scene.constraints:
-        off, turned = scene_constraint_residual(t, y, scene)
+        off, turned = scene_constraint_residual(t, y, now)
         code = jnp.where((off <= _CONSISTENT) & (turned <= _CONSISTENT), code, INCONSISTENT)
     widths = [module.width for _, module in modules_of(scene) if isinstance(module, Regularized)]
     if atol is not None and widths:
@@ -169,7 +168,7 @@ def end_code(
     t: Float[Array, ""],
     y: State,
     rate: State,
-    mode: Any,
+    mode: Array | None,
     result: dfx.RESULTS,
     ending: Ending | None,
     ahead: Float[Array, ""],
@@ -178,7 +177,7 @@ def end_code(
 
     `ahead` is the time [s] by which the next step may have failed.
     """
-    early = ~dfx.is_okay(result)
+    early, now = ~dfx.is_okay(result), scene.bind_time(t)
     code = jnp.where(result == dfx.RESULTS.dt_min_reached, STEP_TOO_SMALL, NOT_FINITE)
     code = jnp.where(result == dfx.RESULTS.max_steps_reached, MAX_STEPS, code)
     code = jnp.where(early, code, SUCCESS)
@@ -195,15 +194,15 @@ def end_code(
         code = _blame_margins(code, scene_validity_margins(t + ahead, beyond, scene, mode), offsets.checks, early)
         code = _blame_margins(code, scene_validity_margins(t, y, scene, mode), offsets.checks, early)
     if scene.constraints:
-        kept = scene_constraint_residual(t, y, scene)[0] <= _KEPT
+        kept = scene_constraint_residual(t, y, now)[0] <= _KEPT
         code = jnp.where(kept | ~finite, code, DRIFTED)
     eps = float(jnp.finfo(y.q.dtype).eps)
     # A run that stopped in front of a singular mass matrix cannot have come closer than its smallest step.
     tolerance = jnp.where(early, eps**0.5, 16 * y.q.shape[0] * eps)
-    return _blame_mass(code, _pivots(scene, t, y), tolerance, jnp.all(jnp.isfinite(y.q)) & jnp.all(jnp.isfinite(y.qd)))
+    return _blame_mass(code, _pivots(now, t, y), tolerance, jnp.all(jnp.isfinite(y.q)) & jnp.all(jnp.isfinite(y.qd)))
 
 
-def _blame_margins(code: Int[Array, ""], margins: Any, first: int, known: Array | bool) -> Int[Array, ""]:
+def _blame_margins(code: Int[Array, ""], margins: Array | None, first: int, known: Array | bool) -> Int[Array, ""]:
     """Replace `code` by that of the last condition that does not hold, where `known`.
 
     The margin of uniqueness comes last: where it is gone, normal forces change their sign, but no contact opens.
@@ -232,7 +231,8 @@ def describe_failure(scene: Scene, t: float, y: State, code: int) -> str:
     dof = y.q.shape[0]
     text = outcome_messages(scene, dof)[code]
     if FIRST_MASS <= code < FIRST_MASS + dof:
-        mass = np.asarray(scene_mass(jnp.asarray(t, y.q.dtype), y, scene))
+        time = jnp.asarray(t, y.q.dtype)
+        mass = np.asarray(scene_mass(time, y, scene.bind_time(time)))
         text += f" Mass matrix {np.array2string(mass, precision=4)}"
         if np.all(np.isfinite(mass)):
             values, vectors = np.linalg.eigh(mass)

@@ -1,24 +1,15 @@
 """`simulate`: a scene in, a trajectory out."""
 
-import math
-from collections.abc import Callable
-from typing import Any
-
 import diffrax as dfx
 import equinox as eqx
-import jax
-import jax.core
-import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
-from .._core.arguments import as_flag, as_mapping, as_whole, check_real
-from ..scene import Friction, Scene, check_step
-from ..solvers import ImplicitFriction
+from .._core.arguments import as_flag
+from ..scene import Scene
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages
-from ._search import reach
-from ._solve import Options, Problem, Solved, solve
+from ._run_request import RunRequest, is_known
+from ._solve import RunInputs, RunOutput, solve
 from ._trajectory import Trajectory, trajectory
 
 
@@ -42,8 +33,6 @@ def simulate(
     hold_chatter: bool = False,
     project: bool = True,
     throw: bool = True,
-    accuracy: float | None = None,
-    observable: str | Callable[[Trajectory], Any] | None = None,
 ) -> Trajectory:
     """Run a scene from `t0` to `t1`.
 
@@ -87,19 +76,7 @@ def simulate(
       smallest changes in the metric of the masses. Without, constraints hold for the accelerations alone and drift with
       the error of integration, but for their own `stabilise`.
     - `throw`: whether a run that ends early raises; otherwise `run.result` says how it ended, and what was computed
-      is kept. Likewise for an accuracy that is not reached, of which `run.accuracy.remark` says why.
-    - `accuracy`: largest error of `observable`, from 1e-12 to 0.1, instead of `rtol`, `atol` and `dt`. Solver and
-      tolerances are searched for, by about ten runs of two methods, so that numbers must be known (not traced): the
-      run with the least work is taken whose difference to tighter runs by either method is within the accuracy. In
-      scenes with events the second method makes steps of at most 1/127 of the run, unless `dtmax` bounds both, so that
-      the two look at different places. What steps over a short pulse in all of them is not seen: `dtmax`.
-      `run.accuracy` reports it, and `run.accuracy.options` are the arguments for more such runs. With `solver` given
-      the tolerances alone are chosen. Errors are relative to the largest magnitude of the observable at the saved
-      times (of fewer than 11, at 101 times along the run), or to 1e-6 of its unit where it stays below that.
-    - `observable`: what `accuracy` is of: `"q[0]"`, `"qd[0]"`, the name of an effect for its force (`[i]` behind for a
-      component), or a function of the `Trajectory` that returns numbers of shape `[]`, `[time]` or `[time, k]`, each
-      column relative to its own largest magnitude among the numbers returned. By default all coordinates and
-      velocities, each relative to its own.
+      is kept.
 
     **Returns:**
 
@@ -108,12 +85,12 @@ def simulate(
     **Raises:**
 
     - `ValueError` for wrong shapes, types or ranges, before anything runs; for `accuracy` where numbers are traced.
-    - `SimulationError` if the run ended early, or no run of the accuracy was found, and `throw` is set. Inside
+    - `SimulationError` if the run ended early and `throw` is set. Inside
       `jax.jit`, `jax.vmap` or `jax.grad` the same sentence comes as equinox's run-time error. That calls Python, and
       JAX keeps no compiled program that does in its persistent cache: pass `throw=False` there, and read `run.result`.
     """
     throw = as_flag(throw, name="throw")
-    problem, options = prepare(
+    inputs, options = RunRequest(
         scene,
         q0,
         qd0,
@@ -131,11 +108,9 @@ def simulate(
         max_events,
         hold_chatter,
         project,
-    )
-    if accuracy is not None or observable is not None:
-        return reach(problem, options, accuracy, observable, (rtol, atol), throw)
+    ).checked()
     try:
-        solved = solve(problem, options)
+        solved = solve(inputs, options)
     except TypeError as error:
         if "custom_vjp" in str(error) and adjoint is None:
             raise TypeError(
@@ -144,190 +119,17 @@ def simulate(
             ) from error
         raise
     if throw:
-        solved = _raise_early_end(problem, solved)
-    return trajectory(problem, options, solved)
+        solved = _raise_early_end(inputs, solved)
+    return trajectory(inputs, options, solved)
 
 
-def prepare(
-    scene: Any,
-    q0: Any,
-    qd0: Any,
-    t1: Any,
-    t0: Any = 0.0,
-    ts: Any = None,
-    z0: Any = None,
-    rtol: Any = 1e-6,
-    atol: Any = 1e-9,
-    dt: Any = None,
-    dtmax: Any = None,
-    solver: Any = None,
-    adjoint: Any = None,
-    max_steps: Any = 16384,
-    max_events: Any = 1024,
-    hold_chatter: Any = False,
-    project: Any = True,
-) -> tuple[Problem, Options]:
-    """Convert and check the arguments of `simulate`: its numbers, and what is compiled in."""
-    problem = _problem(scene, q0, qd0, t1, t0, ts, z0, rtol, atol, dt, dtmax)
-    max_steps, max_events = as_whole(max_steps, name="max_steps"), as_whole(max_events, name="max_events")
-    hold_chatter, project = as_flag(hold_chatter, name="hold_chatter"), as_flag(project, name="project")
-    solver_arrays, solver_rest = _split(solver, dfx.AbstractSolver, "solver")
-    if isinstance(solver, ImplicitFriction):
-        if dt is None:
-            raise ValueError(
-                "ImplicitFriction takes fixed steps and has no estimate of its error: pass the step, as in dt=1e-3."
-            )
-        check_step(scene)
-    if isinstance(adjoint, dfx.BacksolveAdjoint):
-        raise ValueError(
-            "simulate cannot use diffrax.BacksolveAdjoint, which knows neither events nor projections nor what is kept"
-            " of a run. Leave adjoint out, or pass diffrax.ForwardMode()."
-        )
-    adjoint_arrays, adjoint_rest = _split(adjoint, dfx.AbstractAdjoint, "adjoint")
-    problem = problem._replace(plugins=(solver_arrays, adjoint_arrays))
-    options = Options(solver_rest, adjoint_rest, max_steps, max_events, hold_chatter, project)
-    return problem, options
-
-
-def _known(*values: Any) -> bool:
-    return not any(isinstance(value, jax.core.Tracer) for value in values)
-
-
-def _array(value: Any, dtype: Any) -> Any:
-    """As an array of `dtype`: NumPy for what is known (cheaper to hand over), JAX for what is traced or on a device."""
-    if isinstance(value, jax.Array):
-        return value if value.dtype == dtype else value.astype(dtype)
-    return np.asarray(value, dtype)
-
-
-def _problem(
-    scene: Any, q0: Any, qd0: Any, t1: Any, t0: Any, ts: Any, z0: Any, rtol: Any, atol: Any, dt: Any, dtmax: Any
-) -> Problem:
-    """Convert and check all numbers of a run."""
-    if not isinstance(scene, Scene):
-        raise ValueError(f"simulate needs a Scene, but a {type(scene).__name__} was given.")
-    # A list may hold numbers that are traced, as in qd0=[scene.params["v"]].
-    q0, qd0, ts = (
-        jnp.asarray(value) if isinstance(value, list | tuple) and not _known(*value) else value
-        for value in (q0, qd0, ts)
-    )
-    given = {"q0": q0, "qd0": qd0, "t1": t1, "t0": t0, "rtol": rtol, "atol": atol}
-    given |= {name: value for name, value in (("ts", ts), ("dt", dt), ("dtmax", dtmax)) if value is not None}
-    for name, value in given.items():
-        if type(value) is not float:
-            check_real(value, name=name)
-    kinds = {x.dtype for x in (*jtu.tree_leaves(scene), q0, qd0) if hasattr(x, "dtype")}
-    dtype = kinds.pop() if len(kinds) == 1 else jnp.result_type(*kinds) if kinds else jnp.result_type(float)
-    if not jnp.issubdtype(dtype, jnp.floating):
-        dtype = jnp.result_type(float)
-    array = {name: _array(value, dtype) for name, value in given.items()}
-    for name in ("q0", "qd0"):
-        if array[name].ndim != 1 or array[name].shape[0] == 0 or array[name].shape != array["q0"].shape:
-            raise ValueError(
-                f"q0 and qd0 must both have the shape [dof], but q0 has the shape {array['q0'].shape} and qd0"
-                f" {array['qd0'].shape}."
-            )
-    for name in ("t0", "t1", "rtol", "atol", "dt", "dtmax"):
-        if name in array and array[name].shape != ():
-            raise ValueError(f"{name} must be one number, but has the shape {array[name].shape}.")
-    _check_values(array)
-    _check_span(t0, t1, array)
-    if array["q0"].shape != (1,):
-        _check_slips(scene, array["q0"], array["t0"])
-    return Problem(
-        scene,
-        array["q0"],
-        array["qd0"],
-        {} if z0 is None else _own_states(scene, array["q0"], z0, dtype),
-        array["t0"],
-        array["t1"],
-        array.get("ts"),
-        array["rtol"],
-        array["atol"],
-        array.get("dt"),
-        array.get("dtmax"),
-        None,
-    )
-
-
-def _check_span(t0: Any, t1: Any, array: dict[str, Any]) -> None:
-    """Refuse times that differ, but not in the type the run has: it would end where it begins, and all be well."""
-    if _known(t0, t1) and array["t0"] == array["t1"] and t0 != t1:
-        raise ValueError(
-            f"t0 = {t0} and t1 = {t1} are the same number in {array['t0'].dtype}: count the time from another moment,"
-            " or pass q0 in float64."
-        )
-
-
-def _check_slips(scene: Scene, q0: Any, t0: Any) -> None:
-    """Refuse the velocity of a belt that is a number where slip is a vector."""
-    for i, effect in enumerate(scene.effects):
-        if not isinstance(effect, Friction) or effect.along is None or callable(effect.belt_velocity):
-            continue
-        # Asked first, as the rest takes time.
-        if _known(effect.belt_velocity) and np.any(np.asarray(effect.belt_velocity) != 0):
-            effect.check_belt(q0, scene.bind_time(jnp.asarray(t0)).params, scene.names[i])
-
-
-def _own_states(scene: Scene, q0: Any, z0: dict[str, PyTree], dtype: Any) -> dict[str, PyTree]:
-    """Convert and check the initial own states that were given."""
-    z0 = as_mapping(z0, name="z0", example="{'friction': 0.0}")
-    states = scene.initial_state(jnp.asarray(q0, dtype))
-    for name, state in z0.items():
-        if name not in states:
-            raise ValueError(
-                f"z0 names {name!r}, but the effects with a state of their own are: {', '.join(states) or 'none'}."
-            )
-        if jtu.tree_structure(state) != jtu.tree_structure(states[name]):
-            raise ValueError(f"z0[{name!r}] must have the structure of {states[name]}, but {state} was given.")
-        if [jnp.shape(x) for x in jtu.tree_leaves(state)] != [jnp.shape(x) for x in jtu.tree_leaves(states[name])]:
-            raise ValueError(f"z0[{name!r}] must have the shapes of {states[name]}, but {state} was given.")
-    return {name: jtu.tree_map(lambda x: _array(x, dtype), state) for name, state in z0.items()}
-
-
-def _check_values(array: dict[str, Any]) -> None:
-    """Check the values that are known now; those that are traced are checked in the run."""
-    known = {name: np.asarray(value) for name, value in array.items() if _known(value)}
-    for name, value in known.items():
-        if not (math.isfinite(value) if value.ndim == 0 else np.isfinite(value).all()):
-            raise ValueError(f"{name} must be finite, but it is {value}.")
-    for name in ("rtol", "atol"):
-        if name in known and known[name] < 0:
-            raise ValueError(f"{name} must not be negative, but it is {known[name]}.")
-    if "rtol" in known and "atol" in known and known["rtol"] + known["atol"] <= 0:
-        raise ValueError("rtol and atol must not both be zero.")
-    for name in ("dt", "dtmax"):
-        if name in known and known[name] <= 0:
-            raise ValueError(f"{name} must be positive, but it is {known[name]}.")
-    if "dt" in array and "dtmax" in array:
-        raise ValueError("dt fixes the step, so dtmax has no place beside it: pass one of them.")
-    t0, t1, ts = known.get("t0"), known.get("t1"), known.get("ts")
-    if t0 is not None and t1 is not None and t1 < t0:
-        raise ValueError(f"t1 must not be before t0, but t0 = {t0} and t1 = {t1}.")
-    if "ts" in array and (array["ts"].ndim != 1 or array["ts"].shape[0] == 0):
-        raise ValueError(f"ts must be a vector of times, shape [time], but it has the shape {array['ts'].shape}.")
-    if ts is not None and (np.diff(ts) < 0).any():
-        raise ValueError("ts must increase.")
-    if ts is not None and t0 is not None and t1 is not None and not (t0 <= ts[0] and ts[-1] <= t1):
-        raise ValueError(f"ts must lie within [t0, t1] = [{t0}, {t1}], but runs from {ts[0]} to {ts[-1]}.")
-
-
-def _split(plugin: Any, kind: type, name: str) -> tuple[Any, Any]:
-    """Arrays of a plug-in, and the rest of it, which is compiled in."""
-    if plugin is None:
-        return None, None
-    if not isinstance(plugin, kind):
-        raise ValueError(f"{name} must be a diffrax.{kind.__name__} object, but {plugin!r} was given.")
-    return eqx.partition(plugin, eqx.is_array)
-
-
-def _raise_early_end(problem: Problem, solved: Solved) -> Solved:
+def _raise_early_end(inputs: RunInputs, solved: RunOutput) -> RunOutput:
     """Raise for a run that ended early: at once where its values are known, by a run-time check where traced."""
-    if _known(solved.code):
+    if is_known(solved.code):
         code = int(solved.code)
         if code != SUCCESS:
             t, y = solved.end or (solved.t[-1], jtu.tree_map(lambda x: x[-1], solved.y))
-            raise SimulationError(describe_failure(problem.scene, float(t), y, code))
+            raise SimulationError(describe_failure(inputs.scene, float(t), y, code))
         return solved
-    messages = outcome_messages(problem.scene, problem.q0.shape[0])
+    messages = outcome_messages(inputs.scene, inputs.q0.shape[0])
     return eqx.branched_error_if(solved, solved.code != SUCCESS, solved.code, messages)

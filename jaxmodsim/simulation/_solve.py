@@ -32,11 +32,12 @@ from ..solvers import (
     ImplicitFriction,
     Projected,
     Rodas5P,
+    SampledJumps,
     StepsTo,
     first_step,
     unchecked,
 )
-from ._integrated_system import Hybrid, IntegratedSystem, Work
+from ._integrated_system import IntegratedSystem, RunFunctions, Work
 from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, end_code, start_code
 
 # Part of the absolute tolerance below which a slip velocity counts as none.
@@ -52,7 +53,7 @@ _GAINS = (0.0, 1.0)
 _ROSENBROCK_GAINS = (0.25, 0.5)
 
 
-class Problem(NamedTuple):
+class RunInputs(NamedTuple):
     """All numbers of a run."""
 
     scene: Scene
@@ -71,13 +72,13 @@ class Problem(NamedTuple):
     plugins: PyTree
 
 
-def initial_state(problem: Problem) -> State:
+def initial_state(inputs: RunInputs) -> State:
     """State at t0: effects whose state is not given start at rest."""
-    return State(problem.q0, problem.qd0, problem.scene.initial_state(problem.q0) | problem.z0)
+    return State(inputs.q0, inputs.qd0, inputs.scene.initial_state(inputs.q0) | inputs.z0)
 
 
 @dataclass(frozen=True)
-class Options:
+class RunOptions:
     """All choices of a run that are compiled in."""
 
     solver: Any
@@ -88,14 +89,14 @@ class Options:
     project: bool
 
 
-class Solved(NamedTuple):
+class RunOutput(NamedTuple):
     """What a run gives: saved times and states, the outcome, the end that was reached, and the numbers of steps."""
 
     t: Float[Array, " time"]
     # A `State`; in an audited run a pair of it and `Work`.
-    y: Any
+    y: PyTree
     # Of the set-valued friction elements, shape `[time, elements]`; None where there are none.
-    mode: Any
+    mode: Array | None
     code: Int[Array, ""]
     # None where the end alone is kept, and so is in `t` and `y` already: every output of compiled code costs time.
     end: tuple[Float[Array, ""], State] | None
@@ -113,64 +114,66 @@ def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolv
     return Rodas5P(pivot=fixed_step) if stiff or (scene.event_driven and dof == 1) else dfx.Tsit5()
 
 
-def _shortest(problem: Problem) -> Float[Array, ""]:
+def _shortest(inputs: RunInputs) -> Float[Array, ""]:
     """Shortest step [s]: what time resolves."""
-    span = jnp.maximum(jnp.abs(problem.t0), jnp.abs(problem.t1))
+    span = jnp.maximum(jnp.abs(inputs.t0), jnp.abs(inputs.t1))
     return float(jnp.finfo(span.dtype).eps) * span
 
 
-def _tolerances(problem: Problem) -> tuple[Array, Array]:
+def _tolerances(inputs: RunInputs) -> tuple[Array, Array]:
     """Relative and absolute; of what is zero and stays so, the error is zero and not 0/0."""
-    return problem.rtol, jnp.maximum(problem.atol, float(jnp.finfo(problem.atol.dtype).tiny))
+    return inputs.rtol, jnp.maximum(inputs.atol, float(jnp.finfo(inputs.atol.dtype).tiny))
 
 
-def _first(problem: Problem, method: dfx.AbstractSolver, rate: Any, y0: Any) -> Array:
+def _first(inputs: RunInputs, method: dfx.AbstractSolver, rate: Any, y0: PyTree) -> Array:
     """First step [s]."""
-    if problem.dt is not None:
-        return problem.dt
-    scene = jax.lax.stop_gradient(problem.scene)
+    if inputs.dt is not None:
+        return inputs.dt
+    scene = jax.lax.stop_gradient(inputs.scene)
     step = first_step(
         lambda t, y: rate(t, y, scene),
-        problem.t0,
+        inputs.t0,
         y0,
         method.error_order(dfx.ODETerm(rate)),
-        _tolerances(problem),
-        _shortest(problem),
+        _tolerances(inputs),
+        _shortest(inputs),
     )
-    return step if problem.dtmax is None else jnp.minimum(step, problem.dtmax)
+    return step if inputs.dtmax is None else jnp.minimum(step, inputs.dtmax)
 
 
-def _error_control(problem: Problem, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
-    if problem.dt is not None:
+def _error_control(inputs: RunInputs, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
+    if inputs.dt is not None:
         return FiniteSteps()
-    (rtol, atol), dtmin = _tolerances(problem), _shortest(problem)
-    p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not problem.scene.event_driven else _GAINS
-    return dfx.PIDController(rtol, atol, pcoeff=p, icoeff=i, dtmin=dtmin, dtmax=problem.dtmax, force_dtmin=False)
+    (rtol, atol), dtmin = _tolerances(inputs), _shortest(inputs)
+    p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not inputs.scene.event_driven else _GAINS
+    return dfx.PIDController(rtol, atol, pcoeff=p, icoeff=i, dtmin=dtmin, dtmax=inputs.dtmax, force_dtmin=False)
 
 
 def _solver(
-    solver: dfx.AbstractSolver, hybrid: Hybrid, scene: Scene, options: Options, log: int | None
+    solver: dfx.AbstractSolver, functions: RunFunctions, scene: Scene, options: RunOptions, log: int | None
 ) -> dfx.AbstractSolver:
     """`solver`, wrapped in what the scene needs: events, projections, signals."""
     if isinstance(solver, ImplicitFriction):
-        solver = ImplicitFriction(hybrid.flow.advance)
-    pin = _step_from if signals_of(scene.params) else None
+        solver = ImplicitFriction(functions.system.advance)
+    freeze_args, samples = None, None
+    if signals_of(scene.params):
+        freeze_args = _step_from
+        samples = SampledJumps(freeze_args, sample_times(scene.params, linear=False))
     if scene.event_driven:
         return EventSolver(
             solver,
-            hybrid.guards,
-            hybrid.reset,
-            on_zeno=hybrid.on_zeno if options.hold_chatter else None,
-            project=hybrid.project_and_stick if hybrid.projects or hybrid.sticks else None,
-            freeze_args=pin,
-            jump_ts=sample_times(scene.params, linear=False),
-            rtol=hybrid.tolerances[0],
+            functions.guards,
+            functions.reset,
+            on_zeno=functions.on_zeno if options.hold_chatter else None,
+            project=functions.project_and_stick if functions.projects or functions.sticks else None,
+            samples=samples,
+            rtol=functions.tolerances[0],
             enforce=True,
             max_events=options.max_events if log is None else min(log, options.max_events),
             log=log is not None,
         )
-    if hybrid.projects or pin is not None:
-        return Projected(solver, hybrid.project if hybrid.projects else None, pin)
+    if functions.projects or freeze_args is not None:
+        return Projected(solver, functions.project if functions.projects else None, freeze_args)
     return solver
 
 
@@ -178,31 +181,31 @@ def _step_from(t: Array, scene: Scene) -> Scene:
     return scene.step_from(t)
 
 
-def _controller(problem: Problem, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
-    controller = _error_control(problem, solver)
-    times = sample_times(problem.scene.params, linear=True)
-    if problem.scene.event_driven:
+def _controller(inputs: RunInputs, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
+    controller = _error_control(inputs, solver)
+    times = sample_times(inputs.scene.params, linear=True)
+    if inputs.scene.event_driven:
         return EventController(controller, times, direction=1)
     return controller if times is None else StepsTo(controller, times)
 
 
-def _plugins(problem: Problem, options: Options) -> tuple[Any, Any]:
+def _plugins(inputs: RunInputs, options: RunOptions) -> tuple[Any, Any]:
     """Solver and adjoint: those that were given, or the defaults."""
-    solver = default_solver(problem.scene, problem.q0.shape[0], problem.dt is not None)
+    solver = default_solver(inputs.scene, inputs.q0.shape[0], inputs.dt is not None)
     # With fewer checkpoints than steps, steps are made again from states that differ by rounding from those of the run,
     # which events and error control enlarge: derivatives lose half of their digits, or all but two.
     adjoint = dfx.RecursiveCheckpointAdjoint(checkpoints=options.max_steps)
     if options.solver is not None:
-        solver = eqx.combine(options.solver, problem.plugins[0])
+        solver = eqx.combine(options.solver, inputs.plugins[0])
     if options.adjoint is not None:
-        adjoint = eqx.combine(options.adjoint, problem.plugins[1])
+        adjoint = eqx.combine(options.adjoint, inputs.plugins[1])
     return solver, adjoint
 
 
-def _well_posed(problem: Problem) -> Bool[Array, ""]:
+def _well_posed(inputs: RunInputs) -> Bool[Array, ""]:
     """Whether times and tolerances make a run; known ones are checked before, with a sentence of their own."""
-    t0, t1, ts, rtol, atol = problem.t0, problem.t1, problem.ts, problem.rtol, problem.atol
-    steps = [step for step in (problem.dt, problem.dtmax) if step is not None]
+    t0, t1, ts, rtol, atol = inputs.t0, inputs.t1, inputs.ts, inputs.rtol, inputs.atol
+    steps = [step for step in (inputs.dt, inputs.dtmax) if step is not None]
     fine = (t0 <= t1) & (rtol >= 0) & (atol >= 0) & (rtol + atol > 0)
     for step in steps:
         fine &= step > 0
@@ -212,55 +215,57 @@ def _well_posed(problem: Problem) -> Bool[Array, ""]:
     return fine & jnp.isfinite(jnp.stack([t0, t1, rtol, atol, *steps])).all()
 
 
-def _prepared(problem: Problem, options: Options, audited: bool) -> tuple[State, Any, Hybrid, Int[Array, ""]]:
+def _prepared(inputs: RunInputs, options: RunOptions, audited: bool) -> tuple[State, Any, RunFunctions, Int[Array, ""]]:
     """State and modes to begin with, the functions of the run, and what is wrong with the start."""
-    scene, t0 = problem.scene, problem.t0
-    given = initial = initial_state(problem)
+    scene, t0 = inputs.scene, inputs.t0
+    given = initial = initial_state(inputs)
     check_scene(scene, initial)
-    projects, rest = bool(scene.constraints) and options.project, _REST * problem.atol
+    projects, rest = bool(scene.constraints) and options.project, _REST * inputs.atol
     mode = None
     if projects:
-        initial = scene_project(t0, initial, scene)
+        initial = scene_project(t0, initial, scene.bind_time(t0))
     if scene.event_driven:
         initial, mode = scene_modes(t0, initial, scene, rest)
     canonical = isinstance(options.solver, Gauss)
-    atol = None if problem.dt is not None else problem.atol
+    atol = None if inputs.dt is not None else inputs.atol
     start = start_code(scene, t0, given, vector_field(t0, initial, scene, mode), mode, atol, canonical)
-    start = jnp.where(_well_posed(problem), start, ILL_POSED)
+    start = jnp.where(_well_posed(inputs), start, ILL_POSED)
     sticks = bool(scene.event_driven) and scene_drifts(scene)
     return (
         initial,
         mode,
-        Hybrid(IntegratedSystem(audited, canonical), rest, (problem.rtol, problem.atol), projects, sticks),
+        RunFunctions(IntegratedSystem(audited, canonical), rest, (inputs.rtol, inputs.atol), projects, sticks),
         start,
     )
 
 
-def _integrate(problem: Problem, options: Options, audited: bool, log: int | None) -> tuple[Solved, EventLog | None]:
+def _integrate(
+    inputs: RunInputs, options: RunOptions, audited: bool, log: int | None
+) -> tuple[RunOutput, EventLog | None]:
     """Run diffrax; with modes only where the scene has them, with a log of that many events where one is wanted."""
-    scene, exact = problem.scene, bool(problem.scene.event_driven)
-    initial, mode, hybrid, start = _prepared(problem, options, audited)
-    method, adjoint = _plugins(problem, options)
-    solver = _solver(method, hybrid, scene, options, log)
+    scene, exact = inputs.scene, bool(inputs.scene.event_driven)
+    initial, mode, functions, start = _prepared(inputs, options, audited)
+    method, adjoint = _plugins(inputs, options)
+    solver = _solver(method, functions, scene, options, log)
     # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
     starts = start == SUCCESS
-    ts = None if problem.ts is None else jnp.where(starts, problem.ts, problem.t0)
-    y0, controller = hybrid.flow.start(problem.t0, initial, scene, mode), _controller(problem, method)
-    first = _first(problem, method, partial(hybrid.plain_rate, mode=mode), y0)
+    ts = None if inputs.ts is None else jnp.where(starts, inputs.ts, inputs.t0)
+    y0, controller = functions.system.start(inputs.t0, initial, scene, mode), _controller(inputs, method)
+    first = _first(inputs, method, partial(functions.plain_derivative, mode=mode), y0)
     if isinstance(solver, EventSolver):
-        y0 = solver.start(problem.t0, y0, mode, scene)
+        y0 = solver.start(inputs.t0, y0, mode, scene)
 
-    def keep_end(t: Any, y: Any, scene: Scene) -> Any:
-        return hybrid.keep(t, y, scene), ((y.events, y.status, y.fired), y.log) if exact else None
+    def keep_end(t: Array, y: PyTree, scene: Scene) -> Any:
+        return functions.keep(t, y, scene), ((y.events, y.status, y.fired), y.log) if exact else None
 
     def integrate(first: Array, ts: Array | None) -> dfx.Solution:
         end = dfx.SubSaveAt(t1=True, fn=keep_end)
-        saved = dfx.SubSaveAt(t1=ts is None, ts=ts, fn=hybrid.keep)
+        saved = dfx.SubSaveAt(t1=ts is None, ts=ts, fn=functions.keep)
         return dfx.diffeqsolve(
-            dfx.ODETerm(hybrid.rate if exact else hybrid.plain_rate),
+            dfx.ODETerm(functions.derivative if exact else functions.plain_derivative),
             solver,
-            problem.t0,
-            jnp.where(starts, problem.t1, problem.t0),
+            inputs.t0,
+            jnp.where(starts, inputs.t1, inputs.t0),
             first,
             y0,
             args=scene,
@@ -281,31 +286,33 @@ def _integrate(problem: Problem, options: Options, audited: bool, log: int | Non
     if exact:
         (count, status, fired), history = events
         ending, stats["num_events"] = Ending(status, fired), count
-    ended = _ended(problem, t_end, end_state, mode, solution.result, ending)
-    t, y, modes, missed = _kept(problem, starts, solution.ts[1], solution.ys[1])
+    ended = _ended(inputs, t_end, end_state, mode, solution.result, ending)
+    t, y, modes, missed = _kept(inputs, starts, solution.ts[1], solution.ys[1])
     code = jnp.where(starts, ended, start)
     if exact and not options.hold_chatter:
         code = jnp.where((code == SUCCESS) & missed, MISSED_EVENT, code)
-    return Solved(t, y, modes, code, None if problem.ts is None else (t_end, end_state), stats), history
+    return RunOutput(t, y, modes, code, None if inputs.ts is None else (t_end, end_state), stats), history
 
 
-def _ended(problem: Problem, t: Array, y: State, mode: Any, result: dfx.RESULTS, ending: Ending | None) -> Array:
+def _ended(
+    inputs: RunInputs, t: Array, y: State, mode: Array | None, result: dfx.RESULTS, ending: Ending | None
+) -> Array:
     """How the run ended, if it began."""
-    span = jnp.maximum(jnp.abs(problem.t0), jnp.abs(problem.t1))
-    ahead = float(jnp.finfo(span.dtype).eps) ** 0.5 * span if problem.dt is None else problem.dt
-    rate = vector_field(t, y, problem.scene, mode)
-    return end_code(problem.scene, t, y, rate, mode, result, ending, ahead)
+    span = jnp.maximum(jnp.abs(inputs.t0), jnp.abs(inputs.t1))
+    ahead = float(jnp.finfo(span.dtype).eps) ** 0.5 * span if inputs.dt is None else inputs.dt
+    rate = vector_field(t, y, inputs.scene, mode)
+    return end_code(inputs.scene, t, y, rate, mode, result, ending, ahead)
 
 
-def _kept(problem: Problem, starts: Array, t: Array, kept: Any) -> tuple[Array, Any, Any, Array]:
+def _kept(inputs: RunInputs, starts: Array, t: Array, kept: PyTree) -> tuple[Array, PyTree, PyTree, Array]:
     """Saved times, results and modes, infinite where a run that did not start would have kept them.
 
     And whether an element sticks at one of them under a load beyond its limit: then an event was stepped over.
     """
-    scene, (y, modes) = problem.scene, kept
-    if problem.ts is None:
+    scene, (y, modes) = inputs.scene, kept
+    if inputs.ts is None:
         return t, y, modes, jnp.asarray(False)
-    reached = starts | (problem.ts <= problem.t0)
+    reached = starts | (inputs.ts <= inputs.t0)
     t = jnp.where(reached, t, jnp.inf)
     y, modes = jtu.tree_map(
         lambda x: jnp.where(jnp.expand_dims(reached, tuple(range(1, x.ndim))), x, jnp.inf), (y, modes)
@@ -321,27 +328,27 @@ def _kept(problem: Problem, starts: Array, t: Array, kept: Any) -> tuple[Array, 
 
 
 @partial(jax.jit, static_argnames=("options",))
-def solve(problem: Problem, options: Options) -> Solved:
+def solve(inputs: RunInputs, options: RunOptions) -> RunOutput:
     """Run a scene."""
-    return _integrate(problem, options, False, None)[0]
+    return _integrate(inputs, options, False, None)[0]
 
 
 @partial(jax.jit, static_argnames=("options",))
-def solve_audited(problem: Problem, options: Options) -> tuple[Work, Int[Array, ""]]:
+def solve_audited(inputs: RunInputs, options: RunOptions) -> tuple[Work, Int[Array, ""]]:
     """Run a scene again with the integrals of power beside it: the work at the saved times, and how that run ended."""
-    solved = _integrate(problem, options, True, None)[0]
+    solved = _integrate(inputs, options, True, None)[0]
     return solved.y[1], solved.code
 
 
 @partial(jax.jit, static_argnames=("options",))
-def solve_start(problem: Problem, options: Options) -> State:
+def solve_start(inputs: RunInputs, options: RunOptions) -> State:
     """The state a run begins with: on the constraints, and at rest where elements stick."""
-    return _prepared(problem, options, False)[0]
+    return _prepared(inputs, options, False)[0]
 
 
 @partial(jax.jit, static_argnames=("options", "size"))
-def solve_logged(problem: Problem, options: Options, size: int) -> EventLog:
+def solve_logged(inputs: RunInputs, options: RunOptions, size: int) -> EventLog:
     """Run a scene again with a log of `size` events beside it."""
-    log = _integrate(problem, options, False, size)[1]
+    log = _integrate(inputs, options, False, size)[1]
     assert log is not None
     return log

@@ -1,14 +1,15 @@
 """The result of a run."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..mechanics import momentum
@@ -16,8 +17,9 @@ from ..scene import ConstraintReaction, Scene, State, scene_forces, scene_reacti
 from ..solvers import EventLog
 from ._accuracy import Accuracy
 from ._energy_ledger import EnergyLedger, event_losses, ledger
-from ._outcome import Outcome, outcome_messages
-from ._solve import Options, Problem, Solved, solve_logged
+from ._outcome import RunResult, outcome_messages
+from ._run_request import is_known
+from ._solve import RunInputs, RunOptions, RunOutput, solve_logged
 
 _Value = TypeVar("_Value")
 
@@ -59,10 +61,18 @@ class Energy(NamedTuple):
     balance: Float[Array, " time"]
 
 
-@jtu.register_dataclass
+@partial(
+    jtu.register_dataclass,
+    data_fields=("t", "q", "qd", "z", "modes", "stats", "code", "end", "inputs"),
+    meta_fields=("options", "accuracy"),
+)
 @dataclass(frozen=True)
 class Trajectory:
     """A run of a scene. Everything but the motion itself is computed when it is asked for.
+
+    What is not saved along a run takes another run: events and energies. Each such run is made once, and its results
+    stay with this object, not with copies of it, such as `jax.jit` and `jax.tree.map` make. Inside `jax.jit`, read them
+    before a branch or a loop (`jax.lax.cond`, `jax.lax.scan`) does.
 
     - `t`: times [s], shape `[time]`; `ts`, or the end alone. Times that an early end left unreached are infinite.
     - `q`, `qd`: coordinates and velocities, shape `[time, dof]`.
@@ -83,14 +93,16 @@ class Trajectory:
     stats: dict[str, Array]
     code: Int[Array, "..."]
     end: Float[Array, "..."] | None
-    problem: Problem
-    options: Options = field(metadata={"static": True})
-    accuracy: Accuracy | None = field(default=None, metadata={"static": True})
+    inputs: RunInputs
+    options: RunOptions
+    accuracy: Accuracy | None = None
+    # What was read from repeats of the run, by name; no part of the pytree.
+    _repeats: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def scene(self) -> Scene:
         """The scene that was run."""
-        return self.problem.scene
+        return self.inputs.scene
 
     @property
     def t_end(self) -> Float[Array, "..."]:
@@ -98,9 +110,9 @@ class Trajectory:
         return self.t[..., -1] if self.end is None else self.end
 
     @property
-    def result(self) -> Outcome:
+    def result(self) -> RunResult:
         """How the run ended: `run.result.ok`, `run.result.message`."""
-        return Outcome(self.code, outcome_messages(self.scene, self.q.shape[-1]))
+        return RunResult(self.code, outcome_messages(self.scene, self.q.shape[-1]))
 
     @property
     def forces(self) -> dict[str, Array]:
@@ -129,7 +141,7 @@ class Trajectory:
 
     @property
     def events(self) -> Events:
-        """Mode changes along the run. Runs the scene once more, with a log beside it."""
+        """Mode changes along the run; the first reading runs the scene once more, with a log beside it."""
         self._one_run("events")
         if self.modes is None:
             none = jnp.zeros(0, int)
@@ -138,10 +150,10 @@ class Trajectory:
 
     @property
     def event_forces(self) -> dict[str, Array]:
-        """Force of each effect just before and after each instant at which a mode changes, by effect name.
+        """Force of each effect just before and after each change of mode, by effect name; needs the run of `events`.
 
-        Shape `[instants, 2, ...]`, padded with NaN. At a break-away the force before is the limit in stick. Found with
-        `events`; several elements that change at one instant have one entry here.
+        Shape `[instants, 2, ...]`, padded with NaN. At a break-away the force before is the limit in stick. Several
+        elements that change at one instant have one entry here.
         """
         self._one_run("event_forces")
         if self.modes is None:
@@ -156,22 +168,22 @@ class Trajectory:
 
     @property
     def ledger(self) -> EnergyLedger:
-        """Energies by their places, what each effect brought in and lost; `jaxmodsim.energy_audit` adds them up.
+        """Energies by their places; the first reading runs the scene once more, with the work integrals beside it.
 
-        Runs the scene once more, with the work integrals beside it.
+        What each effect brought in and lost; `jaxmodsim.energy_audit` adds them up.
         """
         self._one_run("ledger")
-        return self._once("ledger", lambda: ledger(self.problem, self.options, self.t, self._states(), self.code))
+        return self._once("ledger", lambda: ledger(self.inputs, self.options, self.t, self._states(), self.code))
 
     @property
     def event_losses(self) -> Float[Array, " time"]:
-        """Energy [J] lost since t0 at events; runs the scene once more where it has any."""
+        """Energy [J] lost since t0 at events; needs the run of `events`."""
         self._one_run("event_losses")
-        return event_losses(self.problem, self.options, self.t, self.log_size)
+        return event_losses(self.inputs, self.options, self.t, None if self.modes is None else self._log())
 
     @property
     def energy(self) -> Energy:
-        """Energies and their balance along the run. Runs the scene once more, with the work integrals beside it."""
+        """Energies and their balance along the run; needs the run of `ledger`."""
         self._one_run("energy")
         book, zero = self.ledger, jnp.zeros_like(self.t)
         stored, supplied, dissipated = (
@@ -183,20 +195,19 @@ class Trajectory:
     def log_size(self) -> int:
         """Length of a log that holds all events: as many as needed, in powers of two; another one compiles anew."""
         count, size = self.stats.get("num_events", 0), self.options.max_events
-        return size if isinstance(count, jax.core.Tracer) else min(size, 1 << max(int(count), 8).bit_length())
+        return size if not is_known(count) else min(size, 1 << max(int(count), 8).bit_length())
 
     def _log(self) -> EventLog:
-        return self._once("log", lambda: solve_logged(self.problem, self.options, self.log_size))
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_made"}
+        return self._once("log", lambda: solve_logged(self.inputs, self.options, self.log_size))
 
     def _once(self, name: str, make: Callable[[], _Value]) -> _Value:
-        """What costs another run, made once; anew inside another `jax.jit`, `jax.vmap` or `jax.grad` than before."""
-        made, now = self.__dict__.setdefault("_made", {}), get_opaque_trace_state()
-        if name not in made or made[name][0] != now:
-            made[name] = now, make()
-        return made[name][1]
+        """A value that takes a repeat of the run, made where it is not there yet."""
+        if name not in self._repeats:
+            # Of a run whose numbers are known so is the value, also where the caller is being traced.
+            known = is_known(*jtu.tree_leaves(self))
+            with jax.core.eval_context() if known else nullcontext():
+                self._repeats[name] = make()
+        return self._repeats[name]
 
     def _states(self) -> State:
         return State(self.q, self.qd, self.z)
@@ -209,19 +220,19 @@ class Trajectory:
             )
 
 
-def trajectory(problem: Problem, options: Options, solved: Solved) -> Trajectory:
+def trajectory(inputs: RunInputs, options: RunOptions, solved: RunOutput) -> Trajectory:
     """The run that was solved."""
     y, end = solved.y, None if solved.end is None else solved.end[0]
-    return Trajectory(solved.t, y.q, y.qd, y.z, solved.mode, solved.stats, solved.code, end, problem, options)
+    return Trajectory(solved.t, y.q, y.qd, y.z, solved.mode, solved.stats, solved.code, end, inputs, options)
 
 
 @jax.jit
-def _forces(scene: Scene, t: Array, y: State, mode: Any) -> dict[str, Array]:
+def _forces(scene: Scene, t: Array, y: State, mode: Array | None) -> dict[str, Array]:
     return _reached(t, jax.vmap(lambda t, y, mode: scene_forces(t, y, scene, mode))(t, y, mode))
 
 
 @jax.jit
-def _reactions(scene: Scene, t: Array, y: State, mode: Any) -> dict[str, ConstraintReaction]:
+def _reactions(scene: Scene, t: Array, y: State, mode: Array | None) -> dict[str, ConstraintReaction]:
     return _reached(t, jax.vmap(lambda t, y, mode: scene_reactions(t, y, scene, mode))(t, y, mode))
 
 
@@ -243,7 +254,7 @@ def _event_forces(scene: Scene, log: EventLog) -> dict[str, Array]:
     return jtu.tree_map(lambda x: jnp.where(jnp.expand_dims(happened, range(1, x.ndim)), x, jnp.nan), both)
 
 
-def _reached(t: Array, tree: Any) -> Any:
+def _reached(t: Array, tree: PyTree) -> PyTree:
     """Arrays along a run, infinite at the times that an early end left unreached."""
     reached = jnp.isfinite(t)
     return jtu.tree_map(lambda x: jnp.where(jnp.expand_dims(reached, range(1, x.ndim)), x, jnp.inf), tree)
@@ -257,7 +268,7 @@ def _events(scene: Scene, log: EventLog) -> Events:
     changed = jnp.ravel((before != after) & jnp.isfinite(log.t)[:, None])
     order = jnp.argsort(~changed, stable=True)
 
-    def column(x: Array, filler: Any) -> Array:
+    def column(x: Array, filler: float | int) -> Array:
         return jnp.where(changed, jnp.ravel(jnp.broadcast_to(x, before.shape)), filler)[order]
 
     return Events(

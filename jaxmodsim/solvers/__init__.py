@@ -1,7 +1,6 @@
 """Plug-ins for diffrax."""
 
 from ._collocation import GAUSS as GAUSS
-from ._collocation import CollocationMemory as CollocationMemory
 from ._collocation import collocation_start as collocation_start
 from ._collocation import collocation_step as collocation_step
 from ._controllers import FiniteSteps as FiniteSteps
@@ -12,15 +11,12 @@ from ._implicit_friction import ImplicitFriction as ImplicitFriction
 from ._projected import Projected as Projected
 from ._rodas5p import RODAS5P as RODAS5P
 from ._rodas5p import Rodas5P as Rodas5P
-from ._rosenbrock import RosenbrockStep as RosenbrockStep
 from ._rosenbrock import RosenbrockTableau as RosenbrockTableau
 from ._rosenbrock import rosenbrock_step as rosenbrock_step
 from ._unchecked import calls_back as calls_back
 from ._unchecked import unchecked as unchecked
 from .events._controller import EventController as EventController
-from .events._guard_scan import GuardScan as GuardScan
-from .events._guard_scan import first_root as first_root
-from .events._guard_scan import scan_guards as scan_guards
+from .events._samples import SampledJumps as SampledJumps
 from .events._solver import EventSolver as EventSolver
 from .events._state import ACCUMULATION as ACCUMULATION
 from .events._state import TOO_MANY as TOO_MANY

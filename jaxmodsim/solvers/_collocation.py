@@ -127,7 +127,7 @@ class CollocationStep:
     iterations: Int[Array, ""]
 
 
-class _Solved(NamedTuple):
+class _SolvedStages(NamedTuple):
     slopes: list[Parts]
     solved: Array
     iterations: Array
@@ -137,7 +137,7 @@ class _Solved(NamedTuple):
 _NO_TANGENTS: Any = (None, None)
 
 
-class _Search(NamedTuple):
+class _StageIteration(NamedTuple):
     slopes: list[Parts]
     # The largest change of any stage's slope by the last iteration, and the smallest such change so far but zero.
     change: Parts
@@ -189,7 +189,7 @@ def _slopes(
     return [rates(t0 + float(c) * dt, point) for c, point in zip(method.nodes, points, strict=True)]
 
 
-def _small(method: GaussCollocation, dt: Array, y: Parts, search: _Search) -> Array:
+def _small(method: GaussCollocation, dt: Array, y: Parts, search: _StageIteration) -> Array:
     """Whether the last change of every unknown is rounding, as it is not where the iteration diverges."""
     steps = _increments(method, dt, search.slopes)
     scales = [jnp.abs(x) + _sum([jnp.abs(step[m]) for step in steps]) for m, x in enumerate(y)]
@@ -203,7 +203,7 @@ def _small(method: GaussCollocation, dt: Array, y: Parts, search: _Search) -> Ar
 
 
 @eqx.filter_custom_jvp
-def _solve(stages: int, rates: Rates, t0: Array, dt: Array, y: Parts, rest: Parts, guess: list[Parts]) -> _Solved:
+def _solve(stages: int, rates: Rates, t0: Array, dt: Array, y: Parts, rest: Parts, guess: list[Parts]) -> _SolvedStages:
     """Slopes of the stages by fixed-point iteration; zeros where it does not converge.
 
     The iteration goes on until no unknown changes less than it did before: a tolerance, however small, would leave an
@@ -212,7 +212,7 @@ def _solve(stages: int, rates: Rates, t0: Array, dt: Array, y: Parts, rest: Part
     """
     method, unit = GAUSS[stages], opaque_one(t0)
 
-    def iterate(search: _Search) -> _Search:
+    def iterate(search: _StageIteration) -> _StageIteration:
         before = fusion_barrier(_slopes(method, rates, t0, dt, y, rest, search.slopes), unit)
         slopes = fusion_barrier(_slopes(method, rates, t0, dt, y, rest, before), unit)
         change, least, settled = [], [], jnp.array(True)
@@ -221,16 +221,18 @@ def _solve(stages: int, rates: Rates, t0: Array, dt: Array, y: Parts, rest: Part
             settled &= jnp.all((size == 0) | (size >= smallest))
             change.append(size)
             least.append(jnp.where(size > 0, jnp.minimum(size, smallest), smallest))
-        return _Search(slopes, change, least, settled, search.iterations + 2)
+        return _StageIteration(slopes, change, least, settled, search.iterations + 2)
 
-    def unsettled(search: _Search) -> Array:
+    def unsettled(search: _StageIteration) -> Array:
         return ~search.settled & (search.iterations < MAX_ITERATIONS)
 
     never = [jnp.full_like(x, jnp.inf) for x in y]
-    search = jax.lax.while_loop(unsettled, iterate, _Search(guess, never, never, jnp.array(False), jnp.array(0)))
+    search = jax.lax.while_loop(
+        unsettled, iterate, _StageIteration(guess, never, never, jnp.array(False), jnp.array(0))
+    )
     solved = search.settled & _small(method, dt, y, search)
     slopes = [[jnp.where(solved, x, 0.0) for x in slope] for slope in search.slopes]
-    return _Solved(slopes, solved, search.iterations)
+    return _SolvedStages(slopes, solved, search.iterations)
 
 
 def _jacobian(rates: Rates, t: Array, point: Parts, unrolled: bool) -> Any:
@@ -278,7 +280,7 @@ def _solve_linear(
 
 
 @_solve.def_jvp
-def _solve_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Solved, Any]:
+def _solve_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_SolvedStages, Any]:
     """Implicit function theorem at the solution; the guess and what rounding left have no derivative."""
     stages, rates, t0, dt, y, rest, guess = primals
     method = GAUSS[stages]
@@ -293,7 +295,7 @@ def _solve_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_So
 
     _, rhs = jax.jvp(slopes, (moving,), (motions,))
     points = _points(method, dt, y, rest, solution.slopes)
-    return solution, _Solved(_solve_linear(method, rates, t0, dt, points, rhs), *_NO_TANGENTS)
+    return solution, _SolvedStages(_solve_linear(method, rates, t0, dt, points, rhs), *_NO_TANGENTS)
 
 
 def collocation_start(stages: int, field: Callable[[Array, State], State], t0: Array, y0: State) -> CollocationMemory:

@@ -9,7 +9,7 @@ from jaxtyping import PyTree
 
 from ._collocation import CollocationMemory, collocation_start, collocation_step
 from ._equation import check_floating, check_ode, in_own_time
-from ._interpolation import PolynomialInterpolation
+from ._state_layout import PolynomialInterpolation
 
 
 class Gauss(dfx.AbstractSolver):

@@ -1,15 +1,17 @@
 """A solver wrapper that gives each step its own arguments, and moves the state back onto what it has to obey."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import diffrax as dfx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
+from ._wrapper import AbstractSolverWrapper
 
-class Projected(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
+
+class Projected(AbstractSolverWrapper):
     """Wrap a diffrax solver so that every step ends with a projection, or has arguments of its own.
 
     The order is that of the wrapped solver, as what a projection takes away is at most the error of the step. Dense
@@ -19,36 +21,18 @@ class Projected(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
 
     - `solver`: any solver of an `ODETerm`.
     - `project`: `project(t, y, args)` -> `y`; None for no projection.
-    - `pin`: `pin(t0, args)` -> `args` of a step that begins at t0; None for those of the run.
+    - `freeze_args`: `freeze_args(t0, args)` -> `args` of a step that begins at t0; None for those of the run.
     """
 
     term_structure: ClassVar = dfx.ODETerm
     solver: dfx.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
     project: Callable[..., Any] | None
-    pin: Callable[..., Any] | None = None
-
-    @property
-    def root_finder(self) -> Any:
-        """That of the wrapped solver, if it is implicit."""
-        return cast(Any, self.solver).root_finder
-
-    @property
-    def scan_kind(self) -> Any:
-        """That of the wrapped solver, if it is a Runge-Kutta method."""
-        return cast(Any, self.solver).scan_kind
+    freeze_args: Callable[..., Any] | None = None
 
     @property
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Interpolation of the wrapped solver."""
         return self.solver.interpolation_cls
-
-    def order(self, terms: PyTree) -> Any:
-        """Order of the wrapped solver."""
-        return self.solver.order(terms)
-
-    def error_order(self, terms: PyTree) -> Any:
-        """Order of the error estimate of the wrapped solver."""
-        return self.solver.error_order(terms)
 
     def func(self, terms: PyTree, t0: Any, y0: PyTree, args: PyTree) -> PyTree:
         """The vector field."""
@@ -59,10 +43,10 @@ class Projected(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         return self.solver.init(terms, t0, t1, y0, args)
 
     def step(
-        self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree, solver_state: Any, made_jump: Any
-    ) -> tuple[PyTree, PyTree, dict[str, Any], Any, dfx.RESULTS]:
+        self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree, solver_state: PyTree, made_jump: Any
+    ) -> tuple[PyTree, PyTree, dict[str, PyTree], Any, dfx.RESULTS]:
         """A step of the wrapped solver, projected."""
-        args = args if self.pin is None else self.pin(t0, args)
+        args = args if self.freeze_args is None else self.freeze_args(t0, args)
         y1, error, dense, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
         if self.project is not None:
             y1, error = projected(y1, error, self.project(t1, y1, args))

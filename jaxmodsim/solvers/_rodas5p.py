@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ._equation import check_floating, check_ode, in_own_time
-from ._interpolation import PolynomialInterpolation
 from ._rosenbrock import RosenbrockStep, RosenbrockTableau, rosenbrock_step
+from ._state_layout import PolynomialInterpolation
 
 
 def _lower(rows: tuple[tuple[float, ...], ...]) -> np.ndarray:

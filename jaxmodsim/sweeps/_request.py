@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 
 from .._core.arguments import check_real, did_you_mean
 from ..scene import Scene, elements, scene_numbers, scene_ranges
-from ..simulation import prepare, simulate
+from ..simulation import RunRequest, simulate
 from ._compute import shapes
 from ._grid import Grid, GridAxis
 from ._observe import Derivative, Observation, observations
@@ -22,7 +22,6 @@ _NUMBERS = ("q0", "qd0", "t1", "t0", "ts", "z0", "rtol", "atol", "dt", "dtmax")
 # Those of them that can be swept.
 _SWEPT = tuple(name for name in _NUMBERS if name not in ("ts", "z0"))
 _UNITS = {"t0": "s", "t1": "s", "dt": "s", "dtmax": "s"}
-_SEARCH = ("accuracy", "observable")
 _OPTIONS = {name: x.default for name, x in inspect.signature(simulate).parameters.items()}
 
 
@@ -93,9 +92,8 @@ def _check_taken(function: Any, names: Iterable[str]) -> None:
 def _of_scene(scene: Scene, grid: Grid, observe: object, arguments: dict[str, Any]) -> Request:
     arguments = {name: value for name, value in arguments.items() if value is not None}
     for name in arguments:
-        if name in ("throw", "adjoint", "scene", *_SEARCH) or name not in _OPTIONS:
+        if name in ("throw", "adjoint", "scene") or name not in _OPTIONS:
             hint = ": a run that fails gets its code" if name == "throw" else ""
-            hint = ": search for one run, and pass **run.accuracy.options" if name in _SEARCH else hint
             raise ValueError(f"sweep takes no argument {name!r}{hint}.")
     swept = grid.values
     for name in ("q0", "qd0", "t1"):
@@ -127,7 +125,7 @@ def _of_scene(scene: Scene, grid: Grid, observe: object, arguments: dict[str, An
     _check_runs(converted, numbers)
     # Let `simulate` look at the arguments of the first run while their values are known.
     given = numbers | {name: value for name, value in converted.first.items() if name in numbers}
-    prepare(scene, **given, **dict(run.choices))
+    RunRequest(scene, **given, **dict(run.choices)).checked()
     ranges, units = scene_ranges(scene), dict(_UNITS)
     for name in swept:
         leaf = inside[name][2] if name in inside else name

@@ -90,7 +90,7 @@ def test_a_failure_stays(found: WorkPrecision) -> None:
     assert not fine.failed
 
 
-def test_evaluations_are_those_of_the_stages(found: WorkPrecision) -> None:
+def test_evaluations_are_those_of_the_stages_and_the_jacobian(found: WorkPrecision) -> None:
     explicit, rosenbrock = rows_of(found, "Tsit5")[0], rows_of(found, "Rodas5P")[0]
     assert explicit.evaluations == 6 * known(explicit.steps)
     # Eight stages, the derivative by time, and the Jacobian by position and velocity.

@@ -23,6 +23,7 @@ from jaxmodsim import (
     rigid_body,
     scaled_by,
     simulate,
+    simulate_to_accuracy,
     sweep,
 )
 from jaxmodsim._core.index_check import traced
@@ -236,7 +237,7 @@ def test_observables() -> None:
     start: Any = ([1.0, 0.0], [0.0, 0.0], 1.0)
     text = r"the index 5 is out of range along axis 1 of an array of shape \(\d+, 2\)"
     with pytest.raises(ValueError, match=f"In observable, {text}"):
-        simulate(SPRING, *start, accuracy=1e-3, observable=lambda run: run.q[:, 5])
+        simulate_to_accuracy(SPRING, *start, accuracy=1e-3, observable=lambda run: run.q[:, 5])
     with pytest.raises(ValueError, match=rf"In observe\['x'\], {text}"):
         sweep(SPRING, {"k": [1.0, 2.0]}, {"x": lambda run: run.q[-1, 5]}, q0=start[0], qd0=start[1], t1=1.0)
     t = np.linspace(0.0, 1.0, 11)
@@ -247,9 +248,11 @@ def test_observables() -> None:
 
 def test_an_observable_may_compute_with_numpy() -> None:
     """What cannot be traced is not looked at."""
-    run = simulate(SPRING, [1.0], [0.0], 1.0, accuracy=1e-3, observable=lambda run: np.asarray(run.q)[:, 0])
+    run = simulate_to_accuracy(SPRING, [1.0], [0.0], 1.0, accuracy=1e-3, observable=lambda run: np.asarray(run.q)[:, 0])
     assert run.accuracy is not None
-    run = simulate(SPRING, [1.0], [0.0], 1.0, accuracy=1e-3, observable=lambda run: jnp.asarray(float(run.q[-1, 0])))
+    run = simulate_to_accuracy(
+        SPRING, [1.0], [0.0], 1.0, accuracy=1e-3, observable=lambda run: jnp.asarray(float(run.q[-1, 0]))
+    )
     assert run.accuracy is not None
 
 

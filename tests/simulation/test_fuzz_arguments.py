@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 
 import jaxmodsim as jms
 from jaxmodsim import identify, metrics, sweeps
-from jaxmodsim.simulation import _simulate
+from jaxmodsim.simulation import _simulate, _to_accuracy
 
 from ..helpers.fuzz import fuzz
 
@@ -90,7 +90,11 @@ CALLS = {
         jms.simulate,
         {"scene": SCENE, **MOTION, "t1": 1.0, "t0": 0.0, "ts": T, "z0": None, "rtol": 1e-6, "atol": 1e-9, "dt": None,
          "dtmax": None, "solver": None, "adjoint": None, "max_steps": 9, "max_events": 9, "hold_chatter": False,
-         "project": True, "throw": True, "accuracy": None, "observable": None},
+         "project": True, "throw": True},
+    ),
+    "simulate_to_accuracy": Call(
+        jms.simulate_to_accuracy,
+        {"scene": SCENE, **MOTION, "t1": 1.0, "accuracy": 1e-3, "observable": None, "throw": True},
     ),
     "consistent": Call(jms.consistent, {"scene": SCENE, **MOTION, "t0": 0.0, "hold": ()}),
     "Record": Call(
@@ -191,7 +195,7 @@ def _as_users_have_it(monkeypatch: pytest.MonkeyPatch) -> None:
     solve = _simulate.solve
     # Compiling takes longest, and does not look at arguments.
     monkeypatch.setattr(_simulate, "solve", traced)
-    monkeypatch.setattr(_simulate, "reach", lambda problem, options, *more: None)
+    monkeypatch.setattr(_to_accuracy, "_search", lambda *more: None)
 
 
 def refusal(call: Call, argument: str, garbage: Any) -> str | None:

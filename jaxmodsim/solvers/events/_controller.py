@@ -16,8 +16,10 @@ from .._controllers import end_at
 from .._equation import check_ode
 from ._state import ACCUMULATION, TOO_MANY, EventState
 
-# How often a step may shrink only because its guards are not resolved.
+# Attempts in a row that may be rejected only because they do not resolve the guards: each is at most 0.9, at least 0.2
+# times as long as the one before. After that a guard that jumps is taken as it is.
 _MAX_DOUBTS = 12
+_SHRINK, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 # A step whose successor may be this much longer was not limited by its error.
 _UNLIMITED = 5.0
 
@@ -41,7 +43,7 @@ class _ControllerState(NamedTuple):
     - `doubts`: how many attempts since the last accepted step were rejected because the guards were not resolved.
     """
 
-    inner: Any
+    inner: PyTree
     usual: Float[Array, ""]
     doubts: Float[Array, ""]
 
@@ -140,15 +142,15 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
         controller_state: _ControllerState,
     ) -> tuple[Any, Any, Any, Any, _ControllerState, dfx.RESULTS]:
         """As the wrapped controller, but reject a step that passes an event or does not resolve the guards."""
-        old, seen = controller_state, y1_candidate
+        old, seen = controller_state, y1_candidate.memory
         keep, inner_t0, inner_t1, jump, inner, result = self.controller.adapt_step_size(
-            t0, t1, y0.y, seen.y, args, y_error, error_order, old.inner
+            t0, t1, y0.y, y1_candidate.y, args, y_error, error_order, old.inner
         )
         length = _constant(t1 - t0)
-        aim, factor, landed = _constant(seen.next_root), _constant(seen.step_factor), _constant(seen.landed) > 0.5
+        next_root, factor, landed = _constant(seen.next_root), _constant(seen.step_factor), _constant(seen.landed) > 0.5
         proposed = inner_t1 - inner_t0
-        passed = keep & (aim < 1.0) & ~landed
-        doubtful = keep & ~passed & (factor < 0.9) & (old.doubts < _MAX_DOUBTS)
+        passed = keep & (next_root < 1.0) & ~landed
+        doubtful = keep & ~passed & (factor < _SHRINK) & (old.doubts < _MAX_DOUBTS)
         accept = keep & ~passed & ~doubtful
         accept = fusion_barrier(jnp.where(accept, 1.0, jnp.zeros_like(length)), opaque_one(length)) > 0.5
         landed = landed & accept
@@ -156,16 +158,16 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
         shortest = jnp.maximum(4.0 * float(jnp.finfo(length.dtype).eps) * jnp.abs(t0), _SHORTEST * length)
         unlimited = proposed > _UNLIMITED * length
         usual = jnp.where(accept & ~unlimited, proposed, old.usual)
-        step = jnp.minimum(proposed, jnp.clip(0.9 * factor, 0.2, 10.0) * length)
+        step = jnp.minimum(proposed, jnp.clip(_SHRINK * factor, _SMALLEST, _LARGEST) * length)
         # A step that failed by little still knows where the event is.
         near = proposed > _MILD * length
-        step = jnp.where(keep, step, jnp.where(near, jnp.minimum(proposed, aim * length), proposed))
+        step = jnp.where(keep, step, jnp.where(near, jnp.minimum(proposed, next_root * length), proposed))
         # Just in front of an event, go straight to it.
-        ahead = (aim - 1.0) * length
-        close = accept & ~landed & (aim - 1.0 < _CLOSE) & (ahead < step)
+        ahead = (next_root - 1.0) * length
+        close = accept & ~landed & (next_root - 1.0 < _CLOSE) & (ahead < step)
         step = jnp.where(close, ahead, step)
         step = jnp.where(landed, usual, step)
-        step = jnp.where(passed, jnp.maximum(aim * length, shortest), step)
+        step = jnp.where(passed, jnp.maximum(next_root * length, shortest), step)
         next_t0 = jnp.where(accept, t1, t0)
         next_t1 = next_t0 + step
         if self.times is not None:
@@ -176,7 +178,7 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
             _constant(usual),
             _constant(jnp.where(accept, 0.0, old.doubts + doubtful)),
         )
-        status = jnp.where(landed, seen.status, 0.0)
+        status = jnp.where(landed, y1_candidate.status, 0.0)
         ended = cast(dfx.RESULTS, dfx.RESULTS.where(landed, dfx.RESULTS.successful, result))
         ended = dfx.RESULTS.where(status == ACCUMULATION, dfx.RESULTS.dt_min_reached, ended)
         ended = dfx.RESULTS.where(status == TOO_MANY, dfx.RESULTS.max_steps_reached, ended)

@@ -1,7 +1,7 @@
 """A solver wrapper that makes events non-terminating."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import diffrax as dfx
 import equinox as eqx
@@ -11,22 +11,18 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..._core.fusion import fusion_barrier, opaque_one
-from ...scene import is_one_of
 from .._projected import projected
-from ._guard_scan import first_root, scan_guards
-from ._state import ACCUMULATION, ONGOING, TOO_MANY, EventLog, EventState, write
+from .._wrapper import AbstractSolverWrapper
+from ._guard_scan import GuardScan, first_root, scan_guards
+from ._policy import AbstractGuardPolicy, Conditions, Crossings
+from ._samples import Landing, SampledJumps, on_jump
+from ._state import ACCUMULATION, ONGOING, TOO_MANY, EventLog, EventMemory, EventState, write
 
 # How far beside the root a step may end, as a fraction of the last steps; from there the state is carried to the root,
 # with an error of the third power of that distance.
 _LANDING = 1e-5
-# Where a step is to end if conditions have to hold after it, in landing distances behind the root, and at most this
-# part of what is left of the step: in front of it is no motion after the event. A slip that begins touches rest there,
-# and would end again.
-_BEYOND, _BEYOND_OF_REST = 0.3, 0.5
 # What the step and the jump measure of the way to a root may differ by this factor.
 _LATITUDE = 4.0
-# Within 100 rounding units of time before the end of a run diffrax ends no step.
-_UNPLACED = 128.0
 # A step this much shorter than the last ones has no length.
 _SHORT = 1e-6
 # Events accumulate where the longest of the last intervals is below this part of the time since the start, times the
@@ -70,7 +66,7 @@ class _Field(eqx.Module):
         return self.terms.vf(t, args[0]._replace(y=y), args[1]).y
 
 
-class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
+class EventSolver(AbstractSolverWrapper):
     """Wrap a diffrax solver so that the solution passes through events: resets, changes of mode, counters.
 
     To be used together with `EventController`:
@@ -146,10 +142,7 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     - `on_zeno`: as `reset`, for events that accumulate; by default the run ends there.
     - `project`: `project(t, s, args)` -> `s`, applied after every step, for invariants that drift.
     - `enforce`: whether the guards are conditions that have to hold, not crossings that are to be noted.
-    - `freeze_args`: `freeze_args(t0, args)` -> `args` of a step that begins at t0, without what jumps at its end;
-      the reset at the end of the step gets `args` as they are.
-    - `jump_ts`: times at which fields and guards jump, increasing, shape `[n]`, among the `times` of the controller.
-      There `reset` is called, with no guard marked, and what it changes of the modes is an event.
+    - `samples`: a `SampledJumps` where `args` hold sampled values; None where they do not.
     - `rtol`: the part of its largest magnitude in a step by which a guard may fall below zero, and return, unseen.
     - `max_events`: limit of the number of events, > 0, and length of the log.
     - `log`: whether the state carries an `EventLog`.
@@ -173,39 +166,24 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     reset: Callable[..., Any]
     on_zeno: Callable[..., Any] | None = None
     project: Callable[..., Any] | None = None
-    freeze_args: Callable[..., Any] | None = None
-    jump_ts: Float[Array, " n"] | None = None
+    samples: SampledJumps | None = None
     rtol: Any = 1e-6
     enforce: bool = eqx.field(default=False, static=True)
     max_events: int = eqx.field(default=128, static=True)
     log: bool = eqx.field(default=True, static=True)
 
     @property
-    def root_finder(self) -> Any:
-        """That of the wrapped solver, if it is implicit: diffrax gives it the tolerances of the controller."""
-        return cast(Any, self.solver).root_finder
-
-    @property
-    def scan_kind(self) -> Any:
-        """That of the wrapped solver, if it is a Runge-Kutta method: diffrax sets it for the kind of derivative."""
-        return cast(Any, self.solver).scan_kind
-
-    @property
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Interpolation of the wrapped solver, with the event at the end of the step."""
 
-        def interpolation(*, t0: Any, t1: Any, inner: Any, state0: Any, state1: Any) -> _EventInterpolation:
+        def interpolation(*, t0: Any, t1: Any, inner: PyTree, state0: Any, state1: Any) -> _EventInterpolation:
             return _EventInterpolation(t0, t1, self.solver.interpolation_cls(t0=t0, t1=t1, **inner), state0, state1)
 
         return interpolation
 
-    def order(self, terms: PyTree) -> Any:
-        """Order of the wrapped solver, which events keep."""
-        return self.solver.order(terms)
-
-    def error_order(self, terms: PyTree) -> Any:
-        """Order of the error estimate of the wrapped solver."""
-        return self.solver.error_order(terms)
+    @property
+    def _policy(self) -> AbstractGuardPolicy:
+        return Conditions() if self.enforce else Crossings()
 
     def start(self, t0: Any, y0: PyTree, mode: PyTree = None, args: PyTree = None) -> EventState:
         """State to begin with, to be passed to `diffeqsolve` as `y0`.
@@ -221,7 +199,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         zero = jnp.zeros((), jnp.result_type(t0, *jtu.tree_leaves(y0)))
         t0 = jnp.asarray(t0, zero.dtype)
         one = zero + 1.0
-        state = EventState(y0, mode, t0, zero, zero, zero, None, zero, zero, zero, zero, zero, one, one)
+        memory = EventMemory(zero, zero, zero, zero, zero, one, one)
+        state = EventState(y0, mode, t0, zero, zero, zero, None, memory)
         guard = self._guards(t0, state, args)
         log = None
         if self.log:
@@ -231,8 +210,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
 
             pair = jtu.tree_map(rows, (y0, mode))
             log = EventLog(jnp.full(self.max_events, jnp.inf, zero.dtype), rows(guard), pair, pair)
-        ready = jnp.ones_like(guard) if self.enforce else jnp.where(guard > 0, 1.0, jnp.zeros_like(guard))
-        return state._replace(fired=jnp.zeros_like(guard), log=log, guard=guard, armed=ready)
+        memory = memory._replace(guard=guard, armed=_flags(self._policy.armed_at_start(guard), guard))
+        return state._replace(fired=jnp.zeros_like(guard), log=log, memory=memory)
 
     def _guards(self, t: Any, state: EventState, args: PyTree) -> Float[Array, " guards"]:
         return self._guards_and_atol(t, state, args)[0]
@@ -240,8 +219,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
     def _guards_and_atol(
         self, t: Any, state: EventState, args: PyTree
     ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
-        found = self.guards(t, state, args)
-        values, atol = found if isinstance(found, tuple) else (found, None)
+        given = self.guards(t, state, args)
+        values, atol = given if isinstance(given, tuple) else (given, None)
         values = jnp.asarray(values)
         return values, jnp.zeros_like(values) if atol is None else atol
 
@@ -255,43 +234,95 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         return inner, _constant(t1 - t0), _constant(t0 - (t1 - t0))
 
     def step(
-        self, terms: PyTree, t0: Any, t1: Any, y0: EventState, args: PyTree, solver_state: Any, made_jump: Any
-    ) -> tuple[EventState, PyTree, dict[str, Any], Any, dfx.RESULTS]:
+        self, terms: PyTree, t0: Any, t1: Any, y0: EventState, args: PyTree, solver_state: PyTree, made_jump: Any
+    ) -> tuple[EventState, PyTree, dict[str, PyTree], PyTree, dfx.RESULTS]:
         """A step of the wrapped solver, a look at the guards along it, and the reset where it ends on an event."""
         inner, pace, begin = solver_state
-        whole, args = args, args if self.freeze_args is None else self.freeze_args(t0, args)
+        whole, args = args, args if self.samples is None else self.samples.freeze_args(t0, args)
         y1, error, dense, inner, result = self.solver.step(
             dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0._replace(log=None), args), inner, made_jump
         )
         if self.project is not None:
             y1, error = projected(y1, error, self.project(t1, y0._replace(y=y1), args).y)
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
+        unit = opaque_one(_constant(t1 - t0))
+        # Around t0 = 0 the resolution of time is that of the step itself.
+        length = _constant(t1 - t0)
+        resolution = 4.0 * float(jnp.finfo(length.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+        seen, end = self._look(path, (t0, t1), y0._replace(y=y1), args, resolution)
+        # Where nothing moves steps grow without measure, and tell nothing of the motion that the event begins.
+        measure = jnp.minimum(length, _GROW * pace)
+        jumps = None if self.samples is None else self.samples.at(t1, length)
+        landing = self._land(seen, end, (t1, length, resolution), (measure, pace), jumps)
+        next_root = fusion_barrier(landing.next_root, unit)
+        landed = fusion_barrier(_flags(landing.landed, next_root), unit) > 0.5
+        landing = landing._replace(next_root=next_root, landed=landed, happens=landed)
+        if jumps is not None:
+            landing = on_jump(landing, jumps)
+        step_factor = jnp.min(jnp.where(landing.fired, seen.landing_factor, seen.step_factor))
+        memory = y0.memory._replace(
+            guard=end,
+            armed=_flags(seen.armed, end),
+            landed=_flags(landed, next_root),
+            next_root=landing.next_root,
+            step_factor=fusion_barrier(step_factor, unit),
+        )
+        state1 = y0._replace(y=y1, memory=memory)
+        state1 = jax.lax.cond(
+            landing.happens,
+            lambda: self._jump(terms, t1, state1, landing, (landing.near * length, begin), (args, whole)),
+            lambda: state1,
+        )
+        dense = {"inner": dense, "state0": y0, "state1": state1}
+        pace = jnp.maximum(measure, _FORGET * pace)
+        return state1, error, dense, (inner, pace, begin), result
+
+    def _look(
+        self,
+        path: dfx.AbstractLocalInterpolation,
+        times: tuple[Array, Array],
+        state: EventState,
+        args: PyTree,
+        resolution: Array,
+    ) -> tuple[GuardScan, Float[Array, " guards"]]:
+        """What the guards do in a step that ends at `state`, and their values there."""
+        t0, t1 = times
         places = [t0 + (t1 - t0) * part for part in (1 / 3, 1 / 2, 2 / 3)]
-        states = [y0._replace(y=y) for y in (*map(path.evaluate, places), y1)]
+        states = [state._replace(y=y) for y in (*map(path.evaluate, places), state.y)]
         looks = [self._guards_and_atol(t, s, args) for t, s in zip((*places, t1), states, strict=True)]
         unit = opaque_one(_constant(t1 - t0))
         one, middle, two, end = fusion_barrier(_constant([values for values, _ in looks]), unit)
         # Where limits vanish at one end of the step, the other tells their size.
         tolerances = jnp.asarray(_constant(self.rtol), end.dtype), _constant(jnp.maximum(looks[0][1], looks[-1][1]))
-        # Around t0 = 0 the resolution of time is that of the step itself.
         length = _constant(t1 - t0)
-        eps = float(jnp.finfo(length.dtype).eps)
-        resolution = 4.0 * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
         blur = _constant(resolution) / jnp.where(length > 0, length, 1.0)
-        seen = scan_guards((y0.guard, one, two, end), middle, y0.armed > 0.5, tolerances, blur, unit)
-        # Where nothing moves steps grow without measure, and tell nothing of the motion that the event begins.
-        measure = jnp.minimum(length, _GROW * pace)
+        memory = state.memory
+        return scan_guards((memory.guard, one, two, end), middle, memory.armed > 0.5, tolerances, blur, unit), end
+
+    def _land(
+        self,
+        seen: GuardScan,
+        end: Float[Array, " guards"],
+        step: tuple[Array, Array, Array],
+        paces: tuple[Array, Array],
+        jumps: Bool[Array, ""] | None,
+    ) -> Landing:
+        """Which guards fire at the end of a step, and where the next one is to end.
+
+        `step` are its end, its length and the resolution of time; `paces` the length of the last steps, with this one
+        and without.
+        """
+        (t1, length, resolution), (measure, pace) = step, paces
+        divisor = jnp.where(length > 0, length, 1.0)
         near = jnp.maximum(_LANDING * jnp.maximum(measure, pace), _constant(resolution))
-        beyond = _BEYOND * near / jnp.where(length > 0, length, 1.0)
-        jumps = None if self.jump_ts is None else is_one_of(self.jump_ts, t1) & (length > 0)
+        shortest = jnp.maximum(_SHORT * pace, 2.0 * _constant(resolution))
+        behind = near
         if jumps is not None:  # an event before a jump is not one with it
             near = jnp.where(jumps, _constant(resolution), near)
-        near = near / jnp.where(length > 0, length, 1.0)
-        shortest = jnp.maximum(_SHORT * pace, 2.0 * _constant(resolution))
+        near = near / divisor
         # One that has just fallen through zero may look flat, or rising, to the cubic.
         here = (seen.armed & (jnp.abs(seen.ahead) <= near)) | (seen.crosses & (1.0 - seen.root <= near))
-        if self.enforce:  # in front of the root is no motion after the event
-            here = (here | (seen.crosses & (length <= _UNPLACED * eps * jnp.abs(t1)))) & (end <= 0)
+        here = self._policy.fires(here, seen, end, length, t1)
         # One that fires at the start of the step does so where the step is the shortest.
         here = here | (seen.crosses & (seen.root * length <= resolution) & (length <= shortest))
         passed = seen.crosses & ~here
@@ -301,39 +332,17 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         landed = jnp.any(here) & ~missed & (length > 0)
         fired = here & landed
         first = jnp.arange(fired.shape[0]) == jnp.argmin(jnp.where(fired, seen.ahead, jnp.inf))
-        aim = jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0))
-        if self.enforce:
-            aim = aim + jnp.where(missed, jnp.minimum(beyond, _BEYOND_OF_REST * (1.0 - aim)), beyond)
-        aim = fusion_barrier(aim, unit)
-        landed = fusion_barrier(jnp.where(landed, 1.0, jnp.zeros_like(aim)), unit) > 0.5
-        state1 = y0._replace(
-            y=y1,
-            guard=end,
-            armed=jnp.where(seen.armed, 1.0, jnp.zeros_like(end)),
-            landed=jnp.where(landed, 1.0, jnp.zeros_like(aim)),
-            next_root=aim,
-            step_factor=fusion_barrier(jnp.min(jnp.where(fired, seen.landing_factor, seen.step_factor)), unit),
+        root = jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0))
+        return Landing(
+            fired, first, missed, landed, landed, self._policy.next_end(root, missed, (behind, divisor)), near
         )
-        happens = landed if jumps is None else landed | (jumps & ~missed)
-        if jumps is not None:  # what was in sight is no more, and the root of one that fires with a jump is the jump
-            state1 = state1._replace(next_root=jnp.where(jumps & ~missed, jnp.inf, aim))
-            near = jnp.where(jumps, 0.0, near)
-        state1 = jax.lax.cond(
-            happens,
-            lambda: self._jump(terms, t1, state1, fired, first, (near * length, begin), (args, whole)),
-            lambda: state1,
-        )
-        dense = {"inner": dense, "state0": y0, "state1": state1}
-        pace = jnp.maximum(measure, _FORGET * pace)
-        return state1, error, dense, (inner, pace, begin), result
 
     def _jump(
         self,
         terms: PyTree,
         t: Any,
         state: EventState,
-        fired: Bool[Array, " guards"],
-        first: Bool[Array, " guards"],
+        landing: Landing,
         times: tuple[Array, Array],
         sides: tuple[PyTree, PyTree],
     ) -> EventState:
@@ -342,7 +351,8 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         The way to the root is zero but for the error of the landing; its derivatives are those of the time of the
         event, to second order, so that those of the result are exact.
         """
-        (near, begin), (args, whole) = times, sides
+        (near, begin), (args, whole), (fired, first) = times, sides, landing[:2]
+        memory = state.memory
         unit = opaque_one(begin)
 
         def field(t: Any, state: EventState, args: PyTree = args) -> PyTree:
@@ -353,9 +363,9 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
 
         way, rate, before = _to_root(field, guard, t, state, near)
         t_event, before = t + way, before._replace(y=fusion_barrier(before.y, unit))
-        since = jnp.where(state.resets == 0, t_event - state.t, jnp.maximum(t_event - state.t, _FORGET * state.spread))
-        spread = _constant(since)
-        dense = _accumulates(spread, _constant(t_event), begin) & (state.resets >= _FEWEST)
+        since = t_event - state.t
+        spread = _constant(jnp.where(memory.resets == 0, since, jnp.maximum(since, _FORGET * memory.spread)))
+        dense = _accumulates(spread, _constant(t_event), begin) & (memory.resets >= _FEWEST)
 
         after = self.reset(t_event, before, whole, fired)
         status = jnp.where(dense, jnp.asarray(ACCUMULATION, spread.dtype), ONGOING)
@@ -374,14 +384,15 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
         end = after._replace(y=fusion_barrier(_along(after.y, -way, middle), unit))
         values = self._guards(t, end, whole)
         clear = _constant(values) > jnp.where(fired, _LATITUDE * jnp.abs(rate) * near, 0.0)
-        armed = self.enforce | clear | (~fired & (state.armed > 0.5))
-        if not self.enforce:  # what rises from the reset will fall again, be it as low as rounding
+        rises = fired
+        if not self.enforce:
             ahead = jnp.ones_like(t_event), field(t_event, after, whole)
             _, rise = jax.jvp(lambda t, y: self._guards(t, after._replace(y=y), whole), (t_event, after.y), ahead)
-            armed = armed | (fired & (_constant(rise) > 0))
+            rises = _constant(rise) > 0
+        armed = self._policy.armed_after(clear, fired, memory.armed > 0.5, rises)
         if self.on_zeno is not None:
             armed = jnp.where(dense, values > 0, armed)
-        flags = jnp.where(fired, 1.0, jnp.zeros_like(values))
+        flags = _flags(fired, values)
         log = state.log
         if log is not None:
             entry = EventLog(t_event, flags, (before.y, before.mode), (after.y, after.mode))
@@ -394,19 +405,17 @@ class EventSolver(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
             status=status,
             fired=flags,
             log=log,
-            guard=_constant(values),
-            armed=jnp.where(armed, 1.0, jnp.zeros_like(values)),
-            resets=state.resets + 1.0,
-            spread=spread,
+            memory=memory._replace(
+                guard=_constant(values), armed=_flags(armed, values), resets=memory.resets + 1.0, spread=spread
+            ),
         )
-        if self.jump_ts is None:
+        if self.samples is None or self.samples.times is None:
             return after_reset
         # Samples at which nothing happens say nothing of whether events accumulate.
-        return jtu.tree_map(
-            lambda a, b: jnp.where(happened | jnp.any(fired), a, b),
-            after_reset,
-            state._replace(y=end.y, guard=after_reset.guard, armed=after_reset.armed),
+        passed = state._replace(
+            y=end.y, memory=memory._replace(guard=after_reset.memory.guard, armed=after_reset.memory.armed)
         )
+        return jtu.tree_map(lambda a, b: jnp.where(happened | jnp.any(fired), a, b), after_reset, passed)
 
 
 def _to_root(
@@ -423,7 +432,9 @@ def _to_root(
     rate = jnp.where(rate == 0, 1.0, rate)
     way = -height / rate
     # A guard that a reset has violated fires where it stands: it has no root here, or one before that reset.
-    on_root = (state.landed > 0.5) & (jnp.abs(_constant(way)) <= _LATITUDE * near) & _constant(t + way >= state.t)
+    on_root = (
+        (state.memory.landed > 0.5) & (jnp.abs(_constant(way)) <= _LATITUDE * near) & _constant(t + way >= state.t)
+    )
     way = jnp.where(on_root, way, 0.0)
     middle = field(t + 0.5 * way, state._replace(y=_along(state.y, 0.5 * way, slope)))
     there = _along(state.y, way, middle)
@@ -445,6 +456,11 @@ def _accumulates(spread: Array, t: Array, begin: Array) -> Array:
 def _differ(one: PyTree, other: PyTree) -> Bool[Array, ""]:
     different = jtu.tree_map(lambda a, b: jnp.any(a != b), one, other)
     return jtu.tree_reduce(jnp.logical_or, different, jnp.asarray(False))
+
+
+def _flags(x: Bool[Array, "..."], like: Array) -> Array:
+    """Ones and zeros in the type of `like`, as the state holds them."""
+    return jnp.where(x, 1.0, jnp.zeros_like(like))
 
 
 def _real(x: Any) -> Array:

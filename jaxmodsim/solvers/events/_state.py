@@ -1,6 +1,6 @@
 """The state that diffrax integrates where events happen."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -24,6 +24,26 @@ class EventLog(NamedTuple):
     after: tuple[PyTree, PyTree]
 
 
+class EventMemory(NamedTuple):
+    """What `EventSolver` tells `EventController`, and keeps from event to event.
+
+    - `guard`, `armed`: values of the guards at this state, and 1 for each that is armed, shape `[guards]`.
+    - `resets`: number of calls of `reset`.
+    - `spread`: the longest of the last intervals between them.
+    - `landed`: 1 where the step ended on a root.
+    - `next_root`: where the next root is or seems to be, in steps from the start of this one.
+    - `step_factor`: by which factor the length of the step may change before the guards are not resolved.
+    """
+
+    guard: Float[Array, "*s guards"]
+    armed: Float[Array, "*s guards"]
+    resets: Float[Array, "..."]
+    spread: Float[Array, "..."]
+    landed: Float[Array, "..."]
+    next_root: Float[Array, "..."]
+    step_factor: Float[Array, "..."]
+
+
 class EventState(NamedTuple):
     """State of a run with events; made by `EventSolver.start`.
 
@@ -34,11 +54,7 @@ class EventState(NamedTuple):
     - `status`: 0; 1 where events accumulate; 2 where there were more than allowed.
     - `fired`: 1 for each guard that fired in the last event, shape `[guards]`.
     - `log`: an `EventLog`, or None.
-
-    The rest is how `EventSolver` tells `EventController` what it saw: `guard` and `armed` at this state, `resets` the
-    number of calls of `reset`, `spread` the longest of the last intervals between them, `landed` whether the step ended
-    on a root, `next_root` where the next root is or seems to be, in steps from the start of this one, `step_factor` by
-    which factor the step may change before the guards are not resolved.
+    - `memory`: of the solver itself.
     """
 
     y: PyTree
@@ -48,20 +64,14 @@ class EventState(NamedTuple):
     status: Float[Array, "..."]
     fired: Float[Array, "*s guards"]
     log: EventLog | None
-    guard: Float[Array, "*s guards"]
-    armed: Float[Array, "*s guards"]
-    resets: Float[Array, "..."]
-    spread: Float[Array, "..."]
-    landed: Float[Array, "..."]
-    next_root: Float[Array, "..."]
-    step_factor: Float[Array, "..."]
+    memory: EventMemory
 
     def rate(self, dy: PyTree) -> "EventState":
         """What a vector field returns: `dy` for `y`, and zero for everything else, which is constant in a step."""
         return jtu.tree_map(jnp.zeros_like, self)._replace(y=dy)
 
 
-def write(log: Any, index: Array, entry: Any) -> Any:
+def write(log: Array, index: Array, entry: Array) -> Array:
     """Array `log` with `entry` at `index`; without effect where the index lies outside."""
     here = jnp.arange(log.shape[0]) == index
     return jnp.where(jnp.reshape(here, (-1, *(1,) * (log.ndim - 1))), entry[None], log)

@@ -1,25 +1,28 @@
-"""The search behind `simulate(..., accuracy=...)`: runs by two methods, compared until their difference is small."""
+"""Runs of an accuracy that is asked for: two methods, compared until their difference is small."""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import TypeAlias
 
 import diffrax as dfx
 import equinox as eqx
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import ArrayLike, PyTree
 
+from .._core.arguments import as_flag
 from .._core.index_check import check_indices
-from ._accuracy import Accuracy, Tenfold, Tried
+from ..scene import Scene
+from ._accuracy import Accuracy, Attempt, CostScaling
 from ._evaluations import evaluations_per_step
 from ._observe import named_series
 from ._outcome import SUCCESS, SimulationError, describe_failure
-from ._solve import Options, Problem, Solved, default_solver, solve
+from ._run_request import RunRequest, is_known
+from ._solve import RunInputs, RunOptions, RunOutput, default_solver, solve
 from ._trajectory import Trajectory, trajectory
 
 _ACCURACIES = (1e-12, 1e-1)
@@ -45,8 +48,11 @@ _PART, _BOUNDED = 127.0, 2
 _FEW, _TIMES = 11, 101
 
 
+Observe: TypeAlias = Callable[[Trajectory], ArrayLike]
+
+
 @dataclass(frozen=True, eq=False)
-class _Made:
+class _TrialRun:
     """A run of the search, with what is compared: the observable and the state, of the shape `[..., columns]`."""
 
     run: Trajectory
@@ -76,72 +82,77 @@ class _Made:
     def num_steps(self) -> int:
         return int(self.run.stats["num_steps"])
 
+    @property
+    def evaluations(self) -> int | None:
+        """Evaluations of the vector field in one step."""
+        return evaluations_per_step(self.solver, self.run)
+
 
 @dataclass(frozen=True)
-class _Search:
+class _AccuracySearch:
     """What is searched for, and what was run: by the tolerance and the place of the method among `solvers`."""
 
-    problem: Problem
-    options: Options
+    inputs: RunInputs
+    options: RunOptions
     asked: float
-    observe: Callable[[Trajectory], Any]
+    observe: Observe
     solvers: tuple[dfx.AbstractSolver, ...]
-    made: dict[tuple[float, int], _Made] = field(default_factory=dict)
-    seen: dict[tuple[float, int], _Made] = field(default_factory=dict)
+    made: dict[tuple[float, int], _TrialRun] = field(default_factory=dict)
+    seen: dict[tuple[float, int], _TrialRun] = field(default_factory=dict)
 
     @property
     def tightest(self) -> float:
-        return _round(_TIGHTEST * float(jnp.finfo(self.problem.q0.dtype).eps))
+        return _round(_TIGHTEST * float(jnp.finfo(self.inputs.q0.dtype).eps))
 
     @property
     def second(self) -> int:
         """Place of the method that the first one is compared with."""
         return len(self.solvers) - 1
 
-    def run(self, rtol: float, which: int) -> _Made:
+    def run(self, rtol: float, which: int) -> _TrialRun:
         """The run by one of the methods at a tolerance; made once."""
         if (rtol, which) not in self.made:
-            self.made[rtol, which] = self.make(rtol, which, self.problem)
+            self.made[rtol, which] = self.make(rtol, which, self.inputs)
         return self.made[rtol, which]
 
-    def along(self, rtol: float, which: int) -> _Made:
+    def along(self, rtol: float, which: int) -> _TrialRun:
         """The same run, kept at more times where few are saved."""
-        if self.problem.ts is not None and self.problem.ts.shape[0] >= _FEW:
+        if self.inputs.ts is not None and self.inputs.ts.shape[0] >= _FEW:
             return self.run(rtol, which)
         if (rtol, which) not in self.seen:
-            ts = np.linspace(self.problem.t0, self.problem.t1, _TIMES).astype(self.problem.q0.dtype)
-            self.seen[rtol, which] = self.make(rtol, which, self.problem._replace(ts=ts))
+            ts = np.linspace(self.inputs.t0, self.inputs.t1, _TIMES).astype(self.inputs.q0.dtype)
+            self.seen[rtol, which] = self.make(rtol, which, self.inputs._replace(ts=ts))
         return self.seen[rtol, which]
 
     def failure(self, rtol: float, which: int) -> str:
         """How the run by one of the methods at a tolerance ended early; nothing if it did not."""
         return self.run(rtol, which).failure or self.along(rtol, which).failure
 
-    def make(self, rtol: float, which: int, problem: Problem) -> _Made:
-        solver, dtype = self.solvers[which], self.problem.q0.dtype
+    def make(self, rtol: float, which: int, inputs: RunInputs) -> _TrialRun:
+        solver, dtype = self.solvers[which], self.inputs.q0.dtype
         atol = _round(max(_ABSOLUTE * rtol, float(jnp.finfo(dtype).eps)))
         arrays, rest = eqx.partition(solver, eqx.is_array)
-        plugins = (arrays, None if problem.plugins is None else problem.plugins[1])
-        problem = problem._replace(rtol=np.asarray(rtol, dtype), atol=np.asarray(atol, dtype), plugins=plugins)
+        plugins = (arrays, None if inputs.plugins is None else inputs.plugins[1])
+        inputs = inputs._replace(rtol=np.asarray(rtol, dtype), atol=np.asarray(atol, dtype), plugins=plugins)
         if which == _BOUNDED:
-            problem = problem._replace(dtmax=np.asarray((problem.t1 - problem.t0) / _PART, dtype))
+            inputs = inputs._replace(dtmax=np.asarray((inputs.t1 - inputs.t0) / _PART, dtype))
         options = replace(self.options, solver=rest)
-        solved = solve(problem, options)
+        solved = solve(inputs, options)
         _check_known(solved)
-        run, failure = trajectory(problem, options, solved), _failure(problem, solved)
+        run, failure = trajectory(inputs, options, solved), _failure(inputs, solved)
         observed = np.zeros(0) if failure else _observed(self.observe, run)
-        return _Made(run, which, solver, rtol, atol, observed, _states(run), failure)
+        return _TrialRun(run, which, solver, rtol, atol, observed, _states(run), failure)
 
-    def pair(self, rtol: float) -> tuple[_Made, ...]:
+    def pair(self, rtol: float) -> tuple[_TrialRun, ...]:
         """Runs by both methods; by one of them at two tolerances where the other does not reach the end."""
         good = [which for which in (0, self.second) if not self.failure(rtol, which)]
-        found = tuple(self.run(rtol, which) for which in good)
+        runs = tuple(self.run(rtol, which) for which in good)
         if len(good) != 1:
-            return found
+            return runs
         other = _round(rtol / 10 if rtol / 10 >= self.tightest else rtol * 10), good[0]
-        if self.failure(*other) or self.run(*other).num_steps == found[0].num_steps:
-            return found
-        return (*found, self.run(*other))
+        if self.failure(*other) or self.run(*other).num_steps == runs[0].num_steps:
+            return runs
+        return (*runs, self.run(*other))
 
 
 @dataclass(frozen=True)
@@ -151,39 +162,121 @@ class _References:
     And a remark if they are too far apart.
     """
 
-    runs: tuple[_Made, ...]
+    runs: tuple[_TrialRun, ...]
     size: np.ndarray
     gap: float
     remark: str
 
-    def error(self, made: _Made) -> float:
+    def error(self, made: _TrialRun) -> float:
         """Difference to the farther one."""
         return max(_error(made, each, self.size) for each in self.runs)
 
-    def estimate(self, made: _Made) -> float:
+    def estimate(self, made: _TrialRun) -> float:
         """Of the error of a run: its difference, and what is uncertain of that."""
         return self.error(made) + self.gap if made.ok else math.inf
 
 
-def _error(one: _Made, other: _Made, size: np.ndarray) -> float:
+def _error(one: _TrialRun, other: _TrialRun, size: np.ndarray) -> float:
     return float(np.max(np.abs(one.observed - other.observed) / size))
 
 
-def reach(
-    problem: Problem, options: Options, accuracy: Any, observable: Any, tolerances: tuple[Any, Any], throw: bool
+def simulate_to_accuracy(
+    scene: Scene,
+    q0: ArrayLike | list[float],
+    qd0: ArrayLike | list[float],
+    t1: ArrayLike,
+    *,
+    accuracy: float,
+    observable: str | Observe | None = None,
+    t0: ArrayLike = 0.0,
+    ts: ArrayLike | list[float] | None = None,
+    z0: dict[str, PyTree] | None = None,
+    dtmax: ArrayLike | None = None,
+    solver: dfx.AbstractSolver | None = None,
+    adjoint: dfx.AbstractAdjoint | None = None,
+    max_steps: int = RunRequest.max_steps,
+    max_events: int = RunRequest.max_events,
+    hold_chatter: bool = False,
+    project: bool = True,
+    throw: bool = True,
 ) -> Trajectory:
-    """The cheapest run whose observable has the accuracy; see `simulate`."""
-    asked = _asked(problem, accuracy, observable, tolerances)
-    observe = _states if observable is None else observable
+    """Run a scene with the solver and the tolerances that give a global accuracy for the least work.
+
+    They are searched for by about ten runs of two methods: the run with the least work is taken whose difference to
+    tighter runs by either method is within the accuracy. In scenes with events the second method makes steps of at most
+    1/127 of the run, unless `dtmax` bounds both, so that the two look at different places. What steps over a short
+    pulse in all of them is not seen: `dtmax`.
+
+    Errors are relative to the largest magnitude of the observable at the saved times (of fewer than 11, at 101 times
+    along the run), or to 1e-6 of its unit where it stays below that.
+
+    **Arguments:**
+
+    Those of `simulate` without `rtol`, `atol` and `dt`, and:
+
+    - `accuracy`: largest error of the observable, from 1e-12 to 0.1.
+    - `observable`: `"q[0]"`, `"qd[0]"`, the name of an effect for its force (`[i]` behind for a component), or a
+      function of the `Trajectory` that returns numbers of shape `[]`, `[time]` or `[time, k]`, each column relative to
+      its own largest magnitude among the numbers returned. By default all coordinates and velocities, each relative to
+      its own.
+    - `solver`: where given, the tolerances alone are chosen.
+    - `throw`: whether a run that ends early, or an accuracy that is not reached, raises. Otherwise `run.result` says
+      how the run ended, or `run.accuracy.remark` what kept the search from the accuracy.
+
+    **Returns:**
+
+    A `Trajectory`. `run.accuracy` reports the search, and `run.accuracy.options` are the arguments of `simulate` for
+    more such runs.
+
+    **Raises:**
+
+    - `ValueError` as `simulate`, and where numbers are traced (`jax.jit`, `jax.vmap`, `jax.grad`).
+    - `SimulationError` if the run ended early, or no run of the accuracy was found, and `throw` is set.
+    """
+    throw = as_flag(throw, name="throw")
+    request = RunRequest(
+        scene,
+        q0,
+        qd0,
+        t1,
+        t0,
+        ts,
+        z0,
+        dtmax=dtmax,
+        solver=solver,
+        adjoint=adjoint,
+        max_steps=max_steps,
+        max_events=max_events,
+        hold_chatter=hold_chatter,
+        project=project,
+    )
+    inputs, options = request.checked()
+    asked = _asked(inputs, accuracy)
+    solvers, choices = _solvers(inputs, options)
+    search = _AccuracySearch(inputs, options, asked, _observe(observable), solvers)
+    return _search(search, choices, callable(observable), throw)
+
+
+def _observe(observable: str | Observe | None) -> Observe:
+    if observable is None:
+        return _states
     if isinstance(observable, str):
-        observe = partial(named_series, name=observable)
-    solvers, choices = _solvers(problem, options)
-    search = _Search(problem, options, asked, observe, solvers)
+        return partial(named_series, name=observable)
+    if callable(observable):
+        return observable
+    raise ValueError(
+        f"observable must be a name such as 'q[0]' or a function of the Trajectory, but {observable!r} was given."
+    )
+
+
+def _search(search: _AccuracySearch, choices: tuple[int, ...], own: bool, throw: bool) -> Trajectory:
+    """The run with the least work; `choices` are the methods that it may be of, see `_references` for `own`."""
+    asked = search.asked
     rtol = _round(max(_AHEAD * asked, search.tightest))
     first = search.pair(rtol)
     if len(first) < 2:
         return _early(search, rtol, throw)
-    references = _references(search, rtol, callable(observable))
+    references = _references(search, rtol, own)
     if references.remark:
         if throw:
             raise SimulationError(references.remark)
@@ -195,60 +288,50 @@ def reach(
     good = [made for (_, which), made in search.made.items() if which in choices and references.estimate(made) <= asked]
     best = min(
         good or references.runs,
-        key=lambda made: (
-            made.num_steps * (evaluations_per_step(made.solver, made.run) or 1),
-            references.estimate(made),
-        ),
+        key=lambda made: (made.num_steps * (made.evaluations or 1), references.estimate(made)),
     )
     return _chosen(search, references, best, references.estimate(best))
 
 
-def _check_known(tree: Any) -> None:
-    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(tree)):
+def _check_known(tree: PyTree) -> None:
+    if not is_known(*jtu.tree_leaves(tree)):
         raise ValueError(
-            "accuracy is a search by several runs, which needs numbers that are known, but here some are traced"
-            " (jax.jit, jax.vmap or jax.grad): run simulate(..., accuracy=...) once outside, and pass"
-            " **run.accuracy.options, its solver, rtol and atol, instead of accuracy here."
+            "simulate_to_accuracy makes several runs and compares them, which needs numbers that are known, but here"
+            " some are traced (jax.jit, jax.vmap or jax.grad): call it once outside, and pass **run.accuracy.options,"
+            " its solver, rtol and atol, to simulate here."
         )
 
 
-def _asked(problem: Problem, accuracy: Any, observable: Any, tolerances: tuple[Any, Any]) -> float:
-    """The accuracy, if it and what goes with it can be searched for."""
-    if accuracy is None:
-        raise ValueError("observable says what accuracy= is of: pass accuracy, too, or leave observable out.")
-    _check_known((problem, accuracy))
+def _asked(inputs: RunInputs, accuracy: float) -> float:
+    """The accuracy, if it can be searched for."""
+    _check_known((inputs, accuracy))
     if isinstance(accuracy, bool) or not isinstance(accuracy, int | float | np.number):
         raise ValueError(f"accuracy must be a known number, as in accuracy=1e-6, but {accuracy!r} was given.")
     if not _ACCURACIES[0] <= accuracy <= _ACCURACIES[1]:
         raise ValueError(
             f"accuracy must lie within [{_ACCURACIES[0]:g}, {_ACCURACIES[1]:g}], but {accuracy:g} was given."
         )
-    if problem.dt is not None or not all(isinstance(x, float) for x in tolerances) or tolerances != (1e-6, 1e-9):
-        raise ValueError("accuracy= chooses the tolerances itself: leave rtol, atol and dt out, or accuracy.")
-    if not (observable is None or isinstance(observable, str) or callable(observable)):
-        raise ValueError(
-            f"observable must be a name such as 'q[0]' or a function of the Trajectory, but {observable!r} was given."
-        )
     return float(accuracy)
 
 
-def _solvers(problem: Problem, options: Options) -> tuple[tuple[dfx.AbstractSolver, ...], tuple[int, ...]]:
+def _solvers(inputs: RunInputs, options: RunOptions) -> tuple[tuple[dfx.AbstractSolver, ...], tuple[int, ...]]:
     """Two methods, and which of them may be chosen; in scenes with events the second one again, for bounded steps.
 
     Where nothing is stiff a method of order 8 is cheaper at tight tolerances. Of stiff scenes all other methods at hand
     take far more work, so that one of them serves as a check only; so does any beside a method that was given.
     """
-    default = default_solver(problem.scene, problem.q0.shape[0], False)
-    stiff = any(effect.stiff for effect in problem.scene.effects)
+    default = default_solver(inputs.scene, inputs.q0.shape[0], False)
+    stiff = any(effect.stiff for effect in inputs.scene.effects)
     other = dfx.Kvaerno5() if stiff else dfx.Dopri8()
-    bounds = bool(problem.scene.event_driven) and problem.dtmax is None
+    bounds = bool(inputs.scene.event_driven) and inputs.dtmax is None
     if options.solver is None:
         bounded = (other,) if bounds else ()
         return (default, other, *bounded), (0,) if stiff else (0, 1)
-    given = eqx.combine(options.solver, problem.plugins[0])
+    given = eqx.combine(options.solver, inputs.plugins[0])
     if not isinstance(given, dfx.AbstractAdaptiveSolver):
         raise ValueError(
-            f"accuracy= chooses tolerances, but {type(given).__name__} takes fixed steps: pass another solver, or none."
+            f"simulate_to_accuracy chooses tolerances, but {type(given).__name__} takes fixed steps: pass another"
+            " solver, or none."
         )
     other = other if type(given) is type(default) else default
     bounded = (other,) if bounds else ()
@@ -259,7 +342,7 @@ def _states(run: Trajectory) -> np.ndarray:
     return np.concatenate([np.asarray(run.q), np.asarray(run.qd)], axis=1).astype(float)
 
 
-def _observed(observe: Callable[[Trajectory], Any], run: Trajectory) -> np.ndarray:
+def _observed(observe: Observe, run: Trajectory) -> np.ndarray:
     check_indices(lambda: observe(run), name="observable")
     values = np.asarray(observe(run))
     if not np.issubdtype(values.dtype, np.floating) or values.ndim > 2 or not values.size:
@@ -280,7 +363,7 @@ def _size(values: np.ndarray) -> np.ndarray:
     return np.maximum(np.max(np.abs(np.atleast_1d(values)), axis=0, keepdims=True), _SMALLEST)
 
 
-def _references(search: _Search, rtol: float, own: bool) -> _References:
+def _references(search: _AccuracySearch, rtol: float, own: bool) -> _References:
     """The first two runs, from a tolerance downwards, that agree; if none do, the nearest.
 
     Magnitudes are those along the run, of a function (`own`) those of what it returns.
@@ -292,13 +375,13 @@ def _references(search: _Search, rtol: float, own: bool) -> _References:
             break
         one, other = (search.along(made.rtol, made.which) for made in pair)
         size = _size(pair[0].observed if own else one.observed)
-        found = _References(pair, size, _error(pair[0], pair[1], size), "")
+        references = _References(pair, size, _error(pair[0], pair[1], size), "")
         if np.max(np.abs(one.state - other.state) / _size(one.state)) > _APART:
-            found = replace(found, gap=max(found.gap, _APART))
-        elif found.gap <= _AGREE * search.asked and _confirmed(search, found, rtol):
-            return found
-        if nearest is None or found.gap < nearest.gap:
-            nearest = found
+            references = replace(references, gap=max(references.gap, _APART))
+        elif references.gap <= _AGREE * search.asked and _confirmed(search, references, rtol):
+            return references
+        if nearest is None or references.gap < nearest.gap:
+            nearest = references
         if rtol <= search.tightest:
             break
         rtol = _round(max(rtol / 10, search.tightest))
@@ -306,13 +389,13 @@ def _references(search: _Search, rtol: float, own: bool) -> _References:
     return replace(nearest, remark=_remark(search, nearest, rtol))
 
 
-def _confirmed(search: _Search, found: _References, rtol: float) -> bool:
+def _confirmed(search: _AccuracySearch, references: _References, rtol: float) -> bool:
     """Whether a pair from a looser tolerance is near, too: in chaos two runs may meet in one number by accident."""
     looser = search.pair(_round(10 * rtol))
-    return len(looser) == 2 and max(map(found.error, looser)) <= _NEAR * search.asked
+    return len(looser) == 2 and max(map(references.error, looser)) <= _NEAR * search.asked
 
 
-def _remark(search: _Search, nearest: _References, rtol: float) -> str:
+def _remark(search: _AccuracySearch, nearest: _References, rtol: float) -> str:
     """Why two runs do not agree, and what to do."""
     names = " and ".join(dict.fromkeys(each.name for each in nearest.runs))
     text = (
@@ -326,7 +409,7 @@ def _remark(search: _Search, nearest: _References, rtol: float) -> str:
     falls = converges and nearest.gap < _error(looser[0], looser[1], nearest.size) / _FALL
     if len(ended) == 2:
         return f"{text} At rtol {rtol:g} none reached the end. {ended[0]}"
-    if search.problem.q0.dtype == jnp.float32:
+    if search.inputs.q0.dtype == jnp.float32:
         return (
             f"{text} The numbers are in float32, whose rounding is {float(jnp.finfo(jnp.float32).eps):.1g}: set"
             " jax_enable_x64 and build the scene and the initial state in float64."
@@ -343,7 +426,7 @@ def _remark(search: _Search, nearest: _References, rtol: float) -> str:
     )
 
 
-def _early(search: _Search, rtol: float, throw: bool) -> Trajectory:
+def _early(search: _AccuracySearch, rtol: float, throw: bool) -> Trajectory:
     """What becomes of runs that end early: the sentence of the first."""
     if throw:
         failure = search.failure(rtol, 0) or search.failure(rtol, search.second)
@@ -351,18 +434,18 @@ def _early(search: _Search, rtol: float, throw: bool) -> Trajectory:
     return search.run(rtol, 0).run
 
 
-def _failure(problem: Problem, solved: Solved) -> str:
+def _failure(inputs: RunInputs, solved: RunOutput) -> str:
     """How a run ended early; nothing if it did not."""
     if int(solved.code) == SUCCESS:
         return ""
     t, y = solved.end or (solved.t[-1], jtu.tree_map(lambda x: x[-1], solved.y))
-    return describe_failure(problem.scene, float(t), y, int(solved.code))
+    return describe_failure(inputs.scene, float(t), y, int(solved.code))
 
 
-def _chosen(search: _Search, references: _References, best: _Made, estimate: float) -> Trajectory:
+def _chosen(search: _AccuracySearch, references: _References, best: _TrialRun, estimate: float) -> Trajectory:
     """A run with the report of the search."""
-    tried = {
-        x: Tried(x.name, x.rtol, x.atol, x.num_steps, evaluations_per_step(x.solver, x.run), references.estimate(x))
+    attempts = {
+        x: Attempt(x.name, x.rtol, x.atol, x.num_steps, x.evaluations, references.estimate(x))
         for x in search.made.values()
     }
     accuracy = Accuracy(
@@ -372,17 +455,17 @@ def _chosen(search: _Search, references: _References, best: _Made, estimate: flo
         best.rtol,
         best.atol,
         best.num_steps,
-        _tenfold([tried[x] for x in tried if x.which == best.which], best.rtol, references.gap),
-        tuple(tried.values()),
+        _cost_scaling([attempts[x] for x in attempts if x.which == best.which], best.rtol, references.gap),
+        tuple(attempts.values()),
         references.remark,
-        float(np.asarray(best.run.problem.dtmax)) if best.bounded else None,
+        float(np.asarray(best.run.inputs.dtmax)) if best.bounded else None,
     )
     return replace(best.run, accuracy=accuracy)
 
 
-def _tenfold(tried: list[Tried], rtol: float, gap: float) -> Tenfold:
+def _cost_scaling(attempts: list[Attempt], rtol: float, gap: float) -> CostScaling:
     """Steps for ten times better and worse, from the next tighter and the next looser run of the same method."""
-    runs = sorted((run for run in tried if math.isfinite(run.estimate)), key=lambda r: r.rtol)
+    runs = sorted((run for run in attempts if math.isfinite(run.estimate)), key=lambda r: r.rtol)
     place = [run.rtol for run in runs].index(rtol)
     # Powers of ten in steps for one in the tolerance, and in the tolerance for one in the error, where that is known.
     slopes = [math.log10(a.num_steps / b.num_steps) / math.log10(b.rtol / a.rtol) for a, b in pairwise(runs)]
@@ -393,7 +476,7 @@ def _tenfold(tried: list[Tried], rtol: float, gap: float) -> Tenfold:
     per = min(max(1.0 / order, 0.5), 2.0)
     better = slopes[max(place - 1, 0)] if slopes else 0.0
     worse = slopes[min(place, len(slopes) - 1)] if slopes else 0.0
-    return Tenfold(max(10 ** (per * better), 1.0), min(10 ** (-per * worse), 1.0))
+    return CostScaling(max(10 ** (per * better), 1.0), min(10 ** (-per * worse), 1.0))
 
 
 def _round(x: float) -> float:

@@ -1,0 +1,205 @@
+"""What is asked of a run: the arguments of `simulate`, checked and converted."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import ArrayLike, PyTree
+
+from .._core.arguments import as_flag, as_mapping, as_whole, check_real
+from ..scene import Friction, Scene, check_step
+from ..solvers import ImplicitFriction
+from ._solve import RunInputs, RunOptions
+
+_Plugin = TypeVar("_Plugin")
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """The arguments of `simulate`, as they were given."""
+
+    scene: Scene
+    q0: ArrayLike | list[float]
+    qd0: ArrayLike | list[float]
+    t1: ArrayLike
+    t0: ArrayLike = 0.0
+    ts: ArrayLike | list[float] | None = None
+    z0: dict[str, PyTree] | None = None
+    rtol: ArrayLike = 1e-6
+    atol: ArrayLike = 1e-9
+    dt: ArrayLike | None = None
+    dtmax: ArrayLike | None = None
+    solver: dfx.AbstractSolver | None = None
+    adjoint: dfx.AbstractAdjoint | None = None
+    max_steps: int = 16384
+    max_events: int = 1024
+    hold_chatter: bool = False
+    project: bool = True
+
+    def checked(self) -> tuple[RunInputs, RunOptions]:
+        """The numbers of the run, and what is compiled in.
+
+        **Raises:**
+
+        - `ValueError` naming the argument, what was given and what is needed.
+        """
+        inputs = _inputs(self)
+        max_steps, max_events = as_whole(self.max_steps, name="max_steps"), as_whole(self.max_events, name="max_events")
+        hold_chatter, project = as_flag(self.hold_chatter, name="hold_chatter"), as_flag(self.project, name="project")
+        solver_arrays, solver = _split(self.solver, dfx.AbstractSolver, "solver")
+        if isinstance(self.solver, ImplicitFriction):
+            if self.dt is None:
+                raise ValueError(
+                    "ImplicitFriction takes fixed steps and has no estimate of its error: pass the step, as in dt=1e-3."
+                )
+            check_step(self.scene)
+        if isinstance(self.adjoint, dfx.BacksolveAdjoint):
+            raise ValueError(
+                "simulate cannot use diffrax.BacksolveAdjoint, which knows neither events nor projections nor what is"
+                " kept of a run. Leave adjoint out, or pass diffrax.ForwardMode()."
+            )
+        adjoint_arrays, adjoint = _split(self.adjoint, dfx.AbstractAdjoint, "adjoint")
+        inputs = inputs._replace(plugins=(solver_arrays, adjoint_arrays))
+        return inputs, RunOptions(solver, adjoint, max_steps, max_events, hold_chatter, project)
+
+
+def is_known(*values: object) -> bool:
+    """Whether none of the values is traced by JAX."""
+    return not any(isinstance(value, jax.core.Tracer) for value in values)
+
+
+def _array(value: PyTree, dtype: np.dtype) -> Any:
+    """As an array of `dtype`: NumPy for what is known (cheaper to hand over), JAX for what is traced or on a device."""
+    if isinstance(value, jax.Array):
+        return value if value.dtype == dtype else value.astype(dtype)
+    return np.asarray(value, dtype)
+
+
+def _inputs(asked: RunRequest) -> RunInputs:
+    """Convert and check all numbers of a run."""
+    scene, t0, t1, z0 = asked.scene, asked.t0, asked.t1, asked.z0
+    if not isinstance(scene, Scene):
+        raise ValueError(f"simulate needs a Scene, but a {type(scene).__name__} was given.")
+    # A list may hold numbers that are traced, as in qd0=[scene.params["v"]].
+    q0, qd0, ts = (
+        jnp.asarray(value) if isinstance(value, list | tuple) and not is_known(*value) else value
+        for value in (asked.q0, asked.qd0, asked.ts)
+    )
+    given = {"q0": q0, "qd0": qd0, "t1": t1, "t0": t0, "rtol": asked.rtol, "atol": asked.atol}
+    given |= {
+        name: value for name, value in (("ts", ts), ("dt", asked.dt), ("dtmax", asked.dtmax)) if value is not None
+    }
+    for name, value in given.items():
+        if type(value) is not float:
+            check_real(value, name=name)
+    leaves: list[Any] = [*jtu.tree_leaves(scene), q0, qd0]
+    kinds = {x.dtype for x in leaves if hasattr(x, "dtype")}
+    dtype = kinds.pop() if len(kinds) == 1 else jnp.result_type(*kinds) if kinds else jnp.result_type(float)
+    if not jnp.issubdtype(dtype, jnp.floating):
+        dtype = jnp.result_type(float)
+    array = {name: _array(value, dtype) for name, value in given.items()}
+    for name in ("q0", "qd0"):
+        if array[name].ndim != 1 or array[name].shape[0] == 0 or array[name].shape != array["q0"].shape:
+            raise ValueError(
+                f"q0 and qd0 must both have the shape [dof], but q0 has the shape {array['q0'].shape} and qd0"
+                f" {array['qd0'].shape}."
+            )
+    for name in ("t0", "t1", "rtol", "atol", "dt", "dtmax"):
+        if name in array and array[name].shape != ():
+            raise ValueError(f"{name} must be one number, but has the shape {array[name].shape}.")
+    _check_values(array)
+    _check_span(t0, t1, array)
+    if array["q0"].shape != (1,):
+        _check_slips(scene, array["q0"], array["t0"])
+    return RunInputs(
+        scene,
+        array["q0"],
+        array["qd0"],
+        {} if z0 is None else _own_states(scene, array["q0"], z0, dtype),
+        array["t0"],
+        array["t1"],
+        array.get("ts"),
+        array["rtol"],
+        array["atol"],
+        array.get("dt"),
+        array.get("dtmax"),
+        None,
+    )
+
+
+def _check_span(t0: ArrayLike, t1: ArrayLike, array: dict[str, Any]) -> None:
+    """Refuse times that differ, but not in the type the run has: it would end where it begins, and all be well."""
+    if is_known(t0, t1) and array["t0"] == array["t1"] and t0 != t1:
+        raise ValueError(
+            f"t0 = {t0} and t1 = {t1} are the same number in {array['t0'].dtype}: count the time from another moment,"
+            " or pass q0 in float64."
+        )
+
+
+def _check_slips(scene: Scene, q0: jax.Array | np.ndarray, t0: jax.Array | np.ndarray) -> None:
+    """Refuse the velocity of a belt that is a number where slip is a vector."""
+    for i, effect in enumerate(scene.effects):
+        if not isinstance(effect, Friction) or effect.along is None or callable(effect.belt_velocity):
+            continue
+        # Asked first, as the rest takes time.
+        if is_known(effect.belt_velocity) and np.any(np.asarray(effect.belt_velocity) != 0):
+            effect.check_belt(q0, scene.bind_time(jnp.asarray(t0)).params, scene.names[i])
+
+
+def _own_states(scene: Scene, q0: jax.Array | np.ndarray, z0: dict[str, PyTree], dtype: np.dtype) -> dict[str, PyTree]:
+    """Convert and check the initial own states that were given."""
+    z0 = as_mapping(z0, name="z0", example="{'friction': 0.0}")
+    states = scene.initial_state(jnp.asarray(q0, dtype))
+    for name, state in z0.items():
+        if name not in states:
+            raise ValueError(
+                f"z0 names {name!r}, but the effects with a state of their own are: {', '.join(states) or 'none'}."
+            )
+        if jtu.tree_structure(state) != jtu.tree_structure(states[name]):
+            raise ValueError(f"z0[{name!r}] must have the structure of {states[name]}, but {state} was given.")
+        if [jnp.shape(x) for x in jtu.tree_leaves(state)] != [jnp.shape(x) for x in jtu.tree_leaves(states[name])]:
+            raise ValueError(f"z0[{name!r}] must have the shapes of {states[name]}, but {state} was given.")
+    return {name: jtu.tree_map(lambda x: _array(x, dtype), state) for name, state in z0.items()}
+
+
+def _check_values(array: dict[str, Any]) -> None:
+    """Check the values that are known now; those that are traced are checked in the run."""
+    known = {name: np.asarray(value) for name, value in array.items() if is_known(value)}
+    for name, value in known.items():
+        if not (math.isfinite(value) if value.ndim == 0 else np.isfinite(value).all()):
+            raise ValueError(f"{name} must be finite, but it is {value}.")
+    for name in ("rtol", "atol"):
+        if name in known and known[name] < 0:
+            raise ValueError(f"{name} must not be negative, but it is {known[name]}.")
+    if "rtol" in known and "atol" in known and known["rtol"] + known["atol"] <= 0:
+        raise ValueError("rtol and atol must not both be zero.")
+    for name in ("dt", "dtmax"):
+        if name in known and known[name] <= 0:
+            raise ValueError(f"{name} must be positive, but it is {known[name]}.")
+    if "dt" in array and "dtmax" in array:
+        raise ValueError("dt fixes the step, so dtmax has no place beside it: pass one of them.")
+    t0, t1, ts = known.get("t0"), known.get("t1"), known.get("ts")
+    if t0 is not None and t1 is not None and t1 < t0:
+        raise ValueError(f"t1 must not be before t0, but t0 = {t0} and t1 = {t1}.")
+    if "ts" in array and (array["ts"].ndim != 1 or array["ts"].shape[0] == 0):
+        raise ValueError(f"ts must be a vector of times, shape [time], but it has the shape {array['ts'].shape}.")
+    if ts is not None and (np.diff(ts) < 0).any():
+        raise ValueError("ts must increase.")
+    if ts is not None and t0 is not None and t1 is not None and not (t0 <= ts[0] and ts[-1] <= t1):
+        raise ValueError(f"ts must lie within [t0, t1] = [{t0}, {t1}], but runs from {ts[0]} to {ts[-1]}.")
+
+
+def _split(plugin: _Plugin | None, kind: type[_Plugin], name: str) -> tuple[_Plugin | None, _Plugin | None]:
+    """Arrays of a plug-in, and the rest of it, which is compiled in."""
+    if plugin is None:
+        return None, None
+    if not isinstance(plugin, kind):
+        raise ValueError(f"{name} must be a diffrax.{kind.__name__} object, but {plugin!r} was given.")
+    return eqx.partition(plugin, eqx.is_array)
