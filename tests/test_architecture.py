@@ -41,8 +41,6 @@ PARTS = ("validation.behaviour", "validation.hard", "validation.testbench")
 MAX_FILE_LINES = 500
 MAX_FUNCTION_LINES = 80
 LONG_FUNCTIONS: dict[str, str] = {}  # "file:function" -> reason
-# Classes that wait for a name of their own.
-NAMED_TWICE: set[str] = set()
 
 
 def room_of(path: Path) -> str:
@@ -187,7 +185,7 @@ def test_a_class_has_one_meaning() -> None:
         for node in statements(path, (ast.ClassDef,)):
             assert isinstance(node, ast.ClassDef)
             files.setdefault(node.name.lstrip("_"), set()).add(str(path.relative_to(ROOT)))
-    twice = {name: where for name, where in files.items() if len(where) > 1 and name not in NAMED_TWICE}
+    twice = {name: where for name, where in files.items() if len(where) > 1}
     assert not twice, f"classes of one name: {twice}"
 
 
