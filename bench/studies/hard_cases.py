@@ -1,4 +1,4 @@
-"""Hard cases by `jaxmodsim` and by what people would use without it: right, wrong without a word, error, no answer.
+"""Hard cases by `jaxmodsim` and by what people would use without it: right, silently wrong, error, no answer.
 
 diffrax and scipy get the same equations of motion, with `Fc sign(v)` for dry friction, all else as they come: mass
 matrices are solved with care, constraints are differentiated twice, which is more than most would write; missing are
@@ -31,7 +31,7 @@ from jaxmodsim.friction import AbstractSetValuedLaw
 from jaxmodsim.scene import State, vector_field
 from jaxmodsim.validation.hard import HardCase, SceneTask, check, hard_cases
 
-RIGHT, WRONG, ERROR, NONE = "right", "wrong without a word", "error", "no answer"
+RIGHT, WRONG, ERROR, NONE = "right", "silently wrong", "error", "no answer"
 RTOL, ATOL, LIMIT = 1e-6, 1e-9, 60.0
 # Admissible error of the others, in that of ours, and at least, relative to the scale of the answer.
 GENEROUS, LEAST = 100.0, 1e-3
