@@ -214,7 +214,7 @@ def _prepared(name: str, method: Method, scene: Scene, question: Question, batch
     allowed = max(question.max_steps, *(math.ceil(question.t1 / dt) + 1 for dt in method.steps or ()), 1)
     options: dict[str, object] = {"solver": solver, "max_steps": allowed}
 
-    def end(start: dict[str, Array], scene: Scene, setting: dict[str, float]) -> tuple[Array, Array, Array]:
+    def end(start: dict[str, Array], scene: Scene, setting: dict[str, ArrayLike]) -> tuple[Array, Array, Array]:
         run = question.run(scene, start, setting, throw=False, **options)
         return run.q, run.qd, run.code
 

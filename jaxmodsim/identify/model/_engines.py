@@ -87,7 +87,7 @@ def run_samples(
     """
 
     def advance(
-        carry: tuple[State, PyTree], sample: tuple[Array, Array, Inputs, Inputs]
+        carry: tuple[State, PyTree], sample: tuple[Array, Array, PyTree, PyTree]
     ) -> tuple[tuple[State, PyTree], PyTree]:
         (y, memory), (start, dt, held, slopes) = carry, sample
         here = _driven(scene, held)
