@@ -1,15 +1,16 @@
 """What the runs of a problem converge to: the reference that errors are measured against."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jax.typing import DTypeLike
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..scene import Scene
 from ..simulation import SimulationError, Trajectory, simulate
@@ -36,21 +37,30 @@ class Question:
     qd0: np.ndarray
     t1: float
     ts: np.ndarray | None
-    observe: Callable[[Trajectory], Any]
+    observe: Callable[[Trajectory], ArrayLike]
     label: str
     unit: str
     values: dict[str, float]
     max_steps: int
 
-    def start(self, dtype: Any) -> dict[str, Array]:
+    def start(self, dtype: DTypeLike) -> dict[str, Array]:
         """Initial coordinates and velocities in a floating type."""
         return {"q0": jnp.asarray(self.q0, dtype), "qd0": jnp.asarray(self.qd0, dtype)}
 
-    def run(self, scene: Scene, start: dict[str, Array], setting: dict[str, Any], **options: object) -> Trajectory:
+    def run(
+        self, scene: Scene, start: dict[str, Array], setting: Mapping[str, object], **options: object
+    ) -> Trajectory:
         """A run; `setting` holds tolerances or a step."""
         return simulate(scene, **start, t1=self.t1, ts=self.ts, **{"max_steps": self.max_steps, **setting, **options})
 
-    def last(self, x: dict[str, Array], scene: Scene, start: Any, setting: dict[str, Any], **options: Any) -> Array:
+    def last(
+        self,
+        x: dict[str, Array],
+        scene: Scene,
+        start: dict[str, Array],
+        setting: Mapping[str, object],
+        **options: object,
+    ) -> Array:
         """The last value of the observable, as a function of the numbers `x`."""
         scene, start = with_values(scene, start, x)
         return jnp.ravel(self.observe(self.run(scene, start, setting, throw=False, **options)))[-1]
@@ -124,7 +134,7 @@ def converged(
     - `RuntimeError` if they disagree by more than `agreement`, or a run fails.
     """
     scene, stiff = in_type(scene, jnp.float64), any(effect.stiff for effect in scene.effects)
-    solvers: tuple[Any, ...] = (Rodas5P(), dfx.Tsit5() if scene.event_driven or stiff else dfx.Dopri8())
+    solvers: tuple[object, ...] = (Rodas5P(), dfx.Tsit5() if scene.event_driven or stiff else dfx.Dopri8())
     if closed is not None and not scene.event_driven and not question.values:
         solvers = solvers[:1]
     found = [_tight(scene, question, solver, rtol) for solver in solvers]

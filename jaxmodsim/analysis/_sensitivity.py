@@ -84,7 +84,7 @@ def sensitivity(
     t1: ArrayLike,
     ts: ArrayLike | list[float] | None = None,
     mode: str | None = None,
-    **options: Any,
+    **options: object,
 ) -> Sensitivity:
     """Derivatives of what is observed along a run by numbers of its scene, exact, through all mode changes.
 
@@ -132,9 +132,10 @@ def sensitivity(
     if mode not in (None, *_MODES):
         raise ValueError(f"mode must be 'forward', 'reverse' or left out for the cheaper one, but {mode!r} was given.")
     values = chosen_numbers(scene, q0, qd0, wrt)
-    run = simulate(scene, q0, qd0, t1, ts=ts, **options)
+    given: dict[str, Any] = {**options, "ts": ts}
+    run = simulate(scene, q0, qd0, t1, **given)
     if run.modes is not None:  # a traced run would hold room for all events that are allowed
-        options["max_events"] = run.log_size
+        given["max_events"] = run.log_size
     observe, label, unit = observable_of(observable)
     y = observed(observe(run))
     if mode is None:
@@ -144,7 +145,7 @@ def sensitivity(
 
     def at(x: dict[str, Array]) -> Array:
         changed, start = with_values(scene, {"q0": run.inputs.q0, "qd0": run.inputs.qd0}, x)
-        return jnp.asarray(observe(simulate(changed, **start, t1=t1, ts=ts, adjoint=adjoint, throw=False, **options)))
+        return jnp.asarray(observe(simulate(changed, **start, t1=t1, adjoint=adjoint, throw=False, **given)))
 
     differentiate = jax.jacfwd if mode == "forward" else jax.jacrev
     derivatives = differentiate(at)({name: jnp.asarray(x, y.dtype) for name, x in values.items()})
@@ -186,7 +187,7 @@ def chosen_numbers(scene: Scene, q0: object, qd0: object, wrt: Sequence[str] | s
     return {name: known[name] for name in chosen}
 
 
-def with_values(scene: Scene, start: dict[str, Any], x: Mapping[str, Array]) -> tuple[Scene, dict[str, Array]]:
+def with_values(scene: Scene, start: Mapping[str, ArrayLike], x: Mapping[str, Array]) -> tuple[Scene, dict[str, Array]]:
     """Scene and initial state with the parameters `x`."""
     known = elements(scene)
     start = {name: jnp.asarray(value) for name, value in start.items()}

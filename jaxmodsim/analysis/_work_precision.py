@@ -196,7 +196,7 @@ class _PreparedMethod(NamedTuple):
     name: str
     method: Method
     solver: dfx.AbstractSolver
-    dtype: Any
+    dtype: np.dtype
     calls: dict[str, Callable[[dict[str, float]], Any]]
 
 
@@ -212,9 +212,9 @@ def _prepared(name: str, method: Method, scene: Scene, question: Question, batch
     solver = default_solver(scene, start["q0"].size, fixed) if method.solver is None else method.solver
     # All steps of a ladder that was asked for are allowed.
     allowed = max(question.max_steps, *(math.ceil(question.t1 / dt) + 1 for dt in method.steps or ()), 1)
-    options: dict[str, Any] = {"solver": solver, "max_steps": allowed}
+    options: dict[str, object] = {"solver": solver, "max_steps": allowed}
 
-    def end(start: dict[str, Array], scene: Scene, setting: dict[str, Any]) -> Any:
+    def end(start: dict[str, Array], scene: Scene, setting: dict[str, ArrayLike]) -> tuple[Array, Array, Array]:
         run = question.run(scene, start, setting, throw=False, **options)
         return run.q, run.qd, run.code
 

@@ -101,7 +101,7 @@ class WorkPrecision:
     costs: tuple[str, ...]
     batch: int
     rows: tuple[Row, ...]
-    machine: dict[str, Any]
+    machine: dict[str, object]
 
     def cheapest(self, error: float, *, cost: str = "run") -> Row:
         """The row with the least time among those whose error is no larger.
@@ -215,9 +215,9 @@ def _aligned(lines: list[list[str]]) -> list[str]:
     ]
 
 
-def _columns(row: Row, costs: Sequence[str]) -> dict[str, Any]:
+def _columns(row: Row, costs: Sequence[str]) -> dict[str, object]:
     """A row of the table."""
-    columns: dict[str, Any] = {
+    columns: dict[str, object] = {
         "method": row.method,
         "rtol": row.rtol,
         "dt [s]": row.dt,
@@ -238,7 +238,7 @@ def _columns(row: Row, costs: Sequence[str]) -> dict[str, Any]:
     return {**columns, "failed": row.failed}
 
 
-def _digest(body: dict[str, Any]) -> str:
+def _digest(body: dict[str, object]) -> str:
     """Tells whether a number has changed, which JSON itself does not."""
     return hashlib.sha256(json.dumps(body).encode()).hexdigest()
 

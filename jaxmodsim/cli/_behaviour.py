@@ -1,13 +1,12 @@
 """`jaxmodsim testbench --laws`: every friction law in the standard experiments."""
 
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
-from ..plot import behaviour_figure
+from ..plot import Figure, behaviour_figure
 from ..validation.behaviour import EXPERIMENTS, ExperimentResult, Verdict, run_bench
-from ._output import console, show_paths, show_table, write
+from ._output import Content, console, show_paths, show_table, write
 
 
 def report_behaviour(out: Path) -> bool:
@@ -16,7 +15,9 @@ def report_behaviour(out: Path) -> bool:
         outcomes = run_bench(progress=lambda name: status.update(f"{name}: done"))
     show_table(_table(outcomes), "Friction laws in the standard experiments: verdict and number")
     show_table(_limits(), "The numbers and what they must keep to pass")
-    files: dict[str, Any] = {f"behaviour_{name.replace('-', '_')}.png": _figure(name, outcomes) for name in EXPERIMENTS}
+    files: dict[str, Content] = {
+        f"behaviour_{name.replace('-', '_')}.png": _figure(name, outcomes) for name in EXPERIMENTS
+    }
     files["behaviour.csv"] = _long(outcomes)
     files["behaviour.json"] = _nested(outcomes)
     show_paths(write(out, files))
@@ -32,7 +33,7 @@ def report_behaviour(out: Path) -> bool:
     return not failed
 
 
-def _figure(name: str, outcomes: dict[str, dict[str, ExperimentResult]]) -> Any:
+def _figure(name: str, outcomes: dict[str, dict[str, ExperimentResult]]) -> Figure:
     return behaviour_figure(EXPERIMENTS[name], {law: of[name] for law, of in outcomes.items()})
 
 
@@ -60,7 +61,7 @@ def _limits() -> pd.DataFrame:
     )
 
 
-def _entry(name: str, outcome: ExperimentResult) -> dict[str, Any]:
+def _entry(name: str, outcome: ExperimentResult) -> dict[str, object]:
     experiment = EXPERIMENTS[name]
     return {
         "verdict": outcome.verdict.value,
@@ -84,5 +85,5 @@ def _long(outcomes: dict[str, dict[str, ExperimentResult]]) -> pd.DataFrame:
     )
 
 
-def _nested(outcomes: dict[str, dict[str, ExperimentResult]]) -> dict[str, Any]:
+def _nested(outcomes: dict[str, dict[str, ExperimentResult]]) -> dict[str, object]:
     return {law: {name: _entry(name, outcome) for name, outcome in of.items()} for law, of in outcomes.items()}

@@ -30,7 +30,7 @@ from ..plot import comparison_figure, design_figure, fit_figure, score_figure
 from ..scene import Scene, scene_numbers
 from ._fitted import Findings, Fitted, origin, parameter_table, record_table, sample_table, summary, with_units
 from ._options import Interrupted
-from ._output import console, say, show_paths, show_table, write
+from ._output import Content, console, say, show_paths, show_table, write
 from ._plan import FitRequest, Plan, plan_of
 from ._report_html import report_page
 
@@ -101,7 +101,7 @@ def _ctrl_c() -> Iterator[Callable[[], None]]:
     before = signal.getsignal(signal.SIGINT)
     pressed = threading.Event()
 
-    def press(*_: Any) -> None:
+    def press(*_: object) -> None:
         pressed.set()
         raise KeyboardInterrupt
 
@@ -157,10 +157,10 @@ def _show(fitted: Fitted) -> None:
     say(f"{samples} samples, {fitted.seconds:.1f} s with compilation")
 
 
-def _files(findings: Findings) -> dict[str, Any]:
+def _files(findings: Findings) -> dict[str, Content]:
     """Figures, tables, JSON and the result by file name."""
     fitted, result = findings.fitted, findings.fitted.result
-    files: dict[str, Any] = {}
+    files: dict[str, Content] = {}
     single = len(result.provenance.records) == 1
     for i, record in enumerate(result.provenance.records):
         files["fit.png" if single else f"fit_{_numbered(i, record)}.png"] = fit_figure(result, record=i)

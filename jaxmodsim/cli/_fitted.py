@@ -6,7 +6,6 @@ import sys
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib import metadata
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -170,7 +169,7 @@ def sample_table(fitted: Fitted) -> pd.DataFrame:
     )
 
 
-def summary(findings: Findings) -> dict[str, Any]:
+def summary(findings: Findings) -> dict[str, object]:
     """All but the samples, of types that JSON knows."""
     fitted = findings.fitted
     return {

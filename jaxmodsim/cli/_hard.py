@@ -3,14 +3,13 @@
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
 from ..plot import hard_figure, step_limits_figure
 from ..validation.hard import TRANSFORMS, CaseReport, HardCase, check_many, choose
 from ._options import Interrupted
-from ._output import console, say, show_paths, show_table, write
+from ._output import Content, console, say, show_paths, show_table, write
 
 _VALUES, _SLOPES = ("alone", "jit", "vmap"), ("forward", "reverse")
 
@@ -63,7 +62,7 @@ def _report(found: list[CaseReport], out: Path, *, whole: bool) -> None:
         return
     table = hard_table(found)
     show_table(table.drop(columns="asked"), "Hard cases: errors in what is admissible, so that 1 is the limit")
-    files: dict[str, Any] = {
+    files: dict[str, Content] = {
         "hard.csv": table,
         "hard.json": {verdict.case.name: _entry(verdict) for verdict in found},
         "hard.png": hard_figure(found),
@@ -113,7 +112,7 @@ def _worst(verdict: CaseReport, dtype: str, transforms: tuple[str, ...]) -> str:
     return "named" if all(each.ok for each in ran) else "FAIL"
 
 
-def _entry(verdict: CaseReport) -> dict[str, Any]:
+def _entry(verdict: CaseReport) -> dict[str, object]:
     case = verdict.case
     return {
         "family": case.family,

@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import pandas as pd
 from rich import box
@@ -18,13 +18,14 @@ from .._core.files import jsonable
 from ..identify import FitResult, InputDesign
 from ..plot import Figure
 
+# What a file may hold; a mapping becomes JSON.
+Content: TypeAlias = Figure | pd.DataFrame | Mapping[str, object] | str | FitResult | InputDesign
+
 # Off a terminal (a file, a pipe) there is no width to keep to.
 console = Console() if sys.stdout.isatty() else Console(width=140)
 
 
-def write(
-    out: Path, files: Mapping[str, Figure | pd.DataFrame | dict[str, Any] | str | FitResult | InputDesign]
-) -> list[Path]:
+def write(out: Path, files: Mapping[str, Content]) -> list[Path]:
     """Write figures as PNG, tables and designed inputs as CSV, dicts as JSON, text, and fits as `FitResult.load` reads.
 
     Into the folder `out`; returns the paths.

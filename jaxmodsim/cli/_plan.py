@@ -23,7 +23,7 @@ from ..identify import (
     rough_axis,
     start_state,
 )
-from ..scene import scene_numbers
+from ..scene import Scene, scene_numbers
 from ._read import AxisColumns, read_records
 
 _LOSSES = {"squares": SquaredLoss, "huber": Huber, "cauchy": Cauchy}
@@ -175,7 +175,7 @@ def _models(request: FitRequest) -> tuple[str, ...]:
     return names
 
 
-def _numbers(scene: Any) -> tuple[str, ...]:
+def _numbers(scene: Scene) -> tuple[str, ...]:
     """Names of the numbers that may be given: neither the input nor the velocity of a belt, which an axis has not."""
     return tuple(name for name in scene_numbers(scene) if name != "u" and not name.endswith("belt_velocity"))
 

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -85,7 +84,7 @@ def _column(table: Mapping[str, object], path: Path, option: str, name: str) -> 
     raise ValueError(f"{path.name}: column {name!r} holds {given.iloc[bad]!r} in sample {bad}, which is no number.")
 
 
-def _csv(path: Path) -> dict[str, Any]:
+def _csv(path: Path) -> dict[str, object]:
     try:
         frame = pd.read_csv(path)
     except (ValueError, pd.errors.ParserError) as error:
@@ -93,7 +92,7 @@ def _csv(path: Path) -> dict[str, Any]:
     return {str(name): frame[name] for name in frame.columns}
 
 
-def _parquet(path: Path) -> dict[str, Any]:
+def _parquet(path: Path) -> dict[str, object]:
     try:
         frame = pd.read_parquet(path)
     except ImportError as error:
@@ -103,7 +102,7 @@ def _parquet(path: Path) -> dict[str, Any]:
     return {str(name): frame[name] for name in frame.columns}
 
 
-def _mat(path: Path) -> dict[str, Any]:
+def _mat(path: Path) -> dict[str, object]:
     # In a process of its own: some damaged files end the one that reads them.
     reading = subprocess.run([sys.executable, "-c", _MAT, str(path.resolve())], capture_output=True, check=False)
     if reading.returncode == _HDF5:
@@ -138,7 +137,7 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-_READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
+_READERS: dict[str, Callable[[Path], dict[str, object]]] = {
     ".csv": _csv,
     ".txt": _csv,
     ".parquet": _parquet,

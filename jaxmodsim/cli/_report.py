@@ -1,14 +1,13 @@
 """`jaxmodsim testbench`: figures, table and sweep of the test bench."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from ..plot import ramp_figure, stick_figure
 from ..validation.testbench import RampResult, ramp_cases, run_ramp, stick_sweep
-from ._output import console, show_paths, show_table, write
+from ._output import Content, console, show_paths, show_table, write
 
 PARTS = {
     "a": "a: Coulomb friction by sign(v)",
@@ -24,7 +23,7 @@ def report_testbench(out: Path) -> None:
     show_paths(write(out, testbench_files()))
 
 
-def testbench_files() -> dict[str, Any]:
+def testbench_files() -> dict[str, Content]:
     """Run the bench and print its tables; returns figures, tables and JSON by file name."""
     measured = []
     with console.status("") as status:
@@ -37,7 +36,7 @@ def testbench_files() -> dict[str, Any]:
     show_table(table, "A box of 2 kg under a force rising with time")
     show_table(grid, "LuGre in stick over sigma0 and sigma1")
     curves = _curves(measured)
-    files: dict[str, Any] = {
+    files: dict[str, Content] = {
         f"testbench_{part}.png": ramp_figure(title, [m.run for m in measured if m.case.part == part])
         for part, title in PARTS.items()
     }
@@ -71,7 +70,7 @@ def _table(measured: list[RampResult]) -> pd.DataFrame:
     )
 
 
-def _grid(sweep: dict[str, Any]) -> pd.DataFrame:
+def _grid(sweep: dict[str, np.ndarray]) -> pd.DataFrame:
     sigma0, sigma1 = np.meshgrid(sweep["sigma0"], sweep["sigma1"], indexing="ij")
     return pd.DataFrame(
         {

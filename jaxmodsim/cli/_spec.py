@@ -78,9 +78,9 @@ class Spec:
     - `run`: those that go to `simulate`.
     """
 
-    system: Scene | Callable[..., Any]
+    system: Scene | Callable[..., object]
     over: dict[str, Any]
-    observe: dict[str, Any] | None
+    observe: dict[str, object] | None
     run: dict[str, Any]
 
 
@@ -102,7 +102,7 @@ def read_spec(path: Path) -> Spec:
     return Spec(system, dimensions, kept, arguments)
 
 
-def _run(content: dict[str, Any], where: str) -> dict[str, Any]:
+def _run(content: dict[str, object], where: str) -> dict[str, object]:
     arguments = _table.read_table(_RunTable, content, where).model_dump(exclude_none=True)
     ts = arguments.get("ts")
     if isinstance(ts, dict):
@@ -111,7 +111,7 @@ def _run(content: dict[str, Any], where: str) -> dict[str, Any]:
     return arguments if ts is None else {**arguments, "ts": np.asarray(ts, float)}
 
 
-def _dimension(name: str, given: object, over: str) -> Any:
+def _dimension(name: str, given: object, over: str) -> object:
     """Values of a dimension, or of several numbers that change along it."""
     if isinstance(given, list):
         return given
@@ -176,9 +176,9 @@ class Reduced:
         return {"max": jnp.max, "min": jnp.min, "ptp": jnp.ptp}[self.take](x)
 
 
-def _observe(content: dict[str, Any], where: str, along: bool) -> dict[str, Any]:
+def _observe(content: dict[str, object], where: str, along: bool) -> dict[str, object]:
     """What is kept of each run; `along` says whether the run may be known over time."""
-    kept: dict[str, Any] = {}
+    kept: dict[str, object] = {}
     for name, given in content.items():
         if isinstance(given, str):
             kept[name] = given

@@ -33,7 +33,7 @@ class _FileScene(AbstractTable):
     object: Text
 
 
-def read_system(content: dict[str, Any], where: str, folder: Path) -> Scene | Callable[..., Any]:
+def read_system(content: dict[str, object], where: str, folder: Path) -> Scene | Callable[..., object]:
     """The scene, or the function, that a table names. A file that it names is run.
 
     **Arguments:**
@@ -55,7 +55,7 @@ def read_system(content: dict[str, Any], where: str, folder: Path) -> Scene | Ca
     return _from_file(where, folder / asked.file, asked.object)
 
 
-def _made(content: dict[str, Any], where: str, key: str, makers: Mapping[str, Callable[..., object]]) -> Any:
+def _made(content: dict[str, object], where: str, key: str, makers: Mapping[str, Callable[..., object]]) -> Any:
     """What the constructor that a table names by `key` makes of the numbers and the law of the table."""
     name = content.get(key)
     fields: dict[str, Any] = {key: (Literal[*makers], ...)}
@@ -92,7 +92,7 @@ def known_laws() -> dict[str, type[AbstractLaw]]:
     }
 
 
-def _from_file(where: str, path: Path, name: str) -> Scene | Callable[..., Any]:
+def _from_file(where: str, path: Path, name: str) -> Scene | Callable[..., object]:
     """Run a Python file and take an object of it."""
     if not path.is_file():
         raise ValueError(f"{where}: file {str(path)!r} is not there; it is looked for beside the SPEC.")

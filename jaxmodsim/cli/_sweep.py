@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -21,6 +21,9 @@ from ._options import Interrupted
 from ._output import say, show_paths, show_table, write
 from ._spec import Spec, read_spec
 from ._spec_scene import MODEL
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 @dataclass(frozen=True)
@@ -134,7 +137,7 @@ def _check_figure(spec: Spec, laid: SweepPlan, name: str) -> None:
 
 
 @contextmanager
-def _executor(request: SweepRequest) -> Iterator[Any]:
+def _executor(request: SweepRequest) -> Iterator[object]:
     """A cluster, here or elsewhere; None for the threads of this process."""
     if request.workers is None and request.scheduler is None:
         yield None
@@ -172,7 +175,7 @@ def _show_plan(laid: SweepPlan) -> None:
     say(f"{laid.runs:,} runs, in {laid.chunks:,} chunks of up to {laid.runs_per_chunk:,}; nothing was run.")
 
 
-def _show_summary(found: Any, seen: list[SweepProgress], seconds: float, out: Path) -> None:
+def _show_summary(found: "xr.Dataset", seen: list[SweepProgress], seconds: float, out: Path) -> None:
     codes, counts = np.unique(np.asarray(found["result"]), return_counts=True)
     sentences = found["result"].attrs["flag_meanings"]
     rows = [(f"{n:,}", sentences[code]) for code, n in zip(codes, counts, strict=True)]

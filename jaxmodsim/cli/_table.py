@@ -17,7 +17,7 @@ Text = Annotated[str, "text"]
 Switch = Annotated[bool, "true or false"]
 Numbers = Annotated[list[float], Field(min_length=1), "a list of numbers"]
 Values = Annotated[float | Annotated[list[float], Field(min_length=1)], "a number or a list of numbers"]
-Table = Annotated[dict[str, Any], "a table"]
+Table = Annotated[dict[str, object], "a table"]
 
 
 class AbstractTable(BaseModel):
@@ -74,7 +74,7 @@ def inner(where: str, key: str) -> str:
     return f"{file} [{inside[:-1]}.{name}]" if inside else f"{file} [{name}]"
 
 
-def read_toml(path: Path) -> dict[str, Any]:
+def read_toml(path: Path) -> dict[str, object]:
     """The content of a TOML file.
 
     **Raises:**

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,8 +26,8 @@ class Metric:
 
     label: str
     unit: str
-    measure: Callable[..., Any]
-    arguments: tuple[Any, ...] = ()
+    measure: Callable[..., object]
+    arguments: tuple[object, ...] = ()
     read: Callable[..., str] | None = None
 
     def __call__(self, run: Trajectory) -> Array:
@@ -71,7 +70,7 @@ def classes(fn: Callable[[Trajectory], object], names: tuple[str, ...] | list[st
     return Metric("kind of motion", "1", _class_of, (fn, names), _class_name)
 
 
-def _class_of(run: Trajectory, fn: Callable[[Trajectory], object], names: tuple[str, ...]) -> Any:
+def _class_of(run: Trajectory, fn: Callable[[Trajectory], object], names: tuple[str, ...]) -> object:
     del names
     return fn(run)
 

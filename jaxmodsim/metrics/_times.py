@@ -1,7 +1,6 @@
 """When something happens in a run."""
 
 import math
-from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -134,7 +133,7 @@ def _period(run: Trajectory, of: str, since: float | None, swing: float) -> Arra
     return jnp.where(alive, mean_gap, jnp.nan)
 
 
-def _swing(x: Float[Array, " n"], these: Array) -> Any:
+def _swing(x: Float[Array, " n"], these: Array) -> Array:
     return jnp.max(jnp.where(these, x, -jnp.inf)) - jnp.min(jnp.where(these, x, jnp.inf))
 
 

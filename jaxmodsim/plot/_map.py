@@ -1,7 +1,7 @@
 """A map of a sweep."""
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -36,7 +36,7 @@ _CELLS = 2500
 _UNRUN, _NAN = -1, -2
 
 # Curves over a map: label to x and y.
-Curves: TypeAlias = Mapping[str, tuple[Any, Any]]
+Curves: TypeAlias = Mapping[str, tuple[object, object]]
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def map2d(
     return figure
 
 
-def _read(dataset: Any, name: str, x: str | None, y: str | None) -> tuple[Any, _Side, _Side]:
+def _read(dataset: "xr.Dataset", name: str, x: str | None, y: str | None) -> "tuple[xr.DataArray, _Side, _Side]":
     """The variable with its dimensions in the order (y, x), and both axes."""
     if not hasattr(dataset, "data_vars"):
         raise ValueError(f"map2d needs a Dataset as sweep returns it, but a {type(dataset).__name__} was given.")
@@ -141,14 +141,14 @@ def _read(dataset: Any, name: str, x: str | None, y: str | None) -> tuple[Any, _
     return values.transpose(upwards, right), across, up
 
 
-def _check_known(kind: str, name: Any, known: Any) -> None:
+def _check_known(kind: str, name: object, known: Iterable[object]) -> None:
     known = [str(each) for each in known]
     if name not in known:
         hint = did_you_mean(str(name), known)
         raise ValueError(f"There is no {kind} {name!r}; there are: {', '.join(known)}.{hint}")
 
 
-def _dimension(dataset: Any, values: Any, given: str) -> Any:
+def _dimension(dataset: "xr.Dataset", values: "xr.DataArray", given: str) -> Hashable:
     """The dimension that a name of an axis means: itself, or that of a number that changes along it alone."""
     along = {dim: dim for dim in values.dims}
     along |= {each: c.dims[0] for each, c in dataset.coords.items() if len(c.dims) == 1 and c.dims[0] in values.dims}
@@ -156,7 +156,7 @@ def _dimension(dataset: Any, values: Any, given: str) -> Any:
     return along[given]
 
 
-def _side(dataset: Any, dim: Any, given: str | None) -> _Side:
+def _side(dataset: "xr.Dataset", dim: Hashable, given: str | None) -> _Side:
     """The axis of a dimension, by the number of that name, by the first that changes along it, or by plain counting."""
     along = [name for name, coordinate in dataset.coords.items() if coordinate.dims == (dim,)]
     name = given if given in along else dim if dim in along or not along else along[0]
@@ -200,7 +200,7 @@ def _scale(axis: Axis, side: _Side) -> None:
             place(StrMethodFormatter("{x:g}"))
 
 
-def _codes(dataset: Any, values: Any) -> np.ndarray:
+def _codes(dataset: "xr.Dataset", values: "xr.DataArray") -> np.ndarray:
     """How each run of a map ended; of a map of that itself, whether it was run."""
     result = dataset["result"] if "result" in dataset.data_vars else None
     if result is None or not set(result.dims) <= set(values.dims):
@@ -209,12 +209,12 @@ def _codes(dataset: Any, values: Any) -> np.ndarray:
     return np.where(codes < 0, codes, 0) if values.name == "result" else codes
 
 
-def _flags(values: Any) -> dict[int, str]:
+def _flags(values: "xr.DataArray") -> dict[int, str]:
     """Names of values, from the attributes."""
     return dict(zip(values.attrs.get("flag_values", ()), values.attrs.get("flag_meanings", ()), strict=False))
 
 
-def _names(values: Any, there: np.ndarray, classes: Mapping[int, str] | None) -> dict[int, str] | None:
+def _names(values: "xr.DataArray", there: np.ndarray, classes: Mapping[int, str] | None) -> dict[int, str] | None:
     """A name for each class of the variable; None where it has none."""
     found = np.unique(there)
     named = dict(classes) if classes is not None else _flags(values)
@@ -233,7 +233,7 @@ def _draw(axes: Axes, across: _Side, up: _Side, cells: np.ndarray, **style: Any)
     return axes.pcolormesh(across.edges, up.edges, masked, rasterized=cells.size > _CELLS, **style)
 
 
-def _draw_classes(axes: Axes, across: _Side, up: _Side, cells: np.ndarray, names: dict[int, str]) -> list[Any]:
+def _draw_classes(axes: Axes, across: _Side, up: _Side, cells: np.ndarray, names: dict[int, str]) -> list[Patch]:
     """One colour for each class, and an entry of the legend for each that occurs."""
     colours = [_CLASSES[i % _FEW] for i in range(len(names))]
     entries = []
@@ -272,7 +272,9 @@ def _draw_failures(
 def _draw_curves(axes: Axes, curves: Curves) -> list[Line2D]:
     entries = []
     for i, (label, (x, y)) in enumerate(curves.items()):
-        entries += axes.plot(x, y, color=RED, lw=1.8, ls=_CURVES[i % len(_CURVES)], label=_folded(label))
+        entries += axes.plot(
+            np.asanyarray(x), np.asanyarray(y), color=RED, lw=1.8, ls=_CURVES[i % len(_CURVES)], label=_folded(label)
+        )
     return entries
 
 

@@ -4,7 +4,7 @@ import hashlib
 import re
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -112,7 +112,7 @@ def _in_groups(
     return found
 
 
-def _answer(run: AbstractRun, fixed: PyTree, given: dict[str, Any]) -> RunOutcome:
+def _answer(run: AbstractRun, fixed: PyTree, given: PyTree) -> RunOutcome:
     """What compiled code gives, when it is there."""
     try:
         return jax.block_until_ready(_call(run, fixed, given))
@@ -149,25 +149,25 @@ def program(run: AbstractRun, fixed: PyTree, numbers: PyTree) -> str:
     return _program(rehearsed(run), *_abstract(fixed, numbers))
 
 
-_Abstract: TypeAlias = tuple[Any, tuple[tuple[tuple[int, ...], Any], ...]]
+_Avals: TypeAlias = tuple[tuple[tuple[int, ...], object], ...]
 
 
-def _abstract(*given: PyTree) -> _Abstract:
+def _abstract(*given: PyTree) -> tuple[object, _Avals]:
     """Structure, shapes and types: all that a trace depends on."""
     leaves, structure = jtu.tree_flatten(given)
     return structure, tuple((jnp.shape(x), jnp.result_type(x)) for x in leaves)
 
 
-def _concrete(structure: Any, avals: Any) -> Any:
+def _concrete(structure: object, avals: _Avals) -> PyTree:
     return jtu.tree_unflatten(structure, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in avals])
 
 
 @lru_cache(maxsize=32)
-def _shapes(run: AbstractRun, structure: object, avals: object) -> RunOutcome:
+def _shapes(run: AbstractRun, structure: object, avals: _Avals) -> RunOutcome:
     return jax.eval_shape(run.evaluate, *_concrete(structure, avals))
 
 
 @lru_cache(maxsize=32)
-def _program(run: AbstractRun, structure: object, avals: object) -> str:
+def _program(run: AbstractRun, structure: object, avals: _Avals) -> str:
     text = jax.jit(run.evaluate).lower(*_concrete(structure, avals)).as_text()
     return hashlib.sha256(text.encode()).hexdigest()

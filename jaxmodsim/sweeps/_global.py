@@ -1,7 +1,7 @@
 """What parameters do to the outcome of runs over whole ranges of them."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -61,7 +61,7 @@ class GlobalSensitivity:
         rows = []
         for (name, runs), found in self.groups().items():
             for j, parameter in enumerate(self.names):
-                row: dict[str, Any] = {"observable": name, "runs": runs, "parameter": parameter}
+                row: dict[str, object] = {"observable": name, "runs": runs, "parameter": parameter}
                 for index, values in found.indices.items():
                     row[index] = float(values[j])
                     if index in found.errors:

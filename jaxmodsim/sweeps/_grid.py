@@ -47,7 +47,7 @@ class Grid:
         return {name: values for axis in self.axes for name, values in axis.values.items()}
 
     @property
-    def first(self) -> dict[str, Any]:
+    def first(self) -> dict[str, np.ndarray | np.generic]:
         """The numbers of the first run."""
         return {name: values[0] for name, values in self.values.items()}
 
@@ -87,7 +87,7 @@ def grid(over: object) -> Grid:
     return Grid(axes)
 
 
-def _axis(name: Any, given: Any) -> GridAxis:
+def _axis(name: object, given: Any) -> GridAxis:
     if not isinstance(name, str):
         raise ValueError(f"over must map names to values, but {name!r} is no name.")
     # A table of pandas is no Mapping, but is read like one.

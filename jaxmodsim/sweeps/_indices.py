@@ -1,7 +1,7 @@
 """`global_sensitivity`: which parameters matter over their whole ranges, motion by motion."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -11,6 +11,9 @@ from ._estimates import Estimate, MorrisDesign, SobolDesign, constant, morris_de
 from ._global import GlobalSensitivity
 from ._samples import Span, check_power, check_ranges, spread
 from ._sweep import sweep
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _DESIGNS = {"sobol": sobol_design, "morris": morris_design}
 # Share of the blocks of a design that may be lost.
@@ -44,7 +47,7 @@ def global_sensitivity(
     by: str | None = None,
     seed: int = 0,
     confidence: float = 0.95,
-    **options: Any,
+    **options: object,
 ) -> GlobalSensitivity:
     """Which parameters matter over their whole ranges, for each kind of motion apart.
 
@@ -119,7 +122,8 @@ def global_sensitivity(
         raise ValueError(f"confidence must lie between 0 and 1, but {confidence!r} was given.")
     asked, by = _asked(system, observe, by)
     design = _DESIGNS[method](len(ranges), int(count), confidence, seed)
-    runs = sweep(system, {"sample": spread(ranges, design.points)}, asked, **options)
+    given: dict[str, Any] = options
+    runs = sweep(system, {"sample": spread(ranges, design.points)}, asked, **given)
     values = _values(runs, by)
     ok = np.asarray(runs["result"]) == 0
     use = np.repeat(ok.reshape(-1, design.block).all(axis=1), design.block)
@@ -130,11 +134,13 @@ def global_sensitivity(
     return _result(method, design, tuple(ranges), runs, values, use, classes, confidence)
 
 
-def _asked(system: Any, observe: Any, by: str | None) -> tuple[Any, str | None]:
+def _asked(
+    system: object, observe: Mapping[str, object] | Sequence[str] | str | None, by: str | None
+) -> tuple[dict[str, object] | None, str | None]:
     """What is observed, with the kind of motion where a scene has one, and its name."""
     if observe is None:
         return None, by
-    asked = {name: name for name in ([observe] if isinstance(observe, str) else observe)}
+    asked: dict[str, object] = {name: name for name in ([observe] if isinstance(observe, str) else observe)}
     if isinstance(observe, Mapping):
         asked = dict(observe)
     if by is None and isinstance(system, Scene) and system.event_driven:
@@ -145,14 +151,14 @@ def _asked(system: Any, observe: Any, by: str | None) -> tuple[Any, str | None]:
     return asked, by
 
 
-def _given(asked: Any, name: str) -> Any:
+def _given(asked: Mapping[str, object] | None, name: str) -> object:
     given = None if asked is None else asked[name]
     return given[0] if isinstance(given, tuple) else given
 
 
-def _values(runs: Any, by: str | None) -> dict[str, np.ndarray]:
+def _values(runs: "xr.Dataset", by: str | None) -> dict[str, np.ndarray]:
     """Each observable as a vector over the runs."""
-    values = {name: runs[name] for name in runs.data_vars if name not in ("result", "num_steps")}
+    values = {str(name): runs[name] for name in runs.data_vars if name not in ("result", "num_steps")}
     if by is not None and by not in values:
         raise ValueError(f"by names {by!r}, but the function returns: {', '.join(values)}.")
     for name, value in values.items():
@@ -164,7 +170,7 @@ def _values(runs: Any, by: str | None) -> dict[str, np.ndarray]:
     return {name: np.asarray(value, float) for name, value in values.items()}
 
 
-def _check_losses(runs: Any, ok: np.ndarray, use: np.ndarray) -> None:
+def _check_losses(runs: "xr.Dataset", ok: np.ndarray, use: np.ndarray) -> None:
     lost = 1.0 - use.mean()
     if lost <= _LOSS:
         return
@@ -190,7 +196,7 @@ def _result(
     method: str,
     design: SobolDesign | MorrisDesign,
     names: tuple[str, ...],
-    runs: Any,
+    runs: "xr.Dataset",
     values: dict[str, np.ndarray],
     use: np.ndarray,
     classes: _Classes | None,

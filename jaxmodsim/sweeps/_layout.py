@@ -1,7 +1,7 @@
 """The variables of a result: their dimensions, sizes and attributes."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +24,7 @@ class Variable:
     shape: tuple[int, ...]
     dtype: np.dtype
     fill: float | int
-    attrs: dict[str, Any]
+    attrs: Mapping[str, object]
 
 
 @dataclass(frozen=True)
@@ -38,14 +38,14 @@ class ResultLayout:
 
     dims: tuple[str, ...]
     shape: tuple[int, ...]
-    coordinates: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]]
+    coordinates: dict[str, tuple[tuple[str, ...], np.ndarray, Mapping[str, object]]]
     variables: tuple[Variable, ...]
 
 
 def layout(request: Request) -> ResultLayout:
     """Lay out the result of a sweep."""
     dims = tuple(axis.name for axis in request.grid.axes)
-    coordinates: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]] = {}
+    coordinates: dict[str, tuple[tuple[str, ...], np.ndarray, Mapping[str, object]]] = {}
     for axis in request.grid.axes:
         for name, values in axis.values.items():
             inner = tuple(f"{name}_{i}" for i in range(values.ndim - 1))

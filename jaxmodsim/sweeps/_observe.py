@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -13,7 +13,7 @@ from ..simulation import Trajectory, named_series
 from ._grid import RESERVED
 
 # A function of the run that returns real numbers, or a name as in `simulation.named_series`.
-Observable: TypeAlias = Callable[[Trajectory], Any] | str
+Observable: TypeAlias = Callable[[Trajectory], object] | str
 
 
 @dataclass(frozen=True)

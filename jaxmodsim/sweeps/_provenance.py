@@ -2,7 +2,6 @@
 
 import hashlib
 from functools import cache
-from typing import Any
 
 import jax
 import jax.tree_util as jtu
@@ -19,7 +18,7 @@ _PACKAGES = ("jaxmodsim", "jax", "jaxlib", "diffrax", "equinox", "numpy")
 _SHORT = 16
 
 
-def provenance(request: Request, work: Work, extent: tuple[int, ...]) -> dict[str, Any]:
+def provenance(request: Request, work: Work, extent: tuple[int, ...]) -> dict[str, object]:
     """All that the numbers of a sweep follow from, as values for JSON: where it is the same, so are they."""
     scene, arguments = request.fixed or (None, {})
     numbers = {} if scene is None else scene_numbers(scene)
@@ -69,7 +68,7 @@ def solver_of(request: Request) -> str:
     return repr(default_solver(scene, np.size(arguments["q0"]), "dt" in arguments) if chosen is None else chosen)
 
 
-def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
+def differences(then: dict[str, object], now: dict[str, object]) -> list[str]:
     """What is not the same in two provenances, in words."""
     found = []
     for part in [*then, *(name for name in now if name not in then)]:
@@ -93,6 +92,6 @@ def _digest(x: object) -> str:
     return hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest()[:16]
 
 
-def _value(x: object) -> Any:
+def _value(x: object) -> object:
     x = np.asarray(x)
     return x.tolist() if x.size <= _SHORT else f"{x.shape} {x.dtype} {_digest(x)}"

@@ -1,7 +1,7 @@
 """What the caller of `sweep` asks for, checked and converted."""
 
 import inspect
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,7 +75,7 @@ def request(system: object, grid: Grid, observe: object, arguments: Mapping[str,
     return Request(run, (), converted, shapes(run, (), converted.first), {})
 
 
-def _check_taken(function: Any, names: Iterable[str]) -> None:
+def _check_taken(function: Callable[..., object], names: Iterable[str]) -> None:
     """Refuse names that a function does not take, and those that are missing."""
     try:
         signature = inspect.signature(function)
@@ -89,7 +89,7 @@ def _check_taken(function: Any, names: Iterable[str]) -> None:
         ) from error
 
 
-def _of_scene(scene: Scene, grid: Grid, observe: object, arguments: dict[str, Any]) -> Request:
+def _of_scene(scene: Scene, grid: Grid, observe: object, arguments: dict[str, object]) -> Request:
     arguments = {name: value for name, value in arguments.items() if value is not None}
     for name in arguments:
         if name in ("throw", "adjoint", "scene") or name not in _OPTIONS:
@@ -155,7 +155,7 @@ def _check_runs(grid: Grid, numbers: Mapping[str, Any]) -> None:
         )
 
 
-def _inside(scene: Scene) -> dict[str, tuple[tuple[int, ...], Any, str]]:
+def _inside(scene: Scene) -> dict[str, tuple[tuple[int, ...], np.dtype, str]]:
     """Shape, type and array of each number of a scene, arrays and their single entries alike, by name."""
     leaves = scene_numbers(scene)
     single = {name: ((), leaves[leaf].dtype, leaf) for name, (leaf, _) in elements(scene).items()}
@@ -168,7 +168,9 @@ def _outside(numbers: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
     return known | {f"{name}[{i}]": () for name in ("q0", "qd0") for i in range(np.size(numbers[name]))}
 
 
-def _fixed(scene: Scene, arguments: dict[str, Any], swept: Mapping[str, np.ndarray]) -> tuple[dict[str, Any], Any]:
+def _fixed(
+    scene: Scene, arguments: Mapping[str, Any], swept: Mapping[str, np.ndarray]
+) -> tuple[dict[str, Any], np.dtype]:
     """Arguments of `simulate` that are numbers, one value of those that are swept; and the floating type."""
     numbers = {name: arguments[name] for name in _NUMBERS if name in arguments}
     numbers |= {name: swept[name][0] for name in _SWEPT if name in swept}

@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,10 +47,12 @@ class AbstractResults(abc.ABC):
 class Memory(AbstractResults):
     """Results in the memory of this process."""
 
-    def __init__(self, layout: ResultLayout, blocks: Blocks, attrs: dict[str, Any], provenance: dict[str, Any]) -> None:
+    def __init__(
+        self, layout: ResultLayout, blocks: Blocks, attrs: Mapping[str, object], provenance: dict[str, object]
+    ) -> None:
         """Make room for all of them."""
         self._layout, self._blocks = layout, blocks
-        self._attrs = attrs | {_ATTRIBUTE: json.dumps(provenance)}
+        self._attrs = {**attrs, _ATTRIBUTE: json.dumps(provenance)}
         self._arrays = {x.name: np.full((*layout.shape, *x.shape), x.fill, x.dtype) for x in layout.variables}
 
     def done(self, block: int) -> np.ndarray | None:
@@ -84,7 +86,12 @@ class Store(AbstractResults):
     """
 
     def __init__(
-        self, path: Path, layout: ResultLayout, blocks: Blocks, attrs: dict[str, Any], provenance: dict[str, Any]
+        self,
+        path: Path,
+        layout: ResultLayout,
+        blocks: Blocks,
+        attrs: Mapping[str, object],
+        provenance: dict[str, object],
     ) -> None:
         """Make the store, or go on with the one that is there."""
         self._path, self._layout, self._blocks = path, layout, blocks
@@ -94,7 +101,7 @@ class Store(AbstractResults):
             for left in path.rglob(_PARTIAL):
                 left.unlink(missing_ok=True)
         else:
-            _create(path, layout, blocks, attrs | {_ATTRIBUTE: json.dumps(provenance)})
+            _create(path, layout, blocks, {**attrs, _ATTRIBUTE: json.dumps(provenance)})
         self._group = extra("zarr").open_group(path, mode="r+")
 
     def done(self, block: int) -> np.ndarray | None:
@@ -130,7 +137,7 @@ def parts(layout: ResultLayout, blocks: Blocks, block: int, computed: Computed) 
         yield variable.name, x.reshape(*shape, *variable.shape)
 
 
-def _check_same(path: Path, provenance: dict[str, Any]) -> None:
+def _check_same(path: Path, provenance: dict[str, object]) -> None:
     """Refuse to go on with what is something else."""
     try:
         then = json.loads(extra("zarr").open_group(path, mode="r").attrs[_ATTRIBUTE])
@@ -145,7 +152,7 @@ def _check_same(path: Path, provenance: dict[str, Any]) -> None:
         )
 
 
-def _create(path: Path, layout: ResultLayout, blocks: Blocks, attrs: dict[str, Any]) -> None:
+def _create(path: Path, layout: ResultLayout, blocks: Blocks, attrs: Mapping[str, object]) -> None:
     """Make an empty store, which appears whole."""
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
@@ -180,7 +187,7 @@ def _create_variable(group: Any, x: Variable, layout: ResultLayout, blocks: Bloc
     )
 
 
-def _codecs() -> tuple[Any, ...]:
+def _codecs() -> tuple[object, ...]:
     """How chunks are packed: with a checksum behind, as a damaged one could hold other numbers."""
     codecs = importlib.import_module("zarr.codecs")
     return codecs.ZstdCodec(), codecs.Crc32cCodec()

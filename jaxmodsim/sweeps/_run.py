@@ -105,7 +105,7 @@ class SceneRun(AbstractRun):
 class FunctionRun(AbstractRun):
     """A function of the numbers of the run that returns numbers, or a run that is then observed."""
 
-    function: Callable[..., Any]
+    function: Callable[..., object]
     observe: tuple[Observation, ...] | None
 
     def evaluate(self, fixed: PyTree, numbers: Mapping[str, Array]) -> RunOutcome:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from .._core.arguments import as_whole
 
 # (low, high), (low, high, "log"), or a frozen distribution of scipy.stats.
-Span: TypeAlias = tuple[float, float] | tuple[float, float, str] | Any
+Span: TypeAlias = tuple[float, float] | tuple[float, float, str] | object
 
 
 def latin_hypercube(ranges: Mapping[str, Span], count: int, *, seed: int = 0) -> dict[str, np.ndarray]:

@@ -149,7 +149,7 @@ def runs_per_block(asked: Request, platform: str, chunk: int | None) -> int:
     return max(min(_RUNS, even, int(_ROOM / room)), 1)
 
 
-def _results(asked: Request, work: Work, cut: Blocks, out: Any) -> AbstractResults:
+def _results(asked: Request, work: Work, cut: Blocks, out: str | PathLike[str] | None) -> AbstractResults:
     laid = layout(asked)
     attrs = {
         "system": describe(asked),
@@ -167,7 +167,7 @@ def _run(
     cut: Blocks,
     results: AbstractResults,
     executor: object,
-    devices: list[Any],
+    devices: list[object],
     report: Progress,
 ) -> None:
     """Run the blocks that are not there yet."""

@@ -1,7 +1,6 @@
 """An axis led along a motion: the force it takes, and what the record of it would tell about the axis."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -90,14 +89,14 @@ def feed_forward(
     scene = axis.scene
 
     def acceleration(force: float, t: Array, y: State) -> Array:
-        params: dict[str, Any] = {**scene.params, axis.input: jnp.full((), force, q.dtype)}
+        params: dict[str, object] = {**scene.params, axis.input: jnp.full((), force, q.dtype)}
         driven = Scene(scene.lagrangian, params=params, effects=scene.effects)
         return vector_field(t, y, driven).qd[0]
 
-    def advance(z: dict[str, Any], sample: tuple[Array, ...]) -> tuple[dict[str, Any], Array]:
+    def advance(z: dict[str, object], sample: tuple[Array, ...]) -> tuple[dict[str, object], Array]:
         start, step, q0, qd0, q1, qd1 = sample
 
-        def state(t: Array, z: dict[str, Any]) -> State:
+        def state(t: Array, z: dict[str, object]) -> State:
             share = (t - start) / step
             return State(jnp.reshape(q0 + share * (q1 - q0), (1,)), jnp.reshape(qd0 + share * (qd1 - qd0), (1,)), z)
 

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -206,7 +205,7 @@ class InputDesign:
             for name, value in self.values.items()
         ]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """All but the samples, as JSON knows it: errors that are infinite are None."""
         return jsonable(
             {

@@ -50,7 +50,7 @@ class Controller(eqx.Module):
     - `memory`: its state at the first sample, a pytree of numbers.
     """
 
-    fn: Callable[..., Any] = eqx.field(static=True)
+    fn: Callable[..., tuple[dict[str, Array], PyTree]] = eqx.field(static=True)
     memory: PyTree[Array] = eqx.field(default=(), converter=lambda tree: jtu.tree_map(jnp.asarray, tree))
 
 
@@ -86,7 +86,9 @@ def run_samples(
     What was observed at each sample, with a leading axis of samples, and the state at the last one.
     """
 
-    def advance(carry: tuple[State, Any], sample: Any) -> tuple[tuple[State, Any], Any]:
+    def advance(
+        carry: tuple[State, PyTree], sample: tuple[Array, Array, PyTree, PyTree]
+    ) -> tuple[tuple[State, PyTree], PyTree]:
         (y, memory), (start, dt, held, slopes) = carry, sample
         here = _driven(scene, held)
         outputs: dict[str, Array] = {}
@@ -100,7 +102,7 @@ def run_samples(
 
         step = dt / substeps
 
-        def substep(k: Any, y: State) -> State:
+        def substep(k: int | Array, y: State) -> State:
             return rosenbrock_step(RODAS3, field, start + k * step, step, y, pivot=True).y1
 
         moved = substep(0, y) if substeps == 1 else jax.lax.fori_loop(0, substeps, substep, y)
@@ -328,10 +330,10 @@ def law_force(
     dt = jnp.diff(t)
     v = jnp.diff(x) / jnp.where(dt > 0, dt, 1.0)  # records side by side repeat their last time
 
-    def at(t: Array, x: Array, v: Array, params: Any) -> Any:
+    def at(t: Array, x: Array, v: Array, params: PyTree) -> Any:
         return law.bind_state(t, x[None], v[None], params)
 
-    def advance(z: Any, sample: Any) -> tuple[Any, Array]:
+    def advance(z: PyTree, sample: tuple[PyTree, ...]) -> tuple[PyTree, Array]:
         t, x, v, params, dt = sample
         here = at(t, x, v, params)
         if isinstance(here, AbstractForceLaw):

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -182,9 +182,9 @@ class Comparison:
         return self.ranked[0]
 
     @property
-    def table(self) -> list[dict[str, Any]]:
+    def table(self) -> list[dict[str, object]]:
         """Rows by rank, then the models that failed or were not finished, of types that JSON knows."""
-        rows: list[dict[str, Any]] = [
+        rows: list[dict[str, object]] = [
             {
                 "name": each.name,
                 "description": each.description,
@@ -203,7 +203,7 @@ class Comparison:
             }
             for each in self.ranked
         ]
-        rows += [{"name": name, "failed": reason} for name, reason in self.failures.items()]
+        rows.extend({"name": name, "failed": reason} for name, reason in self.failures.items())
         return rows + [{"name": name, "failed": "not finished"} for name in self.left]
 
     @property
@@ -239,7 +239,7 @@ class Comparison:
 
     def __str__(self) -> str:
         """A ranked table that ends with the conclusion."""
-        width = max(len(row["name"]) for row in self.table)
+        width = max(len(str(row["name"])) for row in self.table)
         lines = [
             f"{'':{width}}  {'param.':>6}  {'held back':>10}  {'std. error':>10}  {'over the best':>21}  {'fitted':>10}"
             f"  {'Takeuchi':>9}  {'BIC':>9}"
@@ -261,7 +261,7 @@ class Comparison:
             lines.append(f"Interrupted; not finished: {', '.join(self.left)}.")
         return "\n".join([*lines, self.conclusion] if self.ranked else lines)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """All of it but the samples and the models, as JSON knows it: numbers that are not finite are None."""
         return jsonable(
             {

@@ -143,7 +143,7 @@ class FitResult:
         parts = {part: kind(**{name: stored[name] for name in names[part]}) for part, kind in _PARTS.items()}
         return FitResult(**parts, search=None)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """All but the samples and the model, as JSON knows it: numbers that are not finite are None."""
         estimate, diagnostics, intervals = self.estimate, self.diagnostics, self.estimate.intervals()
         return jsonable(
@@ -303,7 +303,7 @@ def _bytes(array: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def _packed(x: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
+def _packed(x: object, name: str, arrays: dict[str, np.ndarray]) -> object:
     """As JSON knows it; arrays aside, numbers that JSON does not know as words."""
     if isinstance(x, Record):
         parts = {
@@ -327,7 +327,7 @@ def _packed(x: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
     return x
 
 
-def _unpacked(x: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+def _unpacked(x: object, arrays: Mapping[str, np.ndarray]) -> Any:
     if not isinstance(x, dict):
         return x
     ((kind, inside),) = x.items()
