@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
-from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -194,7 +193,7 @@ class _Mode:
         return np.array([rows @ each for each in (x, first, second, self.rate @ second)])
 
 
-def _polynomial(coefficients: np.ndarray, s: Any) -> Any:
+def _polynomial(coefficients: np.ndarray, s: float | np.ndarray) -> np.ndarray:
     return np.polynomial.polynomial.polyval(s, coefficients)
 
 
