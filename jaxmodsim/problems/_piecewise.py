@@ -193,7 +193,7 @@ class _Mode:
         return np.array([rows @ each for each in (x, first, second, self.rate @ second)])
 
 
-def _polynomial(coefficients: np.ndarray, s: float | np.ndarray) -> np.ndarray:
+def _polynomial(coefficients: np.ndarray, s: float | np.ndarray) -> np.ndarray | np.floating:
     return np.polynomial.polynomial.polyval(s, coefficients)
 
 
