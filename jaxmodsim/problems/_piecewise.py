@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -193,7 +194,7 @@ class _Mode:
         return np.array([rows @ each for each in (x, first, second, self.rate @ second)])
 
 
-def _polynomial(coefficients: np.ndarray, s: float | np.ndarray) -> np.ndarray | np.floating:
+def _polynomial(coefficients: np.ndarray, s: Any) -> Any:
     return np.polynomial.polynomial.polyval(s, coefficients)
 
 
