@@ -3,11 +3,10 @@
 import difflib
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 
 
 def check_real(value: object, *, name: str) -> None:
@@ -103,7 +102,7 @@ def as_names(value: object, *, name: str) -> tuple[str, ...]:
     return tuple(value)
 
 
-def as_mapping(value: object, *, name: str, example: str) -> dict[str, Any]:
+def as_mapping(value: object, *, name: str, example: str) -> dict[str, PyTree]:
     """A mapping by names; None is an empty one.
 
     **Raises:**

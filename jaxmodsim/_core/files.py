@@ -6,7 +6,9 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
+
+from jaxtyping import PyTree
 
 
 @contextmanager
@@ -25,7 +27,7 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         raise
 
 
-def jsonable(value: Any) -> Any:
+def jsonable(value: PyTree) -> PyTree:
     """Dictionaries, lists, text and numbers as JSON knows them: arrays become lists, what is not finite null."""
     if isinstance(value, dict):
         return {key: jsonable(item) for key, item in value.items()}

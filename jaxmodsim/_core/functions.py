@@ -1,13 +1,12 @@
 """Functions as parts of pytrees."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .arguments import check_real
 from .index_check import traced
@@ -16,9 +15,9 @@ from .index_check import traced
 class Function(eqx.Module):
     """A plain function as part of a pytree: it holds no numbers and is compared by identity."""
 
-    fn: Callable[..., Any] = eqx.field(static=True)
+    fn: Callable[..., PyTree] = eqx.field(static=True)
 
-    def __call__(self, *args: object) -> Any:
+    def __call__(self, *args: object) -> PyTree:
         """Call the function."""
         return self.fn(*args)
 
@@ -58,7 +57,7 @@ def real_array(value: object, *, name: str) -> Array:
         raise ValueError(f"What {name} returns must be an array of real numbers, but it is {value!r}.") from error
 
 
-def as_function(value: object, *, name: str) -> Callable[..., Any]:
+def as_function(value: object, *, name: str) -> Callable[..., PyTree]:
     """Make a callable fit to sit in a pytree: an `eqx.Module` stays what it is, anything else is wrapped.
 
     **Raises:**
@@ -67,7 +66,7 @@ def as_function(value: object, *, name: str) -> Callable[..., Any]:
     """
     if not callable(value):
         raise ValueError(f"{name} must be a function, but {value!r} was given.")
-    fn: Callable[..., Any] = value
+    fn: Callable[..., PyTree] = value
     return fn if isinstance(value, eqx.Module) else Function(fn)
 
 

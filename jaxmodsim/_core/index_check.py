@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jax.lax import GatherScatterMode
+from jaxtyping import ArrayLike, PyTree
 
 # What is known of a variable while tracing: its value, integers or booleans; the name of an argument; nothing.
 _Known: TypeAlias = np.ndarray | str | None
@@ -18,7 +19,7 @@ _Known: TypeAlias = np.ndarray | str | None
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call"}
 
 
-def traced(fn: Callable[..., object], *, name: str, **args: object) -> Any:
+def traced(fn: Callable[..., object], *, name: str, **args: object) -> PyTree:
     """Shapes and types of what a function returns, from one trace that also looks at its indices.
 
     An index is seen where it is known while tracing: a number, or an array of numbers. Passed over are indices that
@@ -103,7 +104,7 @@ def _sentence(array: _Known, shape: tuple[int, ...], axis: int, index: int) -> s
     )
 
 
-def _follow(closed: Any, inputs: Sequence[_Known], name: str) -> list[_Known]:
+def _follow(closed: ClosedJaxpr | Jaxpr, inputs: Sequence[_Known], name: str) -> list[_Known]:
     """What is known of the results of a traced function, with what is known of its inputs.
 
     **Raises:**
@@ -111,7 +112,7 @@ def _follow(closed: Any, inputs: Sequence[_Known], name: str) -> list[_Known]:
     - `ValueError` naming `name` where it reads or writes at an index out of range.
     """
     jaxpr, consts = (closed.jaxpr, closed.consts) if isinstance(closed, ClosedJaxpr) else (closed, ())
-    known: dict[Any, _Known] = dict(zip(jaxpr.invars, inputs, strict=True))
+    known: dict[object, _Known] = dict(zip(jaxpr.invars, inputs, strict=True))
     known.update(zip(jaxpr.constvars, map(_constant, consts), strict=False))
 
     def read(x: object) -> _Known:
@@ -143,9 +144,9 @@ def _constant(value: object) -> np.ndarray | None:
     return np.asarray(value) if isinstance(kind, np.dtype) and kind.kind in "iub" else None
 
 
-def _bodies(eqn: JaxprEqn, given: list[_Known]) -> list[tuple[Any, list[_Known]]]:
+def _bodies(eqn: JaxprEqn, given: list[_Known]) -> list[tuple[ClosedJaxpr | Jaxpr, list[_Known]]]:
     """Functions inside an equation, with what is known of their inputs: in loops, what does not change."""
-    params: dict[str, Any] = eqn.params
+    params = eqn.params
     bodies = [
         body
         for value in params.values()
@@ -217,12 +218,12 @@ def _iota(*, shape: tuple[int, ...], dimension: int, **_: object) -> np.ndarray:
     )
 
 
-def _elementwise(fn: Callable[..., object]) -> Callable[..., Any]:
+def _elementwise(fn: Callable[..., ArrayLike]) -> Callable[..., ArrayLike]:
     return lambda *values, **_: fn(*values)
 
 
 # Primitives that indices are computed with, in NumPy: by JAX, each would be compiled.
-_INTEGERS: dict[str, Callable[..., Any]] = {
+_INTEGERS: dict[str, Callable[..., ArrayLike]] = {
     **{
         kind: _elementwise(fn)
         for kind, fn in {

@@ -14,13 +14,14 @@ MAX_UNROLLED_LU = 12
 # An array, or one of NumPy's scalars where the number is known while tracing.
 Scalar: TypeAlias = Inexact[Array, ""] | np.generic
 LinearSolver: TypeAlias = Callable[[list[Array]], list[Array]]
-_Rows: TypeAlias = list[list[Any]]
+_Entry: TypeAlias = Any  # a `Scalar`: type checkers know no arithmetic of `np.generic`
+_Rows: TypeAlias = list[list[_Entry]]
 
 
 class _Pattern(NamedTuple):
     """Rows whose known entries are written here, and whose others (None) are in a list."""
 
-    rows: tuple[tuple[Any, ...], ...]
+    rows: tuple[tuple[_Entry, ...], ...]
 
     @classmethod
     def of(cls, rows: _Rows) -> tuple["_Pattern", list[Array]]:
@@ -123,18 +124,18 @@ def _eliminate(table: _Rows, pivot: bool) -> tuple[_Rows, dict[tuple[int, int], 
     return table, swaps
 
 
-def _choose(condition: Array, a: Any, b: Any) -> Any:
+def _choose(condition: Array, a: _Entry, b: _Entry) -> _Entry:
     return a if is_known(a) and is_known(b) and a == b else jnp.where(condition, a, b)
 
 
-def _reduce(x: Any, a: Any, b: Any) -> Any:
+def _reduce(x: _Entry, a: _Entry, b: _Entry) -> _Entry:
     """`x - a b`."""
     if is_zero(a) or is_zero(b):
         return x
     return -(a * b) if is_zero(x) else x - a * b
 
 
-def _substitute(table: _Rows, swaps: dict[tuple[int, int], Array], rhs: list[Any]) -> list[Any]:
+def _substitute(table: _Rows, swaps: dict[tuple[int, int], Array], rhs: list[_Entry]) -> list[_Entry]:
     n, x = len(table), list(rhs)
     for (k, i), swap in swaps.items():
         x[k], x[i] = jnp.where(swap, x[i], x[k]), jnp.where(swap, x[k], x[i])
@@ -160,7 +161,9 @@ def _solve(
 
 
 @_solve.defjvp
-def _solve_jvp(shape: _Shape, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+def _solve_jvp(
+    shape: _Shape, primals: tuple[list[Array], ...], tangents: tuple[list[Array], ...]
+) -> tuple[list[Array], list[Array]]:
     """A x = b gives A dx = db - dA x."""
     matrix, factors, swaps, rhs = primals
     matrix_dot, _, _, rhs_dot = tangents

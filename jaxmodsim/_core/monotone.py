@@ -6,11 +6,11 @@ between points where the sign is known, so that the search always ends.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .lu import MAX_UNROLLED_LU, factor_lu
 
@@ -256,7 +256,7 @@ def _length(
 ) -> Array:
     """Length of a Newton step, at most 1, along which the derivative begins with `first` < 0; 1 where `settled`."""
 
-    def along(length: Any) -> Array:
+    def along(length: ArrayLike) -> Array:
         return jnp.sum(step * (fn(x + length * step) - push - length * change))
 
     eps, one = float(jnp.finfo(x.dtype).eps), jnp.ones_like(first)

@@ -148,7 +148,7 @@ def optional_vector_parameter(name: str, unit: str, *, lower: float | str | None
     return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower)})
 
 
-def _unless_none(value: object, *, convert: Callable[..., object], name: str) -> Any:
+def _unless_none(value: object, *, convert: Callable[..., object], name: str) -> object:
     return None if value is None else convert(value, name=name)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .functions import as_function, real_array
 from .parameters import as_real
@@ -15,7 +15,7 @@ from .parameters import as_real
 class PositionFn(eqx.Module):
     """A function `place(q)` or `place(q, params)`, called as the latter."""
 
-    place: Callable[..., Any]
+    place: Callable[..., ArrayLike]
     with_params: bool = eqx.field(static=True)
     name: str = eqx.field(static=True)
 
@@ -50,7 +50,7 @@ def as_position_fn(value: Any, *, name: str) -> PositionFn:
 class ScalarOrFn(eqx.Module):
     """A number, or a function of the parameters that returns one."""
 
-    amount: Any
+    amount: Callable[..., ArrayLike] | Array
 
     def __call__(self, params: PyTree) -> Array:
         """The number."""

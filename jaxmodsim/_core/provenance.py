@@ -5,10 +5,9 @@ import platform
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 
-def describe_machine(*packages: str, beside: tuple[str, ...] = ()) -> dict[str, Any]:
+def describe_machine(*packages: str, beside: tuple[str, ...] = ()) -> dict[str, object]:
     """Processor, versions of the packages, date and, of the repository in the working directory, the commit.
 
     Changes to the paths `beside`, from the root of the repository, do not count as uncommitted changes.

@@ -2,16 +2,16 @@
 
 import functools
 import itertools
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeAlias
 
 import jax
 import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.extend.core import Literal, jaxpr_as_fun
-from jaxtyping import Array, Float
+from jax.extend.core import Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .fusion import fusion_barrier, opaque_one
 
@@ -35,9 +35,11 @@ _CALLS = {"jit", "pjit", "closed_call", "core_call"}
 
 # Entries of an array: scalars, those known while tracing as NumPy's. Every other value is one array, not taken apart.
 _Parts = np.ndarray
+_Value: TypeAlias = Array | np.ndarray | np.generic
+_Params: TypeAlias = dict[str, Any]  # as JAX has them
 
 
-def in_scalars(fn: Callable[..., Any], *args: Any, seed: Float[Array, "..."]) -> Any:
+def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "..."]) -> PyTree:
     """`fn(*args)`, with every small array on the way taken apart into scalars.
 
     XLA on CPU fuses operations on arrays of two to eight entries badly, and computes what they share over and over; of
@@ -69,7 +71,7 @@ def in_scalars(fn: Callable[..., Any], *args: Any, seed: Float[Array, "..."]) ->
     return jtu.tree_unflatten(jtu.tree_structure(shapes), out)
 
 
-def columns_of(linear: Callable[..., list[Any]], unit: Float[Array, ""], *like: Any) -> list[list[Any]]:
+def columns_of(linear: Callable[..., list[_Value]], unit: Float[Array, ""], *like: ArrayLike) -> list[list[_Value]]:
     """The matrix of a linear function of scalars, column by column; zeros and ones that its structure shows are known.
 
     **Arguments:**
@@ -104,7 +106,7 @@ def _entries(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
     return itertools.product(*map(range, shape))
 
 
-def _array(shape: tuple[int, ...], entry: Callable[[tuple[int, ...]], Any]) -> _Parts:
+def _array(shape: tuple[int, ...], entry: Callable[[tuple[int, ...]], _Value]) -> _Parts:
     out = np.empty(shape, object)
     for index in _entries(shape):
         out[index] = entry(index)
@@ -119,11 +121,11 @@ def _whole(x: Any) -> Any:
     return jnp.asarray(x[()]) if x.shape == () else jnp.stack([_whole(x[i, ...]) for i in range(len(x))])
 
 
-def _apart(x: Any) -> bool:
+def _apart(x: object) -> bool:
     return isinstance(x, np.ndarray) and x.dtype == object
 
 
-def _known(x: Any) -> bool:
+def _known(x: object) -> bool:
     return isinstance(x, np.generic)
 
 
@@ -132,7 +134,7 @@ class _Scalars:
 
     def __init__(self, unit: Array) -> None:
         self.unit = unit
-        self.memory: dict[Any, tuple[Any, Any]] = {}
+        self.memory: dict[object, tuple[object, Any]] = {}
 
     def parts(self, x: Any) -> _Parts:
         """A value taken apart."""
@@ -146,11 +148,11 @@ class _Scalars:
             self.memory[id(x)] = x, _array(x.shape, lambda _: next(entries))
         return self.memory[id(x)][1]
 
-    def run(self, jaxpr: Any, consts: Any, args: Any) -> list[Any]:
+    def run(self, jaxpr: Jaxpr, consts: Sequence[ArrayLike], args: Sequence[_Value]) -> list[_Value]:
         """Values of the outputs, apart or whole."""
         values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(_constant, consts), *args], strict=True))
 
-        def read(atom: Any) -> Any:
+        def read(atom: Any) -> _Value:
             kind: Any = atom.aval
             return np.asarray(atom.val, kind.dtype) if isinstance(atom, Literal) else values[atom]
 
@@ -158,7 +160,7 @@ class _Scalars:
             values.update(zip(eqn.outvars, self.step(eqn, [read(x) for x in eqn.invars]), strict=True))
         return [read(x) for x in jaxpr.outvars]
 
-    def step(self, eqn: Any, inputs: list[Any]) -> list[Any]:
+    def step(self, eqn: Any, inputs: list[_Value]) -> Sequence[_Value]:
         """Outputs of one equation."""
         name, params = eqn.primitive.name, eqn.params
         if name in _CALLS:
@@ -182,14 +184,14 @@ class _Scalars:
             return [getattr(self, name)(params, *map(self.parts, inputs))]
         return self.whole(eqn, inputs)
 
-    def whole(self, eqn: Any, inputs: list[Any]) -> list[Any]:
+    def whole(self, eqn: JaxprEqn, inputs: list[_Value]) -> list[_Value]:
         """Outputs of an equation that gets its arrays whole."""
         bound = eqn.primitive.get_bind_params(eqn.params)
         functions, params = bound if isinstance(bound, tuple) else ((), bound)
         out = eqn.primitive.bind(*functions, *map(_whole, inputs), **params)
         return list(out) if eqn.primitive.multiple_results else [out]
 
-    def apply(self, compute: Callable[..., Any], name: str, params: dict[str, Any], operands: list[Any]) -> Any:
+    def apply(self, compute: Callable[..., _Value], name: str, params: _Params, operands: list[_Value]) -> _Value:
         """One scalar from scalars."""
         if all(map(_known, operands)) and name in _KNOWN:
             return np.asarray(_KNOWN[name](params, *operands))[()]
@@ -203,16 +205,16 @@ class _Scalars:
             self.memory[key] = operands, fusion_barrier(out, self.unit) if name in _REPEATED else out
         return self.memory[key][1]
 
-    def add(self, a: Any, b: Any) -> Any:
+    def add(self, a: _Value, b: _Value) -> _Value:
         return self.apply(jax.lax.add, "add", {}, [a, b])
 
-    def reduce_sum(self, params: dict[str, Any], x: _Parts) -> _Parts:
+    def reduce_sum(self, params: _Params, x: _Parts) -> _Parts:
         axes = params["axes"]
         x = np.moveaxis(x, axes, range(len(axes)))
         x = x.reshape(-1, *x.shape[len(axes) :])
         return _array(x.shape[1:], lambda i: functools.reduce(self.add, x[(slice(None), *i)]))
 
-    def cumsum(self, params: dict[str, Any], x: _Parts) -> _Parts:
+    def cumsum(self, params: _Params, x: _Parts) -> _Parts:
         step = -1 if params["reverse"] else 1
         x = np.moveaxis(x, params["axis"], 0)[::step].copy()
         for k in range(1, x.shape[0]):
@@ -220,14 +222,14 @@ class _Scalars:
                 x[(k, *i)] = self.add(x[(k - 1, *i)], x[(k, *i)])
         return np.moveaxis(x[::step], 0, params["axis"])
 
-    def dot_general(self, params: dict[str, Any], a: _Parts, b: _Parts) -> _Parts:
+    def dot_general(self, params: _Params, a: _Parts, b: _Parts) -> _Parts:
         (sum_a, sum_b), (batch_a, batch_b) = params["dimension_numbers"]
         free_a = [i for i in range(a.ndim) if i not in (*sum_a, *batch_a)]
         free_b = [i for i in range(b.ndim) if i not in (*sum_b, *batch_b)]
         a, b = a.transpose(*batch_a, *free_a, *sum_a), b.transpose(*batch_b, *free_b, *sum_b)
         batch, rows, columns = len(batch_a), len(free_a), len(free_b)
 
-        def entry(i: tuple[int, ...]) -> Any:
+        def entry(i: tuple[int, ...]) -> _Value:
             left, right = a[(*i[: batch + rows], ...)], b[(*i[:batch], *i[batch + rows :], ...)]
             pairs = zip(left.flat, right.flat, strict=True)
             return functools.reduce(self.add, [self.apply(jax.lax.mul, "mul", {}, [x, y]) for x, y in pairs])
@@ -235,11 +237,11 @@ class _Scalars:
         return _array((*a.shape[: batch + rows], *b.shape[batch : batch + columns]), entry)
 
 
-def _constant(x: Any) -> Any:
+def _constant(x: ArrayLike) -> _Value:
     return x if isinstance(x, jax.core.Tracer) else np.asarray(x)
 
 
-def _shorten(name: str, operands: list[Any]) -> Any:
+def _shorten(name: str, operands: list[_Value]) -> _Value | None:
     """Sums, products and quotients with zero or one, and choices that are known or make no difference; else None."""
     if name in ("add", "add_any", "mul"):
         for a, b in (operands, operands[::-1]):
@@ -261,7 +263,7 @@ def _shorten(name: str, operands: list[Any]) -> Any:
     return None
 
 
-def _pad(params: dict[str, Any], x: _Parts, filling: _Parts) -> _Parts:
+def _pad(params: _Params, x: _Parts, filling: _Parts) -> _Parts:
     config = [tuple(map(int, sizes)) for sizes in params["padding_config"]]
     shape = tuple(
         low + high + size + inner * max(size - 1, 0) for size, (low, high, inner) in zip(x.shape, config, strict=True)
@@ -274,19 +276,19 @@ def _pad(params: dict[str, Any], x: _Parts, filling: _Parts) -> _Parts:
     return out
 
 
-def _broadcast(params: dict[str, Any], x: _Parts) -> _Parts:
+def _broadcast(params: _Params, x: _Parts) -> _Parts:
     shape = [1] * len(params["shape"])
     for dimension, size in zip(params["broadcast_dimensions"], x.shape, strict=True):
         shape[dimension] = size
     return np.broadcast_to(x.reshape(shape), params["shape"])
 
 
-def _slice(params: dict[str, Any], x: _Parts) -> _Parts:
+def _slice(params: _Params, x: _Parts) -> _Parts:
     strides = params["strides"] or (1,) * x.ndim
     return x[tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]
 
 
-def _iota(params: dict[str, Any]) -> _Parts:
+def _iota(params: _Params) -> _Parts:
     shape, dimension = params["shape"], params["dimension"]
     return _array(shape, lambda i: np.dtype(params["dtype"]).type(i[dimension]))
 
@@ -306,7 +308,7 @@ _MOVES: dict[str, Callable[..., _Parts]] = {
 }
 
 # What is computed while tracing if the operands are known.
-_KNOWN: dict[str, Callable[..., Any]] = {
+_KNOWN: dict[str, Callable[..., ArrayLike]] = {
     "add": lambda _, a, b: a + b,
     "add_any": lambda _, a, b: a + b,
     "convert_element_type": lambda params, x: x.astype(params["new_dtype"]),

@@ -1,12 +1,12 @@
 """Parameters that change with the state of the mechanism."""
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike, PyTree
 
 from .functions import Function
 
@@ -20,8 +20,8 @@ class StateDependent(eqx.Module):
     It takes the number's place in its module, which keeps its kind; `bind_state` puts the product there.
     """
 
-    number: Any
-    fn: Callable[..., Any]
+    number: PyTree
+    fn: Callable[..., ArrayLike]
 
     def __jax_array__(self) -> Array:
         """Refuse to be taken for a number."""
@@ -59,7 +59,7 @@ def bind_state(tree: _Module, t: Array, q: Array, qd: Array, params: object) -> 
     """`tree` with the values of its parameters at a state of the mechanism; factors below 1e-30 count as that."""
     factors: dict[int, Array] = {}  # by function: parameters that share one evaluate it once
 
-    def value(x: object) -> Any:
+    def value(x: object) -> PyTree:
         if not isinstance(x, StateDependent):
             return x
         key = id(x.fn.fn if isinstance(x.fn, Function) else x.fn)
@@ -71,6 +71,6 @@ def bind_state(tree: _Module, t: Array, q: Array, qd: Array, params: object) -> 
     return jax.tree.map(value, tree, is_leaf=lambda x: isinstance(x, StateDependent))
 
 
-def nominal(value: object) -> Any:
+def nominal(value: object) -> PyTree:
     """The number of a parameter, without the factor it varies by."""
     return nominal(value.number) if isinstance(value, StateDependent) else value

@@ -3,13 +3,14 @@
 import gc
 import time
 from collections.abc import Callable
-from typing import Any
+
+from jaxtyping import PyTree
 
 _SLOW = 0.02
 _BURST = 5
 
 
-def measure(calls: dict[str, Callable[[], object]], rounds: int, limit_s: float = 30.0) -> dict[str, dict[str, Any]]:
+def measure(calls: dict[str, Callable[[], object]], rounds: int, limit_s: float = 30.0) -> dict[str, dict[str, PyTree]]:
     """Time several calls in turns, so that a drift of the machine's speed meets them all alike.
 
     The first call of each, which compiles, is timed apart. Then in every round each call has its turn: a fast one
@@ -26,7 +27,7 @@ def measure(calls: dict[str, Callable[[], object]], rounds: int, limit_s: float 
 
     For each name `first_s`, `median_s`, `quartiles_s`, `minimum_s`, `repetitions`; or `failed`, the reason.
     """
-    report: dict[str, dict[str, Any]] = {}
+    report: dict[str, dict[str, PyTree]] = {}
     seconds: dict[str, list[float]] = {}
     for name, call in calls.items():
         try:
@@ -65,7 +66,7 @@ def _seconds(call: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def _summary(taken: list[float]) -> dict[str, Any]:
+def _summary(taken: list[float]) -> dict[str, PyTree]:
     import statistics  # slow to import
 
     quartiles = statistics.quantiles(taken, n=4) if len(taken) > 1 else [taken[0]] * 3

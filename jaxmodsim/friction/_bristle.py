@@ -1,11 +1,10 @@
 """What laws with elastic elements share: how an element follows the surface and gives way, and its passivity."""
 
 import math
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._core.safe import bounded_ratio, decay_mean
 from .._core.state_dependent import nominal
@@ -60,7 +59,7 @@ def advance_elastoplastic(
     return side * limit * bent
 
 
-def bristle_passivity(self: Any) -> Passivity:
+def bristle_passivity(self: PyTree) -> Passivity:
     """Passivity of a bristle with damping, `F = sigma0 z + sigma1 z' + sigma2 v`, which fades over `vd` if it has one.
 
     At v > 0 with the bristle force `g u`, `u <= Fs/g`, the dissipation D has

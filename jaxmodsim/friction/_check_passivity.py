@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from .._core.parameters import modules_of
 from .._core.state_dependent import need_values
@@ -126,13 +126,13 @@ def _sampled(law: AbstractDynamicLaw, v_max: float) -> Passivity:
 def _losses(law: AbstractDynamicLaw, slips: jax.Array, times: jax.Array, speeds: jax.Array) -> jax.Array:
     """Dissipation [W] at each state along the slip and each speed, shape `[state, speed]`; 0 where it is rounding."""
 
-    def step(z: Any, x: tuple[jax.Array, jax.Array]) -> tuple[Any, Any]:
+    def step(z: PyTree, x: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         z = law.step_exact(x[0], z, x[1])
         return z, z
 
     states = jax.lax.scan(step, law.initial_state(jnp.zeros((), slips.dtype)), (slips, times))[1]
 
-    def lost(z: Any, v: jax.Array) -> jax.Array:
+    def lost(z: PyTree, v: jax.Array) -> jax.Array:
         given = v * law.force(v, z)
         parts = jax.tree.map(lambda slope, rate: jnp.vdot(slope, rate), jax.grad(law.stored_energy)(z), law.zdot(v, z))
         kept = jnp.stack(jax.tree.leaves(parts))

@@ -1,9 +1,9 @@
 """Coulomb friction with stiction."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._core.parameters import Number, optional_parameter, parameter
 from ._law import NO_STICTION_IN_MUJOCO, AbstractSetValuedLaw, register_law
@@ -45,11 +45,11 @@ class Coulomb(AbstractSetValuedLaw):
         del direction
         return jnp.asarray(self.Fc if self.Fs is None else self.Fs)
 
-    def lugre_numbers(self, vs: float) -> dict[str, Any]:
+    def lugre_numbers(self, vs: float) -> dict[str, PyTree]:
         """With stiction that falls over the velocity `vs`."""
         return {"Fc": self.Fc, "Fs": self.Fc if self.Fs is None else self.Fs, "vs": vs, "sigma2": 0.0}
 
-    def mujoco(self) -> dict[str, Any] | str:
+    def mujoco(self) -> dict[str, PyTree] | str:
         """Dry friction of a joint, which is one force."""
         stiction = self.Fs is not None and float(self.Fs) > float(self.Fc)
         return AbstractSetValuedLaw.mujoco(self) if stiction else {"frictionloss": self.Fc}

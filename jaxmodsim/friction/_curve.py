@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from .._core.functions import as_function, real_array
 from .._core.parameters import Number, parameter
@@ -37,7 +37,7 @@ class Curve(AbstractForceLaw):
     - `ValueError` if `fn` is no function or `gain` is out of range.
     """
 
-    fn: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Curve fn"))
+    fn: Callable[..., ArrayLike] = eqx.field(converter=partial(as_function, name="Curve fn"))
     gain: Number = parameter("gain", "N", lower=0.0, default=1.0)
     stiff: ClassVar[bool] = False
     description: ClassVar[str] = "any function of slip velocity; `Friction(fn)` makes one"

@@ -2,10 +2,10 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._core.parameters import Number, parameter
 from .._core.safe import magnitude
@@ -76,6 +76,6 @@ class Dahl(AbstractPlanarLaw):
         """Always passive: with the bristle force `Fc u` the dissipation is `|v| Fc u^2`."""
         return Passivity(True, 0.0, math.inf, "Dahl is always passive: it dissipates |v| (sigma0 z)^2/Fc.")
 
-    def mujoco(self) -> dict[str, Any]:
+    def mujoco(self) -> dict[str, PyTree]:
         """LuGre without damping and Stribeck effect, at any Stribeck velocity."""
         return {"damping": 0.0, "lugre": (self.sigma0, 0.0, self.Fc, self.Fc, 1.0)}

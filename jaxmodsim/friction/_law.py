@@ -6,7 +6,7 @@ import inspect
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -62,7 +62,7 @@ class AbstractLaw(eqx.Module):
     mujoco_lacks: ClassVar[str] = (
         ": its joints have friction that is constant, viscous, or LuGre. Fit one of these, with fit_law, and export it"
     )
-    example: ClassVar[Mapping[str, Any]] = {}
+    example: ClassVar[Mapping[str, PyTree]] = {}
     example_step: ClassVar[float | None] = None
 
     def __check_init__(self) -> None:
@@ -92,7 +92,7 @@ class AbstractLaw(eqx.Module):
         """Whether the law is passive, from a closed form; None to have `check_passivity` search."""
         return None
 
-    def mujoco(self) -> dict[str, Any] | str:
+    def mujoco(self) -> dict[str, PyTree] | str:
         """The law in MuJoCo: attributes with their numbers; or what MuJoCo lacks, and what to do.
 
         Of a `joint`, `frictionloss` [N] and `damping` [N s/m]; of a motor, `damping` and `lugre`, the numbers sigma0,
@@ -111,7 +111,7 @@ class AbstractLaw(eqx.Module):
         )
 
     @classmethod
-    def standard(cls: type[_Law], **others: Any) -> _Law:
+    def standard(cls: type[_Law], **others: object) -> _Law:
         """The law with the standard parameters, as far as it has them, and others."""
         names = [field.name for field in dataclasses.fields(cls)]
         return cls(**{name: STANDARD[name] for name in names if name in STANDARD} | dict(cls.example) | others)
@@ -188,7 +188,7 @@ class AbstractSetValuedLaw(AbstractLaw):
         """Modelica's friction components are such laws."""
         return ""
 
-    def lugre_numbers(self, vs: float) -> dict[str, Any] | None:
+    def lugre_numbers(self, vs: float) -> dict[str, PyTree] | None:
         """Parameters of LuGre but sigma0 and sigma1 that give its steady force; None where it has no such force.
 
         **Arguments:**
@@ -231,27 +231,27 @@ class AbstractDynamicLaw(AbstractLaw):
     """A law with a state of its own."""
 
     @abc.abstractmethod
-    def initial_state(self, v: Float[Array, "..."]) -> Any:
+    def initial_state(self, v: Float[Array, "..."]) -> PyTree:
         """State at rest and unloaded, for slip of the shape of `v`."""
 
     @abc.abstractmethod
-    def zdot(self, v: Float[Array, "..."], z: Any) -> Any:
+    def zdot(self, v: Float[Array, "..."], z: PyTree) -> PyTree:
         """Time derivative of the state `z` at slip velocity `v` [m/s]."""
 
     @abc.abstractmethod
-    def force_given_zdot(self, v: Float[Array, "..."], z: Any, rate: Any) -> Float[Array, "..."]:
+    def force_given_zdot(self, v: Float[Array, "..."], z: PyTree, rate: PyTree) -> Float[Array, "..."]:
         """Friction force [N] at slip velocity `v` [m/s], the state `z`, and a rate of that: damping in the bristle."""
 
-    def force(self, v: Float[Array, "..."], z: Any) -> Float[Array, "..."]:
+    def force(self, v: Float[Array, "..."], z: PyTree) -> Float[Array, "..."]:
         """Friction force [N] at slip velocity `v` [m/s] and state `z`."""
         return self.force_given_zdot(v, z, self.zdot(v, z))
 
     @abc.abstractmethod
-    def stored_energy(self, z: Any) -> Float[Array, ""]:
+    def stored_energy(self, z: PyTree) -> Float[Array, ""]:
         """Energy [J] held in the state `z`."""
 
     @abc.abstractmethod
-    def step_exact(self, v: Float[Array, "..."], z: Any, dt: Float[Array, ""]) -> Any:
+    def step_exact(self, v: Float[Array, "..."], z: PyTree, dt: Float[Array, ""]) -> PyTree:
         """State after the time `dt` [s] at constant slip velocity `v` [m/s]: bounded at any step, however stiff."""
 
     def modelica(self) -> str:

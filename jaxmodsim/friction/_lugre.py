@@ -1,11 +1,11 @@
 """The LuGre law."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._core.parameters import Number, optional_parameter, parameter
 from .._core.safe import bounded_ratio, magnitude
@@ -115,7 +115,7 @@ class LuGre(AbstractPlanarLaw):
         """Deflection [m] after `dt` [s] at constant `v` [m/s], exactly: the rate is linear in z."""
         return relax_exact(v, z, dt, self.sigma0 * magnitude(v) / self.stribeck_curve(v))
 
-    def mujoco(self) -> dict[str, Any] | str:
+    def mujoco(self) -> dict[str, PyTree] | str:
         """MuJoCo's motor has the bristle with a constant sigma1."""
         if self.vd is not None:
             return AbstractPlanarLaw.mujoco(self)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -10,7 +9,7 @@ import jax
 import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, PyTree
 
 from .._core.state_dependent import need_values
 from ._law import AbstractDynamicLaw, AbstractForceLaw, AbstractKarnoppLaw, AbstractLaw, AbstractSetValuedLaw
@@ -34,7 +33,7 @@ def max_stable_step(
     *,
     v: float = 0.0,
     k: float = 0.0,
-    z: Any = None,
+    z: PyTree = None,
     solver: dfx.AbstractSolver | dfx.ButcherTableau | None = None,
 ) -> float:
     """Largest stable step of an explicit solver for a law on a mass, on a spring if there is one.
@@ -87,7 +86,7 @@ def max_stable_step(
 
 @eqx.filter_jit
 def _matrices(
-    law: AbstractLaw, m: Float[Array, ""] | None, v: Float[Array, ""], k: Float[Array, ""], z: Any
+    law: AbstractLaw, m: Float[Array, ""] | None, v: Float[Array, ""], k: Float[Array, ""], z: PyTree
 ) -> Float[Array, "2 n n"]:
     """Derivatives of the rates of (x, v, own state) by these, of the own state alone without a mass.
 
@@ -107,7 +106,7 @@ def _matrices(
     return jnp.stack([jax.jacfwd(field)(jnp.concatenate([motion, side])) for side in sides])
 
 
-def _parts(law: AbstractLaw, z: Any) -> tuple[Array, _Part, _Part]:
+def _parts(law: AbstractLaw, z: PyTree) -> tuple[Array, _Part, _Part]:
     """The law's own state in a vector, and its force and rate as functions of velocity and that vector."""
     if isinstance(law, AbstractDynamicLaw):
         own, unravel = jax.flatten_util.ravel_pytree(z)
@@ -135,7 +134,7 @@ def _parts(law: AbstractLaw, z: Any) -> tuple[Array, _Part, _Part]:
 
 
 @eqx.filter_jit
-def _steady(law: AbstractDynamicLaw, v: Float[Array, ""]) -> Any:
+def _steady(law: AbstractDynamicLaw, v: Float[Array, ""]) -> PyTree:
     """State of steady slip at `v` [m/s], not zero."""
     z = law.initial_state(v)
     distances = jnp.asarray(_DISTANCES, v.dtype)
@@ -146,7 +145,7 @@ def _steady(law: AbstractDynamicLaw, v: Float[Array, ""]) -> Any:
     def rate(own: Array) -> Array:
         return jax.flatten_util.ravel_pytree(law.zdot(v, unravel(own)))[0]
 
-    def newton(_: Any, own: Array) -> Array:
+    def newton(_: Array, own: Array) -> Array:
         move = jnp.linalg.lstsq(jax.jacfwd(rate)(own), rate(own))[0]
         better = jnp.max(jnp.abs(rate(own - move))) < jnp.max(jnp.abs(rate(own)))
         return jnp.where(better, own - move, own)
@@ -169,7 +168,7 @@ def _refusal(law: AbstractLaw) -> str:
     return f"max_stable_step knows nothing of laws such as {name}."
 
 
-def _weights(solver: Any) -> tuple[list[np.ndarray], np.ndarray]:
+def _weights(solver: object) -> tuple[list[np.ndarray], np.ndarray]:
     """Rows below the diagonal, and weights, of an explicit Runge-Kutta method."""
     if isinstance(solver, dfx.Euler):
         return [], np.ones(1)

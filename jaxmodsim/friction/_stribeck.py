@@ -1,11 +1,11 @@
 """Coulomb friction with stiction, Stribeck effect and viscous term."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._core.parameters import Number, optional_parameter, parameter
 from .._core.safe import bounded_ratio, safe_power
@@ -33,7 +33,7 @@ def _power(x: Float[Array, ""], exponent: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.where(exponent < 1.0, rounded, safe_power(x, exponent))
 
 
-def _fall(value: Any) -> Any:
+def _fall(value: object) -> object:
     if not callable(value):
         raise ValueError(
             f"Stribeck: fall must be a function such as jaxmodsim.friction.lorentzian, but {value!r} was given."
@@ -79,7 +79,7 @@ class Stribeck(AbstractSetValuedLaw):
     vs: Number = parameter("vs", "m/s", lower=0.0, strict=True)
     Fv: Number = parameter("Fv", "N s/m", lower=0.0, default=0.0)
     exponent: Number | None = optional_parameter("exponent", "1", lower=0.0, strict=True)
-    fall: Any = eqx.field(default=exponential, static=True, converter=_fall)
+    fall: PyTree = eqx.field(default=exponential, static=True, converter=_fall)
     stiff: ClassVar[bool] = False
     description: ClassVar[str] = "stiction, Stribeck effect and viscous friction; Gaussian, exponential, Lorentzian"
     equations: ClassVar[tuple[str, ...]] = ("g(v) sign(v) + Fv v", STRIBECK_CURVE)
@@ -102,7 +102,7 @@ class Stribeck(AbstractSetValuedLaw):
         del direction
         return jnp.asarray(self.Fs)
 
-    def lugre_numbers(self, vs: float) -> dict[str, Any] | None:
+    def lugre_numbers(self, vs: float) -> dict[str, PyTree] | None:
         """Of the Gaussian curve its own."""
         del vs
         gaussian = self.fall is exponential and (self.exponent is None or bool(jnp.all(self.exponent == 2.0)))

@@ -1,12 +1,11 @@
 """A ball that bounces on the floor: infinitely many events in a finite time."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from .._core.parameters import Number, check_ranges, parameter
+from ..solvers import EventState
 
 
 class BouncingBall(eqx.Module):
@@ -41,22 +40,22 @@ class BouncingBall(eqx.Module):
         h = jnp.asarray(h, self.g.dtype)
         return jnp.stack([h, jnp.zeros_like(h)])
 
-    def field(self, t: Any, s: Any, args: Any) -> Any:
+    def field(self, t: object, s: EventState, args: object) -> EventState:
         """Rate: in free fall, or zero on the floor."""
         del t, args
         return s.rate(jnp.where(s.mode > 0.5, 0.0, jnp.stack([s.y[1], -self.g])))
 
-    def guards(self, t: Any, s: Any, args: Any) -> Float[Array, "1"]:
+    def guards(self, t: object, s: EventState, args: object) -> Float[Array, "1"]:
         """Height above the floor [m]."""
         del t, args
         return s.y[:1]
 
-    def reset(self, t: Any, s: Any, args: Any, fired: Bool[Array, "1"]) -> Any:
+    def reset(self, t: object, s: EventState, args: object, fired: Bool[Array, "1"]) -> EventState:
         """Bounce: the velocity changes its sign and keeps the part e."""
         del t, args, fired
         return s._replace(y=jnp.stack([jnp.zeros_like(s.y[0]), -self.e * s.y[1]]))
 
-    def hold(self, t: Any, s: Any, args: Any, fired: Bool[Array, "1"]) -> Any:
+    def hold(self, t: object, s: EventState, args: object, fired: Bool[Array, "1"]) -> EventState:
         """Come to rest on the floor."""
         del t, args, fired
         return s._replace(y=jnp.zeros_like(s.y), mode=jnp.ones_like(s.mode))

@@ -1,12 +1,10 @@
 """A pole on a cart."""
 
-from typing import Any
-
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..mechanics import rigid_body
-from ..scene import AppliedForce, Friction, Scene
+from ..scene import AbstractEffect, AppliedForce, Friction, Scene
 
 # Masses of cart and pole [kg], length of the pole [m], gravity [m/s^2].
 CART_POLE = {"M": 1.0, "m": 0.3, "l": 1.2, "g": 9.81}
@@ -67,8 +65,8 @@ def cart_pole(
     A `Scene`, with the effects `push` and `friction` where they are asked for. Its exact accelerations:
     `cart_pole_acceleration`.
     """
-    params: dict[str, Any] = {"M": M, "m": m, "l": l, "g": g}
-    effects: tuple[Any, ...] = () if law is None else (Friction(law, along=_track),)
+    params: dict[str, ArrayLike] = {"M": M, "m": m, "l": l, "g": g}
+    effects: tuple[AbstractEffect, ...] = () if law is None else (Friction(law, along=_track),)
     if force is not None:
         params["force"] = force
         effects = (AppliedForce(_push, name="push"), *effects)

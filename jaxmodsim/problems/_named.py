@@ -2,11 +2,10 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import ArrayLike, Float, PyTree
 
 from ..friction import Coulomb
 from ..scene import Scene
@@ -49,7 +48,7 @@ class NamedProblem:
     max_steps: int = 16384
 
     @property
-    def arguments(self) -> dict[str, Any]:
+    def arguments(self) -> dict[str, PyTree]:
         """Keyword arguments of `jaxmodsim.work_precision`."""
         start = {"scene": self.scene, "q0": self.q0, "qd0": self.qd0, "t1": self.t1}
         return {**start, "observable": self.observable, "reference": self.exact, "name": self.name}
@@ -73,9 +72,16 @@ def named_problems() -> dict[str, Callable[[], NamedProblem]]:
 
 
 def _case(
-    name: str, scene: Scene, q0: ArrayLike | list[float], qd0: ArrayLike | list[float], *rest: Any, **more: Any
+    name: str,
+    scene: Scene,
+    q0: ArrayLike | list[float],
+    qd0: ArrayLike | list[float],
+    t1: float,
+    observable: str,
+    exact: float | None = None,
+    **more: int,
 ) -> NamedProblem:
-    return NamedProblem(name, scene, np.asarray(q0, float), np.asarray(qd0, float), *rest, **more)
+    return NamedProblem(name, scene, np.asarray(q0, float), np.asarray(qd0, float), t1, observable, exact, **more)
 
 
 def _coulomb_box() -> NamedProblem:

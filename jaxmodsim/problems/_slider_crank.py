@@ -1,13 +1,13 @@
 """A slider-crank: closed by constraints, with friction under the force that presses the slider to its guide."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..friction import Coulomb
 from ..mechanics import Constraint, rigid_body
-from ..scene import AppliedForce, Friction, Scene
+from ..scene import AbstractEffect, AppliedForce, Friction, Scene
 
 # Masses of crank, rod and slider [kg], lengths of crank and rod [m], gravity [m/s^2].
 SLIDER_CRANK = {"m1": 0.6, "m2": 0.9, "m3": 1.4, "r": 0.3, "l": 0.8, "g": 9.81}
@@ -125,8 +125,8 @@ def slider_crank(
     `guide`, y = 0, whose multiplier is the force of the guide on the slider [N]; and where they are asked for the
     effects `drive` and `friction`. Its exact motion: `slider_crank_acceleration`, `slider_crank_forces`.
     """
-    params: dict[str, Any] = {"m1": m1, "m2": m2, "m3": m3, "r": r, "l": l, "g": g}
-    effects: tuple[Any, ...] = ()
+    params: dict[str, ArrayLike] = {"m1": m1, "m2": m2, "m3": m3, "r": r, "l": l, "g": g}
+    effects: tuple[AbstractEffect, ...] = ()
     if torque is not None:
         params["torque"] = torque
         effects = (AppliedForce(_drive, name="drive"),)

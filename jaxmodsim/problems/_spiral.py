@@ -1,7 +1,5 @@
 """A bead on a spherical spiral, with or without viscous drag and dry friction."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,7 +8,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._core.parameters import Number, parameter
 from ..friction import Coulomb
 from ..mechanics import point_mass
-from ..scene import AppliedForce, Friction, Scene
+from ..scene import AbstractEffect, AppliedForce, Friction, Scene
 
 
 class SphericalSpiral(eqx.Module):
@@ -72,8 +70,8 @@ def spiral_bead(
     with `mu`, the effect `friction`, whose law holds `mu`. All other numbers are in its `params`. Its exact
     acceleration: `spiral_bead_acceleration`.
     """
-    params: dict[str, Any] = {"m": m, "R": R, "a": a, "g": g}
-    effects: tuple[Any, ...] = ()
+    params: dict[str, ArrayLike] = {"m": m, "R": R, "a": a, "g": g}
+    effects: tuple[AbstractEffect, ...] = ()
     if k is not None:
         params["k"] = k
         effects = (AppliedForce(_drag, at=_spiral, name="drag"),)

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, TypeVar, cast
 import equinox as eqx
 import jax.numpy as jnp
 from equinox import AbstractVar
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from ..._core.parameters import check_ranges, ranges_of
 from ..._core.state_dependent import StateDependent
@@ -19,21 +19,21 @@ _Law = TypeVar("_Law")
 _ONE_WAY = "friction that depends on the direction: export the law of one direction, or the mean of both"
 
 
-def _toward(v: Float[Array, ""], law: Any) -> Any:
+def _toward(v: Float[Array, ""], law: "AbstractAsymmetric") -> PyTree:
     """The law that holds at velocity `v`."""
     names = tuple(law.backward)
     values = [jnp.where(v < 0, law.backward[name], getattr(law.forward, name)) for name in names]
     return eqx.tree_at(lambda x: [getattr(x, name) for name in names], law.forward, values)
 
 
-def other_side(law: Any) -> Any:
+def other_side(law: "AbstractAsymmetric") -> AbstractLaw:
     """The whole law for negative slip of an asymmetric one."""
     names = tuple(law.backward)
     values = [law.backward[name] for name in names]
     return eqx.tree_at(lambda x: [getattr(x, name) for name in names], law.forward, values, is_leaf=_is_varying)
 
 
-def _is_varying(x: Any) -> bool:
+def _is_varying(x: object) -> bool:
     return isinstance(x, StateDependent)
 
 
@@ -41,8 +41,8 @@ class AbstractAsymmetric(AbstractLaw):
     """What laws share some of whose parameters differ for negative slip."""
 
     # The law for positive slip, and the numbers that differ, by name.
-    forward: AbstractVar[Any]
-    backward: AbstractVar[dict[str, Any]]
+    forward: AbstractVar[PyTree]
+    backward: AbstractVar[dict[str, PyTree]]
 
     @property
     def stiff(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -77,7 +77,7 @@ class _AsymmetricForce(AbstractAsymmetric, AbstractForceLaw):  # pyright: ignore
     """A function of velocity, some of whose parameters differ for negative slip."""
 
     forward: AbstractForceLaw
-    backward: dict[str, Any]
+    backward: dict[str, PyTree]
 
     def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         return _toward(v, self).force(v)
@@ -87,7 +87,7 @@ class _AsymmetricSetValued(AbstractAsymmetric, AbstractSetValuedLaw):  # pyright
     """A set-valued law, some of whose parameters differ for negative slip."""
 
     forward: AbstractSetValuedLaw
-    backward: dict[str, Any]
+    backward: dict[str, PyTree]
 
     def sliding_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
         return _toward(v, self).sliding_force(v)
@@ -103,22 +103,22 @@ class _AsymmetricDynamic(AbstractAsymmetric, AbstractDynamicLaw):  # pyright: ig
     """A law with a state, some of whose parameters differ for negative slip."""
 
     forward: AbstractDynamicLaw
-    backward: dict[str, Any]
+    backward: dict[str, PyTree]
 
-    def initial_state(self, v: Float[Array, "..."]) -> Any:
+    def initial_state(self, v: Float[Array, "..."]) -> PyTree:
         return self.forward.initial_state(v)
 
-    def zdot(self, v: Float[Array, ""], z: Any) -> Any:
+    def zdot(self, v: Float[Array, ""], z: PyTree) -> PyTree:
         return _toward(v, self).zdot(v, z)
 
-    def force_given_zdot(self, v: Float[Array, ""], z: Any, rate: Any) -> Float[Array, ""]:
+    def force_given_zdot(self, v: Float[Array, ""], z: PyTree, rate: PyTree) -> Float[Array, ""]:
         return _toward(v, self).force_given_zdot(v, z, rate)
 
-    def stored_energy(self, z: Any) -> Float[Array, ""]:
+    def stored_energy(self, z: PyTree) -> Float[Array, ""]:
         """Energy [J] in the state: stiffness is one for both directions."""
         return self.forward.stored_energy(z)
 
-    def step_exact(self, v: Float[Array, ""], z: Any, dt: Float[Array, ""]) -> Any:
+    def step_exact(self, v: Float[Array, ""], z: PyTree, dt: Float[Array, ""]) -> PyTree:
         return _toward(v, self).step_exact(v, z, dt)
 
     def passivity(self) -> Passivity | None:
@@ -140,7 +140,7 @@ _KINDS = (
 )
 
 
-def asymmetric(law: _Law, **backward: Any) -> _Law:
+def asymmetric(law: _Law, **backward: object) -> _Law:
     """A law with other parameters for negative slip velocities.
 
     **Arguments:**
@@ -182,7 +182,7 @@ def asymmetric(law: _Law, **backward: Any) -> _Law:
             raise ValueError(
                 f"asymmetric({type(law).__name__}): {name} stores energy, so it must be the same in both directions."
             )
-    converters = {f.name: f.metadata["converter"] for f in dataclasses.fields(cast(Any, law)) if f.name in backward}
+    converters = {f.name: f.metadata["converter"] for f in dataclasses.fields(module) if f.name in backward}
     numbers = {name: _like(getattr(law, name), converters[name](value), name) for name, value in backward.items()}
     # A parameter that is limited by one that differs must differ, too, to stay above it.
     while above := [n for n, r in allowed.items() if r.lower in numbers and n not in numbers]:
@@ -192,7 +192,7 @@ def asymmetric(law: _Law, **backward: Any) -> _Law:
     return cast(_Law, both)
 
 
-def _like(old: Any, number: Any, name: str) -> Any:
+def _like(old: Array | StateDependent, number: Array | None, name: str) -> Array | StateDependent:
     """The new number, varying as the old one does.
 
     **Raises:**

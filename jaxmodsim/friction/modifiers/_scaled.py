@@ -2,10 +2,11 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
+from jaxtyping import ArrayLike
 
 from ..._core.arguments import as_names
 from ..._core.functions import as_function
@@ -14,9 +15,10 @@ from ..._core.state_dependent import StateDependent
 from .._law import AbstractLaw
 
 _Law = TypeVar("_Law")
+_Module = TypeVar("_Module", bound=eqx.Module)
 
 
-def scaled_by(law: _Law, fn: Any, parameters: Sequence[str] | None = None) -> _Law:
+def scaled_by(law: _Law, fn: object, parameters: Sequence[str] | None = None) -> _Law:
     """A law whose force, or some of whose parameters, are multiplied by a function of the mechanism's state.
 
     Friction that depends on position (`lambda t, q, qd, p: 1 + 0.2 * jnp.sin(q[0] / p["pitch"])`), on load or
@@ -64,7 +66,7 @@ def scaled_by(law: _Law, fn: Any, parameters: Sequence[str] | None = None) -> _L
     return _vary(law, factor, chosen)
 
 
-def _vary(module: Any, factor: Callable[..., Any], chosen: list[str]) -> Any:
+def _vary(module: _Module, factor: Callable[..., ArrayLike], chosen: list[str]) -> _Module:
     """`module` with the chosen parameters, its own and those of the modules in it, made to vary."""
     names, values = [], []
     for field in dataclasses.fields(module):
@@ -84,5 +86,5 @@ def _vary(module: Any, factor: Callable[..., Any], chosen: list[str]) -> Any:
     return eqx.tree_at(lambda m: [getattr(m, name) for name in names], module, values, is_leaf=_is_whole)
 
 
-def _is_whole(x: Any) -> bool:
+def _is_whole(x: object) -> bool:
     return isinstance(x, StateDependent | dict)

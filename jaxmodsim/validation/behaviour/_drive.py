@@ -1,12 +1,12 @@
 """A law under a prescribed slip velocity, without a mechanism."""
 
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from ...friction import AbstractDynamicLaw, AbstractForceLaw, AbstractKarnoppLaw, AbstractLaw, AbstractSetValuedLaw
 
@@ -46,7 +46,7 @@ def respond(law: AbstractLaw, v: np.ndarray, dt: np.ndarray) -> Response:
 
 @jax.jit
 def _respond(law: AbstractLaw, v: Array, dt: Array) -> tuple[Array, Array, Array]:
-    def over(carry: Any, sample: tuple[Array, Array]) -> tuple[Any, tuple[Array, Array, Array]]:
+    def over(carry: PyTree, sample: tuple[Array, Array]) -> tuple[PyTree, tuple[Array, Array, Array]]:
         (t, x, z), (v, dt) = carry, sample
         t, x = t + dt, x + v * dt
         here = law.bind_state(t, x[None], v[None], {})

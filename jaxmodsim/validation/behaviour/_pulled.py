@@ -1,12 +1,12 @@
 """A mass with friction under a load: the one scene of all experiments that need inertia."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from ...friction import AbstractDynamicLaw, AbstractSetValuedLaw
 from ...scene import AppliedForce, Friction, Scene
@@ -69,7 +69,7 @@ def move(case: LawCase, t1: float, *, z0: object = None, dtmax: float = 1.0, **l
         start = None
     # Heun's method sees the jumps of the laws that need a fixed step twice in a step, and no more often.
     solver = dfx.Heun() if fixed else None if isinstance(law, AbstractSetValuedLaw) else Rodas5P()
-    steps: dict[str, Any] = {"dt": case.dt} if fixed else {"dtmax": dtmax}
+    steps: dict[str, PyTree] = {"dt": case.dt} if fixed else {"dtmax": dtmax}
     run = simulate(
         scene,
         [0.0],
@@ -89,13 +89,13 @@ def move(case: LawCase, t1: float, *, z0: object = None, dtmax: float = 1.0, **l
     )
 
 
-def after_slip(case: LawCase) -> Any:
+def after_slip(case: LawCase) -> PyTree:
     """State of a dynamic law that has just slid fast and was unloaded; None of laws without a state."""
     return _after_slip(case.law) if isinstance(case.law, AbstractDynamicLaw) else None
 
 
 @jax.jit
-def _after_slip(law: AbstractDynamicLaw) -> Any:
+def _after_slip(law: AbstractDynamicLaw) -> PyTree:
     """Slide for one second, then go back, and keep the state at which the force at rest is least."""
     rest = jnp.zeros(())
     here = law.bind_state(rest, rest[None], rest[None], {})
@@ -104,7 +104,7 @@ def _after_slip(law: AbstractDynamicLaw) -> Any:
     slid = jax.lax.fori_loop(0, 100, lambda _, z: here.step_exact(fast, z, dt), here.initial_state(rest))
     slow = -fast * 0.01
 
-    def back(z: object, _: None) -> tuple[Any, tuple[Any, Array]]:
+    def back(z: object, _: None) -> tuple[PyTree, tuple[PyTree, Array]]:
         z = here.step_exact(slow, z, _BACK / -slow)
         return z, (z, jnp.abs(here.force(rest, z)))
 

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from ...scene import Scene, read_element, replace_elements
 from ...simulation import Trajectory, simulate
@@ -42,7 +43,7 @@ class SceneTask(eqx.Module):
     by: str = eqx.field(static=True)
     read: Callable[[Trajectory], Array] = eqx.field(static=True)
     numbers: dict[str, Array]
-    choices: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+    choices: tuple[tuple[str, PyTree], ...] = eqx.field(static=True)
 
     @property
     def x(self) -> float:
@@ -58,7 +59,7 @@ class SceneTask(eqx.Module):
         numbers = cast.numbers | {"rtol": jnp.maximum(cast.numbers["rtol"], _LEAST_RTOL[dtype])}
         return eqx.tree_at(lambda task: task.numbers, cast, numbers)
 
-    def run(self, x: Float[Array, ""], adjoint: Any = None) -> Trajectory:
+    def run(self, x: Float[Array, ""], adjoint: dfx.AbstractAdjoint | None = None) -> Trajectory:
         """The run for another value of the number `by`."""
         scene, q0, qd0 = self.scene, self.q0, self.qd0
         if self.by.startswith("q0["):
@@ -69,7 +70,7 @@ class SceneTask(eqx.Module):
             scene = replace_elements(scene, {self.by: x})
         return simulate(scene, q0, qd0, self.t1, **self.numbers, **dict(self.choices), adjoint=adjoint, throw=False)
 
-    def answer(self, x: Float[Array, ""], adjoint: object = None) -> Answer:
+    def answer(self, x: Float[Array, ""], adjoint: dfx.AbstractAdjoint | None = None) -> Answer:
         """The number asked for."""
         run = self.run(x, adjoint)
         return Answer(run.code, self.read(run))
@@ -83,7 +84,7 @@ class FunctionTask(eqx.Module):
     - `by`: what that is.
     """
 
-    fn: Callable[[Array, Any], Answer] = eqx.field(static=True)
+    fn: Callable[[Array, dfx.AbstractAdjoint | None], Answer] = eqx.field(static=True)
     x: float = eqx.field(static=True)
     by: str = eqx.field(static=True)
 
@@ -92,7 +93,7 @@ class FunctionTask(eqx.Module):
         del dtype
         return self
 
-    def answer(self, x: Float[Array, ""], adjoint: object = None) -> Answer:
+    def answer(self, x: Float[Array, ""], adjoint: dfx.AbstractAdjoint | None = None) -> Answer:
         """The number asked for."""
         return self.fn(x, adjoint)
 
@@ -115,7 +116,7 @@ class RefusedCalls:
     - `match`: regular expression that the error's text of each must match, by name.
     """
 
-    calls: dict[str, Callable[[], Any]]
+    calls: dict[str, Callable[[], object]]
     match: dict[str, str]
 
 

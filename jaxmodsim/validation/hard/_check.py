@@ -5,16 +5,16 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from ...analysis import check_gradients
 from ...scene import Scene
-from ...simulation import SimulationError, outcome_messages
+from ...simulation import SimulationError, Trajectory, outcome_messages
 from ._case import Answer, FunctionTask, HardCase, MeasuredNumber, RefusedCalls, SceneTask, differentiate
 
 TRANSFORMS = ("alone", "jit", "vmap", "forward", "reverse", "energy")
@@ -141,18 +141,18 @@ def _measured(case: HardCase, task: MeasuredNumber) -> CheckFinding:
 
 # Compiled once for all cases of one structure.
 @eqx.filter_jit
-def _jit(task: SceneTask | FunctionTask, x: Any) -> Answer:
+def _jit(task: SceneTask | FunctionTask, x: Array) -> Answer:
     return task.answer(x)
 
 
 @eqx.filter_jit
-def _vmap(task: SceneTask | FunctionTask, x: Any) -> Answer:
+def _vmap(task: SceneTask | FunctionTask, x: Array) -> Answer:
     return jax.vmap(task.answer)(x)
 
 
 @eqx.filter_jit
-def _forward(task: SceneTask | FunctionTask, x: Any) -> tuple[Answer, Any]:
-    def value(x: Any) -> tuple[Any, Answer]:
+def _forward(task: SceneTask | FunctionTask, x: Array) -> tuple[Answer, Array]:
+    def value(x: Array) -> tuple[Array, Answer]:
         answer = task.answer(x, dfx.ForwardMode())
         return answer.value, answer
 
@@ -161,8 +161,8 @@ def _forward(task: SceneTask | FunctionTask, x: Any) -> tuple[Answer, Any]:
 
 
 @eqx.filter_jit
-def _reverse(task: SceneTask | FunctionTask, x: Any) -> tuple[Answer, Any]:
-    def value(x: Any) -> tuple[Any, Answer]:
+def _reverse(task: SceneTask | FunctionTask, x: Array) -> tuple[Answer, Array]:
+    def value(x: Array) -> tuple[Array, Answer]:
         answer = task.answer(x)
         return answer.value, answer
 
@@ -179,7 +179,7 @@ class _Trial:
     dtype: str
 
     @property
-    def x(self) -> Any:
+    def x(self) -> Array:
         return jnp.asarray(self.task.x, self.dtype)
 
     def gives_up(self, answer: Answer) -> bool:
@@ -308,7 +308,7 @@ class _Trial:
 def _watched(task: SceneTask) -> str:
     """The verdict of `check_gradients` on the number of a case."""
 
-    def fn(scene: Scene, simulate: Callable[..., Any]) -> Any:
+    def fn(scene: Scene, simulate: Callable[..., Trajectory]) -> Array:
         run = simulate(scene, task.q0, task.qd0, task.t1, **task.numbers, **dict(task.choices))
         return task.read(run)
 

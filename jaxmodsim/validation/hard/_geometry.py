@@ -2,7 +2,6 @@
 
 import math
 from functools import cache
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +24,7 @@ from ...problems import (
 )
 from ...scene import AppliedForce, Friction, Scene
 from ...simulation import Trajectory
-from ._case import Answer, FunctionTask, HardCase, end_time, motion, position
+from ._case import Answer, FunctionTask, HardCase, SceneTask, end_time, motion, position
 
 FAMILY = "geometry"
 _G = 9.81
@@ -123,7 +122,7 @@ def _mass_matrices() -> list[HardCase]:
     def body(k: float) -> float:
         return math.cos(math.sqrt(k) * 5.0)
 
-    def task(light: float) -> Any:
+    def task(light: float) -> SceneTask:
         scene = Scene(_shared, params={"m": 1.0, "k": 1.0, "light": light})
         return motion(scene, [0.5, 0.5], [0.0, 0.0], 5.0, by="k", read=_of_body, numbers={"rtol": 1e-8, "atol": 1e-8})
 

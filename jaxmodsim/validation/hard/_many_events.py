@@ -1,12 +1,13 @@
 """Many events: accumulating, chattering, simultaneous, endlessly repeated, and touching without crossing."""
 
 import math
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import ClassVar
 
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from ...friction import AbstractSetValuedLaw, Coulomb
 from ...problems import (
@@ -23,14 +24,20 @@ from ...problems import (
 )
 from ...scene import AppliedForce, Friction, Scene
 from ...simulation import Trajectory
-from ...solvers import EventController, EventSolver
+from ...solvers import EventController, EventSolver, EventState
 from ._case import Answer, FunctionTask, HardCase, motion, position
 
 FAMILY = "many events"
 _G = 9.81
 
 
-def _solve(field: Any, solver: EventSolver, t1: float, start: Any, adjoint: Any) -> tuple[Array, Any]:
+def _solve(
+    field: Callable[..., EventState],
+    solver: EventSolver,
+    t1: float,
+    start: EventState,
+    adjoint: dfx.AbstractAdjoint | None,
+) -> tuple[Array, PyTree]:
     """Code and last state of a run of the event solver in plain diffrax."""
     dtype = start.t.dtype
     rtol = 1e-10 if dtype == jnp.float64 else 1e-6
@@ -51,7 +58,7 @@ def _solve(field: Any, solver: EventSolver, t1: float, start: Any, adjoint: Any)
     return code, solution.ys
 
 
-def _bounce(e: Array, adjoint: object, held: bool) -> Answer:
+def _bounce(e: Array, adjoint: dfx.AbstractAdjoint | None, held: bool) -> Answer:
     ball = BouncingBall(e=e, g=jnp.asarray(_G, e.dtype))
     hold = ball.hold if held else None
     solver = EventSolver(dfx.Tsit5(), ball.guards, ball.reset, on_zeno=hold, max_events=512, log=False)
@@ -60,11 +67,11 @@ def _bounce(e: Array, adjoint: object, held: bool) -> Answer:
     return Answer(code, ys.t[-1])
 
 
-def _bounce_to_rest(e: Array, adjoint: object) -> Answer:
+def _bounce_to_rest(e: Array, adjoint: dfx.AbstractAdjoint | None) -> Answer:
     return _bounce(e, adjoint, held=True)
 
 
-def _bounce_unheld(e: Array, adjoint: object) -> Answer:
+def _bounce_unheld(e: Array, adjoint: dfx.AbstractAdjoint | None) -> Answer:
     return _bounce(e, adjoint, held=False)
 
 
@@ -286,23 +293,23 @@ def _grazing() -> HardCase:
     )
 
 
-def _below_ceiling(t: Any, s: Any, args: Any) -> Array:
+def _below_ceiling(t: object, s: EventState, args: object) -> Array:
     del t, args
     return 1.0 - s.y[:1]
 
 
-def _caught(t: Any, s: Any, args: Any, fired: Any) -> Any:
+def _caught(t: object, s: EventState, args: object, fired: Array) -> EventState:
     del t, args, fired
     return s._replace(y=0.0 * s.y + 1.0, mode=jnp.ones_like(s.mode))
 
 
-def _throw(v0: Array, adjoint: Any) -> Answer:
+def _throw(v0: Array, adjoint: dfx.AbstractAdjoint | None) -> Answer:
     """A ball is thrown up and caught where it touches the ceiling, one metre above."""
     one = jnp.ones((), v0.dtype)
     solver = EventSolver(dfx.Tsit5(), _below_ceiling, _caught, log=False)
     start = solver.start(0.0 * one, jnp.stack([0.0 * one, v0]), mode=0.0 * one)
 
-    def field(t: Any, s: Any, args: Any) -> Any:
+    def field(t: object, s: EventState, args: object) -> EventState:
         del t, args
         return s.rate(jnp.where(s.mode > 0.5, 0.0, jnp.stack([s.y[1], -_G * one])))
 

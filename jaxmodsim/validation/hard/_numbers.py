@@ -2,29 +2,29 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from ...friction import Coulomb, Stribeck
 from ...identify import Record
 from ...problems import box_lugre, braked_spring, braked_spring_law, ramped_box
 from ...scene import Signal
-from ...simulation import simulate
+from ...simulation import Trajectory, simulate
 from ._case import HardCase, MeasuredNumber, RefusedCalls, motion, position, velocity
 
 FAMILY = "numbers"
 _NAN, _INF = float("nan"), float("inf")
 
 
-def _run(**changes: Any) -> Any:
+def _run(**changes: PyTree) -> Trajectory:
     given = {"q0": [1.0], "qd0": [0.0], "t1": 1.0} | changes
     return simulate(braked_spring(braked_spring_law()), given.pop("q0"), given.pop("qd0"), given.pop("t1"), **given)
 
 
-def _poisoned(value: float) -> Any:
+def _poisoned(value: float) -> Trajectory:
     scene = eqx.tree_at(lambda scene: scene.params["k"], braked_spring(braked_spring_law()), jnp.asarray(value))
     return simulate(scene, [1.0], [0.0], 1.0)
 
@@ -97,7 +97,7 @@ def _same_times() -> float:
 
 def _same_types() -> float:
     """Largest difference between runs whose numbers are Python's, NumPy's and JAX's, whole and floating."""
-    kinds: list[Callable[[float], Any]] = [float, int, np.int32, np.float64, np.asarray, jnp.asarray]
+    kinds: list[Callable[[float], PyTree]] = [float, int, np.int32, np.float64, np.asarray, jnp.asarray]
     ends = []
     for kind in kinds:
         scene = braked_spring(Coulomb(kind(1), kind(2)), m=kind(1), k=kind(10))

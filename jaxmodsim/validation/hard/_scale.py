@@ -1,7 +1,7 @@
 """Scale and time: very small, very large, very long, very late, and next to nothing."""
 
 import math
-from typing import Any
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -64,7 +64,7 @@ def _units() -> list[HardCase]:
     ]
 
 
-def _sampled_at(i: int) -> Any:
+def _sampled_at(i: int) -> Callable[[Trajectory], Array]:
     def read(run: Trajectory) -> Array:
         return run.q[i, 0]
 

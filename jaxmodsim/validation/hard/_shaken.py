@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
+from jaxtyping import PyTree
 
 from ...problems import LinearStickSlip, linear_stick_slip, stick_slip_motion
 from ._case import HardCase, motion, position
@@ -18,7 +18,7 @@ def _system(
     frequencies: Sequence[float] = (),
     *,
     mass: float = 2.0,
-    stiffness: Any = 0.0,
+    stiffness: float | np.ndarray = 0.0,
     directions: Sequence[Sequence[float]] | None = None,
     belt: Sequence[float] = (),
 ) -> LinearStickSlip:
@@ -37,7 +37,7 @@ def _system(
 
 
 def _case(
-    name: str, why: str, naive: str, system: LinearStickSlip, t1: float, qd0: float = 0.0, **options: Any
+    name: str, why: str, naive: str, system: LinearStickSlip, t1: float, qd0: float = 0.0, **options: PyTree
 ) -> HardCase:
     """The first coordinate at `t1` from q = 0, by Coulomb's force of the first element."""
     q0, qd = np.zeros(system.size), np.full(system.size, qd0)

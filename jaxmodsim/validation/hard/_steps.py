@@ -4,16 +4,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, PyTree
 
 from ...friction import AbstractLaw, LuGre, Regularized, Viscous, max_stable_step
 from ...problems import box_coulomb, ramped_box, slipping_bristle
 from ...scene import Scene
-from ...simulation import simulate
+from ...simulation import Trajectory, simulate
 from ...solvers import ImplicitFriction, Rodas5P
 from ._case import HardCase, MeasuredNumber
 
@@ -42,12 +42,12 @@ class Formulation:
 
     name: str
     scene: Scene
-    z0: dict[str, Any] | None
+    z0: dict[str, PyTree] | None
     qd0: float
     law: AbstractLaw
     m: float | None
     v: float
-    off: Callable[[Any], Any]
+    off: Callable[[Trajectory], Array]
 
 
 def formulations() -> dict[str, Formulation]:
@@ -110,12 +110,12 @@ EXPLICIT = {
 IMPLICIT = {"Rodas5P": Rodas5P(pivot=True), "ImplicitFriction": ImplicitFriction()}
 
 
-def theory(formulation: Formulation, solver: Any) -> float:
+def theory(formulation: Formulation, solver: dfx.AbstractSolver) -> float:
     """Largest stable step [s] by `max_stable_step`: the stability function at the eigenvalues."""
     return max_stable_step(formulation.law, formulation.m, v=formulation.v, solver=solver)
 
 
-def grows(formulation: Formulation, solver: Any, h: float) -> bool:
+def grows(formulation: Formulation, solver: dfx.AbstractSolver, h: float) -> bool:
     """Whether the disturbance has grown after so many steps of `h` [s]."""
     run = simulate(
         formulation.scene,
@@ -131,7 +131,7 @@ def grows(formulation: Formulation, solver: Any, h: float) -> bool:
     return not (bool(run.result.ok) and abs(float(formulation.off(run))) < _GROWS)
 
 
-def largest_step(formulation: Formulation, solver: object) -> float:
+def largest_step(formulation: Formulation, solver: dfx.AbstractSolver) -> float:
     """Largest stable step [s], by bisection."""
     low, high = 0.5 * theory(formulation, solver), 2.0 * theory(formulation, solver)
     if grows(formulation, solver, low) or not grows(formulation, solver, high):
@@ -142,7 +142,7 @@ def largest_step(formulation: Formulation, solver: object) -> float:
     return math.sqrt(low * high)
 
 
-def _ratio(name: str, solvers: dict[str, Any]) -> float:
+def _ratio(name: str, solvers: dict[str, dfx.AbstractSolver]) -> float:
     """The measured limit over that of theory, of the solver where they are farthest apart."""
     formulation = formulations()[name]
     ratios = [largest_step(formulation, solver) / theory(formulation, solver) for solver in solvers.values()]

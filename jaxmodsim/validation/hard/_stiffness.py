@@ -1,7 +1,6 @@
 """Stiffness: rates of friction that are many orders above those of the motion."""
 
 import math
-from typing import Any
 
 import diffrax as dfx
 import numpy as np
@@ -11,6 +10,7 @@ from scipy.integrate import solve_ivp
 from ...friction import LuGre, Regularized, Viscous
 from ...problems import BOX_LUGRE, box_coulomb, box_lugre, ramped_box, slipping_bristle
 from ...scene import Scene
+from ...simulation import Trajectory
 from ...solvers import ImplicitFriction, Rodas5P
 from ._case import HardCase, motion, position, velocity
 from ._steps import step_limits
@@ -201,7 +201,7 @@ def _bristle_steady() -> HardCase:
     )
 
 
-def _deflection(run: Any) -> Array:
+def _deflection(run: Trajectory) -> Array:
     return run.z["friction"][-1]
 
 

@@ -1,9 +1,7 @@
 """The test bench: a box on a table under a rising force, with one friction model after the other."""
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import diffrax as dfx
 import jax
@@ -158,7 +156,7 @@ def _oscillation(t: np.ndarray, gap: np.ndarray, sigma0: float) -> np.ndarray:
     return np.hypot(weights[3], weights[4])
 
 
-def stick_sweep() -> dict[str, Any]:
+def stick_sweep() -> dict[str, np.ndarray]:
     """LuGre over a grid of sigma0 and sigma1, as one vmap.
 
     **Returns:**
@@ -175,7 +173,7 @@ def stick_sweep() -> dict[str, Any]:
         gap = run.forces["friction"] - run.forces["pull"][:, 0]
         return run.q[300, 0], run.qd[-1, 0], run.stats["num_steps"], gap, run.result.ok
 
-    grid: Callable[..., Any] = jax.jit(jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(0, None)))
+    grid = jax.jit(jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(0, None)))
     found = grid(jnp.asarray(SIGMA0), jnp.asarray(SIGMA1))
     creep, speed, steps, gap, ok = (np.asarray(x) for x in found)
     if not ok.all():
