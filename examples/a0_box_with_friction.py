@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxmodsim as jms
-from jaxmodsim.plot import RampRun, ramp_figure
+from jaxmodsim.plot import ramp_figure
+from jaxmodsim.validation.testbench import RampRun
 
 
 def lagrangian(t, q, qd, p):

@@ -48,14 +48,16 @@ def drift_force(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     return jnp.reshape(-p["drift"] * jnp.exp(-since / p["tau"]), (1,))
 
 
-ASYMMETRIC = axis_models()["asymmetric"]
-DRIFTING = AxisModel(
-    effects=lambda rough: (jms.AppliedForce(drift_force, name="drift"), *ASYMMETRIC.effects(rough)),
-    free=("m", "drift", *(name for name in ASYMMETRIC.free if name != "m")),
-    description="as asymmetric, with a part of the drive's offset that dies away over the time tau",
-    params=lambda rough: {"drift": 0.0, "tau": DRIFT_TIME, "t0": rough.start},
-)
-MODELS = {"coulomb": axis_models()["coulomb"], "asymmetric": ASYMMETRIC, "drifting": DRIFTING}
+def models() -> dict[str, AxisModel]:
+    """Two models of the library, and the second with the drift."""
+    asymmetric = axis_models()["asymmetric"]
+    drifting = AxisModel(
+        effects=lambda rough: (jms.AppliedForce(drift_force, name="drift"), *asymmetric.effects(rough)),
+        free=("m", "drift", *(name for name in asymmetric.free if name != "m")),
+        description="as asymmetric, with a part of the drive's offset that dies away over the time tau",
+        params=lambda rough: {"drift": 0.0, "tau": DRIFT_TIME, "t0": rough.start},
+    )
+    return {"coulomb": axis_models()["coulomb"], "asymmetric": asymmetric, "drifting": drifting}
 
 
 def resimulated(result: FitResult, substeps: int) -> float:
@@ -75,8 +77,9 @@ def main(record_file: Path, out: Path, smoke: bool = False) -> None:
     record = jms.Record(t, q, {"u": DRIVE_GAIN * u}, name="EMPS")
     rough, (q0, qd0) = rough_axis(record), start_state(record)
     out.mkdir(parents=True, exist_ok=True)
-    for name in ("coulomb",) if smoke else MODELS:
-        model = MODELS[name]
+    fitted = models()
+    for name in ("coulomb",) if smoke else fitted:
+        model = fitted[name]
         # The record starts in motion. A width that comes down from a large one does not get caught on the way.
         result = fit(
             axis_scene(model, rough),
@@ -91,7 +94,7 @@ def main(record_file: Path, out: Path, smoke: bool = False) -> None:
         print(f"\n{name}: {model.description}\n{result}\nwith five steps for every sample: RMSE {1e3 * fine:.4f} mm")
         fit_figure(result, caption=SOURCE).savefig(out / f"b0_emps_{name}.png", dpi=130)
     if not smoke:
-        candidates = {name: Candidate(axis_scene(x, rough), x.free, x.description) for name, x in MODELS.items()}
+        candidates = {name: Candidate(axis_scene(x, rough), x.free, x.description) for name, x in fitted.items()}
         start, narrowing = {"q0": [q0], "qd0": [qd0]}, Continuation("dry.width", 10.0, 2)
         print(f"\n{compare(candidates, record, **start, limits={'m': (0.0, None)}, initializer=narrowing)}")
     print(f"wrote figures to {out}")

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Inexact
+from jaxtyping import Array, Inexact, PyTree
 
 MAX_UNROLLED_LU = 12
 
@@ -162,7 +162,7 @@ def _solve(
 
 @_solve.defjvp
 def _solve_jvp(
-    shape: _Shape, primals: tuple[list[Array], ...], tangents: tuple[list[Array], ...]
+    shape: _Shape, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[list[Array], list[Array]]:
     """A x = b gives A dx = db - dA x."""
     matrix, factors, swaps, rhs = primals

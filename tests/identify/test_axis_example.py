@@ -19,7 +19,7 @@ def test_the_clock_of_a_record_makes_no_difference():
     assert spec.loader is not None
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
-    model, t = example.DRIFTING, FRAME["time"].to_numpy() - 10.0
+    model, t = example.models()["drifting"], FRAME["time"].to_numpy() - 10.0
 
     def values(start: float) -> dict[str, float]:
         record = record_of(FRAME, time=t + start)
