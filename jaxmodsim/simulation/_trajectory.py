@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
@@ -10,6 +10,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..mechanics import momentum
@@ -71,8 +72,8 @@ class Trajectory:
     """A run of a scene. Everything but the motion itself is computed when it is asked for.
 
     What is not saved along a run takes another run: events and energies. Each such run is made once, and its results
-    stay with this object, not with copies of it, such as `jax.jit` and `jax.tree.map` make. Inside `jax.jit`, read them
-    before a branch or a loop (`jax.lax.cond`, `jax.lax.scan`) does.
+    stay with this object, not with copies of it, such as `jax.jit` and `jax.tree.map` make. A branch or a loop in `jax.jit`
+    (`jax.lax.cond`, `jax.lax.scan`) that reads them first makes that run for itself.
 
     - `t`: times [s], shape `[time]`; `ts`, or the end alone. Times that an early end left unreached are infinite.
     - `q`, `qd`: coordinates and velocities, shape `[time, dof]`.
@@ -98,6 +99,11 @@ class Trajectory:
     accuracy: Accuracy | None = None
     # What was read from repeats of the run, by name; no part of the pytree.
     _repeats: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    # Where values may be kept: those that are traced further inside must not outlive that.
+    _home: object = field(default_factory=get_opaque_trace_state, init=False, repr=False, compare=False)
+
+    def __reduce__(self) -> tuple[Callable[[], "Trajectory"], tuple[()]]:
+        return partial(Trajectory, **{x.name: getattr(self, x.name) for x in fields(self) if x.init}), ()
 
     @property
     def scene(self) -> Scene:
@@ -202,12 +208,15 @@ class Trajectory:
 
     def _once(self, name: str, make: Callable[[], _Value]) -> _Value:
         """A value that takes a repeat of the run, made where it is not there yet."""
-        if name not in self._repeats:
-            # Of a run whose numbers are known so is the value, also where the caller is being traced.
-            known = is_known(*jtu.tree_leaves(self))
-            with jax.core.eval_context() if known else nullcontext():
-                self._repeats[name] = make()
-        return self._repeats[name]
+        if name in self._repeats:
+            return self._repeats[name]
+        # Of a run whose numbers are known so is the value, also where the caller is being traced.
+        known = is_known(*jtu.tree_leaves(self))
+        with jax.core.eval_context() if known else nullcontext():
+            value = make()
+        if known or get_opaque_trace_state() == self._home:
+            self._repeats[name] = value
+        return value
 
     def _states(self) -> State:
         return State(self.q, self.qd, self.z)
