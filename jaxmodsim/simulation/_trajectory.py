@@ -72,8 +72,8 @@ class Trajectory:
     """A run of a scene. Everything but the motion itself is computed when it is asked for.
 
     What is not saved along a run takes another run: events and energies. Each such run is made once, and its results
-    stay with this object, not with copies of it, such as `jax.jit` and `jax.tree.map` make. A branch or a loop in `jax.jit`
-    (`jax.lax.cond`, `jax.lax.scan`) that reads them first makes that run for itself.
+    stay with this object, not with copies of it, such as `jax.jit` and `jax.tree.map` make. A branch or a loop in
+    `jax.jit` (`jax.lax.cond`, `jax.lax.scan`) that reads them first makes that run for itself.
 
     - `t`: times [s], shape `[time]`; `ts`, or the end alone. Times that an early end left unreached are infinite.
     - `q`, `qd`: coordinates and velocities, shape `[time, dof]`.
