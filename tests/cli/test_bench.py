@@ -16,8 +16,6 @@ from jaxmodsim.cli import _bench
 
 ROOT = Path(__file__).parents[2]
 RESULTS = sorted((ROOT / "bench" / "results").glob("*.json"))
-# Recorded before commits had to be clean; each is to be recorded again.
-STALE = ("stick_slip", "friction_models", "measured_axis", "coverage")
 
 # In the place of `bench/one.py`: writes a result, as clean as its name says.
 ONE = """
@@ -155,13 +153,7 @@ def test_results_are_tidy(path):
     assert len(found.known) == len(found.rows)
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        pytest.param(path, marks=[pytest.mark.xfail(strict=True)] if path.stem in STALE else [], id=path.stem)
-        for path in RESULTS
-    ],
-)
+@pytest.mark.parametrize("path", RESULTS, ids=lambda path: path.stem)
 def test_results_come_from_clean_commits(path):
     assert Recorded.read(path).provenance["clean"]
 
