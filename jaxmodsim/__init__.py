@@ -45,6 +45,7 @@ from .solvers import EventSolver as EventSolver
 from .solvers import Gauss as Gauss
 from .solvers import ImplicitFriction as ImplicitFriction
 from .solvers import Rodas5P as Rodas5P
+from .solvers import StoredSteps as StoredSteps
 
 if TYPE_CHECKING:
     from . import metrics as metrics

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial, wraps
 from typing import Any, NamedTuple, TypeAlias, TypeVar, cast
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -118,17 +119,17 @@ _derivative = partial(jax.jit, static_argnums=0)(at_time(IntegratedSystem.deriva
 _guards = jax.jit(scene_guards)
 
 
-class RunFunctions(NamedTuple):
+class RunFunctions(eqx.Module):
     """The functions of a run; those of a state `s` in the form that `EventSolver` takes, for runs with modes."""
 
-    system: IntegratedSystem
+    system: IntegratedSystem = eqx.field(static=True)
     # Slip velocity [m/s] that counts as none.
     rest: Float[Array, ""]
     # Relative and absolute, of the limits of stick and of slip velocities.
     tolerances: tuple[Float[Array, ""], Float[Array, ""]]
     # What drifts with the error of integration and is put right after every step: off the constraints, out of stick.
-    projects: bool
-    sticks: bool
+    projects: bool = eqx.field(static=True)
+    sticks: bool = eqx.field(static=True)
 
     def plain_derivative(self, t: Any, y: PyTree, scene: Scene, mode: Array | None = None) -> PyTree:
         """Right-hand side in these modes; None in a run without."""

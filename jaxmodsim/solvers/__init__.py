@@ -13,6 +13,7 @@ from ._rodas5p import RODAS5P as RODAS5P
 from ._rodas5p import Rodas5P as Rodas5P
 from ._rosenbrock import RosenbrockTableau as RosenbrockTableau
 from ._rosenbrock import rosenbrock_step as rosenbrock_step
+from ._stored_steps import StoredSteps as StoredSteps
 from ._unchecked import calls_back as calls_back
 from ._unchecked import unchecked as unchecked
 from .events._controller import EventController as EventController

@@ -1,0 +1,207 @@
+"""Reverse mode from stored steps, in plain diffrax: equal to forward mode, which differentiates the same steps."""
+
+from typing import Any
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmodsim import EventController, EventSolver, Gauss, Rodas5P, StoredSteps
+
+from ..helpers.optimized import optimized
+
+NUMBERS = {"mu": 1.5, "f": 0.4, "x0": 1.0, "t0": 0.2, "t1": 3.0}
+SOLVERS: dict[str, Any] = {
+    "Tsit5": dfx.Tsit5(),
+    "Dopri8": dfx.Dopri8(),
+    "Kvaerno5": dfx.Kvaerno5(),
+    "Rodas5P": Rodas5P(),
+    "Gauss": Gauss(),
+}
+SAVE_AT = {
+    "times": lambda p, ts: dfx.SaveAt(ts=ts, fn=lambda t, y, args: p["f"] * t * y[0]),  # closes over a number
+    "everything": lambda p, ts: dfx.SaveAt(t0=True, t1=True, ts=ts),
+    "two": lambda p, ts: dfx.SaveAt(
+        subs=[dfx.SubSaveAt(ts=ts[:2]), dfx.SubSaveAt(t1=True, fn=lambda t, y, args: args["mu"] * y)]
+    ),
+    "steps": lambda p, ts: dfx.SaveAt(steps=True),
+    "every third step": lambda p, ts: dfx.SaveAt(steps=3, t0=True, t1=True),
+    "dense": lambda p, ts: dfx.SaveAt(dense=True),
+}
+
+
+def van_der_pol(t: Any, y: Any, p: Any) -> Any:
+    return jnp.stack([y[1], p["mu"] * (1 - y[0] ** 2) * y[1] - y[0] + p["f"] * jnp.cos(t)])
+
+
+def total(p: Any, adjoint: Any, solver: str, save: str, max_steps: int = 500) -> Any:
+    """Weighted sum of what is saved of a run."""
+    ts = jnp.stack([p["t0"] + 0.3, p["t0"] + 0.8, p["t1"] - 0.2])
+    fixed = solver == "Gauss"
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(van_der_pol),
+        SOLVERS[solver],
+        p["t0"],
+        p["t1"],
+        0.02 if fixed else 0.01,
+        jnp.stack([p["x0"], jnp.zeros_like(p["x0"])]),
+        p,
+        saveat=SAVE_AT[save](p, ts),
+        stepsize_controller=dfx.ConstantStepSize() if fixed else dfx.PIDController(1e-7, 1e-9),
+        adjoint=adjoint,
+        max_steps=max_steps,
+        throw=max_steps == 500,
+    )
+    if save == "dense":
+        return jnp.sum(jax.vmap(solution.evaluate)(ts))
+
+    def weighted(y: Any) -> Any:
+        weights = jnp.reshape(jnp.sin(jnp.arange(y.size, dtype=y.dtype)), y.shape)
+        return jnp.sum(jnp.where(jnp.isfinite(y), y, 0.0) * weights)
+
+    times: Any = [] if "step" in save else [weighted(t) for t in jax.tree.leaves(solution.ts)]
+    return sum([weighted(y) for y in jax.tree.leaves(solution.ys)], jnp.zeros(())) + sum(times)
+
+
+def numbers(dtype: Any = float) -> dict[str, Any]:
+    return {name: jnp.asarray(x, dtype) for name, x in NUMBERS.items()}
+
+
+@pytest.mark.parametrize(
+    ("solver", "save"),
+    [("Tsit5", save) for save in SAVE_AT] + [(solver, "times") for solver in SOLVERS if solver != "Tsit5"],
+)
+@optimized()
+def test_equals_forward_mode(solver: str, save: str) -> None:
+    """Except by t0, with which forward mode moves all steps: that differs by the error of the method.
+
+    Equations of an implicit method are solved to a tolerance, and t1 enters them by the length of a step.
+    """
+    reverse = jax.jit(jax.grad(lambda p: total(p, StoredSteps(), solver, save)))(numbers())
+    forward = jax.jit(jax.jacfwd(lambda p: total(p, dfx.ForwardMode(), solver, save)))(numbers())
+    for name in ("mu", "f", "x0", "t1"):
+        np.testing.assert_allclose(reverse[name], forward[name], rtol=1e-8 if name == "t1" else 1e-11, err_msg=name)
+    if "step" not in save:  # the times of steps are constants
+        np.testing.assert_allclose(reverse["t0"], forward["t0"], rtol=1e-3)
+
+
+def test_closed_form_of_a_start_time() -> None:
+    """y' = a cos(t) y from 1 at t0: y(t1) = exp(a (sin t1 - sin t0))."""
+
+    def end(a: Any, t0: Any, t1: Any) -> Any:
+        solution = dfx.diffeqsolve(
+            dfx.ODETerm(lambda t, y, a: a * jnp.cos(t) * y),
+            dfx.Dopri8(),
+            t0,
+            t1,
+            0.1,
+            jnp.ones(()),
+            a,
+            stepsize_controller=dfx.PIDController(1e-12, 1e-12),
+            adjoint=StoredSteps(),
+            max_steps=500,
+        )
+        ys: Any = solution.ys
+        return ys[0]
+
+    a, t0, t1 = 0.7, 0.4, 2.5
+    exact = np.exp(a * (np.sin(t1) - np.sin(t0)))
+    value, slopes = jax.value_and_grad(end, argnums=(0, 1, 2))(*map(jnp.asarray, (a, t0, t1)))
+    np.testing.assert_allclose(value, exact, rtol=1e-11)
+    right = np.array([np.sin(t1) - np.sin(t0), -a * np.cos(t0), a * np.cos(t1)]) * exact
+    np.testing.assert_allclose(slopes, right, rtol=1e-10)
+
+
+def test_vmap_and_float32() -> None:
+    """Runs of different lengths in one batch are as each alone; in float32 to its rounding."""
+    t1 = jnp.linspace(1.5, 3.0, 3)
+    gradient = jax.grad(lambda p: total(p, StoredSteps(), "Tsit5", "times"))
+    together = jax.jit(jax.vmap(lambda t: gradient({**numbers(), "t1": t})))(t1)
+    for i, t in enumerate(t1):
+        alone = gradient({**numbers(), "t1": t})
+        for name in NUMBERS:
+            np.testing.assert_allclose(together[name][i], alone[name], rtol=1e-11)
+    single = jax.jit(gradient)(numbers(jnp.float32))
+    for name, x in single.items():
+        assert x.dtype == jnp.float32
+        np.testing.assert_allclose(x, together[name][-1], rtol=2e-4)
+
+
+def test_a_run_that_ends_early_or_has_no_length() -> None:
+    """The derivative is that of what was integrated: no step beyond, none at all."""
+
+    def five(p: Any, adjoint: Any) -> Any:
+        return total(p, adjoint, "Tsit5", "everything", max_steps=5)
+
+    few = [jax.grad(five)(numbers(), StoredSteps()), jax.jacfwd(five)(numbers(), dfx.ForwardMode())]
+    for name in ("mu", "f", "x0"):
+        np.testing.assert_allclose(few[0][name], few[1][name], rtol=1e-11)
+    assert few[0]["t1"] == few[1]["t1"] == 0.0
+
+    def still(x: Any) -> Any:
+        solution = dfx.diffeqsolve(
+            dfx.ODETerm(lambda t, y, args: -y),
+            dfx.Tsit5(),
+            1.0,
+            1.0,
+            0.1,
+            x,
+            saveat=dfx.SaveAt(ts=jnp.ones(2)),
+            adjoint=StoredSteps(),
+            max_steps=10,
+        )
+        ys: Any = solution.ys
+        return jnp.sum(ys)
+
+    assert jax.grad(still)(jnp.asarray(2.0)) == 2.0
+
+
+def test_events() -> None:
+    """A ball that bounces three times; its height at the end and the time of the last bounce, against closed forms."""
+    g, e, h, t1 = 9.81, 0.8, 1.0, 2.0
+
+    def end(x: Any) -> Any:
+        h = x[2]
+        solver = EventSolver(
+            dfx.Tsit5(),
+            lambda t, s, args: s.y[:1],
+            lambda t, s, args, fired: s._replace(y=jnp.stack([jnp.zeros_like(args[1]), -args[1] * s.y[1]])),
+        )
+        solution = dfx.diffeqsolve(
+            dfx.ODETerm(lambda t, s, args: s.rate(jnp.stack([s.y[1], -args[0]]))),
+            solver,
+            0.0,
+            t1,
+            0.01,
+            solver.start(0.0, jnp.stack([h, jnp.zeros_like(h)]), None, x),
+            x,
+            stepsize_controller=EventController(dfx.PIDController(1e-9, 1e-9)),
+            adjoint=StoredSteps(),
+            max_steps=200,
+        )
+        ys: Any = solution.ys
+        return jnp.stack([ys.y[0, 0], ys.t[0]])
+
+    def exact(x: Any) -> Any:
+        g, e, h = x
+        fall = jnp.sqrt(2 * h / g)
+        last = fall * (1 + 2 * e + 2 * e**2)
+        return jnp.stack([e**3 * g * fall * (t1 - last) - 0.5 * g * (t1 - last) ** 2, last])
+
+    x = jnp.array([g, e, h])
+    np.testing.assert_allclose(end(x), exact(x), rtol=1e-8)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(end))(x), jax.jacfwd(exact)(x), rtol=1e-7)
+
+
+def test_what_cannot_be_is_refused() -> None:
+    def solve(**how: Any) -> Any:
+        return dfx.diffeqsolve(
+            dfx.ODETerm(lambda t, y, args: -y), dfx.Tsit5(), 0.0, 1.0, 0.1, jnp.ones(1), adjoint=StoredSteps(), **how
+        )
+
+    with pytest.raises(ValueError, match="max_steps=None"):
+        solve(max_steps=None)
+    with pytest.raises(ValueError, match="use EventSolver"):
+        solve(event=dfx.Event(lambda t, y, args, **_: y[0] - 0.5))
