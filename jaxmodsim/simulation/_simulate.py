@@ -65,8 +65,8 @@ def simulate(
       may be too long for the stiffness of friction.
     - `adjoint`: how diffrax differentiates the run. By default for reverse mode (`jax.grad`), by
       `diffrax.RecursiveCheckpointAdjoint(checkpoints=max_steps)`, which keeps the state before each step; with fewer
-      checkpoints derivatives through events lose digits. Pass `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`.
-      Not `diffrax.BacksolveAdjoint`.
+      checkpoints derivatives through events lose digits. `StoredSteps()` compiles sooner and
+      is as exact. Pass `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`. Not `diffrax.BacksolveAdjoint`.
     - `max_steps`: limit of the number of steps. In reverse mode memory is set aside for the state before each of them.
     - `max_events`: limit of the number of instants at which set-valued laws change modes. Inside `jax.jit`
       `run.events` has as many entries for each such law, so a smaller one is faster there.

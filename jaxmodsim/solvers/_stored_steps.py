@@ -242,14 +242,14 @@ class _Carry(NamedTuple):
     # By the times of each `SubSaveAt`; None where it has none.
     ts: list[Any]
     # Values kept by each `SubSaveAt`, and how many of its own times among them, that are not treated yet.
-    count: list[Int[Array, ""]]
+    saved: list[Int[Array, ""]]
     timed: list[Int[Array, ""]]
 
 
 class _Pulled(NamedTuple):
     """Cotangents that one saved time adds: of the dense output of its step, the ends of that, and the numbers."""
 
-    count: Int[Array, ""]
+    saved: Int[Array, ""]
     timed: Int[Array, ""]
     dense: PyTree
     ends: tuple[Array, Array]
@@ -314,7 +314,7 @@ class _WayBack:
             last = jnp.asarray(sub.t1 and sub.steps != 1)
             if sub.steps > 1:
                 last &= final.num_accepted_steps % sub.steps != 0
-            count, empty = carry.count[i] - last, (t0 == t1) & (sub.ts is not None)
+            count, empty = carry.saved[i] - last, (t0 == t1) & (sub.ts is not None)
             if self.asks(i) and (sub.ts is not None or (sub.t1 and sub.steps != 1)):
                 ct = jtu.tree_map(lambda c: jnp.where(last, c, 0.0), self.row(i, count))  # noqa: B023
                 if sub.ts is not None:  # a run of no length keeps all of its times at once, and makes no step
@@ -326,7 +326,7 @@ class _WayBack:
                 carry = carry._replace(
                     y=_add(carry.y, ct_y), numbers=numbers, t1=carry.t1 + jnp.where(reached, ct_t, 0.0)
                 )
-            carry.count[i] = count
+            carry.saved[i] = count
             carry.timed[i] = jnp.where(empty, 0, carry.timed[i])
         return carry
 
@@ -357,9 +357,9 @@ class _WayBack:
             if sub.steps == 0:
                 continue
             kept = (k + 1) % sub.steps == 0
-            carry.count[i] = carry.count[i] - kept
+            carry.saved[i] = carry.saved[i] - kept
             if self.asks(i):
-                ct = jtu.tree_map(lambda c: jnp.where(kept, c, 0.0), self.row(i, carry.count[i]))  # noqa: B023
+                ct = jtu.tree_map(lambda c: jnp.where(kept, c, 0.0), self.row(i, carry.saved[i]))  # noqa: B023
                 after = eqx.combine(y, others[0])
                 ct_t, ct_y, numbers = self.pull_value(i, step.t1, after, ct, carry.numbers)
                 last = (k == self.steps_made - 1) & (step.t1 == self.inputs.t1)
@@ -373,11 +373,11 @@ class _WayBack:
         for i, sub in enumerate(self.subs):
             if sub.ts is None or not self.asks(i):
                 continue
-            pulled = _Pulled(carry.count[i], carry.timed[i], ct_dense, pulled_ends, numbers, carry.ts[i])
+            pulled = _Pulled(carry.saved[i], carry.timed[i], ct_dense, pulled_ends, numbers, carry.ts[i])
             inside = partial(self._inside, i, step, k)
             pulled = lax.while_loop(inside, partial(self._over_time, i, step, (dense, others[2])), pulled)
             ct_dense, pulled_ends, numbers = pulled.dense, pulled.ends, pulled.numbers
-            carry.count[i], carry.timed[i], carry.ts[i] = pulled.count, pulled.timed, pulled.ts
+            carry.saved[i], carry.timed[i], carry.ts[i] = pulled.saved, pulled.timed, pulled.ts
         (ct_y, ct_state), ct_ends, more = pull((carry.y, carry.solver_state, ct_dense))
         ct_ends = _add(ct_ends, pulled_ends)
         last = (k == self.steps_made - 1) & (step.t1 == self.inputs.t1)
@@ -402,7 +402,7 @@ class _WayBack:
 
     def _over_time(self, i: int, step: _Step, dense: tuple[PyTree, PyTree], pulled: _Pulled) -> _Pulled:
         """Cotangents of one saved time."""
-        count, timed, solver = pulled.count - 1, pulled.timed - 1, self.inputs.solver
+        count, timed, solver = pulled.saved - 1, pulled.timed - 1, self.inputs.solver
 
         def value(t: Array, dense_numbers: PyTree, ends: tuple[Array, Array], numbers: _Numbers) -> PyTree:
             info = eqx.combine(dense_numbers, dense[1])

@@ -9,7 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmodsim import Coulomb, EventController, EventSolver, Friction, Gauss, Regularized, Rodas5P, Scene, simulate
+from jaxmodsim import (
+    Coulomb,
+    EventController,
+    EventSolver,
+    Friction,
+    Gauss,
+    Regularized,
+    Rodas5P,
+    Scene,
+    StoredSteps,
+    simulate,
+)
 
 from ..helpers.differences import central_difference
 
@@ -21,6 +32,7 @@ METHODS: dict[str, tuple[Any, Any]] = {
 ADJOINTS = {
     "checkpoints": dfx.RecursiveCheckpointAdjoint(),
     "direct": dfx.DirectAdjoint(),
+    "stored steps": StoredSteps(),
     "backsolve": dfx.BacksolveAdjoint(),
     "backsolve by another solver": dfx.BacksolveAdjoint(
         solver=dfx.Tsit5(), stepsize_controller=dfx.PIDController(1e-9, 1e-9)
@@ -191,7 +203,8 @@ def test_simulate_takes_the_other_adjoints(scene: Scene) -> None:
     for adjoint in (dfx.RecursiveCheckpointAdjoint(), dfx.DirectAdjoint()):
         np.testing.assert_allclose(jax.grad(end)(k, adjoint), forward, rtol=1e-5)
     tight = jax.jacfwd(end)(k, dfx.ForwardMode(), 1e-9)
-    np.testing.assert_allclose(jax.grad(end)(k, None, 1e-9), tight, rtol=1e-11)
+    for adjoint in (None, StoredSteps()):
+        np.testing.assert_allclose(jax.grad(end)(k, adjoint, 1e-9), tight, rtol=1e-11)
 
 
 def test_simulate_looks_at_no_direction_of_time_in_the_run() -> None:
