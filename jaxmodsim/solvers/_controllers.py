@@ -6,10 +6,10 @@ import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
 from ..scene import after, is_one_of
+from ._wrapper import AbstractControllerWrapper
 
 # Part of a step by which it may end before or behind the time that is meant.
 _STRETCH = 1e-6
@@ -73,7 +73,7 @@ def end_at(times: Float[Array, " n"], t0: Any, t1: Any, stretch: Any = True) -> 
     return jnp.where((i <= last) & (time - t0 <= longest), time, t1)
 
 
-class StepsTo(dfx.AbstractAdaptiveStepSizeController):
+class StepsTo(AbstractControllerWrapper):
     """Wrap a step size controller so that steps end on given times, and a new start is made there.
 
     For runs with events `EventController` does the same, so that one place decides where a step ends. Unlike
@@ -93,21 +93,6 @@ class StepsTo(dfx.AbstractAdaptiveStepSizeController):
     def __init__(self, controller: dfx.AbstractStepSizeController, times: Float[Array, " n"]):
         self.controller = controller
         self.times = times
-
-    @property
-    def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Relative tolerance of the wrapped controller, for implicit solvers; NaN if it has none."""
-        return getattr(self.controller, "rtol", float("nan"))
-
-    @property
-    def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Absolute tolerance of the wrapped controller, for implicit solvers; NaN if it has none."""
-        return getattr(self.controller, "atol", float("nan"))
-
-    @property
-    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Norm of the wrapped controller, for implicit solvers."""
-        return getattr(self.controller, "norm", optx.max_norm)
 
     def wrap(self, direction: Any) -> "StepsTo":
         """Wrap the controller inside. Time runs forward."""

@@ -264,7 +264,14 @@ class _WayBack:
         self.inputs, self.jumps, self.final, self.steps, self.ct = inputs, known.jumps, final, steps, ct
         self.subs = _subs(fixed.saveat)
         self.numbers, self.constants = eqx.partition(_Numbers(*inputs[:4]), _Numbers(*known.perturbed[:4]))
-        self.kept, self.cts = _save_states(final), _save_states(ct)
+        self.kept, cts = _save_states(final), _save_states(ct)
+        # Cotangents of values and times that each `SubSaveAt` kept; None where nothing of it is differentiated.
+        self.cts = [
+            (_filled(c.ys, kept.ys), _filled(c.ts, kept.ts)) if jtu.tree_leaves((c.ys, c.ts)) else None
+            for c, kept in zip(cts, self.kept, strict=True)
+        ]
+        infos = ct.dense_infos
+        self.ct_infos = _filled(infos, final.dense_infos) if jtu.tree_leaves(infos) else None
 
     def result(self) -> _Inputs:
         """Cotangents of the inputs."""
@@ -275,13 +282,11 @@ class _WayBack:
 
     def asks(self, i: int) -> bool:
         """Whether anything that the i-th `SubSaveAt` keeps is differentiated."""
-        return bool(jtu.tree_leaves((self.cts[i].ys, self.cts[i].ts)))
+        return self.cts[i] is not None
 
     def row(self, i: int, index: Array) -> tuple[PyTree, Array]:
         """Cotangents of one entry, of values and time."""
-        ct, kept = self.cts[i], self.kept[i]
-        times = jnp.zeros_like(kept.ts) if ct.ts is None else ct.ts
-        return jtu.tree_map(lambda c: c[index], (_filled(ct.ys, kept.ys), times))
+        return jtu.tree_map(lambda c: c[index], self.cts[i])
 
     def value(self, i: int, t: Array, y: PyTree, numbers: _Numbers) -> PyTree:
         """What the i-th `SubSaveAt` keeps of a state."""
@@ -353,6 +358,7 @@ class _WayBack:
 
         ends = (step.t0, step.t1)
         (y, _, dense), pull, others = jax.vjp(advance, began, ends, self.numbers, has_aux=True)
+        last = (k == self.final.num_accepted_steps - 1) & (step.t1 == self.inputs.t1)
         for i, sub in enumerate(self.subs):
             if sub.steps == 0:
                 continue
@@ -362,12 +368,9 @@ class _WayBack:
                 ct = jtu.tree_map(lambda c: jnp.where(kept, c, 0.0), self.row(i, carry.saved[i]))  # noqa: B023
                 after = eqx.combine(y, others[0])
                 ct_t, ct_y, numbers = self.pull_value(i, step.t1, after, ct, carry.numbers)
-                last = (k == self.steps_made - 1) & (step.t1 == self.inputs.t1)
                 carry = carry._replace(y=_add(carry.y, ct_y), numbers=numbers, t1=carry.t1 + jnp.where(last, ct_t, 0.0))
-        ct_dense = jtu.tree_map(jnp.zeros_like, dense)
-        if jtu.tree_leaves(self.ct.dense_infos):
-            infos = _filled(self.ct.dense_infos, self.final.dense_infos)
-            ct_dense = jtu.tree_map(lambda x: x[k], infos)
+        no_dense = self.ct_infos is None
+        ct_dense = jtu.tree_map(jnp.zeros_like, dense) if no_dense else jtu.tree_map(lambda x: x[k], self.ct_infos)
         pulled_ends = jtu.tree_map(jnp.zeros_like, ends)
         numbers = carry.numbers
         for i, sub in enumerate(self.subs):
@@ -380,7 +383,6 @@ class _WayBack:
             carry.saved[i], carry.timed[i], carry.ts[i] = pulled.saved, pulled.timed, pulled.ts
         (ct_y, ct_state), ct_ends, more = pull((carry.y, carry.solver_state, ct_dense))
         ct_ends = _add(ct_ends, pulled_ends)
-        last = (k == self.steps_made - 1) & (step.t1 == self.inputs.t1)
         return carry._replace(
             k=k - 1,
             y=ct_y,
@@ -389,11 +391,6 @@ class _WayBack:
             t0=carry.t0 + jnp.where(k == 0, ct_ends[0], 0.0),
             t1=carry.t1 + jnp.where(last, ct_ends[1], 0.0),
         )
-
-    @property
-    def steps_made(self) -> Array:
-        """Number of accepted steps."""
-        return self.final.num_accepted_steps
 
     def _inside(self, i: int, step: _Step, k: Array, pulled: _Pulled) -> Array:
         """Whether the next saved time lies in this step."""

@@ -1,8 +1,10 @@
-"""What all wrappers of a solver take from it."""
+"""What all wrappers of a solver, or of a step size controller, take from it."""
 
-from typing import cast
+from typing import Any, cast
 
 import diffrax as dfx
+import equinox as eqx
+import optimistix as optx
 from jaxtyping import PyTree
 
 
@@ -26,3 +28,24 @@ class AbstractSolverWrapper(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolve
     def error_order(self, terms: PyTree) -> PyTree:
         """Order of the error estimate of the wrapped solver."""
         return self.solver.error_order(terms)
+
+
+class AbstractControllerWrapper(dfx.AbstractAdaptiveStepSizeController):
+    """A step size controller made of another one, with what implicit solvers read of it."""
+
+    controller: eqx.AbstractVar[dfx.AbstractStepSizeController]
+
+    @property
+    def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Relative tolerance of the wrapped controller, for implicit solvers; NaN if it has none."""
+        return getattr(self.controller, "rtol", float("nan"))
+
+    @property
+    def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Absolute tolerance of the wrapped controller, for implicit solvers; NaN if it has none."""
+        return getattr(self.controller, "atol", float("nan"))
+
+    @property
+    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Norm of the wrapped controller, for implicit solvers."""
+        return getattr(self.controller, "norm", optx.max_norm)

@@ -7,13 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
 from ..._core.fusion import fusion_barrier, opaque_one
 from ...scene import is_one_of
 from .._controllers import end_at
 from .._equation import check_ode
+from .._wrapper import AbstractControllerWrapper
 from ._state import ACCUMULATION, TOO_MANY, EventState
 
 # Attempts in a row that may be rejected only because they do not resolve the guards: each is at most 0.9, at least 0.2
@@ -48,7 +48,7 @@ class _ControllerState(NamedTuple):
     doubts: Float[Array, ""]
 
 
-class EventController(dfx.AbstractAdaptiveStepSizeController):
+class EventController(AbstractControllerWrapper):
     """Wrap a step size controller so that steps end on the events that `EventSolver` sees.
 
     A step that passes a root of a guard is rejected and aimed at it, until one lands; the step after an event is as
@@ -83,21 +83,6 @@ class EventController(dfx.AbstractAdaptiveStepSizeController):
         self.controller = controller
         self.times = times
         self.direction = direction
-
-    @property
-    def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Relative tolerance of the wrapped controller, for implicit solvers; NaN if it has none."""
-        return getattr(self.controller, "rtol", float("nan"))
-
-    @property
-    def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Absolute tolerance of the wrapped controller, for implicit solvers; NaN if it has none."""
-        return getattr(self.controller, "atol", float("nan"))
-
-    @property
-    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Norm of the wrapped controller, for implicit solvers."""
-        return getattr(self.controller, "norm", optx.max_norm)
 
     def wrap(self, direction: Any) -> "EventController":
         """Wrap the controller inside."""

@@ -1,6 +1,7 @@
 """The two kinds of guards: crossings that are noted, and conditions that have to hold."""
 
 import abc
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -37,8 +38,11 @@ class AbstractGuardPolicy(eqx.Module):
         """
 
     @abc.abstractmethod
-    def armed_after(self, clear: Flags, fired: Flags, armed: Flags, rises: Flags) -> Flags:
-        """Which guards are armed after an event: those are `clear` that are far enough above zero."""
+    def armed_after(self, clear: Flags, fired: Flags, armed: Flags, rises: Callable[[], Flags]) -> Flags:
+        """Which guards are armed after an event.
+
+        Those are `clear` that are far enough above zero; `rises()` says which of them rise from the reset.
+        """
 
 
 class Crossings(AbstractGuardPolicy):
@@ -58,9 +62,9 @@ class Crossings(AbstractGuardPolicy):
         del passed, near
         return root
 
-    def armed_after(self, clear: Flags, fired: Flags, armed: Flags, rises: Flags) -> Flags:
+    def armed_after(self, clear: Flags, fired: Flags, armed: Flags, rises: Callable[[], Flags]) -> Flags:
         """What rises from the reset will fall again, be it as low as rounding."""
-        return clear | (~fired & armed) | (fired & rises)
+        return clear | (~fired & armed) | (fired & rises())
 
 
 class Conditions(AbstractGuardPolicy):
@@ -80,7 +84,7 @@ class Conditions(AbstractGuardPolicy):
         beyond = _BEYOND * near[0] / near[1]
         return root + jnp.where(passed, jnp.minimum(beyond, _BEYOND_OF_REST * (1.0 - root)), beyond)
 
-    def armed_after(self, clear: Flags, fired: Flags, armed: Flags, rises: Flags) -> Flags:
+    def armed_after(self, clear: Flags, fired: Flags, armed: Flags, rises: Callable[[], Flags]) -> Flags:
         """All of them."""
         del fired, armed, rises
         return jnp.ones_like(clear)

@@ -384,11 +384,12 @@ class EventSolver(AbstractSolverWrapper):
         end = after._replace(y=fusion_barrier(_along(after.y, -way, middle), unit))
         values = self._guards(t, end, whole)
         clear = _constant(values) > jnp.where(fired, _LATITUDE * jnp.abs(rate) * near, 0.0)
-        rises = fired
-        if not self.enforce:
+
+        def rises() -> Bool[Array, " guards"]:
             ahead = jnp.ones_like(t_event), field(t_event, after, whole)
             _, rise = jax.jvp(lambda t, y: self._guards(t, after._replace(y=y), whole), (t_event, after.y), ahead)
-            rises = _constant(rise) > 0
+            return _constant(rise) > 0
+
         armed = self._policy.armed_after(clear, fired, memory.armed > 0.5, rises)
         if self.on_zeno is not None:
             armed = jnp.where(dense, values > 0, armed)
