@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .lu import MAX_UNROLLED_LU, factor_lu
+from .lu import MAX_UNROLLED_LU, factor_lu, invert
 
 # Evaluations of one search along a line, and Newton steps of several unknowns.
 _MOST_EVALUATIONS = 200
@@ -166,7 +166,7 @@ def _newton(coupling: Array, slopes: Array, residual: Array) -> Array:
         return -residual / jnp.where(slope > 0, slope, 1.0)
     matrix = jnp.eye(n, dtype=residual.dtype) + jnp.sum(coupling[:, :, None] * slopes[None, :, :], axis=1)
     if n > MAX_UNROLLED_LU:
-        return -jnp.linalg.solve(matrix, residual)
+        return -invert(matrix, pivot=True)(residual)
     solve = factor_lu([[matrix[i, j] for j in range(n)] for i in range(n)], pivot=True)
     return -jnp.stack(solve([residual[i] for i in range(n)]))
 

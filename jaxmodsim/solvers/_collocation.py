@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from .._core.fusion import fusion_barrier, opaque_one
-from .._core.lu import MAX_UNROLLED_LU, factor_lu
+from .._core.lu import MAX_UNROLLED_LU, factor_lu, invert
 from ._state_layout import Layout, Parts, State
 
 MAX_ITERATIONS = 50
@@ -273,7 +273,7 @@ def _solve_linear(
         return [[x[i * n + p].astype(b.dtype) for p, b in enumerate(slope)] for i, slope in enumerate(rhs)]
     matrix = jnp.eye(s * n, dtype=dtype) - jnp.concatenate([jnp.kron(a[i : i + 1], jacobians[i]) for i in range(s)])
     vector = jnp.concatenate([jnp.ravel(b).astype(dtype) for slope in rhs for b in slope])
-    x = jnp.reshape(jnp.linalg.solve(matrix, vector), (s, n))
+    x = jnp.reshape(invert(matrix, pivot=True)(vector), (s, n))
     if len(points[0]) == 1:
         return [[x[i]] for i in range(s)]
     return [[x[i, p].astype(b.dtype) for p, b in enumerate(slope)] for i, slope in enumerate(rhs)]

@@ -137,12 +137,12 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
 
     Usable wherever diffrax takes a solver of an `ODETerm`, forward and backward in time, with adaptive or fixed steps
     and any adjoint, on any pytree of real floating arrays, in float32 and float64. Up to 12 state entries the linear
-    algebra is written out in scalars, so that a whole step becomes one fused computation; above, LAPACK is called.
+    algebra is written out in scalars, so that XLA compiles a step as a few loops; above, it is loops over rows.
     Dense output has order 4.
 
     **Arguments:**
 
-    - `pivot`: whether the eliminations up to 12 state entries swap rows. Under error control they need not: a step
+    - `pivot`: whether the eliminations swap rows. Under error control they need not: a step
       that a bad pivot spoils is rejected. With fixed steps nothing would notice, so `simulate(..., dt=...)` sets it.
 
     **Raises:**

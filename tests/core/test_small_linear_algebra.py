@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxmodsim._core.cholesky import cholesky_pivots, solve_positive_definite
-from jaxmodsim._core.lu import factor_lu
+from jaxmodsim._core.lu import factor_lu, invert
 
 from ..helpers.differences import central_difference
 
@@ -133,11 +133,16 @@ def test_lu_in_a_batch_of_different_pivots() -> None:
     np.testing.assert_allclose(batch, [np.linalg.solve(a, rhs) for a in cases], rtol=ROUNDING)
 
 
+def solve_inverse(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
+    return invert(matrix, pivot=True)(rhs)
+
+
 SOLVERS: dict[str, tuple[Any, int]] = {
     "cholesky 1": (solve_positive_definite, 1),
     "cholesky 3": (solve_positive_definite, 3),
     "lapack 13": (solve_positive_definite, 13),
     "lu 3": (solve_lu, 3),
+    "inverse 13": (solve_inverse, 13),
 }
 
 
@@ -149,7 +154,7 @@ def test_derivatives_of_solutions(name: str) -> None:
     a, b, d, w = spd(n, 5), *rng.standard_normal((3, n))
     s = rng.standard_normal((n, n))
     s = s + s.T
-    if solve is solve_lu:  # a permutation of the rows makes the elimination swap
+    if solve is not solve_positive_definite:  # a permutation of the rows makes the elimination swap
         a, s = np.roll(a, 1, axis=0), np.roll(s, 1, axis=0)
 
     def line(x: jax.Array) -> jax.Array:

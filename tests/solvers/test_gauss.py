@@ -207,8 +207,8 @@ def test_derivatives_against_a_closed_form() -> None:
     np.testing.assert_allclose(slope, -T1 * np.sin(1.7 * T1), rtol=1e-7)
 
 
-def test_unrolled_and_lapack_paths_agree() -> None:
-    """Twelve unknowns are solved in scalars, fifteen by LAPACK; a state of thirteen is one vector: the same numbers."""
+def test_scalars_and_arrays_agree() -> None:
+    """Twelve unknowns are solved in scalars, fifteen in arrays; a state of thirteen is one vector: the same numbers."""
 
     def rates(t: Any, y: Any, args: Any) -> Any:
         head = y[:4]
