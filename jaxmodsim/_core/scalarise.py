@@ -3,6 +3,7 @@
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
 from typing import Any, TypeAlias
 
 import jax
@@ -10,7 +11,7 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.extend.core import Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
+from jax.extend.core import Jaxpr, JaxprEqn, Literal
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .fusion import fusion_barrier, opaque_one
@@ -33,6 +34,9 @@ _REPEATED = {"sin", "cos", "tan"}
 _SUMS = {"reduce_sum", "cumsum", "dot_general"}
 _CALLS = {"jit", "pjit", "closed_call", "core_call"}
 
+# Whether a function is being traced to be taken apart: those that it calls are, with it.
+_within: ContextVar[bool] = ContextVar("within", default=False)
+
 # Entries of an array: scalars, those known while tracing as NumPy's. Every other value is one array, not taken apart.
 _Parts = np.ndarray
 _Value: TypeAlias = Array | np.ndarray | np.generic
@@ -51,7 +55,7 @@ def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "...
     **Arguments:**
 
     - `fn`: a function that JAX can trace. Where its values have one entry each or more than `MAX_SCALARS` in all, and
-      outside of `jax.jit` and the like, it is evaluated as it is.
+      outside of `jax.jit` and the like, it is evaluated as it is; what of it asks for scalars itself is then.
     - `args`: pytrees of arrays and numbers.
     - `seed`: numbers not known while compiling. Where the first of them is not finite, the result may not be, either.
 
@@ -59,15 +63,20 @@ def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "...
 
     What `fn` returns, equal but for rounding and for zero times infinity, which is zero if that zero is a constant.
     """
-    closed, shapes = jax.make_jaxpr(fn, return_shape=True)(*args)
+    if _within.get():
+        return fn(*args)
+    outside = _within.set(True)
+    try:
+        closed, shapes = jax.make_jaxpr(fn, return_shape=True)(*args)
+    finally:
+        _within.reset(outside)
     leaves = [x if hasattr(x, "shape") else jnp.asarray(x) for x in jtu.tree_leaves(args)]
     sizes = [size for size in _sizes(closed.jaxpr) if size <= MAX_ENTRIES]
     traced = any(isinstance(x, jax.core.Tracer) for x in leaves)
-    if traced and max(sizes, default=0) > 1 and sum(sizes) <= MAX_SCALARS:
-        unit = opaque_one(jax.lax.stop_gradient(jnp.ravel(seed)[0]))
-        out = [_whole(x) for x in _Scalars(unit).run(closed.jaxpr, closed.consts, leaves)]
-    else:
-        out = jaxpr_as_fun(closed)(*leaves)
+    if not traced or max(sizes, default=0) <= 1 or sum(sizes) > MAX_SCALARS:
+        return fn(*args)
+    unit = opaque_one(jax.lax.stop_gradient(jnp.ravel(seed)[0]))
+    out = [_whole(x) for x in _Scalars(unit).run(closed.jaxpr, closed.consts, leaves)]
     return jtu.tree_unflatten(jtu.tree_structure(shapes), out)
 
 
@@ -93,6 +102,16 @@ def columns_of(linear: Callable[..., list[_Value]], unit: Float[Array, ""], *lik
         out = scalars.run(closed.jaxpr, closed.consts, basis)
         columns.append([x[()] if isinstance(x, np.ndarray) else x for x in out])
     return columns
+
+
+def _needed(jaxpr: Jaxpr) -> list[JaxprEqn]:
+    """The equations of a traced function on which its outputs depend."""
+    live, needed = set(map(id, jaxpr.outvars)), []
+    for eqn in reversed(jaxpr.eqns):
+        if eqn.effects or any(id(var) in live for var in eqn.outvars):
+            live.update(map(id, eqn.invars))
+            needed.append(eqn)
+    return needed[::-1]
 
 
 def _sizes(jaxpr: Any) -> list[int]:
@@ -156,7 +175,7 @@ class _Scalars:
             kind: Any = atom.aval
             return np.asarray(atom.val, kind.dtype) if isinstance(atom, Literal) else values[atom]
 
-        for eqn in jaxpr.eqns:
+        for eqn in _needed(jaxpr):
             values.update(zip(eqn.outvars, self.step(eqn, [read(x) for x in eqn.invars]), strict=True))
         return [read(x) for x in jaxpr.outvars]
 

@@ -1,16 +1,18 @@
 """The equations of motion of a scene, with only the terms it holds, and what a run asks beside them."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from functools import wraps
+from typing import Any, NamedTuple, TypeAlias, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._core.cholesky import solve_positive_definite
+from .._core.cholesky import factor_positive_definite
 from .._core.functions import depends_on, real_array
 from .._core.index_check import traced
 from .._core.safe import safe_norm
+from .._core.scalarise import in_scalars
 from ..mechanics import (
     LinearizedConstraints,
     MotionEquations,
@@ -25,6 +27,7 @@ from ..mechanics import (
 )
 from ._event_driven import (
     Contact,
+    FrictionForces,
     Loads,
     contact,
     contact_guards,
@@ -40,6 +43,8 @@ from .forces._friction import Friction
 
 # Rounding units by which the mobility within constraints may be wrong.
 _ROUNDING = 256.0
+
+_Function = TypeVar("_Function", bound=Callable[..., PyTree])
 
 # Modes of the set-valued friction elements; None where the scene has none.
 Modes: TypeAlias = Any
@@ -64,7 +69,7 @@ class Dynamics(NamedTuple):
     - `equations`: the equations of motion.
     - `actions`: of every effect, by name.
     - `qdd`: accelerations.
-    - `contact`: the friction elements that depend on accelerations, or None.
+    - `contact`, `friction`: the friction elements that depend on accelerations, and their forces, or None.
     - `constraints`, `multipliers`: of all constraints, or None.
     - `validity_margins`: what has to be positive for the equations to hold: of each constraint that can only push its
       multiplier, then the margin of uniqueness of the loads; None where there is nothing of this.
@@ -75,20 +80,21 @@ class Dynamics(NamedTuple):
     actions: dict[str, Action]
     qdd: Float[Array, " dof"]
     contact: Contact | None
+    friction: FrictionForces | None
     constraints: LinearizedConstraints | None
     multipliers: Float[Array, " m"] | None
     validity_margins: Float[Array, " checks"] | None
 
 
 class Mobility(NamedTuple):
-    """How the mechanism answers forces within its constraints."""
+    """How the mechanism answers forces: `solve` without its constraints, the methods within them."""
 
-    mass: Float[Array, "dof dof"]
+    solve: Callable[[Array], Array]
     constraints: LinearizedConstraints | None
 
     def accelerate(self, force: Float[Array, " dof"]) -> Float[Array, " dof"]:
         """Accelerations under the generalised force `force`."""
-        free = solve_positive_definite(self.mass, force)
+        free = self.solve(force)
         return (
             free
             if self.constraints is None
@@ -97,7 +103,7 @@ class Mobility(NamedTuple):
 
     def respond(self, force: Float[Array, " dof"]) -> Float[Array, " dof"]:
         """Change of the accelerations with the generalised force."""
-        free = solve_positive_definite(self.mass, force)
+        free = self.solve(force)
         return (
             free
             if self.constraints is None
@@ -107,7 +113,7 @@ class Mobility(NamedTuple):
     def least(self, row: Float[Array, " dof"]) -> Float[Array, ""]:
         """Mobility [1/kg] along a direction that rounding can tell from none, where constraints take it away."""
         eps = float(jnp.finfo(row.dtype).eps)
-        return _ROUNDING * eps * jnp.sum(row * solve_positive_definite(self.mass, row))
+        return _ROUNDING * eps * jnp.sum(row * self.solve(row))
 
 
 def forward_dynamics(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -> Dynamics:
@@ -119,7 +125,7 @@ def forward_dynamics(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -
     linearized = (
         linearize_constraints(scene.constraints, t, q, qd, params, equations.mass) if scene.constraints else None
     )
-    mobility = Mobility(equations.mass, linearized)
+    mobility = Mobility(factor_positive_definite(equations.mass), linearized)
     actions, rhs = {}, equations.load
     holding = {}
     for name, effect in zip(scene.names, scene.effects, strict=True):
@@ -135,14 +141,14 @@ def forward_dynamics(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -
         for name, action in held.items():
             rhs = rhs + action.generalised - actions[name].generalised
             actions[name] = action
-    qdd = solve_positive_definite(equations.mass, rhs)
+    qdd = mobility.solve(rhs)
     multipliers = None
     if linearized is not None:
         multipliers = linearized.multipliers(qdd)
         qdd = qdd + linearized.apply_force(multipliers)
     if not (scene.event_driven or scene.reaction_loaded):
         margins = _margins(scene, t, y, multipliers, None)
-        return Dynamics(scene, equations, actions, qdd, None, linearized, multipliers, margins)
+        return Dynamics(scene, equations, actions, qdd, None, None, linearized, multipliers, margins)
 
     units = {name: each.force_per_load(t, q, qd, y.z.get(name), params) for name, each in scene.reaction_loaded.items()}
     pushes = [-each.apply_force(q, units[name][0], params) for name, each in scene.reaction_loaded.items()]
@@ -161,11 +167,9 @@ def forward_dynamics(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -
     qdd = qdd - jnp.sum(contacts.minv_jt * settled.force[:, None], axis=0)
     if linearized is not None and multipliers is not None:
         taken = sum(actions[name].generalised for name in (*scene.event_driven, *scene.reaction_loaded))
-        multipliers = multipliers + linearized.multiplier_response(
-            solve_positive_definite(equations.mass, jnp.asarray(taken))
-        )
+        multipliers = multipliers + linearized.multiplier_response(mobility.solve(jnp.asarray(taken)))
     margins = _margins(scene, t, y, multipliers, settled.margin)
-    return Dynamics(scene, equations, actions, qdd, contacts, linearized, multipliers, margins)
+    return Dynamics(scene, equations, actions, qdd, contacts, settled, linearized, multipliers, margins)
 
 
 def _loads(
@@ -181,7 +185,7 @@ def _loads(
     chosen = dict(zip(scene.constraint_names, scene.constraints, strict=True))
     at = jnp.concatenate([where[name] for name in names])
     size = jnp.stack([chosen[name].per_multiplier(t, y.q, scene.params) for name in names])
-    yields = [mobility.constraints.multiplier_response(solve_positive_definite(mobility.mass, row)) for row in rows]
+    yields = [mobility.constraints.multiplier_response(mobility.solve(row)) for row in rows]
     return Loads(
         jnp.asarray([[float(name == each) for name in names] for each in loaded], y.q.dtype),
         size * multipliers[at],
@@ -221,6 +225,17 @@ class ConstraintReaction(NamedTuple):
     force: Any
 
 
+def _scalarised(fn: _Function) -> _Function:
+    """`fn(t, y, scene, ...)` evaluated in scalars as a whole: laws, loads and solves beside the Lagrangian, too."""
+
+    @wraps(fn)
+    def run(t: Array, y: State, scene: Scene, *more: PyTree) -> PyTree:
+        return in_scalars(lambda t, y, *more: fn(t, y, scene, *more), t, y, *more, seed=y.q)
+
+    return cast(_Function, run)
+
+
+@_scalarised
 def vector_field(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> State:
     """Right-hand side of `y' = field(t, y)`; NaN where the equations do not hold, see `scene_validity_margins`."""
     dynamics = forward_dynamics(scene, t, y, mode)
@@ -244,29 +259,32 @@ def scene_canonical(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = N
     return State(y.qd, push, {name: dynamics.actions[name].rate for name in y.z})
 
 
+@_scalarised
 def scene_guards(
     t: Float[Array, ""], y: State, scene: Scene, mode: Modes, rest: Float[Array, ""], tolerances: tuple[Array, Array]
 ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
     """Guards that are positive while the modes hold, and their tolerances; see `contact_guards`."""
-    return contact_guards(_contact(t, y, scene, mode), mode, rest, tolerances)
+    return contact_guards(*_contact_and_forces(t, y, scene, mode), mode, rest, tolerances)
 
 
+@_scalarised
 def scene_switch(
     t: Float[Array, ""], y: State, scene: Scene, mode: Modes, fired: Bool[Array, " guards"]
 ) -> tuple[State, Float[Array, " n"]]:
     """State and modes after the guards that `fired`."""
-    contacts = _contact(t, y, scene, mode)
+    contacts, _ = _contact_and_forces(t, y, scene, mode)
     new = next_modes(contacts, mode, (mode == 0) | fired, fired & (mode == 0))
     return y._replace(qd=stop_slip(contacts, y.qd, new == 0)), new
 
 
+@_scalarised
 def scene_modes(
     t: Float[Array, ""], y: State, scene: Scene, rest: Float[Array, ""]
 ) -> tuple[State, Float[Array, " n"]]:
     """State and modes to begin with: elements with no more slip velocity than `rest` or rounding stick if they can."""
     none = jnp.zeros(len(scene.event_driven), y.q.dtype)
     dynamics = forward_dynamics(scene, t, y, none)
-    scene, contacts = dynamics.scene, _contact_of(dynamics)
+    scene, (contacts, _) = dynamics.scene, _friction_of(dynamics)
     elements = [*scene.event_driven.values()]
     speed = jnp.stack([jnp.sum(jnp.abs(e.direction(y.q, scene.params) * y.qd)) + jnp.abs(e.belt(t)) for e in elements])
     rounding = 8.0 * float(jnp.finfo(y.q.dtype).eps) * jax.lax.stop_gradient(speed)
@@ -276,14 +294,16 @@ def scene_modes(
     return y._replace(qd=stop_slip(contacts, y.qd, mode == 0)), mode
 
 
+@_scalarised
 def scene_stick_violation(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Float[Array, " n"]:
     """By how much the force of each sticking element exceeds its limit, in limits; 0 in slip."""
-    return stick_violation(_contact(t, y, scene, mode), mode)
+    return stick_violation(_contact_and_forces(t, y, scene, mode)[1], mode)
 
 
+@_scalarised
 def scene_stick(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> State:
     """State with the slip velocity of sticking elements, which drifts with the error of integration, set to zero."""
-    return y._replace(qd=stop_slip(_contact(t, y, scene, mode), y.qd, mode == 0))
+    return y._replace(qd=stop_slip(_contact_and_forces(t, y, scene, mode)[0], y.qd, mode == 0))
 
 
 def scene_drifts(scene: Scene) -> bool:
@@ -354,13 +374,14 @@ def _reactions(t: Float[Array, ""], y: State, dynamics: Dynamics) -> dict[str, C
     }
 
 
-def _contact(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Contact:
-    return _contact_of(forward_dynamics(scene, t, y, mode))
+def _contact_and_forces(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> tuple[Contact, FrictionForces]:
+    return _friction_of(forward_dynamics(scene, t, y, mode))
 
 
-def _contact_of(dynamics: Dynamics) -> Contact:
+def _friction_of(dynamics: Dynamics) -> tuple[Contact, FrictionForces]:
     assert dynamics.contact is not None
-    return dynamics.contact
+    assert dynamics.friction is not None
+    return dynamics.contact, dynamics.friction
 
 
 def scene_forces(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> dict[str, Array]:

@@ -213,7 +213,11 @@ def _multipliers(contacts: Contact, drive: Float[Array, " n"], sticks: Bool[Arra
 
 
 def contact_guards(
-    contacts: Contact, mode: Float[Array, " modes"], rest: Float[Array, ""], tolerances: tuple[Array, Array]
+    contacts: Contact,
+    forces: FrictionForces,
+    mode: Float[Array, " modes"],
+    rest: Float[Array, ""],
+    tolerances: tuple[Array, Array],
 ) -> tuple[Float[Array, " modes"], Float[Array, " modes"]]:
     """One guard for each element with a mode, positive while its mode holds, and by how much each may be wrong.
 
@@ -224,7 +228,7 @@ def contact_guards(
     hold it).
     """
     n, (rtol, atol) = mode.shape[0], tolerances
-    force, upper, lower = (x[:n] for x in solve_friction_forces(contacts, mode)[:3])
+    force, upper, lower = (x[:n] for x in forces[:3])
     eps = float(jnp.finfo(force.dtype).eps)
     wider = 1.0 + 16.0 * eps
     span = upper + lower
@@ -233,10 +237,10 @@ def contact_guards(
     return jnp.where(mode == 0, inside, mode * contacts.v[:n] + rest), jnp.where(mode == 0, resolved, atol)
 
 
-def stick_violation(contacts: Contact, mode: Float[Array, " modes"]) -> Float[Array, " modes"]:
+def stick_violation(forces: FrictionForces, mode: Float[Array, " modes"]) -> Float[Array, " modes"]:
     """By how much the force of each sticking element exceeds its limit, in limits; 0 in slip."""
     n = mode.shape[0]
-    force, upper, lower = (x[:n] for x in solve_friction_forces(contacts, mode)[:3])
+    force, upper, lower = (x[:n] for x in forces[:3])
     limit = jnp.where(force > 0, upper, lower)
     excess = (jnp.abs(force) - limit) / jnp.where(limit > 0, limit, 1.0)
     return jnp.where(mode == 0, excess, 0.0)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._core.cholesky import factor_positive_definite
 from .._core.monotone import solve_monotone
 from ..friction import Sign
 from ..mechanics import linearize_constraints, motion_equations
@@ -78,7 +79,7 @@ def scene_step(scene: Scene, t0: Float[Array, ""], t1: Float[Array, ""], y: Stat
     linearized = (
         linearize_constraints(scene.constraints, t0, q, qd, params, equations.mass) if scene.constraints else None
     )
-    mobility = Mobility(equations.mass, linearized)
+    mobility = Mobility(factor_positive_definite(equations.mass), linearized)
     rhs, elements = equations.load, {}
     for name, effect in zip(scene.names, scene.effects, strict=True):
         if isinstance(effect, Friction):
