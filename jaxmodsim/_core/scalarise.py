@@ -11,7 +11,7 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.extend.core import Jaxpr, JaxprEqn, Literal
+from jax.extend.core import Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .fusion import fusion_barrier, opaque_one
@@ -73,10 +73,13 @@ def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "...
     leaves = [x if hasattr(x, "shape") else jnp.asarray(x) for x in jtu.tree_leaves(args)]
     sizes = [size for size in _sizes(closed.jaxpr) if size <= MAX_ENTRIES]
     traced = any(isinstance(x, jax.core.Tracer) for x in leaves)
-    if not traced or max(sizes, default=0) <= 1 or sum(sizes) > MAX_SCALARS:
+    if not traced or sum(sizes) > MAX_SCALARS:
         return fn(*args)
-    unit = opaque_one(jax.lax.stop_gradient(jnp.ravel(seed)[0]))
-    out = [_whole(x) for x in _Scalars(unit).run(closed.jaxpr, closed.consts, leaves)]
+    if max(sizes, default=0) > 1:
+        unit = opaque_one(jax.lax.stop_gradient(jnp.ravel(seed)[0]))
+        out = [_whole(x) for x in _Scalars(unit).run(closed.jaxpr, closed.consts, leaves)]
+    else:
+        out = jaxpr_as_fun(closed)(*leaves)
     return jtu.tree_unflatten(jtu.tree_structure(shapes), out)
 
 

@@ -288,12 +288,14 @@ class EventSolver(AbstractSolverWrapper):
         """What the guards do in a step that ends at `state`, and their values there."""
         t0, t1 = times
         places = [t0 + (t1 - t0) * part for part in (1 / 3, 1 / 2, 2 / 3)]
-        states = [state._replace(y=y) for y in (*map(path.evaluate, places), state.y)]
-        looks = [self._guards_and_atol(t, s, args) for t, s in zip((*places, t1), states, strict=True)]
+        # Constant before the guards are evaluated, so that nothing of them is differentiated.
+        state, args, ends = _held((state, args, [(t, path.evaluate(t)) for t in places] + [(t1, state.y)]))
+        looks = jtu.tree_map(lambda *x: jnp.stack(x), *ends)
+        values, atol = jax.lax.map(lambda at: self._guards_and_atol(at[0], state._replace(y=at[1]), args), looks)
         unit = opaque_one(_constant(t1 - t0))
-        one, middle, two, end = fusion_barrier(_constant([values for values, _ in looks]), unit)
+        one, middle, two, end = fusion_barrier(_constant([*values]), unit)
         # Where limits vanish at one end of the step, the other tells their size.
-        tolerances = jnp.asarray(_constant(self.rtol), end.dtype), _constant(jnp.maximum(looks[0][1], looks[-1][1]))
+        tolerances = jnp.asarray(_constant(self.rtol), end.dtype), _constant(jnp.maximum(atol[0], atol[-1]))
         length = _constant(t1 - t0)
         blur = _constant(resolution) / jnp.where(length > 0, length, 1.0)
         memory = state.memory
@@ -382,7 +384,7 @@ class EventSolver(AbstractSolverWrapper):
         halfway = after._replace(y=_along(after.y, -0.5 * way, field(t_event, after, whole)))
         middle = field(t_event - 0.5 * way, halfway, whole)
         end = after._replace(y=fusion_barrier(_along(after.y, -way, middle), unit))
-        values = self._guards(t, end, whole)
+        values = self._guards(*_held((t, end, whole)))
         clear = _constant(values) > jnp.where(fired, _LATITUDE * jnp.abs(rate) * near, 0.0)
 
         def rises() -> Bool[Array, " guards"]:
@@ -452,6 +454,10 @@ def _accumulates(spread: Array, t: Array, begin: Array) -> Array:
     """Whether intervals between events of `spread` at most are none on the scale of the run, or not resolved at `t`."""
     eps = float(jnp.finfo(spread.dtype).eps)
     return spread <= jnp.maximum(_ACCUMULATION * eps**0.5 * (t - begin), 64.0 * eps * jnp.abs(t))
+
+
+def _held(tree: PyTree) -> PyTree:
+    return jtu.tree_map(lambda x: _constant(x) if eqx.is_inexact_array(x) else x, tree)
 
 
 def _differ(one: PyTree, other: PyTree) -> Bool[Array, ""]:
