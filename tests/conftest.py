@@ -15,8 +15,9 @@ from xdist.scheduler import LoadScopeScheduling
 from .helpers import fuzz
 
 # Nearly all of the time goes into tracing and compiling, hardly any into running. Code that LLVM has not optimized, and
-# XLA's older way to emit fused loops, straight as LLVM code and in one piece, are compiled soonest. XLA ends the process
-# over an option that it does not know: only where it was tried. What needs the last digits asks for `optimized`.
+# XLA's older way to emit fused loops, straight as LLVM code and in one piece, are compiled soonest. XLA ends the
+# process over an option that it does not know: only where it was tried. What needs the last digits asks for
+# `optimized`.
 # For the way that users have: XLA_FLAGS=--xla_cpu_use_fusion_emitters=true JAX_DISABLE_MOST_OPTIMIZATIONS=0.
 _OPTION, _FLAGS = "xla_cpu_use_fusion_emitters", os.environ.get("XLA_FLAGS", "")
 if jaxlib.version.__version_info__[:2] == (0, 10) and _OPTION not in _FLAGS:
