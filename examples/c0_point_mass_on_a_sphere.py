@@ -256,7 +256,7 @@ def spiral():
     words = "theta'' = a^2 theta (1 + 2 a^2 + u)/((1 + u)(1 + a^2 + u)) theta'^2 - (g/R) a sqrt(1 + u)/(1 + a^2 + u)"
     claim(words, at_states(lambda q, qd: acceleration(ON_SPIRAL, NOW, q, qd, NUMBERS), q, qd)[:, 0], free)
     normal = at_states(lambda q, qd: ON_SPIRAL.normal_force(NOW, q, qd, NUMBERS), q, qd)
-    newton = at_states(lambda q, qd: jms.problems.spiral_bead_normal_force(q, qd, **NUMBERS), q, qd)
+    newton = at_states(lambda q, qd: jms.problems.spiral_bead.normal_force(q, qd, **NUMBERS), q, qd)
     claim("the force N of the wire, across the path, is that of Newton's law in the frame of (d)", normal, newton)
     print("(j) The same with drag, and with dry friction under the force of the wire")
 

@@ -61,7 +61,7 @@ def test_friction_keeps_its_limit_at_all_times_of_a_bristle_that_is_loaded_at_on
     """At 10 m/s the bristle is at its limit within 2e-11 s, which a stiff step of 1e-3 s passes over."""
     law = jms.LuGre(sigma0=1e8, sigma1=0.0, sigma2=0.0, Fc=0.02, Fs=0.02, vs=0.1)
     ts = np.concatenate([[0.0], np.geomspace(1e-12, 1.0, 60)])
-    run = jms.simulate(ramped_box(law), [0.0], [10.0], 1.0, ts=ts)
+    run = jms.simulate(ramped_box.scene(law), [0.0], [10.0], 1.0, ts=ts)
     assert float(jnp.max(run.forces["friction"])) < 0.02 * (1.0 + 1e-3)
 
 

@@ -11,17 +11,7 @@ from scipy.integrate import solve_ivp
 
 from ...friction import Coulomb
 from ...mechanics import Constraint, Spherical
-from ...problems import (
-    FOUR_BAR,
-    cartesian_spherical_pendulum,
-    four_bar,
-    four_bar_acceleration,
-    four_bar_state,
-    rod_on_rough_floor,
-    rod_on_rough_floor_state,
-    spherical_pendulum,
-    spherical_pendulum_motion,
-)
+from ...problems import cartesian_pendulum, four_bar, rod_on_rough_floor, spherical_pendulum
 from ...scene import AppliedForce, Friction, Scene
 from ...simulation import Trajectory
 from ._case import Answer, FunctionTask, HardCase, SceneTask, end_time, motion, position
@@ -44,10 +34,10 @@ def _poles() -> list[HardCase]:
     turn = 1e-8 * math.sqrt(2.0 * _G * (1.0 + math.cos(phi))) / math.sin(phi) ** 2
 
     def angle(turn: float) -> float:
-        return float(spherical_pendulum_motion(t1, phi, turn))
+        return float(spherical_pendulum.motion(t1, phi, turn))
 
     cartesian = motion(
-        cartesian_spherical_pendulum(),
+        cartesian_pendulum.cartesian_spherical_pendulum(),
         [math.sin(phi), 0.0, math.cos(phi)],
         [0.0, turn * math.sin(phi), 0.0],
         t1,
@@ -56,7 +46,7 @@ def _poles() -> list[HardCase]:
     )
 
     def by_gravity(g: float) -> float:
-        return math.cos(float(spherical_pendulum_motion(t1, phi, turn, g=g)))
+        return math.cos(float(spherical_pendulum.motion(t1, phi, turn, g=g)))
 
     return [
         HardCase(
@@ -65,7 +55,7 @@ def _poles() -> list[HardCase]:
             "The pendulum passes 1e-8 rad beside the pole of its coordinates, theta turning by pi within 1e-8 s.",
             "Steps over the turn: the pendulum comes back on the wrong side, or with another angular momentum.",
             "angle phi at 1 s [rad]",
-            motion(spherical_pendulum(), [phi, 0.0], [0.0, turn], t1, by="qd0[1]", read=position),
+            motion(spherical_pendulum.scene(), [phi, 0.0], [0.0, turn], t1, by="qd0[1]", read=position),
             angle,
             single_ends="step limit was reached before t1|step size fell below what the time can resolve",
         ),
@@ -75,7 +65,7 @@ def _poles() -> list[HardCase]:
             "A start at the pole, where the mass matrix is singular.",
             "NaN, or a division by 1e-33.",
             "the sentence",
-            motion(spherical_pendulum(), [0.0, 0.0], [0.1, 0.0], t1, by="g", read=position),
+            motion(spherical_pendulum.scene(), [0.0, 0.0], [0.1, 0.0], t1, by="g", read=position),
             ends=r"singular or indefinite at coordinate q\[1\]",
         ),
         HardCase(
@@ -195,14 +185,14 @@ def four_bar_by_scipy(angle: float, rate: float, t1: float) -> float:
 
     @jax.jit
     def acceleration(angle: Array, rate: Array) -> Array:
-        return four_bar_acceleration(angle, rate)[0]
+        return four_bar.acceleration(angle, rate)[0]
 
     def field(t: float, y: np.ndarray) -> list[float]:
         del t
         return [y[1], float(acceleration(y[0], y[1]))]
 
     solution = solve_ivp(field, (0.0, t1), [angle, rate], method="DOP853", rtol=1e-9, atol=1e-11)
-    return float(four_bar_state(solution.y[0, -1], 0.0)[0][2])
+    return float(four_bar.state(solution.y[0, -1], 0.0)[0][2])
 
 
 def parallelogram_by_scipy(angle: float, rate: float, t1: float) -> float:
@@ -210,7 +200,7 @@ def parallelogram_by_scipy(angle: float, rate: float, t1: float) -> float:
 
     The coupler does not turn, so it is a pendulum; by DOP853 of scipy.
     """
-    m1, m2, m3, g = (FOUR_BAR[name] for name in ("m1", "m2", "m3", "g"))
+    m1, m2, m3, g = (four_bar.PARAMS[name] for name in ("m1", "m2", "m3", "g"))
     pace = g / 0.3 * (0.5 * m1 + m2 + 0.5 * m3) / (m1 / 3.0 + m2 + m3 / 3.0)
 
     def field(t: float, y: np.ndarray) -> list[float]:
@@ -221,15 +211,15 @@ def parallelogram_by_scipy(angle: float, rate: float, t1: float) -> float:
 
 
 def _linkages() -> list[HardCase]:
-    q0, qd0 = (np.asarray(x) for x in four_bar_state(0.7, 8.0))
-    once, t1 = four_bar(), 0.5
+    q0, qd0 = (np.asarray(x) for x in four_bar.state(0.7, 8.0))
+    once, t1 = four_bar.scene(), 0.5
     (closure,) = once.constraints
     assert isinstance(closure, Constraint)
     twice = Scene(
         once.lagrangian, params=once.params, constraints=(closure, Constraint(closure.phi, at=closure.at, name="again"))
     )
-    flat = four_bar(a=0.3, b=0.6, c=0.3, d=0.6)
-    before, speed = (np.asarray(x) for x in four_bar_state(0.3, -8.0, a=0.3, b=0.6, c=0.3, d=0.6))
+    flat = four_bar.scene(a=0.3, b=0.6, c=0.3, d=0.6)
+    before, speed = (np.asarray(x) for x in four_bar.state(0.3, -8.0, a=0.3, b=0.6, c=0.3, d=0.6))
     return [
         HardCase(
             "redundant_constraints",
@@ -284,8 +274,8 @@ def _jams() -> list[HardCase]:
     friction = Friction(Coulomb(0.3), normal_force=_lever)
     params = {"m": 1.0, "F": 1e6, "e": 0.4, "L": 0.2}
     drawer = Scene(_drawer, params=params, effects=(AppliedForce(_pull, name="pull"), friction))
-    rod = rod_on_rough_floor(mu=2.0)
-    q0, qd0 = (np.asarray(x) for x in rod_on_rough_floor_state(1.1, 0.0, 1.0))
+    rod = rod_on_rough_floor.scene(mu=2.0)
+    q0, qd0 = (np.asarray(x) for x in rod_on_rough_floor.state(1.1, 0.0, 1.0))
     return [
         HardCase(
             "jammed_slider",

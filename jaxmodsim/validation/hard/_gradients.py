@@ -8,7 +8,7 @@ from jaxtyping import Array
 from scipy.integrate import solve_ivp
 
 from ...friction import Coulomb, LuGre, Stribeck
-from ...problems import BRAKED_SPRING, braked_spring, braked_spring_law, braked_spring_rest, ramped_box
+from ...problems import braked_spring, ramped_box
 from ...scene import AppliedForce, Friction, Scene
 from ._case import HardCase, motion, position, velocity
 
@@ -91,7 +91,7 @@ def _held(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
 
 def _resting_place() -> HardCase:
     def exact(Fc: float) -> float:
-        return float(braked_spring_rest(**(BRAKED_SPRING | {"Fc": Fc})).x)
+        return float(braked_spring.rest(**(braked_spring.PARAMS | {"Fc": Fc})).x)
 
     return HardCase(
         "resting_place",
@@ -99,15 +99,15 @@ def _resting_place() -> HardCase:
         "Where the mass stops depends on Fc through all twelve reversals: -(-1)^N 2 N/k.",
         "Differentiated sign functions have no derivative: zero, or that of the last half cycle.",
         "resting place [m]",
-        motion(braked_spring(braked_spring_law()), [1.0], [0.0], 30.0, by="friction.Fc", read=position),
+        motion(braked_spring.scene(braked_spring.coulomb()), [1.0], [0.0], 30.0, by="friction.Fc", read=position),
         exact,
     )
 
 
 def cases() -> list[HardCase]:
     """The cases of this family."""
-    box = ramped_box(Coulomb(1.5))
-    falling = ramped_box(Stribeck(Fc=1.5, Fs=1.75, vs=0.2, exponent=1.0))
+    box = ramped_box.scene(Coulomb(1.5))
+    falling = ramped_box.scene(Stribeck(Fc=1.5, Fs=1.75, vs=0.2, exponent=1.0))
     return [
         _planar(),
         *_equilibrium(),

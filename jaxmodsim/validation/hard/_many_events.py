@@ -10,18 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from ...friction import AbstractSetValuedLaw, Coulomb
-from ...problems import (
-    BELT_OSCILLATOR,
-    BouncingBall,
-    belt_oscillator,
-    belt_oscillator_cycle,
-    belt_oscillator_motion,
-    belt_stribeck,
-    bouncing_ball_rest,
-    braked_spring,
-    coupled_belts,
-    ramped_box,
-)
+from ...problems import belt_oscillator, bouncing_ball, braked_spring, coupled_belts, ramped_box
 from ...scene import AppliedForce, Friction, Scene
 from ...simulation import Trajectory
 from ...solvers import EventController, EventSolver, EventState
@@ -59,7 +48,7 @@ def _solve(
 
 
 def _bounce(e: Array, adjoint: dfx.AbstractAdjoint | None, held: bool) -> Answer:
-    ball = BouncingBall(e=e, g=jnp.asarray(_G, e.dtype))
+    ball = bouncing_ball.BouncingBall(e=e, g=jnp.asarray(_G, e.dtype))
     hold = ball.hold if held else None
     solver = EventSolver(dfx.Tsit5(), ball.guards, ball.reset, on_zeno=hold, max_events=512, log=False)
     start = solver.start(jnp.zeros((), e.dtype), ball.dropped(1.0), mode=jnp.zeros((), e.dtype))
@@ -77,7 +66,7 @@ def _bounce_unheld(e: Array, adjoint: dfx.AbstractAdjoint | None) -> Answer:
 
 def _zeno() -> list[HardCase]:
     def rest(e: float) -> float:
-        return float(bouncing_ball_rest(h=1.0, e=e, g=_G))
+        return float(bouncing_ball.rest(h=1.0, e=e, g=_G))
 
     return [
         HardCase(
@@ -124,7 +113,7 @@ def _shrinking_swing() -> HardCase:
         return -n / (1.0 - mu**2) * factor(mu) ** n
 
     friction = Friction(Coulomb(mu), normal_force=_load_of_deflection)
-    scene = Scene(braked_spring().lagrangian, params={"m": m, "k": 1.0}, effects=(friction,))
+    scene = Scene(braked_spring.scene().lagrangian, params={"m": m, "k": 1.0}, effects=(friction,))
     numbers = {"rtol": 1e-10, "atol": 0.0}
     task = motion(scene, [1.0], [0.0], t1, by="friction.Fc", read=position, numbers=numbers, max_steps=65536)
     return HardCase(
@@ -161,7 +150,7 @@ class Contradictory(AbstractSetValuedLaw):
 
 
 def _chatter() -> list[HardCase]:
-    scene = ramped_box(Contradictory())
+    scene = ramped_box.scene(Contradictory())
     why = "A law that holds 1 N but resists slip with 2 N: in between it can neither stick nor slip."
     naive = "Ever smaller steps; a fixed step averages to something."
     return [
@@ -188,26 +177,26 @@ def _chatter() -> list[HardCase]:
 
 
 def _cycles() -> list[HardCase]:
-    belt = BELT_OSCILLATOR["belt"]
+    belt = belt_oscillator.PARAMS["belt"]
 
     def place(t1: float, k: float) -> float:
-        return float(belt_oscillator_motion(jnp.asarray(t1), **(BELT_OSCILLATOR | {"k": k}))[0])
+        return float(belt_oscillator.motion(jnp.asarray(t1), **(belt_oscillator.PARAMS | {"k": k}))[0])
 
     def drift(k: float) -> float:
         """Derivative of the place after 1e5 cycles: differences of it would have to be of 1e-8."""
         return float(
-            jax.grad(lambda k: belt_oscillator_motion(jnp.asarray(late), **(BELT_OSCILLATOR | {"k": k}))[0])(k)
+            jax.grad(lambda k: belt_oscillator.motion(jnp.asarray(late), **(belt_oscillator.PARAMS | {"k": k}))[0])(k)
         )
 
     def together(t1: float) -> float:
-        return place(t1, BELT_OSCILLATOR["k"])
+        return place(t1, belt_oscillator.PARAMS["k"])
 
-    law = Coulomb(BELT_OSCILLATOR["Fc"], BELT_OSCILLATOR["Fs"])
-    twins = coupled_belts((law, law), m1=1.0, m2=1.0, k1=100.0, k2=100.0, coupling=35.0)
-    period = float(belt_oscillator_cycle(**BELT_OSCILLATOR).period)
+    law = Coulomb(belt_oscillator.PARAMS["Fc"], belt_oscillator.PARAMS["Fs"])
+    twins = coupled_belts.scene((law, law), m1=1.0, m2=1.0, k1=100.0, k2=100.0, coupling=35.0)
+    period = float(belt_oscillator.cycle(**belt_oscillator.PARAMS).period)
     late = (1e5 + 0.3) * period
     long = motion(
-        belt_oscillator(), [0.0], [belt], late, by="k", read=position, numbers={"rtol": 1e-11, "atol": 1e-13},
+        belt_oscillator.scene(), [0.0], [belt], late, by="k", read=position, numbers={"rtol": 1e-11, "atol": 1e-13},
         solver=dfx.Dopri8(), max_steps=1 << 23, max_events=1 << 18,
     )  # fmt: skip
     return [
@@ -247,9 +236,9 @@ def _changes(run: Trajectory) -> Array:
 
 
 def _smooth_break_away() -> HardCase:
-    belt = BELT_OSCILLATOR["belt"]
+    belt = belt_oscillator.PARAMS["belt"]
     task = motion(
-        belt_oscillator(belt_stribeck()), [0.0], [belt], 5.0, by="k", read=_changes,
+        belt_oscillator.scene(belt_oscillator.stribeck()), [0.0], [belt], 5.0, by="k", read=_changes,
         numbers={"rtol": 1e-12, "atol": 1e-14}, max_steps=65536,
     )  # fmt: skip
     return HardCase(

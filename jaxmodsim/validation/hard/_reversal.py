@@ -7,18 +7,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ...friction import Coulomb
-from ...problems import (
-    BELT_OSCILLATOR,
-    BRAKED_SPRING,
-    belt_coulomb,
-    belt_oscillator,
-    belt_oscillator_motion,
-    braked_spring,
-    braked_spring_law,
-    braked_spring_motion,
-    braked_spring_rest,
-    ramped_box,
-)
+from ...problems import belt_oscillator, braked_spring, ramped_box
 from ...scene import AppliedForce, Friction, Scene
 from ._case import HardCase, motion, position, velocity
 
@@ -56,7 +45,7 @@ def _ramps() -> list[HardCase]:
         return ramp * (t1 - 1.5 / ramp) ** 2 / (2.0 * _M)
 
     def ramped(name: str, ramp: float, t1: float, why: str, naive: str, single_ends: str = "") -> HardCase:
-        task = motion(ramped_box(Coulomb(1.5), ramp=ramp), [0.0], [0.0], t1, by="ramp", read=velocity)
+        task = motion(ramped_box.scene(Coulomb(1.5), ramp=ramp), [0.0], [0.0], t1, by="ramp", read=velocity)
         return HardCase(
             name,
             FAMILY,
@@ -119,9 +108,9 @@ def _exactly_at_the_limit() -> list[HardCase]:
 
 def _spring(name: str, why: str, naive: str, t1: float) -> HardCase:
     def exact(x0: float) -> float:
-        return float(braked_spring_motion(jnp.asarray(t1), **(BRAKED_SPRING | {"x0": x0}))[0])
+        return float(braked_spring.motion(jnp.asarray(t1), **(braked_spring.PARAMS | {"x0": x0}))[0])
 
-    task = motion(braked_spring(braked_spring_law()), [1.0], [0.0], t1, by="q0[0]", read=position)
+    task = motion(braked_spring.scene(braked_spring.coulomb()), [1.0], [0.0], t1, by="q0[0]", read=position)
     return HardCase(name, FAMILY, why, naive, f"position at {t1:g} s [m]", task, exact)
 
 
@@ -166,11 +155,11 @@ def _vanishing() -> HardCase:
     numbers = {"m": 1.3, "k": 2.7}
 
     def exact(Fc: float) -> float:
-        return float(braked_spring_rest(x0=1.0, Fc=Fc, **numbers).x)
+        return float(braked_spring.rest(x0=1.0, Fc=Fc, **numbers).x)
 
     Fc = 2.7 / 2.0 / 2000.3
     task = motion(
-        braked_spring(Coulomb(Fc), **numbers), [1.0], [0.0], 5000.0, by="friction.Fc", read=position,
+        braked_spring.scene(Coulomb(Fc), **numbers), [1.0], [0.0], 5000.0, by="friction.Fc", read=position,
         max_steps=262144, max_events=4096,
     )  # fmt: skip
     return HardCase(
@@ -217,13 +206,13 @@ def _dip() -> HardCase:
 
 def _long_stick() -> HardCase:
     """Stick of 6e5 s beside slip of 0.3 s."""
-    numbers = BELT_OSCILLATOR | {"belt": 1e-7}
+    numbers = belt_oscillator.PARAMS | {"belt": 1e-7}
     t1 = 2.5e6
 
     def exact(k: float) -> float:
-        return float(belt_oscillator_motion(jnp.asarray(t1), **(numbers | {"k": k}))[0])
+        return float(belt_oscillator.motion(jnp.asarray(t1), **(numbers | {"k": k}))[0])
 
-    task = motion(belt_oscillator(belt_coulomb(), belt=1e-7), [0.0], [1e-7], t1, by="k", read=position)
+    task = motion(belt_oscillator.scene(belt_oscillator.coulomb(), belt=1e-7), [0.0], [1e-7], t1, by="k", read=position)
     return HardCase(
         "long_stick",
         FAMILY,

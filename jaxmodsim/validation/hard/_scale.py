@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ...friction import Coulomb
-from ...problems import BRAKED_SPRING, braked_spring, braked_spring_law, braked_spring_motion, ramped_box
+from ...problems import braked_spring, ramped_box
 from ...scene import Scene
 from ...simulation import Trajectory, simulate
 from ...solvers import Gauss
@@ -20,7 +20,7 @@ _LATE = 1e9
 
 
 def _at(t: float, x0: float) -> float:
-    return float(braked_spring_motion(jnp.asarray(t), **(BRAKED_SPRING | {"x0": x0}))[0])
+    return float(braked_spring.motion(jnp.asarray(t), **(braked_spring.PARAMS | {"x0": x0}))[0])
 
 
 def in_other_units(length: float, time: float, mass: float) -> float:
@@ -28,12 +28,12 @@ def in_other_units(length: float, time: float, mass: float) -> float:
 
     Units that are powers of two change no digit, if nothing in the program is of a size of its own.
     """
-    p, ts = BRAKED_SPRING, np.linspace(0.0, 26.0, 53)
+    p, ts = braked_spring.PARAMS, np.linspace(0.0, 26.0, 53)
     force = mass * length / time**2
     runs = []
     for scale, pace, kilo, newton in ((1.0, 1.0, 1.0, 1.0), (length, time, mass, force)):
         law = Coulomb(p["Fc"] * newton, p["Fs"] * newton)
-        scene = braked_spring(law, m=p["m"] * kilo, k=p["k"] * kilo / pace**2)
+        scene = braked_spring.scene(law, m=p["m"] * kilo, k=p["k"] * kilo / pace**2)
         # One number for lengths and velocities: the tolerance can only be none. Until shortly before rest, whose
         # velocities are rounding, which has no scale of its own.
         run = simulate(scene, [p["x0"] * scale], [0.0], 26.0 * pace, ts=ts * pace, rtol=1e-8, atol=0.0)
@@ -79,7 +79,7 @@ def _single(scene: Scene) -> Scene:
 
 
 def _late() -> list[HardCase]:
-    spring = braked_spring(braked_spring_law())
+    spring = braked_spring.scene(braked_spring.coulomb())
     return [
         HardCase(
             "late_start",
@@ -116,7 +116,7 @@ def _late() -> list[HardCase]:
 
 
 def _times() -> list[HardCase]:
-    spring = braked_spring(braked_spring_law())
+    spring = braked_spring.scene(braked_spring.coulomb())
     fine = 1.0 + np.arange(101) * 2.0**-54
     return [
         HardCase(
@@ -125,7 +125,7 @@ def _times() -> list[HardCase]:
             "atol = 0, from rest at zero: errors relative to nothing.",
             "0/0 in the error norm: NaN, or the smallest steps there are.",
             "velocity at 10 s [m/s]",
-            motion(ramped_box(Coulomb(1.5)), [0.0], [0.0], 10.0, by="ramp", read=velocity, numbers={"atol": 0.0}),
+            motion(ramped_box.scene(Coulomb(1.5)), [0.0], [0.0], 10.0, by="ramp", read=velocity, numbers={"atol": 0.0}),
             lambda ramp: ramp * (10.0 - 1.5 / ramp) ** 2 / 4.0,
             # At break-away the net force is rounding, and so is all of a velocity that comes from it.
             single_ends="step size fell below what the time can resolve",
@@ -145,7 +145,7 @@ def _times() -> list[HardCase]:
             "A fixed step of 100 s for a run of one.",
             "The run ends at 100 s.",
             "velocity at 1 s [m/s]",
-            motion(ramped_box(), [0.0], [0.0], 1.0, by="ramp", read=velocity, numbers={"dt": 100.0}),
+            motion(ramped_box.scene(), [0.0], [0.0], 1.0, by="ramp", read=velocity, numbers={"dt": 100.0}),
             lambda ramp: ramp / 4.0,
         ),
         HardCase(
@@ -183,7 +183,7 @@ def _periods() -> HardCase:
         return math.cos(steps * periods * (angle - 2.0 * math.pi / steps))
 
     task = motion(
-        braked_spring(m=1.0, k=1.0),
+        braked_spring.scene(m=1.0, k=1.0),
         [1.0],
         [0.0],
         2.0 * math.pi * periods,

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from ...friction import AbstractLaw, LuGre, Regularized, Viscous, max_stable_step
-from ...problems import box_coulomb, ramped_box, slipping_bristle
+from ...problems import ramped_box, slipping_bristle
 from ...scene import Scene
 from ...simulation import Trajectory, simulate
 from ...solvers import ImplicitFriction, Rodas5P
@@ -54,11 +54,11 @@ def formulations() -> dict[str, Formulation]:
     """A bristle in slip and in stick, friction smoothed over 1e-6 m/s, viscous friction."""
     bristle, damped = LuGre(**_BRISTLE, sigma1=0.0), LuGre(**_BRISTLE, sigma1=300.0)
     steady = (1.5 + 0.25 * math.exp(-((_V / 0.2) ** 2))) / 1e5
-    smooth = Regularized(box_coulomb(), width=1e-6)
+    smooth = Regularized(ramped_box.coulomb(), width=1e-6)
     each = [
         Formulation(
             "bristle in slip",
-            slipping_bristle(bristle, _V),
+            slipping_bristle.scene(bristle, _V),
             {"friction": jnp.asarray(steady * (1.0 + 1e-6))},
             0.0,
             bristle,
@@ -68,7 +68,7 @@ def formulations() -> dict[str, Formulation]:
         ),
         Formulation(
             "bristle in stick",
-            ramped_box(damped, ramp=0.0, m=_M),
+            ramped_box.scene(damped, ramp=0.0, m=_M),
             {"friction": jnp.asarray(1e-12)},
             0.0,
             damped,
@@ -78,7 +78,7 @@ def formulations() -> dict[str, Formulation]:
         ),
         Formulation(
             "regularised",
-            ramped_box(smooth, ramp=0.0, m=_M),
+            ramped_box.scene(smooth, ramp=0.0, m=_M),
             None,
             1e-12,
             smooth,
@@ -88,7 +88,7 @@ def formulations() -> dict[str, Formulation]:
         ),
         Formulation(
             "viscous",
-            ramped_box(Viscous(1e3), ramp=0.0, m=_M),
+            ramped_box.scene(Viscous(1e3), ramp=0.0, m=_M),
             None,
             1.0,
             Viscous(1e3),

@@ -8,7 +8,7 @@ from jaxtyping import Array
 from scipy.integrate import solve_ivp
 
 from ...friction import LuGre, Regularized, Viscous
-from ...problems import BOX_LUGRE, box_coulomb, box_lugre, ramped_box, slipping_bristle
+from ...problems import ramped_box, slipping_bristle
 from ...scene import Scene
 from ...simulation import Trajectory
 from ...solvers import ImplicitFriction, Rodas5P
@@ -24,7 +24,7 @@ def box_by_scipy(*, m: float = 2.0, ramp: float = 1.0, **changes: float) -> floa
 
     Its relative tolerance is 1e-10. On the six sets below Radau at 1e-11 gives the same to 3e-9.
     """
-    law = BOX_LUGRE | changes
+    law = ramped_box.LUGRE | changes
 
     def rate(t: float, y: np.ndarray) -> list[float]:
         v, z = y
@@ -50,7 +50,7 @@ def _box(
     **changes: float,
 ) -> HardCase:
     m = changes.pop("m", 2.0)
-    scene = ramped_box(box_lugre(**changes), m=m)
+    scene = ramped_box.scene(ramped_box.lugre(**changes), m=m)
     return HardCase(
         name,
         FAMILY,
@@ -157,7 +157,7 @@ def _regularized() -> list[HardCase]:
     def exact(Fc: float) -> float:
         return (_T1 - Fc) ** 2 / 4.0
 
-    scene = ramped_box(Regularized(box_coulomb(), width=1e-9))
+    scene = ramped_box.scene(Regularized(ramped_box.coulomb(), width=1e-9))
     return [
         HardCase(
             "regularized_narrow",
@@ -189,7 +189,7 @@ def _bristle_steady() -> HardCase:
         return level / sigma0
 
     law = LuGre(sigma0=1e9, sigma1=0.0, sigma2=0.1, Fc=1.5, Fs=1.75, vs=0.2)
-    task = motion(slipping_bristle(law, v), [0.0], [0.0], t1, by="friction.sigma0", read=_deflection)
+    task = motion(slipping_bristle.scene(law, v), [0.0], [0.0], t1, by="friction.sigma0", read=_deflection)
     return HardCase(
         "bristle_at_speed",
         FAMILY,
@@ -214,7 +214,7 @@ def _implicit_long_step() -> HardCase:
 
     law = LuGre(sigma0=1e9, sigma1=0.0, sigma2=0.1, Fc=1.5, Fs=1.75, vs=0.2)
     task = motion(
-        slipping_bristle(law, v),
+        slipping_bristle.scene(law, v),
         [0.0],
         [0.0],
         t1,
@@ -236,7 +236,7 @@ def _implicit_long_step() -> HardCase:
 
 
 def _viscous_explicit() -> HardCase:
-    scene = ramped_box(Viscous(1e7))
+    scene = ramped_box.scene(Viscous(1e7))
     task = motion(scene, [0.0], [0.0], _T1, by="friction.Fv", read=velocity, solver=dfx.Tsit5(), max_steps=4096)
     return HardCase(
         "explicit_is_named",
