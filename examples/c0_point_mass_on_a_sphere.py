@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 import jaxmodsim as jms
 from jaxmodsim.mechanics import acceleration, energies
-from jaxmodsim.scene import State, scene_reactions, vector_field
+from jaxmodsim.scene import State, forward_dynamics, vector_field
 
 # Before any array is made, and the scenes below hold some.
 jms.tune_cpu()
@@ -191,7 +191,7 @@ def sphere():
     vector = radial[:, None] * np.asarray(SPHERICAL.basis(place))[:, :, 0]
     found = at_states(lambda q, qd: ON_SPHERE.reaction(NOW, q, qd, NUMBERS), q, qd)
     claim("the same as a vector, f_r e_r, is the `reaction` of `point_mass(m, position)`", found, vector)
-    found = at_states(lambda x, v: scene_reactions(NOW, State(x, v, {}), HELD), *moving(on_sphere, q, qd))
+    found = at_states(lambda x, v: forward_dynamics(NOW, State(x, v, {}), HELD).reactions, *moving(on_sphere, q, qd))
     claim("and in x, y, z with the constraint |x| = R, f_r is its multiplier", found["sphere"].multiplier[:, 0], radial)
     print("(h) The spherical pendulum by Lagrange, from L = m v^2/2 - m g z")
     claim("phi'' = sin(phi) cos(phi) theta'^2 + (g/R) sin(phi)", qdd[:, 0], s * c * theta1**2 + G / R * s)

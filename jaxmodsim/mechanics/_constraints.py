@@ -308,38 +308,49 @@ def rates(
     return at
 
 
-def project_position(
-    constraints: Constraints,
-    t: Float[Array, ""],
-    q: Float[Array, " dof"],
-    params: PyTree,
-    mass: Float[Array, "dof dof"],
-) -> Float[Array, " dof"]:
-    """Coordinates moved onto the holonomic constraints, the shortest way in the metric of the masses.
-
-    Two Newton steps, with the mass matrix held.
-    """
-    error = errors(constraints, t, params)
-    if error(q).shape == (0,):
-        return q
-    for _ in range(_NEWTON):
-        reach, matrix = _reach(_jacobian(error, q), mass)
-        q = q - jnp.sum(reach * solve_balanced(matrix, error(q))[:, None], axis=0)
-    return q
-
-
-def project_velocity(
+def project(
     constraints: Constraints,
     t: Float[Array, ""],
     q: Float[Array, " dof"],
     qd: Float[Array, " dof"],
     params: PyTree,
     mass: Float[Array, "dof dof"],
-) -> Float[Array, " dof"]:
-    """Velocities moved onto the constraints, by the smallest impulses that do."""
+) -> tuple[Float[Array, " dof"], Float[Array, " dof"]]:
+    """Coordinates and velocities moved onto the constraints, the shortest way in the metric of the masses.
+
+    Two Newton steps for the coordinates, with the mass matrix held; then the smallest impulses for the velocities.
+    """
+    error = errors(constraints, t, params)
+    if error(q).shape != (0,):
+        for _ in range(_NEWTON):
+            reach, matrix = _reach(_jacobian(error, q), mass)
+            q = q - jnp.sum(reach * solve_balanced(matrix, error(q))[:, None], axis=0)
     rate = rates(constraints, t, q, params)
     reach, matrix = _reach(_jacobian(rate, qd), mass)
-    return qd - jnp.sum(reach * solve_balanced(matrix, rate(qd))[:, None], axis=0)
+    return q, qd - jnp.sum(reach * solve_balanced(matrix, rate(qd))[:, None], axis=0)
+
+
+def constraint_residual(
+    constraints: Constraints,
+    t: Float[Array, ""],
+    q: Float[Array, " dof"],
+    qd: Float[Array, " dof"],
+    params: PyTree,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """How far coordinates and velocities are from the constraints, relative to their own size or to one.
+
+    Each error is divided by the length of its gradient, which makes it a distance from its own surface: constraints
+    that contradict each other show, too. Without derivatives.
+    """
+    q, qd = jax.lax.stop_gradient((q, qd))
+
+    def far(fn: Callable[[Array], Array], x: Array) -> Array:
+        error, rows = fn(x), _jacobian(fn, x)
+        slope = safe_norm(rows, axis=1)
+        distance = jnp.abs(error) / jnp.where(slope > 0, slope, 1.0)
+        return jnp.max(distance, initial=0.0) / jnp.maximum(1.0, jnp.max(jnp.abs(x)))
+
+    return far(errors(constraints, t, params), q), far(rates(constraints, t, q, params), qd)
 
 
 def _jacobian(fn: object, x: Float[Array, " dof"]) -> Float[Array, "m dof"]:

@@ -163,6 +163,11 @@ class Scene(eqx.Module):
         }
 
     @property
+    def stick_drifts(self) -> bool:
+        """Whether stick drifts with the error of integration: not where it holds one coordinate at a constant speed."""
+        return any(each.along is not None or callable(each.belt_velocity) for each in self.event_driven.values())
+
+    @property
     def reaction_loaded(self) -> dict[str, Friction]:
         """The other friction elements whose load is the reaction of a constraint, by name."""
         return {
@@ -179,7 +184,7 @@ class Scene(eqx.Module):
 
     @property
     def checks(self) -> tuple[str, ...]:
-        """What may end the equations of motion, in words, in the order of `Resolved.margins`."""
+        """What may end the equations of motion, in words, in the order of `Dynamics.validity_margins`."""
         words = [
             f"The constraint {name!r} can only push, and would have to pull: the contact opens. The motion from there"
             " on is that of a scene without it."

@@ -7,10 +7,11 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from .._core.arguments import as_flag
 from .._core.parameters import as_vector
+from .._core.sorted_times import after, entry
 
 
 class Signal(eqx.Module):
@@ -68,12 +69,12 @@ class Signal(eqx.Module):
         last = times.shape[0] - 1
         i = after(times, t) - 1
         here = jnp.maximum(i, 0)
-        start, value = _entry(times, here), _entry(self.values, here)
+        start, value = entry(times, here), entry(self.values, here)
         if not self.linear:
             return Piece(self, value, None, None)
         there = jnp.minimum(i + 1, last)
-        length = _entry(times, there) - start
-        slope = (_entry(self.values, there) - value) / jnp.where(length > 0, length, 1.0).astype(value.dtype)
+        length = entry(times, there) - start
+        slope = (entry(self.values, there) - value) / jnp.where(length > 0, length, 1.0).astype(value.dtype)
         return Piece(self, value, slope, start)
 
 
@@ -90,21 +91,6 @@ class Piece(eqx.Module):
         if self.slope is None or self.start is None:
             return self.value
         return self.value + self.slope * (t - self.start).astype(self.value.dtype)
-
-
-def after(times: Float[Array, " n"], t: Float[Array, ""]) -> Int[Array, ""]:
-    """Number of the increasing `times` that are not after `t`: the index of the first one that is."""
-    # Unrolled: a loop inside the loop of a run would keep XLA from fusing a step.
-    return jnp.searchsorted(times, t.astype(times.dtype), side="right", method="scan_unrolled")
-
-
-def is_one_of(times: Float[Array, " n"], t: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether `t` is one of the increasing `times`."""
-    return _entry(times, jnp.maximum(after(times, t) - 1, 0)) == t
-
-
-def _entry(x: Array, i: Int[Array, ""]) -> Array:
-    return jax.lax.dynamic_index_in_dim(x, i, keepdims=False)
 
 
 def _is_signal(x: Any) -> bool:

@@ -20,7 +20,7 @@ from jaxmodsim import (
     simulate,
 )
 from jaxmodsim.mechanics import energies, momentum
-from jaxmodsim.scene import State, scene_power, vector_field
+from jaxmodsim.scene import State, forward_dynamics, vector_field
 
 from ..helpers.mechanisms import CASES, case
 
@@ -38,7 +38,7 @@ def unaccounted(scene: Scene, t: Any, y: State, mode: Any) -> tuple[Any, Any]:
             return sum(energies(scene.lagrangian, t, q, qd, scene.params))
 
         change = jax.jvp(energy, (t, y.q, y.qd), (jnp.ones_like(t), rate.q, rate.qd))[1]
-        powers = scene_power(t, y, scene, mode).values()
+        powers = forward_dynamics(t, y, scene, mode).power.values()
         supplied, absorbed = [x.supplied for x in powers], [x.absorbed for x in powers if x.absorbed is not None]
         size = sum(jnp.abs(each) for each in (*supplied, *absorbed))
         parts = jax.jvp(lambda qd: energies(scene.lagrangian, t, y.q, qd, scene.params), (y.qd,), (rate.qd,))[1]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodsim import Scene, problems
-from jaxmodsim.scene import ConstraintReaction, State, scene_reactions, scene_validity_margins, vector_field
+from jaxmodsim.scene import ConstraintReaction, State, forward_dynamics, vector_field
 
 SAMPLES = 50
 # Each side is a sum of a few terms, right to some roundings: compare with the largest around.
@@ -172,11 +172,11 @@ def case(name: str) -> Case:
 def look(scene: Scene, q: Any, qd: Any, mode: Any) -> Any:
     def one(q: Any, qd: Any, mode: Any) -> Any:
         t, y = jnp.zeros(()), State(q, qd, {})
-        reactions = scene_reactions(t, y, scene, mode) if scene.constraints else {}
+        reactions = forward_dynamics(t, y, scene, mode).reactions if scene.constraints else {}
         return (
             vector_field(t, y, scene, mode).qd,
             reactions,
-            scene_validity_margins(t, y, scene, mode) if scene.checks else None,
+            forward_dynamics(t, y, scene, mode).validity_margins if scene.checks else None,
         )
 
     return jax.vmap(one)(q, qd, mode)

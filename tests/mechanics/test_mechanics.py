@@ -10,7 +10,7 @@ import pytest
 
 from jaxmodsim import AppliedForce, Friction, Scene, Viscous, problems
 from jaxmodsim.mechanics import acceleration, energies, motion_equations
-from jaxmodsim.scene import State, scene_forces, vector_field
+from jaxmodsim.scene import State, forward_dynamics, vector_field
 
 SAMPLES = 200
 
@@ -179,7 +179,7 @@ def test_friction_along_a_displacement() -> None:
     t, q, qd = jnp.array(0.4), jnp.array([0.7, -0.6]), jnp.array([1.1, 0.2])
     gradient = np.array([np.cos(0.7) - 0.6, 0.7])
     force = (2.0 * 9.81 - 0.66 + 0.4) * 0.3 * (gradient @ np.array([1.1, 0.2]) - 0.04)
-    np.testing.assert_allclose(scene_forces(t, State(q, qd, {}), scene)["friction"], force, rtol=1e-14)
+    np.testing.assert_allclose(forward_dynamics(t, State(q, qd, {}), scene).forces["friction"], force, rtol=1e-14)
     np.testing.assert_allclose(vector_field(t, State(q, qd, {}), scene).qd, -force * gradient / 2.0, rtol=1e-14)
 
 

@@ -16,7 +16,8 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim import problems
-from jaxmodsim.solvers import calls_back, unchecked
+from jaxmodsim.solvers import unchecked
+from jaxmodsim.solvers._unchecked import calls_back
 
 TIMES = np.linspace(0.0, 1.0, 5)
 

@@ -12,7 +12,9 @@ from jaxmodsim.cli import _hard
 from jaxmodsim.plot import hard_figure
 from jaxmodsim.problems import ramped_box
 from jaxmodsim.validation import hard
-from jaxmodsim.validation.hard import CaseReport, CheckFinding, HardCase, MeasuredNumber, RefusedCalls
+from jaxmodsim.validation.hard import CaseReport, HardCase
+from jaxmodsim.validation.hard._case import MeasuredNumber, RefusedCalls
+from jaxmodsim.validation.hard._check import DTYPES, CheckFinding
 
 CASES = hard.hard_cases()
 
@@ -28,7 +30,7 @@ def test_every_case_says_why_it_is_hard_and_what_is_right():
         # A transform, or a transform in one type.
         assert set(case.skips) <= {
             *hard.TRANSFORMS,
-            *(f"{transform} {dtype}" for transform in hard.TRANSFORMS for dtype in hard.DTYPES),
+            *(f"{transform} {dtype}" for transform in hard.TRANSFORMS for dtype in DTYPES),
         }
         assert all(case.skips.values())
 

@@ -142,6 +142,14 @@ def largest_step(formulation: Formulation, solver: dfx.AbstractSolver) -> float:
     return math.sqrt(low * high)
 
 
+def largest_steps() -> dict[str, dict[str, tuple[float, float]]]:
+    """Largest stable step [s] by theory and by running, of each formulation and explicit method."""
+    return {
+        name: {each: (theory(what, solver), largest_step(what, solver)) for each, solver in EXPLICIT.items()}
+        for name, what in formulations().items()
+    }
+
+
 def _ratio(name: str, solvers: dict[str, dfx.AbstractSolver]) -> float:
     """The measured limit over that of theory, of the solver where they are farthest apart."""
     formulation = formulations()[name]
