@@ -42,22 +42,18 @@ class BouncingBall(eqx.Module):
 
     def field(self, t: object, s: EventState, args: object) -> EventState:
         """Rate: in free fall, or zero on the floor."""
-        del t, args
         return s.rate(jnp.where(s.mode > 0.5, 0.0, jnp.stack([s.y[1], -self.g])))
 
     def guards(self, t: object, s: EventState, args: object) -> Float[Array, "1"]:
         """Height above the floor [m]."""
-        del t, args
         return s.y[:1]
 
     def reset(self, t: object, s: EventState, args: object, fired: Bool[Array, "1"]) -> EventState:
         """Bounce: the velocity changes its sign and keeps the part e."""
-        del t, args, fired
         return s._replace(y=jnp.stack([jnp.zeros_like(s.y[0]), -self.e * s.y[1]]))
 
     def hold(self, t: object, s: EventState, args: object, fired: Bool[Array, "1"]) -> EventState:
         """Come to rest on the floor."""
-        del t, args, fired
         return s._replace(y=jnp.zeros_like(s.y), mode=jnp.ones_like(s.mode))
 
 

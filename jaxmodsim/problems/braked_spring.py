@@ -22,7 +22,6 @@ class Rest(NamedTuple):
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
 
 
@@ -50,7 +49,6 @@ def scene(law: object = None, *, m: ArrayLike = PARAMS["m"], k: ArrayLike = PARA
 
 
 def _drive(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q, qd
     return jnp.reshape(p["u"], (1,))
 
 

@@ -11,7 +11,6 @@ PARAMS = {"M": 1.0, "m": 0.3, "l": 1.2, "g": 9.81}
 
 
 def _cart(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q
     return 0.5 * p["M"] * qd[0] ** 2
 
 
@@ -20,20 +19,15 @@ def _middle(q: Array, p: dict[str, Array]) -> Array:
     return jnp.stack([q[0] + half * jnp.sin(q[1]), 0.0 * q[0], half * jnp.cos(q[1])])
 
 
-def _angle(q: Array) -> Array:
-    return q[1]
-
-
 def _track(q: Array) -> Array:
     return q[0]
 
 
 def _push(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, qd
     return jnp.stack([p["force"], 0.0 * q[1]])
 
 
-_POLE = rigid_body(lambda p: p["m"], lambda p: p["m"] * p["l"] ** 2 / 12.0, _middle, _angle, lambda p: p["g"])
+_POLE = rigid_body(lambda p: p["m"], lambda p: p["m"] * p["l"] ** 2 / 12.0, _middle, lambda q: q[1], lambda p: p["g"])
 _LAGRANGIAN = _POLE + _cart
 
 

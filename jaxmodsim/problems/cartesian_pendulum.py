@@ -16,7 +16,6 @@ def _in_space(q: Array) -> Array:
 
 
 def _stretch(t: Array, x: Array, p: dict[str, Array]) -> Array:
-    del t
     return jnp.sqrt(jnp.sum(x**2)) - p["l"]
 
 

@@ -10,18 +10,13 @@ from ..scene import Scene
 PARAMS = {"m": 0.7, "charge": -1.1, "B": 2.3, "E": (0.4, -0.3, 0.2)}
 
 
-def _place(q: Array) -> Array:
-    return q
-
-
 def _fields(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     """`charge (A . v + E . x)`, with the vector potential A = B (-y, x, 0)/2."""
-    del t
     magnetic = 0.5 * p["B"] * (q[0] * qd[1] - q[1] * qd[0])
     return p["charge"] * (magnetic + jnp.sum(p["E"] * q))
 
 
-_LAGRANGIAN = point_mass(lambda p: p["m"], _place, lambda p: 0.0 * p["m"]) + _fields
+_LAGRANGIAN = point_mass(lambda p: p["m"], lambda q: q, lambda p: 0.0 * p["m"]) + _fields
 
 
 def scene(
@@ -69,7 +64,6 @@ def acceleration(
 
     Arguments as for `scene`, velocities `qd` [m/s]; the place `q` [m] does not matter.
     """
-    del q
     bent = B * jnp.stack([qd[1], -qd[0], jnp.zeros_like(qd[2])])
     return jnp.asarray(charge) * (jnp.asarray(E, qd.dtype) + bent) / m
 

@@ -23,7 +23,6 @@ class FirstSlip(NamedTuple):
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     kinetic = 0.5 * p["m1"] * qd[0] ** 2 + 0.5 * p["m2"] * qd[1] ** 2
     springs = 0.5 * p["k1"] * q[0] ** 2 + 0.5 * p["k2"] * q[1] ** 2 + 0.5 * p["coupling"] * (q[0] - q[1]) ** 2
     return kinetic - springs

@@ -10,7 +10,6 @@ PARAMS = {"m": 28.0, "l": 67.0, "g": 9.81, "Omega": 7.2921159e-5, "latitude": 0.
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     spin = p["Omega"] * jnp.sin(p["latitude"])
     turning = spin * (q[0] * qd[1] - q[1] * qd[0])
     swing = 0.5 * p["g"] / p["l"] * (q[0] ** 2 + q[1] ** 2)

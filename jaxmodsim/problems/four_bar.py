@@ -24,48 +24,27 @@ def _coupler_middle(q: Array, p: dict[str, Array]) -> Array:
     return _along(p["a"], q[0]) + _along(0.5 * p["b"], q[1])
 
 
-def _coupler_end(q: Array, p: dict[str, Array]) -> Array:
-    return _along(p["a"], q[0]) + _along(p["b"], q[1])
-
-
 def _rocker_middle(q: Array, p: dict[str, Array]) -> Array:
     return _along(p["d"], 0.0 * q[2]) + _along(0.5 * p["c"], q[2])
 
 
-def _rocker_end(q: Array, p: dict[str, Array]) -> Array:
-    return _along(p["d"], 0.0 * q[2]) + _along(p["c"], q[2])
-
-
-def _crank_angle(q: Array) -> Array:
-    return q[0]
-
-
-def _coupler_angle(q: Array) -> Array:
-    return q[1]
-
-
-def _rocker_angle(q: Array) -> Array:
-    return q[2]
-
-
 def _ends(q: Array, p: dict[str, Array]) -> Array:
-    return jnp.stack([_coupler_end(q, p), _rocker_end(q, p)])
+    return jnp.stack([_along(p["a"], q[0]) + _along(p["b"], q[1]), _along(p["d"], 0.0 * q[2]) + _along(p["c"], q[2])])
 
 
 def _gap(t: Array, ends: Array, p: dict[str, Array]) -> Array:
-    del t, p
     gap = ends[1] - ends[0]
     return jnp.stack([gap[0], gap[2]])
 
 
 _CRANK = rigid_body(
-    lambda p: p["m1"], lambda p: p["m1"] * p["a"] ** 2 / 12.0, _crank_middle, _crank_angle, lambda p: p["g"]
+    lambda p: p["m1"], lambda p: p["m1"] * p["a"] ** 2 / 12.0, _crank_middle, lambda q: q[0], lambda p: p["g"]
 )
 _COUPLER = rigid_body(
-    lambda p: p["m2"], lambda p: p["m2"] * p["b"] ** 2 / 12.0, _coupler_middle, _coupler_angle, lambda p: p["g"]
+    lambda p: p["m2"], lambda p: p["m2"] * p["b"] ** 2 / 12.0, _coupler_middle, lambda q: q[1], lambda p: p["g"]
 )
 _ROCKER = rigid_body(
-    lambda p: p["m3"], lambda p: p["m3"] * p["c"] ** 2 / 12.0, _rocker_middle, _rocker_angle, lambda p: p["g"]
+    lambda p: p["m3"], lambda p: p["m3"] * p["c"] ** 2 / 12.0, _rocker_middle, lambda q: q[2], lambda p: p["g"]
 )
 _LAGRANGIAN = _CRANK + _COUPLER + _ROCKER
 

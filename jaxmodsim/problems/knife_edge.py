@@ -14,16 +14,11 @@ def _place(q: Array, p: dict[str, Array]) -> Array:
     return jnp.stack([q[0] * jnp.cos(p["slope"]), q[1], -q[0] * jnp.sin(p["slope"])])
 
 
-def _heading(q: Array) -> Array:
-    return q[2]
-
-
 def _sideways(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, p
     return jnp.cos(q[2]) * qd[1] - jnp.sin(q[2]) * qd[0]
 
 
-_BLADE = rigid_body(lambda p: p["m"], lambda p: p["I"], _place, _heading, lambda p: p["g"])
+_BLADE = rigid_body(lambda p: p["m"], lambda p: p["I"], _place, lambda q: q[2], lambda p: p["g"])
 
 
 def scene(

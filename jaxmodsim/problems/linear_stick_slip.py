@@ -437,13 +437,11 @@ def _waves(t: Array, frequencies: Array) -> Array:
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     kinetic = 0.5 * jnp.sum(qd * jnp.sum(p["mass"] * qd[None, :], axis=1))
     return kinetic - 0.5 * jnp.sum(q * jnp.sum(p["stiffness"] * q[None, :], axis=1))
 
 
 def _load(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del q
     waves = jnp.sum(p["load"] * _waves(t, p["frequencies"])[None, :], axis=1)
     return waves - jnp.sum(p["damping"] * qd[None, :], axis=1)
 

@@ -9,7 +9,6 @@ from ..scene import Scene
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     # Sums over the links up to each mass. As products: XLA on CPU has a fast one of those, but not of `jnp.cumsum`.
     upto = np.tri(q.shape[0], dtype=q.dtype)
     x = upto @ (p["l"] * jnp.cos(q) * qd)

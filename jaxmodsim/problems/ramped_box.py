@@ -20,12 +20,10 @@ LUGRE_Z10 = 0.0020000000
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q
     return 0.5 * p["m"] * qd[0] ** 2
 
 
 def _pull(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del q, qd
     return jnp.reshape(p["ramp"] * t, (1,))
 
 

@@ -15,10 +15,6 @@ def _centre(q: Array) -> Array:
     return jnp.stack([q[0], 0.0 * q[0], q[1]])
 
 
-def _angle(q: Array) -> Array:
-    return q[2]
-
-
 def _tip(q: Array, p: dict[str, Array]) -> Array:
     half = 0.5 * p["l"]
     return jnp.stack([q[0] + half * jnp.cos(q[2]), 0.0 * q[0], q[1] - half * jnp.sin(q[2])])
@@ -29,11 +25,10 @@ def _tip_along(q: Array, p: dict[str, Array]) -> Array:
 
 
 def _height(t: Array, x: Array, p: dict[str, Array]) -> Array:
-    del t, p
     return x[2]
 
 
-_ROD = rigid_body(lambda p: p["m"], lambda p: p["m"] * p["l"] ** 2 / 12.0, _centre, _angle, lambda p: p["g"])
+_ROD = rigid_body(lambda p: p["m"], lambda p: p["m"] * p["l"] ** 2 / 12.0, _centre, lambda q: q[2], lambda p: p["g"])
 
 
 def scene(

@@ -33,7 +33,6 @@ def _moments(p: dict[str, Array]) -> Array:
 
 def _slip(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     """Velocity of the point of contact along and across the heading."""
-    del t
     sine, cosine = jnp.sin(q[2]), jnp.cos(q[2])
     along, across = cosine * qd[0] + sine * qd[1], cosine * qd[1] - sine * qd[0]
     return jnp.stack([along - p["R"] * (qd[4] + jnp.sin(q[3]) * qd[2]), across + p["R"] * jnp.cos(q[3]) * qd[3]])

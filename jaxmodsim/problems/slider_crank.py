@@ -42,18 +42,6 @@ def _rod_middle(q: Array, p: dict[str, Array]) -> Array:
     return 2.0 * _crank_middle(q, p) + 0.5 * p["l"] * _in_plane(jnp.cos(q[1]), jnp.sin(q[1]))
 
 
-def _rod_end(q: Array, p: dict[str, Array]) -> Array:
-    return 2.0 * _crank_middle(q, p) + p["l"] * _in_plane(jnp.cos(q[1]), jnp.sin(q[1]))
-
-
-def _crank_angle(q: Array) -> Array:
-    return q[0]
-
-
-def _rod_angle(q: Array) -> Array:
-    return q[1]
-
-
 def _slider(q: Array) -> Array:
     return _in_plane(q[2], q[3])
 
@@ -63,34 +51,33 @@ def _track(q: Array) -> Array:
 
 
 def _ends(q: Array, p: dict[str, Array]) -> Array:
-    return jnp.stack([_rod_end(q, p), _slider(q)])
+    rod_end = 2.0 * _crank_middle(q, p) + p["l"] * _in_plane(jnp.cos(q[1]), jnp.sin(q[1]))
+    return jnp.stack([rod_end, _slider(q)])
 
 
 def _gap(t: Array, ends: Array, p: dict[str, Array]) -> Array:
-    del t, p
     gap = ends[1] - ends[0]
     return jnp.stack([gap[0], gap[2]])
 
 
 def _height(t: Array, x: Array, p: dict[str, Array]) -> Array:
-    del t, p
     return x[2]
 
 
 def _drive(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, qd
     return jnp.zeros_like(q).at[0].set(p["torque"])
 
 
 def _slide(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     return 0.5 * p["m3"] * (qd[2] ** 2 + qd[3] ** 2) - p["m3"] * p["g"] * q[3]
 
 
 _CRANK = rigid_body(
-    lambda p: p["m1"], lambda p: p["m1"] * p["r"] ** 2 / 12.0, _crank_middle, _crank_angle, lambda p: p["g"]
+    lambda p: p["m1"], lambda p: p["m1"] * p["r"] ** 2 / 12.0, _crank_middle, lambda q: q[0], lambda p: p["g"]
 )
-_ROD = rigid_body(lambda p: p["m2"], lambda p: p["m2"] * p["l"] ** 2 / 12.0, _rod_middle, _rod_angle, lambda p: p["g"])
+_ROD = rigid_body(
+    lambda p: p["m2"], lambda p: p["m2"] * p["l"] ** 2 / 12.0, _rod_middle, lambda q: q[1], lambda p: p["g"]
+)
 _LAGRANGIAN = _CRANK + _ROD + _slide
 
 

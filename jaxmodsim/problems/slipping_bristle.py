@@ -8,7 +8,6 @@ from ..scene import Friction, Scene
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q
     return 0.5 * p["m"] * qd[0] ** 2
 
 

@@ -9,7 +9,6 @@ from ..scene import Scene
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     phi, speed_phi, speed_theta = q[0], qd[0], jnp.sin(q[0]) * qd[1]
     kinetic = 0.5 * p["m"] * p["R"] ** 2 * (speed_phi**2 + speed_theta**2)
     return kinetic - p["m"] * p["g"] * p["R"] * jnp.cos(phi)

@@ -36,7 +36,6 @@ def _spiral(q: Array, p: dict[str, Array]) -> Array:
 
 
 def _drag(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     return -p["k"] * jax.jvp(lambda q: _spiral(q, p), (q,), (qd,))[1]
 
 

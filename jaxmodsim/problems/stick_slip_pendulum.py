@@ -12,7 +12,6 @@ PARAMS = {"m": 1.0, "l": 0.5, "g": 9.81, "Fc": 0.4, "Fs": 0.6}
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     return 0.5 * p["m"] * (p["l"] * qd[0]) ** 2 + p["m"] * p["g"] * p["l"] * jnp.cos(q[0])
 
 

@@ -76,11 +76,9 @@ def test_checks_fail_where_something_is_wrong():
         "value": replace(STEP, exact=lambda ramp: ramp / 4.0 + 1e-5),
         "end": replace(STEP, ends="step limit"),
         "derivative": replace(STEP, exact=lambda ramp: 0.25 + 0.0 * ramp),
-        "measured": HardCase("m", "numbers", "", "", "", MeasuredNumber(lambda: 1.0), lambda _: 2.0),
-        "refused": HardCase("r", "numbers", "", "", "", RefusedCalls({"x": lambda: None}, {"x": "anything"})),
-        "other text": HardCase(
-            "r", "numbers", "", "", "", RefusedCalls({"x": lambda: jms.Coulomb(-1.0)}, {"x": "Fs must"})
-        ),
+        "measured": HardCase("m", "", "", MeasuredNumber(lambda: 1.0), lambda _: 2.0),
+        "refused": HardCase("r", "", "", RefusedCalls({"x": lambda: None}, {"x": "anything"})),
+        "other text": HardCase("r", "", "", RefusedCalls({"x": lambda: jms.Coulomb(-1.0)}, {"x": "Fs must"})),
     }
     for what, case in wrong.items():
         transforms = ["forward"] if what == "derivative" else ["alone"]

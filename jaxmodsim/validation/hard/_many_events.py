@@ -71,28 +71,25 @@ def _zeno() -> list[HardCase]:
     return [
         HardCase(
             "bouncing_ball",
-            FAMILY,
             "A ball comes to rest after infinitely many bounces in 1.35 s.",
             "It falls through the floor when the bounces come closer than the event search resolves.",
-            "time of rest [s]",
             FunctionTask(_bounce_to_rest, 0.5, "coefficient of restitution"),
             rest,
+            asks="time of rest [s]",
         ),
         HardCase(
             "bouncing_ball_unheld",
-            FAMILY,
             "The same without a state of rest to go to.",
             "Smaller and smaller steps without end.",
-            "a named end, at the time of rest [s]",
             FunctionTask(_bounce_unheld, 0.5, "coefficient of restitution"),
             rest,
+            asks="a named end, at the time of rest [s]",
             ends="ended early",
         ),
     ]
 
 
 def _load_of_deflection(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, qd
     return p["k"] * jnp.abs(q[0])
 
 
@@ -118,13 +115,12 @@ def _shrinking_swing() -> HardCase:
     task = motion(scene, [1.0], [0.0], t1, by="friction.Fc", read=position, numbers=numbers, max_steps=65536)
     return HardCase(
         "shrinking_swing",
-        FAMILY,
         "A hundred reversals, each swing 0.82 of the one before: 1.6e-9 m at the end, with atol = 0.",
         "Absolute tolerances stop it at their own size; thresholds in SI units take it for rest.",
-        "position at the 100th turn [m]",
         task,
         lambda mu: factor(mu) ** n,
         slope,
+        asks="position at the 100th turn [m]",
         # At the last turn an error of its time, 1e-4 s of 321 s, is seen in the derivative alone.
         tolerance=1e-5,
         single=1e-2,
@@ -156,21 +152,19 @@ def _chatter() -> list[HardCase]:
     return [
         HardCase(
             "chatter_named",
-            FAMILY,
             why,
             naive,
-            "the sentence",
             motion(scene, [0.0], [0.0], 1.8, by="ramp", read=position),
+            asks="the sentence",
             ends="mode changes of 'friction' accumulate: chatter",
         ),
         HardCase(
             "chatter_held",
-            FAMILY,
             why,
             naive,
-            "position at 1.8 s, held in stick [m]",
             motion(scene, [0.0], [0.0], 1.8, by="ramp", read=position, hold_chatter=True),
             lambda _: 0.0,
+            asks="position at 1.8 s, held in stick [m]",
             scale=1.0,
         ),
     ]
@@ -202,22 +196,19 @@ def _cycles() -> list[HardCase]:
     return [
         HardCase(
             "simultaneous",
-            FAMILY,
             "Two masses break away, and stick again, at the very same instants.",
             "One event of the two is handled, the other is behind the solver.",
-            "position at 5 s [m]",
             motion(twins, [0.0, 0.0], [belt, belt], 5.0, by="coupling", read=position),
             lambda _: together(5.0),
         ),
         HardCase(
             "cycles_100000",
-            FAMILY,
             "1e5 cycles of stick and slip: an error of 1e-9 in each instant adds up, and so does any bias.",
             "Minutes of event search; a period that drifts with the tolerance.",
-            "position after 100 000 cycles [m]",
             long,
             lambda k: place(late, k),
             drift,
+            asks="position after 100 000 cycles [m]",
             scale=0.06,
             tolerance=1e-4,
             # Times of 1e5 s are known to 8 ms in float32.
@@ -243,23 +234,20 @@ def _smooth_break_away() -> HardCase:
     )  # fmt: skip
     return HardCase(
         "smooth_break_away",
-        FAMILY,
         "Friction goes on from Fs without a jump as slip begins: at break-away slip and the net force both vanish.",
         "It sticks and breaks away again a few times within a microsecond, as rounding has it.",
-        "number of mode changes in 5 s [1]",
         task,
         # Four cycles of break-away and stick.
         lambda _: 8.0,
+        asks="number of mode changes in 5 s [1]",
     )
 
 
 def _swell(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del q, qd
     return jnp.reshape(p["F"] * jnp.sin(t), (1,))
 
 
 def _mass(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q
     return 0.5 * p["m"] * qd[0] ** 2
 
 
@@ -269,10 +257,8 @@ def _grazing() -> HardCase:
     )
     return HardCase(
         "grazing_limit",
-        FAMILY,
         "The load swells up to the limit of stick, touches it and falls again.",
         "An event or none, as rounding has it; the derivative is that of one of the two.",
-        "position at 3 s [m]",
         motion(scene, [0.0], [0.0], 3.0, by="F", read=position, numbers={"dtmax": 0.1}),
         lambda _: 0.0,
         scale=1.0,
@@ -283,12 +269,10 @@ def _grazing() -> HardCase:
 
 
 def _below_ceiling(t: object, s: EventState, args: object) -> Array:
-    del t, args
     return 1.0 - s.y[:1]
 
 
 def _caught(t: object, s: EventState, args: object, fired: Array) -> EventState:
-    del t, args, fired
     return s._replace(y=0.0 * s.y + 1.0, mode=jnp.ones_like(s.mode))
 
 
@@ -299,7 +283,6 @@ def _throw(v0: Array, adjoint: dfx.AbstractAdjoint | None) -> Answer:
     start = solver.start(0.0 * one, jnp.stack([0.0 * one, v0]), mode=0.0 * one)
 
     def field(t: object, s: EventState, args: object) -> EventState:
-        del t, args
         return s.rate(jnp.where(s.mode > 0.5, 0.0, jnp.stack([s.y[1], -_G * one])))
 
     code, ys = _solve(field, solver, 1.0, start, adjoint)
@@ -317,13 +300,12 @@ def _ceiling() -> HardCase:
     v0 = math.sqrt(2.0 * _G) * (1.0 + 1e-8)
     return HardCase(
         "grazing_ceiling",
-        FAMILY,
         "A ball touches the ceiling at 6e-4 m/s: the time of touching goes as a square root of what is left.",
         "The touch lies between two steps and is missed; the derivative, -700, is off by as much.",
-        "time of touching [s]",
         FunctionTask(_throw, v0, "initial velocity [m/s]"),
         exact,
         slope,
+        asks="time of touching [s]",
         tolerance=1e-5,
         # In float32 the ball does not reach the ceiling: 1e-8 is below its rounding.
         single=None,

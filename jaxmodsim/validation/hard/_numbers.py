@@ -37,7 +37,7 @@ def _refused(name: str, why: str, naive: str, calls: dict[str, tuple[Callable[[]
     task = RefusedCalls(
         {key: call for key, (call, _) in calls.items()}, {key: text for key, (_, text) in calls.items()}
     )
-    return HardCase(name, FAMILY, why, naive, "errors that name what is wrong", task)
+    return HardCase(name, why, naive, task, asks="errors that name what is wrong")
 
 
 def _garbage() -> list[HardCase]:
@@ -115,10 +115,8 @@ def _extremes() -> list[HardCase]:
     return [
         HardCase(
             "overflow_in_stribeck",
-            FAMILY,
             "vs = 1e-160 m/s: (v/vs)^2 overflows, and its derivative is infinity times zero.",
             "NaN in the derivative, though the value is right.",
-            "velocity at 10 s [m/s]",
             motion(ramped_box.scene(thin), [0.0], [0.0], 10.0, by="friction.Fc", read=velocity),
             # It breaks away at Fs and then feels Fc: v = ((t - Fc)^2 - (Fs - Fc)^2)/(2 m).
             lambda Fc: ((10.0 - Fc) ** 2 - (1.75 - Fc) ** 2) / 4.0,
@@ -127,10 +125,8 @@ def _extremes() -> list[HardCase]:
         ),
         HardCase(
             "subnormal_state",
-            FAMILY,
             "A deflection of 1e-310 m, below what processors compute with at full speed, or at all.",
             "NaN where it is divided by, or a hundredfold slower run.",
-            "position at 5 s [m]",
             motion(braked_spring.scene(m=1.0, k=1.0), [1e-310], [0.0], 5.0, by="k", read=position),
             lambda _: 0.0,
             scale=1.0,
@@ -138,10 +134,8 @@ def _extremes() -> list[HardCase]:
         ),
         HardCase(
             "huge_state",
-            FAMILY,
             "A deflection of 1e150 m: its square is the energy, the square of that overflows.",
             "Infinity in norms.",
-            "position at 5 s [m]",
             motion(braked_spring.scene(m=1.0, k=1.0), [1e150], [0.0], 5.0, by="q0[0]", read=position),
             lambda x0: x0 * math.cos(5.0),
             # No such number in float32.
@@ -149,23 +143,21 @@ def _extremes() -> list[HardCase]:
         ),
         HardCase(
             "types_mixed",
-            FAMILY,
             "Whole numbers, Python's, NumPy's and JAX's, for masses, states and times.",
             "Integer arrays that round the motion off, or an error from a loop whose types differ.",
-            "largest difference between the runs [m]",
             MeasuredNumber(_same_types),
             lambda _: 0.0,
+            asks="largest difference between the runs [m]",
             scale=1.0,
             tolerance=1e-15,
         ),
         HardCase(
             "times_repeated",
-            FAMILY,
             "Times given twice, and a single one.",
             "Rows of NaN for the second of two.",
-            "largest difference between what must be equal [m]",
             MeasuredNumber(_same_times),
             lambda _: 0.0,
+            asks="largest difference between what must be equal [m]",
             scale=1.0,
             tolerance=1e-15,
         ),

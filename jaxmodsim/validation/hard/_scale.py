@@ -50,12 +50,11 @@ def _units() -> list[HardCase]:
     return [
         HardCase(
             f"units_{name}",
-            FAMILY,
             f"The mass on a spring with friction, 11 reversals, on the scale of {words}.",
             "Tolerances, smoothing widths and thresholds in SI units: nothing moves, or nothing stops.",
-            "difference to the run in metres, after conversion [m, m/s]",
             MeasuredNumber(lambda scales=(length, time, mass): in_other_units(*scales)),
             lambda _: 0.0,
+            asks="difference to the run in metres, after conversion [m, m/s]",
             scale=1.0,
             # Not one digit may differ.
             tolerance=1e-15,
@@ -83,10 +82,8 @@ def _late() -> list[HardCase]:
     return [
         HardCase(
             "late_start",
-            FAMILY,
             "The clock shows 1e9 s at the start: times are known to 1e-7 s.",
             "Steps below the resolution of time: an endless loop, or events that are never met.",
-            "position 30 s later [m]",
             motion(
                 spring,
                 [1.0],
@@ -97,20 +94,20 @@ def _late() -> list[HardCase]:
                 numbers={"t0": _LATE, "rtol": 1e-8, "atol": 1e-9},
             ),
             lambda x0: _at(30.0, x0),
+            asks="position 30 s later [m]",
             tolerance=1e-5,
             # RefusedCalls: see the next.
             single=None,
         ),
         HardCase(
             "late_start_single",
-            FAMILY,
             "The same in float32, where the next number after 1e9 is 1e9 + 64.",
             "A run of no length: the initial state, under a success code.",
-            "an error that names it",
             RefusedCalls(
                 {"clock": lambda: simulate(_single(spring), np.ones(1, np.float32), [0.0], _LATE + 30.0, t0=_LATE)},
                 {"clock": "are the same number in float32"},
             ),
+            asks="an error that names it",
         ),
     ]
 
@@ -121,10 +118,8 @@ def _times() -> list[HardCase]:
     return [
         HardCase(
             "no_absolute_tolerance",
-            FAMILY,
             "atol = 0, from rest at zero: errors relative to nothing.",
             "0/0 in the error norm: NaN, or the smallest steps there are.",
-            "velocity at 10 s [m/s]",
             motion(ramped_box.scene(Coulomb(1.5)), [0.0], [0.0], 10.0, by="ramp", read=velocity, numbers={"atol": 0.0}),
             lambda ramp: ramp * (10.0 - 1.5 / ramp) ** 2 / 4.0,
             # At break-away the net force is rounding, and so is all of a velocity that comes from it.
@@ -132,38 +127,33 @@ def _times() -> list[HardCase]:
         ),
         HardCase(
             "sampled_below_rounding",
-            FAMILY,
             "101 samples within 6e-15 s, four to each number that there is.",
             "Interpolation over a step of no length: 0/0.",
-            "position at the middle one [m]",
             motion(spring, [1.0], [0.0], float(fine[-1]), by="q0[0]", read=_middle, numbers={"ts": fine}),
             lambda x0: _at(1.0, x0),
+            asks="position at the middle one [m]",
         ),
         HardCase(
             "step_longer_than_run",
-            FAMILY,
             "A fixed step of 100 s for a run of one.",
             "The run ends at 100 s.",
-            "velocity at 1 s [m/s]",
             motion(ramped_box.scene(), [0.0], [0.0], 1.0, by="ramp", read=velocity, numbers={"dt": 100.0}),
             lambda ramp: ramp / 4.0,
         ),
         HardCase(
             "run_of_no_length",
-            FAMILY,
             "t1 = t0.",
             "A step of zero length: 0/0, or an error from the depths of the solver.",
-            "position [m]",
             motion(spring, [1.0], [0.0], 0.0, by="q0[0]", read=position),
             lambda x0: x0,
+            asks="position [m]",
         ),
         HardCase(
             "step_limit",
-            FAMILY,
             "Ten steps are allowed, a thousand are needed.",
             "The last state is handed out as that of the end.",
-            "the sentence",
             motion(spring, [1.0], [0.0], 1000.0, by="k", read=position, max_steps=10),
+            asks="the sentence",
             ends="step limit was reached before t1",
         ),
     ]
@@ -195,12 +185,11 @@ def _periods() -> HardCase:
     )
     return HardCase(
         "periods_1000000",
-        FAMILY,
         "A million periods: rounding of 1.6e7 steps adds up, and any damping of the method.",
         "Energy gone, or grown by orders.",
-        "position after 1e6 periods, the method's own phase counted [m]",
         task,
         exact,
+        asks="position after 1e6 periods, the method's own phase counted [m]",
         scale=1.0,
         tolerance=1e-6,
         single=None,

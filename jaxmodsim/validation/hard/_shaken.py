@@ -54,7 +54,7 @@ def _case(
 
     scene = linear_stick_slip.scene(system)
     task = motion(scene, q0, qd, t1, by="element_0.Fc", read=position, max_steps=65536)
-    return HardCase(name, FAMILY, why, naive, f"position at {t1:g} s [m]", task, exact, **options)
+    return HardCase(name, why, naive, task, exact, **options)
 
 
 def _with_samples(

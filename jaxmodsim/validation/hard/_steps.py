@@ -163,7 +163,7 @@ def _unlimited() -> float:
     return float(sum(not grows(each, solver, _FAR * theory(each, dfx.Heun())) for each, solver in runs))
 
 
-def step_limits(family: str) -> list[HardCase]:
+def step_limits() -> list[HardCase]:
     """Cases: the largest stable steps."""
     # Euler's method has none at all on an undamped vibration; this one is damped.
     names = {
@@ -174,12 +174,11 @@ def step_limits(family: str) -> list[HardCase]:
     made = [
         HardCase(
             name,
-            family,
             f"Explicit steps end at the edge of the stability region; the eigenvalue is {value}.",
             "Below the limit all is well, just above it the bristle swings up within a thousand steps.",
-            "largest stable step over that of theory, the farthest of Euler, Heun, Bosh3, Tsit5, Dopri8 [1]",
             MeasuredNumber(partial(_ratio, formulation, EXPLICIT)),
             lambda _: 1.0,
+            asks="largest stable step over that of theory, the farthest of Euler, Heun, Bosh3, Tsit5, Dopri8 [1]",
             tolerance=1e-2,
             single=None,
         )
@@ -187,12 +186,11 @@ def step_limits(family: str) -> list[HardCase]:
     ]
     unlimited = HardCase(
         "step_limit_none",
-        family,
         "Fixed steps of 1e6 times what explicit methods can take, on all four formulations.",
         "Overflow within ten steps.",
-        "runs of Rodas5P and ImplicitFriction in which a disturbance does not grow, of 8 [1]",
         MeasuredNumber(_unlimited),
         lambda _: 8.0,
+        asks="runs of Rodas5P and ImplicitFriction in which a disturbance does not grow, of 8 [1]",
         tolerance=1e-2,
         single=None,
     )
