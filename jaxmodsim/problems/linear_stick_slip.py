@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jax import Array
-from jax.tree_util import Partial
+from jaxtyping import Array, Float
 from numpy.polynomial.polynomial import polyval
 
 from ..friction import Coulomb
@@ -450,12 +450,15 @@ def _load_and_signal(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Arra
     return _load(t, q, qd, p) + p["signal_load"] * p["signal"]
 
 
-def _displacement(row: Array, q: Array) -> Array:
-    return jnp.sum(row * q)
+class _WeightedSum(eqx.Module):
+    """A row of numbers: displacement of an element at q, or velocity of a surface at t, which moves in waves."""
 
+    row: Float[Array, " n"]
+    frequencies: Float[Array, " frequencies"] | None = None
 
-def _belt_velocity(row: Array, frequencies: Array, t: Array) -> Array:
-    return jnp.sum(row * _waves(t, frequencies))
+    def __call__(self, x: Array) -> Array:
+        """The row times q, or times the waves at t."""
+        return jnp.sum(self.row * (x if self.frequencies is None else _waves(x, self.frequencies)))
 
 
 def scene(system: LinearStickSlip, *, moving: bool | None = None) -> Scene:
@@ -485,8 +488,8 @@ def scene(system: LinearStickSlip, *, moving: bool | None = None) -> Scene:
     elements = [
         Friction(
             Coulomb(Fc, Fs),
-            along=Partial(_displacement, jnp.asarray(row)),
-            belt_velocity=Partial(_belt_velocity, jnp.asarray(belt[:-2]), frequencies) if moving else 0.0,
+            along=_WeightedSum(jnp.asarray(row)),
+            belt_velocity=_WeightedSum(jnp.asarray(belt[:-2]), frequencies) if moving else 0.0,
             name=f"element_{i}",
         )
         for i, (Fc, Fs, row, belt) in enumerate(zip(system.Fc, system.Fs, system.directions, system.belt, strict=True))

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from .._core.cholesky import solve_positive_definite
 from .._core.functions import depends_on, real_array
 from .._core.index_check import traced
+from .._core.shapes import PerDof, Scalar
 from ..mechanics import (
     LinearizedConstraints,
     linearize_constraints,
@@ -44,8 +45,8 @@ class State(NamedTuple):
     `Scene.event_driven`, or None where there are none.
     """
 
-    q: Float[Array, " dof"]
-    qd: Float[Array, " dof"]
+    q: PerDof
+    qd: PerDof
     z: dict[str, PyTree]
 
 
@@ -76,12 +77,12 @@ class Dynamics(NamedTuple):
       constraint that can only push its multiplier, then the margin of uniqueness of the loads; None for nothing.
     """
 
-    t: Float[Array, ""]
+    t: Scalar
     y: State
     mode: Modes
     scene: Scene
     actions: dict[str, Action]
-    qdd: Float[Array, " dof"]
+    qdd: PerDof
     contact: Contact | None
     constraints: LinearizedConstraints | None
     multipliers: Float[Array, " m"] | None
@@ -102,7 +103,7 @@ class Dynamics(NamedTuple):
             push = push + self.constraints.force(self.multipliers)
         return self._valid_rate(push)
 
-    def _valid_rate(self, rate: Float[Array, " dof"]) -> State:
+    def _valid_rate(self, rate: PerDof) -> State:
         if self.validity_margins is not None:
             rate = jnp.where(jnp.all(self.validity_margins > 0), rate, jnp.nan)
         return State(self.y.qd, rate, {name: self.actions[name].rate for name in self.y.z})
@@ -152,7 +153,7 @@ class Dynamics(NamedTuple):
         return powers
 
     def guards(
-        self, rest: Float[Array, ""], tolerances: tuple[Array, Array]
+        self, rest: Scalar, tolerances: tuple[Array, Array]
     ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
         """Guards that are positive while the modes hold, and their tolerances; see `contact_guards`."""
         return contact_guards(self.contacts, self.mode, rest, tolerances)
@@ -184,7 +185,7 @@ class Mobility(NamedTuple):
     mass: Float[Array, "dof dof"]
     constraints: LinearizedConstraints | None
 
-    def accelerate(self, force: Float[Array, " dof"]) -> Float[Array, " dof"]:
+    def accelerate(self, force: PerDof) -> PerDof:
         """Accelerations under the generalised force `force`."""
         free = solve_positive_definite(self.mass, force)
         return (
@@ -193,7 +194,7 @@ class Mobility(NamedTuple):
             else free + self.constraints.apply_force(self.constraints.multipliers(free))
         )
 
-    def respond(self, force: Float[Array, " dof"]) -> Float[Array, " dof"]:
+    def respond(self, force: PerDof) -> PerDof:
         """Change of the accelerations with the generalised force."""
         free = solve_positive_definite(self.mass, force)
         return (
@@ -202,13 +203,13 @@ class Mobility(NamedTuple):
             else free + self.constraints.apply_force(self.constraints.multiplier_response(free))
         )
 
-    def least(self, row: Float[Array, " dof"]) -> Float[Array, ""]:
+    def least(self, row: PerDof) -> Scalar:
         """Mobility [1/kg] along a direction that rounding can tell from none, where constraints take it away."""
         eps = float(jnp.finfo(row.dtype).eps)
         return _ROUNDING * eps * jnp.sum(row * solve_positive_definite(self.mass, row))
 
 
-def forward_dynamics(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> Dynamics:
+def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> Dynamics:
     """Solve for the accelerations, and for the forces that depend on them, in the modes `mode`."""
     q, qd = y.q, y.qd
     scene = scene.bind_state(t, q, qd)
@@ -305,14 +306,12 @@ def _margins(scene: Scene, t: Array, y: State, multipliers: Any, unique: Array |
     return jnp.stack(margins) if margins else None
 
 
-def vector_field(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> State:
+def vector_field(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> State:
     """Right-hand side of `y' = field(t, y)`; NaN where the equations do not hold, see `Dynamics.validity_margins`."""
     return forward_dynamics(t, y, scene, mode).rate
 
 
-def scene_modes(
-    t: Float[Array, ""], y: State, scene: Scene, rest: Float[Array, ""]
-) -> tuple[State, Float[Array, " n"]]:
+def scene_modes(t: Scalar, y: State, scene: Scene, rest: Scalar) -> tuple[State, Float[Array, " n"]]:
     """State and modes to begin with: elements with no more slip velocity than `rest` or rounding stick if they can."""
     none = jnp.zeros(len(scene.event_driven), y.q.dtype)
     dynamics = forward_dynamics(t, y, scene, none)

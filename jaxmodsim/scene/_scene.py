@@ -7,10 +7,11 @@ from typing import Any
 
 import equinox as eqx
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, PyTree
 
 from .._core.functions import as_function
 from .._core.parameters import as_real
+from .._core.shapes import PerDof, Scalar
 from ..mechanics import AbstractConstraint, Lagrangian
 from ._signal import Signal, signals_at, signals_from, signals_of
 from .forces._effect import AbstractEffect
@@ -199,7 +200,7 @@ class Scene(eqx.Module):
             )
         return tuple(words)
 
-    def bind_time(self, t: Float[Array, ""]) -> "Scene":
+    def bind_time(self, t: Scalar) -> "Scene":
         """The scene with the numbers of its signals at time `t`; itself where it has none."""
         if not signals_of(self.params):
             return self
@@ -207,7 +208,7 @@ class Scene(eqx.Module):
         lagrangian = _Driven(self.lagrangian, driven) if signals_of(driven) else self.lagrangian
         return self._with(lagrangian=lagrangian, params=signals_at(driven, t))
 
-    def step_from(self, t: Float[Array, ""]) -> "Scene":
+    def step_from(self, t: Scalar) -> "Scene":
         """The scene for a step from `t` up to the next sample: signals are what they are there, without jumps."""
         return self._with(params=signals_from(self.params, t)) if signals_of(self.params) else self
 
@@ -217,7 +218,7 @@ class Scene(eqx.Module):
             object.__setattr__(scene, field.name, parts.get(field.name, getattr(self, field.name)))
         return scene
 
-    def bind_state(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"]) -> "Scene":
+    def bind_state(self, t: Scalar, q: PerDof, qd: PerDof) -> "Scene":
         """The scene with its signals and laws as they are at this state; itself where nothing depends on that."""
         if (scene := self.bind_time(t)) is not self:
             return scene.bind_state(t, q, qd)
@@ -228,7 +229,7 @@ class Scene(eqx.Module):
             return self
         return eqx.tree_at(lambda scene: scene.effects, self, effects)
 
-    def initial_state(self, q: Float[Array, " dof"]) -> dict[str, PyTree]:
+    def initial_state(self, q: PerDof) -> dict[str, PyTree]:
         """Own state of each effect that has one, at rest, by effect name."""
         params = self.bind_time(q[0]).params  # only shapes matter
         states = {name: effect.initial_state(q, params) for name, effect in zip(self.names, self.effects, strict=True)}

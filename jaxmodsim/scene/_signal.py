@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from .._core.arguments import as_flag
 from .._core.parameters import as_vector
+from .._core.shapes import Scalar
 from .._core.sorted_times import after, entry
 
 
@@ -63,7 +64,7 @@ class Signal(eqx.Module):
                 f" ({bad.size} such of {t.size}). Leave such samples out."
             )
 
-    def piece(self, t: Float[Array, ""]) -> "Piece":
+    def piece(self, t: Scalar) -> "Piece":
         """What the signal is from the last sample at or before `t` on, up to the next one."""
         times = jax.lax.stop_gradient(self.t)
         last = times.shape[0] - 1
@@ -82,11 +83,11 @@ class Piece(eqx.Module):
     """A signal between two of its samples: a number, or a straight line that goes on beyond them."""
 
     signal: Signal
-    value: Float[Array, ""]
-    slope: Float[Array, ""] | None
-    start: Float[Array, ""] | None
+    value: Scalar
+    slope: Scalar | None
+    start: Scalar | None
 
-    def at(self, t: Float[Array, ""]) -> Float[Array, ""]:
+    def at(self, t: Scalar) -> Scalar:
         """Value at `t`."""
         if self.slope is None or self.start is None:
             return self.value
@@ -102,7 +103,7 @@ def signals_of(tree: Any) -> list[Any]:
     return [x for x in jax.tree.leaves(tree, is_leaf=_is_signal) if _is_signal(x)]
 
 
-def signals_at(tree: Any, t: Float[Array, ""], *, held: bool = True, linear: bool = True) -> Any:
+def signals_at(tree: Any, t: Scalar, *, held: bool = True, linear: bool = True) -> Any:
     """`tree` with the number at `t` in the place of each signal that is held, or linear."""
 
     def value(x: Any) -> Any:
@@ -116,7 +117,7 @@ def signals_at(tree: Any, t: Float[Array, ""], *, held: bool = True, linear: boo
     return jax.tree.map(value, tree, is_leaf=_is_signal)
 
 
-def signals_from(tree: Any, t: Float[Array, ""]) -> Any:
+def signals_from(tree: Any, t: Scalar) -> Any:
     """`tree` with the piece that each signal begins or is in at `t`, for a step from there."""
     return jax.tree.map(lambda x: x.piece(t) if isinstance(x, Signal) else x, tree, is_leaf=_is_signal)
 

@@ -87,9 +87,7 @@ def _shape(observable: Observable, y: State, scene: Scene) -> tuple[int, ...] | 
     return getattr(jax.eval_shape(look), "shape", None)
 
 
-def observer(
-    observables: tuple[tuple[str, Observable], ...],
-) -> Callable[[Array, State, Scene], dict[str, Array]]:
+def observer(observables: tuple[tuple[str, Observable], ...]) -> Callable[[Array, State, Scene], dict[str, Array]]:
     """A function of time, state and scene that returns what each channel sees."""
 
     def observe(t: Array, y: State, scene: Scene) -> dict[str, Array]:
