@@ -136,7 +136,6 @@ class Armstrong(AbstractDynamicLaw):
 
     def force_given_zdot(self, v: Scalar, z: ArmstrongState, rate: ArmstrongState) -> Scalar:
         """Friction force [N] at slip velocity `v` [m/s]."""
-        del rate
         return self.sigma0 * z.z + self.Fv * v
 
     def stored_energy(self, z: ArmstrongState) -> Scalar:

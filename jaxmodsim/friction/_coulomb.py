@@ -43,7 +43,6 @@ class Coulomb(AbstractSetValuedLaw):
 
     def static_limit(self, direction: Scalar) -> Scalar:
         """Largest force in stick [N]."""
-        del direction
         return jnp.asarray(self.Fc if self.Fs is None else self.Fs)
 
     def lugre_numbers(self, vs: float) -> dict[str, PyTree]:

@@ -62,7 +62,6 @@ class Dahl(AbstractPlanarLaw):
         self, v: Float[Array, "..."], z: Float[Array, "..."], rate: Float[Array, "..."]
     ) -> Float[Array, "..."]:
         """Friction force [N] at deflection `z` [m]."""
-        del v, rate
         return self.sigma0 * z
 
     def stored_energy(self, z: Float[Array, "..."]) -> Scalar:

@@ -139,7 +139,6 @@ class AbstractLaw(eqx.Module):
         - `m`: mass [kg], `Fc`, `Fv`: Coulomb force [N] and viscous coefficient [N s/m], of a linear regression.
         - `v_max`: largest speed of the record [m/s].
         """
-        del m, Fc, Fv, v_max
         return None
 
 
@@ -194,7 +193,6 @@ class AbstractSetValuedLaw(AbstractLaw):
 
         - `vs`: Stribeck velocity [m/s] for a law whose force jumps from stick to slip.
         """
-        del vs
         return None
 
 

@@ -120,11 +120,9 @@ def _parts(law: AbstractLaw, z: PyTree) -> tuple[Array, _Part, _Part]:
         own = jnp.zeros(0)
 
         def force(v: Array, own: Array) -> Array:
-            del own
             return law.force(v)
 
         def rate(v: Array, own: Array) -> Array:
-            del v
             return own
 
     else:

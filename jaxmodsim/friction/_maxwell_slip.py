@@ -119,7 +119,6 @@ class MaxwellSlip(AbstractDynamicLaw):
 
     def force_given_zdot(self, v: Scalar, z: Float[Array, " n"], rate: Float[Array, " n"]) -> Scalar:
         """Friction force [N] at slip velocity `v` [m/s] and deflections `z` [m]."""
-        del rate
         return jnp.sum(self.k * z) + self.sigma2 * v
 
     def stored_energy(self, z: Float[Array, " n"]) -> Scalar:

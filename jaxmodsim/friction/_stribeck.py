@@ -100,12 +100,10 @@ class Stribeck(AbstractSetValuedLaw):
 
     def static_limit(self, direction: Scalar) -> Scalar:
         """Largest force in stick [N]."""
-        del direction
         return jnp.asarray(self.Fs)
 
     def lugre_numbers(self, vs: float) -> dict[str, PyTree] | None:
         """Of the Gaussian curve its own."""
-        del vs
         gaussian = self.fall is exponential and (self.exponent is None or bool(jnp.all(self.exponent == 2.0)))
         return {"Fc": self.Fc, "Fs": self.Fs, "vs": self.vs, "sigma2": self.Fv} if gaussian else None
 
@@ -127,5 +125,4 @@ class Stribeck(AbstractSetValuedLaw):
     @classmethod
     def fit_start(cls, m: float, Fc: float, Fv: float, v_max: float) -> "Stribeck":
         """A break-away force of 1.2 Fc, and a fall over a twentieth of the speed."""
-        del m
         return cls(Fc=Fc, Fs=1.2 * Fc, vs=0.05 * v_max, Fv=Fv)

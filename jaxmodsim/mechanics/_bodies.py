@@ -57,7 +57,6 @@ class PointMass(AbstractBody):
 
     def __call__(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """`m v^2/2 - m g z` [J]."""
-        del t
         x, v = _moving(self.position, q, qd, params, "point_mass")
         m = self.m(params)
         return 0.5 * m * jnp.sum(v**2) - m * self.gravity(params) * x[2]
@@ -68,7 +67,6 @@ class PointMass(AbstractBody):
         It is the normal part of `m (d2x/dt2 + g ez)`, which the accelerations along the path do not enter. Normal
         components of further forces on the mass are to be taken off: they are not known here.
         """
-        del t
         _check_indices(self.position, q, params)
 
         def velocity(q: Array) -> Array:
@@ -128,7 +126,6 @@ class RigidBody(AbstractBody):
 
     def __call__(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """`m v^2/2 + w I w/2 - m g z` [J]."""
-        del t
         x, v = _moving(self.position, q, qd, params, "rigid_body")
         m, inertia = self.m(params), jnp.asarray(self.inertia(params))
         _check_indices(self.orientation, q, params)

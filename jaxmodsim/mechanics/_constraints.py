@@ -123,7 +123,6 @@ class Constraint(AbstractConstraint):
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check that phi is a number or a vector, and a number where the constraint is one-sided."""
-        del qd
         place = {"q": q}
         if self.at is not None:
             place = {"x": traced(self.at, q=q, params=params, name=f"at of Constraint {name!r}")}
@@ -172,7 +171,6 @@ class VelocityConstraint(AbstractConstraint):
 
     def error(self, t: Scalar, q: PerDof, params: PyTree) -> None:
         """No position is excluded."""
-        del t, q, params
 
     def rate(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, " m"]:
         """psi, shape `[m]`."""
@@ -184,11 +182,9 @@ class VelocityConstraint(AbstractConstraint):
 
     def force(self, t: Scalar, q: PerDof, params: PyTree, multiplier: Float[Array, " m"]) -> None:
         """The point is not known."""
-        del t, q, params, multiplier
 
     def per_multiplier(self, t: Scalar, q: PerDof, params: PyTree) -> Scalar:
         """One: psi must be a velocity."""
-        del q, params
         return jnp.ones_like(t)
 
 

@@ -36,7 +36,6 @@ class _Driven(eqx.Module):
 
     def __call__(self, t: Any, q: Any, qd: Any, params: PyTree) -> Any:
         """The Lagrangian with its own parameters as they are at `t`."""
-        del params
         return self.lagrangian(t, q, qd, signals_at(self.params, t))
 
 

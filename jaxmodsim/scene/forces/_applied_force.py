@@ -66,12 +66,10 @@ class AppliedForce(AbstractEffect):
 
     def initial_state(self, q: PerDof, params: PyTree) -> PyTree:
         """An applied force has no state."""
-        del q, params
         return None
 
     def act(self, t: Scalar, q: PerDof, qd: PerDof, z: PyTree, params: PyTree) -> Action:
         """Force as given, and mapped to the coordinates."""
-        del z
         force = jnp.asarray(self.fn(t, q, qd, params), q.dtype)
         at = self.at
         if at is None:
@@ -81,10 +79,8 @@ class AppliedForce(AbstractEffect):
 
     def power(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, action: Action) -> Power:
         """All of it comes from outside."""
-        del t, q, params
         return Power(jnp.sum(action.generalised * qd))
 
     def stored_energy(self, z: PyTree) -> float:
         """Nothing is stored."""
-        del z
         return 0.0
