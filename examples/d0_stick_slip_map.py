@@ -7,7 +7,7 @@ in the same state, the second happens for ever or never: a run that sticks again
 
 The boundary between the two is known: after break-away the mass swings freely, and on the boundary the next maximum of
 its velocity just reaches that of the belt. That is one equation for (Fs - Fc)/(belt sqrt(k m)) at a given
-zeta = c/(2 sqrt(k m)), derived at `jaxmodsim.problems.belt_onset_speed`. For small zeta it gives
+zeta = c/(2 sqrt(k m)), derived at `jaxmodsim.problems.belt_oscillator.onset_speed`. For small zeta it gives
 belt = (Fs - Fc)/sqrt(4 pi zeta k m).
 
 Run it: `python examples/d0_stick_slip_map.py [--smoke] [--out DIR]`.

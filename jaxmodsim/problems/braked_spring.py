@@ -8,7 +8,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ..friction import Coulomb
 from ..scene import AppliedForce, Friction, Scene
 
-# A set of numbers with stiction, and what follows from it: 12 half cycles, at rest [s] from BRAKED_SPRING_STOP on.
+# A set of numbers with stiction, and what follows from it: 12 half cycles, at rest [s] from STOP on.
 PARAMS = {"m": 1.3, "k": 2.7, "Fc": 0.11, "Fs": 0.15, "x0": 1.0}
 STOP = 26.158986444602
 

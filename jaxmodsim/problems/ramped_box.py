@@ -13,7 +13,7 @@ COULOMB = {"Fc": 1.5}
 STRIBECK = {"Fc": 1.5, "Fs": 1.75, "vs": 0.2, "Fv": 0.1}
 LUGRE = {"sigma0": 750.0, "sigma1": 0.0, "sigma2": 0.1, "Fc": 1.5, "Fs": 1.75, "vs": 0.2}
 
-# Velocity [m/s] and bristle deflection [m] at t = 10 s with BOX_LUGRE and a ramp of 1 N/s, on which four solvers
+# Velocity [m/s] and bristle deflection [m] at t = 10 s with LUGRE and a ramp of 1 N/s, on which four solvers
 # agree at tight tolerances.
 LUGRE_V10 = 15.694099521
 LUGRE_Z10 = 0.0020000000

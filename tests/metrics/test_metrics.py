@@ -186,7 +186,7 @@ def test_break_away_counts_slip_and_not_motion() -> None:
 
 
 def test_a_spring_that_stops() -> None:
-    """BRAKED_SPRING from 0.3 m: so many half cycles, and at rest."""
+    """The braked spring from 0.3 m: so many half cycles, and at rest."""
     numbers = {"m": 1.3, "k": 2.7, "Fc": 0.11, "Fs": 0.15}
     rest = problems.braked_spring.rest(x0=0.3, **numbers)
     scene = problems.braked_spring.scene(problems.braked_spring.coulomb())

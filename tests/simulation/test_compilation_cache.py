@@ -83,7 +83,7 @@ jax.monitoring.register_event_listener(lambda event, **_: counts.update([event.r
 import jaxmodsim as jms
 from jaxmodsim import problems
 
-scene = problems.belt_oscillator()
+scene = problems.belt_oscillator.scene()
 run = jms.simulate(scene, [0.0], [0.0], 1.5, ts=jnp.linspace(0.0, 1.5, 4))
 end = lambda q0: jms.simulate(scene, q0, [0.0], 1.5).q[-1, 0]
 slope = jax.grad(end)(jnp.zeros(1))
