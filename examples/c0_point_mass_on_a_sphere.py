@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 import jaxmodsim as jms
 from jaxmodsim.mechanics import acceleration, energies
-from jaxmodsim.scene import State, scene_reactions, vector_field
+from jaxmodsim.scene import State, forward_dynamics, vector_field
 
 # Before any array is made, and the scenes below hold some.
 jms.tune_cpu()
@@ -191,7 +191,7 @@ def sphere():
     vector = radial[:, None] * np.asarray(SPHERICAL.basis(place))[:, :, 0]
     found = at_states(lambda q, qd: ON_SPHERE.reaction(NOW, q, qd, NUMBERS), q, qd)
     claim("the same as a vector, f_r e_r, is the `reaction` of `point_mass(m, position)`", found, vector)
-    found = at_states(lambda x, v: scene_reactions(NOW, State(x, v, {}), HELD), *moving(on_sphere, q, qd))
+    found = at_states(lambda x, v: forward_dynamics(NOW, State(x, v, {}), HELD).reactions, *moving(on_sphere, q, qd))
     claim("and in x, y, z with the constraint |x| = R, f_r is its multiplier", found["sphere"].multiplier[:, 0], radial)
     print("(h) The spherical pendulum by Lagrange, from L = m v^2/2 - m g z")
     claim("phi'' = sin(phi) cos(phi) theta'^2 + (g/R) sin(phi)", qdd[:, 0], s * c * theta1**2 + G / R * s)
@@ -256,7 +256,7 @@ def spiral():
     words = "theta'' = a^2 theta (1 + 2 a^2 + u)/((1 + u)(1 + a^2 + u)) theta'^2 - (g/R) a sqrt(1 + u)/(1 + a^2 + u)"
     claim(words, at_states(lambda q, qd: acceleration(ON_SPIRAL, NOW, q, qd, NUMBERS), q, qd)[:, 0], free)
     normal = at_states(lambda q, qd: ON_SPIRAL.normal_force(NOW, q, qd, NUMBERS), q, qd)
-    newton = at_states(lambda q, qd: jms.problems.spiral_bead_normal_force(q, qd, **NUMBERS), q, qd)
+    newton = at_states(lambda q, qd: jms.problems.spiral_bead.normal_force(q, qd, **NUMBERS), q, qd)
     claim("the force N of the wire, across the path, is that of Newton's law in the frame of (d)", normal, newton)
     print("(j) The same with drag, and with dry friction under the force of the wire")
 

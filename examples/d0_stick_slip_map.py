@@ -7,7 +7,7 @@ in the same state, the second happens for ever or never: a run that sticks again
 
 The boundary between the two is known: after break-away the mass swings freely, and on the boundary the next maximum of
 its velocity just reaches that of the belt. That is one equation for (Fs - Fc)/(belt sqrt(k m)) at a given
-zeta = c/(2 sqrt(k m)), derived at `jaxmodsim.problems.belt_onset_speed`. For small zeta it gives
+zeta = c/(2 sqrt(k m)), derived at `jaxmodsim.problems.belt_oscillator.onset_speed`. For small zeta it gives
 belt = (Fs - Fc)/sqrt(4 pi zeta k m).
 
 Run it: `python examples/d0_stick_slip_map.py [--smoke] [--out DIR]`.
@@ -23,7 +23,7 @@ import numpy as np
 
 import jaxmodsim as jms
 from jaxmodsim.plot import map2d
-from jaxmodsim.problems import belt_onset_speed, belt_oscillator
+from jaxmodsim.problems import belt_oscillator
 
 # Mass [kg], damping [N s/m], friction in slip and at most in stick [N].
 M, C, FC, FS = 1.0, 2.0, 5.0, 8.0
@@ -31,7 +31,7 @@ M, C, FC, FS = 1.0, 2.0, 5.0, 8.0
 
 def first_slip(k, belt):
     """From stick, a tenth of a radian of the free swing before it breaks away, over one cycle of it."""
-    scene = belt_oscillator(jms.Coulomb(FC, FS), m=M, k=k, belt=belt, c=C)
+    scene = belt_oscillator.scene(jms.Coulomb(FC, FS), m=M, k=k, belt=belt, c=C)
     radian = jnp.sqrt(M / k)
     q0 = (FS - C * belt) / k - 0.1 * radian * belt
     return jms.simulate(scene, jnp.stack([q0]), jnp.stack([belt]), 8.0 * radian, throw=False)
@@ -54,7 +54,7 @@ def main(out: Path, smoke: bool = False) -> None:
 
     runs["k"].attrs.update(units="N/m", long_name="stiffness k")
     runs["belt"].attrs.update(units="m/s", long_name="belt velocity")
-    limit = belt_onset_speed(m=M, k=k, c=C, Fc=FC, Fs=FS)
+    limit = belt_oscillator.onset_speed(m=M, k=k, c=C, Fc=FC, Fs=FS)
     agree = runs["motion"] == (runs["belt"].values[:, None] < np.asarray(limit)[None, :])
     print(f"{int(agree.sum())} of {count} agree with the boundary; failed: {int((runs['result'] != 0).sum())}")
 

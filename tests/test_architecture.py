@@ -162,6 +162,13 @@ def test_files_and_functions_are_short(path: Path) -> None:
         assert lines < MAX_FUNCTION_LINES or allowed, f"{node.name} has {lines} lines"
 
 
+@each_file([path for path in FILES if room_of(path) not in ("_core", "__init__")])
+def test_public_modules_are_those_that_their_room_names(path: Path) -> None:
+    room = ast.parse((ROOT / room_of(path) / "__init__.py").read_text()).body
+    modules = {a.name for node in room if isinstance(node, ast.ImportFrom) and not node.module for a in node.names}
+    assert path.stem.startswith("_") or path.stem in modules
+
+
 def test_classes_are_abstract_or_final() -> None:
     bases: dict[str, list[str]] = {}
     for path in FILES:

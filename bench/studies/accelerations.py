@@ -18,7 +18,7 @@ import jaxmodsim as jms
 from bench.record import OURS, Call, Result, importable, timed
 from jaxmodsim._core.cholesky import solve_positive_definite
 from jaxmodsim._core.fusion import fusion_barrier, opaque_one
-from jaxmodsim.problems import n_link_pendulum, n_link_pendulum_acceleration
+from jaxmodsim.problems import n_link_pendulum
 from jaxmodsim.scene import State, vector_field
 
 HAND = ("JAX by hand, arrays", "JAX by hand, scalars")
@@ -44,7 +44,9 @@ def _size(n: int, result: Result, smoke: bool) -> None:
     many, single, batches = (8, 20, 2) if smoke else (1024, max(200, 4000 // n), max(2, 32 // n))
     rng, numbers = np.random.default_rng(20240229), chain_numbers(n)
     q, qd = rng.uniform(-1.0, 1.0, (many, n)), rng.uniform(-1.0, 1.0, (many, n))
-    exact = np.asarray(jax.vmap(_arrays, (0, 0, None))(jnp.asarray(q), jnp.asarray(qd), n_link_pendulum(n, **numbers)))
+    exact = np.asarray(
+        jax.vmap(_arrays, (0, 0, None))(jnp.asarray(q), jnp.asarray(qd), n_link_pendulum.scene(n, **numbers))
+    )
     makers: dict[str, Any] = {
         OURS: lambda: _compiled(_ours, n, q, qd, single, batches),
         HAND[0]: lambda: _compiled(_arrays, n, q, qd, single, batches),
@@ -81,7 +83,7 @@ def _ours(q: Any, qd: Any, scene: jms.Scene) -> Any:
 
 
 def _arrays(q: Any, qd: Any, scene: jms.Scene) -> Any:
-    return n_link_pendulum_acceleration(q, qd, **scene.params)
+    return n_link_pendulum.acceleration(q, qd, **scene.params)
 
 
 def _scalars(q: Any, qd: Any, scene: jms.Scene) -> Any:
@@ -104,7 +106,7 @@ def _scalars(q: Any, qd: Any, scene: jms.Scene) -> Any:
 
 def _compiled(fn: Any, n: int, q: Any, qd: Any, single: int, batches: int) -> Made:
     """By JAX, compiled."""
-    chain, many = n_link_pendulum(n, **chain_numbers(n)), jax.vmap(fn, (0, 0, None))
+    chain, many = n_link_pendulum.scene(n, **chain_numbers(n)), jax.vmap(fn, (0, 0, None))
     one, all_of_them = (jnp.asarray(q[0]), jnp.asarray(qd[0])), (jnp.asarray(q), jnp.asarray(qd))
     programs = {
         LOOP: (partial(_euler, fn, single), one),

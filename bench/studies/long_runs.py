@@ -47,7 +47,7 @@ def main(smoke: bool, out: Path) -> Result:
     closed, periods = Closed(), 300 if smoke else PERIODS
     result = Result("long_runs", ("diffrax", "scipy", "numpy"), {"period": closed.period, "periods": periods})
     result.settings["swing"] = math.acos(closed.lower) - PHI0
-    scene, windows = spherical_pendulum(m=1.0, R=1.0, g=G), _windows(periods, closed.period)
+    scene, windows = spherical_pendulum.scene(m=1.0, R=1.0, g=G), _windows(periods, closed.period)
     times = windows.ravel()
     for name, how in list(LONG.items())[: 1 if smoke else None]:
 

@@ -11,6 +11,5 @@ from ._sensitivity import Sensitivity as Sensitivity
 from ._sensitivity import sensitivity as sensitivity
 from ._work_precision import work_precision as work_precision
 from ._work_rows import Row as Row
-from ._work_rows import Timing as Timing
 from ._work_rows import WorkPrecision as WorkPrecision
 from ._work_rows import load_work_precision as load_work_precision

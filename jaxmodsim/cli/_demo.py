@@ -10,7 +10,7 @@ import pandas as pd
 from ..friction import LuGre
 from ..identify import Record, replay
 from ..plot import fit_figure, truth_figure
-from ..problems import driven_spring
+from ..problems import braked_spring
 from ._fit import fit_with_progress
 from ._output import console, show_paths, show_table, write
 from ._report import testbench_files
@@ -32,7 +32,7 @@ def synthetic_record() -> Record:
     frequency = np.interp(t, [0.0, 3.0, 4.0, 9.0, 10.0, 16.0], [1.0, 1.0, 0.4, 0.4, 0.8, 0.8])
     u = amplitude * np.sin(2 * np.pi * np.cumsum(frequency) * SAMPLE)
     zero = jnp.zeros(1)
-    clean = replay(driven_spring(LuGre(**TRUTH)), jnp.asarray(t), {"u": jnp.asarray(u)}, zero, zero, 10)
+    clean = replay(braked_spring.driven_spring(LuGre(**TRUTH)), jnp.asarray(t), {"u": jnp.asarray(u)}, zero, zero, 10)
     noise = NOISE * np.random.default_rng(1).standard_normal(t.size)
     return Record(t, np.asarray(clean) + noise, {"u": u}, name="synthetic record")
 
@@ -43,7 +43,7 @@ def run_demo(out: Path) -> None:
     record = synthetic_record()
     free = tuple(f"friction.{name}" for name in TRUTH)
     started = time.perf_counter()
-    result = fit_with_progress(driven_spring(LuGre(**START)), record, free, q0=[0.0])
+    result = fit_with_progress(braked_spring.driven_spring(LuGre(**START)), record, free, q0=[0.0])
     truth = {f"friction.{name}": value for name, value in TRUTH.items()}
     frame = pd.DataFrame(
         [

@@ -62,9 +62,9 @@ def _compared(comparison: Comparison) -> dict[str, object]:
 
 
 def _designed(findings: Findings, design: InputDesign) -> dict[str, object]:
-    used = ", ".join(f"{name} {100 * share:.0f} %" for name, share in design.used.items())
+    t, used = design.best.t, ", ".join(f"{name} {100 * share:.0f} %" for name, share in design.used.items())
     sentences = [
-        f"{len(design.t)} samples over {design.t[-1] - design.t[0]:g} s; limits: {design.limits}; used: {used}.",
+        f"{len(t)} samples over {t[-1] - t[0]:g} s; limits: {design.limits}; used: {used}.",
         f"Noise reckoned with: {1e3 * design.noise:.4g} mm, the residual of this fit.",
         *design.remarks,
     ]

@@ -20,9 +20,11 @@ from ._table import AbstractTable, Table, Text, Values, Whole, inner, read_table
 # Under which the file of a SPEC is known as a module.
 MODEL = "jaxmodsim_model"
 
+# The scenes of the modules of `problems`: `scene` by the name of its module, any other by its own.
 PROBLEMS: dict[str, Callable[..., Scene]] = {
-    name: made
-    for name, made in vars(problems).items()
+    module if name == "scene" else name: made
+    for module, system in inspect.getmembers(problems, inspect.ismodule)
+    for name, made in vars(system).items()
     if inspect.isfunction(made) and inspect.signature(made).return_annotation is Scene
 }
 

@@ -32,7 +32,6 @@ from ._law import register_law as register_law
 from ._law_case import STANDARD as STANDARD
 from ._law_case import LawCase as LawCase
 from ._max_stable_step import max_stable_step as max_stable_step
-from ._passivity import Passivity as Passivity
 from ._tuning import damping_sigma1 as damping_sigma1
 from ._tuning import regularized_width as regularized_width
 from .modifiers._asymmetric import AbstractAsymmetric as AbstractAsymmetric

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core.parameters import Number, parameter
+from .._core.shapes import Scalar
 from .._core.state_dependent import nominal
 from ._bristle import advance_elastoplastic, slip_fraction
 from ._law import AbstractDynamicLaw, register_law
@@ -29,10 +30,10 @@ class ArmstrongState(NamedTuple):
     - `slips`: 1 from when the contact has given way until it moves back, 0 from then on.
     """
 
-    z: Float[Array, ""]
-    rise: Float[Array, ""]
-    magnitude: Float[Array, ""]
-    slips: Float[Array, ""]
+    z: Scalar
+    rise: Scalar
+    magnitude: Scalar
+    slips: Scalar
 
 
 @register_law
@@ -97,15 +98,15 @@ class Armstrong(AbstractDynamicLaw):
         ", for the stiction of its bristle neither rises with time nor has a memory: fit a LuGre and export that"
     )
 
-    def _moves(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def _moves(self, v: Scalar) -> Scalar:
         """How far the speed `v` [m/s] is one of sliding, 0 to 1."""
         return jnp.minimum(jnp.abs(v) / (_SLIDES * self.vs), 1.0)
 
-    def _limit(self, rise: Float[Array, ""]) -> Float[Array, ""]:
+    def _limit(self, rise: Scalar) -> Scalar:
         """Deflection [m] at which the contact slides."""
         return (self.Fc + (self.Fs - self.Fc) * rise) / self.sigma0
 
-    def _steady(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def _steady(self, v: Scalar) -> Scalar:
         """What is left of the magnitude in steady slip at `v` [m/s]."""
         ratio = v / self.vs
         return 1.0 / (1.0 + ratio * ratio)
@@ -114,7 +115,7 @@ class Armstrong(AbstractDynamicLaw):
         """Undeflected after a long rest."""
         return ArmstrongState(jnp.zeros_like(v), jnp.ones_like(v), jnp.ones_like(v), jnp.zeros_like(v))
 
-    def zdot(self, v: Float[Array, ""], z: ArmstrongState) -> ArmstrongState:
+    def zdot(self, v: Scalar, z: ArmstrongState) -> ArmstrongState:
         """Rates of the state [m/s, 1/s, 1/s, 1/s] at slip velocity `v` [m/s]."""
         u = z.z * jnp.sign(v) / self._limit(z.rise)
         share = slip_fraction(u, jnp.asarray(_CORNER, u.dtype))
@@ -129,20 +130,19 @@ class Armstrong(AbstractDynamicLaw):
             jnp.abs(v) / self._turn() * turns,
         )
 
-    def _turn(self) -> Float[Array, ""]:
+    def _turn(self) -> Scalar:
         """Slip [m] over which the contact goes over from stick to slip, and back."""
         return _CORNER * self.Fc / self.sigma0
 
-    def force_given_zdot(self, v: Float[Array, ""], z: ArmstrongState, rate: ArmstrongState) -> Float[Array, ""]:
+    def force_given_zdot(self, v: Scalar, z: ArmstrongState, rate: ArmstrongState) -> Scalar:
         """Friction force [N] at slip velocity `v` [m/s]."""
-        del rate
         return self.sigma0 * z.z + self.Fv * v
 
-    def stored_energy(self, z: ArmstrongState) -> Float[Array, ""]:
+    def stored_energy(self, z: ArmstrongState) -> Scalar:
         """Elastic energy [J] of the contact."""
         return 0.5 * self.sigma0 * z.z * z.z
 
-    def step_exact(self, v: Float[Array, ""], z: ArmstrongState, dt: Float[Array, ""]) -> ArmstrongState:
+    def step_exact(self, v: Scalar, z: ArmstrongState, dt: Scalar) -> ArmstrongState:
         """State after `dt` [s] at constant `v` [m/s], of any length: first in stick, then in slip, each exactly."""
         corner, distance = jnp.asarray(_CORNER, z.z.dtype), jnp.abs(v) * dt
         # Back, then along, and of that what the contact does not follow.

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._core.safe import bounded_ratio, decay_mean
+from .._core.shapes import Scalar
 from .._core.state_dependent import nominal
 from ._passivity import Passivity, first_negative, least_on, logarithmic
 
@@ -17,22 +18,20 @@ YIELDS = {"creep": "The bristle yields at any load, a little more forth than bac
 
 
 def stribeck_curve(
-    v: Float[Array, "..."], Fc: Float[Array, "..."], Fs: Float[Array, "..."], vs: Float[Array, ""]
+    v: Float[Array, "..."], Fc: Float[Array, "..."], Fs: Float[Array, "..."], vs: Scalar
 ) -> Float[Array, "..."]:
     """Gaussian Stribeck curve `Fc + (Fs - Fc) exp(-(v/vs)^2)` [N]: what steady slip at `v` [m/s] tends to."""
     ratio = bounded_ratio(v, vs)
     return Fc + (Fs - Fc) * jnp.exp(-ratio * ratio)
 
 
-def relax_exact(
-    v: Float[Array, "..."], z: Float[Array, "..."], dt: Float[Array, ""], rate: Float[Array, ""]
-) -> Float[Array, "..."]:
+def relax_exact(v: Float[Array, "..."], z: Float[Array, "..."], dt: Scalar, rate: Scalar) -> Float[Array, "..."]:
     """Solution after `dt` [s] of `z' = v - rate z` with constant `v` [m/s] and `rate` [1/s]: exact at any step."""
     x = rate * dt
     return z * jnp.exp(-x) + v * dt * decay_mean(x)
 
 
-def slip_fraction(u: Float[Array, "..."], corner: Float[Array, ""]) -> Float[Array, "..."]:
+def slip_fraction(u: Float[Array, "..."], corner: Scalar) -> Float[Array, "..."]:
     """Share of the slip that an element does not follow, at the load `u` in limits towards the slip.
 
     0 up to `1 - corner`, 1 at the limit, and above 1 beyond it, so that the element falls back.
@@ -41,11 +40,7 @@ def slip_fraction(u: Float[Array, "..."], corner: Float[Array, ""]) -> Float[Arr
 
 
 def advance_elastoplastic(
-    v: Float[Array, "..."],
-    z: Float[Array, "..."],
-    dt: Float[Array, ""],
-    limit: Float[Array, "..."],
-    corner: Float[Array, ""],
+    v: Float[Array, "..."], z: Float[Array, "..."], dt: Scalar, limit: Float[Array, "..."], corner: Scalar
 ) -> Float[Array, "..."]:
     """Deflection after `dt` [s] of `z' = v (1 - slip_fraction(z sign(v)/limit))` with constant `v`: exact at any step.
 

@@ -3,9 +3,10 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import PyTree
 
 from .._core.parameters import Number, optional_parameter, parameter
+from .._core.shapes import Scalar
 from ._law import NO_STICTION_IN_MUJOCO, AbstractSetValuedLaw, register_law
 from ._law_case import STANDARD, LawCase, steady_curve
 
@@ -32,17 +33,16 @@ class Coulomb(AbstractSetValuedLaw):
     valid_at_any_speed: ClassVar[bool] = True
     mujoco_lacks: ClassVar[str] = NO_STICTION_IN_MUJOCO
 
-    def sliding_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def sliding_force(self, v: Scalar) -> Scalar:
         """Magnitude [N] of the force in slip."""
         return jnp.broadcast_to(self.Fc, jnp.shape(v))
 
-    def viscous_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def viscous_force(self, v: Scalar) -> Scalar:
         """Coulomb friction has no viscous part: 0 N."""
         return jnp.zeros_like(v)
 
-    def static_limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+    def static_limit(self, direction: Scalar) -> Scalar:
         """Largest force in stick [N]."""
-        del direction
         return jnp.asarray(self.Fc if self.Fs is None else self.Fs)
 
     def lugre_numbers(self, vs: float) -> dict[str, PyTree]:

@@ -6,10 +6,11 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike
 
 from .._core.functions import as_function, real_array
 from .._core.parameters import Number, parameter
+from .._core.shapes import Scalar
 from ._law import AbstractForceLaw, register_law
 from ._law_case import STANDARD, LawCase, stribeck_case
 
@@ -43,7 +44,7 @@ class Curve(AbstractForceLaw):
     description: ClassVar[str] = "any function of slip velocity; `Friction(fn)` makes one"
     equations: ClassVar[tuple[str, ...]] = ("gain fn(v)",)
 
-    def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def force(self, v: Scalar) -> Scalar:
         """Friction force [N] at velocity `v` [m/s]."""
         value = real_array(self.fn(v), name="Curve fn")
         if value.shape != ():

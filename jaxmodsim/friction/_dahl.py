@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._core.parameters import Number, parameter
 from .._core.safe import magnitude
+from .._core.shapes import Scalar
 from ._bristle import ONE_STATE, YIELDS, relax_exact
 from ._law import AbstractPlanarLaw, register_law
 from ._passivity import Passivity
@@ -61,14 +62,13 @@ class Dahl(AbstractPlanarLaw):
         self, v: Float[Array, "..."], z: Float[Array, "..."], rate: Float[Array, "..."]
     ) -> Float[Array, "..."]:
         """Friction force [N] at deflection `z` [m]."""
-        del v, rate
         return self.sigma0 * z
 
-    def stored_energy(self, z: Float[Array, "..."]) -> Float[Array, ""]:
+    def stored_energy(self, z: Float[Array, "..."]) -> Scalar:
         """Elastic energy [J]."""
         return 0.5 * self.sigma0 * jnp.sum(z * z)
 
-    def step_exact(self, v: Float[Array, "..."], z: Float[Array, "..."], dt: Float[Array, ""]) -> Float[Array, "..."]:
+    def step_exact(self, v: Float[Array, "..."], z: Float[Array, "..."], dt: Scalar) -> Float[Array, "..."]:
         """Deflection [m] after `dt` [s] at constant `v` [m/s], exactly."""
         return relax_exact(v, z, dt, self.sigma0 * magnitude(v) / self.Fc)
 

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from .._core.parameters import Number, parameter
 from .._core.safe import decay_mean
+from .._core.shapes import Scalar
 from ._bristle import ONE_STATE, STRIBECK_CURVE, bristle_passivity, stribeck_curve
 from ._law import AbstractDynamicLaw, register_law
 
@@ -76,11 +77,11 @@ class ElastoPlastic(AbstractDynamicLaw):
     example: ClassVar[Mapping[str, float]] = {"Fba": 0.7}
     passivity = bristle_passivity
 
-    def stribeck_curve(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def stribeck_curve(self, v: Scalar) -> Scalar:
         """g(v) [N]: the bristle force that steady slip at `v` [m/s] tends to."""
         return stribeck_curve(v, self.Fc, self.Fs, self.vs)
 
-    def _plastic(self, u: Float[Array, ""], elastic: Float[Array, ""]) -> Float[Array, ""]:
+    def _plastic(self, u: Scalar, elastic: Scalar) -> Scalar:
         """`alpha` at the load `u`; `elastic` is where it begins to rise. Both in limits."""
         span = jnp.clip((u - elastic) / (1.0 - elastic), 0.0, 1.0)
         return 0.5 - 0.5 * jnp.cos(jnp.pi * span)
@@ -89,21 +90,21 @@ class ElastoPlastic(AbstractDynamicLaw):
         """Undeflected bristle, 0 m."""
         return jnp.zeros_like(v)
 
-    def zdot(self, v: Float[Array, ""], z: Float[Array, ""]) -> Float[Array, ""]:
+    def zdot(self, v: Scalar, z: Scalar) -> Scalar:
         """Z' [m/s] at slip velocity `v` [m/s] and deflection `z` [m]."""
         g = self.stribeck_curve(v)
         u = self.sigma0 * z * jnp.sign(v) / g
         return v * (1.0 - self._plastic(u, self.Fba / g) * u)
 
-    def force_given_zdot(self, v: Float[Array, ""], z: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, ""]:
+    def force_given_zdot(self, v: Scalar, z: Scalar, rate: Scalar) -> Scalar:
         """Friction force [N] at slip velocity `v` [m/s], deflection `z` [m] and its `rate` [m/s]."""
         return self.sigma0 * z + self.sigma1 * rate + self.sigma2 * v
 
-    def stored_energy(self, z: Float[Array, ""]) -> Float[Array, ""]:
+    def stored_energy(self, z: Scalar) -> Scalar:
         """Elastic energy [J] of the bristle."""
         return 0.5 * self.sigma0 * z * z
 
-    def step_exact(self, v: Float[Array, ""], z: Float[Array, ""], dt: Float[Array, ""]) -> Float[Array, ""]:
+    def step_exact(self, v: Scalar, z: Scalar, dt: Scalar) -> Scalar:
         """Deflection [m] after `dt` [s] at constant `v` [m/s].
 
         Exact in the elastic range and beyond the limit; between, steps of order 2 that cannot pass the limit.

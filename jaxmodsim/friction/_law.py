@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._core.parameters import check_ranges, ranges_of
+from .._core.shapes import PerDof, Scalar
 from .._core.state_dependent import bind_state, is_state_dependent, nominal
 from ._law_case import STANDARD, LawCase, steady_curve
 from ._passivity import Passivity
@@ -69,9 +70,7 @@ class AbstractLaw(eqx.Module):
         """Refuse parameters out of range."""
         check_ranges(self)
 
-    def bind_state(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-    ) -> "AbstractLaw":
+    def bind_state(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> "AbstractLaw":
         """The law as it is at a state of the mechanism; another one only where `scaled_by` made it depend on that."""
         return bind_state(self, t, q, qd, params) if is_state_dependent(self) else self
 
@@ -140,7 +139,6 @@ class AbstractLaw(eqx.Module):
         - `m`: mass [kg], `Fc`, `Fv`: Coulomb force [N] and viscous coefficient [N s/m], of a linear regression.
         - `v_max`: largest speed of the record [m/s].
         """
-        del m, Fc, Fv, v_max
         return None
 
 
@@ -156,7 +154,7 @@ class AbstractForceLaw(AbstractLaw):
     }
 
     @abc.abstractmethod
-    def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def force(self, v: Scalar) -> Scalar:
         """Friction force [N] at slip velocity `v` [m/s]."""
 
 
@@ -170,18 +168,18 @@ class AbstractSetValuedLaw(AbstractLaw):
     limitations: ClassVar[Mapping[str, str]] = {**_JUMPS, **_NO_MEMORY}
 
     @abc.abstractmethod
-    def sliding_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def sliding_force(self, v: Scalar) -> Scalar:
         """Magnitude [N] of the dry part of the force in slip at velocity `v` [m/s], never negative.
 
         At `v = 0` its limit from above.
         """
 
     @abc.abstractmethod
-    def viscous_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def viscous_force(self, v: Scalar) -> Scalar:
         """Part of the force [N] that is a smooth function of `v` [m/s], zero at rest."""
 
     @abc.abstractmethod
-    def static_limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+    def static_limit(self, direction: Scalar) -> Scalar:
         """Largest force [N] in stick against a load that pulls towards `direction` (+1 or -1)."""
 
     def modelica(self) -> str:
@@ -195,7 +193,6 @@ class AbstractSetValuedLaw(AbstractLaw):
 
         - `vs`: Stribeck velocity [m/s] for a law whose force jumps from stick to slip.
         """
-        del vs
         return None
 
 
@@ -205,15 +202,15 @@ class AbstractKarnoppLaw(AbstractLaw):
     limitations: ClassVar[Mapping[str, str]] = _NO_MEMORY
 
     @abc.abstractmethod
-    def holds(self, v: Float[Array, ""]) -> Bool[Array, ""]:
+    def holds(self, v: Scalar) -> Bool[Array, ""]:
         """Whether velocity `v` [m/s] counts as rest."""
 
     @abc.abstractmethod
-    def static_limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+    def static_limit(self, direction: Scalar) -> Scalar:
         """Largest holding force [N] against a load that pulls towards `direction` (+1 or -1)."""
 
     @abc.abstractmethod
-    def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def force(self, v: Scalar) -> Scalar:
         """Friction force [N] at velocity `v` [m/s] outside the band."""
 
     def passivity(self) -> Passivity:
@@ -247,11 +244,11 @@ class AbstractDynamicLaw(AbstractLaw):
         return self.force_given_zdot(v, z, self.zdot(v, z))
 
     @abc.abstractmethod
-    def stored_energy(self, z: PyTree) -> Float[Array, ""]:
+    def stored_energy(self, z: PyTree) -> Scalar:
         """Energy [J] held in the state `z`."""
 
     @abc.abstractmethod
-    def step_exact(self, v: Float[Array, "..."], z: PyTree, dt: Float[Array, ""]) -> PyTree:
+    def step_exact(self, v: Float[Array, "..."], z: PyTree, dt: Scalar) -> PyTree:
         """State after the time `dt` [s] at constant slip velocity `v` [m/s]: bounded at any step, however stiff."""
 
     def modelica(self) -> str:

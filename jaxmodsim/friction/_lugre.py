@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._core.parameters import Number, optional_parameter, parameter
 from .._core.safe import bounded_ratio, magnitude
+from .._core.shapes import Scalar
 from ._bristle import (
     ONE_STATE,
     STRIBECK_CURVE,
@@ -85,7 +86,7 @@ class LuGre(AbstractPlanarLaw):
     )
     passivity = bristle_passivity
 
-    def stribeck_curve(self, v: Float[Array, "..."]) -> Float[Array, ""]:
+    def stribeck_curve(self, v: Float[Array, "..."]) -> Scalar:
         """g(v) [N]: the bristle force that steady slip at `v` [m/s] tends to."""
         return stribeck_curve(magnitude(v), self.Fc, self.Fs, self.vs)
 
@@ -107,11 +108,11 @@ class LuGre(AbstractPlanarLaw):
             sigma1 = sigma1 * jnp.exp(-ratio * ratio)
         return self.sigma0 * z + sigma1 * rate + self.sigma2 * v
 
-    def stored_energy(self, z: Float[Array, "..."]) -> Float[Array, ""]:
+    def stored_energy(self, z: Float[Array, "..."]) -> Scalar:
         """Elastic energy [J] of the bristle."""
         return 0.5 * self.sigma0 * jnp.sum(z * z)
 
-    def step_exact(self, v: Float[Array, "..."], z: Float[Array, "..."], dt: Float[Array, ""]) -> Float[Array, "..."]:
+    def step_exact(self, v: Float[Array, "..."], z: Float[Array, "..."], dt: Scalar) -> Float[Array, "..."]:
         """Deflection [m] after `dt` [s] at constant `v` [m/s], exactly: the rate is linear in z."""
         return relax_exact(v, z, dt, self.sigma0 * magnitude(v) / self.stribeck_curve(v))
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, PyTree
 
+from .._core.shapes import Scalar
 from .._core.state_dependent import need_values
 from ._law import AbstractDynamicLaw, AbstractForceLaw, AbstractKarnoppLaw, AbstractLaw, AbstractSetValuedLaw
 
@@ -85,9 +86,7 @@ def max_stable_step(
 
 
 @eqx.filter_jit
-def _matrices(
-    law: AbstractLaw, m: Float[Array, ""] | None, v: Float[Array, ""], k: Float[Array, ""], z: PyTree
-) -> Float[Array, "2 n n"]:
+def _matrices(law: AbstractLaw, m: Scalar | None, v: Scalar, k: Scalar, z: PyTree) -> Float[Array, "2 n n"]:
     """Derivatives of the rates of (x, v, own state) by these, of the own state alone without a mass.
 
     Some laws have a kink at the limit that steady slip tends to: beside the state `z`, on either side of it.
@@ -121,11 +120,9 @@ def _parts(law: AbstractLaw, z: PyTree) -> tuple[Array, _Part, _Part]:
         own = jnp.zeros(0)
 
         def force(v: Array, own: Array) -> Array:
-            del own
             return law.force(v)
 
         def rate(v: Array, own: Array) -> Array:
-            del v
             return own
 
     else:
@@ -134,7 +131,7 @@ def _parts(law: AbstractLaw, z: PyTree) -> tuple[Array, _Part, _Part]:
 
 
 @eqx.filter_jit
-def _steady(law: AbstractDynamicLaw, v: Float[Array, ""]) -> PyTree:
+def _steady(law: AbstractDynamicLaw, v: Scalar) -> PyTree:
     """State of steady slip at `v` [m/s], not zero."""
     z = law.initial_state(v)
     distances = jnp.asarray(_DISTANCES, v.dtype)

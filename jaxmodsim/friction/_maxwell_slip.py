@@ -15,6 +15,7 @@ from .._core.parameters import (
     parameter,
     vector_parameter,
 )
+from .._core.shapes import Scalar
 from .._core.state_dependent import nominal
 from ._bristle import advance_elastoplastic, slip_fraction, stribeck_curve
 from ._law import AbstractDynamicLaw, register_law
@@ -93,7 +94,7 @@ class MaxwellSlip(AbstractDynamicLaw):
         if (self.Fs is None) != (self.vs is None):
             raise ValueError("MaxwellSlip: Fs and vs make the Stribeck effect together; give both or none.")
 
-    def limit(self, v: Float[Array, ""]) -> Float[Array, " n"]:
+    def limit(self, v: Scalar) -> Float[Array, " n"]:
         """Force [N] at which each element slips at velocity `v` [m/s]."""
         if self.Fs is None or self.vs is None:
             return self.Fc
@@ -107,7 +108,7 @@ class MaxwellSlip(AbstractDynamicLaw):
         """Undeflected elements, 0 m."""
         return jnp.zeros(jnp.shape(nominal(self.k)), v.dtype)
 
-    def zdot(self, v: Float[Array, ""], z: Float[Array, " n"]) -> Float[Array, " n"]:
+    def zdot(self, v: Scalar, z: Float[Array, " n"]) -> Float[Array, " n"]:
         """Rates of the deflections [m/s] at slip velocity `v` [m/s] and deflections `z` [m]."""
         limit, side = self.limit(v), jnp.sign(v)
         u = self.k * z * side / limit
@@ -116,18 +117,15 @@ class MaxwellSlip(AbstractDynamicLaw):
         rate = v * (1.0 - slip_fraction(jnp.minimum(u, 1.0), self.corner))
         return rate - side * self._attraction(limit) * limit / self.k * jnp.maximum(u - 1.0, 0.0)
 
-    def force_given_zdot(
-        self, v: Float[Array, ""], z: Float[Array, " n"], rate: Float[Array, " n"]
-    ) -> Float[Array, ""]:
+    def force_given_zdot(self, v: Scalar, z: Float[Array, " n"], rate: Float[Array, " n"]) -> Scalar:
         """Friction force [N] at slip velocity `v` [m/s] and deflections `z` [m]."""
-        del rate
         return jnp.sum(self.k * z) + self.sigma2 * v
 
-    def stored_energy(self, z: Float[Array, " n"]) -> Float[Array, ""]:
+    def stored_energy(self, z: Float[Array, " n"]) -> Scalar:
         """Elastic energy [J] of the elements."""
         return 0.5 * jnp.sum(self.k * z * z)
 
-    def step_exact(self, v: Float[Array, ""], z: Float[Array, " n"], dt: Float[Array, ""]) -> Float[Array, " n"]:
+    def step_exact(self, v: Scalar, z: Float[Array, " n"], dt: Scalar) -> Float[Array, " n"]:
         """Deflections [m] after `dt` [s] at constant `v` [m/s], exactly."""
         limit = self.limit(v)
         after = advance_elastoplastic(v, z, dt, limit / self.k, self.corner)

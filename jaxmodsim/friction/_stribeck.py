@@ -5,10 +5,11 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import PyTree
 
 from .._core.parameters import Number, optional_parameter, parameter
 from .._core.safe import bounded_ratio, safe_power
+from .._core.shapes import Scalar
 from ._bristle import STRIBECK_CURVE
 from ._law import NO_STICTION_IN_MUJOCO, AbstractSetValuedLaw, register_law
 from ._law_case import LawCase, stribeck_case
@@ -17,17 +18,17 @@ from ._law_case import LawCase, stribeck_case
 _ROUNDED = 1e-12
 
 
-def exponential(x: Float[Array, ""]) -> Float[Array, ""]:
+def exponential(x: Scalar) -> Scalar:
     """`exp(-x)`, the fall of the Gaussian and the exponential Stribeck curve."""
     return jnp.exp(-x)
 
 
-def lorentzian(x: Float[Array, ""]) -> Float[Array, ""]:
+def lorentzian(x: Scalar) -> Scalar:
     """`1/(1 + x)`, the fall of the Lorentzian Stribeck curve (Hess and Soom 1990, Journal of Tribology 112:147)."""
     return 1.0 / (1.0 + x)
 
 
-def _power(x: Float[Array, ""], exponent: Float[Array, ""]) -> Float[Array, ""]:
+def _power(x: Scalar, exponent: Scalar) -> Scalar:
     """`x^exponent`; below an exponent of one its slope at 0 has no bound, and the corner is rounded over `_ROUNDED`."""
     rounded = (x * x + _ROUNDED * _ROUNDED) ** (0.5 * exponent) - _ROUNDED**exponent
     return jnp.where(exponent < 1.0, rounded, safe_power(x, exponent))
@@ -86,25 +87,23 @@ class Stribeck(AbstractSetValuedLaw):
     valid_at_any_speed: ClassVar[bool] = True
     mujoco_lacks: ClassVar[str] = NO_STICTION_IN_MUJOCO
 
-    def sliding_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def sliding_force(self, v: Scalar) -> Scalar:
         """Magnitude [N] of the dry part in slip."""
         ratio = bounded_ratio(v, self.vs)
         # A square costs a fifth of a power.
         power = ratio * ratio if self.exponent is None else _power(ratio, self.exponent)
         return self.Fc + (self.Fs - self.Fc) * self.fall(power)
 
-    def viscous_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def viscous_force(self, v: Scalar) -> Scalar:
         """Viscous part [N]."""
         return self.Fv * v
 
-    def static_limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+    def static_limit(self, direction: Scalar) -> Scalar:
         """Largest force in stick [N]."""
-        del direction
         return jnp.asarray(self.Fs)
 
     def lugre_numbers(self, vs: float) -> dict[str, PyTree] | None:
         """Of the Gaussian curve its own."""
-        del vs
         gaussian = self.fall is exponential and (self.exponent is None or bool(jnp.all(self.exponent == 2.0)))
         return {"Fc": self.Fc, "Fs": self.Fs, "vs": self.vs, "sigma2": self.Fv} if gaussian else None
 
@@ -126,5 +125,4 @@ class Stribeck(AbstractSetValuedLaw):
     @classmethod
     def fit_start(cls, m: float, Fc: float, Fv: float, v_max: float) -> "Stribeck":
         """A break-away force of 1.2 Fc, and a fall over a twentieth of the speed."""
-        del m
         return cls(Fc=Fc, Fs=1.2 * Fc, vs=0.05 * v_max, Fv=Fv)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core.shapes import Scalar
 from .._core.state_dependent import need_values
 from ._law import AbstractSetValuedLaw
 from ._max_stable_step import max_stable_step
@@ -116,7 +117,7 @@ def regularized_width(law: AbstractSetValuedLaw, creep: float, load: float, m: f
     speeds = jnp.asarray(np.append(creep * np.geomspace(1e-9, 1.0, _SPEEDS)[:-1], creep))
 
     @jax.jit
-    def forces(width: Float[Array, ""], speeds: Float[Array, " n"]) -> Float[Array, " n"]:
+    def forces(width: Scalar, speeds: Float[Array, " n"]) -> Float[Array, " n"]:
         return side * jax.vmap(Regularized(law, width).force)(side * speeds)
 
     def peak(width: float) -> float:

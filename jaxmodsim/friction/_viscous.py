@@ -3,9 +3,8 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
-from jaxtyping import Array, Float
-
 from .._core.parameters import Number, parameter
+from .._core.shapes import Scalar
 from ._law import NO_STRIBECK_EFFECT, AbstractForceLaw, register_law
 
 
@@ -29,7 +28,7 @@ class Viscous(AbstractForceLaw):
     valid_at_any_speed: ClassVar[bool] = True
     limitations: ClassVar[Mapping[str, str]] = {**AbstractForceLaw.limitations, "stick-slip": NO_STRIBECK_EFFECT}
 
-    def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def force(self, v: Scalar) -> Scalar:
         """Friction force [N] at velocity `v` [m/s]."""
         return self.Fv * v
 

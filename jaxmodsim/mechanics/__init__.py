@@ -1,10 +1,7 @@
 """From a Lagrangian to equations of motion; constraints and their reactions; coordinates and their frames."""
 
-from ._bodies import PointMass as PointMass
-from ._bodies import RigidBody as RigidBody
 from ._bodies import point_mass as point_mass
 from ._bodies import rigid_body as rigid_body
-from ._charts import AbstractChart as AbstractChart
 from ._charts import Chart as Chart
 from ._charts import Cylindrical as Cylindrical
 from ._charts import Spherical as Spherical
@@ -12,11 +9,11 @@ from ._constraints import AbstractConstraint as AbstractConstraint
 from ._constraints import Constraint as Constraint
 from ._constraints import LinearizedConstraints as LinearizedConstraints
 from ._constraints import VelocityConstraint as VelocityConstraint
+from ._constraints import constraint_residual as constraint_residual
 from ._constraints import errors as errors
 from ._constraints import linearize_constraints as linearize_constraints
 from ._constraints import parts as parts
-from ._constraints import project_position as project_position
-from ._constraints import project_velocity as project_velocity
+from ._constraints import project as project
 from ._constraints import rates as rates
 from ._lagrange import Lagrangian as Lagrangian
 from ._lagrange import MotionEquations as MotionEquations

@@ -16,15 +16,14 @@ from .._core.index_check import check_indices
 from .._core.position import PositionFn, ScalarOrFn, as_position_fn, as_scalar_or_fn
 from .._core.safe import safe_norm
 from .._core.semidefinite import solve_balanced
+from .._core.shapes import PerDof, Scalar
 
 
 class AbstractBody(eqx.Module):
     """A Lagrangian that can be added to others: `bead + rod + spring`, the last any function `L(t, q, qd, params)`."""
 
     @abc.abstractmethod
-    def __call__(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-    ) -> Float[Array, ""]:
+    def __call__(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """Lagrangian [J]."""
 
     def __add__(self, other: Any) -> "Bodies":
@@ -41,9 +40,7 @@ class Bodies(AbstractBody):
 
     parts: tuple[Callable[..., Any], ...]
 
-    def __call__(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-    ) -> Float[Array, ""]:
+    def __call__(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """Sum of the Lagrangians [J]."""
         total = self.parts[0](t, q, qd, params)
         for part in self.parts[1:]:
@@ -58,24 +55,18 @@ class PointMass(AbstractBody):
     position: PositionFn = eqx.field(converter=partial(as_position_fn, name="point_mass position"))
     gravity: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="point_mass gravity"))
 
-    def __call__(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-    ) -> Float[Array, ""]:
+    def __call__(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """`m v^2/2 - m g z` [J]."""
-        del t
         x, v = _moving(self.position, q, qd, params, "point_mass")
         m = self.m(params)
         return 0.5 * m * jnp.sum(v**2) - m * self.gravity(params) * x[2]
 
-    def reaction(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-    ) -> Float[Array, "3"]:
+    def reaction(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, "3"]:
         """Force [N] of the path or surface on the mass, normal to it, from curvature and gravity, shape `[3]`.
 
         It is the normal part of `m (d2x/dt2 + g ez)`, which the accelerations along the path do not enter. Normal
         components of further forces on the mass are to be taken off: they are not known here.
         """
-        del t
         _check_indices(self.position, q, params)
 
         def velocity(q: Array) -> Array:
@@ -90,9 +81,7 @@ class PointMass(AbstractBody):
         share = solve_balanced(gram, along)
         return load - jnp.sum(tangents * share[:, None], axis=0)
 
-    def normal_force(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-    ) -> Float[Array, ""]:
+    def normal_force(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """Magnitude [N] of `reaction`, to be given to `Friction(normal_force=bead.normal_force)`."""
         return safe_norm(self.reaction(t, q, qd, params))
 
@@ -135,11 +124,8 @@ class RigidBody(AbstractBody):
     orientation: PositionFn = eqx.field(converter=partial(as_position_fn, name="rigid_body orientation"))
     gravity: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="rigid_body gravity"))
 
-    def __call__(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-    ) -> Float[Array, ""]:
+    def __call__(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """`m v^2/2 + w I w/2 - m g z` [J]."""
-        del t
         x, v = _moving(self.position, q, qd, params, "rigid_body")
         m, inertia = self.m(params), jnp.asarray(self.inertia(params))
         _check_indices(self.orientation, q, params)

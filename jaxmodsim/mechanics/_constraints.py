@@ -25,6 +25,7 @@ from .._core.parameters import Number, check_ranges, parameter
 from .._core.position import PositionFn, as_position_fn
 from .._core.safe import safe_norm
 from .._core.semidefinite import solve_balanced
+from .._core.shapes import PerDof, Scalar
 
 
 def _at(value: Any) -> PositionFn | None:
@@ -51,27 +52,23 @@ class AbstractConstraint(eqx.Module):
         check_ranges(self)
 
     @abc.abstractmethod
-    def error(self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree) -> Float[Array, " m"] | None:
+    def error(self, t: Scalar, q: PerDof, params: PyTree) -> Float[Array, " m"] | None:
         """What is zero where the position is admissible, shape `[m]`; None where no position is excluded."""
 
     @abc.abstractmethod
-    def rate(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-    ) -> Float[Array, " m"]:
+    def rate(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, " m"]:
         """What is zero where the velocity is admissible, shape `[m]`."""
 
     @abc.abstractmethod
-    def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
+    def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check shapes while tracing; raises `ValueError` naming the constraint."""
 
     @abc.abstractmethod
-    def force(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree, multiplier: Float[Array, " m"]
-    ) -> Float[Array, "..."] | None:
+    def force(self, t: Scalar, q: PerDof, params: PyTree, multiplier: Float[Array, " m"]) -> Float[Array, "..."] | None:
         """Cartesian force [N] at the constrained point; None where no point is known."""
 
     @abc.abstractmethod
-    def per_multiplier(self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree) -> Float[Array, ""]:
+    def per_multiplier(self, t: Scalar, q: PerDof, params: PyTree) -> Scalar:
         """Magnitude [N] of the force at a multiplier of one, for a single equation."""
 
 
@@ -115,20 +112,17 @@ class Constraint(AbstractConstraint):
     stabilise: Number = parameter("stabilise", "1/s", lower=0.0, default=0.0)
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Constraint name"))
 
-    def error(self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree) -> Float[Array, " m"]:
+    def error(self, t: Scalar, q: PerDof, params: PyTree) -> Float[Array, " m"]:
         """phi, shape `[m]`."""
         place = q if self.at is None else self.at(q, params)
         return jnp.ravel(jnp.asarray(self.phi(t, place, params), q.dtype))
 
-    def rate(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-    ) -> Float[Array, " m"]:
+    def rate(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, " m"]:
         """Time derivative of phi, shape `[m]`."""
         return jax.jvp(lambda t, q: self.error(t, q, params), (t, q), (jnp.ones_like(t), qd))[1]
 
-    def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
+    def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check that phi is a number or a vector, and a number where the constraint is one-sided."""
-        del qd
         place = {"q": q}
         if self.at is not None:
             place = {"x": traced(self.at, q=q, params=params, name=f"at of Constraint {name!r}")}
@@ -139,16 +133,14 @@ class Constraint(AbstractConstraint):
                 " contact a Constraint of its own."
             )
 
-    def force(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree, multiplier: Float[Array, " m"]
-    ) -> Float[Array, "..."] | None:
+    def force(self, t: Scalar, q: PerDof, params: PyTree, multiplier: Float[Array, " m"]) -> Float[Array, "..."] | None:
         """`(dphi/dx)^T lambda` [N], of the shape of `at`'s positions."""
         if self.at is None:
             return None
         _, pull = jax.vjp(lambda x: jnp.ravel(jnp.asarray(self.phi(t, x, params), q.dtype)), self.at(q, params))
         return pull(multiplier)[0]
 
-    def per_multiplier(self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree) -> Float[Array, ""]:
+    def per_multiplier(self, t: Scalar, q: PerDof, params: PyTree) -> Scalar:
         """Length of dphi/dx; one where `at` is not given, so that phi must be a length along the normal."""
         force = self.force(t, q, params, jnp.ones(1, q.dtype))
         return jnp.ones_like(t) if force is None else safe_norm(jnp.ravel(force))
@@ -177,29 +169,22 @@ class VelocityConstraint(AbstractConstraint):
 
     one_sided: ClassVar[bool] = False
 
-    def error(self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree) -> None:
+    def error(self, t: Scalar, q: PerDof, params: PyTree) -> None:
         """No position is excluded."""
-        del t, q, params
 
-    def rate(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-    ) -> Float[Array, " m"]:
+    def rate(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, " m"]:
         """psi, shape `[m]`."""
         return jnp.ravel(jnp.asarray(self.psi(t, q, qd, params), q.dtype))
 
-    def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
+    def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check that psi is a number or a vector."""
         _check_vector(f"psi of VelocityConstraint {name!r}", self.psi, t=q[0], q=q, qd=qd, params=params)
 
-    def force(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree, multiplier: Float[Array, " m"]
-    ) -> None:
+    def force(self, t: Scalar, q: PerDof, params: PyTree, multiplier: Float[Array, " m"]) -> None:
         """The point is not known."""
-        del t, q, params, multiplier
 
-    def per_multiplier(self, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree) -> Float[Array, ""]:
+    def per_multiplier(self, t: Scalar, q: PerDof, params: PyTree) -> Scalar:
         """One: psi must be a velocity."""
-        del q, params
         return jnp.ones_like(t)
 
 
@@ -233,30 +218,25 @@ class LinearizedConstraints(NamedTuple):
     minv_jt: Float[Array, "m dof"]
     matrix: Float[Array, "m m"]
 
-    def multipliers(self, qdd: Float[Array, " dof"]) -> Float[Array, " m"]:
+    def multipliers(self, qdd: PerDof) -> Float[Array, " m"]:
         """Multipliers that make accelerations `qdd` admissible."""
         return -solve_balanced(self.matrix, _times(self.rows, qdd) + self.bias)
 
-    def multiplier_response(self, qdd: Float[Array, " dof"]) -> Float[Array, " m"]:
+    def multiplier_response(self, qdd: PerDof) -> Float[Array, " m"]:
         """What multipliers change if the accelerations without constraints change by `qdd`."""
         return -solve_balanced(self.matrix, _times(self.rows, qdd))
 
-    def apply_force(self, multipliers: Float[Array, " m"]) -> Float[Array, " dof"]:
+    def apply_force(self, multipliers: Float[Array, " m"]) -> PerDof:
         """Accelerations that multipliers make."""
         return jnp.sum(self.minv_jt * multipliers[:, None], axis=0)
 
-    def force(self, multipliers: Float[Array, " m"]) -> Float[Array, " dof"]:
+    def force(self, multipliers: Float[Array, " m"]) -> PerDof:
         """Generalised force of multipliers."""
         return jnp.sum(self.rows * multipliers[:, None], axis=0)
 
 
 def linearize_constraints(
-    constraints: Constraints,
-    t: Float[Array, ""],
-    q: Float[Array, " dof"],
-    qd: Float[Array, " dof"],
-    params: PyTree,
-    mass: Float[Array, "dof dof"],
+    constraints: Constraints, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, mass: Float[Array, "dof dof"]
 ) -> LinearizedConstraints:
     """The constraints at one state of a mechanism with the mass matrix `mass`."""
 
@@ -273,21 +253,13 @@ def linearize_constraints(
     return LinearizedConstraints(rows, bias, reach, matrix)
 
 
-def parts(
-    constraints: Constraints,
-    t: Float[Array, ""],
-    q: Float[Array, " dof"],
-    qd: Float[Array, " dof"],
-    params: PyTree,
-) -> list[slice]:
+def parts(constraints: Constraints, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> list[slice]:
     """Where the equations of each constraint stand among those of all."""
     ends = list(accumulate(jax.eval_shape(each.rate, t, q, qd, params).shape[0] for each in constraints))
     return [slice(start, end) for start, end in zip([0, *ends], ends, strict=False)]
 
 
-def errors(
-    constraints: Constraints, t: Float[Array, ""], params: PyTree
-) -> Callable[[Float[Array, " dof"]], Float[Array, " h"]]:
+def errors(constraints: Constraints, t: Scalar, params: PyTree) -> Callable[[PerDof], Float[Array, " h"]]:
     """All that holonomic constraints say about the coordinates, as a function of these; h = 0 where there are none."""
 
     def at(q: Array) -> Array:
@@ -297,9 +269,7 @@ def errors(
     return at
 
 
-def rates(
-    constraints: Constraints, t: Float[Array, ""], q: Float[Array, " dof"], params: PyTree
-) -> Callable[[Float[Array, " dof"]], Float[Array, " m"]]:
+def rates(constraints: Constraints, t: Scalar, q: PerDof, params: PyTree) -> Callable[[PerDof], Float[Array, " m"]]:
     """All that constraints say about the velocities, as a function of these."""
 
     def at(qd: Array) -> Array:
@@ -308,41 +278,43 @@ def rates(
     return at
 
 
-def project_position(
-    constraints: Constraints,
-    t: Float[Array, ""],
-    q: Float[Array, " dof"],
-    params: PyTree,
-    mass: Float[Array, "dof dof"],
-) -> Float[Array, " dof"]:
-    """Coordinates moved onto the holonomic constraints, the shortest way in the metric of the masses.
+def project(
+    constraints: Constraints, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, mass: Float[Array, "dof dof"]
+) -> tuple[PerDof, PerDof]:
+    """Coordinates and velocities moved onto the constraints, the shortest way in the metric of the masses.
 
-    Two Newton steps, with the mass matrix held.
+    Two Newton steps for the coordinates, with the mass matrix held; then the smallest impulses for the velocities.
     """
     error = errors(constraints, t, params)
-    if error(q).shape == (0,):
-        return q
-    for _ in range(_NEWTON):
-        reach, matrix = _reach(_jacobian(error, q), mass)
-        q = q - jnp.sum(reach * solve_balanced(matrix, error(q))[:, None], axis=0)
-    return q
-
-
-def project_velocity(
-    constraints: Constraints,
-    t: Float[Array, ""],
-    q: Float[Array, " dof"],
-    qd: Float[Array, " dof"],
-    params: PyTree,
-    mass: Float[Array, "dof dof"],
-) -> Float[Array, " dof"]:
-    """Velocities moved onto the constraints, by the smallest impulses that do."""
+    if error(q).shape != (0,):
+        for _ in range(_NEWTON):
+            reach, matrix = _reach(_jacobian(error, q), mass)
+            q = q - jnp.sum(reach * solve_balanced(matrix, error(q))[:, None], axis=0)
     rate = rates(constraints, t, q, params)
     reach, matrix = _reach(_jacobian(rate, qd), mass)
-    return qd - jnp.sum(reach * solve_balanced(matrix, rate(qd))[:, None], axis=0)
+    return q, qd - jnp.sum(reach * solve_balanced(matrix, rate(qd))[:, None], axis=0)
 
 
-def _jacobian(fn: object, x: Float[Array, " dof"]) -> Float[Array, "m dof"]:
+def constraint_residual(
+    constraints: Constraints, t: Scalar, q: PerDof, qd: PerDof, params: PyTree
+) -> tuple[Scalar, Scalar]:
+    """How far coordinates and velocities are from the constraints, relative to their own size or to one.
+
+    Each error is divided by the length of its gradient, which makes it a distance from its own surface: constraints
+    that contradict each other show, too. Without derivatives.
+    """
+    q, qd = jax.lax.stop_gradient((q, qd))
+
+    def far(fn: Callable[[Array], Array], x: Array) -> Array:
+        error, rows = fn(x), _jacobian(fn, x)
+        slope = safe_norm(rows, axis=1)
+        distance = jnp.abs(error) / jnp.where(slope > 0, slope, 1.0)
+        return jnp.max(distance, initial=0.0) / jnp.maximum(1.0, jnp.max(jnp.abs(x)))
+
+    return far(errors(constraints, t, params), q), far(rates(constraints, t, q, params), qd)
+
+
+def _jacobian(fn: object, x: PerDof) -> Float[Array, "m dof"]:
     """Jacobian by rows: there are never more independent constraints than coordinates."""
     return jax.jacrev(fn)(x)  # pyright: ignore[reportArgumentType]
 
@@ -353,5 +325,5 @@ def _reach(rows: Float[Array, "m dof"], mass: Float[Array, "dof dof"]) -> tuple[
     return reach, jnp.sum(rows[:, None, :] * reach[None, :, :], axis=2)
 
 
-def _times(rows: Float[Array, "m dof"], vector: Float[Array, " dof"]) -> Float[Array, " m"]:
+def _times(rows: Float[Array, "m dof"], vector: PerDof) -> Float[Array, " m"]:
     return jnp.sum(rows * vector[None, :], axis=1)

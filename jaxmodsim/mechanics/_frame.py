@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._core.safe import safe_norm
+from .._core.shapes import Scalar
 
 # Unit tangents whose volume is below this many roundings count as dependent: their own roundings would leave fewer
 # than about two right digits of the frame. Lengths do not enter, so a tangent may be short, as it is close to a pole.
@@ -84,7 +85,7 @@ def _scaled(vectors: Float[Array, "3 *rest"]) -> Float[Array, "3 *rest"]:
     return vectors / jnp.where(length == 0, 1.0, length)
 
 
-def _triple(columns: Float[Array, "3 3"]) -> Float[Array, ""]:
+def _triple(columns: Float[Array, "3 3"]) -> Scalar:
     """Triple product (a x b) . c of three columns."""
     a, b, c = columns.T
     return jnp.sum(jnp.cross(a, b) * c)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._core.cholesky import MAX_UNROLLED_CHOLESKY, solve_positive_definite
 from .._core.scalarise import in_scalars
+from .._core.shapes import PerDof, Scalar
 
 Lagrangian: TypeAlias = Callable[[Any, Array, Array, Any], Array]
 
@@ -23,12 +24,10 @@ class MotionEquations(NamedTuple):
     """
 
     mass: Float[Array, "dof dof"]
-    load: Float[Array, " dof"]
+    load: PerDof
 
 
-def motion_equations(
-    lagrangian: Lagrangian, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-) -> MotionEquations:
+def motion_equations(lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> MotionEquations:
     """Mass matrix and load of `d/dt dL/dqd - dL/dq = Q` at one state.
 
     The momentum dL/dqd is linearised once. Its derivative along (1, qd, 0) gives the bias and along the unit
@@ -67,21 +66,14 @@ def _differentiate(lagrangian: Lagrangian, t: Array, q: Array, qd: Array, params
 
 
 def acceleration(
-    lagrangian: Lagrangian,
-    t: Float[Array, ""],
-    q: Float[Array, " dof"],
-    qd: Float[Array, " dof"],
-    params: PyTree,
-    force: Float[Array, " dof"] | float = 0.0,
-) -> Float[Array, " dof"]:
+    lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, force: PerDof | float = 0.0
+) -> PerDof:
     """Accelerations `qdd` under the generalised force `force` [N or N m], shape `[dof]`; see `motion_equations`."""
     equations = motion_equations(lagrangian, t, q, qd, params)
     return solve_positive_definite(equations.mass, equations.load + force)
 
 
-def energies(
-    lagrangian: Lagrangian, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def energies(lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> tuple[Scalar, Scalar]:
     """Kinetic and potential energy [J] of a Lagrangian.
 
     **Returns:**
@@ -96,25 +88,19 @@ def energies(
     return kinetic, jnp.sum(qd * momentum) - lagrangian(t, q, qd, params) - kinetic
 
 
-def momentum(
-    lagrangian: Lagrangian, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-) -> Float[Array, " dof"]:
+def momentum(lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> PerDof:
     """Canonical momenta `dL/dqd`, shape `[dof]` [kg m/s for lengths, kg m^2/s for angles]."""
     return jax.grad(lagrangian, argnums=2)(t, q, qd, params)
 
 
-def velocity(
-    lagrangian: Lagrangian, t: Float[Array, ""], q: Float[Array, " dof"], p: Float[Array, " dof"], params: PyTree
-) -> Float[Array, " dof"]:
+def velocity(lagrangian: Lagrangian, t: Scalar, q: PerDof, p: PerDof, params: PyTree) -> PerDof:
     """Velocities that belong to the momenta `p`, of a Lagrangian that is quadratic in the velocities."""
     still = jnp.zeros_like(p)
     mass = motion_equations(lagrangian, t, q, still, params).mass
     return solve_positive_definite(mass, p - momentum(lagrangian, t, q, still, params))
 
 
-def quadratic(
-    lagrangian: Lagrangian, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-) -> Array:
+def quadratic(lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Array:
     """Whether the mass matrix is the same at `qd` as at rest and at other velocities, to half of the digits."""
     at = [motion_equations(lagrangian, t, q, v, params).mass for v in (jnp.zeros_like(qd), qd, qd + 1.0)]
     largest = jnp.max(jnp.abs(at[0]))

@@ -19,15 +19,15 @@ def design_figure(design: InputDesign, *, caption: str = "") -> Figure:
     figure = Figure(figsize=(12, 6.4), layout="constrained")
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.35, 1))[0]
     axes = left.subplots(3, 1, sharex=True)
-    (factor, small), limits, start = small_unit("m"), design.limits, design.q_ref[0]
+    (factor, small), limits, start = small_unit("m"), design.limits, design.best.q_ref[0]
     panels = (
-        ("position", small, factor, design.q_ref, design.plain.q_ref, limits.travel, start),
-        ("velocity", "m/s", 1.0, design.qd_ref, design.plain.qd_ref, limits.speed, 0.0),
-        ("force", "N", 1.0, design.force, design.plain.force, limits.force, 0.0),
+        ("position", small, factor, design.best.q_ref, design.plain.q_ref, limits.travel, start),
+        ("velocity", "m/s", 1.0, design.best.qd_ref, design.plain.qd_ref, limits.speed, 0.0),
+        ("force", "N", 1.0, design.best.force, design.plain.force, limits.force, 0.0),
     )
     for axis, (quantity, unit, scale, best, plain, limit, middle) in zip(axes, panels, strict=True):
-        axis.plot(design.t, scale * plain, color="#c8c8c8", lw=1.2, label="plain sine")
-        axis.plot(design.t, scale * best, color=BLUE, lw=1.3, label="designed")
+        axis.plot(design.best.t, scale * plain, color="#c8c8c8", lw=1.2, label="plain sine")
+        axis.plot(design.best.t, scale * best, color=BLUE, lw=1.3, label="designed")
         for side in (-1.0, 1.0) if limit is not None else ():
             level = scale * (middle + side * (limit or 0.0))
             axis.axhline(level, color=RED, lw=1.0, ls="--", label="limit" if side > 0 else "_")
@@ -45,7 +45,7 @@ def design_figure(design: InputDesign, *, caption: str = "") -> Figure:
 def _error_bars(axis: Axes, design: InputDesign) -> None:
     """Predicted relative errors, designed against plain; a number that is zero has none and is left out."""
     names = [name for name, value in design.values.items() if value]
-    pairs = (("plain sine", "#c8c8c8", design.plain.errors, 0.2), ("designed", BLUE, design.errors, -0.2))
+    pairs = (("plain sine", "#c8c8c8", design.plain.errors, 0.2), ("designed", BLUE, design.best.errors, -0.2))
     finite = [
         100 * errors[name] / abs(design.values[name])
         for _, _, errors, _ in pairs
@@ -63,5 +63,5 @@ def _error_bars(axis: Axes, design: InputDesign) -> None:
     axis.set_xscale("log")
     axis.set_yticks(range(len(names)), names)
     axis.set(xlim=(low, high), xlabel="predicted standard error [% of the value]")
-    axis.set_title(f"{design.t[-1] - design.t[0]:g} s, noise {design.noise:g}", fontsize=10)
+    axis.set_title(f"{design.best.t[-1] - design.best.t[0]:g} s, noise {design.noise:g}", fontsize=10)
     axis.invert_yaxis()

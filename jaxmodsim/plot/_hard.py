@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..validation.hard import EXPLICIT, CaseReport, formulations, largest_step, theory
+from ..validation.hard import CaseReport, largest_steps
 from ._style import BLUE, GREEN, GREY, RED
 
 _KINDS = {
@@ -65,17 +65,13 @@ def step_limits_figure() -> Figure:
     """Largest stable fixed steps, found by running, over those of theory; runs the cases."""
     figure = Figure(figsize=(7.5, 4.2), layout="constrained")
     axis = figure.subplots()
-    limits = [
-        (name, each, theory(formulation, solver), largest_step(formulation, solver))
-        for name, formulation in formulations().items()
-        for each, solver in EXPLICIT.items()
-    ]
-    for colour, marker, name in zip((BLUE, RED, GREEN, "#7b4fa3"), "osDv", formulations(), strict=True):
-        here = [(predicted, found) for formulation, _, predicted, found in limits if formulation == name]
-        axis.plot(*zip(*here, strict=True), marker, color=colour, label=name, ms=7, alpha=0.8)
-    span = [0.5 * min(x[2] for x in limits), 2.0 * max(x[2] for x in limits)]
+    limits = largest_steps()
+    for colour, marker, (name, here) in zip((BLUE, RED, GREEN, "#7b4fa3"), "osDv", limits.items(), strict=True):
+        axis.plot(*zip(*here.values(), strict=True), marker, color=colour, label=name, ms=7, alpha=0.8)
+    predicted = [x for here in limits.values() for x, _ in here.values()]
+    span = [0.5 * min(predicted), 2.0 * max(predicted)]
     axis.plot(span, span, color="#c8c8c8", lw=3, zorder=0, label="equal")
     axis.set(xscale="log", yscale="log", xlabel="largest stable step by theory [s]", ylabel="found by bisection [s]")
-    axis.set_title(f"Stability of fixed explicit steps: {', '.join(EXPLICIT)}", fontsize=10)
+    axis.set_title(f"Stability of fixed explicit steps: {', '.join(next(iter(limits.values())))}", fontsize=10)
     axis.legend(fontsize=8)
     return figure

@@ -9,20 +9,22 @@ from jaxtyping import ArrayLike, Float, PyTree
 
 from ..friction import Coulomb
 from ..scene import Scene
-from ._belt import BELT_OSCILLATOR, belt_oscillator, belt_oscillator_motion, belt_stribeck
-from ._belts import COUPLED_BELTS, coupled_belts
-from ._box import box_coulomb, box_lugre, ramped_box
-from ._bristle import slipping_bristle, slipping_bristle_deflection
-from ._cart_pole import cart_pole
-from ._cartesian_pendulum import cartesian_spherical_pendulum
-from ._chain import double_pendulum
-from ._charged_particle import CHARGED_PARTICLE, charged_particle, charged_particle_motion
-from ._four_bar import four_bar, four_bar_state
-from ._knife_edge import knife_edge, knife_edge_motion
-from ._pendulum import spherical_pendulum, spherical_pendulum_motion
-from ._pulled_box import pulled_box
-from ._spring import BRAKED_SPRING, braked_spring, braked_spring_law, braked_spring_motion
-from ._stick_slip_pendulum import STICK_SLIP_PENDULUM, stick_slip_pendulum, stick_slip_pendulum_turn
+from . import (
+    belt_oscillator,
+    braked_spring,
+    cart_pole,
+    cartesian_pendulum,
+    charged_particle,
+    coupled_belts,
+    four_bar,
+    knife_edge,
+    n_link_pendulum,
+    pulled_box,
+    ramped_box,
+    slipping_bristle,
+    spherical_pendulum,
+    stick_slip_pendulum,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,91 +89,100 @@ def _case(
 def _coulomb_box() -> NamedProblem:
     # At rest until the force reaches Fc = 1.5 N at t = 1.5 s, then v = (t - 1.5)^2/(2 m) under a ramp of 1 N/s.
     exact = (10.0 - 1.5) ** 2 / 4.0
-    return _case("coulomb_box", ramped_box(box_coulomb()), [0.0], [0.0], 10.0, "qd[0]", exact)
+    return _case("coulomb_box", ramped_box.scene(ramped_box.coulomb()), [0.0], [0.0], 10.0, "qd[0]", exact)
 
 
 def _lugre_box() -> NamedProblem:
-    return _case("lugre_box", ramped_box(box_lugre()), [0.0], [0.0], 10.0, "qd[0]")
+    return _case("lugre_box", ramped_box.scene(ramped_box.lugre()), [0.0], [0.0], 10.0, "qd[0]")
 
 
 def _pulled_box() -> NamedProblem:
-    return _case("pulled_box", pulled_box(), [0.0], [0.0], 20.0, "q[0]", max_steps=200_000)
+    return _case("pulled_box", pulled_box.scene(), [0.0], [0.0], 20.0, "q[0]", max_steps=200_000)
 
 
 def _slipping_bristle() -> NamedProblem:
-    law, v, t1 = box_lugre(), 0.1, 0.05
-    force = law.sigma0 * slipping_bristle_deflection(jnp.asarray(t1), law, v) + law.sigma2 * v
-    return _case("slipping_bristle", slipping_bristle(law, v), [0.0], [0.0], t1, "friction", float(force))
+    law, v, t1 = ramped_box.lugre(), 0.1, 0.05
+    force = law.sigma0 * slipping_bristle.deflection(jnp.asarray(t1), law, v) + law.sigma2 * v
+    return _case("slipping_bristle", slipping_bristle.scene(law, v), [0.0], [0.0], t1, "friction", float(force))
 
 
 def _braked_spring() -> NamedProblem:
-    t1, x0 = 20.0, BRAKED_SPRING["x0"]
-    exact = float(braked_spring_motion(jnp.asarray(t1), **BRAKED_SPRING)[0])
-    return _case("braked_spring", braked_spring(braked_spring_law()), [x0], [0.0], t1, "q[0]", exact)
+    t1, x0 = 20.0, braked_spring.PARAMS["x0"]
+    exact = float(braked_spring.motion(jnp.asarray(t1), **braked_spring.PARAMS)[0])
+    return _case("braked_spring", braked_spring.scene(braked_spring.coulomb()), [x0], [0.0], t1, "q[0]", exact)
 
 
 def _belt_oscillator() -> NamedProblem:
     t1 = 5.0
-    exact = float(belt_oscillator_motion(jnp.asarray(t1), **BELT_OSCILLATOR)[0])
-    return _case("belt_oscillator", belt_oscillator(), [0.0], [BELT_OSCILLATOR["belt"]], t1, "q[0]", exact)
+    exact = float(belt_oscillator.motion(jnp.asarray(t1), **belt_oscillator.PARAMS)[0])
+    return _case("belt_oscillator", belt_oscillator.scene(), [0.0], [belt_oscillator.PARAMS["belt"]], t1, "q[0]", exact)
 
 
 def _stribeck_belt() -> NamedProblem:
-    return _case("stribeck_belt", belt_oscillator(belt_stribeck()), [0.0], [BELT_OSCILLATOR["belt"]], 5.0, "q[0]")
+    return _case(
+        "stribeck_belt",
+        belt_oscillator.scene(belt_oscillator.stribeck()),
+        [0.0],
+        [belt_oscillator.PARAMS["belt"]],
+        5.0,
+        "q[0]",
+    )
 
 
 def _coupled_belts() -> NamedProblem:
-    belt = COUPLED_BELTS["belt"]
-    return _case("coupled_belts", coupled_belts(), [0.0, 0.0], [belt, belt], 4.0, "q[0]")
+    belt = coupled_belts.PARAMS["belt"]
+    return _case("coupled_belts", coupled_belts.scene(), [0.0, 0.0], [belt, belt], 4.0, "q[0]")
 
 
 def _stick_slip_pendulum() -> NamedProblem:
     """From turn to turn until it sticks, where its weight cannot overcome the friction."""
-    p, start = STICK_SLIP_PENDULUM, 1.2
+    p, start = stick_slip_pendulum.PARAMS, 1.2
     place, numbers = start, {name: p[name] for name in ("m", "l", "g", "Fc")}
     while p["m"] * p["g"] * p["l"] * abs(np.sin(place)) > p["Fs"]:
-        place = float(stick_slip_pendulum_turn(place, **numbers))
-    return _case("stick_slip_pendulum", stick_slip_pendulum(), [start], [0.0], 10.0, "q[0]", place)
+        place = float(stick_slip_pendulum.turn(place, **numbers))
+    return _case("stick_slip_pendulum", stick_slip_pendulum.scene(), [start], [0.0], 10.0, "q[0]", place)
 
 
 def _cart_pole() -> NamedProblem:
-    return _case("cart_pole", cart_pole(Coulomb(Fc=0.3, Fs=0.4)), [0.0, 2.0], [0.0, 0.0], 3.0, "q[1]")
+    return _case("cart_pole", cart_pole.scene(Coulomb(Fc=0.3, Fs=0.4)), [0.0, 2.0], [0.0, 0.0], 3.0, "q[1]")
 
 
 def _spherical_pendulum() -> NamedProblem:
     phi, turn, t1 = 1.8, 2.0, 5.0
-    exact = float(spherical_pendulum_motion(t1, phi, turn))
-    return _case("spherical_pendulum", spherical_pendulum(), [phi, 0.0], [0.0, turn], t1, "q[0]", exact)
+    exact = float(spherical_pendulum.motion(t1, phi, turn))
+    return _case("spherical_pendulum", spherical_pendulum.scene(), [phi, 0.0], [0.0, turn], t1, "q[0]", exact)
 
 
 def _cartesian_spherical_pendulum() -> NamedProblem:
     """The spherical pendulum again, its place held on the sphere by a constraint."""
     phi, turn, t1 = 1.8, 2.0, 5.0
     q0, qd0 = [np.sin(phi), 0.0, np.cos(phi)], [0.0, turn * np.sin(phi), 0.0]
-    exact = float(np.cos(spherical_pendulum_motion(t1, phi, turn)))
-    return _case("cartesian_spherical_pendulum", cartesian_spherical_pendulum(), q0, qd0, t1, "q[2]", exact)
+    exact = float(np.cos(spherical_pendulum.motion(t1, phi, turn)))
+    return _case(
+        "cartesian_spherical_pendulum", cartesian_pendulum.cartesian_spherical_pendulum(), q0, qd0, t1, "q[2]", exact
+    )
 
 
 def _double_pendulum() -> NamedProblem:
-    return _case("double_pendulum", double_pendulum(), [2.0, 1.5], [0.0, 0.0], 3.0, "q[1]")
+    return _case("double_pendulum", n_link_pendulum.double_pendulum(), [2.0, 1.5], [0.0, 0.0], 3.0, "q[1]")
 
 
 def _charged_particle() -> NamedProblem:
     q0, qd0, t1 = [0.3, -0.8, 0.5], [1.2, 0.4, -0.7], 10.0
-    motion = charged_particle_motion(jnp.asarray(t1), jnp.asarray(q0), jnp.asarray(qd0), **CHARGED_PARTICLE)
-    scene = charged_particle(E=CHARGED_PARTICLE["E"])
+    motion = charged_particle.motion(jnp.asarray(t1), jnp.asarray(q0), jnp.asarray(qd0), **charged_particle.PARAMS)
+    scene = charged_particle.scene(E=charged_particle.PARAMS["E"])
     return _case("charged_particle", scene, q0, qd0, t1, "q[0]", float(motion[0][0]))
 
 
 def _knife_edge() -> NamedProblem:
     turn, speed, t1 = 1.7, 0.9, 6.0
-    exact = float(knife_edge_motion(jnp.asarray(t1), turn=turn, speed=speed)[0][1])
-    return _case("knife_edge", knife_edge(), [0.0, 0.0, 0.0], [speed, 0.0, turn], t1, "q[1]", exact)
+    exact = float(knife_edge.motion(jnp.asarray(t1), turn=turn, speed=speed)[0][1])
+    return _case("knife_edge", knife_edge.scene(), [0.0, 0.0, 0.0], [speed, 0.0, turn], t1, "q[1]", exact)
 
 
 def _four_bar() -> NamedProblem:
-    q0, qd0 = four_bar_state(0.7, 8.0)
-    return _case("four_bar", four_bar(), q0, qd0, 2.0, "q[2]")
+    q0, qd0 = four_bar.state(0.7, 8.0)
+    return _case("four_bar", four_bar.scene(), q0, qd0, 2.0, "q[2]")
 
 
 _CASES: dict[str, Callable[[], NamedProblem]] = {

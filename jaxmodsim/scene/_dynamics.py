@@ -1,6 +1,5 @@
 """The equations of motion of a scene, with only the terms it holds, and what a run asks beside them."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -10,18 +9,12 @@ from jaxtyping import Array, Bool, Float, PyTree
 from .._core.cholesky import solve_positive_definite
 from .._core.functions import depends_on, real_array
 from .._core.index_check import traced
-from .._core.safe import safe_norm
+from .._core.shapes import PerDof, Scalar
 from ..mechanics import (
     LinearizedConstraints,
-    MotionEquations,
-    energies,
-    errors,
     linearize_constraints,
     motion_equations,
     parts,
-    project_position,
-    project_velocity,
-    rates,
 )
 from ._event_driven import (
     Contact,
@@ -52,32 +45,138 @@ class State(NamedTuple):
     `Scene.event_driven`, or None where there are none.
     """
 
-    q: Float[Array, " dof"]
-    qd: Float[Array, " dof"]
+    q: PerDof
+    qd: PerDof
     z: dict[str, PyTree]
 
 
-class Dynamics(NamedTuple):
-    """What happens at one state.
+class ConstraintReaction(NamedTuple):
+    """What a constraint does; along a run with a leading axis of time.
 
+    - `multiplier`: multipliers, shape `[m]`.
+    - `generalised`: generalised force `J^T lambda`, shape `[dof]` [N or N m].
+    - `force`: Cartesian force [N] on the constrained point, of the shape of its position; None where the constraint has
+      no `at`.
+    """
+
+    multiplier: Float[Array, "*time m"]
+    generalised: Float[Array, "*time dof"]
+    force: Any
+
+
+class Dynamics(NamedTuple):
+    """What happens at one state, see `forward_dynamics`.
+
+    - `t`, `y`, `mode`: time, state and modes.
     - `scene`: with its signals and laws as they are at this state.
-    - `equations`: the equations of motion.
     - `actions`: of every effect, by name.
     - `qdd`: accelerations.
     - `contact`: the friction elements that depend on accelerations, or None.
     - `constraints`, `multipliers`: of all constraints, or None.
-    - `validity_margins`: what has to be positive for the equations to hold: of each constraint that can only push its
-      multiplier, then the margin of uniqueness of the loads; None where there is nothing of this.
+    - `validity_margins`: what has to be positive for the equations to hold, in the order of `Scene.checks`: of each
+      constraint that can only push its multiplier, then the margin of uniqueness of the loads; None for nothing.
     """
 
+    t: Scalar
+    y: State
+    mode: Modes
     scene: Scene
-    equations: MotionEquations
     actions: dict[str, Action]
-    qdd: Float[Array, " dof"]
+    qdd: PerDof
     contact: Contact | None
     constraints: LinearizedConstraints | None
     multipliers: Float[Array, " m"] | None
     validity_margins: Float[Array, " checks"] | None
+
+    @property
+    def rate(self) -> State:
+        """Rate of the state; NaN where the equations do not hold."""
+        return self._valid_rate(self.qdd)
+
+    @property
+    def canonical_rate(self) -> State:
+        """Rates of coordinates and momenta: `p' = dL/dq + Q + J^T lambda`, in the place of qd."""
+        push = jax.grad(self.scene.lagrangian, argnums=1)(self.t, self.y.q, self.y.qd, self.scene.params)
+        for action in self.actions.values():
+            push = push + action.generalised
+        if self.constraints is not None and self.multipliers is not None:
+            push = push + self.constraints.force(self.multipliers)
+        return self._valid_rate(push)
+
+    def _valid_rate(self, rate: PerDof) -> State:
+        if self.validity_margins is not None:
+            rate = jnp.where(jnp.all(self.validity_margins > 0), rate, jnp.nan)
+        return State(self.y.qd, rate, {name: self.actions[name].rate for name in self.y.z})
+
+    @property
+    def forces(self) -> dict[str, Array]:
+        """Force of each effect in its own terms, by name."""
+        return {name: self.actions[name].force for name in self.scene.names}
+
+    @property
+    def reactions(self) -> dict[str, ConstraintReaction]:
+        """What each constraint does, by name."""
+        if self.constraints is None or self.multipliers is None:
+            return {}
+        scene, t, y = self.scene, self.t, self.y
+        multipliers = by_constraint(scene, t, y, self.multipliers)
+        rows = by_constraint(scene, t, y, self.constraints.rows)
+        return {
+            name: ConstraintReaction(
+                multipliers[name],
+                jnp.sum(rows[name] * multipliers[name][:, None], axis=0),
+                each.force(t, y.q, scene.params, multipliers[name]),
+            )
+            for name, each in zip(scene.constraint_names, scene.constraints, strict=True)
+        }
+
+    @property
+    def power(self) -> dict[str, Power]:
+        """Power [W] from outside into the mechanism and its effects, and absorbed by friction: of each by its name.
+
+        Besides, under the name of a constraint what its motion in time supplies, and under `lagrangian` what a
+        Lagrangian does that depends on time by itself, `-dL/dt`; not there where it does not.
+        """
+        scene, y = self.scene, self.y
+        powers = {
+            name: effect.power(self.t, y.q, y.qd, scene.params, self.actions[name])
+            for name, effect in zip(scene.names, scene.effects, strict=True)
+        }
+        for name, reaction in self.reactions.items():
+            powers[name] = Power(jnp.sum(reaction.generalised * y.qd))
+
+        def lagrangian(t: Array) -> Array:
+            return scene.lagrangian(t, y.q, y.qd, scene.params)
+
+        if depends_on(lagrangian, self.t):
+            powers["lagrangian"] = Power(-jax.grad(lagrangian)(self.t))
+        return powers
+
+    def guards(
+        self, rest: Scalar, tolerances: tuple[Array, Array]
+    ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
+        """Guards that are positive while the modes hold, and their tolerances; see `contact_guards`."""
+        return contact_guards(self.contacts, self.mode, rest, tolerances)
+
+    def switch(self, fired: Bool[Array, " guards"]) -> tuple[State, Float[Array, " n"]]:
+        """State and modes after the guards that `fired`."""
+        new = next_modes(self.contacts, self.mode, (self.mode == 0) | fired, fired & (self.mode == 0))
+        return self.stick(new), new
+
+    def stick(self, mode: Modes) -> State:
+        """State with the slip velocity of elements that stick in `mode`, which drifts, set to zero."""
+        return self.y._replace(qd=stop_slip(self.contacts, self.y.qd, mode == 0))
+
+    @property
+    def stick_violation(self) -> Float[Array, " n"]:
+        """By how much the force of each sticking element exceeds its limit, in limits; 0 in slip."""
+        return stick_violation(self.contacts, self.mode)
+
+    @property
+    def contacts(self) -> Contact:
+        """`contact` of a scene that has it."""
+        assert self.contact is not None
+        return self.contact
 
 
 class Mobility(NamedTuple):
@@ -86,7 +185,7 @@ class Mobility(NamedTuple):
     mass: Float[Array, "dof dof"]
     constraints: LinearizedConstraints | None
 
-    def accelerate(self, force: Float[Array, " dof"]) -> Float[Array, " dof"]:
+    def accelerate(self, force: PerDof) -> PerDof:
         """Accelerations under the generalised force `force`."""
         free = solve_positive_definite(self.mass, force)
         return (
@@ -95,7 +194,7 @@ class Mobility(NamedTuple):
             else free + self.constraints.apply_force(self.constraints.multipliers(free))
         )
 
-    def respond(self, force: Float[Array, " dof"]) -> Float[Array, " dof"]:
+    def respond(self, force: PerDof) -> PerDof:
         """Change of the accelerations with the generalised force."""
         free = solve_positive_definite(self.mass, force)
         return (
@@ -104,14 +203,14 @@ class Mobility(NamedTuple):
             else free + self.constraints.apply_force(self.constraints.multiplier_response(free))
         )
 
-    def least(self, row: Float[Array, " dof"]) -> Float[Array, ""]:
+    def least(self, row: PerDof) -> Scalar:
         """Mobility [1/kg] along a direction that rounding can tell from none, where constraints take it away."""
         eps = float(jnp.finfo(row.dtype).eps)
         return _ROUNDING * eps * jnp.sum(row * solve_positive_definite(self.mass, row))
 
 
-def forward_dynamics(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -> Dynamics:
-    """Solve for the accelerations, and for the forces that depend on them."""
+def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> Dynamics:
+    """Solve for the accelerations, and for the forces that depend on them, in the modes `mode`."""
     q, qd = y.q, y.qd
     scene = scene.bind_state(t, q, qd)
     params = scene.params
@@ -142,7 +241,7 @@ def forward_dynamics(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -
         qdd = qdd + linearized.apply_force(multipliers)
     if not (scene.event_driven or scene.reaction_loaded):
         margins = _margins(scene, t, y, multipliers, None)
-        return Dynamics(scene, equations, actions, qdd, None, linearized, multipliers, margins)
+        return Dynamics(t, y, mode, scene, actions, qdd, None, linearized, multipliers, margins)
 
     units = {name: each.force_per_load(t, q, qd, y.z.get(name), params) for name, each in scene.reaction_loaded.items()}
     pushes = [-each.apply_force(q, units[name][0], params) for name, each in scene.reaction_loaded.items()]
@@ -165,7 +264,7 @@ def forward_dynamics(scene: Scene, t: Float[Array, ""], y: State, mode: Modes) -
             solve_positive_definite(equations.mass, jnp.asarray(taken))
         )
     margins = _margins(scene, t, y, multipliers, settled.margin)
-    return Dynamics(scene, equations, actions, qdd, contacts, linearized, multipliers, margins)
+    return Dynamics(t, y, mode, scene, actions, qdd, contacts, linearized, multipliers, margins)
 
 
 def _loads(
@@ -207,189 +306,23 @@ def _margins(scene: Scene, t: Array, y: State, multipliers: Any, unique: Array |
     return jnp.stack(margins) if margins else None
 
 
-class ConstraintReaction(NamedTuple):
-    """What a constraint does; along a run with a leading axis of time.
-
-    - `multiplier`: multipliers, shape `[m]`.
-    - `generalised`: generalised force `J^T lambda`, shape `[dof]` [N or N m].
-    - `force`: Cartesian force [N] on the constrained point, of the shape of its position; None where the constraint has
-      no `at`.
-    """
-
-    multiplier: Float[Array, "*time m"]
-    generalised: Float[Array, "*time dof"]
-    force: Any
+def vector_field(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> State:
+    """Right-hand side of `y' = field(t, y)`; NaN where the equations do not hold, see `Dynamics.validity_margins`."""
+    return forward_dynamics(t, y, scene, mode).rate
 
 
-def vector_field(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> State:
-    """Right-hand side of `y' = field(t, y)`; NaN where the equations do not hold, see `scene_validity_margins`."""
-    dynamics = forward_dynamics(scene, t, y, mode)
-    qdd = dynamics.qdd
-    if dynamics.validity_margins is not None:
-        qdd = jnp.where(jnp.all(dynamics.validity_margins > 0), qdd, jnp.nan)
-    return State(y.qd, qdd, {name: dynamics.actions[name].rate for name in y.z})
-
-
-def scene_canonical(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> State:
-    """Rates of coordinates and momenta at the state `y`: `p' = dL/dq + Q + J^T lambda`, in the place of qd."""
-    dynamics = forward_dynamics(scene, t, y, mode)
-    scene = dynamics.scene
-    push = jax.grad(scene.lagrangian, argnums=1)(t, y.q, y.qd, scene.params)
-    for action in dynamics.actions.values():
-        push = push + action.generalised
-    if dynamics.constraints is not None and dynamics.multipliers is not None:
-        push = push + dynamics.constraints.force(dynamics.multipliers)
-    if dynamics.validity_margins is not None:
-        push = jnp.where(jnp.all(dynamics.validity_margins > 0), push, jnp.nan)
-    return State(y.qd, push, {name: dynamics.actions[name].rate for name in y.z})
-
-
-def scene_guards(
-    t: Float[Array, ""], y: State, scene: Scene, mode: Modes, rest: Float[Array, ""], tolerances: tuple[Array, Array]
-) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
-    """Guards that are positive while the modes hold, and their tolerances; see `contact_guards`."""
-    return contact_guards(_contact(t, y, scene, mode), mode, rest, tolerances)
-
-
-def scene_switch(
-    t: Float[Array, ""], y: State, scene: Scene, mode: Modes, fired: Bool[Array, " guards"]
-) -> tuple[State, Float[Array, " n"]]:
-    """State and modes after the guards that `fired`."""
-    contacts = _contact(t, y, scene, mode)
-    new = next_modes(contacts, mode, (mode == 0) | fired, fired & (mode == 0))
-    return y._replace(qd=stop_slip(contacts, y.qd, new == 0)), new
-
-
-def scene_modes(
-    t: Float[Array, ""], y: State, scene: Scene, rest: Float[Array, ""]
-) -> tuple[State, Float[Array, " n"]]:
+def scene_modes(t: Scalar, y: State, scene: Scene, rest: Scalar) -> tuple[State, Float[Array, " n"]]:
     """State and modes to begin with: elements with no more slip velocity than `rest` or rounding stick if they can."""
     none = jnp.zeros(len(scene.event_driven), y.q.dtype)
-    dynamics = forward_dynamics(scene, t, y, none)
-    scene, contacts = dynamics.scene, _contact_of(dynamics)
+    dynamics = forward_dynamics(t, y, scene, none)
+    scene, contacts = dynamics.scene, dynamics.contacts
     elements = [*scene.event_driven.values()]
     speed = jnp.stack([jnp.sum(jnp.abs(e.direction(y.q, scene.params) * y.qd)) + jnp.abs(e.belt(t)) for e in elements])
     rounding = 8.0 * float(jnp.finfo(y.q.dtype).eps) * jax.lax.stop_gradient(speed)
     v = contacts.v[: len(elements)]
     still = jnp.abs(v) <= jnp.maximum(rounding, rest)
     mode = next_modes(contacts, jnp.sign(v), still, jnp.zeros_like(still))
-    return y._replace(qd=stop_slip(contacts, y.qd, mode == 0)), mode
-
-
-def scene_stick_violation(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Float[Array, " n"]:
-    """By how much the force of each sticking element exceeds its limit, in limits; 0 in slip."""
-    return stick_violation(_contact(t, y, scene, mode), mode)
-
-
-def scene_stick(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> State:
-    """State with the slip velocity of sticking elements, which drifts with the error of integration, set to zero."""
-    return y._replace(qd=stop_slip(_contact(t, y, scene, mode), y.qd, mode == 0))
-
-
-def scene_drifts(scene: Scene) -> bool:
-    """Whether stick drifts with the error of integration: not where it holds one coordinate at a constant speed."""
-    return any(each.along is not None or callable(each.belt_velocity) for each in scene.event_driven.values())
-
-
-def scene_energies(t: Float[Array, ""], y: State, scene: Scene) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Kinetic and potential energy [J] of the Lagrangian; the scene is that of time `t`."""
-    return energies(scene.lagrangian, t, y.q, y.qd, scene.params)
-
-
-def scene_mass(t: Float[Array, ""], y: State, scene: Scene) -> Float[Array, "dof dof"]:
-    """Mass matrix [kg for lengths, kg m^2 for angles]; the scene is that of time `t`."""
-    return motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass
-
-
-def scene_project(t: Float[Array, ""], y: State, scene: Scene) -> State:
-    """State moved onto the constraints: the coordinates, then the velocities there; the scene is that of time `t`."""
-    mass = motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass
-    q = project_position(scene.constraints, t, y.q, scene.params, mass)
-    return y._replace(q=q, qd=project_velocity(scene.constraints, t, q, y.qd, scene.params, mass))
-
-
-def scene_constraint_residual(t: Float[Array, ""], y: State, scene: Scene) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """How far coordinates and velocities are from the constraints, relative to their own size or to one.
-
-    Each error is divided by the length of its gradient, which makes it a distance from its own surface: constraints
-    that contradict each other show, too. The scene is that of time `t`.
-    """
-    y = jax.lax.stop_gradient(y)
-
-    def far(fn: Callable[[Array], Array], x: Array) -> Array:
-        error, rows = fn(x), jax.jacrev(fn)(x)
-        slope = safe_norm(rows, axis=1)
-        distance = jnp.abs(error) / jnp.where(slope > 0, slope, 1.0)
-        return jnp.max(distance, initial=0.0) / jnp.maximum(1.0, jnp.max(jnp.abs(x)))
-
-    position, velocity = errors(scene.constraints, t, scene.params), rates(scene.constraints, t, y.q, scene.params)
-    return far(position, y.q), far(velocity, y.qd)
-
-
-def scene_validity_margins(
-    t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None
-) -> Float[Array, " checks"] | None:
-    """What has to be positive for the equations to hold, in the order of `Scene.checks`; None for nothing."""
-    return forward_dynamics(scene, t, y, mode).validity_margins
-
-
-def scene_reactions(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> dict[str, ConstraintReaction]:
-    """What each constraint does, by name."""
-    return _reactions(t, y, forward_dynamics(scene, t, y, mode))
-
-
-def _reactions(t: Float[Array, ""], y: State, dynamics: Dynamics) -> dict[str, ConstraintReaction]:
-    scene = dynamics.scene
-    if dynamics.constraints is None or dynamics.multipliers is None:
-        return {}
-    multipliers = by_constraint(scene, t, y, dynamics.multipliers)
-    rows = by_constraint(scene, t, y, dynamics.constraints.rows)
-    return {
-        name: ConstraintReaction(
-            multipliers[name],
-            jnp.sum(rows[name] * multipliers[name][:, None], axis=0),
-            each.force(t, y.q, scene.params, multipliers[name]),
-        )
-        for name, each in zip(scene.constraint_names, scene.constraints, strict=True)
-    }
-
-
-def _contact(t: Float[Array, ""], y: State, scene: Scene, mode: Modes) -> Contact:
-    return _contact_of(forward_dynamics(scene, t, y, mode))
-
-
-def _contact_of(dynamics: Dynamics) -> Contact:
-    assert dynamics.contact is not None
-    return dynamics.contact
-
-
-def scene_forces(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> dict[str, Array]:
-    """Force of each effect in its own terms, by name."""
-    actions = forward_dynamics(scene, t, y, mode).actions
-    return {name: actions[name].force for name in scene.names}
-
-
-def scene_power(t: Float[Array, ""], y: State, scene: Scene, mode: Modes = None) -> dict[str, Power]:
-    """Power [W] from outside into the mechanism and its effects, and absorbed by friction: of each effect by its name.
-
-    Besides, under the name of a constraint what its motion in time supplies, and under `lagrangian` what a Lagrangian
-    does that depends on time by itself, `-dL/dt`; not there where it does not.
-    """
-    dynamics = forward_dynamics(scene, t, y, mode)
-    scene = dynamics.scene
-    powers = {
-        name: effect.power(t, y.q, y.qd, scene.params, dynamics.actions[name])
-        for name, effect in zip(scene.names, scene.effects, strict=True)
-    }
-    for name, reaction in _reactions(t, y, dynamics).items():
-        powers[name] = Power(jnp.sum(reaction.generalised * y.qd))
-
-    def lagrangian(t: Array) -> Array:
-        return scene.lagrangian(t, y.q, y.qd, scene.params)
-
-    if depends_on(lagrangian, t):
-        powers["lagrangian"] = Power(-jax.grad(lagrangian)(t))
-    return powers
+    return dynamics.stick(mode), mode
 
 
 def check_scene(scene: Scene, y: State) -> None:

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._core.lu import factor_lu
 from .._core.semidefinite import solve_semidefinite
+from .._core.shapes import PerDof, Scalar
 from .forces._friction import Friction
 
 # Rounding units in the load of a sticking element, of its limits.
@@ -77,20 +78,20 @@ class FrictionForces(NamedTuple):
     force: Float[Array, " n"]
     upper: Float[Array, " n"]
     lower: Float[Array, " n"]
-    margin: Float[Array, ""]
+    margin: Scalar
 
 
 def contact(
     elements: list[Friction],
-    leaning: list[Float[Array, " dof"]],
+    leaning: list[PerDof],
     respond: Callable[[Array], Array],
     floor: Callable[[Array], Array] | None,
     loads: Callable[[Float[Array, "n dof"]], Loads | None],
-    t: Float[Array, ""],
-    q: Float[Array, " dof"],
-    qd: Float[Array, " dof"],
+    t: Scalar,
+    q: PerDof,
+    qd: PerDof,
     params: object,
-    qdd: Float[Array, " dof"],
+    qdd: PerDof,
 ) -> Contact:
     """What the elements see at one state, where the accelerations without them are `qdd`.
 
@@ -166,7 +167,7 @@ def solve_friction_forces(contacts: Contact, mode: Float[Array, " modes"]) -> Fr
 
 def _loads(
     normal: Float[Array, " k"], gain: Float[Array, "k k"], pulls: Float[Array, " k"]
-) -> tuple[Float[Array, " k"], Float[Array, ""]]:
+) -> tuple[Float[Array, " k"], Scalar]:
     """Solve `n + gain load(n) = normal` with `load(n) = n` for n > 0 and `pulls n` otherwise; returns loads and margin.
 
     The margin is the smallest determinant of `I + gain S` over all slopes S. The determinant is linear in each slope,
@@ -213,7 +214,7 @@ def _multipliers(contacts: Contact, drive: Float[Array, " n"], sticks: Bool[Arra
 
 
 def contact_guards(
-    contacts: Contact, mode: Float[Array, " modes"], rest: Float[Array, ""], tolerances: tuple[Array, Array]
+    contacts: Contact, mode: Float[Array, " modes"], rest: Scalar, tolerances: tuple[Array, Array]
 ) -> tuple[Float[Array, " modes"], Float[Array, " modes"]]:
     """One guard for each element with a mode, positive while its mode holds, and by how much each may be wrong.
 
@@ -284,7 +285,7 @@ def next_modes(
     return settle(jnp.asarray(3), mode) if n == 1 else jax.lax.fori_loop(0, 4 * n, settle, mode)
 
 
-def stop_slip(contacts: Contact, qd: Float[Array, " dof"], sticks: Bool[Array, " modes"]) -> Float[Array, " dof"]:
+def stop_slip(contacts: Contact, qd: PerDof, sticks: Bool[Array, " modes"]) -> PerDof:
     """Velocities with the slip of the sticking elements taken away, by the smallest impulses that do."""
     sticks = jnp.concatenate([sticks, jnp.zeros(contacts.v.shape[0] - sticks.shape[0], bool)])
     impulse = _multipliers(contacts, jnp.where(sticks, contacts.v, 0.0), sticks)

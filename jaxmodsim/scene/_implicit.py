@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._core.monotone import solve_monotone
+from .._core.shapes import Scalar
 from ..friction import Sign
 from ..mechanics import linearize_constraints, motion_equations
 from ._dynamics import Mobility, State
@@ -25,12 +26,12 @@ class _StepElement(NamedTuple):
     """
 
     effect: Friction
-    load: Float[Array, ""] | None
+    load: Scalar | None
     rows: Float[Array, "components dof"]
     belt: Float[Array, " components"]
     planar: bool
 
-    def end(self, v: Float[Array, " components"], z: PyTree, h: Float[Array, ""]) -> tuple[Array, PyTree]:
+    def end(self, v: Float[Array, " components"], z: PyTree, h: Scalar) -> tuple[Array, PyTree]:
         """Force and state at the end of the step at the slip velocity `v` there."""
         force, z = self.effect.step_exact(v if self.planar else v[0], z, h, self.load)
         return jnp.atleast_1d(force), z
@@ -65,7 +66,7 @@ def check_step(scene: Scene) -> None:
             )
 
 
-def scene_step(scene: Scene, t0: Float[Array, ""], t1: Float[Array, ""], y: State) -> tuple[State, Bool[Array, ""]]:
+def scene_step(scene: Scene, t0: Scalar, t1: Scalar, y: State) -> tuple[State, Bool[Array, ""]]:
     """State at `t1` after one step from `y` at `t0`, of order 1, and whether its equations were solved.
 
     Masses, directions, loads and all forces but friction are those at t0. Friction is that of the slip velocity and the

@@ -4,8 +4,9 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, PyTree
 
+from .._core.shapes import PerDof, Scalar
 from ..friction import AbstractKarnoppLaw
 from .forces._effect import Action
 from .forces._friction import Friction
@@ -19,10 +20,10 @@ def karnopp_forces(
     slipping: dict[str, Action],
     accelerate: Callable[[Array], Array],
     respond: Callable[[Array], Array],
-    rhs: Float[Array, " dof"],
-    t: Float[Array, ""],
-    q: Float[Array, " dof"],
-    qd: Float[Array, " dof"],
+    rhs: PerDof,
+    t: Scalar,
+    q: PerDof,
+    qd: PerDof,
     params: PyTree,
 ) -> dict[str, Action]:
     """What keeps the slip velocity constant, within the limits of stick.

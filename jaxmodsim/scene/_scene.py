@@ -7,10 +7,11 @@ from typing import Any
 
 import equinox as eqx
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, PyTree
 
 from .._core.functions import as_function
 from .._core.parameters import as_real
+from .._core.shapes import PerDof, Scalar
 from ..mechanics import AbstractConstraint, Lagrangian
 from ._signal import Signal, signals_at, signals_from, signals_of
 from .forces._effect import AbstractEffect
@@ -35,7 +36,6 @@ class _Driven(eqx.Module):
 
     def __call__(self, t: Any, q: Any, qd: Any, params: PyTree) -> Any:
         """The Lagrangian with its own parameters as they are at `t`."""
-        del params
         return self.lagrangian(t, q, qd, signals_at(self.params, t))
 
 
@@ -163,6 +163,11 @@ class Scene(eqx.Module):
         }
 
     @property
+    def stick_drifts(self) -> bool:
+        """Whether stick drifts with the error of integration: not where it holds one coordinate at a constant speed."""
+        return any(each.along is not None or callable(each.belt_velocity) for each in self.event_driven.values())
+
+    @property
     def reaction_loaded(self) -> dict[str, Friction]:
         """The other friction elements whose load is the reaction of a constraint, by name."""
         return {
@@ -179,7 +184,7 @@ class Scene(eqx.Module):
 
     @property
     def checks(self) -> tuple[str, ...]:
-        """What may end the equations of motion, in words, in the order of `Resolved.margins`."""
+        """What may end the equations of motion, in words, in the order of `Dynamics.validity_margins`."""
         words = [
             f"The constraint {name!r} can only push, and would have to pull: the contact opens. The motion from there"
             " on is that of a scene without it."
@@ -194,7 +199,7 @@ class Scene(eqx.Module):
             )
         return tuple(words)
 
-    def bind_time(self, t: Float[Array, ""]) -> "Scene":
+    def bind_time(self, t: Scalar) -> "Scene":
         """The scene with the numbers of its signals at time `t`; itself where it has none."""
         if not signals_of(self.params):
             return self
@@ -202,7 +207,7 @@ class Scene(eqx.Module):
         lagrangian = _Driven(self.lagrangian, driven) if signals_of(driven) else self.lagrangian
         return self._with(lagrangian=lagrangian, params=signals_at(driven, t))
 
-    def step_from(self, t: Float[Array, ""]) -> "Scene":
+    def step_from(self, t: Scalar) -> "Scene":
         """The scene for a step from `t` up to the next sample: signals are what they are there, without jumps."""
         return self._with(params=signals_from(self.params, t)) if signals_of(self.params) else self
 
@@ -212,7 +217,7 @@ class Scene(eqx.Module):
             object.__setattr__(scene, field.name, parts.get(field.name, getattr(self, field.name)))
         return scene
 
-    def bind_state(self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"]) -> "Scene":
+    def bind_state(self, t: Scalar, q: PerDof, qd: PerDof) -> "Scene":
         """The scene with its signals and laws as they are at this state; itself where nothing depends on that."""
         if (scene := self.bind_time(t)) is not self:
             return scene.bind_state(t, q, qd)
@@ -223,7 +228,7 @@ class Scene(eqx.Module):
             return self
         return eqx.tree_at(lambda scene: scene.effects, self, effects)
 
-    def initial_state(self, q: Float[Array, " dof"]) -> dict[str, PyTree]:
+    def initial_state(self, q: PerDof) -> dict[str, PyTree]:
         """Own state of each effect that has one, at rest, by effect name."""
         params = self.bind_time(q[0]).params  # only shapes matter
         states = {name: effect.initial_state(q, params) for name, effect in zip(self.names, self.effects, strict=True)}

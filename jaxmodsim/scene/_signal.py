@@ -7,10 +7,12 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from .._core.arguments import as_flag
 from .._core.parameters import as_vector
+from .._core.shapes import Scalar
+from .._core.sorted_times import after, entry
 
 
 class Signal(eqx.Module):
@@ -62,18 +64,18 @@ class Signal(eqx.Module):
                 f" ({bad.size} such of {t.size}). Leave such samples out."
             )
 
-    def piece(self, t: Float[Array, ""]) -> "Piece":
+    def piece(self, t: Scalar) -> "Piece":
         """What the signal is from the last sample at or before `t` on, up to the next one."""
         times = jax.lax.stop_gradient(self.t)
         last = times.shape[0] - 1
         i = after(times, t) - 1
         here = jnp.maximum(i, 0)
-        start, value = _entry(times, here), _entry(self.values, here)
+        start, value = entry(times, here), entry(self.values, here)
         if not self.linear:
             return Piece(self, value, None, None)
         there = jnp.minimum(i + 1, last)
-        length = _entry(times, there) - start
-        slope = (_entry(self.values, there) - value) / jnp.where(length > 0, length, 1.0).astype(value.dtype)
+        length = entry(times, there) - start
+        slope = (entry(self.values, there) - value) / jnp.where(length > 0, length, 1.0).astype(value.dtype)
         return Piece(self, value, slope, start)
 
 
@@ -81,30 +83,15 @@ class Piece(eqx.Module):
     """A signal between two of its samples: a number, or a straight line that goes on beyond them."""
 
     signal: Signal
-    value: Float[Array, ""]
-    slope: Float[Array, ""] | None
-    start: Float[Array, ""] | None
+    value: Scalar
+    slope: Scalar | None
+    start: Scalar | None
 
-    def at(self, t: Float[Array, ""]) -> Float[Array, ""]:
+    def at(self, t: Scalar) -> Scalar:
         """Value at `t`."""
         if self.slope is None or self.start is None:
             return self.value
         return self.value + self.slope * (t - self.start).astype(self.value.dtype)
-
-
-def after(times: Float[Array, " n"], t: Float[Array, ""]) -> Int[Array, ""]:
-    """Number of the increasing `times` that are not after `t`: the index of the first one that is."""
-    # Unrolled: a loop inside the loop of a run would keep XLA from fusing a step.
-    return jnp.searchsorted(times, t.astype(times.dtype), side="right", method="scan_unrolled")
-
-
-def is_one_of(times: Float[Array, " n"], t: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether `t` is one of the increasing `times`."""
-    return _entry(times, jnp.maximum(after(times, t) - 1, 0)) == t
-
-
-def _entry(x: Array, i: Int[Array, ""]) -> Array:
-    return jax.lax.dynamic_index_in_dim(x, i, keepdims=False)
 
 
 def _is_signal(x: Any) -> bool:
@@ -116,7 +103,7 @@ def signals_of(tree: Any) -> list[Any]:
     return [x for x in jax.tree.leaves(tree, is_leaf=_is_signal) if _is_signal(x)]
 
 
-def signals_at(tree: Any, t: Float[Array, ""], *, held: bool = True, linear: bool = True) -> Any:
+def signals_at(tree: Any, t: Scalar, *, held: bool = True, linear: bool = True) -> Any:
     """`tree` with the number at `t` in the place of each signal that is held, or linear."""
 
     def value(x: Any) -> Any:
@@ -130,7 +117,7 @@ def signals_at(tree: Any, t: Float[Array, ""], *, held: bool = True, linear: boo
     return jax.tree.map(value, tree, is_leaf=_is_signal)
 
 
-def signals_from(tree: Any, t: Float[Array, ""]) -> Any:
+def signals_from(tree: Any, t: Scalar) -> Any:
     """`tree` with the piece that each signal begins or is in at `t`, for a step from there."""
     return jax.tree.map(lambda x: x.piece(t) if isinstance(x, Signal) else x, tree, is_leaf=_is_signal)
 

@@ -1,6 +1,5 @@
 """Runs of scenes."""
 
-from ._accuracy import Accuracy as Accuracy
 from ._consistent import consistent as consistent
 from ._evaluations import evaluations_per_step as evaluations_per_step
 from ._observe import named_series as named_series

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..scene import Power, Scene, State, scene_energies
+from ..mechanics import energies
+from ..scene import Power, Scene, State
 from ..solvers import EventLog
 from ._outcome import SUCCESS, SimulationError, outcome_messages
 from ._run_request import is_known
@@ -18,7 +19,7 @@ class EnergyLedger(NamedTuple):
 
     - `kinetic`, `potential`: of the Lagrangian.
     - `stored`: in the own state of each effect that has one, by name.
-    - `supplied`: brought in since t0, by the names of `scene_power`.
+    - `supplied`: brought in since t0, by the names of `Dynamics.power`.
     - `dissipated`: lost since t0 in each effect that absorbs power, by name: what it absorbed, less what its own state
       has gained.
     - `before`: kinetic, potential and stored energy of the state that was given at t0, shape `[]`.
@@ -68,7 +69,7 @@ def _ledger(inputs: RunInputs, t: Array, y: State, work: dict[str, Power]) -> En
     scene = inputs.scene
 
     def parts(t: Array, y: State) -> tuple[Array, Array, dict[str, Array]]:
-        return *scene_energies(t, y, scene.bind_time(t)), _stored(scene, y)
+        return *_mechanical(t, y, scene), _stored(scene, y)
 
     first = initial_state(inputs)
     kinetic, potential, stored = jax.vmap(parts)(t, y)
@@ -118,6 +119,12 @@ def _stored(scene: Scene, y: State) -> dict[str, Array]:
     }
 
 
+def _mechanical(t: Array, y: State, scene: Scene) -> tuple[Array, Array]:
+    """Kinetic and potential energy of the Lagrangian."""
+    scene = scene.bind_time(t)
+    return energies(scene.lagrangian, t, y.q, y.qd, scene.params)
+
+
 def _energy(scene: Scene, t: Array, y: State) -> Array:
-    kinetic, potential = scene_energies(t, y, scene.bind_time(t))
+    kinetic, potential = _mechanical(t, y, scene)
     return kinetic + potential + sum(_stored(scene, y).values())

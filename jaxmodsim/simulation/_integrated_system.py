@@ -10,19 +10,14 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
-from ..mechanics import momentum, velocity
+from ..mechanics import momentum, motion_equations, velocity
+from ..mechanics import project as projected
 from ..scene import (
     Power,
     Scene,
     State,
-    scene_canonical,
-    scene_guards,
-    scene_power,
-    scene_project,
+    forward_dynamics,
     scene_step,
-    scene_stick,
-    scene_switch,
-    vector_field,
 )
 from ..solvers import EventState
 
@@ -42,7 +37,14 @@ def at_time(fn: _Function) -> _Function:
     return cast(_Function, bound)
 
 
-# Energy [J] that went through a scene since t0, by the names of `scene_power`: supplied from outside, and absorbed.
+def project(t: Float[Array, ""], y: State, scene: Scene) -> State:
+    """State moved onto the constraints; the scene is that of time `t`."""
+    mass = motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass
+    q, qd = projected(scene.constraints, t, y.q, y.qd, scene.params, mass)
+    return y._replace(q=q, qd=qd)
+
+
+# Energy [J] that went through a scene since t0, by the names of `Dynamics.power`: supplied from outside, and absorbed.
 Work: TypeAlias = dict[str, Power]
 
 
@@ -72,7 +74,7 @@ class IntegratedSystem(NamedTuple):
         y = self._inner(t, state, scene)
         if not self.audited:
             return y
-        return AugmentedState(y, jtu.tree_map(jnp.zeros_like, scene_power(t, state, scene, mode)))
+        return AugmentedState(y, jtu.tree_map(jnp.zeros_like, forward_dynamics(t, state, scene, mode).power))
 
     def state(self, t: Array, y: PyTree, scene: Scene) -> State:
         """The state in what is integrated."""
@@ -94,17 +96,18 @@ class IntegratedSystem(NamedTuple):
     def derivative(self, t: Array, y: PyTree, scene: Scene, mode: Array | None = None) -> PyTree:
         """Right-hand side."""
         state = self.state(t, y, scene)
-        rate = (scene_canonical if self.canonical else vector_field)(t, state, scene, mode)
-        if not isinstance(y, AugmentedState):
-            return rate
-        return AugmentedState(rate, scene_power(t, state, scene, mode))
+        dynamics = forward_dynamics(t, state, scene, mode)
+        rate = dynamics.canonical_rate if self.canonical else dynamics.rate
+        return AugmentedState(rate, dynamics.power) if isinstance(y, AugmentedState) else rate
 
     def advance(self, t0: Array, t1: Array, y: PyTree, scene: Scene) -> tuple[PyTree, Array]:
         """One step of `ImplicitFriction`, and whether it was solved; work is done at the powers at its end."""
         state, solved = scene_step(scene, t0, t1, self.state(t0, y, scene))
         if not self.audited:
             return state, solved
-        work = jtu.tree_map(lambda work, power: work + (t1 - t0) * power, y.work, scene_power(t1, state, scene))
+        work = jtu.tree_map(
+            lambda work, power: work + (t1 - t0) * power, y.work, forward_dynamics(t1, state, scene).power
+        )
         return AugmentedState(state, work), solved
 
     def _inner(self, t: Array, state: State, scene: Scene) -> State:
@@ -116,7 +119,7 @@ class IntegratedSystem(NamedTuple):
 # A step of a scene with events or constraints evaluates large fields a dozen times. Traced as one function each, they
 # are traced, linearised and transposed once.
 _derivative = partial(jax.jit, static_argnums=0)(at_time(IntegratedSystem.derivative))
-_guards = jax.jit(scene_guards)
+_guards = jax.jit(lambda t, y, scene, mode, *limits: forward_dynamics(t, y, scene, mode).guards(*limits))
 
 
 class RunFunctions(eqx.Module):
@@ -147,7 +150,7 @@ class RunFunctions(eqx.Module):
     @at_time
     def reset(self, t: Array, s: EventState, scene: Scene, fired: Array) -> EventState:
         """Change of modes; the state as it is where none changes."""
-        state, mode = scene_switch(t, self.system.state(t, s.y, scene), scene, s.mode, fired)
+        state, mode = forward_dynamics(t, self.system.state(t, s.y, scene), scene, s.mode).switch(fired)
         after = self.system.replace(t, s.y, state, scene)
         changed = jnp.any(mode != s.mode)
         return s._replace(y=jtu.tree_map(lambda a, b: jnp.where(changed, a, b), after, s.y), mode=mode)
@@ -158,7 +161,7 @@ class RunFunctions(eqx.Module):
         return self._stick(t, s._replace(mode=jnp.where(fired, 0.0, s.mode)), scene)
 
     def _stick(self, t: Array, s: EventState, scene: Scene) -> EventState:
-        state = scene_stick(t, self.system.state(t, s.y, scene), scene, s.mode)
+        state = forward_dynamics(t, self.system.state(t, s.y, scene), scene, s.mode).stick(s.mode)
         return s._replace(y=self.system.replace(t, s.y, state, scene))
 
     @at_time
@@ -166,7 +169,7 @@ class RunFunctions(eqx.Module):
         """Back onto the constraints."""
         if not self.projects:
             return y
-        return self.system.replace(t, y, scene_project(t, self.system.state(t, y, scene), scene), scene)
+        return self.system.replace(t, y, project(t, self.system.state(t, y, scene), scene), scene)
 
     @at_time
     def project_and_stick(self, t: Array, s: EventState, scene: Scene) -> EventState:

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float, Int
 from .._core.cholesky import cholesky_pivots
 from .._core.parameters import check_ranges, modules_of, range_checks
 from ..friction import Regularized
-from ..mechanics import quadratic
-from ..scene import Scene, State, scene_constraint_residual, scene_mass, scene_validity_margins
+from ..mechanics import constraint_residual, motion_equations, quadratic
+from ..scene import Scene, State, forward_dynamics
 from ..solvers import ACCUMULATION, TOO_MANY
 
 (
@@ -149,10 +149,10 @@ def start_code(
     if canonical:
         code = jnp.where(quadratic(now.lagrangian, t, y.q, y.qd, now.params), code, NOT_QUADRATIC)
     offsets = _offsets(scene, dof)
-    code = _blame_margins(code, scene_validity_margins(t, y, now, mode), offsets.checks, True)
+    code = _blame_margins(code, forward_dynamics(t, y, now, mode).validity_margins, offsets.checks, True)
     code = _blame_mass(code, _pivots(now, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
     if scene.constraints:
-        off, turned = scene_constraint_residual(t, y, now)
+        off, turned = constraint_residual(scene.constraints, t, y.q, y.qd, now.params)
         code = jnp.where((off <= _CONSISTENT) & (turned <= _CONSISTENT), code, INCONSISTENT)
     widths = [module.width for _, module in modules_of(scene) if isinstance(module, Regularized)]
     if atol is not None and widths:
@@ -191,10 +191,11 @@ def end_code(
     if scene.checks:
         # The run ends in front of the place where the equations cease to hold: look a little further.
         beyond = y._replace(q=y.q + ahead * y.qd, qd=y.qd + ahead * rate.qd)
-        code = _blame_margins(code, scene_validity_margins(t + ahead, beyond, scene, mode), offsets.checks, early)
-        code = _blame_margins(code, scene_validity_margins(t, y, scene, mode), offsets.checks, early)
+        for t_look, y_look in ((t + ahead, beyond), (t, y)):
+            margins = forward_dynamics(t_look, y_look, scene, mode).validity_margins
+            code = _blame_margins(code, margins, offsets.checks, early)
     if scene.constraints:
-        kept = scene_constraint_residual(t, y, now)[0] <= _KEPT
+        kept = constraint_residual(scene.constraints, t, y.q, y.qd, now.params)[0] <= _KEPT
         code = jnp.where(kept | ~finite, code, DRIFTED)
     eps = float(jnp.finfo(y.q.dtype).eps)
     # A run that stopped in front of a singular mass matrix cannot have come closer than its smallest step.
@@ -214,8 +215,12 @@ def _blame_margins(code: Int[Array, ""], margins: Array | None, first: int, know
     return jnp.where(jnp.any(bad) & known, first + last, code)
 
 
+def _mass(scene: Scene, t: Float[Array, ""], y: State) -> Float[Array, "dof dof"]:
+    return motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass
+
+
 def _pivots(scene: Scene, t: Float[Array, ""], y: State) -> Float[Array, " dof"]:
-    return cholesky_pivots(scene_mass(t, y, scene))
+    return cholesky_pivots(_mass(scene, t, y))
 
 
 def _blame_mass(
@@ -232,7 +237,7 @@ def describe_failure(scene: Scene, t: float, y: State, code: int) -> str:
     text = outcome_messages(scene, dof)[code]
     if FIRST_MASS <= code < FIRST_MASS + dof:
         time = jnp.asarray(t, y.q.dtype)
-        mass = np.asarray(scene_mass(time, y, scene.bind_time(time)))
+        mass = np.asarray(_mass(scene.bind_time(time), time, y))
         text += f" Mass matrix {np.array2string(mass, precision=4)}"
         if np.all(np.isfinite(mass)):
             values, vectors = np.linalg.eigh(mass)

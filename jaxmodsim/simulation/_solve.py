@@ -15,11 +15,9 @@ from ..scene import (
     Scene,
     State,
     check_scene,
+    forward_dynamics,
     sample_times,
-    scene_drifts,
     scene_modes,
-    scene_project,
-    scene_stick_violation,
     signals_of,
     vector_field,
 )
@@ -38,7 +36,7 @@ from ..solvers import (
     first_step,
     unchecked,
 )
-from ._integrated_system import IntegratedSystem, RunFunctions, Work
+from ._integrated_system import IntegratedSystem, RunFunctions, Work, project
 from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, end_code, start_code
 
 # Part of the absolute tolerance below which a slip velocity counts as none.
@@ -219,14 +217,14 @@ def _prepared(inputs: RunInputs, options: RunOptions, audited: bool) -> tuple[St
     projects, rest = bool(scene.constraints) and options.project, _REST * inputs.atol
     mode = None
     if projects:
-        initial = scene_project(t0, initial, scene.bind_time(t0))
+        initial = project(t0, initial, scene.bind_time(t0))
     if scene.event_driven:
         initial, mode = scene_modes(t0, initial, scene, rest)
     canonical = isinstance(options.solver, Gauss)
     atol = None if inputs.dt is not None else inputs.atol
     start = start_code(scene, t0, given, vector_field(t0, initial, scene, mode), mode, atol, canonical)
     start = jnp.where(_well_posed(inputs), start, ILL_POSED)
-    sticks = bool(scene.event_driven) and scene_drifts(scene)
+    sticks = scene.stick_drifts
     return (
         initial,
         mode,
@@ -319,7 +317,7 @@ def _kept(inputs: RunInputs, starts: Array, t: Array, kept: PyTree) -> tuple[Arr
         return t, y, modes, jnp.asarray(False)
 
     def beyond(t: Array, y: State, mode: Array) -> Array:
-        return jnp.any(scene_stick_violation(t, y, scene, mode) > _OVERLOAD) & jnp.isfinite(t)
+        return jnp.any(forward_dynamics(t, y, scene, mode).stick_violation > _OVERLOAD) & jnp.isfinite(t)
 
     states = y if isinstance(y, State) else y[0]
     return t, y, modes, jnp.any(jax.vmap(beyond)(*jax.lax.stop_gradient((t, states, modes))))

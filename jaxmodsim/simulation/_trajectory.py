@@ -14,7 +14,7 @@ from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..mechanics import momentum
-from ..scene import ConstraintReaction, Scene, State, scene_forces, scene_reactions
+from ..scene import ConstraintReaction, Scene, State, forward_dynamics
 from ..solvers import EventLog
 from ._accuracy import Accuracy
 from ._energy_ledger import EnergyLedger, event_losses, ledger
@@ -237,12 +237,12 @@ def trajectory(inputs: RunInputs, options: RunOptions, solved: RunOutput) -> Tra
 
 @jax.jit
 def _forces(scene: Scene, t: Array, y: State, mode: Array | None) -> dict[str, Array]:
-    return _reached(t, jax.vmap(lambda t, y, mode: scene_forces(t, y, scene, mode))(t, y, mode))
+    return _reached(t, jax.vmap(lambda t, y, mode: forward_dynamics(t, y, scene, mode).forces)(t, y, mode))
 
 
 @jax.jit
 def _reactions(scene: Scene, t: Array, y: State, mode: Array | None) -> dict[str, ConstraintReaction]:
-    return _reached(t, jax.vmap(lambda t, y, mode: scene_reactions(t, y, scene, mode))(t, y, mode))
+    return _reached(t, jax.vmap(lambda t, y, mode: forward_dynamics(t, y, scene, mode).reactions)(t, y, mode))
 
 
 @jax.jit
@@ -258,7 +258,10 @@ def _momentum(scene: Scene, t: Array, q: Array, qd: Array) -> Array:
 def _event_forces(scene: Scene, log: EventLog) -> dict[str, Array]:
     happened = jnp.isfinite(log.t)
     t = jnp.where(happened, log.t, 0.0)
-    sides = [jax.vmap(lambda t, y, mode: scene_forces(t, y, scene, mode))(t, *side) for side in (log.before, log.after)]
+    sides = [
+        jax.vmap(lambda t, y, mode: forward_dynamics(t, y, scene, mode).forces)(t, *side)
+        for side in (log.before, log.after)
+    ]
     both = jtu.tree_map(lambda *each: jnp.stack(each, axis=1), *sides)
     return jtu.tree_map(lambda x: jnp.where(jnp.expand_dims(happened, range(1, x.ndim)), x, jnp.nan), both)
 

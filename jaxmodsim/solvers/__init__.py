@@ -1,8 +1,5 @@
 """Plug-ins for diffrax."""
 
-from ._collocation import GAUSS as GAUSS
-from ._collocation import collocation_start as collocation_start
-from ._collocation import collocation_step as collocation_step
 from ._controllers import FiniteSteps as FiniteSteps
 from ._controllers import StepsTo as StepsTo
 from ._first_step import first_step as first_step
@@ -14,7 +11,6 @@ from ._rodas5p import Rodas5P as Rodas5P
 from ._rosenbrock import RosenbrockTableau as RosenbrockTableau
 from ._rosenbrock import rosenbrock_step as rosenbrock_step
 from ._stored_steps import StoredSteps as StoredSteps
-from ._unchecked import calls_back as calls_back
 from ._unchecked import unchecked as unchecked
 from .events._controller import EventController as EventController
 from .events._samples import SampledJumps as SampledJumps

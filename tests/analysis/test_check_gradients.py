@@ -47,7 +47,7 @@ def ramp(t: Any, q: Any, qd: Any, p: Any) -> Any:
 
 def lugre_box() -> jms.Scene:
     """Mass and ramp in one array, LuGre, no events, in single precision."""
-    effects = (jms.AppliedForce(ramp), jms.Friction(problems.box_lugre()))
+    effects = (jms.AppliedForce(ramp), jms.Friction(problems.ramped_box.lugre()))
     scene = jms.Scene(box_energy, params={"box": jnp.array([2.0, 1.0])}, effects=effects)
     return jax.tree.map(lambda x: x.astype(jnp.float32), scene)
 
@@ -67,7 +67,7 @@ def test_stick_slip_agrees_with_differences_and_closed_form() -> None:
     assert check.dtype == "float64"
 
     def closed(numbers: dict[str, Any]) -> Any:
-        return problems.braked_spring_motion(jnp.asarray(3.5), **numbers)[0]
+        return problems.braked_spring.motion(jnp.asarray(3.5), **numbers)[0]
 
     truth = jax.grad(closed)({name: value for name, value in BRAKED.items() if name != "A"})
     for name, value in {name: float(x) for name, x in truth.items()}.items():

@@ -20,7 +20,7 @@ from jaxmodsim import (
     simulate,
 )
 from jaxmodsim.mechanics import energies, momentum
-from jaxmodsim.scene import State, scene_power, vector_field
+from jaxmodsim.scene import State, forward_dynamics, vector_field
 
 from ..helpers.mechanisms import CASES, case
 
@@ -38,7 +38,7 @@ def unaccounted(scene: Scene, t: Any, y: State, mode: Any) -> tuple[Any, Any]:
             return sum(energies(scene.lagrangian, t, q, qd, scene.params))
 
         change = jax.jvp(energy, (t, y.q, y.qd), (jnp.ones_like(t), rate.q, rate.qd))[1]
-        powers = scene_power(t, y, scene, mode).values()
+        powers = forward_dynamics(t, y, scene, mode).power.values()
         supplied, absorbed = [x.supplied for x in powers], [x.absorbed for x in powers if x.absorbed is not None]
         size = sum(jnp.abs(each) for each in (*supplied, *absorbed))
         parts = jax.jvp(lambda qd: energies(scene.lagrangian, t, y.q, qd, scene.params), (y.qd,), (rate.qd,))[1]
@@ -67,15 +67,15 @@ def random_states(dof: int, count: int = 20) -> tuple[Any, Any]:
 
 
 OTHERS: dict[str, tuple[Any, int, Any]] = {
-    "spherical pendulum": (problems.spherical_pendulum, 2, None),
-    "double pendulum": (problems.double_pendulum, 2, None),
-    "three links": (lambda: problems.n_link_pendulum(3, m=jnp.array([1.0, 0.5, 2.0])), 3, None),
-    "box": (lambda: problems.ramped_box(problems.box_coulomb()), 1, [1.0]),
-    "box with LuGre": (lambda: problems.ramped_box(LuGre(**LUGRE)), 1, None),
-    "braked spring": (problems.braked_spring, 1, [1.0]),
-    "belt oscillator": (problems.belt_oscillator, 1, [-1.0]),
-    "coupled belts": (problems.coupled_belts, 2, [0.0, 1.0]),
-    "stick-slip pendulum": (problems.stick_slip_pendulum, 1, [1.0]),
+    "spherical pendulum": (problems.spherical_pendulum.scene, 2, None),
+    "double pendulum": (problems.n_link_pendulum.double_pendulum, 2, None),
+    "three links": (lambda: problems.n_link_pendulum.scene(3, m=jnp.array([1.0, 0.5, 2.0])), 3, None),
+    "box": (lambda: problems.ramped_box.scene(problems.ramped_box.coulomb()), 1, [1.0]),
+    "box with LuGre": (lambda: problems.ramped_box.scene(LuGre(**LUGRE)), 1, None),
+    "braked spring": (problems.braked_spring.scene, 1, [1.0]),
+    "belt oscillator": (problems.belt_oscillator.scene, 1, [-1.0]),
+    "coupled belts": (problems.coupled_belts.scene, 2, [0.0, 1.0]),
+    "stick-slip pendulum": (problems.stick_slip_pendulum.scene, 1, [1.0]),
 }
 
 
@@ -106,13 +106,13 @@ def test_a_wrong_power_would_show() -> None:
 def test_audit_of_a_run_with_events() -> None:
     """Belt oscillator from sticking: what the belt brings in is lost in slip, effect by effect."""
     run = simulate(
-        problems.belt_oscillator(), [0.05], [0.1], 2.0, ts=jnp.linspace(0.0, 2.0, 401), rtol=1e-9, atol=1e-12
+        problems.belt_oscillator.scene(), [0.05], [0.1], 2.0, ts=jnp.linspace(0.0, 2.0, 401), rtol=1e-9, atol=1e-12
     )
     audit = energy_audit(run)
     np.testing.assert_allclose(audit.closing_error, 0.0, atol=1e-7)
     np.testing.assert_allclose(audit.closing_error, run.energy.balance, atol=1e-11)
     # All that comes in comes from the belt: force times its velocity, by trapezoids across the jumps of the force.
-    work = -np.trapezoid(run.forces["friction"] * problems.BELT_OSCILLATOR["belt"], run.t)
+    work = -np.trapezoid(run.forces["friction"] * problems.belt_oscillator.PARAMS["belt"], run.t)
     np.testing.assert_allclose(audit.work["friction"][-1], work, rtol=5e-3)
     assert float(audit.dissipated["friction"][-1]) > 0.1
     assert np.all(np.diff(audit.dissipated["friction"]) >= -1e-9)
@@ -146,16 +146,16 @@ def test_bristles_store_what_they_have_not_lost() -> None:
 
 
 def test_cyclic_coordinates() -> None:
-    assert cyclic_coordinates(problems.spherical_pendulum(), 2) == (1,)
-    assert cyclic_coordinates(problems.cart_pole(), 2) == (0,)
-    assert cyclic_coordinates(problems.double_pendulum(), 2) == ()
+    assert cyclic_coordinates(problems.spherical_pendulum.scene(), 2) == (1,)
+    assert cyclic_coordinates(problems.cart_pole.scene(), 2) == (0,)
+    assert cyclic_coordinates(problems.n_link_pendulum.double_pendulum(), 2) == ()
     assert cyclic_coordinates(Scene(lambda t, q, qd, p: 0.5 * jnp.sum(qd**2)), 3) == (0, 1, 2)
     with pytest.raises(ValueError, match=r"cannot run inside jax\.jit"):
-        jax.jit(lambda scene: jnp.asarray(cyclic_coordinates(scene, 2)))(problems.spherical_pendulum())
+        jax.jit(lambda scene: jnp.asarray(cyclic_coordinates(scene, 2)))(problems.spherical_pendulum.scene())
 
 
 def test_the_momentum_of_a_cyclic_coordinate_is_kept() -> None:
-    scene = problems.spherical_pendulum()
+    scene = problems.spherical_pendulum.scene()
     run = simulate(scene, [2.0, 0.0], [0.3, 1.1], 10.0, ts=jnp.linspace(0.0, 10.0, 11), rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(run.momentum[:, 1], np.sin(2.0) ** 2 * 1.1, rtol=1e-9)
     p = momentum(scene.lagrangian, jnp.array(0.0), run.q[3], run.qd[3], scene.params)

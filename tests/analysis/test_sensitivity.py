@@ -36,10 +36,10 @@ BENCH = jms.Scene(free, params={"m": 2.0}, effects=(ramp, jms.Friction(LUGRE)))
 @optimized()
 def test_resting_place_and_time_of_a_braked_spring(mode: Any) -> None:
     """Through all reversals, against the derivatives of the closed form."""
-    rest = problems.braked_spring_rest(**SPRING)
-    slopes = jax.jacrev(lambda n: problems.braked_spring_rest(**n)[1:])({n: jnp.asarray(x) for n, x in SPRING.items()})
+    rest = problems.braked_spring.rest(**SPRING)
+    slopes = jax.jacrev(lambda n: problems.braked_spring.rest(**n)[1:])({n: jnp.asarray(x) for n, x in SPRING.items()})
     last = int(rest.half_cycles) - 1
-    scene = problems.braked_spring(jms.Coulomb(SPRING["Fc"], SPRING["Fs"]), m=SPRING["m"], k=SPRING["k"])
+    scene = problems.braked_spring.scene(jms.Coulomb(SPRING["Fc"], SPRING["Fs"]), m=SPRING["m"], k=SPRING["k"])
     found = jms.sensitivity(
         scene,
         lambda run: jnp.stack([run.events.t[last], run.q[-1, 0]]),

@@ -13,7 +13,7 @@ import pytest
 import jaxmodsim as jms
 from jaxmodsim.analysis import Row, WorkPrecision, load_work_precision
 from jaxmodsim.plot import work_precision_figure
-from jaxmodsim.problems import belt_stribeck, braked_spring, named_problems, ramped_box
+from jaxmodsim.problems import belt_oscillator, braked_spring, named_problems, ramped_box
 
 CASE = named_problems()["braked_spring"]()
 LOOSE, TIGHT = 1e-4, 1e-7
@@ -39,7 +39,7 @@ def found() -> WorkPrecision:
         "wide": jms.Method(jms.Rodas5P(), smooth[0]),
         "narrow": jms.Method(jms.Rodas5P(), smooth[1]),
         # Explicit Euler is unstable with the longer step, beyond all numbers.
-        "Euler": jms.Method(dfx.Euler(), braked_spring(jms.Viscous(1e3)), steps=(0.1, 1e-3)),
+        "Euler": jms.Method(dfx.Euler(), braked_spring.scene(jms.Viscous(1e3)), steps=(0.1, 1e-3)),
     }
     return jms.work_precision(**CASE.arguments, methods=methods, tolerances=(LOOSE, TIGHT), rounds=1, max_steps=3000)
 
@@ -157,7 +157,7 @@ def test_gradients_against_a_closed_form() -> None:
     m, k, x0, t1 = 1.3, 2.7, 1.0, 3.0
     w = np.sqrt(k / m)
     found = jms.work_precision(
-        braked_spring(m=m, k=k),
+        braked_spring.scene(m=m, k=k),
         [x0],
         [0.0],
         t1,
@@ -180,7 +180,7 @@ def test_gradients_against_a_closed_form() -> None:
 
 def test_over_time_and_by_a_function() -> None:
     """Velocity of the box without friction, v = t^2/4, at several times; a reference of another motion is refused."""
-    scene, ts = ramped_box(), np.linspace(0.0, 2.0, 5)
+    scene, ts = ramped_box.scene(), np.linspace(0.0, 2.0, 5)
     methods = {"Tsit5": jms.Method(), "single": jms.Method(dtype="float32")}
     choices: dict[str, Any] = {"ts": ts, "methods": methods, "tolerances": (1e-5,), "rounds": 1}
 
@@ -214,7 +214,7 @@ def test_formulations() -> None:
         effects=(
             jms.Friction(jms.Coulomb(1.0, 1.5), along=lambda q: q[0], name="one"),
             jms.Friction(jms.Viscous(0.3), along=lambda q: q[0], name="two"),
-            jms.Friction(belt_stribeck(), along=lambda q: q[1], belt_velocity=0.2, name="three"),
+            jms.Friction(belt_oscillator.stribeck(), along=lambda q: q[1], belt_velocity=0.2, name="three"),
         ),
     )
     found = jms.formulations(scene, width=1e-3, sigma0=1e5, sigma1=3.0)
@@ -229,7 +229,7 @@ def test_formulations() -> None:
     assert set(jms.formulations(scene, width=1e-3)) == {"Regularized", "DeadZone"}
     with pytest.raises(ValueError, match="Gaussian Stribeck"):
         jms.formulations(
-            jms.Scene(scene.lagrangian, effects=(jms.Friction(belt_stribeck(1.0)),)), width=1.0, sigma0=1.0
+            jms.Scene(scene.lagrangian, effects=(jms.Friction(belt_oscillator.stribeck(1.0)),)), width=1.0, sigma0=1.0
         )
     with pytest.raises(ValueError, match="No law of this scene is set-valued"):
         jms.formulations(found["LuGre"], width=1e-3)

@@ -11,7 +11,7 @@ from jaxmodsim.cli._demo import START, TRUTH, synthetic_record
 from jaxmodsim.friction import LuGre
 from jaxmodsim.identify import fit
 from jaxmodsim.plot import fit_figure, ramp_figure, truth_figure
-from jaxmodsim.problems import driven_spring
+from jaxmodsim.problems import braked_spring
 from jaxmodsim.validation.testbench import ramp_cases, run_ramp, stick_sweep
 
 
@@ -71,7 +71,7 @@ def test_larger_sigma1_damps_the_oscillation_in_stick():
 
 def test_demo_fit_covers_the_truth_and_figures_have_labelled_axes(measured):
     names = tuple(f"friction.{name}" for name in TRUTH)
-    result = fit(driven_spring(LuGre(**START)), synthetic_record(), names, q0=[0.0])
+    result = fit(braked_spring.driven_spring(LuGre(**START)), synthetic_record(), names, q0=[0.0])
     for name, true in TRUTH.items():
         # Beyond four standard errors one draw in 16 000.
         assert abs(result.values[f"friction.{name}"] - true) < 4 * result.errors[f"friction.{name}"]

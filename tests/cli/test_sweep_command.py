@@ -93,7 +93,7 @@ def test_a_problem_is_run_as_sweep_runs_it(run_command: Command, spec: Callable[
     np.testing.assert_array_equal(found["friction.Fc"], [4.0, 5.0, 6.0])
     law = jms.Regularized(jms.Coulomb(6.0, 8.0), 1e-2)
     ts = np.linspace(0.0, 0.5, 11)
-    run = jms.simulate(belt_oscillator(law, m=1.0, k=120.0, c=2.0), [0.05], [0.1], 0.5, ts=ts, rtol=1e-7)
+    run = jms.simulate(belt_oscillator.scene(law, m=1.0, k=120.0, c=2.0), [0.05], [0.1], 0.5, ts=ts, rtol=1e-7)
     one = found.isel({"pair": 2, "qd0[0]": 1})
     np.testing.assert_allclose(one["x"], run.q[:, 0], rtol=1e-10)
     np.testing.assert_allclose(one["end"], run.qd[-1, 0], rtol=1e-10)

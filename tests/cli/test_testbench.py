@@ -17,7 +17,7 @@ TS = np.linspace(0.0, 10.0, 1001)
 
 def run(law: Any, ramp: float = 1.0, v0: float = 0.0, t1: float = 10.0, **arguments: Any) -> jms.Trajectory:
     times = jnp.asarray(TS[: round(t1 / STEP) + 1])
-    return jms.simulate(problems.ramped_box(law, ramp=ramp), [0.0], [v0], t1, ts=times, **arguments)
+    return jms.simulate(problems.ramped_box.scene(law, ramp=ramp), [0.0], [v0], t1, ts=times, **arguments)
 
 
 def fixed(law: Any, **arguments: Any) -> jms.Trajectory:
@@ -36,9 +36,9 @@ def crossings(v: Any) -> np.ndarray:
 
 @pytest.mark.quick
 def test_lugre_ends_where_four_solvers_agree() -> None:
-    end = run(problems.box_lugre(), rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(end.qd[-1, 0], problems.BOX_LUGRE_V10, rtol=1e-6)
-    np.testing.assert_allclose(end.z["friction"][-1], problems.BOX_LUGRE_Z10, rtol=1e-6)
+    end = run(problems.ramped_box.lugre(), rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(end.qd[-1, 0], problems.ramped_box.LUGRE_V10, rtol=1e-6)
+    np.testing.assert_allclose(end.z["friction"][-1], problems.ramped_box.LUGRE_Z10, rtol=1e-6)
 
 
 def stick_oscillation(**changes: float) -> tuple[float, float, int, float]:
@@ -48,7 +48,7 @@ def stick_oscillation(**changes: float) -> tuple[float, float, int, float]:
     Quasi-static creep is 1/(sigma0 (1 - t/Fs)), as the bristle yields the more the further it is loaded. A swing
     begins with the force amplitude sqrt(m/sigma0), 0.052 N on the box.
     """
-    motion = run(problems.box_lugre(**changes), rtol=1e-8, atol=1e-12)
+    motion = run(problems.ramped_box.lugre(**changes), rtol=1e-8, atol=1e-12)
     error = (np.asarray(motion.forces["friction"]) - TS) ** 2
     creep = 1.0 / (changes.get("sigma0", 750.0) * (1.0 - TS[:101] / 1.75))
     overtakes = len(crossings(np.asarray(motion.qd[:101, 0]) - creep))
@@ -76,7 +76,7 @@ def test_stick_oscillations_of_lugre_are_damped_by_a_smaller_sigma0() -> None:
 
 # (a) Coulomb by sign(v)
 
-COULOMB = problems.box_coulomb()
+COULOMB = problems.ramped_box.coulomb()
 
 
 def test_sign_stops_an_adaptive_run() -> None:
@@ -146,7 +146,7 @@ def test_small_dead_zone_brings_the_chatter_back() -> None:
 
 # (d) Stiction, Stribeck and viscous friction
 
-STRIBECK = problems.box_stribeck()
+STRIBECK = problems.ramped_box.stribeck()
 
 
 @pytest.mark.parametrize("law", [jms.DeadZone(STRIBECK, 1e-2), jms.Regularized(STRIBECK, 1e-5)], ids=["held", "smooth"])
@@ -176,12 +176,19 @@ def test_stiction_holds_then_drops_then_rises(law: Any) -> None:
 
 def test_bristle_under_constant_slip_follows_its_closed_form() -> None:
     ts = jnp.linspace(0.0, 1.0, 11)
-    law = problems.box_lugre()
+    law = problems.ramped_box.lugre()
     for v, z0 in ((0.01, 0.0), (-0.03, 1e-3)):
         motion = jms.simulate(
-            problems.slipping_bristle(law, v), [0.0], [0.0], 1.0, ts=ts, z0={"friction": z0}, rtol=1e-10, atol=1e-14
+            problems.slipping_bristle.scene(law, v),
+            [0.0],
+            [0.0],
+            1.0,
+            ts=ts,
+            z0={"friction": z0},
+            rtol=1e-10,
+            atol=1e-14,
         )
-        exact = problems.slipping_bristle_deflection(ts, law, v, z0=z0)
+        exact = problems.slipping_bristle.deflection(ts, law, v, z0=z0)
         np.testing.assert_allclose(motion.z["friction"], exact, rtol=1e-8)
         stepped = jax.vmap(lambda t, v=v, z0=z0: law.step_exact(jnp.asarray(v), jnp.asarray(z0), t))(ts)
         np.testing.assert_allclose(stepped, exact, rtol=1e-13)
@@ -190,10 +197,12 @@ def test_bristle_under_constant_slip_follows_its_closed_form() -> None:
 def test_braked_spring_comes_to_rest_as_coulomb_says() -> None:
     """A smooth law of width w slips at up to w where the exact one rests, and errs by the like on the way."""
     width = 1e-4
-    law = jms.Regularized(jms.Coulomb(problems.BRAKED_SPRING["Fc"]), width)
+    law = jms.Regularized(jms.Coulomb(problems.braked_spring.PARAMS["Fc"]), width)
     ts = jnp.linspace(0.0, 26.0, 53)
-    motion = jms.simulate(problems.braked_spring(law), [1.0], [0.0], 26.0, ts=ts, rtol=1e-8, atol=1e-10)
-    x, v = problems.braked_spring_motion(ts, **{**problems.BRAKED_SPRING, "Fs": problems.BRAKED_SPRING["Fc"]})
+    motion = jms.simulate(problems.braked_spring.scene(law), [1.0], [0.0], 26.0, ts=ts, rtol=1e-8, atol=1e-10)
+    x, v = problems.braked_spring.motion(
+        ts, **{**problems.braked_spring.PARAMS, "Fs": problems.braked_spring.PARAMS["Fc"]}
+    )
     np.testing.assert_allclose(motion.q[:, 0], x, atol=2 * width)
     np.testing.assert_allclose(motion.qd[:, 0], v, atol=2 * width)
 

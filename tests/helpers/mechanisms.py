@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodsim import Scene, problems
-from jaxmodsim.scene import ConstraintReaction, State, scene_reactions, scene_validity_margins, vector_field
+from jaxmodsim.scene import ConstraintReaction, State, forward_dynamics, vector_field
 
 SAMPLES = 50
 # Each side is a sum of a few terms, right to some roundings: compare with the largest around.
@@ -18,12 +18,12 @@ ROUNDING = 1e-12
 PENDULUM = {"m": 0.7, "l": 1.9, "g": 9.7}
 SPIRAL = {"m": 0.7, "R": 1.9, "a": 0.35, "g": 9.7}
 MU = 0.2
-DISC = dict(problems.ROLLING_DISC)
-ROD = {**problems.ROD_ON_ROUGH_FLOOR, "mu": 0.5}
+DISC = dict(problems.rolling_disc.PARAMS)
+ROD = {**problems.rod_on_rough_floor.PARAMS, "mu": 0.5}
 FOUCAULT = {"m": 2.0, "l": 1.3, "g": 9.7, "Omega": 0.4, "latitude": 0.8}
-PARTICLE = dict(problems.CHARGED_PARTICLE)
-CART = {**problems.CART_POLE, "force": 1.7}
-CRANK = {**problems.SLIDER_CRANK, "torque": 2.3}
+PARTICLE = dict(problems.charged_particle.PARAMS)
+CART = {**problems.cart_pole.PARAMS, "force": 1.7}
+CRANK = {**problems.slider_crank.PARAMS, "torque": 2.3}
 
 
 class Case(NamedTuple):
@@ -53,23 +53,23 @@ def but(numbers: dict[str, Any], *left_out: str) -> dict[str, Any]:
 
 
 def cart_pole() -> Case:
-    closed = lambda q, qd: problems.cart_pole_acceleration(q, qd, **CART)  # noqa: E731
-    return Case(problems.cart_pole(**CART), draw(-4, 4, 2), draw(-5, 5, 2, seed=6), closed)
+    closed = lambda q, qd: problems.cart_pole.acceleration(q, qd, **CART)  # noqa: E731
+    return Case(problems.cart_pole.scene(**CART), draw(-4, 4, 2), draw(-5, 5, 2, seed=6), closed)
 
 
 def spiral_bead(**further: float) -> Case:
     numbers = {**SPIRAL, **further}
     q, qd = draw(-9, 9, 1), draw(-9, 9, 1, seed=6)
-    closed = lambda q, qd: problems.spiral_bead_acceleration(q, qd, **numbers)  # noqa: E731
-    return Case(problems.spiral_bead(**numbers), q, qd, closed, jnp.sign(qd) if "mu" in further else None)
+    closed = lambda q, qd: problems.spiral_bead.acceleration(q, qd, **numbers)  # noqa: E731
+    return Case(problems.spiral_bead.scene(**numbers), q, qd, closed, jnp.sign(qd) if "mu" in further else None)
 
 
 def cartesian_pendulum() -> Case:
     f, w = draw(-4, 4), draw(-5, 5, seed=6)
     q = PENDULUM["l"] * jnp.stack([jnp.sin(f), -jnp.cos(f)], axis=1)
     qd = PENDULUM["l"] * jnp.stack([w * jnp.cos(f), w * jnp.sin(f)], axis=1)
-    closed = lambda q, qd: problems.cartesian_pendulum_acceleration(q, qd, **but(PENDULUM, "m"))  # noqa: E731
-    return Case(problems.cartesian_pendulum(**PENDULUM), q, qd, closed)
+    closed = lambda q, qd: problems.cartesian_pendulum.acceleration(q, qd, **but(PENDULUM, "m"))  # noqa: E731
+    return Case(problems.cartesian_pendulum.scene(**PENDULUM), q, qd, closed)
 
 
 def on_the_sphere(angles: Any) -> Any:
@@ -82,8 +82,8 @@ ANGLES, ANGLE_RATES = draw(-4, 4, 2), draw(-5, 5, 2, seed=6)
 
 def cartesian_spherical_pendulum() -> Case:
     q, qd = jax.vmap(lambda a, w: jax.jvp(on_the_sphere, (a,), (w,)))(ANGLES, ANGLE_RATES)
-    closed = lambda q, qd: problems.cartesian_pendulum_acceleration(q, qd, **but(PENDULUM, "m"))  # noqa: E731
-    return Case(problems.cartesian_spherical_pendulum(**PENDULUM), q, qd, closed)
+    closed = lambda q, qd: problems.cartesian_pendulum.acceleration(q, qd, **but(PENDULUM, "m"))  # noqa: E731
+    return Case(problems.cartesian_pendulum.cartesian_spherical_pendulum(**PENDULUM), q, qd, closed)
 
 
 # Fast enough for the guide to hold the slider down at times.
@@ -91,32 +91,32 @@ CRANK_ANGLE, CRANK_RATE = draw(-4, 4), draw(-30, 30, seed=6)
 
 
 def slider_crank(mu: float | None = None) -> Case:
-    q, qd = jax.vmap(problems.slider_crank_state)(CRANK_ANGLE, CRANK_RATE)
+    q, qd = jax.vmap(problems.slider_crank.state)(CRANK_ANGLE, CRANK_RATE)
     numbers = CRANK if mu is None else {**CRANK, "mu": mu}
 
     def closed(q: Any, qd: Any) -> Any:
-        return problems.slider_crank_forces(q[0], qd[0], **numbers).qdd
+        return problems.slider_crank.forces(q[0], qd[0], **numbers).qdd
 
-    return Case(problems.slider_crank(**numbers), q, qd, closed, None if mu is None else jnp.sign(qd[:, 2:3]))
+    return Case(problems.slider_crank.scene(**numbers), q, qd, closed, None if mu is None else jnp.sign(qd[:, 2:3]))
 
 
 def four_bar(crossed: bool = False) -> Case:
-    q, qd = jax.vmap(lambda f, w: problems.four_bar_state(f, w, crossed=crossed))(CRANK_ANGLE, CRANK_RATE)
-    closed = lambda q, qd: problems.four_bar_acceleration(q[0], qd[0], crossed=crossed)  # noqa: E731
-    return Case(problems.four_bar(), q, qd, closed)
+    q, qd = jax.vmap(lambda f, w: problems.four_bar.state(f, w, crossed=crossed))(CRANK_ANGLE, CRANK_RATE)
+    closed = lambda q, qd: problems.four_bar.acceleration(q[0], qd[0], crossed=crossed)  # noqa: E731
+    return Case(problems.four_bar.scene(), q, qd, closed)
 
 
 def rolling_disc() -> Case:
     q = draw(-4, 4, 5).at[:, 3].set(draw(-1.2, 1.2, seed=7))
-    qd = jax.vmap(lambda q, w: problems.rolling_disc_velocity(q, w, R=DISC["R"]))(q, draw(-5, 5, 3, seed=6))
-    closed = lambda q, qd: problems.rolling_disc_acceleration(q, qd, **but(DISC, "m"))  # noqa: E731
-    return Case(problems.rolling_disc(**DISC), q, qd, closed)
+    qd = jax.vmap(lambda q, w: problems.rolling_disc.velocity(q, w, R=DISC["R"]))(q, draw(-5, 5, 3, seed=6))
+    closed = lambda q, qd: problems.rolling_disc.acceleration(q, qd, **but(DISC, "m"))  # noqa: E731
+    return Case(problems.rolling_disc.scene(**DISC), q, qd, closed)
 
 
 def knife_edge() -> Case:
     q, u = draw(-4, 4, 3), draw(-5, 5, 2, seed=6)
     qd = jnp.stack([u[:, 0] * jnp.cos(q[:, 2]), u[:, 0] * jnp.sin(q[:, 2]), u[:, 1]], axis=1)
-    return Case(problems.knife_edge(), q, qd, problems.knife_edge_acceleration)
+    return Case(problems.knife_edge.scene(), q, qd, problems.knife_edge.acceleration)
 
 
 # Up to here the floor need not pull: (l/2) f'^2 < g.
@@ -124,22 +124,22 @@ ROD_ANGLE, ROD_RATE, ROD_SLIP = draw(0.1, 3.0), draw(-2.9, 2.9, seed=6), draw(-5
 
 
 def rod_on_rough_floor(mu: float = ROD["mu"]) -> Case:
-    q, qd = jax.vmap(lambda f, w, v: problems.rod_on_rough_floor_state(f, w, v, l=ROD["l"]))(
+    q, qd = jax.vmap(lambda f, w, v: problems.rod_on_rough_floor.state(f, w, v, l=ROD["l"]))(
         ROD_ANGLE, ROD_RATE, ROD_SLIP
     )
     numbers = {**ROD, "mu": mu}
-    closed = lambda q, qd: problems.rod_on_rough_floor_acceleration(q, qd, **numbers)  # noqa: E731
-    return Case(problems.rod_on_rough_floor(**numbers), q, qd, closed, jnp.sign(ROD_SLIP)[:, None])
+    closed = lambda q, qd: problems.rod_on_rough_floor.acceleration(q, qd, **numbers)  # noqa: E731
+    return Case(problems.rod_on_rough_floor.scene(**numbers), q, qd, closed, jnp.sign(ROD_SLIP)[:, None])
 
 
 def foucault_pendulum() -> Case:
-    closed = lambda q, qd: problems.foucault_pendulum_acceleration(q, qd, **but(FOUCAULT, "m"))  # noqa: E731
-    return Case(problems.foucault_pendulum(**FOUCAULT), draw(-4, 4, 2), draw(-5, 5, 2, seed=6), closed)
+    closed = lambda q, qd: problems.foucault_pendulum.acceleration(q, qd, **but(FOUCAULT, "m"))  # noqa: E731
+    return Case(problems.foucault_pendulum.scene(**FOUCAULT), draw(-4, 4, 2), draw(-5, 5, 2, seed=6), closed)
 
 
 def charged_particle() -> Case:
-    closed = lambda q, qd: problems.charged_particle_acceleration(q, qd, **PARTICLE)  # noqa: E731
-    return Case(problems.charged_particle(**PARTICLE), draw(-4, 4, 3), draw(-5, 5, 3, seed=6), closed)
+    closed = lambda q, qd: problems.charged_particle.acceleration(q, qd, **PARTICLE)  # noqa: E731
+    return Case(problems.charged_particle.scene(**PARTICLE), draw(-4, 4, 3), draw(-5, 5, 3, seed=6), closed)
 
 
 CASES: dict[str, Callable[[], Case]] = {
@@ -172,11 +172,11 @@ def case(name: str) -> Case:
 def look(scene: Scene, q: Any, qd: Any, mode: Any) -> Any:
     def one(q: Any, qd: Any, mode: Any) -> Any:
         t, y = jnp.zeros(()), State(q, qd, {})
-        reactions = scene_reactions(t, y, scene, mode) if scene.constraints else {}
+        reactions = forward_dynamics(t, y, scene, mode).reactions if scene.constraints else {}
         return (
             vector_field(t, y, scene, mode).qd,
             reactions,
-            scene_validity_margins(t, y, scene, mode) if scene.checks else None,
+            forward_dynamics(t, y, scene, mode).validity_margins if scene.checks else None,
         )
 
     return jax.vmap(one)(q, qd, mode)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodsim.problems import LinearStickSlip, StickSlipMotion, linear_stick_slip, stick_slip_motion
+from jaxmodsim.problems import linear_stick_slip
 
 MARGIN, SPACING = 1e-4, 1e-4
 # Of the family that comes as near as that by intention.
@@ -24,11 +24,11 @@ TOUCH = 1e-5
 class Member:
     """A system, its start and end, and its motion."""
 
-    system: LinearStickSlip
+    system: linear_stick_slip.LinearStickSlip
     q0: np.ndarray
     qd0: np.ndarray
     t1: float
-    motion: StickSlipMotion
+    motion: linear_stick_slip.StickSlipMotion
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Family:
     def batch(self) -> tuple[Any, jax.Array, jax.Array, jax.Array]:
         """Scenes, initial states and ends, with a leading axis for the members."""
         moving = any(np.any(each.system.belt) for each in self.members)
-        scenes = [linear_stick_slip(each.system, moving=moving) for each in self.members]
+        scenes = [linear_stick_slip.scene(each.system, moving=moving) for each in self.members]
         stacked = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *scenes)
         columns = [[each.q0 for each in self.members], [each.qd0 for each in self.members]]
         q0, qd0 = (jnp.asarray(np.stack(column)) for column in columns)
@@ -54,7 +54,7 @@ class Family:
 
 
 # System, initial coordinates and velocities, end.
-Drawn = tuple[LinearStickSlip, np.ndarray, np.ndarray, float]
+Drawn = tuple[linear_stick_slip.LinearStickSlip, np.ndarray, np.ndarray, float]
 Draw = Callable[[np.random.Generator], Drawn]
 
 
@@ -68,7 +68,7 @@ def system(
     damping: Any = 0.0,
     directions: Any = None,
     belt: Any = None,
-) -> LinearStickSlip:
+) -> linear_stick_slip.LinearStickSlip:
     """A `LinearStickSlip` from what is not zero; `limits` has a row (Fc, Fs) for each element."""
     n, count = len(load), 5 + 4 * len(frequencies)
     full = np.zeros((n, count))
@@ -78,7 +78,9 @@ def system(
     if belt is not None:
         surface[:, : np.shape(belt)[1]] = belt
     M, C, K = (x * np.eye(n) if np.ndim(x) == 0 else np.asarray(x, float) for x in (mass, damping, stiffness))
-    return LinearStickSlip(M, C, K, rows, limits[:, 0], limits[:, 1], np.array(frequencies), full, surface)
+    return linear_stick_slip.LinearStickSlip(
+        M, C, K, rows, limits[:, 0], limits[:, 1], np.array(frequencies), full, surface
+    )
 
 
 def harmonic(amplitude: float, growth: float, phase: float) -> np.ndarray:
@@ -97,7 +99,7 @@ def limit(rng: np.random.Generator, stiction: bool) -> np.ndarray:
     return np.array([Fc, Fc * (rng.uniform(1.05, 1.6) if stiction else 1.0)])
 
 
-def at_rest(drawn: LinearStickSlip, t1: float) -> Drawn:
+def at_rest(drawn: linear_stick_slip.LinearStickSlip, t1: float) -> Drawn:
     return drawn, np.zeros(drawn.size), np.zeros(drawn.size), t1
 
 
@@ -232,7 +234,7 @@ def sampled(linear: bool) -> Draw:
         drawn = replace(drawn, load=load, linear=linear)
         for _ in range(_PAIRS):
             drawn = replace(drawn, sample_times=np.array(times), sample_values=np.array(values))
-            motion = stick_slip_motion(drawn, q0, qd0, t1)
+            motion = linear_stick_slip.motion(drawn, q0, qd0, t1)
             leaves = [
                 (t, after[0])
                 for t, before, after in zip(motion.times, motion.modes[:-1], motion.modes[1:], strict=True)
@@ -258,7 +260,7 @@ def _draw(name: str, one: Draw, seed: int, count: int, margin: float = MARGIN) -
     rng, members, left_out = np.random.default_rng(seed), [], 0
     while len(members) < count:
         drawn, q0, qd0, t1 = one(rng)
-        motion = stick_slip_motion(drawn, q0, qd0, t1)
+        motion = linear_stick_slip.motion(drawn, q0, qd0, t1)
         if motion.margin < margin or motion.spacing < SPACING:
             left_out += 1
         else:

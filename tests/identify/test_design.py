@@ -123,7 +123,7 @@ def test_sensitivities_are_those_of_the_simulated_record(design):
         ends = [driven_motion(_moved(axis, sign * step), t, force)[0] for sign in (1.0, -1.0)]
         slope = np.asarray(ends[0] - ends[1]) / (2e-7 * NOISE)
         np.testing.assert_allclose(columns[:, i], slope, atol=1e-3 * np.max(np.abs(slope)))
-    np.testing.assert_allclose(design.information, columns.T @ columns, rtol=1e-9)
+    np.testing.assert_allclose(design.best.information, columns.T @ columns, rtol=1e-9)
 
 
 def _moved(axis, x):
@@ -164,10 +164,10 @@ def test_goals_of_a_diagonal_matrix():
 
 
 def test_limits_hold_also_in_an_independent_run(design):
-    assert np.max(np.abs(design.force)) <= 40.0
+    assert np.max(np.abs(design.best.force)) <= 40.0
     assert max(design.used.values()) <= 1.0
     assert max(design.used.values()) > 0.98  # a larger motion would tell more
-    held = jnp.asarray(design.force)
+    held = jnp.asarray(design.best.force)
     # Steps of a twentieth of a sample, because one that ends on the next sample's force feels a little of it.
 
     def drive(t, q, qd, p):
@@ -183,7 +183,7 @@ def test_limits_hold_also_in_an_independent_run(design):
     assert np.max(np.abs(q)) <= 0.02
     assert np.max(np.abs(qd)) <= 0.1
     # The force alone keeps the axis on its motion.
-    np.testing.assert_allclose(q, np.interp(ts, design.t, design.q_ref), atol=1e-3)
+    np.testing.assert_allclose(q, np.interp(ts, design.best.t, design.best.q_ref), atol=1e-3)
 
 
 def test_fits_are_as_good_as_predicted_and_better_than_those_of_a_plain_sine(design, fits):
@@ -192,19 +192,21 @@ def test_fits_are_as_good_as_predicted_and_better_than_those_of_a_plain_sine(des
     ratios, better = [], 0
     for name in design.values:
         stated = np.mean([result.errors[name] for result in designed])
-        ratios.append(stated / design.errors[name])
+        ratios.append(stated / design.best.errors[name])
         better += stated < 0.7 * plain.errors[name]
     # A fit reckons its errors from 32 blocks of its residual, of which a few tell nearly all.
     assert np.mean(ratios) == pytest.approx(1.0, rel=0.3)
     assert better >= 4
-    gain = np.linalg.slogdet(design.information)[1] - np.linalg.slogdet(design.plain.information)[1]
+    gain = np.linalg.slogdet(design.best.information)[1] - np.linalg.slogdet(design.plain.information)[1]
     assert gain > 2 * len(design.values) * np.log(1.5)  # errors lower by a third in the geometric mean
 
 
 def test_deviations_of_fits_scatter_as_promised(design, fits):
     # In units of their own promised errors. They cannot be whitened by the information matrix: one error along the
     # direction known worst bends the one known best, ten thousand times sharper, away from its straight line.
-    off = np.array([[(fit.values[n] - value) / design.errors[n] for n, value in design.values.items()] for fit in fits])
+    off = np.array(
+        [[(fit.values[n] - value) / design.best.errors[n] for n, value in design.values.items()] for fit in fits]
+    )
     # 64 deviates, of which about half are independent: a mean square of 1 +- 0.25, three of those are allowed.
     assert np.mean(off[:8] ** 2) == pytest.approx(1.0, abs=0.75)
     assert np.max(np.abs(off[:8])) < 4.5
@@ -224,15 +226,15 @@ def test_the_seed_decides_and_a_prior_adds_what_is_known(design, fits):
     same = design_input(
         box(), MODEL.free, LIMITS, max_steps=1, seed=3, progress=lambda n, goal: seen.append((n, goal)), **OPTIONS
     )
-    assert np.array_equal(first.force, same.force)
+    assert np.array_equal(first.best.force, same.best.force)
     assert [n for n, _ in seen] == [1, 2]
     assert np.isfinite([goal for _, goal in seen]).all()
     assert any("more steps or another seed" in remark for remark in first.remarks)
     again = design_input(box(), MODEL.free, LIMITS, max_steps=1, seed=3, prior=fits[0], **OPTIONS)
     for name in design.values:
-        assert again.errors[name] < fits[0].errors[name]
-    alone = np.sqrt(np.diag(np.linalg.inv(again.information))) * np.abs(list(again.values.values()))
-    assert np.all(np.array(list(again.errors.values())) < alone)
+        assert again.best.errors[name] < fits[0].errors[name]
+    alone = np.sqrt(np.diag(np.linalg.inv(again.best.information))) * np.abs(list(again.values.values()))
+    assert np.all(np.array(list(again.best.errors.values())) < alone)
 
 
 def test_a_prior_is_the_inverse_of_its_covariance(fits):
@@ -257,7 +259,7 @@ def test_ctrl_c_keeps_the_best_so_far(design):
     early = design_input(box(), MODEL.free, LIMITS, max_steps=15, progress=impatient, **OPTIONS)
     assert early.ending == "was interrupted"
     assert max(early.used.values()) <= 1.0
-    assert np.linalg.slogdet(early.information)[1] < np.linalg.slogdet(design.information)[1]
+    assert np.linalg.slogdet(early.best.information)[1] < np.linalg.slogdet(design.best.information)[1]
 
 
 @pytest.mark.usefixtures("hasty")
@@ -265,11 +267,11 @@ def test_what_cannot_be_learned_is_said_and_keeps_the_goal_finite(design):
     # Far below break-away nothing slides, and what is left is a spring; the shapes are those of the other designs.
     tiny = AxisLimits(force=40.0, speed=0.1, travel=1e-6)
     still = design_input(box(), MODEL.free, tiny, max_steps=1, **OPTIONS)
-    assert np.isfinite(still.errors["friction.sigma0"])
+    assert np.isfinite(still.best.errors["friction.sigma0"])
     text = " ".join(still.remarks)
     assert "Within force 40 N, speed 0.1 m/s, travel 1e-06 m, friction.vs is not determined" in text
     assert "What limits it: travel." in text
-    assert still.errors["friction.Fs"] > 1e3 * design.errors["friction.Fs"]
+    assert still.best.errors["friction.Fs"] > 1e3 * design.best.errors["friction.Fs"]
 
 
 def test_csv_holds_the_motion_and_the_force_and_is_whole_or_not_there(design, tmp_path):
@@ -277,7 +279,12 @@ def test_csv_holds_the_motion_and_the_force_and_is_whole_or_not_there(design, tm
     design.to_csv(path)
     assert path.read_text().startswith("t,q_ref,qd_ref,force\n")
     t, q_ref, qd_ref, force = np.loadtxt(path, delimiter=",", skiprows=1).T
-    for column, expected in ((t, design.t), (q_ref, design.q_ref), (qd_ref, design.qd_ref), (force, design.force)):
+    for column, expected in (
+        (t, design.best.t),
+        (q_ref, design.best.q_ref),
+        (qd_ref, design.best.qd_ref),
+        (force, design.best.force),
+    ):
         np.testing.assert_allclose(column, expected, rtol=1e-8, atol=1e-12)
     assert np.max(np.abs(force)) <= 40.0
     (tmp_path / "folder.csv").mkdir()
@@ -292,7 +299,7 @@ def test_the_result_prints_goes_to_json_and_is_drawn(design):
     assert "plain sine" in text
     report = json.loads(json.dumps(design.to_dict(), allow_nan=False))
     assert report["parameters"]["friction.vs"]["unit"] == "m/s"
-    assert report["parameters"]["m"]["standard_error"] == design.errors["m"]
+    assert report["parameters"]["m"]["standard_error"] == design.best.errors["m"]
     figure = design_figure(design, caption="LuGre")
     axes = [axis for part in figure.subfigs for axis in part.axes]
     assert [axis.get_ylabel() for axis in axes[:3]] == ["position [mm]", "velocity [m/s]", "force [N]"]

@@ -19,7 +19,7 @@ from jaxmodsim.identify import (
 from jaxmodsim.identify.estimate._prepare import Settings, prepare
 from jaxmodsim.identify.model._engines import delayed, run_samples
 from jaxmodsim.identify.model._observe import observer
-from jaxmodsim.problems import BELT_STRIBECK, belt_oscillator
+from jaxmodsim.problems import belt_oscillator
 from jaxmodsim.scene import State, replace_numbers
 
 from ..helpers.optimized import optimized
@@ -94,7 +94,7 @@ def full():
 @pytest.fixture(scope="module")
 @optimized()
 def belt():
-    scene = belt_oscillator(jms.Stribeck(**BELT_STRIBECK))
+    scene = belt_oscillator.scene(jms.Stribeck(**belt_oscillator.STRIBECK))
     t = np.linspace(0.0, 3.2, 321)
     run = jms.simulate(scene, [0.0], [0.0], 3.2, ts=t, rtol=1e-9, atol=1e-11)
     events = run.events
@@ -157,7 +157,7 @@ def test_gradient_of_every_objective_equals_finite_differences(name, full):
 
 
 def test_gradient_of_a_fit_through_events_equals_finite_differences(belt):
-    scene = belt_oscillator(jms.Stribeck(**BELT_STRIBECK))
+    scene = belt_oscillator.scene(jms.Stribeck(**belt_oscillator.STRIBECK))
     free = ("friction.Fc", "friction.Fs", "k")
     problem = prepare(scene, belt, free, settings(q0=[0.0])).problem
     x = problem.x0 + jnp.asarray([0.01, -0.02, 0.015])
@@ -168,7 +168,7 @@ def test_gradient_of_a_fit_through_events_equals_finite_differences(belt):
 
 @optimized()
 def test_fit_through_events_finds_back_from_half_wrong(belt):
-    start = belt_oscillator(jms.Stribeck(Fc=2.5, Fs=12.0, vs=0.1, Fv=0.3), k=150.0)
+    start = belt_oscillator.scene(jms.Stribeck(Fc=2.5, Fs=12.0, vs=0.1, Fv=0.3), k=150.0)
     result = jms.fit(start, belt, ("friction.Fc", "friction.Fs", "friction.vs", "k"), q0=[0.0], initializer=Staged())
     assert result.diagnostics.ending == "converged"
     for name, true in {"friction.Fc": 5.0, "friction.Fs": 8.0, "friction.vs": 0.2, "k": 100.0}.items():

@@ -20,7 +20,7 @@ from jaxmodsim import (
     simulate,
 )
 from jaxmodsim.mechanics import acceleration
-from jaxmodsim.scene import State, scene_forces, scene_numbers, vector_field
+from jaxmodsim.scene import State, forward_dynamics, scene_numbers, vector_field
 
 ZERO = jnp.array(0.0)
 
@@ -88,7 +88,9 @@ def test_friction_of_a_bead_acts_along_the_wire_with_the_true_normal_force() -> 
     s = np.hypot(HELIX["R"], HELIX["h"])
     normal = float(BEAD.normal_force(ZERO, q, qd, HELIX))
     np.testing.assert_allclose(effect.slip(ZERO, q, qd, scene.params), 1.7 * s, rtol=1e-14)
-    np.testing.assert_allclose(scene_forces(ZERO, State(q, qd, {}), scene)["friction"], 0.3 * normal, rtol=1e-13)
+    np.testing.assert_allclose(
+        forward_dynamics(ZERO, State(q, qd, {}), scene).forces["friction"], 0.3 * normal, rtol=1e-13
+    )
     exact = -9.7 * HELIX["h"] / s**2 - 0.3 * normal / (HELIX["m"] * s)
     np.testing.assert_allclose(vector_field(ZERO, State(q, qd, {}), scene).qd, [exact], rtol=1e-13)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim.mechanics import AbstractChart
+from jaxmodsim.mechanics._charts import AbstractChart
 
 SAMPLES = 400
 METHODS = {  # name -> how many of q, qd, qdd it takes

@@ -24,7 +24,7 @@ from jaxmodsim import (
     simulate,
 )
 from jaxmodsim._core.semidefinite import solve_semidefinite
-from jaxmodsim.scene import State, scene_forces, scene_reactions, scene_validity_margins, vector_field
+from jaxmodsim.scene import State, forward_dynamics, vector_field
 from jaxmodsim.scene._event_driven import _loads
 
 ZERO = jnp.array(0.0)
@@ -63,7 +63,7 @@ def test_pendulum_in_cartesian_coordinates() -> None:
     state = State(q, qd, {})
     np.testing.assert_allclose(vector_field(ZERO, state, PENDULUM).qd, exact, atol=1e-13)
     tension = 1.3 * (LENGTH * 1.1**2 + G * np.cos(0.7))
-    reaction = scene_reactions(ZERO, state, PENDULUM)["rod"]
+    reaction = forward_dynamics(ZERO, state, PENDULUM).reactions["rod"]
     np.testing.assert_allclose(reaction.force, tension * inwards, rtol=1e-13)
     np.testing.assert_allclose(reaction.generalised, tension * inwards, rtol=1e-13)
     np.testing.assert_allclose(reaction.multiplier, [-tension / (2 * LENGTH)], rtol=1e-13)
@@ -76,9 +76,9 @@ def test_redundant_constraints_share_and_leave_the_motion_as_it_is(copies: int) 
     state = State(q, qd, {})
     one = vector_field(ZERO, state, PENDULUM).qd
     np.testing.assert_allclose(vector_field(ZERO, state, again).qd, one, rtol=1e-12)
-    parts = [each.force for each in scene_reactions(ZERO, state, again).values()]
+    parts = [each.force for each in forward_dynamics(ZERO, state, again).reactions.values()]
     np.testing.assert_allclose(parts[0], parts[-1], rtol=1e-6)
-    np.testing.assert_allclose(sum(parts), scene_reactions(ZERO, state, PENDULUM)["rod"].force, rtol=1e-12)
+    np.testing.assert_allclose(sum(parts), forward_dynamics(ZERO, state, PENDULUM).reactions["rod"].force, rtol=1e-12)
 
 
 def test_smallest_solution_of_a_singular_system() -> None:
@@ -248,10 +248,10 @@ def test_friction_and_its_load_are_solved_together(mu: float, tilt: float) -> No
     """Upright: N = down + tilt F with F = mu N, so N = down/(1 - mu tilt)."""
     scene, state = floor_scene(mu, tilt), State(jnp.zeros(2), jnp.array([1.0, 0.0]), {})
     normal = 4.0 / (1.0 - mu * tilt)
-    np.testing.assert_allclose(scene_reactions(ZERO, state, scene)["floor"].multiplier, [normal], rtol=1e-13)
-    np.testing.assert_allclose(scene_forces(ZERO, state, scene)["friction"], mu * normal, rtol=1e-13)
+    np.testing.assert_allclose(forward_dynamics(ZERO, state, scene).reactions["floor"].multiplier, [normal], rtol=1e-13)
+    np.testing.assert_allclose(forward_dynamics(ZERO, state, scene).forces["friction"], mu * normal, rtol=1e-13)
     np.testing.assert_allclose(vector_field(ZERO, state, scene).qd, [(3.0 - mu * normal) / 2.0, 0.0], atol=1e-13)
-    margins = scene_validity_margins(ZERO, state, scene)
+    margins = forward_dynamics(ZERO, state, scene).validity_margins
     assert margins is not None
     np.testing.assert_allclose(margins, [normal, min(1.0, 1.0 - mu * tilt)], rtol=1e-13)
 

@@ -10,7 +10,7 @@ import pytest
 
 from jaxmodsim import AppliedForce, Friction, Scene, Viscous, problems
 from jaxmodsim.mechanics import acceleration, energies, motion_equations
-from jaxmodsim.scene import State, scene_forces, vector_field
+from jaxmodsim.scene import State, forward_dynamics, vector_field
 
 SAMPLES = 200
 
@@ -36,16 +36,16 @@ def test_spherical_pendulum() -> None:
     # Away from the poles, where the mass matrix is singular and its inverse loses digits.
     q = jnp.stack([draw(0.3, np.pi - 0.3, SAMPLES), draw(-4, 4, SAMPLES, seed=12)], axis=1)
     qd = draw(-5, 5, SAMPLES, 2)
-    scene = problems.spherical_pendulum(m=0.7, R=1.9, g=9.7)
-    assert_equal_motion(scene, lambda _, q, qd: problems.spherical_pendulum_acceleration(q, qd, R=1.9, g=9.7), q, qd)
+    scene = problems.spherical_pendulum.scene(m=0.7, R=1.9, g=9.7)
+    assert_equal_motion(scene, lambda _, q, qd: problems.spherical_pendulum.acceleration(q, qd, R=1.9, g=9.7), q, qd)
 
 
 @pytest.mark.parametrize("k", [None, 0.8])
 def test_bead_on_a_spherical_spiral(k: float | None) -> None:
     q, qd = draw(-9, 9, 2, SAMPLES, 1)
     numbers: dict[str, Any] = {"m": 0.7, "R": 1.9, "a": 0.35, "g": 9.7}
-    scene = problems.spiral_bead(**numbers, k=k)
-    assert_equal_motion(scene, lambda _, q, qd: problems.spiral_bead_acceleration(q, qd, **numbers, k=k or 0.0), q, qd)
+    scene = problems.spiral_bead.scene(**numbers, k=k)
+    assert_equal_motion(scene, lambda _, q, qd: problems.spiral_bead.acceleration(q, qd, **numbers, k=k or 0.0), q, qd)
 
 
 def test_reaction_of_the_sphere() -> None:
@@ -56,11 +56,11 @@ def test_reaction_of_the_sphere() -> None:
     def position(q: Any) -> Any:
         return R * jnp.stack([jnp.sin(q[0]) * jnp.cos(q[1]), jnp.sin(q[0]) * jnp.sin(q[1]), jnp.cos(q[0])])
 
-    qdd = problems.spherical_pendulum_acceleration(q, qd, R=R, g=g)
+    qdd = problems.spherical_pendulum.acceleration(q, qd, R=R, g=g)
     velocity = lambda q, qd: jax.jvp(position, (q,), (qd,))[1]  # noqa: E731
     spatial = jax.jvp(velocity, (q, qd), (qd, qdd))[1]
     reaction = m * spatial + jnp.array([0.0, 0.0, m * g])
-    radial = problems.spherical_pendulum_reaction(q, qd, m=m, R=R, g=g)
+    radial = problems.spherical_pendulum.reaction(q, qd, m=m, R=R, g=g)
     np.testing.assert_allclose(reaction, radial * position(q) / R, atol=1e-12)
 
 
@@ -125,7 +125,7 @@ def test_mass_matrix_and_force_enter_as_they_should() -> None:
 
 def test_energies_of_a_pendulum() -> None:
     q, qd, p = jnp.array([0.8, 0.3]), jnp.array([1.1, -2.0]), {"m": 0.7, "R": 1.9, "g": 9.7}
-    scene = problems.spherical_pendulum(**p)
+    scene = problems.spherical_pendulum.scene(**p)
     kinetic, potential = energies(scene.lagrangian, jnp.array(0.0), q, qd, scene.params)
     square = 1.1**2 + (np.sin(0.8) * 2.0) ** 2
     np.testing.assert_allclose(kinetic, 0.5 * 0.7 * 1.9**2 * square, rtol=1e-14)
@@ -179,7 +179,7 @@ def test_friction_along_a_displacement() -> None:
     t, q, qd = jnp.array(0.4), jnp.array([0.7, -0.6]), jnp.array([1.1, 0.2])
     gradient = np.array([np.cos(0.7) - 0.6, 0.7])
     force = (2.0 * 9.81 - 0.66 + 0.4) * 0.3 * (gradient @ np.array([1.1, 0.2]) - 0.04)
-    np.testing.assert_allclose(scene_forces(t, State(q, qd, {}), scene)["friction"], force, rtol=1e-14)
+    np.testing.assert_allclose(forward_dynamics(t, State(q, qd, {}), scene).forces["friction"], force, rtol=1e-14)
     np.testing.assert_allclose(vector_field(t, State(q, qd, {}), scene).qd, -force * gradient / 2.0, rtol=1e-14)
 
 
@@ -192,13 +192,13 @@ def test_lift_off_gives_no_friction(load: float, expected: float) -> None:
 
 def test_braked_spring_closed_form() -> None:
     """Piecewise solution: its pieces join, it obeys m x'' = -k x - Fc sign(x'), and it rests where it says."""
-    numbers = dict(problems.BRAKED_SPRING)
-    rest = problems.braked_spring_rest(**numbers)
+    numbers = dict(problems.braked_spring.PARAMS)
+    rest = problems.braked_spring.rest(**numbers)
     assert rest.half_cycles == 12
-    np.testing.assert_allclose(rest.t, problems.BRAKED_SPRING_STOP, rtol=1e-14)
+    np.testing.assert_allclose(rest.t, problems.braked_spring.STOP, rtol=1e-14)
     half = float(rest.t) / 12
-    x, v = problems.braked_spring_motion(jnp.asarray(half * np.arange(1, 14)) - 1e-9, **numbers)
-    after, _ = problems.braked_spring_motion(jnp.asarray(half * np.arange(1, 14)) + 1e-9, **numbers)
+    x, v = problems.braked_spring.motion(jnp.asarray(half * np.arange(1, 14)) - 1e-9, **numbers)
+    after, _ = problems.braked_spring.motion(jnp.asarray(half * np.arange(1, 14)) + 1e-9, **numbers)
     # Speeds within 1e-9 s of a turning point are below 1e-9 times the acceleration.
     np.testing.assert_allclose(x, after, atol=1e-15)
     np.testing.assert_allclose(v, 0.0, atol=3e-9)
@@ -206,19 +206,19 @@ def test_braked_spring_closed_form() -> None:
     assert abs(float(rest.x)) <= numbers["Fs"] / numbers["k"]
 
     def speed(t: Any) -> Any:
-        return problems.braked_spring_motion(t, **numbers)[1]
+        return problems.braked_spring.motion(t, **numbers)[1]
 
     t = jnp.asarray(half * (np.arange(12) + 0.37))
-    x, v = problems.braked_spring_motion(t, **numbers)
+    x, v = problems.braked_spring.motion(t, **numbers)
     pull = -numbers["k"] * x - numbers["Fc"] * jnp.sign(v)
     np.testing.assert_allclose(numbers["m"] * jax.vmap(jax.grad(speed))(t), pull, atol=1e-12)
-    rate = jax.vmap(jax.grad(lambda t: problems.braked_spring_motion(t, **numbers)[0]))(t)
+    rate = jax.vmap(jax.grad(lambda t: problems.braked_spring.motion(t, **numbers)[0]))(t)
     np.testing.assert_allclose(rate, v, atol=1e-12)
 
 
 def test_derivatives_of_the_resting_place() -> None:
     def place(x0: Any, Fc: Any) -> Any:
-        return problems.braked_spring_rest(**{**problems.BRAKED_SPRING, "x0": x0, "Fc": Fc}).x
+        return problems.braked_spring.rest(**{**problems.braked_spring.PARAMS, "x0": x0, "Fc": Fc}).x
 
     by_x0, by_fc = jax.grad(place, argnums=(0, 1))(jnp.array(1.0), jnp.array(0.11))
     np.testing.assert_allclose(by_x0, 1.0)

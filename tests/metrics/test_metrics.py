@@ -16,7 +16,7 @@ from jaxmodsim import metrics, problems
 from jaxmodsim.metrics import Metric
 from jaxmodsim.simulation import Events, _trajectory
 
-BELT = problems.BELT_OSCILLATOR
+BELT = problems.belt_oscillator.PARAMS
 TIGHT: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-12, "max_events": 32}
 OF_EVENTS = (
     metrics.break_away(),
@@ -35,7 +35,7 @@ STEP = 1e-3
 
 def on_belt(belt: Any, fs: Any = BELT["Fs"], **more: Any) -> Any:
     """A run in stick from the start on."""
-    scene = problems.belt_oscillator(jms.Coulomb(BELT["Fc"], fs), belt=belt)
+    scene = problems.belt_oscillator.scene(jms.Coulomb(BELT["Fc"], fs), belt=belt)
     return jms.simulate(scene, [0.0], jnp.stack([jnp.asarray(belt)]), 6.0, throw=False, **TIGHT, **more)
 
 
@@ -57,7 +57,7 @@ def batch(lanes: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def cycle(belt: Any, fs: Any = BELT["Fs"]) -> Any:
-    return problems.belt_oscillator_cycle(**{**BELT, "belt": belt, "Fs": fs})
+    return problems.belt_oscillator.cycle(**{**BELT, "belt": belt, "Fs": fs})
 
 
 def test_belt_oscillator_keeps_its_closed_form(batch: list[np.ndarray]) -> None:
@@ -138,7 +138,7 @@ def test_metrics_of_equal_arguments_compile_once(alone: Any) -> None:
 def box(law: Any) -> Any:
     """Pulled by 0.5 t, a mass of 2 kg."""
     ts = jnp.linspace(0.0, 5.0, 2001)
-    return jms.simulate(problems.ramped_box(law, ramp=0.5), [0.0], [0.0], 5.0, ts=ts, rtol=1e-9, atol=1e-12)
+    return jms.simulate(problems.ramped_box.scene(law, ramp=0.5), [0.0], [0.0], 5.0, ts=ts, rtol=1e-9, atol=1e-12)
 
 
 def made(run: Any, scene: Any = None, **fields: Any) -> Any:
@@ -156,7 +156,7 @@ def free(coefficient: float = 0.0) -> Any:
     """The run of a box that nothing holds, of which viscous friction is measured but does not act."""
     run = bristle()
     q, qd = 0.5 * run.t[:, None] ** 3 / 12.0, 0.5 * run.t[:, None] ** 2 / 4.0
-    return made(run, problems.ramped_box(jms.Viscous(coefficient), ramp=0.5), q=q, qd=qd, z={})
+    return made(run, problems.ramped_box.scene(jms.Viscous(coefficient), ramp=0.5), q=q, qd=qd, z={})
 
 
 def test_break_away_of_a_pulled_box() -> None:
@@ -186,10 +186,10 @@ def test_break_away_counts_slip_and_not_motion() -> None:
 
 
 def test_a_spring_that_stops() -> None:
-    """BRAKED_SPRING from 0.3 m: so many half cycles, and at rest."""
+    """The braked spring from 0.3 m: so many half cycles, and at rest."""
     numbers = {"m": 1.3, "k": 2.7, "Fc": 0.11, "Fs": 0.15}
-    rest = problems.braked_spring_rest(x0=0.3, **numbers)
-    scene = problems.braked_spring(problems.braked_spring_law())
+    rest = problems.braked_spring.rest(x0=0.3, **numbers)
+    scene = problems.braked_spring.scene(problems.braked_spring.coulomb())
     half = float(rest.t / rest.half_cycles)
 
     def kind(t1: float, x0: float = 0.3) -> tuple[str, str]:
@@ -212,7 +212,7 @@ def test_several_elements(alone: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Changes of each as they are given: `first` leaves stick for good, `second` at the same time, and comes back."""
     columns = [jnp.array(x) for x in ([1.0, 1.0, 2.0, jnp.inf], [0, 1, 1, -1], [0, 0, 1, -1], [-1, 1, 0, -1])]
     monkeypatch.setattr(jms.Trajectory, "events", property(lambda run: Events(*columns)))
-    run = made(alone, problems.coupled_belts(), modes=jnp.array([[-1.0, 0.0]]), end=jnp.asarray(4.0))
+    run = made(alone, problems.coupled_belts.scene(), modes=jnp.array([[-1.0, 0.0]]), end=jnp.asarray(4.0))
     names = ("first", "second")
     sequence, kind = metrics.mode_sequence(*names), metrics.motion_kind(*names)
     assert sequence.describe(sequence(run)) == "first stick, second stick > first slip- > second slip+ > second stick"
@@ -270,7 +270,7 @@ def test_periods_by_crossings() -> None:
 def test_dahl_loses_its_closed_form_in_each_cycle() -> None:
     """`4 Fc [A - Fc/sigma0 tanh(sigma0 A/Fc)]`, with a mass so heavy that friction does not disturb its swing."""
     sigma0, fc, amplitude = 750.0, 1.5, 2e-2
-    scene = problems.braked_spring(jms.Dahl(sigma0, fc), m=1e9, k=1e9)
+    scene = problems.braked_spring.scene(jms.Dahl(sigma0, fc), m=1e9, k=1e9)
     lost = []
     for cycles in (2, 3):
         run = jms.simulate(scene, [amplitude], [0.0], 2 * np.pi * cycles, rtol=1e-9, atol=1e-12)

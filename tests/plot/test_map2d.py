@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 import jaxmodsim as jms
 from jaxmodsim.plot import map2d
-from jaxmodsim.problems import belt_onset_speed, belt_oscillator
+from jaxmodsim.problems import belt_oscillator
 
 K, V = np.geomspace(10.0, 1000.0, 5), np.linspace(0.1, 0.4, 4)
 NUMBERS = {"m": 1.3, "c": 1.7, "Fc": 4.0, "Fs": 7.0}
@@ -169,35 +169,37 @@ def test_onset_speed_is_where_the_free_swing_just_comes_up_to_the_belt(zeta: flo
     numbers = NUMBERS | {"c": 2.0 * zeta * np.sqrt(1.3 * 60.0)}
     w, u = np.sqrt(60.0 / 1.3), np.sqrt(1.0 - zeta**2)
     s = np.linspace(np.pi / 2, 2.0 * np.pi, 200001) / u
-    limit = float(belt_onset_speed(k=60.0, **numbers))
+    limit = float(belt_oscillator.onset_speed(k=60.0, **numbers))
     for belt, again in ((limit * (1.0 - 1e-6), True), (limit * (1.0 + 1e-6), False)):
         deceleration = (numbers["Fs"] - numbers["Fc"]) / (1.3 * w)
         velocity = np.exp(-zeta * s) * (belt * np.cos(u * s) + (zeta * belt - deceleration) / u * np.sin(u * s))
         assert (velocity.max() > belt) == again
-    slope = jax.grad(lambda k: belt_onset_speed(k=k, **numbers))(60.0)
-    ahead, behind = (float(belt_onset_speed(k=60.0 + h, **numbers)) for h in (1e-3, -1e-3))
+    slope = jax.grad(lambda k: belt_oscillator.onset_speed(k=k, **numbers))(60.0)
+    ahead, behind = (float(belt_oscillator.onset_speed(k=60.0 + h, **numbers)) for h in (1e-3, -1e-3))
     np.testing.assert_allclose(slope, (ahead - behind) / 2e-3, rtol=1e-7)
 
 
 def test_onset_speed_at_its_ends() -> None:
     """Small damping has a formula, critical damping no stick-slip; arrays broadcast, float32 is kept."""
     k = np.array([1e2, 1e6])
-    small = belt_onset_speed(k=k, **(NUMBERS | {"c": 1e-4}))
+    small = belt_oscillator.onset_speed(k=k, **(NUMBERS | {"c": 1e-4}))
     zeta = 1e-4 / (2.0 * np.sqrt(1.3 * k))
     np.testing.assert_allclose(small, 3.0 / np.sqrt(4.0 * np.pi * zeta * k * 1.3), rtol=1e-4)
     critical = 2.0 * np.sqrt(1.3 * 100.0)
-    found = belt_onset_speed(k=100.0, **(NUMBERS | {"c": np.array([0.999 * critical, critical, 10.0 * critical])}))
+    found = belt_oscillator.onset_speed(
+        k=100.0, **(NUMBERS | {"c": np.array([0.999 * critical, critical, 10.0 * critical])})
+    )
     assert 0.0 < found[0] < 1e-20
     np.testing.assert_array_equal(found[1:], 0.0)
     single = {name: np.float32(x) for name, x in NUMBERS.items()}
-    low = belt_onset_speed(k=np.float32(100.0), **single)
+    low = belt_oscillator.onset_speed(k=np.float32(100.0), **single)
     assert low.dtype == jnp.float32
-    np.testing.assert_allclose(low, belt_onset_speed(k=100.0, **NUMBERS), rtol=1e-5)
+    np.testing.assert_allclose(low, belt_oscillator.onset_speed(k=100.0, **NUMBERS), rtol=1e-5)
 
 
 def first_slip(k: Any, belt: Any) -> jms.Trajectory:
     law = jms.Coulomb(NUMBERS["Fc"], NUMBERS["Fs"])
-    scene = belt_oscillator(law, m=NUMBERS["m"], k=k, belt=belt, c=NUMBERS["c"])
+    scene = belt_oscillator.scene(law, m=NUMBERS["m"], k=k, belt=belt, c=NUMBERS["c"])
     radian = jnp.sqrt(NUMBERS["m"] / k)
     begins = (NUMBERS["Fs"] - NUMBERS["c"] * belt) / k - 0.1 * radian * belt
     return jms.simulate(scene, jnp.stack([begins]), jnp.stack([belt]), 8.0 * radian, throw=False)
@@ -206,7 +208,7 @@ def first_slip(k: Any, belt: Any) -> jms.Trajectory:
 def test_runs_stick_again_on_one_side_of_the_boundary() -> None:
     k, belt = np.geomspace(5.0, 5e3, 12), np.geomspace(0.05, 0.5, 10)
     runs = jms.sweep(first_slip, {"belt": belt, "k": k}, {"changes": lambda run: run.stats["num_events"]})
-    limit = np.asarray(belt_onset_speed(k=k, **NUMBERS))
+    limit = np.asarray(belt_oscillator.onset_speed(k=k, **NUMBERS))
     away = np.abs(belt[:, None] / limit - 1.0) > 1e-3
     assert (runs["result"] == 0).all()
     assert away.mean() > 0.9

@@ -7,7 +7,7 @@ CODE = """
 import sys
 sys.modules["matplotlib"] = None
 import jaxmodsim as jms
-run = jms.simulate(jms.problems.ramped_box(), [0.0], [0.0], 0.1)
+run = jms.simulate(jms.problems.ramped_box.scene(), [0.0], [0.0], 0.1)
 assert run.result.ok
 jms.metrics, jms.sweeps, jms.validation, jms.fit, jms.work_precision
 try:

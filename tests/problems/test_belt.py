@@ -95,14 +95,14 @@ def pick(*, t: dict[int, float] | None = None, q: float = 0.0, qd: float = 0.0) 
 
 # On a table: several half cycles, with and without stiction, and a start within the range of rest.
 SPRINGS = [
-    problems.BRAKED_SPRING,
+    problems.braked_spring.PARAMS,
     {"m": 0.7, "k": 3.1, "Fc": 0.2, "Fs": 0.2, "x0": 0.9},
     {"m": 2.0, "k": 40.0, "Fc": 1.0, "Fs": 2.5, "x0": 0.31},
     {"m": 1.0, "k": 1.0, "Fc": 1.0, "Fs": 1.5, "x0": 1.4},
 ]
 # On a belt: the first three start in stick, the last one in slip.
 BELTS = [
-    problems.BELT_OSCILLATOR,
+    problems.belt_oscillator.PARAMS,
     {"m": 2.3, "k": 61.0, "belt": 0.4, "Fc": 3.0, "Fs": 9.0},
     {"m": 0.5, "k": 300.0, "belt": 0.25, "Fc": 0.5, "Fs": 4.0},
     {"m": 1.4, "k": 150.0, "belt": 0.2, "Fc": 6.0, "Fs": 8.0},
@@ -111,23 +111,23 @@ BELTS = [
 
 def spring(numbers: dict[str, float]) -> Start:
     n = dict(numbers)
-    scene = problems.braked_spring(jms.Coulomb(n["Fc"], n["Fs"]), m=n["m"], k=n["k"])
+    scene = problems.braked_spring.scene(jms.Coulomb(n["Fc"], n["Fs"]), m=n["m"], k=n["k"])
     return Start(scene, jnp.array([n["x0"]]), jnp.zeros(1))
 
 
 def belt(numbers: dict[str, float]) -> Start:
     n = dict(numbers)
-    scene = problems.belt_oscillator(jms.Coulomb(n.pop("Fc"), n.pop("Fs")), **n)
+    scene = problems.belt_oscillator.scene(jms.Coulomb(n.pop("Fc"), n.pop("Fs")), **n)
     slips = numbers is BELTS[-1]
     return Start(scene, jnp.array([0.1 if slips else 0.0]), jnp.array([0.0 if slips else n["belt"]]))
 
 
 def spring_end(numbers: dict[str, float]) -> float:
-    return 1.15 * float(problems.braked_spring_rest(**numbers).t) + 0.5
+    return 1.15 * float(problems.braked_spring.rest(**numbers).t) + 0.5
 
 
 def belt_end(numbers: dict[str, float]) -> float:
-    return 4.6 * float(problems.belt_oscillator_cycle(**numbers).period)
+    return 4.6 * float(problems.belt_oscillator.cycle(**numbers).period)
 
 
 def together(starts: list[Start], ends: list[float]) -> tuple[Start, Any]:
@@ -157,7 +157,7 @@ def check_springs() -> None:
     _, ts = start = together([spring(n) for n in SPRINGS], [spring_end(n) for n in SPRINGS])
     every = values(*start, 1e-12)
     for i, numbers in enumerate(SPRINGS):
-        seen, rest = jax.tree.map(lambda x, i=i: np.asarray(x[i]), every), problems.braked_spring_rest(**numbers)
+        seen, rest = jax.tree.map(lambda x, i=i: np.asarray(x[i]), every), problems.braked_spring.rest(**numbers)
         n = int(rest.half_cycles)
         assert seen.count == n
         half = np.pi * np.sqrt(numbers["m"] / numbers["k"])
@@ -165,7 +165,7 @@ def check_springs() -> None:
         np.testing.assert_array_equal(seen.events[n:], 0.0)
         np.testing.assert_array_equal(seen.after[:n], [*(-1) ** np.arange(n)][: n - 1] + [0] * (n > 0))
         np.testing.assert_allclose(seen.q[-1], rest.x, atol=1e-10)
-        x, v = problems.braked_spring_motion(ts[i], **numbers)
+        x, v = problems.braked_spring.motion(ts[i], **numbers)
         np.testing.assert_allclose(seen.q, x, atol=1e-9)
         np.testing.assert_allclose(seen.qd, v, atol=1e-9)
         resting = ts[i] > rest.t + 1e-9
@@ -184,7 +184,7 @@ def check_belts() -> None:
     at = jnp.concatenate([every.events[:, :8], jnp.repeat(ts[:, -1:], TIMES - 8, axis=1)], axis=1)
     again = values(start, at, 1e-12)
     for i, numbers in enumerate(BELTS):
-        seen, cycle = jax.tree.map(lambda x, i=i: np.asarray(x[i]), every), problems.belt_oscillator_cycle(**numbers)
+        seen, cycle = jax.tree.map(lambda x, i=i: np.asarray(x[i]), every), problems.belt_oscillator.cycle(**numbers)
         first = int(numbers is BELTS[-1])  # the first event that begins a slip
         np.testing.assert_array_equal(seen.after[:8], [-1, 0, -1, 0, -1, 0, -1, 0] if first == 0 else [0, -1] * 4)
         t, x = seen.events[first : first + 7], again.q[i, first : first + 7]
@@ -212,7 +212,7 @@ def check_belts() -> None:
 def check_tolerances() -> None:
     """The error of the period falls with the tolerance."""
     start, ts = together([belt(n) for n in BELTS], [belt_end(n) for n in BELTS])
-    exact = np.array([problems.belt_oscillator_cycle(**n).period for n in BELTS])
+    exact = np.array([problems.belt_oscillator.cycle(**n).period for n in BELTS])
     errors = []
     for rtol in (1e-4, 1e-7, 1e-10):
         t = values(start, ts, rtol).events
@@ -227,8 +227,8 @@ def floats(numbers: dict[str, float]) -> dict[str, Any]:
     return {name: jnp.asarray(x) for name, x in numbers.items()}
 
 
-rest_slopes = jax.jit(jax.jacrev(lambda n: problems.braked_spring_rest(**n)))
-period_slopes = jax.jit(jax.grad(lambda n: problems.belt_oscillator_cycle(**n).period))
+rest_slopes = jax.jit(jax.jacrev(lambda n: problems.braked_spring.rest(**n)))
+period_slopes = jax.jit(jax.grad(lambda n: problems.belt_oscillator.cycle(**n).period))
 
 
 @pytest.mark.parametrize("derivatives", [forward, reverse], ids=["forward", "reverse"])
@@ -237,7 +237,7 @@ def test_derivatives_of_braked_spring_and_belt_oscillator(derivatives: Any) -> N
     """One test for both, and for single events, as they share the compiled code."""
     for numbers in SPRINGS:
         start, t1 = spring(numbers), spring_end(numbers)
-        exact, n = rest_slopes(floats(numbers)), int(problems.braked_spring_rest(**numbers).half_cycles)
+        exact, n = rest_slopes(floats(numbers)), int(problems.braked_spring.rest(**numbers).half_cycles)
         place = by_number(derivatives(start, t1, pick(q=1.0)))
         stop = by_number(derivatives(start, t1, pick(t={n - 1: 1.0} if n else None)))
         for name in numbers:

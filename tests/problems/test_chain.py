@@ -30,13 +30,13 @@ def states(n: int, samples: int = SAMPLES) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ours(n: int, q: Any, qd: Any) -> np.ndarray:
-    scene, zero = problems.n_link_pendulum(n, **numbers(n)), jnp.array(0.0)
+    scene, zero = problems.n_link_pendulum.scene(n, **numbers(n)), jnp.array(0.0)
     return np.asarray(jax.jit(jax.vmap(lambda q, qd: vector_field(zero, State(q, qd, {}), scene).qd))(q, qd))
 
 
 def closed(n: int, q: Any, qd: Any) -> np.ndarray:
     values = numbers(n)
-    return np.asarray(jax.vmap(lambda q, qd: problems.n_link_pendulum_acceleration(q, qd, **values))(q, qd))
+    return np.asarray(jax.vmap(lambda q, qd: problems.n_link_pendulum.acceleration(q, qd, **values))(q, qd))
 
 
 def assert_close(a: np.ndarray, b: np.ndarray, tolerance: float) -> None:
@@ -117,7 +117,7 @@ def test_symbolic_multipliers() -> None:
 
 def test_energy_of_a_double_pendulum_is_kept() -> None:
     """Two links through a quarter turn, against the energy it started from."""
-    scene = problems.double_pendulum(m=np.array([1.0, 0.7]), l=np.array([0.8, 1.1]))
+    scene = problems.n_link_pendulum.double_pendulum(m=np.array([1.0, 0.7]), l=np.array([0.8, 1.1]))
     run = simulate(scene, [1.5, -0.4], [0.0, 0.0], 2.0, rtol=1e-10, atol=1e-12)
     zero = jnp.array(0.0)
     before = sum(energies(scene.lagrangian, zero, jnp.array([1.5, -0.4]), jnp.zeros(2), scene.params))
@@ -129,9 +129,9 @@ def test_energy_of_a_double_pendulum_is_kept() -> None:
 def test_number_of_links_is_checked(n: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # as users have it
     with pytest.raises(ValueError, match=f"n must be a positive integer, but {n} was given"):
-        problems.n_link_pendulum(n)
+        problems.n_link_pendulum.scene(n)
 
 
 def test_number_of_masses_is_checked() -> None:
     with pytest.raises(ValueError, match=r"m has the shape \(3,\), but a chain of 2 links needs one number or \(2,\)"):
-        problems.double_pendulum(m=np.ones(3))
+        problems.n_link_pendulum.double_pendulum(m=np.ones(3))

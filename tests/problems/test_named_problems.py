@@ -35,16 +35,16 @@ def test_a_case_is_made_anew_and_the_registry_is_a_copy() -> None:
 
 def test_motion_of_the_belt_oscillator() -> None:
     """Continuous at the events of its cycle, and at their times in the places that the cycle says."""
-    numbers = problems.BELT_OSCILLATOR
-    cycle, first = problems.belt_oscillator_cycle(**numbers), numbers["Fs"] / numbers["k"] / numbers["belt"]
+    numbers = problems.belt_oscillator.PARAMS
+    cycle, first = problems.belt_oscillator.cycle(**numbers), numbers["Fs"] / numbers["k"] / numbers["belt"]
     begins = first + float(cycle.period) * np.arange(3)
     ends = begins + float(cycle.slip)
     for times, place in ((begins, cycle.begins), (ends, cycle.ends)):
         for side in (-1e-9, 1e-9):
-            q, qd = problems.belt_oscillator_motion(jnp.asarray(times + side), **numbers)
+            q, qd = problems.belt_oscillator.motion(jnp.asarray(times + side), **numbers)
             np.testing.assert_allclose(q, place, atol=1e-9)
             np.testing.assert_allclose(qd, numbers["belt"], atol=1e-7)
-    q, qd = problems.belt_oscillator_motion(jnp.linspace(first, ends[2], 4001), **numbers)
+    q, qd = problems.belt_oscillator.motion(jnp.linspace(first, ends[2], 4001), **numbers)
     np.testing.assert_allclose([q.min(), q.max()], [cycle.lowest, cycle.highest], atol=1e-6)
 
 
@@ -52,7 +52,7 @@ def test_motion_of_the_belt_oscillator() -> None:
 def test_motion_of_the_spherical_pendulum(turn: float) -> None:
     """From its upper turning point and from its lower one: energy and angular momentum are kept."""
     t, phi, h = np.linspace(0.0, 4.0, 41), 1.8, 1e-5
-    at, before, after = (problems.spherical_pendulum_motion(x, phi, turn) for x in (t, t - h, t + h))
+    at, before, after = (problems.spherical_pendulum.motion(x, phi, turn) for x in (t, t - h, t + h))
     rate = (after - before) / (2.0 * h)
     momentum = np.sin(phi) ** 2 * turn
     energy = 0.5 * rate**2 + 0.5 * (momentum / np.sin(at)) ** 2 + 9.81 * np.cos(at)

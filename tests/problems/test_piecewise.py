@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import root_scalar
 
-from jaxmodsim.problems import LinearStickSlip, stick_slip_motion
+from jaxmodsim.problems import linear_stick_slip
 
 # Amplitude [N], growth [1/s], angular frequency [rad/s].
 SHAKEN = (0.8441173414514593, 0.09826644620612397, 2.9358368442770417)
@@ -22,23 +22,25 @@ def box(
     k: float = 0.0,
     limits: tuple[float, float] = (1.0, 1.5),
     belt: list[float] | None = None,
-) -> LinearStickSlip:
+) -> linear_stick_slip.LinearStickSlip:
     """One mass with one element."""
     count = 5 + 4 * len(frequencies)
     row = np.array([*load, *[0.0] * (count - len(load))])
     surface = np.array([*(belt or []), *[0.0] * (count - len(belt or []))])
     one = np.ones((1, 1))
     Fc, Fs = (np.array([x]) for x in limits)
-    return LinearStickSlip(m * one, c * one, k * one, one, Fc, Fs, np.array(frequencies), row[None], surface[None])
+    return linear_stick_slip.LinearStickSlip(
+        m * one, c * one, k * one, one, Fc, Fs, np.array(frequencies), row[None], surface[None]
+    )
 
 
-def shaken(limits: tuple[float, float] = (1.0, 1.5)) -> LinearStickSlip:
+def shaken(limits: tuple[float, float] = (1.0, 1.5)) -> linear_stick_slip.LinearStickSlip:
     a, g, w = SHAKEN
     return box([0.0, 0.0, 0.0, a, 0.0, a * g, 0.0], (w,), limits=limits)
 
 
 def test_box_under_a_growing_harmonic():
-    motion = stick_slip_motion(shaken(), np.zeros(1), np.zeros(1), 10.0)
+    motion = linear_stick_slip.motion(shaken(), np.zeros(1), np.zeros(1), 10.0)
     assert motion.q[0] == pytest.approx(0.0210473, abs=5e-8)
     np.testing.assert_array_equal(motion.modes[:, 0], [0, -1, 0, 1, 0])
     assert motion.num_events == len(motion.times) == 4
@@ -49,7 +51,7 @@ def test_box_under_a_growing_harmonic():
 
 
 def test_ramp_in_closed_form():
-    motion = stick_slip_motion(box([0.0, 1e-4]), np.zeros(1), np.zeros(1), 2e4)
+    motion = linear_stick_slip.motion(box([0.0, 1e-4]), np.zeros(1), np.zeros(1), 2e4)
     # Slip from 1.5e4 s on: 2 q'' = 0.5 + 1e-4 s.
     s = 5e3
     assert motion.times == pytest.approx([1.5e4], rel=1e-12)
@@ -58,26 +60,26 @@ def test_ramp_in_closed_form():
 
 def test_undamped_spring_stops_where_it_must():
     """Every half swing loses 2 Fc/k: from 10.3 Fc/k five of them leave 0.3, where it sticks."""
-    motion = stick_slip_motion(box([], k=8.0, limits=(1.0, 1.0)), np.array([10.3 / 8.0]), np.zeros(1), 20.0)
+    motion = linear_stick_slip.motion(box([], k=8.0, limits=(1.0, 1.0)), np.array([10.3 / 8.0]), np.zeros(1), 20.0)
     assert motion.q[0] == pytest.approx(-0.3 / 8.0, rel=1e-10)
     assert motion.times == pytest.approx(np.pi / 2.0 * np.arange(1, 6), rel=1e-12)
 
 
 def test_belt_oscillator_breaks_away_at_the_limit():
     """A spring-held box on an even belt: it goes with the belt until the spring pulls with Fs."""
-    motion = stick_slip_motion(box([], m=1.0, k=4.0, belt=[0.1]), np.zeros(1), np.array([0.1]), 3.9)
+    motion = linear_stick_slip.motion(box([], m=1.0, k=4.0, belt=[0.1]), np.zeros(1), np.array([0.1]), 3.9)
     assert motion.times == pytest.approx([1.5 / 4.0 / 0.1], rel=1e-12)
 
 
 @pytest.mark.parametrize("touch", [-1e-5, 1e-5])
 def test_touching_is_not_crossing(touch: float):
     load = box([0.0, 0.0, 0.0, 1.5 * (1.0 + touch)], (2.0,), limits=(1.5, 1.5))
-    motion = stick_slip_motion(load, np.zeros(1), np.zeros(1), 1.5)
+    motion = linear_stick_slip.motion(load, np.zeros(1), np.zeros(1), 1.5)
     assert (motion.num_events > 0) == (touch > 0)
     assert motion.margin == pytest.approx(1e-5, rel=1e-3)
 
 
-def integrate(system: LinearStickSlip, t1: float) -> tuple[float, int]:
+def integrate(system: linear_stick_slip.LinearStickSlip, t1: float) -> tuple[float, int]:
     """Position and number of events of one mass from rest at 0, by DOP853 and its terminal events."""
     m, c, k, Fc, Fs = (
         float(np.ravel(x)[0]) for x in (system.mass, system.damping, system.stiffness, system.Fc, system.Fs)
@@ -125,7 +127,7 @@ def integrate(system: LinearStickSlip, t1: float) -> tuple[float, int]:
         events += 1
 
 
-def belt_position(system: LinearStickSlip, t: float) -> float:
+def belt_position(system: linear_stick_slip.LinearStickSlip, t: float) -> float:
     """Integral of the belt's velocity b0 + b1 sin(w t)."""
     if not len(system.frequencies):
         return float(system.belt[0, 0] * t)
@@ -142,15 +144,15 @@ def belt_position(system: LinearStickSlip, t: float) -> float:
         (box([0.2, 0.1, 0.0, 0.7], (3.1,), m=1.0, k=3.0, limits=(1.0, 1.2)), 8.0),
     ],
 )
-def test_against_integration_with_short_steps(system: LinearStickSlip, t1: float):
-    motion = stick_slip_motion(system, np.zeros(1), system.belt @ system.loads(0.0), t1)
+def test_against_integration_with_short_steps(system: linear_stick_slip.LinearStickSlip, t1: float):
+    motion = linear_stick_slip.motion(system, np.zeros(1), system.belt @ system.loads(0.0), t1)
     q, events = integrate(system, t1)
     assert motion.q[0] == pytest.approx(q, rel=1e-8, abs=1e-10)
     assert motion.num_events == events
     assert events > 2
 
 
-def step_in_time(system: LinearStickSlip, t1: float, count: int) -> np.ndarray:
+def step_in_time(system: linear_stick_slip.LinearStickSlip, t1: float, count: int) -> np.ndarray:
     """Coordinates from rest at 0 by time-stepping with impulses (J. J. Moreau, 1988), without stiction; order 1."""
     h, n = t1 / count, system.size
     q, qd, impulse = np.zeros(n), np.zeros(n), np.zeros(len(system.Fc))
@@ -176,10 +178,10 @@ def test_chain_with_friction_between_neighbours():
     limits = np.array([0.4, 0.3, 0.5, 0.35, 0.25])
     load = np.zeros((3, 9))
     load[0, 3], load[2, 3], load[2, 0] = 2.5, -0.8, 0.4
-    system = LinearStickSlip(
+    system = linear_stick_slip.LinearStickSlip(
         np.diag([1.0, 1.3, 0.8]), 0.05 * k, k, rows, limits, limits, np.array([1.9]), load, np.zeros((5, 9))
     )
-    motion = stick_slip_motion(system, np.zeros(3), np.zeros(3), 5.0)
+    motion = linear_stick_slip.motion(system, np.zeros(3), np.zeros(3), 5.0)
     assert len(motion.times) > 10
     coarse, fine = (step_in_time(system, 5.0, count) for count in (1000, 2000))
     assert np.max(np.abs(motion.q - (2.0 * fine - coarse))) < 2e-3 * np.max(motion.q_scale)

@@ -63,7 +63,7 @@ def test_tension_of_the_pendulum() -> None:
     rate = (one.q[:, 0] * one.qd[:, 1] - one.q[:, 1] * one.qd[:, 0]) / l**2
     tension = m * (l * rate**2 + g * np.cos(angle))
     assert_equal(-rod.multiplier[:, 0], tension)
-    assert_equal(jax.vmap(lambda q, qd: problems.cartesian_pendulum_tension(q, qd, **PENDULUM))(one.q, one.qd), tension)
+    assert_equal(jax.vmap(lambda q, qd: problems.cartesian_pendulum.tension(q, qd, **PENDULUM))(one.q, one.qd), tension)
     assert rod.force is not None
     assert_equal(rod.force[:, [0, 2]], -tension[:, None] * one.q / l)
     assert_equal(rod.generalised, rod.force[:, [0, 2]])
@@ -72,7 +72,7 @@ def test_tension_of_the_pendulum() -> None:
 def test_reaction_of_the_sphere() -> None:
     m, l, g = PENDULUM.values()  # noqa: E741
     rod = found("pendulum in space").reactions["rod"]
-    radial = jax.vmap(lambda a, w: problems.spherical_pendulum_reaction(a, w, m=m, R=l, g=g))(ANGLES, ANGLE_RATES)
+    radial = jax.vmap(lambda a, w: problems.spherical_pendulum.reaction(a, w, m=m, R=l, g=g))(ANGLES, ANGLE_RATES)
     assert_equal(rod.multiplier[:, 0], radial)
     newton = m * found("pendulum in space").qdd + np.array([0.0, 0.0, m * g])
     assert_equal(rod.force, newton)
@@ -83,7 +83,7 @@ def test_joints_of_the_slider_crank(mu: float | None) -> None:
     """Cut free: the forces in the pin and of the guide, and the crank by its equation of motion alone."""
     name = "slider-crank" if mu is None else "slider-crank with friction"
     said, numbers = found(name), {**CRANK, "mu": mu or 0.0}
-    free = jax.jit(jax.vmap(lambda f, w: problems.slider_crank_forces(f, w, **numbers)))(CRANK_ANGLE, CRANK_RATE)
+    free = jax.jit(jax.vmap(lambda f, w: problems.slider_crank.forces(f, w, **numbers)))(CRANK_ANGLE, CRANK_RATE)
     assert_equal(said.reactions["guide"].multiplier[:, 0], free.guide, 1e-11)
     pin = said.reactions["pin"].force
     assert pin is not None
@@ -92,14 +92,14 @@ def test_joints_of_the_slider_crank(mu: float | None) -> None:
     assert np.any(free.guide > 0)
     assert np.any(free.guide < 0)
     rub = -(mu or 0.0) * np.abs(free.guide) * np.sign(case(name).qd[:, 2])
-    alone = jax.jit(jax.vmap(lambda f, w, force: problems.slider_crank_acceleration(f, w, **CRANK, force=force)))
+    alone = jax.jit(jax.vmap(lambda f, w, force: problems.slider_crank.acceleration(f, w, **CRANK, force=force)))
     assert_equal(said.qdd[:, 0], alone(CRANK_ANGLE, CRANK_RATE, rub), least=1.0 + np.square(CRANK_RATE)[:, None])
 
 
 @pytest.mark.parametrize("name", ["four-bar", "four-bar, crossed"])
 def test_joint_of_the_four_bar(name: str) -> None:
     """Moments: of the rocker about the ground, of the coupler about its middle with the force of the crank on it."""
-    p, one, said = problems.FOUR_BAR, case(name), found(name)
+    p, one, said = problems.four_bar.PARAMS, case(name), found(name)
     force, turn = said.reactions["closure"].multiplier, said.qdd
     unit = np.stack([np.cos(one.q), np.sin(one.q)], axis=-1)
     ahead = np.stack([-unit[..., 1], unit[..., 0]], axis=-1)
@@ -129,7 +129,7 @@ def test_force_on_the_rolling_disc() -> None:
 
 def test_force_on_the_knife_edge() -> None:
     one = case("knife edge")
-    exact = jax.vmap(problems.knife_edge_force)(one.q, one.qd)
+    exact = jax.vmap(problems.knife_edge.force)(one.q, one.qd)
     assert_equal(found("knife edge").reactions["edge"].multiplier[:, 0], exact, least=1.0)
 
 
@@ -139,12 +139,12 @@ def test_rod_on_a_rough_floor(mu: float) -> None:
     one, m = rod_on_rough_floor(mu), ROD["m"]
     qdd, reactions, margins = look(one.scene, one.q, one.qd, one.mode)
     side = jnp.sign(ROD_SLIP)
-    compliance = problems.rod_on_rough_floor_compliance(ROD_ANGLE, side, m=m, mu=mu)
-    smooth = problems.rod_on_rough_floor_compliance(ROD_ANGLE, m=m, mu=0.0)
+    compliance = problems.rod_on_rough_floor.compliance(ROD_ANGLE, side, m=m, mu=mu)
+    smooth = problems.rod_on_rough_floor.compliance(ROD_ANGLE, m=m, mu=0.0)
     np.testing.assert_allclose(smooth, (1 + 3 * np.cos(ROD_ANGLE) ** 2) / m, rtol=1e-14)
     # Friction that lifts the tip never takes the solution away.
     np.testing.assert_allclose(margins[:, 1], np.minimum(compliance / smooth, 1.0), atol=1e-12)
-    normal = jax.vmap(lambda f, w, s: problems.rod_on_rough_floor_normal_force(f, w, s, **{**ROD, "mu": mu}))(
+    normal = jax.vmap(lambda f, w, s: problems.rod_on_rough_floor.normal_force(f, w, s, **{**ROD, "mu": mu}))(
         ROD_ANGLE, ROD_RATE, side
     )
     np.testing.assert_allclose(margins[:, 0], normal, rtol=1e-11)
@@ -156,11 +156,11 @@ def test_rod_on_a_rough_floor(mu: float) -> None:
 def test_the_paradox_begins_at_four_thirds() -> None:
     """Where 1 + 3 cos^2 and 3 mu sin cos touch: tan f = 2, at mu = 4/3."""
     f = jnp.linspace(0.01, 1.56, 100_001)
-    least = [float(jnp.min(problems.rod_on_rough_floor_compliance(f, m=1.0, mu=mu))) for mu in (1.333, 4 / 3, 1.334)]
+    least = [float(jnp.min(problems.rod_on_rough_floor.compliance(f, m=1.0, mu=mu))) for mu in (1.333, 4 / 3, 1.334)]
     assert least[0] > 0
     np.testing.assert_allclose(least[1], 0.0, atol=1e-8)
     assert least[2] < 0
-    at_two = problems.rod_on_rough_floor_compliance(jnp.arctan(2.0), m=1.0, mu=4 / 3)
+    at_two = problems.rod_on_rough_floor.compliance(jnp.arctan(2.0), m=1.0, mu=4 / 3)
     np.testing.assert_allclose(at_two, 0.0, atol=1e-15)
 
 
@@ -168,24 +168,24 @@ def test_each_number_of_the_bead_sits_in_one_place() -> None:
     """So the derivative of its acceleration by a parameter of the scene is that of the closed form."""
     q, qd, mode = jnp.array([1.3]), jnp.array([-2.1]), jnp.array([-1.0])
     numbers = {**SPIRAL, "k": 0.8}
-    scene = problems.spiral_bead(**numbers, mu=0.3)
+    scene = problems.spiral_bead.scene(**numbers, mu=0.3)
     assert set(scene.params) == set(numbers)
 
     def ours(params: Any, mu: Any) -> Any:
         # The scene is built from its numbers anew, by its own leaves.
-        changed = problems.spiral_bead(**params, mu=mu)
+        changed = problems.spiral_bead.scene(**params, mu=mu)
         assert jax.tree.structure(changed) == jax.tree.structure(scene)
         return vector_field(jnp.array(0.0), State(q, qd, {}), changed, mode).qd[0]
 
     def exact(params: Any, mu: Any) -> Any:
-        return problems.spiral_bead_acceleration(q, qd, **params, mu=mu)[0]
+        return problems.spiral_bead.acceleration(q, qd, **params, mu=mu)[0]
 
     values = jax.tree.map(jnp.asarray, numbers)
     by_ours, by_exact = (jax.jit(jax.grad(fn, argnums=(0, 1)))(values, jnp.array(0.3)) for fn in (ours, exact))
     for a, b in zip(jax.tree.leaves(by_ours), jax.tree.leaves(by_exact), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-14)
         assert b != 0
-    normal = problems.spiral_bead_normal_force(q, qd, **SPIRAL)
+    normal = problems.spiral_bead.normal_force(q, qd, **SPIRAL)
     bead: Any = scene.lagrangian
     np.testing.assert_allclose(bead.normal_force(jnp.array(0.0), q, qd, scene.params), normal, rtol=1e-13)
 
@@ -242,7 +242,7 @@ def symbolic_slider_crank() -> Any:
 
 
 def symbolic_four_bar() -> Any:
-    (a, b, c, d, m1, m2, m3, g), numbers = values("a b c d m1 m2 m3 g", problems.FOUR_BAR)
+    (a, b, c, d, m1, m2, m3, g), numbers = values("a b c d m1 m2 m3 g", problems.four_bar.PARAMS)
     q = list(dynamicsymbols("q1 q2 q3"))
     crank, x1, z1 = bar(m1, a, sympy.Integer(0), sympy.Integer(0), q[0], g)
     coupler, x2, z2 = bar(m2, b, x1, z1, q[1], g)
@@ -264,7 +264,7 @@ def symbolic_disc() -> Any:
 
 
 def symbolic_knife_edge() -> Any:
-    (m, inertia, slope, g), numbers = values("m I slope g", problems.KNIFE_EDGE)
+    (m, inertia, slope, g), numbers = values("m I slope g", problems.knife_edge.PARAMS)
     x, y, h = dynamicsymbols("x y h")
     energy = m * (x.diff() ** 2 + y.diff() ** 2) / 2 + inertia * h.diff() ** 2 / 2 + m * g * x * sympy.sin(slope)
     sideways = sympy.cos(h) * y.diff() - sympy.sin(h) * x.diff()
@@ -337,8 +337,8 @@ def assert_motion(motion: Callable[[Any], Any], acceleration: Callable[[Any, Any
 
 def test_cycloid_of_the_knife_edge() -> None:
     numbers = {"turn": 1.7, "speed": 0.9}
-    assert_motion(lambda t: problems.knife_edge_motion(t, **numbers)[0], problems.knife_edge_acceleration)
-    q, qd = problems.knife_edge_motion(jnp.array([0.0, 2.0 * np.pi / 1.7]), turn=1.7)
+    assert_motion(lambda t: problems.knife_edge.motion(t, **numbers)[0], problems.knife_edge.acceleration)
+    q, qd = problems.knife_edge.motion(jnp.array([0.0, 2.0 * np.pi / 1.7]), turn=1.7)
     np.testing.assert_allclose(q[0], 0.0, atol=1e-15)
     np.testing.assert_allclose(qd[:, :2], 0.0, atol=1e-14)
     # In a full turn it has moved across, but not down, by b/(2 w) times the time.
@@ -349,13 +349,13 @@ def test_cycloid_of_the_knife_edge() -> None:
 def test_motion_of_the_charged_particle() -> None:
     q0, qd0 = jnp.array([0.3, -0.8, 0.5]), jnp.array([1.2, 0.4, -0.7])
     assert_motion(
-        lambda t: problems.charged_particle_motion(t, q0, qd0, **PARTICLE)[0],
-        lambda q, qd: problems.charged_particle_acceleration(q, qd, **PARTICLE),
+        lambda t: problems.charged_particle.motion(t, q0, qd0, **PARTICLE)[0],
+        lambda q, qd: problems.charged_particle.acceleration(q, qd, **PARTICLE),
     )
     # Without the electric field a circle at the cyclotron frequency.
     numbers = but(PARTICLE, "E")
     period = 2 * np.pi * 0.7 / (1.1 * 2.3)
-    q, qd = problems.charged_particle_motion(jnp.array([0.0, period]), q0, qd0, **numbers)
+    q, qd = problems.charged_particle.motion(jnp.array([0.0, period]), q0, qd0, **numbers)
     np.testing.assert_allclose(q, [q0, q0 + jnp.array([0.0, 0.0, -0.7 * period])], atol=1e-14)
     np.testing.assert_allclose(qd, [qd0, qd0], atol=1e-14)
 
@@ -364,14 +364,14 @@ def test_motion_of_foucaults_pendulum() -> None:
     q0, qd0 = jnp.array([0.3, -0.8]), jnp.array([1.2, 0.4])
     numbers = but(FOUCAULT, "m")
     assert_motion(
-        lambda t: problems.foucault_pendulum_motion(t, q0, qd0, **numbers),
-        lambda q, qd: problems.foucault_pendulum_acceleration(q, qd, **numbers),
+        lambda t: problems.foucault_pendulum.motion(t, q0, qd0, **numbers),
+        lambda q, qd: problems.foucault_pendulum.acceleration(q, qd, **numbers),
     )
-    start = jax.jvp(lambda t: problems.foucault_pendulum_motion(t, q0, qd0, **numbers), (0.0,), (1.0,))
+    start = jax.jvp(lambda t: problems.foucault_pendulum.motion(t, q0, qd0, **numbers), (0.0,), (1.0,))
     np.testing.assert_allclose(start, [q0, qd0], atol=1e-14)
     day = 2 * np.pi / 7.2921159e-5
     # Paris: a full turn takes a sidereal day over sin(latitude), to the west of north.
-    np.testing.assert_allclose(problems.foucault_pendulum_precession(), -2 * np.pi / (day / np.sin(0.8527)), rtol=1e-14)
+    np.testing.assert_allclose(problems.foucault_pendulum.precession(), -2 * np.pi / (day / np.sin(0.8527)), rtol=1e-14)
 
 
 # --- Runs.
@@ -384,14 +384,14 @@ def total(scene: Any, run: Any) -> np.ndarray:
 
 
 def test_the_swings_of_foucaults_pendulum_turn() -> None:
-    scene, p = problems.foucault_pendulum(**FOUCAULT), -0.4 * np.sin(0.8)
+    scene, p = problems.foucault_pendulum.scene(**FOUCAULT), -0.4 * np.sin(0.8)
     ts = np.linspace(0.0, 10.0, 21)
     run = simulate(scene, [0.5, 0.0], [0.0, 0.5 * p], 10.0, ts=ts, rtol=1e-10, atol=1e-12)
     across = run.q[:, 1] * np.cos(p * ts) - run.q[:, 0] * np.sin(p * ts)
     np.testing.assert_allclose(across, 0.0, atol=1e-9)
     assert np.abs(np.sin(p * ts)).max() > 0.99
     numbers = but(FOUCAULT, "m")
-    exact = problems.foucault_pendulum_motion(jnp.asarray(ts), jnp.array([0.5, 0.0]), run.qd[0], **numbers)
+    exact = problems.foucault_pendulum.motion(jnp.asarray(ts), jnp.array([0.5, 0.0]), run.qd[0], **numbers)
     np.testing.assert_allclose(run.q, exact, atol=1e-9)
 
 
@@ -401,7 +401,7 @@ def test_over_both_poles() -> None:
     speed = 2.2 * np.sqrt(g * l)
     half = 2.0 * l / speed * ellipk(4.0 * g * l / speed**2)
     run = simulate(
-        problems.cartesian_spherical_pendulum(**PENDULUM),
+        problems.cartesian_pendulum.cartesian_spherical_pendulum(**PENDULUM),
         [0.0, 0.0, -l],
         [0.6 * speed, 0.8 * speed, 0.0],
         2.0 * half,
@@ -414,20 +414,20 @@ def test_over_both_poles() -> None:
     np.testing.assert_allclose(run.qd[0], [-0.6 * top, -0.8 * top, 0.0], atol=1e-7)
     np.testing.assert_allclose(run.q[2], [0.0, 0.0, -l], atol=1e-8)
     np.testing.assert_allclose(np.linalg.norm(run.q, axis=1), l, rtol=1e-14)
-    radial = problems.spherical_pendulum_reaction(jnp.zeros(2), jnp.array([top / l, 0.0]), m=m, R=l, g=g)
+    radial = problems.spherical_pendulum.reaction(jnp.zeros(2), jnp.array([top / l, 0.0]), m=m, R=l, g=g)
     np.testing.assert_allclose(run.reactions["rod"].multiplier[0], [radial], rtol=1e-6)
 
 
 def test_four_bar_stays_closed() -> None:
-    q0, qd0 = problems.four_bar_state(0.3, 9.0)
-    scene = problems.four_bar()
+    q0, qd0 = problems.four_bar.state(0.3, 9.0)
+    scene = problems.four_bar.scene()
     ts = jnp.linspace(0.0, 2.0, 41)
     run = simulate(scene, q0, qd0, 2.0, ts=ts, rtol=1e-9, atol=1e-11)
     assert run.q[-1, 0] > 2 * np.pi
     closure: Any = scene.constraints[0]
     drift = jax.vmap(lambda q: closure.error(jnp.zeros(()), q, scene.params))(run.q)
     assert jnp.abs(drift).max() < 1e-12
-    q, qd = jax.vmap(problems.four_bar_state)(run.q[:, 0], run.qd[:, 0])
+    q, qd = jax.vmap(problems.four_bar.state)(run.q[:, 0], run.qd[:, 0])
     turned = (np.asarray(run.q - q) + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_allclose(turned, 0.0, atol=1e-12)
     np.testing.assert_allclose(run.qd, qd, atol=1e-10)
@@ -437,10 +437,10 @@ def test_four_bar_stays_closed() -> None:
 
 def test_runs_of_the_rolling_disc() -> None:
     """A steady circle closes; any other motion rolls on and keeps its energy."""
-    scene, turn, lean = problems.rolling_disc(**DISC), -1.3, 0.4
-    spin = float(problems.rolling_disc_steady_spin(lean, turn, **but(DISC, "m")))
+    scene, turn, lean = problems.rolling_disc.scene(**DISC), -1.3, 0.4
+    spin = float(problems.rolling_disc.steady_spin(lean, turn, **but(DISC, "m")))
     q0 = jnp.array([0.0, 0.0, 0.0, lean, 0.0])
-    qd0 = problems.rolling_disc_velocity(q0, jnp.array([turn, 0.0, spin]), R=DISC["R"])
+    qd0 = problems.rolling_disc.velocity(q0, jnp.array([turn, 0.0, spin]), R=DISC["R"])
     period = 2 * np.pi / abs(turn)
     how: dict[str, Any] = {"ts": np.linspace(0.0, period, 17), "rtol": 1e-10, "atol": 1e-12}
     run = simulate(scene, q0, qd0, period, **how)
@@ -450,20 +450,20 @@ def test_runs_of_the_rolling_disc() -> None:
     np.testing.assert_allclose(np.hypot(run.q[:, 0], run.q[:, 1] - radius), abs(radius), rtol=1e-8)
     np.testing.assert_allclose(run.q[-1], [0.0, 0.0, turn * period, lean, spin * period], atol=1e-7)
 
-    qd0 = problems.rolling_disc_velocity(q0, jnp.array([0.5, -1.0, 6.0]), R=DISC["R"])
+    qd0 = problems.rolling_disc.velocity(q0, jnp.array([0.5, -1.0, 6.0]), R=DISC["R"])
     run = simulate(scene, q0, qd0, period, **how)
     assert np.ptp(run.q[:, 3]) > 0.3
     energy = total(scene, run)
     np.testing.assert_allclose(energy, energy[0], rtol=1e-8)
-    rolls = jax.vmap(lambda q, w: problems.rolling_disc_velocity(q, w, R=DISC["R"]))(run.q, run.qd[:, 2:])
+    rolls = jax.vmap(lambda q, w: problems.rolling_disc.velocity(q, w, R=DISC["R"]))(run.q, run.qd[:, 2:])
     np.testing.assert_allclose(run.qd, rolls, atol=1e-13)
 
 
 def slipping_rod(mu: float, angle: float, rate: float, end: Callable[..., float]) -> tuple[float, float]:
     """Time and angle at which `end(angle, rate)` falls through zero; in slip the angle moves by itself."""
-    q, qd = problems.rod_on_rough_floor_state(angle, rate, 1e6, l=ROD["l"])
+    q, qd = problems.rod_on_rough_floor.state(angle, rate, 1e6, l=ROD["l"])
     turn = jax.jit(
-        lambda f, w: problems.rod_on_rough_floor_acceleration(q.at[2].set(f), qd.at[2].set(w), **{**ROD, "mu": mu})[2]
+        lambda f, w: problems.rod_on_rough_floor.acceleration(q.at[2].set(f), qd.at[2].set(w), **{**ROD, "mu": mu})[2]
     )
 
     def stop(t: float, y: Any) -> float:
@@ -485,15 +485,15 @@ def weight_left(angle: float, rate: float) -> float:
 
 def compliance_left(angle: float, rate: float) -> float:
     del rate
-    return float(problems.rod_on_rough_floor_compliance(jnp.asarray(angle), m=ROD["m"], mu=2.0)) - 1e-6
+    return float(problems.rod_on_rough_floor.compliance(jnp.asarray(angle), m=ROD["m"], mu=2.0)) - 1e-6
 
 
 def test_the_rod_ends_where_it_lifts_off_and_where_the_paradox_begins() -> None:
     ts = jnp.linspace(0.0, 0.5, 101)
 
     def run(mu: float, state: tuple[float, float, float]) -> Any:
-        scene = problems.rod_on_rough_floor(**{**ROD, "mu": mu})
-        q0, qd0 = problems.rod_on_rough_floor_state(*state, l=ROD["l"])
+        scene = problems.rod_on_rough_floor.scene(**{**ROD, "mu": mu})
+        q0, qd0 = problems.rod_on_rough_floor.state(*state, l=ROD["l"])
         return simulate(scene, q0, qd0, 0.5, ts=ts, rtol=1e-9, atol=1e-11, throw=False)
 
     # Lift-off.

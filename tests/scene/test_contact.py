@@ -11,7 +11,7 @@ import pytest
 
 from jaxmodsim import AppliedForce, Coulomb, Friction, LuGre, Regularized, Scene, SimulationError, Stribeck, simulate
 from jaxmodsim.scene._event_driven import Contact, next_modes, solve_friction_forces
-from jaxmodsim.validation.hard import Contradictory
+from jaxmodsim.validation.hard._many_events import Contradictory
 
 
 def masses(t: Any, q: Any, qd: Any, p: Any) -> Any:

@@ -77,7 +77,7 @@ def test_every_number_is_a_leaf() -> None:
             free,
             params={"m": x, "table": np.arange(3.0) + x, "count": 3},
             effects=(
-                AppliedForce(problems.SphericalSpiral(R=1.0 + x, a=0.2)),
+                AppliedForce(problems.spiral_bead.SphericalSpiral(R=1.0 + x, a=0.2)),
                 Friction(regularized(x), belt_velocity=0.1 * x, normal_force=3 + x),
                 Friction(LuGre(**LUGRE)),
                 Friction(DeadZone(Coulomb(1.5), width=x), belt_velocity=jnp.sin),
@@ -99,7 +99,7 @@ def regularized(x: float) -> Regularized:
 
 
 def test_numbers_can_be_replaced() -> None:
-    scene = problems.ramped_box(problems.box_lugre())
+    scene = problems.ramped_box.scene(problems.ramped_box.lugre())
     changed = eqx.tree_at(lambda s: s.effects[1].law.sigma0, scene, jnp.array(10.0))
     assert {10.0} == {float(x) for x in jax.tree.leaves(changed)} - {float(x) for x in jax.tree.leaves(scene)}
     assert 750.0 not in jax.tree.leaves(changed)
@@ -234,10 +234,10 @@ def euler_lagrange(lagrangian: Any, t: Any, q: Any, qd: Any, p: Any) -> Any:
 
 
 MECHANISMS = {
-    "box": (problems.ramped_box(), 1),
-    "spring": (problems.braked_spring(), 1),
-    "bead": (problems.spiral_bead(), 1),
-    "pendulum": (problems.spherical_pendulum(), 2),
+    "box": (problems.ramped_box.scene(), 1),
+    "spring": (problems.braked_spring.scene(), 1),
+    "bead": (problems.spiral_bead.scene(), 1),
+    "pendulum": (problems.spherical_pendulum.scene(), 2),
 }
 
 
@@ -263,10 +263,10 @@ BOOKKEEPING = {
 
 def test_frictionless_pendulum_has_only_the_functions_of_its_closed_form() -> None:
     """Sines and cosines of the Lagrangian, the quotients of the elimination; no factorisation, no loop."""
-    scene = problems.spherical_pendulum()
+    scene = problems.spherical_pendulum.scene()
     y = state(scene, 2)
     ours = primitives(lambda t, y, s: vector_field(t, y, s), jnp.array(0.3), y, scene)
-    closed = primitives(lambda q, qd: problems.spherical_pendulum_acceleration(q, qd), y.q, y.qd)
+    closed = primitives(lambda q, qd: problems.spherical_pendulum.acceleration(q, qd), y.q, y.qd)
     assert {"sin", "cos"} <= set(closed)
     assert set(ours) - set(closed) <= BOOKKEEPING
     # The Lagrangian's sine and cosine, which are their own slopes and curvatures: each is formed once.
@@ -275,7 +275,7 @@ def test_frictionless_pendulum_has_only_the_functions_of_its_closed_form() -> No
 
 EFFECTS = {
     "force": AppliedForce(push),
-    "force at a point": AppliedForce(pull, at=problems.SphericalSpiral(1.0, 0.2)),
+    "force at a point": AppliedForce(pull, at=problems.spiral_bead.SphericalSpiral(1.0, 0.2)),
     "viscous": Friction(Viscous(0.3)),
     "viscous under load": Friction(Viscous(0.3), normal_force=2.0, belt_velocity=jnp.sin),
     "regularized": Friction(Regularized(Coulomb(1.0), 1e-3)),
@@ -288,7 +288,10 @@ EFFECTS = {
 def test_an_effect_adds_only_its_own_terms(name: str) -> None:
     """Its own action and one addition to the right-hand side; and a state only if the law has one."""
     effect = EFFECTS[name]
-    bare, scene = problems.braked_spring(), eqx.tree_at(lambda s: s.effects, problems.braked_spring(), (effect,))
+    bare, scene = (
+        problems.braked_spring.scene(),
+        eqx.tree_at(lambda s: s.effects, problems.braked_spring.scene(), (effect,)),
+    )
     t = jnp.array(0.3)
     without = primitives(lambda t, y, s: vector_field(t, y, s), t, state(bare, 1), bare)
     with_it = primitives(lambda t, y, s: vector_field(t, y, s), t, state(scene, 1), scene)
@@ -313,7 +316,7 @@ def test_only_a_dead_zone_brings_the_holding_force() -> None:
 
     def pivots(law: Any) -> int:
         scene = Scene(
-            problems.spherical_pendulum().lagrangian,
+            problems.spherical_pendulum.scene().lagrangian,
             params={"m": 1.0, "R": 1.0, "g": 9.81},
             effects=(Friction(law, along=lambda q: q[1]),),
         )

@@ -23,14 +23,14 @@ def box(x: Any) -> Any:
     """The first event, to be differentiated by the numbers of the run, and the run."""
     law, ramp = x
     arguments: dict[str, Any] = {"ts": jnp.linspace(0.0, 3.0, 32), "adjoint": dfx.ForwardMode(), **TIGHT}
-    run = jms.simulate(problems.ramped_box(law, ramp=ramp), [0.0], [0.0], 3.0, throw=False, **arguments)
+    run = jms.simulate(problems.ramped_box.scene(law, ramp=ramp), [0.0], [0.0], 3.0, throw=False, **arguments)
     events = run.events
     seen = run.t, run.q[:, 0], run.qd[:, 0], run.mode["friction"], run.forces, events, run.stats["num_events"]
     return events.t[0], seen
 
 
 @pytest.mark.parametrize(
-    ("law", "ramp"), [(jms.Coulomb(1.5, 1.75), 1.3), (problems.box_stribeck(), 1.0)], ids=["coulomb", "stribeck"]
+    ("law", "ramp"), [(jms.Coulomb(1.5, 1.75), 1.3), (problems.ramped_box.stribeck(), 1.0)], ids=["coulomb", "stribeck"]
 )
 def test_box_breaks_away_when_the_pull_reaches_the_limit(law: Any, ramp: float) -> None:
     slopes, seen = jax.jit(jax.jacfwd(box, has_aux=True))((law, jnp.array(ramp)))
@@ -113,7 +113,7 @@ def changed_cycle(numbers: dict[str, float], name: str, x: float) -> np.ndarray:
 def stribeck_times(numbers: dict[str, Any], adjoint: Any) -> Any:
     p = dict(numbers)
     oscillator = {name: p.pop(name) for name in ("m", "k", "belt")}
-    scene = problems.belt_oscillator(jms.Stribeck(**p), **oscillator)
+    scene = problems.belt_oscillator.scene(jms.Stribeck(**p), **oscillator)
     # The law's second derivatives are singular at rest for exponents below 2. They enter the derivatives of an implicit
     # step, but not those of an explicit one.
     arguments = {"adjoint": adjoint, "throw": False, "solver": dfx.Tsit5(), **TIGHT}
@@ -131,7 +131,7 @@ def stribeck_slopes(numbers: dict[str, Any]) -> Any:
 
 def test_belt_oscillator_under_a_law_that_falls() -> None:
     for exponent in (1.0, 2.0):
-        numbers = {**problems.BELT_OSCILLATOR, **problems.BELT_STRIBECK, "exponent": exponent}
+        numbers = {**problems.belt_oscillator.PARAMS, **problems.belt_oscillator.STRIBECK, "exponent": exponent}
         slopes, times = stribeck_slopes({name: jnp.asarray(x) for name, x in numbers.items()})
         np.testing.assert_allclose(times, stribeck_cycle(numbers, 4), atol=1e-9)
         for name, x in numbers.items():
@@ -140,8 +140,8 @@ def test_belt_oscillator_under_a_law_that_falls() -> None:
             np.testing.assert_allclose(slopes[name][:3], exact, rtol=1e-6, atol=1e-7, err_msg=name)
 
 
-BELTS = {**problems.COUPLED_BELTS}
-LAWS = problems.COUPLED_BELTS_LAWS
+BELTS = {**problems.coupled_belts.PARAMS}
+LAWS = problems.coupled_belts.LAWS
 
 
 def coupled_rate(modes: Any) -> Callable[..., Any]:
@@ -184,7 +184,7 @@ def test_coupled_belts_follow_scipy_through_their_modes() -> None:
 
     @jax.jit
     def observe(q0: Any, qd0: Any) -> Any:
-        run = jms.simulate(problems.coupled_belts(), q0, qd0, 4.0, throw=False, **longer)
+        run = jms.simulate(problems.coupled_belts.scene(), q0, qd0, 4.0, throw=False, **longer)
         return run.events, run.q[-1], run.qd[-1]
 
     seen = set()
@@ -211,19 +211,19 @@ def test_coupled_belts_follow_scipy_through_their_modes() -> None:
         np.testing.assert_allclose([*q, *qd], y, atol=1e-8)
         if q0 == [0.0, 0.0]:
             limits = {"Fs1": LAWS[0]["Fs"], "Fs2": LAWS[1]["Fs"]}
-            first = problems.coupled_belts_first_slip(**{k: BELTS[k] for k in ("k1", "k2", "belt")}, **limits)
+            first = problems.coupled_belts.first_slip(**{k: BELTS[k] for k in ("k1", "k2", "belt")}, **limits)
             np.testing.assert_allclose(events.t[0], first.t, atol=1e-12)
             assert int(events.effect[0]) == int(first.which)
     assert {(0, 0), (-1, 0), (0, -1), (-1, -1)} <= seen
 
 
 def test_pendulum_loses_torque_times_angle_and_rests_within_the_range() -> None:
-    numbers = {**problems.STICK_SLIP_PENDULUM}
+    numbers = {**problems.stick_slip_pendulum.PARAMS}
     fs, weight = numbers.pop("Fs"), numbers["m"] * numbers["g"] * numbers["l"]
 
     @jax.jit
     def observe(q0: Any, ts: Any) -> Any:
-        scene = problems.stick_slip_pendulum()
+        scene = problems.stick_slip_pendulum.scene()
         run = jms.simulate(scene, q0, jnp.zeros(1), 12.0, ts=ts, throw=False, **TIGHT)
         return run.events, run.q[:, 0], run.qd[:, 0], run.mode["friction"], run.forces["friction"]
 
@@ -236,7 +236,7 @@ def test_pendulum_loses_torque_times_angle_and_rests_within_the_range() -> None:
         _, q, qd, mode, force = observe(jnp.array([q0]), ends.at[:16].set(jnp.minimum(events.t, 12.0)))
         turns = [q0]
         while weight * abs(np.sin(turns[-1])) > fs:
-            turns.append(float(problems.stick_slip_pendulum_turn(turns[-1], **numbers)))
+            turns.append(float(problems.stick_slip_pendulum.turn(turns[-1], **numbers)))
         assert len(turns) == n + 1
         np.testing.assert_allclose(q[:n], turns[1:], atol=1e-10)
         np.testing.assert_allclose(qd[:n], 0.0, atol=1e-12)
@@ -250,14 +250,14 @@ def test_pendulum_loses_torque_times_angle_and_rests_within_the_range() -> None:
         rests.append(weight * np.sin(turns[-1]))
     assert np.abs(rests).max() <= fs
     assert np.abs(rests).max() > 0.2 * fs
-    slope = jax.grad(lambda fc: problems.stick_slip_pendulum_turn(1.4, **{**numbers, "Fc": fc}))(numbers["Fc"])
+    slope = jax.grad(lambda fc: problems.stick_slip_pendulum.turn(1.4, **{**numbers, "Fc": fc}))(numbers["Fc"])
     by_steps = central_difference(
-        lambda fc: problems.stick_slip_pendulum_turn(1.4, **{**numbers, "Fc": fc}), numbers["Fc"], 1e-3
+        lambda fc: problems.stick_slip_pendulum.turn(1.4, **{**numbers, "Fc": fc}), numbers["Fc"], 1e-3
     )
     np.testing.assert_allclose(slope, by_steps, rtol=1e-10)
 
 
-def drop(ball: problems.BouncingBall, y0: Any, t1: Any, adjoint: Any = None, **options: Any) -> Any:
+def drop(ball: problems.bouncing_ball.BouncingBall, y0: Any, t1: Any, adjoint: Any = None, **options: Any) -> Any:
     hold, tol = ball.hold if options.pop("hold", False) else None, options.pop("tol", 1e-12)
     solver = jms.EventSolver(
         dfx.Tsit5(), ball.guards, ball.reset, on_zeno=hold, max_events=options.pop("max_events", 16)
@@ -277,14 +277,14 @@ def drop(ball: problems.BouncingBall, y0: Any, t1: Any, adjoint: Any = None, **o
 
 
 def bounces(x: Any, t1: Any, adjoint: Any = None) -> Any:
-    ys = drop(problems.BouncingBall(e=x["e"], g=x["g"]), x["y0"], t1, adjoint).ys
+    ys = drop(problems.bouncing_ball.BouncingBall(e=x["e"], g=x["g"]), x["y0"], t1, adjoint).ys
     t = ys.log.t[0, :5]
     return jnp.where(jnp.isfinite(t), t, 0.0), ys.y[0]
 
 
 @partial(jax.jacfwd, argnums=(0, 1, 2))
 def exact_slopes(e: Any, h: Any, g: Any) -> Any:
-    return problems.bouncing_ball_bounces(5, h=h, e=e, g=g)
+    return problems.bouncing_ball.bounces(5, h=h, e=e, g=g)
 
 
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
@@ -311,25 +311,25 @@ def test_derivatives_of_bounces(mode: str) -> None:
 
 def test_bouncing_ball_to_the_end_of_all_bounces() -> None:
     for e in (0.5, 0.8):
-        ball = problems.BouncingBall(e=e)
-        stop = problems.bouncing_ball_rest(h=1.0, e=e)
+        ball = problems.bouncing_ball.BouncingBall(e=e)
+        stop = problems.bouncing_ball.rest(h=1.0, e=e)
         solution = drop(ball, ball.dropped(1.0), 1.5 * stop, max_events=128)
         assert float(solution.ys.status[0]) == 1.0
         assert solution.result == dfx.RESULTS.dt_min_reached
         np.testing.assert_allclose(solution.ys.t[0], stop, atol=1e-8)
         np.testing.assert_allclose(solution.ts[0], stop, atol=1e-8)
         n = int(solution.ys.events[0])
-        exact = problems.bouncing_ball_bounces(n, h=1.0, e=e)
+        exact = problems.bouncing_ball.bounces(n, h=1.0, e=e)
         np.testing.assert_allclose(solution.ys.log.t[0, :n], exact, atol=1e-10)
 
 
 def test_bouncing_ball_comes_to_rest_where_it_may() -> None:
     e = 0.5
-    ball, stop = problems.BouncingBall(e=e), float(problems.bouncing_ball_rest(h=1.0, e=e))
+    ball, stop = problems.bouncing_ball.BouncingBall(e=e), float(problems.bouncing_ball.rest(h=1.0, e=e))
     ts = jnp.linspace(0.0, 1.5 * stop, 301)
     solution = drop(ball, ball.dropped(1.0), ts[-1], max_events=128, hold=True, saveat=dfx.SaveAt(ts=ts))
     assert solution.result == dfx.RESULTS.successful
-    height, velocity = problems.bouncing_ball_motion(ts, h=1.0, e=e)
+    height, velocity = problems.bouncing_ball.motion(ts, h=1.0, e=e)
     np.testing.assert_allclose(solution.ys.y[:, 0], height, atol=1e-9)
     np.testing.assert_allclose(solution.ys.y[:, 1], velocity, atol=1e-9)
     resting = np.asarray(ts) > stop
@@ -344,11 +344,11 @@ def test_no_bouncing_ball_falls_through_the_floor(dtype: str) -> None:
     es = jnp.linspace(0.05, 0.9, 60).astype(dtype)
 
     def run(e: Any) -> Any:
-        ball, t1 = problems.BouncingBall(e=e, g=jnp.asarray(9.81, dtype)), jnp.asarray(20.0, dtype)
+        ball, t1 = problems.bouncing_ball.BouncingBall(e=e, g=jnp.asarray(9.81, dtype)), jnp.asarray(20.0, dtype)
         return drop(ball, ball.dropped(1.0), t1, max_events=256, tol=1e-6).ys
 
     last = jax.jit(jax.vmap(run))(es)
     np.testing.assert_array_equal(last.status[:, 0], 1.0)
     np.testing.assert_allclose(last.y[:, 0, 0], 0.0, atol=1e-8)
-    rest = jax.vmap(lambda e: problems.bouncing_ball_rest(h=1.0, e=e))(es.astype(float))
+    rest = jax.vmap(lambda e: problems.bouncing_ball.rest(h=1.0, e=e))(es.astype(float))
     np.testing.assert_allclose(last.t[:, 0], rest, rtol=1e-4 if dtype == "float32" else 1e-8)

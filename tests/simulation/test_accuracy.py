@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim.problems import double_pendulum, named_problems
+from jaxmodsim.problems import n_link_pendulum, named_problems
 from jaxmodsim.simulation import named_series
 
 # Each problem compiles two methods. Of alike ones the cheaper to compile is here.
@@ -78,7 +78,7 @@ def test_accuracy_is_met(name: str) -> None:
 @pytest.fixture(scope="module")
 def pendulum() -> jms.Trajectory:
     return jms.simulate_to_accuracy(
-        double_pendulum(), [2.0, 1.5], [0.0, 0.0], 3.0, ts=np.linspace(0.0, 3.0, 11), accuracy=1e-6
+        n_link_pendulum.double_pendulum(), [2.0, 1.5], [0.0, 0.0], 3.0, ts=np.linspace(0.0, 3.0, 11), accuracy=1e-6
     )
 
 

@@ -16,7 +16,8 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim import problems
-from jaxmodsim.solvers import calls_back, unchecked
+from jaxmodsim.solvers import unchecked
+from jaxmodsim.solvers._unchecked import calls_back
 
 TIMES = np.linspace(0.0, 1.0, 5)
 
@@ -31,14 +32,14 @@ def driven_mass() -> jms.Scene:
 
 
 RUNS: dict[str, tuple[jms.Scene, list[float], dict[str, Any]]] = {
-    "plain": (problems.braked_spring(jms.Viscous(0.1)), [0.1], {}),
-    "stiff": (problems.ramped_box(problems.box_lugre()), [0.0], {}),
-    "events": (problems.belt_oscillator(), [0.0], {}),
-    "constraints": (problems.cartesian_pendulum(m=0.7, l=1.9, g=9.7), [1.9, 0.0], {}),
+    "plain": (problems.braked_spring.scene(jms.Viscous(0.1)), [0.1], {}),
+    "stiff": (problems.ramped_box.scene(problems.ramped_box.lugre()), [0.0], {}),
+    "events": (problems.belt_oscillator.scene(), [0.0], {}),
+    "constraints": (problems.cartesian_pendulum.scene(m=0.7, l=1.9, g=9.7), [1.9, 0.0], {}),
     "signals": (driven_mass(), [0.0], {}),
-    "fixed steps": (problems.braked_spring(jms.Viscous(0.1)), [0.1], {"dt": 0.01}),
+    "fixed steps": (problems.braked_spring.scene(jms.Viscous(0.1)), [0.1], {"dt": 0.01}),
     "implicit friction": (
-        problems.ramped_box(problems.box_lugre()),
+        problems.ramped_box.scene(problems.ramped_box.lugre()),
         [0.0],
         {"dt": 0.01, "solver": jms.ImplicitFriction()},
     ),
@@ -82,7 +83,7 @@ jax.monitoring.register_event_listener(lambda event, **_: counts.update([event.r
 import jaxmodsim as jms
 from jaxmodsim import problems
 
-scene = problems.belt_oscillator()
+scene = problems.belt_oscillator.scene()
 run = jms.simulate(scene, [0.0], [0.0], 1.5, ts=jnp.linspace(0.0, 1.5, 4))
 end = lambda q0: jms.simulate(scene, q0, [0.0], 1.5).q[-1, 0]
 slope = jax.grad(end)(jnp.zeros(1))
@@ -113,7 +114,7 @@ def test_the_next_process_compiles_nothing(tmp_path: Path) -> None:
     }
 
 
-SPRING = problems.braked_spring(jms.Viscous(0.1))
+SPRING = problems.braked_spring.scene(jms.Viscous(0.1))
 
 # What is not known before the run and cannot be run.
 ILL_POSED: dict[str, dict[str, Any]] = {

@@ -12,7 +12,7 @@ import jaxmodsim as jms
 from jaxmodsim import problems
 from jaxmodsim.scene import replace_elements
 
-BOX = problems.ramped_box(problems.box_lugre())
+BOX = problems.ramped_box.scene(problems.ramped_box.lugre())
 TS = jnp.linspace(0.0, 10.0, 11)
 
 
@@ -49,7 +49,7 @@ def test_parameter_out_of_range_is_found_where_it_was_not_built() -> None:
 
 def test_parameter_out_of_range_inside_jit() -> None:
     def distance(Fc: Any) -> Any:
-        scene = problems.ramped_box(problems.box_lugre(Fc=Fc))
+        scene = problems.ramped_box.scene(problems.ramped_box.lugre(Fc=Fc))
         return jms.simulate(scene, [0.0], [0.0], 10.0).q[-1, 0]
 
     compiled = eqx.filter_jit(distance)
@@ -87,7 +87,7 @@ def test_field_that_is_not_finite_from_the_start() -> None:
 
 def test_pendulum_at_the_pole_names_its_coordinate() -> None:
     with pytest.raises(jms.SimulationError, match=r"singular or indefinite at coordinate q\[1\]") as info:
-        jms.simulate(problems.spherical_pendulum(), [0.0, 0.0], [0.1, 0.0], 1.0)
+        jms.simulate(problems.spherical_pendulum.scene(), [0.0, 0.0], [0.1, 0.0], 1.0)
     assert "coordinates involved: q[1]" in str(info.value)
 
 
@@ -120,7 +120,7 @@ def test_outcomes_can_be_read_under_jit() -> None:
 
 def test_a_tolerance_above_the_width_of_a_smoothed_law_is_refused() -> None:
     """At ten widths the velocity after break-away came 1.5 % low, and nothing was said."""
-    box = problems.ramped_box(jms.Regularized(jms.Coulomb(1.5), width=1e-7))
+    box = problems.ramped_box.scene(jms.Regularized(jms.Coulomb(1.5), width=1e-7))
 
     def run(width: Any, **arguments: Any) -> jms.Trajectory:
         scene = replace_elements(box, {"friction.width": width})

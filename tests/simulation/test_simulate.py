@@ -201,26 +201,31 @@ def test_energy_balance_of_a_lagrangian_that_depends_on_time() -> None:
 
 
 def test_default_solver() -> None:
-    smooth = problems.ramped_box(jms.Viscous(0.1))
+    smooth = problems.ramped_box.scene(jms.Viscous(0.1))
     assert isinstance(default_solver(smooth, 1, fixed_step=False), dfx.Tsit5)
-    assert isinstance(default_solver(problems.ramped_box(), 1, fixed_step=False), dfx.Tsit5)
-    assert isinstance(default_solver(problems.ramped_box(jms.Sign(jms.Coulomb(1.0))), 1, fixed_step=False), dfx.Tsit5)
-    assert isinstance(default_solver(problems.ramped_box(problems.box_lugre()), 1, fixed_step=False), jms.Rodas5P)
+    assert isinstance(default_solver(problems.ramped_box.scene(), 1, fixed_step=False), dfx.Tsit5)
     assert isinstance(
-        default_solver(problems.ramped_box(jms.Regularized(jms.Coulomb(1.0), 0.1)), 1, fixed_step=False), jms.Rodas5P
+        default_solver(problems.ramped_box.scene(jms.Sign(jms.Coulomb(1.0))), 1, fixed_step=False), dfx.Tsit5
     )
-    exact = problems.ramped_box(jms.Coulomb(1.0))
+    assert isinstance(
+        default_solver(problems.ramped_box.scene(problems.ramped_box.lugre()), 1, fixed_step=False), jms.Rodas5P
+    )
+    assert isinstance(
+        default_solver(problems.ramped_box.scene(jms.Regularized(jms.Coulomb(1.0), 0.1)), 1, fixed_step=False),
+        jms.Rodas5P,
+    )
+    exact = problems.ramped_box.scene(jms.Coulomb(1.0))
     assert isinstance(default_solver(exact, 1, fixed_step=False), jms.Rodas5P)
     assert isinstance(default_solver(exact, 2, fixed_step=False), dfx.Tsit5)
     # Nothing rejects a spoilt step where steps are fixed, so there the elimination swaps rows.
-    fixed = default_solver(problems.ramped_box(problems.box_lugre()), 1, fixed_step=True)
+    fixed = default_solver(problems.ramped_box.scene(problems.ramped_box.lugre()), 1, fixed_step=True)
     assert isinstance(fixed, jms.Rodas5P)
     assert fixed.pivot
 
 
 def ramp_to(**arguments: Any) -> jms.Trajectory:
     """Box without friction: v = v0 + ramp t^2/(2 m), x = v0 t + ramp t^3/(6 m), exact for methods of order 3 and up."""
-    return jms.simulate(problems.ramped_box(), [0.0], [0.5], 3.0, **arguments)
+    return jms.simulate(problems.ramped_box.scene(), [0.0], [0.5], 3.0, **arguments)
 
 
 @pytest.mark.quick
@@ -255,7 +260,7 @@ def test_a_fixed_step_is_kept() -> None:
 
 
 def test_a_run_of_no_length() -> None:
-    run = jms.simulate(problems.ramped_box(), [0.0], [0.5], 0.0)
+    run = jms.simulate(problems.ramped_box.scene(), [0.0], [0.5], 0.0)
     np.testing.assert_array_equal(run.q, [[0.0]])
     np.testing.assert_array_equal(run.qd, [[0.5]])
 
@@ -293,7 +298,7 @@ def test_a_run_of_no_length() -> None:
 )
 def test_wrong_arguments_are_refused(changes: dict[str, Any], text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as users have it, who get our own words
-    arguments = {"scene": problems.ramped_box(), "q0": [0.0], "qd0": [0.5], "t1": 3.0} | changes
+    arguments = {"scene": problems.ramped_box.scene(), "q0": [0.0], "qd0": [0.5], "t1": 3.0} | changes
     with pytest.raises(ValueError, match=text):
         jms.simulate(**arguments)
 
@@ -338,7 +343,7 @@ def test_the_page_of_code_that_must_always_work() -> None:
 @pytest.mark.parametrize("ts", [None, jnp.linspace(0.0, 3.0, 7)])
 def test_gradients_under_vmap_are_right_in_lanes_that_finish_early(ts: Any) -> None:
     """Finished lanes take steps of length zero until the last one is through; these must not reach the derivative."""
-    scene = problems.ramped_box(problems.box_lugre())
+    scene = problems.ramped_box.scene(problems.ramped_box.lugre())
 
     def position(m: Any) -> Any:
         run = jms.simulate(eqx.tree_at(lambda s: s.params["m"], scene, m), [0.0], [0.0], 3.0, ts=ts)

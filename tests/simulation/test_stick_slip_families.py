@@ -87,7 +87,9 @@ def compared(name: str) -> Compared:
 @pytest.mark.parametrize("name", NAMES)
 def test_runs_reach_the_end(name: str) -> None:
     found = compared(name)
-    messages = outcome_messages(linear_stick_slip(found.family.members[0].system), found.family.members[0].system.size)
+    messages = outcome_messages(
+        linear_stick_slip.scene(found.family.members[0].system), found.family.members[0].system.size
+    )
     failed = found.codes != 0
     assert not failed.any(), found.describe(failed) + "\n" + messages[found.codes[failed][0]]
 
@@ -118,7 +120,7 @@ def test_few_members_are_left_out(name: str) -> None:
 def test_accuracy_is_met_or_its_lack_is_said() -> None:
     asked = 1e-6
     for member in draw_family("shaken_box", 24 if is_deep() else 4, seed=1).members:
-        scene = linear_stick_slip(member.system)
+        scene = linear_stick_slip.scene(member.system)
         try:
             run = jms.simulate_to_accuracy(scene, member.q0, member.qd0, member.t1, accuracy=asked)
         except jms.SimulationError:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from jaxmodsim import Gauss
-from jaxmodsim.solvers import GAUSS, FiniteSteps, collocation_start, collocation_step
+from jaxmodsim.solvers import FiniteSteps
+from jaxmodsim.solvers._collocation import GAUSS, collocation_start, collocation_step
 
 from ..helpers.differences import central_difference
 

@@ -10,7 +10,7 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim._core.monotone import rising_root, solve_monotone
-from jaxmodsim.problems import box_lugre, ramped_box
+from jaxmodsim.problems import ramped_box
 
 from ..helpers.differences import flat, gradient_by_differences
 
@@ -51,7 +51,7 @@ def errors(scene: jms.Scene, q0: Any, qd0: Any, t1: float, steps: Any) -> np.nda
 @pytest.mark.quick
 def test_order_on_the_test_bench() -> None:
     for sigma1 in (0.0, 40.0):
-        table = errors(ramped_box(box_lugre(sigma1=sigma1)), [0.0], [0.0], 4.0, [4e-3, 2e-3, 1e-3])
+        table = errors(ramped_box.scene(ramped_box.lugre(sigma1=sigma1)), [0.0], [0.0], 4.0, [4e-3, 2e-3, 1e-3])
         np.testing.assert_allclose(np.log2(table[:-1] / table[1:]), 1.0, atol=0.1)
         assert table[-1] < 1e-3
 
@@ -207,7 +207,7 @@ def test_bounded_at_any_step_and_stiffness(name: str, dtype: Any) -> None:
 
 def test_rodas5p_at_the_same_steps_does_not_hold() -> None:
     """What there was for fixed steps: it runs away where the step is far too long for the bristle."""
-    scene = ramped_box(box_lugre(sigma0=1e7, sigma1=2.0 * (2.0 * 1e7) ** 0.5))
+    scene = ramped_box.scene(ramped_box.lugre(sigma0=1e7, sigma1=2.0 * (2.0 * 1e7) ** 0.5))
     run = jms.simulate(scene, [0.0], [0.0], 4.0, dt=0.1, solver=jms.Rodas5P(), throw=False)
     assert not np.abs(run.qd[-1, 0]) < 1e6
     held = jms.simulate(scene, [0.0], [0.0], 4.0, dt=0.1, solver=SOLVER)
@@ -249,7 +249,7 @@ def test_lanes_that_finish_early_have_gradients(saved: bool) -> None:
     def value(scene: Any, t1: Any) -> Any:
         return end(scene, None, t1, jnp.linspace(0.0, 1.0, 3) * t1 if saved else None)
 
-    scene = ramped_box(box_lugre(sigma0=1e5, sigma1=300.0), ramp=30.0)
+    scene = ramped_box.scene(ramped_box.lugre(sigma0=1e5, sigma1=300.0), ramp=30.0)
     gradients = jax.jit(jax.vmap(jax.grad(value), (None, 0)))
     together, alone = gradients(scene, jnp.array([0.01, 0.1, 0.2])), gradients(scene, jnp.full(3, 0.1))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(together))
@@ -259,7 +259,7 @@ def test_lanes_that_finish_early_have_gradients(saved: bool) -> None:
 
 
 def test_forces_and_energy_follow_from_the_state() -> None:
-    scene = ramped_box(box_lugre(sigma0=1e7))
+    scene = ramped_box.scene(ramped_box.lugre(sigma0=1e7))
     ts = jnp.linspace(0.0, 4.0, 9)
     run = jms.simulate(scene, [0.0], [0.0], 4.0, ts=ts, dt=1e-3, solver=SOLVER)
     # In stick friction is the load of the step that ended, saved times being ends of steps.
@@ -270,28 +270,28 @@ def test_forces_and_energy_follow_from_the_state() -> None:
 
 def test_scaled_by_and_no_friction() -> None:
     """A law at half its force is the law with half its parameters; without friction it is semi-implicit Euler."""
-    half = jms.scaled_by(box_lugre(), lambda t, q, qd, p: 0.5)
+    half = jms.scaled_by(ramped_box.lugre(), lambda t, q, qd, p: 0.5)
     same = jms.LuGre(sigma0=375.0, sigma1=0.0, sigma2=0.05, Fc=0.75, Fs=0.875, vs=0.2)
-    ends = [jms.simulate(ramped_box(x), [0.0], [0.0], 2.0, dt=1e-2, solver=SOLVER).qd for x in (half, same)]
+    ends = [jms.simulate(ramped_box.scene(x), [0.0], [0.0], 2.0, dt=1e-2, solver=SOLVER).qd for x in (half, same)]
     np.testing.assert_allclose(*ends, rtol=1e-12)
-    free = jms.simulate(ramped_box(), [0.0], [0.0], 1.0, dt=0.1, solver=SOLVER)
+    free = jms.simulate(ramped_box.scene(), [0.0], [0.0], 1.0, dt=0.1, solver=SOLVER)
     np.testing.assert_allclose(free.qd[0], 0.5 * 0.1 * 0.1 * 45.0, rtol=1e-12)
 
 
 @pytest.mark.quick
 def test_what_it_cannot_step_is_refused() -> None:
     def run(law: Any, **options: Any) -> Any:
-        return jms.simulate(ramped_box(law), [0.0], [0.0], 1.0, solver=SOLVER, **{"dt": 0.1, **options})
+        return jms.simulate(ramped_box.scene(law), [0.0], [0.0], 1.0, solver=SOLVER, **{"dt": 0.1, **options})
 
     with pytest.raises(ValueError, match=r"no estimate of its error: pass the step, as in dt=1e-3"):
-        run(box_lugre(), dt=None)
+        run(ramped_box.lugre(), dt=None)
     for law in (jms.Coulomb(1.0), jms.Sign(jms.Coulomb(1.0))):
         with pytest.raises(ValueError, match=r"'friction' has a force that jumps at rest .*Regularized"):
             run(law)
     with pytest.raises(ValueError, match=r"'friction' is a DeadZone.*Regularized"):
         run(jms.DeadZone(jms.Coulomb(1.0), width=0.1))
     floor = jms.Constraint(lambda t, q, p: q[1:], name="floor")
-    leaning = jms.Friction(box_lugre(), along=lambda q: q[0], normal_force="floor")
+    leaning = jms.Friction(ramped_box.lugre(), along=lambda q: q[0], normal_force="floor")
     plane = lambda t, q, qd, p: 0.5 * p["m"] * jnp.sum(qd**2)  # noqa: E731
     scene = jms.Scene(plane, params={"m": 1.0}, effects=(leaning,), constraints=(floor,))
     with pytest.raises(ValueError, match=r"reaction of the constraint 'floor' for its load"):

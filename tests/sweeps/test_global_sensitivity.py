@@ -152,7 +152,7 @@ def of_belts(method: str, count: int, **ranges: tuple[float, float]) -> GlobalSe
     """A mass let go beside the middle Fc/k of its swing, on belts slow and fast."""
     named = {"friction.belt_velocity": ranges["belt"], "k": ranges["k"]}
     options: dict[str, Any] = {"t1": 10.0, "ts": jnp.linspace(0.0, 10.0, 401), "max_events": 64}
-    scene = problems.belt_oscillator()
+    scene = problems.belt_oscillator.scene()
     return global_sensitivity(scene, OBSERVE, named, method=method, count=count, q0=[0.06], qd0=[0.0], **options)
 
 
@@ -169,7 +169,7 @@ def test_belts_that_stick_and_that_do_not(belt: GlobalSensitivity) -> None:
     np.testing.assert_allclose(belt.shares["stick-slip cycle"], sticks.mean(), rtol=1e-12)
     period = np.asarray(belt.runs["events"])
     np.testing.assert_array_equal(np.isfinite(period), sticks)
-    exact = problems.belt_oscillator_cycle(m=1.0, k=k, belt=v, Fc=5.0, Fs=8.0)
+    exact = problems.belt_oscillator.cycle(m=1.0, k=k, belt=v, Fc=5.0, Fs=8.0)
     np.testing.assert_allclose(period[sticks], np.asarray(exact.period)[sticks], rtol=1e-4)
     assert any("events is not defined" in remark for remark in belt.remarks)
     assert "steady is the same in all runs." in belt.remarks
@@ -222,7 +222,7 @@ def test_one_kind_of_motion() -> None:
     assert found.crossings is None
     assert found.remarks == ("steady is the same in all runs.",)
     numbers = {"m": 1.0, "k": 117.0, "Fc": 5.0, "Fs": 8.0}
-    exact = [problems.belt_oscillator_cycle(belt=0.06 + 0.06 * x / 3, **numbers).period for x in range(4)]
+    exact = [problems.belt_oscillator.cycle(belt=0.06 + 0.06 * x / 3, **numbers).period for x in range(4)]
     chords = sorted(float((exact[i] - exact[i + 2]) * 1.5) for i in (0, 1))
     assert 0.9 * chords[0] < found.overall["events"].indices["mu_star"][0] < 1.1 * chords[1]
     assert len(plot.indices_figure(found).axes) == 3
@@ -248,7 +248,7 @@ def test_garbage_is_refused(more: dict[str, Any], text: str) -> None:
 
 
 def test_what_is_no_number_is_refused() -> None:
-    scene, ranges = problems.ramped_box(jms.Viscous(0.1)), {"m": (1.0, 3.0)}
+    scene, ranges = problems.ramped_box.scene(jms.Viscous(0.1)), {"m": (1.0, 3.0)}
     with pytest.raises(ValueError, match="observed is: v"):
         global_sensitivity(scene, {"v": "qd[0]"}, ranges, by="kind", q0=[0.0], qd0=[0.0], t1=0.1)
     with pytest.raises(ValueError, match="one number of each run, but 'value' has the dimensions"):

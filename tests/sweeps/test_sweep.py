@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 
 import jaxmodsim as jms
-from jaxmodsim.problems import box_lugre, ramped_box
+from jaxmodsim.problems import ramped_box
 from jaxmodsim.sweeps import Derivative, SweepProgress
 
 from ..helpers.optimized import optimized
@@ -30,7 +30,7 @@ def peak(run: jms.Trajectory) -> Any:
 
 # Functions count by identity: one mapping for all tests compiles once.
 OBSERVE = {"v": "qd[0]", "friction": "friction", "peak": (peak, "m/s")}
-SCENE = ramped_box(box_lugre())
+SCENE = ramped_box.scene(ramped_box.lugre())
 
 
 def box_sweep(**changes: Any) -> xr.Dataset:
@@ -50,7 +50,7 @@ def test_numbers_are_those_of_single_runs(found: xr.Dataset) -> None:
     assert found["v"].dims == ("friction.sigma0", "m", "time")
     assert (found["result"] == 0).all()
     for i, j in ((0, 0), (8, 13), (4, 5)):
-        scene = ramped_box(box_lugre(sigma0=SIGMA0[i]), m=MASS[j])
+        scene = ramped_box.scene(ramped_box.lugre(sigma0=SIGMA0[i]), m=MASS[j])
         run = jms.simulate(scene, ts=TS, **START)
         np.testing.assert_allclose(found["v"][i, j], run.qd[:, 0], rtol=1e-10, atol=1e-13)
         np.testing.assert_allclose(found["friction"][i, j], run.forces["friction"], rtol=1e-10, atol=1e-13)
@@ -122,7 +122,7 @@ def test_a_lane_of_many_steps_is_run_again_among_its_like() -> None:
     assert runs["result"][4] == 0
     assert "step limit" in runs["result"].attrs["flag_meanings"][int(runs["result"][9])]
     others = [i for i in range(14) if i not in (4, 9)]
-    scene = ramped_box(box_lugre(), m=MASS[4])
+    scene = ramped_box.scene(ramped_box.lugre(), m=MASS[4])
     run = jms.simulate(scene, ts=TS, rtol=1e-12, atol=1e-15, **START)
     np.testing.assert_allclose(runs["v"][4], run.qd[:, 0], rtol=1e-11, atol=1e-14)
     assert (runs["result"][others] == 0).all()
@@ -155,7 +155,7 @@ def test_derivatives_are_those_of_the_run() -> None:
     assert list(found["slopes_wrt"].values) == ["m", "friction.Fc", "qd0[0]"]
 
     def end(m: float, fc: float, v: float) -> float:
-        scene = ramped_box(box_lugre(Fc=fc), m=m)
+        scene = ramped_box.scene(ramped_box.lugre(Fc=fc), m=m)
         return float(jms.simulate(scene, [0.0], [v], 4.0, rtol=1e-10, atol=1e-13).qd[-1, 0])
 
     # The field is smooth: a step of 1e-4 leaves 1e-8 of truncation, and the run at rtol 1e-6 some 1e-5.
@@ -182,10 +182,10 @@ def test_a_function_may_be_swept() -> None:
 
 def test_a_function_may_return_a_run() -> None:
     def run(gain: Any) -> jms.Trajectory:
-        return jms.simulate(ramped_box(box_lugre(sigma2=gain)), throw=False, **START)
+        return jms.simulate(ramped_box.scene(ramped_box.lugre(sigma2=gain)), throw=False, **START)
 
     found = jms.sweep(run, {"gain": [0.1, 0.4]}, {"v": "qd[0]"})
-    single = jms.simulate(ramped_box(box_lugre(sigma2=0.4)), **START)
+    single = jms.simulate(ramped_box.scene(ramped_box.lugre(sigma2=0.4)), **START)
     np.testing.assert_allclose(found["v"][1], single.qd[-1, 0], rtol=1e-10)
     assert "step limit" in found["result"].attrs["flag_meanings"][1]
 
@@ -266,7 +266,7 @@ def test_mistakes_are_named(monkeypatch: pytest.MonkeyPatch, changes: dict[str, 
 @pytest.mark.filterwarnings("ignore")
 def test_a_function_that_raises_says_how_it_should_not() -> None:
     def end(m: Any) -> Any:
-        return jms.simulate(ramped_box(box_lugre(), m=m), **START).qd[-1, 0]
+        return jms.simulate(ramped_box.scene(ramped_box.lugre(), m=m), **START).qd[-1, 0]
 
     with pytest.raises(RuntimeError, match=r"mass matrix .* Pass throw=False"):
         jms.sweep(end, {"m": [1.0, -2.0]})

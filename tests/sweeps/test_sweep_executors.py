@@ -15,12 +15,12 @@ import pytest
 import xarray as xr
 
 import jaxmodsim as jms
-from jaxmodsim.problems import box_lugre, ramped_box
+from jaxmodsim.problems import ramped_box
 from jaxmodsim.sweeps import SweepProgress
 
 from ..helpers.optimized import optimized
 
-SCENE = ramped_box(box_lugre())
+SCENE = ramped_box.scene(ramped_box.lugre())
 OVER = {"m": np.linspace(1.0, 3.0, 80), "friction.Fc": [1.2, 1.5, 1.7]}
 CHUNK = 12
 

@@ -16,7 +16,7 @@ import pytest
 import xarray as xr
 
 import jaxmodsim as jms
-from jaxmodsim.problems import box_lugre, ramped_box
+from jaxmodsim.problems import ramped_box
 from jaxmodsim.sweeps import SweepProgress
 
 # A function that compiles at once, and a grid of 10 x 13 chunks.
@@ -146,9 +146,9 @@ def test_results_of_something_else_are_refused(whole: Path, tmp_path: Path) -> N
 
 def test_another_scene_is_refused_by_its_number(tmp_path: Path) -> None:
     given: dict[str, Any] = {"q0": [0.0], "qd0": [0.0], "t1": 0.1, "out": tmp_path / "box.zarr"}
-    jms.sweep(ramped_box(box_lugre()), {"m": [1.0, 2.0]}, ["q[0]"], **given)
+    jms.sweep(ramped_box.scene(ramped_box.lugre()), {"m": [1.0, 2.0]}, ["q[0]"], **given)
     with pytest.raises(ValueError, match=r"numbers: friction.Fc was 1.5, is 1.4; .*rtol.* was 1e-06, is 1e-07"):
-        jms.sweep(ramped_box(box_lugre(Fc=1.4)), {"m": [1.0, 2.0]}, ["q[0]"], rtol=1e-7, **given)
+        jms.sweep(ramped_box.scene(ramped_box.lugre(Fc=1.4)), {"m": [1.0, 2.0]}, ["q[0]"], rtol=1e-7, **given)
 
 
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:

@@ -15,9 +15,10 @@ from jaxmodsim._core.state_dependent import StateDependent
 from jaxmodsim.cli import _behaviour
 from jaxmodsim.friction import AbstractLaw, Dahl, LuGre
 from jaxmodsim.plot import behaviour_figure
-from jaxmodsim.validation.behaviour import EXPERIMENTS, LawMeasurement, Verdict, law_cases, run_bench
+from jaxmodsim.validation.behaviour import EXPERIMENTS, Verdict, law_cases, run_bench
 from jaxmodsim.validation.behaviour._drive import SAMPLES, path, respond
 from jaxmodsim.validation.behaviour._laws import DEFLECTION, FC, FS, SIGMA0, WIDTH, LawCase
+from jaxmodsim.validation.behaviour._result import LawMeasurement
 
 BENCH = {each.name: each for each in law_cases()}
 # Experiments with a prescribed motion compile in no time; those with a mass take some seconds for each law.

@@ -12,7 +12,9 @@ from jaxmodsim.cli import _hard
 from jaxmodsim.plot import hard_figure
 from jaxmodsim.problems import ramped_box
 from jaxmodsim.validation import hard
-from jaxmodsim.validation.hard import CaseReport, CheckFinding, HardCase, MeasuredNumber, RefusedCalls
+from jaxmodsim.validation.hard import CaseReport, HardCase
+from jaxmodsim.validation.hard._case import MeasuredNumber, RefusedCalls
+from jaxmodsim.validation.hard._check import DTYPES, CheckFinding
 
 CASES = hard.hard_cases()
 
@@ -28,7 +30,7 @@ def test_every_case_says_why_it_is_hard_and_what_is_right():
         # A transform, or a transform in one type.
         assert set(case.skips) <= {
             *hard.TRANSFORMS,
-            *(f"{transform} {dtype}" for transform in hard.TRANSFORMS for dtype in hard.DTYPES),
+            *(f"{transform} {dtype}" for transform in hard.TRANSFORMS for dtype in DTYPES),
         }
         assert all(case.skips.values())
 
@@ -61,7 +63,7 @@ def test_friction_keeps_its_limit_at_all_times_of_a_bristle_that_is_loaded_at_on
     """At 10 m/s the bristle is at its limit within 2e-11 s, which a stiff step of 1e-3 s passes over."""
     law = jms.LuGre(sigma0=1e8, sigma1=0.0, sigma2=0.0, Fc=0.02, Fs=0.02, vs=0.1)
     ts = np.concatenate([[0.0], np.geomspace(1e-12, 1.0, 60)])
-    run = jms.simulate(ramped_box(law), [0.0], [10.0], 1.0, ts=ts)
+    run = jms.simulate(ramped_box.scene(law), [0.0], [10.0], 1.0, ts=ts)
     assert float(jnp.max(run.forces["friction"])) < 0.02 * (1.0 + 1e-3)
 
 
@@ -74,11 +76,9 @@ def test_checks_fail_where_something_is_wrong():
         "value": replace(STEP, exact=lambda ramp: ramp / 4.0 + 1e-5),
         "end": replace(STEP, ends="step limit"),
         "derivative": replace(STEP, exact=lambda ramp: 0.25 + 0.0 * ramp),
-        "measured": HardCase("m", "numbers", "", "", "", MeasuredNumber(lambda: 1.0), lambda _: 2.0),
-        "refused": HardCase("r", "numbers", "", "", "", RefusedCalls({"x": lambda: None}, {"x": "anything"})),
-        "other text": HardCase(
-            "r", "numbers", "", "", "", RefusedCalls({"x": lambda: jms.Coulomb(-1.0)}, {"x": "Fs must"})
-        ),
+        "measured": HardCase("m", "", "", MeasuredNumber(lambda: 1.0), lambda _: 2.0),
+        "refused": HardCase("r", "", "", RefusedCalls({"x": lambda: None}, {"x": "anything"})),
+        "other text": HardCase("r", "", "", RefusedCalls({"x": lambda: jms.Coulomb(-1.0)}, {"x": "Fs must"})),
     }
     for what, case in wrong.items():
         transforms = ["forward"] if what == "derivative" else ["alone"]

@@ -9,6 +9,7 @@ from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
 from ..._core.parameters import check_ranges, ranges_of
+from ..._core.shapes import Scalar
 from ..._core.state_dependent import StateDependent
 from .._law import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw
 from .._passivity import Passivity
@@ -19,7 +20,7 @@ _Law = TypeVar("_Law")
 _ONE_WAY = "friction that depends on the direction: export the law of one direction, or the mean of both"
 
 
-def _toward(v: Float[Array, ""], law: "AbstractAsymmetric") -> PyTree:
+def _toward(v: Scalar, law: "AbstractAsymmetric") -> PyTree:
     """The law that holds at velocity `v`."""
     names = tuple(law.backward)
     values = [jnp.where(v < 0, law.backward[name], getattr(law.forward, name)) for name in names]
@@ -79,7 +80,7 @@ class _AsymmetricForce(AbstractAsymmetric, AbstractForceLaw):  # pyright: ignore
     forward: AbstractForceLaw
     backward: dict[str, PyTree]
 
-    def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def force(self, v: Scalar) -> Scalar:
         return _toward(v, self).force(v)
 
 
@@ -89,13 +90,13 @@ class _AsymmetricSetValued(AbstractAsymmetric, AbstractSetValuedLaw):  # pyright
     forward: AbstractSetValuedLaw
     backward: dict[str, PyTree]
 
-    def sliding_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def sliding_force(self, v: Scalar) -> Scalar:
         return _toward(v, self).sliding_force(v)
 
-    def viscous_force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def viscous_force(self, v: Scalar) -> Scalar:
         return _toward(v, self).viscous_force(v)
 
-    def static_limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+    def static_limit(self, direction: Scalar) -> Scalar:
         return _toward(direction, self).static_limit(direction)
 
 
@@ -108,17 +109,17 @@ class _AsymmetricDynamic(AbstractAsymmetric, AbstractDynamicLaw):  # pyright: ig
     def initial_state(self, v: Float[Array, "..."]) -> PyTree:
         return self.forward.initial_state(v)
 
-    def zdot(self, v: Float[Array, ""], z: PyTree) -> PyTree:
+    def zdot(self, v: Scalar, z: PyTree) -> PyTree:
         return _toward(v, self).zdot(v, z)
 
-    def force_given_zdot(self, v: Float[Array, ""], z: PyTree, rate: PyTree) -> Float[Array, ""]:
+    def force_given_zdot(self, v: Scalar, z: PyTree, rate: PyTree) -> Scalar:
         return _toward(v, self).force_given_zdot(v, z, rate)
 
-    def stored_energy(self, z: PyTree) -> Float[Array, ""]:
+    def stored_energy(self, z: PyTree) -> Scalar:
         """Energy [J] in the state: stiffness is one for both directions."""
         return self.forward.stored_energy(z)
 
-    def step_exact(self, v: Float[Array, ""], z: PyTree, dt: Float[Array, ""]) -> PyTree:
+    def step_exact(self, v: Scalar, z: PyTree, dt: Scalar) -> PyTree:
         return _toward(v, self).step_exact(v, z, dt)
 
     def passivity(self) -> Passivity | None:

@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from ..._core.parameters import Number, parameter
+from ..._core.shapes import Scalar
 from .._law import AbstractKarnoppLaw, AbstractSetValuedLaw, register_law
 from ._wrapper import AbstractWrapper, set_valued_law
 
@@ -50,14 +51,14 @@ class DeadZone(AbstractWrapper, AbstractKarnoppLaw):
     example: ClassVar[Mapping[str, float]] = {"width": 1e-4}
     example_step: ClassVar[float | None] = 1e-4
 
-    def holds(self, v: Float[Array, ""]) -> Bool[Array, ""]:
+    def holds(self, v: Scalar) -> Bool[Array, ""]:
         """Whether `v` [m/s] lies in the band, edges included."""
         return jnp.abs(v) <= self.width
 
-    def static_limit(self, direction: Float[Array, ""]) -> Float[Array, ""]:
+    def static_limit(self, direction: Scalar) -> Scalar:
         """Largest holding force [N]."""
         return self.law.static_limit(direction)
 
-    def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def force(self, v: Scalar) -> Scalar:
         """Slip force [N] at velocity `v` [m/s]."""
         return self.law.sliding_force(v) * jnp.sign(v) + self.law.viscous_force(v)

@@ -3,10 +3,10 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ..._core.parameters import Number, parameter
 from ..._core.safe import bounded_ratio
+from ..._core.shapes import Scalar
 from .._law import AbstractForceLaw, AbstractSetValuedLaw, register_law
 from ._wrapper import AbstractWrapper, set_valued_law
 
@@ -42,7 +42,7 @@ class Regularized(AbstractWrapper, AbstractForceLaw):
         first, *rest = self.law.formulas()
         return first.replace("sign(v)", "tanh(v/width)"), *rest, f"width = {float(self.width):.4g} m/s"
 
-    def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def force(self, v: Scalar) -> Scalar:
         """Friction force [N] at velocity `v` [m/s]."""
         v = jnp.asarray(v)
         level, spread = self.law.sliding_force(v), 0.5 * bounded_ratio(v, self.width)

@@ -3,8 +3,8 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
+from ..._core.shapes import Scalar
 from .._law import AbstractForceLaw, AbstractSetValuedLaw, register_law
 from ._wrapper import AbstractWrapper, set_valued_law
 
@@ -33,6 +33,6 @@ class Sign(AbstractWrapper, AbstractForceLaw):
     jumps: ClassVar[bool] = True
     example_step: ClassVar[float | None] = 1e-4
 
-    def force(self, v: Float[Array, ""]) -> Float[Array, ""]:
+    def force(self, v: Scalar) -> Scalar:
         """Friction force [N] at velocity `v` [m/s]; exactly zero at `v = 0`."""
         return self.law.sliding_force(v) * jnp.sign(v) + self.law.viscous_force(v)

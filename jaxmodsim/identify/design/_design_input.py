@@ -368,12 +368,7 @@ def _merit(task: _Task, x: Float[np.ndarray, " weights"]) -> float:
 
 
 def _improve(
-    task: _Task,
-    sines: list[np.ndarray],
-    plain: np.ndarray,
-    seed: int,
-    max_steps: int,
-    progress: DesignProgress | None,
+    task: _Task, sines: list[np.ndarray], plain: np.ndarray, seed: int, max_steps: int, progress: DesignProgress | None
 ) -> tuple[Float[np.ndarray, " weights"], str]:
     """The best motion found from the best of some random ones; the best sine if none is better."""
     # Weights in units of the largest sine of their frequency.
@@ -394,12 +389,7 @@ def _improve(
 
 
 def _climb(
-    task: _Task,
-    start: np.ndarray,
-    lengths: np.ndarray,
-    max_steps: int,
-    progress: DesignProgress | None,
-    count: int,
+    task: _Task, start: np.ndarray, lengths: np.ndarray, max_steps: int, progress: DesignProgress | None, count: int
 ) -> tuple[Float[np.ndarray, " weights"], str, int]:
     """Improve the criterion by SLSQP; also says how it ended, and counts the iterations on."""
     seen: dict[bytes, list[np.ndarray]] = {}

@@ -102,7 +102,7 @@ class Excitation:
 class InputDesign:
     """An input that tells most about the numbers that are to be found, within limits.
 
-    - `best`: the designed input; `t`, `q_ref`, `qd_ref`, `force`, `information` and `errors` are its own.
+    - `best`: the designed input.
     - `plain`: the best single sine within the same limits and of the same duration.
     - `values`, `units`: the free numbers that it was designed for, and the unit of each that declares one.
     - `limits`: the `Limits`.
@@ -121,36 +121,6 @@ class InputDesign:
     single_precision: bool
 
     @property
-    def t(self) -> Float[np.ndarray, " time"]:
-        """Times [s]."""
-        return self.best.t
-
-    @property
-    def q_ref(self) -> Float[np.ndarray, " time"]:
-        """Position that is asked for [m]."""
-        return self.best.q_ref
-
-    @property
-    def qd_ref(self) -> Float[np.ndarray, " time"]:
-        """Velocity that is asked for [m/s]."""
-        return self.best.qd_ref
-
-    @property
-    def force(self) -> Float[np.ndarray, " time"]:
-        """Force that leads the model along them [N]."""
-        return self.best.force
-
-    @property
-    def information(self) -> Float[np.ndarray, "free free"]:
-        """Fisher information of the relative numbers."""
-        return self.best.information
-
-    @property
-    def errors(self) -> dict[str, float]:
-        """Predicted standard errors by name."""
-        return self.best.errors
-
-    @property
     def used(self) -> dict[str, float]:
         """Share of each limit that the input uses, at most 1, by its name."""
         best = self.best
@@ -167,8 +137,8 @@ class InputDesign:
         remarks = []
         where = f"Within {self.limits}"
         for name, value in self.values.items():
-            share = self.errors[name] / abs(value) if value else 0.0
-            if not np.isfinite(self.errors[name]):
+            share = self.best.errors[name] / abs(value) if value else 0.0
+            if not np.isfinite(self.best.errors[name]):
                 remarks.append(f"{where}, {name} has no effect on the record.")
             elif share > _VAGUE:
                 remarks.append(
@@ -186,7 +156,7 @@ class InputDesign:
         if full:
             remarks.append(f"What limits it: {' and '.join(full)}.")
         off = float(np.max(np.abs(self.best.q - self.best.q_ref)))
-        reach = float(np.max(np.abs(self.q_ref - self.q_ref[0])))
+        reach = float(np.max(np.abs(self.best.q_ref - self.best.q_ref[0])))
         if off > _OFF * reach:
             remarks.append(
                 f"The force alone leaves the motion by up to {off:.2g} m even in the model: lead the axis by position"
@@ -201,7 +171,7 @@ class InputDesign:
     def rows(self) -> list[tuple[str, float, float, float, str]]:
         """Rows of a table: name, value, predicted standard error, that of the plain sine, unit."""
         return [
-            (name, value, self.errors[name], self.plain.errors[name], self.units[name])
+            (name, value, self.best.errors[name], self.plain.errors[name], self.units[name])
             for name, value in self.values.items()
         ]
 
@@ -209,8 +179,8 @@ class InputDesign:
         """All but the samples, as JSON knows it: errors that are infinite are None."""
         return jsonable(
             {
-                "duration": float(self.t[-1] - self.t[0]),
-                "samples": len(self.t),
+                "duration": float(self.best.t[-1] - self.best.t[0]),
+                "samples": len(self.best.t),
                 "noise": self.noise,
                 "limits": {name: value for name, (value, _) in self.limits.given.items()},
                 "used": self.used,
@@ -218,7 +188,7 @@ class InputDesign:
                     name: {"value": value, "standard_error": error, "standard_error_of_a_sine": plain, "unit": unit}
                     for name, value, error, plain, unit in self.rows()
                 },
-                "information": {"names": list(self.values), "matrix": self.information.tolist()},
+                "information": {"names": list(self.values), "matrix": self.best.information.tolist()},
                 "ending": self.ending,
                 "remarks": list(self.remarks),
             }
@@ -234,7 +204,7 @@ class InputDesign:
 
         - `OSError` if the file cannot be written.
         """
-        columns = np.column_stack([self.t, self.q_ref, self.qd_ref, self.force])
+        columns = np.column_stack([self.best.t, self.best.q_ref, self.best.qd_ref, self.best.force])
         with written_whole(path) as file:
             np.savetxt(file, columns, fmt="%.9g", delimiter=",", header="t,q_ref,qd_ref,force", comments="")
 
@@ -246,5 +216,5 @@ class InputDesign:
             share = f"{100 * error / abs(value):8.2g}" if value else f"{'-':>8}"
             lines.append(f"{name:{width}}  {value:13.6g}  {error:11.2g}  {share}  {plain:11.2g}  {unit}")
         used = ", ".join(f"{name} {100 * share:.0f} %" for name, share in self.used.items())
-        span = f"{len(self.t)} samples, {self.t[-1] - self.t[0]:g} s, noise {self.noise:g}; used: {used}"
+        span = f"{len(self.best.t)} samples, {self.best.t[-1] - self.best.t[0]:g} s, noise {self.noise:g}; used: {used}"
         return "\n".join([*lines, span, *self.remarks])

@@ -33,9 +33,7 @@ class AbstractInitializer(eqx.Module):
 
 
 def run_initializers(
-    initializers: AbstractInitializer | Sequence[AbstractInitializer],
-    problem: FitProblem,
-    options: SearchOptions,
+    initializers: AbstractInitializer | Sequence[AbstractInitializer], problem: FitProblem, options: SearchOptions
 ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
     """Where the search starts after one initializer or several, each from where the one before it ended."""
     x, starts = problem.x0, ()

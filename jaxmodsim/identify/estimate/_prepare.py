@@ -273,10 +273,7 @@ def _bases(
 
 
 def _engine(
-    scene: Scene,
-    records: tuple[Record, ...],
-    settings: Settings,
-    observables: tuple[tuple[str, Observable], ...],
+    scene: Scene, records: tuple[Record, ...], settings: Settings, observables: tuple[tuple[str, Observable], ...]
 ) -> ReplayEngine | EventEngine:
     linear = records[0].linear
     delays = {DELAY + name: jnp.asarray(late, float) for name, late in settings.delay.items()}

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ..._core.arguments import as_mapping, did_you_mean
 from ..._core.index_check import traced
-from ...scene import Friction, Scene, State, scene_forces
+from ...scene import Friction, Scene, State, forward_dynamics
 from ..data._record import Record
 
 # `observe(q, qd)`, or "q[0]", "qd[1]", or the name of an effect, whose force is meant.
@@ -87,13 +87,11 @@ def _shape(observable: Observable, y: State, scene: Scene) -> tuple[int, ...] | 
     return getattr(jax.eval_shape(look), "shape", None)
 
 
-def observer(
-    observables: tuple[tuple[str, Observable], ...],
-) -> Callable[[Array, State, Scene], dict[str, Array]]:
+def observer(observables: tuple[tuple[str, Observable], ...]) -> Callable[[Array, State, Scene], dict[str, Array]]:
     """A function of time, state and scene that returns what each channel sees."""
 
     def observe(t: Array, y: State, scene: Scene) -> dict[str, Array]:
-        forces = scene_forces(t, y, scene) if any(needs_forces(x) for _, x in observables) else {}
+        forces = forward_dynamics(t, y, scene).forces if any(needs_forces(x) for _, x in observables) else {}
         return {channel: observed(observable, y.q, y.qd, forces) for channel, observable in observables}
 
     return observe

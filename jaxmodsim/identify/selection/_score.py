@@ -57,12 +57,7 @@ class Score:
 
 
 def score(
-    result: FitResult,
-    record: Record,
-    *,
-    q0: _Start = None,
-    qd0: _Start = None,
-    free_start: bool = True,
+    result: FitResult, record: Record, *, q0: _Start = None, qd0: _Start = None, free_start: bool = True
 ) -> Score:
     """Run a fitted model on another record, with nothing fitted but its initial state.
 

@@ -7,11 +7,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import PyTree
 
 from ..._core.arguments import as_label
 from ..._core.functions import as_function, result_shape
 from ..._core.position import PositionFn, as_position_fn
+from ..._core.shapes import PerDof, Scalar
 from ._effect import AbstractEffect, Action, Power
 
 
@@ -50,7 +51,7 @@ class AppliedForce(AbstractEffect):
         """Applied forces are taken to be smooth."""
         return False
 
-    def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
+    def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check the shape that `fn` returns."""
         given = result_shape(self.fn, t=q[0], q=q, qd=qd, params=params, name=f"fn of AppliedForce {name!r}")
         wanted = q.shape
@@ -63,16 +64,12 @@ class AppliedForce(AbstractEffect):
                 " Return jnp.array([...]) with one entry for each."
             )
 
-    def initial_state(self, q: Float[Array, " dof"], params: PyTree) -> PyTree:
+    def initial_state(self, q: PerDof, params: PyTree) -> PyTree:
         """An applied force has no state."""
-        del q, params
         return None
 
-    def act(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
-    ) -> Action:
+    def act(self, t: Scalar, q: PerDof, qd: PerDof, z: PyTree, params: PyTree) -> Action:
         """Force as given, and mapped to the coordinates."""
-        del z
         force = jnp.asarray(self.fn(t, q, qd, params), q.dtype)
         at = self.at
         if at is None:
@@ -80,14 +77,10 @@ class AppliedForce(AbstractEffect):
         _, pull = jax.vjp(lambda q: at(q, params), q)
         return Action(pull(force)[0], force)
 
-    def power(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, action: Action
-    ) -> Power:
+    def power(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, action: Action) -> Power:
         """All of it comes from outside."""
-        del t, q, params
         return Power(jnp.sum(action.generalised * qd))
 
     def stored_energy(self, z: PyTree) -> float:
         """Nothing is stored."""
-        del z
         return 0.0

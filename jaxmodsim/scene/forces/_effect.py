@@ -7,6 +7,8 @@ import equinox as eqx
 from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
+from ..._core.shapes import PerDof, Scalar
+
 
 class Action(NamedTuple):
     """What an effect does at one state.
@@ -16,7 +18,7 @@ class Action(NamedTuple):
     - `rate`: time derivative of the effect's own state; None where it has none.
     """
 
-    generalised: Float[Array, " dof"]
+    generalised: PerDof
     force: Float[Array, "..."]
     rate: PyTree = None
 
@@ -27,8 +29,8 @@ class Power(NamedTuple):
     None for an effect that never absorbs any: what is zero by nature is not integrated.
     """
 
-    supplied: Float[Array, ""]
-    absorbed: Float[Array, ""] | None = None
+    supplied: Scalar
+    absorbed: Scalar | None = None
 
 
 class AbstractEffect(eqx.Module):
@@ -51,25 +53,21 @@ class AbstractEffect(eqx.Module):
         """Whether the effect makes the equations of motion stiff."""
 
     @abc.abstractmethod
-    def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
+    def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check shapes against the mechanism while tracing; raises `ValueError` naming the effect."""
 
     @abc.abstractmethod
-    def initial_state(self, q: Float[Array, " dof"], params: PyTree) -> PyTree:
+    def initial_state(self, q: PerDof, params: PyTree) -> PyTree:
         """State at rest and unloaded, at the coordinates `q`; None for an effect without one."""
 
     @abc.abstractmethod
-    def act(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
-    ) -> Action:
+    def act(self, t: Scalar, q: PerDof, qd: PerDof, z: PyTree, params: PyTree) -> Action:
         """Forces and the rate of the own state `z`."""
 
     @abc.abstractmethod
-    def power(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, action: Action
-    ) -> Power:
+    def power(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, action: Action) -> Power:
         """Power of an action of this effect."""
 
     @abc.abstractmethod
-    def stored_energy(self, z: PyTree) -> Float[Array, ""] | float:
+    def stored_energy(self, z: PyTree) -> Scalar | float:
         """Energy [J] held in the own state."""

@@ -16,6 +16,7 @@ from ..._core.functions import as_function, result_shape
 from ..._core.parameters import Number, as_number, check_ranges, modules_of, optional_parameter
 from ..._core.position import PositionFn, as_position_fn
 from ..._core.safe import safe_norm
+from ..._core.shapes import PerDof, Scalar
 from ..._core.state_dependent import StateDependent, is_state_dependent
 from ...friction import (
     AbstractAsymmetric,
@@ -112,9 +113,7 @@ class Friction(AbstractEffect):
         """Refuse an ellipse out of range."""
         check_ranges(self)
 
-    def bind_state(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-    ) -> "Friction":
+    def bind_state(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> "Friction":
         """With the law as it is at this state; itself where the law does not depend on that."""
         if not is_state_dependent(self.law):
             return self
@@ -145,7 +144,7 @@ class Friction(AbstractEffect):
         """Name of the constraint whose reaction is the load; None for other loads."""
         return self.normal_force.constraint if isinstance(self.normal_force, ReactionLoad) else None
 
-    def check(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, name: str) -> None:
+    def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check that displacement, belt velocity and load have the shapes they need."""
         shape = self._shape(q, params, name)
         if self.along is None and q.shape != (1,):
@@ -200,14 +199,14 @@ class Friction(AbstractEffect):
                 f" returns one, but {self.belt_velocity} was given."
             )
 
-    def initial_state(self, q: Float[Array, " dof"], params: PyTree) -> PyTree:
+    def initial_state(self, q: PerDof, params: PyTree) -> PyTree:
         """State of the law; None where it has none."""
         if not isinstance(self.law, AbstractDynamicLaw):
             return None
         slip = () if q.shape == (1,) else self._shape(q, params, self.name or self.default_name)
         return self.law.initial_state(jnp.zeros(slip or (), q.dtype))
 
-    def direction(self, q: Float[Array, " dof"], params: PyTree) -> Float[Array, " dof"]:
+    def direction(self, q: PerDof, params: PyTree) -> PerDof:
         """Gradient d along/dq of a scalar slip: the generalised force of a unit force along the displacement."""
         if self.along is None:
             return jnp.ones_like(q)
@@ -215,25 +214,23 @@ class Friction(AbstractEffect):
             return jnp.reshape(self._pace(q, params), (1,))
         return jax.grad(self.along)(q, params)
 
-    def _pace(self, q: Float[Array, "1"], params: PyTree) -> Float[Array, ""]:
+    def _pace(self, q: Float[Array, "1"], params: PyTree) -> Scalar:
         """Displacement per unit of the one coordinate; of a position the length of its tangent."""
         tangent = self._moves(q, jnp.ones_like(q), params)
         return tangent if tangent.ndim == 0 else safe_norm(tangent)
 
-    def _moves(self, q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree) -> Float[Array, "..."]:
+    def _moves(self, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, "..."]:
         """Rate of the displacement."""
         along = self.along
         assert along is not None
         return jax.jvp(lambda q: along(q, params), (q,), (qd,))[1]
 
-    def belt(self, t: Float[Array, ""]) -> Float[Array, "..."]:
+    def belt(self, t: Scalar) -> Float[Array, "..."]:
         """Velocity [m/s or rad/s] of the surface."""
         fn = self.belt_velocity
         return jnp.asarray(fn(t), t.dtype) if callable(fn) else fn
 
-    def slip(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-    ) -> Float[Array, "..."]:
+    def slip(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, "..."]:
         """Slip velocity [m/s or rad/s], a scalar, or a vector where `along` is a position that moves freely."""
         if self.along is None:
             return qd[0] - self.belt(t)
@@ -241,27 +238,18 @@ class Friction(AbstractEffect):
             return self._pace(q, params) * qd[0] - self.belt(t)
         return self._moves(q, qd, params) - self.belt(t)
 
-    def slip_and_rate(
-        self,
-        t: Float[Array, ""],
-        q: Float[Array, " dof"],
-        qd: Float[Array, " dof"],
-        qdd: Float[Array, " dof"],
-        params: PyTree,
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def slip_and_rate(self, t: Scalar, q: PerDof, qd: PerDof, qdd: PerDof, params: PyTree) -> tuple[Scalar, Scalar]:
         """Slip velocity, and its rate where the accelerations are `qdd`."""
         return jax.jvp(lambda t, q, qd: self.slip(t, q, qd, params), (t, q, qd), (jnp.ones_like(t), qd, qdd))
 
-    def load(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree
-    ) -> Float[Array, ""] | None:
+    def load(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar | None:
         """Normal load [N], never negative; None where the law's forces are in newtons, or per newton of a reaction."""
         fn = self.normal_force
         if fn is None or isinstance(fn, ReactionLoad):
             return None
         return jnp.maximum(jnp.asarray(fn(t, q, qd, params) if callable(fn) else fn), 0.0)
 
-    def apply_force(self, q: Float[Array, " dof"], force: Float[Array, "..."], params: PyTree) -> Float[Array, " dof"]:
+    def apply_force(self, q: PerDof, force: Float[Array, "..."], params: PyTree) -> PerDof:
         """Generalised force of the friction force `force`."""
         if self.along is None:
             return jnp.reshape(-force, (1,))
@@ -271,15 +259,13 @@ class Friction(AbstractEffect):
         _, pull = jax.vjp(lambda q: along(q, params), q)
         return pull(-force)[0]
 
-    def static_limit(self, direction: Float[Array, ""], load: Float[Array, ""] | None) -> Float[Array, ""]:
+    def static_limit(self, direction: Scalar, load: Scalar | None) -> Scalar:
         """Largest force [N] in stick against a load towards `direction` (+1 or -1)."""
         assert isinstance(self.law, AbstractSetValuedLaw | AbstractKarnoppLaw)
         limit = self.law.static_limit(direction)
         return limit if load is None else load * limit
 
-    def slip_force(
-        self, v: Float[Array, ""], direction: Float[Array, ""], load: Float[Array, ""] | None
-    ) -> Float[Array, ""]:
+    def slip_force(self, v: Scalar, direction: Scalar, load: Scalar | None) -> Scalar:
         """Force [N] of a set-valued law in slip at velocity `v` towards `direction` (+1 or -1).
 
         A trial step may run past the end of the slip. There the law goes on as a straight line, so that the field is
@@ -297,7 +283,7 @@ class Friction(AbstractEffect):
         return force if load is None else load * force
 
     def force_per_load(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
+        self, t: Scalar, q: PerDof, qd: PerDof, z: PyTree, params: PyTree
     ) -> tuple[Float[Array, "..."], PyTree]:
         """The law's force, in newtons or per newton of load, and the rate of its state."""
         v = self._stretch(self.slip(t, q, qd, params))
@@ -308,7 +294,7 @@ class Friction(AbstractEffect):
         return self._stretch(_of_slip(self.law.force, v)), None
 
     def step_exact(
-        self, v: Float[Array, "..."], z: PyTree, dt: Float[Array, ""], load: Float[Array, ""] | None
+        self, v: Float[Array, "..."], z: PyTree, dt: Scalar, load: Scalar | None
     ) -> tuple[Float[Array, "..."], PyTree]:
         """Friction force over, and state of the law after, the time `dt` [s] at constant slip velocity `v`.
 
@@ -329,22 +315,18 @@ class Friction(AbstractEffect):
         """What the law sees of a slip, and what its force is to the mechanism."""
         return x if self.ellipse is None else x * jnp.stack([jnp.ones_like(self.ellipse), self.ellipse])
 
-    def act(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], z: PyTree, params: PyTree
-    ) -> Action:
+    def act(self, t: Scalar, q: PerDof, qd: PerDof, z: PyTree, params: PyTree) -> Action:
         """Friction force, its generalised force and the rate of the law's state."""
         force, rate = self.force_per_load(t, q, qd, z, params)
         load = self.load(t, q, qd, params)
         force = force if load is None else load * force
         return Action(self.apply_force(q, force, params), force, rate)
 
-    def power(
-        self, t: Float[Array, ""], q: Float[Array, " dof"], qd: Float[Array, " dof"], params: PyTree, action: Action
-    ) -> Power:
+    def power(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, action: Action) -> Power:
         """The belt brings in -F times its velocity; slip absorbs F times the slip velocity."""
         return Power(-jnp.sum(action.force * self.belt(t)), jnp.sum(action.force * self.slip(t, q, qd, params)))
 
-    def stored_energy(self, z: PyTree) -> Float[Array, ""] | float:
+    def stored_energy(self, z: PyTree) -> Scalar | float:
         """Energy [J] in the law's state, for laws in newtons; under a load of its own, or varying, it has none."""
         if isinstance(self.law, AbstractDynamicLaw) and self.normal_force is None and not is_state_dependent(self.law):
             return self.law.stored_energy(z)

@@ -3,8 +3,6 @@
 from ._bench import EXPERIMENTS as EXPERIMENTS
 from ._bench import run_bench as run_bench
 from ._experiment import Experiment as Experiment
-from ._laws import LawCase as LawCase
 from ._laws import law_cases as law_cases
 from ._result import ExperimentResult as ExperimentResult
-from ._result import LawMeasurement as LawMeasurement
 from ._result import Verdict as Verdict

@@ -13,7 +13,6 @@ BACKWARD = 1.3
 
 
 def _double(t: Array, q: Array, qd: Array, p: object) -> float:
-    del t, q, qd, p
     return 2.0
 
 

@@ -36,12 +36,10 @@ class PulledRun(NamedTuple):
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q
     return 0.5 * p["m"] * qd[0] ** 2
 
 
 def _load(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del qd
     spring = p["k"] * (p["pull"] * t - q[0])
     shaken = p["load"] + p["shake"] * jnp.sin(2.0 * jnp.pi * p["frequency"] * t)
     # Put on so gently that nothing swings beyond it.

@@ -124,10 +124,9 @@ class RefusedCalls:
 class HardCase:
     """A case in which simulations go wrong.
 
-    - `name`, `family`: as in `hard_cases`.
+    - `name`: as in `hard_cases`.
     - `why`: the reason it is hard.
     - `naive`: what a plain simulation does.
-    - `asks`: what is asked for, with its unit.
     - `task`: a `SceneTask`, a `FunctionTask`, `MeasuredNumber` or `RefusedCalls`.
     - `exact`: the right answer as a function of the number the task is a function of, in closed form.
     - `slope`: its derivative in closed form, where differences of `exact` do not give it.
@@ -143,13 +142,13 @@ class HardCase:
     - `undefined`: why there is no derivative; empty where there is one. Then `check_gradients` must say so.
     - `conserves`: whether the energy balance has to close: not where the run fails, or where fixed steps are long.
     - `skips`: entries of `TRANSFORMS` that are not run, in both types or in one ("reverse float32"), and the reason.
+    - `asks`: what is asked for, with its unit; by default as the task says it.
+    - `family`: as in `hard_cases`, which sets it.
     """
 
     name: str
-    family: str
     why: str
     naive: str
-    asks: str
     task: SceneTask | FunctionTask | MeasuredNumber | RefusedCalls
     exact: Callable[[float], float] | None = None
     slope: Callable[[float], float] | None = None
@@ -162,6 +161,15 @@ class HardCase:
     undefined: str = ""
     conserves: bool = True
     skips: Mapping[str, str] = field(default_factory=dict)
+    asks: str = ""
+    family: str = ""
+
+    def __post_init__(self) -> None:
+        """What is asked for, where the task says it."""
+        if not self.asks and isinstance(self.task, SceneTask) and self.task.read in (position, velocity):
+            unit = "m" if self.task.read is position else "m/s"
+            asks = f"{self.task.read.__name__} at {float(self.task.t1):g} s [{unit}]"
+            object.__setattr__(self, "asks", asks)
 
 
 def motion(

@@ -11,17 +11,7 @@ from scipy.integrate import solve_ivp
 
 from ...friction import Coulomb
 from ...mechanics import Constraint, Spherical
-from ...problems import (
-    FOUR_BAR,
-    cartesian_spherical_pendulum,
-    four_bar,
-    four_bar_acceleration,
-    four_bar_state,
-    rod_on_rough_floor,
-    rod_on_rough_floor_state,
-    spherical_pendulum,
-    spherical_pendulum_motion,
-)
+from ...problems import cartesian_pendulum, four_bar, rod_on_rough_floor, spherical_pendulum
 from ...scene import AppliedForce, Friction, Scene
 from ...simulation import Trajectory
 from ._case import Answer, FunctionTask, HardCase, SceneTask, end_time, motion, position
@@ -44,10 +34,10 @@ def _poles() -> list[HardCase]:
     turn = 1e-8 * math.sqrt(2.0 * _G * (1.0 + math.cos(phi))) / math.sin(phi) ** 2
 
     def angle(turn: float) -> float:
-        return float(spherical_pendulum_motion(t1, phi, turn))
+        return float(spherical_pendulum.motion(t1, phi, turn))
 
     cartesian = motion(
-        cartesian_spherical_pendulum(),
+        cartesian_pendulum.cartesian_spherical_pendulum(),
         [math.sin(phi), 0.0, math.cos(phi)],
         [0.0, turn * math.sin(phi), 0.0],
         t1,
@@ -56,46 +46,42 @@ def _poles() -> list[HardCase]:
     )
 
     def by_gravity(g: float) -> float:
-        return math.cos(float(spherical_pendulum_motion(t1, phi, turn, g=g)))
+        return math.cos(float(spherical_pendulum.motion(t1, phi, turn, g=g)))
 
     return [
         HardCase(
             "pole_passed",
-            FAMILY,
             "The pendulum passes 1e-8 rad beside the pole of its coordinates, theta turning by pi within 1e-8 s.",
             "Steps over the turn: the pendulum comes back on the wrong side, or with another angular momentum.",
-            "angle phi at 1 s [rad]",
-            motion(spherical_pendulum(), [phi, 0.0], [0.0, turn], t1, by="qd0[1]", read=position),
+            motion(spherical_pendulum.scene(), [phi, 0.0], [0.0, turn], t1, by="qd0[1]", read=position),
             angle,
+            asks="angle phi at 1 s [rad]",
             single_ends="step limit was reached before t1|step size fell below what the time can resolve",
         ),
         HardCase(
             "pole_start",
-            FAMILY,
             "A start at the pole, where the mass matrix is singular.",
             "NaN, or a division by 1e-33.",
-            "the sentence",
-            motion(spherical_pendulum(), [0.0, 0.0], [0.1, 0.0], t1, by="g", read=position),
+            motion(spherical_pendulum.scene(), [0.0, 0.0], [0.1, 0.0], t1, by="g", read=position),
+            asks="the sentence",
             ends=r"singular or indefinite at coordinate q\[1\]",
         ),
         HardCase(
             "pole_cartesian",
-            FAMILY,
             "The same passage in coordinates without a pole, held on the sphere by a constraint.",
             "The length drifts.",
-            "height at 1 s [m]",
             cartesian,
             by_gravity,
+            asks="height at 1 s [m]",
             tolerance=1e-5,
         ),
         HardCase(
             "chart_at_pole",
-            FAMILY,
             "Acceleration in spherical components at the pole itself, where the basis has no direction of theta.",
             "0/0 in scale factors and Christoffel symbols.",
-            "component along theta, 2 r phi' theta' [m/s^2]",
             FunctionTask(_at_pole, 0.5, "phi' [rad/s]"),
             lambda rate: 2.0 * 2.0 * rate * 0.7,
+            asks="component along theta, 2 r phi' theta' [m/s^2]",
         ),
     ]
 
@@ -109,7 +95,6 @@ def _at_pole(rate: Array, adjoint: object) -> Answer:
 
 def _shared(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     """A body at q[0] + q[1], and one of mass `light` at q[1], each on a spring."""
-    del t
     kinetic = 0.5 * p["m"] * (qd[0] + qd[1]) ** 2 + 0.5 * p["light"] * qd[1] ** 2
     return kinetic - 0.5 * p["k"] * (q[0] + q[1]) ** 2 - 0.5 * p["light"] * q[1] ** 2
 
@@ -129,21 +114,19 @@ def _mass_matrices() -> list[HardCase]:
     return [
         HardCase(
             "mass_nearly_singular",
-            FAMILY,
             "A mass matrix of condition 4e14: two coordinates for one body and next to nothing.",
             "Inverted as it stands, the loss of 14 digits spreads to the body, too.",
-            "position of the body at 5 s [m]",
             task(1e-14),
             body,
+            asks="position of the body at 5 s [m]",
             single_ends="singular or indefinite at coordinate q",
         ),
         HardCase(
             "mass_singular",
-            FAMILY,
             "Two coordinates for one body: no acceleration belongs to a force.",
             "Infinity, or a least-squares answer to a question that has none.",
-            "the sentence",
             task(0.0),
+            asks="the sentence",
             ends=r"singular or indefinite at coordinate q\[1\]",
         ),
     ]
@@ -151,7 +134,6 @@ def _mass_matrices() -> list[HardCase]:
 
 def _gimbals(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     """A free sphere in angles of yaw, pitch and roll."""
-    del t
     return 0.5 * p["J"] * (jnp.sum(qd**2) - 2.0 * qd[0] * qd[2] * jnp.sin(q[1]))
 
 
@@ -167,23 +149,21 @@ def _gimbal_lock() -> list[HardCase]:
     return [
         HardCase(
             "gimbal_passed",
-            FAMILY,
             "Rotation passes gimbal lock at 1e-4 rad: yaw and roll each turn by pi in 1e-4 s.",
             "The turn is stepped over, energy jumps.",
-            "pitch at 2.5 s [rad]",
             motion(scene, [0.0, 0.0, 0.0], [off, 1.0, 0.0], t1, by="qd0[0]", read=_second),
             pitch,
+            asks="pitch at 2.5 s [rad]",
             # sin(pitch) comes as close to 1 as 5e-9; the turn of pi is resolved to the tolerance all the same.
             tolerance=1e-5,
             single=None,
         ),
         HardCase(
             "gimbal_start",
-            FAMILY,
             "A start in gimbal lock.",
             "NaN, or rates of 1e16.",
-            "the sentence",
             motion(scene, [0.0, 0.5 * math.pi, 0.0], [0.1, 0.0, 0.0], t1, by="J", read=_second),
+            asks="the sentence",
             ends=r"singular or indefinite at coordinate q\[2\]",
         ),
     ]
@@ -195,69 +175,64 @@ def four_bar_by_scipy(angle: float, rate: float, t1: float) -> float:
 
     @jax.jit
     def acceleration(angle: Array, rate: Array) -> Array:
-        return four_bar_acceleration(angle, rate)[0]
+        return four_bar.acceleration(angle, rate)[0]
 
     def field(t: float, y: np.ndarray) -> list[float]:
-        del t
         return [y[1], float(acceleration(y[0], y[1]))]
 
     solution = solve_ivp(field, (0.0, t1), [angle, rate], method="DOP853", rtol=1e-9, atol=1e-11)
-    return float(four_bar_state(solution.y[0, -1], 0.0)[0][2])
+    return float(four_bar.state(solution.y[0, -1], 0.0)[0][2])
 
 
 def parallelogram_by_scipy(angle: float, rate: float, t1: float) -> float:
-    """Angle of crank and rocker [rad] of a parallelogram of `FOUR_BAR`'s masses and a crank of 0.3 m, after `t1` [s].
+    """Angle of crank and rocker [rad] of a parallelogram of `four_bar.PARAMS`'s masses and a crank of 0.3 m, after `t1` [s].
 
     The coupler does not turn, so it is a pendulum; by DOP853 of scipy.
     """
-    m1, m2, m3, g = (FOUR_BAR[name] for name in ("m1", "m2", "m3", "g"))
+    m1, m2, m3, g = (four_bar.PARAMS[name] for name in ("m1", "m2", "m3", "g"))
     pace = g / 0.3 * (0.5 * m1 + m2 + 0.5 * m3) / (m1 / 3.0 + m2 + m3 / 3.0)
 
     def field(t: float, y: np.ndarray) -> list[float]:
-        del t
         return [y[1], -pace * math.cos(y[0])]
 
     return float(solve_ivp(field, (0.0, t1), [angle, rate], method="DOP853", rtol=1e-11, atol=1e-12).y[0, -1])
 
 
 def _linkages() -> list[HardCase]:
-    q0, qd0 = (np.asarray(x) for x in four_bar_state(0.7, 8.0))
-    once, t1 = four_bar(), 0.5
+    q0, qd0 = (np.asarray(x) for x in four_bar.state(0.7, 8.0))
+    once, t1 = four_bar.scene(), 0.5
     (closure,) = once.constraints
     assert isinstance(closure, Constraint)
     twice = Scene(
         once.lagrangian, params=once.params, constraints=(closure, Constraint(closure.phi, at=closure.at, name="again"))
     )
-    flat = four_bar(a=0.3, b=0.6, c=0.3, d=0.6)
-    before, speed = (np.asarray(x) for x in four_bar_state(0.3, -8.0, a=0.3, b=0.6, c=0.3, d=0.6))
+    flat = four_bar.scene(a=0.3, b=0.6, c=0.3, d=0.6)
+    before, speed = (np.asarray(x) for x in four_bar.state(0.3, -8.0, a=0.3, b=0.6, c=0.3, d=0.6))
     return [
         HardCase(
             "redundant_constraints",
-            FAMILY,
             "The loop of a four-bar closed twice: the equations for the multipliers are singular.",
             "LU without pivots gives NaN; the index of rank is found by luck.",
-            "angle of the rocker at 0.5 s [rad]",
             motion(twice, q0, qd0, t1, by="g", read=_third, numbers={"rtol": 1e-8, "atol": 1e-10}),
+            asks="angle of the rocker at 0.5 s [rad]",
             second=lambda: four_bar_by_scipy(0.7, 8.0, t1),
             single=None,
         ),
         HardCase(
             "dead_points",
-            FAMILY,
             "A four-bar through the dead points of its rocker, where coupler and crank are in line.",
             "Equations in the rocker's angle divide by zero there.",
-            "angle of the rocker at 0.5 s [rad]",
             motion(once, q0, qd0, t1, by="g", read=_third, numbers={"rtol": 1e-8, "atol": 1e-10}),
+            asks="angle of the rocker at 0.5 s [rad]",
             second=lambda: four_bar_by_scipy(0.7, 8.0, t1),
         ),
         HardCase(
             "change_point",
-            FAMILY,
             "A parallelogram folds flat: the constraints become dependent. Of the two ways to go on, only that of the"
             " parallelogram keeps the velocities.",
             "Multipliers without bound; or the other branch, with a kick.",
-            "angle of the rocker at 0.1 s [rad]",
             motion(flat, before, speed, 0.1, by="g", read=_third),
+            asks="angle of the rocker at 0.1 s [rad]",
             second=lambda: parallelogram_by_scipy(0.3, -8.0, 0.1),
             single_ends="step size fell below what the time can resolve|have become dependent",
         ),
@@ -266,17 +241,14 @@ def _linkages() -> list[HardCase]:
 
 def _lever(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     """Load of a drawer that is pulled `e` beside its middle: two reactions `F e/L` apart, for a pull of `F t`."""
-    del q, qd
     return 2.0 * p["F"] * t * p["e"] / p["L"]
 
 
 def _pull(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del q, qd
     return jnp.reshape(p["F"] * t, (1,))
 
 
 def _drawer(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q
     return 0.5 * p["m"] * qd[0] ** 2
 
 
@@ -284,26 +256,23 @@ def _jams() -> list[HardCase]:
     friction = Friction(Coulomb(0.3), normal_force=_lever)
     params = {"m": 1.0, "F": 1e6, "e": 0.4, "L": 0.2}
     drawer = Scene(_drawer, params=params, effects=(AppliedForce(_pull, name="pull"), friction))
-    rod = rod_on_rough_floor(mu=2.0)
-    q0, qd0 = (np.asarray(x) for x in rod_on_rough_floor_state(1.1, 0.0, 1.0))
+    rod = rod_on_rough_floor.scene(mu=2.0)
+    q0, qd0 = (np.asarray(x) for x in rod_on_rough_floor.state(1.1, 0.0, 1.0))
     return [
         HardCase(
             "jammed_slider",
-            FAMILY,
             "A drawer pulled beside its middle: friction grows with the pull and is always 1.2 times it.",
             "Forces of 1e7 N cancel; what is left over moves the drawer.",
-            "position at 10 s [m]",
             motion(drawer, [0.0], [0.0], 10.0, by="F", read=position),
             lambda _: 0.0,
             scale=1.0,
         ),
         HardCase(
             "painleve_rod",
-            FAMILY,
             "A rod slides on its tip at an angle where friction presses it ever harder into the floor.",
             "A negative normal force, or an acceleration through the floor.",
-            "the sentence, at the start [s]",
             motion(rod, q0, qd0, 1.0, by="g", read=end_time),
+            asks="the sentence, at the start [s]",
             ends="Painleve's paradox",
         ),
     ]

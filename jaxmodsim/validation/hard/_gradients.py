@@ -8,7 +8,7 @@ from jaxtyping import Array
 from scipy.integrate import solve_ivp
 
 from ...friction import Coulomb, LuGre, Stribeck
-from ...problems import BRAKED_SPRING, braked_spring, braked_spring_law, braked_spring_rest, ramped_box
+from ...problems import braked_spring, ramped_box
 from ...scene import AppliedForce, Friction, Scene
 from ._case import HardCase, motion, position, velocity
 
@@ -16,7 +16,6 @@ FAMILY = "gradients"
 
 
 def _plate(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q
     return 0.5 * p["m"] * jnp.sum(qd**2)
 
 
@@ -25,7 +24,6 @@ def _place(q: Array) -> Array:
 
 
 def _sideways(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q, qd
     return jnp.stack([p["F"], 0.0 * p["F"]])
 
 
@@ -39,12 +37,11 @@ def _planar() -> HardCase:
     )
     return HardCase(
         "plane_at_rest",
-        FAMILY,
         "Friction in the plane at zero slip, unloaded: the direction of slip is 0/0.",
         "NaN from the norm of a zero vector.",
-        "position at 5 s [m], and its derivative by the force, 1/sigma0",
         motion(scene, [0.0, 0.0], [0.0, 0.0], 5.0, by="F", read=position, numbers={"dtmax": 0.05}),
         lambda F: F / 100.0,
+        asks="position at 5 s [m], and its derivative by the force, 1/sigma0",
         scale=0.01,
         conserves=False,
     )
@@ -60,23 +57,21 @@ def _equilibrium() -> list[HardCase]:
     return [
         HardCase(
             "equilibrium",
-            FAMILY,
             why,
             naive,
-            "position at 5 s [m], and its derivative by the place of rest, with dtmax",
             motion(shifted, [0.0], [0.0], 5.0, by="x0", read=position, numbers={"dtmax": 0.05}),
             lambda x0: x0 - exact(x0),
+            asks="position at 5 s [m], and its derivative by the place of rest, with dtmax",
             scale=1.0,
             conserves=False,
         ),
         HardCase(
             "equilibrium_unbounded",
-            FAMILY,
             why,
             naive,
-            "position at 5 s [m], and a warning of check_gradients",
             motion(shifted, [0.0], [0.0], 5.0, by="x0", read=position),
             lambda _: 0.0,
+            asks="position at 5 s [m], and a warning of check_gradients",
             scale=1.0,
             undefined="the run makes steps of seconds, and the derivative is theirs",
             conserves=False,
@@ -85,59 +80,51 @@ def _equilibrium() -> list[HardCase]:
 
 
 def _held(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     return 0.5 * qd[0] ** 2 - 0.5 * (q[0] - p["x0"]) ** 2
 
 
 def _resting_place() -> HardCase:
     def exact(Fc: float) -> float:
-        return float(braked_spring_rest(**(BRAKED_SPRING | {"Fc": Fc})).x)
+        return float(braked_spring.rest(**(braked_spring.PARAMS | {"Fc": Fc})).x)
 
     return HardCase(
         "resting_place",
-        FAMILY,
         "Where the mass stops depends on Fc through all twelve reversals: -(-1)^N 2 N/k.",
         "Differentiated sign functions have no derivative: zero, or that of the last half cycle.",
-        "resting place [m]",
-        motion(braked_spring(braked_spring_law()), [1.0], [0.0], 30.0, by="friction.Fc", read=position),
+        motion(braked_spring.scene(braked_spring.coulomb()), [1.0], [0.0], 30.0, by="friction.Fc", read=position),
         exact,
+        asks="resting place [m]",
     )
 
 
 def cases() -> list[HardCase]:
     """The cases of this family."""
-    box = ramped_box(Coulomb(1.5))
-    falling = ramped_box(Stribeck(Fc=1.5, Fs=1.75, vs=0.2, exponent=1.0))
+    box = ramped_box.scene(Coulomb(1.5))
+    falling = ramped_box.scene(Stribeck(Fc=1.5, Fs=1.75, vs=0.2, exponent=1.0))
     return [
         _planar(),
         *_equilibrium(),
         _resting_place(),
         HardCase(
             "event_at_the_end",
-            FAMILY,
             "The run ends at the very instant of break-away.",
             "The event is handled in one run and not in the next: derivatives of either side, or NaN.",
-            "velocity at 1.5 s [m/s]",
             motion(box, [0.0], [0.0], 1.5, by="ramp", read=velocity),
             lambda _: 0.0,
             scale=1.0,
         ),
         HardCase(
             "start_at_rest",
-            FAMILY,
             "The derivative by a velocity that stick takes away at once: x = m v0^2/(2 Fc), so zero.",
             "One second, as if nothing stuck.",
-            "position at 1 s [m]",
             motion(box, [0.0], [0.0], 1.0, by="qd0[0]", read=position),
             lambda _: 0.0,
             scale=1.0,
         ),
         HardCase(
             "cusp_of_stribeck",
-            FAMILY,
             "A Stribeck curve with a cusp at v = 0, exp(-|v|/vs), from break-away on.",
             "NaN from |v|**a at zero, or the derivative of the wrong side.",
-            "velocity at 3 s [m/s]",
             motion(falling, [0.0], [0.0], 3.0, by="friction.Fs", read=velocity),
             second=cusp_by_scipy,
         ),

@@ -10,7 +10,7 @@ from jaxtyping import PyTree
 
 from ...friction import Coulomb, Stribeck
 from ...identify import Record
-from ...problems import box_lugre, braked_spring, braked_spring_law, ramped_box
+from ...problems import braked_spring, ramped_box
 from ...scene import Signal
 from ...simulation import Trajectory, simulate
 from ._case import HardCase, MeasuredNumber, RefusedCalls, motion, position, velocity
@@ -21,11 +21,15 @@ _NAN, _INF = float("nan"), float("inf")
 
 def _run(**changes: PyTree) -> Trajectory:
     given = {"q0": [1.0], "qd0": [0.0], "t1": 1.0} | changes
-    return simulate(braked_spring(braked_spring_law()), given.pop("q0"), given.pop("qd0"), given.pop("t1"), **given)
+    return simulate(
+        braked_spring.scene(braked_spring.coulomb()), given.pop("q0"), given.pop("qd0"), given.pop("t1"), **given
+    )
 
 
 def _poisoned(value: float) -> Trajectory:
-    scene = eqx.tree_at(lambda scene: scene.params["k"], braked_spring(braked_spring_law()), jnp.asarray(value))
+    scene = eqx.tree_at(
+        lambda scene: scene.params["k"], braked_spring.scene(braked_spring.coulomb()), jnp.asarray(value)
+    )
     return simulate(scene, [1.0], [0.0], 1.0)
 
 
@@ -33,7 +37,7 @@ def _refused(name: str, why: str, naive: str, calls: dict[str, tuple[Callable[[]
     task = RefusedCalls(
         {key: call for key, (call, _) in calls.items()}, {key: text for key, (_, text) in calls.items()}
     )
-    return HardCase(name, FAMILY, why, naive, "errors that name what is wrong", task)
+    return HardCase(name, why, naive, task, asks="errors that name what is wrong")
 
 
 def _garbage() -> list[HardCase]:
@@ -46,7 +50,7 @@ def _garbage() -> list[HardCase]:
             "NaN all the way to the end, or a step control that never accepts anything.",
             {
                 "law": (lambda: Coulomb(_NAN), "Fc must be finite"),
-                "infinite law": (lambda: box_lugre(sigma0=_INF), "sigma0 must be finite"),
+                "infinite law": (lambda: ramped_box.lugre(sigma0=_INF), "sigma0 must be finite"),
                 "put in later": (lambda: _poisoned(_NAN), "not finite"),
                 "infinite, put in later": (lambda: _poisoned(_INF), "not finite"),
             },
@@ -100,7 +104,7 @@ def _same_types() -> float:
     kinds: list[Callable[[float], PyTree]] = [float, int, np.int32, np.float64, np.asarray, jnp.asarray]
     ends = []
     for kind in kinds:
-        scene = braked_spring(Coulomb(kind(1), kind(2)), m=kind(1), k=kind(10))
+        scene = braked_spring.scene(Coulomb(kind(1), kind(2)), m=kind(1), k=kind(10))
         run = simulate(scene, [kind(1)], [kind(0)], kind(3), ts=[kind(1), kind(2), kind(3)])
         ends.append(np.asarray(run.q))
     return float(max(np.max(np.abs(end - ends[0])) for end in ends))
@@ -111,11 +115,9 @@ def _extremes() -> list[HardCase]:
     return [
         HardCase(
             "overflow_in_stribeck",
-            FAMILY,
             "vs = 1e-160 m/s: (v/vs)^2 overflows, and its derivative is infinity times zero.",
             "NaN in the derivative, though the value is right.",
-            "velocity at 10 s [m/s]",
-            motion(ramped_box(thin), [0.0], [0.0], 10.0, by="friction.Fc", read=velocity),
+            motion(ramped_box.scene(thin), [0.0], [0.0], 10.0, by="friction.Fc", read=velocity),
             # It breaks away at Fs and then feels Fc: v = ((t - Fc)^2 - (Fs - Fc)^2)/(2 m).
             lambda Fc: ((10.0 - Fc) ** 2 - (1.75 - Fc) ** 2) / 4.0,
             # 1e-160 is zero in float32.
@@ -123,45 +125,39 @@ def _extremes() -> list[HardCase]:
         ),
         HardCase(
             "subnormal_state",
-            FAMILY,
             "A deflection of 1e-310 m, below what processors compute with at full speed, or at all.",
             "NaN where it is divided by, or a hundredfold slower run.",
-            "position at 5 s [m]",
-            motion(braked_spring(m=1.0, k=1.0), [1e-310], [0.0], 5.0, by="k", read=position),
+            motion(braked_spring.scene(m=1.0, k=1.0), [1e-310], [0.0], 5.0, by="k", read=position),
             lambda _: 0.0,
             scale=1.0,
             conserves=False,
         ),
         HardCase(
             "huge_state",
-            FAMILY,
             "A deflection of 1e150 m: its square is the energy, the square of that overflows.",
             "Infinity in norms.",
-            "position at 5 s [m]",
-            motion(braked_spring(m=1.0, k=1.0), [1e150], [0.0], 5.0, by="q0[0]", read=position),
+            motion(braked_spring.scene(m=1.0, k=1.0), [1e150], [0.0], 5.0, by="q0[0]", read=position),
             lambda x0: x0 * math.cos(5.0),
             # No such number in float32.
             single=None,
         ),
         HardCase(
             "types_mixed",
-            FAMILY,
             "Whole numbers, Python's, NumPy's and JAX's, for masses, states and times.",
             "Integer arrays that round the motion off, or an error from a loop whose types differ.",
-            "largest difference between the runs [m]",
             MeasuredNumber(_same_types),
             lambda _: 0.0,
+            asks="largest difference between the runs [m]",
             scale=1.0,
             tolerance=1e-15,
         ),
         HardCase(
             "times_repeated",
-            FAMILY,
             "Times given twice, and a single one.",
             "Rows of NaN for the second of two.",
-            "largest difference between what must be equal [m]",
             MeasuredNumber(_same_times),
             lambda _: 0.0,
+            asks="largest difference between what must be equal [m]",
             scale=1.0,
             tolerance=1e-15,
         ),

@@ -5,6 +5,7 @@ import multiprocessing
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from functools import cache
 
 import jax
@@ -31,7 +32,7 @@ def hard_cases() -> dict[str, HardCase]:
     Families: stiffness, rest and reversal, loads in stick, many events, geometry, scale and time, numbers,
     gradients.
     """
-    return {case.name: case for module in _MODULES for case in module.cases()}
+    return {case.name: replace(case, family=module.FAMILY) for module in _MODULES for case in module.cases()}
 
 
 # Of these the runs themselves take minutes: begun first, they do not hold up the end.

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ...friction import Coulomb
-from ...problems import BRAKED_SPRING, braked_spring, braked_spring_law, braked_spring_motion, ramped_box
+from ...problems import braked_spring, ramped_box
 from ...scene import Scene
 from ...simulation import Trajectory, simulate
 from ...solvers import Gauss
@@ -20,7 +20,7 @@ _LATE = 1e9
 
 
 def _at(t: float, x0: float) -> float:
-    return float(braked_spring_motion(jnp.asarray(t), **(BRAKED_SPRING | {"x0": x0}))[0])
+    return float(braked_spring.motion(jnp.asarray(t), **(braked_spring.PARAMS | {"x0": x0}))[0])
 
 
 def in_other_units(length: float, time: float, mass: float) -> float:
@@ -28,12 +28,12 @@ def in_other_units(length: float, time: float, mass: float) -> float:
 
     Units that are powers of two change no digit, if nothing in the program is of a size of its own.
     """
-    p, ts = BRAKED_SPRING, np.linspace(0.0, 26.0, 53)
+    p, ts = braked_spring.PARAMS, np.linspace(0.0, 26.0, 53)
     force = mass * length / time**2
     runs = []
     for scale, pace, kilo, newton in ((1.0, 1.0, 1.0, 1.0), (length, time, mass, force)):
         law = Coulomb(p["Fc"] * newton, p["Fs"] * newton)
-        scene = braked_spring(law, m=p["m"] * kilo, k=p["k"] * kilo / pace**2)
+        scene = braked_spring.scene(law, m=p["m"] * kilo, k=p["k"] * kilo / pace**2)
         # One number for lengths and velocities: the tolerance can only be none. Until shortly before rest, whose
         # velocities are rounding, which has no scale of its own.
         run = simulate(scene, [p["x0"] * scale], [0.0], 26.0 * pace, ts=ts * pace, rtol=1e-8, atol=0.0)
@@ -50,12 +50,11 @@ def _units() -> list[HardCase]:
     return [
         HardCase(
             f"units_{name}",
-            FAMILY,
             f"The mass on a spring with friction, 11 reversals, on the scale of {words}.",
             "Tolerances, smoothing widths and thresholds in SI units: nothing moves, or nothing stops.",
-            "difference to the run in metres, after conversion [m, m/s]",
             MeasuredNumber(lambda scales=(length, time, mass): in_other_units(*scales)),
             lambda _: 0.0,
+            asks="difference to the run in metres, after conversion [m, m/s]",
             scale=1.0,
             # Not one digit may differ.
             tolerance=1e-15,
@@ -79,14 +78,12 @@ def _single(scene: Scene) -> Scene:
 
 
 def _late() -> list[HardCase]:
-    spring = braked_spring(braked_spring_law())
+    spring = braked_spring.scene(braked_spring.coulomb())
     return [
         HardCase(
             "late_start",
-            FAMILY,
             "The clock shows 1e9 s at the start: times are known to 1e-7 s.",
             "Steps below the resolution of time: an endless loop, or events that are never met.",
-            "position 30 s later [m]",
             motion(
                 spring,
                 [1.0],
@@ -97,73 +94,66 @@ def _late() -> list[HardCase]:
                 numbers={"t0": _LATE, "rtol": 1e-8, "atol": 1e-9},
             ),
             lambda x0: _at(30.0, x0),
+            asks="position 30 s later [m]",
             tolerance=1e-5,
             # RefusedCalls: see the next.
             single=None,
         ),
         HardCase(
             "late_start_single",
-            FAMILY,
             "The same in float32, where the next number after 1e9 is 1e9 + 64.",
             "A run of no length: the initial state, under a success code.",
-            "an error that names it",
             RefusedCalls(
                 {"clock": lambda: simulate(_single(spring), np.ones(1, np.float32), [0.0], _LATE + 30.0, t0=_LATE)},
                 {"clock": "are the same number in float32"},
             ),
+            asks="an error that names it",
         ),
     ]
 
 
 def _times() -> list[HardCase]:
-    spring = braked_spring(braked_spring_law())
+    spring = braked_spring.scene(braked_spring.coulomb())
     fine = 1.0 + np.arange(101) * 2.0**-54
     return [
         HardCase(
             "no_absolute_tolerance",
-            FAMILY,
             "atol = 0, from rest at zero: errors relative to nothing.",
             "0/0 in the error norm: NaN, or the smallest steps there are.",
-            "velocity at 10 s [m/s]",
-            motion(ramped_box(Coulomb(1.5)), [0.0], [0.0], 10.0, by="ramp", read=velocity, numbers={"atol": 0.0}),
+            motion(ramped_box.scene(Coulomb(1.5)), [0.0], [0.0], 10.0, by="ramp", read=velocity, numbers={"atol": 0.0}),
             lambda ramp: ramp * (10.0 - 1.5 / ramp) ** 2 / 4.0,
             # At break-away the net force is rounding, and so is all of a velocity that comes from it.
             single_ends="step size fell below what the time can resolve",
         ),
         HardCase(
             "sampled_below_rounding",
-            FAMILY,
             "101 samples within 6e-15 s, four to each number that there is.",
             "Interpolation over a step of no length: 0/0.",
-            "position at the middle one [m]",
             motion(spring, [1.0], [0.0], float(fine[-1]), by="q0[0]", read=_middle, numbers={"ts": fine}),
             lambda x0: _at(1.0, x0),
+            asks="position at the middle one [m]",
         ),
         HardCase(
             "step_longer_than_run",
-            FAMILY,
             "A fixed step of 100 s for a run of one.",
             "The run ends at 100 s.",
-            "velocity at 1 s [m/s]",
-            motion(ramped_box(), [0.0], [0.0], 1.0, by="ramp", read=velocity, numbers={"dt": 100.0}),
+            motion(ramped_box.scene(), [0.0], [0.0], 1.0, by="ramp", read=velocity, numbers={"dt": 100.0}),
             lambda ramp: ramp / 4.0,
         ),
         HardCase(
             "run_of_no_length",
-            FAMILY,
             "t1 = t0.",
             "A step of zero length: 0/0, or an error from the depths of the solver.",
-            "position [m]",
             motion(spring, [1.0], [0.0], 0.0, by="q0[0]", read=position),
             lambda x0: x0,
+            asks="position [m]",
         ),
         HardCase(
             "step_limit",
-            FAMILY,
             "Ten steps are allowed, a thousand are needed.",
             "The last state is handed out as that of the end.",
-            "the sentence",
             motion(spring, [1.0], [0.0], 1000.0, by="k", read=position, max_steps=10),
+            asks="the sentence",
             ends="step limit was reached before t1",
         ),
     ]
@@ -183,7 +173,7 @@ def _periods() -> HardCase:
         return math.cos(steps * periods * (angle - 2.0 * math.pi / steps))
 
     task = motion(
-        braked_spring(m=1.0, k=1.0),
+        braked_spring.scene(m=1.0, k=1.0),
         [1.0],
         [0.0],
         2.0 * math.pi * periods,
@@ -195,12 +185,11 @@ def _periods() -> HardCase:
     )
     return HardCase(
         "periods_1000000",
-        FAMILY,
         "A million periods: rounding of 1.6e7 steps adds up, and any damping of the method.",
         "Energy gone, or grown by orders.",
-        "position after 1e6 periods, the method's own phase counted [m]",
         task,
         exact,
+        asks="position after 1e6 periods, the method's own phase counted [m]",
         scale=1.0,
         tolerance=1e-6,
         single=None,

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import PyTree
 
-from ...problems import LinearStickSlip, linear_stick_slip, stick_slip_motion
+from ...problems import linear_stick_slip
 from ._case import HardCase, motion, position
 
 FAMILY = "loads in stick"
@@ -21,7 +21,7 @@ def _system(
     stiffness: float | np.ndarray = 0.0,
     directions: Sequence[Sequence[float]] | None = None,
     belt: Sequence[float] = (),
-) -> LinearStickSlip:
+) -> linear_stick_slip.LinearStickSlip:
     """From what is not zero; (Fc, Fs) of each element."""
     n, count, m = len(load), 5 + 4 * len(frequencies), len(limits)
     loads, belts = np.zeros((n, count)), np.zeros((m, count))
@@ -31,27 +31,35 @@ def _system(
     rows = np.eye(n) if directions is None else np.array(directions, float)
     Fc, Fs = np.array(limits).T
     springs = np.ones((1, 1)) * stiffness if n == 1 else np.zeros((n, n)) + stiffness
-    return LinearStickSlip(
+    return linear_stick_slip.LinearStickSlip(
         mass * np.eye(n), np.zeros((n, n)), springs, rows, Fc, Fs, np.array(frequencies), loads, belts
     )
 
 
 def _case(
-    name: str, why: str, naive: str, system: LinearStickSlip, t1: float, qd0: float = 0.0, **options: PyTree
+    name: str,
+    why: str,
+    naive: str,
+    system: linear_stick_slip.LinearStickSlip,
+    t1: float,
+    qd0: float = 0.0,
+    **options: PyTree,
 ) -> HardCase:
     """The first coordinate at `t1` from q = 0, by Coulomb's force of the first element."""
     q0, qd = np.zeros(system.size), np.full(system.size, qd0)
 
     def exact(Fc: float) -> float:
         changed = replace(system, Fc=np.array([Fc, *system.Fc[1:]]))
-        return float(stick_slip_motion(changed, q0, qd, t1).q[0])
+        return float(linear_stick_slip.motion(changed, q0, qd, t1).q[0])
 
-    scene = linear_stick_slip(system)
+    scene = linear_stick_slip.scene(system)
     task = motion(scene, q0, qd, t1, by="element_0.Fc", read=position, max_steps=65536)
-    return HardCase(name, FAMILY, why, naive, f"position at {t1:g} s [m]", task, exact, **options)
+    return HardCase(name, why, naive, task, exact, **options)
 
 
-def _with_samples(system: LinearStickSlip, times: Sequence[float], values: Sequence[float]) -> LinearStickSlip:
+def _with_samples(
+    system: linear_stick_slip.LinearStickSlip, times: Sequence[float], values: Sequence[float]
+) -> linear_stick_slip.LinearStickSlip:
     """Under a signal besides, which is held from sample to sample."""
     load = system.load.copy()
     load[0, -2] = 1.0
@@ -61,7 +69,7 @@ def _with_samples(system: LinearStickSlip, times: Sequence[float], values: Seque
 def _boxes() -> list[HardCase]:
     a, g, w = 0.8441173414514593, 0.09826644620612397, 2.9358368442770417
     growing = _system([[0.0, 0.0, 0.0, a, 0.0, a * g]], [(1.0, 1.5)], [w])
-    t = float(stick_slip_motion(growing, np.zeros(1), np.zeros(1), 10.0).times[0])
+    t = float(linear_stick_slip.motion(growing, np.zeros(1), np.zeros(1), 10.0).times[0])
     steps = (
         "The steps have grown over the load while nothing moved: break-aways are missed or come late, without a word."
     )

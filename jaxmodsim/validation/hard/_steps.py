@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from ...friction import AbstractLaw, LuGre, Regularized, Viscous, max_stable_step
-from ...problems import box_coulomb, ramped_box, slipping_bristle
+from ...problems import ramped_box, slipping_bristle
 from ...scene import Scene
 from ...simulation import Trajectory, simulate
 from ...solvers import ImplicitFriction, Rodas5P
@@ -54,11 +54,11 @@ def formulations() -> dict[str, Formulation]:
     """A bristle in slip and in stick, friction smoothed over 1e-6 m/s, viscous friction."""
     bristle, damped = LuGre(**_BRISTLE, sigma1=0.0), LuGre(**_BRISTLE, sigma1=300.0)
     steady = (1.5 + 0.25 * math.exp(-((_V / 0.2) ** 2))) / 1e5
-    smooth = Regularized(box_coulomb(), width=1e-6)
+    smooth = Regularized(ramped_box.coulomb(), width=1e-6)
     each = [
         Formulation(
             "bristle in slip",
-            slipping_bristle(bristle, _V),
+            slipping_bristle.scene(bristle, _V),
             {"friction": jnp.asarray(steady * (1.0 + 1e-6))},
             0.0,
             bristle,
@@ -68,7 +68,7 @@ def formulations() -> dict[str, Formulation]:
         ),
         Formulation(
             "bristle in stick",
-            ramped_box(damped, ramp=0.0, m=_M),
+            ramped_box.scene(damped, ramp=0.0, m=_M),
             {"friction": jnp.asarray(1e-12)},
             0.0,
             damped,
@@ -78,7 +78,7 @@ def formulations() -> dict[str, Formulation]:
         ),
         Formulation(
             "regularised",
-            ramped_box(smooth, ramp=0.0, m=_M),
+            ramped_box.scene(smooth, ramp=0.0, m=_M),
             None,
             1e-12,
             smooth,
@@ -88,7 +88,7 @@ def formulations() -> dict[str, Formulation]:
         ),
         Formulation(
             "viscous",
-            ramped_box(Viscous(1e3), ramp=0.0, m=_M),
+            ramped_box.scene(Viscous(1e3), ramp=0.0, m=_M),
             None,
             1.0,
             Viscous(1e3),
@@ -142,6 +142,14 @@ def largest_step(formulation: Formulation, solver: dfx.AbstractSolver) -> float:
     return math.sqrt(low * high)
 
 
+def largest_steps() -> dict[str, dict[str, tuple[float, float]]]:
+    """Largest stable step [s] by theory and by running, of each formulation and explicit method."""
+    return {
+        name: {each: (theory(what, solver), largest_step(what, solver)) for each, solver in EXPLICIT.items()}
+        for name, what in formulations().items()
+    }
+
+
 def _ratio(name: str, solvers: dict[str, dfx.AbstractSolver]) -> float:
     """The measured limit over that of theory, of the solver where they are farthest apart."""
     formulation = formulations()[name]
@@ -155,7 +163,7 @@ def _unlimited() -> float:
     return float(sum(not grows(each, solver, _FAR * theory(each, dfx.Heun())) for each, solver in runs))
 
 
-def step_limits(family: str) -> list[HardCase]:
+def step_limits() -> list[HardCase]:
     """Cases: the largest stable steps."""
     # Euler's method has none at all on an undamped vibration; this one is damped.
     names = {
@@ -166,12 +174,11 @@ def step_limits(family: str) -> list[HardCase]:
     made = [
         HardCase(
             name,
-            family,
             f"Explicit steps end at the edge of the stability region; the eigenvalue is {value}.",
             "Below the limit all is well, just above it the bristle swings up within a thousand steps.",
-            "largest stable step over that of theory, the farthest of Euler, Heun, Bosh3, Tsit5, Dopri8 [1]",
             MeasuredNumber(partial(_ratio, formulation, EXPLICIT)),
             lambda _: 1.0,
+            asks="largest stable step over that of theory, the farthest of Euler, Heun, Bosh3, Tsit5, Dopri8 [1]",
             tolerance=1e-2,
             single=None,
         )
@@ -179,12 +186,11 @@ def step_limits(family: str) -> list[HardCase]:
     ]
     unlimited = HardCase(
         "step_limit_none",
-        family,
         "Fixed steps of 1e6 times what explicit methods can take, on all four formulations.",
         "Overflow within ten steps.",
-        "runs of Rodas5P and ImplicitFriction in which a disturbance does not grow, of 8 [1]",
         MeasuredNumber(_unlimited),
         lambda _: 8.0,
+        asks="runs of Rodas5P and ImplicitFriction in which a disturbance does not grow, of 8 [1]",
         tolerance=1e-2,
         single=None,
     )

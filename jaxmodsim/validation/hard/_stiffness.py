@@ -8,7 +8,7 @@ from jaxtyping import Array
 from scipy.integrate import solve_ivp
 
 from ...friction import LuGre, Regularized, Viscous
-from ...problems import BOX_LUGRE, box_coulomb, box_lugre, ramped_box, slipping_bristle
+from ...problems import ramped_box, slipping_bristle
 from ...scene import Scene
 from ...simulation import Trajectory
 from ...solvers import ImplicitFriction, Rodas5P
@@ -24,7 +24,7 @@ def box_by_scipy(*, m: float = 2.0, ramp: float = 1.0, **changes: float) -> floa
 
     Its relative tolerance is 1e-10. On the six sets below Radau at 1e-11 gives the same to 3e-9.
     """
-    law = BOX_LUGRE | changes
+    law = ramped_box.LUGRE | changes
 
     def rate(t: float, y: np.ndarray) -> list[float]:
         v, z = y
@@ -50,13 +50,11 @@ def _box(
     **changes: float,
 ) -> HardCase:
     m = changes.pop("m", 2.0)
-    scene = ramped_box(box_lugre(**changes), m=m)
+    scene = ramped_box.scene(ramped_box.lugre(**changes), m=m)
     return HardCase(
         name,
-        FAMILY,
         why,
         naive,
-        "velocity at 10 s [m/s]",
         motion(scene, [0.0], [0.0], _T1, by="friction.Fc", read=velocity, max_steps=65536),
         second=lambda: box_by_scipy(m=m, **changes),
         single_ends=single_ends,
@@ -110,7 +108,6 @@ def _boxes() -> list[HardCase]:
 
 
 def _two_masses(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     kinetic = 0.5 * p["m"] * (qd[0] ** 2 + qd[1] ** 2)
     return kinetic - 0.5 * p["k"] * q[0] ** 2 - 0.5 * p["link"] * (q[1] - q[0]) ** 2
 
@@ -142,10 +139,8 @@ def _ratio() -> HardCase:
     )
     return HardCase(
         "stiffness_ratio",
-        FAMILY,
         "Two springs whose stiffnesses differ by 1e12: frequencies by 1e6.",
         "Explicit methods follow the fast one: 1e7 steps for a second of which nothing is seen.",
-        "position at 5 s [m]",
         task,
         exact,
         tolerance=1e-5,
@@ -157,24 +152,22 @@ def _regularized() -> list[HardCase]:
     def exact(Fc: float) -> float:
         return (_T1 - Fc) ** 2 / 4.0
 
-    scene = ramped_box(Regularized(box_coulomb(), width=1e-9))
+    scene = ramped_box.scene(Regularized(ramped_box.coulomb(), width=1e-9))
     return [
         HardCase(
             "regularized_narrow",
-            FAMILY,
             "Coulomb friction smoothed over 1e-9 m/s: a slope of 1.5e9 N s/m in stick.",
             "Explicit steps of 1e-9 s in stick; wide steps of other methods jump from one side to the other.",
-            "velocity at 10 s [m/s], against the exact law",
             motion(scene, [0.0], [0.0], _T1, by="friction.Fc", read=velocity),
             exact,
+            asks="velocity at 10 s [m/s], against the exact law",
         ),
         HardCase(
             "regularized_unresolved",
-            FAMILY,
             "The same with an absolute tolerance of 1e-6 m/s: stick lies within it as a whole.",
             "Break-away comes late, the velocity is 3 % low, and the error control sees nothing of it.",
-            "the sentence",
             motion(scene, [0.0], [0.0], _T1, by="friction.Fc", read=velocity, numbers={"atol": 1e-6}),
+            asks="the sentence",
             ends="above the width",
         ),
     ]
@@ -189,15 +182,14 @@ def _bristle_steady() -> HardCase:
         return level / sigma0
 
     law = LuGre(sigma0=1e9, sigma1=0.0, sigma2=0.1, Fc=1.5, Fs=1.75, vs=0.2)
-    task = motion(slipping_bristle(law, v), [0.0], [0.0], t1, by="friction.sigma0", read=_deflection)
+    task = motion(slipping_bristle.scene(law, v), [0.0], [0.0], t1, by="friction.sigma0", read=_deflection)
     return HardCase(
         "bristle_at_speed",
-        FAMILY,
         "sigma0 = 1e9 N/m at 0.1 m/s: the bristle settles at a rate of 6e7/s and stays for a second.",
         "Explicit Euler beyond 2 g/(sigma0 v) = 3.4e-8 s: the deflection grows without bound.",
-        "deflection of the bristle at 1 s [m]",
         task,
         exact,
+        asks="deflection of the bristle at 1 s [m]",
     )
 
 
@@ -214,7 +206,7 @@ def _implicit_long_step() -> HardCase:
 
     law = LuGre(sigma0=1e9, sigma1=0.0, sigma2=0.1, Fc=1.5, Fs=1.75, vs=0.2)
     task = motion(
-        slipping_bristle(law, v),
+        slipping_bristle.scene(law, v),
         [0.0],
         [0.0],
         t1,
@@ -225,26 +217,24 @@ def _implicit_long_step() -> HardCase:
     )
     return HardCase(
         "implicit_long_step",
-        FAMILY,
         "A fixed step of 0.05 s where an explicit one is stable below 3.4e-8 s.",
         "Infinity after a dozen steps.",
-        "deflection of the bristle at 1 s [m]",
         task,
         exact,
+        asks="deflection of the bristle at 1 s [m]",
         conserves=False,
     )
 
 
 def _viscous_explicit() -> HardCase:
-    scene = ramped_box(Viscous(1e7))
+    scene = ramped_box.scene(Viscous(1e7))
     task = motion(scene, [0.0], [0.0], _T1, by="friction.Fv", read=velocity, solver=dfx.Tsit5(), max_steps=4096)
     return HardCase(
         "explicit_is_named",
-        FAMILY,
         "An explicit method that a user insists on, at a rate of 5e6/s.",
         "Hours, or a step limit that is taken for a result.",
-        "the sentence",
         task,
+        asks="the sentence",
         ends="step limit was reached before t1",
         single_ends=_TOO_FAST,
     )
@@ -259,5 +249,5 @@ def cases() -> list[HardCase]:
         *_regularized(),
         _implicit_long_step(),
         _viscous_explicit(),
-        *step_limits(FAMILY),
+        *step_limits(),
     ]

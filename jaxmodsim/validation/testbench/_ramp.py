@@ -10,7 +10,7 @@ import numpy as np
 
 from ...friction import AbstractLaw, DeadZone, Regularized, Sign
 from ...metrics import break_away
-from ...problems import box_coulomb, box_lugre, box_stribeck, ramped_box
+from ...problems import ramped_box
 from ...simulation import Trajectory, simulate
 
 T1 = 10.0
@@ -82,7 +82,7 @@ class RampResult:
 
 def ramp_cases() -> list[RampCase]:
     """The runs of the exercise's parts a to e; b and d exactly, by events, and in their regularised form."""
-    coulomb, stribeck = box_coulomb(), box_stribeck()
+    coulomb, stribeck = ramped_box.coulomb(), ramped_box.stribeck()
     return [
         RampCase("a", "sign, 1 N/s, adaptive", Sign(coulomb)),
         RampCase("a", "sign, 1 N/s, Euler 10 ms", Sign(coulomb), dt=FIXED_STEP, solver=dfx.Euler()),
@@ -101,14 +101,14 @@ def ramp_cases() -> list[RampCase]:
         ),
         RampCase("d", "Stribeck, exact", stribeck),
         RampCase("d", "Stribeck, regularised 1 mm/s", Regularized(stribeck, REGULARISED_WIDTH)),
-        RampCase("e", "LuGre, sigma0 750, sigma1 0", box_lugre()),
-        RampCase("e", "LuGre, sigma0 7500, sigma1 80", box_lugre(sigma0=7500.0, sigma1=80.0)),
+        RampCase("e", "LuGre, sigma0 750, sigma1 0", ramped_box.lugre()),
+        RampCase("e", "LuGre, sigma0 7500, sigma1 80", ramped_box.lugre(sigma0=7500.0, sigma1=80.0)),
     ]
 
 
 def run_ramp(case: RampCase) -> RampResult:
     """Run a case and take its numbers; the second, warm run is timed."""
-    scene = ramped_box(case.law, ramp=case.ramp, m=MASS)
+    scene = ramped_box.scene(case.law, ramp=case.ramp, m=MASS)
     # With a fixed step every step is seen, which is where a chattering velocity shows.
     ts = jnp.linspace(0.0, T1, 1001)
 
@@ -168,7 +168,7 @@ def stick_sweep() -> dict[str, np.ndarray]:
     ts = jnp.linspace(0.0, T1, 2001)
 
     def one(sigma0: jax.Array, sigma1: jax.Array) -> tuple[jax.Array, ...]:
-        scene = ramped_box(box_lugre(sigma0=sigma0, sigma1=sigma1), m=MASS)
+        scene = ramped_box.scene(ramped_box.lugre(sigma0=sigma0, sigma1=sigma1), m=MASS)
         run = simulate(scene, [0.0], [0.0], T1, ts=ts, rtol=1e-8, atol=1e-11, max_steps=65536, throw=False)
         gap = run.forces["friction"] - run.forces["pull"][:, 0]
         return run.q[300, 0], run.qd[-1, 0], run.stats["num_steps"], gap, run.result.ok

@@ -9,13 +9,12 @@ from ..scene import Scene
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     phi, speed_phi, speed_theta = q[0], qd[0], jnp.sin(q[0]) * qd[1]
     kinetic = 0.5 * p["m"] * p["R"] ** 2 * (speed_phi**2 + speed_theta**2)
     return kinetic - p["m"] * p["g"] * p["R"] * jnp.cos(phi)
 
 
-def spherical_pendulum(*, m: ArrayLike = 1.0, R: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Scene:
+def scene(*, m: ArrayLike = 1.0, R: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Scene:
     """Point mass on a sphere about the origin, gravity along -z.
 
     The coordinates are (phi, theta) [rad], phi from the +z axis and theta about it: `x = R sin(phi) cos(theta)`,
@@ -29,12 +28,12 @@ def spherical_pendulum(*, m: ArrayLike = 1.0, R: ArrayLike = 1.0, g: ArrayLike =
 
     **Returns:**
 
-    A `Scene` without effects; its exact accelerations: `spherical_pendulum_acceleration`.
+    A `Scene` without effects; its exact accelerations: `acceleration`.
     """
     return Scene(_lagrangian, params={"m": m, "R": R, "g": g})
 
 
-def spherical_pendulum_acceleration(
+def acceleration(
     q: Float[Array, "2"], qd: Float[Array, "2"], *, R: ArrayLike = 1.0, g: ArrayLike = 9.81
 ) -> Float[Array, "2"]:
     """Accelerations of the spherical pendulum, in closed form; the mass drops out.
@@ -57,18 +56,18 @@ def spherical_pendulum_acceleration(
     return jnp.stack([sine * cosine * qd[1] ** 2 + g / R * sine, -2.0 * cosine / sine * qd[0] * qd[1]])
 
 
-def spherical_pendulum_reaction(
+def reaction(
     q: Float[Array, "2"], qd: Float[Array, "2"], *, m: ArrayLike = 1.0, R: ArrayLike = 1.0, g: ArrayLike = 9.81
 ) -> Float[Array, ""]:
     """Radial force of constraint [N] of the sphere on the mass, positive outwards.
 
     `m (g cos(phi) - R phi'^2 - R sin(phi)^2 theta'^2)`; the tangential components vanish. Arguments as for
-    `spherical_pendulum`, coordinates and rates as for `spherical_pendulum_acceleration`.
+    `scene`, coordinates and rates as for `acceleration`.
     """
     return jnp.asarray(m) * (g * jnp.cos(q[0]) - R * qd[0] ** 2 - R * (jnp.sin(q[0]) * qd[1]) ** 2)
 
 
-def spherical_pendulum_motion(
+def motion(
     t: Float[np.ndarray, "..."] | float, phi: float, turn: float, *, R: float = 1.0, g: float = 9.81
 ) -> Float[np.ndarray, "..."]:
     """Angle phi [rad] at the times `t` [s], from a turning point at t = 0, in closed form; NumPy, float64.

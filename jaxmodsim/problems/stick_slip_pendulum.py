@@ -8,27 +8,22 @@ from ..friction import Coulomb
 from ..scene import Friction, Scene
 
 # Mass [kg], length [m], gravity [m/s^2] and the torques of the joint [N m] in slip and at most in stick.
-STICK_SLIP_PENDULUM = {"m": 1.0, "l": 0.5, "g": 9.81, "Fc": 0.4, "Fs": 0.6}
+PARAMS = {"m": 1.0, "l": 0.5, "g": 9.81, "Fc": 0.4, "Fs": 0.6}
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     return 0.5 * p["m"] * (p["l"] * qd[0]) ** 2 + p["m"] * p["g"] * p["l"] * jnp.cos(q[0])
 
 
-def stick_slip_pendulum(
-    law: object = None,
-    *,
-    m: ArrayLike = STICK_SLIP_PENDULUM["m"],
-    l: ArrayLike = STICK_SLIP_PENDULUM["l"],  # noqa: E741 - the symbol of the length
-    g: ArrayLike = STICK_SLIP_PENDULUM["g"],
+def scene(
+    law: object = None, *, m: ArrayLike = PARAMS["m"], l: ArrayLike = PARAMS["l"], g: ArrayLike = PARAMS["g"]
 ) -> Scene:
     """Point mass on a massless rod, with friction in the joint.
 
     **Arguments:**
 
     - `law`: friction law of the joint, its forces torques [N m] and its velocities [rad/s]; None for Coulomb friction
-      by `STICK_SLIP_PENDULUM`.
+      by `PARAMS`.
     - `m`: mass [kg], > 0.
     - `l`: length [m], > 0.
     - `g`: gravity [m/s^2].
@@ -36,21 +31,14 @@ def stick_slip_pendulum(
     **Returns:**
 
     A `Scene` with one coordinate, the angle from the bottom [rad], and the effect `friction`. Its turning points:
-    `stick_slip_pendulum_turn`; it stays at rest where `m g l |sin q| <= Fs`.
+    `turn`; it stays at rest where `m g l |sin q| <= Fs`.
     """
-    numbers = STICK_SLIP_PENDULUM
+    numbers = PARAMS
     law = Coulomb(Fc=numbers["Fc"], Fs=numbers["Fs"]) if law is None else law
     return Scene(_lagrangian, params={"m": m, "l": l, "g": g}, effects=(Friction(law),))
 
 
-def stick_slip_pendulum_turn(
-    start: ArrayLike,
-    *,
-    m: ArrayLike,
-    l: ArrayLike,  # noqa: E741
-    g: ArrayLike,
-    Fc: ArrayLike,
-) -> Float[Array, ""]:
+def turn(start: ArrayLike, *, m: ArrayLike, l: ArrayLike, g: ArrayLike, Fc: ArrayLike) -> Float[Array, ""]:
     """Angle [rad] at which the pendulum turns next, let go at rest at `start`.
 
     The energy lost is the torque times the angle swept: `m g l (cos b - cos a) = Fc (a + b)` from `a = |start|` to b

@@ -9,7 +9,6 @@ from ..scene import Scene
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     # Sums over the links up to each mass. As products: XLA on CPU has a fast one of those, but not of `jnp.cumsum`.
     upto = np.tri(q.shape[0], dtype=q.dtype)
     x = upto @ (p["l"] * jnp.cos(q) * qd)
@@ -18,13 +17,7 @@ def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     return jnp.sum(p["m"] * (0.5 * (x**2 + z**2) - p["g"] * height))
 
 
-def n_link_pendulum(
-    n: int,
-    *,
-    m: ArrayLike = 1.0,
-    l: ArrayLike = 1.0,  # noqa: E741 - the symbol of the length
-    g: ArrayLike = 9.81,
-) -> Scene:
+def scene(n: int, *, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Scene:
     """Chain of n point masses on massless links in a vertical plane, hung up at the origin, gravity along -z.
 
     The coordinates are the angles of the links [rad], each from straight down and all in the same sense, not from
@@ -40,7 +33,7 @@ def n_link_pendulum(
 
     **Returns:**
 
-    A `Scene` without effects; its exact accelerations: `n_link_pendulum_acceleration`.
+    A `Scene` without effects; its exact accelerations: `acceleration`.
 
     **Raises:**
 
@@ -51,14 +44,9 @@ def n_link_pendulum(
     return Scene(_lagrangian, params={"m": _each(m, "m", n), "l": _each(l, "l", n), "g": g})
 
 
-def double_pendulum(
-    *,
-    m: ArrayLike = 1.0,
-    l: ArrayLike = 1.0,  # noqa: E741
-    g: ArrayLike = 9.81,
-) -> Scene:
-    """The chain of two links; see `n_link_pendulum`."""
-    return n_link_pendulum(2, m=m, l=l, g=g)
+def double_pendulum(*, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Scene:
+    """The chain of two links; see `scene`."""
+    return scene(2, m=m, l=l, g=g)
 
 
 def _each(x: ArrayLike, name: str, n: int) -> Array:
@@ -68,13 +56,8 @@ def _each(x: ArrayLike, name: str, n: int) -> Array:
     return jnp.broadcast_to(array, (n,))
 
 
-def n_link_pendulum_acceleration(
-    q: Float[Array, " n"],
-    qd: Float[Array, " n"],
-    *,
-    m: ArrayLike = 1.0,
-    l: ArrayLike = 1.0,  # noqa: E741
-    g: ArrayLike = 9.81,
+def acceleration(
+    q: Float[Array, " n"], qd: Float[Array, " n"], *, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81
 ) -> Float[Array, " n"]:
     """Accelerations of the chain, from its equations of motion in closed form.
 

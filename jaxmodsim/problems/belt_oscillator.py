@@ -8,12 +8,12 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..friction import Coulomb, Stribeck, Viscous
 from ..scene import Friction, Scene
-from ._spring import braked_spring
+from . import braked_spring
 
 # A machine that sticks and slips about once a second: mass [kg], stiffness [N/m], belt [m/s], forces [N].
-BELT_OSCILLATOR = {"m": 1.0, "k": 100.0, "belt": 0.1, "Fc": 5.0, "Fs": 8.0}
+PARAMS = {"m": 1.0, "k": 100.0, "belt": 0.1, "Fc": 5.0, "Fs": 8.0}
 # A law for it that falls with the slip velocity.
-BELT_STRIBECK = {"Fc": 5.0, "Fs": 8.0, "vs": 0.2, "Fv": 0.3}
+STRIBECK = {"Fc": 5.0, "Fs": 8.0, "vs": 0.2, "Fv": 0.3}
 
 
 class BeltCycle(NamedTuple):
@@ -34,19 +34,19 @@ class BeltCycle(NamedTuple):
     highest: Float[Array, ""]
 
 
-def belt_oscillator(
+def scene(
     law: object = None,
     *,
-    m: ArrayLike = BELT_OSCILLATOR["m"],
-    k: ArrayLike = BELT_OSCILLATOR["k"],
-    belt: ArrayLike = BELT_OSCILLATOR["belt"],
+    m: ArrayLike = PARAMS["m"],
+    k: ArrayLike = PARAMS["k"],
+    belt: ArrayLike = PARAMS["belt"],
     c: ArrayLike | None = None,
 ) -> Scene:
     """The mass and spring of `braked_spring`, on a belt that moves at constant velocity.
 
     **Arguments:**
 
-    - `law`: friction law between mass and belt; None for `belt_coulomb()`.
+    - `law`: friction law between mass and belt; None for `coulomb()`.
     - `m`: mass [kg], > 0.
     - `k`: stiffness of the spring to the ground [N/m], > 0, relaxed at q = 0.
     - `belt`: velocity of the belt [m/s].
@@ -55,26 +55,26 @@ def belt_oscillator(
     **Returns:**
 
     A `Scene` with one coordinate [m] and the effect `friction`; with `c` also `damper`. Under Coulomb friction it
-    follows `belt_oscillator_cycle`, if there is no damper; with one, `belt_onset_speed` says whether it sticks again.
+    follows `cycle`, if there is no damper; with one, `onset_speed` says whether it sticks again.
     """
-    spring = braked_spring(m=m, k=k)
-    friction = Friction(belt_coulomb() if law is None else law, belt_velocity=belt)
+    spring = braked_spring.scene(m=m, k=k)
+    friction = Friction(coulomb() if law is None else law, belt_velocity=belt)
     damper = () if c is None else (Friction(Viscous(c), name="damper"),)
     return Scene(spring.lagrangian, params=spring.params, effects=(friction, *damper))
 
 
-def belt_coulomb() -> Coulomb:
-    """The Coulomb law of `BELT_OSCILLATOR`: a level in stick and a lower one in slip."""
-    return Coulomb(Fc=BELT_OSCILLATOR["Fc"], Fs=BELT_OSCILLATOR["Fs"])
+def coulomb() -> Coulomb:
+    """The Coulomb law of `PARAMS`: a level in stick and a lower one in slip."""
+    return Coulomb(Fc=PARAMS["Fc"], Fs=PARAMS["Fs"])
 
 
-def belt_stribeck(exponent: ArrayLike = 2.0) -> Stribeck:
-    """The law of `BELT_STRIBECK`, with the shape `exponent` of its fall."""
-    return Stribeck(**BELT_STRIBECK, exponent=exponent)
+def stribeck(exponent: ArrayLike = 2.0) -> Stribeck:
+    """The law of `STRIBECK`, with the shape `exponent` of its fall."""
+    return Stribeck(**STRIBECK, exponent=exponent)
 
 
-def belt_oscillator_cycle(*, m: ArrayLike, k: ArrayLike, belt: ArrayLike, Fc: ArrayLike, Fs: ArrayLike) -> BeltCycle:
-    """The cycle of `belt_oscillator` under Coulomb friction, in closed form.
+def cycle(*, m: ArrayLike, k: ArrayLike, belt: ArrayLike, Fc: ArrayLike, Fs: ArrayLike) -> BeltCycle:
+    """The cycle of the scene under Coulomb friction, in closed form.
 
     With `w = sqrt(k/m)` and `d = (Fs - Fc)/k`: in stick the mass goes at the velocity of the belt, until the spring
     pulls with Fs, at `Fs/k`. In slip it is pushed on by Fc, so it swings about `Fc/k`, from `d` above it at the
@@ -102,28 +102,28 @@ def belt_oscillator_cycle(*, m: ArrayLike, k: ArrayLike, belt: ArrayLike, Fc: Ar
     return BeltCycle(stick + slip, stick, slip, middle + d, middle - d, middle - reach, middle + reach)
 
 
-def belt_oscillator_motion(
+def motion(
     t: Float[Array, "..."], *, m: ArrayLike, k: ArrayLike, belt: ArrayLike, Fc: ArrayLike, Fs: ArrayLike
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Position [m] and velocity [m/s] at the times `t` [s], started in stick from q = 0 at t = 0; shape as `t`.
 
-    The cycle of `belt_oscillator_cycle` from the first slip, at `Fs/(k belt)`, on; until then the mass goes with the
+    What `cycle` says from the first slip, at `Fs/(k belt)`, on; until then the mass goes with the
     belt. Arguments as there, t >= 0.
     """
-    cycle = belt_oscillator_cycle(m=m, k=k, belt=belt, Fc=Fc, Fs=Fs)
+    whole = cycle(m=m, k=k, belt=belt, Fc=Fc, Fs=Fs)
     w, middle = jnp.sqrt(k / jnp.asarray(m)), Fc / jnp.asarray(k)
-    since = t - cycle.begins / belt
-    phase = jnp.where(since > 0, since % cycle.period, since)
-    slips = (phase > 0) & (phase < cycle.slip)
-    place = middle + (cycle.begins - middle) * jnp.cos(w * phase) + belt / w * jnp.sin(w * phase)
-    speed = belt * jnp.cos(w * phase) - (cycle.begins - middle) * w * jnp.sin(w * phase)
+    since = t - whole.begins / belt
+    phase = jnp.where(since > 0, since % whole.period, since)
+    slips = (phase > 0) & (phase < whole.slip)
+    place = middle + (whole.begins - middle) * jnp.cos(w * phase) + belt / w * jnp.sin(w * phase)
+    speed = belt * jnp.cos(w * phase) - (whole.begins - middle) * w * jnp.sin(w * phase)
     # In stick, counted from the slip that follows.
-    carried = cycle.begins + belt * jnp.where(since > 0, phase - cycle.period, since)
+    carried = whole.begins + belt * jnp.where(since > 0, phase - whole.period, since)
     return jnp.where(slips, place, carried), jnp.where(slips, speed, belt)
 
 
-def belt_onset_speed(*, m: ArrayLike, k: ArrayLike, c: ArrayLike, Fc: ArrayLike, Fs: ArrayLike) -> Float[Array, "..."]:
-    """Velocity of the belt [m/s] below which `belt_oscillator` with a damper sticks and slips for ever.
+def onset_speed(*, m: ArrayLike, k: ArrayLike, c: ArrayLike, Fc: ArrayLike, Fs: ArrayLike) -> Float[Array, "..."]:
+    """Velocity of the belt [m/s] below which `scene` with a damper sticks and slips for ever.
 
     It breaks away at the velocity of the belt, where `k x + c belt = Fs`, and then swings freely about `Fc/k` while
     friction pushes with Fc. With `w = sqrt(k/m)`, `zeta = c/(2 m w)`, `u = sqrt(1 - zeta^2)`, time `s = w t` and
@@ -170,8 +170,8 @@ def belt_onset_speed(*, m: ArrayLike, k: ArrayLike, c: ArrayLike, Fc: ArrayLike,
 
     fixed = jax.lax.stop_gradient(zeta)
     # The left-hand side is above (d - zeta)^2, the right-hand side below exp(4 pi zeta/u).
-    whole = 2.0 * jnp.pi * fixed / jnp.sqrt(1.0 - fixed**2)
-    bracket = (jnp.log(2.0 * fixed), jnp.logaddexp(whole, jnp.log(fixed)))
+    turns = 2.0 * jnp.pi * fixed / jnp.sqrt(1.0 - fixed**2)
+    bracket = (jnp.log(2.0 * fixed), jnp.logaddexp(turns, jnp.log(fixed)))
     root, _ = jax.lax.fori_loop(0, 60, halve, bracket)
     # One step of Newton, which also carries the derivatives.
     slope = jax.jvp(lambda x: gap(x, fixed), (root,), (jnp.ones_like(root),))[1]

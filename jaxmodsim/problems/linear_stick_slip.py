@@ -1,4 +1,4 @@
-"""Reference for systems that are linear between stick-slip events: matrix exponentials in NumPy, without JAX.
+"""Systems that are linear between stick-slip events: their scene, and a reference by matrix exponentials in NumPy.
 
 `M q'' + C q' + K q = L w(t) - D^T f` with dry friction forces f along the rows of D. In each combination of stick and
 slip the system is linear, and the loads w(t) (polynomials, harmonics, harmonics that grow with time, a sampled signal)
@@ -10,10 +10,16 @@ import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
-from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
+from jaxtyping import Array, Float
+from numpy.polynomial.polynomial import polyval
+
+from ..friction import Coulomb
+from ..scene import AppliedForce, Friction, Scene, Signal
 
 # Grid points of one period of the fastest harmonic or natural oscillation, and the least number along a run.
 _PER_PERIOD, _PER_RUN = 64, 2000
@@ -194,14 +200,10 @@ class _Mode:
         return np.array([rows @ each for each in (x, first, second, self.rate @ second)])
 
 
-def _polynomial(coefficients: np.ndarray, s: Any) -> Any:
-    return np.polynomial.polynomial.polyval(s, coefficients)
-
-
 def _first_crossing(coefficients: np.ndarray, length: float) -> float | None:
     """First time in (0, length] at which a guard, a polynomial, falls through zero."""
     at = np.linspace(0.0, length, _FINE + 1)
-    values = _polynomial(coefficients, at)
+    values = polyval(at, coefficients)
     values[0] = max(values[0], 0.0)
     lowest = int(np.argmin(values[1:])) + 1
     if values[lowest] >= 0:
@@ -210,15 +212,15 @@ def _first_crossing(coefficients: np.ndarray, length: float) -> float | None:
     low, high = at[i - 1], at[i]
     if i == 1 and values[0] < _ZERO * np.abs(values).max():
         # From zero the guard rises first.
-        low = next((s for s in high * 0.5 ** np.arange(1, 30) if _polynomial(coefficients, s) > 0), low)
+        low = next((s for s in high * 0.5 ** np.arange(1, 30) if polyval(s, coefficients) > 0), low)
     for _ in range(80):
         middle = 0.5 * (low + high)
-        low, high = (low, middle) if _polynomial(coefficients, middle) < 0 else (middle, high)
+        low, high = (low, middle) if polyval(middle, coefficients) < 0 else (middle, high)
     return high
 
 
 class _Run:
-    """Propagation of one system; see `stick_slip_motion`."""
+    """Propagation of one system; see `motion`."""
 
     def __init__(self, system: LinearStickSlip, t0: float, t1: float) -> None:
         """A run without any events so far."""
@@ -295,23 +297,19 @@ class _Run:
         while stop - t > 4.0 * math.ulp(stop):  # what is shorter changes nothing
             count = min(int((stop - t) / self.step), _CHUNK)
             length = self.step if count else stop - t
-            after = mode.powers[:count] @ x if count else self.within(mode, x, length)[None]
+            after = mode.powers[:count] @ x if count else np.atleast_2d(polyval(length, mode.series(x)))
             grid = np.vstack([x, after])
             for k in self.suspects(mode, grid, length):
                 fired = self.earliest(mode, grid[k], length)
                 if fired is not None:
                     s, i = fired
                     self.note(grid[: k + 1], mode)
-                    return self.within(mode, grid[k], s), t + k * length + s, i
+                    return np.asarray(polyval(s, mode.series(grid[k]))), t + k * length + s, i
             self.note(grid, mode)
             t = t + count * length if count else stop
             # The loads are known; their propagation would gather rounding.
             x = np.concatenate([grid[-1][:n], self.system.loads(t) if t < stop else grid[-1][n:]])
         return x, stop, None
-
-    def within(self, mode: _Mode, x: np.ndarray, s: float) -> np.ndarray:
-        """State after at most one grid step."""
-        return _polynomial(mode.series(x), s)
 
     def note(self, grid: np.ndarray, mode: _Mode) -> None:
         """Keep the largest magnitudes."""
@@ -338,13 +336,13 @@ class _Run:
             if s is not None:
                 found.append((s, int(i), row))
                 continue
-            values = _polynomial(guard, np.linspace(0.0, length, _FINE + 1))
+            values = polyval(np.linspace(0.0, length, _FINE + 1), guard)
             if 0 < np.argmin(values) < _FINE:
                 self.note_near(mode, int(i), float(values.min()))
         if not found:
             return None
         s, i, row = min(found, key=lambda each: each[0])
-        _, slope, bend, _ = mode.derivatives(row[None], self.within(mode, x, s))[:, 0]
+        _, slope, bend, _ = mode.derivatives(row[None], polyval(s, series))[:, 0]
         if bend > 0:
             # How far the guard would go on to fall.
             self.note_near(mode, i, 0.5 * slope**2 / bend)
@@ -373,7 +371,7 @@ def _stop_slip(system: LinearStickSlip, mode: _Mode, x: np.ndarray) -> np.ndarra
     return np.concatenate([x[:n], x[n : 2 * n] - respond @ impulse, x[2 * n :]])
 
 
-def stick_slip_motion(
+def motion(
     system: LinearStickSlip, q0: np.ndarray, qd0: np.ndarray, t1: float, *, t0: float = 0.0, max_events: int = 10000
 ) -> StickSlipMotion:
     """The motion from `t0` to `t1`, event by event.
@@ -429,3 +427,71 @@ def stick_slip_motion(
         x[:n], x[n : 2 * n], run.scale[:n], run.scale[n:], instants, np.array(modes), min([run.force_margin, *turns]),
         spacing,
     )  # fmt: skip
+
+
+def _waves(t: Array, frequencies: Array) -> Array:
+    """What the loads of a `LinearStickSlip` are combinations of, but for the sampled signal."""
+    sine, cosine = jnp.sin(frequencies * t), jnp.cos(frequencies * t)
+    harmonics = jnp.stack([sine, cosine, t * sine, t * cosine], axis=1)
+    return jnp.concatenate([jnp.stack([jnp.ones_like(t), t, t * t]), jnp.reshape(harmonics, -1)])
+
+
+def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    kinetic = 0.5 * jnp.sum(qd * jnp.sum(p["mass"] * qd[None, :], axis=1))
+    return kinetic - 0.5 * jnp.sum(q * jnp.sum(p["stiffness"] * q[None, :], axis=1))
+
+
+def _load(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    waves = jnp.sum(p["load"] * _waves(t, p["frequencies"])[None, :], axis=1)
+    return waves - jnp.sum(p["damping"] * qd[None, :], axis=1)
+
+
+def _load_and_signal(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    return _load(t, q, qd, p) + p["signal_load"] * p["signal"]
+
+
+class _WeightedSum(eqx.Module):
+    """A row of numbers: displacement of an element at q, or velocity of a surface at t, which moves in waves."""
+
+    row: Float[Array, " n"]
+    frequencies: Float[Array, " frequencies"] | None = None
+
+    def __call__(self, x: Array) -> Array:
+        """The row times q, or times the waves at t."""
+        return jnp.sum(self.row * (x if self.frequencies is None else _waves(x, self.frequencies)))
+
+
+def scene(system: LinearStickSlip, *, moving: bool | None = None) -> Scene:
+    """The scene of a `LinearStickSlip`, whose motion is `motion`.
+
+    Scenes of systems with the same numbers of coordinates, elements, frequencies and samples have the same structure,
+    so that their numbers can be stacked for `jax.vmap`.
+
+    **Arguments:**
+
+    - `system`: the `LinearStickSlip`. Belts must not depend on its signal.
+    - `moving`: whether surfaces move; by default where `belt` is not zero.
+
+    **Returns:**
+
+    A `Scene` with the coordinates of the system [m] and the effects `load`, `element_0`, `element_1`, ...
+    """
+    moving = bool(np.any(system.belt)) if moving is None else moving
+    frequencies = jnp.asarray(system.frequencies)
+    params = {name: getattr(system, name) for name in ("mass", "stiffness", "damping")}
+    params |= {"load": system.load[:, :-2], "frequencies": frequencies}
+    load = _load
+    if len(system.sample_times):
+        params["signal"] = Signal(system.sample_times, system.sample_values, linear=system.linear)
+        params["signal_load"] = system.load[:, -2]
+        load = _load_and_signal
+    elements = [
+        Friction(
+            Coulomb(Fc, Fs),
+            along=_WeightedSum(jnp.asarray(row)),
+            belt_velocity=_WeightedSum(jnp.asarray(belt[:-2]), frequencies) if moving else 0.0,
+            name=f"element_{i}",
+        )
+        for i, (Fc, Fs, row, belt) in enumerate(zip(system.Fc, system.Fs, system.directions, system.belt, strict=True))
+    ]
+    return Scene(_lagrangian, params=params, effects=(AppliedForce(load, name="load"), *elements))

@@ -10,7 +10,7 @@ from ..mechanics import Constraint, rigid_body
 from ..scene import AbstractEffect, AppliedForce, Friction, Scene
 
 # Masses of crank, rod and slider [kg], lengths of crank and rod [m], gravity [m/s^2].
-SLIDER_CRANK = {"m1": 0.6, "m2": 0.9, "m3": 1.4, "r": 0.3, "l": 0.8, "g": 9.81}
+PARAMS = {"m1": 0.6, "m2": 0.9, "m3": 1.4, "r": 0.3, "l": 0.8, "g": 9.81}
 
 
 class SliderCrankForces(NamedTuple):
@@ -42,18 +42,6 @@ def _rod_middle(q: Array, p: dict[str, Array]) -> Array:
     return 2.0 * _crank_middle(q, p) + 0.5 * p["l"] * _in_plane(jnp.cos(q[1]), jnp.sin(q[1]))
 
 
-def _rod_end(q: Array, p: dict[str, Array]) -> Array:
-    return 2.0 * _crank_middle(q, p) + p["l"] * _in_plane(jnp.cos(q[1]), jnp.sin(q[1]))
-
-
-def _crank_angle(q: Array) -> Array:
-    return q[0]
-
-
-def _rod_angle(q: Array) -> Array:
-    return q[1]
-
-
 def _slider(q: Array) -> Array:
     return _in_plane(q[2], q[3])
 
@@ -63,52 +51,51 @@ def _track(q: Array) -> Array:
 
 
 def _ends(q: Array, p: dict[str, Array]) -> Array:
-    return jnp.stack([_rod_end(q, p), _slider(q)])
+    rod_end = 2.0 * _crank_middle(q, p) + p["l"] * _in_plane(jnp.cos(q[1]), jnp.sin(q[1]))
+    return jnp.stack([rod_end, _slider(q)])
 
 
 def _gap(t: Array, ends: Array, p: dict[str, Array]) -> Array:
-    del t, p
     gap = ends[1] - ends[0]
     return jnp.stack([gap[0], gap[2]])
 
 
 def _height(t: Array, x: Array, p: dict[str, Array]) -> Array:
-    del t, p
     return x[2]
 
 
 def _drive(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, qd
     return jnp.zeros_like(q).at[0].set(p["torque"])
 
 
 def _slide(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     return 0.5 * p["m3"] * (qd[2] ** 2 + qd[3] ** 2) - p["m3"] * p["g"] * q[3]
 
 
 _CRANK = rigid_body(
-    lambda p: p["m1"], lambda p: p["m1"] * p["r"] ** 2 / 12.0, _crank_middle, _crank_angle, lambda p: p["g"]
+    lambda p: p["m1"], lambda p: p["m1"] * p["r"] ** 2 / 12.0, _crank_middle, lambda q: q[0], lambda p: p["g"]
 )
-_ROD = rigid_body(lambda p: p["m2"], lambda p: p["m2"] * p["l"] ** 2 / 12.0, _rod_middle, _rod_angle, lambda p: p["g"])
+_ROD = rigid_body(
+    lambda p: p["m2"], lambda p: p["m2"] * p["l"] ** 2 / 12.0, _rod_middle, lambda q: q[1], lambda p: p["g"]
+)
 _LAGRANGIAN = _CRANK + _ROD + _slide
 
 
-def slider_crank(
+def scene(
     *,
-    m1: ArrayLike = SLIDER_CRANK["m1"],
-    m2: ArrayLike = SLIDER_CRANK["m2"],
-    m3: ArrayLike = SLIDER_CRANK["m3"],
-    r: ArrayLike = SLIDER_CRANK["r"],
-    l: ArrayLike = SLIDER_CRANK["l"],  # noqa: E741 - the symbol of the length
-    g: ArrayLike = SLIDER_CRANK["g"],
+    m1: ArrayLike = PARAMS["m1"],
+    m2: ArrayLike = PARAMS["m2"],
+    m3: ArrayLike = PARAMS["m3"],
+    r: ArrayLike = PARAMS["r"],
+    l: ArrayLike = PARAMS["l"],
+    g: ArrayLike = PARAMS["g"],
     torque: ArrayLike | None = None,
     mu: ArrayLike | None = None,
 ) -> Scene:
     """A crank about the origin, a rod from its end, and a slider at the end of the rod, in a vertical plane, y upwards.
 
     The coordinates are the angles of crank and rod [rad], each counterclockwise from the x axis and towards the slider,
-    and the place (x, y) of the slider [m]. Crank and rod are uniform. States that close the loop: `slider_crank_state`.
+    and the place (x, y) of the slider [m]. Crank and rod are uniform. States that close the loop: `state`.
 
     **Arguments:**
 
@@ -123,7 +110,7 @@ def slider_crank(
 
     A `Scene` with the constraints `pin`, two equations, whose force [N] on (rod, slider) has the shape `[2, 3]`, and
     `guide`, y = 0, whose multiplier is the force of the guide on the slider [N]; and where they are asked for the
-    effects `drive` and `friction`. Its exact motion: `slider_crank_acceleration`, `slider_crank_forces`.
+    effects `drive` and `friction`. Its exact motion: `acceleration`, `forces`.
     """
     params: dict[str, ArrayLike] = {"m1": m1, "m2": m2, "m3": m3, "r": r, "l": l, "g": g}
     effects: tuple[AbstractEffect, ...] = ()
@@ -136,14 +123,10 @@ def slider_crank(
     return Scene(_LAGRANGIAN, params=params, effects=effects, constraints=(pin, guide))
 
 
-def slider_crank_state(
-    angle: ArrayLike,
-    rate: ArrayLike,
-    *,
-    r: ArrayLike = SLIDER_CRANK["r"],
-    l: ArrayLike = SLIDER_CRANK["l"],  # noqa: E741
+def state(
+    angle: ArrayLike, rate: ArrayLike, *, r: ArrayLike = PARAMS["r"], l: ArrayLike = PARAMS["l"]
 ) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
-    """Coordinates and velocities of `slider_crank` at an angle of the crank [rad] and its rate [rad/s].
+    """Coordinates and velocities of `scene` at an angle of the crank [rad] and its rate [rad/s].
 
     The slider is on the side of larger x: `sin(rod) = -(r/l) sin(crank)` with cos(rod) > 0.
     """
@@ -156,16 +139,16 @@ def slider_crank_state(
     return q, rate * jnp.stack([jnp.ones_like(angle), turn, r * sine * (turn - 1.0), zero])
 
 
-def slider_crank_acceleration(
+def acceleration(
     angle: Float[Array, ""],
     rate: Float[Array, ""],
     *,
-    m1: ArrayLike = SLIDER_CRANK["m1"],
-    m2: ArrayLike = SLIDER_CRANK["m2"],
-    m3: ArrayLike = SLIDER_CRANK["m3"],
-    r: ArrayLike = SLIDER_CRANK["r"],
-    l: ArrayLike = SLIDER_CRANK["l"],  # noqa: E741
-    g: ArrayLike = SLIDER_CRANK["g"],
+    m1: ArrayLike = PARAMS["m1"],
+    m2: ArrayLike = PARAMS["m2"],
+    m3: ArrayLike = PARAMS["m3"],
+    r: ArrayLike = PARAMS["r"],
+    l: ArrayLike = PARAMS["l"],
+    g: ArrayLike = PARAMS["g"],
     torque: ArrayLike = 0.0,
     force: ArrayLike = 0.0,
 ) -> Float[Array, ""]:
@@ -181,10 +164,10 @@ def slider_crank_acceleration(
 
     - `angle`, `rate`: of the crank [rad], [rad/s].
     - `force`: on the slider along x [N], such as friction.
-    - All others: as for `slider_crank`.
+    - All others: as for `scene`.
     """
     numbers = (m1, m2, m3, r, l, g, torque, force)
-    m1, m2, m3, r, l, g, torque, force = (jnp.asarray(x, angle.dtype) for x in numbers)  # noqa: E741
+    m1, m2, m3, r, l, g, torque, force = (jnp.asarray(x, angle.dtype) for x in numbers)
     sine, cosine, c = jnp.sin(angle), jnp.cos(angle), r / l
     opened = jnp.sqrt(1.0 - (c * sine) ** 2)
     b1 = -c * cosine / opened
@@ -199,16 +182,16 @@ def slider_crank_acceleration(
     return (load - 0.5 * slope * rate**2) / inertia
 
 
-def slider_crank_forces(
+def forces(
     angle: Float[Array, ""],
     rate: Float[Array, ""],
     *,
-    m1: ArrayLike = SLIDER_CRANK["m1"],
-    m2: ArrayLike = SLIDER_CRANK["m2"],
-    m3: ArrayLike = SLIDER_CRANK["m3"],
-    r: ArrayLike = SLIDER_CRANK["r"],
-    l: ArrayLike = SLIDER_CRANK["l"],  # noqa: E741
-    g: ArrayLike = SLIDER_CRANK["g"],
+    m1: ArrayLike = PARAMS["m1"],
+    m2: ArrayLike = PARAMS["m2"],
+    m3: ArrayLike = PARAMS["m3"],
+    r: ArrayLike = PARAMS["r"],
+    l: ArrayLike = PARAMS["l"],
+    g: ArrayLike = PARAMS["g"],
     torque: ArrayLike = 0.0,
     mu: ArrayLike = 0.0,
 ) -> SliderCrankForces:
@@ -217,11 +200,11 @@ def slider_crank_forces(
     Ten linear equations: for crank and rod the forces along x and y and the moments about their middles, for the slider
     the forces, and that the ends of rod and slider have the same acceleration. Friction is `-mu |N| sign(x')`, so they
     are solved for either sign of the guide's force N, and the solution is taken that has the sign it was found with
-    (one has, for mu not too large). Arguments as for `slider_crank_acceleration`; the slider moves.
+    (one has, for mu not too large). Arguments as for `acceleration`; the slider moves.
     """
     numbers = (m1, m2, m3, r, l, g, torque, mu)
-    m1, m2, m3, r, l, g, torque, mu = (jnp.asarray(x, angle.dtype) for x in numbers)  # noqa: E741
-    q, qd = slider_crank_state(angle, rate, r=r, l=l)
+    m1, m2, m3, r, l, g, torque, mu = (jnp.asarray(x, angle.dtype) for x in numbers)
+    q, qd = state(angle, rate, r=r, l=l)
     (s1, s2), (c1, c2) = (jnp.sin(q[:2]), jnp.cos(q[:2]))
     w1, w2 = qd[0] ** 2, qd[1] ** 2
     i1, i2 = m1 * r**2 / 12.0, m2 * l**2 / 12.0

@@ -7,7 +7,7 @@ from ..mechanics import VelocityConstraint, rigid_body
 from ..scene import Scene
 
 # Mass [kg], radius [m], moment of inertia about the axle in units of m R^2 (1/2 a disc, 1 a hoop), gravity [m/s^2].
-ROLLING_DISC = {"m": 0.8, "R": 0.5, "k": 0.5, "g": 9.81}
+PARAMS = {"m": 0.8, "R": 0.5, "k": 0.5, "g": 9.81}
 
 
 def _centre(q: Array, p: dict[str, Array]) -> Array:
@@ -33,7 +33,6 @@ def _moments(p: dict[str, Array]) -> Array:
 
 def _slip(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     """Velocity of the point of contact along and across the heading."""
-    del t
     sine, cosine = jnp.sin(q[2]), jnp.cos(q[2])
     along, across = cosine * qd[0] + sine * qd[1], cosine * qd[1] - sine * qd[0]
     return jnp.stack([along - p["R"] * (qd[4] + jnp.sin(q[3]) * qd[2]), across + p["R"] * jnp.cos(q[3]) * qd[3]])
@@ -42,12 +41,8 @@ def _slip(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
 _DISC = rigid_body(lambda p: p["m"], _moments, _centre, _turned, lambda p: p["g"])
 
 
-def rolling_disc(
-    *,
-    m: ArrayLike = ROLLING_DISC["m"],
-    R: ArrayLike = ROLLING_DISC["R"],
-    k: ArrayLike = ROLLING_DISC["k"],
-    g: ArrayLike = ROLLING_DISC["g"],
+def scene(
+    *, m: ArrayLike = PARAMS["m"], R: ArrayLike = PARAMS["R"], k: ArrayLike = PARAMS["k"], g: ArrayLike = PARAMS["g"]
 ) -> Scene:
     """Thin disc that rolls without slipping on the plane z = 0, its edge always on it.
 
@@ -66,16 +61,14 @@ def rolling_disc(
     **Returns:**
 
     A `Scene` without effects, with the constraint `rolling`, two equations: its multipliers are the force of the plane
-    on the disc [N] along and across the heading. Velocities that roll: `rolling_disc_velocity`; the exact motion:
-    `rolling_disc_acceleration`; steady circles: `rolling_disc_steady_spin`.
+    on the disc [N] along and across the heading. Velocities that roll: `velocity`; the exact motion:
+    `acceleration`; steady circles: `steady_spin`.
     """
     rolling = VelocityConstraint(_slip, name="rolling")
     return Scene(_DISC, params={"m": m, "R": R, "k": k, "g": g}, constraints=(rolling,))
 
 
-def rolling_disc_velocity(
-    q: Float[Array, "5"], rates: Float[Array, "3"], *, R: ArrayLike = ROLLING_DISC["R"]
-) -> Float[Array, "5"]:
+def velocity(q: Float[Array, "5"], rates: Float[Array, "3"], *, R: ArrayLike = PARAMS["R"]) -> Float[Array, "5"]:
     """All velocities [m/s, rad/s], shape `[5]`, that roll with the given rates of (heading, lean, spin) [rad/s]."""
     R = jnp.asarray(R)
     along = R * (rates[2] + jnp.sin(q[3]) * rates[0])
@@ -84,13 +77,13 @@ def rolling_disc_velocity(
     return jnp.concatenate([jnp.stack([cosine * along - sine * across, sine * along + cosine * across]), rates])
 
 
-def rolling_disc_acceleration(
+def acceleration(
     q: Float[Array, "5"],
     qd: Float[Array, "5"],
     *,
-    R: ArrayLike = ROLLING_DISC["R"],
-    k: ArrayLike = ROLLING_DISC["k"],
-    g: ArrayLike = ROLLING_DISC["g"],
+    R: ArrayLike = PARAMS["R"],
+    k: ArrayLike = PARAMS["k"],
+    g: ArrayLike = PARAMS["g"],
 ) -> Float[Array, "5"]:
     """Accelerations of the rolling disc in closed form; the mass drops out.
 
@@ -104,7 +97,7 @@ def rolling_disc_acceleration(
     **Arguments:**
 
     - `q`, `qd`: (x, y, heading, lean, spin) and their rates, shape `[5]`; |lean| < pi/2, and `qd` rolls.
-    - `R`, `k`, `g`: as for `rolling_disc`.
+    - `R`, `k`, `g`: as for `scene`.
 
     **Returns:**
 
@@ -126,24 +119,24 @@ def rolling_disc_acceleration(
     return jnp.stack([c * along - s * across, s * along + c * across, turn2, fall2, spin2])
 
 
-def rolling_disc_steady_spin(
+def steady_spin(
     lean: ArrayLike,
     turn: ArrayLike,
     *,
-    R: ArrayLike = ROLLING_DISC["R"],
-    k: ArrayLike = ROLLING_DISC["k"],
-    g: ArrayLike = ROLLING_DISC["g"],
+    R: ArrayLike = PARAMS["R"],
+    k: ArrayLike = PARAMS["k"],
+    g: ArrayLike = PARAMS["g"],
 ) -> Float[Array, ""]:
     """Rate of spin [rad/s] with which the disc keeps its lean and rolls in a circle.
 
-    From f'' = 0 in `rolling_disc_acceleration`: `w = (d h'^2 sin(f) cos(f) - (g/R) sin(f))/((k + 1) h' cos(f))`. The
+    From f'' = 0 in `acceleration`: `w = (d h'^2 sin(f) cos(f) - (g/R) sin(f))/((k + 1) h' cos(f))`. The
     centre then moves at the speed R w, on a circle of radius R |w/h'|.
 
     **Arguments:**
 
     - `lean`: f [rad], |f| < pi/2.
     - `turn`: rate of the heading h' [rad/s], not zero.
-    - `R`, `k`, `g`: as for `rolling_disc`.
+    - `R`, `k`, `g`: as for `scene`.
     """
     k, turn = jnp.asarray(k), jnp.asarray(turn)
     sine, cosine = jnp.sin(lean), jnp.cos(lean)

@@ -16,7 +16,6 @@ def _in_space(q: Array) -> Array:
 
 
 def _stretch(t: Array, x: Array, p: dict[str, Array]) -> Array:
-    del t
     return jnp.sqrt(jnp.sum(x**2)) - p["l"]
 
 
@@ -24,12 +23,7 @@ _PLANE_BOB = point_mass(lambda p: p["m"], _in_plane, lambda p: p["g"])
 _SPACE_BOB = point_mass(lambda p: p["m"], _in_space, lambda p: p["g"])
 
 
-def cartesian_pendulum(
-    *,
-    m: ArrayLike = 1.0,
-    l: ArrayLike = 1.0,  # noqa: E741 - the symbol of the length
-    g: ArrayLike = 9.81,
-) -> Scene:
+def scene(*, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Scene:
     """Point mass on a massless rod, by its coordinates (x, z) [m] from the pivot in a vertical plane, z upwards.
 
     **Arguments:**
@@ -41,35 +35,24 @@ def cartesian_pendulum(
     **Returns:**
 
     A `Scene` with the constraint `rod`, `sqrt(x^2 + z^2) = l`: its multiplier is the force of the rod on the mass [N],
-    positive outwards, so the tension of `cartesian_pendulum_tension` with a minus sign. Its exact accelerations:
-    `cartesian_pendulum_acceleration`.
+    positive outwards, so the `tension` with a minus sign. Its exact accelerations: `acceleration`.
     """
     rod = Constraint(_stretch, at=_in_plane, name="rod")
     return Scene(_PLANE_BOB, params={"m": m, "l": l, "g": g}, constraints=(rod,))
 
 
-def cartesian_spherical_pendulum(
-    *,
-    m: ArrayLike = 1.0,
-    l: ArrayLike = 1.0,  # noqa: E741
-    g: ArrayLike = 9.81,
-) -> Scene:
+def cartesian_spherical_pendulum(*, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Scene:
     """The spherical pendulum by its coordinates (x, y, z) [m] from the pivot, z upwards.
 
     It passes the top and the bottom as any other place, where the angles of `spherical_pendulum` fail. Arguments and
-    results as for `cartesian_pendulum`; the multiplier is `spherical_pendulum_reaction`.
+    results as for `scene`; the multiplier is `spherical_pendulum.reaction`.
     """
     rod = Constraint(_stretch, at=_in_space, name="rod")
     return Scene(_SPACE_BOB, params={"m": m, "l": l, "g": g}, constraints=(rod,))
 
 
-def cartesian_pendulum_tension(
-    q: Float[Array, " dim"],
-    qd: Float[Array, " dim"],
-    *,
-    m: ArrayLike = 1.0,
-    l: ArrayLike = 1.0,  # noqa: E741
-    g: ArrayLike = 9.81,
+def tension(
+    q: Float[Array, " dim"], qd: Float[Array, " dim"], *, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81
 ) -> Float[Array, ""]:
     """Tension of the rod [N], positive where it pulls the mass inwards: `m (v^2 - g z)/l`.
 
@@ -78,21 +61,17 @@ def cartesian_pendulum_tension(
     **Arguments:**
 
     - `q`, `qd`: position [m] and velocity [m/s], (x, z) or (x, y, z), with |q| = l and q . qd = 0.
-    - `m`, `l`, `g`: as for `cartesian_pendulum`.
+    - `m`, `l`, `g`: as for `scene`.
     """
     return jnp.asarray(m) * (jnp.sum(qd**2) - g * q[-1]) / l
 
 
-def cartesian_pendulum_acceleration(
-    q: Float[Array, " dim"],
-    qd: Float[Array, " dim"],
-    *,
-    l: ArrayLike = 1.0,  # noqa: E741
-    g: ArrayLike = 9.81,
+def acceleration(
+    q: Float[Array, " dim"], qd: Float[Array, " dim"], *, l: ArrayLike = 1.0, g: ArrayLike = 9.81
 ) -> Float[Array, " dim"]:
     """Accelerations [m/s^2] by Newton's law, from gravity and the tension; the mass drops out.
 
-    Arguments as for `cartesian_pendulum_tension`.
+    Arguments as for `tension`.
     """
-    pull = cartesian_pendulum_tension(q, qd, m=1.0, l=l, g=g) / l
+    pull = tension(q, qd, m=1.0, l=l, g=g) / l
     return jnp.asarray(-pull * q).at[-1].add(-jnp.asarray(g, q.dtype))

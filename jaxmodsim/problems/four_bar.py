@@ -9,7 +9,7 @@ from ..scene import Scene
 
 # Lengths [m] of crank, coupler, rocker and ground, masses [kg] of crank, coupler and rocker, gravity [m/s^2]: by
 # Grashof's rule the crank turns fully, as the shortest and longest link together are shorter than the others.
-FOUR_BAR = {"a": 0.2, "b": 0.5, "c": 0.45, "d": 0.6, "m1": 0.4, "m2": 1.0, "m3": 0.9, "g": 9.81}
+PARAMS = {"a": 0.2, "b": 0.5, "c": 0.45, "d": 0.6, "m1": 0.4, "m2": 1.0, "m3": 0.9, "g": 9.81}
 
 
 def _along(length: Array, angle: Array) -> Array:
@@ -24,68 +24,47 @@ def _coupler_middle(q: Array, p: dict[str, Array]) -> Array:
     return _along(p["a"], q[0]) + _along(0.5 * p["b"], q[1])
 
 
-def _coupler_end(q: Array, p: dict[str, Array]) -> Array:
-    return _along(p["a"], q[0]) + _along(p["b"], q[1])
-
-
 def _rocker_middle(q: Array, p: dict[str, Array]) -> Array:
     return _along(p["d"], 0.0 * q[2]) + _along(0.5 * p["c"], q[2])
 
 
-def _rocker_end(q: Array, p: dict[str, Array]) -> Array:
-    return _along(p["d"], 0.0 * q[2]) + _along(p["c"], q[2])
-
-
-def _crank_angle(q: Array) -> Array:
-    return q[0]
-
-
-def _coupler_angle(q: Array) -> Array:
-    return q[1]
-
-
-def _rocker_angle(q: Array) -> Array:
-    return q[2]
-
-
 def _ends(q: Array, p: dict[str, Array]) -> Array:
-    return jnp.stack([_coupler_end(q, p), _rocker_end(q, p)])
+    return jnp.stack([_along(p["a"], q[0]) + _along(p["b"], q[1]), _along(p["d"], 0.0 * q[2]) + _along(p["c"], q[2])])
 
 
 def _gap(t: Array, ends: Array, p: dict[str, Array]) -> Array:
-    del t, p
     gap = ends[1] - ends[0]
     return jnp.stack([gap[0], gap[2]])
 
 
 _CRANK = rigid_body(
-    lambda p: p["m1"], lambda p: p["m1"] * p["a"] ** 2 / 12.0, _crank_middle, _crank_angle, lambda p: p["g"]
+    lambda p: p["m1"], lambda p: p["m1"] * p["a"] ** 2 / 12.0, _crank_middle, lambda q: q[0], lambda p: p["g"]
 )
 _COUPLER = rigid_body(
-    lambda p: p["m2"], lambda p: p["m2"] * p["b"] ** 2 / 12.0, _coupler_middle, _coupler_angle, lambda p: p["g"]
+    lambda p: p["m2"], lambda p: p["m2"] * p["b"] ** 2 / 12.0, _coupler_middle, lambda q: q[1], lambda p: p["g"]
 )
 _ROCKER = rigid_body(
-    lambda p: p["m3"], lambda p: p["m3"] * p["c"] ** 2 / 12.0, _rocker_middle, _rocker_angle, lambda p: p["g"]
+    lambda p: p["m3"], lambda p: p["m3"] * p["c"] ** 2 / 12.0, _rocker_middle, lambda q: q[2], lambda p: p["g"]
 )
 _LAGRANGIAN = _CRANK + _COUPLER + _ROCKER
 
 
-def four_bar(
+def scene(
     *,
-    a: ArrayLike = FOUR_BAR["a"],
-    b: ArrayLike = FOUR_BAR["b"],
-    c: ArrayLike = FOUR_BAR["c"],
-    d: ArrayLike = FOUR_BAR["d"],
-    m1: ArrayLike = FOUR_BAR["m1"],
-    m2: ArrayLike = FOUR_BAR["m2"],
-    m3: ArrayLike = FOUR_BAR["m3"],
-    g: ArrayLike = FOUR_BAR["g"],
+    a: ArrayLike = PARAMS["a"],
+    b: ArrayLike = PARAMS["b"],
+    c: ArrayLike = PARAMS["c"],
+    d: ArrayLike = PARAMS["d"],
+    m1: ArrayLike = PARAMS["m1"],
+    m2: ArrayLike = PARAMS["m2"],
+    m3: ArrayLike = PARAMS["m3"],
+    g: ArrayLike = PARAMS["g"],
 ) -> Scene:
     """Crank about the origin, rocker about (d, 0), and a coupler between their ends, in a vertical plane, y upwards.
 
     The coordinates are the angles of crank, coupler and rocker [rad], each counterclockwise from the x axis; crank and
     rocker point away from the ground, the coupler from crank to rocker. The links are uniform. States that close the
-    loop: `four_bar_state`.
+    loop: `state`.
 
     **Arguments:**
 
@@ -96,23 +75,23 @@ def four_bar(
     **Returns:**
 
     A `Scene` without effects, with the constraint `closure`, two equations: the ends of coupler and rocker meet. Its
-    multipliers are the force [N] of the coupler on the rocker, (x, y). Its exact motion: `four_bar_acceleration`.
+    multipliers are the force [N] of the coupler on the rocker, (x, y). Its exact motion: `acceleration`.
     """
     params = {"a": a, "b": b, "c": c, "d": d, "m1": m1, "m2": m2, "m3": m3, "g": g}
     return Scene(_LAGRANGIAN, params=params, constraints=(Constraint(_gap, at=_ends, name="closure"),))
 
 
-def four_bar_state(
+def state(
     angle: ArrayLike,
     rate: ArrayLike,
     *,
-    a: ArrayLike = FOUR_BAR["a"],
-    b: ArrayLike = FOUR_BAR["b"],
-    c: ArrayLike = FOUR_BAR["c"],
-    d: ArrayLike = FOUR_BAR["d"],
+    a: ArrayLike = PARAMS["a"],
+    b: ArrayLike = PARAMS["b"],
+    c: ArrayLike = PARAMS["c"],
+    d: ArrayLike = PARAMS["d"],
     crossed: bool = False,
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Coordinates and velocities of `four_bar` at an angle of the crank [rad] and its rate [rad/s].
+    """Coordinates and velocities of `scene` at an angle of the crank [rad] and its rate [rad/s].
 
     The joint of coupler and rocker is where the circles of radius b about the end of the crank and c about (d, 0) meet:
     on the line between their centres at `(s^2 + b^2 - c^2)/(2 s)` from the first, s their distance, and to its left
@@ -123,7 +102,7 @@ def four_bar_state(
     **Arguments:**
 
     - `angle`, `rate`: of the crank [rad], [rad/s].
-    - `a`, `b`, `c`, `d`: as for `four_bar`; NaN comes out where they cannot close.
+    - `a`, `b`, `c`, `d`: as for `scene`; NaN comes out where they cannot close.
     - `crossed`: which of the two ways to close it.
     """
     angle, rate = jnp.asarray(angle, float), jnp.asarray(rate, float)
@@ -141,31 +120,31 @@ def four_bar_state(
     return jnp.stack([angle, coupler, rocker]), rate * jnp.stack(rates)
 
 
-def four_bar_acceleration(
+def acceleration(
     angle: Float[Array, ""],
     rate: Float[Array, ""],
     *,
-    a: ArrayLike = FOUR_BAR["a"],
-    b: ArrayLike = FOUR_BAR["b"],
-    c: ArrayLike = FOUR_BAR["c"],
-    d: ArrayLike = FOUR_BAR["d"],
-    m1: ArrayLike = FOUR_BAR["m1"],
-    m2: ArrayLike = FOUR_BAR["m2"],
-    m3: ArrayLike = FOUR_BAR["m3"],
-    g: ArrayLike = FOUR_BAR["g"],
+    a: ArrayLike = PARAMS["a"],
+    b: ArrayLike = PARAMS["b"],
+    c: ArrayLike = PARAMS["c"],
+    d: ArrayLike = PARAMS["d"],
+    m1: ArrayLike = PARAMS["m1"],
+    m2: ArrayLike = PARAMS["m2"],
+    m3: ArrayLike = PARAMS["m3"],
+    g: ArrayLike = PARAMS["g"],
     crossed: bool = False,
 ) -> Float[Array, "3"]:
     """Accelerations of all three angles [rad/s^2], from the equation of motion of the crank angle f alone.
 
-    `J f'' + (dJ/df)/2 f'^2 + dV/df = 0`, with the rates k = d(angles)/df of `four_bar_state` in the reduced inertia
+    `J f'' + (dJ/df)/2 f'^2 + dV/df = 0`, with the rates k = d(angles)/df of `state` in the reduced inertia
     `J = m1 a^2/3 + m2 (a^2 + b^2 k2^2/3 + a b k2 cos(coupler - f)) + m3 c^2 k3^2/3` and
     `V = g (m1 a sin(f)/2 + m2 (a sin(f) + b sin(coupler)/2) + m3 c sin(rocker)/2)`; those of coupler and rocker are
-    `k f'' + (dk/df) f'^2`. Arguments as for `four_bar` and `four_bar_state`.
+    `k f'' + (dk/df) f'^2`. Arguments as for `scene` and `state`.
     """
     a, b, c, d, m1, m2, m3, g = (jnp.asarray(x, angle.dtype) for x in (a, b, c, d, m1, m2, m3, g))
 
     def follow(f: Array) -> tuple[Array, Array]:
-        return four_bar_state(f, 1.0, a=a, b=b, c=c, d=d, crossed=crossed)
+        return state(f, 1.0, a=a, b=b, c=c, d=d, crossed=crossed)
 
     def inertia(f: Array) -> Array:
         q, k = follow(f)

@@ -7,28 +7,23 @@ from ..mechanics import point_mass
 from ..scene import Scene
 
 # Mass [kg], charge [C], magnetic field along z [T], electric field (x, y, z) [V/m].
-CHARGED_PARTICLE = {"m": 0.7, "charge": -1.1, "B": 2.3, "E": (0.4, -0.3, 0.2)}
-
-
-def _place(q: Array) -> Array:
-    return q
+PARAMS = {"m": 0.7, "charge": -1.1, "B": 2.3, "E": (0.4, -0.3, 0.2)}
 
 
 def _fields(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     """`charge (A . v + E . x)`, with the vector potential A = B (-y, x, 0)/2."""
-    del t
     magnetic = 0.5 * p["B"] * (q[0] * qd[1] - q[1] * qd[0])
     return p["charge"] * (magnetic + jnp.sum(p["E"] * q))
 
 
-_LAGRANGIAN = point_mass(lambda p: p["m"], _place, lambda p: 0.0 * p["m"]) + _fields
+_LAGRANGIAN = point_mass(lambda p: p["m"], lambda q: q, lambda p: 0.0 * p["m"]) + _fields
 
 
-def charged_particle(
+def scene(
     *,
-    m: ArrayLike = CHARGED_PARTICLE["m"],
-    charge: ArrayLike = CHARGED_PARTICLE["charge"],
-    B: ArrayLike = CHARGED_PARTICLE["B"],
+    m: ArrayLike = PARAMS["m"],
+    charge: ArrayLike = PARAMS["charge"],
+    B: ArrayLike = PARAMS["B"],
     E: ArrayLike | tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Scene:
     """Charged point mass in a uniform magnetic field along z, with or without a uniform electric field.
@@ -44,7 +39,7 @@ def charged_particle(
 
     **Returns:**
 
-    A `Scene` without effects. Its exact motion: `charged_particle_motion`.
+    A `Scene` without effects. Its exact motion: `motion`.
 
     **Raises:**
 
@@ -56,32 +51,31 @@ def charged_particle(
     return Scene(_LAGRANGIAN, params={"m": m, "charge": charge, "B": B, "E": field})
 
 
-def charged_particle_acceleration(
+def acceleration(
     q: Float[Array, "3"],
     qd: Float[Array, "3"],
     *,
-    m: ArrayLike = CHARGED_PARTICLE["m"],
-    charge: ArrayLike = CHARGED_PARTICLE["charge"],
-    B: ArrayLike = CHARGED_PARTICLE["B"],
+    m: ArrayLike = PARAMS["m"],
+    charge: ArrayLike = PARAMS["charge"],
+    B: ArrayLike = PARAMS["B"],
     E: ArrayLike | tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Float[Array, "3"]:
     """Accelerations [m/s^2] by the force of Lorentz: `m v' = charge (E + v x B)`.
 
-    Arguments as for `charged_particle`, velocities `qd` [m/s]; the place `q` [m] does not matter.
+    Arguments as for `scene`, velocities `qd` [m/s]; the place `q` [m] does not matter.
     """
-    del q
     bent = B * jnp.stack([qd[1], -qd[0], jnp.zeros_like(qd[2])])
     return jnp.asarray(charge) * (jnp.asarray(E, qd.dtype) + bent) / m
 
 
-def charged_particle_motion(
+def motion(
     t: Float[Array, "..."],
     q0: Float[Array, "3"],
     qd0: Float[Array, "3"],
     *,
-    m: ArrayLike = CHARGED_PARTICLE["m"],
-    charge: ArrayLike = CHARGED_PARTICLE["charge"],
-    B: ArrayLike = CHARGED_PARTICLE["B"],
+    m: ArrayLike = PARAMS["m"],
+    charge: ArrayLike = PARAMS["charge"],
+    B: ArrayLike = PARAMS["B"],
     E: ArrayLike | tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"]]:
     """Positions [m] and velocities [m/s] at the times `t` [s], in closed form.
@@ -93,7 +87,7 @@ def charged_particle_motion(
 
     - `t`: times [s].
     - `q0`, `qd0`: position and velocity at t = 0, shape `[3]`.
-    - `m`, `charge`, `B`, `E`: as for `charged_particle`; charge and B not zero.
+    - `m`, `charge`, `B`, `E`: as for `scene`; charge and B not zero.
     """
     push, w = jnp.asarray(E, float), charge * jnp.asarray(B) / m
     drift = (push[1] - 1j * push[0]) / B

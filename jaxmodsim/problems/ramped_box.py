@@ -9,27 +9,25 @@ from jaxtyping import Array, ArrayLike
 from ..friction import Coulomb, LuGre, Stribeck
 from ..scene import AppliedForce, Friction, Scene
 
-BOX_COULOMB = {"Fc": 1.5}
-BOX_STRIBECK = {"Fc": 1.5, "Fs": 1.75, "vs": 0.2, "Fv": 0.1}
-BOX_LUGRE = {"sigma0": 750.0, "sigma1": 0.0, "sigma2": 0.1, "Fc": 1.5, "Fs": 1.75, "vs": 0.2}
+COULOMB = {"Fc": 1.5}
+STRIBECK = {"Fc": 1.5, "Fs": 1.75, "vs": 0.2, "Fv": 0.1}
+LUGRE = {"sigma0": 750.0, "sigma1": 0.0, "sigma2": 0.1, "Fc": 1.5, "Fs": 1.75, "vs": 0.2}
 
-# Velocity [m/s] and bristle deflection [m] at t = 10 s with BOX_LUGRE and a ramp of 1 N/s, on which four solvers
+# Velocity [m/s] and bristle deflection [m] at t = 10 s with LUGRE and a ramp of 1 N/s, on which four solvers
 # agree at tight tolerances.
-BOX_LUGRE_V10 = 15.694099521
-BOX_LUGRE_Z10 = 0.0020000000
+LUGRE_V10 = 15.694099521
+LUGRE_Z10 = 0.0020000000
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q
     return 0.5 * p["m"] * qd[0] ** 2
 
 
 def _pull(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del q, qd
     return jnp.reshape(p["ramp"] * t, (1,))
 
 
-def ramped_box(law: object = None, *, ramp: ArrayLike = 1.0, m: ArrayLike = 2.0) -> Scene:
+def scene(law: object = None, *, ramp: ArrayLike = 1.0, m: ArrayLike = 2.0) -> Scene:
     """Box on a table pulled by the force `ramp * t`.
 
     **Arguments:**
@@ -47,16 +45,16 @@ def ramped_box(law: object = None, *, ramp: ArrayLike = 1.0, m: ArrayLike = 2.0)
     return Scene(_lagrangian, params={"m": m, "ramp": ramp}, effects=(AppliedForce(_pull, name="pull"), *friction))
 
 
-def box_coulomb() -> Coulomb:
+def coulomb() -> Coulomb:
     """The box's Coulomb law."""
-    return Coulomb(**BOX_COULOMB)
+    return Coulomb(**COULOMB)
 
 
-def box_stribeck() -> Stribeck:
+def stribeck() -> Stribeck:
     """The box's law with stiction, Stribeck effect and viscous friction."""
-    return Stribeck(**BOX_STRIBECK)
+    return Stribeck(**STRIBECK)
 
 
-def box_lugre(**changes: ArrayLike) -> LuGre:
+def lugre(**changes: ArrayLike) -> LuGre:
     """The box's LuGre law, with `changes` to its parameters."""
-    return LuGre(**{**BOX_LUGRE, **changes})
+    return LuGre(**{**LUGRE, **changes})

@@ -8,9 +8,9 @@ from jaxtyping import Array, ArrayLike, Float
 from ..friction import Coulomb
 from ..scene import AppliedForce, Friction, Scene
 
-# A set of numbers with stiction, and what follows from it: 12 half cycles, at rest [s] from BRAKED_SPRING_STOP on.
-BRAKED_SPRING = {"m": 1.3, "k": 2.7, "Fc": 0.11, "Fs": 0.15, "x0": 1.0}
-BRAKED_SPRING_STOP = 26.158986444602
+# A set of numbers with stiction, and what follows from it: 12 half cycles, at rest [s] from STOP on.
+PARAMS = {"m": 1.3, "k": 2.7, "Fc": 0.11, "Fs": 0.15, "x0": 1.0}
+STOP = 26.158986444602
 
 
 class Rest(NamedTuple):
@@ -22,36 +22,33 @@ class Rest(NamedTuple):
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
 
 
-def braked_spring_law() -> Coulomb:
-    """The Coulomb law of `BRAKED_SPRING`."""
-    return Coulomb(Fc=BRAKED_SPRING["Fc"], Fs=BRAKED_SPRING["Fs"])
+def coulomb() -> Coulomb:
+    """The Coulomb law of `PARAMS`."""
+    return Coulomb(Fc=PARAMS["Fc"], Fs=PARAMS["Fs"])
 
 
-def braked_spring(law: object = None, *, m: ArrayLike = BRAKED_SPRING["m"], k: ArrayLike = BRAKED_SPRING["k"]) -> Scene:
+def scene(law: object = None, *, m: ArrayLike = PARAMS["m"], k: ArrayLike = PARAMS["k"]) -> Scene:
     """Mass on a spring on a rough table.
 
     **Arguments:**
 
-    - `law`: friction law between mass and table, such as `Regularized(braked_spring_law(), width=1e-4)`; None for
-      no friction.
+    - `law`: friction law between mass and table, such as `Regularized(coulomb(), width=1e-4)`; None for no friction.
     - `m`: mass [kg], > 0.
     - `k`: stiffness of the spring [N/m], > 0, relaxed at q = 0.
 
     **Returns:**
 
     A `Scene` with one coordinate [m] and (with a law) the effect `friction`. Started at rest under exact Coulomb
-    friction it follows `braked_spring_motion`.
+    friction it follows `motion`.
     """
     friction = () if law is None else (Friction(law),)
     return Scene(_lagrangian, params={"m": m, "k": k}, effects=friction)
 
 
 def _drive(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q, qd
     return jnp.reshape(p["u"], (1,))
 
 
@@ -73,9 +70,7 @@ def driven_spring(law: object, *, m: ArrayLike = 2.0, k: ArrayLike = 20.0) -> Sc
     return Scene(_lagrangian, params={"m": m, "k": k, "u": 0.0}, effects=effects)
 
 
-def braked_spring_rest(
-    *, x0: ArrayLike, m: ArrayLike, k: ArrayLike, Fc: ArrayLike, Fs: ArrayLike | None = None
-) -> Rest:
+def rest(*, x0: ArrayLike, m: ArrayLike, k: ArrayLike, Fc: ArrayLike, Fs: ArrayLike | None = None) -> Rest:
     """Where and when the mass comes to rest, started at rest from x0.
 
     With `d = Fc/k`: after `N = ceil((x0 - Fs/k)/(2 d))` half cycles, at `t = N pi sqrt(m/k)` and
@@ -99,26 +94,20 @@ def braked_spring_rest(
     return Rest(half_cycles, half_cycles * jnp.pi * jnp.sqrt(m / jnp.asarray(k)), sign * (x0 - 2.0 * half_cycles * d))
 
 
-def braked_spring_motion(
-    t: Float[Array, "..."],
-    *,
-    x0: ArrayLike,
-    m: ArrayLike,
-    k: ArrayLike,
-    Fc: ArrayLike,
-    Fs: ArrayLike | None = None,
+def motion(
+    t: Float[Array, "..."], *, x0: ArrayLike, m: ArrayLike, k: ArrayLike, Fc: ArrayLike, Fs: ArrayLike | None = None
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Position [m] and velocity [m/s] at the times `t` [s], started at rest from x0 at t = 0; shape as `t`.
 
     In half cycle n, with `d = Fc/k` and `w = sqrt(k/m)`: `x = (-1)^n [d + (x0 - (2 n + 1) d) cos(w t - n pi)]`; at
-    rest from the end of the last one on. Arguments as for `braked_spring_rest`, t >= 0.
+    rest from the end of the last one on. Arguments as for `rest`, t >= 0.
     """
-    rest = braked_spring_rest(x0=x0, m=m, k=k, Fc=Fc, Fs=Fs)
+    end = rest(x0=x0, m=m, k=k, Fc=Fc, Fs=Fs)
     d, w = Fc / jnp.asarray(k), jnp.sqrt(k / jnp.asarray(m))
     n = jnp.floor(w * t / jnp.pi)
     sign = 1.0 - 2.0 * (n % 2.0)
     swing = x0 - (2.0 * n + 1.0) * d
     x = sign * (d + swing * jnp.cos(w * t - n * jnp.pi))
     v = -sign * swing * w * jnp.sin(w * t - n * jnp.pi)
-    moving = n < rest.half_cycles
-    return jnp.where(moving, x, rest.x), jnp.where(moving, v, 0.0)
+    moving = n < end.half_cycles
+    return jnp.where(moving, x, end.x), jnp.where(moving, v, 0.0)

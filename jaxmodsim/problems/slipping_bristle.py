@@ -8,11 +8,10 @@ from ..scene import Friction, Scene
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q
     return 0.5 * p["m"] * qd[0] ** 2
 
 
-def slipping_bristle(law: LuGre, v: ArrayLike, *, m: ArrayLike = 1e15) -> Scene:
+def scene(law: LuGre, v: ArrayLike, *, m: ArrayLike = 1e15) -> Scene:
     """A mass at rest on a surface that moves at -v, so heavy that friction does not move it.
 
     **Arguments:**
@@ -24,14 +23,12 @@ def slipping_bristle(law: LuGre, v: ArrayLike, *, m: ArrayLike = 1e15) -> Scene:
     **Returns:**
 
     A `Scene` with one coordinate [m] and the effect `friction`. Started with `q0=[0.0]`, `qd0=[0.0]`, the deflection
-    `run.z["friction"]` follows `slipping_bristle_deflection`.
+    `run.z["friction"]` follows `deflection`.
     """
     return Scene(_lagrangian, params={"m": m}, effects=(Friction(law, belt_velocity=-jnp.asarray(v)),))
 
 
-def slipping_bristle_deflection(
-    t: Float[Array, "..."], law: LuGre, v: ArrayLike, *, z0: ArrayLike = 0.0
-) -> Float[Array, "..."]:
+def deflection(t: Float[Array, "..."], law: LuGre, v: ArrayLike, *, z0: ArrayLike = 0.0) -> Float[Array, "..."]:
     """Deflection [m] of the bristle at the times `t` [s] under constant slip velocity, shape as `t`.
 
     `z = zss + (z0 - zss) exp(-sigma0 |v| t/g(v))` with `zss = g(v) sign(v)/sigma0` and

@@ -7,11 +7,10 @@ from ..mechanics import rigid_body
 from ..scene import AbstractEffect, AppliedForce, Friction, Scene
 
 # Masses of cart and pole [kg], length of the pole [m], gravity [m/s^2].
-CART_POLE = {"M": 1.0, "m": 0.3, "l": 1.2, "g": 9.81}
+PARAMS = {"M": 1.0, "m": 0.3, "l": 1.2, "g": 9.81}
 
 
 def _cart(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, q
     return 0.5 * p["M"] * qd[0] ** 2
 
 
@@ -20,30 +19,25 @@ def _middle(q: Array, p: dict[str, Array]) -> Array:
     return jnp.stack([q[0] + half * jnp.sin(q[1]), 0.0 * q[0], half * jnp.cos(q[1])])
 
 
-def _angle(q: Array) -> Array:
-    return q[1]
-
-
 def _track(q: Array) -> Array:
     return q[0]
 
 
 def _push(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t, qd
     return jnp.stack([p["force"], 0.0 * q[1]])
 
 
-_POLE = rigid_body(lambda p: p["m"], lambda p: p["m"] * p["l"] ** 2 / 12.0, _middle, _angle, lambda p: p["g"])
+_POLE = rigid_body(lambda p: p["m"], lambda p: p["m"] * p["l"] ** 2 / 12.0, _middle, lambda q: q[1], lambda p: p["g"])
 _LAGRANGIAN = _POLE + _cart
 
 
-def cart_pole(
+def scene(
     law: object = None,
     *,
-    M: ArrayLike = CART_POLE["M"],
-    m: ArrayLike = CART_POLE["m"],
-    l: ArrayLike = CART_POLE["l"],  # noqa: E741 - the symbol of the length
-    g: ArrayLike = CART_POLE["g"],
+    M: ArrayLike = PARAMS["M"],
+    m: ArrayLike = PARAMS["m"],
+    l: ArrayLike = PARAMS["l"],
+    g: ArrayLike = PARAMS["g"],
     force: ArrayLike | None = None,
 ) -> Scene:
     """Uniform rod hinged on a cart that moves along a level track, in a vertical plane.
@@ -62,8 +56,7 @@ def cart_pole(
 
     **Returns:**
 
-    A `Scene`, with the effects `push` and `friction` where they are asked for. Its exact accelerations:
-    `cart_pole_acceleration`.
+    A `Scene`, with the effects `push` and `friction` where they are asked for. Its exact accelerations: `acceleration`.
     """
     params: dict[str, ArrayLike] = {"M": M, "m": m, "l": l, "g": g}
     effects: tuple[AbstractEffect, ...] = () if law is None else (Friction(law, along=_track),)
@@ -73,14 +66,14 @@ def cart_pole(
     return Scene(_LAGRANGIAN, params=params, effects=effects)
 
 
-def cart_pole_acceleration(
+def acceleration(
     q: Float[Array, "2"],
     qd: Float[Array, "2"],
     *,
-    M: ArrayLike = CART_POLE["M"],
-    m: ArrayLike = CART_POLE["m"],
-    l: ArrayLike = CART_POLE["l"],  # noqa: E741
-    g: ArrayLike = CART_POLE["g"],
+    M: ArrayLike = PARAMS["M"],
+    m: ArrayLike = PARAMS["m"],
+    l: ArrayLike = PARAMS["l"],
+    g: ArrayLike = PARAMS["g"],
     force: ArrayLike = 0.0,
 ) -> Float[Array, "2"]:
     """Accelerations of cart and pole in closed form.
@@ -95,7 +88,7 @@ def cart_pole_acceleration(
     **Arguments:**
 
     - `q`, `qd`: (x, f) [m, rad] and their rates, shape `[2]`.
-    - `M`, `m`, `l`, `g`: as for `cart_pole`.
+    - `M`, `m`, `l`, `g`: as for `scene`.
     - `force`: F [N], of all forces on the cart along x.
 
     **Returns:**

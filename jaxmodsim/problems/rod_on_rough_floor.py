@@ -8,15 +8,11 @@ from ..mechanics import Constraint, rigid_body
 from ..scene import Friction, Scene
 
 # Mass [kg], length [m], coefficient of friction and gravity [m/s^2].
-ROD_ON_ROUGH_FLOOR = {"m": 1.0, "l": 2.0, "mu": 0.5, "g": 9.81}
+PARAMS = {"m": 1.0, "l": 2.0, "mu": 0.5, "g": 9.81}
 
 
 def _centre(q: Array) -> Array:
     return jnp.stack([q[0], 0.0 * q[0], q[1]])
-
-
-def _angle(q: Array) -> Array:
-    return q[2]
 
 
 def _tip(q: Array, p: dict[str, Array]) -> Array:
@@ -29,51 +25,41 @@ def _tip_along(q: Array, p: dict[str, Array]) -> Array:
 
 
 def _height(t: Array, x: Array, p: dict[str, Array]) -> Array:
-    del t, p
     return x[2]
 
 
-_ROD = rigid_body(lambda p: p["m"], lambda p: p["m"] * p["l"] ** 2 / 12.0, _centre, _angle, lambda p: p["g"])
+_ROD = rigid_body(lambda p: p["m"], lambda p: p["m"] * p["l"] ** 2 / 12.0, _centre, lambda q: q[2], lambda p: p["g"])
 
 
-def rod_on_rough_floor(
-    *,
-    m: ArrayLike = ROD_ON_ROUGH_FLOOR["m"],
-    l: ArrayLike = ROD_ON_ROUGH_FLOOR["l"],  # noqa: E741 - the symbol of the length
-    mu: ArrayLike = ROD_ON_ROUGH_FLOOR["mu"],
-    g: ArrayLike = ROD_ON_ROUGH_FLOOR["g"],
+def scene(
+    *, m: ArrayLike = PARAMS["m"], l: ArrayLike = PARAMS["l"], mu: ArrayLike = PARAMS["mu"], g: ArrayLike = PARAMS["g"]
 ) -> Scene:
     """Uniform rod in a vertical plane, its lower tip in contact with a rough floor that can only push.
 
     The coordinates are (x, y) of the centre [m], y upwards from the floor, and the angle f [rad] between floor and rod,
     0 < f < pi, such that the tip is at `(x + (l/2) cos(f), y - (l/2) sin(f))`: for f < pi/2 and slip towards larger x
-    the rod is pushed, tip ahead. States with the tip on the floor: `rod_on_rough_floor_state`.
+    the rod is pushed, tip ahead. States with the tip on the floor: `state`.
 
     **Arguments:**
 
     - `m`: mass [kg], > 0.
     - `l`: length [m], > 0.
     - `mu`: coefficient of Coulomb friction between tip and floor, >= 0. Above 4/3 there are angles at which no
-      motion, or more than one, obeys the law: see `rod_on_rough_floor_compliance`.
+      motion, or more than one, obeys the law: see `compliance`.
     - `g`: gravity [m/s^2].
 
     **Returns:**
 
     A `Scene` with the constraint `floor`, whose multiplier is the normal force [N], and the effect `friction` along x
-    at the tip. In slip it follows `rod_on_rough_floor_acceleration`. A run ends where the tip lifts off, and where the
-    paradox begins.
+    at the tip. In slip it follows `acceleration`. A run ends where the tip lifts off, and where the paradox begins.
     """
     floor = Constraint(_height, at=_tip, one_sided=True, name="floor")
     friction = Friction(Coulomb(mu), along=_tip_along, normal_force="floor")
     return Scene(_ROD, params={"m": m, "l": l, "g": g}, effects=(friction,), constraints=(floor,))
 
 
-def rod_on_rough_floor_state(
-    angle: ArrayLike,
-    rate: ArrayLike,
-    slip: ArrayLike,
-    *,
-    l: ArrayLike = ROD_ON_ROUGH_FLOOR["l"],  # noqa: E741
+def state(
+    angle: ArrayLike, rate: ArrayLike, slip: ArrayLike, *, l: ArrayLike = PARAMS["l"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Coordinates and velocities with the tip on the floor at x = 0.
 
@@ -88,7 +74,7 @@ def rod_on_rough_floor_state(
     return jnp.stack([-x, y, angle]), jnp.stack([slip + y * rate, x * rate, rate])
 
 
-def rod_on_rough_floor_compliance(
+def compliance(
     angle: Float[Array, "..."], direction: ArrayLike = 1.0, *, m: ArrayLike, mu: ArrayLike
 ) -> Float[Array, "..."]:
     """Acceleration of the tip away from the floor for each newton of normal force [1/kg], in slip.
@@ -102,23 +88,23 @@ def rod_on_rough_floor_compliance(
 
     - `angle`: f [rad].
     - `direction`: sign s of the slip.
-    - `m`, `mu`: as for `rod_on_rough_floor`.
+    - `m`, `mu`: as for `scene`.
     """
     sine, cosine = jnp.sin(angle), jnp.cos(angle)
     return (1.0 + 3.0 * cosine**2 - 3.0 * jnp.asarray(mu) * direction * sine * cosine) / m
 
 
-def rod_on_rough_floor_normal_force(
+def normal_force(
     angle: Float[Array, ""],
     rate: Float[Array, ""],
     direction: ArrayLike = 1.0,
     *,
-    m: ArrayLike = ROD_ON_ROUGH_FLOOR["m"],
-    l: ArrayLike = ROD_ON_ROUGH_FLOOR["l"],  # noqa: E741
-    mu: ArrayLike = ROD_ON_ROUGH_FLOOR["mu"],
-    g: ArrayLike = ROD_ON_ROUGH_FLOOR["g"],
+    m: ArrayLike = PARAMS["m"],
+    l: ArrayLike = PARAMS["l"],
+    mu: ArrayLike = PARAMS["mu"],
+    g: ArrayLike = PARAMS["g"],
 ) -> Float[Array, ""]:
-    """Normal force [N] on the slipping tip: `(g - (l/2) sin(f) f'^2)` over `rod_on_rough_floor_compliance`.
+    """Normal force [N] on the slipping tip: `(g - (l/2) sin(f) f'^2)` over `compliance`.
 
     The tip lifts off where it falls through zero.
 
@@ -126,20 +112,20 @@ def rod_on_rough_floor_normal_force(
 
     - `angle`, `rate`: f [rad] and its rate [rad/s].
     - `direction`: sign of the slip.
-    - `m`, `l`, `mu`, `g`: as for `rod_on_rough_floor`.
+    - `m`, `l`, `mu`, `g`: as for `scene`.
     """
     fall = jnp.asarray(g) - 0.5 * jnp.asarray(l) * jnp.sin(angle) * rate**2
-    return fall / rod_on_rough_floor_compliance(angle, direction, m=m, mu=mu)
+    return fall / compliance(angle, direction, m=m, mu=mu)
 
 
-def rod_on_rough_floor_acceleration(
+def acceleration(
     q: Float[Array, "3"],
     qd: Float[Array, "3"],
     *,
-    m: ArrayLike = ROD_ON_ROUGH_FLOOR["m"],
-    l: ArrayLike = ROD_ON_ROUGH_FLOOR["l"],  # noqa: E741
-    mu: ArrayLike = ROD_ON_ROUGH_FLOOR["mu"],
-    g: ArrayLike = ROD_ON_ROUGH_FLOOR["g"],
+    m: ArrayLike = PARAMS["m"],
+    l: ArrayLike = PARAMS["l"],
+    mu: ArrayLike = PARAMS["mu"],
+    g: ArrayLike = PARAMS["g"],
 ) -> Float[Array, "3"]:
     """Accelerations [m/s^2, rad/s^2] while the tip slips, in closed form.
 
@@ -149,11 +135,11 @@ def rod_on_rough_floor_acceleration(
     **Arguments:**
 
     - `q`, `qd`: (x, y, f) and their rates, shape `[3]`, with the tip on the floor.
-    - `m`, `l`, `mu`, `g`: as for `rod_on_rough_floor`.
+    - `m`, `l`, `mu`, `g`: as for `scene`.
     """
     sine, cosine = jnp.sin(q[2]), jnp.cos(q[2])
-    m, l, mu, g = (jnp.asarray(x, q.dtype) for x in (m, l, mu, g))  # noqa: E741
+    m, l, mu, g = (jnp.asarray(x, q.dtype) for x in (m, l, mu, g))
     direction = jnp.sign(qd[0] - 0.5 * l * sine * qd[2])
-    push = rod_on_rough_floor_normal_force(q[2], qd[2], direction, m=m, l=l, mu=mu, g=g) / m
+    push = normal_force(q[2], qd[2], direction, m=m, l=l, mu=mu, g=g) / m
     turn = 6.0 / l * push * (mu * direction * sine - cosine)
     return jnp.stack([-mu * direction * push, push - g, turn])

@@ -9,9 +9,9 @@ from ..friction import Coulomb
 from ..scene import Friction, Scene
 
 # Masses [kg], stiffnesses [N/m] to the ground and between the masses, belt [m/s].
-COUPLED_BELTS = {"m1": 1.0, "m2": 1.6, "k1": 100.0, "k2": 130.0, "coupling": 35.0, "belt": 0.1}
+PARAMS = {"m1": 1.0, "m2": 1.6, "k1": 100.0, "k2": 130.0, "coupling": 35.0, "belt": 0.1}
 # Forces [N] in slip and largest in stick, of either mass.
-COUPLED_BELTS_LAWS = ({"Fc": 5.0, "Fs": 8.0}, {"Fc": 6.0, "Fs": 9.5})
+LAWS = ({"Fc": 5.0, "Fs": 8.0}, {"Fc": 6.0, "Fs": 9.5})
 
 
 class FirstSlip(NamedTuple):
@@ -23,7 +23,6 @@ class FirstSlip(NamedTuple):
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     kinetic = 0.5 * p["m1"] * qd[0] ** 2 + 0.5 * p["m2"] * qd[1] ** 2
     springs = 0.5 * p["k1"] * q[0] ** 2 + 0.5 * p["k2"] * q[1] ** 2 + 0.5 * p["coupling"] * (q[0] - q[1]) ** 2
     return kinetic - springs
@@ -37,15 +36,15 @@ def _second(q: Array) -> Array:
     return q[1]
 
 
-def coupled_belts(
+def scene(
     laws: tuple[object, object] | None = None,
     *,
-    m1: ArrayLike = COUPLED_BELTS["m1"],
-    m2: ArrayLike = COUPLED_BELTS["m2"],
-    k1: ArrayLike = COUPLED_BELTS["k1"],
-    k2: ArrayLike = COUPLED_BELTS["k2"],
-    coupling: ArrayLike = COUPLED_BELTS["coupling"],
-    belt: ArrayLike = COUPLED_BELTS["belt"],
+    m1: ArrayLike = PARAMS["m1"],
+    m2: ArrayLike = PARAMS["m2"],
+    k1: ArrayLike = PARAMS["k1"],
+    k2: ArrayLike = PARAMS["k2"],
+    coupling: ArrayLike = PARAMS["coupling"],
+    belt: ArrayLike = PARAMS["belt"],
 ) -> Scene:
     """Two masses on a belt: `m1 x1'' = -k1 x1 - c (x1 - x2) - F1`, `m2 x2'' = -k2 x2 + c (x1 - x2) - F2`.
 
@@ -54,7 +53,7 @@ def coupled_belts(
 
     **Arguments:**
 
-    - `laws`: friction laws of the two masses; None for Coulomb friction by `COUPLED_BELTS_LAWS`.
+    - `laws`: friction laws of the two masses; None for Coulomb friction by `LAWS`.
     - `m1`, `m2`: masses [kg], > 0.
     - `k1`, `k2`: stiffnesses of the springs to the ground [N/m], > 0, relaxed at q = 0.
     - `coupling`: stiffness c of the spring between the masses [N/m], >= 0, relaxed at q[0] = q[1].
@@ -62,9 +61,9 @@ def coupled_belts(
 
     **Returns:**
 
-    A `Scene` with two coordinates [m] and the effects `first` and `second`. Its start: `coupled_belts_first_slip`.
+    A `Scene` with two coordinates [m] and the effects `first` and `second`. Its start: `first_slip`.
     """
-    one, two = (Coulomb(**law) for law in COUPLED_BELTS_LAWS) if laws is None else laws
+    one, two = (Coulomb(**law) for law in LAWS) if laws is None else laws
     return Scene(
         _lagrangian,
         params={"m1": m1, "m2": m2, "k1": k1, "k2": k2, "coupling": coupling},
@@ -75,9 +74,7 @@ def coupled_belts(
     )
 
 
-def coupled_belts_first_slip(
-    *, k1: ArrayLike, k2: ArrayLike, belt: ArrayLike, Fs1: ArrayLike, Fs2: ArrayLike
-) -> FirstSlip:
+def first_slip(*, k1: ArrayLike, k2: ArrayLike, belt: ArrayLike, Fs1: ArrayLike, Fs2: ArrayLike) -> FirstSlip:
     """When, where and which of the two slips first, if both start in stick from q = 0.
 
     Until then both go with the belt and the spring between them stays relaxed: mass i slips when `k_i belt t` reaches

@@ -36,14 +36,13 @@ def _spiral(q: Array, p: dict[str, Array]) -> Array:
 
 
 def _drag(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    del t
     return -p["k"] * jax.jvp(lambda q: _spiral(q, p), (q,), (qd,))[1]
 
 
 _BEAD = point_mass(lambda p: p["m"], _spiral, lambda p: p["g"])
 
 
-def spiral_bead(
+def scene(
     *,
     m: ArrayLike = 1.0,
     R: ArrayLike = 1.0,
@@ -68,7 +67,7 @@ def spiral_bead(
 
     A `Scene` with the coordinate theta [rad] and, with `k`, the effect `drag`, a Cartesian force -k v [N] at the bead;
     with `mu`, the effect `friction`, whose law holds `mu`. All other numbers are in its `params`. Its exact
-    acceleration: `spiral_bead_acceleration`.
+    acceleration: `acceleration`.
     """
     params: dict[str, ArrayLike] = {"m": m, "R": R, "a": a, "g": g}
     effects: tuple[AbstractEffect, ...] = ()
@@ -80,7 +79,7 @@ def spiral_bead(
     return Scene(_BEAD, params=params, effects=effects)
 
 
-def spiral_bead_normal_force(
+def normal_force(
     q: Float[Array, "1"],
     qd: Float[Array, "1"],
     *,
@@ -100,7 +99,7 @@ def spiral_bead_normal_force(
     **Arguments:**
 
     - `q`, `qd`: theta [rad] and its rate [rad/s], shape `[1]`.
-    - `m`, `R`, `a`, `g`: as for `spiral_bead`.
+    - `m`, `R`, `a`, `g`: as for `scene`.
     """
     theta, rate, a = q[0], qd[0], jnp.asarray(a)
     opened = 1.0 + (a * theta) ** 2
@@ -113,7 +112,7 @@ def spiral_bead_normal_force(
     return jnp.asarray(m) * jnp.sqrt(radial**2 + across**2)
 
 
-def spiral_bead_acceleration(
+def acceleration(
     q: Float[Array, "1"],
     qd: Float[Array, "1"],
     *,
@@ -128,18 +127,18 @@ def spiral_bead_acceleration(
 
     With u = a^2 theta^2: `theta'' = a^2 theta (1 + 2 a^2 + u) / ((1 + u)(1 + a^2 + u)) theta'^2
     - (g/R) a sqrt(1 + u)/(1 + a^2 + u) - (k/m) theta'` (NTNU course TTK4130, exercise 9, problem 1), less
-    `mu N/(m s) sign(theta')` for friction, with N by `spiral_bead_normal_force` and the length of the path for each
+    `mu N/(m s) sign(theta')` for friction, with N by `normal_force` and the length of the path for each
     radian `s = R sqrt(1 + a^2 + u)/(1 + u)`.
 
     **Arguments:**
 
     - `q`, `qd`: theta [rad] and its rate [rad/s], shape `[1]`.
-    - `m`, `R`, `a`, `g`, `k`, `mu`: as for `spiral_bead`.
+    - `m`, `R`, `a`, `g`, `k`, `mu`: as for `scene`.
     """
     theta, rate, a2 = q[0], qd[0], jnp.square(jnp.asarray(a))
     u = a2 * theta**2
     along = 1.0 + a2 + u
     turning = a2 * theta * (1.0 + 2.0 * a2 + u) / ((1.0 + u) * along) * rate**2
     falling = g / R * a * jnp.sqrt(1.0 + u) / along
-    rubbing = mu * spiral_bead_normal_force(q, qd, m=1.0, R=R, a=a, g=g) * (1.0 + u) / (R * jnp.sqrt(along))
+    rubbing = mu * normal_force(q, qd, m=1.0, R=R, a=a, g=g) * (1.0 + u) / (R * jnp.sqrt(along))
     return jnp.reshape(turning - falling - k / m * rate - rubbing * jnp.sign(rate), (1,))

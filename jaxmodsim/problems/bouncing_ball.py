@@ -19,8 +19,8 @@ class BouncingBall(eqx.Module):
     ```
 
     What is integrated is (height [m], velocity [m/s]), positive upwards, shape `[2]`; the mode is 0, and 1 once the
-    ball lies on the floor, which only `hold` makes it do. The instants of the bounces: `bouncing_ball_bounces`; the
-    motion: `bouncing_ball_motion`; the end of all bounces: `bouncing_ball_rest`.
+    ball lies on the floor, which only `hold` makes it do. The instants of the bounces: `bounces`; the
+    motion: `motion`; the end of all bounces: `rest`.
 
     **Arguments:**
 
@@ -42,26 +42,22 @@ class BouncingBall(eqx.Module):
 
     def field(self, t: object, s: EventState, args: object) -> EventState:
         """Rate: in free fall, or zero on the floor."""
-        del t, args
         return s.rate(jnp.where(s.mode > 0.5, 0.0, jnp.stack([s.y[1], -self.g])))
 
     def guards(self, t: object, s: EventState, args: object) -> Float[Array, "1"]:
         """Height above the floor [m]."""
-        del t, args
         return s.y[:1]
 
     def reset(self, t: object, s: EventState, args: object, fired: Bool[Array, "1"]) -> EventState:
         """Bounce: the velocity changes its sign and keeps the part e."""
-        del t, args, fired
         return s._replace(y=jnp.stack([jnp.zeros_like(s.y[0]), -self.e * s.y[1]]))
 
     def hold(self, t: object, s: EventState, args: object, fired: Bool[Array, "1"]) -> EventState:
         """Come to rest on the floor."""
-        del t, args, fired
         return s._replace(y=jnp.zeros_like(s.y), mode=jnp.ones_like(s.mode))
 
 
-def bouncing_ball_bounces(n: int, *, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81) -> Float[Array, " n"]:
+def bounces(n: int, *, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81) -> Float[Array, " n"]:
     """Times [s] of the first `n` bounces, dropped from `h` at t = 0: `sqrt(2 h/g) (1 + 2 (e + e^2 + ...))`.
 
     **Arguments:**
@@ -75,23 +71,23 @@ def bouncing_ball_bounces(n: int, *, h: ArrayLike, e: ArrayLike, g: ArrayLike = 
     return jnp.sqrt(2.0 * h / jnp.asarray(g)) * jnp.concatenate([jnp.ones(1), 1.0 + 2.0 * jnp.cumsum(powers)])
 
 
-def bouncing_ball_rest(*, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81) -> Float[Array, ""]:
-    """Time [s] at which all bounces are over: `sqrt(2 h/g) (1 + e)/(1 - e)`; e < 1, else as `bouncing_ball_bounces`."""
+def rest(*, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81) -> Float[Array, ""]:
+    """Time [s] at which all bounces are over: `sqrt(2 h/g) (1 + e)/(1 - e)`; e < 1, else as `bounces`."""
     e = jnp.asarray(e)
     return jnp.sqrt(2.0 * h / jnp.asarray(g)) * (1.0 + e) / (1.0 - e)
 
 
-def bouncing_ball_motion(
+def motion(
     t: Float[Array, "..."], *, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Height [m] and velocity [m/s] at the times `t` [s], dropped from `h` at t = 0; shape as `t`.
 
     The time that is left before rest, in units of what is left after the first bounce, falls by the factor e from
     bounce to bounce, so its logarithm counts them. From bounce n on it is a throw at `e^n sqrt(2 g h)`. Arguments as
-    for `bouncing_ball_rest`, t >= 0.
+    for `rest`, t >= 0.
     """
     g = jnp.asarray(g)
-    fall, end = jnp.sqrt(2.0 * h / g), bouncing_ball_rest(h=h, e=e, g=g)
+    fall, end = jnp.sqrt(2.0 * h / g), rest(h=h, e=e, g=g)
     bouncing = (t >= fall) & (t < end)
     left = jnp.where(bouncing, (end - t) / (end - fall), 1.0)
     n = 1.0 + jnp.floor(jnp.log(left) / jnp.log(e))
