@@ -6,13 +6,16 @@ python -m bench.one NAME OUT [--smoke]
 import importlib
 import os
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 
 def main(name: str, out: Path, *, smoke: bool) -> None:
     """Run it with the settings that all share: tuned for the CPU if the case does not say otherwise, and in float64."""
-    if smoke:  # times mean nothing: programs are compiled in the quickest way
+    if smoke:  # times mean nothing: programs are compiled in the quickest way, by options of XLA where they are known
         os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
+        if version("jaxlib").startswith("0.10."):
+            os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
     import jax
     import matplotlib as mpl
 

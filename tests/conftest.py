@@ -1,3 +1,4 @@
+import ctypes
 import gc
 import io
 import os
@@ -14,13 +15,15 @@ from xdist.scheduler import LoadScopeScheduling
 from .helpers import fuzz
 
 # Nearly all of the time goes into tracing and compiling, hardly any into running. Code that LLVM has not optimized, and
-# XLA's older way to emit fused loops, straight as LLVM code, are compiled soonest. XLA ends the process over an option
-# that it does not know: only where it was tried. What needs the last digits asks for `optimized`.
+# XLA's older way to emit fused loops, straight as LLVM code and in one piece, are compiled soonest. XLA ends the
+# process over an option that it does not know: only where it was tried. What needs the last digits asks for
+# `optimized`.
 # For the way that users have: XLA_FLAGS=--xla_cpu_use_fusion_emitters=true JAX_DISABLE_MOST_OPTIMIZATIONS=0.
 _OPTION, _FLAGS = "xla_cpu_use_fusion_emitters", os.environ.get("XLA_FLAGS", "")
 if jaxlib.version.__version_info__[:2] == (0, 10) and _OPTION not in _FLAGS:
-    os.environ["XLA_FLAGS"] = f"{_FLAGS} --{_OPTION}=false".strip()
+    os.environ["XLA_FLAGS"] = f"{_FLAGS} --{_OPTION}=false --xla_cpu_parallel_codegen_split_count=1".strip()
 if "JAX_DISABLE_MOST_OPTIMIZATIONS" not in os.environ:
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # of the processes that tests start
     jax.config.update("jax_disable_most_optimizations", True)
 
 jax.config.update("jax_enable_x64", True)
@@ -33,16 +36,20 @@ gc.set_threshold(50_000, 20, 100)
 
 
 # A compiled program takes several maps of memory, of which Linux gives a process no more than 65 530; with the next one
-# XLA ends the process.
-_MAPS, _MOST_MAPS = Path("/proc/self/maps"), 30_000
+# XLA ends the process. What programs were traced from takes gigabytes.
+_SELF, _MOST_MAPS, _MOST_BYTES = Path("/proc/self"), 30_000, 3 * 2**30
 
 
 @pytest.fixture(scope="module", autouse=True)
 def what_other_modules_made_is_left_alone() -> None:
-    if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > _MOST_MAPS:
-        jax.clear_caches()
-        gc.unfreeze()
-        gc.collect()
+    if _SELF.exists():
+        maps = (_SELF / "maps").read_bytes().count(b"\n")
+        resident = int((_SELF / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        if maps > _MOST_MAPS or resident > _MOST_BYTES:
+            jax.clear_caches()
+            gc.unfreeze()
+            gc.collect()
+            ctypes.CDLL(None).malloc_trim(0)  # glibc keeps freed memory otherwise
     gc.freeze()
 
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 from jaxmodsim import tune_cpu
+from jaxmodsim._core.speed import recommend_tuning
 
 
 def test_too_late() -> None:
@@ -41,3 +42,16 @@ def test_in_time() -> None:
     """In a process of its own, as the option holds for the whole process; importing the package computes nothing."""
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(("flags", "said"), [("", True), ("--xla_cpu_small_while_loop_byte_threshold=50000", False)])
+def test_runs_without_it_say_so_once(
+    flags: str, said: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    monkeypatch.setattr("jax.default_backend", lambda: "cpu")
+    recommend_tuning.cache_clear()
+    recommend_tuning()
+    recommend_tuning()
+    assert [record.name for record in caplog.records] == ["jaxmodsim"] * said
+    assert not said or "jaxmodsim.tune_cpu()" in caplog.text

@@ -1,6 +1,8 @@
 """Cores at hand, and the one opt-in that changes how XLA compiles."""
 
+import logging
 import os
+from functools import cache
 
 import jax
 from jax._src import xla_bridge
@@ -37,6 +39,15 @@ def tune_cpu(while_loop_bytes: int = 1_000_000) -> None:
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if _OPTION not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_backend_extra_options={_OPTION}={while_loop_bytes}".strip()
+
+
+@cache
+def recommend_tuning() -> None:
+    """Log once, where XLA runs on CPU without the option, what makes runs faster."""
+    if jax.default_backend() == "cpu" and _OPTION not in os.environ.get("XLA_FLAGS", ""):
+        logging.getLogger("jaxmodsim").warning(
+            "Runs on CPU are 2 to 8 times faster after jaxmodsim.tune_cpu(), called before JAX computes anything."
+        )
 
 
 def cores() -> int:

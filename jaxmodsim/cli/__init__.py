@@ -1,4 +1,4 @@
-"""The command line: `jaxmodsim demo | testbench | fit | sweep | bench`."""
+"""The command line: `jaxmodsim demo | testbench | fit | sweep | hard | bench | cache`."""
 
 import os
 import sys

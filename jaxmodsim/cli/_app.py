@@ -35,13 +35,15 @@ def run() -> None:
 
 
 def _start() -> None:
-    """An application may set what a library must not: double precision, and XLA's treatment of small loops."""
+    """An application may set what a library must not: double precision, XLA's treatment of small loops, a cache."""
     import jax
 
     from .._core.speed import tune_cpu
+    from ._cache import use_cache
 
     tune_cpu()
     jax.config.update("jax_enable_x64", True)
+    use_cache()
 
 
 @app.command()
@@ -201,3 +203,15 @@ def run_benches(
     from ._bench import run_bench_suite
 
     raise typer.Exit(run_bench_suite(arguments or []))
+
+
+@app.command()
+def cache(clear: Annotated[bool, typer.Option("--clear", help="Delete them.")] = False) -> None:
+    """Compiled programs that commands keep for the next ones: where, how many, how large.
+
+    A command that runs again compiles nothing. JAX_COMPILATION_CACHE_DIR names another folder,
+    JAX_ENABLE_COMPILATION_CACHE=false turns it off.
+    """
+    from ._cache import report_cache
+
+    report_cache(clear)

@@ -6,6 +6,7 @@ import jax.tree_util as jtu
 from jaxtyping import ArrayLike, PyTree
 
 from .._core.arguments import as_flag
+from .._core.speed import recommend_tuning
 from ..scene import Scene
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages
 from ._run_request import RunRequest, is_known
@@ -90,6 +91,7 @@ def simulate(
       `jax.jit`, `jax.vmap` or `jax.grad` the same sentence comes as equinox's run-time error. That calls Python, and
       JAX keeps no compiled program that does in its persistent cache: pass `throw=False` there, and read `run.result`.
     """
+    recommend_tuning()
     throw = as_flag(throw, name="throw")
     inputs, options = RunRequest(
         scene,
