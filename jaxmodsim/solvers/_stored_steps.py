@@ -29,7 +29,8 @@ class StoredSteps(dfx.AbstractAdjoint):
     over reverse or forward over forward derivatives work likewise. Nothing is computed a second time in another order,
     so rounding, which events and error control would enlarge, does not enter: the derivative is that of the run, to
     rounding, at any tolerance. The times of the steps, and with them the work of the step size controller, count as
-    constants; those of constant steps, which divide a run evenly, move with its ends. Rejected steps cost nothing.
+    constants; those of constant steps, by which diffrax divides a run evenly, move with its ends. Rejected steps cost
+    nothing.
 
     Derivatives hold by the initial state, by everything in `args`, terms and solver, by `t0`, `t1`, the times in
     `SaveAt(ts=...)`, and by what their functions close over. A run that ended early gives the derivative of the part
@@ -119,7 +120,7 @@ class _How(NamedTuple):
     subs: list[tuple[bool, bool, int]]
     # Whether the solver is told of jumps.
     jumps: bool
-    # Whether the steps divide the run evenly.
+    # Whether the steps are constant: their times move with the ends of the run.
     even: bool
     every: int
 
@@ -434,8 +435,9 @@ class _Derivative:
     def ends_by_run(self, k: Array, ends: tuple[Array, Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """Derivatives of the ends of a step, of each by t0 and by t1 of the run."""
         t0, t1 = self.inputs.t0, self.inputs.t1
-        if self.how.even:
-            start, end = ((t - t0) / (t1 - t0) for t in ends)
+        if self.how.even:  # the first step has the length that was given, the others divide the run evenly
+            part = lambda j, t: (t - t0) / (t1 - t0) * ((j != 1) | (t == t1))  # noqa: E731
+            start, end = part(k, ends[0]), part(k + 1, ends[1])
             return (1.0 - start, start), (1.0 - end, end)
         last, zero = (k == self.count - 1) & (ends[1] == t1), jnp.zeros_like(t0)
         return (jnp.where(k == 0, 1.0, zero), zero), (zero, jnp.where(last, 1.0, zero))
