@@ -211,7 +211,7 @@ def test_simulate_takes_the_other_adjoints(scene: Scene) -> None:
 def test_derivatives_of_a_resting_place_are_exact_to_rounding() -> None:
     """x'' + x in -[-1, 1] from (12, 6): half circles about +-1, the first of radius sqrt(13^2 + 6^2), to a rest.
 
-    The place is +-(sqrt(205) - 2 n + 1), so its derivatives are -13/sqrt(205) and -6/sqrt(205), and the run errs by 1e-14.
+    The place is +-(sqrt(205) - 2 n + 1), so its derivatives are -13/sqrt(205) and -6/sqrt(205); the run errs by 1e-14.
     A derivative of steps that are made again is off by 1e-5.
     """
     scene = Scene(SPRING.lagrangian, params={"k": 1.0}, effects=(Friction(Coulomb(Fc=1.0)),))

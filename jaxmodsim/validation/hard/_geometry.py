@@ -185,7 +185,7 @@ def four_bar_by_scipy(angle: float, rate: float, t1: float) -> float:
 
 
 def parallelogram_by_scipy(angle: float, rate: float, t1: float) -> float:
-    """Angle of crank and rocker [rad] of a parallelogram of `four_bar.PARAMS`'s masses and a crank of 0.3 m, after `t1` [s].
+    """Angle [rad] of crank and rocker of a parallelogram after `t1` [s]: masses of `four_bar.PARAMS`, a crank of 0.3 m.
 
     The coupler does not turn, so it is a pendulum; by DOP853 of scipy.
     """
