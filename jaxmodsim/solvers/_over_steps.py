@@ -73,7 +73,7 @@ class RunTangents(NamedTuple):
     steps: StepRecord | None
 
 
-class _OverSteps:
+class AbstractOverSteps:
     """What both modes share: the parts of a run as functions of what they are differentiated by."""
 
     def __init__(self, by: StepInputs, run: RecordedRun):
@@ -159,7 +159,7 @@ class _Ahead(NamedTuple):
     steps: StepRecord | None
 
 
-class ForwardOverSteps(_OverSteps):
+class ForwardOverSteps(AbstractOverSteps):
     """The derivative of a run, from the first step to the last."""
 
     def __init__(self, by: StepInputs, run: RecordedRun, keeps: bool):
@@ -307,7 +307,7 @@ class _Pulled(NamedTuple):
     times: Array
 
 
-class ReverseOverSteps(_OverSteps):
+class ReverseOverSteps(AbstractOverSteps):
     """The derivative of a run, from the last step to the first."""
 
     def __init__(self, by: StepInputs, run: RecordedRun, cts: RunTangents):
