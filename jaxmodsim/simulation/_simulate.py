@@ -64,11 +64,12 @@ def simulate(
     - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`) or, on one
       coordinate, runs by events (set-valued laws); `diffrax.Tsit5` otherwise. `ImplicitFriction` for fixed steps that
       may be too long for the stiffness of friction.
-    - `adjoint`: how diffrax differentiates the run. By default for reverse mode (`jax.grad`), by
-      `diffrax.RecursiveCheckpointAdjoint(checkpoints=max_steps)`, which keeps the state before each step; with fewer
-      checkpoints derivatives through events lose digits. `StoredSteps()` compiles sooner and
-      is as exact. Pass `diffrax.ForwardMode()` for `jax.jvp` and `jax.jacfwd`. Not `diffrax.BacksolveAdjoint`.
-    - `max_steps`: limit of the number of steps. In reverse mode memory is set aside for the state before each of them.
+    - `adjoint`: how the run is differentiated. By default `StoredSteps()`, in either mode: `jax.grad`, `jax.jacfwd`,
+      `jax.hessian`. `StoredSteps(every=k)` needs a k-th of the memory; `diffrax.ForwardMode()` is for forward mode
+      alone, stores nothing and is quicker there. `diffrax.RecursiveCheckpointAdjoint` makes steps again from
+      checkpoints: their rounding differs from that of the run, and through events derivatives lose digits. Not
+      `diffrax.BacksolveAdjoint`.
+    - `max_steps`: limit of the number of steps. Derivatives set memory aside for the state before each of them.
     - `max_events`: limit of the number of instants at which set-valued laws change modes. Inside `jax.jit`
       `run.events` has as many entries for each such law, so a smaller one is faster there.
     - `hold_chatter`: whether an element whose mode changes accumulate is held in stick, with whatever force that takes,
@@ -111,15 +112,7 @@ def simulate(
         hold_chatter,
         project,
     ).checked()
-    try:
-        solved = solve(inputs, options)
-    except TypeError as error:
-        if "custom_vjp" in str(error) and adjoint is None:
-            raise TypeError(
-                "Forward-mode derivatives of simulate need adjoint=diffrax.ForwardMode(); the default adjoint is for"
-                " reverse mode (jax.grad)."
-            ) from error
-        raise
+    solved = solve(inputs, options)
     if throw:
         solved = _raise_early_end(inputs, solved)
     return trajectory(inputs, options, solved)

@@ -31,6 +31,7 @@ from ..solvers import (
     Rodas5P,
     SampledJumps,
     StepsTo,
+    StoredSteps,
     first_step,
     unchecked,
 )
@@ -189,14 +190,9 @@ def _controller(inputs: RunInputs, solver: dfx.AbstractSolver) -> dfx.AbstractSt
 def _plugins(inputs: RunInputs, options: RunOptions) -> tuple[Any, Any]:
     """Solver and adjoint: those that were given, or the defaults."""
     solver = default_solver(inputs.scene, inputs.q0.shape[0], inputs.dt is not None)
-    # With fewer checkpoints than steps, steps are made again from states that differ by rounding from those of the run,
-    # which events and error control enlarge: derivatives lose half of their digits, or all but two.
-    adjoint = dfx.RecursiveCheckpointAdjoint(checkpoints=options.max_steps)
     if options.solver is not None:
         solver = eqx.combine(options.solver, inputs.plugins[0])
-    if options.adjoint is not None:
-        adjoint = eqx.combine(options.adjoint, inputs.plugins[1])
-    return solver, adjoint
+    return solver, StoredSteps() if options.adjoint is None else eqx.combine(options.adjoint, inputs.plugins[1])
 
 
 def _well_posed(inputs: RunInputs) -> Bool[Array, ""]:
@@ -271,6 +267,8 @@ def _integrate(
             adjoint=adjoint,
             max_steps=options.max_steps,
             throw=False,
+            # Traced from the beginning, as `EventController` makes it: the step is traced once, not for each kind.
+            made_jump=jnp.asarray(False) if exact else None,
         )
 
     # What diffrax checks of them, that they point forward, increase and lie within the run, `_well_posed` has.

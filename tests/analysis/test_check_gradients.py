@@ -223,7 +223,6 @@ backward_only.defvjp(lambda x: (x, None), lambda _, g: (g,))
         (lambda scene, simulate: jnp.argmax(simulate(scene, [0.0], [0.0], 5.0).q[-1]), {}, "one real number .* int"),
         (lambda scene, simulate: slide(scene, simulate) / 0.0, {}, "fn gives -?inf"),
         (lambda scene, simulate: backward_only(slide(scene, simulate)), {}, "custom_vjp"),
-        (lambda scene, simulate: slide(scene, simulate) * slide(scene), {}, "in place of the `simulate`"),
         (slide, {"names": ["k"]}, r"no number 'k'; it has: box\[0\], box\[1\]"),
         (slide, {"names": []}, "names is empty"),
         (slide, {"scales": {"box[0]": 0.0}}, r"scales\['box\[0\]'\] must be a positive number"),

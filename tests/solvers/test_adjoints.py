@@ -203,8 +203,45 @@ def test_simulate_takes_the_other_adjoints(scene: Scene) -> None:
     for adjoint in (dfx.RecursiveCheckpointAdjoint(), dfx.DirectAdjoint()):
         np.testing.assert_allclose(jax.grad(end)(k, adjoint), forward, rtol=1e-5)
     tight = jax.jacfwd(end)(k, dfx.ForwardMode(), 1e-9)
-    for adjoint in (None, StoredSteps()):
+    for adjoint in (None, StoredSteps(every=5)):
         np.testing.assert_allclose(jax.grad(end)(k, adjoint, 1e-9), tight, rtol=1e-11)
+    np.testing.assert_allclose(jax.jacfwd(end)(k, None, 1e-9), tight, rtol=1e-11)
+
+
+def test_derivatives_of_a_resting_place_are_exact_to_rounding() -> None:
+    """x'' + x in -[-1, 1] from (12, 6): half circles about +-1, the first of radius sqrt(13^2 + 6^2), to a rest.
+
+    The place is +-(sqrt(205) - 2 n + 1), so its derivatives are -13/sqrt(205) and -6/sqrt(205); the run errs by 1e-14.
+    A derivative of steps that are made again is off by 1e-5.
+    """
+    scene = Scene(SPRING.lagrangian, params={"k": 1.0}, effects=(Friction(Coulomb(Fc=1.0)),))
+
+    def rest(x: Any) -> Any:
+        return simulate(scene, x[:1], x[1:], 30.0, rtol=1e-11, atol=1e-13).q[-1, 0]
+
+    exact = np.array([-13.0, -6.0]) / np.sqrt(205.0)
+    for mode in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(mode(rest)(jnp.array([12.0, 6.0])), exact, rtol=1e-12)
+
+
+def test_second_derivatives_through_events() -> None:
+    """Place of rest of a braked spring by its stiffness, twice: (-1)^n (x0 - 2 n Fc/k).
+
+    The times of the steps count as constants in both derivatives, so the second has an error of the method.
+    """
+
+    def rest(k: Any, adjoint: Any = None) -> Any:
+        scene = Scene(SPRING.lagrangian, params={"k": k}, effects=(Friction(Coulomb(Fc=0.1)),))
+        return simulate(scene, [1.0], [0.0], 15.0, rtol=1e-9, adjoint=adjoint).q[-1, 0]
+
+    k = 0.7
+    n = float(np.ceil((1.0 - 0.1 / k) / (2 * 0.1 / k)))
+    sign = (-1.0) ** n
+    np.testing.assert_allclose(rest(k), sign * (1.0 - 2 * n * 0.1 / k), rtol=1e-8)
+    second = jax.hessian(rest)(k)
+    ahead = jax.jacfwd(jax.jacfwd(lambda k: rest(k, dfx.ForwardMode())))(k)
+    np.testing.assert_allclose(second, ahead, rtol=1e-9)
+    np.testing.assert_allclose(second, -sign * 4 * n * 0.1 / k**3, rtol=1e-5)
 
 
 def test_simulate_looks_at_no_direction_of_time_in_the_run() -> None:

@@ -1,4 +1,4 @@
-"""Reverse mode from stored steps, in plain diffrax: equal to forward mode, which differentiates the same steps."""
+"""Derivatives from stored steps, in plain diffrax: those of `ForwardMode`, which differentiates the same steps."""
 
 from typing import Any
 
@@ -75,16 +75,66 @@ def numbers(dtype: Any = float) -> dict[str, Any]:
 )
 @optimized()
 def test_equals_forward_mode(solver: str, save: str) -> None:
-    """Except by t0, with which forward mode moves all steps: that differs by the error of the method.
+    """In both modes. Except by t0, with which `ForwardMode` moves all steps: that differs by the error of the method.
 
     Equations of an implicit method are solved to a tolerance, and t1 enters them by the length of a step.
     """
-    reverse = jax.jit(jax.grad(lambda p: total(p, StoredSteps(), solver, save)))(numbers())
-    forward = jax.jit(jax.jacfwd(lambda p: total(p, dfx.ForwardMode(), solver, save)))(numbers())
-    for name in ("mu", "f", "x0", "t1"):
-        np.testing.assert_allclose(reverse[name], forward[name], rtol=1e-8 if name == "t1" else 1e-11, err_msg=name)
-    if "step" not in save:  # the times of steps are constants
-        np.testing.assert_allclose(reverse["t0"], forward["t0"], rtol=1e-3)
+    ahead = jax.jit(jax.jacfwd(lambda p: total(p, dfx.ForwardMode(), solver, save)))(numbers())
+    for mode in (jax.grad, jax.jacfwd):
+        slopes = jax.jit(mode(lambda p: total(p, StoredSteps(), solver, save)))(numbers())
+        for name in ("mu", "f", "x0", "t1"):
+            np.testing.assert_allclose(slopes[name], ahead[name], rtol=1e-8 if name == "t1" else 1e-11, err_msg=name)
+        if "step" not in save:  # the times of steps are constants
+            np.testing.assert_allclose(slopes["t0"], ahead["t0"], rtol=1e-3)
+
+
+@pytest.mark.parametrize("every", [3, 500])
+def test_steps_between_those_kept_are_made_again(every: int) -> None:
+    """At their recorded times: a run of 40 steps, all of them from the first one if no other is kept."""
+    wanted = jax.jit(jax.grad(lambda p: total(p, StoredSteps(), "Tsit5", "everything")))(numbers())
+    for mode in (jax.grad, jax.jacfwd):
+        slopes = jax.jit(mode(lambda p: total(p, StoredSteps(every), "Tsit5", "everything")))(numbers())
+        for name in NUMBERS:
+            np.testing.assert_allclose(slopes[name], wanted[name], rtol=1e-10, err_msg=name)
+
+
+def test_second_derivatives() -> None:
+    """Forward over reverse and twice forward; reverse over reverse says what to take."""
+    names = ("mu", "f", "x0")
+
+    def by(x: Any, adjoint: Any) -> Any:
+        return total({**numbers(), **dict(zip(names, x, strict=True))}, adjoint, "Tsit5", "times")
+
+    x = jnp.array([NUMBERS[name] for name in names])
+    wanted = jax.jit(jax.jacfwd(jax.jacfwd(lambda x: by(x, dfx.ForwardMode()))))(x)
+    for second in (jax.hessian(by), jax.jacfwd(jax.jacfwd(by))):
+        np.testing.assert_allclose(jax.jit(second, static_argnums=1)(x, StoredSteps()), wanted, rtol=1e-10, atol=1e-12)
+    for outer in (jax.jacrev(jax.jacrev(by)), jax.jacrev(jax.jacfwd(by))):
+        with pytest.raises(RuntimeError, match=r"take jax\.hessian, or jax\.jacfwd of jax\.grad"):
+            outer(x, StoredSteps())
+
+
+def test_what_functions_close_over_is_differentiated() -> None:
+    """y' = -k y from 1, k nowhere but in the function: y(1) = exp(-k)."""
+
+    def end(k: Any) -> Any:
+        solution = dfx.diffeqsolve(
+            dfx.ODETerm(lambda t, y, args: -k * y),
+            dfx.Dopri8(),
+            0.0,
+            1.0,
+            0.1,
+            jnp.ones(()),
+            stepsize_controller=dfx.PIDController(1e-12, 1e-12),
+            adjoint=StoredSteps(),
+            max_steps=200,
+        )
+        ys: Any = solution.ys
+        return ys[0]
+
+    for mode in (jax.grad, jax.jacfwd):
+        for slope in (mode(end)(0.7), mode(lambda k: jax.jit(end)(2.0 * k))(0.35) / 2.0):
+            np.testing.assert_allclose(slope, -np.exp(-0.7), rtol=1e-11)
 
 
 def test_closed_form_of_a_start_time() -> None:
@@ -117,12 +167,17 @@ def test_closed_form_of_a_start_time() -> None:
 def test_vmap_and_float32() -> None:
     """Runs of different lengths in one batch are as each alone; in float32 to its rounding."""
     t1 = jnp.linspace(1.5, 3.0, 3)
-    gradient = jax.grad(lambda p: total(p, StoredSteps(), "Tsit5", "times"))
+    value = lambda p: total(p, StoredSteps(), "Tsit5", "times")  # noqa: E731
+    gradient = jax.grad(value)
     together = jax.jit(jax.vmap(lambda t: gradient({**numbers(), "t1": t})))(t1)
     for i, t in enumerate(t1):
         alone = gradient({**numbers(), "t1": t})
         for name in NUMBERS:
             np.testing.assert_allclose(together[name][i], alone[name], rtol=1e-11)
+    # Numbers that all runs have in common, inside of the derivative.
+    common = jax.jit(jax.grad(lambda p: jnp.sum(jax.vmap(lambda t: value({**p, "t1": t}))(t1))))(numbers())
+    for name in ("mu", "f", "x0"):
+        np.testing.assert_allclose(common[name], jnp.sum(together[name]), rtol=1e-11)
     single = jax.jit(gradient)(numbers(jnp.float32))
     for name, x in single.items():
         assert x.dtype == jnp.float32
@@ -135,10 +190,12 @@ def test_a_run_that_ends_early_or_has_no_length() -> None:
     def five(p: Any, adjoint: Any) -> Any:
         return total(p, adjoint, "Tsit5", "everything", max_steps=5)
 
-    few = [jax.grad(five)(numbers(), StoredSteps()), jax.jacfwd(five)(numbers(), dfx.ForwardMode())]
-    for name in ("mu", "f", "x0"):
-        np.testing.assert_allclose(few[0][name], few[1][name], rtol=1e-11)
-    assert few[0]["t1"] == few[1]["t1"] == 0.0
+    ahead = jax.jacfwd(five)(numbers(), dfx.ForwardMode())
+    for mode in (jax.grad, jax.jacfwd):
+        few = mode(five)(numbers(), StoredSteps())
+        for name in ("mu", "f", "x0"):
+            np.testing.assert_allclose(few[name], ahead[name], rtol=1e-11)
+        assert few["t1"] == ahead["t1"] == 0.0
 
     def still(x: Any) -> Any:
         solution = dfx.diffeqsolve(
@@ -155,7 +212,7 @@ def test_a_run_that_ends_early_or_has_no_length() -> None:
         ys: Any = solution.ys
         return jnp.sum(ys)
 
-    assert jax.grad(still)(jnp.asarray(2.0)) == 2.0
+    assert jax.grad(still)(jnp.asarray(2.0)) == jax.jacfwd(still)(jnp.asarray(2.0)) == 2.0
 
 
 def test_events() -> None:
@@ -192,7 +249,8 @@ def test_events() -> None:
 
     x = jnp.array([g, e, h])
     np.testing.assert_allclose(end(x), exact(x), rtol=1e-8)
-    np.testing.assert_allclose(jax.jit(jax.jacrev(end))(x), jax.jacfwd(exact)(x), rtol=1e-7)
+    for mode in (jax.jacrev, jax.jacfwd):
+        np.testing.assert_allclose(jax.jit(mode(end))(x), jax.jacfwd(exact)(x), rtol=1e-7)
 
 
 def test_what_cannot_be_is_refused() -> None:
@@ -201,6 +259,8 @@ def test_what_cannot_be_is_refused() -> None:
             dfx.ODETerm(lambda t, y, args: -y), dfx.Tsit5(), 0.0, 1.0, 0.1, jnp.ones(1), adjoint=StoredSteps(), **how
         )
 
+    with pytest.raises(ValueError, match="every must be at least 1, but every=0"):
+        StoredSteps(every=0)
     with pytest.raises(ValueError, match="max_steps=None"):
         solve(max_steps=None)
     with pytest.raises(ValueError, match="use EventSolver"):

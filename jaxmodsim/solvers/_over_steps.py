@@ -1,0 +1,498 @@
+"""The derivative of a run from the steps that were made, in either mode."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, Int, PyTree
+
+lax_loop = partial(eqxi.while_loop, kind="lax")
+
+
+class StepPlan(NamedTuple):
+    """What is known of a run while compiling."""
+
+    interpolation_cls: Callable[..., dfx.AbstractPath]
+    # Of each `SubSaveAt`: t0, t1 and steps.
+    subs: list[tuple[bool, bool, int]]
+    # Whether the solver is told of jumps.
+    jumps: bool
+    # Whether the steps are constant: their times move with the ends of the run.
+    even: bool
+    every: int
+
+
+class StepInputs(NamedTuple):
+    """What a run is differentiated by."""
+
+    step: Callable[..., Any]
+    # Of each `SubSaveAt`, its function and its times.
+    fns: list[Callable[[Array, PyTree], PyTree]]
+    times: list[Any]
+    t0: Array
+    t1: Array
+    y0: PyTree
+    solver_state: PyTree
+
+
+class StepRecord(NamedTuple):
+    """What accepted steps began with, one or an array of them."""
+
+    t0: Array
+    t1: Array
+    made_jump: Any
+    # Of the steps whose state is kept: y and the solver's state.
+    began: tuple[PyTree, PyTree]
+
+
+class RecordedRun(NamedTuple):
+    """A run that was made, and what its derivative is taken of."""
+
+    inputs: StepInputs
+    final: Any
+    steps: StepRecord
+    how: StepPlan
+
+
+class RunTangents(NamedTuple):
+    """Of what a run gives: derivatives, or cotangents. None is zero."""
+
+    y: PyTree
+    solver_state: PyTree
+    # Of each `SubSaveAt`: values and times.
+    saved: list[tuple[PyTree, Any]]
+    dense_infos: PyTree
+    # Of the steps, where these are differentiated, too.
+    steps: StepRecord | None
+
+
+class AbstractOverSteps:
+    """What both modes share: the parts of a run as functions of what they are differentiated by."""
+
+    def __init__(self, by: StepInputs, run: RecordedRun):
+        self.inputs, self.final, self.steps, self.how = run
+        program = run.inputs[:2]
+        # The differentiated numbers of the step and of what is saved, None elsewhere, and the rest.
+        self.numbers = jtu.tree_map(lambda d, x: None if d is None else x, by[:2], program, is_leaf=is_none)
+        self.constants = jtu.tree_map(lambda d, x: x if d is None else None, by[:2], program, is_leaf=is_none)
+        self.count = jnp.asarray(run.final.num_accepted_steps)
+        self.saves = [x for x in jtu.tree_leaves(run.final.save_state, is_leaf=is_save_state) if is_save_state(x)]
+
+    def times(self, k: Array) -> tuple[tuple[Array, Array], Any]:
+        """Ends of a step, and whether a jump was made before it."""
+        t0, t1, jump = jtu.tree_map(lambda x: x[k], self.steps[:3])
+        return (t0, t1), jump if self.how.jumps else False
+
+    def stored(self, k: Array) -> tuple[PyTree, PyTree]:
+        """The state that is kept of this step, or of the one before it that is kept."""
+        return jtu.tree_map(lambda x: x[k // self.how.every], self.steps.began)
+
+    def ends_by_run(self, k: Array, ends: tuple[Array, Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """Derivatives of the ends of a step, of each by t0 and by t1 of the run."""
+        t0, t1 = self.inputs.t0, self.inputs.t1
+        if self.how.even:  # the first step has the length that was given, the others divide the run evenly
+            part = lambda j, t: (t - t0) / (t1 - t0) * ((j != 1) | (t == t1))  # noqa: E731
+            start, end = part(k, ends[0]), part(k + 1, ends[1])
+            return (1.0 - start, start), (1.0 - end, end)
+        last, zero = (k == self.count - 1) & (ends[1] == t1), jnp.zeros_like(t0)
+        return (jnp.where(k == 0, 1.0, zero), zero), (zero, jnp.where(last, 1.0, zero))
+
+    def advance(self, rest: PyTree, jump: Any, began: PyTree, ends: tuple[Array, Array], numbers: PyTree) -> Any:
+        """One step: numbers of state, solver's state and dense output, and the rest of these."""
+        step, (y, state) = eqx.combine(numbers[0], self.constants[0]), eqx.combine(began, rest)
+        y, _, dense, state, _ = step(*ends, y, state, jump)
+        return eqx.partition((y, state, dense), eqx.is_inexact_array)
+
+    def made_again(self, k: Array, began: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
+        """State and solver's state after a step."""
+        ends, jump = self.times(k)
+        y, _, _, state, _ = self.inputs.step(*ends, *began, jump)
+        return y, state
+
+    def value(self, i: int, t: Array, y: PyTree, rest: PyTree, numbers: PyTree) -> PyTree:
+        """What the i-th `SubSaveAt` keeps of a state."""
+        fn = eqx.combine(numbers[1][i], self.constants[1][i])
+        return _numbers(fn(t, eqx.combine(y, rest)))
+
+    def at_time(self, i: int, rest: PyTree, t: Array, dense: PyTree, ends: tuple[Array, Array], numbers: PyTree) -> Any:
+        """What it keeps at a time within a step."""
+        y = self.how.interpolation_cls(t0=ends[0], t1=ends[1], **eqx.combine(dense, rest)).evaluate(t)
+        return self.value(i, t, *eqx.partition(y, eqx.is_inexact_array), numbers)
+
+    def at_the_end(self, i: int) -> tuple[Array, Array]:
+        """Whether the i-th `SubSaveAt` keeps the last state beside others, and whether it has all of its times there.
+
+        That is so in a run of no length, which makes no step.
+        """
+        (_, t1, steps), times = self.how.subs[i], self.inputs.times[i]
+        last = jnp.asarray(t1 and steps != 1)
+        if steps > 1:
+            last &= self.count % steps != 0
+        return last, (self.inputs.t0 == self.inputs.t1) & (times is not None)
+
+    def rows_at_once(self, i: int, empty: Array) -> Array:
+        """Which entries are those of a run of no length."""
+        size, t0, times = self.saves[i].ts.shape[0], self.how.subs[i][0], self.inputs.times[i]
+        at = jnp.arange(size) - t0
+        return empty & (at >= 0) & (at < (0 if times is None else times.shape[0]))
+
+
+class _Ahead(NamedTuple):
+    """Derivatives on the way forward, of the state before the step `k` and of what was kept so far."""
+
+    k: Int[Array, ""]
+    began: tuple[PyTree, PyTree]
+    # The state itself where not every one is stored.
+    state: Any
+    # Of each `SubSaveAt`: how many entries it has kept, how many of its own times, and their derivatives.
+    saved: list[Int[Array, ""]]
+    timed: list[Int[Array, ""]]
+    rows: list[tuple[PyTree, Array]]
+    dense: PyTree
+    steps: StepRecord | None
+
+
+class ForwardOverSteps(AbstractOverSteps):
+    """The derivative of a run, from the first step to the last."""
+
+    def __init__(self, by: StepInputs, run: RecordedRun, keeps: bool):
+        super().__init__(by, run)
+        self.by, self.keeps = by, keeps
+        self.d_t0, self.d_t1 = _filled(by.t0, run.inputs.t0), _filled(by.t1, run.inputs.t1)
+        self.d_times = [_filled(d, t) for d, t in zip(by.times, run.inputs.times, strict=True)]
+
+    def result(self) -> RunTangents:
+        """Derivatives of what the run gave."""
+        ahead = lax_loop(
+            lambda ahead: ahead.k < self.count,
+            self.over_step,
+            self.before_the_run(),
+            max_steps=None,
+            buffers=lambda ahead: (ahead.rows, ahead.dense, ahead.steps),
+        )
+        y, solver_state = ahead.began
+        return RunTangents(y, solver_state, self.after_the_run(ahead), ahead.dense, ahead.steps)
+
+    def write(self, rows: Any, i: int, at: Array, pred: Any, t: Any, y: Any, d_t: Any, d_y: Any) -> Any:
+        """With the derivative of what the i-th `SubSaveAt` keeps of a state, if `pred`."""
+        y, rest = eqx.partition(y, eqx.is_inexact_array)
+        value = lambda t, y, n: self.value(i, t, y, rest, n)  # noqa: E731
+        _, row = jax.jvp(value, (t, y, self.numbers), (d_t, d_y, self.by[:2]))
+        return _set(rows, at, (row, d_t), pred)
+
+    def before_the_run(self) -> _Ahead:
+        """Of the first state, and of what is kept of it."""
+        inputs, began = self.inputs, (self.inputs.y0, self.inputs.solver_state)
+        d_began = _filled((self.by.y0, self.by.solver_state), began)
+        rows = [jtu.tree_map(jnp.zeros_like, (_numbers(save.ys), save.ts)) for save in self.saves]
+        for i, (t0, _, _) in enumerate(self.how.subs):
+            if t0:
+                rows[i] = self.write(rows[i], i, jnp.asarray(0), True, inputs.t0, inputs.y0, self.d_t0, d_began[0])
+        steps = jtu.tree_map(jnp.zeros_like, _numbers(self.steps)) if self.keeps else None
+        return _Ahead(
+            jnp.asarray(0),
+            d_began,
+            began if self.how.every > 1 else None,
+            [jnp.asarray(int(t0)) for t0, _, _ in self.how.subs],
+            [jnp.asarray(0) for _ in self.how.subs],
+            rows,
+            jtu.tree_map(jnp.zeros_like, _numbers(self.final.dense_infos)),
+            steps,
+        )
+
+    def over_step(self, ahead: _Ahead) -> _Ahead:
+        """From the start of a step to its end."""
+        k, every = ahead.k, self.how.every
+        ends, jump = self.times(k)
+        state = self.stored(k)
+        if every > 1:
+            state = jtu.tree_map(lambda a, b: jnp.where(k % every == 0, a, b), state, ahead.state)
+        began, rest = eqx.partition(state, eqx.is_inexact_array)
+        start, end = self.ends_by_run(k, ends)
+        d_ends = tuple(by[0] * self.d_t0 + by[1] * self.d_t1 for by in (start, end))
+        (y, state, dense), (d_y, d_state, d_dense), others = jax.jvp(
+            partial(self.advance, rest, jump),
+            (began, ends, self.numbers),
+            (ahead.began, d_ends, self.by[:2]),
+            has_aux=True,
+        )
+        for i, (_, _, every_row) in enumerate(self.how.subs):
+            if self.inputs.times[i] is not None:
+                over_time = partial(self.over_time, i, others[2], (dense, ends), (d_dense, d_ends))
+                ahead.saved[i], ahead.timed[i], ahead.rows[i] = lax_loop(
+                    partial(self.inside, i, ends[1]),
+                    over_time,
+                    (ahead.saved[i], ahead.timed[i], ahead.rows[i]),
+                    max_steps=None,
+                    buffers=lambda carry: carry[2],
+                )
+            if every_row:
+                at, kept, after = ahead.saved[i], (k + 1) % every_row == 0, eqx.combine(y, others[0])
+                ahead.rows[i] = self.write(ahead.rows[i], i, at, kept, ends[1], after, d_ends[1], d_y)
+                ahead.saved[i] = at + kept
+        steps = ahead.steps
+        if steps is not None:
+            began = _set(steps.began, k // every, ahead.began, k % every == 0)
+            t0, t1 = _set(steps[:2], k, d_ends, True)
+            steps = StepRecord(t0, t1, None, began)
+        return ahead._replace(
+            k=k + 1,
+            began=(d_y, d_state),
+            state=None if ahead.state is None else eqx.combine((y, state), others[:2]),
+            dense=_set(ahead.dense, k, d_dense, True) if self.final.dense_infos is not None else ahead.dense,
+            steps=steps,
+        )
+
+    def inside(self, i: int, t1: Array, carry: Any) -> Array:
+        """Whether the next saved time lies in this step."""
+        times, timed = self.inputs.times[i], carry[1]
+        return (timed < times.shape[0]) & (times[timed] <= t1)
+
+    def over_time(self, i: int, rest: PyTree, step: Any, d_step: Any, carry: Any) -> Any:
+        """The derivative at one saved time."""
+        saved, timed, rows = carry
+        t, d_t = self.inputs.times[i][timed], self.d_times[i][timed]
+        _, row = jax.jvp(partial(self.at_time, i, rest), (t, *step, self.numbers), (d_t, *d_step, self.by[:2]))
+        return saved + 1, timed + 1, _set(rows, saved, (row, d_t), True)
+
+    def after_the_run(self, ahead: _Ahead) -> list[tuple[PyTree, Array]]:
+        """Of everything that is kept."""
+        final, (d_y, _), rows = self.final, ahead.began, ahead.rows
+        d_t = jnp.where(final.tprev == self.inputs.t1, self.d_t1, 0.0)
+        for i, (_, t1, every_row) in enumerate(self.how.subs):
+            (last, empty), times = self.at_the_end(i), self.inputs.times[i]
+            if times is not None:
+                one = jtu.tree_map(jnp.zeros_like, jtu.tree_map(lambda x: x[:1], rows[i]))
+                one = self.write(one, i, jnp.asarray(0), True, final.tprev, final.y, d_t, d_y)
+                at_once = self.rows_at_once(i, empty)
+                rows[i] = jtu.tree_map(lambda x, one: jnp.where(_column(at_once, x), one, x), rows[i], one)  # noqa: B023
+                ahead.saved[i] = ahead.saved[i] + jnp.where(empty, times.shape[0], 0)
+            if t1 and every_row != 1:
+                rows[i] = self.write(rows[i], i, ahead.saved[i], last, final.tprev, final.y, d_t, d_y)
+        return rows
+
+
+class _Back(NamedTuple):
+    """Cotangents on the way back, of the state after the step `k` and of what does not change, and what is left."""
+
+    k: Int[Array, ""]
+    began: tuple[PyTree, PyTree]
+    # The states of the last steps made again, where not every one is stored.
+    states: Any
+    numbers: PyTree
+    t0: Array
+    t1: Array
+    # By the times of each `SubSaveAt`; None where it has none.
+    times: list[Any]
+    # Of each `SubSaveAt`: entries, and its own times among them, that are not treated yet.
+    saved: list[Int[Array, ""]]
+    timed: list[Int[Array, ""]]
+
+
+class _Pulled(NamedTuple):
+    """Cotangents that one saved time adds: of the dense output of its step, the ends of that, and the numbers."""
+
+    saved: Int[Array, ""]
+    timed: Int[Array, ""]
+    dense: PyTree
+    ends: tuple[Array, Array]
+    numbers: PyTree
+    times: Array
+
+
+class ReverseOverSteps(AbstractOverSteps):
+    """The derivative of a run, from the last step to the first."""
+
+    def __init__(self, by: StepInputs, run: RecordedRun, cts: RunTangents):
+        super().__init__(by, run)
+        self.by, self.cts = by, cts
+        # Cotangents of values and times that each `SubSaveAt` kept; None where nothing of it is differentiated.
+        self.rows = [
+            _filled(ct, (kept.ys, kept.ts)) if jtu.tree_leaves(ct) else None
+            for ct, kept in zip(cts.saved, self.saves, strict=True)
+        ]
+        self.dense = _filled(cts.dense_infos, run.final.dense_infos) if jtu.tree_leaves(cts.dense_infos) else None
+
+    def result(self) -> StepInputs:
+        """Cotangents of the inputs."""
+        back = lax.while_loop(lambda back: back.k >= 0, self.over_step, self.after_the_run())
+        back = self.before_the_run(back)
+        step, fns = back.numbers
+        cts = StepInputs(step, fns, back.times, back.t0, back.t1, *back.began)
+        return jtu.tree_map(lambda asked, ct: None if asked is None else ct, self.by, cts, is_leaf=is_none)
+
+    def row(self, i: int, index: Array, where: Any = True) -> Any:
+        """Cotangents of one entry, of values and time; zero unless `where`."""
+        return jtu.tree_map(lambda c: jnp.where(where, c[index], 0.0), self.rows[i])
+
+    def pull_value(self, i: int, t: Array, y: PyTree, ct: tuple[PyTree, Array], back: _Back) -> tuple[Array, _Back]:
+        """The cotangent of the time of an entry; those of state and numbers are added."""
+        y, rest = eqx.partition(y, eqx.is_inexact_array)
+        _, pull = jax.vjp(lambda t, y, n: self.value(i, t, y, rest, n), t, y, self.numbers)
+        ct_t, ct_y, more = pull(ct[0])
+        began = (_add(back.began[0], ct_y), back.began[1])
+        return ct_t + ct[1], back._replace(began=began, numbers=_add(back.numbers, more))
+
+    def after_the_run(self) -> _Back:
+        """Cotangents of the last state, from that and from what was kept at the end."""
+        final, (t0, t1), cts = self.final, (self.inputs.t0, self.inputs.t1), self.cts
+        first, every = (self.inputs.y0, self.inputs.solver_state), self.how.every
+        back = _Back(
+            self.count - 1,
+            _filled((cts.y, cts.solver_state), (final.y, final.solver_state)),
+            empty_buffers(first, every) if every > 1 else None,
+            jtu.tree_map(jnp.zeros_like, self.numbers),
+            jnp.zeros_like(t0),
+            jnp.zeros_like(t1),
+            jtu.tree_map(jnp.zeros_like, self.inputs.times),
+            [jnp.asarray(each.save_index) for each in self.saves],
+            [jnp.asarray(each.saveat_ts_index) for each in self.saves],
+        )
+        reached = final.tprev == t1
+        for i, (_, sub_t1, every_row) in enumerate(self.how.subs):
+            last, empty = self.at_the_end(i)
+            count, rows, times = back.saved[i] - last, self.rows[i], self.inputs.times[i]
+            if rows is not None and (times is not None or (sub_t1 and every_row != 1)):
+                ct = self.row(i, count, last)
+                if times is not None:
+                    at_once = self.rows_at_once(i, empty)
+                    ct = _add(ct, jtu.tree_map(lambda c: jnp.sum(jnp.where(_column(at_once, c), c, 0.0), 0), rows))  # noqa: B023
+                ct_t, back = self.pull_value(i, final.tprev, final.y, ct, back)
+                back = back._replace(t1=back.t1 + jnp.where(reached, ct_t, 0.0))
+            back.saved[i] = count
+            back.timed[i] = jnp.where(empty, 0, back.timed[i])
+        return back
+
+    def before_the_run(self, back: _Back) -> _Back:
+        """With the cotangents of what was kept at t0."""
+        for i, (t0, _, _) in enumerate(self.how.subs):
+            if t0 and self.rows[i] is not None:
+                ct = self.row(i, jnp.asarray(0))
+                ct_t, back = self.pull_value(i, self.inputs.t0, self.inputs.y0, ct, back)
+                back = back._replace(t0=back.t0 + ct_t)
+        return back
+
+    def state(self, back: _Back) -> tuple[Any, Any]:
+        """The state before a step, and the states of the steps between that and the last one that is stored."""
+        k, every, states = back.k, self.how.every, back.states
+        if states is None:
+            return self.stored(k), None
+        start = k // every * every
+        unknown = (k == self.count - 1) | ((k + 1) % every == 0)
+
+        def again(carry: Any) -> Any:
+            j, state, states = carry
+            states = jtu.tree_map(lambda x, xs: xs.at[j - start].set(x), state, states)
+            return j + 1, self.made_again(j, state), states
+
+        *_, states = lax.while_loop(lambda carry: unknown & (carry[0] <= k), again, (start, self.stored(k), states))
+        return jtu.tree_map(lambda xs: xs[k - start], states), states
+
+    def over_step(self, back: _Back) -> _Back:
+        """From the end of a step to its start."""
+        k = back.k
+        ends, jump = self.times(k)
+        state, states = self.state(back)
+        began, rest = eqx.partition(state, eqx.is_inexact_array)
+        (y, _, dense), pull, others = jax.vjp(
+            partial(self.advance, rest, jump), began, ends, self.numbers, has_aux=True
+        )
+        pulled_ends = jtu.tree_map(jnp.zeros_like, ends)
+        for i, (_, _, every_row) in enumerate(self.how.subs):
+            if every_row == 0:
+                continue
+            kept = (k + 1) % every_row == 0
+            back.saved[i] = back.saved[i] - kept
+            if self.rows[i] is not None:
+                after = eqx.combine(y, others[0])
+                ct_t, back = self.pull_value(i, ends[1], after, self.row(i, back.saved[i], kept), back)
+                pulled_ends = (pulled_ends[0], pulled_ends[1] + ct_t)
+        stored = self.dense
+        ct_dense = jtu.tree_map(jnp.zeros_like, dense) if stored is None else jtu.tree_map(lambda x: x[k], stored)
+        numbers = back.numbers
+        for i, times in enumerate(self.inputs.times):
+            if times is None or self.rows[i] is None:
+                continue
+            pulled = _Pulled(back.saved[i], back.timed[i], ct_dense, pulled_ends, numbers, back.times[i])
+            over_time = partial(self.over_time, i, others[2], (dense, ends))
+            pulled = lax.while_loop(partial(self.inside, i, ends[0], k), over_time, pulled)
+            ct_dense, pulled_ends, numbers = pulled.dense, pulled.ends, pulled.numbers
+            back.saved[i], back.timed[i], back.times[i] = pulled.saved, pulled.timed, pulled.times
+        ct_began, ct_ends, more = pull((*back.began, ct_dense))
+        (start, end), by_run = _add(ct_ends, pulled_ends), self.ends_by_run(k, ends)
+        return back._replace(
+            k=k - 1,
+            began=ct_began,
+            states=states,
+            numbers=_add(numbers, more),
+            t0=back.t0 + by_run[0][0] * start + by_run[1][0] * end,
+            t1=back.t1 + by_run[0][1] * start + by_run[1][1] * end,
+        )
+
+    def inside(self, i: int, t0: Array, k: Array, pulled: _Pulled) -> Array:
+        """Whether the saved time before lies in this step."""
+        t = self.inputs.times[i][jnp.maximum(pulled.timed - 1, 0)]
+        return (pulled.timed > 0) & ((t > t0) | (k == 0))
+
+    def over_time(self, i: int, rest: PyTree, step: Any, pulled: _Pulled) -> _Pulled:
+        """Cotangents of one saved time."""
+        saved, timed = pulled.saved - 1, pulled.timed - 1
+        ct, ct_time = self.row(i, saved)
+        _, pull = jax.vjp(partial(self.at_time, i, rest), self.inputs.times[i][timed], *step, self.numbers)
+        ct_t, ct_dense, ct_ends, more = pull(ct)
+        return _Pulled(
+            saved,
+            timed,
+            _add(pulled.dense, ct_dense),
+            _add(pulled.ends, ct_ends),
+            _add(pulled.numbers, more),
+            pulled.times.at[timed].add(ct_t + ct_time),
+        )
+
+
+def is_none(x: Any) -> bool:
+    return x is None
+
+
+def _numbers(tree: PyTree) -> PyTree:
+    return eqx.filter(tree, eqx.is_inexact_array)
+
+
+def _filled(change: PyTree, like: PyTree) -> PyTree:
+    """Derivatives or cotangents with zeros in place of None."""
+
+    def fill(x: Any, d: Any) -> Any:
+        return x if x is None else jnp.zeros_like(x) if d is None else d
+
+    like = _numbers(like)
+    if not jtu.tree_leaves(change):
+        return jtu.tree_map(jnp.zeros_like, like)
+    return jtu.tree_map(fill, like, change, is_leaf=is_none)
+
+
+def _add(a: PyTree, b: PyTree) -> PyTree:
+    return jtu.tree_map(jnp.add, a, b)
+
+
+def _set(buffers: PyTree, at: Array, entries: PyTree, pred: Any) -> PyTree:
+    return jtu.tree_map(lambda x, xs: eqxi.buffer_at_set(xs, at, x, pred=pred), entries, buffers)
+
+
+def _column(mask: Array, like: Array) -> Array:
+    """`mask` of the entries of `like`, along its first axis."""
+    return jnp.expand_dims(mask, tuple(range(1, like.ndim)))
+
+
+def empty_buffers(tree: PyTree, size: int) -> PyTree:
+    return jtu.tree_map(lambda x: jnp.zeros((size, *jnp.shape(x)), jnp.result_type(x)), tree)
+
+
+def is_save_state(x: Any) -> bool:
+    return hasattr(x, "saveat_ts_index")
