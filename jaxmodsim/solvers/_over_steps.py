@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -32,10 +32,10 @@ class StepPlan(NamedTuple):
 class StepInputs(NamedTuple):
     """What a run is differentiated by."""
 
-    step: Callable[..., Any]
+    step: Callable[..., PyTree]
     # Of each `SubSaveAt`, its function and its times.
     fns: list[Callable[[Array, PyTree], PyTree]]
-    times: list[Any]
+    times: list[PyTree]
     t0: Array
     t1: Array
     y0: PyTree
@@ -47,7 +47,7 @@ class StepRecord(NamedTuple):
 
     t0: Array
     t1: Array
-    made_jump: Any
+    made_jump: PyTree
     # Of the steps whose state is kept: y and the solver's state.
     began: tuple[PyTree, PyTree]
 
@@ -56,7 +56,7 @@ class RecordedRun(NamedTuple):
     """A run that was made, and what its derivative is taken of."""
 
     inputs: StepInputs
-    final: Any
+    final: PyTree
     steps: StepRecord
     how: StepPlan
 
@@ -67,7 +67,7 @@ class RunTangents(NamedTuple):
     y: PyTree
     solver_state: PyTree
     # Of each `SubSaveAt`: values and times.
-    saved: list[tuple[PyTree, Any]]
+    saved: list[tuple[PyTree, PyTree]]
     dense_infos: PyTree
     # Of the steps, where these are differentiated, too.
     steps: StepRecord | None
@@ -85,7 +85,7 @@ class AbstractOverSteps:
         self.count = jnp.asarray(run.final.num_accepted_steps)
         self.saves = [x for x in jtu.tree_leaves(run.final.save_state, is_leaf=is_save_state) if is_save_state(x)]
 
-    def times(self, k: Array) -> tuple[tuple[Array, Array], Any]:
+    def times(self, k: Array) -> tuple[tuple[Array, Array], bool | Array]:
         """Ends of a step, and whether a jump was made before it."""
         t0, t1, jump = jtu.tree_map(lambda x: x[k], self.steps[:3])
         return (t0, t1), jump if self.how.jumps else False
@@ -104,7 +104,9 @@ class AbstractOverSteps:
         last, zero = (k == self.count - 1) & (ends[1] == t1), jnp.zeros_like(t0)
         return (jnp.where(k == 0, 1.0, zero), zero), (zero, jnp.where(last, 1.0, zero))
 
-    def advance(self, rest: PyTree, jump: Any, began: PyTree, ends: tuple[Array, Array], numbers: PyTree) -> Any:
+    def advance(
+        self, rest: PyTree, jump: bool | Array, began: PyTree, ends: tuple[Array, Array], numbers: PyTree
+    ) -> PyTree:
         """One step: numbers of state, solver's state and dense output, and the rest of these."""
         step, (y, state) = eqx.combine(numbers[0], self.constants[0]), eqx.combine(began, rest)
         y, _, dense, state, _ = step(*ends, y, state, jump)
@@ -121,7 +123,9 @@ class AbstractOverSteps:
         fn = eqx.combine(numbers[1][i], self.constants[1][i])
         return _numbers(fn(t, eqx.combine(y, rest)))
 
-    def at_time(self, i: int, rest: PyTree, t: Array, dense: PyTree, ends: tuple[Array, Array], numbers: PyTree) -> Any:
+    def at_time(
+        self, i: int, rest: PyTree, t: Array, dense: PyTree, ends: tuple[Array, Array], numbers: PyTree
+    ) -> PyTree:
         """What it keeps at a time within a step."""
         y = self.how.interpolation_cls(t0=ends[0], t1=ends[1], **eqx.combine(dense, rest)).evaluate(t)
         return self.value(i, t, *eqx.partition(y, eqx.is_inexact_array), numbers)
@@ -150,7 +154,7 @@ class _Ahead(NamedTuple):
     k: Int[Array, ""]
     began: tuple[PyTree, PyTree]
     # The state itself where not every one is stored.
-    state: Any
+    state: PyTree
     # Of each `SubSaveAt`: how many entries it has kept, how many of its own times, and their derivatives.
     saved: list[Int[Array, ""]]
     timed: list[Int[Array, ""]]
@@ -180,12 +184,12 @@ class ForwardOverSteps(AbstractOverSteps):
         y, solver_state = ahead.began
         return RunTangents(y, solver_state, self.after_the_run(ahead), ahead.dense, ahead.steps)
 
-    def write(self, rows: Any, i: int, at: Array, pred: Any, t: Any, y: Any, d_t: Any, d_y: Any) -> Any:
-        """With the derivative of what the i-th `SubSaveAt` keeps of a state, if `pred`."""
-        y, rest = eqx.partition(y, eqx.is_inexact_array)
+    def write(self, rows: PyTree, i: int, at: Array, pred: PyTree, of: PyTree, change: PyTree) -> PyTree:
+        """With the derivative of what the i-th `SubSaveAt` keeps of time and state, if `pred`."""
+        y, rest = eqx.partition(of[1], eqx.is_inexact_array)
         value = lambda t, y, n: self.value(i, t, y, rest, n)  # noqa: E731
-        _, row = jax.jvp(value, (t, y, self.numbers), (d_t, d_y, self.by[:2]))
-        return _set(rows, at, (row, d_t), pred)
+        _, row = jax.jvp(value, (of[0], y, self.numbers), (*change, self.by[:2]))
+        return _set(rows, at, (row, change[0]), pred)
 
     def before_the_run(self) -> _Ahead:
         """Of the first state, and of what is kept of it."""
@@ -194,8 +198,7 @@ class ForwardOverSteps(AbstractOverSteps):
         rows = [jtu.tree_map(jnp.zeros_like, (_numbers(save.ys), save.ts)) for save in self.saves]
         for i, (t0, _, _) in enumerate(self.how.subs):
             if t0:
-                rows[i] = self.write(rows[i], i, jnp.asarray(0), True, inputs.t0, inputs.y0, self.d_t0, d_began[0])
-        steps = jtu.tree_map(jnp.zeros_like, _numbers(self.steps)) if self.keeps else None
+                rows[i] = self.write(rows[i], i, jnp.asarray(0), True, (inputs.t0, inputs.y0), (self.d_t0, d_began[0]))
         return _Ahead(
             jnp.asarray(0),
             d_began,
@@ -204,7 +207,7 @@ class ForwardOverSteps(AbstractOverSteps):
             [jnp.asarray(0) for _ in self.how.subs],
             rows,
             jtu.tree_map(jnp.zeros_like, _numbers(self.final.dense_infos)),
-            steps,
+            jtu.tree_map(jnp.zeros_like, _numbers(self.steps)) if self.keeps else None,
         )
 
     def over_step(self, ahead: _Ahead) -> _Ahead:
@@ -215,8 +218,7 @@ class ForwardOverSteps(AbstractOverSteps):
         if every > 1:
             state = jtu.tree_map(lambda a, b: jnp.where(k % every == 0, a, b), state, ahead.state)
         began, rest = eqx.partition(state, eqx.is_inexact_array)
-        start, end = self.ends_by_run(k, ends)
-        d_ends = tuple(by[0] * self.d_t0 + by[1] * self.d_t1 for by in (start, end))
+        d_ends = tuple(by_t0 * self.d_t0 + by_t1 * self.d_t1 for by_t0, by_t1 in self.ends_by_run(k, ends))
         (y, state, dense), (d_y, d_state, d_dense), others = jax.jvp(
             partial(self.advance, rest, jump),
             (began, ends, self.numbers),
@@ -235,7 +237,7 @@ class ForwardOverSteps(AbstractOverSteps):
                 )
             if every_row:
                 at, kept, after = ahead.saved[i], (k + 1) % every_row == 0, eqx.combine(y, others[0])
-                ahead.rows[i] = self.write(ahead.rows[i], i, at, kept, ends[1], after, d_ends[1], d_y)
+                ahead.rows[i] = self.write(ahead.rows[i], i, at, kept, (ends[1], after), (d_ends[1], d_y))
                 ahead.saved[i] = at + kept
         steps = ahead.steps
         if steps is not None:
@@ -250,12 +252,12 @@ class ForwardOverSteps(AbstractOverSteps):
             steps=steps,
         )
 
-    def inside(self, i: int, t1: Array, carry: Any) -> Array:
+    def inside(self, i: int, t1: Array, carry: PyTree) -> Array:
         """Whether the next saved time lies in this step."""
         times, timed = self.inputs.times[i], carry[1]
         return (timed < times.shape[0]) & (times[timed] <= t1)
 
-    def over_time(self, i: int, rest: PyTree, step: Any, d_step: Any, carry: Any) -> Any:
+    def over_time(self, i: int, rest: PyTree, step: PyTree, d_step: PyTree, carry: PyTree) -> PyTree:
         """The derivative at one saved time."""
         saved, timed, rows = carry
         t, d_t = self.inputs.times[i][timed], self.d_times[i][timed]
@@ -270,12 +272,12 @@ class ForwardOverSteps(AbstractOverSteps):
             (last, empty), times = self.at_the_end(i), self.inputs.times[i]
             if times is not None:
                 one = jtu.tree_map(jnp.zeros_like, jtu.tree_map(lambda x: x[:1], rows[i]))
-                one = self.write(one, i, jnp.asarray(0), True, final.tprev, final.y, d_t, d_y)
+                one = self.write(one, i, jnp.asarray(0), True, (final.tprev, final.y), (d_t, d_y))
                 at_once = self.rows_at_once(i, empty)
                 rows[i] = jtu.tree_map(lambda x, one: jnp.where(_column(at_once, x), one, x), rows[i], one)  # noqa: B023
                 ahead.saved[i] = ahead.saved[i] + jnp.where(empty, times.shape[0], 0)
             if t1 and every_row != 1:
-                rows[i] = self.write(rows[i], i, ahead.saved[i], last, final.tprev, final.y, d_t, d_y)
+                rows[i] = self.write(rows[i], i, ahead.saved[i], last, (final.tprev, final.y), (d_t, d_y))
         return rows
 
 
@@ -285,12 +287,12 @@ class _Back(NamedTuple):
     k: Int[Array, ""]
     began: tuple[PyTree, PyTree]
     # The states of the last steps made again, where not every one is stored.
-    states: Any
+    states: PyTree
     numbers: PyTree
     t0: Array
     t1: Array
     # By the times of each `SubSaveAt`; None where it has none.
-    times: list[Any]
+    times: list[PyTree]
     # Of each `SubSaveAt`: entries, and its own times among them, that are not treated yet.
     saved: list[Int[Array, ""]]
     timed: list[Int[Array, ""]]
@@ -328,7 +330,7 @@ class ReverseOverSteps(AbstractOverSteps):
         cts = StepInputs(step, fns, back.times, back.t0, back.t1, *back.began)
         return jtu.tree_map(lambda asked, ct: None if asked is None else ct, self.by, cts, is_leaf=is_none)
 
-    def row(self, i: int, index: Array, where: Any = True) -> Any:
+    def row(self, i: int, index: Array, where: bool | Array = True) -> PyTree:
         """Cotangents of one entry, of values and time; zero unless `where`."""
         return jtu.tree_map(lambda c: jnp.where(where, c[index], 0.0), self.rows[i])
 
@@ -379,7 +381,7 @@ class ReverseOverSteps(AbstractOverSteps):
                 back = back._replace(t0=back.t0 + ct_t)
         return back
 
-    def state(self, back: _Back) -> tuple[Any, Any]:
+    def state(self, back: _Back) -> tuple[PyTree, PyTree]:
         """The state before a step, and the states of the steps between that and the last one that is stored."""
         k, every, states = back.k, self.how.every, back.states
         if states is None:
@@ -387,7 +389,7 @@ class ReverseOverSteps(AbstractOverSteps):
         start = k // every * every
         unknown = (k == self.count - 1) | ((k + 1) % every == 0)
 
-        def again(carry: Any) -> Any:
+        def again(carry: PyTree) -> PyTree:
             j, state, states = carry
             states = jtu.tree_map(lambda x, xs: xs.at[j - start].set(x), state, states)
             return j + 1, self.made_again(j, state), states
@@ -398,8 +400,7 @@ class ReverseOverSteps(AbstractOverSteps):
     def over_step(self, back: _Back) -> _Back:
         """From the end of a step to its start."""
         k = back.k
-        ends, jump = self.times(k)
-        state, states = self.state(back)
+        (ends, jump), (state, states) = self.times(k), self.state(back)
         began, rest = eqx.partition(state, eqx.is_inexact_array)
         (y, _, dense), pull, others = jax.vjp(
             partial(self.advance, rest, jump), began, ends, self.numbers, has_aux=True
@@ -441,7 +442,7 @@ class ReverseOverSteps(AbstractOverSteps):
         t = self.inputs.times[i][jnp.maximum(pulled.timed - 1, 0)]
         return (pulled.timed > 0) & ((t > t0) | (k == 0))
 
-    def over_time(self, i: int, rest: PyTree, step: Any, pulled: _Pulled) -> _Pulled:
+    def over_time(self, i: int, rest: PyTree, step: PyTree, pulled: _Pulled) -> _Pulled:
         """Cotangents of one saved time."""
         saved, timed = pulled.saved - 1, pulled.timed - 1
         ct, ct_time = self.row(i, saved)
@@ -457,7 +458,7 @@ class ReverseOverSteps(AbstractOverSteps):
         )
 
 
-def is_none(x: Any) -> bool:
+def is_none(x: object) -> bool:
     return x is None
 
 
@@ -468,7 +469,7 @@ def _numbers(tree: PyTree) -> PyTree:
 def _filled(change: PyTree, like: PyTree) -> PyTree:
     """Derivatives or cotangents with zeros in place of None."""
 
-    def fill(x: Any, d: Any) -> Any:
+    def fill(x: PyTree, d: PyTree) -> PyTree:
         return x if x is None else jnp.zeros_like(x) if d is None else d
 
     like = _numbers(like)
@@ -481,7 +482,7 @@ def _add(a: PyTree, b: PyTree) -> PyTree:
     return jtu.tree_map(jnp.add, a, b)
 
 
-def _set(buffers: PyTree, at: Array, entries: PyTree, pred: Any) -> PyTree:
+def _set(buffers: PyTree, at: Array, entries: PyTree, pred: PyTree) -> PyTree:
     return jtu.tree_map(lambda x, xs: eqxi.buffer_at_set(xs, at, x, pred=pred), entries, buffers)
 
 
@@ -494,5 +495,5 @@ def empty_buffers(tree: PyTree, size: int) -> PyTree:
     return jtu.tree_map(lambda x: jnp.zeros((size, *jnp.shape(x)), jnp.result_type(x)), tree)
 
 
-def is_save_state(x: Any) -> bool:
+def is_save_state(x: object) -> bool:
     return hasattr(x, "saveat_ts_index")

@@ -1,7 +1,7 @@
 """Forward and reverse mode from the steps that were made."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import diffrax as dfx
 import equinox as eqx
@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.core import ShapedArray
+from jax.extend.core import Primitive
 from jax.interpreters.ad import UndefinedPrimal
 from jaxtyping import Array, PyTree
 
@@ -28,6 +29,7 @@ from ._over_steps import (
     lax_loop,
 )
 
+_Fn: TypeAlias = Callable[..., PyTree]
 _TWICE = "StoredSteps does not differentiate a derivative in reverse mode: take jax.hessian, or jax.jacfwd of jax.grad."
 
 
@@ -78,12 +80,12 @@ class StoredSteps(dfx.AbstractAdjoint):
         t1: Array,
         dt0: Array | None,
         max_steps: int | None,
-        init_state: Any,
+        init_state: PyTree,
         progress_meter: dfx.AbstractProgressMeter,
         throw: bool,
         passed_solver_state: bool,
         passed_controller_state: bool,
-    ) -> tuple[Any, dict[str, Any]]:
+    ) -> tuple[PyTree, dict[str, Any]]:
         """See `diffrax.AbstractAdjoint`."""
         del throw, passed_solver_state, passed_controller_state
         if max_steps is None:
@@ -95,7 +97,7 @@ class StoredSteps(dfx.AbstractAdjoint):
         y0, args_of_step = begin.y, (begin.tprev, begin.tnext, begin.y, begin.solver_state)
 
         # Numbers of the terms, of the solver and of `args`, and what their functions close over, become leaves.
-        def step(t0: Array, t1: Array, y: PyTree, state: PyTree, jump: Any) -> Any:
+        def step(t0: Array, t1: Array, y: PyTree, state: PyTree, jump: bool | Array) -> PyTree:
             return solver.step(terms, t0, t1, y, args, state, jump)
 
         traced, jumps = _traced_once(step, *args_of_step, begin.made_jump), not isinstance(begin.made_jump, bool)
@@ -125,56 +127,60 @@ class StoredSteps(dfx.AbstractAdjoint):
 class _Fixed(NamedTuple):
     """What it is not differentiated by."""
 
-    controller: Any
-    saveat: Any
-    dt0: Any
+    controller: PyTree
+    saveat: PyTree
+    dt0: Array | None
     args: PyTree
-    progress_meter: Any
-    state: Any
+    progress_meter: PyTree
+    state: PyTree
     max_steps: int
-    loop: Callable[..., Any]
-    error_order: Any
+    loop: Callable[..., PyTree]
+    error_order: PyTree
     how: StepPlan
 
 
 class _Solver(NamedTuple):
     """What diffrax's loop asks of a solver, with a step that is traced already."""
 
-    advance: Callable[..., Any]
-    order: Any
+    advance: Callable[..., PyTree]
+    order: PyTree
     how: StepPlan
 
-    def step(self, terms: Any, t0: Any, t1: Any, y: Any, args: Any, state: Any, jump: Any) -> Any:
+    def step(
+        self, terms: PyTree, t0: Array, t1: Array, y: PyTree, args: PyTree, state: PyTree, jump: bool | Array
+    ) -> PyTree:
         del terms, args
         return self.advance(t0, t1, y, state, jnp.asarray(jump) if self.how.jumps else jump)
 
-    def error_order(self, terms: Any) -> Any:
+    def error_order(self, terms: PyTree) -> PyTree:
         del terms
         return self.order
 
     @property
-    def interpolation_cls(self) -> Any:
+    def interpolation_cls(self) -> Callable[..., dfx.AbstractPath]:
         return self.how.interpolation_cls
 
 
-def _is_sub(x: Any) -> bool:
+def _is_sub(x: object) -> bool:
     return isinstance(x, dfx.SubSaveAt)
 
 
-def _differentiable_in_both_modes(solver: Any) -> Any:
+def _differentiable_in_both_modes(solver: PyTree) -> PyTree:
     """With loops over the stages of diffrax's Runge-Kutta methods that either mode can go through."""
     is_method = lambda x: isinstance(x, dfx.AbstractRungeKutta) and x.scan_kind is None  # noqa: E731
 
-    def bounded(x: Any) -> Any:
+    def bounded(x: PyTree) -> PyTree:
         return eqx.tree_at(lambda s: s.scan_kind, x, "bounded", is_leaf=is_none) if is_method(x) else x
 
     return jtu.tree_map(bounded, solver, is_leaf=is_method)
 
 
-def _tells_of_jumps(controller: Any, args: PyTree, state: Any, order: Any, step: Callable[..., Any]) -> bool:
+def _tells_of_jumps(
+    controller: PyTree, args: PyTree, state: PyTree, order: PyTree, step: Callable[..., PyTree]
+) -> bool:
     """Whether `made_jump` is traced: diffrax keeps it a Python boolean where the controller never tells of a jump."""
 
-    def made_jump(controller: Any, args: PyTree, state: Any) -> Any:
+    def made_jump(controller: PyTree, args: PyTree, state: PyTree) -> bool | Array:
         t0, t1, y0 = state.tprev, state.tnext, state.y
         y1, y_error, *_ = step(t0, t1, y0, state.solver_state, False)
         return controller.adapt_step_size(t0, t1, y0, y1, args, y_error, order, state.controller_state)[3]
@@ -182,21 +188,21 @@ def _tells_of_jumps(controller: Any, args: PyTree, state: Any, order: Any, step:
     return not isinstance(eqx.filter_eval_shape(made_jump, controller, args, state), bool)
 
 
-def _traced_once(fn: Callable[..., Any], *args: Any) -> Callable[..., Any]:
+def _traced_once(fn: Callable[..., PyTree], *args: PyTree) -> Callable[..., PyTree]:
     """`fn`, traced at `args`, as a pytree of what it closes over; its program is one equation in those that call it."""
     numbers, program = eqx.partition(eqx.filter_closure_convert(fn, *args), eqx.is_array)
     return eqx.Partial(eqx.filter_jit(lambda numbers, *args: eqx.combine(numbers, program)(*args)), numbers)
 
 
-def _solve(inputs: StepInputs, fixed: _Fixed, keeps: bool) -> Any:
+def _solve(inputs: StepInputs, fixed: _Fixed, keeps: bool) -> PyTree:
     """The final state of diffrax's loop, and the steps if they are wanted."""
     every, size, kept = fixed.how.every, fixed.max_steps, []
 
-    def outer(cond: Any, body: Any, init: Any, *, max_steps: int, buffers: Any) -> Any:
+    def outer(cond: _Fn, body: _Fn, init: PyTree, *, max_steps: int, buffers: _Fn) -> PyTree:
         if not keeps:
             return lax_loop(cond, body, init, max_steps=max_steps, buffers=buffers)
 
-        def step(carry: Any) -> Any:
+        def step(carry: PyTree) -> PyTree:
             state, steps = carry
             at, one, after = state.num_accepted_steps, _beginning(state), body(state)
             began = jtu.tree_map(
@@ -219,7 +225,7 @@ def _solve(inputs: StepInputs, fixed: _Fixed, keeps: bool) -> Any:
         kept.append(steps)
         return final
 
-    def inner(cond: Any, body: Any, init: Any, max_steps: int, buffers: Any, checkpoints: int) -> Any:
+    def inner(cond: _Fn, body: _Fn, init: PyTree, max_steps: int, buffers: _Fn, checkpoints: int) -> PyTree:
         del checkpoints
         return lax_loop(cond, body, init, max_steps=max_steps, buffers=buffers)
 
@@ -252,7 +258,7 @@ def _solve(inputs: StepInputs, fixed: _Fixed, keeps: bool) -> Any:
     return (final, kept[0]) if keeps else final
 
 
-def _beginning(state: Any) -> StepRecord:
+def _beginning(state: PyTree) -> StepRecord:
     return StepRecord(state.tprev, state.tnext, jnp.asarray(state.made_jump), (state.y, state.solver_state))
 
 
@@ -266,12 +272,12 @@ def _aval(tree: PyTree) -> PyTree:
     return jtu.tree_map(lambda x: ShapedArray(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x, tree)
 
 
-def _array(x: Any) -> Any:
+def _array(x: PyTree) -> PyTree:
     """Constants of a program come in other forms, too."""
     return x if isinstance(x, UndefinedPrimal | jax.Array) else jnp.asarray(x)
 
 
-def _primitive(name: str, fn: Callable[..., Any], jvp: Callable[..., Any], transpose: Callable[..., Any]) -> Any:
+def _primitive(name: str, fn: _Fn, jvp: _Fn, transpose: _Fn) -> Primitive:
     rules = eqxi.filter_primitive_jvp(jvp), eqxi.filter_primitive_transpose(transpose)
     return eqxi.create_vprim(
         name,
@@ -282,13 +288,13 @@ def _primitive(name: str, fn: Callable[..., Any], jvp: Callable[..., Any], trans
     )
 
 
-def _make(run: Callable[[StepInputs], Any], inputs: StepInputs, fixed: _Fixed, keeps: bool) -> Any:
+def _make(run: Callable[[StepInputs], PyTree], inputs: StepInputs, fixed: _Fixed, keeps: bool) -> PyTree:
     """The run."""
     del fixed, keeps
     return run(inputs)
 
 
-def _make_jvp(primals: Any, tangents: Any) -> Any:
+def _make_jvp(primals: PyTree, tangents: PyTree) -> PyTree:
     (run, inputs, fixed, keeps), by = primals, tangents[1]
     if not keeps:
         run = eqx.filter_closure_convert(lambda inputs: _solve(inputs, fixed, True), inputs)
@@ -302,7 +308,7 @@ def _make_jvp(primals: Any, tangents: Any) -> Any:
         change = RunTangents(None, None, [(None, None)] * len(fixed.how.subs), None, None)
     saves = iter(change.saved)
 
-    def saved(state: Any) -> Any:
+    def saved(state: PyTree) -> PyTree:
         ys, ts = next(saves)
         return eqx.tree_at(lambda s: (s.ys, s.ts), _none(state), (ys, ts), is_leaf=lambda x: x is None)
 
@@ -326,7 +332,7 @@ def _none(tree: PyTree) -> PyTree:
     return jtu.tree_map(lambda _: None, tree)
 
 
-def _make_transpose(inputs: Any, cts: Any) -> Any:
+def _make_transpose(inputs: PyTree, cts: PyTree) -> PyTree:
     del inputs, cts
     raise AssertionError("The run is not linear.")
 
@@ -336,12 +342,12 @@ def _change(by: StepInputs, run: RecordedRun, keeps: bool) -> RunTangents:
     return _once(ForwardOverSteps(by, run, keeps).result())
 
 
-def _change_jvp(primals: Any, tangents: Any) -> Any:
+def _change_jvp(primals: PyTree, tangents: PyTree) -> PyTree:
     by, run, keeps = primals
     return eqx.filter_jvp(lambda by, run: _change(by, run, keeps), (by, run), tangents[:2])
 
 
-def _change_transpose(inputs: Any, cts: RunTangents) -> Any:
+def _change_transpose(inputs: PyTree, cts: RunTangents) -> PyTree:
     by, run, keeps = inputs
     if keeps:
         raise NotImplementedError(_TWICE)
