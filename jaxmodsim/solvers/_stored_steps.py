@@ -58,7 +58,7 @@ class StoredSteps(dfx.AbstractAdjoint):
     **Raises:**
 
     - `ValueError` for `every` below 1, `max_steps=None`, and diffrax's own terminating `event`.
-    - `NotImplementedError` for reverse mode over reverse mode.
+    - `RuntimeError` for reverse mode of a derivative.
     """
 
     every: int = eqx.field(static=True, default=1)
@@ -350,7 +350,7 @@ def _change_jvp(primals: PyTree, tangents: PyTree) -> PyTree:
 def _change_transpose(inputs: PyTree, cts: RunTangents) -> PyTree:
     by, run, keeps = inputs
     if keeps:
-        raise NotImplementedError(_TWICE)
+        raise RuntimeError(_TWICE)
     by = jtu.tree_map(
         lambda x: isinstance(x, UndefinedPrimal) or None, by, is_leaf=lambda x: isinstance(x, UndefinedPrimal)
     )
