@@ -23,7 +23,6 @@ _OPTION, _FLAGS = "xla_cpu_use_fusion_emitters", os.environ.get("XLA_FLAGS", "")
 if jaxlib.version.__version_info__[:2] == (0, 10) and _OPTION not in _FLAGS:
     os.environ["XLA_FLAGS"] = f"{_FLAGS} --{_OPTION}=false --xla_cpu_parallel_codegen_split_count=1".strip()
 if "JAX_DISABLE_MOST_OPTIMIZATIONS" not in os.environ:
-    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # of the processes that tests start
     jax.config.update("jax_disable_most_optimizations", True)
 
 jax.config.update("jax_enable_x64", True)
