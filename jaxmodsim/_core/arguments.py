@@ -118,8 +118,8 @@ def as_mapping(value: object, *, name: str, example: str) -> dict[str, PyTree]:
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
     """The known name that is most like this one; None where none is."""
-    found = difflib.get_close_matches(name, list(known), n=1)
-    return found[0] if found else None
+    matches = difflib.get_close_matches(name, list(known), n=1)
+    return matches[0] if matches else None
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

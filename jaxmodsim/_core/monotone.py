@@ -130,14 +130,14 @@ def solve_monotone(
     def value(x: Array) -> Array:
         return fixed(x, *constants)
 
-    found = (_solve_one if free.shape[0] == 1 else _solve_several)(value, free0, a, blocks)
-    x = jax.lax.stop_gradient(found.x)
+    solution = (_solve_one if free.shape[0] == 1 else _solve_several)(value, free0, a, blocks)
+    x = jax.lax.stop_gradient(solution.x)
     # At x = 0 a law may have no derivative; it has one on either side.
     aside = jnp.where(x == 0, tiny, x)
     residual = aside - free + _times(coupling, fn(aside))
     slopes = _slopes(value, aside, blocks)[1]
     change = _newton(a, slopes, residual - jax.lax.stop_gradient(residual))
-    return Monotone(x + change, found.solved, found.iterations)
+    return Monotone(x + change, solution.solved, solution.iterations)
 
 
 def _times(matrix: Array, x: Array) -> Array:

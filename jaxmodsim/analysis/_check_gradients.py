@@ -192,8 +192,8 @@ def check_gradients(
     numbers = {}
     for name, x in entries.items():
         sample = functools.partial(evaluate, name)
-        found = probe(sample, sample(x), scale[name], itemsize)
-        numbers[name] = _judge(name, found, forward[name], reverse[name], scale[name], limits)
+        evaluations = probe(sample, sample(x), scale[name], itemsize)
+        numbers[name] = _judge(name, evaluations, forward[name], reverse[name], scale[name], limits)
     remarks = [remark for number in numbers.values() for remark in number.remarks]
     if not watched:
         remarks.append(
@@ -302,21 +302,23 @@ def _evaluate(
 def _histories(run: Trajectory) -> dict[str, History]:
     """Mode changes by effect."""
     events = jtu.tree_map(np.asarray, run.events)
-    found = {}
+    histories = {}
     for i, effect in enumerate(run.scene.names):
         mine = (events.effect == i) & np.isfinite(events.t)
         if mine.any():
             pairs = zip(events.before[mine].tolist(), events.after[mine].tolist(), strict=True)
-            found[effect] = History(float(run.inputs.t0), events.t[mine].astype(float), tuple(pairs))
-    return found
+            histories[effect] = History(float(run.inputs.t0), events.t[mine].astype(float), tuple(pairs))
+    return histories
 
 
-def _judge(name: str, found: Probe, forward: float, reverse: float, scale: float, limits: Agreement) -> NumberCheck:
+def _judge(
+    name: str, evaluations: Probe, forward: float, reverse: float, scale: float, limits: Agreement
+) -> NumberCheck:
     """The verdict on one number, and the sentences that go with it."""
-    center, guess = found.center, estimate(found, limits.eps)
+    center, guess = evaluations.center, estimate(evaluations, limits.eps)
     shown = guess or DerivativeEstimate(float("nan"), float("nan"), float("nan"), "")
     number = functools.partial(NumberCheck, name, center.x, forward, reverse, shown.value, shown.error, shown.step)
-    sides = [(side, usable(center, side)) for side in (found.below, found.above)]
+    sides = [(side, usable(center, side)) for side in (evaluations.below, evaluations.above)]
     ends = tuple(words.end(name, center, side[first - 1]) for side, first in sides if first)
     if any(len(side) - 2 < first and not side[first - 1].trouble for side, first in sides):
         return number("modes change", (*ends, words.modes_change(name)))
@@ -325,10 +327,10 @@ def _judge(name: str, found: Probe, forward: float, reverse: float, scale: float
     if guess.sides != "both":
         ends = (*ends, words.one_sided(name, guess))
     least = limits.rtol * limits.size / scale
-    corner = kink(found)
+    corner = kink(evaluations)
     if corner is not None and abs(corner[1] - corner[0]) > max(limits.rtol * max(map(abs, corner)), least):
         return number("kink", (words.kink(name, corner), *ends))
-    near = grazing(found, scale)
+    near = grazing(evaluations, scale)
     touch = () if near is None else (words.grazing(name, center.x, near),)
     part = words.parting(name, forward, reverse, guess, limits, scale)
     size = max(abs(forward), abs(reverse), abs(guess.value))

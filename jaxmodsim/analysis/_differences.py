@@ -111,22 +111,22 @@ def first_difference(one: History, other: History) -> int:
     return next((k for k, (a, b) in enumerate(pairs) if a != b), shorter)
 
 
-def estimate(found: Probe, eps: float) -> DerivativeEstimate | None:
+def estimate(evaluations: Probe, eps: float) -> DerivativeEstimate | None:
     """Derivative by Richardson's extrapolation of the pair of steps with the smallest estimated error.
 
     The error is that of the smaller step before it is extrapolated, plus the noise of the evaluations over that
     step. The noise is measured at the smallest steps, by what does not follow the powers of the step there.
     """
-    center, count = found.center, len(found.above)
-    below, above = usable(center, found.below), usable(center, found.above)
+    center, count = evaluations.center, len(evaluations.above)
+    below, above = usable(center, evaluations.below), usable(center, evaluations.above)
     bends = [0.0, 0.0]
     if max(below, above) <= count - 2:
         first, order, sides = max(below, above), 2, "both"
-        pairs = list(zip(found.below[first:], found.above[first:], strict=True))
+        pairs = list(zip(evaluations.below[first:], evaluations.above[first:], strict=True))
         bends = [(low.value + high.value - 2 * center.value) / 2 for low, high in pairs[-2:]]
     elif min(below, above) <= count - 2:
         first, order = min(below, above), 1
-        sides, side = ("below", found.below) if below < above else ("above", found.above)
+        sides, side = ("below", evaluations.below) if below < above else ("above", evaluations.above)
         pairs = [(center, s) for s in side[first:]]
     else:
         return None
@@ -136,46 +136,46 @@ def estimate(found: Probe, eps: float) -> DerivativeEstimate | None:
     noise = 4 * eps * abs(center.value) + abs(bends[1] - bends[0] / _RATIO**2)
     noise += steps[-1] * abs(changes[1] - changes[0] / _RATIO**order)
     best: DerivativeEstimate | None = None
-    found_smaller: list[tuple[float, float]] = []
+    smaller: list[tuple[float, float]] = []
     for j in range(len(pairs) - 1, 0, -1):
         change = (slopes[j] - slopes[j - 1]) / (_RATIO**order - 1)
         value, error = slopes[j] + change, abs(change) + noise / steps[j]
         # What smaller steps contradict, beyond their own errors, is wrong by as much.
-        error = max([error, *(abs(value - v) - e for v, e in found_smaller)])
-        found_smaller.append((value, error))
+        error = max([error, *(abs(value - v) - e for v, e in smaller)])
+        smaller.append((value, error))
         if best is None or error < best.error:
             best = DerivativeEstimate(value, error, steps[j], sides)
     return best
 
 
-def kink(found: Probe) -> tuple[float, float] | None:
+def kink(evaluations: Probe) -> tuple[float, float] | None:
     """Slopes below and above, where they differ by about the same at the three smallest steps."""
-    count, center = len(found.above), found.center
-    if max(usable(center, found.below), usable(center, found.above)) > count - 3:
+    count, center = len(evaluations.above), evaluations.center
+    if max(usable(center, evaluations.below), usable(center, evaluations.above)) > count - 3:
         return None
-    below = [(center.value - s.value) / (center.x - s.x) for s in found.below[-3:]]
-    above = [(s.value - center.value) / (s.x - center.x) for s in found.above[-3:]]
+    below = [(center.value - s.value) / (center.x - s.x) for s in evaluations.below[-3:]]
+    above = [(s.value - center.value) / (s.x - center.x) for s in evaluations.above[-3:]]
     gaps = [b - a for a, b in zip(below, above, strict=True)]
     if gaps[2] and _same(gaps[0], gaps[1]) and _same(gaps[1], gaps[2]):
         return below[2], above[2]
     return None
 
 
-def grazing(found: Probe, scale: float) -> Grazing | None:
+def grazing(evaluations: Probe, scale: float) -> Grazing | None:
     """The first event whose time bends as a square root does close to where it ends.
 
     If an event vanishes where the number p reaches c, its time goes as `t* - a sqrt(|p - c|)` near there, and
     `c = p + t'/(2 t'')`. Counted are events whose time moves (by more than a tenth of the time since the event before,
     per relative change of the number) and whose second difference is the same at two steps, so is no noise.
     """
-    center, count = found.center, len(found.above)
-    first = max(usable(center, found.below), usable(center, found.above))
+    center, count = evaluations.center, len(evaluations.above)
+    first = max(usable(center, evaluations.below), usable(center, evaluations.above))
     suspects = []
     for key, history in center.histories.items():
         lengths = np.diff(history.t, prepend=history.t0)
         before: np.ndarray | None = None
         for j in range(first, count):
-            low, high = found.below[j], found.above[j]
+            low, high = evaluations.below[j], evaluations.above[j]
             down = (history.t - low.histories[key].t) / (center.x - low.x) if len(history.t) else history.t
             up = (high.histories[key].t - history.t) / (high.x - center.x) if len(history.t) else history.t
             rate, bend = (up + down) / 2, (up - down) / ((high.x - low.x) / 2)

@@ -94,13 +94,13 @@ def formulations(scene: Scene, *, width: float, sigma0: float | None = None, sig
     def laws(scene: Scene) -> list[Any]:
         return [scene.effects[i].law for i in at]  # pyright: ignore[reportAttributeAccessIssue]
 
-    found = {
+    scenes = {
         "Regularized": eqx.tree_at(laws, scene, [Regularized(law, width) for law in laws(scene)]),
         "DeadZone": eqx.tree_at(laws, scene, [DeadZone(law, width) for law in laws(scene)]),
     }
     if sigma0 is not None:
-        found["LuGre"] = eqx.tree_at(laws, scene, [_bristle(law, width, sigma0, sigma1) for law in laws(scene)])
-    return found
+        scenes["LuGre"] = eqx.tree_at(laws, scene, [_bristle(law, width, sigma0, sigma1) for law in laws(scene)])
+    return scenes
 
 
 def _bristle(law: AbstractSetValuedLaw, width: float, sigma0: float, sigma1: float) -> LuGre:

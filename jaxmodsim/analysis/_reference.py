@@ -137,9 +137,9 @@ def converged(
     solvers: tuple[object, ...] = (Rodas5P(), dfx.Tsit5() if scene.event_driven or stiff else dfx.Dopri8())
     if closed is not None and not scene.event_driven and not question.values:
         solvers = solvers[:1]
-    found = [_tight(scene, question, solver, rtol) for solver in solvers]
+    solutions = [_tight(scene, question, solver, rtol) for solver in solvers]
     names = [f"{type(solver).__name__} at rtol = {rtol:.0e}" for solver in solvers]
-    ys = [y for y, _, _ in found]
+    ys = [y for y, _, _ in solutions]
     if closed is not None:
         if closed.size != ys[0].size:
             raise ValueError(
@@ -159,9 +159,9 @@ def converged(
             " allowed. End earlier if the motion is chaotic, ask for looser tolerances, pass a closed form as"
             " reference, or allow more by agreement."
         )
-    events, other = found[0][1], found[-1][1]
+    events, other = solutions[0][1], solutions[-1][1]
     times = None if events is None or other is None else event_error(events, other)
-    gradient, second = found[0][2], found[-1][2]
+    gradient, second = solutions[0][2], solutions[-1][2]
     return Converged(
         ys[0],
         events if times is not None else None,
@@ -189,6 +189,6 @@ def _tight(
     y, gradient = np.asarray(observed(question.observe(run))), None
     if question.values:
         x = {name: jnp.asarray(value, jnp.float64) for name, value in question.values.items()}
-        found = jax.jacfwd(question.last)(x, scene, start, setting, adjoint=dfx.ForwardMode(), **options)
-        gradient = {name: float(found[name]) for name in question.values}
+        derivatives = jax.jacfwd(question.last)(x, scene, start, setting, adjoint=dfx.ForwardMode(), **options)
+        gradient = {name: float(derivatives[name]) for name in question.values}
     return y, happened(run), gradient

@@ -89,8 +89,8 @@ def sensitivity(
     """Derivatives of what is observed along a run by numbers of its scene, exact, through all mode changes.
 
     ```python
-    found = jaxmodsim.sensitivity(scene, "q[0]", q0=[1.0], qd0=[0.0], t1=5.0, ts=jnp.linspace(0.0, 5.0, 101))
-    print(found)
+    result = jaxmodsim.sensitivity(scene, "q[0]", q0=[1.0], qd0=[0.0], t1=5.0, ts=jnp.linspace(0.0, 5.0, 101))
+    print(result)
     jaxmodsim.sensitivity(scene, lambda run: run.events.t[2], ("m", "friction.Fc"), q0=[1.0], qd0=[0.0], t1=5.0)
     ```
 
@@ -153,8 +153,8 @@ def sensitivity(
     normalised, remarks = _normalised(y, run, values, derivatives)
     sizes = {name: _rms(x) for name, x in normalised.items()}
     ranking = tuple(sorted(sizes.items(), key=lambda pair: -pair[1]))
-    ranges, found = scene_ranges(scene), elements(scene)
-    leaves = {name: found[name][0] for name in values if name in found}
+    ranges, places = scene_ranges(scene), elements(scene)
+    leaves = {name: places[name][0] for name in values if name in places}
     units = {name: ranges[leaf].unit for name, leaf in leaves.items() if leaf in ranges and ranges[leaf].unit}
     return Sensitivity(label, unit, run.t, y, values, units, derivatives, normalised, ranking, mode, remarks)
 

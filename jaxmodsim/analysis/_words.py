@@ -77,8 +77,8 @@ def parting(
     name: str, forward: float, reverse: float, guess: DerivativeEstimate, limits: Agreement, scale: float
 ) -> tuple[str, ...]:
     """Where the three derivatives differ, and by how much; empty if they agree."""
-    found = {"forward mode": forward, "reverse mode": reverse}
-    bad = [mode for mode, value in found.items() if not math.isfinite(value)]
+    derivatives = {"forward mode": forward, "reverse mode": reverse}
+    bad = [mode for mode, value in derivatives.items() if not math.isfinite(value)]
     if bad:
         return (
             f"{name}: {' and '.join(bad)} gives no finite derivative, the differences {guess.value:.7g}. Look for a"
@@ -93,7 +93,7 @@ def parting(
         )
     wrong = {
         mode: value
-        for mode, value in found.items()
+        for mode, value in derivatives.items()
         if abs(value - guess.value)
         > limits.rtol * (max(abs(value), abs(guess.value)) + _TINY * least) + 3 * guess.error
     }

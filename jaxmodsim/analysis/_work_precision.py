@@ -53,10 +53,10 @@ def work_precision(
 
     ```python
     problem = jaxmodsim.problems.named_problems()["lugre_box"]()
-    found = jaxmodsim.work_precision(**problem.arguments)
-    print(found)
-    found.cheapest(1e-6)
-    jaxmodsim.plot.work_precision_figure(found).savefig("lugre_box.png")
+    study = jaxmodsim.work_precision(**problem.arguments)
+    print(study)
+    study.cheapest(1e-6)
+    jaxmodsim.plot.work_precision_figure(study).savefig("lugre_box.png")
     ```
 
     **Reference.** Two solvers at a tolerance a thousand times tighter than the tightest asked for (1e-12 at the
@@ -256,9 +256,9 @@ def _measured(
 
     for cost in ("run", *(cost for cost in costs if cost != "run")):
         able = [i for i, one in enumerate(outcomes) if not any("failed" in report for report in one.reports.values())]
-        found = measure({str(i): partial(call, i, cost) for i in able}, rounds, limit_s)
+        reports = measure({str(i): partial(call, i, cost) for i in able}, rounds, limit_s)
         for i in able:
-            outcomes[i].reports[cost] = found[str(i)]
+            outcomes[i].reports[cost] = reports[str(i)]
     return outcomes
 
 

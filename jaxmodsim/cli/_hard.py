@@ -50,36 +50,36 @@ def report_hard(request: HardRequest) -> bool:
                     say(done)
         except KeyboardInterrupt:
             stopped = True
-    found = [verdicts[name] for name in cases if name in verdicts]
-    _report(found, request.out, whole=not request.names and not stopped)
+    reports = [verdicts[name] for name in cases if name in verdicts]
+    _report(reports, request.out, whole=not request.names and not stopped)
     if stopped:
-        raise Interrupted(f"interrupted; what was found on {len(found)} of {len(cases)} cases is written")
-    return all(verdict.ok for verdict in found)
+        raise Interrupted(f"interrupted; what was found on {len(reports)} of {len(cases)} cases is written")
+    return all(verdict.ok for verdict in reports)
 
 
-def _report(found: list[CaseReport], out: Path, *, whole: bool) -> None:
-    if not found:
+def _report(reports: list[CaseReport], out: Path, *, whole: bool) -> None:
+    if not reports:
         return
-    table = hard_table(found)
+    table = hard_table(reports)
     show_table(table.drop(columns="asked"), "Hard cases: errors in what is admissible, so that 1 is the limit")
     files: dict[str, Content] = {
         "hard.csv": table,
-        "hard.json": {verdict.case.name: _entry(verdict) for verdict in found},
-        "hard.png": hard_figure(found),
+        "hard.json": {verdict.case.name: _entry(verdict) for verdict in reports},
+        "hard.png": hard_figure(reports),
     }
     if whole:
         files["hard_steps.png"] = step_limits_figure()
     show_paths(write(out, files))
-    for verdict in found:
+    for verdict in reports:
         for finding in verdict.findings:
             if not finding.ok:
                 text = f"FAIL: {verdict.case.name}, {finding.transform}, {finding.dtype}: {finding.sentence}"
                 console.print(text, highlight=False, markup=False, soft_wrap=True)
-    passed = sum(verdict.ok for verdict in found)
-    console.print(f"{passed} of {len(found)} cases pass.")
+    passed = sum(verdict.ok for verdict in reports)
+    console.print(f"{passed} of {len(reports)} cases pass.")
 
 
-def hard_table(found: list[CaseReport]) -> pd.DataFrame:
+def hard_table(reports: list[CaseReport]) -> pd.DataFrame:
     """A row for each case: the worst errors of values, derivatives and energy, 1 being the limit."""
     return pd.DataFrame(
         [
@@ -94,7 +94,7 @@ def hard_table(found: list[CaseReport]) -> pd.DataFrame:
                 "asked": verdict.case.asks,
                 "verdict": "pass" if verdict.ok else "FAIL",
             }
-            for verdict in found
+            for verdict in reports
         ]
     )
 

@@ -114,9 +114,9 @@ def _mat(path: Path) -> dict[str, object]:
         last = reading.stderr.decode(errors="replace").strip().splitlines()[-1:]
         why = " ".join(last) if reading.returncode > 0 else "reading it ends the process that reads"
         raise ValueError(f"{path} is damaged or no MATLAB file: {why}")
-    with np.load(io.BytesIO(reading.stdout), allow_pickle=False) as found:
+    with np.load(io.BytesIO(reading.stdout), allow_pickle=False) as arrays:
         # MATLAB knows no vectors: a row or a column of a matrix is one.
-        vectors = {name[1:]: np.ravel(x) for name, x in found.items() if x.size == max(x.shape, default=0)}
+        vectors = {name[1:]: np.ravel(x) for name, x in arrays.items() if x.size == max(x.shape, default=0)}
     return {name: x for name, x in vectors.items() if not name.startswith("__")}
 
 
@@ -125,10 +125,10 @@ _HDF5 = 3
 _MAT = f"""
 import sys, numpy, scipy.io
 try:
-    found = scipy.io.loadmat(sys.argv[1])
+    arrays = scipy.io.loadmat(sys.argv[1])
 except NotImplementedError:
     sys.exit({_HDF5})
-kept = {{"_" + name: x for name, x in found.items() if getattr(getattr(x, "dtype", None), "kind", "O") in "biufcU"}}
+kept = {{"_" + name: x for name, x in arrays.items() if getattr(getattr(x, "dtype", None), "kind", "O") in "biufcU"}}
 numpy.savez(sys.stdout.buffer, **kept)
 """
 

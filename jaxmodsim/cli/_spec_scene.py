@@ -98,14 +98,14 @@ def _from_file(where: str, path: Path, name: str) -> Scene | Callable[..., objec
     """Run a Python file and take an object of it."""
     if not path.is_file():
         raise ValueError(f"{where}: file {str(path)!r} is not there; it is looked for beside the SPEC.")
-    found = importlib.util.spec_from_file_location(MODEL, path)
-    if found is None or found.loader is None:
+    spec = importlib.util.spec_from_file_location(MODEL, path)
+    if spec is None or spec.loader is None:
         raise ValueError(f"{where}: file must be a Python file, whose name ends in .py, but {path.name!r} was given.")
-    module = importlib.util.module_from_spec(found)
+    module = importlib.util.module_from_spec(spec)
     # Some decorators of classes look their module up.
     sys.modules[MODEL] = module
     try:
-        found.loader.exec_module(module)
+        spec.loader.exec_module(module)
     except Exception as error:  # whatever the file does
         raise ValueError(f"{where}: running {path.name} failed with {type(error).__name__}: {error}") from error
     objects = {

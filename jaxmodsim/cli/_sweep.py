@@ -63,8 +63,8 @@ def _line_of_model(error: Exception) -> str | None:
     """Where in the file of a SPEC an error comes from; None where it does not."""
     file = getattr(sys.modules.get(MODEL), "__file__", None)
     frames = traceback.extract_tb(error.__traceback__)
-    found = [frame for frame in frames if frame.filename == file]
-    return f"{Path(file).name}, line {found[-1].lineno}" if file is not None and found else None
+    in_model = [frame for frame in frames if frame.filename == file]
+    return f"{Path(file).name}, line {in_model[-1].lineno}" if file is not None and in_model else None
 
 
 def _check(request: SweepRequest) -> None:
@@ -98,7 +98,7 @@ def _run(request: SweepRequest, spec: Spec) -> None:
                     seen.append(now)
                     show(now)
 
-                found = sweep(
+                results = sweep(
                     spec.system,
                     spec.over,
                     spec.observe,
@@ -114,9 +114,9 @@ def _run(request: SweepRequest, spec: Spec) -> None:
                 f"interrupted; {seen[-1].done:,} of {seen[-1].total:,} runs are kept in {request.out}, and the same"
                 " command goes on with the others"
             ) from None
-    _show_summary(found, seen, time.perf_counter() - started, request.out)
+    _show_summary(results, seen, time.perf_counter() - started, request.out)
     if request.figure is not None:
-        figure = map2d(found, drawn, title=request.spec.stem)
+        figure = map2d(results, drawn, title=request.spec.stem)
         show_paths(write(request.figure.parent, {request.figure.name: figure}))
 
 
@@ -175,9 +175,9 @@ def _show_plan(laid: SweepPlan) -> None:
     say(f"{laid.runs:,} runs, in {laid.chunks:,} chunks of up to {laid.runs_per_chunk:,}; nothing was run.")
 
 
-def _show_summary(found: "xr.Dataset", seen: list[SweepProgress], seconds: float, out: Path) -> None:
-    codes, counts = np.unique(np.asarray(found["result"]), return_counts=True)
-    sentences = found["result"].attrs["flag_meanings"]
+def _show_summary(results: "xr.Dataset", seen: list[SweepProgress], seconds: float, out: Path) -> None:
+    codes, counts = np.unique(np.asarray(results["result"]), return_counts=True)
+    sentences = results["result"].attrs["flag_meanings"]
     rows = [(f"{n:,}", sentences[code]) for code, n in zip(codes, counts, strict=True)]
     show_table(pd.DataFrame(rows, columns=["runs", "how they ended"]), f"{seen[-1].total:,} runs")
     now = seen[-1].done - seen[0].done

@@ -80,12 +80,12 @@ class AbstractLaw(eqx.Module):
 
     def known_limitations(self) -> dict[str, str]:
         """Experiments that the law misses with these numbers, and why."""
-        found = dict(self.limitations)
+        limitations = dict(self.limitations)
         Fc, Fs = (nominal(getattr(self, name, None)) for name in ("Fc", "Fs"))
         if Fc is not None and (Fs is None or not bool((Fs > Fc).any())):
-            found = dict.fromkeys(("break-away", "lag", "stick-slip"), NO_STRIBECK_EFFECT) | found
+            limitations = dict.fromkeys(("break-away", "lag", "stick-slip"), NO_STRIBECK_EFFECT) | limitations
         passivity = self.passivity()
-        return found if passivity is None or passivity.ok else found | {"passivity": passivity.condition}
+        return limitations if passivity is None or passivity.ok else limitations | {"passivity": passivity.condition}
 
     def passivity(self) -> Passivity | None:
         """Whether the law is passive, from a closed form; None to have `check_passivity` search."""

@@ -19,8 +19,8 @@ def element_of(run: Trajectory, name: str) -> Friction:
     for known, effect in zip(run.scene.names, run.scene.effects, strict=True):
         if known == name and isinstance(effect, Friction):
             return effect
-    found = [x for x, effect in zip(run.scene.names, run.scene.effects, strict=True) if isinstance(effect, Friction)]
-    raise ValueError(f"The scene has no friction element {name!r}; there are: {', '.join(found) or 'none'}.")
+    elements = [x for x, effect in zip(run.scene.names, run.scene.effects, strict=True) if isinstance(effect, Friction)]
+    raise ValueError(f"The scene has no friction element {name!r}; there are: {', '.join(elements) or 'none'}.")
 
 
 def slip_of(run: Trajectory, name: str) -> tuple[Float[Array, " nodes"], Float[Array, "nodes ..."]]:

@@ -216,16 +216,16 @@ def _flags(values: "xr.DataArray") -> dict[int, str]:
 
 def _names(values: "xr.DataArray", there: np.ndarray, classes: Mapping[int, str] | None) -> dict[int, str] | None:
     """A name for each class of the variable; None where it has none."""
-    found = np.unique(there)
+    distinct = np.unique(there)
     named = dict(classes) if classes is not None else _flags(values)
     if named:
-        nameless = [f"{value:g}" for value in found if value not in named]
+        nameless = [f"{value:g}" for value in distinct if value not in named]
         if nameless:
             known = ", ".join(f"{value:g}" for value in named)
             raise ValueError(f"Only {known} of {values.name!r} have names, but there is also {nameless[0]}.")
         return named
-    few = 0 < found.size <= _FEW and bool((found == np.round(found)).all())
-    return {int(value): f"{value:g}" for value in found} if few else None
+    few = 0 < distinct.size <= _FEW and bool((distinct == np.round(distinct)).all())
+    return {int(value): f"{value:g}" for value in distinct} if few else None
 
 
 def _draw(axes: Axes, across: _Side, up: _Side, cells: np.ndarray, **style: Any) -> QuadMesh:

@@ -7,40 +7,40 @@ from ..analysis import Sensitivity
 from ._style import GREY
 
 
-def sensitivity_figure(found: Sensitivity, *, most: int = 8) -> Figure:
+def sensitivity_figure(sensitivity: Sensitivity, *, most: int = 8) -> Figure:
     """Normalised sensitivities along the run beside what is observed, and their ranking as bars.
 
     **Arguments:**
 
-    - `found`: from `jaxmodsim.sensitivity`. Where the observable is no function of time, the bars are all.
+    - `sensitivity`: from `jaxmodsim.sensitivity`. Where the observable is no function of time, the bars are all.
     - `most`: how many parameters are drawn, those that matter most.
     """
-    ranking = found.ranking[:most]
+    ranking = sensitivity.ranking[:most]
     colours = {name: f"C{i}" for i, (name, _) in enumerate(ranking)}
-    unit = f" [{found.unit}]" if found.unit else ""
+    unit = f" [{sensitivity.unit}]" if sensitivity.unit else ""
     height = 0.9 + 0.32 * len(ranking)
-    if found.over_time:
+    if sensitivity.over_time:
         figure = Figure(figsize=(10, 5.2 + height), layout="constrained")
         above, middle, below = figure.subplots(3, 1, height_ratios=(1.6, 3.2, height))
-        above.plot(found.t, found.observable, color=GREY, lw=1.6)
-        above.set(ylabel=f"{found.label}{unit}", title=f"Sensitivity of {found.label}")
+        above.plot(sensitivity.t, sensitivity.observable, color=GREY, lw=1.6)
+        above.set(ylabel=f"{sensitivity.label}{unit}", title=f"Sensitivity of {sensitivity.label}")
         above.tick_params(labelbottom=False)
         above.sharex(middle)
         for name, _ in ranking:
-            middle.plot(found.t, found.normalised[name], color=colours[name], lw=1.3, label=name)
+            middle.plot(sensitivity.t, sensitivity.normalised[name], color=colours[name], lw=1.3, label=name)
         middle.axhline(0.0, color=GREY, lw=0.6)
-        middle.set(xlabel="time [s]", ylabel=f"p d({found.label})/dp\nover its rms [1]")
+        middle.set(xlabel="time [s]", ylabel=f"p d({sensitivity.label})/dp\nover its rms [1]")
         middle.legend(fontsize=8, ncols=2)
     else:
         figure = Figure(figsize=(8, 0.4 + height), layout="constrained")
         below: Axes = figure.subplots()
-        below.set(title=f"Sensitivity of {found.label}")
+        below.set(title=f"Sensitivity of {sensitivity.label}")
     for i, (name, size) in enumerate(ranking):
         below.barh(i, size, color=colours[name])
         below.text(size, i, f" {size:.3g}", va="center", fontsize=8)
     below.set_yticks(
         range(len(ranking)),
-        [f"{n} = {found.values[n]:.4g} {found.units.get(n, '')}".rstrip() for n, _ in ranking],
+        [f"{n} = {sensitivity.values[n]:.4g} {sensitivity.units.get(n, '')}".rstrip() for n, _ in ranking],
     )
     below.margins(x=0.12)
     below.set(xlabel="rms of relative change of the observable per relative change of the parameter [1]")

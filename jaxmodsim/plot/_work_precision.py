@@ -16,7 +16,7 @@ _LABELS = {
 }
 
 
-def work_precision_figure(found: WorkPrecision, *, cost: str = "run") -> Figure:
+def work_precision_figure(study: WorkPrecision, *, cost: str = "run") -> Figure:
     """Time and evaluations of the field over the error: the lower left is the better place.
 
     Bars are quartiles. Where one method iterates, and its evaluations are not known, steps take their place. A
@@ -25,30 +25,30 @@ def work_precision_figure(found: WorkPrecision, *, cost: str = "run") -> Figure:
 
     **Arguments:**
 
-    - `found`: from `jaxmodsim.work_precision`.
+    - `study`: from `jaxmodsim.work_precision`.
     - `cost`: one of its `costs`.
 
     **Raises:**
 
     - `ValueError` if the cost was not measured.
     """
-    if cost not in found.costs:
-        raise ValueError(f"cost is {cost!r}, but measured were: {', '.join(found.costs)}.")
-    failures = _failures(found)
+    if cost not in study.costs:
+        raise ValueError(f"cost is {cost!r}, but measured were: {', '.join(study.costs)}.")
+    failures = _failures(study)
     height = 4.4 + 0.2 * len(failures)
     figure = Figure(figsize=(11.5, height), layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True)
-    counted = all(row.evaluations is not None for row in found.rows if not row.failed)
-    methods, handles = dict.fromkeys(row.method for row in found.rows), []
+    counted = all(row.evaluations is not None for row in study.rows if not row.failed)
+    methods, handles = dict.fromkeys(row.method for row in study.rows), []
     for i, method in enumerate(methods):
-        tried = [row for row in found.rows if row.method == method]
+        tried = [row for row in study.rows if row.method == method]
         rows = [row for row in tried if row.error is not None]
         label = method if len(rows) == len(tried) else f"{method} ({len(tried) - len(rows)} of {len(tried)} failed)"
         if not rows:
             handles += left.plot([], [], color=RED, marker="x", ls="", label=label)
             continue
         style = {"color": f"C{i}", "marker": _MARKERS[i % len(_MARKERS)], "ms": 6.0, "lw": 1.4}
-        errors = [_shown(row, found) for row in rows]
+        errors = [_shown(row, study) for row in rows]
         timings = [row.times[cost] for row in rows if row.times is not None]
         median = 1e3 * np.array([x.median for x in timings])
         bars = 1e3 * np.array([[x.median - x.low for x in timings], [x.high - x.median for x in timings]])
@@ -57,33 +57,33 @@ def work_precision_figure(found: WorkPrecision, *, cost: str = "run") -> Figure:
         right.plot(errors, [row.evaluations if counted else row.steps for row in rows], **style)
         _mark_model(left, right, rows, f"C{i}")
     for axes in (left, right):
-        axes.set(xscale="log", yscale="log", xlabel=f"error of {found.observable}, relative to {_scale(found)} [1]")
+        axes.set(xscale="log", yscale="log", xlabel=f"error of {study.observable}, relative to {_scale(study)} [1]")
         axes.grid(which="major", alpha=0.3)
-        _mark_floor(axes, found.disagreement)
-    left.set(ylabel=_LABELS[cost].format(batch=found.batch), title="Time: lower left is better")
+        _mark_floor(axes, study.disagreement)
+    left.set(ylabel=_LABELS[cost].format(batch=study.batch), title="Time: lower left is better")
     right.set(ylabel="evaluations of the field [1]" if counted else "steps [1]", title="Work")
-    if any(row.model for row in found.rows):
+    if any(row.model for row in study.rows):
         handles += left.plot([], [], color=GREY, ls=":", label="error of the model")
     figure.legend(handles=handles, fontsize=8, loc="outside right upper")
-    figure.suptitle(f"{found.problem}: {found.observable} {found.when}", fontsize=11)
+    figure.suptitle(f"{study.problem}: {study.observable} {study.when}", fontsize=11)
     if failures:
         figure.supxlabel("\n".join(failures), fontsize=7, color=RED, x=0.01, ha="left")
     return figure
 
 
-def _failures(found: WorkPrecision) -> list[str]:
+def _failures(study: WorkPrecision) -> list[str]:
     """A line for each failure, cut to the width of the figure."""
-    lines = [f"failed: {row.method}, {row.setting}: {row.failed}" for row in found.rows if row.failed]
+    lines = [f"failed: {row.method}, {row.setting}: {row.failed}" for row in study.rows if row.failed]
     return [line if len(line) <= 170 else f"{line[:167]}..." for line in lines]
 
 
-def _scale(found: WorkPrecision) -> str:
-    return with_unit(f"{found.scale:.3g}", found.unit).replace("[", "").replace("]", "")
+def _scale(study: WorkPrecision) -> str:
+    return with_unit(f"{study.scale:.3g}", study.unit).replace("[", "").replace("]", "")
 
 
-def _shown(row: Row, found: WorkPrecision) -> float:
+def _shown(row: Row, study: WorkPrecision) -> float:
     """The error, at the floor where the references cannot tell, and where it is zero at the rounding unit."""
-    return max(row.error or 0.0, found.disagreement, float(np.finfo(float).eps))
+    return max(row.error or 0.0, study.disagreement, float(np.finfo(float).eps))
 
 
 def _mark_model(left: Axes, right: Axes, rows: list[Row], color: str) -> None:

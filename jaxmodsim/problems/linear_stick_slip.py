@@ -250,7 +250,7 @@ class _Run:
         if before is not None:
             still |= before.stick | before.held
         choices = [(0, 1, -1) if s else (int(np.sign(v)),) for s, v in zip(still, slip, strict=True)]
-        best, found = (-1, -math.inf), None
+        best, chosen = (-1, -math.inf), None
         for sigma in sorted(product(*choices), key=lambda each: -each.count(0)):
             if sigma.count(0) < best[0]:
                 break
@@ -258,10 +258,10 @@ class _Run:
             if self.is_consistent(mode, x, still):
                 use = np.abs(mode.force @ x)[mode.stick] / self.system.Fs[mode.stick]
                 rank = (sigma.count(0), -float(use.max(initial=0.0)))
-                best, found = (rank, mode) if rank > best else (best, found)
-        if found is None:
+                best, chosen = (rank, mode) if rank > best else (best, chosen)
+        if chosen is None:
             raise ArithmeticError(f"No mode is consistent with the slip velocities {slip}.")
-        return found
+        return chosen
 
     def is_consistent(self, mode: _Mode, x: np.ndarray, still: np.ndarray) -> bool:
         """Whether forces in stick stay within their limits, and elements at rest start in their directions."""
@@ -328,20 +328,20 @@ class _Run:
 
     def earliest(self, mode: _Mode, x: np.ndarray, length: float) -> tuple[float, int] | None:
         """Time and element of the first event within a grid step; notes what comes near to one."""
-        series, found = mode.series(x), []
+        series, crossings = mode.series(x), []
         for row, i in zip(mode.guards, mode.of, strict=True):
             guard = series @ row
             level = self.system.Fs[i] if mode.stick[i] else self.still_slip[i] / _STILL
             s = _first_crossing(guard + np.eye(1, _TERMS)[0] * _ROUNDING * level, length)
             if s is not None:
-                found.append((s, int(i), row))
+                crossings.append((s, int(i), row))
                 continue
             values = polyval(np.linspace(0.0, length, _FINE + 1), guard)
             if 0 < np.argmin(values) < _FINE:
                 self.note_near(mode, int(i), float(values.min()))
-        if not found:
+        if not crossings:
             return None
-        s, i, row = min(found, key=lambda each: each[0])
+        s, i, row = min(crossings, key=lambda each: each[0])
         _, slope, bend, _ = mode.derivatives(row[None], polyval(s, series))[:, 0]
         if bend > 0:
             # How far the guard would go on to fall.

@@ -241,6 +241,6 @@ def forces(
         return jnp.linalg.solve(matrix, jnp.stack([jnp.asarray(x, angle.dtype) for x in rhs]))
 
     up, down = solve(1.0), solve(-1.0)
-    found = jnp.where(up[9] > 0, up, down)
-    qdd = jnp.concatenate([found[:3], jnp.zeros(1, found.dtype)])
-    return SliderCrankForces(qdd, found[3:5], found[5:7], found[7:9], found[9])
+    solution = jnp.where(up[9] > 0, up, down)
+    qdd = jnp.concatenate([solution[:3], jnp.zeros(1, solution.dtype)])
+    return SliderCrankForces(qdd, solution[3:5], solution[5:7], solution[7:9], solution[9])

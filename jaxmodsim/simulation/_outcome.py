@@ -86,7 +86,7 @@ class SimulationError(RuntimeError):
 class RunResult(eqx.Module):
     """How a run ended.
 
-    - `code`: 0 for a run that reached t1; an index into `messages` otherwise. Under `jax.vmap` one per lane.
+    - `code`: 0 for a run that reached t1; an index into `messages` otherwise. Under `jax.vmap` one per run.
     - `messages`: the sentence for each code.
     """
 

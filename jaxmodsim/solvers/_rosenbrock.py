@@ -158,7 +158,7 @@ def rosenbrock_step(
 
     A `RosenbrockStep`.
     """
-    # Under vmap and reverse mode, lanes that have finished make steps of length zero that nobody uses; 1/dt would make
+    # Under vmap and reverse mode, runs that have finished make steps of length zero that nobody uses; 1/dt would make
     # their derivatives NaN, and zero times NaN is NaN. A short step in its place keeps them finite.
     short = float(jnp.finfo(dt.dtype).eps) ** 0.5 * jnp.maximum(jnp.abs(t0), 1.0)
     dt = jnp.where(dt == 0, short, dt)

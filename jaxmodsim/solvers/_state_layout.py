@@ -62,7 +62,7 @@ class PolynomialInterpolation(dfx.AbstractLocalInterpolation):
         del left
         if t1 is not None:
             return jtu.tree_map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
-        # A step of length zero is one of a finished lane under vmap; see `rosenbrock_step`.
+        # A step of length zero is one of a finished run under vmap; see `rosenbrock_step`.
         length = self.t1 - self.t0
         s = (t0 - self.t0) / jnp.where(length == 0, 1.0, length)
 

@@ -60,17 +60,17 @@ def compute(work: Work, numbers: dict[str, np.ndarray], order: np.ndarray, devic
     with jax.enable_x64(work.x64):
         fixed = work.fixed if device is None else jax.device_put(work.fixed, device)
         first = work.run if work.cap is None else work.run.within(work.cap)
-        found = _in_groups(first, fixed, numbers, order, (_groups_of(order.size, work.group), work.group), device)
-        slow = np.flatnonzero(out_of_steps(found.code)) if work.cap is not None else np.zeros(0, int)
+        computed = _in_groups(first, fixed, numbers, order, (_groups_of(order.size, work.group), work.group), device)
+        slow = np.flatnonzero(out_of_steps(computed.code)) if work.cap is not None else np.zeros(0, int)
         if slow.size:
             shape = (1, _NARROW if work.group == GROUP else work.group)
             again = _in_groups(work.run, fixed, numbers, slow, shape, device)
-            for whole, part in zip(jtu.tree_leaves(found), jtu.tree_leaves(again), strict=True):
+            for whole, part in zip(jtu.tree_leaves(computed), jtu.tree_leaves(again), strict=True):
                 whole[slow] = part[slow]
-    failed = found.code != 0
-    for value in found.values.values():
+    failed = computed.code != 0
+    for value in computed.values.values():
         value[failed] = np.nan
-    return found
+    return computed
 
 
 def runs_per_call(runs: int, group: int) -> int:
@@ -93,7 +93,7 @@ def _in_groups(
 ) -> Computed:
     """Compute the chosen runs, in calls of compiled code for `shape` groups and runs each; the others stay empty."""
     runs, size = next(iter(numbers.values())).shape[0], shape[0] * shape[1]
-    found: Computed | None = None
+    computed: Computed | None = None
     for start in range(0, chosen.size, size):
         rows = chosen[start : start + size]
         # The last call is filled up by its last run.
@@ -102,14 +102,14 @@ def _in_groups(
         given = given if device is None else jax.device_put(given, device)
         part = _answer(run, fixed, given)
         code, steps, values = (jtu.tree_map(_flat, x) for x in (part.code, part.num_steps, part.values))
-        if found is None:
+        if computed is None:
             empty = partial(jtu.tree_map, lambda x: np.zeros((runs, *x.shape[1:]), x.dtype))
-            found = Computed(np.zeros(runs, np.int32), np.zeros(runs, np.int32), empty(values))
-        found.code[rows], found.num_steps[rows] = code[: rows.size], steps[: rows.size]
+            computed = Computed(np.zeros(runs, np.int32), np.zeros(runs, np.int32), empty(values))
+        computed.code[rows], computed.num_steps[rows] = code[: rows.size], steps[: rows.size]
         for name, x in values.items():
-            found.values[name][rows] = x[: rows.size]
-    assert found is not None
-    return found
+            computed.values[name][rows] = x[: rows.size]
+    assert computed is not None
+    return computed
 
 
 def _answer(run: AbstractRun, fixed: PyTree, given: PyTree) -> RunOutcome:
@@ -117,11 +117,11 @@ def _answer(run: AbstractRun, fixed: PyTree, given: PyTree) -> RunOutcome:
     try:
         return jax.block_until_ready(_call(run, fixed, given))
     except jax.errors.JaxRuntimeError as error:
-        found = re.search(r"_EquinoxRuntimeError: (.*)", str(error))
-        if found is None:
+        match = re.search(r"_EquinoxRuntimeError: (.*)", str(error))
+        if match is None:
             raise
         raise RuntimeError(
-            f"One of the runs raised an error, which ends all of them: {found[1]} Pass throw=False to simulate in the"
+            f"One of the runs raised an error, which ends all of them: {match[1]} Pass throw=False to simulate in the"
             " function that is swept, and return the run or what is known of it: a run that fails then stays alone."
         ) from error
 

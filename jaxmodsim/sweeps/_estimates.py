@@ -53,10 +53,10 @@ class SobolDesign:
         if y.size < 2 * self.block or constant(y):
             return _nothing(("S1", "ST"), d, samples)
         # SALib takes the seed 0 for none.
-        found = extra("SALib.analyze.sobol").analyze(
+        analysis = extra("SALib.analyze.sobol").analyze(
             _problem(d), y, calc_second_order=False, conf_level=self.confidence, seed=self.seed + 1
         )
-        indices, errors = ({x: found[f"{x}{of}"] for x in ("S1", "ST")} for of in ("", "_conf"))
+        indices, errors = ({x: analysis[f"{x}{of}"] for x in ("S1", "ST")} for of in ("", "_conf"))
         return Estimate(indices, errors, samples)
 
     def within(self, y: Float[np.ndarray, " runs"], use: Bool[np.ndarray, " runs"]) -> Estimate:
@@ -72,10 +72,10 @@ class SobolDesign:
         samples = np.full(d, float(use.sum()))
         if use.sum() < _LEAST_RUNS or constant(y[use]):
             return _nothing(("S1",), d, samples)
-        found = extra("SALib.analyze.rbd_fast").analyze(
+        analysis = extra("SALib.analyze.rbd_fast").analyze(
             _problem(d), self.points[use], y[use], conf_level=self.confidence, seed=self.seed
         )
-        return Estimate({"S1": np.asarray(found["S1"])}, {"S1": np.asarray(found["S1_conf"])}, samples)
+        return Estimate({"S1": np.asarray(analysis["S1"])}, {"S1": np.asarray(analysis["S1_conf"])}, samples)
 
 
 @dataclass(frozen=True)

@@ -50,23 +50,23 @@ class GlobalSensitivity:
 
     def groups(self) -> dict[tuple[str, str], Estimate]:
         """All indices by observable and runs, in the order of the table; of membership the observable is "motion"."""
-        groups = {(name, "all runs"): found for name, found in self.overall.items()}
-        groups |= {("motion", f"is {kind!r}"): found for kind, found in self.membership.items()}
+        groups = {(name, "all runs"): estimate for name, estimate in self.overall.items()}
+        groups |= {("motion", f"is {kind!r}"): estimate for kind, estimate in self.membership.items()}
         for kind, each in self.within.items():
-            groups |= {(name, f"within {kind!r}"): found for name, found in each.items()}
+            groups |= {(name, f"within {kind!r}"): estimate for name, estimate in each.items()}
         return groups
 
     def table(self) -> "pd.DataFrame":
         """A row for each observable, group of runs and parameter; half widths of intervals in columns `_conf`."""
         rows = []
-        for (name, runs), found in self.groups().items():
+        for (name, runs), estimate in self.groups().items():
             for j, parameter in enumerate(self.names):
                 row: dict[str, object] = {"observable": name, "runs": runs, "parameter": parameter}
-                for index, values in found.indices.items():
+                for index, values in estimate.indices.items():
                     row[index] = float(values[j])
-                    if index in found.errors:
-                        row[f"{index}_conf"] = float(found.errors[index][j])
-                rows.append(row | {"samples": int(found.samples[j])})
+                    if index in estimate.errors:
+                        row[f"{index}_conf"] = float(estimate.errors[index][j])
+                rows.append(row | {"samples": int(estimate.samples[j])})
         return extra("pandas").DataFrame(rows)
 
     def __str__(self) -> str:
@@ -77,27 +77,27 @@ class GlobalSensitivity:
         if self.shares:
             lines.append("motion: " + ", ".join(f"{kind} {100 * share:.0f} %" for kind, share in self.shares.items()))
         width = max(map(len, self.names))
-        for (name, runs), found in self.groups().items():
-            lines += ["", *self._block(name, runs, found, width)]
+        for (name, runs), estimate in self.groups().items():
+            lines += ["", *self._block(name, runs, estimate, width)]
         if self.crossings is not None:
             steps = (f"{name} {100 * x:.0f} %" for name, x in zip(self.names, self.crossings, strict=True))
             lines += ["", "steps into another class: " + ", ".join(steps)]
         return "\n".join([*lines, *(f"- {remark}" for remark in self.remarks)])
 
-    def _block(self, name: str, runs: str, found: Estimate, width: int) -> list[str]:
+    def _block(self, name: str, runs: str, estimate: Estimate, width: int) -> list[str]:
         unit = self.units.get(name, "")
-        unit = f" [{unit}]" if unit and "mu_star" in found.indices else ""
+        unit = f" [{unit}]" if unit and "mu_star" in estimate.indices else ""
         samples = "effects each" if self.method == "morris" else "runs"
-        low, high = int(found.samples.min()), int(found.samples.max())
+        low, high = int(estimate.samples.min()), int(estimate.samples.max())
         count = f"{low}" if low == high else f"{low} to {high}"
         lines = [f"{name}{unit}, {runs} ({count} {samples})"]
-        if all(np.isnan(x).all() for x in found.indices.values()):
+        if all(np.isnan(x).all() for x in estimate.indices.values()):
             return [f"{lines[0]}: no indices"]
-        lines.append(" " * width + "".join(f"  {index:>21}" for index in found.indices))
+        lines.append(" " * width + "".join(f"  {index:>21}" for index in estimate.indices))
         for j, parameter in enumerate(self.names):
             cells = []
-            for index, values in found.indices.items():
-                error = f" +- {found.errors[index][j]:8.2g}" if index in found.errors else ""
+            for index, values in estimate.indices.items():
+                error = f" +- {estimate.errors[index][j]:8.2g}" if index in estimate.errors else ""
                 cells.append(f"  {f'{values[j]:.3g}{error}':>21}")
             lines.append(f"{parameter:{width}}{''.join(cells)}")
         return lines

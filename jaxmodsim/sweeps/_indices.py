@@ -52,13 +52,13 @@ def global_sensitivity(
     """Which parameters matter over their whole ranges, for each kind of motion apart.
 
     ```python
-    found = sweeps.global_sensitivity(
+    result = sweeps.global_sensitivity(
         scene,
         {"period": metrics.period(), "peak": metrics.peak("friction")},
         {"friction.Fs": (5.0, 9.0), "k": (50.0, 200.0, "log")},
         q0=[0.0], qd0=[0.1], t1=10.0, ts=jnp.linspace(0.0, 10.0, 201), max_events=64,
     )
-    print(found)
+    print(result)
     ```
 
     **Sobol' indices** (`method="sobol"`) share out the variance of an observable: `S1` goes with one parameter alone,
@@ -186,10 +186,10 @@ def _check_losses(runs: "xr.Dataset", ok: np.ndarray, use: np.ndarray) -> None:
 def _classes(labels: np.ndarray, use: np.ndarray, describe: Callable[[object], str] | None, by: str) -> _Classes:
     if not np.isfinite(labels[use]).all():
         raise ValueError(f"by={by!r} is not a number in some runs: it must say a class for each.")
-    found, counts = np.unique(labels[use], return_counts=True)
+    values, counts = np.unique(labels[use], return_counts=True)
     order = np.argsort(-counts, kind="stable")
-    names = {float(x): f"{by} = {x:g}" if describe is None else describe(x) for x in found}
-    return _Classes(labels, names, {float(found[i]): float(counts[i] / use.sum()) for i in order})
+    names = {float(x): f"{by} = {x:g}" if describe is None else describe(x) for x in values}
+    return _Classes(labels, names, {float(values[i]): float(counts[i] / use.sum()) for i in order})
 
 
 def _result(

@@ -70,17 +70,17 @@ def solver_of(request: Request) -> str:
 
 def differences(then: dict[str, object], now: dict[str, object]) -> list[str]:
     """What is not the same in two provenances, in words."""
-    found = []
+    texts = []
     for part in [*then, *(name for name in now if name not in then)]:
         old, new = then.get(part), now.get(part)
         if isinstance(old, dict) and isinstance(new, dict):
             for name in [*old, *(name for name in new if name not in old)]:
                 if old.get(name) != new.get(name):
-                    found.append(f"{part}: {name} was {old.get(name, 'not there')}, is {new.get(name, 'not there')}")
+                    texts.append(f"{part}: {name} was {old.get(name, 'not there')}, is {new.get(name, 'not there')}")
         elif old != new:
             what = "the code of the scene, the observables, or this library" if part == "program" else None
-            found.append(f"{what} has changed" if what else f"{part} was {old}, is {new}")
-    return found
+            texts.append(f"{what} has changed" if what else f"{part} was {old}, is {new}")
+    return texts
 
 
 def _called(function: object) -> str:

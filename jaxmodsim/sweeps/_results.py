@@ -123,8 +123,8 @@ class Store(AbstractResults):
 
     def dataset(self) -> "xr.Dataset":
         """All results, read when they are asked for."""
-        found = extra("xarray").open_zarr(self._path, consolidated=False, chunks=None)
-        return found[[x.name for x in self._layout.variables]]  # a store keeps no order
+        stored = extra("xarray").open_zarr(self._path, consolidated=False, chunks=None)
+        return stored[[x.name for x in self._layout.variables]]  # a store keeps no order
 
 
 def parts(layout: ResultLayout, blocks: Blocks, block: int, computed: Computed) -> Iterator[tuple[str, np.ndarray]]:
@@ -145,10 +145,10 @@ def _check_same(path: Path, provenance: dict[str, object]) -> None:
         raise ValueError(
             f"{path} exists and is no store of a sweep ({type(error).__name__}): name another one, or remove it."
         ) from error
-    found = differences(then, provenance)
-    if found:
+    changes = differences(then, provenance)
+    if changes:
         raise ValueError(
-            f"{path} holds the results of another sweep: {'; '.join(found)}. Name another store, or remove this one."
+            f"{path} holds the results of another sweep: {'; '.join(changes)}. Name another store, or remove this one."
         )
 
 

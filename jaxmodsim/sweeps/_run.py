@@ -80,8 +80,8 @@ class SceneRun(AbstractRun):
 
         if not wrt:
             return at({})[1]
-        slopes, found = jax.jacfwd(at, has_aux=True)({name: number_of(scene, arguments, name) for name in wrt})
-        return eqx.tree_at(lambda x: x.values, found, self._with_derivatives(found.values, slopes))
+        slopes, outcome = jax.jacfwd(at, has_aux=True)({name: number_of(scene, arguments, name) for name in wrt})
+        return eqx.tree_at(lambda x: x.values, outcome, self._with_derivatives(outcome.values, slopes))
 
     def _with_derivatives(self, values: dict[str, Array], slopes: dict[str, dict[str, Array]]) -> dict[str, Array]:
         chosen = dict(values)

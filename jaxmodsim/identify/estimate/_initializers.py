@@ -120,20 +120,20 @@ def side_by_side(
 ) -> SearchState:
     """Go on with many searches, for at most so many evaluations each; Ctrl-C ends all with the best so far.
 
-    Lanes go in groups of one size, shared out among threads, one for each core: a compiled loop over small states uses
+    They go in groups of one size, shared out among threads, one for each core: a compiled loop over small states uses
     one core, and groups of one size compile once.
 
     **Arguments:**
 
-    - `axes`: which numbers of the problem differ from lane to lane, as for `equinox.filter_vmap`; None for none.
-    - `search`: with a leading axis of lanes.
+    - `axes`: which numbers of the problem differ from search to search, as for `equinox.filter_vmap`; None for none.
+    - `state`: with a leading axis of searches.
     """
-    lanes = state.x.shape[0]
+    searches = state.x.shape[0]
     rtol = jnp.asarray(options.rtol, state.x.dtype)
     problems, states = [], []
-    for first in range(0, lanes, _GROUP):
-        rows = jnp.minimum(jnp.arange(first, first + _GROUP), lanes - 1)
-        problems.append(problem if axes is None else chosen_lanes(problem, axes, rows))
+    for first in range(0, searches, _GROUP):
+        rows = jnp.minimum(jnp.arange(first, first + _GROUP), searches - 1)
+        problems.append(problem if axes is None else problem_at(problem, axes, rows))
         states.append(jtu.tree_map(lambda x, rows=rows: x[rows], state))
     stopped = threading.Event()
 
@@ -151,16 +151,16 @@ def side_by_side(
             stopped.set()
             if not np.isfinite(np.concatenate([np.asarray(each.cost) for each in states])).any():
                 raise
-    return jtu.tree_map(lambda *x: jnp.concatenate(x)[:lanes], *states)
+    return jtu.tree_map(lambda *x: jnp.concatenate(x)[:searches], *states)
 
 
-def starts_of(problem: FitProblem, x: Float[Array, "lanes n"]) -> SearchState:
+def starts_of(problem: FitProblem, x: Float[Array, "starts n"]) -> SearchState:
     """Searches that start at the rows of `x`."""
     return eqx.filter_vmap(lambda x: start_search(x, problem.rows))(x)
 
 
-def chosen_lanes(problem: FitProblem, axes: PyTree[int | None], rows: Array | int) -> FitProblem:
-    """The problem of some of the lanes, or of one."""
+def problem_at(problem: FitProblem, axes: PyTree[int | None], rows: Array | int) -> FitProblem:
+    """The problem of some of the searches, or of one."""
     return jtu.tree_map(
         lambda axis, leaf: leaf if axis is None else leaf[rows], axes, problem, is_leaf=lambda x: x is None
     )

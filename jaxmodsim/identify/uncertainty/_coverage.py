@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..estimate._initializers import AbstractInitializer, chosen_lanes, run_initializers, side_by_side, starts_of
+from ..estimate._initializers import AbstractInitializer, problem_at, run_initializers, side_by_side, starts_of
 from ..estimate._problem import FitProblem
 from ..estimate._search import SearchOptions, SearchState
 from ._estimate import covariance_inside, interval, sample_blocks
@@ -90,7 +90,7 @@ def coverage(
     truth = np.asarray(problem.runs.measured[name]) + float(problem.noise[name]) * seen
     noise = float(problem.noise[name]) * _correlated(rng.standard_normal((repeats, *truth.shape)), memory)
     several = eqx.tree_at(lambda p: p.runs.measured[name], problem, jnp.asarray(truth + noise))
-    # A problem with nothing but the measured samples different from lane to lane.
+    # A problem with nothing but the measured samples different from repeat to repeat.
     axes = eqx.tree_at(
         lambda p: p.runs.measured[name], jtu.tree_map(lambda _: None, problem), 0, is_leaf=lambda x: x is None
     )
@@ -128,7 +128,7 @@ def _correlated(white: np.ndarray, memory: float) -> np.ndarray:
 
 
 def _estimates(problem: FitProblem, axes: FitProblem, state: SearchState) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters and standard errors of every lane, shape `[lanes, free]`."""
+    """Parameters and standard errors of every repeat, shape `[repeats, free]`."""
     blocks, count = sample_blocks(problem)
 
     @eqx.filter_jit
@@ -139,7 +139,7 @@ def _estimates(problem: FitProblem, axes: FitProblem, state: SearchState) -> tup
 
     values, errors = [], []
     for i in range(state.x.shape[0]):
-        value, error = estimate(chosen_lanes(problem, axes, i), jtu.tree_map(lambda x, i=i: x[i], state), blocks)
+        value, error = estimate(problem_at(problem, axes, i), jtu.tree_map(lambda x, i=i: x[i], state), blocks)
         values.append(np.asarray(value))
         errors.append(np.asarray(error))
     return np.stack(values), np.stack(errors)

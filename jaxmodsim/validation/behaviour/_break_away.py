@@ -16,18 +16,18 @@ _LOAD, _SLIDES = 1.7 * FS, 10.0 * VS
 def _measure(case: LawCase) -> LawMeasurement:
     """Pull a mass harder and harder; the largest friction before it slides, at slow and at fast rates."""
     z0 = after_slip(case)
-    found = []
+    forces = []
     for rate in RATES:
         run = move(case, _LOAD / rate, z0=z0, ramp=float(rate), dtmax=0.01 * _LOAD / rate)
         slides = run.v > _SLIDES
         end = int(np.argmax(slides)) if slides.any() else run.v.size
-        found.append(float(np.max(run.friction[: max(end, 1)])))
-    lines = (FigureLine("", RATES, np.asarray(found)),)
-    if found[0] < 0.1 * FC:
+        forces.append(float(np.max(run.friction[: max(end, 1)])))
+    lines = (FigureLine("", RATES, np.asarray(forces)),)
+    if forces[0] < 0.1 * FC:
         return LawMeasurement(float("nan"), "Nothing sticks, so nothing breaks away.", lines)
     return LawMeasurement(
-        (found[0] - found[-1]) / found[0],
-        f"Breaks away at {found[0]:.3g} N under {RATES[0]:g} N/s and at {found[-1]:.3g} N under {RATES[-1]:g} N/s.",
+        (forces[0] - forces[-1]) / forces[0],
+        f"Breaks away at {forces[0]:.3g} N under {RATES[0]:g} N/s and at {forces[-1]:.3g} N under {RATES[-1]:g} N/s.",
         lines,
     )
 

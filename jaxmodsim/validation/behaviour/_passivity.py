@@ -76,8 +76,8 @@ def _measure(case: LawCase) -> LawMeasurement:
     families = {"sines": sines(), "random": random_cycles(), "pulses": pulses()}
     lines, least = [], {}
     for family, cycles in families.items():
-        found = [balance(case, cycle) for cycle in cycles]
-        share, taken = min(found, key=lambda each: each[0])
+        balances = [balance(case, cycle) for cycle in cycles]
+        share, taken = min(balances, key=lambda each: each[0])
         least[family] = share
         lines.append(FigureLine(family, np.linspace(0.0, 1.0, taken.size), taken))
     return LawMeasurement(

@@ -242,20 +242,20 @@ class _Trial:
         numbers = jnp.stack([self.x, jnp.full_like(self.x, jnp.nan), self.x])
         answers = _vmap(self.task, numbers)
         first, sick, last = (Answer(answers.code[i], answers.value[i]) for i in range(3))
-        found, other = (self.finding("vmap", each) for each in (first, last))
+        finding, other = (self.finding("vmap", each) for each in (first, last))
         if isinstance(self.task, SceneTask) and int(sick.code) == 0:
             return CheckFinding(
-                "vmap", self.dtype, found.error, False, "A run whose number is NaN says that all is well."
+                "vmap", self.dtype, finding.error, False, "A run whose number is NaN says that all is well."
             )
-        # Rounding may differ between the lanes of the processor's vectors: the two differ then, but both are right.
-        return found if other.ok else other
+        # Rounding may differ between the entries of the processor's vectors: the two differ then, but both are right.
+        return finding if other.ok else other
 
     def derivative(self, transform: str) -> CheckFinding:
         """A derivative, compared."""
         answer, slope = (_forward if transform == "forward" else _reverse)(self.task, self.x)
-        found, slope = self.finding(transform, answer), float(slope)
-        if not found.ok or self.gives_up(answer):
-            return found
+        finding, slope = self.finding(transform, answer), float(slope)
+        if not finding.ok or self.gives_up(answer):
+            return finding
         if not math.isfinite(slope):
             return CheckFinding(transform, self.dtype, math.inf, False, f"The derivative is {slope}.")
         if self.case.undefined:
@@ -281,9 +281,9 @@ class _Trial:
             return CheckFinding(
                 transform, self.dtype, math.nan, True, f"{slope:.9g}, and there is none: {self.case.undefined}"
             )
-        found = _watched(self.task)
-        sentence = f"check_gradients says: {found}"
-        return CheckFinding(transform, self.dtype, math.nan, found != "agree", sentence)
+        verdict = _watched(self.task)
+        sentence = f"check_gradients says: {verdict}"
+        return CheckFinding(transform, self.dtype, math.nan, verdict != "agree", sentence)
 
     def energy(self) -> CheckFinding:
         """The energy balance at the end, relative to the largest energy there is."""

@@ -214,7 +214,7 @@ def _cycles() -> list[HardCase]:
             # Times of 1e5 s are known to 8 ms in float32.
             single=None,
             skips={
-                "vmap": "as alone, and it takes as long for every lane",
+                "vmap": "as alone, and it takes as long for every run",
                 "reverse": "checkpoints of 2e6 steps take minutes; `forward` has the same saltation matrices",
                 "energy": "sums over 1e5 cycles; audited on one cycle elsewhere",
             },

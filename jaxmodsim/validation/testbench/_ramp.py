@@ -174,8 +174,8 @@ def stick_sweep() -> dict[str, np.ndarray]:
         return run.q[300, 0], run.qd[-1, 0], run.stats["num_steps"], gap, run.result.ok
 
     grid = jax.jit(jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(0, None)))
-    found = grid(jnp.asarray(SIGMA0), jnp.asarray(SIGMA1))
-    creep, speed, steps, gap, ok = (np.asarray(x) for x in found)
+    results = grid(jnp.asarray(SIGMA0), jnp.asarray(SIGMA1))
+    creep, speed, steps, gap, ok = (np.asarray(x) for x in results)
     if not ok.all():
         raise RuntimeError("A run of the LuGre sweep ended early.")
     return {
