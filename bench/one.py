@@ -6,16 +6,13 @@ python -m bench.one NAME OUT [--smoke]
 import importlib
 import os
 import sys
-from importlib.metadata import version
 from pathlib import Path
 
 
 def main(name: str, out: Path, *, smoke: bool) -> None:
     """Run it with the settings that all share: tuned for the CPU if the case does not say otherwise, and in float64."""
-    if smoke:  # times mean nothing: programs are compiled in the quickest way, by options of XLA where they are known
+    if smoke:  # times mean nothing: programs are compiled in the quickest way
         os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
-        if version("jaxlib").startswith("0.10."):
-            os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
     import jax
     import matplotlib as mpl
 
@@ -40,9 +37,9 @@ def main(name: str, out: Path, *, smoke: bool) -> None:
     if result is None:
         return
     result.write(out, smoke=smoke)
-    found = Recorded.read(out / f"{name}.json")
-    print(report(found))
-    figures.write(found, out)
+    recorded = Recorded.read(out / f"{name}.json")
+    print(report(recorded))
+    figures.write(recorded, out)
 
 
 if __name__ == "__main__":

@@ -44,9 +44,8 @@ def _size(n: int, result: Result, smoke: bool) -> None:
     many, single, batches = (8, 20, 2) if smoke else (1024, max(200, 4000 // n), max(2, 32 // n))
     rng, numbers = np.random.default_rng(20240229), chain_numbers(n)
     q, qd = rng.uniform(-1.0, 1.0, (many, n)), rng.uniform(-1.0, 1.0, (many, n))
-    exact = np.asarray(
-        jax.vmap(_arrays, (0, 0, None))(jnp.asarray(q), jnp.asarray(qd), n_link_pendulum.scene(n, **numbers))
-    )
+    scene = n_link_pendulum.scene(n, **numbers)
+    exact = np.asarray(jax.vmap(_arrays, (0, 0, None))(jnp.asarray(q), jnp.asarray(qd), scene))
     makers: dict[str, Any] = {
         OURS: lambda: _compiled(_ours, n, q, qd, single, batches),
         HAND[0]: lambda: _compiled(_arrays, n, q, qd, single, batches),
