@@ -107,7 +107,7 @@ class StoredSteps(dfx.AbstractAdjoint):
         subs = [sub for sub in jtu.tree_leaves(saveat.subs, is_leaf=_is_sub) if _is_sub(sub)]
         fns = [eqx.filter_closure_convert(lambda t, y, fn=sub.fn: fn(t, y, args), t0, y0) for sub in subs]
         inputs = StepInputs(traced, fns, [sub.ts for sub in subs], t0, t1, y0, begin.solver_state)
-        stripped = eqx.tree_at(lambda s: (s.y, s.solver_state), begin, (None, None), is_leaf=lambda x: x is None)
+        stripped = eqx.tree_at(lambda s: (s.y, s.solver_state), begin, (None, None), is_leaf=is_none)
         fixed = _Fixed(
             stepsize_controller,
             saveat,
@@ -235,9 +235,7 @@ def _solve(inputs: StepInputs, fixed: _Fixed, keeps: bool) -> PyTree:
         fn, times = next(each)
         return dfx.SubSaveAt(t0=sub.t0, t1=sub.t1, ts=times, steps=sub.steps, fn=lambda t, y, _: fn(t, y))
 
-    state = eqx.tree_at(
-        lambda s: (s.y, s.solver_state), fixed.state, (inputs.y0, inputs.solver_state), is_leaf=lambda x: x is None
-    )
+    state = eqx.tree_at(lambda s: (s.y, s.solver_state), fixed.state, (inputs.y0, inputs.solver_state), is_leaf=is_none)
     saveat = eqx.tree_at(lambda s: s.subs, fixed.saveat, jtu.tree_map(put, fixed.saveat.subs, is_leaf=_is_sub))
     final, _ = fixed.loop(
         args=fixed.args,
@@ -274,7 +272,7 @@ def _aval(tree: PyTree) -> PyTree:
 
 def _array(x: PyTree) -> PyTree:
     """Constants of a program come in other forms, too."""
-    return x if isinstance(x, UndefinedPrimal | jax.Array) else jnp.asarray(x)
+    return x if _is_asked(x) or isinstance(x, jax.Array) else jnp.asarray(x)
 
 
 def _primitive(name: str, fn: _Fn, jvp: _Fn, transpose: _Fn) -> Primitive:
@@ -310,7 +308,7 @@ def _make_jvp(primals: PyTree, tangents: PyTree) -> PyTree:
 
     def saved(state: PyTree) -> PyTree:
         ys, ts = next(saves)
-        return eqx.tree_at(lambda s: (s.ys, s.ts), _none(state), (ys, ts), is_leaf=lambda x: x is None)
+        return eqx.tree_at(lambda s: (s.ys, s.ts), _none(state), (ys, ts), is_leaf=is_none)
 
     t_final = eqx.tree_at(
         lambda s: (s.y, s.solver_state, s.save_state, s.dense_infos),
@@ -321,7 +319,7 @@ def _make_jvp(primals: PyTree, tangents: PyTree) -> PyTree:
             jtu.tree_map(saved, final.save_state, is_leaf=is_save_state),
             change.dense_infos,
         ),
-        is_leaf=lambda x: x is None,
+        is_leaf=is_none,
     )
     if not keeps:
         return final, t_final
@@ -347,13 +345,16 @@ def _change_jvp(primals: PyTree, tangents: PyTree) -> PyTree:
     return eqx.filter_jvp(lambda by, run: _change(by, run, keeps), (by, run), tangents[:2])
 
 
+def _is_asked(x: object) -> bool:
+    """Whether JAX asks for the cotangent of this input."""
+    return isinstance(x, UndefinedPrimal)
+
+
 def _change_transpose(inputs: PyTree, cts: RunTangents) -> PyTree:
     by, run, keeps = inputs
     if keeps:
         raise RuntimeError(_TWICE)
-    by = jtu.tree_map(
-        lambda x: isinstance(x, UndefinedPrimal) or None, by, is_leaf=lambda x: isinstance(x, UndefinedPrimal)
-    )
+    by = jtu.tree_map(lambda x: _is_asked(x) or None, by, is_leaf=_is_asked)
     return _once(ReverseOverSteps(by, run, cts).result()), _none(run), None
 
 
