@@ -75,6 +75,29 @@ def _accelerations(r: Recorded) -> list[tuple[str, str, float]]:
     return hand + [(f"time of MuJoCo, n = {n}, many", "< 1", ratio(n, "many", "MuJoCo")) for n in sizes if int(n) <= 6]
 
 
+def _first_calls(r: Recorded) -> list[tuple[str, str, float]]:
+    viscous, six = r.number("first run", case="two viscous joints"), "six LuGre joints"
+    scenes = ("LuGre box", "Coulomb belt", "two LuGre joints", "two Coulomb joints", "three LuGre joints")
+    asked = {"first run": (0.8, 1, 1.5, 2, 1.5), "first gradient": (2, 3, 4, 6, 5)}
+
+    def runs(way: str, name: str) -> float:
+        return r.number(way, case=name) / r.number("run", case=name)
+
+    return [
+        *(
+            (f"{way}, in first runs of two viscous joints: {name}", f"<= {most}", r.number(way, case=name) / viscous)
+            for way, limits in asked.items()
+            for name, most in zip(scenes, limits, strict=True)
+        ),
+        *((f"reverse gradient in runs: {name}", "<= 3", runs("gradient", name)) for name in scenes[:3]),
+        *((f"forward Jacobian in runs: {name}", "<= 2.5", runs("jacobian", name)) for name in scenes[:3]),
+        (f"step of the default solver in steps of Tsit5: {six}", "<= 4",
+         r.number("step of run", case=six) / r.number("step of run by Tsit5", case=six)),
+        (f"first run [s]: {six}", "<= 6", r.number("first run", case=six)),
+        (f"first gradient [s]: {six}", "<= 20", r.number("first gradient", case=six)),
+    ]  # fmt: skip
+
+
 def _sweep(r: Recorded) -> list[tuple[str, str, float]]:
     ours, kills, count = r.number("run", at=SWEEP), r.settings.get("kills", 0), r.settings["many"]
     processes = next(iter(r.all_of("run", "at", peer=CVODES)), "")
@@ -98,6 +121,18 @@ REPORTS = {
     "lugre_work_precision": Report(
         "LuGre's test bench: time against error, tolerance by tolerance.", "accuracy",
         (Table("Time of one run at each rtol, medians.", ("run",), ("at",), ("peer",)),),
+    ),
+    "first_calls": Report(
+        "What the first call of a scene costs, and its derivatives.", "speed",
+        (
+            Table(
+                "First calls, traced and compiled, in processor time; warm calls of jitted functions, medians. Runs"
+                " with {samples} saved times, derivatives by six numbers (belt: five), with `jaxmodsim.tune_cpu()`.",
+                ("first run", "first gradient", "first jacobian", "steps of run", "run", "gradient", "jacobian"),
+                ("case",),
+            ),
+            Targets("Targets on first calls and derivatives.", _first_calls),
+        ),
     ),
     "pulled_spring": Report(
         "LuGre's law of 1995, pulled through a spring: error against steps, time of a run.", "speed",
