@@ -20,5 +20,6 @@ from ._signal import sample_times as sample_times
 from ._signal import signals_of as signals_of
 from .forces._applied_force import AppliedForce as AppliedForce
 from .forces._effect import AbstractEffect as AbstractEffect
+from .forces._effect import Action as Action
 from .forces._effect import Power as Power
 from .forces._friction import Friction as Friction
