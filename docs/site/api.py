@@ -26,8 +26,34 @@ def page(room: str) -> str:
     summary = ast.get_docstring(ast.parse((PACKAGE / room / "__init__.py").read_text()))
     lines = [f"# {room}", "", summary or "", ""]
     for name in public_names(room):
-        lines += [f"::: {name}", ""]
+        short = name.rpartition(".")[2]
+        # Constants have no docstring, and some are names of an unpacked tuple, which mkdocstrings does not see.
+        lines += [f"## `{short}` {{#{name}}}", "", _comment(name), ""] if short.isupper() else [f"::: {name}", ""]
     return "\n".join(lines)
+
+
+def _comment(name: str) -> str:
+    """The comment above the assignment of a constant."""
+    module, _, short = name.rpartition(".")
+    folder = PACKAGE.joinpath(*module.split(".")[1:])
+    for node in ast.parse((folder / "__init__.py").read_text()).body:
+        if isinstance(node, ast.ImportFrom) and node.level and short in [alias.name for alias in node.names]:
+            lines = folder.joinpath(*(node.module or "").split(".")).with_suffix(".py").read_text().splitlines()
+            break
+    else:
+        raise ValueError(f"{name} is not imported in {folder}.")
+    first = next(
+        statement.lineno - 1
+        for statement in ast.parse("\n".join(lines)).body
+        if isinstance(statement, ast.Assign | ast.AnnAssign)
+        and short in [part.id for part in ast.walk(statement) if isinstance(part, ast.Name)]
+    )
+    last = first
+    while first and lines[first - 1].startswith("#"):
+        first -= 1
+    if first == last:
+        raise ValueError(f"{name} needs a comment above its assignment, which says what it is.")
+    return "\n".join(line.removeprefix("# ") for line in lines[first:last])
 
 
 def _exports(module: str) -> tuple[list[str], list[str]]:

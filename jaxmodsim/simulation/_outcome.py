@@ -15,6 +15,7 @@ from ..mechanics import constraint_residual, motion_equations, quadratic
 from ..scene import Scene, State, forward_dynamics
 from ..solvers import ACCUMULATION, TOO_MANY
 
+# Codes of how a run ended; `outcome_messages` has the sentence of each.
 (
     SUCCESS,
     MAX_STEPS,

@@ -40,6 +40,7 @@ _STAGE = _lower(
         ),
     ),
 )
+# Coefficients of `Rodas5P`.
 RODAS5P = RosenbrockTableau(
     gamma=0.21193756319429014,
     stage=_STAGE,
