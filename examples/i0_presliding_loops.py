@@ -1,7 +1,7 @@
 """Presliding loops: what each law does before it breaks away.
 
-A displacement that goes to and fro, with a small loop within the large one. Only Maxwell slip returns to where it left
-the large loop: non-local memory.
+A displacement that goes back and forth, with a small loop within the large one. Only Maxwell slip returns to where it
+left the large loop: non-local memory.
 
 Run it: `python examples/i0_presliding_loops.py [--smoke] [--out DIR]`.
 """
@@ -17,7 +17,7 @@ import jaxmodsim as jms
 
 
 def displacement(t):
-    """Out and back by 20 um, with an excursion to and fro on the way [m]."""
+    """Out and back by 20 um, with an excursion back and forth on the way [m]."""
     corners = jnp.array([0.0, 20.0, -20.0, 8.0, -4.0, 20.0, -20.0])
     return 1e-6 * jnp.interp(t, jnp.arange(7.0), corners)
 

@@ -120,6 +120,18 @@ def test_figures_of_the_claims_are_those_of_the_tables() -> None:
         )
 
 
+def test_figures_of_the_paper_are_those_of_the_tables() -> None:
+    """Numbers with a decimal point stand in the tables of the pages."""
+    rows = [row for page in PAGES for row in page.read_text().splitlines() if row.startswith("|")]
+    cells = {cell.strip() for row in rows for cell in row.split("|")}
+    paper = (ROOT / "paper" / "paper.md").read_text()
+    figures = set(re.findall(r"\b\d+\.\d+(?:e-\d+)?\b", paper))
+    assert len(figures) > 5
+    assert figures <= cells
+    keys = set(re.findall(r"^@\w+\{(\w+),", (ROOT / "paper" / "paper.bib").read_text(), re.MULTILINE))
+    assert keys == {key for group in re.findall(r"\[(@[^\]]+)\]", paper) for key in re.findall(r"@(\w+)", group)}
+
+
 @pytest.mark.parametrize("page", PAGES_WITH_CODE, ids=lambda page: page.name)
 def test_the_code_of_a_page_prints_what_the_page_shows(page: Path) -> None:
     """Written by `python -m tests.helpers.snippets PAGE`."""
