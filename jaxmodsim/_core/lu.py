@@ -56,7 +56,7 @@ def is_zero(x: object) -> bool:
     return is_known(x) and bool(x == 0)
 
 
-def product(row: Sequence[Scalar], x: Sequence[Array]) -> Array:
+def product(row: Sequence[_Entry], x: Sequence[Array]) -> Array:
     """Of a row that is not zero and a vector, without the terms that are known to be zero."""
     terms: list[_Entry] = [a * b for a, b in zip(row, x, strict=True) if not is_zero(a)]
     return functools.reduce(operator.add, terms)

@@ -119,7 +119,8 @@ def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolv
 def _structured(inputs: RunInputs) -> bool:
     """Whether the systems of `Rodas5P` are solved by `linear_solver`, from the structure of mechanics.
 
-    On one coordinate the Jacobian takes as little.
+    A step of 2, 3 and 6 links with LuGre joints takes 2.4, 4.8 and 9.3 us so, and 2.4, 5.6 and 37 us with the Jacobian
+    (two shared cores, float64). On one coordinate 1.4 and 1.2 us.
     """
     unknowns = sum(np.size(x) for x in jtu.tree_leaves((inputs.q0, inputs.scene.initial_state(inputs.q0))))
     return inputs.q0.shape[0] > 1 and unknowns <= _MOST_UNKNOWNS and has_linear_solver(inputs.scene)

@@ -74,3 +74,23 @@ def test_what_it_does_not_know() -> None:
     assert not has_linear_solver(chain(2, Friction(Coulomb(Fc=0.3), along=lambda q: q[0])))
     assert not has_linear_solver(chain(2, Friction(DeadZone(Coulomb(Fc=0.3), 0.1), along=lambda q: q[0])))
     assert not has_linear_solver(slider_crank.scene())
+
+
+def test_derivatives_of_the_solution() -> None:
+    """By the state, the acceleration and the shift at once: forward and reverse, against central differences."""
+    scene = SCENES["states of several entries"]
+    q, qd, qdd = jnp.array([0.3, 0.5]), jnp.array([0.1, -0.4]), jnp.array([1.0, -2.0])
+    z = jax.tree.map(lambda x: x + 1e-3, scene.initial_state(q))
+    rhs = State(q, qd, z)
+
+    @jax.jit
+    def total(x: Any) -> Any:
+        y = State(x * q, x * qd, jax.tree.map(lambda each: x * each, z))
+        solve = linear_solver(x * 0.3, y, x * qdd, scene, shift=37.0 * x, pivot=False)
+        return jnp.sum(ravel_pytree(solve(rhs))[0] ** 2)
+
+    one = jnp.array(1.0)
+    reverse, forward = jax.grad(total)(one), jax.jvp(total, (one,), (one,))[1]
+    np.testing.assert_allclose(reverse, forward, rtol=1e-11)
+    # Step 1e-5: truncation 1e-10 and rounding 1e-11 of the value.
+    np.testing.assert_allclose(forward, (total(one + 1e-5) - total(one - 1e-5)) / 2e-5, rtol=1e-6)
