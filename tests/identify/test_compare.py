@@ -68,9 +68,11 @@ def test_the_truth_is_named_and_what_has_more_parameters_is_not(comparison):
     assert set(comparison.results) == set(candidates())
     by_name = {each.name: each for each in comparison.ranked}
     assert [each.name for each in comparison.ranked][2:] == ["coulomb", "viscous"]
-    # The error on what was held back is the noise, where the model is right: 1600 samples, 5 parameters and 8 numbers
-    # of start states; three standard errors of a root mean square of 1600 samples are 5 %.
-    assert by_name["stribeck"].held_back == pytest.approx(NOISE, rel=0.06)
+    # With starts fitted to all samples the error on what was held back is the noise, where the model is right: 1600
+    # samples, 5 parameters and 8 numbers of start states; three standard errors of a root mean square of 1600 samples
+    # are 5 %. What a twentieth of the samples shows of the starts is off by a part of the noise.
+    assert by_name["stribeck"].start_fitted == pytest.approx(NOISE, rel=0.06)
+    assert 1.0 < by_name["stribeck"].held_back / by_name["stribeck"].start_fitted < 1.5
     assert by_name["coulomb"].held_back > 10 * NOISE
     assert by_name["viscous"].over > by_name["viscous"].over_error
 
@@ -109,7 +111,8 @@ def test_records_that_were_not_fitted_judge_open_loop():
     found = compare(some, _record(0), hold_out=other, q0=[0.0], limits=LIMITS)
     assert found.best == found.simplest == "stribeck"
     assert found.by == "other[0], other[1], other[2], other[3]"
-    assert found.ranked[0].held_back == pytest.approx(NOISE, rel=0.06)
+    assert found.ranked[0].start_fitted == pytest.approx(NOISE, rel=0.06)
+    assert 1.0 < found.ranked[0].held_back / found.ranked[0].start_fitted < 1.5
     assert found.ranked[0].parts.shape == (16,)
 
 
@@ -154,8 +157,9 @@ def test_laws_are_compared_by_blocks_that_were_held_back():
     laws = {"Dahl": jms.Dahl(5e3, 0.3), "LuGre": Candidate(jms.LuGre(**numbers), None)}
     found = compare_laws(laws, record, folds=3)
     assert found.simplest == "Dahl"
-    assert {each.name: each.held_back for each in found.ranked}["Dahl"] == pytest.approx(2e-3, rel=0.07)
     by_name = {each.name: each for each in found.ranked}
+    assert by_name["Dahl"].held_back == pytest.approx(2e-3, rel=0.07)
+    assert by_name["Dahl"].start_fitted is None  # a law by itself starts unloaded
     assert by_name["LuGre"].undetermined  # its Stribeck effect, of which there is nothing in the record
 
 

@@ -17,7 +17,7 @@ from ..data._record import Record, Runs, cut, runs_of
 from ..estimate._initializers import AbstractInitializer, Continuation
 from ..estimate._prepare import Settings, StartState, measured_start, prepare
 from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
-from ..estimate._search import Progress, SearchOptions, SearchResult, solve
+from ..estimate._search import Progress, SearchOptions, SearchResult, SearchState, solve
 from ..estimate._search import by_channel as residual_by_channel
 from ..model._engines import DELAY
 from ..model._observe import Observable, by_channel, first_coordinate
@@ -25,6 +25,7 @@ from ..model._parameters import split_entries
 from ..uncertainty._fit import fit, fit_law
 from ..uncertainty._result import FitResult
 from ._comparison import Comparison, CrossValidated, Part, comparison_of
+from ._opening import after, begin, counting
 
 # Called after each iteration with the name of the model, the number of the fold that is held back (None: nothing is),
 # the number of the iteration and the root mean square of the residual.
@@ -106,9 +107,10 @@ def compare(
 
     Each record is cut into `folds` windows. In turn one window of each record is held back: the model is fitted to the
     others, every window from a start state (q0, qd0) of its own, then run over the window that was held back with these
-    parameters, for which only the start state is fitted. The states of friction laws where a window begins are those of
-    the fit to whole records. With `hold_out` the model is fitted to `records` and run over the whole of each of those,
-    again with its start state fitted.
+    parameters. Its start is fitted to its first samples, a twentieth and at least 20, and the others are judged. The
+    error with a start that is fitted to all of them stands beside it and judges nothing. The states of friction laws
+    where a window begins are those of the fit to whole records. With `hold_out` the model is fitted to `records`, and
+    run over the whole of each of those in the same way.
 
     **Arguments:**
 
@@ -214,8 +216,8 @@ def compare_laws(
         block = _blocks(problem.runs, folds)
         for fold in range(folds):
             options = SearchOptions(_ENOUGH, max_steps, _told(progress, name, fold))
-            held += _held_back(problem, search.state.x, result, block == fold, block, options)
-        return CrossValidated(result, tuple(held))
+            held += _held_back(problem, search.state.x, result, block == fold, block, options)[0]
+        return CrossValidated(result, tuple(held), ())
 
     judges = {name: partial(judge, name, candidate) for name, candidate in candidates.items()}
     return _compared(judges, {name: each.description for name, each in candidates.items()}, f"{folds} folds")
@@ -299,16 +301,18 @@ def _validate_scene(name: str, candidate: Candidate, asked: _Asked) -> CrossVali
         problem = _apart(scene, asked.hold_out, _measured_starts(search, asked), search, asked)
         block = _blocks(problem.runs, asked.folds)
         x = _at(problem, search)
-        return CrossValidated(result, tuple(_evaluated(problem, x, result, block, asked.options(name, 0))))
+        return CrossValidated(result, *_evaluated(problem, x, result, block, asked.options(name, 0)))
     windows = [each for record in asked.records for each in record.windows(_span(record) / asked.folds)]
     problem = _apart(scene, tuple(windows), _reached(search, asked.records, asked.folds), search, asked)
     fold = np.arange(problem.count) % asked.folds
     block = np.broadcast_to(fold[:, None], problem.runs.t.shape)
     everything = _finished(solve(problem, _at(problem, search), asked.options(name, None)))
-    held: list[Part] = []
-    for k in range(asked.folds):
-        held += _held_back(problem, everything.state.x, result, block == k, block, asked.options(name, k))
-    return CrossValidated(result, tuple(held))
+    parts = [
+        _held_back(problem, everything.state.x, result, block == k, block, asked.options(name, k))
+        for k in range(asked.folds)
+    ]
+    held, fitted = zip(*parts, strict=True)
+    return CrossValidated(result, sum(held, ()), sum(fitted, ()))
 
 
 def _held_back(
@@ -318,10 +322,10 @@ def _held_back(
     mask: np.ndarray,
     block: Int[np.ndarray, "runs samples"],
     options: SearchOptions,
-) -> list[Part]:
-    """Fit from `x` without the samples in the mask; what is left of these."""
-    fitted = _finished(solve(_counting(problem, ~mask), x, options)).state.x
-    return _evaluated(_counting(problem, mask), fitted, result, block, options)
+) -> tuple[tuple[Part, ...], tuple[Part, ...]]:
+    """Fit from `x` without the samples in the mask; what is left of these, as `_evaluated` gives it."""
+    fitted = _finished(solve(counting(problem, ~mask), x, options)).state.x
+    return _evaluated(counting(problem, mask), fitted, result, block, options)
 
 
 def _evaluated(
@@ -330,20 +334,19 @@ def _evaluated(
     result: FitResult,
     block: Int[np.ndarray, "runs samples"],
     options: SearchOptions,
-) -> list[Part]:
-    """Residual of the samples that count with the parameters at `x` and the start states that fit best."""
-    search = _finished(solve(_pinned(problem, x, result), x, options))
-    return _parts(search, block)
+) -> tuple[tuple[Part, ...], tuple[Part, ...]]:
+    """Residual with the parameters at `x`, from starts that the first samples show, and from starts fitted to all.
 
-
-def _counting(problem: FitProblem, mask: np.ndarray) -> FitProblem:
-    """The problem in which only the samples in the mask count, and slip instants of runs that have any."""
-    runs, own = problem.runs, np.any(mask, axis=1, keepdims=True)
-    runs = runs._replace(
-        weight={name: jnp.where(mask, weight, 0.0) for name, weight in runs.weight.items()},
-        slip_weight={name: jnp.where(own, weight, 0.0) for name, weight in runs.slip_weight.items()},
-    )
-    return eqx.tree_at(lambda p: p.runs, problem, runs)
+    Of the samples that count; behind the first ones, where there are starts.
+    """
+    pinned = _pinned(problem, x, result)
+    if not problem.local:
+        search = _finished(solve(pinned, x, options))
+        return _parts(search.problem, search.state, block), ()
+    shown = _finished(begin(pinned, x, options)).state.x
+    best = _finished(solve(pinned, shown, options)).state.x
+    held, fitted = (_parts(*after(pinned, each, options), block) for each in (shown, best))
+    return held, fitted
 
 
 def _pinned(problem: FitProblem, x: Float[Array, " n"], result: FitResult) -> FitProblem:
@@ -360,10 +363,10 @@ def _pinned(problem: FitProblem, x: Float[Array, " n"], result: FitResult) -> Fi
     return eqx.tree_at(lambda p: p.prior, problem, Prior(mean, jnp.asarray(weight, mean.dtype)))
 
 
-def _parts(search: SearchResult, block: Int[np.ndarray, "runs samples"]) -> list[Part]:
+def _parts(problem: FitProblem, state: SearchState, block: Int[np.ndarray, "runs samples"]) -> tuple[Part, ...]:
     """Residuals in the units of their channels, for each run and block that has samples that count."""
-    problem, parts = search.problem, {}
-    for name, (residual, weight) in residual_by_channel(problem, search.state.residual).items():
+    parts: dict[tuple[int, int], Part] = {}
+    for name, (residual, weight) in residual_by_channel(problem, state.residual).items():
         level = float(problem.noise[name])
         # Slip instants all go with the first sample of their run.
         number = block if block.shape == weight.shape else np.broadcast_to(block[:, :1], weight.shape)
@@ -371,7 +374,7 @@ def _parts(search: SearchResult, block: Int[np.ndarray, "runs samples"]) -> list
             for k in np.unique(number[run][weight[run] > 0]):
                 chosen = (number[run] == k) & (weight[run] > 0)
                 parts.setdefault((run, int(k)), {})[name] = level * residual[run, chosen]
-    return list(parts.values())
+    return tuple(parts.values())
 
 
 def _blocks(runs: Runs, folds: int) -> Int[np.ndarray, "runs samples"]:
