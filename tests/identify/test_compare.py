@@ -77,6 +77,15 @@ def test_the_truth_is_named_and_what_has_more_parameters_is_not(comparison):
     assert by_name["viscous"].over > by_name["viscous"].over_error
 
 
+def test_a_model_starts_also_from_where_a_part_of_it_ended():
+    far = jms.Regularized(jms.Stribeck(Fc=0.01, Fs=9.0, vs=3.0, Fv=30.0), WIDTH)
+    some = {"stribeck": Candidate(scene(far), candidates()["stribeck"].free), "coulomb": candidates()["coulomb"]}
+    found = {each.name: each for each in compare(some, _record(0), q0=[0.0], limits=LIMITS, max_steps=6).ranked}
+    alone = jms.fit(scene(far), _record(0), some["stribeck"].free, q0=[0.0], limits=LIMITS, max_steps=6)
+    assert alone.rmse > found["coulomb"].fitted  # by itself it ends worse than what is part of it
+    assert found["stribeck"].fitted < found["coulomb"].fitted
+
+
 def test_the_criteria_agree_and_count_parameters_where_the_residual_is_white(comparison):
     by_name = {each.name: each for each in comparison.ranked}
     assert min(by_name.values(), key=lambda each: each.bic).name == "stribeck"

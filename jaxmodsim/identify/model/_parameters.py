@@ -264,6 +264,11 @@ class FreeParameters(eqx.Module):
             for name in self.names
         }
 
+    def limit_of(self, name: str) -> str | None:
+        """Name of the parameter that is the lower limit of this one, as Fc of Fs."""
+        base = self._bases[self._order.index(name)]
+        return base if isinstance(base, str) else None
+
     def fixed_limits(self, name: str) -> tuple[float, float]:
         """Lower and upper limit of a parameter that are numbers, infinite where they are none."""
         line = self._kind(name) == "line" or self._bases[self._order.index(name)] is not None

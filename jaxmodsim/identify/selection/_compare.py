@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..._core.parameters import ranges_of
 from ...friction import AbstractLaw
 from ...scene import Scene, State, scene_numbers
 from ..data._record import Record, Runs, cut, runs_of
-from ..estimate._initializers import AbstractInitializer, Continuation
+from ..estimate._initializers import AbstractInitializer, Continuation, FromSmaller, last_part
 from ..estimate._prepare import Settings, StartState, measured_start, prepare
 from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
 from ..estimate._search import Progress, SearchOptions, SearchResult, SearchState, solve
@@ -50,6 +51,17 @@ class Candidate:
     scene: Scene | AbstractLaw
     free: Sequence[str] | None
     description: str = ""
+
+
+def _from_smaller(free: Sequence[str], judged: Mapping[str, CrossValidated]) -> tuple[AbstractInitializer, ...]:
+    """From the fit of the largest model all of whose parameters are among `free`, by the last parts of their names."""
+    names = {last_part(name) for name in free}
+    fitted = [
+        {last_part(name): jnp.asarray(each.values[name], float) for name in _finished(each.search).problem.free.names}
+        for each, _, _ in judged.values()
+    ]
+    nested = [values for values in fitted if set(values) <= names]
+    return (FromSmaller(max(nested, key=len)),) if nested else ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,6 +124,9 @@ def compare(
     where a window begins are those of the fit to whole records. With `hold_out` the model is fitted to `records`, and
     run over the whole of each of those in the same way.
 
+    Models are fitted in the order of their numbers of parameters, each also from where the largest one before it ended
+    whose parameters, by the last part of their names, it has all: what is part of it should not fit better.
+
     **Arguments:**
 
     - `candidates`: the models by name.
@@ -164,7 +179,10 @@ def compare(
     unknown += [each.name for each in initializers if isinstance(each, Continuation) and each.name not in known]
     if unknown:
         raise ValueError(f"{unknown[0]} is no number of any candidate; there are: {', '.join(sorted(known))}.")
-    judges = {name: partial(_validate_scene, name, candidate, asked) for name, candidate in candidates.items()}
+    judges = {
+        name: partial(_validate_scene, name, candidate, asked)
+        for name, candidate in sorted(candidates.items(), key=lambda item: len(item[1].free or ()))
+    }
     description = {name: candidate.description for name, candidate in candidates.items()}
     by = f"{folds} folds" if not others else ", ".join(record.name for record in others)
     return _compared(judges, description, by)
@@ -203,13 +221,16 @@ def compare_laws(
     _check(laws, folds)
     candidates = {name: x if isinstance(x, Candidate) else Candidate(x, None) for name, x in laws.items()}
 
-    def judge(name: str, candidate: Candidate) -> CrossValidated:
+    own = (initializer,) if isinstance(initializer, AbstractInitializer) else tuple(initializer)
+
+    def judge(name: str, candidate: Candidate, judged: Mapping[str, CrossValidated]) -> CrossValidated:
         law = candidate.scene
         if not isinstance(law, AbstractLaw):
             raise ValueError(f"{name}: compare_laws needs friction laws; for scenes, compare.")
         told = _told(progress, name, None)
         result = fit_law(
-            law, records, candidate.free, loss=loss, initializer=initializer, max_steps=max_steps, progress=told
+            law, records, candidate.free, loss=loss, initializer=(*own, *_from_smaller(tuple(ranges_of(law)), judged)),
+            max_steps=max_steps, progress=told,
         )  # fmt: skip
         search = _finished(result.search)
         problem, held = search.problem, []
@@ -219,7 +240,10 @@ def compare_laws(
             held += _held_back(problem, search.state.x, result, block == fold, block, options)[0]
         return CrossValidated(result, tuple(held), ())
 
-    judges = {name: partial(judge, name, candidate) for name, candidate in candidates.items()}
+    judges = {
+        name: partial(judge, name, candidate)
+        for name, candidate in sorted(candidates.items(), key=lambda item: len(ranges_of(item[1].scene)))
+    }
     return _compared(judges, {name: each.description for name, each in candidates.items()}, f"{folds} folds")
 
 
@@ -247,14 +271,16 @@ def _told(progress: CompareProgress | None, name: str, fold: int | None) -> Prog
 
 
 def _compared(
-    judges: Mapping[str, Callable[[], CrossValidated]], description: Mapping[str, str], by: str
+    judges: Mapping[str, Callable[[Mapping[str, CrossValidated]], CrossValidated]],
+    description: Mapping[str, str],
+    by: str,
 ) -> Comparison:
-    """All candidates one after the other, whatever becomes of each."""
+    """All candidates one after the other, each told of those before it, whatever becomes of each."""
     judged: dict[str, CrossValidated] = {}
     failures: dict[str, str] = {}
     for name, judge in judges.items():
         try:
-            judged[name] = judge()
+            judged[name] = judge(judged)
         except KeyboardInterrupt:
             if not judged:
                 raise  # nothing is finished
@@ -275,13 +301,16 @@ def _finished(search: SearchResult | None) -> SearchResult:
     return search
 
 
-def _validate_scene(name: str, candidate: Candidate, asked: _Asked) -> CrossValidated:
+def _validate_scene(
+    name: str, candidate: Candidate, asked: _Asked, judged: Mapping[str, CrossValidated]
+) -> CrossValidated:
     """The fit to everything, then what each held-back part makes of a fit without it."""
     scene, free = candidate.scene, candidate.free
     assert isinstance(scene, Scene)
     assert free is not None
     numbers = _names(scene, asked.records)
     settings = asked.settings(scene, asked.q0, asked.qd0)
+    own = [each for each in asked.initializer if not isinstance(each, Continuation) or each.name in numbers]
     result = fit(
         scene,
         asked.records,
@@ -291,7 +320,7 @@ def _validate_scene(name: str, candidate: Candidate, asked: _Asked) -> CrossVali
         qd0=asked.qd0,
         limits=settings.limits,
         loss=asked.loss,
-        initializer=[each for each in asked.initializer if not isinstance(each, Continuation) or each.name in numbers],
+        initializer=[*own, *_from_smaller(free, judged)],
         substeps=asked.substeps,
         max_steps=asked.max_steps,
         progress=_told(asked.progress, name, None),
