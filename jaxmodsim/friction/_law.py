@@ -27,6 +27,9 @@ else:
 _Law = TypeVar("_Law", bound="AbstractLaw")
 
 # Limitation of laws whose friction does not fall as slip begins.
+# A fit looks for Fs up to this many times Fc. Beyond it the peak at zero velocity is so high and narrow that samples
+# which pass through it in a moment trade it against vs, and what is fitted fails on the next record.
+MOST_STICTION = 5.0
 NO_STRIBECK_EFFECT = "Without a Stribeck effect friction does not depend on slip velocity but for the viscous part."
 NO_STICTION_IN_MUJOCO = (
     " with Fs > Fc: its dry friction is one force, in stick and in slip. Export a LuGre with the same Fc and Fs, and"

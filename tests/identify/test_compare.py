@@ -78,7 +78,7 @@ def test_the_truth_is_named_and_what_has_more_parameters_is_not(comparison):
 
 
 def test_a_model_starts_also_from_where_a_part_of_it_ended():
-    far = jms.Regularized(jms.Stribeck(Fc=0.01, Fs=9.0, vs=3.0, Fv=30.0), WIDTH)
+    far = jms.Regularized(jms.Stribeck(Fc=2.0, Fs=9.0, vs=3.0, Fv=30.0), WIDTH)
     some = {"stribeck": Candidate(scene(far), candidates()["stribeck"].free), "coulomb": candidates()["coulomb"]}
     found = {each.name: each for each in compare(some, _record(0), q0=[0.0], limits=LIMITS, max_steps=6).ranked}
     alone = jms.fit(scene(far), _record(0), some["stribeck"].free, q0=[0.0], limits=LIMITS, max_steps=6)

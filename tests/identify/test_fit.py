@@ -240,6 +240,32 @@ def test_too_few_samples_are_refused(clean):
         jms.fit(sprung(), jms.Record(t[:3], q[:3], {"u": u[:3]}), tuple(TRUTH))
 
 
+def test_stiction_is_sought_up_to_a_multiple_of_sliding_friction():
+    t = np.arange(0.0, 2.0, 2e-3)
+    x = 2e-3 * np.sin(2 * np.pi * t) * (1 + 0.5 * np.sin(2 * np.pi * 0.3 * t))
+    numbers = {"sigma0": 1e5, "sigma1": 100.0, "sigma2": 5.0, "Fc": 1.0, "vs": 2e-3}
+    force = np.asarray(law_force(jms.LuGre(Fs=9.0, **numbers), jnp.asarray(t), jnp.asarray(x)))
+    record, start = jms.Record(t, force, {"x": x}), jms.LuGre(Fs=2.0, **numbers)
+    held = jms.fit_law(start, record, ("Fc", "Fs"))
+    assert held.values["Fs"] == pytest.approx(5 * held.values["Fc"], rel=1e-12)
+    assert held.values["Fs"] in held.estimate.bounds["Fs"]
+    problem = held.search.problem
+    np.testing.assert_allclose(problem.free.coordinates(held.values), held.search.state.x, rtol=1e-12)
+    with pytest.raises(ValueError, match="Fs = 9 is more than 5 times Fc = 1"):
+        jms.fit_law(jms.LuGre(Fs=9.0, **numbers), record, ("Fc", "Fs"))
+
+
+def test_the_multiple_of_a_limit_may_be_another():
+    numbers, ranges = {"a": 1.0, "b": 2.0}, {"b": Range("N", "a", most=5.0)}
+    free = FreeParameters.of(numbers, ranges, ("a", "b"))
+    assert free.kinds == ("line", "ratio")
+    assert free.limits(free.x0)["b"] == (1.0, 5.0)
+    x = free.coordinates({"a": 3.0, "b": 4.5})
+    assert {name: float(each) for name, each in free.values(x).items()} == pytest.approx({"a": 3.0, "b": 4.5})
+    fixed = FreeParameters.of(numbers, ranges, ("b",))
+    assert fixed.limits(fixed.x0)["b"] == (1.0, 5.0)
+
+
 def test_lower_limits_tighten_declared_ranges(clean):
     result = jms.fit(sprung(Fc=2.5), noisy(clean, 0), ("friction.Fc",), q0=[0.0], limits={"friction.Fc": (2.0, None)})
     assert result.values["friction.Fc"] >= 2.0

@@ -86,7 +86,7 @@ class MultiStart(AbstractInitializer):
         for i, kind in enumerate(problem.free.kinds):
             if kind == "log":
                 drawn[:, i] = here[i] + np.log(factor[:, i])
-            elif kind == "above":
+            elif kind in ("above", "ratio"):
                 drawn[:, i] = (here[i] or 1.0) * factor[:, i]
             else:
                 drawn[:, i] = here[i] + (abs(here[i]) or 1.0) * away[:, i]

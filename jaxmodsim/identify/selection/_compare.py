@@ -83,7 +83,7 @@ class _Asked:
 
     def settings(self, scene: Scene, q0: StartState | None, qd0: StartState | None) -> Settings:
         """As `prepare` wants them, with the limits that are for this scene."""
-        limits = {name: each for name, each in self.limits.items() if name in _names(scene, self.records)}
+        limits = {name: each for name, each in self.limits.items() if _base(name) in _names(scene, self.records)}
         return Settings(
             observe=self.observe,
             q0=q0,
@@ -175,7 +175,7 @@ def compare(
         known |= _names(candidate.scene, several)
         # Wrong names show before the first model has taken its time.
         prepare(candidate.scene, several, candidate.free, asked.settings(candidate.scene, q0, qd0))
-    unknown = [name for name in asked.limits if name not in known]
+    unknown = [name for name in asked.limits if _base(name) not in known]
     unknown += [each.name for each in initializers if isinstance(each, Continuation) and each.name not in known]
     if unknown:
         raise ValueError(f"{unknown[0]} is no number of any candidate; there are: {', '.join(sorted(known))}.")
@@ -252,6 +252,11 @@ def _check(candidates: Mapping[str, object], folds: int) -> None:
         raise ValueError("There must be one candidate at least.")
     if isinstance(folds, bool) or folds < 2:
         raise ValueError(f"folds must be at least 2, an integer, but {folds!r} was given.")
+
+
+def _base(name: str) -> str:
+    """The number that a limit is for: friction.Fs of "friction.Fs/friction.Fc"."""
+    return name.partition("/")[0]
 
 
 def _names(scene: Scene, records: tuple[Record, ...]) -> set[str]:
