@@ -39,7 +39,7 @@ def main(smoke: bool, out: Path) -> Result | None:
         t, q, _, u = np.loadtxt(path, delimiter=",", skiprows=1).T
         record = jms.Record(t, q, {"u": EMPS_GAIN * u}, name="EMPS")
         result.settings["samples"] = len(t)
-        how = ("--model", "coulomb") if smoke else ("--compare", "all")
+        how = ("--laws", "coulomb" if smoke else "all")
         command = [sys.executable, "-c", "from jaxmodsim.cli import main; main()", "fit", str(path), *how]
         started = time.perf_counter()
         subprocess.run([*command, "--force-gain", str(EMPS_GAIN), "--out", folder], check=True, capture_output=True)

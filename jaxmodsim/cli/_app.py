@@ -86,13 +86,12 @@ def fit(
     position: _options.Position = "q",
     force: _options.Force = "u",
     force_gain: _options.ForceGain = 1.0,
-    model: _options.Model = "coulomb",
-    compare: _options.Compare = None,
+    laws: _options.Laws = "coulomb",
     free: _options.Free = None,
     start: _options.Start = None,
     fix: _options.Fix = None,
     limit: _options.Limit = None,
-    hold_out: _options.HoldOut = None,
+    held_out: _options.HeldOut = None,
     folds: _options.Folds = None,
     loss: _options.Loss = "squares",
     begin: _options.Begin = "rough",
@@ -117,8 +116,8 @@ def fit(
 
     run_fit(
         FitRequest(
-            record, AxisColumns(time, position, force, force_gain), model, compare, free or [], start or [], fix or [],
-            limit or [], hold_out or [], folds, loss, begin, starts, substeps, out, report, next_input, max_force,
+            record, AxisColumns(time, position, force, force_gain), laws, free or [], start or [], fix or [],
+            limit or [], held_out or [], folds, loss, begin, starts, substeps, out, report, next_input, max_force,
             max_speed, max_travel, duration,
         )
     )  # fmt: skip

@@ -22,22 +22,19 @@ Time = Annotated[str, typer.Option(help=r"Column of time \[s].", rich_help_panel
 Position = Annotated[str, typer.Option(help=r"Column of measured position \[m].", rich_help_panel=_COLUMNS)]
 Force = Annotated[str, typer.Option(help="Column of the applied force or drive signal.", rich_help_panel=_COLUMNS)]
 ForceGain = Annotated[float, typer.Option(help="Newtons per unit of the force column.", rich_help_panel=_COLUMNS)]
-Model = Annotated[
-    str, typer.Option(help="Model of the axis: coulomb, asymmetric, stribeck, lugre.", rich_help_panel=_MODEL)
-]
-Compare = Annotated[
-    str | None,
+Laws = Annotated[
+    str,
     typer.Option(
-        help="Fit several models, `all` or names with commas between, judge them by what was held back, and take"
-        " the simplest that is as good as the best.",
-        metavar="all|A,B,...",
+        help="Friction of the axis: coulomb, asymmetric, stribeck, lugre. Several, with commas between, or `all` are"
+        " judged by what was held back, and the simplest that is as good as the best is taken.",
+        metavar="A,B,...|all",
         rich_help_panel=_MODEL,
     ),
 ]
 Free = Annotated[
     list[str] | None,
     typer.Option(
-        help="Parameters to fit, names with commas between, repeatable; by default those of the model. Also q0"
+        help="Parameters to fit, names with commas between, repeatable; by default those of the law. Also q0"
         r" and qd0, the state at the first sample of each record, and delay.u of the force \[s].",
         metavar="NAME,...",
         rich_help_panel=_MODEL,
@@ -65,7 +62,7 @@ Limit = Annotated[
         rich_help_panel=_MODEL,
     ),
 ]
-HoldOut = Annotated[
+HeldOut = Annotated[
     list[Path] | None,
     typer.Option(help="Record that is never fitted, to judge by. Repeatable.", rich_help_panel=_JUDGED),
 ]
@@ -73,7 +70,7 @@ Folds = Annotated[
     int | None,
     typer.Option(
         help="Judge by cross-validation instead: cut each record into so many parts, and hold back one after the"
-        " other. --compare without --hold-out does so with 4.",
+        " other. Several laws without --held-out are judged so with 4.",
         rich_help_panel=_JUDGED,
     ),
 ]

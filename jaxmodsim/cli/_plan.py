@@ -40,13 +40,12 @@ class FitRequest:
 
     records: Sequence[Path]
     columns: AxisColumns
-    model: str
-    compare: str | None
+    laws: str
     free: Sequence[str]
     start: Sequence[str]
     fix: Sequence[str]
     limit: Sequence[str]
-    hold_out: Sequence[Path]
+    held_out: Sequence[Path]
     folds: int | None
     loss: str
     begin: str
@@ -94,10 +93,10 @@ def plan_of(request: FitRequest) -> Plan:
     - `ValueError` for an option that names something unknown, or that does not go with another one; as `read_records`.
     """
     _check(request)
-    names = _models(request)
+    names = _laws(request)
     loss = _LOSSES[_known("--loss", request.loss, _LOSSES)]()
     _known("--begin", request.begin, _INITIALIZERS)
-    together = read_records([*request.records, *request.hold_out], request.columns)
+    together = read_records([*request.records, *request.held_out], request.columns)
     records, held_out = together[: len(request.records)], together[len(request.records) :]
     # A record that stands still, or that nothing drives, may go beside others that do not.
     driven = [record for record in together if np.ptp(record.measured) > 0 and np.ptp(record.inputs["u"]) > 0]
@@ -123,7 +122,7 @@ def plan_of(request: FitRequest) -> Plan:
     limits = {"m": (0.0, None)} | _limits(request.limit, numbers)
     initializer = _initializers(request, candidates, numbers)
     options = {"loss": loss, "initializer": initializer, "substeps": request.substeps, **start_states(records)}
-    compared = request.compare is not None or request.folds is not None
+    compared = len(names) > 1 or request.folds is not None
     return Plan(candidates, compared, request.folds, records, held_out, limits, options)
 
 
@@ -147,10 +146,8 @@ def _check(request: FitRequest) -> None:
         raise ValueError(f"--starts must be at least 1, but it is {request.starts}.")
     if request.folds is not None and request.folds < 2:
         raise ValueError(f"--folds must be at least 2, but it is {request.folds}.")
-    if request.folds is not None and request.hold_out:
-        raise ValueError("--folds and --hold-out do not go together: a model is judged by one of them.")
-    if request.compare is not None and request.free:
-        raise ValueError("--free does not go with --compare, where each model has its own parameters: use --fix.")
+    if request.folds is not None and request.held_out:
+        raise ValueError("--folds and --held-out do not go together: a model is judged by one of them.")
     numbers = {"force": request.max_force, "speed": request.max_speed, "travel": request.max_travel}
     given = {f"--max-{name}": x for name, x in numbers.items()} | {"--duration": request.duration}
     for option, number in given.items():
@@ -162,16 +159,15 @@ def _check(request: FitRequest) -> None:
         raise ValueError(f"--next {request.next_input} is a folder; a file is needed.")
 
 
-def _models(request: FitRequest) -> tuple[str, ...]:
-    if request.compare is None:
-        return (_known("--model", request.model, axis_models(), "model"),)
-    if request.compare == "all":
-        return tuple(axis_models())
-    names = tuple(dict.fromkeys(name.strip() for name in request.compare.split(",") if name.strip()))
+def _laws(request: FitRequest) -> tuple[str, ...]:
+    given = dict.fromkeys(name.strip() for name in request.laws.split(",") if name.strip())
+    names = tuple(axis_models()) if "all" in given else tuple(given)
+    if not names:
+        raise ValueError(f"--laws needs a law, several as A,B, or `all`, but {request.laws!r} was given.")
     for name in names:
-        _known("--compare", name, axis_models(), "model")
-    if len(names) < 2:
-        raise ValueError(f"--compare needs `all` or two models or more, A,B, but {request.compare!r} was given.")
+        _known("--laws", name, axis_models(), "law")
+    if len(names) > 1 and request.free:
+        raise ValueError("--free does not go with several --laws, each of which has its own parameters: use --fix.")
     return names
 
 

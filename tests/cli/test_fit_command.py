@@ -82,7 +82,7 @@ class Page(HTMLParser):
 def fitted(run_command, files, tmp_path_factory):
     """The fit of two records with a third held out, and a report."""
     out = tmp_path_factory.mktemp("fit")
-    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--hold-out", files[2])
+    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--held-out", files[2])
     code, text, errors = run_command(*command, "--out", str(out), "--report", str(out / "report"))
     assert code == 0, errors
     return out, text
@@ -153,7 +153,7 @@ def test_ctrl_c_keeps_what_was_found(run_command, files, tmp_path, monkeypatch):
 
     monkeypatch.setattr(_fit, "fit", stopped)
     out = tmp_path / "out"
-    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--hold-out", files[2])
+    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--held-out", files[2])
     code, _, errors = run_command(*command, "--out", str(out), "--report", str(out))
     assert code == 130
     assert errors == "jaxmodsim: interrupted; what was found until then is written\n"
@@ -168,7 +168,7 @@ def test_ctrl_c_keeps_what_was_found(run_command, files, tmp_path, monkeypatch):
 
 def test_models_are_compared(run_command, files, tmp_path):
     out = tmp_path / "out"
-    command = ("fit", files[0], *COLUMNS, *MODEL[:-2], "--compare", "coulomb,asymmetric", "--folds", "2")
+    command = ("fit", files[0], *COLUMNS, *MODEL[:-2], "--laws", "coulomb,asymmetric", "--folds", "2")
     code, text, errors = run_command(*command, "--out", str(out), "--report", str(out))
     assert code == 0, errors
     found = json.loads((out / "fit.json").read_text())
@@ -189,7 +189,7 @@ def test_the_next_input_is_written(run_command, files, tmp_path, monkeypatch):
     out = tmp_path / "out"
     monkeypatch.setattr(_fit, "design_input", partial(_fit.design_input, max_steps=2))
     limits = ("--max-force", "30", "--max-travel", "0.1", "--duration", "1.5")
-    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--hold-out", files[2])
+    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--held-out", files[2])
     code, text, errors = run_command(*command, "--next", str(out / "next.csv"), *limits, "--out", str(out))
     assert code == 0, errors
     frame = pd.read_csv(out / "next.csv")
@@ -325,10 +325,10 @@ def check_refusal(run_command, out: Path, text: str, *command: str) -> None:
     ("change", "text"),
     [
         (("--position", "poss"), "no column 'poss' .*time, pos, volt.* Did you mean --position pos"),
-        (("--model", "coulom"), "no model 'coulom'; the models are: coulomb, asymmetric.* Did you mean coulomb"),
-        (("--compare", "coulomb,lugr"), "no model 'lugr'.* Did you mean lugre"),
-        (("--compare", "coulomb"), "two models or more, A,B, but 'coulomb' was given"),
-        (("--compare", "all", "--free", "m"), "--free does not go with --compare"),
+        (("--laws", "coulom"), "no law 'coulom'; the laws are: coulomb, asymmetric.* Did you mean coulomb"),
+        (("--laws", "coulomb,lugr"), "no law 'lugr'.* Did you mean lugre"),
+        (("--laws", " ,"), "--laws needs a law, several as A,B, or `all`, but ' ,' was given"),
+        (("--laws", "all", "--free", "m"), "--free does not go with several --laws"),
         (("--free", "m,dry.Fs"), "no name 'dry.Fs'; .* Did you mean dry.Fc"),
         (("--free", "m", "--fix", "m=2"), "m stands in --free and in --fix"),
         (("--start", "m"), "--start needs NAME=VALUE"),
@@ -350,7 +350,7 @@ def check_refusal(run_command, out: Path, text: str, *command: str) -> None:
         (("--time", "volt"), "times must increase"),
         (("--max-force", "3"), "--max-force belongs to --next"),
         (("--next", "n.csv", "--duration", "-1"), "--duration must be finite and > 0"),
-        (("--hold-out", "nowhere.csv"), "There is no file nowhere.csv"),
+        (("--held-out", "nowhere.csv"), "There is no file nowhere.csv"),
     ],
 )
 def test_wrong_options_are_one_sentence_and_exit_code_two(run_command, files, tmp_path, change, text):
@@ -401,7 +401,7 @@ def test_matlab_vectors_of_other_lengths_and_folders_are_refused(run_command, fi
     check_refusal(run_command, out, "is a folder; a file is needed", str(tmp_path))
     check_refusal(run_command, out, "There is no file", str(tmp_path / "none.csv"))
     check_refusal(run_command, out, "is given twice", files[0], files[0], *COLUMNS)
-    check_refusal(run_command, out, "is given twice", files[0], "--hold-out", files[0], *COLUMNS)
+    check_refusal(run_command, out, "is given twice", files[0], "--held-out", files[0], *COLUMNS)
     code, _, errors = run_command("fit", files[0], *COLUMNS, "--out", files[0])
     assert code == 2
     assert "is a file; a folder is needed" in errors

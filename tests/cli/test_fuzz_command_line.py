@@ -76,8 +76,8 @@ def check_ending(ending: tuple[int, str, str]) -> None:
 
 
 FIT_OPTIONS = (
-    "--time", "--position", "--force", "--force-gain", "--model", "--compare", "--free", "--start", "--fix", "--limit",
-    "--hold-out", "--folds", "--loss", "--begin", "--starts", "--substeps", "--report", "--next", "--max-force",
+    "--time", "--position", "--force", "--force-gain", "--laws", "--free", "--start", "--fix", "--limit",
+    "--held-out", "--folds", "--loss", "--begin", "--starts", "--substeps", "--report", "--next", "--max-force",
     "--max-speed", "--max-travel", "--duration", "--out",
 )  # fmt: skip
 SWEEP_OPTIONS = ("--out", "--figure", "--chunk", "--dry-run", "--help")
