@@ -42,7 +42,7 @@ def main(smoke: bool, out: Path) -> Result | None:
         how = ("--laws", "coulomb" if smoke else "all")
         command = [sys.executable, "-c", "from jaxmodsim.cli import main; main()", "fit", str(path), *how]
         started = time.perf_counter()
-        subprocess.run([*command, "--force-gain", str(EMPS_GAIN), "--out", folder], check=True, capture_output=True)
+        subprocess.run([*command, "--units", f"force={EMPS_GAIN}", "--out", folder], check=True, capture_output=True)
         result.settings["seconds"] = round(time.perf_counter() - started)
         report = json.loads((Path(folder) / "fit.json").read_text())
     if smoke:

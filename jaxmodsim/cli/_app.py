@@ -85,7 +85,8 @@ def fit(
     time: _options.Time = "t",
     position: _options.Position = "q",
     force: _options.Force = "u",
-    force_gain: _options.ForceGain = 1.0,
+    units: _options.Units = None,
+    drop: _options.Drop = None,
     laws: _options.Laws = "coulomb",
     free: _options.Free = None,
     start: _options.Start = None,
@@ -96,7 +97,8 @@ def fit(
     loss: _options.Loss = "squares",
     begin: _options.Begin = "rough",
     starts: _options.Starts = 1,
-    substeps: _options.Substeps = 1,
+    max_steps: _options.MaxSteps = 100,
+    substeps: _options.Substeps = None,
     out: Out = Path("jaxmodsim-fit"),
     report: _options.Report = None,
     next_input: _options.NextInput = None,
@@ -112,13 +114,12 @@ def fit(
     _start()
     from ._fit import run_fit
     from ._plan import FitRequest
-    from ._read import AxisColumns
 
     run_fit(
         FitRequest(
-            record, AxisColumns(time, position, force, force_gain), laws, free or [], start or [], fix or [],
-            limit or [], held_out or [], folds, loss, begin, starts, substeps, out, report, next_input, max_force,
-            max_speed, max_travel, duration,
+            record, (time, position, force), units or [], drop or [], laws, free or [], start or [], fix or [],
+            limit or [], held_out or [], folds, loss, begin, starts, max_steps, substeps, out, report, next_input,
+            max_force, max_speed, max_travel, duration,
         )
     )  # fmt: skip
 

@@ -18,10 +18,31 @@ _COLUMNS, _MODEL, _JUDGED, _SEARCH, _NEXT = "Columns", "Model", "Judging it", "S
 Records = Annotated[
     list[Path], typer.Argument(help="Records, fitted together: .csv with a header line, .parquet or .mat.")
 ]
-Time = Annotated[str, typer.Option(help=r"Column of time \[s].", rich_help_panel=_COLUMNS)]
-Position = Annotated[str, typer.Option(help=r"Column of measured position \[m].", rich_help_panel=_COLUMNS)]
-Force = Annotated[str, typer.Option(help="Column of the applied force or drive signal.", rich_help_panel=_COLUMNS)]
-ForceGain = Annotated[float, typer.Option(help="Newtons per unit of the force column.", rich_help_panel=_COLUMNS)]
+Time = Annotated[str, typer.Option(help="Column of time.", rich_help_panel=_COLUMNS)]
+Position = Annotated[
+    str, typer.Option(help="Column of measured position or angle; or of velocity.", rich_help_panel=_COLUMNS)
+]
+Force = Annotated[
+    str, typer.Option(help="Column of the applied force or torque, or drive signal.", rich_help_panel=_COLUMNS)
+]
+Units = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="What the columns time, position and force are in, as in time=ms,position=deg,force=12.5; by default"
+        r" what their names say, `phi \[deg]` or `phi_deg`, or SI. A number is SI units per unit of the column. An"
+        " angle or a torque makes the axis a rotary one.",
+        metavar="COLUMN=UNIT,...",
+        rich_help_panel=_COLUMNS,
+    ),
+]
+Drop = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Samples to leave out: nan, those without a finite value; repeated, those at the time of the one before.",
+        metavar="nan,repeated",
+        rich_help_panel=_COLUMNS,
+    ),
+]
 Laws = Annotated[
     str,
     typer.Option(
@@ -34,9 +55,9 @@ Laws = Annotated[
 Free = Annotated[
     list[str] | None,
     typer.Option(
-        help="Parameters to fit, names with commas between, repeatable; by default those of the law. Also q0"
-        r" and qd0, the state at the first sample of each record, and delay.u of the force \[s].",
-        metavar="NAME,...",
+        help="Parameters to fit, names with commas between, repeatable; by default those of the law, to which +NAME"
+        r" adds one. Also q0 and qd0, the state at the first sample of each record, and delay.u of the force \[s].",
+        metavar="NAME,...|+NAME",
         rich_help_panel=_MODEL,
     ),
 ]
@@ -90,7 +111,14 @@ Starts = Annotated[
     int,
     typer.Option(help="Searches from so many starts around it, of which the best is taken.", rich_help_panel=_SEARCH),
 ]
-Substeps = Annotated[int, typer.Option(help="Integration steps between two samples.", rich_help_panel=_SEARCH)]
+MaxSteps = Annotated[int, typer.Option(help="Limit of iterations of a search.", rich_help_panel=_SEARCH)]
+Substeps = Annotated[
+    int | None,
+    typer.Option(
+        help="Integration steps between two samples; by default as many as it takes until they no longer show.",
+        rich_help_panel=_SEARCH,
+    ),
+]
 Report = Annotated[
     Path | None, typer.Option(help="Folder for report.html: all of it in one file, to attach to a report.")
 ]
