@@ -1,4 +1,4 @@
-"""Columns of files: CSV, Parquet, MATLAB."""
+"""Columns of files: CSV, Parquet, MATLAB, and those of loggers."""
 
 import io
 import re
@@ -10,6 +10,8 @@ from typing import TypeAlias
 
 import numpy as np
 import pandas as pd
+
+from ._logs import LOG_READERS
 
 # Columns by name, as the file has them.
 Columns: TypeAlias = Mapping[str, object]
@@ -26,15 +28,29 @@ def read_columns(path: Path) -> Columns:
 
     - `ValueError` naming a file that is missing, damaged or of an unknown kind; `OSError` if it cannot be read.
     """
+    if path.is_dir() and (path / "metadata.yaml").is_file():
+        return _logged(path, ".bag")
     if path.is_dir():
         raise ValueError(f"{path} is a folder; a file is needed.")
     if not path.is_file():
         raise ValueError(f"There is no file {path}.")
+    if path.suffix.lower() in LOG_READERS:
+        return _logged(path, path.suffix.lower())
     if path.suffix.lower() not in _READERS:
-        raise ValueError(
-            f"{path.name}: the ending must be one of {', '.join(_READERS)}, as it says how to read the file."
-        )
+        endings = ", ".join((*_READERS, *LOG_READERS))
+        raise ValueError(f"{path.name}: the ending must be one of {endings}, as it says how to read the file.")
     return _READERS[path.suffix.lower()](path)
+
+
+def _logged(path: Path, ending: str) -> Columns:
+    try:
+        return LOG_READERS[ending](path)
+    except (ValueError, OSError) as error:
+        if "pip install" in str(error):
+            raise
+        raise ValueError(f"{path} is damaged or no {ending} file: {_one_line(error)}") from error
+    except Exception as error:  # whatever the bytes of a damaged file lead the reader into
+        raise ValueError(f"{path} is damaged or no {ending} file: {_one_line(error)}") from error
 
 
 def _csv(path: Path) -> Columns:

@@ -16,7 +16,10 @@ Out = Annotated[Path, typer.Option(help="Folder for figures, tables and JSON; ma
 _COLUMNS, _MODEL, _JUDGED, _SEARCH, _NEXT = "Columns", "Model", "Judging it", "Search", "The next record"
 
 Records = Annotated[
-    list[Path], typer.Argument(help="Records, fitted together: .csv with a header line, .parquet or .mat.")
+    list[Path],
+    typer.Argument(
+        help="Records, fitted together: .csv with a header line, .parquet, .mat; of loggers .mf4, .tdms, .mcap, .bag."
+    ),
 ]
 Time = Annotated[str, typer.Option(help="Column of time.", rich_help_panel=_COLUMNS)]
 Position = Annotated[

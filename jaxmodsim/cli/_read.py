@@ -11,6 +11,7 @@ import pandas as pd
 from .._core.arguments import nearest
 from ..identify import Record, clock_offset, sampling_gaps, unexplained_force
 from ._files import Columns, read_columns
+from ._logs import Channel, held_on
 from ._units import Unit, axis_unit, column_unit, split_header
 
 # What --drop may name.
@@ -91,14 +92,16 @@ def read_record(path: Path, columns: AxisColumns, name: str | None = None) -> Ax
       column that holds no numbers, NaN, lengths that differ, or times that do not increase; `OSError` if the file
       cannot be read.
     """
-    table = read_columns(path)
+    table, notes = read_columns(path), []
+    if any(isinstance(column, Channel) for column in table.values()):
+        table, notes = _on_one_clock(table, path, columns)
     headers = {role: _header(table, path, role, wanted) for role, wanted in columns.names.items()}
     try:
         read = {role: column_unit(role, header, columns.units.get(role)) for role, header in headers.items()}
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from error
     units = {role: unit for role, (unit, _) in read.items()}
-    notes = [f"{path.name}: {sentence}" for _, sentence in read.values() if sentence]
+    notes += [f"{path.name}: {sentence}" for _, sentence in read.values() if sentence]
     rotary = _rotary(path, headers, units)
     arrays = {role: _numbers(table, path, header) for role, header in headers.items()}
     lengths = {header: arrays[role].size for role, header in headers.items()}
@@ -133,6 +136,30 @@ def offset_note(record: Record, force: str) -> tuple[str, ...]:
         f" shifted by that it explains the motion best, with {100 * left:.0f} % of the force that is left without. If"
         f" it is no accident, {mend}.",
     )
+
+
+def _on_one_clock(table: Columns, path: Path, columns: AxisColumns) -> tuple[Columns, list[str]]:
+    """Position and force of a logger at the times of the position, where the force was logged as well."""
+    headers = [_header(table, path, role, columns.names[role]) for role in ("position", "force")]
+    position, force = (table[header] for header in headers)
+    if not (isinstance(position, Channel) and isinstance(force, Channel)):
+        return table, []
+    if np.array_equal(position.t, force.t):
+        return {columns.time: position.t, headers[0]: position.values, headers[1]: force.values}, []
+    last = force.t[-1] + float(np.median(np.diff(force.t))) if force.t.size > 1 else force.t[-1]
+    both = (position.t >= force.t[0]) & (position.t < last)
+    if np.count_nonzero(both) < _LEAST_PART:
+        raise ValueError(f"{path.name}: {headers[0]!r} and {headers[1]!r} were hardly logged at the same time.")
+    t, q = position.t[both], position.values[both]
+    resampled = held_on(force, t)
+    try:
+        offset = clock_offset(Record(t, q, {"u": resampled}))[0]
+    except ValueError:  # what is wrong with the samples is said later, in words of the user's
+        offset = 0.0
+    return {columns.time: t, headers[0]: q, headers[1]: resampled}, [
+        f"{path.name}: {headers[1]!r} is resampled to the times of {headers[0]!r}. As the motion shows, the clock of"
+        f" the force is {1e3 * abs(offset):.2f} ms {'early' if offset >= 0 else 'late'} against that of the position."
+    ]
 
 
 def _header(table: Columns, path: Path, role: str, wanted: str) -> str:

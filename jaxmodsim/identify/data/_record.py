@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,8 +10,18 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..._core.arguments import as_float, as_label, as_mapping, as_names, as_reals
 
+
+@runtime_checkable
+class TableColumn(Protocol):
+    """A column of a table (pandas, xarray, polars): what NumPy makes an array of."""
+
+    def __array__(self, *arguments: object, **options: object) -> np.ndarray:
+        """As an array."""
+        ...
+
+
 # Samples of one channel, shape `[samples]`.
-Column: TypeAlias = ArrayLike | Sequence[object]
+Column: TypeAlias = ArrayLike | Sequence[object] | TableColumn
 # Name of a single channel that was given none.
 SINGLE = "measured"
 # Samples at the beginning of a record, from which position and velocity are estimated.
