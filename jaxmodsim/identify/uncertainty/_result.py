@@ -216,6 +216,16 @@ def remarks(result: FitResult) -> tuple[str, ...]:
     return tuple(sentences)
 
 
+def step_shows(result: FitResult) -> bool:
+    """Whether the integration steps between samples are so few that they show beside what the model misses."""
+    return _step_shows(result.diagnostics)
+
+
+def _step_shows(diagnostics: FitDiagnostics) -> bool:
+    errors, moved = list(diagnostics.rmse.values()), diagnostics.step_error
+    return moved is not None and len(errors) == 1 and moved > _STEP_SHOWS * errors[0]
+
+
 def uncertain_of(estimate: ParameterEstimate) -> dict[str, tuple[str, ...]]:
     """Parameters that are not well known, each with those that it is hardly told apart from."""
     pairs, errors, uncertain = _alike(estimate), estimate.errors, {}
@@ -230,11 +240,10 @@ def _of_the_search(diagnostics: FitDiagnostics, records: tuple[Record, ...]) -> 
     sentences = []
     if diagnostics.ending not in ENDINGS.values():
         sentences.append(f"The search {diagnostics.ending}: do not trust the standard errors.")
-    errors, moved = list(diagnostics.rmse.values()), diagnostics.step_error
-    if moved is not None and len(errors) == 1 and moved > _STEP_SHOWS * errors[0]:
+    if _step_shows(diagnostics):
         sentences.append(
-            f"The integration step shows: with four times as many the output moves by {moved:.2g} (root mean square)"
-            f" against an RMSE of {errors[0]:.2g}. Raise substeps."
+            f"The integration step shows: with four times as many the output moves by {diagnostics.step_error:.2g}"
+            f" (root mean square) against an RMSE of {next(iter(diagnostics.rmse.values())):.2g}. Raise substeps."
         )
     for channel, rmse in diagnostics.rmse.items():
         columns = [record.channels[channel] for record in records if channel in record.channels]
