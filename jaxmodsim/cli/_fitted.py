@@ -134,11 +134,16 @@ def headline(fitted: Fitted) -> tuple[str, str, str]:
 
 
 def _first_doubt(fitted: Fitted) -> str:
-    doubts = (*fitted.plan.notes, *remarks(fitted.result))
+    doubts = (*fitted.plan.notes, *start_remarks(fitted), *remarks(fitted.result))
     if doubts:
         return f"Before you rely on it: {doubts[0]}"
     untested = "" if fitted.scores else " Whether it holds on another day only a record that is held out can tell."
     return f"Nothing in the records speaks against it.{untested}"
+
+
+def start_remarks(fitted: Fitted) -> tuple[str, ...]:
+    """What the starts of records that were held out say of the model."""
+    return tuple(remark for score in fitted.scores for remark in score.remarks)
 
 
 def parameter_table(result: FitResult) -> pd.DataFrame:
@@ -156,20 +161,20 @@ def record_table(fitted: Fitted) -> pd.DataFrame:
     """Records, fitted and held out, with the root mean square of what the model misses."""
     rows = []
     for record, residuals in zip(fitted.result.provenance.records, fitted.result.residuals, strict=True):
-        rows.append((record, "fitted", residuals["measured"]))
+        rows.append((record, "fitted", math.sqrt(float(np.mean(residuals["measured"] ** 2))), math.nan))
     for score in fitted.scores:
-        rows.append((score.record, "held out", score.residuals["measured"]))
+        start = math.nan if score.start_fitted is None else score.start_fitted.rmse["measured"]
+        rows.append((score.record, "held out", score.rmse["measured"], start))
     return pd.DataFrame(
         {
-            "record": [record.name for record, _, _ in rows],
-            "use": [use for _, use, _ in rows],
-            "samples": [len(record.t) for record, _, _ in rows],
-            "from [s]": [float(record.t[0]) for record, _, _ in rows],
-            "to [s]": [float(record.t[-1]) for record, _, _ in rows],
-            f"RMSE [m{fitted.unit}]": [1e3 * math.sqrt(float(np.mean(residual**2))) for _, _, residual in rows],
-            "of its spread [%]": [
-                100 * float(np.std(residual) / (np.std(record.measured) or np.nan)) for record, _, residual in rows
-            ],
+            "record": [record.name for record, *_ in rows],
+            "use": [use for _, use, *_ in rows],
+            "samples": [len(record.t) for record, *_ in rows],
+            "from [s]": [float(record.t[0]) for record, *_ in rows],
+            "to [s]": [float(record.t[-1]) for record, *_ in rows],
+            f"RMSE [m{fitted.unit}]": [1e3 * rmse for _, _, rmse, _ in rows],
+            "of its spread [%]": [100 * rmse / float(np.std(record.measured) or np.nan) for record, _, rmse, _ in rows],
+            f"start fitted, RMSE [m{fitted.unit}]": [1e3 * start for *_, start in rows],
         }
     )
 
@@ -184,6 +189,9 @@ def model_table(comparison: Comparison, unit: str) -> pd.DataFrame:
             f"standard error [m{unit}]": [1e3 * each.error for each in comparison.ranked],
             f"over the best [m{unit}]": [1e3 * each.over for each in comparison.ranked],
             f"its standard error [m{unit}]": [1e3 * each.over_error for each in comparison.ranked],
+            f"start fitted, RMSE [m{unit}]": [
+                math.nan if each.start_fitted is None else 1e3 * each.start_fitted for each in comparison.ranked
+            ],
             f"fitted, RMSE [m{unit}]": [1e3 * each.fitted for each in comparison.ranked],
             "not determined": [", ".join(each.undetermined) or "-" for each in comparison.ranked],
         }
@@ -231,6 +239,10 @@ def summary(findings: Findings) -> dict[str, object]:
         **fitted.result.to_dict(),
         "held": fitted.held,
         "held_out": {score.record.name: score.rmse for score in fitted.scores},
+        "held_out_start_fitted": {
+            score.record.name: None if score.start_fitted is None else score.start_fitted.rmse
+            for score in fitted.scores
+        },
         "comparison": None if fitted.comparison is None else fitted.comparison.to_dict(),
         "substeps": fitted.substeps,
         "seconds": fitted.seconds,
