@@ -244,7 +244,7 @@ def _designed(request: FitRequest, fitted: Fitted) -> InputDesign:
         def progress(step: int, goal: float) -> None:
             status.update(f"designing the next input: iteration {step}, goal {goal:.4g}")
 
-        return design_input(
+        design = design_input(
             fitted.scene,
             [name for name in result.values if name in numbers],
             limits,
@@ -254,3 +254,4 @@ def _designed(request: FitRequest, fitted: Fitted) -> InputDesign:
             q0=[0.5 * (low + high)],
             progress=progress,
         )
+    return replace(design, units={name: result.estimate.units[name] for name in design.values})

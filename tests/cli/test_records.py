@@ -8,9 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from jaxmodsim.cli._plan import FitRequest, plan_of
 from jaxmodsim.cli._read import AxisColumns, read_record
 from jaxmodsim.cli._units import Unit, given_units, known_unit, split_header
-from jaxmodsim.identify import Record, clock_offset, sampling_gaps
+from jaxmodsim.identify import Record, axis_models, clock_offset, sampling_gaps
 
 from ..helpers.axis_records import GAIN, TRUTH, axis_frame
 
@@ -219,3 +220,28 @@ def test_the_offset_between_clocks_is_found_to_a_tenth_of_a_millisecond(ticks):
     noise = 1e-6 * np.random.default_rng(0).standard_normal(samples.size)
     offset, _ = clock_offset(Record(t[samples], q[samples - ticks] + noise, {"u": u[samples]}))
     assert offset == pytest.approx(1e-4 * ticks, abs=1e-4)
+
+
+def test_a_current_becomes_a_force_by_a_factor(run_command, tmp_path):
+    path = written(tmp_path, FRAME.rename(columns={"volt": "volt [mA]"}))
+    code, _, errors = run_command("fit", str(path), *COLUMNS, "--out", str(tmp_path / "out"))
+    assert code == 2
+    assert errors.startswith("jaxmodsim: run.csv: column 'volt [mA]': mA is a unit of current, from which the force")
+    np.testing.assert_allclose(read_record(path, names()).parts[0].inputs["u"], GAIN * U, rtol=1e-12)
+
+
+@pytest.mark.parametrize("free", [(), ("+delay.u",)])
+def test_a_parameter_can_be_added_to_those_of_the_law(capsys, tmp_path, free):
+    path = written(tmp_path, changed(volt=np.roll(U, -6)))
+    request = FitRequest(
+        records=[path], columns=("time", "pos", "volt"), units=[FORCE[1]], drop=(), laws="coulomb,lugre", free=free,
+        start=(), fix=(), limit=(), held_out=(), folds=None, loss="squares", begin="rough", starts=1, max_steps=9,
+        substeps=None, out=tmp_path, report=None, next_input=None, max_force=None, max_speed=None, max_travel=None,
+        duration=None,
+    )  # fmt: skip
+    plan = plan_of(request)
+    for name, candidate in plan.candidates.items():
+        assert candidate.free == (*axis_models()[name].free, *(each.removeprefix("+") for each in free))
+    # What is fitted is no surprise.
+    assert len(plan.notes) == 1 - len(free)
+    assert capsys.readouterr().err.count("Note: ") == len(plan.notes)
