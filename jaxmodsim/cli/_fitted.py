@@ -123,7 +123,7 @@ def headline(fitted: Fitted) -> tuple[str, str, str]:
     spread = math.sqrt(np.mean(np.concatenate([record.measured - np.mean(record.measured) for record in records]) ** 2))
     seconds = sum(float(record.t[-1] - record.t[0]) for record in records)
     held_out = [f"{1e3 * score.rmse['measured']:.3g} m{fitted.unit} on {score.record.name}" for score in fitted.scores]
-    never = f"; {', '.join(held_out)}, held out but for the state it starts from" if held_out else ""
+    never = f"; {', '.join(held_out)}, where nothing but the start is fitted, to the first samples" if held_out else ""
     return (
         f"{fitted.model.capitalize()}: {numbers}.",
         f"Driven by the force alone for {seconds:.3g} s it misses the measured {fitted.quantity} by"

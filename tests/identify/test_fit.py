@@ -249,6 +249,7 @@ def test_stiction_is_sought_up_to_a_multiple_of_sliding_friction():
     held = jms.fit_law(start, record, ("Fc", "Fs"))
     assert held.values["Fs"] == pytest.approx(5 * held.values["Fc"], rel=1e-12)
     assert held.values["Fs"] in held.estimate.bounds["Fs"]
+    assert held.search is not None
     problem = held.search.problem
     np.testing.assert_allclose(problem.free.coordinates(held.values), held.search.state.x, rtol=1e-12)
     with pytest.raises(ValueError, match="Fs = 9 is more than 5 times Fc = 1"):

@@ -450,6 +450,7 @@ def test_a_record_that_was_not_fitted_is_scored(scored, parts, clean):
 def test_a_start_that_takes_up_an_error_of_the_model_is_a_remark(result, parts):
     other = jms.Record(parts[1].t, parts[1].channels, {"u": 0.8 * parts[1].inputs["u"]}, "weak")
     found = score(result, other)
+    assert found.start_fitted is not None
     assert found.start_fitted.rmse["x"] < found.rmse["x"]
     assert any("standard errors from what its first samples show" in each for each in found.remarks)
     nothing = jms.Record(parts[1].t, parts[1].channels, {"u": np.full(len(parts[1].t), 1e200)}, "overflow")
