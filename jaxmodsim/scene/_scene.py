@@ -13,6 +13,7 @@ from .._core.functions import as_function
 from .._core.parameters import as_real
 from .._core.shapes import PerDof, Scalar
 from ..mechanics import AbstractConstraint, Lagrangian
+from ._coordinates import as_coordinates, read_label
 from ._signal import Signal, signals_at, signals_from, signals_of
 from .forces._effect import AbstractEffect
 from .forces._friction import Friction
@@ -93,11 +94,13 @@ class Scene(eqx.Module):
       become floating; what is no number (sizes, options) belongs into the functions.
     - `effects`: tuple of `AppliedForce` and `Friction`.
     - `constraints`: tuple of `Constraint` and `VelocityConstraint`, for coordinates that are not independent.
+    - `coordinates`: names of the coordinates with their units, such as `("x [m]", "phi [rad]")`, for messages, tables
+      and figures. In functions and names of what is observed they remain `q[0]`, `q[1]`.
 
     **Raises:**
 
     - `ValueError` naming the entry that is no number, no effect, or has another's name, and friction that rests on a
-      constraint that is not there.
+      constraint that is not there; at the run for a number of `coordinates` that q0 has not.
     """
 
     lagrangian: Lagrangian = eqx.field(converter=partial(as_function, name="Scene lagrangian"))
@@ -105,6 +108,7 @@ class Scene(eqx.Module):
     effects: tuple[AbstractEffect, ...] = eqx.field(default=(), converter=_effects)
 
     constraints: tuple[AbstractConstraint, ...] = eqx.field(default=(), converter=_constraints)
+    coordinates: tuple[str, ...] = eqx.field(default=(), static=True, converter=as_coordinates)
 
     def __check_init__(self) -> None:
         """Refuse two things of one name, and what does not go together."""
@@ -118,6 +122,9 @@ class Scene(eqx.Module):
                 raise ValueError(f"Two constraints have the name {name!r}; names of constraints must differ.")
         for name in set(self.names) & set(self.constraint_names):
             raise ValueError(f"An effect and a constraint both have the name {name!r}; give one of them another name.")
+        for name in {read_label(text).name for text in self.coordinates} & {"t", *self.names}:
+            whose = "the time" if name == "t" else "an effect"
+            raise ValueError(f"A coordinate has the name {name!r}, which is that of {whose}; give it another name.")
         if self.event_driven and any(isinstance(x, Friction) and x.karnopp for x in self.effects):
             raise ValueError(
                 f"{', '.join(self.event_driven)}: set-valued laws of one scene run either all by events or all by"
