@@ -2,9 +2,9 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..identify import InputDesign
+from ._figure import Figure
 from ._style import BLUE, GREY, RED, small_unit
 
 

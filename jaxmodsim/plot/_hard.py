@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..validation.hard import CaseReport, largest_steps
+from ._figure import Figure
 from ._style import BLUE, GREEN, GREY, RED
 
 _KINDS = {

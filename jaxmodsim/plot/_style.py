@@ -3,6 +3,7 @@
 from ..validation.behaviour import Verdict
 
 BLUE, RED, GREY, GREEN = "#1f5fa8", "#c2452d", "#8a8a8a", "#2e8b57"
+COLOURS = (BLUE, RED, GREEN, "#7b4fa3", "#b8860b")  # of lines in one panel
 VERDICTS = {
     Verdict.PASS: GREEN,
     Verdict.FAIL: RED,

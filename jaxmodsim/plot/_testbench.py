@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from ..validation.testbench import RampRun
+from ._figure import Figure
 from ._style import BLUE, GREY, RED
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..analysis import Row, WorkPrecision
+from ._figure import Figure
 from ._style import GREY, RED, with_unit
 
 _MARKERS = "osD^vPX*"

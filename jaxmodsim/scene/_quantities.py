@@ -4,10 +4,13 @@ import math
 import re
 from dataclasses import replace
 
+import jax
+import jax.core
+import jax.numpy as jnp
+
 from .._core.parameters import Range
 from ._coordinates import Quantity, read_label
 from ._scene import Scene
-from .forces._applied_force import AppliedForce
 from .forces._effect import AbstractEffect
 from .forces._friction import Friction
 
@@ -24,8 +27,8 @@ def quantity_of(scene: Scene, series: str) -> Quantity:
     """What `q[0]`, `qd[0]`, or the force of an effect (`friction`, `pull[0]`) is called, with its unit.
 
     The velocity of `x [m]` is `x_dot [m/s]`. Coordinates without names keep `q[0]`, as "m or rad"; so do forces whose
-    unit depends on that, and friction along some other displacement than a coordinate, as "N or N m". A name that is
-    none of these has no unit.
+    unit depends on that, and friction along a displacement that is no sum or difference of coordinates, as "N or N m".
+    A name that is none of these has no unit.
     """
     state, component = _STATE.fullmatch(series), _COMPONENT.fullmatch(series)
     if state is not None and int(state[2]) < (len(scene.coordinates) or math.inf):
@@ -56,17 +59,32 @@ def _velocity(scene: Scene, i: int) -> Quantity:
 
 
 def _force_unit(scene: Scene, effect: AbstractEffect, index: int) -> str:
-    units = [_coordinate(scene, i).unit for i in range(max(len(scene.coordinates), index + 1))]
-    if isinstance(effect, AppliedForce):
-        return "N" if effect.at is not None else _FORCES.get(units[index], f"J/{units[index]}")
-    if len(units) == 1 and isinstance(effect, Friction) and effect.along is None:
-        return _FORCES.get(units[0], f"J/{units[0]}")
-    return "N" if set(units) == {"m"} else "N or N m"
+    if isinstance(effect, Friction):
+        unit = _slip_unit(scene, effect)
+    else:
+        unit = "m" if getattr(effect, "at", None) is not None else _coordinate(scene, index).unit
+    return _FORCES.get(unit, f"J/{unit}")
+
+
+def _slip_unit(scene: Scene, friction: Friction) -> str:
+    """Unit of the displacement that friction acts along: of the coordinates that it is a sum or a difference of."""
+    units = [read_label(text).unit for text in scene.coordinates]
+    if friction.along is None or not units:
+        return units[0] if units else "m or rad"
+    q, params, along = jnp.linspace(0.3, 0.7, len(units)), scene.bind_time(jnp.zeros(())).params, friction.along
+    if jax.eval_shape(along, q, params).shape != ():
+        return "m"
+    slopes = jax.jacfwd(along)(q, params)
+    if isinstance(slopes, jax.core.Tracer):
+        return "m or rad"
+    within = {unit for unit, slope in zip(units, slopes, strict=True) if slope != 0}
+    return (
+        within.pop() if len(within) == 1 and bool(jnp.isin(slopes, jnp.asarray([-1.0, 0.0, 1.0])).all()) else "m or rad"
+    )
 
 
 def in_units_of(scene: Scene, effect: AbstractEffect, allowed: Range) -> Range:
     """The range of a number of an effect: in N m and rad for friction about an axis."""
-    about = isinstance(effect, Friction) and effect.along is None and effect.normal_force is None
-    if not about or [read_label(text).unit for text in scene.coordinates] != ["rad"]:
+    if not isinstance(effect, Friction) or effect.normal_force is not None or _slip_unit(scene, effect) != "rad":
         return allowed
     return replace(allowed, unit=_ABOUT_AN_AXIS.get(allowed.unit, allowed.unit))

@@ -122,8 +122,9 @@ class Scene(eqx.Module):
                 raise ValueError(f"Two constraints have the name {name!r}; names of constraints must differ.")
         for name in set(self.names) & set(self.constraint_names):
             raise ValueError(f"An effect and a constraint both have the name {name!r}; give one of them another name.")
-        for name in {read_label(text).name for text in self.coordinates} & {"t", *self.names}:
-            whose = "the time" if name == "t" else "an effect"
+        coordinates = [read_label(text).name for text in self.coordinates]
+        for name in {"t", "time", *self.names, *(f"{each}_dot" for each in coordinates)} & set(coordinates):
+            whose = "an effect" if name in self.names else "a velocity" if name.endswith("_dot") else "the time"
             raise ValueError(f"A coordinate has the name {name!r}, which is that of {whose}; give it another name.")
         if self.event_driven and any(isinstance(x, Friction) and x.karnopp for x in self.effects):
             raise ValueError(

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field, fields
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
 import jax.core
@@ -17,10 +17,15 @@ from ..mechanics import momentum
 from ..scene import ConstraintReaction, Scene, State, forward_dynamics
 from ..solvers import EventLog
 from ._accuracy import Accuracy
+from ._columns import Columns, columns
 from ._energy_ledger import EnergyLedger, event_losses, ledger
 from ._outcome import RunResult, outcome_messages
 from ._run_request import is_known
 from ._solve import RunInputs, RunOptions, RunOutput, solve_logged
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
 
 _Value = TypeVar("_Value")
 
@@ -196,6 +201,19 @@ class Trajectory:
             sum(each.values(), zero) for each in (book.stored, book.supplied, book.dissipated)
         )
         return Energy(book.kinetic, book.potential, stored, supplied, dissipated, book.balance)
+
+    @property
+    def columns(self) -> Columns:
+        """Coordinates, velocities, forces and modes at the times that were reached, by name, with their units."""
+        return columns(self.scene, self.t, self.q, self.qd, self.forces, self.mode)
+
+    def to_dataframe(self) -> "pd.DataFrame":
+        """`columns` as a pandas DataFrame over time; `attrs["units"]` has the units."""
+        return self.columns.to_dataframe()
+
+    def to_xarray(self) -> "xr.Dataset":
+        """`columns` as an xarray Dataset over time, with units as attributes."""
+        return self.columns.to_xarray()
 
     @property
     def log_size(self) -> int:

@@ -115,9 +115,7 @@ def test_coordinates_have_names_and_units() -> None:
     assert quantity_of(Scene(free, effects=(law,)), "friction") == ("friction", "N or N m")
     assert quantity_of(Scene(free, coordinates=("s [mm]", "z")), "q[1]").label == "z"
     # Of a run that fails, the state has their names, too.
-    with pytest.raises(
-        SimulationError, match=r"(?s)coordinate q\[1\] \(b\):.*with a = 0 m, b = 0 m, a_dot = 0 m/s"
-    ):
+    with pytest.raises(SimulationError, match=r"(?s)coordinate q\[1\] \(b\):.*with a = 0 m, b = 0 m, a_dot = 0 m/s"):
         run(Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, coordinates=("a [m]", "b [m]")), 2)
     with pytest.raises(ValueError, match=r"there are: q\[0\] \(phi\), qd\[0\] \(phi_dot\), applied\[0\], friction;"):
         named_series(run(axis), "phi")
