@@ -1,5 +1,6 @@
 """Scenes: what is in them, and the vector field that follows."""
 
+from . import _readable as _readable  # what they print
 from ._coordinates import Quantity as Quantity
 from ._dynamics import ConstraintReaction as ConstraintReaction
 from ._dynamics import State as State

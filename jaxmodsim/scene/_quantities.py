@@ -21,6 +21,7 @@ _FORCES = {"m": "N", "rad": "N m", "m or rad": "N or N m", "": ""}
 _ABOUT_AN_AXIS = {
     "N": "N m", "N/m": "N m/rad", "N s/m": "N m s/rad", "N/s": "N m/s", "m": "rad", "m/s": "rad/s",
 }  # fmt: skip
+_PER_NEWTON = {"N": "1", "N/m": "1/m", "N s/m": "s/m", "N/s": "1/s"}
 
 
 def quantity_of(scene: Scene, series: str) -> Quantity:
@@ -60,13 +61,13 @@ def _velocity(scene: Scene, i: int) -> Quantity:
 
 def _force_unit(scene: Scene, effect: AbstractEffect, index: int) -> str:
     if isinstance(effect, Friction):
-        unit = _slip_unit(scene, effect)
+        unit = slip_unit(scene, effect)
     else:
         unit = "m" if getattr(effect, "at", None) is not None else _coordinate(scene, index).unit
     return _FORCES.get(unit, f"J/{unit}")
 
 
-def _slip_unit(scene: Scene, friction: Friction) -> str:
+def slip_unit(scene: Scene, friction: Friction) -> str:
     """Unit of the displacement that friction acts along: of the coordinates that it is a sum or a difference of."""
     units = [read_label(text).unit for text in scene.coordinates]
     if friction.along is None or not units:
@@ -84,7 +85,10 @@ def _slip_unit(scene: Scene, friction: Friction) -> str:
 
 
 def in_units_of(scene: Scene, effect: AbstractEffect, allowed: Range) -> Range:
-    """The range of a number of an effect: in N m and rad for friction about an axis."""
-    if not isinstance(effect, Friction) or effect.normal_force is not None or _slip_unit(scene, effect) != "rad":
+    """The range of a number of an effect: in N m and rad for friction about an axis, per newton under a load."""
+    if not isinstance(effect, Friction):
         return allowed
-    return replace(allowed, unit=_ABOUT_AN_AXIS.get(allowed.unit, allowed.unit))
+    if effect.normal_force is not None:
+        return replace(allowed, unit=_PER_NEWTON.get(allowed.unit, allowed.unit))
+    about = slip_unit(scene, effect) == "rad"
+    return replace(allowed, unit=_ABOUT_AN_AXIS.get(allowed.unit, allowed.unit)) if about else allowed

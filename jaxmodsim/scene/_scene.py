@@ -11,6 +11,7 @@ from jaxtyping import Array, PyTree
 
 from .._core.functions import as_function
 from .._core.parameters import as_real
+from .._core.readable import AbstractReadable
 from .._core.shapes import PerDof, Scalar
 from ..mechanics import AbstractConstraint, Lagrangian
 from ._coordinates import as_coordinates, read_label
@@ -77,7 +78,7 @@ def _names(things: Any, default: Callable[[Any], str]) -> tuple[str, ...]:
     return tuple(names)
 
 
-class Scene(eqx.Module):
+class Scene(AbstractReadable, eqx.Module):
     """A mechanism, the effects on it, and the constraints it obeys.
 
     A scene is a pytree whose leaves are all its numbers, so `jax.grad`, `jax.vmap` and `equinox.tree_at` work on it,

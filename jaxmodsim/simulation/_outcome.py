@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -108,7 +109,9 @@ class RunResult(eqx.Module):
 
     def __str__(self) -> str:
         """The sentence."""
-        return self.message
+        return "Traced: known outside of jax.jit." if isinstance(self.code, jax.core.Tracer) else self.message
+
+    __repr__ = __str__
 
 
 def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
