@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from ..scene import Friction, quantity_of
 from ..simulation import Trajectory
 from ._figure import Figure
-from ._style import COLOURS, GREY
+from ._style import COLOURS, GREY, panel_letters
 
 _SHADE = "#d9d9d9"
 
@@ -64,6 +64,7 @@ def run(trajectory: Trajectory) -> Figure:
     if "stick" in shaded[1]:
         figure.legend([shaded[0][shaded[1].index("stick")]], ["stick"], loc="outside upper right", frameon=False)
     figure.align_ylabels(axes)
+    panel_letters(axes)
     return figure
 
 

@@ -70,6 +70,7 @@ def test_figure_of_a_run(belt: Trajectory, mixed: Trajectory) -> None:
     figure = plot.run(belt)
     assert [axis.get_ylabel() for axis in figure.axes] == ["x [m]", "x_dot [m/s]", "friction [N]"]
     assert figure.axes[-1].get_xlabel() == "time [s]"
+    assert [axis.get_title(loc="left") for axis in figure.axes] == ["a", "b", "c"]
     # It sticks to the belt until k x = Fs, and in slip for the time that the closed form says.
     numbers = belt_oscillator.PARAMS
     breaks = numbers["Fs"] / numbers["k"] / numbers["belt"]
