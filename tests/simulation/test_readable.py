@@ -94,10 +94,10 @@ def test_a_notebook_shows_tables(run: jms.Trajectory) -> None:
 
 @pytest.mark.quick
 def test_help_and_version() -> None:
-    text = pydoc.render_doc(jms, renderer=pydoc.plaintext)
+    text = pydoc.plain(pydoc.render_doc(jms))
     public = [name for name in dir(jms) if name[0] not in "_" and name not in ("TYPE_CHECKING", "cli", "jaxtyping")]
     listed = set(text.replace(",", " ").replace(";", " ").replace(".", " ").replace("(", " ").replace(")", " ").split())
     rooms = {"friction", "mechanics", "scene", "simulation", "solvers"}
     assert set(public) - rooms <= listed
-    assert "ts: 'ArrayLike | list[float] | None' = None" in pydoc.render_doc(jms.simulate, renderer=pydoc.plaintext)
+    assert "ts: 'ArrayLike | list[float] | None' = None" in pydoc.plain(pydoc.render_doc(jms.simulate))
     assert jms.__version__.count(".") == 2
