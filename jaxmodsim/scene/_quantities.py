@@ -21,7 +21,6 @@ _FORCES = {"m": "N", "rad": "N m", "m or rad": "N or N m", "": ""}
 _ABOUT_AN_AXIS = {
     "N": "N m", "N/m": "N m/rad", "N s/m": "N m s/rad", "N/s": "N m/s", "m": "rad", "m/s": "rad/s",
 }  # fmt: skip
-_PER_NEWTON = {"N": "1", "N/m": "1/m", "N s/m": "s/m", "N/s": "1/s"}
 
 
 def quantity_of(scene: Scene, series: str) -> Quantity:
@@ -89,6 +88,6 @@ def in_units_of(scene: Scene, effect: AbstractEffect, allowed: Range) -> Range:
     if not isinstance(effect, Friction):
         return allowed
     if effect.normal_force is not None:
-        return replace(allowed, unit=_PER_NEWTON.get(allowed.unit, allowed.unit))
+        return replace(allowed, unit=f"{allowed.unit} per N") if allowed.unit.startswith("N") else allowed
     about = slip_unit(scene, effect) == "rad"
     return replace(allowed, unit=_ABOUT_AN_AXIS.get(allowed.unit, allowed.unit)) if about else allowed

@@ -46,7 +46,7 @@ def test_a_scene_and_its_gradient_print_names_values_and_units() -> None:
     assert len(str(many).splitlines()) <= 30
     assert "... and 18 more" in str(many)
     loaded = jms.problems.slider_crank.scene(mu=0.1)
-    assert "friction.Fc [1]" in str(loaded)
+    assert "friction.Fc [N per N]" in str(loaded)
 
 
 def test_a_law_prints_its_parameters() -> None:
