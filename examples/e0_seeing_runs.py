@@ -47,7 +47,11 @@ def main(out: Path, smoke: bool = False) -> None:
     cases = {
         "pendulum": (problems.stick_slip_pendulum.scene(), ([1.2], [0.0]), pendulum),
         "four_bar": (problems.four_bar.scene(), problems.four_bar.state(0.7, 8.0), four_bar),
-        "slider_crank": (problems.slider_crank.scene(mu=0.1), problems.slider_crank.state(0.6, 9.0), slider_crank),
+        "slider_crank": (
+            problems.slider_crank.scene(mu=None if smoke else 0.1),
+            problems.slider_crank.state(0.6, 9.0),
+            slider_crank,
+        ),
         "belt": (problems.belt_oscillator.scene(), ([0.0], [0.0]), belt),
     }
     out.mkdir(parents=True, exist_ok=True)
