@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._core.parameters import check_ranges, ranges_of
+from .._core.readable import AbstractReadable
 from .._core.shapes import PerDof, Scalar
 from .._core.state_dependent import bind_state, is_state_dependent, nominal
 from ._law_case import STANDARD, LawCase, steady_curve
@@ -42,7 +43,7 @@ _NO_MEMORY = {
 _JUMPS = {"presliding": "The force is a function of velocity and jumps as the velocity reverses."}
 
 
-class AbstractLaw(eqx.Module):
+class AbstractLaw(AbstractReadable, eqx.Module):
     """A friction law: knows its slip velocity [m/s or rad/s] and its own state, nothing of the mechanism.
 
     Its class says all that is known of it; `register_law` makes it known to the command line, the benches and tables.

@@ -2,10 +2,10 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..identify import InputDesign
-from ._style import BLUE, GREY, RED, small_unit
+from ._figure import Figure
+from ._style import BLUE, GREY, RED, panel_letters, small_unit
 
 
 def design_figure(design: InputDesign, *, caption: str = "") -> Figure:
@@ -35,6 +35,7 @@ def design_figure(design: InputDesign, *, caption: str = "") -> Figure:
             axis.axhline(level, color=RED, lw=1.0, ls="--", label="limit" if side > 0 else "_")
         axis.set(ylabel=f"{quantity} [{unit}]")
     axes[-1].set_xlabel("time [s]")
+    panel_letters(axes)
     handles = {str(line.get_label()): line for axis in axes for line in axis.get_lines()}
     shown = {label: line for label, line in handles.items() if not label.startswith("_")}
     left.legend(list(shown.values()), list(shown), loc="outside upper center", ncols=3, fontsize=9)

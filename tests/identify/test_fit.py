@@ -103,6 +103,10 @@ def test_a_parameter_without_effect_is_reported_and_not_given_an_error_of_zero(c
     force = np.asarray(law_force(law, jnp.asarray(t), jnp.asarray(motion["x"])))
     start = jms.LuGre(sigma0=1e4, sigma1=0.0, sigma2=0.5, Fc=0.8, Fs=1.0, vs=1e-9)
     result = jms.fit_law(start, jms.Record(t, force, motion), ("Fc", "Fs"))
+    assert repr(result) == str(result)
+    assert f"<td style='text-align:left'>Fc [N]</td><td style='text-align:left'>{result.values['Fc']:.6g}</td>" in (
+        result._repr_html_()
+    )
     assert np.isinf(result.errors["Fs"])
     assert any("Fs has no effect" in remark for remark in remarks(result))
     assert result.values["Fc"] == pytest.approx(1.0, rel=1e-3)

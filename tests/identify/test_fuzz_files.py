@@ -21,7 +21,6 @@ import pandas as pd
 import pytest
 import scipy.io
 from hypothesis import strategies as st
-from matplotlib.figure import Figure
 
 import jaxmodsim as jms
 from jaxmodsim._core import files
@@ -30,6 +29,7 @@ from jaxmodsim.analysis import Row, WorkPrecision, load_work_precision
 from jaxmodsim.cli import _output, _read
 from jaxmodsim.identify import FitResult
 from jaxmodsim.identify.uncertainty._estimate import FitDiagnostics, FitProvenance, ParameterEstimate
+from jaxmodsim.plot import Figure
 
 from ..helpers.fuzz import fuzz
 from .test_how_sure import PARTS, same

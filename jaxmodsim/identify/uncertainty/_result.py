@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._core.files import jsonable, written_whole
+from ..._core.readable import AbstractReadable, Table, table_of
 from ..data._record import Record
 from ..estimate._search import ENDINGS, SearchResult
 from ..model._parameters import with_numbers
@@ -37,8 +38,8 @@ _PARTS = {"estimate": ParameterEstimate, "diagnostics": FitDiagnostics, "provena
 _LEFT_OUT = ("model",)
 
 
-@dataclass(frozen=True, kw_only=True)
-class FitResult:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class FitResult(AbstractReadable):
     """A fitted model.
 
     - `estimate`: parameters with their covariance. `diagnostics`: how the fit went. `provenance`: records and model.
@@ -181,6 +182,22 @@ class FitResult:
         errors = ", ".join(f"{'' if len(rmse) == 1 else name + ' '}{x:.6g}" for name, x in rmse.items())
         ending = f"RMSE {errors}; {self.diagnostics.evaluations} evaluations, {self.diagnostics.ending}"
         return "\n".join([*lines, ending, *remarks(self)])
+
+    __repr__ = __str__
+
+
+@table_of.register
+def _(result: FitResult) -> Table:
+    intervals = result.estimate.intervals()
+    rows = []
+    for name, value, error, _, unit in result.estimate.rows():
+        low, high = intervals[name]
+        label = f"{name} [{unit}]" if unit else name
+        rows.append((label, f"{value:.6g}", f"{error:.2g}", f"{low:.5g} to {high:.5g}"))
+    errors = ", ".join(f"{name} {x:.6g}" for name, x in result.diagnostics.rmse.items())
+    names = ", ".join(record.name for record in result.provenance.records)
+    head = ("parameter", "value", "standard error", "95 % interval")
+    return Table(f"Fit to {names}, RMSE {errors}", head, rows, (result.diagnostics.ending, *remarks(result)))
 
 
 def remarks(result: FitResult) -> tuple[str, ...]:
