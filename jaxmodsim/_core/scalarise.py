@@ -306,7 +306,7 @@ def _shorten(name: str, operands: list[Value]) -> Value | None:
     if name == "select_n":
         chosen, *cases = operands
         if is_known(chosen):
-            return cases[int(chosen)]
+            return cases[int(np.asarray(chosen))]
         # The derivative of |v| by anything else is zero on either side.
         if all(map(is_known, cases)) and all(x == cases[0] for x in cases):
             return cases[0]

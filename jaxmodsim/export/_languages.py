@@ -200,7 +200,7 @@ class _BlockText:
     def branch(self, branch: Branch) -> Iterator[str]:
         for out in branch.outs:
             yield f"{self.language.declared(self.language.variable, out.dtype, self.new(out))};"
-        index, last = self.value(branch.index), len(branch.arms) - 1
+        index, last = self.value(branch.chosen), len(branch.arms) - 1
         for i, (block, results) in enumerate(branch.arms):
             test = "" if i == last else f"if ({index} == {i}) "
             yield f"{'} else ' if i else ''}{test}{{"

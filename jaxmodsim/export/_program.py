@@ -59,9 +59,9 @@ class Loop(NamedTuple):
 
 
 class Branch(NamedTuple):
-    """The arm number `index`, each a block with the values that it gives to `outs`; the last one for any other index."""
+    """The arm with the number `chosen`, or else the last one; each a block with the values that it gives to `outs`."""
 
-    index: Entry
+    chosen: Entry
     outs: list[Symbol]
     arms: list[tuple["Block", list[Entry]]]
 
@@ -97,6 +97,10 @@ def _scalar_array(x: Entry) -> Parts:
     out = np.empty((), object)
     out[()] = x
     return out
+
+
+def _one(dtype: np.dtype) -> np.generic:
+    return dtype.type(1)
 
 
 def _is_symbol(x: object) -> bool:
@@ -144,6 +148,13 @@ class _StatementWriter(AbstractScalars):
             return self.power(first, params["y"])
         if name == "square":
             return self.apply(jax.lax.mul, "mul", {}, [first, first])
+        if name in ("rsqrt", "logistic"):
+            one = _one(first.dtype)
+            if name == "rsqrt":
+                return self.assign("div", [one, self.assign("sqrt", operands)])
+            return self.assign(
+                "div", [one, self.assign("add", [one, self.assign("exp", [self.assign("neg", operands)])])]
+            )
         if name == "clamp":
             low, x, high = operands
             return self.apply(jax.lax.min, "min", {}, [self.apply(jax.lax.max, "max", {}, [x, low]), high])
@@ -162,12 +173,12 @@ class _StatementWriter(AbstractScalars):
 
     def power(self, x: Value, exponent: int) -> Value:
         """By products, as JAX computes it."""
-        out: Value = np.ones((), x.dtype)[()]
+        out: Value = _one(x.dtype)
         for digit in bin(abs(exponent))[:1:-1]:
             if digit == "1":
                 out = self.apply(jax.lax.mul, "mul", {}, [out, x])
             x = self.apply(jax.lax.mul, "mul", {}, [x, x])
-        return out if exponent >= 0 else self.apply(jax.lax.div, "div", {}, [np.ones((), x.dtype)[()], out])
+        return out if exponent >= 0 else self.apply(jax.lax.div, "div", {}, [_one(x.dtype), out])
 
     def whole(self, eqn: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
         """Loops, branches, calls, and what moves entries to places that are known."""
@@ -185,7 +196,7 @@ class _StatementWriter(AbstractScalars):
         if all(x is not None for x in known):
             out = eqn.primitive.bind(*known, **params)
             return [np.asarray(x) for x in (out if eqn.primitive.multiple_results else [out])]
-        sizes = [int(x.aval.size) for x in (*eqn.invars, *eqn.outvars)]
+        sizes = [self.parts(x).size for x in inputs]
         if name in _FOLDS:
             return [self.fold(_FOLDS[name], name.removeprefix("reduce_"), params["axes"], self.parts(inputs[0]))]
         if name in _INDEXED and all(x is not None for x in known[1:2]):
@@ -240,7 +251,9 @@ class _StatementWriter(AbstractScalars):
             self.block = []
             after = [self.parts(x) for x in self.run(body.jaxpr, body.consts, [*body_consts, *symbols])]
             inside = self.block
-        changed = [parts for parts, kept in zip(zip(symbols, starts, after, strict=True), same, strict=True) if not kept]
+        changed = [
+            parts for parts, kept in zip(zip(symbols, starts, after, strict=True), same, strict=True) if not kept
+        ]
         carries = [Carry(*each) for parts in changed for each in zip(*(x.flat for x in parts), strict=True)]
         self.block.append(Loop(self.bound(condition, carries), carries, head, condition, inside))
         return list(symbols)
@@ -316,14 +329,14 @@ def _needed(block: Block, live: set[Symbol]) -> Block:
         elif isinstance(statement, Branch):
             wanted = [out in live for out in statement.outs]
             if any(wanted):
-                _add(live, [statement.index])
+                _add(live, [statement.chosen])
                 arms = []
                 for inside, results in statement.arms:
                     results = [x for x, each in zip(results, wanted, strict=True) if each]
                     _add(live, results)
                     arms.append((_needed(inside, live), results))
                 outs = [x for x, each in zip(statement.outs, wanted, strict=True) if each]
-                kept.append(Branch(statement.index, outs, arms))
+                kept.append(Branch(statement.chosen, outs, arms))
         elif any(carry.symbol in live for carry in statement.carries):
             kept.append(_needed_loop(statement, live))
     return kept[::-1]

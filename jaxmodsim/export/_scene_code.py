@@ -99,7 +99,7 @@ def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
 
     `p` are the numbers of the scene by the names of an enumeration, `p[NAME_p_friction_Fc]`; `NAME_numbers` are those
     it was written with. What is measured or commanded in every cycle, a torque or a temperature, is such a number.
-    Where nothing depends on the time itself, give the times 0 and h: they keep their digits however long the drive runs.
+    Where nothing depends on the time itself, give the times 0 and h, which keep their digits however long it runs.
 
     Numbers are `double` for a scene of float64 and `float` for one of float32, for units without `double`. An
     evaluation is that of JAX to four units in the last place of its terms, if the compiler neither reorders sums nor
@@ -168,7 +168,7 @@ def _scene_code(scene: Scene, dof: int, name: str, language: Language, caller: s
             f"{caller} does not write a Signal: put a number in its place, which the caller sets before every step."
         )
     check_step(scene)
-    start = jnp.zeros(dof, jnp.result_type(*jtu.tree_leaves(scene), *([] if jtu.tree_leaves(scene) else [float])))
+    start = jnp.zeros(dof, jnp.result_type(*(jtu.tree_leaves(scene) or [float])))
     y = State(start, start, scene.initial_state(start))
     check_scene(scene, y)
     routines = _routines(scene, y)
@@ -259,9 +259,9 @@ def _routine_text(routine: _Routine, scene: Scene, y: State, language: Language,
         lines = write_program(program, routine.results, language, "    " if javascript else "  ")
     except ValueError as error:
         raise ValueError(
-            f"{caller} cannot write {error}, which `{routine.name}` of the scene needs. It writes arithmetic, elementary"
-            " functions and choices (jnp.where) of single numbers and of small arrays: make that part of the"
-            " Lagrangian, force or law of these."
+            f"{caller} cannot write {error}, which `{routine.name}` of the scene needs. It writes arithmetic,"
+            " elementary functions and choices (jnp.where) of single numbers and of small arrays: make that part of"
+            " the Lagrangian, force or law of these."
         ) from error
     if javascript:
         arguments = ", ".join([*routine.times, "p", "y", *([routine.extra[0]] if routine.extra else [])])

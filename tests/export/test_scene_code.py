@@ -69,7 +69,7 @@ def many_functions(t: Any, q: Any, qd: Any, p: Any) -> Any:
     x, v = q[0], qd[0]
     a = 0.5 + 0.4 * jnp.sin(x) * jnp.cos(v)
     smooth = [jnp.tan(a), jnp.arcsin(a), jnp.arccos(a), jnp.arctan(x), jnp.arctan2(v, a), jnp.sinh(a), jnp.cosh(x)]
-    smooth += [jnp.tanh(v), jnp.exp(v), jnp.expm1(a), jnp.log(a), jnp.log1p(a), jnp.sqrt(a), jnp.cbrt(x), a**p["n"]]
+    smooth += [jnp.tanh(v), jnp.exp(v), jnp.expm1(a), jnp.log(a), jnp.log1p(a), jnp.sqrt(a), jnp.cbrt(x), a ** p["n"]]
     smooth += [1.0 / (x**3 + 8.0 * jnp.sign(x)), jax.lax.rsqrt(a), jax.nn.sigmoid(x), jnp.linalg.norm(q - p["at"])]
     bent = [jnp.floor(3.0 * x), jnp.ceil(x * v), jnp.sign(v), jnp.clip(x, -0.5, 0.5), jnp.maximum(x, v), jnp.abs(v)]
     bent += [jnp.where((x > 0) ^ (v > 0), x, v), jnp.where(jnp.isfinite(x) & ~(v <= 0), t, x), jnp.fmod(x, 0.7)]
@@ -140,7 +140,9 @@ class InC:
         source, self.program = folder / "scene.c", folder / "scene"
         source.write_text(text + MAIN.replace("FRICTION", call).replace("REAL", real))
         assert COMPILER is not None
-        found = subprocess.run([COMPILER, *CHECKED, "-x", "c", "-", "-o", str(folder / "try")], input=b"int main(void){return 0;}")
+        found = subprocess.run(
+            [COMPILER, *CHECKED, "-x", "c", "-", "-o", str(folder / "try")], input=b"int main(void){return 0;}"
+        )
         checks = CHECKED if found.returncode == 0 else []
         subprocess.run([COMPILER, *FLAGS, *checks, str(source), "-lm", "-o", str(self.program)], check=True)
         self.numbers, self.size = flat(scene), 0
@@ -210,11 +212,12 @@ def test_the_feed_forward_is_the_force_of_the_laws(name: str, in_c: Callable[[st
         force, after = jnp.zeros(dof), {}
         for key, effect in zip(scene.names, scene.effects, strict=True):
             if isinstance(effect, jms.Friction):
+                law: Any = effect.law
                 along = effect.direction(state.q, scene.params)
-                after[key] = effect.law.step_exact(jnp.sum(along * state.qd), state.z[key], h)
+                after[key] = law.step_exact(jnp.sum(along * state.qd), state.z[key], h)
                 mean = (after[key] - state.z[key]) / h
                 load = 1.0 if effect.normal_force is None else scene.params["m"]
-                force += along * load * effect.law.force_given_zdot(jnp.sum(along * state.qd), after[key], mean)
+                force += along * load * law.force_given_zdot(jnp.sum(along * state.qd), after[key], mean)
         return force, jnp.stack(list(after.values()))
 
     force, z = jax.jit(jax.vmap(expected))(y)
@@ -241,7 +244,9 @@ def test_a_scene_of_float32_is_written_in_float(tmp_path: Path) -> None:
     text = to_c(scene, dof)
     assert "double" not in text
     h = 1e-3
-    run = jms.simulate(scene, jnp.zeros(1, jnp.float32), jnp.zeros(1, jnp.float32), 3.0, dt=h, solver=jms.ImplicitFriction())
+    run = jms.simulate(
+        scene, jnp.zeros(1, jnp.float32), jnp.zeros(1, jnp.float32), 3.0, dt=h, solver=jms.ImplicitFriction()
+    )
     (solved,), _, after = InC(scene, dof, tmp_path)("s", 0.0, h, np.zeros((1, 3)), steps=3000)
     assert solved
     np.testing.assert_allclose(after[0, :2], [run.q[-1, 0], run.qd[-1, 0]], rtol=1e-3)
@@ -291,7 +296,10 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: jms.Scene(one_mass, params={"m": 1.0}, constraints=(jms.Constraint(lambda q: q[0], name="wall"),)),
         "'wall': choose coordinates",
     ),
-    "signal": (lambda: jms.Scene(one_mass, params={"m": jms.Signal([0.0, 1.0], [1.0, 2.0])}), "does not write a Signal"),
+    "signal": (
+        lambda: jms.Scene(one_mass, params={"m": jms.Signal([0.0, 1.0], [1.0, 2.0])}),
+        "does not write a Signal",
+    ),
     "sort": (lambda: with_force(lambda t, q, qd, p: jnp.sort(jnp.stack([q[0], qd[0]]))[:1]), "cannot write sort"),
     "gamma function": (lambda: with_force(lambda t, q, qd, p: jax.lax.lgamma(q)), "cannot write lgamma"),
     "loop without a limit": (lambda: with_force(endless), "loop without a known limit"),
