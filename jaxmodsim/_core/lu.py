@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias, TypeGuard
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,7 @@ class _Shape(NamedTuple):
     pairs: tuple[tuple[int, int], ...]
 
 
-def is_known(x: object) -> TypeGuard[np.generic]:
+def is_known(x: object) -> bool:
     """Whether a number is known while tracing."""
     return isinstance(x, np.generic)
 
@@ -167,9 +167,7 @@ def _eliminate(table: _Rows, pivot: bool) -> tuple[_Rows, dict[tuple[int, int], 
 
 
 def _choose(condition: Array, a: _Entry, b: _Entry) -> _Entry:
-    if is_known(a) and is_known(b) and a == b:
-        return a
-    return jnp.where(condition, a, b)
+    return a if is_known(a) and is_known(b) and a == b else jnp.where(condition, a, b)
 
 
 def _reduce(x: _Entry, a: _Entry, b: _Entry) -> _Entry:

@@ -233,7 +233,11 @@ class AbstractScalars(abc.ABC):
         short = _shorten(name, operands)
         if short is not None:
             return short
-        key = (name, str(params), *(x.tobytes() + x.dtype.str.encode() if is_known(x) else id(x) for x in operands))
+        key = (
+            name,
+            str(params),
+            *(np.asarray(x).tobytes() + x.dtype.str.encode() if is_known(x) else id(x) for x in operands),
+        )
         if key not in self.memory:
             # The operands are kept, for an id is that of one object only while it lives.
             self.memory[key] = operands, self.scalar(compute, name, params, operands)
