@@ -36,11 +36,10 @@ extern const {real} {name}_numbers[{name}_P];
 const {real} {name}_numbers[{name}_P] = {{{numbers}}};
 
 {routines}
+/* Steps of the length h from the time t, one after another; false (0) if one was not solved. */
 {run} {{
   for (long i = 0; i < steps; ++i) {{
-    const {real} next = t + h;
-    if (!{name}_step(t, next, p, y)) return 0;
-    t = next;
+    if (!{name}_step(t + i * h, t + (i + 1) * h, p, y)) return 0;
   }}
   return 1;
 }}
@@ -56,9 +55,7 @@ const {name} = (() => {{
   // Steps of the length h from the time t, one after another; false if one was not solved.
   function run(t, h, steps, p, y) {{
     for (let i = 0; i < steps; ++i) {{
-      const next = t + h;
-      if (!step(t, next, p, y)) return false;
-      t = next;
+      if (!step(t + i * h, t + (i + 1) * h, p, y)) return false;
     }}
     return true;
   }}
