@@ -198,7 +198,8 @@ class _StatementWriter(AbstractScalars):
             return [np.asarray(x) for x in (out if eqn.primitive.multiple_results else [out])]
         sizes = [self.parts(x).size for x in inputs]
         if name in _FOLDS:
-            return [self.fold(_FOLDS[name], name.removeprefix("reduce_"), params["axes"], self.parts(inputs[0]))]
+            axes = tuple(map(int, params["axes"]))
+            return [self.fold(_FOLDS[name], name.removeprefix("reduce_"), axes, self.parts(inputs[0]))]
         if name in _INDEXED and all(x is not None for x in known[1:2]):
             return [self.move(eqn, inputs, known)]
         raise ValueError(f"{name} of arrays with {max(sizes)} entries" if max(sizes) > 1 else name)

@@ -29,11 +29,13 @@ enum {{
 /* Entries of y: {states}. */
 enum {{ {name}_Y = {size}, {name}_DOF = {dof} }};
 
-extern const {real} {name}_numbers[{name}_P];
+extern const {real} {name}_numbers[{name}_P], {name}_rest[{name}_Y];
 {prototypes}
 
 /* The numbers with which the scene was written. */
 const {real} {name}_numbers[{name}_P] = {{{numbers}}};
+/* The state at rest at the origin. */
+const {real} {name}_rest[{name}_Y] = {{{rest}}};
 
 {routines}
 /* Steps of the length h from the time t, one after another; false (0) if one was not solved. */
@@ -50,6 +52,7 @@ const {name} = (() => {{
   const names = {names};
   const numbers = [{numbers}];
   const states = {states};
+  const rest = [{rest}];
 
 {routines}
   // Steps of the length h from the time t, one after another; false if one was not solved.
@@ -59,7 +62,7 @@ const {name} = (() => {{
     }}
     return true;
   }}
-  return {{ names, numbers, states, run, {exported} }};
+  return {{ names, numbers, states, rest, run, {exported} }};
 }})();
 """
 
@@ -94,18 +97,19 @@ def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
     - `NAME_friction(t0, t1, p, y, force)`, where there is friction: what the drive adds in every cycle to make up for
       it. Put the planned coordinates and velocities into `y`; the states of the laws in there are moved on.
 
-    `p` are the numbers of the scene by the names of an enumeration, `p[NAME_p_friction_Fc]`; `NAME_numbers` are those
-    it was written with. What is measured or commanded in every cycle, a torque or a temperature, is such a number.
-    Where nothing depends on the time itself, give the times 0 and h, which keep their digits however long it runs.
+    `p` are the numbers of the scene by the names of an enumeration, `p[NAME_p_friction_Fc]`; begin with those that it
+    was written with, `NAME_numbers`, and with the state at rest, `NAME_rest`. What is measured or commanded in every
+    cycle, a torque or a temperature, is such a number. Where nothing depends on the time itself, give the times 0 and
+    h, which keep their digits however long it runs.
 
     Numbers are `double` for a scene of float64 and `float` for one of float32, for units without `double`. An
     evaluation is that of JAX to four units in the last place of its terms, if the compiler neither reorders sums nor
     takes NaN for impossible (no `-ffast-math`).
 
     ```c
-    static double p[PRESS_P], y[PRESS_Y], u[1];   /* p: a copy of press_numbers; y: q, qd, bristle */
-    y[0] = q_plan; y[1] = qd_plan;
-    press_friction(0.0, 1e-3, p, y, u);           /* every millisecond */
+    static double y[press_Y], u[press_DOF];        /* q, qd, bristle; begins as a copy of press_rest */
+    y[0] = q_plan, y[1] = qd_plan;                 /* every millisecond */
+    press_friction(0.0, 1e-3, press_numbers, y, u);
     torque += u[0];
     ```
 
@@ -132,7 +136,7 @@ def to_javascript(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
     """JavaScript of a scene in float64: an object with the functions of `to_c`.
 
     `NAME.step(t0, t1, p, y)` and the others take arrays of numbers; `NAME.names` and `NAME.numbers` are the names and
-    values of p, `NAME.states` the names of y.
+    values of p, `NAME.states` the names of y, `NAME.rest` its values at rest.
 
     **Arguments:**
 
@@ -171,7 +175,8 @@ def _scene_code(scene: Scene, dof: int, name: str, language: Language, caller: s
     routines = _routines(scene, y)
     text = {each.name: _routine_text(each, scene, y, language, name, caller) for each in routines}
     fields = {"name": name, "routines": "\n".join(text.values())}
-    fields["numbers"] = ", ".join(language.literal(x) for leaf in jtu.tree_leaves(scene) for x in np.ravel(leaf))
+    for field, tree in (("numbers", scene), ("rest", y)):
+        fields[field] = ", ".join(language.literal(x) for leaf in jtu.tree_leaves(tree) for x in np.ravel(leaf))
     if language is JAVASCRIPT:
         names = {"names": json.dumps([*elements(scene)]), "states": json.dumps(_state_names(y))}
         return _JAVASCRIPT_TEXT.format(**fields, **names, exported=", ".join(text))

@@ -93,6 +93,14 @@ SCENES: dict[str, Callable[[], tuple[jms.Scene, int]]] = {
         ),
         2,
     ),
+    "block in the plane": lambda: (
+        jms.Scene(
+            lambda t, q, qd, p: 0.5 * p["m"] * jnp.sum(qd**2) - 3.0 * p["m"] * q[0],
+            params={"m": 1.0},
+            effects=(jms.Friction(LUGRE, along=lambda q: q, ellipse=1.5),),
+        ),
+        2,
+    ),
     "many functions": lambda: (
         jms.Scene(
             one_mass,
@@ -189,7 +197,7 @@ def test_the_right_hand_side_in_c_is_that_of_jax(name: str, in_c: Callable[[str]
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", ["lugre box", "coulomb belt", "arm with two laws"])
+@pytest.mark.parametrize("name", ["lugre box", "coulomb belt", "arm with two laws", "block in the plane"])
 def test_a_run_in_c_is_that_of_simulate(name: str, in_c: Callable[[str], InC]) -> None:
     scene, dof = scene_of(name)
     y0, h, t1 = random_states(scene, dof, 2)[1] * 0.1, 1e-3, 3.0
@@ -270,6 +278,12 @@ def test_a_run_in_javascript_is_that_of_simulate(name: str) -> None:
     np.testing.assert_allclose(after, expected, rtol=1e-9, atol=1e-12)
     assert len(names) == flat(scene).size
     assert states[0] == "q[0]"
+
+
+def test_the_state_at_rest_is_that_of_the_laws() -> None:
+    """Armstrong's law has rested long: its stiction is whole."""
+    law = jms.Armstrong(1e4, 1.0, 1.5, 0.01, 0.2, 0.1, 1.0)
+    assert "scene_rest[scene_Y] = {0.0, 0.0, 0.0, 1.0, 1.0, 0.0}" in to_c(ramped_box.scene(law))
 
 
 def test_the_text_names_its_numbers_and_allocates_nothing() -> None:
