@@ -277,7 +277,7 @@ class _StatementWriter(AbstractScalars):
                 if operands[0] is carry.symbol and is_known(carry.start) and step is not None and counts:
                     by = step.operands[1]
                     if is_known(by) and by == 1:
-                        found.append(int(_number(operands[1])) - int(_number(carry.start)))
+                        found.append(int(np.asarray(operands[1])) - int(np.asarray(carry.start)))
         if not found:
             raise ValueError("while, a loop without a known limit of its passes")
         return min(found)
@@ -296,10 +296,6 @@ class _StatementWriter(AbstractScalars):
         outs = [_symbols(np.empty(x.aval.shape), x.aval.dtype) for x in branches[0].jaxpr.outvars]
         self.block.append(Branch(index, [x for out in outs for x in out.flat], arms))
         return list(outs)
-
-
-def _number(x: Entry) -> Any:
-    return x
 
 
 def _symbols(like: np.ndarray, dtype: np.dtype | None = None) -> Parts:
