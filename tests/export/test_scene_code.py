@@ -337,7 +337,7 @@ def test_wrong_arguments_are_refused() -> None:
     with pytest.raises(ValueError, match="dof must be"):
         to_c(box, 0)
     with pytest.raises(ValueError, match="returned the shape"):
-        to_c(box, 2)
+        to_c(with_force(lambda t, q, qd, p: q[:1]), 2)
     with pytest.raises(ValueError, match="come to one name"):
         to_c(jms.Scene(one_mass, params={"m": 1.0, "a.b": 1.0, "a_b": 1.0}))
     with pytest.raises(ValueError, match="JavaScript has no float32"):
