@@ -82,6 +82,8 @@ if TYPE_CHECKING:
     from .analysis import formulations as formulations
     from .analysis import sensitivity as sensitivity
     from .analysis import work_precision as work_precision
+    from .export import to_c as to_c
+    from .export import to_javascript as to_javascript
     from .export import to_modelica as to_modelica
     from .export import to_mujoco as to_mujoco
     from .identify import FitResult as FitResult
@@ -106,7 +108,7 @@ _LATER = {
         "sensitivity",
         "work_precision",
     ),
-    "export": ("to_modelica", "to_mujoco"),
+    "export": ("to_c", "to_javascript", "to_modelica", "to_mujoco"),
     "identify": ("FitResult", "Record", "fit", "fit_law"),
     "metrics": (),
     "plot": (),
