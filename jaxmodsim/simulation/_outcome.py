@@ -149,7 +149,8 @@ def start_code(
     if canonical:
         code = jnp.where(quadratic(now.lagrangian, t, y.q, y.qd, now.params), code, NOT_QUADRATIC)
     offsets = _offsets(scene, dof)
-    code = _blame_margins(code, forward_dynamics(t, y, now, mode).validity_margins, offsets.checks, True)
+    if scene.checks:
+        code = _blame_margins(code, forward_dynamics(t, y, now, mode).validity_margins, offsets.checks, True)
     code = _blame_mass(code, _pivots(now, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
     if scene.constraints:
         off, turned = constraint_residual(scene.constraints, t, y.q, y.qd, now.params)

@@ -24,6 +24,7 @@ from ..solvers import (
     EventController,
     EventLog,
     EventSolver,
+    EventState,
     FiniteSteps,
     Gauss,
     ImplicitFriction,
@@ -35,7 +36,7 @@ from ..solvers import (
     first_step,
     unchecked,
 )
-from ._integrated_system import IntegratedSystem, RunFunctions, Work, project
+from ._integrated_system import AugmentedState, Instant, IntegratedSystem, RunFunctions, Work, project
 from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, end_code, start_code
 
 # Part of the absolute tolerance below which a slip velocity counts as none.
@@ -123,12 +124,12 @@ def _tolerances(inputs: RunInputs) -> tuple[Array, Array]:
     return inputs.rtol, jnp.maximum(inputs.atol, float(jnp.finfo(inputs.atol.dtype).tiny))
 
 
-def _first(inputs: RunInputs, method: dfx.AbstractSolver, rate: Any, y0: PyTree) -> Array:
-    """First step [s]."""
-    if inputs.dt is not None:
-        return inputs.dt
+def _first(inputs: RunInputs, method: dfx.AbstractSolver, rate: Any, y0: PyTree) -> tuple[Array, PyTree]:
+    """First step [s], and the rate of the first state."""
     scene = jax.lax.stop_gradient(inputs.scene)
-    step = first_step(
+    if inputs.dt is not None:
+        return inputs.dt, rate(inputs.t0, y0, scene)
+    step, slope = first_step(
         lambda t, y: rate(t, y, scene),
         inputs.t0,
         y0,
@@ -136,7 +137,7 @@ def _first(inputs: RunInputs, method: dfx.AbstractSolver, rate: Any, y0: PyTree)
         _tolerances(inputs),
         _shortest(inputs),
     )
-    return step if inputs.dtmax is None else jnp.minimum(step, inputs.dtmax)
+    return step if inputs.dtmax is None else jnp.minimum(step, inputs.dtmax), slope
 
 
 def _error_control(inputs: RunInputs, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
@@ -208,10 +209,10 @@ def _well_posed(inputs: RunInputs) -> Bool[Array, ""]:
     return fine & jnp.isfinite(jnp.stack([t0, t1, rtol, atol, *steps])).all()
 
 
-def _prepared(inputs: RunInputs, options: RunOptions, audited: bool) -> tuple[State, Any, RunFunctions, Int[Array, ""]]:
-    """State and modes to begin with, the functions of the run, and what is wrong with the start."""
+def _prepared(inputs: RunInputs, options: RunOptions, audited: bool) -> tuple[State, Any, RunFunctions]:
+    """State and modes to begin with, and the functions of the run."""
     scene, t0 = inputs.scene, inputs.t0
-    given = initial = initial_state(inputs)
+    initial = initial_state(inputs)
     check_scene(scene, initial)
     projects, rest = bool(scene.constraints) and options.project, _REST * inputs.atol
     mode = None
@@ -219,17 +220,16 @@ def _prepared(inputs: RunInputs, options: RunOptions, audited: bool) -> tuple[St
         initial = project(t0, initial, scene.bind_time(t0))
     if scene.event_driven:
         initial, mode = from_dynamics(lambda d: d.start(rest), t0, initial, scene)
-    canonical = isinstance(options.solver, Gauss)
+    system = IntegratedSystem(audited, isinstance(options.solver, Gauss))
+    return initial, mode, RunFunctions(system, rest, (inputs.rtol, inputs.atol), projects, scene.stick_drifts)
+
+
+def _start_code(inputs: RunInputs, functions: RunFunctions, mode: Array | None, rate: PyTree) -> Int[Array, ""]:
+    """What is wrong before the first step, where the first state has that rate."""
+    rate = rate.motion if isinstance(rate, AugmentedState) else rate
     atol = None if inputs.dt is not None else inputs.atol
-    start = start_code(scene, t0, given, vector_field(t0, initial, scene, mode), mode, atol, canonical)
-    start = jnp.where(_well_posed(inputs), start, ILL_POSED)
-    sticks = scene.stick_drifts
-    return (
-        initial,
-        mode,
-        RunFunctions(IntegratedSystem(audited, canonical), rest, (inputs.rtol, inputs.atol), projects, sticks),
-        start,
-    )
+    start = start_code(inputs.scene, inputs.t0, initial_state(inputs), rate, mode, atol, functions.system.canonical)
+    return jnp.where(_well_posed(inputs), start, ILL_POSED)
 
 
 def _integrate(
@@ -237,23 +237,28 @@ def _integrate(
 ) -> tuple[RunOutput, EventLog | None]:
     """Run diffrax; with modes only where the scene has them, with a log of that many events where one is wanted."""
     scene, exact = inputs.scene, bool(inputs.scene.event_driven)
-    initial, mode, functions, start = _prepared(inputs, options, audited)
+    initial, mode, functions = _prepared(inputs, options, audited)
     method, adjoint = _plugins(inputs, options)
     solver = _solver(method, functions, scene, options, log)
+    y0, controller = functions.system.start(inputs.t0, initial, scene, mode), _controller(inputs, method)
+    first, rate = _first(inputs, method, partial(functions.plain_derivative, mode=mode), y0)
+    start = _start_code(inputs, functions, mode, rate)
     # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
     starts = start == SUCCESS
     ts = None if inputs.ts is None else jnp.where(starts, inputs.ts, inputs.t0)
-    y0, controller = functions.system.start(inputs.t0, initial, scene, mode), _controller(inputs, method)
-    first = _first(inputs, method, partial(functions.plain_derivative, mode=mode), y0)
     if isinstance(solver, EventSolver):
         y0 = solver.start(inputs.t0, y0, mode, scene)
 
-    def keep_end(t: Array, y: PyTree, scene: Scene) -> Any:
-        return functions.keep(t, y, scene), ((y.events, y.status, y.fired), y.log) if exact else None
+    # As it is: what states are on constraints and in stick, all at once after the run.
+    def saved(t: Array, y: PyTree, scene: Scene) -> tuple[PyTree, Array | None]:
+        del t, scene
+        return (y.y, y.mode) if isinstance(y, EventState) else (y, None)
+
+    def last(t: Array, y: PyTree, scene: Scene) -> Any:
+        return saved(t, y, scene), ((y.events, y.status, y.fired), y.log) if exact else None
 
     def integrate(first: Array, ts: Array | None) -> dfx.Solution:
-        end = dfx.SubSaveAt(t1=True, fn=keep_end)
-        saved = dfx.SubSaveAt(t1=ts is None, ts=ts, fn=functions.keep)
+        subs = [dfx.SubSaveAt(t1=True, fn=last)] + ([] if ts is None else [dfx.SubSaveAt(ts=ts, fn=saved)])
         return dfx.diffeqsolve(
             dfx.ODETerm(functions.derivative if exact else functions.plain_derivative),
             solver,
@@ -262,7 +267,7 @@ def _integrate(
             first,
             y0,
             args=scene,
-            saveat=dfx.SaveAt(subs=(end, saved)),
+            saveat=dfx.SaveAt(subs=subs),
             stepsize_controller=controller,
             adjoint=adjoint,
             max_steps=options.max_steps,
@@ -275,52 +280,65 @@ def _integrate(
     solution = unchecked(integrate, first, ts)
     assert solution.ts is not None
     assert solution.ys is not None
-    (last, mode), events = jtu.tree_map(lambda x: x[0], solution.ys[0])
-    t_end, end_state, ending, history = solution.ts[0][0], last[0] if audited else last, None, None
+    (rows, events), ending, history = solution.ys[0], None, None
     stats = {name: solution.stats[name] for name in ("num_steps", "num_rejected_steps")}
     if exact:
-        (count, status, fired), history = events
+        (count, status, fired), history = jtu.tree_map(lambda x: x[0], events)
         ending, stats["num_events"] = Ending(status, fired), count
-    ended = _ended(inputs, t_end, end_state, mode, solution.result, ending)
-    t, y, modes, missed = _kept(inputs, starts, solution.ts[1], solution.ys[1])
+    t = solution.ts[0]
+    if ts is not None:
+        t, rows = jtu.tree_map(lambda *x: jnp.concatenate(x), (t, rows), (solution.ts[1], solution.ys[1]))
+    t, y, modes, instants = _kept(inputs, functions, starts, t, rows)
+    end, rate, missed = jtu.tree_map(lambda x: x[0], (t, y, modes)), None, jnp.asarray(False)
+    if ts is not None:
+        t, y, modes = jtu.tree_map(lambda x: x[1:], (t, y, modes))
+    if instants is not None:
+        rate = jtu.tree_map(lambda x: x[0], instants.rate)
+        if ts is not None:  # an element that sticks under a load beyond its limit: an event was stepped over
+            beyond = jnp.any(instants.stick_violation[1:] > _OVERLOAD, axis=1)
+            missed = jnp.any(beyond & jnp.isfinite(t))
+    t_end, end_state = end[0], end[1][0] if audited else end[1]
+    ended = _ended(inputs, t_end, end_state, rate, end[2], solution.result, ending)
     code = jnp.where(starts, ended, start)
     if exact and not options.hold_chatter:
         code = jnp.where((code == SUCCESS) & missed, MISSED_EVENT, code)
-    return RunOutput(t, y, modes, code, None if inputs.ts is None else (t_end, end_state), stats), history
+    return RunOutput(t, y, modes, code, None if ts is None else (t_end, end_state), stats), history
 
 
 def _ended(
-    inputs: RunInputs, t: Array, y: State, mode: Array | None, result: dfx.RESULTS, ending: Ending | None
+    inputs: RunInputs,
+    t: Array,
+    y: State,
+    rate: State | None,
+    mode: Array | None,
+    result: dfx.RESULTS,
+    ending: Ending | None,
 ) -> Array:
-    """How the run ended, if it began."""
+    """How the run ended, if it began; the rate is None where nothing has given it yet."""
     span = jnp.maximum(jnp.abs(inputs.t0), jnp.abs(inputs.t1))
     ahead = float(jnp.finfo(span.dtype).eps) ** 0.5 * span if inputs.dt is None else inputs.dt
-    rate = vector_field(t, y, inputs.scene, mode)
+    rate = vector_field(t, y, inputs.scene, mode) if rate is None else rate
     return end_code(inputs.scene, t, y, rate, mode, result, ending, ahead)
 
 
-def _kept(inputs: RunInputs, starts: Array, t: Array, kept: PyTree) -> tuple[Array, PyTree, PyTree, Array]:
-    """Saved times, results and modes, infinite where a run that did not start would have kept them.
+def _kept(
+    inputs: RunInputs, functions: RunFunctions, starts: Array, t: Array, rows: tuple[PyTree, Array | None]
+) -> tuple[Array, PyTree, Array | None, Instant | None]:
+    """Times, results, modes and more of the end and of all saved times: infinite where they were not reached.
 
-    And whether an element sticks at one of them under a load beyond its limit: then an event was stepped over.
+    A run that did not start has reached times up to t0.
     """
-    scene, (y, modes) = inputs.scene, kept
-    if inputs.ts is None:
-        return t, y, modes, jnp.asarray(False)
-    reached = starts | (inputs.ts <= inputs.t0)
-    t = jnp.where(reached, t, jnp.inf)
-    y, modes = jtu.tree_map(
-        lambda x: jnp.where(jnp.expand_dims(reached, tuple(range(1, x.ndim))), x, jnp.inf), (y, modes)
-    )
-    if not scene.event_driven:
-        return t, y, modes, jnp.asarray(False)
+    times = t[:1] if inputs.ts is None else jnp.concatenate([t[:1], inputs.ts])
+    reached = jnp.isfinite(t) & (starts | (times <= inputs.t0) | (jnp.arange(t.shape[0]) == 0))
 
-    def beyond(t: Array, y: State, mode: Array) -> Array:
-        over = from_dynamics(lambda d: d.stick_violation, t, y, scene, mode)
-        return jnp.any(over > _OVERLOAD) & jnp.isfinite(t)
+    def fill(x: Array, filling: Array | float) -> Array:
+        return jnp.where(jnp.expand_dims(reached, tuple(range(1, x.ndim))), x, filling)
 
-    states = y if isinstance(y, State) else y[0]
-    return t, y, modes, jnp.any(jax.vmap(beyond)(*jax.lax.stop_gradient((t, states, modes))))
+    # What was not reached is evaluated at the end of the run.
+    t_there, (y, modes) = jtu.tree_map(lambda x: fill(x, x[:1]), (t, rows))
+    y, instants = jax.lax.map(lambda row: functions.keep(row[0], row[1], inputs.scene, row[2]), (t_there, y, modes))
+    t, y, modes = jtu.tree_map(lambda x: fill(x, jnp.inf), (t, y, modes))
+    return t, y, modes, instants
 
 
 @partial(jax.jit, static_argnames=("options",))

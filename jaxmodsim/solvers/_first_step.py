@@ -20,8 +20,8 @@ def first_step(
     order: Any,
     tolerances: tuple[Float[Array, ""], Float[Array, ""]],
     shortest: Float[Array, ""],
-) -> Float[Array, ""]:
-    r"""Guess at the first step [s], with two evaluations of the field.
+) -> tuple[Float[Array, ""], PyTree]:
+    r"""Guess at the first step [s], with two evaluations of the field, and the rate of `y0`.
 
     That of the literature below, which diffrax takes, too, with two changes. It is not longer than the time in which
     the field changes by itself: a stiff method may step over the transient of a bristle and be right at the end of
@@ -75,4 +75,4 @@ def first_step(
     step = jnp.minimum(100.0 * trial, step)
     changes = known & (d2 * step > d1)
     step = jnp.where(changes, d1 / jnp.where(changes, d2, 1.0), step)
-    return jax.lax.stop_gradient(jnp.where(step > _LEAST * shortest, step, _LEAST * shortest))
+    return jax.lax.stop_gradient((jnp.where(step > _LEAST * shortest, step, _LEAST * shortest), slope))
