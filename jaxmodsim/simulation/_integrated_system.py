@@ -159,6 +159,13 @@ class RunFunctions(eqx.Module):
         return _guards(t, self.system.state(t, s.y, scene), scene, s.mode, self.rest, self.tolerances)
 
     @at_time
+    def begin(self, t: Array, y: PyTree, scene: Scene, mode: Array) -> tuple[PyTree, Array]:
+        """State and modes to begin with, whatever `mode` is."""
+        state = self.system.state(t, y, scene)
+        state, mode = from_dynamics(lambda d: d.start(self.rest), t, state, scene, mode)
+        return self.system.replace(t, y, state, scene), mode
+
+    @at_time
     def reset(self, t: Array, s: EventState, scene: Scene, fired: Array) -> EventState:
         """Change of modes; the state as it is where none changes."""
         state = self.system.state(t, s.y, scene)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.cholesky import cholesky_pivots
 from .._core.parameters import check_ranges, modules_of, range_checks
+from .._core.scalarise import in_scalars
 from ..friction import Regularized
 from ..mechanics import constraint_residual, motion_equations, quadratic
 from ..scene import Scene, State, forward_dynamics
@@ -217,7 +218,9 @@ def _blame_margins(code: Int[Array, ""], margins: Array | None, first: int, know
 
 
 def _mass(scene: Scene, t: Float[Array, ""], y: State) -> Float[Array, "dof dof"]:
-    return motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass
+    return in_scalars(
+        lambda t, q, qd: motion_equations(scene.lagrangian, t, q, qd, scene.params).mass, t, y.q, y.qd, seed=y.q
+    )
 
 
 def _pivots(scene: Scene, t: Float[Array, ""], y: State) -> Float[Array, " dof"]:

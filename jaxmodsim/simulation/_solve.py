@@ -15,7 +15,6 @@ from ..scene import (
     Scene,
     State,
     check_scene,
-    from_dynamics,
     sample_times,
     signals_of,
     vector_field,
@@ -34,6 +33,7 @@ from ..solvers import (
     StepsTo,
     StoredSteps,
     first_step,
+    trial_step,
     unchecked,
 )
 from ._integrated_system import AugmentedState, Instant, IntegratedSystem, RunFunctions, Work, project
@@ -124,22 +124,6 @@ def _tolerances(inputs: RunInputs) -> tuple[Array, Array]:
     return inputs.rtol, jnp.maximum(inputs.atol, float(jnp.finfo(inputs.atol.dtype).tiny))
 
 
-def _first(inputs: RunInputs, method: dfx.AbstractSolver, rate: Any, y0: PyTree) -> tuple[Array, PyTree]:
-    """First step [s], and the rate of the first state."""
-    scene = jax.lax.stop_gradient(inputs.scene)
-    if inputs.dt is not None:
-        return inputs.dt, rate(inputs.t0, y0, scene)
-    step, slope = first_step(
-        lambda t, y: rate(t, y, scene),
-        inputs.t0,
-        y0,
-        method.error_order(dfx.ODETerm(rate)),
-        _tolerances(inputs),
-        _shortest(inputs),
-    )
-    return step if inputs.dtmax is None else jnp.minimum(step, inputs.dtmax), slope
-
-
 def _error_control(inputs: RunInputs, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
     if inputs.dt is not None:
         return FiniteSteps()
@@ -209,19 +193,62 @@ def _well_posed(inputs: RunInputs) -> Bool[Array, ""]:
     return fine & jnp.isfinite(jnp.stack([t0, t1, rtol, atol, *steps])).all()
 
 
-def _prepared(inputs: RunInputs, options: RunOptions, audited: bool) -> tuple[State, Any, RunFunctions]:
-    """State and modes to begin with, and the functions of the run."""
-    scene, t0 = inputs.scene, inputs.t0
+class _Start(NamedTuple):
+    """What a run begins with: state, modes, its rate, and the first step [s]."""
+
+    y: PyTree
+    mode: Array | None
+    rate: PyTree
+    first: Float[Array, ""]
+
+
+def _functions(inputs: RunInputs, options: RunOptions, audited: bool) -> RunFunctions:
+    scene = inputs.scene
+    return RunFunctions(
+        IntegratedSystem(audited, isinstance(options.solver, Gauss)),
+        _REST * inputs.atol,
+        (inputs.rtol, inputs.atol),
+        bool(scene.constraints) and options.project,
+        scene.stick_drifts,
+    )
+
+
+def _start(inputs: RunInputs, functions: RunFunctions, order: Any) -> _Start:
+    """The start of a run whose method has an error estimate of this order.
+
+    Everything is evaluated in a loop, which is compiled once: modes to begin with, the rate, and another one for the
+    first step. In reverse mode it is evaluated again.
+    """
+    scene, t0, exact = inputs.scene, inputs.t0, bool(inputs.scene.event_driven)
     initial = initial_state(inputs)
     check_scene(scene, initial)
-    projects, rest = bool(scene.constraints) and options.project, _REST * inputs.atol
-    mode = None
-    if projects:
+    if functions.projects:
         initial = project(t0, initial, scene.bind_time(t0))
-    if scene.event_driven:
-        initial, mode = from_dynamics(lambda d: d.start(rest), t0, initial, scene)
-    system = IntegratedSystem(audited, isinstance(options.solver, Gauss))
-    return initial, mode, RunFunctions(system, rest, (inputs.rtol, inputs.atol), projects, scene.stick_drifts)
+    mode = jnp.zeros(len(scene.event_driven), inputs.q0.dtype) if exact else None
+    y0 = functions.system.start(t0, initial, scene, mode)
+    tolerances = _tolerances(inputs)
+
+    @partial(jax.checkpoint, prevent_cse=False)
+    def evaluate(at: tuple[Array, PyTree, Array | None], turn: Array) -> tuple[PyTree, PyTree]:
+        held, (t, y, mode) = jax.lax.stop_gradient((*at, scene)), at
+        slope = functions.plain_derivative(held[0], held[1], held[3], held[2])
+        trial = trial_step(held[1], slope, tolerances)
+        following = held[0] + trial, jtu.tree_map(lambda y, f: y + trial * f, held[1], slope), held[2]
+        if exact:
+            y, mode = functions.begin(t, y, scene, mode)
+            following = jtu.tree_map(lambda a, b: jnp.where(turn == 0, a, b), (t, y, mode), following)
+        return following, ((y, mode) if exact else None, slope)
+
+    turns = exact + (1 if inputs.dt is not None else 2)
+    _, (begun, slopes) = jax.lax.scan(evaluate, (t0, y0, mode), jnp.arange(turns))
+    if exact:
+        y0, mode = jtu.tree_map(lambda x: x[0], begun)
+    slope = jtu.tree_map(lambda x: x[int(exact)], slopes)
+    if inputs.dt is not None:
+        return _Start(y0, mode, slope, inputs.dt)
+    there = jtu.tree_map(lambda x: x[-1], slopes)
+    step = first_step(jax.lax.stop_gradient(y0), (slope, there), order, tolerances, _shortest(inputs))
+    return _Start(y0, mode, slope, step if inputs.dtmax is None else jnp.minimum(step, inputs.dtmax))
 
 
 def _start_code(inputs: RunInputs, functions: RunFunctions, mode: Array | None, rate: PyTree) -> Int[Array, ""]:
@@ -237,11 +264,10 @@ def _integrate(
 ) -> tuple[RunOutput, EventLog | None]:
     """Run diffrax; with modes only where the scene has them, with a log of that many events where one is wanted."""
     scene, exact = inputs.scene, bool(inputs.scene.event_driven)
-    initial, mode, functions = _prepared(inputs, options, audited)
-    method, adjoint = _plugins(inputs, options)
+    functions, (method, adjoint) = _functions(inputs, options, audited), _plugins(inputs, options)
     solver = _solver(method, functions, scene, options, log)
-    y0, controller = functions.system.start(inputs.t0, initial, scene, mode), _controller(inputs, method)
-    first, rate = _first(inputs, method, partial(functions.plain_derivative, mode=mode), y0)
+    y0, mode, rate, first = _start(inputs, functions, method.error_order(dfx.ODETerm(functions.plain_derivative)))
+    controller = _controller(inputs, method)
     start = _start_code(inputs, functions, mode, rate)
     # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
     starts = start == SUCCESS
@@ -357,7 +383,9 @@ def solve_audited(inputs: RunInputs, options: RunOptions) -> tuple[Work, Int[Arr
 @partial(jax.jit, static_argnames=("options",))
 def solve_start(inputs: RunInputs, options: RunOptions) -> State:
     """The state a run begins with: on the constraints, and at rest where elements stick."""
-    return _prepared(inputs, options, False)[0]
+    functions = _functions(inputs, options, False)
+    y0 = _start(inputs, functions, 1).y
+    return functions.system.state(inputs.t0, y0, inputs.scene.bind_time(inputs.t0))
 
 
 @partial(jax.jit, static_argnames=("options", "size"))

@@ -338,6 +338,12 @@ class EventSolver(AbstractSolverWrapper):
             fired, first, missed, landed, landed, self._policy.next_end(root, missed, (behind, divisor)), near
         )
 
+    def _guard_rates(self, t: Array, state: EventState, slope: PyTree, args: PyTree) -> Float[Array, " guards"]:
+        """Along the motion; constant, so that nothing of them is differentiated."""
+        t, state, slope, args = _held((t, state, slope, args))
+        along = jnp.ones_like(t), slope
+        return jax.jvp(lambda t, y: self._guards(t, state._replace(y=y), args), (t, state.y), along)[1]
+
     def _jump(
         self,
         terms: PyTree,
@@ -357,14 +363,8 @@ class EventSolver(AbstractSolverWrapper):
             here = state._replace(y=y, mode=mode)
             return terms.vf(t, here, args).y, self._guards(t, here, args)
 
-        def guard_rates(t: Array, state: EventState, slope: PyTree, args: PyTree) -> Array:
-            """Along the motion; constant, so that nothing of them is differentiated."""
-            t, state, slope, args = _held((t, state, slope, args))
-            along = jnp.ones_like(t), slope
-            return jax.jvp(lambda t, y: self._guards(t, state._replace(y=y), args), (t, state.y), along)[1]
-
         held = _held((t, state, args))
-        rates = guard_rates(t, state, terms.vf(*held).y, args)
+        rates = self._guard_rates(t, state, terms.vf(*held).y, args)
         rate = jnp.sum(jnp.where(first, rates, 0.0))
         rate = jnp.where(rate == 0, 1.0, rate)
 
@@ -382,12 +382,8 @@ class EventSolver(AbstractSolverWrapper):
                 after = jtu.tree_map(lambda a, b: jnp.where(dense, a, b), held, after)
             return after.y, after.mode
 
-        passage = pass_event(
-            Landed(t, state.y, state.mode, first, rate, memory.landed > 0.5, near, state.t),
-            evaluate,
-            (args, new_args),
-            reset,
-        )
+        landed = Landed(t, state.y, state.mode, first, rate, memory.landed > 0.5, near, state.t)
+        passage = pass_event(landed, evaluate, (args, new_args), reset)
         t_event, values, (y, mode, slope) = passage.t, passage.guards, passage.after
         spread, dense = spread_at(t_event)
         status = jnp.where(dense, jnp.asarray(ACCUMULATION, spread.dtype), ONGOING)
@@ -400,7 +396,7 @@ class EventSolver(AbstractSolverWrapper):
         clear = _constant(values) > jnp.where(fired, LATITUDE * jnp.abs(rate) * near, 0.0)
 
         def rises() -> Bool[Array, " guards"]:
-            return guard_rates(t_event, state._replace(y=y, mode=mode), slope, new_args) > 0
+            return self._guard_rates(t_event, state._replace(y=y, mode=mode), slope, new_args) > 0
 
         armed = self._policy.armed_after(clear, fired, memory.armed > 0.5, rises)
         if self.on_zeno is not None:
@@ -410,6 +406,7 @@ class EventSolver(AbstractSolverWrapper):
         if log is not None:
             entry = EventLog(t_event, flags, (passage.before, state.mode), (y, mode))
             log = jtu.tree_map(lambda a, b: write(a, index, b), log, entry)
+        after = memory._replace(guard=_constant(values), armed=_flags(armed, values))
         after_reset = state._replace(
             y=passage.y,
             mode=mode,
@@ -418,16 +415,12 @@ class EventSolver(AbstractSolverWrapper):
             status=status,
             fired=flags,
             log=log,
-            memory=memory._replace(
-                guard=_constant(values), armed=_flags(armed, values), resets=memory.resets + 1.0, spread=spread
-            ),
+            memory=after._replace(resets=memory.resets + 1.0, spread=spread),
         )
         if self.samples is None or self.samples.times is None:
             return after_reset
         # Samples at which nothing happens say nothing of whether events accumulate.
-        passed = state._replace(
-            y=passage.y, memory=memory._replace(guard=after_reset.memory.guard, armed=after_reset.memory.armed)
-        )
+        passed = state._replace(y=passage.y, memory=after)
         return jtu.tree_map(lambda a, b: jnp.where(happened | jnp.any(fired), a, b), after_reset, passed)
 
 
