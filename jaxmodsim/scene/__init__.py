@@ -8,6 +8,8 @@ from ._dynamics import from_dynamics as from_dynamics
 from ._dynamics import vector_field as vector_field
 from ._implicit import check_step as check_step
 from ._implicit import scene_step as scene_step
+from ._linear_solver import has_linear_solver as has_linear_solver
+from ._linear_solver import linear_solver as linear_solver
 from ._names import elements as elements
 from ._names import read_element as read_element
 from ._names import replace_elements as replace_elements

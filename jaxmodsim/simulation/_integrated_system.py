@@ -18,6 +18,7 @@ from ..scene import (
     State,
     forward_dynamics,
     from_dynamics,
+    linear_solver,
     scene_step,
 )
 from ..solvers import EventState
@@ -113,6 +114,13 @@ class IntegratedSystem(NamedTuple):
             lambda work, power: work + (t1 - t0) * power, y.work, forward_dynamics(t1, state, scene).power
         )
         return AugmentedState(state, work), solved
+
+    @at_time
+    def linear_solver(
+        self, t: Array, y: State, scene: Scene, rate: State, shift: Array, pivot: bool
+    ) -> Callable[[State], State]:
+        """The linear systems of a step of `Rodas5P`, of a run that is neither audited nor canonical."""
+        return linear_solver(t, y, rate.qd, scene, shift=shift, pivot=pivot)
 
     def _inner(self, t: Array, state: State, scene: Scene) -> State:
         if not self.canonical:
