@@ -85,19 +85,20 @@ def fit(
     time: _options.Time = "t",
     position: _options.Position = "q",
     force: _options.Force = "u",
-    force_gain: _options.ForceGain = 1.0,
-    model: _options.Model = "coulomb",
-    compare: _options.Compare = None,
+    units: _options.Units = None,
+    drop: _options.Drop = None,
+    laws: _options.Laws = "coulomb",
     free: _options.Free = None,
     start: _options.Start = None,
     fix: _options.Fix = None,
     limit: _options.Limit = None,
-    hold_out: _options.HoldOut = None,
+    held_out: _options.HeldOut = None,
     folds: _options.Folds = None,
     loss: _options.Loss = "squares",
     begin: _options.Begin = "rough",
     starts: _options.Starts = 1,
-    substeps: _options.Substeps = 1,
+    max_steps: _options.MaxSteps = 100,
+    substeps: _options.Substeps = None,
     out: Out = Path("jaxmodsim-fit"),
     report: _options.Report = None,
     next_input: _options.NextInput = None,
@@ -113,13 +114,12 @@ def fit(
     _start()
     from ._fit import run_fit
     from ._plan import FitRequest
-    from ._read import AxisColumns
 
     run_fit(
         FitRequest(
-            record, AxisColumns(time, position, force, force_gain), model, compare, free or [], start or [], fix or [],
-            limit or [], hold_out or [], folds, loss, begin, starts, substeps, out, report, next_input, max_force,
-            max_speed, max_travel, duration,
+            record, (time, position, force), units or [], drop or [], laws, free or [], start or [], fix or [],
+            limit or [], held_out or [], folds, loss, begin, starts, max_steps, substeps, out, report, next_input,
+            max_force, max_speed, max_travel, duration,
         )
     )  # fmt: skip
 

@@ -1,5 +1,7 @@
 """Scenes: what is in them, and the vector field that follows."""
 
+from . import _readable as _readable  # what they print
+from ._coordinates import Quantity as Quantity
 from ._dynamics import ConstraintReaction as ConstraintReaction
 from ._dynamics import State as State
 from ._dynamics import check_scene as check_scene
@@ -16,6 +18,8 @@ from ._names import replace_elements as replace_elements
 from ._names import replace_numbers as replace_numbers
 from ._names import scene_numbers as scene_numbers
 from ._names import scene_ranges as scene_ranges
+from ._quantities import describe_series as describe_series
+from ._quantities import quantity_of as quantity_of
 from ._scene import Scene as Scene
 from ._signal import Signal as Signal
 from ._signal import sample_times as sample_times

@@ -1,5 +1,7 @@
 """`simulate`: a scene in, a trajectory out."""
 
+from __future__ import annotations  # `help` shows types as they are written here
+
 import diffrax as dfx
 import equinox as eqx
 import jax.tree_util as jtu
