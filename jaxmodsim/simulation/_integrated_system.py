@@ -128,6 +128,13 @@ class IntegratedSystem(NamedTuple):
         return state._replace(qd=momentum(scene.lagrangian, t, state.q, state.qd, scene.params))
 
 
+class Instant(NamedTuple):
+    """The rate of a state, and by how much the force of each sticking element exceeds its limit, in limits."""
+
+    rate: State
+    stick_violation: Float[Array, "..."]
+
+
 # A step of a scene with events or constraints evaluates large fields a dozen times. Traced as one function each, they
 # are traced, linearised and transposed once.
 _derivative = partial(jax.jit, static_argnums=0)(at_time(IntegratedSystem.derivative))
@@ -158,6 +165,13 @@ class RunFunctions(eqx.Module):
     def guards(self, t: Array, s: EventState, scene: Scene) -> tuple[Array, Array]:
         """Guards of the modes, and their tolerances."""
         return _guards(t, self.system.state(t, s.y, scene), scene, s.mode, self.rest, self.tolerances)
+
+    @at_time
+    def begin(self, t: Array, y: PyTree, scene: Scene, mode: Array) -> tuple[PyTree, Array]:
+        """State and modes to begin with, whatever `mode` is."""
+        state = self.system.state(t, y, scene)
+        state, mode = from_dynamics(lambda d: d.start(self.rest), t, state, scene, mode)
+        return self.system.replace(t, y, state, scene), mode
 
     @at_time
     def reset(self, t: Array, s: EventState, scene: Scene, fired: Array) -> EventState:
@@ -191,8 +205,15 @@ class RunFunctions(eqx.Module):
         return self._stick(t, s, scene) if self.sticks else s
 
     @at_time
-    def keep(self, t: Array, y: PyTree, scene: Scene) -> PyTree:
-        """What is kept at a saved time, where the state comes from dense output and obeys nothing: result and mode."""
-        if isinstance(y, EventState):
-            return self.system.result(t, self.project_and_stick(t, y, scene).y, scene), y.mode
-        return self.system.result(t, self.project(t, y, scene), scene), None
+    def keep(self, t: Array, y: PyTree, scene: Scene, mode: Array | None) -> tuple[PyTree, Instant | None]:
+        """What is kept of a saved state, which comes from dense output and obeys nothing; in a run with modes more."""
+        y = self.project(t, y, scene)
+        if mode is None:
+            return self.system.result(t, y, scene), None
+        state = self.system.state(t, y, scene)
+        state, instant = from_dynamics(
+            lambda d: (d.stick(mode) if self.sticks else d.y, Instant(d.rate, d.stick_violation)),
+            *(t, state, scene, mode),
+        )
+        y = self.system.replace(t, y, state, scene) if self.sticks else y
+        return self.system.result(t, y, scene), jax.lax.stop_gradient(instant)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.cholesky import cholesky_pivots
 from .._core.parameters import check_ranges, modules_of, range_checks
+from .._core.scalarise import in_scalars
 from ..friction import Regularized
 from ..mechanics import constraint_residual, motion_equations, quadratic
 from ..scene import Scene, State, describe_series, forward_dynamics, quantity_of
@@ -153,7 +154,8 @@ def start_code(
     if canonical:
         code = jnp.where(quadratic(now.lagrangian, t, y.q, y.qd, now.params), code, NOT_QUADRATIC)
     offsets = _offsets(scene, dof)
-    code = _blame_margins(code, forward_dynamics(t, y, now, mode).validity_margins, offsets.checks, True)
+    if scene.checks:
+        code = _blame_margins(code, forward_dynamics(t, y, now, mode).validity_margins, offsets.checks, True)
     code = _blame_mass(code, _pivots(now, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
     if scene.constraints:
         off, turned = constraint_residual(scene.constraints, t, y.q, y.qd, now.params)
@@ -220,7 +222,9 @@ def _blame_margins(code: Int[Array, ""], margins: Array | None, first: int, know
 
 
 def _mass(scene: Scene, t: Float[Array, ""], y: State) -> Float[Array, "dof dof"]:
-    return motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass
+    return in_scalars(
+        lambda t, q, qd: motion_equations(scene.lagrangian, t, q, qd, scene.params).mass, t, y.q, y.qd, seed=y.q
+    )
 
 
 def _pivots(scene: Scene, t: Float[Array, ""], y: State) -> Float[Array, " dof"]:
