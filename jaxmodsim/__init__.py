@@ -5,6 +5,7 @@ Mechanics: point_mass, rigid_body; Chart, Cylindrical, Spherical.
 Friction laws: Viscous, Curve, Coulomb, Stribeck, Dahl, LuGre, ElastoPlastic, MaxwellSlip, Armstrong; in the wrappers
     Regularized, DeadZone, Sign; with asymmetric, scaled_by.
 About laws: check_passivity, damping_sigma1, regularized_width, max_stable_step; to_mujoco, to_modelica.
+Scenes elsewhere: to_c, to_javascript.
 Runs: simulate, simulate_to_accuracy; they give a Trajectory, or raise a SimulationError.
 Solvers: Rodas5P, Gauss, ImplicitFriction; EventSolver and EventController; StoredSteps, an adjoint.
 Analysis: energy_audit (EnergyAudit), sensitivity (Sensitivity), check_gradients (GradientCheck), cyclic_coordinates;

@@ -250,7 +250,7 @@ def _start(inputs: RunInputs, functions: RunFunctions, order: Any) -> _Start:
         slope = functions.plain_derivative(held[0], held[1], held[3], held[2])
         trial = trial_step(held[1], slope, tolerances)
         following = held[0] + trial, jtu.tree_map(lambda y, f: y + trial * f, held[1], slope), held[2]
-        if exact:
+        if mode is not None:
             y, mode = functions.begin(t, y, scene, mode)
             following = jtu.tree_map(lambda a, b: jnp.where(turn == 0, a, b), (t, y, mode), following)
         return following, ((y, mode) if exact else None, slope)

@@ -57,7 +57,7 @@ class Passage(NamedTuple):
     guards: Float[Array, " guards"]
 
 
-class _Carry(NamedTuple):
+class _Place(NamedTuple):
     """Between two evaluations: where the next one is, where this half of the way began, and how long it is."""
 
     t: Float[Array, ""]
@@ -91,13 +91,13 @@ def pass_event(
     """
 
     @partial(jax.checkpoint, prevent_cse=False)
-    def onward(carry: _Carry, turn: tuple[Int[Array, ""], Float[Array, ""]]) -> tuple[_Carry, PyTree]:
+    def onward(place: _Place, turn: tuple[Int[Array, ""], Float[Array, ""]]) -> tuple[_Place, PyTree]:
         i, share = turn
-        t, y, mode = carry[:3]
+        t, y, mode = place[:3]
         begins, at_root, behind = (i == 0) | (i == _RESET), i == _ROOT, i >= _RESET
         before = y
         y, mode = jax.lax.cond(i == _RESET, lambda: reset(t, y), lambda: (y, mode))
-        origin = _choose(begins, (t, y), carry.origin)
+        origin = _choose(begins, (t, y), place.origin)
         rates, guards = evaluate(t, y, mode, _choose(behind, args[1], args[0]))
         newton = -jnp.sum(jnp.where(landed.first, guards, 0.0)) / landed.rate
         # A guard that a reset has violated fires where it stands: it has no root here, or one before that reset.
@@ -106,15 +106,15 @@ def pass_event(
             landed.on_root
             & (jnp.abs(_constant(newton)) <= LATITUDE * landed.near)
             & _constant(t + newton >= landed.earliest),
-            carry.on_root,
+            place.on_root,
         )
         newton = jnp.where(on_root, newton, 0.0)
-        way = jnp.where(i == 0, newton, carry.way)
+        way = jnp.where(i == 0, newton, place.way)
         whole = way + newton
         whole = jnp.where(_constant(landed.t + whole < landed.earliest), _constant(landed.earliest - landed.t), whole)
         start, length = _choose(at_root, ((landed.t, y), newton), (origin, share * way))
         way = jnp.where(at_root, whole, way)
-        following = _Carry(
+        following = _Place(
             jnp.where(i == _LAST, landed.t, start[0] + jnp.where(at_root, way, length)),
             jtu.tree_map(lambda a, b: a + (length * b).astype(a.dtype), start[1], rates),
             mode,
@@ -125,7 +125,7 @@ def pass_event(
         return following, (t, before, (y, mode, rates), guards)
 
     turns = jnp.arange(_COUNT), jnp.asarray(_SHARES, landed.rate.dtype)
-    begin = _Carry(
+    begin = _Place(
         landed.t, landed.y, landed.mode, (landed.t, landed.y), jnp.zeros_like(landed.rate), jnp.asarray(False)
     )
     _, (t, before, after, guards) = jax.lax.scan(onward, begin, turns)
