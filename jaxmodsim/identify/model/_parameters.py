@@ -165,18 +165,18 @@ class FreeParameters(eqx.Module):
         strict = {name for name in free if name in ranges and ranges[name].strict}
         upper = {name: ranges[name].upper for name in free if name in ranges and ranges[name].upper is not None}
         upper |= {
-            name: most * values[str(ranges[name].lower)]
+            name: max(most * values[str(ranges[name].lower)], values[name])
             for name in free
             if name in ranges and isinstance(floors[name], float) and (most := ranges[name].most) is not None
         }
-        # Of a limit that starts at zero there is no multiple.
+        # Of a limit that starts at zero there is no multiple. Whoever starts with more is not held back.
         most = {
-            name: most
+            name: max(most, values[name] / values[base])
             for name in free
             if isinstance(base := floors[name], str) and (most := ranges[name].most) is not None and values[base] > 0
         }
         for name in free:
-            _check_start(name, values, floors[name], name in strict, upper.get(name), most.get(name))
+            _check_start(name, values, floors[name], name in strict, upper.get(name))
         kinds = {
             name: "follow"
             if name in following
@@ -339,20 +339,13 @@ def _check_names(numbers: Mapping[str, ArrayLike], free: Sequence[str]) -> None:
             raise ValueError(f"{name} is an array of shape {jnp.shape(numbers[name])}; only single numbers fit.")
 
 
-def _check_start(
-    name: str, values: Mapping[str, float], floor: Floor, strict: bool, upper: float | None, most: float | None
-) -> None:
+def _check_start(name: str, values: Mapping[str, float], floor: Floor, strict: bool, upper: float | None) -> None:
     value = values[name]
     if isinstance(floor, str | float | int):
         least = values[floor] if isinstance(floor, str) else floor
         if value < least or (strict and value == least):
             shown = f"{floor} = {least:g}" if isinstance(floor, str) else f"{floor:g}"
             raise ValueError(f"The start {name} = {value:g} must lie above its limit {shown}.")
-    if most is not None and value > most * (base := values[str(floor)]):
-        raise ValueError(
-            f"The start {name} = {value:g} is more than {most:g} times {floor} = {base:g}. Start with less, free one of"
-            f" the two alone, or pass fit another limit, limits={{'{name}/{floor}': (None, {2 * value / base:.2g})}}."
-        )
     if upper is not None:
         if isinstance(floor, str | tuple):
             raise ValueError(f"{name} is limited by {floor} and by {upper:g}: free only one of the two.")

@@ -78,8 +78,8 @@ def fit(
       of each coordinate that was measured, the others 0, and rest. `jaxmodsim.identify.start_state` estimates one.
     - `delay`: by how much inputs come later than recorded [s], >= 0; where they start if they are free.
     - `limits`: lower and upper limits of numbers beyond the declared ones, None for none: `{"m": (0.0, 5.0)}`. A lower
-      limit of 0 is excluded. A fit looks for Fs up to 5 Fc; `{"friction.Fs/friction.Fc": (None, 8.0)}` says another
-      limit of such a ratio, None for none.
+      limit of 0 is excluded. A fit looks for Fs up to 5 Fc, or the ratio it starts with;
+      `{"friction.Fs/friction.Fc": (None, 8.0)}` says another limit of such a ratio, None for none.
     - `passive`: names of the friction effects with a LuGre law that has to be passive, `sigma2 >= sigma1 (Fs - Fc)/Fc`;
       their sigma2 must be free.
     - `prior`: what was known before: mean and standard deviation by name, `{"m": (95.0, 5.0)}`.
