@@ -1,5 +1,6 @@
 """The commands. Everything heavy is imported inside them, so that --help and usage errors come at once."""
 
+import logging
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -42,6 +43,7 @@ def _start() -> None:
     from ._cache import use_cache
 
     tune_cpu()
+    logging.getLogger("jaxmodsim").setLevel(logging.ERROR)  # what takes time shows its progress
     jax.config.update("jax_enable_x64", True)
     use_cache()
 

@@ -18,6 +18,7 @@ from ..identify import (
     InputDesign,
     Profile,
     Record,
+    agreement,
     compare,
     design_input,
     fit,
@@ -98,7 +99,14 @@ def _fitted(plan: Plan) -> Fitted:
         fitted = _fitted_with(plan, substeps, fitted.result)
     # Whoever pressed Ctrl-C does not wait for more.
     scores = () if fitted.interrupted else tuple(score(fitted.result, record) for record in plan.held_out)
-    return replace(fitted, scores=scores, substeps=substeps, seconds=time.perf_counter() - started)
+    several = len(plan.records) > 1 and not fitted.interrupted
+    return replace(
+        fitted,
+        scores=scores,
+        agreement=agreement(fitted.result) if several else None,
+        substeps=substeps,
+        seconds=time.perf_counter() - started,
+    )
 
 
 def _fitted_with(plan: Plan, substeps: int, before: FitResult | None = None) -> Fitted:

@@ -10,7 +10,7 @@ from importlib import metadata
 import numpy as np
 import pandas as pd
 
-from ..identify import Comparison, FitResult, InputDesign, Profile, Score, remarks
+from ..identify import Agreement, Comparison, FitResult, InputDesign, Profile, Score, remarks
 from ..scene import Scene, scene_numbers
 from ._equations import equations
 from ._plan import Plan
@@ -27,7 +27,7 @@ class Fitted:
     - `plan`: what was asked for. `model`: name of the model that was taken.
     - `result`: its fit to all records.
     - `comparison`: None where a single model was fitted, and not on folds.
-    - `scores`: on the records that were held out.
+    - `scores`: on the records that were held out. `agreement`: of several records; None of one.
     - `substeps`: integration steps between two samples.
     - `seconds`: that all took.
     """
@@ -37,6 +37,7 @@ class Fitted:
     result: FitResult
     comparison: Comparison | None = None
     scores: tuple[Score, ...] = ()
+    agreement: Agreement | None = None
     substeps: int = 1
     seconds: float = 0.0
 
@@ -134,11 +135,17 @@ def headline(fitted: Fitted) -> tuple[str, str, str]:
 
 
 def _first_doubt(fitted: Fitted) -> str:
-    doubts = (*fitted.plan.notes, *start_remarks(fitted), *remarks(fitted.result))
+    doubts = (*fitted.plan.notes, *differences(fitted), *start_remarks(fitted), *remarks(fitted.result))
     if doubts:
         return f"Before you rely on it: {doubts[0]}"
-    untested = "" if fitted.scores else " Whether it holds on another day only a record that is held out can tell."
+    one = len(fitted.result.provenance.records) == 1
+    untested = "" if fitted.scores or not one else " Whether it holds on another day one record cannot tell."
     return f"Nothing in the records speaks against it.{untested}"
+
+
+def differences(fitted: Fitted) -> tuple[str, ...]:
+    """Parameters in which the records differ."""
+    return () if fitted.agreement is None else fitted.agreement.sentences
 
 
 def start_remarks(fitted: Fitted) -> tuple[str, ...]:
@@ -243,6 +250,7 @@ def summary(findings: Findings) -> dict[str, object]:
             score.record.name: None if score.start_fitted is None else score.start_fitted.rmse
             for score in fitted.scores
         },
+        "differing": None if fitted.agreement is None else list(fitted.agreement.differing),
         "comparison": None if fitted.comparison is None else fitted.comparison.to_dict(),
         "substeps": fitted.substeps,
         "seconds": fitted.seconds,

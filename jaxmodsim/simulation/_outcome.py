@@ -41,7 +41,8 @@ _KEPT = 1e-2
 _GENERAL = (
     "The run reached t1.",
     "The step limit was reached before t1: pass a larger max_steps, a larger dt or looser tolerances. A law that"
-    " chatters (Sign) never gets through its zero crossings with adaptive steps.",
+    " chatters (Sign, or jnp.sign of a velocity in a force of your own) never gets through its zero crossings with"
+    " adaptive steps: Friction(Coulomb(Fc)) sticks exactly.",
     "The step size fell below what the time can resolve: the vector field jumps or is singular there. Run DeadZone"
     " and Sign with a fixed step (dt=...); pass atol > 0 where something comes to rest.",
     "The vector field gave a value that is not finite (NaN or infinity). With a fixed step this is also how a"
