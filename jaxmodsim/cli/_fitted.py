@@ -10,7 +10,7 @@ from importlib import metadata
 import numpy as np
 import pandas as pd
 
-from ..identify import Agreement, Comparison, FitResult, InputDesign, Profile, Score, remarks
+from ..identify import Comparison, FitResult, InputDesign, Profile, RecordAgreement, Score, remarks
 from ..scene import Scene, scene_numbers
 from ._equations import equations
 from ._plan import Plan
@@ -37,7 +37,7 @@ class Fitted:
     result: FitResult
     comparison: Comparison | None = None
     scores: tuple[Score, ...] = ()
-    agreement: Agreement | None = None
+    agreement: RecordAgreement | None = None
     substeps: int = 1
     seconds: float = 0.0
 

@@ -26,7 +26,7 @@ from .model._axis import rough_axis as rough_axis
 from .model._engines import Controller as Controller
 from .model._engines import law_force as law_force
 from .model._engines import replay as replay
-from .selection._agreement import Agreement as Agreement
+from .selection._agreement import RecordAgreement as RecordAgreement
 from .selection._agreement import agreement as agreement
 from .selection._compare import Candidate as Candidate
 from .selection._compare import compare as compare

@@ -15,7 +15,7 @@ from .._core.speed import recommend_tuning, remark_on_compilation
 from ..scene import Scene
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages
 from ._run_request import RunRequest, is_known
-from ._solve import RunInputs, RunOutput, solve
+from ._solve import RunInputs, RunOutput, compiled_runs, solve
 from ._trajectory import Trajectory, trajectory
 
 
@@ -117,9 +117,9 @@ def simulate(
         hold_chatter,
         project,
     ).checked()
-    compiled, began = solve._cache_size(), time.perf_counter()
+    compiled, began = compiled_runs(), time.perf_counter()
     solved = solve(inputs, options)
-    if solve._cache_size() > compiled:
+    if compiled_runs() > compiled:
         remark_on_compilation(time.perf_counter() - began, _functions(scene))
     if throw:
         solved = _raise_early_end(inputs, solved)

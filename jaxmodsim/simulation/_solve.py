@@ -390,6 +390,11 @@ def solve(inputs: RunInputs, options: RunOptions) -> RunOutput:
     return _integrate(inputs, options, False, None)[0]
 
 
+def compiled_runs() -> int:
+    """How many programs `solve` has compiled."""
+    return solve._cache_size()  # pyright: ignore[reportAttributeAccessIssue] - functions of `jax.jit` have it
+
+
 @partial(jax.jit, static_argnames=("options",))
 def solve_audited(inputs: RunInputs, options: RunOptions) -> tuple[Work, Int[Array, ""]]:
     """Run a scene again with the integrals of power beside it: the work at the saved times, and how that run ended."""

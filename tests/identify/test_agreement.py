@@ -19,7 +19,7 @@ def record(name: str, seed: int, Fc: float) -> jms.Record:
     return jms.Record(T, force + 0.05 * np.random.default_rng(seed).standard_normal(T.size), {"x": x}, name)
 
 
-def found(Fc: float, seed: int, count: int = 2) -> jms.identify.Agreement:
+def found(Fc: float, seed: int, count: int = 2) -> jms.identify.RecordAgreement:
     days = [record(f"day {i}", count * seed + i, Fc if i else 1.0) for i in range(count)]
     start = jms.Regularized(jms.Stribeck(Fc=0.8, Fs=1.5, vs=0.03, Fv=1.5), 1e-3)
     return agreement(jms.fit_law(start, days, ("Fc", "Fs", "vs", "Fv")))

@@ -14,7 +14,7 @@ from ..uncertainty._result import FitResult
 
 
 @dataclass(frozen=True, kw_only=True)
-class Agreement:
+class RecordAgreement:
     """Whether the parameters of a model are the same in several records.
 
     - `records`, `names`: of the records and of the parameters.
@@ -66,7 +66,7 @@ class Agreement:
         return "\n".join(lines)
 
 
-def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 100) -> Agreement:
+def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 100) -> RecordAgreement:
     """Fit each record by itself, from the fit to all, and test whether the parameters are the same.
 
     For each parameter the sum of squared distances from its weighted mean, in standard errors, is held against its
@@ -80,7 +80,7 @@ def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 100) -
 
     **Returns:**
 
-    An `Agreement`.
+    An `RecordAgreement`.
 
     **Raises:**
 
@@ -118,7 +118,7 @@ def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 100) -
         mean = np.sum(weight * values, axis=0) / np.sum(weight, axis=0)
         p = chi2.sf(np.sum(weight * (values - mean) ** 2, axis=0), len(records) - 1)
     known = np.all(np.isfinite(errors) & (errors > 0), axis=0)
-    return Agreement(
+    return RecordAgreement(
         records=records,
         names=problem.free.names,
         values=values,
