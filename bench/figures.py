@@ -28,6 +28,7 @@ def accelerations(r: Recorded) -> Figure:
         panel.set_xticks([int(n) for n in sizes], sizes)
         panel.minorticks_off()
         panel.grid(which="major", alpha=0.25)
+        panel.set_title("a" if way == "loop" else "b", loc="left", fontweight="bold")
     axes[0].set_ylabel("time of one evaluation of the accelerations [ns]")
     axes[0].legend()
     return figure
@@ -57,15 +58,16 @@ def long_runs(r: Recorded) -> Figure:
         "error of energy": "Energy: no drift with Gauss (solid), linear with the others",
         "error of phi": "Angle: linear in time with Gauss, quadratic with the others",
     }
-    for panel, (quantity, title) in zip(axes, titles.items(), strict=True):
+    units = {row["quantity"]: row["unit"] for row in r.rows}
+    for letter, panel, (quantity, title) in zip("ab", axes, titles.items(), strict=True):
         for peer in r.all_of(quantity, "peer"):
             ends = r.all_of(quantity, "at", peer=peer)
             values = [r.number(quantity, case="spherical pendulum", peer=peer, at=end) for end in ends]
             panel.loglog(ends, values, "-" if peer.startswith("Gauss") else "--", label=peer)
-        panel.set(xlabel="time [periods]", ylabel=f"{quantity}, largest in a period")
-        panel.set_title(title, loc="left")
+        panel.set(xlabel="time [periods]", ylabel=f"{quantity}, largest in a period [{units[quantity]}]")
+        panel.set_title(f"$\\bf{{{letter}}}$  {title}", loc="left")
         panel.grid(which="major", alpha=0.25)
-    axes[0].legend(fontsize=8)
+    axes[1].legend(fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     return figure
 
 

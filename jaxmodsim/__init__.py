@@ -1,9 +1,28 @@
-"""Differentiable mechanics with friction: Lagrangians in, motion, figures and fits out."""
+"""Differentiable mechanics with friction: Lagrangians in, motion, figures and fits out.
+
+Scenes: Scene, AppliedForce, Friction, Signal, AbstractEffect; Constraint, VelocityConstraint, consistent.
+Mechanics: point_mass, rigid_body; Chart, Cylindrical, Spherical.
+Friction laws: Viscous, Curve, Coulomb, Stribeck, Dahl, LuGre, ElastoPlastic, MaxwellSlip, Armstrong; in the wrappers
+    Regularized, DeadZone, Sign; with asymmetric, scaled_by.
+About laws: check_passivity, damping_sigma1, regularized_width, max_stable_step; to_mujoco, to_modelica.
+Scenes elsewhere: to_c, to_javascript.
+Runs: simulate, simulate_to_accuracy; they give a Trajectory, or raise a SimulationError.
+Solvers: Rodas5P, Gauss, ImplicitFriction; EventSolver and EventController; StoredSteps, an adjoint.
+Analysis: energy_audit (EnergyAudit), sensitivity (Sensitivity), check_gradients (GradientCheck), cyclic_coordinates;
+    work_precision (WorkPrecision), Method, formulations.
+Records: fit, fit_law, Record, FitResult.
+Many runs: sweep.
+Speed: tune_cpu, called before JAX computes anything.
+Modules: analysis, export, identify, metrics, plot, problems, sweeps, validation.
+
+`help(jaxmodsim.simulate)` says more of each. Remarks go to the logger "jaxmodsim" of the module logging.
+"""
 
 from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 from typing import Any as _Any
 
+from ._core.provenance import versions as _versions
 from ._core.speed import tune_cpu as tune_cpu
 from .friction import Armstrong as Armstrong
 from .friction import Coulomb as Coulomb
@@ -64,6 +83,8 @@ if TYPE_CHECKING:
     from .analysis import formulations as formulations
     from .analysis import sensitivity as sensitivity
     from .analysis import work_precision as work_precision
+    from .export import to_c as to_c
+    from .export import to_javascript as to_javascript
     from .export import to_modelica as to_modelica
     from .export import to_mujoco as to_mujoco
     from .identify import FitResult as FitResult
@@ -88,7 +109,7 @@ _LATER = {
         "sensitivity",
         "work_precision",
     ),
-    "export": ("to_modelica", "to_mujoco"),
+    "export": ("to_c", "to_javascript", "to_modelica", "to_mujoco"),
     "identify": ("FitResult", "Record", "fit", "fit_law"),
     "metrics": (),
     "plot": (),
@@ -100,6 +121,8 @@ _FOLDERS = {name: folder for folder, names in _LATER.items() for name in names}
 
 
 def __getattr__(name: str) -> _Any:
+    if name == "__version__":
+        return _versions(__name__)[__name__]
     if name in _LATER:
         return _import_module(f"{__name__}.{name}")
     if name not in _FOLDERS:

@@ -1,6 +1,7 @@
 import ctypes
 import gc
 import io
+import logging
 import os
 import sys
 from collections.abc import Callable
@@ -45,6 +46,7 @@ jaxtyping.jaxtyped = _checked_where_made_once  # what the import hook looks up a
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 fuzz.register()
+logging.getLogger("jaxmodsim").setLevel(logging.ERROR)  # what compiles slowly here says nothing of the package
 
 # Programs keep millions of objects that never become garbage. Looking at all of them again and again costs a tenth of
 # the time.

@@ -9,13 +9,15 @@ import pytest
 
 from bench import render
 
-from .helpers import law_table
+from .helpers import law_table, snippets
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*render.pages(), ROOT / "CONTRIBUTING.md"]
 README = (ROOT / "README.md").read_text()
 _CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.DOTALL | re.MULTILINE)
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
+
+PAGES_WITH_CODE = [page for page in PAGES if page.parent.name == "docs" and snippets.snippets(page.read_text())]
 
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
@@ -57,6 +59,18 @@ def test_the_index_lists_every_page() -> None:
     assert linked == {page.name for page in index.parent.glob("*.md")} - {"index.md"}
 
 
+def test_the_gallery_lists_every_example() -> None:
+    linked = re.findall(r"\]\(\.\./(examples/\w+\.py)\)", (ROOT / "docs" / "gallery.md").read_text())
+    assert sorted(linked) == sorted(f"examples/{path.name}" for path in (ROOT / "examples").glob("*.py"))
+
+
+def test_the_site_has_every_page() -> None:
+    navigation = re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text())
+    assert {path.name for path in (ROOT / "docs").glob("*.md")} <= set(navigation)
+    rooms = {path.parent.name for path in (ROOT / "jaxmodsim").glob("*/__init__.py")} - {"_core", "cli"}
+    assert {f"api/{room}.md" for room in rooms} <= set(navigation)
+
+
 def test_every_figure_is_shown() -> None:
     shown = {Path(link).name for page in PAGES for link in _LINK.findall(page.read_text())}
     assert {path.name for path in (ROOT / "docs" / "figures").iterdir()} <= shown
@@ -84,6 +98,51 @@ def test_figures_of_the_readme_are_those_of_the_tables() -> None:
         assert set(figures) <= cells, f"{link} has none of {sorted(set(figures) - cells)}"
         checked += len(figures)
     assert checked >= 10
+
+
+def test_figures_of_the_claims_are_those_of_the_tables() -> None:
+    """Bold figures of a claim stand in a table of the page that its row links to; what else it names is there."""
+    claims = re.findall(r"^\| .+", (ROOT / "docs" / "claims.md").read_text(), re.MULTILINE)[1:]
+    assert len(claims) > 10
+    for claim in claims:
+        tables = [(ROOT / "docs" / link).read_text() for link in _LINK.findall(claim)]
+        cells = {
+            cell.strip()
+            for text in tables
+            for row in text.splitlines()
+            if row.startswith("|")
+            for cell in row.split("|")
+        }
+        assert set(re.findall(r"\*\*([\d.,e-]+)\*\*", claim)) <= cells, claim
+        assert all((ROOT / path).exists() for path in re.findall(r"`(tests/[\w/.]+)`", claim)), claim
+        assert all(
+            (ROOT / "bench" / "results" / f"{name}.json").exists() for name in re.findall(r"bench `(\w+)`", claim)
+        )
+
+
+def test_figures_of_the_paper_are_those_of_the_tables() -> None:
+    """Numbers with a decimal point stand in the tables of the pages."""
+    rows = [row for page in PAGES for row in page.read_text().splitlines() if row.startswith("|")]
+    cells = {cell.strip() for row in rows for cell in row.split("|")}
+    paper = (ROOT / "paper" / "paper.md").read_text()
+    figures = set(re.findall(r"\b\d+\.\d+(?:e-\d+)?\b", paper))
+    assert len(figures) > 5
+    assert figures <= cells
+    keys = set(re.findall(r"^@\w+\{(\w+),", (ROOT / "paper" / "paper.bib").read_text(), re.MULTILINE))
+    assert keys == {key for group in re.findall(r"\[(@[^\]]+)\]", paper) for key in re.findall(r"@(\w+)", group)}
+
+
+@pytest.mark.parametrize("page", PAGES_WITH_CODE, ids=lambda page: page.name)
+def test_the_code_of_a_page_prints_what_the_page_shows(page: Path) -> None:
+    """Written by `python -m tests.helpers.snippets PAGE`."""
+    assert snippets.printed_by(page) == [snippet.printed for snippet in snippets.snippets(page.read_text())]
+
+
+@each_page
+def test_every_block_of_code_runs_or_says_why_not(page: Path) -> None:
+    text = page.read_text()
+    not_run = len(re.findall(r"^ *\*Not run in the tests: .+\*\n\n *```python\n", text, re.MULTILINE))
+    assert text.count("```python\n") == len(snippets.snippets(text)) + not_run
 
 
 def test_the_code_of_the_readme_runs(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The one switch for speed."""
 
+import logging
 import subprocess
 import sys
 
@@ -50,6 +51,7 @@ def test_runs_without_it_say_so_once(
 ) -> None:
     monkeypatch.setenv("XLA_FLAGS", flags)
     monkeypatch.setattr("jax.default_backend", lambda: "cpu")
+    caplog.set_level(logging.WARNING, "jaxmodsim")
     recommend_tuning.cache_clear()
     recommend_tuning()
     recommend_tuning()

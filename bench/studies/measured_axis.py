@@ -39,10 +39,10 @@ def main(smoke: bool, out: Path) -> Result | None:
         t, q, _, u = np.loadtxt(path, delimiter=",", skiprows=1).T
         record = jms.Record(t, q, {"u": EMPS_GAIN * u}, name="EMPS")
         result.settings["samples"] = len(t)
-        how = ("--model", "coulomb") if smoke else ("--compare", "all")
+        how = ("--laws", "coulomb" if smoke else "all")
         command = [sys.executable, "-c", "from jaxmodsim.cli import main; main()", "fit", str(path), *how]
         started = time.perf_counter()
-        subprocess.run([*command, "--force-gain", str(EMPS_GAIN), "--out", folder], check=True, capture_output=True)
+        subprocess.run([*command, "--units", f"force={EMPS_GAIN}", "--out", folder], check=True, capture_output=True)
         result.settings["seconds"] = round(time.perf_counter() - started)
         report = json.loads((Path(folder) / "fit.json").read_text())
     if smoke:

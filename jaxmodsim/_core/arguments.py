@@ -4,6 +4,7 @@ import difflib
 import math
 from collections.abc import Iterable, Mapping
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PyTree
@@ -22,9 +23,13 @@ def check_real(value: object, *, name: str) -> None:
             kind = np.asarray(value).dtype
         except ValueError:  # of lists of unequal length
             kind = np.dtype(object)
+    column = None
+    if hasattr(value, "__array__") and not isinstance(value, np.ndarray | np.generic | jax.Array):
+        # Columns of tables have types of their own, and print over many lines.
+        kind, column = np.asarray(value).dtype, f"a {type(value).__name__} of {kind}"
     # What merely calls something its dtype is no array.
     if not isinstance(kind, np.dtype) or not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
-        raise ValueError(f"{name} must hold real numbers, but {value!r} was given.")
+        raise ValueError(f"{name} must hold real numbers, but {column or repr(value)} was given.")
 
 
 def as_reals(value: object, *, name: str) -> Float[np.ndarray, "..."]:

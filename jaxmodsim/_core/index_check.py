@@ -12,6 +12,8 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jax.lax import GatherScatterMode
 from jaxtyping import ArrayLike, PyTree
 
+from .user_errors import explain
+
 # What is known of a variable while tracing: its value, integers or booleans; the name of an argument; nothing.
 _Known: TypeAlias = np.ndarray | str | None
 
@@ -38,9 +40,16 @@ def traced(fn: Callable[..., object], *, name: str, **args: object) -> PyTree:
 
     **Raises:**
 
-    - `ValueError` naming the function, the index and what it is out of range of.
+    - `ValueError` naming the function, the index and what it is out of range of; or the line that JAX cannot trace,
+      and the mend.
     """
-    jaxpr, shapes = jax.make_jaxpr(fn, return_shape=True)(*args.values())
+    try:
+        jaxpr, shapes = jax.make_jaxpr(fn, return_shape=True)(*args.values())
+    except (TypeError, KeyError, IndexError) as error:
+        said = explain(error, name, args)
+        if said is None:
+            raise
+        raise ValueError(said) from error
     names = [key + jtu.keystr(path) for key, arg in args.items() for path, _ in jtu.tree_flatten_with_path(arg)[0]]
     _follow(jaxpr, names, name)
     return shapes

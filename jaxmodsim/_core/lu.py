@@ -1,5 +1,7 @@
 """LU factorisation written out in scalars, without the operations on what is known to be zero."""
 
+import functools
+import operator
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
@@ -52,6 +54,12 @@ def is_known(x: object) -> bool:
 def is_zero(x: object) -> bool:
     """Whether a number is known to be zero while tracing."""
     return is_known(x) and bool(x == 0)
+
+
+def product(row: Sequence[_Entry], x: Sequence[Array]) -> Array:
+    """Of a row that is not zero and a vector, without the terms that are known to be zero."""
+    terms: list[_Entry] = [a * b for a, b in zip(row, x, strict=True) if not is_zero(a)]
+    return functools.reduce(operator.add, terms)
 
 
 def factor_lu(rows: Sequence[Sequence[Scalar]], *, pivot: bool) -> LinearSolver:

@@ -32,6 +32,7 @@ class Range:
     - `lower`: lower limit; a string names another parameter of the same object; None for no limit.
     - `strict`: whether the lower limit itself is excluded.
     - `upper`: upper limit, included; None for no limit.
+    - `most`: a fit looks no further than this many times the parameter that `lower` names; None for no limit.
     - `execution`: whether the parameter says how a law is run and not what it is; a fit leaves it alone by itself.
     """
 
@@ -40,6 +41,7 @@ class Range:
     strict: bool = False
     upper: float | None = None
     execution: bool = False
+    most: float | None = None
 
     @property
     def text(self) -> str:
@@ -117,6 +119,7 @@ def parameter(
     strict: bool = False,
     upper: float | None = None,
     execution: bool = False,
+    most: float | None = None,
     **field: Any,
 ) -> Any:
     """Dataclass field of an `eqx.Module` that holds one number with a unit and an admissible range.
@@ -124,17 +127,19 @@ def parameter(
     **Arguments:**
 
     - `name`: name of the field, for error messages.
-    - `unit`, `lower`, `strict`, `upper`, `execution`: see `Range`.
+    - `unit`, `lower`, `strict`, `upper`, `execution`, `most`: see `Range`.
     - `field`: further arguments of `equinox.field`, such as `default`.
     """
-    allowed = Range(unit, lower, strict, upper, execution)
+    allowed = Range(unit, lower, strict, upper, execution, most)
     return eqx.field(converter=partial(as_number, name=name), metadata={"range": allowed}, **field)
 
 
-def optional_parameter(name: str, unit: str, *, lower: float | str | None = None, strict: bool = False) -> Any:
+def optional_parameter(
+    name: str, unit: str, *, lower: float | str | None = None, strict: bool = False, most: float | None = None
+) -> Any:
     """A `parameter` that may be left out, and then is None."""
     convert = partial(_unless_none, convert=as_number, name=name)
-    return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower, strict)})
+    return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower, strict, most=most)})
 
 
 def vector_parameter(name: str, unit: str, *, lower: float | str | None = None, strict: bool = False) -> Any:

@@ -1,5 +1,6 @@
 """Small arrays taken apart: a function of arrays, evaluated in scalars."""
 
+import abc
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
@@ -11,10 +12,11 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.extend.core import Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .fusion import fusion_barrier, opaque_one
+from .lu import is_known
 
 # Arrays with more entries stay whole: tables, and what is looked up in them. Twelve coordinates make squares of 144.
 MAX_ENTRIES = 144
@@ -37,10 +39,17 @@ _CALLS = {"jit", "pjit", "closed_call", "core_call"}
 # Whether a function is being traced to be taken apart: those that it calls are, with it.
 _within: ContextVar[bool] = ContextVar("within", default=False)
 
+
+class AbstractSymbol(abc.ABC):
+    """A scalar that stands for what a program is going to compute, of the type `dtype`."""
+
+    dtype: np.dtype
+
+
 # Entries of an array: scalars, those known while tracing as NumPy's. Every other value is one array, not taken apart.
-_Parts = np.ndarray
-_Value: TypeAlias = Array | np.ndarray | np.generic
-_Params: TypeAlias = dict[str, Any]  # as JAX has them
+Parts: TypeAlias = np.ndarray
+Value: TypeAlias = Array | np.ndarray | np.generic | AbstractSymbol
+Params: TypeAlias = dict[str, Any]  # as JAX has them
 
 
 def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "..."]) -> PyTree:
@@ -65,11 +74,7 @@ def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "...
     """
     if _within.get():
         return fn(*args)
-    outside = _within.set(True)
-    try:
-        closed, shapes = jax.make_jaxpr(fn, return_shape=True)(*args)
-    finally:
-        _within.reset(outside)
+    closed, shapes = trace_in_arrays(fn, *args)
     leaves = [x if hasattr(x, "shape") else jnp.asarray(x) for x in jtu.tree_leaves(args)]
     sizes = [size for size in _sizes(closed.jaxpr) if size <= MAX_ENTRIES]
     traced = any(isinstance(x, jax.core.Tracer) for x in leaves)
@@ -83,7 +88,16 @@ def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "...
     return jtu.tree_unflatten(jtu.tree_structure(shapes), out)
 
 
-def columns_of(linear: Callable[..., list[_Value]], unit: Float[Array, ""], *like: ArrayLike) -> list[list[_Value]]:
+def trace_in_arrays(fn: Callable[..., PyTree], *args: PyTree) -> tuple[ClosedJaxpr, PyTree]:
+    """`fn(*args)` traced with nothing in it taken apart, and the shapes of what it returns."""
+    outside = _within.set(True)
+    try:
+        return jax.make_jaxpr(fn, return_shape=True)(*args)
+    finally:
+        _within.reset(outside)
+
+
+def columns_of(linear: Callable[..., list[Value]], unit: Float[Array, ""], *like: ArrayLike) -> list[list[Value]]:
     """The matrix of a linear function of scalars, column by column; zeros and ones that its structure shows are known.
 
     **Arguments:**
@@ -128,7 +142,7 @@ def _entries(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
     return itertools.product(*map(range, shape))
 
 
-def _array(shape: tuple[int, ...], entry: Callable[[tuple[int, ...]], _Value]) -> _Parts:
+def _array(shape: tuple[int, ...], entry: Callable[[tuple[int, ...]], Value]) -> Parts:
     out = np.empty(shape, object)
     for index in _entries(shape):
         out[index] = entry(index)
@@ -137,30 +151,36 @@ def _array(shape: tuple[int, ...], entry: Callable[[tuple[int, ...]], _Value]) -
 
 def _whole(x: Any) -> Any:
     """A value as one array."""
-    if not _apart(x):
+    if not is_apart(x):
         return x
     # Row by row: XLA finds the entries of a stack again, but not behind a reshape.
     return jnp.asarray(x[()]) if x.shape == () else jnp.stack([_whole(x[i, ...]) for i in range(len(x))])
 
 
-def _apart(x: object) -> bool:
+def is_apart(x: object) -> bool:
     return isinstance(x, np.ndarray) and x.dtype == object
 
 
-def _known(x: object) -> bool:
-    return isinstance(x, np.generic)
+class AbstractScalars(abc.ABC):
+    """Evaluates a traced function entry by entry; remembers what it has computed.
 
+    Entries are NumPy's scalars where they are known while tracing, and else what `scalar` makes of them.
+    """
 
-class _Scalars:
-    """Evaluates a traced function entry by entry; remembers what it has computed."""
-
-    def __init__(self, unit: Array) -> None:
-        self.unit = unit
+    def __init__(self) -> None:
         self.memory: dict[object, tuple[object, Any]] = {}
 
-    def parts(self, x: Any) -> _Parts:
+    @abc.abstractmethod
+    def scalar(self, compute: Callable[..., Value], name: str, params: Params, operands: list[Value]) -> Value:
+        """One scalar from scalars, by the operation `name` of JAX, which is `compute(*operands, **params)`."""
+
+    @abc.abstractmethod
+    def whole(self, eqn: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
+        """Outputs of an equation that is not taken apart here."""
+
+    def parts(self, x: Any) -> Parts:
         """A value taken apart."""
-        if _apart(x):
+        if is_apart(x):
             return x
         if isinstance(x, np.ndarray):
             return _array(x.shape, lambda index: x[index])
@@ -170,11 +190,11 @@ class _Scalars:
             self.memory[id(x)] = x, _array(x.shape, lambda _: next(entries))
         return self.memory[id(x)][1]
 
-    def run(self, jaxpr: Jaxpr, consts: Sequence[ArrayLike], args: Sequence[_Value]) -> list[_Value]:
+    def run(self, jaxpr: Jaxpr, consts: Sequence[ArrayLike], args: Sequence[Value]) -> list[Value]:
         """Values of the outputs, apart or whole."""
         values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(_constant, consts), *args], strict=True))
 
-        def read(atom: Any) -> _Value:
+        def read(atom: Any) -> Value:
             kind: Any = atom.aval
             return np.asarray(atom.val, kind.dtype) if isinstance(atom, Literal) else values[atom]
 
@@ -182,7 +202,7 @@ class _Scalars:
             values.update(zip(eqn.outvars, self.step(eqn, [read(x) for x in eqn.invars]), strict=True))
         return [read(x) for x in jaxpr.outvars]
 
-    def step(self, eqn: Any, inputs: list[_Value]) -> Sequence[_Value]:
+    def step(self, eqn: Any, inputs: list[Value]) -> Sequence[Value]:
         """Outputs of one equation."""
         name, params = eqn.primitive.name, eqn.params
         if name in _CALLS:
@@ -206,37 +226,33 @@ class _Scalars:
             return [getattr(self, name)(params, *map(self.parts, inputs))]
         return self.whole(eqn, inputs)
 
-    def whole(self, eqn: JaxprEqn, inputs: list[_Value]) -> list[_Value]:
-        """Outputs of an equation that gets its arrays whole."""
-        bound = eqn.primitive.get_bind_params(eqn.params)
-        functions, params = bound if isinstance(bound, tuple) else ((), bound)
-        out = eqn.primitive.bind(*functions, *map(_whole, inputs), **params)
-        return list(out) if eqn.primitive.multiple_results else [out]
-
-    def apply(self, compute: Callable[..., _Value], name: str, params: _Params, operands: list[_Value]) -> _Value:
+    def apply(self, compute: Callable[..., Value], name: str, params: Params, operands: list[Value]) -> Value:
         """One scalar from scalars."""
-        if all(map(_known, operands)) and name in _KNOWN:
+        if all(map(is_known, operands)) and name in _KNOWN:
             return np.asarray(_KNOWN[name](params, *operands))[()]
         short = _shorten(name, operands)
         if short is not None:
             return short
-        key = (name, str(params), *(x.tobytes() + x.dtype.str.encode() if _known(x) else id(x) for x in operands))
+        key = (
+            name,
+            str(params),
+            *(np.asarray(x).tobytes() + x.dtype.str.encode() if is_known(x) else id(x) for x in operands),
+        )
         if key not in self.memory:
-            out = compute(*operands, **params)
             # The operands are kept, for an id is that of one object only while it lives.
-            self.memory[key] = operands, fusion_barrier(out, self.unit) if name in _REPEATED else out
+            self.memory[key] = operands, self.scalar(compute, name, params, operands)
         return self.memory[key][1]
 
-    def add(self, a: _Value, b: _Value) -> _Value:
+    def add(self, a: Value, b: Value) -> Value:
         return self.apply(jax.lax.add, "add", {}, [a, b])
 
-    def reduce_sum(self, params: _Params, x: _Parts) -> _Parts:
+    def reduce_sum(self, params: Params, x: Parts) -> Parts:
         axes = params["axes"]
         x = np.moveaxis(x, axes, range(len(axes)))
         x = x.reshape(-1, *x.shape[len(axes) :])
         return _array(x.shape[1:], lambda i: functools.reduce(self.add, x[(slice(None), *i)]))
 
-    def cumsum(self, params: _Params, x: _Parts) -> _Parts:
+    def cumsum(self, params: Params, x: Parts) -> Parts:
         step = -1 if params["reverse"] else 1
         x = np.moveaxis(x, params["axis"], 0)[::step].copy()
         for k in range(1, x.shape[0]):
@@ -244,14 +260,14 @@ class _Scalars:
                 x[(k, *i)] = self.add(x[(k - 1, *i)], x[(k, *i)])
         return np.moveaxis(x[::step], 0, params["axis"])
 
-    def dot_general(self, params: _Params, a: _Parts, b: _Parts) -> _Parts:
+    def dot_general(self, params: Params, a: Parts, b: Parts) -> Parts:
         (sum_a, sum_b), (batch_a, batch_b) = params["dimension_numbers"]
         free_a = [i for i in range(a.ndim) if i not in (*sum_a, *batch_a)]
         free_b = [i for i in range(b.ndim) if i not in (*sum_b, *batch_b)]
         a, b = a.transpose(*batch_a, *free_a, *sum_a), b.transpose(*batch_b, *free_b, *sum_b)
         batch, rows, columns = len(batch_a), len(free_a), len(free_b)
 
-        def entry(i: tuple[int, ...]) -> _Value:
+        def entry(i: tuple[int, ...]) -> Value:
             left, right = a[(*i[: batch + rows], ...)], b[(*i[:batch], *i[batch + rows :], ...)]
             pairs = zip(left.flat, right.flat, strict=True)
             return functools.reduce(self.add, [self.apply(jax.lax.mul, "mul", {}, [x, y]) for x, y in pairs])
@@ -259,33 +275,53 @@ class _Scalars:
         return _array((*a.shape[: batch + rows], *b.shape[batch : batch + columns]), entry)
 
 
-def _constant(x: ArrayLike) -> _Value:
+class _Scalars(AbstractScalars):
+    """Scalars of JAX."""
+
+    def __init__(self, unit: Array) -> None:
+        super().__init__()
+        self.unit = unit
+
+    def scalar(self, compute: Callable[..., Value], name: str, params: Params, operands: list[Value]) -> Value:
+        """The operation itself."""
+        out = compute(*operands, **params)
+        return fusion_barrier(out, self.unit) if name in _REPEATED else out
+
+    def whole(self, eqn: JaxprEqn, inputs: list[Value]) -> list[Value]:
+        """Outputs of an equation that gets its arrays whole."""
+        bound = eqn.primitive.get_bind_params(eqn.params)
+        functions, params = bound if isinstance(bound, tuple) else ((), bound)
+        out = eqn.primitive.bind(*functions, *map(_whole, inputs), **params)
+        return list(out) if eqn.primitive.multiple_results else [out]
+
+
+def _constant(x: ArrayLike) -> Value:
     return x if isinstance(x, jax.core.Tracer) else np.asarray(x)
 
 
-def _shorten(name: str, operands: list[_Value]) -> _Value | None:
+def _shorten(name: str, operands: list[Value]) -> Value | None:
     """Sums, products and quotients with zero or one, and choices that are known or make no difference; else None."""
     if name in ("add", "add_any", "mul"):
         for a, b in (operands, operands[::-1]):
-            if _known(a) and a == 0:
+            if is_known(a) and a == 0:
                 return a if name == "mul" else b
-            if _known(a) and a == 1 and name == "mul":
+            if is_known(a) and a == 1 and name == "mul":
                 return b
     if name == "select_n":
         chosen, *cases = operands
-        if _known(chosen):
-            return cases[int(chosen)]
+        if is_known(chosen):
+            return cases[int(np.asarray(chosen))]
         # The derivative of |v| by anything else is zero on either side.
-        if all(map(_known, cases)) and all(x == cases[0] for x in cases):
+        if all(map(is_known, cases)) and all(x == cases[0] for x in cases):
             return cases[0]
-    if name == "div" and _known(operands[0]) and operands[0] == 0:
+    if name == "div" and is_known(operands[0]) and operands[0] == 0:
         return operands[0]
-    if name == "sub" and _known(operands[1]) and operands[1] == 0:
+    if name == "sub" and is_known(operands[1]) and operands[1] == 0:
         return operands[0]
     return None
 
 
-def _pad(params: _Params, x: _Parts, filling: _Parts) -> _Parts:
+def _pad(params: Params, x: Parts, filling: Parts) -> Parts:
     config = [tuple(map(int, sizes)) for sizes in params["padding_config"]]
     shape = tuple(
         low + high + size + inner * max(size - 1, 0) for size, (low, high, inner) in zip(x.shape, config, strict=True)
@@ -298,25 +334,25 @@ def _pad(params: _Params, x: _Parts, filling: _Parts) -> _Parts:
     return out
 
 
-def _broadcast(params: _Params, x: _Parts) -> _Parts:
+def _broadcast(params: Params, x: Parts) -> Parts:
     shape = [1] * len(params["shape"])
     for dimension, size in zip(params["broadcast_dimensions"], x.shape, strict=True):
         shape[dimension] = size
     return np.broadcast_to(x.reshape(shape), params["shape"])
 
 
-def _slice(params: _Params, x: _Parts) -> _Parts:
+def _slice(params: Params, x: Parts) -> Parts:
     strides = params["strides"] or (1,) * x.ndim
     return x[tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]
 
 
-def _iota(params: _Params) -> _Parts:
+def _iota(params: Params) -> Parts:
     shape, dimension = params["shape"], params["dimension"]
     return _array(shape, lambda i: np.dtype(params["dtype"]).type(i[dimension]))
 
 
 # Which entry goes where.
-_MOVES: dict[str, Callable[..., _Parts]] = {
+_MOVES: dict[str, Callable[..., Parts]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda params, *xs: np.concatenate(xs, params["dimension"]),
     "iota": _iota,

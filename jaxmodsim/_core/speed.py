@@ -2,10 +2,18 @@
 
 import logging
 import os
+from collections.abc import Iterable
 from functools import cache
 
 import jax
 from jax._src import xla_bridge
+
+_LOG = logging.getLogger("jaxmodsim")
+# Compiling that takes longer is said [s].
+_LONG = 3.0
+# Functions that were compiled, by the line they are defined in.
+_COMPILED: dict[str, set[int]] = {}
+_TOO_OFTEN = 3
 
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
 
@@ -45,9 +53,47 @@ def tune_cpu(while_loop_bytes: int = 1_000_000) -> None:
 def recommend_tuning() -> None:
     """Log once, where XLA runs on CPU without the option, what makes runs faster."""
     if jax.default_backend() == "cpu" and _OPTION not in os.environ.get("XLA_FLAGS", ""):
-        logging.getLogger("jaxmodsim").warning(
+        _LOG.warning(
             "Runs on CPU are 2 to 8 times faster after jaxmodsim.tune_cpu(), called before JAX computes anything."
         )
+
+
+@cache
+def remark_on_single_precision() -> None:
+    """Log once that single precision cannot meet the tolerance that was asked for."""
+    _LOG.warning(
+        "rtol is below 1e-6 in float32, which holds seven digits: rounding decides. Call"
+        ' jax.config.update("jax_enable_x64", True) first, and give q0 in float64.'
+    )
+
+
+def remark_on_compilation(seconds: float, functions: Iterable[object]) -> None:
+    """Log a compilation that took long, and a function that is compiled again and again because it is made anew.
+
+    **Arguments:**
+
+    - `seconds`: how long it took.
+    - `functions`: those of the scene that was compiled.
+    """
+    if seconds > _LONG:
+        _LOG.warning(
+            "Compiling this scene took %.1f s; further runs of it, with other numbers too, start at once. A line like"
+            " this is turned off by logging.getLogger('jaxmodsim').setLevel('ERROR').",
+            seconds,
+        )
+    for each in functions:
+        code = getattr(each, "__code__", None)
+        if code is None:
+            continue
+        line = f"{code.co_filename}:{code.co_firstlineno}"
+        seen = _COMPILED.setdefault(line, set())
+        seen.add(id(each))  # what was compiled is kept, so no other function gets its identity
+        if len(seen) == _TOO_OFTEN:
+            _LOG.warning(
+                "The function of %s was compiled for the third time, as a new function each time: define it once,"
+                " outside of the loop, and pass what changes by the params of the scene.",
+                line,
+            )
 
 
 def cores() -> int:

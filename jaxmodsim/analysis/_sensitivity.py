@@ -11,8 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..scene import Scene, elements, read_element, replace_elements, scene_numbers, scene_ranges, signals_of
-from ..simulation import Trajectory, named_series, named_unit, simulate
+from ..scene import (
+    Scene,
+    elements,
+    quantity_of,
+    read_element,
+    replace_elements,
+    scene_numbers,
+    scene_ranges,
+    signals_of,
+)
+from ..simulation import Trajectory, named_series, simulate
 
 _MODES = ("forward", "reverse")
 
@@ -136,7 +145,7 @@ def sensitivity(
     run = simulate(scene, q0, qd0, t1, **given)
     if run.modes is not None:  # a traced run would hold room for all events that are allowed
         given["max_events"] = run.log_size
-    observe, label, unit = observable_of(observable)
+    observe, label, unit = observable_of(scene, observable)
     y = observed(observe(run))
     if mode is None:
         forward, reverse = _FORWARD + _PER_PARAMETER * len(values), _REVERSE + _PER_OUTPUT * y.size
@@ -199,11 +208,13 @@ def with_values(scene: Scene, start: Mapping[str, ArrayLike], x: Mapping[str, Ar
 
 
 def observable_of(
+    scene: Scene,
     observable: str | Callable[[Trajectory], ArrayLike],
 ) -> tuple[Callable[[Trajectory], ArrayLike], str, str]:
     """What is observed, its label and its unit."""
     if isinstance(observable, str):
-        return partial(named_series, name=observable), observable, named_unit(observable)
+        label, unit = quantity_of(scene, observable)
+        return partial(named_series, name=observable), label, unit
     if not callable(observable):
         raise ValueError(
             "observable must be a function of the Trajectory, as in lambda run: run.q[:, 0], or a name such as"

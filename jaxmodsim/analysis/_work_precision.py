@@ -102,7 +102,7 @@ def work_precision(
         )
     if not isinstance(scene, Scene):
         raise ValueError(f"work_precision needs a Scene, but {scene!r} was given.")
-    observe, label, unit = observable_of(observable)
+    observe, label, unit = observable_of(scene, observable)
     ts = None if ts is None else np.asarray(ts, float)
     question = Question(
         np.asarray(q0, float), np.asarray(qd0, float), float(t1), ts, observe, label, unit, {}, max_steps

@@ -1,5 +1,6 @@
 """The commands. Everything heavy is imported inside them, so that --help and usage errors come at once."""
 
+import logging
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -42,6 +43,7 @@ def _start() -> None:
     from ._cache import use_cache
 
     tune_cpu()
+    logging.getLogger("jaxmodsim").setLevel(logging.ERROR)  # what takes time shows its progress
     jax.config.update("jax_enable_x64", True)
     use_cache()
 
@@ -85,19 +87,20 @@ def fit(
     time: _options.Time = "t",
     position: _options.Position = "q",
     force: _options.Force = "u",
-    force_gain: _options.ForceGain = 1.0,
-    model: _options.Model = "coulomb",
-    compare: _options.Compare = None,
+    units: _options.Units = None,
+    drop: _options.Drop = None,
+    laws: _options.Laws = "coulomb",
     free: _options.Free = None,
     start: _options.Start = None,
     fix: _options.Fix = None,
     limit: _options.Limit = None,
-    hold_out: _options.HoldOut = None,
+    held_out: _options.HeldOut = None,
     folds: _options.Folds = None,
     loss: _options.Loss = "squares",
     begin: _options.Begin = "rough",
     starts: _options.Starts = 1,
-    substeps: _options.Substeps = 1,
+    max_steps: _options.MaxSteps = 100,
+    substeps: _options.Substeps = None,
     out: Out = Path("jaxmodsim-fit"),
     report: _options.Report = None,
     next_input: _options.NextInput = None,
@@ -113,13 +116,12 @@ def fit(
     _start()
     from ._fit import run_fit
     from ._plan import FitRequest
-    from ._read import AxisColumns
 
     run_fit(
         FitRequest(
-            record, AxisColumns(time, position, force, force_gain), model, compare, free or [], start or [], fix or [],
-            limit or [], hold_out or [], folds, loss, begin, starts, substeps, out, report, next_input, max_force,
-            max_speed, max_travel, duration,
+            record, (time, position, force), units or [], drop or [], laws, free or [], start or [], fix or [],
+            limit or [], held_out or [], folds, loss, begin, starts, max_steps, substeps, out, report, next_input,
+            max_force, max_speed, max_travel, duration,
         )
     )  # fmt: skip
 

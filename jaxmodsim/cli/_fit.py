@@ -18,6 +18,7 @@ from ..identify import (
     InputDesign,
     Profile,
     Record,
+    agreement,
     compare,
     design_input,
     fit,
@@ -25,15 +26,28 @@ from ..identify import (
     remarks,
     rough_axis,
     score,
+    step_shows,
 )
 from ..plot import comparison_figure, design_figure, fit_figure, score_figure
 from ..scene import Scene, scene_numbers
-from ._fitted import Findings, Fitted, origin, parameter_table, record_table, sample_table, summary, with_units
+from ._fitted import (
+    Findings,
+    Fitted,
+    headline,
+    origin,
+    parameter_table,
+    record_table,
+    sample_table,
+    summary,
+    with_units,
+)
 from ._options import Interrupted
 from ._output import Content, console, say, show_paths, show_table, write
 from ._plan import FitRequest, Plan, plan_of
 from ._report_html import report_page
 
+# Integration steps between two samples are raised by this factor, to so many at most.
+_FINER, _MOST_SUBSTEPS = 4, 64
 # Parameters whose likelihood a report profiles, and about how many points on either side.
 _PROFILED, _POINTS = 2, 4
 
@@ -76,23 +90,44 @@ def run_fit(request: FitRequest) -> None:
 
 
 def _fitted(plan: Plan) -> Fitted:
-    """Fit the one model, or compare several and take the simplest that is as good as the best."""
+    """Fit the one model, or compare several; with more integration steps between samples as long as these show."""
     started = time.perf_counter()
-    comparison = None
-    if plan.compared:
-        comparison = _compared(plan)
-        model = comparison.simplest
-        result = comparison.results[model]
-    else:
-        ((model, candidate),) = plan.candidates.items()
-        scene, free = candidate.scene, candidate.free
-        assert isinstance(scene, Scene)
-        assert free is not None
-        result = fit_with_progress(scene, plan.records, free, limits=plan.limits, **plan.options)
-    fitted = Fitted(plan, model, with_units(result), comparison, (), time.perf_counter() - started)
+    substeps = plan.substeps or 1
+    fitted = _fitted_with(plan, substeps)
+    while plan.substeps is None and substeps < _MOST_SUBSTEPS and step_shows(fitted.result) and not fitted.interrupted:
+        substeps *= _FINER
+        fitted = _fitted_with(plan, substeps, fitted.result)
     # Whoever pressed Ctrl-C does not wait for more.
-    scores = () if fitted.interrupted else tuple(score(result, record) for record in plan.held_out)
-    return replace(fitted, scores=scores, seconds=time.perf_counter() - started)
+    scores = () if fitted.interrupted else tuple(score(fitted.result, record) for record in plan.held_out)
+    several = len(plan.records) > 1 and not fitted.interrupted
+    return replace(
+        fitted,
+        scores=scores,
+        agreement=agreement(fitted.result) if several else None,
+        substeps=substeps,
+        seconds=time.perf_counter() - started,
+    )
+
+
+def _fitted_with(plan: Plan, substeps: int, before: FitResult | None = None) -> Fitted:
+    """Fit the one model, or compare several and take the simplest that is as good as the best.
+
+    A single model goes on from the result of the fit before.
+    """
+    if plan.compared:
+        comparison = _compared(plan, substeps)
+        model = comparison.simplest
+        return Fitted(plan, model, with_units(comparison.results[model], plan.rotary), comparison)
+    ((model, candidate),) = plan.candidates.items()
+    scene, free, options = candidate.scene, candidate.free, plan.options
+    if before is not None:
+        scene, options = before.model, {**options, "initializer": ()}
+    assert isinstance(scene, Scene)
+    assert free is not None
+    result = fit_with_progress(scene, plan.records, free, limits=plan.limits, substeps=substeps, **options)
+    if before is not None:
+        result = replace(result, estimate=replace(result.estimate, start=before.estimate.start))
+    return Fitted(plan, model, with_units(result, plan.rotary))
 
 
 @contextmanager
@@ -116,7 +151,7 @@ def _ctrl_c() -> Iterator[Callable[[], None]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _compared(plan: Plan) -> Comparison:
+def _compared(plan: Plan, substeps: int) -> Comparison:
     judged: dict[str, Any] = {"hold_out": plan.held_out} if plan.folds is None else {"folds": plan.folds}
     with console.status("compiling") as status, _ctrl_c() as end:
 
@@ -125,7 +160,8 @@ def _compared(plan: Plan) -> Comparison:
             status.update(f"{name}{held}, iteration {step}: RMSE {rms:.6g}")
             end()
 
-        return compare(plan.candidates, plan.records, limits=plan.limits, progress=progress, **judged, **plan.options)
+        options = {**judged, **plan.options, "substeps": substeps, "progress": progress}
+        return compare(plan.candidates, plan.records, limits=plan.limits, **options)
 
 
 def fit_with_progress(
@@ -144,28 +180,32 @@ def fit_with_progress(
 
 def _show(fitted: Fitted) -> None:
     result = fitted.result
+    for line in headline(fitted):
+        say(line)
     if fitted.comparison is not None:
         say(str(fitted.comparison))
     names = ", ".join(record.name for record in result.provenance.records)
     show_table(parameter_table(result), f"{names}: {fitted.model}, {fitted.description}")
     if len(result.provenance.records) + len(fitted.scores) > 1:
         show_table(record_table(fitted), "Records")
-    say(f"RMSE {result.rmse:.6g} m; {result.diagnostics.evaluations} evaluations, {result.diagnostics.ending}")
+    how = result.diagnostics
+    say(f"RMSE {result.rmse:.6g} {fitted.unit}; {how.evaluations} evaluations, {how.ending}")
     for remark in remarks(result):
         say(f"- {remark}")
     samples = sum(len(record.t) for record in result.provenance.records)
-    say(f"{samples} samples, {fitted.seconds:.1f} s with compilation")
+    steps = f"{fitted.substeps} integration step{'s' if fitted.substeps > 1 else ''} from one to the next"
+    say(f"{samples} samples, {steps}; {fitted.seconds:.1f} s with compilation")
 
 
 def _files(findings: Findings) -> dict[str, Content]:
     """Figures, tables, JSON and the result by file name."""
     fitted, result = findings.fitted, findings.fitted.result
     files: dict[str, Content] = {}
-    single = len(result.provenance.records) == 1
+    single, seen = len(result.provenance.records) == 1, fitted.measured
     for i, record in enumerate(result.provenance.records):
-        files["fit.png" if single else f"fit_{_numbered(i, record)}.png"] = fit_figure(result, record=i)
+        files["fit.png" if single else f"fit_{_numbered(i, record)}.png"] = fit_figure(result, record=i, **seen)
     for i, held_out in enumerate(fitted.scores):
-        files[f"held_out_{_numbered(i, held_out.record)}.png"] = score_figure(held_out)
+        files[f"held_out_{_numbered(i, held_out.record)}.png"] = score_figure(held_out, **seen)
     if fitted.comparison is not None:
         files["comparison.png"] = comparison_figure(fitted.comparison)
     return {
@@ -204,6 +244,7 @@ def _designed(request: FitRequest, fitted: Fitted) -> InputDesign:
         request.max_force or max(float(np.max(np.abs(record.inputs["u"]))) for record in records),
         request.max_speed or max(rough_axis(record).top for record in records if np.ptp(record.measured) > 0),
         request.max_travel or 0.5 * (high - low),
+        rotary=fitted.plan.rotary,
     )
     numbers = scene_numbers(fitted.scene)
     with console.status("designing the next input: compiling") as status:
@@ -211,7 +252,7 @@ def _designed(request: FitRequest, fitted: Fitted) -> InputDesign:
         def progress(step: int, goal: float) -> None:
             status.update(f"designing the next input: iteration {step}, goal {goal:.4g}")
 
-        return design_input(
+        design = design_input(
             fitted.scene,
             [name for name in result.values if name in numbers],
             limits,
@@ -221,3 +262,4 @@ def _designed(request: FitRequest, fitted: Fitted) -> InputDesign:
             q0=[0.5 * (low + high)],
             progress=progress,
         )
+    return replace(design, units={name: result.estimate.units[name] for name in design.values})

@@ -10,10 +10,11 @@ from importlib import metadata
 import numpy as np
 import pandas as pd
 
-from ..identify import Comparison, FitResult, InputDesign, Profile, Score
+from ..identify import Comparison, FitResult, InputDesign, Profile, RecordAgreement, Score, remarks
 from ..scene import Scene, scene_numbers
 from ._equations import equations
 from ._plan import Plan
+from ._units import axis_unit
 
 # Units of what declares none: the params of an axis, and initial states.
 _UNITS = {"m": "kg", "offset": "N", "q0[0]": "m", "qd0[0]": "m/s"}
@@ -26,16 +27,19 @@ class Fitted:
     - `plan`: what was asked for. `model`: name of the model that was taken.
     - `result`: its fit to all records.
     - `comparison`: None where a single model was fitted, and not on folds.
-    - `scores`: on the records that were held out.
+    - `scores`: on the records that were held out. `agreement`: of several records; None of one.
+    - `substeps`: integration steps between two samples.
     - `seconds`: that all took.
     """
 
     plan: Plan
     model: str
     result: FitResult
-    comparison: Comparison | None
-    scores: tuple[Score, ...]
-    seconds: float
+    comparison: Comparison | None = None
+    scores: tuple[Score, ...] = ()
+    agreement: RecordAgreement | None = None
+    substeps: int = 1
+    seconds: float = 0.0
 
     @property
     def scene(self) -> Scene:
@@ -47,6 +51,21 @@ class Fitted:
     def description(self) -> str:
         """The model in words."""
         return self.plan.candidates[self.model].description
+
+    @property
+    def quantity(self) -> str:
+        """What was measured, in words."""
+        return "angle" if self.plan.rotary else "position"
+
+    @property
+    def unit(self) -> str:
+        """Unit of the position."""
+        return axis_unit("m", self.plan.rotary)
+
+    @property
+    def measured(self) -> dict[str, str]:
+        """What was measured, as figures name it."""
+        return {"quantity": self.quantity, "unit": self.unit}
 
     @property
     def interrupted(self) -> bool:
@@ -75,9 +94,12 @@ class Findings:
     origin: dict[str, str]
 
 
-def with_units(result: FitResult) -> FitResult:
-    """The result with the units of what declares none."""
-    units = {name: unit or _UNITS.get(name.rpartition("/")[2], "") for name, unit in result.estimate.units.items()}
+def with_units(result: FitResult, rotary: bool) -> FitResult:
+    """The result with the units of what declares none, and those of a rotary axis where it is one."""
+    units = {
+        name: axis_unit(unit or _UNITS.get(name.rpartition("/")[2], ""), rotary)
+        for name, unit in result.estimate.units.items()
+    }
     return replace(result, estimate=replace(result.estimate, units=units))
 
 
@@ -89,6 +111,46 @@ def origin() -> dict[str, str]:
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "versions": f"{versions}, Python {sys.version.split()[0]}",
     }
+
+
+def headline(fitted: Fitted) -> tuple[str, str, str]:
+    """Three lines to say aloud: what the axis is, how well it follows, and the first doubt."""
+    result, records = fitted.result, fitted.result.provenance.records
+    numbers = ", ".join(
+        f"{name} {value:.4g}{f' {unit}' if unit else ''} (+-{error:.2g})"
+        for name, value, error, _, unit in result.estimate.rows()
+    )
+    missed = np.concatenate([residual["measured"] for residual in result.residuals])
+    spread = math.sqrt(np.mean(np.concatenate([record.measured - np.mean(record.measured) for record in records]) ** 2))
+    seconds = sum(float(record.t[-1] - record.t[0]) for record in records)
+    held_out = [f"{1e3 * score.rmse['measured']:.3g} m{fitted.unit} on {score.record.name}" for score in fitted.scores]
+    never = f"; {', '.join(held_out)}, where nothing but the start is fitted, to the first samples" if held_out else ""
+    return (
+        f"{fitted.model.capitalize()}: {numbers}.",
+        f"Driven by the force alone for {seconds:.3g} s it misses the measured {fitted.quantity} by"
+        f" {1e3 * math.sqrt(np.mean(missed**2)):.3g} m{fitted.unit}, {100 * np.std(missed) / spread:.2g} % of its"
+        f" scatter{never}.",
+        _first_doubt(fitted),
+    )
+
+
+def _first_doubt(fitted: Fitted) -> str:
+    doubts = (*fitted.plan.notes, *differences(fitted), *start_remarks(fitted), *remarks(fitted.result))
+    if doubts:
+        return f"Before you rely on it: {doubts[0]}"
+    one = len(fitted.result.provenance.records) == 1
+    untested = "" if fitted.scores or not one else " Whether it holds on another day one record cannot tell."
+    return f"Nothing in the records speaks against it.{untested}"
+
+
+def differences(fitted: Fitted) -> tuple[str, ...]:
+    """Parameters in which the records differ."""
+    return () if fitted.agreement is None else fitted.agreement.sentences
+
+
+def start_remarks(fitted: Fitted) -> tuple[str, ...]:
+    """What the starts of records that were held out say of the model."""
+    return tuple(remark for score in fitted.scores for remark in score.remarks)
 
 
 def parameter_table(result: FitResult) -> pd.DataFrame:
@@ -106,35 +168,38 @@ def record_table(fitted: Fitted) -> pd.DataFrame:
     """Records, fitted and held out, with the root mean square of what the model misses."""
     rows = []
     for record, residuals in zip(fitted.result.provenance.records, fitted.result.residuals, strict=True):
-        rows.append((record, "fitted", residuals["measured"]))
+        rows.append((record, "fitted", math.sqrt(float(np.mean(residuals["measured"] ** 2))), math.nan))
     for score in fitted.scores:
-        rows.append((score.record, "held out", score.residuals["measured"]))
+        start = math.nan if score.start_fitted is None else score.start_fitted.rmse["measured"]
+        rows.append((score.record, "held out", score.rmse["measured"], start))
     return pd.DataFrame(
         {
-            "record": [record.name for record, _, _ in rows],
-            "use": [use for _, use, _ in rows],
-            "samples": [len(record.t) for record, _, _ in rows],
-            "from [s]": [float(record.t[0]) for record, _, _ in rows],
-            "to [s]": [float(record.t[-1]) for record, _, _ in rows],
-            "RMSE [mm]": [1e3 * math.sqrt(float(np.mean(residual**2))) for _, _, residual in rows],
-            "of its spread [%]": [
-                100 * float(np.std(residual) / (np.std(record.measured) or np.nan)) for record, _, residual in rows
-            ],
+            "record": [record.name for record, *_ in rows],
+            "use": [use for _, use, *_ in rows],
+            "samples": [len(record.t) for record, *_ in rows],
+            "from [s]": [float(record.t[0]) for record, *_ in rows],
+            "to [s]": [float(record.t[-1]) for record, *_ in rows],
+            f"RMSE [m{fitted.unit}]": [1e3 * rmse for _, _, rmse, _ in rows],
+            "of its spread [%]": [100 * rmse / float(np.std(record.measured) or np.nan) for record, _, rmse, _ in rows],
+            f"start fitted, RMSE [m{fitted.unit}]": [1e3 * start for *_, start in rows],
         }
     )
 
 
-def model_table(comparison: Comparison) -> pd.DataFrame:
-    """Compared models, best first."""
+def model_table(comparison: Comparison, unit: str) -> pd.DataFrame:
+    """Compared models, best first; `unit` is that of the position."""
     return pd.DataFrame(
         {
             "model": [each.name for each in comparison.ranked],
             "parameters": [each.parameters for each in comparison.ranked],
-            "held back, RMSE [mm]": [1e3 * each.held_back for each in comparison.ranked],
-            "standard error [mm]": [1e3 * each.error for each in comparison.ranked],
-            "over the best [mm]": [1e3 * each.over for each in comparison.ranked],
-            "its standard error [mm]": [1e3 * each.over_error for each in comparison.ranked],
-            "fitted, RMSE [mm]": [1e3 * each.fitted for each in comparison.ranked],
+            f"held back, RMSE [m{unit}]": [1e3 * each.held_back for each in comparison.ranked],
+            f"standard error [m{unit}]": [1e3 * each.error for each in comparison.ranked],
+            f"over the best [m{unit}]": [1e3 * each.over for each in comparison.ranked],
+            f"its standard error [m{unit}]": [1e3 * each.over_error for each in comparison.ranked],
+            f"start fitted, RMSE [m{unit}]": [
+                math.nan if each.start_fitted is None else 1e3 * each.start_fitted for each in comparison.ranked
+            ],
+            f"fitted, RMSE [m{unit}]": [1e3 * each.fitted for each in comparison.ranked],
             "not determined": [", ".join(each.undetermined) or "-" for each in comparison.ranked],
         }
     )
@@ -160,9 +225,9 @@ def sample_table(fitted: Fitted) -> pd.DataFrame:
                 "record": record.name,
                 "use": "held out" if record.name in held_out else "fitted",
                 "t [s]": record.t,
-                "force [N]": record.inputs["u"],
-                "measured [m]": record.measured,
-                "simulated [m]": simulated,
+                f"force [{axis_unit('N', fitted.plan.rotary)}]": record.inputs["u"],
+                f"measured [{fitted.unit}]": record.measured,
+                f"simulated [{fitted.unit}]": simulated,
             }
         )
         for record, simulated in outputs
@@ -173,13 +238,21 @@ def summary(findings: Findings) -> dict[str, object]:
     """All but the samples, of types that JSON knows."""
     fitted = findings.fitted
     return {
+        "headline": list(headline(fitted)),
+        "read": list(fitted.plan.notes),
         "model": fitted.model,
         "description": fitted.description,
         "equations": list(equations(fitted.scene)),
         **fitted.result.to_dict(),
         "held": fitted.held,
         "held_out": {score.record.name: score.rmse for score in fitted.scores},
+        "held_out_start_fitted": {
+            score.record.name: None if score.start_fitted is None else score.start_fitted.rmse
+            for score in fitted.scores
+        },
+        "differing": None if fitted.agreement is None else list(fitted.agreement.differing),
         "comparison": None if fitted.comparison is None else fitted.comparison.to_dict(),
+        "substeps": fitted.substeps,
         "seconds": fitted.seconds,
         **findings.origin,
     }

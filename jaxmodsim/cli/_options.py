@@ -16,30 +16,51 @@ Out = Annotated[Path, typer.Option(help="Folder for figures, tables and JSON; ma
 _COLUMNS, _MODEL, _JUDGED, _SEARCH, _NEXT = "Columns", "Model", "Judging it", "Search", "The next record"
 
 Records = Annotated[
-    list[Path], typer.Argument(help="Records, fitted together: .csv with a header line, .parquet or .mat.")
+    list[Path],
+    typer.Argument(
+        help="Records, fitted together: .csv with a header line, .parquet, .mat; of loggers .mf4, .tdms, .mcap, .bag."
+    ),
 ]
-Time = Annotated[str, typer.Option(help=r"Column of time \[s].", rich_help_panel=_COLUMNS)]
-Position = Annotated[str, typer.Option(help=r"Column of measured position \[m].", rich_help_panel=_COLUMNS)]
-Force = Annotated[str, typer.Option(help="Column of the applied force or drive signal.", rich_help_panel=_COLUMNS)]
-ForceGain = Annotated[float, typer.Option(help="Newtons per unit of the force column.", rich_help_panel=_COLUMNS)]
-Model = Annotated[
-    str, typer.Option(help="Model of the axis: coulomb, asymmetric, stribeck, lugre.", rich_help_panel=_MODEL)
+Time = Annotated[str, typer.Option(help="Column of time.", rich_help_panel=_COLUMNS)]
+Position = Annotated[
+    str, typer.Option(help="Column of measured position or angle; or of velocity.", rich_help_panel=_COLUMNS)
 ]
-Compare = Annotated[
-    str | None,
+Force = Annotated[
+    str, typer.Option(help="Column of the applied force or torque, or drive signal.", rich_help_panel=_COLUMNS)
+]
+Units = Annotated[
+    list[str] | None,
     typer.Option(
-        help="Fit several models, `all` or names with commas between, judge them by what was held back, and take"
-        " the simplest that is as good as the best.",
-        metavar="all|A,B,...",
+        help="What the columns time, position and force are in, as in time=ms,position=deg,force=12.5; by default"
+        r" what their names say, `phi \[deg]` or `phi_deg`, or SI. A number is SI units per unit of the column. An"
+        " angle or a torque makes the axis a rotary one.",
+        metavar="COLUMN=UNIT,...",
+        rich_help_panel=_COLUMNS,
+    ),
+]
+Drop = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Samples to leave out: nan, those without a finite value; repeated, those at the time of the one before.",
+        metavar="nan,repeated",
+        rich_help_panel=_COLUMNS,
+    ),
+]
+Laws = Annotated[
+    str,
+    typer.Option(
+        help="Friction of the axis: coulomb, asymmetric, stribeck, lugre. Several, with commas between, or `all` are"
+        " judged by what was held back, and the simplest that is as good as the best is taken.",
+        metavar="A,B,...|all",
         rich_help_panel=_MODEL,
     ),
 ]
 Free = Annotated[
     list[str] | None,
     typer.Option(
-        help="Parameters to fit, names with commas between, repeatable; by default those of the model. Also q0"
-        r" and qd0, the state at the first sample of each record, and delay.u of the force \[s].",
-        metavar="NAME,...",
+        help="Parameters to fit, names with commas between, repeatable; by default those of the law, to which +NAME"
+        r" adds one. Also q0 and qd0, the state at the first sample of each record, and delay.u of the force \[s].",
+        metavar="NAME,...|+NAME",
         rich_help_panel=_MODEL,
     ),
 ]
@@ -65,7 +86,7 @@ Limit = Annotated[
         rich_help_panel=_MODEL,
     ),
 ]
-HoldOut = Annotated[
+HeldOut = Annotated[
     list[Path] | None,
     typer.Option(help="Record that is never fitted, to judge by. Repeatable.", rich_help_panel=_JUDGED),
 ]
@@ -73,7 +94,7 @@ Folds = Annotated[
     int | None,
     typer.Option(
         help="Judge by cross-validation instead: cut each record into so many parts, and hold back one after the"
-        " other. --compare without --hold-out does so with 4.",
+        " other. Several laws without --held-out are judged so with 4.",
         rich_help_panel=_JUDGED,
     ),
 ]
@@ -93,7 +114,14 @@ Starts = Annotated[
     int,
     typer.Option(help="Searches from so many starts around it, of which the best is taken.", rich_help_panel=_SEARCH),
 ]
-Substeps = Annotated[int, typer.Option(help="Integration steps between two samples.", rich_help_panel=_SEARCH)]
+MaxSteps = Annotated[int, typer.Option(help="Limit of iterations of a search.", rich_help_panel=_SEARCH)]
+Substeps = Annotated[
+    int | None,
+    typer.Option(
+        help="Integration steps between two samples; by default as many as it takes until they no longer show.",
+        rich_help_panel=_SEARCH,
+    ),
+]
 Report = Annotated[
     Path | None, typer.Option(help="Folder for report.html: all of it in one file, to attach to a report.")
 ]

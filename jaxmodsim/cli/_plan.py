@@ -1,6 +1,7 @@
 """What `jaxmodsim fit` was asked for: as it was typed, and checked."""
 
 import math
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +25,8 @@ from ..identify import (
     start_state,
 )
 from ..scene import Scene, scene_numbers
-from ._read import AxisColumns, read_records
+from ._read import DROPS, AxisColumns, offset_note, read_records
+from ._units import given_units
 
 _LOSSES = {"squares": SquaredLoss, "huber": Huber, "cauchy": Cauchy}
 _INITIALIZERS = ("rough", "staged")
@@ -39,19 +41,21 @@ class FitRequest:
     """The arguments of `jaxmodsim fit`, as they were typed; see its --help."""
 
     records: Sequence[Path]
-    columns: AxisColumns
-    model: str
-    compare: str | None
+    columns: tuple[str, str, str]
+    units: Sequence[str]
+    drop: Sequence[str]
+    laws: str
     free: Sequence[str]
     start: Sequence[str]
     fix: Sequence[str]
     limit: Sequence[str]
-    hold_out: Sequence[Path]
+    held_out: Sequence[Path]
     folds: int | None
     loss: str
     begin: str
     starts: int
-    substeps: int
+    max_steps: int
+    substeps: int | None
     out: Path
     report: Path | None
     next_input: Path | None
@@ -69,6 +73,7 @@ class Plan:
     - `compared`: whether they are compared, or one is scored on folds. `folds`: how many, None for the default.
     - `records`, `held_out`: records that are fitted, and that are not.
     - `limits`: of parameters, for `fit`. `options`: further arguments of it.
+    - `substeps`: None for as many as it takes. `rotary`: whether the axis is. `notes`: how the files were read.
     """
 
     candidates: dict[str, Candidate]
@@ -78,6 +83,9 @@ class Plan:
     held_out: tuple[Record, ...]
     limits: dict[str, tuple[float | None, float | None]]
     options: dict[str, Any]
+    substeps: int | None
+    rotary: bool
+    notes: tuple[str, ...]
 
 
 def start_states(records: Sequence[Record]) -> dict[str, np.ndarray]:
@@ -87,18 +95,28 @@ def start_states(records: Sequence[Record]) -> dict[str, np.ndarray]:
 
 
 def plan_of(request: FitRequest) -> Plan:
-    """Read the records and check everything.
+    """Read the records and check everything; what is to be known of how they were read goes to stderr at once.
 
     **Raises:**
 
     - `ValueError` for an option that names something unknown, or that does not go with another one; as `read_records`.
     """
     _check(request)
-    names = _models(request)
+    names = _laws(request)
     loss = _LOSSES[_known("--loss", request.loss, _LOSSES)]()
     _known("--begin", request.begin, _INITIALIZERS)
-    together = read_records([*request.records, *request.hold_out], request.columns)
-    records, held_out = together[: len(request.records)], together[len(request.records) :]
+    columns = AxisColumns(*request.columns, given_units(request.units), _drops(request.drop))
+    read = read_records([*request.records, *request.held_out], columns)
+    records, held_out = (
+        tuple(part for file in files for part in file.parts)
+        for files in (read[: len(request.records)], read[len(request.records) :])
+    )
+    together = (*records, *held_out)
+    notes = [note for file in read for note in file.notes]
+    if not any("delay.u" in text for text in request.free):
+        notes += [note for record in together for note in offset_note(record, columns.force)]
+    for note in notes:
+        sys.stderr.write(f"Note: {note}\n")
     # A record that stands still, or that nothing drives, may go beside others that do not.
     driven = [record for record in together if np.ptp(record.measured) > 0 and np.ptp(record.inputs["u"]) > 0]
     for record in driven:
@@ -107,10 +125,12 @@ def plan_of(request: FitRequest) -> Plan:
     rough = replace(rough, start=min(float(record.t[0]) for record in records))
     numbers = {name: _numbers(axis_scene(axis_models()[name], rough)) for name in names}
     fixed, start = _values("--fix", request.fix, numbers), _values("--start", request.start, numbers)
-    chosen = tuple(name.strip() for text in request.free for name in text.split(",") if name.strip())
-    for name in chosen:
+    listed = tuple(name.strip() for text in request.free for name in text.split(",") if name.strip())
+    chosen = tuple(name for name in listed if not name.startswith("+"))
+    added = tuple(name.removeprefix("+") for name in listed if name.startswith("+"))
+    for name in (*chosen, *added):
         _known("--free", name, (*next(iter(numbers.values())), *_ALSO_FREE), listed=name.split("[")[0].split(".")[0])
-    for option, others in (("--start", start), ("--free", chosen)):
+    for option, others in (("--start", start), ("--free", (*chosen, *added))):
         both = sorted(set(fixed) & set(others))
         if both:
             raise ValueError(f"{both[0]} stands in {option} and in --fix: it can be fitted or fixed, not both.")
@@ -118,13 +138,16 @@ def plan_of(request: FitRequest) -> Plan:
     for name in names:
         model = axis_models()[name]
         own = [{key: x for key, x in given.items() if key in numbers[name]} for given in (start, fixed)]
-        free = tuple(each for each in chosen or model.free if each not in fixed)
+        free = tuple(dict.fromkeys(each for each in (*(chosen or model.free), *added) if each not in fixed))
         candidates[name] = Candidate(axis_scene(model, rough, *own), free, model.description)
     limits = {"m": (0.0, None)} | _limits(request.limit, numbers)
     initializer = _initializers(request, candidates, numbers)
-    options = {"loss": loss, "initializer": initializer, "substeps": request.substeps, **start_states(records)}
-    compared = request.compare is not None or request.folds is not None
-    return Plan(candidates, compared, request.folds, records, held_out, limits, options)
+    options = {"loss": loss, "initializer": initializer, "max_steps": request.max_steps, **start_states(records)}
+    compared = len(names) > 1 or request.folds is not None
+    rotary = any(file.rotary for file in read)
+    return Plan(
+        candidates, compared, request.folds, records, held_out, limits, options, request.substeps, rotary, tuple(notes)
+    )
 
 
 def _initializers(
@@ -145,12 +168,14 @@ def _check(request: FitRequest) -> None:
             raise ValueError(f"{option} {path} is a file; a folder is needed.")
     if request.starts < 1:
         raise ValueError(f"--starts must be at least 1, but it is {request.starts}.")
+    if request.max_steps < 1:
+        raise ValueError(f"--max-steps must be at least 1, but it is {request.max_steps}.")
+    if request.substeps is not None and request.substeps < 1:
+        raise ValueError(f"--substeps must be at least 1, but it is {request.substeps}.")
     if request.folds is not None and request.folds < 2:
         raise ValueError(f"--folds must be at least 2, but it is {request.folds}.")
-    if request.folds is not None and request.hold_out:
-        raise ValueError("--folds and --hold-out do not go together: a model is judged by one of them.")
-    if request.compare is not None and request.free:
-        raise ValueError("--free does not go with --compare, where each model has its own parameters: use --fix.")
+    if request.folds is not None and request.held_out:
+        raise ValueError("--folds and --held-out do not go together: a model is judged by one of them.")
     numbers = {"force": request.max_force, "speed": request.max_speed, "travel": request.max_travel}
     given = {f"--max-{name}": x for name, x in numbers.items()} | {"--duration": request.duration}
     for option, number in given.items():
@@ -162,17 +187,23 @@ def _check(request: FitRequest) -> None:
         raise ValueError(f"--next {request.next_input} is a folder; a file is needed.")
 
 
-def _models(request: FitRequest) -> tuple[str, ...]:
-    if request.compare is None:
-        return (_known("--model", request.model, axis_models(), "model"),)
-    if request.compare == "all":
-        return tuple(axis_models())
-    names = tuple(dict.fromkeys(name.strip() for name in request.compare.split(",") if name.strip()))
+def _laws(request: FitRequest) -> tuple[str, ...]:
+    given = dict.fromkeys(name.strip() for name in request.laws.split(",") if name.strip())
+    names = tuple(axis_models()) if "all" in given else tuple(given)
+    if not names:
+        raise ValueError(f"--laws needs a law, several as A,B, or `all`, but {request.laws!r} was given.")
     for name in names:
-        _known("--compare", name, axis_models(), "model")
-    if len(names) < 2:
-        raise ValueError(f"--compare needs `all` or two models or more, A,B, but {request.compare!r} was given.")
+        _known("--laws", name, axis_models(), "law")
+    if len(names) > 1 and any(not name.strip().startswith("+") for text in request.free for name in text.split(",")):
+        raise ValueError(
+            "--free does not go with several --laws, each of which has its own parameters: use --fix, or --free +NAME."
+        )
     return names
+
+
+def _drops(texts: Sequence[str]) -> frozenset[str]:
+    kinds = [kind.strip() for text in texts for kind in text.split(",") if kind.strip()]
+    return frozenset(_known("--drop", kind, DROPS, "kind of sample") for kind in kinds)
 
 
 def _numbers(scene: Scene) -> tuple[str, ...]:

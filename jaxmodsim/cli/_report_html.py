@@ -11,7 +11,7 @@ from markupsafe import Markup
 from ..identify import Comparison, InputDesign, remarks, residual_tests
 from ..plot import Figure, comparison_figure, design_figure, fit_figure, profile_figure, result_figure, score_figure
 from ._equations import equations
-from ._fitted import Findings, Fitted, design_table, model_table, parameter_table, record_table
+from ._fitted import Findings, Fitted, design_table, headline, model_table, parameter_table, record_table
 from ._output import cell
 
 # Magnitude of a correlation above which its cell is marked.
@@ -29,6 +29,10 @@ def report_page(findings: Findings) -> str:
     return environment.get_template("report.html.jinja").render(
         title=f"Fit of {', '.join(record.name for record in result.provenance.records)}: {fitted.model}",
         result=result,
+        headline=headline(fitted),
+        notes=fitted.plan.notes,
+        unit=fitted.unit,
+        quantity=fitted.quantity,
         origin=findings.origin,
         records=record_table(fitted),
         parameters=parameter_table(result),
@@ -39,8 +43,10 @@ def report_page(findings: Findings) -> str:
         simulated=list(_simulated(fitted)),
         residual_tests=residual_tests(result),
         strong=_STRONG,
-        scores=[(f"{score.record.name}, never fitted", score_figure(score)) for score in fitted.scores],
-        comparison=None if fitted.comparison is None else _compared(fitted.comparison),
+        scores=[
+            (f"{score.record.name}, never fitted", score_figure(score, **fitted.measured)) for score in fitted.scores
+        ],
+        comparison=None if fitted.comparison is None else _compared(fitted.comparison, fitted.unit),
         profiles=[(str(profile), profile.name, profile_figure(profile)) for profile in findings.profiles],
         design=None if findings.design is None else _designed(findings, findings.design),
     )
@@ -49,23 +55,23 @@ def report_page(findings: Findings) -> str:
 def _simulated(fitted: Fitted) -> Iterator[tuple[str, Figure]]:
     """The first record with all that belongs to a fit, the others with their residuals."""
     first, *others = fitted.result.provenance.records
-    yield first.name, result_figure(fitted.result, units={"measured": "m"})
+    yield first.name, result_figure(fitted.result, units={"measured": fitted.unit})
     for i, record in enumerate(others, 1):
-        yield record.name, fit_figure(fitted.result, record=i)
+        yield record.name, fit_figure(fitted.result, record=i, **fitted.measured)
 
 
-def _compared(comparison: Comparison) -> dict[str, object]:
+def _compared(comparison: Comparison, unit: str) -> dict[str, object]:
     sentences = [comparison.conclusion, f"Held back: {comparison.by}."]
     sentences += [f"{name} failed: {reason}" for name, reason in comparison.failures.items()]
     sentences += [f"{name} was not finished." for name in comparison.left]
-    return {"table": model_table(comparison), "sentences": sentences, "drawing": comparison_figure(comparison)}
+    return {"table": model_table(comparison, unit), "sentences": sentences, "drawing": comparison_figure(comparison)}
 
 
 def _designed(findings: Findings, design: InputDesign) -> dict[str, object]:
     t, used = design.best.t, ", ".join(f"{name} {100 * share:.0f} %" for name, share in design.used.items())
     sentences = [
         f"{len(t)} samples over {t[-1] - t[0]:g} s; limits: {design.limits}; used: {used}.",
-        f"Noise reckoned with: {1e3 * design.noise:.4g} mm, the residual of this fit.",
+        f"Noise reckoned with: {1e3 * design.noise:.4g} m{findings.fitted.unit}, the residual of this fit.",
         *design.remarks,
     ]
     return {"table": design_table(findings, design), "sentences": sentences, "drawing": design_figure(design)}

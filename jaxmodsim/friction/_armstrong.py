@@ -11,7 +11,7 @@ from .._core.parameters import Number, parameter
 from .._core.shapes import Scalar
 from .._core.state_dependent import nominal
 from ._bristle import advance_elastoplastic, slip_fraction
-from ._law import AbstractDynamicLaw, register_law
+from ._law import MOST_STICTION, AbstractDynamicLaw, register_law
 from ._law_case import LawCase, stribeck_case
 from ._passivity import Passivity
 
@@ -78,7 +78,7 @@ class Armstrong(AbstractDynamicLaw):
 
     sigma0: Number = parameter("sigma0", "N/m", lower=0.0, strict=True)
     Fc: Number = parameter("Fc", "N", lower=0.0, strict=True)
-    Fs: Number = parameter("Fs", "N", lower="Fc")
+    Fs: Number = parameter("Fs", "N", lower="Fc", most=MOST_STICTION)
     vs: Number = parameter("vs", "m/s", lower=0.0, strict=True)
     Fv: Number = parameter("Fv", "N s/m", lower=0.0)
     tau: Number = parameter("tau", "s", lower=0.0, strict=True)

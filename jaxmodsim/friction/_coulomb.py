@@ -7,7 +7,7 @@ from jaxtyping import PyTree
 
 from .._core.parameters import Number, optional_parameter, parameter
 from .._core.shapes import Scalar
-from ._law import NO_STICTION_IN_MUJOCO, AbstractSetValuedLaw, register_law
+from ._law import MOST_STICTION, NO_STICTION_IN_MUJOCO, AbstractSetValuedLaw, register_law
 from ._law_case import STANDARD, LawCase, steady_curve
 
 
@@ -26,7 +26,7 @@ class Coulomb(AbstractSetValuedLaw):
     """
 
     Fc: Number = parameter("Fc", "N", lower=0.0)
-    Fs: Number | None = optional_parameter("Fs", "N", lower="Fc")
+    Fs: Number | None = optional_parameter("Fs", "N", lower="Fc", most=MOST_STICTION)
     stiff: ClassVar[bool] = False
     description: ClassVar[str] = "one force in slip, stiction up to `Fs`"
     equations: ClassVar[tuple[str, ...]] = ("Fc sign(v)",)

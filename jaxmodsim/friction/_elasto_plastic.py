@@ -10,7 +10,7 @@ from .._core.parameters import Number, parameter
 from .._core.safe import decay_mean
 from .._core.shapes import Scalar
 from ._bristle import ONE_STATE, STRIBECK_CURVE, bristle_passivity, stribeck_curve
-from ._law import AbstractDynamicLaw, register_law
+from ._law import MOST_STICTION, AbstractDynamicLaw, register_law
 
 # Steps of order 2 through the transition between elastic and plastic in `step_exact`, and the slip in limit deflections
 # that they cover; after that the bristle is all but at its limit, and one step does the rest.
@@ -58,7 +58,7 @@ class ElastoPlastic(AbstractDynamicLaw):
     sigma2: Number = parameter("sigma2", "N s/m", lower=0.0)
     Fba: Number = parameter("Fba", "N", lower=0.0)
     Fc: Number = parameter("Fc", "N", lower="Fba", strict=True)
-    Fs: Number = parameter("Fs", "N", lower="Fc")
+    Fs: Number = parameter("Fs", "N", lower="Fc", most=MOST_STICTION)
     vs: Number = parameter("vs", "m/s", lower=0.0, strict=True)
     stiff: ClassVar[bool] = True
     description: ClassVar[str] = "bristle that is elastic below `Fba`: no creep"

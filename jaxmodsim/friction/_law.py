@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._core.parameters import check_ranges, ranges_of
+from .._core.readable import AbstractReadable
 from .._core.shapes import PerDof, Scalar
 from .._core.state_dependent import bind_state, is_state_dependent, nominal
 from ._law_case import STANDARD, LawCase, steady_curve
@@ -27,6 +28,9 @@ else:
 _Law = TypeVar("_Law", bound="AbstractLaw")
 
 # Limitation of laws whose friction does not fall as slip begins.
+# A fit looks for Fs up to this many times Fc. Beyond it the peak at zero velocity is so high and narrow that samples
+# which pass through it in a moment trade it against vs, and what is fitted fails on the next record.
+MOST_STICTION = 5.0
 NO_STRIBECK_EFFECT = "Without a Stribeck effect friction does not depend on slip velocity but for the viscous part."
 NO_STICTION_IN_MUJOCO = (
     " with Fs > Fc: its dry friction is one force, in stick and in slip. Export a LuGre with the same Fc and Fs, and"
@@ -39,7 +43,7 @@ _NO_MEMORY = {
 _JUMPS = {"presliding": "The force is a function of velocity and jumps as the velocity reverses."}
 
 
-class AbstractLaw(eqx.Module):
+class AbstractLaw(AbstractReadable, eqx.Module):
     """A friction law: knows its slip velocity [m/s or rad/s] and its own state, nothing of the mechanism.
 
     Its class says all that is known of it; `register_law` makes it known to the command line, the benches and tables.

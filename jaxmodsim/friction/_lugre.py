@@ -18,7 +18,7 @@ from ._bristle import (
     relax_exact,
     stribeck_curve,
 )
-from ._law import AbstractPlanarLaw, register_law
+from ._law import MOST_STICTION, AbstractPlanarLaw, register_law
 from ._law_case import STANDARD, LawCase, stribeck_case
 
 # A fit starts with a break-away distance of two milliseconds at top speed, a tenth of critical damping in stick, and a
@@ -70,7 +70,7 @@ class LuGre(AbstractPlanarLaw):
     sigma1: Number = parameter("sigma1", "N s/m", lower=0.0)
     sigma2: Number = parameter("sigma2", "N s/m", lower=0.0)
     Fc: Number = parameter("Fc", "N", lower=0.0, strict=True)
-    Fs: Number = parameter("Fs", "N", lower="Fc")
+    Fs: Number = parameter("Fs", "N", lower="Fc", most=MOST_STICTION)
     vs: Number = parameter("vs", "m/s", lower=0.0, strict=True)
     vd: Number | None = optional_parameter("vd", "m/s", lower=0.0, strict=True)
     stiff: ClassVar[bool] = True

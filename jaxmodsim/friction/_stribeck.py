@@ -11,7 +11,7 @@ from .._core.parameters import Number, optional_parameter, parameter
 from .._core.safe import bounded_ratio, safe_power
 from .._core.shapes import Scalar
 from ._bristle import STRIBECK_CURVE
-from ._law import NO_STICTION_IN_MUJOCO, AbstractSetValuedLaw, register_law
+from ._law import MOST_STICTION, NO_STICTION_IN_MUJOCO, AbstractSetValuedLaw, register_law
 from ._law_case import LawCase, stribeck_case
 
 # Velocity over vs below which a curve with an exponent below one is rounded off.
@@ -76,7 +76,7 @@ class Stribeck(AbstractSetValuedLaw):
     """
 
     Fc: Number = parameter("Fc", "N", lower=0.0)
-    Fs: Number = parameter("Fs", "N", lower="Fc")
+    Fs: Number = parameter("Fs", "N", lower="Fc", most=MOST_STICTION)
     vs: Number = parameter("vs", "m/s", lower=0.0, strict=True)
     Fv: Number = parameter("Fv", "N s/m", lower=0.0, default=0.0)
     exponent: Number | None = optional_parameter("exponent", "1", lower=0.0, strict=True)

@@ -1,5 +1,8 @@
 """Identification: numbers of scenes and laws from measured records."""
 
+from .data._clock import clock_offset as clock_offset
+from .data._clock import sampling_gaps as sampling_gaps
+from .data._clock import unexplained_force as unexplained_force
 from .data._record import Record as Record
 from .data._record import start_state as start_state
 from .design._design_input import design_input as design_input
@@ -23,6 +26,8 @@ from .model._axis import rough_axis as rough_axis
 from .model._engines import Controller as Controller
 from .model._engines import law_force as law_force
 from .model._engines import replay as replay
+from .selection._agreement import RecordAgreement as RecordAgreement
+from .selection._agreement import agreement as agreement
 from .selection._compare import Candidate as Candidate
 from .selection._compare import compare as compare
 from .selection._compare import compare_laws as compare_laws
@@ -37,3 +42,4 @@ from .uncertainty._profile import profile as profile
 from .uncertainty._residual_tests import residual_tests as residual_tests
 from .uncertainty._result import FitResult as FitResult
 from .uncertainty._result import remarks as remarks
+from .uncertainty._result import step_shows as step_shows

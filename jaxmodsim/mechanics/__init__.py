@@ -19,6 +19,7 @@ from ._lagrange import Lagrangian as Lagrangian
 from ._lagrange import MotionEquations as MotionEquations
 from ._lagrange import acceleration as acceleration
 from ._lagrange import energies as energies
+from ._lagrange import inverse_dynamics as inverse_dynamics
 from ._lagrange import momentum as momentum
 from ._lagrange import motion_equations as motion_equations
 from ._lagrange import quadratic as quadratic

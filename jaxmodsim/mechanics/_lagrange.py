@@ -51,12 +51,23 @@ def motion_equations(lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, p
     return in_scalars(equations, t, q, qd, params, seed=q)
 
 
-def _differentiate(lagrangian: Lagrangian, t: Array, q: Array, qd: Array, params: PyTree) -> MotionEquations:
-    def momentum(t: Array, q: Array, qd: Array) -> tuple[Array, Array]:
-        by_q, by_qd = jax.grad(lagrangian, argnums=(1, 2))(t, q, qd, params)
-        return by_qd, by_q
+def _momentum(
+    lagrangian: Lagrangian, params: PyTree
+) -> Callable[[Array, Array, Array], tuple[Float[Array, " dof"], Float[Array, " dof"]]]:
+    """Function of t, q and qd that returns dL/dqd and dL/dq."""
+    return lambda t, q, qd: jax.grad(lagrangian, argnums=(2, 1))(t, q, qd, params)
 
-    _, push, by_q = jax.linearize(momentum, t, q, qd, has_aux=True)
+
+def inverse_dynamics(
+    lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, qdd: PerDof, params: PyTree
+) -> Float[Array, " dof"]:
+    """Generalised force `d/dt dL/dqd - dL/dq` [N or N m] under which the accelerations are `qdd`, shape `[dof]`."""
+    _, rate, by_q = jax.jvp(_momentum(lagrangian, params), (t, q, qd), (jnp.ones_like(t), qd, qdd), has_aux=True)
+    return rate - by_q
+
+
+def _differentiate(lagrangian: Lagrangian, t: Array, q: Array, qd: Array, params: PyTree) -> MotionEquations:
+    _, push, by_q = jax.linearize(_momentum(lagrangian, params), t, q, qd, has_aux=True)
     zero_t, zero = jnp.zeros_like(t), jnp.zeros_like(q)
     if q.shape[0] == 1:
         mass = push(zero_t, zero, jnp.ones_like(qd))[None]

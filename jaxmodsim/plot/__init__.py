@@ -1,10 +1,12 @@
-"""Figures. The only part that imports matplotlib; every function returns a `matplotlib.figure.Figure`."""
+"""Figures. The only part that imports matplotlib; functions return a `Figure`, which a notebook shows."""
 
 try:
-    from matplotlib.figure import Figure as Figure
+    from ._figure import Figure as Figure
 except ModuleNotFoundError as error:
     raise ImportError('jaxmodsim.plot needs matplotlib: pip install "jaxmodsim[plot]".') from error
 
+from ._animate import Animation as Animation
+from ._animate import animate as animate
 from ._behaviour import behaviour_figure as behaviour_figure
 from ._comparison import comparison_figure as comparison_figure
 from ._design import design_figure as design_figure
@@ -18,6 +20,7 @@ from ._records import loops_figure as loops_figure
 from ._records import score_figure as score_figure
 from ._records import truth_figure as truth_figure
 from ._result import result_figure as result_figure
+from ._run import run as run
 from ._sensitivity import sensitivity_figure as sensitivity_figure
 from ._testbench import ramp_figure as ramp_figure
 from ._testbench import stick_figure as stick_figure

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..validation.behaviour import Experiment, ExperimentResult
+from ._figure import Figure
 from ._style import BLUE, GREEN, GREY, RED, VERDICTS
 
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from ..identify import Comparison
+from ._figure import Figure
 from ._style import BLUE, GREEN, GREY, small_unit
 
 

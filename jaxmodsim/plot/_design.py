@@ -2,10 +2,10 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..identify import InputDesign
-from ._style import BLUE, GREY, RED, small_unit
+from ._figure import Figure
+from ._style import BLUE, GREY, RED, panel_letters, small_unit
 
 
 def design_figure(design: InputDesign, *, caption: str = "") -> Figure:
@@ -19,11 +19,13 @@ def design_figure(design: InputDesign, *, caption: str = "") -> Figure:
     figure = Figure(figsize=(12, 6.4), layout="constrained")
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.35, 1))[0]
     axes = left.subplots(3, 1, sharex=True)
-    (factor, small), limits, start = small_unit("m"), design.limits, design.best.q_ref[0]
+    limits, start = design.limits, design.best.q_ref[0]
+    quantity, unit, force = ("angle", "rad", "N m") if limits.rotary else ("position", "m", "N")
+    factor, small = small_unit(unit)
     panels = (
-        ("position", small, factor, design.best.q_ref, design.plain.q_ref, limits.travel, start),
-        ("velocity", "m/s", 1.0, design.best.qd_ref, design.plain.qd_ref, limits.speed, 0.0),
-        ("force", "N", 1.0, design.best.force, design.plain.force, limits.force, 0.0),
+        (quantity, small, factor, design.best.q_ref, design.plain.q_ref, limits.travel, start),
+        ("velocity", f"{unit}/s", 1.0, design.best.qd_ref, design.plain.qd_ref, limits.speed, 0.0),
+        ("torque" if limits.rotary else "force", force, 1.0, design.best.force, design.plain.force, limits.force, 0.0),
     )
     for axis, (quantity, unit, scale, best, plain, limit, middle) in zip(axes, panels, strict=True):
         axis.plot(design.best.t, scale * plain, color="#c8c8c8", lw=1.2, label="plain sine")
@@ -33,6 +35,7 @@ def design_figure(design: InputDesign, *, caption: str = "") -> Figure:
             axis.axhline(level, color=RED, lw=1.0, ls="--", label="limit" if side > 0 else "_")
         axis.set(ylabel=f"{quantity} [{unit}]")
     axes[-1].set_xlabel("time [s]")
+    panel_letters(axes)
     handles = {str(line.get_label()): line for axis in axes for line in axis.get_lines()}
     shown = {label: line for label, line in handles.items() if not label.startswith("_")}
     left.legend(list(shown.values()), list(shown), loc="outside upper center", ncols=3, fontsize=9)

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..validation.hard import CaseReport, largest_steps
+from ._figure import Figure
 from ._style import BLUE, GREEN, GREY, RED
 
 _KINDS = {
@@ -37,16 +37,16 @@ def hard_figure(verdicts: Sequence[CaseReport]) -> Figure:
         if not verdict.ok:
             axis.axhspan(row - 0.5, row + 0.5, color=RED, alpha=0.2, lw=0)
         elif all(math.isnan(each.error) for each in verdict.findings):
-            axis.text(_LEAST, float(row), " ends, or is refused, by name", va="center", fontsize=7, color=GREY)
+            axis.text(_LEAST, float(row), " ends, or is refused, by name", va="center", fontsize=9, color=GREY)
     axis.axvline(1.0, color=RED, lw=1.2)
     axis.set(xscale="log", xlabel="error over what is admissible [1]", yticks=rows, xlim=(0.5 * _LEAST, 10.0))
-    axis.set_yticklabels([verdict.case.name for verdict in verdicts], fontsize=7)
+    axis.set_yticklabels([verdict.case.name for verdict in verdicts], fontsize=9)
     axis.set_ylim(len(verdicts) - 0.4, -0.6)
     axis.grid(axis="x", color="#e4e4e4", lw=0.6)
     _families(axis, verdicts)
     passed = sum(verdict.ok for verdict in verdicts)
-    figure.suptitle(f"Hard cases: {passed} of {len(verdicts)} pass (red line: the limit)", fontsize=11)
-    figure.legend(loc="outside lower center", ncols=4, fontsize=8)
+    figure.suptitle(f"Hard cases: {passed} of {len(verdicts)} pass (line: the limit)", fontsize=12)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=10)
     return figure
 
 
@@ -57,7 +57,7 @@ def _families(axis: Axes, verdicts: Sequence[CaseReport]) -> None:
         if row == 0 or names[row - 1] != name:
             axis.axhline(row - 0.5, color="black", lw=0.6)
             axis.text(
-                1.01, row - 0.4, name, transform=axis.get_yaxis_transform(), va="top", fontsize=8, fontweight="bold"
+                1.01, row - 0.4, name, transform=axis.get_yaxis_transform(), va="top", fontsize=10, fontweight="bold"
             )
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..sweeps import Estimate, GlobalSensitivity
+from ._figure import Figure
 from ._style import BLUE, GREEN, GREY, RED, with_unit
 
 # Of classes, in their order.

@@ -7,16 +7,14 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, StrMethodFormatter
 
 from .._core.arguments import did_you_mean
-from ._style import BLUE, GREEN, RED, with_unit
+from ._figure import Figure
+from ._style import BLUE, GREEN, RED, plain_ticks, with_unit
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -27,8 +25,6 @@ _FEW = len(_CLASSES)
 # Runs that failed, by reason, the most frequent first; runs that were not computed.
 _FAILED, _NOT_RUN = ("#1a1a1a", "#6b4a2b", "#8a8a8a"), "#f6f1dc"
 _CURVES = ("-", "--", ":", "-.")
-# Ratio of the ends of a logarithmic axis up to which its numbers are written out.
-_FEW_DECADES = 300.0
 # A map of more cells than these is an image inside vector graphics.
 _CELLS = 2500
 
@@ -108,8 +104,7 @@ def map2d(
     entries += _draw_failures(axes, across, up, np.where(shown, 0, np.where(codes == 0, _NAN, codes)), sentences)
     entries += _draw_curves(axes, boundary or {})
     axes.set(xlabel=across.label, xlim=across.limits, ylabel=up.label, ylim=up.limits)
-    for side, axis in ((across, axes.xaxis), (up, axes.yaxis)):
-        _scale(axis, side)
+    plain_ticks(axes.xaxis, axes.yaxis)
     axes.set_title(title, fontsize=11)
     if entries:
         # What the numbers are stands beside the bar, or here; names say it themselves.
@@ -189,15 +184,6 @@ def _edges(values: np.ndarray, log: bool) -> np.ndarray:
     middle = 0.5 * (x[1:] + x[:-1])
     edges = np.concatenate([[2.0 * x[0] - middle[0]], middle, [2.0 * x[-1] - middle[-1]]])
     return np.exp(edges) if log else edges
-
-
-def _scale(axis: Axis, side: _Side) -> None:
-    """Plain numbers on a logarithmic axis that has few decades."""
-    low, high = side.limits
-    if side.log and high < _FEW_DECADES * low:
-        axis.set_minor_locator(LogLocator(subs=(2.0, 3.0, 5.0)))
-        for place in (axis.set_major_formatter, axis.set_minor_formatter):
-            place(StrMethodFormatter("{x:g}"))
 
 
 def _codes(dataset: "xr.Dataset", values: "xr.DataArray") -> np.ndarray:

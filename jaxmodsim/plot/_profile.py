@@ -1,9 +1,9 @@
 """A profile likelihood."""
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from ..identify import Profile
+from ._figure import Figure
 from ._style import BLUE, GREEN, GREY, RED, with_unit
 
 

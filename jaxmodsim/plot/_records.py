@@ -4,10 +4,10 @@ from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..identify import FitResult, Record, Score
-from ._style import BLUE, GREEN, GREY, RED, small_unit
+from ._figure import Figure
+from ._style import BLUE, GREEN, GREY, RED, panel_letters, small_unit
 
 
 def fit_figure(
@@ -51,6 +51,7 @@ def _followed(record: Record, residual: np.ndarray, label: str, quantity: str, u
     below.plot(record.t, factor * residual, color=BLUE, lw=1.0)
     below.axhline(0.0, color=GREY, lw=0.6)
     below.set(xlabel="time [s]", ylabel=f"simulated - measured [{small}]")
+    panel_letters((above, below))
     if caption:
         figure.supxlabel(caption, fontsize=8, color=GREY)
     return figure
@@ -80,6 +81,7 @@ def loops_figure(result: FitResult, *, caption: str = "") -> Figure:
     right.plot(record.t[inside], record.measured[inside], color=GREY, lw=2.2, label="measured")
     right.plot(record.t[inside], result.simulated[inside], color=RED, lw=1.1, label="modelled")
     right.set(xlabel="time [s]", ylabel="friction force [N]", title="A few cycles")
+    panel_letters((left, right))
     if caption:
         figure.supxlabel(caption, fontsize=8, color=GREY)
     return figure

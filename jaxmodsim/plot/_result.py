@@ -4,9 +4,9 @@ from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..identify import FitResult, residual_tests
+from ._figure import Figure
 from ._style import BLUE, GREEN, GREY, RED, small_unit, with_unit
 
 

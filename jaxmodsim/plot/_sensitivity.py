@@ -1,9 +1,9 @@
 """What matters to an observable along a run."""
 
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..analysis import Sensitivity
+from ._figure import Figure
 from ._style import GREY
 
 

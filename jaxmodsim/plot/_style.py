@@ -1,14 +1,43 @@
-"""Colours and units that all figures share."""
+"""Colours, units, ticks and panel letters that all figures share."""
+
+from collections.abc import Iterable
+from string import ascii_lowercase
+
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.ticker import LogLocator, StrMethodFormatter
 
 from ..validation.behaviour import Verdict
 
-BLUE, RED, GREY, GREEN = "#1f5fa8", "#c2452d", "#8a8a8a", "#2e8b57"
+# Blue, vermilion and bluish green of Okabe and Ito, Color universal design, 2008: told apart without red and green.
+BLUE, RED, GREY, GREEN = "#0072b2", "#d55e00", "#8a8a8a", "#009e73"
+COLOURS = (BLUE, RED, GREEN, "#7b4fa3", "#b8860b")  # of lines in one panel
 VERDICTS = {
     Verdict.PASS: GREEN,
     Verdict.FAIL: RED,
     Verdict.KNOWN_LIMITATION: "#b8860b",
     Verdict.NOT_APPLICABLE: GREY,
 }
+
+
+# Ratio of the ends of a logarithmic axis up to which its numbers are written out.
+_FEW_DECADES = 300.0
+
+
+def plain_ticks(*axes: Axis) -> None:
+    """Plain numbers, in place of 3 x 10^-1, on logarithmic axes that have few decades."""
+    for axis in axes:
+        low, high = sorted(axis.get_view_interval())
+        if axis.get_scale() == "log" and high < _FEW_DECADES * low:
+            axis.set_minor_locator(LogLocator(subs=(2.0, 3.0, 5.0)))
+            for place in (axis.set_major_formatter, axis.set_minor_formatter):
+                place(StrMethodFormatter("{x:g}"))
+
+
+def panel_letters(panels: Iterable[Axes]) -> None:
+    """Letters a, b, c above the left corners of panels."""
+    for letter, panel in zip(ascii_lowercase, panels, strict=False):
+        panel.set_title(letter, loc="left", fontweight="bold", fontsize=11)
 
 
 def small_unit(unit: str) -> tuple[float, str]:

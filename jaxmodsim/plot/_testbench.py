@@ -3,10 +3,11 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.colors import LogNorm
 
 from ..validation.testbench import RampRun
-from ._style import BLUE, GREY, RED
+from ._figure import Figure
+from ._style import BLUE, COLOURS, GREY, RED, panel_letters
 
 
 def ramp_figure(title: str, runs: Sequence[RampRun], zoom: tuple[float, float] = (0.0, 3.0)) -> Figure:
@@ -35,11 +36,12 @@ def ramp_figure(title: str, runs: Sequence[RampRun], zoom: tuple[float, float] =
         peak = max(float(np.max(np.abs(run.friction[inside]), initial=0.0)), 1.0)
         below = float(np.min(run.friction[inside], initial=0.0)) < -0.1 * peak
         right.set(ylabel="force [N]", xlim=zoom, ylim=(-1.4 * peak if below else -0.05 * peak, 1.6 * peak))
-        right.legend(loc="lower right", fontsize=8)
         if run.note:
             left.text(0.5, 0.6, run.note, transform=left.transAxes, ha="center", fontsize=9, color=RED)
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
+    panel_letters(axes.flat)
+    figure.legend(*axes[0, 2].get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False)
     figure.suptitle(title)
     return figure
 
@@ -65,14 +67,16 @@ def stick_figure(
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.15, 1))
     inside = t <= 1.5
+    left.set_prop_cycle(color=COLOURS, linestyle=("-", "--", "-.", ":", (0, (6, 1))))
     for label, force in friction.items():
         left.plot(t[inside], 1e3 * (force - applied)[inside], lw=1.2, label=label)
     left.set(xlabel="time [s]", ylabel="friction - applied force [mN]", title="Stick: friction about the applied force")
-    left.legend(fontsize=8)
+    left.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False)
     mesh = right.pcolormesh(
         np.arange(len(sigma1) + 1),
         np.arange(len(sigma0) + 1),
-        np.log10(1e3 * np.maximum(oscillation, 1e-9)),
+        1e3 * np.maximum(oscillation, 1e-9),
+        norm=LogNorm(),
         cmap="viridis",
     )
     for i in range(len(sigma0)):
@@ -83,5 +87,6 @@ def stick_figure(
     right.set_xticks(np.arange(len(sigma1)) + 0.5, [f"{x:g}" for x in sigma1])
     right.set_yticks(np.arange(len(sigma0)) + 0.5, [f"{x:g}" for x in sigma0])
     right.set(xlabel="sigma1 [N s/m]", ylabel="sigma0 [N/m]", title="Amplitude of the oscillation in stick [mN]")
-    figure.colorbar(mesh, ax=right, label="log10 of oscillation in mN")
+    figure.colorbar(mesh, ax=right, label="amplitude [mN]")
+    panel_letters((left, right))
     return figure

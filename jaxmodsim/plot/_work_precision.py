@@ -2,10 +2,10 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..analysis import Row, WorkPrecision
-from ._style import GREY, RED, with_unit
+from ._figure import Figure
+from ._style import GREY, RED, panel_letters, plain_ticks, with_unit
 
 _MARKERS = "osD^vPX*"
 _LABELS = {
@@ -62,6 +62,8 @@ def work_precision_figure(study: WorkPrecision, *, cost: str = "run") -> Figure:
         _mark_floor(axes, study.disagreement)
     left.set(ylabel=_LABELS[cost].format(batch=study.batch), title="Time: lower left is better")
     right.set(ylabel="evaluations of the field [1]" if counted else "steps [1]", title="Work")
+    plain_ticks(left.yaxis, right.yaxis)
+    panel_letters((left, right))
     if any(row.model for row in study.rows):
         handles += left.plot([], [], color=GREY, ls=":", label="error of the model")
     figure.legend(handles=handles, fontsize=8, loc="outside right upper")

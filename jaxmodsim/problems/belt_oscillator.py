@@ -60,7 +60,7 @@ def scene(
     spring = braked_spring.scene(m=m, k=k)
     friction = Friction(coulomb() if law is None else law, belt_velocity=belt)
     damper = () if c is None else (Friction(Viscous(c), name="damper"),)
-    return Scene(spring.lagrangian, params=spring.params, effects=(friction, *damper))
+    return Scene(spring.lagrangian, params=spring.params, effects=(friction, *damper), coordinates=spring.coordinates)
 
 
 def coulomb() -> Coulomb:

@@ -13,7 +13,7 @@ class BouncingBall(eqx.Module):
 
     ```python
     ball = BouncingBall(e=0.5)
-    solver = jaxmodsim.EventSolver(diffrax.Tsit5(), ball.guards, ball.reset, hold=ball.hold)
+    solver = jaxmodsim.EventSolver(diffrax.Tsit5(), ball.guards, ball.reset, on_zeno=ball.hold)
     start = solver.start(0.0, ball.dropped(h=1.0), mode=0.0)
     diffrax.diffeqsolve(diffrax.ODETerm(ball.field), solver, 0.0, 1.0, None, start, ...)
     ```

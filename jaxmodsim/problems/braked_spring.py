@@ -45,7 +45,7 @@ def scene(law: object = None, *, m: ArrayLike = PARAMS["m"], k: ArrayLike = PARA
     friction it follows `motion`.
     """
     friction = () if law is None else (Friction(law),)
-    return Scene(_lagrangian, params={"m": m, "k": k}, effects=friction)
+    return Scene(_lagrangian, params={"m": m, "k": k}, effects=friction, coordinates=("x [m]",))
 
 
 def _drive(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
@@ -67,7 +67,7 @@ def driven_spring(law: object, *, m: ArrayLike = 2.0, k: ArrayLike = 20.0) -> Sc
     of a `Record` takes its place), and `friction`.
     """
     effects = (AppliedForce(_drive, name="drive"), Friction(law))
-    return Scene(_lagrangian, params={"m": m, "k": k, "u": 0.0}, effects=effects)
+    return Scene(_lagrangian, params={"m": m, "k": k, "u": 0.0}, effects=effects, coordinates=("x [m]",))
 
 
 def rest(*, x0: ArrayLike, m: ArrayLike, k: ArrayLike, Fc: ArrayLike, Fs: ArrayLike | None = None) -> Rest:

@@ -63,7 +63,7 @@ def scene(
     if force is not None:
         params["force"] = force
         effects = (AppliedForce(_push, name="push"), *effects)
-    return Scene(_LAGRANGIAN, params=params, effects=effects)
+    return Scene(_LAGRANGIAN, params=params, effects=effects, coordinates=("x [m]", "angle [rad]"))
 
 
 def acceleration(

@@ -38,7 +38,7 @@ def scene(*, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Sce
     positive outwards, so the `tension` with a minus sign. Its exact accelerations: `acceleration`.
     """
     rod = Constraint(_stretch, at=_in_plane, name="rod")
-    return Scene(_PLANE_BOB, params={"m": m, "l": l, "g": g}, constraints=(rod,))
+    return Scene(_PLANE_BOB, params={"m": m, "l": l, "g": g}, constraints=(rod,), coordinates=("x [m]", "z [m]"))
 
 
 def cartesian_spherical_pendulum(*, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Scene:
@@ -48,7 +48,9 @@ def cartesian_spherical_pendulum(*, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: A
     results as for `scene`; the multiplier is `spherical_pendulum.reaction`.
     """
     rod = Constraint(_stretch, at=_in_space, name="rod")
-    return Scene(_SPACE_BOB, params={"m": m, "l": l, "g": g}, constraints=(rod,))
+    return Scene(
+        _SPACE_BOB, params={"m": m, "l": l, "g": g}, constraints=(rod,), coordinates=("x [m]", "y [m]", "z [m]")
+    )
 
 
 def tension(

@@ -48,7 +48,9 @@ def scene(
     field = jnp.asarray(E, float)
     if field.shape != (3,):
         raise ValueError(f"E must be a vector (x, y, z) [V/m], shape (3,), but it has the shape {field.shape}.")
-    return Scene(_LAGRANGIAN, params={"m": m, "charge": charge, "B": B, "E": field})
+    return Scene(
+        _LAGRANGIAN, params={"m": m, "charge": charge, "B": B, "E": field}, coordinates=("x [m]", "y [m]", "z [m]")
+    )
 
 
 def acceleration(

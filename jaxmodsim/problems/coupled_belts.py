@@ -71,6 +71,7 @@ def scene(
             Friction(one, along=_first, belt_velocity=belt, name="first"),
             Friction(two, along=_second, belt_velocity=belt, name="second"),
         ),
+        coordinates=("x_1 [m]", "x_2 [m]"),
     )
 
 

@@ -41,7 +41,11 @@ def scene(
 
     A `Scene` without effects. Its exact motion: `motion`; in angles, the plane of the swings turns at `precession`.
     """
-    return Scene(_lagrangian, params={"m": m, "l": l, "g": g, "Omega": Omega, "latitude": latitude})
+    return Scene(
+        _lagrangian,
+        params={"m": m, "l": l, "g": g, "Omega": Omega, "latitude": latitude},
+        coordinates=("east [m]", "north [m]"),
+    )
 
 
 def precession(*, Omega: ArrayLike = PARAMS["Omega"], latitude: ArrayLike = PARAMS["latitude"]) -> Float[Array, ""]:

@@ -78,7 +78,12 @@ def scene(
     multipliers are the force [N] of the coupler on the rocker, (x, y). Its exact motion: `acceleration`.
     """
     params = {"a": a, "b": b, "c": c, "d": d, "m1": m1, "m2": m2, "m3": m3, "g": g}
-    return Scene(_LAGRANGIAN, params=params, constraints=(Constraint(_gap, at=_ends, name="closure"),))
+    return Scene(
+        _LAGRANGIAN,
+        params=params,
+        constraints=(Constraint(_gap, at=_ends, name="closure"),),
+        coordinates=("crank [rad]", "coupler [rad]", "rocker [rad]"),
+    )
 
 
 def state(

@@ -46,7 +46,12 @@ def scene(
     across the edge, positive to its left; see `force`. Its exact motion: `motion`.
     """
     edge = VelocityConstraint(_sideways, name="edge")
-    return Scene(_BLADE, params={"m": m, "I": I, "slope": slope, "g": g}, constraints=(edge,))
+    return Scene(
+        _BLADE,
+        params={"m": m, "I": I, "slope": slope, "g": g},
+        constraints=(edge,),
+        coordinates=("x [m]", "y [m]", "heading [rad]"),
+    )
 
 
 def motion(

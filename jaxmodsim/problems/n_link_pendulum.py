@@ -41,7 +41,11 @@ def scene(n: int, *, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81
     """
     if isinstance(n, bool) or not isinstance(n, int) or n < 1:
         raise ValueError(f"n must be a positive integer, but {n!r} was given.")
-    return Scene(_lagrangian, params={"m": _each(m, "m", n), "l": _each(l, "l", n), "g": g})
+    return Scene(
+        _lagrangian,
+        params={"m": _each(m, "m", n), "l": _each(l, "l", n), "g": g},
+        coordinates=tuple(f"angle_{i} [rad]" for i in range(n)),
+    )
 
 
 def double_pendulum(*, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Scene:

@@ -34,7 +34,7 @@ def scene(
     slips, and it sticks for seconds: a stiff problem.
     """
     law = lugre() if law is None else law
-    return Scene(_lagrangian, params={"m": m, "k": k, "pull": pull}, effects=(Friction(law),))
+    return Scene(_lagrangian, params={"m": m, "k": k, "pull": pull}, effects=(Friction(law),), coordinates=("x [m]",))
 
 
 def lugre(**changes: ArrayLike) -> LuGre:

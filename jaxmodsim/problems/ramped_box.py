@@ -42,7 +42,12 @@ def scene(law: object = None, *, ramp: ArrayLike = 1.0, m: ArrayLike = 2.0) -> S
     `v(t) = v0 + ramp t^2/(2 m)`; with dry friction up to `Fs` the box rests until `t = Fs/ramp`.
     """
     friction = () if law is None else (Friction(law),)
-    return Scene(_lagrangian, params={"m": m, "ramp": ramp}, effects=(AppliedForce(_pull, name="pull"), *friction))
+    return Scene(
+        _lagrangian,
+        params={"m": m, "ramp": ramp},
+        effects=(AppliedForce(_pull, name="pull"), *friction),
+        coordinates=("x [m]",),
+    )
 
 
 def coulomb() -> Coulomb:

@@ -55,7 +55,13 @@ def scene(
     """
     floor = Constraint(_height, at=_tip, one_sided=True, name="floor")
     friction = Friction(Coulomb(mu), along=_tip_along, normal_force="floor")
-    return Scene(_ROD, params={"m": m, "l": l, "g": g}, effects=(friction,), constraints=(floor,))
+    return Scene(
+        _ROD,
+        params={"m": m, "l": l, "g": g},
+        effects=(friction,),
+        constraints=(floor,),
+        coordinates=("x [m]", "y [m]", "angle [rad]"),
+    )
 
 
 def state(

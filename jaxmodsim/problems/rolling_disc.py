@@ -65,7 +65,12 @@ def scene(
     `acceleration`; steady circles: `steady_spin`.
     """
     rolling = VelocityConstraint(_slip, name="rolling")
-    return Scene(_DISC, params={"m": m, "R": R, "k": k, "g": g}, constraints=(rolling,))
+    return Scene(
+        _DISC,
+        params={"m": m, "R": R, "k": k, "g": g},
+        constraints=(rolling,),
+        coordinates=("x [m]", "y [m]", "heading [rad]", "lean [rad]", "spin [rad]"),
+    )
 
 
 def velocity(q: Float[Array, "5"], rates: Float[Array, "3"], *, R: ArrayLike = PARAMS["R"]) -> Float[Array, "5"]:

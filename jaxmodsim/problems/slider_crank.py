@@ -120,7 +120,13 @@ def scene(
     if mu is not None:
         effects = (*effects, Friction(Coulomb(mu), along=_track, normal_force="guide"))
     pin, guide = Constraint(_gap, at=_ends, name="pin"), Constraint(_height, at=_slider, name="guide")
-    return Scene(_LAGRANGIAN, params=params, effects=effects, constraints=(pin, guide))
+    return Scene(
+        _LAGRANGIAN,
+        params=params,
+        effects=effects,
+        constraints=(pin, guide),
+        coordinates=("crank [rad]", "rod [rad]", "x [m]", "y [m]"),
+    )
 
 
 def state(

@@ -25,7 +25,9 @@ def scene(law: LuGre, v: ArrayLike, *, m: ArrayLike = 1e15) -> Scene:
     A `Scene` with one coordinate [m] and the effect `friction`. Started with `q0=[0.0]`, `qd0=[0.0]`, the deflection
     `run.z["friction"]` follows `deflection`.
     """
-    return Scene(_lagrangian, params={"m": m}, effects=(Friction(law, belt_velocity=-jnp.asarray(v)),))
+    return Scene(
+        _lagrangian, params={"m": m}, effects=(Friction(law, belt_velocity=-jnp.asarray(v)),), coordinates=("x [m]",)
+    )
 
 
 def deflection(t: Float[Array, "..."], law: LuGre, v: ArrayLike, *, z0: ArrayLike = 0.0) -> Float[Array, "..."]:

@@ -30,7 +30,7 @@ def scene(*, m: ArrayLike = 1.0, R: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Sce
 
     A `Scene` without effects; its exact accelerations: `acceleration`.
     """
-    return Scene(_lagrangian, params={"m": m, "R": R, "g": g})
+    return Scene(_lagrangian, params={"m": m, "R": R, "g": g}, coordinates=("phi [rad]", "theta [rad]"))
 
 
 def acceleration(

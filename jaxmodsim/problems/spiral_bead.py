@@ -76,7 +76,7 @@ def scene(
         effects = (AppliedForce(_drag, at=_spiral, name="drag"),)
     if mu is not None:
         effects = (*effects, Friction(Coulomb(mu), along=_spiral, normal_force=_BEAD.normal_force))
-    return Scene(_BEAD, params=params, effects=effects)
+    return Scene(_BEAD, params=params, effects=effects, coordinates=("theta [rad]",))
 
 
 def normal_force(

@@ -35,7 +35,7 @@ def scene(
     """
     numbers = PARAMS
     law = Coulomb(Fc=numbers["Fc"], Fs=numbers["Fs"]) if law is None else law
-    return Scene(_lagrangian, params={"m": m, "l": l, "g": g}, effects=(Friction(law),))
+    return Scene(_lagrangian, params={"m": m, "l": l, "g": g}, effects=(Friction(law),), coordinates=("angle [rad]",))
 
 
 def turn(start: ArrayLike, *, m: ArrayLike, l: ArrayLike, g: ArrayLike, Fc: ArrayLike) -> Float[Array, ""]:

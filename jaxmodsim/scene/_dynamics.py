@@ -345,9 +345,14 @@ def check_scene(scene: Scene, y: State) -> None:
     **Raises:**
 
     - `ValueError` naming the function, the shape it returned and the shape that is needed, or the index that is out of
-      range; see `traced` for those that are seen.
+      range; see `traced` for those that are seen; or for names of more or fewer coordinates than there are.
     """
-    t = y.q[0]
+    t, named = y.q[0], len(scene.coordinates)
+    if named not in (0, y.q.shape[0]):
+        raise ValueError(
+            f"The scene names {named} coordinates ({', '.join(scene.coordinates)}), but q has {y.q.shape[0]}: give a"
+            " name for each, or none."
+        )
     scene = scene.bind_time(t)
 
     def energy(*state: Any) -> Array:

@@ -13,6 +13,7 @@ from jaxtyping import Array
 from .._core.parameters import Range, ranges_of
 from .._core.state_dependent import StateDependent
 from ..friction import AbstractAsymmetric
+from ._quantities import in_units_of
 from ._scene import Scene
 from ._signal import Signal
 
@@ -84,6 +85,8 @@ def scene_ranges(scene: eqx.Module) -> dict[str, Range]:
             there = isinstance(owner, dict) and allowed.lower in owner
             limit = (*path[:-1], jtu.DictKey(allowed.lower)) if there else (*beside, jtu.GetAttrKey(allowed.lower))
             allowed = replace(allowed, lower=_name(scene, limit))
+        if isinstance(scene, Scene) and path[0].name == "effects":
+            allowed = in_units_of(scene, scene.effects[path[1].idx], allowed)
         ranges[_name(scene, path)] = allowed
     return ranges
 

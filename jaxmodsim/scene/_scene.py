@@ -11,8 +11,10 @@ from jaxtyping import Array, PyTree
 
 from .._core.functions import as_function
 from .._core.parameters import as_real
+from .._core.readable import AbstractReadable
 from .._core.shapes import PerDof, Scalar
 from ..mechanics import AbstractConstraint, Lagrangian
+from ._coordinates import as_coordinates, read_label
 from ._signal import Signal, signals_at, signals_from, signals_of
 from .forces._effect import AbstractEffect
 from .forces._friction import Friction
@@ -76,7 +78,7 @@ def _names(things: Any, default: Callable[[Any], str]) -> tuple[str, ...]:
     return tuple(names)
 
 
-class Scene(eqx.Module):
+class Scene(AbstractReadable, eqx.Module):
     """A mechanism, the effects on it, and the constraints it obeys.
 
     A scene is a pytree whose leaves are all its numbers, so `jax.grad`, `jax.vmap` and `equinox.tree_at` work on it,
@@ -93,11 +95,13 @@ class Scene(eqx.Module):
       become floating; what is no number (sizes, options) belongs into the functions.
     - `effects`: tuple of `AppliedForce` and `Friction`.
     - `constraints`: tuple of `Constraint` and `VelocityConstraint`, for coordinates that are not independent.
+    - `coordinates`: names of the coordinates with their units, such as `("x [m]", "phi [rad]")`, for messages, tables
+      and figures. In functions and names of what is observed they remain `q[0]`, `q[1]`.
 
     **Raises:**
 
     - `ValueError` naming the entry that is no number, no effect, or has another's name, and friction that rests on a
-      constraint that is not there.
+      constraint that is not there; at the run for a number of `coordinates` that q0 has not.
     """
 
     lagrangian: Lagrangian = eqx.field(converter=partial(as_function, name="Scene lagrangian"))
@@ -105,6 +109,7 @@ class Scene(eqx.Module):
     effects: tuple[AbstractEffect, ...] = eqx.field(default=(), converter=_effects)
 
     constraints: tuple[AbstractConstraint, ...] = eqx.field(default=(), converter=_constraints)
+    coordinates: tuple[str, ...] = eqx.field(default=(), static=True, converter=as_coordinates)
 
     def __check_init__(self) -> None:
         """Refuse two things of one name, and what does not go together."""
@@ -118,6 +123,10 @@ class Scene(eqx.Module):
                 raise ValueError(f"Two constraints have the name {name!r}; names of constraints must differ.")
         for name in set(self.names) & set(self.constraint_names):
             raise ValueError(f"An effect and a constraint both have the name {name!r}; give one of them another name.")
+        coordinates = [read_label(text).name for text in self.coordinates]
+        for name in {"t", "time", *self.names, *(f"{each}_dot" for each in coordinates)} & set(coordinates):
+            whose = "an effect" if name in self.names else "a velocity" if name.endswith("_dot") else "the time"
+            raise ValueError(f"A coordinate has the name {name!r}, which is that of {whose}; give it another name.")
         if self.event_driven and any(isinstance(x, Friction) and x.karnopp for x in self.effects):
             raise ValueError(
                 f"{', '.join(self.event_driven)}: set-valued laws of one scene run either all by events or all by"

@@ -9,10 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.arguments import as_flag
+from .._core.arguments import as_flag, as_reals
 from .._core.parameters import as_vector
 from .._core.shapes import Scalar
 from .._core.sorted_times import after, entry
+
+
+def _samples(x: object, *, name: str) -> Float[Array, " n"]:
+    """A vector; a column of a table (pandas, polars, xarray) becomes the array that it stands for."""
+    if isinstance(x, range) or (hasattr(x, "__array__") and not isinstance(x, jax.Array | np.ndarray | np.generic)):
+        x = as_reals(x, name=name)
+    return as_vector(x, name=name)
 
 
 class Signal(eqx.Module):
@@ -33,7 +40,8 @@ class Signal(eqx.Module):
 
     **Arguments:**
 
-    - `t`: times of the samples [s], increasing, shape `[samples]`.
+    - `t`: times of the samples [s], increasing, shape `[samples]`: an array, a list, or a column of a table, as
+      `Record` takes them.
     - `values`: values there, any unit, shape `[samples]`.
     - `linear`: whether values are interpolated and not held.
 
@@ -42,8 +50,8 @@ class Signal(eqx.Module):
     - `ValueError` for shapes that differ, and times that are not finite or do not increase.
     """
 
-    t: Any = eqx.field(converter=lambda x: as_vector(x, name="Signal t"))
-    values: Any = eqx.field(converter=lambda x: as_vector(x, name="Signal values"))
+    t: Any = eqx.field(converter=lambda x: _samples(x, name="Signal t"))
+    values: Any = eqx.field(converter=lambda x: _samples(x, name="Signal values"))
     linear: bool = eqx.field(default=False, static=True, converter=lambda x: as_flag(x, name="Signal linear"))
 
     def __check_init__(self) -> None:

@@ -18,6 +18,7 @@ from ..scene import (
     State,
     forward_dynamics,
     from_dynamics,
+    linear_solver,
     scene_step,
 )
 from ..solvers import EventState
@@ -114,10 +115,24 @@ class IntegratedSystem(NamedTuple):
         )
         return AugmentedState(state, work), solved
 
+    @at_time
+    def linear_solver(
+        self, t: Array, y: State, scene: Scene, rate: State, shift: Array, pivot: bool
+    ) -> Callable[[State], State]:
+        """The linear systems of a step of `Rodas5P`, of a run that is neither audited nor canonical."""
+        return linear_solver(t, y, rate.qd, scene, shift=shift, pivot=pivot)
+
     def _inner(self, t: Array, state: State, scene: Scene) -> State:
         if not self.canonical:
             return state
         return state._replace(qd=momentum(scene.lagrangian, t, state.q, state.qd, scene.params))
+
+
+class Instant(NamedTuple):
+    """The rate of a state, and by how much the force of each sticking element exceeds its limit, in limits."""
+
+    rate: State
+    stick_violation: Float[Array, "..."]
 
 
 # A step of a scene with events or constraints evaluates large fields a dozen times. Traced as one function each, they
@@ -152,6 +167,13 @@ class RunFunctions(eqx.Module):
         return _guards(t, self.system.state(t, s.y, scene), scene, s.mode, self.rest, self.tolerances)
 
     @at_time
+    def begin(self, t: Array, y: PyTree, scene: Scene, mode: Array) -> tuple[PyTree, Array]:
+        """State and modes to begin with, whatever `mode` is."""
+        state = self.system.state(t, y, scene)
+        state, mode = from_dynamics(lambda d: d.start(self.rest), t, state, scene, mode)
+        return self.system.replace(t, y, state, scene), mode
+
+    @at_time
     def reset(self, t: Array, s: EventState, scene: Scene, fired: Array) -> EventState:
         """Change of modes; the state as it is where none changes."""
         state = self.system.state(t, s.y, scene)
@@ -183,8 +205,15 @@ class RunFunctions(eqx.Module):
         return self._stick(t, s, scene) if self.sticks else s
 
     @at_time
-    def keep(self, t: Array, y: PyTree, scene: Scene) -> PyTree:
-        """What is kept at a saved time, where the state comes from dense output and obeys nothing: result and mode."""
-        if isinstance(y, EventState):
-            return self.system.result(t, self.project_and_stick(t, y, scene).y, scene), y.mode
-        return self.system.result(t, self.project(t, y, scene), scene), None
+    def keep(self, t: Array, y: PyTree, scene: Scene, mode: Array | None) -> tuple[PyTree, Instant | None]:
+        """What is kept of a saved state, which comes from dense output and obeys nothing; in a run with modes more."""
+        y = self.project(t, y, scene)
+        if mode is None:
+            return self.system.result(t, y, scene), None
+        state = self.system.state(t, y, scene)
+        state, instant = from_dynamics(
+            lambda d: (d.stick(mode) if self.sticks else d.y, Instant(d.rate, d.stick_violation)),
+            *(t, state, scene, mode),
+        )
+        y = self.system.replace(t, y, state, scene) if self.sticks else y
+        return self.system.result(t, y, scene), jax.lax.stop_gradient(instant)

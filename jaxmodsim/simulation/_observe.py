@@ -4,6 +4,7 @@ import re
 
 from jaxtyping import Array, Float
 
+from ..scene import describe_series
 from ._trajectory import Trajectory
 
 _STATE = re.compile(r"(q|qd)\[(\d+)\]")
@@ -30,7 +31,7 @@ def named_series(run: Trajectory, name: str) -> Float[Array, " time"]:
             return force
         if index is not None and force.ndim == 2 and int(index) < force.shape[1]:
             return force[:, int(index)]
-    names = [f"{kind}[{i}]" for kind in ("q", "qd") for i in range(dof)]
+    names = [describe_series(run.scene, f"{kind}[{i}]") for kind in ("q", "qd") for i in range(dof)]
     for each, force in forces.items():
         names += [f"{each}[{i}]" for i in range(force.shape[1])] if force.ndim == 2 else [each]
     raise ValueError(f"No observable has the name {name!r}; there are: {', '.join(names)}; or a function.")

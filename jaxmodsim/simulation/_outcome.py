@@ -4,17 +4,20 @@ from typing import NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._core.cholesky import cholesky_pivots
 from .._core.parameters import check_ranges, modules_of, range_checks
+from .._core.scalarise import in_scalars
 from ..friction import Regularized
 from ..mechanics import constraint_residual, motion_equations, quadratic
-from ..scene import Scene, State, forward_dynamics
+from ..scene import Scene, State, describe_series, forward_dynamics, quantity_of
 from ..solvers import ACCUMULATION, TOO_MANY
 
+# Codes of how a run ended; `outcome_messages` has the sentence of each.
 (
     SUCCESS,
     MAX_STEPS,
@@ -38,7 +41,8 @@ _KEPT = 1e-2
 _GENERAL = (
     "The run reached t1.",
     "The step limit was reached before t1: pass a larger max_steps, a larger dt or looser tolerances. A law that"
-    " chatters (Sign) never gets through its zero crossings with adaptive steps.",
+    " chatters (Sign, or jnp.sign of a velocity in a force of your own) never gets through its zero crossings with"
+    " adaptive steps: Friction(Coulomb(Fc)) sticks exactly.",
     "The step size fell below what the time can resolve: the vector field jumps or is singular there. Run DeadZone"
     " and Sign with a fixed step (dt=...); pass atol > 0 where something comes to rest.",
     "The vector field gave a value that is not finite (NaN or infinity). With a fixed step this is also how a"
@@ -108,14 +112,16 @@ class RunResult(eqx.Module):
 
     def __str__(self) -> str:
         """The sentence."""
-        return self.message
+        return "Traced: known outside of jax.jit." if isinstance(self.code, jax.core.Tracer) else self.message
+
+    __repr__ = __str__
 
 
 def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
     """The sentence for each code that a run of this scene can end with."""
     mass = tuple(
-        f"The mass matrix is singular or indefinite at coordinate q[{i}]: its inertia is not positive"
-        + (" once the motion of the coordinates before it is taken out." if i else ".")
+        f"The mass matrix is singular or indefinite at coordinate {describe_series(scene, f'q[{i}]')}: its inertia is"
+        " not positive" + (" once the motion of the coordinates before it is taken out." if i else ".")
         for i in range(dof)
     )
     ranges = tuple(
@@ -149,7 +155,8 @@ def start_code(
     if canonical:
         code = jnp.where(quadratic(now.lagrangian, t, y.q, y.qd, now.params), code, NOT_QUADRATIC)
     offsets = _offsets(scene, dof)
-    code = _blame_margins(code, forward_dynamics(t, y, now, mode).validity_margins, offsets.checks, True)
+    if scene.checks:
+        code = _blame_margins(code, forward_dynamics(t, y, now, mode).validity_margins, offsets.checks, True)
     code = _blame_mass(code, _pivots(now, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
     if scene.constraints:
         off, turned = constraint_residual(scene.constraints, t, y.q, y.qd, now.params)
@@ -216,7 +223,9 @@ def _blame_margins(code: Int[Array, ""], margins: Array | None, first: int, know
 
 
 def _mass(scene: Scene, t: Float[Array, ""], y: State) -> Float[Array, "dof dof"]:
-    return motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass
+    return in_scalars(
+        lambda t, q, qd: motion_equations(scene.lagrangian, t, q, qd, scene.params).mass, t, y.q, y.qd, seed=y.q
+    )
 
 
 def _pivots(scene: Scene, t: Float[Array, ""], y: State) -> Float[Array, " dof"]:
@@ -241,7 +250,7 @@ def describe_failure(scene: Scene, t: float, y: State, code: int) -> str:
         text += f" Mass matrix {np.array2string(mass, precision=4)}"
         if np.all(np.isfinite(mass)):
             values, vectors = np.linalg.eigh(mass)
-            involved = [f"q[{i}]" for i in range(dof) if abs(vectors[i, 0]) > 0.05]
+            involved = [describe_series(scene, f"q[{i}]") for i in range(dof) if abs(vectors[i, 0]) > 0.05]
             text += f", smallest eigenvalue {values[0]:.3g}, coordinates involved: {', '.join(involved)}"
         text += "."
     for path, module in modules_of(scene):
@@ -249,7 +258,14 @@ def describe_failure(scene: Scene, t: float, y: State, code: int) -> str:
             check_ranges(module)
         except ValueError as error:
             text = f"{error} (at scene{path})"
-    state = (
-        f"q = {np.array2string(np.asarray(y.q), precision=6)}, qd = {np.array2string(np.asarray(y.qd), precision=6)}"
-    )
-    return f"{text} The run stopped at t = {t:.9g} with {state}; throw=False returns what was computed up to there."
+    stopped = f"The run stopped at t = {t:.9g} with {_state(scene, y)}"
+    return f"{text} {stopped}; throw=False returns what was computed up to there."
+
+
+def _state(scene: Scene, y: State) -> str:
+    if not scene.coordinates:
+        q, qd = (np.array2string(np.asarray(x), precision=6) for x in (y.q, y.qd))
+        return f"q = {q}, qd = {qd}"
+    series = {f"{name}[{i}]": float(x) for name in ("q", "qd") for i, x in enumerate(getattr(y, name))}
+    quantities = {quantity_of(scene, name): x for name, x in series.items()}
+    return ", ".join(f"{name} = {x:.6g} {unit}".rstrip() for (name, unit), x in quantities.items())

@@ -14,11 +14,14 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from .._core.arguments import as_flag, as_mapping, as_whole, check_real
+from .._core.speed import remark_on_single_precision
 from ..scene import Friction, Scene, check_step
 from ..solvers import ImplicitFriction
 from ._solve import RunInputs, RunOptions
 
 _Plugin = TypeVar("_Plugin")
+# Relative tolerance below which single precision does not reach.
+_SINGLE = 0.99e-6
 
 
 @dataclass(frozen=True)
@@ -180,6 +183,8 @@ def _check_values(array: dict[str, Any]) -> None:
             raise ValueError(f"{name} must not be negative, but it is {known[name]}.")
     if "rtol" in known and "atol" in known and known["rtol"] + known["atol"] <= 0:
         raise ValueError("rtol and atol must not both be zero.")
+    if "rtol" in known and known["rtol"].dtype == np.float32 and known["rtol"] < _SINGLE:
+        remark_on_single_precision()
     for name in ("dt", "dtmax"):
         if name in known and known[name] <= 0:
             raise ValueError(f"{name} must be positive, but it is {known[name]}.")

@@ -1,16 +1,21 @@
 """`simulate`: a scene in, a trajectory out."""
 
+from __future__ import annotations  # `help` shows types as they are written here
+
+import time
+
 import diffrax as dfx
 import equinox as eqx
 import jax.tree_util as jtu
 from jaxtyping import ArrayLike, PyTree
 
 from .._core.arguments import as_flag
-from .._core.speed import recommend_tuning
+from .._core.functions import Function
+from .._core.speed import recommend_tuning, remark_on_compilation
 from ..scene import Scene
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages
 from ._run_request import RunRequest, is_known
-from ._solve import RunInputs, RunOutput, solve
+from ._solve import RunInputs, RunOutput, compiled_runs, solve
 from ._trajectory import Trajectory, trajectory
 
 
@@ -112,10 +117,19 @@ def simulate(
         hold_chatter,
         project,
     ).checked()
+    compiled, began = compiled_runs(), time.perf_counter()
     solved = solve(inputs, options)
+    if compiled_runs() > compiled:
+        remark_on_compilation(time.perf_counter() - began, _functions(scene))
     if throw:
         solved = _raise_early_end(inputs, solved)
     return trajectory(inputs, options, solved)
+
+
+def _functions(scene: Scene) -> list[object]:
+    """The user's functions in a scene."""
+    nodes = jtu.tree_leaves(scene, is_leaf=lambda x: isinstance(x, Function))
+    return [each.fn for each in nodes if isinstance(each, Function)]
 
 
 def _raise_early_end(inputs: RunInputs, solved: RunOutput) -> RunOutput:

@@ -1,32 +1,40 @@
 """The result of a run."""
 
+import math
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field, fields
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
 import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, Float, Int, PyTree
 
+from .._core.readable import AbstractReadable, Table, short, table_of
 from ..mechanics import momentum
-from ..scene import ConstraintReaction, Scene, State, forward_dynamics
+from ..scene import ConstraintReaction, Scene, State, forward_dynamics, quantity_of
 from ..solvers import EventLog
 from ._accuracy import Accuracy
+from ._columns import Columns, columns
 from ._energy_ledger import EnergyLedger, event_losses, ledger
 from ._outcome import RunResult, outcome_messages
 from ._run_request import is_known
 from ._solve import RunInputs, RunOptions, RunOutput, solve_logged
 
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
 _Value = TypeVar("_Value")
 
 
 class Events(NamedTuple):
-    """Mode changes along a run in order of time, padded with infinity or -1.
+    """Mode changes along a run in order of time, padded with infinity or -1; in words: `Trajectory.mode_changes`.
 
     Only set-valued laws that run exactly change modes. Elements that do so at the same instant have one entry each.
 
@@ -39,6 +47,22 @@ class Events(NamedTuple):
     effect: Int[Array, " events"]
     before: Int[Array, " events"]
     after: Int[Array, " events"]
+
+
+class ModeChange(NamedTuple):
+    """A change of the mode of a friction element.
+
+    - `t`: time [s]; `effect`: name of the element.
+    - `before`, `after`: `"stick"`, or `"forward"` or `"backward"` for positive and negative slip.
+    """
+
+    t: float
+    effect: str
+    before: str
+    after: str
+
+
+_MODES = {0: "stick", 1: "forward", -1: "backward"}
 
 
 class Energy(NamedTuple):
@@ -67,8 +91,8 @@ class Energy(NamedTuple):
     data_fields=("t", "q", "qd", "z", "modes", "stats", "code", "end", "inputs"),
     meta_fields=("options", "accuracy"),
 )
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, repr=False)
+class Trajectory(AbstractReadable):
     """A run of a scene. Everything but the motion itself is computed when it is asked for.
 
     What is not saved along a run takes another run: events and energies. Each such run is made once, and its results
@@ -101,6 +125,9 @@ class Trajectory:
     _repeats: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     # Where values may be kept: those that are traced further inside must not outlive that.
     _home: object = field(default_factory=get_opaque_trace_state, init=False, repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        return str(self)
 
     def __reduce__(self) -> tuple[Callable[[], "Trajectory"], tuple[()]]:
         return partial(Trajectory, **{x.name: getattr(self, x.name) for x in fields(self) if x.init}), ()
@@ -155,6 +182,16 @@ class Trajectory:
         return self._once("events", lambda: _events(self.scene, self._log()))
 
     @property
+    def mode_changes(self) -> tuple[ModeChange, ...]:
+        """`events` in words, as many as there are; outside of `jax.jit`."""
+        names, columns = self.scene.names, [x.tolist() for x in map(np.asarray, self.events)]
+        return tuple(
+            ModeChange(t, names[effect], _MODES[before], _MODES[after])
+            for t, effect, before, after in zip(*columns, strict=True)
+            if t < math.inf
+        )
+
+    @property
     def event_forces(self) -> dict[str, Array]:
         """Force of each effect just before and after each change of mode, by effect name; needs the run of `events`.
 
@@ -198,6 +235,19 @@ class Trajectory:
         return Energy(book.kinetic, book.potential, stored, supplied, dissipated, book.balance)
 
     @property
+    def columns(self) -> Columns:
+        """Coordinates, velocities, forces and modes at the times that were reached, by name, with their units."""
+        return columns(self.scene, self.t, self.q, self.qd, self.forces, self.mode)
+
+    def to_dataframe(self) -> "pd.DataFrame":
+        """`columns` as a pandas DataFrame over time; `attrs["units"]` has the units."""
+        return self.columns.to_dataframe()
+
+    def to_xarray(self) -> "xr.Dataset":
+        """`columns` as an xarray Dataset over time, with units as attributes."""
+        return self.columns.to_xarray()
+
+    @property
     def log_size(self) -> int:
         """Length of a log that holds all events: as many as needed, in powers of two; another one compiles anew."""
         count, size = self.stats.get("num_events", 0), self.options.max_events
@@ -227,6 +277,23 @@ class Trajectory:
                 f"This Trajectory holds a batch of runs (times of shape {self.t.shape}); {what} reads one run:"
                 f" use jax.vmap(lambda run: run.{what})(runs)."
             )
+
+
+@table_of.register
+def _(run: Trajectory) -> Table:
+    """The motion alone: forces and events take a computation, or another run."""
+    notes = tuple(f"{name} {short(x)}" for name, x in run.stats.items())
+    if not is_known(run.t, run.q) or run.t.ndim != 1:
+        return Table(f"Trajectory, times of shape {run.t.shape}: {run.result}", (), [], notes)
+    reached = np.isfinite(run.t)
+    rows = []
+    for kind, x in (("q", run.q), ("qd", run.qd)):
+        for i, column in enumerate(np.asarray(x)[reached].T):
+            edges = (column[0], column[-1], column.min(), column.max()) if len(column) else ()
+            rows.append((quantity_of(run.scene, f"{kind}[{i}]").label, *map(short, edges), *[""] * (4 - len(edges))))
+    t = f"{reached.sum()} of {len(run.t)} times up to {short(run.t_end)} s"
+    head = ("", "first", "last", "least", "greatest")
+    return Table(f"Trajectory, {t}: {run.result}", head, rows, (", ".join(notes),))
 
 
 def trajectory(inputs: RunInputs, options: RunOptions, solved: RunOutput) -> Trajectory:

@@ -3,6 +3,7 @@
 from ._controllers import FiniteSteps as FiniteSteps
 from ._controllers import StepsTo as StepsTo
 from ._first_step import first_step as first_step
+from ._first_step import trial_step as trial_step
 from ._gauss import Gauss as Gauss
 from ._implicit_friction import ImplicitFriction as ImplicitFriction
 from ._projected import Projected as Projected

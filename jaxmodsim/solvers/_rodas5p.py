@@ -1,5 +1,6 @@
 """Rodas5P: a Rosenbrock method of order 5 for stiff equations, as a diffrax solver."""
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import diffrax as dfx
@@ -9,7 +10,7 @@ from jaxtyping import PyTree
 
 from ._equation import check_floating, check_ode, in_own_time
 from ._rosenbrock import RosenbrockStep, RosenbrockTableau, rosenbrock_step
-from ._state_layout import PolynomialInterpolation
+from ._state_layout import PolynomialInterpolation, State
 
 
 def _lower(rows: tuple[tuple[float, ...], ...]) -> np.ndarray:
@@ -40,6 +41,7 @@ _STAGE = _lower(
         ),
     ),
 )
+# Coefficients of `Rodas5P`.
 RODAS5P = RosenbrockTableau(
     gamma=0.21193756319429014,
     stage=_STAGE,
@@ -127,9 +129,12 @@ RODAS5P = RosenbrockTableau(
 
 # diffrax asks for a step several times over. As one function it is traced, linearised and transposed once.
 @eqx.filter_jit
-def _step(terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree, pivot: bool) -> RosenbrockStep:
+def _step(method: "Rodas5P", terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> RosenbrockStep:
     field, start, length = in_own_time(terms, t0, t1, args)
-    return rosenbrock_step(RODAS5P, field, start, length, y0, pivot=pivot)
+    given, solver = method.linear_solver, None
+    if given is not None:
+        solver = lambda t, y, rate, shift: given(t, y, args, rate, shift, method.pivot)  # noqa: E731
+    return rosenbrock_step(RODAS5P, field, start, length, y0, pivot=method.pivot, linear_solver=solver)
 
 
 class Rodas5P(dfx.AbstractAdaptiveSolver):
@@ -144,6 +149,10 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
 
     - `pivot`: whether the eliminations swap rows. Under error control they need not: a step
       that a bad pivot spoils is rejected. With fixed steps nothing would notice, so `simulate(..., dt=...)` sets it.
+    - `linear_solver`: `linear_solver(t, y, args, rate, shift, pivot)` -> the function from `rhs` to the solution of
+      `(shift I - J) x = rhs`, both as `y`, where J is the Jacobian of the field at (t, y), and `rate` the field there.
+      By default J is formed, column by column. `jaxmodsim.simulate` puts there one that uses the structure of
+      mechanics, where a scene has several coordinates; all derivatives must go through it.
 
     **Raises:**
 
@@ -162,6 +171,7 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
     """
 
     pivot: bool = eqx.field(default=False, static=True)
+    linear_solver: Callable[..., Callable[[State], State]] | None = None
     # Not `ODETerm`: `diffrax.BacksolveAdjoint` solves its adjoint equation, a term of another class.
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar = PolynomialInterpolation
@@ -191,5 +201,5 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
     ) -> tuple[PyTree, PyTree, dict[str, PyTree], None, dfx.RESULTS]:
         """One step; see `rosenbrock_step`."""
         del solver_state, made_jump
-        step = _step(terms, t0, t1, y0, args, self.pivot)
+        step = _step(self, terms, t0, t1, y0, args)
         return step.y1, step.error, {"y0": y0, "y1": step.y1, "k": step.dense}, None, dfx.RESULTS.successful

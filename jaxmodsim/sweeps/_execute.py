@@ -10,9 +10,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from .._core.extra import extra
 from .._core.speed import cores
 from ._compute import Computed, Work, compute
-from ._extra import extra
 
 # A block: its number, the numbers of its runs, and the order in which they are run.
 Task = tuple[int, dict[str, np.ndarray], np.ndarray]

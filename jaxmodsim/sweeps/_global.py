@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from .._core.extra import extra
 from ._estimates import Estimate
-from ._extra import extra
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ._observe import Derivative
+from ..scene import quantity_of
+from ._observe import Derivative, Observable
 from ._request import Request
 
 # Of runs that have not been run.
@@ -64,7 +65,7 @@ def layout(request: Request) -> ResultLayout:
             coordinates[inner[0]] = ((inner[0],), np.asarray(what.of.wrt), {})
         if ts is not None and shape.shape[first : first + 1] == np.shape(ts):
             inner[first] = "time"
-        attrs = {"units": what.unit} if what.unit else {}
+        attrs = {"units": what.unit} if what.unit else _named_attrs(request, what.of)
         variables.append(Variable(what.name, tuple(inner), shape.shape, np.dtype(shape.dtype), np.nan, attrs))
     sentences = list(request.shapes.messages)
     codes = {"long_name": "how the run ended", "flag_values": [*range(len(sentences))], "flag_meanings": sentences}
@@ -74,3 +75,12 @@ def layout(request: Request) -> ResultLayout:
         if variable.name in dims or variable.name in coordinates:
             raise ValueError(f"{variable.name!r} names both what is observed and what is swept: rename the former.")
     return ResultLayout(dims, tuple(request.grid.shape), coordinates, tuple(variables))
+
+
+def _named_attrs(request: Request, of: Observable | Derivative) -> dict[str, object]:
+    """Name and unit of what is observed by name, where the scene names its coordinates."""
+    scene = request.fixed[0] if request.fixed else None
+    if scene is None or not scene.coordinates or not isinstance(of, str):
+        return {}
+    name, unit = quantity_of(scene, of)
+    return {"long_name": name, "units": unit}

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from ._extra import extra
+from .._core.extra import extra
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .._core.extra import extra
 from ._compute import Computed
-from ._extra import extra
 from ._grid import Blocks
 from ._layout import NOT_RUN, ResultLayout, Variable
 from ._provenance import differences

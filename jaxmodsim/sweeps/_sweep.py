@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from .._core.arguments import as_whole
+from .._core.extra import extra
 from .._core.provenance import commit
 from ..scene import Scene
 from ._compute import GROUP, Work, runs_per_call
 from ._execute import Task, in_threads, run_on_executor
-from ._extra import extra
 from ._grid import Blocks, blocks, grid
 from ._layout import layout
 from ._predict import Prediction, predict_steps

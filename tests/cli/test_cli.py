@@ -4,13 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from jaxmodsim.cli import _output
 from jaxmodsim.cli._demo import START, TRUTH, synthetic_record
 from jaxmodsim.friction import LuGre
 from jaxmodsim.identify import fit
-from jaxmodsim.plot import fit_figure, ramp_figure, truth_figure
+from jaxmodsim.plot import Figure, fit_figure, ramp_figure, truth_figure
 from jaxmodsim.problems import braked_spring
 from jaxmodsim.validation.testbench import ramp_cases, run_ramp, stick_sweep
 

@@ -15,32 +15,16 @@ import scipy.io
 
 from jaxmodsim.cli import _fit
 from jaxmodsim.cli._read import AxisColumns, read_record, read_records
+from jaxmodsim.cli._units import given_units
 from jaxmodsim.identify import FitResult, Record, axis_models, axis_scene, fit, remarks, rough_axis
 from jaxmodsim.identify.model._axis import RoughAxis
 
-GAIN = 12.0
-COLUMNS = ("--time", "time", "--position", "pos", "--force", "volt", "--force-gain", str(GAIN))
+from ..helpers.axis_records import GAIN, TRUTH, axis_frame
+
+COLUMNS = ("--time", "time", "--position", "pos", "--force", "volt", "--units", f"force={GAIN}")
 # Friction as the records have it, and integration steps that follow its changes of sign.
 MODEL = ("--fix", "dry.width=1e-3", "--limit", "m=:50", "--substeps", "2", "--begin", "staged")
-NAMES = AxisColumns("time", "pos", "volt", GAIN)
-TRUTH = {"m": 5.0, "offset": 0.7, "dry.Fc": 3.0, "viscous.Fv": 8.0}
-
-
-def axis_frame(seed: int = 0, v: float = 0.0) -> pd.DataFrame:
-    """A record of an axis with the numbers of TRUTH, from a plain Euler simulation that starts at the velocity `v`.
-
-    There is no force over the first 20 samples, the parabola through which is to show the velocity.
-    """
-    t = 10.0 + np.arange(0.0, 2.0, 2.5e-3)
-    u = np.where(t > 10.05, 0.8 * np.sign(np.sin(5.1 * t + seed)) + 1.5 * np.sin(9.3 * t), 0.0)
-    q = np.zeros_like(t)
-    for k in range(1, t.size):
-        for _ in range(25):
-            v += 1e-4 * (GAIN * u[k - 1] - 0.7 - 3.0 * np.tanh(v / 1e-3) - 8.0 * v) / 5.0
-            q[k] += 1e-4 * v
-        q[k] += q[k - 1]
-    noise = 1e-6 * np.random.default_rng(seed).standard_normal(t.size)
-    return pd.DataFrame({"time": t, "pos": q + noise, "volt": u})
+NAMES = AxisColumns("time", "pos", "volt", given_units([f"force={GAIN}"]))
 
 
 def write_mat(path: Path, columns: dict[Any, Any]) -> None:
@@ -82,7 +66,7 @@ class Page(HTMLParser):
 def fitted(run_command, files, tmp_path_factory):
     """The fit of two records with a third held out, and a report."""
     out = tmp_path_factory.mktemp("fit")
-    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--hold-out", files[2])
+    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--held-out", files[2])
     code, text, errors = run_command(*command, "--out", str(out), "--report", str(out / "report"))
     assert code == 0, errors
     return out, text
@@ -153,7 +137,7 @@ def test_ctrl_c_keeps_what_was_found(run_command, files, tmp_path, monkeypatch):
 
     monkeypatch.setattr(_fit, "fit", stopped)
     out = tmp_path / "out"
-    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--hold-out", files[2])
+    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--held-out", files[2])
     code, _, errors = run_command(*command, "--out", str(out), "--report", str(out))
     assert code == 130
     assert errors == "jaxmodsim: interrupted; what was found until then is written\n"
@@ -168,7 +152,7 @@ def test_ctrl_c_keeps_what_was_found(run_command, files, tmp_path, monkeypatch):
 
 def test_models_are_compared(run_command, files, tmp_path):
     out = tmp_path / "out"
-    command = ("fit", files[0], *COLUMNS, *MODEL[:-2], "--compare", "coulomb,asymmetric", "--folds", "2")
+    command = ("fit", files[0], *COLUMNS, *MODEL[:-2], "--laws", "coulomb,asymmetric", "--folds", "2")
     code, text, errors = run_command(*command, "--out", str(out), "--report", str(out))
     assert code == 0, errors
     found = json.loads((out / "fit.json").read_text())
@@ -189,7 +173,7 @@ def test_the_next_input_is_written(run_command, files, tmp_path, monkeypatch):
     out = tmp_path / "out"
     monkeypatch.setattr(_fit, "design_input", partial(_fit.design_input, max_steps=2))
     limits = ("--max-force", "30", "--max-travel", "0.1", "--duration", "1.5")
-    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--hold-out", files[2])
+    command = ("fit", *files[:2], *COLUMNS, *MODEL, "--held-out", files[2])
     code, text, errors = run_command(*command, "--next", str(out / "next.csv"), *limits, "--out", str(out))
     assert code == 0, errors
     frame = pd.read_csv(out / "next.csv")
@@ -218,7 +202,7 @@ def test_every_kind_of_file_gives_the_same_record(tmp_path, kind):
         write_mat(path, {**columns, "matrix": np.eye(3), "label": np.array(["EMPS"])})
     else:
         frame.to_csv(path, index=False)
-    record = read_record(path, NAMES)
+    (record,) = read_record(path, NAMES).parts
     np.testing.assert_allclose(record.t, frame["time"], rtol=1e-15)
     np.testing.assert_allclose(record.measured, frame["pos"], rtol=1e-12)
     np.testing.assert_allclose(record.inputs["u"], GAIN * frame["volt"], rtol=1e-12)
@@ -230,13 +214,13 @@ def test_records_of_one_name_are_told_apart_by_their_folders(tmp_path):
     for path in paths:
         path.parent.mkdir()
         axis_frame().to_csv(path, index=False)
-    assert [record.name for record in read_records(paths, NAMES)] == ["a/run.csv", "b/run.csv"]
+    assert [record.parts[0].name for record in read_records(paths, NAMES)] == ["a/run.csv", "b/run.csv"]
     with pytest.raises(ValueError, match=r"run\.csv is given twice"):
         read_records([paths[0], tmp_path / "b" / ".." / "a" / "run.csv"], NAMES)
 
 
 def test_rough_values_come_from_the_record(files):
-    rough = rough_axis(read_record(Path(files[0]), NAMES))
+    rough = rough_axis(read_record(Path(files[0]), NAMES).parts[0])
     assert rough.m == pytest.approx(TRUTH["m"], rel=0.2)
     assert rough.Fc == pytest.approx(TRUTH["dry.Fc"], rel=0.5)
 
@@ -325,10 +309,10 @@ def check_refusal(run_command, out: Path, text: str, *command: str) -> None:
     ("change", "text"),
     [
         (("--position", "poss"), "no column 'poss' .*time, pos, volt.* Did you mean --position pos"),
-        (("--model", "coulom"), "no model 'coulom'; the models are: coulomb, asymmetric.* Did you mean coulomb"),
-        (("--compare", "coulomb,lugr"), "no model 'lugr'.* Did you mean lugre"),
-        (("--compare", "coulomb"), "two models or more, A,B, but 'coulomb' was given"),
-        (("--compare", "all", "--free", "m"), "--free does not go with --compare"),
+        (("--laws", "coulom"), "no law 'coulom'; the laws are: coulomb, asymmetric.* Did you mean coulomb"),
+        (("--laws", "coulomb,lugr"), "no law 'lugr'.* Did you mean lugre"),
+        (("--laws", " ,"), "--laws needs a law, several as A,B, or `all`, but ' ,' was given"),
+        (("--laws", "all", "--free", "m"), "--free does not go with several --laws"),
         (("--free", "m,dry.Fs"), "no name 'dry.Fs'; .* Did you mean dry.Fc"),
         (("--free", "m", "--fix", "m=2"), "m stands in --free and in --fix"),
         (("--start", "m"), "--start needs NAME=VALUE"),
@@ -341,16 +325,23 @@ def check_refusal(run_command, out: Path, text: str, *command: str) -> None:
         (("--limit", "m=9:8"), "the lower limit must be below"),
         (("--limit", "mass=1:9"), "--limit: there is no parameter 'mass'"),
         (("--limit", "dry.Fc=100:200"), "dry.Fc must be .*but it is"),
-        (("--force-gain", "0"), "--force-gain must be finite and not zero"),
-        (("--substeps", "0"), "substeps must be a positive integer"),
+        (("--units", "force=0"), "--units force=0: the factor must be finite and not zero"),
+        (("--units", "force=12", "--units", "mass=kg"), "--units needs COLUMN=UNIT .*but 'mass=kg' was given"),
+        (("--units", "position=mmm"), "no unit 'mmm'; the units are: m, mm.* Did you mean mm"),
+        (("--units", "time=mm"), "mm is a unit of length; the units are: s, ms"),
+        (("--units", "force=mA"), "mA is a unit of current, .*as in --units force=12.5"),
+        (("--units", "position=deg,force=N"), "'pos' is in deg and 'volt' in N, but a rotary axis needs"),
+        (("--drop", "zero"), "no kind of sample 'zero'; the kind of samples are: nan, repeated"),
+        (("--max-steps", "0"), "--max-steps must be at least 1"),
+        (("--substeps", "0"), "--substeps must be at least 1"),
         (("--starts", "0"), "--starts must be at least 1"),
         (("--folds", "1"), "--folds must be at least 2"),
         (("--loss", "absolute"), "no name 'absolute'; the names are: squares, huber, cauchy"),
         (("--begin", "stage"), "no name 'stage'; .* Did you mean staged"),
-        (("--time", "volt"), "times must increase"),
+        (("--time", "volt"), "times must increase, but column 'volt'"),
         (("--max-force", "3"), "--max-force belongs to --next"),
         (("--next", "n.csv", "--duration", "-1"), "--duration must be finite and > 0"),
-        (("--hold-out", "nowhere.csv"), "There is no file nowhere.csv"),
+        (("--held-out", "nowhere.csv"), "There is no file nowhere.csv"),
     ],
 )
 def test_wrong_options_are_one_sentence_and_exit_code_two(run_command, files, tmp_path, change, text):
@@ -362,11 +353,14 @@ def test_wrong_options_are_one_sentence_and_exit_code_two(run_command, files, tm
     [
         ("", "no CSV file with a header line"),
         ("time,pos,volt\n0,1,2\n1,x,2\n", "'pos' holds 'x' in sample 1"),
-        ("time,pos,volt\n0,1,2\n1,,2\n", "not finite, the first in sample 1"),
-        ("time,pos,volt\n0,1,2\n0,1,2\n", "times must increase, but sample 1"),
+        ("time,pos,volt\n0,1,2\n1,,2\n", "'pos' has 1 values that are not finite, the first in sample 1.*--drop nan"),
+        ("time,pos,volt\n0,1,2\n0,1,2\n1,1,2\n", "'time' has 1 samples at the time of the one before: 1. The times"),
+        ("time,pos,volt\n" + "".join(f"{max(k, 1)},1,2\n" for k in range(9)), "before: 1. Leave .*--drop repeated"),
+        ("time,pos,volt\n1,1,2\n2,1,2\n0,1,2\n", "'time' goes back 1 times, first from 2 s to 0 s in sample 2"),
+        ("1,1,2\n2,1,2\n0,1,2\n", "no CSV file with a header line: the first line holds numbers"),
+        ("time [s],phi_deg,volt [mA]\n0,1,2\n1,1,3\n", "no column 'pos' .*has: time .s., phi_deg"),
         ("time,pos,volt\n0,1,2\n", "two samples or more"),
-        ("time,pos,volt\n0,1,2\n1,1,2\n2,1,3\n", "the position never changes"),
-        ("time;pos;volt\n0;1;2\n1;2;2\n", "no column 'time' .*it has: time;pos;volt"),
+        ("time,pos,volt\n0,1,2\n.01,1,2\n.02,1,3\n", "the position never changes"),
     ],
 )
 def test_bad_tables_are_one_sentence_and_exit_code_two(run_command, tmp_path, content, text):
@@ -382,7 +376,7 @@ def test_bad_tables_are_one_sentence_and_exit_code_two(run_command, tmp_path, co
         ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(105) + b"\x00\x01IM" + bytes(7), "damaged or no MATLAB file"),
         ("a.mat", b"MATLAB 7.3 MAT-file" + b" " * 105 + b"\x00\x02IM" + bytes(800), "MATLAB 7.3 .*'-v7'"),
         ("a.csv", b"\xff\xfe\x00\x80", "no CSV file"),
-        ("a.xlsx", b"PK", "must be one of .csv, .txt, .parquet, .mat"),
+        ("a.xlsx", b"PK", "must be one of .csv, .txt, .parquet, .mat, .mf4"),
         ("axis", b"", "must be one of"),
     ],
 )
@@ -395,13 +389,13 @@ def test_damaged_and_unknown_files_are_one_sentence(run_command, tmp_path, name,
 def test_matlab_vectors_of_other_lengths_and_folders_are_refused(run_command, files, tmp_path):
     path, out = tmp_path / "a.mat", tmp_path / "out"
     write_mat(path, {"time": np.arange(3.0), "pos": np.arange(4.0), "volt": np.arange(3.0)})
-    check_refusal(run_command, out, r"'t' has \(3,\) and 'measured' has \(4,\)", str(path), *COLUMNS)
+    check_refusal(run_command, out, r"3 \('time'\), 4 \('pos'\), 3 \('volt'\)", str(path), *COLUMNS)
     write_mat(path, {"time": np.arange(3.0), "pos": np.eye(3), "volt": np.arange(3.0)})
     check_refusal(run_command, out, "no column 'pos' .*it has: time, volt", str(path), *COLUMNS)
     check_refusal(run_command, out, "is a folder; a file is needed", str(tmp_path))
     check_refusal(run_command, out, "There is no file", str(tmp_path / "none.csv"))
     check_refusal(run_command, out, "is given twice", files[0], files[0], *COLUMNS)
-    check_refusal(run_command, out, "is given twice", files[0], "--hold-out", files[0], *COLUMNS)
+    check_refusal(run_command, out, "is given twice", files[0], "--held-out", files[0], *COLUMNS)
     code, _, errors = run_command("fit", files[0], *COLUMNS, "--out", files[0])
     assert code == 2
     assert "is a file; a folder is needed" in errors

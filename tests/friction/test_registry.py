@@ -137,9 +137,9 @@ def test_it_is_a_candidate_of_a_fit(registered: type[SoftCoulomb], run_command: 
     assert set(model.free) <= set(scene_numbers(scene)) | {"m", "offset"}
     path = tmp_path / "record.csv"
     pd.DataFrame({"t": t, "q": np.sin(t), "u": np.cos(t)}).to_csv(path, index=False)
-    code, _, errors = run_command("fit", str(path), "--model", "softcoulom")
+    code, _, errors = run_command("fit", str(path), "--laws", "softcoulom")
     assert code == 2
-    assert "softcoulomb" in errors.split("the models are")[1]
+    assert "softcoulomb" in errors.split("the laws are")[1]
     assert "Did you mean softcoulomb?" in errors
 
 

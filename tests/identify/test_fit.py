@@ -103,6 +103,10 @@ def test_a_parameter_without_effect_is_reported_and_not_given_an_error_of_zero(c
     force = np.asarray(law_force(law, jnp.asarray(t), jnp.asarray(motion["x"])))
     start = jms.LuGre(sigma0=1e4, sigma1=0.0, sigma2=0.5, Fc=0.8, Fs=1.0, vs=1e-9)
     result = jms.fit_law(start, jms.Record(t, force, motion), ("Fc", "Fs"))
+    assert repr(result) == str(result)
+    assert f"<td style='text-align:left'>Fc [N]</td><td style='text-align:left'>{result.values['Fc']:.6g}</td>" in (
+        result._repr_html_()
+    )
     assert np.isinf(result.errors["Fs"])
     assert any("Fs has no effect" in remark for remark in remarks(result))
     assert result.values["Fc"] == pytest.approx(1.0, rel=1e-3)
@@ -238,6 +242,33 @@ def test_too_few_samples_are_refused(clean):
     t, u, q = clean
     with pytest.raises(ValueError, match="3 samples are too few for 3"):
         jms.fit(sprung(), jms.Record(t[:3], q[:3], {"u": u[:3]}), tuple(TRUTH))
+
+
+def test_stiction_is_sought_up_to_a_multiple_of_sliding_friction():
+    t = np.arange(0.0, 2.0, 2e-3)
+    x = 2e-3 * np.sin(2 * np.pi * t) * (1 + 0.5 * np.sin(2 * np.pi * 0.3 * t))
+    numbers = {"sigma0": 1e5, "sigma1": 100.0, "sigma2": 5.0, "Fc": 1.0, "vs": 2e-3}
+    force = np.asarray(law_force(jms.LuGre(Fs=9.0, **numbers), jnp.asarray(t), jnp.asarray(x)))
+    record, start = jms.Record(t, force, {"x": x}), jms.LuGre(Fs=2.0, **numbers)
+    held = jms.fit_law(start, record, ("Fc", "Fs"))
+    assert held.values["Fs"] == pytest.approx(5 * held.values["Fc"], rel=1e-12)
+    assert held.values["Fs"] in held.estimate.bounds["Fs"]
+    assert held.search is not None
+    problem = held.search.problem
+    np.testing.assert_allclose(problem.free.coordinates(held.values), held.search.state.x, rtol=1e-12)
+    further = jms.fit_law(jms.LuGre(**(numbers | {"Fs": 10.0, "sigma2": 4.0})), record, ("Fc", "Fs", "sigma2"))
+    assert further.values["Fs"] == pytest.approx(9.0, rel=1e-4)
+
+
+def test_the_multiple_of_a_limit_may_be_another():
+    numbers, ranges = {"a": 1.0, "b": 2.0}, {"b": Range("N", "a", most=5.0)}
+    free = FreeParameters.of(numbers, ranges, ("a", "b"))
+    assert free.kinds == ("line", "ratio")
+    assert free.limits(free.x0)["b"] == (1.0, 5.0)
+    x = free.coordinates({"a": 3.0, "b": 4.5})
+    assert {name: float(each) for name, each in free.values(x).items()} == pytest.approx({"a": 3.0, "b": 4.5})
+    fixed = FreeParameters.of(numbers, ranges, ("b",))
+    assert fixed.limits(fixed.x0)["b"] == (1.0, 5.0)
 
 
 def test_lower_limits_tighten_declared_ranges(clean):

@@ -431,23 +431,41 @@ def test_residuals_of_a_fit_are_tested_against_its_motion(result):
 
 def test_a_record_that_was_not_fitted_is_scored(scored, parts, clean):
     t, _, q = clean
-    assert scored.ending == "converged"
-    assert scored.rmse["x"] == pytest.approx(1e-4, rel=0.15)
+    fitted = scored.start_fitted
+    assert fitted.ending == "converged"
+    assert fitted.rmse["x"] == pytest.approx(1e-4, rel=0.15)
+    assert scored.rmse["x"] == pytest.approx(1e-4, rel=0.3)
     assert scored.fit["x"] == pytest.approx(100 * (1 - scored.rmse["x"] / np.std(parts[1].channels["x"])))
     # The initial state comes out as it was, the velocity of the true motion by difference.
-    assert scored.q0 == pytest.approx(q[750], abs=1e-4)
-    assert scored.qd0 == pytest.approx(np.gradient(q, t)[750], abs=1e-2)
+    for each in (fitted, scored):
+        assert each.q0 == pytest.approx(q[750], abs=1e-4)
+        assert each.qd0 == pytest.approx(np.gradient(q, t)[750], abs=1e-2)
+    assert set(fitted.away) == {"q0[0]", "qd0[0]"}
+    assert max(abs(x) for x in fitted.away.values()) < 3
+    assert scored.remarks == ()
     np.testing.assert_allclose(scored.residuals["x"], scored.outputs["x"] - parts[1].channels["x"])
     assert "fit 99.9" in str(scored)
 
 
+def test_a_start_that_takes_up_an_error_of_the_model_is_a_remark(result, parts):
+    other = jms.Record(parts[1].t, parts[1].channels, {"u": 0.8 * parts[1].inputs["u"]}, "weak")
+    found = score(result, other)
+    assert found.start_fitted is not None
+    assert found.start_fitted.rmse["x"] < found.rmse["x"]
+    assert any("standard errors from what its first samples show" in each for each in found.remarks)
+    nothing = jms.Record(parts[1].t, parts[1].channels, {"u": np.full(len(parts[1].t), 1e200)}, "overflow")
+    with pytest.raises(RuntimeError, match="not finite"):
+        score(result, nothing)
+
+
 def test_a_start_that_is_given_is_not_moved(result, parts):
-    given = score(result, parts[0], q0=[0.05], qd0=[0.1], free_start=False)
-    assert given.ending is None
+    given = score(result, parts[0], q0=[0.05], qd0=[0.1])
     np.testing.assert_allclose(given.outputs["x"], result.provenance.outputs[0]["x"], rtol=0, atol=1e-12)
-    assert score(result, parts[0], free_start=False).rmse["x"] > 10 * given.rmse["x"]  # from rest, which it was not
+    assert score(result, parts[0], q0=[0.05], qd0=[0.0]).rmse["x"] > 10 * given.rmse["x"]  # from rest, which it was not
+    with pytest.raises(ValueError, match="give q0 and qd0, or neither"):
+        score(result, parts[0], q0=[0.05])
     with pytest.raises(ValueError, match=r"q0 must be finite and of the shape \(1,\)"):
-        score(result, parts[0], q0=[0.0, 0.0])
+        score(result, parts[0], q0=[0.0, 0.0], qd0=[0.0])
     other = jms.Record(parts[0].t, {"y": parts[0].channels["x"]}, parts[0].inputs)
     with pytest.raises(ValueError, match="has the channel 'y', but the fit observed: x"):
         score(result, other)

@@ -21,13 +21,15 @@ from jaxmodsim import (
     Regularized,
     Scene,
     Sign,
+    SimulationError,
     Stribeck,
     Viscous,
     problems,
     simulate,
 )
 from jaxmodsim._core.scalarise import in_scalars
-from jaxmodsim.scene import State, vector_field
+from jaxmodsim.scene import State, quantity_of, scene_ranges, vector_field
+from jaxmodsim.simulation import named_series
 
 
 def free(t: Any, q: Any, qd: Any, p: Any) -> Any:
@@ -99,6 +101,33 @@ def regularized(x: float) -> Regularized:
     return Regularized(Stribeck(Fc=1.0, Fs=1.0 + x, vs=0.1), width=1e-3)
 
 
+def test_coordinates_have_names_and_units() -> None:
+    """From them follow those of velocities and forces; and of the numbers of friction about an axis."""
+    cart = problems.cart_pole.scene(Viscous(1.0))
+    assert [quantity_of(cart, x).label for x in ("q[0]", "qd[1]")] == ["x [m]", "angle_dot [rad/s]"]
+    assert quantity_of(cart, "nothing[2]") == ("nothing[2]", "")
+    law = Friction(Viscous(1.0))
+    axis = Scene(free, effects=(AppliedForce(push), law), coordinates=("phi[rad]",))
+    assert axis.coordinates == ("phi [rad]",)
+    assert [quantity_of(axis, x).unit for x in ("applied[0]", "friction")] == ["N m", "N m"]
+    assert scene_ranges(axis)["friction.Fv"].unit == "N m s/rad"
+    assert scene_ranges(Scene(free, effects=(law,), coordinates=("x [m]",)))["friction.Fv"].unit == "N s/m"
+    assert quantity_of(Scene(free, effects=(law,)), "friction") == ("friction", "N or N m")
+    assert quantity_of(Scene(free, coordinates=("s [mm]", "z")), "q[1]").label == "z"
+    # Of a run that fails, the state has their names, too.
+    with pytest.raises(SimulationError, match=r"(?s)coordinate q\[1\] \(b\):.*with a = 0 m, b = 0 m, a_dot = 0 m/s"):
+        run(Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, coordinates=("a [m]", "b [m]")), 2)
+    with pytest.raises(ValueError, match=r"there are: q\[0\] \(phi\), qd\[0\] \(phi_dot\), applied\[0\], friction;"):
+        named_series(run(axis), "phi")
+
+
+@pytest.mark.parametrize("name", sorted(problems.named_problems()))
+def test_named_problems_name_their_coordinates(name: str) -> None:
+    case = problems.named_problems()[name]()
+    assert len(case.scene.coordinates) == len(case.q0)
+    assert all(x.endswith(("[m]", "[rad]")) for x in case.scene.coordinates)
+
+
 def test_numbers_can_be_replaced() -> None:
     scene = problems.ramped_box.scene(problems.ramped_box.lugre())
     changed = eqx.tree_at(lambda s: s.effects[1].law.sigma0, scene, jnp.array(10.0))
@@ -145,6 +174,19 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
         "normal_force='floor' names no constraint of the scene; there are: none",
     ),
     "along is no function": (lambda: Friction(Viscous(1.0), along=cast_any(0)), "along must be a function, but 0"),
+    "coordinates in one text": (lambda: Scene(free, coordinates=cast_any("x [m]")), "must hold a name for each coord"),
+    "coordinate without a name": (
+        lambda: Scene(free, coordinates=("[m]",)),
+        r"coordinates must hold a name for each.*'\[m\]'",
+    ),
+    "coordinates of one name": (
+        lambda: Scene(free, coordinates=("x [m]", "x [rad]")),
+        "Two coordinates have the name 'x'; names of coordinates must differ",
+    ),
+    "coordinate of an effect's name": (
+        lambda: Scene(free, effects=(Friction(Viscous(1.0)),), coordinates=("friction [m]",)),
+        "A coordinate has the name 'friction', which is that of an effect",
+    ),
     "force is no function": (lambda: AppliedForce(cast_any(2.0)), r"AppliedForce fn must be a function, but 2.0"),
     "at is no function": (lambda: AppliedForce(push, at=cast_any(1)), r"AppliedForce at must be a function, but 1"),
     # The following are found when the run is traced.
@@ -161,6 +203,10 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
         r"fn returned the shape \(1,\), but \(3,\) is needed.*what `at` returns",
     ),
     "friction on two coordinates": (lambda: run(one_friction(), 2), "2 coordinates: say along which displacement"),
+    "names of two coordinates for one": (
+        lambda: run(Scene(free, coordinates=("x [m]", "y [m]"))),
+        r"The scene names 2 coordinates \(x \[m\], y \[m\]\), but q has 1: give a name for each, or none",
+    ),
     "vector displacement": (lambda: run(one_friction(along=lambda q: q)), r"along\(q\) returned the shape \(1,\)"),
     "vector belt": (
         lambda: run(one_friction(belt_velocity=lambda t: jnp.ones(3) * t)),

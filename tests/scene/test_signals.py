@@ -7,6 +7,7 @@ import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 
 import jaxmodsim as jms
@@ -174,3 +175,27 @@ def test_times_of_events_are_differentiable() -> None:
     forward, t = jax.jit(jax.jacfwd(twice, has_aux=True))(x)
     np.testing.assert_allclose(t, [rest, 2.0 / k], rtol=1e-9)
     np.testing.assert_allclose(forward, expected, atol=1e-7)
+
+
+COLUMNS: Any = pd.DataFrame({"t": [0.0, 0.5, 2.0], "u": [1, 2, 3], "text": ["a", "b", "c"]})
+
+
+@pytest.mark.parametrize("kind", ["int64", "float32", "Float64", "Int64", "float64[pyarrow]"])
+def test_columns_of_tables_are_taken_as_a_record_takes_them(kind):
+    u = COLUMNS["u"].astype(kind)
+    for values in (u, u.array, u.to_list(), range(1, 4), u.to_xarray()):
+        assert jms.Signal(COLUMNS["t"], values).values.tolist() == [1.0, 2.0, 3.0]
+        assert jms.Record(COLUMNS["t"], values).measured.tolist() == [1.0, 2.0, 3.0]
+    assert jms.Signal(COLUMNS.set_index("t").index, u).t.tolist() == [0.0, 0.5, 2.0]
+    hollow = u.astype("Float64").where(u != 2)
+    with pytest.raises(ValueError, match=r"values must be finite, but the one at t = 0.5 is nan"):
+        jms.Signal(COLUMNS["t"], hollow)
+
+
+def test_columns_of_text_are_refused_in_a_line():
+    for make in (jms.Signal, jms.Record):
+        with pytest.raises(
+            ValueError, match=r"must hold real numbers, but a Series of (str|object) was given"
+        ) as error:
+            make(COLUMNS["t"], COLUMNS["text"])
+        assert "\n" not in str(error.value)

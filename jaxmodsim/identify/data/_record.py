@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,12 +10,25 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..._core.arguments import as_float, as_label, as_mapping, as_names, as_reals
 
+
+@runtime_checkable
+class TableColumn(Protocol):
+    """A column of a table (pandas, xarray, polars): what NumPy makes an array of."""
+
+    def __array__(self, *arguments: object, **options: object) -> np.ndarray:
+        """As an array."""
+        ...
+
+
 # Samples of one channel, shape `[samples]`.
-Column: TypeAlias = ArrayLike | Sequence[object]
+Column: TypeAlias = ArrayLike | Sequence[object] | TableColumn
 # Name of a single channel that was given none.
 SINGLE = "measured"
 # Samples at the beginning of a record, from which position and velocity are estimated.
 _SAMPLES = 20
+# A value stands out that is so many times as far from the median of its neighbours as nearly all others are, and as far
+# as samples go from one to the next.
+_NEIGHBOURS, _STANDS_OUT, _NEARLY_ALL = 5, 10.0, 0.95
 # Smoothing: one sample to either side for so many of the record, and never fewer than so many to either side.
 _SAMPLES_A_SIDE, _LEAST_SPAN = 1000, 3
 
@@ -328,6 +341,25 @@ def smooth_span(samples: int) -> int:
     return max(samples // _SAMPLES_A_SIDE, _LEAST_SPAN)
 
 
+def outliers(x: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
+    """Samples that stand out from their neighbours to either side, as those of a sensor that drops out do."""
+    deviation, steps = np.abs(x - _local_median(x)), np.abs(np.diff(x))
+    step = float(np.median(steps[steps > 0])) if steps.any() else 0.0
+    usual = max(float(np.quantile(deviation, _NEARLY_ALL)), step)
+    return deviation > _STANDS_OUT * usual
+
+
+def without_outliers(x: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+    """The samples, with the median of their neighbours in place of those that stand out."""
+    bad = outliers(x)
+    return np.where(bad, _local_median(x), x) if bad.any() else x
+
+
+def _local_median(x: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+    side = _NEIGHBOURS // 2
+    return np.median(np.lib.stride_tricks.sliding_window_view(np.pad(x, side, mode="edge"), _NEIGHBOURS), axis=-1)
+
+
 def differentiate(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> SmoothedMotion:
     """Velocity and acceleration of a position, smoothed before either differentiation."""
     span = smooth_span(len(t))
@@ -347,7 +379,7 @@ def start_state(record: Record, channel: str | None = None) -> tuple[float, floa
 
     Position and velocity.
     """
-    x = record.measured if channel is None else record.channels[channel]
+    x = without_outliers(record.measured if channel is None else record.channels[channel])
     count = min(_SAMPLES, len(record.t))
     t = record.t[:count] - record.t[0]
     coefficients = np.polynomial.polynomial.polyfit(t, x[:count], min(2, count - 1))

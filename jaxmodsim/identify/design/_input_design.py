@@ -40,8 +40,7 @@ class AxisLimits:
     - `speed`: largest magnitude of the velocity [m/s], > 0.
     - `travel`: largest distance from the start to either side [m], > 0: half of the whole stroke if the axis starts in
       its middle.
-
-    For a rotary axis read torque, rad/s and rad.
+    - `rotary`: whether these are a torque [N m], rad/s and rad.
 
     **Raises:**
 
@@ -51,6 +50,7 @@ class AxisLimits:
     force: float | None = None
     speed: float | None = None
     travel: float | None = None
+    rotary: bool = False
 
     def __post_init__(self) -> None:
         given = self.given
@@ -66,7 +66,9 @@ class AxisLimits:
     @property
     def given(self) -> dict[str, tuple[float, str]]:
         """Value and unit of each limit that there is, by name."""
-        each = {"force": (self.force, "N"), "speed": (self.speed, "m/s"), "travel": (self.travel, "m")}
+        units = ("N m", "rad/s", "rad") if self.rotary else ("N", "m/s", "m")
+        values = {"force": self.force, "speed": self.speed, "travel": self.travel}
+        each = {name: (value, unit) for (name, value), unit in zip(values.items(), units, strict=True)}
         return {name: (value, unit) for name, (value, unit) in each.items() if value is not None}
 
     def __str__(self) -> str:

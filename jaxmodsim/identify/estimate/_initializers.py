@@ -86,7 +86,7 @@ class MultiStart(AbstractInitializer):
         for i, kind in enumerate(problem.free.kinds):
             if kind == "log":
                 drawn[:, i] = here[i] + np.log(factor[:, i])
-            elif kind == "above":
+            elif kind in ("above", "ratio"):
                 drawn[:, i] = (here[i] or 1.0) * factor[:, i]
             else:
                 drawn[:, i] = here[i] + (abs(here[i]) or 1.0) * away[:, i]
@@ -204,6 +204,37 @@ class Continuation(AbstractInitializer):
             factor = self.factor ** (1 - stage / self.stages)
             x = solve(problem.with_number(self.name, factor), x, options).state.x
         return x, ()
+
+
+class FromSmaller(AbstractInitializer):
+    """Search also from where a model with fewer parameters ended, so that one with more is not left behind it.
+
+    Its parameters are taken over, and the others start as they were given; or at their limit by another one, as
+    Fs = Fc, where they have no effect and the model is the smaller one.
+
+    - `values`: those that were fitted, by the last part of their names, as Fc in friction.Fc.
+    """
+
+    values: dict[str, Array]
+
+    def initialize(
+        self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions
+    ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
+        """The best of the ends."""
+        size = len(problem.free.names)
+        here = {name: self.values[last_part(name)] for name in problem.free.names if last_part(name) in self.values}
+        over = problem.free.coordinates(problem.free.values(x[:size]) | here)
+        rest = jnp.asarray(
+            [name not in here and problem.free.limit_of(name) is not None for name in problem.free.names]
+        )
+        starts = [x, *(jnp.concatenate([each, x[size:]]) for each in (over, jnp.where(rest, 0.0, over)))]
+        ends = [solve(problem, each, options).state for each in (starts if bool(jnp.any(rest)) else starts[:2])]
+        return min(ends, key=lambda end: float(jnp.nan_to_num(end.cost, nan=jnp.inf))).x, ()
+
+
+def last_part(name: str) -> str:
+    """Of the name of a number: Fc of friction.Fc."""
+    return name.rsplit(".", 1)[-1]
 
 
 class Stochastic(AbstractInitializer):

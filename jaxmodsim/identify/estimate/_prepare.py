@@ -222,6 +222,10 @@ def _numbers(
     ranges |= {DELAY + name: Range("s", 0.0) for name in delays}
     for name, span in settings.limits.items():
         low, high = _limits(name, span)
+        upper, _, base = name.partition("/")
+        if base and upper in ranges and ranges[upper].lower == base:
+            ranges[upper] = replace(ranges[upper], most=high)
+            continue
         if name not in numbers:
             raise ValueError(f"limits: {name} is no number of the scene; there are: {', '.join(numbers)}.")
         declared = ranges.get(name, Range(""))

@@ -171,7 +171,8 @@ def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
     - `ValueError` if there are no more samples than free parameters.
     - `RuntimeError` if the model is not finite at the start.
     """
-    counted, unknown = int(jnp.sum(problem.weights > 0)), x.shape[0]
+    counted = int(jnp.sum(problem.weights > 0)) + int(jnp.sum(problem.prior.weight > 0))
+    unknown = x.shape[0]
     if counted <= unknown:
         raise ValueError(f"{counted} samples are too few for {unknown} free parameters.")
     rtol = jnp.asarray(options.rtol, x.dtype)

@@ -11,7 +11,7 @@ from jaxtyping import Array
 from ..._core.parameters import ranges_of
 from ...friction import AbstractLaw, AbstractSetValuedLaw, Coulomb, Regularized, Viscous, asymmetric, laws
 from ...scene import AbstractEffect, AppliedForce, Friction, Scene, replace_numbers
-from ..data._record import Record, differentiate, smooth, smooth_span
+from ..data._record import Record, differentiate, smooth, smooth_span, without_outliers
 
 # Share of the variance of a force below which a regression explains it well enough to tell that its sign is wrong.
 _EXPLAINED = 0.5
@@ -64,7 +64,7 @@ def rough_axis(record: Record) -> RoughAxis:
                 f"{record.name}: the {what} never changes (it is {column[0]:g} throughout), so nothing can be fitted:"
                 " mass and friction show in the motion under a force that changes. Is it the right column?"
             )
-    motion, span = differentiate(record.t, record.measured), smooth_span(len(record.t))
+    motion, span = differentiate(record.t, without_outliers(record.measured)), smooth_span(len(record.t))
     inside = slice(motion.edge, -motion.edge) if len(record.t) > 4 * motion.edge else slice(None)
     v, a, u = (x[inside] for x in (motion.v, motion.a, smooth(record.inputs["u"], span)))
     top = float(np.max(np.abs(v)))
@@ -75,9 +75,9 @@ def rough_axis(record: Record) -> RoughAxis:
     left = float(np.sum((u[moving] - columns @ weights) ** 2))
     if m < 0 and dissipated < 0 and left < _EXPLAINED * (len(columns) - 4) * np.var(u[moving]):
         raise ValueError(
-            f"{record.name}: the force goes against the motion: it is that of a mass of {m:.3g} kg and of friction that"
-            f" drives with {-dissipated:.3g} W. Force and position count in opposite directions: change the sign of one"
-            " of them (on the command line, that of --force-gain)."
+            f"{record.name}: the force goes against the motion: it is that of a mass (or moment of inertia) of {m:.3g}"
+            f" and of friction that drives with {-dissipated:.3g} W. Force and position count in opposite directions:"
+            " change the sign of one of them (on the command line, --units force=-1)."
         )
     scale = float(np.sqrt(np.mean(u**2))) or 1.0
     return RoughAxis(

@@ -105,8 +105,9 @@ class FreeParameters(eqx.Module):
 
     Each has a coordinate x, about 1 in size: a parameter that must be greater than a number is `floor + unit exp(x)`;
     one that may also reach its lower limit is `floor + unit x` with x >= 0, where the limit may be another parameter
-    (Fs >= Fc); one without is `unit x`. So all limits are bounds of x, and one may be reached exactly. A parameter that
-    is not free, but whose limit is, keeps its distance from it: with Fs = Fc at the start, it stays so.
+    (Fs >= Fc); one that is also at most so many times that other is `floor (1 + unit x)`; one without limits is
+    `unit x`. So all limits are bounds of x, and one may be reached exactly. A parameter that is not free, but whose
+    limit is, keeps its distance from it: with Fs = Fc at the start, it stays so.
 
     - `names`: of the free parameters, in the order they were given.
     - `following`: names of the parameters that are not free but follow one that is.
@@ -121,6 +122,7 @@ class FreeParameters(eqx.Module):
     _floors: dict[str, Array]
     _units: dict[str, Array]
     _upper: dict[str, Array]
+    _most: dict[str, Array]
 
     @staticmethod
     def of(
@@ -162,6 +164,17 @@ class FreeParameters(eqx.Module):
             _append_after(name, floors, order)
         strict = {name for name in free if name in ranges and ranges[name].strict}
         upper = {name: ranges[name].upper for name in free if name in ranges and ranges[name].upper is not None}
+        upper |= {
+            name: max(most * values[str(ranges[name].lower)], values[name])
+            for name in free
+            if name in ranges and isinstance(floors[name], float) and (most := ranges[name].most) is not None
+        }
+        # Of a limit that starts at zero there is no multiple. Whoever starts with more is not held back.
+        most = {
+            name: max(most, values[name] / values[base])
+            for name in free
+            if isinstance(base := floors[name], str) and (most := ranges[name].most) is not None and values[base] > 0
+        }
         for name in free:
             _check_start(name, values, floors[name], name in strict, upper.get(name))
         kinds = {
@@ -169,6 +182,8 @@ class FreeParameters(eqx.Module):
             if name in following
             else "line"
             if floors[name] is None
+            else "ratio"
+            if name in most
             else "log"
             if name in strict and isinstance(floors[name], float | int)
             else "above"
@@ -178,7 +193,9 @@ class FreeParameters(eqx.Module):
         units = {name: _unit(kinds[name], values, name, floors[name]) for name in order}
         beside = {each: values[each] for x in floors.values() if isinstance(x, tuple) for each in x}
         start = beside | {name: values[name] for name in order}
-        start |= {name: max(values[name], _base(floors[name], values)) for name in free if kinds[name] == "above"}
+        start |= {
+            name: max(values[name], _base(floors[name], values)) for name in free if kinds[name] in ("above", "ratio")
+        }
         return FreeParameters(
             names=tuple(free),
             following=tuple(following),
@@ -189,6 +206,7 @@ class FreeParameters(eqx.Module):
             _floors={name: jnp.asarray(numeric.get(name, 0.0)) for name in order},
             _units={name: jnp.asarray(x) for name, x in units.items()},
             _upper={name: jnp.asarray(x) for name, x in upper.items()},
+            _most={name: jnp.asarray(x) for name, x in most.items()},
         )
 
     @property
@@ -200,7 +218,7 @@ class FreeParameters(eqx.Module):
     @staticmethod
     def none() -> "FreeParameters":
         """Nothing is free."""
-        return FreeParameters((), (), (), (), (), {}, {}, {}, {})
+        return FreeParameters((), (), (), (), (), {}, {}, {}, {}, {})
 
     def _kind(self, name: str) -> str:
         return self._kinds[self._order.index(name)]
@@ -221,7 +239,8 @@ class FreeParameters(eqx.Module):
                 values[name] = floor + (self.start[name] - start)
                 continue
             here = x[self.names.index(name)]
-            values[name] = floor + self._units[name] * (jnp.exp(here) if kind == "log" else here)
+            over = self._units[name] * (jnp.exp(here) if kind == "log" else here)
+            values[name] = floor * (1.0 + over) if kind == "ratio" else floor + over
         return {name: values[name] for name in self._order}
 
     def coordinates(self, values: Mapping[str, ArrayLike]) -> Float[Array, " free"]:
@@ -229,8 +248,9 @@ class FreeParameters(eqx.Module):
         coordinates: dict[str, Array] = {}
         known = {**self.start, **{name: jnp.asarray(x, float) for name, x in values.items()}}
         for name in self.names:
-            over = (known[name] - self._floor(name, known)) / self._units[name]
-            coordinates[name] = jnp.log(jnp.maximum(over, _LEAST_DISTANCE)) if self._kind(name) == "log" else over
+            floor, kind = self._floor(name, known), self._kind(name)
+            over = (known[name] / floor - 1.0 if kind == "ratio" else known[name] - floor) / self._units[name]
+            coordinates[name] = jnp.log(jnp.maximum(over, _LEAST_DISTANCE)) if kind == "log" else over
         lower, upper = self.bounds
         return jnp.clip(_stack([coordinates[name] for name in self.names]), lower, upper)
 
@@ -242,13 +262,15 @@ class FreeParameters(eqx.Module):
     @property
     def bounds(self) -> tuple[Float[Array, " free"], Float[Array, " free"]]:
         """Lower and upper bounds of x."""
-        least = {"line": -jnp.inf, "log": -_MOST_DECADES, "above": 0.0}
+        least = {"line": -jnp.inf, "log": -_MOST_DECADES, "above": 0.0, "ratio": 0.0}
         lower = _stack([jnp.asarray(least[self._kind(name)], float) for name in self.names])
         upper = []
         for name in self.names:
             if name in self._upper:
                 most = (self._upper[name] - self._floors[name]) / self._units[name]
                 upper.append(jnp.log(most) if self._kind(name) == "log" else most)
+            elif name in self._most:
+                upper.append((self._most[name] - 1.0) / self._units[name])
             else:
                 upper.append(jnp.asarray(_MOST_DECADES if self._kind(name) == "log" else jnp.inf, float))
         return lower, _stack(upper)
@@ -259,10 +281,19 @@ class FreeParameters(eqx.Module):
         return {
             name: (
                 -math.inf if self._kind(name) == "line" else float(self._floor(name, values)),
-                float(self._upper.get(name, math.inf)),
+                float(
+                    self._most[name] * self._floor(name, values)
+                    if name in self._most
+                    else self._upper.get(name, math.inf)
+                ),
             )
             for name in self.names
         }
+
+    def limit_of(self, name: str) -> str | None:
+        """Name of the parameter that is the lower limit of this one, as Fc of Fs."""
+        base = self._bases[self._order.index(name)]
+        return base if isinstance(base, str) else None
 
     def fixed_limits(self, name: str) -> tuple[float, float]:
         """Lower and upper limit of a parameter that are numbers, infinite where they are none."""
@@ -277,7 +308,7 @@ class FreeParameters(eqx.Module):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kind of each coordinate: "line", "above" (a distance from a limit) or "log" (of such a distance)."""
+        """Kind of each coordinate: "line", "above" (a limit), "ratio" (to a limit) or "log" (of a distance from it)."""
         return tuple(self._kind(name) for name in self.names)
 
     def vector(self, x: Float[Array, " free"]) -> Float[Array, " free"]:
@@ -351,4 +382,6 @@ def _unit(kind: str, values: Mapping[str, float], name: str, floor: Floor) -> fl
     if kind == "line":
         return max(abs(value), _LEAST_UNIT) if value else 1.0
     distance = value - _base(floor, values)
+    if kind == "ratio":
+        return distance / _base(floor, values) or 1.0
     return distance if distance > 0 else (abs(value) or 1.0)

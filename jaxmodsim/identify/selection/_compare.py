@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..._core.parameters import ranges_of
 from ...friction import AbstractLaw
 from ...scene import Scene, State, scene_numbers
 from ..data._record import Record, Runs, cut, runs_of
-from ..estimate._initializers import AbstractInitializer, Continuation
+from ..estimate._initializers import AbstractInitializer, Continuation, FromSmaller, last_part
 from ..estimate._prepare import Settings, StartState, measured_start, prepare
 from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
-from ..estimate._search import Progress, SearchOptions, SearchResult, solve
+from ..estimate._search import Progress, SearchOptions, SearchResult, SearchState, solve
 from ..estimate._search import by_channel as residual_by_channel
 from ..model._engines import DELAY
 from ..model._observe import Observable, by_channel, first_coordinate
@@ -25,6 +26,7 @@ from ..model._parameters import split_entries
 from ..uncertainty._fit import fit, fit_law
 from ..uncertainty._result import FitResult
 from ._comparison import Comparison, CrossValidated, Part, comparison_of
+from ._opening import after, begin, counting
 
 # Called after each iteration with the name of the model, the number of the fold that is held back (None: nothing is),
 # the number of the iteration and the root mean square of the residual.
@@ -51,6 +53,17 @@ class Candidate:
     description: str = ""
 
 
+def _from_smaller(free: Sequence[str], judged: Mapping[str, CrossValidated]) -> tuple[AbstractInitializer, ...]:
+    """From the fit of the largest model all of whose parameters are among `free`, by the last parts of their names."""
+    names = {last_part(name) for name in free}
+    fitted = [
+        {last_part(name): jnp.asarray(each.values[name], float) for name in _finished(each.search).problem.free.names}
+        for each, _, _ in judged.values()
+    ]
+    nested = [values for values in fitted if set(values) <= names]
+    return (FromSmaller(max(nested, key=len)),) if nested else ()
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Asked:
     """What `compare` was asked for that is the same for all candidates; see there."""
@@ -70,7 +83,7 @@ class _Asked:
 
     def settings(self, scene: Scene, q0: StartState | None, qd0: StartState | None) -> Settings:
         """As `prepare` wants them, with the limits that are for this scene."""
-        limits = {name: each for name, each in self.limits.items() if name in _names(scene, self.records)}
+        limits = {name: each for name, each in self.limits.items() if _base(name) in _names(scene, self.records)}
         return Settings(
             observe=self.observe,
             q0=q0,
@@ -106,9 +119,13 @@ def compare(
 
     Each record is cut into `folds` windows. In turn one window of each record is held back: the model is fitted to the
     others, every window from a start state (q0, qd0) of its own, then run over the window that was held back with these
-    parameters, for which only the start state is fitted. The states of friction laws where a window begins are those of
-    the fit to whole records. With `hold_out` the model is fitted to `records` and run over the whole of each of those,
-    again with its start state fitted.
+    parameters. Its start is fitted to its first samples, a twentieth and at least 20, and the others are judged. The
+    error with a start that is fitted to all of them stands beside it and judges nothing. The states of friction laws
+    where a window begins are those of the fit to whole records. With `hold_out` the model is fitted to `records`, and
+    run over the whole of each of those in the same way.
+
+    Models are fitted in the order of their numbers of parameters, each also from where the largest one before it ended
+    whose parameters, by the last part of their names, it has all: what is part of it should not fit better.
 
     **Arguments:**
 
@@ -158,11 +175,14 @@ def compare(
         known |= _names(candidate.scene, several)
         # Wrong names show before the first model has taken its time.
         prepare(candidate.scene, several, candidate.free, asked.settings(candidate.scene, q0, qd0))
-    unknown = [name for name in asked.limits if name not in known]
+    unknown = [name for name in asked.limits if _base(name) not in known]
     unknown += [each.name for each in initializers if isinstance(each, Continuation) and each.name not in known]
     if unknown:
         raise ValueError(f"{unknown[0]} is no number of any candidate; there are: {', '.join(sorted(known))}.")
-    judges = {name: partial(_validate_scene, name, candidate, asked) for name, candidate in candidates.items()}
+    judges = {
+        name: partial(_validate_scene, name, candidate, asked)
+        for name, candidate in sorted(candidates.items(), key=lambda item: len(item[1].free or ()))
+    }
     description = {name: candidate.description for name, candidate in candidates.items()}
     by = f"{folds} folds" if not others else ", ".join(record.name for record in others)
     return _compared(judges, description, by)
@@ -201,23 +221,29 @@ def compare_laws(
     _check(laws, folds)
     candidates = {name: x if isinstance(x, Candidate) else Candidate(x, None) for name, x in laws.items()}
 
-    def judge(name: str, candidate: Candidate) -> CrossValidated:
+    own = (initializer,) if isinstance(initializer, AbstractInitializer) else tuple(initializer)
+
+    def judge(name: str, candidate: Candidate, judged: Mapping[str, CrossValidated]) -> CrossValidated:
         law = candidate.scene
         if not isinstance(law, AbstractLaw):
             raise ValueError(f"{name}: compare_laws needs friction laws; for scenes, compare.")
         told = _told(progress, name, None)
         result = fit_law(
-            law, records, candidate.free, loss=loss, initializer=initializer, max_steps=max_steps, progress=told
+            law, records, candidate.free, loss=loss, initializer=(*own, *_from_smaller(tuple(ranges_of(law)), judged)),
+            max_steps=max_steps, progress=told,
         )  # fmt: skip
         search = _finished(result.search)
         problem, held = search.problem, []
         block = _blocks(problem.runs, folds)
         for fold in range(folds):
             options = SearchOptions(_ENOUGH, max_steps, _told(progress, name, fold))
-            held += _held_back(problem, search.state.x, result, block == fold, block, options)
-        return CrossValidated(result, tuple(held))
+            held += _held_back(problem, search.state.x, result, block == fold, block, options)[0]
+        return CrossValidated(result, tuple(held), ())
 
-    judges = {name: partial(judge, name, candidate) for name, candidate in candidates.items()}
+    judges = {
+        name: partial(judge, name, candidate)
+        for name, candidate in sorted(candidates.items(), key=lambda item: len(ranges_of(item[1].scene)))
+    }
     return _compared(judges, {name: each.description for name, each in candidates.items()}, f"{folds} folds")
 
 
@@ -226,6 +252,11 @@ def _check(candidates: Mapping[str, object], folds: int) -> None:
         raise ValueError("There must be one candidate at least.")
     if isinstance(folds, bool) or folds < 2:
         raise ValueError(f"folds must be at least 2, an integer, but {folds!r} was given.")
+
+
+def _base(name: str) -> str:
+    """The number that a limit is for: friction.Fs of "friction.Fs/friction.Fc"."""
+    return name.partition("/")[0]
 
 
 def _names(scene: Scene, records: tuple[Record, ...]) -> set[str]:
@@ -245,14 +276,16 @@ def _told(progress: CompareProgress | None, name: str, fold: int | None) -> Prog
 
 
 def _compared(
-    judges: Mapping[str, Callable[[], CrossValidated]], description: Mapping[str, str], by: str
+    judges: Mapping[str, Callable[[Mapping[str, CrossValidated]], CrossValidated]],
+    description: Mapping[str, str],
+    by: str,
 ) -> Comparison:
-    """All candidates one after the other, whatever becomes of each."""
+    """All candidates one after the other, each told of those before it, whatever becomes of each."""
     judged: dict[str, CrossValidated] = {}
     failures: dict[str, str] = {}
     for name, judge in judges.items():
         try:
-            judged[name] = judge()
+            judged[name] = judge(judged)
         except KeyboardInterrupt:
             if not judged:
                 raise  # nothing is finished
@@ -273,13 +306,16 @@ def _finished(search: SearchResult | None) -> SearchResult:
     return search
 
 
-def _validate_scene(name: str, candidate: Candidate, asked: _Asked) -> CrossValidated:
+def _validate_scene(
+    name: str, candidate: Candidate, asked: _Asked, judged: Mapping[str, CrossValidated]
+) -> CrossValidated:
     """The fit to everything, then what each held-back part makes of a fit without it."""
     scene, free = candidate.scene, candidate.free
     assert isinstance(scene, Scene)
     assert free is not None
     numbers = _names(scene, asked.records)
     settings = asked.settings(scene, asked.q0, asked.qd0)
+    own = [each for each in asked.initializer if not isinstance(each, Continuation) or each.name in numbers]
     result = fit(
         scene,
         asked.records,
@@ -289,7 +325,7 @@ def _validate_scene(name: str, candidate: Candidate, asked: _Asked) -> CrossVali
         qd0=asked.qd0,
         limits=settings.limits,
         loss=asked.loss,
-        initializer=[each for each in asked.initializer if not isinstance(each, Continuation) or each.name in numbers],
+        initializer=[*own, *_from_smaller(free, judged)],
         substeps=asked.substeps,
         max_steps=asked.max_steps,
         progress=_told(asked.progress, name, None),
@@ -299,16 +335,18 @@ def _validate_scene(name: str, candidate: Candidate, asked: _Asked) -> CrossVali
         problem = _apart(scene, asked.hold_out, _measured_starts(search, asked), search, asked)
         block = _blocks(problem.runs, asked.folds)
         x = _at(problem, search)
-        return CrossValidated(result, tuple(_evaluated(problem, x, result, block, asked.options(name, 0))))
+        return CrossValidated(result, *_evaluated(problem, x, result, block, asked.options(name, 0)))
     windows = [each for record in asked.records for each in record.windows(_span(record) / asked.folds)]
     problem = _apart(scene, tuple(windows), _reached(search, asked.records, asked.folds), search, asked)
     fold = np.arange(problem.count) % asked.folds
     block = np.broadcast_to(fold[:, None], problem.runs.t.shape)
     everything = _finished(solve(problem, _at(problem, search), asked.options(name, None)))
-    held: list[Part] = []
-    for k in range(asked.folds):
-        held += _held_back(problem, everything.state.x, result, block == k, block, asked.options(name, k))
-    return CrossValidated(result, tuple(held))
+    parts = [
+        _held_back(problem, everything.state.x, result, block == k, block, asked.options(name, k))
+        for k in range(asked.folds)
+    ]
+    held, fitted = zip(*parts, strict=True)
+    return CrossValidated(result, sum(held, ()), sum(fitted, ()))
 
 
 def _held_back(
@@ -318,10 +356,10 @@ def _held_back(
     mask: np.ndarray,
     block: Int[np.ndarray, "runs samples"],
     options: SearchOptions,
-) -> list[Part]:
-    """Fit from `x` without the samples in the mask; what is left of these."""
-    fitted = _finished(solve(_counting(problem, ~mask), x, options)).state.x
-    return _evaluated(_counting(problem, mask), fitted, result, block, options)
+) -> tuple[tuple[Part, ...], tuple[Part, ...]]:
+    """Fit from `x` without the samples in the mask; what is left of these, as `_evaluated` gives it."""
+    fitted = _finished(solve(counting(problem, ~mask), x, options)).state.x
+    return _evaluated(counting(problem, mask), fitted, result, block, options)
 
 
 def _evaluated(
@@ -330,20 +368,19 @@ def _evaluated(
     result: FitResult,
     block: Int[np.ndarray, "runs samples"],
     options: SearchOptions,
-) -> list[Part]:
-    """Residual of the samples that count with the parameters at `x` and the start states that fit best."""
-    search = _finished(solve(_pinned(problem, x, result), x, options))
-    return _parts(search, block)
+) -> tuple[tuple[Part, ...], tuple[Part, ...]]:
+    """Residual with the parameters at `x`, from starts that the first samples show, and from starts fitted to all.
 
-
-def _counting(problem: FitProblem, mask: np.ndarray) -> FitProblem:
-    """The problem in which only the samples in the mask count, and slip instants of runs that have any."""
-    runs, own = problem.runs, np.any(mask, axis=1, keepdims=True)
-    runs = runs._replace(
-        weight={name: jnp.where(mask, weight, 0.0) for name, weight in runs.weight.items()},
-        slip_weight={name: jnp.where(own, weight, 0.0) for name, weight in runs.slip_weight.items()},
-    )
-    return eqx.tree_at(lambda p: p.runs, problem, runs)
+    Of the samples that count; behind the first ones, where there are starts.
+    """
+    pinned = _pinned(problem, x, result)
+    if not problem.local:
+        search = _finished(solve(pinned, x, options))
+        return _parts(search.problem, search.state, block), ()
+    shown = _finished(begin(pinned, x, options)).state.x
+    best = _finished(solve(pinned, shown, options)).state.x
+    held, fitted = (_parts(*after(pinned, each, options), block) for each in (shown, best))
+    return held, fitted
 
 
 def _pinned(problem: FitProblem, x: Float[Array, " n"], result: FitResult) -> FitProblem:
@@ -360,10 +397,10 @@ def _pinned(problem: FitProblem, x: Float[Array, " n"], result: FitResult) -> Fi
     return eqx.tree_at(lambda p: p.prior, problem, Prior(mean, jnp.asarray(weight, mean.dtype)))
 
 
-def _parts(search: SearchResult, block: Int[np.ndarray, "runs samples"]) -> list[Part]:
+def _parts(problem: FitProblem, state: SearchState, block: Int[np.ndarray, "runs samples"]) -> tuple[Part, ...]:
     """Residuals in the units of their channels, for each run and block that has samples that count."""
-    problem, parts = search.problem, {}
-    for name, (residual, weight) in residual_by_channel(problem, search.state.residual).items():
+    parts: dict[tuple[int, int], Part] = {}
+    for name, (residual, weight) in residual_by_channel(problem, state.residual).items():
         level = float(problem.noise[name])
         # Slip instants all go with the first sample of their run.
         number = block if block.shape == weight.shape else np.broadcast_to(block[:, :1], weight.shape)
@@ -371,7 +408,7 @@ def _parts(search: SearchResult, block: Int[np.ndarray, "runs samples"]) -> list
             for k in np.unique(number[run][weight[run] > 0]):
                 chosen = (number[run] == k) & (weight[run] > 0)
                 parts.setdefault((run, int(k)), {})[name] = level * residual[run, chosen]
-    return list(parts.values())
+    return tuple(parts.values())
 
 
 def _blocks(runs: Runs, folds: int) -> Int[np.ndarray, "runs samples"]:

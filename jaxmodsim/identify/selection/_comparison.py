@@ -78,10 +78,11 @@ def correlation_time(series: Float[np.ndarray, " samples"]) -> float:
 
 
 class CrossValidated(NamedTuple):
-    """A fit, and the residuals of what was held back from it."""
+    """A fit, and the residuals of what was held back from it; those with starts fitted to it, where there are any."""
 
     result: FitResult
     held: tuple[Part, ...]
+    start_fitted: tuple[Part, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +90,9 @@ class Ranked:
     """One model of a comparison.
 
     - `name`, `description`: what it is. `parameters`: number of all that was fitted, initial states included.
-    - `held_back`, `error`: root mean square error on what was held back, and its standard error.
+    - `held_back`, `error`: root mean square error on what was held back, and its standard error; nothing but
+      the start of each part was fitted to it, and that to its first samples. `start_fitted`: the error with starts
+      fitted to all of each part; None for laws, which have none.
     - `parts`: the root mean square errors of the parts that were held back, shape `[parts]`.
     - `over`, `over_error`: how much more than the best model's error it is, and the standard error of this difference,
       from the differences in each part.
@@ -107,6 +110,7 @@ class Ranked:
     parts: Float[np.ndarray, " parts"]
     over: float
     over_error: float
+    start_fitted: float | None
     fitted: float
     takeuchi: float
     bic: float
@@ -194,6 +198,7 @@ class Comparison:
                 "parts": each.parts.tolist(),
                 "over_the_best": each.over,
                 "over_the_best_standard_error": each.over_error,
+                "start_fitted": each.start_fitted,
                 "fitted": each.fitted,
                 "takeuchi": each.takeuchi,
                 "bic": each.bic,
@@ -241,13 +246,15 @@ class Comparison:
         """A ranked table that ends with the conclusion."""
         width = max(len(str(row["name"])) for row in self.table)
         lines = [
-            f"{'':{width}}  {'param.':>6}  {'held back':>10}  {'std. error':>10}  {'over the best':>21}  {'fitted':>10}"
+            f"{'':{width}}  {'param.':>6}  {'held back':>10}  {'std. error':>10}  {'over the best':>21}"
+            f"  {'start fitted':>12}  {'all fitted':>10}"
             f"  {'Takeuchi':>9}  {'BIC':>9}"
         ]
         for each in self.ranked:
             over = "" if each is self.ranked[0] else f"{each.over:10.3g} +- {each.over_error:7.2g}"
             lines.append(
                 f"{each.name:{width}}  {each.parameters:6d}  {each.held_back:10.4g}  {each.error:10.2g}  {over:>21}"
+                f"  {'' if each.start_fitted is None else f'{each.start_fitted:.4g}':>12}"
                 f"  {each.fitted:10.4g}  {each.takeuchi:9.1f}  {each.bic:9.1f}"
             )
         lines += [f"{each.name}: the records do not determine {', '.join(each.undetermined)}." for each in self.ranked
@@ -326,6 +333,7 @@ def comparison_of(
                 parts=np.sqrt(losses[name]),
                 over=float(held_back - least),
                 over_error=float(_standard_error(losses[name] - losses[best], count) / together) if together else 0.0,
+                start_fitted=_mean_root(kept[name].start_fitted, searches[name].problem.loss, levels),
                 fitted=fitted[name],
                 takeuchi=float(takeuchi[name] - min(takeuchi.values())),
                 bic=float(bic[name] - min(bic.values())),
@@ -364,6 +372,12 @@ def _fitted(search: SearchResult) -> Part:
 def _losses(parts: tuple[Part, ...], loss: AbstractLoss, levels: Mapping[str, float]) -> Float[np.ndarray, " parts"]:
     """Mean loss of each part, in the squared unit of the channel if there is one."""
     return np.array([_root(part, loss, levels) ** 2 for part in parts])
+
+
+def _mean_root(parts: tuple[Part, ...], loss: AbstractLoss, levels: Mapping[str, float]) -> float | None:
+    """Root of the mean loss of all parts; None of none."""
+    count = [sum(len(x) for x in part.values()) for part in parts]
+    return float(np.sqrt(np.average(_losses(parts, loss, levels), weights=count))) if parts else None
 
 
 def _root(part: Part, loss: AbstractLoss, levels: Mapping[str, float]) -> float:

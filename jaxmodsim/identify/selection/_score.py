@@ -8,18 +8,21 @@ from typing import TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ...scene import Scene, State
 from ..data._record import Record, cut, runs_of
 from ..estimate._prepare import measured_start
 from ..estimate._problem import FitProblem, Prior, SquaredLoss
-from ..estimate._search import SearchOptions, by_channel, channels_seen, solve
+from ..estimate._search import SearchOptions, channels_seen, solve
 from ..model._engines import DELAY, EventEngine, ReplayEngine
 from ..model._parameters import FreeParameters
 from ..uncertainty._result import FitResult
+from ._opening import begin, opening
 
 _Start: TypeAlias = ArrayLike | Sequence[ArrayLike] | None
+# Standard errors beyond which a fitted start is no longer what was measured.
+_FAR = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,11 +30,12 @@ class Score:
     """How a fitted model does on a record.
 
     - `record`: the record. `outputs`: the model's output at its times, by channel.
-    - `rmse`: root mean square of output less measured value, by channel, in its unit.
+    - `rmse`: root mean square of output less measured value, by channel, in its unit, over the samples that did not
+      show the start.
     - `fit`: `100 (1 - rmse/standard deviation of the channel)` [%], by channel: 100 is perfect, 0 no better than the
       mean.
     - `q0`, `qd0`: coordinates and velocities at the first sample, shape `[dof]`; None for a law by itself.
-    - `ending`: how the search of the initial state ended; None where nothing was searched.
+    - `start_fitted`: the same samples with a start that is fitted to all of the record; None for a law by itself.
     """
 
     record: Record
@@ -40,7 +44,7 @@ class Score:
     fit: dict[str, float]
     q0: Float[np.ndarray, " dof"] | None
     qd0: Float[np.ndarray, " dof"] | None
-    ending: str | None
+    start_fitted: "StartFitted | None" = None
 
     @property
     def residuals(self) -> dict[str, Float[np.ndarray, " samples"]]:
@@ -51,25 +55,54 @@ class Score:
         """A line for each channel."""
         lines = [f"{self.record.name}:"]
         lines += [f"  {name}: RMSE {x:.6g}, fit {self.fit[name]:.2f} %" for name, x in self.rmse.items()]
-        if self.ending is not None:
-            lines.append(f"  initial state fitted: q0 = {self.q0}, qd0 = {self.qd0}; {self.ending}")
-        return "\n".join(lines)
+        if self.start_fitted is not None:
+            lines += [
+                f"  {name}: RMSE {x:.6g} with a start fitted to all of it" for name, x in self.start_fitted.rmse.items()
+            ]
+        return "\n".join(lines + [f"  {each}" for each in self.remarks])
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on a fitted start that the first samples contradict: it has taken up an error of the model."""
+        away = {} if self.start_fitted is None else self.start_fitted.away
+        return tuple(
+            f"Fitted to all of {self.record.name}, {name} moves by {abs(x):.3g} standard errors from what its first"
+            " samples show: the start takes up an error of the model."
+            for name, x in away.items()
+            if abs(x) > _FAR
+        )
 
 
-def score(
-    result: FitResult, record: Record, *, q0: _Start = None, qd0: _Start = None, free_start: bool = True
-) -> Score:
-    """Run a fitted model on another record, with nothing fitted but its initial state.
+@dataclass(frozen=True, kw_only=True)
+class StartFitted:
+    """What becomes of a record if the state at its first sample is fitted to all of its samples.
+
+    - `rmse`: by channel, as in `Score`. `q0`, `qd0`: the state, shape `[dof]`. `ending`: how the search ended.
+    - `away`: how far each number of it, such as `q0[0]`, is from what the first samples show, in standard errors of
+      these; those that they do not show are left out.
+    """
+
+    rmse: dict[str, float]
+    q0: Float[np.ndarray, " dof"]
+    qd0: Float[np.ndarray, " dof"]
+    away: dict[str, float]
+    ending: str
+
+
+def score(result: FitResult, record: Record, *, q0: _Start = None, qd0: _Start = None) -> Score:
+    """Run a fitted model on another record, to which nothing is fitted but where it starts.
+
+    The start is fitted to the first samples alone, a twentieth and at least 20, which do not count after that. Beside
+    the error stands the one with a start fitted to all samples: smaller, as it takes up a part of what the model does
+    wrong.
 
     **Arguments:**
 
     - `result`: a fit that was not loaded from a file.
     - `record`: with the inputs, and some of the channels, of the records that were fitted. Better a part of the
       measurement that the fit has not seen.
-    - `q0`, `qd0`: state at the first sample, shape `[dof]`; by default what the record's beginning shows of each
-      coordinate that was measured, the others 0.
-    - `free_start`: whether the state at the first sample is fitted to this record, from `q0` and `qd0`. If not, it
-      is as given, by default the first measured position and rest. A law by itself starts unloaded at rest always.
+    - `q0`, `qd0`: state at the first sample, shape `[dof]`, where it is known: both or none. All samples count then.
+      A law by itself starts unloaded at rest always.
 
     **Returns:**
 
@@ -78,26 +111,41 @@ def score(
     **Raises:**
 
     - `ValueError` for channels or inputs that the fit does not know, or of a result that was loaded.
+    - `RuntimeError` where the model gives values that are not finite.
     """
     search = result.search
     if search is None:
         raise ValueError("A score needs what the fit observed, which a loaded result does not have: fit again.")
     problem = search.problem
     _check(record, problem)
+    if (q0 is None) != (qd0 is None):
+        raise ValueError("A start has positions and velocities: give q0 and qd0, or neither.")
     if not isinstance(problem.engine, ReplayEngine | EventEngine):
         values, _ = problem.split(search.state.x)
         fixed = dataclasses.replace(problem, runs=runs_of((_bare(record),), cut((record,), None)))
-        return _scored(record, channels_seen(fixed, values), None, None)
-    alone = _alone(result, problem, record, (q0, qd0), free_start)
-    if not free_start:
-        assert alone.base is not None
-        return _scored(record, channels_seen(alone, alone.x0), alone.base, None)
-    start = solve(alone, alone.x0, SearchOptions())
-    outputs = {
-        name: (record.channels[name] + float(alone.noise[name]) * residual[0])[None]
-        for name, (residual, _) in by_channel(alone, start.state.residual).items()
-    }
-    return _scored(record, outputs, alone.starts(start.state.x), start.ending)
+        return _scored(record, channels_seen(fixed, values), np.ones(len(record.t), bool), None)
+    alone = _alone(result, problem, record, (q0, qd0))
+    counts, x, errors = np.ones(len(record.t), bool), alone.x0, np.full(len(alone.local), np.inf)
+    if q0 is None:
+        counts, shown = ~opening(alone.runs)[0, : len(record.t)], begin(alone, x, SearchOptions())
+        x, errors = shown.state.x, _errors(np.asarray(shown.state.jacobian))
+    found = _scored(record, channels_seen(alone, x), counts, alone.starts(x))
+    best = solve(alone, x, SearchOptions())
+    start = _scored(record, channels_seen(alone, best.state.x), counts, alone.starts(best.state.x))
+    moved = np.asarray(best.state.x - x)
+    away = {name: float(d / e) for name, d, e in zip(alone.local, moved, errors, strict=True) if np.isfinite(e)}
+    assert start.q0 is not None
+    assert start.qd0 is not None
+    fitted = StartFitted(rmse=start.rmse, q0=start.q0, qd0=start.qd0, away=away, ending=best.ending)
+    return dataclasses.replace(found, start_fitted=fitted)
+
+
+def _errors(jacobian: Float[np.ndarray, "rows local"]) -> Float[np.ndarray, " local"]:
+    """Standard errors of a start from the Jacobian of its residual; infinite of numbers without effect."""
+    size = np.linalg.norm(jacobian, axis=0)
+    scaled = jacobian / np.where(size > 0, size, 1.0)
+    error = np.sqrt(np.diag(np.linalg.pinv(scaled.T @ scaled, rcond=1e-12, hermitian=True)))
+    return np.where(size > 0, error / np.where(size > 0, size, 1.0), np.inf)
 
 
 def _check(record: Record, problem: FitProblem) -> None:
@@ -123,7 +171,6 @@ def _alone(
     old: FitProblem,
     record: Record,
     given: tuple[ArrayLike | Sequence[ArrayLike] | None, ...],
-    free_start: bool,
 ) -> FitProblem:
     """The fitted model with nothing free but the initial state."""
     scene, engine, first = result.model, old.engine, old.base
@@ -137,12 +184,12 @@ def _alone(
     if isinstance(engine, EventEngine):
         engine = dataclasses.replace(engine, slips=())
     dof = first.q.shape[-1]
-    guessed = measured_start(record, observables, dof, exact=not free_start)
+    guessed = measured_start(record, observables, dof, exact=False)
     start = [_given(x, guess, dof, name) for x, guess, name in zip(given, guessed, ("q0", "qd0"), strict=True)]
     q, qd = (jnp.asarray(x, float)[None] for x in start)
     z = scene.initial_state(q[0])
     base = State(q, qd, jax.tree.map(lambda x: jnp.asarray(x)[None], z))
-    local = tuple(f"{x}[{i}]" for x in ("q0", "qd0") for i in range(dof)) if free_start else ()
+    local = tuple(f"{x}[{i}]" for x in ("q0", "qd0") for i in range(dof))
     return FitProblem(
         engine,
         FreeParameters.none(),
@@ -165,11 +212,17 @@ def _given(given: _Start, guess: np.ndarray, dof: int, name: str) -> np.ndarray:
 
 
 def _scored(
-    record: Record, outputs: Mapping[str, Array | np.ndarray], start: State | None, ending: str | None
+    record: Record, outputs: Mapping[str, Array], counts: Bool[np.ndarray, " samples"], start: State | None
 ) -> Score:
     seen = {name: np.asarray(outputs[name], float)[0] for name in record.channels}
-    rmse = {name: float(np.sqrt(np.mean((x - record.channels[name]) ** 2))) for name, x in seen.items()}
+    rmse = {name: float(np.sqrt(np.mean((x - record.channels[name])[counts] ** 2))) for name, x in seen.items()}
+    for name, x in rmse.items():
+        if not np.isfinite(x):
+            raise RuntimeError(
+                f"{record.name}: the model gives values of {name} that are not finite. Check the units and the"
+                " start of the record, or fit with more substeps."
+            )
     changes = {name: float(np.std(x)) for name, x in record.channels.items()}
     fit = {name: 100 * (1 - rmse[name] / changes[name]) if changes[name] else float("nan") for name in seen}
     q0, qd0 = (None, None) if start is None else (np.asarray(start.q[0]), np.asarray(start.qd[0]))
-    return Score(record=record, outputs=seen, rmse=rmse, fit=fit, q0=q0, qd0=qd0, ending=ending)
+    return Score(record=record, outputs=seen, rmse=rmse, fit=fit, q0=q0, qd0=qd0)

@@ -13,7 +13,8 @@ from ..._core.parameters import Range
 from ..._core.state_dependent import is_state_dependent
 from ...friction import AbstractLaw
 from ...scene import Scene, scene_numbers, scene_ranges
-from ..data._record import Record, Windows, cut, runs_of
+from ..data._clock import sampling_gaps
+from ..data._record import Record, Windows, cut, outliers, runs_of
 from ..estimate._initializers import AbstractInitializer, run_initializers
 from ..estimate._prepare import MultipleShooting, Settings, StartState, prepare, step_error
 from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
@@ -77,7 +78,8 @@ def fit(
       of each coordinate that was measured, the others 0, and rest. `jaxmodsim.identify.start_state` estimates one.
     - `delay`: by how much inputs come later than recorded [s], >= 0; where they start if they are free.
     - `limits`: lower and upper limits of numbers beyond the declared ones, None for none: `{"m": (0.0, 5.0)}`. A lower
-      limit of 0 is excluded.
+      limit of 0 is excluded. A fit looks for Fs up to 5 Fc, or the ratio it starts with;
+      `{"friction.Fs/friction.Fc": (None, 8.0)}` says another limit of such a ratio, None for none.
     - `passive`: names of the friction effects with a LuGre law that has to be passive, `sigma2 >= sigma1 (Fs - Fc)/Fc`;
       their sigma2 must be free.
     - `prior`: what was known before: mean and standard deviation by name, `{"m": (95.0, 5.0)}`.
@@ -303,11 +305,35 @@ def _issues(
 ) -> tuple[IdentifiabilityIssue, ...]:
     """Causes in the motion for what the figures call uncertain."""
     uncertain, model, base = uncertain_of(estimate), provenance.model, search.problem.base
+    of_samples = _sample_issues(provenance.records, isinstance(search.problem.loss, SquaredLoss))
     if not uncertain or not isinstance(model, Scene | AbstractLaw):
-        return ()
+        return of_samples
     dof = 1 if base is None else base.q.shape[-1]
     free = search.problem.free.names
-    return identifiability_issues(model, provenance.motions, dof, provenance.numbers, free, uncertain)
+    issues = identifiability_issues(model, provenance.motions, dof, provenance.numbers, free, uncertain)
+    return (*of_samples, *issues)
+
+
+def _sample_issues(records: tuple[Record, ...], squares: bool) -> tuple[IdentifiabilityIssue, ...]:
+    """Samples that are missing, and ones that stand out where nothing gives them less weight."""
+    issues = []
+    for record in records:
+        gaps = sampling_gaps(record)
+        if gaps and record.inputs:
+            k = gaps[0]
+            more = f", and {len(gaps) - 1} times more" if len(gaps) > 1 else ""
+            issues.append(
+                f"{record.name}: samples are missing from {record.t[k]:g} to {record.t[k + 1]:g} s{more}. Inputs are"
+                " held or interpolated over it, which they hardly were: cut the record there (Record.part)."
+            )
+        for channel, x in record.channels.items() if squares else ():
+            count = int(np.count_nonzero(outliers(x)))
+            if count:
+                issues.append(
+                    f"{record.name}: {count} of {x.size} samples of {channel} stand far out from their neighbours. A"
+                    " robust loss, Huber() or Cauchy(), gives them less weight (on the command line --loss huber)."
+                )
+    return tuple(IdentifiabilityIssue(sentence, ()) for sentence in issues)
 
 
 def _first_states(search: SearchResult) -> np.ndarray:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._core.files import jsonable, written_whole
+from ..._core.readable import AbstractReadable, Table, table_of
 from ..data._record import Record
 from ..estimate._search import ENDINGS, SearchResult
 from ..model._parameters import with_numbers
@@ -37,8 +38,8 @@ _PARTS = {"estimate": ParameterEstimate, "diagnostics": FitDiagnostics, "provena
 _LEFT_OUT = ("model",)
 
 
-@dataclass(frozen=True, kw_only=True)
-class FitResult:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class FitResult(AbstractReadable):
     """A fitted model.
 
     - `estimate`: parameters with their covariance. `diagnostics`: how the fit went. `provenance`: records and model.
@@ -182,6 +183,22 @@ class FitResult:
         ending = f"RMSE {errors}; {self.diagnostics.evaluations} evaluations, {self.diagnostics.ending}"
         return "\n".join([*lines, ending, *remarks(self)])
 
+    __repr__ = __str__
+
+
+@table_of.register
+def _(result: FitResult) -> Table:
+    intervals = result.estimate.intervals()
+    rows = []
+    for name, value, error, _, unit in result.estimate.rows():
+        low, high = intervals[name]
+        label = f"{name} [{unit}]" if unit else name
+        rows.append((label, f"{value:.6g}", f"{error:.2g}", f"{low:.5g} to {high:.5g}"))
+    errors = ", ".join(f"{name} {x:.6g}" for name, x in result.diagnostics.rmse.items())
+    names = ", ".join(record.name for record in result.provenance.records)
+    head = ("parameter", "value", "standard error", "95 % interval")
+    return Table(f"Fit to {names}, RMSE {errors}", head, rows, (result.diagnostics.ending, *remarks(result)))
+
 
 def remarks(result: FitResult) -> tuple[str, ...]:
     """What the records of a fit cannot tell, in sentences: what spoils the figures, what is not determined, and why.
@@ -216,6 +233,16 @@ def remarks(result: FitResult) -> tuple[str, ...]:
     return tuple(sentences)
 
 
+def step_shows(result: FitResult) -> bool:
+    """Whether the integration steps between samples are so few that they show beside what the model misses."""
+    return _step_shows(result.diagnostics)
+
+
+def _step_shows(diagnostics: FitDiagnostics) -> bool:
+    errors, moved = list(diagnostics.rmse.values()), diagnostics.step_error
+    return moved is not None and len(errors) == 1 and moved > _STEP_SHOWS * errors[0]
+
+
 def uncertain_of(estimate: ParameterEstimate) -> dict[str, tuple[str, ...]]:
     """Parameters that are not well known, each with those that it is hardly told apart from."""
     pairs, errors, uncertain = _alike(estimate), estimate.errors, {}
@@ -230,11 +257,10 @@ def _of_the_search(diagnostics: FitDiagnostics, records: tuple[Record, ...]) -> 
     sentences = []
     if diagnostics.ending not in ENDINGS.values():
         sentences.append(f"The search {diagnostics.ending}: do not trust the standard errors.")
-    errors, moved = list(diagnostics.rmse.values()), diagnostics.step_error
-    if moved is not None and len(errors) == 1 and moved > _STEP_SHOWS * errors[0]:
+    if _step_shows(diagnostics):
         sentences.append(
-            f"The integration step shows: with four times as many the output moves by {moved:.2g} (root mean square)"
-            f" against an RMSE of {errors[0]:.2g}. Raise substeps."
+            f"The integration step shows: with four times as many the output moves by {diagnostics.step_error:.2g}"
+            f" (root mean square) against an RMSE of {next(iter(diagnostics.rmse.values())):.2g}. Raise substeps."
         )
     for channel, rmse in diagnostics.rmse.items():
         columns = [record.channels[channel] for record in records if channel in record.channels]

@@ -14,6 +14,7 @@ from ..._core.fusion import fusion_barrier, opaque_one
 from .._projected import projected
 from .._wrapper import AbstractSolverWrapper
 from ._guard_scan import GuardScan, first_root, scan_guards
+from ._passage import LATITUDE, Landed, pass_event
 from ._policy import AbstractGuardPolicy, Conditions, Crossings
 from ._samples import Landing, SampledJumps, on_jump
 from ._state import ACCUMULATION, ONGOING, TOO_MANY, EventLog, EventMemory, EventState, write
@@ -21,8 +22,6 @@ from ._state import ACCUMULATION, ONGOING, TOO_MANY, EventLog, EventMemory, Even
 # How far beside the root a step may end, as a fraction of the last steps; from there the state is carried to the root,
 # with an error of the third power of that distance.
 _LANDING = 1e-5
-# What the step and the jump measure of the way to a root may differ by this factor.
-_LATITUDE = 4.0
 # A step this much shorter than the last ones has no length.
 _SHORT = 1e-6
 # Events accumulate where the longest of the last intervals is below this part of the time since the start, times the
@@ -339,6 +338,12 @@ class EventSolver(AbstractSolverWrapper):
             fired, first, missed, landed, landed, self._policy.next_end(root, missed, (behind, divisor)), near
         )
 
+    def _guard_rates(self, t: Array, state: EventState, slope: PyTree, args: PyTree) -> Float[Array, " guards"]:
+        """Along the motion; constant, so that nothing of them is differentiated."""
+        t, state, slope, args = _held((t, state, slope, args))
+        along = jnp.ones_like(t), slope
+        return jax.jvp(lambda t, y: self._guards(t, state._replace(y=y), args), (t, state.y), along)[1]
+
     def _jump(
         self,
         terms: PyTree,
@@ -348,49 +353,50 @@ class EventSolver(AbstractSolverWrapper):
         times: tuple[Array, Array],
         sides: tuple[PyTree, PyTree],
     ) -> EventState:
-        """Carry the state to the root of the first guard, reset it there, and carry it back to `t`.
-
-        The way to the root is zero but for the error of the landing; its derivatives are those of the time of the
-        event, to second order, so that those of the result are exact.
-        """
+        """Carry the state to the root of the first guard, reset it there, and carry it back to `t`."""
         (near, begin), (args, whole), (fired, first) = times, sides, landing[:2]
         memory = state.memory
-        unit = opaque_one(begin)
+        # After the event arguments are those of the step that begins there.
+        new_args = whole if self.samples is None else self.samples.freeze_args(t, whole)
 
-        def field(t: Any, state: EventState, args: PyTree = args) -> PyTree:
-            return terms.vf(t, state, args).y
+        def evaluate(t: Array, y: PyTree, mode: PyTree, args: PyTree) -> tuple[PyTree, Array]:
+            here = state._replace(y=y, mode=mode)
+            return terms.vf(t, here, args).y, self._guards(t, here, args)
 
-        def guard(t: Any, y: PyTree) -> Array:
-            return jnp.sum(jnp.where(first, self._guards(t, state._replace(y=y), args), 0.0))
+        held = _held((t, state, args))
+        rates = self._guard_rates(t, state, terms.vf(*held).y, args)
+        rate = jnp.sum(jnp.where(first, rates, 0.0))
+        rate = jnp.where(rate == 0, 1.0, rate)
 
-        way, rate, before = _to_root(field, guard, t, state, near)
-        t_event, before = t + way, before._replace(y=fusion_barrier(before.y, unit))
-        since = t_event - state.t
-        spread = _constant(jnp.where(memory.resets == 0, since, jnp.maximum(since, _FORGET * memory.spread)))
-        dense = _accumulates(spread, _constant(t_event), begin) & (memory.resets >= _FEWEST)
+        def spread_at(t_event: Array) -> tuple[Array, Bool[Array, ""]]:
+            """The longest of the last intervals between events, and whether they accumulate."""
+            since = t_event - state.t
+            spread = _constant(jnp.where(memory.resets == 0, since, jnp.maximum(since, _FORGET * memory.spread)))
+            return spread, _accumulates(spread, _constant(t_event), begin) & (memory.resets >= _FEWEST)
 
-        after = self.reset(t_event, before, whole, fired)
+        def reset(t_event: Array, y: PyTree) -> tuple[PyTree, PyTree]:
+            before = state._replace(y=y)
+            after = self.reset(t_event, before, whole, fired)
+            if self.on_zeno is not None:
+                held, dense = self.on_zeno(t_event, before, whole, fired), spread_at(t_event)[1]
+                after = jtu.tree_map(lambda a, b: jnp.where(dense, a, b), held, after)
+            return after.y, after.mode
+
+        landed = Landed(t, state.y, state.mode, first, rate, memory.landed > 0.5, near, state.t)
+        passage = pass_event(landed, evaluate, (args, new_args), reset)
+        t_event, values, (y, mode, slope) = passage.t, passage.guards, passage.after
+        spread, dense = spread_at(t_event)
         status = jnp.where(dense, jnp.asarray(ACCUMULATION, spread.dtype), ONGOING)
         if self.on_zeno is not None:
-            held = self.on_zeno(t_event, before, whole, fired)
-            after = jtu.tree_map(lambda a, b: jnp.where(dense, a, b), held, after)
             status = jnp.zeros_like(spread)
-        after = after._replace(y=fusion_barrier(after.y, unit), mode=fusion_barrier(after.mode, unit))
         # A reset that changes nothing is no event.
-        happened = _differ((before.y, before.mode), (after.y, after.mode))
+        happened = _differ((passage.before, state.mode), (y, mode))
         events, index = jnp.where(happened, state.events + 1.0, state.events), jnp.where(happened, state.events, -1.0)
         status = jnp.where((status == ONGOING) & (events > self.max_events), TOO_MANY, status)
-
-        halfway = after._replace(y=_along(after.y, -0.5 * way, field(t_event, after, whole)))
-        middle = field(t_event - 0.5 * way, halfway, whole)
-        end = after._replace(y=fusion_barrier(_along(after.y, -way, middle), unit))
-        values = self._guards(*_held((t, end, whole)))
-        clear = _constant(values) > jnp.where(fired, _LATITUDE * jnp.abs(rate) * near, 0.0)
+        clear = _constant(values) > jnp.where(fired, LATITUDE * jnp.abs(rate) * near, 0.0)
 
         def rises() -> Bool[Array, " guards"]:
-            ahead = jnp.ones_like(t_event), field(t_event, after, whole)
-            _, rise = jax.jvp(lambda t, y: self._guards(t, after._replace(y=y), whole), (t_event, after.y), ahead)
-            return _constant(rise) > 0
+            return self._guard_rates(t_event, state._replace(y=y, mode=mode), slope, new_args) > 0
 
         armed = self._policy.armed_after(clear, fired, memory.armed > 0.5, rises)
         if self.on_zeno is not None:
@@ -398,56 +404,24 @@ class EventSolver(AbstractSolverWrapper):
         flags = _flags(fired, values)
         log = state.log
         if log is not None:
-            entry = EventLog(t_event, flags, (before.y, before.mode), (after.y, after.mode))
+            entry = EventLog(t_event, flags, (passage.before, state.mode), (y, mode))
             log = jtu.tree_map(lambda a, b: write(a, index, b), log, entry)
+        after = memory._replace(guard=_constant(values), armed=_flags(armed, values))
         after_reset = state._replace(
-            y=end.y,
-            mode=end.mode,
+            y=passage.y,
+            mode=mode,
             t=t_event,
             events=events,
             status=status,
             fired=flags,
             log=log,
-            memory=memory._replace(
-                guard=_constant(values), armed=_flags(armed, values), resets=memory.resets + 1.0, spread=spread
-            ),
+            memory=after._replace(resets=memory.resets + 1.0, spread=spread),
         )
         if self.samples is None or self.samples.times is None:
             return after_reset
         # Samples at which nothing happens say nothing of whether events accumulate.
-        passed = state._replace(
-            y=end.y, memory=memory._replace(guard=after_reset.memory.guard, armed=after_reset.memory.armed)
-        )
+        passed = state._replace(y=passage.y, memory=after)
         return jtu.tree_map(lambda a, b: jnp.where(happened | jnp.any(fired), a, b), after_reset, passed)
-
-
-def _to_root(
-    field: Callable[..., Any], guard: Callable[..., Array], t: Any, state: EventState, near: Array
-) -> tuple[Array, Array, EventState]:
-    """The time from `t` to the root of `guard`, the rate of the guard, and the state at the root.
-
-    Two Newton steps with one rate on a flow of second order: right to second order in the perturbation of anything that
-    the root depends on, as `way` itself is next to zero.
-    """
-    slope = field(t, state)
-    height, rate = jax.jvp(guard, (t, state.y), (jnp.ones_like(t), slope))
-    rate = _constant(rate)
-    rate = jnp.where(rate == 0, 1.0, rate)
-    way = -height / rate
-    # A guard that a reset has violated fires where it stands: it has no root here, or one before that reset.
-    on_root = (
-        (state.memory.landed > 0.5) & (jnp.abs(_constant(way)) <= _LATITUDE * near) & _constant(t + way >= state.t)
-    )
-    way = jnp.where(on_root, way, 0.0)
-    middle = field(t + 0.5 * way, state._replace(y=_along(state.y, 0.5 * way, slope)))
-    there = _along(state.y, way, middle)
-    rest = jnp.where(on_root, -guard(t + way, there) / rate, 0.0)
-    way = way + rest
-    return (
-        jnp.where(_constant(t + way < state.t), _constant(state.t - t), way),
-        rate,
-        state._replace(y=_along(there, rest, middle)),
-    )
 
 
 def _accumulates(spread: Array, t: Array, begin: Array) -> Array:
@@ -473,7 +447,3 @@ def _flags(x: Bool[Array, "..."], like: Array) -> Array:
 def _real(x: Any) -> Array:
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(jnp.result_type(float))
-
-
-def _along(y: PyTree, s: Array, slope: PyTree) -> PyTree:
-    return jtu.tree_map(lambda a, b: a + (s * b).astype(a.dtype), y, slope)

@@ -14,6 +14,7 @@ from ._presliding import MEMORY, PRESLIDING
 from ._result import ExperimentResult
 from ._stick_slip import STICK_SLIP
 
+# The standard experiments by name.
 EXPERIMENTS: dict[str, Experiment] = {
     each.name: each for each in (CHARACTERISTIC, PRESLIDING, MEMORY, BREAK_AWAY, LAG, STICK_SLIP, CREEP, PASSIVITY)
 }

@@ -17,6 +17,7 @@ from ...scene import Scene
 from ...simulation import SimulationError, Trajectory, outcome_messages
 from ._case import Answer, FunctionTask, HardCase, MeasuredNumber, RefusedCalls, SceneTask, differentiate
 
+# Ways in which a hard case is run.
 TRANSFORMS = ("alone", "jit", "vmap", "forward", "reverse", "energy")
 DTYPES = ("float64", "float32")
 

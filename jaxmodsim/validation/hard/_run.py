@@ -17,6 +17,7 @@ from ._check import DTYPES, TRANSFORMS, CaseReport, CheckFinding, check, check_c
 
 _MODULES = (_stiffness, _reversal, _shaken, _many_events, _geometry, _scale, _numbers, _gradients)
 
+# Families of hard cases, in the order in which they run.
 FAMILIES = tuple(module.FAMILY for module in _MODULES)
 
 

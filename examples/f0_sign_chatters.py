@@ -1,0 +1,37 @@
+"""Friction by sign(v): why it fails.
+
+A box of 2 kg under a rising force. With adaptive steps the run grinds to a halt in zero crossings; with a fixed step
+friction jumps between plus and minus Fc while it should hold.
+
+Run it: `python examples/f0_sign_chatters.py [--smoke] [--out DIR]`.
+"""
+
+import argparse
+from pathlib import Path
+
+import jax
+
+import jaxmodsim as jms
+from jaxmodsim.plot import ramp_figure
+from jaxmodsim.validation.testbench import ramp_cases, run_ramp
+
+
+def main(out: Path, smoke: bool = False) -> None:
+    """Run the cases of part a and draw them; --smoke takes the first."""
+    cases = [case for case in ramp_cases() if case.part == "a"]
+    results = [run_ramp(case) for case in cases[: 1 if smoke else None]]
+    for result in results:
+        print(f"{result.case.label}: {result.ending}, {result.crossings} zero crossings of the velocity in 10 s")
+    figure = ramp_figure("Coulomb friction as Fc sign(v)", [result.run for result in results])
+    out.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out / "f0_sign_chatters.png", dpi=110)
+    print(f"wrote {out / 'f0_sign_chatters.png'}")
+
+
+if __name__ == "__main__":
+    jms.tune_cpu()
+    jax.config.update("jax_enable_x64", True)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--smoke", action="store_true", help="small and quick")
+    parser.add_argument("--out", type=Path, default=Path("example-output"))
+    main(**vars(parser.parse_args()))

@@ -1,0 +1,357 @@
+"""A traced function as a list of statements on scalars: what there is to write in another language."""
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, JaxprEqn
+
+from .._core.lu import is_known
+from .._core.scalarise import AbstractScalars, AbstractSymbol, Params, Parts, Value, is_apart
+
+_COMPARISONS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
+_FOLDS = {"reduce_max": jax.lax.max, "reduce_min": jax.lax.min}
+_FOLDS |= {"reduce_and": jax.lax.bitwise_and, "reduce_or": jax.lax.bitwise_or}
+# What only moves entries, whose places are known.
+_INDEXED = {"gather", "scatter", "dynamic_slice", "dynamic_update_slice"}
+_FUNCTIONS = {"custom_jvp_call", "custom_vjp_call"}
+
+
+class Symbol(AbstractSymbol):
+    """A scalar of the program: a result of a statement, or an argument, which has its name from the beginning."""
+
+    def __init__(self, dtype: np.dtype, name: str | None = None) -> None:
+        self.dtype = np.dtype(dtype)
+        self.name = name
+
+
+Entry: TypeAlias = Symbol | np.generic
+
+
+class Assign(NamedTuple):
+    """`out` is the operation `name` of JAX on `operands`."""
+
+    out: Symbol
+    name: str
+    operands: list[Entry]
+
+
+class Carry(NamedTuple):
+    """What a loop carries: `symbol` is `start` in the first pass and `after` in the next one."""
+
+    symbol: Symbol
+    start: Entry
+    after: Entry
+
+
+class Loop(NamedTuple):
+    """At most `bound` passes, each of `head`, an end of the loop unless `condition`, and `body`."""
+
+    bound: int
+    carries: list[Carry]
+    head: "Block"
+    condition: Entry
+    body: "Block"
+
+
+class Branch(NamedTuple):
+    """The arm with the number `chosen`, or else the last one; each a block with the values that it gives to `outs`."""
+
+    chosen: Entry
+    outs: list[Symbol]
+    arms: list[tuple["Block", list[Entry]]]
+
+
+Statement: TypeAlias = Assign | Loop | Branch
+Block: TypeAlias = list[Statement]
+
+
+class Program(NamedTuple):
+    """Statements, and the results that they lead to."""
+
+    block: Block
+    results: list[Entry]
+
+
+def program_of(closed: ClosedJaxpr, arguments: Sequence[Symbol]) -> Program:
+    """The statements of a traced function whose arguments are scalars, without those that nothing depends on.
+
+    **Raises:**
+
+    - `ValueError` naming an operation that is not known here.
+    """
+    writer = _StatementWriter()
+    inputs: list[Value] = [_scalar_array(x) for x in arguments]
+    outputs = writer.run(closed.jaxpr, closed.consts, inputs)
+    results = [x for each in outputs for x in writer.parts(each).flat]
+    # Results are written over the arguments: what is an argument itself is read before.
+    copied = [writer.assign("copy", [x]) if isinstance(x, Symbol) and x.name else x for x in results]
+    return Program(_needed(writer.block, set(filter(_is_symbol, copied))), copied)
+
+
+def _scalar_array(x: Entry) -> Parts:
+    out = np.empty((), object)
+    out[()] = x
+    return out
+
+
+def _one(dtype: np.dtype) -> np.generic:
+    return dtype.type(1)
+
+
+def _is_symbol(x: object) -> bool:
+    return isinstance(x, Symbol)
+
+
+class _StatementWriter(AbstractScalars):
+    """Writes a statement for every scalar that is not known."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.block: Block = []
+        self.origin: dict[Symbol, Assign] = {}
+
+    def assign(self, name: str, operands: list[Entry], dtype: np.dtype | None = None) -> Symbol:
+        out = Symbol(operands[-1].dtype if dtype is None else dtype)
+        self.origin[out] = Assign(out, name, operands)
+        self.block.append(self.origin[out])
+        return out
+
+    def scalar(self, compute: Callable[..., Any], name: str, params: Params, operands: list[Any]) -> Any:
+        """A statement, or what is the same without one."""
+        if all(map(is_known, operands)):
+            return np.asarray(compute(*operands, **params))[()]
+        first = operands[0]
+        if name == "convert_element_type":
+            kind = np.dtype(params["new_dtype"])
+            return first if kind == first.dtype else self.converted(compute, first, params)
+        if name in ("copy", "stop_gradient"):
+            return first
+        if name in ("and", "or") and first.dtype == bool and any(map(is_known, operands)):
+            known, other = operands if is_known(first) else operands[::-1]
+            return other if bool(known) == (name == "and") else known
+        if name == "sub" and first is operands[1]:
+            return np.zeros((), first.dtype)[()]
+        if name == "neg" and first in self.origin and self.origin[first].name == "neg":
+            return self.origin[first].operands[0]
+        if name == "div" and is_known(operands[1]) and operands[1] == 1:
+            return first
+        if name == "select_n" and operands[1] is operands[2] and len(operands) == 3:
+            return operands[1]
+        if name in _COMPARISONS:
+            return self.assign(name, operands, np.dtype(bool))
+        if name == "integer_pow":
+            return self.power(first, params["y"])
+        if name == "square":
+            return self.apply(jax.lax.mul, "mul", {}, [first, first])
+        if name in ("rsqrt", "logistic"):
+            one = _one(first.dtype)
+            if name == "rsqrt":
+                return self.assign("div", [one, self.assign("sqrt", operands)])
+            return self.assign(
+                "div", [one, self.assign("add", [one, self.assign("exp", [self.assign("neg", operands)])])]
+            )
+        if name == "clamp":
+            low, x, high = operands
+            return self.apply(jax.lax.min, "min", {}, [self.apply(jax.lax.max, "max", {}, [x, low]), high])
+        if name == "round" and int(params["rounding_method"]) != int(jax.lax.RoundingMethod.TO_NEAREST_EVEN):
+            raise ValueError("round halves away from zero")
+        return self.assign("add" if name == "add_any" else name, operands)
+
+    def converted(self, compute: Callable[..., Value], x: Symbol, params: Params) -> Value:
+        """In another type; numbers to choose from are, and not what is chosen."""
+        made = self.origin.get(x)
+        if made is None or made.name != "select_n" or not all(map(is_known, made.operands[1:])):
+            return self.assign("convert_element_type", [x], np.dtype(params["new_dtype"]))
+        chosen, *cases = made.operands
+        cases = [self.scalar(compute, "convert_element_type", params, [case]) for case in cases]
+        return self.apply(jax.lax.select_n, "select_n", {}, [chosen, *cases])
+
+    def power(self, x: Value, exponent: int) -> Value:
+        """By products, as JAX computes it."""
+        out: Value = _one(x.dtype)
+        for digit in bin(abs(exponent))[:1:-1]:
+            if digit == "1":
+                out = self.apply(jax.lax.mul, "mul", {}, [out, x])
+            x = self.apply(jax.lax.mul, "mul", {}, [x, x])
+        return out if exponent >= 0 else self.apply(jax.lax.div, "div", {}, [_one(x.dtype), out])
+
+    def whole(self, eqn: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
+        """Loops, branches, calls, and what moves entries to places that are known."""
+        name, params = eqn.primitive.name, eqn.params
+        if name in _FUNCTIONS:
+            called = params["call_jaxpr"]
+            return self.run(called.jaxpr, called.consts, inputs)
+        if name == "platform_index":
+            return [np.asarray(params["platforms"].index(("cpu",)) if ("cpu",) in params["platforms"] else 0)]
+        if name == "while":
+            return self.loop(params, inputs)
+        if name == "cond":
+            return self.branch(params["branches"], inputs)
+        known = [_known_array(x) for x in inputs]
+        if all(x is not None for x in known):
+            out = eqn.primitive.bind(*known, **params)
+            return [np.asarray(x) for x in (out if eqn.primitive.multiple_results else [out])]
+        sizes = [self.parts(x).size for x in inputs]
+        if name in _FOLDS:
+            axes = tuple(map(int, params["axes"]))
+            return [self.fold(_FOLDS[name], name.removeprefix("reduce_"), axes, self.parts(inputs[0]))]
+        if name in _INDEXED and all(x is not None for x in known[1:2]):
+            return [self.move(eqn, inputs, known)]
+        raise ValueError(f"{name} of arrays with {max(sizes)} entries" if max(sizes) > 1 else name)
+
+    def fold(self, compute: Callable[..., Any], name: str, axes: tuple[int, ...], x: Parts) -> Parts:
+        x = np.moveaxis(x, axes, range(len(axes)))
+        x = x.reshape(-1, *x.shape[len(axes) :])
+        out = np.empty(x.shape[1:], object)
+        for i in np.ndindex(*out.shape):
+            out[i] = functools.reduce(lambda a, b: self.apply(compute, name, {}, [a, b]), x[(slice(None), *i)])
+        return out
+
+    def move(self, eqn: JaxprEqn, inputs: list[Value], known: list[np.ndarray | None]) -> Parts:
+        """Entries of the operand and the updates where the operation takes their numbers to."""
+        entries: list[Any] = []
+        numbered: list[Any] = []
+        for x, places in zip(inputs, known, strict=True):
+            if places is not None and np.issubdtype(places.dtype, np.integer):
+                numbered.append(jnp.asarray(places))
+                continue
+            parts = self.parts(x)
+            numbered.append(jnp.arange(len(entries), len(entries) + parts.size).reshape(parts.shape))
+            entries += list(parts.flat)
+        places = np.asarray(eqn.primitive.bind(*numbered, **eqn.params))
+        out = np.empty(places.shape, object)
+        for i in np.ndindex(*places.shape):
+            out[i] = entries[places[i]]
+        return out
+
+    @contextmanager
+    def inner_block(self) -> Iterator[Block]:
+        """A block of its own: what is computed in it is not known after it."""
+        block, memory = self.block, self.memory
+        self.block, self.memory = [], dict(memory)
+        try:
+            yield self.block
+        finally:
+            self.block, self.memory = block, memory
+
+    def loop(self, params: Params, inputs: list[Value]) -> list[Value]:
+        """A loop that counts its passes up to a limit."""
+        test, body = params["cond_jaxpr"], params["body_jaxpr"]
+        n_test, n_body = params["cond_nconsts"], params["body_nconsts"]
+        test_consts, body_consts = inputs[:n_test], inputs[n_test : n_test + n_body]
+        starts = [self.parts(x) for x in inputs[n_test + n_body :]]
+        same = [a is b for a, b in zip(body.jaxpr.outvars, body.jaxpr.invars[n_body:], strict=True)]
+        symbols = [x if kept else _symbols(x) for x, kept in zip(starts, same, strict=True)]
+        with self.inner_block() as head:
+            (condition,) = self.parts(self.run(test.jaxpr, test.consts, [*test_consts, *symbols])[0]).flat
+            self.block = []
+            after = [self.parts(x) for x in self.run(body.jaxpr, body.consts, [*body_consts, *symbols])]
+            inside = self.block
+        changed = [
+            parts for parts, kept in zip(zip(symbols, starts, after, strict=True), same, strict=True) if not kept
+        ]
+        carries = [Carry(*each) for parts in changed for each in zip(*(x.flat for x in parts), strict=True)]
+        self.block.append(Loop(self.bound(condition, carries), carries, head, condition, inside))
+        return list(symbols)
+
+    def bound(self, condition: Entry, carries: list[Carry]) -> int:
+        """Most passes of a loop, from a counter that the condition compares with a limit."""
+        found, open_ = [], [condition]
+        while open_:
+            x = open_.pop()
+            if not isinstance(x, Symbol) or x not in self.origin:
+                continue
+            _, name, operands = self.origin[x]
+            if name == "and":
+                open_ += operands
+            if name != "lt" or not is_known(operands[1]):
+                continue
+            for carry in carries:
+                step = self.origin.get(carry.after) if isinstance(carry.after, Symbol) else None
+                counts = step is not None and step.name == "add" and step.operands[0] is carry.symbol
+                if operands[0] is carry.symbol and is_known(carry.start) and step is not None and counts:
+                    by = step.operands[1]
+                    if is_known(by) and by == 1:
+                        found.append(int(np.asarray(operands[1])) - int(np.asarray(carry.start)))
+        if not found:
+            raise ValueError("while, a loop without a known limit of its passes")
+        return min(found)
+
+    def branch(self, branches: Sequence[ClosedJaxpr], inputs: list[Value]) -> list[Value]:
+        """Arms of which one is taken."""
+        (index,) = self.parts(inputs[0]).flat
+        if is_known(index):
+            chosen = branches[int(np.clip(int(index), 0, len(branches) - 1))]
+            return self.run(chosen.jaxpr, chosen.consts, inputs[1:])
+        arms = []
+        for each in branches:
+            with self.inner_block() as block:
+                outputs = self.run(each.jaxpr, each.consts, inputs[1:])
+                arms.append((block, [x for out in outputs for x in self.parts(out).flat]))
+        outs = [_symbols(np.empty(x.aval.shape), x.aval.dtype) for x in branches[0].jaxpr.outvars]
+        self.block.append(Branch(index, [x for out in outs for x in out.flat], arms))
+        return list(outs)
+
+
+def _symbols(like: np.ndarray, dtype: np.dtype | None = None) -> Parts:
+    """New symbols, of the types of these entries."""
+    out = np.empty(like.shape, object)
+    for i in np.ndindex(*like.shape):
+        out[i] = Symbol(like[i].dtype if dtype is None else dtype)
+    return out
+
+
+def _known_array(x: Value) -> np.ndarray | None:
+    """An array all of whose entries are known; None for others."""
+    if not isinstance(x, np.ndarray) or not is_apart(x):
+        return np.asarray(x)
+    if x.size == 0 or not all(map(is_known, x.flat)):
+        return None
+    return np.asarray(x.tolist(), x.flat[0].dtype).reshape(x.shape)
+
+
+def _needed(block: Block, live: set[Symbol]) -> Block:
+    """The statements on which the symbols `live` depend; what these need from before the block is added to `live`."""
+    kept: Block = []
+    for statement in reversed(block):
+        if isinstance(statement, Assign):
+            if statement.out in live:
+                kept.append(statement)
+                _add(live, statement.operands)
+        elif isinstance(statement, Branch):
+            wanted = [out in live for out in statement.outs]
+            if any(wanted):
+                _add(live, [statement.chosen])
+                arms = []
+                for inside, results in statement.arms:
+                    results = [x for x, each in zip(results, wanted, strict=True) if each]
+                    _add(live, results)
+                    arms.append((_needed(inside, live), results))
+                outs = [x for x, each in zip(statement.outs, wanted, strict=True) if each]
+                kept.append(Branch(statement.chosen, outs, arms))
+        elif any(carry.symbol in live for carry in statement.carries):
+            kept.append(_needed_loop(statement, live))
+    return kept[::-1]
+
+
+def _needed_loop(loop: Loop, live: set[Symbol]) -> Loop:
+    """With the carries alone that the results or its end depend on."""
+    _add(live, [loop.condition])
+    head, body, carries, size = [], [], [], -1
+    while size < len(live):
+        size = len(live)
+        carries = [carry for carry in loop.carries if carry.symbol in live]
+        _add(live, [carry.after for carry in carries])
+        body = _needed(loop.body, live)
+        head = _needed(loop.head, live)
+    _add(live, [carry.start for carry in carries])
+    return Loop(loop.bound, carries, head, loop.condition, body)
+
+
+def _add(live: set[Symbol], entries: Sequence[Entry]) -> None:
+    live.update(x for x in entries if isinstance(x, Symbol))

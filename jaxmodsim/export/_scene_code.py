@@ -1,0 +1,303 @@
+"""A scene as C99, for a drive or a controller, and as JavaScript, for a page."""
+
+import json
+import re
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from .._core.arguments import as_whole
+from .._core.scalarise import trace_in_arrays
+from .._core.shapes import PerDof, Scalar
+from ..scene import Friction, Scene, State, check_scene, check_step, elements, scene_step, signals_of, vector_field
+from ._languages import JAVASCRIPT, C, Language, write_program
+from ._program import Symbol, program_of
+
+_C_TEXT = """\
+/* {name}: a scene of jaxmodsim as C99. Generated; change the scene, not this file. Units are SI. */
+#include <math.h>
+
+/* Places in p, the numbers of the scene. */
+enum {{
+{places}
+  {name}_P
+}};
+/* Entries of y: {states}. */
+enum {{ {name}_Y = {size}, {name}_DOF = {dof} }};
+
+extern const {real} {name}_numbers[{name}_P], {name}_rest[{name}_Y];
+{prototypes}
+
+/* The numbers with which the scene was written. */
+const {real} {name}_numbers[{name}_P] = {{{numbers}}};
+/* The state at rest at the origin. */
+const {real} {name}_rest[{name}_Y] = {{{rest}}};
+
+{routines}
+/* Steps of the length h from the time t, one after another; false (0) if one was not solved. */
+{run} {{
+  for (long i = 0; i < steps; ++i) {{
+    if (!{name}_step(t + i * h, t + (i + 1) * h, p, y)) return 0;
+  }}
+  return 1;
+}}
+"""
+_JAVASCRIPT_TEXT = """\
+// {name}: a scene of jaxmodsim as JavaScript. Generated; change the scene, not this file. Units are SI.
+const {name} = (() => {{
+  const names = {names};
+  const numbers = [{numbers}];
+  const states = {states};
+  const rest = [{rest}];
+
+{routines}
+  // Steps of the length h from the time t, one after another; false if one was not solved.
+  function run(t, h, steps, p, y) {{
+    for (let i = 0; i < steps; ++i) {{
+      if (!step(t + i * h, t + (i + 1) * h, p, y)) return false;
+    }}
+    return true;
+  }}
+  return {{ names, numbers, states, rest, run, {exported} }};
+}})();
+"""
+
+
+class _Routine(NamedTuple):
+    """A function to write.
+
+    - `purpose`: what it does, for the comment above it.
+    - `times`: names of its first arguments, which the numbers p and the state y follow.
+    - `extra`: name and size of an array that it fills, or none.
+    - `results`: where its results go.
+    - `fn`: `fn(scene, y, *times)` -> a pytree of as many numbers.
+    """
+
+    name: str
+    purpose: str
+    times: tuple[str, ...]
+    extra: tuple[str, int] | None
+    results: list[str]
+    fn: Callable[..., PyTree]
+
+
+def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
+    """C99 of a scene: its right-hand side, steps of `ImplicitFriction`, and a feed-forward of its friction.
+
+    For a drive: put the text into `NAME.c` of its project, and the prototypes at its head into a header. The functions
+    allocate nothing, have no state of their own, and every loop has a limit that stands in the code:
+
+    - `NAME_rate(t, p, y, rate)`: rates of the state `y`, for an observer or another solver.
+    - `NAME_step(t0, t1, p, y)`: one step of `ImplicitFriction`, in place; 0 where its equations were not solved.
+    - `NAME_run(t, h, steps, p, y)`: such steps one after another, those of `simulate(..., dt=h)`.
+    - `NAME_friction(t0, t1, p, y, force)`, where there is friction: what the drive adds in every cycle to make up for
+      it. Put the planned coordinates and velocities into `y`; the states of the laws in there are moved on.
+
+    `p` are the numbers of the scene by the names of an enumeration, `p[NAME_p_friction_Fc]`; begin with those that it
+    was written with, `NAME_numbers`, and with the state at rest, `NAME_rest`. What is measured or commanded in every
+    cycle, a torque or a temperature, is such a number. Where nothing depends on the time itself, give the times 0 and
+    h, which keep their digits however long it runs.
+
+    Numbers are `double` for a scene of float64 and `float` for one of float32, for units without `double`. An
+    evaluation is that of JAX to four units in the last place of its terms, if the compiler neither reorders sums nor
+    takes NaN for impossible (no `-ffast-math`).
+
+    ```c
+    static double y[press_Y], u[press_DOF];        /* q, qd, bristle; begins as a copy of press_rest */
+    y[0] = q_plan, y[1] = qd_plan;                 /* every millisecond */
+    press_friction(0.0, 1e-3, press_numbers, y, u);
+    torque += u[0];
+    ```
+
+    **Arguments:**
+
+    - `scene`: the `Scene`. Set-valued laws in the wrapper `Regularized`; no constraints; in the place of a `Signal` a
+      number, which the caller sets.
+    - `dof`: number of coordinates.
+    - `name`: what the names in the code begin with, an identifier.
+
+    **Returns:**
+
+    The text of one file.
+
+    **Raises:**
+
+    - `ValueError` naming what cannot be written: an operation of JAX, a loop without a limit, a friction element that
+      `ImplicitFriction` does not take, a constraint, a `Signal`; for a name that is no identifier.
+    """
+    return _scene_code(scene, dof, name, C, "to_c")
+
+
+def to_javascript(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
+    """JavaScript of a scene in float64: an object with the functions of `to_c`.
+
+    `NAME.step(t0, t1, p, y)` and the others take arrays of numbers; `NAME.names` and `NAME.numbers` are the names and
+    values of p, `NAME.states` the names of y, `NAME.rest` its values at rest.
+
+    **Arguments:**
+
+    As for `to_c`.
+
+    **Returns:**
+
+    The text of one script, which declares the constant `name`.
+
+    **Raises:**
+
+    - `ValueError` as `to_c`, and for a scene of float32, which JavaScript has not.
+    """
+    return _scene_code(scene, dof, name, JAVASCRIPT, "to_javascript")
+
+
+def _scene_code(scene: Scene, dof: int, name: str, language: Language, caller: str) -> str:
+    if not isinstance(scene, Scene):
+        raise ValueError(f"{caller} needs a Scene, but {scene!r} was given.")
+    if not (isinstance(name, str) and name.isidentifier() and name.isascii()):
+        raise ValueError(f"{caller}: name must be an identifier such as 'press', but {name!r} was given.")
+    dof = as_whole(dof, name="dof")
+    if scene.constraints:
+        raise ValueError(
+            f"{caller} writes scenes without constraints, but there are {', '.join(map(repr, scene.constraint_names))}:"
+            " choose coordinates that are independent."
+        )
+    if signals_of(scene.params):
+        raise ValueError(
+            f"{caller} does not write a Signal: put a number in its place, which the caller sets before every step."
+        )
+    check_step(scene)
+    start = jnp.zeros(dof, jnp.result_type(*(jtu.tree_leaves(scene) or [float])))
+    y = State(start, start, scene.initial_state(start))
+    check_scene(scene, y)
+    routines = _routines(scene, y)
+    text = {each.name: _routine_text(each, scene, y, language, name, caller) for each in routines}
+    fields = {"name": name, "routines": "\n".join(text.values())}
+    for field, tree in (("numbers", scene), ("rest", y)):
+        fields[field] = ", ".join(language.literal(x) for leaf in jtu.tree_leaves(tree) for x in np.ravel(leaf))
+    if language is JAVASCRIPT:
+        names = {"names": json.dumps([*elements(scene)]), "states": json.dumps(_state_names(y))}
+        return _JAVASCRIPT_TEXT.format(**fields, **names, exported=", ".join(text))
+    places = {f"{name}_p_{re.sub('[^0-9A-Za-z]+', '_', each).strip('_')}": each for each in elements(scene)}
+    if len(places) < len(elements(scene)):
+        raise ValueError(f"{caller}: numbers of the scene come to one name in C: {', '.join(elements(scene))}.")
+    real = language.type_of(start.dtype)
+    run = f"int {name}_run({real} t, {real} h, long steps, const {real} p[{name}_P], {real} y[{name}_Y])"
+    return _C_TEXT.format(
+        **fields,
+        places="\n".join(f"  {place}, /* {each} */" for place, each in places.items()),
+        states=", ".join(_state_names(y)),
+        size=len(_state_names(y)),
+        dof=dof,
+        real=real,
+        prototypes="\n".join([*(_c_signature(each, name, real) + ";" for each in routines), run + ";"]),
+        run=run,
+    )
+
+
+def _routines(scene: Scene, y: State) -> list[_Routine]:
+    names, dof = _state_names(y), y.q.shape[0]
+    own = [f"y[{i}]" for i in range(2 * dof, len(names))]
+    whole = [f"y[{i}]" for i in range(len(names))]
+    rates = [f"rate[{i}]" for i in range(len(names))]
+    force = [f"force[{i}]" for i in range(dof)]
+    routines = [
+        _Routine(
+            "rate",
+            "Rates of the state y at the time t.",
+            ("t",),
+            ("rate", len(names)),
+            rates,
+            lambda scene, y, t: vector_field(t, y, scene),
+        ),
+        _Routine(
+            "step",
+            "One step of ImplicitFriction from t0 to t1; false (0) where its equations were not solved.",
+            ("t0", "t1"),
+            None,
+            [*whole, "return"],
+            lambda scene, y, t0, t1: scene_step(scene, t0, t1, y),
+        ),
+    ]
+    if any(isinstance(each, Friction) for each in scene.effects):
+        purpose = "Force that makes up for friction at the motion in y; states of the laws in y go from t0 to t1."
+        routines.append(
+            _Routine("friction", purpose, ("t0", "t1"), ("force", dof), [*force, *own], _friction_feed_forward)
+        )
+    return routines
+
+
+def _friction_feed_forward(scene: Scene, y: State, t0: Scalar, t1: Scalar) -> tuple[PerDof, dict[str, PyTree]]:
+    """Generalised force [N or N m] against friction, and the states of the laws after the time from t0 to t1."""
+    scene = scene.bind_state(t0, y.q, y.qd)
+    total, after = jnp.zeros_like(y.q), dict(y.z)
+    for name, effect in zip(scene.names, scene.effects, strict=True):
+        if isinstance(effect, Friction):
+            v = effect.slip(t0, y.q, y.qd, scene.params)
+            force, z = effect.step_exact(v, y.z.get(name), t1 - t0, effect.load(t0, y.q, y.qd, scene.params))
+            total = total + -effect.apply_force(y.q, force, scene.params)
+            after |= {name: z} if name in y.z else {}
+    return total, after
+
+
+def _routine_text(routine: _Routine, scene: Scene, y: State, language: Language, name: str, caller: str) -> str:
+    """The function in C or JavaScript."""
+    numbers, states = [], []
+    for like, symbols, array in ((scene, numbers, "p"), (y, states, "y")):
+        kinds = [leaf.dtype for leaf in jtu.tree_leaves(like) for _ in range(np.size(leaf))]
+        symbols += [Symbol(kind, f"{array}[{i}]") for i, kind in enumerate(kinds)]
+    times = [Symbol(y.q.dtype, each) for each in routine.times]
+
+    def flat(times: list[Array], numbers: list[Array], states: list[Array]) -> list[Array]:
+        return jtu.tree_leaves(routine.fn(_filled(scene, numbers), _filled(y, states), *times))
+
+    like = [[jnp.zeros((), x.dtype) for x in symbols] for symbols in (times, numbers, states)]
+    closed, _ = trace_in_arrays(flat, *like)
+    javascript = language is JAVASCRIPT
+    try:
+        program = program_of(closed, [*times, *numbers, *states])
+        lines = write_program(program, routine.results, language, "    " if javascript else "  ")
+    except ValueError as error:
+        raise ValueError(
+            f"{caller} cannot write {error}, which `{routine.name}` of the scene needs. It writes arithmetic,"
+            " elementary functions and choices (jnp.where) of single numbers and of small arrays: make that part of"
+            " the Lagrangian, force or law of these."
+        ) from error
+    if javascript:
+        arguments = ", ".join([*routine.times, "p", "y", *([routine.extra[0]] if routine.extra else [])])
+        head = [f"  // {routine.purpose}", f"  function {routine.name}({arguments}) {{"]
+        return "\n".join([*head, *lines, "  }\n"])
+    unused = [x for x in (*routine.times, "p", "y") if not re.search(rf"\b{x}\b", "\n".join(lines))]
+    head = [f"/* {routine.purpose} */", _c_signature(routine, name, language.type_of(y.q.dtype)) + " {"]
+    return "\n".join([*head, *(f"  (void){x};" for x in unused), *lines, "}\n"])
+
+
+def _c_signature(routine: _Routine, name: str, real: str) -> str:
+    returns, constant = ("int", "") if "return" in routine.results else ("void", "const ")
+    changed = any(each.startswith("y[") for each in routine.results)
+    arguments = [f"{real} {each}" for each in routine.times]
+    arguments += [f"const {real} p[{name}_P]", f"{'' if changed else constant}{real} y[{name}_Y]"]
+    if routine.extra:
+        arguments.append(f"{real} {routine.extra[0]}[{routine.extra[1]}]")
+    return f"{returns} {name}_{routine.name}({', '.join(arguments)})"
+
+
+def _filled(like: PyTree, entries: list[Array]) -> PyTree:
+    """The pytree with these scalars for the entries of its arrays."""
+    leaves, left = [], iter(entries)
+    for leaf in jtu.tree_leaves(like):
+        part = [next(left) for _ in range(np.size(leaf))]
+        leaves.append(jnp.stack(part).reshape(np.shape(leaf)) if np.ndim(leaf) else part[0])
+    return jtu.tree_unflatten(jtu.tree_structure(like), leaves)
+
+
+def _state_names(y: State) -> list[str]:
+    """Names of the entries of a state: q[0], qd[0], and friction.z of the law's own."""
+    names = []
+    for path, leaf in jtu.tree_leaves_with_path(y):
+        words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]
+        word = ".".join([*words[1:], "z"] if words[0] == "z" else words)
+        names += [word + (f"[{','.join(map(str, i))}]" if i else "") for i in np.ndindex(np.shape(leaf))]
+    return names

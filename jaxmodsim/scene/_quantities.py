@@ -1,0 +1,93 @@
+"""Names and units of what a run holds: coordinates, velocities, forces."""
+
+import math
+import re
+from dataclasses import replace
+
+import jax
+import jax.core
+import jax.numpy as jnp
+
+from .._core.parameters import Range
+from ._coordinates import Quantity, read_label
+from ._scene import Scene
+from .forces._effect import AbstractEffect
+from .forces._friction import Friction
+
+_STATE = re.compile(r"(q|qd)\[(\d+)\]")
+_COMPONENT = re.compile(r"(.+)\[(\d+)\]")
+_FORCES = {"m": "N", "rad": "N m", "m or rad": "N or N m", "": ""}
+# Units of friction along an angle, by those along a displacement.
+_ABOUT_AN_AXIS = {
+    "N": "N m", "N/m": "N m/rad", "N s/m": "N m s/rad", "N/s": "N m/s", "m": "rad", "m/s": "rad/s",
+}  # fmt: skip
+
+
+def quantity_of(scene: Scene, series: str) -> Quantity:
+    """What `q[0]`, `qd[0]`, or the force of an effect (`friction`, `pull[0]`) is called, with its unit.
+
+    The velocity of `x [m]` is `x_dot [m/s]`. Coordinates without names keep `q[0]`, as "m or rad"; so do forces whose
+    unit depends on that, and friction along a displacement that is no sum or difference of coordinates, as "N or N m".
+    A name that is none of these has no unit.
+    """
+    state, component = _STATE.fullmatch(series), _COMPONENT.fullmatch(series)
+    if state is not None and int(state[2]) < (len(scene.coordinates) or math.inf):
+        return _velocity(scene, int(state[2])) if state[1] == "qd" else _coordinate(scene, int(state[2]))
+    effect, index = series, 0
+    if effect not in scene.names and component is not None:
+        effect, index = component[1], int(component[2])
+    if effect not in scene.names:
+        return Quantity(series, "")
+    return Quantity(series, _force_unit(scene, scene.effects[scene.names.index(effect)], index))
+
+
+def describe_series(scene: Scene, series: str) -> str:
+    """The series as functions know it, and what it is called, as in `q[1] (theta)`."""
+    name = quantity_of(scene, series).name
+    return series if name == series else f"{series} ({name})"
+
+
+def _coordinate(scene: Scene, i: int) -> Quantity:
+    return read_label(scene.coordinates[i]) if scene.coordinates else Quantity(f"q[{i}]", "m or rad")
+
+
+def _velocity(scene: Scene, i: int) -> Quantity:
+    if not scene.coordinates:
+        return Quantity(f"qd[{i}]", "m/s or rad/s")
+    name, unit = _coordinate(scene, i)
+    return Quantity(f"{name}_dot", f"{unit}/s" if unit else "")
+
+
+def _force_unit(scene: Scene, effect: AbstractEffect, index: int) -> str:
+    if isinstance(effect, Friction):
+        unit = slip_unit(scene, effect)
+    else:
+        unit = "m" if getattr(effect, "at", None) is not None else _coordinate(scene, index).unit
+    return _FORCES.get(unit, f"J/{unit}")
+
+
+def slip_unit(scene: Scene, friction: Friction) -> str:
+    """Unit of the displacement that friction acts along: of the coordinates that it is a sum or a difference of."""
+    units = [read_label(text).unit for text in scene.coordinates]
+    if friction.along is None or not units:
+        return units[0] if units else "m or rad"
+    q, params, along = jnp.linspace(0.3, 0.7, len(units)), scene.bind_time(jnp.zeros(())).params, friction.along
+    if jax.eval_shape(along, q, params).shape != ():
+        return "m"
+    slopes = jax.jacfwd(along)(q, params)
+    if isinstance(slopes, jax.core.Tracer):
+        return "m or rad"
+    within = {unit for unit, slope in zip(units, slopes, strict=True) if slope != 0}
+    return (
+        within.pop() if len(within) == 1 and bool(jnp.isin(slopes, jnp.asarray([-1.0, 0.0, 1.0])).all()) else "m or rad"
+    )
+
+
+def in_units_of(scene: Scene, effect: AbstractEffect, allowed: Range) -> Range:
+    """The range of a number of an effect: in N m and rad for friction about an axis, per newton under a load."""
+    if not isinstance(effect, Friction):
+        return allowed
+    if effect.normal_force is not None:
+        return replace(allowed, unit=f"{allowed.unit} per N") if allowed.unit.startswith("N") else allowed
+    about = slip_unit(scene, effect) == "rad"
+    return replace(allowed, unit=_ABOUT_AN_AXIS.get(allowed.unit, allowed.unit)) if about else allowed

@@ -1,0 +1,56 @@
+"""What scenes and laws print; gradients by them are such, too."""
+
+from textwrap import shorten
+
+import equinox as eqx
+
+from .._core.functions import Function
+from .._core.readable import Table, short, table_of
+from ..friction import AbstractAsymmetric, AbstractLaw
+from ._coordinates import Quantity
+from ._names import scene_numbers, scene_ranges
+from ._quantities import slip_unit
+from ._scene import Scene
+from .forces._friction import Friction
+
+
+def _numbers(thing: eqx.Module) -> list[tuple[str, ...]]:
+    """Each number by its name and unit. A derivative has the name and the unit of what it is taken by."""
+    units = {name: allowed.unit for name, allowed in scene_ranges(thing).items()}
+    if isinstance(thing, Scene):
+        for name, effect in zip(thing.names, thing.effects, strict=True):
+            if isinstance(effect, Friction):
+                units[f"{name}.belt_velocity"] = slip_unit(thing, effect).replace(" ", "/s ", 1) + "/s"
+    return [(Quantity(name, units.get(name, "")).label, short(x)) for name, x in scene_numbers(thing).items()]
+
+
+def _called(law: AbstractLaw) -> str:
+    """The law's kind, with what is inside of a wrapper or a law for both directions."""
+    both = isinstance(law, AbstractAsymmetric)
+    inside = getattr(law, "forward" if both else "law", None)
+    kind = "asymmetric" if both else type(law).__name__
+    return f"{kind}({_called(inside)})" if isinstance(inside, AbstractLaw) else kind
+
+
+@table_of.register
+def _(law: AbstractLaw) -> Table:
+    return Table(f"{_called(law)}: {law.description}".rstrip(": "), ("number", "value"), _numbers(law))
+
+
+@table_of.register
+def _(scene: Scene) -> Table:
+    lagrangian = scene.lagrangian.fn if isinstance(scene.lagrangian, Function) else type(scene.lagrangian)
+    title = f"Scene of {getattr(lagrangian, '__name__', 'a Lagrangian')}"
+    if scene.coordinates:
+        title += f" in {', '.join(scene.coordinates)}"
+    effects = {
+        name: _called(effect.law) if isinstance(effect, Friction) else type(effect).__name__
+        for name, effect in zip(scene.names, scene.effects, strict=True)
+    }
+    parts = {"effects": effects, "constraints": dict.fromkeys(scene.constraint_names)}
+    notes = tuple(
+        f"{kind}: " + ", ".join(f"{name} ({what})" if what else name for name, what in named.items())
+        for kind, named in parts.items()
+        if named
+    )
+    return Table(shorten(title, 110, placeholder=" ..."), ("number", "value"), _numbers(scene), notes)

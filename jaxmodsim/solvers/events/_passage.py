@@ -1,0 +1,138 @@
+"""The way through an event: to the root in the old mode, through the reset, and back in the new mode."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+# What the step and the passage measure of the way to a root may differ by this factor.
+LATITUDE = 4.0
+
+# Evaluations: at the end of the step, halfway, at the root; after the reset there, halfway, at the end of the step.
+_ROOT, _RESET, _LAST, _COUNT = 2, 3, 4, 6
+# Where the next evaluation is, in ways from the end of the step, or from the root; at the root by the rest.
+_SHARES = (0.5, 1.0, 0.0, -0.5, -1.0, 0.0)
+
+_constant = jax.lax.stop_gradient
+
+
+class Landed(NamedTuple):
+    """Where a step ended.
+
+    - `t`, `y`, `mode`: the end of the step.
+    - `first`: marks the guard whose root the event is, shape `[guards]`.
+    - `rate`: of that guard along the motion, constant.
+    - `on_root`: whether it has a root.
+    - `near`: how far the root may be [time].
+    - `earliest`: time before which the event cannot be.
+    """
+
+    t: Float[Array, ""]
+    y: PyTree
+    mode: PyTree
+    first: Bool[Array, " guards"]
+    rate: Float[Array, ""]
+    on_root: Bool[Array, ""]
+    near: Float[Array, ""]
+    earliest: Float[Array, ""]
+
+
+class Passage(NamedTuple):
+    """What happened.
+
+    - `t`: time of the event.
+    - `before`: y before the reset; the mode is that of the step.
+    - `after`: y and mode after it, and the rate of y.
+    - `y`, `guards`: y at the end of the step, and the guards there.
+    """
+
+    t: Float[Array, ""]
+    before: PyTree
+    after: tuple[PyTree, PyTree, PyTree]
+    y: PyTree
+    guards: Float[Array, " guards"]
+
+
+class _Place(NamedTuple):
+    """Between two evaluations: where the next one is, where this half of the way began, and how long it is."""
+
+    t: Float[Array, ""]
+    y: PyTree
+    mode: PyTree
+    origin: tuple[Float[Array, ""], PyTree]
+    way: Float[Array, ""]
+    on_root: Bool[Array, ""]
+
+
+def pass_event(
+    landed: Landed,
+    evaluate: Callable[[Array, PyTree, PyTree, PyTree], tuple[PyTree, Float[Array, " guards"]]],
+    args: tuple[PyTree, PyTree],
+    reset: Callable[[Array, PyTree], tuple[PyTree, PyTree]],
+) -> Passage:
+    """Carry a state from the end of a step to the root of a guard, reset it, and carry it back.
+
+    The way to the root is zero but for the error of the landing; its derivatives are those of the time of the event, to
+    second order, so that those of the result are exact: two Newton steps with one rate, on flows of second order.
+
+    Field and guards are evaluated in a loop, which is compiled once, and differentiated once. Its derivative in reverse
+    mode evaluates them again: what they keep else are hundreds of numbers.
+
+    **Arguments:**
+
+    - `landed`: where the step ended.
+    - `evaluate`: `evaluate(t, y, mode, args)` -> the rate of y, and the guards.
+    - `args`: those before and after the event.
+    - `reset`: `reset(t, y)` -> y and mode after the event.
+    """
+
+    @partial(jax.checkpoint, prevent_cse=False)
+    def onward(place: _Place, turn: tuple[Int[Array, ""], Float[Array, ""]]) -> tuple[_Place, PyTree]:
+        i, share = turn
+        t, y, mode = place[:3]
+        begins, at_root, behind = (i == 0) | (i == _RESET), i == _ROOT, i >= _RESET
+        before = y
+        y, mode = jax.lax.cond(i == _RESET, lambda: reset(t, y), lambda: (y, mode))
+        origin = _choose(begins, (t, y), place.origin)
+        rates, guards = evaluate(t, y, mode, _choose(behind, args[1], args[0]))
+        newton = -jnp.sum(jnp.where(landed.first, guards, 0.0)) / landed.rate
+        # A guard that a reset has violated fires where it stands: it has no root here, or one before that reset.
+        on_root = jnp.where(
+            i == 0,
+            landed.on_root
+            & (jnp.abs(_constant(newton)) <= LATITUDE * landed.near)
+            & _constant(t + newton >= landed.earliest),
+            place.on_root,
+        )
+        newton = jnp.where(on_root, newton, 0.0)
+        way = jnp.where(i == 0, newton, place.way)
+        whole = way + newton
+        whole = jnp.where(_constant(landed.t + whole < landed.earliest), _constant(landed.earliest - landed.t), whole)
+        start, length = _choose(at_root, ((landed.t, y), newton), (origin, share * way))
+        way = jnp.where(at_root, whole, way)
+        following = _Place(
+            jnp.where(i == _LAST, landed.t, start[0] + jnp.where(at_root, way, length)),
+            jtu.tree_map(lambda a, b: a + (length * b).astype(a.dtype), start[1], rates),
+            mode,
+            origin,
+            way,
+            on_root,
+        )
+        return following, (t, before, (y, mode, rates), guards)
+
+    turns = jnp.arange(_COUNT), jnp.asarray(_SHARES, landed.rate.dtype)
+    begin = _Place(
+        landed.t, landed.y, landed.mode, (landed.t, landed.y), jnp.zeros_like(landed.rate), jnp.asarray(False)
+    )
+    _, (t, before, after, guards) = jax.lax.scan(onward, begin, turns)
+    at, end = (lambda tree, i=i: jtu.tree_map(lambda x: x[i], tree) for i in (_RESET, _COUNT - 1))
+    return Passage(at(t), at(before), at(after), end(after[0]), end(guards))
+
+
+def _choose(where: Bool[Array, ""], one: PyTree, other: PyTree) -> PyTree:
+    """`one` or `other`; what is the same in both stays as it is."""
+    return jtu.tree_map(lambda a, b: a if a is b else jnp.where(where, a, b), one, other)

@@ -1,0 +1,346 @@
+"""Scenes as C99 and JavaScript: compiled, run, and compared with JAX."""
+
+import functools
+import json
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import pytest
+
+import jaxmodsim as jms
+from jaxmodsim import to_c, to_javascript
+from jaxmodsim.problems import belt_oscillator, ramped_box
+from jaxmodsim.scene import State, vector_field
+
+COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+NODE = shutil.which("node")
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="needs a C compiler: cc, gcc or clang")
+needs_node = pytest.mark.skipif(NODE is None, reason="needs node, which runs JavaScript")
+FLAGS = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Wmissing-prototypes", "-O1"]
+CHECKED = ["-fsanitize=undefined,address", "-fno-sanitize-recover=all"]
+
+# Reads what to do, the numbers and the state, and prints what comes of it, all in hexadecimal.
+MAIN = """
+#include <stdio.h>
+#include <stdlib.h>
+static double next(void) { double x; if (scanf("%lf", &x) != 1) exit(2); return x; }
+int main(void) {
+  REAL p[scene_P], y[scene_Y], out[scene_Y] = {0};
+  char kind;
+  while (scanf(" %c", &kind) == 1) {
+    const double t0 = next(), t1 = next();
+    const long steps = (long)next();
+    for (int i = 0; i < scene_P; ++i) p[i] = next();
+    for (int i = 0; i < scene_Y; ++i) y[i] = next();
+    int solved = 1;
+    if (kind == 'r') scene_rate(t0, p, y, out);
+    if (kind == 's') solved = scene_run(t0, t1, steps, p, y);
+    FRICTION
+    printf("%d", solved);
+    for (int i = 0; i < scene_Y; ++i) printf(" %a", (double)out[i]);
+    for (int i = 0; i < scene_Y; ++i) printf(" %a", (double)y[i]);
+    printf("\\n");
+  }
+  return 0;
+}
+"""
+
+
+def arm_energy(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    del t
+    coupled = jnp.cos(q[1] - q[0]) * qd[0] * qd[1]
+    return 0.5 * p["m"] * jnp.sum(qd**2) + 0.4 * p["m"] * coupled + p["g"] * jnp.cos(q[0])
+
+
+def one_mass(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    del t, q
+    return 0.5 * p["m"] * qd[0] ** 2
+
+
+def many_functions(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    """A force of all the functions that are written, on arguments where they have values."""
+    x, v = q[0], qd[0]
+    a = 0.5 + 0.4 * jnp.sin(x) * jnp.cos(v)
+    smooth = [jnp.tan(a), jnp.arcsin(a), jnp.arccos(a), jnp.arctan(x), jnp.arctan2(v, a), jnp.sinh(a), jnp.cosh(x)]
+    smooth += [jnp.tanh(v), jnp.exp(v), jnp.expm1(a), jnp.log(a), jnp.log1p(a), jnp.sqrt(a), jnp.cbrt(x), a ** p["n"]]
+    smooth += [1.0 / (x**3 + 8.0 * jnp.sign(x)), jax.lax.rsqrt(a), jax.nn.sigmoid(x), jnp.linalg.norm(q - p["at"])]
+    bent = [jnp.floor(3.0 * x), jnp.ceil(x * v), jnp.sign(v), jnp.clip(x, -0.5, 0.5), jnp.maximum(x, v), jnp.abs(v)]
+    bent += [jnp.where((x > 0) ^ (v > 0), x, v), jnp.where(jnp.isfinite(x) & ~(v <= 0), t, x), jnp.fmod(x, 0.7)]
+    bent += [jnp.max(p["at"] * x), jnp.where(jnp.any(q > p["at"]), 1.0, x), jax.lax.cond(x > v, jnp.sin, jnp.cos, x)]
+    powers = jnp.stack([*smooth, *bent])
+    return jnp.sum(jnp.where(jnp.arange(powers.size) < powers.size, powers, 0.0))[None]
+
+
+LUGRE = jms.LuGre(sigma0=1e4, sigma1=12.0, sigma2=0.1, Fc=1.0, Fs=1.5, vs=0.01)
+SCENES: dict[str, Callable[[], tuple[jms.Scene, int]]] = {
+    "lugre box": lambda: (ramped_box.scene(ramped_box.lugre(sigma1=12.0)), 1),
+    "coulomb belt": lambda: (belt_oscillator.scene(jms.Regularized(belt_oscillator.stribeck(), 1e-9)), 1),
+    "arm with two laws": lambda: (
+        jms.Scene(
+            arm_energy,
+            params={"m": 1.0, "g": 9.0},
+            effects=(
+                jms.Friction(LUGRE, along=lambda q: q[0]),
+                jms.Friction(jms.Dahl(1e3, 0.7), along=lambda q: q[1] - q[0], normal_force=lambda t, q, qd, p: p["m"]),
+            ),
+        ),
+        2,
+    ),
+    "block in the plane": lambda: (
+        jms.Scene(
+            lambda t, q, qd, p: 0.5 * p["m"] * jnp.sum(qd**2) - 3.0 * p["m"] * q[0],
+            params={"m": 1.0},
+            effects=(jms.Friction(LUGRE, along=lambda q: q, ellipse=1.5),),
+        ),
+        2,
+    ),
+    "many functions": lambda: (
+        jms.Scene(
+            one_mass,
+            params={"m": 1.0, "n": 1.7, "at": np.array([0.1, -0.3])},
+            effects=(jms.AppliedForce(many_functions),),
+        ),
+        1,
+    ),
+}
+
+
+@functools.cache
+def scene_of(name: str) -> tuple[jms.Scene, int]:
+    return SCENES[name]()
+
+
+def state_of(scene: jms.Scene, y: Any, dof: int) -> State:
+    like = State(jnp.zeros(dof), jnp.zeros(dof), scene.initial_state(jnp.zeros(dof)))
+    leaves, ends = [], np.cumsum([np.size(x) for x in jtu.tree_leaves(like)])
+    for leaf, end in zip(jtu.tree_leaves(like), ends, strict=True):
+        leaves.append(jnp.asarray(y[end - np.size(leaf) : end]).reshape(leaf.shape))
+    return jtu.tree_unflatten(jtu.tree_structure(like), leaves)
+
+
+def flat(tree: Any) -> np.ndarray:
+    return np.concatenate([np.ravel(x) for x in jtu.tree_leaves(tree)])
+
+
+def random_states(scene: jms.Scene, dof: int, count: int) -> np.ndarray:
+    """Positions and velocities of both signs, deflections about as large as they get; some at rest."""
+    rng = np.random.default_rng(0)
+    own = flat(scene.initial_state(jnp.zeros(dof))).size if scene.initial_state(jnp.zeros(dof)) else 0
+    y = rng.normal(size=(count, 2 * dof + own)) * [*[1.0] * dof, *[0.3] * dof, *[1e-4] * own]
+    y[::10, dof:] = 0.0
+    return y
+
+
+class InC:
+    """The program of a scene, compiled with every check there is."""
+
+    def __init__(self, scene: jms.Scene, dof: int, folder: Path) -> None:
+        text = to_c(scene, dof)
+        call = "if (kind == 'f') scene_friction(t0, t1, p, y, out);" if "scene_friction" in text else ""
+        real = "float" if "const float scene_numbers" in text else "double"
+        source, self.program = folder / "scene.c", folder / "scene"
+        source.write_text(text + MAIN.replace("FRICTION", call).replace("REAL", real))
+        assert COMPILER is not None
+        found = subprocess.run(
+            [COMPILER, *CHECKED, "-x", "c", "-", "-o", str(folder / "try")], input=b"int main(void){return 0;}"
+        )
+        checks = CHECKED if found.returncode == 0 else []
+        subprocess.run([COMPILER, *FLAGS, *checks, str(source), "-lm", "-o", str(self.program)], check=True)
+        self.numbers, self.size = flat(scene), 0
+
+    def __call__(self, kind: str, t0: Any, t1: Any, states: np.ndarray, steps: int = 1) -> tuple[Any, Any, Any]:
+        """For each state whether it was solved, what was filled, and the state after."""
+        times = np.broadcast_arrays(t0, t1, np.zeros(len(states)))[:2]
+        lines = [
+            " ".join([kind, float(a).hex(), float(b).hex(), str(steps), *(float(x).hex() for x in (*self.numbers, *y))])
+            for a, b, y in zip(*times, states, strict=True)
+        ]
+        done = subprocess.run([str(self.program)], input="\n".join(lines), capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        rows = [[float.fromhex(x) for x in line.split()[1:]] for line in done.stdout.splitlines()]
+        out, after = np.split(np.array(rows), 2, axis=1)
+        return [line[0] == "1" for line in done.stdout.splitlines()], out, after
+
+
+@pytest.fixture(scope="module")
+def in_c(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], InC]:
+    return functools.cache(lambda name: InC(*scene_of(name), tmp_path_factory.mktemp("c")))
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", SCENES)
+def test_the_right_hand_side_in_c_is_that_of_jax(name: str, in_c: Callable[[str], InC]) -> None:
+    """To four units in the last place of its terms: as if that had been the rounding of numbers and state."""
+    scene, dof = scene_of(name)
+    y = random_states(scene, dof, 200)
+    t = np.linspace(0.0, 5.0, len(y))
+
+    def rate(t: Any, y: Any, scene: jms.Scene) -> Any:
+        return jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(vector_field(t, state_of(scene, y, dof), scene))])
+
+    values = jax.jit(jax.vmap(rate, (0, 0, None)))(t, y, scene)
+    by = jax.jit(jax.vmap(jax.jacfwd(rate, (0, 1, 2)), (0, 0, None)))(t, y, scene)
+    terms = np.abs(np.asarray(values))
+    for slope, at in zip(jtu.tree_leaves(by), [t, y, *jtu.tree_leaves(scene)], strict=True):
+        at = np.asarray(at) if at is t or at is y else np.broadcast_to(at, (len(y), *np.shape(at)))
+        parts = np.abs(np.asarray(slope).reshape(*values.shape, -1) * at.reshape(len(y), 1, -1))
+        terms = terms + np.where(np.isfinite(parts), parts, 0.0).sum(-1)
+    _, out, _ = in_c(name)("r", t, t, y)
+    assert (np.abs(out - values) <= 4 * np.finfo(float).eps * terms).all()
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["lugre box", "coulomb belt", "arm with two laws", "block in the plane"])
+def test_a_run_in_c_is_that_of_simulate(name: str, in_c: Callable[[str], InC]) -> None:
+    scene, dof = scene_of(name)
+    y0, h, t1 = random_states(scene, dof, 2)[1] * 0.1, 1e-3, 3.0
+    start = state_of(scene, y0, dof)
+    run = jms.simulate(scene, start.q, start.qd, t1, z0=start.z, dt=h, solver=jms.ImplicitFriction())
+    (solved,), _, after = in_c(name)("s", 0.0, h, y0[None], steps=round(t1 / h))
+    assert solved
+    expected = flat((run.q[-1], run.qd[-1], {key: z[-1] for key, z in (run.z or {}).items()}))
+    np.testing.assert_allclose(after[0], expected, rtol=1e-9, atol=1e-12)
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["lugre box", "arm with two laws"])
+def test_the_feed_forward_is_the_force_of_the_laws(name: str, in_c: Callable[[str], InC]) -> None:
+    scene, dof = scene_of(name)
+    y, h = random_states(scene, dof, 50), jnp.asarray(1e-3)
+
+    def expected(y: Any) -> Any:
+        state = state_of(scene, y, dof)
+        force, after = jnp.zeros(dof), {}
+        for key, effect in zip(scene.names, scene.effects, strict=True):
+            if isinstance(effect, jms.Friction):
+                law: Any = effect.law
+                along = effect.direction(state.q, scene.params)
+                after[key] = law.step_exact(jnp.sum(along * state.qd), state.z[key], h)
+                mean = (after[key] - state.z[key]) / h
+                load = 1.0 if effect.normal_force is None else scene.params["m"]
+                force += along * load * law.force_given_zdot(jnp.sum(along * state.qd), after[key], mean)
+        return force, jnp.stack(list(after.values()))
+
+    force, z = jax.jit(jax.vmap(expected))(y)
+    _, out, after = in_c(name)("f", 0.0, float(h), y)
+    np.testing.assert_allclose(out[:, :dof], force, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(after[:, 2 * dof :], z, rtol=1e-12, atol=1e-18)
+    assert (after[:, : 2 * dof] == y[:, : 2 * dof]).all()
+
+
+@needs_compiler
+def test_steps_end_whatever_they_are_given(in_c: Callable[[str], InC]) -> None:
+    """Infinite numbers, steps of no length and backwards: nothing that the sanitizers know, and an answer."""
+    worst = np.array([np.nan, np.inf, -np.inf, 1e308, 1e-308, 0.0])
+    y = np.array([[a, b, c] for a in worst for b in worst for c in worst])
+    for h in (0.0, -1.0, 1e300, np.nan):
+        solved, _, after = in_c("lugre box")("s", 0.0, h, y)
+        assert len(solved) == len(after) == len(y)
+
+
+@needs_compiler
+def test_a_scene_of_float32_is_written_in_float(tmp_path: Path) -> None:
+    scene, dof = scene_of("lugre box")
+    scene = jtu.tree_map(lambda x: jnp.asarray(x, jnp.float32), scene)
+    text = to_c(scene, dof)
+    assert "double" not in text
+    h = 1e-3
+    run = jms.simulate(
+        scene, jnp.zeros(1, jnp.float32), jnp.zeros(1, jnp.float32), 3.0, dt=h, solver=jms.ImplicitFriction()
+    )
+    (solved,), _, after = InC(scene, dof, tmp_path)("s", 0.0, h, np.zeros((1, 3)), steps=3000)
+    assert solved
+    np.testing.assert_allclose(after[0, :2], [run.q[-1, 0], run.qd[-1, 0]], rtol=1e-3)
+
+
+@needs_node
+@pytest.mark.parametrize("name", ["coulomb belt", "arm with two laws"])
+def test_a_run_in_javascript_is_that_of_simulate(name: str) -> None:
+    scene, dof = scene_of(name)
+    y0, h, t1 = random_states(scene, dof, 2)[1] * 0.1, 1e-3, 3.0
+    start = state_of(scene, y0, dof)
+    run = jms.simulate(scene, start.q, start.qd, t1, z0=start.z, dt=h, solver=jms.ImplicitFriction())
+    script = to_javascript(scene, dof, name="it")
+    script += f"const y = {json.dumps(y0.tolist())}; const ok = it.run(0, {h}, {round(t1 / h)}, it.numbers, y);"
+    script += "console.log(JSON.stringify([ok, y, it.names, it.states]));"
+    assert NODE is not None
+    done = subprocess.run([NODE, "-"], input=script, capture_output=True, text=True, check=True)
+    solved, after, names, states = json.loads(done.stdout)
+    assert solved
+    expected = flat((run.q[-1], run.qd[-1], {key: z[-1] for key, z in (run.z or {}).items()}))
+    np.testing.assert_allclose(after, expected, rtol=1e-9, atol=1e-12)
+    assert len(names) == flat(scene).size
+    assert states[0] == "q[0]"
+
+
+def test_the_state_at_rest_is_that_of_the_laws() -> None:
+    """Armstrong's law has rested long: its stiction is whole."""
+    law = jms.Armstrong(1e4, 1.0, 1.5, 0.01, 0.2, 0.1, 1.0)
+    assert "scene_rest[scene_Y] = {0.0, 0.0, 0.0, 1.0, 1.0, 0.0}" in to_c(ramped_box.scene(law))
+
+
+def test_the_text_names_its_numbers_and_allocates_nothing() -> None:
+    text = to_c(scene_of("lugre box")[0], name="press")
+    for word in ("press_p_m", "press_p_friction_sigma0", "press_step", "press_friction", "q[0], qd[0], friction.z"):
+        assert word in text
+    for word in ("malloc", "static", "goto", "while"):
+        assert word not in text
+
+
+def with_force(force: Any) -> jms.Scene:
+    return jms.Scene(one_mass, params={"m": 1.0}, effects=(jms.AppliedForce(force),))
+
+
+def endless(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    del t, qd, p
+    return jax.lax.while_loop(lambda x: x[0] > 1.0, lambda x: 0.5 * x, q)
+
+
+REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
+    "set-valued law": (lambda: ramped_box.scene(jms.Coulomb(1.0)), r"wrap the law as Regularized"),
+    "dead zone": (lambda: ramped_box.scene(jms.DeadZone(jms.Coulomb(1.0), 1e-3)), "is a DeadZone"),
+    "constraint": (
+        lambda: jms.Scene(one_mass, params={"m": 1.0}, constraints=(jms.Constraint(lambda q: q[0], name="wall"),)),
+        "'wall': choose coordinates",
+    ),
+    "signal": (
+        lambda: jms.Scene(one_mass, params={"m": jms.Signal([0.0, 1.0], [1.0, 2.0])}),
+        "does not write a Signal",
+    ),
+    "sort": (lambda: with_force(lambda t, q, qd, p: jnp.sort(jnp.stack([q[0], qd[0]]))[:1]), "cannot write sort"),
+    "gamma function": (lambda: with_force(lambda t, q, qd, p: jax.lax.lgamma(q)), "cannot write lgamma"),
+    "loop without a limit": (lambda: with_force(endless), "loop without a known limit"),
+    "large array": (lambda: with_force(lambda t, q, qd, p: jnp.sum(q[0] * jnp.arange(200.0))[None]), "arrays with 200"),
+}
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_written_is_refused_by_name(case: str) -> None:
+    make, text = REFUSED[case]
+    for export in (to_c, to_javascript):
+        with pytest.raises(ValueError, match=text):
+            export(make())
+
+
+def test_wrong_arguments_are_refused() -> None:
+    box = scene_of("lugre box")[0]
+    with pytest.raises(ValueError, match="name must be an identifier"):
+        to_c(box, name="a b")
+    with pytest.raises(ValueError, match="dof must be"):
+        to_c(box, 0)
+    with pytest.raises(ValueError, match="returned the shape"):
+        to_c(with_force(lambda t, q, qd, p: q[:1]), 2)
+    with pytest.raises(ValueError, match="come to one name"):
+        to_c(jms.Scene(one_mass, params={"m": 1.0, "a.b": 1.0, "a_b": 1.0}))
+    with pytest.raises(ValueError, match="JavaScript has no float32"):
+        to_javascript(jtu.tree_map(lambda x: jnp.asarray(x, jnp.float32), box))
+    with pytest.raises(ValueError, match="to_javascript cannot write erf of float64"):
+        to_javascript(with_force(lambda t, q, qd, p: jax.lax.erf(q)))

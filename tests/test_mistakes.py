@@ -1,0 +1,54 @@
+"""What the page of mistakes says is what one reads."""
+
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from jaxmodsim._core import speed
+
+PAGE = (Path(__file__).parents[1] / "docs" / "mistakes.md").read_text()
+ROWS = re.findall(r"^\| `(.+)` \| (.+) \|$", PAGE, re.MULTILINE)
+NAMES: dict[str, Any] = {}
+
+
+@pytest.fixture(autouse=True)
+def loud(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING, "jaxmodsim")
+    speed.remark_on_single_precision.cache_clear()
+    if not NAMES:
+        block = re.search(r"```python\n(.*?)```", PAGE, re.DOTALL)
+        assert block is not None
+        exec(block[1], NAMES)
+
+
+def test_there_are_twenty() -> None:
+    assert len(ROWS) >= 20
+
+
+@pytest.mark.parametrize(("written", "read"), ROWS, ids=range(len(ROWS)))
+def test_what_one_reads(written: str, read: str, caplog: pytest.LogCaptureFixture) -> None:
+    said = ""
+    try:
+        eval(written, NAMES)
+    except Exception as error:
+        said = str(error)
+    assert read in said + caplog.text
+
+
+def test_a_line_of_the_user_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("def energy(t, q, qd, p):\n    return np.dot(qd, qd)\n")
+    names = dict(NAMES)
+    exec(compile(file.read_text(), str(file), "exec"), names)
+    with pytest.raises(ValueError, match=re.escape(f"at {file}:2 (`return np.dot(qd, qd)`)")):
+        names["run"](names["energy"])
+
+
+def test_a_long_compilation_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    speed.remark_on_compilation(2.9, ())
+    assert not caplog.records
+    speed.remark_on_compilation(3.1, ())
+    assert "Compiling this scene took 3.1 s" in caplog.text
