@@ -88,7 +88,9 @@ Limit = Annotated[
 ]
 HeldOut = Annotated[
     list[Path] | None,
-    typer.Option(help="Record that is never fitted, to judge by. Repeatable.", rich_help_panel=_JUDGED),
+    typer.Option(
+        help="Record to judge by; nothing but its start is fitted to it. Repeatable.", rich_help_panel=_JUDGED
+    ),
 ]
 Folds = Annotated[
     int | None,

@@ -43,9 +43,7 @@ def report_page(findings: Findings) -> str:
         simulated=list(_simulated(fitted)),
         residual_tests=residual_tests(result),
         strong=_STRONG,
-        scores=[
-            (f"{score.record.name}, never fitted", score_figure(score, **fitted.measured)) for score in fitted.scores
-        ],
+        scores=[(f"{score.record.name}, held out", score_figure(score, **fitted.measured)) for score in fitted.scores],
         comparison=None if fitted.comparison is None else _compared(fitted.comparison, fitted.unit),
         profiles=[(str(profile), profile.name, profile_figure(profile)) for profile in findings.profiles],
         design=None if findings.design is None else _designed(findings, findings.design),

@@ -23,7 +23,9 @@ def fit_figure(
     - `caption`: a line for the source of the record.
     """
     (residual,) = result.residuals[record].values()
-    return _followed(result.provenance.records[record], residual, "simulated, open loop", quantity, unit, caption)
+    rmse = float(np.sqrt(np.mean(residual**2)))
+    shown = result.provenance.records[record]
+    return _followed(shown, residual, rmse, "simulated, open loop", quantity, unit, caption)
 
 
 def score_figure(score: Score, *, quantity: str = "position", unit: str = "m", caption: str = "") -> Figure:
@@ -35,18 +37,19 @@ def score_figure(score: Score, *, quantity: str = "position", unit: str = "m", c
     - `quantity`, `unit`: what was measured.
     - `caption`: a line for the source of the record.
     """
-    (residual,) = score.residuals.values()
-    return _followed(score.record, residual, "simulated, not fitted to it", quantity, unit, caption)
+    (residual,), (rmse,) = score.residuals.values(), score.rmse.values()
+    return _followed(score.record, residual, rmse, "simulated, only its start fitted", quantity, unit, caption)
 
 
-def _followed(record: Record, residual: np.ndarray, label: str, quantity: str, unit: str, caption: str) -> Figure:
+def _followed(
+    record: Record, residual: np.ndarray, rmse: float, label: str, quantity: str, unit: str, caption: str
+) -> Figure:
     figure = Figure(figsize=(11, 6), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     above.plot(record.t, record.measured, color=GREY, lw=2.4, label="measured")
     above.plot(record.t, record.measured + residual, color=RED, lw=1.1, label=label)
     factor, small = small_unit(unit)
-    rmse = f"RMSE {factor * float(np.sqrt(np.mean(residual**2))):.3g} {small}"
-    above.set(ylabel=f"{quantity} [{unit}]", title=f"{record.name}: {rmse}")
+    above.set(ylabel=f"{quantity} [{unit}]", title=f"{record.name}: RMSE {factor * rmse:.3g} {small}")
     above.legend(loc="upper right")
     below.plot(record.t, factor * residual, color=BLUE, lw=1.0)
     below.axhline(0.0, color=GREY, lw=0.6)
