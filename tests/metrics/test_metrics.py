@@ -327,7 +327,7 @@ def test_garbage_is_refused_when_made(make: Any, text: str) -> None:
         (metrics.stick_share(), "rest=1e-4"),
         (metrics.motion_kind(), "classes"),
         (metrics.mode_sequence(), "classes"),
-        (metrics.peak("q[1]"), r"'q\[1\]'; there are: q\[0\], qd\[0\], pull\[0\], friction"),
+        (metrics.peak("q[1]"), r"'q\[1\]'; there are: q\[0\] \(x\), qd\[0\] \(x_dot\), pull\[0\], friction"),
         (metrics.final("pull"), "No observable"),
         (metrics.period("brake"), "No observable"),
     ],
