@@ -45,10 +45,8 @@ def read_columns(path: Path) -> Columns:
 def _logged(path: Path, ending: str) -> Columns:
     try:
         return LOG_READERS[ending](path)
-    except (ValueError, OSError) as error:
-        if "pip install" in str(error):
-            raise
-        raise ValueError(f"{path} is damaged or no {ending} file: {_one_line(error)}") from error
+    except ImportError as error:
+        raise ValueError(str(error)) from error
     except Exception as error:  # whatever the bytes of a damaged file lead the reader into
         raise ValueError(f"{path} is damaged or no {ending} file: {_one_line(error)}") from error
 

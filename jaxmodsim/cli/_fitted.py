@@ -10,11 +10,11 @@ from importlib import metadata
 import numpy as np
 import pandas as pd
 
+from .._core.units import axis_unit
 from ..identify import Comparison, FitResult, InputDesign, Profile, RecordAgreement, Score, remarks
 from ..scene import Scene, scene_numbers
 from ._equations import equations
 from ._plan import Plan
-from ._units import axis_unit
 
 # Units of what declares none: the params of an axis, and initial states.
 _UNITS = {"m": "kg", "offset": "N", "q0[0]": "m", "qd0[0]": "m/s"}

@@ -82,7 +82,7 @@ def _library(name: str, extra: str, what: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError as error:
         package = name.split(".")[0]
-        raise ValueError(f"Reading {what} needs {package}: pip install 'jaxmodsim[{extra}]'.") from error
+        raise ImportError(f"Reading {what} needs {package}: pip install 'jaxmodsim[{extra}]'.") from error
 
 
 def _is_column(values: object) -> bool:

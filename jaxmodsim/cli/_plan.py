@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from .._core.arguments import nearest
 from ..identify import (
     Candidate,
     Cauchy,
@@ -26,7 +25,7 @@ from ..identify import (
 )
 from ..scene import Scene, scene_numbers
 from ._read import DROPS, AxisColumns, offset_note, read_records
-from ._units import given_units
+from ._units import given_units, option_hint
 
 _LOSSES = {"squares": SquaredLoss, "huber": Huber, "cauchy": Cauchy}
 _INITIALIZERS = ("rough", "staged")
@@ -216,8 +215,7 @@ def _known(option: str, name: str, known: Iterable[str], noun: str = "name", lis
     known = tuple(known)
     if name in known or listed in known:
         return name
-    near = nearest(name, known)
-    hint = f" Did you mean {near}?" if near else ""
+    hint = option_hint(name, known)
     raise ValueError(f"{option}: there is no {noun} {name!r}; the {noun}s are: {', '.join(known)}.{hint}")
 
 

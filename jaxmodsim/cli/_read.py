@@ -9,10 +9,11 @@ import numpy as np
 import pandas as pd
 
 from .._core.arguments import nearest
+from .._core.units import axis_unit
 from ..identify import Record, clock_offset, sampling_gaps, unexplained_force
 from ._files import Columns, read_columns
 from ._logs import Channel, held_on
-from ._units import Unit, axis_unit, column_unit, split_header
+from ._units import Unit, column_unit, split_header
 
 # What --drop may name.
 DROPS = ("nan", "repeated")

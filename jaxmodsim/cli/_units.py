@@ -124,7 +124,7 @@ def _given(role: str, text: str) -> Unit:
     if unit is None:
         raise ValueError(
             f"--units {role}={text}: there is no unit {name!r}; the units are: {', '.join(allowed)}."
-            f"{_hint(name, allowed)}"
+            f"{option_hint(name, allowed)}"
         )
     if unit.quantity in _DRIVE:
         raise ValueError(f"--units {role}={text}: {drive_sentence(unit)}")
@@ -135,7 +135,8 @@ def _given(role: str, text: str) -> Unit:
     return Unit(factor * unit.factor, unit.quantity, text, scaled=number is not None)
 
 
-def _hint(name: str, allowed: Iterable[str]) -> str:
+def option_hint(name: str, allowed: Iterable[str]) -> str:
+    """A question whether the nearest one was meant, written as on the command line; "" where none is near."""
     near = nearest(name, allowed)
     return f" Did you mean {near}?" if near else ""
 
@@ -176,14 +177,3 @@ def column_unit(role: str, header: str, given: Unit | None) -> tuple[Unit, str]:
     return unit, (
         f"column {header!r} says {in_header.text}, but --units {role}={given.text} was given: what was given is taken."
     )
-
-
-_ROTARY = {
-    "kg": "kg m^2", "N": "N m", "m": "rad", "m/s": "rad/s", "N/m": "N m/rad", "N s/m": "N m s/rad",
-    "N s^2/m": "N m s^2/rad", "1/m": "1/rad", "s/m": "s/rad",
-}  # fmt: skip
-
-
-def axis_unit(unit: str, rotary: bool) -> str:
-    """The unit of a linear axis, or what takes its place on a rotary one."""
-    return _ROTARY.get(unit, unit) if rotary else unit

@@ -9,6 +9,7 @@ import jax.core
 import jax.numpy as jnp
 
 from .._core.parameters import Range
+from .._core.units import axis_unit
 from ._coordinates import Quantity, read_label
 from ._scene import Scene
 from .forces._effect import AbstractEffect
@@ -17,10 +18,6 @@ from .forces._friction import Friction
 _STATE = re.compile(r"(q|qd)\[(\d+)\]")
 _COMPONENT = re.compile(r"(.+)\[(\d+)\]")
 _FORCES = {"m": "N", "rad": "N m", "m or rad": "N or N m", "": ""}
-# Units of friction along an angle, by those along a displacement.
-_ABOUT_AN_AXIS = {
-    "N": "N m", "N/m": "N m/rad", "N s/m": "N m s/rad", "N/s": "N m/s", "m": "rad", "m/s": "rad/s",
-}  # fmt: skip
 
 
 def quantity_of(scene: Scene, series: str) -> Quantity:
@@ -89,5 +86,4 @@ def in_units_of(scene: Scene, effect: AbstractEffect, allowed: Range) -> Range:
         return allowed
     if effect.normal_force is not None:
         return replace(allowed, unit=f"{allowed.unit} per N") if allowed.unit.startswith("N") else allowed
-    about = slip_unit(scene, effect) == "rad"
-    return replace(allowed, unit=_ABOUT_AN_AXIS.get(allowed.unit, allowed.unit)) if about else allowed
+    return replace(allowed, unit=axis_unit(allowed.unit, slip_unit(scene, effect) == "rad"))

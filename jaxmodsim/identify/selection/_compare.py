@@ -26,7 +26,7 @@ from ..model._parameters import split_entries
 from ..uncertainty._fit import fit, fit_law
 from ..uncertainty._result import FitResult
 from ._comparison import Comparison, CrossValidated, Part, comparison_of
-from ._opening import after, begin, counting
+from ._opening import after, begin, counting, sample_counts
 
 # Called after each iteration with the name of the model, the number of the fold that is held back (None: nothing is),
 # the number of the iteration and the root mean square of the residual.
@@ -413,9 +413,7 @@ def _parts(problem: FitProblem, state: SearchState, block: Int[np.ndarray, "runs
 
 def _blocks(runs: Runs, folds: int) -> Int[np.ndarray, "runs samples"]:
     """Number of the block of each sample, with nearly the same number of samples in each block of a run."""
-    weight = np.max(np.stack([np.asarray(x) for x in runs.weight.values()]), axis=0)
-    counts = np.sum(weight > 0, axis=1, keepdims=True)
-    return np.minimum(np.arange(weight.shape[1])[None, :] * folds // np.maximum(counts, 1), folds - 1)
+    return np.minimum(np.arange(runs.t.shape[1]) * folds // np.maximum(sample_counts(runs), 1), folds - 1)
 
 
 def _span(record: Record) -> float:

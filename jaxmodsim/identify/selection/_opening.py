@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..data._record import Runs
 from ..estimate._problem import FitProblem
@@ -13,19 +13,19 @@ from ..estimate._search import SearchOptions, SearchResult, SearchState, solve, 
 SHARE, LEAST = 0.05, 20
 
 
+def sample_counts(runs: Runs) -> Int[np.ndarray, "runs 1"]:
+    """Number of the samples of each run that count in any channel."""
+    return np.sum(np.any([np.asarray(x) > 0 for x in runs.weight.values()], axis=0), axis=1, keepdims=True)
+
+
 def opening(runs: Runs) -> Bool[np.ndarray, "runs samples"]:
     """The first samples of each run."""
-    weight = np.max(np.stack([np.asarray(x) for x in runs.weight.values()]), axis=0)
-    counts = np.maximum(np.ceil(SHARE * np.sum(weight > 0, axis=1)), LEAST)
-    return np.arange(weight.shape[1])[None, :] < counts[:, None]
+    return np.arange(runs.t.shape[1]) < np.maximum(np.ceil(SHARE * sample_counts(runs)), LEAST)
 
 
-def counting(problem: FitProblem, mask: np.ndarray, slips: np.ndarray | None = None) -> FitProblem:
-    """The problem in which only the samples in the mask count, and slip instants of the runs in `slips`.
-
-    By default slip instants count in runs of which any sample does.
-    """
-    own = (np.any(mask, axis=1) if slips is None else slips)[:, None]
+def counting(problem: FitProblem, mask: np.ndarray, *, slips: bool = True) -> FitProblem:
+    """The problem in which only the samples in the mask count, and with `slips` slip instants of runs that have any."""
+    own = np.any(mask, axis=1, keepdims=True) & slips
     runs = problem.runs._replace(
         weight={name: jnp.where(mask, weight, 0.0) for name, weight in problem.runs.weight.items()},
         slip_weight={name: jnp.where(own, weight, 0.0) for name, weight in problem.runs.slip_weight.items()},
@@ -35,12 +35,11 @@ def counting(problem: FitProblem, mask: np.ndarray, slips: np.ndarray | None = N
 
 def begin(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> SearchResult:
     """Search for the states at the first samples with these samples alone; parameters must be pinned or none."""
-    return solve(counting(problem, opening(problem.runs), np.zeros(problem.count, bool)), x, options)
+    return solve(counting(problem, opening(problem.runs), slips=False), x, options)
 
 
 def after(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> tuple[FitProblem, SearchState]:
     """The residual at `x` of the samples behind the first ones."""
-    runs = np.any([np.any(np.asarray(x) > 0, axis=1) for x in problem.runs.weight.values()], axis=0)
-    rest = counting(problem, ~opening(problem.runs), runs)
+    rest = counting(problem, ~opening(problem.runs))
     # The first evaluation of a search, which has nothing to move by yet.
     return rest, step(rest, start_search(x, rest.rows), jnp.asarray(options.rtol, x.dtype))
