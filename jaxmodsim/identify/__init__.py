@@ -37,6 +37,9 @@ from .selection._score import score as score
 from .uncertainty._coverage import coverage as coverage
 from .uncertainty._fit import fit as fit
 from .uncertainty._fit import fit_law as fit_law
+from .uncertainty._log_density import log_density as log_density
+from .uncertainty._posterior import Posterior as Posterior
+from .uncertainty._posterior import sample_posterior as sample_posterior
 from .uncertainty._profile import Profile as Profile
 from .uncertainty._profile import profile as profile
 from .uncertainty._residual_tests import residual_tests as residual_tests

@@ -304,6 +304,14 @@ class FitProblem(eqx.Module):
         columns = {name: self.runs.weight[name] for name in sorted(self.runs.weight)}
         return columns | {slip_channel(name): self.runs.slip_weight[name] for name in sorted(self.runs.slip_weight)}
 
+    def by_channel(self, rows: Float[Array, " rows"]) -> dict[str, tuple[Array, Array]]:
+        """Rows of the residual and weights of each channel, shape `[runs, samples]` each."""
+        table, split, at = jnp.reshape(rows[: self.samples], (self.count, -1)), {}, 0
+        for name, weight in self.columns.items():
+            split[name] = table[:, at : at + weight.shape[1]], weight
+            at += weight.shape[1]
+        return split
+
     @property
     def samples(self) -> int:
         """Number of rows of the residual that are samples, those without weight included."""

@@ -251,13 +251,9 @@ def estimated_noise(search: SearchResult, given: frozenset[str]) -> dict[str, Ar
 
 def by_channel(problem: FitProblem, residual: Array) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Residual in noise levels and weight of each channel, shape `[runs, samples]`."""
-    rows, split = np.asarray(residual)[: problem.samples].reshape(problem.count, -1), {}
-    at = 0
-    for name, weight in problem.columns.items():
-        width = weight.shape[1]
-        split[name] = rows[:, at : at + width], np.asarray(weight)
-        at += width
-    return split
+    return {
+        name: (np.asarray(rows), np.asarray(weight)) for name, (rows, weight) in problem.by_channel(residual).items()
+    }
 
 
 def _rescaled(search: SearchResult, problem: FitProblem) -> SearchResult:

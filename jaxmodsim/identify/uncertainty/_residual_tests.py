@@ -9,6 +9,7 @@ from jaxtyping import Float
 from scipy import special  # scipy.stats takes most of a second to import
 
 from ..model._observe import RecordedMotion
+from ._estimate import lag_number
 from ._result import FitResult
 
 # A trend or an input is named in words from this share of the variance on, at this probability of chance.
@@ -17,8 +18,8 @@ _SHARE, _CHANCE = 0.01, 0.01
 _WHITE_BAND = 1.96
 # Least variance of a correlation in units of that of white noise: negative memories must not make it vanish.
 _LEAST_VARIANCE = 0.1
-# Lags of the tests a decade of samples, and at most one for so many samples; lags looked at in units of the memory.
-_LAGS_A_DECADE, _SAMPLES_A_LAG, _MEMORIES = 10, 5, 3
+# Samples for each lag that is looked at, at least, and lags in units of the memory.
+_SAMPLES_A_LAG, _MEMORIES = 5, 3
 # Keeps divisions by what may vanish finite.
 _TINY = 1e-300
 _MEANING = {
@@ -193,11 +194,6 @@ def channel_tests(
         trends,
         crosses,
     )
-
-
-def lag_number(n: int) -> int:
-    """Lags of the tests of n samples: ten a decade, a fifth of the samples at most."""
-    return max(min(round(_LAGS_A_DECADE * math.log10(n)), n // _SAMPLES_A_LAG), 1)
 
 
 def autocorrelation(e: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
