@@ -20,7 +20,7 @@ def posterior_figure(posterior: Posterior) -> Figure:
     - `posterior`: from `jaxmodsim.identify.sample_posterior`; its first ten unknowns are drawn.
     """
     names, estimate = list(posterior.draws)[:_MOST], posterior.estimate
-    fitted = [name for name in estimate.values]
+    fitted, values = list(estimate.values), np.array([*estimate.values.values()])
     n = len(names)
     figure = Figure(figsize=(1.5 + 1.35 * n, 1.2 + 1.35 * n), layout="constrained")
     axes = figure.subplots(n, n, squeeze=False)
@@ -36,9 +36,7 @@ def posterior_figure(posterior: Posterior) -> Figure:
                 axis.plot(posterior.draws[b].ravel(), posterior.draws[a].ravel(), ",", color=BLUE, alpha=0.6)
                 if a in fitted and b in fitted:
                     k = [fitted.index(b), fitted.index(a)]
-                    _ellipse(
-                        axis, np.array([estimate.values[b], estimate.values[a]]), estimate.covariance[np.ix_(k, k)]
-                    )
+                    _ellipse(axis, values[k], estimate.covariance[np.ix_(k, k)])
             _label(axis, posterior, names, i, j)
     axes[0, 0].plot([], [], color=BLUE, label="posterior")
     axes[0, 0].plot([], [], color=RED, label="fit, standard errors")

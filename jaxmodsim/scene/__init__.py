@@ -20,6 +20,7 @@ from ._names import scene_numbers as scene_numbers
 from ._names import scene_ranges as scene_ranges
 from ._quantities import describe_series as describe_series
 from ._quantities import quantity_of as quantity_of
+from ._robot import read_robot as read_robot
 from ._scene import Scene as Scene
 from ._signal import Signal as Signal
 from ._signal import sample_times as sample_times

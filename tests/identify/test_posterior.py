@@ -22,7 +22,7 @@ from jaxmodsim.identify.uncertainty._log_density import _SoftBox
 from jaxmodsim.identify.uncertainty._result import FitResult
 from jaxmodsim.plot import posterior_figure
 
-from ..helpers.sprung import lagrangian
+from ..helpers.sprung import DRIVE, sprung_mass
 
 T = np.linspace(0.0, 3.0, 120)
 
@@ -35,7 +35,7 @@ class Decay(eqx.Module):
 
 def fitted(measured, ranges=None, prior=None, loss: AbstractLoss | None = None, start=(1.0, 1.0)) -> FitResult:
     record = jms.Record(T, measured)
-    values = dict(zip(("A", "k"), start, strict=True))
+    values: dict[str, float] = dict(zip(("A", "k"), start, strict=True))
     free = FreeParameters.of(values, ranges or {}, tuple(values))
     windows = cut((record,), None)
     known = prior or {}
@@ -188,11 +188,7 @@ def test_without_blackjax_the_error_names_the_extra(monkeypatch: pytest.MonkeyPa
 
 
 def test_delays_and_free_starts_and_events_are_among_the_unknowns() -> None:
-    scene = jms.Scene(
-        lagrangian,
-        params={"m": 1.0, "k": 20.0, "u": 0.0},
-        effects=(jms.AppliedForce(_drive), jms.Friction(jms.Coulomb(0.4))),
-    )
+    scene = sprung_mass(DRIVE, jms.Friction(jms.Coulomb(0.4)), m=1.0)
     t = np.linspace(0.0, 1.0, 101)
     u = 3.0 * np.sin(2 * np.pi * t)
     signal = {"m": 1.0, "k": 20.0, "u": jms.Signal(t, u)}
@@ -207,7 +203,3 @@ def test_delays_and_free_starts_and_events_are_among_the_unknowns() -> None:
     gradient, step = jax.jit(jax.grad(density))(u0 + 0.1), 1e-4
     differences = [(density(u0 + 0.1 + e) - density(u0 + 0.1 - e)) / (2 * step) for e in step * jnp.eye(5)]
     np.testing.assert_allclose(gradient, differences, rtol=1e-3, atol=2e-3)
-
-
-def _drive(t, q, qd, p):
-    return jnp.reshape(p["u"], (1,))

@@ -4,13 +4,12 @@ import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import ModuleType
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..._core.arguments import as_whole
 from ._estimate import ParameterEstimate
@@ -185,7 +184,7 @@ def _sampled(
     (state, tuned), _ = adaptation.run(warm_key, start, num_steps=warmup)
     nuts = blackjax.nuts(density, **tuned)
 
-    def draw(state: NamedTuple, key: Array) -> tuple[NamedTuple, tuple[Array, Array, Array]]:
+    def draw(state: PyTree, key: Array) -> tuple[PyTree, tuple[Array, Array, Array]]:
         state, info = nuts.step(key, state)
         return state, (state.position, info.is_divergent, info.num_integration_steps)
 
