@@ -67,7 +67,7 @@ def low_pass(x: np.ndarray) -> np.ndarray:
 
 def main(out: Path, smoke: bool = False) -> None:
     """Make records, identify, count."""
-    sets, seconds = (2, 6.0) if smoke else (20, 20.0)
+    sets, seconds = (2, 6.0) if smoke else (20, 10.0)
     t, rng, scene = np.arange(0.0, seconds, 1 / RATE), np.random.default_rng(0), arm()
     drawn = [(rng.uniform(0.05, 0.25), rng.uniform(0.6, 5.0), rng.uniform(0, 6.28)) for _ in range(35)]
     a, w, phase = (np.reshape(x, (7, 5, 1)) for x in zip(*drawn, strict=True))

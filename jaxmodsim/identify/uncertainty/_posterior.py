@@ -155,7 +155,7 @@ def sample_posterior(
     with ThreadPoolExecutor() as pool:
         several = pool.map(lambda key: _sampled(density, key, blackjax, draws, warmup), keys)
         u, diverged, steps = (jnp.stack(x) for x in zip(*several, strict=True))
-    x = jnp.moveaxis(jax.jit(jax.vmap(jax.vmap(density.vector)))(u), -1, 0)
+    x = _values(density, u)
     rhat, bulk, tail = (
         np.asarray(jnp.stack([of(each) for each in x]))
         for of in (diagnostics.rhat, diagnostics.ess_bulk, diagnostics.ess_tail)
@@ -168,6 +168,12 @@ def sample_posterior(
         gradients=int(jnp.sum(steps)),
         estimate=result.estimate,
     )
+
+
+@eqx.filter_jit
+def _values(density: LogDensity, u: Float[Array, "chains draws n"]) -> Float[Array, "n chains draws"]:
+    """The unknowns in their units."""
+    return jnp.moveaxis(jax.vmap(jax.vmap(density.vector))(u), -1, 0)
 
 
 @eqx.filter_jit
