@@ -155,13 +155,9 @@ def sample_posterior(
     with ThreadPoolExecutor() as pool:
         several = pool.map(lambda key: _sampled(density, key, blackjax, draws, warmup), keys)
         u, diverged, steps = (jnp.stack(x) for x in zip(*several, strict=True))
-    x = _values(density, u)
-    rhat, bulk, tail = (
-        np.asarray(jnp.stack([of(each) for each in x]))
-        for of in (diagnostics.rhat, diagnostics.ess_bulk, diagnostics.ess_tail)
-    )
+    x, rhat, bulk, tail = (np.asarray(each) for each in _summary(density, u, diagnostics))
     return Posterior(
-        draws=dict(zip(density.names, np.asarray(x), strict=True)),
+        draws=dict(zip(density.names, x, strict=True)),
         rhat=dict(zip(density.names, rhat.tolist(), strict=True)),
         effective=dict(zip(density.names, np.minimum(bulk, tail).tolist(), strict=True)),
         divergences=int(jnp.sum(diverged)),
@@ -171,9 +167,15 @@ def sample_posterior(
 
 
 @eqx.filter_jit
-def _values(density: LogDensity, u: Float[Array, "chains draws n"]) -> Float[Array, "n chains draws"]:
-    """The unknowns in their units."""
-    return jnp.moveaxis(jax.vmap(jax.vmap(density.vector))(u), -1, 0)
+def _summary(
+    density: LogDensity, u: Float[Array, "chains draws n"], diagnostics: ModuleType
+) -> tuple[Float[Array, "n chains draws"], Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
+    """The unknowns in their units, R-hat, and effective samples for the bulk and the tails."""
+    x = jnp.moveaxis(jax.vmap(jax.vmap(density.vector))(u), -1, 0)
+    rhat, bulk, tail = jax.lax.map(
+        lambda x: tuple(of(x) for of in (diagnostics.rhat, diagnostics.ess_bulk, diagnostics.ess_tail)), x
+    )
+    return x, rhat, bulk, tail
 
 
 @eqx.filter_jit
