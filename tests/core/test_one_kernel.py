@@ -29,7 +29,7 @@ def _compiled(function, *args):
         pytest.param(lambda x: (x.T @ x)[:2, :3] @ x[:3, :3], (X[:3, :3],), id="small matrices"),
         pytest.param(lambda x, y: (x, y), (X, np.array(True)), id="handed on"),
         pytest.param(lambda x, y: x + 0 * y, (X, np.uint8(3)), id="argument of no use"),
-        pytest.param(lambda x, y: jnp.where(False, x, 1.0), (X, np.array(np.nan, np.float32)), id="none of use"),  # noqa: FBT003
+        pytest.param(lambda x, y: jnp.where(False, x, 1.0), (X, np.array(np.nan, np.float32)), id="none of use"),
         pytest.param(lambda x, v: jnp.interp(v, x, x * x), (np.sort(X[:, 0]), np.float64(0.3)), id="interpolation"),
         pytest.param(lambda x: jax.scipy.special.erfinv(jnp.tanh(x)) + jnp.sinh(x), (X,), id="special functions"),
     ],
