@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from .._core.progress import progress_line
 from ..plot import ramp_figure, stick_figure
 from ..validation.testbench import RampResult, ramp_cases, run_ramp, stick_sweep
-from ._output import Content, console, show_paths, show_table, write
+from ._output import Content, show_paths, show_table, write
 
 PARTS = {
     "a": "a: Coulomb friction by sign(v)",
@@ -26,11 +27,11 @@ def report_testbench(out: Path) -> None:
 def testbench_files() -> dict[str, Content]:
     """Run the bench and print its tables; returns figures, tables and JSON by file name."""
     measured = []
-    with console.status("") as status:
+    with progress_line("test bench") as show:
         for case in ramp_cases():
-            status.update(f"{case.part}: {case.label}")
+            show(f"{case.part}: {case.label}")
             measured.append(run_ramp(case))
-        status.update("LuGre over sigma0 and sigma1")
+        show("LuGre over sigma0 and sigma1")
         sweep = stick_sweep()
     table, grid = _table(measured), _grid(sweep)
     show_table(table, "A box of 2 kg under a force rising with time")
