@@ -50,7 +50,7 @@ def _followed(
     above.plot(record.t, record.measured + residual, color=RED, lw=1.1, label=label)
     factor, small = small_unit(unit)
     above.set(ylabel=f"{quantity} [{unit}]", title=f"{record.name}: RMSE {factor * rmse:.3g} {small}")
-    above.legend(loc="upper right")
+    figure.legend(loc="outside upper right", ncols=2, frameon=False)
     below.plot(record.t, factor * residual, color=BLUE, lw=1.0)
     below.axhline(0.0, color=GREY, lw=0.6)
     below.set(xlabel="time [s]", ylabel=f"simulated - measured [{small}]")
