@@ -74,4 +74,4 @@ print(f"on the second record: {1e6 * judged.rmse['measured']:.1f} um, with noise
 # The same from the shell, without a line of code, models compared and a report written:
 #
 # `jaxmodsim fit axis_1.csv --held-out axis_2.csv --time "time [ms]" --position "position [mm]" --force "current [A]"
-# --force-gain 12 --report report`
+# --units force=12 --report report`
