@@ -17,7 +17,7 @@ jms.tune_cpu()
 jax.config.update("jax_enable_x64", True)
 
 # %% [markdown]
-# The drive's logger would write the torque. Here it is made: to and fro, and then a slow rise from rest.
+# The drive's logger would write the torque. Here it is made: back and forth, and then a slow rise from rest.
 
 # %%
 t = np.arange(0.0, 3.0, 0.02)

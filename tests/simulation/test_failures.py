@@ -145,7 +145,7 @@ def test_energies_of_a_run_that_cannot_be_repeated_with_the_work_beside_it() -> 
         _ = run.energy
 
 
-EARLY = """
+ENDS_EARLY = """
 import jax, jaxmodsim as jms
 jax.config.update("jax_enable_x64", True)
 def swing(k):
@@ -161,13 +161,13 @@ InteractiveShell.instance().run_cell({code!r})
 @pytest.mark.parametrize("where", ["script", "cell"])
 @pytest.mark.parametrize("call", ["jax.jit(swing)(2.0)", "eqx.filter_jit(swing)(2.0)"])
 def test_the_last_line_of_an_early_end_inside_jit_names_the_cause(where: str, call: str) -> None:
-    code = f"{EARLY}\nimport equinox as eqx\n{call}\n"
+    code = f"{ENDS_EARLY}\nimport equinox as eqx\n{call}\n"
     code = code if where == "script" else IN_A_CELL.format(code=code)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr.rstrip().splitlines()[-1].startswith("The step limit was reached before t1: pass a larger")
 
 
 def test_an_early_end_inside_jit_that_is_caught_is_not_said_again() -> None:
-    code = f"{EARLY}\ntry:\n    jax.jit(swing)(2.0)\nexcept Exception:\n    raise ValueError('mine') from None\n"
+    code = f"{ENDS_EARLY}\ntry:\n    jax.jit(swing)(2.0)\nexcept Exception:\n    raise ValueError('mine') from None\n"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr.rstrip().splitlines()[-1] == "ValueError: mine"
