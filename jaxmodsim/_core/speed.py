@@ -11,8 +11,8 @@ from jax._src import xla_bridge
 _LOG = logging.getLogger("jaxmodsim")
 # Compiling that takes longer is said [s].
 _LONG = 3.0
-# Functions that were compiled, by the line they are defined in.
-_COMPILED: dict[str, set[int]] = {}
+# Identities of the functions that were compiled, by the identity of their code, which those that a loop makes share.
+_COMPILED: dict[int, set[int]] = {}
 _TOO_OFTEN = 3
 
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
@@ -87,14 +87,14 @@ def remark_on_compilation(seconds: float, functions: Iterable[object]) -> None:
         code = getattr(each, "__code__", None)
         if code is None:
             continue
-        line = f"{code.co_filename}:{code.co_firstlineno}"
-        seen = _COMPILED.setdefault(line, set())
-        seen.add(id(each))  # what was compiled is kept, so no other function gets its identity
+        seen = _COMPILED.setdefault(id(code), set())
+        seen.add(id(each))  # what was compiled is kept, so nothing else gets its identity
         if len(seen) == _TOO_OFTEN:
             _LOG.warning(
-                "The function of %s was compiled for the third time, as a new function each time: define it once,"
+                "The function of %s:%d was compiled for the third time, as a new function each time: define it once,"
                 " outside of the loop, and pass what changes by the params of the scene.",
-                line,
+                code.co_filename,
+                code.co_firstlineno,
             )
 
 
