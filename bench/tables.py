@@ -250,6 +250,21 @@ REPORTS = {
             ("parameters", "RMSE", "RMSE with 5 steps a sample", "held back", "standard error", "not determined"),
         ),),
     ),
+    "new_records": Report(
+        "Whether a fit to one record keeps its word on another one.", "identification",
+        (
+            Table(
+                "{pairs} synthetic pairs of records of an axis with LuGre friction, which depends on position by 5 %,"
+                " too; its level differs by 0 to {largest:g} % (drawn). A law is chosen by folds of the first record;"
+                " errors on the second, and its samples within bands for 90 %.",
+                ("samples in the band", "within 10 % of the best", "median error"), ("case",), ("quantity", "at"),
+            ),
+            Table(
+                "Pairs that are said to differ, by LuGre's law with 8 parameters, at 5 % for all together.",
+                ("said to differ", "friction level named"), ("case",), ("quantity", "at"),
+            ),
+        ),
+    ),
     "coverage": Report(
         "How often 95 % intervals hold the truth.", "identification",
         (Table(
