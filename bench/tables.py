@@ -259,10 +259,6 @@ REPORTS = {
                 " errors on the second, and its samples within bands for 90 %.",
                 ("samples in the band", "within 10 % of the best", "median error"), ("case",), ("quantity", "at"),
             ),
-            Table(
-                "Pairs that are said to differ, by LuGre's law with 8 parameters, at 5 % for all together.",
-                ("said to differ", "friction level named"), ("case",), ("quantity", "at"),
-            ),
         ),
     ),
     "coverage": Report(

@@ -114,7 +114,7 @@ class Comparison:
     and the derivatives J of the output of the fit to everything: parts begin anew and are short, and hide what
     uncertain parameters make of a whole record. A friction level that varies from record to record by 4 % (standard
     deviation) adds the same to all models, as it is the machine that varies: as much as the model with the least error
-    on what was held back says.
+    on what was held back says, of those whose parameters the records determine if there are any.
 
     Errors are root mean squares in the unit of the channel where there is one, in noise levels (as given, or the least
     that any model found) where there are several; with another loss than squares, roots of the mean loss. The standard
@@ -163,7 +163,7 @@ class Comparison:
         """Name of the simplest model that is expected to be no worse than the best by more than one standard error.
 
         Nor may its error on what was held back be larger by more than a tenth: with few parts the standard error is
-        rough.
+        rough. A tenth alone counts where the records do not determine all parameters of the best.
 
         The simplest is the one with the fewest parameters among those whose parameters the records determine, and among
         the others where there is none of these: what nothing determines is not known of another motion.
@@ -179,7 +179,11 @@ class Comparison:
         near = [
             each
             for each in self.ranked
-            if (each.over <= each.over_error and each.held_back <= _AS_GOOD * best.held_back) or each is best
+            if each is best
+            or (
+                each.held_back <= _AS_GOOD * best.held_back
+                and (each.over <= each.over_error or bool(best.undetermined))
+            )
         ]
         return min(near, key=lambda each: (bool(each.undetermined), each.parameters, each.expected)).name
 
@@ -231,9 +235,11 @@ class Comparison:
         if simple.expected > simple.held_back:
             said += f", {simple.expected:.4g} to expect on a new record"
         if simple is not best:
+            near = simple.over <= simple.over_error
             said += (
-                f"; {best.name} with {best.parameters} is expected to be better by {simple.over:.2g}, which is within"
-                f" one standard error, {simple.over_error:.2g}."
+                f"; {best.name} with {best.parameters} is expected to be better by {simple.over:.2g}, which is"
+                f" {'within' if near else 'more than'} one standard error, {simple.over_error:.2g}"
+                f"{'' if near else ', but the records do not determine its ' + _listed(best.undetermined)}."
             )
         else:
             simpler = [each for each in self.ranked if each.parameters < best.parameters]
@@ -373,7 +379,7 @@ def _expected(
     """Mean loss to expect on a new record, by the name of the model."""
     searches = {name: _search_of(each) for name, each in judged.items()}
     covariance = {name: covariances(each.result, VARIATION, None) for name, each in judged.items()}
-    best = min(means, key=lambda name: means[name])
+    best = min(means, key=lambda name: (bool(_undetermined(judged[name].result)), means[name]))
     between = _mean(change_between(searches[best], covariance[best][1]), searches[best], levels)
     return {
         name: mean + _mean(mean_variances(searches[name], covariance[name][0]), searches[name], levels) + between
