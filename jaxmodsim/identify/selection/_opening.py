@@ -73,7 +73,7 @@ def pinned(problem: FitProblem, x: Float[Array, " n"], result: FitResult, free: 
     """
     mean = problem.free.vector(problem.split(x)[0])
     stiff = float(jnp.finfo(mean.dtype).eps) ** -0.25
-    known = np.sqrt(np.diag(result.estimate.information)[: len(mean)])
+    known = np.sqrt(np.maximum(np.diag(result.estimate.information)[: len(mean)], 0.0))  # rounding may leave less
     size = np.abs(np.asarray(mean))
     weight = stiff * np.maximum(known, 1 / np.where(size > 0, size, 1.0))
     moves = np.array([name in free for name in problem.free.names], bool)
