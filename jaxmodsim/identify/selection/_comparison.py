@@ -238,8 +238,7 @@ class Comparison:
             near = simple.over <= simple.over_error
             said += (
                 f"; {best.name} with {best.parameters} is expected to be better by {simple.over:.2g}, which is"
-                f" {'within' if near else 'more than'} one standard error, {simple.over_error:.2g}"
-                f"{'' if near else ', but the records do not determine its ' + _listed(best.undetermined)}."
+                f" {'within' if near else 'more than'} one standard error, {simple.over_error:.2g}."
             )
         else:
             simpler = [each for each in self.ranked if each.parameters < best.parameters]
