@@ -3,11 +3,15 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from cycler import cycler
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 from bench.layout import OURS, Recorded
 from bench.tables import HAND
+
+# Okabe and Ito, Color universal design, 2008: told apart without red and green.
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8a8a8a", "#e69f00", "#56b4e9", "#000000")
 
 
 def save(figure: Figure, path: Path, dpi: int = 150) -> None:
@@ -79,4 +83,5 @@ FIGURES: dict[str, Callable[[Recorded], Figure]] = {
 def write(found: Recorded, folder: Path) -> None:
     """Draw a result, where it has a figure."""
     if found.name in FIGURES:
-        save(FIGURES[found.name](found), folder / f"{found.name}.png")
+        with plt.rc_context({"axes.prop_cycle": cycler(color=_COLOURS)}):
+            save(FIGURES[found.name](found), folder / f"{found.name}.png")

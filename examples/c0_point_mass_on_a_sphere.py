@@ -26,7 +26,7 @@ from jaxmodsim.scene import State, forward_dynamics, vector_field
 jms.tune_cpu()
 jax.config.update("jax_enable_x64", True)
 
-BLUE, RED, GREEN, GREY = "#1f5fa8", "#c2452d", "#2e8b57", "#8a8a8a"
+BLUE, RED, GREEN, GREY, YELLOW = "#0072b2", "#d55e00", "#009e73", "#8a8a8a", "#e69f00"
 EYE = (75.0, -60.0)  # phi and theta of the onlooker [deg]
 CYLINDRICAL, SPHERICAL = jms.Cylindrical(), jms.Spherical()
 M, R, G, A = 0.5, 1.2, 9.81, 0.2
@@ -327,6 +327,11 @@ def globe(axis, title):
     axis.set_box_aspect((1, 1, 1), zoom=1.1)
 
 
+def below(axis, ncols=2):
+    """A legend below a panel."""
+    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=ncols, frameon=False, fontsize=9)
+
+
 def draw(conserved, swings, runs, audit):
     """The figure."""
     figure = Figure(figsize=(15, 9), layout="constrained")
@@ -334,26 +339,26 @@ def draw(conserved, swings, runs, audit):
     ball, wire = (figure.add_subplot(grid[i, 0], projection="3d") for i in (0, 1))
     force, errors, speed, account = (figure.add_subplot(grid[i, j]) for i in (0, 1) for j in (1, 2))
 
-    globe(ball, "(h) Spherical pendulum: around, and over the poles")
+    globe(ball, "Spherical pendulum: around, and over the poles")
     for (name, run), color in zip(swings.items(), (RED, BLUE), strict=False):
         path(ball, run.q, color, lw=2)
         formula = M * (G * run.q[:, 2] - np.sum(np.square(run.qd), axis=1)) / R
         force.plot(run.t, formula, color=color, lw=6, alpha=0.3, label=f"{name}: formula")
         force.plot(run.t, run.reactions["sphere"].multiplier[:, 0], color=color, lw=1.2, label="multiplier of |x| = R")
-        force.legend(loc="lower center", ncols=2)
+        below(force)
     force.axhspan(0.0, 8.0, color=GREY, alpha=0.15, lw=0)
     force.text(0.0, 6.2, "outwards: a mass that lies loose stays on")
     force.text(0.0, -24.0, "inwards:\nit lifts off")
-    force.set(ylabel="radial force of constraint [N]", ylim=(-34, 8), title="(g) The sphere pushes, then pulls")
+    force.set(ylabel="radial force of constraint [N]", ylim=(-28, 8), title="The sphere pushes, then pulls")
 
     t, by_solver = conserved
     for (name, both), color in zip(by_solver.items(), (RED, BLUE), strict=False):
         for x, what, style in zip(both, ("momentum of theta", "energy"), ("-", "--"), strict=True):
             errors.semilogy(t[1:], np.maximum.accumulate(x)[1:], color=color, ls=style, lw=1.8, label=f"{name}: {what}")
-    errors.set(ylabel="largest relative error so far", ylim=(1e-17, 1e-2), title="(h) What a run conserves")
-    errors.legend(loc="center right", bbox_to_anchor=(1.0, 0.42))
+    errors.set(ylabel="largest relative error so far", ylim=(1e-17, 1e-2), title="What a run conserves")
+    below(errors)
 
-    globe(wire, "(i), (j) Bead on the spiral: a dot every 0.2 s")
+    globe(wire, "Bead on the spiral: a dot every 0.2 s")
     turns = np.linspace(-60.0, 8.0, 4000)[:, None]
     path(wire, moving(on_spiral, turns, turns)[0], "black", lw=1)
     for (name, run), color in zip(runs.items(), (BLUE, RED, GREEN), strict=False):
@@ -363,18 +368,22 @@ def draw(conserved, swings, runs, audit):
             path(wire, x[::60], color, ls="", marker="o", ms=4)
         if "dry" in name:
             wire.plot(*x[-1], color=color, marker="*", ms=16, mec="black", ls="", label="sticks here")
-            wire.legend(loc="upper left")
-    speed.set(ylabel="speed [m/s]", ylim=(0, None), title="(i), (j) Free, braked by drag, stuck by friction")
-    speed.legend()
+            wire.legend(loc="upper left", bbox_to_anchor=(0.0, 0.95), frameon=False)
+    speed.set(ylabel="speed [m/s]", ylim=(0, None), title="Free, braked by drag, stuck by friction")
+    below(speed, 3)
 
     if audit is not None:
         stack = audit.kinetic, audit.potential + M * G * R, audit.dissipated["friction"]
         names = "kinetic", "potential, from the lower pole", "dissipated"
-        account.stackplot(audit.t, *stack, labels=names, colors=(BLUE, GREEN, RED), alpha=0.6)
-        account.legend(loc="center right")
-    account.set(ylabel="energy [J]", title="(j) Drag: nothing is missing")
+        account.stackplot(audit.t, *stack, labels=names, colors=(BLUE, YELLOW, GREY), alpha=0.6)
+        below(account, 3)
+    account.set(ylabel="energy [J]", title="Drag: nothing is missing")
     for axis in (force, errors, speed, account):
         axis.set_xlabel("time [s]")
+    for letter, axis in zip("abcdef", (ball, force, errors, wire, speed, account), strict=True):
+        title = axis.get_title()
+        axis.set_title("")
+        axis.set_title(f"$\\bf{{{letter}}}$  {title}", loc="left")
     return figure
 
 

@@ -64,6 +64,14 @@ def test_the_gallery_lists_every_example() -> None:
     assert sorted(linked) == sorted(f"examples/{path.name}" for path in (ROOT / "examples").glob("*.py"))
 
 
+def test_notebooks_are_listed_and_short() -> None:
+    notebooks = {path.name: path.read_text() for path in (ROOT / "examples" / "notebooks").glob("*.py")}
+    linked = re.findall(r"\]\(\.\./examples/notebooks/(\w+\.py)\)", (ROOT / "docs" / "notebooks.md").read_text())
+    assert sorted(linked) == sorted(notebooks)
+    assert max(len(text.splitlines()) for text in notebooks.values()) < 80
+    assert not [name for name, text in notebooks.items() if "pyplot" in text]
+
+
 def test_the_site_has_every_page() -> None:
     navigation = re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text())
     assert {path.name for path in (ROOT / "docs").glob("*.md")} <= set(navigation)

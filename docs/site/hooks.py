@@ -1,8 +1,8 @@
 """What mkdocs does beside its plugins: pages made from other files, links that hold on a forge and on the site.
 
 Pages under docs/ link to files of the repository (`../examples/a0_box_with_friction.py`, `../CHANGELOG.md`), which a
-forge shows. Here those links lead to pages that are made from these files: the changelog, one page for each example
-and one for each room of the package.
+forge shows. Here those links lead to pages that are made from these files: the changelog, one page for each example,
+one for each notebook and one for each room of the package.
 """
 
 import re
@@ -21,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 import api  # noqa: E402
 import formulas  # noqa: E402
 import gallery  # noqa: E402
+import notebooks  # noqa: E402
 
 _COPIES = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
 _LINK = re.compile(r"\]\((?:\.\./)+([\w./]+?)(#[\w-]*)?\)")
@@ -59,6 +60,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         )
         for figure in shown.figures:
             files.append(File.generated(config, f"examples/{figure.name}", abs_src_path=str(figure)))
+    for notebook in notebooks.notebooks():
+        shown, place = notebooks.recorded(notebook), "examples/notebooks"
+        files.append(File.generated(config, f"{place}/{notebook.stem}.md", content=shown.page))
+        files.append(File.generated(config, f"{place}/{notebook.stem}.ipynb", content=shown.plain))
+        for name, content in shown.files.items():
+            files.append(File.generated(config, f"{place}/{name}", content=content))
     if _LIVE.exists():
         made = ROOT / "build" / "live.html"
         subprocess.run([sys.executable, str(_LIVE), str(made)], cwd=ROOT, check=True)

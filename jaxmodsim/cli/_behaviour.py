@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from .._core.progress import progress_line
 from ..plot import Figure, behaviour_figure
 from ..validation.behaviour import EXPERIMENTS, ExperimentResult, Verdict, run_bench
 from ._output import Content, console, show_paths, show_table, write
@@ -11,8 +12,8 @@ from ._output import Content, console, show_paths, show_table, write
 
 def report_behaviour(out: Path) -> bool:
     """Run the bench, print its table, write everything to `out`; returns whether no law failed."""
-    with console.status("laws") as status:
-        outcomes = run_bench(progress=lambda name: status.update(f"{name}: done"))
+    with progress_line("laws") as show:
+        outcomes = run_bench(progress=lambda name: show(f"{name} is done"))
     show_table(_table(outcomes), "Friction laws in the standard experiments: verdict and number")
     show_table(_limits(), "The numbers and what they must keep to pass")
     files: dict[str, Content] = {

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .._core.progress import candidate_words, iteration_words, progress_line
 from ..identify import (
     AxisLimits,
     Comparison,
@@ -44,7 +45,7 @@ from ._fitted import (
     with_units,
 )
 from ._options import Interrupted
-from ._output import Content, console, say, show_paths, show_table, write
+from ._output import Content, say, show_paths, show_table, write
 from ._plan import FitRequest, Plan, plan_of
 from ._report_html import report_page
 
@@ -79,7 +80,7 @@ def run_fit(request: FitRequest) -> None:
             interrupted = interrupted or design.ending == "was interrupted"
         if request.report is not None and not interrupted:
             for name in _least_known(fitted):
-                with console.status(f"profile of {name}"):
+                with progress_line("likelihood profile", name):
                     profiles.append(profile(fitted.result, name, points=_POINTS))
     except KeyboardInterrupt:
         interrupted = True
@@ -157,11 +158,10 @@ def _ctrl_c() -> Iterator[Callable[[], None]]:
 
 def _compared(plan: Plan, substeps: int) -> Comparison:
     judged: dict[str, Any] = {"hold_out": plan.held_out} if plan.folds is None else {"folds": plan.folds}
-    with console.status("compiling") as status, _ctrl_c() as end:
+    with progress_line("compare") as show, _ctrl_c() as end:
 
         def progress(name: str, fold: int | None, step: int, rms: float) -> None:
-            held = "" if fold is None else f", fold {fold + 1} held back"
-            status.update(f"{name}{held}, iteration {step}: RMSE {rms:.6g}")
+            show(candidate_words(name, fold, step, rms))
             end()
 
         options = {**judged, **plan.options, "substeps": substeps, "progress": progress}
@@ -172,11 +172,10 @@ def fit_with_progress(
     scene: Scene, records: Record | Sequence[Record], free: Sequence[str], **options: Any
 ) -> FitResult:
     """`fit` with a line that shows how it goes."""
-    with console.status("compiling") as status, _ctrl_c() as end:
+    with progress_line("fit") as show, _ctrl_c() as end:
 
         def progress(step: int, rms: float, values: dict[str, float]) -> None:
-            shown = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
-            status.update(f"iteration {step}: RMSE {rms:.6g}  {shown}")
+            show(iteration_words(step, rms, values))
             end()
 
         return fit(scene, records, free, progress=progress, **options)
@@ -253,19 +252,14 @@ def _designed(request: FitRequest, fitted: Fitted) -> InputDesign:
         rotary=fitted.plan.rotary,
     )
     numbers = scene_numbers(fitted.scene)
-    with console.status("designing the next input: compiling") as status:
-
-        def progress(step: int, goal: float) -> None:
-            status.update(f"designing the next input: iteration {step}, goal {goal:.4g}")
-
-        design = design_input(
-            fitted.scene,
-            [name for name in result.values if name in numbers],
-            limits,
-            duration=request.duration or max(float(record.t[-1] - record.t[0]) for record in records),
-            noise=result.diagnostics.noise["measured"],
-            dt=float(np.median(np.diff(records[0].t))),
-            q0=[0.5 * (low + high)],
-            progress=progress,
-        )
+    design = design_input(
+        fitted.scene,
+        [name for name in result.values if name in numbers],
+        limits,
+        duration=request.duration or max(float(record.t[-1] - record.t[0]) for record in records),
+        noise=result.diagnostics.noise["measured"],
+        dt=float(np.median(np.diff(records[0].t))),
+        q0=[0.5 * (low + high)],
+        progress=True,
+    )
     return replace(design, units={name: result.estimate.units[name] for name in design.values})

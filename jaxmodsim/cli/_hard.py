@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from .._core.progress import progress_line
 from ..plot import hard_figure, step_limits_figure
 from ..validation.hard import TRANSFORMS, CaseReport, HardCase, check_many, choose
 from ._options import Interrupted
@@ -40,12 +41,12 @@ def report_hard(request: HardRequest) -> bool:
     transforms = TRANSFORMS if request.transforms == "all" else tuple(request.transforms.split(","))
     verdicts: dict[str, CaseReport] = {}
     stopped = False
-    with console.status("hard cases") as status:
+    with progress_line("hard cases") as show:
         try:
             for verdict in check_many(request.names, transforms=transforms, jobs=request.jobs):
                 verdicts[verdict.case.name] = verdict
                 done = f"{len(verdicts)} of {len(cases)}: {verdict.case.name}: {'pass' if verdict.ok else 'FAIL'}"
-                status.update(done)
+                show(done)
                 if not console.is_terminal:
                     say(done)
         except KeyboardInterrupt:

@@ -1,13 +1,16 @@
 """`jaxmodsim testbench`: figures, table and sweep of the test bench."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from .._core.progress import progress_line
+from .._core.speed import cores
 from ..plot import ramp_figure, stick_figure
 from ..validation.testbench import RampResult, ramp_cases, run_ramp, stick_sweep
-from ._output import Content, console, show_paths, show_table, write
+from ._output import Content, show_paths, show_table, write
 
 PARTS = {
     "a": "a: Coulomb friction by sign(v)",
@@ -25,13 +28,16 @@ def report_testbench(out: Path) -> None:
 
 def testbench_files() -> dict[str, Content]:
     """Run the bench and print its tables; returns figures, tables and JSON by file name."""
-    measured = []
-    with console.status("") as status:
-        for case in ramp_cases():
-            status.update(f"{case.part}: {case.label}")
-            measured.append(run_ramp(case))
-        status.update("LuGre over sigma0 and sigma1")
-        sweep = stick_sweep()
+    cases = ramp_cases()
+    with progress_line("test bench") as show, ThreadPoolExecutor(cores()) as pool:
+        grid_of_runs = pool.submit(stick_sweep)  # compiles longest
+        # Neighbours are alike: apart from each other, the second finds compiled what it needs.
+        apart = cases[::2] + cases[1::2]
+        for case, _ in zip(apart, pool.map(run_ramp, apart), strict=True):
+            show(f"{case.part}: {case.label}")
+        show("LuGre over sigma0 and sigma1")
+        sweep = grid_of_runs.result()
+    measured = [run_ramp(case) for case in cases]  # compiled by now, and timed alone
     table, grid = _table(measured), _grid(sweep)
     show_table(table, "A box of 2 kg under a force rising with time")
     show_table(grid, "LuGre in stick over sigma0 and sigma1")

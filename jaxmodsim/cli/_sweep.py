@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from .._core.progress import progress_line
 from .._core.speed import tune_cpu
 from ..plot import map2d
-from ..sweeps import SweepPlan, SweepProgress, plan_sweep, progress_bar, sweep
+from ..sweeps import SweepPlan, SweepProgress, SweepWords, plan_sweep, sweep
 from ._options import Interrupted
 from ._output import say, show_paths, show_table, write
 from ._spec import Spec, read_spec
@@ -92,11 +93,12 @@ def _run(request: SweepRequest, spec: Spec) -> None:
     started = time.perf_counter()
     with _executor(request) as executor:
         try:
-            with progress_bar() as show:
+            with progress_line("sweep") as show:
+                words = SweepWords()
 
                 def report(now: SweepProgress) -> None:
                     seen.append(now)
-                    show(now)
+                    show(words(now))
 
                 results = sweep(
                     spec.system,

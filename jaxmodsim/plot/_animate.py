@@ -1,5 +1,6 @@
 """A mechanism in motion."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, final
@@ -20,6 +21,17 @@ from ._figure import Figure
 from ._style import BLUE, GREY
 
 _MOST_FRAMES = 5000
+_BUTTONS = {
+    "minus": "&minus;",
+    "fast-backward": "|&#9664;",
+    "step-backward": "&lsaquo;",
+    "play fa-flip-horizontal": "&#9664;",
+    "pause": "||",
+    "play": "&#9654;",
+    "step-forward": "&rsaquo;",
+    "fast-forward": "&#9654;|",
+    "plus": "+",
+}
 
 
 @final
@@ -46,7 +58,10 @@ class Animation:
             raise ValueError(f"An animation goes into a file that ends in .gif or .html, but {str(path)!r} was given.")
 
     def _repr_html_(self) -> str:
-        return self._drawn().to_jshtml(fps=self._fps)
+        page = self._drawn().to_jshtml(fps=self._fps)
+        # The symbols on its buttons would come from the network.
+        page = re.sub(r"<link rel=\"stylesheet\"[^>]*>", "", page)
+        return re.sub(r'<i class="fa fa-([^"]+)"></i>', lambda match: _BUTTONS[match[1]], page)
 
     def _drawn(self) -> FuncAnimation:
         space = self._chains[0].shape[2] == 3

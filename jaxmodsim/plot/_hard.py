@@ -8,12 +8,12 @@ from matplotlib.axes import Axes
 
 from ..validation.hard import CaseReport, largest_steps
 from ._figure import Figure
-from ._style import BLUE, GREEN, GREY, RED
+from ._style import BLUE, COLOURS, GREEN, GREY, RED
 
 _KINDS = {
     "value, float64": ("float64", ("alone", "jit", "vmap"), BLUE, "o"),
     "derivative, float64": ("float64", ("forward", "reverse"), GREEN, "s"),
-    "energy balance": ("float64", ("energy",), "#7b4fa3", "D"),
+    "energy balance": ("float64", ("energy",), COLOURS[3], "D"),
     "value or derivative, float32": ("float32", ("alone", "jit", "vmap", "forward", "reverse"), GREY, "v"),
 }
 # What is exact is drawn at the edge.
@@ -21,13 +21,13 @@ _LEAST = 1e-12
 
 
 def hard_figure(verdicts: Sequence[CaseReport]) -> Figure:
-    """Errors of hard cases in what is admissible, so that 1 is the limit; cases that end by name have none.
+    """Errors of hard cases in what is admissible, so that 1 is the limit; cases without a number have none.
 
     **Arguments:**
 
     - `verdicts`: of `jaxmodsim.validation.hard.check`.
     """
-    figure = Figure(figsize=(10.0, 1.4 + 0.2 * len(verdicts)), layout="constrained")
+    figure = Figure(figsize=(8.5, 1.4 + 0.19 * len(verdicts)), layout="constrained")
     axis = figure.subplots()
     rows = np.arange(len(verdicts))
     for label, (dtype, transforms, colour, marker) in _KINDS.items():
@@ -37,7 +37,7 @@ def hard_figure(verdicts: Sequence[CaseReport]) -> Figure:
         if not verdict.ok:
             axis.axhspan(row - 0.5, row + 0.5, color=RED, alpha=0.2, lw=0)
         elif all(math.isnan(each.error) for each in verdict.findings):
-            axis.text(_LEAST, float(row), " ends, or is refused, by name", va="center", fontsize=9, color=GREY)
+            axis.text(_LEAST, float(row), " says why there is no answer", va="center", fontsize=9, color=GREY)
     axis.axvline(1.0, color=RED, lw=1.2)
     axis.set(xscale="log", xlabel="error over what is admissible [1]", yticks=rows, xlim=(0.5 * _LEAST, 10.0))
     axis.set_yticklabels([verdict.case.name for verdict in verdicts], fontsize=9)
@@ -46,7 +46,7 @@ def hard_figure(verdicts: Sequence[CaseReport]) -> Figure:
     _families(axis, verdicts)
     passed = sum(verdict.ok for verdict in verdicts)
     figure.suptitle(f"Hard cases: {passed} of {len(verdicts)} pass (line: the limit)", fontsize=12)
-    figure.legend(loc="outside lower center", ncols=4, fontsize=10)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=10, frameon=False)
     return figure
 
 
@@ -66,12 +66,12 @@ def step_limits_figure() -> Figure:
     figure = Figure(figsize=(7.5, 4.2), layout="constrained")
     axis = figure.subplots()
     limits = largest_steps()
-    for colour, marker, (name, here) in zip((BLUE, RED, GREEN, "#7b4fa3"), "osDv", limits.items(), strict=True):
+    for colour, marker, (name, here) in zip(COLOURS, "osDv", limits.items(), strict=False):
         axis.plot(*zip(*here.values(), strict=True), marker, color=colour, label=name, ms=7, alpha=0.8)
     predicted = [x for here in limits.values() for x, _ in here.values()]
     span = [0.5 * min(predicted), 2.0 * max(predicted)]
     axis.plot(span, span, color="#c8c8c8", lw=3, zorder=0, label="equal")
     axis.set(xscale="log", yscale="log", xlabel="largest stable step by theory [s]", ylabel="found by bisection [s]")
     axis.set_title(f"Stability of fixed explicit steps: {', '.join(next(iter(limits.values())))}", fontsize=10)
-    axis.legend(fontsize=8)
+    axis.legend(fontsize=9, frameon=False)
     return figure

@@ -4,7 +4,7 @@ import numpy as np
 
 from ..identify import Profile
 from ._figure import Figure
-from ._style import BLUE, GREEN, GREY, RED, with_unit
+from ._style import BLUE, COLOURS, GREEN, GREY, RED, legend_beside, panel_letters, with_unit
 
 
 def profile_figure(profile: Profile) -> Figure:
@@ -34,16 +34,17 @@ def profile_figure(profile: Profile) -> Figure:
     top = max(1.6 * profile.threshold, 1.05 * float(np.min(profile.ratio[[0, -1]])))
     above.set(ylim=(min(-0.03 * top, float(np.min(profile.ratio))), top), ylabel="likelihood ratio")
     above.set_title("\n".join([f"Profile of {profile.name}", *profile.notes]), fontsize=10)
-    above.legend(fontsize=8)
+    legend_beside(above)
     here = int(np.argmin(np.abs(profile.values - profile.estimate)))
-    for name, x in others.items():
+    for (name, x), colour in zip(others.items(), COLOURS * len(others), strict=False):
         scale = abs(x[here]) or 1.0
-        axes[-1].plot(profile.values, 100 * (x - x[here]) / scale, marker=".", ms=4, lw=1.0, label=name)
+        axes[-1].plot(profile.values, 100 * (x - x[here]) / scale, color=colour, marker=".", ms=4, lw=1.0, label=name)
     if others:
         axes[-1].set_ylabel("others, change [%]")
         if max(float(np.max(np.abs(x / (x[here] or 1.0) - 1))) for x in others.values()) > 10:
             axes[-1].set_yscale("symlog", linthresh=10.0)
-        axes[-1].legend(fontsize=8)
+        legend_beside(axes[-1])
+        panel_letters(axes)
     ratio = profile.values[-1] / profile.values[0] if profile.values[0] > 0 else 0.0
     if ratio > 20:
         above.set_xscale("log")

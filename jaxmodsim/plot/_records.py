@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 
 from ..identify import FitResult, Record, RecordPrediction, Score
 from ._figure import Figure
-from ._style import BLUE, GREEN, GREY, RED, panel_letters, small_unit
+from ._style import BLUE, GREEN, GREY, RED, legend_above, legend_beside, panel_letters, small_unit
 
 
 def fit_figure(
@@ -67,8 +67,9 @@ def _followed(
     above.plot(record.t, record.measured, color=GREY, lw=2.4, label="measured")
     above.plot(record.t, record.measured + residual, color=RED, lw=1.1, label=label)
     factor, small = small_unit(unit)
-    above.set(ylabel=f"{quantity} [{unit}]", title=f"{record.name}: RMSE {factor * rmse:.3g} {small}")
-    above.legend(loc="upper right")
+    above.set_ylabel(f"{quantity} [{unit}]")
+    figure.suptitle(f"{record.name}: RMSE {factor * rmse:.3g} {small}")
+    legend_above(above)
     below.plot(record.t, factor * residual, color=BLUE, lw=1.0)
     below.axhline(0.0, color=GREY, lw=0.6)
     below.set(xlabel="time [s]", ylabel=f"simulated - measured [{small}]")
@@ -94,14 +95,14 @@ def loops_figure(result: FitResult, *, caption: str = "") -> Figure:
     left.set(
         xlabel="displacement about its mean [um]",
         ylabel="friction force [N]",
-        title=f"{record.name}: RMSE {result.rmse:.3g} N",
     )
-    left.legend(loc="upper left")
+    legend_above(left)
+    figure.suptitle(f"{record.name}: RMSE {result.rmse:.3g} N")
     middle = 0.5 * (record.t[0] + record.t[-1])
     inside = (record.t >= middle) & (record.t <= middle + 0.06 * (record.t[-1] - record.t[0]))
     right.plot(record.t[inside], record.measured[inside], color=GREY, lw=2.2, label="measured")
     right.plot(record.t[inside], result.simulated[inside], color=RED, lw=1.1, label="modelled")
-    right.set(xlabel="time [s]", ylabel="friction force [N]", title="A few cycles")
+    right.set(xlabel="time [s]", ylabel="friction force [N]", title="a few cycles")
     panel_letters((left, right))
     if caption:
         figure.supxlabel(caption, fontsize=8, color=GREY)
@@ -125,5 +126,5 @@ def truth_figure(result: FitResult, truth: Mapping[str, float]) -> Figure:
     axis.set_yticks(range(len(truth)), list(truth))
     axis.set(xlabel="estimate relative to truth [%], bars: 95 % interval", title="LuGre fitted to a synthetic record")
     axis.invert_yaxis()
-    axis.legend(fontsize=8)
+    legend_beside(axis)
     return figure

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 
 from ..identify import FitResult, residual_tests
 from ._figure import Figure
-from ._style import BLUE, GREEN, GREY, RED, small_unit, with_unit
+from ._style import BLUE, COLOURS, GREEN, GREY, RED, legend_above, panel_letters, small_unit, with_unit
 
 
 def result_figure(result: FitResult, *, record: int = 0, units: Mapping[str, str] | None = None) -> Figure:
@@ -40,6 +40,7 @@ def result_figure(result: FitResult, *, record: int = 0, units: Mapping[str, str
     _memory_panel(memory, result, record)
     _interval_panel(sure, result)
     _correlation_panel(alike, result)
+    panel_letters((*rows, memory, sure, alike))
     ending = f"{result.diagnostics.ending}, {result.diagnostics.evaluations} evaluations"
     figure.suptitle(f"{result.provenance.records[record].name}: {ending}")
     return figure
@@ -52,8 +53,8 @@ def _channel_panels(above: Axes, below: Axes, result: FitResult, number: int, ch
     above.plot(record.t, record.channels[channel], color="#b4b4b4", lw=3.2, label="measured")
     above.plot(record.t, result.provenance.outputs[number][channel], color=RED, lw=1.1, label="simulated")
     rmse = factor * float(np.sqrt(np.mean(residual**2)))
-    above.set(ylabel=with_unit(name, unit), title=f"{name}: RMSE {rmse:.3g} {small}".rstrip())
-    above.legend(loc="upper right", fontsize=8)
+    above.set(ylabel=with_unit(name, unit), title=f"RMSE {rmse:.3g} {small}".rstrip())
+    legend_above(above)
     below.plot(record.t, factor * residual, color=BLUE, lw=0.8)
     below.axhline(0.0, color=GREY, lw=0.6)
     below.set(ylabel=with_unit("residual", small))
@@ -63,9 +64,8 @@ def _memory_panel(axis: Axes, result: FitResult, number: int) -> None:
     """Autocorrelation of the residuals with the band that white noise would stay in."""
     record = result.provenance.records[number]
     interval = float(np.median(np.diff(record.t)))
-    colours = (BLUE, RED, GREEN, "#7b4fa3", "#b8860b")
     tests = [each for each in residual_tests(result).channels if each.record == record.name]
-    for each, colour in zip(tests, colours * (1 + len(tests) // len(colours)), strict=False):
+    for each, colour in zip(tests, COLOURS * (1 + len(tests)), strict=False):
         lags = interval * np.arange(len(each.autocorrelation))
         label = f"{each.channel}: p = {each.whiteness:.2g} (white)"
         axis.plot(lags, each.autocorrelation, color=colour, lw=1.0, label=label)
@@ -73,7 +73,7 @@ def _memory_panel(axis: Axes, result: FitResult, number: int) -> None:
     axis.axhspan(-band, band, color=GREY, alpha=0.3, lw=0, label="95 % of white noise")
     axis.axhline(0.0, color=GREY, lw=0.6)
     axis.set(xlabel="lag [s]", ylabel="autocorrelation", title="Residual: autocorrelation")
-    axis.legend(loc="upper right", fontsize=8)
+    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=2, fontsize=9, frameon=False)
 
 
 def _interval_panel(axis: Axes, result: FitResult) -> None:

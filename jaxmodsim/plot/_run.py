@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from ..scene import Friction, quantity_of
 from ..simulation import Trajectory
 from ._figure import Figure
-from ._style import COLOURS, GREY, panel_letters
+from ._style import COLOURS, GREY, legend_beside, panel_letters
 
 _SHADE = "#d9d9d9"
 
@@ -76,7 +76,7 @@ def _draw(axis: Axes, t: np.ndarray, unit: str, lines: Mapping[str, np.ndarray])
         axis.set_ylabel(next(iter(lines)) + label)
     else:
         axis.set_ylabel(label.strip())
-        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+        legend_beside(axis)
     axis.axhline(0.0, color=GREY, lw=0.6, zorder=1)
 
 

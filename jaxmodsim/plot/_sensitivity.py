@@ -4,7 +4,7 @@ from matplotlib.axes import Axes
 
 from ..analysis import Sensitivity
 from ._figure import Figure
-from ._style import GREY
+from ._style import COLOURS, GREY, legend_beside, panel_letters
 
 
 def sensitivity_figure(sensitivity: Sensitivity, *, most: int = 8) -> Figure:
@@ -16,7 +16,8 @@ def sensitivity_figure(sensitivity: Sensitivity, *, most: int = 8) -> Figure:
     - `most`: how many parameters are drawn, those that matter most.
     """
     ranking = sensitivity.ranking[:most]
-    colours = {name: f"C{i}" for i, (name, _) in enumerate(ranking)}
+    colours = {name: COLOURS[i % len(COLOURS)] for i, (name, _) in enumerate(ranking)}
+    styles = {name: ("-", "--", ":", "-.")[i // len(COLOURS) % 4] for i, name in enumerate(colours)}
     unit = f" [{sensitivity.unit}]" if sensitivity.unit else ""
     height = 0.9 + 0.32 * len(ranking)
     if sensitivity.over_time:
@@ -27,10 +28,13 @@ def sensitivity_figure(sensitivity: Sensitivity, *, most: int = 8) -> Figure:
         above.tick_params(labelbottom=False)
         above.sharex(middle)
         for name, _ in ranking:
-            middle.plot(sensitivity.t, sensitivity.normalised[name], color=colours[name], lw=1.3, label=name)
+            middle.plot(
+                sensitivity.t, sensitivity.normalised[name], color=colours[name], ls=styles[name], lw=1.3, label=name
+            )
         middle.axhline(0.0, color=GREY, lw=0.6)
         middle.set(xlabel="time [s]", ylabel=f"p d({sensitivity.label})/dp\nover its rms [1]")
-        middle.legend(fontsize=8, ncols=2)
+        legend_beside(middle)
+        panel_letters((above, middle, below))
     else:
         figure = Figure(figsize=(8, 0.4 + height), layout="constrained")
         below: Axes = figure.subplots()

@@ -40,6 +40,18 @@ def panel_letters(panels: Iterable[Axes]) -> None:
         panel.set_title(letter, loc="left", fontweight="bold", fontsize=11)
 
 
+def legend_above(panel: Axes, ncols: int = 2) -> None:
+    """A legend above the right corner of a panel, where it covers nothing."""
+    panel.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=ncols, fontsize=9, frameon=False
+    )
+
+
+def legend_beside(panel: Axes) -> None:
+    """A legend to the right of a panel."""
+    panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=9, frameon=False)
+
+
 def small_unit(unit: str) -> tuple[float, str]:
     """Factor and name of a unit a thousand times smaller."""
     return (1e3, f"m{unit}") if unit in ("m", "N", "rad", "m/s") else (1.0, unit)

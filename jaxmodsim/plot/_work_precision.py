@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 
 from ..analysis import Row, WorkPrecision
 from ._figure import Figure
-from ._style import GREY, RED, panel_letters, plain_ticks, with_unit
+from ._style import COLOURS, GREY, RED, panel_letters, plain_ticks, with_unit
 
 _MARKERS = "osD^vPX*"
 _LABELS = {
@@ -47,7 +47,7 @@ def work_precision_figure(study: WorkPrecision, *, cost: str = "run") -> Figure:
         if not rows:
             handles += left.plot([], [], color=RED, marker="x", ls="", label=label)
             continue
-        style = {"color": f"C{i}", "marker": _MARKERS[i % len(_MARKERS)], "ms": 6.0, "lw": 1.4}
+        style = {"color": COLOURS[i % len(COLOURS)], "marker": _MARKERS[i % len(_MARKERS)], "ms": 6.0, "lw": 1.4}
         errors = [_shown(row, study) for row in rows]
         timings = [row.times[cost] for row in rows if row.times is not None]
         median = 1e3 * np.array([x.median for x in timings])
@@ -55,7 +55,7 @@ def work_precision_figure(study: WorkPrecision, *, cost: str = "run") -> Figure:
         bars = np.maximum(bars, 0.0)
         handles.append(left.errorbar(errors, median, yerr=bars, capsize=2.0, elinewidth=0.8, **style, label=label))
         right.plot(errors, [row.evaluations if counted else row.steps for row in rows], **style)
-        _mark_model(left, right, rows, f"C{i}")
+        _mark_model(left, right, rows, COLOURS[i % len(COLOURS)])
     for axes in (left, right):
         axes.set(xscale="log", yscale="log", xlabel=f"error of {study.observable}, relative to {_scale(study)} [1]")
         axes.grid(which="major", alpha=0.3)
@@ -66,7 +66,7 @@ def work_precision_figure(study: WorkPrecision, *, cost: str = "run") -> Figure:
     panel_letters((left, right))
     if any(row.model for row in study.rows):
         handles += left.plot([], [], color=GREY, ls=":", label="error of the model")
-    figure.legend(handles=handles, fontsize=8, loc="outside right upper")
+    figure.legend(handles=handles, fontsize=9, frameon=False, loc="outside right upper")
     figure.suptitle(f"{study.problem}: {study.observable} {study.when}", fontsize=11)
     if failures:
         figure.supxlabel("\n".join(failures), fontsize=7, color=RED, x=0.01, ha="left")

@@ -11,6 +11,7 @@ from jaxtyping import ArrayLike, PyTree
 
 from .._core.arguments import as_flag
 from .._core.functions import Function
+from .._core.last_line import LastLines
 from .._core.speed import recommend_tuning, remark_on_compilation
 from ..scene import Scene
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages
@@ -93,8 +94,9 @@ def simulate(
 
     - `ValueError` for wrong shapes, types or ranges, before anything runs; for `accuracy` where numbers are traced.
     - `SimulationError` if the run ended early and `throw` is set. Inside
-      `jax.jit`, `jax.vmap` or `jax.grad` the same sentence comes as equinox's run-time error. That calls Python, and
-      JAX keeps no compiled program that does in its persistent cache: pass `throw=False` there, and read `run.result`.
+      `jax.jit`, `jax.vmap` or `jax.grad` the same sentence comes as equinox's run-time error, and once more as the
+      last line behind the traceback. That calls Python, and JAX keeps no compiled program that does in its persistent
+      cache: pass `throw=False` there, and read `run.result`.
     """
     recommend_tuning()
     throw = as_flag(throw, name="throw")
@@ -140,5 +142,5 @@ def _raise_early_end(inputs: RunInputs, solved: RunOutput) -> RunOutput:
             t, y = solved.end or (solved.t[-1], jtu.tree_map(lambda x: x[-1], solved.y))
             raise SimulationError(describe_failure(inputs.scene, float(t), y, code))
         return solved
-    messages = outcome_messages(inputs.scene, inputs.q0.shape[0])
+    messages = LastLines(outcome_messages(inputs.scene, inputs.q0.shape[0]))
     return eqx.branched_error_if(solved, solved.code != SUCCESS, solved.code, messages)

@@ -12,6 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from .._core.one_kernel import in_one_kernel
 from ..scene import (
     Scene,
     State,
@@ -384,10 +385,15 @@ def _kept(
     return t, y, modes, instants
 
 
-@partial(jax.jit, static_argnames=("options",))
+@partial(jax.jit, static_argnums=1)
+def _run(inputs: RunInputs, options: RunOptions) -> RunOutput:
+    return _integrate(inputs, options, False, None)[0]
+
+
+@partial(jax.jit, static_argnums=1)
 def solve(inputs: RunInputs, options: RunOptions) -> RunOutput:
     """Run a scene."""
-    return _integrate(inputs, options, False, None)[0]
+    return in_one_kernel(lambda inputs: _run(inputs, options), inputs)
 
 
 def compiled_runs() -> int:

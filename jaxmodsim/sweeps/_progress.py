@@ -1,11 +1,11 @@
 """How far a sweep has come."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from .._core.extra import extra
+from .._core.progress import minutes
 
 
 @dataclass(frozen=True)
@@ -24,49 +24,20 @@ class SweepProgress:
 Progress: TypeAlias = Callable[[SweepProgress], None]
 
 
-@contextmanager
-def reporter(progress: bool | Progress) -> Iterator[Progress]:
-    """What is called after each block: a function that was given, a bar, or nothing."""
-    if not progress:
-        yield _silent
-    elif callable(progress):
-        yield progress
-    else:
-        with progress_bar() as report:
-            yield report
+class SweepWords:
+    """A report in words, with the pace since the first one and the time that is left at that pace."""
 
+    def __init__(self) -> None:
+        self._before: int | None = None
+        self._began = 0.0
 
-def _silent(now: SweepProgress) -> None:
-    del now
-
-
-@contextmanager
-def progress_bar() -> Iterator[Progress]:
-    """A bar on the terminal, shown while the context is open; yields what to call with a `SweepProgress`.
-
-    **Raises:**
-
-    - `ImportError` where rich is not installed.
-    """
-    rich = extra("rich.progress")
-    columns = (
-        rich.BarColumn(bar_width=16),
-        rich.TextColumn("{task.completed:,.0f} of {task.total:,.0f} runs{task.fields[rate]}"),
-        rich.TextColumn("{task.fields[failed]:,} failed"),
-        rich.TimeElapsedColumn(),
-        rich.TextColumn("left"),
-        rich.TimeRemainingColumn(),
-    )
-    with rich.Progress(*columns) as bar:
-        task = bar.add_task("sweep", total=1, failed=0, rate="")
-        before: list[int] = []
-
-        def report(now: SweepProgress) -> None:
-            if not before:  # what was there already says nothing of the rate
-                before.append(now.done)
-                bar.reset(task, total=now.total, completed=now.done)
-            seconds = bar.tasks[0].elapsed or 0.0
-            rate = f", {(now.done - before[0]) / seconds:,.0f}/s" if seconds > 0 and now.done > before[0] else ""
-            bar.update(task, completed=now.done, total=now.total, failed=now.failed, rate=rate)
-
-        yield report
+    def __call__(self, now: SweepProgress) -> str:
+        """The words."""
+        if self._before is None:  # what was there already says nothing of the pace
+            self._before, self._began = now.done, time.perf_counter()
+        count = f"{now.done:,} of {now.total:,} runs"
+        if now.done == now.total or now.done > self._before:
+            pace = (now.done - self._before) / max(time.perf_counter() - self._began, 1e-3)
+            left = f", {pace:,.0f}/s, {minutes((now.total - now.done) / pace)} left" if now.done < now.total else ""
+            return f"{count}, {now.failed:,} failed{left}"
+        return "compiling" if now.done == 0 else f"compiling, {count} are there"

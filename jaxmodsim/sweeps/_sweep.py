@@ -14,6 +14,7 @@ from jaxtyping import ArrayLike
 
 from .._core.arguments import as_whole
 from .._core.extra import extra
+from .._core.progress import reported
 from .._core.provenance import commit
 from ..scene import Scene
 from ._compute import GROUP, Work, runs_per_call
@@ -21,7 +22,7 @@ from ._execute import Task, in_threads, run_on_executor
 from ._grid import Blocks, blocks, grid
 from ._layout import layout
 from ._predict import Prediction, predict_steps
-from ._progress import Progress, SweepProgress, reporter
+from ._progress import Progress, SweepProgress, SweepWords
 from ._provenance import describe, package_versions, provenance, solver_of
 from ._request import Request, request
 from ._results import AbstractResults, Memory, Store
@@ -92,7 +93,8 @@ def sweep(
     - `devices`: JAX devices to share the chunks among; by default all of this process.
     - `chunk`: largest number of runs that are computed, sent and written as one; by default up to 16384, fewer where
       results are large.
-    - `progress`: True for a bar, or a function that is called with a `jaxmodsim.sweeps.SweepProgress` after each chunk.
+    - `progress`: True for a line of text, or a function that is called with a `jaxmodsim.sweeps.SweepProgress` after
+      each chunk.
     - `options`: further arguments of `simulate`, `ts` among them, but not `throw` and `adjoint`.
 
     **Returns:**
@@ -109,25 +111,23 @@ def sweep(
       another scene, other numbers, code, or versions.
     - `ImportError` where the extra `sweep` is not installed.
     """
-    if not (callable(progress) or isinstance(progress, bool)):
-        raise ValueError(f"progress must be True, False or a function, but {progress!r} was given.")
-    for needed in ("xarray", "zarr"):  # rather now than after the runs
-        extra(needed)
-    asked = request(system, grid(over), observe, {"q0": q0, "qd0": qd0, "t1": t1, **options})
-    places: list[Any] = list(devices) if devices is not None else jax.local_devices()
-    runs = runs_per_block(asked, places[0].platform, chunk)
-    cut = blocks(asked.grid.shape, runs)
-    group = GROUP if places[0].platform == "cpu" else runs
-    work = Work(asked.run, asked.fixed, None, group, jnp.result_type(float) == jnp.float64)
-    results = _results(asked, work, cut, out)
-    with reporter(progress) as report:
+    with reported(progress, "sweep", SweepWords()) as report:
+        for needed in ("xarray", "zarr"):  # rather now than after the runs
+            extra(needed)
+        asked = request(system, grid(over), observe, {"q0": q0, "qd0": qd0, "t1": t1, **options})
+        places: list[Any] = list(devices) if devices is not None else jax.local_devices()
+        runs = runs_per_block(asked, places[0].platform, chunk)
+        cut = blocks(asked.grid.shape, runs)
+        group = GROUP if places[0].platform == "cpu" else runs
+        work = Work(asked.run, asked.fixed, None, group, jnp.result_type(float) == jnp.float64)
+        results = _results(asked, work, cut, out)
         try:
             _run(asked, work, cut, results, executor, places, report)
         except KeyboardInterrupt:
             if out is not None:
                 raise KeyboardInterrupt(f"Interrupted; call sweep again with out={str(out)!r} to go on.") from None
             warnings.warn("sweep was interrupted: runs that have not been run have the result -1.", stacklevel=2)
-    return results.dataset()
+        return results.dataset()
 
 
 def runs_per_block(asked: Request, platform: str, chunk: int | None) -> int:
@@ -168,7 +168,7 @@ def _run(
     results: AbstractResults,
     executor: object,
     devices: list[object],
-    report: Progress,
+    report: Progress | None,
 ) -> None:
     """Run the blocks that are not there yet."""
     left, done, failed = [], 0, 0
@@ -178,7 +178,8 @@ def _run(
             left.append(block)
         else:
             done, failed = done + codes.size, failed + int((codes != 0).sum())
-    report(SweepProgress(done, asked.grid.size, failed))
+    if report is not None:
+        report(SweepProgress(done, asked.grid.size, failed))
     if not left:
         return
     work, prediction = predict_steps(work, asked.grid, prod(cut.extent))
@@ -187,7 +188,8 @@ def _run(
     for block, computed in came:
         results.write(block, computed)
         done, failed = done + computed.code.size, failed + int((computed.code != 0).sum())
-        report(SweepProgress(done, asked.grid.size, failed))
+        if report is not None:
+            report(SweepProgress(done, asked.grid.size, failed))
 
 
 def _tasks(asked: Request, cut: Blocks, left: list[int], prediction: Prediction | None) -> Iterator[Task]:

@@ -3,7 +3,6 @@
 import re
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -151,17 +150,14 @@ def test_the_example_is_a_spec(run_command: Command) -> None:
 def test_ctrl_c_says_what_is_kept_and_the_same_command_goes_on(
     run_command: Command, spec: Callable[[str], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    @contextmanager
-    def interrupting() -> Iterator[Callable[[SweepProgress], None]]:
-        def report(now: SweepProgress) -> None:
-            if now.done >= 6:
-                raise KeyboardInterrupt
-
-        yield report
+    def interrupting(now: SweepProgress) -> str:
+        if now.done >= 6:
+            raise KeyboardInterrupt
+        return ""
 
     command = ("sweep", spec(ROOT), "--out", str(tmp_path / "root.zarr"), "--chunk", "3")
     with monkeypatch.context() as patch:
-        patch.setattr(_sweep, "progress_bar", interrupting)
+        patch.setattr(_sweep, "SweepWords", lambda: interrupting)
         code, _, errors = run_command(*command)
     assert code == 130
     assert "6 of 30 runs are kept in" in errors

@@ -113,6 +113,9 @@ def test_films(belt: Trajectory, tmp_path: Path) -> None:
         assert getattr(image, "n_frames", 0) == 2 * 2 * 4 + 1
     html = (tmp_path / "film.html").read_text()
     assert html.count("data:image/png") == 17
+    assert html.count("<button") == 9
+    assert "https:" not in html
+    assert "fa-" not in html
     in_space = plot.animate(belt, lambda q: jnp.stack([jnp.stack([q[0], q[0] ** 2, 1.0 - q[0]])]), fps=1)
     in_space.save(tmp_path / "space.gif")
     with Image.open(tmp_path / "space.gif") as image:

@@ -1,5 +1,7 @@
 """Runs that end early: a code inside compiled code, a sentence outside, and what was computed is kept."""
 
+import subprocess
+import sys
 from typing import Any
 
 import equinox as eqx
@@ -141,3 +143,31 @@ def test_energies_of_a_run_that_cannot_be_repeated_with_the_work_beside_it() -> 
     run = jms.simulate(heavy, [0.0], [1.0], 1.0, max_steps=steps + 1)
     with pytest.raises(jms.SimulationError, match=r"work integrals beside it, it does not.*step limit"):
         _ = run.energy
+
+
+ENDS_EARLY = """
+import jax, jaxmodsim as jms
+jax.config.update("jax_enable_x64", True)
+def swing(k):
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * (qd[0] ** 2 - p["k"] * q[0] ** 2), {"k": k})
+    return jms.simulate(scene, [1.0], [0.0], 100.0, max_steps=20).q[-1, 0]
+"""
+IN_A_CELL = """
+from IPython.core.interactiveshell import InteractiveShell
+InteractiveShell.instance().run_cell({code!r})
+"""
+
+
+@pytest.mark.parametrize("where", ["script", "cell"])
+@pytest.mark.parametrize("call", ["jax.jit(swing)(2.0)", "eqx.filter_jit(swing)(2.0)"])
+def test_the_last_line_of_an_early_end_inside_jit_names_the_cause(where: str, call: str) -> None:
+    code = f"{ENDS_EARLY}\nimport equinox as eqx\n{call}\n"
+    code = code if where == "script" else IN_A_CELL.format(code=code)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stderr.rstrip().splitlines()[-1].startswith("The step limit was reached before t1: pass a larger")
+
+
+def test_an_early_end_inside_jit_that_is_caught_is_not_said_again() -> None:
+    code = f"{ENDS_EARLY}\ntry:\n    jax.jit(swing)(2.0)\nexcept Exception:\n    raise ValueError('mine') from None\n"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stderr.rstrip().splitlines()[-1] == "ValueError: mine"

@@ -118,7 +118,7 @@ CALLS = {
         identify.fit,
         {"scene": SCENE, "records": RECORD, "free": ("m",), "observe": "q[0]", **MOTION, "delay": None, "limits": None,
          "passive": (), "prior": None, "loss": None, "controller": None, "shooting": None, "initializer": (),
-         "substeps": 1, "accuracy": 1e-8, "rtol": 1e-6, "max_steps": 1, "progress": None},
+         "substeps": 1, "accuracy": 1e-8, "rtol": 1e-6, "max_steps": 1, "progress": False},
         {"observe": f"observe|{ARITY}", "progress": f"progress|{ARITY}"},
     ),
 }  # fmt: skip

@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..._core.index_check import traced
 from ..._core.parameters import check_ranges, modules_of
+from ..._core.progress import reported
 from ...scene import Scene, State, check_scene, scene_numbers, scene_ranges
 from ..model._observe import first_coordinate
 from ..model._parameters import FreeParameters, chosen_entries, split_entries, split_ranges
@@ -100,7 +101,7 @@ def design_input(
     uncertainty: float = 0.1,
     seed: int = 0,
     max_steps: int = 30,
-    progress: DesignProgress | None = None,
+    progress: bool | DesignProgress = False,
 ) -> InputDesign:
     """Design the input whose record tells most about the numbers of an axis, within limits.
 
@@ -138,8 +139,8 @@ def design_input(
     - `uncertainty`: relative error that the numbers of the scene may have now, > 0: 0.1 for 10 %.
     - `seed`: of the random starts.
     - `max_steps`: limit of iterations from each start.
-    - `progress`: called after each iteration with its number and the criterion of its motion, which may still be
-      beyond a limit. Ctrl-C ends the search with the best so far.
+    - `progress`: True for a line of text, or a function that is called after each iteration with its number and the
+      criterion of its motion, which may still be beyond a limit. Ctrl-C ends the search with the best so far.
 
     **Returns:**
 
@@ -179,7 +180,8 @@ def design_input(
     fine, coarse = task(samples), task((samples - 1) // stride + 1)
     sines = [_fill(_coarse_share, coarse, column) for column in np.eye(2 * harmonics)[:harmonics]]
     plain = max(sines, key=lambda x: float(_judge(coarse, jnp.asarray(x, float))[0]))
-    best, ending = _improve(coarse, sines, plain, seed, max_steps, progress)
+    with reported(progress, "next input", lambda number, value: f"iteration {number}: criterion {value:.4g}") as report:
+        best, ending = _improve(coarse, sines, plain, seed, max_steps, report)
     designed, compared = (
         _excitation(fine, _fill(_fine_share, fine, x), parameters.names, scale) for x in (best, plain)
     )

@@ -1,7 +1,7 @@
 """`compare`, `compare_laws`: which of several models, judged by what was held back from the fit."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeAlias
 
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..._core.parameters import ranges_of
+from ..._core.progress import candidate_words, reported
 from ...friction import AbstractLaw
 from ...scene import Scene, State, scene_numbers
 from ..data._record import Record, Runs, cut, runs_of
@@ -79,7 +80,7 @@ class _Asked:
     initializer: tuple[AbstractInitializer, ...]
     substeps: int
     max_steps: int
-    progress: CompareProgress | None
+    progress: CompareProgress | None = None
 
     def settings(self, scene: Scene, q0: StartState | None, qd0: StartState | None) -> Settings:
         """As `prepare` wants them, with the limits that are for this scene."""
@@ -113,7 +114,7 @@ def compare(
     initializer: AbstractInitializer | Sequence[AbstractInitializer] = (),
     substeps: int = 1,
     max_steps: int = 100,
-    progress: CompareProgress | None = None,
+    progress: bool | CompareProgress = False,
 ) -> Comparison:
     """Fit several models to the same records, and judge each by its error on what it was not fitted to.
 
@@ -136,8 +137,9 @@ def compare(
     - `observe`, `q0`, `qd0`, `loss`, `substeps`, `max_steps`: see `fit`.
     - `limits`, `initializer`: see `fit`; a limit of, or a `Continuation` in, a number that a candidate does not have is
       none for it.
-    - `progress`: called after each iteration with the model's name, the fold that is held back (None: the fit to
-      everything), the iteration and the RMSE. Ctrl-C ends the comparison with the models that were finished.
+    - `progress`: True for a line of text, or a function that is called after each iteration with the model's name,
+      the fold that is held back (None: the fit to everything), the iteration and the RMSE. Ctrl-C ends the comparison
+      with the models that were finished.
 
     **Returns:**
 
@@ -164,7 +166,6 @@ def compare(
         initializer=initializers,
         substeps=substeps,
         max_steps=max_steps,
-        progress=progress,
     )
     _check(candidates, folds)
     known = set()
@@ -188,7 +189,7 @@ def compare(
     }
     description = {name: candidate.description for name, candidate in candidates.items()}
     by = f"{folds} folds" if not others else ", ".join(record.name for record in others)
-    return _compared(judges, description, by, new_records=bool(others))
+    return _compared(judges, description, by, progress, new_records=bool(others))
 
 
 def compare_laws(
@@ -199,7 +200,7 @@ def compare_laws(
     loss: AbstractLoss | None = None,
     initializer: AbstractInitializer | Sequence[AbstractInitializer] = (),
     max_steps: int = 100,
-    progress: CompareProgress | None = None,
+    progress: bool | CompareProgress = False,
 ) -> Comparison:
     """Fit several friction laws to a measured force under a measured motion, and judge each by what was held back.
 
@@ -226,20 +227,22 @@ def compare_laws(
 
     own = (initializer,) if isinstance(initializer, AbstractInitializer) else tuple(initializer)
 
-    def judge(name: str, candidate: Candidate, judged: Mapping[str, CrossValidated]) -> CrossValidated:
+    def judge(
+        name: str, candidate: Candidate, report: CompareProgress | None, judged: Mapping[str, CrossValidated]
+    ) -> CrossValidated:
         law = candidate.scene
         if not isinstance(law, AbstractLaw):
             raise ValueError(f"{name}: compare_laws needs friction laws; for scenes, compare.")
-        told = _told(progress, name, None)
+        told = _told(report, name, None)
         result = fit_law(
             law, records, candidate.free, loss=loss, initializer=(*own, *_from_smaller(tuple(ranges_of(law)), judged)),
-            max_steps=max_steps, progress=told,
+            max_steps=max_steps, progress=told or False,
         )  # fmt: skip
         search = _finished(result.search)
         problem, held = search.problem, []
         block = _blocks(problem.runs, folds)
         for fold in range(folds):
-            options = SearchOptions(_ENOUGH, max_steps, _told(progress, name, fold))
+            options = SearchOptions(_ENOUGH, max_steps, _told(report, name, fold))
             held += _held_back(problem, search.state.x, result, block == fold, block, options)[0]
         return CrossValidated(result, tuple(held), ())
 
@@ -247,9 +250,8 @@ def compare_laws(
         name: partial(judge, name, candidate)
         for name, candidate in sorted(candidates.items(), key=lambda item: len(ranges_of(item[1].scene)))
     }
-    return _compared(
-        judges, {name: each.description for name, each in candidates.items()}, f"{folds} folds", new_records=False
-    )
+    description = {name: each.description for name, each in candidates.items()}
+    return _compared(judges, description, f"{folds} folds", progress, new_records=False)
 
 
 def _check(candidates: Mapping[str, object], folds: int) -> None:
@@ -281,24 +283,26 @@ def _told(progress: CompareProgress | None, name: str, fold: int | None) -> Prog
 
 
 def _compared(
-    judges: Mapping[str, Callable[[Mapping[str, CrossValidated]], CrossValidated]],
+    judges: Mapping[str, Callable[[CompareProgress | None, Mapping[str, CrossValidated]], CrossValidated]],
     description: Mapping[str, str],
     by: str,
+    progress: bool | CompareProgress,
     *,
     new_records: bool,
 ) -> Comparison:
     """All candidates one after the other, each told of those before it, whatever becomes of each."""
     judged: dict[str, CrossValidated] = {}
     failures: dict[str, str] = {}
-    for name, judge in judges.items():
-        try:
-            judged[name] = judge(judged)
-        except KeyboardInterrupt:
-            if not judged:
-                raise  # nothing is finished
-            break
-        except RuntimeError as error:
-            failures[name] = str(error).splitlines()[0]
+    with reported(progress, "compare", candidate_words) as report:
+        for name, judge in judges.items():
+            try:
+                judged[name] = judge(report, judged)
+            except KeyboardInterrupt:
+                if not judged:
+                    raise  # nothing is finished
+                break
+            except RuntimeError as error:
+                failures[name] = str(error).splitlines()[0]
     left = tuple(name for name in judges if name not in judged and name not in failures)
     return comparison_of(judged, failures, left, description, by, new_records=new_records)
 
@@ -314,10 +318,14 @@ def _finished(search: SearchResult | None) -> SearchResult:
 
 
 def _validate_scene(
-    name: str, candidate: Candidate, asked: _Asked, judged: Mapping[str, CrossValidated]
+    name: str,
+    candidate: Candidate,
+    asked: _Asked,
+    report: CompareProgress | None,
+    judged: Mapping[str, CrossValidated],
 ) -> CrossValidated:
     """The fit to everything, then what each held-back part makes of a fit without it."""
-    scene, free = candidate.scene, candidate.free
+    scene, free, asked = candidate.scene, candidate.free, replace(asked, progress=report)
     assert isinstance(scene, Scene)
     assert free is not None
     numbers = _names(scene, asked.records)
@@ -335,7 +343,7 @@ def _validate_scene(
         initializer=[*own, *_from_smaller(free, judged)],
         substeps=asked.substeps,
         max_steps=asked.max_steps,
-        progress=_told(asked.progress, name, None),
+        progress=_told(asked.progress, name, None) or False,
     )
     search = _finished(result.search)
     if asked.hold_out:

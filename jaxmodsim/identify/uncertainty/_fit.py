@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from ..._core.arguments import as_float, as_mapping, as_names, as_whole
 from ..._core.parameters import Range
+from ..._core.progress import iteration_words, reported
 from ..._core.state_dependent import is_state_dependent
 from ...friction import AbstractLaw
 from ...scene import Scene, scene_numbers, scene_ranges
@@ -54,7 +55,7 @@ def fit(
     accuracy: float = 1e-8,
     rtol: float = 1e-6,
     max_steps: int = 100,
-    progress: Progress | None = None,
+    progress: bool | Progress = False,
 ) -> FitResult:
     """Fit numbers of a scene so that its simulation follows measured records.
 
@@ -92,8 +93,8 @@ def fit(
     - `accuracy`: relative tolerance of runs by events.
     - `rtol`: relative change of the residual at which the search ends.
     - `max_steps`: limit of iterations.
-    - `progress`: called after each iteration with its number, the RMSE and the parameters. Ctrl-C ends the fit
-      with the best so far.
+    - `progress`: True for a line of text, or a function that is called after each iteration with its number, the RMSE
+      and the parameters. Ctrl-C ends the fit with the best so far.
 
     **Returns:**
 
@@ -105,7 +106,7 @@ def fit(
     - `RuntimeError` if the model is not finite at its start values.
     """
     loss = SquaredLoss() if loss is None else loss
-    _check_kinds(scene, loss, controller, shooting, progress)
+    _check_kinds(scene, loss, controller, shooting)
     initializer = _initializers(initializer)
     settings = Settings(
         observe=observe,
@@ -121,10 +122,11 @@ def fit(
         substeps=as_whole(substeps, name="substeps"),
         accuracy=as_float(accuracy, name="accuracy", lower=0.0),
     )
-    options = SearchOptions(as_float(rtol, name="rtol", lower=0.0), as_whole(max_steps, name="max_steps"), progress)
-    prepared = prepare(scene, records, free, settings)
-    x, starts = run_initializers(initializer, prepared.problem, options)
-    search = solve_with_noise(prepared.problem, x, options, prepared.given)
+    limit, rtol = as_whole(max_steps, name="max_steps"), as_float(rtol, name="rtol", lower=0.0)
+    with reported(progress, "fit", iteration_words) as report:
+        prepared, options = prepare(scene, records, free, settings), SearchOptions(rtol, limit, report)
+        x, starts = run_initializers(initializer, prepared.problem, options)
+        search = solve_with_noise(prepared.problem, x, options, prepared.given)
     values = search.problem.free.values(search.problem.split(search.state.x)[0])
     error = step_error(search)
     return result_of(
@@ -132,7 +134,7 @@ def fit(
     )
 
 
-def _check_kinds(scene: object, loss: object, controller: object, shooting: object, progress: object) -> None:
+def _check_kinds(scene: object, loss: object, controller: object, shooting: object) -> None:
     """Refuse objects of another kind."""
     for name, value, kind in (
         ("scene", scene, Scene),
@@ -142,8 +144,6 @@ def _check_kinds(scene: object, loss: object, controller: object, shooting: obje
     ):
         if not isinstance(value, kind):
             raise ValueError(f"{name} must be {_KINDS[name]}, but {value!r} was given.")
-    if not (progress is None or callable(progress)):
-        raise ValueError(f"progress must be a function, but {progress!r} was given.")
 
 
 def _initializers(initializer: object) -> tuple[AbstractInitializer, ...]:
@@ -164,7 +164,7 @@ def fit_law(
     initializer: AbstractInitializer | Sequence[AbstractInitializer] = (),
     rtol: float = 1e-6,
     max_steps: int = 100,
-    progress: Progress | None = None,
+    progress: bool | Progress = False,
 ) -> FitResult:
     """Fit a friction law to a measured friction force under a measured motion.
 
@@ -214,9 +214,10 @@ def fit_law(
         SquaredLoss() if loss is None else loss,
         Prior(jnp.zeros(len(parameters.names)), jnp.zeros(len(parameters.names))),
     )
-    options = SearchOptions(rtol, max_steps, progress)
-    x, starts = run_initializers(initializer, problem, options)
-    search = solve_with_noise(problem, x, options, frozenset(given))
+    with reported(progress, "fit", iteration_words) as report:
+        options = SearchOptions(rtol, max_steps, report)
+        x, starts = run_initializers(initializer, problem, options)
+        search = solve_with_noise(problem, x, options, frozenset(given))
     per_load = " per N" if "normal" in several[0].inputs else ""
     units = {
         name: allowed.unit + (per_load if allowed.unit.startswith("N") else "") for name, allowed in ranges.items()

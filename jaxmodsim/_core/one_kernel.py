@@ -1,0 +1,194 @@
+"""A function that XLA compiles, on CPU, as one kernel."""
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from functools import partial, reduce
+from typing import Any, TypeVar
+
+import jax
+import jaxlib.version
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxlib.mlir import ir
+from jaxlib.mlir.dialects import stablehlo as hlo
+
+_Tree = TypeVar("_Tree")
+# A kernel runs on one core, and its arrays shall fit the cache of that core.
+_MOST_AT_ONCE = 64
+# Entries of the first factor times those of the product, terms of a sum, entries of other results.
+_MOST_PRODUCTS, _MOST_TERMS, _MOST_ENTRIES = 256, 1000, 100_000
+# What XLA's emitter of whole functions holds. Anything else needs the services of a run: LAPACK, callbacks, threads.
+_HOLDS = frozenset(
+    """
+    abs add and atan2 bitcast_convert broadcast_in_dim case cbrt ceil clamp compare concatenate constant convert cosine
+    divide dot_general dynamic_slice dynamic_update_slice exponential exponential_minus_one floor gather if iota
+    is_finite log log_plus_one logistic maximum minimum multiply negate not one_scatter optimization_barrier or pad
+    popcnt power reduce remainder reshape return reverse round_nearest_afz round_nearest_even rsqrt select shift_left
+    shift_right_arithmetic shift_right_logical sign sine slice sqrt subtract tan tanh transpose while xor
+    chlo.acos chlo.acosh chlo.asin chlo.asinh chlo.atan chlo.atanh chlo.cosh chlo.erf chlo.erf_inv chlo.erfc chlo.is_inf
+    chlo.is_neg_inf chlo.is_pos_inf chlo.lgamma chlo.next_after chlo.sinh chlo.square chlo.tan
+    """.split()  # noqa: SIM905 - a list has a line for each
+)
+# Those that make or hand on the buffers of a run, of whatever size.
+_MOVES = {"broadcast_in_dim", "case", "constant", "dynamic_slice", "dynamic_update_slice", "if", "reshape", "while"}
+# XLA ends the process where it fails to compile such a call: only where it was tried.
+_KNOWN = jaxlib.version.__version_info__[:2] == (0, 10)
+
+
+def in_one_kernel(function: Callable[..., _Tree], *args: Any) -> _Tree:
+    """The result of `function(*args)`, and its derivatives, computed in one kernel each where XLA runs on CPU.
+
+    XLA on CPU makes a kernel of every few operations, compiles each by itself, and calls one after the other. A call
+    takes 0.1 us, far more than the few numbers of a mechanical system. A call with the attribute `xla_cpu_small_call`,
+    which XLA gives to small loops, becomes one kernel, loops and all. On other platforms, with more than 64 runs side
+    by side, and with operations that such a kernel cannot hold, all stays as it is.
+
+    **Arguments:**
+
+    - `function`: a function of `jax.jit`.
+    - `args`: pytrees of arrays.
+    """
+    args = jax.tree.map(partial(_mark.bind, result=False, runs=1), args)
+    return jax.tree.map(partial(_mark.bind, result=True, runs=1), function(*args))
+
+
+# An identity on what goes into the call and on what comes out: its lowering sees the call that a value comes from. What
+# comes out of the call of a derivative in reverse mode is the cotangent of what went in. A tangent keeps the value
+# beside it, so that the mark of the run is not dropped where only the derivative is asked for.
+_mark = Primitive("mark_one_kernel")
+_mark.def_impl(lambda x, *_, **__: x)
+_mark.def_abstract_eval(lambda x, *_, **__: x)
+
+
+def _jvp(primals: Any, tangents: Any, **marks: Any) -> tuple[Any, Any]:
+    value, tangent = _mark.bind(*primals, **marks), tangents[0]
+    return value, tangent if isinstance(tangent, ad.Zero) else _mark.bind(tangent, value, **marks)
+
+
+def _transpose(cotangent: Any, *given: Any, result: bool, runs: int) -> list[Any]:
+    if not isinstance(cotangent, ad.Zero):
+        cotangent = _mark.bind(cotangent, *given[1:], result=not result, runs=runs)
+    return [cotangent] + [None] * len(given[1:])
+
+
+def _batch(given: Any, axes: Any, *, result: bool, runs: int) -> tuple[Any, Any]:
+    size = next(x.shape[axis] for x, axis in zip(given, axes, strict=True) if axis is not None)
+    return _mark.bind(*given, result=result, runs=runs * size), axes[0]
+
+
+def _lower(ctx: mlir.LoweringRuleContext, x: Any, *_: Any, result: bool, runs: int) -> list[Any]:
+    call = getattr(x.owner, "operation", None)  # of an argument it is a block, which is none
+    alone = getattr(ctx.module_context.axis_context, "num_devices", None) in (None, 1)
+    if _KNOWN and result and runs <= _MOST_AT_ONCE and alone and call is not None and call.name == "func.call":
+        _mark_call(ctx, call)
+    return [x]
+
+
+def _mark_call(ctx: mlir.LoweringRuleContext, call: Any) -> None:
+    """Give the call its attribute, and a function of its own that needs all its arguments."""
+    functions = ctx.module_context.symbol_table
+    function = functions[_callee(call)].operation
+    block = function.regions[0].blocks[0]
+    if "mhlo.frontend_attributes" in call.attributes:
+        return  # marked already, by another of its results
+    ending = block.operations[len(block.operations) - 1].operation
+    if not block.arguments or not all(_is_plain(x.type) for x in [*block.arguments, *ending.operands]):
+        return
+    if not all(kind in _HOLDS for kind in _operations(functions, function, set())):
+        return
+    with ir.InsertionPoint(function):
+        own = function.clone()
+    call.attributes["callee"] = ir.FlatSymbolRefAttr.get(functions.insert(own).value)
+    marks = {"xla_cpu_small_call": "true", "inlineable": "false"}
+    attributes = {name: ir.StringAttr.get(value) for name, value in marks.items()}
+    call.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(attributes)
+    block = own.regions[0].blocks[0]
+    ending = block.operations[len(block.operations) - 1].operation
+    smallest = min(range(len(ending.operands)), key=lambda i: math.prod(ending.operands[i].type.shape))
+    with ir.InsertionPoint(ending):
+        ending.operands[smallest] = _needing(ending.operands[smallest], list(block.arguments))
+
+
+def _needing(x: Any, all_of: list[Any]) -> Any:
+    """`x`, computed with all the others: XLA ends the process over an argument of such a call that nothing uses.
+
+    Of any integer n, n (n + 1) is even: its last bit, which is zero, changes no bit of `x`, but XLA does not know.
+    """
+    number = reduce(hlo.add, map(_any_number, all_of))
+    one = hlo.constant(ir.DenseElementsAttr.get(np.ones((), np.int32)))
+    nothing = hlo.and_(hlo.multiply(number, hlo.add(number, one)), one)
+    bits, element = _bits(x), _bits(x).type.element_type
+    nothing = hlo.convert(ir.RankedTensorType.get([], element), nothing)
+    changed = hlo.xor(bits, hlo.broadcast_in_dim(bits.type, nothing, mlir.dense_int_array([])))
+    return changed if changed.type == x.type else hlo.bitcast_convert(x.type, changed)
+
+
+def _bits(x: Any) -> Any:
+    """`x` as integers."""
+    shape, element = x.type.shape, x.type.element_type
+    if isinstance(element, ir.IntegerType):
+        return x
+    return hlo.bitcast_convert(ir.RankedTensorType.get(shape, ir.IntegerType.get_signless(element.width)), x)
+
+
+def _any_number(x: Any) -> Any:
+    """An integer made of the first entry."""
+    lowest, highest, steps = (mlir.dense_int_array([n] * len(x.type.shape)) for n in (0, 1, 1))
+    entry = hlo.slice(x, lowest, highest, steps)
+    entry = _bits(hlo.reshape(ir.RankedTensorType.get([], x.type.element_type), entry))
+    return hlo.convert(ir.RankedTensorType.get([], ir.IntegerType.get_signless(32)), entry)
+
+
+def _is_plain(array: Any) -> bool:
+    return math.prod(array.shape) > 0 and not isinstance(array.element_type, ir.ComplexType)
+
+
+def _callee(call: Any) -> str:
+    return ir.FlatSymbolRefAttr(call.attributes["callee"]).value
+
+
+def _operations(functions: Any, function: Any, seen: set[str]) -> Iterator[str]:
+    """Kinds of the operations in a function, and in those it calls."""
+    todo = [function]
+    while todo:
+        for region in todo.pop().regions:
+            for block in region.blocks:
+                for each in block.operations:
+                    operation = each.operation
+                    if operation.name == "func.call" and _callee(operation) not in seen:
+                        seen.add(_callee(operation))
+                        yield from _operations(functions, functions[_callee(operation)].operation, seen)
+                    elif not operation.name.startswith("func."):
+                        yield _kind(operation)
+                        todo.append(operation)
+
+
+def _kind(operation: Any) -> str:
+    """Name of an operation without its dialect; of one that is too large for the kernel, a name that it does not hold.
+
+    XLA leaves products of matrices from 8 x 8 on and sums of many terms to a library; arithmetic of large arrays is for
+    several cores. A scatter to one place is a slice that is written.
+    """
+    kind, given = operation.name.removeprefix("stablehlo."), operation.operands
+    size = max((math.prod(x.type.shape) for x in operation.results), default=0)
+    if kind == "scatter":
+        indices = given[(len(given) - 1) // 2].type.shape
+        places = re.search(r"index_vector_dim = (\d+)", str(operation.attributes["scatter_dimension_numbers"]))
+        vector = int(places[1]) if places else 0
+        return "one_scatter" if math.prod(n for i, n in enumerate(indices) if i != vector) == 1 else kind
+    if kind == "dot_general":
+        fits = size * math.prod(given[0].type.shape) <= _MOST_PRODUCTS
+    elif kind == "reduce":
+        fits = math.prod(given[0].type.shape) <= _MOST_TERMS
+    else:
+        fits = kind in _MOVES or size <= _MOST_ENTRIES
+    return kind if fits else f"large {kind}"
+
+
+ad.primitive_jvps[_mark] = _jvp
+ad.primitive_transposes[_mark] = _transpose
+batching.primitive_batchers[_mark] = _batch
+mlir.register_lowering(_mark, lambda _, x, *__, **___: [x])
+mlir.register_lowering(_mark, _lower, platform="cpu", cacheable=False)
