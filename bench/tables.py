@@ -250,6 +250,17 @@ REPORTS = {
             ("parameters", "RMSE", "RMSE with 5 steps a sample", "held back", "standard error", "not determined"),
         ),),
     ),
+    "new_records": Report(
+        "Whether a fit to one record keeps its word on another one.", "identification",
+        (
+            Table(
+                "{pairs} synthetic pairs of records of an axis with LuGre friction, which depends on position by 5 %,"
+                " too; its level differs by 0 to {largest:g} % (drawn). A law is chosen by folds of the first record;"
+                " errors on the second, and its samples within bands for 90 %.",
+                ("samples in the band", "within 10 % of the best", "median error"), ("case",), ("quantity", "at"),
+            ),
+        ),
+    ),
     "coverage": Report(
         "How often 95 % intervals hold the truth.", "identification",
         (Table(

@@ -102,7 +102,7 @@ def _mark_call(ctx: mlir.LoweringRuleContext, call: Any) -> None:
         own = function.clone()
     call.attributes["callee"] = ir.FlatSymbolRefAttr.get(functions.insert(own).value)
     marks = {"xla_cpu_small_call": "true", "inlineable": "false"}
-    attributes = {name: ir.StringAttr.get(value) for name, value in marks.items()}
+    attributes: dict[str, ir.Attribute] = {name: ir.StringAttr.get(value) for name, value in marks.items()}
     call.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(attributes)
     block = own.regions[0].blocks[0]
     ending = block.operations[len(block.operations) - 1].operation
@@ -117,7 +117,7 @@ def _needing(x: Any, all_of: list[Any]) -> Any:
     Of any integer n, n (n + 1) is even: its last bit, which is zero, changes no bit of `x`, but XLA does not know.
     """
     number = reduce(hlo.add, map(_any_number, all_of))
-    one = hlo.constant(ir.DenseElementsAttr.get(np.ones((), np.int32)))
+    one = hlo.constant(ir.DenseElementsAttr.get(array=np.ones((), np.int32)))
     nothing = hlo.and_(hlo.multiply(number, hlo.add(number, one)), one)
     bits, element = _bits(x), _bits(x).type.element_type
     nothing = hlo.convert(ir.RankedTensorType.get([], element), nothing)

@@ -22,11 +22,12 @@ from ..identify import (
     agreement,
     compare,
     design_input,
+    expected_error,
     fit,
+    predict,
     profile,
     remarks,
     rough_axis,
-    score,
     step_shows,
 )
 from ..plot import comparison_figure, design_figure, fit_figure, score_figure
@@ -34,6 +35,7 @@ from ..scene import Scene, scene_numbers
 from ._fitted import (
     Findings,
     Fitted,
+    agreement_table,
     headline,
     origin,
     parameter_table,
@@ -99,12 +101,14 @@ def _fitted(plan: Plan) -> Fitted:
         substeps *= _FINER
         fitted = _fitted_with(plan, substeps, fitted.result)
     # Whoever pressed Ctrl-C does not wait for more.
-    scores = () if fitted.interrupted else tuple(score(fitted.result, record) for record in plan.held_out)
     several = len(plan.records) > 1 and not fitted.interrupted
+    agreed = agreement(fitted.result) if several else None
+    held_out = () if fitted.interrupted else plan.held_out
     return replace(
         fitted,
-        scores=scores,
-        agreement=agreement(fitted.result) if several else None,
+        predictions=tuple(predict(fitted.result, record, agreement=agreed) for record in held_out),
+        agreement=agreed,
+        expected=None if fitted.interrupted else expected_error(fitted.result, agreement=agreed)["measured"],
         substeps=substeps,
         seconds=time.perf_counter() - started,
     )
@@ -187,6 +191,8 @@ def _show(fitted: Fitted) -> None:
     show_table(parameter_table(result), f"{names}: {fitted.model}, {fitted.description}")
     if len(result.provenance.records) + len(fitted.scores) > 1:
         show_table(record_table(fitted), "Records")
+    if fitted.agreement is not None:
+        show_table(agreement_table(fitted.agreement), "What the records have in common, and what varies")
     how = result.diagnostics
     say(f"RMSE {result.rmse:.6g} {fitted.unit}; {how.evaluations} evaluations, {how.ending}")
     for remark in remarks(result):
@@ -203,8 +209,8 @@ def _files(findings: Findings) -> dict[str, Content]:
     single, seen = len(result.provenance.records) == 1, fitted.measured
     for i, record in enumerate(result.provenance.records):
         files["fit.png" if single else f"fit_{_numbered(i, record)}.png"] = fit_figure(result, record=i, **seen)
-    for i, held_out in enumerate(fitted.scores):
-        files[f"held_out_{_numbered(i, held_out.record)}.png"] = score_figure(held_out, **seen)
+    for i, held_out in enumerate(fitted.predictions):
+        files[f"held_out_{_numbered(i, held_out.score.record)}.png"] = score_figure(held_out, **seen)
     if fitted.comparison is not None:
         files["comparison.png"] = comparison_figure(fitted.comparison)
     return {

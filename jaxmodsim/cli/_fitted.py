@@ -10,8 +10,19 @@ from importlib import metadata
 import numpy as np
 import pandas as pd
 
+from .._core.files import jsonable
 from .._core.units import axis_unit
-from ..identify import Comparison, FitResult, InputDesign, Profile, RecordAgreement, Score, remarks
+from ..identify import (
+    Comparison,
+    ExpectedError,
+    FitResult,
+    InputDesign,
+    Profile,
+    RecordAgreement,
+    RecordPrediction,
+    Score,
+    remarks,
+)
 from ..scene import Scene, scene_numbers
 from ._equations import equations
 from ._plan import Plan
@@ -27,7 +38,8 @@ class Fitted:
     - `plan`: what was asked for. `model`: name of the model that was taken.
     - `result`: its fit to all records.
     - `comparison`: None where a single model was fitted, and not on folds.
-    - `scores`: on the records that were held out. `agreement`: of several records; None of one.
+    - `predictions`: of the records that were held out. `agreement`: of several records; None of one.
+    - `expected`: error on a new record; None after Ctrl-C.
     - `substeps`: integration steps between two samples.
     - `seconds`: that all took.
     """
@@ -36,10 +48,16 @@ class Fitted:
     model: str
     result: FitResult
     comparison: Comparison | None = None
-    scores: tuple[Score, ...] = ()
+    predictions: tuple[RecordPrediction, ...] = ()
     agreement: RecordAgreement | None = None
+    expected: ExpectedError | None = None
     substeps: int = 1
     seconds: float = 0.0
+
+    @property
+    def scores(self) -> tuple[Score, ...]:
+        """On the records that were held out."""
+        return tuple(prediction.score for prediction in self.predictions)
 
     @property
     def scene(self) -> Scene:
@@ -113,8 +131,8 @@ def origin() -> dict[str, str]:
     }
 
 
-def headline(fitted: Fitted) -> tuple[str, str, str]:
-    """Three lines to say aloud: what the axis is, how well it follows, and the first doubt."""
+def headline(fitted: Fitted) -> tuple[str, ...]:
+    """Lines to say aloud: what the axis is, how well it follows, the first doubt, what to expect of a new record."""
     result, records = fitted.result, fitted.result.provenance.records
     numbers = ", ".join(
         f"{name} {value:.4g}{f' {unit}' if unit else ''} (+-{error:.2g})"
@@ -131,16 +149,32 @@ def headline(fitted: Fitted) -> tuple[str, str, str]:
         f" {1e3 * math.sqrt(np.mean(missed**2)):.3g} m{fitted.unit}, {100 * np.std(missed) / spread:.2g} % of its"
         f" scatter{never}.",
         _first_doubt(fitted),
+        *_new_record(fitted),
+    )
+
+
+def _new_record(fitted: Fitted) -> tuple[str, ...]:
+    """What to expect of a record of the same motion, and whether bands held of the records that were held out."""
+    miss = fitted.expected
+    if miss is None:
+        return ()
+    causes = {"the model": miss.model, "unsure parameters": miss.parameters, "their change": miss.between}
+    listed = ", ".join(f"{1e3 * x:.3g} from {cause}" for cause, x in causes.items())
+    held = "".join(
+        f" Of {each.score.record.name} {100 * each.shares['measured']:.0f} % of the samples lie within the band for"
+        f" {100 * each.level:g} %."
+        for each in fitted.predictions
+    )
+    cannot = "One record cannot tell what changes from day to day. " if miss.records == 1 else ""
+    return (
+        f"{cannot}On a new record of this motion expect to miss by {1e3 * miss.total:.3g} m{fitted.unit} ({listed}),"
+        f" with {miss.assumption}.{held}",
     )
 
 
 def _first_doubt(fitted: Fitted) -> str:
     doubts = (*fitted.plan.notes, *differences(fitted), *start_remarks(fitted), *remarks(fitted.result))
-    if doubts:
-        return f"Before you rely on it: {doubts[0]}"
-    one = len(fitted.result.provenance.records) == 1
-    untested = "" if fitted.scores or not one else " Whether it holds on another day one record cannot tell."
-    return f"Nothing in the records speaks against it.{untested}"
+    return f"Before you rely on it: {doubts[0]}" if doubts else "Nothing in the records speaks against it."
 
 
 def differences(fitted: Fitted) -> tuple[str, ...]:
@@ -186,6 +220,12 @@ def record_table(fitted: Fitted) -> pd.DataFrame:
     )
 
 
+def agreement_table(agreement: RecordAgreement) -> pd.DataFrame:
+    """What is common to several records and what varies, by how much."""
+    columns = ["parameter", "common", "standard error", "between records", "95 % from", "to", "p of no difference"]
+    return pd.DataFrame(agreement.rows(), columns=pd.Index(columns))
+
+
 def model_table(comparison: Comparison, unit: str) -> pd.DataFrame:
     """Compared models, best first; `unit` is that of the position."""
     return pd.DataFrame(
@@ -194,6 +234,7 @@ def model_table(comparison: Comparison, unit: str) -> pd.DataFrame:
             "parameters": [each.parameters for each in comparison.ranked],
             f"held back, RMSE [m{unit}]": [1e3 * each.held_back for each in comparison.ranked],
             f"standard error [m{unit}]": [1e3 * each.error for each in comparison.ranked],
+            f"new record, RMSE to expect [m{unit}]": [1e3 * each.expected for each in comparison.ranked],
             f"over the best [m{unit}]": [1e3 * each.over for each in comparison.ranked],
             f"its standard error [m{unit}]": [1e3 * each.over_error for each in comparison.ranked],
             f"start fitted, RMSE [m{unit}]": [
@@ -236,7 +277,7 @@ def sample_table(fitted: Fitted) -> pd.DataFrame:
 
 def summary(findings: Findings) -> dict[str, object]:
     """All but the samples, of types that JSON knows."""
-    fitted = findings.fitted
+    fitted, agreed = findings.fitted, findings.fitted.agreement
     return {
         "headline": list(headline(fitted)),
         "read": list(fitted.plan.notes),
@@ -250,7 +291,10 @@ def summary(findings: Findings) -> dict[str, object]:
             score.record.name: None if score.start_fitted is None else score.start_fitted.rmse
             for score in fitted.scores
         },
-        "differing": None if fitted.agreement is None else list(fitted.agreement.differing),
+        "expected": None if fitted.expected is None else fitted.expected.total,
+        "held_out_within_band": {each.score.record.name: each.shares for each in fitted.predictions},
+        "agreement": None if agreed is None else jsonable(agreement_table(agreed).to_dict("records")),
+        "differing": None if agreed is None else list(agreed.differing),
         "comparison": None if fitted.comparison is None else fitted.comparison.to_dict(),
         "substeps": fitted.substeps,
         "seconds": fitted.seconds,

@@ -11,7 +11,17 @@ from markupsafe import Markup
 from ..identify import Comparison, InputDesign, remarks, residual_tests
 from ..plot import Figure, comparison_figure, design_figure, fit_figure, profile_figure, result_figure, score_figure
 from ._equations import equations
-from ._fitted import Findings, Fitted, design_table, headline, model_table, parameter_table, record_table
+from ._fitted import (
+    Findings,
+    Fitted,
+    agreement_table,
+    design_table,
+    differences,
+    headline,
+    model_table,
+    parameter_table,
+    record_table,
+)
 from ._output import cell
 
 # Magnitude of a correlation above which its cell is marked.
@@ -43,7 +53,13 @@ def report_page(findings: Findings) -> str:
         simulated=list(_simulated(fitted)),
         residual_tests=residual_tests(result),
         strong=_STRONG,
-        scores=[(f"{score.record.name}, held out", score_figure(score, **fitted.measured)) for score in fitted.scores],
+        scores=[
+            (f"{each.score.record.name}, held out", score_figure(each, **fitted.measured))
+            for each in fitted.predictions
+        ],
+        bands=[str(each) for each in fitted.predictions],
+        agreement=None if fitted.agreement is None else agreement_table(fitted.agreement),
+        differing=differences(fitted),
         comparison=None if fitted.comparison is None else _compared(fitted.comparison, fitted.unit),
         profiles=[(str(profile), profile.name, profile_figure(profile)) for profile in findings.profiles],
         design=None if findings.design is None else _designed(findings, findings.design),

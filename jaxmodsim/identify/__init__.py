@@ -32,6 +32,10 @@ from .selection._compare import Candidate as Candidate
 from .selection._compare import compare as compare
 from .selection._compare import compare_laws as compare_laws
 from .selection._comparison import Comparison as Comparison
+from .selection._prediction import ExpectedError as ExpectedError
+from .selection._prediction import RecordPrediction as RecordPrediction
+from .selection._prediction import expected_error as expected_error
+from .selection._prediction import predict as predict
 from .selection._score import Score as Score
 from .selection._score import score as score
 from .uncertainty._coverage import coverage as coverage

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..identify import FitResult, Record, Score
+from ..identify import FitResult, Record, RecordPrediction, Score
 from ._figure import Figure
 from ._style import BLUE, GREEN, GREY, RED, legend_above, legend_beside, panel_letters, small_unit
 
@@ -28,17 +28,35 @@ def fit_figure(
     return _followed(shown, residual, rmse, "simulated, open loop", quantity, unit, caption)
 
 
-def score_figure(score: Score, *, quantity: str = "position", unit: str = "m", caption: str = "") -> Figure:
+def score_figure(
+    score: Score | RecordPrediction, *, quantity: str = "position", unit: str = "m", caption: str = ""
+) -> Figure:
     """A fitted model on a record that it was not fitted to: measured and simulated, and their difference.
 
     **Arguments:**
 
-    - `score`: from `jaxmodsim.identify.score`, of one channel.
+    - `score`: from `jaxmodsim.identify.score` or `predict`, of one channel; the latter with its band.
     - `quantity`, `unit`: what was measured.
     - `caption`: a line for the source of the record.
     """
-    (residual,), (rmse,) = score.residuals.values(), score.rmse.values()
-    return _followed(score.record, residual, rmse, "simulated, only its start fitted", quantity, unit, caption)
+    prediction = score if isinstance(score, RecordPrediction) else None
+    shown = score.score if isinstance(score, RecordPrediction) else score
+    (residual,), (rmse,) = shown.residuals.values(), shown.rmse.values()
+    figure = _followed(shown.record, residual, rmse, "simulated, only its start fitted", quantity, unit, caption)
+    if prediction is not None:
+        _add_band(figure, prediction, small_unit(unit)[0])
+    return figure
+
+
+def _add_band(figure: Figure, prediction: RecordPrediction, factor: float) -> None:
+    """The band of a prediction, in both panels; in the lower one around the measured values."""
+    (lower,), (upper,), (share,) = prediction.lower.values(), prediction.upper.values(), prediction.shares.values()
+    (above, below), (output,) = figure.axes, prediction.score.outputs.values()
+    t, level = prediction.score.record.t, 100 * prediction.level
+    label = f"band for {level:g} % of the samples: it holds {100 * share:.0f} %"
+    above.fill_between(t, lower, upper, color=GREEN, alpha=0.25, lw=0, label=label)
+    below.fill_between(t, factor * (lower - output), factor * (upper - output), color=GREEN, alpha=0.25, lw=0)
+    above.legend(loc="upper right")
 
 
 def _followed(

@@ -85,6 +85,13 @@ def test_several_records_are_fitted_together_and_a_held_out_one_is_scored(fitted
     assert found["rmse"]["measured"] < 2e-4
     assert found["held_out"]["test"]["measured"] < 4e-4
     assert "held out" in text
+    # The same friction in all three; the band allows for a level that varies, and is wide.
+    assert found["headline"][3].startswith("On a new record of this motion expect to miss by ")
+    assert "as these 2 records show" in found["headline"][3]
+    assert "Of test 100 % of the samples lie within the band for 90 %." in found["headline"][3]
+    assert found["held_out_within_band"]["test"]["measured"] == 1.0
+    assert {row["parameter"] for row in found["agreement"]} == set(TRUTH)
+    assert "What the records have in common, and what varies" in text
     assert sorted(path.name for path in out.iterdir()) == [
         "fit.csv", "fit.json", "fit.npz", "fit_1_run_b_1.png", "fit_2_run2.png", "held_out_1_test.png", "report",
     ]  # fmt: skip
@@ -114,7 +121,7 @@ def test_a_report_is_one_page_that_needs_nothing_else(fitted):
         assert kind == "data:image/png;base64"
         assert base64.b64decode(data).startswith(b"\x89PNG")
     for text in ("run <b>1", "run2", "test", "m q'' = u - offset - F_dry - F_viscous", "Fc tanh(v/width)", "N s/m",
-                 "jaxmodsim fit", "jax 0.", "95 %", "held out", "Correlation", "likelihood"):  # fmt: skip
+                 "jaxmodsim fit", "jax 0.", "95 %", "in common", "90 % band", "Correlation", "likelihood"):  # fmt: skip
         assert text in page.text, text
     result = json.loads((out / "fit.json").read_text())
     for remark in result["remarks"]:
@@ -162,6 +169,8 @@ def test_models_are_compared(run_command, files, tmp_path):
         ["coulomb", "asymmetric"],
         ["asymmetric", "coulomb"],
     )
+    assert found["headline"][3].startswith("One record cannot tell what changes from day to day. On a new record")
+    assert "a friction level that varies by 4 % from record to record (assumed)" in text.splitlines()[3]
     assert found["comparison"]["conclusion"] in text
     assert (out / "comparison.png").stat().st_size > 10_000
     page = Page((out / "report.html").read_text())

@@ -1,6 +1,7 @@
 """Which model: the truth or a simpler one that suffices is named, by what was held back from the fit."""
 
 import json
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,7 @@ from jaxmodsim import plot
 from jaxmodsim.identify import Candidate, Comparison, Continuation, compare, compare_laws, law_force, replay
 from jaxmodsim.identify.data._record import cut, runs_of
 from jaxmodsim.identify.selection._compare import _blocks
-from jaxmodsim.identify.selection._comparison import correlation_time
+from jaxmodsim.identify.selection._memory import correlation_time
 
 DT, NOISE, WIDTH = 5e-3, 2e-5, 5e-3
 
@@ -192,3 +193,21 @@ def test_correlation_time_of_a_series_that_remembers():
         series[k] = 0.8 * series[k - 1] + white[k]
     assert correlation_time(series) == pytest.approx(9.0, rel=0.2)
     assert correlation_time(white) == pytest.approx(1.0, abs=0.1)
+
+
+def test_what_determines_its_parameters_comes_first_among_those_that_are_as_good(comparison):
+    best, second, *_ = comparison.ranked
+    near = replace(second, over=0.5 * best.error, over_error=best.error, parameters=best.parameters - 1)
+    assert replace(comparison, ranked=(best, near)).simplest == near.name
+    unknown = replace(near, undetermined=("friction.vs",))
+    assert replace(comparison, ranked=(best, unknown)).simplest == best.name
+    far = replace(best, undetermined=("friction.vs",))
+    assert replace(comparison, ranked=(far,)).simplest == best.name
+
+
+def test_a_level_that_varies_adds_the_same_to_all_and_uncertain_parameters_their_own(comparison):
+    added = {each.name: each.expected**2 - each.held_back**2 for each in comparison.ranked}
+    least = min(added.values())
+    assert least > 0
+    assert added["stribeck"] < 1.05 * least  # well determined: next to nothing but the level
+    assert "to expect on a new record" in comparison.conclusion

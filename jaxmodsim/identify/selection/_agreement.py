@@ -1,4 +1,4 @@
-"""Whether records agree: each fitted by itself, parameter by parameter."""
+"""Whether records agree: each fitted by itself, parameter by parameter; what is common, what varies, by how much."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -6,16 +6,27 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 
-from ..estimate._search import SearchOptions, solve
+from ...friction import AbstractLaw
+from ...scene import Scene, scene_numbers, scene_ranges
+from ..estimate._problem import FitProblem
+from ..estimate._search import SearchOptions, SearchResult, solve
+from ..model._parameters import split_ranges
 from ..uncertainty._estimate import covariance_of
 from ..uncertainty._result import FitResult
+from ._memory import blocks_that_are_independent
+from ._opening import pinned
+
+# Least eigenvalue of a correlation matrix of estimates against the largest one.
+_LEAST = 1e-10
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordAgreement:
-    """Whether the parameters of a model are the same in several records.
+    """Whether the parameters of a model are the same in several records, and by how much they vary if not.
+
+    Each parameter of a record is taken as a common value plus a random part of the record plus the error of its fit.
 
     - `records`, `names`: of the records and of the parameters.
     - `values`, `errors`: of each parameter in a fit to each record alone, and its standard error (residuals correlated
@@ -23,6 +34,13 @@ class RecordAgreement:
     - `p`: probability that values which are the same come out at least as different, shape `[parameters]`; NaN of a
       parameter that some record does not determine or that ends at a limit.
     - `level`: probability with which any parameter at all is said to differ where none does.
+    - `common`, `common_errors`: the common value of each parameter and its standard error, shape `[parameters]`.
+    - `between`: standard deviation of each parameter from record to record (Paule, Mandel 1982, J. Res. NBS 87:377),
+      shape `[parameters]`; `between_interval`: its 95 % interval (Viechtbauer 2007, Stat. Med. 26:37), shape
+      `[parameters, 2]`, wide with few records. NaN as `p`.
+    - `covariance`: of the parameters between records, shape `[parameters, parameters]`, by the method of moments with
+      what errors of the fits explain taken off, never below zero in any direction (Jackson, White, Riley 2013, Biom. J.
+      55:231); zero where `p` is NaN.
     """
 
     records: tuple[str, ...]
@@ -31,6 +49,11 @@ class RecordAgreement:
     errors: Float[np.ndarray, "records parameters"]
     p: Float[np.ndarray, " parameters"]
     level: float
+    common: Float[np.ndarray, " parameters"]
+    common_errors: Float[np.ndarray, " parameters"]
+    between: Float[np.ndarray, " parameters"]
+    between_interval: Float[np.ndarray, "parameters 2"]
+    covariance: Float[np.ndarray, "parameters parameters"]
 
     @property
     def differing(self) -> tuple[str, ...]:
@@ -55,6 +78,11 @@ class RecordAgreement:
             lines.append(f"The records differ in {name} by {share:.2g} %: {each} (p = {p:.1g}).")
         return tuple(lines)
 
+    def rows(self) -> list[tuple[str, float, float, float, float, float, float]]:
+        """Rows of a table: name, common value, its standard error, between records, its 95 % interval, p."""
+        columns = (self.common, self.common_errors, self.between, *self.between_interval.T, self.p)
+        return list(zip(self.names, *(x.tolist() for x in columns), strict=True))
+
     def __str__(self) -> str:
         """What differs, and what does not as far as the records show."""
         lines = [*self.sentences]
@@ -63,6 +91,14 @@ class RecordAgreement:
         ]
         if others:
             lines.append(f"They do not show a difference in {', '.join(others)}.")
+        width = max(len(name) for name in self.names)
+        lines.append(
+            f"{'':{width}}  {'common':>12}  {'std. error':>10}  {'between':>10}  {'95 % interval':>21}  {'p':>7}"
+        )
+        lines += [
+            f"{name:{width}}  {x:12.5g}  {error:10.2g}  {between:10.2g}  {low:9.2g} to {high:8.2g}  {p:7.2g}"
+            for name, x, error, between, low, high, p in self.rows()
+        ]
         return "\n".join(lines)
 
 
@@ -70,7 +106,10 @@ def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 100) -
     """Fit each record by itself, from the fit to all, and test whether the parameters are the same.
 
     For each parameter the sum of squared distances from its weighted mean, in standard errors, is held against its
-    distribution (chi-squared, one degree of freedom less than there are records).
+    distribution (F, one degree of freedom less than there are records, and one less than there are blocks of samples
+    from whose scatter each error comes; blocks are longer where the residual remembers for long). The standard
+    deviation between records is the one with which this sum, errors and deviation together, comes to its expectation,
+    and the ends of its interval those with which it comes to its quantiles.
 
     **Arguments:**
 
@@ -87,7 +126,7 @@ def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 100) -
     - `ValueError` for one record, records in windows, a loaded result, or a level out of range.
     - `RuntimeError` where the fit to a record ends with values that are not finite.
     """
-    from scipy.stats import chi2  # most of a second to import, and only needed here
+    from scipy.stats import chi2, f  # most of a second to import, and only needed here
 
     records = tuple(record.name for record in result.provenance.records)
     if result.search is None:
@@ -104,25 +143,100 @@ def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 100) -
     for i, record in enumerate(records):
         base, runs = jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], (problem.base, problem.runs))
         alone = dataclasses.replace(problem, base=base, runs=runs)
-        search = solve(alone, jnp.concatenate([shared, own[i]]), SearchOptions(max_steps=max_steps))
+        search = _search_alone(alone, jnp.concatenate([shared, own[i]]), result, SearchOptions(max_steps=max_steps))
         if not bool(jnp.isfinite(search.state.cost)):
             raise RuntimeError(f"The fit to {record} alone ended with values that are not finite.")
-        covariance = covariance_of(alone, search.state, len(problem.free.names)).covariance
+        blocks = blocks_that_are_independent(search)
+        covariance = np.array(covariance_of(alone, search.state, len(problem.free.names), blocks).covariance)
         value = np.asarray(problem.free.vector(search.state.x[: len(problem.free.names)]))
         limits = problem.free.limits(search.state.x[: len(problem.free.names)])
         at_limit = [x in limits[name] for name, x in zip(problem.free.names, value.tolist(), strict=True)]
-        fits.append((value, np.where(at_limit, np.nan, np.sqrt(np.diag(np.asarray(covariance))))))
-    values, errors = (np.stack(each) for each in zip(*fits, strict=True))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        weight = 1.0 / errors**2
-        mean = np.sum(weight * values, axis=0) / np.sum(weight, axis=0)
-        p = chi2.sf(np.sum(weight * (values - mean) ** 2, axis=0), len(records) - 1)
-    known = np.all(np.isfinite(errors) & (errors > 0), axis=0)
+        covariance[np.diag_indices(len(value))] = np.where(at_limit, np.nan, np.diag(covariance))
+        fits.append((value, covariance, blocks - 1))
+    values, own, known_by = (np.stack(each) for each in zip(*fits, strict=True))
+    variances = np.diagonal(own, axis1=1, axis2=2)
+    known = np.all(np.isfinite(variances) & (variances > 0), axis=0)
+    freedom = len(records) - 1
+    quantiles = (float(freedom), *chi2.ppf([0.975, 0.025], freedom).tolist())
+    found = np.full((6, len(problem.free.names)), np.nan)
+    for k in np.flatnonzero(known):
+        x, variance = values[:, k], variances[:, k]
+        between = [_between(x, variance, quantile) for quantile in quantiles]
+        mean, precision, _ = _weighted(x, variance + between[0])
+        p = f.sf(_weighted(x, variance)[2] / freedom, freedom, np.sum(known_by))
+        found[:, k] = (mean, precision**-0.5, *np.sqrt(between), p)
     return RecordAgreement(
         records=records,
         names=problem.free.names,
         values=values,
-        errors=errors,
-        p=np.where(known, p, np.nan),
+        errors=np.sqrt(variances),
+        p=found[5],
         level=level,
+        common=found[0],
+        common_errors=found[1],
+        between=found[2],
+        between_interval=found[3:5].T,
+        covariance=_covariance_between(values, own, known),
     )
+
+
+def _search_alone(
+    problem: FitProblem, x: Float[Array, " n"], result: FitResult, options: SearchOptions
+) -> SearchResult:
+    """From where the fit to all ended, and from there with the friction level of this record: the better of both.
+
+    What fits several records whose levels differ has other parameters wrong, too, and lies in a valley of its own.
+    """
+    direct = solve(problem, x, options)
+    levels = friction_levels(result)
+    if not levels:
+        return direct
+    level = solve(pinned(problem, x, result, levels), x, options).state.x
+    return min(direct, solve(problem, level, options), key=lambda search: float(search.state.cost))
+
+
+def friction_levels(result: FitResult) -> tuple[str, ...]:
+    """Names of the free parameters that are forces of friction: those of the laws in N."""
+    model = result.model
+    if not isinstance(model, Scene | AbstractLaw):
+        return ()
+    ranges = split_ranges(scene_numbers(model), scene_ranges(model))
+    return tuple(name for name in result.values if name in ranges and ranges[name].unit.split(" per ")[0] == "N")
+
+
+def _weighted(x: Float[np.ndarray, " records"], variance: Float[np.ndarray, " records"]) -> tuple[float, float, float]:
+    """Weighted mean, the sum of the weights, and the weighted sum of squares around it."""
+    weight = 1.0 / variance
+    mean = float(np.sum(weight * x) / np.sum(weight))
+    return mean, float(np.sum(weight)), float(np.sum(weight * (x - mean) ** 2))
+
+
+def _between(x: Float[np.ndarray, " records"], variance: Float[np.ndarray, " records"], target: float) -> float:
+    """Variance between records, >= 0, with which the weighted sum of squares comes to `target`."""
+    from scipy.optimize import brentq  # slow to import, and only needed here
+
+    if _weighted(x, variance)[2] <= target:
+        return 0.0
+    # With equal weights, which are too large, the sum is still larger than with those of the weighted mean.
+    most = float(np.sum((x - np.mean(x)) ** 2)) / target
+    return float(np.asarray(brentq(lambda between: _weighted(x, variance + between)[2] - target, 0.0, most)))
+
+
+def _covariance_between(
+    values: Float[np.ndarray, "records free"],
+    own: Float[np.ndarray, "records free free"],
+    known: Bool[np.ndarray, " free"],
+) -> Float[np.ndarray, "free free"]:
+    """Covariance between records: of the scatter of the values, what exceeds the mean covariance `own` of the fits."""
+    covariance = np.zeros(own.shape[1:])
+    if not known.any():
+        return covariance
+    mean = np.mean(own, axis=0)[np.ix_(known, known)]
+    scale = np.sqrt(np.diag(mean))
+    size, direction = np.linalg.eigh(mean / np.outer(scale, scale))
+    size = np.sqrt(np.maximum(size, _LEAST * size[-1]))
+    whitened = ((values - np.mean(values, axis=0))[:, known] / scale) @ direction / size
+    spread, axes = np.linalg.eigh(whitened.T @ whitened / (len(values) - 1))
+    back = scale[:, None] * direction * size @ axes
+    covariance[np.ix_(known, known)] = back * np.maximum(spread - 1.0, 0.0) @ back.T
+    return covariance

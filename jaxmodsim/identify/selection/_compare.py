@@ -18,7 +18,7 @@ from ...scene import Scene, State, scene_numbers
 from ..data._record import Record, Runs, cut, runs_of
 from ..estimate._initializers import AbstractInitializer, Continuation, FromSmaller, last_part
 from ..estimate._prepare import Settings, StartState, measured_start, prepare
-from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
+from ..estimate._problem import AbstractLoss, FitProblem, SquaredLoss
 from ..estimate._search import Progress, SearchOptions, SearchResult, SearchState, solve
 from ..estimate._search import by_channel as residual_by_channel
 from ..model._engines import DELAY
@@ -27,7 +27,7 @@ from ..model._parameters import split_entries
 from ..uncertainty._fit import fit, fit_law
 from ..uncertainty._result import FitResult
 from ._comparison import Comparison, CrossValidated, Part, comparison_of
-from ._opening import after, begin, counting, sample_counts
+from ._opening import after, begin, check_lengths, counting, pinned, sample_counts
 
 # Called after each iteration with the name of the model, the number of the fold that is held back (None: nothing is),
 # the number of the iteration and the root mean square of the residual.
@@ -120,10 +120,10 @@ def compare(
 
     Each record is cut into `folds` windows. In turn one window of each record is held back: the model is fitted to the
     others, every window from a start state (q0, qd0) of its own, then run over the window that was held back with these
-    parameters. Its start is fitted to its first samples, a twentieth and at least 20, and the others are judged. The
-    error with a start that is fitted to all of them stands beside it and judges nothing. The states of friction laws
-    where a window begins are those of the fit to whole records. With `hold_out` the model is fitted to `records`, and
-    run over the whole of each of those in the same way.
+    parameters. Its start is fitted to its first samples, a twentieth and at least 20, but no more than half of them,
+    and the others are judged. The error with a start that is fitted to all of them stands beside it and judges nothing.
+    The states of friction laws where a window begins are those of the fit to whole records. With `hold_out` the model
+    is fitted to `records`, and run over the whole of each of those in the same way.
 
     Models are fitted in the order of their numbers of parameters, each also from where the largest one before it ended
     whose parameters, by the last part of their names, it has all: what is part of it should not fit better.
@@ -147,7 +147,8 @@ def compare(
 
     **Raises:**
 
-    - `ValueError` for fewer than two folds, no candidates, limits that no candidate has, and as `fit` does.
+    - `ValueError` for fewer than two folds, parts that are too short to be judged by, no candidates, limits that no
+      candidate has, and as `fit` does.
     """
     several = (records,) if isinstance(records, Record) else tuple(records)
     others = (hold_out,) if isinstance(hold_out, Record) else tuple(hold_out)
@@ -175,7 +176,9 @@ def compare(
             )
         known |= _names(candidate.scene, several)
         # Wrong names show before the first model has taken its time.
-        prepare(candidate.scene, several, candidate.free, asked.settings(candidate.scene, q0, qd0))
+        base = prepare(candidate.scene, several, candidate.free, asked.settings(candidate.scene, q0, qd0)).problem.base
+        parts = others or [each for record in several for each in record.windows(_span(record) / folds)]
+        check_lengths(parts, 0 if base is None else base.q.shape[1] + base.qd.shape[1])
     unknown = [name for name in asked.limits if _base(name) not in known]
     unknown += [each.name for each in initializers if isinstance(each, Continuation) and each.name not in known]
     if unknown:
@@ -186,7 +189,7 @@ def compare(
     }
     description = {name: candidate.description for name, candidate in candidates.items()}
     by = f"{folds} folds" if not others else ", ".join(record.name for record in others)
-    return _compared(judges, description, by, progress)
+    return _compared(judges, description, by, progress, new_records=bool(others))
 
 
 def compare_laws(
@@ -247,7 +250,8 @@ def compare_laws(
         name: partial(judge, name, candidate)
         for name, candidate in sorted(candidates.items(), key=lambda item: len(ranges_of(item[1].scene)))
     }
-    return _compared(judges, {name: each.description for name, each in candidates.items()}, f"{folds} folds", progress)
+    description = {name: each.description for name, each in candidates.items()}
+    return _compared(judges, description, f"{folds} folds", progress, new_records=False)
 
 
 def _check(candidates: Mapping[str, object], folds: int) -> None:
@@ -283,6 +287,8 @@ def _compared(
     description: Mapping[str, str],
     by: str,
     progress: bool | CompareProgress,
+    *,
+    new_records: bool,
 ) -> Comparison:
     """All candidates one after the other, each told of those before it, whatever becomes of each."""
     judged: dict[str, CrossValidated] = {}
@@ -298,7 +304,7 @@ def _compared(
             except RuntimeError as error:
                 failures[name] = str(error).splitlines()[0]
     left = tuple(name for name in judges if name not in judged and name not in failures)
-    return comparison_of(judged, failures, left, description, by)
+    return comparison_of(judged, failures, left, description, by, new_records=new_records)
 
 
 def _finished(search: SearchResult | None) -> SearchResult:
@@ -382,28 +388,14 @@ def _evaluated(
 
     Of the samples that count; behind the first ones, where there are starts.
     """
-    pinned = _pinned(problem, x, result)
+    fixed = pinned(problem, x, result)
     if not problem.local:
-        search = _finished(solve(pinned, x, options))
+        search = _finished(solve(fixed, x, options))
         return _parts(search.problem, search.state, block), ()
-    shown = _finished(begin(pinned, x, options)).state.x
-    best = _finished(solve(pinned, shown, options)).state.x
-    held, fitted = (_parts(*after(pinned, each, options), block) for each in (shown, best))
+    shown = _finished(begin(fixed, x, options)).state.x
+    best = _finished(solve(fixed, shown, options)).state.x
+    held, fitted = (_parts(*after(fixed, each, options), block) for each in (shown, best))
     return held, fitted
-
-
-def _pinned(problem: FitProblem, x: Float[Array, " n"], result: FitResult) -> FitProblem:
-    """The problem with the parameters held where they are, by a prior: arrays alone, so nothing compiles again.
-
-    A quarter of the digits beyond what the records know of each parameter: it moves by no more than a
-    millionth of its standard error, and the normal equations are still well scaled.
-    """
-    mean = problem.free.vector(problem.split(x)[0])
-    stiff = float(jnp.finfo(mean.dtype).eps) ** -0.25
-    known = np.sqrt(np.diag(result.estimate.information)[: len(mean)])
-    size = np.abs(np.asarray(mean))
-    weight = stiff * np.maximum(known, 1 / np.where(size > 0, size, 1.0))
-    return eqx.tree_at(lambda p: p.prior, problem, Prior(mean, jnp.asarray(weight, mean.dtype)))
 
 
 def _parts(problem: FitProblem, state: SearchState, block: Int[np.ndarray, "runs samples"]) -> tuple[Part, ...]:

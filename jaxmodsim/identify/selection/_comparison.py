@@ -13,8 +13,9 @@ from ..estimate._problem import AbstractLoss
 from ..estimate._search import SearchResult
 from ..estimate._search import by_channel as residual_by_channel
 from ..uncertainty._estimate import sample_blocks
-from ..uncertainty._residual_tests import autocorrelation, positive_lags
 from ..uncertainty._result import FitResult
+from ._memory import effective_samples
+from ._variation import VARIATION, change_between, covariances, mean_variances
 
 # Directions of the parameters known this much worse than the best one are nothing that double precision can weigh.
 _LEAST = 1e-10
@@ -23,6 +24,8 @@ Part: TypeAlias = dict[str, np.ndarray]
 # A standard error beyond this share of the value says that the record does not determine it; so does a value that went
 # further from its start than this factor.
 _SHARE, _FAR = 0.5, 1e6
+# Errors on what was held back that differ by no more than this factor are the same for whoever uses the model.
+_AS_GOOD = 1.1
 
 
 def deviance(search: SearchResult) -> float:
@@ -58,25 +61,6 @@ def penalty(search: SearchResult) -> float:
     return float(np.sum(across**2 / values[known]) * count / (count - 1) + np.sum(~known))
 
 
-def effective_samples(search: SearchResult) -> float:
-    """Number of samples over the correlation of the residual, `n / (1 + 2 sum of autocorrelations)`, of all series."""
-    total = 0.0
-    for residual, weight in residual_by_channel(search.problem, search.state.residual).values():
-        for row, counts in zip(residual, weight, strict=True):
-            series = row[counts > 0]
-            total += len(series) / correlation_time(series)
-    return total
-
-
-def correlation_time(series: Float[np.ndarray, " samples"]) -> float:
-    """`1 + 2 sum of autocorrelations`, >= 1, by Geyer's initial positive sequence."""
-    around = series - np.mean(series) if len(series) else series
-    if len(series) < 2 or not np.any(around):
-        return 1.0
-    correlation = autocorrelation(around)
-    return max(2 * float(np.sum(correlation[: positive_lags(correlation)])) - 1.0, 1.0)
-
-
 class CrossValidated(NamedTuple):
     """A fit, and the residuals of what was held back from it; those with starts fitted to it, where there are any."""
 
@@ -94,8 +78,11 @@ class Ranked:
       the start of each part was fitted to it, and that to its first samples. `start_fitted`: the error with starts
       fitted to all of each part; None for laws, which have none.
     - `parts`: the root mean square errors of the parts that were held back, shape `[parts]`.
-    - `over`, `over_error`: how much more than the best model's error it is, and the standard error of this difference,
-      from the differences in each part.
+    - `expected`: root mean square error to expect on a new record: `held_back` and, squares added, what the uncertainty
+      of the parameters adds over whole records and what a friction level that varies between records adds. Where
+      records were held out, these show it themselves, and it is `held_back`.
+    - `over`, `over_error`: by how much it is expected to err more than the best model, and the standard error of this
+      difference, from the differences in each part.
     - `fitted`: root mean square error of the fit to everything.
     - `takeuchi`, `bic`: information criteria less the least of all models; see `Comparison`.
     - `penalty`: effective number of parameters, of Takeuchi's criterion.
@@ -108,6 +95,7 @@ class Ranked:
     held_back: float
     error: float
     parts: Float[np.ndarray, " parts"]
+    expected: float
     over: float
     over_error: float
     start_fitted: float | None
@@ -120,7 +108,13 @@ class Ranked:
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Models, ranked by their error on what was held back from the fit.
+    """Models, ranked by the error to expect on a new record, from that on what was held back from the fit.
+
+    What is added to the squared error on parts that were held back is `J V J'`, by the covariance V of the parameters
+    and the derivatives J of the output of the fit to everything: parts begin anew and are short, and hide what
+    uncertain parameters make of a whole record. A friction level that varies from record to record by 4 % (standard
+    deviation) adds the same to all models, as it is the machine that varies: as much as the model with the least error
+    on what was held back says, of those whose parameters the records determine if there are any.
 
     Errors are root mean squares in the unit of the channel where there is one, in noise levels (as given, or the least
     that any model found) where there are several; with another loss than squares, roots of the mean loss. The standard
@@ -156,7 +150,7 @@ class Comparison:
 
     @property
     def best(self) -> str:
-        """Name of the model with the least error on what was held back.
+        """Name of the model with the least error to expect on a new record.
 
         **Raises:**
 
@@ -166,7 +160,13 @@ class Comparison:
 
     @property
     def simplest(self) -> str:
-        """Name of the model with the fewest parameters that is no worse than the best by more than one standard error.
+        """Name of the simplest model that is expected to be no worse than the best by more than one standard error.
+
+        Nor may its error on what was held back be larger by more than a tenth: with few parts the standard error is
+        rough. A tenth alone counts where the records do not determine all parameters of the best.
+
+        The simplest is the one with the fewest parameters among those whose parameters the records determine, and among
+        the others where there is none of these: what nothing determines is not known of another motion.
 
         The one-standard-error rule of Breiman et al. (1984, Classification and Regression Trees, section 3.4.3), with
         the standard error of the difference from the best one, which leaves out what is hard for all of them.
@@ -175,8 +175,17 @@ class Comparison:
 
         - `ValueError` if no model could be fitted.
         """
-        near = [each for each in self.ranked if each.over <= each.over_error or each is self._first]
-        return min(near or (self._first,), key=lambda each: (each.parameters, each.held_back)).name
+        best = self._first
+        near = [
+            each
+            for each in self.ranked
+            if each is best
+            or (
+                each.held_back <= _AS_GOOD * best.held_back
+                and (each.over <= each.over_error or bool(best.undetermined))
+            )
+        ]
+        return min(near, key=lambda each: (bool(each.undetermined), each.parameters, each.expected)).name
 
     @property
     def _first(self) -> Ranked:
@@ -196,6 +205,7 @@ class Comparison:
                 "held_back": each.held_back,
                 "standard_error": each.error,
                 "parts": each.parts.tolist(),
+                "expected": each.expected,
                 "over_the_best": each.over,
                 "over_the_best_standard_error": each.over_error,
                 "start_fitted": each.start_fitted,
@@ -222,10 +232,13 @@ class Comparison:
             f"The simplest sufficient law is {chosen}{what}: {simple.parameters} parameters, error on what was held"
             f" back {simple.held_back:.4g}"
         )
+        if simple.expected > simple.held_back:
+            said += f", {simple.expected:.4g} to expect on a new record"
         if simple is not best:
+            near = simple.over <= simple.over_error
             said += (
-                f"; {best.name} with {best.parameters} is better by {simple.over:.2g}, which is within one standard"
-                f" error, {simple.over_error:.2g}."
+                f"; {best.name} with {best.parameters} is expected to be better by {simple.over:.2g}, which is"
+                f" {'within' if near else 'more than'} one standard error, {simple.over_error:.2g}."
             )
         else:
             simpler = [each for each in self.ranked if each.parameters < best.parameters]
@@ -246,14 +259,16 @@ class Comparison:
         """A ranked table that ends with the conclusion."""
         width = max(len(str(row["name"])) for row in self.table)
         lines = [
-            f"{'':{width}}  {'param.':>6}  {'held back':>10}  {'std. error':>10}  {'over the best':>21}"
+            f"{'':{width}}  {'param.':>6}  {'held back':>10}  {'std. error':>10}  {'new record':>10}"
+            f"  {'over the best':>21}"
             f"  {'start fitted':>12}  {'all fitted':>10}"
             f"  {'Takeuchi':>9}  {'BIC':>9}"
         ]
         for each in self.ranked:
             over = "" if each is self.ranked[0] else f"{each.over:10.3g} +- {each.over_error:7.2g}"
             lines.append(
-                f"{each.name:{width}}  {each.parameters:6d}  {each.held_back:10.4g}  {each.error:10.2g}  {over:>21}"
+                f"{each.name:{width}}  {each.parameters:6d}  {each.held_back:10.4g}  {each.error:10.2g}"
+                f"  {each.expected:10.4g}  {over:>21}"
                 f"  {'' if each.start_fitted is None else f'{each.start_fitted:.4g}':>12}"
                 f"  {each.fitted:10.4g}  {each.takeuchi:9.1f}  {each.bic:9.1f}"
             )
@@ -290,8 +305,10 @@ def comparison_of(
     left: tuple[str, ...],
     descriptions: Mapping[str, str],
     by: str,
+    *,
+    new_records: bool,
 ) -> Comparison:
-    """Rank what was judged; what is not finite failed."""
+    """Rank what was judged; what is not finite failed. `new_records`: whether whole records were held back."""
     failures, kept = dict(failures), {}
     for name, each in judged.items():
         finite = all(np.isfinite(x).all() for part in each.held for x in part.values())
@@ -312,7 +329,8 @@ def comparison_of(
     losses = {name: _losses(each.held, searches[name].problem.loss, levels) for name, each in kept.items()}
     count = np.array([sum(len(x) for x in part.values()) for part in next(iter(kept.values())).held])
     means = {name: float(np.sum(count * loss) / np.sum(count)) for name, loss in losses.items()}
-    order = sorted(means, key=lambda name: means[name])
+    expected = dict(means) if new_records else _expected(means, kept, levels)
+    order = sorted(expected, key=lambda name: expected[name])
     best = order[0]
     d = {name: deviance(each) for name, each in searches.items()}
     trace = {name: penalty(each) for name, each in searches.items()}
@@ -321,17 +339,18 @@ def comparison_of(
     bic = {name: d[name] * effective / samples + size[name] * np.log(effective) for name in kept}
     ranked = []
     for name in order:
-        held_back, least = np.sqrt(means[name]), np.sqrt(means[best])
-        together = held_back + least
+        held_back, root, least = (float(np.sqrt(x)) for x in (means[name], expected[name], expected[best]))
+        together = root + least
         ranked.append(
             Ranked(
                 name=name,
                 description=descriptions.get(name, ""),
                 parameters=size[name],
-                held_back=float(held_back),
+                held_back=held_back,
                 error=float(_standard_error(losses[name], count) / (2 * held_back)) if held_back > 0 else 0.0,
                 parts=np.sqrt(losses[name]),
-                over=float(held_back - least),
+                expected=root,
+                over=root - least,
                 over_error=float(_standard_error(losses[name] - losses[best], count) / together) if together else 0.0,
                 start_fitted=_mean_root(kept[name].start_fitted, searches[name].problem.loss, levels),
                 fitted=fitted[name],
@@ -351,6 +370,29 @@ def comparison_of(
         samples=samples,
         effective=effective,
     )
+
+
+def _expected(
+    means: Mapping[str, float], judged: Mapping[str, CrossValidated], levels: Mapping[str, float]
+) -> dict[str, float]:
+    """Mean loss to expect on a new record, by the name of the model."""
+    searches = {name: _search_of(each) for name, each in judged.items()}
+    covariance = {name: covariances(each.result, VARIATION, None) for name, each in judged.items()}
+    best = min(means, key=lambda name: (bool(_undetermined(judged[name].result)), means[name]))
+    between = _mean(change_between(searches[best], covariance[best][1]), searches[best], levels)
+    return {
+        name: mean + _mean(mean_variances(searches[name], covariance[name][0]), searches[name], levels) + between
+        for name, mean in means.items()
+    }
+
+
+def _mean(variances: Mapping[str, float], search: SearchResult, levels: Mapping[str, float]) -> float:
+    """Over all samples, of variances in the noise levels of the search; in the squared unit of a single channel."""
+    count = {name: float(jnp.sum(weight > 0)) for name, weight in search.problem.columns.items()}
+    ratio = {name: float(search.problem.noise[name]) / level for name, level in levels.items()}
+    count = {name: count[name] for name in variances}
+    total = sum(count[name] * ratio[name] ** 2 * x for name, x in variances.items()) / sum(count.values())
+    return (next(iter(levels.values())) ** 2 if len(levels) == 1 else 1.0) * total
 
 
 def _listed(names: tuple[str, ...], most: int = 4) -> str:

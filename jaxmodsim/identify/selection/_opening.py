@@ -1,15 +1,19 @@
 """The first samples of a record that was not fitted: they show where it starts, and do not count after that."""
 
+from collections.abc import Collection, Iterable
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..data._record import Runs
-from ..estimate._problem import FitProblem
+from ..data._record import Record, Runs
+from ..estimate._problem import FitProblem, Prior
 from ..estimate._search import SearchOptions, SearchResult, SearchState, solve, start_search, step
+from ..uncertainty._result import FitResult
 
-# So many of the samples, and at least so many, show the state at the first one.
+# So many of the samples, and at least so many but no more than half of them, show the state at the first one.
 SHARE, LEAST = 0.05, 20
 
 
@@ -20,7 +24,23 @@ def sample_counts(runs: Runs) -> Int[np.ndarray, "runs 1"]:
 
 def opening(runs: Runs) -> Bool[np.ndarray, "runs samples"]:
     """The first samples of each run."""
-    return np.arange(runs.t.shape[1]) < np.maximum(np.ceil(SHARE * sample_counts(runs)), LEAST)
+    count = sample_counts(runs)
+    return np.arange(runs.t.shape[1]) < np.minimum(np.maximum(np.ceil(SHARE * count), LEAST), count // 2)
+
+
+def check_lengths(records: Iterable[Record], numbers: int) -> None:
+    """Refuse records, or parts of them, half of which does not show so many numbers of a state.
+
+    **Raises:**
+
+    - `ValueError` naming the record.
+    """
+    for record in records:
+        if len(record.t) // 2 <= numbers:
+            raise ValueError(
+                f"{record.name} has {len(record.t)} samples, too few to show the {numbers} numbers of its start and to"
+                f" judge the model by the others: {2 * numbers + 2} are needed. Take a longer record, or fewer folds."
+            )
 
 
 def counting(problem: FitProblem, mask: np.ndarray, *, slips: bool = True) -> FitProblem:
@@ -43,3 +63,20 @@ def after(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
     rest = counting(problem, ~opening(problem.runs))
     # The first evaluation of a search, which has nothing to move by yet.
     return rest, step(rest, start_search(x, rest.rows), jnp.asarray(options.rtol, x.dtype))
+
+
+def pinned(problem: FitProblem, x: Float[Array, " n"], result: FitResult, free: Collection[str] = ()) -> FitProblem:
+    """The problem with all parameters but `free` held at `x`, by a prior: arrays alone, so nothing compiles again.
+
+    A quarter of the digits beyond what the records know of each parameter: it moves by no more than a
+    millionth of its standard error, and the normal equations are still well scaled.
+    """
+    mean = problem.free.vector(problem.split(x)[0])
+    stiff = float(jnp.finfo(mean.dtype).eps) ** -0.25
+    known = np.sqrt(np.maximum(np.diag(result.estimate.information)[: len(mean)], 0.0))  # rounding may leave less
+    size = np.abs(np.asarray(mean))
+    weight = stiff * np.maximum(known, 1 / np.where(size > 0, size, 1.0))
+    moves = np.array([name in free for name in problem.free.names], bool)
+    held = Prior(mean, jnp.asarray(weight, mean.dtype))
+    prior = jax.tree.map(lambda own, new: jnp.where(moves, own, new), problem.prior, held)
+    return eqx.tree_at(lambda p: p.prior, problem, prior)

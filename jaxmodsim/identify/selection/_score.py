@@ -18,7 +18,7 @@ from ..estimate._search import SearchOptions, channels_seen, solve
 from ..model._engines import DELAY, EventEngine, ReplayEngine
 from ..model._parameters import FreeParameters
 from ..uncertainty._result import FitResult
-from ._opening import begin, opening
+from ._opening import begin, check_lengths, opening
 
 _Start: TypeAlias = ArrayLike | Sequence[ArrayLike] | None
 # Standard errors beyond which a fitted start is no longer what was measured.
@@ -92,9 +92,9 @@ class StartFitted:
 def score(result: FitResult, record: Record, *, q0: _Start = None, qd0: _Start = None) -> Score:
     """Run a fitted model on another record, to which nothing is fitted but where it starts.
 
-    The start is fitted to the first samples alone, a twentieth and at least 20, which do not count after that. Beside
-    the error stands the one with a start fitted to all samples: smaller, as it takes up a part of what the model does
-    wrong.
+    The start is fitted to the first samples alone, a twentieth and at least 20, but no more than half of them, which do
+    not count after that. Beside the error stands the one with a start fitted to all samples: smaller, as it takes up a
+    part of what the model does wrong.
 
     **Arguments:**
 
@@ -110,7 +110,8 @@ def score(result: FitResult, record: Record, *, q0: _Start = None, qd0: _Start =
 
     **Raises:**
 
-    - `ValueError` for channels or inputs that the fit does not know, or of a result that was loaded.
+    - `ValueError` for channels or inputs that the fit does not know, a record that is too short, or a result that was
+      loaded.
     - `RuntimeError` where the model gives values that are not finite.
     """
     search = result.search
@@ -120,13 +121,13 @@ def score(result: FitResult, record: Record, *, q0: _Start = None, qd0: _Start =
     _check(record, problem)
     if (q0 is None) != (qd0 is None):
         raise ValueError("A start has positions and velocities: give q0 and qd0, or neither.")
-    if not isinstance(problem.engine, ReplayEngine | EventEngine):
+    alone = record_problem(result, record, (q0, qd0))
+    if not alone.local:
         values, _ = problem.split(search.state.x)
-        fixed = dataclasses.replace(problem, runs=runs_of((_bare(record),), cut((record,), None)))
-        return _scored(record, channels_seen(fixed, values), np.ones(len(record.t), bool), None)
-    alone = _alone(result, problem, record, (q0, qd0))
+        return _scored(record, channels_seen(alone, values), np.ones(len(record.t), bool), None)
     counts, x, errors = np.ones(len(record.t), bool), alone.x0, np.full(len(alone.local), np.inf)
     if q0 is None:
+        check_lengths((record,), len(alone.local))
         counts, shown = ~opening(alone.runs)[0, : len(record.t)], begin(alone, x, SearchOptions())
         x, errors = shown.state.x, _errors(np.asarray(shown.state.jacobian))
     found = _scored(record, channels_seen(alone, x), counts, alone.starts(x))
@@ -166,13 +167,12 @@ def _bare(record: Record) -> Record:
     return Record(record.t, record.channels, record.inputs, record.name, linear=record.linear)
 
 
-def _alone(
-    result: FitResult,
-    old: FitProblem,
-    record: Record,
-    given: tuple[ArrayLike | Sequence[ArrayLike] | None, ...],
-) -> FitProblem:
-    """The fitted model with nothing free but the initial state."""
+def record_problem(result: FitResult, record: Record, given: tuple[_Start, _Start]) -> FitProblem:
+    """The fitted model with nothing free but the initial state; of a law by itself, which has none, the parameters."""
+    assert result.search is not None
+    old = result.search.problem
+    if not isinstance(old.engine, ReplayEngine | EventEngine):
+        return dataclasses.replace(old, runs=runs_of((_bare(record),), cut((record,), None)))
     scene, engine, first = result.model, old.engine, old.base
     assert isinstance(scene, Scene)
     assert isinstance(first, State)

@@ -163,7 +163,9 @@ class CovarianceEstimate(NamedTuple):
     information: Float[Array, "free free"]
 
 
-def block_numbers(weights: Float[Array, "runs samples"], channels: int) -> tuple[Int[Array, " rows"], int]:
+def block_numbers(
+    weights: Float[Array, "runs samples"], channels: int, blocks: int = BLOCKS
+) -> tuple[Int[Array, " rows"], int]:
     """Number of the block of each sample row, in the order of the residual, and the number of blocks.
 
     All channels of a time are in one block. Runs share the blocks by their numbers of samples.
@@ -173,7 +175,7 @@ def block_numbers(weights: Float[Array, "runs samples"], channels: int) -> tuple
     whole = sum(counts)
     numbers, used = [], 0
     for count in counts:
-        own = max(round(BLOCKS * count / whole), 1)
+        own = max(round(blocks * count / whole), 1)
         here = jnp.minimum(jnp.arange(samples) * own // max(count, 1), own - 1)
         numbers.append(jnp.tile(used + here, channels))
         used += own
@@ -304,16 +306,16 @@ def interval(
     return max(value - margin, low), min(value + margin, high)
 
 
-def covariance_of(problem: FitProblem, state: SearchState, kept: int) -> CovarianceEstimate:
+def covariance_of(problem: FitProblem, state: SearchState, kept: int, blocks: int = BLOCKS) -> CovarianceEstimate:
     """How sure the estimate is; the first `kept` entries of x are parameters, the others nuisance."""
-    blocks, count = sample_blocks(problem)
-    return _covariance_of(problem, state, blocks, count, kept)
+    numbers, count = sample_blocks(problem, blocks)
+    return _covariance_of(problem, state, numbers, count, kept)
 
 
-def sample_blocks(problem: FitProblem) -> tuple[Array, int]:
+def sample_blocks(problem: FitProblem, blocks: int = BLOCKS) -> tuple[Array, int]:
     """Block of each sample row, and the number of blocks."""
     weight = next(iter(problem.runs.weight.values()))
-    numbers, count = block_numbers(weight, 1)
+    numbers, count = block_numbers(weight, 1, blocks)
     time = np.asarray(numbers).reshape(problem.count, -1)
     parts = [time] * len(problem.runs.weight)
     for effect in sorted(problem.runs.slips):
