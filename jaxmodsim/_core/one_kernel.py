@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 import jax
 import jaxlib.version
-import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxlib.mlir import ir
@@ -117,7 +116,8 @@ def _needing(x: Any, all_of: list[Any]) -> Any:
     Of any integer n, n (n + 1) is even: its last bit, which is zero, changes no bit of `x`, but XLA does not know.
     """
     number = reduce(hlo.add, map(_any_number, all_of))
-    one = hlo.constant(ir.DenseElementsAttr.get(array=np.ones((), np.int32)))
+    number_type = ir.RankedTensorType.get([], ir.IntegerType.get_signless(32))
+    one = hlo.constant(ir.DenseElementsAttr.get_splat(number_type, ir.IntegerAttr.get(number_type.element_type, 1)))
     nothing = hlo.and_(hlo.multiply(number, hlo.add(number, one)), one)
     bits, element = _bits(x), _bits(x).type.element_type
     nothing = hlo.convert(ir.RankedTensorType.get([], element), nothing)
