@@ -139,7 +139,8 @@ def _inputs(asked: RunRequest) -> RunInputs:
 
 def _check_span(t0: ArrayLike, t1: ArrayLike, array: dict[str, Any]) -> None:
     """Refuse times that differ, but not in the type the run has: it would end where it begins, and all be well."""
-    if is_known(t0, t1) and array["t0"] == array["t1"] and t0 != t1:
+    known = is_known(t0, t1, array["t0"], array["t1"])  # inside `jax.jit` arithmetic of known arrays is traced
+    if known and np.asarray(array["t0"]) == np.asarray(array["t1"]) and np.asarray(t0) != np.asarray(t1):
         raise ValueError(
             f"t0 = {t0} and t1 = {t1} are the same number in {array['t0'].dtype}: count the time from another moment,"
             " or pass q0 in float64."

@@ -355,3 +355,9 @@ def test_gradients_under_vmap_are_right_in_lanes_that_finish_early(ts: Any) -> N
     alone = jax.jit(jax.grad(position)) if ts is None else lambda m: gradients(jnp.full(3, m))[0]
     # Lanes of one batch take the same steps as alone, so only rounding differs.
     np.testing.assert_allclose(together, [alone(m) for m in masses], rtol=1e-8)
+
+
+def test_times_that_are_arrays_of_jax_are_known_inside_jit() -> None:
+    end = jnp.asarray(1.5)
+    found = jax.jit(lambda v: run_belt(belt_scene(), qd0=v, t0=jnp.asarray(0.0), t1=end).q)(jnp.asarray([0.1]))
+    np.testing.assert_allclose(found, run_belt(belt_scene()).q, rtol=1e-7)

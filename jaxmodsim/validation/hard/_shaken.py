@@ -147,6 +147,8 @@ def _several() -> list[HardCase]:
             _system([[]], [(1.0, 1.5)], [1.7], mass=1.0, stiffness=4.0, belt=[0.2, 0.0, 0.0, 0.3]),
             12.0,
             qd0=0.2,
+            # So do half of the runs from velocities within a tenth of this one; the others are right to 1e-6.
+            single_ends="step size fell below what the time can resolve",
         ),
         _case(
             "chain_with_neighbours",
