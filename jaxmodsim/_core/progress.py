@@ -46,7 +46,7 @@ def progress_line(title: str, text: str = "compiling") -> Iterator[Callable[[str
     """A line on standard output with the time since its begin; yields what changes its text.
 
     In a terminal and in a notebook the line is written over itself; its last text stays, or nothing where there never
-    was another than the first. In a file or pipe only the last text is written.
+    was another than the first. Elsewhere, in a file or pipe, only the last text is written, to standard error.
 
     **Arguments:**
 
@@ -76,6 +76,8 @@ class _StatusLine:
         self.terminal = self.stream.isatty()
         # Notebooks obey a carriage return, too.
         self.rewritten = self.terminal or type(self.stream).__module__.startswith("ipykernel")
+        if not self.rewritten:  # where output goes to a file or another program, it is the result alone
+            self.stream = sys.stderr
 
     def show(self, text: str) -> None:
         """Change the text."""

@@ -68,10 +68,12 @@ def test_off_a_terminal_only_the_last_text_is_written(capsys: pytest.CaptureFixt
     with progress_line("fit") as show:
         show("iteration 1")
         show("iteration 2")
-    assert re.fullmatch(rf"fit {TIME}: iteration 2\n", capsys.readouterr().out)
+    found = capsys.readouterr()
+    assert re.fullmatch(rf"fit {TIME}: iteration 2\n", found.err)
+    assert found.out == ""
     with progress_line("fit"):
         pass
-    assert capsys.readouterr().out == ""
+    assert capsys.readouterr() == ("", "")
 
 
 def test_words() -> None:
