@@ -16,24 +16,15 @@ import numpy as np
 import jaxmodsim as jms
 from jaxmodsim.identify import replay, sample_posterior
 from jaxmodsim.plot import posterior_figure
+from jaxmodsim.problems.braked_spring import driven_spring
 
 FREE = ("friction.sigma0", "friction.sigma1", "friction.sigma2", "friction.Fc", "friction.Fs", "friction.vs")
 
 
-def lagrangian(t, q, qd, p):
-    """A mass on a spring."""
-    return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
-
-
-def drive(t, q, qd, p):
-    """The force that the record drives."""
-    return jnp.reshape(p["u"], (1,))
-
-
 def main(out: Path, smoke: bool = False) -> None:
     """Make a record, fit it, sample the posterior."""
-    friction = jms.Friction(jms.LuGre(sigma0=1e4, sigma1=40.0, sigma2=2.0, Fc=1.0, Fs=1.5, vs=0.02))
-    scene = jms.Scene(lagrangian, params={"m": 1.0, "k": 200.0, "u": 0.0}, effects=(jms.AppliedForce(drive), friction))
+    law = jms.LuGre(sigma0=1e4, sigma1=40.0, sigma2=2.0, Fc=1.0, Fs=1.5, vs=0.02)
+    scene = driven_spring(law, m=1.0, k=200.0)
     t = np.arange(400 if smoke else 2000) * 2e-3
     u = 3 * np.sin(2 * np.pi * 0.7 * t) + 2 * np.sin(2 * np.pi * 1.9 * t) + 1.2 * np.sin(2 * np.pi * 0.31 * t)
     q = replay(scene, jnp.asarray(t), {"u": jnp.asarray(u)}, jnp.zeros(1), jnp.zeros(1))

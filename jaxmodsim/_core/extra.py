@@ -4,8 +4,8 @@ import importlib
 from types import ModuleType
 
 
-def extra(name: str, user: str = "sweep") -> ModuleType:
-    """Import a package of the extra `sweep`, for the function `user`.
+def extra(name: str, user: str = "sweep", of: str = "sweep") -> ModuleType:
+    """Import a package of the extra `of`, for the function `user`.
 
     **Raises:**
 
@@ -14,4 +14,4 @@ def extra(name: str, user: str = "sweep") -> ModuleType:
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        raise ImportError(f'{user} needs {error.name}: pip install "jaxmodsim[sweep]".') from error
+        raise ImportError(f'{user} needs {error.name}: pip install "jaxmodsim[{of}]".') from error

@@ -119,8 +119,8 @@ def _needing(x: Any, all_of: list[Any]) -> Any:
     number_type = ir.RankedTensorType.get([], ir.IntegerType.get_signless(32))
     one = hlo.constant(ir.DenseElementsAttr.get_splat(number_type, ir.IntegerAttr.get(number_type.element_type, 1)))
     nothing = hlo.and_(hlo.multiply(number, hlo.add(number, one)), one)
-    bits, element = _bits(x), _bits(x).type.element_type
-    nothing = hlo.convert(ir.RankedTensorType.get([], element), nothing)
+    bits = _bits(x)
+    nothing = hlo.convert(ir.RankedTensorType.get([], bits.type.element_type), nothing)
     changed = hlo.xor(bits, hlo.broadcast_in_dim(bits.type, nothing, mlir.dense_int_array([])))
     return changed if changed.type == x.type else hlo.bitcast_convert(x.type, changed)
 

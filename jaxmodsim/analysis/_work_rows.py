@@ -1,7 +1,6 @@
 """What `work_precision` returns: rows, a table, a file."""
 
 import hashlib
-import importlib
 import json
 import os
 from collections.abc import Sequence
@@ -9,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .._core.extra import extra
 from .._core.files import written_whole
 
 if TYPE_CHECKING:
@@ -142,11 +142,7 @@ class WorkPrecision:
 
         - `ImportError` if pandas is not installed.
         """
-        try:
-            pandas = importlib.import_module("pandas")
-        except ModuleNotFoundError as error:
-            raise ImportError('table needs pandas: pip install "jaxmodsim[cli]".') from error
-        return pandas.DataFrame([_columns(row, self.costs) for row in self.rows])
+        return extra("pandas", "table", "cli").DataFrame([_columns(row, self.costs) for row in self.rows])
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all of it as JSON, whole or not at all; `load_work_precision` reads it.

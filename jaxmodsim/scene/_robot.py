@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core.extra import extra
 from .._core.shapes import PerDof, Scalar
 from ._scene import Scene
 from .forces._effect import AbstractEffect
@@ -115,14 +116,10 @@ def read_robot(source: str | PathLike[str], effects: Sequence[AbstractEffect] = 
     - `ValueError` for a file it cannot read, and, by name, for free and ball joints, springs, tendons and closed
       loops or coupled joints (`equality`, `mimic`).
     """
-    try:
-        import mujoco  # only needed here
-    except ImportError as error:
-        raise ImportError('read_robot needs mujoco: pip install "jaxmodsim[robots]".') from error
+    kind: type[MjModel] = extra("mujoco", "read_robot", "robots").MjModel
     text = str(source)
     is_text = text.lstrip().startswith("<")
     try:
-        kind: type[MjModel] = mujoco.MjModel  # pyright: ignore[reportAttributeAccessIssue]
         model = kind.from_xml_string(text) if is_text else kind.from_xml_path(text)
     except ValueError as error:
         raise ValueError(f"{'The text' if is_text else text} is no URDF or MJCF that MuJoCo reads: {error}") from error

@@ -13,23 +13,13 @@ from jaxmodsim.identify import Candidate, Comparison, Continuation, compare, com
 from jaxmodsim.identify.data._record import cut, runs_of
 from jaxmodsim.identify.selection._compare import _blocks
 from jaxmodsim.identify.selection._memory import correlation_time
+from jaxmodsim.problems.braked_spring import driven_spring
 
 DT, NOISE, WIDTH = 5e-3, 2e-5, 5e-3
 
 
-def _lagrangian(t, q, qd, p):
-    del t
-    return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
-
-
-def _drive(t, q, qd, p):
-    del t, q, qd
-    return jnp.reshape(p["u"], (1,))
-
-
 def scene(law):
-    effects = (jms.AppliedForce(_drive, name="drive"), jms.Friction(law, name="friction"))
-    return jms.Scene(_lagrangian, params={"m": 2.0, "k": 30.0, "u": 0.0}, effects=effects)
+    return driven_spring(law, m=2.0, k=30.0)
 
 
 def _force(t, pitch=0.4):

@@ -11,6 +11,7 @@ import jaxmodsim as jms
 from jaxmodsim import plot
 from jaxmodsim.identify import agreement, expected_error, law_force, predict, replay, score
 from jaxmodsim.identify.selection._agreement import _between, _covariance_between
+from jaxmodsim.problems.braked_spring import driven_spring
 
 T = np.arange(0.0, 4.0, 5e-3)
 NOISE = 0.05
@@ -103,19 +104,8 @@ def test_variances_between_records_have_closed_forms_where_errors_are_the_same()
     assert not _covariance_between(noisy, own, np.array([False, False])).any()
 
 
-def _lagrangian(t, q, qd, p):
-    del t
-    return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
-
-
-def _drive(t, q, qd, p):
-    del t, q, qd
-    return jnp.reshape(p["u"], (1,))
-
-
 def spring(Fc: float) -> jms.Scene:
-    effects = (jms.AppliedForce(_drive), jms.Friction(jms.Regularized(jms.Coulomb(Fc), 1e-2)))
-    return jms.Scene(_lagrangian, params={"m": 2.0, "k": 30.0, "u": 0.0}, effects=effects)
+    return driven_spring(jms.Regularized(jms.Coulomb(Fc), 1e-2), m=2.0, k=30.0)
 
 
 def driven(Fc: float, seed: int, name: str, samples: int = 600) -> jms.Record:

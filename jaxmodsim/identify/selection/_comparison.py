@@ -15,7 +15,7 @@ from ..estimate._search import by_channel as residual_by_channel
 from ..uncertainty._estimate import sample_blocks
 from ..uncertainty._result import FitResult
 from ._memory import effective_samples
-from ._variation import VARIATION, change_between, covariances, mean_variances
+from ._variation import VARIATION, change_between, covariances, mean_variances, search_of
 
 # Directions of the parameters known this much worse than the best one are nothing that double precision can weigh.
 _LEAST = 1e-10
@@ -318,7 +318,7 @@ def comparison_of(
             failures[name] = "Its error on what was held back is not finite."
     if not kept:
         return Comparison(ranked=(), failures=failures, left=left, results={}, by=by, samples=0, effective=0.0)
-    searches = {name: _search_of(each) for name, each in kept.items()}
+    searches = {name: search_of(each.result, "A comparison") for name, each in kept.items()}
     levels = {
         channel: min(float(each.problem.noise[channel]) for each in searches.values())
         for channel in next(iter(searches.values())).problem.noise
@@ -376,7 +376,7 @@ def _expected(
     means: Mapping[str, float], judged: Mapping[str, CrossValidated], levels: Mapping[str, float]
 ) -> dict[str, float]:
     """Mean loss to expect on a new record, by the name of the model."""
-    searches = {name: _search_of(each) for name, each in judged.items()}
+    searches = {name: search_of(each.result, "A comparison") for name, each in judged.items()}
     covariance = {name: covariances(each.result, VARIATION, None) for name, each in judged.items()}
     best = min(means, key=lambda name: (bool(_undetermined(judged[name].result)), means[name]))
     between = _mean(change_between(searches[best], covariance[best][1]), searches[best], levels)
@@ -388,9 +388,8 @@ def _expected(
 
 def _mean(variances: Mapping[str, float], search: SearchResult, levels: Mapping[str, float]) -> float:
     """Over all samples, of variances in the noise levels of the search; in the squared unit of a single channel."""
-    count = {name: float(jnp.sum(weight > 0)) for name, weight in search.problem.columns.items()}
+    count = {name: float(jnp.sum(search.problem.columns[name] > 0)) for name in variances}
     ratio = {name: float(search.problem.noise[name]) / level for name, level in levels.items()}
-    count = {name: count[name] for name in variances}
     total = sum(count[name] * ratio[name] ** 2 * x for name, x in variances.items()) / sum(count.values())
     return (next(iter(levels.values())) ** 2 if len(levels) == 1 else 1.0) * total
 
@@ -398,11 +397,6 @@ def _mean(variances: Mapping[str, float], search: SearchResult, levels: Mapping[
 def _listed(names: tuple[str, ...], most: int = 4) -> str:
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
-
-
-def _search_of(judged: CrossValidated) -> SearchResult:
-    assert judged.result.search is not None
-    return judged.result.search
 
 
 def _fitted(search: SearchResult) -> Part:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..._core.arguments import as_whole
+from ..._core.extra import extra
 from ._estimate import ParameterEstimate
 from ._log_density import LogDensity, log_density
 from ._result import FitResult
@@ -137,11 +138,7 @@ def sample_posterior(
     - `ImportError` without blackjax, which the extra `posterior` brings along.
     - `ValueError` of a result that was loaded, or numbers out of range.
     """
-    try:
-        import blackjax  # only needed here
-        from blackjax import diagnostics
-    except ImportError as error:
-        raise ImportError('sample_posterior needs blackjax: pip install "jaxmodsim[posterior]".') from error
+    blackjax = extra("blackjax", "sample_posterior", "posterior")
     draws, warmup, chains = (
         as_whole(x, name=name) for x, name in ((draws, "draws"), (warmup, "warmup"), (chains, "chains"))
     )
@@ -155,7 +152,7 @@ def sample_posterior(
     with ThreadPoolExecutor() as pool:
         several = pool.map(lambda key: _sampled(density, key, blackjax, draws, warmup), keys)
         u, diverged, steps = (jnp.stack(x) for x in zip(*several, strict=True))
-    x, rhat, bulk, tail = (np.asarray(each) for each in _summary(density, u, diagnostics))
+    x, rhat, bulk, tail = (np.asarray(each) for each in _summary(density, u, blackjax.diagnostics))
     return Posterior(
         draws=dict(zip(density.names, x, strict=True)),
         rhat=dict(zip(density.names, rhat.tolist(), strict=True)),
