@@ -41,6 +41,12 @@ def test_one_kernel_gives_the_same(function, args):
         np.testing.assert_allclose(one, other, rtol=1e-15)
 
 
+def _written_into(x):
+    """A loop that hands on 40 arrays."""
+    start = tuple(jnp.broadcast_to(x[0], x.shape) for _ in range(40))
+    return jax.lax.fori_loop(0, 9, lambda i, xs: tuple(a.at[i].set(1.0) for a in xs), start)[0][:3]
+
+
 @pytest.mark.parametrize(
     ("function", "args"),
     [
@@ -51,6 +57,7 @@ def test_one_kernel_gives_the_same(function, args):
         pytest.param(lambda x: x @ x, (np.ones((8, 8)),), id="matrices of a library"),
         pytest.param(lambda x: jnp.sum(x), (np.ones(2000),), id="sum of a library"),
         pytest.param(lambda x: jnp.sin(x), (np.ones(200_000),), id="work for several cores"),
+        pytest.param(_written_into, (np.ones(200_000),), id="buffers that come fresh from the system"),
         pytest.param(lambda x: jnp.real(jnp.exp(1j * x)), (X,), id="complex"),
         pytest.param(lambda x: jnp.sin(x), (np.ones((0, 2)),), id="empty"),
     ],
