@@ -43,8 +43,9 @@ def test_one_kernel_gives_the_same(function, args):
 
 def _written_into(x):
     """A loop that hands on 40 arrays."""
-    start = tuple(jnp.broadcast_to(x[0], x.shape) for _ in range(40))
-    return jax.lax.fori_loop(0, 9, lambda i, xs: tuple(a.at[i].set(1.0) for a in xs), start)[0][:3]
+    start = [jnp.broadcast_to(x[0], x.shape)] * 40
+    ends = jax.lax.fori_loop(0, 9, lambda i, arrays: [each.at[i].set(1.0) for each in arrays], start)
+    return jnp.stack([each[0] for each in ends])
 
 
 @pytest.mark.parametrize(
