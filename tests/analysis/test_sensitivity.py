@@ -73,7 +73,7 @@ def test_lugre_bench_against_differences(bench: jms.Sensitivity) -> None:
     for name in ("m", "friction.Fs", "friction.sigma0"):
 
         def at(x: float, name: str = name) -> Any:
-            scene = replace_numbers(BENCH, {name: jnp.asarray(x)})
+            scene = replace_numbers(BENCH, {name: jnp.asarray(x, float)})
             return jms.simulate(scene, [0.0], [0.0], 5.0, ts=TS, rtol=1e-10, atol=1e-12).qd[:, 0]
 
         p = float(numbers[name])

@@ -69,7 +69,7 @@ def fits(design):
     wrong = {"m": 10.5, "friction.Fc": 7.6, "friction.sigma0": 7e4, "friction.sigma1": 420.0}
 
     def fit(each, seed, start):
-        scene = replace_numbers(box(), {name: jnp.asarray(value) for name, value in start.items()})
+        scene = replace_numbers(box(), {name: jnp.asarray(x, float) for name, x in start.items()})
         return jms.fit(scene, measured(each, seed), MODEL.free, q0=[0.0], limits={"m": (0.0, None)})
 
     plain = fit(design.plain, 8, wrong)

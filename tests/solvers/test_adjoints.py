@@ -67,15 +67,15 @@ def total(x: Any, method: str, adjoint: Any) -> Any:
 
 
 @pytest.fixture(scope="module")
-def slopes() -> list[float]:
+def slopes() -> np.ndarray:
     """Differences of the run by one method, whose own error is 1e-11: step 1e-3, rounding 1e-9."""
     value = jax.jit(lambda x: total(x, "Gauss", dfx.ForwardMode()))
-    return [central_difference(lambda x, i=i: value(X.at[i].set(x)), float(X[i]), 1e-3) for i in range(3)]
+    return np.array([central_difference(lambda x, i=i: value(X.at[i].set(x)), float(X[i]), 1e-3) for i in range(3)])
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("adjoint", ADJOINTS)
-def test_every_adjoint_gives_the_gradient(method: str, adjoint: str, slopes: list[float]) -> None:
+def test_every_adjoint_gives_the_gradient(method: str, adjoint: str, slopes: np.ndarray) -> None:
     way = jax.jacfwd if adjoint == "forward" else jax.grad
     gradient = jax.jit(way(lambda x: total(x, method, ADJOINTS[adjoint])))(X)
     np.testing.assert_allclose(gradient, slopes, rtol=1e-6)
