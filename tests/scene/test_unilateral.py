@@ -1,5 +1,7 @@
 """Contacts that open, close and strike: against closed forms, in value, derivative and energy."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 import jaxmodsim as jms
 from jaxmodsim.problems import bouncing_ball, vibrating_table
 
-TIGHT = {"rtol": 1e-10, "atol": 1e-12}
+TIGHT: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-12}
 
 
 def _ball_end(start):
