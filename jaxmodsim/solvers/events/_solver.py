@@ -27,8 +27,9 @@ _SHORT = 1e-6
 # Events accumulate where the longest of the last intervals is below this part of the time since the start, times the
 # square root of the rounding unit.
 _ACCUMULATION = 1e-3
-# Weight that the last intervals between events, and the last steps, keep at each new one.
-_FORGET = 0.25
+# Weights that the last intervals between events, and the last steps, keep at each new one. Of intervals it is small:
+# those of a ball that gives little back are rounding before a larger weight has forgotten the first of them.
+_FORGET_INTERVALS, _FORGET_STEPS = 0.05, 0.25
 # A step counts as no longer than this many of those before it.
 _GROW = 2.0
 # Events that few do not accumulate.
@@ -273,7 +274,7 @@ class EventSolver(AbstractSolverWrapper):
             lambda: state1,
         )
         dense = {"inner": dense, "state0": y0, "state1": state1}
-        pace = jnp.maximum(measure, _FORGET * pace)
+        pace = jnp.maximum(measure, _FORGET_STEPS * pace)
         return state1, error, dense, (inner, pace, begin), result
 
     def _look(
@@ -371,7 +372,9 @@ class EventSolver(AbstractSolverWrapper):
         def spread_at(t_event: Array) -> tuple[Array, Bool[Array, ""]]:
             """The longest of the last intervals between events, and whether they accumulate."""
             since = t_event - state.t
-            spread = _constant(jnp.where(memory.resets == 0, since, jnp.maximum(since, _FORGET * memory.spread)))
+            spread = _constant(
+                jnp.where(memory.resets == 0, since, jnp.maximum(since, _FORGET_INTERVALS * memory.spread))
+            )
             return spread, _accumulates(spread, _constant(t_event), begin) & (memory.resets >= _FEWEST)
 
         def reset(t_event: Array, y: PyTree) -> tuple[PyTree, PyTree]:
