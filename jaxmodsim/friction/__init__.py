@@ -12,6 +12,8 @@ from ._stribeck import lorentzian as lorentzian
 from .wrappers._regularized import Regularized as Regularized
 from .wrappers._dead_zone import DeadZone as DeadZone
 from .wrappers._sign import Sign as Sign
+from .wrappers._bristle import Bristle as Bristle
+from .modifiers._geared import Geared as Geared
 from ._dahl import Dahl as Dahl
 from ._lugre import LuGre as LuGre
 from ._elasto_plastic import ElastoPlastic as ElastoPlastic
