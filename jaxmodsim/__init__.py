@@ -3,7 +3,7 @@
 Scenes: Scene, AppliedForce, Friction, Signal, AbstractEffect; Constraint, VelocityConstraint, consistent.
 Mechanics: point_mass, rigid_body; Chart, Cylindrical, Spherical.
 Friction laws: Viscous, Curve, Coulomb, Stribeck, Dahl, LuGre, ElastoPlastic, MaxwellSlip, Armstrong; in the wrappers
-    Regularized, DeadZone, Sign, Bristle; with asymmetric, scaled_by, Geared.
+    Regularized, DeadZone, Sign, Bristle; with asymmetric, scaled_by; of gears Geared, ServoGear.
 About laws: check_passivity, damping_sigma1, regularized_width, max_stable_step; to_mujoco, to_modelica.
 Scenes elsewhere: to_c, to_javascript.
 Runs: simulate, simulate_to_accuracy; they give a Trajectory, or raise a SimulationError.
@@ -35,6 +35,7 @@ from .friction import Geared as Geared
 from .friction import LuGre as LuGre
 from .friction import MaxwellSlip as MaxwellSlip
 from .friction import Regularized as Regularized
+from .friction import ServoGear as ServoGear
 from .friction import Sign as Sign
 from .friction import Stribeck as Stribeck
 from .friction import Viscous as Viscous

@@ -20,6 +20,7 @@ from ._elasto_plastic import ElastoPlastic as ElastoPlastic
 from ._maxwell_slip import MaxwellSlip as MaxwellSlip
 from ._armstrong import Armstrong as Armstrong
 from ._armstrong import ArmstrongState as ArmstrongState
+from ._servo_gear import ServoGear as ServoGear
 
 # isort: on
 from ._check_passivity import check_passivity as check_passivity

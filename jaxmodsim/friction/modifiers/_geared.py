@@ -6,9 +6,9 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..._core.parameters import Number, as_number
+from ..._core.parameters import Number, as_number, state_parameter
 from ..._core.shapes import Scalar
-from ..._core.state_dependent import StateDependent, as_state_function
+from ..._core.state_dependent import StateDependent
 from .._coulomb import Coulomb
 from .._law import AbstractSetValuedLaw, register_law
 
@@ -30,19 +30,6 @@ def _per_torque(value: Any) -> AbstractSetValuedLaw:
 
 def _unless_none(value: Any) -> AbstractSetValuedLaw | None:
     return None if value is None else _per_torque(value)
-
-
-def torque_of_state(name: str) -> Any:
-    """Field that takes a torque: a function of the mechanism's state, or a number where it does not change."""
-
-    def convert(value: Any) -> Any:
-        if isinstance(value, StateDependent):
-            return value
-        if callable(value):
-            return StateDependent(None, as_state_function(value, name=name))
-        return as_number(value, name=name)
-
-    return eqx.field(converter=convert)
 
 
 @register_law
@@ -71,11 +58,12 @@ class Geared(AbstractSetValuedLaw):
 
     **Raises:**
 
-    - `ValueError` for what is no set-valued law, no coefficient or no function.    """
+    - `ValueError` for what is no set-valued law, no coefficient or no function.
+    """
 
     law: AbstractSetValuedLaw = eqx.field(converter=_set_valued)
     drive: AbstractSetValuedLaw = eqx.field(converter=_per_torque)
-    torque: Number | StateDependent = torque_of_state("Geared torque")
+    torque: Number | StateDependent = state_parameter("Geared torque")
     back: AbstractSetValuedLaw | None = eqx.field(default=None, converter=_unless_none)
     stiff: ClassVar[bool] = False
     description: ClassVar[str] = "a law without load, and one per transmitted torque, for driving and back-driving"

@@ -17,11 +17,12 @@ from ._wrapper import AbstractWrapper, set_valued_law
 class Bristle(AbstractWrapper, AbstractDynamicLaw):
     """A set-valued law run by a bristle z between -1 and 1, which follows slip over the displacement `h`.
 
-    `z' = (v - |v| z)/h`, `F = mean z + half z^2 + viscous_force(v)` with the mean and half the difference of the sliding
-    forces towards either side, at the speed |v|. In steady slip z = +-1, and F is that of the law. z has no unit and
-    its limit is 1 whatever the load, so a load or a temperature that changes scales the force and leaves z alone: of
-    `Coulomb` it is `Dahl` with `sigma0 = Fc/h`, of `Geared` in terms of the transmitted torque tau
-    `mu_avg |tau| z + mu_dif tau z^2`. There is no stiction beyond the sliding force.
+    `z' = (v - |v| z)/h`, `F = mean z + half z^2 + viscous_force(v)`, with the mean and half the difference of the
+    sliding forces towards either side at the speed |v|. In steady slip z = +-1, and F is that of the law. z has no unit
+    and its limit is 1 whatever the load, so a load or a temperature that changes scales the force and leaves z alone.
+    Of `Coulomb` it is `Dahl` with `sigma0 = Fc/h`; of the load-dependent part of `Geared`, with the transmitted torque
+    tau, `mu_avg |tau| z + mu_dif tau z^2`, where mu_avg is the mean of both coefficients and mu_dif half of drive minus
+    back. There is no stiction beyond the sliding force.
 
     **Arguments:**
 
