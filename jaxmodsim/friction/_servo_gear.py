@@ -11,7 +11,7 @@ from .._core.shapes import Scalar
 from .._core.state_dependent import StateDependent
 from ._law import AbstractSetValuedLaw, register_law
 from ._servo_sets import PUBLISHED
-from ._stribeck import Stribeck
+from ._stribeck import exponential, stribeck_power
 
 Torque: TypeAlias = Callable[..., ArrayLike] | ArrayLike
 
@@ -116,21 +116,23 @@ class ServoGear(AbstractSetValuedLaw):
             )
         return cls(motor, external, **PUBLISHED[actuator, model])
 
-    def _curve(self) -> Stribeck:
-        """The Stribeck law that this is under the torques at hand."""
+    def _lasting(self) -> Scalar:
+        """Dry part at any speed [N m]."""
+        return self.Kc + jnp.abs(self.Km * self.motor - _or(self.Ke, self.Km) * self.external)
+
+    def _falling(self) -> Scalar:
+        """What is added at rest [N m], and falls with speed."""
         motor, external = self.motor, self.external
-        lasting = self.Kc + jnp.abs(self.Km * motor - _or(self.Ke, self.Km) * external)
-        if self.vs is None:
-            return Stribeck(lasting, lasting, 1.0, self.Kv)
         larger = jnp.abs(motor) > jnp.abs(external)
         quadratic = jnp.where(larger, _or(self.Keq, self.Kmq) * external**2, self.Kmq * motor**2)
-        falling = self.Kcs + jnp.abs(self.Kms * motor - _or(self.Kes, self.Kms) * external)
-        falling = falling + jnp.where(motor * external < 0, quadratic, 0.0)
-        return Stribeck(lasting, lasting + falling, self.vs, self.Kv, self.alpha)
+        linear = self.Kcs + jnp.abs(self.Kms * motor - _or(self.Kes, self.Kms) * external)
+        return linear + jnp.where(motor * external < 0, quadratic, 0.0)
 
     def sliding_force(self, v: Scalar) -> Scalar:
         """Magnitude [N m] of the dry part in slip."""
-        return self._curve().sliding_force(v)
+        if self.vs is None:
+            return jnp.broadcast_to(self._lasting(), jnp.shape(v))
+        return self._lasting() + self._falling() * exponential(stribeck_power(v, self.vs, self.alpha))
 
     def viscous_force(self, v: Scalar) -> Scalar:
         """Viscous part [N m]."""
@@ -138,7 +140,7 @@ class ServoGear(AbstractSetValuedLaw):
 
     def static_limit(self, direction: Scalar) -> Scalar:
         """Largest friction torque in stick [N m]."""
-        return self._curve().static_limit(direction)
+        return self.sliding_force(jnp.zeros_like(direction))
 
     def modelica(self) -> str:
         """Friction components do not know torques beside their own."""

@@ -10,6 +10,7 @@ from ..._core.parameters import Number, parameter
 from ..._core.shapes import Scalar
 from .._bristle import ONE_STATE, YIELDS, relax_exact
 from .._law import AbstractDynamicLaw, AbstractSetValuedLaw, register_law
+from .._law_case import LawCase
 from ._wrapper import AbstractWrapper, set_valued_law
 
 
@@ -74,3 +75,8 @@ class Bristle(AbstractWrapper, AbstractDynamicLaw):
     def step_exact(self, v: Scalar, z: Scalar, dt: Scalar) -> Scalar:
         """Deflection after `dt` [s] at constant `v` [m/s], exactly: the rate is linear in z."""
         return relax_exact(v / self.h, z, dt, jnp.abs(v) / self.h)
+
+    @classmethod
+    def cases(cls) -> tuple[LawCase, ...]:
+        """None: it is Dahl of a Coulomb law, and the benches run that."""
+        return ()
