@@ -17,9 +17,11 @@ from .state_dependent import StateDependent, as_state_function, nominal
 if TYPE_CHECKING:
     Number: TypeAlias = Any  # a plain number in the call: type checkers do not see the converter of `parameter`
     Vector: TypeAlias = Any
+    NumberOrState: TypeAlias = Any  # a number, or what has one at a state of the mechanism
 else:
     Number: TypeAlias = Float[Array, ""]
     Vector: TypeAlias = Float[Array, " n"]
+    NumberOrState: TypeAlias = Float[Array, ""] | StateDependent
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,9 +6,8 @@ from typing import Any, ClassVar, TypeAlias
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
-from .._core.parameters import Number, optional_parameter, parameter, state_parameter
+from .._core.parameters import Number, NumberOrState, optional_parameter, parameter, state_parameter
 from .._core.shapes import Scalar
-from .._core.state_dependent import StateDependent
 from ._law import AbstractSetValuedLaw, register_law
 from ._servo_sets import PUBLISHED
 from ._stribeck import exponential, stribeck_power
@@ -71,8 +70,8 @@ class ServoGear(AbstractSetValuedLaw):
         ```
     """
 
-    motor: Number | StateDependent = state_parameter("ServoGear motor")
-    external: Number | StateDependent = state_parameter("ServoGear external")
+    motor: NumberOrState = state_parameter("ServoGear motor")
+    external: NumberOrState = state_parameter("ServoGear external")
     Kc: Number = parameter("Kc", "N", lower=0.0)
     Kv: Number = parameter("Kv", "N s/m", lower=0.0)
     Kcs: Number = _load_term("Kcs", "N")

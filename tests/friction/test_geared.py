@@ -1,6 +1,6 @@
 """Friction that grows with a transmitted torque: efficiencies, self-locking, and its execution by a bristle."""
 
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -132,7 +132,7 @@ def warmth(t: Any, q: Any, qd: Any, p: Any) -> Any:
 
 
 def test_temperature_and_position_scale_it() -> None:
-    base = Geared(Stribeck(0.1, 0.2, 0.3, 0.05), DRIVE, spring, BACK)
+    base: Any = Geared(Stribeck(0.1, 0.2, 0.3, 0.05), DRIVE, spring, BACK)
     params = {"k": jnp.array(20.0), "temperature": jnp.array(45.0)}
     at = jnp.array(0.0), jnp.array([0.3, 0.25]), jnp.array([2.0, 2.0]), params
     factor, v = warmth(*at), jnp.array(-0.4)
@@ -141,7 +141,8 @@ def test_temperature_and_position_scale_it() -> None:
     np.testing.assert_allclose(scaled.sliding_force(v), factor * plain.sliding_force(v), rtol=1e-14)
     np.testing.assert_allclose(scaled.viscous_force(v), factor * plain.viscous_force(v), rtol=1e-14)
     np.testing.assert_allclose(scaled.static_limit(-v), factor * plain.static_limit(-v), rtol=1e-14)
-    inside = Geared(scaled_by(base.law, warmth), DRIVE, spring, BACK).bind_state(*at)
+    inside: Any = Geared(scaled_by(base.law, warmth), DRIVE, spring, BACK)
+    inside = inside.bind_state(*at)
     load = plain.sliding_force(v) - plain.law.sliding_force(v)
     np.testing.assert_allclose(inside.sliding_force(v), factor * plain.law.sliding_force(v) + load, rtol=1e-14)
 
@@ -167,11 +168,11 @@ def test_it_stands_beside_lugre_and_an_elastic_joint() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Geared(jms.Viscous(0.1), 0.1, spring), "Geared needs a set-valued law"),
+        (lambda: Geared(cast(Any, jms.Viscous(0.1)), 0.1, spring), "Geared needs a set-valued law"),
         (lambda: Geared(Coulomb(0.1), -0.1, spring), "Fc must be finite and >= 0"),
         (lambda: Geared(Coulomb(0.1), "a", spring), "Geared drive and back must be a real number"),
         (lambda: Geared(Coulomb(0.1), 0.1, "a"), "Geared torque must be a real number"),
-        (lambda: Bristle(jms.Viscous(0.1), 1e-3), "Bristle executes a set-valued law"),
+        (lambda: Bristle(cast(Any, jms.Viscous(0.1)), 1e-3), "Bristle executes a set-valued law"),
         (lambda: Bristle(Coulomb(0.1), 0.0), "h must be finite and > 0"),
         (lambda: jms.to_mujoco(Geared(Coulomb(0.1), 0.2, 1.0)), "MuJoCo has no Geared: its joints do not know"),
         (lambda: jms.to_mujoco(Bristle(Coulomb(0.1), 1e-3)), "MuJoCo has no Bristle"),
@@ -277,7 +278,7 @@ def test_a_servo_on_a_pendulum_sticks_and_slips() -> None:
 
 
 def test_derivatives_of_the_richest_model_equal_differences() -> None:
-    law = ServoGear(1.3, -0.8, **PUBLISHED["mx106", "M6"])
+    law: Any = ServoGear(1.3, -0.8, **PUBLISHED["mx106", "M6"])
 
     def force(law: ServoGear, v: Any) -> Any:
         return law.sliding_force(v) + law.viscous_force(v)

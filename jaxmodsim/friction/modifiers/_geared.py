@@ -6,9 +6,8 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..._core.parameters import Number, as_number, state_parameter
+from ..._core.parameters import NumberOrState, as_number, state_parameter
 from ..._core.shapes import Scalar
-from ..._core.state_dependent import StateDependent
 from .._coulomb import Coulomb
 from .._law import AbstractSetValuedLaw, register_law
 
@@ -63,7 +62,7 @@ class Geared(AbstractSetValuedLaw):
 
     law: AbstractSetValuedLaw = eqx.field(converter=_set_valued)
     drive: AbstractSetValuedLaw = eqx.field(converter=_per_torque)
-    torque: Number | StateDependent = state_parameter("Geared torque")
+    torque: NumberOrState = state_parameter("Geared torque")
     back: AbstractSetValuedLaw | None = eqx.field(default=None, converter=_unless_none)
     stiff: ClassVar[bool] = False
     description: ClassVar[str] = "a law without load, and one per transmitted torque, for driving and back-driving"
