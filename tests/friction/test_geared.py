@@ -176,13 +176,30 @@ def test_it_stands_beside_lugre_and_an_elastic_joint() -> None:
         (lambda: Bristle(Coulomb(0.1), 0.0), "h must be finite and > 0"),
         (lambda: jms.to_mujoco(Geared(Coulomb(0.1), 0.2, 1.0)), "MuJoCo has no Geared: its joints do not know"),
         (lambda: jms.to_mujoco(Bristle(Coulomb(0.1), 1e-3)), "MuJoCo has no Bristle"),
-        (lambda: jms.to_modelica(Geared(Coulomb(0.1), 0.2, 1.0), 1.0), "have no friction that depends on a transm"),
+        (lambda: jms.to_modelica(Geared(Coulomb(0.1), 0.2, 1.0), 1.0), "rotary gear"),
+        (lambda: jms.to_modelica(Geared(Coulomb(0.1), 0.2, 1.0, 1.1), 1.0, rotary=True), "up to 1.1"),
+        (lambda: jms.to_modelica(Geared(Coulomb(0.1, 0.2), 0.2, 1.0), 1.0, rotary=True), "without stiction"),
+        (lambda: jms.to_modelica(ServoGear(1.0, 1.0, 0.1, 0.1), 1.0), "have no friction that depends on the torques"),
         (lambda: jms.check_passivity(Geared(Coulomb(0.1), 0.2, spring)), "depend on the state of the mechanism"),
     ],
 )
 def test_bad_gears_are_refused(make: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_modelica_has_it_as_a_lossy_gear() -> None:
+    law = Geared(Stribeck(0.1, 0.1, 0.3, 0.05), Stribeck(0.25, 0.25, 0.1, 0.02), spring, 0.4)
+    text = jms.to_modelica(law, 2.0, name="gear", rotary=True, rtol=1e-6)
+    assert text.startswith("Modelica.Mechanics.Rotational.Components.LossyGear gear(ratio=1, lossTable=[0, ")
+    rows = np.array([[float(x) for x in row.split(",")] for row in text.split("[")[1].split("]")[0].split(";")])
+    for w in (0.0, 0.4, 1.7):
+        eta1, eta2, tau1, tau2 = (np.interp(w, rows[:, 0], column) for column in rows[:, 1:].T)
+        # The component's loss at the torque u of the motor, against the law at the torque that is left.
+        for u, loss in ((2.0, (1.0 - eta1) * 2.0 + tau1), (-1.5, (1.0 - 1.0 / eta2) * -1.5 + tau2)):
+            gear = Geared(law.law, law.drive, u - loss, law.back)
+            v = jnp.array(w)
+            assert loss == pytest.approx(float(gear.sliding_force(v) + gear.viscous_force(v)), rel=1e-5)
 
 
 def test_a_torque_of_the_wrong_shape_is_refused() -> None:

@@ -103,5 +103,5 @@ class Geared(AbstractSetValuedLaw):
         return self.law.known_limitations()
 
     def modelica(self) -> str:
-        """Friction components do not know the transmitted torque."""
-        return "friction that depends on a transmitted torque: LossyGear has it, by efficiencies over the speed"
+        """`LossyGear` has it, by efficiencies over the speed."""
+        return ""
