@@ -1,6 +1,6 @@
 """Differentiable mechanics with friction: Lagrangians in, motion, figures and fits out.
 
-Scenes: Scene, AppliedForce, Friction, Signal, AbstractEffect; Constraint, VelocityConstraint, consistent.
+Scenes: Scene, AppliedForce, Friction, Signal, AbstractEffect; Constraint, VelocityConstraint, Contact, consistent.
 Mechanics: point_mass, rigid_body; Chart, Cylindrical, Spherical.
 Friction laws: Viscous, Curve, Coulomb, Stribeck, Dahl, LuGre, ElastoPlastic, MaxwellSlip, Armstrong; in the wrappers
     Regularized, DeadZone, Sign, Bristle; with asymmetric, scaled_by; of gears Geared, ServoGear.
@@ -47,6 +47,7 @@ from .friction import regularized_width as regularized_width
 from .friction import scaled_by as scaled_by
 from .mechanics import Chart as Chart
 from .mechanics import Constraint as Constraint
+from .mechanics import Contact as Contact
 from .mechanics import Cylindrical as Cylindrical
 from .mechanics import Spherical as Spherical
 from .mechanics import VelocityConstraint as VelocityConstraint
