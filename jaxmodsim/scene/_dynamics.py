@@ -217,7 +217,7 @@ class Dynamics(NamedTuple):
         return self._stick(mode), mode
 
     def switch(
-        self, fired: Bool[Array, " guards"], rest: Scalar, elastic: Bool[Array, ""] | bool = True
+        self, fired: Bool[Array, " guards"], rest: Scalar, elastic: bool = True
     ) -> tuple[State, Float[Array, " n"]]:
         """State and modes after the guards that `fired`; `elastic` is False where impacts have accumulated."""
         n, mode = self._elements.size, self._elements

@@ -27,7 +27,7 @@ def impact(
     closed: Float[Array, " contacts"],
     fired: Bool[Array, " contacts"],
     rest: Scalar,
-    elastic: Bool[Array, ""] | bool,
+    elastic: bool,
 ) -> tuple[PerDof, Float[Array, " contacts"]]:
     """Velocities, and the modes of the contacts, after the instant at which those `fired`.
 
@@ -40,7 +40,8 @@ def impact(
     - `closed`: modes before.
     - `fired`: contacts whose guards have.
     - `rest`: velocity [m/s] that counts as none.
-    - `elastic`: whether contacts give back a part of their velocity; False where impacts have accumulated.
+    - `elastic`: whether contacts give back a part of their velocity; False where impacts have accumulated, and what is
+      left of the velocity of a gap, be it away from the contact, is below what time resolves: it is taken away.
     """
     contacts, params = tuple(scene.contacts.values()), scene.params
     mass = motion_equations(scene.lagrangian, t, q, qd, params).mass
@@ -55,8 +56,10 @@ def impact(
     delassus = jnp.sum(gaps.rows[:, None, :] * reach[None, :, :], axis=2)
     touches = jnp.where(closed > 0, ~fired, fired)
     e = jnp.stack([each.restitution.astype(w.dtype) for each in contacts])
-    e = jnp.where((closed > 0) | ~jnp.asarray(elastic), 0.0, e)
-    impulse = _impulses(delassus, (1.0 + e) * w, touches)
+    if elastic:
+        impulse = _impulses(delassus, (1.0 + jnp.where(closed > 0, 0.0, e)) * w, touches)
+    else:
+        impulse = solve_semidefinite(delassus, jnp.where(touches, -w, 0.0), jnp.ones_like(w), touches)
     after = w + jnp.sum(delassus * impulse[None, :], axis=1)
     rounding = _ROUNDING * float(jnp.finfo(w.dtype).eps) * jnp.sum(jnp.abs(gaps.rows * qd[None, :]), axis=1)
     still = _constant(jnp.abs(after) <= jnp.maximum(rest, rounding))

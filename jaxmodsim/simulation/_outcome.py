@@ -60,7 +60,8 @@ _GENERAL = (
     " sees, and a break-away comes late. Pass atol no larger than the width.",
     "The times or tolerances do not make a run: t1 must not be before t0, ts must increase within [t0, t1], dt and"
     " dtmax must be positive, rtol and atol not negative and not both zero, and all of them finite.",
-    "A contact is violated at t0: its gap is negative. Begin where all gaps are zero or positive.",
+    "A contact is violated: its gap is negative. A run has to begin where all gaps are zero or positive; one that comes"
+    " to this later has missed an impact: pass smaller tolerances or dtmax, or compute in float64.",
 )
 
 
@@ -163,9 +164,7 @@ def start_code(
     if scene.constraints:
         off, turned = constraint_residual(now.bind_modes(mode).constraints, t, y.q, y.qd, now.params)
         code = jnp.where((off <= _CONSISTENT) & (turned <= _CONSISTENT), code, INCONSISTENT)
-    for contact in scene.contacts.values():
-        shallow = contact.error(t, y.q, now.params)[0] >= -_CONSISTENT * jnp.maximum(1.0, jnp.max(jnp.abs(y.q)))
-        code = jnp.where(shallow, code, PENETRATES)
+    code = jnp.where(_penetration(now, t, y) <= _CONSISTENT, code, PENETRATES)
     widths = [module.width for _, module in modules_of(scene) if isinstance(module, Regularized)]
     if atol is not None and widths:
         code = jnp.where(atol <= jnp.min(jnp.stack([jnp.min(width) for width in widths])), code, TOO_NARROW)
@@ -209,10 +208,18 @@ def end_code(
     if scene.constraints:
         kept = constraint_residual(now.bind_modes(mode).constraints, t, y.q, y.qd, now.params)[0] <= _KEPT
         code = jnp.where(kept | ~finite, code, DRIFTED)
+        code = jnp.where((_penetration(now, t, y) <= _CONSISTENT**0.5) | ~finite, code, PENETRATES)
     eps = float(jnp.finfo(y.q.dtype).eps)
     # A run that stopped in front of a singular mass matrix cannot have come closer than its smallest step.
     tolerance = jnp.where(early, eps**0.5, 16 * y.q.shape[0] * eps)
     return _blame_mass(code, _pivots(now, t, y), tolerance, jnp.all(jnp.isfinite(y.q)) & jnp.all(jnp.isfinite(y.qd)))
+
+
+def _penetration(scene: Scene, t: Array, y: State) -> Float[Array, ""]:
+    """The deepest that a gap is below zero, relative to the coordinates or to one."""
+    gaps = [contact.error(t, y.q, scene.params) for contact in scene.contacts.values()]
+    deepest = jnp.min(jnp.concatenate(gaps)) if gaps else jnp.zeros_like(t)
+    return -deepest / jnp.maximum(1.0, jnp.max(jnp.abs(y.q)))
 
 
 def _blame_margins(code: Int[Array, ""], margins: Array | None, first: int, known: Array | bool) -> Int[Array, ""]:

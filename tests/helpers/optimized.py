@@ -1,4 +1,4 @@
-"""Programs as users have them, for what depends on more digits than code without optimization agrees in."""
+"""Programs as users have them: for numbers that are compared with theirs, and for what runs longer than it compiles."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -25,6 +25,8 @@ from jaxmodsim.identify.model._axis import RoughAxis
 from jaxmodsim.plot import design_figure
 from jaxmodsim.scene import replace_numbers
 
+from ..helpers.optimized import optimized
+
 MODEL = axis_models()["lugre"]
 LIMITS = AxisLimits(force=40.0, speed=0.1, travel=0.02)
 DT, DURATION, HARMONICS, NOISE = 2e-3, 2.0, 5, 1e-6
@@ -45,6 +47,7 @@ def shorten(patch, tried, improved):
 
 
 @pytest.fixture(scope="module")
+@optimized()  # its many runs take longer than compilation
 def design() -> InputDesign:
     with pytest.MonkeyPatch.context() as patch:
         shorten(patch, 8, 1)
@@ -66,7 +69,7 @@ def fits(design):
     wrong = {"m": 10.5, "friction.Fc": 7.6, "friction.sigma0": 7e4, "friction.sigma1": 420.0}
 
     def fit(each, seed, start):
-        scene = replace_numbers(box(), {name: jnp.asarray(value) for name, value in start.items()})
+        scene = replace_numbers(box(), {name: jnp.asarray(x, float) for name, x in start.items()})
         return jms.fit(scene, measured(each, seed), MODEL.free, q0=[0.0], limits={"m": (0.0, None)})
 
     plain = fit(design.plain, 8, wrong)
@@ -118,10 +121,10 @@ def test_sensitivities_are_those_of_the_simulated_record(design):
     assert scale[0] == 10.0
     # Central differences with relative steps of 1e-7: they move the record by less than the bristle's tenth of a
     # millimetre, and by far more than rounding.
+    moved = jax.jit(lambda x: driven_motion(_moved(axis, x), t, force)[0])
     for i in range(len(scale)):
         step = 1e-7 * jnp.eye(len(scale))[i]
-        ends = [driven_motion(_moved(axis, sign * step), t, force)[0] for sign in (1.0, -1.0)]
-        slope = np.asarray(ends[0] - ends[1]) / (2e-7 * NOISE)
+        slope = np.asarray(moved(step) - moved(-step)) / (2e-7 * NOISE)
         np.testing.assert_allclose(columns[:, i], slope, atol=1e-3 * np.max(np.abs(slope)))
     np.testing.assert_allclose(design.best.information, columns.T @ columns, rtol=1e-9)
 

@@ -22,7 +22,6 @@ from jaxmodsim.identify.model._observe import observer
 from jaxmodsim.problems import belt_oscillator
 from jaxmodsim.scene import State, replace_numbers
 
-from ..helpers.optimized import optimized
 from ..helpers.sprung import lagrangian, sprung_mass
 
 DT = 4e-3
@@ -92,7 +91,6 @@ def full():
 
 
 @pytest.fixture(scope="module")
-@optimized()
 def belt():
     scene = belt_oscillator.scene(jms.Stribeck(**belt_oscillator.STRIBECK))
     t = np.linspace(0.0, 3.2, 321)
@@ -166,7 +164,6 @@ def test_gradient_of_a_fit_through_events_equals_finite_differences(belt):
     np.testing.assert_allclose(exact, differences, rtol=1e-4)
 
 
-@optimized()
 def test_fit_through_events_finds_back_from_half_wrong(belt):
     start = belt_oscillator.scene(jms.Stribeck(Fc=2.5, Fs=12.0, vs=0.1, Fv=0.3), k=150.0)
     result = jms.fit(start, belt, ("friction.Fc", "friction.Fs", "friction.vs", "k"), q0=[0.0], initializer=Staged())

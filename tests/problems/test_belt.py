@@ -12,8 +12,6 @@ import pytest
 import jaxmodsim as jms
 from jaxmodsim import problems
 
-from ..helpers.optimized import optimized
-
 TIMES, EVENTS = 61, 16
 
 
@@ -232,7 +230,6 @@ period_slopes = jax.jit(jax.grad(lambda n: problems.belt_oscillator.cycle(**n).p
 
 
 @pytest.mark.parametrize("derivatives", [forward, reverse], ids=["forward", "reverse"])
-@optimized()
 def test_derivatives_of_braked_spring_and_belt_oscillator(derivatives: Any) -> None:
     """One test for both, and for single events, as they share the compiled code."""
     for numbers in SPRINGS:

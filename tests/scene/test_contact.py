@@ -144,7 +144,7 @@ def test_short_pulses_are_named_where_they_are_stepped_over_and_found_with_dtmax
     friction = Friction(Coulomb(2.0, 3.0))
     box = Scene(masses, params={"m": 1.0, "k": 0.0, "a": 6.0}, effects=(AppliedForce(pulses), friction))
     ts = jnp.linspace(0.5, 10.5, 201)
-    missed = simulate(box, [0.0], [0.0], 10.5, t0=0.5, ts=ts, throw=False)
+    missed = simulate(box, [0.0], [0.0], 10.5, t0=0.5, ts=ts, dtmax=10.0, throw=False)
     assert "stepped over" in missed.result.message
     found = simulate(box, [0.0], [0.0], 10.5, t0=0.5, ts=ts, dtmax=0.03)
     assert found.stats["num_events"] == 20

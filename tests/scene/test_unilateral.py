@@ -174,6 +174,28 @@ def test_a_block_lands_slides_and_stops():
     np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-11)
 
 
+@pytest.mark.parametrize("e", [0.0, 1e-12, 0.5])
+def test_restitution_down_to_none(e):
+    run = jms.simulate(bouncing_ball.scene(e=e), [1.0], [0.0], 2.0)
+    assert run.q[-1, 0] == run.qd[-1, 0] == 0
+    assert run.mode["floor"][-1] == 1
+
+
+def test_a_ball_comes_to_rest_in_single_precision():
+    scene = jax.tree.map(lambda x: x.astype(jnp.float32), bouncing_ball.scene(e=0.5))
+    run = jms.simulate(scene, jnp.ones(1, jnp.float32), jnp.zeros(1, jnp.float32), 2.0)
+    assert run.q.dtype == jnp.float32
+    assert run.q[-1, 0] == run.qd[-1, 0] == 0
+
+
+def test_an_impact_at_either_end_of_a_run():
+    fall = float(np.sqrt(2 / 9.81))
+    run = jms.simulate(bouncing_ball.scene(e=0.5), [1.0], [0.0], fall, **TIGHT)
+    np.testing.assert_allclose(run.qd[-1, 0], 0.5 * 9.81 * fall, rtol=1e-12)
+    run = jms.simulate(bouncing_ball.scene(e=0.5), [0.0], [-1.0], 0.05, **TIGHT)
+    np.testing.assert_allclose(run.q[-1, 0], 0.5 * 0.05 - 0.5 * 9.81 * 0.05**2, rtol=1e-10)
+
+
 @pytest.mark.quick
 def test_wrong_contacts_are_refused():
     with pytest.raises(ValueError, match="restitution must be"):

@@ -116,37 +116,46 @@ def test_the_next_process_compiles_nothing(tmp_path: Path) -> None:
 
 SPRING = problems.braked_spring.scene(jms.Viscous(0.1))
 
-# What is not known before the run and cannot be run.
+# What makes a run, and what is not known before the run and makes none.
+POSED: dict[str, Any] = {"t1": 1.0, "ts": [0.1, 0.5, 0.9], "dtmax": 1.0, "rtol": 1e-6, "atol": 1e-9}
+STEPS: dict[str, Any] = {"t1": 1.0, "dt": 0.25}
 ILL_POSED: dict[str, dict[str, Any]] = {
-    "backward": {"t1": -1.0},
-    "endless": {"t1": np.inf},
-    "not a time": {"t1": np.nan},
-    "unsorted": {"ts": [0.0, 0.7, 0.3]},
-    "before": {"ts": [-0.1, 0.5]},
-    "behind": {"ts": [0.5, 1.1]},
-    "missing": {"ts": [0.1, np.nan, 0.5]},
-    "step backward": {"dt": -0.01},
-    "no step": {"dt": 0.0},
-    "no longest step": {"dtmax": 0.0},
-    "no tolerance": {"rtol": 0.0, "atol": 0.0},
-    "negative tolerance": {"atol": -1e-9},
+    "backward": POSED | {"t1": -1.0},
+    "endless": POSED | {"t1": np.inf},
+    "not a time": POSED | {"t1": np.nan},
+    "unsorted": POSED | {"ts": [0.0, 0.7, 0.3]},
+    "before": POSED | {"ts": [-0.1, 0.5, 0.9]},
+    "behind": POSED | {"ts": [0.1, 0.5, 1.1]},
+    "missing": POSED | {"ts": [0.1, np.nan, 0.5]},
+    "step backward": STEPS | {"dt": -0.01},
+    "no step": STEPS | {"dt": 0.0},
+    "no longest step": POSED | {"dtmax": 0.0},
+    "no tolerance": POSED | {"rtol": 0.0, "atol": 0.0},
+    "negative tolerance": POSED | {"atol": -1e-9},
 }
+
+
+@eqx.filter_jit
+def run_spring(given: dict[str, Any], throw: bool) -> Any:
+    run = jms.simulate(SPRING, [0.1], [0.0], **given, throw=throw)
+    return run.result, run.t_end
 
 
 @pytest.mark.parametrize("given", ILL_POSED.values(), ids=ILL_POSED)
 def test_traced_times_and_tolerances_that_make_no_run(given: dict[str, Any]) -> None:
     """diffrax's checks of them are not in the compiled run: it ends by a code of its own, at t0."""
-
-    def run(given: dict[str, Any], throw: bool) -> Any:
-        run = jms.simulate(SPRING, [0.1], [0.0], **{"t1": 1.0, **given}, throw=throw)
-        return run.result, run.t_end
-
-    arrays = {name: jnp.asarray(x) for name, x in given.items()}
-    result, t_end = eqx.filter_jit(run)(arrays, False)
+    result, t_end = run_spring({name: jnp.asarray(x, float) for name, x in given.items()}, False)
     assert "The times or tolerances do not make a run" in str(result)
     assert float(t_end) == 0.0
     with pytest.raises(eqx.EquinoxRuntimeError, match="t1 must not be before t0, ts must increase"):
-        eqx.filter_jit(run)(arrays, True)
+        run_spring({name: jnp.asarray(x, float) for name, x in given.items()}, True)
+
+
+@pytest.mark.parametrize("given", [POSED, STEPS], ids=["tolerances", "steps"])
+def test_traced_times_and_tolerances_that_make_a_run(given: dict[str, Any]) -> None:
+    result, t_end = run_spring({name: jnp.asarray(x, float) for name, x in given.items()}, False)
+    assert result.ok
+    assert float(t_end) == 1.0
 
 
 def test_one_run_of_a_batch_that_is_none_leaves_the_others() -> None:

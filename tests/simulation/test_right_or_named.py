@@ -11,8 +11,6 @@ from scipy.integrate import solve_ivp
 
 import jaxmodsim as jms
 
-from ..helpers.optimized import optimized
-
 BOX = {"m": 2.0, "A": 0.8441173414514593, "g": 0.09826644620612397, "w": 2.9358368442770417}
 # On a grid of 0.2 ms; `test_piecewise` has it by matrix exponentials, too.
 BOX_END = 0.0210472714
@@ -163,22 +161,3 @@ def test_gradients_pass_where_differences_converge() -> None:
 
     check = jms.check_gradients(end, inertias(), names=["k", "J2"])
     assert check.ok, str(check)
-
-
-def test_reverse_mode_is_that_of_the_steps_that_were_made() -> None:
-    """x'' + x in -[-1, 1] from (12, 6) comes to rest with the derivatives -13/sqrt(205) and -6/sqrt(205)."""
-
-    def end(start: Any, rtol: float) -> Any:
-        scene = jms.Scene(spring_lagrangian, effects=(jms.Friction(jms.Coulomb(1.0)),))
-        return jms.simulate(scene, start[:1], start[1:], 30.0, rtol=rtol, atol=1e-3 * rtol).q[-1, 0]
-
-    with optimized():
-        slope = jax.jit(jax.grad(end))
-        for rtol, admissible in ((1e-9, 1e-10), (1e-11, 1e-12)):
-            found = slope(jnp.array([12.0, 6.0]), rtol)
-            np.testing.assert_allclose(found, np.array([-13.0, -6.0]) / math.sqrt(205.0), atol=admissible)
-
-
-def spring_lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
-    del t, p
-    return 0.5 * qd[0] ** 2 - 0.5 * q[0] ** 2

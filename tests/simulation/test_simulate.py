@@ -15,7 +15,6 @@ from jaxmodsim import problems
 from jaxmodsim.simulation._solve import default_solver
 
 from ..helpers.differences import central_difference, flat, gradient_by_differences
-from ..helpers.optimized import optimized
 
 TRACES: list[int] = []
 
@@ -125,7 +124,6 @@ def test_forward_derivatives_equal_reverse(reverse_gradient: Any) -> None:
     np.testing.assert_allclose(linear(direction), flat(direction) @ flat(reverse_gradient), rtol=1e-10)
 
 
-@optimized()
 def test_a_batch_equals_a_loop_and_a_sick_lane_harms_no_other() -> None:
     """Lanes: two sound ones, a NaN in the Lagrangian, a parameter out of range, a field of NaN on the way."""
     changes: list[dict[str, Any]] = [{}, {"F": float("nan")}, {"sigma0": 200.0}, {"m": -1.0}, {"k": 60.0}]
