@@ -3,7 +3,7 @@
 Scenes: Scene, AppliedForce, Friction, Signal, AbstractEffect; Constraint, VelocityConstraint, Contact, consistent.
 Mechanics: point_mass, rigid_body; Chart, Cylindrical, Spherical.
 Friction laws: Viscous, Curve, Coulomb, Stribeck, Dahl, LuGre, ElastoPlastic, MaxwellSlip, Armstrong; in the wrappers
-    Regularized, DeadZone, Sign; with asymmetric, scaled_by.
+    Regularized, DeadZone, Sign, Bristle; with asymmetric, scaled_by; of gears Geared, ServoGear.
 About laws: check_passivity, damping_sigma1, regularized_width, max_stable_step; to_mujoco, to_modelica.
 Scenes elsewhere: to_c, to_javascript.
 Runs: simulate, simulate_to_accuracy; they give a Trajectory, or raise a SimulationError.
@@ -25,14 +25,17 @@ from typing import Any as _Any
 from ._core.provenance import versions as _versions
 from ._core.speed import tune_cpu as tune_cpu
 from .friction import Armstrong as Armstrong
+from .friction import Bristle as Bristle
 from .friction import Coulomb as Coulomb
 from .friction import Curve as Curve
 from .friction import Dahl as Dahl
 from .friction import DeadZone as DeadZone
 from .friction import ElastoPlastic as ElastoPlastic
+from .friction import Geared as Geared
 from .friction import LuGre as LuGre
 from .friction import MaxwellSlip as MaxwellSlip
 from .friction import Regularized as Regularized
+from .friction import ServoGear as ServoGear
 from .friction import Sign as Sign
 from .friction import Stribeck as Stribeck
 from .friction import Viscous as Viscous

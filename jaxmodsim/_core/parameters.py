@@ -12,14 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .state_dependent import nominal
+from .state_dependent import StateDependent, as_state_function, nominal
 
 if TYPE_CHECKING:
     Number: TypeAlias = Any  # a plain number in the call: type checkers do not see the converter of `parameter`
     Vector: TypeAlias = Any
+    NumberOrState: TypeAlias = Any  # a number, or what has one at a state of the mechanism
 else:
     Number: TypeAlias = Float[Array, ""]
     Vector: TypeAlias = Float[Array, " n"]
+    NumberOrState: TypeAlias = Float[Array, ""] | StateDependent
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,6 +153,19 @@ def optional_vector_parameter(name: str, unit: str, *, lower: float | str | None
     """A `vector_parameter` that may be left out, and then is None."""
     convert = partial(_unless_none, convert=as_vector, name=name)
     return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower)})
+
+
+def state_parameter(name: str) -> Any:
+    """Field that holds a function of the mechanism's state, of either sign, or a number where it is constant."""
+    return eqx.field(converter=partial(_of_state, name=name))
+
+
+def _of_state(value: Any, *, name: str) -> object:
+    if isinstance(value, StateDependent):
+        return value
+    if callable(value):
+        return StateDependent(None, as_state_function(value, name=name))
+    return as_number(value, name=name)
 
 
 def _unless_none(value: object, *, convert: Callable[..., object], name: str) -> object:

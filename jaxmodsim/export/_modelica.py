@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .._core.state_dependent import need_values
-from ..friction import AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw
+from ..friction import AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw, Geared
 
 # Speeds at which the table is held against the law, spaced evenly in the logarithm over so many decades, and evenly.
 _POINTS, _DECADES = 6000, 12
 # Part of the tolerance that is used, for what lies between those speeds.
 _SHARE = 0.9
 
-Table = Float[np.ndarray, "row 2"]
+Table = Float[np.ndarray, "row width"]
 
 
 def to_modelica(
@@ -27,9 +27,13 @@ def to_modelica(
     events, as here: a table of the force in slip over the speed, interpolated linearly, and the limit of stick as a
     multiple (`peak`) of the table's first force. The rows are placed where the law bends.
 
+    `Geared` becomes a `LossyGear` of ratio 1, whose efficiencies and bearing friction over the speed are the same law.
+    It knows the torque that it transmits, so `torque` is left out.
+
     **Arguments:**
 
-    - `law`: `Coulomb`, `Stribeck` or another set-valued law, the same in both directions, or `Viscous`.
+    - `law`: `Coulomb`, `Stribeck` or another set-valued law, the same in both directions, or `Viscous`; for a rotary
+      axis also `Geared`, without stiction and with back-driving coefficients below one.
     - `v_max`: speed up to which the table follows the law [m/s or rad/s], > 0; the component extends its last segment.
     - `name`: name of the component, a Modelica identifier.
     - `rtol`: largest error of the interpolated force relative to the law's, > 0 and < 1.
@@ -46,18 +50,33 @@ def to_modelica(
     """
     if not isinstance(law, AbstractLaw):
         raise ValueError(f"to_modelica needs a law, but {law!r} was given.")
-    need_values(law, "to_modelica")
+    if not isinstance(law, Geared):
+        need_values(law, "to_modelica")
     if not 0 < v_max < math.inf or not 0 < rtol < 1:
         raise ValueError(f"to_modelica needs v_max > 0 [m/s] and 0 < rtol < 1; given: {v_max=}, {rtol=}.")
     if not (name.isidentifier() and name.isascii()):
         raise ValueError(f"to_modelica: name must be an identifier such as 'friction1', but {name!r} was given.")
-    lacks = law.modelica()
-    if lacks or not isinstance(law, AbstractSetValuedLaw | AbstractForceLaw):
-        raise ValueError(f"to_modelica: Modelica's friction components have no {lacks or type(law).__name__}.")
     speeds = np.concatenate(
         [[0.0], np.geomspace(v_max * 10.0**-_DECADES, v_max, _POINTS), np.linspace(0.0, v_max, _POINTS)[1:-1]]
     )
     speeds = np.unique(speeds)
+    if isinstance(law, Geared):
+        table = _lossy_gear(law, speeds, rtol, rotary)
+        return f"Modelica.Mechanics.Rotational.Components.LossyGear {name}(ratio=1, lossTable=[{table}]);"
+    forward, limit = _both_ways(law, speeds)
+    level = forward[0]
+    peak = limit / level if level > 0 else 1.0
+    rows = _written(_table(speeds, forward[:, None], rtol))
+    kind, table = ("Rotational", "tau_pos") if rotary else ("Translational", "f_pos")
+    component = "BearingFriction" if rotary else "SupportFriction"
+    return f"Modelica.Mechanics.{kind}.Components.{component} {name}({table}=[{rows}], peak={peak:.10g});"
+
+
+def _both_ways(law: AbstractLaw, speeds: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], float]:
+    """Force [N] in slip, the same in both directions, and the limit of stick."""
+    lacks = law.modelica()
+    if lacks or not isinstance(law, AbstractSetValuedLaw | AbstractForceLaw):
+        raise ValueError(f"to_modelica: Modelica's friction components have no {lacks or type(law).__name__}.")
     forward, backward = _forces(law, speeds), -_forces(law, -speeds)
     limits = [forward[0], backward[0]]
     if isinstance(law, AbstractSetValuedLaw):
@@ -67,17 +86,35 @@ def to_modelica(
             "to_modelica: Modelica's friction components have no friction that depends on the direction: export the law"
             " of one direction, or the mean of both."
         )
-    level, limit = forward[0], limits[0]
+    level, limit = forward[0], float(limits[0])
     if not np.isfinite(forward).all() or limit < level or (level == 0 and limit > 0):
         raise ValueError(
             "to_modelica: the limit of stick must be at least the force of slip at v = 0, above zero if it is, and all"
             f" forces finite; given: {limit:g} N in stick, {level:g} N in slip."
         )
-    peak = limit / level if level > 0 else 1.0
-    rows = "; ".join(f"{v:.10g}, {f:.10g}" for v, f in _table(speeds, forward, rtol))
-    kind, table = ("Rotational", "tau_pos") if rotary else ("Translational", "f_pos")
-    component = "BearingFriction" if rotary else "SupportFriction"
-    return f"Modelica.Mechanics.{kind}.Components.{component} {name}({table}=[{rows}], peak={peak:.10g});"
+    return forward, limit
+
+
+def _lossy_gear(law: Geared, speeds: Float[np.ndarray, " n"], rtol: float, rotary: bool) -> str:
+    """Rows of speed, efficiencies of driving and back-driving, and bearing friction in either case.
+
+    With the torque u on the motor's side the component loses `(1 - eta1) u + tau1` driving and `(1 - 1/eta2) u + tau2`
+    driven back, which is `F0 + mu |u - F|` for `eta1 = 1/(1 + mu_drive)`, `tau1 = eta1 F0`, `eta2 = 1 - mu_back`,
+    `tau2 = F0/eta2`.
+    """
+    parts = [law.law, law.drive, law.drive if law.back is None else law.back]
+    for part in parts:
+        need_values(part, "to_modelica")
+    (idle, rest), (drive, drive_rest), (back, back_rest) = (_both_ways(part, speeds) for part in parts)
+    held, slides = np.array([rest, drive_rest, back_rest]), np.array([idle[0], drive[0], back[0]])
+    if not rotary or not np.allclose(held, slides, rtol=1e-6, atol=0.0) or np.max(back) >= 1.0:
+        raise ValueError(
+            "to_modelica: LossyGear is a rotary gear (rotary=True) without stiction (Fs = Fc) that does not lock"
+            f" itself (coefficients of back-driving below 1); given: {rotary=}, limits of stick {held} over forces in"
+            f" slip {slides}, coefficients of back-driving up to {np.max(back):g}."
+        )
+    drives, driven = 1.0 / (1.0 + drive), 1.0 - back
+    return _written(_table(speeds, np.stack([drives, driven, drives * idle, idle / driven], axis=1), rtol))
 
 
 def _forces(law: AbstractSetValuedLaw | AbstractForceLaw, v: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -90,29 +127,33 @@ def _forces(law: AbstractSetValuedLaw | AbstractForceLaw, v: Float[np.ndarray, "
     )
 
 
-def _table(v: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], rtol: float) -> Table:
-    """Rows (v, force), each as far from the last as a straight line between them stays within the tolerance."""
+def _table(v: Float[np.ndarray, " n"], values: Float[np.ndarray, "n column"], rtol: float) -> Table:
+    """Rows (v, values), each as far from the last as a straight line between them stays within the tolerance."""
     rows, last = [0], v.size - 1
     while rows[-1] < last:
         start = rows[-1]
         # The next row lies between `near`, which does, and `far`, which does not.
         near, far = start + 1, start + 2
-        while far < last and _straight(v, force, start, far, rtol):
+        while far < last and _straight(v, values, start, far, rtol):
             near, far = far, start + 2 * (far - start)
         far = min(far, last + 1)
-        if far > last and _straight(v, force, start, last, rtol):
+        if far > last and _straight(v, values, start, last, rtol):
             near = last
         while far - near > 1:
             middle = (near + far) // 2
-            near, far = (middle, far) if _straight(v, force, start, middle, rtol) else (near, middle)
+            near, far = (middle, far) if _straight(v, values, start, middle, rtol) else (near, middle)
         rows.append(near)
-    return np.stack([v[rows], force[rows]], axis=1)
+    return np.concatenate([v[rows, None], values[rows]], axis=1)
 
 
 def _straight(
-    v: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], i: int, j: int, rtol: float
+    v: Float[np.ndarray, " n"], values: Float[np.ndarray, "n column"], i: int, j: int, rtol: float
 ) -> Bool[np.ndarray, ""] | np.bool_:
     """Whether the straight line between two rows is within the tolerance of the law."""
     between = slice(i, j + 1)
-    line = force[i] + (force[j] - force[i]) * ((v[between] - v[i]) / (v[j] - v[i]))
-    return np.all(np.abs(line - force[between]) <= _SHARE * rtol * np.abs(force[between]))
+    line = values[i] + (values[j] - values[i]) * ((v[between, None] - v[i]) / (v[j] - v[i]))
+    return np.all(np.abs(line - values[between]) <= _SHARE * rtol * np.abs(values[between]))
+
+
+def _written(table: Table) -> str:
+    return "; ".join(", ".join(f"{x:.10g}" for x in row) for row in table)

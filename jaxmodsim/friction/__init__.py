@@ -12,12 +12,15 @@ from ._stribeck import lorentzian as lorentzian
 from .wrappers._regularized import Regularized as Regularized
 from .wrappers._dead_zone import DeadZone as DeadZone
 from .wrappers._sign import Sign as Sign
+from .wrappers._bristle import Bristle as Bristle
+from .modifiers._geared import Geared as Geared
 from ._dahl import Dahl as Dahl
 from ._lugre import LuGre as LuGre
 from ._elasto_plastic import ElastoPlastic as ElastoPlastic
 from ._maxwell_slip import MaxwellSlip as MaxwellSlip
 from ._armstrong import Armstrong as Armstrong
 from ._armstrong import ArmstrongState as ArmstrongState
+from ._servo_gear import ServoGear as ServoGear
 
 # isort: on
 from ._check_passivity import check_passivity as check_passivity

@@ -34,6 +34,13 @@ def _power(x: Scalar, exponent: Scalar) -> Scalar:
     return jnp.where(exponent < 1.0, rounded, safe_power(x, exponent))
 
 
+def stribeck_power(v: Scalar, vs: Scalar, exponent: Scalar | None) -> Scalar:
+    """`(|v|/vs)^exponent`, what the fall of a Stribeck curve goes by; a square without an exponent."""
+    ratio = bounded_ratio(v, vs)
+    # A square costs a fifth of a power.
+    return ratio * ratio if exponent is None else _power(ratio, exponent)
+
+
 def _fall(value: object) -> object:
     if not callable(value):
         raise ValueError(
@@ -89,10 +96,7 @@ class Stribeck(AbstractSetValuedLaw):
 
     def sliding_force(self, v: Scalar) -> Scalar:
         """Magnitude [N] of the dry part in slip."""
-        ratio = bounded_ratio(v, self.vs)
-        # A square costs a fifth of a power.
-        power = ratio * ratio if self.exponent is None else _power(ratio, self.exponent)
-        return self.Fc + (self.Fs - self.Fc) * self.fall(power)
+        return self.Fc + (self.Fs - self.Fc) * self.fall(stribeck_power(v, self.vs, self.exponent))
 
     def viscous_force(self, v: Scalar) -> Scalar:
         """Viscous part [N]."""

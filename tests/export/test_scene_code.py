@@ -78,6 +78,12 @@ def many_functions(t: Any, q: Any, qd: Any, p: Any) -> Any:
     return jnp.sum(jnp.where(jnp.arange(powers.size) < powers.size, powers, 0.0))[None]
 
 
+def transmitted(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    """Torque of the spring in an elastic gear."""
+    del t, qd
+    return p["k"] * (q[0] - q[1])
+
+
 LUGRE = jms.LuGre(sigma0=1e4, sigma1=12.0, sigma2=0.1, Fc=1.0, Fs=1.5, vs=0.01)
 SCENES: dict[str, Callable[[], tuple[jms.Scene, int]]] = {
     "lugre box": lambda: (ramped_box.scene(ramped_box.lugre(sigma1=12.0)), 1),
@@ -98,6 +104,23 @@ SCENES: dict[str, Callable[[], tuple[jms.Scene, int]]] = {
             lambda t, q, qd, p: 0.5 * p["m"] * jnp.sum(qd**2) - 3.0 * p["m"] * q[0],
             params={"m": 1.0},
             effects=(jms.Friction(LUGRE, along=lambda q: q, ellipse=1.5),),
+        ),
+        2,
+    ),
+    "elastic gear": lambda: (
+        jms.Scene(
+            lambda t, q, qd, p: 0.5 * p["m"] * jnp.sum(qd**2) - 0.5 * p["k"] * (q[0] - q[1]) ** 2 + 2.0 * q[0],
+            params={"m": 0.1, "k": 30.0},
+            effects=(
+                jms.Friction(
+                    jms.Bristle(jms.Geared(jms.Stribeck(0.1, 0.2, 0.1), 0.2, transmitted, 0.3), 1e-3),
+                    along=lambda q: q[0],
+                ),
+                jms.Friction(
+                    jms.Regularized(jms.ServoGear(1.0, transmitted, 0.1, 0.01, 0.2, 0.3, 1.5, 0.1, 0.2), 1e-3),
+                    along=lambda q: q[1],
+                ),
+            ),
         ),
         2,
     ),
@@ -197,7 +220,9 @@ def test_the_right_hand_side_in_c_is_that_of_jax(name: str, in_c: Callable[[str]
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", ["lugre box", "coulomb belt", "arm with two laws", "block in the plane"])
+@pytest.mark.parametrize(
+    "name", ["lugre box", "coulomb belt", "arm with two laws", "block in the plane", "elastic gear"]
+)
 def test_a_run_in_c_is_that_of_simulate(name: str, in_c: Callable[[str], InC]) -> None:
     scene, dof = scene_of(name)
     y0, h, t1 = random_states(scene, dof, 2)[1] * 0.1, 1e-3, 3.0

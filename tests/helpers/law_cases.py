@@ -9,14 +9,17 @@ import numpy as np
 
 from jaxmodsim import (
     Armstrong,
+    Bristle,
     Coulomb,
     Curve,
     Dahl,
     DeadZone,
     ElastoPlastic,
+    Geared,
     LuGre,
     MaxwellSlip,
     Regularized,
+    ServoGear,
     Sign,
     Stribeck,
     Viscous,
@@ -75,6 +78,11 @@ def contact(law: Any, share: Any) -> Any:
     )
 
 
+def deflection(law: Any, share: Any) -> Any:
+    """State of a bristle whose limit is 1."""
+    return jnp.asarray(share, law.h.dtype)
+
+
 def forward(loaded: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     """State of an asymmetric law, from its law for positive slip."""
     return lambda law, share: loaded(law.forward, share)
@@ -91,6 +99,11 @@ LUGRE = LuGre(sigma0=750.0, sigma1=12.0, sigma2=2.1, Fc=1.5, Fs=1.75, vs=0.2)
 ELASTO = ElastoPlastic(sigma0=750.0, sigma1=12.0, sigma2=2.1, Fba=1.0, Fc=1.5, Fs=1.75, vs=0.2)
 MAXWELL = MaxwellSlip(k=[500.0, 250.0, 80.0], Fc=[0.8, 0.4, 0.3], Fs=[0.9, 0.5, 0.35], vs=0.2, C=4.0, sigma2=0.1)
 ARMSTRONG = Armstrong(sigma0=750.0, Fc=1.5, Fs=1.75, vs=0.2, Fv=0.1, tau=0.05, gamma=2.0)
+
+# Under 1 N m of the motor and 0.8 N m against it: 0.1 + 0.215 N m at any speed, and 0.5 N m more at rest.
+SERVO = ServoGear(
+    1.0, -0.8, Kc=0.1, Kv=0.1, Kcs=0.2, vs=0.2, Km=0.135, Ke=0.1, Kms=0.2, Kes=0.0725, Kmq=0.1, Keq=0.065625
+)
 
 # A new law gets one entry here, and one with each modifier.
 CASES = {
@@ -122,6 +135,15 @@ CASES = {
     "maxwell slip": Case(MAXWELL, 1.75, (1.5, 1.5), (0.1, 0.1), loaded=elements),
     "armstrong": Case(ARMSTRONG, 1.75, (1.5, 1.5), (0.1, 0.1), loaded=contact),
 
+    "geared": Case(
+        Geared(STRIBECK, 0.2, jnp.array(2.0), 0.3), 2.35, (1.9, 2.1), (0.1, 0.1), odd=False, smooth=False
+    ),
+    "servo gear": Case(SERVO, 0.815, (0.315, 0.315), (0.1, 0.1), smooth=False),
+    "bristle": Case(Bristle(Coulomb(1.5), 2e-3), 1.5, (1.5, 1.5), loaded=deflection),
+    "bristle geared": Case(
+        Bristle(Geared(Coulomb(1.5), 0.2, jnp.array(2.0), 0.3), 2e-3), 2.1, (1.9, 2.1), odd=False, loaded=deflection
+    ),
+
     "viscous asymmetric": Case(
         asymmetric(Viscous(0.4), Fv=0.7), 0.0, (0.0, 0.0), (0.4, 0.7), odd=False, smooth=False
     ),
@@ -146,6 +168,16 @@ CASES = {
     ),
     "maxwell slip asymmetric": Case(
         asymmetric(MAXWELL, Fc=[0.6, 0.3, 0.2]), 1.75, (1.5, 1.1), (0.1, 0.1), odd=False, loaded=forward(elements)
+    ),
+    "geared asymmetric": Case(
+        asymmetric(Geared(STRIBECK, 0.2, jnp.array(2.0), 0.3), Fc=1.6, Fv=0.3), 2.35, (1.9, 2.2), (0.1, 0.3),
+        odd=False, smooth=False,
+    ),
+    "servo gear asymmetric": Case(
+        asymmetric(SERVO, Kc=0.2, Kv=0.3), 0.915, (0.315, 0.415), (0.1, 0.3), odd=False, smooth=False
+    ),
+    "bristle asymmetric": Case(
+        asymmetric(Bristle(Coulomb(1.5), 2e-3), Fc=1.2), 1.5, (1.5, 1.2), odd=False, loaded=deflection
     ),
     "armstrong asymmetric": Case(
         asymmetric(ARMSTRONG, Fc=1.2), 1.75, (1.5, 1.2), (0.1, 0.1), odd=False, loaded=forward(contact)
@@ -190,6 +222,7 @@ CASES |= {
     for name in (
         "viscous", "curve", "coulomb", "stribeck", "regularized stribeck", "sign", "dead zone", "dahl", "lugre",
         "elasto-plastic", "maxwell slip", "armstrong", "regularized asymmetric", "lugre asymmetric",
+        "geared", "servo gear", "bristle",
     )
 }  # fmt: skip
 

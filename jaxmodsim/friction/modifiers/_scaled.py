@@ -5,13 +5,11 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import equinox as eqx
-import jax
 from jaxtyping import ArrayLike
 
 from ..._core.arguments import as_names
-from ..._core.functions import as_function
 from ..._core.parameters import modules_of, ranges_of
-from ..._core.state_dependent import StateDependent
+from ..._core.state_dependent import StateDependent, as_state_function
 from .._law import AbstractLaw
 
 _Law = TypeVar("_Law")
@@ -45,11 +43,7 @@ def scaled_by(law: _Law, fn: object, parameters: Sequence[str] | None = None) ->
     """
     if not isinstance(law, AbstractLaw):
         raise ValueError(f"scaled_by needs a law, but {law!r} was given; of a function of velocity make a Curve(fn).")
-    factor = as_function(fn, name="scaled_by fn")
-    if any(eqx.is_inexact_array(x) for x in jax.tree.leaves(factor)):
-        raise ValueError(
-            "scaled_by: fn holds numbers of its own; put them into the scene's params, and read them there."
-        )
+    factor = as_state_function(fn, name="scaled_by fn")
     known = {name: r.unit for _, module in modules_of(law) for name, r in ranges_of(module).items()}
     chosen = (
         [name for name, unit in known.items() if unit.startswith("N")]

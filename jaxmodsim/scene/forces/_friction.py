@@ -27,6 +27,7 @@ from ...friction import (
     AbstractPlanarLaw,
     AbstractSetValuedLaw,
     Curve,
+    Geared,
     laws,
 )
 from ._effect import AbstractEffect, Action, Power
@@ -67,6 +68,11 @@ def _load(value: Any) -> Any:
     if callable(value):
         return as_function(value, name="Friction normal_force")
     return as_number(value, name="Friction normal_force")
+
+
+def _role(x: StateDependent) -> str:
+    """What a function of the state is to its law."""
+    return "the torque" if x.number is None else "scaled_by's fn"
 
 
 class Friction(AbstractEffect):
@@ -158,7 +164,7 @@ class Friction(AbstractEffect):
                 " shape (2,) or (3,), is needed."
             )
         slip = () if q.shape == (1,) else shape
-        sided = any(isinstance(module, AbstractAsymmetric) for _, module in modules_of(self.law))
+        sided = any(isinstance(module, AbstractAsymmetric | Geared) for _, module in modules_of(self.law))
         if slip != () and (sided or not isinstance(self.law, AbstractForceLaw | AbstractPlanarLaw)):
             raise ValueError(
                 f"Friction {name!r}: along(q) is a position that moves in several directions, and there"
@@ -172,12 +178,12 @@ class Friction(AbstractEffect):
                 f" {slip}: return a position of shape (2,) from along."
             )
         load = None if self.load_constraint is not None else self.normal_force
-        factors = [x.fn for _, x in modules_of(self.law) if isinstance(x, StateDependent)]
+        varying = [x for _, x in modules_of(self.law) if isinstance(x, StateDependent)]
         state = {"t": q[0], "q": q, "qd": qd, "params": params}
         for label, fn, args, wanted in (
             ("belt_velocity(t)", self.belt_velocity, {"t": q[0]}, slip),
             ("normal_force(t, q, qd, params)", load, state, ()),
-            *(("scaled_by's fn(t, q, qd, params)", fn, state, ()) for fn in factors),
+            *((f"{_role(x)}(t, q, qd, params)", x.fn, state, ()) for x in varying),
         ):
             given = result_shape(fn, **args, name=f"{label} of Friction {name!r}") if callable(fn) else wanted
             if given != wanted:
