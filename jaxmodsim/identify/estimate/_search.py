@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from ..data._record import Windows
 from ._problem import AbstractLoss, Box, FitProblem
 
 # `x` -> residual and its Jacobian.
@@ -17,11 +18,16 @@ Evaluate: TypeAlias = Callable[[Float[Array, " n"]], tuple[Float[Array, " m"], F
 # A step whose effect on the residual is smaller than this against the residual itself is lost in rounding.
 _ROUNDING = 8.0
 _LARGEST_DAMPING = 1e14
+# Damping of the first step, and what a refused one multiplies it by.
+_DAMPING, _GROWTH = 1e-3, 2.0
 # The cost is flat to second order around its minimum, so it must be known better than the parameters.
 _FLAT = 0.1
 # Models that stick and slip by fixed steps have a cost with small steps in it, on which a search never ends by itself:
 # it has settled after so many evaluations in a row that each lowered the cost by less than so many `rtol` of itself.
 _PATIENCE, _SLOW = 8, 10.0
+# Iterations after which a search that has not ended begins anew where it is. A long curved valley leaves it with a
+# damping that suits the last bend only.
+_ROUND = 100
 # Called after each iteration with its number, the root mean square of the residual and the parameters by name.
 Progress: TypeAlias = Callable[[int, float, dict[str, float]], None]
 # Noise levels that are estimated are estimated again until they settle.
@@ -57,8 +63,8 @@ def start_search(x: Float[Array, " n"], rows: int) -> SearchState:
         jnp.zeros(rows, x.dtype),
         jnp.zeros((rows, x.shape[0]), x.dtype),
         inf,
-        zero + 1e-3,
-        zero + 2.0,
+        zero + _DAMPING,
+        zero + _GROWTH,
         jnp.asarray(0),
         jnp.asarray(0),
         jnp.asarray(0),
@@ -114,7 +120,7 @@ def levenberg_marquardt_step(
         jnp.where(better, trial_jacobian, state.jacobian),
         jnp.where(better, cost, state.cost),
         damping,
-        jnp.where(better, 2.0, 2.0 * state.growth),
+        jnp.where(better, _GROWTH, 2.0 * state.growth),
         state.steps + 1,
         slow,
         jnp.where(state.done > 0, state.done, done),
@@ -126,23 +132,38 @@ class SearchOptions:
     """How a search is run: relative tolerance, limit of iterations, who is told."""
 
     rtol: float = 1e-6
-    max_steps: int = 100
+    max_steps: int = 400
     progress: Progress | None = None
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Where a search ended: the problem with the noise levels it ended with, the last iterate, and how it ended."""
+    """Where a search ended: the problem with the noise levels it ended with, the last iterate, and how it ended.
+
+    - `windows`: what its runs are of; None until it is the search of a result.
+    """
 
     problem: FitProblem
     state: SearchState
     iterations: int
     ending: str
+    windows: Windows | None = None
 
     @property
     def converged(self) -> bool:
         """Whether it ended by itself."""
-        return self.ending in ENDINGS.values()
+        return ended_by_itself(self.ending)
+
+
+def ended_by_itself(ending: str) -> bool:
+    """Whether the words for the end of a search are of one that needed no limit."""
+    return ending.startswith(tuple(ENDINGS.values()))
+
+
+def continued(ending: str, times: int, where: str) -> str:
+    """The words for the end of a search with how often it went on by itself, and where."""
+    often = "once" if times == 1 else f"{times} times"
+    return f"{ending}; continued {often} {where}" if times else ending
 
 
 @eqx.filter_jit
@@ -164,7 +185,7 @@ def _beside(done: Array, like: Array) -> Array:
 
 
 def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> SearchResult:
-    """Search from `x`.
+    """Search from `x`; after each hundred iterations it goes on with a damping as at the start, to the limit of all.
 
     **Raises:**
 
@@ -176,9 +197,14 @@ def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
     if counted <= unknown:
         raise ValueError(f"{counted} samples are too few for {unknown} free parameters.")
     rtol = jnp.asarray(options.rtol, x.dtype)
-    state, best = start_search(x, problem.rows), None
+    state, best, rounds = start_search(x, problem.rows), None, 0
+    at = f"after {_ROUND} iterations each"
     try:
         for iteration in range(1, options.max_steps + 1):
+            if iteration > 1 and iteration % _ROUND == 1:
+                rounds += 1
+                fresh = start_search(state.x, problem.rows)
+                state = state._replace(damping=fresh.damping, growth=fresh.growth)
             state = step(problem, state, rtol)
             if iteration == 1 and not np.isfinite(float(state.cost)):
                 raise RuntimeError(
@@ -191,12 +217,13 @@ def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
                 shown = {name: float(values[name]) for name in problem.free.names}
                 options.progress(iteration, _rms(problem, state), shown)
             if int(state.done):
-                return SearchResult(problem, state, int(state.steps), ENDINGS[int(state.done)])
+                return SearchResult(problem, state, int(state.steps), continued(ENDINGS[int(state.done)], rounds, at))
     except KeyboardInterrupt:
         if best is None:
             raise  # nothing was computed yet
         return SearchResult(problem, best, int(best.steps), "interrupted; these are the best values so far")
-    return SearchResult(problem, state, int(state.steps), f"stopped at the limit of {options.max_steps} iterations")
+    ending = f"stopped at the limit of {options.max_steps} iterations (max_steps)"
+    return SearchResult(problem, state, int(state.steps), continued(ending, rounds, at))
 
 
 @eqx.filter_jit

@@ -102,7 +102,7 @@ class RecordAgreement:
         return "\n".join(lines)
 
 
-def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 100) -> RecordAgreement:
+def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 400) -> RecordAgreement:
     """Fit each record by itself, from the fit to all, and test whether the parameters are the same.
 
     For each parameter the sum of squared distances from its weighted mean, in standard errors, is held against its

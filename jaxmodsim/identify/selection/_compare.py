@@ -113,7 +113,7 @@ def compare(
     loss: AbstractLoss | None = None,
     initializer: AbstractInitializer | Sequence[AbstractInitializer] = (),
     substeps: int = 1,
-    max_steps: int = 100,
+    max_steps: int = 400,
     progress: bool | CompareProgress = False,
 ) -> Comparison:
     """Fit several models to the same records, and judge each by its error on what it was not fitted to.
@@ -199,7 +199,7 @@ def compare_laws(
     folds: int = 4,
     loss: AbstractLoss | None = None,
     initializer: AbstractInitializer | Sequence[AbstractInitializer] = (),
-    max_steps: int = 100,
+    max_steps: int = 400,
     progress: bool | CompareProgress = False,
 ) -> Comparison:
     """Fit several friction laws to a measured force under a measured motion, and judge each by what was held back.

@@ -1,12 +1,13 @@
 """`fit` and `fit_law`: numbers of a scene, or of a law by itself, from measured records."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from ..._core.arguments import as_float, as_mapping, as_names, as_whole
 from ..._core.parameters import Range
@@ -19,7 +20,7 @@ from ..data._record import Record, Windows, cut, outliers, runs_of
 from ..estimate._initializers import AbstractInitializer, run_initializers
 from ..estimate._prepare import MultipleShooting, Settings, StartState, prepare, step_error
 from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
-from ..estimate._search import Progress, SearchOptions, SearchResult, by_channel, solve_with_noise
+from ..estimate._search import Progress, SearchOptions, SearchResult, by_channel, continued, solve_with_noise
 from ..model._engines import Controller, LawEngine, with_values
 from ..model._observe import Observable, coordinates_seen, first_coordinate
 from ..model._parameters import FreeParameters, chosen_entries, split_entries, split_ranges
@@ -54,7 +55,7 @@ def fit(
     substeps: int = 1,
     accuracy: float = 1e-8,
     rtol: float = 1e-6,
-    max_steps: int = 100,
+    max_steps: int = 400,
     progress: bool | Progress = False,
 ) -> FitResult:
     """Fit numbers of a scene so that its simulation follows measured records.
@@ -92,7 +93,8 @@ def fit(
     - `substeps`: integration steps between two samples.
     - `accuracy`: relative tolerance of runs by events.
     - `rtol`: relative change of the residual at which the search ends.
-    - `max_steps`: limit of iterations.
+    - `max_steps`: limit of iterations. Up to it a search goes on by itself, every hundred of them with a damping as at
+      the start; the result says how often.
     - `progress`: True for a line of text, or a function that is called after each iteration with its number, the RMSE
       and the parameters. Ctrl-C ends the fit with the best so far.
 
@@ -163,7 +165,7 @@ def fit_law(
     loss: AbstractLoss | None = None,
     initializer: AbstractInitializer | Sequence[AbstractInitializer] = (),
     rtol: float = 1e-6,
-    max_steps: int = 100,
+    max_steps: int = 400,
     progress: bool | Progress = False,
 ) -> FitResult:
     """Fit a friction law to a measured friction force under a measured motion.
@@ -215,7 +217,7 @@ def fit_law(
         Prior(jnp.zeros(len(parameters.names)), jnp.zeros(len(parameters.names))),
     )
     with reported(progress, "fit", iteration_words) as report:
-        options = SearchOptions(rtol, max_steps, report)
+        options = SearchOptions(rtol, as_whole(max_steps, name="max_steps"), report)
         x, starts = run_initializers(initializer, problem, options)
         search = solve_with_noise(problem, x, options, frozenset(given))
     per_load = " per N" if "normal" in several[0].inputs else ""
@@ -290,7 +292,24 @@ def result_of(
         single_precision=jnp.result_type(float) == jnp.float32,
         issues=_issues(estimate, provenance, search),
     )
+    search = replace(search, windows=windows)
     return FitResult(estimate=estimate, diagnostics=diagnostics, provenance=provenance, search=search)
+
+
+def searched_on(result: FitResult, x: Float[Array, " n"], options: SearchOptions, times: int, where: str) -> FitResult:
+    """The result of the same fit, its search continued from `x`; `where` that is, in words, for the so many-th time."""
+    before, provenance = result.search, result.provenance
+    assert before is not None
+    assert before.windows is not None
+    assert provenance.model is not None
+    given = frozenset(name for record in provenance.records for name in record.noise)
+    search = solve_with_noise(before.problem, x, options, given)
+    ending = continued(search.ending, times, where)
+    search = replace(search, iterations=before.iterations + search.iterations, ending=ending)
+    model = with_values(provenance.model, search.problem.free.values(search.problem.split(search.state.x)[0]))
+    error = None if result.diagnostics.step_error is None else step_error(search)
+    units, starts = result.estimate.units, result.diagnostics.starts
+    return result_of(search, provenance.records, before.windows, units, model, error, starts)
 
 
 def _coordinates(search: SearchResult) -> dict[str, str]:
