@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from ..._core.device import on_device
 from ..data._record import Windows
 from ._problem import AbstractLoss, Box, FitProblem
 
@@ -57,18 +58,11 @@ class SearchState(NamedTuple):
 
 def start_search(x: Float[Array, " n"], rows: int) -> SearchState:
     """A search that knows nothing yet: its first iteration evaluates `x`."""
-    inf, zero = jnp.asarray(jnp.inf, x.dtype), jnp.asarray(0.0, x.dtype)
-    return SearchState(
-        x,
-        jnp.zeros(rows, x.dtype),
-        jnp.zeros((rows, x.shape[0]), x.dtype),
-        inf,
-        zero + _DAMPING,
-        zero + _GROWTH,
-        jnp.asarray(0),
-        jnp.asarray(0),
-        jnp.asarray(0),
-    )
+    cost, damping, growth = (on_device(np.asarray(each, x.dtype)) for each in (np.inf, _DAMPING, _GROWTH))
+    residual = on_device(np.zeros(rows, x.dtype))
+    jacobian = on_device(np.zeros((rows, x.shape[0]), x.dtype))
+    none = on_device(0)
+    return SearchState(x, residual, jacobian, cost, damping, growth, none, none, none)
 
 
 def levenberg_marquardt_step(
@@ -192,11 +186,11 @@ def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
     - `ValueError` if there are no more samples than free parameters.
     - `RuntimeError` if the model is not finite at the start.
     """
-    counted = int(jnp.sum(problem.weights > 0)) + int(jnp.sum(problem.prior.weight > 0))
+    counted = int(np.sum(problem.weights > 0)) + int(np.sum(np.asarray(problem.prior.weight) > 0))
     unknown = x.shape[0]
     if counted <= unknown:
         raise ValueError(f"{counted} samples are too few for {unknown} free parameters.")
-    rtol = jnp.asarray(options.rtol, x.dtype)
+    rtol = on_device(np.asarray(options.rtol, x.dtype))
     state, best, rounds = start_search(x, problem.rows), None, 0
     at = f"after {_ROUND} iterations each"
     try:
@@ -213,7 +207,7 @@ def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
                 )
             best = state
             if options.progress is not None:
-                values = problem.free.values(problem.split(state.x)[0])
+                values = problem.at(state.x).values
                 shown = {name: float(values[name]) for name in problem.free.names}
                 options.progress(iteration, _rms(problem, state), shown)
             if int(state.done):
@@ -232,10 +226,28 @@ def channels_seen(problem: FitProblem, x: Float[Array, " n"]) -> dict[str, Float
     return problem.seen(x).channels
 
 
+@eqx.filter_jit
+def cost_of(loss: AbstractLoss, residual: Float[Array, " m"]) -> Float[Array, ""]:
+    """Half the sum of the losses of a residual that is known."""
+    return loss.cost(residual)
+
+
+def weighted_by(loss: AbstractLoss, state: SearchState) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
+    """Residual and Jacobian of a search whose least squares have the gradient of the cost, see `AbstractLoss`."""
+    pair = state.residual, state.jacobian
+    residual, jacobian = _weighted(loss, *pair) if loss.robust else pair
+    return np.asarray(residual), np.asarray(jacobian)
+
+
+@eqx.filter_jit
+def _weighted(loss: AbstractLoss, residual: Array, jacobian: Array) -> tuple[Array, Array]:
+    return loss.weighted(residual, jacobian)
+
+
 def _rms(problem: FitProblem, state: SearchState) -> float:
     """Root mean square of the residual: in the unit of the channel where there is one, in noise levels otherwise."""
     samples = np.asarray(state.residual)[: problem.samples]
-    rms = float(np.sqrt(np.sum(samples**2) / max(float(jnp.sum(problem.weights)), 1.0)))
+    rms = float(np.sqrt(np.sum(samples**2) / max(float(np.sum(problem.weights)), 1.0)))
     return rms * float(next(iter(problem.noise.values()))) if len(problem.noise) == 1 else rms
 
 
@@ -250,11 +262,13 @@ def solve_with_noise(
     search = solve(problem, x, options)
     if not set(problem.noise) - given:
         return search
-    single = len(problem.noise) == 1 and not problem.loss.robust and float(jnp.max(problem.prior.weight)) == 0
+    single = (
+        len(problem.noise) == 1 and not problem.loss.robust and float(np.max(np.asarray(problem.prior.weight))) == 0
+    )
     single = single and problem.jump is None
     for _ in range(_NOISE_ROUNDS):
         levels = estimated_noise(search, given)
-        changes = [abs(float(levels[k] / search.problem.noise[k]) - 1) for k in levels]
+        changes = [abs(float(levels[k]) / float(search.problem.noise[k]) - 1) for k in levels]
         problem = eqx.tree_at(lambda p: p.noise, search.problem, levels)
         if single or search.ending.startswith("interrupted") or max(changes) < _NOISE_SETTLED:
             return _rescaled(search, problem)
@@ -272,25 +286,24 @@ def estimated_noise(search: SearchResult, given: frozenset[str]) -> dict[str, Ar
         own = residual[weight > 0]
         size = 1.4826 * np.median(np.abs(own)) if problem.loss.robust else np.sqrt(np.mean(own**2))
         floor = 10 * float(jnp.finfo(levels[name].dtype).eps)  # of a model that is exact
-        levels[name] = levels[name] * max(float(size), floor)
+        levels[name] = on_device(np.asarray(levels[name]) * np.asarray(max(float(size), floor), levels[name].dtype))
     return levels
 
 
-def by_channel(problem: FitProblem, residual: Array) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def by_channel(problem: FitProblem, residual: Array | np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Residual in noise levels and weight of each channel, shape `[runs, samples]`."""
-    return {
-        name: (np.asarray(rows), np.asarray(weight)) for name, (rows, weight) in problem.by_channel(residual).items()
-    }
+    split = problem.by_channel(np.asarray(residual))
+    return {name: (rows, np.asarray(weight)) for name, (rows, weight) in split.items()}
 
 
 def _rescaled(search: SearchResult, problem: FitProblem) -> SearchResult:
     """The same iterate in the noise levels of `problem`."""
     old = search.problem
-    factors = [jnp.full(weight.shape, old.noise[name] / problem.noise[name]) for name, weight in old.columns.items()]
-    factor = jnp.reshape(jnp.concatenate(factors, axis=1), (-1,))
-    factor = jnp.concatenate([factor, jnp.ones(old.rows - old.samples, factor.dtype)])
-    residual = search.state.residual * factor
-    state = search.state._replace(
-        residual=residual, jacobian=search.state.jacobian * factor[:, None], cost=old.loss.cost(residual)
-    )
+    ratio = {name: np.asarray(level) / np.asarray(problem.noise[name]) for name, level in old.noise.items()}
+    factors = [np.full(weight.shape, ratio[name]) for name, weight in old.columns.items()]
+    factor = np.concatenate(factors, axis=1).reshape(-1)
+    factor = np.concatenate([factor, np.ones(old.rows - old.samples, factor.dtype)])
+    residual = on_device(np.asarray(search.state.residual) * factor)
+    jacobian = on_device(np.asarray(search.state.jacobian) * factor[:, None])
+    state = search.state._replace(residual=residual, jacobian=jacobian, cost=cost_of(old.loss, residual))
     return SearchResult(problem, state, search.iterations, search.ending)

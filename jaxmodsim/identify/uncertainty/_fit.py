@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._core.arguments import as_float, as_mapping, as_names, as_whole
+from ..._core.device import on_device
 from ..._core.parameters import Range
 from ..._core.progress import iteration_words, reported
 from ..._core.state_dependent import is_state_dependent
@@ -129,7 +130,7 @@ def fit(
         prepared, options = prepare(scene, records, free, settings), SearchOptions(rtol, limit, report)
         x, starts = run_initializers(initializer, prepared.problem, options)
         search = solve_with_noise(prepared.problem, x, options, prepared.given)
-    values = search.problem.free.values(search.problem.split(search.state.x)[0])
+    values = search.problem.at(search.state.x).values
     error = step_error(search)
     return result_of(
         search, prepared.records, prepared.windows, prepared.units, with_values(scene, values), error, starts
@@ -212,9 +213,9 @@ def fit_law(
         (),
         None,
         runs_of(several, windows),
-        {name: jnp.asarray(given.get(name, size)) for name in several[0].channels},
+        {name: on_device(given.get(name, size)) for name in several[0].channels},
         SquaredLoss() if loss is None else loss,
-        Prior(jnp.zeros(len(parameters.names)), jnp.zeros(len(parameters.names))),
+        Prior(*(on_device(np.zeros(len(parameters.names))) for _ in range(2))),
     )
     with reported(progress, "fit", iteration_words) as report:
         options = SearchOptions(rtol, as_whole(max_steps, name="max_steps"), report)
@@ -224,7 +225,7 @@ def fit_law(
     units = {
         name: allowed.unit + (per_load if allowed.unit.startswith("N") else "") for name, allowed in ranges.items()
     }
-    fitted = with_values(law, search.problem.free.values(search.state.x))
+    fitted = with_values(law, search.problem.at(search.state.x).values)
     return result_of(search, several, windows, units, fitted, None, starts)
 
 
@@ -251,8 +252,8 @@ def result_of(
     """The result of a search: estimate, diagnostics, provenance."""
     problem, state = search.problem, search.state
     names, at_start, values = list(problem.free.names), [], []
-    shared, own = problem.split(state.x)
-    values += [float(x) for x in problem.free.vector(shared)]
+    shared, own = np.split(np.asarray(state.x), [len(names)])
+    values += problem.at(state.x).vector.tolist()
     at_start += [float(problem.free.start[name]) for name in names]
     whole = len(set(windows.record)) == len(windows.record)
     if whole and problem.local:
@@ -261,7 +262,7 @@ def result_of(
             prefix = "" if len(records) == 1 else f"{record.name}/"
             names += [prefix + name for name in problem.local]
             at_start += base[i].tolist()
-            values += (base[i] + np.asarray(own[i])).tolist()
+            values += (base[i] + own.reshape(len(records), -1)[i]).tolist()
     covariance = covariance_of(problem, state, len(names))
     outputs, rmse = _stitched(search, records, windows)
     free = problem.free
@@ -269,9 +270,9 @@ def result_of(
         values=dict(zip(names, values, strict=True)),
         start=dict(zip(names, at_start, strict=True)),
         units={name: units.get(name, "") for name in names},
-        covariance=np.asarray(covariance.covariance),
-        white=np.asarray(covariance.white),
-        information=np.asarray(covariance.information),
+        covariance=covariance.covariance,
+        white=covariance.white,
+        information=covariance.information,
         logarithmic=tuple(name for name, kind in zip(free.names, free.kinds, strict=True) if kind == "log"),
         bounds=free.limits(shared) | {name: (-np.inf, np.inf) for name in names[len(free.names) :]},
     )
@@ -306,7 +307,7 @@ def searched_on(result: FitResult, x: Float[Array, " n"], options: SearchOptions
     search = solve_with_noise(before.problem, x, options, given)
     ending = continued(search.ending, times, where)
     search = replace(search, iterations=before.iterations + search.iterations, ending=ending)
-    model = with_values(provenance.model, search.problem.free.values(search.problem.split(search.state.x)[0]))
+    model = with_values(provenance.model, search.problem.at(search.state.x).values)
     error = None if result.diagnostics.step_error is None else step_error(search)
     units, starts = result.estimate.units, result.diagnostics.starts
     return result_of(search, provenance.records, before.windows, units, model, error, starts)

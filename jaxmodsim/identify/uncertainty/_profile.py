@@ -7,12 +7,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy import special  # scipy.stats takes most of a second to import
 
 from ..._core.arguments import as_whole
+from ..._core.device import on_device
 from ..estimate._problem import FitProblem, Prior
-from ..estimate._search import SearchOptions, SearchResult, start_search, step
+from ..estimate._search import SearchOptions, SearchResult, SearchState, cost_of, start_search, step, weighted_by
 from ._estimate import BLOCKS, ROUNDING, ParameterEstimate, floored_inverse
 from ._fit import searched_on
 from ._result import FitResult
@@ -133,7 +134,7 @@ class _Line:
         """Cost without the row that holds the parameter, and with what was known of it before."""
         rows = np.array(residual)
         rows[self.problem.samples + self.index] = self.known[1] * (value - self.known[0])
-        return float(self.problem.loss.cost(jnp.asarray(rows)))
+        return float(cost_of(self.problem.loss, on_device(rows)))
 
     def refit(self, u: float, guess: np.ndarray) -> _Point | None:
         """The best fit with the parameter at u; None where the model is not finite."""
@@ -141,13 +142,17 @@ class _Line:
         value = self.value(u)
         slope = 1.0 if self.floor is None else value - self.floor
         dtype = problem.prior.mean.dtype
-        weight = problem.prior.weight.at[i].set(_STIFF / (self.unit * slope))
-        held = eqx.tree_at(lambda p: p.prior, problem, Prior(problem.prior.mean.at[i].set(value), weight))
-        lower, upper, _ = problem.box
-        x = jnp.clip(jnp.asarray(guess, dtype), lower, upper)
-        values = {**problem.free.values(problem.split(x)[0]), self.name: jnp.asarray(value, dtype)}
-        x = x.at[: len(problem.free.names)].set(problem.free.coordinates(values))
-        rtol = jnp.asarray(min(_PRECISE * self.inflation / max(self.best, 1e-300), _LARGEST_RTOL), dtype)
+        mean, weight = np.array(problem.prior.mean), np.array(problem.prior.weight)
+        mean[i], weight[i] = value, _STIFF / (self.unit * slope)
+        held = eqx.tree_at(lambda p: p.prior, problem, Prior(on_device(mean), on_device(weight)))
+        size = len(problem.free.names)
+        here = problem.at(on_device(guess))
+        here = problem.free.at(np.clip(guess[:size], here.lower, here.upper))
+        x = np.array(guess, dtype)
+        x[:size] = problem.free.coordinates({**here.values, self.name: value})
+        x = on_device(x)
+        rtol = min(_PRECISE * self.inflation / max(self.best, 1e-300), _LARGEST_RTOL)
+        rtol = on_device(np.asarray(rtol, dtype))
         state = start_search(x, problem.rows)
         for _ in range(_ITERATIONS):
             state = step(held, state, rtol)
@@ -199,7 +204,7 @@ def profile(result: FitResult, name: str, *, points: int = 6, level: float = 0.9
     while isinstance(curve := _along(result, name, points, level, -_BELOW * threshold if left else -math.inf), _Point):
         times += 1
         before = _search_of(result)
-        x = jnp.asarray(curve.x, before.state.x.dtype)
+        x = on_device(curve.x)
         result = searched_on(result, x, SearchOptions(max_steps=left), times, f"from a better value of {name}")
         left = max(left - _search_of(result).iterations + before.iterations, 0)
     notes = list(curve.notes)
@@ -261,8 +266,8 @@ def _along(result: FitResult, name: str, points: int, level: float, least: float
 
 
 def _values(problem: FitProblem, x: np.ndarray) -> dict[str, np.ndarray]:
-    values = problem.free.values(problem.split(jnp.asarray(x))[0])
-    return {name: np.asarray(values[name]) for name in problem.free.names}
+    values = problem.at(on_device(x)).values
+    return {name: values[name] for name in problem.free.names}
 
 
 def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tuple[_Line, np.ndarray]:
@@ -271,12 +276,12 @@ def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tu
     i, size = problem.free.names.index(name), len(problem.free.names)
     value, error = estimate.values[name], estimate.errors[name]
     slopes = np.zeros(state.x.shape[0])
-    slopes[:size] = np.asarray(problem.free.slopes(state.x[:size]))[i]
-    sensitivity = _inverse_normal(problem, state.residual, state.jacobian) @ slopes
+    slopes[:size] = problem.at(state.x).slopes[i]
+    sensitivity = _inverse_normal(problem, state) @ slopes
     by_losses = float(slopes @ sensitivity)
-    residual, _ = problem.loss.weighted(state.residual[: problem.samples], state.jacobian[: problem.samples])
-    counted = float(np.sum(np.asarray(problem.weights) > 0))
-    variance = float(np.sum(np.asarray(residual) ** 2)) / max(counted - state.x.shape[0], 1)
+    residual, _ = weighted_by(problem.loss, state)
+    counted = float(np.sum(problem.weights > 0))
+    variance = float(np.sum(residual[: problem.samples] ** 2)) / max(counted - state.x.shape[0], 1)
     # A squared standard error costs error^2 / by_losses, which is the variance of white residuals. Where one block of
     # samples decides, the scatter over blocks may say next to nothing by chance, and half of that is the least.
     inflation = error**2 / by_losses if by_losses > 0 else math.nan
@@ -299,10 +304,10 @@ def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tu
     return line, sensitivity / by_losses * (1.0 if floor is None else size_of)
 
 
-def _inverse_normal(problem: FitProblem, residual: Array, jacobian: Array) -> np.ndarray:
+def _inverse_normal(problem: FitProblem, state: SearchState) -> np.ndarray:
     """Inverse of the normal matrix of the fit by x, with directions that nothing is known of made very long."""
-    _, weighted = problem.loss.weighted(residual, jacobian)
-    matrix = np.asarray(weighted, float).T @ np.asarray(weighted, float)
+    weighted = weighted_by(problem.loss, state)[1].astype(float)
+    matrix = weighted.T @ weighted
     scale = np.sqrt(np.diag(matrix))
     scale = np.where(scale > 0, scale, 1.0)
     size = np.outer(scale, scale)
