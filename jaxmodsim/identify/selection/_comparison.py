@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -324,7 +323,7 @@ def comparison_of(
         for channel in next(iter(searches.values())).problem.noise
     }
     fitted = {name: float(_root(_fitted(each), each.problem.loss, levels)) for name, each in searches.items()}
-    samples = int(jnp.sum(next(iter(searches.values())).problem.weights > 0))
+    samples = int(np.sum(next(iter(searches.values())).problem.weights > 0))
     effective = effective_samples(searches[min(fitted, key=lambda name: fitted[name])])
     losses = {name: _losses(each.held, searches[name].problem.loss, levels) for name, each in kept.items()}
     count = np.array([sum(len(x) for x in part.values()) for part in next(iter(kept.values())).held])
@@ -418,7 +417,7 @@ def _mean_root(parts: tuple[Part, ...], loss: AbstractLoss, levels: Mapping[str,
 
 def _root(part: Part, loss: AbstractLoss, levels: Mapping[str, float]) -> float:
     """Root of the mean loss: with squares, the root mean square."""
-    total = sum(float(jnp.sum(loss.rho(jnp.asarray((x / levels[name]) ** 2)))) for name, x in part.items())
+    total = sum(float(np.sum(np.asarray(loss.rho(on_device((x / levels[name]) ** 2))))) for name, x in part.items())
     scale = next(iter(levels.values())) if len(levels) == 1 else 1.0
     return scale * float(np.sqrt(total / sum(len(x) for x in part.values())))
 
