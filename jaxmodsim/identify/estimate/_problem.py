@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from ..._core.device import on_device
 from ..._core.parameters import Number, check_ranges, parameter
@@ -212,8 +212,8 @@ class FitProblem(eqx.Module):
         size = len(self.free.names)
         return x[:size], jnp.reshape(x[size:], (self.count, len(self.local)))
 
-    def at(self, x: Float[Array, " n"]) -> ParameterPoint:
-        """The parameters at an x that is known."""
+    def at(self, x: ArrayLike) -> ParameterPoint:
+        """The parameters at an x that is known, shape `[n]`."""
         return self.free.at(np.asarray(x)[: len(self.free.names)])
 
     def start_of(self, base: State | None, moved: Float[Array, " local"]) -> State | None:
