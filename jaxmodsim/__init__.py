@@ -1,6 +1,6 @@
 """Differentiable mechanics with friction: Lagrangians in, motion, figures and fits out.
 
-Scenes: Scene, AppliedForce, Friction, Signal, AbstractEffect; Constraint, VelocityConstraint, consistent.
+Scenes: Scene, AppliedForce, Friction, Signal, AbstractEffect; Constraint, VelocityConstraint, Contact, consistent.
 Mechanics: point_mass, rigid_body; Chart, Cylindrical, Spherical.
 Friction laws: Viscous, Curve, Coulomb, Stribeck, Dahl, LuGre, ElastoPlastic, MaxwellSlip, Armstrong; in the wrappers
     Regularized, DeadZone, Sign; with asymmetric, scaled_by.
@@ -70,6 +70,7 @@ if TYPE_CHECKING:
     from .identify import fit_law as fit_law
     from .mechanics import Chart as Chart
     from .mechanics import Constraint as Constraint
+    from .mechanics import Contact as Contact
     from .mechanics import Cylindrical as Cylindrical
     from .mechanics import Spherical as Spherical
     from .mechanics import VelocityConstraint as VelocityConstraint
@@ -132,7 +133,16 @@ _LATER = {
         "scaled_by",
     ),
     "identify": ("FitResult", "Record", "fit", "fit_law"),
-    "mechanics": ("Chart", "Constraint", "Cylindrical", "Spherical", "VelocityConstraint", "point_mass", "rigid_body"),
+    "mechanics": (
+        "Chart",
+        "Constraint",
+        "Contact",
+        "Cylindrical",
+        "Spherical",
+        "VelocityConstraint",
+        "point_mass",
+        "rigid_body",
+    ),
     "metrics": (),
     "plot": (),
     "problems": (),

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 
@@ -20,13 +21,38 @@ def magnitude(v: Float[Array, "..."]) -> Float[Array, ""]:
     return jnp.abs(v) if jnp.ndim(v) == 0 else safe_norm(v)
 
 
+@jax.custom_jvp
 def bounded_ratio(v: Float[Array, "..."], scale: Float[Array, ""]) -> Float[Array, "..."]:
     """`|v|/scale`, but no more than the fourth root of the largest number: powers up to four do not overflow.
 
     What falls with that ratio is long gone there; without the bound its derivative is zero times infinity.
     """
-    most = float(jnp.finfo(jnp.result_type(v)).max) ** 0.25
-    return jnp.minimum(jnp.abs(v), most * scale) / scale
+    return jnp.minimum(jnp.abs(v) / scale, _most(v))
+
+
+def _most(v: Float[Array, "..."]) -> float:
+    return float(jnp.finfo(jnp.result_type(v)).max) ** 0.25
+
+
+def _bounded_ratio_jvp(
+    primals: tuple[Array, Array], tangents: tuple[Array | SymbolicZero, Array | SymbolicZero]
+) -> tuple[Array, Array]:
+    """Derivatives of `|v|/scale`, zero beyond the bound.
+
+    Those of the minimum and of the absolute value as JAX has them took a fifth of the time of a step of LuGre's box in
+    batches.
+    """
+    (v, scale), (dv, dscale) = primals, tangents
+    ratio = bounded_ratio(v, scale)
+    inside, tangent = ratio < _most(v), jnp.zeros_like(ratio)
+    if not isinstance(dv, SymbolicZero):
+        tangent = tangent + jnp.where(inside, jnp.sign(v) / scale, 0.0) * dv
+    if not isinstance(dscale, SymbolicZero):
+        tangent = tangent - jnp.where(inside, ratio / scale, 0.0) * dscale
+    return ratio, tangent
+
+
+bounded_ratio.defjvp(_bounded_ratio_jvp, symbolic_zeros=True)
 
 
 def decay_mean(x: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -45,7 +45,7 @@ class Method:
 
 def default_methods(scene: Scene) -> dict[str, Method]:
     """Solvers that a careful user would try on the scene."""
-    if scene.event_driven:
+    if scene.mode_names:
         solvers = (Rodas5P(), dfx.Tsit5())
     elif any(effect.stiff for effect in scene.effects):
         solvers = (Rodas5P(), dfx.Kvaerno5(), dfx.Tsit5())

@@ -134,8 +134,8 @@ def converged(
     - `RuntimeError` if they disagree by more than `agreement`, or a run fails.
     """
     scene, stiff = in_type(scene, jnp.float64), any(effect.stiff for effect in scene.effects)
-    solvers: tuple[object, ...] = (Rodas5P(), dfx.Tsit5() if scene.event_driven or stiff else dfx.Dopri8())
-    if closed is not None and not scene.event_driven and not question.values:
+    solvers: tuple[object, ...] = (Rodas5P(), dfx.Tsit5() if scene.mode_names or stiff else dfx.Dopri8())
+    if closed is not None and not scene.mode_names and not question.values:
         solvers = solvers[:1]
     solutions = [_tight(scene, question, solver, rtol) for solver in solvers]
     names = [f"{type(solver).__name__} at rtol = {rtol:.0e}" for solver in solvers]

@@ -15,6 +15,8 @@ from ._constraints import linearize_constraints as linearize_constraints
 from ._constraints import parts as parts
 from ._constraints import project as project
 from ._constraints import rates as rates
+from ._contact import BoundContact as BoundContact
+from ._contact import Contact as Contact
 from ._lagrange import Lagrangian as Lagrangian
 from ._lagrange import MotionEquations as MotionEquations
 from ._lagrange import acceleration as acceleration

@@ -28,7 +28,8 @@ from .._core.semidefinite import solve_balanced
 from .._core.shapes import PerDof, Scalar
 
 
-def _at(value: Any) -> PositionFn | None:
+def as_at(value: Any) -> PositionFn | None:
+    """The position function of a constraint, or None."""
     return None if value is None else as_position_fn(value, name="Constraint at")
 
 
@@ -72,7 +73,50 @@ class AbstractConstraint(eqx.Module):
         """Magnitude [N] of the force at a multiplier of one, for a single equation."""
 
 
-class Constraint(AbstractConstraint):
+class AbstractPositionConstraint(AbstractConstraint):
+    """Something that is said about the position of a point, or about the coordinates themselves."""
+
+    if TYPE_CHECKING:
+        at = cast("PositionFn | None", None)
+    else:
+        at: AbstractVar[PositionFn | None]
+
+    @abc.abstractmethod
+    def value(self, t: Scalar, x: Float[Array, "..."], params: PyTree) -> Float[Array, "..."]:
+        """What is said of the position `x`, or of the coordinates where `at` is None; a number or shape `[m]`."""
+
+    def error(self, t: Scalar, q: PerDof, params: PyTree) -> Float[Array, " m"]:
+        """The value at the coordinates, shape `[m]`."""
+        return self._values(t, q if self.at is None else self.at(q, params), params)
+
+    def _values(self, t: Scalar, x: Float[Array, "..."], params: PyTree) -> Float[Array, " m"]:
+        return jnp.ravel(jnp.asarray(self.value(t, x, params), x.dtype))
+
+    def rate(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, " m"]:
+        """Its time derivative, shape `[m]`."""
+        return jax.jvp(lambda t, q: self.error(t, q, params), (t, q), (jnp.ones_like(t), qd))[1]
+
+    def check_value(self, fn: Callable[..., Any], what: str, q: PerDof, params: PyTree, name: str) -> None:
+        """Check that `fn`, which `what` calls as in "phi of Constraint", returns a number or a vector."""
+        place = {"q": q}
+        if self.at is not None:
+            place = {"x": traced(self.at, q=q, params=params, name=f"at of {what.split()[-1]} {name!r}")}
+        _check_vector(f"{what} {name!r}", fn, t=q[0], **place, params=params)
+
+    def force(self, t: Scalar, q: PerDof, params: PyTree, multiplier: Float[Array, " m"]) -> Float[Array, "..."] | None:
+        """`(d value/dx)^T lambda` [N], of the shape of `at`'s positions."""
+        if self.at is None:
+            return None
+        _, pull = jax.vjp(lambda x: self._values(t, x, params), self.at(q, params))
+        return pull(multiplier)[0]
+
+    def per_multiplier(self, t: Scalar, q: PerDof, params: PyTree) -> Scalar:
+        """Length of d value/dx; one where `at` is not given, so that the value must be a length along the normal."""
+        force = self.force(t, q, params, jnp.ones(1, q.dtype))
+        return jnp.ones_like(t) if force is None else safe_norm(jnp.ravel(force))
+
+
+class Constraint(AbstractPositionConstraint):
     """A holonomic constraint `phi(t, q, params) = 0`, kept by the force of its multiplier.
 
     The equations of motion are `M qdd = load + Q + J^T lambda` with `J = dphi/dq`: the multiplier is positive where it
@@ -107,43 +151,23 @@ class Constraint(AbstractConstraint):
     """
 
     phi: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Constraint phi"))
-    at: PositionFn | None = eqx.field(default=None, converter=_at)
+    at: PositionFn | None = eqx.field(default=None, converter=as_at)
     one_sided: bool = eqx.field(default=False, static=True, converter=partial(as_flag, name="Constraint one_sided"))
     stabilise: Number = parameter("stabilise", "1/s", lower=0.0, default=0.0)
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Constraint name"))
 
-    def error(self, t: Scalar, q: PerDof, params: PyTree) -> Float[Array, " m"]:
-        """phi, shape `[m]`."""
-        place = q if self.at is None else self.at(q, params)
-        return jnp.ravel(jnp.asarray(self.phi(t, place, params), q.dtype))
-
-    def rate(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, " m"]:
-        """Time derivative of phi, shape `[m]`."""
-        return jax.jvp(lambda t, q: self.error(t, q, params), (t, q), (jnp.ones_like(t), qd))[1]
+    def value(self, t: Scalar, x: Float[Array, "..."], params: PyTree) -> Float[Array, "..."]:
+        """Phi."""
+        return self.phi(t, x, params)
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check that phi is a number or a vector, and a number where the constraint is one-sided."""
-        place = {"q": q}
-        if self.at is not None:
-            place = {"x": traced(self.at, q=q, params=params, name=f"at of Constraint {name!r}")}
-        _check_vector(f"phi of Constraint {name!r}", self.phi, t=q[0], **place, params=params)
+        self.check_value(self.phi, "phi of Constraint", q, params, name)
         if self.one_sided and jax.eval_shape(self.error, q[0], q, params).shape != (1,):
             raise ValueError(
                 f"Constraint {name!r}: one_sided=True needs phi to be one number, but it returned several. Give each"
                 " contact a Constraint of its own."
             )
-
-    def force(self, t: Scalar, q: PerDof, params: PyTree, multiplier: Float[Array, " m"]) -> Float[Array, "..."] | None:
-        """`(dphi/dx)^T lambda` [N], of the shape of `at`'s positions."""
-        if self.at is None:
-            return None
-        _, pull = jax.vjp(lambda x: jnp.ravel(jnp.asarray(self.phi(t, x, params), q.dtype)), self.at(q, params))
-        return pull(multiplier)[0]
-
-    def per_multiplier(self, t: Scalar, q: PerDof, params: PyTree) -> Scalar:
-        """Length of dphi/dx; one where `at` is not given, so that phi must be a length along the normal."""
-        force = self.force(t, q, params, jnp.ones(1, q.dtype))
-        return jnp.ones_like(t) if force is None else safe_norm(jnp.ravel(force))
 
 
 class VelocityConstraint(AbstractConstraint):
@@ -246,7 +270,7 @@ def linearize_constraints(
     rows = _jacobian(rates(constraints, t, q, params), qd)
     w, bias = jax.jvp(along, (t, q), (jnp.ones_like(t), qd))
     for each, part in zip(constraints, parts(constraints, t, q, qd, params), strict=True):
-        error, rate = each.error(t, q, params), each.stabilise.astype(q.dtype)
+        error, rate = each.error(t, q, params), jnp.asarray(each.stabilise, q.dtype)
         damped = rate * w[part] if error is None else 2.0 * rate * w[part] + rate**2 * error
         bias = bias.at[part].add(damped)
     reach, matrix = _reach(rows, mass)

@@ -85,7 +85,8 @@ def _stick_intervals(trajectory: Trajectory) -> dict[str, list[tuple[float, floa
     scene, events = trajectory.scene, trajectory.events
     intervals: dict[str, list[tuple[float, float]]] = {}
     begin, end = float(trajectory.inputs.t0), float(trajectory.t_end)
-    for name, mode in trajectory.mode.items():
+    for name in scene.event_driven:
+        mode = trajectory.mode[name]
         own = np.asarray(events.effect) == scene.names.index(name)
         t, after = np.asarray(events.t)[own], np.asarray(events.after)[own]
         first = np.asarray(events.before)[own][0] if own.any() else int(mode[0])

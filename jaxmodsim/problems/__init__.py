@@ -21,5 +21,6 @@ from . import slipping_bristle as slipping_bristle
 from . import spherical_pendulum as spherical_pendulum
 from . import spiral_bead as spiral_bead
 from . import stick_slip_pendulum as stick_slip_pendulum
+from . import vibrating_table as vibrating_table
 from ._named import NamedProblem as NamedProblem
 from ._named import named_problems as named_problems

@@ -5,6 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from .._core.parameters import Number, check_ranges, parameter
+from ..mechanics import Contact
+from ..scene import Scene
 from ..solvers import EventState
 
 
@@ -55,6 +57,26 @@ class BouncingBall(eqx.Module):
     def hold(self, t: object, s: EventState, args: object, fired: Bool[Array, "1"]) -> EventState:
         """Come to rest on the floor."""
         return s._replace(y=jnp.zeros_like(s.y), mode=jnp.ones_like(s.mode))
+
+
+def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    return 0.5 * p["m"] * qd[0] ** 2 - p["m"] * p["g"] * q[0]
+
+
+def _height(t: Array, q: Array, p: dict[str, Array]) -> Array:
+    return q[0]
+
+
+def scene(*, e: ArrayLike, g: ArrayLike = 9.81, m: ArrayLike = 1.0) -> Scene:
+    """The ball at the height `q[0]` [m] over the floor, whose contact is called `floor`.
+
+    **Arguments:**
+
+    - `e`: coefficient of restitution, 0 to 1.
+    - `g`: gravity [m/s^2], > 0.
+    - `m`: mass [kg], > 0.
+    """
+    return Scene(_lagrangian, params={"m": m, "g": g}, constraints=(Contact(_height, restitution=e, name="floor"),))
 
 
 def bounces(n: int, *, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81) -> Float[Array, " n"]:

@@ -13,13 +13,14 @@ from .._core.index_check import traced
 from .._core.scalarise import in_scalars
 from .._core.shapes import PerDof, Scalar
 from ..mechanics import (
+    Constraint,
     LinearizedConstraints,
     linearize_constraints,
     motion_equations,
     parts,
 )
 from ._event_driven import (
-    Contact,
+    FrictionElements,
     FrictionForces,
     Loads,
     contact,
@@ -29,6 +30,7 @@ from ._event_driven import (
     stick_violation,
     stop_slip,
 )
+from ._impact import impact
 from ._karnopp import karnopp_forces
 from ._scene import Scene
 from .forces._effect import Action, Power
@@ -88,7 +90,7 @@ class Dynamics(NamedTuple):
     scene: Scene
     actions: dict[str, Action]
     qdd: PerDof
-    contact: Contact | None
+    contact: FrictionElements | None
     friction: FrictionForces | None
     constraints: LinearizedConstraints | None
     multipliers: Float[Array, " m"] | None
@@ -161,15 +163,50 @@ class Dynamics(NamedTuple):
     def guards(
         self, rest: Scalar, tolerances: tuple[Array, Array]
     ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
-        """Guards that are positive while the modes hold, and their tolerances; see `contact_guards`."""
-        assert self.friction is not None
-        return contact_guards(self.contacts, self.friction, self.mode, rest, tolerances)
+        """Guards that are positive while the modes hold, and their tolerances; see `contact_guards`.
+
+        Of a contact that is open the gap, of one that is closed its multiplier. A gap counts as closed only at `-rest`:
+        behind an impact, and where a contact opens, it begins from zero.
+        """
+        friction, gaps = self._elements, self._closed
+        guards, atol = [], []
+        if friction.size:
+            assert self.friction is not None
+            of_friction = contact_guards(self.contacts, self.friction, friction, rest, tolerances)
+            guards, atol = [of_friction[0]], [of_friction[1]]
+        if gaps.size:
+            assert self.multipliers is not None
+            pushes = by_constraint(self.scene, self.t, self.y, self.multipliers)
+            pushing = jnp.concatenate([pushes[name] for name in self.scene.contacts])
+            wide = [each.error(self.t, self.y.q, self.scene.params) for each in self.scene.contacts.values()]
+            guards.append(jnp.where(gaps > 0, pushing, jnp.concatenate(wide) + rest))
+            atol.append(jnp.where(gaps > 0, 0.0, tolerances[1]))
+        return jnp.concatenate(guards), jnp.concatenate(atol)
 
     def start(self, rest: Scalar) -> tuple[State, Float[Array, " n"]]:
         """State and modes to begin with: elements with no more slip velocity than `rest` or rounding stick if they can.
 
-        They do not depend on `mode`.
+        Contacts without gap and without velocity are closed. They do not depend on `mode`.
         """
+        t, y, scene = self.t, self.y, self.scene
+        if scene.contacts:
+            eps = 8.0 * float(jnp.finfo(y.q.dtype).eps)
+            closed = []
+            for each in scene.contacts.values():
+                gap, velocity = each.error(t, y.q, scene.params), each.rate(t, y.q, y.qd, scene.params)
+                size = jnp.max(jnp.abs(y.q)), jnp.max(jnp.abs(y.qd))
+                here = jnp.maximum(jnp.stack([gap, velocity])[:, 0], 0.0)
+                closed.append(jnp.all(here <= jnp.maximum(rest, eps * jnp.stack(size))) & (velocity[0] >= -rest))
+            modes = jnp.where(jnp.stack(closed), 1.0, jnp.zeros_like(y.q[0]))
+            if not scene.event_driven:
+                return y, modes
+            begun = jnp.concatenate([jnp.zeros_like(self._elements), modes])
+            state, mode = forward_dynamics(t, y, scene, begun)._start_friction(rest)
+            return state, jnp.concatenate([mode, modes])
+        return self._start_friction(rest)
+
+    def _start_friction(self, rest: Scalar) -> tuple[State, Float[Array, " n"]]:
+        """State, and modes of the friction elements, to begin with."""
         t, y, scene, contacts = self.t, self.y, self.scene, self.contacts
         elements = [*scene.event_driven.values()]
         speed = [jnp.sum(jnp.abs(e.direction(y.q, scene.params) * y.qd)) + jnp.abs(e.belt(t)) for e in elements]
@@ -177,25 +214,57 @@ class Dynamics(NamedTuple):
         v = contacts.v[: len(elements)]
         still = jnp.abs(v) <= jnp.maximum(rounding, rest)
         mode = next_modes(contacts, jnp.sign(v), still, jnp.zeros_like(still))
-        return self.stick(mode), mode
+        return self._stick(mode), mode
 
-    def switch(self, fired: Bool[Array, " guards"]) -> tuple[State, Float[Array, " n"]]:
-        """State and modes after the guards that `fired`."""
-        new = next_modes(self.contacts, self.mode, (self.mode == 0) | fired, fired & (self.mode == 0))
-        return self.stick(new), new
+    def switch(
+        self, fired: Bool[Array, " guards"], rest: Scalar, elastic: Bool[Array, ""] | bool = True
+    ) -> tuple[State, Float[Array, " n"]]:
+        """State and modes after the guards that `fired`; `elastic` is False where impacts have accumulated."""
+        n, mode = self._elements.size, self._elements
+        if not self._closed.size:
+            return self._switch_friction(fired, mode)
+        qd, closed = impact(self.t, self.y.q, self.y.qd, self.scene, self._closed, fired[n:], rest, elastic)
+        struck = self.y._replace(qd=qd)
+        if not n:
+            return struck, closed
+        after = forward_dynamics(self.t, struck, self.scene, jnp.concatenate([mode, closed]))
+        # An impact may turn a slip, and end a stick.
+        v = jax.lax.stop_gradient(after.contacts.v[:n])
+        turned = jnp.any(qd != self.y.qd) & (jnp.abs(v) > rest)
+        state, mode = after._switch_friction(fired[:n] & ~turned, jnp.where(turned, jnp.sign(v), mode))
+        return state, jnp.concatenate([mode, closed])
+
+    def _switch_friction(self, fired: Bool[Array, " n"], mode: Float[Array, " n"]) -> tuple[State, Float[Array, " n"]]:
+        new = next_modes(self.contacts, mode, (mode == 0) | fired, fired & (mode == 0))
+        return self._stick(new), new
 
     def stick(self, mode: Modes) -> State:
         """State with the slip velocity of elements that stick in `mode`, which drifts, set to zero."""
+        return self._stick(mode[: self._elements.size])
+
+    def _stick(self, mode: Float[Array, " n"]) -> State:
         return self.y._replace(qd=stop_slip(self.contacts, self.y.qd, mode == 0))
+
+    @property
+    def _elements(self) -> Float[Array, " n"]:
+        """Modes of the friction elements."""
+        return self.mode[: len(self.scene.event_driven)]
+
+    @property
+    def _closed(self) -> Float[Array, " n"]:
+        """Modes of the contacts."""
+        return self.mode[len(self.scene.event_driven) :]
 
     @property
     def stick_violation(self) -> Float[Array, " n"]:
         """By how much the force of each sticking element exceeds its limit, in limits; 0 in slip."""
+        if not self._elements.size:
+            return self._elements
         assert self.friction is not None
-        return stick_violation(self.friction, self.mode)
+        return stick_violation(self.friction, self._elements)
 
     @property
-    def contacts(self) -> Contact:
+    def contacts(self) -> FrictionElements:
         """`contact` of a scene that has it."""
         assert self.contact is not None
         return self.contact
@@ -238,7 +307,9 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     params = scene.params
     equations = motion_equations(scene.lagrangian, t, q, qd, params)
     linearized = (
-        linearize_constraints(scene.constraints, t, q, qd, params, equations.mass) if scene.constraints else None
+        linearize_constraints(scene.bind_modes(mode).constraints, t, q, qd, params, equations.mass)
+        if scene.constraints
+        else None
     )
     mobility = Mobility(factor_positive_definite(equations.mass), linearized)
     actions, rhs = {}, equations.load
@@ -273,7 +344,8 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
 
     floor = mobility.least if linearized is not None else None
     contacts = contact([*scene.event_driven.values()], pushes, mobility.respond, floor, loads, t, q, qd, params, qdd)
-    settled = solve_friction_forces(contacts, jnp.zeros(0, q.dtype) if mode is None else mode)
+    modes = jnp.zeros(0, q.dtype) if mode is None else mode[: len(scene.event_driven)]
+    settled = solve_friction_forces(contacts, modes)
     for i, (name, effect) in enumerate(scene.event_driven.items()):
         actions[name] = Action(effect.apply_force(q, settled.force[i], params), settled.force[i])
     for i, name in enumerate(scene.reaction_loaded, start=len(scene.event_driven)):
@@ -316,7 +388,8 @@ def by_constraint(scene: Scene, t: Array, y: State, values: Array) -> dict[str, 
 
 
 def _margins(scene: Scene, t: Array, y: State, multipliers: Any, unique: Array | None) -> Array | None:
-    pushing = [name for name, each in zip(scene.constraint_names, scene.constraints, strict=True) if each.one_sided]
+    pairs = zip(scene.constraint_names, scene.constraints, strict=True)
+    pushing = [name for name, each in pairs if isinstance(each, Constraint) and each.one_sided]
     margins = []
     if pushing:
         of_each = by_constraint(scene, t, y, multipliers)

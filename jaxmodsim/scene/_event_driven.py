@@ -43,7 +43,7 @@ class Loads(NamedTuple):
     pulls: Float[Array, " k"]
 
 
-class Contact(NamedTuple):
+class FrictionElements(NamedTuple):
     """The friction elements at one state, n of them; those without a mode come last.
 
     - `v`: slip velocities [m/s]; zero for elements without a mode.
@@ -92,7 +92,7 @@ def contact(
     qd: PerDof,
     params: object,
     qdd: PerDof,
-) -> Contact:
+) -> FrictionElements:
     """What the elements see at one state, where the accelerations without them are `qdd`.
 
     **Arguments:**
@@ -121,7 +121,7 @@ def contact(
         # Where constraints leave a direction no mobility (a slider at its dead centre), no force holds it. Rounding may
         # leave a mobility of zero or less, which would look as if none were needed.
         coupling = coupling + jnp.diag(jnp.stack([floor(row) for row in rows]))
-    return Contact(
+    return FrictionElements(
         jnp.stack([*(v for v, _ in slip), *(zero for _ in leaning)]),
         jnp.stack([*(a for _, a in slip), *(zero for _ in leaning)]),
         coupling,
@@ -134,7 +134,7 @@ def contact(
     )
 
 
-def solve_friction_forces(contacts: Contact, mode: Float[Array, " modes"]) -> FrictionForces:
+def solve_friction_forces(contacts: FrictionElements, mode: Float[Array, " modes"]) -> FrictionForces:
     """Friction forces [N] in the modes given: the slip force, or the multiplier of stick."""
     extra = contacts.v.shape[0] - mode.shape[0]
     mode = jnp.concatenate([mode, jnp.ones(extra, mode.dtype)]) if extra else mode
@@ -200,7 +200,9 @@ def _determinant(rows: list[list[Array]]) -> Array:
     return jnp.sum(jnp.stack([s * a * m for s, a, m in zip(signs, rows[0], minors, strict=True)]))
 
 
-def _multipliers(contacts: Contact, drive: Float[Array, " n"], sticks: Bool[Array, " n"]) -> Float[Array, " n"]:
+def _multipliers(
+    contacts: FrictionElements, drive: Float[Array, " n"], sticks: Bool[Array, " n"]
+) -> Float[Array, " n"]:
     """Forces of the sticking elements that take their slip accelerations away; others get zero.
 
     Where sticking elements are redundant (two on one coordinate), the equations leave the share of each open. The one
@@ -214,7 +216,7 @@ def _multipliers(contacts: Contact, drive: Float[Array, " n"], sticks: Bool[Arra
 
 
 def contact_guards(
-    contacts: Contact,
+    contacts: FrictionElements,
     forces: FrictionForces,
     mode: Float[Array, " modes"],
     rest: Scalar,
@@ -248,7 +250,10 @@ def stick_violation(forces: FrictionForces, mode: Float[Array, " modes"]) -> Flo
 
 
 def next_modes(
-    contacts: Contact, mode: Float[Array, " modes"], still: Bool[Array, " modes"], at_limit: Bool[Array, " modes"]
+    contacts: FrictionElements,
+    mode: Float[Array, " modes"],
+    still: Bool[Array, " modes"],
+    at_limit: Bool[Array, " modes"],
 ) -> Float[Array, " modes"]:
     """Modes after an instant at which the elements `still` have no slip velocity; the others go on as they are.
 
@@ -289,7 +294,7 @@ def next_modes(
     return settle(jnp.asarray(3), mode) if n == 1 else jax.lax.fori_loop(0, 4 * n, settle, mode)
 
 
-def stop_slip(contacts: Contact, qd: PerDof, sticks: Bool[Array, " modes"]) -> PerDof:
+def stop_slip(contacts: FrictionElements, qd: PerDof, sticks: Bool[Array, " modes"]) -> PerDof:
     """Velocities with the slip of the sticking elements taken away, by the smallest impulses that do."""
     sticks = jnp.concatenate([sticks, jnp.zeros(contacts.v.shape[0] - sticks.shape[0], bool)])
     impulse = _multipliers(contacts, jnp.where(sticks, contacts.v, 0.0), sticks)

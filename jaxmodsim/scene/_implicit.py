@@ -43,8 +43,13 @@ def check_step(scene: Scene) -> None:
 
     **Raises:**
 
-    - `ValueError` naming the friction element that it cannot step, and what to do.
+    - `ValueError` naming the friction element or the contact that it cannot step, and what to do.
     """
+    if scene.contacts:
+        raise ValueError(
+            f"ImplicitFriction takes no events, which {', '.join(scene.contacts)} opens and closes by: use another"
+            " solver."
+        )
     for name, effect in zip(scene.names, scene.effects, strict=True):
         if not isinstance(effect, Friction):
             continue

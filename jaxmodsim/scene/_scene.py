@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
@@ -13,7 +14,7 @@ from .._core.functions import as_function
 from .._core.parameters import as_real
 from .._core.readable import AbstractReadable
 from .._core.shapes import PerDof, Scalar
-from ..mechanics import AbstractConstraint, Lagrangian
+from ..mechanics import AbstractConstraint, BoundContact, Constraint, Contact, Lagrangian
 from ._coordinates import as_coordinates, read_label
 from ._signal import Signal, signals_at, signals_from, signals_of
 from .forces._effect import AbstractEffect
@@ -59,7 +60,7 @@ def _constraints(constraints: Any) -> tuple[AbstractConstraint, ...]:
     for constraint in constraints:
         if not isinstance(constraint, AbstractConstraint):
             raise ValueError(
-                f"constraints must hold Constraint or VelocityConstraint objects, but it holds {constraint!r}."
+                f"constraints must hold Constraint, VelocityConstraint or Contact objects, but it holds {constraint!r}."
             )
     return tuple(constraints)
 
@@ -94,7 +95,8 @@ class Scene(AbstractReadable, eqx.Module):
     - `params`: pytree of real numbers, arrays or `Signal`s for the Lagrangian and the applied forces. Integers
       become floating; what is no number (sizes, options) belongs into the functions.
     - `effects`: tuple of `AppliedForce` and `Friction`.
-    - `constraints`: tuple of `Constraint` and `VelocityConstraint`, for coordinates that are not independent.
+    - `constraints`: tuple of `Constraint` and `VelocityConstraint`, for coordinates that are not independent, and of
+      `Contact`.
     - `coordinates`: names of the coordinates with their units, such as `("x [m]", "phi [rad]")`, for messages, tables
       and figures. In functions and names of what is observed they remain `q[0]`, `q[1]`.
 
@@ -160,7 +162,7 @@ class Scene(AbstractReadable, eqx.Module):
     @property
     def constraint_names(self) -> tuple[str, ...]:
         """Name of each constraint, made as those of effects."""
-        return _names(self.constraints, lambda _: "constraint")
+        return _names(self.constraints, lambda each: "contact" if isinstance(each, Contact) else "constraint")
 
     @property
     def event_driven(self) -> dict[str, Friction]:
@@ -170,6 +172,22 @@ class Scene(AbstractReadable, eqx.Module):
             for name, effect in zip(self.names, self.effects, strict=True)
             if isinstance(effect, Friction) and effect.event_driven
         }
+
+    @property
+    def contacts(self) -> dict[str, Contact]:
+        """The contacts that open and close, by name, in the order of their modes."""
+        pairs = zip(self.constraint_names, self.constraints, strict=True)
+        return {name: each for name, each in pairs if isinstance(each, Contact)}
+
+    @property
+    def bilateral(self) -> tuple[AbstractConstraint, ...]:
+        """The other constraints, which hold at all times."""
+        return tuple(each for each in self.constraints if not isinstance(each, Contact))
+
+    @property
+    def mode_names(self) -> tuple[str, ...]:
+        """What has a mode, in the order of the modes: friction elements that run by events, then contacts."""
+        return (*self.event_driven, *self.contacts)
 
     @property
     def stick_drifts(self) -> bool:
@@ -198,7 +216,7 @@ class Scene(AbstractReadable, eqx.Module):
             f"The constraint {name!r} can only push, and would have to pull: the contact opens. The motion from there"
             " on is that of a scene without it."
             for name, each in zip(self.constraint_names, self.constraints, strict=True)
-            if each.one_sided
+            if isinstance(each, Constraint) and each.one_sided
         ]
         if self.loaded:
             words.append(
@@ -215,6 +233,27 @@ class Scene(AbstractReadable, eqx.Module):
         driven = signals_at(self.params, t, linear=False)
         lagrangian = _Driven(self.lagrangian, driven) if signals_of(driven) else self.lagrangian
         return self._with(lagrangian=lagrangian, params=signals_at(driven, t))
+
+    def bind_modes(self, mode: Array | None) -> "Scene":
+        """The scene with each contact as the constraint that it is in its mode; itself without contacts.
+
+        `mode` holds those of `mode_names`.
+
+        **Raises:**
+
+        - `ValueError` for contacts without modes.
+        """
+        if not self.contacts:
+            return self
+        if mode is None:
+            raise ValueError(
+                f"{', '.join(self.contacts)}: contacts open and close by events, so that position and velocity do not"
+                " tell the forces: run the scene by jaxmodsim.simulate."
+            )
+        modes = iter(jax.lax.stop_gradient(mode[len(self.event_driven) :]))
+        return self._with(
+            constraints=tuple(BoundContact(x, next(modes)) if isinstance(x, Contact) else x for x in self.constraints)
+        )
 
     def step_from(self, t: Scalar) -> "Scene":
         """The scene for a step from `t` up to the next sample: signals are what they are there, without jumps."""

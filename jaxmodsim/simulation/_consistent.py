@@ -63,7 +63,7 @@ def consistent(
     if not isinstance(hold, list | tuple | range) or not all(isinstance(i, int) and 0 <= i < dof for i in hold):
         raise ValueError(f"hold must be indices of coordinates, 0 to {dof - 1}, as in (0,), but {hold!r} was given.")
     check_scene(scene, State(q, qd, scene.initial_state(q)))
-    if not scene.constraints:
+    if not scene.bilateral:
         return q, qd
     free = jnp.asarray([float(i not in hold) for i in range(dof)], kind)
     q, qd, off = _find(scene, t, q, qd, free)
@@ -83,7 +83,7 @@ def consistent(
 def _find(scene: Scene, t: Array, q: Array, qd: Array, free: Array) -> tuple[Array, Array, tuple[Array, Array]]:
     """Position, velocity, and by how much the constraints are still violated."""
     scene = scene.bind_time(t)
-    constraints, params = scene.constraints, scene.params
+    constraints, params = scene.bilateral, scene.params
     mass = motion_equations(scene.lagrangian, t, q, qd, params).mass
     inverse = factor_positive_definite(mass)(jnp.eye(q.shape[0], dtype=q.dtype))
     inverse = inverse * free[:, None] * free[None, :]

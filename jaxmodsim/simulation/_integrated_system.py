@@ -39,8 +39,9 @@ def at_time(fn: _Function) -> _Function:
     return cast(_Function, bound)
 
 
-def project(t: Float[Array, ""], y: State, scene: Scene) -> State:
-    """State moved onto the constraints; the scene is that of time `t`."""
+def project(t: Float[Array, ""], y: State, scene: Scene, mode: Array | None) -> State:
+    """State moved onto the constraints of these modes; the scene is that of time `t`."""
+    scene = scene.bind_modes(mode)
     mass = motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass
     q, qd = projected(scene.constraints, t, y.q, y.qd, scene.params, mass)
     return y._replace(q=q, qd=qd)
@@ -152,6 +153,8 @@ class RunFunctions(eqx.Module):
     # What drifts with the error of integration and is put right after every step: off the constraints, out of stick.
     projects: bool = eqx.field(static=True)
     sticks: bool = eqx.field(static=True)
+    # Whether chatter is held in stick.
+    holds: bool = eqx.field(static=True)
 
     def plain_derivative(self, t: Any, y: PyTree, scene: Scene, mode: Array | None = None) -> PyTree:
         """Right-hand side in these modes; None in a run without."""
@@ -175,16 +178,25 @@ class RunFunctions(eqx.Module):
 
     @at_time
     def reset(self, t: Array, s: EventState, scene: Scene, fired: Array) -> EventState:
-        """Change of modes; the state as it is where none changes."""
-        state = self.system.state(t, s.y, scene)
-        state, mode = from_dynamics(lambda d: d.switch(fired), t, state, scene, s.mode)
+        """Change of modes, and impacts; the state as it is where there is neither."""
+        return self._switch(t, s, scene, fired, True)
+
+    def _switch(self, t: Array, s: EventState, scene: Scene, fired: Array, elastic: bool) -> EventState:
+        before = self.system.state(t, s.y, scene)
+        state, mode = from_dynamics(lambda d: d.switch(fired, self.rest, elastic), t, before, scene, s.mode)
         after = self.system.replace(t, s.y, state, scene)
-        changed = jnp.any(mode != s.mode)
+        changed = jnp.any(mode != s.mode) | jnp.any(state.qd != before.qd)
         return s._replace(y=jtu.tree_map(lambda a, b: jnp.where(changed, a, b), after, s.y), mode=mode)
 
     @at_time
     def on_zeno(self, t: Array, s: EventState, scene: Scene, fired: Array) -> EventState:
-        """Stick of what chatters."""
+        """Stick of what chatters, where that is to be held, and closed contacts where impacts accumulate."""
+        n = len(scene.event_driven)
+        if scene.contacts:
+            s = self._switch(t, s, scene, fired if self.holds else fired.at[:n].set(False), False)
+        if not (n and self.holds):
+            return s
+        fired = jnp.concatenate([fired[:n], jnp.zeros_like(fired[n:])])
         return self._stick(t, s._replace(mode=jnp.where(fired, 0.0, s.mode)), scene)
 
     def _stick(self, t: Array, s: EventState, scene: Scene) -> EventState:
@@ -192,22 +204,22 @@ class RunFunctions(eqx.Module):
         return s._replace(y=self.system.replace(t, s.y, state, scene))
 
     @at_time
-    def project(self, t: Array, y: PyTree, scene: Scene) -> PyTree:
+    def project(self, t: Array, y: PyTree, scene: Scene, mode: Array | None = None) -> PyTree:
         """Back onto the constraints."""
         if not self.projects:
             return y
-        return self.system.replace(t, y, project(t, self.system.state(t, y, scene), scene), scene)
+        return self.system.replace(t, y, project(t, self.system.state(t, y, scene), scene, mode), scene)
 
     @at_time
     def project_and_stick(self, t: Array, s: EventState, scene: Scene) -> EventState:
         """Back onto the constraints, and into stick."""
-        s = s._replace(y=self.project(t, s.y, scene))
+        s = s._replace(y=self.project(t, s.y, scene, s.mode))
         return self._stick(t, s, scene) if self.sticks else s
 
     @at_time
     def keep(self, t: Array, y: PyTree, scene: Scene, mode: Array | None) -> tuple[PyTree, Instant | None]:
         """What is kept of a saved state, which comes from dense output and obeys nothing; in a run with modes more."""
-        y = self.project(t, y, scene)
+        y = self.project(t, y, scene, mode)
         if mode is None:
             return self.system.result(t, y, scene), None
         state = self.system.state(t, y, scene)

@@ -30,8 +30,9 @@ from ..solvers import ACCUMULATION, TOO_MANY
     NOT_QUADRATIC,
     TOO_NARROW,
     ILL_POSED,
+    PENETRATES,
     FIRST_MASS,
-) = range(12)
+) = range(13)
 
 # Correction of the initial state, relative to its size or to one, below which it is meant to obey the constraints.
 _CONSISTENT = 1e-6
@@ -59,6 +60,7 @@ _GENERAL = (
     " sees, and a break-away comes late. Pass atol no larger than the width.",
     "The times or tolerances do not make a run: t1 must not be before t0, ts must increase within [t0, t1], dt and"
     " dtmax must be positive, rtol and atol not negative and not both zero, and all of them finite.",
+    "A contact is violated at t0: its gap is negative. Begin where all gaps are zero or positive.",
 )
 
 
@@ -73,7 +75,7 @@ class _Offsets(NamedTuple):
 def _offsets(scene: Scene, dof: int) -> _Offsets:
     ranges = FIRST_MASS + dof
     chatter = ranges + sum(len(range_checks(module)) for _, module in modules_of(scene))
-    return _Offsets(ranges, chatter, chatter + len(scene.event_driven))
+    return _Offsets(ranges, chatter, chatter + len(scene.mode_names))
 
 
 class Ending(NamedTuple):
@@ -130,7 +132,7 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
     chatter = tuple(
         f"The mode changes of {name!r} accumulate: chatter between stick and slip. Pass hold_chatter=True to hold it in"
         " stick from there on."
-        for name in scene.event_driven
+        for name in scene.mode_names
     )
     return _GENERAL + mass + ranges + chatter + scene.checks
 
@@ -159,8 +161,11 @@ def start_code(
         code = _blame_margins(code, forward_dynamics(t, y, now, mode).validity_margins, offsets.checks, True)
     code = _blame_mass(code, _pivots(now, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
     if scene.constraints:
-        off, turned = constraint_residual(scene.constraints, t, y.q, y.qd, now.params)
+        off, turned = constraint_residual(now.bind_modes(mode).constraints, t, y.q, y.qd, now.params)
         code = jnp.where((off <= _CONSISTENT) & (turned <= _CONSISTENT), code, INCONSISTENT)
+    for contact in scene.contacts.values():
+        shallow = contact.error(t, y.q, now.params)[0] >= -_CONSISTENT * jnp.maximum(1.0, jnp.max(jnp.abs(y.q)))
+        code = jnp.where(shallow, code, PENETRATES)
     widths = [module.width for _, module in modules_of(scene) if isinstance(module, Regularized)]
     if atol is not None and widths:
         code = jnp.where(atol <= jnp.min(jnp.stack([jnp.min(width) for width in widths])), code, TOO_NARROW)
@@ -202,7 +207,7 @@ def end_code(
             margins = forward_dynamics(t_look, y_look, scene, mode).validity_margins
             code = _blame_margins(code, margins, offsets.checks, early)
     if scene.constraints:
-        kept = constraint_residual(scene.constraints, t, y.q, y.qd, now.params)[0] <= _KEPT
+        kept = constraint_residual(now.bind_modes(mode).constraints, t, y.q, y.qd, now.params)[0] <= _KEPT
         code = jnp.where(kept | ~finite, code, DRIFTED)
     eps = float(jnp.finfo(y.q.dtype).eps)
     # A run that stopped in front of a singular mass matrix cannot have come closer than its smallest step.

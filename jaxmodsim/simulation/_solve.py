@@ -115,7 +115,7 @@ def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolv
     Jacobian costs more than that, most of all in compile time.
     """
     stiff = any(effect.stiff for effect in scene.effects)
-    return Rodas5P(pivot=fixed_step) if stiff or (scene.event_driven and dof == 1) else dfx.Tsit5()
+    return Rodas5P(pivot=fixed_step) if stiff or (scene.mode_names and dof == 1) else dfx.Tsit5()
 
 
 def _structured(inputs: RunInputs) -> bool:
@@ -143,7 +143,7 @@ def _error_control(inputs: RunInputs, solver: dfx.AbstractSolver) -> dfx.Abstrac
     if inputs.dt is not None:
         return FiniteSteps()
     (rtol, atol), dtmin = _tolerances(inputs), _shortest(inputs)
-    p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not inputs.scene.event_driven else _GAINS
+    p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not inputs.scene.mode_names else _GAINS
     return dfx.PIDController(rtol, atol, pcoeff=p, icoeff=i, dtmin=dtmin, dtmax=inputs.dtmax, force_dtmin=False)
 
 
@@ -157,12 +157,12 @@ def _solver(
     if signals_of(scene.params):
         freeze_args = _step_from
         samples = SampledJumps(freeze_args, sample_times(scene.params, linear=False))
-    if scene.event_driven:
+    if scene.mode_names:
         return EventSolver(
             solver,
             functions.guards,
             functions.reset,
-            on_zeno=functions.on_zeno if options.hold_chatter else None,
+            on_zeno=functions.on_zeno if options.hold_chatter or scene.contacts else None,
             project=functions.project_and_stick if functions.projects or functions.sticks else None,
             samples=samples,
             rtol=functions.tolerances[0],
@@ -182,7 +182,7 @@ def _step_from(t: Array, scene: Scene) -> Scene:
 def _controller(inputs: RunInputs, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
     controller = _error_control(inputs, solver)
     times = sample_times(inputs.scene.params, linear=True)
-    if inputs.scene.event_driven:
+    if inputs.scene.mode_names:
         return EventController(controller, times, direction=1)
     return controller if times is None else StepsTo(controller, times)
 
@@ -227,6 +227,7 @@ def _functions(inputs: RunInputs, options: RunOptions, audited: bool) -> RunFunc
         (inputs.rtol, inputs.atol),
         bool(scene.constraints) and options.project,
         scene.stick_drifts,
+        options.hold_chatter,
     )
 
 
@@ -236,12 +237,12 @@ def _start(inputs: RunInputs, functions: RunFunctions, order: Any) -> _Start:
     Everything is evaluated in a loop, which is compiled once: modes to begin with, the rate, and another one for the
     first step. In reverse mode it is evaluated again.
     """
-    scene, t0, exact = inputs.scene, inputs.t0, bool(inputs.scene.event_driven)
+    scene, t0, exact = inputs.scene, inputs.t0, bool(inputs.scene.mode_names)
     initial = initial_state(inputs)
     check_scene(scene, initial)
+    mode = jnp.zeros(len(scene.mode_names), inputs.q0.dtype) if exact else None
     if functions.projects:
-        initial = project(t0, initial, scene.bind_time(t0))
-    mode = jnp.zeros(len(scene.event_driven), inputs.q0.dtype) if exact else None
+        initial = project(t0, initial, scene.bind_time(t0), mode)
     y0 = functions.system.start(t0, initial, scene, mode)
     tolerances = _tolerances(inputs)
 
@@ -280,7 +281,7 @@ def _integrate(
     inputs: RunInputs, options: RunOptions, audited: bool, log: int | None
 ) -> tuple[RunOutput, EventLog | None]:
     """Run diffrax; with modes only where the scene has them, with a log of that many events where one is wanted."""
-    scene, exact = inputs.scene, bool(inputs.scene.event_driven)
+    scene, exact = inputs.scene, bool(inputs.scene.mode_names)
     functions = _functions(inputs, options, audited)
     method, adjoint = _plugins(inputs, options, functions.system)
     solver = _solver(method, functions, scene, options, log)

@@ -323,7 +323,7 @@ def _solvers(inputs: RunInputs, options: RunOptions) -> tuple[tuple[dfx.Abstract
     default = default_solver(inputs.scene, inputs.q0.shape[0], False)
     stiff = any(effect.stiff for effect in inputs.scene.effects)
     other = dfx.Kvaerno5() if stiff else dfx.Dopri8()
-    bounds = bool(inputs.scene.event_driven) and inputs.dtmax is None
+    bounds = bool(inputs.scene.mode_names) and inputs.dtmax is None
     if options.solver is None:
         bounded = (other,) if bounds else ()
         return (default, other, *bounded), (0,) if stiff else (0, 1)

@@ -36,11 +36,13 @@ _Value = TypeVar("_Value")
 class Events(NamedTuple):
     """Mode changes along a run in order of time, padded with infinity or -1; in words: `Trajectory.mode_changes`.
 
-    Only set-valued laws that run exactly change modes. Elements that do so at the same instant have one entry each.
+    Set-valued laws that run exactly and contacts change modes. Elements that do so at the same instant have one entry
+    each. An impact is an entry of its contact, from open to open where the gap opens again.
 
     - `t`: time [s], differentiable.
-    - `effect`: index of the effect in the scene.
-    - `before`, `after`: mode before and after: 0 in stick, else the sign of the slip velocity.
+    - `effect`: index of the effect in the scene; contacts follow the effects, in the order of the constraints.
+    - `before`, `after`: mode before and after: of friction 0 in stick, else the sign of the slip velocity; of a contact
+      0 where it is open, 1 where it is closed.
     """
 
     t: Float[Array, " events"]
@@ -50,10 +52,11 @@ class Events(NamedTuple):
 
 
 class ModeChange(NamedTuple):
-    """A change of the mode of a friction element.
+    """A change of the mode of a friction element or a contact, or an impact.
 
     - `t`: time [s]; `effect`: name of the element.
-    - `before`, `after`: `"stick"`, or `"forward"` or `"backward"` for positive and negative slip.
+    - `before`, `after`: `"stick"`, or `"forward"` or `"backward"` for positive and negative slip; of a contact `"open"`
+      or `"closed"`.
     """
 
     t: float
@@ -62,7 +65,7 @@ class ModeChange(NamedTuple):
     after: str
 
 
-_MODES = {0: "stick", 1: "forward", -1: "backward"}
+_MODES, _CONTACT_MODES = {0: "stick", 1: "forward", -1: "backward"}, {0: "open", 1: "closed"}
 
 
 class Energy(NamedTuple):
@@ -167,10 +170,13 @@ class Trajectory(AbstractReadable):
 
     @property
     def mode(self) -> dict[str, Array]:
-        """Mode of each friction element that runs by events, by effect name, shape `[time]`: 0 in stick, else +-1."""
+        """Mode of each friction element that runs by events and of each contact, by name, shape `[time]`.
+
+        Of friction 0 in stick, else +-1; of a contact 0 while it is open, 1 while it is closed.
+        """
         if self.modes is None:
             return {}
-        return {name: self.modes[..., i] for i, name in enumerate(self.scene.event_driven)}
+        return {name: self.modes[..., i] for i, name in enumerate(self.scene.mode_names)}
 
     @property
     def events(self) -> Events:
@@ -184,10 +190,12 @@ class Trajectory(AbstractReadable):
     @property
     def mode_changes(self) -> tuple[ModeChange, ...]:
         """`events` in words, as many as there are; outside of `jax.jit`."""
-        names, columns = self.scene.names, [x.tolist() for x in map(np.asarray, self.events)]
+        columns = [x.tolist() for x in map(np.asarray, self.events)]
+        names, effects = (*self.scene.names, *self.scene.constraint_names), len(self.scene.names)
+        words = [_MODES if effect < effects else _CONTACT_MODES for effect in columns[1]]
         return tuple(
-            ModeChange(t, names[effect], _MODES[before], _MODES[after])
-            for t, effect, before, after in zip(*columns, strict=True)
+            ModeChange(t, names[effect], word[before], word[after])
+            for t, effect, before, after, word in zip(*columns, words, strict=True)
             if t < math.inf
         )
 
@@ -226,13 +234,17 @@ class Trajectory(AbstractReadable):
 
     @property
     def energy(self) -> Energy:
-        """Energies and their balance along the run; needs the run of `ledger`."""
+        """Energies and their balance along the run; needs the run of `ledger`, and with contacts that of `events`.
+
+        What is lost in impacts is dissipated.
+        """
         self._one_run("energy")
         book, zero = self.ledger, jnp.zeros_like(self.t)
         stored, supplied, dissipated = (
             sum(each.values(), zero) for each in (book.stored, book.supplied, book.dissipated)
         )
-        return Energy(book.kinetic, book.potential, stored, supplied, dissipated, book.balance)
+        lost = self.event_losses if self.scene.contacts else zero
+        return Energy(book.kinetic, book.potential, stored, supplied, dissipated + lost, book.balance + lost)
 
     @property
     def columns(self) -> Columns:
@@ -343,8 +355,11 @@ def _reached(t: Array, tree: PyTree) -> PyTree:
 def _events(scene: Scene, log: EventLog) -> Events:
     """One entry for each element that changed its mode, from a log with one for each instant."""
     before, after = log.before[1], log.after[1]
-    indices = jnp.asarray([scene.names.index(name) for name in scene.event_driven])
-    changed = jnp.ravel((before != after) & jnp.isfinite(log.t)[:, None])
+    names = (*scene.names, *scene.constraint_names)
+    indices = jnp.asarray([names.index(name) for name in scene.mode_names])
+    # What happens to contacts that fire is an event, be it an impact that leaves them open.
+    strikes = jnp.asarray([[name in scene.contacts for name in scene.mode_names]]) & (log.fired > 0.5)
+    changed = jnp.ravel(((before != after) | strikes) & jnp.isfinite(log.t)[:, None])
     order = jnp.argsort(~changed, stable=True)
 
     def column(x: Array, filler: float | int) -> Array:

@@ -338,7 +338,10 @@ TWO = Constraint(lambda t, q, p: q, name="floor")
     ("build", "text"),
     [
         (lambda: Scene(free, constraints=ON), r"constraints must be a tuple, as in constraints=\(constraint,\)"),
-        (lambda: Scene(free, constraints=(Coulomb(1.0),)), "must hold Constraint or VelocityConstraint objects"),
+        (
+            lambda: Scene(free, constraints=(Coulomb(1.0),)),
+            "VelocityConstraint or Contact objects",
+        ),
         (lambda: Scene(free, constraints=(ON, ON)), "Two constraints have the name 'floor'"),
         (
             lambda: Scene(free, effects=(Friction(Coulomb(1.0), name="floor"),), constraints=(ON,)),

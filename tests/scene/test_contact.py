@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxmodsim import AppliedForce, Coulomb, Friction, LuGre, Regularized, Scene, SimulationError, Stribeck, simulate
-from jaxmodsim.scene._event_driven import Contact, next_modes, solve_friction_forces
+from jaxmodsim.scene._event_driven import FrictionElements, next_modes, solve_friction_forces
 from jaxmodsim.validation.hard._many_events import Contradictory
 
 
@@ -30,28 +30,28 @@ def scene(*friction: Friction, **params: float) -> Scene:
     )
 
 
-def random_contact(rng: np.random.Generator, n: int, stiction: bool) -> Contact:
+def random_contact(rng: np.random.Generator, n: int, stiction: bool) -> FrictionElements:
     directions = rng.normal(size=(n, n))
     coupling = directions @ directions.T
     limit = rng.uniform(0.5, 2.0, n)
     level = limit * rng.uniform(0.5, 1.0, n) if stiction else limit
     base = 3.0 * rng.normal(size=n) * np.diag(coupling)
     numbers = (np.zeros(n), base, coupling, directions, level, -level, limit, limit)
-    return Contact(*(jnp.asarray(x) for x in numbers), loads=None)
+    return FrictionElements(*(jnp.asarray(x) for x in numbers), loads=None)
 
 
 @jax.jit
-def choose(found: Contact) -> Any:
+def choose(found: FrictionElements) -> Any:
     rest = jnp.zeros_like(found.v)
     return next_modes(found, rest, rest == 0, rest != 0)
 
 
 @jax.jit
-def forces(found: Contact, modes: Any) -> Any:
+def forces(found: FrictionElements, modes: Any) -> Any:
     return jax.vmap(lambda mode: solve_friction_forces(found, mode).force)(modes)
 
 
-def consistent(found: Contact, modes: np.ndarray) -> np.ndarray:
+def consistent(found: FrictionElements, modes: np.ndarray) -> np.ndarray:
     """Of sets of modes: stick within limits and without acceleration, slip not accelerated against its direction."""
     force = np.asarray(forces(found, modes))
     acceleration = np.asarray(found.free_slip_acceleration) - force @ np.asarray(found.delassus).T

@@ -290,12 +290,12 @@ def _engine(
 ) -> ReplayEngine | EventEngine:
     linear = records[0].linear
     delays = {DELAY + name: on_device(float(late)) for name, late in settings.delay.items()}
-    if not scene.event_driven:
+    if not scene.mode_names:
         return ReplayEngine(scene, delays, settings.controller, observables, linear, settings.substeps)
     if settings.controller is not None:
         raise ValueError(
-            f"A controller runs with fixed steps, but {', '.join(scene.event_driven)} runs by events: wrap the law,"
-            " as in Regularized(law, width)."
+            f"A controller runs with fixed steps, but {', '.join(scene.mode_names)} runs by events: wrap the law,"
+            " as in Regularized(law, width); contacts need events."
         )
     slips = tuple(dict.fromkeys(effect for record in records for effect in record.slips))
     return EventEngine(

@@ -1,0 +1,92 @@
+"""Impacts: what velocities and modes of contacts become at the instant at which gaps close."""
+
+from itertools import product
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._core.cholesky import factor_positive_definite
+from .._core.semidefinite import solve_semidefinite
+from .._core.shapes import PerDof, Scalar
+from ..mechanics import linearize_constraints, motion_equations
+from ._scene import Scene
+
+# Rounding units of the velocities of all coordinates, below which a gap has no velocity.
+_ROUNDING = 64.0
+
+_constant = jax.lax.stop_gradient
+
+
+def impact(
+    t: Scalar,
+    q: PerDof,
+    qd: PerDof,
+    scene: Scene,
+    closed: Float[Array, " contacts"],
+    fired: Bool[Array, " contacts"],
+    rest: Scalar,
+    elastic: Bool[Array, ""] | bool,
+) -> tuple[PerDof, Float[Array, " contacts"]]:
+    """Velocities, and the modes of the contacts, after the instant at which those `fired`.
+
+    Contacts that are closed and have fired open: their multiplier has fallen to zero. Those that are open and have
+    fired are struck. Struck contacts whose gap has no velocity afterwards are closed.
+
+    **Arguments:**
+
+    - `t`, `q`, `qd`, `scene`: the instant; the scene is that of time `t`.
+    - `closed`: modes before.
+    - `fired`: contacts whose guards have.
+    - `rest`: velocity [m/s] that counts as none.
+    - `elastic`: whether contacts give back a part of their velocity; False where impacts have accumulated.
+    """
+    contacts, params = tuple(scene.contacts.values()), scene.params
+    mass = motion_equations(scene.lagrangian, t, q, qd, params).mass
+    solve = factor_positive_definite(mass)
+    gaps = linearize_constraints(contacts, t, q, qd, params, mass)
+    # The velocity of a gap that moves by itself counts, too.
+    w = jnp.concatenate([each.rate(t, q, qd, params) for each in contacts])
+    reach = gaps.minv_jt
+    if scene.bilateral:
+        held = linearize_constraints(scene.bilateral, t, q, qd, params, mass)
+        reach = jnp.stack([row + held.apply_force(held.multiplier_response(row)) for row in map(solve, gaps.rows)])
+    delassus = jnp.sum(gaps.rows[:, None, :] * reach[None, :, :], axis=2)
+    touches = jnp.where(closed > 0, ~fired, fired)
+    e = jnp.stack([each.restitution.astype(w.dtype) for each in contacts])
+    e = jnp.where((closed > 0) | ~jnp.asarray(elastic), 0.0, e)
+    impulse = _impulses(delassus, (1.0 + e) * w, touches)
+    after = w + jnp.sum(delassus * impulse[None, :], axis=1)
+    rounding = _ROUNDING * float(jnp.finfo(w.dtype).eps) * jnp.sum(jnp.abs(gaps.rows * qd[None, :]), axis=1)
+    still = _constant(jnp.abs(after) <= jnp.maximum(rest, rounding))
+    return qd + jnp.sum(reach * impulse[:, None], axis=0), jnp.where(touches & still, 1.0, jnp.zeros_like(w))
+
+
+def _impulses(
+    delassus: Float[Array, "n n"], closing: Float[Array, " n"], touches: Bool[Array, " n"]
+) -> Float[Array, " n"]:
+    """Impulses of the contacts that touch: `A p + closing >= 0`, `p >= 0`, one of the two zero for each.
+
+    Every set of contacts that push is tried, and the one that violates the conditions least is taken: of a positive
+    definite matrix exactly one violates none (Cottle, Pang, Stone: The Linear Complementarity Problem, 1992, theorem
+    3.3.7). Of redundant contacts the smallest impulses.
+    """
+    n = closing.shape[0]
+    ones = jnp.ones_like(closing)
+
+    def pushed(active: Bool[Array, " n"]) -> Float[Array, " n"]:
+        return solve_semidefinite(delassus, jnp.where(active, -closing, 0.0), ones, active & touches)
+
+    if n == 1:
+        return jnp.maximum(pushed(jnp.asarray([True])), 0.0)
+    sets = jnp.asarray(np.array(list(product((False, True), repeat=n))))
+
+    def violation(active: Bool[Array, " n"]) -> Scalar:
+        impulse = pushed(active)
+        after = closing + jnp.sum(delassus * impulse[None, :], axis=1)
+        pulls = jnp.max(-impulse * jnp.diagonal(delassus))
+        return jnp.maximum(pulls, jnp.max(jnp.where(touches, -after, 0.0)))
+
+    worst = jax.lax.map(violation, sets)
+    return pushed(sets[jnp.argmin(_constant(worst))])

@@ -1,0 +1,190 @@
+"""Contacts that open, close and strike: against closed forms, in value, derivative and energy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmodsim as jms
+from jaxmodsim.problems import bouncing_ball, vibrating_table
+
+TIGHT = {"rtol": 1e-10, "atol": 1e-12}
+
+
+def _ball_end(start):
+    """Saved motion, the end of all bounces, and the run of a ball dropped from `h`."""
+    run = jms.simulate(
+        bouncing_ball.scene(e=start["e"]),
+        jnp.stack([start["h"]]),
+        [0.0],
+        2.5,
+        ts=jnp.array([0.3, 0.7, 1.1, 1.35, 2.0, 2.5]),
+        **TIGHT,
+    )
+    return run, jnp.max(jnp.where(jnp.isfinite(run.events.t), run.events.t, 0.0))
+
+
+def test_a_ball_bounces_to_rest_on_the_floor():
+    start = {"h": 1.0, "e": 0.5}
+    run, stop = _ball_end(start)
+    height, velocity = bouncing_ball.motion(run.t, **start)
+    np.testing.assert_allclose(run.q[:, 0], height, atol=1e-11)
+    np.testing.assert_allclose(run.qd[:, 0], velocity, atol=1e-11)
+    assert abs(stop - bouncing_ball.rest(**start)) < 1e-10
+    assert (run.q[-2:] == 0).all()
+    assert (run.qd[-2:] == 0).all()
+    np.testing.assert_array_equal(run.mode["floor"], [0, 0, 0, 0, 1, 1])
+    np.testing.assert_allclose(run.reactions["floor"].multiplier[:, 0], [0, 0, 0, 0, 9.81, 9.81], rtol=1e-12)
+    assert run.mode_changes[0].before == run.mode_changes[0].after == "open"
+    assert run.mode_changes[-1].after == "closed"
+    # All of the energy is lost in impacts, and no impact gains any.
+    np.testing.assert_allclose(run.energy.dissipated[-1], 9.81, rtol=1e-11)
+    np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-11)
+    assert (np.diff(run.event_losses) >= -1e-13).all()
+
+
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
+def test_derivatives_of_the_end_of_all_bounces(derivative):
+    start = {"h": 1.0, "e": 0.5}
+    ours = derivative(lambda start: _ball_end(start)[1])(start)
+    closed = jax.grad(lambda start: bouncing_ball.rest(**start))(start)
+    for name in start:
+        np.testing.assert_allclose(ours[name], closed[name], rtol=1e-8)
+
+
+def _walls(e):
+    walls = (
+        jms.Contact(lambda t, q, p: q[0], restitution=e, name="left"),
+        jms.Contact(lambda t, q, p: p["L"] - q[0], restitution=e, name="right"),
+    )
+    return jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, params={"L": 1.0}, constraints=walls)
+
+
+def test_gradient_through_a_hundred_impacts():
+    impacts = 100
+
+    def closed(v, e):
+        """Between walls one metre apart: halfway after that many impacts, the time and the place at a fixed time."""
+        speeds = v * e ** jnp.arange(impacts + 1)
+        t = 0.5 / v + jnp.sum(1.0 / speeds[1:impacts])
+        return t, speeds[impacts]
+
+    t1 = float(closed(1.0, 0.99)[0]) + 0.1
+
+    def end(start):
+        scene = _walls(start["e"])
+        return jms.simulate(scene, [0.5], jnp.stack([start["v"]]), t1, max_events=256, **TIGHT).q[-1, 0]
+
+    def exact(start):
+        t, speed = closed(start["v"], start["e"])
+        return speed * (t1 - t)  # the last of an even number of impacts is at the left wall
+
+    start = {"v": 1.0, "e": 0.99}
+    np.testing.assert_allclose(end(start), exact(start), rtol=1e-9)
+    ours, theirs = jax.grad(end)(start), jax.grad(exact)(start)
+    for name in start:
+        np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-8)
+
+
+def test_a_ball_bounces_once_a_period_of_a_vibrating_table():
+    p = vibrating_table.PARAMS
+    phase, period = float(vibrating_table.bounce_phase()), 2 * np.pi / p["omega"]
+    t0 = phase / p["omega"]
+    run = jms.simulate(
+        vibrating_table.scene(),
+        [p["A"] * np.sin(phase)],
+        [0.5 * p["g"] * period],
+        t0 + 5.5 * period,
+        t0=t0,
+        rtol=1e-11,
+        atol=1e-14,
+    )
+    times = np.array([change.t for change in run.mode_changes])
+    np.testing.assert_allclose(p["omega"] * times, phase + 2 * np.pi * np.arange(1, 6), atol=1e-10 * 2 * np.pi)
+
+
+def test_a_contact_opens_where_its_reaction_falls_to_zero():
+    A, omega = 0.05, 20.0
+    scene = vibrating_table.scene(A=A, omega=omega, e=0.0)
+    run = jms.simulate(scene, [0.0], [A * omega], 0.3, **TIGHT)
+    opens, closes = run.mode_changes
+    assert (opens.before, opens.after, closes.after) == ("closed", "open", "closed")
+    np.testing.assert_allclose(opens.t, np.arcsin(9.81 / (A * omega**2)) / omega, rtol=1e-9)
+    # In between it is a throw, and lands on the table without a bounce.
+    speed = A * omega * np.cos(omega * opens.t)
+    fall = closes.t - opens.t
+    height = A * np.sin(omega * opens.t) + speed * fall - 0.5 * 9.81 * fall**2
+    np.testing.assert_allclose(height, A * np.sin(omega * closes.t), atol=1e-10)
+    np.testing.assert_allclose(run.q[-1, 0], A * np.sin(omega * 0.3), rtol=1e-14)
+
+
+def test_two_equal_balls_exchange_their_velocities():
+    gap = jms.Contact(lambda t, q, p: q[1] - q[0] - 0.1, restitution=1.0)
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * jnp.sum(qd**2), constraints=(gap,))
+
+    def end(q0):
+        return jms.simulate(scene, q0, [1.0, 0.0], 1.0, **TIGHT).q[-1]
+
+    q0 = jnp.array([0.0, 0.5])
+    np.testing.assert_allclose(end(q0), [0.4, 1.1], rtol=1e-12)
+    for derivative in (jax.jacrev, jax.jacfwd):
+        np.testing.assert_allclose(derivative(end)(q0), [[0.0, 1.0], [1.0, 0.0]], atol=1e-12)
+
+
+def test_several_contacts_at_one_instant():
+    """A rigid bar falls flat on two supports; three balls at rest are struck by a fourth, by Newton's law."""
+    bar = jms.Scene(
+        lambda t, q, qd, p: 0.5 * qd[0] ** 2 + 0.5 * 0.1 * qd[1] ** 2 - 9.81 * q[0],
+        constraints=(
+            jms.Contact(lambda t, q, p: q[0] - 0.5 * jnp.sin(q[1]), restitution=0.5),
+            jms.Contact(lambda t, q, p: q[0] + 0.5 * jnp.sin(q[1]), restitution=0.5),
+        ),
+    )
+    run = jms.simulate(bar, [0.1, 0.0], [0.0, 0.0], 2.0, ts=jnp.array([0.2, 2.0]), **TIGHT)
+    height, velocity = bouncing_ball.motion(run.t, h=0.1, e=0.5)
+    np.testing.assert_allclose(run.q[:, 0], height, atol=1e-11)
+    np.testing.assert_allclose(run.qd[:, 0], velocity, atol=1e-11)
+    np.testing.assert_allclose(run.q[:, 1], 0.0, atol=1e-12)
+    np.testing.assert_allclose([each.multiplier[-1, 0] for each in run.reactions.values()], 9.81 / 2, rtol=1e-9)
+
+    balls = jms.Scene(
+        lambda t, q, qd, p: 0.5 * jnp.sum(qd**2),
+        constraints=(
+            jms.Contact(lambda t, q, p: q[1] - q[0], restitution=1.0),
+            jms.Contact(lambda t, q, p: q[2] - q[1], restitution=1.0),
+            jms.Contact(lambda t, q, p: q[3] - q[2], restitution=1.0),
+        ),
+    )
+    run = jms.simulate(balls, [-0.5, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], 1.0, **TIGHT)
+    np.testing.assert_allclose(run.qd[-1], [-0.5, 0.5, 0.5, 0.5], atol=1e-12)
+
+
+def test_a_block_lands_slides_and_stops():
+    mu, g = 0.3, 9.81
+    block = jms.Scene(
+        lambda t, q, qd, p: 0.5 * jnp.sum(qd**2) - g * q[1],
+        effects=(jms.Friction(jms.Coulomb(mu), along=lambda q: q[0], normal_force="floor"),),
+        constraints=(jms.Contact(lambda t, q, p: q[1], name="floor"),),
+    )
+    run = jms.simulate(block, [0.0, 0.5], [1.0, 0.0], 1.5, ts=jnp.linspace(0.0, 1.5, 7), **TIGHT)
+    landing = np.sqrt(2 * 0.5 / g)
+    lands, stops = run.mode_changes
+    np.testing.assert_allclose([lands.t, stops.t], [landing, landing + 1.0 / (mu * g)], rtol=1e-10)
+    np.testing.assert_allclose(run.q[-1], [landing + 1.0 / (2 * mu * g), 0.0], rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-11)
+
+
+@pytest.mark.quick
+def test_wrong_contacts_are_refused():
+    with pytest.raises(ValueError, match="restitution must be"):
+        jms.Contact(lambda t, q, p: q[0], restitution=1.5)
+    with pytest.raises(ValueError, match="Contact gap must be a function"):
+        jms.Contact(1.0)
+    pair = jms.Contact(lambda t, q, p: jnp.stack([q[0], q[0]]), name="floor")
+    lagrangian = bouncing_ball.scene(e=0.5).lagrangian
+    with pytest.raises(ValueError, match=r"'floor'.*one number"):
+        jms.simulate(jms.Scene(lagrangian, params={"m": 1.0, "g": 9.81}, constraints=(pair,)), [1.0], [0.0], 1.0)
+    with pytest.raises(ValueError, match="opens and closes by: use another solver"):
+        jms.simulate(bouncing_ball.scene(e=0.5), [1.0], [0.0], 1.0, dt=1e-3, solver=jms.ImplicitFriction())
+    with pytest.raises(jms.SimulationError, match="gap is negative"):
+        jms.simulate(bouncing_ball.scene(e=0.5), [-0.1], [0.0], 1.0)
