@@ -23,52 +23,6 @@ from typing import TYPE_CHECKING
 from typing import Any as _Any
 
 from ._core.provenance import versions as _versions
-from ._core.speed import tune_cpu as tune_cpu
-from .friction import Armstrong as Armstrong
-from .friction import Bristle as Bristle
-from .friction import Coulomb as Coulomb
-from .friction import Curve as Curve
-from .friction import Dahl as Dahl
-from .friction import DeadZone as DeadZone
-from .friction import ElastoPlastic as ElastoPlastic
-from .friction import Geared as Geared
-from .friction import LuGre as LuGre
-from .friction import MaxwellSlip as MaxwellSlip
-from .friction import Regularized as Regularized
-from .friction import ServoGear as ServoGear
-from .friction import Sign as Sign
-from .friction import Stribeck as Stribeck
-from .friction import Viscous as Viscous
-from .friction import asymmetric as asymmetric
-from .friction import check_passivity as check_passivity
-from .friction import damping_sigma1 as damping_sigma1
-from .friction import max_stable_step as max_stable_step
-from .friction import regularized_width as regularized_width
-from .friction import scaled_by as scaled_by
-from .mechanics import Chart as Chart
-from .mechanics import Constraint as Constraint
-from .mechanics import Contact as Contact
-from .mechanics import Cylindrical as Cylindrical
-from .mechanics import Spherical as Spherical
-from .mechanics import VelocityConstraint as VelocityConstraint
-from .mechanics import point_mass as point_mass
-from .mechanics import rigid_body as rigid_body
-from .scene import AbstractEffect as AbstractEffect
-from .scene import AppliedForce as AppliedForce
-from .scene import Friction as Friction
-from .scene import Scene as Scene
-from .scene import Signal as Signal
-from .simulation import SimulationError as SimulationError
-from .simulation import Trajectory as Trajectory
-from .simulation import consistent as consistent
-from .simulation import simulate as simulate
-from .simulation import simulate_to_accuracy as simulate_to_accuracy
-from .solvers import EventController as EventController
-from .solvers import EventSolver as EventSolver
-from .solvers import Gauss as Gauss
-from .solvers import ImplicitFriction as ImplicitFriction
-from .solvers import Rodas5P as Rodas5P
-from .solvers import StoredSteps as StoredSteps
 
 if TYPE_CHECKING:
     from . import metrics as metrics
@@ -76,6 +30,7 @@ if TYPE_CHECKING:
     from . import problems as problems
     from . import sweeps as sweeps
     from . import validation as validation
+    from ._core.speed import tune_cpu as tune_cpu
     from .analysis import EnergyAudit as EnergyAudit
     from .analysis import GradientCheck as GradientCheck
     from .analysis import Method as Method
@@ -91,15 +46,61 @@ if TYPE_CHECKING:
     from .export import to_javascript as to_javascript
     from .export import to_modelica as to_modelica
     from .export import to_mujoco as to_mujoco
+    from .friction import Armstrong as Armstrong
+    from .friction import Bristle as Bristle
+    from .friction import Coulomb as Coulomb
+    from .friction import Curve as Curve
+    from .friction import Dahl as Dahl
+    from .friction import DeadZone as DeadZone
+    from .friction import ElastoPlastic as ElastoPlastic
+    from .friction import Geared as Geared
+    from .friction import LuGre as LuGre
+    from .friction import MaxwellSlip as MaxwellSlip
+    from .friction import Regularized as Regularized
+    from .friction import ServoGear as ServoGear
+    from .friction import Sign as Sign
+    from .friction import Stribeck as Stribeck
+    from .friction import Viscous as Viscous
+    from .friction import asymmetric as asymmetric
+    from .friction import check_passivity as check_passivity
+    from .friction import damping_sigma1 as damping_sigma1
+    from .friction import max_stable_step as max_stable_step
+    from .friction import regularized_width as regularized_width
+    from .friction import scaled_by as scaled_by
     from .identify import FitResult as FitResult
     from .identify import Record as Record
     from .identify import fit as fit
     from .identify import fit_law as fit_law
+    from .mechanics import Chart as Chart
+    from .mechanics import Constraint as Constraint
+    from .mechanics import Contact as Contact
+    from .mechanics import Cylindrical as Cylindrical
+    from .mechanics import Spherical as Spherical
+    from .mechanics import VelocityConstraint as VelocityConstraint
+    from .mechanics import point_mass as point_mass
+    from .mechanics import rigid_body as rigid_body
+    from .scene import AbstractEffect as AbstractEffect
+    from .scene import AppliedForce as AppliedForce
+    from .scene import Friction as Friction
+    from .scene import Scene as Scene
+    from .scene import Signal as Signal
+    from .simulation import SimulationError as SimulationError
+    from .simulation import Trajectory as Trajectory
+    from .simulation import consistent as consistent
+    from .simulation import simulate as simulate
+    from .simulation import simulate_to_accuracy as simulate_to_accuracy
+    from .solvers import EventController as EventController
+    from .solvers import EventSolver as EventSolver
+    from .solvers import Gauss as Gauss
+    from .solvers import ImplicitFriction as ImplicitFriction
+    from .solvers import Rodas5P as Rodas5P
+    from .solvers import StoredSteps as StoredSteps
     from .sweeps import sweep as sweep
 
-# What a simulation does not need is loaded when it is first asked for: it takes longer than the rest. The same names
-# as above, which is for type checkers.
+# Every name is loaded when it is first asked for: with JAX that takes more than a second, which `jaxmodsim --help`
+# does not wait for. The same names as above, which is for type checkers.
 _LATER = {
+    "_core.speed": ("tune_cpu",),
     "analysis": (
         "EnergyAudit",
         "GradientCheck",
@@ -114,10 +115,46 @@ _LATER = {
         "work_precision",
     ),
     "export": ("to_c", "to_javascript", "to_modelica", "to_mujoco"),
+    "friction": (
+        "Armstrong",
+        "Bristle",
+        "Coulomb",
+        "Curve",
+        "Dahl",
+        "DeadZone",
+        "ElastoPlastic",
+        "Geared",
+        "LuGre",
+        "MaxwellSlip",
+        "Regularized",
+        "ServoGear",
+        "Sign",
+        "Stribeck",
+        "Viscous",
+        "asymmetric",
+        "check_passivity",
+        "damping_sigma1",
+        "max_stable_step",
+        "regularized_width",
+        "scaled_by",
+    ),
     "identify": ("FitResult", "Record", "fit", "fit_law"),
+    "mechanics": (
+        "Chart",
+        "Constraint",
+        "Contact",
+        "Cylindrical",
+        "Spherical",
+        "VelocityConstraint",
+        "point_mass",
+        "rigid_body",
+    ),
     "metrics": (),
     "plot": (),
     "problems": (),
+    "scene": ("AbstractEffect", "AppliedForce", "Friction", "Scene", "Signal"),
+    "simulation": ("SimulationError", "Trajectory", "consistent", "simulate", "simulate_to_accuracy"),
+    "solvers": ("EventController", "EventSolver", "Gauss", "ImplicitFriction", "Rodas5P", "StoredSteps"),
     "sweeps": ("sweep",),
     "validation": (),
 }
@@ -136,4 +173,4 @@ def __getattr__(name: str) -> _Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_LATER, *_FOLDERS})
+    return sorted({*globals(), *_FOLDERS, *(folder.partition(".")[0] for folder in _LATER)})

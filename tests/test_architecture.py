@@ -94,13 +94,28 @@ def test_names_that_load_later_are_those_that_type_checkers_see() -> None:
         assert getattr(jaxmodsim, name) is not None
 
 
-@pytest.mark.quick
-def test_the_import_loads_no_more_than_a_simulation_needs() -> None:
-    code = (
-        "import sys, jaxmodsim; print(*{name.split('.')[1] for name in sys.modules if name.startswith('jaxmodsim.')})"
+def loaded_by(code: str) -> set[str]:
+    """Modules that a fresh interpreter has loaded after a piece of code."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}\nimport sys; print(*sys.modules)"], capture_output=True, text=True, check=True
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert set(done.stdout.split()) == NEEDED_TO_SIMULATE
+    return set(done.stdout.splitlines()[-1].split())
+
+
+@pytest.mark.quick
+def test_simulate_loads_no_more_than_a_simulation_needs() -> None:
+    loaded = loaded_by("from jaxmodsim import simulate")
+    rooms = {name.split(".")[1] for name in loaded if name.startswith("jaxmodsim.")}
+    assert rooms == NEEDED_TO_SIMULATE
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("words", [["--help"], ["fit", "--help"], ["sweep", "--help"]], ids=" ".join)
+def test_help_loads_nothing_that_takes_long(words: list[str]) -> None:
+    arguments = ["jaxmodsim", *words]
+    run = f"import sys; sys.argv = {arguments}\nfrom jaxmodsim.cli import main\ntry: main()\nexcept SystemExit: pass"
+    slow = {"jax", "numpy", "scipy", "pandas", "matplotlib", "diffrax"}
+    assert not slow & loaded_by(run)
 
 
 @each_file([path for path in FILES if path != ROOT / "__init__.py"])

@@ -22,6 +22,7 @@ else:
     Number: TypeAlias = Float[Array, ""]
     Vector: TypeAlias = Float[Array, " n"]
     NumberOrState: TypeAlias = Float[Array, ""] | StateDependent
+_Numbers: TypeAlias = Float[Array | np.ndarray, "..."]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,9 +57,12 @@ class Range:
         most = "" if self.upper is None else f" and <= {self.upper:g}"
         return f"finite{least}{most}{unit}"
 
-    def holds(self, value: Float[Array, "..."], others: Mapping[str, Float[Array, "..."]]) -> Bool[Array, "..."]:
-        """Whether `value` is in range, elementwise; `others` are the parameters of the same object by name."""
-        finite = jnp.isfinite(value)
+    def holds(self, value: _Numbers, others: Mapping[str, _Numbers]) -> Bool[Array | np.ndarray | np.bool_, "..."]:
+        """Whether `value` is in range, elementwise; `others` are the parameters of the same object by name.
+
+        Without JAX where the value is of NumPy.
+        """
+        finite = np.isfinite(value) if isinstance(value, np.ndarray) else jnp.isfinite(value)
         if self.upper is not None:
             finite = finite & (value <= self.upper)
         if self.lower is None:
@@ -203,7 +207,8 @@ def check_ranges(module: eqx.Module) -> None:
         limit = values.get(allowed.lower) if isinstance(allowed.lower, str) else None
         if any(isinstance(x, jax.core.Tracer) for x in (values[name], limit)):
             continue
-        if not bool(jnp.all(allowed.holds(values[name], values))):
+        others = {} if limit is None else {str(allowed.lower): np.asarray(limit)}
+        if not np.all(allowed.holds(np.asarray(values[name]), others)):
             against = "" if limit is None else f" ({allowed.lower} = {limit})"
             raise ValueError(
                 f"{type(module).__name__}: {name} must be {allowed.text}{against}, but {values[name]} was given."

@@ -99,7 +99,7 @@ def fit(
     loss: _options.Loss = "squares",
     begin: _options.Begin = "rough",
     starts: _options.Starts = 1,
-    max_steps: _options.MaxSteps = 100,
+    max_steps: _options.MaxSteps = 400,
     substeps: _options.Substeps = None,
     out: Out = Path("jaxmodsim-fit"),
     report: _options.Report = None,

@@ -69,23 +69,26 @@ def run_fit(request: FitRequest) -> None:
     findings = Findings(fitted, (), None, origin())
     paths = write(request.out, _files(findings))
     interrupted = fitted.interrupted
-    profiles: list[Profile] = []
+    profiles: tuple[Profile, ...] = ()
     design = None
     try:
+        if request.report is not None and not interrupted:
+            better, profiles = _profiled(fitted)
+            if better is not fitted:
+                fitted = better
+                _show(fitted)
+                findings = Findings(fitted, profiles, None, findings.origin)
+                write(request.out, _files(findings))
         if request.next_input is not None:
             design = _designed(request, fitted)
             say(f"Next input, for {request.next_input}:\n{design}")
             paths += write(request.next_input.parent, {request.next_input.name: design})
             paths += write(request.out, {"next.png": design_figure(design), "next.json": design.to_dict()})
             interrupted = interrupted or design.ending == "was interrupted"
-        if request.report is not None and not interrupted:
-            for name in _least_known(fitted):
-                with progress_line("likelihood profile", name):
-                    profiles.append(profile(fitted.result, name, points=_POINTS))
     except KeyboardInterrupt:
         interrupted = True
     if request.report is not None:
-        findings = Findings(fitted, tuple(profiles), design, findings.origin)
+        findings = Findings(fitted, profiles, design, findings.origin)
         paths += write(request.report, {"report.html": report_page(findings)})
     show_paths(paths)
     if interrupted:
@@ -100,17 +103,20 @@ def _fitted(plan: Plan) -> Fitted:
     while plan.substeps is None and substeps < _MOST_SUBSTEPS and step_shows(fitted.result) and not fitted.interrupted:
         substeps *= _FINER
         fitted = _fitted_with(plan, substeps, fitted.result)
-    # Whoever pressed Ctrl-C does not wait for more.
-    several = len(plan.records) > 1 and not fitted.interrupted
-    agreed = agreement(fitted.result) if several else None
-    held_out = () if fitted.interrupted else plan.held_out
+    judged = _judged(replace(fitted, substeps=substeps))
+    return replace(judged, seconds=time.perf_counter() - started)
+
+
+def _judged(fitted: Fitted) -> Fitted:
+    """With predictions, the agreement of the records, and the error to expect: not for whoever pressed Ctrl-C."""
+    if fitted.interrupted:
+        return fitted
+    agreed = agreement(fitted.result) if len(fitted.plan.records) > 1 else None
     return replace(
         fitted,
-        predictions=tuple(predict(fitted.result, record, agreement=agreed) for record in held_out),
+        predictions=tuple(predict(fitted.result, record, agreement=agreed) for record in fitted.plan.held_out),
         agreement=agreed,
-        expected=None if fitted.interrupted else expected_error(fitted.result, agreement=agreed)["measured"],
-        substeps=substeps,
-        seconds=time.perf_counter() - started,
+        expected=expected_error(fitted.result, agreement=agreed)["measured"],
     )
 
 
@@ -225,6 +231,18 @@ def _numbered(i: int, record: Record) -> str:
     """A part of a file name that is like the record's, and differs from all others."""
     alike = re.sub(r"[^\w.-]+", "_", record.name)
     return f"{i + 1}_{alike}"
+
+
+def _profiled(fitted: Fitted) -> tuple[Fitted, tuple[Profile, ...]]:
+    """Profiles of the least known parameters, and the fit that they are of: a better one, where one came upon it."""
+    profiles: list[Profile] = []
+    for name in _least_known(fitted):
+        with progress_line("likelihood profile", name):
+            profiles.append(profile(fitted.result, name, points=_POINTS))
+        if profiles[-1].result is not fitted.result:
+            say(f"{profiles[-1].notes[-1]} This is the fit from here on:")
+            return _profiled(_judged(replace(fitted, result=profiles[-1].result)))
+    return fitted, tuple(profiles)
 
 
 def _least_known(fitted: Fitted) -> list[str]:

@@ -116,7 +116,10 @@ Starts = Annotated[
     int,
     typer.Option(help="Searches from so many starts around it, of which the best is taken.", rich_help_panel=_SEARCH),
 ]
-MaxSteps = Annotated[int, typer.Option(help="Limit of iterations of a search.", rich_help_panel=_SEARCH)]
+MaxSteps = Annotated[
+    int,
+    typer.Option(help="Limit of iterations of a search, up to which it goes on by itself.", rich_help_panel=_SEARCH),
+]
 Substeps = Annotated[
     int | None,
     typer.Option(

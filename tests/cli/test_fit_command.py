@@ -130,6 +130,24 @@ def test_a_report_is_one_page_that_needs_nothing_else(fitted):
         assert f"{result['parameters'][name]['value']:.5g}" in page.text
 
 
+def test_a_better_fit_that_a_profile_comes_upon_is_the_fit(run_command, files, tmp_path, monkeypatch):
+    fit = _fit.fit
+    monkeypatch.setattr(_fit, "fit", lambda *arguments, **options: fit(*arguments, **{**options, "max_steps": 2}))
+    monkeypatch.setattr(_fit, "_POINTS", 2)
+    out = tmp_path / "out"
+    code, text, errors = run_command(
+        "fit", files[0], *COLUMNS, "--fix", "dry.width=1e-3", "--substeps", "2", "--out", str(out), "--report", str(out)
+    )
+    assert code == 0, errors
+    found = json.loads((out / "fit.json").read_text())
+    stopped, after = text.split("This is the fit from here on:")
+    assert "stopped at the limit of 2 iterations (max_steps)" in stopped
+    assert found["ending"] in after
+    assert "continued once from a better value of" in found["ending"]
+    assert "went on from there in" in " ".join(stopped.split())
+    assert found["ending"] in Page((out / "report.html").read_text()).text
+
+
 def test_ctrl_c_keeps_what_was_found(run_command, files, tmp_path, monkeypatch):
     fit, seen = _fit.fit, []
 

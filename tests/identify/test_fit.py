@@ -88,9 +88,9 @@ def test_covariance_of_correlated_residuals_is_larger_than_for_white_ones():
             series[i] = r * series[i - 1] + e[i]
         series -= series.mean()
         white = series.var() / n
-        one, blocks = jnp.ones((n, 1)), jnp.arange(n) * BLOCKS // n
-        rest = jnp.zeros((0, 1)), jnp.eye(1), blocks, BLOCKS, 1, jnp.asarray(False)
-        sure = covariance_estimate(jnp.asarray(series), one, *rest)
+        one, blocks = np.ones((n, 1)), np.arange(n) * BLOCKS // n
+        rest = np.zeros((0, 1)), np.eye(1), blocks, BLOCKS, 1, False
+        sure = covariance_estimate(series, one, *rest)
         assert float(sure.white[0, 0]) == pytest.approx(white, rel=1e-3)
         ratios.append(float(sure.covariance[0, 0]) / white)
     # 31 degrees of freedom in each of 20 estimates: the mean is good to 6 %, three of those are allowed.
@@ -99,13 +99,13 @@ def test_covariance_of_correlated_residuals_is_larger_than_for_white_ones():
 
 def test_standard_errors_are_steadier_where_the_residual_is_white():
     rng, n, p = np.random.default_rng(5), 640, 4
-    blocks, rest = jnp.arange(n) * BLOCKS // n, (jnp.zeros((0, p)), jnp.eye(p))
-    jacobian = jnp.asarray(rng.standard_normal((n, p)))
+    blocks, rest = np.arange(n) * BLOCKS // n, (np.zeros((0, p)), np.eye(p))
+    jacobian = rng.standard_normal((n, p))
     ratios: dict[bool, list[np.ndarray]] = {True: [], False: []}
     for _ in range(40):
-        e = jnp.asarray(rng.standard_normal(n))
+        e = rng.standard_normal(n)
         for white, found in ratios.items():
-            sure = covariance_estimate(e, jacobian, *rest, blocks, BLOCKS, p, jnp.asarray(white))
+            sure = covariance_estimate(e, jacobian, *rest, blocks, BLOCKS, p, white)
             found.append(np.sqrt(np.diag(sure.covariance) / np.diag(sure.white)))
     # 31 degrees of freedom: a standard error from blocks alone scatters by 1/sqrt(62) = 13 %.
     assert np.std(ratios[False]) == pytest.approx(0.13, rel=0.25)

@@ -51,6 +51,23 @@ class Decay(eqx.Module):
         return ModelOutput({"measured": values["A"] * jnp.exp(-values["k"] * run.t)}, {}, None)
 
 
+class Sine(eqx.Module):
+    def __call__(self, values, start, run):
+        del start
+        return ModelOutput({"measured": values["A"] * jnp.sin(values["w"] * run.t)}, {}, None)
+
+
+class Valley(eqx.Module):
+    """The valley of Rosenbrock (1960), the narrower the larger k: b = a^2 is its bottom, a = 1 its end."""
+
+    k: jnp.ndarray
+
+    def __call__(self, values, start, run):
+        del start
+        a, b = values["a"], values["b"]
+        return ModelOutput({"measured": jnp.where(run.t < 0.5, self.k * (b - a**2), 1 - a)}, {}, None)
+
+
 class Saturation(eqx.Module):
     """1 - exp(-stiffness t): above a certain stiffness all are alike."""
 
@@ -159,6 +176,49 @@ def test_what_was_known_before_counts_in_a_profile_and_limits_end_it():
     known = fitted(Line(), t, y, {"a": 1.0, "b": 0.5}, prior={"a": (0.05, 1e-3)})
     low, high = profile(known, "a", points=2).interval
     assert high - low < 0.1 * (curve.interval[1] - curve.interval[0])
+
+
+def test_a_profile_goes_on_from_a_better_value():
+    rng, t = np.random.default_rng(0), np.linspace(0.0, 6.0, 300)
+    y = np.sin(3.0 * t) + 0.2 * rng.standard_normal(t.size)
+    # The first search ends in a minimum of its own, with a frequency that is none of the record.
+    result = fitted(Sine(), t, y, {"A": 0.5, "w": 2.2})
+    assert result.rmse > 0.7
+    assert abs(result.values["w"]) < 2.5
+    curve = profile(result, "w", points=3)
+    assert curve.result.rmse == pytest.approx(0.2, rel=0.05)
+    assert curve.estimate == curve.result.values["w"]
+    assert curve.interval[0] < np.sign(curve.estimate) * 3.0 < curve.interval[1]
+    assert np.min(curve.ratio) > -1e-3
+    assert "search went on from there in" in curve.notes[-1]
+    assert "; continued once from a better value of w" in str(curve.result)
+    assert curve.result.diagnostics.evaluations > result.diagnostics.evaluations
+    assert not any("do not trust" in remark for remark in remarks(curve.result))
+    # What is good already is left as it is.
+    assert profile(curve.result, "w", points=3).result is curve.result
+
+
+def test_a_profile_goes_on_within_a_limit():
+    t = np.linspace(0.0, 6.0, 300)
+    result = fitted(Sine(), t, np.sin(3.0 * t), {"A": 0.5, "w": 2.2})
+    still = profile(result, "w", points=3, max_steps=0)
+    assert still.result is result
+    assert "the limit of 0 iterations (max_steps)" in still.notes[-1]
+    with pytest.raises(ValueError, match="max_steps must be an integer >= 0, but -1 was given"):
+        profile(result, "w", max_steps=-1)
+
+
+def test_a_search_goes_on_at_a_hundred_iterations_within_its_limit():
+    t, start = np.linspace(0.0, 1.0, 10), {"a": -1.2, "b": 1.0}
+    result = fitted(Valley(jnp.asarray(1e3)), t, 0 * t, start)
+    assert result.diagnostics.evaluations > 200
+    assert result.diagnostics.ending == "converged; continued 2 times after 100 iterations each"
+    assert result.values == pytest.approx({"a": 1.0, "b": 1.0})
+    assert not any("The search" in remark for remark in remarks(result))
+    never = fitted(Valley(jnp.asarray(1e6)), t, 0 * t, start)
+    ending = "stopped at the limit of 400 iterations (max_steps); continued 3 times after 100 iterations each"
+    assert never.diagnostics.ending == ending
+    assert any(ending in remark for remark in remarks(never))
 
 
 @pytest.mark.parametrize(

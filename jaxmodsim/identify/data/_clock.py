@@ -110,9 +110,14 @@ def clock_offset(record: Record, name: str = "u") -> tuple[float, float]:
     def left(offset: float) -> float:
         return explained.left(offset)[0]
 
-    offsets = interval * np.arange(-furthest, furthest + 1)
-    best = int(np.argmin([left(offset) for offset in offsets]))
-    low, high = (float(offsets[min(max(best + side, 0), len(offsets) - 1)]) for side in (-1, 1))
+    def least(first: int, last: int, step: int) -> int:
+        return min(range(max(first, -furthest), min(last, furthest) + 1, step), key=lambda k: left(interval * k))
+
+    # A smoothed force changes little over a quarter of the span: so far apart are the offsets of a first look.
+    step = max(smooth_span(len(record.t)) // 4, 1)
+    best = least(-furthest, furthest, step)
+    best = least(best - step, best + step, 1)
+    low, high = (interval * min(max(best + side, -furthest), furthest) for side in (-1, 1))
     for _ in range(_REFINED):
         a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
         low, high = (low, b) if left(a) < left(b) else (a, high)

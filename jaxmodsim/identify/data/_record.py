@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..._core.arguments import as_float, as_label, as_mapping, as_names, as_reals
+from ..._core.device import on_device
 
 
 @runtime_checkable
@@ -287,7 +288,7 @@ def runs_of(records: tuple[Record, ...], windows: Windows) -> Runs:
     instants = max((len(x) for part in parts for x in part.slips.values()), default=0)
 
     def column(values: Sequence[np.ndarray] | np.ndarray) -> Array:
-        return jnp.asarray(np.stack(list(values)))
+        return on_device(np.stack(list(values)).astype(jnp.result_type(float)))
 
     def pad(x: np.ndarray) -> np.ndarray:
         return np.pad(x, (0, longest - len(x)), mode="edge")

@@ -12,6 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from ..._core.device import on_device
 from ..._core.speed import cores
 from ._problem import FitProblem
 from ._search import SearchOptions, SearchState, solve, start_search, steps_side_by_side
@@ -223,13 +224,12 @@ class FromSmaller(AbstractInitializer):
         """The best of the ends."""
         size = len(problem.free.names)
         here = {name: self.values[last_part(name)] for name in problem.free.names if last_part(name) in self.values}
-        over = problem.free.coordinates(problem.free.values(x[:size]) | here)
-        rest = jnp.asarray(
-            [name not in here and problem.free.limit_of(name) is not None for name in problem.free.names]
-        )
-        starts = [x, *(jnp.concatenate([each, x[size:]]) for each in (over, jnp.where(rest, 0.0, over)))]
-        ends = [solve(problem, each, options).state for each in (starts if bool(jnp.any(rest)) else starts[:2])]
-        return min(ends, key=lambda end: float(jnp.nan_to_num(end.cost, nan=jnp.inf))).x, ()
+        over = np.asarray(problem.free.coordinates(problem.at(x).values | here))
+        rest = np.array([name not in here and problem.free.limit_of(name) is not None for name in problem.free.names])
+        own = np.asarray(x)[size:]
+        starts = [x, *(on_device(np.concatenate([each, own])) for each in (over, np.where(rest, 0.0, over)))]
+        ends = [solve(problem, each, options).state for each in (starts if np.any(rest) else starts[:2])]
+        return min(ends, key=lambda end: float(np.nan_to_num(float(end.cost), nan=np.inf))).x, ()
 
 
 def last_part(name: str) -> str:

@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array, ArrayLike, Float
 
 from ..._core.arguments import as_float, as_names, as_reals
+from ..._core.device import on_device
 from ..._core.parameters import Range, check_ranges, modules_of
 from ...scene import Scene, State, check_scene, scene_numbers, scene_ranges
 from ..data._record import Record, Windows, cut, runs_of, slip_channel, start_state
@@ -98,8 +99,8 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
         check_ranges(module)
     states = _states(scene, several, settings)
     observables = by_channel(settings.observe, several)
-    check_observables(observables, scene, jax.tree.map(lambda x: x[0], states))
-    own = local_names(jax.tree.map(lambda x: x[0], states))
+    check_observables(observables, scene, _first(states))
+    own = local_names(_first(states))
     local, shared = _sorted_out(free, own)
     if settings.shooting is not None:
         shot = settings.shooting
@@ -116,7 +117,7 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
     base = _bases(scene, several, windows, states, observables)
     engine = _engine(scene, several, settings, observables)
     names = (*dict(observables), *(slip_channel(x) for x in dict.fromkeys(e for r in several for e in r.slips)))
-    noise = {name: jnp.asarray(_level(name, several)) for name in names}
+    noise = {name: on_device(_level(name, several)) for name in names}
     problem = FitProblem(
         engine,
         parameters,
@@ -185,10 +186,20 @@ def _states(scene: Scene, records: tuple[Record, ...], settings: Settings) -> St
                 f" qd0 = {settings.qd0}."
             )
         starts.append(np.broadcast_to(array, (count, dof)))
-    q, qd = (jnp.asarray(x, float) for x in starts)
-    state = State(q[0], qd[0], scene.initial_state(q[0]))
-    check_scene(scene, state)
+    q, qd = (on_device(np.array(x, jnp.result_type(float))) for x in starts)
+    states = initial_states(scene, q, qd)
+    check_scene(scene, _first(states))
+    return states
+
+
+@eqx.filter_jit
+def initial_states(scene: Scene, q: Float[Array, "runs dof"], qd: Float[Array, "runs dof"]) -> State:
+    """States with the effects at rest, with a leading axis of runs."""
     return jax.vmap(lambda q, qd: State(q, qd, scene.initial_state(q)))(q, qd)
+
+
+def _first(states: State) -> State:
+    return jax.tree.map(lambda x: on_device(np.asarray(x)[0]), states)
 
 
 def _sorted_out(free: Sequence[str], own: tuple[str, ...]) -> tuple[tuple[str, ...], Sequence[str]]:
@@ -218,7 +229,7 @@ def _numbers(
                 f"delay of {name!r} is {late!r}, but it must be a time >= 0 of one of the inputs"
                 f" {', '.join(delays) or '(there are none)'}."
             )
-    numbers = split_entries(whole) | {DELAY + name: jnp.asarray(late, float) for name, late in delays.items()}
+    numbers = split_entries(whole) | {DELAY + name: on_device(float(late)) for name, late in delays.items()}
     ranges |= {DELAY + name: Range("s", 0.0) for name in delays}
     for name, span in settings.limits.items():
         low, high = _limits(name, span)
@@ -236,7 +247,7 @@ def _numbers(
         if high is not None and (declared.upper is None or float(high) <= declared.upper):
             declared = replace(declared, upper=float(high))
         ranges[name] = declared
-        if not isinstance(declared.lower, str) and not bool(declared.holds(numbers[name], {})):
+        if not isinstance(declared.lower, str) and not declared.holds(np.asarray(numbers[name]), {}):
             raise ValueError(f"limits: {name} must be {declared.text}, but it is {numbers[name]}.")
     return numbers, ranges
 
@@ -264,23 +275,21 @@ def _bases(
     q, qd = [], []
     for i, first in zip(windows.record, windows.first, strict=True):
         if first == 0:
-            q.append(np.asarray(states.q[i]))
-            qd.append(np.asarray(states.qd[i]))
+            q.append(np.asarray(states.q)[i])
+            qd.append(np.asarray(states.qd)[i])
             continue
         rest = records[i].samples(first, len(records[i].t))
         start = measured_start(rest, observables, dof, exact=False)
         q.append(start[0])
         qd.append(start[1])
-    return jax.vmap(lambda q, qd: State(q, qd, scene.initial_state(q)))(
-        jnp.asarray(np.stack(q)), jnp.asarray(np.stack(qd))
-    )
+    return initial_states(scene, *(on_device(np.stack(each)) for each in (q, qd)))
 
 
 def _engine(
     scene: Scene, records: tuple[Record, ...], settings: Settings, observables: tuple[tuple[str, Observable], ...]
 ) -> ReplayEngine | EventEngine:
     linear = records[0].linear
-    delays = {DELAY + name: jnp.asarray(late, float) for name, late in settings.delay.items()}
+    delays = {DELAY + name: on_device(float(late)) for name, late in settings.delay.items()}
     if not scene.mode_names:
         return ReplayEngine(scene, delays, settings.controller, observables, linear, settings.substeps)
     if settings.controller is not None:
@@ -326,8 +335,8 @@ def _prior(prior: Mapping[str, tuple[float, float]], names: tuple[str, ...]) -> 
         if not deviation > 0:
             raise ValueError(f"prior of {name} must be a mean and a standard deviation > 0, but it is {prior[name]}.")
     return Prior(
-        jnp.asarray([float(prior[name][0]) if name in prior else 0.0 for name in names]),
-        jnp.asarray([1 / float(prior[name][1]) if name in prior else 0.0 for name in names]),
+        on_device([float(prior[name][0]) if name in prior else 0.0 for name in names]),
+        on_device([1 / float(prior[name][1]) if name in prior else 0.0 for name in names]),
     )
 
 
@@ -358,10 +367,10 @@ def step_error(search: SearchResult) -> float | None:
         engine.model, engine.delays, engine.controller, engine.observables, engine.linear, _FINER * engine.substeps
     )
     fine = channels_seen(eqx.tree_at(lambda p: p.engine, problem, finer), search.state.x)
-    name, weight = next(iter(problem.columns.items()))
-    coarse = jnp.reshape(search.state.residual[: problem.samples], weight.shape) * problem.noise[name]
-    moved = jnp.where(weight > 0, fine[name] - problem.runs.measured[name] - coarse, 0.0)
-    return float(jnp.sqrt(jnp.sum(moved**2) / jnp.sum(weight)))
+    name, weight = next((name, np.asarray(weight)) for name, weight in problem.columns.items())
+    coarse = np.asarray(search.state.residual)[: problem.samples].reshape(weight.shape) * float(problem.noise[name])
+    moved = np.asarray(fine[name]) - np.asarray(problem.runs.measured[name]) - coarse
+    return float(np.sqrt(np.sum(moved[weight > 0] ** 2) / np.sum(weight)))
 
 
 def measured_start(

@@ -2,26 +2,29 @@
 
 import abc
 import re
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
+from ..._core.device import on_device
 from ..._core.parameters import Number, check_ranges, parameter
 from ...scene import State, replace_numbers, scene_numbers
 from ..data._record import Runs, slip_channel
 from ..model._engines import ModelOutput
-from ..model._parameters import FreeParameters
+from ..model._parameters import FreeParameters, ParameterPoint
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractClassVar
 else:
     from equinox import AbstractClassVar
 
+_Rows = TypeVar("_Rows", Array, np.ndarray)
 _LOCAL = re.compile(r"(q0|qd0)\[(\d+)\]|z0\.(.+?)(?:\[(\d+)\])?")
 
 
@@ -190,7 +193,8 @@ class FitProblem(eqx.Module):
     @property
     def x0(self) -> Float[Array, " n"]:
         """Where the search starts."""
-        return jnp.concatenate([self.free.x0, jnp.zeros(self.count * len(self.local), self.free.x0.dtype)])
+        x0 = np.asarray(self.free.x0)
+        return on_device(np.concatenate([x0, np.zeros(self.count * len(self.local), x0.dtype)]))
 
     @property
     def box(self) -> Box:
@@ -207,6 +211,10 @@ class FitProblem(eqx.Module):
         """Coordinates of the parameters, and those of the initial states."""
         size = len(self.free.names)
         return x[:size], jnp.reshape(x[size:], (self.count, len(self.local)))
+
+    def at(self, x: ArrayLike) -> ParameterPoint:
+        """The parameters at an x that is known, shape `[n]`."""
+        return self.free.at(np.asarray(x)[: len(self.free.names)])
 
     def start_of(self, base: State | None, moved: Float[Array, " local"]) -> State | None:
         """Initial state of one run."""
@@ -294,7 +302,7 @@ class FitProblem(eqx.Module):
         numbers = scene_numbers(self.engine.model)
         if name not in numbers:
             raise ValueError(f"The model has no number {name!r}; it has: {', '.join(numbers)}.")
-        model = replace_numbers(self.engine.model, {name: factor * numbers[name]})
+        model = replace_numbers(self.engine.model, {name: on_device(factor * np.asarray(numbers[name]))})
         return eqx.tree_at(lambda p: p.engine.model, self, model)
 
     @property
@@ -304,9 +312,9 @@ class FitProblem(eqx.Module):
         columns = {name: self.runs.weight[name] for name in sorted(self.runs.weight)}
         return columns | {slip_channel(name): self.runs.slip_weight[name] for name in sorted(self.runs.slip_weight)}
 
-    def by_channel(self, rows: Float[Array, " rows"]) -> dict[str, tuple[Array, Array]]:
-        """Rows of the residual and weights of each channel, shape `[runs, samples]` each."""
-        table, split, at = jnp.reshape(rows[: self.samples], (self.count, -1)), {}, 0
+    def by_channel(self, rows: _Rows) -> dict[str, tuple[_Rows, Array]]:
+        """Rows of the residual, shape `[rows]`, and weights of each channel, shape `[runs, samples]` each."""
+        table, split, at = rows[: self.samples].reshape(self.count, -1), {}, 0
         for name, weight in self.columns.items():
             split[name] = table[:, at : at + weight.shape[1]], weight
             at += weight.shape[1]
@@ -324,6 +332,6 @@ class FitProblem(eqx.Module):
         return self.samples + len(self.free.names) + links
 
     @property
-    def weights(self) -> Float[Array, " samples"]:
+    def weights(self) -> Float[np.ndarray, " samples"]:
         """1 for each sample row that counts, 0 for the others."""
-        return jnp.reshape(jnp.concatenate([*self.columns.values()], axis=1), (-1,))
+        return np.concatenate([np.asarray(weight) for weight in self.columns.values()], axis=1).reshape(-1)

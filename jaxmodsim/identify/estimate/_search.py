@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from ..._core.device import on_device
+from ..data._record import Windows
 from ._problem import AbstractLoss, Box, FitProblem
 
 # `x` -> residual and its Jacobian.
@@ -17,11 +19,16 @@ Evaluate: TypeAlias = Callable[[Float[Array, " n"]], tuple[Float[Array, " m"], F
 # A step whose effect on the residual is smaller than this against the residual itself is lost in rounding.
 _ROUNDING = 8.0
 _LARGEST_DAMPING = 1e14
+# Damping of the first step, and what a refused one multiplies it by.
+_DAMPING, _GROWTH = 1e-3, 2.0
 # The cost is flat to second order around its minimum, so it must be known better than the parameters.
 _FLAT = 0.1
 # Models that stick and slip by fixed steps have a cost with small steps in it, on which a search never ends by itself:
 # it has settled after so many evaluations in a row that each lowered the cost by less than so many `rtol` of itself.
 _PATIENCE, _SLOW = 8, 10.0
+# Iterations after which a search that has not ended begins anew where it is. A long curved valley leaves it with a
+# damping that suits the last bend only.
+_ROUND = 100
 # Called after each iteration with its number, the root mean square of the residual and the parameters by name.
 Progress: TypeAlias = Callable[[int, float, dict[str, float]], None]
 # Noise levels that are estimated are estimated again until they settle.
@@ -51,18 +58,11 @@ class SearchState(NamedTuple):
 
 def start_search(x: Float[Array, " n"], rows: int) -> SearchState:
     """A search that knows nothing yet: its first iteration evaluates `x`."""
-    inf, zero = jnp.asarray(jnp.inf, x.dtype), jnp.asarray(0.0, x.dtype)
-    return SearchState(
-        x,
-        jnp.zeros(rows, x.dtype),
-        jnp.zeros((rows, x.shape[0]), x.dtype),
-        inf,
-        zero + 1e-3,
-        zero + 2.0,
-        jnp.asarray(0),
-        jnp.asarray(0),
-        jnp.asarray(0),
-    )
+    cost, damping, growth = (on_device(np.asarray(each, x.dtype)) for each in (np.inf, _DAMPING, _GROWTH))
+    residual = on_device(np.zeros(rows, x.dtype))
+    jacobian = on_device(np.zeros((rows, x.shape[0]), x.dtype))
+    none = on_device(0)
+    return SearchState(x, residual, jacobian, cost, damping, growth, none, none, none)
 
 
 def levenberg_marquardt_step(
@@ -114,7 +114,7 @@ def levenberg_marquardt_step(
         jnp.where(better, trial_jacobian, state.jacobian),
         jnp.where(better, cost, state.cost),
         damping,
-        jnp.where(better, 2.0, 2.0 * state.growth),
+        jnp.where(better, _GROWTH, 2.0 * state.growth),
         state.steps + 1,
         slow,
         jnp.where(state.done > 0, state.done, done),
@@ -126,23 +126,38 @@ class SearchOptions:
     """How a search is run: relative tolerance, limit of iterations, who is told."""
 
     rtol: float = 1e-6
-    max_steps: int = 100
+    max_steps: int = 400
     progress: Progress | None = None
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Where a search ended: the problem with the noise levels it ended with, the last iterate, and how it ended."""
+    """Where a search ended: the problem with the noise levels it ended with, the last iterate, and how it ended.
+
+    - `windows`: what its runs are of; None until it is the search of a result.
+    """
 
     problem: FitProblem
     state: SearchState
     iterations: int
     ending: str
+    windows: Windows | None = None
 
     @property
     def converged(self) -> bool:
         """Whether it ended by itself."""
-        return self.ending in ENDINGS.values()
+        return ended_by_itself(self.ending)
+
+
+def ended_by_itself(ending: str) -> bool:
+    """Whether the words for the end of a search are of one that needed no limit."""
+    return ending.startswith(tuple(ENDINGS.values()))
+
+
+def continued(ending: str, times: int, where: str) -> str:
+    """The words for the end of a search with how often it went on by itself, and where."""
+    often = "once" if times == 1 else f"{times} times"
+    return f"{ending}; continued {often} {where}" if times else ending
 
 
 @eqx.filter_jit
@@ -164,21 +179,26 @@ def _beside(done: Array, like: Array) -> Array:
 
 
 def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> SearchResult:
-    """Search from `x`.
+    """Search from `x`; after each hundred iterations it goes on with a damping as at the start, to the limit of all.
 
     **Raises:**
 
     - `ValueError` if there are no more samples than free parameters.
     - `RuntimeError` if the model is not finite at the start.
     """
-    counted = int(jnp.sum(problem.weights > 0)) + int(jnp.sum(problem.prior.weight > 0))
+    counted = int(np.sum(problem.weights > 0)) + int(np.sum(np.asarray(problem.prior.weight) > 0))
     unknown = x.shape[0]
     if counted <= unknown:
         raise ValueError(f"{counted} samples are too few for {unknown} free parameters.")
-    rtol = jnp.asarray(options.rtol, x.dtype)
-    state, best = start_search(x, problem.rows), None
+    rtol = on_device(np.asarray(options.rtol, x.dtype))
+    state, best, rounds = start_search(x, problem.rows), None, 0
+    at = f"after {_ROUND} iterations each"
     try:
         for iteration in range(1, options.max_steps + 1):
+            if iteration > 1 and iteration % _ROUND == 1:
+                rounds += 1
+                fresh = start_search(state.x, problem.rows)
+                state = state._replace(damping=fresh.damping, growth=fresh.growth)
             state = step(problem, state, rtol)
             if iteration == 1 and not np.isfinite(float(state.cost)):
                 raise RuntimeError(
@@ -187,16 +207,17 @@ def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
                 )
             best = state
             if options.progress is not None:
-                values = problem.free.values(problem.split(state.x)[0])
+                values = problem.at(state.x).values
                 shown = {name: float(values[name]) for name in problem.free.names}
                 options.progress(iteration, _rms(problem, state), shown)
             if int(state.done):
-                return SearchResult(problem, state, int(state.steps), ENDINGS[int(state.done)])
+                return SearchResult(problem, state, int(state.steps), continued(ENDINGS[int(state.done)], rounds, at))
     except KeyboardInterrupt:
         if best is None:
             raise  # nothing was computed yet
         return SearchResult(problem, best, int(best.steps), "interrupted; these are the best values so far")
-    return SearchResult(problem, state, int(state.steps), f"stopped at the limit of {options.max_steps} iterations")
+    ending = f"stopped at the limit of {options.max_steps} iterations (max_steps)"
+    return SearchResult(problem, state, int(state.steps), continued(ending, rounds, at))
 
 
 @eqx.filter_jit
@@ -205,10 +226,28 @@ def channels_seen(problem: FitProblem, x: Float[Array, " n"]) -> dict[str, Float
     return problem.seen(x).channels
 
 
+@eqx.filter_jit
+def cost_of(loss: AbstractLoss, residual: Float[Array, " m"]) -> Float[Array, ""]:
+    """Half the sum of the losses of a residual that is known."""
+    return loss.cost(residual)
+
+
+def weighted_by(loss: AbstractLoss, state: SearchState) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
+    """Residual and Jacobian of a search whose least squares have the gradient of the cost, see `AbstractLoss`."""
+    pair = state.residual, state.jacobian
+    residual, jacobian = _weighted(loss, *pair) if loss.robust else pair
+    return np.asarray(residual), np.asarray(jacobian)
+
+
+@eqx.filter_jit
+def _weighted(loss: AbstractLoss, residual: Array, jacobian: Array) -> tuple[Array, Array]:
+    return loss.weighted(residual, jacobian)
+
+
 def _rms(problem: FitProblem, state: SearchState) -> float:
     """Root mean square of the residual: in the unit of the channel where there is one, in noise levels otherwise."""
     samples = np.asarray(state.residual)[: problem.samples]
-    rms = float(np.sqrt(np.sum(samples**2) / max(float(jnp.sum(problem.weights)), 1.0)))
+    rms = float(np.sqrt(np.sum(samples**2) / max(float(np.sum(problem.weights)), 1.0)))
     return rms * float(next(iter(problem.noise.values()))) if len(problem.noise) == 1 else rms
 
 
@@ -223,11 +262,13 @@ def solve_with_noise(
     search = solve(problem, x, options)
     if not set(problem.noise) - given:
         return search
-    single = len(problem.noise) == 1 and not problem.loss.robust and float(jnp.max(problem.prior.weight)) == 0
+    single = (
+        len(problem.noise) == 1 and not problem.loss.robust and float(np.max(np.asarray(problem.prior.weight))) == 0
+    )
     single = single and problem.jump is None
     for _ in range(_NOISE_ROUNDS):
         levels = estimated_noise(search, given)
-        changes = [abs(float(levels[k] / search.problem.noise[k]) - 1) for k in levels]
+        changes = [abs(float(levels[k]) / float(search.problem.noise[k]) - 1) for k in levels]
         problem = eqx.tree_at(lambda p: p.noise, search.problem, levels)
         if single or search.ending.startswith("interrupted") or max(changes) < _NOISE_SETTLED:
             return _rescaled(search, problem)
@@ -245,25 +286,24 @@ def estimated_noise(search: SearchResult, given: frozenset[str]) -> dict[str, Ar
         own = residual[weight > 0]
         size = 1.4826 * np.median(np.abs(own)) if problem.loss.robust else np.sqrt(np.mean(own**2))
         floor = 10 * float(jnp.finfo(levels[name].dtype).eps)  # of a model that is exact
-        levels[name] = levels[name] * max(float(size), floor)
+        levels[name] = on_device(np.asarray(levels[name]) * np.asarray(max(float(size), floor), levels[name].dtype))
     return levels
 
 
-def by_channel(problem: FitProblem, residual: Array) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def by_channel(problem: FitProblem, residual: Array | np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Residual in noise levels and weight of each channel, shape `[runs, samples]`."""
-    return {
-        name: (np.asarray(rows), np.asarray(weight)) for name, (rows, weight) in problem.by_channel(residual).items()
-    }
+    split = problem.by_channel(np.asarray(residual))
+    return {name: (rows, np.asarray(weight)) for name, (rows, weight) in split.items()}
 
 
 def _rescaled(search: SearchResult, problem: FitProblem) -> SearchResult:
     """The same iterate in the noise levels of `problem`."""
     old = search.problem
-    factors = [jnp.full(weight.shape, old.noise[name] / problem.noise[name]) for name, weight in old.columns.items()]
-    factor = jnp.reshape(jnp.concatenate(factors, axis=1), (-1,))
-    factor = jnp.concatenate([factor, jnp.ones(old.rows - old.samples, factor.dtype)])
-    residual = search.state.residual * factor
-    state = search.state._replace(
-        residual=residual, jacobian=search.state.jacobian * factor[:, None], cost=old.loss.cost(residual)
-    )
+    ratio = {name: np.asarray(level) / np.asarray(problem.noise[name]) for name, level in old.noise.items()}
+    factors = [np.full(weight.shape, ratio[name]) for name, weight in old.columns.items()]
+    factor = np.concatenate(factors, axis=1).reshape(-1)
+    factor = np.concatenate([factor, np.ones(old.rows - old.samples, factor.dtype)])
+    residual = on_device(np.asarray(search.state.residual) * factor)
+    jacobian = on_device(np.asarray(search.state.jacobian) * factor[:, None])
+    state = search.state._replace(residual=residual, jacobian=jacobian, cost=cost_of(old.loss, residual))
     return SearchResult(problem, state, search.iterations, search.ending)

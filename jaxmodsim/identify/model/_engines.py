@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from ..._core.device import on_device
 from ...friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw
 from ...scene import Scene, Signal, State, replace_numbers, scene_numbers, vector_field
 from ...simulation import Trajectory, simulate
@@ -253,7 +254,11 @@ class EventEngine(eqx.Module):
 
 def with_values(model: _Model, values: Mapping[str, ArrayLike]) -> _Model:
     """The scene or law with numbers of these names replaced; delays are none of them."""
-    own = {name: jnp.asarray(x) for name, x in values.items() if not name.startswith(DELAY)}
+    own = {
+        name: x if isinstance(x, jax.Array) else on_device(x)
+        for name, x in values.items()
+        if not name.startswith(DELAY)
+    }
     return replace_numbers(model, join_entries(scene_numbers(model), own))
 
 

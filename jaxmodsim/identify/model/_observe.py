@@ -4,12 +4,14 @@ import re
 from collections.abc import Callable, Mapping
 from typing import NamedTuple, TypeAlias
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ..._core.arguments import as_mapping, did_you_mean
+from ..._core.device import on_device
 from ..._core.index_check import traced
 from ...scene import Friction, Scene, State, forward_dynamics
 from ..data._record import Record
@@ -175,11 +177,15 @@ def slip_of(effect: Friction | None, motion: RecordedMotion, params: PyTree, dof
     if effect is None:
         return _slipped(motion.t, motion.qd[0])
     q, qd = (np.stack([each[i] for i in range(dof)], axis=1) for each in (motion.q, motion.qd))
-    states = (jnp.asarray(motion.t), jnp.asarray(q), jnp.asarray(qd))
-    v = np.asarray(jax.vmap(lambda t, q, qd: effect.slip(t, q, qd, params))(*states))
+    v = np.asarray(_slips(effect, params, *(on_device(each) for each in (motion.t, q, qd))))
     if v.ndim > 1 or not np.isfinite(v).all():
         return None
     return _slipped(motion.t, v)
+
+
+@eqx.filter_jit
+def _slips(effect: Friction, params: PyTree, t: Array, q: Array, qd: Array) -> Array:
+    return jax.vmap(lambda t, q, qd: effect.slip(t, q, qd, params))(t, q, qd)
 
 
 def _slipped(t: np.ndarray, v: np.ndarray) -> Slip:

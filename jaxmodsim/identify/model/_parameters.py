@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from ..._core.device import on_device
 from ..._core.parameters import Range
 from ...friction import AbstractLaw
 from ...scene import Scene, replace_numbers, scene_numbers
@@ -23,7 +24,8 @@ _MOST_DECADES, _LONGEST_LOG_STEP = 60.0, 1.5
 # Least distance from a limit that a logarithm is taken of, and least unit of a parameter without limits.
 _LEAST_DISTANCE, _LEAST_UNIT = 1e-30, 1e-12
 
-_Number = TypeVar("_Number", float, Array)
+_Number = TypeVar("_Number", float, Array, np.ndarray)
+_Known = TypeVar("_Known", Array, np.ndarray)
 
 
 def entry_names(name: str, number: ArrayLike) -> tuple[str, ...]:
@@ -163,7 +165,7 @@ class FreeParameters(eqx.Module):
         for name in moving:
             _append_after(name, floors, order)
         strict = {name for name in free if name in ranges and ranges[name].strict}
-        upper = {name: ranges[name].upper for name in free if name in ranges and ranges[name].upper is not None}
+        upper = {name: most for name in free if name in ranges and (most := ranges[name].upper) is not None}
         upper |= {
             name: max(most * values[str(ranges[name].lower)], values[name])
             for name in free
@@ -202,11 +204,11 @@ class FreeParameters(eqx.Module):
             _order=tuple(order),
             _kinds=tuple(kinds[name] for name in order),
             _bases=tuple(x if isinstance(x := floors[name], str | tuple) else None for name in order),
-            start={name: jnp.asarray(x) for name, x in start.items()},
-            _floors={name: jnp.asarray(numeric.get(name, 0.0)) for name in order},
-            _units={name: jnp.asarray(x) for name, x in units.items()},
-            _upper={name: jnp.asarray(x) for name, x in upper.items()},
-            _most={name: jnp.asarray(x) for name, x in most.items()},
+            start={name: on_device(x) for name, x in start.items()},
+            _floors={name: on_device(numeric.get(name, 0.0)) for name in order},
+            _units={name: on_device(x) for name, x in units.items()},
+            _upper={name: on_device(x) for name, x in upper.items()},
+            _most={name: on_device(x) for name, x in most.items()},
         )
 
     @property
@@ -223,7 +225,7 @@ class FreeParameters(eqx.Module):
     def _kind(self, name: str) -> str:
         return self._kinds[self._order.index(name)]
 
-    def _floor(self, name: str, values: Mapping[str, Array]) -> Array:
+    def _floor(self, name: str, values: Mapping[str, _Known]) -> _Known | Array:
         base = self._bases[self._order.index(name)]
         if base is None:
             return self._floors[name]
@@ -245,8 +247,13 @@ class FreeParameters(eqx.Module):
 
     def coordinates(self, values: Mapping[str, ArrayLike]) -> Float[Array, " free"]:
         """The x at which the parameters are these `values`, moved into the limits."""
+        dtype = jnp.result_type(float)
+        return _coordinates(
+            self, {**self.start, **{name: on_device(np.asarray(x, dtype)) for name, x in values.items()}}
+        )
+
+    def _coordinates(self, known: Mapping[str, Array]) -> Float[Array, " free"]:
         coordinates: dict[str, Array] = {}
-        known = {**self.start, **{name: jnp.asarray(x, float) for name, x in values.items()}}
         for name in self.names:
             floor, kind = self._floor(name, known), self._kind(name)
             over = (known[name] / floor - 1.0 if kind == "ratio" else known[name] - floor) / self._units[name]
@@ -275,17 +282,16 @@ class FreeParameters(eqx.Module):
                 upper.append(jnp.asarray(_MOST_DECADES if self._kind(name) == "log" else jnp.inf, float))
         return lower, _stack(upper)
 
-    def limits(self, x: Float[Array, " free"]) -> dict[str, tuple[float, float]]:
+    def limits(self, x: ArrayLike) -> dict[str, tuple[float, float]]:
         """Lower and upper limit of each parameter where the others are as at `x`."""
-        values = {**self.start, **self.values(x)}
+        values = {name: np.asarray(each) for name, each in {**self.start, **self.at(x).values}.items()}
+        floors = {name: float(self._floor(name, values)) for name in self.names}
         return {
             name: (
-                -math.inf if self._kind(name) == "line" else float(self._floor(name, values)),
-                float(
-                    self._most[name] * self._floor(name, values)
-                    if name in self._most
-                    else self._upper.get(name, math.inf)
-                ),
+                -math.inf if self._kind(name) == "line" else floors[name],
+                float(self._most[name]) * floors[name]
+                if name in self._most
+                else float(self._upper.get(name, math.inf)),
             )
             for name in self.names
         }
@@ -321,6 +327,37 @@ class FreeParameters(eqx.Module):
         if not self.names:
             return jnp.zeros((0, 0), x.dtype)
         return jax.jacfwd(self.vector)(x)
+
+    def at(self, x: ArrayLike) -> "ParameterPoint":
+        """The parameters at `x`, shape `[free]`, which is known; for what is not compiled itself."""
+        values, slopes, lower, upper = _parameters_at(self, on_device(x))
+        values = {name: np.asarray(each) for name, each in values.items()}
+        vector = np.array([values[name] for name in self.names], lower.dtype)
+        return ParameterPoint(values, vector, *(np.asarray(each) for each in (slopes, lower, upper)))
+
+
+class ParameterPoint(NamedTuple):
+    """The parameters at a point.
+
+    - `values`: by name, those that follow included. `vector`: those that are free, in their order, shape `[free]`.
+    - `slopes`: their derivatives by x, shape `[free, free]`. `lower`, `upper`: bounds of x, shape `[free]`.
+    """
+
+    values: dict[str, np.ndarray]
+    vector: Float[np.ndarray, " free"]
+    slopes: Float[np.ndarray, "free free"]
+    lower: Float[np.ndarray, " free"]
+    upper: Float[np.ndarray, " free"]
+
+
+@eqx.filter_jit
+def _parameters_at(free: FreeParameters, x: Float[Array, " free"]) -> tuple[dict[str, Array], Array, Array, Array]:
+    return free.values(x), free.slopes(x), *free.bounds
+
+
+@eqx.filter_jit
+def _coordinates(free: FreeParameters, known: dict[str, Array]) -> Float[Array, " free"]:
+    return free._coordinates(known)
 
 
 def _stack(entries: list[Array]) -> Float[Array, " free"]:

@@ -102,7 +102,7 @@ class RecordAgreement:
         return "\n".join(lines)
 
 
-def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 100) -> RecordAgreement:
+def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 400) -> RecordAgreement:
     """Fit each record by itself, from the fit to all, and test whether the parameters are the same.
 
     For each parameter the sum of squared distances from its weighted mean, in standard errors, is held against its
@@ -147,8 +147,8 @@ def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 100) -
         if not bool(jnp.isfinite(search.state.cost)):
             raise RuntimeError(f"The fit to {record} alone ended with values that are not finite.")
         blocks = blocks_that_are_independent(search)
-        covariance = np.array(covariance_of(alone, search.state, len(problem.free.names), blocks).covariance)
-        value = np.asarray(problem.free.vector(search.state.x[: len(problem.free.names)]))
+        covariance = covariance_of(alone, search.state, len(problem.free.names), blocks).covariance
+        value = alone.at(search.state.x).vector
         limits = problem.free.limits(search.state.x[: len(problem.free.names)])
         at_limit = [x in limits[name] for name, x in zip(problem.free.names, value.tolist(), strict=True)]
         covariance[np.diag_indices(len(value))] = np.where(at_limit, np.nan, np.diag(covariance))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..._core.device import on_device
 from ..._core.parameters import ranges_of
 from ..._core.progress import candidate_words, reported
 from ...friction import AbstractLaw
@@ -58,7 +59,7 @@ def _from_smaller(free: Sequence[str], judged: Mapping[str, CrossValidated]) -> 
     """From the fit of the largest model all of whose parameters are among `free`, by the last parts of their names."""
     names = {last_part(name) for name in free}
     fitted = [
-        {last_part(name): jnp.asarray(each.values[name], float) for name in _finished(each.search).problem.free.names}
+        {last_part(name): on_device(each.values[name]) for name in _finished(each.search).problem.free.names}
         for each, _, _ in judged.values()
     ]
     nested = [values for values in fitted if set(values) <= names]
@@ -113,7 +114,7 @@ def compare(
     loss: AbstractLoss | None = None,
     initializer: AbstractInitializer | Sequence[AbstractInitializer] = (),
     substeps: int = 1,
-    max_steps: int = 100,
+    max_steps: int = 400,
     progress: bool | CompareProgress = False,
 ) -> Comparison:
     """Fit several models to the same records, and judge each by its error on what it was not fitted to.
@@ -199,7 +200,7 @@ def compare_laws(
     folds: int = 4,
     loss: AbstractLoss | None = None,
     initializer: AbstractInitializer | Sequence[AbstractInitializer] = (),
-    max_steps: int = 100,
+    max_steps: int = 400,
     progress: bool | CompareProgress = False,
 ) -> Comparison:
     """Fit several friction laws to a measured force under a measured motion, and judge each by what was held back.
@@ -312,7 +313,7 @@ def _finished(search: SearchResult | None) -> SearchResult:
     assert search is not None
     if search.ending.startswith("interrupted"):
         raise KeyboardInterrupt
-    if not bool(jnp.isfinite(search.state.cost)):
+    if not np.isfinite(float(search.state.cost)):
         raise RuntimeError("The fit ended with values that are not finite.")
     return search
 
@@ -424,7 +425,7 @@ def _span(record: Record) -> float:
 def _at(problem: FitProblem, search: SearchResult) -> Float[Array, " n"]:
     """The parameters that were found, and the start states of the problem as they are."""
     size = len(problem.free.names)
-    return jnp.concatenate([search.state.x[:size], problem.x0[size:]])
+    return on_device(np.concatenate([np.asarray(search.state.x)[:size], np.asarray(problem.x0)[size:]]))
 
 
 def _apart(scene: Scene, records: tuple[Record, ...], starts: State, search: SearchResult, asked: _Asked) -> FitProblem:
@@ -438,27 +439,28 @@ def _apart(scene: Scene, records: tuple[Record, ...], starts: State, search: Sea
 def _reached(search: SearchResult, records: tuple[Record, ...], folds: int) -> State:
     """States of the fit where windows begin, with a leading axis of windows: runs that end there."""
     problem, x = search.problem, search.state.x
-    first = problem.starts(x)
     before = []
     for i, record in enumerate(records):
         edges = np.cumsum([len(window.t) for window in record.windows(_span(record) / folds)])[:-1]
         before += [record.samples(0, int(edge) + 1, f"{i} {edge}") for edge in edges]
     runs = runs_of(tuple(before), cut(tuple(before), None))
-    own = jnp.repeat(jnp.arange(len(records)), folds - 1)
-    ends = _ends(problem, x, jax.tree.map(lambda x: x[own], first), runs)
+    first, ends = _ends(problem, x, on_device(np.repeat(np.arange(len(records)), folds - 1)), runs)
 
     def merge(start: Array, end: Array) -> Array:
-        later = jnp.reshape(end, (len(records), folds - 1, *end.shape[1:]))
-        both = jnp.concatenate([start[:, None], later], axis=1)
-        return jnp.reshape(both, (len(records) * folds, *end.shape[1:]))
+        later = np.asarray(end).reshape(len(records), folds - 1, *end.shape[1:])
+        both = np.concatenate([np.asarray(start)[:, None], later], axis=1)
+        return on_device(both.reshape(len(records) * folds, *end.shape[1:]))
 
     return jax.tree.map(merge, first, ends)
 
 
 @eqx.filter_jit
-def _ends(problem: FitProblem, x: Array, starts: State, runs: Runs) -> State:
-    values = problem.free.values(problem.split(x)[0])
-    return jax.vmap(lambda start, run: problem.engine(values, start, run).end)(starts, runs)
+def _ends(problem: FitProblem, x: Array, own: Int[Array, " runs"], runs: Runs) -> tuple[State, State]:
+    """Where the records start, and where runs from the starts of the records `own` end."""
+    values, first = problem.free.values(problem.split(x)[0]), problem.starts(x)
+    assert first is not None  # of a scene
+    starts = jax.tree.map(lambda leaf: leaf[own], first)
+    return first, jax.vmap(lambda start, run: problem.engine(values, start, run).end)(starts, runs)
 
 
 def _measured_starts(search: SearchResult, asked: _Asked) -> State:

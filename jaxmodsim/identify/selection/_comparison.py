@@ -4,13 +4,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.device import on_device
 from ..._core.files import jsonable
 from ..estimate._problem import AbstractLoss
-from ..estimate._search import SearchResult
+from ..estimate._search import SearchResult, cost_of, weighted_by
 from ..estimate._search import by_channel as residual_by_channel
 from ..uncertainty._estimate import sample_blocks
 from ..uncertainty._result import FitResult
@@ -36,7 +36,7 @@ def deviance(search: SearchResult) -> float:
     problem = search.problem
     counts = {name: int(np.sum(np.asarray(weight) > 0)) for name, weight in problem.columns.items()}
     levels = sum(count * 2 * float(np.log(float(problem.noise[name]))) for name, count in counts.items())
-    return levels + 2 * float(problem.loss.cost(search.state.residual[: problem.samples]))
+    return levels + 2 * float(cost_of(problem.loss, on_device(np.asarray(search.state.residual)[: problem.samples])))
 
 
 def penalty(search: SearchResult) -> float:
@@ -48,15 +48,14 @@ def penalty(search: SearchResult) -> float:
     principal directions of H. A direction that the record does not determine counts as one parameter.
     """
     rows = search.problem.samples
-    weighted = search.problem.loss.weighted(search.state.residual[:rows], search.state.jacobian[:rows])
-    residual, jacobian = (np.asarray(each) for each in weighted)
+    residual, jacobian = (each[:rows] for each in weighted_by(search.problem.loss, search.state))
     size = np.linalg.norm(jacobian, axis=0)
     scaled = jacobian / np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh(scaled.T @ scaled)
     known = values > _LEAST * values[-1]
     blocks, count = sample_blocks(search.problem)
     scores = np.zeros((count, len(size)))
-    np.add.at(scores, np.asarray(blocks), scaled * residual[:, None])
+    np.add.at(scores, blocks, scaled * residual[:, None])
     across = (scores - np.mean(scores, axis=0)) @ vectors[:, known]
     return float(np.sum(across**2 / values[known]) * count / (count - 1) + np.sum(~known))
 
@@ -324,7 +323,7 @@ def comparison_of(
         for channel in next(iter(searches.values())).problem.noise
     }
     fitted = {name: float(_root(_fitted(each), each.problem.loss, levels)) for name, each in searches.items()}
-    samples = int(jnp.sum(next(iter(searches.values())).problem.weights > 0))
+    samples = int(np.sum(next(iter(searches.values())).problem.weights > 0))
     effective = effective_samples(searches[min(fitted, key=lambda name: fitted[name])])
     losses = {name: _losses(each.held, searches[name].problem.loss, levels) for name, each in kept.items()}
     count = np.array([sum(len(x) for x in part.values()) for part in next(iter(kept.values())).held])
@@ -388,7 +387,7 @@ def _expected(
 
 def _mean(variances: Mapping[str, float], search: SearchResult, levels: Mapping[str, float]) -> float:
     """Over all samples, of variances in the noise levels of the search; in the squared unit of a single channel."""
-    count = {name: float(jnp.sum(search.problem.columns[name] > 0)) for name in variances}
+    count = {name: float(np.sum(np.asarray(search.problem.columns[name]) > 0)) for name in variances}
     ratio = {name: float(search.problem.noise[name]) / level for name, level in levels.items()}
     total = sum(count[name] * ratio[name] ** 2 * x for name, x in variances.items()) / sum(count.values())
     return (next(iter(levels.values())) ** 2 if len(levels) == 1 else 1.0) * total
@@ -418,7 +417,7 @@ def _mean_root(parts: tuple[Part, ...], loss: AbstractLoss, levels: Mapping[str,
 
 def _root(part: Part, loss: AbstractLoss, levels: Mapping[str, float]) -> float:
     """Root of the mean loss: with squares, the root mean square."""
-    total = sum(float(jnp.sum(loss.rho(jnp.asarray((x / levels[name]) ** 2)))) for name, x in part.items())
+    total = sum(float(np.sum(np.asarray(loss.rho(on_device((x / levels[name]) ** 2))))) for name, x in part.items())
     scale = next(iter(levels.values())) if len(levels) == 1 else 1.0
     return scale * float(np.sqrt(total / sum(len(x) for x in part.values())))
 

@@ -3,11 +3,10 @@
 from collections.abc import Collection, Iterable
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..._core.device import on_device
 from ..data._record import Record, Runs
 from ..estimate._problem import FitProblem, Prior
 from ..estimate._search import SearchOptions, SearchResult, SearchState, solve, start_search, step
@@ -47,8 +46,8 @@ def counting(problem: FitProblem, mask: np.ndarray, *, slips: bool = True) -> Fi
     """The problem in which only the samples in the mask count, and with `slips` slip instants of runs that have any."""
     own = np.any(mask, axis=1, keepdims=True) & slips
     runs = problem.runs._replace(
-        weight={name: jnp.where(mask, weight, 0.0) for name, weight in problem.runs.weight.items()},
-        slip_weight={name: jnp.where(own, weight, 0.0) for name, weight in problem.runs.slip_weight.items()},
+        weight={name: on_device(np.asarray(weight) * mask) for name, weight in problem.runs.weight.items()},
+        slip_weight={name: on_device(np.asarray(weight) * own) for name, weight in problem.runs.slip_weight.items()},
     )
     return eqx.tree_at(lambda p: p.runs, problem, runs)
 
@@ -62,7 +61,7 @@ def after(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
     """The residual at `x` of the samples behind the first ones."""
     rest = counting(problem, ~opening(problem.runs))
     # The first evaluation of a search, which has nothing to move by yet.
-    return rest, step(rest, start_search(x, rest.rows), jnp.asarray(options.rtol, x.dtype))
+    return rest, step(rest, start_search(x, rest.rows), on_device(np.asarray(options.rtol, x.dtype)))
 
 
 def pinned(problem: FitProblem, x: Float[Array, " n"], result: FitResult, free: Collection[str] = ()) -> FitProblem:
@@ -71,12 +70,14 @@ def pinned(problem: FitProblem, x: Float[Array, " n"], result: FitResult, free: 
     A quarter of the digits beyond what the records know of each parameter: it moves by no more than a
     millionth of its standard error, and the normal equations are still well scaled.
     """
-    mean = problem.free.vector(problem.split(x)[0])
-    stiff = float(jnp.finfo(mean.dtype).eps) ** -0.25
+    mean = problem.at(x).vector
+    stiff = float(np.finfo(mean.dtype).eps) ** -0.25
     known = np.sqrt(np.maximum(np.diag(result.estimate.information)[: len(mean)], 0.0))  # rounding may leave less
-    size = np.abs(np.asarray(mean))
+    size = np.abs(mean)
     weight = stiff * np.maximum(known, 1 / np.where(size > 0, size, 1.0))
     moves = np.array([name in free for name in problem.free.names], bool)
-    held = Prior(mean, jnp.asarray(weight, mean.dtype))
-    prior = jax.tree.map(lambda own, new: jnp.where(moves, own, new), problem.prior, held)
-    return eqx.tree_at(lambda p: p.prior, problem, prior)
+    held = Prior(
+        on_device(np.where(moves, np.asarray(problem.prior.mean), mean)),
+        on_device(np.where(moves, np.asarray(problem.prior.weight), weight).astype(mean.dtype)),
+    )
+    return eqx.tree_at(lambda p: p.prior, problem, held)

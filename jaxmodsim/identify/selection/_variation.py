@@ -3,10 +3,10 @@
 from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..._core.device import on_device
 from ..estimate._search import SearchResult, channels_seen
 from ..estimate._search import by_channel as residual_by_channel
 from ..uncertainty._estimate import covariance_of
@@ -32,7 +32,7 @@ def covariances(result: FitResult, variation: float, agreement: RecordAgreement 
     search = search_of(result, "A prediction")
     names, count = search.problem.free.names, len(result.provenance.records)
     blocks = blocks_that_are_independent(search)
-    own = np.asarray(covariance_of(search.problem, search.state, len(names), blocks).covariance)
+    own = covariance_of(search.problem, search.state, len(names), blocks).covariance
     known = np.isfinite(np.diag(own))
     own = np.where(np.outer(known, known), own, 0.0)
     level = np.array([result.values[name] * (name in friction_levels(result)) for name in names])
@@ -56,9 +56,9 @@ def mean_variances(search: SearchResult, covariance: _Matrix) -> dict[str, float
     - `covariance`: of the free parameters, by the same derivatives.
     """
     problem, size = search.problem, len(search.problem.free.names)
-    slopes = np.asarray(problem.free.slopes(search.state.x[:size]))
+    slopes = problem.at(search.state.x).slopes
     jacobian = np.asarray(search.state.jacobian)[: problem.samples, :size] @ np.linalg.pinv(slopes)
-    split = residual_by_channel(problem, jnp.asarray(np.sum((jacobian @ covariance) * jacobian, axis=1)))
+    split = residual_by_channel(problem, np.sum((jacobian @ covariance) * jacobian, axis=1))
     return {name: max(float(np.mean(x[weight > 0])), 0.0) for name, (x, weight) in split.items()}
 
 
@@ -77,9 +77,9 @@ def output_changes(
     - `covariance`: of the free parameters.
     - `seen`: the output at coordinates of the free parameters.
     """
-    free, size = search.problem.free, len(search.problem.free.names)
-    x, (lower, upper) = search.state.x[:size], free.bounds
-    back = np.linalg.pinv(np.asarray(free.slopes(x)))
+    size, here = len(search.problem.free.names), search.problem.at(search.state.x)
+    x = np.asarray(search.state.x)[:size]
+    back = np.linalg.pinv(here.slopes)
     scatter = back @ covariance @ back.T
     moving = np.flatnonzero(np.diag(scatter) > 0)
     if not moving.size:
@@ -93,8 +93,9 @@ def output_changes(
         axis = np.zeros(size)
         axis[moving] = np.sqrt(value) * scale * vector
         step = min(np.sqrt(3.0), _LONGEST / float(np.max(np.abs(axis))))
-        ahead, behind = (seen(jnp.clip(x + side * step * axis, lower, upper)) for side in (1.0, -1.0))
-        changes.append({name: np.asarray(ahead[name] - behind[name]) / (2 * step) for name in ahead})
+        ends = (np.clip(x + side * step * axis, here.lower, here.upper).astype(x.dtype) for side in (1.0, -1.0))
+        ahead, behind = (seen(on_device(end)) for end in ends)
+        changes.append({name: (np.asarray(ahead[name]) - np.asarray(behind[name])) / (2 * step) for name in ahead})
     return changes
 
 
@@ -103,9 +104,9 @@ def change_between(search: SearchResult, covariance: _Matrix) -> dict[str, float
 
     In squared noise levels.
     """
-    problem, size = search.problem, len(search.problem.free.names)
+    problem, starts = search.problem, np.asarray(search.state.x)[len(search.problem.free.names) :]
     changes = output_changes(
-        search, covariance, lambda x: channels_seen(problem, jnp.concatenate([x, search.state.x[size:]]))
+        search, covariance, lambda x: channels_seen(problem, on_device(np.concatenate([x, starts])))
     )
     found = {}
     for name, weight in problem.runs.weight.items():

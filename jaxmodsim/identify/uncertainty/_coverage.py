@@ -7,12 +7,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from ..estimate._initializers import AbstractInitializer, problem_at, run_initializers, side_by_side, starts_of
 from ..estimate._problem import FitProblem
 from ..estimate._search import SearchOptions, SearchState
-from ._estimate import covariance_inside, interval, sample_blocks
+from ._estimate import covariance_of, interval
 from ._result import FitResult
 
 
@@ -129,17 +129,9 @@ def _correlated(white: np.ndarray, memory: float) -> np.ndarray:
 
 def _estimates(problem: FitProblem, axes: FitProblem, state: SearchState) -> tuple[np.ndarray, np.ndarray]:
     """Parameters and standard errors of every repeat, shape `[repeats, free]`."""
-    blocks, count = sample_blocks(problem)
-
-    @eqx.filter_jit
-    def estimate(problem: FitProblem, state: SearchState, blocks: Array) -> tuple[Array, Array]:
-        size = len(problem.free.names)
-        covariance = covariance_inside(problem, state, blocks, count, size).covariance
-        return problem.free.vector(state.x[:size]), jnp.sqrt(jnp.diagonal(covariance))
-
-    values, errors = [], []
+    states, values, errors = jtu.tree_map(np.asarray, state), [], []
     for i in range(state.x.shape[0]):
-        value, error = estimate(problem_at(problem, axes, i), jtu.tree_map(lambda x, i=i: x[i], state), blocks)
-        values.append(np.asarray(value))
-        errors.append(np.asarray(error))
+        one, here = problem_at(problem, axes, i), jtu.tree_map(lambda x, i=i: x[i], states)
+        values.append(problem.at(here.x).vector)
+        errors.append(np.sqrt(np.diagonal(covariance_of(one, here, len(problem.free.names)).covariance)))
     return np.stack(values), np.stack(errors)

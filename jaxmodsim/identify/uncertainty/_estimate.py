@@ -2,18 +2,16 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import special  # scipy.stats takes most of a second to import
 
 from ..data._record import Record
 from ..estimate._problem import FitProblem
-from ..estimate._search import SearchState
+from ..estimate._search import SearchState, by_channel, weighted_by
 from ..model._observe import RecordedMotion, motion_of
 
 # Blocks of samples: enough for the scatter of the scores of a dozen parameters, and each far longer than what the
@@ -158,39 +156,39 @@ class CovarianceEstimate(NamedTuple):
     - `information`: Fisher information of the samples, in noise levels, and of the prior.
     """
 
-    covariance: Float[Array, "free free"]
-    white: Float[Array, "free free"]
-    information: Float[Array, "free free"]
+    covariance: Float[np.ndarray, "free free"]
+    white: Float[np.ndarray, "free free"]
+    information: Float[np.ndarray, "free free"]
 
 
 def block_numbers(
-    weights: Float[Array, "runs samples"], channels: int, blocks: int = BLOCKS
-) -> tuple[Int[Array, " rows"], int]:
+    weights: Float[np.ndarray, "runs samples"], channels: int, blocks: int = BLOCKS
+) -> tuple[Int[np.ndarray, " rows"], int]:
     """Number of the block of each sample row, in the order of the residual, and the number of blocks.
 
     All channels of a time are in one block. Runs share the blocks by their numbers of samples.
     """
     samples = weights.shape[1]
-    counts = [int(x) for x in jnp.sum(weights > 0, axis=1)]
+    counts = np.sum(weights > 0, axis=1).tolist()
     whole = sum(counts)
     numbers, used = [], 0
     for count in counts:
         own = max(round(blocks * count / whole), 1)
-        here = jnp.minimum(jnp.arange(samples) * own // max(count, 1), own - 1)
-        numbers.append(jnp.tile(used + here, channels))
+        here = np.minimum(np.arange(samples) * own // max(count, 1), own - 1)
+        numbers.append(np.tile(used + here, channels))
         used += own
-    return jnp.concatenate(numbers), used
+    return np.concatenate(numbers), used
 
 
 def covariance_estimate(
-    residual: Float[Array, " rows"],
-    jacobian: Float[Array, "rows n"],
-    extra: Float[Array, "others n"],
-    slopes: Float[Array, "n n"],
-    blocks: Int[Array, " rows"],
+    residual: Float[np.ndarray, " rows"],
+    jacobian: Float[np.ndarray, "rows n"],
+    extra: Float[np.ndarray, "others n"],
+    slopes: Float[np.ndarray, "n n"],
+    blocks: Int[np.ndarray, " rows"],
     count: int,
     kept: int,
-    white: Bool[Array, ""],
+    white: bool,
 ) -> CovarianceEstimate:
     """Covariance `H^-1 S H^-1` with S from the scatter of the scores of blocks of samples.
 
@@ -212,47 +210,57 @@ def covariance_estimate(
     - `kept`: number of parameters, the first entries of x; the others are nuisance.
     - `white`: whether the residual passes for white noise.
     """
+    rounding = ROUNDING * float(np.finfo(jacobian.dtype).eps)
+    residual, jacobian, extra = (each.astype(float) for each in (residual, jacobian, extra))
     n = jacobian.shape[1]
     beside = extra.T @ extra
     matrix = jacobian.T @ jacobian + beside
-    scale = jnp.sqrt(jnp.diagonal(matrix))
+    scale = np.sqrt(np.diagonal(matrix))
     silent = scale == 0
-    scale = jnp.where(silent, 1.0, scale)
-    bread = floored_inverse(matrix / jnp.outer(scale, scale), ROUNDING * float(jnp.finfo(matrix.dtype).eps))
-    scaled = jacobian / scale[None, :]
-    scores = jax.ops.segment_sum(scaled * residual[:, None], blocks, count)
+    scale = np.where(silent, 1.0, scale)
+    size = np.outer(scale, scale)
+    bread = floored_inverse(matrix / size, rounding)
+    scaled = jacobian / scale
+    scores = np.zeros((count, n))
+    for b in range(count):
+        here = scaled[blocks == b]
+        rest = np.eye(n) - here.T @ here @ bread
+        fair = abs(np.linalg.det(rest)) > _ALONE
+        scores[b] = np.linalg.solve(rest if fair else np.eye(n), here.T @ residual[blocks == b])
+    samples = np.sum(np.any(jacobian != 0, axis=1))
+    meat = scores.T @ scores * ((count - 1) / count) + beside / size
+    variance = np.sum(residual**2) / max(samples - n, 1)
+    if_white = (matrix - beside) / size * variance + beside / size
+    if white:
+        meat = meat + _chance(scores, meat - if_white, bread) * (if_white - meat)
+    change = slopes / scale
 
-    def fair_score(sample: tuple[Array, Array]) -> Array:
-        b, score = sample
-        own = jnp.where((blocks == b)[:, None], scaled, 0.0)
-        rest = jnp.eye(n, dtype=scaled.dtype) - own.T @ own @ bread
-        fair = jnp.abs(jnp.linalg.det(rest)) > _ALONE
-        return jnp.linalg.solve(jnp.where(fair, rest, jnp.eye(n, dtype=scaled.dtype)), score)
-
-    scores = jax.lax.map(fair_score, (jnp.arange(count), scores))
-    samples = jnp.sum(jnp.any(jacobian != 0, axis=1))
-    meat = scores.T @ scores * ((count - 1) / count) + beside / jnp.outer(scale, scale)
-    variance = jnp.sum(residual**2) / jnp.maximum(samples - n, 1)
-    if_white = (matrix - beside) / jnp.outer(scale, scale) * variance + beside / jnp.outer(scale, scale)
-    root = jnp.linalg.cholesky(bread)
-    products = jax.vmap(jnp.outer)(scores @ root, scores @ root)
-    chance = jnp.sum((products - jnp.mean(products, axis=0)[None]) ** 2)
-    share = jnp.minimum(chance / jnp.maximum(jnp.sum((root.T @ (meat - if_white) @ root) ** 2), _TINY), 1.0)
-    # Where a direction is not determined, the root may not exist.
-    meat = jnp.where(white & jnp.isfinite(share), meat + share * (if_white - meat), meat)
-    change = slopes / scale[None, :]
-
-    def of_parameters(middle: Array) -> Array:
+    def of_parameters(middle: np.ndarray) -> np.ndarray:
         covariance = (change @ middle @ change.T)[:kept, :kept]
-        return covariance.at[jnp.diag_indices(kept)].set(jnp.where(silent[:kept], jnp.inf, jnp.diagonal(covariance)))
+        np.fill_diagonal(covariance, np.where(silent[:kept], np.inf, np.diagonal(covariance)))
+        return covariance
 
-    back = jnp.linalg.pinv(slopes[:kept, :kept])
+    back = np.linalg.pinv(slopes[:kept, :kept])
     information = back.T @ matrix[:kept, :kept] @ back
     return CovarianceEstimate(of_parameters(bread @ meat @ bread), of_parameters(bread @ if_white @ bread), information)
 
 
-def floored_inverse(matrix: Array | np.ndarray, least: float) -> Any:
-    """Inverse of a scaled normal matrix, with eigenvalues kept off zero, as an array of the kind that was given.
+def _chance(
+    scores: Float[np.ndarray, "blocks n"], difference: Float[np.ndarray, "n n"], bread: Float[np.ndarray, "n n"]
+) -> float:
+    """Share of a squared difference of S that chance explains; none where a direction is not determined."""
+    try:
+        root = np.linalg.cholesky(bread)
+    except np.linalg.LinAlgError:
+        return 0.0
+    products = np.einsum("bi,bj->bij", scores @ root, scores @ root)
+    chance = np.sum((products - np.mean(products, axis=0)) ** 2)
+    share = chance / max(float(np.sum((root.T @ difference @ root) ** 2)), _TINY)
+    return min(float(share), 1.0) if np.isfinite(share) else 0.0
+
+
+def floored_inverse(matrix: Float[np.ndarray, "n n"], least: float) -> Float[np.ndarray, "n n"]:
+    """Inverse of a scaled normal matrix, with eigenvalues kept off zero.
 
     A direction that the record says nothing about gets a huge error, not none.
 
@@ -261,9 +269,8 @@ def floored_inverse(matrix: Array | np.ndarray, least: float) -> Any:
     - `matrix`: symmetric, its diagonal one, shape `[n, n]`.
     - `least`: smallest eigenvalue, as a share of the largest one.
     """
-    xp = jnp if isinstance(matrix, jax.Array) else np
-    values, vectors = xp.linalg.eigh(matrix)
-    return vectors / xp.maximum(values, least * xp.maximum(values[-1], 1.0))[None, :] @ vectors.T
+    values, vectors = np.linalg.eigh(matrix)
+    return vectors / np.maximum(values, least * max(values[-1], 1.0)) @ vectors.T
 
 
 def correlation_of(covariance: Float[np.ndarray, "free free"]) -> Float[np.ndarray, "free free"]:
@@ -307,57 +314,48 @@ def interval(
 
 
 def covariance_of(problem: FitProblem, state: SearchState, kept: int, blocks: int = BLOCKS) -> CovarianceEstimate:
-    """How sure the estimate is; the first `kept` entries of x are parameters, the others nuisance."""
+    """How sure the estimate is; the first `kept` entries of x are parameters, the others nuisance.
+
+    Without JAX: its many small matrices take seconds to compile.
+    """
     numbers, count = sample_blocks(problem, blocks)
-    return _covariance_of(problem, state, numbers, count, kept)
+    rows, size = problem.samples, len(problem.free.names)
+    residual, jacobian = (each[:rows] for each in weighted_by(problem.loss, state))
+    slopes = np.eye(state.x.shape[0])
+    slopes[:size, :size] = problem.at(state.x).slopes
+    white = _passes_for_white(problem, residual)
+    extra = np.asarray(state.jacobian)[rows:]
+    return covariance_estimate(residual, jacobian, extra, slopes, numbers, count, kept, white)
 
 
-def sample_blocks(problem: FitProblem, blocks: int = BLOCKS) -> tuple[Array, int]:
+def sample_blocks(problem: FitProblem, blocks: int = BLOCKS) -> tuple[Int[np.ndarray, " rows"], int]:
     """Block of each sample row, and the number of blocks."""
     weight = next(iter(problem.runs.weight.values()))
-    numbers, count = block_numbers(weight, 1, blocks)
-    time = np.asarray(numbers).reshape(problem.count, -1)
+    numbers, count = block_numbers(np.asarray(weight), 1, blocks)
+    time = numbers.reshape(problem.count, -1)
     parts = [time] * len(problem.runs.weight)
     for effect in sorted(problem.runs.slips):
         ts, instants = np.asarray(problem.runs.t), np.asarray(problem.runs.slips[effect])
         nearest = np.stack([np.searchsorted(t, own) for t, own in zip(ts, instants, strict=True)])
         parts.append(np.take_along_axis(time, np.minimum(nearest, time.shape[1] - 1), axis=1))
-    return jnp.asarray(np.concatenate(parts, axis=1).reshape(-1)), count
+    return np.concatenate(parts, axis=1).reshape(-1), count
 
 
-@eqx.filter_jit
-def _covariance_of(problem: FitProblem, state: SearchState, blocks: Array, count: int, kept: int) -> CovarianceEstimate:
-    return covariance_inside(problem, state, blocks, count, kept)
-
-
-def covariance_inside(
-    problem: FitProblem, state: SearchState, blocks: Array, count: int, kept: int
-) -> CovarianceEstimate:
-    """`covariance_of`, for compiled code."""
-    rows, size = problem.samples, len(problem.free.names)
-    residual, jacobian = problem.loss.weighted(state.residual[:rows], state.jacobian[:rows])
-    slopes = jnp.eye(state.x.shape[0], dtype=state.x.dtype)
-    slopes = slopes.at[:size, :size].set(problem.free.slopes(state.x[:size]))
-    white = _passes_for_white(problem, residual)
-    return covariance_estimate(residual, jacobian, state.jacobian[rows:], slopes, blocks, count, kept, white)
-
-
-def _passes_for_white(problem: FitProblem, residual: Float[Array, " rows"]) -> Bool[Array, ""]:
+def _passes_for_white(problem: FitProblem, residual: Float[np.ndarray, " rows"]) -> bool:
     """Whether the test of Ljung and Box (1978, Biometrika 65:297) finds no memory in any channel."""
-    passes = jnp.asarray(True)
-    for name, (rows, weight) in problem.by_channel(residual).items():
+    for name, (rows, weight) in by_channel(problem, residual.astype(float)).items():
         if name not in problem.runs.weight:
             continue  # instants have no neighbours
-        counted = jnp.sum(weight)
-        e = jnp.where(weight > 0, rows - jnp.sum(rows) / counted, 0.0)
+        counted = float(np.sum(weight))
+        e = np.where(weight > 0, rows - np.sum(rows) / counted, 0.0)
         lags = lag_number(rows.shape[1])
-        later = jnp.arange(rows.shape[1])[None, :] + jnp.arange(1, lags + 1)[:, None]
-        products = jnp.einsum("rs,rks->k", e, jnp.pad(e, ((0, 0), (0, lags)))[:, later])
-        correlation = products / jnp.maximum(jnp.sum(e**2), _TINY)
-        left = jnp.maximum(counted - jnp.arange(1, lags + 1), 1)
-        statistic = counted * (counted + 2) * jnp.sum(correlation**2 / left)
-        passes &= statistic < special.chdtri(lags, _CHANCE)
-    return passes
+        later = np.arange(1, lags + 1)
+        products = np.array([np.sum(e[:, :-lag] * e[:, lag:]) for lag in later])
+        correlation = products / max(float(np.sum(e**2)), _TINY)
+        left = np.maximum(counted - later, 1)
+        if not counted * (counted + 2) * np.sum(correlation**2 / left) < special.chdtri(lags, _CHANCE):
+            return False
+    return True
 
 
 def lag_number(n: int) -> int:

@@ -1,14 +1,16 @@
 """`fit` and `fit_law`: numbers of a scene, or of a law by itself, from measured records."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from ..._core.arguments import as_float, as_mapping, as_names, as_whole
+from ..._core.device import on_device
 from ..._core.parameters import Range
 from ..._core.progress import iteration_words, reported
 from ..._core.state_dependent import is_state_dependent
@@ -19,7 +21,7 @@ from ..data._record import Record, Windows, cut, outliers, runs_of
 from ..estimate._initializers import AbstractInitializer, run_initializers
 from ..estimate._prepare import MultipleShooting, Settings, StartState, prepare, step_error
 from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
-from ..estimate._search import Progress, SearchOptions, SearchResult, by_channel, solve_with_noise
+from ..estimate._search import Progress, SearchOptions, SearchResult, by_channel, continued, solve_with_noise
 from ..model._engines import Controller, LawEngine, with_values
 from ..model._observe import Observable, coordinates_seen, first_coordinate
 from ..model._parameters import FreeParameters, chosen_entries, split_entries, split_ranges
@@ -54,7 +56,7 @@ def fit(
     substeps: int = 1,
     accuracy: float = 1e-8,
     rtol: float = 1e-6,
-    max_steps: int = 100,
+    max_steps: int = 400,
     progress: bool | Progress = False,
 ) -> FitResult:
     """Fit numbers of a scene so that its simulation follows measured records.
@@ -92,7 +94,8 @@ def fit(
     - `substeps`: integration steps between two samples.
     - `accuracy`: relative tolerance of runs by events.
     - `rtol`: relative change of the residual at which the search ends.
-    - `max_steps`: limit of iterations.
+    - `max_steps`: limit of iterations. Up to it a search goes on by itself, every hundred of them with a damping as at
+      the start; the result says how often.
     - `progress`: True for a line of text, or a function that is called after each iteration with its number, the RMSE
       and the parameters. Ctrl-C ends the fit with the best so far.
 
@@ -127,7 +130,7 @@ def fit(
         prepared, options = prepare(scene, records, free, settings), SearchOptions(rtol, limit, report)
         x, starts = run_initializers(initializer, prepared.problem, options)
         search = solve_with_noise(prepared.problem, x, options, prepared.given)
-    values = search.problem.free.values(search.problem.split(search.state.x)[0])
+    values = search.problem.at(search.state.x).values
     error = step_error(search)
     return result_of(
         search, prepared.records, prepared.windows, prepared.units, with_values(scene, values), error, starts
@@ -163,7 +166,7 @@ def fit_law(
     loss: AbstractLoss | None = None,
     initializer: AbstractInitializer | Sequence[AbstractInitializer] = (),
     rtol: float = 1e-6,
-    max_steps: int = 100,
+    max_steps: int = 400,
     progress: bool | Progress = False,
 ) -> FitResult:
     """Fit a friction law to a measured friction force under a measured motion.
@@ -210,19 +213,19 @@ def fit_law(
         (),
         None,
         runs_of(several, windows),
-        {name: jnp.asarray(given.get(name, size)) for name in several[0].channels},
+        {name: on_device(given.get(name, size)) for name in several[0].channels},
         SquaredLoss() if loss is None else loss,
-        Prior(jnp.zeros(len(parameters.names)), jnp.zeros(len(parameters.names))),
+        Prior(*(on_device(np.zeros(len(parameters.names))) for _ in range(2))),
     )
     with reported(progress, "fit", iteration_words) as report:
-        options = SearchOptions(rtol, max_steps, report)
+        options = SearchOptions(rtol, as_whole(max_steps, name="max_steps"), report)
         x, starts = run_initializers(initializer, problem, options)
         search = solve_with_noise(problem, x, options, frozenset(given))
     per_load = " per N" if "normal" in several[0].inputs else ""
     units = {
         name: allowed.unit + (per_load if allowed.unit.startswith("N") else "") for name, allowed in ranges.items()
     }
-    fitted = with_values(law, search.problem.free.values(search.state.x))
+    fitted = with_values(law, search.problem.at(search.state.x).values)
     return result_of(search, several, windows, units, fitted, None, starts)
 
 
@@ -249,8 +252,8 @@ def result_of(
     """The result of a search: estimate, diagnostics, provenance."""
     problem, state = search.problem, search.state
     names, at_start, values = list(problem.free.names), [], []
-    shared, own = problem.split(state.x)
-    values += [float(x) for x in problem.free.vector(shared)]
+    shared, own = np.split(np.asarray(state.x), [len(names)])
+    values += problem.at(state.x).vector.tolist()
     at_start += [float(problem.free.start[name]) for name in names]
     whole = len(set(windows.record)) == len(windows.record)
     if whole and problem.local:
@@ -259,7 +262,7 @@ def result_of(
             prefix = "" if len(records) == 1 else f"{record.name}/"
             names += [prefix + name for name in problem.local]
             at_start += base[i].tolist()
-            values += (base[i] + np.asarray(own[i])).tolist()
+            values += (base[i] + own.reshape(len(records), -1)[i]).tolist()
     covariance = covariance_of(problem, state, len(names))
     outputs, rmse = _stitched(search, records, windows)
     free = problem.free
@@ -267,9 +270,9 @@ def result_of(
         values=dict(zip(names, values, strict=True)),
         start=dict(zip(names, at_start, strict=True)),
         units={name: units.get(name, "") for name in names},
-        covariance=np.asarray(covariance.covariance),
-        white=np.asarray(covariance.white),
-        information=np.asarray(covariance.information),
+        covariance=covariance.covariance,
+        white=covariance.white,
+        information=covariance.information,
         logarithmic=tuple(name for name, kind in zip(free.names, free.kinds, strict=True) if kind == "log"),
         bounds=free.limits(shared) | {name: (-np.inf, np.inf) for name in names[len(free.names) :]},
     )
@@ -290,7 +293,24 @@ def result_of(
         single_precision=jnp.result_type(float) == jnp.float32,
         issues=_issues(estimate, provenance, search),
     )
+    search = replace(search, windows=windows)
     return FitResult(estimate=estimate, diagnostics=diagnostics, provenance=provenance, search=search)
+
+
+def searched_on(result: FitResult, x: Float[Array, " n"], options: SearchOptions, times: int, where: str) -> FitResult:
+    """The result of the same fit, its search continued from `x`; `where` that is, in words, for the so many-th time."""
+    before, provenance = result.search, result.provenance
+    assert before is not None
+    assert before.windows is not None
+    assert provenance.model is not None
+    given = frozenset(name for record in provenance.records for name in record.noise)
+    search = solve_with_noise(before.problem, x, options, given)
+    ending = continued(search.ending, times, where)
+    search = replace(search, iterations=before.iterations + search.iterations, ending=ending)
+    model = with_values(provenance.model, search.problem.at(search.state.x).values)
+    error = None if result.diagnostics.step_error is None else step_error(search)
+    units, starts = result.estimate.units, result.diagnostics.starts
+    return result_of(search, provenance.records, before.windows, units, model, error, starts)
 
 
 def _coordinates(search: SearchResult) -> dict[str, str]:

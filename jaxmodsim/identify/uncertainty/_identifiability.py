@@ -5,11 +5,12 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
+from ..._core.device import on_device
 from ..._core.parameters import modules_of
 from ...friction import AbstractAsymmetric, AbstractLaw, Dahl, ElastoPlastic, LuGre, MaxwellSlip
 from ...scene import Friction, Scene, replace_numbers, scene_numbers
@@ -316,12 +317,15 @@ def _mass(scene: Scene, name: str, value: float, motion: RecordedMotion) -> floa
     """Part of the mass that is due to a parameter."""
 
     def mass(number: float) -> float:
-        params = replace_numbers(scene, {name: jnp.asarray(number)}).params
-        t, q = jnp.asarray(motion.t[0]), jnp.asarray(motion.q[0][:1])
-        qd = jnp.asarray(motion.qd[0][:1])
-        return float(jax.hessian(lambda qd: scene.lagrangian(t, q, qd, params))(qd)[0, 0])
+        t, q, qd = (on_device(each) for each in (motion.t[0], motion.q[0][:1], motion.qd[0][:1]))
+        return float(_inertia(replace_numbers(scene, {name: on_device(number)}), t, q, qd))
 
     return (mass(1.01 * value) - mass(value)) / 0.01
+
+
+@eqx.filter_jit
+def _inertia(scene: Scene, t: Array, q: Float[Array, " one"], qd: Float[Array, " one"]) -> Array:
+    return jax.hessian(lambda qd: scene.lagrangian(t, q, qd, scene.params))(qd)[0, 0]
 
 
 def _listed(names: Iterable[str]) -> str:

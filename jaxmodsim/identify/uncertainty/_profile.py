@@ -7,12 +7,15 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy import special  # scipy.stats takes most of a second to import
 
+from ..._core.arguments import as_whole
+from ..._core.device import on_device
 from ..estimate._problem import FitProblem, Prior
-from ..estimate._search import SearchResult, start_search, step
+from ..estimate._search import SearchOptions, SearchResult, SearchState, cost_of, start_search, step, weighted_by
 from ._estimate import BLOCKS, ROUNDING, ParameterEstimate, floored_inverse
+from ._fit import searched_on
 from ._result import FitResult
 
 # Weight of what holds the parameter, in its standard errors: it gives way by a millionth of one.
@@ -25,7 +28,7 @@ _LEAP = 4.0
 _PRECISE, _LARGEST_RTOL, _ITERATIONS = 2e-3, 1e-4, 40
 # Shorter and longer steps of the walk, and how closely the end of an interval is found, as a share of the distance.
 _SHORTER, _LONGER, _CLOSE = 0.3, 3.0, 1e-2
-# A point that fits better than the estimate by this share of the threshold says that the search had ended early.
+# From a point that fits better than the estimate by this share of the threshold the search goes on.
 _BELOW = 0.1
 # Scatter over blocks below this share of the residual's variance says next to nothing.
 _LEAST_INFLATION = 0.5
@@ -51,6 +54,7 @@ class Profile:
     - `interval`: where the ratio stays below the threshold; infinite or on a limit where the record sets no end.
     - `notes`: why an end is open, in words.
     - `others`: the other parameters along it by name, shape `[points]` each.
+    - `result`: the fit that this is the profile of: the one that was given, or a better one that was reached from it.
     """
 
     name: str
@@ -66,6 +70,7 @@ class Profile:
     interval: tuple[float, float]
     notes: tuple[str, ...]
     others: dict[str, Float[np.ndarray, " points"]]
+    result: FitResult
 
     def __str__(self) -> str:
         """The interval and why an end of it is open."""
@@ -129,7 +134,7 @@ class _Line:
         """Cost without the row that holds the parameter, and with what was known of it before."""
         rows = np.array(residual)
         rows[self.problem.samples + self.index] = self.known[1] * (value - self.known[0])
-        return float(self.problem.loss.cost(jnp.asarray(rows)))
+        return float(cost_of(self.problem.loss, on_device(rows)))
 
     def refit(self, u: float, guess: np.ndarray) -> _Point | None:
         """The best fit with the parameter at u; None where the model is not finite."""
@@ -137,13 +142,17 @@ class _Line:
         value = self.value(u)
         slope = 1.0 if self.floor is None else value - self.floor
         dtype = problem.prior.mean.dtype
-        weight = problem.prior.weight.at[i].set(_STIFF / (self.unit * slope))
-        held = eqx.tree_at(lambda p: p.prior, problem, Prior(problem.prior.mean.at[i].set(value), weight))
-        lower, upper, _ = problem.box
-        x = jnp.clip(jnp.asarray(guess, dtype), lower, upper)
-        values = {**problem.free.values(problem.split(x)[0]), self.name: jnp.asarray(value, dtype)}
-        x = x.at[: len(problem.free.names)].set(problem.free.coordinates(values))
-        rtol = jnp.asarray(min(_PRECISE * self.inflation / max(self.best, 1e-300), _LARGEST_RTOL), dtype)
+        mean, weight = np.array(problem.prior.mean), np.array(problem.prior.weight)
+        mean[i], weight[i] = value, _STIFF / (self.unit * slope)
+        held = eqx.tree_at(lambda p: p.prior, problem, Prior(on_device(mean), on_device(weight)))
+        size = len(problem.free.names)
+        here = problem.at(on_device(guess))
+        here = problem.free.at(np.clip(guess[:size], here.lower, here.upper))
+        x = np.array(guess, dtype)
+        x[:size] = problem.free.coordinates({**here.values, self.name: value})
+        x = on_device(x)
+        rtol = min(_PRECISE * self.inflation / max(self.best, 1e-300), _LARGEST_RTOL)
+        rtol = on_device(np.asarray(rtol, dtype))
         state = start_search(x, problem.rows)
         for _ in range(_ITERATIONS):
             state = step(held, state, rtol)
@@ -155,7 +164,7 @@ class _Line:
         return _Point(u, np.asarray(state.x), 2 * (cost - self.best) / self.inflation, cost)
 
 
-def profile(result: FitResult, name: str, *, points: int = 6, level: float = 0.95) -> Profile:
+def profile(result: FitResult, name: str, *, points: int = 6, level: float = 0.95, max_steps: int = 400) -> Profile:
     """Profile likelihood of one parameter: all others, and free initial states, are fitted again at each value.
 
     Unlike the intervals of the estimate it holds where the model is far from linear, and shows what the record leaves
@@ -163,12 +172,16 @@ def profile(result: FitResult, name: str, *, points: int = 6, level: float = 0.9
     worse than the level allows. The noise levels stay as they are. Costs a few evaluations a point, and compiles
     nothing.
 
+    Where a value fits better than the estimate, the search had ended too early, or in a worse minimum. It goes on from
+    there with all parameters, and the profile is that of the fit where it ends, `Profile.result`; the notes say so.
+
     **Arguments:**
 
     - `result`: a fit that was not loaded from a file.
     - `name`: of a free parameter that is no initial state.
     - `points`: about how many on either side, at least 2.
     - `level`: of the interval, between 0 and 1.
+    - `max_steps`: limit of all iterations of searches that go on from better values.
 
     **Returns:**
 
@@ -178,29 +191,62 @@ def profile(result: FitResult, name: str, *, points: int = 6, level: float = 0.9
 
     - `ValueError` for another name or level, or of a result that was loaded.
     """
-    search = result.search
-    if search is None:
-        raise ValueError("A profile needs the search, which a loaded result does not have: fit again.")
-    names = search.problem.free.names
+    names = _search_of(result).problem.free.names
     if name not in names:
         raise ValueError(f"{name!r} has no profile; the parameters that have one are: {', '.join(names)}.")
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1, but it is {level}.")
     if isinstance(points, bool) or not isinstance(points, int) or points < 2:
         raise ValueError(f"points must be an integer >= 2, but it is {points!r}.")
+    limit = as_whole(max_steps, name="max_steps", least=0)
     threshold = float(special.fdtri(1, BLOCKS - 1, level))
+    first, left, times = result, limit, 0
+    while isinstance(curve := _along(result, name, points, level, -_BELOW * threshold if left else -math.inf), _Point):
+        times += 1
+        before = _search_of(result)
+        x = on_device(curve.x)
+        result = searched_on(result, x, SearchOptions(max_steps=left), times, f"from a better value of {name}")
+        left = max(left - _search_of(result).iterations + before.iterations, 0)
+    notes = list(curve.notes)
+    if times:
+        fell = ", ".join(f"{x:.6g} to {result.diagnostics.rmse[k]:.6g}" for k, x in first.diagnostics.rmse.items())
+        notes.append(
+            f"A value of {name} fitted better than the estimate: {'one search' if times == 1 else f'{times} searches'}"
+            f" went on from there in {limit - left} iterations, and the RMSE fell from {fell}."
+        )
+    if np.min(curve.ratio) < -_BELOW * threshold:
+        notes.append(
+            f"Some value of {name} fits better than the estimate, but the limit of {limit} iterations (max_steps) of"
+            " searches that go on from there is used up."
+        )
+    return replace(curve, notes=tuple(notes))
+
+
+def _search_of(result: FitResult) -> SearchResult:
+    if result.search is None:
+        raise ValueError("A profile needs the search, which a loaded result does not have: fit again.")
+    return result.search
+
+
+def _along(result: FitResult, name: str, points: int, level: float, least: float) -> Profile | _Point:
+    """The profile of a fit, or the first point whose ratio is below `least`."""
+    threshold = float(special.fdtri(1, BLOCKS - 1, level))
+    search = _search_of(result)
     line, tangent = _line_of(result.estimate, search, name)
-    estimate = result.values[name]
+    estimate, names = result.values[name], search.problem.free.names
     start = _Point(line.coordinate(estimate), np.asarray(search.state.x), 0.0, line.best)
-    down, up = (_walk(line, start, tangent, side, threshold, points) for side in (-1.0, 1.0))
+    sides = []
+    for side in (-1.0, 1.0):
+        sides.append(_walk(line, start, tangent, side, threshold, points, least))
+        lowest = min([start, *sides[-1].points], key=lambda point: point.ratio)
+        if lowest.ratio < least:
+            return lowest
+    down, up = sides
     path = [*reversed(down.points), start, *up.points]
     others = [{k: float(x) for k, x in _values(line.problem, point.x).items()} for point in path]
     ends = [end.u if math.isinf(end.u) else line.value(end.u) for end in (down, up)]
     if line.floor is not None and math.isinf(ends[0]):
         ends[0] = line.floor
-    notes = [end.note for end in (down, up) if end.note]
-    if min(point.ratio for point in path) < -_BELOW * threshold:
-        notes.append(f"Some value of {name} fits better than the estimate: the search had ended early, fit again.")
     return Profile(
         name=name,
         unit=result.estimate.units[name],
@@ -213,14 +259,15 @@ def profile(result: FitResult, name: str, *, points: int = 6, level: float = 0.9
         ratio=np.array([point.ratio for point in path]),
         cost=np.array([point.cost for point in path]),
         interval=(ends[0], ends[1]),
-        notes=tuple(notes),
+        notes=tuple(end.note for end in (down, up) if end.note),
         others={k: np.array([values[k] for values in others]) for k in names if k != name},
+        result=result,
     )
 
 
 def _values(problem: FitProblem, x: np.ndarray) -> dict[str, np.ndarray]:
-    values = problem.free.values(problem.split(jnp.asarray(x))[0])
-    return {name: np.asarray(values[name]) for name in problem.free.names}
+    values = problem.at(on_device(x)).values
+    return {name: values[name] for name in problem.free.names}
 
 
 def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tuple[_Line, np.ndarray]:
@@ -229,12 +276,12 @@ def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tu
     i, size = problem.free.names.index(name), len(problem.free.names)
     value, error = estimate.values[name], estimate.errors[name]
     slopes = np.zeros(state.x.shape[0])
-    slopes[:size] = np.asarray(problem.free.slopes(state.x[:size]))[i]
-    sensitivity = _inverse_normal(problem, state.residual, state.jacobian) @ slopes
+    slopes[:size] = problem.at(state.x).slopes[i]
+    sensitivity = _inverse_normal(problem, state) @ slopes
     by_losses = float(slopes @ sensitivity)
-    residual, _ = problem.loss.weighted(state.residual[: problem.samples], state.jacobian[: problem.samples])
-    counted = float(np.sum(np.asarray(problem.weights) > 0))
-    variance = float(np.sum(np.asarray(residual) ** 2)) / max(counted - state.x.shape[0], 1)
+    residual, _ = weighted_by(problem.loss, state)
+    counted = float(np.sum(problem.weights > 0))
+    variance = float(np.sum(residual[: problem.samples] ** 2)) / max(counted - state.x.shape[0], 1)
     # A squared standard error costs error^2 / by_losses, which is the variance of white residuals. Where one block of
     # samples decides, the scatter over blocks may say next to nothing by chance, and half of that is the least.
     inflation = error**2 / by_losses if by_losses > 0 else math.nan
@@ -257,18 +304,23 @@ def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tu
     return line, sensitivity / by_losses * (1.0 if floor is None else size_of)
 
 
-def _inverse_normal(problem: FitProblem, residual: Array, jacobian: Array) -> np.ndarray:
+def _inverse_normal(problem: FitProblem, state: SearchState) -> np.ndarray:
     """Inverse of the normal matrix of the fit by x, with directions that nothing is known of made very long."""
-    _, weighted = problem.loss.weighted(residual, jacobian)
-    matrix = np.asarray(weighted, float).T @ np.asarray(weighted, float)
+    weighted = weighted_by(problem.loss, state)[1].astype(float)
+    matrix = weighted.T @ weighted
     scale = np.sqrt(np.diag(matrix))
     scale = np.where(scale > 0, scale, 1.0)
     size = np.outer(scale, scale)
     return floored_inverse(matrix / size, ROUNDING * float(jnp.finfo(problem.prior.mean.dtype).eps)) / size
 
 
-def _walk(line: _Line, start: _Point, tangent: np.ndarray, side: float, threshold: float, points: int) -> _End:
-    """Walk away from the estimate until the ratio reaches the threshold, or there is nothing more to see."""
+def _walk(
+    line: _Line, start: _Point, tangent: np.ndarray, side: float, threshold: float, points: int, least: float
+) -> _End:
+    """Walk away from the estimate until the ratio reaches the threshold, or there is nothing more to see.
+
+    A ratio below `least` ends it, too: there is a better fit to be had.
+    """
     aim = math.sqrt(threshold) / points
     pace, slope, path = aim * line.unit, tangent, [start]
     limit = line.limits[0] if side < 0 else line.limits[1]
@@ -293,6 +345,8 @@ def _walk(line: _Line, start: _Point, tangent: np.ndarray, side: float, threshol
             text = f"The model cannot be run with {line.name} much beyond {line.value(last.u):.4g}: its {word} limit"
             return _End(path[1:], side * math.inf, f"{text} is not known.")
         path.append(point)
+        if point.ratio < least:
+            return _End(path[1:], point.u, "")
         if point.ratio > threshold:
             inside, crossing = _crossing(line, last, point, threshold)
             path[-1:] = [*inside, point] if inside else [point]

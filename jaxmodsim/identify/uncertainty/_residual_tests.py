@@ -147,10 +147,6 @@ def residual_tests(result: FitResult) -> ResidualTests:
     """Whether the residuals of a fit are noise, how long they remember, and what they go with.
 
     Position and velocity are those of the model's output, where a channel shows them.
-
-    **Raises:**
-
-    - `ImportError` without statsmodels, which the extra `cli` brings along.
     """
     provenance, tests = result.provenance, []
     for record, residuals, motion in zip(provenance.records, provenance.residuals, provenance.motions, strict=True):
@@ -186,7 +182,7 @@ def channel_tests(
         n / tau,
         interval * (tau - 1) / 2,
         lags,
-        _ljung_box(e, lags),
+        _ljung_box(correlation, lags),
         correlation[: min(max(lags, 4 * memory), n - 1) + 1],
         skewness,
         kurtosis,
@@ -225,13 +221,11 @@ def remembered(correlation: Float[np.ndarray, " lags"]) -> int:
     return max(min(positive_lags(correlation), first), 1)
 
 
-def _ljung_box(e: np.ndarray, lags: int) -> float:
+def _ljung_box(correlation: np.ndarray, lags: int) -> float:
     """Probability of as much autocorrelation by chance (Ljung, Box 1978, Biometrika 65:297)."""
-    try:
-        from statsmodels.stats.diagnostic import acorr_ljungbox  # half a second to import, and only needed here
-    except ImportError as error:
-        raise ImportError("Tests of residuals need statsmodels: pip install 'jaxmodsim[cli]'.") from error
-    return float(acorr_ljungbox(e, lags=[lags])["lb_pvalue"].iloc[0]) if e @ e > 0 else 1.0
+    n = len(correlation)
+    statistic = n * (n + 2) * float(np.sum(correlation[1 : lags + 1] ** 2 / (n - np.arange(1, lags + 1))))
+    return float(special.chdtrc(lags, statistic))
 
 
 def _normality(e: np.ndarray, correlation: np.ndarray, memory: int) -> tuple[float, float, float]:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from ..._core.files import jsonable, written_whole
 from ..._core.readable import AbstractReadable, Table, table_of
 from ..data._record import Record
-from ..estimate._search import ENDINGS, SearchResult
+from ..estimate._search import SearchResult, ended_by_itself
 from ..model._parameters import with_numbers
 from ._estimate import FitDiagnostics, FitProvenance, IdentifiabilityIssue, ParameterEstimate
 from ._identifiability import sloppy_directions
@@ -255,7 +255,7 @@ def uncertain_of(estimate: ParameterEstimate) -> dict[str, tuple[str, ...]]:
 
 def _of_the_search(diagnostics: FitDiagnostics, records: tuple[Record, ...]) -> list[str]:
     sentences = []
-    if diagnostics.ending not in ENDINGS.values():
+    if not ended_by_itself(diagnostics.ending):
         sentences.append(f"The search {diagnostics.ending}: do not trust the standard errors.")
     if _step_shows(diagnostics):
         sentences.append(
