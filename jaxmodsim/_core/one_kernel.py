@@ -101,6 +101,10 @@ def _mark_call(ctx: mlir.LoweringRuleContext, call: Any) -> None:
         return
     if not all(kind in _HOLDS for kind in _operations(functions, function, set())):
         return
+    with ir.InsertionPoint(call):
+        # Else XLA replaces an argument that is known by its number inside of the function, where nothing uses it then.
+        for i, x in enumerate(call.operands):
+            call.operands[i] = hlo.optimization_barrier([x])
     with ir.InsertionPoint(function):
         own = function.clone()
     call.attributes["callee"] = ir.FlatSymbolRefAttr.get(functions.insert(own).value)

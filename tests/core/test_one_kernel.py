@@ -7,6 +7,7 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim._core.one_kernel import in_one_kernel
+from jaxmodsim.problems import bouncing_ball
 
 _MARK = "xla_cpu_small_call"
 X = np.random.default_rng(0).normal(size=(7, 5))
@@ -101,6 +102,16 @@ def test_a_run_and_its_gradient_are_kernels(pendulum):
 
     for function, kernels in ((end, 1), (jax.grad(end), 2), (jax.jacfwd(end), 1)):
         assert jax.jit(function).lower(0.3).as_text().count(_MARK) == kernels
+
+
+def test_what_is_known_of_a_run_stays_an_argument():
+    """XLA would write it into the kernel, and end the process over the argument that is left without use."""
+
+    def height(e):
+        return jms.simulate(bouncing_ball.scene(e=e), [1.0], [0.0], 0.6, throw=False).q[-1, 0]
+
+    closed = jax.grad(lambda e: bouncing_ball.motion(jnp.asarray(0.6), h=1.0, e=e)[0])(0.5)
+    np.testing.assert_allclose(jax.jit(jax.grad(height))(0.5), closed, rtol=1e-6)
 
 
 @pytest.fixture
