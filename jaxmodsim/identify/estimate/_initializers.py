@@ -314,7 +314,7 @@ def _gradient(problem: FitProblem, x: Float[Array, " n"], drawn: Array) -> tuple
     residual, jacobian = some.evaluate(jnp.concatenate([shared, jnp.reshape(own[drawn], (-1,))]))
     cost = problem.loss.cost(residual)
     residual, jacobian = problem.loss.weighted(residual, jacobian)
-    slope, samples = jacobian.T @ residual, jnp.sum(some.weights)
+    slope, samples = jacobian.T @ residual, sum(map(jnp.sum, some.columns.values()))
     size = shared.shape[0]
     mine = jnp.zeros_like(own).at[drawn].set(jnp.reshape(slope[size:], (drawn.shape[0], own.shape[1])))
     return cost / samples, jnp.concatenate([slope[:size], jnp.reshape(mine, (-1,))]) / samples

@@ -225,7 +225,7 @@ class FreeParameters(eqx.Module):
     def _kind(self, name: str) -> str:
         return self._kinds[self._order.index(name)]
 
-    def _floor(self, name: str, values: Mapping[str, _Known]) -> _Known | Array:
+    def _floor(self, name: str, values: Mapping[str, _Known]) -> _Known | Array | np.floating:
         base = self._bases[self._order.index(name)]
         if base is None:
             return self._floors[name]
