@@ -303,7 +303,7 @@ def _histories(run: Trajectory) -> dict[str, History]:
     """Mode changes by effect."""
     events = jtu.tree_map(np.asarray, run.events)
     histories = {}
-    for i, effect in enumerate((*run.scene.names, *run.scene.constraint_names)):
+    for i, effect in enumerate(run.scene.part_names):
         mine = (events.effect == i) & np.isfinite(events.t)
         if mine.any():
             pairs = zip(events.before[mine].tolist(), events.after[mine].tolist(), strict=True)

@@ -250,6 +250,10 @@ class LinearizedConstraints(NamedTuple):
         """What multipliers change if the accelerations without constraints change by `qdd`."""
         return -solve_balanced(self.matrix, _times(self.rows, qdd))
 
+    def respond(self, qdd: PerDof) -> PerDof:
+        """Change of the accelerations within the constraints, where it is `qdd` without them."""
+        return qdd + self.apply_force(self.multiplier_response(qdd))
+
     def apply_force(self, multipliers: Float[Array, " m"]) -> PerDof:
         """Accelerations that multipliers make."""
         return jnp.sum(self.minv_jt * multipliers[:, None], axis=0)

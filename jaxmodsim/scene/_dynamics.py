@@ -288,11 +288,7 @@ class Mobility(NamedTuple):
     def respond(self, force: PerDof) -> PerDof:
         """Change of the accelerations with the generalised force."""
         free = self.solve(force)
-        return (
-            free
-            if self.constraints is None
-            else free + self.constraints.apply_force(self.constraints.multiplier_response(free))
-        )
+        return free if self.constraints is None else self.constraints.respond(free)
 
     def least(self, row: PerDof) -> Scalar:
         """Mobility [1/kg] along a direction that rounding can tell from none, where constraints take it away."""

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._core.cholesky import factor_positive_definite
 from .._core.semidefinite import solve_semidefinite
 from .._core.shapes import PerDof, Scalar
 from ..mechanics import linearize_constraints, motion_equations
@@ -45,14 +44,13 @@ def impact(
     """
     contacts, params = tuple(scene.contacts.values()), scene.params
     mass = motion_equations(scene.lagrangian, t, q, qd, params).mass
-    solve = factor_positive_definite(mass)
     gaps = linearize_constraints(contacts, t, q, qd, params, mass)
     # The velocity of a gap that moves by itself counts, too.
     w = jnp.concatenate([each.rate(t, q, qd, params) for each in contacts])
     reach = gaps.minv_jt
     if scene.bilateral:
         held = linearize_constraints(scene.bilateral, t, q, qd, params, mass)
-        reach = jnp.stack([row + held.apply_force(held.multiplier_response(row)) for row in map(solve, gaps.rows)])
+        reach = jnp.stack([held.respond(row) for row in reach])
     delassus = jnp.sum(gaps.rows[:, None, :] * reach[None, :, :], axis=2)
     touches = jnp.where(closed > 0, ~fired, fired)
     e = jnp.stack([each.restitution.astype(w.dtype) for each in contacts])

@@ -165,6 +165,11 @@ class Scene(AbstractReadable, eqx.Module):
         return _names(self.constraints, lambda each: "contact" if isinstance(each, Contact) else "constraint")
 
     @property
+    def part_names(self) -> tuple[str, ...]:
+        """Names of the effects, then of the constraints: what indices of events count."""
+        return (*self.names, *self.constraint_names)
+
+    @property
     def event_driven(self) -> dict[str, Friction]:
         """The friction elements that run by events, by name, in the order of their modes."""
         return {

@@ -191,7 +191,7 @@ class Trajectory(AbstractReadable):
     def mode_changes(self) -> tuple[ModeChange, ...]:
         """`events` in words, as many as there are; outside of `jax.jit`."""
         columns = [x.tolist() for x in map(np.asarray, self.events)]
-        names, effects = (*self.scene.names, *self.scene.constraint_names), len(self.scene.names)
+        names, effects = self.scene.part_names, len(self.scene.names)
         words = [_MODES if effect < effects else _CONTACT_MODES for effect in columns[1]]
         return tuple(
             ModeChange(t, names[effect], word[before], word[after])
@@ -355,8 +355,7 @@ def _reached(t: Array, tree: PyTree) -> PyTree:
 def _events(scene: Scene, log: EventLog) -> Events:
     """One entry for each element that changed its mode, from a log with one for each instant."""
     before, after = log.before[1], log.after[1]
-    names = (*scene.names, *scene.constraint_names)
-    indices = jnp.asarray([names.index(name) for name in scene.mode_names])
+    indices = jnp.asarray([scene.part_names.index(name) for name in scene.mode_names])
     # What happens to contacts that fire is an event, be it an impact that leaves them open.
     strikes = jnp.asarray([[name in scene.contacts for name in scene.mode_names]]) & (log.fired > 0.5)
     changed = jnp.ravel(((before != after) | strikes) & jnp.isfinite(log.t)[:, None])
