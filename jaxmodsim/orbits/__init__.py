@@ -1,0 +1,5 @@
+"""Periodic orbits, their stability, and branches of them."""
+
+from ._orbit import PeriodicOrbit as PeriodicOrbit
+from ._periodic_orbit import periodic_orbit as periodic_orbit
+from ._return_map import OrbitError as OrbitError
