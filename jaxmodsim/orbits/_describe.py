@@ -17,44 +17,58 @@ _ZERO = 1e-4
 
 def describe(problem: OrbitProblem, point: ShotOrbit, dof: int) -> tuple[PeriodicOrbit, np.ndarray, np.ndarray]:
     """The orbit, and the times [s] of the least and greatest coordinates, shape `[dof]` each."""
-    scene = problem.with_value(point.value)
-    problem = eqx.tree_at(lambda p: p.scene, problem, scene)
-    state, period = unpack(scene, jnp.asarray(point.x), dof), point.period
-    once = run_for(problem, state, period, np.asarray([period]))
+    problem, once = _once(problem, point, dof)
+    scene, period = problem.scene, point.period
+    state = unpack(scene, jnp.asarray(point.x), dof)
     changes = [x for x in zip(*(np.asarray(each).tolist() for each in once.events), strict=True) if x[0] < np.inf]
-    times = np.asarray([x[0] for x in changes])
+    begin, end = float(once.inputs.t0), float(once.inputs.t1)
+    times = np.clip([x[0] for x in changes], begin, end)
     # Of a length that few numbers of events change, for which nothing is compiled anew.
     padding = (-len(times)) % 16
-    grid = np.concatenate([np.linspace(0.0, period, _INTERVALS + 1), np.clip(times, 0.0, period), [period] * padding])
-    run = run_for(problem, state, period, np.sort(grid))
-    sequence = _sequence(once)
-    shares, held = _shares(once, run, changes, period)
+    run = run_for(
+        *(problem, state, begin),
+        np.sort(np.concatenate([np.linspace(begin, end, _INTERVALS + 1), times, [end] * padding])),
+    )
+    shares, held = _shares(once, run, changes, (begin, end))
     strikes = times[[scene.part_names[i] in scene.contacts for _, i, _, _ in changes]]
     lowest, highest = (_extreme(run, sign, strikes) for sign in (-1.0, 1.0))
     x = states_of(run)
     scale = magnitudes(x, period)[:-1]
     orbit = PeriodicOrbit(
+        jnp.asarray(begin),
         *state,
         jnp.asarray(period),
         -jnp.asarray(lowest[0]),
         jnp.asarray(highest[0]),
-        multipliers(problem, point, held, scale),
+        floquet(problem, point, held, scale),
         problem.autonomous,
         float(np.max(np.abs(point.residual[: len(point.x)]) / scale)),
         run,
-        sequence,
+        _sequence(once),
         shares,
     )
     return orbit, lowest[1], highest[1]
 
 
+def _once(problem: OrbitProblem, point: ShotOrbit, dof: int) -> tuple[OrbitProblem, Trajectory]:
+    """The problem at the value of the parameter, and a run over a period of which the end alone is kept."""
+    problem = eqx.tree_at(lambda p: p.scene, problem, problem.with_value(point.value))
+    state = unpack(problem.scene, jnp.asarray(point.x), dof)
+    t0 = float(problem.phase) * point.period
+    return problem, run_for(problem, state, t0, np.asarray([t0 + point.period]))
+
+
+def mode_sequence(problem: OrbitProblem, point: ShotOrbit, dof: int) -> Sequence:
+    """Mode changes of a period, from the start of the orbit on."""
+    return _sequence(_once(problem, point, dof)[1])
+
+
 def _sequence(run: Trajectory) -> Sequence:
-    """Mode changes of a period, of an orbit of any start from the same one on."""
     return tuple((x.effect, x.before, x.after) for x in run.mode_changes)
 
 
 def _shares(
-    once: Trajectory, run: Trajectory, changes: list[tuple[float, int, int, int]], period: float
+    once: Trajectory, run: Trajectory, changes: list[tuple[float, int, int, int]], span: tuple[float, float]
 ) -> tuple[dict[str, float], int]:
     """Part of the period in which each element is held, and the number of multipliers that must be zero."""
     scene = once.scene
@@ -64,16 +78,15 @@ def _shares(
     first = {name: int(x[0]) for name, x in run.mode.items()}
     for _, i, before, _ in reversed(changes):
         first[names[i]] = int(before)
-    modes, t, shares, zeros = dict(first), 0.0, dict.fromkeys(first, 0.0), 0
-    for time, i, _, after in [*changes, (period, -1, 0, 0)]:
+    (t, end), zeros = span, 0
+    period, modes, shares = end - t, dict(first), dict.fromkeys(first, 0.0)
+    for time, i, _, after in [*changes, (end, -1, 0, 0)]:
         held = [name for name, mode in modes.items() if (mode == 0) == (name in friction)]
         for name in held:
             shares[name] += (time - t) / period
         if time - t > 1e-9 * period:
-            zeros = max(
-                zeros,
-                _directions(once, [x for x in held if x in friction], t) + 2 * sum(x not in friction for x in held),
-            )
+            sticking = [name for name in held if name in friction]
+            zeros = max(zeros, _directions(once, sticking, t) + 2 * (len(held) - len(sticking)))
         t = time
         if i >= 0:
             modes[names[i]] = int(after)
@@ -89,7 +102,7 @@ def _directions(run: Trajectory, held: list[str], t: float) -> int:
     return int(np.linalg.matrix_rank(np.stack(rows), tol=1e-6))
 
 
-def multipliers(problem: OrbitProblem, point: ShotOrbit, zeros: int, scale: np.ndarray) -> np.ndarray:
+def floquet(problem: OrbitProblem, point: ShotOrbit, zeros: int, scale: np.ndarray) -> np.ndarray:
     """Floquet multipliers, with the 1 and the zeros that are known exactly."""
     monodromy = point.monodromy * scale[None, :] / scale[:, None]
     if problem.autonomous:

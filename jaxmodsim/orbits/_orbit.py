@@ -23,7 +23,8 @@ class PeriodicOrbit(AbstractReadable, eqx.Module):
 
     `q`, `qd`, `z`, `period`, `lowest` and `highest` have derivatives by all numbers of the scene.
 
-    - `q`, `qd`, `z`: state at its start, as of `simulate`; of forced orbits at t = 0.
+    - `t0`: time [s] at its start; 0 but where along a branch a change of modes came to lie there.
+    - `q`, `qd`, `z`: state at its start, as of `simulate`.
     - `period`: [s].
     - `lowest`, `highest`: least and greatest value of each coordinate, shape `[dof]`.
     - `multipliers`: Floquet multipliers, complex, shape `[n]`: by magnitude, after the 1 that every orbit of unknown
@@ -35,6 +36,7 @@ class PeriodicOrbit(AbstractReadable, eqx.Module):
     - `stick`: part of the period in which each friction element sticks and each contact is closed, by name.
     """
 
+    t0: Float[Array, ""]
     q: Float[Array, " dof"]
     qd: Float[Array, " dof"]
     z: dict[str, PyTree]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from .._core.arguments import as_float, check_real
-from ..scene import Scene, State
+from ..scene import Scene, State, read_element
 from ..simulation import simulate
 from ._describe import describe
 from ._newton import newton, scaled
@@ -125,8 +125,11 @@ def prepare(
         jnp.asarray(as_float(x, name=name, lower=0.0), float) for name, x in (("rtol", rtol), ("atol", atol))
     )
     empty = jnp.zeros(0)
+    phase = jnp.zeros(())
+    if isinstance(guess, PeriodicOrbit):
+        phase = jax.lax.stop_gradient(guess.t0 / guess.period)
     number = period if period is None or callable(period) else _Constant(as_float(period, name="period", lower=0.0))
-    problem = OrbitProblem(scene, relative, absolute, empty, empty, number, section, parameter)
+    problem = OrbitProblem(scene, phase, relative, absolute, empty, empty, number, section, parameter)
     state = _state(scene, guess)
     dof = state.q.shape[0]
     if isinstance(guess, PeriodicOrbit) and settle is None:
@@ -205,7 +208,8 @@ def anchored(problem: OrbitProblem, start: SettledState, dof: int) -> OrbitProbl
     problem = eqx.tree_at(lambda p: (p.normal, p.anchor), problem, (jnp.zeros_like(x), x))
     if not problem.autonomous or problem.section is not None:
         return problem
-    flow = evaluate(problem, start.x, start.period, 0.0, dof).flow
+    value = 0.0 if problem.parameter is None else read_element(problem.scene, problem.parameter)
+    flow = evaluate(problem, start.x, start.period, value, dof).flow
     scale = start.scale[: len(start.x)]
     return eqx.tree_at(lambda p: p.normal, problem, jnp.asarray(flow / scale**2))
 
@@ -253,7 +257,8 @@ def _with_derivatives(
     times = np.concatenate(extrema)
     order = np.argsort(times, kind="stable")
     q = simulate(
-        *(problem.scene, state.q, state.qd, point.period),
+        *(problem.scene, state.q, state.qd, orbit.t0 + point.period),
+        t0=orbit.t0,
         z0=state.z,
         ts=jnp.asarray(times[order]),
         rtol=problem.rtol,

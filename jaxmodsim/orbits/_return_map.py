@@ -30,6 +30,7 @@ class OrbitError(RuntimeError):
 class OrbitProblem(eqx.Module):
     """What has to return to itself.
 
+    - `phase`: time at which forced orbits begin, in periods.
     - `period`: of a forced orbit, from the parameters of the scene; None where the period is unknown.
     - `parameter`: a number of the scene that is one of the unknowns; None where there is none.
     - `normal`, `anchor`: the plane in which an orbit of unknown period begins: `normal . (x - anchor) = 0`. With a
@@ -37,6 +38,7 @@ class OrbitProblem(eqx.Module):
     """
 
     scene: Scene
+    phase: Float[Array, ""]
     rtol: Float[Array, ""]
     atol: Float[Array, ""]
     normal: Float[Array, " n"]
@@ -103,7 +105,8 @@ def end_state(
     """State a period after x, and how the run ended."""
     y = unpack(scene, x, dof)
     run = simulate(
-        *(scene, y.q, y.qd, period),
+        *(scene, y.q, y.qd, (problem.phase + 1.0) * period),
+        t0=problem.phase * period,
         z0=y.z,
         rtol=problem.rtol,
         atol=problem.atol,

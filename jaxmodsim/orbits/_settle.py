@@ -28,11 +28,12 @@ class SettledState(NamedTuple):
     scale: np.ndarray
 
 
-def run_for(problem: OrbitProblem, state: State, t1: float, ts: np.ndarray) -> Trajectory:
-    """A run of the scene from t = 0."""
+def run_for(problem: OrbitProblem, state: State, t0: float, ts: np.ndarray) -> Trajectory:
+    """A run of the scene from t0 to the last of these times."""
     try:
         return simulate(
-            *(problem.scene, state.q, state.qd, t1),
+            *(problem.scene, state.q, state.qd, ts[-1]),
+            t0=t0,
             z0=state.z,
             ts=jnp.asarray(ts),
             rtol=problem.rtol,
@@ -59,15 +60,16 @@ def settled(problem: OrbitProblem, state: State, settle: float, section: Section
     """
     if problem.period is not None:
         period = float(problem.period(problem.scene.params))
+        t0 = float(problem.phase) * period
         count = max(round(settle / period), 0)
         x = np.asarray(pack(state))
         if count:
-            run = run_for(problem, state, count * period, np.asarray([count * period]))
+            run = run_for(problem, state, t0, np.asarray([t0 + count * period]))
             state, x = jtu.tree_map(lambda a: a[-1], State(run.q, run.qd, run.z)), states_of(run)[-1]
-        run = run_for(problem, state, period, np.linspace(0.0, period, 257))
+        run = run_for(problem, state, t0, np.linspace(t0, t0 + period, 257))
         return SettledState(x, period, magnitudes(states_of(run), period))
     ts = np.linspace((1.0 - _LAST) * settle, settle, _TIMES)
-    run = run_for(problem, state, settle, ts)
+    run = run_for(problem, state, 0.0, ts)
     x = states_of(run)
     scale = magnitudes(x, 1.0)
     period = _return_time(ts, x / scale[: x.shape[1]])
