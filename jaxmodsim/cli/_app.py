@@ -166,7 +166,7 @@ def sweep(
 
 
 @app.command()
-def orbit(spec: _options.OrbitSpecFile, out: Out = Path("jaxmodsim-orbit")) -> None:
+def orbit(spec: _options.Spec, out: Out = Path("jaxmodsim-orbit")) -> None:
     r"""Find a periodic orbit, as a SPEC says: its period, extent, stability and modes.
 
     SPEC is a TOML file; \[scene] as for jaxmodsim sweep.
@@ -183,7 +183,7 @@ def orbit(spec: _options.OrbitSpecFile, out: Out = Path("jaxmodsim-orbit")) -> N
 
 
 @app.command()
-def branch(spec: _options.OrbitSpecFile, out: Out = Path("jaxmodsim-branch")) -> None:
+def branch(spec: _options.Spec, out: Out = Path("jaxmodsim-branch")) -> None:
     r"""Follow a periodic orbit over a number, through folds, and name where it changes; goes on where one ended.
 
     SPEC is that of jaxmodsim orbit with one more table: \[branch] has parameter,

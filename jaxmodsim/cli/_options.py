@@ -157,7 +157,6 @@ Duration = Annotated[
     typer.Option(help=r"Its duration \[s]; by default that of the longest record.", rich_help_panel=_NEXT),
 ]
 
-OrbitSpecFile = Annotated[Path, typer.Argument(help="TOML file that says which scene and orbit.")]
 Spec = Annotated[Path, typer.Argument(help="TOML file that says what to run; see above.")]
 Store = Annotated[
     Path | None,

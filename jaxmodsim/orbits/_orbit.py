@@ -13,6 +13,8 @@ from ..simulation import Trajectory
 
 # Distance of a multiplier from the unit circle that its error may hide.
 NEUTRAL = 1e-6
+# Residual that is more than rounding and the tolerance of the run.
+_WORTH_SAYING = 1e-9
 
 # Name of an element, its mode before and after.
 Sequence: TypeAlias = tuple[tuple[str, str, str], ...]
@@ -108,7 +110,7 @@ def _(orbit: PeriodicOrbit) -> Table:
         f"multipliers {', '.join(map(complex_words, orbit.multipliers))}",
         *(f"{name} held {100 * share:.4g} % of the period" for name, share in orbit.stick.items()),
         f"mode changes: {', '.join(changes) or 'none'}",
-        f"residual {orbit.residual:.2g}",
+        *([f"residual {orbit.residual:.2g}"] if orbit.residual > _WORTH_SAYING else []),
     ]
     title = f"PeriodicOrbit, {kind}, period {short(orbit.period)} s, {orbit.stability}"
     return Table(title, ("", "lowest", "highest", "velocity at the start"), rows, tuple(notes))
