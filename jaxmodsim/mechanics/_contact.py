@@ -59,7 +59,6 @@ class Contact(AbstractPositionConstraint):
     at: PositionFn | None = eqx.field(default=None, converter=as_at)
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Contact name"))
 
-    one_sided: ClassVar[bool] = True
     stabilise: ClassVar[float] = 0.0
 
     def value(self, t: Scalar, x: Float[Array, "..."], params: PyTree) -> Float[Array, "..."]:
@@ -81,7 +80,6 @@ class BoundContact(AbstractConstraint):
 
     contact: Contact
     closed: Float[Array, ""]
-    one_sided: ClassVar[bool] = True
     stabilise: ClassVar[float] = 0.0
 
     @property

@@ -13,7 +13,6 @@ from .._core.index_check import traced
 from .._core.scalarise import in_scalars
 from .._core.shapes import PerDof, Scalar
 from ..mechanics import (
-    Constraint,
     LinearizedConstraints,
     linearize_constraints,
     motion_equations,
@@ -80,8 +79,8 @@ class Dynamics(NamedTuple):
     - `qdd`: accelerations.
     - `contact`, `friction`: the friction elements that depend on accelerations, and their forces, or None.
     - `constraints`, `multipliers`: of all constraints, or None.
-    - `validity_margins`: what has to be positive for the equations to hold, in the order of `Scene.checks`: of each
-      constraint that can only push its multiplier, then the margin of uniqueness of the loads; None for nothing.
+    - `uniqueness`: what is left of the uniqueness of loads that are reactions, see `FrictionForces.margin`; the
+      equations hold where it is positive. None without such loads.
     """
 
     t: Scalar
@@ -94,7 +93,7 @@ class Dynamics(NamedTuple):
     friction: FrictionForces | None
     constraints: LinearizedConstraints | None
     multipliers: Float[Array, " m"] | None
-    validity_margins: Float[Array, " checks"] | None
+    uniqueness: Scalar | None
 
     @property
     def rate(self) -> State:
@@ -112,8 +111,8 @@ class Dynamics(NamedTuple):
         return self._valid_rate(push)
 
     def _valid_rate(self, rate: PerDof) -> State:
-        if self.validity_margins is not None:
-            rate = jnp.where(jnp.all(self.validity_margins > 0), rate, jnp.nan)
+        if self.uniqueness is not None:
+            rate = jnp.where(self.uniqueness > 0, rate, jnp.nan)
         return State(self.y.qd, rate, {name: self.actions[name].rate for name in self.y.z})
 
     @property
@@ -329,8 +328,7 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
         multipliers = linearized.multipliers(qdd)
         qdd = qdd + linearized.apply_force(multipliers)
     if not (scene.event_driven or scene.reaction_loaded):
-        margins = _margins(scene, t, y, multipliers, None)
-        return Dynamics(t, y, mode, scene, actions, qdd, None, None, linearized, multipliers, margins)
+        return Dynamics(t, y, mode, scene, actions, qdd, None, None, linearized, multipliers, None)
 
     units = {name: each.force_per_load(t, q, qd, y.z.get(name), params) for name, each in scene.reaction_loaded.items()}
     pushes = [-each.apply_force(q, units[name][0], params) for name, each in scene.reaction_loaded.items()]
@@ -351,8 +349,8 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     if linearized is not None and multipliers is not None:
         taken = sum(actions[name].generalised for name in (*scene.event_driven, *scene.reaction_loaded))
         multipliers = multipliers + linearized.multiplier_response(mobility.solve(jnp.asarray(taken)))
-    margins = _margins(scene, t, y, multipliers, settled.margin)
-    return Dynamics(t, y, mode, scene, actions, qdd, contacts, settled, linearized, multipliers, margins)
+    uniqueness = settled.margin if scene.loaded else None
+    return Dynamics(t, y, mode, scene, actions, qdd, contacts, settled, linearized, multipliers, uniqueness)
 
 
 def _loads(
@@ -373,7 +371,7 @@ def _loads(
         jnp.asarray([[float(name == each) for name in names] for each in loaded], y.q.dtype),
         size * multipliers[at],
         size[:, None] * jnp.stack([each[at] for each in yields], axis=1),
-        jnp.asarray([0.0 if chosen[name].one_sided else -1.0 for name in names], y.q.dtype),
+        jnp.asarray([0.0 if name in scene.contacts else -1.0 for name in names], y.q.dtype),
     )
 
 
@@ -381,18 +379,6 @@ def by_constraint(scene: Scene, t: Array, y: State, values: Array) -> dict[str, 
     """What there is one of for each equation (multipliers, rows), by the names of the constraints."""
     where = parts(scene.constraints, t, y.q, y.qd, scene.params)
     return {name: values[part] for name, part in zip(scene.constraint_names, where, strict=True)}
-
-
-def _margins(scene: Scene, t: Array, y: State, multipliers: Any, unique: Array | None) -> Array | None:
-    pairs = zip(scene.constraint_names, scene.constraints, strict=True)
-    pushing = [name for name, each in pairs if isinstance(each, Constraint) and each.one_sided]
-    margins = []
-    if pushing:
-        of_each = by_constraint(scene, t, y, multipliers)
-        margins += [of_each[name][0] for name in pushing]
-    if unique is not None and scene.loaded:
-        margins.append(unique)
-    return jnp.stack(margins) if margins else None
 
 
 def from_dynamics(get: Callable[[Dynamics], _Value], t: Scalar, y: State, scene: Scene, mode: Modes = None) -> _Value:
@@ -404,7 +390,7 @@ def from_dynamics(get: Callable[[Dynamics], _Value], t: Scalar, y: State, scene:
 
 
 def vector_field(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> State:
-    """Right-hand side of `y' = field(t, y)`; NaN where the equations do not hold, see `Dynamics.validity_margins`."""
+    """Right-hand side of `y' = field(t, y)`; NaN where the equations do not hold, see `Dynamics.uniqueness`."""
     return from_dynamics(lambda dynamics: dynamics.rate, t, y, scene, mode)
 
 

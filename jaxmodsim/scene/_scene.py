@@ -14,7 +14,7 @@ from .._core.functions import as_function
 from .._core.parameters import as_real
 from .._core.readable import AbstractReadable
 from .._core.shapes import PerDof, Scalar
-from ..mechanics import AbstractConstraint, BoundContact, Constraint, Contact, Lagrangian
+from ..mechanics import AbstractConstraint, BoundContact, Contact, Lagrangian
 from ._coordinates import as_coordinates, read_label
 from ._signal import Signal, signals_at, signals_from, signals_of
 from .forces._effect import AbstractEffect
@@ -22,6 +22,8 @@ from .forces._friction import Friction
 
 # The test of uniqueness looks at every corner of the box of slopes: two to this power.
 _MOST_LOADS = 4
+# An impact tries every set of contacts that may push: two to this power.
+_MOST_CONTACTS = 6
 
 
 def _params(params: PyTree) -> PyTree:
@@ -153,6 +155,12 @@ class Scene(AbstractReadable, eqx.Module):
                 f"Friction rests on {len(self.loaded)} constraints, but no more than {_MOST_LOADS} can be solved"
                 " together; give the load of the others as functions."
             )
+        if len(self.contacts) > _MOST_CONTACTS:
+            raise ValueError(
+                f"There are {len(self.contacts)} contacts, but impacts of no more than {_MOST_CONTACTS} can be solved"
+                " together, as every set of them is tried: leave out those that never touch, or give the others a"
+                " force of their own by AppliedForce."
+            )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -216,20 +224,14 @@ class Scene(AbstractReadable, eqx.Module):
 
     @property
     def checks(self) -> tuple[str, ...]:
-        """What may end the equations of motion, in words, in the order of `Dynamics.validity_margins`."""
-        words = [
-            f"The constraint {name!r} can only push, and would have to pull: the contact opens. The motion from there"
-            " on is that of a scene without it."
-            for name, each in zip(self.constraint_names, self.constraints, strict=True)
-            if isinstance(each, Constraint) and each.one_sided
-        ]
-        if self.loaded:
-            words.append(
-                f"Friction under the reaction of {', '.join(map(repr, self.loaded))} has lost its unique solution: it"
-                " raises its own load without bound (Painleve's paradox, jamming). Lower the coefficient of friction,"
-                " or model the contact as elastic."
-            )
-        return tuple(words)
+        """What may end the equations of motion, in words: a `Dynamics.uniqueness` that is not positive, or nothing."""
+        if not self.loaded:
+            return ()
+        return (
+            f"Friction under the reaction of {', '.join(map(repr, self.loaded))} has lost its unique solution: it"
+            " raises its own load without bound (Painleve's paradox, jamming). Lower the coefficient of friction,"
+            " or model the contact as elastic.",
+        )
 
     def bind_time(self, t: Scalar) -> "Scene":
         """The scene with the numbers of its signals at time `t`; itself where it has none."""

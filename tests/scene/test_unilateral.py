@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import ellipk
 
 import jaxmodsim as jms
 from jaxmodsim.problems import bouncing_ball, vibrating_table
@@ -176,6 +177,30 @@ def test_a_block_lands_slides_and_stops():
     np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-11)
 
 
+def test_an_impact_within_a_constraint():
+    """A pendulum in Cartesian coordinates strikes a wall at its lowest point: the rod holds, the speed is e times."""
+    e, g, start = 0.5, 9.81, 0.6
+    scene = jms.Scene(
+        jms.point_mass(1.0, lambda q: jnp.stack([q[0], 0.0 * q[0], q[1]])),
+        constraints=(
+            jms.Contact(lambda t, q, p: q[0], restitution=e, name="wall"),
+            jms.Constraint(lambda t, q, p: jnp.sqrt(jnp.sum(q**2)) - 1.0, name="rod"),
+        ),
+    )
+    run = jms.simulate(
+        scene, [np.sin(start), -np.cos(start)], [0.0, 0.0], 0.75, ts=jnp.linspace(0.0, 0.75, 16), **TIGHT
+    )
+    (strike,) = run.mode_changes
+    # A quarter of the period, an elliptic integral.
+    np.testing.assert_allclose(strike.t, ellipk(np.sin(start / 2) ** 2) / np.sqrt(g), rtol=1e-9)
+    np.testing.assert_allclose(jnp.sum(run.q**2, axis=1), 1.0, atol=1e-12)
+    after = run.t > strike.t
+    energy = 0.5 * jnp.sum(run.qd**2, axis=1) + g * (1 + run.q[:, 1])
+    full = g * (1 - np.cos(start))
+    np.testing.assert_allclose(energy, np.where(after, e**2 * full, full), rtol=1e-8)
+    np.testing.assert_allclose(run.event_losses, np.where(after, (1 - e**2) * full, 0.0), atol=1e-8)
+
+
 @pytest.mark.parametrize("e", [0.0, 1e-12, 0.5])
 def test_restitution_down_to_none(e):
     run = jms.simulate(bouncing_ball.scene(e=e), [1.0], [0.0], 2.0)
@@ -204,6 +229,8 @@ def test_wrong_contacts_are_refused():
         jms.Contact(lambda t, q, p: q[0], restitution=1.5)
     with pytest.raises(ValueError, match="Contact gap must be a function"):
         jms.Contact(1.0)
+    with pytest.raises(ValueError, match="7 contacts, but impacts of no more than 6"):
+        jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, constraints=7 * (jms.Contact(lambda t, q, p: q[0]),))
     pair = jms.Contact(lambda t, q, p: jnp.stack([q[0], q[0]]), name="floor")
     lagrangian = bouncing_ball.scene(e=0.5).lagrangian
     with pytest.raises(ValueError, match=r"'floor'.*one number"):
