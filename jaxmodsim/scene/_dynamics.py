@@ -13,6 +13,7 @@ from .._core.index_check import traced
 from .._core.scalarise import in_scalars
 from .._core.shapes import PerDof, Scalar
 from ..mechanics import (
+    Contact,
     LinearizedConstraints,
     linearize_constraints,
     motion_equations,
@@ -150,7 +151,11 @@ class Dynamics(NamedTuple):
             for name, effect in zip(scene.names, scene.effects, strict=True)
         }
         for name, reaction in self.reactions.items():
-            powers[name] = Power(jnp.sum(reaction.generalised * y.qd))
+            done = jnp.sum(reaction.generalised * y.qd)
+            powers[name] = Power(done)
+            if name in scene.compliant:
+                taken = -reaction.multiplier[0] * scene.compliant[name].rate(self.t, y.q, y.qd, scene.params)[0]
+                powers[name] = Power(done + taken, taken)
 
         def lagrangian(t: Array) -> Array:
             return scene.lagrangian(t, y.q, y.qd, scene.params)
@@ -308,6 +313,9 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     )
     mobility = Mobility(factor_positive_definite(equations.mass), linearized)
     actions, rhs = {}, equations.load
+    compliant = _compliant(scene, t, y) if scene.compliant else None
+    if compliant is not None:
+        rhs = rhs + compliant.generalised
     holding = {}
     for name, effect in zip(scene.names, scene.effects, strict=True):
         if name in scene.event_driven or name in scene.reaction_loaded:
@@ -327,6 +335,9 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     if linearized is not None:
         multipliers = linearized.multipliers(qdd)
         qdd = qdd + linearized.apply_force(multipliers)
+        if compliant is not None:
+            multipliers = multipliers + compliant.force
+            linearized = linearized._replace(rows=linearized.rows + compliant.rate)  # from here on to be reported
     if not (scene.event_driven or scene.reaction_loaded):
         return Dynamics(t, y, mode, scene, actions, qdd, None, None, linearized, multipliers, None)
 
@@ -346,9 +357,9 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
         unit, rate = units[name]
         actions[name] = Action(-settled.force[i] * pushes[i - len(scene.event_driven)], settled.force[i] * unit, rate)
     qdd = qdd - jnp.sum(contacts.minv_jt * settled.force[:, None], axis=0)
-    if linearized is not None and multipliers is not None:
+    if (within := mobility.constraints) is not None and multipliers is not None:
         taken = sum(actions[name].generalised for name in (*scene.event_driven, *scene.reaction_loaded))
-        multipliers = multipliers + linearized.multiplier_response(mobility.solve(jnp.asarray(taken)))
+        multipliers = multipliers + within.multiplier_response(mobility.solve(jnp.asarray(taken)))
     uniqueness = settled.margin if scene.loaded else None
     return Dynamics(t, y, mode, scene, actions, qdd, contacts, settled, linearized, multipliers, uniqueness)
 
@@ -371,8 +382,21 @@ def _loads(
         jnp.asarray([[float(name == each) for name in names] for each in loaded], y.q.dtype),
         size * multipliers[at],
         size[:, None] * jnp.stack([each[at] for each in yields], axis=1),
-        jnp.asarray([0.0 if name in scene.contacts else -1.0 for name in names], y.q.dtype),
+        jnp.asarray([0.0 if isinstance(chosen[name], Contact) else -1.0 for name in names], y.q.dtype),
     )
+
+
+def _compliant(scene: Scene, t: Array, y: State) -> Action:
+    """Forces of the contacts that give way, among the multipliers of all constraints, and in `rate` their rows."""
+    where, dof = parts(scene.constraints, t, y.q, y.qd, scene.params), y.q.shape[0]
+    force = jnp.zeros(where[-1].stop, y.q.dtype)
+    rows = jnp.zeros((where[-1].stop, dof), y.q.dtype)
+    for part, each in zip(where, scene.constraints, strict=True):
+        if isinstance(each, Contact) and each.compliant is not None:
+            rate, pull = jax.vjp(lambda qd, each=each: each.rate(t, y.q, qd, scene.params), y.qd)
+            push = each.compliant.force(-each.error(t, y.q, scene.params)[0], -rate[0])
+            force, rows = force.at[part].set(push), rows.at[part].set(pull(jnp.ones_like(rate))[0])
+    return Action(jnp.sum(rows * force[:, None], axis=0), force, rows)
 
 
 def by_constraint(scene: Scene, t: Array, y: State, values: Array) -> dict[str, Array]:

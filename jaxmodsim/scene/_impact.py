@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._core.semidefinite import solve_semidefinite
 from .._core.shapes import PerDof, Scalar
-from ..mechanics import linearize_constraints, motion_equations
+from ..mechanics import Poisson, linearize_constraints, motion_equations
 from ._scene import Scene
 
 # Rounding units of the velocities of all coordinates, below which a gap has no velocity.
@@ -53,11 +53,15 @@ def impact(
         reach = jnp.stack([held.respond(row) for row in reach])
     delassus = jnp.sum(gaps.rows[:, None, :] * reach[None, :, :], axis=2)
     touches = jnp.where(closed > 0, ~fired, fired)
-    e = jnp.stack([each.restitution.astype(w.dtype) for each in contacts])
-    if elastic:
-        impulse = _impulses(delassus, (1.0 + jnp.where(closed > 0, 0.0, e)) * w, touches)
-    else:
+    e, none = jnp.stack([each.coefficient.astype(w.dtype) for each in contacts]), jnp.zeros_like(w)
+    if not elastic:
         impulse = solve_semidefinite(delassus, jnp.where(touches, -w, 0.0), jnp.ones_like(w), touches)
+    elif any(isinstance(each.restitution, Poisson) for each in contacts):
+        squeeze = _impulses(delassus, w, touches, none)
+        halfway = w + jnp.sum(delassus * squeeze[None, :], axis=1)
+        impulse = squeeze + _impulses(delassus, halfway, touches, e * squeeze)
+    else:
+        impulse = _impulses(delassus, (1.0 + jnp.where(closed > 0, 0.0, e)) * w, touches, none)
     after = w + jnp.sum(delassus * impulse[None, :], axis=1)
     rounding = _ROUNDING * float(jnp.finfo(w.dtype).eps) * jnp.sum(jnp.abs(gaps.rows * qd[None, :]), axis=1)
     still = _constant(jnp.abs(after) <= jnp.maximum(rest, rounding))
@@ -65,28 +69,30 @@ def impact(
 
 
 def _impulses(
-    delassus: Float[Array, "n n"], closing: Float[Array, " n"], touches: Bool[Array, " n"]
+    delassus: Float[Array, "n n"], closing: Float[Array, " n"], touches: Bool[Array, " n"], least: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """Impulses of the contacts that touch: `A p + closing >= 0`, `p >= 0`, one of the two zero for each.
+    """Impulses of the contacts that touch: `A p + closing >= 0`, `p >= least`, one of the two equal for each.
 
-    Every set of contacts that push is tried, and the one that violates the conditions least is taken: of a positive
-    definite matrix exactly one violates none (Cottle, Pang, Stone: The Linear Complementarity Problem, 1992, theorem
-    3.3.7). Of redundant contacts the smallest impulses.
+    Every set of contacts whose gaps end at zero is tried, and the one that violates the conditions least is taken: of a
+    positive definite matrix exactly one violates none (Cottle, Pang, Stone: The Linear Complementarity Problem, 1992,
+    theorem 3.3.7). Of redundant contacts the smallest impulses.
     """
     n = closing.shape[0]
     ones = jnp.ones_like(closing)
 
     def pushed(active: Bool[Array, " n"]) -> Float[Array, " n"]:
-        return solve_semidefinite(delassus, jnp.where(active, -closing, 0.0), ones, active & touches)
+        given = jnp.where(active, 0.0, least)
+        rhs = -closing - jnp.sum(delassus * given[None, :], axis=1)
+        return given + solve_semidefinite(delassus, jnp.where(active, rhs, 0.0), ones, active & touches)
 
     if n == 1:
-        return jnp.maximum(pushed(jnp.asarray([True])), 0.0)
+        return jnp.maximum(pushed(jnp.asarray([True])), least)
     sets = jnp.asarray(np.array(list(product((False, True), repeat=n))))
 
     def violation(active: Bool[Array, " n"]) -> Scalar:
         impulse = pushed(active)
         after = closing + jnp.sum(delassus * impulse[None, :], axis=1)
-        pulls = jnp.max(-impulse * jnp.diagonal(delassus))
+        pulls = jnp.max((least - impulse) * jnp.diagonal(delassus))
         return jnp.maximum(pulls, jnp.max(jnp.where(touches, -after, 0.0)))
 
     worst = jax.lax.map(violation, sets)

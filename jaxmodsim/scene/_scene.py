@@ -7,6 +7,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
@@ -14,7 +15,7 @@ from .._core.functions import as_function
 from .._core.parameters import as_real
 from .._core.readable import AbstractReadable
 from .._core.shapes import PerDof, Scalar
-from ..mechanics import AbstractConstraint, BoundContact, Contact, Lagrangian
+from ..mechanics import AbstractConstraint, BoundContact, Contact, Lagrangian, Poisson
 from ._coordinates import as_coordinates, read_label
 from ._signal import Signal, signals_at, signals_from, signals_of
 from .forces._effect import AbstractEffect
@@ -155,6 +156,11 @@ class Scene(AbstractReadable, eqx.Module):
                 f"Friction rests on {len(self.loaded)} constraints, but no more than {_MOST_LOADS} can be solved"
                 " together; give the load of the others as functions."
             )
+        if len({isinstance(each.restitution, Poisson) for each in self.contacts.values()}) > 1:
+            raise ValueError(
+                f"{', '.join(self.contacts)}: contacts of one scene obey one law of impact. Give restitution=Poisson(e)"
+                " to all of them, or numbers."
+            )
         if len(self.contacts) > _MOST_CONTACTS:
             raise ValueError(
                 f"There are {len(self.contacts)} contacts, but impacts of no more than {_MOST_CONTACTS} can be solved"
@@ -189,6 +195,15 @@ class Scene(AbstractReadable, eqx.Module):
     @property
     def contacts(self) -> dict[str, Contact]:
         """The contacts that open and close, by name, in the order of their modes."""
+        return {name: each for name, each in self._all_contacts.items() if each.compliant is None}
+
+    @property
+    def compliant(self) -> dict[str, Contact]:
+        """The contacts that give way, which have no modes, by name."""
+        return {name: each for name, each in self._all_contacts.items() if each.compliant is not None}
+
+    @property
+    def _all_contacts(self) -> dict[str, Contact]:
         pairs = zip(self.constraint_names, self.constraints, strict=True)
         return {name: each for name, each in pairs if isinstance(each, Contact)}
 
@@ -201,6 +216,11 @@ class Scene(AbstractReadable, eqx.Module):
     def mode_names(self) -> tuple[str, ...]:
         """What has a mode, in the order of the modes: friction elements that run by events, then contacts."""
         return (*self.event_driven, *self.contacts)
+
+    @property
+    def stiff(self) -> bool:
+        """Whether the equations of motion are stiff."""
+        return any(effect.stiff for effect in self.effects) or bool(self.compliant)
 
     @property
     def stick_drifts(self) -> bool:
@@ -242,7 +262,7 @@ class Scene(AbstractReadable, eqx.Module):
         return self._with(lagrangian=lagrangian, params=signals_at(driven, t))
 
     def bind_modes(self, mode: Array | None) -> "Scene":
-        """The scene with each contact as the constraint that it is in its mode; itself without contacts.
+        """The scene with each contact as the constraint that it is in its mode, if any; itself without contacts.
 
         `mode` holds those of `mode_names`.
 
@@ -250,17 +270,19 @@ class Scene(AbstractReadable, eqx.Module):
 
         - `ValueError` for contacts without modes.
         """
-        if not self.contacts:
+        if not self._all_contacts:
             return self
-        if mode is None:
+        if self.contacts and mode is None:
             raise ValueError(
                 f"{', '.join(self.contacts)}: contacts open and close by events, so that position and velocity do not"
                 " tell the forces: run the scene by jaxmodsim.simulate."
             )
-        modes = iter(jax.lax.stop_gradient(mode[len(self.event_driven) :]))
-        return self._with(
-            constraints=tuple(BoundContact(x, next(modes)) if isinstance(x, Contact) else x for x in self.constraints)
-        )
+        modes = iter(() if mode is None else jax.lax.stop_gradient(mode[len(self.event_driven) :]))
+
+        def bound(x: Contact) -> BoundContact:
+            return BoundContact(x, next(modes) if x.compliant is None else jnp.zeros_like(x.compliant.stiffness))
+
+        return self._with(constraints=tuple(bound(x) if isinstance(x, Contact) else x for x in self.constraints))
 
     def step_from(self, t: Scalar) -> "Scene":
         """The scene for a step from `t` up to the next sample: signals are what they are there, without jumps."""
