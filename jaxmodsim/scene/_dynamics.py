@@ -227,7 +227,7 @@ class Dynamics(NamedTuple):
         n, mode = self._elements.size, self._elements
         if not self._closed.size:
             return self._switch_friction(fired, mode)
-        qd, closed = impact(self.t, self.y.q, self.y.qd, self.scene, self._closed, fired[n:], rest, elastic)
+        qd, closed, stopped = impact(self.t, self.y.q, self.y.qd, self.scene, self._closed, fired[n:], rest, elastic)
         struck = self.y._replace(qd=qd)
         if not n:
             return struck, closed
@@ -235,7 +235,8 @@ class Dynamics(NamedTuple):
         # An impact may turn a slip, and end a stick.
         v = jax.lax.stop_gradient(after.contacts.v[:n])
         turned = jnp.any(qd != self.y.qd) & (jnp.abs(v) > rest)
-        state, mode = after._switch_friction(fired[:n] & ~turned, jnp.where(turned, jnp.sign(v), mode))
+        fired = (fired[:n] & ~turned) | (stopped & (mode != 0))
+        state, mode = after._switch_friction(fired, jnp.where(turned, jnp.sign(v), mode))
         return state, jnp.concatenate([mode, closed])
 
     def _switch_friction(self, fired: Bool[Array, " n"], mode: Float[Array, " n"]) -> tuple[State, Float[Array, " n"]]:

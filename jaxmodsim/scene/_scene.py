@@ -21,7 +21,8 @@ from ._signal import Signal, signals_at, signals_from, signals_of
 from .forces._effect import AbstractEffect
 from .forces._friction import Friction
 
-# The test of uniqueness looks at every corner of the box of slopes: two to this power.
+# The test of uniqueness looks at every corner of the box of slopes, two to this power; an impact tries stick, and slip
+# in either direction, of each element: three to this power.
 _MOST_LOADS = 4
 # An impact tries every set of contacts that may push: two to this power.
 _MOST_CONTACTS = 6
@@ -156,6 +157,12 @@ class Scene(AbstractReadable, eqx.Module):
                 f"Friction rests on {len(self.loaded)} constraints, but no more than {_MOST_LOADS} can be solved"
                 " together; give the load of the others as functions."
             )
+        if len(self.impact_friction) > _MOST_LOADS:
+            raise ValueError(
+                f"{', '.join(self.impact_friction)}: no more than {_MOST_LOADS} friction elements under contacts can be"
+                " solved together with an impact; wrap the laws of the others as Regularized(law, width), which take"
+                " no part in impacts."
+            )
         if len({isinstance(each.restitution, Poisson) for each in self.contacts.values()}) > 1:
             raise ValueError(
                 f"{', '.join(self.contacts)}: contacts of one scene obey one law of impact. Give restitution=Poisson(e)"
@@ -206,6 +213,11 @@ class Scene(AbstractReadable, eqx.Module):
     def _all_contacts(self) -> dict[str, Contact]:
         pairs = zip(self.constraint_names, self.constraints, strict=True)
         return {name: each for name, each in pairs if isinstance(each, Contact)}
+
+    @property
+    def impact_friction(self) -> dict[str, Friction]:
+        """The friction elements that take part in impacts: those by events under the reaction of a contact, by name."""
+        return {name: each for name, each in self.event_driven.items() if each.load_constraint in self.contacts}
 
     @property
     def bilateral(self) -> tuple[AbstractConstraint, ...]:

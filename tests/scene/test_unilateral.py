@@ -163,21 +163,6 @@ def test_several_contacts_at_one_instant():
     np.testing.assert_allclose(run.qd[-1], [-0.5, 0.5, 0.5, 0.5], atol=1e-12)
 
 
-def test_a_block_lands_slides_and_stops():
-    mu, g = 0.3, 9.81
-    block = jms.Scene(
-        lambda t, q, qd, p: 0.5 * jnp.sum(qd**2) - g * q[1],
-        effects=(jms.Friction(jms.Coulomb(mu), along=lambda q: q[0], normal_force="floor"),),
-        constraints=(jms.Contact(lambda t, q, p: q[1], name="floor"),),
-    )
-    run = jms.simulate(block, [0.0, 0.5], [1.0, 0.0], 1.5, ts=jnp.linspace(0.0, 1.5, 7), **TIGHT)
-    landing = np.sqrt(2 * 0.5 / g)
-    lands, stops = run.mode_changes
-    np.testing.assert_allclose([lands.t, stops.t], [landing, landing + 1.0 / (mu * g)], rtol=1e-10)
-    np.testing.assert_allclose(run.q[-1], [landing + 1.0 / (2 * mu * g), 0.0], rtol=1e-10, atol=1e-15)
-    np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-11)
-
-
 def test_an_impact_within_a_constraint():
     """A pendulum in Cartesian coordinates strikes a wall at its lowest point: the rod holds, the speed is e times."""
     e, g, start = 0.5, 9.81, 0.6
