@@ -213,7 +213,9 @@ def _check_values(array: dict[str, Any]) -> None:
     if ts is not None and (ts[1:] < ts[:-1]).any():
         raise ValueError("ts must increase.")
     if ts is not None and t0 is not None and t1 is not None and not (t0 <= ts[0] and ts[-1] <= t1):
-        raise ValueError(f"ts must lie within [t0, t1] = [{array['t0']}, {array['t1']}], but runs from {ts[0]} to {ts[-1]}.")
+        raise ValueError(
+            f"ts must lie within [t0, t1] = [{array['t0']}, {array['t1']}], but runs from {ts[0]} to {ts[-1]}."
+        )
 
 
 def _split(plugin: _Plugin | None, kind: type[_Plugin], name: str) -> tuple[_Plugin | None, _Plugin | None]:
