@@ -1,6 +1,7 @@
 """Differentiable mechanics with friction: Lagrangians in, motion, figures and fits out.
 
-Scenes: Scene, AppliedForce, Friction, Signal, AbstractEffect; Constraint, VelocityConstraint, Contact, consistent.
+Scenes: Scene, AppliedForce, Friction, Signal, AbstractEffect; Constraint, VelocityConstraint, consistent; Contact,
+    with Poisson or HuntCrossley.
 Mechanics: point_mass, rigid_body; Chart, Cylindrical, Spherical.
 Friction laws: Viscous, Curve, Coulomb, Stribeck, Dahl, LuGre, ElastoPlastic, MaxwellSlip, Armstrong; in the wrappers
     Regularized, DeadZone, Sign, Bristle; with asymmetric, scaled_by; of gears Geared, ServoGear.
@@ -76,6 +77,8 @@ if TYPE_CHECKING:
     from .mechanics import Constraint as Constraint
     from .mechanics import Contact as Contact
     from .mechanics import Cylindrical as Cylindrical
+    from .mechanics import HuntCrossley as HuntCrossley
+    from .mechanics import Poisson as Poisson
     from .mechanics import Spherical as Spherical
     from .mechanics import VelocityConstraint as VelocityConstraint
     from .mechanics import point_mass as point_mass
@@ -149,6 +152,8 @@ _LATER = {
         "Constraint",
         "Contact",
         "Cylindrical",
+        "HuntCrossley",
+        "Poisson",
         "Spherical",
         "VelocityConstraint",
         "point_mass",

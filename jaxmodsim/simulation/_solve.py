@@ -108,14 +108,13 @@ class RunOutput(NamedTuple):
 
 
 def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolver:
-    """Rodas5P where an effect of the scene is stiff, or runs by events on one coordinate; Tsit5 otherwise.
+    """Rodas5P where the scene is stiff, or runs by events on one coordinate; Tsit5 otherwise.
 
     Every step of a run with events looks at the guards, whatever the method. On one coordinate Rodas5P makes the fewest
     of those whose dense output keeps the tolerance, and is twice as fast as Tsit5 under vmap; on more of them its
     Jacobian costs more than that, most of all in compile time.
     """
-    stiff = any(effect.stiff for effect in scene.effects)
-    return Rodas5P(pivot=fixed_step) if stiff or (scene.mode_names and dof == 1) else dfx.Tsit5()
+    return Rodas5P(pivot=fixed_step) if scene.stiff or (scene.mode_names and dof == 1) else dfx.Tsit5()
 
 
 def _structured(inputs: RunInputs) -> bool:
@@ -225,7 +224,7 @@ def _functions(inputs: RunInputs, options: RunOptions, audited: bool) -> RunFunc
         IntegratedSystem(audited, isinstance(options.solver, Gauss)),
         _REST * inputs.atol,
         (inputs.rtol, inputs.atol),
-        bool(scene.constraints) and options.project,
+        bool(scene.bilateral or scene.contacts) and options.project,
         scene.stick_drifts,
         options.hold_chatter,
     )
