@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ._program import Assign, Block, Branch, Entry, Loop, Program, Symbol
+from ._program import Assign, Block, Entry, Loop, Program, Switch, Symbol
 
 # Written alike in both languages; operands are names or literals.
 _FORMS = {
@@ -163,7 +163,7 @@ class _BlockText:
     def block(self, block: Block, indent: str) -> list[str]:
         return [indent + line for statement in block for line in self.statement(statement)]
 
-    def statement(self, statement: Assign | Loop | Branch) -> Iterator[str]:
+    def statement(self, statement: Assign | Loop | Switch) -> Iterator[str]:
         if isinstance(statement, Assign):
             value = self.language.expression(statement, [self.value(x) for x in statement.operands])
             out = statement.out
@@ -197,7 +197,7 @@ class _BlockText:
             yield f"  {name} = {value};"
         yield "}"
 
-    def branch(self, branch: Branch) -> Iterator[str]:
+    def branch(self, branch: Switch) -> Iterator[str]:
         for out in branch.outs:
             yield f"{self.language.declared(self.language.variable, out.dtype, self.new(out))};"
         index, last = self.value(branch.chosen), len(branch.arms) - 1

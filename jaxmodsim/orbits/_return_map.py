@@ -21,6 +21,9 @@ PeriodFn: TypeAlias = Callable[[PyTree], Array | float]
 Section: TypeAlias = Callable[[Array, Array], Array | float]
 
 MAX_STEPS, MAX_EVENTS = 65536, 4096
+# Steps in a period. Derivatives are those of the steps that are made: where little moves these would grow beyond what is
+# stable for disturbances that decay fast, which then seem to grow.
+LEAST_STEPS = 128
 
 
 class OrbitError(RuntimeError):
@@ -112,6 +115,7 @@ def end_state(
         atol=problem.atol,
         adjoint=adjoint,
         max_steps=max_steps,
+        dtmax=jax.lax.stop_gradient(period) / LEAST_STEPS,
         max_events=MAX_EVENTS,
         throw=False,
     )
