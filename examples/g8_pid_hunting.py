@@ -2,8 +2,7 @@
 
 In stick the integral of the error winds up until the axis breaks away, slips beyond its target, and sticks again. The
 integral is a coordinate of its own, whose velocity follows the error. Its limit cycle is found by shooting and followed
-over the damping of the controller, which makes it slower and hardly smaller: as long as friction falls from stick to
-slip, an integral hunts.
+over the damping of the controller, which makes it smaller and slower, but does not end it.
 
 Run it: `python examples/g8_pid_hunting.py [--smoke] [--out DIR]`.
 """
