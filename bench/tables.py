@@ -242,7 +242,7 @@ REPORTS = {
         ),),
     ),
     "bouncing_ball": Report(
-        "A ball bounces to rest: events, compliant contacts, MuJoCo.", "benchmarks",
+        "A ball bounces to rest: events, compliant contacts, MuJoCo.", "theory",
         (Table(
             "A ball dropped from 1 m, e = 1/2: height and its derivative by the initial height after {bouncing} s,"
             " between bounces; height and energy after {rest} s, at rest, both zero. At: rtol, or the step h [s], with"
