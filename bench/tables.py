@@ -241,6 +241,16 @@ REPORTS = {
             ("break-away", "zero crossings", "steps", "run", "ending"), ("peer", "case"),
         ),),
     ),
+    "bouncing_ball": Report(
+        "A ball bounces to rest: events, compliant contacts, MuJoCo.", "theory",
+        (Table(
+            "A ball dropped from 1 m, e = 1/2: height and its derivative by the initial height after {bouncing} s,"
+            " between bounces; height and energy after {rest} s, at rest, both zero. At: rtol, or the step h [s], with"
+            " springs whose contacts take 0.2 sqrt(h) seconds.",
+            ("error of the height", "error of its derivative", "height at rest", "energy at rest", "run"),
+            ("peer", "at"),
+        ),),
+    ),
     "measured_axis": Report(
         "`jaxmodsim fit` on a measured axis.", "measured_record",
         (Table(

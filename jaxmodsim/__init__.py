@@ -1,7 +1,7 @@
 """Differentiable mechanics with friction: Lagrangians in, motion, figures and fits out.
 
 Scenes: Scene, AppliedForce, Friction, Signal, AbstractEffect; Constraint, VelocityConstraint, consistent; Contact,
-    with Poisson or HuntCrossley.
+    with Poisson or HuntCrossley, end_stops, backlash.
 Mechanics: point_mass, rigid_body; Chart, Cylindrical, Spherical.
 Friction laws: Viscous, Curve, Coulomb, Stribeck, Dahl, LuGre, ElastoPlastic, MaxwellSlip, Armstrong; in the wrappers
     Regularized, DeadZone, Sign, Bristle; with asymmetric, scaled_by; of gears Geared, ServoGear.
@@ -81,6 +81,8 @@ if TYPE_CHECKING:
     from .mechanics import Poisson as Poisson
     from .mechanics import Spherical as Spherical
     from .mechanics import VelocityConstraint as VelocityConstraint
+    from .mechanics import backlash as backlash
+    from .mechanics import end_stops as end_stops
     from .mechanics import point_mass as point_mass
     from .mechanics import rigid_body as rigid_body
     from .orbits import Branch as Branch
@@ -156,6 +158,8 @@ _LATER = {
         "Poisson",
         "Spherical",
         "VelocityConstraint",
+        "backlash",
+        "end_stops",
         "point_mass",
         "rigid_body",
     ),

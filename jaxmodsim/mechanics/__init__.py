@@ -28,3 +28,5 @@ from ._lagrange import quadratic as quadratic
 from ._lagrange import velocity as velocity
 from ._restitution import HuntCrossley as HuntCrossley
 from ._restitution import Poisson as Poisson
+from ._stops import backlash as backlash
+from ._stops import end_stops as end_stops

@@ -12,8 +12,10 @@ from . import four_bar as four_bar
 from . import knife_edge as knife_edge
 from . import linear_stick_slip as linear_stick_slip
 from . import n_link_pendulum as n_link_pendulum
+from . import newtons_cradle as newtons_cradle
 from . import pulled_box as pulled_box
 from . import ramped_box as ramped_box
+from . import rocking_block as rocking_block
 from . import rod_on_rough_floor as rod_on_rough_floor
 from . import rolling_disc as rolling_disc
 from . import slider_crank as slider_crank
@@ -21,6 +23,7 @@ from . import slipping_bristle as slipping_bristle
 from . import spherical_pendulum as spherical_pendulum
 from . import spiral_bead as spiral_bead
 from . import stick_slip_pendulum as stick_slip_pendulum
+from . import two_balls as two_balls
 from . import vibrating_table as vibrating_table
 from . import worm_drive as worm_drive
 from ._named import NamedProblem as NamedProblem

@@ -8,6 +8,7 @@ from .._core.parameters import Number, check_ranges, parameter
 from ..mechanics import Contact
 from ..scene import Scene
 from ..solvers import EventState
+from ._falling import falling
 
 
 class BouncingBall(eqx.Module):
@@ -59,10 +60,6 @@ class BouncingBall(eqx.Module):
         return s._replace(y=jnp.zeros_like(s.y), mode=jnp.ones_like(s.mode))
 
 
-def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    return 0.5 * p["m"] * qd[0] ** 2 - p["m"] * p["g"] * q[0]
-
-
 def _height(t: Array, q: Array, p: dict[str, Array]) -> Array:
     return q[0]
 
@@ -76,7 +73,7 @@ def scene(*, e: ArrayLike, g: ArrayLike = 9.81, m: ArrayLike = 1.0) -> Scene:
     - `g`: gravity [m/s^2], > 0.
     - `m`: mass [kg], > 0.
     """
-    return Scene(_lagrangian, params={"m": m, "g": g}, constraints=(Contact(_height, restitution=e, name="floor"),))
+    return Scene(falling, params={"m": m, "g": g}, constraints=(Contact(_height, restitution=e, name="floor"),))
 
 
 def bounces(n: int, *, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81) -> Float[Array, " n"]:

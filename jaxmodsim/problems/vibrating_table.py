@@ -5,13 +5,10 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..mechanics import Contact
 from ..scene import Scene
+from ._falling import falling
 
 # Numbers for which there is a bounce a period; stable it is for A below 0.90 mm.
 PARAMS = {"m": 0.1, "g": 9.81, "A": 1e-3, "omega": 120.0, "e": 0.6}
-
-
-def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    return 0.5 * p["m"] * qd[0] ** 2 - p["m"] * p["g"] * q[0]
 
 
 def _gap(t: Array, q: Array, p: dict[str, Array]) -> Array:
@@ -36,7 +33,7 @@ def scene(
     - `e`: coefficient of restitution, 0 to 1.
     """
     contact = Contact(_gap, restitution=e, name="table")
-    return Scene(_lagrangian, params={"m": m, "g": g, "A": A, "omega": omega}, constraints=(contact,))
+    return Scene(falling, params={"m": m, "g": g, "A": A, "omega": omega}, constraints=(contact,))
 
 
 def bounce_phase(

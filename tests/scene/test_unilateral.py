@@ -11,7 +11,10 @@ from scipy.special import ellipk
 
 import jaxmodsim as jms
 from jaxmodsim.problems import bouncing_ball, vibrating_table
+from jaxmodsim.validation.hard import hard_cases
+from jaxmodsim.validation.hard._case import SceneTask
 
+HARD = hard_cases()
 TIGHT: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-12}
 
 
@@ -56,14 +59,6 @@ def test_derivatives_of_the_end_of_all_bounces(derivative):
         np.testing.assert_allclose(ours[name], closed[name], rtol=1e-8)
 
 
-def _walls(e):
-    walls = (
-        jms.Contact(lambda t, q, p: q[0], restitution=e, name="left"),
-        jms.Contact(lambda t, q, p: p["L"] - q[0], restitution=e, name="right"),
-    )
-    return jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, params={"L": 1.0}, constraints=walls)
-
-
 def test_gradient_through_a_hundred_impacts():
     impacts = 100
 
@@ -76,7 +71,8 @@ def test_gradient_through_a_hundred_impacts():
     t1 = float(closed(1.0, 0.99)[0]) + 0.1
 
     def end(start):
-        scene = _walls(start["e"])
+        walls = jms.end_stops(lambda q: q[0], lower=0.0, upper=1.0, restitution=start["e"])
+        scene = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, constraints=walls)
         return jms.simulate(scene, [0.5], jnp.stack([start["v"]]), t1, max_events=256, **TIGHT).q[-1, 0]
 
     def exact(start):
@@ -122,45 +118,44 @@ def test_a_contact_opens_where_its_reaction_falls_to_zero():
     np.testing.assert_allclose(run.q[-1, 0], A * np.sin(omega * 0.3), rtol=1e-14)
 
 
-def test_two_equal_balls_exchange_their_velocities():
-    gap = jms.Contact(lambda t, q, p: q[1] - q[0] - 0.1, restitution=1.0)
-    scene = jms.Scene(lambda t, q, qd, p: 0.5 * jnp.sum(qd**2), constraints=(gap,))
-
-    def end(q0):
-        return jms.simulate(scene, q0, [1.0, 0.0], 1.0, **TIGHT).q[-1]
-
-    q0 = jnp.array([0.0, 0.5])
-    np.testing.assert_allclose(end(q0), [0.4, 1.1], rtol=1e-12)
-    for derivative in (jax.jacrev, jax.jacfwd):
-        np.testing.assert_allclose(derivative(end)(q0), [[0.0, 1.0], [1.0, 0.0]], atol=1e-12)
-
-
 def test_several_contacts_at_one_instant():
-    """A rigid bar falls flat on two supports; three balls at rest are struck by a fourth, by Newton's law."""
-    bar = jms.Scene(
-        lambda t, q, qd, p: 0.5 * qd[0] ** 2 + 0.5 * 0.1 * qd[1] ** 2 - 9.81 * q[0],
-        constraints=(
-            jms.Contact(lambda t, q, p: q[0] - 0.5 * jnp.sin(q[1]), restitution=0.5),
-            jms.Contact(lambda t, q, p: q[0] + 0.5 * jnp.sin(q[1]), restitution=0.5),
-        ),
-    )
-    run = jms.simulate(bar, [0.1, 0.0], [0.0, 0.0], 2.0, ts=jnp.array([0.2, 2.0]), **TIGHT)
+    """A rigid bar falls flat on two supports."""
+    bar = HARD["bar_on_two_supports"].task
+    assert isinstance(bar, SceneTask)
+    run = jms.simulate(bar.scene, [0.1, 0.0], [0.0, 0.0], 2.0, ts=jnp.array([0.2, 2.0]), **TIGHT)
     height, velocity = bouncing_ball.motion(run.t, h=0.1, e=0.5)
     np.testing.assert_allclose(run.q[:, 0], height, atol=1e-11)
     np.testing.assert_allclose(run.qd[:, 0], velocity, atol=1e-11)
     np.testing.assert_allclose(run.q[:, 1], 0.0, atol=1e-12)
     np.testing.assert_allclose([each.multiplier[-1, 0] for each in run.reactions.values()], 9.81 / 2, rtol=1e-9)
 
-    balls = jms.Scene(
-        lambda t, q, qd, p: 0.5 * jnp.sum(qd**2),
-        constraints=(
-            jms.Contact(lambda t, q, p: q[1] - q[0], restitution=1.0),
-            jms.Contact(lambda t, q, p: q[2] - q[1], restitution=1.0),
-            jms.Contact(lambda t, q, p: q[3] - q[2], restitution=1.0),
-        ),
+
+def test_backlash_between_a_motor_and_its_load():
+    """The motor runs through the play and strikes: momentum and Newton's law, then both accelerate together."""
+    play, torque = 0.2, 0.5
+    scene = jms.Scene(
+        lambda t, q, qd, p: 0.5 * (1.0 * qd[0] ** 2 + 3.0 * qd[1] ** 2),
+        params={"play": play},
+        effects=(jms.AppliedForce(lambda t, q, qd, p: jnp.stack([torque + 0.0 * t, 0.0 * t])),),
+        constraints=jms.backlash(lambda q: q[0] - q[1], lambda p: p["play"], name="teeth"),
     )
-    run = jms.simulate(balls, [-0.5, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], 1.0, **TIGHT)
-    np.testing.assert_allclose(run.qd[-1], [-0.5, 0.5, 0.5, 0.5], atol=1e-12)
+
+    def end(play):
+        run = jms.simulate(
+            jms.scene.replace_numbers(scene, {"play": play}), [0.0, 0.0], [0.0, 0.0], 2.0, ts=[1.0, 2.0], **TIGHT
+        )
+        return run.q[-1, 1]
+
+    run = jms.simulate(scene, [0.0, 0.0], [0.0, 0.0], 2.0, ts=[1.0, 2.0], **TIGHT)
+    strikes, left = np.sqrt(play / torque), 2.0 - np.sqrt(play / torque)
+    (change,) = run.mode_changes
+    assert (change.effect, change.after) == ("teeth_upper", "closed")
+    np.testing.assert_allclose(change.t, strikes, rtol=1e-10)
+    np.testing.assert_allclose(run.q[-1, 1], torque / 4 * (strikes * left + 0.5 * left**2), rtol=1e-10)
+    np.testing.assert_allclose(run.q[-1, 0] - run.q[-1, 1], play / 2, rtol=1e-12)
+    np.testing.assert_allclose(run.reactions["teeth_upper"].multiplier[:, 0], 0.75 * torque, rtol=1e-10)
+    # The place is torque/4 (2 - play/(2 torque)).
+    np.testing.assert_allclose(jax.grad(end)(jnp.asarray(play)), -1 / 8, rtol=1e-8)
 
 
 def test_an_impact_within_a_constraint():
@@ -292,6 +287,10 @@ def test_wrong_contacts_are_refused():
         jms.HuntCrossley(0.0)
     with pytest.raises(ValueError, match="Poisson: e must be finite and >= 0 and <= 1"):
         jms.Poisson(1.5)
+    with pytest.raises(ValueError, match="end_stops needs lower, upper or both"):
+        jms.end_stops(lambda q: q[0])
+    with pytest.raises(ValueError, match="backlash along must be a function"):
+        jms.backlash(0.1, 0.2)
     mixed = jms.Contact(lambda t, q, p: q[0]), jms.Contact(lambda t, q, p: q[0], restitution=jms.Poisson(0.5))
     with pytest.raises(ValueError, match="one law of impact"):
         jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, constraints=mixed)

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ...friction import Coulomb
-from ...mechanics import Contact
+from ...mechanics import Contact, HuntCrossley, Poisson, end_stops
 from ...problems import bouncing_ball, vibrating_table
 from ...scene import AppliedForce, Friction, Scene, Signal
+from ...simulation import Trajectory
 from ._case import HardCase, motion, position
 
 FAMILY = "contacts"
@@ -101,18 +102,9 @@ def _free(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     return 0.5 * jnp.sum(qd**2)
 
 
-def _left(t: Array, q: Array, p: dict[str, Array]) -> Array:
-    return q[0]
-
-
-def _right(t: Array, q: Array, p: dict[str, Array]) -> Array:
-    return 1.0 - q[0]
-
-
 def _walls() -> HardCase:
     e, impacts = 0.99, 100
-    walls = Contact(_left, restitution=e, name="left"), Contact(_right, restitution=e, name="right")
-    scene = Scene(_free, constraints=walls)
+    scene = Scene(_free, constraints=end_stops(_along, lower=0.0, upper=1.0, restitution=e))
 
     def last(v: float) -> float:
         return 0.5 / v + sum(1.0 / (v * e**k) for k in range(1, impacts))
@@ -210,6 +202,162 @@ def _landing() -> HardCase:
     )
 
 
+def _speed(run: Trajectory) -> Array:
+    return run.qd[-1, 0]
+
+
+def _at_the_end() -> HardCase:
+    wall = (Contact(_first, restitution=0.5, name="wall"),)
+    return HardCase(
+        "impact_at_the_end",
+        "The impact is a nanosecond before t1.",
+        "The last step ends before the event is looked for.",
+        motion(Scene(_free, constraints=wall), [0.5], [-1.0], 0.5 + 1e-9, by="wall.restitution", read=_speed),
+        lambda e: e,
+        lambda _: 1.0,
+        # There the two are one.
+        single=None,
+    )
+
+
+def _ceiling(t: Array, q: Array, p: dict[str, Array]) -> Array:
+    return 1.0 - q[0]
+
+
+def _grazing() -> HardCase:
+    e, late, reach = 0.5, 0.5, 1e-3
+    start = math.sqrt(2.0 * _G + reach**2)
+
+    def height(v: float) -> float:
+        strikes = math.sqrt(v**2 - 2.0 * _G)
+        left = late - (v - strikes) / _G
+        return 1.0 - e * strikes * left - 0.5 * _G * left**2
+
+    def slope(v: float) -> float:
+        strikes = math.sqrt(v**2 - 2.0 * _G)
+        left, rate = late - (v - strikes) / _G, v / strikes
+        return -e * rate * left - (e * strikes + _G * left) * (rate - 1.0) / _G
+
+    ball = bouncing_ball.scene(e=e)
+    scene = Scene(ball.lagrangian, ball.params, constraints=(Contact(_ceiling, restitution=e, name="ceiling"),))
+    return HardCase(
+        "near_grazing",
+        "A ball thrown up touches a ceiling at 1 mm/s, a tenth of a millisecond before it would turn.",
+        "The impact is not seen, and the derivative, which has no bound towards grazing, is off by a factor of 4000.",
+        motion(scene, [0.0], [start], late, by="qd0[0]", read=position, numbers={"rtol": 1e-11, "atol": 1e-13}),
+        height,
+        slope,
+        tolerance=1e-6,
+        single=None,
+    )
+
+
+def _pair(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    return 0.5 * jnp.sum(qd**2) - _G * jnp.sum(q)
+
+
+def _first(t: Array, q: Array, p: dict[str, Array]) -> Array:
+    return q[0]
+
+
+def _two_accumulations() -> HardCase:
+    late = 1.0
+    balls = Contact(_first, restitution=0.6, name="one"), Contact(_above, restitution=0.3, name="other")
+    return HardCase(
+        "rest_while_another_bounces",
+        "Two balls: the bounces of one accumulate to rest at 0.84 s, between those of the other.",
+        "What ends the bounces of one ends those of the other.",
+        motion(Scene(_pair, constraints=balls), [1.0, 1.0], [0.0, 0.0], late, by="one.restitution", read=position),
+        lambda e: _height(late, 1.0, e),
+        lambda e: _restitution(late, 1.0, e),
+        single=None,
+    )
+
+
+def _redundant() -> HardCase:
+    ball = bouncing_ball.scene(e=0.5)
+    twice = tuple(Contact(_first, restitution=Poisson(0.5), name=name) for name in ("one", "other"))
+    scene = Scene(ball.lagrangian, ball.params, constraints=twice)
+    return HardCase(
+        "redundant_contacts",
+        "A ball falls on two floors at the same height: any share of the impulse obeys the law, Poisson's.",
+        "A singular system, or twice the impulse.",
+        motion(scene, [1.0], [0.0], 1.2, by="q0[0]", read=position),
+        lambda h: _height(1.2, h, 0.5),
+        lambda h: float(jax.grad(lambda h: bouncing_ball.motion(jnp.asarray(1.2), h=h, e=0.5)[0])(h)),
+    )
+
+
+def _lift(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    return jnp.stack([0.0 * t, 2.0 * _G * t])
+
+
+def _lost_in_stick() -> HardCase:
+    scene = Scene(
+        _thrown,
+        effects=(
+            AppliedForce(_lift, name="lift"),
+            Friction(Coulomb(0.5), along=_along, belt_velocity=0.4, normal_force="belt"),
+        ),
+        constraints=(Contact(_above, name="belt"),),
+    )
+    return HardCase(
+        "lift_off_in_stick",
+        "A block sticks on a belt, is lifted off it at 0.5 s, and flies on at the speed of the belt.",
+        "Stick without a load is solved for, or holds the block in the air.",
+        motion(scene, [0.0, 0.0], [0.4, 0.0], 1.5, by="qd0[0]", read=position),
+        # Whatever it begins with, it has the speed of the belt soon; within rounding of that, at once.
+        lambda _: 0.4 * 1.5,
+        lambda _: 0.0,
+    )
+
+
+def _stiff() -> HardCase:
+    law = HuntCrossley(1e14, damping=0.3)
+    scene = Scene(_free, constraints=(Contact(_first, restitution=law, name="wall"),))
+
+    return HardCase(
+        "stiff_compliant_contact",
+        "A compliant contact of 1e14 N/m^(3/2): it lasts some microseconds of a run of a second.",
+        "Explicit steps follow every microsecond, and others pass over the contact.",
+        motion(scene, [0.5], [-1.0], 1.0, by="qd0[0]", read=_speed, numbers={"rtol": 1e-9, "atol": 1e-12}),
+        lambda v: -v * float(law.restitution(-v)),
+        single=1e-2,
+        skips=dict.fromkeys(
+            ("forward", "reverse"), "no event ends a step where the contact begins, so digits are lost"
+        ),
+    )
+
+
+def _rolling(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    return 0.5 * jnp.sum(qd**2) - 0.3 * qd[2] ** 2
+
+
+def _rim(q: Array) -> Array:
+    return q[0] + q[2]
+
+
+def _oblique() -> HardCase:
+    inertia, e = 0.4, 0.8
+    friction = Friction(Coulomb(0.1), along=_rim, normal_force="floor")
+    scene = Scene(_rolling, effects=(friction,), constraints=(Contact(_above, restitution=e, name="floor"),))
+    return HardCase(
+        "oblique_impact",
+        "A spinning disc strikes a rough floor: friction, an impulse, turns its spin, and slip does not end.",
+        "Friction at an instant is left out, or stops the slip that it only slows.",
+        motion(scene, [0.0, 1.0, 0.0], [1.0, -2.0, 5.0], 1.0, by="friction.Fc", read=_spin),
+        lambda mu: 5.0 - mu * (1.0 + e) * 2.0 / inertia,
+        lambda _: -(1.0 + e) * 2.0 / inertia,
+    )
+
+
+def _spin(run: Trajectory) -> Array:
+    return run.qd[-1, 2]
+
+
 def cases() -> list[HardCase]:
     """All of the family."""
-    return [*_accumulating(), _table(), _walls(), _two_supports(), _at_a_sample(), _landing()]
+    return [
+        *_accumulating(), _table(), _walls(), _two_supports(), _at_a_sample(), _landing(), _at_the_end(), _grazing(),
+        _two_accumulations(), _redundant(), _lost_in_stick(), _stiff(), _oblique(),
+    ]  # fmt: skip

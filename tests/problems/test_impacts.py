@@ -1,0 +1,59 @@
+"""Problems with impacts, against their closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmodsim as jms
+from jaxmodsim.problems import newtons_cradle, rocking_block, two_balls
+
+
+@pytest.mark.parametrize("numbers", [{}, {"m2": 3.0, "e": 0.6}])
+def test_two_balls(numbers):
+    scene, qd0 = two_balls.scene(**numbers), jnp.array([1.0, -0.2])
+
+    def end(q0):
+        return jms.simulate(scene, q0, qd0, 1.0, rtol=1e-10, atol=1e-12).q[-1]
+
+    q0 = jnp.array([0.0, 0.5])
+    np.testing.assert_allclose(end(q0), two_balls.motion(1.0, q0, qd0, **numbers), rtol=1e-12)
+    exact = jax.jacfwd(lambda q0: two_balls.motion(1.0, q0, qd0, **numbers))(q0)
+    if not numbers:
+        np.testing.assert_allclose(exact, [[0.0, 1.0], [1.0, 0.0]], atol=1e-15)
+    for derivative in (jax.jacrev, jax.jacfwd):
+        np.testing.assert_allclose(derivative(end)(q0), exact, atol=1e-12)
+
+
+def test_newtons_cradle():
+    """A quarter of a period after its release the first ball strikes: the balls' velocities there."""
+    quarter, start = 0.5 * np.pi * np.sqrt(0.2 / 9.81), -0.02
+    speed = -start * np.sqrt(9.81 / 0.2)
+    for gap in (0.0, 1e-6):
+        run = jms.simulate(
+            newtons_cradle.scene(gap=gap), [start, 0.0, 0.0], [0.0] * 3, quarter + 2e-5, rtol=1e-9, atol=1e-14
+        )
+        exact = newtons_cradle.velocities_after(3, speed, touching=gap == 0)
+        np.testing.assert_allclose(run.qd[-1], exact, atol=1e-4)
+    np.testing.assert_allclose(newtons_cradle.velocities_after(4, 1.0, touching=True), [-0.5, 0.5, 0.5, 0.5])
+    inelastic = newtons_cradle.velocities_after(3, 1.0, touching=False, e=0.5)
+    np.testing.assert_allclose(jnp.sum(inelastic), 1.0)
+    with pytest.raises(ValueError, match="balls must be 2 to 7, but 8"):
+        newtons_cradle.scene(8)
+
+
+def test_a_block_rocks_as_housner_says():
+    start, p = 0.02, rocking_block.PARAMS
+    quarter = float(rocking_block.quarter_period(start))
+    q0, qd0 = rocking_block.state(start)
+    # The closed form is that of a slender block, alpha = 0.1.
+    ts = jnp.asarray([0.5 * quarter, 0.998 * quarter, 1.002 * quarter, 2.0 * quarter])
+    run = jms.simulate(rocking_block.scene(), q0, qd0, 2.0 * quarter, ts=ts, rtol=1e-9, atol=1e-11)
+    np.testing.assert_array_equal(run.mode["right"], [1, 1, 0, 0])
+    np.testing.assert_array_equal(run.mode["left"], [0, 0, 1, 1])
+    # On the one edge or on the other, which does not slip.
+    inertia = 4.0 / 3.0 * p["m"] * (p["b"] ** 2 + p["h"] ** 2)
+    energy = 0.5 * inertia * run.qd[:, 2] ** 2 + p["m"] * p["g"] * (run.q[:, 1] - p["h"])
+    begun = p["m"] * p["g"] * (float(q0[1]) - p["h"])
+    kept = begun * rocking_block.speed_ratio() ** 2
+    np.testing.assert_allclose(energy, jnp.asarray([begun, begun, kept, kept]), rtol=1e-7)
