@@ -21,8 +21,8 @@ PeriodFn: TypeAlias = Callable[[PyTree], Array | float]
 Section: TypeAlias = Callable[[Array, Array], Array | float]
 
 MAX_STEPS, MAX_EVENTS = 65536, 4096
-# Steps in a period. Derivatives are those of the steps that are made: where little moves, these would become too long for
-# disturbances that decay fast, which then seem to grow.
+# Steps in a period. Derivatives are those of the steps that are made: where little moves, these would become too long
+# for disturbances that decay fast, which then seem to grow.
 LEAST_STEPS = 128
 
 
