@@ -95,9 +95,10 @@ def _draw_orbit(axis: Axes, orbit: PeriodicOrbit, i: int, known: list[str]) -> N
         words = combinations[start]
         colour = COLOURS[known.index(words) % len(COLOURS)]
         stuck = "stick" in words or "closed" in words
-        style = {"lw": 2.6, "marker": "o", "ms": 4, "zorder": 3} if stuck else {"lw": 1.3}  # at rest it is a point
         label = f"_{words}" if words in named else words  # once in a legend
-        axis.plot(q[start : start + 2], qd[start : start + 2], color=colour, label=label, **style)
+        axis.plot(q[start : start + 2], qd[start : start + 2], color=colour, lw=2.6 if stuck else 1.3, label=label)
+        if stuck:  # on the ground it is a point
+            axis.plot(q[start], qd[start], "o", color=colour, ms=4, zorder=3)
         named.add(words)
     (name, unit), (rate, rate_unit) = (quantity_of(run.scene, f"{kind}[{i}]") for kind in ("q", "qd"))
     axis.set(xlabel=with_unit(name, unit), ylabel=with_unit(rate, rate_unit))
