@@ -8,6 +8,7 @@ from ._dynamics import check_scene as check_scene
 from ._dynamics import forward_dynamics as forward_dynamics
 from ._dynamics import from_dynamics as from_dynamics
 from ._dynamics import vector_field as vector_field
+from ._event_driven import mode_numbers as mode_numbers
 from ._implicit import check_step as check_step
 from ._implicit import scene_step as scene_step
 from ._linear_solver import has_linear_solver as has_linear_solver

@@ -23,9 +23,10 @@ from ._event_driven import (
     FrictionElements,
     FrictionForces,
     Loads,
-    contact,
-    contact_guards,
+    assemble_friction,
+    friction_guards,
     next_modes,
+    renew_slip,
     solve_friction_forces,
     stick_violation,
     stop_slip,
@@ -48,8 +49,8 @@ Modes: TypeAlias = Any
 class State(NamedTuple):
     """State of a scene: coordinates and velocities, shape `[dof]`, and the effects' own states by name.
 
-    The modes of set-valued friction elements come beside it, an array of -1, 0, +1 in the order of
-    `Scene.event_driven`, or None where there are none.
+    The modes of set-valued friction elements and of contacts come beside it, an array in the order of
+    `Scene.mode_names`, or None where there are none.
     """
 
     q: PerDof
@@ -78,7 +79,7 @@ class Dynamics(NamedTuple):
     - `scene`: with its signals and laws as they are at this state.
     - `actions`: of every effect, by name.
     - `qdd`: accelerations.
-    - `contact`, `friction`: the friction elements that depend on accelerations, and their forces, or None.
+    - `elements`, `friction`: the friction elements that depend on accelerations, and their forces, or None.
     - `constraints`, `multipliers`: of all constraints, or None.
     - `validity_margins`: what has to be positive for the equations to hold, in the order of `Scene.checks`: of each
       constraint that can only push its multiplier, then the margin of uniqueness of the loads; None for nothing.
@@ -90,7 +91,7 @@ class Dynamics(NamedTuple):
     scene: Scene
     actions: dict[str, Action]
     qdd: PerDof
-    contact: FrictionElements | None
+    elements: FrictionElements | None
     friction: FrictionForces | None
     constraints: LinearizedConstraints | None
     multipliers: Float[Array, " m"] | None
@@ -163,7 +164,7 @@ class Dynamics(NamedTuple):
     def guards(
         self, rest: Scalar, tolerances: tuple[Array, Array]
     ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
-        """Guards that are positive while the modes hold, and their tolerances; see `contact_guards`.
+        """Guards that are positive while the modes hold, and their tolerances; see `friction_guards`.
 
         Of a contact that is open the gap, of one that is closed its multiplier. A gap counts as closed only at `-rest`:
         behind an impact, and where a contact opens, it begins from zero.
@@ -172,7 +173,7 @@ class Dynamics(NamedTuple):
         guards, atol = [], []
         if friction.size:
             assert self.friction is not None
-            of_friction = contact_guards(self.contacts, self.friction, friction, rest, tolerances)
+            of_friction = friction_guards(self.friction_elements, self.friction, friction, rest, tolerances)
             guards, atol = [of_friction[0]], [of_friction[1]]
         if gaps.size:
             assert self.multipliers is not None
@@ -207,13 +208,16 @@ class Dynamics(NamedTuple):
 
     def _start_friction(self, rest: Scalar) -> tuple[State, Float[Array, " n"]]:
         """State, and modes of the friction elements, to begin with."""
-        t, y, scene, contacts = self.t, self.y, self.scene, self.contacts
-        elements = [*scene.event_driven.values()]
-        speed = [jnp.sum(jnp.abs(e.direction(y.q, scene.params) * y.qd)) + jnp.abs(e.belt(t)) for e in elements]
+        t, y, scene, elements = self.t, self.y, self.scene, self.friction_elements
+        speed = []
+        for each in scene.event_driven.values():
+            row = each.direction(y.q, scene.params)
+            size = jnp.sum(jnp.abs(row * y.qd)) + jnp.sum(jnp.abs(each.belt(t)))
+            speed += [size] if row.ndim == 1 else [size] * row.shape[0]
         rounding = 8.0 * float(jnp.finfo(y.q.dtype).eps) * jax.lax.stop_gradient(jnp.stack(speed))
-        v = contacts.v[: len(elements)]
-        still = jnp.abs(v) <= jnp.maximum(rounding, rest)
-        mode = next_modes(contacts, jnp.sign(v), still, jnp.zeros_like(still))
+        v = elements.v[: len(speed)]
+        still = elements.magnitude(v) <= jnp.maximum(rounding, rest)
+        mode = next_modes(elements, elements.slipping(jax.lax.stop_gradient(v)), still, jnp.zeros_like(still), rest)
         return self._stick(mode), mode
 
     def switch(
@@ -222,38 +226,55 @@ class Dynamics(NamedTuple):
         """State and modes after the guards that `fired`; `elastic` is False where impacts have accumulated."""
         n, mode = self._elements.size, self._elements
         if not self._closed.size:
-            return self._switch_friction(fired, mode)
+            return self._switch_friction(fired, mode, rest)
         qd, closed = impact(self.t, self.y.q, self.y.qd, self.scene, self._closed, fired[n:], rest, elastic)
         struck = self.y._replace(qd=qd)
         if not n:
             return struck, closed
         after = forward_dynamics(self.t, struck, self.scene, jnp.concatenate([mode, closed]))
         # An impact may turn a slip, and end a stick.
-        v = jax.lax.stop_gradient(after.contacts.v[:n])
-        turned = jnp.any(qd != self.y.qd) & (jnp.abs(v) > rest)
-        state, mode = after._switch_friction(fired[:n] & ~turned, jnp.where(turned, jnp.sign(v), mode))
+        elements = after.friction_elements
+        v = jax.lax.stop_gradient(elements.v[:n])
+        turned = jnp.any(qd != self.y.qd) & (elements.magnitude(v) > rest)
+        mode = jnp.where(turned, elements.slipping(v), mode)
+        state, mode = after._switch_friction(fired[:n] & ~turned, mode, rest)
         return state, jnp.concatenate([mode, closed])
 
-    def _switch_friction(self, fired: Bool[Array, " n"], mode: Float[Array, " n"]) -> tuple[State, Float[Array, " n"]]:
-        new = next_modes(self.contacts, mode, (mode == 0) | fired, fired & (mode == 0))
-        return self._stick(new), new
+    def _switch_friction(
+        self, fired: Bool[Array, " n"], mode: Float[Array, " n"], rest: Scalar
+    ) -> tuple[State, Float[Array, " n"]]:
+        elements = self.friction_elements
+        mode, fired = renew_slip(elements, mode, fired, rest) if elements.planes else (mode, fired)
+        sticks = elements.sticks(mode)
+        new = next_modes(elements, mode, sticks | fired, fired & sticks, rest)
+        # What is left of a slip in the plane that stops goes, whatever follows: it says nothing of the next direction.
+        stops = elements.in_planes(elements.sticks(new), lambda part: fired[part] | elements.sticks(new)[part])
+        return self.y._replace(qd=stop_slip(elements, self.y.qd, stops)), new
+
+    def hold(self, fired: Bool[Array, " guards"]) -> tuple[State, Float[Array, " n"]]:
+        """State and modes where the friction elements that `fired` stick, whatever their limits."""
+        n, elements = self._elements.size, self.friction_elements
+        held = elements.in_planes(fired[:n], lambda part: jnp.any(fired[part]))
+        mode = jnp.concatenate([jnp.where(held, 0.0, self._elements), self._closed])
+        return self.stick(mode), mode
 
     def stick(self, mode: Modes) -> State:
         """State with the slip velocity of elements that stick in `mode`, which drifts, set to zero."""
         return self._stick(mode[: self._elements.size])
 
     def _stick(self, mode: Float[Array, " n"]) -> State:
-        return self.y._replace(qd=stop_slip(self.contacts, self.y.qd, mode == 0))
+        elements = self.friction_elements
+        return self.y._replace(qd=stop_slip(elements, self.y.qd, elements.sticks(mode)))
 
     @property
     def _elements(self) -> Float[Array, " n"]:
         """Modes of the friction elements."""
-        return self.mode[: len(self.scene.event_driven)]
+        return self.mode[: _rows_of_friction(self.scene, self.mode)]
 
     @property
     def _closed(self) -> Float[Array, " n"]:
         """Modes of the contacts."""
-        return self.mode[len(self.scene.event_driven) :]
+        return self.mode[_rows_of_friction(self.scene, self.mode) :]
 
     @property
     def stick_violation(self) -> Float[Array, " n"]:
@@ -261,13 +282,13 @@ class Dynamics(NamedTuple):
         if not self._elements.size:
             return self._elements
         assert self.friction is not None
-        return stick_violation(self.friction, self._elements)
+        return stick_violation(self.friction_elements, self.friction, self._elements)
 
     @property
-    def contacts(self) -> FrictionElements:
-        """`contact` of a scene that has it."""
-        assert self.contact is not None
-        return self.contact
+    def friction_elements(self) -> FrictionElements:
+        """`elements` of a scene that has them."""
+        assert self.elements is not None
+        return self.elements
 
 
 class Mobility(NamedTuple):
@@ -335,35 +356,53 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     units = {name: each.force_per_load(t, q, qd, y.z.get(name), params) for name, each in scene.reaction_loaded.items()}
     pushes = [-each.apply_force(q, units[name][0], params) for name, each in scene.reaction_loaded.items()]
 
-    def loads(rows: Array) -> Loads | None:
-        return _loads(scene, mobility, t, y, rows, multipliers)
+    def loads(rows: Array, widths: tuple[int, ...]) -> Loads | None:
+        return _loads(scene, mobility, t, y, rows, widths, multipliers)
 
     floor = mobility.least if linearized is not None else None
-    contacts = contact([*scene.event_driven.values()], pushes, mobility.respond, floor, loads, t, q, qd, params, qdd)
-    modes = jnp.zeros(0, q.dtype) if mode is None else mode[: len(scene.event_driven)]
-    settled = solve_friction_forces(contacts, modes)
-    for i, (name, effect) in enumerate(scene.event_driven.items()):
-        actions[name] = Action(effect.apply_force(q, settled.force[i], params), settled.force[i])
-    for i, name in enumerate(scene.reaction_loaded, start=len(scene.event_driven)):
+    friction = [*scene.event_driven.values()]
+    modes = jnp.zeros(0, q.dtype) if mode is None else mode[: _rows_of_friction(scene, mode)]
+    elements = assemble_friction(friction, pushes, mobility.respond, floor, loads, t, q, qd, params, qdd, modes)
+    settled = solve_friction_forces(elements, modes)
+    forces = [settled.force[part] for part in elements.parts]
+    for force, (name, effect) in zip(forces, scene.event_driven.items(), strict=False):
+        force = force if force.ndim == 0 else effect.stretch(force)
+        actions[name] = Action(effect.apply_force(q, force, params), force)
+    for force, push, name in zip(forces[len(friction) :], pushes, scene.reaction_loaded, strict=True):
         unit, rate = units[name]
-        actions[name] = Action(-settled.force[i] * pushes[i - len(scene.event_driven)], settled.force[i] * unit, rate)
-    qdd = qdd - jnp.sum(contacts.minv_jt * settled.force[:, None], axis=0)
+        actions[name] = Action(-force * push, force * unit, rate)
+    qdd = qdd - jnp.sum(elements.minv_jt * settled.force[:, None], axis=0)
     if linearized is not None and multipliers is not None:
         taken = sum(actions[name].generalised for name in (*scene.event_driven, *scene.reaction_loaded))
         multipliers = multipliers + linearized.multiplier_response(mobility.solve(jnp.asarray(taken)))
     margins = _margins(scene, t, y, multipliers, settled.margin)
-    return Dynamics(t, y, mode, scene, actions, qdd, contacts, settled, linearized, multipliers, margins)
+    return Dynamics(t, y, mode, scene, actions, qdd, elements, settled, linearized, multipliers, margins)
+
+
+def _rows_of_friction(scene: Scene, mode: Float[Array, " modes"]) -> int:
+    """How many of the modes are those of friction elements; the others are of contacts."""
+    return mode.shape[0] - len(scene.contacts)
 
 
 def _loads(
-    scene: Scene, mobility: Mobility, t: Array, y: State, rows: Float[Array, "n dof"], multipliers: Any
+    scene: Scene,
+    mobility: Mobility,
+    t: Array,
+    y: State,
+    rows: Float[Array, "n dof"],
+    widths: tuple[int, ...],
+    multipliers: Any,
 ) -> Loads | None:
-    """Normal forces of the constraints that load friction, and what the elements with `rows` take off them."""
+    """Normal forces of the constraints that load friction, and what the elements take off them.
+
+    Of each element there are as many `rows` as `widths` says.
+    """
     names = scene.loaded
     if not names:
         return None
     assert mobility.constraints is not None
-    loaded = [each.load_constraint for each in (*scene.event_driven.values(), *scene.reaction_loaded.values())]
+    friction = (*scene.event_driven.values(), *scene.reaction_loaded.values())
+    loaded = [x.load_constraint for x, width in zip(friction, widths, strict=True) for _ in range(width)]
     where = by_constraint(scene, t, y, jnp.arange(multipliers.shape[0]))
     chosen = dict(zip(scene.constraint_names, scene.constraints, strict=True))
     at = jnp.concatenate([where[name] for name in names])
