@@ -31,9 +31,9 @@ from .forces._friction import Friction
 _LOAD_ROUNDING = 100.0
 
 # The velocity in the mode of slip in a plane is renewed where slip has fallen to, or grown to, so much of it.
-_SHRUNK, _GROWN = 1e-2, 1e4
+_SHRUNK, _GROWN = 0.1, 1e4
 # Slip in a plane has ended where it goes back past its direction and is not faster than so many speeds of none.
-_ENDED = 100.0
+_ENDED = 10.0
 
 _constant = jax.lax.stop_gradient
 

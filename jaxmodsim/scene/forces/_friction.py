@@ -33,7 +33,7 @@ from ...friction import (
 from ._effect import AbstractEffect, Action, Power
 
 # Part of an earlier slip velocity below which the direction of slip in the plane is rounded off.
-_FLOOR = 1e-3
+_FLOOR = 1e-2
 
 
 def _law(law: Any) -> AbstractLaw:
