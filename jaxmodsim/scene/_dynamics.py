@@ -217,7 +217,9 @@ class Dynamics(NamedTuple):
         rounding = 8.0 * float(jnp.finfo(y.q.dtype).eps) * jax.lax.stop_gradient(jnp.stack(speed))
         v = elements.v[: len(speed)]
         still = elements.magnitude(v) <= jnp.maximum(rounding, rest)
-        mode = next_modes(elements, elements.slipping(jax.lax.stop_gradient(v)), still, jnp.zeros_like(still), rest)
+        mode = next_modes(
+            elements, elements.slipping(jax.lax.stop_gradient(v), rest), still, jnp.zeros_like(still), rest
+        )
         return self._stick(mode), mode
 
     def switch(
@@ -236,7 +238,7 @@ class Dynamics(NamedTuple):
         elements = after.friction_elements
         v = jax.lax.stop_gradient(elements.v[:n])
         turned = jnp.any(qd != self.y.qd) & (elements.magnitude(v) > rest)
-        mode = jnp.where(turned, elements.slipping(v), mode)
+        mode = jnp.where(turned, elements.slipping(v, rest), mode)
         state, mode = after._switch_friction(fired[:n] & ~turned, mode, rest)
         return state, jnp.concatenate([mode, closed])
 

@@ -30,10 +30,13 @@ from .forces._friction import Friction
 # Rounding units in the load of a sticking element, of its limits.
 _LOAD_ROUNDING = 100.0
 
-# The velocity in the mode of slip in a plane is renewed where slip has fallen to, or grown to, so much of it.
+# The velocity in the mode of slip in a plane is renewed where slip has fallen to, or grown to, so much of it ...
 _SHRUNK, _GROWN = 0.1, 1e4
-# Slip in a plane has ended where it goes back past its direction and is not faster than so many speeds of none.
-_ENDED = 10.0
+# ... but is at least so many speeds of none: the direction is rounded off below a part of it, which must not be below
+# what the error control resolves.
+_SLOWEST = 1e6
+# Slip in a plane has ended where it goes back past its direction, and is not faster than so many speeds of none.
+_ENDED = 1e5
 
 _constant = jax.lax.stop_gradient
 
@@ -113,14 +116,20 @@ class FrictionElements(eqx.Module):
         """Which rows are of elements that stick."""
         return self.in_planes(mode == 0, lambda part: jnp.all(mode[part] == 0))
 
-    def slipping(self, v: Float[Array, " modes"]) -> Float[Array, " modes"]:
-        """Modes of slip with the velocities `v`."""
-        return self.in_planes(jnp.sign(v), lambda part: v[part])
+    def slipping(self, v: Float[Array, " modes"], rest: Scalar) -> Float[Array, " modes"]:
+        """Modes of slip with the velocities `v`; `rest` is the speed [m/s] that counts as none."""
+        return self.in_planes(
+            jnp.sign(v), lambda part: jnp.maximum(_slowest(rest), safe_norm(v[part])) * _unit(v[part])
+        )
 
     def beginning(self, load: Float[Array, " modes"], rest: Scalar) -> Float[Array, " modes"]:
-        """Modes of slip that begins under these loads; `rest` is the speed [m/s] that counts as none."""
-        least = jnp.maximum(rest, float(jnp.finfo(load.dtype).tiny) ** 0.5) / _SHRUNK
-        return self.in_planes(jnp.sign(load), lambda part: least * _unit(load[part]))
+        """Modes of slip that begins under these loads."""
+        return self.in_planes(jnp.sign(load), lambda part: _slowest(rest) * _unit(load[part]))
+
+
+def _slowest(rest: Scalar) -> Scalar:
+    """The least speed [m/s] of a mode."""
+    return jnp.maximum(_SLOWEST * rest, float(jnp.finfo(rest.dtype).tiny) ** 0.5)
 
 
 def _unit(x: Float[Array, " components"]) -> Float[Array, " components"]:
@@ -342,7 +351,7 @@ def _split(v: Float[Array, " d"], mode: Float[Array, " d"]) -> tuple[Scalar, Sca
 
 def _ends(speed: Scalar, rest: Scalar) -> Bool[Array, ""]:
     """Whether the next that happens to a slip that falls is its end, where the mode is of this speed."""
-    return _SHRUNK * speed <= 2.0 * rest
+    return speed <= 1.01 * _slowest(rest)
 
 
 def renew_slip(
@@ -361,7 +370,7 @@ def renew_slip(
     each = iter(stops)
     changes = elements.in_planes(fired, lambda _: next(each))
     turns = elements.in_planes(jnp.zeros_like(fired), lambda part: jnp.any(fired[part])) & ~changes
-    return jnp.where(turns, elements.slipping(v), mode), changes
+    return jnp.where(turns, elements.slipping(v, rest), mode), changes
 
 
 def stick_violation(

@@ -307,7 +307,7 @@ class Friction(AbstractEffect):
 
         A trial step may run past the end of the slip. On a line through rest slip and force go on as those of a scalar
         slip, with the sign of the component of `v` along `reference`, an earlier velocity. Where that component is
-        below 1e-3 of `reference` the direction of the force goes over into that of `reference`, so that the force is a
+        below 1e-2 of `reference` the direction of the force goes over into that of `reference`, so that the force is a
         smooth function of `v` at rest, too.
         """
         speed = safe_norm(reference)
