@@ -55,8 +55,8 @@ class ModeChange(NamedTuple):
     """A change of the mode of a friction element or a contact, or an impact.
 
     - `t`: time [s]; `effect`: name of the element.
-    - `before`, `after`: `"stick"`, or `"forward"` or `"backward"` for positive and negative slip; of a contact `"open"`
-      or `"closed"`.
+    - `before`, `after`: `"stick"`, or `"forward"` or `"backward"` for positive and negative slip, `"slip"` in the
+      plane; of a contact `"open"` or `"closed"`.
     """
 
     t: float
@@ -65,7 +65,8 @@ class ModeChange(NamedTuple):
     after: str
 
 
-_MODES, _CONTACT_MODES = {0: "stick", 1: "forward", -1: "backward"}, {0: "open", 1: "closed"}
+_MODES, _PLANE_MODES = {0: "stick", 1: "forward", -1: "backward"}, {0: "stick", 1: "slip"}
+_CONTACT_MODES = {0: "open", 1: "closed"}
 
 
 class Energy(NamedTuple):
@@ -193,12 +194,13 @@ class Trajectory(AbstractReadable):
     def mode_changes(self) -> tuple[ModeChange, ...]:
         """`events` in words, as many as there are; outside of `jax.jit`."""
         columns = [x.tolist() for x in map(np.asarray, self.events)]
-        names, effects = self.scene.part_names, len(self.scene.names)
-        words = [_MODES if effect < effects else _CONTACT_MODES for effect in columns[1]]
+        scene = self.scene
+        widths = dict(zip(scene.mode_names, scene.mode_widths(self.q.shape[-1]), strict=True))
+        words = {name: _MODES if width == 1 else _PLANE_MODES for name, width in widths.items()}
+        words |= dict.fromkeys(scene.contacts, _CONTACT_MODES)
+        happened = [(t, scene.part_names[i], *modes) for t, i, *modes in zip(*columns, strict=True) if t < math.inf]
         return tuple(
-            ModeChange(t, names[effect], word[before], word[after])
-            for t, effect, before, after, word in zip(*columns, words, strict=True)
-            if t < math.inf
+            ModeChange(t, name, words[name][before], words[name][after]) for t, name, before, after in happened
         )
 
     @property

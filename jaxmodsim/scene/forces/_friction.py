@@ -93,7 +93,7 @@ class Friction(AbstractEffect):
       position of the contact [m], shape `[2]` or `[3]`: with one coordinate slip is the velocity along its path,
       positive for a rising coordinate; with several it is a vector, and so is the friction force: of a law that is a
       function of slip opposite to it, of the magnitude that the law gives at the magnitude of slip; of `LuGre` and
-      `Dahl` with a bristle that is a vector, too.
+      `Dahl` with a bristle that is a vector, too; of a set-valued law in stick any vector up to the limit.
     - `belt_velocity`: velocity [m/s or rad/s] of the surface, a number or a continuous function of t (a jump would
       carry with it what sticks); where slip is a vector, a function that returns one.
     - `normal_force`: load [N]: a number, `normal_force(t, q, qd, params)`, or the name of a `Constraint`, whose
