@@ -28,6 +28,7 @@ from ._event_driven import (
     next_modes,
     renew_slip,
     solve_friction_forces,
+    speed_of_rest,
     stick_violation,
     stop_slip,
 )
@@ -173,7 +174,8 @@ class Dynamics(NamedTuple):
         guards, atol = [], []
         if friction.size:
             assert self.friction is not None
-            of_friction = friction_guards(self.friction_elements, self.friction, friction, rest, tolerances)
+            slowest = self._speed_of_rest(rest)
+            of_friction = friction_guards(self.friction_elements, self.friction, friction, slowest, tolerances)
             guards, atol = [of_friction[0]], [of_friction[1]]
         if gaps.size:
             assert self.multipliers is not None
@@ -212,11 +214,12 @@ class Dynamics(NamedTuple):
         speed = []
         for each in scene.event_driven.values():
             row = each.direction(y.q, scene.params)
-            size = jnp.sum(jnp.abs(row * y.qd)) + jnp.sum(jnp.abs(each.belt(t)))
+            size = jnp.sum(jnp.abs(row * jnp.broadcast_to(y.qd, row.shape))) + jnp.sum(jnp.abs(each.belt(t)))
             speed += [size] if row.ndim == 1 else [size] * row.shape[0]
         rounding = 8.0 * float(jnp.finfo(y.q.dtype).eps) * jax.lax.stop_gradient(jnp.stack(speed))
         v = elements.v[: len(speed)]
         still = elements.magnitude(v) <= jnp.maximum(rounding, rest)
+        rest = self._speed_of_rest(rest)
         mode = next_modes(
             elements, elements.slipping(jax.lax.stop_gradient(v), rest), still, jnp.zeros_like(still), rest
         )
@@ -238,14 +241,14 @@ class Dynamics(NamedTuple):
         elements = after.friction_elements
         v = jax.lax.stop_gradient(elements.v[:n])
         turned = jnp.any(qd != self.y.qd) & (elements.magnitude(v) > rest)
-        mode = jnp.where(turned, elements.slipping(v, rest), mode)
+        mode = jnp.where(turned, elements.slipping(v, after._speed_of_rest(rest)), mode)
         state, mode = after._switch_friction(fired[:n] & ~turned, mode, rest)
         return state, jnp.concatenate([mode, closed])
 
     def _switch_friction(
         self, fired: Bool[Array, " n"], mode: Float[Array, " n"], rest: Scalar
     ) -> tuple[State, Float[Array, " n"]]:
-        elements = self.friction_elements
+        elements, rest = self.friction_elements, self._speed_of_rest(rest)
         mode, fired = renew_slip(elements, mode, fired, rest) if elements.planes else (mode, fired)
         sticks = elements.sticks(mode)
         new = next_modes(elements, mode, sticks | fired, fired & sticks, rest)
@@ -267,6 +270,10 @@ class Dynamics(NamedTuple):
     def _stick(self, mode: Float[Array, " n"]) -> State:
         elements = self.friction_elements
         return self.y._replace(qd=stop_slip(elements, self.y.qd, elements.sticks(mode)))
+
+    def _speed_of_rest(self, rest: Scalar) -> Scalar:
+        assert self.friction is not None
+        return speed_of_rest(self.friction_elements, self.friction, rest, self.t)
 
     @property
     def _elements(self) -> Float[Array, " n"]:

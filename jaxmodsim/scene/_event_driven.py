@@ -35,6 +35,8 @@ _SHRUNK, _GROWN = 0.1, 1e4
 # ... but is at least so many speeds of none: the direction is rounded off below a part of it, which must not be below
 # what the error control resolves.
 _SLOWEST = 1e6
+# Speeds of slip in a plane that friction takes away in so many rounding units of time count as none.
+_INSTANT = 1e-3
 # Slip in a plane has ended where it goes back past its direction, and is not faster than so many speeds of none.
 _ENDED = 1e5
 
@@ -340,6 +342,14 @@ def friction_guards(
 
     slip, sticks = elements.in_planes(mode * elements.v[:n] + rest, in_plane), elements.sticks(mode)
     return jnp.where(sticks, inside, slip), jnp.where(sticks, resolved, atol)
+
+
+def speed_of_rest(elements: FrictionElements, forces: FrictionForces, rest: Scalar, t: Scalar) -> Scalar:
+    """The speed [m/s] that counts as none: `rest`, and in planes no less than what time resolves of a slip's end."""
+    if not elements.planes:
+        return rest
+    slows = jnp.max(jnp.sum(jnp.abs(elements.delassus) * forces.upper[None, :], axis=1))
+    return jnp.maximum(rest, _INSTANT * float(jnp.finfo(t.dtype).eps) * jnp.abs(t) * _constant(slows))
 
 
 def _split(v: Float[Array, " d"], mode: Float[Array, " d"]) -> tuple[Scalar, Scalar, Scalar]:

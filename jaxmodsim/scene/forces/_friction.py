@@ -256,7 +256,9 @@ class Friction(AbstractEffect):
             return self._pace(q, params) * qd[0] - self.belt(t)
         return self._moves(q, qd, params) - self.belt(t)
 
-    def slip_and_rate(self, t: Scalar, q: PerDof, qd: PerDof, qdd: PerDof, params: PyTree) -> tuple[Scalar, Scalar]:
+    def slip_and_rate(
+        self, t: Scalar, q: PerDof, qd: PerDof, qdd: PerDof, params: PyTree
+    ) -> tuple[Float[Array, "*components"], Float[Array, "*components"]]:
         """Slip velocity, and its rate where the accelerations are `qdd`."""
         return jax.jvp(lambda t, q, qd: self.slip(t, q, qd, params), (t, q, qd), (jnp.ones_like(t), qd, qdd))
 
