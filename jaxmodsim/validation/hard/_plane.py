@@ -38,7 +38,15 @@ def _dies() -> HardCase:
         "slip_dies_in_a_turn",
         "A load of 0.9 of the limit turns slip to itself, ever faster: at the end the direction has no rate.",
         "Steps become ever shorter, or the puck creeps on at the width of a regularised law.",
-        motion(_puck(0.9), [0.0, 0.0], [math.cos(angle), math.sin(angle)], 6.0, by="f", read=position),
+        motion(
+            _puck(0.9),
+            [0.0, 0.0],
+            [math.cos(angle), math.sin(angle)],
+            6.0,
+            by="f",
+            read=position,
+            numbers={"atol": 1e-8},
+        ),
         lambda f: -_way(f, 1.0, math.cos(angle)),
     )
 
