@@ -1,6 +1,7 @@
 """Differentiable mechanics with friction: Lagrangians in, motion, figures and fits out.
 
-Scenes: Scene, AppliedForce, Friction, Signal, AbstractEffect; Constraint, VelocityConstraint, Contact, consistent.
+Scenes: Scene, AppliedForce, Friction, Signal, AbstractEffect; Constraint, VelocityConstraint, consistent; Contact,
+    with Poisson or HuntCrossley.
 Mechanics: point_mass, rigid_body; Chart, Cylindrical, Spherical.
 Friction laws: Viscous, Curve, Coulomb, Stribeck, Dahl, LuGre, ElastoPlastic, MaxwellSlip, Armstrong; in the wrappers
     Regularized, DeadZone, Sign, Bristle; with asymmetric, scaled_by; of gears Geared, ServoGear.
@@ -10,10 +11,11 @@ Runs: simulate, simulate_to_accuracy; they give a Trajectory, or raise a Simulat
 Solvers: Rodas5P, Gauss, ImplicitFriction; EventSolver and EventController; StoredSteps, an adjoint.
 Analysis: energy_audit (EnergyAudit), sensitivity (Sensitivity), check_gradients (GradientCheck), cyclic_coordinates;
     work_precision (WorkPrecision), Method, formulations.
+Periodic orbits: periodic_orbit (PeriodicOrbit), continue_orbits (Branch).
 Records: fit, fit_law, Record, FitResult.
 Many runs: sweep.
 Speed: tune_cpu, called before JAX computes anything.
-Modules: analysis, export, identify, metrics, plot, problems, sweeps, validation.
+Modules: analysis, export, identify, metrics, orbits, plot, problems, sweeps, validation.
 
 `help(jaxmodsim.simulate)` says more of each. Remarks go to the logger "jaxmodsim" of the module logging.
 """
@@ -75,10 +77,16 @@ if TYPE_CHECKING:
     from .mechanics import Constraint as Constraint
     from .mechanics import Contact as Contact
     from .mechanics import Cylindrical as Cylindrical
+    from .mechanics import HuntCrossley as HuntCrossley
+    from .mechanics import Poisson as Poisson
     from .mechanics import Spherical as Spherical
     from .mechanics import VelocityConstraint as VelocityConstraint
     from .mechanics import point_mass as point_mass
     from .mechanics import rigid_body as rigid_body
+    from .orbits import Branch as Branch
+    from .orbits import PeriodicOrbit as PeriodicOrbit
+    from .orbits import continue_orbits as continue_orbits
+    from .orbits import periodic_orbit as periodic_orbit
     from .scene import AbstractEffect as AbstractEffect
     from .scene import AppliedForce as AppliedForce
     from .scene import Friction as Friction
@@ -144,12 +152,15 @@ _LATER = {
         "Constraint",
         "Contact",
         "Cylindrical",
+        "HuntCrossley",
+        "Poisson",
         "Spherical",
         "VelocityConstraint",
         "point_mass",
         "rigid_body",
     ),
     "metrics": (),
+    "orbits": ("Branch", "PeriodicOrbit", "continue_orbits", "periodic_orbit"),
     "plot": (),
     "problems": (),
     "scene": ("AbstractEffect", "AppliedForce", "Friction", "Scene", "Signal"),

@@ -24,6 +24,7 @@ ROOMS = (
     "simulation",
     "metrics",
     "analysis",
+    "orbits",
     "identify",
     "sweeps",
     "export",

@@ -140,6 +140,16 @@ def parameter(
     return eqx.field(converter=partial(as_number, name=name), metadata={"range": allowed}, **field)
 
 
+def parameter_or(name: str, unit: str, instead: tuple[type, ...], *, lower: float, upper: float, default: float) -> Any:
+    """A `parameter` in whose place an object of the types `instead` may stand, with parameters of its own."""
+    convert = partial(_unless_instance, instead=instead, name=name)
+    return eqx.field(converter=convert, metadata={"range": Range(unit, lower, upper=upper)}, default=default)
+
+
+def _unless_instance(value: object, *, instead: tuple[type, ...], name: str) -> object:
+    return value if isinstance(value, instead) else as_number(value, name=name)
+
+
 def optional_parameter(
     name: str, unit: str, *, lower: float | str | None = None, strict: bool = False, most: float | None = None
 ) -> Any:
@@ -177,11 +187,11 @@ def _unless_none(value: object, *, convert: Callable[..., object], name: str) ->
 
 
 def ranges_of(module: eqx.Module) -> dict[str, Range]:
-    """Ranges of the parameters that `module` holds, by name; an optional one that was not given has none."""
+    """Ranges of the parameters that `module` holds, by name; one that is not a number has none."""
     return {
         f.name: f.metadata["range"]
         for f in dataclasses.fields(module)
-        if "range" in f.metadata and getattr(module, f.name) is not None
+        if "range" in f.metadata and not isinstance(nominal(getattr(module, f.name)), eqx.Module | None)
     }
 
 

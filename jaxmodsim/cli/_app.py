@@ -166,6 +166,37 @@ def sweep(
 
 
 @app.command()
+def orbit(spec: _options.Spec, out: Out = Path("jaxmodsim-orbit")) -> None:
+    r"""Find a periodic orbit, as a SPEC says: its period, extent, stability and modes.
+
+    SPEC is a TOML file; \[scene] as for jaxmodsim sweep.
+
+    \[orbit] has q0 and qd0, from where a simulation settles for settle seconds.
+    A forced orbit has period, in seconds, or frequency, the name of the number
+    that is the angular frequency of the force; without, the period is found.
+    Also rtol, atol.
+    """
+    _start()
+    from ._orbits import run_orbit
+
+    run_orbit(spec, out)
+
+
+@app.command()
+def branch(spec: _options.Spec, out: Out = Path("jaxmodsim-branch")) -> None:
+    r"""Follow a periodic orbit over a number, through folds, and name where it changes; goes on where one ended.
+
+    SPEC is that of jaxmodsim orbit with one more table: \[branch] has parameter,
+    the name of the number, from and to; step, the longest step as a part of
+    that; max_orbits.
+    """
+    _start()
+    from ._orbits import run_branch
+
+    run_branch(spec, out)
+
+
+@app.command()
 def hard(
     names: Annotated[
         list[str] | None, typer.Argument(metavar="NAME", help="Cases or families; all without.", show_default=False)

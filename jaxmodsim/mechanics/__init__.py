@@ -26,3 +26,5 @@ from ._lagrange import momentum as momentum
 from ._lagrange import motion_equations as motion_equations
 from ._lagrange import quadratic as quadratic
 from ._lagrange import velocity as velocity
+from ._restitution import HuntCrossley as HuntCrossley
+from ._restitution import Poisson as Poisson

@@ -9,7 +9,7 @@ import abc
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
-from .._core.arguments import as_flag, as_label
+from .._core.arguments import as_label
 from .._core.cholesky import factor_positive_definite
 from .._core.functions import as_function, result_shape
 from .._core.index_check import traced
@@ -39,12 +39,9 @@ class AbstractConstraint(eqx.Module):
     # By which the constraint is known in the results and to friction; None for the class's own.
     if TYPE_CHECKING:
         name = cast("str | None", None)  # not a field, which would come before those of the constraints
-        one_sided = cast("bool", None)
         stabilise = cast("Array", None)
     else:
         name: AbstractVar[str | None]
-        # Whether the multiplier can only push.
-        one_sided: AbstractVar[bool]
         # Rate [1/s] at which errors die out.
         stabilise: AbstractVar[Number]
 
@@ -121,14 +118,13 @@ class Constraint(AbstractPositionConstraint):
 
     The equations of motion are `M qdd = load + Q + J^T lambda` with `J = dphi/dq`: the multiplier is positive where it
     pushes towards larger phi (so that of a rod under tension, `phi = |x| - l`, is negative). Where phi is a length
-    measured along the normal, it is the normal force in newtons.
+    measured along the normal, it is the normal force in newtons. What can only push, a floor, is a `Contact`.
 
     **Arguments:**
 
     - `phi`: `phi(t, q, params)`, a scalar or shape `[m]`, any unit. With `at`, `phi(t, x, params)` of the position x.
     - `at`: `at(q)` or `at(q, params)`, the position [m] of the constrained point, or of several in an array of any
       shape. Then the force of constraint is known in space, whatever the unit of phi.
-    - `one_sided`: whether the constraint can only push (a floor, phi >= 0). A run ends where it would have to pull.
     - `stabilise`: rate [1/s], >= 0, at which an error of position dies out: the accelerations obey
       `phi'' + 2 stabilise phi' + stabilise^2 phi = 0` (Baumgarte 1972). By default none, as `simulate` projects the
       state onto the constraint after every step.
@@ -152,7 +148,6 @@ class Constraint(AbstractPositionConstraint):
 
     phi: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Constraint phi"))
     at: PositionFn | None = eqx.field(default=None, converter=as_at)
-    one_sided: bool = eqx.field(default=False, static=True, converter=partial(as_flag, name="Constraint one_sided"))
     stabilise: Number = parameter("stabilise", "1/s", lower=0.0, default=0.0)
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Constraint name"))
 
@@ -161,13 +156,8 @@ class Constraint(AbstractPositionConstraint):
         return self.phi(t, x, params)
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
-        """Check that phi is a number or a vector, and a number where the constraint is one-sided."""
+        """Check that phi is a number or a vector."""
         self.check_value(self.phi, "phi of Constraint", q, params, name)
-        if self.one_sided and jax.eval_shape(self.error, q[0], q, params).shape != (1,):
-            raise ValueError(
-                f"Constraint {name!r}: one_sided=True needs phi to be one number, but it returned several. Give each"
-                " contact a Constraint of its own."
-            )
 
 
 class VelocityConstraint(AbstractConstraint):
@@ -190,8 +180,6 @@ class VelocityConstraint(AbstractConstraint):
     psi: Callable[..., Any] = eqx.field(converter=partial(as_function, name="VelocityConstraint psi"))
     stabilise: Number = parameter("stabilise", "1/s", lower=0.0, default=0.0)
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="VelocityConstraint name"))
-
-    one_sided: ClassVar[bool] = False
 
     def error(self, t: Scalar, q: PerDof, params: PyTree) -> None:
         """No position is excluded."""

@@ -6,14 +6,16 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._core.arguments import as_label
 from .._core.functions import as_function
-from .._core.parameters import Number, parameter
+from .._core.parameters import Number, parameter_or
 from .._core.position import PositionFn
 from .._core.shapes import PerDof, Scalar
 from ._constraints import AbstractConstraint, AbstractPositionConstraint, as_at
+from ._restitution import HuntCrossley, Poisson
 
 
 class Contact(AbstractPositionConstraint):
@@ -23,8 +25,9 @@ class Contact(AbstractPositionConstraint):
     where the multiplier falls to zero. Where the gap closes with the velocity `w < 0`, an impact makes it `-e w`
     (Newton's law of impact, e the coefficient of restitution); where several contacts are struck at one instant, or
     some are closed, the impulses solve `w_i(after) + e_i w_i(before) >= 0`, `impulse_i >= 0`, one of the two zero
-    (Moreau 1988). Impacts act along the normals: friction takes no part in them. Impacts that accumulate end in a
-    closed contact at their accumulation time.
+    (Moreau 1988). `Poisson` is another law, and `HuntCrossley` makes the contact compliant instead. Impacts that
+    accumulate end in a closed contact at their accumulation time. Friction by events whose load is the contact takes
+    part in its impacts, by Coulomb's law for the impulses.
 
     The contacts of a scene stand among its constraints; their modes are 0, open, and 1, closed. Where the gap is a
     length along the normal, the multiplier is the normal force in newtons; `Friction(normal_force=name)` takes it as
@@ -34,7 +37,8 @@ class Contact(AbstractPositionConstraint):
 
     - `gap`: `gap(t, q, params)`, one number, not negative at the start. With `at`, `gap(t, x, params)` of the
       position x.
-    - `restitution`: coefficient e, 0 to 1; 0 for a landing without bounce.
+    - `restitution`: coefficient e of Newton's law, 0 to 1; 0 for a landing without bounce. Or `Poisson(e)`, or
+      `HuntCrossley(stiffness)`.
     - `at`: `at(q)` or `at(q, params)`, the position [m] of the point of contact; then the normal force is known in
       newtons whatever the unit of the gap.
     - `name`: name in `run.reactions`, `run.mode` and `run.events`, and for `Friction(normal_force=name)`.
@@ -55,12 +59,26 @@ class Contact(AbstractPositionConstraint):
     """
 
     gap: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Contact gap"))
-    restitution: Number = parameter("restitution", "", lower=0.0, upper=1.0, default=0.0)
+    restitution: Number | Poisson | HuntCrossley = parameter_or(
+        "restitution", "", (Poisson, HuntCrossley), lower=0.0, upper=1.0, default=0.0
+    )
     at: PositionFn | None = eqx.field(default=None, converter=as_at)
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Contact name"))
 
-    one_sided: ClassVar[bool] = True
     stabilise: ClassVar[float] = 0.0
+
+    @property
+    def coefficient(self) -> Scalar:
+        """Coefficient of restitution by either law of impact; zero of a contact that gives way."""
+        law = self.restitution
+        if isinstance(law, HuntCrossley):
+            return jnp.zeros_like(law.stiffness)
+        return law.e if isinstance(law, Poisson) else law
+
+    @property
+    def compliant(self) -> HuntCrossley | None:
+        """The force of a contact that gives way; None for one with impacts and modes."""
+        return self.restitution if isinstance(self.restitution, HuntCrossley) else None
 
     def value(self, t: Scalar, x: Float[Array, "..."], params: PyTree) -> Float[Array, "..."]:
         """The gap."""
@@ -77,11 +95,10 @@ class Contact(AbstractPositionConstraint):
 
 
 class BoundContact(AbstractConstraint):
-    """A contact in a mode: the constraint that it is while `closed` is 1, and nothing while that is 0."""
+    """A contact in a mode: the constraint that it is while `closed` is 1, and none while that is 0."""
 
     contact: Contact
     closed: Float[Array, ""]
-    one_sided: ClassVar[bool] = True
     stabilise: ClassVar[float] = 0.0
 
     @property

@@ -14,6 +14,8 @@ from ._hard import hard_figure as hard_figure
 from ._hard import step_limits_figure as step_limits_figure
 from ._indices import indices_figure as indices_figure
 from ._map import map2d as map2d
+from ._orbits import branch_figure as branch_figure
+from ._orbits import orbit_figure as orbit_figure
 from ._posterior import posterior_figure as posterior_figure
 from ._profile import profile_figure as profile_figure
 from ._records import fit_figure as fit_figure

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..friction import Coulomb
-from ..mechanics import Constraint, rigid_body
+from ..mechanics import Contact, rigid_body
 from ..scene import Friction, Scene
 
 # Mass [kg], length [m], coefficient of friction and gravity [m/s^2].
@@ -34,7 +34,7 @@ _ROD = rigid_body(lambda p: p["m"], lambda p: p["m"] * p["l"] ** 2 / 12.0, _cent
 def scene(
     *, m: ArrayLike = PARAMS["m"], l: ArrayLike = PARAMS["l"], mu: ArrayLike = PARAMS["mu"], g: ArrayLike = PARAMS["g"]
 ) -> Scene:
-    """Uniform rod in a vertical plane, its lower tip in contact with a rough floor that can only push.
+    """Uniform rod in a vertical plane over a rough floor, which its lower tip strikes without a bounce.
 
     The coordinates are (x, y) of the centre [m], y upwards from the floor, and the angle f [rad] between floor and rod,
     0 < f < pi, such that the tip is at `(x + (l/2) cos(f), y - (l/2) sin(f))`: for f < pi/2 and slip towards larger x
@@ -50,10 +50,10 @@ def scene(
 
     **Returns:**
 
-    A `Scene` with the constraint `floor`, whose multiplier is the normal force [N], and the effect `friction` along x
-    at the tip. In slip it follows `acceleration`. A run ends where the tip lifts off, and where the paradox begins.
+    A `Scene` with the contact `floor`, whose multiplier is the normal force [N], and the effect `friction` along x at
+    the tip. In slip it follows `acceleration`. The tip lifts off and lands; a run ends where the paradox begins.
     """
-    floor = Constraint(_height, at=_tip, one_sided=True, name="floor")
+    floor = Contact(_height, at=_tip, name="floor")
     friction = Friction(Coulomb(mu), along=_tip_along, normal_force="floor")
     return Scene(
         _ROD,

@@ -1,10 +1,10 @@
 """Scenes: what is in them, and the vector field that follows."""
 
 from . import _readable as _readable  # what they print
+from ._check_scene import check_scene as check_scene
 from ._coordinates import Quantity as Quantity
 from ._dynamics import ConstraintReaction as ConstraintReaction
 from ._dynamics import State as State
-from ._dynamics import check_scene as check_scene
 from ._dynamics import forward_dynamics as forward_dynamics
 from ._dynamics import from_dynamics as from_dynamics
 from ._dynamics import vector_field as vector_field

@@ -8,12 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._core.cholesky import factor_positive_definite
-from .._core.functions import depends_on, real_array
-from .._core.index_check import traced
+from .._core.functions import depends_on
 from .._core.scalarise import in_scalars
 from .._core.shapes import PerDof, Scalar
 from ..mechanics import (
-    Constraint,
+    Contact,
     LinearizedConstraints,
     linearize_constraints,
     motion_equations,
@@ -82,8 +81,8 @@ class Dynamics(NamedTuple):
     - `qdd`: accelerations.
     - `elements`, `friction`: the friction elements that depend on accelerations, and their forces, or None.
     - `constraints`, `multipliers`: of all constraints, or None.
-    - `validity_margins`: what has to be positive for the equations to hold, in the order of `Scene.checks`: of each
-      constraint that can only push its multiplier, then the margin of uniqueness of the loads; None for nothing.
+    - `uniqueness`: what is left of the uniqueness of loads that are reactions, see `FrictionForces.margin`; the
+      equations hold where it is positive. None without such loads.
     """
 
     t: Scalar
@@ -96,7 +95,7 @@ class Dynamics(NamedTuple):
     friction: FrictionForces | None
     constraints: LinearizedConstraints | None
     multipliers: Float[Array, " m"] | None
-    validity_margins: Float[Array, " checks"] | None
+    uniqueness: Scalar | None
 
     @property
     def rate(self) -> State:
@@ -114,8 +113,8 @@ class Dynamics(NamedTuple):
         return self._valid_rate(push)
 
     def _valid_rate(self, rate: PerDof) -> State:
-        if self.validity_margins is not None:
-            rate = jnp.where(jnp.all(self.validity_margins > 0), rate, jnp.nan)
+        if self.uniqueness is not None:
+            rate = jnp.where(self.uniqueness > 0, rate, jnp.nan)
         return State(self.y.qd, rate, {name: self.actions[name].rate for name in self.y.z})
 
     @property
@@ -153,7 +152,11 @@ class Dynamics(NamedTuple):
             for name, effect in zip(scene.names, scene.effects, strict=True)
         }
         for name, reaction in self.reactions.items():
-            powers[name] = Power(jnp.sum(reaction.generalised * y.qd))
+            done = jnp.sum(reaction.generalised * y.qd)
+            powers[name] = Power(done)
+            if name in scene.compliant:
+                taken = -reaction.multiplier[0] * scene.compliant[name].rate(self.t, y.q, y.qd, scene.params)[0]
+                powers[name] = Power(done + taken, taken)
 
         def lagrangian(t: Array) -> Array:
             return scene.lagrangian(t, y.q, y.qd, scene.params)
@@ -232,7 +235,7 @@ class Dynamics(NamedTuple):
         n, mode = self._elements.size, self._elements
         if not self._closed.size:
             return self._switch_friction(fired, mode, rest)
-        qd, closed = impact(self.t, self.y.q, self.y.qd, self.scene, self._closed, fired[n:], rest, elastic)
+        qd, closed, stopped = impact(self.t, self.y.q, self.y.qd, self.scene, self._closed, fired[n:], rest, elastic)
         struck = self.y._replace(qd=qd)
         if not n:
             return struck, closed
@@ -241,8 +244,9 @@ class Dynamics(NamedTuple):
         elements = after.friction_elements
         v = jax.lax.stop_gradient(elements.v[:n])
         turned = jnp.any(qd != self.y.qd) & (elements.magnitude(v) > rest)
+        fired = (fired[:n] & ~turned) | (elements.in_rows(stopped) & ~elements.sticks(mode))
         mode = jnp.where(turned, elements.slipping(v, after._speed_of_rest(rest)), mode)
-        state, mode = after._switch_friction(fired[:n] & ~turned, mode, rest)
+        state, mode = after._switch_friction(fired, mode, rest)
         return state, jnp.concatenate([mode, closed])
 
     def _switch_friction(
@@ -339,6 +343,9 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     )
     mobility = Mobility(factor_positive_definite(equations.mass), linearized)
     actions, rhs = {}, equations.load
+    compliant = _compliant(scene, t, y) if scene.compliant else None
+    if compliant is not None:
+        rhs = rhs + compliant.generalised
     holding = {}
     for name, effect in zip(scene.names, scene.effects, strict=True):
         if name in scene.event_driven or name in scene.reaction_loaded:
@@ -358,9 +365,11 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     if linearized is not None:
         multipliers = linearized.multipliers(qdd)
         qdd = qdd + linearized.apply_force(multipliers)
+        if compliant is not None:
+            multipliers = multipliers + compliant.force
+            linearized = linearized._replace(rows=linearized.rows + compliant.rate)  # from here on to be reported
     if not (scene.event_driven or scene.reaction_loaded):
-        margins = _margins(scene, t, y, multipliers, None)
-        return Dynamics(t, y, mode, scene, actions, qdd, None, None, linearized, multipliers, margins)
+        return Dynamics(t, y, mode, scene, actions, qdd, None, None, linearized, multipliers, None)
 
     units = {name: each.force_per_load(t, q, qd, y.z.get(name), params) for name, each in scene.reaction_loaded.items()}
     pushes = [-each.apply_force(q, units[name][0], params) for name, each in scene.reaction_loaded.items()]
@@ -381,11 +390,11 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
         unit, rate = units[name]
         actions[name] = Action(-force * push, force * unit, rate)
     qdd = qdd - jnp.sum(elements.minv_jt * settled.force[:, None], axis=0)
-    if linearized is not None and multipliers is not None:
+    if (within := mobility.constraints) is not None and multipliers is not None:
         taken = sum(actions[name].generalised for name in (*scene.event_driven, *scene.reaction_loaded))
-        multipliers = multipliers + linearized.multiplier_response(mobility.solve(jnp.asarray(taken)))
-    margins = _margins(scene, t, y, multipliers, settled.margin)
-    return Dynamics(t, y, mode, scene, actions, qdd, elements, settled, linearized, multipliers, margins)
+        multipliers = multipliers + within.multiplier_response(mobility.solve(jnp.asarray(taken)))
+    uniqueness = settled.margin if scene.loaded else None
+    return Dynamics(t, y, mode, scene, actions, qdd, elements, settled, linearized, multipliers, uniqueness)
 
 
 def _rows_of_friction(scene: Scene, mode: Float[Array, " modes"]) -> int:
@@ -421,26 +430,27 @@ def _loads(
         jnp.asarray([[float(name == each) for name in names] for each in loaded], y.q.dtype),
         size * multipliers[at],
         size[:, None] * jnp.stack([each[at] for each in yields], axis=1),
-        jnp.asarray([0.0 if chosen[name].one_sided else -1.0 for name in names], y.q.dtype),
+        jnp.asarray([0.0 if isinstance(chosen[name], Contact) else -1.0 for name in names], y.q.dtype),
     )
+
+
+def _compliant(scene: Scene, t: Array, y: State) -> Action:
+    """Forces of the contacts that give way, among the multipliers of all constraints, and in `rate` their rows."""
+    where, dof = parts(scene.constraints, t, y.q, y.qd, scene.params), y.q.shape[0]
+    force = jnp.zeros(where[-1].stop, y.q.dtype)
+    rows = jnp.zeros((where[-1].stop, dof), y.q.dtype)
+    for part, each in zip(where, scene.constraints, strict=True):
+        if isinstance(each, Contact) and each.compliant is not None:
+            rate, pull = jax.vjp(lambda qd, each=each: each.rate(t, y.q, qd, scene.params), y.qd)
+            push = each.compliant.force(-each.error(t, y.q, scene.params)[0], -rate[0])
+            force, rows = force.at[part].set(push), rows.at[part].set(pull(jnp.ones_like(rate))[0])
+    return Action(jnp.sum(rows * force[:, None], axis=0), force, rows)
 
 
 def by_constraint(scene: Scene, t: Array, y: State, values: Array) -> dict[str, Array]:
     """What there is one of for each equation (multipliers, rows), by the names of the constraints."""
     where = parts(scene.constraints, t, y.q, y.qd, scene.params)
     return {name: values[part] for name, part in zip(scene.constraint_names, where, strict=True)}
-
-
-def _margins(scene: Scene, t: Array, y: State, multipliers: Any, unique: Array | None) -> Array | None:
-    pairs = zip(scene.constraint_names, scene.constraints, strict=True)
-    pushing = [name for name, each in pairs if isinstance(each, Constraint) and each.one_sided]
-    margins = []
-    if pushing:
-        of_each = by_constraint(scene, t, y, multipliers)
-        margins += [of_each[name][0] for name in pushing]
-    if unique is not None and scene.loaded:
-        margins.append(unique)
-    return jnp.stack(margins) if margins else None
 
 
 def from_dynamics(get: Callable[[Dynamics], _Value], t: Scalar, y: State, scene: Scene, mode: Modes = None) -> _Value:
@@ -452,42 +462,5 @@ def from_dynamics(get: Callable[[Dynamics], _Value], t: Scalar, y: State, scene:
 
 
 def vector_field(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> State:
-    """Right-hand side of `y' = field(t, y)`; NaN where the equations do not hold, see `Dynamics.validity_margins`."""
+    """Right-hand side of `y' = field(t, y)`; NaN where the equations do not hold, see `Dynamics.uniqueness`."""
     return from_dynamics(lambda dynamics: dynamics.rate, t, y, scene, mode)
-
-
-def check_scene(scene: Scene, y: State) -> None:
-    """Check shapes of everything the scene's functions return, and the indices that they use.
-
-    **Raises:**
-
-    - `ValueError` naming the function, the shape it returned and the shape that is needed, or the index that is out of
-      range; see `traced` for those that are seen; or for names of more or fewer coordinates than there are.
-    """
-    t, named = y.q[0], len(scene.coordinates)
-    if named not in (0, y.q.shape[0]):
-        raise ValueError(
-            f"The scene names {named} coordinates ({', '.join(scene.coordinates)}), but q has {y.q.shape[0]}: give a"
-            " name for each, or none."
-        )
-    scene = scene.bind_time(t)
-
-    def energy(*state: Any) -> Array:
-        return real_array(scene.lagrangian(*state), name="the Lagrangian")
-
-    given = traced(energy, t=t, q=y.q, qd=y.qd, params=scene.params, name="the Lagrangian")
-    if given.shape != () or not jnp.issubdtype(given.dtype, jnp.floating):
-        raise ValueError(
-            f"The Lagrangian must return one number [J], shape (), that depends on the state, but it returned {given}."
-            f" With q and qd of shape {y.q.shape}, index the coordinates (qd[0]) or sum over them."
-        )
-    for name, effect in zip(scene.names, scene.effects, strict=True):
-        effect.check(y.q, y.qd, scene.params, name)
-    for name, constraint in zip(scene.constraint_names, scene.constraints, strict=True):
-        constraint.check(y.q, y.qd, scene.params, name)
-        size = jax.eval_shape(constraint.rate, t, y.q, y.qd, scene.params).shape[0]
-        if name in scene.loaded and size != 1:
-            raise ValueError(
-                f"Constraint {name!r} loads friction (normal_force={name!r}), so it must be one equation, but it has"
-                f" {size}. Give each direction a Constraint of its own."
-            )

@@ -110,6 +110,15 @@ class FrictionElements(eqx.Module):
             at = stop
         return parts
 
+    def in_rows(self, values: Bool[Array, " elements"]) -> Bool[Array, " modes"]:
+        """What there is one of for each element with a mode, in each of its rows."""
+        if not self.planes:
+            return values
+        parts = self.parts[: values.shape[0]]
+        return jnp.concatenate(
+            [jnp.broadcast_to(x, self.v[part].shape or (1,)) for x, part in zip(values, parts, strict=True)]
+        )
+
     def magnitude(self, x: Float[Array, " rows"]) -> Float[Array, " rows"]:
         """Of each element, in each of its rows."""
         return self.in_planes(jnp.abs(x), lambda part: safe_norm(x[part]))

@@ -1,21 +1,51 @@
-"""Impacts: what velocities and modes of contacts become at the instant at which gaps close."""
+"""Impacts: what velocities and modes become at the instant at which gaps close.
+
+Contacts that touch take impulses p along their gaps, friction elements that they load take r against their slip. With
+the velocities w of gaps and v of slips, and the matrix A of what unit impulses do to them within the bilateral
+constraints, `(w, v)(after) = (w, v) + A (p, -r)`. For each contact `p >= 0`, `w(after) + e w >= 0`, one of the two
+zero; for each friction element Coulomb's law of the impulses: stick, `v(after) = 0` and `-mu p <= r <= mu p`, or slip
+in either direction, `r = +-mu p` with the sign of `v(after)`. The coefficient mu is that of the law in slip at zero
+velocity. This is a complementarity problem (Moreau 1988; Pfeiffer and Glocker 1996, chapter 8), solved by trying all
+combinations. `Poisson` solves it twice, in compression and in expansion.
+"""
 
 from itertools import product
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from .._core.cholesky import factor_positive_definite
+from .._core.lu import factor_lu
 from .._core.semidefinite import solve_semidefinite
 from .._core.shapes import PerDof, Scalar
-from ..mechanics import linearize_constraints, motion_equations
+from ..mechanics import LinearizedConstraints, Poisson, linearize_constraints, motion_equations
 from ._scene import Scene
 
-# Rounding units of the velocities of all coordinates, below which a gap has no velocity.
+# Rounding units of the velocities of all coordinates, below which a gap or a slip has no velocity.
 _ROUNDING = 64.0
+# Steps of refinement of systems that may be singular, as in `solve_semidefinite`.
+_REFINEMENTS = 2
 
 _constant = jax.lax.stop_gradient
+
+
+class _Struck(NamedTuple):
+    """The mechanism at an impact: n contacts, then m friction elements that they load.
+
+    - `delassus`: A [1/kg], shape `[n + m, n + m]`, for impulses towards larger gaps and slips.
+    - `touches`: contacts that are closed or struck, shape `[n]`.
+    - `loads`: 1 where a contact loads an element, shape `[m, n]`.
+    - `forward`, `backward`: coefficients of friction against slip in either direction, >= 0, shape `[m]`.
+    """
+
+    delassus: Float[Array, "k k"]
+    touches: Bool[Array, " n"]
+    loads: Float[Array, "m n"]
+    forward: Float[Array, " m"]
+    backward: Float[Array, " m"]
 
 
 def impact(
@@ -27,8 +57,8 @@ def impact(
     fired: Bool[Array, " contacts"],
     rest: Scalar,
     elastic: bool,
-) -> tuple[PerDof, Float[Array, " contacts"]]:
-    """Velocities, and the modes of the contacts, after the instant at which those `fired`.
+) -> tuple[PerDof, Float[Array, " contacts"], Bool[Array, " elements"]]:
+    """What comes after the instant at which those contacts `fired`.
 
     Contacts that are closed and have fired open: their multiplier has fallen to zero. Those that are open and have
     fired are struck. Struck contacts whose gap has no velocity afterwards are closed.
@@ -41,53 +71,151 @@ def impact(
     - `rest`: velocity [m/s] that counts as none.
     - `elastic`: whether contacts give back a part of their velocity; False where impacts have accumulated, and what is
       left of the velocity of a gap, be it away from the contact, is below what time resolves: it is taken away.
+
+    **Returns:**
+
+    Velocities, modes of the contacts, and which friction elements of `Scene.event_driven` the impact has stopped.
     """
-    contacts, params = tuple(scene.contacts.values()), scene.params
+    contacts, params, n = tuple(scene.contacts.values()), scene.params, len(scene.contacts)
     mass = motion_equations(scene.lagrangian, t, q, qd, params).mass
     gaps = linearize_constraints(contacts, t, q, qd, params, mass)
+    rubbing = scene.impact_friction
     # The velocity of a gap that moves by itself counts, too.
     w = jnp.concatenate([each.rate(t, q, qd, params) for each in contacts])
-    reach = gaps.minv_jt
-    if scene.bilateral:
-        held = linearize_constraints(scene.bilateral, t, q, qd, params, mass)
-        reach = jnp.stack([held.respond(row) for row in reach])
-    delassus = jnp.sum(gaps.rows[:, None, :] * reach[None, :, :], axis=2)
     touches = jnp.where(closed > 0, ~fired, fired)
-    e = jnp.stack([each.restitution.astype(w.dtype) for each in contacts])
-    if elastic:
-        impulse = _impulses(delassus, (1.0 + jnp.where(closed > 0, 0.0, e)) * w, touches)
+    struck, rows, reach = _struck(t, (q, qd), scene, mass, gaps, touches)
+    v = jnp.concatenate([w, *(jnp.reshape(x.slip(t, q, qd, params), (1,)) for x in rubbing.values())])
+    e, none = jnp.stack([each.coefficient.astype(w.dtype) for each in contacts]), jnp.zeros_like(w)
+    if not elastic:
+        normal = solve_semidefinite(struck.delassus[:n, :n], jnp.where(touches, -w, 0.0), jnp.ones_like(w), touches)
+        impulse = jnp.concatenate([normal, jnp.zeros_like(v[n:])])
+    elif any(isinstance(each.restitution, Poisson) for each in contacts):
+        squeeze = _impulses(struck, v, none)
+        halfway = v + jnp.sum(struck.delassus * squeeze[None, :], axis=1)
+        impulse = squeeze + _impulses(struck, halfway, e * squeeze[:n])
     else:
-        impulse = solve_semidefinite(delassus, jnp.where(touches, -w, 0.0), jnp.ones_like(w), touches)
-    after = w + jnp.sum(delassus * impulse[None, :], axis=1)
-    rounding = _ROUNDING * float(jnp.finfo(w.dtype).eps) * jnp.sum(jnp.abs(gaps.rows * qd[None, :]), axis=1)
+        aimed = (1.0 + jnp.where(closed > 0, 0.0, e)) * w
+        impulse = _impulses(struck, jnp.concatenate([aimed, v[n:]]), none)
+    after = v + jnp.sum(struck.delassus * impulse[None, :], axis=1)
+    rounding = _ROUNDING * float(jnp.finfo(w.dtype).eps) * jnp.sum(jnp.abs(rows * qd[None, :]), axis=1)
     still = _constant(jnp.abs(after) <= jnp.maximum(rest, rounding))
-    return qd + jnp.sum(reach * impulse[:, None], axis=0), jnp.where(touches & still, 1.0, jnp.zeros_like(w))
+    stopped = still[n:] & _constant(jnp.abs(v[n:]) > jnp.maximum(rest, rounding[n:]))
+    of_each = dict(zip(rubbing, stopped, strict=True))
+    return (
+        qd + jnp.sum(reach * impulse[:, None], axis=0),
+        jnp.where(touches & still[:n], 1.0, none),
+        jnp.asarray([of_each.get(name, False) for name in scene.event_driven], bool),
+    )
 
 
-def _impulses(
-    delassus: Float[Array, "n n"], closing: Float[Array, " n"], touches: Bool[Array, " n"]
-) -> Float[Array, " n"]:
-    """Impulses of the contacts that touch: `A p + closing >= 0`, `p >= 0`, one of the two zero for each.
+def _struck(
+    t: Scalar,
+    state: tuple[PerDof, PerDof],
+    scene: Scene,
+    mass: Float[Array, "dof dof"],
+    gaps: LinearizedConstraints,
+    touches: Bool[Array, " n"],
+) -> tuple[_Struck, Float[Array, "k dof"], Float[Array, "k dof"]]:
+    """The struck mechanism, its rows d(w, v)/dqd, and the velocities that unit impulses make."""
+    (q, qd), rows, reach, rubbing = state, gaps.rows, gaps.minv_jt, scene.impact_friction
+    if rubbing:
+        along = jnp.stack([each.direction(q, scene.params) for each in rubbing.values()])
+        rows, reach = (
+            jnp.concatenate([rows, along]),
+            jnp.concatenate([reach, factor_positive_definite(mass)(along.T).T]),
+        )
+    if scene.bilateral:
+        held = linearize_constraints(scene.bilateral, t, q, qd, scene.params, mass)
+        reach = jnp.stack([held.respond(row) for row in reach])
+    delassus = jnp.sum(rows[:, None, :] * reach[None, :, :], axis=2)
+    size = [each.per_multiplier(t, q, scene.params) for each in scene.contacts.values()]
+    zero = jnp.zeros_like(t)
+    mu = [[abs(x.slip_force(zero, side * jnp.ones_like(t), None)) for x in rubbing.values()] for side in (1.0, -1.0)]
+    loads = [
+        [length if name == each.load_constraint else zero for name, length in zip(scene.contacts, size, strict=True)]
+        for each in rubbing.values()
+    ]
+    forward, backward = (jnp.asarray(side, q.dtype) for side in mu)
+    of = jnp.reshape(jnp.asarray(loads, q.dtype), (len(rubbing), len(size)))
+    return _Struck(delassus, touches, of, forward, backward), rows, reach
 
-    Every set of contacts that push is tried, and the one that violates the conditions least is taken: of a positive
-    definite matrix exactly one violates none (Cottle, Pang, Stone: The Linear Complementarity Problem, 1992, theorem
-    3.3.7). Of redundant contacts the smallest impulses.
+
+def _impulses(struck: _Struck, v: Float[Array, " k"], least: Float[Array, " n"]) -> Float[Array, " k"]:
+    """Impulses (p, -r) from velocities `v`, those of gaps with what restitution adds; `p >= least` in place of zero.
+
+    All combinations are tried, and the one that violates the conditions least is taken: without friction, of a positive
+    definite matrix, exactly one violates none (Cottle, Pang, Stone: The Linear Complementarity Problem, 1992, theorem
+    3.3.7). With friction there may be several: the first in the order stick, slip forward, slip backward. Of redundant
+    contacts the smallest impulses.
     """
-    n = closing.shape[0]
-    ones = jnp.ones_like(closing)
+    n, m = struck.loads.shape[1], struck.loads.shape[0]
+    if m == 0 and n == 1:
+        return jnp.maximum(_solve(struck, v, least, jnp.ones(1, v.dtype)), least)
+    combinations = list(product(*n * ((0.0, 1.0),), *m * ((0.0, 1.0, -1.0),)))
+    tried = jnp.asarray(np.array(combinations), v.dtype)
+    at = _constant(struck), _constant(v), _constant(least)
+    worst = jax.lax.map(lambda each: _violation(at[0], at[1], at[2], each), tried)
+    return _solve(struck, v, least, tried[jnp.argmin(worst)])
 
-    def pushed(active: Bool[Array, " n"]) -> Float[Array, " n"]:
-        return solve_semidefinite(delassus, jnp.where(active, -closing, 0.0), ones, active & touches)
 
-    if n == 1:
-        return jnp.maximum(pushed(jnp.asarray([True])), 0.0)
-    sets = jnp.asarray(np.array(list(product((False, True), repeat=n))))
+def _solve(
+    struck: _Struck, v: Float[Array, " k"], least: Float[Array, " n"], combination: Float[Array, " k"]
+) -> Float[Array, " k"]:
+    """Impulses where contacts at 1 push until their gaps rest, and elements stick at 0 or slip in a direction."""
+    a, n, m = struck.delassus, struck.loads.shape[1], struck.loads.shape[0]
+    pushes, slips = combination[:n] > 0, combination[n:]
+    given = jnp.concatenate([jnp.where(pushes, 0.0, least), jnp.zeros(m, v.dtype)])
+    rhs = -v - jnp.sum(a * given[None, :], axis=1)
+    if m == 0:
+        return given + solve_semidefinite(a, jnp.where(pushes, rhs, 0.0), jnp.ones_like(v), pushes & struck.touches)
+    free = jnp.concatenate([pushes & struck.touches, slips == 0])
+    # Slip friction is what its contact pushes times a coefficient: its columns go into those of the contacts.
+    share = jnp.where(slips > 0, -struck.forward, jnp.where(slips < 0, struck.backward, 0.0))[:, None] * struck.loads
+    given = given.at[n:].set(jnp.sum(share * given[None, :n], axis=1))
+    rhs = -v - jnp.sum(a * given[None, :], axis=1)
+    spread = jnp.eye(n + m, dtype=v.dtype).at[n:, :n].set(share)
+    both = free[:, None] & free[None, :]
+    matrix = jnp.where(both, jnp.sum(a[:, :, None] * spread[None, :, :], axis=1), 0.0)
+    solution = _solve_singular(matrix, jnp.where(free, rhs, 0.0), free)
+    return given + jnp.sum(spread * solution[None, :], axis=1)
 
-    def violation(active: Bool[Array, " n"]) -> Scalar:
-        impulse = pushed(active)
-        after = closing + jnp.sum(delassus * impulse[None, :], axis=1)
-        pulls = jnp.max(-impulse * jnp.diagonal(delassus))
-        return jnp.maximum(pulls, jnp.max(jnp.where(touches, -after, 0.0)))
 
-    worst = jax.lax.map(violation, sets)
-    return pushed(sets[jnp.argmin(_constant(worst))])
+def _solve_singular(
+    matrix: Float[Array, "k k"], rhs: Float[Array, " k"], free: Bool[Array, " k"]
+) -> Float[Array, " k"]:
+    """As `solve_semidefinite`, of a matrix that friction makes unsymmetric."""
+    k = rhs.shape[0]
+    scale = jnp.max(jnp.abs(matrix))
+    scale = jnp.where(scale > 0, scale, 1.0)
+    matrix, rhs = matrix / scale, rhs / scale
+    shift = float(jnp.finfo(rhs.dtype).eps) ** 0.5
+    shifted = matrix + jnp.eye(k, dtype=rhs.dtype) * jnp.where(free, shift, 1.0)[None, :]
+    factored = factor_lu([list(row) for row in shifted], pivot=True)
+
+    def solve(x: Array) -> Array:
+        return jnp.stack(factored(list(x)))
+
+    solution = solve(rhs)
+    for _ in range(_REFINEMENTS):
+        solution = solution + solve(rhs - jnp.sum(matrix * solution[None, :], axis=1))
+    return jnp.where(free, solution - shift**2 * solve(solve(solution)), 0.0)
+
+
+def _violation(
+    struck: _Struck, v: Float[Array, " k"], least: Float[Array, " n"], combination: Float[Array, " k"]
+) -> Scalar:
+    """The largest velocity by which a combination misses the conditions."""
+    n, slips = struck.loads.shape[1], combination[struck.loads.shape[1] :]
+    impulse = _solve(struck, v, least, combination)
+    after = v + jnp.sum(struck.delassus * impulse[None, :], axis=1)
+    mobility = jnp.diagonal(struck.delassus)
+    pulls = (least - impulse[:n]) * mobility[:n]
+    worst = jnp.maximum(jnp.max(pulls), jnp.max(jnp.where(struck.touches, -after[:n], 0.0)))
+    if not slips.size:
+        return worst
+    load = jnp.sum(struck.loads * impulse[None, :n], axis=1)
+    friction = -impulse[n:]
+    beyond = jnp.maximum(friction - struck.forward * load, -friction - struck.backward * load) * mobility[n:]
+    touched = jnp.sum(struck.loads * jnp.where(struck.touches, 1.0, 0.0)[None, :], axis=1) > 0
+    misses = jnp.where(slips == 0, beyond, jnp.where(touched, -slips * after[n:], 0.0))
+    return jnp.maximum(worst, jnp.max(misses))

@@ -50,6 +50,10 @@ def check_step(scene: Scene) -> None:
             f"ImplicitFriction takes no events, which {', '.join(scene.contacts)} opens and closes by: use another"
             " solver."
         )
+    if scene.compliant:
+        raise ValueError(
+            f"ImplicitFriction takes no forces of contacts ({', '.join(scene.compliant)}): use another solver."
+        )
     for name, effect in zip(scene.names, scene.effects, strict=True):
         if not isinstance(effect, Friction):
             continue

@@ -16,14 +16,17 @@ from .._core.functions import as_function
 from .._core.parameters import as_real
 from .._core.readable import AbstractReadable
 from .._core.shapes import PerDof, Scalar
-from ..mechanics import AbstractConstraint, BoundContact, Constraint, Contact, Lagrangian
+from ..mechanics import AbstractConstraint, BoundContact, Contact, Lagrangian, Poisson
 from ._coordinates import as_coordinates, read_label
 from ._signal import Signal, signals_at, signals_from, signals_of
 from .forces._effect import AbstractEffect
 from .forces._friction import Friction
 
-# The test of uniqueness looks at every corner of the box of slopes: two to this power.
+# The test of uniqueness looks at every corner of the box of slopes, two to this power; an impact tries stick, and slip
+# in either direction, of each element: three to this power.
 _MOST_LOADS = 4
+# An impact tries every set of contacts that may push: two to this power.
+_MOST_CONTACTS = 6
 
 
 def _params(params: PyTree) -> PyTree:
@@ -155,6 +158,23 @@ class Scene(AbstractReadable, eqx.Module):
                 f"Friction rests on {len(self.loaded)} constraints, but no more than {_MOST_LOADS} can be solved"
                 " together; give the load of the others as functions."
             )
+        if len(self.impact_friction) > _MOST_LOADS:
+            raise ValueError(
+                f"{', '.join(self.impact_friction)}: no more than {_MOST_LOADS} friction elements under contacts can be"
+                " solved together with an impact; wrap the laws of the others as Regularized(law, width), which take"
+                " no part in impacts."
+            )
+        if len({isinstance(each.restitution, Poisson) for each in self.contacts.values()}) > 1:
+            raise ValueError(
+                f"{', '.join(self.contacts)}: contacts of one scene obey one law of impact. Give restitution=Poisson(e)"
+                " to all of them, or numbers."
+            )
+        if len(self.contacts) > _MOST_CONTACTS:
+            raise ValueError(
+                f"There are {len(self.contacts)} contacts, but impacts of no more than {_MOST_CONTACTS} can be solved"
+                " together, as every set of them is tried: leave out those that never touch, or give the others a"
+                " force of their own by AppliedForce."
+            )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -183,8 +203,22 @@ class Scene(AbstractReadable, eqx.Module):
     @property
     def contacts(self) -> dict[str, Contact]:
         """The contacts that open and close, by name, in the order of their modes."""
+        return {name: each for name, each in self._all_contacts.items() if each.compliant is None}
+
+    @property
+    def compliant(self) -> dict[str, Contact]:
+        """The contacts that give way, which have no modes, by name."""
+        return {name: each for name, each in self._all_contacts.items() if each.compliant is not None}
+
+    @property
+    def _all_contacts(self) -> dict[str, Contact]:
         pairs = zip(self.constraint_names, self.constraints, strict=True)
         return {name: each for name, each in pairs if isinstance(each, Contact)}
+
+    @property
+    def impact_friction(self) -> dict[str, Friction]:
+        """The friction elements that take part in impacts: those by events under the reaction of a contact, by name."""
+        return {name: each for name, each in self.event_driven.items() if each.load_constraint in self.contacts}
 
     @property
     def bilateral(self) -> tuple[AbstractConstraint, ...]:
@@ -202,6 +236,11 @@ class Scene(AbstractReadable, eqx.Module):
         params = self.bind_time(jnp.zeros(())).params
         shapes = [each.slip_shape(q, params) for each in self.event_driven.values()]
         return (*(math.prod(shape) for shape in shapes), *(1 for _ in self.contacts))
+
+    @property
+    def stiff(self) -> bool:
+        """Whether the equations of motion are stiff."""
+        return any(effect.stiff for effect in self.effects) or bool(self.compliant)
 
     @property
     def stick_drifts(self) -> bool:
@@ -225,20 +264,14 @@ class Scene(AbstractReadable, eqx.Module):
 
     @property
     def checks(self) -> tuple[str, ...]:
-        """What may end the equations of motion, in words, in the order of `Dynamics.validity_margins`."""
-        words = [
-            f"The constraint {name!r} can only push, and would have to pull: the contact opens. The motion from there"
-            " on is that of a scene without it."
-            for name, each in zip(self.constraint_names, self.constraints, strict=True)
-            if isinstance(each, Constraint) and each.one_sided
-        ]
-        if self.loaded:
-            words.append(
-                f"Friction under the reaction of {', '.join(map(repr, self.loaded))} has lost its unique solution: it"
-                " raises its own load without bound (Painleve's paradox, jamming). Lower the coefficient of friction,"
-                " or model the contact as elastic."
-            )
-        return tuple(words)
+        """What may end the equations of motion, in words: a `Dynamics.uniqueness` that is not positive, or nothing."""
+        if not self.loaded:
+            return ()
+        return (
+            f"Friction under the reaction of {', '.join(map(repr, self.loaded))} has lost its unique solution: it"
+            " raises its own load without bound (Painleve's paradox, jamming). Lower the coefficient of friction,"
+            " or model the contact as elastic.",
+        )
 
     def bind_time(self, t: Scalar) -> "Scene":
         """The scene with the numbers of its signals at time `t`; itself where it has none."""
@@ -249,7 +282,7 @@ class Scene(AbstractReadable, eqx.Module):
         return self._with(lagrangian=lagrangian, params=signals_at(driven, t))
 
     def bind_modes(self, mode: Array | None) -> "Scene":
-        """The scene with each contact as the constraint that it is in its mode; itself without contacts.
+        """The scene with each contact as the constraint that it is in its mode, if any; itself without contacts.
 
         `mode` holds those of `mode_names`.
 
@@ -257,17 +290,19 @@ class Scene(AbstractReadable, eqx.Module):
 
         - `ValueError` for contacts without modes.
         """
-        if not self.contacts:
+        if not self._all_contacts:
             return self
-        if mode is None:
+        if self.contacts and mode is None:
             raise ValueError(
                 f"{', '.join(self.contacts)}: contacts open and close by events, so that position and velocity do not"
                 " tell the forces: run the scene by jaxmodsim.simulate."
             )
-        modes = iter(jax.lax.stop_gradient(mode[mode.shape[0] - len(self.contacts) :]))
-        return self._with(
-            constraints=tuple(BoundContact(x, next(modes)) if isinstance(x, Contact) else x for x in self.constraints)
-        )
+        modes = iter(() if mode is None else jax.lax.stop_gradient(mode[mode.shape[0] - len(self.contacts) :]))
+
+        def bound(x: Contact) -> BoundContact:
+            return BoundContact(x, next(modes) if x.compliant is None else jnp.zeros_like(x.compliant.stiffness))
+
+        return self._with(constraints=tuple(bound(x) if isinstance(x, Contact) else x for x in self.constraints))
 
     def step_from(self, t: Scalar) -> "Scene":
         """The scene for a step from `t` up to the next sample: signals are what they are there, without jumps."""

@@ -18,10 +18,10 @@ class EnergyLedger(NamedTuple):
     """Energies of a run [J], shape `[time]` each.
 
     - `kinetic`, `potential`: of the Lagrangian.
-    - `stored`: in the own state of each effect that has one, by name.
+    - `stored`: in the own state of each effect that has one, and in each compliant contact, by name.
     - `supplied`: brought in since t0, by the names of `Dynamics.power`.
-    - `dissipated`: lost since t0 in each effect that absorbs power, by name: what it absorbed, less what its own state
-      has gained.
+    - `dissipated`: lost since t0 in each effect, or compliant contact, that absorbs power, by name: what it absorbed,
+      less what it has stored.
     - `before`: kinetic, potential and stored energy of the state that was given at t0, shape `[]`.
     """
 
@@ -69,14 +69,14 @@ def _ledger(inputs: RunInputs, t: Array, y: State, work: dict[str, Power]) -> En
     scene = inputs.scene
 
     def parts(t: Array, y: State) -> tuple[Array, Array, dict[str, Array]]:
-        return *_mechanical(t, y, scene), _stored(scene, y)
+        return *_mechanical(t, y, scene), _stored(t, y, scene)
 
     first = initial_state(inputs)
     kinetic, potential, stored = jax.vmap(parts)(t, y)
-    gained = {name: now - _stored(scene, first)[name] for name, now in stored.items()}
+    gained = {name: now - _stored(inputs.t0, first, scene)[name] for name, now in stored.items()}
     supplied = {name: each.supplied for name, each in work.items()}
     dissipated = {
-        name: absorbed - gained.get(name, 0.0) for name in scene.names if (absorbed := work[name].absorbed) is not None
+        name: each.absorbed - gained.get(name, 0.0) for name, each in work.items() if each.absorbed is not None
     }
     return EnergyLedger(kinetic, potential, stored, supplied, dissipated, _energy(scene, inputs.t0, first))
 
@@ -111,12 +111,18 @@ def _losses(inputs: RunInputs, t: Array, start: State, log: EventLog | None) -> 
     return losses + jnp.sum(jnp.where(counts, drops[None, :], 0.0), axis=1)
 
 
-def _stored(scene: Scene, y: State) -> dict[str, Array]:
-    return {
+def _stored(t: Array, y: State, scene: Scene) -> dict[str, Array]:
+    """In the states of effects, and in contacts that give way."""
+    stored = {
         name: jnp.asarray(effect.stored_energy(y.z[name]), y.q.dtype)
         for name, effect in zip(scene.names, scene.effects, strict=True)
         if name in y.z
     }
+    for name, each in scene.compliant.items():
+        assert each.compliant is not None
+        gap = each.error(t, y.q, scene.bind_time(t).params)[0]
+        stored[name] = each.compliant.stored_energy(-gap)
+    return stored
 
 
 def _mechanical(t: Array, y: State, scene: Scene) -> tuple[Array, Array]:
@@ -127,4 +133,4 @@ def _mechanical(t: Array, y: State, scene: Scene) -> tuple[Array, Array]:
 
 def _energy(scene: Scene, t: Array, y: State) -> Array:
     kinetic, potential = _mechanical(t, y, scene)
-    return kinetic + potential + sum(_stored(scene, y).values())
+    return kinetic + potential + sum(_stored(t, y, scene).values())

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._core.cholesky import cholesky_pivots
 from .._core.parameters import check_ranges, modules_of, range_checks
@@ -160,7 +160,7 @@ def start_code(
         code = jnp.where(quadratic(now.lagrangian, t, y.q, y.qd, now.params), code, NOT_QUADRATIC)
     offsets = _offsets(scene, dof)
     if scene.checks:
-        code = _blame_margins(code, forward_dynamics(t, y, now, mode).validity_margins, offsets.checks, True)
+        code = jnp.where(_unique(now, t, y, mode), code, offsets.checks)
     code = _blame_mass(code, _pivots(now, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
     if scene.constraints:
         off, turned = constraint_residual(now.bind_modes(mode).constraints, t, y.q, y.qd, now.params)
@@ -204,8 +204,7 @@ def end_code(
         # The run ends in front of the place where the equations cease to hold: look a little further.
         beyond = y._replace(q=y.q + ahead * y.qd, qd=y.qd + ahead * rate.qd)
         for t_look, y_look in ((t + ahead, beyond), (t, y)):
-            margins = forward_dynamics(t_look, y_look, scene, mode).validity_margins
-            code = _blame_margins(code, margins, offsets.checks, early)
+            code = jnp.where(early & ~_unique(scene, t_look, y_look, mode), offsets.checks, code)
     if scene.constraints:
         kept = constraint_residual(now.bind_modes(mode).constraints, t, y.q, y.qd, now.params)[0] <= _KEPT
         code = jnp.where(kept | ~finite, code, DRIFTED)
@@ -223,16 +222,11 @@ def _penetration(scene: Scene, t: Array, y: State) -> Float[Array, ""]:
     return -deepest / jnp.maximum(1.0, jnp.max(jnp.abs(y.q)))
 
 
-def _blame_margins(code: Int[Array, ""], margins: Array | None, first: int, known: Array | bool) -> Int[Array, ""]:
-    """Replace `code` by that of the last condition that does not hold, where `known`.
-
-    The margin of uniqueness comes last: where it is gone, normal forces change their sign, but no contact opens.
-    """
-    if margins is None:
-        return code
-    bad = ~(margins > 0)
-    last = margins.shape[0] - 1 - jnp.argmax(bad[::-1])
-    return jnp.where(jnp.any(bad) & known, first + last, code)
+def _unique(scene: Scene, t: Array, y: State, mode: Array | None) -> Bool[Array, ""]:
+    """Whether friction under reactions has a unique solution, in a scene with some."""
+    margin = forward_dynamics(t, y, scene, mode).uniqueness
+    assert margin is not None
+    return margin > 0
 
 
 def _mass(scene: Scene, t: Float[Array, ""], y: State) -> Float[Array, "dof dof"]:

@@ -108,14 +108,14 @@ class RunOutput(NamedTuple):
 
 
 def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolver:
-    """Rodas5P where an effect is stiff, or runs by events on one coordinate or in the plane; Tsit5 otherwise.
+    """Rodas5P where the scene is stiff, or runs by events on one coordinate or in the plane; Tsit5 otherwise.
 
     Every step of a run with events looks at the guards, whatever the method. On one coordinate Rodas5P makes the fewest
     of those whose dense output keeps the tolerance, and is twice as fast as Tsit5 under vmap; on more of them its
     Jacobian costs more than that, most of all in compile time. Exact friction in the plane is stiff where slip is slow:
     its direction follows that of the load.
     """
-    stiff = any(effect.stiff for effect in scene.effects) or sum(scene.mode_widths(dof)) > len(scene.mode_names)
+    stiff = scene.stiff or sum(scene.mode_widths(dof)) > len(scene.mode_names)
     return Rodas5P(pivot=fixed_step) if stiff or (scene.mode_names and dof == 1) else dfx.Tsit5()
 
 
@@ -227,7 +227,7 @@ def _functions(inputs: RunInputs, options: RunOptions, audited: bool) -> RunFunc
         IntegratedSystem(audited, isinstance(options.solver, Gauss)),
         _REST * inputs.atol,
         (inputs.rtol, inputs.atol),
-        bool(scene.constraints) and options.project,
+        bool(scene.bilateral or scene.contacts) and options.project,
         scene.stick_drifts,
         options.hold_chatter,
         scene.mode_widths(inputs.q0.shape[0]),

@@ -321,7 +321,7 @@ def _solvers(inputs: RunInputs, options: RunOptions) -> tuple[tuple[dfx.Abstract
     take far more work, so that one of them serves as a check only; so does any beside a method that was given.
     """
     default = default_solver(inputs.scene, inputs.q0.shape[0], False)
-    stiff = any(effect.stiff for effect in inputs.scene.effects)
+    stiff = inputs.scene.stiff
     other = dfx.Kvaerno5() if stiff else dfx.Dopri8()
     bounds = bool(inputs.scene.mode_names) and inputs.dtmax is None
     if options.solver is None:

@@ -41,7 +41,7 @@ class Found(NamedTuple):
 
     qdd: np.ndarray
     reactions: dict[str, ConstraintReaction]
-    margins: Any
+    uniqueness: Any
 
 
 def draw(low: float, high: float, *shape: int, seed: int = 5) -> Any:
@@ -129,7 +129,8 @@ def rod_on_rough_floor(mu: float = ROD["mu"]) -> Case:
     )
     numbers = {**ROD, "mu": mu}
     closed = lambda q, qd: problems.rod_on_rough_floor.acceleration(q, qd, **numbers)  # noqa: E731
-    return Case(problems.rod_on_rough_floor.scene(**numbers), q, qd, closed, jnp.sign(ROD_SLIP)[:, None])
+    modes = jnp.stack([jnp.sign(ROD_SLIP), jnp.ones_like(ROD_SLIP)], axis=1)  # in slip, on the floor
+    return Case(problems.rod_on_rough_floor.scene(**numbers), q, qd, closed, modes)
 
 
 def foucault_pendulum() -> Case:
@@ -176,7 +177,7 @@ def look(scene: Scene, q: Any, qd: Any, mode: Any) -> Any:
         return (
             vector_field(t, y, scene, mode).qd,
             reactions,
-            forward_dynamics(t, y, scene, mode).validity_margins if scene.checks else None,
+            forward_dynamics(t, y, scene, mode).uniqueness if scene.checks else None,
         )
 
     return jax.vmap(one)(q, qd, mode)

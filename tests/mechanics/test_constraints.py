@@ -11,6 +11,7 @@ import pytest
 from jaxmodsim import (
     AppliedForce,
     Constraint,
+    Contact,
     Coulomb,
     DeadZone,
     Friction,
@@ -221,7 +222,7 @@ def test_constraints_that_contradict_each_other_end_the_run() -> None:
 # --- Loads that are reactions ---------------------------------------------------------------------------------------
 
 
-def floor_scene(mu: float, tilt: float, one_sided: bool = True) -> Scene:
+def floor_scene(mu: float, tilt: float, pulls: bool = False) -> Scene:
     """A block of 2 kg on a floor, pushed by 3 N along it and 4 N + tilt times friction's own side force.
 
     The block's height is a coordinate; a lever of slope `tilt` turns sliding into pressing: the direction of friction
@@ -239,27 +240,27 @@ def floor_scene(mu: float, tilt: float, one_sided: bool = True) -> Scene:
             AppliedForce(push),
             Friction(Regularized(Coulomb(mu), 1e-6), along=lambda q: q[0] + tilt * q[1], normal_force="floor"),
         ),
-        constraints=(Constraint(lambda t, q, p: q[1], one_sided=one_sided, name="floor"),),
+        constraints=((Constraint if pulls else Contact)(lambda t, q, p: q[1], name="floor"),),
     )
 
 
 @pytest.mark.parametrize(("mu", "tilt"), [(0.3, 0.0), (0.3, 0.5), (0.3, -0.5), (0.9, 1.0)])
 def test_friction_and_its_load_are_solved_together(mu: float, tilt: float) -> None:
     """Upright: N = down + tilt F with F = mu N, so N = down/(1 - mu tilt)."""
-    scene, state = floor_scene(mu, tilt), State(jnp.zeros(2), jnp.array([1.0, 0.0]), {})
+    scene, state, closed = floor_scene(mu, tilt), State(jnp.zeros(2), jnp.array([1.0, 0.0]), {}), jnp.ones(1)
     normal = 4.0 / (1.0 - mu * tilt)
-    np.testing.assert_allclose(forward_dynamics(ZERO, state, scene).reactions["floor"].multiplier, [normal], rtol=1e-13)
-    np.testing.assert_allclose(forward_dynamics(ZERO, state, scene).forces["friction"], mu * normal, rtol=1e-13)
-    np.testing.assert_allclose(vector_field(ZERO, state, scene).qd, [(3.0 - mu * normal) / 2.0, 0.0], atol=1e-13)
-    margins = forward_dynamics(ZERO, state, scene).validity_margins
-    assert margins is not None
-    np.testing.assert_allclose(margins, [normal, min(1.0, 1.0 - mu * tilt)], rtol=1e-13)
+    dynamics = forward_dynamics(ZERO, state, scene, closed)
+    np.testing.assert_allclose(dynamics.reactions["floor"].multiplier, [normal], rtol=1e-13)
+    np.testing.assert_allclose(dynamics.forces["friction"], mu * normal, rtol=1e-13)
+    np.testing.assert_allclose(dynamics.rate.qd, [(3.0 - mu * normal) / 2.0, 0.0], atol=1e-13)
+    assert dynamics.uniqueness is not None
+    np.testing.assert_allclose(dynamics.uniqueness, min(1.0, 1.0 - mu * tilt), rtol=1e-13)
 
 
-@pytest.mark.parametrize(("one_sided", "tilt", "lost"), [(True, 1.2, True), (True, -1.2, False), (False, -1.2, True)])
-def test_loss_of_uniqueness_is_named(one_sided: bool, tilt: float, lost: bool) -> None:
+@pytest.mark.parametrize(("pulls", "tilt", "lost"), [(False, 1.2, True), (False, -1.2, False), (True, -1.2, True)])
+def test_loss_of_uniqueness_is_named(pulls: bool, tilt: float, lost: bool) -> None:
     """mu tilt = 1.2: friction raises its own load without bound. A guide that also pulls loses it for either sign."""
-    scene = floor_scene(1.0, tilt, one_sided)
+    scene = floor_scene(1.0, tilt, pulls)
     run = simulate(scene, [0.0, 0.0], [1.0, 0.0], 0.1, throw=False)
     assert bool(run.result.ok) == (not lost)
     if lost:
@@ -268,16 +269,18 @@ def test_loss_of_uniqueness_is_named(one_sided: bool, tilt: float, lost: bool) -
 
 
 def test_a_contact_that_would_have_to_pull_opens() -> None:
-    """Pressed by 1 N - t: the floor lets go at t = 1, and the run stops there with all that was computed."""
+    """Pressed by 1 N - t: the floor lets go at t = 1, and the force lifts the mass."""
     scene = Scene(
         free,
         effects=(AppliedForce(lambda t, q, qd, p: jnp.stack([0.0 * t, t - 1.0])),),
-        constraints=(Constraint(lambda t, q, p: q[1], one_sided=True, name="floor"),),
+        constraints=(Contact(lambda t, q, p: q[1], name="floor"),),
     )
-    run = simulate(scene, [0.0, 0.0], [1.0, 0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 31), throw=False)
-    assert "'floor' can only push, and would have to pull" in run.result.message
-    np.testing.assert_allclose(run.t_end, 1.0, rtol=1e-6)
-    np.testing.assert_allclose(run.q[:10, 0], run.t[:10], rtol=1e-6)
+    run = simulate(scene, [0.0, 0.0], [1.0, 0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 31))
+    (opens,) = run.mode_changes
+    assert (opens.effect, opens.before, opens.after) == ("floor", "closed", "open")
+    np.testing.assert_allclose(opens.t, 1.0, rtol=1e-6)
+    np.testing.assert_allclose(run.q[:, 0], run.t, rtol=1e-6)
+    np.testing.assert_allclose(run.q[:, 1], jnp.maximum(run.t - 1.0, 0.0) ** 3 / 6.0, atol=1e-6)
 
 
 def test_a_load_of_a_reaction_sticks_and_slides_exactly() -> None:
@@ -368,10 +371,6 @@ TWO = Constraint(lambda t, q, p: q, name="floor")
         (lambda: Constraint(3.0), "phi must be a function, but 3.0"),
         (lambda: Constraint(circle, stabilise=-1.0), "stabilise must be finite and >= 0"),
         (lambda: Scene(free, constraints=(Constraint(lambda t, q, p: jnp.eye(2)),)), r"it returned shape \(2, 2\)"),
-        (
-            lambda: Scene(free, constraints=(Constraint(lambda t, q, p: q, one_sided=True),)),
-            "one_sided=True needs phi to be one number",
-        ),
     ],
 )
 def test_wrong_constraints_are_refused(build: Any, text: str) -> None:

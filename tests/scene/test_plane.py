@@ -124,13 +124,10 @@ def test_on_a_line_it_is_the_scalar_law(law: Any) -> None:
     np.testing.assert_allclose(plane.forces["friction"][:, 0], scalar.forces["friction"], atol=1e-12 if exact else 1e-9)
     np.testing.assert_array_equal(plane.q[:, 1], 0.0)
     signs = [(e.before, e.after) for e in scalar.mode_changes]
-    assert signs == [("stick", "forward"), ("forward", "stick"), ("stick", "backward")]
-    assert [(e.before, e.after) for e in plane.mode_changes] == [
-        ("stick", "slip"),
-        ("slip", "stick"),
-        ("stick", "slip"),
-    ]
-    np.testing.assert_allclose([e.t for e in plane.mode_changes], [e.t for e in scalar.mode_changes], atol=1e-9)
+    # Where slip turns round at once, it is slip on both sides.
+    assert signs == [("stick", "forward"), ("forward", "backward")]
+    assert [(e.before, e.after) for e in plane.mode_changes] == [("stick", "slip")]
+    np.testing.assert_allclose(plane.mode_changes[0].t, scalar.mode_changes[0].t, rtol=1e-12)
     np.testing.assert_array_equal(plane.mode["friction"], np.abs(scalar.mode["friction"]))
 
 

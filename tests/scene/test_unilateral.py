@@ -2,10 +2,12 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import ellipk
 
 import jaxmodsim as jms
 from jaxmodsim.problems import bouncing_ball, vibrating_table
@@ -161,19 +163,101 @@ def test_several_contacts_at_one_instant():
     np.testing.assert_allclose(run.qd[-1], [-0.5, 0.5, 0.5, 0.5], atol=1e-12)
 
 
-def test_a_block_lands_slides_and_stops():
-    mu, g = 0.3, 9.81
-    block = jms.Scene(
-        lambda t, q, qd, p: 0.5 * jnp.sum(qd**2) - g * q[1],
-        effects=(jms.Friction(jms.Coulomb(mu), along=lambda q: q[0], normal_force="floor"),),
-        constraints=(jms.Contact(lambda t, q, p: q[1], name="floor"),),
+def test_an_impact_within_a_constraint():
+    """A pendulum in Cartesian coordinates strikes a wall at its lowest point: the rod holds, the speed is e times."""
+    e, g, start = 0.5, 9.81, 0.6
+    scene = jms.Scene(
+        jms.point_mass(1.0, lambda q: jnp.stack([q[0], 0.0 * q[0], q[1]])),
+        constraints=(
+            jms.Contact(lambda t, q, p: q[0], restitution=e, name="wall"),
+            jms.Constraint(lambda t, q, p: jnp.sqrt(jnp.sum(q**2)) - 1.0, name="rod"),
+        ),
     )
-    run = jms.simulate(block, [0.0, 0.5], [1.0, 0.0], 1.5, ts=jnp.linspace(0.0, 1.5, 7), **TIGHT)
-    landing = np.sqrt(2 * 0.5 / g)
-    lands, stops = run.mode_changes
-    np.testing.assert_allclose([lands.t, stops.t], [landing, landing + 1.0 / (mu * g)], rtol=1e-10)
-    np.testing.assert_allclose(run.q[-1], [landing + 1.0 / (2 * mu * g), 0.0], rtol=1e-10, atol=1e-15)
-    np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-11)
+    run = jms.simulate(
+        scene, [np.sin(start), -np.cos(start)], [0.0, 0.0], 0.75, ts=jnp.linspace(0.0, 0.75, 16), **TIGHT
+    )
+    (strike,) = run.mode_changes
+    # A quarter of the period, an elliptic integral.
+    np.testing.assert_allclose(strike.t, ellipk(np.sin(start / 2) ** 2) / np.sqrt(g), rtol=1e-9)
+    np.testing.assert_allclose(jnp.sum(run.q**2, axis=1), 1.0, atol=1e-12)
+    after = run.t > strike.t
+    energy = 0.5 * jnp.sum(run.qd**2, axis=1) + g * (1 + run.q[:, 1])
+    full = g * (1 - np.cos(start))
+    np.testing.assert_allclose(energy, np.where(after, e**2 * full, full), rtol=1e-8)
+    np.testing.assert_allclose(run.event_losses, np.where(after, (1 - e**2) * full, 0.0), atol=1e-8)
+
+
+def test_poissons_law():
+    """A ball strikes one that lies on a floor: the floor gives its impulse back, which Newton's law cannot say."""
+    m1, m2, v = 2.0, 3.0, 1.5
+    scene = jms.Scene(
+        lambda t, q, qd, p: 0.5 * m1 * qd[0] ** 2 + 0.5 * m2 * qd[1] ** 2,
+        constraints=(
+            jms.Contact(lambda t, q, p: q[0], restitution=jms.Poisson(1.0), name="floor"),
+            jms.Contact(lambda t, q, p: q[1] - q[0], restitution=jms.Poisson(0.0), name="balls"),
+        ),
+    )
+    run = jms.simulate(scene, [0.0, 1.0], [0.0, -v], 1.0, ts=jnp.array([0.5, 1.0]), **TIGHT)
+    np.testing.assert_allclose(run.qd[-1], m2 * v / (m1 + m2), rtol=1e-12)
+    np.testing.assert_array_equal(run.mode["floor"], [1, 0])
+    np.testing.assert_array_equal(run.mode["balls"], [0, 1])
+    # Alone, a contact does as by Newton's law.
+    ball = bouncing_ball.scene(e=0.5)
+    ball = jms.Scene(
+        ball.lagrangian, ball.params, constraints=(jms.Contact(lambda t, q, p: q[0], restitution=jms.Poisson(0.5)),)
+    )
+    run = jms.simulate(ball, [1.0], [0.0], 2.5, ts=jnp.array([1.1, 2.5]), **TIGHT)
+    np.testing.assert_allclose(run.q[:, 0], bouncing_ball.motion(run.t, h=1.0, e=0.5)[0], atol=1e-11)
+
+
+def _compliant_ball(law, **more):
+    floor = jms.Contact(lambda t, q, p: q[0] - p["rise"] * t, restitution=law, name="floor", **more)
+    return jms.Scene(
+        lambda t, q, qd, p: 0.5 * p["m"] * qd[0] ** 2 - p["m"] * p["g"] * q[0],
+        params={"m": 1.0, "g": 9.81, "rise": 0.0},
+        constraints=(floor,),
+    )
+
+
+@pytest.mark.parametrize("law", [jms.HuntCrossley(1e3, 1.0, 0.2), jms.HuntCrossley(1e5, 1.5, 0.4)])
+def test_a_compliant_contact_gives_back_what_its_closed_form_says(law):
+    """In free flight against a floor that moves; energy is stored, lost and supplied, and all of it accounted for."""
+    scene = eqx.tree_at(lambda s: s.params, _compliant_ball(law), {"m": 2.0, "g": 0.0, "rise": 0.5})
+    scene = jax.tree.map(jnp.asarray, scene)
+    run = jms.simulate(scene, [0.1], [-1.5], 1.0, ts=jnp.linspace(0.0, 1.0, 41), **TIGHT)
+    np.testing.assert_allclose(run.qd[-1, 0], 0.5 + 2.0 * law.restitution(2.0), rtol=1e-8)
+    assert not run.mode
+    np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-8)
+    assert (np.diff(run.energy.dissipated) >= -1e-9).all()
+    np.testing.assert_allclose(run.energy.dissipated[-1], 4.0 * (1.0 - law.restitution(2.0) ** 2), rtol=1e-7)
+    np.testing.assert_allclose(jnp.sum(run.reactions["floor"].multiplier < 0), 0)
+
+
+def test_a_compliant_contact_becomes_rigid_as_its_stiffness_grows():
+    """It lasts as long as depth over speed, and the depth is `(m v^2/k)^(1/(n + 1))`: order 2/5 for n = 3/2."""
+    law = jms.HuntCrossley(1.0, damping=0.2)
+    e = float(law.restitution(np.sqrt(2 * 9.81)))
+    exact = float(bouncing_ball.motion(jnp.asarray(0.8), h=1.0, e=e)[0])
+
+    def error(k):
+        scene = _compliant_ball(jms.HuntCrossley(k, damping=0.2))
+        return abs(float(jms.simulate(scene, [1.0], [0.0], 0.8, rtol=1e-9, atol=1e-12).q[-1, 0]) - exact)
+
+    errors = np.array([error(k) for k in (1e9, 1e11, 1e13)])
+    np.testing.assert_allclose(np.log10(errors[:-1] / errors[1:]) / 2, 0.4, atol=0.01)
+
+
+def test_friction_under_a_compliant_contact():
+    """A block settled in a soft floor slides under its weight's friction, and stops."""
+    law = jms.HuntCrossley(1e4, 1.0, 1.0)
+    scene = jms.Scene(
+        lambda t, q, qd, p: 0.5 * jnp.sum(qd**2) - 9.81 * q[1],
+        effects=(jms.Friction(jms.Coulomb(0.3), along=lambda q: q[0], normal_force="floor"),),
+        constraints=(jms.Contact(lambda t, q, p: q[1], restitution=law, name="floor"),),
+    )
+    run = jms.simulate(scene, [0.0, -9.81e-4], [1.0, 0.0], 1.0, **TIGHT)
+    np.testing.assert_allclose(run.q[-1], [1.0 / (2 * 0.3 * 9.81), -9.81e-4], rtol=1e-9)
+    assert abs(run.qd[-1, 0]) < 1e-15
 
 
 @pytest.mark.parametrize("e", [0.0, 1e-12, 0.5])
@@ -204,6 +288,15 @@ def test_wrong_contacts_are_refused():
         jms.Contact(lambda t, q, p: q[0], restitution=1.5)
     with pytest.raises(ValueError, match="Contact gap must be a function"):
         jms.Contact(1.0)
+    with pytest.raises(ValueError, match="HuntCrossley: stiffness must be finite and > 0"):
+        jms.HuntCrossley(0.0)
+    with pytest.raises(ValueError, match="Poisson: e must be finite and >= 0 and <= 1"):
+        jms.Poisson(1.5)
+    mixed = jms.Contact(lambda t, q, p: q[0]), jms.Contact(lambda t, q, p: q[0], restitution=jms.Poisson(0.5))
+    with pytest.raises(ValueError, match="one law of impact"):
+        jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, constraints=mixed)
+    with pytest.raises(ValueError, match="7 contacts, but impacts of no more than 6"):
+        jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, constraints=7 * (jms.Contact(lambda t, q, p: q[0]),))
     pair = jms.Contact(lambda t, q, p: jnp.stack([q[0], q[0]]), name="floor")
     lagrangian = bouncing_ball.scene(e=0.5).lagrangian
     with pytest.raises(ValueError, match=r"'floor'.*one number"):

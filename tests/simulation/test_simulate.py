@@ -64,6 +64,9 @@ def test_changing_a_number_compiles_nothing() -> None:
         run = run_belt(belt_scene(**changes))
         seen.append(np.asarray(run.q))
         assert set(run.forces) == {"applied", "friction", "guide"}
+    for number in (1.4, jnp.asarray(1.45)):  # put in as they are, both of a type that gives way to others
+        run = run_belt(eqx.tree_at(lambda scene: scene.params["m"], belt_scene(), number))
+        seen.append(np.asarray(run.q))
     for changes in (
         {"q0": [0.03]},
         {"qd0": np.array([0.2])},

@@ -396,9 +396,7 @@ class EventSolver(AbstractSolverWrapper):
         if self.on_zeno is not None:
             status = jnp.zeros_like(spread)
         # A reset that changes nothing is no event.
-        modes = state.mode, mode
-        seen = modes if self.event_mode is None else [self.event_mode(x) for x in modes]
-        happened = _differ((passage.before, seen[0]), (y, seen[1]))
+        happened = _differ(*zip((passage.before, y), self._event_modes(state.mode, mode), strict=True))
         events, index = jnp.where(happened, state.events + 1.0, state.events), jnp.where(happened, state.events, -1.0)
         status = jnp.where((status == ONGOING) & (events > self.max_events), TOO_MANY, status)
         clear = _constant(values) > jnp.where(fired, LATITUDE * jnp.abs(rate) * near, 0.0)
@@ -415,9 +413,8 @@ class EventSolver(AbstractSolverWrapper):
             entry = EventLog(t_event, flags, (passage.before, state.mode), (y, mode))
             log = jtu.tree_map(lambda a, b: write(a, index, b), log, entry)
         after = memory._replace(guard=_constant(values), armed=_flags(armed, values))
-        after_reset = state._replace(
-            y=passage.y,
-            mode=mode,
+        passed = state._replace(y=passage.y, mode=mode, memory=after)
+        after_reset = passed._replace(
             t=t_event,
             events=events,
             status=status,
@@ -425,13 +422,15 @@ class EventSolver(AbstractSolverWrapper):
             log=log,
             memory=after._replace(resets=memory.resets + 1.0, spread=spread),
         )
-        sampled = self.samples is not None and self.samples.times is not None
-        if not sampled and self.event_mode is None:
+        if self.event_mode is None and (self.samples is None or self.samples.times is None):
             return after_reset
         # Samples at which nothing happens, and resets that are no events, say nothing of whether events accumulate.
-        counts = happened | (jnp.any(fired) if self.event_mode is None else jnp.any(fired) & ~_differ(*modes))
-        passed = state._replace(y=passage.y, mode=mode, memory=after)
-        return jtu.tree_map(lambda a, b: jnp.where(counts, a, b), after_reset, passed)
+        chatters = jnp.any(fired) if self.event_mode is None else jnp.any(fired) & ~_differ(state.mode, mode)
+        return jtu.tree_map(lambda a, b: jnp.where(happened | chatters, a, b), after_reset, passed)
+
+    def _event_modes(self, *modes: PyTree) -> tuple[PyTree, ...]:
+        """What of the modes an event changes."""
+        return modes if self.event_mode is None else tuple(self.event_mode(mode) for mode in modes)
 
 
 def _accumulates(spread: Array, t: Array, begin: Array) -> Array:

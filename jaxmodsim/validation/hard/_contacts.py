@@ -192,17 +192,21 @@ def _above(t: Array, q: Array, p: dict[str, Array]) -> Array:
 
 
 def _landing() -> HardCase:
-    mu = 0.3
+    mu, start = 0.3, 2.0
     friction = Friction(Coulomb(mu), along=_along, normal_force="floor")
     scene = Scene(_thrown, effects=(friction,), constraints=(Contact(_above, name="floor"),))
     landing = math.sqrt(2 * 0.5 / _G)
+
+    def left(mu: float) -> float:
+        return start - mu * _G * landing
+
     return HardCase(
         "lands_and_slides",
-        "A block lands on a rough floor, slides and stops: its friction is there with the contact.",
+        "A block lands on a rough floor, where friction takes a part of its speed at once, slides and stops.",
         "Friction needs the normal force, which is an impulse at the landing.",
-        motion(scene, [0.0, 0.5], [1.0, 0.0], 1.5, by="friction.Fc", read=position),
-        lambda mu: landing + 1.0 / (2.0 * mu * _G),
-        lambda mu: -1.0 / (2.0 * mu**2 * _G),
+        motion(scene, [0.0, 0.5], [start, 0.0], 1.5, by="friction.Fc", read=position),
+        lambda mu: start * landing + left(mu) ** 2 / (2.0 * mu * _G),
+        lambda mu: -landing * left(mu) / mu - left(mu) ** 2 / (2.0 * mu**2 * _G),
     )
 
 

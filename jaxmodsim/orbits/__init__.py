@@ -1,0 +1,8 @@
+"""Periodic orbits, their stability, and branches of them."""
+
+from ._branch import Branch as Branch
+from ._branch import SpecialOrbit as SpecialOrbit
+from ._continue import continue_orbits as continue_orbits
+from ._orbit import PeriodicOrbit as PeriodicOrbit
+from ._periodic_orbit import periodic_orbit as periodic_orbit
+from ._return_map import OrbitError as OrbitError

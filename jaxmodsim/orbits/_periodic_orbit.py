@@ -1,0 +1,278 @@
+"""`periodic_orbit`: a scene and a guess in, an orbit that returns to itself out."""
+
+from __future__ import annotations  # `help` shows types as they are written here
+
+from dataclasses import replace
+from typing import TypeAlias
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import ArrayLike, PyTree
+
+from .._core.arguments import as_float, check_real
+from ..scene import Scene, State, read_element
+from ..simulation import simulate
+from ._describe import describe
+from ._newton import newton, scaled
+from ._orbit import PeriodicOrbit
+from ._return_map import (
+    MAX_EVENTS,
+    OrbitError,
+    OrbitProblem,
+    PeriodFn,
+    Section,
+    ShotOrbit,
+    end_state,
+    evaluate,
+    pack,
+    unpack,
+)
+from ._settle import SettledState, magnitudes, settled, states_of
+
+# Periods of the force until a run has settled, where nothing else is asked for.
+_PERIODS = 20
+# A direction in which the derivative of the return map is one to so many digits.
+_FAMILY = 1e-7
+
+Guess: TypeAlias = "PeriodicOrbit | tuple[ArrayLike | list[float], ArrayLike | list[float]]"
+
+
+def periodic_orbit(
+    scene: Scene,
+    guess: Guess,
+    *,
+    period: float | PeriodFn | None = None,
+    section: Section | None = None,
+    settle: float | None = None,
+    rtol: float = 1e-10,
+    atol: float = 1e-12,
+) -> PeriodicOrbit:
+    """Find a periodic orbit by shooting: Newton's iteration on the run over one period.
+
+    The run has its events, and derivatives through them. It finds unstable orbits as well as stable ones; a simulation
+    for `settle` seconds, which starts the search, comes near to stable ones alone.
+
+    The state, the period and the extrema of the orbit have first derivatives by all numbers of the scene, forward and
+    reverse, by the implicit function theorem: `jax.grad(lambda s: periodic_orbit(s, ...).period)(scene)`.
+
+    **Arguments:**
+
+    - `scene`: the `Scene`, in float64. Coordinates must return: the angle of a shaft that turns on does not.
+    - `guess`: `(q0, qd0)`, shape `[dof]` each; or a `PeriodicOrbit`, of another scene for instance, which is then where
+      Newton's iteration starts.
+    - `period`: period [s] of a forced orbit, > 0, which begins at t = 0: a number, or a function of `params`, as in
+      `lambda p: 2 * jnp.pi / p["omega"]`, so that it changes with them. None for an orbit of a scene that does not
+      depend on time, whose period is then found.
+    - `section`: `section(q, qd)` -> a number that is zero where an orbit of unknown period begins, and rises. By
+      default it begins in the middle of the longest phase without a change of modes, in slip if there is one.
+    - `settle`: how long [s] the run from the guess lasts, >= 0. Of a forced orbit it is rounded to periods, by default
+      20. Of an orbit of unknown period it is needed where the guess is no orbit, and in its second half the state has
+      to return.
+    - `rtol`, `atol`: tolerances of the runs, as of `simulate`.
+
+    **Returns:**
+
+    A `PeriodicOrbit`.
+
+    **Raises:**
+
+    - `ValueError` for wrong arguments, float32, and inside `jax.jit` or `jax.vmap`.
+    - `OrbitError` where there is no convergence, the run does not return or comes to rest, the section is degenerate,
+      or the orbit is one of a family.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @book{leine2004dynamics,
+            author={Leine, R. I. and Nijmeijer, H.}, title={Dynamics and Bifurcations of Non-Smooth Mechanical Systems},
+            publisher={Springer}, year={2004},
+        }
+        ```
+    """
+    known = jtu.tree_map(jax.lax.stop_gradient, scene)
+    problem, start, dof = prepare(known, guess, period, section, settle, rtol, atol, None)
+    point, _ = newton(problem, start.x, start.period, 0.0, dof, start.scale, None)
+    refuse_family(problem, point, start.scale, dof)
+    orbit, lowest, highest = describe(problem, point, dof)
+    if not any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(scene)):
+        return orbit
+    return _with_derivatives(eqx.tree_at(lambda p: p.scene, problem, scene), point, orbit, (lowest, highest))
+
+
+def prepare(
+    scene: Scene,
+    guess: Guess,
+    period: float | PeriodFn | None,
+    section: Section | None,
+    settle: float | None,
+    rtol: float,
+    atol: float,
+    parameter: str | None,
+) -> tuple[OrbitProblem, SettledState, int]:
+    """The equations of an orbit, a start with the magnitudes of all unknowns, and the number of coordinates.
+
+    **Raises:**
+
+    - `ValueError` for wrong arguments; `OrbitError` where nothing settles.
+    """
+    _check_scene(scene)
+    _check_functions(period, section)
+    relative, absolute = (
+        jnp.asarray(as_float(x, name=name, lower=0.0), float) for name, x in (("rtol", rtol), ("atol", atol))
+    )
+    empty = jnp.zeros(0)
+    phase = jnp.zeros(())
+    if isinstance(guess, PeriodicOrbit):
+        phase = jax.lax.stop_gradient(guess.t0 / guess.period)
+    number = period if period is None or callable(period) else _Constant(as_float(period, name="period", lower=0.0))
+    problem = OrbitProblem(scene, phase, relative, absolute, empty, empty, number, section, parameter)
+    state = _state(scene, guess)
+    dof = state.q.shape[0]
+    if isinstance(guess, PeriodicOrbit) and settle is None:
+        start = SettledState(
+            np.asarray(pack(state)), float(guess.period), magnitudes(states_of(guess.run), float(guess.period))
+        )
+    else:
+        start = settled(problem, state, _settle(problem, settle), section)
+    if problem.period is not None:
+        start = start._replace(scale=start.scale[:-1])
+    start = start._replace(scale=np.append(start.scale, 1.0))
+    return anchored(problem, start, dof), start, dof
+
+
+class _Constant(eqx.Module):
+    """A period that is a number."""
+
+    seconds: float
+
+    def __call__(self, params: PyTree) -> float:
+        """The period [s]."""
+        del params
+        return self.seconds
+
+
+def _settle(problem: OrbitProblem, settle: float | None) -> float:
+    if settle is not None:
+        return as_float(settle, name="settle", lower=None if problem.period is not None else 0.0)
+    if problem.period is None:
+        raise ValueError(
+            "An orbit of unknown period needs settle, the time [s] of the simulation that the search starts with, some"
+            " tens of periods for one that attracts slowly; or pass period, if the scene is forced."
+        )
+    return _PERIODS * float(problem.period(problem.scene.params))
+
+
+def _state(scene: Scene, guess: Guess) -> State:
+    if isinstance(guess, PeriodicOrbit):
+        return jtu.tree_map(jax.lax.stop_gradient, guess.state)
+    if not isinstance(guess, tuple | list) or len(guess) != 2:
+        raise ValueError(f"guess must be (q0, qd0), as in ([0.0], [0.1]), or a PeriodicOrbit, but got {guess!r}.")
+    for name, value in zip(("q0", "qd0"), guess, strict=True):
+        check_real(value, name=f"guess, {name},")
+    q, qd = (jnp.asarray(x, float) for x in guess)
+    if q.ndim != 1 or not q.shape[0] or q.shape != qd.shape:
+        raise ValueError(f"guess must have q0 and qd0 of the shape [dof], but they have {q.shape} and {qd.shape}.")
+    return State(q, qd, scene.initial_state(q))
+
+
+def _check_scene(scene: Scene) -> None:
+    if not isinstance(scene, Scene):
+        raise ValueError(f"periodic_orbit needs a Scene, but a {type(scene).__name__} was given.")
+    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(scene)):
+        raise ValueError(
+            "Periodic orbits are searched for by numbers that are known, which they are not inside jax.jit and"
+            " jax.vmap: call it outside. jax.grad and jax.jacfwd work."
+        )
+    kind = jnp.result_type(float, *jtu.tree_leaves(scene))
+    if kind != jnp.float64 or any(x.dtype == jnp.float32 for x in jtu.tree_leaves(scene)):
+        raise ValueError(
+            "Periodic orbits need float64: in float32 the run itself misses its start by more than what tells an orbit"
+            ' from its neighbours. Call jax.config.update("jax_enable_x64", True) before the scene is made.'
+        )
+
+
+def _check_functions(period: object, section: object) -> None:
+    if section is not None and not callable(section):
+        raise ValueError(f"section must be a function of q and qd, but {section!r} was given.")
+    if section is not None and period is not None:
+        raise ValueError("section is for orbits of unknown period; a forced one begins at t = 0. Pass one of the two.")
+
+
+def anchored(problem: OrbitProblem, start: SettledState, dof: int) -> OrbitProblem:
+    """With the plane through the start that is normal to the flow there, in the magnitudes of the state."""
+    x = jnp.asarray(start.x)
+    problem = eqx.tree_at(lambda p: (p.normal, p.anchor), problem, (jnp.zeros_like(x), x))
+    if not problem.autonomous or problem.section is not None:
+        return problem
+    value = 0.0 if problem.parameter is None else read_element(problem.scene, problem.parameter)
+    flow = evaluate(problem, start.x, start.period, value, dof).flow
+    scale = start.scale[: len(start.x)]
+    return eqx.tree_at(lambda p: p.normal, problem, jnp.asarray(flow / scale**2))
+
+
+def refuse_family(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, dof: int) -> None:
+    """Refuse an orbit that has others beside it, not only to first order.
+
+    **Raises:**
+
+    - `OrbitError` where a multiplier is 1 and the state a small way along its direction returns as well.
+    """
+    by = scaled(point, scale)[:, :-1]
+    _, sizes, rows = np.linalg.svd(by)
+    if sizes[-1] > _FAMILY * sizes[0]:
+        return
+    n, away = len(point.x), 1e-3 * rows[-1] * scale[:-1]
+    period = point.period + (away[n] if problem.autonomous else 0.0)
+    beside = evaluate(problem, point.x + away[:n], period, point.value, dof)
+    # Of a fold the residual there would be of the second order, 1e-6.
+    if not beside.failure and np.max(np.abs(beside.residual[:n]) / scale[:n]) < 1e-8:
+        raise OrbitError(
+            "The orbit is not alone but one of a family, with a multiplier of exactly 1 beside those that every orbit"
+            " has: nothing in the scene says which one. A conservative scene has such families, and dry friction at"
+            " certain frequencies; a little damping, or another frequency, leaves one of them."
+        )
+
+
+def _with_derivatives(
+    problem: OrbitProblem, point: ShotOrbit, orbit: PeriodicOrbit, extrema: tuple[np.ndarray, np.ndarray]
+) -> PeriodicOrbit:
+    """The orbit with the derivatives of the implicit function theorem: one step of Newton from where it is solved."""
+    dof, n = orbit.q.shape[0], len(point.x)
+    inverse = np.linalg.inv(point.by[:, :-1])
+    x, period = jnp.asarray(point.x), jnp.asarray(point.period)
+    after, _ = end_state(problem, problem.scene, x, problem.period_of(problem.scene, period), dof)
+    residual = after - x
+    if problem.autonomous:
+        residual = jnp.append(residual, 0.0)
+    unknowns = jnp.asarray(inverse) @ residual
+    change = jax.lax.stop_gradient(unknowns) - unknowns
+    x = x + change[:n]
+    period = period + change[n] if problem.autonomous else problem.period_of(problem.scene, period)
+    state = unpack(problem.scene, x, dof)
+    # At an extremum the velocity is zero, so its time may be held.
+    times = np.concatenate(extrema)
+    order = np.argsort(times, kind="stable")
+    q = simulate(
+        *(problem.scene, state.q, state.qd, orbit.t0 + point.period),
+        t0=orbit.t0,
+        z0=state.z,
+        ts=jnp.asarray(times[order]),
+        rtol=problem.rtol,
+        atol=problem.atol,
+        max_events=MAX_EVENTS,
+        throw=False,
+    ).q
+    places = np.argsort(order, kind="stable")
+    lowest, highest = (
+        value + (made - jax.lax.stop_gradient(made))
+        for value, made in (
+            (orbit.lowest, q[places[:dof], np.arange(dof)]),
+            (orbit.highest, q[places[dof:], np.arange(dof)]),
+        )
+    )
+    q, qd, z = state
+    return replace(orbit, q=q, qd=qd, z=z, period=period, lowest=lowest, highest=highest)

@@ -1,0 +1,114 @@
+"""A branch on disk: written as it grows, gone on with by the same call."""
+
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeAlias
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._core.extra import extra
+from ..scene import Scene, scene_numbers
+from ._branch import SpecialOrbit
+from ._describe import describe
+from ._return_map import OrbitError, OrbitProblem, ShotOrbit, evaluate, pack
+from ._step import BranchStep, step_at
+
+# Kind, value, index, phase, period, state and direction.
+_StoredPoint: TypeAlias = tuple[str, float, int, float, float, list[float], list[float]]
+
+# Orbits between two times that a branch is written.
+_OFTEN = 20
+
+
+class BranchStore:
+    """A Zarr store of the orbits of a branch: states, periods and values, and what is known of them.
+
+    **Raises:**
+
+    - `ValueError` if the folder holds something else, or another branch.
+    """
+
+    def __init__(self, path: Path, scene: Scene, parameter: str, span: Sequence[float]) -> None:
+        """Read what is there."""
+        self._path, self.steps = path, 0
+        numbers = {name: np.asarray(x).tolist() for name, x in scene_numbers(scene).items()}
+        self._about = {"parameter": parameter, "span": list(span), "numbers": numbers}
+        self._arrays: dict[str, np.ndarray] = {}
+        self._points: list[_StoredPoint] = []
+        if not path.exists():
+            return
+        try:
+            stored = extra("xarray").open_zarr(path, consolidated=False, chunks=None)
+            about, self._points = json.loads(stored.attrs["branch"]), json.loads(stored.attrs["points"])
+            self._arrays = {name: np.asarray(x) for name, x in stored.items()}
+        except (KeyError, ValueError, OSError) as error:
+            raise ValueError(
+                f"{path} exists and is no store of a branch ({type(error).__name__}): name another one, or remove it."
+            ) from error
+        changed = [name for name, x in self._about.items() if about.get(name) != x]
+        if changed:
+            raise ValueError(
+                f"{path} holds another branch; what differs: {', '.join(changed)}. Name another store, or remove it."
+            )
+        self.steps = len(self._arrays["value"])
+
+    def read(self, begin: BranchStep) -> tuple[list[BranchStep], list[SpecialOrbit]]:
+        """The orbits that are there, computed again from their states."""
+        steps, points, dof = [], [], len(begin.orbit.q)
+        stored = zip(*(self._arrays[name] for name in ("state", "period", "value", "tangent", "phase")), strict=True)
+        for x, period, value, sense, phase in stored:
+            problem = replace(begin.problem, phase=jnp.asarray(phase), anchor=jnp.asarray(x))
+            shot = self._shot(problem, x, float(period), float(value), dof)
+            steps.append(step_at(problem, shot, describe(problem, shot, dof)[0], float(begin.scale[-1]), sense))
+        for kind, value, index, phase, period, x, direction in self._points:
+            problem = replace(begin.problem, phase=jnp.asarray(phase))
+            shot = self._shot(problem, np.asarray(x), period, value, dof)
+            points.append(SpecialOrbit(kind, value, index, describe(problem, shot, dof)[0], np.asarray(direction)))
+        return steps, points
+
+    def _shot(self, problem: OrbitProblem, x: np.ndarray, period: float, value: float, dof: int) -> ShotOrbit:
+        shot = evaluate(problem, x, period, value, dof)
+        if shot.failure:
+            raise OrbitError(f"An orbit of {self._path} does not run any more: {shot.failure}")
+        return shot
+
+    def write_often(self, steps: list[BranchStep], points: list[SpecialOrbit]) -> None:
+        """Write where there are some more."""
+        if len(steps) % _OFTEN == 0:
+            self.write(steps, points)
+
+    def write(self, steps: list[BranchStep], points: list[SpecialOrbit]) -> None:
+        """Write all of it, in the place of what was there."""
+        orbits = [each.orbit for each in steps]
+        multipliers = np.array([each.multipliers for each in orbits])
+        rows = {
+            "phase": ("orbit", [float(each.problem.phase) for each in steps]),
+            "value": ("orbit", [each.shot.value for each in steps]),
+            "period": ("orbit", [each.shot.period for each in steps]),
+            "state": (("orbit", "entry"), [each.shot.x for each in steps]),
+            "tangent": (("orbit", "unknown"), [each.tangent * each.scale for each in steps]),
+            "lowest": (("orbit", "coordinate"), [np.asarray(each.lowest) for each in orbits]),
+            "highest": (("orbit", "coordinate"), [np.asarray(each.highest) for each in orbits]),
+            "multipliers_real": (("orbit", "multiplier"), np.real(multipliers)),
+            "multipliers_imaginary": (("orbit", "multiplier"), np.imag(multipliers)),
+            "stable": ("orbit", [each.stable for each in orbits]),
+        }
+        special: list[_StoredPoint] = []
+        for each in points:
+            x, phase = np.asarray(pack(each.orbit.state)).tolist(), float(each.orbit.t0 / each.orbit.period)
+            period, direction = float(each.orbit.period), each.direction.tolist()
+            special.append((each.kind, each.value, each.index, phase, period, x, direction))
+        attrs = {"branch": json.dumps(self._about), "points": json.dumps(special)}
+        data = extra("xarray").Dataset({name: (dims, np.array(x)) for name, (dims, x) in rows.items()}, attrs=attrs)
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        scratch = self._path.with_name(f".{self._path.name}.{uuid.uuid4().hex}")
+        data.to_zarr(scratch, mode="w", zarr_format=3, consolidated=False)
+        if self._path.exists():
+            shutil.rmtree(self._path)
+        os.rename(scratch, self._path)

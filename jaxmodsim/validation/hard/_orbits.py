@@ -1,0 +1,164 @@
+"""Periodic orbits: unstable, stiff, with many phases of stick, nearly grazing, and refused in single precision."""
+
+import math
+from functools import partial
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from ...friction import Coulomb, LuGre, Viscous
+from ...orbits import PeriodicOrbit, periodic_orbit
+from ...problems import belt_oscillator, coupled_belts, vibrating_table
+from ...scene import AppliedForce, Friction, Scene
+from ...simulation import simulate
+from ._case import HardCase, MeasuredNumber, RefusedCalls
+
+FAMILY = "periodic orbits"
+# A bounce a period, past its period doubling.
+_TABLE = {"g": 9.81, "A": 1.1e-3, "omega": 120.0, "e": 0.6}
+
+
+def _table_period(p: dict[str, Array]) -> Array:
+    return 2.0 * math.pi / p["omega"]
+
+
+def _unstable_multiplier() -> float:
+    p, T = _TABLE, 2.0 * math.pi / _TABLE["omega"]
+    phase = float(vibrating_table.bounce_phase(**p))
+    since = T - phase / p["omega"]
+    q0 = p["A"] * math.sin(phase) + 0.5 * p["g"] * since * (T - since)
+    guess = ([1.001 * q0], [p["g"] * (0.5 * T - since)])
+    orbit = periodic_orbit(vibrating_table.scene(**p), guess, period=_table_period, settle=0.0)
+    return float(np.min(np.real(orbit.multipliers)))
+
+
+def _exact_multiplier() -> float:
+    """Of the map of one bounce, of which the determinant is e^2 and the trace follows from the table's acceleration."""
+    p = _TABLE
+    fall = p["A"] * p["omega"] ** 2 * math.sin(float(vibrating_table.bounce_phase(**p)))
+    trace = 1.0 + p["e"] ** 2 - (1.0 + p["e"]) ** 2 * fall / p["g"]
+    return 0.5 * trace - math.sqrt(0.25 * trace**2 - p["e"] ** 2)
+
+
+def _spring(t: Array, q: Array, qd: Array, p: PyTree) -> Array:
+    del t, p
+    return 0.5 * jnp.square(qd[0]) - 0.5 * jnp.square(q[0])
+
+
+def _swing(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del q, qd
+    return jnp.reshape(jnp.cos(p["W"] * t), (1,))
+
+
+def _swing_period(p: dict[str, Array]) -> Array:
+    return 2.0 * math.pi / p["W"]
+
+
+def _forced(W: float, Fc: float, Fs: float, c: float) -> Scene:
+    """Mass and stiffness one under the force cos(W t), with dry friction and a damper."""
+    effects = (AppliedForce(_swing), Friction(Coulomb(Fc, Fs)), Friction(Viscous(c), name="damper"))
+    return Scene(_spring, params={"W": W}, effects=effects)
+
+
+def _by_forced_orbit(scene: Scene) -> float:
+    return float(periodic_orbit(scene, ([0.0], [0.0]), period=_swing_period).q[0])
+
+
+def _by_settling(scene: Scene, periods: int) -> float:
+    t1 = periods * _swing_period(scene.params)
+    return float(simulate(scene, [0.0], [0.0], t1, rtol=1e-11, atol=1e-13, max_steps=400_000, max_events=4096).q[-1, 0])
+
+
+def _orbit(scene: Scene, settle: float) -> PeriodicOrbit:
+    rest = [0.0] * len(scene.effects)
+    return periodic_orbit(scene, (rest, rest), settle=settle)
+
+
+def _period(scene: Scene, settle: float) -> float:
+    return float(_orbit(scene, settle).period)
+
+
+def _period_by_settling(scene: Scene, settle: float) -> float:
+    """Time between the last two passages of the first mass through the middle of its way, in a long run."""
+    ts = np.linspace(settle - 3.0, settle, 6001)
+    rest = [0.0] * len(scene.effects)
+    run = simulate(scene, rest, rest, settle, ts=ts, rtol=1e-11, atol=1e-13, max_steps=400_000, max_events=4096)
+    x, v = np.asarray(run.q[:, 0]), np.asarray(run.qd[:, 0])
+    level = 0.5 * (x.min() + x.max())
+    up = np.flatnonzero((x[:-1] < level) & (x[1:] >= level))
+    # On the cubic of both ends.
+    h, passages = ts[1] - ts[0], []
+    for i in up[-2:]:
+        a, b = x[i + 1] - x[i], h * v[i]
+        cubic = [b + h * v[i + 1] - 2.0 * a, 3.0 * a - 2.0 * b - h * v[i + 1], b, x[i] - level]
+        roots = np.roots(cubic)
+        passages.append(ts[i] + h * min((r.real for r in roots if abs(r.imag) < 1e-9), key=lambda s: abs(s - 0.5)))
+    return float(passages[1] - passages[0])
+
+
+def _single() -> object:
+    single = jtu.tree_map(lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, belt_oscillator.scene())
+    return periodic_orbit(single, ([0.0], [0.0]), settle=20.0)
+
+
+def cases() -> list[HardCase]:
+    """The cases of this family."""
+    bristles = belt_oscillator.scene(LuGre(sigma0=1e5, sigma1=300.0, sigma2=0.4, Fc=5.0, Fs=8.0, vs=0.1))
+    belts = coupled_belts.scene()
+    sticky, grazing = _forced(0.05, 0.03, 0.06, 0.0), _forced(0.6168, 0.5, 0.5, 0.1)
+    return [
+        HardCase(
+            "orbit_unstable",
+            "A ball bounces once a period, though any disturbance doubles from bounce to bounce.",
+            "A simulation leaves the orbit, however long it runs.",
+            MeasuredNumber(_unstable_multiplier),
+            lambda _: _exact_multiplier(),
+            asks="largest multiplier",
+            tolerance=1e-8,
+        ),
+        HardCase(
+            "orbit_bristles",
+            "Stick-slip of a belt with bristles of 1e5 N/m: multipliers of 1 and next to nothing.",
+            "Shooting in the bristles' own small unit, or steps of microseconds.",
+            MeasuredNumber(partial(_period, bristles, 20.0)),
+            lambda _: _period_by_settling(bristles, 40.0),
+            asks="period [s]",
+            tolerance=1e-8,
+        ),
+        HardCase(
+            "orbit_two_belts",
+            "Two coupled masses on a belt stick and slip in turns.",
+            "The sequence of modes changes under the iteration.",
+            MeasuredNumber(partial(_period, belts, 60.0)),
+            lambda _: _period_by_settling(belts, 120.0),
+            asks="period [s]",
+            tolerance=1e-8,
+        ),
+        HardCase(
+            "orbit_many_sticks",
+            "Slow forcing: sixteen phases of stick in a period.",
+            "Each takes a direction away; differences of the return map see nothing.",
+            MeasuredNumber(partial(_by_forced_orbit, sticky)),
+            lambda _: _by_settling(sticky, 40),
+            asks="position at the start [m]",
+            tolerance=1e-8,
+        ),
+        HardCase(
+            "orbit_nearly_grazing",
+            "A forced mass that has just ceased to stick at its turning points.",
+            "The derivative of the return map jumps next to the orbit.",
+            MeasuredNumber(partial(_by_forced_orbit, grazing)),
+            lambda _: _by_settling(grazing, 60),
+            asks="position at the start [m]",
+            tolerance=1e-8,
+        ),
+        HardCase(
+            "orbit_in_single_precision",
+            "Shooting in float32.",
+            "A residual that never falls, or an orbit that is none.",
+            RefusedCalls({"float32": _single}, {"float32": "need float64"}),
+        ),
+    ]

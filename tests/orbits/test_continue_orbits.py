@@ -1,0 +1,135 @@
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmodsim as jms
+from jaxmodsim.orbits import OrbitError
+from jaxmodsim.problems import vibrating_table
+
+
+def spring(_t, q, qd, p):
+    return 0.5 * qd[0] ** 2 - 0.5 * q[0] ** 2 - 0.25 * p["a"] * q[0] ** 4
+
+
+def swing(t, _q, _qd, p):
+    return jnp.array([jnp.cos(p["W"] * t)])
+
+
+def of_frequency(p):
+    return 2.0 * jnp.pi / p["W"]
+
+
+def duffing(W):
+    effects = (jms.AppliedForce(swing), jms.Friction(jms.Viscous(0.1)))
+    return jms.Scene(spring, params={"a": 0.05, "W": W}, effects=effects)
+
+
+def table_period(p):
+    return 2.0 * jnp.pi / p["omega"]
+
+
+BALL = {**vibrating_table.PARAMS, "A": 0.9e-3}
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """One bounce a period, in closed form but for the last digits."""
+    T = 2 * np.pi / BALL["omega"]
+    phase = float(vibrating_table.bounce_phase(**{k: BALL[k] for k in ("g", "A", "omega", "e")}))
+    since = T - phase / BALL["omega"]
+    q0, qd0 = BALL["A"] * np.sin(phase) + BALL["g"] * since * (T - since) / 2, BALL["g"] * (T / 2 - since)
+    return jms.periodic_orbit(vibrating_table.scene(**BALL), ([q0], [qd0]), period=table_period, settle=0.0)
+
+
+def ball_branch(ball, guess, to, **options):
+    return jms.continue_orbits(
+        vibrating_table.scene(**BALL), guess or ball, "A", (BALL["A"], to), period=table_period, **options
+    )
+
+
+def test_period_doubling_of_the_ball_is_that_of_its_closed_form(ball):
+    branch = ball_branch(ball, None, 0.95e-3, step=0.1)
+    (point,) = branch.points
+    g, omega, e = BALL["g"], BALL["omega"], BALL["e"]
+    table = np.pi * g * (1 - e) / ((1 + e) * omega)
+    exact = np.hypot(2 * (1 + e**2) * g / (1 + e) ** 2 / omega**2, table / omega)
+    assert point.kind == "period doubling"
+    np.testing.assert_allclose(point.value, exact, rtol=1e-8)
+    assert list(branch.stable) == [x < exact for x in branch.values]
+    # Two bounces in two periods branch off there, and are stable.
+    doubled = ball_branch(ball, point, 0.95e-3, step=0.1)
+    orbit = doubled.orbits[-1]
+    np.testing.assert_allclose(orbit.period, 2 * ball.period)
+    assert orbit.sequence == (("table", "open", "open"),) * 2
+    assert orbit.stable
+    with pytest.raises(ValueError, match="starts at a period doubling"):
+        ball_branch(ball, ball_branch(ball, None, 0.5e-3, step=0.1).points[0], 1e-3)
+
+
+def test_fold_of_the_ball_is_that_of_its_closed_form(ball):
+    # Where the table moves just fast enough: the bounce passes through the start of the period there.
+    branch = ball_branch(ball, None, 0.5e-3, step=0.1)
+    (point,) = branch.points
+    g, omega, e = BALL["g"], BALL["omega"], BALL["e"]
+    assert point.kind == "fold"
+    np.testing.assert_allclose(point.value, np.pi * g * (1 - e) / ((1 + e) * omega**2), rtol=1e-8)
+    assert "end of the span" in branch.ending
+    assert not branch.stable[-1]
+
+
+def test_branch_of_a_forced_oscillator_with_dry_friction_and_its_loss_of_stick():
+    effects = (jms.AppliedForce(swing), jms.Friction(jms.Coulomb(0.5)), jms.Friction(jms.Viscous(0.1)))
+    scene = jms.Scene(spring, params={"a": 0.0, "W": 0.55}, effects=effects)
+    branch = jms.continue_orbits(scene, ([0.0], [0.0]), "W", (0.55, 0.7), period=of_frequency, step=0.25)
+    (point,) = branch.points
+    assert point.kind == "loss of stick"
+    assert point.orbit.stick["friction"] < 1e-4
+    for value, orbit in zip(branch.values, branch.orbits, strict=True):
+        assert (orbit.stick["friction"] > 0) == (value < point.value)
+        np.testing.assert_allclose(orbit.period, 2 * np.pi / value)
+        assert orbit.residual < 1e-9
+    assert branch.stable.all()
+    assert "loss of stick" in str(branch)
+
+
+def test_folds_of_duffing_and_a_branch_that_goes_on_from_its_store(tmp_path):
+    def follow(**options):
+        return jms.continue_orbits(
+            duffing(0.8), ([0.0], [0.0]), "W", (0.8, 2.2), period=of_frequency, step=0.1, **options
+        )
+
+    whole = follow()
+    assert [each.kind for each in whole.points] == ["fold", "fold"]
+    between = slice(whole.points[0].index + 1, whole.points[1].index + 1)
+    assert not whole.stable[between].any()
+    assert whole.stable[: between.start].all()
+    for point in whole.points:
+        np.testing.assert_allclose(np.min(np.abs(point.orbit.multipliers - 1.0)), 0.0, atol=1e-5)
+    seen = []
+    follow(out=tmp_path / "duffing", max_orbits=len(whole.values) // 2, progress=lambda count, _: seen.append(count))
+    rest = []
+    again = follow(out=tmp_path / "duffing", progress=lambda count, _: rest.append(count))
+    assert rest[0] == seen[-1] + 1
+    np.testing.assert_allclose([x.value for x in again.points], [x.value for x in whole.points], rtol=1e-7)
+    with pytest.raises(ValueError, match="holds another branch; what differs: span"):
+        jms.continue_orbits(
+            duffing(0.8), ([0.0], [0.0]), "W", (0.8, 2.0), period=of_frequency, out=tmp_path / "duffing"
+        )
+    (tmp_path / "other").mkdir()
+    with pytest.raises(ValueError, match="is no store of a branch"):
+        follow(out=tmp_path / "other")
+
+
+def test_garbage_is_refused(ball):
+    scene = duffing(0.8)
+    start = ([0.0], [0.0])
+    with pytest.raises(ValueError, match="Did you mean 'friction"):
+        jms.continue_orbits(scene, start, "friction.Fc", (0.1, 0.2), period=of_frequency)
+    with pytest.raises(ValueError, match=r"span must be \(first, last\)"):
+        jms.continue_orbits(scene, start, "W", (0.1, 0.2, 0.3), period=of_frequency)
+    with pytest.raises(ValueError, match="two different values"):
+        jms.continue_orbits(scene, start, "W", (0.1, 0.1), period=of_frequency)
+    with pytest.raises(ValueError, match="step must be one finite number > 0"):
+        jms.continue_orbits(scene, start, "W", (0.1, 0.2), period=of_frequency, step=0.0)
+    with pytest.raises(OrbitError):
+        ball_branch(ball, ([-1.0], [0.0]), 1e-3)

@@ -1,0 +1,131 @@
+"""Impacts with friction: against closed forms, in velocities and energy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmodsim as jms
+from jaxmodsim.scene._impact import _impulses, _Struck
+
+J = 0.4
+
+
+def _disc(law, mu):
+    """A disc of mass and radius one over a floor, without gravity: place, height, angle."""
+    return jms.Scene(
+        lambda t, q, qd, p: 0.5 * (qd[0] ** 2 + qd[1] ** 2 + J * qd[2] ** 2),
+        effects=(jms.Friction(jms.Coulomb(mu), along=lambda q: q[0] + q[2], normal_force="floor"),),
+        constraints=(jms.Contact(lambda t, q, p: q[1], restitution=law, name="floor"),),
+    )
+
+
+@pytest.mark.parametrize("law", [0.8, jms.Poisson(0.8)])
+def test_an_oblique_impact_of_a_disc(law):
+    """It slides all through, in either direction, or sticks: the impulse then takes all of the slip."""
+    scene, speed = _disc(law, 0.1), 2.0
+
+    def after(mu, vx, spin):
+        other = jms.scene.replace_numbers(scene, {"friction.Fc": mu, "friction.Fs": mu})
+        return jms.simulate(other, [0.0, 1.0, 0.0], jnp.stack([vx, -speed, spin]), 1.0, rtol=1e-10, atol=1e-12)
+
+    for mu, vx, spin in ((0.1, 1.0, 0.3), (0.1, 1.0, -3.0), (1.0, 1.0, 0.3), (0.6, -2.0, 0.5)):
+        run = after(mu, jnp.asarray(vx), jnp.asarray(spin))
+        slip, most = vx + spin, mu * 1.8 * speed
+        push = np.clip(slip / (1 + 1 / J), -most, most)
+        np.testing.assert_allclose(run.qd[-1], [vx - push, 0.8 * speed, spin - push / J], rtol=1e-11)
+        lost = 0.5 * (1 - 0.64) * speed**2 + push * slip - 0.5 * (1 + 1 / J) * push**2
+        np.testing.assert_allclose(run.event_losses[-1], lost, rtol=1e-10)
+    slope = jax.grad(lambda mu: after(mu, jnp.asarray(1.0), jnp.asarray(0.3)).qd[-1, 2])(jnp.asarray(0.1))
+    np.testing.assert_allclose(slope, -1.8 * speed / J, rtol=1e-9)
+
+
+def test_a_block_lands_with_friction_slides_and_stops():
+    mu, g, height, start = 0.3, 9.81, 0.5, 2.0
+    block = jms.Scene(
+        lambda t, q, qd, p: 0.5 * jnp.sum(qd**2) - g * q[1],
+        effects=(jms.Friction(jms.Coulomb(mu), along=lambda q: q[0], normal_force="floor"),),
+        constraints=(jms.Contact(lambda t, q, p: q[1], name="floor"),),
+    )
+    run = jms.simulate(block, [0.0, height], [start, 0.0], 1.5, ts=jnp.linspace(0.0, 1.5, 7), rtol=1e-10, atol=1e-12)
+    landing = np.sqrt(2 * height / g)
+    left = start - mu * g * landing
+    lands, stops = run.mode_changes
+    np.testing.assert_allclose([lands.t, stops.t], [landing, landing + left / (mu * g)], rtol=1e-10)
+    np.testing.assert_allclose(run.q[-1], [start * landing + left**2 / (2 * mu * g), 0.0], rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-11)
+
+
+def test_a_slow_block_stops_where_it_lands():
+    mu = 0.3
+    block = jms.Scene(
+        lambda t, q, qd, p: 0.5 * jnp.sum(qd**2) - 9.81 * q[1] - 0.5 * q[0],
+        effects=(jms.Friction(jms.Coulomb(mu), along=lambda q: q[0], normal_force="floor"),),
+        constraints=(jms.Contact(lambda t, q, p: q[1], name="floor"),),
+    )
+    run = jms.simulate(block, [0.0, 0.5], [0.5, 0.0], 1.0, rtol=1e-10, atol=1e-12)
+    assert {change.after for change in run.mode_changes} == {"stick", "closed"}
+    landing = np.sqrt(1 / 9.81)
+    np.testing.assert_allclose(run.q[-1, 0], 0.5 * landing - 0.25 * landing**2, rtol=1e-9)
+
+
+def _double_pendulum(law):
+    """Two thin rods, whose tip strikes a rough floor."""
+
+    def lagrangian(t, q, qd, p):
+        del t, p
+        kinetic = 4 / 3 * qd[0] ** 2 + 1 / 3 * qd[1] ** 2 + jnp.cos(q[1] - q[0]) * qd[0] * qd[1]
+        return 0.5 * kinetic + 9.81 * (1.5 * jnp.cos(q[0]) + 0.5 * jnp.cos(q[1]))
+
+    def tip(q):
+        return jnp.sin(q[0]) + jnp.sin(q[1])
+
+    floor = np.cos(np.pi / 9) + np.cos(np.pi / 6)
+    gap = lambda t, q, p: floor - jnp.cos(q[0]) - jnp.cos(q[1])  # noqa: E731
+    return jms.Scene(
+        lagrangian,
+        effects=(jms.Friction(jms.Coulomb(0.5), along=tip, normal_force="floor"),),
+        constraints=(jms.Contact(gap, restitution=law, name="floor"),),
+    )
+
+
+@pytest.mark.parametrize(("law", "gains"), [(0.5, True), (jms.Poisson(0.5), False)])
+def test_where_newtons_law_gains_energy_poissons_does_not(law, gains):
+    """The double pendulum of Kane and Levinson, Dynamics: Theory and Applications, 1985."""
+    run = jms.simulate(_double_pendulum(law), [np.pi / 9, np.pi / 6], [-0.1, -0.2], 1e-3)
+    assert run.mode_changes[0].effect == "floor"
+    assert (run.event_losses[-1] < 0) == gains
+
+
+def _random_impacts(count, n, m, dof):
+    rng = np.random.default_rng(n + m)
+    rows = rng.normal(size=(count, n + m, dof))
+    v = np.einsum("bij,bj->bi", rows, rng.normal(size=(count, dof)))
+    v[:, :n] = -np.abs(v[:, :n])
+    return np.einsum("bij,bkj->bik", rows, rows), v, rng.uniform(0, 1, (count, m)), rng.uniform(0, 1, (count, n))
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (2, 2)])
+def test_impacts_obey_their_laws_and_poissons_gains_no_energy(n, m):
+    """Random mechanisms, struck at all contacts at once, each with its own coefficients."""
+
+    def poisson(matrix, v, mu, e):
+        struck = _Struck(matrix, jnp.ones(n, bool), jnp.eye(m, n), mu, mu)
+        squeeze = _impulses(struck, v, jnp.zeros(n))
+        halfway = v + matrix @ squeeze
+        return squeeze, halfway, _impulses(struck, halfway, e * squeeze[:n])
+
+    matrix, v, mu, e = _random_impacts(200, n, m, 6)
+    squeeze, halfway, expand = jax.jit(jax.vmap(poisson))(matrix, v, mu, e)
+    after = halfway + np.einsum("bij,bj->bi", matrix, expand)
+    for end, p, least in ((halfway, squeeze, 0.0), (after, expand, e * squeeze[:, :n])):
+        normal, friction = p[:, :n] - least, p[:, n:]
+        assert (normal > -1e-10).all()
+        assert (end[:, :n] > -1e-10).all()
+        np.testing.assert_allclose(normal * end[:, :n], 0.0, atol=1e-9)
+        assert (np.abs(friction) <= mu * p[:, :m] + 1e-10).all()
+        # Where it slips, friction is at its limit, against the slip.
+        slides = np.abs(end[:, n:]) > 1e-9
+        np.testing.assert_allclose((friction + np.sign(end[:, n:]) * mu * p[:, :m])[slides], 0.0, atol=1e-9)
+    gain = 0.5 * np.sum((squeeze + expand) * (v + after), axis=1)
+    assert (gain < 1e-12).all()
