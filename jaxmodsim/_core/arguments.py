@@ -17,9 +17,9 @@ def check_real(value: object, *, name: str) -> None:
 
     - `ValueError` naming `name` and what was given.
     """
-    kind = getattr(value, "dtype", None)
-    if type(value) is np.ndarray and kind.kind in "fiu":
+    if type(value) is np.ndarray and value.dtype.kind in "fiu":
         return  # what is usual is told apart soonest
+    kind = getattr(value, "dtype", None)
     if kind is None:
         try:
             kind = np.asarray(value).dtype

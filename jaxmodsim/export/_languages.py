@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ._program import Assign, Block, Entry, Loop, Program, Switch, Symbol
+from ._program import Assign, Block, Choice, Entry, Loop, Program, Symbol
 
 # Written alike in both languages; operands are names or literals.
 _FORMS = {
@@ -163,7 +163,7 @@ class _BlockText:
     def block(self, block: Block, indent: str) -> list[str]:
         return [indent + line for statement in block for line in self.statement(statement)]
 
-    def statement(self, statement: Assign | Loop | Switch) -> Iterator[str]:
+    def statement(self, statement: Assign | Loop | Choice) -> Iterator[str]:
         if isinstance(statement, Assign):
             value = self.language.expression(statement, [self.value(x) for x in statement.operands])
             out = statement.out
@@ -171,7 +171,7 @@ class _BlockText:
         elif isinstance(statement, Loop):
             yield from self.loop(statement)
         else:
-            yield from self.branch(statement)
+            yield from self.choice(statement)
 
     def loop(self, loop: Loop) -> Iterator[str]:
         word, counter = self.language.variable, f"k{next(self.numbers)}"
@@ -197,14 +197,14 @@ class _BlockText:
             yield f"  {name} = {value};"
         yield "}"
 
-    def branch(self, branch: Switch) -> Iterator[str]:
-        for out in branch.outs:
+    def choice(self, choice: Choice) -> Iterator[str]:
+        for out in choice.outs:
             yield f"{self.language.declared(self.language.variable, out.dtype, self.new(out))};"
-        index, last = self.value(branch.chosen), len(branch.arms) - 1
-        for i, (block, results) in enumerate(branch.arms):
+        index, last = self.value(choice.chosen), len(choice.arms) - 1
+        for i, (block, results) in enumerate(choice.arms):
             test = "" if i == last else f"if ({index} == {i}) "
             yield f"{'} else ' if i else ''}{test}{{"
             yield from self.block(block, "  ")
-            for out, x in zip(branch.outs, results, strict=True):
+            for out, x in zip(choice.outs, results, strict=True):
                 yield f"  {self.names[out]} = {self.value(x)};"
         yield "}"

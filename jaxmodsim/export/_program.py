@@ -58,7 +58,7 @@ class Loop(NamedTuple):
     body: "Block"
 
 
-class Switch(NamedTuple):
+class Choice(NamedTuple):
     """The arm with the number `chosen`, or else the last one; each a block with the values that it gives to `outs`."""
 
     chosen: Entry
@@ -66,7 +66,7 @@ class Switch(NamedTuple):
     arms: list[tuple["Block", list[Entry]]]
 
 
-Statement: TypeAlias = Assign | Loop | Switch
+Statement: TypeAlias = Assign | Loop | Choice
 Block: TypeAlias = list[Statement]
 
 
@@ -294,7 +294,7 @@ class _StatementWriter(AbstractScalars):
                 outputs = self.run(each.jaxpr, each.consts, inputs[1:])
                 arms.append((block, [x for out in outputs for x in self.parts(out).flat]))
         outs = [_symbols(np.empty(x.aval.shape), x.aval.dtype) for x in branches[0].jaxpr.outvars]
-        self.block.append(Switch(index, [x for out in outs for x in out.flat], arms))
+        self.block.append(Choice(index, [x for out in outs for x in out.flat], arms))
         return list(outs)
 
 
@@ -323,7 +323,7 @@ def _needed(block: Block, live: set[Symbol]) -> Block:
             if statement.out in live:
                 kept.append(statement)
                 _add(live, statement.operands)
-        elif isinstance(statement, Switch):
+        elif isinstance(statement, Choice):
             wanted = [out in live for out in statement.outs]
             if any(wanted):
                 _add(live, [statement.chosen])
@@ -333,7 +333,7 @@ def _needed(block: Block, live: set[Symbol]) -> Block:
                     _add(live, results)
                     arms.append((_needed(inside, live), results))
                 outs = [x for x, each in zip(statement.outs, wanted, strict=True) if each]
-                kept.append(Switch(statement.chosen, outs, arms))
+                kept.append(Choice(statement.chosen, outs, arms))
         elif any(carry.symbol in live for carry in statement.carries):
             kept.append(_needed_loop(statement, live))
     return kept[::-1]

@@ -59,8 +59,7 @@ def changes_of(run: Trajectory, name: str) -> tuple[Events, Array]:
 
 def modes_at_ends(run: Trajectory, name: str, events: Events, own: Array) -> tuple[Array, Array]:
     """Mode of an element at t0 and at the end of a run: 0 in stick, else the sign of its slip velocity."""
-    assert run.modes is not None
-    kept = run.modes[-1, list(run.scene.event_driven).index(name)].astype(int)
+    kept = run.mode[name][-1].astype(int)
     first, last = jnp.argmax(own), own.shape[0] - 1 - jnp.argmax(own[::-1])
     changed = jnp.any(own)
     return jnp.where(changed, events.before[first], kept), jnp.where(changed, events.after[last], kept)

@@ -24,6 +24,7 @@ from . import spherical_pendulum as spherical_pendulum
 from . import spiral_bead as spiral_bead
 from . import stick_slip_pendulum as stick_slip_pendulum
 from . import two_balls as two_balls
+from . import turntable_puck as turntable_puck
 from . import vibrating_table as vibrating_table
 from . import worm_drive as worm_drive
 from ._named import NamedProblem as NamedProblem

@@ -24,6 +24,7 @@ from . import (
     slipping_bristle,
     spherical_pendulum,
     stick_slip_pendulum,
+    turntable_puck,
 )
 
 
@@ -66,9 +67,10 @@ def named_problems() -> dict[str, Callable[[], NamedProblem]]:
     ```
 
     Set-valued friction with a closed form: `coulomb_box`, `braked_spring`, `belt_oscillator`, `stick_slip_pendulum`;
-    without: `stribeck_belt`, `coupled_belts`, `cart_pole`. Bristles: `lugre_box`, `pulled_box` (stiff),
-    `slipping_bristle` (closed form). Smooth: `spherical_pendulum` and `charged_particle` (closed forms),
-    `double_pendulum`. With constraints: `cartesian_spherical_pendulum` and `knife_edge` (closed forms), `four_bar`.
+    without: `stribeck_belt`, `coupled_belts`, `cart_pole`, `turntable_puck` (in the plane). Bristles: `lugre_box`,
+    `pulled_box` (stiff), `slipping_bristle` (closed form). Smooth: `spherical_pendulum` and `charged_particle` (closed
+    forms), `double_pendulum`. With constraints: `cartesian_spherical_pendulum` and `knife_edge` (closed forms),
+    `four_bar`.
     """
     return dict(_CASES)
 
@@ -147,6 +149,13 @@ def _cart_pole() -> NamedProblem:
     return _case("cart_pole", cart_pole.scene(Coulomb(Fc=0.3, Fs=0.4)), [0.0, 2.0], [0.0, 0.0], 3.0, "q[1]")
 
 
+def _turntable_puck() -> NamedProblem:
+    law = Coulomb(turntable_puck.PARAMS["mu"], 1.3 * turntable_puck.PARAMS["mu"])
+    return _case(
+        "turntable_puck", turntable_puck.scene(law), [turntable_puck.PARAMS["r0"], 0.0], [0.0, 0.0], 4.0, "q[1]"
+    )
+
+
 def _spherical_pendulum() -> NamedProblem:
     phi, turn, t1 = 1.8, 2.0, 5.0
     exact = float(spherical_pendulum.motion(t1, phi, turn))
@@ -196,6 +205,7 @@ _CASES: dict[str, Callable[[], NamedProblem]] = {
     "coupled_belts": _coupled_belts,
     "stick_slip_pendulum": _stick_slip_pendulum,
     "cart_pole": _cart_pole,
+    "turntable_puck": _turntable_puck,
     "spherical_pendulum": _spherical_pendulum,
     "cartesian_spherical_pendulum": _cartesian_spherical_pendulum,
     "double_pendulum": _double_pendulum,

@@ -1,13 +1,14 @@
 """Scenes: what is in them, and the vector field that follows."""
 
 from . import _readable as _readable  # what they print
+from ._check_scene import check_scene as check_scene
 from ._coordinates import Quantity as Quantity
 from ._dynamics import ConstraintReaction as ConstraintReaction
 from ._dynamics import State as State
-from ._dynamics import check_scene as check_scene
 from ._dynamics import forward_dynamics as forward_dynamics
 from ._dynamics import from_dynamics as from_dynamics
 from ._dynamics import vector_field as vector_field
+from ._event_driven import mode_numbers as mode_numbers
 from ._implicit import check_step as check_step
 from ._implicit import scene_step as scene_step
 from ._linear_solver import has_linear_solver as has_linear_solver

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._core.cholesky import factor_positive_definite
-from .._core.functions import depends_on, real_array
-from .._core.index_check import traced
+from .._core.functions import depends_on
 from .._core.scalarise import in_scalars
 from .._core.shapes import PerDof, Scalar
 from ..mechanics import (
@@ -23,10 +22,12 @@ from ._event_driven import (
     FrictionElements,
     FrictionForces,
     Loads,
-    contact,
-    contact_guards,
+    assemble_friction,
+    friction_guards,
     next_modes,
+    renew_slip,
     solve_friction_forces,
+    speed_of_rest,
     stick_violation,
     stop_slip,
 )
@@ -48,8 +49,8 @@ Modes: TypeAlias = Any
 class State(NamedTuple):
     """State of a scene: coordinates and velocities, shape `[dof]`, and the effects' own states by name.
 
-    The modes of set-valued friction elements come beside it, an array of -1, 0, +1 in the order of
-    `Scene.event_driven`, or None where there are none.
+    The modes of set-valued friction elements and of contacts come beside it, an array in the order of
+    `Scene.mode_names`, or None where there are none.
     """
 
     q: PerDof
@@ -78,7 +79,7 @@ class Dynamics(NamedTuple):
     - `scene`: with its signals and laws as they are at this state.
     - `actions`: of every effect, by name.
     - `qdd`: accelerations.
-    - `contact`, `friction`: the friction elements that depend on accelerations, and their forces, or None.
+    - `elements`, `friction`: the friction elements that depend on accelerations, and their forces, or None.
     - `constraints`, `multipliers`: of all constraints, or None.
     - `uniqueness`: what is left of the uniqueness of loads that are reactions, see `FrictionForces.margin`; the
       equations hold where it is positive. None without such loads.
@@ -90,7 +91,7 @@ class Dynamics(NamedTuple):
     scene: Scene
     actions: dict[str, Action]
     qdd: PerDof
-    contact: FrictionElements | None
+    elements: FrictionElements | None
     friction: FrictionForces | None
     constraints: LinearizedConstraints | None
     multipliers: Float[Array, " m"] | None
@@ -167,7 +168,7 @@ class Dynamics(NamedTuple):
     def guards(
         self, rest: Scalar, tolerances: tuple[Array, Array]
     ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
-        """Guards that are positive while the modes hold, and their tolerances; see `contact_guards`.
+        """Guards that are positive while the modes hold, and their tolerances; see `friction_guards`.
 
         Of a contact that is open the gap, of one that is closed its multiplier. A gap counts as closed only at `-rest`:
         behind an impact, and where a contact opens, it begins from zero.
@@ -176,7 +177,8 @@ class Dynamics(NamedTuple):
         guards, atol = [], []
         if friction.size:
             assert self.friction is not None
-            of_friction = contact_guards(self.contacts, self.friction, friction, rest, tolerances)
+            slowest = self._speed_of_rest(rest)
+            of_friction = friction_guards(self.friction_elements, self.friction, friction, slowest, tolerances)
             guards, atol = [of_friction[0]], [of_friction[1]]
         if gaps.size:
             assert self.multipliers is not None
@@ -211,13 +213,19 @@ class Dynamics(NamedTuple):
 
     def _start_friction(self, rest: Scalar) -> tuple[State, Float[Array, " n"]]:
         """State, and modes of the friction elements, to begin with."""
-        t, y, scene, contacts = self.t, self.y, self.scene, self.contacts
-        elements = [*scene.event_driven.values()]
-        speed = [jnp.sum(jnp.abs(e.direction(y.q, scene.params) * y.qd)) + jnp.abs(e.belt(t)) for e in elements]
+        t, y, scene, elements = self.t, self.y, self.scene, self.friction_elements
+        speed = []
+        for each in scene.event_driven.values():
+            row = each.direction(y.q, scene.params)
+            size = jnp.sum(jnp.abs(row * jnp.broadcast_to(y.qd, row.shape))) + jnp.sum(jnp.abs(each.belt(t)))
+            speed += [size] if row.ndim == 1 else [size] * row.shape[0]
         rounding = 8.0 * float(jnp.finfo(y.q.dtype).eps) * jax.lax.stop_gradient(jnp.stack(speed))
-        v = contacts.v[: len(elements)]
-        still = jnp.abs(v) <= jnp.maximum(rounding, rest)
-        mode = next_modes(contacts, jnp.sign(v), still, jnp.zeros_like(still))
+        v = elements.v[: len(speed)]
+        still = elements.magnitude(v) <= jnp.maximum(rounding, rest)
+        rest = self._speed_of_rest(rest)
+        mode = next_modes(
+            elements, elements.slipping(jax.lax.stop_gradient(v), rest), still, jnp.zeros_like(still), rest
+        )
         return self._stick(mode), mode
 
     def switch(
@@ -226,39 +234,60 @@ class Dynamics(NamedTuple):
         """State and modes after the guards that `fired`; `elastic` is False where impacts have accumulated."""
         n, mode = self._elements.size, self._elements
         if not self._closed.size:
-            return self._switch_friction(fired, mode)
+            return self._switch_friction(fired, mode, rest)
         qd, closed, stopped = impact(self.t, self.y.q, self.y.qd, self.scene, self._closed, fired[n:], rest, elastic)
         struck = self.y._replace(qd=qd)
         if not n:
             return struck, closed
         after = forward_dynamics(self.t, struck, self.scene, jnp.concatenate([mode, closed]))
         # An impact may turn a slip, and end a stick.
-        v = jax.lax.stop_gradient(after.contacts.v[:n])
-        turned = jnp.any(qd != self.y.qd) & (jnp.abs(v) > rest)
-        fired = (fired[:n] & ~turned) | (stopped & (mode != 0))
-        state, mode = after._switch_friction(fired, jnp.where(turned, jnp.sign(v), mode))
+        elements = after.friction_elements
+        v = jax.lax.stop_gradient(elements.v[:n])
+        turned = jnp.any(qd != self.y.qd) & (elements.magnitude(v) > rest)
+        fired = (fired[:n] & ~turned) | (elements.in_rows(stopped) & ~elements.sticks(mode))
+        mode = jnp.where(turned, elements.slipping(v, after._speed_of_rest(rest)), mode)
+        state, mode = after._switch_friction(fired, mode, rest)
         return state, jnp.concatenate([mode, closed])
 
-    def _switch_friction(self, fired: Bool[Array, " n"], mode: Float[Array, " n"]) -> tuple[State, Float[Array, " n"]]:
-        new = next_modes(self.contacts, mode, (mode == 0) | fired, fired & (mode == 0))
-        return self._stick(new), new
+    def _switch_friction(
+        self, fired: Bool[Array, " n"], mode: Float[Array, " n"], rest: Scalar
+    ) -> tuple[State, Float[Array, " n"]]:
+        elements, rest = self.friction_elements, self._speed_of_rest(rest)
+        mode, fired = renew_slip(elements, mode, fired, rest) if elements.planes else (mode, fired)
+        sticks = elements.sticks(mode)
+        new = next_modes(elements, mode, sticks | fired, fired & sticks, rest)
+        # What is left of a slip in the plane that stops goes, whatever follows: it says nothing of the next direction.
+        stops = elements.in_planes(elements.sticks(new), lambda part: fired[part] | elements.sticks(new)[part])
+        return self.y._replace(qd=stop_slip(elements, self.y.qd, stops)), new
+
+    def hold(self, fired: Bool[Array, " guards"]) -> tuple[State, Float[Array, " n"]]:
+        """State and modes where the friction elements that `fired` stick, whatever their limits."""
+        n, elements = self._elements.size, self.friction_elements
+        held = elements.in_planes(fired[:n], lambda part: jnp.any(fired[part]))
+        mode = jnp.concatenate([jnp.where(held, 0.0, self._elements), self._closed])
+        return self.stick(mode), mode
 
     def stick(self, mode: Modes) -> State:
         """State with the slip velocity of elements that stick in `mode`, which drifts, set to zero."""
         return self._stick(mode[: self._elements.size])
 
     def _stick(self, mode: Float[Array, " n"]) -> State:
-        return self.y._replace(qd=stop_slip(self.contacts, self.y.qd, mode == 0))
+        elements = self.friction_elements
+        return self.y._replace(qd=stop_slip(elements, self.y.qd, elements.sticks(mode)))
+
+    def _speed_of_rest(self, rest: Scalar) -> Scalar:
+        assert self.friction is not None
+        return speed_of_rest(self.friction_elements, self.friction, rest, self.t)
 
     @property
     def _elements(self) -> Float[Array, " n"]:
         """Modes of the friction elements."""
-        return self.mode[: len(self.scene.event_driven)]
+        return self.mode[: _rows_of_friction(self.scene, self.mode)]
 
     @property
     def _closed(self) -> Float[Array, " n"]:
         """Modes of the contacts."""
-        return self.mode[len(self.scene.event_driven) :]
+        return self.mode[_rows_of_friction(self.scene, self.mode) :]
 
     @property
     def stick_violation(self) -> Float[Array, " n"]:
@@ -266,13 +295,13 @@ class Dynamics(NamedTuple):
         if not self._elements.size:
             return self._elements
         assert self.friction is not None
-        return stick_violation(self.friction, self._elements)
+        return stick_violation(self.friction_elements, self.friction, self._elements)
 
     @property
-    def contacts(self) -> FrictionElements:
-        """`contact` of a scene that has it."""
-        assert self.contact is not None
-        return self.contact
+    def friction_elements(self) -> FrictionElements:
+        """`elements` of a scene that has them."""
+        assert self.elements is not None
+        return self.elements
 
 
 class Mobility(NamedTuple):
@@ -345,35 +374,53 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     units = {name: each.force_per_load(t, q, qd, y.z.get(name), params) for name, each in scene.reaction_loaded.items()}
     pushes = [-each.apply_force(q, units[name][0], params) for name, each in scene.reaction_loaded.items()]
 
-    def loads(rows: Array) -> Loads | None:
-        return _loads(scene, mobility, t, y, rows, multipliers)
+    def loads(rows: Array, widths: tuple[int, ...]) -> Loads | None:
+        return _loads(scene, mobility, t, y, rows, widths, multipliers)
 
     floor = mobility.least if linearized is not None else None
-    contacts = contact([*scene.event_driven.values()], pushes, mobility.respond, floor, loads, t, q, qd, params, qdd)
-    modes = jnp.zeros(0, q.dtype) if mode is None else mode[: len(scene.event_driven)]
-    settled = solve_friction_forces(contacts, modes)
-    for i, (name, effect) in enumerate(scene.event_driven.items()):
-        actions[name] = Action(effect.apply_force(q, settled.force[i], params), settled.force[i])
-    for i, name in enumerate(scene.reaction_loaded, start=len(scene.event_driven)):
+    friction = [*scene.event_driven.values()]
+    modes = jnp.zeros(0, q.dtype) if mode is None else mode[: _rows_of_friction(scene, mode)]
+    elements = assemble_friction(friction, pushes, mobility.respond, floor, loads, t, q, qd, params, qdd, modes)
+    settled = solve_friction_forces(elements, modes)
+    forces = [settled.force[part] for part in elements.parts]
+    for force, (name, effect) in zip(forces, scene.event_driven.items(), strict=False):
+        force = force if force.ndim == 0 else effect.stretch(force)
+        actions[name] = Action(effect.apply_force(q, force, params), force)
+    for force, push, name in zip(forces[len(friction) :], pushes, scene.reaction_loaded, strict=True):
         unit, rate = units[name]
-        actions[name] = Action(-settled.force[i] * pushes[i - len(scene.event_driven)], settled.force[i] * unit, rate)
-    qdd = qdd - jnp.sum(contacts.minv_jt * settled.force[:, None], axis=0)
+        actions[name] = Action(-force * push, force * unit, rate)
+    qdd = qdd - jnp.sum(elements.minv_jt * settled.force[:, None], axis=0)
     if (within := mobility.constraints) is not None and multipliers is not None:
         taken = sum(actions[name].generalised for name in (*scene.event_driven, *scene.reaction_loaded))
         multipliers = multipliers + within.multiplier_response(mobility.solve(jnp.asarray(taken)))
     uniqueness = settled.margin if scene.loaded else None
-    return Dynamics(t, y, mode, scene, actions, qdd, contacts, settled, linearized, multipliers, uniqueness)
+    return Dynamics(t, y, mode, scene, actions, qdd, elements, settled, linearized, multipliers, uniqueness)
+
+
+def _rows_of_friction(scene: Scene, mode: Float[Array, " modes"]) -> int:
+    """How many of the modes are those of friction elements; the others are of contacts."""
+    return mode.shape[0] - len(scene.contacts)
 
 
 def _loads(
-    scene: Scene, mobility: Mobility, t: Array, y: State, rows: Float[Array, "n dof"], multipliers: Any
+    scene: Scene,
+    mobility: Mobility,
+    t: Array,
+    y: State,
+    rows: Float[Array, "n dof"],
+    widths: tuple[int, ...],
+    multipliers: Any,
 ) -> Loads | None:
-    """Normal forces of the constraints that load friction, and what the elements with `rows` take off them."""
+    """Normal forces of the constraints that load friction, and what the elements take off them.
+
+    Of each element there are as many `rows` as `widths` says.
+    """
     names = scene.loaded
     if not names:
         return None
     assert mobility.constraints is not None
-    loaded = [each.load_constraint for each in (*scene.event_driven.values(), *scene.reaction_loaded.values())]
+    friction = (*scene.event_driven.values(), *scene.reaction_loaded.values())
+    loaded = [x.load_constraint for x, width in zip(friction, widths, strict=True) for _ in range(width)]
     where = by_constraint(scene, t, y, jnp.arange(multipliers.shape[0]))
     chosen = dict(zip(scene.constraint_names, scene.constraints, strict=True))
     at = jnp.concatenate([where[name] for name in names])
@@ -417,40 +464,3 @@ def from_dynamics(get: Callable[[Dynamics], _Value], t: Scalar, y: State, scene:
 def vector_field(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> State:
     """Right-hand side of `y' = field(t, y)`; NaN where the equations do not hold, see `Dynamics.uniqueness`."""
     return from_dynamics(lambda dynamics: dynamics.rate, t, y, scene, mode)
-
-
-def check_scene(scene: Scene, y: State) -> None:
-    """Check shapes of everything the scene's functions return, and the indices that they use.
-
-    **Raises:**
-
-    - `ValueError` naming the function, the shape it returned and the shape that is needed, or the index that is out of
-      range; see `traced` for those that are seen; or for names of more or fewer coordinates than there are.
-    """
-    t, named = y.q[0], len(scene.coordinates)
-    if named not in (0, y.q.shape[0]):
-        raise ValueError(
-            f"The scene names {named} coordinates ({', '.join(scene.coordinates)}), but q has {y.q.shape[0]}: give a"
-            " name for each, or none."
-        )
-    scene = scene.bind_time(t)
-
-    def energy(*state: Any) -> Array:
-        return real_array(scene.lagrangian(*state), name="the Lagrangian")
-
-    given = traced(energy, t=t, q=y.q, qd=y.qd, params=scene.params, name="the Lagrangian")
-    if given.shape != () or not jnp.issubdtype(given.dtype, jnp.floating):
-        raise ValueError(
-            f"The Lagrangian must return one number [J], shape (), that depends on the state, but it returned {given}."
-            f" With q and qd of shape {y.q.shape}, index the coordinates (qd[0]) or sum over them."
-        )
-    for name, effect in zip(scene.names, scene.effects, strict=True):
-        effect.check(y.q, y.qd, scene.params, name)
-    for name, constraint in zip(scene.constraint_names, scene.constraints, strict=True):
-        constraint.check(y.q, y.qd, scene.params, name)
-        size = jax.eval_shape(constraint.rate, t, y.q, y.qd, scene.params).shape[0]
-        if name in scene.loaded and size != 1:
-            raise ValueError(
-                f"Constraint {name!r} loads friction (normal_force={name!r}), so it must be one equation, but it has"
-                f" {size}. Give each direction a Constraint of its own."
-            )

@@ -5,19 +5,24 @@ slip accelerations are `a = base - A f`, `A_ij = D_i W D_j`, where W gives the a
 within the constraints, `base` is what they would be without these elements and f are their forces. In slip f follows
 from the law; in stick it is the multiplier that makes `a_i = 0`.
 
+An element whose slip is a vector has a row for each component. Its mode is zero in stick, and in slip a velocity: the
+slip at the last event, for it is renewed as slip turns, falls and grows; see `Friction.slip_force_in_plane`.
+
 A load that is the reaction of a constraint depends on f in turn: `n = n0 - fall f` for the normal forces n. Then slip
 forces are coefficients times n, and everything is solved together.
 """
 
 from collections.abc import Callable
-from itertools import product
+from itertools import accumulate, product
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._core.lu import factor_lu
+from .._core.safe import safe_norm
 from .._core.semidefinite import solve_semidefinite
 from .._core.shapes import PerDof, Scalar
 from .forces._friction import Friction
@@ -25,7 +30,26 @@ from .forces._friction import Friction
 # Rounding units in the load of a sticking element, of its limits.
 _LOAD_ROUNDING = 100.0
 
+# The velocity in the mode of slip in a plane is renewed where slip has fallen to, or grown to, so much of it ...
+_SHRUNK, _GROWN = 0.1, 1e4
+# ... but is at least so many speeds of none: the direction is rounded off below a part of it, which must not be below
+# what the error control resolves.
+_SLOWEST = 1e6
+# Speeds of slip in a plane that friction takes away in so many rounding units of time count as none.
+_INSTANT = 1e-3
+# Slip in a plane has ended where it goes back past its direction, and is not faster than so many speeds of none.
+_ENDED = 1e5
+
 _constant = jax.lax.stop_gradient
+
+
+def mode_numbers(modes: Float[Array, "*time modes"], widths: tuple[int, ...]) -> Float[Array, "*time things"]:
+    """Modes in one number each: of slip in a plane, whose mode has as many numbers as `widths` says, one."""
+    if all(width == 1 for width in widths):
+        return modes
+    stops = list(accumulate(widths))
+    parts = [modes[..., stop - width : stop] for stop, width in zip(stops, widths, strict=True)]
+    return jnp.stack([x[..., 0] if x.shape[-1] == 1 else jnp.any(x != 0, axis=-1) * 1.0 for x in parts], axis=-1)
 
 
 class Loads(NamedTuple):
@@ -43,16 +67,18 @@ class Loads(NamedTuple):
     pulls: Float[Array, " k"]
 
 
-class FrictionElements(NamedTuple):
-    """The friction elements at one state, n of them; those without a mode come last.
+class FrictionElements(eqx.Module):
+    """The friction elements at one state, of n rows in all; those without a mode come last.
 
     - `v`: slip velocities [m/s]; zero for elements without a mode.
-    - `base`: slip accelerations without these elements [m/s^2].
-    - `coupling`: A [1/kg].
-    - `reach`: rows `W D_i`, the accelerations that a unit force takes away.
-    - `forward`, `backward`: forces in slip towards either direction, at `v` [N, or per newton of load].
+    - `free_slip_acceleration`: slip accelerations without these elements [m/s^2].
+    - `delassus`: A [1/kg].
+    - `minv_jt`: rows `W D_i`, the accelerations that a unit force takes away.
+    - `forward`, `backward`: forces in slip towards either direction, at `v` [N, or per newton of load]. In rows of a
+      plane the magnitude with which slip begins, and the force in slip in the mode given.
     - `upper`, `lower`: limits of stick against a load towards either direction, >= 0 [N, or per newton of load].
     - `loads`: None where no load is a reaction.
+    - `planes`: first row, and row after the last, of each element whose slip is a vector.
     """
 
     v: Float[Array, " n"]
@@ -64,6 +90,63 @@ class FrictionElements(NamedTuple):
     upper: Float[Array, " n"]
     lower: Float[Array, " n"]
     loads: Loads | None
+    planes: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
+
+    def in_planes(self, rows: Array, of_plane: Callable[[slice], Array]) -> Array:
+        """`rows`, with those of each element in a plane replaced by what `of_plane` gives, a number or one a row."""
+        parts, at = [], 0
+        for start, stop in self.planes:
+            parts += [rows[at:start], jnp.broadcast_to(of_plane(slice(start, stop)), (stop - start,))]
+            at = stop
+        return jnp.concatenate([x for x in (*parts, rows[at:]) if x.shape[0]]) if parts else rows
+
+    @property
+    def parts(self) -> list[int | slice]:
+        """The row of each element; of one in a plane its rows."""
+        stops, parts, at = dict(self.planes), [], 0
+        while at < self.v.shape[0]:
+            stop = stops.get(at, at + 1)
+            parts.append(slice(at, stop) if at in stops else at)
+            at = stop
+        return parts
+
+    def in_rows(self, values: Bool[Array, " elements"]) -> Bool[Array, " modes"]:
+        """What there is one of for each element with a mode, in each of its rows."""
+        if not self.planes:
+            return values
+        parts = self.parts[: values.shape[0]]
+        return jnp.concatenate(
+            [jnp.broadcast_to(x, self.v[part].shape or (1,)) for x, part in zip(values, parts, strict=True)]
+        )
+
+    def magnitude(self, x: Float[Array, " rows"]) -> Float[Array, " rows"]:
+        """Of each element, in each of its rows."""
+        return self.in_planes(jnp.abs(x), lambda part: safe_norm(x[part]))
+
+    def sticks(self, mode: Float[Array, " modes"]) -> Bool[Array, " modes"]:
+        """Which rows are of elements that stick."""
+        return self.in_planes(mode == 0, lambda part: jnp.all(mode[part] == 0))
+
+    def slipping(self, v: Float[Array, " modes"], rest: Scalar) -> Float[Array, " modes"]:
+        """Modes of slip with the velocities `v`; `rest` is the speed [m/s] that counts as none."""
+        return self.in_planes(
+            jnp.sign(v), lambda part: jnp.maximum(_slowest(rest), safe_norm(v[part])) * _unit(v[part])
+        )
+
+    def beginning(self, load: Float[Array, " modes"], rest: Scalar) -> Float[Array, " modes"]:
+        """Modes of slip that begins under these loads."""
+        return self.in_planes(jnp.sign(load), lambda part: _slowest(rest) * _unit(load[part]))
+
+
+def _slowest(rest: Scalar) -> Scalar:
+    """The least speed [m/s] of a mode."""
+    return jnp.maximum(_SLOWEST * rest, float(jnp.finfo(rest.dtype).tiny) ** 0.5)
+
+
+def _unit(x: Float[Array, " components"]) -> Float[Array, " components"]:
+    """Direction of a vector; zero for zero."""
+    size = safe_norm(x)
+    return x / jnp.where(size > 0, size, 1.0)
 
 
 class FrictionForces(NamedTuple):
@@ -81,88 +164,107 @@ class FrictionForces(NamedTuple):
     margin: Scalar
 
 
-def contact(
-    elements: list[Friction],
+def assemble_friction(
+    friction: list[Friction],
     leaning: list[PerDof],
     respond: Callable[[Array], Array],
     floor: Callable[[Array], Array] | None,
-    loads: Callable[[Float[Array, "n dof"]], Loads | None],
+    loads: Callable[[Float[Array, "n dof"], tuple[int, ...]], Loads | None],
     t: Scalar,
     q: PerDof,
     qd: PerDof,
     params: object,
     qdd: PerDof,
+    mode: Float[Array, " modes"],
 ) -> FrictionElements:
     """What the elements see at one state, where the accelerations without them are `qdd`.
 
     **Arguments:**
 
-    - `elements`: those with a mode.
+    - `friction`: those with a mode.
+    - `mode`: of elements in a plane the forces in slip depend on it.
     - `leaning`: of those without one, loaded by a reaction, what they take from the generalised forces per newton.
     - `respond`: accelerations of a generalised force, within the constraints.
     - `floor`: of a direction the least mobility [1/kg] that rounding can tell from none; None where nothing cancels.
-    - `loads`: the `Loads` from the generalised forces that unit forces of all elements take away.
+    - `loads`: the `Loads` from the generalised forces that unit forces of all elements take away, and the number of
+      rows of each.
     """
-    rows = [*(element.direction(q, params) for element in elements), *leaning]
-    reach = [respond(row) for row in rows]
-    slip = [element.slip_and_rate(t, q, qd, qdd, params) for element in elements]
-    given = [element.load(t, q, qd, params) for element in elements]
+    slip = [element.slip_and_rate(t, q, qd, qdd, params) for element in friction]
+    given = [element.load(t, q, qd, params) for element in friction]
     one, zero = jnp.ones_like(t), jnp.zeros_like(t)
-    forces = [
-        [element.slip_force(v, sign * one, load) for element, (v, _), load in zip(elements, slip, given, strict=True)]
-        for sign in (1.0, -1.0)
-    ]
-    limits = [
-        [element.static_limit(sign * one, load) for element, load in zip(elements, given, strict=True)]
-        for sign in (1.0, -1.0)
-    ]
-    coupling = jnp.stack([jnp.stack([jnp.sum(row * each) for each in reach]) for row in rows])
+    directions: list[PerDof] = []
+    rows: list[tuple[Array, ...]] = []
+    planes: list[tuple[int, int]] = []
+    widths: list[int] = []
+    for element, (v, rate), load in zip(friction, slip, given, strict=True):
+        upper, lower = (element.static_limit(sign * one, load) for sign in (1.0, -1.0))
+        widths.append(max(1, v.size))
+        if v.ndim == 0:
+            directions.append(element.direction(q, params))
+            forward, backward = (element.slip_force(v, sign * one, load) for sign in (1.0, -1.0))
+            rows.append((v, rate, forward, backward, upper, lower))
+            continue
+        start, stop = len(rows), len(rows) + v.shape[0]
+        planes.append((start, stop))
+        directions += [*element.direction(q, params)]
+        v, rate = element.stretch(v), element.stretch(rate)
+        begins = element.slip_force(zero, one, load)
+        forces = element.slip_force_in_plane(v, mode[start:stop] if mode.shape[0] else v, load)
+        rows += [(v[i], rate[i], begins, forces[i], upper, lower) for i in range(v.shape[0])]
+    directions += leaning
+    rows += [(zero, zero, one, one, one, one) for _ in leaning]
+    reach = [respond(row) for row in directions]
+    coupling = jnp.stack([jnp.stack([jnp.sum(row * each) for each in reach]) for row in directions])
     if floor is not None:
         # Where constraints leave a direction no mobility (a slider at its dead centre), no force holds it. Rounding may
         # leave a mobility of zero or less, which would look as if none were needed.
-        coupling = coupling + jnp.diag(jnp.stack([floor(row) for row in rows]))
-    return FrictionElements(
-        jnp.stack([*(v for v, _ in slip), *(zero for _ in leaning)]),
-        jnp.stack([*(a for _, a in slip), *(zero for _ in leaning)]),
-        coupling,
-        jnp.stack(reach),
-        jnp.stack([*forces[0], *(one for _ in leaning)]),
-        jnp.stack([*forces[1], *(one for _ in leaning)]),
-        jnp.stack([*limits[0], *(one for _ in leaning)]),
-        jnp.stack([*limits[1], *(one for _ in leaning)]),
-        loads(jnp.stack(rows)),
-    )
+        coupling = coupling + jnp.diag(jnp.stack([floor(row) for row in directions]))
+    v, rate, *forces = (jnp.stack(column) for column in zip(*rows, strict=True))
+    widths += [1] * len(leaning)
+    loaded = loads(jnp.stack(directions), tuple(widths))
+    return FrictionElements(v, rate, coupling, jnp.stack(reach), *forces, loads=loaded, planes=tuple(planes))
 
 
-def solve_friction_forces(contacts: FrictionElements, mode: Float[Array, " modes"]) -> FrictionForces:
-    """Friction forces [N] in the modes given: the slip force, or the multiplier of stick."""
-    extra = contacts.v.shape[0] - mode.shape[0]
+def solve_friction_forces(
+    elements: FrictionElements, mode: Float[Array, " modes"], begins: Bool[Array, " modes"] | None = None
+) -> FrictionForces:
+    """Friction forces [N] in the modes given: the slip force, or the multiplier of stick.
+
+    In a plane the slip force is that at the state; of the elements `begins` that with which a slip begins.
+    """
+    extra = elements.v.shape[0] - mode.shape[0]
     mode = jnp.concatenate([mode, jnp.ones(extra, mode.dtype)]) if extra else mode
-    sticks = mode == 0
-    slipping = jnp.where(mode > 0, contacts.forward, contacts.backward)
+    sticks = elements.sticks(mode)
+    slipping = jnp.where(mode > 0, elements.forward, elements.backward)
+
+    def in_plane(part: slice) -> Array:
+        force = elements.backward[part]
+        return force if begins is None else jnp.where(begins[part], elements.forward[part] * _unit(mode[part]), force)
+
+    slipping = elements.in_planes(slipping, in_plane)
 
     def settled(slipping: Array, base: Array | float) -> Array:
-        drive = base - jnp.sum(contacts.delassus * jnp.where(sticks, 0.0, slipping)[None, :], axis=1)
-        return jnp.where(sticks, _multipliers(contacts, drive, sticks), slipping)
+        drive = base - jnp.sum(elements.delassus * jnp.where(sticks, 0.0, slipping)[None, :], axis=1)
+        return jnp.where(sticks, _multipliers(elements, drive, sticks), slipping)
 
-    if contacts.loads is None:
+    if elements.loads is None:
         return FrictionForces(
-            settled(slipping, contacts.free_slip_acceleration),
-            contacts.upper,
-            contacts.lower,
-            jnp.ones_like(contacts.v[0]),
+            settled(slipping, elements.free_slip_acceleration),
+            elements.upper,
+            elements.lower,
+            jnp.ones_like(elements.v[0]),
         )
-    on, fall = contacts.loads.on, contacts.loads.normal_coupling
+    on, fall = elements.loads.on, elements.loads.normal_coupling
     count = on.shape[1]
     loaded = jnp.sum(on, axis=1)
-    fixed = settled(jnp.where(loaded > 0, 0.0, slipping), contacts.free_slip_acceleration)
+    fixed = settled(jnp.where(loaded > 0, 0.0, slipping), elements.free_slip_acceleration)
     per_load = jnp.stack([settled(on[:, k] * slipping, 0.0) for k in range(count)])
-    normal = contacts.loads.normal - jnp.sum(fall * fixed[None, :], axis=1)
+    normal = elements.loads.normal - jnp.sum(fall * fixed[None, :], axis=1)
     gain = jnp.sum(fall[:, None, :] * per_load[None, :, :], axis=2)
-    load, margin = _loads(normal, gain, contacts.loads.pulls)
+    load, margin = _loads(normal, gain, elements.loads.pulls)
     factor = jnp.where(loaded > 0, jnp.sum(on * load[None, :], axis=1), 1.0)
     force = fixed + jnp.sum(per_load * load[:, None], axis=0)
-    return FrictionForces(force, factor * contacts.upper, factor * contacts.lower, margin)
+    return FrictionForces(force, factor * elements.upper, factor * elements.lower, margin)
 
 
 def _loads(
@@ -201,7 +303,7 @@ def _determinant(rows: list[list[Array]]) -> Array:
 
 
 def _multipliers(
-    contacts: FrictionElements, drive: Float[Array, " n"], sticks: Bool[Array, " n"]
+    elements: FrictionElements, drive: Float[Array, " n"], sticks: Bool[Array, " n"]
 ) -> Float[Array, " n"]:
     """Forces of the sticking elements that take their slip accelerations away; others get zero.
 
@@ -209,14 +311,14 @@ def _multipliers(
     with the smallest sum of `f_i^2/limit_i` is taken: elements in parallel then share in proportion to their
     limits and reach them together.
     """
-    weight = 0.5 * (contacts.upper + contacts.lower)
+    weight = 0.5 * (elements.upper + elements.lower)
     largest = jnp.max(weight)
     weight = jnp.maximum(weight / jnp.where(largest > 0, largest, 1.0), 1e-6)
-    return solve_semidefinite(contacts.delassus, drive, jnp.sqrt(jnp.where(largest > 0, weight, 1.0)), sticks)
+    return solve_semidefinite(elements.delassus, drive, jnp.sqrt(jnp.where(largest > 0, weight, 1.0)), sticks)
 
 
-def contact_guards(
-    contacts: FrictionElements,
+def friction_guards(
+    elements: FrictionElements,
     forces: FrictionForces,
     mode: Float[Array, " modes"],
     rest: Scalar,
@@ -229,31 +331,84 @@ def contact_guards(
     [m/s], and the absolute one. What differs by rounding must not flicker: the limits are 16 rounding units further
     out, and a slip has to turn by `rest` [m/s] before it ends (an element may be in slip, at its limit, while others
     hold it).
+
+    In a plane f is the magnitude of the force. Of slip the first row is the velocity in the direction of the mode, less
+    a part of the mode as long as that counts as a velocity, and the others are positive until it has grown.
     """
     n, (rtol, atol) = mode.shape[0], tolerances
     force, upper, lower = (x[:n] for x in forces[:3])
+    force = elements.in_planes(force, lambda part: safe_norm(force[part]))
     eps = float(jnp.finfo(force.dtype).eps)
     wider = 1.0 + 16.0 * eps
     span = upper + lower
     inside = (wider * upper - force) * (wider * lower + force) / jnp.where(span > 0, span, 1.0)
     resolved = jnp.maximum(rtol, _LOAD_ROUNDING * eps) * span
-    return jnp.where(mode == 0, inside, mode * contacts.v[:n] + rest), jnp.where(mode == 0, resolved, atol)
+
+    def in_plane(part: slice) -> Array:
+        along, _, speed = _split(elements.v[part], mode[part])
+        end = jnp.where(_ends(speed, rest), rest, -_SHRUNK * speed)
+        return jnp.stack([along + end] + (part.stop - part.start - 1) * [_GROWN * speed - along])
+
+    slip, sticks = elements.in_planes(mode * elements.v[:n] + rest, in_plane), elements.sticks(mode)
+    return jnp.where(sticks, inside, slip), jnp.where(sticks, resolved, atol)
 
 
-def stick_violation(forces: FrictionForces, mode: Float[Array, " modes"]) -> Float[Array, " modes"]:
+def speed_of_rest(elements: FrictionElements, forces: FrictionForces, rest: Scalar, t: Scalar) -> Scalar:
+    """The speed [m/s] that counts as none: `rest`, and in planes no less than what time resolves of a slip's end."""
+    if not elements.planes:
+        return rest
+    slows = jnp.max(jnp.sum(jnp.abs(elements.delassus) * forces.upper[None, :], axis=1))
+    return jnp.maximum(rest, _INSTANT * float(jnp.finfo(t.dtype).eps) * jnp.abs(t) * _constant(slows))
+
+
+def _split(v: Float[Array, " d"], mode: Float[Array, " d"]) -> tuple[Scalar, Scalar, Scalar]:
+    """Component of a velocity in the direction of a mode, magnitude of the rest, and that of the mode."""
+    speed, direction = safe_norm(mode), _unit(mode)
+    along = jnp.sum(v * direction)
+    return along, safe_norm(v - along * direction), speed
+
+
+def _ends(speed: Scalar, rest: Scalar) -> Bool[Array, ""]:
+    """Whether the next that happens to a slip that falls is its end, where the mode is of this speed."""
+    return speed <= 1.01 * _slowest(rest)
+
+
+def renew_slip(
+    elements: FrictionElements, mode: Float[Array, " modes"], fired: Bool[Array, " modes"], rest: Scalar
+) -> tuple[Float[Array, " modes"], Bool[Array, " modes"]]:
+    """Modes with those of slips in planes that go on renewed, and which rows stop or break away.
+
+    Scalar elements stay as they are.
+    """
+    v, stops = _constant(elements.v[: mode.shape[0]]), []
+    for start, stop in elements.planes:
+        part = slice(start, stop)
+        _, across, speed = _split(v[part], mode[part])
+        ended = fired[start] & _ends(speed, rest) & (across <= _ENDED * rest)
+        stops.append(jnp.where(jnp.all(mode[part] == 0), jnp.any(fired[part]), ended))
+    each = iter(stops)
+    changes = elements.in_planes(fired, lambda _: next(each))
+    turns = elements.in_planes(jnp.zeros_like(fired), lambda part: jnp.any(fired[part])) & ~changes
+    return jnp.where(turns, elements.slipping(v, rest), mode), changes
+
+
+def stick_violation(
+    elements: FrictionElements, forces: FrictionForces, mode: Float[Array, " modes"]
+) -> Float[Array, " modes"]:
     """By how much the force of each sticking element exceeds its limit, in limits; 0 in slip."""
     n = mode.shape[0]
     force, upper, lower = (x[:n] for x in forces[:3])
     limit = jnp.where(force > 0, upper, lower)
-    excess = (jnp.abs(force) - limit) / jnp.where(limit > 0, limit, 1.0)
-    return jnp.where(mode == 0, excess, 0.0)
+    excess = (elements.magnitude(force) - limit) / jnp.where(limit > 0, limit, 1.0)
+    return jnp.where(elements.sticks(mode), excess, 0.0)
 
 
 def next_modes(
-    contacts: FrictionElements,
+    elements: FrictionElements,
     mode: Float[Array, " modes"],
     still: Bool[Array, " modes"],
     at_limit: Bool[Array, " modes"],
+    rest: Scalar,
 ) -> Float[Array, " modes"]:
     """Modes after an instant at which the elements `still` have no slip velocity; the others go on as they are.
 
@@ -265,37 +420,42 @@ def next_modes(
 
     **Arguments:**
 
-    - `contacts`: at this instant.
+    - `elements`: at this instant.
     - `mode`: modes before.
     - `still`: elements that may stick or change direction.
     - `at_limit`: sticking elements that have reached a limit, and slip in the direction of their load.
+    - `rest`: speed [m/s] that counts as none.
     """
-    contacts = jax.tree.map(_constant, contacts)
+    elements = jax.tree.map(_constant, elements)
     n = mode.shape[0]
     wider = 1.0 + 16.0 * float(jnp.finfo(mode.dtype).eps)
-    before = solve_friction_forces(contacts, mode)
-    load = jnp.sign(before.force[:n])
+    before = solve_friction_forces(elements, mode)
+    load = elements.beginning(before.force[:n], rest)
     mode = jnp.where(still, jnp.where(at_limit, load, jnp.zeros_like(mode)), mode)
-    scale = 1e-6 * jnp.max(jnp.abs(contacts.delassus) * jnp.maximum(before.upper, before.lower)[None, :], axis=1)[:n]
+    scale = 1e-6 * jnp.max(jnp.abs(elements.delassus) * jnp.maximum(before.upper, before.lower)[None, :], axis=1)[:n]
 
     def settle(i: Array, mode: Array) -> Array:
-        all_forces, upper, lower, _ = solve_friction_forces(contacts, mode)
+        all_forces, upper, lower, _ = solve_friction_forces(elements, mode, still)
         force = all_forces[:n]
         limit = jnp.where(force > 0, upper[:n], lower[:n])
         least = float(jnp.finfo(limit.dtype).tiny)
-        use = jnp.where(mode == 0, jnp.abs(force) / jnp.maximum(limit, least), 0.0)
+        use = jnp.where(elements.sticks(mode), elements.magnitude(force) / jnp.maximum(limit, least), 0.0)
         worst = (use == jnp.max(use)) & (use > wider)
-        acceleration = (contacts.free_slip_acceleration - jnp.sum(contacts.delassus * all_forces[None, :], axis=1))[:n]
+        acceleration = (elements.free_slip_acceleration - jnp.sum(elements.delassus * all_forces[None, :], axis=1))[:n]
+        in_direction = elements.in_planes(
+            mode * acceleration, lambda part: jnp.sum(_unit(mode[part]) * acceleration[part])
+        )
         # Where nothing is consistent, the last word is rather a slip that ends at once, which shows as chatter, than a
         # stick above its limit.
-        against = still & (mode * acceleration < -scale) & ~jnp.any(worst) & (i < 3 * n)
-        return jnp.where(worst, jnp.sign(force), jnp.where(against, jnp.zeros_like(mode), mode))
+        against = still & (in_direction < -scale) & ~jnp.any(worst) & (i < 3 * n)
+        return jnp.where(worst, elements.beginning(force, rest), jnp.where(against, jnp.zeros_like(mode), mode))
 
-    return settle(jnp.asarray(3), mode) if n == 1 else jax.lax.fori_loop(0, 4 * n, settle, mode)
+    alone = n == 1 or elements.planes == ((0, n),)
+    return settle(jnp.asarray(3 * n), mode) if alone else jax.lax.fori_loop(0, 4 * n, settle, mode)
 
 
-def stop_slip(contacts: FrictionElements, qd: PerDof, sticks: Bool[Array, " modes"]) -> PerDof:
+def stop_slip(elements: FrictionElements, qd: PerDof, sticks: Bool[Array, " modes"]) -> PerDof:
     """Velocities with the slip of the sticking elements taken away, by the smallest impulses that do."""
-    sticks = jnp.concatenate([sticks, jnp.zeros(contacts.v.shape[0] - sticks.shape[0], bool)])
-    impulse = _multipliers(contacts, jnp.where(sticks, contacts.v, 0.0), sticks)
-    return qd - jnp.sum(contacts.minv_jt * impulse[:, None], axis=0)
+    sticks = jnp.concatenate([sticks, jnp.zeros(elements.v.shape[0] - sticks.shape[0], bool)])
+    impulse = _multipliers(elements, jnp.where(sticks, elements.v, 0.0), sticks)
+    return qd - jnp.sum(elements.minv_jt * impulse[:, None], axis=0)

@@ -1,6 +1,7 @@
 """What is in a scene: data only."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -229,6 +230,13 @@ class Scene(AbstractReadable, eqx.Module):
         """What has a mode, in the order of the modes: friction elements that run by events, then contacts."""
         return (*self.event_driven, *self.contacts)
 
+    def mode_widths(self, dof: int) -> tuple[int, ...]:
+        """How many numbers the mode of each thing is: one, or of friction in a plane as many as slip has components."""
+        q = jnp.zeros(dof)  # only shapes matter
+        params = self.bind_time(jnp.zeros(())).params
+        shapes = [each.slip_shape(q, params) for each in self.event_driven.values()]
+        return (*(math.prod(shape) for shape in shapes), *(1 for _ in self.contacts))
+
     @property
     def stiff(self) -> bool:
         """Whether the equations of motion are stiff."""
@@ -289,7 +297,7 @@ class Scene(AbstractReadable, eqx.Module):
                 f"{', '.join(self.contacts)}: contacts open and close by events, so that position and velocity do not"
                 " tell the forces: run the scene by jaxmodsim.simulate."
             )
-        modes = iter(() if mode is None else jax.lax.stop_gradient(mode[len(self.event_driven) :]))
+        modes = iter(() if mode is None else jax.lax.stop_gradient(mode[mode.shape[0] - len(self.contacts) :]))
 
         def bound(x: Contact) -> BoundContact:
             return BoundContact(x, next(modes) if x.compliant is None else jnp.zeros_like(x.compliant.stiffness))

@@ -19,6 +19,7 @@ from ..scene import (
     forward_dynamics,
     from_dynamics,
     linear_solver,
+    mode_numbers,
     scene_step,
 )
 from ..solvers import EventState
@@ -155,6 +156,8 @@ class RunFunctions(eqx.Module):
     sticks: bool = eqx.field(static=True)
     # Whether chatter is held in stick.
     holds: bool = eqx.field(static=True)
+    # How many numbers the mode of each thing is.
+    widths: tuple[int, ...] = eqx.field(static=True)
 
     def plain_derivative(self, t: Any, y: PyTree, scene: Scene, mode: Array | None = None) -> PyTree:
         """Right-hand side in these modes; None in a run without."""
@@ -188,16 +191,20 @@ class RunFunctions(eqx.Module):
         changed = jnp.any(mode != s.mode) | jnp.any(state.qd != before.qd)
         return s._replace(y=jtu.tree_map(lambda a, b: jnp.where(changed, a, b), after, s.y), mode=mode)
 
+    def event_mode(self, mode: Array) -> Array:
+        """What of the modes an event changes: not the velocities that those of slip in a plane are."""
+        return mode_numbers(mode, self.widths)
+
     @at_time
     def on_zeno(self, t: Array, s: EventState, scene: Scene, fired: Array) -> EventState:
         """Stick of what chatters, where that is to be held, and closed contacts where impacts accumulate."""
-        n = len(scene.event_driven)
+        n = fired.shape[0] - len(scene.contacts)
         if scene.contacts:
             s = self._switch(t, s, scene, fired if self.holds else fired.at[:n].set(False), False)
         if not (n and self.holds):
             return s
-        fired = jnp.concatenate([fired[:n], jnp.zeros_like(fired[n:])])
-        return self._stick(t, s._replace(mode=jnp.where(fired, 0.0, s.mode)), scene)
+        state, mode = from_dynamics(lambda d: d.hold(fired), t, self.system.state(t, s.y, scene), scene, s.mode)
+        return s._replace(y=self.system.replace(t, s.y, state, scene), mode=mode)
 
     def _stick(self, t: Array, s: EventState, scene: Scene) -> EventState:
         state = from_dynamics(lambda d: d.stick(s.mode), t, self.system.state(t, s.y, scene), scene, s.mode)

@@ -76,7 +76,7 @@ class _Offsets(NamedTuple):
 def _offsets(scene: Scene, dof: int) -> _Offsets:
     ranges = FIRST_MASS + dof
     chatter = ranges + sum(len(range_checks(module)) for _, module in modules_of(scene))
-    return _Offsets(ranges, chatter, chatter + len(scene.mode_names))
+    return _Offsets(ranges, chatter, chatter + sum(scene.mode_widths(dof)))
 
 
 class Ending(NamedTuple):
@@ -133,7 +133,8 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
     chatter = tuple(
         f"The mode changes of {name!r} accumulate: chatter between stick and slip. Pass hold_chatter=True to hold it in"
         " stick from there on."
-        for name in scene.mode_names
+        for name, width in zip(scene.mode_names, scene.mode_widths(dof), strict=True)
+        for _ in range(width)
     )
     return _GENERAL + mass + ranges + chatter + scene.checks
 

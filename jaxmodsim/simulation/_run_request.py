@@ -111,7 +111,7 @@ def _inputs(asked: RunRequest) -> RunInputs:
         if type(value) is not float:
             check_real(value, name=name)
     leaves: list[Any] = [*jtu.tree_leaves(scene), q0, qd0]
-    kinds = {getattr(x, "dtype", None) for x in leaves} - {None}
+    kinds = {x.dtype for x in leaves if hasattr(x, "dtype")}
     dtype = kinds.pop() if len(kinds) == 1 else jnp.result_type(*kinds) if kinds else jnp.result_type(float)
     if not jnp.issubdtype(dtype, jnp.floating):
         dtype = jnp.result_type(float)

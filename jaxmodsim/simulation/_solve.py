@@ -108,13 +108,15 @@ class RunOutput(NamedTuple):
 
 
 def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolver:
-    """Rodas5P where the scene is stiff, or runs by events on one coordinate; Tsit5 otherwise.
+    """Rodas5P where the scene is stiff, or runs by events on one coordinate or in the plane; Tsit5 otherwise.
 
     Every step of a run with events looks at the guards, whatever the method. On one coordinate Rodas5P makes the fewest
     of those whose dense output keeps the tolerance, and is twice as fast as Tsit5 under vmap; on more of them its
-    Jacobian costs more than that, most of all in compile time.
+    Jacobian costs more than that, most of all in compile time. Exact friction in the plane is stiff where slip is slow:
+    its direction follows that of the load.
     """
-    return Rodas5P(pivot=fixed_step) if scene.stiff or (scene.mode_names and dof == 1) else dfx.Tsit5()
+    stiff = scene.stiff or sum(scene.mode_widths(dof)) > len(scene.mode_names)
+    return Rodas5P(pivot=fixed_step) if stiff or (scene.mode_names and dof == 1) else dfx.Tsit5()
 
 
 def _structured(inputs: RunInputs) -> bool:
@@ -166,6 +168,7 @@ def _solver(
             samples=samples,
             rtol=functions.tolerances[0],
             enforce=True,
+            event_mode=functions.event_mode if sum(functions.widths) > len(functions.widths) else None,
             max_events=options.max_events if log is None else min(log, options.max_events),
             log=log is not None,
         )
@@ -227,6 +230,7 @@ def _functions(inputs: RunInputs, options: RunOptions, audited: bool) -> RunFunc
         bool(scene.bilateral or scene.contacts) and options.project,
         scene.stick_drifts,
         options.hold_chatter,
+        scene.mode_widths(inputs.q0.shape[0]),
     )
 
 
@@ -239,7 +243,7 @@ def _start(inputs: RunInputs, functions: RunFunctions, order: Any) -> _Start:
     scene, t0, exact = inputs.scene, inputs.t0, bool(inputs.scene.mode_names)
     initial = initial_state(inputs)
     check_scene(scene, initial)
-    mode = jnp.zeros(len(scene.mode_names), inputs.q0.dtype) if exact else None
+    mode = jnp.zeros(sum(scene.mode_widths(inputs.q0.shape[0])), inputs.q0.dtype) if exact else None
     if functions.projects:
         initial = project(t0, initial, scene.bind_time(t0), mode)
     y0 = functions.system.start(t0, initial, scene, mode)

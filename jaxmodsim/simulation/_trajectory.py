@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from .._core.readable import AbstractReadable, Table, short, table_of
 from ..mechanics import momentum
-from ..scene import ConstraintReaction, Scene, State, forward_dynamics, quantity_of
+from ..scene import ConstraintReaction, Scene, State, forward_dynamics, mode_numbers, quantity_of
 from ..solvers import EventLog
 from ._accuracy import Accuracy
 from ._columns import Columns, columns
@@ -41,8 +41,8 @@ class Events(NamedTuple):
 
     - `t`: time [s], differentiable.
     - `effect`: index of the effect in the scene; contacts follow the effects, in the order of the constraints.
-    - `before`, `after`: mode before and after: of friction 0 in stick, else the sign of the slip velocity; of a contact
-      0 where it is open, 1 where it is closed.
+    - `before`, `after`: mode before and after: of friction 0 in stick, else the sign of the slip velocity, in the plane
+      1; of a contact 0 where it is open, 1 where it is closed.
     """
 
     t: Float[Array, " events"]
@@ -55,8 +55,8 @@ class ModeChange(NamedTuple):
     """A change of the mode of a friction element or a contact, or an impact.
 
     - `t`: time [s]; `effect`: name of the element.
-    - `before`, `after`: `"stick"`, or `"forward"` or `"backward"` for positive and negative slip; of a contact `"open"`
-      or `"closed"`.
+    - `before`, `after`: `"stick"`, or `"forward"` or `"backward"` for positive and negative slip, `"slip"` in the
+      plane; of a contact `"open"` or `"closed"`.
     """
 
     t: float
@@ -65,7 +65,8 @@ class ModeChange(NamedTuple):
     after: str
 
 
-_MODES, _CONTACT_MODES = {0: "stick", 1: "forward", -1: "backward"}, {0: "open", 1: "closed"}
+_MODES, _PLANE_MODES = {0: "stick", 1: "forward", -1: "backward"}, {0: "stick", 1: "slip"}
+_CONTACT_MODES = {0: "open", 1: "closed"}
 
 
 class Energy(NamedTuple):
@@ -105,8 +106,8 @@ class Trajectory(AbstractReadable):
     - `t`: times [s], shape `[time]`; `ts`, or the end alone. Times that an early end left unreached are infinite.
     - `q`, `qd`: coordinates and velocities, shape `[time, dof]`.
     - `z`: own states of effects, by effect name; each with a leading time axis.
-    - `modes`: of the friction elements that run by events, shape `[time, elements]`; None where there are none. By
-      name: `mode`.
+    - `modes`: of the friction elements that run by events and of contacts, shape `[time, modes]`; None where there are
+      none. By name: `mode`.
     - `stats`: `num_steps`, `num_rejected_steps` of these, and `num_events` where laws run by events.
     - `accuracy`: what was chosen for the accuracy that was asked for; None where none was.
 
@@ -172,11 +173,13 @@ class Trajectory(AbstractReadable):
     def mode(self) -> dict[str, Array]:
         """Mode of each friction element that runs by events and of each contact, by name, shape `[time]`.
 
-        Of friction 0 in stick, else +-1; of a contact 0 while it is open, 1 while it is closed.
+        Of friction 0 in stick, else +-1, in the plane 1: slip is then in the direction of the force in `forces`. Of a
+        contact 0 while it is open, 1 while it is closed.
         """
         if self.modes is None:
             return {}
-        return {name: self.modes[..., i] for i, name in enumerate(self.scene.mode_names)}
+        modes = mode_numbers(self.modes, self.scene.mode_widths(self.q.shape[-1]))
+        return {name: modes[..., i] for i, name in enumerate(self.scene.mode_names)}
 
     @property
     def events(self) -> Events:
@@ -191,12 +194,13 @@ class Trajectory(AbstractReadable):
     def mode_changes(self) -> tuple[ModeChange, ...]:
         """`events` in words, as many as there are; outside of `jax.jit`."""
         columns = [x.tolist() for x in map(np.asarray, self.events)]
-        names, effects = self.scene.part_names, len(self.scene.names)
-        words = [_MODES if effect < effects else _CONTACT_MODES for effect in columns[1]]
+        scene = self.scene
+        widths = dict(zip(scene.mode_names, scene.mode_widths(self.q.shape[-1]), strict=True))
+        words = {name: _MODES if width == 1 else _PLANE_MODES for name, width in widths.items()}
+        words |= dict.fromkeys(scene.contacts, _CONTACT_MODES)
+        happened = [(t, scene.part_names[i], *modes) for t, i, *modes in zip(*columns, strict=True) if t < math.inf]
         return tuple(
-            ModeChange(t, names[effect], word[before], word[after])
-            for t, effect, before, after, word in zip(*columns, words, strict=True)
-            if t < math.inf
+            ModeChange(t, name, words[name][before], words[name][after]) for t, name, before, after in happened
         )
 
     @property
@@ -354,10 +358,11 @@ def _reached(t: Array, tree: PyTree) -> PyTree:
 @jax.jit
 def _events(scene: Scene, log: EventLog) -> Events:
     """One entry for each element that changed its mode, from a log with one for each instant."""
-    before, after = log.before[1], log.after[1]
+    widths = scene.mode_widths(log.before[0].q.shape[-1])
+    before, after, fired = (mode_numbers(x, widths) for x in (log.before[1], log.after[1], log.fired))
     indices = jnp.asarray([scene.part_names.index(name) for name in scene.mode_names])
     # What happens to contacts that fire is an event, be it an impact that leaves them open.
-    strikes = jnp.asarray([[name in scene.contacts for name in scene.mode_names]]) & (log.fired > 0.5)
+    strikes = jnp.asarray([[name in scene.contacts for name in scene.mode_names]]) & (fired > 0.5)
     changed = jnp.ravel(((before != after) | strikes) & jnp.isfinite(log.t)[:, None])
     order = jnp.argsort(~changed, stable=True)
 

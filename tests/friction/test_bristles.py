@@ -225,7 +225,7 @@ def test_an_ellipse_of_friction_dissipates_as_much_as_it_can() -> None:
         (
             jms.ElastoPlastic(1e3, 0.0, 0.0, 0.5, 1.0, 1.0, 0.1),
             {},
-            "Needed is LuGre, Dahl, or a law that is a function",
+            "Needed is a law that is the same in all directions: Coulomb",
         ),
         (jms.asymmetric(jms.Viscous(1.0), Fv=2.0), {}, "the same in all directions"),
         (jms.Viscous(1.0), {"along": lambda q: q[0], "ellipse": 0.5}, r"ellipse needs slip .* has the shape \(\)"),

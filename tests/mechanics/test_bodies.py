@@ -15,6 +15,7 @@ from jaxmodsim import (
     Regularized,
     Scene,
     Viscous,
+    asymmetric,
     point_mass,
     rigid_body,
     simulate,
@@ -150,7 +151,7 @@ def test_a_puck_slides_straight_and_slows_at_mu_g() -> None:
 @pytest.mark.parametrize(
     ("effect", "text"),
     [
-        (Friction(Coulomb(1.0), along=bowl), r"Coulomb cannot act.*Regularized\(law, width\)"),
+        (Friction(asymmetric(Coulomb(1.0), Fc=2.0), along=bowl), "cannot act.*the same in all directions"),
         (Friction(ElastoPlastic(1e3, 1.0, 0.1, 0.5, 1.0, 1.5, 0.1), along=bowl), "ElastoPlastic cannot act"),
         (Friction(DeadZone(Coulomb(1.0), 0.1), along=bowl), "DeadZone cannot act"),
         (Friction(Viscous(1.0), along=bowl, belt_velocity=0.1), "must be a function of t that returns one"),

@@ -43,7 +43,7 @@ def random_contact(rng: np.random.Generator, n: int, stiction: bool) -> Friction
 @jax.jit
 def choose(found: FrictionElements) -> Any:
     rest = jnp.zeros_like(found.v)
-    return next_modes(found, rest, rest == 0, rest != 0)
+    return next_modes(found, rest, rest == 0, rest != 0, jnp.zeros(()))
 
 
 @jax.jit

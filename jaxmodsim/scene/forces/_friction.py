@@ -32,6 +32,9 @@ from ...friction import (
 )
 from ._effect import AbstractEffect, Action, Power
 
+# Part of an earlier slip velocity below which the direction of slip in the plane is rounded off.
+_FLOOR = 1e-2
+
 
 def _law(law: Any) -> AbstractLaw:
     if isinstance(law, AbstractLaw):
@@ -90,7 +93,7 @@ class Friction(AbstractEffect):
       position of the contact [m], shape `[2]` or `[3]`: with one coordinate slip is the velocity along its path,
       positive for a rising coordinate; with several it is a vector, and so is the friction force: of a law that is a
       function of slip opposite to it, of the magnitude that the law gives at the magnitude of slip; of `LuGre` and
-      `Dahl` with a bristle that is a vector, too.
+      `Dahl` with a bristle that is a vector, too; of a set-valued law in stick any vector up to the limit.
     - `belt_velocity`: velocity [m/s or rad/s] of the surface, a number or a continuous function of t (a jump would
       carry with it what sticks); where slip is a vector, a function that returns one.
     - `normal_force`: load [N]: a number, `normal_force(t, q, qd, params)`, or the name of a `Constraint`, whose
@@ -165,12 +168,13 @@ class Friction(AbstractEffect):
             )
         slip = () if q.shape == (1,) else shape
         sided = any(isinstance(module, AbstractAsymmetric | Geared) for _, module in modules_of(self.law))
-        if slip != () and (sided or not isinstance(self.law, AbstractForceLaw | AbstractPlanarLaw)):
+        if slip != () and (
+            sided or not isinstance(self.law, AbstractForceLaw | AbstractPlanarLaw | AbstractSetValuedLaw)
+        ):
             raise ValueError(
                 f"Friction {name!r}: along(q) is a position that moves in several directions, and there"
-                f" {type(self.law).__name__} cannot act. Needed is LuGre, Dahl, or a law that is a function of slip and"
-                " the same in all directions: wrap a set-valued one as Regularized(law, width), or give a scalar"
-                " displacement."
+                f" {type(self.law).__name__} cannot act. Needed is a law that is the same in all directions: Coulomb,"
+                " Stribeck or another set-valued one, LuGre, Dahl, a function of slip; or give a scalar displacement."
             )
         if self.ellipse is not None and slip != (2,):
             raise ValueError(
@@ -209,16 +213,24 @@ class Friction(AbstractEffect):
         """State of the law; None where it has none."""
         if not isinstance(self.law, AbstractDynamicLaw):
             return None
-        slip = () if q.shape == (1,) else self._shape(q, params, self.name or self.default_name)
-        return self.law.initial_state(jnp.zeros(slip or (), q.dtype))
+        return self.law.initial_state(jnp.zeros(self.slip_shape(q, params), q.dtype))
 
-    def direction(self, q: PerDof, params: PyTree) -> PerDof:
-        """Gradient d along/dq of a scalar slip: the generalised force of a unit force along the displacement."""
+    def slip_shape(self, q: PerDof, params: PyTree) -> tuple[int, ...]:
+        """Shape of the slip: () or, where `along` is a position that moves in several directions, that of a vector."""
+        return () if self.along is None or q.shape == (1,) else jax.eval_shape(self.along, q, params).shape
+
+    def direction(self, q: PerDof, params: PyTree) -> Float[Array, "*components dof"]:
+        """Gradient d along/dq of the slip: the generalised force of a unit force along the displacement.
+
+        Of a vector one for each component, as the law sees them.
+        """
         if self.along is None:
             return jnp.ones_like(q)
         if q.shape == (1,):
             return jnp.reshape(self._pace(q, params), (1,))
-        return jax.grad(self.along)(q, params)
+        if self.slip_shape(q, params) == ():
+            return jax.grad(self.along)(q, params)
+        return jax.vmap(self.stretch, in_axes=1, out_axes=1)(jax.jacrev(self.along)(q, params))
 
     def _pace(self, q: Float[Array, "1"], params: PyTree) -> Scalar:
         """Displacement per unit of the one coordinate; of a position the length of its tangent."""
@@ -244,7 +256,9 @@ class Friction(AbstractEffect):
             return self._pace(q, params) * qd[0] - self.belt(t)
         return self._moves(q, qd, params) - self.belt(t)
 
-    def slip_and_rate(self, t: Scalar, q: PerDof, qd: PerDof, qdd: PerDof, params: PyTree) -> tuple[Scalar, Scalar]:
+    def slip_and_rate(
+        self, t: Scalar, q: PerDof, qd: PerDof, qdd: PerDof, params: PyTree
+    ) -> tuple[Float[Array, "*components"], Float[Array, "*components"]]:
         """Slip velocity, and its rate where the accelerations are `qdd`."""
         return jax.jvp(lambda t, q, qd: self.slip(t, q, qd, params), (t, q, qd), (jnp.ones_like(t), qd, qdd))
 
@@ -288,16 +302,38 @@ class Friction(AbstractEffect):
         force = direction * level + law.viscous_force(v)
         return force if load is None else load * force
 
+    def slip_force_in_plane(
+        self, v: Float[Array, " d"], reference: Float[Array, " d"], load: Scalar | None
+    ) -> Float[Array, " d"]:
+        """Force [N] of a set-valued law in slip at the velocity `v`, a vector: that at its magnitude, along it.
+
+        A trial step may run past the end of the slip. On a line through rest slip and force go on as those of a scalar
+        slip, with the sign of the component of `v` along `reference`, an earlier velocity. Where that component is
+        below 1e-2 of `reference` the direction of the force goes over into that of `reference`, so that the force is a
+        smooth function of `v` at rest, too.
+        """
+        speed = safe_norm(reference)
+        direction = reference / jnp.where(speed > 0, speed, 1.0)
+        none = _FLOOR * jnp.where(speed > 0, speed, 1.0)
+        along = jnp.sum(v * direction)
+        slips = jnp.abs(along) > none
+        inverse = jnp.where(
+            slips, 1.0 / jnp.where(slips, along, 1.0), (1.0 + 2.0 * jnp.minimum(along, 0.0) / none) / none
+        )
+        tangent = (v - along * direction) * inverse
+        slant = jnp.sqrt(1.0 + jnp.sum(tangent * tangent))
+        return self.slip_force(along * slant, jnp.ones_like(along), load) / slant * (direction + tangent)
+
     def force_per_load(
         self, t: Scalar, q: PerDof, qd: PerDof, z: PyTree, params: PyTree
     ) -> tuple[Float[Array, "..."], PyTree]:
         """The law's force, in newtons or per newton of load, and the rate of its state."""
-        v = self._stretch(self.slip(t, q, qd, params))
+        v = self.stretch(self.slip(t, q, qd, params))
         if isinstance(self.law, AbstractDynamicLaw):
-            return self._stretch(self.law.force(v, z)), self.law.zdot(v, z)
+            return self.stretch(self.law.force(v, z)), self.law.zdot(v, z)
         if not isinstance(self.law, AbstractForceLaw | AbstractKarnoppLaw):
             raise TypeError(f"{type(self.law).__name__} acts by a mode, or is of no known kind of law.")
-        return self._stretch(_of_slip(self.law.force, v)), None
+        return self.stretch(_of_slip(self.law.force, v)), None
 
     def step_exact(
         self, v: Float[Array, "..."], z: PyTree, dt: Scalar, load: Scalar | None
@@ -306,7 +342,7 @@ class Friction(AbstractEffect):
 
         Damping in a bristle is that of its mean rate, so that its impulse is right however far the bristle has gone.
         """
-        v = self._stretch(v)
+        v = self.stretch(v)
         if isinstance(self.law, AbstractDynamicLaw):
             after = self.law.step_exact(v, z, dt)
             force = self.law.force_given_zdot(v, after, _mean_rate(self.law, v, z, after, dt))
@@ -314,10 +350,10 @@ class Friction(AbstractEffect):
         else:
             assert isinstance(self.law, AbstractForceLaw)
             force = _of_slip(self.law.force, v)
-        force = self._stretch(force)
+        force = self.stretch(force)
         return (force if load is None else load * force), z
 
-    def _stretch(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+    def stretch(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
         """What the law sees of a slip, and what its force is to the mechanism."""
         return x if self.ellipse is None else x * jnp.stack([jnp.ones_like(self.ellipse), self.ellipse])
 

@@ -144,6 +144,8 @@ class EventSolver(AbstractSolverWrapper):
     - `enforce`: whether the guards are conditions that have to hold, not crossings that are to be noted.
     - `samples`: a `SampledJumps` where `args` hold sampled values; None where they do not.
     - `rtol`: the part of its largest magnitude in a step by which a guard may fall below zero, and return, unseen.
+    - `event_mode`: `event_mode(mode)` -> what of the mode an event changes; a reset that changes other parts of it
+      alone, as to choose other coordinates, is no event. By default all of it.
     - `max_events`: limit of the number of events, > 0, and length of the log.
     - `log`: whether the state carries an `EventLog`.
 
@@ -168,6 +170,7 @@ class EventSolver(AbstractSolverWrapper):
     project: Callable[..., Any] | None = None
     samples: SampledJumps | None = None
     rtol: Any = 1e-6
+    event_mode: Callable[[PyTree], PyTree] | None = None
     enforce: bool = eqx.field(default=False, static=True)
     max_events: int = eqx.field(default=128, static=True)
     log: bool = eqx.field(default=True, static=True)
@@ -393,7 +396,7 @@ class EventSolver(AbstractSolverWrapper):
         if self.on_zeno is not None:
             status = jnp.zeros_like(spread)
         # A reset that changes nothing is no event.
-        happened = _differ((passage.before, state.mode), (y, mode))
+        happened = _differ(*zip((passage.before, y), self._event_modes(state.mode, mode), strict=True))
         events, index = jnp.where(happened, state.events + 1.0, state.events), jnp.where(happened, state.events, -1.0)
         status = jnp.where((status == ONGOING) & (events > self.max_events), TOO_MANY, status)
         clear = _constant(values) > jnp.where(fired, LATITUDE * jnp.abs(rate) * near, 0.0)
@@ -410,9 +413,8 @@ class EventSolver(AbstractSolverWrapper):
             entry = EventLog(t_event, flags, (passage.before, state.mode), (y, mode))
             log = jtu.tree_map(lambda a, b: write(a, index, b), log, entry)
         after = memory._replace(guard=_constant(values), armed=_flags(armed, values))
-        after_reset = state._replace(
-            y=passage.y,
-            mode=mode,
+        passed = state._replace(y=passage.y, mode=mode, memory=after)
+        after_reset = passed._replace(
             t=t_event,
             events=events,
             status=status,
@@ -420,11 +422,15 @@ class EventSolver(AbstractSolverWrapper):
             log=log,
             memory=after._replace(resets=memory.resets + 1.0, spread=spread),
         )
-        if self.samples is None or self.samples.times is None:
+        if self.event_mode is None and (self.samples is None or self.samples.times is None):
             return after_reset
-        # Samples at which nothing happens say nothing of whether events accumulate.
-        passed = state._replace(y=passage.y, memory=after)
-        return jtu.tree_map(lambda a, b: jnp.where(happened | jnp.any(fired), a, b), after_reset, passed)
+        # Samples at which nothing happens, and resets that are no events, say nothing of whether events accumulate.
+        chatters = jnp.any(fired) if self.event_mode is None else jnp.any(fired) & ~_differ(state.mode, mode)
+        return jtu.tree_map(lambda a, b: jnp.where(happened | chatters, a, b), after_reset, passed)
+
+    def _event_modes(self, *modes: PyTree) -> tuple[PyTree, ...]:
+        """What of the modes an event changes."""
+        return modes if self.event_mode is None else tuple(self.event_mode(mode) for mode in modes)
 
 
 def _accumulates(spread: Array, t: Array, begin: Array) -> Array:

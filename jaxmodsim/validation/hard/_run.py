@@ -11,11 +11,26 @@ from functools import cache
 import jax
 
 from ..._core.arguments import did_you_mean
-from . import _contacts, _geometry, _gradients, _many_events, _numbers, _orbits, _reversal, _scale, _shaken, _stiffness
+from . import (
+    _contacts,
+    _geometry,
+    _gradients,
+    _many_events,
+    _numbers,
+    _orbits,
+    _plane,
+    _reversal,
+    _scale,
+    _shaken,
+    _stiffness,
+)
 from ._case import HardCase
 from ._check import DTYPES, TRANSFORMS, CaseReport, CheckFinding, check, check_choice
 
-_MODULES = (_stiffness, _reversal, _shaken, _many_events, _contacts, _orbits, _geometry, _scale, _numbers, _gradients)
+_MODULES = (
+    *(_stiffness, _reversal, _shaken, _many_events, _contacts, _orbits),
+    *(_plane, _geometry, _scale, _numbers, _gradients),
+)
 
 # Families of hard cases, in the order in which they run.
 FAMILIES = tuple(module.FAMILY for module in _MODULES)

@@ -1,0 +1,56 @@
+"""What a scene's functions return is checked before it runs."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._core.functions import real_array
+from .._core.index_check import traced
+from ._dynamics import State
+from ._scene import Scene
+
+
+def check_scene(scene: Scene, y: State) -> None:
+    """Check shapes of everything the scene's functions return, and the indices that they use.
+
+    **Raises:**
+
+    - `ValueError` naming the function, the shape it returned and the shape that is needed, or the index that is out of
+      range; see `traced` for those that are seen; or for names of more or fewer coordinates than there are.
+    """
+    t, named = y.q[0], len(scene.coordinates)
+    if named not in (0, y.q.shape[0]):
+        raise ValueError(
+            f"The scene names {named} coordinates ({', '.join(scene.coordinates)}), but q has {y.q.shape[0]}: give a"
+            " name for each, or none."
+        )
+    scene = scene.bind_time(t)
+
+    def energy(*state: Any) -> Array:
+        return real_array(scene.lagrangian(*state), name="the Lagrangian")
+
+    given = traced(energy, t=t, q=y.q, qd=y.qd, params=scene.params, name="the Lagrangian")
+    if given.shape != () or not jnp.issubdtype(given.dtype, jnp.floating):
+        raise ValueError(
+            f"The Lagrangian must return one number [J], shape (), that depends on the state, but it returned {given}."
+            f" With q and qd of shape {y.q.shape}, index the coordinates (qd[0]) or sum over them."
+        )
+    for name, effect in zip(scene.names, scene.effects, strict=True):
+        effect.check(y.q, y.qd, scene.params, name)
+    for name, effect in scene.impact_friction.items():
+        if effect.slip_shape(y.q, scene.params) != ():
+            raise ValueError(
+                f"Friction {name!r} slides in several directions under the reaction of a Contact, whose impacts know"
+                " friction in one direction alone: give the load as a Constraint or as a function, wrap the law as"
+                " Regularized(law, width), which takes no part in impacts, or give a scalar displacement."
+            )
+    for name, constraint in zip(scene.constraint_names, scene.constraints, strict=True):
+        constraint.check(y.q, y.qd, scene.params, name)
+        size = jax.eval_shape(constraint.rate, t, y.q, y.qd, scene.params).shape[0]
+        if name in scene.loaded and size != 1:
+            raise ValueError(
+                f"Constraint {name!r} loads friction (normal_force={name!r}), so it must be one equation, but it has"
+                f" {size}. Give each direction a Constraint of its own."
+            )

@@ -1,0 +1,263 @@
+"""Exact friction in the plane: against closed forms, the scalar law, a second solver, and finite differences."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from jaxmodsim import AppliedForce, Constraint, Coulomb, Friction, Rodas5P, Scene, Stribeck, simulate
+from jaxmodsim.problems import turntable_puck
+from jaxmodsim.scene import State, forward_dynamics
+
+TIGHT: Any = {"rtol": 1e-10, "atol": 1e-12}
+F = 1.5
+
+
+def free(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    """A puck under a constant force along x."""
+    del t
+    return 0.5 * p["m"] * jnp.sum(qd**2) + p["f"] * q[0]
+
+
+def place(q: Any) -> Any:
+    return q
+
+
+def puck(law: Any = None, **friction: Any) -> Scene:
+    law = Coulomb(F, 2.0) if law is None else law
+    return Scene(free, params={"m": 2.0, "f": 0.0}, effects=(Friction(law, along=place, **friction),))
+
+
+PUCK = puck()
+
+
+@jax.jit
+def stop(v: Any, f: Any) -> tuple[Any, Any, Any, Any]:
+    """Where and when a puck stops that begins at the velocity `v` under the force `f`, and what holds it then."""
+    scene = eqx.tree_at(lambda s: s.params["f"], PUCK, f)
+    run = simulate(scene, jnp.zeros(2), v, 40.0, **TIGHT)
+    return run.q[-1], run.events.t[0], run.mode["friction"][-1], run.forces["friction"][-1]
+
+
+def test_a_puck_stops_on_a_line_at_the_place_in_closed_form() -> None:
+    """x = v |v| m/(2 F), t = |v| m/F, and their derivatives in both modes."""
+    v, zero = jnp.array([3.0, 4.0]), jnp.array(0.0)
+    q, t, mode, force = stop(v, zero)
+    np.testing.assert_allclose(q, v * 5.0 * 2.0 / (2.0 * F), rtol=1e-12)
+    np.testing.assert_allclose(t, 5.0 * 2.0 / F, rtol=1e-12)
+    assert mode == 0
+    np.testing.assert_array_equal(force, 0.0)
+    exact = jax.jacfwd(lambda v: v * jnp.linalg.norm(v) * 2.0 / (2.0 * F))(v)
+    for derive in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derive(lambda v: stop(v, zero)[0])(v), exact, atol=1e-10)
+
+
+def turning(f: float, speed: float, angle: float) -> tuple[float, np.ndarray]:
+    """Time and place at which slip dies whose direction turns to that of the load.
+
+    With dt = v ds the equations of ln v and of the angle are regular to the end; the time is in closed form, as
+    `v (F + f cos(angle))` falls at the constant rate (F^2 - f^2)/m.
+    """
+    a, b = F / 2.0, f / 2.0
+
+    def rate(_: float, y: np.ndarray) -> list[float]:
+        v, c, n = np.exp(y[0]), np.cos(y[1]), np.sin(y[1])
+        return [-a + b * c, -b * n, v * v * c, v * v * n]
+
+    end = solve_ivp(
+        rate, (0.0, 40.0 / (a - b)), [np.log(speed), angle, 0.0, 0.0], method="DOP853", rtol=1e-13, atol=1e-14
+    )
+    return speed * (a + b * np.cos(angle)) / (a * a - b * b), end.y[2:, -1]
+
+
+@pytest.mark.parametrize("f", [0.3, 0.8, 1.4])
+def test_slip_that_turns_dies_where_a_regular_form_of_the_equations_says(f: float) -> None:
+    """At 0.2, 0.53 and 0.93 of the limit, from 115 degrees of the load; derivatives of the way in closed form."""
+    speed, angle = 2.0, 2.0
+    v = speed * jnp.array([np.cos(angle), np.sin(angle)])
+    t_exact, q_exact = turning(f, speed, angle)
+    q, t, mode, force = stop(v, jnp.array(f))
+    np.testing.assert_allclose(t, t_exact, rtol=1e-9)
+    np.testing.assert_allclose(q, q_exact, atol=1e-9)
+    assert mode == 0
+    np.testing.assert_allclose(force, [f, 0.0], atol=1e-12)
+
+    def way(f: Any) -> Any:
+        """Along the load; its rate is the velocity, as that of `v (F + f cos(angle))` is a constant."""
+        a, b, c = F / 2.0, f / 2.0, jnp.cos(angle)
+        return speed**2 * (b * (1.0 + c * c) + 2.0 * a * c) / (4.0 * (a * a - b * b))
+
+    np.testing.assert_allclose(q[0], way(f), atol=1e-9)
+    for derive in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derive(lambda f: stop(v, f)[0][0])(jnp.array(f)), jax.grad(way)(f), rtol=1e-8)
+
+
+def ramp(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    """Breaks away forwards, stops, and breaks away backwards."""
+    del q, qd, p
+    return jnp.stack([3.0 * t - t * t, 0.0 * t])
+
+
+@pytest.mark.parametrize("law", [Coulomb(1.0, 1.4), Stribeck(1.0, 1.4, 0.1, 0.3)])
+def test_on_a_line_it_is_the_scalar_law(law: Any) -> None:
+    runs = [
+        simulate(
+            Scene(
+                free,
+                params={"m": 2.0, "f": 0.0},
+                effects=(AppliedForce(ramp), Friction(law, along=along, name="friction")),
+            ),
+            [0.0, 0.0],
+            [0.0, 0.0],
+            5.5,
+            ts=jnp.linspace(0.0, 5.5, 12),
+            solver=Rodas5P(),
+            **TIGHT,
+        )
+        for along in (lambda q: q[0], place)
+    ]
+    scalar, plane = runs
+    exact = isinstance(law, Coulomb)
+    np.testing.assert_allclose(plane.q, scalar.q, rtol=0, atol=1e-13 if exact else 1e-10)
+    np.testing.assert_allclose(plane.forces["friction"][:, 0], scalar.forces["friction"], atol=1e-12 if exact else 1e-9)
+    np.testing.assert_array_equal(plane.q[:, 1], 0.0)
+    signs = [(e.before, e.after) for e in scalar.mode_changes]
+    # Where slip turns round at once, it is slip on both sides.
+    assert signs == [("stick", "forward"), ("forward", "backward")]
+    assert [(e.before, e.after) for e in plane.mode_changes] == [("stick", "slip")]
+    np.testing.assert_allclose(plane.mode_changes[0].t, scalar.mode_changes[0].t, rtol=1e-12)
+    np.testing.assert_array_equal(plane.mode["friction"], np.abs(scalar.mode["friction"]))
+
+
+def test_forces_turn_with_the_frame() -> None:
+    """Stick and slip, at rest and at all speeds, in twenty frames."""
+    rng, scene = np.random.default_rng(0), puck(Stribeck(1.0, 2.0, 0.3, 0.4))
+
+    @jax.jit
+    def force(q: Any, qd: Any, mode: Any, f: Any) -> Any:
+        pushed = Scene(scene.lagrangian, scene.params, (AppliedForce(lambda t, q, qd, p: f), *scene.effects))
+        return forward_dynamics(jnp.zeros(()), State(q, qd, {}), pushed, mode).actions["friction"].force
+
+    for _ in range(20):
+        angle, v, load = rng.uniform(0, 7), rng.normal(size=2) * 10.0 ** rng.uniform(-9, 2), rng.normal(size=2)
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        mode = (v + 0.3 * np.linalg.norm(v) * rng.normal(size=2)) * rng.integers(2)
+        plain, turned = (
+            np.asarray(force(jnp.zeros(2), *(jnp.asarray(r @ x) for x in (v, mode, load)))) for r in (np.eye(2), turn)
+        )
+        np.testing.assert_allclose(turned, turn @ plain, atol=1e-12)
+        if mode.any() and v @ mode > 0:
+            speed = np.linalg.norm(v)
+            np.testing.assert_allclose(plain, (1 + np.exp(-((speed / 0.3) ** 2)) + 0.4 * speed) * v / speed, rtol=1e-9)
+
+
+def after_break_away(mu: float, stiction: float, t1: float) -> np.ndarray:
+    """Place on the turntable by scipy, in polar coordinates of the slip, from just behind the break-away on."""
+    p, t0, late = turntable_puck.PARAMS, float(turntable_puck.break_away(stiction).t), 1e-5
+
+    def load(t: float, x: float, y: float, u: float, v: float) -> np.ndarray:
+        w = p["alpha"] * t
+        return np.array([w * w * x + p["alpha"] * y + 2 * w * v, w * w * y - p["alpha"] * x - 2 * w * u])
+
+    first = [load(t, p["r0"], 0.0, 0.0, 0.0) for t in (t0, t0 + late)]
+    size, angle = np.linalg.norm(first, axis=1) - mu * p["g"], np.arctan2(first[1][1], first[1][0])
+    # The load grows in proportion to the time; where friction does not fall at break-away, slip begins with its square.
+    speed = late * 0.5 * (size[0] + size[1])
+
+    def rate(t: float, y: np.ndarray) -> list[float]:
+        v, n = np.exp(y[2]), np.array([np.cos(y[3]), np.sin(y[3])])
+        a = load(t, y[0], y[1], *(v * n))
+        return [*(v * n), (a @ n - mu * p["g"]) / v, (a[1] * n[0] - a[0] * n[1]) / v]
+
+    end = solve_ivp(rate, (t0 + late, t1), [p["r0"], 0.0, np.log(speed), angle], method="Radau", rtol=1e-10, atol=1e-12)
+    return end.y[:2, -1]
+
+
+def test_the_turntable_lets_the_puck_go_at_the_speed_in_closed_form() -> None:
+    """With and without stiction; the way from there on by a second solver; derivatives of the time in both modes."""
+    mu = turntable_puck.PARAMS["mu"]
+
+    @jax.jit
+    def run(law: Coulomb) -> tuple[Any, Any, Any]:
+        out = simulate(turntable_puck.scene(law), [0.5, 0.0], [0.0, 0.0], 4.0, **TIGHT)
+        return out.events.t[0], out.q[-1], out.event_forces["friction"][0, 0]
+
+    for stiction in (1.0, 1.3):
+        law = Coulomb(mu, stiction * mu)
+        t, q, force = run(law)
+        exact = turntable_puck.break_away(stiction * mu)
+        np.testing.assert_allclose(t, exact.t, rtol=1e-12)
+        # The load of the turning frame against the radius, which friction holds until then.
+        np.testing.assert_allclose(jnp.arctan2(-force[1], force[0]), exact.direction, rtol=1e-10)
+        np.testing.assert_allclose(jnp.linalg.norm(force), 0.5 * 9.81 * stiction * mu, rtol=1e-10)
+        np.testing.assert_allclose(q, after_break_away(mu, stiction * mu, 4.0), rtol=1e-7)
+        slope = jax.grad(lambda x: turntable_puck.break_away(x).t)(stiction * mu)
+        for derive in (jax.jacfwd, jax.jacrev):
+            np.testing.assert_allclose(derive(lambda law: run(law)[0])(law).Fs, slope, rtol=1e-8)
+
+
+def test_the_load_may_be_a_reaction_or_a_number() -> None:
+    """A block on a floor that presses harder and harder, in three coordinates and in two."""
+    lift = 0.2
+
+    def solid(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del p
+        return 0.5 * jnp.sum(qd**2) - (9.81 + lift * t) * q[2]
+
+    def push(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del qd, p
+        return jnp.stack([1.0 + 0.0 * t, 0.5 + 0.0 * t, *(0.0 * q[2:])])
+
+    floor = Constraint(lambda t, q, p: q[2], name="floor")
+    block = Friction(Coulomb(0.3), along=lambda q: q[:2], normal_force="floor")
+    reaction = simulate(
+        Scene(solid, effects=(AppliedForce(push), block), constraints=(floor,)),
+        [0.0] * 3,
+        [1.0, -2.0, 0.0],
+        2.0,
+        **TIGHT,
+    )
+    number = Friction(Coulomb(0.3), along=place, normal_force=lambda t, q, qd, p: 9.81 + lift * t)
+    plane = simulate(
+        Scene(lambda t, q, qd, p: 0.5 * jnp.sum(qd**2), effects=(AppliedForce(push), number)),
+        [0.0] * 2,
+        [1.0, -2.0],
+        2.0,
+        **TIGHT,
+    )
+    np.testing.assert_allclose(reaction.q[-1, :2], plane.q[-1], atol=1e-10)
+    np.testing.assert_allclose(reaction.events.t[0], plane.events.t[0], rtol=1e-9)
+    np.testing.assert_allclose(reaction.forces["friction"][-1], [1.0, 0.5], atol=1e-10)
+
+
+def test_on_an_ellipse_friction_is_the_point_of_greatest_dissipation() -> None:
+    """In slip against 10 000 points of the ellipse; break-away where the load passes it."""
+    ratio, v = 0.5, np.array([0.3, -0.7])
+    scene = puck(Coulomb(F), ellipse=ratio)
+    state = State(jnp.zeros(2), jnp.asarray(v), {})
+    force = np.asarray(forward_dynamics(jnp.zeros(()), state, scene, jnp.asarray(v)).actions["friction"].force)
+    angles = np.linspace(0, 2 * np.pi, 10_001)
+    points = F * np.stack([np.cos(angles), ratio * np.sin(angles)])
+    np.testing.assert_allclose(force @ v, np.max(v @ points), rtol=1e-6)
+    np.testing.assert_allclose((force[0] / F) ** 2 + (force[1] / (ratio * F)) ** 2, 1.0, rtol=1e-12)
+    pull = AppliedForce(lambda t, q, qd, p: t * jnp.stack([jnp.cos(0.7), jnp.sin(0.7)]))
+    run = simulate(Scene(free, scene.params, (pull, *scene.effects)), [0.0, 0.0], [0.0, 0.0], 1.5, **TIGHT)
+    limit = F / np.sqrt(np.cos(0.7) ** 2 + (np.sin(0.7) / ratio) ** 2)
+    np.testing.assert_allclose(run.events.t[0], limit, rtol=1e-10)
+
+
+def test_energy_float32_and_batches() -> None:
+    """The energy balance closes over slip and stick; in float32 the stop is right to rounding, in batches too."""
+    run = simulate(PUCK, [0.0, 0.0], [3.0, 4.0], 8.0, ts=jnp.linspace(0.0, 8.0, 9), **TIGHT)
+    np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-9)
+    np.testing.assert_allclose(run.energy.dissipated[-1], 25.0, rtol=1e-9)
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), PUCK)
+    v = jnp.array([[3.0, 4.0], [-1.0, 0.5], [0.0, 0.0]], jnp.float32)
+    ends = jax.jit(jax.vmap(lambda v: simulate(single, jnp.zeros(2, jnp.float32), v, 8.0).q[-1]))(v)
+    assert ends.dtype == jnp.float32
+    exact = v * jnp.linalg.norm(v, axis=1, keepdims=True) * 2.0 / (2.0 * F)
+    np.testing.assert_allclose(ends, exact, rtol=2e-5, atol=1e-5)
