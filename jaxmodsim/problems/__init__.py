@@ -23,8 +23,8 @@ from . import slipping_bristle as slipping_bristle
 from . import spherical_pendulum as spherical_pendulum
 from . import spiral_bead as spiral_bead
 from . import stick_slip_pendulum as stick_slip_pendulum
-from . import two_balls as two_balls
 from . import turntable_puck as turntable_puck
+from . import two_balls as two_balls
 from . import vibrating_table as vibrating_table
 from . import worm_drive as worm_drive
 from ._named import NamedProblem as NamedProblem
