@@ -251,6 +251,16 @@ REPORTS = {
             ("peer", "at"),
         ),),
     ),
+    "periodic_orbit": Report(
+        "Periodic orbits by shooting, beside simulations until they have settled.", "orbits",
+        (Table(
+            "Two numbers with closed forms: by `periodic_orbit`, which gives the multipliers too and says that it has"
+            " converged, and by a simulation that is taken to have settled. rtol {rtol:g}; Den Hartog's oscillator at"
+            " the frequency {W:g} rad/s with friction of {Fc:g} N, mass, stiffness and force of amplitude 1. At: how"
+            " long the simulation lasts, from rest, with which the search starts too.",
+            ("error", "run"), ("case", "peer", "at"),
+        ),),
+    ),
     "measured_axis": Report(
         "`jaxmodsim fit` on a measured axis.", "measured_record",
         (Table(

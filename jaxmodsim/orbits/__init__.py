@@ -3,6 +3,8 @@
 from ._branch import Branch as Branch
 from ._branch import SpecialOrbit as SpecialOrbit
 from ._continue import continue_orbits as continue_orbits
+from ._hunting import Hunting as Hunting
+from ._hunting import hunting as hunting
 from ._orbit import PeriodicOrbit as PeriodicOrbit
 from ._periodic_orbit import periodic_orbit as periodic_orbit
 from ._return_map import OrbitError as OrbitError

@@ -92,7 +92,7 @@ def continue_orbits(
         ```
     """
     first, last = _span(span)
-    _check_parameter(scene, parameter)
+    check_parameter(scene, parameter)
     step, most = as_float(step, name="step", lower=0.0), as_whole(max_orbits, name="max_orbits")
     if isinstance(guess, SpecialOrbit):
         begin = _doubled(scene, guess, parameter, last - first, period, section, rtol, atol)
@@ -213,7 +213,13 @@ def _span(span: Sequence[float]) -> tuple[float, float]:
     return first, last
 
 
-def _check_parameter(scene: Scene, parameter: str) -> None:
+def check_parameter(scene: Scene, parameter: str) -> None:
+    """Refuse what is no number of the scene.
+
+    **Raises:**
+
+    - `ValueError` with the numbers that there are.
+    """
     known = elements(scene)
     if parameter not in known:
         raise ValueError(

@@ -11,6 +11,8 @@ _ITERATIONS, _HALVINGS = 30, 6
 _GOAL, _ENOUGH = 1e-12, 1e-8
 # Singular values below this part of the largest one are no directions.
 _RANK = 1e-10
+# Part of the first period below which an iteration has run into an equilibrium.
+_COLLAPSED = 1e-3
 # Angle between section and orbit that is none.
 _TANGENT = 1e-8
 
@@ -34,6 +36,11 @@ def newton(
     for i in range(_ITERATIONS):
         _refuse_tangent(point, scale)
         history.append(size)
+        if problem.autonomous and point.period < _COLLAPSED * period:
+            raise OrbitError(
+                "The iteration runs into an equilibrium, where every period will do: there is no orbit near the start."
+                " Begin nearer to it, from a longer `settle`."
+            )
         if size < _GOAL:
             return point, i
         step = _step(point, scale, extra)

@@ -1,6 +1,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import jaxmodsim as jms
 from jaxmodsim.orbits import OrbitError
@@ -90,6 +91,63 @@ def test_branch_of_a_forced_oscillator_with_dry_friction_and_its_loss_of_stick()
         assert orbit.residual < 1e-9
     assert branch.stable.all()
     assert "loss of stick" in str(branch)
+
+
+def test_onset_of_stick_is_where_the_closed_form_without_stick_fails():
+    W = 0.7
+    friction = jms.Friction(jms.Coulomb(0.7))
+    scene = jms.Scene(spring, params={"a": 0.0, "W": W}, effects=(jms.AppliedForce(swing), friction))
+    branch = jms.continue_orbits(
+        scene, ([0.0], [0.0]), "friction.Fc", (0.7, 0.74), period=of_frequency, settle=900.0, step=0.2
+    )
+    (point,) = branch.points
+    # Behind a turning point the acceleration is W^2 amplitude - Fc, with Den Hartog's amplitude; stick where it ends.
+    V, U = 1 / (1 - W**2), np.sin(np.pi / W) / (W * (1 + np.cos(np.pi / W)))
+    assert point.kind == "onset of stick"
+    np.testing.assert_allclose(point.value, V * W**2 / np.sqrt(1 + W**4 * U**2), rtol=1e-6)
+
+
+def van_der_pol_force(t, q, qd, p):
+    return jnp.array([(1.0 - q[0] ** 2) * qd[0] + p["F"] * jnp.cos(p["W"] * t)])
+
+
+def test_neimark_sacker_point_of_a_forced_van_der_pol_oscillator():
+    effects = (jms.AppliedForce(van_der_pol_force),)
+    scene = jms.Scene(spring, params={"a": 0.0, "F": 5.0, "W": 1.7}, effects=effects)
+    branch = jms.continue_orbits(scene, ([0.0], [0.0]), "F", (5.0, 2.0), period=of_frequency, step=0.1)
+    (point,) = branch.points
+    assert point.kind == "Neimark-Sacker"
+    assert list(branch.stable) == [x > point.value for x in branch.values]
+    np.testing.assert_allclose(np.abs(point.orbit.multipliers), 1.0, atol=1e-8)
+    assert np.min(np.abs(np.imag(point.orbit.multipliers))) > 0.1
+    # By Liouville's formula their product is 1 where the mean of q^2 is, in a second solver too.
+    orbit, T = point.orbit, 2 * np.pi / 1.7
+    t = np.linspace(0.0, T, 400, endpoint=False)
+    second = solve_ivp(
+        lambda t, y: [y[1], (1 - y[0] ** 2) * y[1] - y[0] + point.value * np.cos(1.7 * t)],
+        *((0.0, T), [orbit.q[0], orbit.qd[0]], "DOP853", [*t, T]), rtol=1e-12, atol=1e-13,
+    )  # fmt: skip
+    np.testing.assert_allclose(np.mean(second.y[0, :-1] ** 2), 1.0, rtol=1e-7)
+    np.testing.assert_allclose(second.y[:, -1], second.y[:, 0], atol=1e-8)
+
+
+def buckling(_t, q, qd, p):
+    return 0.5 * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2 - 0.25 * q[0] ** 4
+
+
+def pulsing_damper(t, _q, qd, _p):
+    return -(1.0 + 0.5 * jnp.cos(t)) * qd
+
+
+def test_branch_point_where_a_spring_buckles():
+    scene = jms.Scene(buckling, params={"k": 0.2}, effects=(jms.AppliedForce(pulsing_damper),))
+    branch = jms.continue_orbits(scene, ([0.0], [0.0]), "k", (0.2, -0.2), period=2 * np.pi, settle=0.0, step=0.3)
+    (point,) = branch.points
+    assert point.kind == "branch point"
+    np.testing.assert_allclose(point.value, 0.0, atol=1e-8)
+    # Without a spring velocities decay by the mean of the damping, and positions stay.
+    np.testing.assert_allclose(np.sort(np.real(point.orbit.multipliers)), [np.exp(-2 * np.pi), 1.0], rtol=1e-7)
+    assert list(branch.stable) == [k > 0 for k in branch.values]
 
 
 def test_folds_of_duffing_and_a_branch_that_goes_on_from_its_store(tmp_path):
