@@ -254,10 +254,10 @@ REPORTS = {
     "periodic_orbit": Report(
         "Periodic orbits by shooting, beside simulations until they have settled.", "orbits",
         (Table(
-            "Two numbers with closed forms: by `periodic_orbit`, which gives the multipliers too and says that it has"
+            "Numbers with closed forms: by `periodic_orbit`, which gives the multipliers too and says that it has"
             " converged, and by a simulation that is taken to have settled. rtol {rtol:g}; Den Hartog's oscillator at"
-            " the frequency {W:g} rad/s with friction of {Fc:g} N, mass, stiffness and force of amplitude 1. At: how"
-            " long the simulation lasts, from rest, with which the search starts too.",
+            " {W:g} rad/s, mass, stiffness and amplitude of the force 1. At: how long the simulation lasts, from rest;"
+            " with one the search starts too.",
             ("error", "run"), ("case", "peer", "at"),
         ),),
     ),

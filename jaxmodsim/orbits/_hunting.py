@@ -62,8 +62,8 @@ def hunting(
 
     **Arguments:**
 
-    - `law`: friction law with the parameters `Fc` and `Fs > Fc`. With `Fs = Fc` an axis does not hunt, and with
-      `Coulomb` it does at any gain: what ends it is a curve that falls over some velocity, as that of `Stribeck`.
+    - `law`: friction law with the parameters `Fc` and `Fs > Fc`. With `Fs = Fc` an axis does not hunt. What damping
+      ends is hunting with a curve that falls over some velocity, as that of `Stribeck`; with `Coulomb` it only shrinks.
     - `gain`: which number changes: `"kp"`, `"ki"`, `"kd"`, or another one of the scene, such as `"m"` or
       `"friction.Fs"`.
     - `last`: its last value; the first one is that of the axis.
