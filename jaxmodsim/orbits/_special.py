@@ -35,9 +35,8 @@ def locate(one: BranchStep, two: BranchStep, length: float, index: int) -> list[
         located = [each for each in located if each[1].kind != CROSSING]
     before, after = (_cycle(x.orbit.sequence) for x in (one, two))
     if before != after:
-        at = _cut(one, before, length)
-        if at is not None:
-            located.append((at, _special(one, at, _change(before, after), index)))
+        at = _cut(one, before, after, length)
+        located.append((at, _special(one, at, _change(before, after), index)))
     return [each for _, each in sorted(located, key=lambda pair: pair[0])]
 
 
@@ -86,17 +85,19 @@ def _root(one: BranchStep, test: _Test, length: float, ends: tuple[float, float]
         return None
 
 
-def _cut(one: BranchStep, before: Sequence, length: float) -> float | None:
+def _cut(one: BranchStep, before: Sequence, after: Sequence, length: float) -> float:
     """Where on the step the sequence of modes is another one."""
     low, high, dof = 0.0, length, len(one.orbit.q)
-    try:
-        while high - low > _CUT * length:
-            middle = 0.5 * (low + high)
+    # Beside a grazing the derivative of the run is unbounded where it strikes: Newton's iteration may fail there.
+    singular_before, failed = len(before) > len(after), False
+    while high - low > _CUT * length:
+        middle = 0.5 * (low + high)
+        try:
             same = _cycle(mode_sequence(one.problem, one.corrected(middle)[0], dof)) == before
-            low, high = (middle, high) if same else (low, middle)
-    except OrbitError:
-        return None
-    return high
+        except OrbitError:
+            same, failed = singular_before, True
+        low, high = (middle, high) if same else (low, middle)
+    return low if failed and not singular_before else high
 
 
 def _cycle(sequence: Sequence) -> Sequence:

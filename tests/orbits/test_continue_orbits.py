@@ -4,6 +4,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxmodsim as jms
+from jaxmodsim.mechanics import Contact
 from jaxmodsim.orbits import OrbitError
 from jaxmodsim.problems import vibrating_table
 
@@ -148,6 +149,24 @@ def test_branch_point_where_a_spring_buckles():
     # Without a spring velocities decay by the mean of the damping, and positions stay.
     np.testing.assert_allclose(np.sort(np.real(point.orbit.multipliers)), [np.exp(-2 * np.pi), 1.0], rtol=1e-7)
     assert list(branch.stable) == [k > 0 for k in branch.values]
+
+
+def gap_to_the_stop(_t, q, p):
+    return p["stop"] - q[0]
+
+
+def test_grazing_is_where_the_amplitude_without_impacts_reaches_the_stop():
+    W, c = 0.8, 0.3
+    amplitude = 1 / np.hypot(1 - W**2, c * W)
+    effects = (jms.AppliedForce(swing), jms.Friction(jms.Viscous(c)))
+    stop = Contact(gap_to_the_stop, restitution=0.5, name="stop")
+    scene = jms.Scene(spring, params={"a": 0.0, "W": W, "stop": 3.0}, effects=effects, constraints=(stop,))
+    span = (amplitude + 0.01, amplitude - 0.01)
+    branch = jms.continue_orbits(scene, ([0.0], [0.0]), "stop", span, period=of_frequency, settle=200.0, step=0.3)
+    (point,) = branch.points
+    assert point.kind == "grazing"
+    np.testing.assert_allclose(point.value, amplitude, rtol=1e-7)
+    assert list(branch.stable) == [x > amplitude for x in branch.values]
 
 
 def test_folds_of_duffing_and_a_branch_that_goes_on_from_its_store(tmp_path):
