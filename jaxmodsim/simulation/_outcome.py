@@ -206,7 +206,7 @@ def end_code(
         # The run ends in front of the place where the equations cease to hold: look a little further.
         beyond = y._replace(q=y.q + ahead * y.qd, qd=y.qd + ahead * rate.qd)
         looks = jtu.tree_map(lambda *x: jnp.stack(x), (t + ahead, beyond), (t, y))
-        unique = jax.lax.map(lambda at: _unique(scene, *at, mode), looks)  # traced and compiled once
+        unique = jax.lax.map(lambda at: _unique(scene, at[0], at[1], mode), looks)  # traced and compiled once
         code = jnp.where(early & ~jnp.all(unique), offsets.checks, code)
     if scene.constraints:
         kept = constraint_residual(now.bind_modes(mode).constraints, t, y.q, y.qd, now.params)[0] <= _KEPT
