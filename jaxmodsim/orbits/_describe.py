@@ -1,5 +1,7 @@
 """From a solved start to a `PeriodicOrbit`."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -15,8 +17,19 @@ _INTERVALS = 512
 _ZERO = 1e-4
 
 
-def describe(problem: OrbitProblem, point: ShotOrbit, dof: int) -> tuple[PeriodicOrbit, np.ndarray, np.ndarray]:
-    """The orbit, and the times [s] of the least and greatest coordinates, shape `[dof]` each."""
+class Extremes(NamedTuple):
+    """The least or greatest values of the coordinates along an orbit, shape `[dof]` each.
+
+    - `time`: about when [s]; `acceleration`: then, infinite where the velocity is not zero (an impact, the ends).
+    """
+
+    value: np.ndarray
+    time: np.ndarray
+    acceleration: np.ndarray
+
+
+def describe(problem: OrbitProblem, point: ShotOrbit, dof: int) -> tuple[PeriodicOrbit, Extremes, Extremes]:
+    """The orbit, and its least and greatest coordinates."""
     problem, once = _once(problem, point, dof)
     scene, period = problem.scene, point.period
     state = unpack(scene, jnp.asarray(point.x), dof)
@@ -31,15 +44,15 @@ def describe(problem: OrbitProblem, point: ShotOrbit, dof: int) -> tuple[Periodi
     )
     shares, held = _shares(once, run, changes, (begin, end))
     strikes = times[[scene.part_names[i] in scene.contacts for _, i, _, _ in changes]]
-    lowest, highest = (_extreme(run, sign, strikes) for sign in (-1.0, 1.0))
+    lowest, highest = (_extremes(run, sign, strikes) for sign in (-1.0, 1.0))
     x = states_of(run)
     scale = magnitudes(x, period)[:-1]
     orbit = PeriodicOrbit(
         jnp.asarray(begin),
         *state,
         jnp.asarray(period),
-        -jnp.asarray(lowest[0]),
-        jnp.asarray(highest[0]),
+        jnp.asarray(lowest.value),
+        jnp.asarray(highest.value),
         floquet(problem, point, held, scale),
         problem.autonomous,
         float(np.max(np.abs(point.residual[: len(point.x)]) / scale)),
@@ -47,7 +60,7 @@ def describe(problem: OrbitProblem, point: ShotOrbit, dof: int) -> tuple[Periodi
         _sequence(once),
         shares,
     )
-    return orbit, lowest[1], highest[1]
+    return orbit, lowest, highest
 
 
 def _once(problem: OrbitProblem, point: ShotOrbit, dof: int) -> tuple[OrbitProblem, Trajectory]:
@@ -118,8 +131,8 @@ def floquet(problem: OrbitProblem, point: ShotOrbit, zeros: int, scale: np.ndarr
     return np.append(1.0, values) if problem.autonomous else values
 
 
-def _extreme(run: Trajectory, sign: float, strikes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Greatest value of `sign q` along a run and its time, shape `[dof]` each: on cubics between the times of the run.
+def _extremes(run: Trajectory, sign: float, strikes: np.ndarray) -> Extremes:
+    """Where `sign q` is greatest along a run: on cubics between the times of the run.
 
     Before an impact the velocity is another one than at it, so there the ends of the interval are all.
     """
@@ -136,6 +149,8 @@ def _extreme(run: Trajectory, sign: float, strikes: np.ndarray) -> tuple[np.ndar
     values = a + s * (b + s * (u + s * v))
     values = np.concatenate([values, q[-1:]])
     at = np.concatenate([t[:-1, None] + s * h, np.full((1, q.shape[1]), t[-1])])
-    best = np.argmax(values, axis=0)
-    columns = np.arange(q.shape[1])
-    return values[best, columns], at[best, columns]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        acceleration = np.where(inside, (2.0 * u + 6.0 * v * s) / h**2, np.inf)
+    acceleration = np.concatenate([acceleration, np.full((1, q.shape[1]), np.inf)])
+    place = np.argmax(values, axis=0), np.arange(q.shape[1])
+    return Extremes(sign * values[place], at[place], sign * acceleration[place])

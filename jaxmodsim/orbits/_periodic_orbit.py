@@ -16,7 +16,7 @@ from jaxtyping import ArrayLike, PyTree
 from .._core.arguments import as_float, check_real
 from ..scene import Scene, State, read_element
 from ..simulation import simulate
-from ._describe import describe
+from ._describe import Extremes, describe
 from ._newton import newton, scaled
 from ._orbit import PeriodicOrbit
 from ._return_map import (
@@ -37,6 +37,8 @@ from ._settle import SettledState, magnitudes, settled, states_of
 _PERIODS = 20
 # A direction in which the derivative of the return map is one to so many digits.
 _FAMILY = 1e-7
+# At another time, in periods, a scene that does not depend on it ends in the same state; relative, per multiplier.
+_OTHER_TIME, _SAME = 0.381966, 1e-6
 
 Guess: TypeAlias = "PeriodicOrbit | tuple[ArrayLike | list[float], ArrayLike | list[float]]"
 
@@ -82,7 +84,7 @@ def periodic_orbit(
 
     - `ValueError` for wrong arguments, float32, and inside `jax.jit` or `jax.vmap`.
     - `OrbitError` where there is no convergence, the run does not return or comes to rest, the section is degenerate,
-      or the orbit is one of a family.
+      the orbit is one of a family, or the scene depends on time otherwise than `period` says.
 
     ??? cite "Reference"
 
@@ -96,6 +98,7 @@ def periodic_orbit(
     known = jtu.tree_map(jax.lax.stop_gradient, scene)
     problem, start, dof = prepare(known, guess, period, section, settle, rtol, atol, None)
     point, _ = newton(problem, start.x, start.period, 0.0, dof, start.scale, None)
+    refuse_clock(problem, point, start.scale, dof)
     refuse_family(problem, point, start.scale, dof)
     orbit, lowest, highest = describe(problem, point, dof)
     if not any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(scene)):
@@ -214,6 +217,30 @@ def anchored(problem: OrbitProblem, start: SettledState, dof: int) -> OrbitProbl
     return eqx.tree_at(lambda p: p.normal, problem, jnp.asarray(flow / scale**2))
 
 
+def refuse_clock(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, dof: int) -> None:
+    """Refuse an orbit that does not return at other times: a period later, or at any time if it has no given period.
+
+    **Raises:**
+
+    - `OrbitError` where the scene depends on time otherwise than the period says.
+    """
+    moved = problem.phase + (_OTHER_TIME if problem.autonomous else 1.0)
+    later = evaluate(eqx.tree_at(lambda p: p.phase, problem, moved), point.x, point.period, point.value, dof)
+    n = len(point.x)
+    growth = max(1.0, float(np.max(np.abs(np.linalg.eigvals(point.monodromy)))))
+    if not later.failure and np.max(np.abs(later.residual[:n]) / scale[:n]) < _SAME * growth:
+        return
+    if problem.autonomous:
+        raise OrbitError(
+            "The scene depends on time: from the same state at another time it goes elsewhere. Pass period, that of its"
+            ' forces, as in period=lambda p: 2 * jnp.pi / p["omega"].'
+        )
+    raise OrbitError(
+        "The run does not go on as an orbit: the forces of the scene do not repeat after the period"
+        f" {point.period:.6g} s. Pass a multiple of theirs."
+    )
+
+
 def refuse_family(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, dof: int) -> None:
     """Refuse an orbit that has others beside it, not only to first order.
 
@@ -238,7 +265,7 @@ def refuse_family(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, do
 
 
 def _with_derivatives(
-    problem: OrbitProblem, point: ShotOrbit, orbit: PeriodicOrbit, extrema: tuple[np.ndarray, np.ndarray]
+    problem: OrbitProblem, point: ShotOrbit, orbit: PeriodicOrbit, extrema: tuple[Extremes, Extremes]
 ) -> PeriodicOrbit:
     """The orbit with the derivatives of the implicit function theorem: one step of Newton from where it is solved."""
     dof, n = orbit.q.shape[0], len(point.x)
@@ -253,10 +280,9 @@ def _with_derivatives(
     x = x + change[:n]
     period = period + change[n] if problem.autonomous else problem.period_of(problem.scene, period)
     state = unpack(problem.scene, x, dof)
-    # At an extremum the velocity is zero, so its time may be held.
-    times = np.concatenate(extrema)
+    times, acceleration = (np.concatenate([each[i] for each in extrema]) for i in (1, 2))
     order = np.argsort(times, kind="stable")
-    q = simulate(
+    run = simulate(
         *(problem.scene, state.q, state.qd, orbit.t0 + point.period),
         t0=orbit.t0,
         z0=state.z,
@@ -265,14 +291,13 @@ def _with_derivatives(
         atol=problem.atol,
         max_events=MAX_EVENTS,
         throw=False,
-    ).q
-    places = np.argsort(order, kind="stable")
+    )
+    place = np.argsort(order, kind="stable"), np.tile(np.arange(dof), 2)
+    # The times are right to some digits alone: a parabola leads from there to where the velocity is zero.
+    made = run.q[place] - 0.5 * run.qd[place] ** 2 / acceleration
     lowest, highest = (
-        value + (made - jax.lax.stop_gradient(made))
-        for value, made in (
-            (orbit.lowest, q[places[:dof], np.arange(dof)]),
-            (orbit.highest, q[places[dof:], np.arange(dof)]),
-        )
+        value + (x - jax.lax.stop_gradient(x))
+        for value, x in zip((orbit.lowest, orbit.highest), made.reshape(2, dof), strict=True)
     )
     q, qd, z = state
     return replace(orbit, q=q, qd=qd, z=z, period=period, lowest=lowest, highest=highest)
