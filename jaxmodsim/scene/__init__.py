@@ -7,6 +7,8 @@ from ._dynamics import ConstraintReaction as ConstraintReaction
 from ._dynamics import State as State
 from ._dynamics import forward_dynamics as forward_dynamics
 from ._dynamics import from_dynamics as from_dynamics
+from ._dynamics import start as start
+from ._dynamics import switch as switch
 from ._dynamics import vector_field as vector_field
 from ._event_driven import mode_numbers as mode_numbers
 from ._implicit import check_step as check_step

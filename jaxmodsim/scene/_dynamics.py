@@ -189,30 +189,8 @@ class Dynamics(NamedTuple):
             atol.append(jnp.where(gaps > 0, 0.0, tolerances[1]))
         return jnp.concatenate(guards), jnp.concatenate(atol)
 
-    def start(self, rest: Scalar) -> tuple[State, Float[Array, " n"]]:
-        """State and modes to begin with: elements with no more slip velocity than `rest` or rounding stick if they can.
-
-        Contacts without gap and without velocity are closed. They do not depend on `mode`.
-        """
-        t, y, scene = self.t, self.y, self.scene
-        if scene.contacts:
-            eps = 8.0 * float(jnp.finfo(y.q.dtype).eps)
-            closed = []
-            for each in scene.contacts.values():
-                gap, velocity = each.error(t, y.q, scene.params), each.rate(t, y.q, y.qd, scene.params)
-                size = jnp.max(jnp.abs(y.q)), jnp.max(jnp.abs(y.qd))
-                here = jnp.maximum(jnp.stack([gap, velocity])[:, 0], 0.0)
-                closed.append(jnp.all(here <= jnp.maximum(rest, eps * jnp.stack(size))) & (velocity[0] >= -rest))
-            modes = jnp.where(jnp.stack(closed), 1.0, jnp.zeros_like(y.q[0]))
-            if not scene.event_driven:
-                return y, modes
-            begun = jnp.concatenate([jnp.zeros_like(self._elements), modes])
-            state, mode = forward_dynamics(t, y, scene, begun)._start_friction(rest)
-            return state, jnp.concatenate([mode, modes])
-        return self._start_friction(rest)
-
-    def _start_friction(self, rest: Scalar) -> tuple[State, Float[Array, " n"]]:
-        """State, and modes of the friction elements, to begin with."""
+    def start_friction(self, rest: Scalar) -> tuple[State, Float[Array, " n"]]:
+        """State, and modes of the friction elements, to begin with; they do not depend on those in `mode`."""
         t, y, scene, elements = self.t, self.y, self.scene, self.friction_elements
         speed = []
         for each in scene.event_driven.values():
@@ -228,30 +206,24 @@ class Dynamics(NamedTuple):
         )
         return self._stick(mode), mode
 
-    def switch(
-        self, fired: Bool[Array, " guards"], rest: Scalar, elastic: bool = True
+    def switch_struck(
+        self, fired: Bool[Array, " n"], stopped: Bool[Array, " elements"], struck: Bool[Array, ""], rest: Scalar
     ) -> tuple[State, Float[Array, " n"]]:
-        """State and modes after the guards that `fired`; `elastic` is False where impacts have accumulated."""
-        n, mode = self._elements.size, self._elements
-        if not self._closed.size:
-            return self._switch_friction(fired, mode, rest)
-        qd, closed, stopped = impact(self.t, self.y.q, self.y.qd, self.scene, self._closed, fired[n:], rest, elastic)
-        struck = self.y._replace(qd=qd)
-        if not n:
-            return struck, closed
-        after = forward_dynamics(self.t, struck, self.scene, jnp.concatenate([mode, closed]))
-        # An impact may turn a slip, and end a stick.
-        elements = after.friction_elements
-        v = jax.lax.stop_gradient(elements.v[:n])
-        turned = jnp.any(qd != self.y.qd) & (elements.magnitude(v) > rest)
-        fired = (fired[:n] & ~turned) | (elements.in_rows(stopped) & ~elements.sticks(mode))
-        mode = jnp.where(turned, elements.slipping(v, after._speed_of_rest(rest)), mode)
-        state, mode = after._switch_friction(fired, mode, rest)
-        return state, jnp.concatenate([mode, closed])
+        """State and modes of the friction elements behind an impact, which may turn a slip, and end a stick.
 
-    def _switch_friction(
+        `stopped` are the elements whose slip it has taken; `struck` is False where no velocity has changed.
+        """
+        elements, mode = self.friction_elements, self._elements
+        v = jax.lax.stop_gradient(elements.v[: mode.size])
+        turned = struck & (elements.magnitude(v) > rest)
+        fired = (fired & ~turned) | (elements.in_rows(stopped) & ~elements.sticks(mode))
+        mode = jnp.where(turned, elements.slipping(v, self._speed_of_rest(rest)), mode)
+        return self.switch_friction(fired, mode, rest)
+
+    def switch_friction(
         self, fired: Bool[Array, " n"], mode: Float[Array, " n"], rest: Scalar
     ) -> tuple[State, Float[Array, " n"]]:
+        """State and modes of the friction elements after the guards that `fired`."""
         elements, rest = self.friction_elements, self._speed_of_rest(rest)
         mode, fired = renew_slip(elements, mode, fired, rest) if elements.planes else (mode, fired)
         sticks = elements.sticks(mode)
@@ -459,6 +431,62 @@ def from_dynamics(get: Callable[[Dynamics], _Value], t: Scalar, y: State, scene:
     Laws, loads and solves are small arrays like the terms of the Lagrangian; see `in_scalars`.
     """
     return in_scalars(lambda t, y, mode: get(forward_dynamics(t, y, scene, mode)), t, y, mode, seed=y.q)
+
+
+def start(
+    t: Scalar, y: State, scene: Scene, mode: Float[Array, " modes"], rest: Scalar
+) -> tuple[State, Float[Array, " modes"]]:
+    """State and modes to begin with: elements with no more slip velocity than `rest` or rounding stick if they can.
+
+    Contacts without gap and without velocity are closed. Of `mode` only the shape counts.
+    """
+    if not scene.contacts:
+        return from_dynamics(lambda d: d.start_friction(rest), t, y, scene, mode)
+    eps, params = 8.0 * float(jnp.finfo(y.q.dtype).eps), scene.bind_time(t).params
+    closed = []
+    for each in scene.contacts.values():
+        gap, velocity = each.error(t, y.q, params), each.rate(t, y.q, y.qd, params)
+        size = jnp.max(jnp.abs(y.q)), jnp.max(jnp.abs(y.qd))
+        here = jnp.maximum(jnp.stack([gap, velocity])[:, 0], 0.0)
+        closed.append(jnp.all(here <= jnp.maximum(rest, eps * jnp.stack(size))) & (velocity[0] >= -rest))
+    modes = jnp.where(jnp.stack(closed), 1.0, jnp.zeros_like(y.q[0]))
+    if not scene.event_driven:
+        return y, modes
+    begun = jnp.concatenate([jnp.zeros_like(mode[: _rows_of_friction(scene, mode)]), modes])
+    state, slips = from_dynamics(lambda d: d.start_friction(rest), t, y, scene, begun)
+    return state, jnp.concatenate([slips, modes])
+
+
+def switch(
+    t: Scalar,
+    y: State,
+    scene: Scene,
+    mode: Float[Array, " modes"],
+    fired: Bool[Array, " guards"],
+    rest: Scalar,
+    elastic: bool = True,
+) -> tuple[State, Float[Array, " modes"]]:
+    """State and modes after the guards that `fired`; `elastic` is False where impacts have accumulated.
+
+    The impact and the friction behind it are two functions for `in_scalars`, of which one would be too large for it.
+    """
+    if not scene.contacts:
+        return from_dynamics(lambda d: d.switch_friction(fired, mode, rest), t, y, scene, mode)
+    n = _rows_of_friction(scene, mode)
+
+    def strike(t: Array, q: Array, qd: Array) -> tuple[Array, Array, Array]:
+        return impact(t, q, qd, scene.bind_state(t, q, qd), mode[n:], fired[n:], rest, elastic)
+
+    qd, closed, stopped = in_scalars(strike, t, y.q, y.qd, seed=y.q)
+    after = y._replace(qd=qd)
+    if not n:
+        return after, closed
+    struck = jnp.any(qd != y.qd)
+    after, slips = from_dynamics(
+        lambda d: d.switch_struck(fired[:n], stopped, struck, rest),
+        *(t, after, scene, jnp.concatenate([mode[:n], closed])),
+    )
+    return after, jnp.concatenate([slips, closed])
 
 
 def vector_field(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> State:

@@ -21,6 +21,8 @@ from ..scene import (
     linear_solver,
     mode_numbers,
     scene_step,
+    start,
+    switch,
 )
 from ..solvers import EventState
 
@@ -176,7 +178,7 @@ class RunFunctions(eqx.Module):
     def begin(self, t: Array, y: PyTree, scene: Scene, mode: Array) -> tuple[PyTree, Array]:
         """State and modes to begin with, whatever `mode` is."""
         state = self.system.state(t, y, scene)
-        state, mode = from_dynamics(lambda d: d.start(self.rest), t, state, scene, mode)
+        state, mode = start(t, state, scene, mode, self.rest)
         return self.system.replace(t, y, state, scene), mode
 
     @at_time
@@ -186,7 +188,7 @@ class RunFunctions(eqx.Module):
 
     def _switch(self, t: Array, s: EventState, scene: Scene, fired: Array, elastic: bool) -> EventState:
         before = self.system.state(t, s.y, scene)
-        state, mode = from_dynamics(lambda d: d.switch(fired, self.rest, elastic), t, before, scene, s.mode)
+        state, mode = switch(t, before, scene, s.mode, fired, self.rest, elastic)
         after = self.system.replace(t, s.y, state, scene)
         changed = jnp.any(mode != s.mode) | jnp.any(state.qd != before.qd)
         return s._replace(y=jtu.tree_map(lambda a, b: jnp.where(changed, a, b), after, s.y), mode=mode)

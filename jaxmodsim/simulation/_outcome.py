@@ -4,8 +4,10 @@ from typing import NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.core
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -14,7 +16,7 @@ from .._core.parameters import check_ranges, modules_of, range_checks
 from .._core.scalarise import in_scalars
 from ..friction import Regularized
 from ..mechanics import constraint_residual, motion_equations, quadratic
-from ..scene import Scene, State, describe_series, forward_dynamics, quantity_of
+from ..scene import Scene, State, describe_series, from_dynamics, quantity_of
 from ..solvers import ACCUMULATION, TOO_MANY
 
 # Codes of how a run ended; `outcome_messages` has the sentence of each.
@@ -203,8 +205,9 @@ def end_code(
     if scene.checks:
         # The run ends in front of the place where the equations cease to hold: look a little further.
         beyond = y._replace(q=y.q + ahead * y.qd, qd=y.qd + ahead * rate.qd)
-        for t_look, y_look in ((t + ahead, beyond), (t, y)):
-            code = jnp.where(early & ~_unique(scene, t_look, y_look, mode), offsets.checks, code)
+        looks = jtu.tree_map(lambda *x: jnp.stack(x), (t + ahead, beyond), (t, y))
+        unique = jax.lax.map(lambda at: _unique(scene, at[0], at[1], mode), looks)  # traced and compiled once
+        code = jnp.where(early & ~jnp.all(unique), offsets.checks, code)
     if scene.constraints:
         kept = constraint_residual(now.bind_modes(mode).constraints, t, y.q, y.qd, now.params)[0] <= _KEPT
         code = jnp.where(kept | ~finite, code, DRIFTED)
@@ -224,7 +227,7 @@ def _penetration(scene: Scene, t: Array, y: State) -> Float[Array, ""]:
 
 def _unique(scene: Scene, t: Array, y: State, mode: Array | None) -> Bool[Array, ""]:
     """Whether friction under reactions has a unique solution, in a scene with some."""
-    margin = forward_dynamics(t, y, scene, mode).uniqueness
+    margin = from_dynamics(lambda d: d.uniqueness, t, y, scene, mode)
     assert margin is not None
     return margin > 0
 

@@ -40,6 +40,46 @@ def test_an_oblique_impact_of_a_disc(law):
     np.testing.assert_allclose(slope, -1.8 * speed / J, rtol=1e-9)
 
 
+def test_friction_of_an_impact_may_depend_on_where_it_happens():
+    """The coefficient of `scaled_by` is that of the place and the parameters at the instant of the impact."""
+    law = jms.scaled_by(jms.Coulomb(0.05), lambda t, q, qd, p: p["wear"] * (1.0 + q[0]))
+    scene = jms.Scene(
+        lambda t, q, qd, p: 0.5 * (qd[0] ** 2 + qd[1] ** 2 + J * qd[2] ** 2),
+        params={"wear": 1.0},
+        effects=(jms.Friction(law, along=lambda q: q[0] + q[2], normal_force="floor"),),
+        constraints=(jms.Contact(lambda t, q, p: q[1], restitution=0.8, name="floor"),),
+    )
+
+    def end(wear):
+        worn = jms.scene.replace_numbers(scene, {"wear": wear})
+        return jms.simulate(worn, [0.0, 1.0, 0.0], [1.0, -2.0, 0.3], 1.0, rtol=1e-10, atol=1e-12).qd[-1]
+
+    push = 0.05 * 1.5 * 1.8 * 2.0  # it strikes at x = 0.5, and slides all through
+    value, slope = jax.jvp(end, (jnp.asarray(1.2),), (jnp.asarray(1.0),))
+    np.testing.assert_allclose(value, [1.0 - 1.2 * push, 1.6, 0.3 - 1.2 * push / J], rtol=1e-10)
+    np.testing.assert_allclose(slope, [-push, 0.0, -push / J], atol=1e-10)
+
+
+def test_impacts_with_friction_in_batches_and_single_precision():
+    """Batches of runs that slide either way or stick, equal to single runs and, in float32, to the closed form."""
+    scene, speed = _disc(0.8, 0.3), 2.0
+    vx, spin = np.array([1.0, 1.0, -2.0]), np.array([0.3, -3.0, 1.8])
+
+    def after(scene, v):
+        return jms.simulate(scene, jnp.array([0.0, 1.0, 0.0], v.dtype), v, 1.0).qd[-1]
+
+    before = jnp.asarray(np.stack([vx, np.full(3, -speed), spin], axis=1))
+    batch = jax.jit(jax.vmap(lambda v: after(scene, v)))(before)
+    np.testing.assert_allclose(batch, [after(scene, v) for v in before], rtol=1e-12)
+    push = np.clip((vx + spin) / (1 + 1 / J), -0.3 * 1.8 * speed, 0.3 * 1.8 * speed)
+    exact = np.stack([vx - push, np.full(3, 0.8 * speed), spin - push / J], axis=1)
+    np.testing.assert_allclose(batch, exact, rtol=1e-9)
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), scene)
+    short = jax.jit(jax.vmap(lambda v: after(single, v)))(before.astype(jnp.float32))
+    assert short.dtype == jnp.float32
+    np.testing.assert_allclose(short, exact, rtol=1e-5)
+
+
 def test_a_block_lands_with_friction_slides_and_stops():
     mu, g, height, start = 0.3, 9.81, 0.5, 2.0
     block = jms.Scene(

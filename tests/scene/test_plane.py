@@ -261,3 +261,54 @@ def test_energy_float32_and_batches() -> None:
     assert ends.dtype == jnp.float32
     exact = v * jnp.linalg.norm(v, axis=1, keepdims=True) * 2.0 / (2.0 * F)
     np.testing.assert_allclose(ends, exact, rtol=2e-5, atol=1e-5)
+
+
+MASS, HALF, LIMIT = 2.0, 0.5, 1.5
+
+
+def bar(load: Any, *limits: float) -> Scene:
+    """A bar seen from above, on rough feet at its ends; the coordinates are its centre and its angle."""
+
+    def feet(side: float) -> Any:
+        return lambda q: q[:2] + side * HALF * jnp.stack([jnp.cos(q[2]), jnp.sin(q[2])])
+
+    elements = [
+        Friction(Coulomb(limit), along=feet(side), name=name)
+        for limit, side, name in zip(limits, (-1.0, 1.0), ("left", "right"), strict=True)
+    ]
+    inertia = MASS * HALF**2 / 3.0
+    return Scene(
+        lambda t, q, qd, p: 0.5 * MASS * jnp.sum(qd[:2] ** 2) + 0.5 * inertia * qd[2] ** 2,
+        effects=(AppliedForce(load), *elements),
+    )
+
+
+def test_feet_of_a_bar_share_a_pull_along_it() -> None:
+    """The equations leave the shares open: each foot takes its part in proportion to its limit, and both let go."""
+    pull = lambda t, q, qd, p: jnp.stack([t, 0.0 * t, 0.0 * t])  # noqa: E731
+    run = simulate(bar(pull, 1.0, 2.0), [0.0] * 3, [0.0] * 3, 4.0, ts=jnp.array([1.5, 4.0]), **TIGHT)
+    np.testing.assert_allclose(run.forces["left"][0], [0.5, 0.0], atol=1e-9)
+    np.testing.assert_allclose(run.forces["right"][0], [1.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(run.events.t[:2], 3.0, rtol=1e-6)
+    np.testing.assert_allclose(run.q[-1], [1.0 / (6.0 * MASS), 0.0, 0.0], atol=1e-6)
+
+
+def test_a_bar_pushed_across_at_one_end_pivots_about_the_other() -> None:
+    """Constant angular acceleration, until the force that keeps the foot in place reaches its limit."""
+    push = LIMIT + 1.0
+
+    def load(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t, qd, p
+        c, s = jnp.cos(q[2]), jnp.sin(q[2])
+        return push * jnp.stack([-s, c, HALF + 0.0 * c])
+
+    angular = (push - LIMIT) * 2 * HALF / (4 / 3 * MASS * HALF**2)
+    # Across the bar the foot holds half of what accelerates the bar, along it the centripetal force.
+    slips = (LIMIT**2 - 0.25 * (push - LIMIT) ** 2) ** 0.25 / (MASS * HALF) ** 0.5 / angular
+    run = simulate(bar(load, LIMIT, LIMIT), [0.0] * 3, [0.0] * 3, 1.5 * slips, ts=0.9 * slips * jnp.ones(1), **TIGHT)
+    angle = 0.5 * angular * (0.9 * slips) ** 2
+    centre = HALF * np.array([np.cos(angle) - 1.0, np.sin(angle)])
+    np.testing.assert_allclose(run.q[0], [*centre, angle], rtol=1e-7)
+    assert run.mode["left"][0] == 0
+    lets_go = next(each for each in run.mode_changes if each.effect == "left" and each.before == "stick")
+    np.testing.assert_allclose(lets_go.t, slips, rtol=1e-6)

@@ -228,6 +228,24 @@ def test_a_compliant_contact_gives_back_what_its_closed_form_says(law):
     np.testing.assert_allclose(jnp.sum(run.reactions["floor"].multiplier < 0), 0)
 
 
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+def test_derivatives_through_a_compliant_contact(derivative):
+    """Of the velocity after a rebound: that of its closed form by speed and damping, and none by mass and stiffness."""
+
+    def after(x):
+        law = jms.HuntCrossley(x["stiffness"], 1.5, x["damping"])
+        scene = eqx.tree_at(lambda s: s.params, _compliant_ball(law), {"m": x["m"], "g": 0.0 * x["m"], "rise": 0.0})
+        scene = jax.tree.map(jnp.asarray, scene)
+        return jms.simulate(scene, [0.1], jnp.stack([-x["speed"]]), 1.0, **TIGHT).qd[-1, 0]
+
+    at = {"stiffness": 1e4, "damping": 0.3, "m": 2.0, "speed": 1.5}
+    at = jax.tree.map(jnp.asarray, at)
+    exact = jax.grad(lambda x: x["speed"] * jms.HuntCrossley(1.0, damping=x["damping"]).restitution(x["speed"]))(at)
+    ours = derivative(after)(at)
+    for name in at:  # the error control of the run is that of the motion, not of its derivatives
+        np.testing.assert_allclose(ours[name], exact[name], rtol=1e-6, atol=1e-6, err_msg=name)
+
+
 def test_a_compliant_contact_becomes_rigid_as_its_stiffness_grows():
     """It lasts as long as depth over speed, and the depth is `(m v^2/k)^(1/(n + 1))`: order 2/5 for n = 3/2."""
     law = jms.HuntCrossley(1.0, damping=0.2)
