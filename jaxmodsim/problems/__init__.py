@@ -9,6 +9,7 @@ from . import charged_particle as charged_particle
 from . import coupled_belts as coupled_belts
 from . import foucault_pendulum as foucault_pendulum
 from . import four_bar as four_bar
+from . import gripper as gripper
 from . import knife_edge as knife_edge
 from . import linear_stick_slip as linear_stick_slip
 from . import n_link_pendulum as n_link_pendulum
@@ -22,6 +23,7 @@ from . import slider_crank as slider_crank
 from . import slipping_bristle as slipping_bristle
 from . import spherical_pendulum as spherical_pendulum
 from . import spiral_bead as spiral_bead
+from . import stacked_blocks as stacked_blocks
 from . import stick_slip_pendulum as stick_slip_pendulum
 from . import turntable_puck as turntable_puck
 from . import two_balls as two_balls

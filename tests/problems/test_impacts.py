@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim.problems import newtons_cradle, rocking_block, two_balls
+from jaxmodsim.problems import gripper, newtons_cradle, rocking_block, stacked_blocks, two_balls
 
 
 @pytest.mark.parametrize("numbers", [{}, {"m2": 3.0, "e": 0.6}])
@@ -57,3 +57,33 @@ def test_a_block_rocks_as_housner_says():
     begun = p["m"] * p["g"] * (float(q0[1]) - p["h"])
     kept = begun * rocking_block.speed_ratio() ** 2
     np.testing.assert_allclose(energy, jnp.asarray([begun, begun, kept, kept]), rtol=1e-7)
+
+
+def test_a_gripper_catches_what_falls():
+    d, v0 = gripper.PARAMS["d"], gripper.PARAMS["v0"]
+
+    def end(mu):
+        return jms.simulate(gripper.scene(mu=mu), [d, 0.0], [0.0, v0], 0.5, rtol=1e-10, atol=1e-12)
+
+    run, caught = end(0.2), gripper.catch(mu=0.2)
+    assert caught.speed > 0.1  # the impact alone does not stop it
+    changes = [(each.effect, each.after) for each in run.mode_changes]
+    assert changes[-1] == ("friction", "stick")
+    np.testing.assert_allclose([run.mode_changes[0].t, run.mode_changes[-1].t], caught[::2], rtol=1e-10)
+    np.testing.assert_allclose(run.q[-1], [0.0, caught.depth], rtol=1e-10, atol=1e-14)
+    np.testing.assert_allclose(run.reactions["fingers"].multiplier[-1], 2.0 * gripper.PARAMS["grip"], rtol=1e-10)
+    exact = jax.grad(lambda mu: gripper.catch(mu=mu).depth)(0.2)
+    np.testing.assert_allclose(jax.grad(lambda mu: end(mu).q[-1, 1])(0.2), exact, rtol=1e-8)
+    # Too weak a grip: it slides on.
+    assert np.isinf(gripper.catch(mu=0.1).stops)
+    np.testing.assert_array_equal(end(0.1).mode["friction"], 1)
+
+
+def test_of_stacked_blocks_the_upper_one_stays_behind():
+    slips = stacked_blocks.slips()
+    ts = jnp.asarray([0.9 * slips.floor, 0.5 * (slips.floor + slips.between), 1.5 * slips.between])
+    run = jms.simulate(stacked_blocks.scene(), [0.0, 0.0], [0.0, 0.0], ts[-1], ts=ts, rtol=1e-10, atol=1e-12)
+    changes = {each.effect: each.t for each in run.mode_changes}
+    np.testing.assert_allclose([changes["floor"], changes["between"]], slips, rtol=1e-11)
+    np.testing.assert_allclose(run.q, jnp.stack([stacked_blocks.motion(t) for t in ts]), rtol=1e-9, atol=1e-13)
+    np.testing.assert_array_equal(run.mode["between"], [0, 0, -1])
