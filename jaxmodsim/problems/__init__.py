@@ -16,6 +16,7 @@ from . import n_link_pendulum as n_link_pendulum
 from . import newtons_cradle as newtons_cradle
 from . import pulled_box as pulled_box
 from . import ramped_box as ramped_box
+from . import relief_valve as relief_valve
 from . import rocking_block as rocking_block
 from . import rod_on_rough_floor as rod_on_rough_floor
 from . import rolling_disc as rolling_disc

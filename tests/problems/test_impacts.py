@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim.problems import gripper, newtons_cradle, rocking_block, stacked_blocks, two_balls
+from jaxmodsim.problems import gripper, newtons_cradle, relief_valve, rocking_block, stacked_blocks, two_balls
 
 
 @pytest.mark.parametrize("numbers", [{}, {"m2": 3.0, "e": 0.6}])
@@ -87,3 +87,23 @@ def test_of_stacked_blocks_the_upper_one_stays_behind():
     np.testing.assert_allclose([changes["floor"], changes["between"]], slips, rtol=1e-11)
     np.testing.assert_allclose(run.q, jnp.stack([stacked_blocks.motion(t) for t in ts]), rtol=1e-9, atol=1e-13)
     np.testing.assert_array_equal(run.mode["between"], [0, 0, -1])
+
+
+def test_a_relief_valve_swings_below_the_flow_of_its_closed_form_and_strikes_its_seat():
+    at = jax.tree.map(float, relief_valve.onset())
+    period, pressure = 2.0 * np.pi / at.frequency, at.lift + relief_valve.PARAMS["delta"]
+    ts, sizes = 40.0 + jnp.linspace(0.0, 20.0 * period, 2001), {}
+    for part in (0.98, 1.0, 1.02):
+        scene = relief_valve.scene(flow=part * at.flow)
+        start = [at.lift + 1e-4], [0.0], ts[-1]
+        run = jms.simulate(scene, *start, ts=ts, z0={"pressure": pressure}, rtol=1e-9, atol=1e-12)
+        swing = run.q[:, 0] - jnp.mean(run.q[:, 0])
+        sizes[part] = [float(jnp.max(jnp.abs(x))) for x in (swing[:200], swing[-200:])]
+    assert sizes[0.98][1] > 1.5 * sizes[0.98][0]
+    np.testing.assert_allclose(sizes[1.0][1], sizes[1.0][0], rtol=1e-3)
+    assert sizes[1.02][1] < 0.7 * sizes[1.02][0]
+    # Far below it strikes its seat, again and again.
+    run = jms.simulate(relief_valve.scene(), [0.1], [0.0], ts[-1], ts=ts, rtol=1e-9, atol=1e-12)
+    assert float(jnp.min(run.q)) >= 0.0
+    assert np.sum(np.isfinite(run.events.t)) > 10
+    assert (np.diff(run.event_losses) >= -1e-12).all()
