@@ -1,6 +1,6 @@
 """A pressure relief valve whose body strikes its seat, in dimensionless numbers."""
 
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
@@ -18,8 +18,16 @@ class Pressure(AbstractEffect):
     """The pressure in the vessel, which lifts the valve and escapes through it: `p' = beta (flow - x sqrt(p))`."""
 
     name: str | None = None
-    default_name: ClassVar[str] = "pressure"
-    stiff: ClassVar[bool] = False
+
+    @property
+    def default_name(self) -> str:
+        """Name in the results."""
+        return "pressure"
+
+    @property
+    def stiff(self) -> bool:
+        """It swings with the valve."""
+        return False
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Nothing to check: it stands in the scene of this problem alone."""
@@ -104,6 +112,7 @@ def onset(
     `B = beta x/(2 sqrt(x + delta))`, `C = beta sqrt(x + delta)`; by Hurwitz two roots are imaginary where
     `(kappa + B)(1 + kappa B) = B + C`, and their square is `-(1 + kappa B)`. Arguments as for `scene`.
     """
+    delta, beta = jnp.asarray(delta), jnp.asarray(beta)
 
     def terms(x: Array) -> tuple[Array, Array]:
         root = jnp.sqrt(x + delta)

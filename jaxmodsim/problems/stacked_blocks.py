@@ -85,7 +85,7 @@ def slips(
     The upper block can be accelerated by `mu2 g` and no more.
     """
     weight = (jnp.asarray(m1) + m2) * g
-    return Slips(mu1 * weight / rate, (jnp.asarray(mu1) + mu2) * weight / rate)
+    return Slips(weight * mu1 / rate, weight * (jnp.asarray(mu1) + mu2) / rate)
 
 
 def motion(
