@@ -7,8 +7,9 @@ import numpy as np
 from ._return_map import OrbitError, OrbitProblem, ShotOrbit, evaluate
 
 _ITERATIONS, _HALVINGS = 30, 6
-# Residuals, in the scales of the unknowns: where the iteration ends, and what counts as an orbit where it ends earlier.
-_GOAL, _ENOUGH = 1e-12, 1e-8
+# Residuals, in the scales of the unknowns: where the iteration ends, and what counts as an orbit where it ends earlier,
+# or so many tolerances of the run.
+_GOAL, _ENOUGH, _TOLERANCES = 1e-12, 1e-8, 10.0
 # Singular values below this part of the largest one are no directions.
 _RANK = 1e-10
 # Part of the first period below which an iteration has run into an equilibrium.
@@ -33,6 +34,7 @@ def newton(
     """
     point = _checked(evaluate(problem, x, period, value, dof))
     size, history = _size(point, scale, extra), []
+    enough = max(_ENOUGH, _TOLERANCES * float(problem.rtol))
     for i in range(_ITERATIONS):
         _refuse_tangent(point, scale)
         history.append(size)
@@ -49,11 +51,11 @@ def newton(
             unknowns = point.unknowns + step * 0.5**halving
             made = evaluate(problem, *_split(unknowns, point, problem.autonomous), dof)
             after = np.inf if made.failure else _size(made, scale, extra)
-            if after < size or size < _ENOUGH:
+            if after < size or size < enough:
                 break
         else:
             break
-        if size < _ENOUGH and not after < 0.5 * size:
+        if size < enough and not after < 0.5 * size:
             # As near as the steps of the run let it come.
             return (point if size <= after else made), i
         point, size = made, after

@@ -259,8 +259,8 @@ def refuse_family(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, do
     if not beside.failure and np.max(np.abs(beside.residual[:n]) / scale[:n]) < 1e-8:
         raise OrbitError(
             "The orbit is not alone but one of a family, with a multiplier of exactly 1 beside those that every orbit"
-            " has: nothing in the scene says which one. A conservative scene has such families, and dry friction at"
-            " certain frequencies; a little damping, or another frequency, leaves one of them."
+            " has: nothing in the scene says which one. A conservative scene has such families, a bristle that never"
+            " gives way, and dry friction at certain frequencies; a little damping, or another frequency, leaves one."
         )
 
 
