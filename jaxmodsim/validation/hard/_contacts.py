@@ -217,6 +217,7 @@ def _at_the_end() -> HardCase:
         lambda _: 1.0,
         # There the two are one.
         single=None,
+        asks="velocity after the run",
     )
 
 
@@ -326,6 +327,7 @@ def _stiff() -> HardCase:
         skips=dict.fromkeys(
             ("forward", "reverse"), "no event ends a step where the contact begins, so digits are lost"
         ),
+        asks="motion after the contact",
     )
 
 
@@ -348,6 +350,7 @@ def _oblique() -> HardCase:
         motion(scene, [0.0, 1.0, 0.0], [1.0, -2.0, 5.0], 1.0, by="friction.Fc", read=_spin),
         lambda mu: 5.0 - mu * (1.0 + e) * 2.0 / inertia,
         lambda _: -(1.0 + e) * 2.0 / inertia,
+        asks="velocities after the impact",
     )
 
 

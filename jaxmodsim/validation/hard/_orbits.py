@@ -160,5 +160,6 @@ def cases() -> list[HardCase]:
             "Shooting in float32.",
             "A residual that never falls, or an orbit that is none.",
             RefusedCalls({"float32": _single}, {"float32": "need float64"}),
+            asks="a sentence that asks for float64",
         ),
     ]
