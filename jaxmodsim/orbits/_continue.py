@@ -16,7 +16,7 @@ from ..scene import Scene, elements, replace_elements
 from ._branch import DOUBLING, Branch, SpecialOrbit
 from ._describe import describe
 from ._newton import newton
-from ._periodic_orbit import Guess, prepare, refuse_clock, refuse_family
+from ._periodic_orbit import Guess, prepare, shoot
 from ._return_map import OrbitError, PeriodFn, Section
 from ._special import locate
 from ._step import BranchStep, step_at
@@ -99,9 +99,7 @@ def continue_orbits(
     else:
         there = replace_elements(scene, {parameter: first})
         problem, start, dof = prepare(there, guess, period, section, settle, rtol, atol, parameter)
-        shot, _ = newton(problem, start.x, start.period, first, dof, start.scale, None)
-        refuse_clock(problem, shot, start.scale, dof)
-        refuse_family(problem, shot, start.scale, dof)
+        shot = shoot(problem, start, first, dof)
         sense = np.zeros(len(start.scale))
         sense[-1] = last - first
         begin = step_at(problem, shot, describe(problem, shot, dof)[0], abs(last - first), sense)

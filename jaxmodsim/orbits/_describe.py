@@ -112,7 +112,7 @@ def _directions(run: Trajectory, held: list[str], t: float) -> int:
     if not held:
         return 0
     rows = [np.asarray(scene.event_driven[name].direction(run.q[-1], scene.params)) for name in held]
-    return int(np.linalg.matrix_rank(np.stack(rows), tol=1e-6))
+    return int(np.linalg.matrix_rank(np.vstack(rows), tol=1e-6))
 
 
 def floquet(problem: OrbitProblem, point: ShotOrbit, zeros: int, scale: np.ndarray) -> np.ndarray:

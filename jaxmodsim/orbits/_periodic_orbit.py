@@ -97,9 +97,7 @@ def periodic_orbit(
     """
     known = jtu.tree_map(jax.lax.stop_gradient, scene)
     problem, start, dof = prepare(known, guess, period, section, settle, rtol, atol, None)
-    point, _ = newton(problem, start.x, start.period, 0.0, dof, start.scale, None)
-    refuse_clock(problem, point, start.scale, dof)
-    refuse_family(problem, point, start.scale, dof)
+    point = shoot(problem, start, 0.0, dof)
     orbit, lowest, highest = describe(problem, point, dof)
     if not any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(scene)):
         return orbit
@@ -217,7 +215,20 @@ def anchored(problem: OrbitProblem, start: SettledState, dof: int) -> OrbitProbl
     return eqx.tree_at(lambda p: p.normal, problem, jnp.asarray(flow / scale**2))
 
 
-def refuse_clock(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, dof: int) -> None:
+def shoot(problem: OrbitProblem, start: SettledState, value: float, dof: int) -> ShotOrbit:
+    """The orbit near the start, at this value of the parameter.
+
+    **Raises:**
+
+    - `OrbitError` where there is none, the scene depends on time otherwise than the period says, or there is a family.
+    """
+    point, _ = newton(problem, start.x, start.period, value, dof, start.scale, None)
+    _refuse_clock(problem, point, start.scale, dof)
+    _refuse_family(problem, point, start.scale, dof)
+    return point
+
+
+def _refuse_clock(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, dof: int) -> None:
     """Refuse an orbit that does not return at other times: a period later, or at any time if it has no given period.
 
     **Raises:**
@@ -241,7 +252,7 @@ def refuse_clock(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, dof
     )
 
 
-def refuse_family(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, dof: int) -> None:
+def _refuse_family(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, dof: int) -> None:
     """Refuse an orbit that has others beside it, not only to first order.
 
     **Raises:**
@@ -280,7 +291,7 @@ def _with_derivatives(
     x = x + change[:n]
     period = period + change[n] if problem.autonomous else problem.period_of(problem.scene, period)
     state = unpack(problem.scene, x, dof)
-    times, acceleration = (np.concatenate([each[i] for each in extrema]) for i in (1, 2))
+    times, acceleration = (np.concatenate(x) for x in ([x.time for x in extrema], [x.acceleration for x in extrema]))
     order = np.argsort(times, kind="stable")
     run = simulate(
         *(problem.scene, state.q, state.qd, orbit.t0 + point.period),

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from ..scene import Scene, State
+from ..scene import State
 from ..simulation import SimulationError, Trajectory, simulate
 from ._return_map import MAX_EVENTS, MAX_STEPS, OrbitError, OrbitProblem, Section, pack
 
@@ -51,6 +51,12 @@ def states_of(run: Trajectory) -> np.ndarray:
     return np.concatenate([np.asarray(x).reshape(len(run.t), -1) for x in rows], axis=1)
 
 
+def held(run: Trajectory) -> np.ndarray:
+    """How many elements stick, and contacts are closed, at each time of a run that has modes, shape `[time]`."""
+    friction = run.scene.event_driven
+    return np.sum([np.asarray(mode) == (0 if name in friction else 1) for name, mode in run.mode.items()], axis=0)
+
+
 def settled(problem: OrbitProblem, state: State, settle: float, section: Section | None) -> SettledState:
     """The state after `settle` seconds, where an orbit of unknown period may begin, and a first period.
 
@@ -75,7 +81,7 @@ def settled(problem: OrbitProblem, state: State, settle: float, section: Section
     period = _return_time(ts, x / scale[: x.shape[1]])
     last = ts >= settle - period
     scale = magnitudes(x[last], period)
-    at = _beginning(problem.scene, run, x, np.flatnonzero(last), section)
+    at = _beginning(run, x, np.flatnonzero(last), section)
     return SettledState(x[at], period, scale)
 
 
@@ -110,7 +116,7 @@ def _return_time(ts: np.ndarray, x: np.ndarray) -> float:
     return float((first + near[0] + part[first + near[0]]) * (ts[1] - ts[0]))
 
 
-def _beginning(scene: Scene, run: Trajectory, x: np.ndarray, last: np.ndarray, section: Section | None) -> int:
+def _beginning(run: Trajectory, x: np.ndarray, last: np.ndarray, section: Section | None) -> int:
     """Index of a state for an orbit to begin at: on the section, or where no mode changes for longest, in slip."""
     if section is not None:
         values = np.asarray([float(section(run.q[i], run.qd[i])) for i in last])
@@ -124,12 +130,9 @@ def _beginning(scene: Scene, run: Trajectory, x: np.ndarray, last: np.ndarray, s
     if run.modes is None:
         speed = np.linalg.norm(np.diff(x[last] / magnitudes(x[last], 1.0)[:-1], axis=0), axis=1)
         return int(last[int(np.argmax(speed))])
-    modes = np.asarray(run.modes)[last]
+    modes, stuck = np.stack([np.asarray(mode) for mode in run.mode.values()], axis=1)[last], held(run)[last]
     cuts = np.flatnonzero(np.any(modes[1:] != modes[:-1], axis=1)) + 1
     pieces = np.split(np.arange(len(last)), cuts)
     pieces = pieces[1:-1] if len(pieces) > 2 else pieces  # the others are cut off by the ends
-    friction = len(scene.event_driven)
-    held = [int(np.sum(modes[piece[0], :friction] == 0) + np.sum(modes[piece[0], friction:] == 1)) for piece in pieces]
-    best = min(range(len(pieces)), key=lambda i: (held[i], -len(pieces[i])))
-    piece = pieces[best]
+    piece = min(pieces, key=lambda each: (stuck[each[0]], -len(each)))
     return int(last[piece[len(piece) // 2]])

@@ -11,7 +11,7 @@ from ._describe import describe
 from ._newton import newton, scaled
 from ._orbit import PeriodicOrbit
 from ._return_map import OrbitProblem, ShotOrbit, evaluate
-from ._settle import magnitudes, states_of
+from ._settle import held, magnitudes, states_of
 
 # Part of the largest possible distance from a change of modes at which orbits begin elsewhere.
 _CLOSE = 0.2
@@ -88,9 +88,8 @@ def _clear_of_events(orbit: PeriodicOrbit) -> float | None:
         return None
     gaps = np.diff([*times, times[0] + period])
     middles = (times + 0.5 * gaps) % period
-    modes = np.asarray(orbit.run.modes)[:, : len(orbit.run.scene.event_driven)]
     at = np.searchsorted(np.asarray(orbit.run.t) - float(orbit.t0), middles)
-    held = np.sum(modes[np.clip(at, 0, len(modes) - 1)] == 0, axis=1)
-    best = min(range(len(gaps)), key=lambda i: (held[i], -gaps[i]))
+    stuck = held(orbit.run)[np.clip(at, 0, len(orbit.run.t) - 1)]
+    best = min(range(len(gaps)), key=lambda i: (stuck[i], -gaps[i]))
     near = min(np.min(times), period - np.max(times))
     return float(middles[best]) if near < _CLOSE * 0.5 * gaps[best] else None

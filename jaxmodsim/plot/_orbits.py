@@ -111,14 +111,10 @@ def _known(*orbits: PeriodicOrbit) -> list[str]:
 
 def _modes_in_words(orbit: PeriodicOrbit) -> list[str]:
     """Modes on each piece between two times of the run, after the events at its begin."""
-    run, words = orbit.run, {0: "stick", 1: "forward", -1: "backward"}
+    run, words = orbit.run, orbit.run.mode_words
     if run.modes is None:
         return ["orbit"] * len(run.t)
-    friction = run.scene.event_driven
-    columns = [
-        [words[int(x)] if name in friction else ("open", "closed")[int(x)] for x in np.asarray(mode)]
-        for name, mode in run.mode.items()
-    ]
+    columns = [[words[name][int(x)] for x in np.asarray(mode)] for name, mode in run.mode.items()]
     alone = len(columns) == 1
     names = list(run.mode)
     return [

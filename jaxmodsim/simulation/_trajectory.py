@@ -182,6 +182,14 @@ class Trajectory(AbstractReadable):
         return {name: modes[..., i] for i, name in enumerate(self.scene.mode_names)}
 
     @property
+    def mode_words(self) -> dict[str, dict[int, str]]:
+        """What the numbers of `mode` mean, by name, in the words of `ModeChange`."""
+        scene = self.scene
+        widths = dict(zip(scene.mode_names, scene.mode_widths(self.q.shape[-1]), strict=True))
+        words = {name: _MODES if width == 1 else _PLANE_MODES for name, width in widths.items()}
+        return words | dict.fromkeys(scene.contacts, _CONTACT_MODES)
+
+    @property
     def events(self) -> Events:
         """Mode changes along the run; the first reading runs the scene once more, with a log beside it."""
         self._one_run("events")
@@ -194,10 +202,7 @@ class Trajectory(AbstractReadable):
     def mode_changes(self) -> tuple[ModeChange, ...]:
         """`events` in words, as many as there are; outside of `jax.jit`."""
         columns = [x.tolist() for x in map(np.asarray, self.events)]
-        scene = self.scene
-        widths = dict(zip(scene.mode_names, scene.mode_widths(self.q.shape[-1]), strict=True))
-        words = {name: _MODES if width == 1 else _PLANE_MODES for name, width in widths.items()}
-        words |= dict.fromkeys(scene.contacts, _CONTACT_MODES)
+        scene, words = self.scene, self.mode_words
         happened = [(t, scene.part_names[i], *modes) for t, i, *modes in zip(*columns, strict=True) if t < math.inf]
         return tuple(
             ModeChange(t, name, words[name][before], words[name][after]) for t, name, before, after in happened
