@@ -99,6 +99,32 @@ def test_den_hartog(W, f):
     assert orbit.stability == "stable"
 
 
+def spring_of_any_size(_t, q, qd, _p):
+    return 0.5 * jnp.sum(qd**2) - 0.5 * jnp.sum(q**2)
+
+
+def swing_along(t, _q, _qd, p):
+    return jnp.cos(p["W"] * t) * p["axis"]
+
+
+def the_plane(q):
+    return q
+
+
+def test_dry_friction_in_the_plane_has_the_orbit_of_that_along_the_force():
+    axis = np.array([0.6, 0.8])
+    effects = (jms.AppliedForce(swing_along), jms.Friction(jms.Coulomb(0.5), along=the_plane))
+    scene = jms.Scene(spring_of_any_size, params={"W": 0.35, "axis": axis}, effects=effects)
+    plane = jms.periodic_orbit(scene, ([0.1, 0.2], [0.0, 0.0]), period=of_frequency)
+    line = jms.periodic_orbit(den_hartog(0.35, 0.5), ([0.1], [0.0]), period=of_frequency)
+    np.testing.assert_allclose(plane.highest, axis * line.highest, rtol=1e-8)
+    np.testing.assert_allclose(plane.stick["friction"], line.stick["friction"], rtol=1e-9)
+    # That of the line, that of the motion across it, and two of stick.
+    np.testing.assert_allclose(plane.multipliers[0], line.multipliers[0], rtol=1e-7)
+    assert list(plane.multipliers[2:]) == [0.0, 0.0]
+    assert [after for _, _, after in plane.sequence] == ["slip", "stick"] * 2
+
+
 def test_a_family_of_orbits_is_refused():
     # At W = 1/2 any part of a free swing, which closes in a half period, may be added; this is an orbit without one.
     f, at = 0.05, 1.0
