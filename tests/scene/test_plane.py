@@ -35,25 +35,30 @@ def puck(law: Any = None, **friction: Any) -> Scene:
 PUCK = puck()
 
 
-@jax.jit
-def stop(v: Any, f: Any) -> tuple[Any, Any, Any, Any]:
-    """Where and when a puck stops that begins at the velocity `v` under the force `f`, and what holds it then."""
-    scene = eqx.tree_at(lambda s: s.params["f"], PUCK, f)
-    run = simulate(scene, jnp.zeros(2), v, 40.0, **TIGHT)
-    return run.q[-1], run.events.t[0], run.mode["friction"][-1], run.forces["friction"][-1]
+def stop(v: Any, f: Any, **more: Any) -> Any:
+    """The run of a puck that begins at the velocity `v` under the force `f`, to its stop."""
+    return simulate(eqx.tree_at(lambda s: s.params["f"], PUCK, f), jnp.zeros(2), v, 40.0, **TIGHT, **more)
+
+
+def place_of_stop(v: Any, f: Any) -> Any:
+    return stop(v, f, throw=False).q[-1]
+
+
+# By the velocity and by the force, in both modes.
+SLOPES = [jax.jit(derive(place_of_stop, argnums=(0, 1))) for derive in (jax.jacfwd, jax.jacrev)]
 
 
 def test_a_puck_stops_on_a_line_at_the_place_in_closed_form() -> None:
     """x = v |v| m/(2 F), t = |v| m/F, and their derivatives in both modes."""
-    v, zero = jnp.array([3.0, 4.0]), jnp.array(0.0)
-    q, t, mode, force = stop(v, zero)
-    np.testing.assert_allclose(q, v * 5.0 * 2.0 / (2.0 * F), rtol=1e-12)
-    np.testing.assert_allclose(t, 5.0 * 2.0 / F, rtol=1e-12)
-    assert mode == 0
-    np.testing.assert_array_equal(force, 0.0)
-    exact = jax.jacfwd(lambda v: v * jnp.linalg.norm(v) * 2.0 / (2.0 * F))(v)
-    for derive in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(derive(lambda v: stop(v, zero)[0])(v), exact, atol=1e-10)
+    v, zero = np.array([3.0, 4.0]), jnp.array(0.0)
+    run = stop(v, zero)
+    np.testing.assert_allclose(run.q[-1], v * 5.0 * 2.0 / (2.0 * F), rtol=1e-12)
+    np.testing.assert_allclose(run.events.t[0], 5.0 * 2.0 / F, rtol=1e-12)
+    assert run.mode["friction"][-1] == 0
+    np.testing.assert_array_equal(run.forces["friction"][-1], 0.0)
+    exact = (5.0 * np.eye(2) + np.outer(v, v) / 5.0) * 2.0 / (2.0 * F)
+    for slopes in SLOPES:
+        np.testing.assert_allclose(slopes(v, zero)[0], exact, atol=1e-10)
 
 
 def turning(f: float, speed: float, angle: float) -> tuple[float, np.ndarray]:
@@ -78,22 +83,23 @@ def turning(f: float, speed: float, angle: float) -> tuple[float, np.ndarray]:
 def test_slip_that_turns_dies_where_a_regular_form_of_the_equations_says(f: float) -> None:
     """At 0.2, 0.53 and 0.93 of the limit, from 115 degrees of the load; derivatives of the way in closed form."""
     speed, angle = 2.0, 2.0
-    v = speed * jnp.array([np.cos(angle), np.sin(angle)])
+    v = speed * np.array([np.cos(angle), np.sin(angle)])
     t_exact, q_exact = turning(f, speed, angle)
-    q, t, mode, force = stop(v, jnp.array(f))
-    np.testing.assert_allclose(t, t_exact, rtol=1e-9)
-    np.testing.assert_allclose(q, q_exact, atol=1e-9)
-    assert mode == 0
-    np.testing.assert_allclose(force, [f, 0.0], atol=1e-12)
+    run = stop(v, jnp.array(f))
+    np.testing.assert_allclose(run.events.t[0], t_exact, rtol=1e-9)
+    np.testing.assert_allclose(run.q[-1], q_exact, atol=1e-9)
+    assert run.mode["friction"][-1] == 0
+    np.testing.assert_allclose(run.forces["friction"][-1], [f, 0.0], atol=1e-12)
 
     def way(f: Any) -> Any:
         """Along the load; its rate is the velocity, as that of `v (F + f cos(angle))` is a constant."""
         a, b, c = F / 2.0, f / 2.0, jnp.cos(angle)
         return speed**2 * (b * (1.0 + c * c) + 2.0 * a * c) / (4.0 * (a * a - b * b))
 
-    np.testing.assert_allclose(q[0], way(f), atol=1e-9)
-    for derive in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(derive(lambda f: stop(v, f)[0][0])(jnp.array(f)), jax.grad(way)(f), rtol=1e-8)
+    np.testing.assert_allclose(run.q[-1, 0], way(f), atol=1e-9)
+    exact = jax.jit(jax.grad(way))(f)
+    for slopes in SLOPES:
+        np.testing.assert_allclose(slopes(v, jnp.array(f))[1][0], exact, rtol=1e-8)
 
 
 def ramp(t: Any, q: Any, qd: Any, p: Any) -> Any:
@@ -114,7 +120,7 @@ def test_on_a_line_it_is_the_scalar_law(law: Any) -> None:
             [0.0, 0.0],
             [0.0, 0.0],
             5.5,
-            ts=jnp.linspace(0.0, 5.5, 12),
+            ts=np.linspace(0.0, 5.5, 12),
             solver=Rodas5P(),
             **TIGHT,
         )
@@ -125,12 +131,14 @@ def test_on_a_line_it_is_the_scalar_law(law: Any) -> None:
     np.testing.assert_allclose(plane.q, scalar.q, rtol=0, atol=1e-13 if exact else 1e-10)
     np.testing.assert_allclose(plane.forces["friction"][:, 0], scalar.forces["friction"], atol=1e-12 if exact else 1e-9)
     np.testing.assert_array_equal(plane.q[:, 1], 0.0)
-    signs = [(e.before, e.after) for e in scalar.mode_changes]
-    # Where slip turns round at once, it is slip on both sides.
-    assert signs == [("stick", "forward"), ("forward", "backward")]
-    assert [(e.before, e.after) for e in plane.mode_changes] == [("stick", "slip")]
-    np.testing.assert_allclose(plane.mode_changes[0].t, scalar.mode_changes[0].t, rtol=1e-12)
     np.testing.assert_array_equal(plane.mode["friction"], np.abs(scalar.mode["friction"]))
+    np.testing.assert_array_equal(np.unique(scalar.mode["friction"]), [-1, 0, 1])
+    if exact:
+        signs = [(e.before, e.after) for e in scalar.mode_changes]
+        # Where slip turns round at once, it is slip on both sides.
+        assert signs == [("stick", "forward"), ("forward", "backward")]
+        assert [(e.before, e.after) for e in plane.mode_changes] == [("stick", "slip")]
+        np.testing.assert_allclose(plane.mode_changes[0].t, scalar.mode_changes[0].t, rtol=1e-12)
 
 
 def test_forces_turn_with_the_frame() -> None:
@@ -181,23 +189,23 @@ def test_the_turntable_lets_the_puck_go_at_the_speed_in_closed_form() -> None:
     """With and without stiction; the way from there on by a second solver; derivatives of the time in both modes."""
     mu = turntable_puck.PARAMS["mu"]
 
-    @jax.jit
-    def run(law: Coulomb) -> tuple[Any, Any, Any]:
-        out = simulate(turntable_puck.scene(law), [0.5, 0.0], [0.0, 0.0], 4.0, **TIGHT)
-        return out.events.t[0], out.q[-1], out.event_forces["friction"][0, 0]
+    def run(law: Coulomb, **more: Any) -> Any:
+        return simulate(turntable_puck.scene(law), [0.5, 0.0], [0.0, 0.0], 4.0, **TIGHT, **more)
 
+    slopes = [jax.jit(derive(lambda law: run(law, throw=False).events.t[0])) for derive in (jax.jacfwd, jax.jacrev)]
     for stiction in (1.0, 1.3):
         law = Coulomb(mu, stiction * mu)
-        t, q, force = run(law)
+        out = run(law)
+        force = np.asarray(out.event_forces["friction"][0, 0])
         exact = turntable_puck.break_away(stiction * mu)
-        np.testing.assert_allclose(t, exact.t, rtol=1e-12)
+        np.testing.assert_allclose(out.events.t[0], exact.t, rtol=1e-12)
         # The load of the turning frame against the radius, which friction holds until then.
-        np.testing.assert_allclose(jnp.arctan2(-force[1], force[0]), exact.direction, rtol=1e-10)
-        np.testing.assert_allclose(jnp.linalg.norm(force), 0.5 * 9.81 * stiction * mu, rtol=1e-10)
-        np.testing.assert_allclose(q, after_break_away(mu, stiction * mu, 4.0), rtol=1e-7)
+        np.testing.assert_allclose(np.arctan2(-force[1], force[0]), exact.direction, rtol=1e-10)
+        np.testing.assert_allclose(np.linalg.norm(force), 0.5 * 9.81 * stiction * mu, rtol=1e-10)
+        np.testing.assert_allclose(out.q[-1], after_break_away(mu, stiction * mu, 4.0), rtol=1e-7)
         slope = jax.grad(lambda x: turntable_puck.break_away(x).t)(stiction * mu)
-        for derive in (jax.jacfwd, jax.jacrev):
-            np.testing.assert_allclose(derive(lambda law: run(law)[0])(law).Fs, slope, rtol=1e-8)
+        for derivative in slopes:
+            np.testing.assert_allclose(derivative(law).Fs, slope, rtol=1e-8)
 
 
 def test_the_load_may_be_a_reaction_or_a_number() -> None:
@@ -239,7 +247,7 @@ def test_on_an_ellipse_friction_is_the_point_of_greatest_dissipation() -> None:
     ratio, v = 0.5, np.array([0.3, -0.7])
     scene = puck(Coulomb(F), ellipse=ratio)
     state = State(jnp.zeros(2), jnp.asarray(v), {})
-    force = np.asarray(forward_dynamics(jnp.zeros(()), state, scene, jnp.asarray(v)).actions["friction"].force)
+    force = np.asarray(jax.jit(forward_dynamics)(jnp.zeros(()), state, scene, jnp.asarray(v)).actions["friction"].force)
     angles = np.linspace(0, 2 * np.pi, 10_001)
     points = F * np.stack([np.cos(angles), ratio * np.sin(angles)])
     np.testing.assert_allclose(force @ v, np.max(v @ points), rtol=1e-6)
@@ -252,41 +260,51 @@ def test_on_an_ellipse_friction_is_the_point_of_greatest_dissipation() -> None:
 
 def test_energy_float32_and_batches() -> None:
     """The energy balance closes over slip and stick; in float32 the stop is right to rounding, in batches too."""
-    run = simulate(PUCK, [0.0, 0.0], [3.0, 4.0], 8.0, ts=jnp.linspace(0.0, 8.0, 9), **TIGHT)
+    run = simulate(PUCK, [0.0, 0.0], [3.0, 4.0], 8.0, ts=np.linspace(0.0, 8.0, 9), **TIGHT)
     np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-9)
     np.testing.assert_allclose(run.energy.dissipated[-1], 25.0, rtol=1e-9)
     single = jax.tree.map(lambda x: x.astype(jnp.float32), PUCK)
-    v = jnp.array([[3.0, 4.0], [-1.0, 0.5], [0.0, 0.0]], jnp.float32)
+    v = np.array([[3.0, 4.0], [-1.0, 0.5], [0.0, 0.0]], np.float32)
     ends = jax.jit(jax.vmap(lambda v: simulate(single, jnp.zeros(2, jnp.float32), v, 8.0).q[-1]))(v)
     assert ends.dtype == jnp.float32
-    exact = v * jnp.linalg.norm(v, axis=1, keepdims=True) * 2.0 / (2.0 * F)
+    exact = v * np.linalg.norm(v, axis=1, keepdims=True) * 2.0 / (2.0 * F)
     np.testing.assert_allclose(ends, exact, rtol=2e-5, atol=1e-5)
 
 
 MASS, HALF, LIMIT = 2.0, 0.5, 1.5
 
 
-def bar(load: Any, *limits: float) -> Scene:
-    """A bar seen from above, on rough feet at its ends; the coordinates are its centre and its angle."""
+def foot(side: float) -> Any:
+    return lambda q: q[:2] + side * HALF * jnp.stack([jnp.cos(q[2]), jnp.sin(q[2])])
 
-    def feet(side: float) -> Any:
-        return lambda q: q[:2] + side * HALF * jnp.stack([jnp.cos(q[2]), jnp.sin(q[2])])
 
-    elements = [
-        Friction(Coulomb(limit), along=feet(side), name=name)
-        for limit, side, name in zip(limits, (-1.0, 1.0), ("left", "right"), strict=True)
+def bar_alone(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    """Seen from above; the coordinates are its centre and its angle."""
+    del t, q, p
+    return 0.5 * MASS * jnp.sum(qd[:2] ** 2) + 0.5 * (MASS * HALF**2 / 3.0) * qd[2] ** 2
+
+
+def on_bar(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    """A pull along x that grows with time, and a push across the bar at its right end."""
+    del qd
+    c, s = jnp.cos(q[2]), jnp.sin(q[2])
+    return jnp.stack([p["pull"] * t, 0.0 * t, 0.0 * t]) + p["push"] * jnp.stack([-s, c, HALF + 0.0 * c])
+
+
+LEFT, RIGHT = foot(-1.0), foot(1.0)
+
+
+def bar(left: float, right: float, pull: float, push: float) -> Scene:
+    """A bar on rough feet at its ends, with their limits."""
+    feet = [
+        Friction(Coulomb(x), along=at, name=name) for x, at, name in ((left, LEFT, "left"), (right, RIGHT, "right"))
     ]
-    inertia = MASS * HALF**2 / 3.0
-    return Scene(
-        lambda t, q, qd, p: 0.5 * MASS * jnp.sum(qd[:2] ** 2) + 0.5 * inertia * qd[2] ** 2,
-        effects=(AppliedForce(load), *elements),
-    )
+    return Scene(bar_alone, params={"pull": pull, "push": push}, effects=(AppliedForce(on_bar), *feet))
 
 
 def test_feet_of_a_bar_share_a_pull_along_it() -> None:
     """The equations leave the shares open: each foot takes its part in proportion to its limit, and both let go."""
-    pull = lambda t, q, qd, p: jnp.stack([t, 0.0 * t, 0.0 * t])  # noqa: E731
-    run = simulate(bar(pull, 1.0, 2.0), [0.0] * 3, [0.0] * 3, 4.0, ts=jnp.array([1.5, 4.0]), **TIGHT)
+    run = simulate(bar(1.0, 2.0, pull=1.0, push=0.0), [0.0] * 3, [0.0] * 3, 4.0, ts=np.array([1.5, 4.0]), **TIGHT)
     np.testing.assert_allclose(run.forces["left"][0], [0.5, 0.0], atol=1e-9)
     np.testing.assert_allclose(run.forces["right"][0], [1.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(run.events.t[:2], 3.0, rtol=1e-6)
@@ -296,16 +314,11 @@ def test_feet_of_a_bar_share_a_pull_along_it() -> None:
 def test_a_bar_pushed_across_at_one_end_pivots_about_the_other() -> None:
     """Constant angular acceleration, until the force that keeps the foot in place reaches its limit."""
     push = LIMIT + 1.0
-
-    def load(t: Any, q: Any, qd: Any, p: Any) -> Any:
-        del t, qd, p
-        c, s = jnp.cos(q[2]), jnp.sin(q[2])
-        return push * jnp.stack([-s, c, HALF + 0.0 * c])
-
     angular = (push - LIMIT) * 2 * HALF / (4 / 3 * MASS * HALF**2)
     # Across the bar the foot holds half of what accelerates the bar, along it the centripetal force.
     slips = (LIMIT**2 - 0.25 * (push - LIMIT) ** 2) ** 0.25 / (MASS * HALF) ** 0.5 / angular
-    run = simulate(bar(load, LIMIT, LIMIT), [0.0] * 3, [0.0] * 3, 1.5 * slips, ts=0.9 * slips * jnp.ones(1), **TIGHT)
+    scene = bar(LIMIT, LIMIT, pull=0.0, push=push)
+    run = simulate(scene, [0.0] * 3, [0.0] * 3, 1.5 * slips, ts=slips * np.array([0.9, 1.5]), **TIGHT)
     angle = 0.5 * angular * (0.9 * slips) ** 2
     centre = HALF * np.array([np.cos(angle) - 1.0, np.sin(angle)])
     np.testing.assert_allclose(run.q[0], [*centre, angle], rtol=1e-7)
