@@ -50,7 +50,7 @@ def test_a_number_in_params_serves_every_function() -> None:
 
     R, h, g = HELIX["R"], HELIX["h"], 9.7
     np.testing.assert_allclose(turn(scene), -g * h / (R**2 + h**2), rtol=1e-14)
-    by = jax.grad(turn)(scene)
+    by = jax.jit(jax.grad(turn))(scene)
     np.testing.assert_allclose(by.params["R"], 2 * g * h * R / (R**2 + h**2) ** 2, rtol=1e-13)
     np.testing.assert_allclose(by.params["h"], -g / (R**2 + h**2) + 2 * g * h**2 / (R**2 + h**2) ** 2, rtol=1e-13)
     np.testing.assert_allclose(by.params["m"], 0.0, atol=1e-13)

@@ -251,7 +251,7 @@ def test_periods_by_crossings() -> None:
 
     for name in ("q[0]", "qd[0]"):
         np.testing.assert_allclose(metrics.period(name)(swing(1.7)), 2 * np.pi / 1.7, rtol=1e-5)
-    slope = jax.grad(lambda w: metrics.period("q[0]")(swing(w)))(1.7)
+    slope = jax.jit(jax.grad(lambda w: metrics.period("q[0]")(swing(w))))(1.7)
     np.testing.assert_allclose(slope, -2 * np.pi / 1.7**2, rtol=1e-3)
     np.testing.assert_allclose(metrics.peak("q[0]")(swing(1.7)), 4.0, rtol=1e-9)
     # A sample every tenth of a period, with turning points between them; samples alone are off by 0.05.

@@ -100,7 +100,7 @@ def fixed_point() -> Any:
 
 @pytest.fixture(scope="module")
 def reverse_gradient() -> Any:
-    return jax.grad(end_of_fixed)(fixed_point())
+    return jax.jit(jax.grad(end_of_fixed))(fixed_point())
 
 
 def test_gradients_by_every_number_equal_finite_differences(reverse_gradient: Any) -> None:

@@ -248,8 +248,8 @@ def test_second_derivatives_through_events() -> None:
     n = float(np.ceil((1.0 - 0.1 / k) / (2 * 0.1 / k)))
     sign = (-1.0) ** n
     np.testing.assert_allclose(rest(k), sign * (1.0 - 2 * n * 0.1 / k), rtol=1e-8)
-    second = jax.hessian(rest)(k)
-    ahead = jax.jacfwd(jax.jacfwd(lambda k: rest(k, dfx.ForwardMode())))(k)
+    second = jax.jit(jax.hessian(rest))(k)
+    ahead = jax.jit(jax.jacfwd(jax.jacfwd(lambda k: rest(k, dfx.ForwardMode()))))(k)
     np.testing.assert_allclose(second, ahead, rtol=1e-9)
     np.testing.assert_allclose(second, -sign * 4 * n * 0.1 / k**3, rtol=1e-5)
 

@@ -234,7 +234,7 @@ def test_derivatives() -> None:
     reverse = flat(jax.jit(jax.grad(end))(scene))
     leaves, tree = jax.tree.flatten(scene)
     ahead = dfx.ForwardMode()
-    forward = jax.jacfwd(lambda leaves: end(jax.tree.unflatten(tree, leaves), ahead))(leaves)
+    forward = jax.jit(jax.jacfwd(lambda leaves: end(jax.tree.unflatten(tree, leaves), ahead)))(leaves)
     np.testing.assert_allclose(flat(forward), reverse, rtol=1e-9, atol=1e-13)
     # Truncation of order step^4; rounding of the end, 1e-16, divided by the step: 1e-12.
     differences = gradient_by_differences(end, scene, 1e-4)
