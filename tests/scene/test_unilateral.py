@@ -1,8 +1,8 @@
 """Contacts that open, close and strike: against closed forms, in value, derivative and energy."""
+# ruff: noqa: ARG001 (Lagrangians, gaps and forces have all their arguments, used or not)
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,15 +18,16 @@ HARD = hard_cases()
 TIGHT: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-12}
 
 
-def _ball_end(start):
+def _ball_end(start, **more):
     """Saved motion, the end of all bounces, and the run of a ball dropped from `h`."""
     run = jms.simulate(
         bouncing_ball.scene(e=start["e"]),
         jnp.stack([start["h"]]),
         [0.0],
         2.5,
-        ts=jnp.array([0.3, 0.7, 1.1, 1.35, 2.0, 2.5]),
+        ts=np.array([0.3, 0.7, 1.1, 1.35, 2.0, 2.5]),
         **TIGHT,
+        **more,
     )
     return run, jnp.max(jnp.where(jnp.isfinite(run.events.t), run.events.t, 0.0))
 
@@ -53,8 +54,8 @@ def test_a_ball_bounces_to_rest_on_the_floor():
 @pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
 def test_derivatives_of_the_end_of_all_bounces(derivative):
     start = {"h": 1.0, "e": 0.5}
-    ours = derivative(lambda start: _ball_end(start)[1])(start)
-    closed = jax.grad(lambda start: bouncing_ball.rest(**start))(start)
+    ours = jax.jit(derivative(lambda start: _ball_end(start, throw=False)[1]))(start)
+    closed = jax.jit(jax.grad(lambda start: bouncing_ball.rest(**start)))(start)
     for name in start:
         np.testing.assert_allclose(ours[name], closed[name], rtol=1e-8)
 
@@ -68,20 +69,21 @@ def test_gradient_through_a_hundred_impacts():
         t = 0.5 / v + jnp.sum(1.0 / speeds[1:impacts])
         return t, speeds[impacts]
 
-    t1 = float(closed(1.0, 0.99)[0]) + 0.1
+    t1 = float(jax.jit(closed)(1.0, 0.99)[0]) + 0.1
 
     def end(start):
         walls = jms.end_stops(lambda q: q[0], lower=0.0, upper=1.0, restitution=start["e"])
         scene = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, constraints=walls)
-        return jms.simulate(scene, [0.5], jnp.stack([start["v"]]), t1, max_events=256, **TIGHT).q[-1, 0]
+        run = jms.simulate(scene, [0.5], jnp.stack([start["v"]]), t1, max_events=256, throw=False, **TIGHT)
+        return run.q[-1, 0]
 
     def exact(start):
         t, speed = closed(start["v"], start["e"])
         return speed * (t1 - t)  # the last of an even number of impacts is at the left wall
 
     start = {"v": 1.0, "e": 0.99}
-    np.testing.assert_allclose(end(start), exact(start), rtol=1e-9)
-    ours, theirs = jax.grad(end)(start), jax.grad(exact)(start)
+    (value, ours), (right, theirs) = (jax.jit(jax.value_and_grad(f))(start) for f in (end, exact))
+    np.testing.assert_allclose(value, right, rtol=1e-9)
     for name in start:
         np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-8)
 
@@ -122,7 +124,7 @@ def test_several_contacts_at_one_instant():
     """A rigid bar falls flat on two supports."""
     bar = HARD["bar_on_two_supports"].task
     assert isinstance(bar, SceneTask)
-    run = jms.simulate(bar.scene, [0.1, 0.0], [0.0, 0.0], 2.0, ts=jnp.array([0.2, 2.0]), **TIGHT)
+    run = jms.simulate(bar.scene, [0.1, 0.0], [0.0, 0.0], 2.0, ts=np.array([0.2, 2.0]), **TIGHT)
     height, velocity = bouncing_ball.motion(run.t, h=0.1, e=0.5)
     np.testing.assert_allclose(run.q[:, 0], height, atol=1e-11)
     np.testing.assert_allclose(run.qd[:, 0], velocity, atol=1e-11)
@@ -141,10 +143,8 @@ def test_backlash_between_a_motor_and_its_load():
     )
 
     def end(play):
-        run = jms.simulate(
-            jms.scene.replace_numbers(scene, {"play": play}), [0.0, 0.0], [0.0, 0.0], 2.0, ts=[1.0, 2.0], **TIGHT
-        )
-        return run.q[-1, 1]
+        wide = jms.scene.replace_numbers(scene, {"play": play})
+        return jms.simulate(wide, [0.0, 0.0], [0.0, 0.0], 2.0, throw=False, **TIGHT).q[-1, 1]
 
     run = jms.simulate(scene, [0.0, 0.0], [0.0, 0.0], 2.0, ts=[1.0, 2.0], **TIGHT)
     strikes, left = np.sqrt(play / torque), 2.0 - np.sqrt(play / torque)
@@ -155,7 +155,7 @@ def test_backlash_between_a_motor_and_its_load():
     np.testing.assert_allclose(run.q[-1, 0] - run.q[-1, 1], play / 2, rtol=1e-12)
     np.testing.assert_allclose(run.reactions["teeth_upper"].multiplier[:, 0], 0.75 * torque, rtol=1e-10)
     # The place is torque/4 (2 - play/(2 torque)).
-    np.testing.assert_allclose(jax.grad(end)(jnp.asarray(play)), -1 / 8, rtol=1e-8)
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(jnp.asarray(play)), -1 / 8, rtol=1e-8)
 
 
 def test_an_impact_within_a_constraint():
@@ -168,15 +168,14 @@ def test_an_impact_within_a_constraint():
             jms.Constraint(lambda t, q, p: jnp.sqrt(jnp.sum(q**2)) - 1.0, name="rod"),
         ),
     )
-    run = jms.simulate(
-        scene, [np.sin(start), -np.cos(start)], [0.0, 0.0], 0.75, ts=jnp.linspace(0.0, 0.75, 16), **TIGHT
-    )
+    run = jms.simulate(scene, [np.sin(start), -np.cos(start)], [0.0, 0.0], 0.75, ts=np.linspace(0.0, 0.75, 16), **TIGHT)
     (strike,) = run.mode_changes
     # A quarter of the period, an elliptic integral.
     np.testing.assert_allclose(strike.t, ellipk(np.sin(start / 2) ** 2) / np.sqrt(g), rtol=1e-9)
-    np.testing.assert_allclose(jnp.sum(run.q**2, axis=1), 1.0, atol=1e-12)
-    after = run.t > strike.t
-    energy = 0.5 * jnp.sum(run.qd**2, axis=1) + g * (1 + run.q[:, 1])
+    t, q, qd = map(np.asarray, (run.t, run.q, run.qd))
+    np.testing.assert_allclose(np.sum(q**2, axis=1), 1.0, atol=1e-12)
+    after = t > strike.t
+    energy = 0.5 * np.sum(qd**2, axis=1) + g * (1 + q[:, 1])
     full = g * (1 - np.cos(start))
     np.testing.assert_allclose(energy, np.where(after, e**2 * full, full), rtol=1e-8)
     np.testing.assert_allclose(run.event_losses, np.where(after, (1 - e**2) * full, 0.0), atol=1e-8)
@@ -192,7 +191,7 @@ def test_poissons_law():
             jms.Contact(lambda t, q, p: q[1] - q[0], restitution=jms.Poisson(0.0), name="balls"),
         ),
     )
-    run = jms.simulate(scene, [0.0, 1.0], [0.0, -v], 1.0, ts=jnp.array([0.5, 1.0]), **TIGHT)
+    run = jms.simulate(scene, [0.0, 1.0], [0.0, -v], 1.0, ts=np.array([0.5, 1.0]), **TIGHT)
     np.testing.assert_allclose(run.qd[-1], m2 * v / (m1 + m2), rtol=1e-12)
     np.testing.assert_array_equal(run.mode["floor"], [1, 0])
     np.testing.assert_array_equal(run.mode["balls"], [0, 1])
@@ -201,31 +200,34 @@ def test_poissons_law():
     ball = jms.Scene(
         ball.lagrangian, ball.params, constraints=(jms.Contact(lambda t, q, p: q[0], restitution=jms.Poisson(0.5)),)
     )
-    run = jms.simulate(ball, [1.0], [0.0], 2.5, ts=jnp.array([1.1, 2.5]), **TIGHT)
+    run = jms.simulate(ball, [1.0], [0.0], 2.5, ts=np.array([1.1, 2.5]), **TIGHT)
     np.testing.assert_allclose(run.q[:, 0], bouncing_ball.motion(run.t, h=1.0, e=0.5)[0], atol=1e-11)
 
 
-def _compliant_ball(law, **more):
-    floor = jms.Contact(lambda t, q, p: q[0] - p["rise"] * t, restitution=law, name="floor", **more)
-    return jms.Scene(
-        lambda t, q, qd, p: 0.5 * p["m"] * qd[0] ** 2 - p["m"] * p["g"] * q[0],
-        params={"m": 1.0, "g": 9.81, "rise": 0.0},
-        constraints=(floor,),
-    )
+def _ball(t, q, qd, p):
+    return 0.5 * p["m"] * qd[0] ** 2 - p["m"] * p["g"] * q[0]
+
+
+def _over_a_rising_floor(t, q, p):
+    return q[0] - p["rise"] * t
+
+
+def _compliant_ball(law, m=1.0, g=9.81, rise=0.0):
+    floor = jms.Contact(_over_a_rising_floor, restitution=law, name="floor")
+    return jms.Scene(_ball, params={"m": m, "g": g, "rise": rise}, constraints=(floor,))
 
 
 @pytest.mark.parametrize("law", [jms.HuntCrossley(1e3, 1.0, 0.2), jms.HuntCrossley(1e5, 1.5, 0.4)])
 def test_a_compliant_contact_gives_back_what_its_closed_form_says(law):
     """In free flight against a floor that moves; energy is stored, lost and supplied, and all of it accounted for."""
-    scene = eqx.tree_at(lambda s: s.params, _compliant_ball(law), {"m": 2.0, "g": 0.0, "rise": 0.5})
-    scene = jax.tree.map(jnp.asarray, scene)
-    run = jms.simulate(scene, [0.1], [-1.5], 1.0, ts=jnp.linspace(0.0, 1.0, 41), **TIGHT)
-    np.testing.assert_allclose(run.qd[-1, 0], 0.5 + 2.0 * law.restitution(2.0), rtol=1e-8)
+    scene, e = _compliant_ball(law, m=2.0, g=0.0, rise=0.5), float(law.restitution(2.0))
+    run = jms.simulate(scene, [0.1], [-1.5], 1.0, ts=np.linspace(0.0, 1.0, 41), **TIGHT)
+    np.testing.assert_allclose(run.qd[-1, 0], 0.5 + 2.0 * e, rtol=1e-8)
     assert not run.mode
     np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-8)
     assert (np.diff(run.energy.dissipated) >= -1e-9).all()
-    np.testing.assert_allclose(run.energy.dissipated[-1], 4.0 * (1.0 - law.restitution(2.0) ** 2), rtol=1e-7)
-    np.testing.assert_allclose(jnp.sum(run.reactions["floor"].multiplier < 0), 0)
+    np.testing.assert_allclose(run.energy.dissipated[-1], 4.0 * (1.0 - e**2), rtol=1e-7)
+    assert np.min(run.reactions["floor"].multiplier) >= 0.0
 
 
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
@@ -234,14 +236,14 @@ def test_derivatives_through_a_compliant_contact(derivative):
 
     def after(x):
         law = jms.HuntCrossley(x["stiffness"], 1.5, x["damping"])
-        scene = eqx.tree_at(lambda s: s.params, _compliant_ball(law), {"m": x["m"], "g": 0.0 * x["m"], "rise": 0.0})
-        scene = jax.tree.map(jnp.asarray, scene)
-        return jms.simulate(scene, [0.1], jnp.stack([-x["speed"]]), 1.0, **TIGHT).qd[-1, 0]
+        scene = _compliant_ball(law, m=x["m"], g=0.0)
+        return jms.simulate(scene, [0.1], jnp.stack([-x["speed"]]), 1.0, throw=False, **TIGHT).qd[-1, 0]
+
+    def closed(x):
+        return x["speed"] * jms.HuntCrossley(1.0, damping=x["damping"]).restitution(x["speed"])
 
     at = {"stiffness": 1e4, "damping": 0.3, "m": 2.0, "speed": 1.5}
-    at = jax.tree.map(jnp.asarray, at)
-    exact = jax.grad(lambda x: x["speed"] * jms.HuntCrossley(1.0, damping=x["damping"]).restitution(x["speed"]))(at)
-    ours = derivative(after)(at)
+    ours, exact = (jax.jit(f)(at) for f in (derivative(after), jax.grad(closed)))
     for name in at:  # the error control of the run is that of the motion, not of its derivatives
         np.testing.assert_allclose(ours[name], exact[name], rtol=1e-6, atol=1e-6, err_msg=name)
 
