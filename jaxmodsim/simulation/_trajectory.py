@@ -275,7 +275,9 @@ class Trajectory(AbstractReadable):
         return size if not is_known(count) else min(size, 1 << max(int(count), 8).bit_length())
 
     def _log(self) -> EventLog:
-        return self._once("log", lambda: solve_logged(self.inputs, self.options, self.log_size))
+        # Events do not depend on saved times, which are checked already where they are known.
+        inputs = self.inputs._replace(ts=None) if is_known(self.inputs.ts) else self.inputs
+        return self._once("log", lambda: solve_logged(inputs, self.options, self.log_size))
 
     def _once(self, name: str, make: Callable[[], _Value]) -> _Value:
         """A value that takes a repeat of the run, made where it is not there yet."""

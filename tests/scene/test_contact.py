@@ -11,6 +11,7 @@ import pytest
 
 from jaxmodsim import AppliedForce, Coulomb, Friction, LuGre, Regularized, Scene, SimulationError, Stribeck, simulate
 from jaxmodsim.scene._event_driven import FrictionElements, next_modes, solve_friction_forces
+from jaxmodsim.simulation._solve import solve_logged
 from jaxmodsim.validation.hard._many_events import Contradictory
 
 
@@ -82,7 +83,7 @@ def test_the_modes_found_satisfy_all_limits(n: int, stiction: bool) -> None:
 def test_two_elements_on_one_coordinate_share_in_proportion_to_their_limits() -> None:
     """Limits 1 N and 3 N under a ramp of 1 N/s: both let go at 4 s, and slide against 1 N + 2 N from there on."""
     both = scene(Friction(Coulomb(1.0)), Friction(Coulomb(2.0, 3.0)), r=1.0)
-    run = simulate(both, [0.0], [0.0], 6.0, ts=jnp.array([2.0, 3.9, 6.0]), rtol=1e-9, atol=1e-12)
+    run = simulate(both, [0.0], [0.0], 6.0, ts=np.array([2.0, 3.9, 6.0]), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(run.events.t[:2], 4.0, rtol=1e-7)
     np.testing.assert_array_equal(run.events.effect[:3], [1, 2, -1])
     np.testing.assert_allclose(run.forces["friction"][:2], [0.5, 0.975], rtol=1e-7)
@@ -98,7 +99,7 @@ def test_redundant_elements_in_series_give_no_nan() -> None:
         Friction(Coulomb(0.5), along=lambda q: q[0] - q[1]),
         r=1.0,
     )
-    run = simulate(three, [0.0, 0.0], [0.0, 0.0], 4.0, ts=jnp.array([1.0, 1.45, 2.0, 4.0]), rtol=1e-9, atol=1e-12)
+    run = simulate(three, [0.0, 0.0], [0.0, 0.0], 4.0, ts=np.array([1.0, 1.45, 2.0, 4.0]), rtol=1e-9, atol=1e-12)
     # The first mass moves at 1.5 N = 1 N to the ground + 0.5 N through the second, which never moves.
     np.testing.assert_allclose(run.events.t[1], 1.5, rtol=1e-7)
     speed = [0.0, 0.0, 0.5 * 0.5**2, 0.5 * 2.5**2]
@@ -109,18 +110,19 @@ def test_redundant_elements_in_series_give_no_nan() -> None:
 
 def test_a_moving_base_is_followed_to_rounding_while_its_acceleration_can_be() -> None:
     """A box on a surface that swings with sin(3 t): friction m 3 cos(3 t) <= 3 N carries it, 2.9 N does not."""
-    ts = jnp.linspace(0.0, 10.0, 41)
+    ts = np.linspace(0.0, 10.0, 41)
     swing = lambda t: jnp.sin(3.0 * t)  # noqa: E731
     carried = simulate(scene(Friction(Coulomb(2.0, 3.0), belt_velocity=swing)), [0.0], [0.0], 10.0, ts=ts)
     assert carried.stats["num_events"] == 0
-    np.testing.assert_allclose(carried.qd[:, 0], jnp.sin(3.0 * ts), atol=1e-14)
-    np.testing.assert_allclose(carried.forces["friction"], -3.0 * jnp.cos(3.0 * ts), atol=1e-12)
+    np.testing.assert_allclose(carried.qd[:, 0], np.sin(3.0 * ts), atol=1e-14)
+    np.testing.assert_allclose(carried.forces["friction"], -3.0 * np.cos(3.0 * ts), atol=1e-12)
     slips = simulate(scene(Friction(Coulomb(2.0, 2.9), belt_velocity=swing)), [0.0], [0.0], 10.0, ts=ts)
     assert slips.stats["num_events"] > 5
     # At the very start the base runs away from the box, which has no slip velocity yet.
-    v, mode = (slips.qd[:, 0] - jnp.sin(3.0 * ts))[1:], slips.mode["friction"][1:]
-    np.testing.assert_array_equal(jnp.sign(jnp.where(jnp.abs(v) < 1e-12, 0.0, v)), mode)
-    np.testing.assert_allclose(jnp.where(mode == 0, 0.0, slips.forces["friction"][1:] - 2.0 * mode), 0.0, atol=1e-12)
+    velocity, mode, force = map(np.asarray, (slips.qd[:, 0], slips.mode["friction"], slips.forces["friction"]))
+    v, mode, force = (velocity - np.sin(3.0 * ts))[1:], mode[1:], force[1:]
+    np.testing.assert_array_equal(np.sign(np.where(np.abs(v) < 1e-12, 0.0, v)), mode)
+    np.testing.assert_allclose(np.where(mode == 0, 0.0, force - 2.0 * mode), 0.0, atol=1e-12)
     np.testing.assert_allclose(slips.energy.balance, 0.0, atol=1e-5)
 
 
@@ -143,7 +145,7 @@ def test_short_pulses_are_named_where_they_are_stepped_over_and_found_with_dtmax
     """Once a second a pulse of 6 N and a twentieth of a second on a box that 3 N hold."""
     friction = Friction(Coulomb(2.0, 3.0))
     box = Scene(masses, params={"m": 1.0, "k": 0.0, "a": 6.0}, effects=(AppliedForce(pulses), friction))
-    ts = jnp.linspace(0.5, 10.5, 201)
+    ts = np.linspace(0.5, 10.5, 201)
     missed = simulate(box, [0.0], [0.0], 10.5, t0=0.5, ts=ts, dtmax=10.0, throw=False)
     assert "stepped over" in missed.result.message
     found = simulate(box, [0.0], [0.0], 10.5, t0=0.5, ts=ts, dtmax=0.03)
@@ -197,8 +199,8 @@ def test_exact_and_bristle_laws_in_one_scene() -> None:
 def test_chatter_is_named_or_held() -> None:
     law = scene(Friction(Contradictory(), name="pad"), r=1.0)
     with pytest.raises(SimulationError, match=r"mode changes of 'pad' accumulate: chatter.*stopped at t = 1"):
-        simulate(law, [0.0], [0.0], 1.8, ts=jnp.array([0.5, 1.5]))
-    early = simulate(law, [0.0], [0.0], 1.8, ts=jnp.array([0.5, 1.5]), throw=False)
+        simulate(law, [0.0], [0.0], 1.8, ts=np.array([0.5, 1.5]))
+    early = simulate(law, [0.0], [0.0], 1.8, ts=np.array([0.5, 1.5]), throw=False)
     assert not early.result.ok
     # The step before ends on the event to 1e-5 of its length.
     np.testing.assert_allclose(early.t_end, 1.0, atol=1e-5)
@@ -221,6 +223,11 @@ def test_the_limit_of_mode_changes_is_named() -> None:
     run = simulate(shaken, [0.0], [0.0], 10.0, max_events=5, throw=False)
     assert np.sum(np.isfinite(run.events.t)) == 5
     assert run.events.t[4] < run.t_end + 1e-6
+    # Whatever times are saved, events are those, and nothing is compiled for them.
+    ts, compiled = np.array([1.0, 2.0]), solve_logged._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
+    other = simulate(shaken, [0.0], [0.0], 10.0, ts=ts, max_events=5, throw=False)
+    np.testing.assert_array_equal(other.events.t, run.events.t)
+    assert solve_logged._cache_size() == compiled  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_smooth_and_bristle_laws_converge_to_the_exact_run() -> None:
