@@ -46,6 +46,9 @@ def joint(law: Any, u: Any = 0.0, *, w: float = 0.0, c: float = 0.0, load: Any =
     )
 
 
+rate_of = jax.jit(vector_field)
+
+
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 @pytest.mark.parametrize("load", [LOAD, -LOAD])
 def test_efficiency_in_steady_motion(direction: float, load: float) -> None:
@@ -55,14 +58,14 @@ def test_efficiency_in_steady_motion(direction: float, load: float) -> None:
     speed = direction * SPEED
     scene = joint(Geared(Coulomb(0.0), DRIVE, spring, BACK), u, load=load)
     state = State(jnp.array([load / 20.0, 0.0]), jnp.array([speed, speed]), {})
-    rate = vector_field(jnp.array(0.0), state, scene, jnp.array([direction]))
+    rate = rate_of(0.0, state, scene, np.array([direction]))
     np.testing.assert_allclose(rate.qd, 0.0, atol=1e-12)
     motor, other = u * speed, load * speed
     efficiency = other / motor if drives else motor / other
     assert efficiency == pytest.approx(1.0 / (1.0 + DRIVE) if drives else 1.0 - BACK, abs=1e-12)
     # With a bristle in place of events, where it has come to its limit.
     bent = joint(Bristle(Geared(Coulomb(0.0), DRIVE, spring, BACK), 1e-3), u, load=load)
-    rate = vector_field(jnp.array(0.0), state._replace(z={"gear": jnp.array(direction)}), bent)
+    rate = rate_of(0.0, state._replace(z={"gear": jnp.array(direction)}), bent)
     np.testing.assert_allclose(rate.qd, 0.0, atol=1e-12)
     assert rate.z["gear"] == 0.0
 

@@ -29,6 +29,8 @@ from jaxmodsim.scene import State, forward_dynamics, vector_field
 from jaxmodsim.scene._event_driven import _loads
 
 ZERO = jnp.array(0.0)
+# As a whole, not operation by operation.
+rate_of, dynamics_of = jax.jit(vector_field), jax.jit(forward_dynamics)
 G, LENGTH = 9.81, 2.0
 
 
@@ -62,9 +64,9 @@ def test_pendulum_in_cartesian_coordinates() -> None:
     along, inwards = np.array([np.cos(0.7), np.sin(0.7)]), np.array([-np.sin(0.7), np.cos(0.7)])
     exact = -G * np.sin(0.7) * along + LENGTH * 1.1**2 * inwards
     state = State(q, qd, {})
-    np.testing.assert_allclose(vector_field(ZERO, state, PENDULUM).qd, exact, atol=1e-13)
+    np.testing.assert_allclose(rate_of(ZERO, state, PENDULUM).qd, exact, atol=1e-13)
     tension = 1.3 * (LENGTH * 1.1**2 + G * np.cos(0.7))
-    reaction = forward_dynamics(ZERO, state, PENDULUM).reactions["rod"]
+    reaction = dynamics_of(ZERO, state, PENDULUM).reactions["rod"]
     np.testing.assert_allclose(reaction.force, tension * inwards, rtol=1e-13)
     np.testing.assert_allclose(reaction.generalised, tension * inwards, rtol=1e-13)
     np.testing.assert_allclose(reaction.multiplier, [-tension / (2 * LENGTH)], rtol=1e-13)
@@ -75,11 +77,11 @@ def test_redundant_constraints_share_and_leave_the_motion_as_it_is(copies: int) 
     q, qd = hanging(0.7, 1.1)
     again = Scene(BOB, constraints=tuple(Constraint(circle, at=lambda q: q) for _ in range(copies)))
     state = State(q, qd, {})
-    one = vector_field(ZERO, state, PENDULUM).qd
-    np.testing.assert_allclose(vector_field(ZERO, state, again).qd, one, rtol=1e-12)
-    parts = [each.force for each in forward_dynamics(ZERO, state, again).reactions.values()]
+    one = rate_of(ZERO, state, PENDULUM).qd
+    np.testing.assert_allclose(rate_of(ZERO, state, again).qd, one, rtol=1e-12)
+    parts = [each.force for each in dynamics_of(ZERO, state, again).reactions.values()]
     np.testing.assert_allclose(parts[0], parts[-1], rtol=1e-6)
-    np.testing.assert_allclose(sum(parts), forward_dynamics(ZERO, state, PENDULUM).reactions["rod"].force, rtol=1e-12)
+    np.testing.assert_allclose(sum(parts), dynamics_of(ZERO, state, PENDULUM).reactions["rod"].force, rtol=1e-12)
 
 
 def test_smallest_solution_of_a_singular_system() -> None:
@@ -222,6 +224,24 @@ def test_constraints_that_contradict_each_other_end_the_run() -> None:
 # --- Loads that are reactions ---------------------------------------------------------------------------------------
 
 
+def pushed_down(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    del t, q, qd
+    return jnp.stack([p["side"], -p["down"]])
+
+
+def heavy(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    return 0.5 * 2.0 * jnp.sum(qd**2) + 0.0 * (t + q[0] + p["down"])
+
+
+def tilted(q: Any, p: Any) -> Any:
+    return q[0] + p["tilt"] * q[1]
+
+
+def height(t: Any, q: Any, p: Any) -> Any:
+    del t, p
+    return q[1]
+
+
 def floor_scene(mu: float, tilt: float, pulls: bool = False) -> Scene:
     """A block of 2 kg on a floor, pushed by 3 N along it and 4 N + tilt times friction's own side force.
 
@@ -229,18 +249,14 @@ def floor_scene(mu: float, tilt: float, pulls: bool = False) -> Scene:
     is x + tilt z, so each newton of friction changes the load by tilt.
     """
 
-    def push(t: Any, q: Any, qd: Any, p: Any) -> Any:
-        del t, q, qd
-        return jnp.stack([p["side"], -p["down"]])
-
     return Scene(
-        lambda t, q, qd, p: 0.5 * 2.0 * jnp.sum(qd**2) + 0.0 * (t + q[0] + p["down"]),
-        params={"side": 3.0, "down": 4.0},
+        heavy,
+        params={"side": 3.0, "down": 4.0, "tilt": tilt},
         effects=(
-            AppliedForce(push),
-            Friction(Regularized(Coulomb(mu), 1e-6), along=lambda q: q[0] + tilt * q[1], normal_force="floor"),
+            AppliedForce(pushed_down),
+            Friction(Regularized(Coulomb(mu), 1e-6), along=tilted, normal_force="floor"),
         ),
-        constraints=((Constraint if pulls else Contact)(lambda t, q, p: q[1], name="floor"),),
+        constraints=((Constraint if pulls else Contact)(height, name="floor"),),
     )
 
 
@@ -249,7 +265,7 @@ def test_friction_and_its_load_are_solved_together(mu: float, tilt: float) -> No
     """Upright: N = down + tilt F with F = mu N, so N = down/(1 - mu tilt)."""
     scene, state, closed = floor_scene(mu, tilt), State(jnp.zeros(2), jnp.array([1.0, 0.0]), {}), jnp.ones(1)
     normal = 4.0 / (1.0 - mu * tilt)
-    dynamics = forward_dynamics(ZERO, state, scene, closed)
+    dynamics = dynamics_of(ZERO, state, scene, closed)
     np.testing.assert_allclose(dynamics.reactions["floor"].multiplier, [normal], rtol=1e-13)
     np.testing.assert_allclose(dynamics.forces["friction"], mu * normal, rtol=1e-13)
     np.testing.assert_allclose(dynamics.rate.qd, [(3.0 - mu * normal) / 2.0, 0.0], atol=1e-13)
