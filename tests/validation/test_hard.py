@@ -1,4 +1,4 @@
-"""Hard cases: those that found something to mend, and that the checks themselves can fail."""
+"""Hard cases: one of each kind, and that the checks themselves can fail."""
 
 from dataclasses import replace
 from typing import Any
