@@ -1,7 +1,9 @@
-"""Brake squeal: a pad sings as the disc slows down.
+"""Brake squeal: at which speeds of the disc a pad sings, how loud, and what a damper changes.
 
-Friction that falls with slip velocity feeds the pad's vibration as soon as its slope exceeds the damping of the pad:
-below a certain velocity of the disc. Stick and slip are exact, the disc is a belt whose velocity is a function of time.
+Friction that falls with slip velocity feeds the vibration of the pad as soon as its slope exceeds the damping: below a
+Hopf point of steady sliding. The orbits that begin there are unstable and go back to higher speeds, until the pad comes
+to stick to the disc; from there they are stable, and loud. Between the two speeds a pad that slides goes on sliding,
+and one that squeals goes on squealing, as runs show: from near steady sliding, and from stick.
 
 Run it: `python examples/g0_brake_squeal.py [--smoke] [--out DIR]`.
 """
@@ -11,11 +13,12 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-from matplotlib.figure import Figure
 
 import jaxmodsim as jms
+from jaxmodsim.plot import branch_figure
 
-SPEED, DURATION = 0.8, 0.3  # of the disc at first [m/s], and how long it takes to stop [s]
+FAST = 2.2  # speed of the disc [m/s]
+PAD = {"m": 0.4, "k": 4e6}  # [kg], [N/m]
 
 
 def lagrangian(t, q, qd, p):
@@ -23,34 +26,48 @@ def lagrangian(t, q, qd, p):
     return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
 
 
-def disc(t):
-    """Velocity of the disc under the pad [m/s]."""
-    return SPEED * (1.0 - t / DURATION)
+def brake(speed, damping=8.0):
+    """A pad with a damper [N s/m] on a disc of this speed [m/s]."""
+    pad = jms.Stribeck(Fc=60.0, Fs=110.0, vs=0.3)
+    effects = (
+        jms.Friction(pad, belt_velocity=speed, name="disc"),
+        jms.Friction(jms.Viscous(damping), name="damper"),
+    )
+    return jms.Scene(lagrangian, PAD, effects, coordinates=("x [m]",))
+
+
+def amplitudes(speeds, starts, smoke):
+    """Amplitude of the pad at these speeds of the disc, after a while from these velocities of the pad [m/s]."""
+    t1 = 0.1 if smoke else 1.0
+
+    def run(speed, start):
+        ts = jnp.linspace(0.95 * t1, t1, 1001)
+        q = jms.simulate(brake(speed), [15e-6], start[None], t1, ts=ts, max_events=2048, max_steps=2**17).q
+        return 0.5 * jnp.ptp(q)
+
+    return jax.jit(jax.vmap(run))(speeds, starts)
 
 
 def main(out: Path, smoke: bool = False) -> None:
-    """Brake, and draw the pad's velocity below that of the disc."""
-    friction = jms.Stribeck(Fc=60.0, Fs=110.0, vs=0.3, Fv=0.0)
-    scene = jms.Scene(
-        lagrangian,
-        params={"m": 0.4, "k": 4e6},
-        effects=(
-            jms.Friction(friction, belt_velocity=disc, name="disc"),
-            jms.Friction(jms.Viscous(8.0), name="damper"),
-        ),
-    )
-    t1 = 0.6 * DURATION if smoke else 0.98 * DURATION
-    run = jms.simulate(scene, [80.0 / 4e6], [0.0], t1, ts=jnp.linspace(0.0, t1, 4001), max_events=1024)
-    print(f"{run.result} {int(run.stats['num_events'])} changes of mode")
-    print(f"the pad swings at {float(jnp.sqrt(4e6 / 0.4) / (2.0 * jnp.pi)):.0f} Hz")
-    figure = Figure(figsize=(9, 5.5), layout="constrained")
-    above, below = figure.subplots(2, 1, sharex=True)
-    above.plot(run.t, disc(run.t), color="#8a8a8a", label="disc")
-    above.plot(run.t, run.qd[:, 0], lw=0.6, color="#1f5fa8", label="pad")
-    above.set(ylabel="velocity [m/s]", title="A pad on a disc that slows down")
-    above.legend()
-    below.plot(run.t, run.forces["disc"], lw=0.6, color="#c2452d")
-    below.set(ylabel="friction [N]", xlabel="time [s]")
+    """Follow steady sliding and squeal over the speed of the disc."""
+    name, span = "disc.belt_velocity", (FAST, 0.05)
+    for damping in (8.0,) if smoke else (40.0, 20.0, 8.0):
+        sliding = jms.continue_equilibria(brake(FAST, damping), [0.0], name, span, step=0.1)
+        start = sliding.points[0]
+        squeal = jms.continue_orbits(brake(FAST, damping), start, name, span, step=0.2, max_orbits=5 if smoke else 500)
+        print(
+            f"damper {damping:g} N s/m: {1 / start.orbit.period:.0f} Hz, begins below {start.value:.3f} m/s,"
+            f" lasts up to {squeal.values.max():.3f} m/s, amplitude up to {1e6 * squeal.amplitude.max():.0f} um"
+        )
+    print(squeal)
+    figure = branch_figure(squeal, beside=(sliding,))
+    speeds = jnp.linspace(0.1, FAST, 4 if smoke else 22)
+    for start, mark, label in ((0.01 + 0 * speeds, "v", "run, from sliding"), (speeds, "^", "run, from stick")):
+        amplitude = amplitudes(speeds, start, smoke)
+        figure.axes[0].plot(speeds, amplitude, mark, ms=4, color="#8a8a8a", label=label)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    once = dict(zip(labels, handles, strict=True))
+    figure.axes[0].legend(once.values(), once.keys(), fontsize=9, frameon=False)
     out.mkdir(parents=True, exist_ok=True)
     figure.savefig(out / "g0_brake_squeal.png", dpi=110)
     print(f"wrote {out / 'g0_brake_squeal.png'}")

@@ -11,7 +11,8 @@ Runs: simulate, simulate_to_accuracy; they give a Trajectory, or raise a Simulat
 Solvers: Rodas5P, Gauss, ImplicitFriction; EventSolver and EventController; StoredSteps, an adjoint.
 Analysis: energy_audit (EnergyAudit), sensitivity (Sensitivity), check_gradients (GradientCheck), cyclic_coordinates;
     work_precision (WorkPrecision), Method, formulations.
-Periodic orbits: periodic_orbit (PeriodicOrbit), continue_orbits (Branch), hunting (Hunting).
+Periodic orbits: periodic_orbit (PeriodicOrbit), continue_orbits (Branch), hunting (Hunting); where they begin:
+equilibrium (Equilibrium), continue_equilibria.
 Records: fit, fit_law, Record, FitResult.
 Many runs: sweep.
 Speed: tune_cpu, called before JAX computes anything.
@@ -86,9 +87,12 @@ if TYPE_CHECKING:
     from .mechanics import point_mass as point_mass
     from .mechanics import rigid_body as rigid_body
     from .orbits import Branch as Branch
+    from .orbits import Equilibrium as Equilibrium
     from .orbits import Hunting as Hunting
     from .orbits import PeriodicOrbit as PeriodicOrbit
+    from .orbits import continue_equilibria as continue_equilibria
     from .orbits import continue_orbits as continue_orbits
+    from .orbits import equilibrium as equilibrium
     from .orbits import hunting as hunting
     from .orbits import periodic_orbit as periodic_orbit
     from .scene import AbstractEffect as AbstractEffect
@@ -166,7 +170,17 @@ _LATER = {
         "rigid_body",
     ),
     "metrics": (),
-    "orbits": ("Branch", "Hunting", "PeriodicOrbit", "continue_orbits", "hunting", "periodic_orbit"),
+    "orbits": (
+        "Branch",
+        "Equilibrium",
+        "Hunting",
+        "PeriodicOrbit",
+        "continue_equilibria",
+        "continue_orbits",
+        "equilibrium",
+        "hunting",
+        "periodic_orbit",
+    ),
     "plot": (),
     "problems": (),
     "scene": ("AbstractEffect", "AppliedForce", "Friction", "Scene", "Signal"),

@@ -188,7 +188,8 @@ def branch(spec: _options.Spec, out: Out = Path("jaxmodsim-branch")) -> None:
 
     SPEC is that of jaxmodsim orbit with one more table: \[branch] has parameter,
     the name of the number, from and to; step, the longest step as a part of
-    that; max_orbits.
+    that; max_orbits; start = "Hopf" for orbits from the first Hopf point of the
+    equilibria on, which are followed from q0.
     """
     _start()
     from ._orbits import run_branch

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from ..orbits import continue_orbits, periodic_orbit
+from ..orbits import OrbitError, continue_equilibria, continue_orbits, periodic_orbit
 from ..plot import branch_figure, orbit_figure
 from ._output import say, show_paths, show_table, write
 from ._spec_orbit import read_orbit_spec
@@ -41,14 +41,22 @@ def run_branch(spec: Path, out: Path) -> None:
 
     **Raises:**
 
-    - `ValueError` as `read_orbit_spec` and `continue_orbits`; `OrbitError` where there is no first orbit.
+    - `ValueError` as `read_orbit_spec` and `continue_orbits`; `OrbitError` where there is no first orbit, or no Hopf
+      point.
     """
     asked = read_orbit_spec(spec)
     if asked.branch is None:
         raise ValueError(f'{spec.name}: the table [branch] is missing, as in parameter = "W", from = 0.2, to = 1.2.')
-    store = out / "branch.zarr"
+    store, guess, beside = out / "branch.zarr", asked.guess, ()
+    if asked.from_rest:
+        parameter, span = asked.branch["parameter"], asked.branch["span"]
+        beside = (continue_equilibria(asked.scene, asked.guess[0], parameter, span),)
+        say(str(beside[0]))
+        guess = next((point for point in beside[0].points if point.kind == "Hopf"), None)
+        if guess is None:
+            raise OrbitError("The equilibria have no Hopf point where orbits could begin: change from or to.")
     try:
-        branch = continue_orbits(asked.scene, asked.guess, out=store, progress=True, **asked.branch, **asked.options)
+        branch = continue_orbits(asked.scene, guess, out=store, progress=True, **asked.branch, **asked.options)
     except ImportError as error:  # of the extra
         raise ValueError(str(error)) from error
     rows = [(x.kind, x.value, *np.asarray(x.orbit.amplitude).tolist()) for x in branch.points]
@@ -58,5 +66,5 @@ def run_branch(spec: Path, out: Path) -> None:
     say(f"{len(branch.orbits)} orbits, {int(branch.stable.sum())} of them stable. {branch.ending}")
     table = pd.DataFrame({branch.parameter: branch.values, "period [s]": branch.period, "stable": branch.stable})
     table[amplitudes] = branch.amplitude
-    paths = write(out, {"branch.png": branch_figure(branch), "branch.csv": table})
+    paths = write(out, {"branch.png": branch_figure(branch, beside=beside), "branch.csv": table})
     show_paths([*paths, store])

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from jaxtyping import Array, PyTree
 from pydantic import Field
@@ -33,6 +33,7 @@ class _BranchTable(_table.AbstractTable):
     parameter: _table.Text
     first: _table.Number = Field(alias="from")
     to: _table.Number
+    start: Literal["orbit", "Hopf"] = "orbit"
     step: _table.Number | None = None
     max_orbits: _table.Whole | None = None
 
@@ -54,12 +55,14 @@ class OrbitSpec:
 
     - `guess`: `(q0, qd0)`; `options`: `period` and others that both functions take.
     - `branch`: those of the branch alone, without `progress` and `out`; None where the file has none.
+    - `from_rest`: whether the branch begins at the first Hopf point of the equilibria from `q0`.
     """
 
     scene: Scene
     guess: tuple[list[float], list[float]]
     options: dict[str, Any]
     branch: dict[str, Any] | None
+    from_rest: bool = False
 
 
 def read_orbit_spec(path: Path) -> OrbitSpec:
@@ -91,4 +94,10 @@ def read_orbit_spec(path: Path) -> OrbitSpec:
         return OrbitSpec(scene, guess, options, None)
     branch = _table.read_table(_BranchTable, whole.branch, _table.inner(name, "branch")).model_dump(exclude_none=True)
     branch["span"] = (branch.pop("first"), branch.pop("to"))
-    return OrbitSpec(scene, guess, options, branch)
+    from_rest = branch.pop("start") == "Hopf"
+    if from_rest and not {"period", "settle"}.isdisjoint(options):
+        raise ValueError(
+            f'{where}: orbits from a Hopf point on have their own period, and do not settle: with start = "Hopf" leave'
+            " period, frequency and settle out."
+        )
+    return OrbitSpec(scene, guess, options, branch, from_rest)

@@ -8,13 +8,17 @@ import numpy as np
 
 from ..simulation import Trajectory
 from ._orbit import PeriodicOrbit, Sequence
-from ._return_map import OrbitProblem, ShotOrbit, unpack
+from ._return_map import OrbitError, OrbitProblem, ShotOrbit, unpack
 from ._settle import magnitudes, run_for, states_of
 
-# Intervals along an orbit between which extrema are interpolated.
+# Intervals along a segment of an orbit between which extrema are interpolated.
 _INTERVALS = 512
+# Residual in the extent of an orbit that is none, or so many tolerances of the run.
+_MISSED, _TOLERANCES = 1e-6, 1e3
 # Multipliers that a phase in stick makes zero are that small but for errors of the run.
 _ZERO = 1e-4
+# Passes through the segments after which a basis is that of the multipliers, if these differ.
+_SWEEPS = 4
 
 
 class Extremes(NamedTuple):
@@ -30,50 +34,50 @@ class Extremes(NamedTuple):
 
 def describe(problem: OrbitProblem, point: ShotOrbit, dof: int) -> tuple[PeriodicOrbit, Extremes, Extremes]:
     """The orbit, and its least and greatest coordinates."""
-    problem, once = _once(problem, point, dof)
-    scene, period = problem.scene, point.period
-    state = unpack(scene, jnp.asarray(point.x), dof)
-    changes = [x for x in zip(*(np.asarray(each).tolist() for each in once.events), strict=True) if x[0] < np.inf]
-    begin, end = float(once.inputs.t0), float(once.inputs.t1)
-    times = np.clip([x[0] for x in changes], begin, end)
-    # Of a length that few numbers of events change, for which nothing is compiled anew.
-    padding = (-len(times)) % 16
-    run = run_for(
-        *(problem, state, begin),
-        np.sort(np.concatenate([np.linspace(begin, end, _INTERVALS + 1), times, [end] * padding])),
-    )
-    shares, held = _shares(once, run, changes, (begin, end))
-    strikes = times[[scene.part_names[i] in scene.contacts for _, i, _, _ in changes]]
-    lowest, highest = (_extremes(run, sign, strikes) for sign in (-1.0, 1.0))
-    x = states_of(run)
-    scale = magnitudes(x, period)[:-1]
+    problem, period = eqx.tree_at(lambda p: p.scene, problem, problem.with_values(point.values)), point.period
+    scene, spans = problem.scene, np.asarray(problem.spans) * period
+    states = [unpack(scene, jnp.asarray(x), dof) for x in point.x]
+    # Their ends alone are kept: of what is read from them, events, a log is made beside another run.
+    once = [run_for(problem, x, begin, np.asarray([end])) for x, (begin, end) in zip(states, spans, strict=True)]
+    changes = [_changes(each) for each in once]
+    runs = []
+    for x, (begin, end), events in zip(states, spans, changes, strict=True):
+        times = np.clip([change[0] for change in events], begin, end)
+        # Of a length that few numbers of events change, for which nothing is compiled anew.
+        padding = (-len(times)) % 16
+        grid = np.linspace(begin, end, _INTERVALS + 1)
+        runs.append(run_for(problem, x, begin, np.sort(np.concatenate([grid, times, [end] * padding]))))
+    happened = [change for events in changes for change in events]
+    whole = float(spans[0, 0]), float(spans[-1, 1])
+    shares, held = _shares(once[0], runs[0], happened, whole)
+    strikes = np.clip([t for t, i, _, _ in happened if scene.part_names[i] in scene.contacts], *whole)
+    lowest, highest = (_extremes(runs, sign, strikes) for sign in (-1.0, 1.0))
+    scale = magnitudes(states_of(*runs), period)[:-1]
+    missed = float(np.max(np.abs(point.residual[: point.x.size].reshape(point.x.shape)) / scale))
+    if missed > max(_MISSED, _TOLERANCES * float(problem.rtol)):
+        raise OrbitError(
+            f"No convergence to a periodic orbit: the state misses itself by {missed:.3g} of the extent of the motion."
+            " Errors grow out of all digits on a run over the period: pass more `segments`."
+        )
     orbit = PeriodicOrbit(
-        jnp.asarray(begin),
-        *state,
+        jnp.asarray(whole[0]),
+        *states[0],
         jnp.asarray(period),
         jnp.asarray(lowest.value),
         jnp.asarray(highest.value),
         floquet(problem, point, held, scale),
         problem.autonomous,
-        float(np.max(np.abs(point.residual[: len(point.x)]) / scale)),
-        run,
-        _sequence(once),
+        missed,
+        tuple(runs),
+        tuple(change for each in once for change in _sequence(each)),
         shares,
     )
     return orbit, lowest, highest
 
 
-def _once(problem: OrbitProblem, point: ShotOrbit, dof: int) -> tuple[OrbitProblem, Trajectory]:
-    """The problem at the value of the parameter, and a run over a period of which the end alone is kept."""
-    problem = eqx.tree_at(lambda p: p.scene, problem, problem.with_value(point.value))
-    state = unpack(problem.scene, jnp.asarray(point.x), dof)
-    t0 = float(problem.phase) * point.period
-    return problem, run_for(problem, state, t0, np.asarray([t0 + point.period]))
-
-
-def mode_sequence(problem: OrbitProblem, point: ShotOrbit, dof: int) -> Sequence:
-    """Mode changes of a period, from the start of the orbit on."""
-    return _sequence(_once(problem, point, dof)[1])
+def _changes(run: Trajectory) -> list[tuple[float, int, int, int]]:
+    """Events along a run: time, element, mode before and after."""
+    return [x for x in zip(*(np.asarray(each).tolist() for each in run.events), strict=True) if x[0] < np.inf]
 
 
 def _sequence(run: Trajectory) -> Sequence:
@@ -117,26 +121,42 @@ def _directions(run: Trajectory, held: list[str], t: float) -> int:
 
 def floquet(problem: OrbitProblem, point: ShotOrbit, zeros: int, scale: np.ndarray) -> np.ndarray:
     """Floquet multipliers, with the 1 and the zeros that are known exactly."""
-    monodromy = point.monodromy * scale[None, :] / scale[:, None]
+    maps = point.maps * scale[None, :] / scale[:, None]
     if problem.autonomous:
-        # On the plane normal to the flow, along the flow: what is left are the others.
-        flow = point.flow / scale
-        flow = flow / np.linalg.norm(flow)
-        basis = np.linalg.svd(flow[None, :])[2][1:].T
-        monodromy = basis.T @ monodromy @ basis
-    values = np.linalg.eigvals(monodromy).astype(complex)
+        # On the planes normal to the flow, along the flow: what is left are the others.
+        normal = [np.linalg.svd((flow / scale)[None, :])[2][1:].T for flow in point.flows]
+        maps = np.array([b.T @ x @ a for a, x, b in zip(normal, maps, [*normal[1:], normal[0]], strict=True)])
+    values = _eigenvalues_of_product(maps).astype(complex)
     values = values[np.argsort(-np.abs(values), kind="stable")]
     small = np.arange(len(values)) >= len(values) - zeros
     values = np.where(small & (np.abs(values) < _ZERO), 0.0, values)
     return np.append(1.0, values) if problem.autonomous else values
 
 
-def _extremes(run: Trajectory, sign: float, strikes: np.ndarray) -> Extremes:
-    """Where `sign q` is greatest along a run: on cubics between the times of the run.
+def _eigenvalues_of_product(maps: np.ndarray) -> np.ndarray:
+    """Eigenvalues of the product of matrices, the first one on the right, of which the product itself loses the small.
+
+    Orthogonal iteration: passing through all factors again and again a basis turns into that in which each of them is
+    triangular, and the product of those has each eigenvalue in its own row.
+    """
+    first = basis = product = np.eye(maps.shape[1])
+    if len(maps) == 1:
+        return np.linalg.eigvals(maps[0])
+    for _ in range(_SWEEPS):
+        first, product = basis, np.eye(len(basis))
+        for each in maps:
+            basis, triangle = np.linalg.qr(each @ basis)
+            product = triangle @ product
+    return np.linalg.eigvals(product @ (first.T @ basis))
+
+
+def _extremes(runs: list[Trajectory], sign: float, strikes: np.ndarray) -> Extremes:
+    """Where `sign q` is greatest along runs: on cubics between their times.
 
     Before an impact the velocity is another one than at it, so there the ends of the interval are all.
     """
-    t, q, qd = np.asarray(run.t), sign * np.asarray(run.q), sign * np.asarray(run.qd)
+    t, q, qd = (np.concatenate([np.asarray(getattr(run, name)) for run in runs]) for name in ("t", "q", "qd"))
+    q, qd = sign * q, sign * qd
     h = np.diff(t)[:, None]
     a, b, c = q[:-1], h * qd[:-1], np.diff(q, axis=0)
     u, v = 3.0 * c - 2.0 * b - h * qd[1:], b + h * qd[1:] - 2.0 * c  # a + b s + u s^2 + v s^3

@@ -1,6 +1,7 @@
 """Newton's iteration for the equations of an orbit."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,14 +18,28 @@ _COLLAPSED = 1e-3
 # Angle between section and orbit that is none.
 _TANGENT = 1e-8
 
-# Rows that are added to the equations: their residual and derivatives at a point.
-Extra = Callable[[ShotOrbit], tuple[float, np.ndarray]]
+
+@dataclass(frozen=True)
+class Condition:
+    """An equation that is added to those of an orbit, for each parameter that is an unknown.
+
+    - `residual`: at a point; `by`: its derivatives there, by the unknowns in their scales.
+    """
+
+    residual: Callable[[ShotOrbit], float]
+    by: Callable[[ShotOrbit], np.ndarray]
 
 
 def newton(
-    problem: OrbitProblem, x: np.ndarray, period: float, value: float, dof: int, scale: np.ndarray, extra: Extra | None
+    problem: OrbitProblem,
+    x: np.ndarray,
+    period: float,
+    values: np.ndarray,
+    dof: int,
+    scale: np.ndarray,
+    conditions: Sequence[Condition] = (),
 ) -> tuple[ShotOrbit, int]:
-    """Solve the equations; with `extra` the parameter is one of the unknowns.
+    """Solve the equations; without conditions the parameters stay.
 
     `scale` has the magnitudes of the unknowns of `ShotOrbit.by`. Returns the point and the number of iterations.
 
@@ -32,8 +47,8 @@ def newton(
 
     - `OrbitError` where it does not converge.
     """
-    point = _checked(evaluate(problem, x, period, value, dof))
-    size, history = _size(point, scale, extra), []
+    point = _checked(evaluate(problem, x, period, values, dof))
+    size, history = _size(point, scale, conditions), []
     enough = max(_ENOUGH, _TOLERANCES * float(problem.rtol))
     for i in range(_ITERATIONS):
         _refuse_tangent(point, scale)
@@ -45,12 +60,12 @@ def newton(
             )
         if size < _GOAL:
             return point, i
-        step = _step(point, scale, extra)
+        step = _step(point, scale, conditions)
         made = None
         for halving in range(_HALVINGS):
             unknowns = point.unknowns + step * 0.5**halving
-            made = evaluate(problem, *_split(unknowns, point, problem.autonomous), dof)
-            after = np.inf if made.failure else _size(made, scale, extra)
+            made = evaluate(problem, *split(unknowns, point, problem.autonomous), dof)
+            after = np.inf if made.failure else _size(made, scale, conditions)
             if after < size or size < enough:
                 break
         else:
@@ -74,9 +89,9 @@ def _checked(point: ShotOrbit) -> ShotOrbit:
 
 
 def _refuse_tangent(point: ShotOrbit, scale: np.ndarray) -> None:
-    n = len(point.x)
-    for row in point.by[n:, :n] * scale[:n]:
-        flow = point.flow / scale[:n]
+    n = point.x.shape[1]
+    for row in point.by[point.x.size :, :n] * scale[:n]:
+        flow = point.flows[0] / scale[:n]
         if abs(row @ flow) <= _TANGENT * np.linalg.norm(row) * np.linalg.norm(flow):
             raise OrbitError(
                 "The section is degenerate: the orbit does not cross it but runs along it, or rests on it. Pass a"
@@ -84,37 +99,34 @@ def _refuse_tangent(point: ShotOrbit, scale: np.ndarray) -> None:
             )
 
 
-def _size(point: ShotOrbit, scale: np.ndarray, extra: Extra | None) -> float:
+def _rows(point: ShotOrbit, scale: np.ndarray) -> np.ndarray:
+    """Scales of the equations: of states those of the state, of the plane its largest derivative."""
+    size = point.x.size
+    return np.append(scale[:size], np.max(np.abs(point.by[size:] * scale), axis=1, initial=1e-300))
+
+
+def _size(point: ShotOrbit, scale: np.ndarray, conditions: Sequence[Condition]) -> float:
     """Largest residual, in the scales."""
-    n = len(point.x)
-    size = np.max(np.abs(point.residual[:n]) / scale[:n])
-    for row, residual in zip(point.by[n:], point.residual[n:], strict=True):
-        size = max(size, abs(residual) / max(np.max(np.abs(row) * scale), 1e-300))
-    return size if extra is None else max(size, abs(extra(point)[0]))
+    size = float(np.max(np.abs(point.residual) / _rows(point, scale)))
+    return max([size, *(abs(each.residual(point)) for each in conditions)])
 
 
 def scaled(point: ShotOrbit, scale: np.ndarray) -> np.ndarray:
     """Derivatives of the equations with rows and columns in the scales of the unknowns; `[equations, unknowns]`."""
-    n = len(point.x)
-    by = point.by * scale
-    rows = [scale[:n], np.max(np.abs(by[n:]), axis=1, initial=1e-300)]
-    return by / np.concatenate(rows)[:, None]
+    return point.by * scale / _rows(point, scale)[:, None]
 
 
-def _step(point: ShotOrbit, scale: np.ndarray, extra: Extra | None) -> np.ndarray:
-    n = len(point.x)
-    by = scaled(point, scale)
-    rows = np.concatenate([scale[:n], np.max(np.abs(point.by[n:] * scale), axis=1, initial=1e-300)])
-    residual = point.residual / rows
-    if extra is None:
-        by = by[:, :-1]
-    else:
-        more, row = extra(point)
-        by, residual = np.vstack([by, row]), np.append(residual, more)
-    step = -np.linalg.lstsq(by, residual, rcond=_RANK)[0]
-    return scale * (np.append(step, 0.0) if extra is None else step)
+def _step(point: ShotOrbit, scale: np.ndarray, conditions: Sequence[Condition]) -> np.ndarray:
+    by, residual = scaled(point, scale), point.residual / _rows(point, scale)
+    if conditions:
+        by = np.vstack([by, *(each.by(point) for each in conditions)])
+        residual = np.append(residual, [each.residual(point) for each in conditions])
+    step = -np.linalg.lstsq(by[:, : len(by)], residual, rcond=_RANK)[0]
+    return scale * np.append(step, np.zeros(len(scale) - len(step)))
 
 
-def _split(unknowns: np.ndarray, point: ShotOrbit, autonomous: bool) -> tuple[np.ndarray, float, float]:
-    n = len(point.x)
-    return unknowns[:n], float(unknowns[n]) if autonomous else point.period, float(unknowns[-1])
+def split(unknowns: np.ndarray, point: ShotOrbit, autonomous: bool) -> tuple[np.ndarray, float, np.ndarray]:
+    """Starts, period and values of the parameters in a vector as `ShotOrbit.unknowns` of this point."""
+    size = point.x.size
+    period = float(unknowns[size]) if autonomous else point.period
+    return unknowns[:size].reshape(point.x.shape), period, unknowns[size + autonomous :]

@@ -33,7 +33,7 @@ class PeriodicOrbit(AbstractReadable, eqx.Module):
       period has. A phase in which an element sticks makes one of them zero, a phase in which a contact is closed two.
     - `autonomous`: whether the period was unknown, and one of the multipliers is 1 therefore.
     - `residual`: by how much the state misses itself after a period, in the extent of the orbit.
-    - `run`: the `Trajectory` over a period.
+    - `runs`: the `Trajectory` over each segment of the period.
     - `sequence`: mode changes along it: element, mode before, mode after.
     - `stick`: part of the period in which each friction element sticks and each contact is closed, by name.
     """
@@ -48,7 +48,7 @@ class PeriodicOrbit(AbstractReadable, eqx.Module):
     multipliers: np.ndarray
     autonomous: bool = eqx.field(static=True)
     residual: float = eqx.field(static=True)
-    run: Trajectory
+    runs: tuple[Trajectory, ...]
     sequence: Sequence = eqx.field(static=True)
     stick: dict[str, float]
 
@@ -58,6 +58,19 @@ class PeriodicOrbit(AbstractReadable, eqx.Module):
         return State(self.q, self.qd, self.z)
 
     @property
+    def run(self) -> Trajectory:
+        """The run over the period.
+
+        **Raises:**
+
+        - `ValueError` for an orbit of several segments.
+        """
+        run, *others = self.runs
+        if others:
+            raise ValueError(f"This orbit was found in {len(self.runs)} segments: it has one run each, `orbit.runs`.")
+        return run
+
+    @property
     def amplitude(self) -> Float[Array, " dof"]:
         """Half the distance between the turning points of each coordinate, shape `[dof]`."""
         return 0.5 * (self.highest - self.lowest)
@@ -65,7 +78,7 @@ class PeriodicOrbit(AbstractReadable, eqx.Module):
     @property
     def energy(self) -> float:
         """Energy lost in a period, which is the energy brought in [J]; takes two more runs where contacts strike."""
-        return float(self.run.energy.dissipated[-1])
+        return sum(float(run.energy.dissipated[-1]) for run in self.runs)
 
     @property
     def stable(self) -> bool:
@@ -100,8 +113,9 @@ def _(orbit: PeriodicOrbit) -> Table:
     """Extent, period, stability, modes."""
     if isinstance(orbit.period, jax.core.Tracer):
         return Table("PeriodicOrbit, traced", (), [])
+    scene = orbit.runs[0].scene
     rows = [
-        (quantity_of(orbit.run.scene, f"q[{i}]").label, *(short(x[i]) for x in (orbit.lowest, orbit.highest, orbit.qd)))
+        (quantity_of(scene, f"q[{i}]").label, *(short(x[i]) for x in (orbit.lowest, orbit.highest, orbit.qd)))
         for i in range(len(orbit.q))
     ]
     kind = "autonomous" if orbit.autonomous else "forced"

@@ -13,25 +13,24 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
-from .._core.arguments import as_float, check_real
+from .._core.arguments import as_float, as_whole, check_real
 from ..scene import Scene, State, read_element
-from ..simulation import simulate
 from ._describe import Extremes, describe
 from ._newton import newton, scaled
 from ._orbit import PeriodicOrbit
 from ._return_map import (
-    MAX_EVENTS,
     OrbitError,
     OrbitProblem,
     PeriodFn,
     Section,
     ShotOrbit,
-    end_state,
+    end_of,
     evaluate,
     pack,
+    run_segment,
     unpack,
 )
-from ._settle import SettledState, magnitudes, settled, states_of
+from ._settle import SettledState, cut, magnitudes, run_for, settled, states_of
 
 # Periods of the force until a run has settled, where nothing else is asked for.
 _PERIODS = 20
@@ -40,7 +39,8 @@ _FAMILY = 1e-7
 # At another time, in periods, a scene that does not depend on it ends in the same state; relative, per multiplier.
 _OTHER_TIME, _SAME = 0.381966, 1e-6
 
-Guess: TypeAlias = "PeriodicOrbit | tuple[ArrayLike | list[float], ArrayLike | list[float]]"
+_States: TypeAlias = ArrayLike | list[float] | list[list[float]]
+Guess: TypeAlias = "PeriodicOrbit | tuple[_States, _States]"
 
 
 def periodic_orbit(
@@ -50,10 +50,11 @@ def periodic_orbit(
     period: float | PeriodFn | None = None,
     section: Section | None = None,
     settle: float | None = None,
+    segments: int = 1,
     rtol: float = 1e-10,
     atol: float = 1e-12,
 ) -> PeriodicOrbit:
-    """Find a periodic orbit by shooting: Newton's iteration on the run over one period.
+    """Find a periodic orbit by shooting: Newton's iteration on the run over one period, or over segments of it.
 
     The run has its events, and derivatives through them. It finds unstable orbits as well as stable ones; a simulation
     for `settle` seconds, which starts the search, comes near to stable ones alone.
@@ -64,7 +65,8 @@ def periodic_orbit(
     **Arguments:**
 
     - `scene`: the `Scene`, in float64. Coordinates must return: the angle of a shaft that turns on does not.
-    - `guess`: `(q0, qd0)`, shape `[dof]` each; or a `PeriodicOrbit`, of another scene for instance, which is then where
+    - `guess`: `(q0, qd0)`, shape `[dof]` each, or of a forced orbit `[segments, dof]`, then where each of the equally
+      long segments starts; or a `PeriodicOrbit`, of another scene for instance, which is then where
       Newton's iteration starts.
     - `period`: period [s] of a forced orbit, > 0, which begins at t = 0: a number, or a function of `params`, as in
       `lambda p: 2 * jnp.pi / p["omega"]`, so that it changes with them. None for an orbit of a scene that does not
@@ -74,6 +76,8 @@ def periodic_orbit(
     - `settle`: how long [s] the run from the guess lasts, >= 0. Of a forced orbit it is rounded to periods, by default
       20. Of an orbit of unknown period it is needed where the guess is no orbit, and in its second half the state has
       to return.
+    - `segments`: number of runs into which the period is cut, >= 1. Their starts are unknowns too (multiple shooting):
+      for orbits so unstable that an error of the start grows out of all digits in a period.
     - `rtol`, `atol`: tolerances of the runs, as of `simulate`.
 
     **Returns:**
@@ -96,8 +100,8 @@ def periodic_orbit(
         ```
     """
     known = jtu.tree_map(jax.lax.stop_gradient, scene)
-    problem, start, dof = prepare(known, guess, period, section, settle, rtol, atol, None)
-    point = shoot(problem, start, 0.0, dof)
+    problem, start, dof = prepare(known, guess, period, section, settle, rtol, atol, segments=segments)
+    point = shoot(problem, start, dof)
     orbit, lowest, highest = describe(problem, point, dof)
     if not any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(scene)):
         return orbit
@@ -112,7 +116,8 @@ def prepare(
     settle: float | None,
     rtol: float,
     atol: float,
-    parameter: str | None,
+    parameters: tuple[str, ...] = (),
+    segments: int = 1,
 ) -> tuple[OrbitProblem, SettledState, int]:
     """The equations of an orbit, a start with the magnitudes of all unknowns, and the number of coordinates.
 
@@ -120,7 +125,7 @@ def prepare(
 
     - `ValueError` for wrong arguments; `OrbitError` where nothing settles.
     """
-    _check_scene(scene)
+    check_known(scene, "periodic_orbit")
     _check_functions(period, section)
     relative, absolute = (
         jnp.asarray(as_float(x, name=name, lower=0.0), float) for name, x in (("rtol", rtol), ("atol", atol))
@@ -130,19 +135,39 @@ def prepare(
     if isinstance(guess, PeriodicOrbit):
         phase = jax.lax.stop_gradient(guess.t0 / guess.period)
     number = period if period is None or callable(period) else _Constant(as_float(period, name="period", lower=0.0))
-    problem = OrbitProblem(scene, phase, relative, absolute, empty, empty, number, section, parameter)
+    problem = OrbitProblem(scene, phase, relative, absolute, empty, empty, empty, number, section, parameters)
+    count = as_whole(segments, name="segments")
     state = _state(scene, guess)
-    dof = state.q.shape[0]
+    dof = state.q.shape[-1]
     if isinstance(guess, PeriodicOrbit) and settle is None:
-        start = SettledState(
-            np.asarray(pack(state)), float(guess.period), magnitudes(states_of(guess.run), float(guess.period))
-        )
+        start = cut(guess.runs, float(guess.period), count)
+    elif state.q.ndim == 2:
+        start = _segment_starts(problem, state, count)
     else:
-        start = settled(problem, state, _settle(problem, settle), section)
-    if problem.period is not None:
-        start = start._replace(scale=start.scale[:-1])
-    start = start._replace(scale=np.append(start.scale, 1.0))
+        start = settled(problem, state, _settle(problem, settle), section, count)
+    state_scale, of_period = start.scale[:-1], start.scale[-1:] if problem.autonomous else []
+    start = start._replace(scale=np.concatenate([*[state_scale] * count, of_period, np.ones(len(parameters))]))
     return anchored(problem, start, dof), start, dof
+
+
+def _segment_starts(problem: OrbitProblem, states: State, count: int) -> SettledState:
+    """A start from states for all segments, equally long.
+
+    **Raises:**
+
+    - `ValueError` for another number of them, and where the period is not known.
+    """
+    if problem.period is None or len(states.q) != count:
+        raise ValueError(
+            f"guess has {len(states.q)} states, of which there must be one for each segment of a forced orbit; but"
+            f" segments is {count}, and {'no period' if problem.period is None else 'a period'} was given."
+        )
+    period, cuts = float(problem.period(problem.scene.params)), np.arange(count) / count
+    each = [jtu.tree_map(lambda a, i=i: a[i], states) for i in range(count)]
+    t = [np.linspace(a, a + 1.0 / count, 257) * period for a in cuts]
+    runs = [run_for(problem, state, times[0], times) for state, times in zip(each, t, strict=True)]
+    x = np.array([np.asarray(pack(state)) for state in each])
+    return SettledState(x, cuts, period, magnitudes(states_of(*runs), period))
 
 
 class _Constant(eqx.Module):
@@ -175,24 +200,33 @@ def _state(scene: Scene, guess: Guess) -> State:
     for name, value in zip(("q0", "qd0"), guess, strict=True):
         check_real(value, name=f"guess, {name},")
     q, qd = (jnp.asarray(x, float) for x in guess)
-    if q.ndim != 1 or not q.shape[0] or q.shape != qd.shape:
-        raise ValueError(f"guess must have q0 and qd0 of the shape [dof], but they have {q.shape} and {qd.shape}.")
-    return State(q, qd, scene.initial_state(q))
+    if q.ndim not in (1, 2) or not q.size or q.shape != qd.shape:
+        raise ValueError(
+            "guess must have q0 and qd0 of the shape [dof], or [segments, dof], but they have"
+            f" {q.shape} and {qd.shape}."
+        )
+    return State(q, qd, scene.initial_state(q) if q.ndim == 1 else jax.vmap(scene.initial_state)(q))
 
 
-def _check_scene(scene: Scene) -> None:
+def check_known(scene: Scene, name: str) -> None:
+    """Refuse what is no scene, and numbers that are not known or in float32.
+
+    **Raises:**
+
+    - `ValueError` in the name of the function that searches.
+    """
     if not isinstance(scene, Scene):
-        raise ValueError(f"periodic_orbit needs a Scene, but a {type(scene).__name__} was given.")
+        raise ValueError(f"{name} needs a Scene, but a {type(scene).__name__} was given.")
     if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(scene)):
         raise ValueError(
-            "Periodic orbits are searched for by numbers that are known, which they are not inside jax.jit and"
+            "Orbits and equilibria are searched for by numbers that are known, which they are not inside jax.jit and"
             " jax.vmap: call it outside. jax.grad and jax.jacfwd work."
         )
     kind = jnp.result_type(float, *jtu.tree_leaves(scene))
     if kind != jnp.float64 or any(x.dtype == jnp.float32 for x in jtu.tree_leaves(scene)):
         raise ValueError(
-            "Periodic orbits need float64: in float32 the run itself misses its start by more than what tells an orbit"
-            ' from its neighbours. Call jax.config.update("jax_enable_x64", True) before the scene is made.'
+            "Orbits and equilibria need float64: in float32 the run itself misses its start by more than what tells an"
+            ' orbit from its neighbours. Call jax.config.update("jax_enable_x64", True) before the scene is made.'
         )
 
 
@@ -204,25 +238,28 @@ def _check_functions(period: object, section: object) -> None:
 
 
 def anchored(problem: OrbitProblem, start: SettledState, dof: int) -> OrbitProblem:
-    """With the plane through the start that is normal to the flow there, in the magnitudes of the state."""
-    x = jnp.asarray(start.x)
-    problem = eqx.tree_at(lambda p: (p.normal, p.anchor), problem, (jnp.zeros_like(x), x))
+    """With the segments of the start, and the plane through it that is normal to the flow, in the scales."""
+    x = jnp.asarray(start.x[0])
+    problem = replace(problem, normal=jnp.zeros_like(x), anchor=x, cuts=jnp.asarray(start.cuts))
     if not problem.autonomous or problem.section is not None:
         return problem
-    value = 0.0 if problem.parameter is None else read_element(problem.scene, problem.parameter)
-    flow = evaluate(problem, start.x, start.period, value, dof).flow
-    scale = start.scale[: len(start.x)]
-    return eqx.tree_at(lambda p: p.normal, problem, jnp.asarray(flow / scale**2))
+    flow = evaluate(problem, start.x, start.period, values_of(problem), dof).flows[0]
+    return replace(problem, normal=jnp.asarray(flow / start.scale[: len(x)] ** 2))
 
 
-def shoot(problem: OrbitProblem, start: SettledState, value: float, dof: int) -> ShotOrbit:
-    """The orbit near the start, at this value of the parameter.
+def values_of(problem: OrbitProblem) -> np.ndarray:
+    """Values that the parameters have in the scene."""
+    return np.array([read_element(problem.scene, name) for name in problem.parameters])
+
+
+def shoot(problem: OrbitProblem, start: SettledState, dof: int) -> ShotOrbit:
+    """The orbit near the start, at the values that the parameters have in the scene.
 
     **Raises:**
 
     - `OrbitError` where there is none, the scene depends on time otherwise than the period says, or there is a family.
     """
-    point, _ = newton(problem, start.x, start.period, value, dof, start.scale, None)
+    point, _ = newton(problem, start.x, start.period, values_of(problem), dof, start.scale)
     _refuse_clock(problem, point, start.scale, dof)
     _refuse_family(problem, point, start.scale, dof)
     return point
@@ -236,10 +273,9 @@ def _refuse_clock(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, do
     - `OrbitError` where the scene depends on time otherwise than the period says.
     """
     moved = problem.phase + (_OTHER_TIME if problem.autonomous else 1.0)
-    later = evaluate(eqx.tree_at(lambda p: p.phase, problem, moved), point.x, point.period, point.value, dof)
-    n = len(point.x)
-    growth = max(1.0, float(np.max(np.abs(np.linalg.eigvals(point.monodromy)))))
-    if not later.failure and np.max(np.abs(later.residual[:n]) / scale[:n]) < _SAME * growth:
+    later = evaluate(eqx.tree_at(lambda p: p.phase, problem, moved), point.x, point.period, point.values, dof)
+    growth = max(1.0, float(np.max(np.abs(np.linalg.eigvals(point.maps)))))
+    if not later.failure and _miss(later, scale) < _SAME * growth:
         return
     if problem.autonomous:
         raise OrbitError(
@@ -259,15 +295,15 @@ def _refuse_family(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, d
 
     - `OrbitError` where a multiplier is 1 and the state a small way along its direction returns as well.
     """
-    by = scaled(point, scale)[:, :-1]
+    by = scaled(point, scale)[:, : len(point.residual)]
     _, sizes, rows = np.linalg.svd(by)
     if sizes[-1] > _FAMILY * sizes[0]:
         return
-    n, away = len(point.x), 1e-3 * rows[-1] * scale[:-1]
-    period = point.period + (away[n] if problem.autonomous else 0.0)
-    beside = evaluate(problem, point.x + away[:n], period, point.value, dof)
+    size, away = point.x.size, 1e-3 * rows[-1] * scale[: len(rows)]
+    period = point.period + (away[size] if problem.autonomous else 0.0)
+    beside = evaluate(problem, point.x + away[:size].reshape(point.x.shape), period, point.values, dof)
     # Of a fold the residual there would be of the second order, 1e-6.
-    if not beside.failure and np.max(np.abs(beside.residual[:n]) / scale[:n]) < 1e-8:
+    if not beside.failure and _miss(beside, scale) < 1e-8:
         raise OrbitError(
             "The orbit is not alone but one of a family, with a multiplier of exactly 1 beside those that every orbit"
             " has: nothing in the scene says which one. A conservative scene has such families, a bristle that never"
@@ -275,40 +311,42 @@ def _refuse_family(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, d
         )
 
 
+def _miss(point: ShotOrbit, scale: np.ndarray) -> float:
+    """By how much the states miss the next ones, in the scales."""
+    size = point.x.size
+    return float(np.max(np.abs(point.residual[:size]) / scale[:size]))
+
+
 def _with_derivatives(
     problem: OrbitProblem, point: ShotOrbit, orbit: PeriodicOrbit, extrema: tuple[Extremes, Extremes]
 ) -> PeriodicOrbit:
     """The orbit with the derivatives of the implicit function theorem: one step of Newton from where it is solved."""
-    dof, n = orbit.q.shape[0], len(point.x)
-    inverse = np.linalg.inv(point.by[:, :-1])
+    dof, size, scene, spans = orbit.q.shape[0], point.x.size, problem.scene, problem.spans
+    inverse = np.linalg.inv(point.by[:, : len(point.residual)])
     x, period = jnp.asarray(point.x), jnp.asarray(point.period)
-    after, _ = end_state(problem, problem.scene, x, problem.period_of(problem.scene, period), dof)
-    residual = after - x
+    after = [
+        end_of(run_segment(problem, scene, y, problem.period_of(scene, period), span, dof))
+        for y, span in zip(x, spans, strict=True)
+    ]
+    residual = jnp.ravel(jnp.stack(after) - jnp.roll(x, -1, axis=0))
     if problem.autonomous:
         residual = jnp.append(residual, 0.0)
     unknowns = jnp.asarray(inverse) @ residual
     change = jax.lax.stop_gradient(unknowns) - unknowns
-    x = x + change[:n]
-    period = period + change[n] if problem.autonomous else problem.period_of(problem.scene, period)
-    state = unpack(problem.scene, x, dof)
+    x = x + change[:size].reshape(x.shape)
+    period = period + change[size] if problem.autonomous else problem.period_of(scene, period)
     times, acceleration = (np.concatenate(x) for x in ([x.time for x in extrema], [x.acceleration for x in extrema]))
     order = np.argsort(times, kind="stable")
-    run = simulate(
-        *(problem.scene, state.q, state.qd, orbit.t0 + point.period),
-        t0=orbit.t0,
-        z0=state.z,
-        ts=jnp.asarray(times[order]),
-        rtol=problem.rtol,
-        atol=problem.atol,
-        max_events=MAX_EVENTS,
-        throw=False,
-    )
     place = np.argsort(order, kind="stable"), np.tile(np.arange(dof), 2)
-    # The times are right to some digits alone: a parabola leads from there to where the velocity is zero.
-    made = run.q[place] - 0.5 * run.qd[place] ** 2 / acceleration
+    made = jnp.zeros(len(times))
+    for y, span in zip(x, spans, strict=True):
+        run = run_segment(problem, scene, y, period, span, dof, jnp.asarray(times[order]))
+        # The times are right to some digits alone: a parabola leads from there to where the velocity is zero.
+        there = run.q[place] - 0.5 * run.qd[place] ** 2 / acceleration
+        made = jnp.where(times >= float(span[0]) * point.period, there, made)
     lowest, highest = (
         value + (x - jax.lax.stop_gradient(x))
         for value, x in zip((orbit.lowest, orbit.highest), made.reshape(2, dof), strict=True)
     )
-    q, qd, z = state
+    q, qd, z = unpack(scene, x[0], dof)
     return replace(orbit, q=q, qd=qd, z=z, period=period, lowest=lowest, highest=highest)

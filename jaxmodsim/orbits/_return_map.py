@@ -1,6 +1,7 @@
 """The return map of a scene, its derivatives, and the equations of an orbit."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
 import diffrax as dfx
@@ -13,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from ..scene import Scene, State, replace_elements
-from ..simulation import RunRequest, outcome_messages, simulate
+from ..simulation import RunRequest, Trajectory, outcome_messages, simulate
 
 # Period [s] from the parameters of the scene.
 PeriodFn: TypeAlias = Callable[[PyTree], Array | float]
@@ -35,7 +36,8 @@ class OrbitProblem(eqx.Module):
 
     - `phase`: time at which forced orbits begin, in periods.
     - `period`: of a forced orbit, from the parameters of the scene; None where the period is unknown.
-    - `parameter`: a number of the scene that is one of the unknowns; None where there is none.
+    - `cuts`: where the segments of the period begin, in periods after its start; the first at 0.
+    - `parameters`: numbers of the scene that are unknowns too.
     - `normal`, `anchor`: the plane in which an orbit of unknown period begins: `normal . (x - anchor) = 0`. With a
       `section` that takes its place.
     """
@@ -46,18 +48,24 @@ class OrbitProblem(eqx.Module):
     atol: Float[Array, ""]
     normal: Float[Array, " n"]
     anchor: Float[Array, " n"]
+    cuts: Float[Array, " segments"]
     period: PeriodFn | None = eqx.field(static=True)
     section: Section | None = eqx.field(static=True)
-    parameter: str | None = eqx.field(static=True)
+    parameters: tuple[str, ...] = eqx.field(static=True)
 
     @property
     def autonomous(self) -> bool:
         """Whether the period is unknown."""
         return self.period is None
 
-    def with_value(self, value: Array | float) -> Scene:
-        """The scene with another value of the parameter."""
-        return self.scene if self.parameter is None else replace_elements(self.scene, {self.parameter: value})
+    @property
+    def spans(self) -> Float[Array, "segments 2"]:
+        """Where the segments begin and end, in periods."""
+        return self.phase + jnp.stack([self.cuts, jnp.append(self.cuts[1:], 1.0)], axis=1)
+
+    def with_values(self, values: Array | np.ndarray) -> Scene:
+        """The scene with other values of the parameters."""
+        return replace_elements(self.scene, dict(zip(self.parameters, values, strict=True)))
 
     def period_of(self, scene: Scene, unknown: Array) -> Array:
         """Period [s]."""
@@ -82,10 +90,10 @@ def unpack(scene: Scene, x: Array, dof: int) -> State:
 
 
 class Returned(NamedTuple):
-    """The state after a period, and derivatives.
+    """The state after a segment, and derivatives.
 
-    - `x`: after a period, shape `[n]`; `by`: its derivatives by start, unknown period and parameter, `[n, n + 2]`.
-    - `plane`, `plane_by`: of `OrbitProblem.plane`.
+    - `x`: at its end, shape `[n]`; `by`: its derivatives by start, unknown period and parameters, `[n, unknowns]`.
+    - `plane`, `plane_by`: of `OrbitProblem.plane` at its start.
     - `code`: how the run ended.
     """
 
@@ -96,21 +104,25 @@ class Returned(NamedTuple):
     code: Array
 
 
-def end_state(
+def run_segment(
     problem: OrbitProblem,
     scene: Scene,
     x: Array,
     period: Array,
+    span: Array,
     dof: int,
+    times: Array | None = None,
     adjoint: dfx.AbstractAdjoint | None = None,
     max_steps: int = RunRequest.max_steps,
-) -> tuple[Float[Array, " n"], Array]:
-    """State a period after x, and how the run ended."""
+) -> Trajectory:
+    """The run from x over a segment; at these times [s] as far as they are inside it, else at its end alone."""
     y = unpack(scene, x, dof)
-    run = simulate(
-        *(scene, y.q, y.qd, (problem.phase + 1.0) * period),
-        t0=problem.phase * period,
+    t0, t1 = span * period
+    return simulate(
+        *(scene, y.q, y.qd, t1),
+        t0=t0,
         z0=y.z,
+        ts=None if times is None else jnp.clip(times, t0, t1),
         rtol=problem.rtol,
         atol=problem.atol,
         adjoint=adjoint,
@@ -119,18 +131,23 @@ def end_state(
         max_events=MAX_EVENTS,
         throw=False,
     )
-    return pack(jtu.tree_map(lambda a: a[-1], State(run.q, run.qd, run.z))), run.result.code
+
+
+def end_of(run: Trajectory) -> Float[Array, " n"]:
+    """The last state of a run."""
+    return pack(jtu.tree_map(lambda a: a[-1], State(run.q, run.qd, run.z)))
 
 
 @eqx.filter_jit
-def _returned(problem: OrbitProblem, unknowns: Array, dof: int) -> Returned:
-    n = unknowns.shape[0] - 2
+def _returned(problem: OrbitProblem, span: Array, unknowns: Array, dof: int) -> Returned:
+    n = problem.anchor.shape[0]
 
     def map_(unknowns: Array) -> tuple[Array, tuple[Array, Array]]:
-        scene = problem.with_value(unknowns[-1])
+        scene = problem.with_values(unknowns[n + 1 :])
         period = problem.period_of(scene, unknowns[n])
-        x, code = end_state(problem, scene, unknowns[:n], period, dof, dfx.ForwardMode(), MAX_STEPS)
-        return x, (x, code)
+        run = run_segment(problem, scene, unknowns[:n], period, span, dof, None, dfx.ForwardMode(), MAX_STEPS)
+        x = end_of(run)
+        return x, (x, run.code)
 
     by, (x, code) = jax.jacfwd(map_, has_aux=True)(unknowns)
     plane, plane_by = jax.value_and_grad(problem.plane)(unknowns[:n], dof)
@@ -138,50 +155,68 @@ def _returned(problem: OrbitProblem, unknowns: Array, dof: int) -> Returned:
 
 
 class ShotOrbit(NamedTuple):
-    """A start, a period [s] and a value of the parameter, and what becomes of them in a period.
+    """Starts of the segments, a period [s] and values of the parameters, and what becomes of them in a period.
 
-    - `residual`: of the equations, `[n]`, or `[n + 1]` with the plane; `by`: their derivatives by start, period (of
-      unknown period alone) and parameter.
+    - `x`: shape `[segments, n]`; `values`: `[parameters]`.
+    - `maps`: derivatives of the state after each segment by the state before it, `[segments, n, n]`.
+    - `flows`: rates of the state at the starts, `[segments, n]`; of unknown period.
+    - `residual`: of the equations, `[segments n]`, and one more with the plane; `by`: their derivatives by starts,
+      period (of unknown period alone) and parameters.
     - `failure`: how the run ended early; "" where it did not.
     """
 
     x: np.ndarray
     period: float
-    value: float
-    map_by: np.ndarray
+    values: np.ndarray
+    maps: np.ndarray
+    flows: np.ndarray
     residual: np.ndarray
     by: np.ndarray
     failure: str
 
     @property
-    def monodromy(self) -> np.ndarray:
-        """Derivative of the state after a period by the state before it, `[n, n]`."""
-        return self.map_by[:, : len(self.x)]
+    def value(self) -> float:
+        """Of the parameter along which a branch is followed, the last one."""
+        return float(self.values[-1])
 
     @property
-    def flow(self) -> np.ndarray:
-        """Rate of the state at the start, `[n]`; of unknown period."""
-        return self.map_by[:, len(self.x)]
+    def monodromy(self) -> np.ndarray:
+        """Derivative of the state after a period by the state before it, `[n, n]`."""
+        product = self.maps[0]
+        for each in self.maps[1:]:
+            product = each @ product
+        return product
 
     @property
     def unknowns(self) -> np.ndarray:
         """What the columns of `by` belong to."""
-        period = [self.period] if self.by.shape[1] == len(self.x) + 2 else []
-        return np.array([*self.x, *period, self.value])
+        period = [self.period] if len(self.residual) > self.x.size else []
+        return np.array([*self.x.ravel(), *period, *self.values])
 
 
-def evaluate(problem: OrbitProblem, x: np.ndarray, period: float, value: float, dof: int) -> ShotOrbit:
+def evaluate(problem: OrbitProblem, x: np.ndarray, period: float, values: np.ndarray, dof: int) -> ShotOrbit:
     """The equations of an orbit at these unknowns."""
-    n = len(x)
-    made = jax.device_get(_returned(problem, jnp.asarray([*x, period, value]), dof))
-    by, residual = made.by - np.eye(n, n + 2), made.x - x
+    (count, n), spans = x.shape, np.asarray(problem.spans)
+    starts = [jnp.asarray([*y, period, *values]) for y in x]
+    # Of a shape that does not depend on how many segments there are: one program serves any number of them.
+    alone = replace(problem, cuts=problem.cuts[:0])
+    made = jax.device_get([_returned(alone, span, y, dof) for span, y in zip(problem.spans, starts, strict=True)])
+    by = np.zeros((x.size, x.size + 1 + len(values)))
+    for i, each in enumerate(made):
+        rows, columns, later = (slice(j * n, (j + 1) * n) for j in (i, i, (i + 1) % count))
+        by[rows, columns], by[rows, x.size :] = each.by[:, :n], each.by[:, n:]
+        by[rows, later] -= np.eye(n)
+    residual = np.ravel([each.x for each in made] - np.roll(x, -1, axis=0))
+    by_period = np.array([each.by[:, n] for each in made]) / np.diff(spans)
     if problem.autonomous:
-        by = np.vstack([by, [*made.plane_by, 0.0, 0.0]])
-        residual = np.append(residual, made.plane)
+        by = np.vstack([by, np.append(made[0].plane_by, np.zeros(by.shape[1] - n))])
+        residual = np.append(residual, made[0].plane)
     else:
-        by = np.delete(by, n, axis=1)
-        period = float(problem.period_of(problem.with_value(value), jnp.asarray(period)))
-    failure = "" if made.code == 0 else outcome_messages(problem.scene, dof)[int(made.code)]
+        by = np.delete(by, x.size, axis=1)
+        period = float(problem.period_of(problem.with_values(values), jnp.asarray(period)))
+    codes = [int(each.code) for each in made if each.code != 0]
+    failure = outcome_messages(problem.scene, dof)[codes[0]] if codes else ""
     if not failure and not (np.isfinite(by).all() and np.isfinite(residual).all()):
         failure = "The run or its derivatives are not finite."
-    return ShotOrbit(x, period, value, made.by, residual, by, failure)
+    maps = np.array([each.by[:, :n] for each in made])
+    return ShotOrbit(x, period, values, maps, np.roll(by_period, 1, axis=0), residual, by, failure)

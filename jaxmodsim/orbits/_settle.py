@@ -1,5 +1,6 @@
 """Where the search for an orbit starts: a simulation that settles."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 
 from ..scene import State
 from ..simulation import SimulationError, Trajectory, simulate
-from ._return_map import MAX_EVENTS, MAX_STEPS, OrbitError, OrbitProblem, Section, pack
+from ._return_map import MAX_EVENTS, MAX_STEPS, OrbitError, OrbitProblem, Section
 
 # Times at which a run is looked at.
 _TIMES = 4001
@@ -16,14 +17,22 @@ _TIMES = 4001
 _NEAR = 0.02
 # And the largest one, where a run comes no nearer.
 _FAR = 0.2
+# Distance of the begin of a segment from changes of modes that is enough, in segments.
+_CLEAR = 0.1
 # Part of the run at its end in which returns are looked for.
 _LAST = 0.5
 
 
 class SettledState(NamedTuple):
-    """Where the search starts: state, period [s], and the magnitudes of state and period."""
+    """Where the search starts.
+
+    - `x`: states at the begins of the segments, `[segments, n]`; `cuts`: when these are, in periods after the first.
+    - `period`: [s].
+    - `scale`: magnitudes of the state and the period, `[n + 1]`.
+    """
 
     x: np.ndarray
+    cuts: np.ndarray
     period: float
     scale: np.ndarray
 
@@ -45,19 +54,46 @@ def run_for(problem: OrbitProblem, state: State, t0: float, ts: np.ndarray) -> T
         raise OrbitError(f"The run over one period, or until it settles, failed: {error}") from error
 
 
-def states_of(run: Trajectory) -> np.ndarray:
-    """States along a run, shape `[time, n]`."""
+def states_of(*runs: Trajectory) -> np.ndarray:
+    """States along runs one after the other, shape `[time, n]`."""
+    return np.concatenate([_states(run) for run in runs])
+
+
+def _states(run: Trajectory) -> np.ndarray:
     rows = [run.q, run.qd, *jtu.tree_leaves(run.z)]
     return np.concatenate([np.asarray(x).reshape(len(run.t), -1) for x in rows], axis=1)
 
 
+def modes_of(run: Trajectory) -> np.ndarray:
+    """Modes along a run, shape `[time, elements]`."""
+    none = np.zeros((len(run.t), 0))
+    return np.stack([np.asarray(mode) for mode in run.mode.values()], axis=1) if run.mode else none
+
+
 def held(run: Trajectory) -> np.ndarray:
-    """How many elements stick, and contacts are closed, at each time of a run that has modes, shape `[time]`."""
+    """How many elements stick, and contacts are closed, at each time of a run, shape `[time]`."""
     friction = run.scene.event_driven
-    return np.sum([np.asarray(mode) == (0 if name in friction else 1) for name, mode in run.mode.items()], axis=0)
+    which = [0.0 if name in friction else 1.0 for name in run.mode]
+    return np.sum(modes_of(run) == np.asarray(which), axis=1)
 
 
-def settled(problem: OrbitProblem, state: State, settle: float, section: Section | None) -> SettledState:
+def begins(at: np.ndarray, modes: np.ndarray, held: np.ndarray, segments: int) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of states for the segments to begin at, and when that is: about equally long, if possible in slip.
+
+    `at` are the times of the states in periods, from 0 up; they need not be in order.
+    """
+    order = np.argsort(at, kind="stable")
+    changes = at[order][1:][np.any(np.diff(modes[order], axis=0) != 0, axis=1)]
+    clear = np.min(np.abs(at[:, None] - changes), axis=1, initial=_CLEAR / segments)
+    first = int(np.argmin(at))
+    chosen = [first]
+    for target in np.arange(1, segments) / segments:
+        near = np.flatnonzero(np.abs(at - target) < 0.45 / segments)
+        chosen.append(min(map(int, near), key=lambda i: (held[i], -clear[i], abs(at[i] - target))))
+    return np.asarray(chosen), at[chosen] - at[first]
+
+
+def settled(problem: OrbitProblem, state: State, settle: float, section: Section | None, segments: int) -> SettledState:
     """The state after `settle` seconds, where an orbit of unknown period may begin, and a first period.
 
     **Raises:**
@@ -68,12 +104,11 @@ def settled(problem: OrbitProblem, state: State, settle: float, section: Section
         period = float(problem.period(problem.scene.params))
         t0 = float(problem.phase) * period
         count = max(round(settle / period), 0)
-        x = np.asarray(pack(state))
         if count:
             run = run_for(problem, state, t0, np.asarray([t0 + count * period]))
-            state, x = jtu.tree_map(lambda a: a[-1], State(run.q, run.qd, run.z)), states_of(run)[-1]
+            state = jtu.tree_map(lambda a: a[-1], State(run.q, run.qd, run.z))
         run = run_for(problem, state, t0, np.linspace(t0, t0 + period, 257))
-        return SettledState(x, period, magnitudes(states_of(run), period))
+        return cut([run], period, segments)
     ts = np.linspace((1.0 - _LAST) * settle, settle, _TIMES)
     run = run_for(problem, state, 0.0, ts)
     x = states_of(run)
@@ -82,7 +117,17 @@ def settled(problem: OrbitProblem, state: State, settle: float, section: Section
     last = ts >= settle - period
     scale = magnitudes(x[last], period)
     at = _beginning(run, x, np.flatnonzero(last), section)
-    return SettledState(x[at], period, scale)
+    since = (ts[last] - ts[at]) / period % 1.0
+    chosen, cuts = begins(since, modes_of(run)[last], held(run)[last], segments)
+    return SettledState(x[last][chosen], cuts, period, scale)
+
+
+def cut(runs: Sequence[Trajectory], period: float, segments: int) -> SettledState:
+    """A start on runs that lead through a period, one after the other."""
+    t, x = np.concatenate([np.asarray(run.t) for run in runs]), states_of(*runs)
+    modes, stuck = (np.concatenate([of(run) for run in runs]) for of in (modes_of, held))
+    chosen, cuts = begins((t - t[0]) / period, modes, stuck, segments)
+    return SettledState(x[chosen], cuts, period, magnitudes(x, period))
 
 
 def magnitudes(x: np.ndarray, period: float) -> np.ndarray:
@@ -130,9 +175,11 @@ def _beginning(run: Trajectory, x: np.ndarray, last: np.ndarray, section: Sectio
     if run.modes is None:
         speed = np.linalg.norm(np.diff(x[last] / magnitudes(x[last], 1.0)[:-1], axis=0), axis=1)
         return int(last[int(np.argmax(speed))])
-    modes, stuck = np.stack([np.asarray(mode) for mode in run.mode.values()], axis=1)[last], held(run)[last]
+    modes, stuck = modes_of(run)[last], held(run)[last]
     cuts = np.flatnonzero(np.any(modes[1:] != modes[:-1], axis=1)) + 1
     pieces = np.split(np.arange(len(last)), cuts)
-    pieces = pieces[1:-1] if len(pieces) > 2 else pieces  # the others are cut off by the ends
+    if len(pieces) > 1 and np.array_equal(modes[-1], modes[0]):
+        # The ends of the period are in one phase.
+        pieces = [np.concatenate([pieces[-1], pieces[0]]), *pieces[1:-1]]
     piece = min(pieces, key=lambda each: (stuck[each[0]], -len(each)))
     return int(last[piece[len(piece) // 2]])

@@ -1,34 +1,43 @@
 """Special orbits between two neighbours on a branch."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.optimize import brentq
 
 from ._branch import CROSSING, DOUBLING, FOLD, GRAZING, LOSS, ONSET, TORUS, SpecialOrbit
-from ._describe import describe, floquet, mode_sequence
-from ._newton import scaled
-from ._orbit import Sequence
-from ._return_map import OrbitError, ShotOrbit
-from ._step import BranchStep
+from ._describe import describe, floquet
+from ._newton import newton, scaled, split
+from ._orbit import PeriodicOrbit, Sequence
+from ._rest_step import RestStep
+from ._return_map import OrbitError, OrbitProblem, ShotOrbit
+from ._step import BranchStep, Test
 
 # Part of a step to which special orbits are located: where a function is zero, and where the modes change.
 _ROOT, _CUT = 1e-10, 1e-6
 # Part of its ends above which a function that changes its sign has jumped.
 _JUMP = 1e-3
+# Step away from a corner of the branch, in the span of the parameter and the extent of the orbit.
+_BEHIND = 1e-3
 # Distance of complex multipliers from the unit circle, and of their angle from the real axis, that is none.
 _CIRCLE = 1e-4
 
-_Test = Callable[[BranchStep, ShotOrbit], float]
+_Step = TypeVar("_Step", BranchStep, RestStep)
 
 
 def locate(one: BranchStep, two: BranchStep, length: float, index: int) -> list[SpecialOrbit]:
     """Special orbits on the step of this length from the one to the other, in order along it."""
-    tests: dict[str, _Test] = {FOLD: _turning, DOUBLING: _doubling, TORUS: _torus, CROSSING: _crossing}
     located: list[tuple[float, SpecialOrbit]] = []
-    for kind, test in tests.items():
-        ends = test(one, one.shot), float(two.tangent[-1]) if kind == FOLD else test(one, two.shot)
-        at = _root(one, test, length, ends) if ends[0] * ends[1] < 0 else None
+    for kind in (FOLD, DOUBLING, TORUS, CROSSING):
+
+        def test(shot: ShotOrbit, kind: str = kind) -> float:
+            return _turning(one, shot) if kind == FOLD else TESTS[kind](one.problem, shot, one.scale)
+
+        ends = test(one.shot), float(two.tangent[-1]) if kind == FOLD else test(two.shot)
+        at = root_on_step(one, test, length, ends)
         if at is not None and (kind != TORUS or _is_torus(one, at)):
             located.append((at, _special(one, at, kind, index)))
     if any(each.kind == FOLD for _, each in located):
@@ -40,9 +49,33 @@ def locate(one: BranchStep, two: BranchStep, length: float, index: int) -> list[
     return [each for _, each in sorted(located, key=lambda pair: pair[0])]
 
 
-def _multipliers(one: BranchStep, shot: ShotOrbit) -> np.ndarray:
-    values = floquet(one.problem, shot, 0, one.scale[: len(shot.x)])
-    return values[1:] if one.problem.autonomous else values
+def corner(now: BranchStep, index: int) -> tuple[BranchStep, SpecialOrbit[PeriodicOrbit]] | None:
+    """The next orbit where a branch has a corner, as the sequence of modes changes, and the special orbit there.
+
+    The branch may turn back there, to the values of the parameter it came from, or go on; the parameter is held.
+    """
+    dof, before = len(now.orbit.q), _cycle(now.orbit.sequence)
+    onwards = _BEHIND * now.scale[-1] * np.sign(now.tangent[-1])
+    for change, sense in product((-onwards, onwards), (1.0, -1.0)):
+        ahead = now.shot.unknowns + sense * _BEHIND * now.tangent * now.scale
+        ahead[-1] = now.shot.value + change
+        try:
+            shot, _ = newton(now.problem, *split(ahead, now.shot, now.problem.autonomous), dof, now.scale)
+            after = _cycle(describe(now.problem, shot, dof)[0].sequence)
+            if after != before:
+                way = (shot.unknowns - now.shot.unknowns) / now.scale
+                made = replace(now, tangent=way / np.linalg.norm(way)).described(shot)
+                kind = _change(before, after)
+                return made, SpecialOrbit(kind, now.shot.value, index, now.orbit, np.zeros(now.shot.x.size))
+        except OrbitError:
+            continue
+    return None
+
+
+def _multipliers(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray) -> np.ndarray:
+    """All but the 1 of an orbit of unknown period."""
+    values = floquet(problem, shot, 0, scale[: shot.x.shape[1]])
+    return values[1:] if problem.autonomous else values
 
 
 def _turning(one: BranchStep, shot: ShotOrbit) -> float:
@@ -51,32 +84,38 @@ def _turning(one: BranchStep, shot: ShotOrbit) -> float:
     return float(tangent[-1] * np.sign(tangent @ one.tangent))
 
 
-def _doubling(one: BranchStep, shot: ShotOrbit) -> float:
-    return float(np.prod(_multipliers(one, shot) + 1.0).real)
+def _doubling(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray) -> float:
+    return float(np.prod(_multipliers(problem, shot, scale) + 1.0).real)
 
 
-def _crossing(one: BranchStep, shot: ShotOrbit) -> float:
-    return float(np.prod(_multipliers(one, shot) - 1.0).real)
+def _crossing(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray) -> float:
+    return float(np.prod(_multipliers(problem, shot, scale) - 1.0).real)
 
 
-def _torus(one: BranchStep, shot: ShotOrbit) -> float:
-    values = _multipliers(one, shot)
+def _torus(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray) -> float:
+    values = _multipliers(problem, shot, scale)
     i, j = np.triu_indices(len(values), 1)
     return float(np.prod(values[i] * values[j] - 1.0).real) if len(i) else 1.0
 
 
+# What is zero at special orbits.
+TESTS: dict[str, Test] = {FOLD: _crossing, CROSSING: _crossing, DOUBLING: _doubling, TORUS: _torus}
+
+
 def _is_torus(one: BranchStep, at: float) -> bool:
     """Whether it is a pair of complex multipliers whose product is 1, not two real ones."""
-    values = _multipliers(one, one.corrected(at)[0])
+    values = _multipliers(one.problem, one.corrected(at)[0], one.scale)
     return bool(np.any((np.abs(np.abs(values) - 1.0) < _CIRCLE) & (np.abs(np.imag(values)) > _CIRCLE)))
 
 
-def _root(one: BranchStep, test: _Test, length: float, ends: tuple[float, float]) -> float | None:
-    """Where on the step a function is zero; None where it jumps, or the orbits there are not found."""
+def root_on_step(one: _Step, test: Callable[[Any], float], length: float, ends: tuple[float, float]) -> float | None:
+    """Where on the step a function is zero; None where it is not, jumps, or the orbits there are not found."""
+    if not ends[0] * ends[1] < 0:
+        return None
     known = {0.0: ends[0], length: ends[1]}
 
     def value(at: float) -> float:
-        return known[at] if at in known else test(one, one.corrected(at)[0])
+        return known[at] if at in known else test(one.corrected(at)[0])
 
     try:
         at: float = brentq(value, 0.0, length, xtol=_ROOT * length)  # pyright: ignore[reportAssignmentType] - a number
@@ -93,7 +132,7 @@ def _cut(one: BranchStep, before: Sequence, after: Sequence, length: float) -> f
     while high - low > _CUT * length:
         middle = 0.5 * (low + high)
         try:
-            same = _cycle(mode_sequence(one.problem, one.corrected(middle)[0], dof)) == before
+            same = _cycle(describe(one.problem, one.corrected(middle)[0], dof)[0].sequence) == before
         except OrbitError:
             same, failed = singular_before, True
         low, high = (middle, high) if same else (low, middle)
@@ -112,7 +151,7 @@ def _change(before: Sequence, after: Sequence) -> str:
 
 def _special(one: BranchStep, at: float, kind: str, index: int) -> SpecialOrbit:
     shot = one.corrected(at)[0]
-    scale = one.scale[: len(shot.x)]
+    scale = one.scale[: shot.x.shape[1]]
     values, vectors = np.linalg.eig(shot.monodromy * scale[None, :] / scale[:, None])
     direction = scale * np.real(vectors[:, int(np.argmin(np.abs(values + 1.0)))])
     orbit = describe(one.problem, shot, len(one.orbit.q))[0]

@@ -17,7 +17,7 @@ from ..scene import Scene, scene_numbers
 from ._branch import SpecialOrbit
 from ._describe import describe
 from ._return_map import OrbitError, OrbitProblem, ShotOrbit, evaluate, pack
-from ._step import BranchStep, step_at
+from ._step import BranchStep
 
 # Kind, value, index, phase, period, state and direction.
 _StoredPoint: TypeAlias = tuple[str, float, int, float, float, list[float], list[float]]
@@ -65,7 +65,7 @@ class BranchStore:
         for x, period, value, sense, phase in stored:
             problem = replace(begin.problem, phase=jnp.asarray(phase), anchor=jnp.asarray(x))
             shot = self._shot(problem, x, float(period), float(value), dof)
-            steps.append(step_at(problem, shot, describe(problem, shot, dof)[0], float(begin.scale[-1]), sense))
+            steps.append(begin.next_at(problem, shot, describe(problem, shot, dof)[0], sense))
         for kind, value, index, phase, period, x, direction in self._points:
             problem = replace(begin.problem, phase=jnp.asarray(phase))
             shot = self._shot(problem, np.asarray(x), period, value, dof)
@@ -73,7 +73,7 @@ class BranchStore:
         return steps, points
 
     def _shot(self, problem: OrbitProblem, x: np.ndarray, period: float, value: float, dof: int) -> ShotOrbit:
-        shot = evaluate(problem, x, period, value, dof)
+        shot = evaluate(problem, x[None], period, np.array([value]), dof)
         if shot.failure:
             raise OrbitError(f"An orbit of {self._path} does not run any more: {shot.failure}")
         return shot
@@ -91,7 +91,7 @@ class BranchStore:
             "phase": ("orbit", [float(each.problem.phase) for each in steps]),
             "value": ("orbit", [each.shot.value for each in steps]),
             "period": ("orbit", [each.shot.period for each in steps]),
-            "state": (("orbit", "entry"), [each.shot.x for each in steps]),
+            "state": (("orbit", "entry"), [each.shot.x[0] for each in steps]),
             "tangent": (("orbit", "unknown"), [each.tangent * each.scale for each in steps]),
             "lowest": (("orbit", "coordinate"), [np.asarray(each.lowest) for each in orbits]),
             "highest": (("orbit", "coordinate"), [np.asarray(each.highest) for each in orbits]),

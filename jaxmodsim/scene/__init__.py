@@ -21,6 +21,7 @@ from ._names import replace_elements as replace_elements
 from ._names import replace_numbers as replace_numbers
 from ._names import scene_numbers as scene_numbers
 from ._names import scene_ranges as scene_ranges
+from ._names import scene_units as scene_units
 from ._quantities import describe_series as describe_series
 from ._quantities import quantity_of as quantity_of
 from ._robot import read_robot as read_robot

@@ -13,9 +13,10 @@ from jaxtyping import Array
 from .._core.parameters import Range, ranges_of
 from .._core.state_dependent import StateDependent
 from ..friction import AbstractAsymmetric
-from ._quantities import in_units_of
+from ._quantities import in_units_of, slip_unit
 from ._scene import Scene
 from ._signal import Signal
+from .forces._friction import Friction
 
 # Levels of the scene that say nothing about a number.
 _SILENT = ("law", "place", "amount", "number")
@@ -89,6 +90,16 @@ def scene_ranges(scene: eqx.Module) -> dict[str, Range]:
             allowed = in_units_of(scene, scene.effects[path[1].idx], allowed)
         ranges[_name(scene, path)] = allowed
     return ranges
+
+
+def scene_units(scene: eqx.Module) -> dict[str, str]:
+    """Unit of each number that has a known one, by the names of `scene_numbers`."""
+    units = {name: allowed.unit for name, allowed in scene_ranges(scene).items()}
+    if isinstance(scene, Scene):
+        for name, effect in zip(scene.names, scene.effects, strict=True):
+            if isinstance(effect, Friction):
+                units[f"{name}.belt_velocity"] = slip_unit(scene, effect).replace(" ", "/s ", 1) + "/s"
+    return units
 
 
 def replace_numbers(scene: _Module, values: dict[str, Any]) -> _Module:

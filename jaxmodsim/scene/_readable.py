@@ -8,19 +8,14 @@ from .._core.functions import Function
 from .._core.readable import Table, short, table_of
 from ..friction import AbstractAsymmetric, AbstractLaw
 from ._coordinates import Quantity
-from ._names import scene_numbers, scene_ranges
-from ._quantities import slip_unit
+from ._names import scene_numbers, scene_units
 from ._scene import Scene
 from .forces._friction import Friction
 
 
 def _numbers(thing: eqx.Module) -> list[tuple[str, ...]]:
     """Each number by its name and unit. A derivative has the name and the unit of what it is taken by."""
-    units = {name: allowed.unit for name, allowed in scene_ranges(thing).items()}
-    if isinstance(thing, Scene):
-        for name, effect in zip(thing.names, thing.effects, strict=True):
-            if isinstance(effect, Friction):
-                units[f"{name}.belt_velocity"] = slip_unit(thing, effect).replace(" ", "/s ", 1) + "/s"
+    units = scene_units(thing)
     return [(Quantity(name, units.get(name, "")).label, short(x)) for name, x in scene_numbers(thing).items()]
 
 

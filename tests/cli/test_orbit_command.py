@@ -25,6 +25,28 @@ step = 0.5
 """
 
 
+HOPF = """
+[scene]
+problem = "belt_oscillator"
+c = 2.0
+[scene.law]
+kind = "Stribeck"
+Fc = 5.0
+Fs = 8.0
+vs = 0.2
+[orbit]
+q0 = [0.0]
+qd0 = [0.0]
+rtol = 1e-8
+[branch]
+parameter = "friction.belt_velocity"
+from = 1.0
+to = 0.35
+start = "Hopf"
+max_orbits = 2
+"""
+
+
 @pytest.fixture
 def spec(tmp_path):
     def write(text):
@@ -56,6 +78,21 @@ def test_a_branch_is_written_and_gone_on_with(spec, tmp_path, run_command):
     np.testing.assert_allclose(table["period [s]"], [each.period for each in cycles], rtol=1e-8)
     assert (tmp_path / "out" / "branch.png").stat().st_size > 1000
     assert run_command(*arguments)[1] == out
+
+
+def test_a_branch_begins_at_a_hopf_point(spec, tmp_path, run_command):
+    code, out, _ = run_command("branch", spec(HOPF), "--out", str(tmp_path / "out"))
+    assert code == 0
+    assert "Hopf  0.36364298" in out
+    values = pd.read_csv(tmp_path / "out" / "branch.csv")["friction.belt_velocity"]
+    assert values.between(0.36364298, 0.37).all()
+    assert (tmp_path / "out" / "branch.png").stat().st_size > 1000
+    code, _, errors = run_command("branch", spec(HOPF.replace("0.35", "0.5")), "--out", str(tmp_path / "none"))
+    assert code != 0
+    assert "no Hopf point" in errors
+    code, _, errors = run_command("branch", spec(HOPF.replace("rtol = 1e-8", "settle = 1.0")))
+    assert code == 2
+    assert 'with start = "Hopf" leave period, frequency and settle out' in errors
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -5,7 +7,7 @@ from scipy.integrate import solve_ivp
 
 import jaxmodsim as jms
 from jaxmodsim.mechanics import Contact
-from jaxmodsim.orbits import OrbitError
+from jaxmodsim.orbits import OrbitError, continue_special
 from jaxmodsim.problems import vibrating_table
 
 
@@ -58,6 +60,14 @@ def test_period_doubling_of_the_ball_is_that_of_its_closed_form(ball):
     assert point.kind == "period doubling"
     np.testing.assert_allclose(point.value, exact, rtol=1e-8)
     assert list(branch.stable) == [x < exact for x in branch.values]
+    # Over the restitution it is followed as exactly.
+    scene, span = vibrating_table.scene(**BALL), (BALL["e"], 0.7)
+    curve = continue_special(scene, point, ("A", "table.restitution"), span, period=table_period, step=0.3)
+    A, e = curve.values.T
+    table = np.pi * g * (1 - e) / ((1 + e) * omega)
+    np.testing.assert_allclose(A, np.hypot(2 * (1 + e**2) * g / (1 + e) ** 2 / omega, table) / omega, rtol=1e-8)
+    assert e[-1] > 0.7
+    assert "period doubling" in str(curve)
     # Two bounces in two periods branch off there, and are stable.
     doubled = ball_branch(ball, point, 0.95e-3, step=0.1)
     orbit = doubled.orbits[-1]
@@ -77,6 +87,14 @@ def test_fold_of_the_ball_is_that_of_its_closed_form(ball):
     np.testing.assert_allclose(point.value, np.pi * g * (1 - e) / ((1 + e) * omega**2), rtol=1e-8)
     assert "end of the span" in branch.ending
     assert not branch.stable[-1]
+    scene, span = vibrating_table.scene(**BALL), (omega, 1.1 * omega)
+    curve = continue_special(scene, point, ("A", "omega"), span, period=table_period, step=0.3)
+    A, omega = curve.values.T
+    np.testing.assert_allclose(A, np.pi * g * (1 - e) / ((1 + e) * omega**2), rtol=1e-8)
+    with pytest.raises(ValueError, match="parameters must be the names of two"):
+        continue_special(scene, point, ("A", "A"), span, period=table_period)
+    with pytest.raises(ValueError, match="A curve starts at a special orbit of a branch: fold,"):
+        continue_special(scene, dataclasses.replace(point, kind="grazing"), ("A", "omega"), span, period=table_period)
 
 
 def test_branch_of_a_forced_oscillator_with_dry_friction_and_its_loss_of_stick():
@@ -132,6 +150,45 @@ def test_neimark_sacker_point_of_a_forced_van_der_pol_oscillator():
     np.testing.assert_allclose(second.y[:, -1], second.y[:, 0], atol=1e-8)
 
 
+def soft(_t, q, qd, p):
+    spring = 0.5 * q[0] ** 2 - q[0] ** 3 / 3
+    return 0.5 * qd[0] ** 2 - spring + 0.5 * qd[1] ** 2 - 0.5 * p["W"] ** 2 * q[1] ** 2
+
+
+def excited(_t, q, qd, p):
+    swing = qd[1] / p["W"]
+    return jnp.stack([p["F"] * q[1] - 0.1 * qd[0], p["W"] * (1 - q[1] ** 2 - swing**2) * qd[1]])
+
+
+def test_period_doubling_of_an_orbit_of_unknown_period():
+    # A soft spring (Thompson's escape equation) under a self-excited oscillator, whose limit cycle is sin(W t).
+    W, span = 0.85, (0.095, 0.102)
+    scene = jms.Scene(soft, params={"F": 0.095, "W": W}, effects=(jms.AppliedForce(excited),))
+    branch = jms.continue_orbits(scene, ([-0.074, 0.0], [-0.552, W]), "F", span, settle=300.0, step=0.3)
+    (point,) = branch.points
+    assert point.kind == "period doubling"
+    assert list(branch.stable) == [point.value > F for F in branch.values]
+    doubled = jms.continue_orbits(scene, point, "F", span, step=0.2, max_orbits=3)
+    orbit, F, T = doubled.orbits[-1], doubled.values[-1], 2 * np.pi / W
+    assert point.value < F
+    assert orbit.stable
+    np.testing.assert_allclose(orbit.period, 2 * T, rtol=1e-9)
+
+    def second(F, start, time):
+        """Under a force that is given, by another solver."""
+        q, at = start.q, np.arctan2(start.q[1] * W, start.qd[1])
+        return solve_ivp(
+            lambda t, y: [y[1], -y[0] + y[0] ** 2 - 0.1 * y[1] + F * np.sin(W * t + at)],
+            *((0.0, time), [q[0], start.qd[0]], "DOP853"), rtol=1e-12, atol=1e-13,
+        ).y[:, -1]  # fmt: skip
+
+    start = np.array([orbit.q[0], orbit.qd[0]])
+    np.testing.assert_allclose(second(F, orbit, 2 * T), start, atol=1e-8)
+    assert np.max(np.abs(second(F, orbit, T) - start)) > 1e-3
+    np.testing.assert_allclose(second(point.value, point.orbit, T), [point.orbit.q[0], point.orbit.qd[0]], atol=1e-8)
+    np.testing.assert_allclose(np.min(np.real(point.orbit.multipliers)), -1.0, atol=1e-8)
+
+
 def buckling(_t, q, qd, p):
     return 0.5 * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2 - 0.25 * q[0] ** 4
 
@@ -182,6 +239,17 @@ def test_folds_of_duffing_and_a_branch_that_goes_on_from_its_store(tmp_path):
     assert whole.stable[: between.start].all()
     for point in whole.points:
         np.testing.assert_allclose(np.min(np.abs(point.orbit.multipliers - 1.0)), 0.0, atol=1e-5)
+    # One of them over the hardening of the spring, against branches at other values of it.
+    fold = whole.points[0]
+    curve = continue_special(duffing(0.8), fold, ("W", "a"), (0.05, 0.07), period=of_frequency, step=0.5)
+    i = len(curve.orbits) // 2
+    (W, a), nearby = curve.values[i], (curve.orbits[i].q, curve.orbits[i].qd)
+    scene = jms.Scene(spring, params={"a": a, "W": W}, effects=duffing(W).effects)
+    span = (W - 0.05, W + 0.05)
+    branch = jms.continue_orbits(scene, nearby, "W", span, period=of_frequency, step=0.5)
+    at = [x.value for x in branch.points if x.kind == "fold"]
+    np.testing.assert_allclose(at, [W], rtol=1e-8)
+    assert 0.05 < a < 0.07
     seen = []
     follow(out=tmp_path / "duffing", max_orbits=len(whole.values) // 2, progress=lambda count, _: seen.append(count))
     rest = []

@@ -35,6 +35,15 @@ def test_a_branch_is_drawn_with_its_stability_and_period(branch: Branch) -> None
     def unstable(orbit: PeriodicOrbit) -> PeriodicOrbit:
         return replace(orbit, multipliers=np.array([1.0, 2.0 + 0j]))
 
+    rests = jms.continue_equilibria(
+        belt_oscillator.scene(belt_oscillator.stribeck(), c=2.0), [0.0], branch.parameter, (0.8, 0.1), step=0.5
+    )
+    beside = branch_figure(branch, beside=(rests,)).axes[0]
+    assert beside.get_xlabel() == "friction.belt_velocity [m/s]"
+    legend = beside.get_legend()
+    assert legend is not None
+    assert {text.get_text() for text in legend.get_texts()} == {"stable", "unstable", "Hopf"}
+
     half = len(branch.orbits) // 2
     orbits = branch.orbits[:half] + tuple(map(unstable, branch.orbits[half:]))
     mixed = branch_figure(Branch(branch.parameter, branch.values, orbits, (), branch.ending))

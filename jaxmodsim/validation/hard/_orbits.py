@@ -1,4 +1,4 @@
-"""Periodic orbits: unstable, stiff, with many phases of stick, nearly grazing, and refused in single precision."""
+"""Periodic orbits: unstable, of twice the period, stiff, with many sticks, nearly grazing, and refused in float32."""
 
 import math
 from functools import partial
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
+from scipy.optimize import root
 
 from ...friction import Coulomb, LuGre, Viscous
 from ...orbits import PeriodicOrbit, periodic_orbit
@@ -19,6 +20,8 @@ from ._case import HardCase, MeasuredNumber, RefusedCalls
 FAMILY = "periodic orbits"
 # A bounce a period, past its period doubling.
 _TABLE = {"g": 9.81, "A": 1.1e-3, "omega": 120.0, "e": 0.6}
+# Bounces of two heights in turn.
+_TWICE = {**_TABLE, "A": 0.95e-3}
 
 
 def _table_period(p: dict[str, Array]) -> Array:
@@ -41,6 +44,44 @@ def _exact_multiplier() -> float:
     fall = p["A"] * p["omega"] ** 2 * math.sin(float(vibrating_table.bounce_phase(**p)))
     trace = 1.0 + p["e"] ** 2 - (1.0 + p["e"]) ** 2 * fall / p["g"]
     return 0.5 * trace - math.sqrt(0.25 * trace**2 - p["e"] ** 2)
+
+
+def _guess_of_two_bounces() -> tuple[list[float], list[float]]:
+    """A start beside a bounce a period, from which the ball comes to bounces of two heights."""
+    p, T = _TWICE, 2.0 * math.pi / _TWICE["omega"]
+    phase = float(vibrating_table.bounce_phase(**p))
+    since = T - phase / p["omega"]
+    return [p["A"] * math.sin(phase) + 0.5 * p["g"] * since * (T - since)], [1.01 * p["g"] * (0.5 * T - since)]
+
+
+def _two_periods(p: dict[str, Array]) -> Array:
+    return 2.0 * _table_period(p)
+
+
+def _top_of_two_bounces() -> float:
+    orbit = periodic_orbit(vibrating_table.scene(**_TWICE), _guess_of_two_bounces(), period=_two_periods, settle=40.0)
+    return float(orbit.highest[0])
+
+
+def _exact_top() -> float:
+    """Of two parabolas between two impacts: equations for the times of impacts and the velocities behind them."""
+    g, A, omega, e = (_TWICE[name] for name in ("g", "A", "omega", "e"))
+    T = 2.0 * math.pi / omega
+
+    def misses(x: np.ndarray) -> list[float]:
+        (one, two), v = x[:2] / omega, x[2:] * g * T
+        flights = ((one, v[0], two, v[1]), (two, v[1], one + 2.0 * T, v[0]))
+        out = []
+        for begin, start, end, after in flights:
+            fall, table = end - begin, A * omega * math.cos(omega * end)
+            out.append(A * (math.sin(omega * begin) - math.sin(omega * end)) + start * fall - 0.5 * g * fall**2)
+            out.append(after - table + e * (start - g * fall - table))
+        return [omega**2 * out[0] / g, out[1] / (g * T), omega**2 * out[2] / g, out[3] / (g * T)]
+
+    phase = float(vibrating_table.bounce_phase(**_TWICE))
+    x = root(misses, [phase + 0.3, phase - 0.5 + 2.0 * math.pi, 0.6, 0.4], tol=1e-14).x
+    tops = A * np.sin(x[:2]) + 0.5 * (x[2:] * g * T) ** 2 / g
+    return float(np.max(tops))
 
 
 def _spring(t: Array, q: Array, qd: Array, p: PyTree) -> Array:
@@ -117,6 +158,15 @@ def cases() -> list[HardCase]:
             MeasuredNumber(_unstable_multiplier),
             lambda _: _exact_multiplier(),
             asks="largest multiplier",
+            tolerance=1e-8,
+        ),
+        HardCase(
+            "orbit_period_two",
+            "A ball bounces to two heights in turn, on a table beyond the doubling of its period.",
+            "The orbit of one period is near, and solves the equations too.",
+            MeasuredNumber(_top_of_two_bounces),
+            lambda _: _exact_top(),
+            asks="highest position [m]",
             tolerance=1e-8,
         ),
         HardCase(
