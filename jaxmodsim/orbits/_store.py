@@ -41,6 +41,8 @@ class BranchStore:
         self._about = {"parameter": parameter, "span": list(span), "numbers": numbers}
         self._arrays: dict[str, np.ndarray] = {}
         self._points: list[_StoredPoint] = []
+        if self._before.exists() and not path.exists():
+            os.rename(self._before, path)  # the process was killed in that moment
         if not path.exists():
             return
         try:
@@ -110,5 +112,12 @@ class BranchStore:
         scratch = self._path.with_name(f".{self._path.name}.{uuid.uuid4().hex}")
         data.to_zarr(scratch, mode="w", zarr_format=3, consolidated=False)
         if self._path.exists():
-            shutil.rmtree(self._path)
+            shutil.rmtree(self._before, ignore_errors=True)
+            os.rename(self._path, self._before)
         os.rename(scratch, self._path)
+        shutil.rmtree(self._before, ignore_errors=True)
+
+    @property
+    def _before(self) -> Path:
+        """Where the store is for the moment in which another one takes its place."""
+        return self._path.with_name(f".{self._path.name}.before")

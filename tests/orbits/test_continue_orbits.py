@@ -252,6 +252,8 @@ def test_folds_of_duffing_and_a_branch_that_goes_on_from_its_store(tmp_path):
     assert 0.05 < a < 0.07
     seen = []
     follow(out=tmp_path / "duffing", max_orbits=len(whole.values) // 2, progress=lambda count, _: seen.append(count))
+    # As a process leaves it that is killed while it writes.
+    (tmp_path / "duffing").rename(tmp_path / ".duffing.before")
     rest = []
     again = follow(out=tmp_path / "duffing", progress=lambda count, _: rest.append(count))
     assert rest[0] == seen[-1] + 1
