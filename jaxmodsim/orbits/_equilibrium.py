@@ -231,7 +231,7 @@ def _(rest: Equilibrium) -> Table:
     rows = [(quantity_of(rest.scene, f"q[{i}]").label, short(x)) for i, x in enumerate(rest.q)]
     notes = [f"eigenvalues {', '.join(map(complex_words, rest.eigenvalues))} 1/s"] if len(rest.eigenvalues) else []
     if np.isfinite(rest.period):
-        notes.append(f"period of small oscillations {short(rest.period)} s")
+        notes.append(f"period of small oscillations {rest.period:.6g} s")
     sides = [f"{name}, {'forwards' if side > 0 else 'backwards'}" for name, side in rest.ends.items()]
     notes += [f"about to slide: {'; '.join(sides)}"] if sides else []
     return Table(f"Equilibrium, {rest.stability}", ("", "at"), rows, tuple(notes))
