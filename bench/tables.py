@@ -217,8 +217,8 @@ REPORTS = {
             Table(
                 "Reverse mode against forward mode, which may differ by rounding alone: differences relative to the"
                 " derivative, or to the answer over the number where that is larger. Named problems by all numbers of"
-                " their scenes, at rtol 1e-6, 1e-9 and 1e-12; hard cases by theirs. Tuned: with"
-                " `jaxmodsim.tune_cpu()`.",
+                " their scenes, at rtol 1e-6, 1e-9 and 1e-12; hard cases (stiffness, rest and reversal, many events,"
+                " gradients) by theirs. Tuned: with `jaxmodsim.tune_cpu()`.",
                 ("derivatives", "median", "largest", "above 1e-11"), ("case", "at"),
             ),
             Table("Those above {shown:g}.", ("difference", "why it is hard"), ("case", "at")),
