@@ -1,8 +1,8 @@
 """Reverse mode against forward mode: derivatives of the same steps, which may differ by rounding alone.
 
 Every named problem, by all numbers of its scene at three tolerances, and the hard cases of `FAMILIES` that have a
-derivative, by their number; as users have it, and with `tune_cpu`, each in a process of its own. Differences are relative to the derivative,
-or to the scale of the answer over the number where that is larger.
+derivative, by their number; as users have it, and with `tune_cpu`, each in a process of its own. Differences are
+relative to the derivative, or to the scale of the answer over the number where that is larger.
 """
 
 import multiprocessing
