@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import diffrax as dfx
 import jax
 import jax.core
 import jax.numpy as jnp
@@ -33,7 +32,6 @@ from ._differences import (
 
 Verdict = Literal["agree", "part", "modes change", "grazing", "kink", "unclear", "no differences"]
 
-_FORWARD = dfx.ForwardMode()
 # Admissible relative differences, by bytes of the type: between derivatives and differences, between the two modes.
 _RTOL = {8: 1e-3, 4: 1e-2}
 _RTOL_MODES = {8: 1e-6, 4: 1e-3}
@@ -232,11 +230,6 @@ def _recording(runs: list[Trajectory]) -> Callable[..., Trajectory]:
     return run
 
 
-@functools.wraps(simulate)
-def _forward_simulate(*args: Any, **options: Any) -> Trajectory:
-    return simulate(*args, **{**options, "adjoint": _FORWARD})
-
-
 def _first(fn: Callable[..., Any], scene: Scene, runs: list[Trajectory]) -> tuple[Array, bool, float]:
     """The value at the scene itself, whether its runs can be watched, and their atol; refuse what cannot be checked."""
     if not callable(fn):
@@ -269,7 +262,7 @@ def _forward(fn: Callable[..., object], scene: Scene, name: str) -> float:
     """Derivative in forward mode."""
     zero = jtu.tree_map(jnp.zeros_like, scene)
     try:
-        tangent = jax.jvp(lambda s: fn(s, _forward_simulate), (scene,), (replace_elements(zero, {name: 1.0}),))[1]
+        tangent = jax.jvp(lambda s: fn(s, simulate), (scene,), (replace_elements(zero, {name: 1.0}),))[1]
     except TypeError as error:
         if "custom_vjp" not in str(error):
             raise

@@ -189,6 +189,6 @@ def _tight(
     y, gradient = np.asarray(observed(question.observe(run))), None
     if question.values:
         x = {name: jnp.asarray(value, jnp.float64) for name, value in question.values.items()}
-        derivatives = jax.jacfwd(question.last)(x, scene, start, setting, adjoint=dfx.ForwardMode(), **options)
+        derivatives = jax.jacfwd(question.last)(x, scene, start, setting, **options)
         gradient = {name: float(derivatives[name]) for name in question.values}
     return y, happened(run), gradient

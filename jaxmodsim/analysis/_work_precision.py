@@ -226,7 +226,7 @@ def _prepared(name: str, method: Method, scene: Scene, question: Question, batch
     x = {name: jnp.asarray(value, dtype) for name, value in question.values.items()}
     starts = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (batch, *leaf.shape)), start)
     many = jax.jit(jax.vmap(end, in_axes=(0, None, None)))
-    forward = jax.jit(jax.jacfwd(partial(question.last, adjoint=dfx.ForwardMode(), **options)))
+    forward = jax.jit(jax.jacfwd(partial(question.last, **options)))
     reverse = jax.jit(jax.grad(partial(question.last, **options)))
     calls = {
         "run": run,

@@ -15,7 +15,7 @@ from ._continue import check_parameter, follow, read_span
 from ._equilibrium import Equilibrium, described_rest, nearest_oscillation, prepare_rest, refuse_time, rest_scale
 from ._rest import RestPoint, solve_rest
 from ._rest_step import RestStep, rest_step_at, tangent_at
-from ._special import root_on_step
+from ._special import in_order, root_on_step
 
 # Real part of a pair of eigenvalues, relative to their size, that is none.
 _AXIS = 1e-6
@@ -89,9 +89,7 @@ def _locate(one: RestStep, two: RestStep, length: float, index: int) -> list[Spe
             if not abs(rate.real) < _AXIS * rate.imag:
                 continue  # two real eigenvalues of opposite signs: a saddle that contracts as much as it expands
         located.append((at, SpecialOrbit(kind, shot.value, index, made, np.zeros(0))))
-    if any(each.kind == FOLD for _, each in located):
-        located = [each for each in located if each[1].kind != CROSSING]
-    return [each for _, each in sorted(located, key=lambda pair: pair[0])]
+    return in_order(located)
 
 
 def _turning(one: RestStep, point: RestPoint) -> float:

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.optimize import brentq
 
-from ._branch import CROSSING, DOUBLING, FOLD, GRAZING, LOSS, ONSET, TORUS, SpecialOrbit
+from ._branch import CROSSING, DOUBLING, FOLD, GRAZING, LOSS, ONSET, TORUS, OrbitT, SpecialOrbit
 from ._describe import describe, floquet
 from ._newton import newton, scaled, split
 from ._orbit import PeriodicOrbit, Sequence
@@ -40,13 +40,18 @@ def locate(one: BranchStep, two: BranchStep, length: float, index: int) -> list[
         at = root_on_step(one, test, length, ends)
         if at is not None and (kind != TORUS or _is_torus(one, at)):
             located.append((at, _special(one, at, kind, index)))
-    if any(each.kind == FOLD for _, each in located):
-        located = [each for each in located if each[1].kind != CROSSING]
     before, after = (_cycle(x.orbit.sequence) for x in (one, two))
     if before != after:
         at = _cut(one, before, after, length)
         located.append((at, _special(one, at, _change(before, after), index)))
-    return [each for _, each in sorted(located, key=lambda pair: pair[0])]
+    return in_order(located)
+
+
+def in_order(located: list[tuple[float, SpecialOrbit[OrbitT]]]) -> list[SpecialOrbit[OrbitT]]:
+    """Special orbits by where they are on a step; a fold, whose multiplier is 1 as well, is no branch point."""
+    folds = any(each.kind == FOLD for _, each in located)
+    kept = [pair for pair in located if not (folds and pair[1].kind == CROSSING)]
+    return [each for _, each in sorted(kept, key=lambda pair: pair[0])]
 
 
 def corner(now: BranchStep, index: int) -> tuple[BranchStep, SpecialOrbit[PeriodicOrbit]] | None:

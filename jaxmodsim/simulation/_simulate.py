@@ -7,6 +7,7 @@ import time
 import diffrax as dfx
 import equinox as eqx
 import jax.tree_util as jtu
+from jax import lax
 from jaxtyping import ArrayLike, PyTree
 
 from .._core.arguments import as_flag
@@ -65,16 +66,15 @@ def simulate(
       is smooth on the scale of its own derivatives. What cannot be seen is a pulse out of rest that is shorter than a
       step: give it as a `Signal`, on whose samples steps end, or bound the step by its length. Where a missed pulse
       shows at a saved time, the run fails.
-      Derivatives are those of the steps that were made: of a run in which nothing moves, such as one that starts and
-      stays in equilibrium, they need a bound, too, that resolves what would move. `check_gradients` tells.
     - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`) or, on one
       coordinate, runs by events (set-valued laws); `diffrax.Tsit5` otherwise. `ImplicitFriction` for fixed steps that
       may be too long for the stiffness of friction.
     - `adjoint`: how the run is differentiated. By default `StoredSteps()`, in either mode: `jax.grad`, `jax.jacfwd`,
-      `jax.hessian`. `StoredSteps(every=k)` needs a k-th of the memory; `diffrax.ForwardMode()` is for forward mode
-      alone, stores nothing and is quicker there. `diffrax.RecursiveCheckpointAdjoint` makes steps again from
-      checkpoints: their rounding differs from that of the run, and through events derivatives lose digits. Not
-      `diffrax.BacksolveAdjoint`.
+      `jax.hessian`. The steps of a run that is differentiated keep `rtol` for the derivative, too.
+      `StoredSteps(every=k)` needs a k-th of the memory. Adjoints of diffrax control the error of the state alone, so
+      their derivatives are wrong where little moves. `diffrax.ForwardMode()` is for forward mode alone and stores
+      nothing. `diffrax.RecursiveCheckpointAdjoint` makes steps again from checkpoints: their rounding differs from that
+      of the run, and through events derivatives lose digits. Not `diffrax.BacksolveAdjoint`.
     - `max_steps`: limit of the number of steps. Derivatives set memory aside for the state before each of them.
     - `max_events`: limit of the number of instants at which set-valued laws change modes. Inside `jax.jit`
       `run.events` has as many entries for each such law, so a smaller one is faster there.
@@ -140,7 +140,8 @@ def _raise_early_end(inputs: RunInputs, solved: RunOutput) -> RunOutput:
         code = int(solved.code)
         if code != SUCCESS:
             t, y = solved.end or (solved.t[-1], jtu.tree_map(lambda x: x[-1], solved.y))
-            raise SimulationError(describe_failure(inputs.scene, float(t), y, code))
+            scene, t, y = lax.stop_gradient((inputs.scene, t, y))
+            raise SimulationError(describe_failure(scene, float(t), y, code))
         return solved
     messages = LastLines(outcome_messages(inputs.scene, inputs.q0.shape[0]))
     return eqx.branched_error_if(solved, solved.code != SUCCESS, solved.code, messages)

@@ -28,6 +28,7 @@ from ._over_steps import (
     is_save_state,
     lax_loop,
 )
+from ._probe import ProbedController, ProbedStep, direction, has_error_control, start, without_probe
 
 _Fn: TypeAlias = Callable[..., PyTree]
 _TWICE = "StoredSteps does not differentiate a derivative in reverse mode: take jax.hessian, or jax.jacfwd of jax.grad."
@@ -54,14 +55,33 @@ class StoredSteps(dfx.AbstractAdjoint):
     **Arguments:**
 
     - `every`: keep the state of every such step, at least 1; those between are made again, at their recorded times.
+    - `probe`: whether the error of a derivative limits the steps, too, where a `diffrax.PIDController` chooses them. A
+      run that is differentiated then carries its tangent in one random direction of the differentiated numbers, each
+      changed by its magnitude. The error estimate of this tangent enters the norm of the step size control, relative to
+      the largest values of its components so far. Without it, steps grow without bound where nothing moves, and the
+      derivatives of such a run are wrong. The differentiated run makes other steps than the plain run; both keep the
+      tolerance.
 
     **Raises:**
 
     - `ValueError` for `every` below 1, `max_steps=None`, and diffrax's own terminating `event`.
     - `RuntimeError` for reverse mode of a derivative.
+
+    ??? cite "Reference"
+
+        Tangents in the error norm:
+
+        ```bibtex
+        @article{eberhard1999automatic,
+            author={Eberhard, Peter and Bischof, Christian},
+            title={Automatic differentiation of numerical integration algorithms},
+            journal={Mathematics of Computation}, volume={68}, number={226}, pages={717--731}, year={1999},
+        }
+        ```
     """
 
     every: int = eqx.field(static=True, default=1)
+    probe: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self) -> None:
         if self.every < 1:
@@ -119,8 +139,10 @@ class StoredSteps(dfx.AbstractAdjoint):
             self._loop,
             order,
             StepPlan(solver.interpolation_cls, [(sub.t0, sub.t1, sub.steps) for sub in subs], jumps, even, self.every),
+            _projection(solver, t0, y0, args),
+            self.probe and has_error_control(stepsize_controller),
         )
-        run = eqx.filter_closure_convert(lambda inputs: _solve(inputs, fixed, False), inputs)
+        run = eqx.filter_closure_convert(lambda inputs: _solve(inputs, fixed, None), inputs)
         return eqxi.filter_primitive_bind(_run_p, run, inputs, fixed, False), {}
 
 
@@ -137,6 +159,10 @@ class _Fixed(NamedTuple):
     loop: Callable[..., PyTree]
     error_order: PyTree
     how: StepPlan
+    # After every step, from time and state to the state; None without.
+    project: Callable[[Array, PyTree], PyTree] | None
+    # Whether a probe limits the steps of a run that is differentiated.
+    probe: bool
 
 
 class _Solver(NamedTuple):
@@ -159,6 +185,11 @@ class _Solver(NamedTuple):
     @property
     def interpolation_cls(self) -> Callable[..., dfx.AbstractPath]:
         return self.how.interpolation_cls
+
+
+def _projection(solver: PyTree, t0: Array, y0: PyTree, args: PyTree) -> _Fn | None:
+    project = getattr(solver, "project", None)
+    return None if project is None else eqx.filter_closure_convert(lambda t, y: project(t, y, args), t0, y0)
 
 
 def _is_sub(x: object) -> bool:
@@ -194,9 +225,17 @@ def _traced_once(fn: Callable[..., PyTree], *args: PyTree) -> Callable[..., PyTr
     return eqx.Partial(eqx.filter_jit(lambda numbers, *args: eqx.combine(numbers, program)(*args)), numbers)
 
 
-def _solve(inputs: StepInputs, fixed: _Fixed, keeps: bool) -> PyTree:
-    """The final state of diffrax's loop, and the steps if they are wanted."""
-    every, size, kept = fixed.how.every, fixed.max_steps, []
+def _solve(inputs: StepInputs, fixed: _Fixed, by: StepInputs | None) -> PyTree:
+    """The final state of diffrax's loop; where the run is differentiated by something, the steps, too.
+
+    Then a probe limits the steps, if they are those that an error estimate allows.
+    """
+    every, size, kept, keeps = fixed.how.every, fixed.max_steps, [], by is not None
+    y0, step, controller = inputs.y0, inputs.step, fixed.controller
+    if by is not None and fixed.probe and jtu.tree_leaves((by.step, by.y0)):
+        change = direction((inputs.step, inputs.y0), (by.step, by.y0))
+        y0 = start(inputs.t0, y0, inputs.solver_state, change[1], fixed.project)
+        step, controller = ProbedStep(step, change[0], controller), ProbedController(controller)
 
     def outer(cond: _Fn, body: _Fn, init: PyTree, *, max_steps: int, buffers: _Fn) -> PyTree:
         if not keeps:
@@ -233,15 +272,17 @@ def _solve(inputs: StepInputs, fixed: _Fixed, keeps: bool) -> PyTree:
 
     def put(sub: dfx.SubSaveAt) -> dfx.SubSaveAt:
         fn, times = next(each)
-        return dfx.SubSaveAt(t0=sub.t0, t1=sub.t1, ts=times, steps=sub.steps, fn=lambda t, y, _: fn(t, y))
+        return dfx.SubSaveAt(
+            t0=sub.t0, t1=sub.t1, ts=times, steps=sub.steps, fn=lambda t, y, _: fn(t, without_probe(y))
+        )
 
-    state = eqx.tree_at(lambda s: (s.y, s.solver_state), fixed.state, (inputs.y0, inputs.solver_state), is_leaf=is_none)
+    state = eqx.tree_at(lambda s: (s.y, s.solver_state), fixed.state, (y0, inputs.solver_state), is_leaf=is_none)
     saveat = eqx.tree_at(lambda s: s.subs, fixed.saveat, jtu.tree_map(put, fixed.saveat.subs, is_leaf=_is_sub))
     final, _ = fixed.loop(
         args=fixed.args,
         terms=None,
-        solver=_Solver(inputs.step, fixed.error_order, fixed.how),
-        stepsize_controller=fixed.controller,
+        solver=_Solver(step, fixed.error_order, fixed.how),
+        stepsize_controller=controller,
         event=None,
         saveat=saveat,
         t0=inputs.t0,
@@ -253,11 +294,13 @@ def _solve(inputs: StepInputs, fixed: _Fixed, keeps: bool) -> PyTree:
         outer_while_loop=outer,
         progress_meter=fixed.progress_meter,
     )
+    final = eqx.tree_at(lambda s: s.y, final, without_probe(final.y))
     return (final, kept[0]) if keeps else final
 
 
 def _beginning(state: PyTree) -> StepRecord:
-    return StepRecord(state.tprev, state.tnext, jnp.asarray(state.made_jump), (state.y, state.solver_state))
+    y = without_probe(state.y)
+    return StepRecord(state.tprev, state.tnext, jnp.asarray(state.made_jump), (y, state.solver_state))
 
 
 # The run and its derivative are primitives, the second linear in the tangents and with a transpose of its own. So one
@@ -295,7 +338,8 @@ def _make(run: Callable[[StepInputs], PyTree], inputs: StepInputs, fixed: _Fixed
 def _make_jvp(primals: PyTree, tangents: PyTree) -> PyTree:
     (run, inputs, fixed, keeps), by = primals, tangents[1]
     if not keeps:
-        run = eqx.filter_closure_convert(lambda inputs: _solve(inputs, fixed, True), inputs)
+        asked = jtu.tree_map(lambda _: True, by)
+        run = eqx.filter_closure_convert(lambda inputs: _solve(inputs, fixed, asked), inputs)
     final, steps = eqxi.filter_primitive_bind(_run_p, run, inputs, fixed, True)
     if jtu.tree_leaves(by):
         # Under vmap this makes a batch of each input where the run is one: only then is the transpose right.

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -70,7 +69,7 @@ class SceneRun(AbstractRun):
         scene, given = fixed
         scene, arguments = replaced(scene, given, numbers)
         wrt = list(dict.fromkeys(n for what in self.observe if isinstance(what.of, Derivative) for n in what.of.names))
-        choices: dict[str, Any] = dict(self.choices) | ({"adjoint": dfx.ForwardMode()} if wrt else {})
+        choices: dict[str, Any] = dict(self.choices)
 
         def at(x: dict[str, Array]) -> tuple[dict[str, Array], RunOutcome]:
             changed, called = replaced(scene, arguments, x)

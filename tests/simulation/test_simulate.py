@@ -340,13 +340,14 @@ def test_the_page_of_code_that_must_always_work() -> None:
     np.testing.assert_allclose(gradient.effects[1].law.Fc, by_fc, rtol=1e-4)
 
 
-@pytest.mark.parametrize("ts", [None, jnp.linspace(0.0, 3.0, 7)])
-def test_gradients_under_vmap_are_right_in_lanes_that_finish_early(ts: Any) -> None:
+@pytest.mark.parametrize(("ts", "probe"), [(None, False), (jnp.linspace(0.0, 3.0, 7), False), (None, True)])
+def test_gradients_under_vmap_are_right_in_lanes_that_finish_early(ts: Any, probe: bool) -> None:
     """Finished lanes take steps of length zero until the last one is through; these must not reach the derivative."""
     scene = problems.ramped_box.scene(problems.ramped_box.lugre())
 
     def position(m: Any) -> Any:
-        run = jms.simulate(eqx.tree_at(lambda s: s.params["m"], scene, m), [0.0], [0.0], 3.0, ts=ts)
+        changed = eqx.tree_at(lambda s: s.params["m"], scene, m)
+        run = jms.simulate(changed, [0.0], [0.0], 3.0, ts=ts, adjoint=jms.StoredSteps(probe=probe))
         return run.q[-1, 0]
 
     masses = jnp.array([1.0, 3.0, 2.0])
@@ -354,8 +355,9 @@ def test_gradients_under_vmap_are_right_in_lanes_that_finish_early(ts: Any) -> N
     together = gradients(masses)
     # By the program for one lane; with times, whose derivatives are the same there, by lanes that are all alike.
     alone = jax.jit(jax.grad(position)) if ts is None else lambda m: gradients(jnp.full(3, m))[0]
-    # Lanes of one batch take the same steps as alone, so only rounding differs.
-    np.testing.assert_allclose(together, [alone(m) for m in masses], rtol=1e-8)
+    # Without a probe lanes take the same steps as alone, so only rounding differs. With one, stability limits the steps
+    # of a bristle at rest, and rounding decides which of them are accepted: derivatives agree to the tolerance.
+    np.testing.assert_allclose(together, [alone(m) for m in masses], rtol=1e-6 if probe else 1e-8)
 
 
 def test_times_that_are_arrays_of_jax_are_known_inside_jit() -> None:

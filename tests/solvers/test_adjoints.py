@@ -211,8 +211,8 @@ def test_simulate_takes_the_other_adjoints(scene: Scene) -> None:
     for adjoint in (dfx.RecursiveCheckpointAdjoint(), dfx.DirectAdjoint()):
         np.testing.assert_allclose(slope(jax.grad, adjoint, 1e-6), forward, rtol=1e-5)
     tight, _ = ahead(k, 1e-9)
-    for mode, adjoint in ((jax.grad, None), (jax.grad, StoredSteps(every=5)), (jax.jacfwd, None)):
-        np.testing.assert_allclose(slope(mode, adjoint, 1e-9), tight, rtol=1e-11)
+    for mode, every in ((jax.grad, 1), (jax.grad, 5), (jax.jacfwd, 1)):
+        np.testing.assert_allclose(slope(mode, StoredSteps(every, probe=False), 1e-9), tight, rtol=1e-11)
 
 
 def test_derivatives_of_a_resting_place_are_exact_to_rounding() -> None:

@@ -10,6 +10,8 @@ import pytest
 
 from jaxmodsim import EventController, EventSolver, Gauss, Rodas5P, StoredSteps
 
+# Over the steps of the plain run, which are those of `ForwardMode`.
+SAME_STEPS = StoredSteps(probe=False)
 NUMBERS = {"mu": 1.5, "f": 0.4, "x0": 1.0, "t0": 0.2, "t1": 3.0}
 SOLVERS: dict[str, Any] = {
     "Tsit5": dfx.Tsit5(),
@@ -82,7 +84,7 @@ def test_equals_forward_mode(solver: str, save: str) -> None:
     """
     ahead = jax.jit(jax.jacfwd(lambda p: total(p, dfx.ForwardMode(), solver, save)))(numbers())
     for mode in (jax.grad, jax.jacfwd):
-        slopes = jax.jit(mode(lambda p: total(p, StoredSteps(), solver, save)))(numbers())
+        slopes = jax.jit(mode(lambda p: total(p, SAME_STEPS, solver, save)))(numbers())
         for name in ("mu", "f", "x0", "t1"):
             np.testing.assert_allclose(slopes[name], ahead[name], rtol=1e-8 if name == "t1" else 1e-11, err_msg=name)
         if save != "steps":  # the times of steps are constants
@@ -113,7 +115,7 @@ def test_second_derivatives() -> None:
     x = jnp.array([NUMBERS[name] for name in names])
     wanted = jax.jit(jax.jacfwd(jax.jacfwd(lambda x: by(x, dfx.ForwardMode()))))(x)
     for second in (jax.hessian(by), jax.jacfwd(jax.jacfwd(by))):
-        np.testing.assert_allclose(jax.jit(second, static_argnums=1)(x, StoredSteps()), wanted, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(jax.jit(second, static_argnums=1)(x, SAME_STEPS), wanted, rtol=1e-10, atol=1e-12)
     for outer in (jax.jacrev(jax.jacrev(by)), jax.jacrev(jax.jacfwd(by))):
         with pytest.raises(RuntimeError, match=r"take jax\.hessian, or jax\.jacfwd of jax\.grad"):
             jax.jit(outer, static_argnums=1)(x, StoredSteps())
@@ -197,7 +199,7 @@ def test_a_run_that_ends_early_or_has_no_length() -> None:
 
     ahead = jax.jit(jax.jacfwd(lambda p: five(p, dfx.ForwardMode())))(numbers())
     for mode in (jax.grad, jax.jacfwd):
-        few = jax.jit(mode(lambda p: five(p, StoredSteps())))(numbers())
+        few = jax.jit(mode(lambda p: five(p, SAME_STEPS)))(numbers())
         for name in ("mu", "f", "x0"):
             np.testing.assert_allclose(few[name], ahead[name], rtol=1e-11)
         assert few["t1"] == ahead["t1"] == 0.0

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -223,7 +222,6 @@ class EventEngine(eqx.Module):
             z0=start.z,
             rtol=self.rtol,
             atol=self.atol,
-            adjoint=dfx.ForwardMode(),
             max_events=self.max_events,
             throw=False,
         )

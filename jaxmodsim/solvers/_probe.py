@@ -1,0 +1,179 @@
+"""A probe: one tangent beside the state, whose error limits the steps of a run that is differentiated."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax import lax
+from jaxtyping import Array, PyTree
+
+from .events._state import EventState
+
+# Change in a number that is zero, and so has no magnitude of its own.
+_OF_ZERO = 1e-3
+# Error allowed in the tangent, in parts of `rtol`: of what does not move, and how many times more of what does. There
+# the error of the state limits the steps, too. Parts of its own tolerance from which on the latter counts.
+_AT_REST, _IN_MOTION, _MOVES = 0.3, 25.0, 0.01
+# A tangent counts as no smaller than this part of the largest in its array.
+_OF_ARRAY = 1e-3
+# Errors of a tangent that are noise, in parts of `atol` and in roundings of the state.
+_OF_ATOL, _ROUNDINGS = 1e-6, 16.0
+
+
+class ProbeTangent(NamedTuple):
+    """The tangent of the state and of the solver's state, and the largest values of the former so far."""
+
+    tangent: tuple[PyTree, PyTree]
+    largest: PyTree
+    # 0 in a first step at whose end a projection moves the tangent by what the projection's own numbers change: a jump
+    # that no shorter step makes smaller, and no error. Else 1.
+    counts: Array
+
+
+class Probed(NamedTuple):
+    """A state with a probe beside it."""
+
+    y: PyTree
+    probe: ProbeTangent
+
+
+def without_probe(y: PyTree) -> PyTree:
+    """The state alone."""
+    return y.y if isinstance(y, Probed) else y
+
+
+def direction(numbers: PyTree, asked: PyTree) -> PyTree:
+    """A change in the numbers that a run is differentiated by, of their magnitude and of signs and parts at random."""
+    rng = np.random.default_rng(35)
+
+    def change(is_asked: Any, x: Any) -> Any:
+        if is_asked is None:
+            return None
+        part = np.exp(rng.uniform(-0.7, 0.7, x.shape)) * rng.choice((-1.0, 1.0), x.shape)
+        size = jnp.abs(lax.stop_gradient(x))
+        return jnp.asarray(part, x.dtype) * jnp.where(size > 0, size, jnp.maximum(_OF_ZERO * jnp.max(size), _OF_ZERO))
+
+    return jtu.tree_map(change, asked, numbers, is_leaf=_is_none)
+
+
+def start(
+    t0: Array, y0: PyTree, solver_state: PyTree, change: PyTree, project: Callable[[Array, PyTree], PyTree] | None
+) -> Probed:
+    """The state a run begins with, and the change in it, as a projection leaves it."""
+    tangent = _filled(change, y0)
+    if project is not None:
+        numbers, rest = eqx.partition(y0, eqx.is_inexact_array)
+        moved = lambda x: eqx.filter(project(t0, eqx.combine(x, rest)), eqx.is_inexact_array)  # noqa: E731
+        tangent = jax.jvp(moved, (numbers,), (tangent,))[1]
+    tangent = _moving(tangent), _filled(None, solver_state)
+    counts = jnp.asarray(1.0 if project is None else 0.0, t0.dtype)
+    return Probed(y0, ProbeTangent(tangent, jtu.tree_map(jnp.abs, _integrated(tangent[0])), counts))
+
+
+class ProbedStep(NamedTuple):
+    """A step of a solver that takes the probe along."""
+
+    step: PyTree
+    change: PyTree
+    controller: PyTree
+
+    def __call__(self, t0: Array, t1: Array, y: Probed, state: PyTree, jump: Any) -> tuple[Any, ...]:
+        """The step, whose error estimate is a pair of that of the state and of the size of that of the probe."""
+        held, probe = y.y, y.probe
+        numbers = jtu.tree_map(lambda d, x: None if d is None else x, self.change, self.step, is_leaf=_is_none)
+        rest = jtu.tree_map(lambda d, x: x if d is None else None, self.change, self.step, is_leaf=_is_none)
+        moving, others = eqx.partition((_moving(held), state), eqx.is_inexact_array)
+
+        def advance(numbers: PyTree, moving: PyTree) -> tuple[PyTree, PyTree]:
+            (y, state), step = eqx.combine(moving, others), eqx.combine(numbers, rest)
+            y1, error, dense, state1, result = step(t0, t1, _with_moving(held, y), state, jump)
+            of_probe, _ = eqx.partition((_moving(y1), state1), eqx.is_inexact_array)
+            return (of_probe, error), (y1, error, dense, state1, result)
+
+        (_, _), (tangent, error_of_probe), (y1, error, dense, state1, result) = jax.jvp(
+            advance, (numbers, moving), (self.change, probe.tangent), has_aux=True
+        )
+        largest = jtu.tree_map(lambda d, x: jnp.maximum(jnp.abs(d), x), _integrated(tangent[0]), probe.largest)
+        ends = jtu.tree_map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), _integrated(held), _integrated(y1))
+        errors = jnp.where(probe.counts > 0, self._size(error, error_of_probe, largest, ends), 0.0)
+        after = ProbeTangent(tangent, largest, jnp.ones_like(probe.counts))
+        return Probed(y1, after), (error, errors), dense, state1, result
+
+    def _size(self, error: PyTree, error_of_probe: PyTree, largest: PyTree, y: PyTree) -> Array:
+        """Size of the probe's error, 1 where it is as large as it may be."""
+        control = _pid(self.controller)[0]
+        rtol, atol = lax.stop_gradient((control.rtol, control.atol))
+
+        def size(of_state: Array, of_tangent: Array, largest: Array, y: Array) -> Array:
+            moves = jnp.minimum(1.0, jnp.abs(of_state) / (_MOVES * (atol + rtol * y)))
+            relative = _AT_REST * (1.0 + (_IN_MOTION - 1.0) * moves) * rtol
+            tangent = jnp.maximum(largest, _OF_ARRAY * jnp.max(largest))
+            noise = _OF_ATOL * atol + _ROUNDINGS * float(jnp.finfo(y.dtype).eps) * y
+            return jnp.sqrt(jnp.mean(jnp.square(of_tangent / (relative * tangent + noise))))
+
+        return jnp.max(jnp.stack(jtu.tree_leaves(jtu.tree_map(size, error, error_of_probe, largest, y))))
+
+
+class ProbedController(NamedTuple):
+    """What diffrax's loop asks of a step size controller, with the error of the probe in its norm."""
+
+    controller: PyTree
+
+    def adapt_step_size(
+        self, t0: Any, t1: Any, y0: Probed, y1: Probed, args: PyTree, error: PyTree, order: Any, state: PyTree
+    ) -> tuple[Any, ...]:
+        """See `diffrax.AbstractStepSizeController`."""
+        of_state, of_probe = error
+
+        def with_probe(x: PyTree) -> PyTree:
+            if not _is_pid(x):
+                return x
+            norm: Callable[[PyTree], Array] = x.norm
+            return eqx.tree_at(lambda x: x.norm, x, lambda scaled: jnp.maximum(norm(scaled), of_probe))
+
+        controller = jtu.tree_map(with_probe, self.controller, is_leaf=_is_pid)
+        return controller.adapt_step_size(t0, t1, y0.y, y1.y, args, of_state, order, state)
+
+
+def has_error_control(controller: PyTree) -> bool:
+    """Whether the steps are those that an error estimate allows."""
+    return len(_pid(controller)) == 1
+
+
+def _pid(controller: PyTree) -> list[dfx.PIDController]:
+    return [x for x in jtu.tree_leaves(controller, is_leaf=_is_pid) if _is_pid(x)]
+
+
+def _is_pid(x: object) -> bool:
+    return isinstance(x, dfx.PIDController)
+
+
+def _is_none(x: object) -> bool:
+    return x is None
+
+
+def _integrated(y: PyTree) -> PyTree:
+    """The part of the state that has an error estimate."""
+    return y.y if isinstance(y, EventState) else y
+
+
+def _moving(y: PyTree) -> PyTree:
+    """The state without the log of events, on which nothing depends."""
+    return y._replace(log=None) if isinstance(y, EventState) else y
+
+
+def _with_moving(y: PyTree, moving: PyTree) -> PyTree:
+    return moving._replace(log=y.log) if isinstance(y, EventState) else moving
+
+
+def _filled(change: PyTree, like: PyTree) -> PyTree:
+    """`change`, with zeros where it is None, or all zero."""
+    like = eqx.filter(like, eqx.is_inexact_array)
+    if change is None:
+        return jtu.tree_map(jnp.zeros_like, like)
+    return jtu.tree_map(lambda x, d: jnp.zeros_like(x) if d is None else d, like, change)
