@@ -25,6 +25,15 @@ else:
 _Numbers: TypeAlias = Float[Array | np.ndarray, "..."]
 
 
+class Default(float):
+    """A number that was left out: it takes the floating type of the numbers beside it."""
+
+
+def is_weak(number: object) -> bool:
+    """Whether JAX lets the type of a number give way to that of others."""
+    return getattr(number, "weak_type", isinstance(number, float))
+
+
 @dataclasses.dataclass(frozen=True)
 class Range:
     """Admissible range and unit of a parameter: above (or at) a number, or another parameter, and below a number.
@@ -70,6 +79,20 @@ class Range:
         lower = others[self.lower] if isinstance(self.lower, str) else self.lower
         return finite & ((value > lower) if self.strict else (value >= lower))
 
+    def check(self, value: _Numbers, *, name: str, others: Mapping[str, _Numbers] | None = None) -> None:
+        """Refuse numbers out of range, where they are known now (not traced); `others` as in `holds`.
+
+        **Raises:**
+
+        - `ValueError` that names `name`, the range and the value.
+        """
+        limit = None if others is None or not isinstance(self.lower, str) else others[self.lower]
+        if any(isinstance(x, jax.core.Tracer) for x in (value, limit)):
+            return
+        if not np.all(self.holds(np.asarray(value), {} if limit is None else {str(self.lower): np.asarray(limit)})):
+            against = "" if limit is None else f" ({self.lower} = {limit})"
+            raise ValueError(f"{name} must be {self.text}{against}, but {value} was given.")
+
 
 def as_number(value: object, *, name: str) -> Float[Array, ""]:
     """Convert to a real floating scalar; integers become floating, a dtype that is given is kept.
@@ -88,7 +111,9 @@ def as_number(value: object, *, name: str) -> Float[Array, ""]:
 
 
 def as_real(value: object, *, name: str) -> Float[Array, "..."]:
-    """Convert to a real floating array of any shape; see `as_number`."""
+    """Convert to a real floating array of any shape; see `as_number`. Of a `Default` the type stays weak."""
+    if isinstance(value, Default):
+        return jnp.asarray(float(value))
     if isinstance(value, jax.Array | np.ndarray | np.number | int | float) and not isinstance(value, bool):
         kind = getattr(value, "dtype", np.dtype(type(value)))
         whole = jnp.issubdtype(kind, jnp.integer)
@@ -137,13 +162,15 @@ def parameter(
     - `field`: further arguments of `equinox.field`, such as `default`.
     """
     allowed = Range(unit, lower, strict, upper, execution, most)
+    if "default" in field:
+        field["default"] = Default(field["default"])
     return eqx.field(converter=partial(as_number, name=name), metadata={"range": allowed}, **field)
 
 
 def parameter_or(name: str, unit: str, instead: tuple[type, ...], *, lower: float, upper: float, default: float) -> Any:
     """A `parameter` in whose place an object of the types `instead` may stand, with parameters of its own."""
     convert = partial(_unless_instance, instead=instead, name=name)
-    return eqx.field(converter=convert, metadata={"range": Range(unit, lower, upper=upper)}, default=default)
+    return eqx.field(converter=convert, metadata={"range": Range(unit, lower, upper=upper)}, default=Default(default))
 
 
 def _unless_instance(value: object, *, instead: tuple[type, ...], name: str) -> object:
@@ -179,7 +206,9 @@ def _of_state(value: Any, *, name: str) -> object:
         return value
     if callable(value):
         return StateDependent(None, as_state_function(value, name=name))
-    return as_number(value, name=name)
+    number = as_number(value, name=name)
+    Range("").check(number, name=name)
+    return number
 
 
 def _unless_none(value: object, *, convert: Callable[..., object], name: str) -> object:
@@ -214,15 +243,7 @@ def check_ranges(module: eqx.Module) -> None:
     """
     values = {name: nominal(getattr(module, name)) for name in ranges_of(module)}
     for name, allowed in ranges_of(module).items():
-        limit = values.get(allowed.lower) if isinstance(allowed.lower, str) else None
-        if any(isinstance(x, jax.core.Tracer) for x in (values[name], limit)):
-            continue
-        others = {} if limit is None else {str(allowed.lower): np.asarray(limit)}
-        if not np.all(allowed.holds(np.asarray(values[name]), others)):
-            against = "" if limit is None else f" ({allowed.lower} = {limit})"
-            raise ValueError(
-                f"{type(module).__name__}: {name} must be {allowed.text}{against}, but {values[name]} was given."
-            )
+        allowed.check(values[name], name=f"{type(module).__name__}: {name}", others=values)
 
 
 def modules_of(tree: object, path: str = "") -> Iterator[tuple[str, eqx.Module]]:

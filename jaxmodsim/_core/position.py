@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .functions import as_function, real_array
-from .parameters import as_real
+from .parameters import Range, as_number, as_real
 
 
 class PositionFn(eqx.Module):
@@ -57,13 +57,17 @@ class ScalarOrFn(eqx.Module):
         return jnp.asarray(self.amount(params) if callable(self.amount) else self.amount)
 
 
-def as_scalar_or_fn(value: object, *, name: str) -> ScalarOrFn:
-    """Make a number, an array of numbers, or a function of `params` fit to sit in a pytree.
+def as_scalar_or_fn(value: object, *, name: str, allowed: Range, array: bool = False) -> ScalarOrFn:
+    """Make a number, or a function of `params`, fit to sit in a pytree; with `array` also an array of numbers.
 
     **Raises:**
 
-    - `ValueError` if it is none of these.
+    - `ValueError` if it is none of these, or a number out of the range `allowed`.
     """
     if isinstance(value, ScalarOrFn):
         return value
-    return ScalarOrFn(as_function(value, name=name) if callable(value) else as_real(value, name=name))
+    if callable(value):
+        return ScalarOrFn(as_function(value, name=name))
+    number = (as_real if array else as_number)(value, name=name)
+    allowed.check(number, name=name)
+    return ScalarOrFn(number)

@@ -69,6 +69,16 @@ def remark_on_single_precision() -> None:
     )
 
 
+@cache
+def remark_on_rounding() -> None:
+    """Log once that the steps of a run in single precision are so many that their rounding exceeds its tolerance."""
+    _LOG.warning(
+        "A run in float32 makes so many steps that their rounding, about 6e-8 sqrt(steps) of the state, exceeds rtol."
+        ' For smaller errors call jax.config.update("jax_enable_x64", True) first, and give q0 and the numbers of the'
+        " scene in float64; for fewer steps pass a larger rtol, such as 1e-4 for a stiff bristle (LuGre)."
+    )
+
+
 def remark_on_compilation(seconds: float, functions: Iterable[object]) -> None:
     """Log a compilation that took long, and a function that is compiled again and again because it is made anew.
 

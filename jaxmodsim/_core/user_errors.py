@@ -12,6 +12,16 @@ import numpy as np
 _LIBRARIES = (*(str(Path(module.__file__ or "").parent) for module in (jax, np)), str(Path(__file__).parents[1]))
 _FOREIGN = ("equinox", "diffrax", "jaxtyping", "beartype")
 
+# Parts of the errors of an index by name into a list, a tuple, an array of JAX or a number.
+_NOT_BY_NAME = (
+    "indices must be integers or slices, not str",
+    "does not support string indexing",
+    "object is not subscriptable",
+)
+
+# Parts of the errors of arithmetic with a list or a mapping.
+_NO_OPERAND = ("unsupported operand type(s)", "requires ndarray or scalar arguments", "can't multiply sequence by")
+
 # The most special first.
 _MENDS = (
     (
@@ -47,6 +57,16 @@ def explain(error: Exception, name: str, arguments: Iterable[str]) -> str | None
     if isinstance(error, KeyError) and where:
         return (
             f"{_sentence(name)} asks for {error.args[0]!r}, which there is not{where}: give it in the scene's params."
+        )
+    if isinstance(error, TypeError) and where and any(each in str(error) for each in _NOT_BY_NAME):
+        return (
+            f"{_sentence(name)} reads params by name, but params, or the entry it reads from, is no mapping{where}:"
+            ' give params={"m": 2.0}, or read entries of a list by their position.'
+        )
+    if isinstance(error, TypeError) and where and any(each in str(error) for each in _NO_OPERAND):
+        return (
+            f"{_sentence(name)} cannot compute with a list or a mapping{where} ({error}): read its entries, or give an"
+            " array in the scene's params."
         )
     if isinstance(error, TypeError) and "positional argument" in str(error):
         return f"{_sentence(name)} is called with ({', '.join(arguments)}), but: {error}."

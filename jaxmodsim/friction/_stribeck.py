@@ -3,6 +3,7 @@
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
@@ -16,6 +17,8 @@ from ._law_case import LawCase, stribeck_case
 
 # Velocity over vs below which a curve with an exponent below one is rounded off.
 _ROUNDED = 1e-12
+# Deviation from 1 at rest that counts as rounding of a fall.
+_ROUNDING = 1e-6
 
 
 def exponential(x: Scalar) -> Scalar:
@@ -46,6 +49,11 @@ def _fall(value: object) -> object:
         raise ValueError(
             f"Stribeck: fall must be a function such as jaxmodsim.friction.lorentzian, but {value!r} was given."
         )
+    if value not in (exponential, lorentzian):
+        with jax.ensure_compile_time_eval():
+            start = float(jnp.asarray(value(jnp.zeros(()))))
+        if not abs(start - 1.0) <= _ROUNDING:
+            raise ValueError(f"Stribeck: fall must be 1 at 0, where slip begins at Fs, but fall(0) = {start:g}.")
     return value
 
 

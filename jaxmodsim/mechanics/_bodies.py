@@ -9,14 +9,21 @@ import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._core.functions import as_function
 from .._core.index_check import check_indices
+from .._core.parameters import Default, Range
 from .._core.position import PositionFn, ScalarOrFn, as_position_fn, as_scalar_or_fn
 from .._core.safe import safe_norm
 from .._core.semidefinite import solve_balanced
 from .._core.shapes import PerDof, Scalar
+
+_MASS, _INERTIA, _GRAVITY = Range("kg", 0.0, strict=True), Range("kg m^2"), Range("m/s^2")
+_ON_EARTH = Default(9.81)
+# Part of the largest moment of inertia that counts as rounding.
+_ROUNDING = 1e-6
 
 
 class AbstractBody(eqx.Module):
@@ -51,9 +58,9 @@ class Bodies(AbstractBody):
 class PointMass(AbstractBody):
     """Lagrangian of a point mass; made by `point_mass`."""
 
-    m: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="point_mass m"))
+    m: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="point_mass m", allowed=_MASS))
     position: PositionFn = eqx.field(converter=partial(as_position_fn, name="point_mass position"))
-    gravity: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="point_mass gravity"))
+    gravity: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="point_mass gravity", allowed=_GRAVITY))
 
     def __call__(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """`m v^2/2 - m g z` [J]."""
@@ -86,7 +93,7 @@ class PointMass(AbstractBody):
         return safe_norm(self.reaction(t, q, qd, params))
 
 
-def point_mass(m: Any, position: Any, gravity: Any = 9.81) -> PointMass:
+def point_mass(m: Any, position: Any, gravity: Any = _ON_EARTH) -> PointMass:
     """Lagrangian of a point mass whose position is a function of the coordinates.
 
     ```python
@@ -100,7 +107,7 @@ def point_mass(m: Any, position: Any, gravity: Any = 9.81) -> PointMass:
 
     - `m`: mass [kg], > 0, or `m(params)`, so that a number in `params` serves several functions.
     - `position`: `position(q)` or `position(q, params)` in space [m], shape `[3]`, z upwards.
-    - `gravity`: acceleration [m/s^2] along -z, or a function of `params`.
+    - `gravity`: acceleration [m/s^2] along -z, or a function of `params`; by default 9.81.
 
     **Returns:**
 
@@ -115,14 +122,28 @@ def point_mass(m: Any, position: Any, gravity: Any = 9.81) -> PointMass:
     return PointMass(m, position, gravity)
 
 
+def _inertia(value: object) -> ScalarOrFn:
+    inertia = as_scalar_or_fn(value, name="rigid_body inertia", allowed=_INERTIA, array=True)
+    if callable(inertia.amount) or isinstance(inertia.amount, jax.core.Tracer):
+        return inertia
+    known = np.asarray(inertia.amount)
+    rounding = _ROUNDING * np.abs(known).max(initial=0.0)
+    tensor = known.shape == (3, 3)
+    if tensor and np.abs(known - known.T).max() > rounding:
+        raise ValueError(f"rigid_body inertia must be symmetric, but {known.tolist()} was given.")
+    if (moments := np.linalg.eigvalsh(known) if tensor else known).min(initial=0.0) < -rounding * tensor:
+        raise ValueError(f"rigid_body inertia must have moments >= 0 [kg m^2], but those given are {moments.tolist()}.")
+    return inertia
+
+
 class RigidBody(AbstractBody):
     """Lagrangian of a rigid body; made by `rigid_body`."""
 
-    m: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="rigid_body m"))
-    inertia: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="rigid_body inertia"))
+    m: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="rigid_body m", allowed=_MASS))
+    inertia: ScalarOrFn = eqx.field(converter=_inertia)
     position: PositionFn = eqx.field(converter=partial(as_position_fn, name="rigid_body position"))
     orientation: PositionFn = eqx.field(converter=partial(as_position_fn, name="rigid_body orientation"))
-    gravity: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="rigid_body gravity"))
+    gravity: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="rigid_body gravity", allowed=_GRAVITY))
 
     def __call__(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """`m v^2/2 + w I w/2 - m g z` [J]."""
@@ -140,7 +161,7 @@ class RigidBody(AbstractBody):
         return 0.5 * m * jnp.sum(v**2) + spin - m * self.gravity(params) * x[2]
 
 
-def rigid_body(m: Any, inertia: Any, position: Any, orientation: Any, gravity: Any = 9.81) -> RigidBody:
+def rigid_body(m: Any, inertia: Any, position: Any, orientation: Any, gravity: Any = _ON_EARTH) -> RigidBody:
     """Lagrangian of a rigid body by the motion of its centre of mass and of a frame fixed in it.
 
     **Arguments:**
@@ -148,11 +169,11 @@ def rigid_body(m: Any, inertia: Any, position: Any, orientation: Any, gravity: A
     - `m`: mass [kg], > 0, or `m(params)`.
     - `inertia`: moments of inertia [kg m^2] about the centre of mass, or a function of `params`: with an angle the one
       about its axis; with a matrix the principal ones along the axes of the body frame, shape `[3]`, or the tensor in
-      that frame, shape `[3, 3]`, symmetric.
+      that frame, shape `[3, 3]`, symmetric. None of the moments is negative.
     - `position`: `position(q)` or `position(q, params)` of the centre of mass [m], shape `[3]`, z upwards.
     - `orientation`: `orientation(q)` or `orientation(q, params)`: the rotation matrix, shape `[3, 3]`, whose columns
       are the axes of the body frame in fixed components; or, for plane motion, the angle [rad] about a fixed axis.
-    - `gravity`: acceleration [m/s^2] along -z, or a function of `params`.
+    - `gravity`: acceleration [m/s^2] along -z, or a function of `params`; by default 9.81.
 
     **Returns:**
 

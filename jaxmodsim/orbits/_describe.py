@@ -13,6 +13,8 @@ from ._settle import magnitudes, run_for, states_of
 
 # Intervals along a segment of an orbit between which extrema are interpolated.
 _INTERVALS = 512
+# Rounding units of time by which a state before an event is saved before it.
+_BEFORE = 256.0
 # Residual in the extent of an orbit that is none, or so many tolerances of the run.
 _MISSED, _TOLERANCES = 1e-6, 1e3
 # Multipliers that a phase in stick makes zero are that small but for errors of the run.
@@ -25,11 +27,13 @@ class Extremes(NamedTuple):
     """The least or greatest values of the coordinates along an orbit, shape `[dof]` each.
 
     - `time`: about when [s]; `acceleration`: then, infinite where the velocity is not zero (an impact, the ends).
+    - `struck`: names of the contacts that are struck then, "" where there is no impact; the time is before the impact.
     """
 
     value: np.ndarray
     time: np.ndarray
     acceleration: np.ndarray
+    struck: tuple[str, ...]
 
 
 def describe(problem: OrbitProblem, point: ShotOrbit, dof: int) -> tuple[PeriodicOrbit, Extremes, Extremes]:
@@ -43,6 +47,7 @@ def describe(problem: OrbitProblem, point: ShotOrbit, dof: int) -> tuple[Periodi
     runs = []
     for x, (begin, end), events in zip(states, spans, changes, strict=True):
         times = np.clip([change[0] for change in events], begin, end)
+        times = np.concatenate([np.maximum(times - _before(end), begin), times])
         # Of a length that few numbers of events change, for which nothing is compiled anew.
         padding = (-len(times)) % 16
         grid = np.linspace(begin, end, _INTERVALS + 1)
@@ -50,7 +55,7 @@ def describe(problem: OrbitProblem, point: ShotOrbit, dof: int) -> tuple[Periodi
     happened = [change for events in changes for change in events]
     whole = float(spans[0, 0]), float(spans[-1, 1])
     shares, held = _shares(once[0], runs[0], happened, whole)
-    strikes = np.clip([t for t, i, _, _ in happened if scene.part_names[i] in scene.contacts], *whole)
+    strikes = [(x[0], scene.part_names[x[1]]) for x in happened if scene.part_names[x[1]] in scene.contacts]
     lowest, highest = (_extremes(runs, sign, strikes) for sign in (-1.0, 1.0))
     scale = magnitudes(states_of(*runs), period)[:-1]
     missed = float(np.max(np.abs(point.residual[: point.x.size].reshape(point.x.shape)) / scale))
@@ -73,6 +78,11 @@ def describe(problem: OrbitProblem, point: ShotOrbit, dof: int) -> tuple[Periodi
         shares,
     )
     return orbit, lowest, highest
+
+
+def _before(end: float) -> float:
+    """How long [s] before an event the state before it is saved."""
+    return _BEFORE * float(np.finfo(float).eps) * abs(end)
 
 
 def _changes(run: Trajectory) -> list[tuple[float, int, int, int]]:
@@ -150,11 +160,8 @@ def _eigenvalues_of_product(maps: np.ndarray) -> np.ndarray:
     return np.linalg.eigvals(product @ (first.T @ basis))
 
 
-def _extremes(runs: list[Trajectory], sign: float, strikes: np.ndarray) -> Extremes:
-    """Where `sign q` is greatest along runs: on cubics between their times.
-
-    Before an impact the velocity is another one than at it, so there the ends of the interval are all.
-    """
+def _extremes(runs: list[Trajectory], sign: float, strikes: list[tuple[float, str]]) -> Extremes:
+    """Where `sign q` is greatest along runs: on cubics between their times, which are on either side of each event."""
     t, q, qd = (np.concatenate([np.asarray(getattr(run, name)) for run in runs]) for name in ("t", "q", "qd"))
     q, qd = sign * q, sign * qd
     h = np.diff(t)[:, None]
@@ -164,7 +171,7 @@ def _extremes(runs: list[Trajectory], sign: float, strikes: np.ndarray) -> Extre
     root = np.sqrt(np.maximum(u * u - 3.0 * v * b, 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
         s = np.where(u < 0, b / (root - u), (-u - root) / (3.0 * v))
-    inside = (s > 0) & (s < 1) & (h > 0) & ~np.isin(t[1:], strikes)[:, None]
+    inside = (s > 0) & (s < 1) & (h > 0)
     s = np.where(inside, s, 0.0)
     values = a + s * (b + s * (u + s * v))
     values = np.concatenate([values, q[-1:]])
@@ -173,4 +180,8 @@ def _extremes(runs: list[Trajectory], sign: float, strikes: np.ndarray) -> Extre
         acceleration = np.where(inside, (2.0 * u + 6.0 * v * s) / h**2, np.inf)
     acceleration = np.concatenate([acceleration, np.full((1, q.shape[1]), np.inf)])
     place = np.argmax(values, axis=0), np.arange(q.shape[1])
-    return Extremes(sign * values[place], at[place], sign * acceleration[place])
+    time, resolution = at[place], _before(t[-1])
+    hit = [next((x for x in strikes if abs(x[0] - each) <= 2.0 * resolution), None) for each in time]
+    time = np.array([each if x is None else x[0] - resolution for each, x in zip(time, hit, strict=True)])
+    struck = tuple("" if x is None else x[1] for x in hit)
+    return Extremes(sign * values[place], time, sign * acceleration[place], struck)

@@ -11,7 +11,7 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import ArrayLike, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
 from .._core.arguments import as_float, as_whole, check_real
 from ..scene import Scene, State, read_element
@@ -336,6 +336,7 @@ def _with_derivatives(
     x = x + change[:size].reshape(x.shape)
     period = period + change[size] if problem.autonomous else problem.period_of(scene, period)
     times, acceleration = (np.concatenate(x) for x in ([x.time for x in extrema], [x.acceleration for x in extrema]))
+    struck = [name for x in extrema for name in x.struck]
     order = np.argsort(times, kind="stable")
     place = np.argsort(order, kind="stable"), np.tile(np.arange(dof), 2)
     made = jnp.zeros(len(times))
@@ -343,6 +344,11 @@ def _with_derivatives(
         run = run_segment(problem, scene, y, period, span, dof, jnp.asarray(times[order]))
         # The times are right to some digits alone: a parabola leads from there to where the velocity is zero.
         there = run.q[place] - 0.5 * run.qd[place] ** 2 / acceleration
+        for i, name in enumerate(struck):
+            if name:
+                there = there.at[i].add(
+                    _to_impact(scene, name, times[i], run.q[place[0][i]], run.qd[place[0][i]])[i % dof]
+                )
         made = jnp.where(times >= float(span[0]) * point.period, there, made)
     lowest, highest = (
         value + (x - jax.lax.stop_gradient(x))
@@ -350,3 +356,9 @@ def _with_derivatives(
     )
     q, qd, z = unpack(scene, x[0], dof)
     return replace(orbit, q=q, qd=qd, z=z, period=period, lowest=lowest, highest=highest)
+
+
+def _to_impact(scene: Scene, name: str, t: float, q: Array, qd: Array) -> Array:
+    """The way from a state just before an impact to it; its derivative is that of the time of the impact."""
+    contact, params, time = scene.contacts[name], scene.bind_time(jnp.asarray(t)).params, jnp.asarray(t)
+    return -qd * contact.error(time, q, params)[0] / contact.rate(time, q, qd, params)[0]

@@ -3,6 +3,8 @@
 import re
 from typing import NamedTuple
 
+from .._core.units import check_unit
+
 _LABEL = re.compile(r"\s*([^\[\]]*[^\[\]\s])\s*(?:\[\s*([^\[\]]*[^\[\]\s])\s*\])?\s*")
 
 
@@ -27,7 +29,7 @@ def read_label(text: str) -> Quantity:
 
 
 def as_coordinates(given: object) -> tuple[str, ...]:
-    """Texts such as "x [m]", one for each coordinate, of different names.
+    """Texts such as "x [m]", one for each coordinate, of different names and known units.
 
     **Raises:**
 
@@ -38,6 +40,9 @@ def as_coordinates(given: object) -> tuple[str, ...]:
             'coordinates must hold a name for each coordinate, with its unit in brackets, as in ("x [m]", "phi [rad]"),'
             f" but {given!r} was given."
         )
+    for text in given:
+        if unit := read_label(text).unit:
+            check_unit(unit, name=f"The coordinate {text!r}")
     names = [read_label(text).name for text in given]
     for name in names:
         if names.count(name) > 1:

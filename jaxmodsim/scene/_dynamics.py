@@ -165,16 +165,15 @@ class Dynamics(NamedTuple):
             powers["lagrangian"] = Power(-jax.grad(lagrangian)(self.t))
         return powers
 
-    def guards(
-        self, rest: Scalar, tolerances: tuple[Array, Array]
-    ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
+    def guards(self, rest: Scalar, tolerances: tuple[Array, Array]) -> tuple[Float[Array, " guards"], ...]:
         """Guards that are positive while the modes hold, and their tolerances; see `friction_guards`.
 
         Of a contact that is open the gap, of one that is closed its multiplier. A gap counts as closed only at `-rest`:
-        behind an impact, and where a contact opens, it begins from zero.
+        behind an impact, and where a contact opens, it begins from zero. Of scenes with contacts there follow the
+        values that guards have at their events: of a gap `rest`.
         """
         friction, gaps = self._elements, self._closed
-        guards, atol = [], []
+        guards, atol, roots = [], [], [jnp.zeros_like(friction)]
         if friction.size:
             assert self.friction is not None
             slowest = self._speed_of_rest(rest)
@@ -187,7 +186,8 @@ class Dynamics(NamedTuple):
             wide = [each.error(self.t, self.y.q, self.scene.params) for each in self.scene.contacts.values()]
             guards.append(jnp.where(gaps > 0, pushing, jnp.concatenate(wide) + rest))
             atol.append(jnp.where(gaps > 0, 0.0, tolerances[1]))
-        return jnp.concatenate(guards), jnp.concatenate(atol)
+            roots.append(jnp.where(gaps > 0, 0.0, rest))
+        return tuple(jnp.concatenate(each) for each in (guards, atol, *([roots] if gaps.size else [])))
 
     def start_friction(self, rest: Scalar) -> tuple[State, Float[Array, " n"]]:
         """State, and modes of the friction elements, to begin with; they do not depend on those in `mode`."""

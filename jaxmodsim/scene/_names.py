@@ -86,7 +86,7 @@ def scene_ranges(scene: eqx.Module) -> dict[str, Range]:
             there = isinstance(owner, dict) and allowed.lower in owner
             limit = (*path[:-1], jtu.DictKey(allowed.lower)) if there else (*beside, jtu.GetAttrKey(allowed.lower))
             allowed = replace(allowed, lower=_name(scene, limit))
-        if isinstance(scene, Scene) and path[0].name == "effects":
+        if isinstance(scene, Scene) and path[0].name == "effects" and not isinstance(owner, Friction):
             allowed = in_units_of(scene, scene.effects[path[1].idx], allowed)
         ranges[_name(scene, path)] = allowed
     return ranges

@@ -13,7 +13,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from .._core.functions import as_function
-from .._core.parameters import as_real
+from .._core.parameters import as_real, is_weak
 from .._core.readable import AbstractReadable
 from .._core.shapes import PerDof, Scalar
 from ..mechanics import AbstractConstraint, BoundContact, Contact, Lagrangian, Poisson
@@ -31,9 +31,18 @@ _MOST_CONTACTS = 6
 
 def _params(params: PyTree) -> PyTree:
     def convert(path: Any, leaf: Any) -> Any:
-        return leaf if isinstance(leaf, Signal) else as_real(leaf, name=f"params{jtu.keystr(path)}")
+        within_module = bool(path) and isinstance(path[-1], jtu.GetAttrKey)  # of a field that is left out
+        if isinstance(leaf, Signal) or (leaf is None and within_module):
+            return leaf
+        name = f"params{jtu.keystr(path)}"
+        if leaf is None:
+            raise ValueError(
+                f"{name} is None, but a real number, an array of real numbers or a Signal is needed: give it a value,"
+                " or leave it out."
+            )
+        return as_real(leaf, name=name)
 
-    return jtu.tree_map_with_path(convert, params, is_leaf=lambda x: isinstance(x, Signal))
+    return jtu.tree_map_with_path(convert, params, is_leaf=lambda x: x is None or isinstance(x, Signal))
 
 
 class _Driven(eqx.Module):
@@ -97,18 +106,19 @@ class Scene(AbstractReadable, eqx.Module):
       index beyond that is refused at the run, here and in the functions of effects and constraints, where it is a
       number or an array of numbers. JAX itself takes another entry in silence: so it is with an index that is computed
       from q, qd or `params`, or that counts a loop of `jax.lax`.
-    - `params`: pytree of real numbers, arrays or `Signal`s for the Lagrangian and the applied forces. Integers
-      become floating; what is no number (sizes, options) belongs into the functions.
+    - `params`: pytree of real numbers, arrays or `Signal`s for the Lagrangian and the applied forces, mostly a
+      mapping by names. Integers become floating; what is no number (sizes, options, None) belongs into the functions.
     - `effects`: tuple of `AppliedForce` and `Friction`.
     - `constraints`: tuple of `Constraint` and `VelocityConstraint`, for coordinates that are not independent, and of
       `Contact`.
     - `coordinates`: names of the coordinates with their units, such as `("x [m]", "phi [rad]")`, for messages, tables
-      and figures. In functions and names of what is observed they remain `q[0]`, `q[1]`.
+      and figures. A unit is a product or quotient of SI units or of mm, deg and the like; `-` stands for none. In
+      functions and names of what is observed they remain `q[0]`, `q[1]`.
 
     **Raises:**
 
-    - `ValueError` naming the entry that is no number, no effect, or has another's name, and friction that rests on a
-      constraint that is not there; at the run for a number of `coordinates` that q0 has not.
+    - `ValueError` naming the entry that is no number, no effect, or has another's name, a unit that is not known, and
+      friction that rests on a constraint that is not there; at the run for a number of `coordinates` that q0 has not.
     """
 
     lagrangian: Lagrangian = eqx.field(converter=partial(as_function, name="Scene lagrangian"))
@@ -119,7 +129,8 @@ class Scene(AbstractReadable, eqx.Module):
     coordinates: tuple[str, ...] = eqx.field(default=(), static=True, converter=as_coordinates)
 
     def __check_init__(self) -> None:
-        """Refuse two things of one name, and what does not go together."""
+        """Refuse two things of one name, and what does not go together; settle types of numbers that were left out."""
+        self._settle_defaults()
         given = [each.name for each in self.effects if each.name is not None]
         for name in given:
             if given.count(name) > 1:
@@ -175,6 +186,20 @@ class Scene(AbstractReadable, eqx.Module):
                 " together, as every set of them is tried: leave out those that never touch, or give the others a"
                 " force of their own by AppliedForce."
             )
+
+    def _settle_defaults(self) -> None:
+        """Give the numbers of weak type the floating type of the others, where there are some."""
+        numbers = [x for x in jtu.tree_leaves(self) if eqx.is_inexact_array(x)]
+        kinds = {x.dtype for x in numbers if not is_weak(x)}
+        if not kinds or not any(is_weak(x) for x in numbers):
+            return
+        dtype = jnp.result_type(*kinds)
+
+        def settled(x: Any) -> Any:
+            return jnp.asarray(x, dtype) if eqx.is_inexact_array(x) and is_weak(x) else x
+
+        for field in ("lagrangian", "effects", "constraints"):
+            object.__setattr__(self, field, jtu.tree_map(settled, getattr(self, field)))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from ._observe import named_unit as named_unit
 from ._outcome import MAX_STEPS as MAX_STEPS
 from ._outcome import SimulationError as SimulationError
 from ._outcome import outcome_messages as outcome_messages
+from ._peak import peak_of as peak_of
 from ._run_request import RunRequest as RunRequest
 from ._simulate import simulate as simulate
 from ._solve import default_solver as default_solver

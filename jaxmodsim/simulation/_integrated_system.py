@@ -132,6 +132,14 @@ class IntegratedSystem(NamedTuple):
         return state._replace(qd=momentum(scene.lagrangian, t, state.q, state.qd, scene.params))
 
 
+class Series(NamedTuple):
+    """A number along a run: `q` or `qd` of the coordinate `i`, or a `force` of an `effect`, its component `i`."""
+
+    kind: str
+    effect: str
+    i: int | None
+
+
 class Instant(NamedTuple):
     """The rate of a state, and by how much the force of each sticking element exceeds its limit, in limits."""
 
@@ -170,8 +178,8 @@ class RunFunctions(eqx.Module):
         return s.rate(_derivative(self.system, t, s.y, scene, s.mode))
 
     @at_time
-    def guards(self, t: Array, s: EventState, scene: Scene) -> tuple[Array, Array]:
-        """Guards of the modes, and their tolerances."""
+    def guards(self, t: Array, s: EventState, scene: Scene) -> tuple[Array, ...]:
+        """Guards of the modes, their tolerances, and in scenes with contacts their values at events."""
         return _guards(t, self.system.state(t, s.y, scene), scene, s.mode, self.rest, self.tolerances)
 
     @at_time
@@ -224,6 +232,19 @@ class RunFunctions(eqx.Module):
         """Back onto the constraints, and into stick."""
         s = s._replace(y=self.project(t, s.y, scene, s.mode))
         return self._stick(t, s, scene) if self.sticks else s
+
+    @at_time
+    def observe(
+        self, t: Array, y: PyTree, scene: Scene, mode: Array | None, series: Series
+    ) -> tuple[Float[Array, ""], Float[Array, ""] | None]:
+        """A number of a state and its rate; that of a force is not known."""
+        state = self.system.state(t, y, scene)
+        if series.kind == "q":
+            return state.q[series.i], state.qd[series.i]
+        if series.kind == "qd":
+            return state.qd[series.i], from_dynamics(lambda d: d.rate, t, state, scene, mode).qd[series.i]
+        force = from_dynamics(lambda d: d.forces[series.effect], t, state, scene, mode)
+        return force if series.i is None else force[series.i], None
 
     @at_time
     def keep(self, t: Array, y: PyTree, scene: Scene, mode: Array | None) -> tuple[PyTree, Instant | None]:

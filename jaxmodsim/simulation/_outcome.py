@@ -1,6 +1,7 @@
 """How a run ended: a code inside compiled code, a sentence outside."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -12,11 +13,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.cholesky import cholesky_pivots
+from .._core.functions import depends_on
 from .._core.parameters import check_ranges, modules_of, range_checks
 from .._core.scalarise import in_scalars
 from ..friction import Regularized
 from ..mechanics import constraint_residual, motion_equations, quadratic
-from ..scene import Scene, State, describe_series, from_dynamics, quantity_of
+from ..scene import Friction, Scene, State, describe_series, from_dynamics, quantity_of
 from ..solvers import ACCUMULATION, TOO_MANY
 
 # Codes of how a run ended; `outcome_messages` has the sentence of each.
@@ -73,12 +75,14 @@ class _Offsets(NamedTuple):
     ranges: int
     chatter: int
     checks: int
+    loads: int
 
 
 def _offsets(scene: Scene, dof: int) -> _Offsets:
     ranges = FIRST_MASS + dof
     chatter = ranges + sum(len(range_checks(module)) for _, module in modules_of(scene))
-    return _Offsets(ranges, chatter, chatter + sum(scene.mode_widths(dof)))
+    checks = chatter + sum(scene.mode_widths(dof))
+    return _Offsets(ranges, chatter, checks, checks + len(scene.checks))
 
 
 class Ending(NamedTuple):
@@ -138,7 +142,35 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
         for name, width in zip(scene.mode_names, scene.mode_widths(dof), strict=True)
         for _ in range(width)
     )
-    return _GENERAL + mass + ranges + chatter + scene.checks
+    loads = tuple(
+        f"Friction {name!r}: normal_force depends on params alone, so it is a constant load and must be finite and >= 0"
+        " [N], but it is negative or not finite. Correct its sign; a load that is below zero for a while depends on t,"
+        " q or qd."
+        for name in _load_functions(scene)
+    )
+    return _GENERAL + mass + ranges + chatter + scene.checks + loads
+
+
+def _load_functions(scene: Scene) -> dict[str, Callable[..., Any]]:
+    """Loads of friction elements that are functions, by name of the element."""
+    elements = zip(scene.names, scene.effects, strict=True)
+    loads = {name: each.normal_force for name, each in elements if isinstance(each, Friction)}
+    return {name: load for name, load in loads.items() if callable(load)}
+
+
+def _has_load(fn: Callable[..., Any], scene: Scene, t: Float[Array, ""], y: State) -> Bool[Array, ""]:
+    """Whether a load that depends on neither time nor state is in range; True of one that does."""
+    dof = y.q.shape[0]
+
+    def load(state: Array) -> Array:
+        t, q, qd = state[0], state[1 : dof + 1], state[dof + 1 :]
+        return jnp.asarray(fn(t, q, qd, scene.bind_time(t).params))
+
+    state = jnp.concatenate([t[None], y.q, y.qd])
+    if depends_on(load, state):
+        return jnp.asarray(True)
+    value = load(state)
+    return jnp.isfinite(value) & (value >= 0)
 
 
 def start_code(
@@ -171,6 +203,8 @@ def start_code(
     widths = [module.width for _, module in modules_of(scene) if isinstance(module, Regularized)]
     if atol is not None and widths:
         code = jnp.where(atol <= jnp.min(jnp.stack([jnp.min(width) for width in widths])), code, TOO_NARROW)
+    for i, fn in enumerate(_load_functions(scene).values()):
+        code = jnp.where(_has_load(fn, scene, t, y), code, offsets.loads + i)
     checks = [ok for _, module in modules_of(scene) for _, ok in range_checks(module)]
     for i, ok in reversed(list(enumerate(checks))):
         code = jnp.where(ok, code, offsets.ranges + i)

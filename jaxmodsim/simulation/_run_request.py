@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from .._core.arguments import as_flag, as_mapping, as_whole, check_real
+from .._core.parameters import is_weak
 from .._core.speed import remark_on_single_precision
 from ..scene import Friction, Scene, check_step
 from ..solvers import ImplicitFriction
@@ -88,11 +89,6 @@ def _array(value: PyTree, dtype: np.dtype) -> Any:
     return np.asarray(value, dtype)
 
 
-def _is_weak(number: object) -> bool:
-    """Whether JAX lets the type of a number give way to that of others."""
-    return getattr(number, "weak_type", isinstance(number, float))
-
-
 def _inputs(asked: RunRequest) -> RunInputs:
     """Convert and check all numbers of a run."""
     scene, t0, t1, z0 = asked.scene, asked.t0, asked.t1, asked.z0
@@ -111,13 +107,13 @@ def _inputs(asked: RunRequest) -> RunInputs:
         if type(value) is not float:
             check_real(value, name=name)
     leaves: list[Any] = [*jtu.tree_leaves(scene), q0, qd0]
-    kinds = {x.dtype for x in leaves if hasattr(x, "dtype")}
+    kinds = {x.dtype for x in leaves if hasattr(x, "dtype") and not is_weak(x)}
     dtype = kinds.pop() if len(kinds) == 1 else jnp.result_type(*kinds) if kinds else jnp.result_type(float)
     if not jnp.issubdtype(dtype, jnp.floating):
         dtype = jnp.result_type(float)
-    if any(_is_weak(x) for x in leaves[:-2]):
+    if any(is_weak(x) for x in leaves[:-2]):
         # Numbers put in by `jnp.asarray(2.0)` or as Python's own would else compile the run once more.
-        scene = jtu.tree_map(lambda x: jnp.asarray(x, getattr(x, "dtype", dtype)) if _is_weak(x) else x, scene)
+        scene = jtu.tree_map(lambda x: jnp.asarray(x, dtype) if is_weak(x) else x, scene)
     array = {name: _array(value, dtype) for name, value in given.items()}
     for name in ("q0", "qd0"):
         if array[name].ndim != 1 or array[name].shape[0] == 0 or array[name].shape != array["q0"].shape:

@@ -39,7 +39,7 @@ from ..solvers import (
     trial_step,
     unchecked,
 )
-from ._integrated_system import AugmentedState, Instant, IntegratedSystem, RunFunctions, Work, project
+from ._integrated_system import AugmentedState, Instant, IntegratedSystem, RunFunctions, Series, Work, project
 from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, end_code, start_code
 
 # Part of the absolute tolerance below which a slip velocity counts as none.
@@ -91,6 +91,14 @@ class RunOptions:
     max_events: int
     hold_chatter: bool
     project: bool
+
+
+class Nodes(NamedTuple):
+    """A number at t0 and at the ends of all steps: times, values and rates (None if not known), infinite beyond."""
+
+    t: Float[Array, " nodes"]
+    x: Float[Array, " nodes"]
+    rate: Float[Array, " nodes"] | None
 
 
 class RunOutput(NamedTuple):
@@ -281,9 +289,12 @@ def _start_code(inputs: RunInputs, functions: RunFunctions, mode: Array | None, 
 
 
 def _integrate(
-    inputs: RunInputs, options: RunOptions, audited: bool, log: int | None
-) -> tuple[RunOutput, EventLog | None]:
-    """Run diffrax; with modes only where the scene has them, with a log of that many events where one is wanted."""
+    inputs: RunInputs, options: RunOptions, audited: bool, log: int | None, series: Series | None = None
+) -> tuple[RunOutput, EventLog | None, Nodes | None]:
+    """Run diffrax; with modes only where the scene has them, with a log of that many events where one is wanted.
+
+    With a `series` also its nodes.
+    """
     scene, exact = inputs.scene, bool(inputs.scene.mode_names)
     functions = _functions(inputs, options, audited)
     method, adjoint = _plugins(inputs, options, functions.system)
@@ -302,11 +313,17 @@ def _integrate(
         del t, scene
         return (y.y, y.mode) if isinstance(y, EventState) else (y, None)
 
+    def observed(t: Array, y: PyTree, scene: Scene) -> Any:
+        assert series is not None
+        y, mode = saved(t, y, scene)
+        return functions.observe(t, y, scene, mode, series)
+
     def last(t: Array, y: PyTree, scene: Scene) -> Any:
         return saved(t, y, scene), ((y.events, y.status, y.fired), y.log) if exact else None
 
     def integrate(first: Array, ts: Array | None) -> dfx.Solution:
         subs = [dfx.SubSaveAt(t1=True, fn=last)] + ([] if ts is None else [dfx.SubSaveAt(ts=ts, fn=saved)])
+        subs += [] if series is None else [dfx.SubSaveAt(t0=True, steps=True, fn=observed)]
         return dfx.diffeqsolve(
             dfx.ODETerm(functions.derivative if exact else functions.plain_derivative),
             solver,
@@ -350,7 +367,8 @@ def _integrate(
     code = jnp.where(starts, ended, start)
     if exact and not options.hold_chatter:
         code = jnp.where((code == SUCCESS) & missed, MISSED_EVENT, code)
-    return RunOutput(t, y, modes, code, None if ts is None else (t_end, end_state), stats), history
+    output = RunOutput(t, y, modes, code, None if ts is None else (t_end, end_state), stats)
+    return output, history, None if series is None else Nodes(solution.ts[-1], *solution.ys[-1])
 
 
 def _ended(
@@ -408,7 +426,7 @@ def compiled_runs() -> int:
 @partial(jax.jit, static_argnames=("options",))
 def solve_audited(inputs: RunInputs, options: RunOptions) -> tuple[Work, Int[Array, ""]]:
     """Run a scene again with the integrals of power beside it: the work at the saved times, and how that run ended."""
-    solved = _integrate(inputs, options, True, None)[0]
+    solved, _, _ = _integrate(inputs, options, True, None)
     return solved.y[1], solved.code
 
 
@@ -426,3 +444,11 @@ def solve_logged(inputs: RunInputs, options: RunOptions, size: int) -> EventLog:
     log = _integrate(inputs, options, False, size)[1]
     assert log is not None
     return log
+
+
+@partial(jax.jit, static_argnames=("options", "series"))
+def solve_nodes(inputs: RunInputs, options: RunOptions, series: Series) -> Nodes:
+    """Run a scene again with a number at the ends of its steps beside it."""
+    nodes = _integrate(inputs, options, False, None, series)[2]
+    assert nodes is not None
+    return nodes

@@ -22,6 +22,7 @@ from ..solvers import EventLog
 from ._accuracy import Accuracy
 from ._columns import Columns, columns
 from ._energy_ledger import EnergyLedger, event_losses, ledger
+from ._integrated_system import Series
 from ._outcome import RunResult, outcome_messages
 from ._run_request import is_known
 from ._solve import RunInputs, RunOptions, RunOutput, solve_logged
@@ -219,6 +220,18 @@ class Trajectory(AbstractReadable):
         if self.modes is None:
             return {name: jnp.zeros((0, 2, *force.shape[1:]), force.dtype) for name, force in self.forces.items()}
         return self._once("event_forces", lambda: _event_forces(self.scene, self._log()))
+
+    def event_sides(self, series: Series) -> Float[Array, "instants 2"]:
+        """A number just before and after each change of mode, zero in entries that were not needed."""
+        if self.modes is None:
+            return jnp.zeros((0, 2), self.t.dtype)
+        log, (kind, effect, index) = self._log(), series
+        if kind == "force":
+            sides = jnp.nan_to_num(self.event_forces[effect])
+        else:
+            sides = jnp.stack([getattr(side[0], kind) for side in (log.before, log.after)], axis=1)
+            sides = jnp.where(jnp.isfinite(log.t)[:, None, None], sides, 0.0)
+        return sides if index is None else sides[..., index]
 
     @property
     def momentum(self) -> Float[Array, "*time dof"]:

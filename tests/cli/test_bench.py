@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -103,7 +104,11 @@ def test_list_runs_nothing(suite):
 
 def test_an_interrupt_leaves_finished_results(suite):
     command = [sys.executable, "bench", "good", "long"]
-    with subprocess.Popen(command, cwd=suite.folder.parent, stdout=subprocess.PIPE, text=True) as process:
+    # A suite started in the background ignores SIGINT, and so would its children.
+    restored = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    with subprocess.Popen(
+        command, cwd=suite.folder.parent, stdout=subprocess.PIPE, text=True, preexec_fn=restored
+    ) as process:
         assert process.stdout is not None
         for line in process.stdout:
             if "begun" in line:

@@ -174,7 +174,7 @@ def turned(q: Any) -> Any:
 
 def test_heavy_symmetric_top() -> None:
     """The Lagrangian of the top in its angles: A/2 (sin^2(b) a'^2 + b'^2) + C/2 (c' + cos(b) a')^2 - m g l cos(b)."""
-    m, length, A, C = 0.6, 0.3, 0.02, 0.01
+    m, length, A, C = 0.6, 0.3, 0.08, 0.01
     about_tip = rigid_body(
         m, jnp.array([A - m * length**2, A - m * length**2, C]), lambda q: length * turned(q)[:, 2], turned
     )

@@ -185,7 +185,7 @@ def test_friction_along_a_displacement() -> None:
 
 @pytest.mark.parametrize(("load", "expected"), [(-3.0, 0.0), (0.0, 0.0), (2.0, 2.0 * 0.3 * 0.5)])
 def test_lift_off_gives_no_friction(load: float, expected: float) -> None:
-    effect = Friction(Viscous(0.3), normal_force=load)
+    effect = Friction(Viscous(0.3), normal_force=lambda *state: load)
     action = effect.act(jnp.array(0.0), jnp.array([0.0]), jnp.array([0.5]), None, {})
     np.testing.assert_allclose(action.force, expected)
 

@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 
 import jaxmodsim as jms
 from jaxmodsim.orbits import OrbitError
-from jaxmodsim.problems import belt_oscillator, vibrating_table
+from jaxmodsim.problems import belt_oscillator, relief_valve, vibrating_table
 from jaxmodsim.scene import replace_elements, scene_numbers
 
 
@@ -166,6 +166,26 @@ def test_ball_on_a_vibrating_table():
     np.testing.assert_allclose(np.sum(orbit.multipliers).real, trace, rtol=1e-7)
     np.testing.assert_allclose(np.prod(orbit.multipliers).real, p["e"] ** 2, rtol=1e-8)
     assert orbit.sequence == (("table", "open", "open"),)
+    struck = p["A"] * np.sin(phase)
+    np.testing.assert_allclose([orbit.lowest[0], orbit.highest[0]], [struck, struck + p["g"] * T**2 / 8], rtol=1e-9)
+
+
+def test_the_lowest_of_a_valve_that_strikes_is_its_seat():
+    """The greatest lift is that of samples, and derivatives are differences, which of the seat is zero."""
+
+    def orbit(flow):
+        return jms.periodic_orbit(relief_valve.scene(flow=flow), ([0.5], [0.0]), settle=100.0)
+
+    def extent(flow):
+        return jnp.stack([orbit(flow).lowest[0], orbit(flow).amplitude[0]])
+
+    made, h = orbit(6.0), 1e-3
+    ts = np.linspace(0.0, float(made.period), 4001)
+    run = jms.simulate(made.run.scene, made.q, made.qd, ts[-1], ts=ts, z0=made.z, rtol=1e-10, atol=1e-12)
+    assert abs(made.lowest[0]) < 1e-12
+    np.testing.assert_allclose(2.0 * made.amplitude[0], np.max(run.q), rtol=1e-6)
+    differences = (extent(6.0 + h) - extent(6.0 - h)) / (2.0 * h)
+    np.testing.assert_allclose(jax.jacfwd(extent)(6.0), differences, rtol=1e-5, atol=1e-8)
 
 
 def test_van_der_pol(van_der_pol):

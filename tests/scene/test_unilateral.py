@@ -297,6 +297,28 @@ def test_an_impact_at_either_end_of_a_run():
     np.testing.assert_allclose(run.q[-1, 0], 0.5 * 0.05 - 0.5 * 9.81 * 0.05**2, rtol=1e-10)
 
 
+def test_a_saved_time_and_an_end_at_an_impact_hold_the_state_after_it():
+    """At the default tolerances, at impacts of the closed form and at those that a run has noted."""
+    for h, e in ((1.0, 0.5), (0.37, 0.8), (20.0, 0.3)):
+        fall = np.sqrt(2 * h / 9.81)
+        strikes = fall * np.cumsum([1.0, *(2 * e ** np.arange(1, 6))])
+        after = 9.81 * fall * e ** np.arange(1, 7)
+        scene = bouncing_ball.scene(e=e)
+        saved = jms.simulate(scene, [h], [0.0], strikes[-1], ts=strikes, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(saved.qd[:, 0], after, rtol=1e-8)
+        np.testing.assert_allclose(saved.q[:, 0], 0.0, atol=1e-11)
+        np.testing.assert_allclose(saved.mode_changes[-1].t, strikes[-1], rtol=1e-11)
+        for t, v in zip(strikes, after, strict=True):
+            np.testing.assert_allclose(jms.simulate(scene, [h], [0.0], t).qd[-1, 0], v, rtol=1e-8)
+    table = vibrating_table.scene(e=0.8)
+    times = [change.t for change in jms.simulate(table, [0.02], [0.0], 0.5).mode_changes]
+    assert len(times) > 5
+    saved = jms.simulate(table, [0.02], [0.0], 0.5, ts=np.repeat(times, 2) - np.tile([1e-10, 0.0], len(times)))
+    p = vibrating_table.PARAMS
+    before, after = (saved.qd[:, 0] - p["A"] * p["omega"] * jnp.cos(p["omega"] * saved.t)).reshape(-1, 2).T
+    np.testing.assert_allclose(after, -0.8 * before, rtol=1e-6)
+
+
 @pytest.mark.quick
 def test_wrong_contacts_are_refused():
     with pytest.raises(ValueError, match="restitution must be"):

@@ -13,7 +13,8 @@ from jaxtyping import Array, Float, PyTree
 
 from ..._core.arguments import as_label
 from ..._core.functions import as_function, result_shape
-from ..._core.parameters import Number, as_number, check_ranges, modules_of, optional_parameter
+from ..._core.index_check import traced
+from ..._core.parameters import Default, Number, Range, as_number, check_ranges, modules_of, optional_parameter
 from ..._core.position import PositionFn, as_position_fn
 from ..._core.safe import safe_norm
 from ..._core.shapes import PerDof, Scalar
@@ -96,10 +97,11 @@ class Friction(AbstractEffect):
       `Dahl` with a bristle that is a vector, too; of a set-valued law in stick any vector up to the limit.
     - `belt_velocity`: velocity [m/s or rad/s] of the surface, a number or a continuous function of t (a jump would
       carry with it what sticks); where slip is a vector, a function that returns one.
-    - `normal_force`: load [N]: a number, `normal_force(t, q, qd, params)`, or the name of a `Constraint`, whose
+    - `normal_force`: load [N]: a number >= 0, `normal_force(t, q, qd, params)`, or the name of a `Constraint`, whose
       reaction is the load; friction and reaction are then solved together. The law's forces are per newton of
-      load (`Fc` is the coefficient of friction), and a negative load, which is lift-off, gives no friction. By
-      default the law's forces are in newtons.
+      load (`Fc` is the coefficient of friction). Where a function of t, q or qd is negative, the parts have lifted
+      off, and there is no friction; one that depends on `params` alone must be >= 0, too. By default the law's
+      forces are in newtons.
     - `name`: name in `run.forces`.
     - `ellipse`: where slip is a vector of two components, friction across over friction along the first one, > 0: the
       limit of friction is an ellipse with these half-axes, and the direction that of greatest dissipation. By
@@ -107,19 +109,23 @@ class Friction(AbstractEffect):
 
     **Raises:**
 
-    - `ValueError` for a law that is none, and (at the run) for wrong shapes or for `along` missing where there are
-      several coordinates.
+    - `ValueError` for a law that is none, numbers out of range, and (at the run) for wrong shapes or for `along`
+      missing where there are several coordinates.
     """
 
     law: AbstractLaw = eqx.field(converter=_law)
     along: PositionFn | None = eqx.field(default=None, converter=_along)
-    belt_velocity: Number | Callable[..., Any] = eqx.field(default=0.0, converter=_belt)
-    normal_force: Number | Callable[..., Any] | ReactionLoad | None = eqx.field(default=None, converter=_load)
+    belt_velocity: Number | Callable[..., Any] = eqx.field(
+        default=Default(0.0), converter=_belt, metadata={"range": Range("")}
+    )
+    normal_force: Number | Callable[..., Any] | ReactionLoad | None = eqx.field(
+        default=None, converter=_load, metadata={"range": Range("N", 0.0)}
+    )
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Friction name"))
     ellipse: Number | None = optional_parameter("ellipse", "1", lower=0.0, strict=True)
 
     def __check_init__(self) -> None:
-        """Refuse an ellipse out of range."""
+        """Refuse numbers out of range."""
         check_ranges(self)
 
     def bind_state(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> "Friction":
@@ -217,7 +223,11 @@ class Friction(AbstractEffect):
 
     def slip_shape(self, q: PerDof, params: PyTree) -> tuple[int, ...]:
         """Shape of the slip: () or, where `along` is a position that moves in several directions, that of a vector."""
-        return () if self.along is None or q.shape == (1,) else jax.eval_shape(self.along, q, params).shape
+        if self.along is None or q.shape == (1,):
+            return ()
+        return traced(
+            self.along, q=q, params=params, name=f"along of Friction {self.name or self.default_name!r}"
+        ).shape
 
     def direction(self, q: PerDof, params: PyTree) -> Float[Array, "*components dof"]:
         """Gradient d along/dq of the slip: the generalised force of a unit force along the displacement.

@@ -25,7 +25,7 @@ class Landed(NamedTuple):
 
     - `t`, `y`, `mode`: the end of the step.
     - `first`: marks the guard whose root the event is, shape `[guards]`.
-    - `rate`: of that guard along the motion, constant.
+    - `fall`: the value of that guard at its root, and its rate along the motion; constant.
     - `on_root`: whether it has a root.
     - `near`: how far the root may be [time].
     - `earliest`: time before which the event cannot be.
@@ -35,7 +35,7 @@ class Landed(NamedTuple):
     y: PyTree
     mode: PyTree
     first: Bool[Array, " guards"]
-    rate: Float[Array, ""]
+    fall: tuple[Float[Array, ""], Float[Array, ""]]
     on_root: Bool[Array, ""]
     near: Float[Array, ""]
     earliest: Float[Array, ""]
@@ -89,6 +89,7 @@ def pass_event(
     - `args`: those before and after the event.
     - `reset`: `reset(t, y)` -> y and mode after the event.
     """
+    level, rate = landed.fall
 
     @partial(jax.checkpoint, prevent_cse=False)
     def onward(place: _Place, turn: tuple[Int[Array, ""], Float[Array, ""]]) -> tuple[_Place, PyTree]:
@@ -99,7 +100,7 @@ def pass_event(
         y, mode = jax.lax.cond(i == _RESET, lambda: reset(t, y), lambda: (y, mode))
         origin = _choose(begins, (t, y), place.origin)
         rates, guards = evaluate(t, y, mode, _choose(behind, args[1], args[0]))
-        newton = -jnp.sum(jnp.where(landed.first, guards, 0.0)) / landed.rate
+        newton = (level - jnp.sum(jnp.where(landed.first, guards, 0.0))) / rate
         # A guard that a reset has violated fires where it stands: it has no root here, or one before that reset.
         on_root = jnp.where(
             i == 0,
@@ -124,10 +125,8 @@ def pass_event(
         )
         return following, (t, before, (y, mode, rates), guards)
 
-    turns = jnp.arange(_COUNT), jnp.asarray(_SHARES, landed.rate.dtype)
-    begin = _Place(
-        landed.t, landed.y, landed.mode, (landed.t, landed.y), jnp.zeros_like(landed.rate), jnp.asarray(False)
-    )
+    turns = jnp.arange(_COUNT), jnp.asarray(_SHARES, rate.dtype)
+    begin = _Place(landed.t, landed.y, landed.mode, (landed.t, landed.y), jnp.zeros_like(rate), jnp.asarray(False))
     _, (t, before, after, guards) = jax.lax.scan(onward, begin, turns)
     at, end = (lambda tree, i=i: jtu.tree_map(lambda x: x[i], tree) for i in (_RESET, _COUNT - 1))
     return Passage(at(t), at(before), at(after), end(after[0]), end(guards))

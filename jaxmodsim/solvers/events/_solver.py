@@ -34,26 +34,33 @@ _FORGET_INTERVALS, _FORGET_STEPS = 0.05, 0.25
 _GROW = 2.0
 # Events that few do not accumulate.
 _FEWEST = 8
+# Rounding units of time within which a saved time is that of an event.
+_INSTANT = 64.0
 
 _constant = jax.lax.stop_gradient
 
 
 class _EventInterpolation(dfx.AbstractLocalInterpolation):
-    """Dense output of the wrapped solver inside a step; at its end the state after the event."""
+    """Dense output of the wrapped solver inside a step; from the event at its end on the state after that.
+
+    `event` is the time from which on that state holds, and the rate of y there.
+    """
 
     t0: Any
     t1: Any
     inner: dfx.AbstractLocalInterpolation
     state0: EventState
     state1: EventState
+    event: tuple[Array, PyTree]
 
     def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> EventState:
         """State at `t0`, or the increment from `t0` to `t1`."""
         del left
         if t1 is not None:
             return jtu.tree_map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
-        inside = self.state0._replace(y=self.inner.evaluate(t0))
-        return jtu.tree_map(lambda a, b: jnp.where(t0 >= self.t1, b, a), inside, self.state1)
+        inside, (begins, slope) = self.state0._replace(y=self.inner.evaluate(t0)), self.event
+        back = jtu.tree_map(lambda y, f: y + ((t0 - self.t1) * f).astype(y.dtype), self.state1.y, slope)
+        return jtu.tree_map(lambda a, b: jnp.where(t0 >= begins, b, a), inside, self.state1._replace(y=back))
 
 
 class _Field(eqx.Module):
@@ -119,7 +126,8 @@ class EventSolver(AbstractSolverWrapper):
       `times` of the controller).
 
     The event is located on steps of the solver, not on its dense output: a step that passes a root is
-    rejected and ends on it. The saved value at an event, and at t1 if that is one, is the one after the reset.
+    rejected and ends on it. The saved value at an event, and at t1 if that is one, is the one after the reset; times
+    that differ by 64 rounding units are one.
 
     **Derivatives.** From the end of the step the state is carried to the root, reset there, and carried back with the
     new field. The way is zero but for the landing error, while its derivative is that of the event's time: the result
@@ -136,7 +144,9 @@ class EventSolver(AbstractSolverWrapper):
 
     - `solver`: the diffrax solver of an `ODETerm`: explicit, `Rodas5P`, `diffrax.Kvaerno5`.
     - `guards`: `guards(t, s, args)` -> shape `[guards]`; `s` is an `EventState` of which `s.y` and `s.mode` are yours.
-      Or a pair of that and, of the same shape, by how much each guard may be wrong beside `rtol` of its magnitude.
+      Or a tuple of that and, of the same shape, by how much each guard may be wrong beside `rtol` of its magnitude,
+      and the value that it has at its event: it fires at zero, below that, so that rounding does not fire it again;
+      times in between hold the state after the event.
     - `reset`: `reset(t, s, args, fired)` -> `s` with another `y` or `mode` (by `s._replace`); `fired` are booleans,
       shape `[guards]`.
     - `on_zeno`: as `reset`, for events that accumulate; by default the run ends there.
@@ -179,8 +189,9 @@ class EventSolver(AbstractSolverWrapper):
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Interpolation of the wrapped solver, with the event at the end of the step."""
 
-        def interpolation(*, t0: Any, t1: Any, inner: PyTree, state0: Any, state1: Any) -> _EventInterpolation:
-            return _EventInterpolation(t0, t1, self.solver.interpolation_cls(t0=t0, t1=t1, **inner), state0, state1)
+        def interpolation(*, t0: Any, t1: Any, inner: PyTree, state0: Any, state1: Any, event: Any) -> Any:
+            path = self.solver.interpolation_cls(t0=t0, t1=t1, **inner)
+            return _EventInterpolation(t0, t1, path, state0, state1, event)
 
         return interpolation
 
@@ -217,15 +228,16 @@ class EventSolver(AbstractSolverWrapper):
         return state._replace(fired=jnp.zeros_like(guard), log=log, memory=memory)
 
     def _guards(self, t: Any, state: EventState, args: PyTree) -> Float[Array, " guards"]:
-        return self._guards_and_atol(t, state, args)[0]
+        return self._guards_and_limits(t, state, args)[0]
 
-    def _guards_and_atol(
+    def _guards_and_limits(
         self, t: Any, state: EventState, args: PyTree
-    ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
+    ) -> tuple[Float[Array, " guards"], Float[Array, " guards"], Float[Array, " guards"]]:
         given = self.guards(t, state, args)
-        values, atol = given if isinstance(given, tuple) else (given, None)
+        values, *limits = given if isinstance(given, tuple) else (given,)
         values = jnp.asarray(values)
-        return values, jnp.zeros_like(values) if atol is None else atol
+        atol, root, *_ = (*limits, jnp.zeros_like(values), jnp.zeros_like(values))
+        return values, atol, root
 
     def func(self, terms: PyTree, t0: Any, y0: EventState, args: PyTree) -> PyTree:
         """The vector field of the wrapped solver."""
@@ -252,11 +264,11 @@ class EventSolver(AbstractSolverWrapper):
         # Around t0 = 0 the resolution of time is that of the step itself.
         length = _constant(t1 - t0)
         resolution = 4.0 * float(jnp.finfo(length.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-        seen, end = self._look(path, (t0, t1), y0._replace(y=y1), args, resolution)
+        seen, end, root = self._look(path, (t0, t1), y0._replace(y=y1), args, resolution)
         # Where nothing moves steps grow without measure, and tell nothing of the motion that the event begins.
         measure = jnp.minimum(length, _GROW * pace)
         jumps = None if self.samples is None else self.samples.at(t1, length)
-        landing = self._land(seen, end, (t1, length, resolution), (measure, pace), jumps)
+        landing = self._land(seen, (end, root), (t1, length, resolution), (measure, pace), jumps)
         next_root = fusion_barrier(landing.next_root, unit)
         landed = fusion_barrier(_flags(landing.landed, next_root), unit) > 0.5
         landing = landing._replace(next_root=next_root, landed=landed, happens=landed)
@@ -271,12 +283,13 @@ class EventSolver(AbstractSolverWrapper):
             step_factor=fusion_barrier(step_factor, unit),
         )
         state1 = y0._replace(y=y1, memory=memory)
-        state1 = jax.lax.cond(
+        state1, (t_event, slope) = jax.lax.cond(
             landing.happens,
-            lambda: self._jump(terms, t1, state1, landing, (landing.near * length, begin), (args, whole)),
-            lambda: state1,
+            lambda: self._jump(terms, t1, state1, landing, (root, landing.near * length, begin), (args, whole)),
+            lambda: (state1, (jnp.asarray(t1), jtu.tree_map(jnp.zeros_like, y1))),
         )
-        dense = {"inner": dense, "state0": y0, "state1": state1}
+        begins = jnp.where(landing.happens, _constant(t_event) - _INSTANT / 4.0 * resolution, t1)
+        dense = {"inner": dense, "state0": y0, "state1": state1, "event": (begins, slope)}
         pace = jnp.maximum(measure, _FORGET_STEPS * pace)
         return state1, error, dense, (inner, pace, begin), result
 
@@ -287,14 +300,16 @@ class EventSolver(AbstractSolverWrapper):
         state: EventState,
         args: PyTree,
         resolution: Array,
-    ) -> tuple[GuardScan, Float[Array, " guards"]]:
-        """What the guards do in a step that ends at `state`, and their values there."""
+    ) -> tuple[GuardScan, Float[Array, " guards"], Float[Array, " guards"]]:
+        """What the guards do in a step that ends at `state`, their values there, and those that they have at events."""
         t0, t1 = times
         places = [t0 + (t1 - t0) * part for part in (1 / 3, 1 / 2, 2 / 3)]
         # Constant before the guards are evaluated, so that nothing of them is differentiated.
         state, args, ends = _held((state, args, [(t, path.evaluate(t)) for t in places] + [(t1, state.y)]))
         looks = jtu.tree_map(lambda *x: jnp.stack(x), *ends)
-        values, atol = jax.lax.map(lambda at: self._guards_and_atol(at[0], state._replace(y=at[1]), args), looks)
+        values, atol, root = jax.lax.map(
+            lambda at: self._guards_and_limits(at[0], state._replace(y=at[1]), args), looks
+        )
         unit = opaque_one(_constant(t1 - t0))
         one, middle, two, end = fusion_barrier(_constant([*values]), unit)
         # Where limits vanish at one end of the step, the other tells their size.
@@ -302,22 +317,23 @@ class EventSolver(AbstractSolverWrapper):
         length = _constant(t1 - t0)
         blur = _constant(resolution) / jnp.where(length > 0, length, 1.0)
         memory = state.memory
-        return scan_guards((memory.guard, one, two, end), middle, memory.armed > 0.5, tolerances, blur, unit), end
+        seen = scan_guards((memory.guard, one, two, end), middle, memory.armed > 0.5, tolerances, blur, unit)
+        return seen, end, _constant(root[-1])
 
     def _land(
         self,
         seen: GuardScan,
-        end: Float[Array, " guards"],
+        ends: tuple[Float[Array, " guards"], Float[Array, " guards"]],
         step: tuple[Array, Array, Array],
         paces: tuple[Array, Array],
         jumps: Bool[Array, ""] | None,
     ) -> Landing:
         """Which guards fire at the end of a step, and where the next one is to end.
 
-        `step` are its end, its length and the resolution of time; `paces` the length of the last steps, with this one
-        and without.
+        `ends` are the guards there and what they are at events; `step` are its end, its length and the resolution of
+        time; `paces` the length of the last steps, with this one and without.
         """
-        (t1, length, resolution), (measure, pace) = step, paces
+        (end, root), (t1, length, resolution), (measure, pace) = ends, step, paces
         divisor = jnp.where(length > 0, length, 1.0)
         near = jnp.maximum(_LANDING * jnp.maximum(measure, pace), _constant(resolution))
         shortest = jnp.maximum(_SHORT * pace, 2.0 * _constant(resolution))
@@ -327,7 +343,7 @@ class EventSolver(AbstractSolverWrapper):
         near = near / divisor
         # One that has just fallen through zero may look flat, or rising, to the cubic.
         here = (seen.armed & (jnp.abs(seen.ahead) <= near)) | (seen.crosses & (1.0 - seen.root <= near))
-        here = self._policy.fires(here, seen, end, length, t1)
+        here = self._policy.fires(here, seen, end, length, t1) | _arrives(seen, end, root, resolution / divisor)
         # One that fires at the start of the step does so where the step is the shortest.
         here = here | (seen.crosses & (seen.root * length <= resolution) & (length <= shortest))
         passed = seen.crosses & ~here
@@ -337,9 +353,9 @@ class EventSolver(AbstractSolverWrapper):
         landed = jnp.any(here) & ~missed & (length > 0)
         fired = here & landed
         first = jnp.arange(fired.shape[0]) == jnp.argmin(jnp.where(fired, seen.ahead, jnp.inf))
-        root = jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0))
+        ahead = jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0))
         return Landing(
-            fired, first, missed, landed, landed, self._policy.next_end(root, missed, (behind, divisor)), near
+            fired, first, missed, landed, landed, self._policy.next_end(ahead, missed, (behind, divisor)), near
         )
 
     def _guard_rates(self, t: Array, state: EventState, slope: PyTree, args: PyTree) -> Float[Array, " guards"]:
@@ -354,11 +370,14 @@ class EventSolver(AbstractSolverWrapper):
         t: Any,
         state: EventState,
         landing: Landing,
-        times: tuple[Array, Array],
+        places: tuple[Array, Array, Array],
         sides: tuple[PyTree, PyTree],
-    ) -> EventState:
-        """Carry the state to the root of the first guard, reset it there, and carry it back to `t`."""
-        (near, begin), (args, whole), (fired, first) = times, sides, landing[:2]
+    ) -> tuple[EventState, tuple[Array, PyTree]]:
+        """Carry the state to the root of the first guard, reset it there, and carry it back to `t`.
+
+        Returned with the time from which on the new state holds, and the rate of y there.
+        """
+        (root, near, begin), (args, whole), (fired, first) = places, sides, landing[:2]
         memory = state.memory
         # After the event arguments are those of the step that begins there.
         new_args = whole if self.samples is None else self.samples.freeze_args(t, whole)
@@ -388,7 +407,11 @@ class EventSolver(AbstractSolverWrapper):
                 after = jtu.tree_map(lambda a, b: jnp.where(dense, a, b), held, after)
             return after.y, after.mode
 
-        landed = Landed(t, state.y, state.mode, first, rate, memory.landed > 0.5, near, state.t)
+        # A guard that arrives has its event where it is `root`, any other one where it fires, by so much later.
+        level = jnp.sum(jnp.where(first, root, 0.0))
+        arrives = jnp.any(first & (memory.guard > 0))
+        early, level = jnp.where(arrives, 0.0, level / jnp.abs(rate)), jnp.where(arrives, level, 0.0)
+        landed = Landed(t, state.y, state.mode, first, (level, rate), memory.landed > 0.5, near, state.t)
         passage = pass_event(landed, evaluate, (args, new_args), reset)
         t_event, values, (y, mode, slope) = passage.t, passage.guards, passage.after
         spread, dense = spread_at(t_event)
@@ -422,15 +445,24 @@ class EventSolver(AbstractSolverWrapper):
             log=log,
             memory=after._replace(resets=memory.resets + 1.0, spread=spread),
         )
+        event = t_event - early, slope
         if self.event_mode is None and (self.samples is None or self.samples.times is None):
-            return after_reset
+            return after_reset, event
         # Samples at which nothing happens, and resets that are no events, say nothing of whether events accumulate.
         chatters = jnp.any(fired) if self.event_mode is None else jnp.any(fired) & ~_differ(state.mode, mode)
-        return jtu.tree_map(lambda a, b: jnp.where(happened | chatters, a, b), after_reset, passed)
+        return jtu.tree_map(lambda a, b: jnp.where(happened | chatters, a, b), after_reset, passed), event
 
     def _event_modes(self, *modes: PyTree) -> tuple[PyTree, ...]:
         """What of the modes an event changes."""
         return modes if self.event_mode is None else tuple(self.event_mode(mode) for mode in modes)
+
+
+def _arrives(seen: GuardScan, end: Array, root: Array, instant: Array) -> Bool[Array, " guards"]:
+    """Which guards are at their events within `instant`, in steps, though not yet at zero, and come from above."""
+    c0, c1, c2, c3 = seen.cubic
+    falls, middle = c1 + 2.0 * c2 + 3.0 * c3, c0 + 0.5 * (c1 + 0.5 * (c2 + 0.5 * c3))
+    comes = (end > 0) & (root > 0) & (middle > 2.0 * root) & (falls < 0)
+    return seen.armed & comes & (end - root <= -_INSTANT / 4.0 * instant * falls)
 
 
 def _accumulates(spread: Array, t: Array, begin: Array) -> Array:

@@ -1,0 +1,99 @@
+"""The largest magnitude of a series in a run, between saved times too."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ._observe import find_series, read_series
+from ._run_request import is_known
+from ._solve import Nodes, solve, solve_nodes
+from ._trajectory import Trajectory, trajectory
+
+# Steps of the run in which the peak is sought, those with the largest estimates, and samples in each of them.
+_INTERVALS, _SAMPLES = 8, 16
+# Relative difference up to which a peak counts as that of an event, whose time has a derivative.
+_CORNER = 1e-6
+
+
+def peak_of(run: Trajectory, name: str) -> Float[Array, ""]:
+    """Largest magnitude of a series from t0 to the end of a run, see `metrics.peak`."""
+    series = find_series(run, name)
+    x = read_series(run, series)
+    saved = jnp.max(jnp.where(jnp.isfinite(run.t), jnp.abs(x), 0.0))
+    between = _between(run, name)
+    corner = jnp.max(jnp.abs(run.event_sides(series)), initial=0.0)
+    smooth = jnp.maximum(saved, between)
+    return jnp.where(corner >= (1.0 - _CORNER) * smooth, corner, smooth)
+
+
+def _between(run: Trajectory, name: str) -> Float[Array, ""]:
+    """The largest magnitude within steps: a first repeat of the run says which steps, a second one samples these."""
+    series = find_series(run, name)
+    inputs = run.inputs._replace(ts=None)
+    nodes = solve_nodes(jax.lax.stop_gradient(inputs), replace(run.options, max_steps=_most_steps(run)), series)
+    nodes = jax.lax.stop_gradient(nodes)
+    chosen = _largest(nodes)
+    start, length = nodes.t[chosen], nodes.t[chosen + 1] - nodes.t[chosen]
+    within = jnp.isfinite(length)
+    start, length = jnp.where(within, start, run.t_end), jnp.where(within, length, 0.0)
+    # Open intervals: at their ends an event may have changed the series.
+    share = (jnp.arange(_SAMPLES, dtype=start.dtype) + 0.5) / _SAMPLES
+    ts = jnp.clip(jax.lax.stop_gradient(start[:, None] + share * length[:, None]), inputs.t0, run.t_end)
+    near = run.inputs._replace(ts=jnp.ravel(ts))
+    samples = jnp.reshape(read_series(trajectory(near, run.options, solve(near, run.options)), series), ts.shape)
+    samples = jnp.where(within[:, None] & jnp.isfinite(samples), samples, 0.0)
+    return jnp.max(jax.vmap(_vertex)(samples))
+
+
+def _most_steps(run: Trajectory) -> int:
+    """A bound on the number of steps, in powers of two where it is known: another one compiles anew."""
+    count, most = run.stats["num_steps"], run.options.max_steps
+    return min(most, 1 << max(int(count), 64).bit_length()) if is_known(count) else most
+
+
+def _largest(nodes: Nodes) -> Int[Array, " intervals"]:
+    """The steps with the largest estimates of the magnitude, in the order of time."""
+    t, x = nodes.t, jnp.where(jnp.isfinite(nodes.t), nodes.x, 0.0)
+    step = jnp.where(jnp.isfinite(t[1:]), jnp.diff(jnp.where(jnp.isfinite(t), t, 0.0)), 0.0)
+    v = _slopes(step, x) if nodes.rate is None else jnp.where(jnp.isfinite(t), nodes.rate, 0.0)
+    turn = jnp.abs(_turns(step, x, v))
+    estimate = jnp.maximum(jnp.maximum(jnp.abs(x[:-1]), jnp.abs(x[1:])), turn)
+    _, chosen = jax.lax.top_k(jnp.where(step > 0, estimate, -1.0), min(_INTERVALS, step.shape[0]))
+    return jnp.sort(chosen)
+
+
+def _slopes(step: Float[Array, " steps"], x: Float[Array, " nodes"]) -> Float[Array, " nodes"]:
+    """Slopes at the nodes, of the parabola through each and its neighbours."""
+    slope = jnp.diff(x) / jnp.where(step > 0, step, 1.0)
+    both = step[:-1] + step[1:]
+    inner = (step[1:] * slope[:-1] + step[:-1] * slope[1:]) / jnp.where(both > 0, both, 1.0)
+    return jnp.concatenate([slope[:1], inner, slope[-1:]])
+
+
+def _turns(step: Float[Array, " steps"], x: Float[Array, " nodes"], v: Float[Array, " nodes"]) -> Array:
+    """Where x turns within a step by the cubic through its ends with their slopes `v`; else zero."""
+    turns = v[:-1] * v[1:] < 0
+    x0, x1, v0, v1 = x[:-1], x[1:], v[:-1], v[1:]
+    s = v0 / jnp.where(turns, v0 - v1, 1.0)
+    cubic = (1 - s) ** 2 * ((1 + 2 * s) * x0 + s * step * v0) + s**2 * ((3 - 2 * s) * x1 - (1 - s) * step * v1)
+    return jnp.where(turns, cubic, 0.0)
+
+
+def _vertex(x: Float[Array, " samples"]) -> Float[Array, ""]:
+    """Largest magnitude within a step by the parabola through the largest sample and its neighbours.
+
+    The place of the vertex counts as a constant: there the series is stationary, or the step ends.
+    """
+    fixed = jnp.abs(jax.lax.stop_gradient(x))
+    j = jnp.clip(jnp.argmax(fixed), 1, _SAMPLES - 2)
+    y = jax.lax.dynamic_slice(x, (j - 1,), (3,))
+    y = y * jnp.sign(jax.lax.stop_gradient(y[1]))
+    before, here, after = jax.lax.stop_gradient(y)
+    bend = before - 2.0 * here + after
+    d = 0.5 * (before - after) / jnp.where(bend < 0, bend, -1.0)
+    # As far as the ends of the step, half a sample beyond the outer ones; without a vertex the largest sample.
+    least, most = jnp.where(j == 1, -1.5, -1.0), jnp.where(j == _SAMPLES - 2, 1.5, 1.0)
+    d = jnp.clip(jnp.where(bend < 0, d, jnp.sign(after - before) * most), least, most)
+    return 0.5 * d * (d - 1.0) * y[0] + (1.0 - d**2) * y[1] + 0.5 * d * (d + 1.0) * y[2]
