@@ -12,6 +12,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jax.lax import GatherScatterMode
 from jaxtyping import ArrayLike, PyTree
 
+from .step_functions import remark_on_steps
 from .user_errors import explain
 
 # What is known of a variable while tracing: its value, integers or booleans; the name of an argument; nothing.
@@ -22,7 +23,7 @@ _CALLS = {"jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "cu
 
 
 def traced(fn: Callable[..., object], *, name: str, **args: object) -> PyTree:
-    """Shapes and types of what a function returns, from one trace that also looks at its indices.
+    """Shapes and types of what a function returns, from one trace that also looks at its indices and step functions.
 
     An index is seen where it is known while tracing: a number, or an array of numbers. Passed over are indices that
     are computed from the arguments, slices (which Python cuts off, too), and those that say what is to happen out of
@@ -52,6 +53,7 @@ def traced(fn: Callable[..., object], *, name: str, **args: object) -> PyTree:
         raise ValueError(said) from error
     names = [key + jtu.keystr(path) for key, arg in args.items() for path, _ in jtu.tree_flatten_with_path(arg)[0]]
     _follow(jaxpr, names, name)
+    remark_on_steps(jaxpr, names, name)
     return shapes
 
 

@@ -7,14 +7,14 @@ from ._dynamics import ConstraintReaction as ConstraintReaction
 from ._dynamics import State as State
 from ._dynamics import forward_dynamics as forward_dynamics
 from ._dynamics import from_dynamics as from_dynamics
-from ._dynamics import start as start
-from ._dynamics import switch as switch
 from ._dynamics import vector_field as vector_field
 from ._event_driven import mode_numbers as mode_numbers
 from ._implicit import check_step as check_step
 from ._implicit import scene_step as scene_step
 from ._linear_solver import has_linear_solver as has_linear_solver
 from ._linear_solver import linear_solver as linear_solver
+from ._modes import start as start
+from ._modes import switch as switch
 from ._names import elements as elements
 from ._names import read_element as read_element
 from ._names import replace_elements as replace_elements
@@ -34,3 +34,4 @@ from .forces._effect import AbstractEffect as AbstractEffect
 from .forces._effect import Action as Action
 from .forces._effect import Power as Power
 from .forces._friction import Friction as Friction
+from .forces._switch import Switch as Switch

@@ -31,7 +31,6 @@ from ._event_driven import (
     stick_violation,
     stop_slip,
 )
-from ._impact import impact
 from ._karnopp import karnopp_forces
 from ._scene import Scene
 from .forces._effect import Action, Power
@@ -169,10 +168,10 @@ class Dynamics(NamedTuple):
         """Guards that are positive while the modes hold, and their tolerances; see `friction_guards`.
 
         Of a contact that is open the gap, of one that is closed its multiplier. A gap counts as closed only at `-rest`:
-        behind an impact, and where a contact opens, it begins from zero. Of scenes with contacts there follow the
-        values that guards have at their events: of a gap `rest`.
+        behind an impact, and where a contact opens, it begins from zero. Of a switch its guard, times its mode. Of
+        scenes with contacts there follow the values that guards have at their events: of a gap `rest`.
         """
-        friction, gaps = self._elements, self._closed
+        friction, gaps, sides = self._modes
         guards, atol, roots = [], [], [jnp.zeros_like(friction)]
         if friction.size:
             assert self.friction is not None
@@ -180,13 +179,16 @@ class Dynamics(NamedTuple):
             of_friction = friction_guards(self.friction_elements, self.friction, friction, slowest, tolerances)
             guards, atol = [of_friction[0]], [of_friction[1]]
         if gaps.size:
-            assert self.multipliers is not None
-            pushes = by_constraint(self.scene, self.t, self.y, self.multipliers)
-            pushing = jnp.concatenate([pushes[name] for name in self.scene.contacts])
             wide = [each.error(self.t, self.y.q, self.scene.params) for each in self.scene.contacts.values()]
-            guards.append(jnp.where(gaps > 0, pushing, jnp.concatenate(wide) + rest))
+            guards.append(jnp.where(gaps > 0, self.contact_forces, jnp.concatenate(wide) + rest))
             atol.append(jnp.where(gaps > 0, 0.0, tolerances[1]))
             roots.append(jnp.where(gaps > 0, 0.0, rest))
+        if sides.size:
+            switches = self.scene.switches.values()
+            values = [each.value(self.t, self.y.q, self.y.qd, self.scene.params) for each in switches]
+            guards.append(sides * jnp.stack(values))
+            atol.append(jnp.zeros_like(sides))
+            roots.append(jnp.zeros_like(sides))
         return tuple(jnp.concatenate(each) for each in (guards, atol, *([roots] if gaps.size else [])))
 
     def start_friction(self, rest: Scalar) -> tuple[State, Float[Array, " n"]]:
@@ -234,9 +236,10 @@ class Dynamics(NamedTuple):
 
     def hold(self, fired: Bool[Array, " guards"]) -> tuple[State, Float[Array, " n"]]:
         """State and modes where the friction elements that `fired` stick, whatever their limits."""
-        n, elements = self._elements.size, self.friction_elements
+        (modes, *others), elements = self._modes, self.friction_elements
+        n = modes.size
         held = elements.in_planes(fired[:n], lambda part: jnp.any(fired[part]))
-        mode = jnp.concatenate([jnp.where(held, 0.0, self._elements), self._closed])
+        mode = jnp.concatenate([jnp.where(held, 0.0, modes), *others])
         return self.stick(mode), mode
 
     def stick(self, mode: Modes) -> State:
@@ -254,12 +257,19 @@ class Dynamics(NamedTuple):
     @property
     def _elements(self) -> Float[Array, " n"]:
         """Modes of the friction elements."""
-        return self.mode[: _rows_of_friction(self.scene, self.mode)]
+        return self._modes[0]
 
     @property
-    def _closed(self) -> Float[Array, " n"]:
-        """Modes of the contacts."""
-        return self.mode[_rows_of_friction(self.scene, self.mode) :]
+    def _modes(self) -> tuple[Array, Array, Array]:
+        """Modes of the friction elements, the contacts and the switches."""
+        return self.scene.split_modes(self.mode)
+
+    @property
+    def contact_forces(self) -> Float[Array, " n"]:
+        """Multipliers of the contacts, negative where one that is closed would pull."""
+        assert self.multipliers is not None
+        pushes = by_constraint(self.scene, self.t, self.y, self.multipliers)
+        return jnp.concatenate([pushes[name] for name in self.scene.contacts])
 
     @property
     def stick_violation(self) -> Float[Array, " n"]:
@@ -318,11 +328,16 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     compliant = _compliant(scene, t, y) if scene.compliant else None
     if compliant is not None:
         rhs = rhs + compliant.generalised
-    holding = {}
+    holding, sides = {}, {}
+    if scene.switches and mode is not None:
+        sides = dict(zip(scene.switches, jax.lax.stop_gradient(scene.split_modes(mode)[2]), strict=True))
     for name, effect in zip(scene.names, scene.effects, strict=True):
         if name in scene.event_driven or name in scene.reaction_loaded:
             continue
-        action = effect.act(t, q, qd, y.z.get(name), params)
+        if name in sides:
+            action = scene.switches[name].act_on(sides[name], t, q, qd, params)
+        else:
+            action = effect.act(t, q, qd, y.z.get(name), params)
         actions[name] = action
         rhs = rhs + action.generalised
         if isinstance(effect, Friction) and effect.karnopp:
@@ -351,7 +366,7 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
 
     floor = mobility.least if linearized is not None else None
     friction = [*scene.event_driven.values()]
-    modes = jnp.zeros(0, q.dtype) if mode is None else mode[: _rows_of_friction(scene, mode)]
+    modes = jnp.zeros(0, q.dtype) if mode is None else scene.split_modes(mode)[0]
     elements = assemble_friction(friction, pushes, mobility.respond, floor, loads, t, q, qd, params, qdd, modes)
     settled = solve_friction_forces(elements, modes)
     forces = [settled.force[part] for part in elements.parts]
@@ -367,11 +382,6 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
         multipliers = multipliers + within.multiplier_response(mobility.solve(jnp.asarray(taken)))
     uniqueness = settled.margin if scene.loaded else None
     return Dynamics(t, y, mode, scene, actions, qdd, elements, settled, linearized, multipliers, uniqueness)
-
-
-def _rows_of_friction(scene: Scene, mode: Float[Array, " modes"]) -> int:
-    """How many of the modes are those of friction elements; the others are of contacts."""
-    return mode.shape[0] - len(scene.contacts)
 
 
 def _loads(
@@ -431,62 +441,6 @@ def from_dynamics(get: Callable[[Dynamics], _Value], t: Scalar, y: State, scene:
     Laws, loads and solves are small arrays like the terms of the Lagrangian; see `in_scalars`.
     """
     return in_scalars(lambda t, y, mode: get(forward_dynamics(t, y, scene, mode)), t, y, mode, seed=y.q)
-
-
-def start(
-    t: Scalar, y: State, scene: Scene, mode: Float[Array, " modes"], rest: Scalar
-) -> tuple[State, Float[Array, " modes"]]:
-    """State and modes to begin with: elements with no more slip velocity than `rest` or rounding stick if they can.
-
-    Contacts without gap and without velocity are closed. Of `mode` only the shape counts.
-    """
-    if not scene.contacts:
-        return from_dynamics(lambda d: d.start_friction(rest), t, y, scene, mode)
-    eps, params = 8.0 * float(jnp.finfo(y.q.dtype).eps), scene.bind_time(t).params
-    closed = []
-    for each in scene.contacts.values():
-        gap, velocity = each.error(t, y.q, params), each.rate(t, y.q, y.qd, params)
-        size = jnp.max(jnp.abs(y.q)), jnp.max(jnp.abs(y.qd))
-        here = jnp.maximum(jnp.stack([gap, velocity])[:, 0], 0.0)
-        closed.append(jnp.all(here <= jnp.maximum(rest, eps * jnp.stack(size))) & (velocity[0] >= -rest))
-    modes = jnp.where(jnp.stack(closed), 1.0, jnp.zeros_like(y.q[0]))
-    if not scene.event_driven:
-        return y, modes
-    begun = jnp.concatenate([jnp.zeros_like(mode[: _rows_of_friction(scene, mode)]), modes])
-    state, slips = from_dynamics(lambda d: d.start_friction(rest), t, y, scene, begun)
-    return state, jnp.concatenate([slips, modes])
-
-
-def switch(
-    t: Scalar,
-    y: State,
-    scene: Scene,
-    mode: Float[Array, " modes"],
-    fired: Bool[Array, " guards"],
-    rest: Scalar,
-    elastic: bool = True,
-) -> tuple[State, Float[Array, " modes"]]:
-    """State and modes after the guards that `fired`; `elastic` is False where impacts have accumulated.
-
-    The impact and the friction behind it are two functions for `in_scalars`, of which one would be too large for it.
-    """
-    if not scene.contacts:
-        return from_dynamics(lambda d: d.switch_friction(fired, mode, rest), t, y, scene, mode)
-    n = _rows_of_friction(scene, mode)
-
-    def strike(t: Array, q: Array, qd: Array) -> tuple[Array, Array, Array]:
-        return impact(t, q, qd, scene.bind_state(t, q, qd), mode[n:], fired[n:], rest, elastic)
-
-    qd, closed, stopped = in_scalars(strike, t, y.q, y.qd, seed=y.q)
-    after = y._replace(qd=qd)
-    if not n:
-        return after, closed
-    struck = jnp.any(qd != y.qd)
-    after, slips = from_dynamics(
-        lambda d: d.switch_struck(fired[:n], stopped, struck, rest),
-        *(t, after, scene, jnp.concatenate([mode[:n], closed])),
-    )
-    return after, jnp.concatenate([slips, closed])
 
 
 def vector_field(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> State:

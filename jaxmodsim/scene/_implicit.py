@@ -45,11 +45,8 @@ def check_step(scene: Scene) -> None:
 
     - `ValueError` naming the friction element or the contact that it cannot step, and what to do.
     """
-    if scene.contacts:
-        raise ValueError(
-            f"ImplicitFriction takes no events, which {', '.join(scene.contacts)} opens and closes by: use another"
-            " solver."
-        )
+    if events := {**scene.contacts, **scene.switches}:
+        raise ValueError(f"ImplicitFriction takes no events, by which {', '.join(events)} changes: use another solver.")
     if scene.compliant:
         raise ValueError(
             f"ImplicitFriction takes no forces of contacts ({', '.join(scene.compliant)}): use another solver."

@@ -19,8 +19,8 @@ from .forces._friction import Friction
 
 
 def has_linear_solver(scene: Scene) -> bool:
-    """Whether `linear_solver` knows all of the scene: no constraints, and no friction that depends on accelerations."""
-    depends = scene.event_driven or scene.reaction_loaded
+    """Whether `linear_solver` knows the scene: no constraints, no switches, no friction by accelerations."""
+    depends = scene.event_driven or scene.reaction_loaded or scene.switches
     return not (depends or scene.constraints or any(isinstance(x, Friction) and x.karnopp for x in scene.effects))
 
 

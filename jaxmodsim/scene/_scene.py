@@ -21,6 +21,7 @@ from ._coordinates import as_coordinates, read_label
 from ._signal import Signal, signals_at, signals_from, signals_of
 from .forces._effect import AbstractEffect
 from .forces._friction import Friction
+from .forces._switch import Switch
 
 # The test of uniqueness looks at every corner of the box of slopes, two to this power; an impact tries stick, and slip
 # in either direction, of each element: three to this power.
@@ -62,8 +63,8 @@ def _effects(effects: Any) -> tuple[AbstractEffect, ...]:
     for effect in effects:
         if not isinstance(effect, AbstractEffect):
             raise ValueError(
-                f"effects must hold AppliedForce or Friction objects, but it holds {effect!r}. A friction law goes"
-                " into Friction(law)."
+                f"effects must hold AppliedForce, Friction or Switch objects, but it holds {effect!r}. A friction law"
+                " goes into Friction(law)."
             )
     return tuple(effects)
 
@@ -108,7 +109,7 @@ class Scene(AbstractReadable, eqx.Module):
       from q, qd or `params`, or that counts a loop of `jax.lax`.
     - `params`: pytree of real numbers, arrays or `Signal`s for the Lagrangian and the applied forces, mostly a
       mapping by names. Integers become floating; what is no number (sizes, options, None) belongs into the functions.
-    - `effects`: tuple of `AppliedForce` and `Friction`.
+    - `effects`: tuple of `AppliedForce`, `Friction` and `Switch`.
     - `constraints`: tuple of `Constraint` and `VelocityConstraint`, for coordinates that are not independent, and of
       `Contact`.
     - `coordinates`: names of the coordinates with their units, such as `("x [m]", "phi [rad]")`, for messages, tables
@@ -231,6 +232,11 @@ class Scene(AbstractReadable, eqx.Module):
         return {name: each for name, each in self._all_contacts.items() if each.compliant is None}
 
     @property
+    def switches(self) -> dict[str, Switch]:
+        """The effects that change at events of their own, by name."""
+        return {name: each for name, each in zip(self.names, self.effects, strict=True) if isinstance(each, Switch)}
+
+    @property
     def compliant(self) -> dict[str, Contact]:
         """The contacts that give way, which have no modes, by name."""
         return {name: each for name, each in self._all_contacts.items() if each.compliant is not None}
@@ -252,15 +258,21 @@ class Scene(AbstractReadable, eqx.Module):
 
     @property
     def mode_names(self) -> tuple[str, ...]:
-        """What has a mode, in the order of the modes: friction elements that run by events, then contacts."""
-        return (*self.event_driven, *self.contacts)
+        """What has a mode, in the order of the modes: friction elements that run by events, contacts, switches."""
+        return (*self.event_driven, *self.contacts, *self.switches)
+
+    def split_modes(self, modes: Array) -> tuple[Array, Array, Array]:
+        """What there is one of for each mode: of the friction elements, of the contacts, and of the switches."""
+        end = modes.shape[0] - len(self.switches)
+        start = end - len(self.contacts)
+        return modes[:start], modes[start:end], modes[end:]
 
     def mode_widths(self, dof: int) -> tuple[int, ...]:
         """How many numbers the mode of each thing is: one, or of friction in a plane as many as slip has components."""
         q = jnp.zeros(dof)  # only shapes matter
         params = self.bind_time(jnp.zeros(())).params
         shapes = [each.slip_shape(q, params) for each in self.event_driven.values()]
-        return (*(math.prod(shape) for shape in shapes), *(1 for _ in self.contacts))
+        return (*(math.prod(shape) for shape in shapes), *(1 for _ in (*self.contacts, *self.switches)))
 
     @property
     def stiff(self) -> bool:
@@ -322,7 +334,7 @@ class Scene(AbstractReadable, eqx.Module):
                 f"{', '.join(self.contacts)}: contacts open and close by events, so that position and velocity do not"
                 " tell the forces: run the scene by jaxmodsim.simulate."
             )
-        modes = iter(() if mode is None else jax.lax.stop_gradient(mode[mode.shape[0] - len(self.contacts) :]))
+        modes = iter(() if mode is None else jax.lax.stop_gradient(self.split_modes(mode)[1]))
 
         def bound(x: Contact) -> BoundContact:
             return BoundContact(x, next(modes) if x.compliant is None else jnp.zeros_like(x.compliant.stiffness))

@@ -208,7 +208,7 @@ class RunFunctions(eqx.Module):
     @at_time
     def on_zeno(self, t: Array, s: EventState, scene: Scene, fired: Array) -> EventState:
         """Stick of what chatters, where that is to be held, and closed contacts where impacts accumulate."""
-        n = fired.shape[0] - len(scene.contacts)
+        n = scene.split_modes(fired)[0].shape[0]
         if scene.contacts:
             s = self._switch(t, s, scene, fired if self.holds else fired.at[:n].set(False), False)
         if not (n and self.holds):

@@ -137,8 +137,11 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
         f"{text} (at scene{path})." for path, module in modules_of(scene) for text, _ in range_checks(module)
     )
     chatter = tuple(
-        f"The mode changes of {name!r} accumulate: chatter between stick and slip. Pass hold_chatter=True to hold it in"
-        " stick from there on."
+        f"The crossings of {name!r} accumulate: its forces push back to guard = 0 from both sides (sliding mode). Make"
+        " the force a continuous function of the guard near zero."
+        if name in scene.switches
+        else f"The mode changes of {name!r} accumulate: chatter between stick and slip. Pass hold_chatter=True to hold"
+        " it in stick from there on."
         for name, width in zip(scene.mode_names, scene.mode_widths(dof), strict=True)
         for _ in range(width)
     )

@@ -37,13 +37,13 @@ _Value = TypeVar("_Value")
 class Events(NamedTuple):
     """Mode changes along a run in order of time, padded with infinity or -1; in words: `Trajectory.mode_changes`.
 
-    Set-valued laws that run exactly and contacts change modes. Elements that do so at the same instant have one entry
-    each. An impact is an entry of its contact, from open to open where the gap opens again.
+    Set-valued laws that run exactly, contacts and switches change modes. Elements that do so at the same instant have
+    one entry each. An impact is an entry of its contact, from open to open where the gap opens again.
 
     - `t`: time [s], differentiable.
     - `effect`: index of the effect in the scene; contacts follow the effects, in the order of the constraints.
     - `before`, `after`: mode before and after: of friction 0 in stick, else the sign of the slip velocity, in the plane
-      1; of a contact 0 where it is open, 1 where it is closed.
+      1; of a contact 0 where it is open, 1 where it is closed; of a switch the sign of its guard.
     """
 
     t: Float[Array, " events"]
@@ -53,11 +53,11 @@ class Events(NamedTuple):
 
 
 class ModeChange(NamedTuple):
-    """A change of the mode of a friction element or a contact, or an impact.
+    """A change of the mode of a friction element, a contact or a switch, or an impact.
 
     - `t`: time [s]; `effect`: name of the element.
     - `before`, `after`: `"stick"`, or `"forward"` or `"backward"` for positive and negative slip, `"slip"` in the
-      plane; of a contact `"open"` or `"closed"`.
+      plane; of a contact `"open"` or `"closed"`; of a switch `"above"` or `"below"`.
     """
 
     t: float
@@ -67,7 +67,7 @@ class ModeChange(NamedTuple):
 
 
 _MODES, _PLANE_MODES = {0: "stick", 1: "forward", -1: "backward"}, {0: "stick", 1: "slip"}
-_CONTACT_MODES = {0: "open", 1: "closed"}
+_CONTACT_MODES, _SWITCH_MODES = {0: "open", 1: "closed"}, {1: "above", -1: "below"}
 
 
 class Energy(NamedTuple):
@@ -107,8 +107,8 @@ class Trajectory(AbstractReadable):
     - `t`: times [s], shape `[time]`; `ts`, or the end alone. Times that an early end left unreached are infinite.
     - `q`, `qd`: coordinates and velocities, shape `[time, dof]`.
     - `z`: own states of effects, by effect name; each with a leading time axis.
-    - `modes`: of the friction elements that run by events and of contacts, shape `[time, modes]`; None where there are
-      none. By name: `mode`.
+    - `modes`: of the friction elements that run by events, contacts and switches, shape `[time, modes]`; None where
+      there are none. By name: `mode`.
     - `stats`: `num_steps`, `num_rejected_steps` of these, and `num_events` where laws run by events.
     - `accuracy`: what was chosen for the accuracy that was asked for; None where none was.
 
@@ -172,10 +172,10 @@ class Trajectory(AbstractReadable):
 
     @property
     def mode(self) -> dict[str, Array]:
-        """Mode of each friction element that runs by events and of each contact, by name, shape `[time]`.
+        """Mode of each friction element that runs by events, contact and switch, by name, shape `[time]`.
 
         Of friction 0 in stick, else +-1, in the plane 1: slip is then in the direction of the force in `forces`. Of a
-        contact 0 while it is open, 1 while it is closed.
+        contact 0 while it is open, 1 while it is closed; of a switch the sign of its guard.
         """
         if self.modes is None:
             return {}
@@ -188,7 +188,7 @@ class Trajectory(AbstractReadable):
         scene = self.scene
         widths = dict(zip(scene.mode_names, scene.mode_widths(self.q.shape[-1]), strict=True))
         words = {name: _MODES if width == 1 else _PLANE_MODES for name, width in widths.items()}
-        return words | dict.fromkeys(scene.contacts, _CONTACT_MODES)
+        return words | dict.fromkeys(scene.contacts, _CONTACT_MODES) | dict.fromkeys(scene.switches, _SWITCH_MODES)
 
     @property
     def events(self) -> Events:

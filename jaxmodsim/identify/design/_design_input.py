@@ -235,10 +235,10 @@ def _axis(
     if not isinstance(params, dict) or input not in params or jnp.shape(params[input]) != ():
         have = ", ".join(params) if isinstance(params, dict) else "no dict"
         raise ValueError(f"The input {input!r} must be a single number in the scene's params ({have}).")
-    if scene.event_driven:
+    if scene.mode_names:
         raise ValueError(
-            f"design_input differentiates a run with fixed steps, but {', '.join(scene.event_driven)} would need"
-            " events: wrap the law, as in Regularized(law, width)."
+            f"design_input differentiates a run with fixed steps, but {', '.join(scene.mode_names)} would need"
+            " events: wrap a law, as in Regularized(law, width)."
         )
     if input in free:
         raise ValueError(f"{input} is the input and cannot be free.")

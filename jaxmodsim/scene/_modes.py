@@ -1,0 +1,99 @@
+"""Modes at the start of a run, and after events."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._core.scalarise import in_scalars
+from .._core.shapes import Scalar
+from ._dynamics import State, from_dynamics, vector_field
+from ._impact import impact
+from ._scene import Scene
+
+
+def start(
+    t: Scalar, y: State, scene: Scene, mode: Float[Array, " modes"], rest: Scalar
+) -> tuple[State, Float[Array, " modes"]]:
+    """State and modes to begin with: elements with no more slip velocity than `rest` or rounding stick if they can.
+
+    Contacts without gap and without velocity are closed. Of `mode` only the shape counts.
+    """
+    slips, closed, sides = scene.split_modes(mode)
+    if scene.contacts:
+        closed = _start_contacts(t, y, scene, rest)
+    if scene.switches:
+        sides = _start_switches(t, y, scene, jnp.concatenate([jnp.zeros_like(slips), closed, jnp.ones_like(sides)]))
+    if scene.event_driven:
+        begun = _join(jnp.zeros_like(slips), closed, sides)
+        y, slips = from_dynamics(lambda d: d.start_friction(rest), t, y, scene, begun)
+    return y, _join(slips, closed, sides)
+
+
+def _start_contacts(t: Scalar, y: State, scene: Scene, rest: Scalar) -> Float[Array, " contacts"]:
+    eps, params = 8.0 * float(jnp.finfo(y.q.dtype).eps), scene.bind_time(t).params
+    closed = []
+    for each in scene.contacts.values():
+        gap, velocity = each.error(t, y.q, params), each.rate(t, y.q, y.qd, params)
+        size = jnp.max(jnp.abs(y.q)), jnp.max(jnp.abs(y.qd))
+        here = jnp.maximum(jnp.stack([gap, velocity])[:, 0], 0.0)
+        closed.append(jnp.all(here <= jnp.maximum(rest, eps * jnp.stack(size))) & (velocity[0] >= -rest))
+    return jnp.where(jnp.stack(closed), 1.0, jnp.zeros_like(y.q[0]))
+
+
+def _start_switches(t: Scalar, y: State, scene: Scene, mode: Float[Array, " modes"]) -> Float[Array, " switches"]:
+    """On which sides the guards are; one of zero is where it goes."""
+    rate, params = vector_field(t, y, scene, mode), scene.bind_time(t).params
+
+    def guards(t: Array, q: Array, qd: Array) -> Array:
+        return jnp.stack([each.value(t, q, qd, params) for each in scene.switches.values()])
+
+    value, pace = jax.jvp(guards, (t, y.q, y.qd), (jnp.ones_like(t), rate.q, rate.qd))
+    return jnp.where(jnp.where(value == 0, pace, value) >= 0, 1.0, -jnp.ones_like(value))
+
+
+def _join(*modes: Array) -> Float[Array, " modes"]:
+    """Modes of friction elements, contacts and switches in one array."""
+    some = [each for each in modes if each.size]
+    return some[0] if len(some) == 1 else jnp.concatenate(some)
+
+
+def switch(
+    t: Scalar,
+    y: State,
+    scene: Scene,
+    mode: Float[Array, " modes"],
+    fired: Bool[Array, " guards"],
+    rest: Scalar,
+    elastic: bool = True,
+) -> tuple[State, Float[Array, " modes"]]:
+    """State and modes after the guards that `fired`; `elastic` is False where impacts have accumulated.
+
+    The impact and the friction behind it are two functions for `in_scalars`, of which one would be too large for it.
+    """
+    slips, closed, sides = scene.split_modes(mode)
+    slip_fired, contact_fired, side_fired = scene.split_modes(fired)
+    if scene.switches:
+        sides = jnp.where(side_fired, -sides, sides)
+    if not scene.contacts:
+        if slips.size:
+            whole = _join(slips, sides)
+            y, slips = from_dynamics(lambda d: d.switch_friction(slip_fired, slips, rest), t, y, scene, whole)
+        return y, _join(slips, sides)
+
+    if scene.switches:
+        # What a switch lifts opens at the same instant, so that its time has the derivative of the switch.
+        push = from_dynamics(lambda d: d.contact_forces, t, y, scene, _join(slips, closed, sides))
+        contact_fired = contact_fired | ((closed > 0) & (push < 0))
+
+    def strike(t: Array, q: Array, qd: Array) -> tuple[Array, Array, Array]:
+        return impact(t, q, qd, scene.bind_state(t, q, qd), closed, contact_fired, rest, elastic)
+
+    qd, closed, stopped = in_scalars(strike, t, y.q, y.qd, seed=y.q)
+    after = y._replace(qd=qd)
+    if slips.size:
+        struck = jnp.any(qd != y.qd)
+        after, slips = from_dynamics(
+            lambda d: d.switch_struck(slip_fired, stopped, struck, rest),
+            *(t, after, scene, _join(slips, closed, sides)),
+        )
+    return after, _join(slips, closed, sides)
