@@ -79,6 +79,19 @@ def remark_on_rounding() -> None:
     )
 
 
+@cache
+def remark_on_fixed_steps(solver: str, dt: float, most: float) -> None:
+    """Log once that the fixed steps of a run that is differentiated are too long for an explicit solver."""
+    _LOG.warning(
+        "This run is differentiated over fixed steps of dt=%.3g s, too long for the fastest motion of the scene: errors"
+        " of the derivative may grow with %s, though the motion looks right. Pass dt <= %.2g s, an implicit solver such"
+        " as jaxmodsim.Rodas5P(), or tolerances in place of dt.",
+        dt,
+        solver,
+        most,
+    )
+
+
 def remark_on_compilation(seconds: float, functions: Iterable[object]) -> None:
     """Log a compilation that took long, and a function that is compiled again and again because it is made anew.
 

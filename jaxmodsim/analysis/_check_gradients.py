@@ -15,6 +15,7 @@ from jaxtyping import Array, PyTree
 
 from ..scene import Scene, elements, read_element, replace_elements
 from ..simulation import Trajectory, simulate
+from ..solvers import StoredSteps
 from . import _words as words
 from ._differences import (
     Agreement,
@@ -37,6 +38,8 @@ _RTOL = {8: 1e-3, 4: 1e-2}
 _RTOL_MODES = {8: 1e-6, 4: 1e-3}
 # Differences with an estimated error above this part of the derivative say nothing.
 _UNCLEAR = 0.1
+# Adjoints whose steps keep the tolerance for derivatives; None stands for the default.
+_CONTROLLED = (StoredSteps, type(None))
 _INTERFACE = (
     "check_gradients needs a function fn(scene, simulate) that returns one number and runs the scene with the"
     " `simulate` it is given, as in: def fn(scene, simulate=jaxmodsim.simulate): return simulate(scene, [1.0], [0.0],"
@@ -120,11 +123,10 @@ def check_gradients(
     jax.grad(end)(scene)
     ```
 
-    The function gets the `simulate` to use as its second argument, because forward mode goes another way than reverse
-    mode (`diffrax.ForwardMode`), and because the modes of the runs are watched. Give it `jaxmodsim.simulate` as a
-    default, and it serves `jax.grad` as it is. It may run several scenes, also others made of this one; initial values
-    and times are checked if it takes them from `scene.params`. Do not put it inside `jax.jit`: `simulate` compiles by
-    itself.
+    The function gets the `simulate` to use as its second argument, so that the modes of the runs are watched. Give it
+    `jaxmodsim.simulate` as a default, and it serves `jax.grad` as it is. It may run several scenes, also others made of
+    this one; initial values and times are checked if it takes them from `scene.params`. Do not put it inside `jax.jit`:
+    `simulate` compiles by itself.
 
     **Differences.** Each number is changed by +-1 % of itself and by a fourth of that four times (float32: 4 %, three
     times), each run anew. Of these steps those count from which on, down to the smallest, no run has failed and all
@@ -171,7 +173,7 @@ def check_gradients(
     entries = _entries(scene, names, scales or {})
     runs: list[Trajectory] = []
     evaluate = functools.partial(_evaluate, fn, scene, runs, _recording(runs))
-    value, watched, noise = _first(fn, scene, runs)
+    value, watched, noise, adjoints = _first(fn, scene, runs)
     itemsize = min(x.dtype.itemsize for x in (value, *jtu.tree_leaves(scene)))
     if itemsize not in _RTOL:
         raise ValueError(f"check_gradients works in float32 and float64, but the scene holds {value.dtype}.")
@@ -193,6 +195,8 @@ def check_gradients(
         evaluations = probe(sample, sample(x), scale[name], itemsize)
         numbers[name] = _judge(name, evaluations, forward[name], reverse[name], scale[name], limits)
     remarks = [remark for number in numbers.values() for remark in number.remarks]
+    if adjoints and any(number.verdict == "part" for number in numbers.values()):
+        remarks.append(words.adjoint(adjoints))
     if not watched:
         remarks.append(
             "Runs inside jax.jit or jax.vmap cannot be watched: changes of modes and grazing go unseen there."
@@ -230,8 +234,11 @@ def _recording(runs: list[Trajectory]) -> Callable[..., Trajectory]:
     return run
 
 
-def _first(fn: Callable[..., Any], scene: Scene, runs: list[Trajectory]) -> tuple[Array, bool, float]:
-    """The value at the scene itself, whether its runs can be watched, and their atol; refuse what cannot be checked."""
+def _first(fn: Callable[..., Any], scene: Scene, runs: list[Trajectory]) -> tuple[Array, bool, float, tuple[str, ...]]:
+    """The value at the scene, whether its runs can be watched, their atol, and the adjoints that diffrax has for them.
+
+    What cannot be checked is refused.
+    """
     if not callable(fn):
         raise ValueError(f"{_INTERFACE} A {type(fn).__name__} was given.")
     try:
@@ -250,8 +257,9 @@ def _first(fn: Callable[..., Any], scene: Scene, runs: list[Trajectory]) -> tupl
     watched = [run for run in runs if not _traced(run)]
     atol = max((float(run.inputs.atol) for run in watched), default=0.0)
     complete = len(watched) == len(runs)
+    others = {type(run.options.adjoint).__name__ for run in runs if not isinstance(run.options.adjoint, _CONTROLLED)}
     runs.clear()
-    return jnp.asarray(value), complete, atol
+    return jnp.asarray(value), complete, atol, tuple(sorted(others))
 
 
 def _traced(tree: PyTree) -> bool:

@@ -113,6 +113,14 @@ def parting(
     return tuple(texts)
 
 
+def adjoint(names: tuple[str, ...]) -> str:
+    """What adjoints of diffrax do to derivatives."""
+    return (
+        f"The steps of a run with adjoint={' or '.join(names)} keep the tolerance of the motion alone, and derivatives"
+        " are wrong where little moves. Leave adjoint out: the default keeps the tolerance of the derivatives, too."
+    )
+
+
 def _change(history: History | None, k: int) -> str | None:
     if history is None or k >= len(history.changes):
         return None

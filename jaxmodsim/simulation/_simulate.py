@@ -7,21 +7,28 @@ import time
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, PyTree
 
 from .._core.arguments import as_flag
 from .._core.functions import Function
 from .._core.last_line import LastLines
-from .._core.speed import recommend_tuning, remark_on_compilation, remark_on_rounding
-from ..scene import Scene
+from .._core.speed import recommend_tuning, remark_on_compilation, remark_on_fixed_steps, remark_on_rounding
+from ..scene import Scene, vector_field
+from ..solvers import Gauss, ImplicitFriction, Rodas5P
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages
 from ._run_request import RunRequest, is_known
-from ._solve import RunInputs, RunOutput, compiled_runs, solve
+from ._solve import RunInputs, RunOptions, RunOutput, compiled_runs, default_solver, solve
 from ._trajectory import Trajectory, trajectory
 
+_IMPLICIT = (dfx.AbstractImplicitSolver, Gauss, ImplicitFriction, Rodas5P)
+# Longest fixed step of an explicit solver, times the fastest rate, for which a derivative is trusted.
+_LONGEST = 2.0
 # Multiple of the relative tolerance above which the rounding of the steps in single precision is remarked on.
 _ROUNDING = 2.0
 
@@ -68,7 +75,9 @@ def simulate(
       let it lie below the smallest velocity [m/s] and deflection [m] that decide anything. Above the width of a
       `Regularized` law it is refused. In float32 the rounding of n steps is about 6e-8 sqrt(n) of the state: where that
       exceeds `rtol`, as with the many steps of a stiff bristle, a remark is logged once.
-    - `dt`: fixed step [s], > 0, instead of tolerances. A sample of a `Signal` in between divides the step.
+    - `dt`: fixed step [s], > 0, instead of tolerances. A sample of a `Signal` in between divides the step. Derivatives
+      of a scene at rest need `dt` below 2 over its fastest rate [1/s] with explicit solvers; outside of `jax.jit` a
+      longer one is remarked on, once.
     - `dtmax`: longest step [s], > 0. Steps resolve the load of what sticks to `rtol` of its limit, as long as the load
       is smooth on the scale of its own derivatives. What cannot be seen is a pulse out of rest that is shorter than a
       step: give it as a `Signal`, on whose samples steps end, or bound the step by its length. Where a missed pulse
@@ -133,6 +142,7 @@ def simulate(
     if throw:
         solved = _raise_early_end(inputs, solved)
         _check_rounding(inputs, solved)
+        _check_fixed_steps(inputs, options, solved)
     return trajectory(inputs, options, solved)
 
 
@@ -147,6 +157,26 @@ def _check_rounding(inputs: RunInputs, solved: RunOutput) -> None:
         rounding = 0.5 * float(jnp.finfo(jnp.float32).eps) * math.sqrt(int(steps))
         if rounding > _ROUNDING * float(inputs.rtol):
             remark_on_rounding()
+
+
+def _check_fixed_steps(inputs: RunInputs, options: RunOptions, solved: RunOutput) -> None:
+    """Remark on explicit fixed steps, of a run that is differentiated, beyond about the limit of stability.
+
+    At rest the motion stays right there, and the derivative grows without bound. The rate is the spectral radius of the
+    vector field at the end of the run. It is known outside of `jax.jit` alone.
+    """
+    if inputs.dt is None or is_known(*jtu.tree_leaves(inputs)):
+        return
+    end = (solved.t[-1], jtu.tree_map(lambda x: x[-1], (solved.y, solved.mode)), inputs.scene, inputs.dt)
+    t, (y, mode), scene, dt = lax.stop_gradient(end)
+    solver = options.solver or default_solver(scene, y.q.shape[0], True)
+    if not is_known(*jtu.tree_leaves((t, y, mode, scene))) or isinstance(solver, _IMPLICIT):
+        return
+    numbers, as_state = ravel_pytree(y)
+    jacobian = jax.jacfwd(lambda x: ravel_pytree(vector_field(t, as_state(x), scene.bind_time(t), mode))[0])(numbers)
+    reach = float(dt) * max(abs(np.linalg.eigvals(np.asarray(jacobian))), default=0.0)
+    if reach > _LONGEST:
+        remark_on_fixed_steps(type(solver).__name__, float(dt), float(dt) * _LONGEST / reach)
 
 
 def _functions(scene: Scene) -> list[object]:

@@ -16,6 +16,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from jaxmodsim import AppliedForce, Coulomb, Friction, Rodas5P, Scene, Signal, check_gradients, sensitivity, simulate
+from jaxmodsim._core.speed import remark_on_fixed_steps
 
 from ..helpers.differences import central_difference
 
@@ -304,3 +305,43 @@ def test_checked_derivatives_at_rest_agree() -> None:
         return simulate(scene, pose, [0.0, 0.0], 2.0, max_steps=ROOM).q[-1, 1]
 
     assert check_gradients(end, scene, names=["payload"]).ok
+
+
+def test_the_cause_of_derivatives_that_part_is_named() -> None:
+    """637 m/kg in place of -0.0226 by an adjoint of diffrax, whose steps see the state alone."""
+
+    def end(scene: Scene, simulate: Any = simulate) -> Any:
+        return simulate(scene, [-G / 400.0], [0.0], 1.0, adjoint=dfx.DirectAdjoint(), max_steps=64).q[-1, 0]
+
+    check = check_gradients(end, MASS, names=["m"])
+    assert check.numbers["m"].verdict == "part"
+    assert any("adjoint=DirectAdjoint" in remark and "Leave adjoint out" in remark for remark in check.remarks)
+
+
+@pytest.mark.parametrize("name", ["Tsit5", "Rodas5P"])
+def test_fixed_steps_that_are_too_long_are_remarked_on(name: str, caplog: Any) -> None:
+    """The fastest rate is 20 1/s: 0.05 s is right, 0.2 s is too long for explicit steps."""
+    exact = slopes_at_rest(1.0, 400.0, 4.0, 10.0)[0]
+
+    def slope(dt: float) -> float:
+        remark_on_fixed_steps.cache_clear()
+        caplog.clear()
+        run = lambda scene: simulate(scene, [-G / 400.0], [0.0], 10.0, dt=dt, solver=SOLVERS[name]).q[-1, 0]  # noqa: E731
+        return float(jax.grad(run)(MASS).params["m"])
+
+    with caplog.at_level("WARNING", logger="jaxmodsim"):
+        assert slope(0.05) == pytest.approx(exact, rel=1e-5)
+        assert "fixed steps" not in caplog.text
+        long = slope(0.2)
+        if name == "Rodas5P":
+            assert long == pytest.approx(exact, rel=1e-3)
+            assert "fixed steps" not in caplog.text
+        else:
+            assert abs(long / exact) > 1e6
+            assert "dt=0.2 s" in caplog.text
+            assert "Pass dt <= 0.1 s" in caplog.text
+        # A plain run is not looked at.
+        remark_on_fixed_steps.cache_clear()
+        caplog.clear()
+        simulate(MASS, [-G / 400.0], [0.0], 10.0, dt=0.2, solver=SOLVERS[name])
+        assert "fixed steps" not in caplog.text
