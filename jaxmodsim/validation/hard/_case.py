@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -59,7 +58,7 @@ class SceneTask(eqx.Module):
         numbers = cast.numbers | {"rtol": jnp.maximum(cast.numbers["rtol"], _LEAST_RTOL[dtype])}
         return eqx.tree_at(lambda task: task.numbers, cast, numbers)
 
-    def run(self, x: Float[Array, ""], adjoint: dfx.AbstractAdjoint | None = None) -> Trajectory:
+    def run(self, x: Float[Array, ""]) -> Trajectory:
         """The run for another value of the number `by`."""
         scene, q0, qd0 = self.scene, self.q0, self.qd0
         if self.by.startswith("q0["):
@@ -68,23 +67,23 @@ class SceneTask(eqx.Module):
             qd0 = qd0.at[_index(self.by)].set(x)
         else:
             scene = replace_elements(scene, {self.by: x})
-        return simulate(scene, q0, qd0, self.t1, **self.numbers, **dict(self.choices), adjoint=adjoint, throw=False)
+        return simulate(scene, q0, qd0, self.t1, **self.numbers, **dict(self.choices), throw=False)
 
-    def answer(self, x: Float[Array, ""], adjoint: dfx.AbstractAdjoint | None = None) -> Answer:
+    def answer(self, x: Float[Array, ""]) -> Answer:
         """The number asked for."""
-        run = self.run(x, adjoint)
+        run = self.run(x)
         return Answer(run.code, self.read(run))
 
 
 class FunctionTask(eqx.Module):
     """Another computation of one number from one number: with the event solver alone, or with charts.
 
-    - `fn`: `fn(x, adjoint)` -> an `Answer`; `adjoint` is None for the default.
+    - `fn`: `fn(x)` -> an `Answer`.
     - `x`: the number that it is a function of.
     - `by`: what that is.
     """
 
-    fn: Callable[[Array, dfx.AbstractAdjoint | None], Answer] = eqx.field(static=True)
+    fn: Callable[[Array], Answer] = eqx.field(static=True)
     x: float = eqx.field(static=True)
     by: str = eqx.field(static=True)
 
@@ -93,9 +92,9 @@ class FunctionTask(eqx.Module):
         del dtype
         return self
 
-    def answer(self, x: Float[Array, ""], adjoint: dfx.AbstractAdjoint | None = None) -> Answer:
+    def answer(self, x: Float[Array, ""]) -> Answer:
         """The number asked for."""
-        return self.fn(x, adjoint)
+        return self.fn(x)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -154,7 +153,7 @@ def _vmap(task: SceneTask | FunctionTask, x: Array) -> Answer:
 @eqx.filter_jit
 def _forward(task: SceneTask | FunctionTask, x: Array) -> tuple[Answer, Array]:
     def value(x: Array) -> tuple[Array, Answer]:
-        answer = task.answer(x, dfx.ForwardMode())
+        answer = task.answer(x)
         return answer.value, answer
 
     _, slope, answer = jax.jvp(value, (x,), (jnp.ones_like(x),), has_aux=True)

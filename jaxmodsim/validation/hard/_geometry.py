@@ -86,8 +86,7 @@ def _poles() -> list[HardCase]:
     ]
 
 
-def _at_pole(rate: Array, adjoint: object) -> Answer:
-    del adjoint
+def _at_pole(rate: Array) -> Answer:
     q = jnp.asarray([2.0, 0.0, 0.3], rate.dtype)
     qd = jnp.stack([jnp.asarray(0.1, rate.dtype), rate, jnp.asarray(0.7, rate.dtype)])
     return Answer(jnp.asarray(0), Spherical().acceleration(q, qd, jnp.zeros_like(q))[2])

@@ -13,7 +13,7 @@ from ...friction import AbstractSetValuedLaw, Coulomb
 from ...problems import belt_oscillator, bouncing_ball, braked_spring, coupled_belts, ramped_box
 from ...scene import AppliedForce, Friction, Scene
 from ...simulation import Trajectory
-from ...solvers import EventController, EventSolver, EventState
+from ...solvers import EventController, EventSolver, EventState, StoredSteps
 from ._case import Answer, FunctionTask, HardCase, motion, position
 
 FAMILY = "many events"
@@ -25,7 +25,6 @@ def _solve(
     solver: EventSolver,
     t1: float,
     start: EventState,
-    adjoint: dfx.AbstractAdjoint | None,
 ) -> tuple[Array, PyTree]:
     """Code and last state of a run of the event solver in plain diffrax."""
     dtype = start.t.dtype
@@ -38,7 +37,7 @@ def _solve(
         None,
         start,
         stepsize_controller=EventController(dfx.PIDController(rtol=rtol, atol=rtol)),
-        adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        adjoint=StoredSteps(),
         max_steps=4096,
         throw=False,
     )
@@ -47,21 +46,21 @@ def _solve(
     return code, solution.ys
 
 
-def _bounce(e: Array, adjoint: dfx.AbstractAdjoint | None, held: bool) -> Answer:
+def _bounce(e: Array, held: bool) -> Answer:
     ball = bouncing_ball.BouncingBall(e=e, g=jnp.asarray(_G, e.dtype))
     hold = ball.hold if held else None
     solver = EventSolver(dfx.Tsit5(), ball.guards, ball.reset, on_zeno=hold, max_events=512, log=False)
     start = solver.start(jnp.zeros((), e.dtype), ball.dropped(1.0), mode=jnp.zeros((), e.dtype))
-    code, ys = _solve(ball.field, solver, 2.0, start, adjoint)
+    code, ys = _solve(ball.field, solver, 2.0, start)
     return Answer(code, ys.t[-1])
 
 
-def _bounce_to_rest(e: Array, adjoint: dfx.AbstractAdjoint | None) -> Answer:
-    return _bounce(e, adjoint, held=True)
+def _bounce_to_rest(e: Array) -> Answer:
+    return _bounce(e, held=True)
 
 
-def _bounce_unheld(e: Array, adjoint: dfx.AbstractAdjoint | None) -> Answer:
-    return _bounce(e, adjoint, held=False)
+def _bounce_unheld(e: Array) -> Answer:
+    return _bounce(e, held=False)
 
 
 def _zeno() -> list[HardCase]:
@@ -276,7 +275,7 @@ def _caught(t: object, s: EventState, args: object, fired: Array) -> EventState:
     return s._replace(y=0.0 * s.y + 1.0, mode=jnp.ones_like(s.mode))
 
 
-def _throw(v0: Array, adjoint: dfx.AbstractAdjoint | None) -> Answer:
+def _throw(v0: Array) -> Answer:
     """A ball is thrown up and caught where it touches the ceiling, one metre above."""
     one = jnp.ones((), v0.dtype)
     solver = EventSolver(dfx.Tsit5(), _below_ceiling, _caught, log=False)
@@ -285,7 +284,7 @@ def _throw(v0: Array, adjoint: dfx.AbstractAdjoint | None) -> Answer:
     def field(t: object, s: EventState, args: object) -> EventState:
         return s.rate(jnp.where(s.mode > 0.5, 0.0, jnp.stack([s.y[1], -_G * one])))
 
-    code, ys = _solve(field, solver, 1.0, start, adjoint)
+    code, ys = _solve(field, solver, 1.0, start)
     return Answer(code, ys.t[-1])
 
 

@@ -12,6 +12,7 @@ import jax
 
 from ..._core.arguments import did_you_mean
 from . import (
+    _at_rest,
     _contacts,
     _geometry,
     _gradients,
@@ -29,7 +30,7 @@ from ._check import DTYPES, TRANSFORMS, CaseReport, CheckFinding, check, check_c
 
 _MODULES = (
     *(_stiffness, _reversal, _shaken, _many_events, _contacts, _orbits),
-    *(_plane, _geometry, _scale, _numbers, _gradients),
+    *(_plane, _geometry, _scale, _numbers, _gradients, _at_rest),
 )
 
 # Families of hard cases, in the order in which they run.
@@ -46,7 +47,7 @@ def hard_cases() -> dict[str, HardCase]:
     ```
 
     Families: stiffness, rest and reversal, loads in stick, many events, contacts, periodic orbits, geometry, scale and
-    time, numbers, gradients.
+    time, numbers, gradients, derivatives at rest.
     """
     return {case.name: replace(case, family=module.FAMILY) for module in _MODULES for case in module.cases()}
 
