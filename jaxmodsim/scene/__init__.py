@@ -7,8 +7,6 @@ from ._dynamics import ConstraintReaction as ConstraintReaction
 from ._dynamics import State as State
 from ._dynamics import forward_dynamics as forward_dynamics
 from ._dynamics import from_dynamics as from_dynamics
-from ._dynamics import start as start
-from ._dynamics import switch as switch
 from ._dynamics import vector_field as vector_field
 from ._event_driven import mode_numbers as mode_numbers
 from ._implicit import check_step as check_step
@@ -29,6 +27,8 @@ from ._scene import Scene as Scene
 from ._signal import Signal as Signal
 from ._signal import sample_times as sample_times
 from ._signal import signals_of as signals_of
+from ._switching import start as start
+from ._switching import switch as switch
 from .forces._applied_force import AppliedForce as AppliedForce
 from .forces._effect import AbstractEffect as AbstractEffect
 from .forces._effect import Action as Action

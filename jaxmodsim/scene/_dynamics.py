@@ -31,7 +31,6 @@ from ._event_driven import (
     stick_violation,
     stop_slip,
 )
-from ._impact import impact
 from ._karnopp import karnopp_forces
 from ._scene import Scene
 from .forces._effect import Action, Power
@@ -168,9 +167,9 @@ class Dynamics(NamedTuple):
     def guards(self, rest: Scalar, tolerances: tuple[Array, Array]) -> tuple[Float[Array, " guards"], ...]:
         """Guards that are positive while the modes hold, and their tolerances; see `friction_guards`.
 
-        Of a contact that is open the gap, of one that is closed its multiplier. A gap counts as closed only at `-rest`:
-        behind an impact, and where a contact opens, it begins from zero. Of scenes with contacts there follow the
-        values that guards have at their events: of a gap `rest`.
+        Of a contact that is open the gap, of one that is closed its multiplier. A gap counts as closed only where it is
+        negative by more than its rounding: behind an impact, and where a contact opens, it begins from zero. Of scenes
+        with contacts there follow the values that guards have at their events: of a gap its rounding.
         """
         friction, gaps = self._elements, self._closed
         guards, atol, roots = [], [], [jnp.zeros_like(friction)]
@@ -183,10 +182,12 @@ class Dynamics(NamedTuple):
             assert self.multipliers is not None
             pushes = by_constraint(self.scene, self.t, self.y, self.multipliers)
             pushing = jnp.concatenate([pushes[name] for name in self.scene.contacts])
-            wide = [each.error(self.t, self.y.q, self.scene.params) for each in self.scene.contacts.values()]
-            guards.append(jnp.where(gaps > 0, pushing, jnp.concatenate(wide) + rest))
+            contacts, at = self.scene.contacts.values(), (self.t, self.y.q, self.scene.params)
+            wide = jnp.concatenate([each.error(*at) for each in contacts])
+            rounding = jnp.stack([each.rounding(*at) for each in contacts])
+            guards.append(jnp.where(gaps > 0, pushing, wide + rounding))
             atol.append(jnp.where(gaps > 0, 0.0, tolerances[1]))
-            roots.append(jnp.where(gaps > 0, 0.0, rest))
+            roots.append(jnp.where(gaps > 0, 0.0, rounding))
         return tuple(jnp.concatenate(each) for each in (guards, atol, *([roots] if gaps.size else [])))
 
     def start_friction(self, rest: Scalar) -> tuple[State, Float[Array, " n"]]:
@@ -431,62 +432,6 @@ def from_dynamics(get: Callable[[Dynamics], _Value], t: Scalar, y: State, scene:
     Laws, loads and solves are small arrays like the terms of the Lagrangian; see `in_scalars`.
     """
     return in_scalars(lambda t, y, mode: get(forward_dynamics(t, y, scene, mode)), t, y, mode, seed=y.q)
-
-
-def start(
-    t: Scalar, y: State, scene: Scene, mode: Float[Array, " modes"], rest: Scalar
-) -> tuple[State, Float[Array, " modes"]]:
-    """State and modes to begin with: elements with no more slip velocity than `rest` or rounding stick if they can.
-
-    Contacts without gap and without velocity are closed. Of `mode` only the shape counts.
-    """
-    if not scene.contacts:
-        return from_dynamics(lambda d: d.start_friction(rest), t, y, scene, mode)
-    eps, params = 8.0 * float(jnp.finfo(y.q.dtype).eps), scene.bind_time(t).params
-    closed = []
-    for each in scene.contacts.values():
-        gap, velocity = each.error(t, y.q, params), each.rate(t, y.q, y.qd, params)
-        size = jnp.max(jnp.abs(y.q)), jnp.max(jnp.abs(y.qd))
-        here = jnp.maximum(jnp.stack([gap, velocity])[:, 0], 0.0)
-        closed.append(jnp.all(here <= jnp.maximum(rest, eps * jnp.stack(size))) & (velocity[0] >= -rest))
-    modes = jnp.where(jnp.stack(closed), 1.0, jnp.zeros_like(y.q[0]))
-    if not scene.event_driven:
-        return y, modes
-    begun = jnp.concatenate([jnp.zeros_like(mode[: _rows_of_friction(scene, mode)]), modes])
-    state, slips = from_dynamics(lambda d: d.start_friction(rest), t, y, scene, begun)
-    return state, jnp.concatenate([slips, modes])
-
-
-def switch(
-    t: Scalar,
-    y: State,
-    scene: Scene,
-    mode: Float[Array, " modes"],
-    fired: Bool[Array, " guards"],
-    rest: Scalar,
-    elastic: bool = True,
-) -> tuple[State, Float[Array, " modes"]]:
-    """State and modes after the guards that `fired`; `elastic` is False where impacts have accumulated.
-
-    The impact and the friction behind it are two functions for `in_scalars`, of which one would be too large for it.
-    """
-    if not scene.contacts:
-        return from_dynamics(lambda d: d.switch_friction(fired, mode, rest), t, y, scene, mode)
-    n = _rows_of_friction(scene, mode)
-
-    def strike(t: Array, q: Array, qd: Array) -> tuple[Array, Array, Array]:
-        return impact(t, q, qd, scene.bind_state(t, q, qd), mode[n:], fired[n:], rest, elastic)
-
-    qd, closed, stopped = in_scalars(strike, t, y.q, y.qd, seed=y.q)
-    after = y._replace(qd=qd)
-    if not n:
-        return after, closed
-    struck = jnp.any(qd != y.qd)
-    after, slips = from_dynamics(
-        lambda d: d.switch_struck(fired[:n], stopped, struck, rest),
-        *(t, after, scene, jnp.concatenate([mode[:n], closed])),
-    )
-    return after, jnp.concatenate([slips, closed])
 
 
 def vector_field(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> State:
