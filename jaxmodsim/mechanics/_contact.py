@@ -17,6 +17,9 @@ from .._core.shapes import PerDof, Scalar
 from ._constraints import AbstractConstraint, AbstractPositionConstraint, as_at
 from ._restitution import HuntCrossley, Poisson
 
+# Rounding units in a gap, of the terms that it is made of.
+_ROUNDING = 4.0
+
 
 class Contact(AbstractPositionConstraint):
     """A unilateral contact `gap(t, q, params) >= 0`: open, closed, or struck at an instant.
@@ -83,6 +86,12 @@ class Contact(AbstractPositionConstraint):
     def value(self, t: Scalar, x: Float[Array, "..."], params: PyTree) -> Float[Array, "..."]:
         """The gap."""
         return self.gap(t, x, params)
+
+    def rounding(self, t: Scalar, q: PerDof, params: PyTree) -> Scalar:
+        """Rounding error of the gap, from the coordinates and the time that it is made of; constant."""
+        t, q, params = jax.lax.stop_gradient((t, q, params))
+        by_t, by_q = jax.grad(lambda t, q: self.error(t, q, params)[0], (0, 1))(t, q)
+        return _ROUNDING * float(jnp.finfo(q.dtype).eps) * (jnp.abs(by_t * t) + jnp.sum(jnp.abs(by_q * q)))
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check that the gap is one number."""

@@ -13,8 +13,6 @@ from ._implicit import check_step as check_step
 from ._implicit import scene_step as scene_step
 from ._linear_solver import has_linear_solver as has_linear_solver
 from ._linear_solver import linear_solver as linear_solver
-from ._modes import start as start
-from ._modes import switch as switch
 from ._names import elements as elements
 from ._names import read_element as read_element
 from ._names import replace_elements as replace_elements
@@ -29,6 +27,8 @@ from ._scene import Scene as Scene
 from ._signal import Signal as Signal
 from ._signal import sample_times as sample_times
 from ._signal import signals_of as signals_of
+from ._switching import start as start
+from ._switching import switch as switch
 from .forces._applied_force import AppliedForce as AppliedForce
 from .forces._effect import AbstractEffect as AbstractEffect
 from .forces._effect import Action as Action

@@ -167,9 +167,10 @@ class Dynamics(NamedTuple):
     def guards(self, rest: Scalar, tolerances: tuple[Array, Array]) -> tuple[Float[Array, " guards"], ...]:
         """Guards that are positive while the modes hold, and their tolerances; see `friction_guards`.
 
-        Of a contact that is open the gap, of one that is closed its multiplier. A gap counts as closed only at `-rest`:
-        behind an impact, and where a contact opens, it begins from zero. Of a switch its guard, times its mode. Of
-        scenes with contacts there follow the values that guards have at their events: of a gap `rest`.
+        Of a contact that is open the gap, of one that is closed its multiplier. A gap counts as closed only where it is
+        negative by more than its rounding: behind an impact, and where a contact opens, it begins from zero. Of a
+        switch its guard, times its mode. Of scenes with contacts there follow the values that guards have at their
+        events: of a gap its rounding.
         """
         friction, gaps, sides = self._modes
         guards, atol, roots = [], [], [jnp.zeros_like(friction)]
@@ -179,10 +180,12 @@ class Dynamics(NamedTuple):
             of_friction = friction_guards(self.friction_elements, self.friction, friction, slowest, tolerances)
             guards, atol = [of_friction[0]], [of_friction[1]]
         if gaps.size:
-            wide = [each.error(self.t, self.y.q, self.scene.params) for each in self.scene.contacts.values()]
-            guards.append(jnp.where(gaps > 0, self.contact_forces, jnp.concatenate(wide) + rest))
+            contacts, at = self.scene.contacts.values(), (self.t, self.y.q, self.scene.params)
+            wide = jnp.concatenate([each.error(*at) for each in contacts])
+            rounding = jnp.stack([each.rounding(*at) for each in contacts])
+            guards.append(jnp.where(gaps > 0, self.contact_forces, wide + rounding))
             atol.append(jnp.where(gaps > 0, 0.0, tolerances[1]))
-            roots.append(jnp.where(gaps > 0, 0.0, rest))
+            roots.append(jnp.where(gaps > 0, 0.0, rounding))
         if sides.size:
             switches = self.scene.switches.values()
             values = [each.value(self.t, self.y.q, self.y.qd, self.scene.params) for each in switches]

@@ -56,7 +56,7 @@ def impact(
     closed: Float[Array, " contacts"],
     fired: Bool[Array, " contacts"],
     rest: Scalar,
-    elastic: bool,
+    bounces: Bool[Array, " contacts"] | None,
 ) -> tuple[PerDof, Float[Array, " contacts"], Bool[Array, " elements"]]:
     """What comes after the instant at which those contacts `fired`.
 
@@ -69,7 +69,7 @@ def impact(
     - `closed`: modes before.
     - `fired`: contacts whose guards have.
     - `rest`: velocity [m/s] that counts as none.
-    - `elastic`: whether contacts give back a part of their velocity; False where impacts have accumulated, and what is
+    - `bounces`: which contacts give back a part of their velocity; None where impacts have accumulated, and what is
       left of the velocity of a gap, be it away from the contact, is below what time resolves: it is taken away.
 
     **Returns:**
@@ -86,15 +86,15 @@ def impact(
     struck, rows, reach = _struck(t, (q, qd), scene, mass, gaps, touches)
     v = jnp.concatenate([w, *(jnp.reshape(x.slip(t, q, qd, params), (1,)) for x in rubbing.values())])
     e, none = jnp.stack([each.coefficient.astype(w.dtype) for each in contacts]), jnp.zeros_like(w)
-    if not elastic:
+    if bounces is None:
         normal = solve_semidefinite(struck.delassus[:n, :n], jnp.where(touches, -w, 0.0), jnp.ones_like(w), touches)
         impulse = jnp.concatenate([normal, jnp.zeros_like(v[n:])])
     elif any(isinstance(each.restitution, Poisson) for each in contacts):
         squeeze = _impulses(struck, v, none)
         halfway = v + jnp.sum(struck.delassus * squeeze[None, :], axis=1)
-        impulse = squeeze + _impulses(struck, halfway, e * squeeze[:n])
+        impulse = squeeze + _impulses(struck, halfway, jnp.where(bounces, e, 0.0) * squeeze[:n])
     else:
-        aimed = (1.0 + jnp.where(closed > 0, 0.0, e)) * w
+        aimed = (1.0 + jnp.where(bounces & (closed == 0), e, 0.0)) * w
         impulse = _impulses(struck, jnp.concatenate([aimed, v[n:]]), none)
     after = v + jnp.sum(struck.delassus * impulse[None, :], axis=1)
     rounding = _ROUNDING * float(jnp.finfo(w.dtype).eps) * jnp.sum(jnp.abs(rows * qd[None, :]), axis=1)

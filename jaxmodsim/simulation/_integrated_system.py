@@ -198,6 +198,8 @@ class RunFunctions(eqx.Module):
         before = self.system.state(t, s.y, scene)
         state, mode = switch(t, before, scene, s.mode, fired, self.rest, elastic)
         after = self.system.replace(t, s.y, state, scene)
+        if scene.contacts:  # where a contact closes; the derivative, too, or the next step would move it
+            after = self.project(t, after, scene, mode)
         changed = jnp.any(mode != s.mode) | jnp.any(state.qd != before.qd)
         return s._replace(y=jtu.tree_map(lambda a, b: jnp.where(changed, a, b), after, s.y), mode=mode)
 

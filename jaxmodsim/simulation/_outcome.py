@@ -18,7 +18,7 @@ from .._core.parameters import check_ranges, modules_of, range_checks
 from .._core.scalarise import in_scalars
 from ..friction import Regularized
 from ..mechanics import constraint_residual, motion_equations, quadratic
-from ..scene import Friction, Scene, State, describe_series, from_dynamics, quantity_of
+from ..scene import Friction, Scene, State, check_scene, describe_series, from_dynamics, quantity_of
 from ..solvers import ACCUMULATION, TOO_MANY
 
 # Codes of how a run ended; `outcome_messages` has the sentence of each.
@@ -200,9 +200,7 @@ def start_code(
         code = jnp.where(_unique(now, t, y, mode), code, offsets.checks)
     code = _blame_mass(code, _pivots(now, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
     if scene.constraints:
-        off, turned = constraint_residual(now.bind_modes(mode).constraints, t, y.q, y.qd, now.params)
-        code = jnp.where((off <= _CONSISTENT) & (turned <= _CONSISTENT), code, INCONSISTENT)
-    code = jnp.where(_penetration(now, t, y) <= _CONSISTENT, code, PENETRATES)
+        code = _violation(now, now.bind_modes(mode).constraints, t, y, code)
     widths = [module.width for _, module in modules_of(scene) if isinstance(module, Regularized)]
     if atol is not None and widths:
         code = jnp.where(atol <= jnp.min(jnp.stack([jnp.min(width) for width in widths])), code, TOO_NARROW)
@@ -212,6 +210,22 @@ def start_code(
     for i, ok in reversed(list(enumerate(checks))):
         code = jnp.where(ok, code, offsets.ranges + i)
     return code
+
+
+@jax.jit
+def violation_code(scene: Scene, t: Float[Array, ""], y: State) -> Int[Array, ""]:
+    """Whether an initial state violates constraints or contacts: a small program, to ask before that of the run."""
+    check_scene(scene, y)
+    now = scene.bind_time(t)
+    return _violation(now, now.bilateral, t, y, jnp.asarray(SUCCESS))
+
+
+def _violation(scene: Scene, constraints: Any, t: Array, y: State, code: Array) -> Int[Array, ""]:
+    """`code`, or that of an initial state off these constraints, or of a gap below zero."""
+    if constraints:
+        off, turned = constraint_residual(constraints, t, y.q, y.qd, scene.params)
+        code = jnp.where((off <= _CONSISTENT) & (turned <= _CONSISTENT), code, INCONSISTENT)
+    return jnp.where(_penetration(scene, t, y) <= _CONSISTENT, code, PENETRATES)
 
 
 def end_code(

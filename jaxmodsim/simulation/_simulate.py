@@ -21,9 +21,9 @@ from .._core.last_line import LastLines
 from .._core.speed import recommend_tuning, remark_on_compilation, remark_on_fixed_steps, remark_on_rounding
 from ..scene import Scene, vector_field
 from ..solvers import Gauss, ImplicitFriction, Rodas5P
-from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages
+from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages, violation_code
 from ._run_request import RunRequest, is_known
-from ._solve import RunInputs, RunOptions, RunOutput, compiled_runs, default_solver, solve
+from ._solve import RunInputs, RunOptions, RunOutput, compiled_runs, default_solver, initial_state, solve
 from ._trajectory import Trajectory, trajectory
 
 _IMPLICIT = (dfx.AbstractImplicitSolver, Gauss, ImplicitFriction, Rodas5P)
@@ -135,6 +135,8 @@ def simulate(
         hold_chatter,
         project,
     ).checked()
+    if throw and scene.constraints:
+        _check_initial_state(inputs)
     compiled, began = compiled_runs(), time.perf_counter()
     solved = solve(inputs, options)
     if compiled_runs() > compiled:
@@ -183,6 +185,16 @@ def _functions(scene: Scene) -> list[object]:
     """The user's functions in a scene."""
     nodes = jtu.tree_leaves(scene, is_leaf=lambda x: isinstance(x, Function))
     return [each.fn for each in nodes if isinstance(each, Function)]
+
+
+def _check_initial_state(inputs: RunInputs) -> None:
+    """Raise for a known initial state that violates constraints or contacts, before the run is compiled."""
+    scene, t0 = inputs.scene, inputs.t0
+    if is_known(*jtu.tree_leaves((scene, t0, inputs.q0, inputs.qd0, inputs.z0))):
+        y = initial_state(inputs)
+        code = violation_code(scene, t0, y)
+        if is_known(code) and int(code) != SUCCESS:
+            raise SimulationError(describe_failure(scene, float(t0), y, int(code)))
 
 
 def _raise_early_end(inputs: RunInputs, solved: RunOutput) -> RunOutput:

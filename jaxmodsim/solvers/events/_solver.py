@@ -19,9 +19,9 @@ from ._policy import AbstractGuardPolicy, Conditions, Crossings
 from ._samples import Landing, SampledJumps, on_jump
 from ._state import ACCUMULATION, ONGOING, TOO_MANY, EventLog, EventMemory, EventState, write
 
-# How far beside the root a step may end, as a fraction of the last steps; from there the state is carried to the root,
-# with an error of the third power of that distance.
-_LANDING = 1e-5
+# How far beside the root a step may end, as a fraction of the last steps, and of the time since the last event; from
+# there the state is carried to the root, with an error of the third power of that distance.
+_LANDING, _LANDING_OF_INTERVAL = 1e-5, 1e-2
 # A step this much shorter than the last ones has no length.
 _SHORT = 1e-6
 # Events accumulate where the longest of the last intervals is below this part of the time since the start, times the
@@ -268,7 +268,7 @@ class EventSolver(AbstractSolverWrapper):
         # Where nothing moves steps grow without measure, and tell nothing of the motion that the event begins.
         measure = jnp.minimum(length, _GROW * pace)
         jumps = None if self.samples is None else self.samples.at(t1, length)
-        landing = self._land(seen, (end, root), (t1, length, resolution), (measure, pace), jumps)
+        landing = self._land(seen, (end, root), (t1, length, resolution, y0.t), (measure, pace), jumps)
         next_root = fusion_barrier(landing.next_root, unit)
         landed = fusion_barrier(_flags(landing.landed, next_root), unit) > 0.5
         landing = landing._replace(next_root=next_root, landed=landed, happens=landed)
@@ -324,20 +324,24 @@ class EventSolver(AbstractSolverWrapper):
         self,
         seen: GuardScan,
         ends: tuple[Float[Array, " guards"], Float[Array, " guards"]],
-        step: tuple[Array, Array, Array],
+        step: tuple[Array, Array, Array, Array],
         paces: tuple[Array, Array],
         jumps: Bool[Array, ""] | None,
     ) -> Landing:
         """Which guards fire at the end of a step, and where the next one is to end.
 
-        `ends` are the guards there and what they are at events; `step` are its end, its length and the resolution of
-        time; `paces` the length of the last steps, with this one and without.
+        `ends` are the guards there and what they are at events; `step` are its end, its length, the resolution of time
+        and the time of the last event; `paces` the length of the last steps, with this one and without.
         """
-        (end, root), (t1, length, resolution), (measure, pace) = ends, step, paces
+        (end, root), (t1, length, resolution, last), (measure, pace) = ends, step, paces
         divisor = jnp.where(length > 0, length, 1.0)
-        near = jnp.maximum(_LANDING * jnp.maximum(measure, pace), _constant(resolution))
+
+        def landing(t: Array) -> Array:
+            near = jnp.minimum(_LANDING * jnp.maximum(measure, pace), _LANDING_OF_INTERVAL * _constant(t - last))
+            return jnp.maximum(near, _constant(resolution))
+
+        near = landing(t1)
         shortest = jnp.maximum(_SHORT * pace, 2.0 * _constant(resolution))
-        behind = near
         if jumps is not None:  # an event before a jump is not one with it
             near = jnp.where(jumps, _constant(resolution), near)
         near = near / divisor
@@ -354,6 +358,7 @@ class EventSolver(AbstractSolverWrapper):
         fired = here & landed
         first = jnp.arange(fired.shape[0]) == jnp.argmin(jnp.where(fired, seen.ahead, jnp.inf))
         ahead = jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0))
+        behind = landing(t1 + (jnp.minimum(ahead, 2.0) - 1.0) * length)
         return Landing(
             fired, first, missed, landed, landed, self._policy.next_end(ahead, missed, (behind, divisor)), near
         )

@@ -1,14 +1,21 @@
-"""Modes at the start of a run, and after events."""
+"""Modes at the start of a run, and modes and velocities behind its events."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
 from .._core.scalarise import in_scalars
 from .._core.shapes import Scalar
-from ._dynamics import State, from_dynamics, vector_field
+from ..mechanics import Contact
+from ._dynamics import Dynamics, State, from_dynamics, vector_field
 from ._impact import impact
 from ._scene import Scene
+
+# A rebound closes its contact at once if it rises to less than so many rounding errors of the gap, or lasts less than
+# this part of the time, in square roots of its rounding unit and in units.
+_RESOLVED, _LONG, _RESOLVED_TIME = 32.0, 1e-3, 2048.0
 
 
 def start(
@@ -85,8 +92,10 @@ def switch(
         push = from_dynamics(lambda d: d.contact_forces, t, y, scene, _join(slips, closed, sides))
         contact_fired = contact_fired | ((closed > 0) & (push < 0))
 
+    bounces = _bounces(t, y, scene, _join(slips, closed, sides)) if elastic else None
+
     def strike(t: Array, q: Array, qd: Array) -> tuple[Array, Array, Array]:
-        return impact(t, q, qd, scene.bind_state(t, q, qd), closed, contact_fired, rest, elastic)
+        return impact(t, q, qd, scene.bind_state(t, q, qd), closed, contact_fired, rest, bounces)
 
     qd, closed, stopped = in_scalars(strike, t, y.q, y.qd, seed=y.q)
     after = y._replace(qd=qd)
@@ -97,3 +106,26 @@ def switch(
             *(t, after, scene, _join(slips, closed, sides)),
         )
     return after, _join(slips, closed, sides)
+
+
+def _bounces(t: Scalar, y: State, scene: Scene, mode: Float[Array, " modes"]) -> Bool[Array, " contacts"]:
+    """Which contacts give back velocity: those in contact already, and those whose rebound can be told from rest.
+
+    After a rebound with the velocity w a gap that accelerates by a < 0 is `w^2/(2 |a|)` wide at most, and closes after
+    `2 w/|a|`. Both are relative to the surface, which may move. Where one rebound cannot be told from rest, all that
+    follow it cannot: to first order in w their impulses, and those of friction under them, are those of rest.
+    """
+    held = jtu.tree_map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, (t, y, scene, mode))
+    eps = float(jnp.finfo(y.q.dtype).eps)
+    shortest = max(_LONG * eps**0.5, _RESOLVED_TIME * eps) * jnp.abs(held[0])
+
+    def look(contact: Contact, d: Dynamics) -> Bool[Array, ""]:
+        (t, q, qd), params = (d.t, d.y.q, d.y.qd), d.scene.params
+        w, a = jax.jvp(lambda t, q, qd: contact.rate(t, q, qd, params)[0], (t, q, qd), (jnp.ones_like(t), qd, d.qdd))
+        gap = contact.rounding(t, q, params)
+        w, pull = contact.coefficient * jnp.abs(w), jnp.maximum(-a, 0.0)
+        return (w * w >= 2.0 * _RESOLVED * gap * pull) & (2.0 * w >= shortest * pull)
+
+    contacts = tuple(scene.contacts.values())
+    resolved = from_dynamics(lambda d: jnp.stack([look(each, d) for each in contacts]), *held)
+    return resolved | (scene.split_modes(mode)[1] > 0)
