@@ -18,7 +18,7 @@ from .events._state import EventState
 _OF_ZERO = 1e-3
 # Error allowed in the tangent, in parts of `rtol`: of what does not move, and how many times more of what does. There
 # the error of the state limits the steps, too. Parts of its own tolerance from which on the latter counts.
-_AT_REST, _IN_MOTION, _MOVES = 0.1, 75.0, 0.01
+_AT_REST, _IN_MOTION, _MOVES = 0.1, 150.0, 0.01
 # A tangent counts as no smaller than this part of the largest in its array.
 _OF_ARRAY = 1e-3
 # Errors of a tangent that are noise, in parts of `atol` and in roundings of the state.
