@@ -27,6 +27,7 @@ def run_orbit(spec: Path, out: Path) -> None:
         "qd": np.asarray(orbit.qd).tolist(),
         "lowest": np.asarray(orbit.lowest).tolist(),
         "highest": np.asarray(orbit.highest).tolist(),
+        "advance": np.asarray(orbit.advance).tolist(),
         "multipliers": [[x.real, x.imag] for x in orbit.multipliers.tolist()],
         "stability": orbit.stability,
         "stick": orbit.stick,

@@ -16,7 +16,7 @@ from ._continue import BranchProgress, check_parameter, follow, read_span
 from ._describe import describe
 from ._newton import Condition, newton
 from ._orbit import PeriodicOrbit
-from ._periodic_orbit import prepare, values_of
+from ._periodic_orbit import prepare
 from ._return_map import PeriodFn, Section, ShotOrbit
 from ._special import TESTS
 from ._step import step_at, test_condition
@@ -103,7 +103,7 @@ def continue_special(
 
     held = Condition(from_first, lambda _: np.abs(np.sign(sense)))
     conditions = (test_condition(problem, test, scale, dof), held)
-    shot, _ = newton(problem, start.x, start.period, values_of(problem), dof, scale, conditions)
+    shot, _ = newton(problem, start.x, start.period, problem.values, dof, scale, conditions)
     steps = [step_at(problem, shot, describe(problem, shot, dof)[0], spans, sense, test)]
     with reported(progress, "curve", lambda count, value: f"{count} orbits, {other} = {value:.6g}") as report:
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..simulation import Trajectory
+from ._neutral import neutral_directions
 from ._orbit import PeriodicOrbit, Sequence
 from ._return_map import OrbitError, OrbitProblem, ShotOrbit, unpack
 from ._settle import magnitudes, run_for, states_of
@@ -57,25 +58,35 @@ def describe(problem: OrbitProblem, point: ShotOrbit, dof: int) -> tuple[Periodi
     shares, held = _shares(once[0], runs[0], happened, whole)
     strikes = [(x[0], scene.part_names[x[1]]) for x in happened if scene.part_names[x[1]] in scene.contacts]
     lowest, highest = (_extremes(runs, sign, strikes) for sign in (-1.0, 1.0))
-    scale = magnitudes(states_of(*runs), period)[:-1]
+    scale = magnitudes(problem, states_of(*runs), dof, period)[:-1]
+    for name in problem.held:
+        if any(scene.part_names[i] == name for _, i, _, _ in happened):
+            raise OrbitError(
+                f"{name} sticks throughout near the start of the search, and the orbit begins in the place where it"
+                " sticks; but in this place it slips on the orbit. Begin where it sticks, or from a longer `settle`."
+            )
     missed = float(np.max(np.abs(point.residual[: point.x.size].reshape(point.x.shape)) / scale))
     if missed > max(_MISSED, _TOLERANCES * float(problem.rtol)):
         raise OrbitError(
             f"No convergence to a periodic orbit: the state misses itself by {missed:.3g} of the extent of the motion."
             " Errors grow out of all digits on a run over the period: pass more `segments`."
         )
+    values = floquet(problem, point, held, scale, dof)
+    neutral = point.x.shape[1] - len(values)
     orbit = PeriodicOrbit(
         jnp.asarray(whole[0]),
         *states[0],
         jnp.asarray(period),
         jnp.asarray(lowest.value),
         jnp.asarray(highest.value),
-        floquet(problem, point, held, scale),
+        np.append(np.ones(neutral), values),
         problem.autonomous,
         missed,
         tuple(runs),
         tuple(change for each in once for change in _sequence(each)),
         shares,
+        jnp.asarray(point.advance[:dof]),
+        neutral,
     )
     return orbit, lowest, highest
 
@@ -129,27 +140,30 @@ def _directions(run: Trajectory, held: list[str], t: float) -> int:
     return int(np.linalg.matrix_rank(np.vstack(rows), tol=1e-6))
 
 
-def floquet(problem: OrbitProblem, point: ShotOrbit, zeros: int, scale: np.ndarray) -> np.ndarray:
-    """Floquet multipliers, with the 1 and the zeros that are known exactly."""
-    maps = point.maps * scale[None, :] / scale[:, None]
+def floquet(problem: OrbitProblem, point: ShotOrbit, zeros: int, scale: np.ndarray, dof: int) -> np.ndarray:
+    """Floquet multipliers but for those that are exactly 1, with the zeros that are known exactly."""
+    maps = list(point.maps * scale[None, :] / scale[:, None])
+    bases = [np.eye(len(scale))] * len(maps)
     if problem.autonomous:
-        # On the planes normal to the flow, along the flow: what is left are the others.
-        normal = [np.linalg.svd((flow / scale)[None, :])[2][1:].T for flow in point.flows]
-        maps = np.array([b.T @ x @ a for a, x, b in zip(normal, maps, [*normal[1:], normal[0]], strict=True)])
+        # The planes normal to the flow: along the flow the multiplier is 1.
+        bases = [np.linalg.svd((flow / scale)[None, :])[2][1:].T for flow in point.flows]
+    if np.any(problem.pinned):
+        along = bases[0].T @ neutral_directions(problem, point, scale, dof)
+        bases[0] = bases[0] @ np.linalg.svd(along)[0][:, along.shape[1] :]
+    maps = [b.T @ x @ a for a, x, b in zip(bases, maps, [*bases[1:], bases[0]], strict=True)]
     values = _eigenvalues_of_product(maps).astype(complex)
     values = values[np.argsort(-np.abs(values), kind="stable")]
     small = np.arange(len(values)) >= len(values) - zeros
-    values = np.where(small & (np.abs(values) < _ZERO), 0.0, values)
-    return np.append(1.0, values) if problem.autonomous else values
+    return np.where(small & (np.abs(values) < _ZERO), 0.0, values)
 
 
-def _eigenvalues_of_product(maps: np.ndarray) -> np.ndarray:
+def _eigenvalues_of_product(maps: list[np.ndarray]) -> np.ndarray:
     """Eigenvalues of the product of matrices, the first one on the right, of which the product itself loses the small.
 
     Orthogonal iteration: passing through all factors again and again a basis turns into that in which each of them is
     triangular, and the product of those has each eigenvalue in its own row.
     """
-    first = basis = product = np.eye(maps.shape[1])
+    first = basis = product = np.eye(maps[0].shape[1])
     if len(maps) == 1:
         return np.linalg.eigvals(maps[0])
     for _ in range(_SWEEPS):

@@ -23,19 +23,22 @@ Sequence: TypeAlias = tuple[tuple[str, str, str], ...]
 class PeriodicOrbit(AbstractReadable, eqx.Module):
     """A periodic orbit of a scene.
 
-    `q`, `qd`, `z`, `period`, `lowest` and `highest` have derivatives by all numbers of the scene.
+    `q`, `qd`, `z`, `period`, `lowest`, `highest` and `advance` have derivatives by all numbers of the scene.
 
     - `t0`: time [s] at its start; 0 but where along a branch a change of modes came to lie there.
     - `q`, `qd`, `z`: state at its start, as of `simulate`.
     - `period`: [s].
     - `lowest`, `highest`: least and greatest value of each coordinate, shape `[dof]`.
-    - `multipliers`: Floquet multipliers, complex, shape `[n]`: by magnitude, after the 1 that every orbit of unknown
-      period has. A phase in which an element sticks makes one of them zero, a phase in which a contact is closed two.
+    - `multipliers`: Floquet multipliers, complex, shape `[n]`: by magnitude, after those that are exactly 1, `neutral`
+      in number: one of an unknown period, one of each shift, one of each coordinate that sticks throughout. A phase in
+      which an element sticks makes one of them zero, a phase in which a contact is closed two.
     - `autonomous`: whether the period was unknown, and one of the multipliers is 1 therefore.
     - `residual`: by how much the state misses itself after a period, in the extent of the orbit.
     - `runs`: the `Trajectory` over each segment of the period.
     - `sequence`: mode changes along it: element, mode before, mode after.
-    - `stick`: part of the period in which each friction element sticks and each contact is closed, by name.
+    - `stick`: part of the period in which each friction element sticks and each contact is closed, by name. A
+      coordinate that sticks throughout stays where the guess is, or where it settles from there.
+    - `advance`: by how much each coordinate moves on in a period [m or rad], shape `[dof]`; zero for those that return.
     """
 
     t0: Float[Array, ""]
@@ -51,6 +54,8 @@ class PeriodicOrbit(AbstractReadable, eqx.Module):
     runs: tuple[Trajectory, ...]
     sequence: Sequence = eqx.field(static=True)
     stick: dict[str, float]
+    advance: Float[Array, " dof"]
+    neutral: int = eqx.field(static=True)
 
     @property
     def state(self) -> State:
@@ -82,13 +87,13 @@ class PeriodicOrbit(AbstractReadable, eqx.Module):
 
     @property
     def stable(self) -> bool:
-        """Whether all multipliers, but for the 1 of an orbit of unknown period, are inside the unit circle."""
+        """Whether all multipliers, but for those that are exactly 1, are inside the unit circle."""
         return self.stability == "stable"
 
     @property
     def stability(self) -> str:
         """Stable, unstable and by which multiplier, or undecided to first order."""
-        return stability_words(self.multipliers[1:] if self.autonomous else self.multipliers)
+        return stability_words(self.multipliers[self.neutral :])
 
 
 def stability_words(multipliers: np.ndarray) -> str:
@@ -114,17 +119,24 @@ def _(orbit: PeriodicOrbit) -> Table:
     if isinstance(orbit.period, jax.core.Tracer):
         return Table("PeriodicOrbit, traced", (), [])
     scene = orbit.runs[0].scene
+    columns = {"lowest": orbit.lowest, "highest": orbit.highest, "velocity at the start": orbit.qd}
+    if np.any(orbit.advance):
+        columns["advance"] = orbit.advance
     rows = [
-        (quantity_of(scene, f"q[{i}]").label, *(short(x[i]) for x in (orbit.lowest, orbit.highest, orbit.qd)))
-        for i in range(len(orbit.q))
+        (quantity_of(scene, f"q[{i}]").label, *(short(x[i]) for x in columns.values())) for i in range(len(orbit.q))
     ]
     kind = "autonomous" if orbit.autonomous else "forced"
+    held = [name for name, share in orbit.stick.items() if share > 1.0 - 1e-12 and name in scene.event_driven]
     changes = [f"{name}: {before} to {after}" for name, before, after in orbit.sequence]
     notes = [
         f"multipliers {', '.join(map(complex_words, orbit.multipliers))}",
-        *(f"{name} held {100 * share:.4g} % of the period" for name, share in orbit.stick.items()),
+        *(
+            f"{name} sticks throughout, in the place where the guess is or settles; others are possible"
+            for name in held
+        ),
+        *(f"{name} held {100 * share:.4g} % of the period" for name, share in orbit.stick.items() if name not in held),
         f"mode changes: {', '.join(changes) or 'none'}",
         *([f"residual {orbit.residual:.2g}"] if orbit.residual > _WORTH_SAYING else []),
     ]
     title = f"PeriodicOrbit, {kind}, period {short(orbit.period)} s, {orbit.stability}"
-    return Table(title, ("", "lowest", "highest", "velocity at the start"), rows, tuple(notes))
+    return Table(title, ("", *columns), rows, tuple(notes))

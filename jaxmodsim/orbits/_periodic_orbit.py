@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
 from .._core.arguments import as_float, as_whole, check_real
-from ..scene import Scene, State, read_element
+from ..scene import Scene, State
 from ._describe import Extremes, describe
+from ._neutral import anchored, differs, moving_on, shifted
 from ._newton import newton, scaled
 from ._orbit import PeriodicOrbit
 from ._return_map import (
@@ -30,14 +31,14 @@ from ._return_map import (
     run_segment,
     unpack,
 )
-from ._settle import SettledState, cut, magnitudes, run_for, settled, states_of
+from ._settle import SettledState, cut, run_for, settled
 
 # Periods of the force until a run has settled, where nothing else is asked for.
 _PERIODS = 20
 # A direction in which the derivative of the return map is one to so many digits.
 _FAMILY = 1e-7
-# At another time, in periods, a scene that does not depend on it ends in the same state; relative, per multiplier.
-_OTHER_TIME, _SAME = 0.381966, 1e-6
+# At another time, in periods, a scene that does not depend on it ends in the same state.
+_OTHER_TIME = 0.381966
 
 _States: TypeAlias = ArrayLike | list[float] | list[list[float]]
 Guess: TypeAlias = "PeriodicOrbit | tuple[_States, _States]"
@@ -135,19 +136,27 @@ def prepare(
     if isinstance(guess, PeriodicOrbit):
         phase = jax.lax.stop_gradient(guess.t0 / guess.period)
     number = period if period is None or callable(period) else _Constant(as_float(period, name="period", lower=0.0))
-    problem = OrbitProblem(scene, phase, relative, absolute, empty, empty, empty, number, section, parameters)
+    none = jnp.zeros((0, 0))
+    problem = OrbitProblem(
+        *(scene, phase, relative, absolute, empty, empty, empty, number, section, parameters, none, none)
+    )
     count = as_whole(segments, name="segments")
     state = _state(scene, guess)
     dof = state.q.shape[-1]
     if isinstance(guess, PeriodicOrbit) and settle is None:
-        start = cut(guess.runs, float(guess.period), count)
+        start = cut(problem, guess.runs, float(guess.period), count)
     elif state.q.ndim == 2:
         start = _segment_starts(problem, state, count)
     else:
         start = settled(problem, state, _settle(problem, settle), section, count)
     state_scale, of_period = start.scale[:-1], start.scale[-1:] if problem.autonomous else []
     start = start._replace(scale=np.concatenate([*[state_scale] * count, of_period, np.ones(len(parameters))]))
-    return anchored(problem, start, dof), start, dof
+    problem, start = anchored(problem, start, dof)
+    if not isinstance(guess, PeriodicOrbit) and state.q.ndim == 1:
+        # What a shift does not change begins where the guess is.
+        x = start.x + np.asarray(problem.free) @ (np.asarray(pack(state)) - start.x[0])
+        start, problem = start._replace(x=x), replace(problem, anchor=jnp.asarray(x[0]))
+    return problem, start, dof
 
 
 def _segment_starts(problem: OrbitProblem, states: State, count: int) -> SettledState:
@@ -167,7 +176,7 @@ def _segment_starts(problem: OrbitProblem, states: State, count: int) -> Settled
     t = [np.linspace(a, a + 1.0 / count, 257) * period for a in cuts]
     runs = [run_for(problem, state, times[0], times) for state, times in zip(each, t, strict=True)]
     x = np.array([np.asarray(pack(state)) for state in each])
-    return SettledState(x, cuts, period, magnitudes(states_of(*runs), period))
+    return cut(problem, runs, period, count)._replace(x=x, cuts=cuts)
 
 
 class _Constant(eqx.Module):
@@ -237,21 +246,6 @@ def _check_functions(period: object, section: object) -> None:
         raise ValueError("section is for orbits of unknown period; a forced one begins at t = 0. Pass one of the two.")
 
 
-def anchored(problem: OrbitProblem, start: SettledState, dof: int) -> OrbitProblem:
-    """With the segments of the start, and the plane through it that is normal to the flow, in the scales."""
-    x = jnp.asarray(start.x[0])
-    problem = replace(problem, normal=jnp.zeros_like(x), anchor=x, cuts=jnp.asarray(start.cuts))
-    if not problem.autonomous or problem.section is not None:
-        return problem
-    flow = evaluate(problem, start.x, start.period, values_of(problem), dof).flows[0]
-    return replace(problem, normal=jnp.asarray(flow / start.scale[: len(x)] ** 2))
-
-
-def values_of(problem: OrbitProblem) -> np.ndarray:
-    """Values that the parameters have in the scene."""
-    return np.array([read_element(problem.scene, name) for name in problem.parameters])
-
-
 def shoot(problem: OrbitProblem, start: SettledState, dof: int) -> ShotOrbit:
     """The orbit near the start, at the values that the parameters have in the scene.
 
@@ -259,8 +253,14 @@ def shoot(problem: OrbitProblem, start: SettledState, dof: int) -> ShotOrbit:
 
     - `OrbitError` where there is none, the scene depends on time otherwise than the period says, or there is a family.
     """
-    point, _ = newton(problem, start.x, start.period, values_of(problem), dof, start.scale)
+    try:
+        point, _ = newton(problem, start.x, start.period, problem.values, dof, start.scale)
+    except OrbitError as error:
+        raise OrbitError(f"{error}{start.moving}") from error
     _refuse_clock(problem, point, start.scale, dof)
+    advance = point.advance[:dof]
+    if np.any(advance) and differs(point, shifted(problem, point, point.advance, dof), start.scale):
+        raise OrbitError(f"The run does not go on as an orbit.{moving_on(problem.scene, advance, 0.0 * advance)}")
     _refuse_family(problem, point, start.scale, dof)
     return point
 
@@ -274,8 +274,7 @@ def _refuse_clock(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, do
     """
     moved = problem.phase + (_OTHER_TIME if problem.autonomous else 1.0)
     later = evaluate(eqx.tree_at(lambda p: p.phase, problem, moved), point.x, point.period, point.values, dof)
-    growth = max(1.0, float(np.max(np.abs(np.linalg.eigvals(point.maps)))))
-    if not later.failure and _miss(later, scale) < _SAME * growth:
+    if not differs(point, later, scale):
         return
     if problem.autonomous:
         raise OrbitError(
@@ -328,7 +327,8 @@ def _with_derivatives(
         end_of(run_segment(problem, scene, y, problem.period_of(scene, period), span, dof))
         for y, span in zip(x, spans, strict=True)
     ]
-    residual = jnp.ravel(jnp.stack(after) - jnp.roll(x, -1, axis=0))
+    miss = jnp.stack(after) - jnp.roll(x, -1, axis=0)
+    residual = jnp.ravel(miss.at[-1].set(problem.closure(x[0], after[-1])))
     if problem.autonomous:
         residual = jnp.append(residual, 0.0)
     unknowns = jnp.asarray(inverse) @ residual
@@ -339,9 +339,10 @@ def _with_derivatives(
     struck = [name for x in extrema for name in x.struck]
     order = np.argsort(times, kind="stable")
     place = np.argsort(order, kind="stable"), np.tile(np.arange(dof), 2)
-    made = jnp.zeros(len(times))
+    made, end = jnp.zeros(len(times)), x[0]
     for y, span in zip(x, spans, strict=True):
-        run = run_segment(problem, scene, y, period, span, dof, jnp.asarray(times[order]))
+        run = run_segment(problem, scene, y, period, span, dof, jnp.asarray([*times[order], np.inf]))
+        end = end_of(run)
         # The times are right to some digits alone: a parabola leads from there to where the velocity is zero.
         there = run.q[place] - 0.5 * run.qd[place] ** 2 / acceleration
         for i, name in enumerate(struck):
@@ -355,7 +356,8 @@ def _with_derivatives(
         for value, x in zip((orbit.lowest, orbit.highest), made.reshape(2, dof), strict=True)
     )
     q, qd, z = unpack(scene, x[0], dof)
-    return replace(orbit, q=q, qd=qd, z=z, period=period, lowest=lowest, highest=highest)
+    advance = (problem.free @ (end - x[0]))[:dof]
+    return replace(orbit, q=q, qd=qd, z=z, period=period, lowest=lowest, highest=highest, advance=advance)
 
 
 def _to_impact(scene: Scene, name: str, t: float, q: Array, qd: Array) -> Array:

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from ..scene import Scene, State, replace_elements
+from ..scene import Scene, State, read_element, replace_elements
 from ..simulation import RunRequest, Trajectory, outcome_messages, simulate
 
 # Period [s] from the parameters of the scene.
@@ -22,9 +21,6 @@ PeriodFn: TypeAlias = Callable[[PyTree], Array | float]
 Section: TypeAlias = Callable[[Array, Array], Array | float]
 
 MAX_STEPS, MAX_EVENTS = 65536, 4096
-# Steps in a period. Derivatives are those of the steps that are made: where little moves, these would become too long
-# for disturbances that decay fast, which then seem to grow.
-LEAST_STEPS = 128
 
 
 class OrbitError(RuntimeError):
@@ -40,6 +36,10 @@ class OrbitProblem(eqx.Module):
     - `parameters`: numbers of the scene that are unknowns too.
     - `normal`, `anchor`: the plane in which an orbit of unknown period begins: `normal . (x - anchor) = 0`. With a
       `section` that takes its place.
+    - `free`: projector on the shifts of coordinates under which the scene stays the same; along them the orbit may
+      advance. `pinned`: projector on these and on the directions in which elements stick throughout; in all of them
+      the orbit begins at `anchor`. Shape `[n, n]` each.
+    - `held`: names of the friction elements that stick throughout.
     """
 
     scene: Scene
@@ -52,6 +52,9 @@ class OrbitProblem(eqx.Module):
     period: PeriodFn | None = eqx.field(static=True)
     section: Section | None = eqx.field(static=True)
     parameters: tuple[str, ...] = eqx.field(static=True)
+    free: Float[Array, "n n"]
+    pinned: Float[Array, "n n"]
+    held: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def autonomous(self) -> bool:
@@ -63,6 +66,11 @@ class OrbitProblem(eqx.Module):
         """Where the segments begin and end, in periods."""
         return self.phase + jnp.stack([self.cuts, jnp.append(self.cuts[1:], 1.0)], axis=1)
 
+    @property
+    def values(self) -> np.ndarray:
+        """Values that the parameters have in the scene."""
+        return np.array([read_element(self.scene, name) for name in self.parameters])
+
     def with_values(self, values: Array | np.ndarray) -> Scene:
         """The scene with other values of the parameters."""
         return replace_elements(self.scene, dict(zip(self.parameters, values, strict=True)))
@@ -70,6 +78,11 @@ class OrbitProblem(eqx.Module):
     def period_of(self, scene: Scene, unknown: Array) -> Array:
         """Period [s]."""
         return unknown if self.period is None else jnp.asarray(self.period(scene.params), unknown.dtype)
+
+    def closure(self, start: Array | np.ndarray, end: Array | np.ndarray) -> Array:
+        """Zero where the state at the end is that at the start, but for the advance, and the start is in its place."""
+        miss = end - start
+        return miss - self.free @ miss + self.pinned @ (start - self.anchor)
 
     def plane(self, x: Array, dof: int) -> Array:
         """Zero where an orbit of unknown period may begin."""
@@ -112,7 +125,6 @@ def run_segment(
     span: Array,
     dof: int,
     times: Array | None = None,
-    adjoint: dfx.AbstractAdjoint | None = None,
     max_steps: int = RunRequest.max_steps,
 ) -> Trajectory:
     """The run from x over a segment; at these times [s] as far as they are inside it, else at its end alone."""
@@ -125,9 +137,7 @@ def run_segment(
         ts=None if times is None else jnp.clip(times, t0, t1),
         rtol=problem.rtol,
         atol=problem.atol,
-        adjoint=adjoint,
         max_steps=max_steps,
-        dtmax=jax.lax.stop_gradient(period) / LEAST_STEPS,
         max_events=MAX_EVENTS,
         throw=False,
     )
@@ -145,7 +155,7 @@ def _returned(problem: OrbitProblem, span: Array, unknowns: Array, dof: int) -> 
     def map_(unknowns: Array) -> tuple[Array, tuple[Array, Array]]:
         scene = problem.with_values(unknowns[n + 1 :])
         period = problem.period_of(scene, unknowns[n])
-        run = run_segment(problem, scene, unknowns[:n], period, span, dof, None, dfx.ForwardMode(), MAX_STEPS)
+        run = run_segment(problem, scene, unknowns[:n], period, span, dof, max_steps=MAX_STEPS)
         x = end_of(run)
         return x, (x, run.code)
 
@@ -160,6 +170,7 @@ class ShotOrbit(NamedTuple):
     - `x`: shape `[segments, n]`; `values`: `[parameters]`.
     - `maps`: derivatives of the state after each segment by the state before it, `[segments, n, n]`.
     - `flows`: rates of the state at the starts, `[segments, n]`; of unknown period.
+    - `advance`: change of the state in a period along the shifts of the scene, `[n]`.
     - `residual`: of the equations, `[segments n]`, and one more with the plane; `by`: their derivatives by starts,
       period (of unknown period alone) and parameters.
     - `failure`: how the run ended early; "" where it did not.
@@ -170,6 +181,7 @@ class ShotOrbit(NamedTuple):
     values: np.ndarray
     maps: np.ndarray
     flows: np.ndarray
+    advance: np.ndarray
     residual: np.ndarray
     by: np.ndarray
     failure: str
@@ -194,19 +206,42 @@ class ShotOrbit(NamedTuple):
         return np.array([*self.x.ravel(), *period, *self.values])
 
 
+class SettledState(NamedTuple):
+    """Where the search starts.
+
+    - `x`: states at the begins of the segments, `[segments, n]`; `cuts`: when these are, in periods after the first.
+    - `period`: [s].
+    - `scale`: magnitudes of the state and the period, `[n + 1]`.
+    - `held`: names of the friction elements that stick throughout; `moving`: a sentence on coordinates that move on.
+    """
+
+    x: np.ndarray
+    cuts: np.ndarray
+    period: float
+    scale: np.ndarray
+    held: tuple[str, ...]
+    moving: str = ""
+
+
 def evaluate(problem: OrbitProblem, x: np.ndarray, period: float, values: np.ndarray, dof: int) -> ShotOrbit:
     """The equations of an orbit at these unknowns."""
     (count, n), spans = x.shape, np.asarray(problem.spans)
     starts = [jnp.asarray([*y, period, *values]) for y in x]
     # Of a shape that does not depend on how many segments there are: one program serves any number of them.
-    alone = replace(problem, cuts=problem.cuts[:0])
+    alone = replace(problem, cuts=problem.cuts[:0], held=())
     made = jax.device_get([_returned(alone, span, y, dof) for span, y in zip(problem.spans, starts, strict=True)])
     by = np.zeros((x.size, x.size + 1 + len(values)))
     for i, each in enumerate(made):
         rows, columns, later = (slice(j * n, (j + 1) * n) for j in (i, i, (i + 1) % count))
         by[rows, columns], by[rows, x.size :] = each.by[:, :n], each.by[:, n:]
         by[rows, later] -= np.eye(n)
-    residual = np.ravel([each.x for each in made] - np.roll(x, -1, axis=0))
+    free, pinned = np.asarray(problem.free), np.asarray(problem.pinned)
+    last, miss = slice(-n, None), np.array([each.x for each in made]) - np.roll(x, -1, axis=0)
+    advance = free @ miss[-1]
+    by[last] -= free @ by[last]
+    by[last, :n] += pinned
+    miss[-1] = problem.closure(x[0], made[-1].x)
+    residual = np.ravel(miss)
     by_period = np.array([each.by[:, n] for each in made]) / np.diff(spans)
     if problem.autonomous:
         by = np.vstack([by, np.append(made[0].plane_by, np.zeros(by.shape[1] - n))])
@@ -219,4 +254,4 @@ def evaluate(problem: OrbitProblem, x: np.ndarray, period: float, values: np.nda
     if not failure and not (np.isfinite(by).all() and np.isfinite(residual).all()):
         failure = "The run or its derivatives are not finite."
     maps = np.array([each.by[:, :n] for each in made])
-    return ShotOrbit(x, period, values, maps, np.roll(by_period, 1, axis=0), residual, by, failure)
+    return ShotOrbit(x, period, values, maps, np.roll(by_period, 1, axis=0), advance, residual, by, failure)

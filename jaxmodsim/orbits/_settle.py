@@ -1,7 +1,6 @@
 """Where the search for an orbit starts: a simulation that settles."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -9,7 +8,8 @@ import numpy as np
 
 from ..scene import State
 from ..simulation import SimulationError, Trajectory, simulate
-from ._return_map import MAX_EVENTS, MAX_STEPS, OrbitError, OrbitProblem, Section
+from ._neutral import anchored, moving_on
+from ._return_map import MAX_EVENTS, MAX_STEPS, OrbitError, OrbitProblem, Section, SettledState
 
 # Times at which a run is looked at.
 _TIMES = 4001
@@ -19,22 +19,10 @@ _NEAR = 0.02
 _FAR = 0.2
 # Distance of the begin of a segment from changes of modes that is enough, in segments.
 _CLEAR = 0.1
+# Tolerances of a run within which its range is no motion.
+_NOISE = 10.0
 # Part of the run at its end in which returns are looked for.
 _LAST = 0.5
-
-
-class SettledState(NamedTuple):
-    """Where the search starts.
-
-    - `x`: states at the begins of the segments, `[segments, n]`; `cuts`: when these are, in periods after the first.
-    - `period`: [s].
-    - `scale`: magnitudes of the state and the period, `[n + 1]`.
-    """
-
-    x: np.ndarray
-    cuts: np.ndarray
-    period: float
-    scale: np.ndarray
 
 
 def run_for(problem: OrbitProblem, state: State, t0: float, ts: np.ndarray) -> Trajectory:
@@ -77,6 +65,12 @@ def held(run: Trajectory) -> np.ndarray:
     return np.sum(modes_of(run) == np.asarray(which), axis=1)
 
 
+def held_throughout(runs: Sequence[Trajectory], since: int = 0) -> tuple[str, ...]:
+    """Names of the friction elements that stick at all times of the runs, from this index of each on."""
+    names = runs[0].scene.event_driven
+    return tuple(name for name in names if not any(np.any(run.mode[name][since:]) for run in runs))
+
+
 def begins(at: np.ndarray, modes: np.ndarray, held: np.ndarray, segments: int) -> tuple[np.ndarray, np.ndarray]:
     """Indices of states for the segments to begin at, and when that is: about equally long, if possible in slip.
 
@@ -108,36 +102,49 @@ def settled(problem: OrbitProblem, state: State, settle: float, section: Section
             run = run_for(problem, state, t0, np.asarray([t0 + count * period]))
             state = jtu.tree_map(lambda a: a[-1], State(run.q, run.qd, run.z))
         run = run_for(problem, state, t0, np.linspace(t0, t0 + period, 257))
-        return cut([run], period, segments)
+        return cut(problem, [run], period, segments)
     ts = np.linspace((1.0 - _LAST) * settle, settle, _TIMES)
     run = run_for(problem, state, 0.0, ts)
     x = states_of(run)
-    scale = magnitudes(x, 1.0)
-    period = _return_time(ts, x / scale[: x.shape[1]])
+    dof = state.q.shape[-1]
+    scale = magnitudes(problem, x, dof, settle)
+    returning, moving = x, ""
+    if moving_on(problem.scene, x[-1] - x[0], scale[:dof]):
+        half = SettledState(x[:1], np.zeros(1), ts[-1] - ts[0], scale, ())
+        here, half = anchored(problem, half, dof)
+        returning, moving = x - x @ np.asarray(here.free).T, half.moving
+    period = _return_time(ts, returning / scale[: x.shape[1]], moving)
     last = ts >= settle - period
-    scale = magnitudes(x[last], period)
-    at = _beginning(run, x, np.flatnonzero(last), section)
+    scale = magnitudes(problem, x[last], dof, period)
+    at = _beginning(run, x / scale[:-1], np.flatnonzero(last), section)
     since = (ts[last] - ts[at]) / period % 1.0
     chosen, cuts = begins(since, modes_of(run)[last], held(run)[last], segments)
-    return SettledState(x[last][chosen], cuts, period, scale)
+    return SettledState(x[last][chosen], cuts, period, scale, held_throughout([run], int(np.argmax(last))))
 
 
-def cut(runs: Sequence[Trajectory], period: float, segments: int) -> SettledState:
+def cut(problem: OrbitProblem, runs: Sequence[Trajectory], period: float, segments: int) -> SettledState:
     """A start on runs that lead through a period, one after the other."""
     t, x = np.concatenate([np.asarray(run.t) for run in runs]), states_of(*runs)
     modes, stuck = (np.concatenate([of(run) for run in runs]) for of in (modes_of, held))
     chosen, cuts = begins((t - t[0]) / period, modes, stuck, segments)
-    return SettledState(x[chosen], cuts, period, magnitudes(x, period))
+    scale = magnitudes(problem, x, runs[0].q.shape[1], period)
+    return SettledState(x[chosen], cuts, period, scale, held_throughout(runs))
 
 
-def magnitudes(x: np.ndarray, period: float) -> np.ndarray:
-    """Half the range of each entry of the state along a run, and the period; of what does not move its magnitude."""
+def magnitudes(problem: OrbitProblem, x: np.ndarray, dof: int, period: float) -> np.ndarray:
+    """Half the range of each entry of the state along a run, and the period; of what does not move its magnitude.
+
+    A range within the errors of the run is no motion. The velocity of a coordinate has at least the magnitude of the
+    coordinate over the period.
+    """
     half, size = 0.5 * np.ptp(x, axis=0), np.max(np.abs(x), axis=0)
-    half = np.where(half > 1e-9 * size, half, size)
-    return np.append(np.where(half > 0, half, 1.0), period)
+    noise = _NOISE * (float(problem.rtol) * size + float(problem.atol))
+    half = np.where(half > noise, half, np.where(size > noise, size, 1.0))
+    half[dof : 2 * dof] = np.maximum(0.5 * np.ptp(x[:, dof : 2 * dof], axis=0), half[:dof] / period)
+    return np.append(half, period)
 
 
-def _return_time(ts: np.ndarray, x: np.ndarray) -> float:
+def _return_time(ts: np.ndarray, x: np.ndarray, moving: str) -> float:
     """How long before its end a run was last in the same state; from the last piece of its path backwards."""
     begin, way = x[1:][::-1] - x[-1], (x[:-1] - x[1:])[::-1]
     length = np.sum(way * way, axis=1)
@@ -156,7 +163,7 @@ def _return_time(ts: np.ndarray, x: np.ndarray) -> float:
     if not near or later[near[0]] > _FAR:
         raise OrbitError(
             "The run does not return to where it was in the second half of `settle`: pass a longer `settle`, or there"
-            " is no stable orbit here."
+            f" is no stable orbit here.{moving}"
         )
     return float((first + near[0] + part[first + near[0]]) * (ts[1] - ts[0]))
 
@@ -173,7 +180,7 @@ def _beginning(run: Trajectory, x: np.ndarray, last: np.ndarray, section: Sectio
             )
         return int(last[up[-1]])
     if run.modes is None:
-        speed = np.linalg.norm(np.diff(x[last] / magnitudes(x[last], 1.0)[:-1], axis=0), axis=1)
+        speed = np.linalg.norm(np.diff(x[last], axis=0), axis=1)
         return int(last[int(np.argmax(speed))])
     modes, stuck = modes_of(run)[last], held(run)[last]
     cuts = np.flatnonzero(np.any(modes[1:] != modes[:-1], axis=1)) + 1

@@ -34,7 +34,7 @@ def locate(one: BranchStep, two: BranchStep, length: float, index: int) -> list[
     for kind in (FOLD, DOUBLING, TORUS, CROSSING):
 
         def test(shot: ShotOrbit, kind: str = kind) -> float:
-            return _turning(one, shot) if kind == FOLD else TESTS[kind](one.problem, shot, one.scale)
+            return _turning(one, shot) if kind == FOLD else TESTS[kind](one.problem, shot, one.scale, len(one.orbit.q))
 
         ends = test(one.shot), float(two.tangent[-1]) if kind == FOLD else test(two.shot)
         at = root_on_step(one, test, length, ends)
@@ -77,10 +77,9 @@ def corner(now: BranchStep, index: int) -> tuple[BranchStep, SpecialOrbit[Period
     return None
 
 
-def _multipliers(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray) -> np.ndarray:
-    """All but the 1 of an orbit of unknown period."""
-    values = floquet(problem, shot, 0, scale[: shot.x.shape[1]])
-    return values[1:] if problem.autonomous else values
+def _multipliers(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray, dof: int) -> np.ndarray:
+    """All but those that are exactly 1."""
+    return floquet(problem, shot, 0, scale[: shot.x.shape[1]], dof)
 
 
 def _turning(one: BranchStep, shot: ShotOrbit) -> float:
@@ -89,16 +88,16 @@ def _turning(one: BranchStep, shot: ShotOrbit) -> float:
     return float(tangent[-1] * np.sign(tangent @ one.tangent))
 
 
-def _doubling(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray) -> float:
-    return float(np.prod(_multipliers(problem, shot, scale) + 1.0).real)
+def _doubling(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray, dof: int) -> float:
+    return float(np.prod(_multipliers(problem, shot, scale, dof) + 1.0).real)
 
 
-def _crossing(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray) -> float:
-    return float(np.prod(_multipliers(problem, shot, scale) - 1.0).real)
+def _crossing(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray, dof: int) -> float:
+    return float(np.prod(_multipliers(problem, shot, scale, dof) - 1.0).real)
 
 
-def _torus(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray) -> float:
-    values = _multipliers(problem, shot, scale)
+def _torus(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray, dof: int) -> float:
+    values = _multipliers(problem, shot, scale, dof)
     i, j = np.triu_indices(len(values), 1)
     return float(np.prod(values[i] * values[j] - 1.0).real) if len(i) else 1.0
 
@@ -109,7 +108,7 @@ TESTS: dict[str, Test] = {FOLD: _crossing, CROSSING: _crossing, DOUBLING: _doubl
 
 def _is_torus(one: BranchStep, at: float) -> bool:
     """Whether it is a pair of complex multipliers whose product is 1, not two real ones."""
-    values = _multipliers(one.problem, one.corrected(at)[0], one.scale)
+    values = _multipliers(one.problem, one.corrected(at)[0], one.scale, len(one.orbit.q))
     return bool(np.any((np.abs(np.abs(values) - 1.0) < _CIRCLE) & (np.abs(np.imag(values)) > _CIRCLE)))
 
 

@@ -10,12 +10,12 @@ from ..scene import Scene, replace_elements
 from ._branch import DOUBLING, HOPF, SpecialOrbit
 from ._describe import describe
 from ._equilibrium import Equilibrium, nearest_oscillation, prepare_rest, rest_scale
+from ._neutral import anchored
 from ._newton import Condition, newton
 from ._orbit import PeriodicOrbit
-from ._periodic_orbit import anchored, prepare
+from ._periodic_orbit import prepare
 from ._rest import rest_at
-from ._return_map import OrbitError, OrbitProblem, PeriodFn, Section, ShotOrbit, pack
-from ._settle import SettledState
+from ._return_map import OrbitError, OrbitProblem, PeriodFn, Section, SettledState, ShotOrbit, pack
 from ._step import BranchStep, step_at
 
 # First step to the orbits of twice the period, in the extent of the orbit.
@@ -98,19 +98,20 @@ def _born(
     rest, dof = point.orbit, len(point.orbit.q)
     centre, (wave, extent), born = np.asarray(pack(rest.state)), _wave(scene, rest), rest.period
     n, empty, (rtol, atol) = len(centre), jnp.zeros(0), map(jnp.asarray, tolerances)
-    problem = OrbitProblem(scene, jnp.zeros(()), rtol, atol, empty, empty, empty, None, None, (parameter,))
+    none = jnp.zeros((0, 0))
+    problem = OrbitProblem(scene, jnp.zeros(()), rtol, atol, empty, empty, empty, None, None, (parameter,), none, none)
     along = wave / extent
     row = np.append(along / (along @ along), [0.0, 0.0])
     first: BranchStep | None = None
     x, period, value, amplitude = centre + _LEAST * wave, born, point.value, _LEAST
     for _ in range(_TRIES):
         scale = np.append(amplitude * extent, [period, span])
-        here = anchored(problem, SettledState(x[None, :], np.zeros(1), period, scale), dof)
 
         def on_wave(shot: ShotOrbit, scale: np.ndarray = scale) -> float:
             return float(row[:n] @ ((shot.x[0] - centre) / scale[:n])) - 1.0
 
         try:
+            here, _ = anchored(problem, SettledState(x[None, :], np.zeros(1), period, scale, ()), dof)
             condition = Condition(on_wave, lambda _: row)
             shot, _ = newton(here, x[None, :], period, np.array([value]), dof, scale, (condition,))
             change = max(abs(shot.value - point.value) / span, abs(shot.period / born - 1.0))

@@ -15,8 +15,8 @@ from ._orbit import PeriodicOrbit
 from ._return_map import OrbitProblem, ShotOrbit, evaluate
 from ._settle import held, magnitudes, states_of
 
-# Of a problem, a point and the scales of the unknowns.
-Test: TypeAlias = Callable[[OrbitProblem, ShotOrbit, np.ndarray], float]
+# Of a problem, a point, the scales of the unknowns, and the number of coordinates.
+Test: TypeAlias = Callable[[OrbitProblem, ShotOrbit, np.ndarray, int], float]
 
 # Step of differences, in the scales of the unknowns: the iteration needs few digits of the derivatives.
 _DIFFERENCE = 1e-6
@@ -75,8 +75,9 @@ class BranchStep:
         """At an orbit that begins so much later [s], away from changes of modes."""
         n, dof = shot.x.size, len(self.orbit.q)
         t0 = float(self.problem.phase) * shot.period
-        free = replace(self.problem, period=None, phase=jnp.asarray(t0 / later))
-        moved = evaluate(free, shot.x, later, shot.values, dof)
+        none = 0.0 * self.problem.free
+        open_ended = replace(self.problem, period=None, phase=jnp.asarray(t0 / later), free=none, pinned=none)
+        moved = evaluate(open_ended, shot.x, later, shot.values, dof)
         x = shot.x + moved.residual[:n]
         by_values = moved.by[:n, n + 1 :] @ sense[-len(shot.values) :]
         sense = np.concatenate([moved.monodromy @ sense[:n] + by_values, sense[n:]])
@@ -99,7 +100,7 @@ def step_at(
 
     `spans` are the scales of the parameters.
     """
-    scale = magnitudes(states_of(*orbit.runs), shot.period)
+    scale = magnitudes(problem, states_of(*orbit.runs), len(orbit.q), shot.period)
     scale = np.concatenate([scale if problem.autonomous else scale[:-1], spans])
     if problem.autonomous and problem.section is None:
         n = shot.x.size
@@ -117,13 +118,13 @@ def test_condition(problem: OrbitProblem, test: Test, scale: np.ndarray, dof: in
     """That a function of the orbits is zero, with its derivatives by differences of shots."""
 
     def by(shot: ShotOrbit) -> np.ndarray:
-        here, row = test(problem, shot, scale), []
+        here, row = test(problem, shot, scale, dof), []
         for moved in shot.unknowns + _DIFFERENCE * np.diag(scale):
             beside = evaluate(problem, *split(moved, shot, problem.autonomous), dof)
-            row.append((test(problem, beside, scale) - here) / _DIFFERENCE)
+            row.append((test(problem, beside, scale, dof) - here) / _DIFFERENCE)
         return np.array(row)
 
-    return Condition(lambda shot: test(problem, shot, scale), by)
+    return Condition(lambda shot: test(problem, shot, scale, dof), by)
 
 
 def _clear_of_events(orbit: PeriodicOrbit) -> float | None:

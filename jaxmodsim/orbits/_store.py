@@ -97,6 +97,7 @@ class BranchStore:
             "tangent": (("orbit", "unknown"), [each.tangent * each.scale for each in steps]),
             "lowest": (("orbit", "coordinate"), [np.asarray(each.lowest) for each in orbits]),
             "highest": (("orbit", "coordinate"), [np.asarray(each.highest) for each in orbits]),
+            "advance": (("orbit", "coordinate"), [np.asarray(each.advance) for each in orbits]),
             "multipliers_real": (("orbit", "multiplier"), np.real(multipliers)),
             "multipliers_imaginary": (("orbit", "multiplier"), np.imag(multipliers)),
             "stable": ("orbit", [each.stable for each in orbits]),
