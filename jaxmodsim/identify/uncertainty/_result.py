@@ -209,7 +209,8 @@ def remarks(result: FitResult) -> tuple[str, ...]:
     errors, bounds = estimate.errors, estimate.bounds
     explained = {name for issue in diagnostics.issues for name in issue.about}
     sentences = _of_the_search(diagnostics, result.provenance.records)
-    sentences += [f"{name} has no effect on this record." for name in estimate.values if not np.isfinite(errors[name])]
+    silent = [name for name in estimate.values if not np.isfinite(errors[name]) and name not in explained]
+    sentences += [f"{name} has no effect on this record." for name in silent]
     sentences += [issue.sentence for issue in diagnostics.issues]
     for name, value in estimate.values.items():
         if np.isfinite(errors[name]) and value in bounds[name]:
