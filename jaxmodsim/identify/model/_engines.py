@@ -36,6 +36,8 @@ RODAS3 = RosenbrockTableau(
 # laws are None where it has none.
 Observe: TypeAlias = Callable[[Array, State, Scene, Array | None], PyTree[Array]]
 Inputs: TypeAlias = dict[str, Float[Array, " samples"]]
+# Limit of the steps of a run by events; each sample of a held input ends one.
+_STEPS_A_RUN, _STEPS_A_SAMPLE = 16384, 4
 # What names of delays of inputs start with.
 DELAY = "delay."
 _Model = TypeVar("_Model", bound=eqx.Module)
@@ -180,7 +182,7 @@ class ModelOutput(NamedTuple):
 
 
 class ReplayEngine(eqx.Module):
-    """A scene without events, by fixed steps from sample to sample."""
+    """A scene by fixed steps from sample to sample, through stick and slip along a line."""
 
     model: Scene
     delays: dict[str, Array]
@@ -207,7 +209,7 @@ class ReplayEngine(eqx.Module):
 
 
 class EventEngine(eqx.Module):
-    """A scene with set-valued laws, by events; NaN where the run ends early."""
+    """A scene with contacts, or whose slip instants were recorded, by tolerances; NaN where the run ends early."""
 
     model: Scene
     delays: dict[str, Array]
@@ -235,6 +237,7 @@ class EventEngine(eqx.Module):
             z0=start.z,
             rtol=self.rtol,
             atol=self.atol,
+            max_steps=_STEPS_A_RUN + _STEPS_A_SAMPLE * run.t.shape[0],
             max_events=self.max_events,
             throw=False,
         )

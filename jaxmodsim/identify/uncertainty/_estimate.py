@@ -354,12 +354,12 @@ def derivatives_hold(problem: FitProblem, state: SearchState) -> bool:
     level = np.sqrt(np.mean(residual[: problem.samples][problem.weights > 0] ** 2))
     move = level * (vectors @ (signs / np.sqrt(np.maximum(values, rounding)))) / scale
     move *= min(_TRIED, _FARTHEST / max(float(np.max(np.abs(move))), _TINY))
-    trial = np.clip(x + move, np.asarray(box.lower), np.asarray(box.upper)).astype(x.dtype)
+    inside = np.clip(move, np.asarray(box.lower) - x, np.asarray(box.upper) - x)
+    trial = (x + inside).astype(x.dtype)
     # The first evaluation of a search: the program is that of the fit.
     there = step(problem, start_search(on_device(trial), problem.rows), on_device(np.asarray(0.0, x.dtype)))
-    expected = jacobian @ (trial - x).astype(float)
-    missed = np.linalg.norm(np.asarray(there.residual) - residual - expected)
-    return bool(missed <= _HOLDS * np.linalg.norm(jacobian @ move))
+    missed = np.linalg.norm(np.asarray(there.residual) - residual - jacobian @ inside)
+    return bool(missed < _HOLDS * np.linalg.norm(jacobian @ move))
 
 
 def sample_blocks(problem: FitProblem, blocks: int = BLOCKS) -> tuple[Int[np.ndarray, " rows"], int]:
