@@ -68,8 +68,9 @@ def fit(
 
     The inputs drive the scene, nothing measured is fed back, and the sum of squares of `observe - measured`, each
     channel in units of its noise, is minimised over all samples by Levenberg-Marquardt within bounds, on the exact
-    derivatives of the simulated run. Scenes without set-valued laws are run by fixed steps from sample to sample,
-    those with such laws by events.
+    derivatives of the simulated run. It has fixed steps from sample to sample; set-valued laws stick and slip exactly,
+    and every change of mode on the way is located. Scenes with contacts or constraints under set-valued laws, slip in a
+    plane, and records with slip instants are run by tolerances.
 
     **Arguments:**
 
@@ -97,7 +98,7 @@ def fit(
     - `initializer`: how to find where the search starts, one after the other: `Staged()`, `MultiStart(...)`,
       `Continuation(...)`.
     - `substeps`: integration steps between two samples.
-    - `accuracy`: relative tolerance of runs by events.
+    - `accuracy`: relative tolerance of runs by tolerances.
     - `rtol`: relative change of the residual at which the search ends.
     - `max_steps`: limit of iterations. Up to it a search goes on by itself, every hundred of them with a damping as at
       the start; the result says how often.
