@@ -22,7 +22,6 @@ import jaxmodsim as jms
 from jaxmodsim.identify import (
     AxisModel,
     Candidate,
-    Continuation,
     FitResult,
     axis_models,
     axis_scene,
@@ -80,7 +79,7 @@ def main(record_file: Path, out: Path, smoke: bool = False) -> None:
     fitted = models()
     for name in ("coulomb",) if smoke else fitted:
         model = fitted[name]
-        # The record starts in motion. A width that comes down from a large one does not get caught on the way.
+        # The record starts in motion.
         result = fit(
             axis_scene(model, rough),
             record,
@@ -88,15 +87,13 @@ def main(record_file: Path, out: Path, smoke: bool = False) -> None:
             q0=[q0],
             qd0=[qd0],
             limits={"m": (0.0, None)},
-            initializer=Continuation("dry.width", 10.0, 2),
         )
         fine = resimulated(result, 5)
         print(f"\n{name}: {model.description}\n{result}\nwith five steps for every sample: RMSE {1e3 * fine:.4f} mm")
         fit_figure(result, caption=SOURCE).savefig(out / f"b0_emps_{name}.png", dpi=130)
     if not smoke:
         candidates = {name: Candidate(axis_scene(x, rough), x.free, x.description) for name, x in fitted.items()}
-        start, narrowing = {"q0": [q0], "qd0": [qd0]}, Continuation("dry.width", 10.0, 2)
-        print(f"\n{compare(candidates, record, **start, limits={'m': (0.0, None)}, initializer=narrowing)}")
+        print(f"\n{compare(candidates, record, q0=[q0], qd0=[qd0], limits={'m': (0.0, None)})}")
     print(f"wrote figures to {out}")
 
 

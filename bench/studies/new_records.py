@@ -17,7 +17,6 @@ from bench.record import Result
 from jaxmodsim.identify import (
     Candidate,
     Comparison,
-    Continuation,
     axis_models,
     axis_scene,
     compare,
@@ -106,8 +105,7 @@ def _compared(one: jms.Record) -> Comparison:
     models = {name: axis_models()[name] for name in LAWS}
     candidates = {name: Candidate(axis_scene(model, rough), model.free) for name, model in models.items()}
     q0, qd0 = start_state(one)
-    narrower = [Continuation(name, 10.0, 2) for name in ("dry.width", "friction.width")]
-    return compare(candidates, one, q0=[q0], qd0=[qd0], limits={"m": (0.0, None)}, initializer=narrower)
+    return compare(candidates, one, q0=[q0], qd0=[qd0], limits={"m": (0.0, None)})
 
 
 def _pair(change: float, stiction: float, rng: np.random.Generator) -> _Pair:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .._core.progress import candidate_words, iteration_words, progress_line
+from ..analysis import formulations
 from ..identify import (
     AxisLimits,
     Comparison,
@@ -51,6 +52,8 @@ from ._report_html import report_page
 
 # Integration steps between two samples are raised by this factor, to so many at most.
 _FINER, _MOST_SUBSTEPS = 4, 64
+# Width of friction made smooth for the design of an input, in top speeds.
+_SMOOTH = 1e-3
 # Parameters whose likelihood a report profiles, and about how many points on either side.
 _PROFILED, _POINTS = 2, 4
 
@@ -269,9 +272,11 @@ def _designed(request: FitRequest, fitted: Fitted) -> InputDesign:
         request.max_travel or 0.5 * (high - low),
         rotary=fitted.plan.rotary,
     )
-    numbers = scene_numbers(fitted.scene)
+    numbers, scene = scene_numbers(fitted.scene), fitted.scene
+    if scene.event_driven:  # which a design by derivatives of all samples cannot pass
+        scene = formulations(scene, width=_SMOOTH * limits.speed)["Regularized"]
     design = design_input(
-        fitted.scene,
+        scene,
         [name for name in result.values if name in numbers],
         limits,
         duration=request.duration or max(float(record.t[-1] - record.t[0]) for record in records),

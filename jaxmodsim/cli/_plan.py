@@ -12,7 +12,6 @@ import numpy as np
 from ..identify import (
     Candidate,
     Cauchy,
-    Continuation,
     Huber,
     MultiStart,
     Record,
@@ -29,8 +28,6 @@ from ._units import given_units, option_hint
 
 _LOSSES = {"squares": SquaredLoss, "huber": Huber, "cauchy": Cauchy}
 _INITIALIZERS = ("rough", "staged")
-# How many times wider friction is regularised at first, and in how many fits it comes down.
-_WIDER, _STAGES = 10.0, 2
 # Beside the numbers of the scene: the state at the first sample of each record, and the delay of the force.
 _ALSO_FREE = ("q0", "qd0", "z0", "delay.u")
 
@@ -140,7 +137,7 @@ def plan_of(request: FitRequest) -> Plan:
         free = tuple(dict.fromkeys(each for each in (*(chosen or model.free), *added) if each not in fixed))
         candidates[name] = Candidate(axis_scene(model, rough, *own), free, model.description)
     limits = {"m": (0.0, None)} | _limits(request.limit, numbers)
-    initializer = _initializers(request, candidates, numbers)
+    initializer = _initializers(request)
     options = {"loss": loss, "initializer": initializer, "max_steps": request.max_steps, **start_states(records)}
     compared = len(names) > 1 or request.folds is not None
     rotary = any(file.rotary for file in read)
@@ -149,16 +146,10 @@ def plan_of(request: FitRequest) -> Plan:
     )
 
 
-def _initializers(
-    request: FitRequest, candidates: Mapping[str, Candidate], numbers: Mapping[str, Sequence[str]]
-) -> list[Staged | MultiStart | Continuation]:
-    """Where a search starts, with the width of the regularisation coming down at last: narrow at once, it is caught."""
-    initializers: list[Staged | MultiStart | Continuation] = [Staged()] if request.begin == "staged" else []
-    if request.starts > 1:
-        initializers.append(MultiStart(request.starts))
-    free = {name for candidate in candidates.values() for name in candidate.free or ()}
-    widths = dict.fromkeys(each for own in numbers.values() for each in own if each.endswith(".width"))
-    return [*initializers, *(Continuation(each, _WIDER, _STAGES) for each in widths if each not in free)]
+def _initializers(request: FitRequest) -> list[Staged | MultiStart]:
+    """Where a search starts."""
+    staged = [Staged()] if request.begin == "staged" else []
+    return [*staged, *([MultiStart(request.starts)] if request.starts > 1 else [])]
 
 
 def _check(request: FitRequest) -> None:

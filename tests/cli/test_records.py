@@ -19,7 +19,7 @@ FRAME, RANDOM = axis_frame(), np.random.default_rng(1)
 T, Q, U = (FRAME[name].to_numpy() for name in ("time", "pos", "volt"))
 COLUMNS = ("--time", "time", "--position", "pos", "--force", "volt")
 FORCE = ("--units", f"force={GAIN}")
-MODEL = ("--fix", "dry.width=1e-3", "--substeps", "2")
+MODEL = ("--substeps", "1")
 SPIKES = np.where(RANDOM.random(T.size) < 0.005, 0.05 * RANDOM.standard_normal(T.size), 0.0)
 QUICK_CLOCK = "--units", f"time=ms,position=mm,force={GAIN}"
 VELOCITY = np.gradient(Q, T)
@@ -110,7 +110,7 @@ def test_a_rotary_axis_has_its_units(run_command, tmp_path):
 
 def test_integration_steps_are_raised_until_they_no_longer_show(run_command, tmp_path):
     changed(pos=Q + 5e-5 * RANDOM.standard_normal(T.size)).to_csv(tmp_path / "run.csv", index=False)
-    options = (*COLUMNS, *FORCE, "--fix", "dry.width=1e-3", "--max-steps", "12")
+    options = (*COLUMNS, *FORCE, "--max-steps", "12")
     read = Read(run_command, tmp_path, str(tmp_path / "run.csv"), *options)
     assert read.right
     assert read.found["substeps"] > 1

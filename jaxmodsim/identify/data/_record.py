@@ -1,5 +1,6 @@
 """Measured records: samples, windows as arrays of one shape, and positions differentiated."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
@@ -32,6 +33,8 @@ _SAMPLES = 20
 _NEIGHBOURS, _STANDS_OUT, _NEARLY_ALL = 5, 10.0, 0.95
 # Smoothing: one sample to either side for so many of the record, and never fewer than so many to either side.
 _SAMPLES_A_SIDE, _LEAST_SPAN = 1000, 3
+# Orders of the differences that show noise, into how many parts of how many samples at least a record is cut.
+_ORDERS, _PARTS, _LEAST_PART = (2, 3, 4, 5, 6), 32, 32
 
 
 class Record:
@@ -354,6 +357,21 @@ def without_outliers(x: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " sa
     """The samples, with the median of their neighbours in place of those that stand out."""
     bad = outliers(x)
     return np.where(bad, _local_median(x), x) if bad.any() else x
+
+
+def sample_noise(x: Float[np.ndarray, " samples"]) -> float:
+    """Standard deviation of the noise that samples do not share with their neighbours, and half the resolution.
+
+    Differences of the order that leaves least of the motion; the median over parts of the record, so that impacts and
+    outliers decide nothing.
+    """
+    levels = [np.inf]
+    for order in _ORDERS:
+        squares = np.diff(x, order) ** 2 / math.comb(2 * order, order)
+        parts = np.array_split(squares, max(min(squares.size // _LEAST_PART, _PARTS), 1))
+        levels.append(float(np.sqrt(np.median([np.mean(part) for part in parts]))) if squares.size else np.inf)
+    steps = np.diff(np.unique(x))
+    return float(np.hypot(min(levels), 0.5 * np.min(steps) if steps.size else 0.0))
 
 
 def _local_median(x: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:

@@ -19,6 +19,8 @@ from ._search import SearchOptions, SearchState, solve, start_search, steps_side
 
 # Searches that are run as one.
 _GROUP = 32
+# Share of the cost by which the fit from a smaller model must be better to be taken.
+_BETTER = 1e-3
 # Rounds of several starts: share of the evaluations, and share of the starts that is kept after it.
 _ROUNDS = ((0.25, 0.25), (0.25, 0.125), (1.0, 0.0))
 
@@ -229,7 +231,10 @@ class FromSmaller(AbstractInitializer):
         own = np.asarray(x)[size:]
         starts = [x, *(on_device(np.concatenate([each, own])) for each in (over, np.where(rest, 0.0, over)))]
         ends = [solve(problem, each, options).state for each in (starts if np.any(rest) else starts[:2])]
-        return min(ends, key=lambda end: float(np.nan_to_num(float(end.cost), nan=np.inf))).x, ()
+        costs = [float(np.nan_to_num(float(end.cost), nan=np.inf)) for end in ends]
+        # An end that is no better is the same fit, which is then the one without the smaller model.
+        best = int(np.argmin(costs))
+        return ends[best if costs[best] < (1 - _BETTER) * costs[0] else 0].x, ()
 
 
 def last_part(name: str) -> str:

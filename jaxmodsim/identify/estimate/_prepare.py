@@ -115,7 +115,7 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
     parameters = FreeParameters.of(single, ranges, chosen, _passive(settings.passive, numbers))
     windows = cut(several, None if settings.shooting is None else settings.shooting.window)
     base = _bases(scene, several, windows, states, observables)
-    engine = _engine(scene, several, settings, observables)
+    engine = _engine(scene, several, settings, observables, states.q.shape[1])
     names = (*dict(observables), *(slip_channel(x) for x in dict.fromkeys(e for r in several for e in r.slips)))
     noise = {name: on_device(_level(name, several)) for name in names}
     problem = FitProblem(
@@ -286,18 +286,23 @@ def _bases(
 
 
 def _engine(
-    scene: Scene, records: tuple[Record, ...], settings: Settings, observables: tuple[tuple[str, Observable], ...]
+    scene: Scene,
+    records: tuple[Record, ...],
+    settings: Settings,
+    observables: tuple[tuple[str, Observable], ...],
+    dof: int,
 ) -> ReplayEngine | EventEngine:
     linear = records[0].linear
     delays = {DELAY + name: on_device(float(late)) for name, late in settings.delay.items()}
-    if not scene.mode_names:
+    slips = tuple(dict.fromkeys(effect for record in records for effect in record.slips))
+    fixed_steps = not scene.mode_names or (not scene.constraints and set(scene.mode_widths(dof)) == {1})
+    if fixed_steps and not slips:
         return ReplayEngine(scene, delays, settings.controller, observables, linear, settings.substeps)
     if settings.controller is not None:
         raise ValueError(
-            f"A controller runs with fixed steps, but {', '.join(scene.mode_names)} runs by events: wrap the law,"
-            " as in Regularized(law, width); contacts need events."
+            "A controller runs with fixed steps, which pass stick and slip along a line, but neither constraints, nor"
+            " slip in a plane, nor slip instants in a record: wrap the laws, as in Regularized(law, width)."
         )
-    slips = tuple(dict.fromkeys(effect for record in records for effect in record.slips))
     return EventEngine(
         scene, delays, observables, linear, slips, settings.accuracy, _ATOL_SHARE * settings.accuracy, _MAX_EVENTS
     )

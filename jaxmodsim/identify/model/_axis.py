@@ -9,14 +9,12 @@ import numpy as np
 from jaxtyping import Array
 
 from ..._core.parameters import ranges_of
-from ...friction import AbstractLaw, AbstractSetValuedLaw, Coulomb, Regularized, Viscous, asymmetric, laws
+from ...friction import AbstractLaw, Coulomb, Viscous, asymmetric, laws
 from ...scene import AbstractEffect, AppliedForce, Friction, Scene, replace_numbers
 from ..data._record import Record, differentiate, smooth, smooth_span, without_outliers
 
 # Share of the variance of a force below which a regression explains it well enough to tell that its sign is wrong.
 _EXPLAINED = 0.5
-# Width of the regularisation in top speeds. Fits that come down to it from a wider one do not get caught on the way.
-_WIDTH = 1e-3
 # Slower than this share of the top speed a sample says little of friction in slip.
 _MOVING = 0.05
 # Where the regression gives no positive number: friction as a share of the root mean square of the force.
@@ -92,14 +90,14 @@ def rough_axis(record: Record) -> RoughAxis:
 
 def _coulomb(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
     return (
-        Friction(Regularized(Coulomb(rough.Fc), _WIDTH * rough.top), name="dry"),
+        Friction(Coulomb(rough.Fc), name="dry"),
         Friction(Viscous(rough.Fv), name="viscous"),
     )
 
 
 def _asymmetric(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
     return (
-        Friction(Regularized(asymmetric(Coulomb(rough.Fc), Fc=rough.Fc), _WIDTH * rough.top), name="dry"),
+        Friction(asymmetric(Coulomb(rough.Fc), Fc=rough.Fc), name="dry"),
         Friction(asymmetric(Viscous(rough.Fv), Fv=rough.Fv), name="viscous"),
     )
 
@@ -130,12 +128,12 @@ class AxisModel:
 # Models of more than one friction element.
 _COMBINATIONS = {
     "coulomb": AxisModel(
-        _coulomb, ("m", "offset", "dry.Fc", "viscous.Fv"), "Coulomb friction (regularised) and viscous friction"
+        _coulomb, ("m", "offset", "dry.Fc", "viscous.Fv"), "Coulomb friction and viscous friction"
     ),
     "asymmetric": AxisModel(
         _asymmetric,
         ("m", "dry.forward.Fc", "dry.backward.Fc", "viscous.forward.Fv", "viscous.backward.Fv"),
-        "Coulomb (regularised) and viscous friction, each with a value for either direction; a constant offset is part"
+        "Coulomb and viscous friction, each with a value for either direction; a constant offset is part"
         " of the difference of the Coulomb forces and held at zero",
     ),
 }
@@ -148,19 +146,17 @@ def axis_models() -> dict[str, AxisModel]:
 
 
 def _one_law(kind: type[AbstractLaw]) -> AxisModel | None:
-    """The axis with one friction law, a set-valued one made smooth; None where it does not say a start."""
+    """The axis with one friction law; None where it does not say a start."""
     example = kind.fit_start(1.0, 1.0, 1.0, 1.0)
     if example is None:
         return None
-    smooth = isinstance(example, AbstractSetValuedLaw)
 
     def effects(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
         law: Any = kind.fit_start(rough.m, rough.Fc, rough.Fv, rough.top)
-        return (Friction(Regularized(law, _WIDTH * rough.top) if smooth else law, name="friction"),)
+        return (Friction(law, name="friction"),)
 
     numbers = [f"friction.{name}" for name, allowed in ranges_of(example).items() if not allowed.execution]
-    words = f"{kind.__name__}: {kind.description}" + (" (regularised)" if smooth else "")
-    return AxisModel(effects, ("m", "offset", *numbers), words)
+    return AxisModel(effects, ("m", "offset", *numbers), f"{kind.__name__}: {kind.description}")
 
 
 def axis_scene(

@@ -18,6 +18,7 @@ from ...solvers import RosenbrockTableau, rosenbrock_step
 from ..data._record import Runs
 from ._observe import Observable, first_coordinate, needs_forces, observed, observer
 from ._parameters import join_entries
+from ._stick_slip import first_modes, pass_modes, settle
 
 # Order 3, L-stable, stiffly accurate, three field evaluations (Sandu et al. 1997, Atmospheric Environment 31:3459).
 # Of order 3 because a held input has no more smoothness between samples than its samples carry, and three evaluations
@@ -31,9 +32,12 @@ RODAS3 = RosenbrockTableau(
     solution=np.array([2.0, 0.0, 1.0, 1.0]),
     error=np.array([0.0, 0.0, 0.0, 1.0]),
 )
-# `observe(t, y, scene)`, what is seen of a state; the scene is as the inputs drive it.
-Observe: TypeAlias = Callable[[Array, State, Scene], PyTree[Array]]
+# `observe(t, y, scene, mode)`, what is seen of a state; the scene is as the inputs drive it, the modes of its set-valued
+# laws are None where it has none.
+Observe: TypeAlias = Callable[[Array, State, Scene, Array | None], PyTree[Array]]
 Inputs: TypeAlias = dict[str, Float[Array, " samples"]]
+# Limit of the steps of a run by events; each sample of a held input ends one.
+_STEPS_A_RUN, _STEPS_A_SAMPLE = 16384, 4
 # What names of delays of inputs start with.
 DELAY = "delay."
 _Model = TypeVar("_Model", bound=eqx.Module)
@@ -86,39 +90,50 @@ def run_samples(
     What was observed at each sample, with a leading axis of samples, and the state at the last one.
     """
 
-    def advance(
-        carry: tuple[State, PyTree], sample: tuple[Array, Array, PyTree, PyTree]
-    ) -> tuple[tuple[State, PyTree], PyTree]:
-        (y, memory), (start, dt, held, slopes) = carry, sample
+    exact = bool(scene.mode_names)
+
+    def advance(carry: tuple[Any, PyTree], sample: tuple[Array, Array, PyTree, PyTree]) -> tuple[Any, PyTree]:
+        ((y, mode), memory), (start, dt, held, slopes) = carry, sample
         here = _driven(scene, held)
         outputs: dict[str, Array] = {}
         if controller is not None:
             outputs, memory = controller.fn(start, y.q, y.qd, memory, here.params)
             here = _driven(here, outputs)
-        seen = observe(start, y, here)
+        if exact:
+            y, mode = settle(start, y, here, mode)
+        seen = observe(start, y, here, mode)
+
+        def scene_at(t: Array) -> Scene:
+            return _driven(here, {k: held[k] + (t - start) * x for k, x in slopes.items()})
 
         def field(t: Array, y: State) -> State:
-            return vector_field(t, y, _driven(here, {k: held[k] + (t - start) * x for k, x in slopes.items()}))
+            return vector_field(t, y, scene_at(t))
 
         step = dt / substeps
 
-        def substep(k: int | Array, y: State) -> State:
-            return rosenbrock_step(RODAS3, field, start + k * step, step, y, pivot=True).y1
+        def substep(k: int | Array, at: tuple[State, Array | None]) -> tuple[State, Array | None]:
+            y, mode = at
+            if mode is not None:
+                return pass_modes(RODAS3, scene_at, start + k * step, step, y, mode)
+            return rosenbrock_step(RODAS3, field, start + k * step, step, y, pivot=True).y1, None
 
-        moved = substep(0, y) if substeps == 1 else jax.lax.fori_loop(0, substeps, substep, y)
+        moved = substep(0, (y, mode)) if substeps == 1 else jax.lax.fori_loop(0, substeps, substep, (y, mode))
         # Records of different lengths that run side by side repeat their last time.
-        y = jtu.tree_map(lambda new, old: jnp.where(dt > 0, new, old), moved, y)
-        return (y, memory), seen
+        moved = jtu.tree_map(lambda new, old: jnp.where(dt > 0, new, old), moved, (y, mode))
+        return (moved, memory), seen
 
     dt = jnp.diff(t)
     slopes = {name: jnp.diff(inputs[name]) / jnp.where(dt > 0, dt, 1.0) for name in sorted(linear)}
     memory = () if controller is None else controller.memory
     samples = (t[:-1], dt, jtu.tree_map(lambda x: x[:-1], inputs), slopes)
-    (end, memory), seen = jax.lax.scan(advance, (y0, memory), samples)
+    begin = first_modes(t[0], y0, _driven(scene, jtu.tree_map(lambda x: x[0], inputs))) if exact else (y0, None)
+    ((end, mode), memory), seen = jax.lax.scan(advance, (begin, memory), samples)
     last = _driven(scene, jtu.tree_map(lambda x: x[-1], inputs))
     if controller is not None:
         last = _driven(last, controller.fn(t[-1], end.q, end.qd, memory, last.params)[0])
-    final = observe(t[-1], end, last)
+    if exact:
+        end, mode = settle(t[-1], end, last, mode)
+    final = observe(t[-1], end, last, mode)
     return jtu.tree_map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), seen, final), end
 
 
@@ -145,8 +160,8 @@ def replay(
     """
     y0 = State(q0, qd0, scene.initial_state(q0))
 
-    def look(t: Array, y: State, scene: Scene) -> Array:
-        del t, scene
+    def look(t: Array, y: State, scene: Scene, mode: Array | None) -> Array:
+        del t, scene, mode
         return observe(y.q, y.qd)
 
     return run_samples(scene, t, inputs, y0, look, substeps=substeps)[0]
@@ -167,7 +182,7 @@ class ModelOutput(NamedTuple):
 
 
 class ReplayEngine(eqx.Module):
-    """A scene without events, by fixed steps from sample to sample."""
+    """A scene by fixed steps from sample to sample, through stick and slip along a line."""
 
     model: Scene
     delays: dict[str, Array]
@@ -194,7 +209,7 @@ class ReplayEngine(eqx.Module):
 
 
 class EventEngine(eqx.Module):
-    """A scene with set-valued laws, by events; NaN where the run ends early."""
+    """A scene with contacts, or whose slip instants were recorded, by tolerances; NaN where the run ends early."""
 
     model: Scene
     delays: dict[str, Array]
@@ -222,6 +237,7 @@ class EventEngine(eqx.Module):
             z0=start.z,
             rtol=self.rtol,
             atol=self.atol,
+            max_steps=_STEPS_A_RUN + _STEPS_A_SAMPLE * run.t.shape[0],
             max_events=self.max_events,
             throw=False,
         )

@@ -85,15 +85,17 @@ def check_observables(observables: tuple[tuple[str, Observable], ...], scene: Sc
 def _shape(observable: Observable, y: State, scene: Scene) -> tuple[int, ...] | None:
     if callable(observable):
         return getattr(traced(observable, name="observe(q, qd)", q=y.q, qd=y.qd), "shape", None)
-    look = lambda: observer(((".", observable),))(jnp.zeros((), y.q.dtype), y, scene)["."]  # noqa: E731
+    look = lambda: observer(((".", observable),))(jnp.zeros((), y.q.dtype), y, scene, None)["."]  # noqa: E731
     return getattr(jax.eval_shape(look), "shape", None)
 
 
-def observer(observables: tuple[tuple[str, Observable], ...]) -> Callable[[Array, State, Scene], dict[str, Array]]:
-    """A function of time, state and scene that returns what each channel sees."""
+def observer(
+    observables: tuple[tuple[str, Observable], ...],
+) -> Callable[[Array, State, Scene, Array | None], dict[str, Array]]:
+    """A function of time, state, scene and modes that returns what each channel sees."""
 
-    def observe(t: Array, y: State, scene: Scene) -> dict[str, Array]:
-        forces = forward_dynamics(t, y, scene).forces if any(needs_forces(x) for _, x in observables) else {}
+    def observe(t: Array, y: State, scene: Scene, mode: Array | None) -> dict[str, Array]:
+        forces = forward_dynamics(t, y, scene, mode).forces if any(needs_forces(x) for _, x in observables) else {}
         return {channel: observed(observable, y.q, y.qd, forces) for channel, observable in observables}
 
     return observe

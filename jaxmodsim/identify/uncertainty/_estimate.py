@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import special  # scipy.stats takes most of a second to import
 
+from ..._core.device import on_device
 from ..data._record import Record
 from ..estimate._problem import FitProblem
-from ..estimate._search import SearchState, by_channel, weighted_by
+from ..estimate._search import SearchState, by_channel, start_search, step, weighted_by
 from ..model._observe import RecordedMotion, motion_of
 
 # Blocks of samples: enough for the scatter of the scores of a dozen parameters, and each far longer than what the
@@ -29,6 +30,10 @@ _ALONE = 1e-6
 # residuals do not pass for white, and what keeps divisions by what may vanish finite.
 _LAGS_A_DECADE, _SAMPLES_A_LAG = 10, 5
 _CHANCE, _TINY = 0.01, 1e-30
+
+# Derivatives are tried over this share of a standard error, and over no more than this in coordinates of about 1; they
+# hold if they miss no more than this share of the change.
+_TRIED, _FARTHEST, _HOLDS = 0.1, 1e-3, 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,11 +159,13 @@ class CovarianceEstimate(NamedTuple):
     - `covariance`: of the parameters, correlation of the residual in time taken into account.
     - `white`: what it would be if the residual were white noise.
     - `information`: Fisher information of the samples, in noise levels, and of the prior.
+    - `refused`: whether the derivatives do not hold, see `derivatives_hold`; then the variances are infinite.
     """
 
     covariance: Float[np.ndarray, "free free"]
     white: Float[np.ndarray, "free free"]
     information: Float[np.ndarray, "free free"]
+    refused: bool = False
 
 
 def block_numbers(
@@ -318,6 +325,9 @@ def covariance_of(problem: FitProblem, state: SearchState, kept: int, blocks: in
 
     Without JAX: its many small matrices take seconds to compile.
     """
+    if not derivatives_hold(problem, state):
+        unknown = np.diag(np.full(kept, np.inf))
+        return CovarianceEstimate(unknown, unknown, np.zeros((kept, kept)), refused=True)
     numbers, count = sample_blocks(problem, blocks)
     rows, size = problem.samples, len(problem.free.names)
     residual, jacobian = (each[:rows] for each in weighted_by(problem.loss, state))
@@ -326,6 +336,30 @@ def covariance_of(problem: FitProblem, state: SearchState, kept: int, blocks: in
     white = _passes_for_white(problem, residual)
     extra = np.asarray(state.jacobian)[rows:]
     return covariance_estimate(residual, jacobian, extra, slopes, numbers, count, kept, white)
+
+
+def derivatives_hold(problem: FitProblem, state: SearchState) -> bool:
+    """Whether the output changes as its derivatives say, over a small part of the standard errors that these give.
+
+    It does not where the output is as rough as rounding, or as the integration steps, leave it: derivatives are then
+    too large by many powers of ten, and standard errors too small, down to below the rounding of the parameter.
+    """
+    x, box = np.asarray(state.x), problem.box
+    jacobian, residual = (np.asarray(each).astype(float) for each in (state.jacobian, state.residual))
+    scale = np.sqrt(np.sum(jacobian**2, axis=0))
+    scale = np.where(scale > 0, scale, np.inf)
+    values, vectors = np.linalg.eigh(np.nan_to_num((jacobian / scale).T @ (jacobian / scale)))
+    rounding = ROUNDING * float(np.finfo(x.dtype).eps) * max(values[-1], _TINY)
+    signs = np.where(np.arange(x.size) % 2, -1.0, 1.0)
+    level = np.sqrt(np.mean(residual[: problem.samples][problem.weights > 0] ** 2))
+    move = level * (vectors @ (signs / np.sqrt(np.maximum(values, rounding)))) / scale
+    move *= min(_TRIED, _FARTHEST / max(float(np.max(np.abs(move))), _TINY))
+    inside = np.clip(move, np.asarray(box.lower) - x, np.asarray(box.upper) - x)
+    trial = (x + inside).astype(x.dtype)
+    # The first evaluation of a search: the program is that of the fit.
+    there = step(problem, start_search(on_device(trial), problem.rows), on_device(np.asarray(0.0, x.dtype)))
+    missed = np.linalg.norm(np.asarray(there.residual) - residual - jacobian @ inside)
+    return bool(missed < _HOLDS * np.linalg.norm(jacobian @ move))
 
 
 def sample_blocks(problem: FitProblem, blocks: int = BLOCKS) -> tuple[Int[np.ndarray, " rows"], int]:

@@ -29,6 +29,11 @@ from ._estimate import FitDiagnostics, FitProvenance, IdentifiabilityIssue, Para
 from ._identifiability import identifiability_issues
 from ._result import FitResult, uncertain_of
 
+_ROUGH = (
+    "Standard errors are refused: over a tenth of those that the derivatives give, the output does not change as the"
+    " derivatives say, so rounding or the integration steps decide them. Raise substeps; pass a set-valued law such as"
+    " Coulomb itself, without Regularized; if the model misses nothing but rounding, there is nothing to estimate."
+)
 _KINDS = {
     "scene": "a Scene",
     "loss": "a loss such as Huber()",
@@ -63,8 +68,9 @@ def fit(
 
     The inputs drive the scene, nothing measured is fed back, and the sum of squares of `observe - measured`, each
     channel in units of its noise, is minimised over all samples by Levenberg-Marquardt within bounds, on the exact
-    derivatives of the simulated run. Scenes without set-valued laws are run by fixed steps from sample to sample,
-    those with such laws by events.
+    derivatives of the simulated run. It has fixed steps from sample to sample; set-valued laws stick and slip exactly,
+    and every change of mode on the way is located. Scenes with contacts or constraints under set-valued laws, slip in a
+    plane, and records with slip instants are run by tolerances.
 
     **Arguments:**
 
@@ -92,7 +98,7 @@ def fit(
     - `initializer`: how to find where the search starts, one after the other: `Staged()`, `MultiStart(...)`,
       `Continuation(...)`.
     - `substeps`: integration steps between two samples.
-    - `accuracy`: relative tolerance of runs by events.
+    - `accuracy`: relative tolerance of runs by tolerances.
     - `rtol`: relative change of the residual at which the search ends.
     - `max_steps`: limit of iterations. Up to it a search goes on by itself, every hundred of them with a damping as at
       the start; the result says how often.
@@ -291,7 +297,7 @@ def result_of(
         step_error=step_error,
         starts=starts,
         single_precision=jnp.result_type(float) == jnp.float32,
-        issues=_issues(estimate, provenance, search),
+        issues=_issues(estimate, provenance, search, covariance.refused),
     )
     search = replace(search, windows=windows)
     return FitResult(estimate=estimate, diagnostics=diagnostics, provenance=provenance, search=search)
@@ -322,11 +328,13 @@ def _coordinates(search: SearchResult) -> dict[str, str]:
 
 
 def _issues(
-    estimate: ParameterEstimate, provenance: FitProvenance, search: SearchResult
+    estimate: ParameterEstimate, provenance: FitProvenance, search: SearchResult, refused: bool
 ) -> tuple[IdentifiabilityIssue, ...]:
-    """Causes in the motion for what the figures call uncertain."""
+    """Causes in the motion for what the figures call uncertain; or that there are no such figures."""
     uncertain, model, base = uncertain_of(estimate), provenance.model, search.problem.base
     of_samples = _sample_issues(provenance.records, isinstance(search.problem.loss, SquaredLoss))
+    if refused:
+        return (IdentifiabilityIssue(_ROUGH, tuple(estimate.values)), *of_samples)
     if not uncertain or not isinstance(model, Scene | AbstractLaw):
         return of_samples
     dof = 1 if base is None else base.q.shape[-1]

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from ..._core.files import jsonable, written_whole
 from ..._core.readable import AbstractReadable, Table, table_of
-from ..data._record import Record
+from ..data._record import Record, sample_noise
 from ..estimate._search import SearchResult, ended_by_itself
 from ..model._parameters import with_numbers
 from ._estimate import FitDiagnostics, FitProvenance, IdentifiabilityIssue, ParameterEstimate
@@ -29,6 +29,9 @@ _UNCERTAIN, _ALIKE = 0.1, 0.98
 _UNKNOWN, _PAIRS = 0.5, 4
 # Share of the scatter of a channel from which on an RMSE says that nothing is followed.
 _FOLLOWS = 0.95
+# Excess of the mean square error over the noise from sample to sample that is reported: at least this share, and so many
+# times the root of the number of samples, which are four standard deviations of the ratio.
+_EXCESS, _SCATTER = 0.2, 15.0
 # Share of the RMSE from which on the effect of the integration step is reported.
 _STEP_SHOWS = 0.1
 
@@ -209,7 +212,8 @@ def remarks(result: FitResult) -> tuple[str, ...]:
     errors, bounds = estimate.errors, estimate.bounds
     explained = {name for issue in diagnostics.issues for name in issue.about}
     sentences = _of_the_search(diagnostics, result.provenance.records)
-    sentences += [f"{name} has no effect on this record." for name in estimate.values if not np.isfinite(errors[name])]
+    silent = [name for name in estimate.values if not np.isfinite(errors[name]) and name not in explained]
+    sentences += [f"{name} has no effect on this record." for name in silent]
     sentences += [issue.sentence for issue in diagnostics.issues]
     for name, value in estimate.values.items():
         if np.isfinite(errors[name]) and value in bounds[name]:
@@ -269,6 +273,14 @@ def _of_the_search(diagnostics: FitDiagnostics, records: tuple[Record, ...]) -> 
             sentences.append(
                 f"{channel}: the model follows nothing of the record; its RMSE of {rmse:.2g} is no less than that of a"
                 f" constant, {scatter:.2g}. Is the input the right column, has it the right sign and unit?"
+            )
+            continue
+        samples = sum(x.size for x in columns)
+        noise = math.sqrt(sum(x.size * sample_noise(x) ** 2 for x in columns) / max(samples, 1))
+        if columns and rmse**2 > (1 + max(_EXCESS, _SCATTER / math.sqrt(samples))) * noise**2:
+            sentences.append(
+                f"{channel}: the RMSE of {rmse:.3g} is above the noise from sample to sample, {noise:.2g}: the model"
+                " misses part of the motion, or the noise is correlated in time."
             )
     return sentences
 
