@@ -10,7 +10,7 @@ from ..simulation import Trajectory
 from ._neutral import neutral_directions
 from ._orbit import PeriodicOrbit, Sequence
 from ._return_map import OrbitError, OrbitProblem, ShotOrbit, unpack
-from ._settle import magnitudes, run_for, states_of
+from ._settle import holding_mode, magnitudes, run_for, states_of
 
 # Intervals along a segment of an orbit between which extrema are interpolated.
 _INTERVALS = 512
@@ -119,7 +119,7 @@ def _shares(
     (t, end), zeros = span, 0
     period, modes, shares = end - t, dict(first), dict.fromkeys(first, 0.0)
     for time, i, _, after in [*changes, (end, -1, 0, 0)]:
-        held = [name for name, mode in modes.items() if (mode == 0) == (name in friction)]
+        held = [name for name, mode in modes.items() if mode == holding_mode(once, name)]
         for name in held:
             shares[name] += (time - t) / period
         if time - t > 1e-9 * period:

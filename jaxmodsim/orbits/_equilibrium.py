@@ -109,8 +109,8 @@ def equilibrium(scene: Scene, q0: ArrayLike | list[float], *, ends: Mapping[str,
 
     **Raises:**
 
-    - `ValueError` for wrong arguments, float32, inside `jax.jit` or `jax.vmap`, and for `ends` of other elements than
-      those that stick.
+    - `ValueError` for wrong arguments, float32, a scene with a `Switch`, inside `jax.jit` or `jax.vmap`, and for `ends`
+      of other elements than those that stick.
     - `OrbitError` where there is no convergence, the equilibrium is one of a family, the scene depends on time, or a
       contact is closed.
     """
@@ -145,6 +145,11 @@ def prepare_rest(
         raise ValueError(f"q0 must have the shape [dof], but it has {q.shape}.")
     y, dof, given = State(q, jnp.zeros_like(q), scene.initial_state(q)), q.shape[0], dict(ends or {})
     check_scene(scene, y)
+    if scene.switches:
+        raise ValueError(
+            f"equilibrium takes no switches, but the scene has {', '.join(scene.switches)}: give the force of one side"
+            " as an AppliedForce."
+        )
     numbers, rows = sum(scene.mode_widths(dof)), _rows_of(scene, dof)
     mode, sides = jnp.zeros(numbers) if numbers else None, jnp.zeros(numbers - len(scene.contacts))
     if mode is not None and sides.size:

@@ -60,9 +60,12 @@ def modes_of(run: Trajectory) -> np.ndarray:
 
 def held(run: Trajectory) -> np.ndarray:
     """How many elements stick, and contacts are closed, at each time of a run, shape `[time]`."""
-    friction = run.scene.event_driven
-    which = [0.0 if name in friction else 1.0 for name in run.mode]
-    return np.sum(modes_of(run) == np.asarray(which), axis=1)
+    return np.sum(modes_of(run) == np.asarray([holding_mode(run, name) for name in run.mode]), axis=1)
+
+
+def holding_mode(run: Trajectory, name: str) -> float:
+    """The mode in which an element takes motion away: stick, a closed contact; NaN for a switch."""
+    return 0.0 if name in run.scene.event_driven else 1.0 if name in run.scene.contacts else np.nan
 
 
 def held_throughout(runs: Sequence[Trajectory], since: int = 0) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 import jaxmodsim as jms
 from jaxmodsim.mechanics import Contact
 from jaxmodsim.orbits import OrbitError
-from jaxmodsim.scene import replace_elements, scene_numbers
+from jaxmodsim.scene import scene_numbers
 
 
 def of_frequency(p):

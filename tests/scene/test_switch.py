@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
@@ -276,3 +277,37 @@ def test_wrong_functions_are_refused():
             jms.simulate(scene, [0.0], [0.0], 1.0)
     with pytest.raises(ValueError, match="ImplicitFriction takes no events, by which push changes"):
         jms.simulate(PUSHED, [0.0], [0.0], 1.0, dt=0.1, solver=jms.ImplicitFriction())
+
+
+def test_an_orbit_passes_switches():
+    """x'' + 0.3 x' + k x = cos 2t, with k = 1 for x < 0 and 5 for x > 0, against DOP853 from crossing to crossing."""
+    stop = jms.Switch(lambda t, q, qd, p: q[0], above=lambda t, q, qd, p: -p["k"] * q, name="stop")
+    scene = jms.Scene(
+        lambda t, q, qd, p: 0.5 * (qd[0] ** 2 - q[0] ** 2),
+        params={"k": 4.0},
+        effects=(stop, jms.AppliedForce(lambda t, q, qd, p: jnp.cos(2.0 * t) - 0.3 * qd)),
+    )
+    orbit = jms.periodic_orbit(scene, ([0.1], [0.0]), period=lambda p: np.pi)
+
+    def field(t, y, k):
+        return [y[1], np.cos(2.0 * t) - 0.3 * y[1] - k * y[0]]
+
+    def crossing(_, y, k):
+        del k
+        return y[0]
+
+    crossing.terminal = True
+    t, y = float(orbit.t0), np.array([orbit.q[0], orbit.qd[0]])
+    end, begin = t + np.pi, y
+    for _ in range(16):
+        above = y[0] > 0 or (y[0] == 0 and y[1] > 0)
+        k, crossing.direction = (5.0, -1.0) if above else (1.0, 1.0)
+        part = solve_ivp(field, (t, end), y, args=(k,), events=crossing, method="DOP853", rtol=1e-12, atol=1e-14)
+        t, y = part.t[-1], part.y[:, -1]
+        if part.status == 0:
+            break
+        y = np.array([0.0, y[1]])
+    np.testing.assert_allclose(y, begin, atol=1e-7)
+    # By Liouville's formula the multipliers' product is that of the damping alone.
+    assert np.prod(orbit.multipliers).real == pytest.approx(np.exp(-0.3 * np.pi), rel=1e-6)
+    assert orbit.stick == {"stop": 0.0}

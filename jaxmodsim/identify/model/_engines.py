@@ -32,8 +32,8 @@ RODAS3 = RosenbrockTableau(
     solution=np.array([2.0, 0.0, 1.0, 1.0]),
     error=np.array([0.0, 0.0, 0.0, 1.0]),
 )
-# `observe(t, y, scene, mode)`, what is seen of a state; the scene is as the inputs drive it, the modes of its set-valued
-# laws are None where it has none.
+# `observe(t, y, scene, mode)`, what is seen of a state; the scene is as the inputs drive it, the modes of its
+# set-valued laws are None where it has none.
 Observe: TypeAlias = Callable[[Array, State, Scene, Array | None], PyTree[Array]]
 Inputs: TypeAlias = dict[str, Float[Array, " samples"]]
 # Limit of the steps of a run by events; each sample of a held input ends one.
@@ -89,7 +89,6 @@ def run_samples(
 
     What was observed at each sample, with a leading axis of samples, and the state at the last one.
     """
-
     exact = bool(scene.mode_names)
 
     def advance(carry: tuple[Any, PyTree], sample: tuple[Array, Array, PyTree, PyTree]) -> tuple[Any, PyTree]:
