@@ -68,7 +68,7 @@ def switch(
     after = y._replace(qd=qd)
     if not n:
         return after, closed
-    struck = jnp.any(qd != y.qd)
+    struck = jnp.any(fired[n:]) & jnp.any(qd != y.qd)
     after, slips = from_dynamics(
         lambda d: d.switch_struck(fired[:n], stopped, struck, rest),
         *(t, after, scene, jnp.concatenate([mode[:n], closed])),
