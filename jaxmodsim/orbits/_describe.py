@@ -15,7 +15,7 @@ from ._settle import holding_mode, magnitudes, run_for, states_of
 # Intervals along a segment of an orbit between which extrema are interpolated.
 _INTERVALS = 512
 # Rounding units of time by which a state before an event is saved before it.
-_BEFORE = 256.0
+_BEFORE = 8192.0
 # Residual in the extent of an orbit that is none, or so many tolerances of the run.
 _MISSED, _TOLERANCES = 1e-6, 1e3
 # Multipliers that a phase in stick makes zero are that small but for errors of the run.

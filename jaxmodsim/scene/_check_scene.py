@@ -4,12 +4,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
-from .._core.functions import real_array
+from .._core.functions import depends_on, real_array
 from .._core.index_check import traced
+from ..mechanics import AbstractConstraint
 from ._dynamics import State
 from ._scene import Scene
+from ._signal import signals_at, signals_of
 
 
 def check_scene(scene: Scene, y: State) -> None:
@@ -26,6 +28,7 @@ def check_scene(scene: Scene, y: State) -> None:
             f"The scene names {named} coordinates ({', '.join(scene.coordinates)}), but q has {y.q.shape[0]}: give a"
             " name for each, or none."
         )
+    moving = signals_at(scene.params, t, linear=False)
     scene = scene.bind_time(t)
 
     def energy(*state: Any) -> Array:
@@ -48,9 +51,26 @@ def check_scene(scene: Scene, y: State) -> None:
             )
     for name, constraint in zip(scene.constraint_names, scene.constraints, strict=True):
         constraint.check(y.q, y.qd, scene.params, name)
+        if signals_of(moving):
+            _check_at_rest(constraint, t, y, moving, name)
         size = jax.eval_shape(constraint.rate, t, y.q, y.qd, scene.params).shape[0]
         if name in scene.loaded and size != 1:
             raise ValueError(
                 f"Constraint {name!r} loads friction (normal_force={name!r}), so it must be one equation, but it has"
                 f" {size}. Give each direction a Constraint of its own."
             )
+
+
+def _check_at_rest(constraint: AbstractConstraint, t: Array, y: State, params: PyTree, name: str) -> None:
+    """Refuse a constraint that a linear signal moves: `params` have those as signals, and all else as numbers."""
+
+    def at(time: Array) -> Array:
+        there = signals_at(params, time)
+        values = constraint.error(t, y.q, there), constraint.rate(t, y.q, y.qd, there)
+        return jnp.concatenate([x for x in values if x is not None])
+
+    if depends_on(at, t):
+        raise ValueError(
+            f"Constraint {name!r} depends on a linear Signal, but constraints do not see the velocity of a Signal. Give"
+            " the motion as a function of t in the constraint."
+        )

@@ -37,6 +37,7 @@ class Signal(eqx.Module):
     Derivatives are those by `values`; the times are constants. In a Lagrangian a linear signal counts with its rate,
     while a held one that energy depends on changes it by a jump that `run.energy` has no work for. Displacements
     (`along`, `at`) and constraints see the number, but not that it moves: give what moves them as a function of t.
+    Constraints and gaps that a linear signal moves are refused.
 
     **Arguments:**
 

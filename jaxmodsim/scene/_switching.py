@@ -100,7 +100,7 @@ def switch(
     qd, closed, stopped = in_scalars(strike, t, y.q, y.qd, seed=y.q)
     after = y._replace(qd=qd)
     if slips.size:
-        struck = jnp.any(qd != y.qd)
+        struck = jnp.any(contact_fired) & jnp.any(qd != y.qd)
         after, slips = from_dynamics(
             lambda d: d.switch_struck(slip_fired, stopped, struck, rest),
             *(t, after, scene, _join(slips, closed, sides)),

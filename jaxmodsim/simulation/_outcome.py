@@ -16,7 +16,7 @@ from .._core.cholesky import cholesky_pivots
 from .._core.functions import depends_on
 from .._core.parameters import check_ranges, modules_of, range_checks
 from .._core.scalarise import in_scalars
-from ..friction import Regularized
+from ..friction import DeadZone, Regularized, Sign
 from ..mechanics import constraint_residual, motion_equations, quadratic
 from ..scene import Friction, Scene, State, check_scene, describe_series, from_dynamics, quantity_of
 from ..solvers import ACCUMULATION, TOO_MANY
@@ -45,11 +45,9 @@ _KEPT = 1e-2
 
 _GENERAL = (
     "The run reached t1.",
-    "The step limit was reached before t1: pass a larger max_steps, a larger dt or looser tolerances. A law that"
-    " chatters (Sign, or jnp.sign of a velocity in a force of your own) never gets through its zero crossings with"
-    " adaptive steps: Friction(Coulomb(Fc)) sticks exactly.",
-    "The step size fell below what the time can resolve: the vector field jumps or is singular there. Run DeadZone"
-    " and Sign with a fixed step (dt=...); pass atol > 0 where something comes to rest.",
+    "The step limit was reached before t1: pass a larger max_steps, a larger dt or looser tolerances.",
+    "The step size fell below what the time can resolve: the vector field jumps or is singular there. Pass atol > 0"
+    " where something comes to rest.",
     "The vector field gave a value that is not finite (NaN or infinity). With a fixed step this is also how a"
     " step too long for the stiffness ends: pass a smaller dt, or solver=jaxmodsim.Rodas5P().",
     "The limit of mode changes was reached before t1: pass a larger max_events.",
@@ -67,6 +65,14 @@ _GENERAL = (
     "A contact is violated: its gap is negative. A run has to begin where all gaps are zero or positive; one that comes"
     " to this later has missed an impact: pass smaller tolerances or dtmax, or compute in float64.",
 )
+
+# What else the sentences of early ends say of scenes whose forces may chatter, and of those with contacts.
+_CHATTER = {
+    MAX_STEPS: " A law that chatters (Sign, or jnp.sign of a velocity in a force of your own) never gets through its"
+    " zero crossings with adaptive steps: Friction(Coulomb(Fc)) sticks exactly.",
+    STEP_TOO_SMALL: " Run DeadZone and Sign with a fixed step (dt=...).",
+}
+_SOFTER = "lower its restitution, or make it compliant: restitution=jaxmodsim.HuntCrossley(stiffness)."
 
 
 class _Offsets(NamedTuple):
@@ -136,10 +142,20 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
     ranges = tuple(
         f"{text} (at scene{path})." for path, module in modules_of(scene) for text, _ in range_checks(module)
     )
+    general = list(_GENERAL)
+    laws = [module for _, module in modules_of(scene) if isinstance(module, DeadZone | Sign)]
+    for code, asked in ((MAX_STEPS, bool(laws or not scene.contacts)), (STEP_TOO_SMALL, bool(laws))):
+        general[code] += _CHATTER[code] if asked else ""
+    if scene.contacts:
+        names = ", ".join(map(repr, scene.contacts))
+        general[MAX_STEPS] += f" Where impacts of a contact ({names}) follow each other ever faster, {_SOFTER}"
     chatter = tuple(
         f"The crossings of {name!r} accumulate: its forces push back to guard = 0 from both sides (sliding mode). Make"
         " the force a continuous function of the guard near zero."
         if name in scene.switches
+        else f"The step size fell below what the time can resolve at contact {name!r}: its impacts and openings follow each"
+        f" other too fast. Pass larger tolerances, {_SOFTER}"
+        if name in scene.contacts
         else f"The mode changes of {name!r} accumulate: chatter between stick and slip. Pass hold_chatter=True to hold"
         " it in stick from there on."
         for name, width in zip(scene.mode_names, scene.mode_widths(dof), strict=True)
@@ -151,7 +167,7 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
         " q or qd."
         for name in _load_functions(scene)
     )
-    return _GENERAL + mass + ranges + chatter + scene.checks + loads
+    return tuple(general) + mass + ranges + chatter + scene.checks + loads
 
 
 def _load_functions(scene: Scene) -> dict[str, Callable[..., Any]]:
@@ -215,7 +231,7 @@ def start_code(
 @jax.jit
 def violation_code(scene: Scene, t: Float[Array, ""], y: State) -> Int[Array, ""]:
     """Whether an initial state violates constraints or contacts: a small program, to ask before that of the run."""
-    check_scene(scene, y)
+    check_scene(scene, y._replace(z=scene.initial_state(y.q)))
     now = scene.bind_time(t)
     return _violation(now, now.bilateral, t, y, jnp.asarray(SUCCESS))
 
@@ -251,6 +267,11 @@ def end_code(
         element = jnp.argmax(ending.fired)
         chatters, full = ending.status == ACCUMULATION, ending.status == TOO_MANY
         code = jnp.where(early & chatters, offsets.chatter + element, jnp.where(early & full, MAX_EVENTS, code))
+    if scene.contacts:
+        gaps = jnp.abs(_gaps(now, t, y))
+        touches = jnp.min(gaps) <= _CONSISTENT * jnp.maximum(1.0, jnp.max(jnp.abs(y.q)))
+        of_contact = offsets.checks - gaps.shape[0] + jnp.argmin(gaps)
+        code = jnp.where((code == STEP_TOO_SMALL) & touches, of_contact, code)
     finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
     code = jnp.where(early & ~finite, NOT_FINITE, code)
     if scene.checks:
@@ -269,10 +290,13 @@ def end_code(
     return _blame_mass(code, _pivots(now, t, y), tolerance, jnp.all(jnp.isfinite(y.q)) & jnp.all(jnp.isfinite(y.qd)))
 
 
+def _gaps(scene: Scene, t: Array, y: State) -> Float[Array, " contacts"]:
+    return jnp.concatenate([contact.error(t, y.q, scene.params) for contact in scene.contacts.values()])
+
+
 def _penetration(scene: Scene, t: Array, y: State) -> Float[Array, ""]:
     """The deepest that a gap is below zero, relative to the coordinates or to one."""
-    gaps = [contact.error(t, y.q, scene.params) for contact in scene.contacts.values()]
-    deepest = jnp.min(jnp.concatenate(gaps)) if gaps else jnp.zeros_like(t)
+    deepest = jnp.min(_gaps(scene, t, y)) if scene.contacts else jnp.zeros_like(t)
     return -deepest / jnp.maximum(1.0, jnp.max(jnp.abs(y.q)))
 
 

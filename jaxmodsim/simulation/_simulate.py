@@ -19,11 +19,11 @@ from .._core.arguments import as_flag
 from .._core.functions import Function
 from .._core.last_line import LastLines
 from .._core.speed import recommend_tuning, remark_on_compilation, remark_on_fixed_steps, remark_on_rounding
-from ..scene import Scene, vector_field
+from ..scene import Scene, State, vector_field
 from ..solvers import Gauss, ImplicitFriction, Rodas5P
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages, violation_code
 from ._run_request import RunRequest, is_known
-from ._solve import RunInputs, RunOptions, RunOutput, compiled_runs, default_solver, initial_state, solve
+from ._solve import RunInputs, RunOptions, RunOutput, compiled_runs, default_solver, solve
 from ._trajectory import Trajectory, trajectory
 
 _IMPLICIT = (dfx.AbstractImplicitSolver, Gauss, ImplicitFriction, Rodas5P)
@@ -189,12 +189,13 @@ def _functions(scene: Scene) -> list[object]:
 
 def _check_initial_state(inputs: RunInputs) -> None:
     """Raise for a known initial state that violates constraints or contacts, before the run is compiled."""
-    scene, t0 = inputs.scene, inputs.t0
-    if is_known(*jtu.tree_leaves((scene, t0, inputs.q0, inputs.qd0, inputs.z0))):
-        y = initial_state(inputs)
-        code = violation_code(scene, t0, y)
+    start = inputs.t0, inputs.q0, inputs.qd0
+    if is_known(*jtu.tree_leaves((inputs.scene, start))):
+        t0, q0, qd0 = map(jnp.asarray, start)
+        y = State(q0, qd0, {})
+        code = violation_code(inputs.scene, t0, y)
         if is_known(code) and int(code) != SUCCESS:
-            raise SimulationError(describe_failure(scene, float(t0), y, int(code)))
+            raise SimulationError(describe_failure(inputs.scene, float(t0), y, int(code)))
 
 
 def _raise_early_end(inputs: RunInputs, solved: RunOutput) -> RunOutput:

@@ -21,8 +21,8 @@ _OF_ZERO = 1e-3
 _AT_REST, _IN_MOTION, _MOVES = 0.1, 150.0, 0.01
 # A tangent counts as no smaller than this part of the largest in its array.
 _OF_ARRAY = 1e-3
-# Errors of a tangent that are noise, in parts of `atol` and in roundings of the state.
-_OF_ATOL, _ROUNDINGS = 1e-6, 16.0
+# Errors of a tangent that are noise, in parts of `atol`, in roundings of the state and of the tangent itself.
+_OF_ATOL, _ROUNDINGS, _RESOLVED = 1e-6, 16.0, 64.0
 
 
 class ProbeTangent(NamedTuple):
@@ -111,9 +111,10 @@ class ProbedStep(NamedTuple):
 
         def size(of_state: Array, of_tangent: Array, largest: Array, y: Array) -> Array:
             moves = jnp.minimum(1.0, jnp.abs(of_state) / (_MOVES * (atol + rtol * y)))
-            relative = _AT_REST * (1.0 + (_IN_MOTION - 1.0) * moves) * rtol
+            eps = float(jnp.finfo(y.dtype).eps)
+            relative = jnp.maximum(_AT_REST * (1.0 + (_IN_MOTION - 1.0) * moves) * rtol, _RESOLVED * eps)
             tangent = jnp.maximum(largest, _OF_ARRAY * jnp.max(largest))
-            noise = _OF_ATOL * atol + _ROUNDINGS * float(jnp.finfo(y.dtype).eps) * y
+            noise = _OF_ATOL * atol + _ROUNDINGS * eps * y
             return jnp.sqrt(jnp.mean(jnp.square(of_tangent / (relative * tangent + noise))))
 
         return jnp.max(jnp.stack(jtu.tree_leaves(jtu.tree_map(size, error, error_of_probe, largest, y))))

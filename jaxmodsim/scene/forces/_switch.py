@@ -86,12 +86,13 @@ class Switch(AbstractEffect):
         )
 
     def act_on(self, side: Scalar, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Action:
-        """The force on this side of the guard, 1 above and -1 below."""
+        """The force on this side of the guard, 1 above and -1 below; NaN where the guard is."""
         above, below = (
             jnp.zeros_like(q) if fn is None else jnp.asarray(fn(t, q, qd, params), q.dtype)
             for fn in (self.above, self.below)
         )
-        force = jnp.where(side > 0, above, below)
+        # A guard that is not a number has no side: the run ends with a sentence instead of going on.
+        force = jnp.where(jnp.isnan(self.value(t, q, qd, params)), jnp.nan, jnp.where(side > 0, above, below))
         return Action(force, force)
 
     def value(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:

@@ -23,6 +23,8 @@ _ERROR_OF_RANGE, _ERROR_OF_HEADROOM = 0.05, 0.3
 _ROUNDING = 1e3
 # Where a step ends on a root the error of the cubic is below this many of the tolerances.
 _ERROR_AT_ROOT = 10.0
+# An instant in resolutions of time, the larger of: so many, and this part of the inverse root of the rounding unit.
+_INSTANT, _INSTANT_OF_ROOT = 16.0, 1.5e-5
 
 Numbers = Float[Array, " n"]
 Flags = Bool[Array, " n"]
@@ -48,6 +50,11 @@ class GuardScan(NamedTuple):
     step_factor: Numbers
     landing_factor: Numbers
     cubic: tuple[Numbers, Numbers, Numbers, Numbers]
+
+    def slopes(self, place: Array) -> tuple[Numbers, Numbers]:
+        """First and second derivative of the cubic at this place, in steps."""
+        _, c1, c2, c3 = self.cubic
+        return c1 + place * (2.0 * c2 + place * 3.0 * c3), 2.0 * c2 + place * 6.0 * c3
 
 
 def scan_guards(
@@ -187,3 +194,19 @@ def first_root(scan: GuardScan, passed: Flags) -> Float[Array, ""]:
         root = root - (c0 + root * (c1 + root * (c2 + root * c3))) / jnp.where(slope < 0, slope, -jnp.inf)
         root = jnp.clip(root, 0.0, 1.0)
     return jnp.where((first > 0) & (first < 1), root, first)
+
+
+def instant(resolution: Array) -> Array:
+    """How long [time] before an event a saved time is that of the event, where time has this resolution."""
+    return max(_INSTANT, _INSTANT_OF_ROOT / float(jnp.finfo(resolution.dtype).eps) ** 0.5) * resolution
+
+
+def arrives(seen: GuardScan, end: Array, root: Array, resolution: Array) -> Flags:
+    """Which guards are at their events within an instant, though not yet at zero, and come from above.
+
+    `resolution` is that of time, in steps.
+    """
+    c0, c1, c2, c3 = seen.cubic
+    falls, middle = seen.slopes(jnp.ones(()))[0], c0 + 0.5 * (c1 + 0.5 * (c2 + 0.5 * c3))
+    comes = (end > 0) & (root > 0) & (middle > 2.0 * root) & (falls < 0)
+    return seen.armed & comes & (end - root <= -instant(resolution) * falls)

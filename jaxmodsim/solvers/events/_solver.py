@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from ..._core.fusion import fusion_barrier, opaque_one
 from .._projected import projected
 from .._wrapper import AbstractSolverWrapper
-from ._guard_scan import GuardScan, first_root, scan_guards
+from ._guard_scan import GuardScan, arrives, first_root, instant, scan_guards
 from ._passage import LATITUDE, Landed, pass_event
 from ._policy import AbstractGuardPolicy, Conditions, Crossings
 from ._samples import Landing, SampledJumps, on_jump
@@ -34,8 +34,6 @@ _FORGET_INTERVALS, _FORGET_STEPS = 0.05, 0.25
 _GROW = 2.0
 # Events that few do not accumulate.
 _FEWEST = 8
-# Rounding units of time within which a saved time is that of an event.
-_INSTANT = 64.0
 
 _constant = jax.lax.stop_gradient
 
@@ -127,7 +125,7 @@ class EventSolver(AbstractSolverWrapper):
 
     The event is located on steps of the solver, not on its dense output: a step that passes a root is
     rejected and ends on it. The saved value at an event, and at t1 if that is one, is the one after the reset; times
-    that differ by 64 rounding units are one.
+    that differ by 1e-12 of their value are one (64 rounding units in float32).
 
     **Derivatives.** From the end of the step the state is carried to the root, reset there, and carried back with the
     new field. The way is zero but for the landing error, while its derivative is that of the event's time: the result
@@ -288,7 +286,7 @@ class EventSolver(AbstractSolverWrapper):
             lambda: self._jump(terms, t1, state1, landing, (root, landing.near * length, begin), (args, whole)),
             lambda: (state1, (jnp.asarray(t1), jtu.tree_map(jnp.zeros_like, y1))),
         )
-        begins = jnp.where(landing.happens, _constant(t_event) - _INSTANT / 4.0 * resolution, t1)
+        begins = jnp.where(landing.happens, _constant(t_event) - instant(resolution), t1)
         dense = {"inner": dense, "state0": y0, "state1": state1, "event": (begins, slope)}
         pace = jnp.maximum(measure, _FORGET_STEPS * pace)
         return state1, error, dense, (inner, pace, begin), result
@@ -334,20 +332,25 @@ class EventSolver(AbstractSolverWrapper):
         and the time of the last event; `paces` the length of the last steps, with this one and without.
         """
         (end, root), (t1, length, resolution, last), (measure, pace) = ends, step, paces
-        divisor = jnp.where(length > 0, length, 1.0)
+        divisor, tiny = jnp.where(length > 0, length, 1.0), float(jnp.finfo(length.dtype).tiny)
 
-        def landing(t: Array) -> Array:
-            near = jnp.minimum(_LANDING * jnp.maximum(measure, pace), _LANDING_OF_INTERVAL * _constant(t - last))
-            return jnp.maximum(near, _constant(resolution))
+        def landing(place: Array) -> Array:
+            """How far [time] the root of each guard may be from this place; one that is not zero is a rounding."""
+            slope, bend = seen.slopes(jnp.minimum(place, 1.0))
+            blur = jnp.abs(slope) + jnp.sqrt(jnp.maximum(slope * slope + 2.0 * root * jnp.abs(bend), tiny))
+            since = _constant(t1 - last) + (jnp.minimum(place, 2.0) - 1.0) * length
+            near = jnp.minimum(_LANDING * jnp.maximum(measure, pace), _LANDING_OF_INTERVAL * since)
+            return jnp.maximum(jnp.maximum(near, length * 2.0 * root / blur), _constant(resolution))
 
-        near = landing(t1)
+        near = landing(jnp.ones_like(length))
         shortest = jnp.maximum(_SHORT * pace, 2.0 * _constant(resolution))
         if jumps is not None:  # an event before a jump is not one with it
             near = jnp.where(jumps, _constant(resolution), near)
         near = near / divisor
-        # One that has just fallen through zero may look flat, or rising, to the cubic.
+        # One that has just fallen through zero may look flat to the cubic; below a root that is a rounding it is one.
         here = (seen.armed & (jnp.abs(seen.ahead) <= near)) | (seen.crosses & (1.0 - seen.root <= near))
-        here = self._policy.fires(here, seen, end, length, t1) | _arrives(seen, end, root, resolution / divisor)
+        here = here | ((end <= 0) & (end >= -root) & (seen.slopes(jnp.ones(()))[0] < 0))
+        here = self._policy.fires(here, seen, end, length, t1) | arrives(seen, end, root, resolution / divisor)
         # One that fires at the start of the step does so where the step is the shortest.
         here = here | (seen.crosses & (seen.root * length <= resolution) & (length <= shortest))
         passed = seen.crosses & ~here
@@ -358,10 +361,11 @@ class EventSolver(AbstractSolverWrapper):
         fired = here & landed
         first = jnp.arange(fired.shape[0]) == jnp.argmin(jnp.where(fired, seen.ahead, jnp.inf))
         ahead = jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0))
-        behind = landing(t1 + (jnp.minimum(ahead, 2.0) - 1.0) * length)
-        return Landing(
-            fired, first, missed, landed, landed, self._policy.next_end(ahead, missed, (behind, divisor)), near
-        )
+        coming = jnp.argmin(jnp.where(missed, jnp.where(passed, seen.root, jnp.inf), seen.ahead))
+        behind = landing(ahead)[coming]
+        near = jnp.sum(jnp.where(first, near, 0.0))
+        next_end = self._policy.next_end(ahead, missed, (behind, divisor))
+        return Landing(fired, first, missed, landed, landed, next_end, near)
 
     def _guard_rates(self, t: Array, state: EventState, slope: PyTree, args: PyTree) -> Float[Array, " guards"]:
         """Along the motion; constant, so that nothing of them is differentiated."""
@@ -460,14 +464,6 @@ class EventSolver(AbstractSolverWrapper):
     def _event_modes(self, *modes: PyTree) -> tuple[PyTree, ...]:
         """What of the modes an event changes."""
         return modes if self.event_mode is None else tuple(self.event_mode(mode) for mode in modes)
-
-
-def _arrives(seen: GuardScan, end: Array, root: Array, instant: Array) -> Bool[Array, " guards"]:
-    """Which guards are at their events within `instant`, in steps, though not yet at zero, and come from above."""
-    c0, c1, c2, c3 = seen.cubic
-    falls, middle = c1 + 2.0 * c2 + 3.0 * c3, c0 + 0.5 * (c1 + 0.5 * (c2 + 0.5 * c3))
-    comes = (end > 0) & (root > 0) & (middle > 2.0 * root) & (falls < 0)
-    return seen.armed & comes & (end - root <= -_INSTANT / 4.0 * instant * falls)
 
 
 def _accumulates(spread: Array, t: Array, begin: Array) -> Array:
