@@ -153,8 +153,8 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
         f"The crossings of {name!r} accumulate: its forces push back to guard = 0 from both sides (sliding mode). Make"
         " the force a continuous function of the guard near zero."
         if name in scene.switches
-        else f"The step size fell below what the time can resolve at contact {name!r}: its impacts and openings follow each"
-        f" other too fast. Pass larger tolerances, {_SOFTER}"
+        else f"The step size fell below what the time can resolve at contact {name!r}: its impacts and openings follow"
+        f" each other too fast. Pass larger tolerances, {_SOFTER}"
         if name in scene.contacts
         else f"The mode changes of {name!r} accumulate: chatter between stick and slip. Pass hold_chatter=True to hold"
         " it in stick from there on."

@@ -403,9 +403,8 @@ class EventSolver(AbstractSolverWrapper):
         def spread_at(t_event: Array) -> tuple[Array, Bool[Array, ""]]:
             """The longest of the last intervals between events, and whether they accumulate."""
             since = t_event - state.t
-            spread = _constant(
-                jnp.where(memory.resets == 0, since, jnp.maximum(since, _FORGET_INTERVALS * memory.spread))
-            )
+            longest = jnp.maximum(since, _FORGET_INTERVALS * memory.spread)
+            spread = _constant(jnp.where(memory.resets == 0, since, longest))
             return spread, _accumulates(spread, _constant(t_event), begin) & (memory.resets >= _FEWEST)
 
         def reset(t_event: Array, y: PyTree) -> tuple[PyTree, PyTree]:
@@ -424,9 +423,8 @@ class EventSolver(AbstractSolverWrapper):
         passage = pass_event(landed, evaluate, (args, new_args), reset)
         t_event, values, (y, mode, slope) = passage.t, passage.guards, passage.after
         spread, dense = spread_at(t_event)
-        status = jnp.where(dense, jnp.asarray(ACCUMULATION, spread.dtype), ONGOING)
-        if self.on_zeno is not None:
-            status = jnp.zeros_like(spread)
+        ends = dense & (self.on_zeno is None)
+        status = jnp.where(ends, jnp.asarray(ACCUMULATION, spread.dtype), ONGOING)
         # A reset that changes nothing is no event.
         happened = _differ(*zip((passage.before, y), self._event_modes(state.mode, mode), strict=True))
         events, index = jnp.where(happened, state.events + 1.0, state.events), jnp.where(happened, state.events, -1.0)
@@ -440,10 +438,8 @@ class EventSolver(AbstractSolverWrapper):
         if self.on_zeno is not None:
             armed = jnp.where(dense, values > 0, armed)
         flags = _flags(fired, values)
-        log = state.log
-        if log is not None:
-            entry = EventLog(t_event, flags, (passage.before, state.mode), (y, mode))
-            log = jtu.tree_map(lambda a, b: write(a, index, b), log, entry)
+        entry = EventLog(t_event, flags, (passage.before, state.mode), (y, mode))
+        log = None if state.log is None else jtu.tree_map(lambda a, b: write(a, index, b), state.log, entry)
         after = memory._replace(guard=_constant(values), armed=_flags(armed, values))
         passed = state._replace(y=passage.y, mode=mode, memory=after)
         after_reset = passed._replace(
