@@ -70,7 +70,7 @@ def switch(
         return after, closed
     struck = jnp.any(fired[n:]) & jnp.any(qd != y.qd)
     after, slips = from_dynamics(
-        lambda d: d.switch_struck(fired[:n], stopped, struck, rest),
+        lambda d: d.switch_struck(fired[:n], jnp.asarray(stopped), struck, rest),
         *(t, after, scene, jnp.concatenate([mode[:n], closed])),
     )
     return after, jnp.concatenate([slips, closed])
