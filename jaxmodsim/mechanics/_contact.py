@@ -29,8 +29,8 @@ class Contact(AbstractPositionConstraint):
     (Newton's law of impact, e the coefficient of restitution); where several contacts are struck at one instant, or
     some are closed, the impulses solve `w_i(after) + e_i w_i(before) >= 0`, `impulse_i >= 0`, one of the two zero
     (Moreau 1988). `Poisson` is another law, and `HuntCrossley` makes the contact compliant instead. Impacts that
-    accumulate end in a closed contact: where the next rebound, relative to the surface, is lost in rounding. Friction by
-    events whose load is the contact takes part in its impacts, by Coulomb's law for the impulses.
+    accumulate end in a closed contact, where the next rebound, relative to the surface, is lost in rounding. Friction
+    by events whose load is the contact takes part in its impacts, by Coulomb's law for the impulses.
 
     The contacts of a scene stand among its constraints; their modes are 0, open, and 1, closed. Where the gap is a
     length along the normal, the multiplier is the normal force in newtons; `Friction(normal_force=name)` takes it as

@@ -102,7 +102,7 @@ def switch(
     if slips.size:
         struck = jnp.any(contact_fired) & jnp.any(qd != y.qd)
         after, slips = from_dynamics(
-            lambda d: d.switch_struck(slip_fired, stopped, struck, rest),
+            lambda d: d.switch_struck(slip_fired, jnp.asarray(stopped), struck, rest),
             *(t, after, scene, _join(slips, closed, sides)),
         )
     return after, _join(slips, closed, sides)

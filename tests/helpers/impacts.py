@@ -6,8 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-# Flights and slips shorter than this [s] count as none, and nothing changes within this much time [s] of rest.
-_NONE, _LOOK = 1e-9, 2e-4
+# A flight shorter than this [s] is none, as rounding hides its height; so is one that begins with this velocity [m/s].
+_NONE, _SLOW = 1e-7, 1e-9
+# Looks at gaps and tables are this far apart [s].
+_LOOK = 2e-4
 
 
 class Settling(NamedTuple):
@@ -103,7 +105,7 @@ def mass_in_a_dry_box(
             gap, before = 0.0, w
             w, V = -e * before, V - (1.0 + e) * before * m / (m + M)
             count += 1
-            if w < _NONE:
+            if w < _SLOW:
                 # Both move together, and friction stops them.
                 V0 = V
                 a = (-np.sign(V0) * Fc) / (m + M)

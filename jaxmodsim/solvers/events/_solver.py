@@ -400,18 +400,11 @@ class EventSolver(AbstractSolverWrapper):
         rate = jnp.sum(jnp.where(first, rates, 0.0))
         rate = jnp.where(rate == 0, 1.0, rate)
 
-        def spread_at(t_event: Array) -> tuple[Array, Bool[Array, ""]]:
-            """The longest of the last intervals between events, and whether they accumulate."""
-            since = t_event - state.t
-            longest = jnp.maximum(since, _FORGET_INTERVALS * memory.spread)
-            spread = _constant(jnp.where(memory.resets == 0, since, longest))
-            return spread, _accumulates(spread, _constant(t_event), begin) & (memory.resets >= _FEWEST)
-
         def reset(t_event: Array, y: PyTree) -> tuple[PyTree, PyTree]:
             before = state._replace(y=y)
             after = self.reset(t_event, before, whole, fired)
             if self.on_zeno is not None:
-                held, dense = self.on_zeno(t_event, before, whole, fired), spread_at(t_event)[1]
+                held, dense = self.on_zeno(t_event, before, whole, fired), _spread(t_event, state, begin)[1]
                 after = jtu.tree_map(lambda a, b: jnp.where(dense, a, b), held, after)
             return after.y, after.mode
 
@@ -422,7 +415,7 @@ class EventSolver(AbstractSolverWrapper):
         landed = Landed(t, state.y, state.mode, first, (level, rate), memory.landed > 0.5, near, state.t)
         passage = pass_event(landed, evaluate, (args, new_args), reset)
         t_event, values, (y, mode, slope) = passage.t, passage.guards, passage.after
-        spread, dense = spread_at(t_event)
+        spread, dense = _spread(t_event, state, begin)
         ends = dense & (self.on_zeno is None)
         status = jnp.where(ends, jnp.asarray(ACCUMULATION, spread.dtype), ONGOING)
         # A reset that changes nothing is no event.
@@ -460,6 +453,13 @@ class EventSolver(AbstractSolverWrapper):
     def _event_modes(self, *modes: PyTree) -> tuple[PyTree, ...]:
         """What of the modes an event changes."""
         return modes if self.event_mode is None else tuple(self.event_mode(mode) for mode in modes)
+
+
+def _spread(t_event: Array, state: EventState, begin: Array) -> tuple[Array, Bool[Array, ""]]:
+    """The longest of the last intervals between events, and whether they accumulate."""
+    since, memory = t_event - state.t, state.memory
+    spread = _constant(jnp.where(memory.resets == 0, since, jnp.maximum(since, _FORGET_INTERVALS * memory.spread)))
+    return spread, _accumulates(spread, _constant(t_event), begin) & (memory.resets >= _FEWEST)
 
 
 def _accumulates(spread: Array, t: Array, begin: Array) -> Array:

@@ -22,6 +22,7 @@ from . import (
     _plane,
     _reversal,
     _scale,
+    _settling,
     _shaken,
     _stiffness,
 )
@@ -29,7 +30,7 @@ from ._case import HardCase
 from ._check import DTYPES, TRANSFORMS, CaseReport, CheckFinding, check, check_choice
 
 _MODULES = (
-    *(_stiffness, _reversal, _shaken, _many_events, _contacts, _orbits),
+    *(_stiffness, _reversal, _shaken, _many_events, _contacts, _settling, _orbits),
     *(_plane, _geometry, _scale, _numbers, _gradients, _at_rest),
 )
 
