@@ -142,7 +142,7 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
     ranges = tuple(
         f"{text} (at scene{path})." for path, module in modules_of(scene) for text, _ in range_checks(module)
     )
-    general = list(_GENERAL)
+    general: list[str] = list(_GENERAL)
     laws = [module for _, module in modules_of(scene) if isinstance(module, DeadZone | Sign)]
     for code, asked in ((MAX_STEPS, bool(laws or not scene.contacts)), (STEP_TOO_SMALL, bool(laws))):
         general[code] += _CHATTER[code] if asked else ""

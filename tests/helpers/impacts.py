@@ -22,6 +22,10 @@ class Settling(NamedTuple):
     qd: np.ndarray
 
 
+def _root(fn: Callable[[float], float], low: float, high: float) -> float:
+    return brentq(fn, low, high, xtol=1e-16)  # pyright: ignore[reportReturnType] - a number
+
+
 def ball_on_table(
     table: Callable[[float], tuple[float, float, float]], h: float, e: float, ts: np.ndarray, g: float = 9.81
 ) -> Settling:
@@ -43,7 +47,7 @@ def ball_on_table(
             falls = [i for i in range(len(looks) - 1) if table(looks[i])[2] + g > 0 >= table(looks[i + 1])[2] + g]
             if not falls:
                 break
-            t = brentq(lambda t: table(t)[2] + g, looks[falls[0]], looks[falls[0] + 1], xtol=1e-15)
+            t = _root(lambda t: table(t)[2] + g, looks[falls[0]], looks[falls[0] + 1])
             (x, v, _), rests = table(t), False
             opens.append(t)
             continue
@@ -56,7 +60,7 @@ def ball_on_table(
         after = before + step
         while gap(after) > 0:
             before, after = after, after + min(max(step, 0.05 * after), _LOOK)
-        dt = brentq(gap, before, after, xtol=1e-16, rtol=1e-15)
+        dt = _root(gap, before, after)
         t, x, v = t + dt, *table(t + dt)[:1], v - g * dt
         strikes.append(t)
         _, speed, acceleration = table(t)
