@@ -130,10 +130,7 @@ def _(orbit: PeriodicOrbit) -> Table:
     changes = [f"{name}: {before} to {after}" for name, before, after in orbit.sequence]
     notes = [
         f"multipliers {', '.join(map(complex_words, orbit.multipliers))}",
-        *(
-            f"{name} sticks throughout, in the place where the guess is or settles; others are possible"
-            for name in held
-        ),
+        *(f"{name} sticks throughout, where the guess is or settles; other places are possible" for name in held),
         *(f"{name} held {100 * share:.4g} % of the period" for name, share in orbit.stick.items() if name not in held),
         f"mode changes: {', '.join(changes) or 'none'}",
         *([f"residual {orbit.residual:.2g}"] if orbit.residual > _WORTH_SAYING else []),

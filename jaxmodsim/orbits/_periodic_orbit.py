@@ -65,7 +65,8 @@ def periodic_orbit(
 
     **Arguments:**
 
-    - `scene`: the `Scene`, in float64. Coordinates must return: the angle of a shaft that turns on does not.
+    - `scene`: the `Scene`, in float64. Coordinates must return, or advance by the same amount in each period in a scene
+      that a shift of them does not change, such as a box that is pulled over a floor.
     - `guess`: `(q0, qd0)`, shape `[dof]` each, or of a forced orbit `[segments, dof]`, then where each of the equally
       long segments starts; or a `PeriodicOrbit`, of another scene for instance, which is then where
       Newton's iteration starts.

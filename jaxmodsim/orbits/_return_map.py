@@ -79,7 +79,7 @@ class OrbitProblem(eqx.Module):
         """Period [s]."""
         return unknown if self.period is None else jnp.asarray(self.period(scene.params), unknown.dtype)
 
-    def closure(self, start: Array | np.ndarray, end: Array | np.ndarray) -> Array:
+    def closure(self, start: Array | np.ndarray, end: Array | np.ndarray) -> Array | np.ndarray:
         """Zero where the state at the end is that at the start, but for the advance, and the start is in its place."""
         miss = end - start
         return miss - self.free @ miss + self.pinned @ (start - self.anchor)

@@ -10,17 +10,17 @@ from scipy.optimize import brentq
 
 from ._branch import CROSSING, DOUBLING, FOLD, GRAZING, LOSS, ONSET, TORUS, OrbitT, SpecialOrbit
 from ._describe import describe, floquet
-from ._newton import newton, scaled, split
+from ._newton import scaled, split
 from ._orbit import PeriodicOrbit, Sequence
 from ._rest_step import RestStep
-from ._return_map import OrbitError, OrbitProblem, ShotOrbit
+from ._return_map import OrbitError, OrbitProblem, ShotOrbit, evaluate
 from ._step import BranchStep, Test
 
 # Part of a step to which special orbits are located: where a function is zero, and where the modes change.
 _ROOT, _CUT = 1e-10, 1e-6
 # Part of its ends above which a function that changes its sign has jumped.
 _JUMP = 1e-3
-# Step away from a corner of the branch, in the span of the parameter and the extent of the orbit.
+# Step away from a corner of the branch, in the scales of the unknowns.
 _BEHIND = 1e-3
 # Distance of complex multipliers from the unit circle, and of their angle from the real axis, that is none.
 _CIRCLE = 1e-4
@@ -57,23 +57,27 @@ def in_order(located: list[tuple[float, SpecialOrbit[OrbitT]]]) -> list[SpecialO
 def corner(now: BranchStep, index: int) -> tuple[BranchStep, SpecialOrbit[PeriodicOrbit]] | None:
     """The next orbit where a branch has a corner, as the sequence of modes changes, and the special orbit there.
 
-    The branch may turn back there, to the values of the parameter it came from, or go on; the parameter is held.
+    The branch may turn back there, to the values of the parameter it came from, or go on. Its tangent behind the corner
+    is that of a run beside the orbit that has the other modes already.
     """
-    dof, before = len(now.orbit.q), _cycle(now.orbit.sequence)
-    onwards = _BEHIND * now.scale[-1] * np.sign(now.tangent[-1])
-    for change, sense in product((-onwards, onwards), (1.0, -1.0)):
-        ahead = now.shot.unknowns + sense * _BEHIND * now.tangent * now.scale
-        ahead[-1] = now.shot.value + change
-        try:
-            shot, _ = newton(now.problem, *split(ahead, now.shot, now.problem.autonomous), dof, now.scale)
-            after = _cycle(describe(now.problem, shot, dof)[0].sequence)
+    before, at = _cycle(now.orbit.sequence), now.shot.unknowns
+    sides = [now.tangent * now.scale, *np.diag(now.scale)[: now.shot.x.size]]
+    for side, sign in product(sides, (1.0, -1.0)):
+        unknowns = split(at + sign * _BEHIND * side, now.shot, now.problem.autonomous)
+        shot = evaluate(now.problem, *unknowns, len(now.orbit.q))
+        if shot.failure:
+            continue
+        tangent = np.linalg.svd(scaled(shot, now.scale))[2][-1]
+        for sense in (1.0, -1.0):
+            try:
+                made = replace(now, tangent=sense * tangent)
+                made = made.described(made.corrected(_BEHIND)[0])
+            except OrbitError:
+                continue
+            after = _cycle(made.orbit.sequence)
             if after != before:
-                way = (shot.unknowns - now.shot.unknowns) / now.scale
-                made = replace(now, tangent=way / np.linalg.norm(way)).described(shot)
                 kind = _change(before, after)
                 return made, SpecialOrbit(kind, now.shot.value, index, now.orbit, np.zeros(now.shot.x.size))
-        except OrbitError:
-            continue
     return None
 
 

@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import jaxmodsim as jms
@@ -95,6 +96,27 @@ def test_orbits_from_there_turn_back_where_they_come_to_stick(sliding):
         jms.continue_orbits(belt(jms.Stribeck(**LAW), 1.0), sliding.points[0], SPEED, (1.0, 0.5))
     with pytest.raises(ValueError, match="neither period nor section"):
         jms.continue_orbits(belt(jms.Stribeck(**LAW), 1.0), sliding.points[0], SPEED, (1.0, 0.3), period=1.0)
+
+
+def test_orbits_that_stick_turn_back_where_stick_shrinks_to_a_point():
+    scene, span = belt(jms.Stribeck(**LAW), 0.61), (0.61, 0.66)
+    branch = jms.continue_orbits(scene, ([0.0], [0.61]), SPEED, span, settle=20.0, step=0.4, rtol=1e-9)
+    (point,) = branch.points
+    assert point.kind == "loss of stick"
+    sticks = np.array([x.stick["friction"] > 0 for x in branch.orbits])
+    assert list(branch.stable) == list(sticks)
+    assert list(np.flatnonzero(sticks)) == list(range(point.index + 1))
+    assert "end of the span" in branch.ending
+    # From a touch of the speed of the belt the second solver slips to the next touch, at this speed alone.
+    k, v = belt_oscillator.PARAMS["k"], point.value
+
+    def rate(_, y):
+        return [y[1], force(v - y[1]) - k * y[0] - C * y[1]]
+
+    start = [(LAW["Fs"] - C * v) / k, v]
+    run = solve_ivp(rate, (0, 1), start, "DOP853", events=lambda t, y: rate(t, y)[1], rtol=1e-12, atol=1e-13)
+    assert run.y_events is not None
+    np.testing.assert_allclose(np.max(run.y_events[0][1:, 1]), v, rtol=1e-6)
 
 
 def test_hopf_point_with_bristles_has_the_eigenvalues_of_equations_written_by_hand():

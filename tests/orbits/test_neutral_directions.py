@@ -41,7 +41,7 @@ def advance_of_a_box(m=1.3, F0=1.0, F1=2.5, W=2.0, Fc=2.0):
     def velocity(t):
         return ((F0 - Fc) * (t - begin) + F1 / W * (np.sin(W * t) - np.sin(W * begin))) / m
 
-    end = brentq(velocity, 0.0, begin + 2 * np.pi / W, xtol=1e-14)
+    end: float = brentq(velocity, 0.0, begin + 2 * np.pi / W, xtol=1e-14)  # pyright: ignore[reportAssignmentType]
     s = end - begin
     return (0.5 * (F0 - Fc) * s**2 - F1 / W * np.sin(W * begin) * s - F1 / W**2 * np.cos(W * end)) / m + (
         F1 / W**2 * np.cos(W * begin) / m
@@ -162,7 +162,7 @@ def wall(_t, q, _p):
     ],
 )
 def test_a_machine_that_advances_over_a_ground_that_changes_is_refused(scene):
-    with pytest.raises(OrbitError, match="the machine moves on, x by .* a shift by that changes its motion"):
+    with pytest.raises(OrbitError, match=r"the machine moves on, x by .* a shift by that changes its motion"):
         jms.periodic_orbit(scene, ([0.5], [0.0]), period=of_frequency, settle=2 * np.pi)
 
 
@@ -198,7 +198,7 @@ def test_a_mass_that_sticks_throughout_is_held_in_its_place(place):
     assert orbit.multipliers[3] == 0.0
     assert orbit.stick == {"floor": 1.0}
     assert orbit.stability == "stable"
-    assert "floor sticks throughout, in the place where the guess is" in str(orbit)
+    assert "floor sticks throughout, where the guess is" in str(orbit)
 
     def highest(scene):
         return jms.periodic_orbit(scene, guess, period=of_frequency, rtol=1e-12, atol=1e-14).highest[0]

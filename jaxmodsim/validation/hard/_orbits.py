@@ -1,4 +1,4 @@
-"""Periodic orbits: unstable, of twice the period, stiff, with many sticks, nearly grazing, and refused in float32."""
+"""Periodic orbits: unstable, doubled, stiff, sticking often, throughout or hardly, advancing, refused in float32."""
 
 import math
 from functools import partial
@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
-from scipy.optimize import root
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq, root
 
-from ...friction import Coulomb, LuGre, Viscous
-from ...orbits import PeriodicOrbit, periodic_orbit
+from ...friction import Coulomb, LuGre, Stribeck, Viscous
+from ...orbits import PeriodicOrbit, continue_orbits, periodic_orbit
 from ...problems import belt_oscillator, coupled_belts, vibrating_table
 from ...scene import AppliedForce, Friction, Scene
 from ...simulation import simulate
@@ -140,6 +141,94 @@ def _period_by_settling(scene: Scene, settle: float) -> float:
     return float(passages[1] - passages[0])
 
 
+def _two_masses(t: Array, q: Array, qd: Array, p: PyTree) -> Array:
+    del t, p
+    return 0.5 * jnp.sum(jnp.square(qd)) - 0.5 * jnp.square(q[0]) - 0.25 * jnp.square(q[1] - q[0])
+
+
+def _on_the_first(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del q
+    return jnp.stack([jnp.cos(p["W"] * t) - 0.2 * qd[0], jnp.zeros_like(t)])
+
+
+def _second(q: Array) -> Array:
+    return q[1]
+
+
+def _beside_a_held_mass() -> float:
+    """The mass that moves swings about the place in which a spring of 0.5 N/m to the held one leaves it."""
+    effects = (AppliedForce(_on_the_first), Friction(Coulomb(2.0), along=_second))
+    scene = Scene(_two_masses, params={"W": 0.7}, effects=effects)
+    return float(periodic_orbit(scene, ([0.0, 0.3], [0.0, 0.0]), period=_swing_period).highest[0])
+
+
+# A box that is pulled over a floor by F0 + F1 cos(W t).
+_BOX = {"m": 1.3, "F0": 1.0, "F1": 2.5, "W": 2.0}
+_FLOOR = 2.0
+
+
+def _free(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del t, q
+    return 0.5 * p["m"] * jnp.square(qd[0])
+
+
+def _pull(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    del q, qd
+    return jnp.reshape(p["F0"] + p["F1"] * jnp.cos(p["W"] * t), (1,))
+
+
+def _advance_of_a_box() -> float:
+    scene = Scene(_free, params=_BOX, effects=(AppliedForce(_pull), Friction(Coulomb(_FLOOR))))
+    return float(periodic_orbit(scene, ([0.0], [0.0]), period=_swing_period).advance[0])
+
+
+def _exact_advance() -> float:
+    """It slips from where the force exceeds friction until its velocity, in closed form, is zero again."""
+    m, F0, F1, W = (_BOX[name] for name in ("m", "F0", "F1", "W"))
+    begin, mean = -math.acos((_FLOOR - F0) / F1) / W, F0 - _FLOOR
+
+    def momentum(t: float) -> float:
+        return mean * (t - begin) + F1 / W * (math.sin(W * t) - math.sin(W * begin))
+
+    end: float = brentq(momentum, 0.0, begin + 2.0 * math.pi / W, xtol=1e-14)  # pyright: ignore[reportAssignmentType]
+    s = end - begin
+    wave = math.cos(W * begin) - math.cos(W * end) - W * s * math.sin(W * begin)
+    return (0.5 * mean * s**2 + F1 / W**2 * wave) / m
+
+
+# A damped mass on a belt whose friction falls: up to some speed of the belt it sticks and slips.
+_FALLING, _DAMPER = {"Fc": 5.0, "Fs": 8.0, "vs": 0.2}, 2.0
+
+
+def _speed_where_stick_shrinks() -> float:
+    scene = belt_oscillator.scene(Stribeck(**_FALLING), c=_DAMPER, belt=0.61)
+    branch = continue_orbits(
+        *(scene, ([0.0], [0.61]), "friction.belt_velocity", (0.61, 0.66)), settle=20.0, step=0.4, rtol=1e-9
+    )
+    (point,) = branch.points
+    return point.value if not branch.stable[-1] and "end of the span" in branch.ending else math.nan
+
+
+def _speed_where_slip_touches() -> float:
+    """At which the cycle of slip alone, from a touch of the speed of the belt, comes to the next touch."""
+    k, (Fc, Fs, vs) = belt_oscillator.PARAMS["k"], _FALLING.values()
+
+    def misses(belt: float) -> float:
+        def rate(_: float, y: np.ndarray) -> list[float]:
+            friction = Fc + (Fs - Fc) * math.exp(-(((belt - y[1]) / vs) ** 2))
+            return [y[1], friction - k * y[0] - _DAMPER * y[1]]
+
+        def fastest(t: float, y: np.ndarray) -> float:
+            return rate(t, y)[1]
+
+        start = [(Fs - _DAMPER * belt) / k, belt]
+        run = solve_ivp(rate, (0.0, 1.0), start, "DOP853", events=fastest, rtol=1e-12, atol=1e-13)
+        assert run.y_events is not None
+        return max(y[1] for y in run.y_events[0][1:]) - belt
+
+    return float(brentq(misses, 0.55, 0.7, xtol=1e-12))  # pyright: ignore[reportArgumentType]
+
+
 def _single() -> object:
     single = jtu.tree_map(lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, belt_oscillator.scene())
     return periodic_orbit(single, ([0.0], [0.0]), settle=20.0)
@@ -204,6 +293,33 @@ def cases() -> list[HardCase]:
             lambda _: _by_settling(grazing, 60),
             asks="position at the start [m]",
             tolerance=1e-8,
+        ),
+        HardCase(
+            "orbit_beside_a_held_mass",
+            "One of two coupled masses sticks throughout: its place is that in which it was put.",
+            "Equations that are singular along its place, in which Newton's iteration wanders.",
+            MeasuredNumber(_beside_a_held_mass),
+            lambda _: 0.1 + 1.0 / abs(1.5 - 0.49 + 0.14j),
+            asks="greatest position of the other [m]",
+            tolerance=1e-8,
+        ),
+        HardCase(
+            "orbit_that_advances",
+            "A box is pulled over a floor, sticks and slips, and never returns to where it was.",
+            "A search for a state that returns finds none.",
+            MeasuredNumber(_advance_of_a_box),
+            lambda _: _exact_advance(),
+            asks="advance in a period [m]",
+            tolerance=1e-8,
+        ),
+        HardCase(
+            "orbit_stick_shrinks",
+            "A branch of stick-slip comes to where its stick shrinks to a point, and turns back without stick.",
+            "The derivative of the return map jumps there: a step along the tangent finds no orbit.",
+            MeasuredNumber(_speed_where_stick_shrinks),
+            second=_speed_where_slip_touches,
+            asks="speed of the belt [m/s]",
+            tolerance=1e-6,
         ),
         HardCase(
             "orbit_in_single_precision",
