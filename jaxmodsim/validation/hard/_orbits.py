@@ -1,6 +1,7 @@
 """Periodic orbits: unstable, doubled, stiff, sticking often, throughout or hardly, advancing, refused in float32."""
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -234,93 +235,101 @@ def _single() -> object:
     return periodic_orbit(single, ([0.0], [0.0]), settle=20.0)
 
 
+def _found(
+    name: str, why: str, naive: str, fn: Callable[[], float], right: Callable[[], float], asks: str, **more: float
+) -> HardCase:
+    """A number of an orbit, and the right one."""
+    options = {"tolerance": 1e-8, **more}
+    return HardCase(name, why, naive, MeasuredNumber(fn), lambda _: right(), asks=asks, **options)
+
+
+def _without_return() -> list[HardCase]:
+    """Orbits along which something does not return, or is not determined."""
+    return [
+        _found(
+            "orbit_beside_a_held_mass",
+            "One of two coupled masses sticks throughout: its place is that in which it was put.",
+            "Equations that are singular along its place, in which Newton's iteration wanders.",
+            _beside_a_held_mass,
+            lambda: 0.1 + 1.0 / abs(1.5 - 0.49 + 0.14j),
+            "greatest position of the other [m]",
+        ),
+        _found(
+            "orbit_that_advances",
+            "A box is pulled over a floor, sticks and slips, and never returns to where it was.",
+            "A search for a state that returns finds none.",
+            _advance_of_a_box,
+            _exact_advance,
+            "advance in a period [m]",
+        ),
+        _found(
+            "orbit_stick_shrinks",
+            "A branch of stick-slip comes to where its stick shrinks to a point, and turns back without stick.",
+            "The derivative of the return map jumps there: a step along the tangent finds no orbit.",
+            _speed_where_stick_shrinks,
+            _speed_where_slip_touches,
+            "speed of the belt [m/s]",
+            tolerance=1e-6,
+        ),
+    ]
+
+
 def cases() -> list[HardCase]:
     """The cases of this family."""
     bristles = belt_oscillator.scene(LuGre(sigma0=1e5, sigma1=300.0, sigma2=0.4, Fc=5.0, Fs=8.0, vs=0.1))
     belts = coupled_belts.scene()
     sticky, grazing = _forced(0.05, 0.03, 0.06, 0.0), _forced(0.6168, 0.5, 0.5, 0.1)
+
     return [
-        HardCase(
+        _found(
             "orbit_unstable",
             "A ball bounces once a period, though any disturbance doubles from bounce to bounce.",
             "A simulation leaves the orbit, however long it runs.",
-            MeasuredNumber(_unstable_multiplier),
-            lambda _: _exact_multiplier(),
-            asks="largest multiplier",
-            tolerance=1e-8,
+            _unstable_multiplier,
+            _exact_multiplier,
+            "largest multiplier",
         ),
-        HardCase(
+        _found(
             "orbit_period_two",
             "A ball bounces to two heights in turn, on a table beyond the doubling of its period.",
             "The orbit of one period is near, and solves the equations too.",
-            MeasuredNumber(_top_of_two_bounces),
-            lambda _: _exact_top(),
-            asks="highest position [m]",
-            tolerance=1e-8,
+            _top_of_two_bounces,
+            _exact_top,
+            "highest position [m]",
         ),
-        HardCase(
+        _found(
             "orbit_bristles",
             "Stick-slip of a belt with bristles of 1e5 N/m: multipliers of 1 and next to nothing.",
             "Shooting in the bristles' own small unit, or steps of microseconds.",
-            MeasuredNumber(partial(_period, bristles, 20.0)),
-            lambda _: _period_by_settling(bristles, 40.0),
-            asks="period [s]",
-            tolerance=1e-8,
+            partial(_period, bristles, 20.0),
+            lambda: _period_by_settling(bristles, 40.0),
+            "period [s]",
         ),
-        HardCase(
+        _found(
             "orbit_two_belts",
             "Two coupled masses on a belt stick and slip in turns.",
             "The sequence of modes changes under the iteration.",
-            MeasuredNumber(partial(_period, belts, 60.0)),
-            lambda _: _period_by_settling(belts, 120.0),
-            asks="period [s]",
-            tolerance=1e-8,
+            partial(_period, belts, 60.0),
+            lambda: _period_by_settling(belts, 120.0),
+            "period [s]",
         ),
-        HardCase(
+        _found(
             "orbit_many_sticks",
             "Slow forcing: sixteen phases of stick in a period.",
             "Each takes a direction away; differences of the return map see nothing.",
-            MeasuredNumber(partial(_by_forced_orbit, sticky)),
-            lambda _: _by_settling(sticky, 40),
-            asks="position at the start [m]",
-            tolerance=1e-8,
+            partial(_by_forced_orbit, sticky),
+            lambda: _by_settling(sticky, 40),
+            "position at the start [m]",
         ),
-        HardCase(
+        _found(
             "orbit_nearly_grazing",
             "A forced mass that has just ceased to stick at its turning points.",
             "The derivative of the return map jumps next to the orbit.",
-            MeasuredNumber(partial(_by_forced_orbit, grazing)),
-            lambda _: _by_settling(grazing, 60),
-            asks="position at the start [m]",
-            tolerance=1e-8,
+            partial(_by_forced_orbit, grazing),
+            lambda: _by_settling(grazing, 60),
+            "position at the start [m]",
         ),
-        HardCase(
-            "orbit_beside_a_held_mass",
-            "One of two coupled masses sticks throughout: its place is that in which it was put.",
-            "Equations that are singular along its place, in which Newton's iteration wanders.",
-            MeasuredNumber(_beside_a_held_mass),
-            lambda _: 0.1 + 1.0 / abs(1.5 - 0.49 + 0.14j),
-            asks="greatest position of the other [m]",
-            tolerance=1e-8,
-        ),
-        HardCase(
-            "orbit_that_advances",
-            "A box is pulled over a floor, sticks and slips, and never returns to where it was.",
-            "A search for a state that returns finds none.",
-            MeasuredNumber(_advance_of_a_box),
-            lambda _: _exact_advance(),
-            asks="advance in a period [m]",
-            tolerance=1e-8,
-        ),
-        HardCase(
-            "orbit_stick_shrinks",
-            "A branch of stick-slip comes to where its stick shrinks to a point, and turns back without stick.",
-            "The derivative of the return map jumps there: a step along the tangent finds no orbit.",
-            MeasuredNumber(_speed_where_stick_shrinks),
-            second=_speed_where_slip_touches,
-            asks="speed of the belt [m/s]",
-            tolerance=1e-6,
-        ),
+        *_without_return(),
         HardCase(
             "orbit_in_single_precision",
             "Shooting in float32.",
