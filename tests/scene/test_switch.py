@@ -78,7 +78,7 @@ def exactly(numbers, x, t):
         if not crossed.size or t - now < 1e-6:
             return expm(a * (t - now)) @ x, times
         i = crossed[0]
-        h = brentq(guard, grid[i - 1], grid[i], xtol=1e-15)
+        h = float(brentq(guard, grid[i - 1], grid[i], xtol=1e-15))  # pyright: ignore[reportArgumentType]
         now, x, side = now + h, expm(a * h) @ x, 1 - side
         times.append(now)
 
@@ -154,7 +154,7 @@ def test_a_spiral_that_turns_at_the_unit_circle():
 
     def end(x0, t1):
         solver = jms.EventSolver(dfx.Tsit5(), guards, lambda t, s, args, fired: s._replace(mode=-s.mode))
-        return dfx.diffeqsolve(
+        solution = dfx.diffeqsolve(
             dfx.ODETerm(field),
             solver,
             0.0,
@@ -163,7 +163,9 @@ def test_a_spiral_that_turns_at_the_unit_circle():
             solver.start(0.0, x0, jnp.asarray(-1.0)),
             stepsize_controller=jms.EventController(dfx.PIDController(rtol=1e-11, atol=1e-11)),
             adjoint=jms.StoredSteps(),
-        ).ys.y[-1]
+        )
+        assert solution.ys is not None
+        return solution.ys.y[-1]
 
     x0 = jnp.array([jnp.exp(-1.0), 0.0])
     angle = turn * 0.5
@@ -292,11 +294,14 @@ def test_an_orbit_passes_switches():
     def field(t, y, k):
         return [y[1], np.cos(2.0 * t) - 0.3 * y[1] - k * y[0]]
 
-    def crossing(_, y, k):
-        del k
-        return y[0]
+    class Crossing:
+        terminal, direction = True, 0.0
 
-    crossing.terminal = True
+        def __call__(self, t, y, k):
+            del t, k
+            return y[0]
+
+    crossing = Crossing()
     t, y = float(orbit.t0), np.array([orbit.q[0], orbit.qd[0]])
     end, begin = t + np.pi, y
     for _ in range(16):

@@ -174,7 +174,7 @@ def _two_springs(level: float) -> float:
         crossed = np.flatnonzero((np.array([guard(h) for h in grid]) > 0) != bool(side))
         if not crossed.size:
             return float((expm(a * (6.0 - now)) @ x)[0])
-        h = brentq(guard, grid[crossed[0] - 1], grid[crossed[0]], xtol=1e-15)
+        h = float(brentq(guard, grid[crossed[0] - 1], grid[crossed[0]], xtol=1e-15))  # pyright: ignore[reportArgumentType]
         now, x, side = now + h, expm(a * h) @ x, 1 - side
 
 
