@@ -10,7 +10,7 @@ from ._equilibrium import Equilibrium
 from ._orbit import PeriodicOrbit
 
 FOLD, DOUBLING, TORUS, CROSSING, HOPF = "fold", "period doubling", "Neimark-Sacker", "branch point", "Hopf"
-ONSET, LOSS, GRAZING = "onset of stick", "loss of stick", "grazing"
+ONSET, LOSS, GRAZING, ORDER = "onset of stick", "loss of stick", "grazing", "order of modes"
 
 # What a branch consists of. An equilibrium is an orbit that stays where it is.
 OrbitT = TypeVar("OrbitT", PeriodicOrbit, Equilibrium)
@@ -20,7 +20,8 @@ class SpecialOrbit(eqx.Module, Generic[OrbitT]):
     """An orbit at which a branch turns, or orbits change their stability or their sequence of modes.
 
     - `kind`: `"fold"`, `"period doubling"`, `"Neimark-Sacker"`, `"branch point"` (a multiplier of 1 without a fold);
-      where the sequence of modes changes `"onset of stick"`, `"loss of stick"`, or `"grazing"`. Of equilibria `"fold"`,
+      where the sequence of modes changes `"onset of stick"`, `"loss of stick"`, `"grazing"` (an impact or a reversal
+      more or less) or `"order of modes"` (the same changes in another order). Of equilibria `"fold"`,
       `"branch point"`, or `"Hopf"`, where a branch of periodic orbits begins.
     - `value`: of the parameter.
     - `index`: it lies between the orbits `index` and `index + 1` of the branch.

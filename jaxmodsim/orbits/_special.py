@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.optimize import brentq
 
-from ._branch import CROSSING, DOUBLING, FOLD, GRAZING, LOSS, ONSET, TORUS, OrbitT, SpecialOrbit
+from ._branch import CROSSING, DOUBLING, FOLD, GRAZING, LOSS, ONSET, ORDER, TORUS, OrbitT, SpecialOrbit
 from ._describe import describe, floquet
 from ._newton import scaled, split
 from ._orbit import PeriodicOrbit, Sequence
@@ -153,6 +153,8 @@ def _cycle(sequence: Sequence) -> Sequence:
 
 
 def _change(before: Sequence, after: Sequence) -> str:
+    if sorted(before) == sorted(after):
+        return ORDER
     sticks = [sum(mode == "stick" for _, _, mode in each) for each in (before, after)]
     return GRAZING if sticks[0] == sticks[1] else ONSET if sticks[0] < sticks[1] else LOSS
 

@@ -20,6 +20,7 @@ _MARKERS = {
     "onset of stick": "o",
     "loss of stick": "o",
     "grazing": "X",
+    "order of modes": "x",
 }
 # Range of an axis of periods, in the period, that is not made larger: what hardly changes should look so.
 _LEAST_RANGE = 0.05

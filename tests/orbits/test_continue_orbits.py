@@ -226,6 +226,24 @@ def test_grazing_is_where_the_amplitude_without_impacts_reaches_the_stop():
     assert list(branch.stable) == [x > amplitude for x in branch.values]
 
 
+def test_changes_that_swap_are_no_grazing():
+    """Two oscillators of one damping pass zero at once where their stiffnesses are equal."""
+
+    def two(_t, q, qd, p):
+        return 0.5 * jnp.sum(qd**2) - 0.5 * (3.0 * q[0] ** 2 + p["k"] * q[1] ** 2)
+
+    def force(t, _q, qd, p):
+        return jnp.cos(p["W"] * t) - 0.4 * qd
+
+    gates = [jms.Switch(lambda _t, q, _qd, _p, i=i: q[i], name=f"gate_{i}") for i in range(2)]
+    scene = jms.Scene(two, params={"k": 3.2, "W": 1.0}, effects=(jms.AppliedForce(force), *gates))
+    branch = jms.continue_orbits(
+        scene, ([0.5, 0.5], [0.0, 0.0]), "k", (3.2, 2.8), period=of_frequency, settle=60.0, step=0.3
+    )
+    assert {point.kind for point in branch.points} == {"order of modes"}
+    np.testing.assert_allclose([point.value for point in branch.points], 3.0, rtol=1e-6)
+
+
 def test_folds_of_duffing_and_a_branch_that_goes_on_from_its_store(tmp_path):
     def follow(**options):
         return jms.continue_orbits(
