@@ -177,7 +177,9 @@ def test_a_controller_and_an_observed_force_pass_stick():
         return jms.Scene(base.lagrangian, params={**base.params, "P": P, "r": 0.0}, effects=effects)
 
     seen = {"x": "q[0]", "F": "dry"}
-    blank = jms.Record(t, {"x": np.zeros(t.size), "F": np.zeros(t.size)}, {"r": reference}, noise={"x": 1e-5, "F": 1e-2})
+    blank = jms.Record(
+        t, {"x": np.zeros(t.size), "F": np.zeros(t.size)}, {"r": reference}, noise={"x": 1e-5, "F": 1e-2}
+    )
     truth = jms.fit(scene(400.0, 4.0), blank, ("P",), observe=seen, q0=[0.0], controller=loop, max_steps=1)
     rng, outputs = np.random.default_rng(0), truth.provenance.outputs[0]
     stands = np.abs(outputs["F"]) < 3.999

@@ -127,9 +127,7 @@ class AxisModel:
 
 # Models of more than one friction element.
 _COMBINATIONS = {
-    "coulomb": AxisModel(
-        _coulomb, ("m", "offset", "dry.Fc", "viscous.Fv"), "Coulomb friction and viscous friction"
-    ),
+    "coulomb": AxisModel(_coulomb, ("m", "offset", "dry.Fc", "viscous.Fv"), "Coulomb friction and viscous friction"),
     "asymmetric": AxisModel(
         _asymmetric,
         ("m", "dry.forward.Fc", "dry.backward.Fc", "viscous.forward.Fv", "viscous.backward.Fv"),

@@ -94,9 +94,7 @@ def pass_modes(
         y1 = rosenbrock_step(tableau, field, at.t, length, at.y, pivot=True).y1
         t1 = at.t + length
         slope = field(t1, y1)
-        guards, falls = jax.jvp(
-            lambda t, y: _guards(t, y, scene_at(t), at.mode), (t1, y1), (jnp.ones_like(t1), slope)
-        )
+        guards, falls = jax.jvp(lambda t, y: _guards(t, y, scene_at(t), at.mode), (t1, y1), (jnp.ones_like(t1), slope))
         falls = _constant(falls)
         away = -_constant(guards) / jnp.where(falls < 0, falls, -1.0)
         fired = (falls < 0) & (jnp.abs(away) <= landed)
@@ -120,7 +118,9 @@ def pass_modes(
         inside = (newton > lower) & (newton < upper) & ((at.count < _NEWTON) | (at.count % 2 == 0))
         trial = jnp.where(inside, newton, 0.5 * (lower + upper))
         retry = at._replace(lower=lower, upper=upper, trial=trial)
-        onward = _Passage(t_there, left, after, jnp.where(lands, mode, at.mode), jnp.zeros_like(dt), left, left, at.count)
+        onward = _Passage(
+            t_there, left, after, jnp.where(lands, mode, at.mode), jnp.zeros_like(dt), left, left, at.count
+        )
         moved = jtu.tree_map(lambda a, b: jnp.where(passes, a, b), onward, retry)
         lengths = {name: _constant(getattr(moved, name)) for name in ("lower", "upper", "trial")}
         return moved._replace(**lengths, count=at.count + 1)
