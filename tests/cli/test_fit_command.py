@@ -169,9 +169,9 @@ def test_ctrl_c_keeps_what_was_found(run_command, files, tmp_path, monkeypatch):
     found = json.loads((out / "fit.json").read_text())
     assert found["ending"].startswith("interrupted")
     assert seen == [1, 2]
-    assert found["evaluations"] == 1
+    assert found["evaluations"] == 2
     assert "do not trust" in Page((out / "report.html").read_text()).text
-    assert FitResult.load(out / "fit.npz").diagnostics.evaluations == 1
+    assert FitResult.load(out / "fit.npz").diagnostics.evaluations == 2
 
 
 def test_models_are_compared(run_command, files, tmp_path):

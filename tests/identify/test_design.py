@@ -139,7 +139,8 @@ def every_goal(information):
 
 def test_gradients_of_goals_and_limits_equal_finite_differences():
     # A smooth law: the kink of LuGre at rest would be seen by the differences and not by the derivative.
-    scene = axis_scene(axis_models()["coulomb"], RoughAxis(10.0, 40.0, 8.0, -1.0, 0.1), {"dry.width": 0.02})
+    exact = axis_scene(axis_models()["coulomb"], RoughAxis(10.0, 40.0, 8.0, -1.0, 0.1))
+    scene = jms.formulations(exact, width=0.02)["Regularized"]
     axis, parameters, _ = _axis(scene, ("m", "dry.Fc", "viscous.Fv"), None, lambda q, qd: q[0], "u", NOISE)
     t = np.linspace(0.0, 1.0, 101)
     shapes, rates = motion_basis(t, 2)

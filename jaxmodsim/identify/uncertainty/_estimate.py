@@ -31,9 +31,8 @@ _ALONE = 1e-6
 _LAGS_A_DECADE, _SAMPLES_A_LAG = 10, 5
 _CHANCE, _TINY = 0.01, 1e-30
 
-# Derivatives are tried over this share of a standard error, and over no more than this in coordinates of about 1; they
-# hold if they miss no more than this share of the change.
-_TRIED, _FARTHEST, _HOLDS = 0.1, 1e-3, 0.5
+# Derivatives are tried over this share of a standard error; they hold if they miss no more than this share of the change.
+_TRIED, _HOLDS = 0.1, 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -350,10 +349,11 @@ def derivatives_hold(problem: FitProblem, state: SearchState) -> bool:
     scale = np.where(scale > 0, scale, np.inf)
     values, vectors = np.linalg.eigh(np.nan_to_num((jacobian / scale).T @ (jacobian / scale)))
     rounding = ROUNDING * float(np.finfo(x.dtype).eps) * max(values[-1], _TINY)
-    signs = np.where(np.arange(x.size) % 2, -1.0, 1.0)
     level = np.sqrt(np.mean(residual[: problem.samples][problem.weights > 0] ** 2))
-    move = level * (vectors @ (signs / np.sqrt(np.maximum(values, rounding)))) / scale
-    move *= min(_TRIED, _FARTHEST / max(float(np.max(np.abs(move))), _TINY))
+    axes = _TRIED * level * vectors / np.sqrt(np.maximum(values, rounding)) / scale[:, None]
+    # Coordinates are about 1 in size. Along axes that are not determined the output is not linear over standard errors.
+    farthest = float(np.finfo(x.dtype).eps) ** (1 / 3)
+    move = np.sum(axes * np.minimum(1.0, farthest / np.maximum(np.max(np.abs(axes), axis=0), _TINY)), axis=1)
     inside = np.clip(move, np.asarray(box.lower) - x, np.asarray(box.upper) - x)
     trial = (x + inside).astype(x.dtype)
     # The first evaluation of a search: the program is that of the fit.

@@ -334,7 +334,9 @@ def _issues(
     uncertain, model, base = uncertain_of(estimate), provenance.model, search.problem.base
     of_samples = _sample_issues(provenance.records, isinstance(search.problem.loss, SquaredLoss))
     if refused:
-        return (IdentifiabilityIssue(_ROUGH, tuple(estimate.values)), *of_samples)
+        shows = np.any(np.asarray(search.state.jacobian) != 0, axis=0)
+        about = tuple(name for name, column in zip(estimate.values, shows, strict=False) if column)
+        return (IdentifiabilityIssue(_ROUGH, about), *of_samples)
     if not uncertain or not isinstance(model, Scene | AbstractLaw):
         return of_samples
     dof = 1 if base is None else base.q.shape[-1]
