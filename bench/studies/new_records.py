@@ -24,7 +24,6 @@ from jaxmodsim.identify import (
     predict,
     replay,
     rough_axis,
-    start_state,
 )
 
 # Mass [kg], LuGre's numbers but Fs [N], how much friction depends on position over which length [m], offset [N].
@@ -105,9 +104,8 @@ def _compared(one: jms.Record) -> Comparison:
     rough = rough_axis(one)
     models = {name: axis_models()[name] for name in LAWS}
     candidates = {name: Candidate(axis_scene(model, rough), model.free) for name, model in models.items()}
-    q0, qd0 = start_state(one)
     narrower = [Continuation(name, 10.0, 2) for name in ("dry.width", "friction.width")]
-    return compare(candidates, one, q0=[q0], qd0=[qd0], limits={"m": (0.0, None)}, initializer=narrower)
+    return compare(candidates, one, limits={"m": (0.0, None)}, initializer=narrower)
 
 
 def _pair(change: float, stiction: float, rng: np.random.Generator) -> _Pair:

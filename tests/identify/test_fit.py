@@ -257,7 +257,7 @@ def test_inputs_that_the_scene_does_not_know_are_refused(clean):
 
 def test_too_few_samples_are_refused(clean):
     t, u, q = clean
-    with pytest.raises(ValueError, match="3 samples are too few for 3"):
+    with pytest.raises(ValueError, match="3 samples are too few for 5 unknowns"):
         jms.fit(sprung(), jms.Record(t[:3], q[:3], {"u": u[:3]}), tuple(TRUTH))
 
 

@@ -30,6 +30,8 @@ _SAMPLES = 20
 # A value stands out that is so many times as far from the median of its neighbours as nearly all others are, and as far
 # as samples go from one to the next.
 _NEIGHBOURS, _STANDS_OUT, _NEARLY_ALL = 5, 10.0, 0.95
+# Values are on a grid that lie off it by less than this share of its step; keeps divisions by a level finite.
+_ON_A_GRID, _TINY = 1e-3, 1e-300
 # Smoothing: one sample to either side for so many of the record, and never fewer than so many to either side.
 _SAMPLES_A_SIDE, _LEAST_SPAN = 1000, 3
 
@@ -381,7 +383,44 @@ def start_state(record: Record, channel: str | None = None) -> tuple[float, floa
     Position and velocity.
     """
     x = without_outliers(record.measured if channel is None else record.channels[channel])
-    count = min(_SAMPLES, len(record.t))
-    t = record.t[:count] - record.t[0]
-    coefficients = np.polynomial.polynomial.polyfit(t, x[:count], min(2, count - 1))
-    return float(coefficients[0]), float(coefficients[1])
+    powers = _start_powers(record.t)
+    return tuple(np.linalg.lstsq(powers, x[: len(powers)])[0][:2].tolist())
+
+
+def start_errors(record: Record, channel: str) -> float:
+    """Standard error of the velocity of `start_state` over the noise of the channel [1/s].
+
+    Larger where the first samples lie off the parabola by more than the noise: they are too far apart for it.
+    """
+    x = without_outliers(record.channels[channel])
+    powers = _start_powers(record.t)
+    first = x[: len(powers)]
+    off = np.sqrt(np.mean((first - powers @ np.linalg.lstsq(powers, first)[0]) ** 2))
+    return float(np.linalg.norm(np.linalg.pinv(powers)[1])) * max(1.0, float(off) / sample_noise(x))
+
+
+def _start_powers(t: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "first powers"]:
+    """The parabola through the first samples, as a matrix: by time since the first one."""
+    count = min(_SAMPLES, len(t))
+    return np.vander(t[:count] - t[0], min(3, count), increasing=True)
+
+
+def sample_noise(x: Float[np.ndarray, " samples"]) -> float:
+    """Standard deviation of white noise that differences from sample to sample show; at least that of rounding.
+
+    Fourth differences, of which a smooth motion leaves little, by their median; steps of a sensor of resolution r have
+    a standard deviation of r/sqrt(12).
+    """
+    differences = np.diff(x, 4) if len(x) > 4 else np.diff(x)
+    level = float(np.median(np.abs(differences))) / (0.6745 * np.sqrt(70.0 if len(x) > 4 else 2.0))
+    return max(level, resolution(x) / np.sqrt(12.0), float(np.finfo(float).eps * np.max(np.abs(x))), _TINY)
+
+
+def resolution(x: Float[np.ndarray, " samples"]) -> float:
+    """Step of the values of a sensor, all of which are multiples of it apart; 0 where there is none."""
+    values = np.unique(x)
+    steps = np.diff(values)
+    if not steps.size:
+        return 0.0
+    step = float(np.median(steps[steps < 1.5 * np.min(steps)]))
+    return step if np.max(np.abs(steps / step - np.round(steps / step))) < _ON_A_GRID else 0.0

@@ -141,13 +141,13 @@ def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 400) -
     shared, own = problem.split(result.search.state.x)
     fits = []
     for i, record in enumerate(records):
-        base, runs = jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], (problem.base, problem.runs))
-        alone = dataclasses.replace(problem, base=base, runs=runs)
+        base, runs, known = jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], (problem.base, problem.runs, problem.known))
+        alone = dataclasses.replace(problem, base=base, runs=runs, known=known)
         search = _search_alone(alone, jnp.concatenate([shared, own[i]]), result, SearchOptions(max_steps=max_steps))
         if not bool(jnp.isfinite(search.state.cost)):
             raise RuntimeError(f"The fit to {record} alone ended with values that are not finite.")
         blocks = blocks_that_are_independent(search)
-        covariance = covariance_of(alone, search.state, len(problem.free.names), blocks).covariance
+        covariance = covariance_of(alone, search.state, range(len(problem.free.names)), blocks).covariance
         value = alone.at(search.state.x).vector
         limits = problem.free.limits(search.state.x[: len(problem.free.names)])
         at_limit = [x in limits[name] for name, x in zip(problem.free.names, value.tolist(), strict=True)]

@@ -470,7 +470,7 @@ def _measured_starts(search: SearchResult, asked: _Asked) -> State:
     observables = by_channel(asked.observe, asked.hold_out)
     q, qd = [], []
     for record in asked.hold_out:
-        start = measured_start(record, observables, base.q.shape[1], exact=False)
+        start = measured_start(record, observables, base.q.shape[1])
         # What was not measured comes as zero.
         q.append(np.where(start[0] != 0, start[0], base.q[0]))
         qd.append(np.where(start[1] != 0, start[1], base.qd[0]))

@@ -184,7 +184,7 @@ def record_problem(result: FitResult, record: Record, given: tuple[_Start, _Star
     if isinstance(engine, EventEngine):
         engine = dataclasses.replace(engine, slips=())
     dof = first.q.shape[-1]
-    guessed = measured_start(record, observables, dof, exact=False)
+    guessed = measured_start(record, observables, dof)
     start = [_given(x, guess, dof, name) for x, guess, name in zip(given, guessed, ("q0", "qd0"), strict=True)]
     q, qd = (jnp.asarray(x, float)[None] for x in start)
     z = scene.initial_state(q[0])
