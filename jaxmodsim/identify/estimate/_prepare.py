@@ -424,8 +424,8 @@ def measured_start(
     q, qd = np.zeros(dof), np.zeros(dof)
     # Velocities last: where one was measured, it is not the slope of a position.
     for channel, name in sorted(coordinates_seen(observables, dof).items(), key=lambda each: each[1]):
-        if channel in record.channels:
-            i = int(name.split("[")[1][:-1])
+        i = int(name.split("[")[1][:-1])
+        if channel in record.channels and i < dof:
             if name.startswith("qd"):
                 qd[i] = start_state(record, channel)[0]
             else:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import equinox as eqx
@@ -46,6 +46,8 @@ class ParameterEstimate:
     - `information`: Fisher information of the parameters, shape `[free, free]`, the noise at its level.
     - `logarithmic`: names of the parameters that must be positive; their intervals are symmetric in the logarithm.
     - `bounds`: lower and upper limit of each parameter at the estimate.
+    - `natural`: of a parameter that may have either sign, the change with which the model's output moves by as much as
+      the measured samples scatter (of a constant force: the forces in the record); 0 of the others.
     """
 
     values: dict[str, float]
@@ -56,6 +58,11 @@ class ParameterEstimate:
     information: Float[np.ndarray, "free free"]
     logarithmic: tuple[str, ...]
     bounds: dict[str, tuple[float, float]]
+    natural: dict[str, float] = field(default_factory=dict)
+
+    def scale(self, name: str) -> float:
+        """What a standard error is small or large against: the value; of either sign at least its natural scale."""
+        return max(abs(self.values[name]), self.natural.get(name, 0.0))
 
     @property
     def errors(self) -> dict[str, float]:
@@ -338,6 +345,25 @@ def covariance_of(
     order = np.array([*kept, *(k for k in range(slopes.shape[0]) if k not in set(kept))])
     jacobian, extra, slopes = jacobian[:, order], extra[:, order], slopes[np.ix_(order, order)]
     return covariance_estimate(residual, jacobian, extra, slopes, numbers, count, len(kept), white)
+
+
+def natural_scales(problem: FitProblem, state: SearchState, kept: Sequence[int]) -> Float[np.ndarray, " kept"]:
+    """Changes of parameters with which the output moves by as much as the samples scatter; 0 of those without effect.
+
+    **Arguments:**
+
+    - `kept`: entries of x whose parameters are meant.
+    """
+    size = len(problem.free.names)
+    slopes = np.diag(problem.at(state.x).slopes)
+    jacobian = np.asarray(state.jacobian, float)[: problem.samples]
+    scatter = []
+    for name, weight in problem.runs.weight.items():
+        x = np.asarray(problem.runs.measured[name])[np.asarray(weight) > 0]
+        scatter.append(x.size * (np.std(x) / float(problem.noise[name])) ** 2 if x.size else 0.0)
+    moved = np.linalg.norm(jacobian[:, list(kept)], axis=0)
+    moved = moved / np.array([abs(slopes[k]) if k < size else 1.0 for k in kept])
+    return np.where(moved > 0, np.sqrt(sum(scatter)) / np.where(moved > 0, moved, 1.0), 0.0)
 
 
 def offsets_left(

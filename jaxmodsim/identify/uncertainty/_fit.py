@@ -39,6 +39,7 @@ from ._estimate import (
     IdentifiabilityIssue,
     ParameterEstimate,
     covariance_of,
+    natural_scales,
     offsets_left,
 )
 from ._identifiability import identifiability_issues
@@ -283,7 +284,8 @@ def result_of(
             kept += [len(shared) + i * len(problem.local) + k for k in range(shown)]
     covariance = covariance_of(problem, state, kept)
     outputs, rmse = _stitched(search, records, windows)
-    free = problem.free
+    free, scales = problem.free, natural_scales(problem, state, kept)
+    signed = [*(kind == "line" for kind in free.kinds), *(True for _ in names[len(free.names) :])]
     estimate = ParameterEstimate(
         values=dict(zip(names, values, strict=True)),
         start=dict(zip(names, at_start, strict=True)),
@@ -293,6 +295,7 @@ def result_of(
         information=covariance.information,
         logarithmic=tuple(name for name, kind in zip(free.names, free.kinds, strict=True) if kind == "log"),
         bounds=free.limits(shared) | {name: (-np.inf, np.inf) for name in names[len(free.names) :]},
+        natural={name: float(x) if each else 0.0 for name, x, each in zip(names, scales, signed, strict=True)},
     )
     provenance = FitProvenance(
         records=records,

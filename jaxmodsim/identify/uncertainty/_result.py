@@ -32,7 +32,7 @@ _FOLLOWS = 0.95
 # Share of the RMSE from which on the effect of the integration step is reported.
 _STEP_SHOWS = 0.1
 
-_KIND, _VERSION, _TEXT = "jaxmodsim fit result", 1, "result.json"
+_KIND, _VERSION, _TEXT = "jaxmodsim fit result", 2, "result.json"
 _PARTS = {"estimate": ParameterEstimate, "diagnostics": FitDiagnostics, "provenance": FitProvenance}
 # What is not kept in a file: functions.
 _LEFT_OUT = ("model",)
@@ -218,10 +218,11 @@ def remarks(result: FitResult) -> tuple[str, ...]:
     sentences += [direction.sentence for direction in directions]
     told = explained | {name for direction in directions for name in direction.names}
     for name, value in estimate.values.items():
-        share = errors[name] / abs(value) if value else np.inf
+        share = errors[name] / scale if (scale := estimate.scale(name)) else np.inf
         if _UNKNOWN < share < np.inf and value not in bounds[name] and name not in told:
+            of = "its value" if scale == abs(value) else f"{scale:.2g}, which would move the motion by its own size"
             sentences.append(
-                f"{name} is not determined by this record: its standard error is {100 * share:.0f} % of its value."
+                f"{name} is not determined by this record: its standard error is {100 * share:.0f} % of {of}."
             )
     pairs = [(a, b, c) for a, b, c in _alike(estimate) if not {a, b} <= told]
     for a, b, c in pairs[:_PAIRS]:
@@ -248,7 +249,7 @@ def uncertain_of(estimate: ParameterEstimate) -> dict[str, tuple[str, ...]]:
     pairs, errors, uncertain = _alike(estimate), estimate.errors, {}
     for name, value in estimate.values.items():
         others = tuple(b if a == name else a for a, b, _ in pairs if name in (a, b))
-        if others or not errors[name] < _UNCERTAIN * abs(value) or value in estimate.bounds[name]:
+        if others or not errors[name] < _UNCERTAIN * estimate.scale(name) or value in estimate.bounds[name]:
             uncertain[name] = others
     return uncertain
 
