@@ -19,7 +19,7 @@ import numpy as np
 
 import jaxmodsim as jms
 from bench.record import Result
-from jaxmodsim.identify import axis_models, axis_scene, replay, rough_axis, start_state
+from jaxmodsim.identify import axis_models, axis_scene, replay, rough_axis
 
 # Beside the repository and not in it: A. Janot, M. Gautier, M. Brunot, "Data set and reference models of EMPS",
 # Workshop on Nonlinear System Identification Benchmarks, 2019.
@@ -39,7 +39,7 @@ def main(smoke: bool, out: Path) -> Result | None:
         t, q, _, u = np.loadtxt(path, delimiter=",", skiprows=1).T
         record = jms.Record(t, q, {"u": EMPS_GAIN * u}, name="EMPS")
         result.settings["samples"] = len(t)
-        how = ("--laws", "coulomb" if smoke else "all")
+        how = ("--laws", "coulomb" if smoke else "all", "--free", "+q0,+qd0")
         command = [sys.executable, "-c", "from jaxmodsim.cli import main; main()", "fit", str(path), *how]
         started = time.perf_counter()
         subprocess.run([*command, "--units", f"force={EMPS_GAIN}", "--out", folder], check=True, capture_output=True)
@@ -61,9 +61,10 @@ def main(smoke: bool, out: Path) -> Result | None:
 
 def _rmse(record: jms.Record, model: str, parameters: dict[str, Any], substeps: int) -> float:
     """RMSE [m] of a fitted model with `substeps` integration steps for every sample."""
-    scene = axis_scene(axis_models()[model], rough_axis(record), {name: x["value"] for name, x in parameters.items()})
+    values = {name: x["value"] for name, x in parameters.items()}
+    q0, qd0 = (jnp.asarray([values.pop(name)]) for name in ("q0[0]", "qd0[0]"))
+    scene = axis_scene(axis_models()[model], rough_axis(record), values)
     inputs = {name: jnp.asarray(x) for name, x in record.inputs.items()}
-    q0, qd0 = (jnp.asarray([x]) for x in start_state(record))
     run = jax.jit(replay, static_argnums=5)
     position = run(scene, jnp.asarray(record.t), inputs, q0, qd0, substeps)
     return float(jnp.sqrt(jnp.mean((position - record.measured) ** 2)))

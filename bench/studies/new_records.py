@@ -23,7 +23,6 @@ from jaxmodsim.identify import (
     predict,
     replay,
     rough_axis,
-    start_state,
 )
 
 # Mass [kg], LuGre's numbers but Fs [N], how much friction depends on position over which length [m], offset [N].
@@ -104,8 +103,7 @@ def _compared(one: jms.Record) -> Comparison:
     rough = rough_axis(one)
     models = {name: axis_models()[name] for name in LAWS}
     candidates = {name: Candidate(axis_scene(model, rough), model.free) for name, model in models.items()}
-    q0, qd0 = start_state(one)
-    return compare(candidates, one, q0=[q0], qd0=[qd0], limits={"m": (0.0, None)})
+    return compare(candidates, one, limits={"m": (0.0, None)})
 
 
 def _pair(change: float, stiction: float, rng: np.random.Generator) -> _Pair:

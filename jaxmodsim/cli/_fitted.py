@@ -141,13 +141,16 @@ def headline(fitted: Fitted) -> tuple[str, ...]:
     missed = np.concatenate([residual["measured"] for residual in result.residuals])
     spread = math.sqrt(np.mean(np.concatenate([record.measured - np.mean(record.measured) for record in records]) ** 2))
     seconds = sum(float(record.t[-1] - record.t[0]) for record in records)
-    held_out = [f"{1e3 * score.rmse['measured']:.3g} m{fitted.unit} on {score.record.name}" for score in fitted.scores]
-    never = f"; {', '.join(held_out)}, where nothing but the start is fitted, to the first samples" if held_out else ""
+    held_out = "".join(
+        f"; {1e3 * score.rmse['measured']:.3g} m{fitted.unit} on {score.record.name}, where nothing but the start is"
+        f" fitted, to its first {score.opening} samples"
+        for score in fitted.scores
+    )
     return (
         f"{fitted.model.capitalize()}: {numbers}.",
         f"Driven by the force alone for {seconds:.3g} s it misses the measured {fitted.quantity} by"
         f" {1e3 * math.sqrt(np.mean(missed**2)):.3g} m{fitted.unit}, {100 * np.std(missed) / spread:.2g} % of its"
-        f" scatter{never}.",
+        f" scatter{held_out}.",
         _first_doubt(fitted),
         *_new_record(fitted),
     )

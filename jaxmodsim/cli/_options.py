@@ -59,7 +59,7 @@ Free = Annotated[
     list[str] | None,
     typer.Option(
         help="Parameters to fit, names with commas between, repeatable; by default those of the law, to which +NAME"
-        r" adds one. Also q0 and qd0, the state at the first sample of each record, and delay.u of the force \[s].",
+        r" adds one. Also q0 and qd0, to report where records start, and delay.u of the force \[s].",
         metavar="NAME,...|+NAME",
         rich_help_panel=_MODEL,
     ),

@@ -20,7 +20,6 @@ from ..identify import (
     axis_models,
     axis_scene,
     rough_axis,
-    start_state,
 )
 from ..scene import Scene, scene_numbers
 from ._read import DROPS, AxisColumns, offset_note, read_records
@@ -84,12 +83,6 @@ class Plan:
     notes: tuple[str, ...]
 
 
-def start_states(records: Sequence[Record]) -> dict[str, np.ndarray]:
-    """`q0` [m] and `qd0` [m/s] at the first samples, shape `[records, 1]` each: a record may begin in motion."""
-    states = np.array([start_state(record) for record in records])
-    return {"q0": states[:, :1], "qd0": states[:, 1:]}
-
-
 def plan_of(request: FitRequest) -> Plan:
     """Read the records and check everything; what is to be known of how they were read goes to stderr at once.
 
@@ -137,8 +130,7 @@ def plan_of(request: FitRequest) -> Plan:
         free = tuple(dict.fromkeys(each for each in (*(chosen or model.free), *added) if each not in fixed))
         candidates[name] = Candidate(axis_scene(model, rough, *own), free, model.description)
     limits = {"m": (0.0, None)} | _limits(request.limit, numbers)
-    initializer = _initializers(request)
-    options = {"loss": loss, "initializer": initializer, "max_steps": request.max_steps, **start_states(records)}
+    options = {"loss": loss, "initializer": _initializers(request), "max_steps": request.max_steps}
     compared = len(names) > 1 or request.folds is not None
     rotary = any(file.rotary for file in read)
     return Plan(

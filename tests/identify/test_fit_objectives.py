@@ -157,7 +157,7 @@ def test_gradient_of_every_objective_equals_finite_differences(name, full):
 def test_gradient_of_a_fit_through_events_equals_finite_differences(belt):
     scene = belt_oscillator.scene(jms.Stribeck(**belt_oscillator.STRIBECK))
     free = ("friction.Fc", "friction.Fs", "k")
-    problem = prepare(scene, belt, free, settings(q0=[0.0])).problem
+    problem = prepare(scene, belt, free, settings(q0=[0.0], qd0=[0.0])).problem
     x = problem.x0 + jnp.asarray([0.01, -0.02, 0.015])
     # Larger steps than above: event times are found to the accuracy of the run, not to rounding.
     exact, differences = gradient_and_differences(problem, x, [1e-4] * 3)

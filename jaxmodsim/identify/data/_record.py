@@ -31,6 +31,8 @@ _SAMPLES = 20
 # A value stands out that is so many times as far from the median of its neighbours as nearly all others are, and as far
 # as samples go from one to the next.
 _NEIGHBOURS, _STANDS_OUT, _NEARLY_ALL = 5, 10.0, 0.95
+# Values are on a grid that lie off it by less than this share of its step; keeps divisions by a level finite.
+_ON_A_GRID, _TINY = 1e-3, 1e-300
 # Smoothing: one sample to either side for so many of the record, and never fewer than so many to either side.
 _SAMPLES_A_SIDE, _LEAST_SPAN = 1000, 3
 # Orders of the differences that show noise, into how many parts of how many samples at least a record is cut.
@@ -360,18 +362,19 @@ def without_outliers(x: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " sa
 
 
 def sample_noise(x: Float[np.ndarray, " samples"]) -> float:
-    """Standard deviation of the noise that samples do not share with their neighbours, and half the resolution.
+    """Standard deviation of the noise that samples do not share with their neighbours; at least that of rounding.
 
     Differences of the order that leaves least of the motion; the median over parts of the record, so that impacts and
-    outliers decide nothing.
+    outliers decide nothing. Steps of a sensor of resolution r have a standard deviation of r/sqrt(12).
     """
     levels = [np.inf]
     for order in _ORDERS:
         squares = np.diff(x, order) ** 2 / math.comb(2 * order, order)
         parts = np.array_split(squares, max(min(squares.size // _LEAST_PART, _PARTS), 1))
         levels.append(float(np.sqrt(np.median([np.mean(part) for part in parts]))) if squares.size else np.inf)
-    steps = np.diff(np.unique(x))
-    return float(np.hypot(min(levels), 0.5 * np.min(steps) if steps.size else 0.0))
+    rounding = float(np.finfo(float).eps * np.max(np.abs(x)))
+    seen = min(levels) if np.isfinite(min(levels)) else 0.0
+    return max(seen, resolution(x) / 12.0**0.5, rounding, _TINY)
 
 
 def _local_median(x: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
@@ -399,7 +402,33 @@ def start_state(record: Record, channel: str | None = None) -> tuple[float, floa
     Position and velocity.
     """
     x = without_outliers(record.measured if channel is None else record.channels[channel])
-    count = min(_SAMPLES, len(record.t))
-    t = record.t[:count] - record.t[0]
-    coefficients = np.polynomial.polynomial.polyfit(t, x[:count], min(2, count - 1))
-    return float(coefficients[0]), float(coefficients[1])
+    powers = _start_powers(record.t)
+    return tuple(np.linalg.lstsq(powers, x[: len(powers)])[0][:2].tolist())
+
+
+def start_errors(record: Record, channel: str) -> float:
+    """Standard error of the velocity of `start_state` over the noise of the channel [1/s].
+
+    Larger where the first samples lie off the parabola by more than the noise: they are too far apart for it.
+    """
+    x = without_outliers(record.channels[channel])
+    powers = _start_powers(record.t)
+    first = x[: len(powers)]
+    off = np.sqrt(np.mean((first - powers @ np.linalg.lstsq(powers, first)[0]) ** 2))
+    return float(np.linalg.norm(np.linalg.pinv(powers)[1])) * max(1.0, float(off) / sample_noise(x))
+
+
+def _start_powers(t: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "first powers"]:
+    """The parabola through the first samples, as a matrix: by time since the first one."""
+    count = min(_SAMPLES, len(t))
+    return np.vander(t[:count] - t[0], min(3, count), increasing=True)
+
+
+def resolution(x: Float[np.ndarray, " samples"]) -> float:
+    """Step of the values of a sensor, all of which are multiples of it apart; 0 where there is none."""
+    values = np.unique(x)
+    steps = np.diff(values)
+    if not steps.size:
+        return 0.0
+    step = float(np.median(steps[steps < 1.5 * np.min(steps)]))
+    return step if np.max(np.abs(steps / step - np.round(steps / step))) < _ON_A_GRID else 0.0

@@ -311,9 +311,9 @@ def _gradient(problem: FitProblem, x: Float[Array, " n"], drawn: Array) -> tuple
     """Mean loss of a sample of these runs, and its gradient by all of x."""
     shared, own = problem.split(x)
     some = eqx.tree_at(
-        lambda p: (p.base, p.runs),
+        lambda p: (p.base, p.runs, p.known),
         problem,
-        jtu.tree_map(lambda leaf: leaf[drawn], (problem.base, problem.runs)),
+        jtu.tree_map(lambda leaf: leaf[drawn], (problem.base, problem.runs, problem.known)),
         is_leaf=lambda leaf: leaf is None,
     )
     residual, jacobian = some.evaluate(jnp.concatenate([shared, jnp.reshape(own[drawn], (-1,))]))

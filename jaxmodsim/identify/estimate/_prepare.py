@@ -15,9 +15,9 @@ from ..._core.arguments import as_float, as_names, as_reals
 from ..._core.device import on_device
 from ..._core.parameters import Range, check_ranges, modules_of
 from ...scene import Scene, State, check_scene, scene_numbers, scene_ranges
-from ..data._record import Record, Windows, cut, runs_of, slip_channel, start_state
+from ..data._record import Record, Windows, cut, runs_of, slip_channel, start_errors, start_state
 from ..model._engines import DELAY, Controller, EventEngine, ReplayEngine
-from ..model._observe import Observable, by_channel, check_observables, first_coordinate
+from ..model._observe import Observable, by_channel, check_observables, coordinates_seen
 from ..model._parameters import FreeParameters, chosen_entries, split_entries, split_ranges
 from ._problem import AbstractLoss, FitProblem, Prior, local_names
 from ._search import SearchResult, channels_seen
@@ -28,6 +28,10 @@ _MAX_EVENTS = 1024
 _ATOL_SHARE = 1e-3
 # How many times more integration steps show what the step makes of the output.
 _FINER = 4
+
+# Standard errors by which the velocity at the start may differ from what the first samples show: so many that what they
+# say counts hardly twice, beside the fit to them.
+_DOUBT = 4.0
 
 # Coordinates or velocities at the first sample, shape `[dof]` or `[records, dof]`.
 StartState: TypeAlias = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]]
@@ -105,6 +109,7 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
     if settings.shooting is not None:
         shot = settings.shooting
         local = tuple(name for name in own if shot.jump is not None or not name.startswith("z0"))
+    unknown = _unknown(settings, observables, own, local)
     numbers, ranges = _numbers(scene, several, settings)
     single = split_entries(numbers)
     whole = scene_numbers(scene)
@@ -121,13 +126,15 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
     problem = FitProblem(
         engine,
         parameters,
-        local,
+        (*local, *unknown),
         base,
         runs_of(several, windows),
         noise,
         settings.loss,
         _prior(settings.prior, parameters.names),
         _jump(settings.shooting, windows, base),
+        len(unknown),
+        _shown_by_opening(several, observables, (*local, *unknown), unknown),
     )
     given = frozenset(name for record in several for name in record.noise)
     units = {name: allowed.unit for name, allowed in ranges.items()}
@@ -174,11 +181,10 @@ def _states(scene: Scene, records: tuple[Record, ...], settings: Settings) -> St
     sizes = {np.shape(x)[-1] for x in given.values() if x is not None and np.ndim(x) > 0}
     dof = max(sizes, default=1)
     observables = by_channel(settings.observe, records)
+    measured = [np.stack(each) for each in zip(*(measured_start(x, observables, dof) for x in records), strict=True)]
     starts = []
-    for name, value in given.items():
-        if value is None and name == "q0":
-            value = np.stack([measured_start(record, observables, dof, exact=True)[0] for record in records])
-        array = np.zeros(dof) if value is None else value
+    for value, seen in zip(given.values(), measured, strict=True):
+        array = seen if value is None else value
         fine = array.shape in ((dof,), (count, dof)) and np.isfinite(array).all()
         if not fine:
             raise ValueError(
@@ -196,6 +202,44 @@ def _states(scene: Scene, records: tuple[Record, ...], settings: Settings) -> St
 def initial_states(scene: Scene, q: Float[Array, "runs dof"], qd: Float[Array, "runs dof"]) -> State:
     """States with the effects at rest, with a leading axis of runs."""
     return jax.vmap(lambda q, qd: State(q, qd, scene.initial_state(q)))(q, qd)
+
+
+def _unknown(
+    settings: Settings, observables: tuple[tuple[str, Observable], ...], own: tuple[str, ...], local: tuple[str, ...]
+) -> tuple[str, ...]:
+    """Names of the coordinates and velocities at the first sample that a channel shows and no one gave."""
+    if settings.shooting is not None:
+        return ()
+    dof = sum(name.startswith("q0[") for name in own)
+    seen = set(coordinates_seen(observables, dof).values())
+    shown = {f"q0[{i}]": {f"q[{i}]"} for i in range(dof)} | {f"qd0[{i}]": {f"q[{i}]", f"qd[{i}]"} for i in range(dof)}
+    given = {"q0": settings.q0 is not None, "qd0": settings.qd0 is not None}
+    return tuple(
+        name for name, by in shown.items() if by & seen and name not in local and not given[name.partition("[")[0]]
+    )
+
+
+def _shown_by_opening(
+    records: tuple[Record, ...],
+    observables: tuple[tuple[str, Observable], ...],
+    local: tuple[str, ...],
+    unknown: tuple[str, ...],
+) -> dict[str, Array]:
+    """What the first samples of positions show of velocities that no one gave; see `FitProblem.known`.
+
+    A machine that stands still forgets its first velocity at once: nothing else would hold it in the search.
+    """
+    dof = 1 + max((int(name.split("[")[1][:-1]) for name in unknown), default=-1)
+    known = {}
+    for channel, seen in coordinates_seen(observables, dof).items():
+        name, weights = f"qd0[{seen.removeprefix('q[')}", np.zeros((len(records), len(local)))
+        if name in unknown:
+            weights[:, local.index(name)] = [
+                1 / (_DOUBT * start_errors(record, channel)) if channel in record.channels else 0.0
+                for record in records
+            ]
+        known[channel] = on_device(weights)
+    return known if unknown else {}
 
 
 def _first(states: State) -> State:
@@ -279,7 +323,7 @@ def _bases(
             qd.append(np.asarray(states.qd)[i])
             continue
         rest = records[i].samples(first, len(records[i].t))
-        start = measured_start(rest, observables, dof, exact=False)
+        start = measured_start(rest, observables, dof)
         q.append(start[0])
         qd.append(start[1])
     return initial_states(scene, *(on_device(np.stack(each)) for each in (q, qd)))
@@ -379,21 +423,16 @@ def step_error(search: SearchResult) -> float | None:
 
 
 def measured_start(
-    record: Record, observables: tuple[tuple[str, Observable], ...], dof: int, *, exact: bool
+    record: Record, observables: tuple[tuple[str, Observable], ...], dof: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates and velocities at the first sample, as far as they were measured; the others are zero.
-
-    With `exact` the position is the first sample and the velocity zero.
-    """
+    """Coordinates and velocities at the first sample, as far as they were measured; the others are zero."""
     q, qd = np.zeros(dof), np.zeros(dof)
-    for channel, observable in observables:
-        if channel not in record.channels:
-            continue
-        for i in range(dof):
-            if observable == f"q[{i}]" or (i == 0 and observable is first_coordinate):
-                q[i], qd[i] = (record.channels[channel][0], 0.0) if exact else start_state(record, channel)
-    for channel, observable in observables:
-        for i in range(dof):
-            if channel in record.channels and observable == f"qd[{i}]":
-                qd[i] = record.channels[channel][0]
+    # Velocities last: where one was measured, it is not the slope of a position.
+    for channel, name in sorted(coordinates_seen(observables, dof).items(), key=lambda each: each[1]):
+        i = int(name.split("[")[1][:-1])
+        if channel in record.channels and i < dof:
+            if name.startswith("qd"):
+                qd[i] = start_state(record, channel)[0]
+            else:
+                q[i], qd[i] = start_state(record, channel)
     return q, qd

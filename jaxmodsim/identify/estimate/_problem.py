@@ -25,6 +25,8 @@ else:
     from equinox import AbstractClassVar
 
 _Rows = TypeVar("_Rows", Array, np.ndarray)
+# Inverse standard deviation of a start that is held, in noise levels.
+_HELD = 1e6
 _LOCAL = re.compile(r"(q0|qd0)\[(\d+)\]|z0\.(.+?)(?:\[(\d+)\])?")
 
 
@@ -168,11 +170,15 @@ class FitProblem(eqx.Module):
     as differences from `base`.
 
     - `engine`: `engine(values, start, run)`, what the model sees.
-    - `free`: the parameters. `local`: names of the free numbers of each initial state.
+    - `free`: the parameters. `local`: names of the free numbers of each initial state; the last `nuisance` of them are
+      fitted because no one knows them, and not reported.
     - `base`: initial states, with a leading axis of runs; None where a model has none.
     - `runs`: the samples. `noise`: standard deviation of each channel.
     - `jump`: inverse standard deviation of the jump of each number of the state from one window to the next, 0 where
       windows do not go on; shape `[runs - 1, numbers]`; None where there are no windows.
+    - `known`: of the free numbers of the initial states, what the first samples of a channel show: inverse standard
+      deviation of their difference from `base` times the noise of that channel, 0 where nothing is known; by channel,
+      shape `[runs, local]`.
     """
 
     engine: Any
@@ -184,6 +190,31 @@ class FitProblem(eqx.Module):
     loss: AbstractLoss
     prior: Prior
     jump: Float[Array, "links numbers"] | None = None
+    nuisance: int = eqx.field(static=True, default=0)
+    known: dict[str, Float[Array, "runs local"]] = eqx.field(default_factory=dict)
+
+    @property
+    def start_weights(self) -> Float[Array, "runs local"] | None:
+        """Inverse standard deviations of the free numbers of the initial states; None where nothing is known."""
+        weights = [each / self.noise[name] for name, each in self.known.items()]
+        return jnp.sum(jnp.stack(weights), axis=0) if weights else None
+
+    @property
+    def held(self) -> "FitProblem":
+        """The problem whose unasked starts stay at `base`: arrays alone differ, so nothing compiles again.
+
+        A search far from the optimum would else let them take up what the parameters still have wrong.
+        """
+        if not self.nuisance:
+            return self
+        unasked = jnp.arange(len(self.local)) >= self.reported
+        known = {name: jnp.where(unasked[None, :], _HELD, each) for name, each in self.known.items()}
+        return eqx.tree_at(lambda p: p.known, self, known)
+
+    @property
+    def reported(self) -> int:
+        """Number of the first entries of `local` that were asked for."""
+        return len(self.local) - self.nuisance
 
     @property
     def count(self) -> int:
@@ -256,7 +287,7 @@ class FitProblem(eqx.Module):
         return self._weigh(seen, run), ravel_pytree(start)[0], ravel_pytree(seen.end)[0]
 
     def evaluate(self, x: Float[Array, " n"]) -> tuple[Float[Array, " rows"], Float[Array, "rows n"]]:
-        """Residual and Jacobian: of all samples, of the links between windows, of what was known before.
+        """Residual and Jacobian: of all samples, of what was known before, of the links between windows, of the starts.
 
         All columns of a run go side by side in one forward sweep, which keeps nothing of its steps.
         """
@@ -280,6 +311,10 @@ class FitProblem(eqx.Module):
             here = self._spread(self.jump[:, :, None] * slope[2][:-1])
             there = self._spread(self.jump[:, :, None] * slope[1][1:], first=1)
             columns.append(here - there)
+        known = self.start_weights
+        if known is not None:
+            rows.append(jnp.reshape(known * own, (-1,)))
+            columns.append(jnp.pad(jnp.diag(jnp.reshape(known, (-1,))), ((0, 0), (shared.shape[0], 0))))
         return jnp.concatenate(rows), jnp.concatenate(columns)
 
     def _spread(self, slope: Float[Array, "some m k"], first: int = 0) -> Float[Array, "rows n"]:
@@ -329,7 +364,8 @@ class FitProblem(eqx.Module):
     def rows(self) -> int:
         """Number of all rows of the residual."""
         links = 0 if self.jump is None else self.jump.size
-        return self.samples + len(self.free.names) + links
+        starts = self.count * len(self.local) if self.known else 0
+        return self.samples + len(self.free.names) + links + starts
 
     @property
     def weights(self) -> Float[np.ndarray, " samples"]:

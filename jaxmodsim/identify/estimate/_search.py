@@ -1,7 +1,7 @@
 """Levenberg-Marquardt within a box, one visible iteration after the other, alone or many side by side."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -189,7 +189,9 @@ def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
     counted = int(np.sum(problem.weights > 0)) + int(np.sum(np.asarray(problem.prior.weight) > 0))
     unknown = x.shape[0]
     if counted <= unknown:
-        raise ValueError(f"{counted} samples are too few for {unknown} free parameters.")
+        raise ValueError(
+            f"{counted} samples are too few for {unknown} unknowns: free parameters, and starts that are not given."
+        )
     rtol = on_device(np.asarray(options.rtol, x.dtype))
     state, best, rounds = start_search(x, problem.rows), None, 0
     at = f"after {_ROUND} iterations each"
@@ -251,6 +253,17 @@ def _rms(problem: FitProblem, state: SearchState) -> float:
     return rms * float(next(iter(problem.noise.values()))) if len(problem.noise) == 1 else rms
 
 
+def solve_freed(
+    problem: FitProblem, x: Float[Array, " n"], options: SearchOptions, given: frozenset[str]
+) -> SearchResult:
+    """`solve_with_noise`, after a search in which starts that no one asked for are held where they were measured."""
+    first = solve(problem.held, x, options) if problem.nuisance else None
+    if first is None or not first.converged:
+        return first or solve_with_noise(problem, x, options, given)
+    search = solve_with_noise(problem, first.state.x, options, given)
+    return replace(search, iterations=first.iterations + search.iterations)
+
+
 def solve_with_noise(
     problem: FitProblem, x: Float[Array, " n"], options: SearchOptions, given: frozenset[str]
 ) -> SearchResult:
@@ -302,7 +315,11 @@ def _rescaled(search: SearchResult, problem: FitProblem) -> SearchResult:
     ratio = {name: np.asarray(level) / np.asarray(problem.noise[name]) for name, level in old.noise.items()}
     factors = [np.full(weight.shape, ratio[name]) for name, weight in old.columns.items()]
     factor = np.concatenate(factors, axis=1).reshape(-1)
-    factor = np.concatenate([factor, np.ones(old.rows - old.samples, factor.dtype)])
+    rest = np.ones(old.rows - old.samples, factor.dtype)
+    before, now = old.start_weights, problem.start_weights
+    if before is not None and now is not None and before.size:
+        rest[-before.size :] = np.reshape(np.asarray(now) / np.where(before > 0, before, 1.0), -1)
+    factor = np.concatenate([factor, rest])
     residual = on_device(np.asarray(search.state.residual) * factor)
     jacobian = on_device(np.asarray(search.state.jacobian) * factor[:, None])
     state = search.state._replace(residual=residual, jacobian=jacobian, cost=cost_of(old.loss, residual))

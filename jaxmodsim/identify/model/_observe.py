@@ -152,7 +152,9 @@ def _recognised(observable: Callable[[Array, Array], Array], dof: int) -> str:
     matches = {f"{x}[{i}]" for x in ("q", "qd") for i in range(dof)}
     for a, b in _PROBES:
         q, qd = a + 0.11 * np.arange(dof), b - 0.17 * np.arange(dof)
-        got = float(observable(jnp.asarray(q), jnp.asarray(qd)))
+        got = np.asarray(observable(jnp.asarray(q), jnp.asarray(qd)))
+        if got.shape != ():
+            return ""
         states = {f"q[{i}]": x for i, x in enumerate(q)} | {f"qd[{i}]": x for i, x in enumerate(qd)}
         matches = {name for name in matches if np.isclose(got, states[name], rtol=1e-5, atol=0.0)}
     return next(iter(matches), "")

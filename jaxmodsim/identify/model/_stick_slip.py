@@ -19,11 +19,11 @@ _MOST, _NEWTON = 256, 8
 _constant = jax.lax.stop_gradient
 
 
-class _Passage(NamedTuple):
+class _PartialStep(NamedTuple):
     """A step on its way: what lies behind `t`, what is `left` of it [s], and the trial that goes on from there.
 
     - `lower`, `upper`, `trial`: lengths [s]; the next change of mode is between the first two if `upper < left`.
-    - `count`: of the trials of this step.
+    - `trials`: their number in this step so far.
     """
 
     t: Float[Array, ""]
@@ -33,7 +33,7 @@ class _Passage(NamedTuple):
     lower: Float[Array, ""]
     upper: Float[Array, ""]
     trial: Float[Array, ""]
-    count: Int[Array, ""]
+    trials: Int[Array, ""]
 
 
 # A step evaluates them several times; as functions of their own they are traced and linearised once.
@@ -82,10 +82,10 @@ def pass_modes(
     """
     landed, rest = _LANDED * dt, jnp.asarray(_REST, y.q.dtype)
 
-    def go_on(at: _Passage) -> Bool[Array, ""]:
-        return (at.left > 0) & (at.count < _MOST)
+    def go_on(at: _PartialStep) -> Bool[Array, ""]:
+        return (at.left > 0) & (at.trials < _MOST)
 
-    def attempt(at: _Passage) -> _Passage:
+    def attempt(at: _PartialStep) -> _PartialStep:
         def field(t: Array, y: State) -> State:
             return _field(t, y, scene_at(t), at.mode)
 
@@ -115,17 +115,17 @@ def pass_modes(
         lower, upper = jnp.where(over, at.lower, length), jnp.where(over, length, at.upper)
         ahead = jnp.where(falls < 0, length + away, jnp.inf)
         newton = jnp.min(jnp.where(missed | ~over, ahead, jnp.inf))
-        inside = (newton > lower) & (newton < upper) & ((at.count < _NEWTON) | (at.count % 2 == 0))
+        inside = (newton > lower) & (newton < upper) & ((at.trials < _NEWTON) | (at.trials % 2 == 0))
         trial = jnp.where(inside, newton, 0.5 * (lower + upper))
         retry = at._replace(lower=lower, upper=upper, trial=trial)
-        onward = _Passage(
-            t_there, left, after, jnp.where(lands, mode, at.mode), jnp.zeros_like(dt), left, left, at.count
+        onward = _PartialStep(
+            t_there, left, after, jnp.where(lands, mode, at.mode), jnp.zeros_like(dt), left, left, at.trials
         )
         moved = jtu.tree_map(lambda a, b: jnp.where(passes, a, b), onward, retry)
         lengths = {name: _constant(getattr(moved, name)) for name in ("lower", "upper", "trial")}
-        return moved._replace(**lengths, count=at.count + 1)
+        return moved._replace(**lengths, trials=at.trials + 1)
 
-    begin = _Passage(t, dt, y, mode, jnp.zeros_like(dt), dt, dt, jnp.zeros((), int))
+    begin = _PartialStep(t, dt, y, mode, jnp.zeros_like(dt), dt, dt, jnp.zeros((), int))
     end = jax.lax.while_loop(go_on, attempt, begin)
     stuck = end.left > 0
     return jtu.tree_map(lambda x: jnp.where(stuck, jnp.nan, x), end.y), end.mode

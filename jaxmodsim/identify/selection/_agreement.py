@@ -1,6 +1,7 @@
 """Whether records agree: each fitted by itself, parameter by parameter; what is common, what varies, by how much."""
 
 import dataclasses
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import jax
@@ -18,6 +19,8 @@ from ..uncertainty._result import FitResult
 from ._memory import blocks_that_are_independent
 from ._opening import pinned
 
+# Standard error against the scale of a parameter from which on a record by itself does not determine it.
+_DETERMINED = 0.1
 # Least eigenvalue of a correlation matrix of estimates against the largest one.
 _LEAST = 1e-10
 
@@ -30,7 +33,8 @@ class RecordAgreement:
 
     - `records`, `names`: of the records and of the parameters.
     - `values`, `errors`: of each parameter in a fit to each record alone, and its standard error (residuals correlated
-      in time allowed for), shape `[records, parameters]`.
+      in time allowed for), shape `[records, parameters]`. Parameters that some record alone does not determine to a
+      tenth stay at the value of the fit to all: free, they would hide differences of the others.
     - `p`: probability that values which are the same come out at least as different, shape `[parameters]`; NaN of a
       parameter that some record does not determine or that ends at a limit.
     - `level`: probability with which any parameter at all is said to differ where none does.
@@ -91,6 +95,8 @@ class RecordAgreement:
         ]
         if others:
             lines.append(f"They do not show a difference in {', '.join(others)}.")
+        if held := [name for name, p in zip(self.names, self.p, strict=True) if not np.isfinite(p)]:
+            lines.append(f"Not every record determines {', '.join(held)}: not compared.")
         width = max(len(name) for name in self.names)
         lines.append(
             f"{'':{width}}  {'common':>12}  {'std. error':>10}  {'between':>10}  {'95 % interval':>21}  {'p':>7}"
@@ -139,23 +145,22 @@ def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 400) -
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1, but it is {level!r}.")
     shared, own = problem.split(result.search.state.x)
-    fits = []
-    for i, record in enumerate(records):
-        base, runs = jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], (problem.base, problem.runs))
-        alone = dataclasses.replace(problem, base=base, runs=runs)
-        search = _search_alone(alone, jnp.concatenate([shared, own[i]]), result, SearchOptions(max_steps=max_steps))
-        if not bool(jnp.isfinite(search.state.cost)):
-            raise RuntimeError(f"The fit to {record} alone ended with values that are not finite.")
-        blocks = blocks_that_are_independent(search)
-        covariance = covariance_of(alone, search.state, len(problem.free.names), blocks).covariance
-        value = alone.at(search.state.x).vector
-        limits = problem.free.limits(search.state.x[: len(problem.free.names)])
-        at_limit = [x in limits[name] for name, x in zip(problem.free.names, value.tolist(), strict=True)]
-        covariance[np.diag_indices(len(value))] = np.where(at_limit, np.nan, np.diag(covariance))
-        fits.append((value, covariance, blocks - 1))
-    values, own, known_by = (np.stack(each) for each in zip(*fits, strict=True))
-    variances = np.diagonal(own, axis1=1, axis2=2)
-    known = np.all(np.isfinite(variances) & (variances > 0), axis=0)
+    options = SearchOptions(max_steps=max_steps)
+
+    def alone(tested: Collection[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        fits = [
+            _alone(problem, i, jnp.concatenate([shared, own[i]]), result, tested, options) for i in range(len(records))
+        ]
+        values, covariances, freedoms = (np.stack(each) for each in zip(*fits, strict=True))
+        return values, covariances, freedoms
+
+    names = problem.free.names
+    values, own_errors, known_by = alone(names)
+    tested = _determined(own_errors, np.array([result.estimate.scale(name) for name in names]))
+    if tested.any() and not tested.all():
+        values, own_errors, known_by = alone([name for name, each in zip(names, tested, strict=True) if each])
+    variances = np.diagonal(own_errors, axis1=1, axis2=2)
+    known = tested & np.all(np.isfinite(variances) & (variances > 0), axis=0)
     freedom = len(records) - 1
     quantiles = (float(freedom), *chi2.ppf([0.975, 0.025], freedom).tolist())
     found = np.full((6, len(problem.free.names)), np.nan)
@@ -176,19 +181,63 @@ def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 400) -
         common_errors=found[1],
         between=found[2],
         between_interval=found[3:5].T,
-        covariance=_covariance_between(values, own, known),
+        covariance=_covariance_between(values, own_errors, known),
     )
 
 
+def _alone(
+    together: FitProblem,
+    i: int,
+    x: Float[Array, " n"],
+    result: FitResult,
+    tested: Collection[str],
+    options: SearchOptions,
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Parameters of a fit to one record with only those in `tested` free, their covariance, its degrees of freedom."""
+    names, record = together.free.names, result.provenance.records[i].name
+    base, runs, known = jax.tree.map(lambda leaf: leaf[i : i + 1], (together.base, together.runs, together.known))
+    problem = dataclasses.replace(together, base=base, runs=runs, known=known)
+    problem = problem if len(tested) == len(names) else pinned(problem, x, result, tested)
+    search = _search_alone(problem, x, result, tested, options)
+    if not bool(jnp.isfinite(search.state.cost)):
+        raise RuntimeError(f"The fit to {record} alone ended with values that are not finite.")
+    blocks = blocks_that_are_independent(search)
+    covariance = covariance_of(problem, search.state, range(len(names)), blocks).covariance
+    value = problem.at(search.state.x).vector
+    limits = problem.free.limits(search.state.x[: len(names)])
+    out = [x in limits[name] or name not in tested for name, x in zip(names, value.tolist(), strict=True)]
+    covariance[np.diag_indices(len(value))] = np.where(out, np.nan, np.diag(covariance))
+    return value, covariance, blocks - 1
+
+
+def _determined(
+    covariances: Float[np.ndarray, "records free free"], scale: Float[np.ndarray, " free"]
+) -> Bool[np.ndarray, " free"]:
+    """Parameters that each record determines once the least known ones are given, which go one by one."""
+    kept = np.all(np.isfinite(np.diagonal(covariances, axis1=1, axis2=2)), axis=0)
+    covariances = np.where(kept[:, None] & kept[None, :], covariances, 0.0)
+    while kept.any():
+        error = np.sqrt(np.maximum(np.max(np.diagonal(covariances, axis1=1, axis2=2), axis=0), 0.0)) / np.where(
+            scale > 0, scale, 1.0
+        )
+        worst = int(np.argmax(np.where(kept, error, -1.0)))
+        if error[worst] <= _DETERMINED:
+            break
+        kept[worst] = False
+        column = covariances[:, :, worst]
+        covariances = covariances - column[:, :, None] * column[:, None, :] / column[:, worst, None, None]
+    return kept
+
+
 def _search_alone(
-    problem: FitProblem, x: Float[Array, " n"], result: FitResult, options: SearchOptions
+    problem: FitProblem, x: Float[Array, " n"], result: FitResult, tested: Collection[str], options: SearchOptions
 ) -> SearchResult:
     """From where the fit to all ended, and from there with the friction level of this record: the better of both.
 
     What fits several records whose levels differ has other parameters wrong, too, and lies in a valley of its own.
     """
     direct = solve(problem, x, options)
-    levels = friction_levels(result)
+    levels = [name for name in friction_levels(result) if name in tested]
     if not levels:
         return direct
     level = solve(pinned(problem, x, result, levels), x, options).state.x

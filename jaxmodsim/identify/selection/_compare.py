@@ -121,10 +121,11 @@ def compare(
 
     Each record is cut into `folds` windows. In turn one window of each record is held back: the model is fitted to the
     others, every window from a start state (q0, qd0) of its own, then run over the window that was held back with these
-    parameters. Its start is fitted to its first samples, a twentieth and at least 20, but no more than half of them,
-    and the others are judged. The error with a start that is fitted to all of them stands beside it and judges nothing.
-    The states of friction laws where a window begins are those of the fit to whole records. With `hold_out` the model
-    is fitted to `records`, and run over the whole of each of those in the same way.
+    parameters. Its start is fitted to its first samples: 20, or as many more as show the velocity to 1 % of the speed
+    of the record, a twentieth of them at most. The others are judged. The error with a start that is fitted to all of
+    them stands beside it and judges nothing. The states of friction laws where a window begins are those of the fit to
+    whole records. With `hold_out` the model is fitted to `records`, and run over the whole of each of those in the same
+    way.
 
     Models are fitted in the order of their numbers of parameters, each also from where the largest one before it ended
     whose parameters, by the last part of their names, it has all: what is part of it should not fit better.
@@ -470,7 +471,7 @@ def _measured_starts(search: SearchResult, asked: _Asked) -> State:
     observables = by_channel(asked.observe, asked.hold_out)
     q, qd = [], []
     for record in asked.hold_out:
-        start = measured_start(record, observables, base.q.shape[1], exact=False)
+        start = measured_start(record, observables, base.q.shape[1])
         # What was not measured comes as zero.
         q.append(np.where(start[0] != 0, start[0], base.q[0]))
         qd.append(np.where(start[1] != 0, start[1], base.qd[0]))

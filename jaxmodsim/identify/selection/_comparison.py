@@ -436,6 +436,6 @@ def _undetermined(result: FitResult) -> tuple[str, ...]:
     def free_of_doubt(name: str, value: float) -> bool:
         start = abs(estimate.start[name])
         ran = start > 0 and abs(value) > _FAR * start
-        return not ran and (value in estimate.bounds[name] or errors[name] <= _SHARE * abs(value))
+        return not ran and (value in estimate.bounds[name] or errors[name] <= _SHARE * estimate.scale(name))
 
     return tuple(name for name, value in estimate.values.items() if not free_of_doubt(name, value))

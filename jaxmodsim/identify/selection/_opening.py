@@ -7,13 +7,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._core.device import on_device
-from ..data._record import Record, Runs
+from ..data._record import Record, Runs, sample_noise
 from ..estimate._problem import FitProblem, Prior
 from ..estimate._search import SearchOptions, SearchResult, SearchState, solve, start_search, step
 from ..uncertainty._result import FitResult
 
-# So many of the samples, and at least so many but no more than half of them, show the state at the first one.
-SHARE, LEAST = 0.05, 20
+# So many samples show the state at the first one, or as many more as give its velocity with an error of so much of the
+# record's; but no more than this share of them (or the first number), and no more than half.
+LEAST, _ERROR, _MOST = 20, 0.01, 0.05
+# Standard error of the slope at the start of a parabola through n samples: so many noise levels over n^1.5 intervals.
+_SLOPE = 192.0**0.5
 
 
 def sample_counts(runs: Runs) -> Int[np.ndarray, "runs 1"]:
@@ -22,9 +25,20 @@ def sample_counts(runs: Runs) -> Int[np.ndarray, "runs 1"]:
 
 
 def opening(runs: Runs) -> Bool[np.ndarray, "runs samples"]:
-    """The first samples of each run."""
+    """The first samples of each run: as few as show where it starts.
+
+    What a fitted start takes up of an error of the model grows with the number of samples that it is fitted to.
+    """
     count = sample_counts(runs)
-    return np.arange(runs.t.shape[1]) < np.minimum(np.maximum(np.ceil(SHARE * count), LEAST), count // 2)
+    needed = np.full(count.shape, np.inf)
+    for x in runs.measured.values():
+        far = np.asarray(x)[:, LEAST:] - np.asarray(x)[:, :-LEAST]
+        speed = np.sqrt(np.mean(far**2, axis=1, keepdims=True)) / LEAST if far.size else np.zeros(count.shape)
+        noise = np.array([[sample_noise(row)] for row in np.asarray(x)])
+        own = (_SLOPE * noise / np.maximum(_ERROR * speed, np.finfo(float).tiny)) ** (2 / 3)
+        needed = np.minimum(needed, np.where(speed > 0, own, np.inf))
+    most = np.maximum(np.ceil(_MOST * count), LEAST)
+    return np.arange(runs.t.shape[1]) < np.minimum(np.clip(np.ceil(needed), LEAST, most), count // 2)
 
 
 def check_lengths(records: Iterable[Record], numbers: int) -> None:

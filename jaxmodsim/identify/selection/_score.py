@@ -35,6 +35,7 @@ class Score:
     - `fit`: `100 (1 - rmse/standard deviation of the channel)` [%], by channel: 100 is perfect, 0 no better than the
       mean.
     - `q0`, `qd0`: coordinates and velocities at the first sample, shape `[dof]`; None for a law by itself.
+    - `opening`: number of the first samples, which showed the start; 0 where it was given.
     - `start_fitted`: the same samples with a start that is fitted to all of the record; None for a law by itself.
     """
 
@@ -44,6 +45,7 @@ class Score:
     fit: dict[str, float]
     q0: Float[np.ndarray, " dof"] | None
     qd0: Float[np.ndarray, " dof"] | None
+    opening: int = 0
     start_fitted: "StartFitted | None" = None
 
     @property
@@ -53,7 +55,7 @@ class Score:
 
     def __str__(self) -> str:
         """A line for each channel."""
-        lines = [f"{self.record.name}:"]
+        lines = [f"{self.record.name}{f', started from its first {self.opening} samples' if self.opening else ''}:"]
         lines += [f"  {name}: RMSE {x:.6g}, fit {self.fit[name]:.2f} %" for name, x in self.rmse.items()]
         if self.start_fitted is not None:
             lines += [
@@ -92,9 +94,9 @@ class StartFitted:
 def score(result: FitResult, record: Record, *, q0: _Start = None, qd0: _Start = None) -> Score:
     """Run a fitted model on another record, to which nothing is fitted but where it starts.
 
-    The start is fitted to the first samples alone, a twentieth and at least 20, but no more than half of them, which do
-    not count after that. Beside the error stands the one with a start fitted to all samples: smaller, as it takes up a
-    part of what the model does wrong.
+    The start is fitted to the first samples alone: 20, or as many more as show the velocity to 1 % of the speed of the
+    record, a twentieth of them at most. They do not count after that. Beside the error stands the one with a start
+    fitted to all samples: smaller, as it takes up a part of what the model does wrong.
 
     **Arguments:**
 
@@ -138,7 +140,7 @@ def score(result: FitResult, record: Record, *, q0: _Start = None, qd0: _Start =
     assert start.q0 is not None
     assert start.qd0 is not None
     fitted = StartFitted(rmse=start.rmse, q0=start.q0, qd0=start.qd0, away=away, ending=best.ending)
-    return dataclasses.replace(found, start_fitted=fitted)
+    return dataclasses.replace(found, opening=int(np.sum(~counts)), start_fitted=fitted)
 
 
 def _errors(jacobian: Float[np.ndarray, "rows local"]) -> Float[np.ndarray, " local"]:
@@ -184,7 +186,7 @@ def record_problem(result: FitResult, record: Record, given: tuple[_Start, _Star
     if isinstance(engine, EventEngine):
         engine = dataclasses.replace(engine, slips=())
     dof = first.q.shape[-1]
-    guessed = measured_start(record, observables, dof, exact=False)
+    guessed = measured_start(record, observables, dof)
     start = [_given(x, guess, dof, name) for x, guess, name in zip(given, guessed, ("q0", "qd0"), strict=True)]
     q, qd = (jnp.asarray(x, float)[None] for x in start)
     z = scene.initial_state(q[0])

@@ -32,7 +32,7 @@ def covariances(result: FitResult, variation: float, agreement: RecordAgreement 
     search = search_of(result, "A prediction")
     names, count = search.problem.free.names, len(result.provenance.records)
     blocks = blocks_that_are_independent(search)
-    own = covariance_of(search.problem, search.state, len(names), blocks).covariance
+    own = covariance_of(search.problem, search.state, range(len(names)), blocks).covariance
     known = np.isfinite(np.diag(own))
     own = np.where(np.outer(known, known), own, 0.0)
     level = np.array([result.values[name] * (name in friction_levels(result)) for name in names])

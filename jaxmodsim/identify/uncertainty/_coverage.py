@@ -80,8 +80,8 @@ def coverage(
     if result.search is None:
         raise ValueError("coverage fits again, which a result loaded from a file cannot: fit, then ask it.")
     problem = result.search.problem
-    if len(problem.noise) > 1 or problem.local:
-        raise ValueError("coverage knows one channel, and initial states that are given.")
+    if len(problem.noise) > 1:
+        raise ValueError("coverage knows one channel; the fit has several.")
     if repeats < 2 or not 0 <= memory < 1:
         raise ValueError(f"repeats must be >= 2 and memory in [0, 1), but they are {repeats} and {memory}.")
     name = next(iter(problem.noise))
@@ -98,8 +98,11 @@ def coverage(
     starts = []
     for measured in truth + noise:
         one = eqx.tree_at(lambda p: p.runs.measured[name], problem, jnp.asarray(measured))
-        starts.append(run_initializers(initializer, one, options)[0])
-    state = side_by_side(several, axes, starts_of(problem, jnp.stack(starts)), options, steps)
+        starts.append(run_initializers(initializer, one.held, options)[0])
+    x = jnp.stack(starts)
+    if problem.nuisance:
+        x = side_by_side(several.held, axes, starts_of(problem, x), options, steps).x
+    state = side_by_side(several, axes, starts_of(problem, x), options, steps)
     values, errors = _estimates(several, axes, state)
     names, estimate = problem.free.names, result.estimate
     shares = {}
@@ -133,5 +136,5 @@ def _estimates(problem: FitProblem, axes: FitProblem, state: SearchState) -> tup
     for i in range(state.x.shape[0]):
         one, here = problem_at(problem, axes, i), jtu.tree_map(lambda x, i=i: x[i], states)
         values.append(problem.at(here.x).vector)
-        errors.append(np.sqrt(np.diagonal(covariance_of(one, here, len(problem.free.names)).covariance)))
+        errors.append(np.sqrt(np.diagonal(covariance_of(one, here, range(len(problem.free.names))).covariance)))
     return np.stack(values), np.stack(errors)

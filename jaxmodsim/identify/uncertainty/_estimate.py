@@ -1,7 +1,8 @@
 """Estimates with their covariance, from residuals that may be correlated in time, of any size, of a model that errs."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,8 +17,8 @@ from ..estimate._search import SearchState, by_channel, start_search, step, weig
 from ..model._observe import RecordedMotion, motion_of
 
 # Blocks of samples: enough for the scatter of the scores of a dozen parameters, and each far longer than what the
-# residual of a mechanism is correlated over.
-BLOCKS = 32
+# residual of a mechanism is correlated over, which steps of a sensor in slow motion make long.
+BLOCKS = 16
 
 # Smallest eigenvalue of a scaled normal matrix against the largest one, in units of rounding.
 ROUNDING = 10.0
@@ -26,12 +27,16 @@ ROUNDING = 10.0
 # residual to be judged by.
 _ALONE = 1e-6
 
+# An offset counts beyond so many standard errors; share of a constant that is nothing once the parameters have moved.
+_BEYOND, _NO_PART = 4.0, 1e-8
+
 # Lags of tests for whiteness: a decade of samples, and at most one for so many samples. Probability below which
 # residuals do not pass for white, and what keeps divisions by what may vanish finite.
 _LAGS_A_DECADE, _SAMPLES_A_LAG = 10, 5
 _CHANCE, _TINY = 0.01, 1e-30
 
-# Derivatives are tried over this share of a standard error; they hold if they miss no more than this share of the change.
+# Derivatives are tried over this share of a standard error; they hold if they miss no more than this share of the
+# change.
 _TRIED, _HOLDS = 0.1, 0.5
 
 
@@ -46,6 +51,8 @@ class ParameterEstimate:
     - `information`: Fisher information of the parameters, shape `[free, free]`, the noise at its level.
     - `logarithmic`: names of the parameters that must be positive; their intervals are symmetric in the logarithm.
     - `bounds`: lower and upper limit of each parameter at the estimate.
+    - `natural`: of a parameter that may have either sign, the change with which the model's output moves by as much as
+      the measured samples scatter (of a constant force: the forces in the record); 0 of the others.
     """
 
     values: dict[str, float]
@@ -56,6 +63,11 @@ class ParameterEstimate:
     information: Float[np.ndarray, "free free"]
     logarithmic: tuple[str, ...]
     bounds: dict[str, tuple[float, float]]
+    natural: dict[str, float] = field(default_factory=dict)
+
+    def scale(self, name: str) -> float:
+        """What a standard error is small or large against: the value; of either sign at least its natural scale."""
+        return max(abs(self.values[name]), self.natural.get(name, 0.0))
 
     @property
     def errors(self) -> dict[str, float]:
@@ -157,7 +169,7 @@ class CovarianceEstimate(NamedTuple):
 
     - `covariance`: of the parameters, correlation of the residual in time taken into account.
     - `white`: what it would be if the residual were white noise.
-    - `information`: Fisher information of the samples, in noise levels, and of the prior.
+    - `information`: Fisher information of the samples, in noise levels, and of the prior, the other numbers unknown.
     - `refused`: whether the derivatives do not hold, see `derivatives_hold`; then the variances are infinite.
     """
 
@@ -247,7 +259,9 @@ def covariance_estimate(
         return covariance
 
     back = np.linalg.pinv(slopes[:kept, :kept])
-    information = back.T @ matrix[:kept, :kept] @ back
+    cross = (matrix / size)[:kept, kept:]
+    known = (matrix / size)[:kept, :kept] - cross @ floored_inverse((matrix / size)[kept:, kept:], rounding) @ cross.T
+    information = back.T @ (known * size[:kept, :kept]) @ back
     return CovarianceEstimate(of_parameters(bread @ meat @ bread), of_parameters(bread @ if_white @ bread), information)
 
 
@@ -275,6 +289,8 @@ def floored_inverse(matrix: Float[np.ndarray, "n n"], least: float) -> Float[np.
     - `matrix`: symmetric, its diagonal one, shape `[n, n]`.
     - `least`: smallest eigenvalue, as a share of the largest one.
     """
+    if not matrix.size:
+        return matrix
     values, vectors = np.linalg.eigh(matrix)
     return vectors / np.maximum(values, least * max(values[-1], 1.0)) @ vectors.T
 
@@ -319,14 +335,16 @@ def interval(
     return max(value - margin, low), min(value + margin, high)
 
 
-def covariance_of(problem: FitProblem, state: SearchState, kept: int, blocks: int = BLOCKS) -> CovarianceEstimate:
-    """How sure the estimate is; the first `kept` entries of x are parameters, the others nuisance.
+def covariance_of(
+    problem: FitProblem, state: SearchState, kept: Sequence[int], blocks: int = BLOCKS
+) -> CovarianceEstimate:
+    """How sure the estimate is; the entries `kept` of x are parameters, the others nuisance.
 
     Without JAX: its many small matrices take seconds to compile.
     """
     if not derivatives_hold(problem, state):
-        unknown = np.diag(np.full(kept, np.inf))
-        return CovarianceEstimate(unknown, unknown, np.zeros((kept, kept)), refused=True)
+        unknown, none = np.diag(np.full(len(kept), np.inf)), np.zeros((len(kept), len(kept)))
+        return CovarianceEstimate(unknown, unknown, none, refused=True)
     numbers, count = sample_blocks(problem, blocks)
     rows, size = problem.samples, len(problem.free.names)
     residual, jacobian = (each[:rows] for each in weighted_by(problem.loss, state))
@@ -334,7 +352,74 @@ def covariance_of(problem: FitProblem, state: SearchState, kept: int, blocks: in
     slopes[:size, :size] = problem.at(state.x).slopes
     white = _passes_for_white(problem, residual)
     extra = np.asarray(state.jacobian)[rows:]
-    return covariance_estimate(residual, jacobian, extra, slopes, numbers, count, kept, white)
+    order = np.array([*kept, *(k for k in range(slopes.shape[0]) if k not in set(kept))])
+    jacobian, extra, slopes = jacobian[:, order], extra[:, order], slopes[np.ix_(order, order)]
+    return covariance_estimate(residual, jacobian, extra, slopes, numbers, count, len(kept), white)
+
+
+def natural_scales(problem: FitProblem, state: SearchState, kept: Sequence[int]) -> Float[np.ndarray, " kept"]:
+    """Changes of parameters with which the output moves by as much as the samples scatter; 0 of those without effect.
+
+    **Arguments:**
+
+    - `kept`: entries of x whose parameters are meant.
+    """
+    size = len(problem.free.names)
+    slopes = np.diag(problem.at(state.x).slopes)
+    jacobian = np.asarray(state.jacobian, float)[: problem.samples]
+    scatter = []
+    for name, weight in problem.runs.weight.items():
+        x = np.asarray(problem.runs.measured[name])[np.asarray(weight) > 0]
+        scatter.append(x.size * (np.std(x) / float(problem.noise[name])) ** 2 if x.size else 0.0)
+    moved = np.linalg.norm(jacobian[:, list(kept)], axis=0)
+    moved = moved / np.array([abs(slopes[k]) if k < size else 1.0 for k in kept])
+    return np.where(moved > 0, np.sqrt(sum(scatter)) / np.where(moved > 0, moved, 1.0), 0.0)
+
+
+def offsets_left(
+    problem: FitProblem, state: SearchState, kept: Sequence[int], errors: Float[np.ndarray, " kept"]
+) -> dict[str, tuple[float, float]]:
+    """Constants by which channels seem to read too high, with standard errors, in the units of the channels.
+
+    One Gauss-Newton step with the offset as one more parameter. Only offsets that are far beyond their error, and with
+    which a parameter moves by more than its own; none of a channel whose offset the start takes up.
+
+    **Arguments:**
+
+    - `kept`: entries of x whose parameters count. `errors`: their standard errors.
+    """
+    if problem.loss.robust:
+        return {}
+    rows, x = problem.samples, np.asarray(state.x)
+    residual, jacobian = np.asarray(state.residual, float), np.asarray(state.jacobian, float)
+    size = np.linalg.norm(jacobian, axis=0)
+    scaled = jacobian / np.where(size > 0, size, 1.0)
+    numbers, count = sample_blocks(problem)
+    found = {}
+    for channel in problem.runs.weight:
+        column = np.concatenate([np.asarray(w) * (name == channel) for name, w in problem.columns.items()], axis=1)
+        column = np.concatenate([column.reshape(-1), np.zeros(problem.rows - rows)])
+        taken = np.linalg.lstsq(scaled, column, rcond=_NO_PART)[0]
+        rest = column - scaled @ taken
+        if np.sum(rest**2) <= _NO_PART * np.sum(column**2):
+            continue
+        wide = np.column_stack([column, scaled])
+        step = -np.linalg.lstsq(wide, residual, rcond=_NO_PART)[0]
+        offset, left = float(step[0]), residual + wide @ step
+        variance = covariance_estimate(
+            left[:rows], wide[:rows], wide[rows:], np.eye(wide.shape[1]), numbers, count, 1, False
+        ).covariance[0, 0]
+        slopes = np.eye(len(x))
+        slopes[: len(problem.free.names), : len(problem.free.names)] = problem.at(x).slopes
+        moved = slopes @ (offset * taken / np.where(size > 0, size, 1.0))
+        far = np.abs(moved[list(kept)]) > errors
+        if abs(offset) > _BEYOND * math.sqrt(variance) and far.any():
+            # The model lacks what the sensor reads too high.
+            found[channel] = (
+                offset * float(problem.noise[channel]),
+                math.sqrt(variance) * float(problem.noise[channel]),
+            )
+    return found
 
 
 def derivatives_hold(problem: FitProblem, state: SearchState) -> bool:

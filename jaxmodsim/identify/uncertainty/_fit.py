@@ -21,11 +21,27 @@ from ..data._record import Record, Windows, cut, outliers, runs_of
 from ..estimate._initializers import AbstractInitializer, run_initializers
 from ..estimate._prepare import MultipleShooting, Settings, StartState, prepare, step_error
 from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
-from ..estimate._search import Progress, SearchOptions, SearchResult, by_channel, continued, solve_with_noise
+from ..estimate._search import (
+    Progress,
+    SearchOptions,
+    SearchResult,
+    by_channel,
+    continued,
+    solve_freed,
+    solve_with_noise,
+)
 from ..model._engines import Controller, LawEngine, with_values
 from ..model._observe import Observable, coordinates_seen, first_coordinate
 from ..model._parameters import FreeParameters, chosen_entries, split_entries, split_ranges
-from ._estimate import FitDiagnostics, FitProvenance, IdentifiabilityIssue, ParameterEstimate, covariance_of
+from ._estimate import (
+    FitDiagnostics,
+    FitProvenance,
+    IdentifiabilityIssue,
+    ParameterEstimate,
+    covariance_of,
+    natural_scales,
+    offsets_left,
+)
 from ._identifiability import identifiability_issues
 from ._result import FitResult, uncertain_of
 
@@ -83,8 +99,9 @@ def fit(
       keeps its distance from it.
     - `observe`: what a record measured: a function `observe(q, qd)` that returns one number, `"q[0]"`, `"qd[0]"`, or
       the name of an effect, whose force is meant; with several channels a dict of these by channel.
-    - `q0`, `qd0`: state at the first sample, shape `[dof]` or `[records, dof]`; by default the first measured value
-      of each coordinate that was measured, the others 0, and rest. `jaxmodsim.identify.start_state` estimates one.
+    - `q0`, `qd0`: state at the first sample, shape `[dof]` or `[records, dof]`, where it is known exactly. By default
+      coordinates that a channel shows, and their velocities, are fitted for each record by itself, and not reported;
+      the others are 0, and at rest.
     - `delay`: by how much inputs come later than recorded [s], >= 0; where they start if they are free.
     - `limits`: lower and upper limits of numbers beyond the declared ones, None for none: `{"m": (0.0, 5.0)}`. A lower
       limit of 0 is excluded. A fit looks for Fs up to 5 Fc, or the ratio it starts with;
@@ -134,8 +151,8 @@ def fit(
     limit, rtol = as_whole(max_steps, name="max_steps"), as_float(rtol, name="rtol", lower=0.0)
     with reported(progress, "fit", iteration_words) as report:
         prepared, options = prepare(scene, records, free, settings), SearchOptions(rtol, limit, report)
-        x, starts = run_initializers(initializer, prepared.problem, options)
-        search = solve_with_noise(prepared.problem, x, options, prepared.given)
+        x, starts = run_initializers(initializer, prepared.problem.held, options)
+        search = solve_freed(prepared.problem, x, options, prepared.given)
     values = search.problem.at(search.state.x).values
     error = step_error(search)
     return result_of(
@@ -259,19 +276,22 @@ def result_of(
     problem, state = search.problem, search.state
     names, at_start, values = list(problem.free.names), [], []
     shared, own = np.split(np.asarray(state.x), [len(names)])
+    kept = list(range(len(names)))
     values += problem.at(state.x).vector.tolist()
     at_start += [float(problem.free.start[name]) for name in names]
     whole = len(set(windows.record)) == len(windows.record)
     if whole and problem.local:
-        base = _first_states(search)
+        base, shown = _first_states(search), problem.reported
         for i, record in enumerate(records):
             prefix = "" if len(records) == 1 else f"{record.name}/"
-            names += [prefix + name for name in problem.local]
-            at_start += base[i].tolist()
-            values += (base[i] + own.reshape(len(records), -1)[i]).tolist()
-    covariance = covariance_of(problem, state, len(names))
+            names += [prefix + name for name in problem.local[:shown]]
+            at_start += base[i, :shown].tolist()
+            values += (base[i] + own.reshape(len(records), -1)[i])[:shown].tolist()
+            kept += [len(shared) + i * len(problem.local) + k for k in range(shown)]
+    covariance = covariance_of(problem, state, kept)
     outputs, rmse = _stitched(search, records, windows)
-    free = problem.free
+    free, scales = problem.free, natural_scales(problem, state, kept)
+    signed = [*(kind == "line" for kind in free.kinds), *(True for _ in names[len(free.names) :])]
     estimate = ParameterEstimate(
         values=dict(zip(names, values, strict=True)),
         start=dict(zip(names, at_start, strict=True)),
@@ -281,6 +301,7 @@ def result_of(
         information=covariance.information,
         logarithmic=tuple(name for name, kind in zip(free.names, free.kinds, strict=True) if kind == "log"),
         bounds=free.limits(shared) | {name: (-np.inf, np.inf) for name in names[len(free.names) :]},
+        natural={name: float(x) if each else 0.0 for name, x, each in zip(names, scales, signed, strict=True)},
     )
     provenance = FitProvenance(
         records=records,
@@ -297,7 +318,10 @@ def result_of(
         step_error=step_error,
         starts=starts,
         single_precision=jnp.result_type(float) == jnp.float32,
-        issues=_issues(estimate, provenance, search, covariance.refused),
+        issues=(
+            *_offset_issues(estimate, search, kept),
+            *_issues(estimate, provenance, search, covariance.refused),
+        ),
     )
     search = replace(search, windows=windows)
     return FitResult(estimate=estimate, diagnostics=diagnostics, provenance=provenance, search=search)
@@ -343,6 +367,23 @@ def _issues(
     free = search.problem.free.names
     issues = identifiability_issues(model, provenance.motions, dof, provenance.numbers, free, uncertain)
     return (*of_samples, *issues)
+
+
+def _offset_issues(
+    estimate: ParameterEstimate, search: SearchResult, kept: Sequence[int]
+) -> tuple[IdentifiabilityIssue, ...]:
+    """A sensor that reads too high throughout."""
+    errors = np.array(list(estimate.errors.values()))
+    if search.problem.base is None or not np.isfinite(float(search.state.cost)):
+        return ()
+    return tuple(
+        IdentifiabilityIssue(
+            f"{channel} seems to have a constant offset of {offset:.3g} +- {error:.1g}: with it parameters move by more"
+            " than their standard errors, so their intervals do not hold. Subtract it from the record and fit again.",
+            (),
+        )
+        for channel, (offset, error) in offsets_left(search.problem, search.state, kept, errors).items()
+    )
 
 
 def _sample_issues(records: tuple[Record, ...], squares: bool) -> tuple[IdentifiabilityIssue, ...]:

@@ -338,7 +338,7 @@ class SloppyDirection:
     """A way in which the parameters can change together without the record telling.
 
     - `names`: of the parameters that take part, the strongest first.
-    - `changes`: their changes relative to the value or the start, whichever is larger; the largest 1.
+    - `changes`: their changes relative to the scale of the estimate or the start, whichever is larger; the largest 1.
     - `error`: standard error along it, relative in the same way.
     - `sentence`: in words.
     """
@@ -362,7 +362,7 @@ def sloppy_directions(
     if len(names) < 2:
         return []
     keep = [list(estimate.values).index(name) for name in names]
-    size = np.array([max(abs(estimate.values[name]), abs(estimate.start[name])) or 1.0 for name in names])
+    size = np.array([max(estimate.scale(name), abs(estimate.start[name])) or 1.0 for name in names])
     relative = estimate.information[np.ix_(keep, keep)] * np.outer(size, size)
     values, vectors = np.linalg.eigh(relative)
     factor = _inflation(estimate, diagnostics, keep)
@@ -391,7 +391,7 @@ def _inflation(estimate: ParameterEstimate, diagnostics: FitDiagnostics, keep: l
     From the parameters that are known well: of the others the covariance is no more than a large number.
     """
     level = float(np.mean([(diagnostics.rmse[name] / noise) ** 2 for name, noise in diagnostics.noise.items()]))
-    sizes = np.abs(np.array(list(estimate.values.values())))[keep]
+    sizes = np.array([estimate.scale(name) for name in estimate.values])[keep]
     variance, white = np.diag(estimate.covariance)[keep], np.diag(estimate.white)[keep]
     known = (variance < (_WEAK * sizes) ** 2) & (white > 0)
     return level * float(np.median(variance[known] / white[known])) if known.any() else level

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from ..._core.files import jsonable, written_whole
 from ..._core.readable import AbstractReadable, Table, table_of
-from ..data._record import Record, sample_noise
+from ..data._record import Record, resolution, sample_noise
 from ..estimate._search import SearchResult, ended_by_itself
 from ..model._parameters import with_numbers
 from ._estimate import FitDiagnostics, FitProvenance, IdentifiabilityIssue, ParameterEstimate
@@ -29,13 +29,13 @@ _UNCERTAIN, _ALIKE = 0.1, 0.98
 _UNKNOWN, _PAIRS = 0.5, 4
 # Share of the scatter of a channel from which on an RMSE says that nothing is followed.
 _FOLLOWS = 0.95
-# Excess of the mean square error over the noise from sample to sample that is reported: at least this share, and so many
-# times the root of the number of samples, which are four standard deviations of the ratio.
+# Excess of the mean square error over the noise from sample to sample that is reported: at least this share, and so
+# many times the root of the number of samples, which are four standard deviations of the ratio.
 _EXCESS, _SCATTER = 0.2, 15.0
 # Share of the RMSE from which on the effect of the integration step is reported.
 _STEP_SHOWS = 0.1
 
-_KIND, _VERSION, _TEXT = "jaxmodsim fit result", 1, "result.json"
+_KIND, _VERSION, _TEXT = "jaxmodsim fit result", 2, "result.json"
 _PARTS = {"estimate": ParameterEstimate, "diagnostics": FitDiagnostics, "provenance": FitProvenance}
 # What is not kept in a file: functions.
 _LEFT_OUT = ("model",)
@@ -222,10 +222,11 @@ def remarks(result: FitResult) -> tuple[str, ...]:
     sentences += [direction.sentence for direction in directions]
     told = explained | {name for direction in directions for name in direction.names}
     for name, value in estimate.values.items():
-        share = errors[name] / abs(value) if value else np.inf
+        share = errors[name] / scale if (scale := estimate.scale(name)) else np.inf
         if _UNKNOWN < share < np.inf and value not in bounds[name] and name not in told:
+            of = "its value" if scale == abs(value) else f"{scale:.2g}, which would move the motion by its own size"
             sentences.append(
-                f"{name} is not determined by this record: its standard error is {100 * share:.0f} % of its value."
+                f"{name} is not determined by this record: its standard error is {100 * share:.0f} % of {of}."
             )
     pairs = [(a, b, c) for a, b, c in _alike(estimate) if not {a, b} <= told]
     for a, b, c in pairs[:_PAIRS]:
@@ -252,7 +253,7 @@ def uncertain_of(estimate: ParameterEstimate) -> dict[str, tuple[str, ...]]:
     pairs, errors, uncertain = _alike(estimate), estimate.errors, {}
     for name, value in estimate.values.items():
         others = tuple(b if a == name else a for a, b, _ in pairs if name in (a, b))
-        if others or not errors[name] < _UNCERTAIN * abs(value) or value in estimate.bounds[name]:
+        if others or not errors[name] < _UNCERTAIN * estimate.scale(name) or value in estimate.bounds[name]:
             uncertain[name] = others
     return uncertain
 
@@ -276,7 +277,9 @@ def _of_the_search(diagnostics: FitDiagnostics, records: tuple[Record, ...]) -> 
             )
             continue
         samples = sum(x.size for x in columns)
-        noise = math.sqrt(sum(x.size * sample_noise(x) ** 2 for x in columns) / max(samples, 1))
+        # Where a machine stands, rounding to a step takes up to half of it.
+        levels = [max(sample_noise(x), 0.5 * resolution(x)) for x in columns]
+        noise = math.sqrt(sum(x.size * level**2 for x, level in zip(columns, levels, strict=True)) / max(samples, 1))
         if columns and rmse**2 > (1 + max(_EXCESS, _SCATTER / math.sqrt(samples))) * noise**2:
             sentences.append(
                 f"{channel}: the RMSE of {rmse:.3g} is above the noise from sample to sample, {noise:.2g}: the model"
