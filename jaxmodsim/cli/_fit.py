@@ -266,15 +266,16 @@ def _designed(request: FitRequest, fitted: Fitted) -> InputDesign:
     result, records = fitted.result, fitted.result.provenance.records
     positions = np.concatenate([record.measured for record in records])
     low, high = float(np.min(positions)), float(np.max(positions))
+    top = request.max_speed or max(rough_axis(record).top for record in records if np.ptp(record.measured) > 0)
     limits = AxisLimits(
         request.max_force or max(float(np.max(np.abs(record.inputs["u"]))) for record in records),
-        request.max_speed or max(rough_axis(record).top for record in records if np.ptp(record.measured) > 0),
+        top,
         request.max_travel or 0.5 * (high - low),
         rotary=fitted.plan.rotary,
     )
     numbers, scene = scene_numbers(fitted.scene), fitted.scene
     if scene.event_driven:  # which a design by derivatives of all samples cannot pass
-        scene = formulations(scene, width=_SMOOTH * limits.speed)["Regularized"]
+        scene = formulations(scene, width=_SMOOTH * top)["Regularized"]
     design = design_input(
         scene,
         [name for name in result.values if name in numbers],
