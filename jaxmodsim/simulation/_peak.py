@@ -40,7 +40,8 @@ def _between(run: Trajectory, name: str) -> Float[Array, ""]:
     start, length = jnp.where(within, start, run.t_end), jnp.where(within, length, 0.0)
     # Open intervals: at their ends an event may have changed the series.
     share = (jnp.arange(_SAMPLES, dtype=start.dtype) + 0.5) / _SAMPLES
-    ts = jnp.clip(jax.lax.stop_gradient(start[:, None] + share * length[:, None]), inputs.t0, run.t_end)
+    ts = start[:, None] + share[None, :] * length[:, None]
+    ts = jnp.clip(jax.lax.stop_gradient(ts), inputs.t0, run.t_end)
     near = run.inputs._replace(ts=jnp.ravel(ts))
     samples = jnp.reshape(read_series(trajectory(near, run.options, solve(near, run.options)), series), ts.shape)
     samples = jnp.where(within[:, None] & jnp.isfinite(samples), samples, 0.0)

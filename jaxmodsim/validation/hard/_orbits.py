@@ -236,11 +236,16 @@ def _single() -> object:
 
 
 def _found(
-    name: str, why: str, naive: str, fn: Callable[[], float], right: Callable[[], float], asks: str, **more: float
+    name: str,
+    why: str,
+    naive: str,
+    fn: Callable[[], float],
+    right: Callable[[], float],
+    asks: str,
+    tolerance: float = 1e-8,
 ) -> HardCase:
     """A number of an orbit, and the right one."""
-    options = {"tolerance": 1e-8, **more}
-    return HardCase(name, why, naive, MeasuredNumber(fn), lambda _: right(), asks=asks, **options)
+    return HardCase(name, why, naive, MeasuredNumber(fn), lambda _: right(), asks=asks, tolerance=tolerance)
 
 
 def _without_return() -> list[HardCase]:
