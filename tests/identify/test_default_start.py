@@ -70,6 +70,8 @@ def test_what_is_given_is_held_and_what_is_named_is_reported(runs):
     given = jms.fit(start, record, tuple(TRUTH), q0=[0.0], qd0=[0.0], substeps=4)
     assert given.search is not None
     assert given.search.problem.local == ()
+    by_function = jms.fit(start, record, tuple(TRUTH), q0=[0.0], qd0=[0.0], substeps=4, observe=lambda q, qd: q[0])
+    assert by_function.values == pytest.approx(given.values)
     named = jms.fit(start, record, (*TRUTH, "q0", "qd0"), substeps=4)
     assert set(named.values) == {*TRUTH, "q0[0]", "qd0[0]"}
     free = jms.fit(start, record, tuple(TRUTH), substeps=4)

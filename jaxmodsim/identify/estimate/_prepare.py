@@ -134,7 +134,7 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
         _prior(settings.prior, parameters.names),
         _jump(settings.shooting, windows, base),
         len(unknown),
-        _shown_by_opening(several, observables, (*local, *unknown), unknown),
+        _shown_by_opening(several, observables, (*local, *unknown), unknown, states.q.shape[1]),
     )
     given = frozenset(name for record in several for name in record.noise)
     units = {name: allowed.unit for name, allowed in ranges.items()}
@@ -224,12 +224,12 @@ def _shown_by_opening(
     observables: tuple[tuple[str, Observable], ...],
     local: tuple[str, ...],
     unknown: tuple[str, ...],
+    dof: int,
 ) -> dict[str, Array]:
     """What the first samples of positions show of velocities that no one gave; see `FitProblem.known`.
 
     A machine that stands still forgets its first velocity at once: nothing else would hold it in the search.
     """
-    dof = 1 + max((int(name.split("[")[1][:-1]) for name in unknown), default=-1)
     known = {}
     for channel, seen in coordinates_seen(observables, dof).items():
         name, weights = f"qd0[{seen.removeprefix('q[')}", np.zeros((len(records), len(local)))

@@ -121,7 +121,7 @@ def compare(
 
     Each record is cut into `folds` windows. In turn one window of each record is held back: the model is fitted to the
     others, every window from a start state (q0, qd0) of its own, then run over the window that was held back with these
-    parameters. Its start is fitted to its first samples: 20, or as many more as show the velocity to 1 % of the speed
+    parameters. Its start is fitted to its first samples: 20, or as many more as show the velocity to 0.2 % of the speed
     of the record, a twentieth of them at most. The others are judged. The error with a start that is fitted to all of
     them stands beside it and judges nothing. The states of friction laws where a window begins are those of the fit to
     whole records. With `hold_out` the model is fitted to `records`, and run over the whole of each of those in the same

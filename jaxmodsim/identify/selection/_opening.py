@@ -14,7 +14,7 @@ from ..uncertainty._result import FitResult
 
 # So many samples show the state at the first one, or as many more as give its velocity with an error of so much of the
 # record's; but no more than this share of them (or the first number), and no more than half.
-LEAST, _ERROR, _MOST = 20, 0.01, 0.05
+LEAST, _ERROR, _MOST = 20, 0.002, 0.05
 # Standard error of the slope at the start of a parabola through n samples: so many noise levels over n^1.5 intervals.
 _SLOPE = 192.0**0.5
 

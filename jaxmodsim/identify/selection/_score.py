@@ -94,8 +94,8 @@ class StartFitted:
 def score(result: FitResult, record: Record, *, q0: _Start = None, qd0: _Start = None) -> Score:
     """Run a fitted model on another record, to which nothing is fitted but where it starts.
 
-    The start is fitted to the first samples alone: 20, or as many more as show the velocity to 1 % of the speed of the
-    record, a twentieth of them at most. They do not count after that. Beside the error stands the one with a start
+    The start is fitted to the first samples alone: 20, or as many more as show the velocity to 0.2 % of the speed of
+    the record, a twentieth of them at most. They do not count after that. Beside the error stands the one with a start
     fitted to all samples: smaller, as it takes up a part of what the model does wrong.
 
     **Arguments:**
