@@ -125,7 +125,7 @@ def test_a_parameter_without_effect_is_reported_and_not_given_an_error_of_zero(c
         result._repr_html_()
     )
     assert np.isinf(result.errors["Fs"])
-    assert any("Fs has no effect" in remark for remark in remarks(result))
+    assert any("Fs is not seen" in remark for remark in remarks(result))
     assert result.values["Fc"] == pytest.approx(1.0, rel=1e-3)
 
 
