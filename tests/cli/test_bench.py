@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -103,12 +102,11 @@ def test_list_runs_nothing(suite):
 
 
 def test_an_interrupt_leaves_finished_results(suite):
-    command = [sys.executable, "bench", "good", "long"]
     # A suite started in the background ignores SIGINT, and so would its children.
-    restored = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
-    with subprocess.Popen(
-        command, cwd=suite.folder.parent, stdout=subprocess.PIPE, text=True, preexec_fn=restored
-    ) as process:
+    restored = "signal.signal(signal.SIGINT, signal.default_int_handler)"
+    run = f"import runpy, signal; {restored}; runpy.run_path('bench', run_name='__main__')"
+    command = [sys.executable, "-c", run, "good", "long"]
+    with subprocess.Popen(command, cwd=suite.folder.parent, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
             if "begun" in line:

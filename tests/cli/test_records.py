@@ -76,8 +76,8 @@ NAMED = {
     "milliseconds": (changed(time=1e3 * (T - 10.0), pos=1e3 * Q), FORCE, "so: --units time=ms,position=mm."),
     "velocity": (changed(pos=VELOCITY), FORCE, "'pos' as with a velocity, not as with a position"),
     "drive signal": (FRAME, (), "'volt' is read as a force in SI units. If it is a drive signal"),
-    "early force": (changed(volt=np.roll(U, -6)), FORCE, r"'volt' comes 14.9 ms too early"),
-    "late force": (changed(volt=np.roll(U, 6)), FORCE, r"'volt' comes 15.1 ms too late"),
+    "early force": (changed(volt=np.roll(U, -6)), FORCE, r"'volt' comes 15 ms too early"),
+    "late force": (changed(volt=np.roll(U, 6)), FORCE, r"'volt' comes 15 ms too late"),
     "outliers": (changed(pos=Q + SPIKES), FORCE, "stand far out from their neighbours"),
 }  # fmt: skip
 

@@ -70,7 +70,7 @@ def fits(design):
 
     def fit(each, seed, start):
         scene = replace_numbers(box(), {name: jnp.asarray(x, float) for name, x in start.items()})
-        return jms.fit(scene, measured(each, seed), MODEL.free, q0=[0.0], limits={"m": (0.0, None)})
+        return jms.fit(scene, measured(each, seed), MODEL.free, q0=[0.0], qd0=[0.0], limits={"m": (0.0, None)})
 
     plain = fit(design.plain, 8, wrong)
     return [*(fit(design.best, seed, plain.values) for seed in range(8)), plain]

@@ -93,13 +93,14 @@ def test_starts_cover_the_box_and_begin_with_the_given_one(moved):
 
 def test_a_width_that_comes_down_leads_to_the_fit_with_the_small_one(driven):
     law, narrowing = jms.Regularized(jms.Coulomb(0.4), 1e-3), Continuation("friction.width")
-    result = jms.fit(sprung(law, 1.3), driven, ("m", "friction.Fc"), q0=[0.0], initializer=narrowing)
+    result = jms.fit(sprung(law, 1.3), driven, ("m", "friction.Fc"), q0=[0.0], qd0=[0.0], initializer=narrowing)
     assert float(result.model.effects[1].law.width) == pytest.approx(1e-3)  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
     alone = jms.fit(
         replace_numbers(sprung(law), {k: jnp.asarray(x) for k, x in result.values.items()}),
         driven,
         ("m", "friction.Fc"),
         q0=[0.0],
+        qd0=[0.0],
     )
     assert result.rmse == pytest.approx(alone.rmse, rel=1e-3)
 

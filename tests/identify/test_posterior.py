@@ -197,9 +197,9 @@ def test_delays_and_free_starts_and_events_are_among_the_unknowns() -> None:
     record = jms.Record(t, {"x": np.asarray(run.q[:, 0]) + noise}, {"u": u})
     result = jms.fit(scene, record, ("friction.Fc", "q0", "delay.u"), observe={"x": "q[0]"}, delay={"u": 1e-3})
     density = log_density(result)
-    assert density.names == ("friction.Fc", "delay.u", "q0[0]", "noise.x", "memory.x")
+    assert density.names == ("friction.Fc", "delay.u", "q0[0]", "qd0[0]", "noise.x", "memory.x")
     values, u0 = density.values(density.start), density.start
     assert float(values["q0[0]"]) == pytest.approx(result.values["q0[0]"])
     gradient, step = jax.jit(jax.grad(density))(u0 + 0.1), 1e-4
-    differences = [(density(u0 + 0.1 + e) - density(u0 + 0.1 - e)) / (2 * step) for e in step * jnp.eye(5)]
+    differences = [(density(u0 + 0.1 + e) - density(u0 + 0.1 - e)) / (2 * step) for e in step * jnp.eye(6)]
     np.testing.assert_allclose(gradient, differences, rtol=1e-3, atol=2e-3)

@@ -38,6 +38,8 @@ _CHANCE, _TINY = 0.01, 1e-30
 # Derivatives are tried over this share of a standard error; they hold if they miss no more than this share of the
 # change.
 _TRIED, _HOLDS = 0.1, 0.5
+# Share of the largest information from which on an axis counts as determined.
+_SEEN = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -436,7 +438,8 @@ def derivatives_hold(problem: FitProblem, state: SearchState) -> bool:
     rounding = ROUNDING * float(np.finfo(x.dtype).eps) * max(values[-1], _TINY)
     level = np.sqrt(np.mean(residual[: problem.samples][problem.weights > 0] ** 2))
     axes = _TRIED * level * vectors / np.sqrt(np.maximum(values, rounding)) / scale[:, None]
-    # Coordinates are about 1 in size. Along axes that are not determined the output is not linear over standard errors.
+    # Along axes that are not determined the output is not linear over standard errors. Coordinates are about 1 in size.
+    axes = axes[:, values > _SEEN * values[-1]]
     farthest = float(np.finfo(x.dtype).eps) ** (1 / 3)
     move = np.sum(axes * np.minimum(1.0, farthest / np.maximum(np.max(np.abs(axes), axis=0), _TINY)), axis=1)
     inside = np.clip(move, np.asarray(box.lower) - x, np.asarray(box.upper) - x)

@@ -215,6 +215,7 @@ def remarks(result: FitResult) -> tuple[str, ...]:
     silent = [name for name in estimate.values if not np.isfinite(errors[name]) and name not in explained]
     sentences += [f"{name} has no effect on this record." for name in silent]
     sentences += [issue.sentence for issue in diagnostics.issues]
+    sentences += _above_the_noise(diagnostics, result.provenance.records)
     for name, value in estimate.values.items():
         if np.isfinite(errors[name]) and value in bounds[name]:
             sentences.append(f"{name} ended on its limit {value:g}.")
@@ -275,7 +276,13 @@ def _of_the_search(diagnostics: FitDiagnostics, records: tuple[Record, ...]) -> 
                 f"{channel}: the model follows nothing of the record; its RMSE of {rmse:.2g} is no less than that of a"
                 f" constant, {scatter:.2g}. Is the input the right column, has it the right sign and unit?"
             )
-            continue
+    return sentences
+
+
+def _above_the_noise(diagnostics: FitDiagnostics, records: tuple[Record, ...]) -> list[str]:
+    sentences = []
+    for channel, rmse in diagnostics.rmse.items():
+        columns = [record.channels[channel] for record in records if channel in record.channels]
         samples = sum(x.size for x in columns)
         # Where a machine stands, rounding to a step takes up to half of it.
         levels = [max(sample_noise(x), 0.5 * resolution(x)) for x in columns]
