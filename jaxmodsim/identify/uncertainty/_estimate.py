@@ -433,7 +433,8 @@ def derivatives_hold(problem: FitProblem, state: SearchState) -> bool:
     x, box = np.asarray(state.x), problem.box
     jacobian, residual = (np.asarray(each).astype(float) for each in (state.jacobian, state.residual))
     scale = np.sqrt(np.sum(jacobian**2, axis=0))
-    scale = np.where(scale > 0, scale, np.inf)
+    # Columns of rounding are those of parameters without effect.
+    scale = np.where(scale > float(np.finfo(x.dtype).eps) * np.max(scale), scale, np.inf)
     values, vectors = np.linalg.eigh(np.nan_to_num((jacobian / scale).T @ (jacobian / scale)))
     rounding = ROUNDING * float(np.finfo(x.dtype).eps) * max(values[-1], _TINY)
     level = np.sqrt(np.mean(residual[: problem.samples][problem.weights > 0] ** 2))
