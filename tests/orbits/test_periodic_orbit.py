@@ -182,7 +182,8 @@ def test_the_lowest_of_a_valve_that_strikes_is_its_seat():
     made, h = orbit(6.0), 1e-3
     ts = np.linspace(0.0, float(made.period), 4001)
     run = jms.simulate(made.run.scene, made.q, made.qd, ts[-1], ts=ts, z0=made.z, rtol=1e-10, atol=1e-12)
-    assert abs(made.lowest[0]) < 1e-12
+    # The state before an impact is that of 8192 rounding units of time before it.
+    assert abs(made.lowest[0]) < 1e-11
     np.testing.assert_allclose(2.0 * made.amplitude[0], np.max(run.q), rtol=1e-6)
     differences = (extent(6.0 + h) - extent(6.0 - h)) / (2.0 * h)
     np.testing.assert_allclose(jax.jacfwd(extent)(6.0), differences, rtol=1e-5, atol=1e-8)

@@ -152,7 +152,7 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "law without Friction": (
         lambda: Scene(free, effects=cast_any((Viscous(1.0),))),
-        r"effects must hold AppliedForce or Friction objects.*goes into Friction\(law\)",
+        r"effects must hold AppliedForce, Friction or Switch objects.*goes into Friction\(law\)",
     ),
     "same name": (
         lambda: Scene(free, effects=(AppliedForce(push, name="x"), Friction(Viscous(1.0), name="x"))),

@@ -342,7 +342,7 @@ def test_wrong_contacts_are_refused():
     lagrangian = bouncing_ball.scene(e=0.5).lagrangian
     with pytest.raises(ValueError, match=r"'floor'.*one number"):
         jms.simulate(jms.Scene(lagrangian, params={"m": 1.0, "g": 9.81}, constraints=(pair,)), [1.0], [0.0], 1.0)
-    with pytest.raises(ValueError, match="opens and closes by: use another solver"):
+    with pytest.raises(ValueError, match=r"takes no events, by which .* changes: use another solver"):
         jms.simulate(bouncing_ball.scene(e=0.5), [1.0], [0.0], 1.0, dt=1e-3, solver=jms.ImplicitFriction())
     with pytest.raises(jms.SimulationError, match="gap is negative"):
         jms.simulate(bouncing_ball.scene(e=0.5), [-0.1], [0.0], 1.0)
