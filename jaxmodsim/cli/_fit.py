@@ -105,7 +105,7 @@ def _fitted(plan: Plan) -> Fitted:
     fitted = _fitted_with(plan, substeps)
     while plan.substeps is None and substeps < _MOST_SUBSTEPS and step_shows(fitted.result) and not fitted.interrupted:
         substeps *= _FINER
-        fitted = _fitted_with(plan, substeps, fitted.result)
+        fitted = _fitted_with(plan, substeps)
     judged = _judged(replace(fitted, substeps=substeps))
     return replace(judged, seconds=time.perf_counter() - started)
 
@@ -123,24 +123,20 @@ def _judged(fitted: Fitted) -> Fitted:
     )
 
 
-def _fitted_with(plan: Plan, substeps: int, before: FitResult | None = None) -> Fitted:
+def _fitted_with(plan: Plan, substeps: int) -> Fitted:
     """Fit the one model, or compare several and take the simplest that is as good as the best.
 
-    A single model goes on from the result of the fit before.
+    A model is fitted in the same way alone and among others, so that its numbers are the same.
     """
     if plan.compared:
         comparison = _compared(plan, substeps)
         model = comparison.simplest
         return Fitted(plan, model, with_units(comparison.results[model], plan.rotary), comparison)
     ((model, candidate),) = plan.candidates.items()
-    scene, free, options = candidate.scene, candidate.free, plan.options
-    if before is not None:
-        scene, options = before.model, {**options, "initializer": ()}
+    scene, free = candidate.scene, candidate.free
     assert isinstance(scene, Scene)
     assert free is not None
-    result = fit_with_progress(scene, plan.records, free, limits=plan.limits, substeps=substeps, **options)
-    if before is not None:
-        result = replace(result, estimate=replace(result.estimate, start=before.estimate.start))
+    result = fit_with_progress(scene, plan.records, free, limits=plan.limits, substeps=substeps, **plan.options)
     return Fitted(plan, model, with_units(result, plan.rotary))
 
 

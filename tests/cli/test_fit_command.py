@@ -195,6 +195,19 @@ def test_models_are_compared(run_command, files, tmp_path):
     assert found["comparison"]["conclusion"] in page.text
 
 
+def test_one_record_and_law_give_one_fit_whatever_else_is_asked(run_command, files, tmp_path):
+    found = []
+    for i, more in enumerate(((), ("--report", str(tmp_path)), ("--laws", "coulomb,asymmetric", "--folds", "2"))):
+        out = tmp_path / str(i)
+        code, _, errors = run_command("fit", files[0], *COLUMNS, "--limit", "m=:50", *more, "--out", str(out))
+        assert code == 0, errors
+        found.append(json.loads((out / "fit.json").read_text())["parameters"])
+    for other in found[1:]:
+        for name, entry in found[0].items():
+            assert other[name]["value"] == pytest.approx(entry["value"], abs=0.01 * entry["standard_error"])
+            assert other[name]["standard_error"] == pytest.approx(entry["standard_error"], rel=0.01)
+
+
 def test_the_next_input_is_written(run_command, files, tmp_path, monkeypatch):
     out = tmp_path / "out"
     monkeypatch.setattr(_fit, "design_input", partial(_fit.design_input, max_steps=2))
@@ -366,6 +379,7 @@ def check_refusal(run_command, out: Path, text: str, *command: str) -> None:
         (("--begin", "stage"), "no name 'stage'; .* Did you mean staged"),
         (("--time", "volt"), "times must increase, but column 'volt'"),
         (("--max-force", "3"), "--max-force belongs to --next"),
+        (("--fix", "dry.width=1e-6"), "there is no parameter 'dry.width'; the parameters are: m, offset, dry.Fc"),
         (("--next", "n.csv", "--duration", "-1"), "--duration must be finite and > 0"),
         (("--held-out", "nowhere.csv"), "There is no file nowhere.csv"),
     ],

@@ -189,3 +189,12 @@ def test_a_controller_and_an_observed_force_pass_stick():
     result = jms.fit(scene(380.0, 3.7), record, ("P", "dry.Fc"), observe=seen, q0=[0.0], controller=loop)
     for name, true in {"P": 400.0, "dry.Fc": 4.0}.items():
         assert abs(result.values[name] - true) < 4.5 * result.errors[name] < 0.05 * true
+
+
+def test_a_velocity_that_stick_takes_away_has_no_effect():
+    record = dwelling(8.0, 500.0, 110)  # its derivative is rounding, on which a search must not step
+    scene, free = axis_scene(axis_models()["coulomb"], rough_axis(record)), (*TRUTH, "q0", "qd0")
+    result = jms.fit(scene, record, free, q0=[record.measured[0]], qd0=[0.0])
+    assert "qd0[0] has no effect on this record." in remarks(result)
+    assert result.diagnostics.ending == "converged"
+    assert result.rmse == pytest.approx(NOISE, rel=0.05)

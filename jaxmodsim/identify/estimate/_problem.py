@@ -163,6 +163,12 @@ class Prior(eqx.Module):
     weight: Float[Array, " free"]
 
 
+def _without_dust(jacobian: Float[Array, "rows n"]) -> Float[Array, "rows n"]:
+    """The Jacobian with zeros in columns of nothing but rounding: of a velocity that stick takes away at the start."""
+    size = jnp.sqrt(jnp.sum(jacobian**2, axis=0))
+    return jnp.where(size > float(jnp.finfo(size.dtype).eps) ** 1.5 * jnp.max(size), jacobian, 0.0)
+
+
 class FitProblem(eqx.Module):
     """Everything that the residual of a fit depends on.
 
@@ -315,7 +321,7 @@ class FitProblem(eqx.Module):
         if known is not None:
             rows.append(jnp.reshape(known * own, (-1,)))
             columns.append(jnp.pad(jnp.diag(jnp.reshape(known, (-1,))), ((0, 0), (shared.shape[0], 0))))
-        return jnp.concatenate(rows), jnp.concatenate(columns)
+        return jnp.concatenate(rows), _without_dust(jnp.concatenate(columns))
 
     def _spread(self, slope: Float[Array, "some m k"], first: int = 0) -> Float[Array, "rows n"]:
         """Derivatives of runs `first` and on by their own x, as rows by all of x."""
