@@ -11,7 +11,6 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -91,7 +90,7 @@ def _problem(problem: NamedProblem) -> Iterator[Found]:
         return named_series(jms.simulate(scene, problem.q0, problem.qd0, problem.t1, **options), problem.observable)[-1]
 
     x = jnp.array([*numbers.values()])
-    modes = _modes(fn, fn)
+    modes = _modes(fn)
     for rtol in RTOLS:
         yield PROBLEMS, f"{problem.name}, rtol {rtol:g}", _difference(*modes(x, jnp.asarray(rtol)), x), ""
 
@@ -99,16 +98,15 @@ def _problem(problem: NamedProblem) -> Iterator[Found]:
 def _hard(case: HardCase) -> Found:
     task: Any = case.task
     x = jnp.asarray(task.x, float)
-    # Some of them call diffrax, whose default is for reverse mode alone.
-    modes = _modes(lambda x: task.answer(x, dfx.ForwardMode()).value, lambda x: task.answer(x).value)
+    modes = _modes(lambda x: task.answer(x).value)
     forward, (value, reverse) = modes(x)
     size = value if case.scale is None else jnp.asarray(case.scale)
     return HARD, case.name, _difference(forward, (size, reverse), x), case.why
 
 
-def _modes(one: Callable[..., Array], other: Callable[..., Array]) -> Callable[..., tuple[Array, tuple[Array, Array]]]:
-    """Forward derivatives of the one, and the value and reverse derivatives of the other."""
-    forward, reverse = jax.jit(jax.jacfwd(one)), jax.jit(jax.value_and_grad(other))
+def _modes(fn: Callable[..., Array]) -> Callable[..., tuple[Array, tuple[Array, Array]]]:
+    """Forward derivatives of a function, and its value and reverse derivatives."""
+    forward, reverse = jax.jit(jax.jacfwd(fn)), jax.jit(jax.value_and_grad(fn))
     return lambda *x: (forward(*x), reverse(*x))
 
 
