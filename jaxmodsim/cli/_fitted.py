@@ -161,8 +161,6 @@ def _new_record(fitted: Fitted) -> tuple[str, ...]:
     miss = fitted.expected
     if miss is None:
         return ()
-    causes = {"the model": miss.model, "unsure parameters": miss.parameters, "their change": miss.between}
-    listed = ", ".join(f"{1e3 * x:.3g} from {cause}" for cause, x in causes.items())
     held = "".join(
         f" Of {each.score.record.name} {100 * each.shares['measured']:.0f} % of the samples lie within the band for"
         f" {100 * each.level:g} %."
@@ -170,8 +168,9 @@ def _new_record(fitted: Fitted) -> tuple[str, ...]:
     )
     cannot = "One record cannot tell what changes from day to day. " if miss.records == 1 else ""
     return (
-        f"{cannot}On a new record of this motion expect to miss by {1e3 * miss.total:.3g} m{fitted.unit} ({listed}),"
-        f" with {miss.assumption}.{held}",
+        f"{cannot}On a new record of this motion expect to miss by {1e3 * miss.unchanged:.3g} m{fitted.unit} if nothing"
+        f" has changed ({1e3 * miss.model:.3g} from the model, {1e3 * miss.parameters:.3g} from unsure parameters), and"
+        f" by {1e3 * miss.total:.3g} m{fitted.unit} with {miss.assumption}.{held}",
     )
 
 
@@ -295,6 +294,7 @@ def summary(findings: Findings) -> dict[str, object]:
             for score in fitted.scores
         },
         "expected": None if fitted.expected is None else fitted.expected.total,
+        "expected_if_unchanged": None if fitted.expected is None else fitted.expected.unchanged,
         "held_out_within_band": {each.score.record.name: each.shares for each in fitted.predictions},
         "agreement": None if agreed is None else jsonable(agreement_table(agreed).to_dict("records")),
         "differing": None if agreed is None else list(agreed.differing),

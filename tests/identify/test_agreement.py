@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim.identify import agreement, law_force
+from jaxmodsim.identify import agreement, axis_models, axis_scene, law_force, rough_axis
+
+from ..helpers.axis_records import slide
 
 NUMBERS = {"Fs": 1.6, "vs": 0.02, "Fv": 2.0}
 T = np.arange(0.0, 4.0, 5e-3)
@@ -41,6 +43,28 @@ def test_false_alarms_and_what_is_found() -> None:
     # Kolmogorov and Smirnov: 0.26 is exceeded once in 100 times by 40 uniform numbers.
     assert np.max(np.abs(p - np.linspace(0, 1, 40))) < 0.26
     assert sum("Fc" in found(1.05, seed).differing for seed in range(10)) >= 8
+
+
+def axis_day(name: str, seed: int, Fc: float) -> jms.Record:
+    """An axis of 50 kg under a force, and under a disturbance that no model knows."""
+    rng, t = np.random.default_rng(seed), 4e-3 * np.arange(2000)
+    u = 60.0 * np.sin(np.pi * t) + 25.0 * np.sin(2.6 * np.pi * t + 1.0)
+    unknown = sum(0.3 * np.sin(2 * np.pi * rate * t + rng.uniform(0, 2 * np.pi)) for rate in (0.3, 0.7, 1.9))
+    q = slide(t, u + unknown, 0.0, 50.0, Fc, 120.0, 2.0) + 2e-6 * rng.standard_normal(t.size)
+    return jms.Record(t, q, {"u": u}, name)
+
+
+def test_friction_that_changed_by_a_newton_is_seen_through_its_correlation_with_viscous_friction() -> None:
+    model, found = axis_models()["coulomb"], []
+    for seed in range(6):
+        days = [axis_day("one", 2 * seed, 20.0), axis_day("other", 2 * seed + 1, 21.2)]
+        each = agreement(jms.fit(axis_scene(model, rough_axis(days[0])), days, model.free, limits={"m": (0.0, None)}))
+        found.append(each.differing)
+        k = each.names.index("dry.Fc")
+        if "dry.Fc" in each.differing:
+            assert np.diff(each.values[:, k]) == pytest.approx(1.2, abs=0.5)
+    # Coulomb and viscous friction are told apart by other motions than these: -0.98.
+    assert sum(bool({"dry.Fc", "viscous.Fv"} & {*names}) for names in found) >= 5
 
 
 def test_what_cannot_be_compared_is_refused() -> None:

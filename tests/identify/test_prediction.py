@@ -58,6 +58,7 @@ def test_the_deviation_of_a_changing_level_is_half_the_difference_of_two_runs():
     assert found.model["measured"] == pytest.approx(NOISE, rel=0.08)
     total = expected_error(result)["measured"]
     assert total.total**2 == pytest.approx(total.model**2 + total.parameters**2 + total.between**2)
+    assert total.unchanged**2 == pytest.approx(total.model**2 + total.parameters**2)
     assert total.between == pytest.approx(np.sqrt(np.mean(expected**2)), rel=0.1)  # of the first day's motion
     assert "4 % from record to record (assumed)" in str(found)
 

@@ -55,6 +55,16 @@ def test_an_axis_that_stands_still_is_found_within_its_intervals():
     assert not any("sample to sample" in remark for remark in remarks(result))
 
 
+def test_a_small_constant_force_is_determined_if_its_error_is_small_beside_the_forces():
+    t = np.arange(2001) / 500.0
+    q = slide(t, drive(t), 0.0, 3.0, 4.0, 12.0, -0.002)
+    record = jms.Record(t, q + 5e-3 * np.random.default_rng(2).standard_normal(t.size), {"u": drive(t)})
+    result = jms.fit(axis(jms.Coulomb(4.01)), record, tuple(TRUTH))
+    assert result.errors["offset"] > 0.5 * abs(result.values["offset"])
+    assert result.errors["offset"] < 0.01
+    assert not any("determine" in remark or "offset" in remark for remark in remarks(result))
+
+
 def test_a_residual_above_the_noise_is_said(record):
     smooth = jms.fit(axis(jms.Regularized(jms.Coulomb(4.01), 5e-4)), record, tuple(TRUTH), substeps=8)
     assert smooth.rmse > 5 * NOISE

@@ -3,11 +3,12 @@
 import dataclasses
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ...friction import AbstractLaw
 from ...scene import Scene, scene_numbers, scene_ranges
@@ -32,11 +33,13 @@ class RecordAgreement:
     Each parameter of a record is taken as a common value plus a random part of the record plus the error of its fit.
 
     - `records`, `names`: of the records and of the parameters.
-    - `values`, `errors`: of each parameter in a fit to each record alone, and its standard error (residuals correlated
-      in time allowed for), shape `[records, parameters]`. Parameters that some record alone does not determine to a
-      tenth stay at the value of the fit to all: free, they would hide differences of the others.
+    - `values`, `errors`: of each parameter where it alone, and what differs, varies from record to record while the
+      others are common, and its standard error (residuals correlated in time allowed for), shape
+      `[records, parameters]`. Parameters that some record alone does not determine to a tenth stay at the value of
+      the fit to all.
     - `p`: probability that values which are the same come out at least as different, shape `[parameters]`; NaN of a
       parameter that some record does not determine or that ends at a limit.
+    - `differing`: names of the parameters that differ, most certain first.
     - `level`: probability with which any parameter at all is said to differ where none does.
     - `common`, `common_errors`: the common value of each parameter and its standard error, shape `[parameters]`.
     - `between`: standard deviation of each parameter from record to record (Paule, Mandel 1982, J. Res. NBS 87:377),
@@ -52,23 +55,13 @@ class RecordAgreement:
     values: Float[np.ndarray, "records parameters"]
     errors: Float[np.ndarray, "records parameters"]
     p: Float[np.ndarray, " parameters"]
+    differing: tuple[str, ...]
     level: float
     common: Float[np.ndarray, " parameters"]
     common_errors: Float[np.ndarray, " parameters"]
     between: Float[np.ndarray, " parameters"]
     between_interval: Float[np.ndarray, "parameters 2"]
     covariance: Float[np.ndarray, "parameters parameters"]
-
-    @property
-    def differing(self) -> tuple[str, ...]:
-        """Names of the parameters that differ, at `level` for all together (Holm 1979, Scand. J. Statist. 6:65)."""
-        known = [i for i in np.argsort(self.p) if np.isfinite(self.p[i])]
-        found = []
-        for rank, i in enumerate(known):
-            if self.p[i] > self.level / (len(known) - rank):
-                break
-            found.append(self.names[i])
-        return tuple(found)
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -111,9 +104,15 @@ class RecordAgreement:
 def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 400) -> RecordAgreement:
     """Fit each record by itself, from the fit to all, and test whether the parameters are the same.
 
-    For each parameter the sum of squared distances from its weighted mean, in standard errors, is held against its
-    distribution (F, one degree of freedom less than there are records, and one less than there are blocks of samples
-    from whose scatter each error comes; blocks are longer where the residual remembers for long). The standard
+    Where a single level of friction has changed, parameters that are correlated with it change with it in such fits,
+    and none of them by more than its error. So each parameter is tested as the only one that differs: by the value it
+    has in each record if the others are common to all, from the quadratic forms of the fits. The parameter with the
+    least probability differs if that is below `level` over the number of parameters left to test (Bonferroni); from
+    then on it is free, and the others are tested again.
+
+    Differences between records, in standard errors, are held against their distribution (F, one degree of freedom
+    less than there are records, and one less than there are blocks of samples from whose scatter each error comes;
+    blocks are longer where the residual remembers for long). The standard
     deviation between records is the one with which this sum, errors and deviation together, comes to its expectation,
     and the ends of its interval those with which it comes to its quantiles.
 
@@ -147,42 +146,95 @@ def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 400) -
     shared, own = problem.split(result.search.state.x)
     options = SearchOptions(max_steps=max_steps)
 
-    def alone(tested: Collection[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def alone(tested: Collection[str]) -> _Fits:
         fits = [
             _alone(problem, i, jnp.concatenate([shared, own[i]]), result, tested, options) for i in range(len(records))
         ]
-        values, covariances, freedoms = (np.stack(each) for each in zip(*fits, strict=True))
-        return values, covariances, freedoms
+        return _Fits(*(np.stack(each) for each in zip(*fits, strict=True)))
 
     names = problem.free.names
-    values, own_errors, known_by = alone(names)
-    tested = _determined(own_errors, np.array([result.estimate.scale(name) for name in names]))
+    fits = alone(names)
+    tested = _determined(fits.covariances, np.array([result.estimate.scale(name) for name in names]))
     if tested.any() and not tested.all():
-        values, own_errors, known_by = alone([name for name, each in zip(names, tested, strict=True) if each])
-    variances = np.diagonal(own_errors, axis1=1, axis2=2)
+        fits = alone([name for name, each in zip(names, tested, strict=True) if each])
+    variances = np.diagonal(fits.covariances, axis1=1, axis2=2)
     known = tested & np.all(np.isfinite(variances) & (variances > 0), axis=0)
+    values, errors, p = fits.values.copy(), np.sqrt(variances), np.full(len(names), np.nan)
     freedom = len(records) - 1
+    differing: list[int] = []
+    while left := [k for k in np.flatnonzero(known).tolist() if k not in differing]:
+        for k in left:
+            values[:, k], covariance = fits.if_only([*differing, k], known)
+            errors[:, k] = np.sqrt(np.diag(covariance))
+            p[k] = f.sf(_apart(values[:, k], covariance) / freedom, freedom, np.sum(fits.freedoms))
+        first = min(left, key=lambda k: p[k])
+        if not p[first] <= level / len(left):
+            break
+        differing.append(first)
     quantiles = (float(freedom), *chi2.ppf([0.975, 0.025], freedom).tolist())
-    found = np.full((6, len(problem.free.names)), np.nan)
+    found = np.full((5, len(names)), np.nan)
     for k in np.flatnonzero(known):
-        x, variance = values[:, k], variances[:, k]
+        x, variance = values[:, k], errors[:, k] ** 2
         between = [_between(x, variance, quantile) for quantile in quantiles]
         mean, precision, _ = _weighted(x, variance + between[0])
-        p = f.sf(_weighted(x, variance)[2] / freedom, freedom, np.sum(known_by))
-        found[:, k] = (mean, precision**-0.5, *np.sqrt(between), p)
+        found[:, k] = (mean, precision**-0.5, *np.sqrt(between))
     return RecordAgreement(
         records=records,
-        names=problem.free.names,
+        names=names,
         values=values,
-        errors=np.sqrt(variances),
-        p=found[5],
+        errors=errors,
+        p=p,
+        differing=tuple(names[k] for k in differing),
         level=level,
         common=found[0],
         common_errors=found[1],
         between=found[2],
         between_interval=found[3:5].T,
-        covariance=_covariance_between(values, own_errors, known),
+        covariance=_covariance_between(fits.values, fits.covariances, known),
     )
+
+
+class _Fits(NamedTuple):
+    """Fits of each record by itself: values, covariances, Fisher information, and degrees of freedom of the errors."""
+
+    values: Float[np.ndarray, "records free"]
+    covariances: Float[np.ndarray, "records free free"]
+    information: Float[np.ndarray, "records free free"]
+    freedoms: Int[np.ndarray, " records"]
+
+    def if_only(
+        self, varying: list[int], known: Bool[np.ndarray, " free"]
+    ) -> tuple[Float[np.ndarray, " records"], Float[np.ndarray, "records records"]]:
+        """The last one of the parameters `varying` in each record if the others of those `known` are common.
+
+        With its covariance between records. The sum of the quadratic forms of all fits has its least there.
+        """
+        common = [k for k in np.flatnonzero(known).tolist() if k not in varying]
+        count, last = len(self.values), len(varying) - 1
+        scale = np.sqrt(np.sum(np.diagonal(self.information, axis1=1, axis2=2), axis=0))
+        scaled = self.information / np.outer(scale, scale)
+        to_varying = np.linalg.solve(scaled[:, varying][:, :, varying], scaled[:, varying][:, :, common])
+        left = scaled[:, common][:, :, common] - scaled[:, common][:, :, varying] @ to_varying
+        share = np.linalg.solve(np.sum(left, axis=0), left)
+        # Derivatives of the scaled value in each record by the parameters of the fit to each record.
+        by = np.zeros((count, count, len(known)))
+        by[:, :, common] = -np.einsum("ir,jrc->ijc", to_varying[:, last], share)
+        own = np.arange(count)
+        by[np.ix_(own, own, common)] += np.eye(count)[:, :, None] * to_varying[:, None, last]
+        by[own, own, varying[last]] = 1.0
+        by *= scale / scale[varying[last]]
+        whole = [*varying, *common]
+        by, covariances = by[:, :, whole], self.covariances[:, whole][:, :, whole]
+        return (
+            np.einsum("ijk,jk->i", by, self.values[:, whole]),
+            np.einsum("ajk,jkl,bjl->ab", by, covariances, by),
+        )
+
+
+def _apart(x: Float[np.ndarray, " records"], covariance: Float[np.ndarray, "records records"]) -> float:
+    """Sum of squared differences between records, in standard errors."""
+    differences = np.diff(x)
+    return float(differences @ np.linalg.solve(np.diff(np.diff(covariance, axis=0), axis=1), differences))
 
 
 def _alone(
@@ -192,8 +244,8 @@ def _alone(
     result: FitResult,
     tested: Collection[str],
     options: SearchOptions,
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Parameters of a fit to one record with only those in `tested` free, their covariance, its degrees of freedom."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """What `_Fits` has of a fit to one record with only the parameters in `tested` free."""
     names, record = together.free.names, result.provenance.records[i].name
     base, runs, known = jax.tree.map(lambda leaf: leaf[i : i + 1], (together.base, together.runs, together.known))
     problem = dataclasses.replace(together, base=base, runs=runs, known=known)
@@ -202,12 +254,13 @@ def _alone(
     if not bool(jnp.isfinite(search.state.cost)):
         raise RuntimeError(f"The fit to {record} alone ended with values that are not finite.")
     blocks = blocks_that_are_independent(search)
-    covariance = covariance_of(problem, search.state, range(len(names)), blocks).covariance
+    found = covariance_of(problem, search.state, range(len(names)), blocks)
+    covariance = found.covariance
     value = problem.at(search.state.x).vector
     limits = problem.free.limits(search.state.x[: len(names)])
     out = [x in limits[name] or name not in tested for name, x in zip(names, value.tolist(), strict=True)]
     covariance[np.diag_indices(len(value))] = np.where(out, np.nan, np.diag(covariance))
-    return value, covariance, blocks - 1
+    return value, covariance, found.information, blocks - 1
 
 
 def _determined(

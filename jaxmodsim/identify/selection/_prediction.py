@@ -40,9 +40,14 @@ class ExpectedError:
     records: int
 
     @property
+    def unchanged(self) -> float:
+        """What to expect if no parameter changes: the root of the sum of squares without `between`."""
+        return float(np.hypot(self.model, self.parameters))
+
+    @property
     def total(self) -> float:
         """Root of the sum of squares."""
-        return float(np.sqrt(self.model**2 + self.parameters**2 + self.between**2))
+        return float(np.hypot(self.unchanged, self.between))
 
     @property
     def assumption(self) -> str:
