@@ -97,7 +97,8 @@ def _mark_call(ctx: mlir.LoweringRuleContext, call: Any) -> None:
     if "mhlo.frontend_attributes" in call.attributes:
         return  # marked already, by another of its results
     ending = block.operations[len(block.operations) - 1].operation
-    if not block.arguments or not all(_is_plain(x.type) for x in [*block.arguments, *ending.operands]):
+    given, results = ([x for x in values if _size(x)] for values in (block.arguments, ending.operands))
+    if not given or not results or any(isinstance(x.type.element_type, ir.ComplexType) for x in [*given, *results]):
         return
     if not all(kind in _HOLDS for kind in _operations(functions, function, set())):
         return
@@ -113,9 +114,10 @@ def _mark_call(ctx: mlir.LoweringRuleContext, call: Any) -> None:
     call.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(attributes)
     block = own.regions[0].blocks[0]
     ending = block.operations[len(block.operations) - 1].operation
-    smallest = min(range(len(ending.operands)), key=lambda i: math.prod(ending.operands[i].type.shape))
+    # Arrays of no entries take part in nothing.
+    smallest = min((i for i, x in enumerate(ending.operands) if _size(x)), key=lambda i: _size(ending.operands[i]))
     with ir.InsertionPoint(ending):
-        ending.operands[smallest] = _needing(ending.operands[smallest], list(block.arguments))
+        ending.operands[smallest] = _needing(ending.operands[smallest], [x for x in block.arguments if _size(x)])
 
 
 def _needing(x: Any, all_of: list[Any]) -> Any:
@@ -149,8 +151,8 @@ def _any_number(x: Any) -> Any:
     return hlo.convert(ir.RankedTensorType.get([], ir.IntegerType.get_signless(32)), entry)
 
 
-def _is_plain(array: Any) -> bool:
-    return math.prod(array.shape) > 0 and not isinstance(array.element_type, ir.ComplexType)
+def _size(array: Any) -> int:
+    return math.prod(array.type.shape)
 
 
 def _callee(call: Any) -> str:

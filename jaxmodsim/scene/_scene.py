@@ -16,6 +16,7 @@ from .._core.functions import as_function
 from .._core.parameters import as_real, is_weak
 from .._core.readable import AbstractReadable
 from .._core.shapes import PerDof, Scalar
+from ..friction import AbstractLaw
 from ..mechanics import AbstractConstraint, BoundContact, Contact, Lagrangian, Poisson
 from ._coordinates import as_coordinates, read_label
 from ._signal import Signal, signals_at, signals_from, signals_of
@@ -62,9 +63,11 @@ def _effects(effects: Any) -> tuple[AbstractEffect, ...]:
         raise ValueError(f"effects must be a tuple of effects, as in effects=(effect,), but got {effects!r}.")
     for effect in effects:
         if not isinstance(effect, AbstractEffect):
+            remedy = "It goes into constraints=(...)" if isinstance(effect, AbstractConstraint) else ""
+            remedy = "A friction law goes into Friction(law)" if isinstance(effect, AbstractLaw) else remedy
             raise ValueError(
-                f"effects must hold AppliedForce, Friction or Switch objects, but it holds {effect!r}. A friction law"
-                " goes into Friction(law)."
+                "effects must hold AppliedForce, Friction or Switch objects, but it holds"
+                f" {f'{effect!r}. {remedy}'.rstrip('. ')}."
             )
     return tuple(effects)
 

@@ -220,7 +220,7 @@ class _Fits(NamedTuple):
         by = np.zeros((count, count, len(known)))
         by[:, :, common] = -np.einsum("ir,jrc->ijc", to_varying[:, last], share)
         own = np.arange(count)
-        by[np.ix_(own, own, common)] += np.eye(count)[:, :, None] * to_varying[:, None, last]
+        by[np.ix_(own, own, np.array(common, int))] += np.eye(count)[:, :, None] * to_varying[:, None, last]
         by[own, own, varying[last]] = 1.0
         by *= scale / scale[varying[last]]
         whole = [*varying, *common]
