@@ -289,7 +289,7 @@ def _start_code(inputs: RunInputs, functions: RunFunctions, mode: Array | None, 
 
 
 def _integrate(
-    inputs: RunInputs, options: RunOptions, audited: bool, log: int | None, series: Series | None = None
+    inputs: RunInputs, options: RunOptions, audited: bool, log: int | None, series: Series | None
 ) -> tuple[RunOutput, EventLog | None, Nodes | None]:
     """Run diffrax; with modes only where the scene has them, with a log of that many events where one is wanted.
 
@@ -407,15 +407,17 @@ def _kept(
     return t, y, modes, instants
 
 
-@partial(jax.jit, static_argnums=1)
-def _run(inputs: RunInputs, options: RunOptions) -> RunOutput:
-    return _integrate(inputs, options, False, None)[0]
+def _solved(
+    inputs: RunInputs, options: RunOptions, audited: bool = False, log: int | None = None, series: Series | None = None
+) -> tuple[RunOutput, EventLog | None, Nodes | None]:
+    """`_integrate`, with its derivatives, in one kernel each."""
+    return in_one_kernel(jax.jit(lambda inputs: _integrate(inputs, options, audited, log, series)), inputs)
 
 
 @partial(jax.jit, static_argnums=1)
 def solve(inputs: RunInputs, options: RunOptions) -> RunOutput:
     """Run a scene."""
-    return in_one_kernel(lambda inputs: _run(inputs, options), inputs)
+    return _solved(inputs, options)[0]
 
 
 def compiled_runs() -> int:
@@ -426,7 +428,7 @@ def compiled_runs() -> int:
 @partial(jax.jit, static_argnames=("options",))
 def solve_audited(inputs: RunInputs, options: RunOptions) -> tuple[Work, Int[Array, ""]]:
     """Run a scene again with the integrals of power beside it: the work at the saved times, and how that run ended."""
-    solved, _, _ = _integrate(inputs, options, True, None)
+    solved, _, _ = _solved(inputs, options, audited=True)
     return solved.y[1], solved.code
 
 
@@ -441,7 +443,7 @@ def solve_start(inputs: RunInputs, options: RunOptions) -> State:
 @partial(jax.jit, static_argnames=("options", "size"))
 def solve_logged(inputs: RunInputs, options: RunOptions, size: int) -> EventLog:
     """Run a scene again with a log of `size` events beside it."""
-    log = _integrate(inputs, options, False, size)[1]
+    _, log, _ = _solved(inputs, options, log=size)
     assert log is not None
     return log
 
@@ -449,6 +451,6 @@ def solve_logged(inputs: RunInputs, options: RunOptions, size: int) -> EventLog:
 @partial(jax.jit, static_argnames=("options", "series"))
 def solve_nodes(inputs: RunInputs, options: RunOptions, series: Series) -> Nodes:
     """Run a scene again with a number at the ends of its steps beside it."""
-    nodes = _integrate(inputs, options, False, None, series)[2]
+    _, _, nodes = _solved(inputs, options, series=series)
     assert nodes is not None
     return nodes
