@@ -111,7 +111,35 @@ def test_what_is_known_of_a_run_stays_an_argument():
         return jms.simulate(bouncing_ball.scene(e=e), [1.0], [0.0], 0.6, throw=False).q[-1, 0]
 
     closed = jax.grad(lambda e: bouncing_ball.motion(jnp.asarray(0.6), h=1.0, e=e)[0])(0.5)
-    np.testing.assert_allclose(jax.jit(jax.grad(height))(0.5), closed, rtol=1e-6)
+    gradient = jax.jit(jax.grad(height))
+    np.testing.assert_allclose(gradient(0.5), closed, rtol=1e-6)
+    # Contacts without friction have arrays of no entries, which are no reason against a kernel.
+    assert gradient.lower(0.5).as_text().count(_MARK) == 2
+
+
+def test_runs_that_are_made_again_are_kernels(pendulum):
+    damped = jms.Scene(pendulum.lagrangian, params=pendulum.params, effects=(jms.Friction(jms.Viscous(0.1)),))
+    for scene, read in (
+        (bouncing_ball.scene(e=0.5), lambda run: run.events.t),
+        (damped, lambda run: run.energy.dissipated),
+    ):
+        lowered = jax.jit(lambda q0, scene=scene, read=read: read(jms.simulate(scene, q0, [0.0], 0.6, throw=False)))
+        # The motion is not asked for, so that the run without events or work beside it is dropped.
+        assert lowered.lower(jnp.ones(1)).as_text().count(_MARK) == 1
+
+
+@pytest.mark.parametrize(
+    ("function", "args"),
+    [
+        pytest.param(lambda x, none: x + jnp.sum(none), (X, np.ones((0, 2))), id="argument"),
+        pytest.param(lambda x, none: (2 * x, none), (X, np.ones((0, 2), int)), id="result"),
+        pytest.param(lambda x, none: 2 * x, (X, np.ones(0, np.int32)), id="of no use"),
+    ],
+)
+def test_arrays_of_no_entries_are_no_reason_against_a_kernel(function, args):
+    found, marked = _compiled(function, *args)
+    assert marked
+    jax.tree.map(np.testing.assert_array_equal, found, function(*map(jnp.asarray, args)))
 
 
 @pytest.fixture
