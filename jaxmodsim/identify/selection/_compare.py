@@ -28,7 +28,7 @@ from ..model._parameters import split_entries
 from ..uncertainty._fit import fit, fit_law
 from ..uncertainty._result import FitResult
 from ._comparison import Comparison, CrossValidated, Part, comparison_of
-from ._opening import after, begin, check_lengths, counting, pinned, sample_counts
+from ._opening import after, begin, check_lengths, counting, pinned, sample_counts, shown_starts, unknown_starts
 
 # Called after each iteration with the name of the model, the number of the fold that is held back (None: nothing is),
 # the number of the iteration and the root mean square of the residual.
@@ -120,10 +120,10 @@ def compare(
     """Fit several models to the same records, and judge each by its error on what it was not fitted to.
 
     Each record is cut into `folds` windows. In turn one window of each record is held back: the model is fitted to the
-    others, every window from a start state (q0, qd0) of its own, then run over the window that was held back with these
-    parameters. Its start is fitted to its first samples: 20, or as many more as show the velocity to 0.2 % of the speed
-    of the record, a twentieth of them at most. The others are judged. The error with a start that is fitted to all of
-    them stands beside it and judges nothing. The states of friction laws where a window begins are those of the fit to
+    others, then run over the window that was held back with these parameters. Every window starts from a state that its
+    first samples show: 20, or as many more as show the velocity to 0.2 % of the speed of the record, a twentieth at
+    most. The other samples of what was held back are judged. The error with a start that is fitted to all of them
+    stands beside it and judges nothing. The states of friction laws where a window begins are those of the fit to
     whole records. With `hold_out` the model is fitted to `records`, and run over the whole of each of those in the same
     way.
 
@@ -357,9 +357,13 @@ def _validate_scene(
     problem = _apart(scene, tuple(windows), _reached(search, asked.records, asked.folds), search, asked)
     fold = np.arange(problem.count) % asked.folds
     block = np.broadcast_to(fold[:, None], problem.runs.t.shape)
-    everything = _finished(solve(problem, _at(problem, search), asked.options(name, None)))
+    # Windows start as their first samples show. Free starts would take up errors of the model in the windows that are
+    # fitted, and the parameters would then not fit a window whose start does not.
+    x, options = _at(problem, search), asked.options(name, None)
+    tied = shown_starts(problem, _finished(begin(pinned(problem, x, result), x, options)))
+    everything = _finished(solve(tied, x, options))
     parts = [
-        _held_back(problem, everything.state.x, result, block == k, block, asked.options(name, k))
+        _held_back(tied, everything.state.x, result, block == k, block, asked.options(name, k))
         for k in range(asked.folds)
     ]
     held, fitted = zip(*parts, strict=True)
@@ -390,7 +394,7 @@ def _evaluated(
 
     Of the samples that count; behind the first ones, where there are starts.
     """
-    fixed = pinned(problem, x, result)
+    fixed = unknown_starts(pinned(problem, x, result))
     if not problem.local:
         search = _finished(solve(fixed, x, options))
         return _parts(search.problem, search.state, block), ()
@@ -434,7 +438,8 @@ def _apart(scene: Scene, records: tuple[Record, ...], starts: State, search: Sea
     free = (*search.problem.free.names, "q0", "qd0")
     problem = prepare(scene, records, free, asked.settings(scene, starts.q, starts.qd)).problem
     noise = {name: search.problem.noise.get(name, level) for name, level in problem.noise.items()}
-    return eqx.tree_at(lambda p: (p.base, p.noise), problem, (starts, noise))
+    known = {name: on_device(np.zeros((problem.count, len(problem.local)))) for name in list(noise)[:1]}
+    return eqx.tree_at(lambda p: (p.base, p.noise), replace(problem, known=known), (starts, noise))
 
 
 def _reached(search: SearchResult, records: tuple[Record, ...], folds: int) -> State:

@@ -17,6 +17,8 @@ from ..uncertainty._result import FitResult
 LEAST, _ERROR, _MOST = 20, 0.002, 0.05
 # Standard error of the slope at the start of a parabola through n samples: so many noise levels over n^1.5 intervals.
 _SLOPE = 192.0**0.5
+# Largest weight of a start that is shown, which holds it, and least noise.
+_STIFF, _TINY = 1e6, float(np.finfo(float).tiny)
 
 
 def sample_counts(runs: Runs) -> Int[np.ndarray, "runs 1"]:
@@ -69,6 +71,39 @@ def counting(problem: FitProblem, mask: np.ndarray, *, slips: bool = True) -> Fi
 def begin(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> SearchResult:
     """Search for the states at the first samples with these samples alone; parameters must be pinned or none."""
     return solve(counting(problem, opening(problem.runs), slips=False), x, options)
+
+
+def shown_starts(problem: FitProblem, begun: SearchResult) -> FitProblem:
+    """The problem whose states at the first samples are what `begin` found, within the errors of that.
+
+    These errors are those of the noise from sample to sample of the first channel. What the model misses is larger, and
+    a start with errors of that size would take it up.
+    """
+    runs, local = problem.count, len(problem.local)
+    name = next(iter(problem.known))
+    own = np.asarray(begun.state.jacobian, float)[:, len(problem.free.names) :]
+    seen, noise = np.asarray(problem.runs.measured[name]), float(problem.noise[name])
+    counts = np.asarray(problem.runs.weight[name]) > 0
+    weights = np.zeros((runs, local))
+    for run in range(runs):
+        errors = start_errors_of(own[:, run * local : (run + 1) * local])
+        level = max(sample_noise(seen[run][counts[run]]), _TINY)
+        weights[run] = noise**2 / (errors * level)
+    known = {**problem.known, name: on_device(np.minimum(weights, _STIFF * noise))}
+    return eqx.tree_at(lambda p: (p.base, p.known), problem, (problem.starts(begun.state.x), known))
+
+
+def unknown_starts(problem: FitProblem) -> FitProblem:
+    """The problem whose states at the first samples are free."""
+    return eqx.tree_at(lambda p: p.known, problem, {name: 0 * each for name, each in problem.known.items()})
+
+
+def start_errors_of(jacobian: Float[np.ndarray, "rows local"]) -> Float[np.ndarray, " local"]:
+    """Standard errors of a start from the Jacobian of its residual; infinite of numbers without effect."""
+    size = np.linalg.norm(jacobian, axis=0)
+    scaled = jacobian / np.where(size > 0, size, 1.0)
+    error = np.sqrt(np.diag(np.linalg.pinv(scaled.T @ scaled, rcond=1e-12, hermitian=True)))
+    return np.where(size > 0, error / np.where(size > 0, size, 1.0), np.inf)
 
 
 def after(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> tuple[FitProblem, SearchState]:

@@ -18,7 +18,7 @@ from ..estimate._search import SearchOptions, channels_seen, solve
 from ..model._engines import DELAY, EventEngine, ReplayEngine
 from ..model._parameters import FreeParameters
 from ..uncertainty._result import FitResult
-from ._opening import begin, check_lengths, opening
+from ._opening import begin, check_lengths, opening, start_errors_of
 
 _Start: TypeAlias = ArrayLike | Sequence[ArrayLike] | None
 # Standard errors beyond which a fitted start is no longer what was measured.
@@ -131,7 +131,7 @@ def score(result: FitResult, record: Record, *, q0: _Start = None, qd0: _Start =
     if q0 is None:
         check_lengths((record,), len(alone.local))
         counts, shown = ~opening(alone.runs)[0, : len(record.t)], begin(alone, x, SearchOptions())
-        x, errors = shown.state.x, _errors(np.asarray(shown.state.jacobian))
+        x, errors = shown.state.x, start_errors_of(np.asarray(shown.state.jacobian))
     found = _scored(record, channels_seen(alone, x), counts, alone.starts(x))
     best = solve(alone, x, SearchOptions())
     start = _scored(record, channels_seen(alone, best.state.x), counts, alone.starts(best.state.x))
@@ -141,14 +141,6 @@ def score(result: FitResult, record: Record, *, q0: _Start = None, qd0: _Start =
     assert start.qd0 is not None
     fitted = StartFitted(rmse=start.rmse, q0=start.q0, qd0=start.qd0, away=away, ending=best.ending)
     return dataclasses.replace(found, opening=int(np.sum(~counts)), start_fitted=fitted)
-
-
-def _errors(jacobian: Float[np.ndarray, "rows local"]) -> Float[np.ndarray, " local"]:
-    """Standard errors of a start from the Jacobian of its residual; infinite of numbers without effect."""
-    size = np.linalg.norm(jacobian, axis=0)
-    scaled = jacobian / np.where(size > 0, size, 1.0)
-    error = np.sqrt(np.diag(np.linalg.pinv(scaled.T @ scaled, rcond=1e-12, hermitian=True)))
-    return np.where(size > 0, error / np.where(size > 0, size, 1.0), np.inf)
 
 
 def _check(record: Record, problem: FitProblem) -> None:
