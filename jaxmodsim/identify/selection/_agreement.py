@@ -212,6 +212,7 @@ class _Fits(NamedTuple):
         common = [k for k in np.flatnonzero(known).tolist() if k not in varying]
         count, last = len(self.values), len(varying) - 1
         scale = np.sqrt(np.sum(np.diagonal(self.information, axis1=1, axis2=2), axis=0))
+        scale = np.where(scale > 0, scale, 1.0)
         scaled = self.information / np.outer(scale, scale)
         to_varying = np.linalg.solve(scaled[:, varying][:, :, varying], scaled[:, varying][:, :, common])
         left = scaled[:, common][:, :, common] - scaled[:, common][:, :, varying] @ to_varying
