@@ -63,11 +63,13 @@ def _effects(effects: Any) -> tuple[AbstractEffect, ...]:
         raise ValueError(f"effects must be a tuple of effects, as in effects=(effect,), but got {effects!r}.")
     for effect in effects:
         if not isinstance(effect, AbstractEffect):
-            remedy = "It goes into constraints=(...)" if isinstance(effect, AbstractConstraint) else ""
-            remedy = "A friction law goes into Friction(law)" if isinstance(effect, AbstractLaw) else remedy
+            remedy = ""
+            if isinstance(effect, AbstractConstraint):
+                remedy = " It goes into constraints=(...)."
+            elif isinstance(effect, AbstractLaw):
+                remedy = " A friction law goes into Friction(law)."
             raise ValueError(
-                "effects must hold AppliedForce, Friction or Switch objects, but it holds"
-                f" {f'{effect!r}. {remedy}'.rstrip('. ')}."
+                f"effects must hold AppliedForce, Friction or Switch objects, but it holds {effect!r}.{remedy}"
             )
     return tuple(effects)
 

@@ -14,6 +14,7 @@ import pytest
 
 from jaxmodsim import (
     AppliedForce,
+    Contact,
     Coulomb,
     DeadZone,
     Friction,
@@ -153,6 +154,10 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
     "law without Friction": (
         lambda: Scene(free, effects=cast_any((Viscous(1.0),))),
         r"effects must hold AppliedForce, Friction or Switch objects.*goes into Friction\(law\)",
+    ),
+    "contact among effects": (
+        lambda: Scene(free, effects=cast_any((Contact(lambda t, q, p: q[0]),))),
+        r"(?s)effects must hold AppliedForce, Friction or Switch objects.*It goes into constraints=\(\.\.\.\)\.",
     ),
     "same name": (
         lambda: Scene(free, effects=(AppliedForce(push, name="x"), Friction(Viscous(1.0), name="x"))),

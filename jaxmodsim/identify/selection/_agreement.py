@@ -110,11 +110,11 @@ def agreement(result: FitResult, *, level: float = 0.05, max_steps: int = 400) -
     least probability differs if that is below `level` over the number of parameters left to test (Bonferroni); from
     then on it is free, and the others are tested again.
 
-    Differences between records, in standard errors, are held against their distribution (F, one degree of freedom
-    less than there are records, and one less than there are blocks of samples from whose scatter each error comes;
-    blocks are longer where the residual remembers for long). The standard
-    deviation between records is the one with which this sum, errors and deviation together, comes to its expectation,
-    and the ends of its interval those with which it comes to its quantiles.
+    The sum of squared differences between records, in standard errors, is held against its distribution (F, one degree
+    of freedom less than there are records, and one less than there are blocks of samples from whose scatter each error
+    comes; blocks are longer where the residual remembers for long). The standard deviation between records is the one
+    with which the sum of squared distances from the weighted mean, errors and deviation together, comes to its
+    expectation, and the ends of its interval those with which it comes to its quantiles.
 
     **Arguments:**
 

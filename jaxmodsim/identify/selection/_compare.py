@@ -438,6 +438,7 @@ def _apart(scene: Scene, records: tuple[Record, ...], starts: State, search: Sea
     free = (*search.problem.free.names, "q0", "qd0")
     problem = prepare(scene, records, free, asked.settings(scene, starts.q, starts.qd)).problem
     noise = {name: search.problem.noise.get(name, level) for name, level in problem.noise.items()}
+    # Nothing is known of them yet; with weights of zero what is known later changes arrays alone, and compiles nothing.
     known = {name: on_device(np.zeros((problem.count, len(problem.local)))) for name in list(noise)[:1]}
     return eqx.tree_at(lambda p: (p.base, p.noise), replace(problem, known=known), (starts, noise))
 

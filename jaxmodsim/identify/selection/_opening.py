@@ -17,7 +17,7 @@ from ..uncertainty._result import FitResult
 LEAST, _ERROR, _MOST = 20, 0.002, 0.05
 # Standard error of the slope at the start of a parabola through n samples: so many noise levels over n^1.5 intervals.
 _SLOPE = 192.0**0.5
-# Largest weight of a start that is shown, which holds it, and least noise.
+# Largest inverse standard deviation of a start that is shown, which holds it, and least noise.
 _STIFF, _TINY = 1e6, float(np.finfo(float).tiny)
 
 
@@ -88,8 +88,8 @@ def shown_starts(problem: FitProblem, begun: SearchResult) -> FitProblem:
     for run in range(runs):
         errors = start_errors_of(own[:, run * local : (run + 1) * local])
         level = max(sample_noise(seen[run][counts[run]]), _TINY)
-        weights[run] = noise**2 / (errors * level)
-    known = {**problem.known, name: on_device(np.minimum(weights, _STIFF * noise))}
+        weights[run] = noise**2 / np.maximum(errors * level, noise / _STIFF)
+    known = {name: on_device(weights)}
     return eqx.tree_at(lambda p: (p.base, p.known), problem, (problem.starts(begun.state.x), known))
 
 
