@@ -53,8 +53,8 @@ class EnergyAudit:
 def energy_audit(run: Trajectory) -> EnergyAudit:
     """Account for the energy of a run, effect by effect.
 
-    Compiles and runs the scene once more with the work integrals beside the state, and where it has modes once more
-    with a log of the events: an audit that is not asked for costs nothing. Sums of it are in `run.energy`.
+    Compiles and runs the scene once more with the work integrals beside the state, unless `simulate` was called with
+    `record=("energy",)`: an audit that is not asked for costs nothing. Sums of it are in `run.energy`.
 
     **Arguments:**
 

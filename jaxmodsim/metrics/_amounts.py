@@ -63,7 +63,7 @@ def _final(run: Trajectory, of: str) -> Array:
 def dissipated(effect: str | None = None) -> Metric:
     """Energy [J] lost in friction from t0 to the last saved time; see `Trajectory.energy`.
 
-    Runs the scene once more, with the work integrals beside it.
+    Runs the scene once more, with the work integrals beside it, unless the run recorded its energy.
 
     ```python
     metrics.dissipated("friction")(run), metrics.dissipated()(run)

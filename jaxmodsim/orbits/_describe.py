@@ -185,7 +185,8 @@ def _extremes(runs: list[Trajectory], sign: float, strikes: list[tuple[float, st
     root = np.sqrt(np.maximum(u * u - 3.0 * v * b, 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
         s = np.where(u < 0, b / (root - u), (-u - root) / (3.0 * v))
-    inside = (s > 0) & (s < 1) & (h > 0)
+    resolution = _before(t[-1])
+    inside = (s > 0) & (s < 1) & (h > 2.0 * resolution)  # between the states before and after an event is no motion
     s = np.where(inside, s, 0.0)
     values = a + s * (b + s * (u + s * v))
     values = np.concatenate([values, q[-1:]])
@@ -194,7 +195,7 @@ def _extremes(runs: list[Trajectory], sign: float, strikes: list[tuple[float, st
         acceleration = np.where(inside, (2.0 * u + 6.0 * v * s) / h**2, np.inf)
     acceleration = np.concatenate([acceleration, np.full((1, q.shape[1]), np.inf)])
     place = np.argmax(values, axis=0), np.arange(q.shape[1])
-    time, resolution = at[place], _before(t[-1])
+    time = at[place]
     hit = [next((x for x in strikes if abs(x[0] - each) <= 2.0 * resolution), None) for each in time]
     time = np.array([each if x is None else x[0] - resolution for each, x in zip(time, hit, strict=True)])
     struck = tuple("" if x is None else x[1] for x in hit)

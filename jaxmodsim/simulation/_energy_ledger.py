@@ -4,14 +4,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from ..mechanics import energies
-from ..scene import Power, Scene, State
+from ..scene import Scene, State
 from ..solvers import EventLog
-from ._outcome import SUCCESS, SimulationError, outcome_messages
-from ._run_request import is_known
-from ._solve import RunInputs, RunOptions, initial_state, solve_audited, solve_start
+from ._integrated_system import Work
+from ._solve import RunInputs, initial_state
 
 
 class EnergyLedger(NamedTuple):
@@ -40,32 +39,9 @@ class EnergyLedger(NamedTuple):
         return total - sum(self.supplied.values(), jnp.zeros_like(total))
 
 
-def ledger(
-    inputs: RunInputs, options: RunOptions, t: Float[Array, " time"], y: State, code: Int[Array, ""]
-) -> EnergyLedger:
-    """Ledger of a run whose states at the times `t` are `y`. Runs it once more, with the work integrals beside it.
-
-    **Arguments:**
-
-    - `code`: how the run ended.
-
-    **Raises:**
-
-    - `SimulationError` if the run reached t1 and that with the integrals does not, where rounding decides. Inside
-      compiled code the energies are infinite from there on instead.
-    """
-    work, ended = solve_audited(inputs, options)
-    if is_known(code, ended) and int(code) == SUCCESS != int(ended):
-        reason = outcome_messages(inputs.scene, inputs.q0.shape[0])[int(ended)]
-        raise SimulationError(
-            "The run reached t1, but repeated with the work integrals beside it, it does not, so its energies are not"
-            f" known: {reason}"
-        )
-    return _ledger(inputs, t, y, work)
-
-
 @jax.jit
-def _ledger(inputs: RunInputs, t: Array, y: State, work: dict[str, Power]) -> EnergyLedger:
+def ledger(inputs: RunInputs, t: Float[Array, " time"], y: State, work: Work) -> EnergyLedger:
+    """Ledger of a run whose states and work at the times `t` are `y` and `work`."""
     scene = inputs.scene
 
     def parts(t: Array, y: State) -> tuple[Array, Array, dict[str, Array]]:
@@ -81,20 +57,17 @@ def _ledger(inputs: RunInputs, t: Array, y: State, work: dict[str, Power]) -> En
     return EnergyLedger(kinetic, potential, stored, supplied, dissipated, _energy(scene, inputs.t0, first))
 
 
+@jax.jit
 def event_losses(
-    inputs: RunInputs, options: RunOptions, t: Float[Array, " time"], log: EventLog | None
+    inputs: RunInputs, t: Float[Array, " time"], start: State, log: EventLog | None
 ) -> Float[Array, " time"]:
     """Energy [J] that was lost at events up to the times `t`, and at t0 where the state given was not admissible.
 
     **Arguments:**
 
+    - `start`: the state that the run began with.
     - `log`: of the events; None for a scene without modes.
     """
-    return _losses(inputs, t, solve_start(inputs, options), log)
-
-
-@jax.jit
-def _losses(inputs: RunInputs, t: Array, start: State, log: EventLog | None) -> Array:
     scene = inputs.scene
     lost = _energy(scene, inputs.t0, initial_state(inputs)) - _energy(scene, inputs.t0, start)
     losses = jnp.broadcast_to(lost, t.shape)

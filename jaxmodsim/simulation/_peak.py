@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from ._observe import find_series, read_series
 from ._run_request import is_known
-from ._solve import Nodes, solve, solve_nodes
+from ._solve import Nodes, solve
 from ._trajectory import Trajectory, trajectory
 
 # Steps of the run in which the peak is sought, those with the largest estimates, and samples in each of them.
@@ -32,7 +32,9 @@ def _between(run: Trajectory, name: str) -> Float[Array, ""]:
     """The largest magnitude within steps: a first repeat of the run says which steps, a second one samples these."""
     series = find_series(run, name)
     inputs = run.inputs._replace(ts=None)
-    nodes = solve_nodes(jax.lax.stop_gradient(inputs), replace(run.options, max_steps=_most_steps(run)), series)
+    plain = replace(run.options, log=0, audited=False)
+    nodes = solve(jax.lax.stop_gradient(inputs), replace(plain, max_steps=_most_steps(run), series=series)).nodes
+    assert nodes is not None
     nodes = jax.lax.stop_gradient(nodes)
     chosen = _largest(nodes)
     start, length = nodes.t[chosen], nodes.t[chosen + 1] - nodes.t[chosen]
@@ -43,7 +45,7 @@ def _between(run: Trajectory, name: str) -> Float[Array, ""]:
     ts = start[:, None] + share[None, :] * length[:, None]
     ts = jnp.clip(jax.lax.stop_gradient(ts), inputs.t0, run.t_end)
     near = run.inputs._replace(ts=jnp.ravel(ts))
-    samples = jnp.reshape(read_series(trajectory(near, run.options, solve(near, run.options)), series), ts.shape)
+    samples = jnp.reshape(read_series(trajectory(near, plain, solve(near, plain)), series), ts.shape)
     samples = jnp.where(within[:, None] & jnp.isfinite(samples), samples, 0.0)
     return jnp.max(jax.vmap(_vertex)(samples))
 

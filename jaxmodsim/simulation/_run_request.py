@@ -13,7 +13,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
-from .._core.arguments import as_flag, as_mapping, as_whole, check_real
+from .._core.arguments import as_flag, as_mapping, as_names, as_whole, check_real, did_you_mean
 from .._core.parameters import is_weak
 from .._core.speed import remark_on_single_precision
 from ..scene import Friction, Scene, check_step
@@ -23,6 +23,9 @@ from ._solve import RunInputs, RunOptions
 _Plugin = TypeVar("_Plugin")
 # Relative tolerance below which single precision does not reach.
 _SINGLE = 0.99e-6
+# Events that every run logs. Belt oscillator, 60 s with 108 events: 8, 16 and 64 entries take 4, 9 and 19 % of time.
+_LOGGED = 16
+_RECORDS = ("events", "energy")
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,7 @@ class RunRequest:
     max_events: int = 1024
     hold_chatter: bool = False
     project: bool = True
+    record: tuple[str, ...] = ()
 
     def checked(self) -> tuple[RunInputs, RunOptions]:
         """The numbers of the run, and what is compiled in.
@@ -71,7 +75,26 @@ class RunRequest:
             )
         adjoint_arrays, adjoint = _split(self.adjoint, dfx.AbstractAdjoint, "adjoint")
         inputs = inputs._replace(plugins=(solver_arrays, adjoint_arrays))
-        return inputs, RunOptions(solver, adjoint, max_steps, max_events, hold_chatter, project)
+        log, audited = _beside(self, inputs, max_events)
+        return inputs, RunOptions(solver, adjoint, max_steps, max_events, hold_chatter, project, log, audited)
+
+
+def _beside(asked: RunRequest, inputs: RunInputs, max_events: int) -> tuple[int, bool]:
+    """Entries of the log that the run writes, and whether it integrates work beside the motion.
+
+    A run whose numbers are known logs its first events. One that is differentiated would carry the log through its
+    derivatives.
+    """
+    record = as_names(asked.record, name="record")
+    for name in record:
+        if name not in _RECORDS:
+            raise ValueError(
+                f"record holds {name!r}, which is none of {', '.join(_RECORDS)}{did_you_mean(name, _RECORDS)}."
+            )
+    audited = "energy" in record
+    if "events" in record or (audited and asked.scene.contacts):  # what impacts lose is read from the log
+        return max_events, audited
+    return min(_LOGGED, max_events) if is_known(*jtu.tree_leaves(inputs)) else 0, audited
 
 
 def is_known(*values: object) -> bool:

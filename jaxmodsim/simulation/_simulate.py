@@ -52,6 +52,7 @@ def simulate(
     max_events: int = 1024,
     hold_chatter: bool = False,
     project: bool = True,
+    record: tuple[str, ...] = (),
     throw: bool = True,
 ) -> Trajectory:
     """Run a scene from `t0` to `t1`.
@@ -92,13 +93,16 @@ def simulate(
       nothing. `diffrax.RecursiveCheckpointAdjoint` makes steps again from checkpoints: their rounding differs from that
       of the run, and through events derivatives lose digits. Not `diffrax.BacksolveAdjoint`.
     - `max_steps`: limit of the number of steps. Derivatives set memory aside for the state before each of them.
-    - `max_events`: limit of the number of instants at which set-valued laws change modes. Inside `jax.jit`
-      `run.events` has as many entries for each such law, so a smaller one is faster there.
+    - `max_events`: limit of the number of instants at which set-valued laws change modes. Inside `jax.jit`, and where
+      events are recorded, `run.events` has as many entries for each such law, so a smaller one is faster there.
     - `hold_chatter`: whether an element whose mode changes accumulate is held in stick, with whatever force that takes,
       be it above the limit, instead of ending the run.
     - `project`: whether the state is moved onto the constraints after every step, and wherever it is kept, by the
       smallest changes in the metric of the masses. Without, constraints hold for the accelerations alone and drift with
       the error of integration, but for their own `stabilise`.
+    - `record`: `"events"`, `"energy"` or both: what the run records beside the motion. What it does not record takes
+      another run when `run.events` or `run.energy` is read first. Outside of `jax.jit`, `jax.vmap` and `jax.grad` every
+      run records its first 16 events. With `"energy"` the steps are chosen for the work, too.
     - `throw`: whether a run that ends early raises; otherwise `run.result` says how it ended, and what was computed
       is kept.
 
@@ -134,6 +138,7 @@ def simulate(
         max_events,
         hold_chatter,
         project,
+        record,
     ).checked()
     if throw and scene.constraints:
         _check_initial_state(inputs)

@@ -91,6 +91,12 @@ class RunOptions:
     max_events: int
     hold_chatter: bool
     project: bool
+    # Entries of the log of events, of which later ones are counted alone.
+    log: int = 0
+    # Whether the work integrals run beside the motion.
+    audited: bool = False
+    # A number that is kept at the ends of all steps.
+    series: Series | None = None
 
 
 class Nodes(NamedTuple):
@@ -102,17 +108,22 @@ class Nodes(NamedTuple):
 
 
 class RunOutput(NamedTuple):
-    """What a run gives: saved times and states, the outcome, the end that was reached, and the numbers of steps."""
+    """What a run gives: saved times and states, the outcome, the end that was reached, and the numbers of steps.
+
+    And what its options ask for beside that: a log of events, the work at the saved times, a series; else None.
+    """
 
     t: Float[Array, " time"]
-    # A `State`; in an audited run a pair of it and `Work`.
-    y: PyTree
+    y: State
     # Of the set-valued friction elements, shape `[time, elements]`; None where there are none.
     mode: Array | None
     code: Int[Array, ""]
     # None where the end alone is kept, and so is in `t` and `y` already: every output of compiled code costs time.
     end: tuple[Float[Array, ""], State] | None
     stats: dict[str, Array]
+    log: EventLog | None
+    work: Work | None
+    nodes: Nodes | None
 
 
 def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolver:
@@ -157,7 +168,7 @@ def _error_control(inputs: RunInputs, solver: dfx.AbstractSolver) -> dfx.Abstrac
 
 
 def _solver(
-    solver: dfx.AbstractSolver, functions: RunFunctions, scene: Scene, options: RunOptions, log: int | None
+    solver: dfx.AbstractSolver, functions: RunFunctions, scene: Scene, options: RunOptions
 ) -> dfx.AbstractSolver:
     """`solver`, wrapped in what the scene needs: events, projections, signals."""
     if isinstance(solver, ImplicitFriction):
@@ -177,8 +188,8 @@ def _solver(
             rtol=functions.tolerances[0],
             enforce=True,
             event_mode=functions.event_mode if sum(functions.widths) > len(functions.widths) else None,
-            max_events=options.max_events if log is None else min(log, options.max_events),
-            log=log is not None,
+            max_events=options.max_events,
+            log=options.log,
         )
     if functions.projects or freeze_args is not None:
         return Projected(solver, functions.project if functions.projects else None, freeze_args)
@@ -229,10 +240,10 @@ class _Start(NamedTuple):
     first: Float[Array, ""]
 
 
-def _functions(inputs: RunInputs, options: RunOptions, audited: bool) -> RunFunctions:
+def _functions(inputs: RunInputs, options: RunOptions) -> RunFunctions:
     scene = inputs.scene
     return RunFunctions(
-        IntegratedSystem(audited, isinstance(options.solver, Gauss)),
+        IntegratedSystem(options.audited, isinstance(options.solver, Gauss)),
         _REST * inputs.atol,
         (inputs.rtol, inputs.atol),
         bool(scene.bilateral or scene.contacts) and options.project,
@@ -288,17 +299,12 @@ def _start_code(inputs: RunInputs, functions: RunFunctions, mode: Array | None, 
     return jnp.where(_well_posed(inputs), start, ILL_POSED)
 
 
-def _integrate(
-    inputs: RunInputs, options: RunOptions, audited: bool, log: int | None, series: Series | None
-) -> tuple[RunOutput, EventLog | None, Nodes | None]:
-    """Run diffrax; with modes only where the scene has them, with a log of that many events where one is wanted.
-
-    With a `series` also its nodes.
-    """
-    scene, exact = inputs.scene, bool(inputs.scene.mode_names)
-    functions = _functions(inputs, options, audited)
+def _integrate(inputs: RunInputs, options: RunOptions) -> RunOutput:
+    """Run diffrax; with modes only where the scene has them, with a log, work and a series only where asked for."""
+    scene, exact, series = inputs.scene, bool(inputs.scene.mode_names), options.series
+    functions = _functions(inputs, options)
     method, adjoint = _plugins(inputs, options, functions.system)
-    solver = _solver(method, functions, scene, options, log)
+    solver = _solver(method, functions, scene, options)
     y0, mode, rate, first = _start(inputs, functions, method.error_order(dfx.ODETerm(functions.plain_derivative)))
     controller = _controller(inputs, method)
     start = _start_code(inputs, functions, mode, rate)
@@ -319,7 +325,7 @@ def _integrate(
         return functions.observe(t, y, scene, mode, series)
 
     def last(t: Array, y: PyTree, scene: Scene) -> Any:
-        return saved(t, y, scene), ((y.events, y.status, y.fired), y.log) if exact else None
+        return saved(t, y, scene), ((y.events, y.status, y.fired), _motions(y.log)) if exact else None
 
     def integrate(first: Array, ts: Array | None) -> dfx.Solution:
         subs = [dfx.SubSaveAt(t1=True, fn=last)] + ([] if ts is None else [dfx.SubSaveAt(ts=ts, fn=saved)])
@@ -345,10 +351,10 @@ def _integrate(
     solution = unchecked(integrate, first, ts)
     assert solution.ts is not None
     assert solution.ys is not None
-    (rows, events), ending, history = solution.ys[0], None, None
+    (rows, events), ending, log = solution.ys[0], None, None
     stats = {name: solution.stats[name] for name in ("num_steps", "num_rejected_steps")}
     if exact:
-        (count, status, fired), history = jtu.tree_map(lambda x: x[0], events)
+        (count, status, fired), log = jtu.tree_map(lambda x: x[0], events)
         ending, stats["num_events"] = Ending(status, fired), count
     t = solution.ts[0]
     if ts is not None:
@@ -362,13 +368,20 @@ def _integrate(
         if ts is not None:  # an element that sticks under a load beyond its limit: an event was stepped over
             beyond = jnp.any(instants.stick_violation[1:] > _OVERLOAD, axis=1)
             missed = jnp.any(beyond & jnp.isfinite(t))
-    t_end, end_state = end[0], end[1][0] if audited else end[1]
-    ended = _ended(inputs, t_end, end_state, rate, end[2], solution.result, ending)
+    (y, work), (end_state, _) = (y, end[1]) if options.audited else ((y, None), (end[1], None))
+    ended = _ended(inputs, end[0], end_state, rate, end[2], solution.result, ending)
     code = jnp.where(starts, ended, start)
     if exact and not options.hold_chatter:
         code = jnp.where((code == SUCCESS) & missed, MISSED_EVENT, code)
-    output = RunOutput(t, y, modes, code, None if ts is None else (t_end, end_state), stats)
-    return output, history, None if series is None else Nodes(solution.ts[-1], *solution.ys[-1])
+    nodes = None if series is None else Nodes(solution.ts[-1], *solution.ys[-1])
+    return RunOutput(t, y, modes, code, None if ts is None else (end[0], end_state), stats, log, work, nodes)
+
+
+def _motions(log: EventLog | None) -> EventLog | None:
+    """A log without the work that an audited run integrates."""
+    if log is None or not isinstance(log.before[0], AugmentedState):
+        return log
+    return log._replace(before=(log.before[0].motion, log.before[1]), after=(log.after[0].motion, log.after[1]))
 
 
 def _ended(
@@ -407,17 +420,10 @@ def _kept(
     return t, y, modes, instants
 
 
-def _solved(
-    inputs: RunInputs, options: RunOptions, audited: bool = False, log: int | None = None, series: Series | None = None
-) -> tuple[RunOutput, EventLog | None, Nodes | None]:
-    """`_integrate`, with its derivatives, in one kernel each."""
-    return in_one_kernel(jax.jit(lambda inputs: _integrate(inputs, options, audited, log, series)), inputs)
-
-
 @partial(jax.jit, static_argnums=1)
 def solve(inputs: RunInputs, options: RunOptions) -> RunOutput:
-    """Run a scene."""
-    return _solved(inputs, options)[0]
+    """Run a scene; the run, and its derivatives, in one kernel each."""
+    return in_one_kernel(jax.jit(lambda inputs: _integrate(inputs, options)), inputs)
 
 
 def compiled_runs() -> int:
@@ -426,31 +432,8 @@ def compiled_runs() -> int:
 
 
 @partial(jax.jit, static_argnames=("options",))
-def solve_audited(inputs: RunInputs, options: RunOptions) -> tuple[Work, Int[Array, ""]]:
-    """Run a scene again with the integrals of power beside it: the work at the saved times, and how that run ended."""
-    solved, _, _ = _solved(inputs, options, audited=True)
-    return solved.y[1], solved.code
-
-
-@partial(jax.jit, static_argnames=("options",))
 def solve_start(inputs: RunInputs, options: RunOptions) -> State:
     """The state a run begins with: on the constraints, and at rest where elements stick."""
-    functions = _functions(inputs, options, False)
+    functions = _functions(inputs, options)
     y0 = _start(inputs, functions, 1).y
     return functions.system.state(inputs.t0, y0, inputs.scene.bind_time(inputs.t0))
-
-
-@partial(jax.jit, static_argnames=("options", "size"))
-def solve_logged(inputs: RunInputs, options: RunOptions, size: int) -> EventLog:
-    """Run a scene again with a log of `size` events beside it."""
-    _, log, _ = _solved(inputs, options, log=size)
-    assert log is not None
-    return log
-
-
-@partial(jax.jit, static_argnames=("options", "series"))
-def solve_nodes(inputs: RunInputs, options: RunOptions, series: Series) -> Nodes:
-    """Run a scene again with a number at the ends of its steps beside it."""
-    _, _, nodes = _solved(inputs, options, series=series)
-    assert nodes is not None
-    return nodes

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -22,10 +22,10 @@ from ..solvers import EventLog
 from ._accuracy import Accuracy
 from ._columns import Columns, columns
 from ._energy_ledger import EnergyLedger, event_losses, ledger
-from ._integrated_system import Series
-from ._outcome import RunResult, outcome_messages
+from ._integrated_system import Series, Work
+from ._outcome import SUCCESS, RunResult, SimulationError, outcome_messages
 from ._run_request import is_known
-from ._solve import RunInputs, RunOptions, RunOutput, solve_logged
+from ._solve import RunInputs, RunOptions, RunOutput, solve, solve_start
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -93,16 +93,17 @@ class Energy(NamedTuple):
 
 @partial(
     jtu.register_dataclass,
-    data_fields=("t", "q", "qd", "z", "modes", "stats", "code", "end", "inputs"),
+    data_fields=("t", "q", "qd", "z", "modes", "stats", "code", "end", "inputs", "log", "work"),
     meta_fields=("options", "accuracy"),
 )
 @dataclass(frozen=True, repr=False)
 class Trajectory(AbstractReadable):
     """A run of a scene. Everything but the motion itself is computed when it is asked for.
 
-    What is not saved along a run takes another run: events and energies. Each such run is made once, and its results
-    stay with this object, not with copies of it, such as `jax.jit` and `jax.tree.map` make. A branch or a loop in
-    `jax.jit` (`jax.lax.cond`, `jax.lax.scan`) that reads them first makes that run for itself.
+    What the run has not recorded takes another run: more than its first 16 events, and energies. Each such run is made
+    once, and its results stay with this object, not with copies of it, such as `jax.jit` and `jax.tree.map` make. A
+    branch or a loop in `jax.jit` (`jax.lax.cond`, `jax.lax.scan`) that reads them first makes that run for itself.
+    `simulate(..., record=("events", "energy"))` records them in the run.
 
     - `t`: times [s], shape `[time]`; `ts`, or the end alone. Times that an early end left unreached are infinite.
     - `q`, `qd`: coordinates and velocities, shape `[time, dof]`.
@@ -125,6 +126,9 @@ class Trajectory(AbstractReadable):
     end: Float[Array, "..."] | None
     inputs: RunInputs
     options: RunOptions
+    # What the run has recorded: a log of its first events, and the work at the saved times.
+    log: EventLog | None = None
+    work: Work | None = None
     accuracy: Accuracy | None = None
     # What was read from repeats of the run, by name; no part of the pytree.
     _repeats: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
@@ -192,7 +196,7 @@ class Trajectory(AbstractReadable):
 
     @property
     def events(self) -> Events:
-        """Mode changes along the run; the first reading runs the scene once more, with a log beside it."""
+        """Mode changes along the run; where the run logged fewer, the first reading runs the scene once more."""
         self._one_run("events")
         if self.modes is None:
             none = jnp.zeros(0, int)
@@ -241,31 +245,28 @@ class Trajectory(AbstractReadable):
 
     @property
     def ledger(self) -> EnergyLedger:
-        """Energies by their places; the first reading runs the scene once more, with the work integrals beside it.
+        """Energies by their places, from the work integrals; the first reading runs the scene once more for these.
 
         What each effect brought in and lost; `jaxmodsim.energy_audit` adds them up.
         """
         self._one_run("ledger")
-        return self._once("ledger", lambda: ledger(self.inputs, self.options, self.t, self._states(), self.code))
+        return self._once("ledger", lambda: ledger(self.inputs, self.t, self._states(), self._audited()[0]))
 
     @property
     def event_losses(self) -> Float[Array, " time"]:
         """Energy [J] lost since t0 at events; needs the run of `events`."""
         self._one_run("event_losses")
-        return event_losses(self.inputs, self.options, self.t, None if self.modes is None else self._log())
+        return self._lost(None if self.modes is None else self._log())
 
     @property
     def energy(self) -> Energy:
-        """Energies and their balance along the run; needs the run of `ledger`, and with contacts that of `events`.
-
-        What is lost in impacts is dissipated.
-        """
+        """Energies and their balance along the run, as `ledger` has them; what is lost in impacts is dissipated."""
         self._one_run("energy")
         book, zero = self.ledger, jnp.zeros_like(self.t)
         stored, supplied, dissipated = (
             sum(each.values(), zero) for each in (book.stored, book.supplied, book.dissipated)
         )
-        lost = self.event_losses if self.scene.contacts else zero
+        lost = self._lost(self._audited()[1]) if self.scene.contacts else zero
         return Energy(book.kinetic, book.potential, stored, supplied, dissipated + lost, book.balance + lost)
 
     @property
@@ -288,9 +289,40 @@ class Trajectory(AbstractReadable):
         return size if not is_known(count) else min(size, 1 << max(int(count), 8).bit_length())
 
     def _log(self) -> EventLog:
+        """The log of all events: that of the run, if it has room for them, or of another run."""
+        log, count = self.log, self.stats["num_events"]
+        if log is not None:
+            entries = log.t.shape[0]
+            if entries >= self.options.max_events or (is_known(count) and int(count) <= entries):
+                return log
         # Events do not depend on saved times, which are checked already where they are known.
         inputs = self.inputs._replace(ts=None) if is_known(self.inputs.ts) else self.inputs
-        return self._once("log", lambda: solve_logged(inputs, self.options, self.log_size))
+        return self._once("log", lambda: solve(inputs, replace(self.options, log=self.log_size, audited=False)).log)
+
+    def _audited(self) -> tuple[Work, EventLog | None]:
+        """The work at the saved times, and with contacts the log of all events, from which their losses are read.
+
+        Of this run where it recorded them, else of another one.
+
+        **Raises:**
+
+        - `SimulationError` if this run reached t1 and that one does not, where rounding decides. Inside compiled code
+          the work is infinite from there on instead.
+        """
+        if self.work is not None:
+            return self.work, self.log
+        options = replace(self.options, log=self.log_size if self.scene.contacts else 0, audited=True)
+        again = self._once("audited", lambda: solve(self.inputs, options))
+        if is_known(self.code, again.code) and int(self.code) == SUCCESS != int(again.code):
+            raise SimulationError(
+                "The run reached t1, but repeated with the work integrals beside it, it does not, so its energies are"
+                f" not known: {outcome_messages(self.scene, self.q.shape[-1])[int(again.code)]}"
+            )
+        assert again.work is not None
+        return again.work, again.log
+
+    def _lost(self, log: EventLog | None) -> Float[Array, " time"]:
+        return event_losses(self.inputs, self.t, solve_start(self.inputs, self.options), log)
 
     def _once(self, name: str, make: Callable[[], _Value]) -> _Value:
         """A value that takes a repeat of the run, made where it is not there yet."""
@@ -335,7 +367,8 @@ def _(run: Trajectory) -> Table:
 def trajectory(inputs: RunInputs, options: RunOptions, solved: RunOutput) -> Trajectory:
     """The run that was solved."""
     y, end = solved.y, None if solved.end is None else solved.end[0]
-    return Trajectory(solved.t, y.q, y.qd, y.z, solved.mode, solved.stats, solved.code, end, inputs, options)
+    motion = solved.t, y.q, y.qd, y.z, solved.mode
+    return Trajectory(*motion, solved.stats, solved.code, end, inputs, options, solved.log, solved.work)
 
 
 @jax.jit

@@ -71,6 +71,7 @@ def fitted(run_command, files, tmp_path_factory):
     return out, text
 
 
+@pytest.mark.deep
 def test_several_records_are_fitted_together_and_a_held_out_one_is_scored(fitted):
     out, text = fitted
     found = json.loads((out / "fit.json").read_text())

@@ -54,6 +54,7 @@ def comparison() -> Comparison:
     return compare(candidates(), _record(0), q0=[0.0], limits=LIMITS)
 
 
+@pytest.mark.deep
 def test_the_truth_is_named_and_what_has_more_parameters_is_not(comparison):
     assert comparison.simplest == "stribeck"
     assert set(comparison.results) == set(candidates())

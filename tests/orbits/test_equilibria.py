@@ -78,6 +78,7 @@ def test_steady_sliding_loses_its_stability_where_damping_and_slope_cancel(slidi
     assert "unstable: an eigenvalue of" in str(sliding.orbits[-1])
 
 
+@pytest.mark.deep
 def test_orbits_from_there_turn_back_where_they_come_to_stick(sliding):
     branch = jms.continue_orbits(
         belt(jms.Stribeck(**LAW), 1.0), sliding.points[0], SPEED, (1.0, 0.3), step=0.5, rtol=1e-9

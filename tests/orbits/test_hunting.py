@@ -22,6 +22,7 @@ def run_on(orbit, kd):
     return 0.5 * np.ptp(np.asarray(run.q[:, 0]))
 
 
+@pytest.mark.deep
 def test_hunting_vanishes_where_simulations_cease_to_hunt(found):
     last = max((each for each in found.branch.orbits if each.stable), key=lambda each: float(each.period))
     assert run_on(last, 0.999 * found.vanishes) > 0.9 * float(last.amplitude[0])
@@ -30,6 +31,7 @@ def test_hunting_vanishes_where_simulations_cease_to_hunt(found):
     assert f"vanishes at kd = {found.vanishes:.8g}" in str(found)
 
 
+@pytest.mark.deep
 def test_limit_cycle_of_an_axis(found):
     assert found.orbit.stable
     # Between two slips the integral turns from one level of stiction to the other, at the rate of the error.

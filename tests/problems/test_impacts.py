@@ -47,6 +47,7 @@ def test_newtons_cradle():
         newtons_cradle.scene(8)
 
 
+@pytest.mark.deep
 def test_a_block_rocks_as_housner_says():
     start, p = 0.02, rocking_block.PARAMS
     quarter = float(rocking_block.quarter_period(start))
@@ -64,6 +65,7 @@ def test_a_block_rocks_as_housner_says():
     np.testing.assert_allclose(energy, jnp.asarray([begun, begun, kept, kept]), rtol=1e-7)
 
 
+@pytest.mark.deep
 def test_a_gripper_catches_what_falls():
     d, v0 = gripper.PARAMS["d"], gripper.PARAMS["v0"]
 

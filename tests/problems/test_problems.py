@@ -434,6 +434,7 @@ def test_four_bar_stays_closed() -> None:
     np.testing.assert_allclose(energy, energy[0], rtol=1e-7)
 
 
+@pytest.mark.deep
 def test_runs_of_the_rolling_disc() -> None:
     """A steady circle closes; any other motion rolls on and keeps its energy."""
     scene, turn, lean = problems.rolling_disc.scene(**DISC), -1.3, 0.4
@@ -487,6 +488,7 @@ def compliance_left(angle: float, rate: float) -> float:
     return float(problems.rod_on_rough_floor.compliance(jnp.asarray(angle), m=ROD["m"], mu=2.0)) - 1e-6
 
 
+@pytest.mark.deep
 def test_the_rod_lifts_off_and_its_run_ends_where_the_paradox_begins() -> None:
     ts = jnp.linspace(0.0, 0.5, 101)
 

@@ -11,7 +11,7 @@ import pytest
 
 from jaxmodsim import AppliedForce, Coulomb, Friction, LuGre, Regularized, Scene, SimulationError, Stribeck, simulate
 from jaxmodsim.scene._event_driven import FrictionElements, next_modes, solve_friction_forces
-from jaxmodsim.simulation._solve import solve_logged
+from jaxmodsim.simulation._solve import compiled_runs
 from jaxmodsim.validation.hard._many_events import Contradictory
 
 
@@ -91,6 +91,7 @@ def test_two_elements_on_one_coordinate_share_in_proportion_to_their_limits() ->
     np.testing.assert_allclose(run.qd[:, 0], [0.0, 0.0, (36 - 16) / 2 - 3 * 2], atol=1e-6)
 
 
+@pytest.mark.deep
 def test_redundant_elements_in_series_give_no_nan() -> None:
     """Two masses, each on the ground, and an element between them: three constraints for two velocities."""
     three = scene(
@@ -224,10 +225,10 @@ def test_the_limit_of_mode_changes_is_named() -> None:
     assert np.sum(np.isfinite(run.events.t)) == 5
     assert run.events.t[4] < run.t_end + 1e-6
     # Whatever times are saved, events are those, and nothing is compiled for them.
-    ts, compiled = np.array([1.0, 2.0]), solve_logged._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
-    other = simulate(shaken, [0.0], [0.0], 10.0, ts=ts, max_events=5, throw=False)
+    other = simulate(shaken, [0.0], [0.0], 10.0, ts=np.array([1.0, 2.0]), max_events=5, throw=False)
+    compiled = compiled_runs()
     np.testing.assert_array_equal(other.events.t, run.events.t)
-    assert solve_logged._cache_size() == compiled  # pyright: ignore[reportAttributeAccessIssue]
+    assert compiled_runs() == compiled
 
 
 def test_smooth_and_bristle_laws_converge_to_the_exact_run() -> None:

@@ -185,6 +185,7 @@ def after_break_away(mu: float, stiction: float, t1: float) -> np.ndarray:
     return end.y[:2, -1]
 
 
+@pytest.mark.deep
 def test_the_turntable_lets_the_puck_go_at_the_speed_in_closed_form() -> None:
     """With and without stiction; the way from there on by a second solver; derivatives of the time in both modes."""
     mu = turntable_puck.PARAMS["mu"]
@@ -212,6 +213,7 @@ def test_the_turntable_lets_the_puck_go_at_the_speed_in_closed_form() -> None:
             np.testing.assert_allclose(derivative(stiction * mu), slope, rtol=1e-8)
 
 
+@pytest.mark.deep
 def test_the_load_may_be_a_reaction_or_a_number() -> None:
     """A block on a floor that presses harder and harder, in three coordinates and in two."""
     lift = 0.2
@@ -306,6 +308,7 @@ def bar(left: float, right: float, pull: float, push: float) -> Scene:
     return Scene(bar_alone, params={"pull": pull, "push": push}, effects=(AppliedForce(on_bar), *feet))
 
 
+@pytest.mark.deep
 def test_feet_of_a_bar_share_a_pull_along_it() -> None:
     """The equations leave the shares open: each foot takes its part in proportion to its limit, and both let go."""
     run = simulate(bar(1.0, 2.0, pull=1.0, push=0.0), [0.0] * 3, [0.0] * 3, 4.0, ts=np.array([1.5, 4.0]), **TIGHT)

@@ -79,6 +79,7 @@ def _accelerated(t, q, p):
     return q[0] - 0.5 * p["a"] * t**2
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_a_table_that_accelerates_is_a_floor_in_another_gravity(derivative):
     """The end of all bounces, and its derivatives by restitution and acceleration."""

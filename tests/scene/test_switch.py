@@ -112,6 +112,7 @@ def test_two_linear_systems_take_turns(of_linear):
     assert np.all(np.isinf(events.t[len(times) :]))
 
 
+@pytest.mark.deep
 def test_derivatives_of_two_linear_systems_are_those_of_the_exponentials(of_linear):
     forward = jax.jit(jax.jacfwd(lambda scene: of_linear(scene).q[-1, 0]))(LINEAR).params
     reverse = jax.jit(jax.grad(lambda scene: of_linear(scene).q[-1, 0]))(LINEAR).params

@@ -60,6 +60,7 @@ def test_derivatives_of_the_end_of_all_bounces(derivative):
         np.testing.assert_allclose(ours[name], closed[name], rtol=1e-8)
 
 
+@pytest.mark.deep
 def test_gradient_through_a_hundred_impacts():
     impacts = 100
 

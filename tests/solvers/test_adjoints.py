@@ -136,7 +136,7 @@ def bounced(g: Any, t0: Any = 0.0, t1: Any = 1.0, adjoint: Any = None) -> Any:
         dfx.Tsit5(),
         lambda t, s, args: s.y[:1],
         lambda t, s, args, fired: s._replace(y=s.y * jnp.array([0.0, -0.8])),
-        log=False,
+        log=0,
     )
     solution = dfx.diffeqsolve(
         dfx.ODETerm(fall),

@@ -288,7 +288,7 @@ def test_batches_with_different_numbers_of_events_do_not_disturb_each_other() ->
 
     def end(e: Any, v: Any) -> Any:
         reset = lambda t, s, args, fired: s._replace(y=jnp.stack([0.0 * s.y[0], -args * s.y[1]]))  # noqa: E731
-        events = EventSolver(dfx.Tsit5(), floor, reset, max_events=64, log=False)
+        events = EventSolver(dfx.Tsit5(), floor, reset, max_events=64, log=0)
         solution = dfx.diffeqsolve(
             dfx.ODETerm(fall),
             events,
@@ -329,7 +329,7 @@ def test_second_derivatives_pass_through_events() -> None:
         return 0.8**2 * speed * since - 0.5 * g * since**2
 
     def simulated(x: Any) -> Any:
-        events = EventSolver(dfx.Tsit5(), floor, bounce, max_events=4, log=False)
+        events = EventSolver(dfx.Tsit5(), floor, bounce, max_events=4, log=0)
         solution = dfx.diffeqsolve(
             dfx.ODETerm(lambda t, s, g: s.rate(jnp.stack([s.y[1], -g]))),
             events,

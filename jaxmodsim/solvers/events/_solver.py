@@ -154,8 +154,9 @@ class EventSolver(AbstractSolverWrapper):
     - `rtol`: the part of its largest magnitude in a step by which a guard may fall below zero, and return, unseen.
     - `event_mode`: `event_mode(mode)` -> what of the mode an event changes; a reset that changes other parts of it
       alone, as to choose other coordinates, is no event. By default all of it.
-    - `max_events`: limit of the number of events, > 0, and length of the log.
-    - `log`: whether the state carries an `EventLog`.
+    - `max_events`: limit of the number of events, > 0.
+    - `log`: number of entries of the `EventLog` that the state carries; later events are counted, not logged. By
+      default `max_events`; with 0 there is no log.
 
     ??? cite "Reference"
 
@@ -181,7 +182,7 @@ class EventSolver(AbstractSolverWrapper):
     event_mode: Callable[[PyTree], PyTree] | None = None
     enforce: bool = eqx.field(default=False, static=True)
     max_events: int = eqx.field(default=128, static=True)
-    log: bool = eqx.field(default=True, static=True)
+    log: int | None = eqx.field(default=None, static=True)
 
     @property
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -215,13 +216,14 @@ class EventSolver(AbstractSolverWrapper):
         state = EventState(y0, mode, t0, zero, zero, zero, None, memory)
         guard = self._guards(t0, state, args)
         log = None
-        if self.log:
+        entries = self.max_events if self.log is None else self.log
+        if entries:
 
             def rows(x: Array) -> Array:
-                return jnp.zeros((self.max_events, *x.shape), x.dtype)
+                return jnp.zeros((entries, *x.shape), x.dtype)
 
             pair = jtu.tree_map(rows, (y0, mode))
-            log = EventLog(jnp.full(self.max_events, jnp.inf, zero.dtype), rows(guard), pair, pair)
+            log = EventLog(jnp.full(entries, jnp.inf, zero.dtype), rows(guard), pair, pair)
         memory = memory._replace(guard=guard, armed=_flags(self._policy.armed_at_start(guard), guard))
         return state._replace(fired=jnp.zeros_like(guard), log=log, memory=memory)
 

@@ -49,7 +49,7 @@ def _solve(
 def _bounce(e: Array, held: bool) -> Answer:
     ball = bouncing_ball.BouncingBall(e=e, g=jnp.asarray(_G, e.dtype))
     hold = ball.hold if held else None
-    solver = EventSolver(dfx.Tsit5(), ball.guards, ball.reset, on_zeno=hold, max_events=512, log=False)
+    solver = EventSolver(dfx.Tsit5(), ball.guards, ball.reset, on_zeno=hold, max_events=512, log=0)
     start = solver.start(jnp.zeros((), e.dtype), ball.dropped(1.0), mode=jnp.zeros((), e.dtype))
     code, ys = _solve(ball.field, solver, 2.0, start)
     return Answer(code, ys.t[-1])
@@ -278,7 +278,7 @@ def _caught(t: object, s: EventState, args: object, fired: Array) -> EventState:
 def _throw(v0: Array) -> Answer:
     """A ball is thrown up and caught where it touches the ceiling, one metre above."""
     one = jnp.ones((), v0.dtype)
-    solver = EventSolver(dfx.Tsit5(), _below_ceiling, _caught, log=False)
+    solver = EventSolver(dfx.Tsit5(), _below_ceiling, _caught, log=0)
     start = solver.start(0.0 * one, jnp.stack([0.0 * one, v0]), mode=0.0 * one)
 
     def field(t: object, s: EventState, args: object) -> EventState:
