@@ -1,5 +1,7 @@
 """What a run records beside the motion: its first events, and on request all of them and the work."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -82,7 +84,7 @@ def test_energy_with_impacts_takes_one_other_run():
 
 
 def test_recorded_inside_jit_vmap_and_grad():
-    def second(belt: jax.Array, **record: object) -> jax.Array:
+    def second(belt: jax.Array, **record: Any) -> jax.Array:
         scene = belt_oscillator.scene(belt=belt)
         return jms.simulate(scene, [0.0], belt[None], T1, max_events=16, throw=False, **record).events.t[1]
 
@@ -97,10 +99,10 @@ def test_recorded_inside_jit_vmap_and_grad():
 
 
 def test_a_run_that_records_nothing_pays_for_nothing(scene: jms.Scene):
-    def end(q0: jax.Array, **record: object) -> jax.Array:
+    def end(q0: jax.Array, **record: Any) -> jax.Array:
         return jms.simulate(scene, q0, BELT, T1, throw=False, **record).q
 
-    def shapes(**record: object) -> str:
+    def shapes(**record: Any) -> str:
         return str(jax.make_jaxpr(lambda q0: end(q0, **record))(jnp.zeros(1)))
 
     assert "f64[13,1]" not in shapes(max_events=13)
@@ -111,6 +113,6 @@ def test_a_run_that_records_nothing_pays_for_nothing(scene: jms.Scene):
     ("record", "words"),
     [(("event",), r"Did you mean 'events'\?"), (("forces",), "events, energy")],
 )
-def test_records_that_there_are_not(scene: jms.Scene, record: object, words: str):
+def test_records_that_there_are_not(scene: jms.Scene, record: Any, words: str):
     with pytest.raises(ValueError, match=words):
         jms.simulate(scene, [0.0], BELT, T1, record=record)
