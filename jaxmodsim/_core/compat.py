@@ -1,0 +1,149 @@
+"""Private interfaces of JAX, jaxlib, equinox, diffrax and Python, each group of them behind a probe.
+
+They may change with any release. Each group is probed as this module is imported, and `AVAILABLE` names those that are
+present. What is built on a missing group is turned off: the package then computes the same by public interfaces, and
+one warning names the loss. The environment variable `JAXMODSIM_PROBES_OFF` switches groups off, `kernels,programs` or
+`all`. Only `to_c` and `to_javascript` cannot do without: they raise an error that names the versions to install.
+"""
+
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, final
+
+import jax
+
+from .provenance import versions
+
+AVAILABLE: set[str] = set()
+_OFF = set(os.environ.get("JAXMODSIM_PROBES_OFF", "").split(","))
+_LOSSES: list[str] = []
+
+if not TYPE_CHECKING:  # stand for names that are missing
+    ClosedJaxpr = Jaxpr = JaxprEqn = Literal = Primitive = UndefinedPrimal = jaxpr_as_fun = object
+    ad = batching = mlir = ir = stablehlo = eqxi = diffrax_loop = lax_loop = xla_bridge = object
+    get_opaque_trace_state = object  # each call gives another one, so that no two states are equal
+
+
+@contextmanager
+def _probe(group: str, loss: str) -> Iterator[None]:
+    before = dict(globals())
+    try:
+        yield
+        if _OFF & {group, "all"}:
+            raise ImportError("switched off")
+        AVAILABLE.add(group)
+    except (ImportError, AttributeError) as error:
+        globals().update(before)  # a group is there as a whole or not at all
+        _LOSSES.append(f"{group} ({error}): {loss}")
+
+
+def _need(owner: object, names: str) -> None:
+    """Raise where an object, or the fields of a class, lack one of these names."""
+    found = {*dir(owner), *getattr(owner, "__annotations__", ())}
+    if missing := sorted(set(names.split()) - found):
+        raise AttributeError(f"{getattr(owner, '__name__', owner)} has no {', '.join(missing)}")
+
+
+with _probe(
+    "jaxprs",
+    "runs are slower; indices out of range and step functions in functions of a scene are not found; to_c and"
+    " to_javascript raise",
+):
+    from jax.extend.core import ClosedJaxpr as ClosedJaxpr
+    from jax.extend.core import Jaxpr as Jaxpr
+    from jax.extend.core import JaxprEqn as JaxprEqn
+    from jax.extend.core import Literal as Literal
+    from jax.extend.core import Primitive as Primitive
+    from jax.extend.core import jaxpr_as_fun as jaxpr_as_fun
+
+    _need(Jaxpr, "constvars eqns invars outvars")
+    _need(ClosedJaxpr, "consts in_avals jaxpr")
+    _need(JaxprEqn, "effects invars outvars params primitive")
+    _need(Primitive, "bind get_bind_params multiple_results")
+
+with _probe("kernels", "single runs and their derivatives are slower on CPU"):
+    import jaxlib.version
+    from jax.extend.core import Primitive as Primitive
+    from jax.interpreters import ad as ad
+    from jax.interpreters import batching as batching
+    from jax.interpreters import mlir as mlir
+    from jaxlib.mlir import ir as ir
+    from jaxlib.mlir.dialects import stablehlo as stablehlo
+
+    # XLA ends the process where it fails to compile a marked call: only where it was tried.
+    if jaxlib.version.__version_info__[:2] != (0, 10):
+        raise ImportError(f"not tried with jaxlib {jaxlib.version.__version__}")
+
+with _probe("stored_steps", "runs and derivatives are slower, and the error of a derivative does not limit the steps"):
+    import equinox.internal as eqxi
+    from diffrax import _integrate
+    from jax.extend.core import Primitive as Primitive
+    from jax.interpreters.ad import UndefinedPrimal as UndefinedPrimal
+
+    _need(eqxi, "buffer_at_set create_vprim filter_primitive_bind filter_primitive_def filter_primitive_jvp")
+    _need(eqxi, "filter_primitive_transpose nondifferentiable_backward")
+    _need(
+        _integrate.State,
+        "controller_state dense_infos made_jump num_accepted_steps save_state solver_state tnext tprev y",
+    )
+    _need(_integrate.SaveState, "save_index saveat_ts_index ts ys")
+    diffrax_loop = _integrate.loop
+    lax_loop = partial(eqxi.while_loop, kind="lax")
+
+with _probe("trace_state", "values read from a traced run, such as its events, are computed at each reading"):
+    from jax.extend.core import get_opaque_trace_state as get_opaque_trace_state
+
+with _probe("programs", "compilations that take long are not remarked on"):
+    _need(jax.jit(abs), "_cache_size")
+
+with _probe("backends", "tune_cpu does not notice that it comes too late"):
+    from jax._src import xla_bridge
+
+    _need(xla_bridge, "backends_are_initialized")
+
+with _probe("last_line", "the cause of an error inside jax.jit is not repeated after the traceback"):
+    _need(sys, "excepthook")
+
+if _LOSSES:
+    logging.getLogger("jaxmodsim").warning(
+        "Private interfaces that make jaxmodsim fast are off with %s. %s.",
+        ", ".join(map(" ".join, versions("jax", "equinox", "diffrax").items())),
+        ". ".join(_LOSSES),
+    )
+
+
+def programs_of(function: Any) -> int:
+    """How many programs a function of `jax.jit` has compiled; 0 where that is not known."""
+    return function._cache_size() if "programs" in AVAILABLE else 0
+
+
+def backend_has_started() -> bool:
+    """Whether JAX has computed something; False where that is not known."""
+    return "backends" in AVAILABLE and xla_bridge.backends_are_initialized()
+
+
+@final
+class _Hook:
+    """What Python calls with an error that nobody caught."""
+
+    def __init__(
+        self,
+        before: Callable[[type[BaseException], BaseException, TracebackType | None], object],
+        after: Callable[[BaseException], None],
+    ) -> None:
+        self.before, self.after = before, after
+
+    def __call__(self, kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
+        self.before(kind, error, traceback)
+        self.after(error)
+
+
+def after_traceback(say: Callable[[BaseException], None]) -> None:
+    """Call `say` with the error that ends the program, after its traceback. Only the first call has an effect."""
+    if "last_line" in AVAILABLE and not isinstance(sys.excepthook, _Hook):
+        sys.excepthook = _Hook(sys.excepthook, say)
