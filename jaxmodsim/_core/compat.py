@@ -1,9 +1,9 @@
 """Private interfaces of JAX, jaxlib, equinox, diffrax and Python, each group of them behind a probe.
 
-They may change with any release. Each group is probed as this module is imported, and `AVAILABLE` names those that are
-present. What is built on a missing group is turned off: the package then computes the same by public interfaces, and
-one warning names the loss. The environment variable `JAXMODSIM_PROBES_OFF` switches groups off, `kernels,programs` or
-`all`. Only `to_c` and `to_javascript` cannot do without: they raise an error that names the versions to install.
+Such interfaces may change with any release. Each group is probed when this module is imported; `AVAILABLE` names the
+groups that are present. Code that needs a missing group takes a path through public interfaces, and one warning names
+the losses. Only `to_c` and `to_javascript` have no such path: they raise an error that names the versions to install.
+The environment variable `JAXMODSIM_PROBES_OFF` switches groups off, as in `kernels,programs` or `all`.
 """
 
 import logging
@@ -23,10 +23,10 @@ AVAILABLE: set[str] = set()
 _OFF = set(os.environ.get("JAXMODSIM_PROBES_OFF", "").split(","))
 _LOSSES: list[str] = []
 
-if not TYPE_CHECKING:  # stand for names that are missing
+if not TYPE_CHECKING:  # stand-ins for names that are missing
     ClosedJaxpr = Jaxpr = JaxprEqn = Literal = Primitive = UndefinedPrimal = jaxpr_as_fun = object
     ad = batching = mlir = ir = stablehlo = eqxi = diffrax_loop = lax_loop = xla_bridge = object
-    get_opaque_trace_state = object  # each call gives another one, so that no two states are equal
+    get_opaque_trace_state = object  # each call returns a new object, so no two states are equal
 
 
 @contextmanager
@@ -38,7 +38,7 @@ def _probe(group: str, loss: str) -> Iterator[None]:
             raise ImportError("switched off")
         AVAILABLE.add(group)
     except (ImportError, AttributeError) as error:
-        globals().update(before)  # a group is there as a whole or not at all
+        globals().update(before)  # a group is present as a whole or not at all
         _LOSSES.append(f"{group} ({error}): {loss}")
 
 
@@ -51,8 +51,8 @@ def _need(owner: object, names: str) -> None:
 
 with _probe(
     "jaxprs",
-    "runs are slower; indices out of range and step functions in functions of a scene are not found; to_c and"
-    " to_javascript raise",
+    "runs are slower, and compiled runs are not kept in the persistent cache of JAX; indices out of range and step"
+    " functions in functions of a scene are not reported; to_c and to_javascript raise an error",
 ):
     from jax.extend.core import ClosedJaxpr as ClosedJaxpr
     from jax.extend.core import Jaxpr as Jaxpr
@@ -75,11 +75,15 @@ with _probe("kernels", "single runs and their derivatives are slower on CPU"):
     from jaxlib.mlir import ir as ir
     from jaxlib.mlir.dialects import stablehlo as stablehlo
 
-    # XLA ends the process where it fails to compile a marked call: only where it was tried.
+    # If XLA cannot compile a marked call, it ends the process. So only versions that were tested pass.
     if jaxlib.version.__version_info__[:2] != (0, 10):
-        raise ImportError(f"not tried with jaxlib {jaxlib.version.__version__}")
+        raise ImportError(f"not tested with jaxlib {jaxlib.version.__version__}")
 
-with _probe("stored_steps", "runs and derivatives are slower, and the error of a derivative does not limit the steps"):
+with _probe(
+    "stored_steps",
+    "runs and derivatives are slower, as StoredSteps is diffrax.DirectAdjoint, and derivatives are inaccurate where"
+    " little moves",
+):
     import equinox.internal as eqxi
     from diffrax import _integrate
     from jax.extend.core import Primitive as Primitive
@@ -95,13 +99,13 @@ with _probe("stored_steps", "runs and derivatives are slower, and the error of a
     diffrax_loop = _integrate.loop
     lax_loop = partial(eqxi.while_loop, kind="lax")
 
-with _probe("trace_state", "values read from a traced run, such as its events, are computed at each reading"):
+with _probe("trace_state", "events and energies of a traced run are computed at each access"):
     from jax.extend.core import get_opaque_trace_state as get_opaque_trace_state
 
-with _probe("programs", "compilations that take long are not remarked on"):
+with _probe("programs", "long compilations are not reported"):
     _need(jax.jit(abs), "_cache_size")
 
-with _probe("backends", "tune_cpu does not notice that it comes too late"):
+with _probe("backends", "tune_cpu raises no error if JAX has computed something already"):
     from jax._src import xla_bridge
 
     _need(xla_bridge, "backends_are_initialized")
@@ -118,18 +122,18 @@ if _LOSSES:
 
 
 def programs_of(function: Any) -> int:
-    """How many programs a function of `jax.jit` has compiled; 0 where that is not known."""
+    """Number of programs that a function of `jax.jit` has compiled; 0 if unknown."""
     return function._cache_size() if "programs" in AVAILABLE else 0
 
 
 def backend_has_started() -> bool:
-    """Whether JAX has computed something; False where that is not known."""
+    """Whether JAX has computed something; False if unknown."""
     return "backends" in AVAILABLE and xla_bridge.backends_are_initialized()
 
 
 @final
 class _Hook:
-    """What Python calls with an error that nobody caught."""
+    """Python calls it with an error that nobody caught."""
 
     def __init__(
         self,
@@ -144,6 +148,9 @@ class _Hook:
 
 
 def after_traceback(say: Callable[[BaseException], None]) -> None:
-    """Call `say` with the error that ends the program, after its traceback. Only the first call has an effect."""
+    """Call `say` with the error that ends the program, after Python has printed its traceback.
+
+    Only the first call has an effect.
+    """
     if "last_line" in AVAILABLE and not isinstance(sys.excepthook, _Hook):
         sys.excepthook = _Hook(sys.excepthook, say)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from jaxmodsim import AppliedForce, Coulomb, Friction, LuGre, Regularized, Scene, SimulationError, Stribeck, simulate
+from jaxmodsim._core.compat import programs_of
 from jaxmodsim.scene._event_driven import FrictionElements, next_modes, solve_friction_forces
 from jaxmodsim.simulation._solve import solve_logged
 from jaxmodsim.validation.hard._many_events import Contradictory
@@ -224,10 +225,10 @@ def test_the_limit_of_mode_changes_is_named() -> None:
     assert np.sum(np.isfinite(run.events.t)) == 5
     assert run.events.t[4] < run.t_end + 1e-6
     # Whatever times are saved, events are those, and nothing is compiled for them.
-    ts, compiled = np.array([1.0, 2.0]), solve_logged._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
+    ts, compiled = np.array([1.0, 2.0]), programs_of(solve_logged)
     other = simulate(shaken, [0.0], [0.0], 10.0, ts=ts, max_events=5, throw=False)
     np.testing.assert_array_equal(other.events.t, run.events.t)
-    assert solve_logged._cache_size() == compiled  # pyright: ignore[reportAttributeAccessIssue]
+    assert programs_of(solve_logged) == compiled
 
 
 def test_smooth_and_bristle_laws_converge_to_the_exact_run() -> None:
