@@ -1,6 +1,7 @@
 """The rules of the code base that a reader cannot be expected to check by eye."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -39,6 +40,17 @@ STAGES = ("data", "model", "estimate", "uncertainty", "selection", "design")
 # Folders of a room with public names of their own.
 PARTS = ("validation.behaviour", "validation.hard", "validation.testbench")
 
+# Names that their libraries do not document, and the one module that may use them: a release that lacks one then turns
+# off what is built on it. Tests, benches and examples keep to this, too, as they show whether a new release works.
+PRIVATE = re.compile(
+    r"^(jax\.(extend|interpreters)\b|jaxlib\.|equinox\.internal\b|(jax|equinox|diffrax)\.(\w+\.)*_[a-z]|sys\.excepthook$)"
+    r"|\._(cache_size|loop)$"
+)
+COMPAT = ROOT / "_core" / "compat.py"
+SCRIPTS = [
+    path for each in ("tests", "bench", "examples", "docs") for path in (Path(__file__).parents[1] / each).rglob("*.py")
+]
+
 MAX_FILE_LINES = 500
 MAX_FUNCTION_LINES = 80
 LONG_FUNCTIONS: dict[str, str] = {}  # "file:function" -> reason
@@ -68,6 +80,25 @@ def own_imports(path: Path, node: ast.AST) -> Iterator[str]:
             yield stem
         else:  # from . import name, from jaxmodsim import name
             yield from (alias.name for alias in node.names)
+
+
+def names_of_others(source: str) -> Iterator[str]:
+    """Dotted names of imports and of attributes, which begin with the name of their module."""
+    nodes = list(ast.walk(ast.parse(source)))
+    modules = {a.asname: a.name for node in nodes if isinstance(node, ast.Import) for a in node.names if a.asname}
+
+    def dotted(node: ast.AST) -> str:
+        if isinstance(node, ast.Attribute):
+            return f"{dotted(node.value)}.{node.attr}"
+        return modules.get(node.id, node.id) if isinstance(node, ast.Name) else ""
+
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Attribute):
+            yield dotted(node)
 
 
 def statements(path: Path, kind: tuple[type[ast.AST], ...]) -> list[ast.AST]:
@@ -157,6 +188,15 @@ def test_only_plot_imports_matplotlib(path: Path) -> None:
             assert room_of(path) == "plot"
 
 
+def test_only_one_module_uses_private_names_of_others() -> None:
+    found = {
+        str(path): names
+        for path in [*FILES, *SCRIPTS]
+        if path != COMPAT and (names := sorted(set(filter(PRIVATE.search, names_of_others(path.read_text())))))
+    }
+    assert not found, f"import these from jaxmodsim._core.compat, behind a probe: {found}"
+
+
 @each_file([path for path in FILES if room_of(path) != ROOMS[-1]])
 def test_no_import_of_our_own_inside_functions(path: Path) -> None:
     """The last room may: its `--help` does not wait for JAX, and since nothing imports it, no circle can hide there."""
@@ -229,3 +269,17 @@ def test_the_rules_can_be_broken(tmp_path: Path) -> None:
     }
     for source, expected in cases.items():
         assert list(own_imports(inside, ast.parse(source).body[0])) == expected, source
+    private = (
+        "import jax._src.core",
+        "from jax.interpreters import mlir",
+        "import jax\njax.extend.core.Literal",
+        "from jaxlib.mlir import ir",
+        "import equinox as eqx\neqx.internal.while_loop",
+        "from diffrax import _integrate",
+        "import diffrax as dfx\ndfx.Tsit5()._loop",
+        "import sys\nsys.excepthook = print",
+        "jax.jit(abs)._cache_size()",
+    )
+    public = "import jax.core as c\nfrom jax import lax\nimport diffrax as d\nd.ODETerm\nself._loops\njax.__version__"
+    assert all(any(map(PRIVATE.search, names_of_others(source))) for source in private)
+    assert not any(map(PRIVATE.search, names_of_others(public)))

@@ -8,10 +8,10 @@ import jax
 import jax.core
 import jax.tree_util as jtu
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jax.lax import GatherScatterMode
 from jaxtyping import ArrayLike, PyTree
 
+from .compat import AVAILABLE, ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from .step_functions import remark_on_steps
 from .user_errors import explain
 
@@ -51,9 +51,10 @@ def traced(fn: Callable[..., object], *, name: str, **args: object) -> PyTree:
         if said is None:
             raise
         raise ValueError(said) from error
-    names = [key + jtu.keystr(path) for key, arg in args.items() for path, _ in jtu.tree_flatten_with_path(arg)[0]]
-    _follow(jaxpr, names, name)
-    remark_on_steps(jaxpr, names, name)
+    if "jaxprs" in AVAILABLE:
+        names = [key + jtu.keystr(path) for key, arg in args.items() for path, _ in jtu.tree_flatten_with_path(arg)[0]]
+        _follow(jaxpr, names, name)
+        remark_on_steps(jaxpr, names, name)
     return shapes
 
 
@@ -64,6 +65,8 @@ def check_indices(fn: Callable[..., object], *args: object, name: str) -> None:
 
     - `ValueError` as `traced`.
     """
+    if "jaxprs" not in AVAILABLE:
+        return
     try:
         jaxpr = jax.make_jaxpr(fn)(*args)
     except Exception:  # whatever it is: the call that follows shows it

@@ -3,8 +3,9 @@
 import builtins
 import sys
 from collections.abc import Callable
-from types import TracebackType
 from typing import SupportsIndex, final, overload
+
+from .compat import after_traceback
 
 # The sentence of the last error inside compiled code, and what shows it in each shell of IPython.
 _LAST: list[str] = [""]
@@ -36,24 +37,11 @@ class LastLines(tuple[str, ...]):
 def _say_last(sentence: str) -> None:
     """Say it once more after the traceback, if the error ends the program, or the cell of a notebook."""
     _LAST[0] = sentence
-    if not isinstance(sys.excepthook, _Hook):
-        sys.excepthook = _Hook(sys.excepthook)
+    after_traceback(_say)
     shell = getattr(builtins, "get_ipython", lambda: None)()
     if shell is not None and id(shell) not in _SHELLS:
         _SHELLS[id(shell)] = lambda result: _say(result.error_in_exec)
         shell.events.register("post_run_cell", _SHELLS[id(shell)])
-
-
-@final
-class _Hook:
-    """What Python calls with an error that nobody caught."""
-
-    def __init__(self, before: Callable[[type[BaseException], BaseException, TracebackType | None], object]) -> None:
-        self.before = before
-
-    def __call__(self, kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        self.before(kind, error, traceback)
-        _say(error)
 
 
 def _say(error: BaseException | None) -> None:

@@ -7,11 +7,9 @@ from functools import partial, reduce
 from typing import Any, TypeVar
 
 import jax
-import jaxlib.version
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
-from jaxlib.mlir import ir
-from jaxlib.mlir.dialects import stablehlo as hlo
+
+from .compat import AVAILABLE, Primitive, ad, batching, ir, mlir
+from .compat import stablehlo as hlo
 
 _Tree = TypeVar("_Tree")
 # A kernel runs on one core, and its arrays shall fit the cache of that core.
@@ -36,8 +34,6 @@ _HOLDS = frozenset(
 )
 # Those that make or hand on the buffers of a run, of whatever size.
 _MOVES = {"broadcast_in_dim", "case", "constant", "dynamic_slice", "dynamic_update_slice", "if", "reshape"}
-# XLA ends the process where it fails to compile such a call: only where it was tried.
-_KNOWN = jaxlib.version.__version_info__[:2] == (0, 10)
 
 
 def in_one_kernel(function: Callable[..., _Tree], *args: Any) -> _Tree:
@@ -53,16 +49,28 @@ def in_one_kernel(function: Callable[..., _Tree], *args: Any) -> _Tree:
     - `function`: a function of `jax.jit`.
     - `args`: pytrees of arrays.
     """
+    if "kernels" not in AVAILABLE:
+        return function(*args)
     args = jax.tree.map(partial(_mark.bind, result=False, runs=1), args)
     return jax.tree.map(partial(_mark.bind, result=True, runs=1), function(*args))
 
 
-# An identity on what goes into the call and on what comes out: its lowering sees the call that a value comes from. What
-# comes out of the call of a derivative in reverse mode is the cotangent of what went in. A tangent keeps the value
-# beside it, so that the mark of the run is not dropped where only the derivative is asked for.
-_mark = Primitive("mark_one_kernel")
-_mark.def_impl(lambda x, *_, **__: x)
-_mark.def_abstract_eval(lambda x, *_, **__: x)
+def _marker() -> Any:
+    """An identity on what goes into the call and on what comes out.
+
+    Its lowering sees the call that a value comes from. What comes out of the call of a derivative in reverse mode is
+    the cotangent of what went in. A tangent keeps the value beside it, so that the mark of the run is not dropped where
+    only the derivative is asked for.
+    """
+    mark = Primitive("mark_one_kernel")
+    mark.def_impl(lambda x, *_, **__: x)
+    mark.def_abstract_eval(lambda x, *_, **__: x)
+    ad.primitive_jvps[mark] = _jvp
+    ad.primitive_transposes[mark] = _transpose
+    batching.primitive_batchers[mark] = _batch
+    mlir.register_lowering(mark, lambda _, x, *__, **___: [x])
+    mlir.register_lowering(mark, _lower, platform="cpu", cacheable=False)
+    return mark
 
 
 def _jvp(primals: Any, tangents: Any, **marks: Any) -> tuple[Any, Any]:
@@ -81,15 +89,15 @@ def _batch(given: Any, axes: Any, *, result: bool, runs: int) -> tuple[Any, Any]
     return _mark.bind(*given, result=result, runs=runs * size), axes[0]
 
 
-def _lower(ctx: mlir.LoweringRuleContext, x: Any, *_: Any, result: bool, runs: int) -> list[Any]:
+def _lower(ctx: Any, x: Any, *_: Any, result: bool, runs: int) -> list[Any]:
     call = getattr(x.owner, "operation", None)  # of an argument it is a block, which is none
     alone = getattr(ctx.module_context.axis_context, "num_devices", None) in (None, 1)
-    if _KNOWN and result and runs <= _MOST_AT_ONCE and alone and call is not None and call.name == "func.call":
+    if result and runs <= _MOST_AT_ONCE and alone and call is not None and call.name == "func.call":
         _mark_call(ctx, call)
     return [x]
 
 
-def _mark_call(ctx: mlir.LoweringRuleContext, call: Any) -> None:
+def _mark_call(ctx: Any, call: Any) -> None:
     """Give the call its attribute, and a function of its own that needs all its arguments."""
     functions = ctx.module_context.symbol_table
     function = functions[_callee(call)].operation
@@ -199,8 +207,4 @@ def _kind(operation: Any) -> str:
     return kind if fits else f"large {kind}"
 
 
-ad.primitive_jvps[_mark] = _jvp
-ad.primitive_transposes[_mark] = _transpose
-batching.primitive_batchers[_mark] = _batch
-mlir.register_lowering(_mark, lambda _, x, *__, **___: [x])
-mlir.register_lowering(_mark, _lower, platform="cpu", cacheable=False)
+_mark: Any = _marker() if "kernels" in AVAILABLE else None

@@ -12,9 +12,9 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from .compat import AVAILABLE, ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 from .fusion import fusion_barrier, opaque_one
 from .lu import is_known
 
@@ -72,7 +72,7 @@ def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "...
 
     What `fn` returns, equal but for rounding and for zero times infinity, which is zero if that zero is a constant.
     """
-    if _within.get():
+    if _within.get() or "jaxprs" not in AVAILABLE:
         return fn(*args)
     closed, shapes = trace_in_arrays(fn, *args)
     leaves = [x if hasattr(x, "shape") else jnp.asarray(x) for x in jtu.tree_leaves(args)]
@@ -111,8 +111,10 @@ def columns_of(linear: Callable[..., list[Value]], unit: Float[Array, ""], *like
     For each argument the values for it alone being one: NumPy's scalars where they are known while tracing (zeros of
     what does not depend on it, ones of what it is itself), arrays elsewhere.
     """
-    closed, scalars = jax.make_jaxpr(linear)(*like), _Scalars(unit)
     types = [jnp.result_type(x) for x in like]
+    if "jaxprs" not in AVAILABLE:
+        return [linear(*(jnp.asarray(i == j, kind) for i, kind in enumerate(types))) for j in range(len(like))]
+    closed, scalars = jax.make_jaxpr(linear)(*like), _Scalars(unit)
     columns = []
     for j in range(len(like)):
         basis = [np.asarray(i == j, kind) for i, kind in enumerate(types)]

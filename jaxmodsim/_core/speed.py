@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from functools import cache
 
 import jax
-from jax._src import xla_bridge
+
+from .compat import backend_has_started
 
 _LOG = logging.getLogger("jaxmodsim")
 # Compiling that takes longer is said [s].
@@ -39,7 +40,7 @@ def tune_cpu(while_loop_bytes: int = 1_000_000) -> None:
     """
     if isinstance(while_loop_bytes, bool) or not isinstance(while_loop_bytes, int) or while_loop_bytes < 1:
         raise ValueError(f"while_loop_bytes must be a positive integer, but {while_loop_bytes!r} was given.")
-    if xla_bridge.backends_are_initialized():
+    if backend_has_started():
         raise RuntimeError(
             "tune_cpu comes too late: JAX has already started its backend. Call it before the first computation,"
             " and before any jnp.array is made."

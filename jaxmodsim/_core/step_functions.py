@@ -5,7 +5,8 @@ from collections.abc import Iterable, Sequence
 from functools import cache
 
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+
+from .compat import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
 _LOG = logging.getLogger("jaxmodsim")
 # Primitives whose value jumps, or that tell a jump where to be.

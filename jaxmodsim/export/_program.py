@@ -8,8 +8,8 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, JaxprEqn
 
+from .._core.compat import AVAILABLE, ClosedJaxpr, JaxprEqn
 from .._core.lu import is_known
 from .._core.scalarise import AbstractScalars, AbstractSymbol, Params, Parts, Value, is_apart
 
@@ -83,7 +83,13 @@ def program_of(closed: ClosedJaxpr, arguments: Sequence[Symbol]) -> Program:
     **Raises:**
 
     - `ValueError` naming an operation that is not known here.
+    - `RuntimeError` where this release of JAX shows no statements.
     """
+    if "jaxprs" not in AVAILABLE:
+        raise RuntimeError(
+            "to_c and to_javascript read functions that JAX has traced, by jax.extend.core, which differs in"
+            f" jax {jax.__version__}. Install jax>=0.10,<0.11."
+        )
     writer = _StatementWriter()
     inputs: list[Value] = [_scalar_array(x) for x in arguments]
     outputs = writer.run(closed.jaxpr, closed.consts, inputs)

@@ -12,6 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from .._core.compat import programs_of
 from .._core.one_kernel import in_one_kernel
 from ..scene import (
     Scene,
@@ -428,7 +429,7 @@ def solve(inputs: RunInputs, options: RunOptions) -> RunOutput:
 
 def compiled_runs() -> int:
     """How many programs `solve` has compiled."""
-    return solve._cache_size()  # pyright: ignore[reportAttributeAccessIssue] - functions of `jax.jit` have it
+    return programs_of(solve)
 
 
 @partial(jax.jit, static_argnames=("options",))

@@ -12,9 +12,9 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, Float, Int, PyTree
 
+from .._core.compat import get_opaque_trace_state
 from .._core.readable import AbstractReadable, Table, short, table_of
 from ..mechanics import momentum
 from ..scene import ConstraintReaction, Scene, State, forward_dynamics, mode_numbers, quantity_of

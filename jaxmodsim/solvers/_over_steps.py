@@ -6,14 +6,13 @@ from typing import NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Int, PyTree
 
-lax_loop = partial(eqxi.while_loop, kind="lax")
+from .._core.compat import eqxi, lax_loop
 
 
 class StepPlan(NamedTuple):

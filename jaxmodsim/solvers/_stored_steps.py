@@ -5,15 +5,13 @@ from typing import Any, NamedTuple, TypeAlias
 
 import diffrax as dfx
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.core import ShapedArray
-from jax.extend.core import Primitive
-from jax.interpreters.ad import UndefinedPrimal
 from jaxtyping import Array, PyTree
 
+from .._core.compat import AVAILABLE, Primitive, UndefinedPrimal, diffrax_loop, eqxi, lax_loop
 from ._controllers import FiniteSteps
 from ._over_steps import (
     ForwardOverSteps,
@@ -26,7 +24,6 @@ from ._over_steps import (
     empty_buffers,
     is_none,
     is_save_state,
-    lax_loop,
 )
 from ._probe import ProbedController, ProbedStep, direction, has_error_control, start, without_probe
 
@@ -88,31 +85,35 @@ class StoredSteps(dfx.AbstractAdjoint):
             raise ValueError(f"every must be at least 1, but every={self.every}: it is a number of steps.")
 
     def loop(
-        self,
-        *,
-        args: PyTree,
-        terms: PyTree,
-        solver: dfx.AbstractSolver,
-        stepsize_controller: dfx.AbstractStepSizeController,
-        event: dfx.Event | None,
-        saveat: dfx.SaveAt,
-        t0: Array,
-        t1: Array,
-        dt0: Array | None,
-        max_steps: int | None,
-        init_state: PyTree,
-        progress_meter: dfx.AbstractProgressMeter,
-        throw: bool,
-        passed_solver_state: bool,
-        passed_controller_state: bool,
+        self, *, solver: dfx.AbstractSolver, event: dfx.Event | None, max_steps: int | None, **given: Any
     ) -> tuple[PyTree, dict[str, Any]]:
         """See `diffrax.AbstractAdjoint`."""
-        del throw, passed_solver_state, passed_controller_state
         if max_steps is None:
             raise ValueError("StoredSteps keeps every step and needs a bound on their number, but max_steps=None.")
         if event is not None:
             raise ValueError("StoredSteps does not differentiate diffrax's terminating event: use EventSolver.")
         solver = _differentiable_in_both_modes(solver)
+        if "stored_steps" in AVAILABLE:
+            return self._stored(solver=solver, max_steps=max_steps, **given), {}
+        return dfx.DirectAdjoint().loop(solver=solver, event=event, max_steps=max_steps, **given)
+
+    def _stored(
+        self,
+        *,
+        args: PyTree,
+        terms: PyTree,
+        solver: PyTree,
+        stepsize_controller: dfx.AbstractStepSizeController,
+        saveat: dfx.SaveAt,
+        t0: Array,
+        t1: Array,
+        dt0: Array | None,
+        max_steps: int,
+        init_state: PyTree,
+        progress_meter: dfx.AbstractProgressMeter,
+        **_: Any,
+    ) -> PyTree:
+        """The final state of diffrax's loop, by a primitive with derivatives of its own."""
         begin, order = init_state, solver.error_order(terms)
         y0, args_of_step = begin.y, (begin.tprev, begin.tnext, begin.y, begin.solver_state)
 
@@ -136,14 +137,13 @@ class StoredSteps(dfx.AbstractAdjoint):
             progress_meter,
             stripped,
             max_steps,
-            self._loop,
             order,
             StepPlan(solver.interpolation_cls, [(sub.t0, sub.t1, sub.steps) for sub in subs], jumps, even, self.every),
             _projection(solver, t0, y0, args),
             self.probe and has_error_control(stepsize_controller),
         )
         run = eqx.filter_closure_convert(lambda inputs: _solve(inputs, fixed, None), inputs)
-        return eqxi.filter_primitive_bind(_run_p, run, inputs, fixed, False), {}
+        return eqxi.filter_primitive_bind(_run_p, run, inputs, fixed, False)
 
 
 class _Fixed(NamedTuple):
@@ -156,7 +156,6 @@ class _Fixed(NamedTuple):
     progress_meter: PyTree
     state: PyTree
     max_steps: int
-    loop: Callable[..., PyTree]
     error_order: PyTree
     how: StepPlan
     # After every step, from time and state to the state; None without.
@@ -278,7 +277,7 @@ def _solve(inputs: StepInputs, fixed: _Fixed, by: StepInputs | None) -> PyTree:
 
     state = eqx.tree_at(lambda s: (s.y, s.solver_state), fixed.state, (y0, inputs.solver_state), is_leaf=is_none)
     saveat = eqx.tree_at(lambda s: s.subs, fixed.saveat, jtu.tree_map(put, fixed.saveat.subs, is_leaf=_is_sub))
-    final, _ = fixed.loop(
+    final, _ = diffrax_loop(
         args=fixed.args,
         terms=None,
         solver=_Solver(step, fixed.error_order, fixed.how),
@@ -407,5 +406,6 @@ def _once(derivative: PyTree) -> PyTree:
     return eqxi.nondifferentiable_backward(derivative, msg=_TWICE)
 
 
-_run_p = _primitive("run", _make, _make_jvp, _make_transpose)
-_change_p = _primitive("change_of_run", _change, _change_jvp, _change_transpose)
+if "stored_steps" in AVAILABLE:
+    _run_p = _primitive("run", _make, _make_jvp, _make_transpose)
+    _change_p = _primitive("change_of_run", _change, _change_jvp, _change_transpose)

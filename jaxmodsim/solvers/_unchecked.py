@@ -6,8 +6,9 @@ from typing import Any
 import jax
 import jax.core
 import jax.tree_util as jtu
-from jax.extend.core import ClosedJaxpr, Literal
 from jaxtyping import Array
+
+from .._core.compat import AVAILABLE, ClosedJaxpr, Literal
 
 
 def unchecked(fn: Callable[..., Any], *args: Array | None) -> Any:
@@ -26,7 +27,7 @@ def unchecked(fn: Callable[..., Any], *args: Array | None) -> Any:
     - `fn`: a function of arrays that returns a pytree of arrays. It may close over traced values.
     - `args`: arrays, or None. If none of them is traced, nothing is compiled, and `fn` is called as it is.
     """
-    if not any(isinstance(x, jax.core.Tracer) for x in args):
+    if "jaxprs" not in AVAILABLE or not any(isinstance(x, jax.core.Tracer) for x in args):
         return fn(*args)
     closed, shapes = jax.make_jaxpr(fn, return_shape=True)(*args)
     given = jtu.tree_leaves(args)

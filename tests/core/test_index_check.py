@@ -26,9 +26,12 @@ from jaxmodsim import (
     simulate_to_accuracy,
     sweep,
 )
+from jaxmodsim._core.compat import AVAILABLE
 from jaxmodsim._core.index_check import traced
 from jaxmodsim.problems import named_problems
 from jaxmodsim.scene import State, check_scene
+
+pytestmark = pytest.mark.skipif("jaxprs" not in AVAILABLE, reason="needs the programs that JAX traces")
 
 
 def free(t: Any, q: Any, qd: Any, p: Any) -> Any:

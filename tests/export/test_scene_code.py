@@ -16,9 +16,11 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim import to_c, to_javascript
+from jaxmodsim._core.compat import AVAILABLE
 from jaxmodsim.problems import belt_oscillator, ramped_box
 from jaxmodsim.scene import State, vector_field
 
+pytestmark = pytest.mark.skipif("jaxprs" not in AVAILABLE, reason="needs the programs that JAX traces")
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 NODE = shutil.which("node")
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="needs a C compiler: cc, gcc or clang")

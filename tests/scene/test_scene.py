@@ -7,7 +7,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.extend
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -28,6 +27,7 @@ from jaxmodsim import (
     problems,
     simulate,
 )
+from jaxmodsim._core.compat import ClosedJaxpr
 from jaxmodsim._core.scalarise import in_scalars
 from jaxmodsim.scene import State, quantity_of, scene_ranges, vector_field
 from jaxmodsim.simulation import named_series
@@ -246,7 +246,7 @@ def primitives(fn: Callable[..., Any], *args: Any) -> Counter[str]:
 def _count(jaxpr: Any) -> Counter[str]:
     total: Counter[str] = Counter()
     for equation in jaxpr.eqns:
-        inner = [x.jaxpr for x in equation.params.values() if isinstance(x, jax.extend.core.ClosedJaxpr)]
+        inner = [x.jaxpr for x in equation.params.values() if isinstance(x, ClosedJaxpr)]
         if inner:
             total += sum((_count(x) for x in inner), Counter())
         else:
