@@ -39,7 +39,6 @@ _RTOL_MODES = {8: 1e-6, 4: 1e-3}
 # Differences with an estimated error above this part of the derivative say nothing.
 _UNCLEAR = 0.1
 # Adjoints whose steps keep the tolerance for derivatives; None stands for the default.
-_CONTROLLED = (StoredSteps, type(None))
 _INTERFACE = (
     "check_gradients needs a function fn(scene, simulate) that returns one number and runs the scene with the"
     " `simulate` it is given, as in: def fn(scene, simulate=jaxmodsim.simulate): return simulate(scene, [1.0], [0.0],"
@@ -255,9 +254,10 @@ def _first(fn: Callable[..., Any], scene: Scene, runs: list[Trajectory]) -> tupl
     if not np.isfinite(value):
         raise ValueError(f"fn gives {value} at this scene, which has no derivative.")
     watched = [run for run in runs if not _traced(run)]
-    atol = max((float(run.inputs.atol) for run in watched), default=0.0)
+    atol = max((float(run.request.atol) for run in watched), default=0.0)
     complete = len(watched) == len(runs)
-    others = {type(run.options.adjoint).__name__ for run in runs if not isinstance(run.options.adjoint, _CONTROLLED)}
+    adjoints = [run.request.adjoint.rest for run in runs if run.request.adjoint is not None]
+    others = {type(each).__name__ for each in adjoints if not isinstance(each, StoredSteps)}
     runs.clear()
     return jnp.asarray(value), complete, atol, tuple(sorted(others))
 
@@ -308,7 +308,7 @@ def _histories(run: Trajectory) -> dict[str, History]:
         mine = (events.effect == i) & np.isfinite(events.t)
         if mine.any():
             pairs = zip(events.before[mine].tolist(), events.after[mine].tolist(), strict=True)
-            histories[effect] = History(float(run.inputs.t0), events.t[mine].astype(float), tuple(pairs))
+            histories[effect] = History(float(run.request.t0), events.t[mine].astype(float), tuple(pairs))
     return histories
 
 

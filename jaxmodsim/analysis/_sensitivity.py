@@ -151,7 +151,7 @@ def sensitivity(
         mode = "forward" if forward <= reverse else "reverse"
 
     def at(x: dict[str, Array]) -> Array:
-        changed, start = with_values(scene, {"q0": run.inputs.q0, "qd0": run.inputs.qd0}, x)
+        changed, start = with_values(scene, {"q0": run.request.q0, "qd0": run.request.qd0}, x)
         return jnp.asarray(observe(simulate(changed, **start, t1=t1, throw=False, **given)))
 
     differentiate = jax.jacfwd if mode == "forward" else jax.jacrev

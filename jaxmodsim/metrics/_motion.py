@@ -70,7 +70,7 @@ def stick_share(element: str = "friction", *, since: float | None = None, rest: 
 
 
 def _stick_share(run: Trajectory, element: str, since: float | None, rest: float | None) -> Array:
-    begin = run.inputs.t0 if since is None else jnp.asarray(since, run.t.dtype)
+    begin = run.request.t0 if since is None else jnp.asarray(since, run.t.dtype)
     if rest is not None:
         t, v = slip_of(run, element)
         steps = jnp.diff(jnp.maximum(t, begin))

@@ -25,7 +25,7 @@ def element_of(run: Trajectory, name: str) -> Friction:
 
 def slip_of(run: Trajectory, name: str) -> tuple[Float[Array, " nodes"], Float[Array, "nodes ..."]]:
     """Times and slip velocities of a friction element, from t0 on and at the saved times."""
-    element, problem = element_of(run, name), run.inputs
+    element, problem = element_of(run, name), run.request
 
     def slip(t: Array, q: Array, qd: Array) -> Array:
         return element.slip(t, q, qd, run.scene.bind_time(t).params)

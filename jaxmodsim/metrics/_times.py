@@ -117,7 +117,7 @@ def _period(run: Trajectory, of: str, since: float | None, swing: float) -> Arra
         gap, alive = cycle_of(run, of)
         return jnp.where(alive, gap, jnp.nan)
     x = named_series(run, of)
-    begin = 0.5 * (run.inputs.t0 + run.t_end) if since is None else since
+    begin = 0.5 * (run.request.t0 + run.t_end) if since is None else since
     counts = jnp.isfinite(run.t) & (run.t >= begin)
     x = jnp.where(jnp.isfinite(run.t), x, 0.0)
     mean = jnp.sum(jnp.where(counts, x, 0.0)) / jnp.maximum(jnp.sum(counts), 1)

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from ..scene import Scene, State, read_element, replace_elements
-from ..simulation import RunRequest, Trajectory, outcome_messages, simulate
+from ..simulation import Trajectory, outcome_messages, simulate
 
 # Period [s] from the parameters of the scene.
 PeriodFn: TypeAlias = Callable[[PyTree], Array | float]
@@ -125,7 +125,7 @@ def run_segment(
     span: Array,
     dof: int,
     times: Array | None = None,
-    max_steps: int = RunRequest.max_steps,
+    max_steps: int = 16384,
 ) -> Trajectory:
     """The run from x over a segment; at these times [s] as far as they are inside it, else at its end alone."""
     y = unpack(scene, x, dof)

@@ -84,7 +84,7 @@ def _stick_intervals(trajectory: Trajectory) -> dict[str, list[tuple[float, floa
     """Begin and end of each time in stick [s], of each element that runs by events."""
     scene, events = trajectory.scene, trajectory.events
     intervals: dict[str, list[tuple[float, float]]] = {}
-    begin, end = float(trajectory.inputs.t0), float(trajectory.t_end)
+    begin, end = float(trajectory.request.t0), float(trajectory.t_end)
     for name in scene.event_driven:
         mode = trajectory.mode[name]
         own = np.asarray(events.effect) == scene.names.index(name)

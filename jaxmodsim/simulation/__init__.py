@@ -8,7 +8,7 @@ from ._outcome import MAX_STEPS as MAX_STEPS
 from ._outcome import SimulationError as SimulationError
 from ._outcome import outcome_messages as outcome_messages
 from ._peak import peak_of as peak_of
-from ._run_request import RunRequest as RunRequest
+from ._run_request import run_request as run_request
 from ._simulate import simulate as simulate
 from ._solve import default_solver as default_solver
 from ._to_accuracy import simulate_to_accuracy as simulate_to_accuracy

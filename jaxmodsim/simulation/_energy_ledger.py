@@ -10,7 +10,7 @@ from ..mechanics import energies
 from ..scene import Scene, State
 from ..solvers import EventLog
 from ._integrated_system import Work
-from ._solve import RunInputs, initial_state
+from ._run_request import RunRequest
 
 
 class EnergyLedger(NamedTuple):
@@ -40,26 +40,26 @@ class EnergyLedger(NamedTuple):
 
 
 @jax.jit
-def ledger(inputs: RunInputs, t: Float[Array, " time"], y: State, work: Work) -> EnergyLedger:
+def ledger(request: RunRequest, t: Float[Array, " time"], y: State, work: Work) -> EnergyLedger:
     """Ledger of a run whose states and work at the times `t` are `y` and `work`."""
-    scene = inputs.scene
+    scene = request.scene
 
     def parts(t: Array, y: State) -> tuple[Array, Array, dict[str, Array]]:
         return *_mechanical(t, y, scene), _stored(t, y, scene)
 
-    first = initial_state(inputs)
+    first = request.initial_state
     kinetic, potential, stored = jax.vmap(parts)(t, y)
-    gained = {name: now - _stored(inputs.t0, first, scene)[name] for name, now in stored.items()}
+    gained = {name: now - _stored(request.t0, first, scene)[name] for name, now in stored.items()}
     supplied = {name: each.supplied for name, each in work.items()}
     dissipated = {
         name: each.absorbed - gained.get(name, 0.0) for name, each in work.items() if each.absorbed is not None
     }
-    return EnergyLedger(kinetic, potential, stored, supplied, dissipated, _energy(scene, inputs.t0, first))
+    return EnergyLedger(kinetic, potential, stored, supplied, dissipated, _energy(scene, request.t0, first))
 
 
 @jax.jit
 def event_losses(
-    inputs: RunInputs, t: Float[Array, " time"], start: State, log: EventLog | None
+    request: RunRequest, t: Float[Array, " time"], start: State, log: EventLog | None
 ) -> Float[Array, " time"]:
     """Energy [J] that was lost at events up to the times `t`, and at t0 where the state given was not admissible.
 
@@ -68,8 +68,8 @@ def event_losses(
     - `start`: the state that the run began with.
     - `log`: of the events; None for a scene without modes.
     """
-    scene = inputs.scene
-    lost = _energy(scene, inputs.t0, initial_state(inputs)) - _energy(scene, inputs.t0, start)
+    scene = request.scene
+    lost = _energy(scene, request.t0, request.initial_state) - _energy(scene, request.t0, start)
     losses = jnp.broadcast_to(lost, t.shape)
     if log is None:
         return losses
@@ -78,7 +78,7 @@ def event_losses(
         return _energy(scene, t, before) - _energy(scene, t, after)
 
     happened = jnp.isfinite(log.t)
-    at = jnp.where(happened, log.t, inputs.t0)
+    at = jnp.where(happened, log.t, request.t0)
     drops = jax.vmap(drop)(at, log.before[0], log.after[0])
     counts = happened[None, :] & (at[None, :] <= t[:, None])
     return losses + jnp.sum(jnp.where(counts, drops[None, :], 0.0), axis=1)

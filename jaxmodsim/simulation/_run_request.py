@@ -1,8 +1,9 @@
 """What is asked of a run: the arguments of `simulate`, checked and converted."""
 
 import math
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -11,16 +12,16 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import ArrayLike, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._core.arguments import as_flag, as_mapping, as_names, as_whole, check_real, did_you_mean
 from .._core.parameters import is_weak
 from .._core.speed import remark_on_single_precision
-from ..scene import Friction, Scene, check_step
+from ..scene import Friction, Scene, State, check_step
 from ..solvers import ImplicitFriction
-from ._solve import RunInputs, RunOptions
+from ._integrated_system import Series
 
-_Plugin = TypeVar("_Plugin")
+MOST_STEPS, MOST_EVENTS = 16384, 1024
 # Relative tolerance below which single precision does not reach.
 _SINGLE = 0.99e-6
 # Events that every run logs. Belt oscillator, 60 s with 108 events: 8, 16 and 64 entries take 4, 9 and 19 % of time.
@@ -28,73 +29,150 @@ _LOGGED = 16
 _RECORDS = ("events", "energy")
 
 
+@partial(jtu.register_dataclass, data_fields=("arrays",), meta_fields=("rest",))
+@dataclass(frozen=True)
+class Plugin:
+    """A solver or an adjoint that was given: its arrays are numbers of the run, the rest of it is compiled in."""
+
+    arrays: PyTree
+    rest: Any
+
+    @property
+    def whole(self) -> Any:
+        """As it was given."""
+        return eqx.combine(self.arrays, self.rest)
+
+
+@partial(
+    jtu.register_dataclass,
+    data_fields=("scene", "q0", "qd0", "z0", "t0", "t1", "ts", "rtol", "atol", "dt", "dtmax", "solver", "adjoint"),
+    meta_fields=("max_steps", "max_events", "hold_chatter", "project", "log", "audited", "series"),
+)
 @dataclass(frozen=True)
 class RunRequest:
-    """The arguments of `simulate`, as they were given."""
+    """A run that is asked for: the arguments of `simulate`, checked and converted.
+
+    Numbers are arrays of one floating type. Choices, from `max_steps` on, are compiled in.
+    """
 
     scene: Scene
-    q0: ArrayLike | list[float]
-    qd0: ArrayLike | list[float]
-    t1: ArrayLike
-    t0: ArrayLike = 0.0
-    ts: ArrayLike | list[float] | None = None
-    z0: dict[str, PyTree] | None = None
-    rtol: ArrayLike = 1e-6
-    atol: ArrayLike = 1e-9
-    dt: ArrayLike | None = None
-    dtmax: ArrayLike | None = None
-    solver: dfx.AbstractSolver | None = None
-    adjoint: dfx.AbstractAdjoint | None = None
-    max_steps: int = 16384
-    max_events: int = 1024
-    hold_chatter: bool = False
-    project: bool = True
-    record: tuple[str, ...] = ()
+    q0: Float[Array, " dof"]
+    qd0: Float[Array, " dof"]
+    # Initial own states of effects that do not start at rest.
+    z0: dict[str, PyTree]
+    t0: Float[Array, ""]
+    t1: Float[Array, ""]
+    ts: Float[Array, " time"] | None
+    rtol: Float[Array, ""]
+    atol: Float[Array, ""]
+    dt: Float[Array, ""] | None
+    dtmax: Float[Array, ""] | None
+    solver: Plugin | None
+    adjoint: Plugin | None
+    max_steps: int
+    max_events: int
+    hold_chatter: bool
+    project: bool
+    # Entries of the log of events, of which later ones are counted alone.
+    log: int
+    # Whether the work integrals run beside the motion.
+    audited: bool
+    # A number that is kept at the ends of all steps.
+    series: Series | None = None
 
-    def checked(self) -> tuple[RunInputs, RunOptions]:
-        """The numbers of the run, and what is compiled in.
+    @property
+    def initial_state(self) -> State:
+        """State at t0: effects whose state is not given start at rest."""
+        return State(self.q0, self.qd0, self.scene.initial_state(self.q0) | self.z0)
 
-        **Raises:**
 
-        - `ValueError` naming the argument, what was given and what is needed.
-        """
-        inputs = _inputs(self)
-        max_steps, max_events = as_whole(self.max_steps, name="max_steps"), as_whole(self.max_events, name="max_events")
-        hold_chatter, project = as_flag(self.hold_chatter, name="hold_chatter"), as_flag(self.project, name="project")
-        solver_arrays, solver = _split(self.solver, dfx.AbstractSolver, "solver")
-        if isinstance(self.solver, ImplicitFriction):
-            if self.dt is None:
-                raise ValueError(
-                    "ImplicitFriction takes fixed steps and has no estimate of its error: pass the step, as in dt=1e-3."
-                )
-            check_step(self.scene)
-        if isinstance(self.adjoint, dfx.BacksolveAdjoint):
+def run_request(
+    scene: Scene,
+    q0: ArrayLike | list[float],
+    qd0: ArrayLike | list[float],
+    t1: ArrayLike,
+    *,
+    t0: ArrayLike = 0.0,
+    ts: ArrayLike | list[float] | None = None,
+    z0: dict[str, PyTree] | None = None,
+    rtol: ArrayLike = 1e-6,
+    atol: ArrayLike = 1e-9,
+    dt: ArrayLike | None = None,
+    dtmax: ArrayLike | None = None,
+    solver: dfx.AbstractSolver | None = None,
+    adjoint: dfx.AbstractAdjoint | None = None,
+    max_steps: int = MOST_STEPS,
+    max_events: int = MOST_EVENTS,
+    hold_chatter: bool = False,
+    project: bool = True,
+    record: tuple[str, ...] = (),
+) -> RunRequest:
+    """Check and convert the arguments of `simulate`.
+
+    **Raises:**
+
+    - `ValueError` naming the argument, what was given and what is needed.
+    """
+    if not isinstance(scene, Scene):
+        raise ValueError(f"simulate needs a Scene, but a {type(scene).__name__} was given.")
+    given = {"q0": q0, "qd0": qd0, "t1": t1, "t0": t0, "rtol": rtol, "atol": atol, "ts": ts, "dt": dt, "dtmax": dtmax}
+    scene, array = _converted(scene, {name: value for name, value in given.items() if value is not None})
+    _check_values(array)
+    _check_span(t0, t1, array)
+    if array["q0"].shape != (1,):
+        _check_slips(scene, array["q0"], array["t0"])
+    if isinstance(solver, ImplicitFriction):
+        if dt is None:
             raise ValueError(
-                "simulate cannot use diffrax.BacksolveAdjoint, which knows neither events nor projections nor what is"
-                " kept of a run. Leave adjoint out, or pass diffrax.ForwardMode()."
+                "ImplicitFriction takes fixed steps and has no estimate of its error: pass the step, as in dt=1e-3."
             )
-        adjoint_arrays, adjoint = _split(self.adjoint, dfx.AbstractAdjoint, "adjoint")
-        inputs = inputs._replace(plugins=(solver_arrays, adjoint_arrays))
-        log, audited = _beside(self, inputs, max_events)
-        return inputs, RunOptions(solver, adjoint, max_steps, max_events, hold_chatter, project, log, audited)
+        check_step(scene)
+    if isinstance(adjoint, dfx.BacksolveAdjoint):
+        raise ValueError(
+            "simulate cannot use diffrax.BacksolveAdjoint, which knows neither events nor projections nor what is"
+            " kept of a run. Leave adjoint out, or pass diffrax.ForwardMode()."
+        )
+    asked = RunRequest(
+        scene,
+        array["q0"],
+        array["qd0"],
+        {} if z0 is None else _own_states(scene, array["q0"], z0, array["q0"].dtype),
+        array["t0"],
+        array["t1"],
+        array.get("ts"),
+        array["rtol"],
+        array["atol"],
+        array.get("dt"),
+        array.get("dtmax"),
+        _plugin(solver, dfx.AbstractSolver, "solver"),
+        _plugin(adjoint, dfx.AbstractAdjoint, "adjoint"),
+        as_whole(max_steps, name="max_steps"),
+        as_whole(max_events, name="max_events"),
+        as_flag(hold_chatter, name="hold_chatter"),
+        as_flag(project, name="project"),
+        0,
+        False,
+    )
+    return _recording(asked, record)
 
 
-def _beside(asked: RunRequest, inputs: RunInputs, max_events: int) -> tuple[int, bool]:
-    """Entries of the log that the run writes, and whether it integrates work beside the motion.
+def _recording(asked: RunRequest, record: tuple[str, ...]) -> RunRequest:
+    """With a log of as many events as are recorded, and with the work.
 
     A run whose numbers are known logs its first events. One that is differentiated would carry the log through its
     derivatives.
     """
-    record = as_names(asked.record, name="record")
-    for name in record:
+    for name in as_names(record, name="record"):
         if name not in _RECORDS:
             raise ValueError(
-                f"record holds {name!r}, which is none of {', '.join(_RECORDS)}{did_you_mean(name, _RECORDS)}."
+                f"record holds {name!r}, which is none of {', '.join(_RECORDS)}.{did_you_mean(name, _RECORDS)}"
             )
     audited = "energy" in record
     if "events" in record or (audited and asked.scene.contacts):  # what impacts lose is read from the log
-        return max_events, audited
-    return min(_LOGGED, max_events) if is_known(*jtu.tree_leaves(inputs)) else 0, audited
+        log = asked.max_events
+    else:
+        log = min(_LOGGED, asked.max_events) if is_known(*jtu.tree_leaves(asked)) else 0
+    return replace(asked, log=log, audited=audited)
 
 
 def is_known(*values: object) -> bool:
@@ -112,24 +190,17 @@ def _array(value: PyTree, dtype: np.dtype) -> Any:
     return np.asarray(value, dtype)
 
 
-def _inputs(asked: RunRequest) -> RunInputs:
-    """Convert and check all numbers of a run."""
-    scene, t0, t1, z0 = asked.scene, asked.t0, asked.t1, asked.z0
-    if not isinstance(scene, Scene):
-        raise ValueError(f"simulate needs a Scene, but a {type(scene).__name__} was given.")
-    # A list may hold numbers that are traced, as in qd0=[scene.params["v"]].
-    q0, qd0, ts = (
-        jnp.asarray(value) if isinstance(value, list | tuple) and not is_known(*value) else value
-        for value in (asked.q0, asked.qd0, asked.ts)
-    )
-    given = {"q0": q0, "qd0": qd0, "t1": t1, "t0": t0, "rtol": asked.rtol, "atol": asked.atol}
-    given |= {
-        name: value for name, value in (("ts", ts), ("dt", asked.dt), ("dtmax", asked.dtmax)) if value is not None
-    }
+def _converted(scene: Scene, given: dict[str, Any]) -> tuple[Scene, dict[str, Any]]:
+    """The scene, and numbers as arrays of the floating type that it has together with the initial state."""
+    for name in ("q0", "qd0", "ts"):
+        value = given.get(name)
+        # A list may hold numbers that are traced, as in qd0=[scene.params["v"]].
+        if isinstance(value, list | tuple) and not is_known(*value):
+            given[name] = jnp.asarray(value)
     for name, value in given.items():
         if type(value) is not float:
             check_real(value, name=name)
-    leaves: list[Any] = [*jtu.tree_leaves(scene), q0, qd0]
+    leaves: list[Any] = [*jtu.tree_leaves(scene), given["q0"], given["qd0"]]
     kinds = {x.dtype for x in leaves if hasattr(x, "dtype") and not is_weak(x)}
     dtype = kinds.pop() if len(kinds) == 1 else jnp.result_type(*kinds) if kinds else jnp.result_type(float)
     if not jnp.issubdtype(dtype, jnp.floating):
@@ -147,24 +218,7 @@ def _inputs(asked: RunRequest) -> RunInputs:
     for name in ("t0", "t1", "rtol", "atol", "dt", "dtmax"):
         if name in array and array[name].shape != ():
             raise ValueError(f"{name} must be one number, but has the shape {array[name].shape}.")
-    _check_values(array)
-    _check_span(t0, t1, array)
-    if array["q0"].shape != (1,):
-        _check_slips(scene, array["q0"], array["t0"])
-    return RunInputs(
-        scene,
-        array["q0"],
-        array["qd0"],
-        {} if z0 is None else _own_states(scene, array["q0"], z0, dtype),
-        array["t0"],
-        array["t1"],
-        array.get("ts"),
-        array["rtol"],
-        array["atol"],
-        array.get("dt"),
-        array.get("dtmax"),
-        None,
-    )
+    return scene, array
 
 
 def _check_span(t0: ArrayLike, t1: ArrayLike, array: dict[str, Any]) -> None:
@@ -237,10 +291,9 @@ def _check_values(array: dict[str, Any]) -> None:
         )
 
 
-def _split(plugin: _Plugin | None, kind: type[_Plugin], name: str) -> tuple[_Plugin | None, _Plugin | None]:
-    """Arrays of a plug-in, and the rest of it, which is compiled in."""
+def _plugin(plugin: object | None, kind: type, name: str) -> Plugin | None:
     if plugin is None:
-        return None, None
+        return None
     if not isinstance(plugin, kind):
         raise ValueError(f"{name} must be a diffrax.{kind.__name__} object, but {plugin!r} was given.")
-    return eqx.partition(plugin, eqx.is_array)
+    return Plugin(*eqx.partition(plugin, eqx.is_array))

@@ -22,8 +22,8 @@ from .._core.speed import recommend_tuning, remark_on_compilation, remark_on_fix
 from ..scene import Scene, State, vector_field
 from ..solvers import Gauss, ImplicitFriction, Rodas5P
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages, violation_code
-from ._run_request import RunRequest, is_known
-from ._solve import RunInputs, RunOptions, RunOutput, compiled_runs, default_solver, solve
+from ._run_request import MOST_EVENTS, MOST_STEPS, RunRequest, is_known, run_request
+from ._solve import RunOutput, compiled_runs, default_solver, solve
 from ._trajectory import Trajectory, trajectory
 
 _IMPLICIT = (dfx.AbstractImplicitSolver, Gauss, ImplicitFriction, Rodas5P)
@@ -48,8 +48,8 @@ def simulate(
     dtmax: ArrayLike | None = None,
     solver: dfx.AbstractSolver | None = None,
     adjoint: dfx.AbstractAdjoint | None = None,
-    max_steps: int = 16384,
-    max_events: int = 1024,
+    max_steps: int = MOST_STEPS,
+    max_events: int = MOST_EVENTS,
     hold_chatter: bool = False,
     project: bool = True,
     record: tuple[str, ...] = (),
@@ -120,63 +120,60 @@ def simulate(
     """
     recommend_tuning()
     throw = as_flag(throw, name="throw")
-    inputs, options = RunRequest(
-        scene,
-        q0,
-        qd0,
-        t1,
-        t0,
-        ts,
-        z0,
-        rtol,
-        atol,
-        dt,
-        dtmax,
-        solver,
-        adjoint,
-        max_steps,
-        max_events,
-        hold_chatter,
-        project,
-        record,
-    ).checked()
+    request = run_request(
+        *(scene, q0, qd0, t1),
+        t0=t0,
+        ts=ts,
+        z0=z0,
+        rtol=rtol,
+        atol=atol,
+        dt=dt,
+        dtmax=dtmax,
+        solver=solver,
+        adjoint=adjoint,
+        max_steps=max_steps,
+        max_events=max_events,
+        hold_chatter=hold_chatter,
+        project=project,
+        record=record,
+    )
     if throw and scene.constraints:
-        _check_initial_state(inputs)
+        _check_initial_state(request)
     compiled, began = compiled_runs(), time.perf_counter()
-    solved = solve(inputs, options)
+    solved = solve(request)
     if compiled_runs() > compiled:
         remark_on_compilation(time.perf_counter() - began, _functions(scene))
     if throw:
-        solved = _raise_early_end(inputs, solved)
-        _check_rounding(inputs, solved)
-        _check_fixed_steps(inputs, options, solved)
-    return trajectory(inputs, options, solved)
+        solved = _raise_early_end(request, solved)
+        _check_rounding(request, solved)
+        _check_fixed_steps(request, solved)
+    return trajectory(request, solved)
 
 
-def _check_rounding(inputs: RunInputs, solved: RunOutput) -> None:
+def _check_rounding(request: RunRequest, solved: RunOutput) -> None:
     """Remark on a run in single precision whose steps round by more than its tolerance.
 
     Roundings add up as the square root of their number. On a box that a spring pulls by 1 m, with LuGre bristles of
     1e3 to 1e7 N/m and 300 to 4000 steps, the error was 0.5 to 3.2 times `eps/2 sqrt(steps)`.
     """
     steps = solved.stats["num_steps"]
-    if solved.t.dtype == jnp.float32 and inputs.dt is None and is_known(steps, inputs.rtol):
+    if solved.t.dtype == jnp.float32 and request.dt is None and is_known(steps, request.rtol):
         rounding = 0.5 * float(jnp.finfo(jnp.float32).eps) * math.sqrt(int(steps))
-        if rounding > _ROUNDING * float(inputs.rtol):
+        if rounding > _ROUNDING * float(request.rtol):
             remark_on_rounding()
 
 
-def _check_fixed_steps(inputs: RunInputs, options: RunOptions, solved: RunOutput) -> None:
+def _check_fixed_steps(request: RunRequest, solved: RunOutput) -> None:
     """Remark on explicit fixed steps, of a run that is differentiated, beyond about the limit of stability.
 
     At rest the motion stays right there, and the derivative grows without bound. The rate is the spectral radius of the
     vector field at the end of the run. It is known outside of `jax.jit` alone.
     """
-    if inputs.dt is None or is_known(*jtu.tree_leaves(inputs)):
+    if request.dt is None or is_known(*jtu.tree_leaves(request)):
         return
-    end = (solved.t[-1], jtu.tree_map(lambda x: x[-1], (solved.y, solved.mode)), inputs.scene, inputs.dt)
+    end = (solved.t[-1], jtu.tree_map(lambda x: x[-1], (solved.y, solved.mode)), request.scene, request.dt)
     t, (y, mode), scene, dt = lax.stop_gradient(end)
-    solver = options.solver or default_solver(scene, y.q.shape[0], True)
+    solver = default_solver(scene, y.q.shape[0], True) if request.solver is None else request.solver.whole
     if not is_known(*jtu.tree_leaves((t, y, mode, scene))) or isinstance(solver, _IMPLICIT):
         return
     numbers, as_state = ravel_pytree(y)
@@ -192,25 +189,25 @@ def _functions(scene: Scene) -> list[object]:
     return [each.fn for each in nodes if isinstance(each, Function)]
 
 
-def _check_initial_state(inputs: RunInputs) -> None:
+def _check_initial_state(request: RunRequest) -> None:
     """Raise for a known initial state that violates constraints or contacts, before the run is compiled."""
-    start = inputs.t0, inputs.q0, inputs.qd0
-    if is_known(*jtu.tree_leaves((inputs.scene, start))):
+    start = request.t0, request.q0, request.qd0
+    if is_known(*jtu.tree_leaves((request.scene, start))):
         t0, q0, qd0 = map(jnp.asarray, start)
         y = State(q0, qd0, {})
-        code = violation_code(inputs.scene, t0, y)
+        code = violation_code(request.scene, t0, y)
         if is_known(code) and int(code) != SUCCESS:
-            raise SimulationError(describe_failure(inputs.scene, float(t0), y, int(code)))
+            raise SimulationError(describe_failure(request.scene, float(t0), y, int(code)))
 
 
-def _raise_early_end(inputs: RunInputs, solved: RunOutput) -> RunOutput:
+def _raise_early_end(request: RunRequest, solved: RunOutput) -> RunOutput:
     """Raise for a run that ended early: at once where its values are known, by a run-time check where traced."""
     if is_known(solved.code):
         code = int(solved.code)
         if code != SUCCESS:
             t, y = solved.end or (solved.t[-1], jtu.tree_map(lambda x: x[-1], solved.y))
-            scene, t, y = lax.stop_gradient((inputs.scene, t, y))
+            scene, t, y = lax.stop_gradient((request.scene, t, y))
             raise SimulationError(describe_failure(scene, float(t), y, code))
         return solved
-    messages = LastLines(outcome_messages(inputs.scene, inputs.q0.shape[0]))
+    messages = LastLines(outcome_messages(request.scene, request.q0.shape[0]))
     return eqx.branched_error_if(solved, solved.code != SUCCESS, solved.code, messages)

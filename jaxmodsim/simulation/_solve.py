@@ -1,11 +1,9 @@
 """The compiled part of a run."""
 
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -40,8 +38,9 @@ from ..solvers import (
     trial_step,
     unchecked,
 )
-from ._integrated_system import AugmentedState, Instant, IntegratedSystem, RunFunctions, Series, Work, project
+from ._integrated_system import AugmentedState, Instant, IntegratedSystem, RunFunctions, Work, project
 from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, end_code, start_code
+from ._run_request import RunRequest
 
 # Part of the absolute tolerance below which a slip velocity counts as none.
 _REST = 1e-3
@@ -58,48 +57,6 @@ _ROSENBROCK_GAINS = (0.25, 0.5)
 _MOST_UNKNOWNS = 24
 
 
-class RunInputs(NamedTuple):
-    """All numbers of a run."""
-
-    scene: Scene
-    q0: Float[Array, " dof"]
-    qd0: Float[Array, " dof"]
-    # Initial own states of effects that do not start at rest.
-    z0: dict[str, PyTree]
-    t0: Float[Array, ""]
-    t1: Float[Array, ""]
-    ts: Float[Array, " time"] | None
-    rtol: Float[Array, ""]
-    atol: Float[Array, ""]
-    dt: Float[Array, ""] | None
-    dtmax: Float[Array, ""] | None
-    # Array leaves of the solver and the adjoint, if they have any.
-    plugins: PyTree
-
-
-def initial_state(inputs: RunInputs) -> State:
-    """State at t0: effects whose state is not given start at rest."""
-    return State(inputs.q0, inputs.qd0, inputs.scene.initial_state(inputs.q0) | inputs.z0)
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """All choices of a run that are compiled in."""
-
-    solver: Any
-    adjoint: Any
-    max_steps: int
-    max_events: int
-    hold_chatter: bool
-    project: bool
-    # Entries of the log of events, of which later ones are counted alone.
-    log: int = 0
-    # Whether the work integrals run beside the motion.
-    audited: bool = False
-    # A number that is kept at the ends of all steps.
-    series: Series | None = None
-
-
 class Nodes(NamedTuple):
     """A number at t0 and at the ends of all steps: times, values and rates (None if not known), infinite beyond."""
 
@@ -111,7 +68,7 @@ class Nodes(NamedTuple):
 class RunOutput(NamedTuple):
     """What a run gives: saved times and states, the outcome, the end that was reached, and the numbers of steps.
 
-    And what its options ask for beside that: a log of events, the work at the saved times, a series; else None.
+    And what the request asks for beside that: a log of events, the work at the saved times, a series; else None.
     """
 
     t: Float[Array, " time"]
@@ -139,37 +96,37 @@ def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolv
     return Rodas5P(pivot=fixed_step) if stiff or (scene.mode_names and dof == 1) else dfx.Tsit5()
 
 
-def _structured(inputs: RunInputs) -> bool:
+def _structured(request: RunRequest) -> bool:
     """Whether the systems of `Rodas5P` are solved by `linear_solver`, from the structure of mechanics.
 
     A step of 2, 3 and 6 links with LuGre joints takes 2.4, 4.8 and 9.3 us so, and 2.4, 5.6 and 37 us with the Jacobian
     (two shared cores, float64). On one coordinate 1.4 and 1.2 us.
     """
-    unknowns = sum(np.size(x) for x in jtu.tree_leaves((inputs.q0, inputs.scene.initial_state(inputs.q0))))
-    return inputs.q0.shape[0] > 1 and unknowns <= _MOST_UNKNOWNS and has_linear_solver(inputs.scene)
+    unknowns = sum(np.size(x) for x in jtu.tree_leaves((request.q0, request.scene.initial_state(request.q0))))
+    return request.q0.shape[0] > 1 and unknowns <= _MOST_UNKNOWNS and has_linear_solver(request.scene)
 
 
-def _shortest(inputs: RunInputs) -> Float[Array, ""]:
+def _shortest(request: RunRequest) -> Float[Array, ""]:
     """Shortest step [s]: what time resolves."""
-    span = jnp.maximum(jnp.abs(inputs.t0), jnp.abs(inputs.t1))
+    span = jnp.maximum(jnp.abs(request.t0), jnp.abs(request.t1))
     return float(jnp.finfo(span.dtype).eps) * span
 
 
-def _tolerances(inputs: RunInputs) -> tuple[Array, Array]:
+def _tolerances(request: RunRequest) -> tuple[Array, Array]:
     """Relative and absolute; of what is zero and stays so, the error is zero and not 0/0."""
-    return inputs.rtol, jnp.maximum(inputs.atol, float(jnp.finfo(inputs.atol.dtype).tiny))
+    return request.rtol, jnp.maximum(request.atol, float(jnp.finfo(request.atol.dtype).tiny))
 
 
-def _error_control(inputs: RunInputs, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
-    if inputs.dt is not None:
+def _error_control(request: RunRequest, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
+    if request.dt is not None:
         return FiniteSteps()
-    (rtol, atol), dtmin = _tolerances(inputs), _shortest(inputs)
-    p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not inputs.scene.mode_names else _GAINS
-    return dfx.PIDController(rtol, atol, pcoeff=p, icoeff=i, dtmin=dtmin, dtmax=inputs.dtmax, force_dtmin=False)
+    (rtol, atol), dtmin = _tolerances(request), _shortest(request)
+    p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not request.scene.mode_names else _GAINS
+    return dfx.PIDController(rtol, atol, pcoeff=p, icoeff=i, dtmin=dtmin, dtmax=request.dtmax, force_dtmin=False)
 
 
 def _solver(
-    solver: dfx.AbstractSolver, functions: RunFunctions, scene: Scene, options: RunOptions
+    solver: dfx.AbstractSolver, functions: RunFunctions, scene: Scene, request: RunRequest
 ) -> dfx.AbstractSolver:
     """`solver`, wrapped in what the scene needs: events, projections, signals."""
     if isinstance(solver, ImplicitFriction):
@@ -183,14 +140,14 @@ def _solver(
             solver,
             functions.guards,
             functions.reset,
-            on_zeno=functions.on_zeno if options.hold_chatter or scene.contacts else None,
+            on_zeno=functions.on_zeno if request.hold_chatter or scene.contacts else None,
             project=functions.project_and_stick if functions.projects or functions.sticks else None,
             samples=samples,
             rtol=functions.tolerances[0],
             enforce=True,
             event_mode=functions.event_mode if sum(functions.widths) > len(functions.widths) else None,
-            max_events=options.max_events,
-            log=options.log,
+            max_events=request.max_events,
+            log=request.log,
         )
     if functions.projects or freeze_args is not None:
         return Projected(solver, functions.project if functions.projects else None, freeze_args)
@@ -201,28 +158,28 @@ def _step_from(t: Array, scene: Scene) -> Scene:
     return scene.step_from(t)
 
 
-def _controller(inputs: RunInputs, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
-    controller = _error_control(inputs, solver)
-    times = sample_times(inputs.scene.params, linear=True)
-    if inputs.scene.mode_names:
+def _controller(request: RunRequest, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
+    controller = _error_control(request, solver)
+    times = sample_times(request.scene.params, linear=True)
+    if request.scene.mode_names:
         return EventController(controller, times, direction=1)
     return controller if times is None else StepsTo(controller, times)
 
 
-def _plugins(inputs: RunInputs, options: RunOptions, system: IntegratedSystem) -> tuple[Any, Any]:
+def _plugins(request: RunRequest, system: IntegratedSystem) -> tuple[Any, Any]:
     """Solver and adjoint: those that were given, or the defaults."""
-    solver = default_solver(inputs.scene, inputs.q0.shape[0], inputs.dt is not None)
-    if options.solver is not None:
-        solver = eqx.combine(options.solver, inputs.plugins[0])
-    if isinstance(solver, Rodas5P) and solver.linear_solver is None and not system.audited and _structured(inputs):
+    solver = default_solver(request.scene, request.q0.shape[0], request.dt is not None)
+    if request.solver is not None:
+        solver = request.solver.whole
+    if isinstance(solver, Rodas5P) and solver.linear_solver is None and not system.audited and _structured(request):
         solver = Rodas5P(solver.pivot, system.linear_solver)
-    return solver, StoredSteps() if options.adjoint is None else eqx.combine(options.adjoint, inputs.plugins[1])
+    return solver, StoredSteps() if request.adjoint is None else request.adjoint.whole
 
 
-def _well_posed(inputs: RunInputs) -> Bool[Array, ""]:
+def _well_posed(request: RunRequest) -> Bool[Array, ""]:
     """Whether times and tolerances make a run; known ones are checked before, with a sentence of their own."""
-    t0, t1, ts, rtol, atol = inputs.t0, inputs.t1, inputs.ts, inputs.rtol, inputs.atol
-    steps = [step for step in (inputs.dt, inputs.dtmax) if step is not None]
+    t0, t1, ts, rtol, atol = request.t0, request.t1, request.ts, request.rtol, request.atol
+    steps = [step for step in (request.dt, request.dtmax) if step is not None]
     fine = (t0 <= t1) & (rtol >= 0) & (atol >= 0) & (rtol + atol > 0)
     for step in steps:
         fine &= step > 0
@@ -241,33 +198,33 @@ class _Start(NamedTuple):
     first: Float[Array, ""]
 
 
-def _functions(inputs: RunInputs, options: RunOptions) -> RunFunctions:
-    scene = inputs.scene
+def _functions(request: RunRequest) -> RunFunctions:
+    scene = request.scene
     return RunFunctions(
-        IntegratedSystem(options.audited, isinstance(options.solver, Gauss)),
-        _REST * inputs.atol,
-        (inputs.rtol, inputs.atol),
-        bool(scene.bilateral or scene.contacts) and options.project,
+        IntegratedSystem(request.audited, request.solver is not None and isinstance(request.solver.rest, Gauss)),
+        _REST * request.atol,
+        (request.rtol, request.atol),
+        bool(scene.bilateral or scene.contacts) and request.project,
         scene.stick_drifts,
-        options.hold_chatter,
-        scene.mode_widths(inputs.q0.shape[0]),
+        request.hold_chatter,
+        scene.mode_widths(request.q0.shape[0]),
     )
 
 
-def _start(inputs: RunInputs, functions: RunFunctions, order: Any) -> _Start:
+def _start(request: RunRequest, functions: RunFunctions, order: Any) -> _Start:
     """The start of a run whose method has an error estimate of this order.
 
     Everything is evaluated in a loop, which is compiled once: modes to begin with, the rate, and another one for the
     first step. In reverse mode it is evaluated again.
     """
-    scene, t0, exact = inputs.scene, inputs.t0, bool(inputs.scene.mode_names)
-    initial = initial_state(inputs)
+    scene, t0, exact = request.scene, request.t0, bool(request.scene.mode_names)
+    initial = request.initial_state
     check_scene(scene, initial)
-    mode = jnp.zeros(sum(scene.mode_widths(inputs.q0.shape[0])), inputs.q0.dtype) if exact else None
+    mode = jnp.zeros(sum(scene.mode_widths(request.q0.shape[0])), request.q0.dtype) if exact else None
     if functions.projects:
         initial = project(t0, initial, scene.bind_time(t0), mode)
     y0 = functions.system.start(t0, initial, scene, mode)
-    tolerances = _tolerances(inputs)
+    tolerances = _tolerances(request)
 
     @partial(jax.checkpoint, prevent_cse=False)
     def evaluate(at: tuple[Array, PyTree, Array | None], turn: Array) -> tuple[PyTree, PyTree]:
@@ -280,40 +237,40 @@ def _start(inputs: RunInputs, functions: RunFunctions, order: Any) -> _Start:
             following = jtu.tree_map(lambda a, b: jnp.where(turn == 0, a, b), (t, y, mode), following)
         return following, ((y, mode) if exact else None, slope)
 
-    turns = exact + (1 if inputs.dt is not None else 2)
+    turns = exact + (1 if request.dt is not None else 2)
     _, (begun, slopes) = jax.lax.scan(evaluate, (t0, y0, mode), jnp.arange(turns))
     if exact:
         y0, mode = jtu.tree_map(lambda x: x[0], begun)
     slope = jtu.tree_map(lambda x: x[int(exact)], slopes)
-    if inputs.dt is not None:
-        return _Start(y0, mode, slope, inputs.dt)
+    if request.dt is not None:
+        return _Start(y0, mode, slope, request.dt)
     there = jtu.tree_map(lambda x: x[-1], slopes)
-    step = first_step(jax.lax.stop_gradient(y0), (slope, there), order, tolerances, _shortest(inputs))
-    return _Start(y0, mode, slope, step if inputs.dtmax is None else jnp.minimum(step, inputs.dtmax))
+    step = first_step(jax.lax.stop_gradient(y0), (slope, there), order, tolerances, _shortest(request))
+    return _Start(y0, mode, slope, step if request.dtmax is None else jnp.minimum(step, request.dtmax))
 
 
-def _start_code(inputs: RunInputs, functions: RunFunctions, mode: Array | None, rate: PyTree) -> Int[Array, ""]:
+def _start_code(request: RunRequest, functions: RunFunctions, mode: Array | None, rate: PyTree) -> Int[Array, ""]:
     """What is wrong before the first step, where the first state has that rate."""
     rate = rate.motion if isinstance(rate, AugmentedState) else rate
-    atol = None if inputs.dt is not None else inputs.atol
-    start = start_code(inputs.scene, inputs.t0, initial_state(inputs), rate, mode, atol, functions.system.canonical)
-    return jnp.where(_well_posed(inputs), start, ILL_POSED)
+    atol = None if request.dt is not None else request.atol
+    start = start_code(request.scene, request.t0, request.initial_state, rate, mode, atol, functions.system.canonical)
+    return jnp.where(_well_posed(request), start, ILL_POSED)
 
 
-def _integrate(inputs: RunInputs, options: RunOptions) -> RunOutput:
+def _integrate(request: RunRequest) -> RunOutput:
     """Run diffrax; with modes only where the scene has them, with a log, work and a series only where asked for."""
-    scene, exact, series = inputs.scene, bool(inputs.scene.mode_names), options.series
-    functions = _functions(inputs, options)
-    method, adjoint = _plugins(inputs, options, functions.system)
-    solver = _solver(method, functions, scene, options)
-    y0, mode, rate, first = _start(inputs, functions, method.error_order(dfx.ODETerm(functions.plain_derivative)))
-    controller = _controller(inputs, method)
-    start = _start_code(inputs, functions, mode, rate)
+    scene, exact, series = request.scene, bool(request.scene.mode_names), request.series
+    functions = _functions(request)
+    method, adjoint = _plugins(request, functions.system)
+    solver = _solver(method, functions, scene, request)
+    y0, mode, rate, first = _start(request, functions, method.error_order(dfx.ODETerm(functions.plain_derivative)))
+    controller = _controller(request, method)
+    start = _start_code(request, functions, mode, rate)
     # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
     starts = start == SUCCESS
-    ts = None if inputs.ts is None else jnp.where(starts, inputs.ts, inputs.t0)
+    ts = None if request.ts is None else jnp.where(starts, request.ts, request.t0)
     if isinstance(solver, EventSolver):
-        y0 = solver.start(inputs.t0, y0, mode, scene)
+        y0 = solver.start(request.t0, y0, mode, scene)
 
     # As it is: what states are on constraints and in stick, all at once after the run.
     def saved(t: Array, y: PyTree, scene: Scene) -> tuple[PyTree, Array | None]:
@@ -334,15 +291,15 @@ def _integrate(inputs: RunInputs, options: RunOptions) -> RunOutput:
         return dfx.diffeqsolve(
             dfx.ODETerm(functions.derivative if exact else functions.plain_derivative),
             solver,
-            inputs.t0,
-            jnp.where(starts, inputs.t1, inputs.t0),
+            request.t0,
+            jnp.where(starts, request.t1, request.t0),
             first,
             y0,
             args=scene,
             saveat=dfx.SaveAt(subs=subs),
             stepsize_controller=controller,
             adjoint=adjoint,
-            max_steps=options.max_steps,
+            max_steps=request.max_steps,
             throw=False,
             # Traced from the beginning, as `EventController` makes it: the step is traced once, not for each kind.
             made_jump=jnp.asarray(False) if exact else None,
@@ -360,7 +317,7 @@ def _integrate(inputs: RunInputs, options: RunOptions) -> RunOutput:
     t = solution.ts[0]
     if ts is not None:
         t, rows = jtu.tree_map(lambda *x: jnp.concatenate(x), (t, rows), (solution.ts[1], solution.ys[1]))
-    t, y, modes, instants = _kept(inputs, functions, starts, t, rows)
+    t, y, modes, instants = _kept(request, functions, starts, t, rows)
     end, rate, missed = jtu.tree_map(lambda x: x[0], (t, y, modes)), None, jnp.asarray(False)
     if ts is not None:
         t, y, modes = jtu.tree_map(lambda x: x[1:], (t, y, modes))
@@ -369,10 +326,10 @@ def _integrate(inputs: RunInputs, options: RunOptions) -> RunOutput:
         if ts is not None:  # an element that sticks under a load beyond its limit: an event was stepped over
             beyond = jnp.any(instants.stick_violation[1:] > _OVERLOAD, axis=1)
             missed = jnp.any(beyond & jnp.isfinite(t))
-    (y, work), (end_state, _) = (y, end[1]) if options.audited else ((y, None), (end[1], None))
-    ended = _ended(inputs, end[0], end_state, rate, end[2], solution.result, ending)
+    (y, work), (end_state, _) = (y, end[1]) if request.audited else ((y, None), (end[1], None))
+    ended = _ended(request, end[0], end_state, rate, end[2], solution.result, ending)
     code = jnp.where(starts, ended, start)
-    if exact and not options.hold_chatter:
+    if exact and not request.hold_chatter:
         code = jnp.where((code == SUCCESS) & missed, MISSED_EVENT, code)
     nodes = None if series is None else Nodes(solution.ts[-1], *solution.ys[-1])
     return RunOutput(t, y, modes, code, None if ts is None else (end[0], end_state), stats, log, work, nodes)
@@ -386,7 +343,7 @@ def _motions(log: EventLog | None) -> EventLog | None:
 
 
 def _ended(
-    inputs: RunInputs,
+    request: RunRequest,
     t: Array,
     y: State,
     rate: State | None,
@@ -395,36 +352,36 @@ def _ended(
     ending: Ending | None,
 ) -> Array:
     """How the run ended, if it began; the rate is None where nothing has given it yet."""
-    span = jnp.maximum(jnp.abs(inputs.t0), jnp.abs(inputs.t1))
-    ahead = float(jnp.finfo(span.dtype).eps) ** 0.5 * span if inputs.dt is None else inputs.dt
-    rate = vector_field(t, y, inputs.scene, mode) if rate is None else rate
-    return end_code(inputs.scene, t, y, rate, mode, result, ending, ahead)
+    span = jnp.maximum(jnp.abs(request.t0), jnp.abs(request.t1))
+    ahead = float(jnp.finfo(span.dtype).eps) ** 0.5 * span if request.dt is None else request.dt
+    rate = vector_field(t, y, request.scene, mode) if rate is None else rate
+    return end_code(request.scene, t, y, rate, mode, result, ending, ahead)
 
 
 def _kept(
-    inputs: RunInputs, functions: RunFunctions, starts: Array, t: Array, rows: tuple[PyTree, Array | None]
+    request: RunRequest, functions: RunFunctions, starts: Array, t: Array, rows: tuple[PyTree, Array | None]
 ) -> tuple[Array, PyTree, Array | None, Instant | None]:
     """Times, results, modes and more of the end and of all saved times: infinite where they were not reached.
 
     A run that did not start has reached times up to t0.
     """
-    times = t[:1] if inputs.ts is None else jnp.concatenate([t[:1], inputs.ts])
-    reached = jnp.isfinite(t) & (starts | (times <= inputs.t0) | (jnp.arange(t.shape[0]) == 0))
+    times = t[:1] if request.ts is None else jnp.concatenate([t[:1], request.ts])
+    reached = jnp.isfinite(t) & (starts | (times <= request.t0) | (jnp.arange(t.shape[0]) == 0))
 
     def fill(x: Array, filling: Array | float) -> Array:
         return jnp.where(jnp.expand_dims(reached, tuple(range(1, x.ndim))), x, filling)
 
     # What was not reached is evaluated at the end of the run.
     t_there, (y, modes) = jtu.tree_map(lambda x: fill(x, x[:1]), (t, rows))
-    y, instants = jax.lax.map(lambda row: functions.keep(row[0], row[1], inputs.scene, row[2]), (t_there, y, modes))
+    y, instants = jax.lax.map(lambda row: functions.keep(row[0], row[1], request.scene, row[2]), (t_there, y, modes))
     t, y, modes = jtu.tree_map(lambda x: fill(x, jnp.inf), (t, y, modes))
     return t, y, modes, instants
 
 
-@partial(jax.jit, static_argnums=1)
-def solve(inputs: RunInputs, options: RunOptions) -> RunOutput:
+@jax.jit
+def solve(request: RunRequest) -> RunOutput:
     """Run a scene; the run, and its derivatives, in one kernel each."""
-    return in_one_kernel(jax.jit(lambda inputs: _integrate(inputs, options)), inputs)
+    return in_one_kernel(jax.jit(_integrate), request)
 
 
 def compiled_runs() -> int:
@@ -432,9 +389,9 @@ def compiled_runs() -> int:
     return programs_of(solve)
 
 
-@partial(jax.jit, static_argnames=("options",))
-def solve_start(inputs: RunInputs, options: RunOptions) -> State:
+@jax.jit
+def solve_start(request: RunRequest) -> State:
     """The state a run begins with: on the constraints, and at rest where elements stick."""
-    functions = _functions(inputs, options)
-    y0 = _start(inputs, functions, 1).y
-    return functions.system.state(inputs.t0, y0, inputs.scene.bind_time(inputs.t0))
+    functions = _functions(request)
+    y0 = _start(request, functions, 1).y
+    return functions.system.state(request.t0, y0, request.scene.bind_time(request.t0))

@@ -21,8 +21,8 @@ from ._accuracy import Accuracy, Attempt, CostScaling
 from ._evaluations import evaluations_per_step
 from ._observe import named_series
 from ._outcome import SUCCESS, SimulationError, describe_failure
-from ._run_request import RunRequest, is_known
-from ._solve import RunInputs, RunOptions, RunOutput, default_solver, solve
+from ._run_request import MOST_EVENTS, MOST_STEPS, Plugin, RunRequest, is_known, run_request
+from ._solve import RunOutput, default_solver, solve
 from ._trajectory import Trajectory, trajectory
 
 _ACCURACIES = (1e-12, 1e-1)
@@ -92,8 +92,7 @@ class _TrialRun:
 class _AccuracySearch:
     """What is searched for, and what was run: by the tolerance and the place of the method among `solvers`."""
 
-    inputs: RunInputs
-    options: RunOptions
+    request: RunRequest
     asked: float
     observe: Observe
     solvers: tuple[dfx.AbstractSolver, ...]
@@ -102,7 +101,7 @@ class _AccuracySearch:
 
     @property
     def tightest(self) -> float:
-        return _round(_TIGHTEST * float(jnp.finfo(self.inputs.q0.dtype).eps))
+        return _round(_TIGHTEST * float(jnp.finfo(self.request.q0.dtype).eps))
 
     @property
     def second(self) -> int:
@@ -112,34 +111,36 @@ class _AccuracySearch:
     def run(self, rtol: float, which: int) -> _TrialRun:
         """The run by one of the methods at a tolerance; made once."""
         if (rtol, which) not in self.made:
-            self.made[rtol, which] = self.make(rtol, which, self.inputs)
+            self.made[rtol, which] = self.make(rtol, which, self.request)
         return self.made[rtol, which]
 
     def along(self, rtol: float, which: int) -> _TrialRun:
         """The same run, kept at more times where few are saved."""
-        if self.inputs.ts is not None and self.inputs.ts.shape[0] >= _FEW:
+        if self.request.ts is not None and self.request.ts.shape[0] >= _FEW:
             return self.run(rtol, which)
         if (rtol, which) not in self.seen:
-            ts = np.linspace(self.inputs.t0, self.inputs.t1, _TIMES).astype(self.inputs.q0.dtype)
-            self.seen[rtol, which] = self.make(rtol, which, self.inputs._replace(ts=ts))
+            ts = np.linspace(self.request.t0, self.request.t1, _TIMES).astype(self.request.q0.dtype)
+            self.seen[rtol, which] = self.make(rtol, which, replace(self.request, ts=ts))
         return self.seen[rtol, which]
 
     def failure(self, rtol: float, which: int) -> str:
         """How the run by one of the methods at a tolerance ended early; nothing if it did not."""
         return self.run(rtol, which).failure or self.along(rtol, which).failure
 
-    def make(self, rtol: float, which: int, inputs: RunInputs) -> _TrialRun:
-        solver, dtype = self.solvers[which], self.inputs.q0.dtype
+    def make(self, rtol: float, which: int, request: RunRequest) -> _TrialRun:
+        solver, dtype = self.solvers[which], self.request.q0.dtype
         atol = _round(max(_ABSOLUTE * rtol, float(jnp.finfo(dtype).eps)))
-        arrays, rest = eqx.partition(solver, eqx.is_array)
-        plugins = (arrays, None if inputs.plugins is None else inputs.plugins[1])
-        inputs = inputs._replace(rtol=np.asarray(rtol, dtype), atol=np.asarray(atol, dtype), plugins=plugins)
+        request = replace(
+            request,
+            rtol=np.asarray(rtol, dtype),
+            atol=np.asarray(atol, dtype),
+            solver=Plugin(*eqx.partition(solver, eqx.is_array)),
+        )
         if which == _BOUNDED:
-            inputs = inputs._replace(dtmax=np.asarray((inputs.t1 - inputs.t0) / _PART, dtype))
-        options = replace(self.options, solver=rest)
-        solved = solve(inputs, options)
+            request = replace(request, dtmax=np.asarray((request.t1 - request.t0) / _PART, dtype))
+        solved = solve(request)
         _check_known(solved)
-        run, failure = trajectory(inputs, options, solved), _failure(inputs, solved)
+        run, failure = trajectory(request, solved), _failure(request, solved)
         observed = np.zeros(0) if failure else _observed(self.observe, run)
         return _TrialRun(run, which, solver, rtol, atol, observed, _states(run), failure)
 
@@ -194,8 +195,8 @@ def simulate_to_accuracy(
     dtmax: ArrayLike | None = None,
     solver: dfx.AbstractSolver | None = None,
     adjoint: dfx.AbstractAdjoint | None = None,
-    max_steps: int = RunRequest.max_steps,
-    max_events: int = RunRequest.max_events,
+    max_steps: int = MOST_STEPS,
+    max_events: int = MOST_EVENTS,
     hold_chatter: bool = False,
     project: bool = True,
     throw: bool = True,
@@ -234,14 +235,11 @@ def simulate_to_accuracy(
     - `SimulationError` if the run ended early, or no run of the accuracy was found, and `throw` is set.
     """
     throw = as_flag(throw, name="throw")
-    request = RunRequest(
-        scene,
-        q0,
-        qd0,
-        t1,
-        t0,
-        ts,
-        z0,
+    request = run_request(
+        *(scene, q0, qd0, t1),
+        t0=t0,
+        ts=ts,
+        z0=z0,
         dtmax=dtmax,
         solver=solver,
         adjoint=adjoint,
@@ -250,10 +248,9 @@ def simulate_to_accuracy(
         hold_chatter=hold_chatter,
         project=project,
     )
-    inputs, options = request.checked()
-    asked = _asked(inputs, accuracy)
-    solvers, choices = _solvers(inputs, options)
-    search = _AccuracySearch(inputs, options, asked, _observe(observable), solvers)
+    asked = _asked(request, accuracy)
+    solvers, choices = _solvers(request)
+    search = _AccuracySearch(request, asked, _observe(observable), solvers)
     return _search(search, choices, callable(observable), throw)
 
 
@@ -302,9 +299,9 @@ def _check_known(tree: PyTree) -> None:
         )
 
 
-def _asked(inputs: RunInputs, accuracy: float) -> float:
+def _asked(request: RunRequest, accuracy: float) -> float:
     """The accuracy, if it can be searched for."""
-    _check_known((inputs, accuracy))
+    _check_known((request, accuracy))
     if isinstance(accuracy, bool) or not isinstance(accuracy, int | float | np.number):
         raise ValueError(f"accuracy must be a known number, as in accuracy=1e-6, but {accuracy!r} was given.")
     if not _ACCURACIES[0] <= accuracy <= _ACCURACIES[1]:
@@ -314,20 +311,20 @@ def _asked(inputs: RunInputs, accuracy: float) -> float:
     return float(accuracy)
 
 
-def _solvers(inputs: RunInputs, options: RunOptions) -> tuple[tuple[dfx.AbstractSolver, ...], tuple[int, ...]]:
+def _solvers(request: RunRequest) -> tuple[tuple[dfx.AbstractSolver, ...], tuple[int, ...]]:
     """Two methods, and which of them may be chosen; in scenes with events the second one again, for bounded steps.
 
     Where nothing is stiff a method of order 8 is cheaper at tight tolerances. Of stiff scenes all other methods at hand
     take far more work, so that one of them serves as a check only; so does any beside a method that was given.
     """
-    default = default_solver(inputs.scene, inputs.q0.shape[0], False)
-    stiff = inputs.scene.stiff
+    default = default_solver(request.scene, request.q0.shape[0], False)
+    stiff = request.scene.stiff
     other = dfx.Kvaerno5() if stiff else dfx.Dopri8()
-    bounds = bool(inputs.scene.mode_names) and inputs.dtmax is None
-    if options.solver is None:
+    bounds = bool(request.scene.mode_names) and request.dtmax is None
+    if request.solver is None:
         bounded = (other,) if bounds else ()
         return (default, other, *bounded), (0,) if stiff else (0, 1)
-    given = eqx.combine(options.solver, inputs.plugins[0])
+    given = request.solver.whole
     if not isinstance(given, dfx.AbstractAdaptiveSolver):
         raise ValueError(
             f"simulate_to_accuracy chooses tolerances, but {type(given).__name__} takes fixed steps: pass another"
@@ -409,7 +406,7 @@ def _remark(search: _AccuracySearch, nearest: _References, rtol: float) -> str:
     falls = converges and nearest.gap < _error(looser[0], looser[1], nearest.size) / _FALL
     if len(ended) == 2:
         return f"{text} At rtol {rtol:g} none reached the end. {ended[0]}"
-    if search.inputs.q0.dtype == jnp.float32:
+    if search.request.q0.dtype == jnp.float32:
         return (
             f"{text} The numbers are in float32, whose rounding is {float(jnp.finfo(jnp.float32).eps):.1g}: set"
             " jax_enable_x64 and build the scene and the initial state in float64."
@@ -434,12 +431,12 @@ def _early(search: _AccuracySearch, rtol: float, throw: bool) -> Trajectory:
     return search.run(rtol, 0).run
 
 
-def _failure(inputs: RunInputs, solved: RunOutput) -> str:
+def _failure(request: RunRequest, solved: RunOutput) -> str:
     """How a run ended early; nothing if it did not."""
     if int(solved.code) == SUCCESS:
         return ""
     t, y = solved.end or (solved.t[-1], jtu.tree_map(lambda x: x[-1], solved.y))
-    return describe_failure(inputs.scene, float(t), y, int(solved.code))
+    return describe_failure(request.scene, float(t), y, int(solved.code))
 
 
 def _chosen(search: _AccuracySearch, references: _References, best: _TrialRun, estimate: float) -> Trajectory:
@@ -458,7 +455,7 @@ def _chosen(search: _AccuracySearch, references: _References, best: _TrialRun, e
         _cost_scaling([attempts[x] for x in attempts if x.which == best.which], best.rtol, references.gap),
         tuple(attempts.values()),
         references.remark,
-        float(np.asarray(best.run.inputs.dtmax)) if best.bounded else None,
+        float(np.asarray(best.run.request.dtmax)) if best.bounded else None,
     )
     return replace(best.run, accuracy=accuracy)
 

@@ -24,8 +24,8 @@ from ._columns import Columns, columns
 from ._energy_ledger import EnergyLedger, event_losses, ledger
 from ._integrated_system import Series, Work
 from ._outcome import SUCCESS, RunResult, SimulationError, outcome_messages
-from ._run_request import is_known
-from ._solve import RunInputs, RunOptions, RunOutput, solve, solve_start
+from ._run_request import RunRequest, is_known
+from ._solve import RunOutput, solve, solve_start
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -93,8 +93,8 @@ class Energy(NamedTuple):
 
 @partial(
     jtu.register_dataclass,
-    data_fields=("t", "q", "qd", "z", "modes", "stats", "code", "end", "inputs", "log", "work"),
-    meta_fields=("options", "accuracy"),
+    data_fields=("t", "q", "qd", "z", "modes", "stats", "code", "end", "request", "log", "work"),
+    meta_fields=("accuracy",),
 )
 @dataclass(frozen=True, repr=False)
 class Trajectory(AbstractReadable):
@@ -124,8 +124,7 @@ class Trajectory(AbstractReadable):
     stats: dict[str, Array]
     code: Int[Array, "..."]
     end: Float[Array, "..."] | None
-    inputs: RunInputs
-    options: RunOptions
+    request: RunRequest
     # What the run has recorded: a log of its first events, and the work at the saved times.
     log: EventLog | None = None
     work: Work | None = None
@@ -144,7 +143,7 @@ class Trajectory(AbstractReadable):
     @property
     def scene(self) -> Scene:
         """The scene that was run."""
-        return self.inputs.scene
+        return self.request.scene
 
     @property
     def t_end(self) -> Float[Array, "..."]:
@@ -250,7 +249,7 @@ class Trajectory(AbstractReadable):
         What each effect brought in and lost; `jaxmodsim.energy_audit` adds them up.
         """
         self._one_run("ledger")
-        return self._once("ledger", lambda: ledger(self.inputs, self.t, self._states(), self._audited()[0]))
+        return self._once("ledger", lambda: ledger(self.request, self.t, self._states(), self._audited()[0]))
 
     @property
     def event_losses(self) -> Float[Array, " time"]:
@@ -285,7 +284,7 @@ class Trajectory(AbstractReadable):
     @property
     def log_size(self) -> int:
         """Length of a log that holds all events: as many as needed, in powers of two; another one compiles anew."""
-        count, size = self.stats.get("num_events", 0), self.options.max_events
+        count, size = self.stats.get("num_events", 0), self.request.max_events
         return size if not is_known(count) else min(size, 1 << max(int(count), 8).bit_length())
 
     def _log(self) -> EventLog:
@@ -293,11 +292,12 @@ class Trajectory(AbstractReadable):
         log, count = self.log, self.stats["num_events"]
         if log is not None:
             entries = log.t.shape[0]
-            if entries >= self.options.max_events or (is_known(count) and int(count) <= entries):
+            if entries >= self.request.max_events or (is_known(count) and int(count) <= entries):
                 return log
         # Events do not depend on saved times, which are checked already where they are known.
-        inputs = self.inputs._replace(ts=None) if is_known(self.inputs.ts) else self.inputs
-        return self._once("log", lambda: solve(inputs, replace(self.options, log=self.log_size, audited=False)).log)
+        ts = None if is_known(self.request.ts) else self.request.ts
+        again = replace(self.request, ts=ts, log=self.log_size, audited=False)
+        return self._once("log", lambda: solve(again).log)
 
     def _audited(self) -> tuple[Work, EventLog | None]:
         """The work at the saved times, and with contacts the log of all events, from which their losses are read.
@@ -311,8 +311,8 @@ class Trajectory(AbstractReadable):
         """
         if self.work is not None:
             return self.work, self.log
-        options = replace(self.options, log=self.log_size if self.scene.contacts else 0, audited=True)
-        again = self._once("audited", lambda: solve(self.inputs, options))
+        asked = replace(self.request, log=self.log_size if self.scene.contacts else 0, audited=True)
+        again = self._once("audited", lambda: solve(asked))
         if is_known(self.code, again.code) and int(self.code) == SUCCESS != int(again.code):
             raise SimulationError(
                 "The run reached t1, but repeated with the work integrals beside it, it does not, so its energies are"
@@ -322,7 +322,7 @@ class Trajectory(AbstractReadable):
         return again.work, again.log
 
     def _lost(self, log: EventLog | None) -> Float[Array, " time"]:
-        return event_losses(self.inputs, self.t, solve_start(self.inputs, self.options), log)
+        return event_losses(self.request, self.t, solve_start(self.request), log)
 
     def _once(self, name: str, make: Callable[[], _Value]) -> _Value:
         """A value that takes a repeat of the run, made where it is not there yet."""
@@ -364,11 +364,11 @@ def _(run: Trajectory) -> Table:
     return Table(f"Trajectory, {t}: {run.result}", head, rows, (", ".join(notes),))
 
 
-def trajectory(inputs: RunInputs, options: RunOptions, solved: RunOutput) -> Trajectory:
+def trajectory(request: RunRequest, solved: RunOutput) -> Trajectory:
     """The run that was solved."""
     y, end = solved.y, None if solved.end is None else solved.end[0]
     motion = solved.t, y.q, y.qd, y.z, solved.mode
-    return Trajectory(*motion, solved.stats, solved.code, end, inputs, options, solved.log, solved.work)
+    return Trajectory(*motion, solved.stats, solved.code, end, request, solved.log, solved.work)
 
 
 @jax.jit

@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 
 from .._core.arguments import check_real, did_you_mean
 from ..scene import Scene, elements, scene_numbers, scene_ranges
-from ..simulation import RunRequest, simulate
+from ..simulation import run_request, simulate
 from ._compute import shapes
 from ._grid import Grid, GridAxis
 from ._observe import Derivative, Observation, observations
@@ -125,7 +125,7 @@ def _of_scene(scene: Scene, grid: Grid, observe: object, arguments: dict[str, ob
     _check_runs(converted, numbers)
     # Let `simulate` look at the arguments of the first run while their values are known.
     given = numbers | {name: value for name, value in converted.first.items() if name in numbers}
-    RunRequest(scene, **given, **dict(run.choices)).checked()
+    run_request(scene, **given, **dict(run.choices))
     ranges, units = scene_ranges(scene), dict(_UNITS)
     for name in swept:
         leaf = inside[name][2] if name in inside else name

@@ -111,7 +111,7 @@ def test_prediction_of_steps(pendulum: jms.Trajectory) -> None:
 
 
 def again(run: jms.Trajectory, **options: Any) -> jms.Trajectory:
-    p = run.inputs
+    p = run.request
     simulate = jms.simulate_to_accuracy if "accuracy" in options else jms.simulate
     return simulate(p.scene, p.q0, p.qd0, p.t1, ts=p.ts, **options)
 
@@ -162,7 +162,7 @@ def test_rounding_is_said(pendulum: jms.Trajectory) -> None:
 
 
 def test_float32_floor_is_named(pendulum: jms.Trajectory) -> None:
-    p = jtu.tree_map(lambda x: jnp.asarray(x, "float32"), pendulum.inputs)
+    p = jtu.tree_map(lambda x: jnp.asarray(x, "float32"), pendulum.request)
     run = jms.simulate_to_accuracy(p.scene, p.q0, p.qd0, p.t1, ts=p.ts, accuracy=1e-3)
     assert run.q.dtype == jnp.float32
     assert relative(motion(run), motion(pendulum)) <= 1e-3

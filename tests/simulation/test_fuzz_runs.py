@@ -147,9 +147,9 @@ def check_whole(found: jms.Trajectory, ts: np.ndarray) -> bool:
     assert found.result.message.endswith(".")
     if code == 0:
         assert reached.all()
-        assert abs(float(found.t_end) - float(found.inputs.t1)) <= TINY
+        assert abs(float(found.t_end) - float(found.request.t1)) <= TINY
     else:
-        assert float(found.inputs.t0) - TINY <= float(found.t_end) <= float(found.inputs.t1) + TINY
+        assert float(found.request.t0) - TINY <= float(found.t_end) <= float(found.request.t1) + TINY
     return code == 0
 
 
