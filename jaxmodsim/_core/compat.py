@@ -51,8 +51,8 @@ def _need(owner: object, names: str) -> None:
 
 with _probe(
     "jaxprs",
-    "runs are slower, and compiled runs are not kept in the persistent cache of JAX; indices out of range and step"
-    " functions in functions of a scene are not reported; to_c and to_javascript raise an error",
+    "runs and derivatives take several times as long, and JAX keeps no compiled run in its persistent cache; indices"
+    " out of range and step functions in functions of a scene are not reported; to_c and to_javascript raise an error",
 ):
     from jax.extend.core import ClosedJaxpr as ClosedJaxpr
     from jax.extend.core import Jaxpr as Jaxpr
@@ -66,7 +66,7 @@ with _probe(
     _need(JaxprEqn, "effects invars outvars params primitive")
     _need(Primitive, "bind get_bind_params multiple_results")
 
-with _probe("kernels", "single runs and their derivatives are slower on CPU"):
+with _probe("kernels", "single runs and their derivatives take several times as long on CPU"):
     import jaxlib.version
     from jax.extend.core import Primitive as Primitive
     from jax.interpreters import ad as ad
@@ -81,7 +81,7 @@ with _probe("kernels", "single runs and their derivatives are slower on CPU"):
 
 with _probe(
     "stored_steps",
-    "runs and derivatives are slower, as StoredSteps is diffrax.DirectAdjoint, and derivatives are inaccurate where"
+    "StoredSteps is diffrax.DirectAdjoint: derivatives take several times as long to compile, and are inaccurate where"
     " little moves",
 ):
     import equinox.internal as eqxi

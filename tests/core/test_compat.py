@@ -84,7 +84,7 @@ def test_functions_stay_whole(none_available: Callable[[], None]) -> None:
     x, program = jnp.array([0.3, 2.0]), str(jax.make_jaxpr(rotated)(jnp.ones(2)))
     assert str(jax.make_jaxpr(lambda x: in_scalars(rotated, x, seed=x))(jnp.ones(2))) == program
     assert str(jax.make_jaxpr(lambda x: unchecked(rotated, x))(jnp.ones(2))) == program
-    columns = columns_of(lambda a, b: [2.0 * a, 3.0 * b - a], opaque_one(x[0]), *x)
+    columns: Any = columns_of(lambda a, b: [2.0 * a, 3.0 * b - a], opaque_one(x[0]), *x)
     assert [list(map(float, column)) for column in columns] == [[2.0, -1.0], [0.0, 3.0]]
     beyond = lambda q: q[5]  # noqa: E731
     assert traced(beyond, name="the function", q=x) == jax.ShapeDtypeStruct((), x.dtype)
