@@ -126,9 +126,8 @@ REPORTS = {
         "What the first call of a scene costs, and its derivatives.", "speed",
         (
             Table(
-                "First calls, traced and compiled, in processor time; equations that XLA receives; warm calls of jitted"
-                " functions, medians. Runs with {samples} saved times, derivatives by six numbers (belt: five), with"
-                " `jaxmodsim.tune_cpu()`.",
+                "First calls, traced and compiled, in processor time; warm calls of jitted functions, medians. Runs"
+                " with {samples} saved times, derivatives by six numbers (belt: five), with `jaxmodsim.tune_cpu()`.",
                 (
                     "first run", "first gradient", "first jacobian", "equations of run", "equations of gradient",
                     "steps of run", "run", "gradient", "jacobian",
