@@ -128,7 +128,10 @@ REPORTS = {
             Table(
                 "First calls, traced and compiled, in processor time; warm calls of jitted functions, medians. Runs"
                 " with {samples} saved times, derivatives by six numbers (belt: five), with `jaxmodsim.tune_cpu()`.",
-                ("first run", "first gradient", "first jacobian", "steps of run", "run", "gradient", "jacobian"),
+                (
+                    "first run", "first gradient", "first jacobian", "equations of run", "equations of gradient",
+                    "steps of run", "run", "gradient", "jacobian",
+                ),
                 ("case",),
             ),
             Targets("Targets on first calls and derivatives.", _first_calls),

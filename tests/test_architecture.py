@@ -142,6 +142,11 @@ def test_simulate_loads_no_more_than_a_simulation_needs() -> None:
 
 
 @pytest.mark.quick
+def test_problems_do_not_wait_for_scipy() -> None:
+    assert "scipy" not in loaded_by("from jaxmodsim.problems import named_problems")
+
+
+@pytest.mark.quick
 @pytest.mark.parametrize("words", [["--help"], ["fit", "--help"], ["sweep", "--help"]], ids=" ".join)
 def test_help_loads_nothing_that_takes_long(words: list[str]) -> None:
     arguments = ["jaxmodsim", *words]

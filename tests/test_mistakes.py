@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import jax
 import pytest
 
 from jaxmodsim._core import speed
@@ -52,3 +53,14 @@ def test_a_long_compilation_is_said_once(caplog: pytest.LogCaptureFixture) -> No
     assert not caplog.records
     speed.remark_on_compilation(3.1, ())
     assert "Compiling this scene took 3.1 s" in caplog.text
+    assert '("jax_compilation_cache_dir", "/path/of/a/folder")' in caplog.text
+
+
+def test_whoever_keeps_programs_is_not_told_how(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    before = jax.config.values["jax_compilation_cache_dir"]
+    try:
+        jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+        speed.remark_on_compilation(3.1, ())
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+    assert "compile anew. logging" in caplog.text

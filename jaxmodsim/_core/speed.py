@@ -15,6 +15,11 @@ _LONG = 3.0
 # Identities of the functions that were compiled, by the identity of their code, which those that a loop makes share.
 _COMPILED: dict[int, set[int]] = {}
 _TOO_OFTEN = 3
+_KEEP = (
+    " To start at once in the next process, too, begin it with"
+    ' jax.config.update("jax_compilation_cache_dir", "/path/of/a/folder") and'
+    ' jax.config.update("jax_persistent_cache_min_compile_time_secs", 0).'
+)
 
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
 
@@ -103,9 +108,11 @@ def remark_on_compilation(seconds: float, functions: Iterable[object]) -> None:
     """
     if seconds > _LONG:
         _LOG.warning(
-            "Compiling this scene took %.1f s; further runs of it, with other numbers too, start at once. A line like"
-            " this is turned off by logging.getLogger('jaxmodsim').setLevel('ERROR').",
+            "Compiling this scene took %.1f s. Further runs of it start at once, with other numbers too. Another"
+            " structure of the scene, another solver, and `ts` of another length or none compile anew.%s"
+            " logging.getLogger('jaxmodsim').setLevel('ERROR') turns off such messages.",
             seconds,
+            "" if jax.config.values["jax_compilation_cache_dir"] else _KEEP,
         )
     for each in functions:
         code = getattr(each, "__code__", None)

@@ -240,12 +240,20 @@ def run_benches(
 
 
 @app.command()
-def cache(clear: Annotated[bool, typer.Option("--clear", help="Delete them.")] = False) -> None:
+def cache(
+    clear: Annotated[bool, typer.Option("--clear", help="Delete them.")] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Run a scene in two processes: does the second one compile less?")
+    ] = False,
+) -> None:
     """Compiled programs that commands keep for the next ones: where, how many, how large.
 
     A command that runs again compiles nothing. JAX_COMPILATION_CACHE_DIR names another folder,
-    JAX_ENABLE_COMPILATION_CACHE=false turns it off.
+    JAX_ENABLE_COMPILATION_CACHE=false turns it off. Exit code 1 if --check finds no program of the first process.
     """
-    from ._cache import report_cache
+    from ._cache import check_cache, report_cache
 
-    report_cache(clear)
+    if clear or not check:
+        report_cache(clear)
+    if check and not check_cache():
+        raise typer.Exit(1)

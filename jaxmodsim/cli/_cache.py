@@ -1,14 +1,46 @@
 """Compiled programs, kept from one command to the next by JAX's persistent compilation cache."""
 
 import os
+import subprocess
 import sys
 from pathlib import Path
 
 import jax
+import pandas as pd
 
-from ._output import say
+from ._output import say, show_table
 
 _SHORTEST = "jax_persistent_cache_min_compile_time_secs"
+
+# A first run, as a script makes it. JAX logs for each program whether it found it, and why it did not keep it.
+_FIRST_RUN = """
+import time
+began = time.perf_counter(), time.process_time()
+import logging
+import jax
+import jaxmodsim as jms
+logging.basicConfig()
+for name in ("compiler", "compilation_cache"):
+    logging.getLogger(f"jax._src.{name}").setLevel("DEBUG")
+jms.tune_cpu()
+jax.config.update("jax_enable_x64", True)
+belt = jms.Friction(jms.Coulomb(Fc=5.0, Fs=8.0), belt_velocity=0.1)
+scene = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2 - 50.0 * q[0] ** 2, {}, [belt])
+jms.simulate(scene, [0.0], [0.0], 2.0)
+print(time.perf_counter() - began[0], time.process_time() - began[1])
+"""
+_FOUND, _MISSING = "Persistent compilation cache hit", "PERSISTENT COMPILATION CACHE MISS"
+# What stands in the log of a run that found nothing, and what that means.
+_REASONS = {
+    "Loading XLA:CPU AOT result": "XLA rejects them: they name processor features that it does not find here. If they"
+    " come from another machine, delete them with jaxmodsim cache --clear. If not, XLA has a fault on this processor:"
+    " try another version of jaxlib.",
+    "Error reading": "They cannot be read: delete them with jaxmodsim cache --clear.",
+    "Error writing": "They cannot be written: free space on the disk, or name another folder,"
+    " JAX_COMPILATION_CACHE_DIR.",
+    "because it took <": "They compile in less than JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS: set it to 0.",
+    "is less than threshold": "They are smaller than JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES: set it to 0.",
+}
 
 
 def cache_folder() -> Path:
@@ -40,8 +72,9 @@ def use_cache() -> None:
         sys.stderr.write(f"jaxmodsim: compiled programs are not kept for the next command: {error}\n")
         jax.config.update("jax_enable_compilation_cache", False)
         return
-    # JAX leaves out what compiles in less than a second, which is most of what a command compiles.
-    for name, value in {"jax_compilation_cache_dir": str(folder), _SHORTEST: 0.0}.items():
+    # JAX by itself leaves out what compiles in less than a second, which is most of what a command compiles.
+    shortest = float(os.environ.get(_SHORTEST.upper(), 0.0))
+    for name, value in {"jax_compilation_cache_dir": str(folder), _SHORTEST: shortest}.items():
         jax.config.update(name, value)
         os.environ[name.upper()] = str(value)
 
@@ -57,3 +90,30 @@ def report_cache(clear: bool) -> None:
         say(f"{folder}: deleted {held}.")
     else:
         say(f"{folder}: {held}. --clear deletes them; JAX_ENABLE_COMPILATION_CACHE=false keeps none.")
+
+
+def check_cache() -> bool:
+    """Run a small scene in two new processes, and say what each took from the cache; whether the second took any."""
+    use_cache()
+    if not jax.config.values["jax_enable_compilation_cache"]:
+        say("The cache is off: JAX_ENABLE_COMPILATION_CACHE is false, or its folder cannot be written.")
+        return False
+    rows, log = [], ""
+    for process in ("first", "second"):
+        done = subprocess.run([sys.executable, "-c", _FIRST_RUN], capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise RuntimeError(f"the scene does not run in a new process: {done.stderr.strip().splitlines()[-1]}")
+        log = done.stderr
+        wall, cpu = map(float, done.stdout.split())
+        rows.append((process, log.count(_FOUND), log.count(_MISSING), wall, cpu))
+    columns = ("process", "programs from the cache", "compiled", "import and first run [s]", "processor time [s]")
+    show_table(pd.DataFrame(rows, columns=columns), f"Compiled programs in {cache_folder()}")
+    found = rows[-1][1]
+    if not found:
+        say(f"The second process found no programs of the first. {reason(log)}")
+    return found > 0
+
+
+def reason(log: str) -> str:
+    """Why a process found no programs, from what JAX and XLA logged."""
+    return next((reason for text, reason in _REASONS.items() if text in log), "JAX logs no reason.")

@@ -14,7 +14,6 @@ from itertools import product
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 from jaxtyping import Array, Float
 from numpy.polynomial.polynomial import polyval
 
@@ -181,6 +180,8 @@ class _Mode:
     @cached_property
     def powers(self) -> np.ndarray:
         """Propagators over 1, 2, ... grid steps, shape `[chunk, x, x]`."""
+        import scipy.linalg  # slow to import, and only needed here
+
         powers = scipy.linalg.expm(self.rate * self.step)[None]
         while len(powers) < _CHUNK:
             powers = np.concatenate([powers, powers @ powers[-1]])
@@ -225,7 +226,7 @@ class _Run:
     def __init__(self, system: LinearStickSlip, t0: float, t1: float) -> None:
         """A run without any events so far."""
         self.system, self.t0, self.t1 = system, t0, t1
-        modes = [np.sqrt(np.abs(scipy.linalg.eigvals(system.stiffness, system.mass))).max()]
+        modes = [np.sqrt(np.abs(np.linalg.eigvals(np.linalg.solve(system.mass, system.stiffness)))).max()]
         modes.append(np.abs(np.linalg.solve(system.mass, system.damping)).max())
         fastest = max([*modes, *np.abs(system.frequencies), 1e-300])
         self.step = min(2.0 * math.pi / fastest / _PER_PERIOD, (t1 - t0) / _PER_RUN)

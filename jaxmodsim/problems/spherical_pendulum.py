@@ -3,7 +3,6 @@
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
-from scipy.special import ellipj
 
 from ..scene import Scene
 
@@ -88,6 +87,8 @@ def motion(
     - `R`: radius [m], > 0.
     - `g`: gravity [m/s^2], > 0.
     """
+    from scipy.special import ellipj  # slow to import, and only needed here
+
     start, c = np.cos(phi), g / R
     share = (turn * np.sin(phi)) ** 2 / (2.0 * c)
     root = np.sqrt(0.25 * share**2 + 1.0 + start * share)

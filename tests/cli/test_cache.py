@@ -1,5 +1,7 @@
 """Compiled programs that the command line keeps on disk."""
 
+import logging
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -9,7 +11,8 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from jaxmodsim.cli import _cache
 
-_NAMES = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_enable_compilation_cache")
+_SHORTEST, _SMALLEST = "jax_persistent_cache_min_compile_time_secs", "jax_persistent_cache_min_entry_size_bytes"
+_NAMES = ("jax_compilation_cache_dir", _SHORTEST, _SMALLEST, "jax_enable_compilation_cache")
 
 
 @pytest.fixture
@@ -18,6 +21,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     before = {name: jax.config.values[name] for name in _NAMES}
     for name in _NAMES:
         monkeypatch.setenv(name.upper(), "")  # what the command sets is taken back
+        monkeypatch.delenv(name.upper())
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setattr("sys.platform", "linux")
@@ -59,6 +63,61 @@ def test_programs_are_kept_read_reported_and_deleted(
     assert not kept(folder)
     assert compile_anew() == 6.25
     assert kept(folder)
+
+
+@pytest.mark.usefixtures("home")
+def test_the_check_says_what_a_second_process_finds(
+    run_command: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+    code, text, _ = run_command("cache", "--check")
+    first, second = (line.split() for line in text.splitlines() if line.split()[:1] in (["first"], ["second"]))
+    assert code == 0
+    assert first[1] == second[2] == "0"
+    assert first[2] == second[1] != "0"
+    assert float(second[3]) > 0.0
+
+
+def test_the_check_of_a_folder_that_cannot_be_written(
+    home: Path, run_command: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("subprocess.run", None)  # it runs nothing
+    (home / ".cache").write_text("a file where the folder should be")
+    code, text, errors = run_command("cache", "--check")
+    assert (code, "The cache is off" in text) == (1, True)
+    assert "compiled programs are not kept" in errors
+
+
+@pytest.mark.parametrize(
+    ("setting", "text"), [(_SHORTEST, "less than JAX_PERSISTENT_CACHE_MIN"), (_SMALLEST, "They are smaller than")]
+)
+@pytest.mark.usefixtures("home")
+def test_thresholds_of_jax_are_told_from_its_log(
+    setting: str, text: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(setting.upper(), "1000000000")
+    _cache.use_cache()
+    jax.config.update(_SMALLEST, int(os.environ.get(_SMALLEST.upper(), 0)))  # a new process reads it by itself
+    caplog.set_level(logging.DEBUG, "jax._src")
+    assert compile_anew() == 6.25
+    assert text in _cache.reason(caplog.text)
+
+
+def test_programs_that_cannot_be_written_or_read_or_are_rejected_are_told_from_the_log(home: Path) -> None:
+    folder = home / ".cache" / "jaxmodsim"
+    _cache.use_cache()
+    assert compile_anew() == 6.25
+    for path in kept(folder):
+        path.unlink()
+        path.mkdir()  # can neither be read nor written
+    with pytest.warns(UserWarning, match="persistent compilation cache") as warned:
+        assert compile_anew() == 6.25
+    assert "They cannot be read" in _cache.reason(str(warned[0].message))
+    # As XLA says it; JAX then warns of an error in reading, too.
+    rejected = "Loading XLA:CPU AOT result. Target machine feature +prefer-no-gather is not supported on the host."
+    assert "names processor features" not in _cache.reason("")
+    assert "they name processor features" in _cache.reason(f"{rejected} Error reading persistent compilation cache")
+    assert _cache.reason("") == "JAX logs no reason."
 
 
 def test_without_a_folder_that_can_be_written_commands_go_on(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,109 @@
+"""Scenes whose equations are counted and whose first calls are timed: runs that are differentiated by their numbers.
+
+Chains have links of one metre and one kilogram and friction in each joint; they start at rest, raised.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxmodsim as jms
+from bench.tasks import BELT, TESTBENCH
+from jaxmodsim.problems import bouncing_ball, n_link_pendulum, named_problems, slider_crank, worm_drive
+
+SAMPLES, BATCH, VISCOUS, SIX = 51, 4, "two viscous joints", "six LuGre joints"
+JOINT = np.array([100.0, 1.0, 0.05, 0.2, 0.3, 0.1])  # sigma0, sigma1, sigma2, Fc, Fs in N m and rad, vs in rad/s
+
+
+class Task(NamedTuple):
+    """A run of a scene that is made of numbers, a pytree of arrays."""
+
+    make: Callable[[Any], jms.Scene]
+    numbers: Any
+    q0: np.ndarray
+    qd0: np.ndarray
+    t1: float
+
+    def total(self, p: Any, **options: Any) -> tuple[Any, Any]:
+        """Sum of the saved positions of the run with the numbers `p`, and its steps."""
+        ts = np.linspace(0.0, self.t1, SAMPLES)
+        run = jms.simulate(self.make(p), self.q0, self.qd0, self.t1, ts=ts, throw=False, **options)
+        return jnp.sum(run.q), run.stats["num_steps"]
+
+    def ways(self) -> dict[str, Callable[[Any], Any]]:
+        """The run, its derivatives and a batch of it, as functions of the numbers."""
+        return {
+            "run": self.total,
+            "gradient": jax.grad(self.total, has_aux=True),
+            "jacobian": jax.jacfwd(self.total, has_aux=True),
+            "batch": lambda p: jax.vmap(self.total)(jax.tree.map(lambda x: jnp.stack([x] * BATCH), p)),
+        }
+
+
+def chain(n: int, law: Callable[[Any], Any]) -> Task:
+    """A chain of `n` links with a law in each joint."""
+
+    def make(p: Any) -> jms.Scene:
+        base = n_link_pendulum.scene(n)
+        joints = tuple(jms.Friction(law(p), along=lambda q, i=i: q[i]) for i in range(n))
+        return jms.Scene(base.lagrangian, params=base.params, effects=joints)
+
+    return Task(make, JOINT, 0.5 + 0.1 * np.arange(n), np.zeros(n), 5.0)
+
+
+def fixed(scene: jms.Scene, q0: Any, qd0: Any, t1: float) -> Task:
+    """A scene as it is, differentiated by all of its numbers."""
+    return Task(lambda p: p, jax.tree.map(lambda x: jnp.asarray(x, float), scene), np.array(q0), np.array(qd0), t1)
+
+
+def shaken_table() -> jms.Scene:
+    """A ball that bounces over a table that shakes, with friction along it."""
+
+    def lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t
+        return 0.5 * jnp.sum(qd**2) - p["g"] * q[1]
+
+    table = jms.Contact(lambda t, q, p: q[1] - p["A"] * jnp.sin(p["omega"] * t), restitution=0.6, name="table")
+    friction = jms.Friction(jms.Coulomb(0.3), along=lambda q: q[0], normal_force="table")
+    return jms.Scene(lagrangian, {"g": 9.81, "A": 1e-3, "omega": 120.0}, (friction,), (table,))
+
+
+def lugre(p: Any) -> jms.LuGre:
+    """The law of six numbers."""
+    return jms.LuGre(*(p[i] for i in range(6)))
+
+
+def coulomb(p: Any) -> jms.Coulomb:
+    """The law of one of them."""
+    return jms.Coulomb(p[3])
+
+
+# Those whose first calls are timed.
+TIMED: dict[str, Callable[[], Task]] = {
+    VISCOUS: lambda: chain(2, lambda p: jms.Viscous(p[2])),
+    "LuGre box": lambda: Task(TESTBENCH.scene, np.array(TESTBENCH.numbers), np.zeros(1), np.zeros(1), TESTBENCH.t1),
+    "Coulomb belt": lambda: Task(BELT.scene, np.array(BELT.numbers), np.zeros(1), np.zeros(1), BELT.t1),
+    "two LuGre joints": lambda: chain(2, lugre),
+    "two Coulomb joints": lambda: chain(2, coulomb),
+    "three LuGre joints": lambda: chain(3, lugre),
+    SIX: lambda: chain(6, lugre),
+}
+
+
+def _named(name: str) -> Task:
+    case = named_problems()[name]()
+    return fixed(case.scene, case.q0, case.qd0, case.t1)
+
+
+SCENES: dict[str, Callable[[], Task]] = {
+    **TIMED,
+    "ball on a floor": lambda: fixed(bouncing_ball.scene(e=0.8), [1.0], [0.0], 2.0),
+    "ball on a shaken table": lambda: fixed(shaken_table(), [0.0, 0.1], [0.5, 0.0], 2.0),
+    "slider-crank": lambda: fixed(slider_crank.scene(torque=2.3), *slider_crank.state(0.7, 8.0), 1.0),
+    "worm drive": lambda: fixed(worm_drive.scene(motor=0.9), *worm_drive.state(0.0), 0.05),
+    **{name: partial(_named, name) for name in named_problems()},
+}
