@@ -37,7 +37,7 @@ NEEDED_TO_SIMULATE = set(ROOMS[: ROOMS.index("simulation") + 1])
 # Folders of identification in the order of the flow of data: one imports only those before it.
 STAGES = ("data", "model", "estimate", "uncertainty", "selection", "design")
 # Folders of a room with public names of their own.
-PARTS = ("validation.behaviour", "validation.hard", "validation.testbench")
+PARTS = ("validation.behaviour", "validation.testbench")
 
 MAX_FILE_LINES = 500
 MAX_FUNCTION_LINES = 80

@@ -9,9 +9,10 @@ from jaxtyping import Array
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
-from ...friction import Coulomb
-from ...scene import AppliedForce, Friction, Scene, Switch
-from ._case import HardCase, motion, position, velocity
+from jaxmodsim.friction import Coulomb
+from jaxmodsim.scene import AppliedForce, Friction, Scene, Switch
+
+from .case import HardCase, motion, position, velocity
 
 FAMILY = "derivatives at rest"
 

@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ...friction import Coulomb
-from ...problems import belt_oscillator, braked_spring, ramped_box
-from ...scene import AppliedForce, Friction, Scene
-from ._case import HardCase, motion, position, velocity
+from jaxmodsim.friction import Coulomb
+from jaxmodsim.problems import belt_oscillator, braked_spring, ramped_box
+from jaxmodsim.scene import AppliedForce, Friction, Scene
+
+from .case import HardCase, motion, position, velocity
 
 FAMILY = "rest and reversal"
 _M = 2.0

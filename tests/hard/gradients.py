@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Array
 from scipy.integrate import solve_ivp
 
-from ...friction import Coulomb, LuGre, Stribeck
-from ...problems import braked_spring, ramped_box
-from ...scene import AppliedForce, Friction, Scene
-from ._case import HardCase, motion, position, velocity
+from jaxmodsim.friction import Coulomb, LuGre, Stribeck
+from jaxmodsim.problems import braked_spring, ramped_box
+from jaxmodsim.scene import AppliedForce, Friction, Scene
+
+from .case import HardCase, motion, position, velocity
 
 FAMILY = "gradients"
 

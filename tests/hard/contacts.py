@@ -6,12 +6,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ...friction import Coulomb
-from ...mechanics import Contact, HuntCrossley, Poisson, end_stops
-from ...problems import bouncing_ball, vibrating_table
-from ...scene import AppliedForce, Friction, Scene, Signal
-from ...simulation import Trajectory
-from ._case import HardCase, motion, position
+from jaxmodsim.friction import Coulomb
+from jaxmodsim.mechanics import Contact, HuntCrossley, Poisson, end_stops
+from jaxmodsim.problems import bouncing_ball, vibrating_table
+from jaxmodsim.scene import AppliedForce, Friction, Scene, Signal
+from jaxmodsim.simulation import Trajectory
+
+from .case import HardCase, motion, position
 
 FAMILY = "contacts"
 _G = 9.81

@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Array
 from scipy.integrate import solve_ivp
 
-from ...friction import Coulomb
-from ...mechanics import Constraint, Spherical
-from ...problems import cartesian_pendulum, four_bar, rod_on_rough_floor, spherical_pendulum
-from ...scene import AppliedForce, Friction, Scene
-from ...simulation import Trajectory
-from ._case import Answer, FunctionTask, HardCase, SceneTask, end_time, motion, position
+from jaxmodsim.friction import Coulomb
+from jaxmodsim.mechanics import Constraint, Spherical
+from jaxmodsim.problems import cartesian_pendulum, four_bar, rod_on_rough_floor, spherical_pendulum
+from jaxmodsim.scene import AppliedForce, Friction, Scene
+from jaxmodsim.simulation import Trajectory
+
+from .case import Answer, FunctionTask, HardCase, SceneTask, end_time, motion, position
 
 FAMILY = "geometry"
 _G = 9.81

@@ -8,12 +8,13 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
-from ...friction import Coulomb
-from ...problems import braked_spring, ramped_box
-from ...scene import Scene
-from ...simulation import Trajectory, simulate
-from ...solvers import Gauss
-from ._case import HardCase, MeasuredNumber, RefusedCalls, motion, position, velocity
+from jaxmodsim.friction import Coulomb
+from jaxmodsim.problems import braked_spring, ramped_box
+from jaxmodsim.scene import Scene
+from jaxmodsim.simulation import Trajectory, simulate
+from jaxmodsim.solvers import Gauss
+
+from .case import HardCase, MeasuredNumber, RefusedCalls, motion, position, velocity
 
 FAMILY = "scale and time"
 _LATE = 1e9

@@ -9,12 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ...friction import AbstractSetValuedLaw, Coulomb
-from ...problems import belt_oscillator, bouncing_ball, braked_spring, coupled_belts, ramped_box
-from ...scene import AppliedForce, Friction, Scene
-from ...simulation import Trajectory
-from ...solvers import EventController, EventSolver, EventState, StoredSteps
-from ._case import Answer, FunctionTask, HardCase, motion, position
+from jaxmodsim.friction import AbstractSetValuedLaw, Coulomb
+from jaxmodsim.problems import belt_oscillator, bouncing_ball, braked_spring, coupled_belts, ramped_box
+from jaxmodsim.scene import AppliedForce, Friction, Scene
+from jaxmodsim.simulation import Trajectory
+from jaxmodsim.solvers import EventController, EventSolver, EventState, StoredSteps
+
+from .case import Answer, FunctionTask, HardCase, motion, position
 
 FAMILY = "many events"
 _G = 9.81

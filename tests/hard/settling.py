@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ...friction import Coulomb
-from ...mechanics import Contact, end_stops
-from ...problems import bouncing_ball, vibrating_table
-from ...scene import AppliedForce, Friction, Scene, Signal
-from ...simulation import Trajectory, simulate
-from ._case import HardCase, RefusedCalls, differentiate, motion, position
+from jaxmodsim.friction import Coulomb
+from jaxmodsim.mechanics import Contact, end_stops
+from jaxmodsim.problems import bouncing_ball, vibrating_table
+from jaxmodsim.scene import AppliedForce, Friction, Scene, Signal
+from jaxmodsim.simulation import Trajectory, simulate
+
+from .case import HardCase, RefusedCalls, differentiate, motion, position
 
 FAMILY = "settling contacts"
 _G = 9.81

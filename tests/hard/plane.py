@@ -6,9 +6,10 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ...friction import Coulomb
-from ...scene import AppliedForce, Friction, Scene
-from ._case import HardCase, motion, position
+from jaxmodsim.friction import Coulomb
+from jaxmodsim.scene import AppliedForce, Friction, Scene
+
+from .case import HardCase, motion, position
 
 FAMILY = "friction in the plane"
 # Limit of friction [N] on a mass of 1 kg.

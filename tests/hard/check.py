@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ...analysis import check_gradients
-from ...scene import Scene
-from ...simulation import SimulationError, Trajectory, outcome_messages
-from ._case import Answer, FunctionTask, HardCase, MeasuredNumber, RefusedCalls, SceneTask, differentiate
+from jaxmodsim.analysis import check_gradients
+from jaxmodsim.scene import Scene
+from jaxmodsim.simulation import SimulationError, Trajectory, outcome_messages
+
+from .case import Answer, FunctionTask, HardCase, MeasuredNumber, RefusedCalls, SceneTask, differentiate
 
 # Ways in which a hard case is run.
 TRANSFORMS = ("alone", "jit", "vmap", "forward", "reverse", "energy")

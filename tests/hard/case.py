@@ -10,8 +10,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
-from ...scene import Scene, read_element, replace_elements
-from ...simulation import Trajectory, simulate
+from jaxmodsim.scene import Scene, read_element, replace_elements
+from jaxmodsim.simulation import Trajectory, simulate
 
 # In float32 rounding leaves tighter tolerances nothing to work with.
 _LEAST_RTOL = {"float64": 0.0, "float32": 3e-6}

@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from ...friction import AbstractLaw, LuGre, Regularized, Viscous, max_stable_step
-from ...problems import ramped_box, slipping_bristle
-from ...scene import Scene
-from ...simulation import Trajectory, simulate
-from ...solvers import ImplicitFriction, Rodas5P
-from ._case import HardCase, MeasuredNumber
+from jaxmodsim.friction import AbstractLaw, LuGre, Regularized, Viscous, max_stable_step
+from jaxmodsim.problems import ramped_box, slipping_bristle
+from jaxmodsim.scene import Scene
+from jaxmodsim.simulation import Trajectory, simulate
+from jaxmodsim.solvers import ImplicitFriction, Rodas5P
+
+from .case import HardCase, MeasuredNumber
 
 # Steps of a trial: at half a percent beyond the limit a disturbance grows thousandfold in them.
 _STEPS = 3000
@@ -140,14 +141,6 @@ def largest_step(formulation: Formulation, solver: dfx.AbstractSolver) -> float:
         middle = math.sqrt(low * high)
         low, high = (low, middle) if grows(formulation, solver, middle) else (middle, high)
     return math.sqrt(low * high)
-
-
-def largest_steps() -> dict[str, dict[str, tuple[float, float]]]:
-    """Largest stable step [s] by theory and by running, of each formulation and explicit method."""
-    return {
-        name: {each: (theory(what, solver), largest_step(what, solver)) for each, solver in EXPLICIT.items()}
-        for name, what in formulations().items()
-    }
 
 
 def _ratio(name: str, solvers: dict[str, dfx.AbstractSolver]) -> float:

@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from ...friction import Coulomb, Stribeck
-from ...identify import Record
-from ...problems import braked_spring, ramped_box
-from ...scene import Signal
-from ...simulation import Trajectory, simulate
-from ._case import HardCase, MeasuredNumber, RefusedCalls, motion, position, velocity
+from jaxmodsim.friction import Coulomb, Stribeck
+from jaxmodsim.identify import Record
+from jaxmodsim.problems import braked_spring, ramped_box
+from jaxmodsim.scene import Signal
+from jaxmodsim.simulation import Trajectory, simulate
+
+from .case import HardCase, MeasuredNumber, RefusedCalls, motion, position, velocity
 
 FAMILY = "numbers"
 _NAN, _INF = float("nan"), float("inf")

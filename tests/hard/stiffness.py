@@ -7,13 +7,14 @@ import numpy as np
 from jaxtyping import Array
 from scipy.integrate import solve_ivp
 
-from ...friction import LuGre, Regularized, Viscous
-from ...problems import ramped_box, slipping_bristle
-from ...scene import Scene
-from ...simulation import Trajectory
-from ...solvers import ImplicitFriction, Rodas5P
-from ._case import HardCase, motion, position, velocity
-from ._steps import step_limits
+from jaxmodsim.friction import LuGre, Regularized, Viscous
+from jaxmodsim.problems import ramped_box, slipping_bristle
+from jaxmodsim.scene import Scene
+from jaxmodsim.simulation import Trajectory
+from jaxmodsim.solvers import ImplicitFriction, Rodas5P
+
+from .case import HardCase, motion, position, velocity
+from .steps import step_limits
 
 FAMILY = "stiffness"
 _T1 = 10.0

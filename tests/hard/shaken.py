@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import PyTree
 
-from ...problems import linear_stick_slip
-from ._case import HardCase, motion, position
+from jaxmodsim.problems import linear_stick_slip
+
+from .case import HardCase, motion, position
 
 FAMILY = "loads in stick"
 

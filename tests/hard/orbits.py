@@ -12,12 +12,13 @@ from jaxtyping import Array, PyTree
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, root
 
-from ...friction import Coulomb, LuGre, Stribeck, Viscous
-from ...orbits import PeriodicOrbit, continue_orbits, periodic_orbit
-from ...problems import belt_oscillator, coupled_belts, vibrating_table
-from ...scene import AppliedForce, Friction, Scene
-from ...simulation import simulate
-from ._case import HardCase, MeasuredNumber, RefusedCalls
+from jaxmodsim.friction import Coulomb, LuGre, Stribeck, Viscous
+from jaxmodsim.orbits import PeriodicOrbit, continue_orbits, periodic_orbit
+from jaxmodsim.problems import belt_oscillator, coupled_belts, vibrating_table
+from jaxmodsim.scene import AppliedForce, Friction, Scene
+from jaxmodsim.simulation import simulate
+
+from .case import HardCase, MeasuredNumber, RefusedCalls
 
 FAMILY = "periodic orbits"
 # A bounce a period, past its period doubling.
