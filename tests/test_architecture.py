@@ -29,15 +29,12 @@ ROOMS = (
     "sweeps",
     "export",
     "problems",
-    "validation",
     "plot",
     "cli",
 )
 NEEDED_TO_SIMULATE = set(ROOMS[: ROOMS.index("simulation") + 1])
 # Folders of identification in the order of the flow of data: one imports only those before it.
 STAGES = ("data", "model", "estimate", "uncertainty", "selection", "design")
-# Folders of a room with public names of their own.
-PARTS = ("validation.behaviour", "validation.testbench")
 
 MAX_FILE_LINES = 500
 MAX_FUNCTION_LINES = 80
@@ -89,7 +86,7 @@ def test_names_that_load_later_are_those_that_type_checkers_see() -> None:
     imports = [node for node in branch.body if isinstance(node, ast.ImportFrom)]
     seen = {(node.module, alias.name) for node in imports for alias in node.names}
     later = {(folder, name) for folder, names in jaxmodsim._LATER.items() for name in names}
-    folders = {(None, name) for name in ("metrics", "plot", "problems", "sweeps", "validation")}
+    folders = {(None, name) for name in ("metrics", "plot", "problems", "sweeps")}
     assert seen == later | folders
     for _, name in seen:
         assert getattr(jaxmodsim, name) is not None
@@ -128,15 +125,6 @@ def test_rooms_import_only_those_above(path: Path) -> None:
             assert target in ROOMS[: ROOMS.index(room) + 1], f"{room} imports {module}"
             public = target == "_core" or "._" not in module
             assert target == room or public, f"{room} reaches into {module}; import it from {target}"
-
-
-@pytest.mark.parametrize("part", PARTS)
-def test_parts_of_a_room_meet_by_their_public_names(part: str) -> None:
-    for path in ROOT.joinpath(*part.split(".")).glob("*.py"):
-        for node in statements(path, (ast.Import, ast.ImportFrom)):
-            for module in own_imports(path, node):
-                other = module.startswith("validation.") and not module.startswith(part)
-                assert not (other and "._" in module), f"{part} reaches into {module}"
 
 
 @each_file(sorted(ROOT.joinpath("identify").glob("*/*.py")))

@@ -58,24 +58,9 @@ def demo(out: Out = Path("jaxmodsim-demo")) -> None:
 
 
 @app.command("testbench")
-def bench_models(
-    laws: Annotated[
-        bool, typer.Option("--laws", help="Every friction law in the standard experiments, instead of the box.")
-    ] = False,
-    out: Out = Path("jaxmodsim-testbench"),
-) -> None:
-    """A box under a rising force with one friction model after the other: figures, a table, a LuGre sweep.
-
-    With --laws instead what each friction law does in the standard experiments (characteristic, presliding, break-away,
-    lag, stick-slip, creep, passivity); exit code 1 if one fails where it should not.
-    """
+def bench_models(out: Out = Path("jaxmodsim-testbench")) -> None:
+    """A box under a rising force with one friction model after the other: figures, a table, a LuGre sweep."""
     _start()
-    if laws:
-        from ._behaviour import report_behaviour
-
-        if not report_behaviour(out):
-            raise typer.Exit(1)
-        return
     from ._report import report_testbench
 
     report_testbench(out)

@@ -7,7 +7,6 @@ except ModuleNotFoundError as error:
 
 from ._animate import Animation as Animation
 from ._animate import animate as animate
-from ._behaviour import behaviour_figure as behaviour_figure
 from ._comparison import comparison_figure as comparison_figure
 from ._design import design_figure as design_figure
 from ._indices import indices_figure as indices_figure

@@ -26,6 +26,7 @@ from . import spherical_pendulum as spherical_pendulum
 from . import spiral_bead as spiral_bead
 from . import stacked_blocks as stacked_blocks
 from . import stick_slip_pendulum as stick_slip_pendulum
+from . import testbench as testbench
 from . import turntable_puck as turntable_puck
 from . import two_balls as two_balls
 from . import vibrating_table as vibrating_table

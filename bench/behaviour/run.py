@@ -3,16 +3,11 @@
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-from ._break_away import BREAK_AWAY
-from ._characteristic import CHARACTERISTIC
-from ._creep import CREEP
-from ._experiment import Experiment
-from ._lag import LAG
-from ._laws import LawCase, law_cases
-from ._passivity import PASSIVITY
-from ._presliding import MEMORY, PRESLIDING
-from ._result import ExperimentResult
-from ._stick_slip import STICK_SLIP
+from bench.behaviour.drive import CHARACTERISTIC, LAG
+from bench.behaviour.experiment import Experiment, ExperimentResult, LawCase, law_cases
+from bench.behaviour.passivity import PASSIVITY
+from bench.behaviour.presliding import MEMORY, PRESLIDING
+from bench.behaviour.pulled import BREAK_AWAY, CREEP, STICK_SLIP
 
 # The standard experiments by name.
 EXPERIMENTS: dict[str, Experiment] = {

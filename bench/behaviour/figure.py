@@ -4,9 +4,17 @@ from collections.abc import Mapping
 
 from matplotlib.axes import Axes
 
-from ..validation.behaviour import Experiment, ExperimentResult
-from ._figure import Figure
-from ._style import BLUE, GREEN, GREY, RED, VERDICTS
+from bench.behaviour.experiment import Experiment, ExperimentResult, Verdict
+from jaxmodsim.plot import Figure
+
+# Okabe and Ito, Color universal design, 2008: told apart without red and green.
+BLUE, RED, GREY, GREEN = "#0072b2", "#d55e00", "#8a8a8a", "#009e73"
+VERDICTS = {
+    Verdict.PASS: GREEN,
+    Verdict.FAIL: RED,
+    Verdict.KNOWN_LIMITATION: "#b8860b",
+    Verdict.NOT_APPLICABLE: GREY,
+}
 
 
 def behaviour_figure(experiment: Experiment, outcomes: Mapping[str, ExperimentResult], columns: int = 5) -> Figure:
@@ -14,7 +22,7 @@ def behaviour_figure(experiment: Experiment, outcomes: Mapping[str, ExperimentRe
 
     **Arguments:**
 
-    - `experiment`: from `jaxmodsim.validation.behaviour.EXPERIMENTS`.
+    - `experiment`: from `bench.behaviour.run.EXPERIMENTS`.
     - `outcomes`: what it found, by the name of the law.
     - `columns`: panels in a row.
     """

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ...friction import AbstractLaw, DeadZone, Regularized, Sign
-from ...metrics import break_away
-from ...problems import ramped_box
-from ...simulation import Trajectory, simulate
+from ..friction import AbstractLaw, DeadZone, Regularized, Sign
+from ..metrics import break_away
+from ..simulation import Trajectory, simulate
+from . import ramped_box
 
 T1 = 10.0
 MASS = 2.0

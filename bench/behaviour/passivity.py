@@ -4,10 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ._drive import NEEDS_LOAD, SAMPLES, needs_load, respond
-from ._experiment import Experiment
-from ._laws import DEFLECTION, VS, LawCase
-from ._result import FigureLine, LawMeasurement, Threshold
+from bench.behaviour.drive import NEEDS_LOAD, SAMPLES, needs_load, respond
+from bench.behaviour.experiment import DEFLECTION, VS, Experiment, FigureLine, LawCase, LawMeasurement, Threshold
 
 _PERIODS = 4
 _HALF = SAMPLES // (2 * _PERIODS)

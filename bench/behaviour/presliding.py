@@ -2,10 +2,8 @@
 
 import numpy as np
 
-from ._drive import NEEDS_LOAD, SAMPLES, needs_load, path, respond
-from ._experiment import Experiment
-from ._laws import DEFLECTION, VS, LawCase
-from ._result import FigureLine, LawMeasurement, Threshold
+from bench.behaviour.drive import NEEDS_LOAD, SAMPLES, needs_load, path, respond
+from bench.behaviour.experiment import DEFLECTION, VS, Experiment, FigureLine, LawCase, LawMeasurement, Threshold
 
 # Velocity of the motion [m/s]: so slow that friction depends on displacement alone.
 _SLOW = 0.01 * VS

@@ -2,29 +2,27 @@
 
 import dataclasses
 import inspect
-import json
 from typing import TypeVar
 
 import numpy as np
-import pandas as pd
 import pytest
 
+from bench.behaviour.drive import SAMPLES, path, respond
+from bench.behaviour.experiment import DEFLECTION, FC, FS, SIGMA0, WIDTH, LawCase, LawMeasurement, Verdict, law_cases
+from bench.behaviour.figure import behaviour_figure
+from bench.behaviour.run import EXPERIMENTS, run_bench
+from bench.layout import Recorded
+from bench.studies import behaviour
 from jaxmodsim import SimulationError, friction
 from jaxmodsim._core.parameters import modules_of
 from jaxmodsim._core.state_dependent import StateDependent
-from jaxmodsim.cli import _behaviour
 from jaxmodsim.friction import AbstractLaw, Dahl, LuGre
-from jaxmodsim.plot import behaviour_figure
-from jaxmodsim.validation.behaviour import EXPERIMENTS, Verdict, law_cases, run_bench
-from jaxmodsim.validation.behaviour._drive import SAMPLES, path, respond
-from jaxmodsim.validation.behaviour._laws import DEFLECTION, FC, FS, SIGMA0, WIDTH, LawCase
-from jaxmodsim.validation.behaviour._result import LawMeasurement
 
 BENCH = {each.name: each for each in law_cases()}
 # Experiments with a prescribed motion compile in no time; those with a mass take some seconds for each law.
 WITH_MASS = ("break-away", "stick-slip", "creep")
 PRESCRIBED = {name: each for name, each in EXPERIMENTS.items() if name not in WITH_MASS}
-# These stand for all: the command runs the others, too.
+# These stand for all: the bench runs the others, too.
 KINDS = ("Coulomb", "Coulomb, stiction", "Regularized", "Dahl", "LuGre", "ElastoPlastic", "MaxwellSlip, 4, C")
 
 
@@ -193,27 +191,24 @@ def test_figures_have_a_panel_for_each_law_and_labelled_axes(outcomes):
         assert all("[" in label or "/" in label for label in labels)
 
 
-def test_command_writes_figures_table_and_json(run_command, tmp_path, monkeypatch, outcomes):
+def test_the_study_records_verdicts_and_draws_figures(tmp_path, monkeypatch, outcomes):
     found = {law: outcomes[law] for law in ("Coulomb", "LuGre", "ElastoPlastic")}
-    monkeypatch.setattr(_behaviour, "run_bench", lambda progress: found)
-    out = tmp_path / "out"
-    code, text, _ = run_command("testbench", "--laws", "--out", str(out))
-    assert code == 0
-    pictures = [f"behaviour_{name.replace('-', '_')}.png" for name in EXPERIMENTS]
-    assert sorted(path.name for path in out.iterdir()) == sorted([*pictures, "behaviour.csv", "behaviour.json"])
-    table = pd.read_csv(out / "behaviour.csv")
-    assert len(table) == 3 * len(EXPERIMENTS)
-    assert {"law", "experiment", "verdict", "number", "unit", "threshold"} <= set(table.columns)
-    report = json.loads((out / "behaviour.json").read_text())
-    assert report["LuGre"]["creep"]["verdict"] == "known limitation"
-    assert "yields" in report["LuGre"]["creep"]["reason"]
-    assert "known" in text
-    assert "ElastoPlastic" in text
+    monkeypatch.setattr(behaviour, "run_bench", lambda laws, progress: found)
+    behaviour.main(False, tmp_path).write(tmp_path, smoke=True)
+    pictures = ["behaviour_creep.png", "behaviour_memory.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*pictures, "behaviour.json"])
+    recorded = Recorded.read(tmp_path / "behaviour.json")
+    rows = [row for row in recorded.rows if row["quantity"] == "verdict"]
+    assert len(rows) == 3 * len(EXPERIMENTS)
+    assert {"number", "unit", "limit", "finding", "reason"} <= {row["quantity"] for row in recorded.rows}
+    assert str(recorded.get("verdict", case="creep", peer="LuGre")).startswith("**no**")
+    assert "yields" in str(recorded.get("reason", case="creep", peer="LuGre"))
+    assert recorded.get("reason", case="creep", peer="ElastoPlastic") is None
 
 
-def test_a_failure_gives_exit_code_one(run_command, tmp_path, monkeypatch, outcomes):
+def test_a_failure_ends_the_study_with_an_error(tmp_path, monkeypatch, outcomes):
     failure = dataclasses.replace(outcomes["Dahl"]["creep"], verdict=Verdict.FAIL, reason="")
-    monkeypatch.setattr(_behaviour, "run_bench", lambda progress: {"Dahl": outcomes["Dahl"] | {"creep": failure}})
-    code, text, _ = run_command("testbench", "--laws", "--out", str(tmp_path))
-    assert code == 1
-    assert "FAIL: Dahl, creep, 1" in text
+    failed = {"Dahl": outcomes["Dahl"] | {"creep": failure}}
+    monkeypatch.setattr(behaviour, "run_bench", lambda laws, progress: failed)
+    with pytest.raises(RuntimeError, match="FAIL: Dahl, creep, 1"):
+        behaviour.main(False, tmp_path)
