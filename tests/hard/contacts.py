@@ -8,10 +8,11 @@ from jaxtyping import Array
 
 from jaxmodsim.friction import Coulomb
 from jaxmodsim.mechanics import Contact, HuntCrossley, Poisson, end_stops
-from jaxmodsim.problems import bouncing_ball, vibrating_table
+from jaxmodsim.problems import bouncing_ball
 from jaxmodsim.scene import AppliedForce, Friction, Scene, Signal
 from jaxmodsim.simulation import Trajectory
 
+from ..problems import vibrating_table
 from .case import HardCase, motion, position
 
 FAMILY = "contacts"

@@ -14,10 +14,11 @@ from scipy.optimize import brentq, root
 
 from jaxmodsim.friction import Coulomb, LuGre, Stribeck, Viscous
 from jaxmodsim.orbits import PeriodicOrbit, continue_orbits, periodic_orbit
-from jaxmodsim.problems import belt_oscillator, coupled_belts, vibrating_table
+from jaxmodsim.problems import belt_oscillator, coupled_belts
 from jaxmodsim.scene import AppliedForce, Friction, Scene
 from jaxmodsim.simulation import simulate
 
+from ..problems import vibrating_table
 from .case import HardCase, MeasuredNumber, RefusedCalls
 
 FAMILY = "periodic orbits"

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxmodsim.problems import linear_stick_slip
-
+from ..problems import linear_stick_slip
 from .case import HardCase, motion, position
 
 FAMILY = "loads in stick"

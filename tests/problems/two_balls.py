@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..mechanics import Contact
-from ..scene import Scene
+from jaxmodsim.mechanics import Contact
+from jaxmodsim.scene import Scene
 
 # Masses [kg], diameter [m], coefficient of restitution.
 PARAMS = {"m1": 1.0, "m2": 1.0, "d": 0.1, "e": 1.0}

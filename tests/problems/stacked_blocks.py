@@ -5,8 +5,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..friction import Coulomb
-from ..scene import AppliedForce, Friction, Scene
+from jaxmodsim.friction import Coulomb
+from jaxmodsim.scene import AppliedForce, Friction, Scene
 
 # Masses of the lower and the upper block [kg], coefficients of friction on the floor and between the blocks, rate of
 # the pull [N/s], gravity [m/s^2].

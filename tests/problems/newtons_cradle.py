@@ -5,8 +5,8 @@ from functools import partial
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..mechanics import Contact
-from ..scene import Scene
+from jaxmodsim.mechanics import Contact
+from jaxmodsim.scene import Scene
 
 # Mass of a ball [kg], length of the threads [m], gravity [m/s^2], coefficient of restitution.
 PARAMS = {"m": 0.1, "l": 0.2, "g": 9.81, "e": 1.0}
@@ -29,7 +29,7 @@ def scene(
     *,
     gap: ArrayLike = 0.0,
     m: ArrayLike = PARAMS["m"],
-    l: ArrayLike = PARAMS["l"],
+    l: ArrayLike = PARAMS["l"],  # noqa: E741
     g: ArrayLike = PARAMS["g"],
     e: ArrayLike = PARAMS["e"],
 ) -> Scene:

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..friction import Coulomb
-from ..mechanics import Contact
-from ..scene import Friction, Scene
+from jaxmodsim.friction import Coulomb
+from jaxmodsim.mechanics import Contact
+from jaxmodsim.scene import Friction, Scene
 
 # Mass [kg], half width and half height [m], coefficient of friction, gravity [m/s^2].
 PARAMS = {"m": 2.0, "b": 0.05, "h": 0.5, "mu": 0.8, "g": 9.81}

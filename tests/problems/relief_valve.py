@@ -5,10 +5,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .._core.shapes import PerDof, Scalar
-from ..friction import Viscous
-from ..mechanics import Contact
-from ..scene import AbstractEffect, Action, Friction, Power, Scene
+from jaxmodsim._core.shapes import PerDof, Scalar
+from jaxmodsim.friction import Viscous
+from jaxmodsim.mechanics import Contact
+from jaxmodsim.scene import AbstractEffect, Action, Friction, Power, Scene
 
 # Damping, precompression of the spring, stiffness of the fluid in the vessel, flow into it, coefficient of restitution.
 PARAMS = {"kappa": 1.25, "delta": 10.0, "beta": 20.0, "flow": 5.0, "e": 0.8}

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..friction import Coulomb
-from ..mechanics import Contact
-from ..scene import AppliedForce, Friction, Scene
+from jaxmodsim.friction import Coulomb
+from jaxmodsim.mechanics import Contact
+from jaxmodsim.scene import AppliedForce, Friction, Scene
 
 # Masses of the object and of a finger [kg], grip force of a finger [N], way of a finger [m], speed of the object at the
 # start [m/s], coefficient of friction, gravity [m/s^2].

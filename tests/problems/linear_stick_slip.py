@@ -18,8 +18,8 @@ import scipy.linalg
 from jaxtyping import Array, Float
 from numpy.polynomial.polynomial import polyval
 
-from ..friction import Coulomb
-from ..scene import AppliedForce, Friction, Scene, Signal
+from jaxmodsim.friction import Coulomb
+from jaxmodsim.scene import AppliedForce, Friction, Scene, Signal
 
 # Grid points of one period of the fastest harmonic or natural oscillation, and the least number along a run.
 _PER_PERIOD, _PER_RUN = 64, 2000

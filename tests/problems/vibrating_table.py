@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..mechanics import Contact
-from ..scene import Scene
-from ._falling import falling
+from jaxmodsim.mechanics import Contact
+from jaxmodsim.problems.bouncing_ball import falling
+from jaxmodsim.scene import Scene
 
 # Numbers for which there is a bounce a period; stable it is for A below 0.90 mm.
 PARAMS = {"m": 0.1, "g": 9.81, "A": 1e-3, "omega": 120.0, "e": 0.6}
