@@ -12,7 +12,8 @@ from bench.layout import OURS, Recorded
 from bench.tables import HAND
 
 # Okabe and Ito, Color universal design, 2008: told apart without red and green.
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8a8a8a", "#e69f00", "#56b4e9", "#000000")
+BLUE, RED, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#8a8a8a"
+_COLOURS = (BLUE, RED, GREEN, "#cc79a7", GREY, "#e69f00", "#56b4e9", "#000000")
 
 
 def save(figure: Figure, path: Path, dpi: int = 150) -> None:
@@ -87,10 +88,10 @@ def hard(r: Recorded) -> Figure:
     numbers = r.all_of("error", "case")
     for row, case in zip(rows, cases, strict=True):
         if r.get("passes", case=case) != "yes":
-            axes.axhspan(row - 0.5, row + 0.5, color="#d55e00", alpha=0.2, lw=0)
+            axes.axhspan(row - 0.5, row + 0.5, color=RED, alpha=0.2, lw=0)
         elif case not in numbers:
-            axes.text(least, float(row), " says why there is no answer", va="center", fontsize=9, color="#8a8a8a")
-    axes.axvline(1.0, color="#d55e00", lw=1.2)
+            axes.text(least, float(row), " says why there is no answer", va="center", fontsize=9, color=GREY)
+    axes.axvline(1.0, color=RED, lw=1.2)
     axes.set(xscale="log", xlabel="error over what is admissible [1]", yticks=rows, xlim=(0.5 * least, 10.0))
     families, names = zip(*(case.split(": ") for case in cases), strict=True)
     axes.set_yticklabels([name.strip("`") for name in names], fontsize=9)

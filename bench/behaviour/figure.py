@@ -5,10 +5,9 @@ from collections.abc import Mapping
 from matplotlib.axes import Axes
 
 from bench.behaviour.experiment import Experiment, ExperimentResult, Verdict
+from bench.figures import BLUE, GREEN, GREY, RED
 from jaxmodsim.plot import Figure
 
-# Okabe and Ito, Color universal design, 2008: told apart without red and green.
-BLUE, RED, GREY, GREEN = "#0072b2", "#d55e00", "#8a8a8a", "#009e73"
 VERDICTS = {
     Verdict.PASS: GREEN,
     Verdict.FAIL: RED,
