@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 from cycler import cycler
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
@@ -11,7 +12,8 @@ from bench.layout import OURS, Recorded
 from bench.tables import HAND
 
 # Okabe and Ito, Color universal design, 2008: told apart without red and green.
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8a8a8a", "#e69f00", "#56b4e9", "#000000")
+BLUE, RED, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#8a8a8a"
+_COLOURS = (BLUE, RED, GREEN, "#cc79a7", GREY, "#e69f00", "#56b4e9", "#000000")
 
 
 def save(figure: Figure, path: Path, dpi: int = 150) -> None:
@@ -75,13 +77,66 @@ def long_runs(r: Recorded) -> Figure:
     return figure
 
 
-FIGURES: dict[str, Callable[[Recorded], Figure]] = {
-    each.__name__: each for each in (accelerations, lugre_work_precision, long_runs)
+def hard(r: Recorded) -> Figure:
+    """Errors of hard cases in what is admissible, so that 1 is the limit; cases without a number have none."""
+    cases = r.all_of("passes", "case")
+    rows, least = np.arange(len(cases)), 1e-12  # what is exact is drawn at the edge
+    figure, axes = plt.subplots(figsize=(8.5, 1.4 + 0.19 * len(cases)), layout="constrained")
+    for marker, kind in zip("osDv", r.all_of("error", "at"), strict=False):
+        errors = np.array([r.number("error", case=case, at=kind) for case in cases])
+        axes.plot(np.maximum(errors, least), rows, marker, ms=5, label=kind, alpha=0.85)
+    numbers = r.all_of("error", "case")
+    for row, case in zip(rows, cases, strict=True):
+        if r.get("passes", case=case) != "yes":
+            axes.axhspan(row - 0.5, row + 0.5, color=RED, alpha=0.2, lw=0)
+        elif case not in numbers:
+            axes.text(least, float(row), " says why there is no answer", va="center", fontsize=9, color=GREY)
+    axes.axvline(1.0, color=RED, lw=1.2)
+    axes.set(xscale="log", xlabel="error over what is admissible [1]", yticks=rows, xlim=(0.5 * least, 10.0))
+    families, names = zip(*(case.split(": ") for case in cases), strict=True)
+    axes.set_yticklabels([name.strip("`") for name in names], fontsize=9)
+    axes.set_ylim(len(cases) - 0.4, -0.6)
+    axes.grid(axis="x", color="#e4e4e4", lw=0.6)
+    for row, family in enumerate(families):
+        if row == 0 or families[row - 1] != family:
+            axes.axhline(row - 0.5, color="black", lw=0.6)
+            beside = axes.get_yaxis_transform()
+            axes.text(1.01, row - 0.4, family, transform=beside, va="top", fontsize=10, fontweight="bold")
+    passed = sum(r.get("passes", case=case) == "yes" for case in cases)
+    figure.suptitle(f"Hard cases: {passed} of {len(cases)} pass (line: the limit)", fontsize=12)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=10, frameon=False)
+    return figure
+
+
+def hard_steps(r: Recorded) -> Figure:
+    """Largest stable fixed steps, found by running, over those of theory."""
+    figure, axes = plt.subplots(figsize=(7.5, 4.2), layout="constrained")
+    solvers = r.all_of("step found", "peer")
+    steps = {
+        kind: {name: [r.number(kind, case=name, peer=each) for each in solvers] for name in r.all_of(kind, "case")}
+        for kind in ("step by theory", "step found")
+    }
+    for marker, (name, predicted) in zip("osDv", steps["step by theory"].items(), strict=False):
+        axes.plot(predicted, steps["step found"][name], marker, label=name, ms=7, alpha=0.8)
+    every = [step for predicted in steps["step by theory"].values() for step in predicted]
+    span = [0.5 * min(every), 2.0 * max(every)]
+    axes.plot(span, span, color="#c8c8c8", lw=3, zorder=0, label="equal")
+    axes.set(xscale="log", yscale="log", xlabel="largest stable step by theory [s]", ylabel="found by bisection [s]")
+    axes.set_title(f"Stability of fixed explicit steps: {', '.join(solvers)}", fontsize=10)
+    axes.legend(fontsize=9, frameon=False)
+    return figure
+
+
+# Figures by name, each with the bench whose result it shows.
+FIGURES: dict[str, tuple[str, Callable[[Recorded], Figure]]] = {
+    **{each.__name__: (each.__name__, each) for each in (accelerations, lugre_work_precision, long_runs)},
+    **{each.__name__: ("hard_cases", each) for each in (hard, hard_steps)},
 }
 
 
 def write(found: Recorded, folder: Path) -> None:
-    """Draw a result, where it has a figure."""
-    if found.name in FIGURES:
-        with plt.rc_context({"axes.prop_cycle": cycler(color=_COLOURS)}):
-            save(FIGURES[found.name](found), folder / f"{found.name}.png")
+    """Draw the figures of a result."""
+    with plt.rc_context({"axes.prop_cycle": cycler(color=_COLOURS)}):
+        for name, (bench, draw) in FIGURES.items():
+            if bench == found.name:
+                save(draw(found), folder / f"{name}.png")

@@ -12,7 +12,7 @@ import numpy as np
 
 import jaxmodsim as jms
 from jaxmodsim.plot import ramp_figure
-from jaxmodsim.validation.testbench import RampRun
+from jaxmodsim.problems.testbench import RampRun
 
 
 def lagrangian(t, q, qd, p):

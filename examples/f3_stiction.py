@@ -12,7 +12,7 @@ import jax
 
 import jaxmodsim as jms
 from jaxmodsim.plot import ramp_figure
-from jaxmodsim.validation.testbench import ramp_cases, run_ramp
+from jaxmodsim.problems.testbench import ramp_cases, run_ramp
 
 
 def main(out: Path, smoke: bool = False) -> None:

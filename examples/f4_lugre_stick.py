@@ -13,7 +13,7 @@ import jax
 
 import jaxmodsim as jms
 from jaxmodsim.plot import stick_figure
-from jaxmodsim.validation.testbench import stick_sweep
+from jaxmodsim.problems.testbench import stick_sweep
 
 
 def main(out: Path, smoke: bool = False) -> None:

@@ -16,7 +16,7 @@ equilibrium (Equilibrium), continue_equilibria.
 Records: fit, fit_law, Record, FitResult.
 Many runs: sweep.
 Speed: tune_cpu, called before JAX computes anything.
-Modules: analysis, export, identify, metrics, orbits, plot, problems, sweeps, validation.
+Modules: analysis, export, identify, metrics, orbits, plot, problems, sweeps.
 
 `help(jaxmodsim.simulate)` says more of each. Remarks go to the logger "jaxmodsim" of the module logging.
 """
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from . import plot as plot
     from . import problems as problems
     from . import sweeps as sweeps
-    from . import validation as validation
     from ._core.speed import tune_cpu as tune_cpu
     from .analysis import EnergyAudit as EnergyAudit
     from .analysis import GradientCheck as GradientCheck
@@ -188,7 +187,6 @@ _LATER = {
     "simulation": ("SimulationError", "Trajectory", "consistent", "simulate", "simulate_to_accuracy"),
     "solvers": ("EventController", "EventSolver", "Gauss", "ImplicitFriction", "Rodas5P", "StoredSteps"),
     "sweeps": ("sweep",),
-    "validation": (),
 }
 _FOLDERS = {name: folder for folder, names in _LATER.items() for name in names}
 

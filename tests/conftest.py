@@ -58,8 +58,8 @@ gc.set_threshold(50_000, 20, 100)
 _SELF, _MOST_MAPS, _MOST_BYTES = Path("/proc/self"), 30_000, 3 * 2**30
 
 
-@pytest.fixture(scope="module", autouse=True)
-def what_other_modules_made_is_left_alone() -> None:
+def drop_programs() -> None:
+    """Drop what was compiled and traced, where it takes too much memory."""
     if _SELF.exists():
         maps = (_SELF / "maps").read_bytes().count(b"\n")
         resident = int((_SELF / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -68,6 +68,11 @@ def what_other_modules_made_is_left_alone() -> None:
             gc.unfreeze()
             gc.collect()
             ctypes.CDLL(None).malloc_trim(0)  # glibc keeps freed memory otherwise
+
+
+@pytest.fixture(scope="module", autouse=True)
+def what_other_modules_made_is_left_alone() -> None:
+    drop_programs()
     gc.freeze()
 
 
@@ -89,7 +94,10 @@ def no_checks_for_each_scalar() -> None:
 
 # Tests of a module share what they have compiled and computed, so a module stays in one process. Those of these modules
 # share nothing: they are given out one by one, and last, which keeps all processes busy to the end.
-_APART = {"test_belt", "test_constraints", "test_contact", "test_gauss", "test_implicit_friction", "test_stick_slip"}
+_APART = {
+    *("every_case", "test_belt", "test_constraints", "test_contact", "test_gauss"),
+    *("test_implicit_friction", "test_stick_slip"),
+}
 
 
 class ByModule(LoadScopeScheduling):

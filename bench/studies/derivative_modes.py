@@ -21,7 +21,8 @@ from bench.record import Result
 from jaxmodsim.problems import NamedProblem, named_problems
 from jaxmodsim.scene import elements, read_element, replace_elements
 from jaxmodsim.simulation import named_series
-from jaxmodsim.validation.hard import HardCase, hard_cases
+from tests.hard.case import HardCase
+from tests.hard.catalogue import hard_cases
 
 PROBLEMS, HARD = "named problems", "hard cases"
 FAMILIES = ("stiffness", "rest and reversal", "many events", "gradients")

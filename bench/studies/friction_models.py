@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 from bench.record import Result
-from jaxmodsim.validation.testbench import ramp_cases, run_ramp
+from jaxmodsim.problems.testbench import ramp_cases, run_ramp
 
 
 def main(smoke: bool, out: Path) -> Result:

@@ -12,7 +12,7 @@ from ._options import Interrupted, Out
 
 app = typer.Typer(
     name="jaxmodsim",
-    help="Differentiable mechanics with friction: test benches, fits to measured records, sweeps, hard cases.",
+    help="Differentiable mechanics with friction: test benches, fits to measured records, sweeps.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -58,24 +58,9 @@ def demo(out: Out = Path("jaxmodsim-demo")) -> None:
 
 
 @app.command("testbench")
-def bench_models(
-    laws: Annotated[
-        bool, typer.Option("--laws", help="Every friction law in the standard experiments, instead of the box.")
-    ] = False,
-    out: Out = Path("jaxmodsim-testbench"),
-) -> None:
-    """A box under a rising force with one friction model after the other: figures, a table, a LuGre sweep.
-
-    With --laws instead what each friction law does in the standard experiments (characteristic, presliding, break-away,
-    lag, stick-slip, creep, passivity); exit code 1 if one fails where it should not.
-    """
+def bench_models(out: Out = Path("jaxmodsim-testbench")) -> None:
+    """A box under a rising force with one friction model after the other: figures, a table, a LuGre sweep."""
     _start()
-    if laws:
-        from ._behaviour import report_behaviour
-
-        if not report_behaviour(out):
-            raise typer.Exit(1)
-        return
     from ._report import report_testbench
 
     report_testbench(out)
@@ -195,31 +180,6 @@ def branch(spec: _options.Spec, out: Out = Path("jaxmodsim-branch")) -> None:
     from ._orbits import run_branch
 
     run_branch(spec, out)
-
-
-@app.command()
-def hard(
-    names: Annotated[
-        list[str] | None, typer.Argument(metavar="NAME", help="Cases or families; all without.", show_default=False)
-    ] = None,
-    list_only: Annotated[bool, typer.Option("--list", help="Say what the cases are, and run nothing.")] = False,
-    transforms: Annotated[
-        str,
-        typer.Option(help="Transforms, with commas between: alone, jit, vmap, forward, reverse, energy; or all."),
-    ] = "all",
-    jobs: Annotated[int, typer.Option(help="Processes.", min=1)] = 1,
-    out: Out = Path("jaxmodsim-hard"),
-) -> None:
-    """Cases in which simulations go wrong, run under every transform and compared with what is right.
-
-    Each case alone, under jit and vmap, with forward and reverse derivatives, in float64 and float32, and its energy
-    balance; exit code 1 if one fails. All of it takes most of an hour on one core; --transforms alone a few minutes.
-    """
-    _start()
-    from ._hard import HardRequest, report_hard
-
-    if not report_hard(HardRequest(tuple(names or ()), list_only, transforms, jobs, out)):
-        raise typer.Exit(1)
 
 
 @app.command("bench", context_settings={"ignore_unknown_options": True})

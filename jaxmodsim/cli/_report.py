@@ -9,7 +9,7 @@ import pandas as pd
 from .._core.progress import progress_line
 from .._core.speed import cores
 from ..plot import ramp_figure, stick_figure
-from ..validation.testbench import RampResult, ramp_cases, run_ramp, stick_sweep
+from ..problems.testbench import RampResult, ramp_cases, run_ramp, stick_sweep
 from ._output import Content, show_paths, show_table, write
 
 PARTS = {

@@ -52,7 +52,7 @@ class AbstractLaw(AbstractReadable, eqx.Module):
     - `description`, `equations`: in a few words, and as plain formulas: the force, then what that is made of.
     - `execution`: how `simulate` runs it.
     - `valid_at_any_speed`: whether the force may be evaluated up to the largest number there is.
-    - `limitations`: experiments of `jaxmodsim.validation` that the law misses whatever its numbers, and why.
+    - `limitations`: experiments of the behaviour bench that the law misses whatever its numbers, and why.
     - `mujoco_lacks`: why MuJoCo has not such a law, and what to do; read after its name.
     - `example`, `example_step`: numbers that `STANDARD` has not, and the fixed step [s] that the law needs if it does.
     """
@@ -279,8 +279,9 @@ _LAWS: dict[str, type[AbstractLaw]] = {}
 def register_law(law: type[_Law]) -> type[_Law]:
     """Make a law known by the name of its class: a decorator of final classes.
 
-    From then on it is a `kind` in the files of `jaxmodsim sweep`, and stands in the table of laws. With `cases()` it is
-    in `jaxmodsim testbench --laws`, with `fit_start()` a model of `jaxmodsim fit`.
+    From then on it is a `kind` in the files of `jaxmodsim sweep`, and stands in the table of laws. With `cases()` the
+    behaviour bench of the repository runs it (`python -m bench behaviour`), with `fit_start()` it is a model of
+    `jaxmodsim fit`.
 
     **Arguments:**
 

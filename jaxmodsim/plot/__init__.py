@@ -7,11 +7,8 @@ except ModuleNotFoundError as error:
 
 from ._animate import Animation as Animation
 from ._animate import animate as animate
-from ._behaviour import behaviour_figure as behaviour_figure
 from ._comparison import comparison_figure as comparison_figure
 from ._design import design_figure as design_figure
-from ._hard import hard_figure as hard_figure
-from ._hard import step_limits_figure as step_limits_figure
 from ._indices import indices_figure as indices_figure
 from ._map import map2d as map2d
 from ._orbits import branch_figure as branch_figure

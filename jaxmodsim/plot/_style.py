@@ -7,18 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.ticker import LogLocator, StrMethodFormatter
 
-from ..validation.behaviour import Verdict
-
 # Blue, vermilion and bluish green of Okabe and Ito, Color universal design, 2008: told apart without red and green.
 BLUE, RED, GREY, GREEN = "#0072b2", "#d55e00", "#8a8a8a", "#009e73"
 COLOURS = (BLUE, RED, GREEN, "#7b4fa3", "#b8860b")  # of lines in one panel
-VERDICTS = {
-    Verdict.PASS: GREEN,
-    Verdict.FAIL: RED,
-    Verdict.KNOWN_LIMITATION: "#b8860b",
-    Verdict.NOT_APPLICABLE: GREY,
-}
-
 
 # Ratio of the ends of a logarithmic axis up to which its numbers are written out.
 _FEW_DECADES = 300.0

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.colors import LogNorm
 
-from ..validation.testbench import RampRun
+from ..problems.testbench import RampRun
 from ._figure import Figure
 from ._style import BLUE, COLOURS, GREY, RED, panel_letters
 

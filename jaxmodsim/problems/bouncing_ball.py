@@ -8,7 +8,11 @@ from .._core.parameters import Number, check_ranges, parameter
 from ..mechanics import Contact
 from ..scene import Scene
 from ..solvers import EventState
-from ._falling import falling
+
+
+def falling(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
+    """Lagrangian [J] of a mass `m` [kg] at the height `q[0]` [m] under gravity `g` [m/s^2]."""
+    return 0.5 * p["m"] * qd[0] ** 2 - p["m"] * p["g"] * q[0]
 
 
 class BouncingBall(eqx.Module):

@@ -11,7 +11,7 @@ from jaxmodsim.friction import LuGre
 from jaxmodsim.identify import fit
 from jaxmodsim.plot import Figure, fit_figure, ramp_figure, truth_figure
 from jaxmodsim.problems import braked_spring
-from jaxmodsim.validation.testbench import ramp_cases, run_ramp, stick_sweep
+from jaxmodsim.problems.testbench import ramp_cases, run_ramp, stick_sweep
 
 
 def test_help_and_usage_errors(run_command):

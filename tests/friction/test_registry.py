@@ -10,10 +10,11 @@ import pandas as pd
 import pytest
 
 import jaxmodsim as jms
+from bench.behaviour.experiment import Verdict, law_cases
+from bench.behaviour.run import run_bench
 from jaxmodsim.friction import STANDARD, AbstractForceLaw, LawCase, _law, check_passivity, laws, parameter, register_law
 from jaxmodsim.identify import axis_models, axis_scene, rough_axis
 from jaxmodsim.scene import scene_numbers
-from jaxmodsim.validation.behaviour import _bench, law_cases
 
 from ..helpers.law_cases import CASES, cases_of_registered_laws
 from ..helpers.law_table import law_table
@@ -87,17 +88,13 @@ def test_the_contract_holds_for_it(registered: type[SoftCoulomb], monkeypatch: p
     assert check_passivity(case.law)
 
 
-def test_the_behaviour_bench_runs_it(
-    registered: type[SoftCoulomb], run_command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_behaviour_bench_runs_it(registered: type[SoftCoulomb]) -> None:
     (case,) = (case for case in law_cases() if isinstance(case.law, registered))
-    monkeypatch.setattr(_bench, "law_cases", lambda: (case,))
-    code, text, _ = run_command("testbench", "--laws", "--out", str(tmp_path))
-    assert code == 0, text
-    verdicts = pd.read_csv(tmp_path / "behaviour.csv").query("law == 'SoftCoulomb'").set_index("experiment")
-    assert verdicts.verdict["characteristic"] == "pass"
+    found = run_bench([case])["SoftCoulomb"]
+    assert Verdict.FAIL not in [outcome.verdict for outcome in found.values()]
+    assert found["characteristic"].verdict is Verdict.PASS
     for experiment, reason in case.law.known_limitations().items():
-        assert verdicts.reason[experiment] == reason
+        assert found[experiment].reason == reason
 
 
 SPEC = """

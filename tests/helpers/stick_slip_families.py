@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodsim.problems import linear_stick_slip
+from ..problems import linear_stick_slip
 
 MARGIN, SPACING = 1e-4, 1e-4
 # Of the family that comes as near as that by intention.

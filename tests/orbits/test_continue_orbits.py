@@ -8,7 +8,8 @@ from scipy.integrate import solve_ivp
 import jaxmodsim as jms
 from jaxmodsim.mechanics import Contact
 from jaxmodsim.orbits import OrbitError, continue_special
-from jaxmodsim.problems import vibrating_table
+
+from ..problems import vibrating_table
 
 
 def spring(_t, q, qd, p):

@@ -7,8 +7,10 @@ from scipy.integrate import solve_ivp
 
 import jaxmodsim as jms
 from jaxmodsim.orbits import OrbitError
-from jaxmodsim.problems import belt_oscillator, relief_valve, vibrating_table
+from jaxmodsim.problems import belt_oscillator
 from jaxmodsim.scene import replace_elements, scene_numbers
+
+from ..problems import relief_valve, vibrating_table
 
 
 def spring(_t, q, qd, _p):

@@ -9,7 +9,7 @@ sys.modules["matplotlib"] = None
 import jaxmodsim as jms
 run = jms.simulate(jms.problems.ramped_box.scene(), [0.0], [0.0], 0.1)
 assert run.result.ok
-jms.metrics, jms.sweeps, jms.validation, jms.fit, jms.work_precision
+jms.metrics, jms.sweeps, jms.fit, jms.work_precision
 try:
     jms.plot
 except ImportError as error:

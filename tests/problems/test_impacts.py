@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim.problems import gripper, newtons_cradle, relief_valve, rocking_block, stacked_blocks, two_balls
+
+from . import gripper, newtons_cradle, relief_valve, rocking_block, stacked_blocks, two_balls
 
 
 def _after_collision(q0, qd0, numbers):

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import root_scalar
 
-from jaxmodsim.problems import linear_stick_slip
+from . import linear_stick_slip
 
 # Amplitude [N], growth [1/s], angular frequency [rad/s].
 SHAKEN = (0.8441173414514593, 0.09826644620612397, 2.9358368442770417)

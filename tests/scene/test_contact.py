@@ -12,7 +12,8 @@ import pytest
 from jaxmodsim import AppliedForce, Coulomb, Friction, LuGre, Regularized, Scene, SimulationError, Stribeck, simulate
 from jaxmodsim.scene._event_driven import FrictionElements, next_modes, solve_friction_forces
 from jaxmodsim.simulation._solve import compiled_runs
-from jaxmodsim.validation.hard._many_events import Contradictory
+
+from ..hard.many_events import Contradictory
 
 
 def masses(t: Any, q: Any, qd: Any, p: Any) -> Any:

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim.problems import vibrating_table
 from jaxmodsim.scene import replace_elements
 from jaxmodsim.simulation import MAX_STEPS, outcome_messages
 from jaxmodsim.simulation._solve import compiled_runs
 from tests.helpers.impacts import ball_on_table, mass_in_a_dry_box
+
+from ..problems import vibrating_table
 
 TIGHT: dict[str, Any] = {"rtol": 1e-9, "atol": 1e-12}
 

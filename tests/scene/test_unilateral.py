@@ -10,9 +10,11 @@ import pytest
 from scipy.special import ellipk
 
 import jaxmodsim as jms
-from jaxmodsim.problems import bouncing_ball, vibrating_table
-from jaxmodsim.validation.hard import hard_cases
-from jaxmodsim.validation.hard._case import SceneTask
+from jaxmodsim.problems import bouncing_ball
+
+from ..hard.case import SceneTask
+from ..hard.catalogue import hard_cases
+from ..problems import vibrating_table
 
 HARD = hard_cases()
 TIGHT: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-12}

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim.problems import linear_stick_slip
 from jaxmodsim.simulation import outcome_messages
 
 from ..helpers.fuzz import is_deep
 from ..helpers.stick_slip_families import FAMILIES, Family, Member, draw_family
+from ..problems import linear_stick_slip
 
 COUNT, DEEP = 24, 400
 # What takes minutes to compile is left to the deep profile.

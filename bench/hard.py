@@ -1,0 +1,89 @@
+"""All hard cases under every transform, in several processes, and the largest stable steps: rows of a result."""
+
+import math
+import multiprocessing
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from functools import cache
+
+import jax
+
+from bench.record import Result
+from tests.hard.catalogue import LONG, hard_cases
+from tests.hard.check import DTYPES, TRANSFORMS, CaseReport, CheckFinding, check
+from tests.hard.steps import EXPLICIT, formulations, largest_step, theory
+
+VALUES, SLOPES = ("alone", "jit", "vmap"), ("forward", "reverse")
+# Kinds of errors by name: floating type and transforms.
+KINDS = {
+    "value, float64": ("float64", VALUES),
+    "derivative, float64": ("float64", SLOPES),
+    "energy balance": ("float64", ("energy",)),
+    "value or derivative, float32": ("float32", (*VALUES, *SLOPES)),
+}
+# Cases that a process checks. Each compiles tens of programs, a program takes several maps of memory, and Linux gives a
+# process no more than 65 530 of those.
+_PORTION = 12
+
+
+def add_errors(result: Result, reports: Iterable[CaseReport]) -> None:
+    """Errors over what is admissible, so that 1 is the limit, and whether each case passes."""
+    for report in reports:
+        about = {"case": f"{report.case.family}: `{report.case.name}`"}
+        for kind, (dtype, transforms) in KINDS.items():
+            error = report.worst(dtype, transforms)
+            result.add("error", None if math.isnan(error) else error, at=kind, **about)
+        result.add("passes", "yes" if report.ok else "**no**", **about)
+
+
+def add_steps(result: Result, names: Sequence[str], solvers: Sequence[str] = tuple(EXPLICIT)) -> None:
+    """Largest stable fixed steps [s] of explicit methods, by theory and found by running."""
+    for name in names:
+        law = formulations()[name]
+        for solver in solvers:
+            result.add("step by theory", theory(law, EXPLICIT[solver]), "s", case=name, peer=solver)
+            result.add("step found", largest_step(law, EXPLICIT[solver]), "s", case=name, peer=solver)
+
+
+def check_many(
+    names: Sequence[str], transforms: Sequence[str] = TRANSFORMS, dtypes: Sequence[str] = DTYPES
+) -> list[CaseReport]:
+    """Reports on cases, in this order, also where a process was killed; each is printed as it is found."""
+    cases, jobs = hard_cases(), multiprocessing.cpu_count()
+    reports: dict[str, CaseReport] = {}
+    order = sorted(names, key=lambda name: name not in LONG)
+    context = multiprocessing.get_context("spawn")
+    for first in range(0, len(order), jobs * _PORTION):
+        portion = order[first : first + jobs * _PORTION]
+        with ProcessPoolExecutor(jobs, context, initializer=_begin) as pool:
+            futures = {pool.submit(_found, name, tuple(transforms), tuple(dtypes)): name for name in portion}
+            for future in as_completed(futures):
+                report = reports[futures[future]] = CaseReport(cases[futures[future]], _result(future))
+                failed = [f"{each.transform}, {each.dtype}: {each.sentence}" for each in report.findings if not each.ok]
+                print(f"{report.case.name}: {'; '.join(failed) or 'pass'}", flush=True)
+    return [reports[name] for name in names]
+
+
+def _result(future: Future[tuple[CheckFinding, ...]]) -> tuple[CheckFinding, ...]:
+    try:
+        return future.result()
+    except BrokenProcessPool as error:
+        # That of this case, or of another one that was begun with it.
+        return (CheckFinding("alone", "float64", math.nan, False, f"A process was killed: {error}"),)
+
+
+def _begin() -> None:
+    jax.config.update("jax_enable_x64", True)
+
+
+# Cases of one structure share what is compiled, and a process makes them once.
+_cases = cache(hard_cases)
+
+
+def _found(name: str, transforms: tuple[str, ...], dtypes: tuple[str, ...]) -> tuple[CheckFinding, ...]:
+    try:
+        return check(_cases()[name], transforms, dtypes).findings
+    except Exception as error:
+        # Whatever it is, the other cases go on.
+        return (CheckFinding("alone", "float64", math.nan, False, f"{type(error).__name__}: {error}"),)

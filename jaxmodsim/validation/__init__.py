@@ -1,1 +1,0 @@
-"""Above everything: hard cases with their answers, and the behaviour bench of the friction laws."""
