@@ -1,7 +1,5 @@
 """The largest magnitude of a series in a run, between saved times too."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -31,8 +29,8 @@ def peak_of(run: Trajectory, name: str) -> Float[Array, ""]:
 def _between(run: Trajectory, name: str) -> Float[Array, ""]:
     """The largest magnitude within steps: a first repeat of the run says which steps, a second one samples these."""
     series = find_series(run, name)
-    plain = replace(run.request, ts=None, log=0, audited=False)
-    nodes = solve(jax.lax.stop_gradient(replace(plain, max_steps=_most_steps(run), series=series))).nodes
+    plain = run.request._replace(ts=None).choosing(log=0, audited=False)
+    nodes = solve(jax.lax.stop_gradient(plain.choosing(max_steps=_most_steps(run), series=series))).nodes
     assert nodes is not None
     nodes = jax.lax.stop_gradient(nodes)
     chosen = _largest(nodes)
@@ -43,7 +41,7 @@ def _between(run: Trajectory, name: str) -> Float[Array, ""]:
     share = (jnp.arange(_SAMPLES, dtype=start.dtype) + 0.5) / _SAMPLES
     ts = start[:, None] + share[None, :] * length[:, None]
     ts = jnp.clip(jax.lax.stop_gradient(ts), plain.t0, run.t_end)
-    near = replace(plain, ts=jnp.ravel(ts))
+    near = plain._replace(ts=jnp.ravel(ts))
     samples = jnp.reshape(read_series(trajectory(near, solve(near)), series), ts.shape)
     samples = jnp.where(within[:, None] & jnp.isfinite(samples), samples, 0.0)
     return jnp.max(jax.vmap(_vertex)(samples))
@@ -51,7 +49,7 @@ def _between(run: Trajectory, name: str) -> Float[Array, ""]:
 
 def _most_steps(run: Trajectory) -> int:
     """A bound on the number of steps, in powers of two where it is known: another one compiles anew."""
-    count, most = run.stats["num_steps"], run.request.max_steps
+    count, most = run.stats["num_steps"], run.request.choices.max_steps
     return min(most, 1 << max(int(count), 64).bit_length()) if is_known(count) else most
 
 

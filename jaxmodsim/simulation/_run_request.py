@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -43,17 +43,28 @@ class Plugin:
         return eqx.combine(self.arrays, self.rest)
 
 
-@partial(
-    jtu.register_dataclass,
-    data_fields=("scene", "q0", "qd0", "z0", "t0", "t1", "ts", "rtol", "atol", "dt", "dtmax", "solver", "adjoint"),
-    meta_fields=("max_steps", "max_events", "hold_chatter", "project", "log", "audited", "series"),
-)
+@jtu.register_static
 @dataclass(frozen=True)
-class RunRequest:
-    """A run that is asked for: the arguments of `simulate`, checked and converted.
+class RunChoices:
+    """What of a run is compiled in.
 
-    Numbers are arrays of one floating type. Choices, from `max_steps` on, are compiled in.
+    - `max_steps`, `max_events`, `hold_chatter`, `project`: as for `simulate`.
+    - `log`: entries of the log of events, of which later ones are counted alone.
+    - `audited`: whether the work integrals run beside the motion.
+    - `series`: a number that is kept at the ends of all steps; None for none.
     """
+
+    max_steps: int
+    max_events: int
+    hold_chatter: bool
+    project: bool
+    log: int = 0
+    audited: bool = False
+    series: Series | None = None
+
+
+class RunRequest(NamedTuple):
+    """A run that is asked for: the arguments of `simulate`, checked and converted to arrays of one floating type."""
 
     scene: Scene
     q0: Float[Array, " dof"]
@@ -69,21 +80,16 @@ class RunRequest:
     dtmax: Float[Array, ""] | None
     solver: Plugin | None
     adjoint: Plugin | None
-    max_steps: int
-    max_events: int
-    hold_chatter: bool
-    project: bool
-    # Entries of the log of events, of which later ones are counted alone.
-    log: int
-    # Whether the work integrals run beside the motion.
-    audited: bool
-    # A number that is kept at the ends of all steps.
-    series: Series | None = None
+    choices: RunChoices
 
     @property
     def initial_state(self) -> State:
         """State at t0: effects whose state is not given start at rest."""
         return State(self.q0, self.qd0, self.scene.initial_state(self.q0) | self.z0)
+
+    def choosing(self, **choices: Any) -> "RunRequest":
+        """The same run with other choices."""
+        return self._replace(choices=replace(self.choices, **choices))
 
 
 def run_request(
@@ -146,12 +152,12 @@ def run_request(
         array.get("dtmax"),
         _plugin(solver, dfx.AbstractSolver, "solver"),
         _plugin(adjoint, dfx.AbstractAdjoint, "adjoint"),
-        as_whole(max_steps, name="max_steps"),
-        as_whole(max_events, name="max_events"),
-        as_flag(hold_chatter, name="hold_chatter"),
-        as_flag(project, name="project"),
-        0,
-        False,
+        RunChoices(
+            as_whole(max_steps, name="max_steps"),
+            as_whole(max_events, name="max_events"),
+            as_flag(hold_chatter, name="hold_chatter"),
+            as_flag(project, name="project"),
+        ),
     )
     return _recording(asked, record)
 
@@ -169,10 +175,10 @@ def _recording(asked: RunRequest, record: tuple[str, ...]) -> RunRequest:
             )
     audited = "energy" in record
     if "events" in record or (audited and asked.scene.contacts):  # what impacts lose is read from the log
-        log = asked.max_events
+        log = asked.choices.max_events
     else:
-        log = min(_LOGGED, asked.max_events) if is_known(*jtu.tree_leaves(asked)) else 0
-    return replace(asked, log=log, audited=audited)
+        log = min(_LOGGED, asked.choices.max_events) if is_known(*jtu.tree_leaves(asked)) else 0
+    return asked.choosing(log=log, audited=audited)
 
 
 def is_known(*values: object) -> bool:

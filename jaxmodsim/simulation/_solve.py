@@ -140,14 +140,14 @@ def _solver(
             solver,
             functions.guards,
             functions.reset,
-            on_zeno=functions.on_zeno if request.hold_chatter or scene.contacts else None,
+            on_zeno=functions.on_zeno if request.choices.hold_chatter or scene.contacts else None,
             project=functions.project_and_stick if functions.projects or functions.sticks else None,
             samples=samples,
             rtol=functions.tolerances[0],
             enforce=True,
             event_mode=functions.event_mode if sum(functions.widths) > len(functions.widths) else None,
-            max_events=request.max_events,
-            log=request.log,
+            max_events=request.choices.max_events,
+            log=request.choices.log,
         )
     if functions.projects or freeze_args is not None:
         return Projected(solver, functions.project if functions.projects else None, freeze_args)
@@ -199,14 +199,14 @@ class _Start(NamedTuple):
 
 
 def _functions(request: RunRequest) -> RunFunctions:
-    scene = request.scene
+    scene, canonical = request.scene, request.solver is not None and isinstance(request.solver.rest, Gauss)
     return RunFunctions(
-        IntegratedSystem(request.audited, request.solver is not None and isinstance(request.solver.rest, Gauss)),
+        IntegratedSystem(request.choices.audited, canonical),
         _REST * request.atol,
         (request.rtol, request.atol),
-        bool(scene.bilateral or scene.contacts) and request.project,
+        bool(scene.bilateral or scene.contacts) and request.choices.project,
         scene.stick_drifts,
-        request.hold_chatter,
+        request.choices.hold_chatter,
         scene.mode_widths(request.q0.shape[0]),
     )
 
@@ -259,7 +259,7 @@ def _start_code(request: RunRequest, functions: RunFunctions, mode: Array | None
 
 def _integrate(request: RunRequest) -> RunOutput:
     """Run diffrax; with modes only where the scene has them, with a log, work and a series only where asked for."""
-    scene, exact, series = request.scene, bool(request.scene.mode_names), request.series
+    scene, exact, series = request.scene, bool(request.scene.mode_names), request.choices.series
     functions = _functions(request)
     method, adjoint = _plugins(request, functions.system)
     solver = _solver(method, functions, scene, request)
@@ -299,7 +299,7 @@ def _integrate(request: RunRequest) -> RunOutput:
             saveat=dfx.SaveAt(subs=subs),
             stepsize_controller=controller,
             adjoint=adjoint,
-            max_steps=request.max_steps,
+            max_steps=request.choices.max_steps,
             throw=False,
             # Traced from the beginning, as `EventController` makes it: the step is traced once, not for each kind.
             made_jump=jnp.asarray(False) if exact else None,
@@ -326,10 +326,10 @@ def _integrate(request: RunRequest) -> RunOutput:
         if ts is not None:  # an element that sticks under a load beyond its limit: an event was stepped over
             beyond = jnp.any(instants.stick_violation[1:] > _OVERLOAD, axis=1)
             missed = jnp.any(beyond & jnp.isfinite(t))
-    (y, work), (end_state, _) = (y, end[1]) if request.audited else ((y, None), (end[1], None))
+    (y, work), (end_state, _) = (y, end[1]) if request.choices.audited else ((y, None), (end[1], None))
     ended = _ended(request, end[0], end_state, rate, end[2], solution.result, ending)
     code = jnp.where(starts, ended, start)
-    if exact and not request.hold_chatter:
+    if exact and not request.choices.hold_chatter:
         code = jnp.where((code == SUCCESS) & missed, MISSED_EVENT, code)
     nodes = None if series is None else Nodes(solution.ts[-1], *solution.ys[-1])
     return RunOutput(t, y, modes, code, None if ts is None else (end[0], end_state), stats, log, work, nodes)

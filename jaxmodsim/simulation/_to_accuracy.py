@@ -120,7 +120,7 @@ class _AccuracySearch:
             return self.run(rtol, which)
         if (rtol, which) not in self.seen:
             ts = np.linspace(self.request.t0, self.request.t1, _TIMES).astype(self.request.q0.dtype)
-            self.seen[rtol, which] = self.make(rtol, which, replace(self.request, ts=ts))
+            self.seen[rtol, which] = self.make(rtol, which, self.request._replace(ts=ts))
         return self.seen[rtol, which]
 
     def failure(self, rtol: float, which: int) -> str:
@@ -130,14 +130,13 @@ class _AccuracySearch:
     def make(self, rtol: float, which: int, request: RunRequest) -> _TrialRun:
         solver, dtype = self.solvers[which], self.request.q0.dtype
         atol = _round(max(_ABSOLUTE * rtol, float(jnp.finfo(dtype).eps)))
-        request = replace(
-            request,
+        request = request._replace(
             rtol=np.asarray(rtol, dtype),
             atol=np.asarray(atol, dtype),
             solver=Plugin(*eqx.partition(solver, eqx.is_array)),
         )
         if which == _BOUNDED:
-            request = replace(request, dtmax=np.asarray((request.t1 - request.t0) / _PART, dtype))
+            request = request._replace(dtmax=np.asarray((request.t1 - request.t0) / _PART, dtype))
         solved = solve(request)
         _check_known(solved)
         run, failure = trajectory(request, solved), _failure(request, solved)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -284,7 +284,7 @@ class Trajectory(AbstractReadable):
     @property
     def log_size(self) -> int:
         """Length of a log that holds all events: as many as needed, in powers of two; another one compiles anew."""
-        count, size = self.stats.get("num_events", 0), self.request.max_events
+        count, size = self.stats.get("num_events", 0), self.request.choices.max_events
         return size if not is_known(count) else min(size, 1 << max(int(count), 8).bit_length())
 
     def _log(self) -> EventLog:
@@ -292,11 +292,11 @@ class Trajectory(AbstractReadable):
         log, count = self.log, self.stats["num_events"]
         if log is not None:
             entries = log.t.shape[0]
-            if entries >= self.request.max_events or (is_known(count) and int(count) <= entries):
+            if entries >= self.request.choices.max_events or (is_known(count) and int(count) <= entries):
                 return log
         # Events do not depend on saved times, which are checked already where they are known.
         ts = None if is_known(self.request.ts) else self.request.ts
-        again = replace(self.request, ts=ts, log=self.log_size, audited=False)
+        again = self.request._replace(ts=ts).choosing(log=self.log_size, audited=False)
         return self._once("log", lambda: solve(again).log)
 
     def _audited(self) -> tuple[Work, EventLog | None]:
@@ -311,7 +311,7 @@ class Trajectory(AbstractReadable):
         """
         if self.work is not None:
             return self.work, self.log
-        asked = replace(self.request, log=self.log_size if self.scene.contacts else 0, audited=True)
+        asked = self.request.choosing(log=self.log_size if self.scene.contacts else 0, audited=True)
         again = self._once("audited", lambda: solve(asked))
         if is_known(self.code, again.code) and int(self.code) == SUCCESS != int(again.code):
             raise SimulationError(

@@ -143,7 +143,7 @@ def box(law: Any) -> Any:
 
 def made(run: Any, scene: Any = None, **fields: Any) -> Any:
     """A run with some of it replaced by what is given."""
-    request = run.request if scene is None else dataclasses.replace(run.request, scene=scene)
+    request = run.request if scene is None else run.request._replace(scene=scene)
     return dataclasses.replace(run, request=request, **fields)
 
 
@@ -231,7 +231,7 @@ def test_sequences_that_are_too_long_are_one_class(alone: Any) -> None:
 def test_single_precision(alone: Any) -> None:
     single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32) if x.dtype == jnp.float64 else x, alone)
     tolerances = {"rtol": jnp.asarray(1e-5, jnp.float32), "atol": jnp.asarray(1e-6, jnp.float32)}
-    request = dataclasses.replace(single.request, **tolerances)
+    request = single.request._replace(**tolerances)
     single = dataclasses.replace(single, request=request)
     assert metrics.period()(single).dtype == metrics.break_away()(single).dtype == jnp.float32
     np.testing.assert_allclose(metrics.period()(single), metrics.period()(alone), rtol=1e-4)
