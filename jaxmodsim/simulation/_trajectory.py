@@ -289,11 +289,10 @@ class Trajectory(AbstractReadable):
 
     def _log(self) -> EventLog:
         """The log of all events: that of the run, if it has room for them, or of another run."""
-        log, count = self.log, self.stats["num_events"]
-        if log is not None:
-            entries = log.t.shape[0]
-            if entries >= self.request.choices.max_events or (is_known(count) and int(count) <= entries):
-                return log
+        most, count = self.request.choices.max_events, self.stats["num_events"]
+        needed = min(int(count), most) if is_known(count) else most
+        if self.log is not None and self.log.t.shape[0] >= needed:
+            return self.log
         # Events do not depend on saved times, which are checked already where they are known.
         ts = None if is_known(self.request.ts) else self.request.ts
         again = self.request._replace(ts=ts).choosing(log=self.log_size, audited=False)
