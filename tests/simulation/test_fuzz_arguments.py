@@ -90,7 +90,7 @@ CALLS = {
         jms.simulate,
         {"scene": SCENE, **MOTION, "t1": 1.0, "t0": 0.0, "ts": T, "z0": None, "rtol": 1e-6, "atol": 1e-9, "dt": None,
          "dtmax": None, "solver": None, "adjoint": None, "max_steps": 9, "max_events": 9, "hold_chatter": False,
-         "project": True, "throw": True},
+         "project": True, "record": (), "throw": True},
     ),
     "simulate_to_accuracy": Call(
         jms.simulate_to_accuracy,
@@ -188,8 +188,8 @@ GARBAGE: dict[str, Callable[[], Any]] = {
 def _as_users_have_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
-    def traced(problem: Any, options: Any) -> Any:
-        shapes = jax.eval_shape(lambda problem: solve(problem, options), problem)
+    def traced(request: Any) -> Any:
+        shapes = jax.eval_shape(solve, request)
         return jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
     solve = _simulate.solve
