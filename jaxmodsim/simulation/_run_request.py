@@ -122,7 +122,7 @@ def run_request(
     if not isinstance(scene, Scene):
         raise ValueError(f"simulate needs a Scene, but a {type(scene).__name__} was given.")
     given = {"q0": q0, "qd0": qd0, "t1": t1, "t0": t0, "rtol": rtol, "atol": atol, "ts": ts, "dt": dt, "dtmax": dtmax}
-    scene, array = _converted(scene, {name: value for name, value in given.items() if value is not None})
+    scene, array, known = _converted(scene, {name: value for name, value in given.items() if value is not None})
     _check_values(array)
     _check_span(t0, t1, array)
     if array["q0"].shape != (1,):
@@ -138,11 +138,15 @@ def run_request(
             "simulate cannot use diffrax.BacksolveAdjoint, which knows neither events nor projections nor what is"
             " kept of a run. Leave adjoint out, or pass diffrax.ForwardMode()."
         )
-    asked = RunRequest(
+    z0 = {} if z0 is None else _own_states(scene, array["q0"], z0, array["q0"].dtype)
+    plugins = _plugin(solver, dfx.AbstractSolver, "solver"), _plugin(adjoint, dfx.AbstractAdjoint, "adjoint")
+    known = known and is_known(*jtu.tree_leaves((z0, plugins)))
+    max_events = as_whole(max_events, name="max_events")
+    return RunRequest(
         scene,
         array["q0"],
         array["qd0"],
-        {} if z0 is None else _own_states(scene, array["q0"], z0, array["q0"].dtype),
+        z0,
         array["t0"],
         array["t1"],
         array.get("ts"),
@@ -150,20 +154,19 @@ def run_request(
         array["atol"],
         array.get("dt"),
         array.get("dtmax"),
-        _plugin(solver, dfx.AbstractSolver, "solver"),
-        _plugin(adjoint, dfx.AbstractAdjoint, "adjoint"),
+        *plugins,
         RunChoices(
             as_whole(max_steps, name="max_steps"),
-            as_whole(max_events, name="max_events"),
+            max_events,
             as_flag(hold_chatter, name="hold_chatter"),
             as_flag(project, name="project"),
+            *_recorded(record, bool(scene.contacts), max_events, known),
         ),
     )
-    return _recording(asked, record)
 
 
-def _recording(asked: RunRequest, record: tuple[str, ...]) -> RunRequest:
-    """With a log of as many events as are recorded, and with the work.
+def _recorded(record: tuple[str, ...], has_contacts: bool, max_events: int, known: bool) -> tuple[int, bool]:
+    """Entries of the log of events, and whether the work is recorded.
 
     A run whose numbers are known logs its first events. One that is differentiated would carry the log through its
     derivatives.
@@ -174,11 +177,9 @@ def _recording(asked: RunRequest, record: tuple[str, ...]) -> RunRequest:
                 f"record holds {name!r}, which is none of {', '.join(_RECORDS)}.{did_you_mean(name, _RECORDS)}"
             )
     audited = "energy" in record
-    if "events" in record or (audited and asked.scene.contacts):  # what impacts lose is read from the log
-        log = asked.choices.max_events
-    else:
-        log = min(_LOGGED, asked.choices.max_events) if is_known(*jtu.tree_leaves(asked)) else 0
-    return asked.choosing(log=log, audited=audited)
+    if "events" in record or (audited and has_contacts):  # what impacts lose is read from the log
+        return max_events, audited
+    return min(_LOGGED, max_events) if known else 0, audited
 
 
 def is_known(*values: object) -> bool:
@@ -196,8 +197,8 @@ def _array(value: PyTree, dtype: np.dtype) -> Any:
     return np.asarray(value, dtype)
 
 
-def _converted(scene: Scene, given: dict[str, Any]) -> tuple[Scene, dict[str, Any]]:
-    """The scene, and numbers as arrays of the floating type that it has together with the initial state."""
+def _converted(scene: Scene, given: dict[str, Any]) -> tuple[Scene, dict[str, Any], bool]:
+    """The scene, numbers as arrays of the type that it has with the initial state, and whether none is traced."""
     for name in ("q0", "qd0", "ts"):
         value = given.get(name)
         # A list may hold numbers that are traced, as in qd0=[scene.params["v"]].
@@ -224,7 +225,7 @@ def _converted(scene: Scene, given: dict[str, Any]) -> tuple[Scene, dict[str, An
     for name in ("t0", "t1", "rtol", "atol", "dt", "dtmax"):
         if name in array and array[name].shape != ():
             raise ValueError(f"{name} must be one number, but has the shape {array[name].shape}.")
-    return scene, array
+    return scene, array, is_known(*leaves, *array.values())
 
 
 def _check_span(t0: ArrayLike, t1: ArrayLike, array: dict[str, Any]) -> None:

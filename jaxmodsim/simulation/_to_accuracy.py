@@ -130,11 +130,8 @@ class _AccuracySearch:
     def make(self, rtol: float, which: int, request: RunRequest) -> _TrialRun:
         solver, dtype = self.solvers[which], self.request.q0.dtype
         atol = _round(max(_ABSOLUTE * rtol, float(jnp.finfo(dtype).eps)))
-        request = request._replace(
-            rtol=np.asarray(rtol, dtype),
-            atol=np.asarray(atol, dtype),
-            solver=Plugin(*eqx.partition(solver, eqx.is_array)),
-        )
+        plugin = Plugin(*eqx.partition(solver, eqx.is_array))
+        request = request._replace(rtol=np.asarray(rtol, dtype), atol=np.asarray(atol, dtype), solver=plugin)
         if which == _BOUNDED:
             request = request._replace(dtmax=np.asarray((request.t1 - request.t0) / _PART, dtype))
         solved = solve(request)

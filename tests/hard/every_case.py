@@ -1,7 +1,9 @@
 """Every hard case under every transform. The suite leaves these out, as they take most of an hour; run this file.
 
+```sh
 python -m pytest tests/hard/every_case.py --jaxtyping-packages= -n 2 -k "_alone"                  each case in one way
 python -m pytest tests/hard/every_case.py --jaxtyping-packages= -k "many_events and _reverse"     one family, one way
+```
 
 The name of a test is family-case-_transform. Cases call the package as users do, without type checks at run time;
 `.ci/run` also compiles as users do: CONTRIBUTING.md has the environment variables.
