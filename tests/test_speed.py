@@ -11,8 +11,9 @@ from jaxmodsim import tune_cpu
 from jaxmodsim._core.speed import recommend_tuning, remark_on_compilation
 
 
-def test_too_late() -> None:
+def test_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
     jnp.zeros(1).block_until_ready()
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
     with pytest.raises(RuntimeError, match="comes too late: JAX has already started its backend"):
         tune_cpu()
 
@@ -36,6 +37,8 @@ assert first.startswith("--xla_cpu_enable_fast_math=false ")
 assert first.endswith("xla_cpu_small_while_loop_byte_threshold=50000")
 import jax.numpy as jnp
 assert float(jnp.ones(3).sum()) == 3.0, "XLA does not take the flag"
+jaxmodsim.tune_cpu()
+assert os.environ["XLA_FLAGS"] == first
 """
 
 

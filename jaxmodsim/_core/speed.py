@@ -40,17 +40,20 @@ def tune_cpu(while_loop_bytes: int = 1_000_000) -> None:
 
     **Raises:**
 
-    - `RuntimeError` if JAX has computed something already, as the option would come too late.
+    - `RuntimeError` if JAX has computed something already, as the option would come too late. A second call does
+      nothing, nor does a call in a process that inherits `XLA_FLAGS` with the option, such as a worker of dask.
     - `ValueError` if `while_loop_bytes` is not a positive integer.
     """
     if isinstance(while_loop_bytes, bool) or not isinstance(while_loop_bytes, int) or while_loop_bytes < 1:
         raise ValueError(f"while_loop_bytes must be a positive integer, but {while_loop_bytes!r} was given.")
+    flags = os.environ.get("XLA_FLAGS", "")
     if backend_has_started():
+        if _OPTION in flags:
+            return
         raise RuntimeError(
             "tune_cpu comes too late: JAX has already started its backend. Call it before the first computation,"
             " and before any jnp.array is made."
         )
-    flags = os.environ.get("XLA_FLAGS", "")
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if _OPTION not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_backend_extra_options={_OPTION}={while_loop_bytes}".strip()

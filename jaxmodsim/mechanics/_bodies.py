@@ -34,12 +34,12 @@ class AbstractBody(eqx.Module):
         """Lagrangian [J]."""
 
     def __add__(self, other: Any) -> "Bodies":
-        """Both together."""
-        return Bodies((self, as_function(other, name="What is added to a body")))
+        """The sum of both; a sum of sums has their parts side by side."""
+        return Bodies((*_parts(self), *_parts(other)))
 
     def __radd__(self, other: Any) -> "AbstractBody":
-        """Both together; zero, from which `sum` starts, is nothing."""
-        return self if other == 0 else Bodies((as_function(other, name="What is added to a body"), self))
+        """The sum of both; `sum` starts from zero, which adds nothing."""
+        return self if other == 0 else Bodies((*_parts(other), *_parts(self)))
 
 
 class Bodies(AbstractBody):
@@ -53,6 +53,12 @@ class Bodies(AbstractBody):
         for part in self.parts[1:]:
             total = total + part(t, q, qd, params)
         return total
+
+
+def _parts(lagrangian: Any) -> tuple[Callable[..., Any], ...]:
+    if isinstance(lagrangian, Bodies):
+        return lagrangian.parts
+    return (as_function(lagrangian, name="What is added to a body"),)
 
 
 class PointMass(AbstractBody):

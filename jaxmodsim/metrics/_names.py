@@ -60,6 +60,8 @@ def changes_of(run: Trajectory, name: str) -> tuple[Events, Array]:
 def modes_at_ends(run: Trajectory, name: str, events: Events, own: Array) -> tuple[Array, Array]:
     """Mode of an element at t0 and at the end of a run: 0 in stick, else the sign of its slip velocity."""
     kept = run.mode[name][-1].astype(int)
+    if not own.shape[0]:
+        return kept, kept
     first, last = jnp.argmax(own), own.shape[0] - 1 - jnp.argmax(own[::-1])
     changed = jnp.any(own)
     return jnp.where(changed, events.before[first], kept), jnp.where(changed, events.after[last], kept)

@@ -98,7 +98,9 @@ def _before(end: float) -> float:
 
 def _changes(run: Trajectory) -> list[tuple[float, int, int, int]]:
     """Events along a run: time, element, mode before and after."""
-    return [x for x in zip(*(np.asarray(each).tolist() for each in run.events), strict=True) if x[0] < np.inf]
+    events = run.events
+    columns = (np.asarray(x).tolist() for x in (events.t, events.effect, events.before, events.after))
+    return [x for x in zip(*columns, strict=True) if x[0] < np.inf]
 
 
 def _sequence(run: Trajectory) -> Sequence:

@@ -148,9 +148,12 @@ class Scene(AbstractReadable, eqx.Module):
         for name in set(self.names) & set(self.constraint_names):
             raise ValueError(f"An effect and a constraint both have the name {name!r}; give one of them another name.")
         coordinates = [read_label(text).name for text in self.coordinates]
-        for name in {"t", "time", *self.names, *(f"{each}_dot" for each in coordinates)} & set(coordinates):
-            whose = "an effect" if name in self.names else "a velocity" if name.endswith("_dot") else "the time"
-            raise ValueError(f"A coordinate has the name {name!r}, which is that of {whose}; give it another name.")
+        owners = {"t": "the time", "time": "the time"}
+        owners |= {f"{each}_dot": "a velocity" for each in coordinates} | dict.fromkeys(self.names, "an effect")
+        if taken := [f"{name!r} is also that of {owners[name]}" for name in coordinates if name in owners]:
+            raise ValueError(
+                f"Names of coordinates must be their own, but {', '.join(taken)}. Rename one of each pair."
+            )
         if self.event_driven and any(isinstance(x, Friction) and x.karnopp for x in self.effects):
             raise ValueError(
                 f"{', '.join(self.event_driven)}: set-valued laws of one scene run either all by events or all by"

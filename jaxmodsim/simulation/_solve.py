@@ -313,7 +313,7 @@ def _integrate(request: RunRequest) -> RunOutput:
     stats = {name: solution.stats[name] for name in ("num_steps", "num_rejected_steps")}
     if exact:
         (count, status, fired), log = jtu.tree_map(lambda x: x[0], events)
-        ending, stats["num_events"] = Ending(status, fired), count
+        ending, stats["num_events"] = Ending(status, fired), count.astype(int)
     t = solution.ts[0]
     if ts is not None:
         t, rows = jtu.tree_map(lambda *x: jnp.concatenate(x), (t, rows), (solution.ts[1], solution.ys[1]))

@@ -34,22 +34,36 @@ if TYPE_CHECKING:
 _Value = TypeVar("_Value")
 
 
-class Events(NamedTuple):
-    """Mode changes along a run in order of time, padded with infinity or -1; in words: `Trajectory.mode_changes`.
+@partial(jtu.register_dataclass, data_fields=("t", "effect", "before", "after"), meta_fields=("labels",))
+@dataclass(frozen=True, repr=False)
+class Events(AbstractReadable):
+    """Mode changes along a run in order of time; `print` shows them in words.
 
-    Set-valued laws that run exactly, contacts and switches change modes. Elements that do so at the same instant have
-    one entry each. An impact is an entry of its contact, from open to open where the gap opens again.
+    Friction laws with stick, contacts and switches change modes. Elements that change at the same instant have one
+    entry each. An impact is an entry of its contact, from open to open if the gap opens again. Inside `jax.jit`,
+    `jax.vmap` and `jax.grad` the number of entries is fixed: the arrays are padded with infinity and -1.
 
     - `t`: time [s], differentiable.
     - `effect`: index of the effect in the scene; contacts follow the effects, in the order of the constraints.
-    - `before`, `after`: mode before and after: of friction 0 in stick, else the sign of the slip velocity, in the plane
-      1; of a contact 0 where it is open, 1 where it is closed; of a switch the sign of its guard.
+    - `before`, `after`: mode before and after. Friction: 0 in stick, else the sign of the slip velocity, in the plane
+      1. Contact: 0 if open, 1 if closed. Switch: the sign of its guard.
+    - `labels`: name of each effect and contact, and the words for its modes.
     """
 
-    t: Float[Array, " events"]
-    effect: Int[Array, " events"]
-    before: Int[Array, " events"]
-    after: Int[Array, " events"]
+    t: Float[Array, "*runs events"]
+    effect: Int[Array, "*runs events"]
+    before: Int[Array, "*runs events"]
+    after: Int[Array, "*runs events"]
+    labels: tuple[tuple[str, tuple[tuple[int, str], ...]], ...] = ()
+
+    __repr__ = AbstractReadable.__str__
+
+    def changes(self) -> tuple["ModeChange", ...]:
+        """The entries in words; outside of `jax.jit`."""
+        columns = (np.asarray(x).tolist() for x in (self.t, self.effect, self.before, self.after))
+        happened = [entry for entry in zip(*columns, strict=True) if entry[0] < math.inf]
+        words = [(name, dict(modes)) for name, modes in self.labels]
+        return tuple(ModeChange(t, words[i][0], words[i][1][a], words[i][1][b]) for t, i, a, b in happened)
 
 
 class ModeChange(NamedTuple):
@@ -70,7 +84,13 @@ _MODES, _PLANE_MODES = {0: "stick", 1: "forward", -1: "backward"}, {0: "stick", 
 _CONTACT_MODES, _SWITCH_MODES = {0: "open", 1: "closed"}, {1: "above", -1: "below"}
 
 
-class Energy(NamedTuple):
+@partial(
+    jtu.register_dataclass,
+    data_fields=("kinetic", "potential", "stored", "work_in", "dissipated", "balance"),
+    meta_fields=(),
+)
+@dataclass(frozen=True, repr=False)
+class Energy(AbstractReadable):
     """Energies along a run [J], shape `[time]` each.
 
     - `kinetic`, `potential`: of the Lagrangian; see `jaxmodsim.mechanics.energies`.
@@ -83,17 +103,19 @@ class Energy(NamedTuple):
       of the integration.
     """
 
-    kinetic: Float[Array, " time"]
-    potential: Float[Array, " time"]
-    stored: Float[Array, " time"]
-    work_in: Float[Array, " time"]
-    dissipated: Float[Array, " time"]
-    balance: Float[Array, " time"]
+    kinetic: Float[Array, "*runs time"]
+    potential: Float[Array, "*runs time"]
+    stored: Float[Array, "*runs time"]
+    work_in: Float[Array, "*runs time"]
+    dissipated: Float[Array, "*runs time"]
+    balance: Float[Array, "*runs time"]
+
+    __repr__ = AbstractReadable.__str__
 
 
 @partial(
     jtu.register_dataclass,
-    data_fields=("t", "q", "qd", "z", "modes", "stats", "code", "end", "request", "log", "work"),
+    data_fields=("t", "q", "qd", "z", "modes", "counts", "code", "end", "request", "log", "work"),
     meta_fields=("accuracy",),
 )
 @dataclass(frozen=True, repr=False)
@@ -110,7 +132,7 @@ class Trajectory(AbstractReadable):
     - `z`: own states of effects, by effect name; each with a leading time axis.
     - `modes`: of the friction elements that run by events, contacts and switches, shape `[time, modes]`; None where
       there are none. By name: `mode`.
-    - `stats`: `num_steps`, `num_rejected_steps` of these, and `num_events` where laws run by events.
+    - `counts`: `stats` as arrays.
     - `accuracy`: what was chosen for the accuracy that was asked for; None where none was.
 
     A run inside `jax.vmap` is read inside it, or by `jax.vmap(lambda run: run.forces)(runs)`.
@@ -121,7 +143,7 @@ class Trajectory(AbstractReadable):
     qd: Float[Array, "*time dof"]
     z: dict[str, PyTree]
     modes: Float[Array, "*time elements"] | None
-    stats: dict[str, Array]
+    counts: dict[str, Array]
     code: Int[Array, "..."]
     end: Float[Array, "..."] | None
     request: RunRequest
@@ -134,8 +156,7 @@ class Trajectory(AbstractReadable):
     # Where values may be kept: those that are traced further inside must not outlive that.
     _home: object = field(default_factory=get_opaque_trace_state, init=False, repr=False, compare=False)
 
-    def __repr__(self) -> str:
-        return str(self)
+    __repr__ = AbstractReadable.__str__
 
     def __reduce__(self) -> tuple[Callable[[], "Trajectory"], tuple[()]]:
         return partial(Trajectory, **{x.name: getattr(self, x.name) for x in fields(self) if x.init}), ()
@@ -144,6 +165,14 @@ class Trajectory(AbstractReadable):
     def scene(self) -> Scene:
         """The scene that was run."""
         return self.request.scene
+
+    @property
+    def stats(self) -> dict[str, Any]:
+        """`num_steps`, `num_rejected_steps` of these, and `num_events` where laws run by events.
+
+        Integers; arrays inside `jax.jit` and of batches. Elements that change at one instant count as one event.
+        """
+        return {name: int(x) if is_known(x) and x.ndim == 0 else x for name, x in self.counts.items()}
 
     @property
     def t_end(self) -> Float[Array, "..."]:
@@ -200,17 +229,12 @@ class Trajectory(AbstractReadable):
         if self.modes is None:
             none = jnp.zeros(0, int)
             return Events(jnp.zeros(0, self.t.dtype), none, none, none)
-        return self._once("events", lambda: _events(self.scene, self._log()))
+        return self._once("events", self._named_events)
 
     @property
     def mode_changes(self) -> tuple[ModeChange, ...]:
-        """`events` in words, as many as there are; outside of `jax.jit`."""
-        columns = [x.tolist() for x in map(np.asarray, self.events)]
-        scene, words = self.scene, self.mode_words
-        happened = [(t, scene.part_names[i], *modes) for t, i, *modes in zip(*columns, strict=True) if t < math.inf]
-        return tuple(
-            ModeChange(t, name, words[name][before], words[name][after]) for t, name, before, after in happened
-        )
+        """`events` in words; outside of `jax.jit`."""
+        return self.events.changes()
 
     @property
     def event_forces(self) -> dict[str, Array]:
@@ -298,6 +322,16 @@ class Trajectory(AbstractReadable):
         again = self.request._replace(ts=ts).choosing(log=self.log_size, audited=False)
         return self._once("log", lambda: solve(again).log)
 
+    def _named_events(self) -> Events:
+        """Events with the words for their modes; as many as happened, where that is known."""
+        t, *modes = _events(self.scene, self._log())
+        if is_known(t):
+            count = int(np.isfinite(t).sum())
+            t, *modes = (x[:count] for x in (t, *modes))
+        words = self.mode_words
+        labels = tuple((name, tuple(words.get(name, {}).items())) for name in self.scene.part_names)
+        return Events(t, *modes, labels=labels)
+
     def _audited(self) -> tuple[Work, EventLog | None]:
         """The work at the saved times, and with contacts the log of all events, from which their losses are read.
 
@@ -349,7 +383,7 @@ class Trajectory(AbstractReadable):
 @table_of.register
 def _(run: Trajectory) -> Table:
     """The motion alone: forces and events take a computation, or another run."""
-    notes = tuple(f"{name} {short(x)}" for name, x in run.stats.items())
+    notes = tuple(f"{name} {short(x)}" for name, x in run.counts.items())
     if not is_known(run.t, run.q) or run.t.ndim != 1:
         return Table(f"Trajectory, times of shape {run.t.shape}: {run.result}", (), [], notes)
     reached = np.isfinite(run.t)
@@ -361,6 +395,24 @@ def _(run: Trajectory) -> Table:
     t = f"{reached.sum()} of {len(run.t)} times up to {short(run.t_end)} s"
     head = ("", "first", "last", "least", "greatest")
     return Table(f"Trajectory, {t}: {run.result}", head, rows, (", ".join(notes),))
+
+
+@table_of.register
+def _(events: Events) -> Table:
+    if not is_known(events.t) or events.t.ndim != 1:
+        return Table(f"Events, times of shape {events.t.shape}", (), [])
+    rows = [(f"{t:.6g}", *words) for t, *words in events.changes()]
+    return Table(f"{len(rows)} mode changes", ("t [s]", "effect", "before", "after"), rows)
+
+
+@table_of.register
+def _(energy: Energy) -> Table:
+    columns = {each.name: getattr(energy, each.name) for each in fields(energy)}
+    if not is_known(*columns.values()) or energy.balance.ndim != 1:
+        return Table(f"Energy, shape {energy.balance.shape}", (), [])
+    reached = {name: np.asarray(x)[np.isfinite(x)] for name, x in columns.items()}
+    rows = [(f"{name} [J]", *map(short, (x[0], x[-1], x.min(), x.max()))) for name, x in reached.items() if len(x)]
+    return Table("Energy", ("", "first", "last", "least", "greatest"), rows)
 
 
 def trajectory(request: RunRequest, solved: RunOutput) -> Trajectory:
@@ -408,8 +460,8 @@ def _reached(t: Array, tree: PyTree) -> PyTree:
 
 
 @jax.jit
-def _events(scene: Scene, log: EventLog) -> Events:
-    """One entry for each element that changed its mode, from a log with one for each instant."""
+def _events(scene: Scene, log: EventLog) -> tuple[Array, Array, Array, Array]:
+    """Columns of `Events`, padded: one entry for each element that changed its mode, from a log of the instants."""
     widths = scene.mode_widths(log.before[0].q.shape[-1])
     before, after, fired = (mode_numbers(x, widths) for x in (log.before[1], log.after[1], log.fired))
     indices = jnp.asarray([scene.part_names.index(name) for name in scene.mode_names])
@@ -421,7 +473,7 @@ def _events(scene: Scene, log: EventLog) -> Events:
     def column(x: Array, filler: float | int) -> Array:
         return jnp.where(changed, jnp.ravel(jnp.broadcast_to(x, before.shape)), filler)[order]
 
-    return Events(
+    return (
         column(log.t[:, None], jnp.inf),
         column(indices[None, :], -1),
         column(before.astype(int), -1),

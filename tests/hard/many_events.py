@@ -223,7 +223,7 @@ def _cycles() -> list[HardCase]:
 
 
 def _changes(run: Trajectory) -> Array:
-    return run.stats["num_events"]
+    return jnp.asarray(run.stats["num_events"], float)
 
 
 def _smooth_break_away() -> HardCase:

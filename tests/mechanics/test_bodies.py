@@ -206,6 +206,14 @@ def test_an_inertia_tensor_and_an_angle() -> None:
     )
 
 
+def test_numbers_of_a_sum_are_named_by_the_place_of_their_body() -> None:
+    many: Any = sum  # type checkers know of sums of numbers
+    body = point_mass(1.0, lambda q: jnp.stack([q[0], 0.0 * q[0], 0.0 * q[0]]))
+    for total in (body + body + body, body + (body + body), many([body, body, body])):
+        names = scene_numbers(Scene(total))
+        assert list(names) == [f"lagrangian.parts.{i}.{x}" for i in range(3) for x in ("m", "gravity")]
+
+
 def test_bodies_and_springs_add_up() -> None:
     def spring(t: Any, q: Any, qd: Any, p: Any) -> Any:
         del t, qd, p

@@ -190,7 +190,11 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "coordinate of an effect's name": (
         lambda: Scene(free, effects=(Friction(Viscous(1.0)),), coordinates=("friction [m]",)),
-        "A coordinate has the name 'friction', which is that of an effect",
+        "Names of coordinates must differ from others: 'friction' is also that of an effect",
+    ),
+    "coordinates of the names of an effect and of the time": (
+        lambda: Scene(free, effects=(Friction(Viscous(1.0)),), coordinates=("friction [m]", "t [m]")),
+        "'friction' is also that of an effect, 't' is also that of the time",
     ),
     "force is no function": (lambda: AppliedForce(cast_any(2.0)), r"AppliedForce fn must be a function, but 2.0"),
     "at is no function": (lambda: AppliedForce(push, at=cast_any(1)), r"AppliedForce at must be a function, but 1"),

@@ -75,15 +75,37 @@ def test_a_run_prints_how_it_ended_and_how_far_it_went(run: jms.Trajectory) -> N
 
 def test_mode_changes_are_in_words_and_without_padding(run: jms.Trajectory) -> None:
     changes = run.mode_changes
-    assert len(changes) == run.stats["num_events"] < len(run.events.t)
+    assert len(changes) == run.stats["num_events"] == len(run.events.t)
     assert [change[1:] for change in changes] == [
         ("friction", "stick", "backward"),
         ("friction", "backward", "stick"),
         ("friction", "stick", "backward"),
     ]
-    np.testing.assert_array_equal([change.t for change in changes], run.events.t[:3])
+    np.testing.assert_array_equal([change.t for change in changes], run.events.t)
     smooth = jms.simulate(jms.problems.n_link_pendulum.scene(1), [0.1], [0.0], 0.1)
     assert smooth.mode_changes == ()
+
+
+def test_events_energy_and_counts_print_in_words_outside_of_traces(run: jms.Trajectory) -> None:
+    title, head, *lines = str(run.events).splitlines()
+    assert title == "3 mode changes"
+    assert head.split() == ["t", "[s]", "effect", "before", "after"]
+    assert [line.split()[1:] for line in lines] == [list(change[1:]) for change in run.mode_changes]
+    assert repr(run.events) == str(run.events)
+    assert [row[0].strip() for row in rows(run.energy)[1:]] == [f"{name} [J]" for name in (
+        "kinetic", "potential", "stored", "work_in", "dissipated", "balance",
+    )]  # fmt: skip
+    assert all(type(count) is int for count in run.stats.values())
+    seen = []
+    jax.jit(lambda run: seen.append((str(run.events), str(run.energy), run.events.t.shape)))(run)
+    (events, energy, (size,)) = seen[0]
+    assert events == f"Events, times of shape ({size},)"
+    assert energy == "Energy, shape (201,)"
+    assert size > 3
+    ball = jms.simulate(jms.problems.bouncing_ball.scene(e=0.5), [1.0], [0.0], 1.0)
+    assert str(ball.events).splitlines()[2].split()[1:] == ["floor", "open", "open"]
+    none = jms.simulate(jms.problems.n_link_pendulum.scene(1), [0.1], [0.0], 0.1)
+    assert str(none.events) == "0 mode changes"
 
 
 def test_a_notebook_shows_tables(run: jms.Trajectory) -> None:
