@@ -72,7 +72,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         "'meters' is not known. Did you mean 'm'?",
     ),
     "unit in capitals": (lambda: jms.Scene(energy, coordinates=("x [KG m]",)), "'KG' is not known. Did you mean 'kg'?"),
-    "fall": (lambda: jms.Stribeck(1.0, 2.0, 0.1, fall=jnp.sinh), "fall must be 1 at 0, where slip begins at Fs, but"),
+    "fall": (lambda: jms.Stribeck(1.0, 2.0, 0.1, fall=jnp.sinh), "fall(0) must be 1, so that slip begins at Fs"),
 }
 
 
