@@ -25,7 +25,7 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 from typing import Any as _Any
 
-from ._core.provenance import versions as _versions
+from ._core.system import versions as _versions
 
 if TYPE_CHECKING:
     from . import metrics as metrics

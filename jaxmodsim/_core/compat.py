@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, final
 
 import jax
 
-from .provenance import versions
+from .system import versions
 
 AVAILABLE: set[str] = set()
 _OFF = set(os.environ.get("JAXMODSIM_PROBES_OFF", "").split(","))

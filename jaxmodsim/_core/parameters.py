@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .state_dependent import StateDependent, as_state_function, nominal
+from .functions import StateDependent, as_state_function, nominal
 
 if TYPE_CHECKING:
     Number: TypeAlias = Any  # a plain number in the call: type checkers do not see the converter of `parameter`

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from .._core.functions import need_values
 from .._core.parameters import modules_of
-from .._core.state_dependent import need_values
 from ._law import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw, Passivity
 
 _SLOWEST = 1e-9  # lowest speed of the search [m/s]

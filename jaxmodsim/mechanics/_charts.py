@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from .._core.functions import as_function
-from .._core.index_check import check_indices
 from .._core.parameters import as_real
 from .._core.safe import safe_norm
+from .._core.trace_checks import check_indices
 from ._frame import is_right_handed, orthonormal_frame, resolve
 
 _Triples: TypeAlias = ArrayLike | Sequence[Any]

@@ -21,9 +21,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .._core.cholesky import solve_semidefinite
 from .._core.lu import factor_lu
 from .._core.safe import safe_norm
-from .._core.semidefinite import solve_semidefinite
 from .._core.shapes import PerDof, Scalar
 from .forces._friction import Friction
 

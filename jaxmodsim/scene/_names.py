@@ -10,8 +10,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
+from .._core.functions import StateDependent
 from .._core.parameters import Range, ranges_of
-from .._core.state_dependent import StateDependent
 from ..friction import AbstractAsymmetric
 from ._quantities import in_units_of, slip_unit
 from ._scene import Scene

@@ -8,8 +8,8 @@ import jax
 import jax.core
 import jax.numpy as jnp
 
+from .._core.arguments import axis_unit
 from .._core.parameters import Range
-from .._core.units import axis_unit
 from ._coordinates import Quantity, read_label
 from ._scene import Scene
 from .forces._effect import AbstractEffect

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._core.arguments import check_real
-from .._core.cholesky import factor_positive_definite
-from .._core.semidefinite import solve_balanced
+from .._core.cholesky import factor_positive_definite, solve_balanced
 from ..mechanics import errors, motion_equations, rates
 from ..scene import Scene, State, check_scene
 from ._outcome import SimulationError

@@ -17,8 +17,8 @@ from jaxtyping import ArrayLike, PyTree
 
 from .._core.arguments import as_flag
 from .._core.functions import Function
-from .._core.last_line import LastLines
 from .._core.speed import recommend_tuning, remark_on_compilation, remark_on_fixed_steps, remark_on_rounding
+from .._core.user_errors import LastLines
 from ..scene import Scene, State, vector_field
 from ..solvers import Gauss, ImplicitFriction, Rodas5P
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages, violation_code

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from .._core.arguments import as_flag
-from .._core.index_check import check_indices
+from .._core.trace_checks import check_indices
 from ..scene import Scene
 from ._accuracy import Accuracy, Attempt, CostScaling
 from ._evaluations import evaluations_per_step

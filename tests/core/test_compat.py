@@ -21,8 +21,8 @@ import pytest
 import jaxmodsim as jms
 from jaxmodsim._core import compat
 from jaxmodsim._core.fusion import opaque_one
-from jaxmodsim._core.index_check import check_indices, traced
 from jaxmodsim._core.scalarise import columns_of, in_scalars
+from jaxmodsim._core.trace_checks import check_indices, traced
 from jaxmodsim.export._program import program_of
 from jaxmodsim.solvers._unchecked import calls_back, unchecked
 

@@ -24,8 +24,8 @@ from jaxmodsim import (
     friction,
     scaled_by,
 )
+from jaxmodsim._core.functions import nominal
 from jaxmodsim._core.parameters import modules_of, parameter, ranges_of
-from jaxmodsim._core.state_dependent import nominal
 from jaxmodsim.friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw
 
 from ..helpers.differences import flat, gradient_by_differences

@@ -24,7 +24,7 @@ from jaxmodsim import (
     point_mass,
     simulate,
 )
-from jaxmodsim._core.semidefinite import solve_semidefinite
+from jaxmodsim._core.cholesky import solve_semidefinite
 from jaxmodsim.scene import State, forward_dynamics, vector_field
 from jaxmodsim.scene._event_driven import _loads
 

@@ -65,7 +65,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "numbers of nothing": (lambda: jms.Scene(energy, params={"a": [1.0, None]}), "params['a'][1] is None"),
     "unit": (
         lambda: jms.Scene(energy, coordinates=("x [furlong]",)),
-        "The coordinate 'x [furlong]' has the unit 'furlong', where 'furlong' is not known. A unit is made of m, km",
+        "The coordinate 'x [furlong]' has the unit 'furlong', where 'furlong' is not known. Units are products,",
     ),
     "unit in full": (
         lambda: jms.Scene(energy, coordinates=("x [meters/s]",)),

@@ -15,8 +15,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..._core.files import jsonable, written_whole
 from ..._core.readable import AbstractReadable, Table, table_of
+from ..._core.system import jsonable, written_whole
 from ..data._record import Record, resolution, sample_noise
 from ..estimate._search import SearchResult, ended_by_itself
 from ..model._parameters import with_numbers
