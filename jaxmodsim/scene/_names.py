@@ -96,9 +96,8 @@ def scene_units(scene: eqx.Module) -> dict[str, str]:
     """Unit of each number that has a known one, by the names of `scene_numbers`."""
     units = {name: allowed.unit for name, allowed in scene_ranges(scene).items()}
     if isinstance(scene, Scene):
-        for name, effect in zip(scene.names, scene.effects, strict=True):
-            if isinstance(effect, Friction):
-                units[f"{name}.belt_velocity"] = slip_unit(scene, effect).replace(" ", "/s ", 1) + "/s"
+        for name, effect in scene.friction.items():
+            units[f"{name}.belt_velocity"] = slip_unit(scene, effect).replace(" ", "/s ", 1) + "/s"
     return units
 
 

@@ -193,7 +193,7 @@ def simulate_to_accuracy(
     adjoint: dfx.AbstractAdjoint | None = None,
     max_steps: int = MOST_STEPS,
     max_events: int = MOST_EVENTS,
-    hold_chatter: bool = False,
+    stick_on_chatter: bool = False,
     project: bool = True,
     throw: bool = True,
 ) -> Trajectory:
@@ -241,7 +241,7 @@ def simulate_to_accuracy(
         adjoint=adjoint,
         max_steps=max_steps,
         max_events=max_events,
-        hold_chatter=hold_chatter,
+        stick_on_chatter=stick_on_chatter,
         project=project,
     )
     asked = _asked(request, accuracy)

@@ -186,7 +186,7 @@ class Trajectory(AbstractReadable):
         return {name: modes[..., i] for i, name in enumerate(self.scene.mode_names)}
 
     @property
-    def mode_words(self) -> dict[str, dict[int, str]]:
+    def mode_labels(self) -> dict[str, dict[int, str]]:
         """What the numbers of `mode` mean, by name, in the words of `ModeChange`."""
         scene = self.scene
         widths = dict(zip(scene.mode_names, scene.mode_widths(self.q.shape[-1]), strict=True))
@@ -206,7 +206,7 @@ class Trajectory(AbstractReadable):
     def mode_changes(self) -> tuple[ModeChange, ...]:
         """`events` in words, as many as there are; outside of `jax.jit`."""
         columns = [x.tolist() for x in map(np.asarray, self.events)]
-        scene, words = self.scene, self.mode_words
+        scene, words = self.scene, self.mode_labels
         happened = [(t, scene.part_names[i], *modes) for t, i, *modes in zip(*columns, strict=True) if t < math.inf]
         return tuple(
             ModeChange(t, name, words[name][before], words[name][after]) for t, name, before, after in happened

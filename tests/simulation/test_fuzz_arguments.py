@@ -89,14 +89,14 @@ CALLS = {
     "simulate": Call(
         jms.simulate,
         {"scene": SCENE, **MOTION, "t1": 1.0, "t0": 0.0, "ts": T, "z0": None, "rtol": 1e-6, "atol": 1e-9, "dt": None,
-         "dtmax": None, "solver": None, "adjoint": None, "max_steps": 9, "max_events": 9, "hold_chatter": False,
+         "dtmax": None, "solver": None, "adjoint": None, "max_steps": 9, "max_events": 9, "stick_on_chatter": False,
          "project": True, "record": (), "throw": True},
     ),
     "simulate_to_accuracy": Call(
         jms.simulate_to_accuracy,
         {"scene": SCENE, **MOTION, "t1": 1.0, "accuracy": 1e-3, "observable": None, "throw": True},
     ),
-    "consistent": Call(jms.consistent, {"scene": SCENE, **MOTION, "t0": 0.0, "hold": ()}),
+    "project_initial_state": Call(jms.project_initial_state, {"scene": SCENE, **MOTION, "t0": 0.0, "hold": ()}),
     "Record": Call(
         jms.Record,
         {"t": T, "measured": T, "inputs": {"u": T}, "name": "r", "linear": ("u",), "noise": 0.1,
@@ -273,8 +273,8 @@ FOUND = [
     ("simulate", "z0", "text", "z0 must be a mapping with names as keys"),
     ("simulate", "throw", "matrix", "throw must be True or False"),
     ("simulate", "max_steps", "huge", "max_steps must be a positive integer, but one of 401 digits"),
-    ("consistent", "q0", "complex array", "q0 must hold real numbers"),
-    ("consistent", "scene", "None", "consistent needs a Scene"),
+    ("project_initial_state", "q0", "complex array", "q0 must hold real numbers"),
+    ("project_initial_state", "scene", "None", "project_initial_state needs a Scene"),
     ("Record", "inputs", "True", "inputs must be a mapping with names as keys"),
     ("Record", "t", "complex array", "column 't' must hold real numbers"),
     ("part", "start", "text", "start must hold real numbers"),

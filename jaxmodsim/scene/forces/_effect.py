@@ -42,6 +42,10 @@ class AbstractEffect(eqx.Module):
     else:
         name: AbstractVar[str | None]
 
+    def bind_state(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> "AbstractEffect":
+        """The effect with its parameters at a state of the mechanism; itself if none of them depends on the state."""
+        return self
+
     @property
     @abc.abstractmethod
     def default_name(self) -> str:
