@@ -264,7 +264,7 @@ def test_functions_that_return_garbage_are_refused_by_name(name: str, kind: str)
 
 # What was an error from deep inside, or was taken, when it was found.
 FOUND = [
-    ("LuGre", "Fc", "huge", "Fc is a number beyond all that a float64 can hold"),
+    ("LuGre", "Fc", "huge", "Fc is too large for float64"),
     ("Coulomb", "Fs", "array of text", "Fs must be a real number"),
     ("Stribeck", "fall", "text", "fall must be a function"),
     ("Friction", "name", "matrix", "Friction name must be a text"),
