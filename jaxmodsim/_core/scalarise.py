@@ -14,8 +14,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from .arrays import fusion_barrier, opaque_one
 from .compat import AVAILABLE, ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
-from .fusion import fusion_barrier, opaque_one
 from .lu import is_known
 
 # Largest number of entries of an array in scalars; tables and look-ups remain whole. 12 coordinates have 144 squares.

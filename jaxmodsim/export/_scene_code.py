@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._core.arguments import as_whole
+from .._core.arrays import PerDof, Scalar
 from .._core.scalarise import trace_in_arrays
-from .._core.shapes import PerDof, Scalar
 from ..scene import Scene, State, check_scene, check_step, elements, scene_step, signals_of, vector_field
 from ._languages import JAVASCRIPT, C, Language, write_program
 from ._program import Symbol, program_of

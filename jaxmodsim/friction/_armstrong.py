@@ -7,9 +7,9 @@ from typing import ClassVar, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._core.arrays import Scalar
 from .._core.functions import nominal
 from .._core.parameters import Number, parameter
-from .._core.shapes import Scalar
 from ._bristles import advance_elastoplastic, slip_fraction
 from ._law import MOST_STICTION, AbstractDynamicLaw, LawCase, Passivity, register_law, stribeck_case
 

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from .._core.arrays import Scalar
 from .._core.functions import nominal
 from .._core.parameters import Number, optional_parameter, parameter
 from .._core.safe import bounded_ratio, decay_mean, magnitude
-from .._core.shapes import Scalar
 from ._law import (
     MOST_STICTION,
     STANDARD,

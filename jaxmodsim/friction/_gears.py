@@ -10,8 +10,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
+from .._core.arrays import Scalar
 from .._core.parameters import Number, NumberOrState, as_number, optional_parameter, parameter, state_parameter
-from .._core.shapes import Scalar
 from ._law import AbstractSetValuedLaw, register_law
 from ._static import Coulomb, exponential, stribeck_power
 

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._core.arrays import PerDof, Scalar
 from .._core.functions import bind_state, is_state_dependent, nominal
 from .._core.parameters import check_ranges, ranges_of
 from .._core.readable import AbstractReadable
-from .._core.shapes import PerDof, Scalar
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractClassVar

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core.arrays import Scalar
 from .._core.functions import nominal
 from .._core.parameters import (
     Number,
@@ -16,7 +17,6 @@ from .._core.parameters import (
     parameter,
     vector_parameter,
 )
-from .._core.shapes import Scalar
 from ._bristles import advance_elastoplastic, slip_fraction, stribeck_curve
 from ._law import STANDARD, AbstractDynamicLaw, LawCase, Passivity, register_law, steady_curve, stribeck_case
 

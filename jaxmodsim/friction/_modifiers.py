@@ -10,9 +10,9 @@ from equinox import AbstractVar
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._core.arguments import as_names
+from .._core.arrays import Scalar
 from .._core.functions import StateDependent, as_state_function
 from .._core.parameters import check_ranges, modules_of, ranges_of
-from .._core.shapes import Scalar
 from ._law import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw, Passivity
 
 _Law = TypeVar("_Law")

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
+from .._core.arrays import Scalar
 from .._core.functions import as_function, real_array
 from .._core.parameters import Number, optional_parameter, parameter
 from .._core.safe import bounded_ratio, safe_power
-from .._core.shapes import Scalar
 from ._law import (
     MOST_STICTION,
     NO_STICTION_IN_MUJOCO,

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, PyTree
 
+from .._core.arrays import Scalar
 from .._core.functions import need_values
-from .._core.shapes import Scalar
 from ._law import AbstractDynamicLaw, AbstractForceLaw, AbstractKarnoppLaw, AbstractLaw, AbstractSetValuedLaw
 from ._wrappers import Regularized
 

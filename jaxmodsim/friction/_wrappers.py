@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, Bool
 
+from .._core.arrays import Scalar
 from .._core.parameters import Number, parameter
 from .._core.safe import bounded_ratio
-from .._core.shapes import Scalar
 from ._law import (
     AbstractForceLaw,
     AbstractKarnoppLaw,

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from .._core.arrays import PerDof, Scalar
 from .._core.cholesky import solve_balanced
 from .._core.functions import as_function
 from .._core.parameters import Default, Range
 from .._core.position import PositionFn, ScalarOrFn, as_position_fn, as_scalar_or_fn
 from .._core.safe import safe_norm
-from .._core.shapes import PerDof, Scalar
 from .._core.trace_checks import check_indices
 
 _MASS, _INERTIA, _GRAVITY = Range("kg", 0.0, strict=True), Range("kg m^2"), Range("m/s^2")

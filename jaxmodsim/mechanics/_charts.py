@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from .._core.arrays import Scalar
 from .._core.functions import as_function
 from .._core.parameters import as_real
 from .._core.safe import safe_norm
-from .._core.shapes import Scalar
 from .._core.trace_checks import check_indices
 
 _Triples: TypeAlias = ArrayLike | Sequence[Any]

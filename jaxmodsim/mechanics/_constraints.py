@@ -18,12 +18,12 @@ from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
 from .._core.arguments import as_label
+from .._core.arrays import PerDof, Scalar
 from .._core.cholesky import factor_positive_definite, solve_balanced
 from .._core.functions import as_function, result_shape
 from .._core.parameters import Number, check_ranges, parameter
 from .._core.position import PositionFn, as_position_fn
 from .._core.safe import safe_norm
-from .._core.shapes import PerDof, Scalar
 from .._core.trace_checks import traced
 
 

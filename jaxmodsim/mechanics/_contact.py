@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._core.arguments import as_label
+from .._core.arrays import PerDof, Scalar
 from .._core.functions import as_function
 from .._core.parameters import Default, Number, Range, check_ranges, parameter, parameter_or
 from .._core.position import PositionFn, ScalarOrFn, as_position_fn, as_scalar_or_fn
 from .._core.safe import safe_power
-from .._core.shapes import PerDof, Scalar
 from ._constraints import AbstractConstraint, AbstractPositionConstraint, as_at
 
 # Newton steps to the speed after an impact; at low speed each of the first steps only halves the error.

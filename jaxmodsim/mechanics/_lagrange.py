@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from .._core.arrays import PerDof, Scalar
 from .._core.cholesky import MAX_UNROLLED_CHOLESKY, solve_positive_definite
 from .._core.scalarise import in_scalars
-from .._core.shapes import PerDof, Scalar
 
 Lagrangian: TypeAlias = Callable[[Any, Array, Array, Any], Array]
 

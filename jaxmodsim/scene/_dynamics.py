@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._core.arrays import PerDof, Scalar
 from .._core.cholesky import factor_positive_definite
 from .._core.functions import depends_on
 from .._core.scalarise import in_scalars
-from .._core.shapes import PerDof, Scalar
 from ..mechanics import (
     Contact,
     LinearizedConstraints,

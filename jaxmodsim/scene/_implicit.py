@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._core.arrays import Scalar
 from .._core.cholesky import factor_positive_definite
 from .._core.monotone import solve_monotone
-from .._core.shapes import Scalar
 from ..friction import Sign
 from ..mechanics import linearize_constraints, motion_equations
 from ._dynamics import Mobility, State

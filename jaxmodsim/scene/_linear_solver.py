@@ -7,11 +7,10 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .._core.fusion import fusion_barrier, opaque_one
+from .._core.arrays import PerDof, Scalar, fusion_barrier, opaque_one
 from .._core.lu import Scalar as Entry
 from .._core.lu import factor_lu, product
 from .._core.scalarise import columns_of, in_scalars
-from .._core.shapes import PerDof, Scalar
 from ..mechanics import inverse_dynamics
 from ._dynamics import State
 from ._scene import Scene

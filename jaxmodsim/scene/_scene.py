@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
+from .._core.arrays import PerDof, Scalar
 from .._core.functions import as_function
 from .._core.parameters import as_real, is_weak
 from .._core.readable import AbstractReadable
-from .._core.shapes import PerDof, Scalar
 from ..friction import AbstractLaw
 from ..mechanics import AbstractConstraint, BoundContact, Contact, Lagrangian, Poisson
 from ._coordinates import as_coordinates, read_label

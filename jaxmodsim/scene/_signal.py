@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.arguments import as_flag, as_reals
+from .._core.arrays import Scalar, after, entry
 from .._core.parameters import as_vector
-from .._core.shapes import Scalar
-from .._core.sorted_times import after, entry
 
 
 def _samples(x: object, *, name: str) -> Float[Array, " n"]:

@@ -20,7 +20,7 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim._core import compat
-from jaxmodsim._core.fusion import opaque_one
+from jaxmodsim._core.arrays import opaque_one
 from jaxmodsim._core.scalarise import columns_of, in_scalars
 from jaxmodsim._core.trace_checks import check_indices, traced
 from jaxmodsim.export._program import program_of

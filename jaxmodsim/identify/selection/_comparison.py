@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from ..._core.device import on_device
+from ..._core.arrays import on_device
 from ..._core.system import jsonable
 from ..estimate._problem import AbstractLoss
 from ..estimate._search import SearchResult, cost_of, weighted_by

@@ -7,7 +7,7 @@ import equinox as eqx
 from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
-from ..._core.shapes import PerDof, Scalar
+from ..._core.arrays import PerDof, Scalar
 
 
 class Action(NamedTuple):

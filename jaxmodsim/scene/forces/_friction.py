@@ -12,11 +12,11 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
 from ..._core.arguments import as_label
+from ..._core.arrays import PerDof, Scalar
 from ..._core.functions import StateDependent, as_function, is_state_dependent, result_shape
 from ..._core.parameters import Default, Number, Range, as_number, check_ranges, modules_of, optional_parameter
 from ..._core.position import PositionFn, as_position_fn
 from ..._core.safe import safe_norm
-from ..._core.shapes import PerDof, Scalar
 from ..._core.trace_checks import traced
 from ...friction import (
     AbstractAsymmetric,
