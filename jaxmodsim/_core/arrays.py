@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import TypeAlias, TypeVar
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
@@ -12,6 +13,14 @@ Scalar: TypeAlias = Float[Array, ""]
 # One number per coordinate.
 PerDof: TypeAlias = Float[Array, " dof"]
 _Tree = TypeVar("_Tree")
+
+
+def is_known(*values: object) -> bool:
+    """Whether JAX traces none of the values."""
+    for value in values:  # noqa: SIM110 - a generator takes three times as long
+        if isinstance(value, jax.core.Tracer):
+            return False
+    return True
 
 
 def on_device(x: ArrayLike | Sequence[ArrayLike]) -> Shaped[Array, "..."]:

@@ -28,8 +28,8 @@ class _Pattern(NamedTuple):
     @classmethod
     def of(cls, rows: _Rows) -> tuple["_Pattern", list[Array]]:
         """The pattern of a matrix, and the list of its unknown entries."""
-        pattern = cls(tuple(tuple(x if is_known(x) else None for x in row) for row in rows))
-        return pattern, [x for row in rows for x in row if not is_known(x)]
+        pattern = cls(tuple(tuple(x if is_constant(x) else None for x in row) for row in rows))
+        return pattern, [x for row in rows for x in row if not is_constant(x)]
 
     def fill(self, unknown: list[Array], known: object = None) -> _Rows:
         """The matrix with these unknown entries; the number `known`, if any, replaces all known entries."""
@@ -46,14 +46,14 @@ class _Shape(NamedTuple):
     pairs: tuple[tuple[int, int], ...]
 
 
-def is_known(x: object) -> bool:
+def is_constant(x: object) -> bool:
     """Whether a number is known while tracing."""
     return isinstance(x, np.generic)
 
 
 def is_zero(x: object) -> bool:
     """Whether a number is known to be zero while tracing."""
-    return is_known(x) and bool(x == 0)
+    return is_constant(x) and bool(x == 0)
 
 
 def product(row: Sequence[_Entry], x: Sequence[Array]) -> Array:
@@ -175,7 +175,7 @@ def _eliminate(table: _Rows, pivot: bool) -> tuple[_Rows, dict[tuple[int, int], 
 
 
 def _choose(condition: Array, a: _Entry, b: _Entry) -> _Entry:
-    return a if is_known(a) and is_known(b) and a == b else jnp.where(condition, a, b)
+    return a if is_constant(a) and is_constant(b) and a == b else jnp.where(condition, a, b)
 
 
 def _reduce(x: _Entry, a: _Entry, b: _Entry) -> _Entry:

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from .arrays import is_known
 from .functions import StateDependent, as_state_function, nominal
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class Range:
         - `ValueError` with `name`, the range and the value.
         """
         limit = None if others is None or not isinstance(self.lower, str) else others[self.lower]
-        if any(isinstance(x, jax.core.Tracer) for x in (value, limit)):
+        if not is_known(value, limit):
             return
         if not np.all(self.holds(np.asarray(value), {} if limit is None else {str(self.lower): np.asarray(limit)})):
             against = "" if limit is None else f" ({self.lower} = {limit})"

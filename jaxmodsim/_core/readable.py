@@ -4,8 +4,9 @@ from functools import singledispatch
 from html import escape
 from typing import NamedTuple
 
-import jax.core
 import numpy as np
+
+from .arrays import is_known
 
 # Lines of a printed table.
 _MOST_ROWS = 22
@@ -60,8 +61,10 @@ class AbstractReadable:
 
 def short(x: object) -> str:
     """Short text for a number or an array of numbers."""
-    if isinstance(x, jax.core.Tracer) or not hasattr(x, "dtype"):
-        return "traced" if isinstance(x, jax.core.Tracer) else str(x)
+    if not is_known(x):
+        return "traced"
+    if not hasattr(x, "dtype"):
+        return str(x)
     array = np.asarray(x)
     if array.ndim == 0 or array.size <= 4:
         return str(np.vectorize(lambda value: f"{value:.6g}", otypes=[object])(array).tolist()).replace("'", "")

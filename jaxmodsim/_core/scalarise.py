@@ -8,15 +8,14 @@ from contextvars import ContextVar
 from typing import Any, TypeAlias
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .arrays import fusion_barrier, opaque_one
+from .arrays import fusion_barrier, is_known, opaque_one
 from .compat import AVAILABLE, ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
-from .lu import is_known
+from .lu import is_constant
 
 # Largest number of entries of an array in scalars; tables and look-ups remain whole. 12 coordinates have 144 squares.
 MAX_ENTRIES = 144
@@ -77,8 +76,7 @@ def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "...
     closed, shapes = trace_in_arrays(fn, *args)
     leaves = [x if hasattr(x, "shape") else jnp.asarray(x) for x in jtu.tree_leaves(args)]
     sizes = [size for size in _sizes(closed.jaxpr) if size <= MAX_ENTRIES]
-    traced = any(isinstance(x, jax.core.Tracer) for x in leaves)
-    if not traced or sum(sizes) > MAX_SCALARS:
+    if is_known(*leaves) or sum(sizes) > MAX_SCALARS:
         return fn(*args)
     if max(sizes, default=0) > 1:
         unit = opaque_one(jax.lax.stop_gradient(jnp.ravel(seed)[0]))
@@ -230,7 +228,7 @@ class AbstractScalars(abc.ABC):
 
     def apply(self, compute: Callable[..., Value], name: str, params: Params, operands: list[Value]) -> Value:
         """One scalar by an operation on scalars, or a known or equal one."""
-        if all(map(is_known, operands)) and name in _KNOWN:
+        if all(map(is_constant, operands)) and name in _KNOWN:
             return np.asarray(_KNOWN[name](params, *operands))[()]
         short = _shorten(name, operands)
         if short is not None:
@@ -238,7 +236,7 @@ class AbstractScalars(abc.ABC):
         key = (
             name,
             str(params),
-            *(np.asarray(x).tobytes() + x.dtype.str.encode() if is_known(x) else id(x) for x in operands),
+            *(np.asarray(x).tobytes() + x.dtype.str.encode() if is_constant(x) else id(x) for x in operands),
         )
         if key not in self.memory:
             # The memory keeps the operands alive, so that their ids remain unique.
@@ -298,27 +296,27 @@ class _Scalars(AbstractScalars):
 
 
 def _constant(x: ArrayLike) -> Value:
-    return x if isinstance(x, jax.core.Tracer) else np.asarray(x)
+    return np.asarray(x) if is_known(x) else x
 
 
 def _shorten(name: str, operands: list[Value]) -> Value | None:
     """Result of a sum, product or quotient with zero or one, or of a trivial choice; otherwise None."""
     if name in ("add", "add_any", "mul"):
         for a, b in (operands, operands[::-1]):
-            if is_known(a) and a == 0:
+            if is_constant(a) and a == 0:
                 return a if name == "mul" else b
-            if is_known(a) and a == 1 and name == "mul":
+            if is_constant(a) and a == 1 and name == "mul":
                 return b
     if name == "select_n":
         chosen, *cases = operands
-        if is_known(chosen):
+        if is_constant(chosen):
             return cases[int(np.asarray(chosen))]
         # Equal known cases: for example, the derivative of |v| by an unrelated variable is zero on both sides.
-        if all(map(is_known, cases)) and all(x == cases[0] for x in cases):
+        if all(map(is_constant, cases)) and all(x == cases[0] for x in cases):
             return cases[0]
-    if name == "div" and is_known(operands[0]) and operands[0] == 0:
+    if name == "div" and is_constant(operands[0]) and operands[0] == 0:
         return operands[0]
-    if name == "sub" and is_known(operands[1]) and operands[1] == 0:
+    if name == "sub" and is_constant(operands[1]) and operands[1] == 0:
         return operands[0]
     return None
 

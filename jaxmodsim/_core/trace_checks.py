@@ -7,13 +7,13 @@ from functools import cache
 from typing import Any, TypeAlias
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.lax import GatherScatterMode
 from jaxtyping import ArrayLike, PyTree
 
+from .arrays import is_known
 from .compat import AVAILABLE, ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from .user_errors import explain
 
@@ -156,7 +156,7 @@ def _follow(closed: ClosedJaxpr | Jaxpr, inputs: Sequence[_Known], name: str) ->
 
 def _constant(value: object) -> np.ndarray | None:
     """The value of integers and booleans; None for tracers and other types."""
-    if isinstance(value, jax.core.Tracer):
+    if not is_known(value):
         return None
     kind = np.dtype(int) if isinstance(value, int) else getattr(value, "dtype", None)
     return np.asarray(value) if isinstance(kind, np.dtype) and kind.kind in "iub" else None

@@ -7,12 +7,11 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from .._core.arrays import PerDof, Scalar
+from .._core.arrays import PerDof, Scalar, is_known
 from .._core.cholesky import solve_balanced
 from .._core.functions import as_function
 from .._core.parameters import Default, Range
@@ -124,7 +123,7 @@ def point_mass(m: Any, position: Any, gravity: Any = _ON_EARTH) -> PointMass:
 
 def _inertia(value: object) -> ScalarOrFn:
     inertia = as_scalar_or_fn(value, name="rigid_body inertia", allowed=_INERTIA, array=True)
-    if callable(inertia.amount) or isinstance(inertia.amount, jax.core.Tracer):
+    if callable(inertia.amount) or not is_known(inertia.amount):
         return inertia
     known = np.asarray(inertia.amount)
     rounding = _ROUNDING * np.abs(known).max(initial=0.0)
@@ -206,7 +205,7 @@ def _moving(position: PositionFn, q: Array, qd: Array, params: PyTree, what: str
 
 def _check_indices(place: PositionFn, q: Array, params: PyTree) -> None:
     """Refuse indices out of range if a body is called directly; a scene checks its whole Lagrangian."""
-    if not isinstance(q, jax.core.Tracer):
+    if is_known(q):
         check_indices(place, q, params, name=place.name)
 
 

@@ -6,13 +6,12 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._core.arguments import as_label
-from .._core.arrays import PerDof, Scalar
+from .._core.arrays import PerDof, Scalar, is_known
 from .._core.functions import as_function
 from .._core.parameters import Default, Number, Range, check_ranges, parameter, parameter_or
 from .._core.position import PositionFn, ScalarOrFn, as_position_fn, as_scalar_or_fn
@@ -277,7 +276,7 @@ def end_stops(
         if limit is not None
     )
     amounts = [limit.amount for _, limit, _, _ in stops]
-    if len(amounts) == 2 and not any(callable(x) or isinstance(x, jax.core.Tracer) for x in amounts):
+    if len(amounts) == 2 and is_known(*amounts) and not any(map(callable, amounts)):
         least, most = (np.asarray(x) for x in amounts)
         if not least < most:
             raise ValueError(

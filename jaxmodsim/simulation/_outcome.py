@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 import diffrax as dfx
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._core.arrays import is_known
 from .._core.cholesky import cholesky_pivots
 from .._core.functions import depends_on
 from .._core.parameters import check_ranges, modules_of, range_checks
@@ -127,7 +127,7 @@ class RunResult(eqx.Module):
 
     def __str__(self) -> str:
         """The sentence."""
-        return "Traced: known outside of jax.jit." if isinstance(self.code, jax.core.Tracer) else self.message
+        return "Traced: known outside of jax.jit." if not is_known(self.code) else self.message
 
     __repr__ = __str__
 

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import diffrax as dfx
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._core.arguments import as_flag, as_mapping, as_names, as_whole, check_real, did_you_mean
+from .._core.arrays import is_known
 from .._core.parameters import is_weak
 from .._core.speed import warn_about_single_precision
 from ..scene import Scene, State, check_step
@@ -180,14 +180,6 @@ def _recorded(record: tuple[str, ...], has_contacts: bool, max_events: int, know
     if "events" in record or (audited and has_contacts):  # what impacts lose is read from the log
         return max_events, audited
     return min(_LOGGED, max_events) if known else 0, audited
-
-
-def is_known(*values: object) -> bool:
-    """Whether none of the values is traced by JAX."""
-    for value in values:  # noqa: SIM110 - a generator takes three times as long
-        if isinstance(value, jax.core.Tracer):
-            return False
-    return True
 
 
 def _array(value: PyTree, dtype: np.dtype) -> Any:

@@ -16,13 +16,14 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, PyTree
 
 from .._core.arguments import as_flag
+from .._core.arrays import is_known
 from .._core.functions import Function
 from .._core.speed import recommend_tuning, warn_about_compilation, warn_about_fixed_steps, warn_about_rounding
 from .._core.user_errors import LastLines
 from ..scene import Scene, State, vector_field
 from ..solvers import Gauss, ImplicitFriction, Rodas5P
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages, violation_code
-from ._run_request import MOST_EVENTS, MOST_STEPS, RunRequest, is_known, run_request
+from ._run_request import MOST_EVENTS, MOST_STEPS, RunRequest, run_request
 from ._solve import RunOutput, compiled_runs, default_solver, solve
 from ._trajectory import Trajectory, trajectory
 

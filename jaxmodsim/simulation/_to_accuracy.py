@@ -15,13 +15,14 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from .._core.arguments import as_flag
+from .._core.arrays import is_known
 from .._core.trace_checks import check_indices
 from ..scene import Scene
 from ._accuracy import Accuracy, Attempt, CostScaling
 from ._evaluations import evaluations_per_step
 from ._observe import named_series
 from ._outcome import SUCCESS, SimulationError, describe_failure
-from ._run_request import MOST_EVENTS, MOST_STEPS, Plugin, RunRequest, is_known, run_request
+from ._run_request import MOST_EVENTS, MOST_STEPS, Plugin, RunRequest, run_request
 from ._solve import RunOutput, default_solver, solve
 from ._trajectory import Trajectory, trajectory
 

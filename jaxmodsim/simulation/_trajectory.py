@@ -14,6 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from .._core.arrays import is_known
 from .._core.compat import get_opaque_trace_state
 from .._core.readable import AbstractReadable, Table, short, table_of
 from ..mechanics import momentum
@@ -24,7 +25,7 @@ from ._columns import Columns, columns
 from ._energy_ledger import EnergyLedger, event_losses, ledger
 from ._integrated_system import Series, Work
 from ._outcome import SUCCESS, RunResult, SimulationError, outcome_messages
-from ._run_request import RunRequest, is_known
+from ._run_request import RunRequest
 from ._solve import RunOutput, solve, solve_start
 
 if TYPE_CHECKING:

@@ -4,10 +4,10 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.core
 import jax.tree_util as jtu
 from jaxtyping import Array
 
+from .._core.arrays import is_known
 from .._core.compat import AVAILABLE, ClosedJaxpr, Literal
 
 
@@ -27,7 +27,7 @@ def without_error_checks(fn: Callable[..., Any], *args: Array | None) -> Any:
     - `fn`: a function of arrays that returns a pytree of arrays. It may close over traced values.
     - `args`: arrays, or None. If none of them is traced, the result is that of the plain call.
     """
-    if "jaxprs" not in AVAILABLE or not any(isinstance(x, jax.core.Tracer) for x in args):
+    if "jaxprs" not in AVAILABLE or is_known(*args):
         return fn(*args)
     closed, shapes = jax.make_jaxpr(fn, return_shape=True)(*args)
     given = jtu.tree_leaves(args)
