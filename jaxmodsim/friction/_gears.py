@@ -14,15 +14,7 @@ from .._core.arrays import Scalar
 from .._core.parameters import Number, NumberOrState, as_number, optional_parameter, parameter, state_parameter
 from ._law import AbstractSetValuedLaw, register_law
 from ._static import Coulomb, exponential, stribeck_power
-
-
-def _set_valued(value: object) -> AbstractSetValuedLaw:
-    if not isinstance(value, AbstractSetValuedLaw):
-        raise ValueError(
-            f"Geared needs a set-valued law such as Coulomb or Stribeck for its part without load, but {value!r} was"
-            " given. For a law with a state use Bristle(Geared(...), h)."
-        )
-    return value
+from ._wrappers import set_valued_law
 
 
 def _per_torque(value: Any) -> AbstractSetValuedLaw:
@@ -61,7 +53,7 @@ class Geared(AbstractSetValuedLaw):
     - `ValueError` if a law is not set-valued, a coefficient is out of range, or `torque` is no function and no number.
     """
 
-    law: AbstractSetValuedLaw = eqx.field(converter=_set_valued)
+    law: AbstractSetValuedLaw = set_valued_law("Geared")
     drive: AbstractSetValuedLaw = eqx.field(converter=_per_torque)
     torque: NumberOrState = state_parameter("Geared torque")
     back: AbstractSetValuedLaw | None = eqx.field(default=None, converter=_unless_none)

@@ -49,17 +49,17 @@ class AbstractWrapper(AbstractLaw):
         return (case._replace(dt=cls.example_step),)
 
 
-def set_valued_law(wrapper: str) -> Any:
-    """Field of a wrapper, for the set-valued law that it runs."""
-    return eqx.field(converter=partial(_need_set_valued, wrapper=wrapper))
+def set_valued_law(owner: str) -> Any:
+    """Field of the law `owner`, for the set-valued law that it contains."""
+    return eqx.field(converter=partial(_need_set_valued, owner=owner))
 
 
-def _need_set_valued(law: object, wrapper: str) -> AbstractSetValuedLaw:
+def _need_set_valued(law: object, owner: str) -> AbstractSetValuedLaw:
     if not isinstance(law, AbstractSetValuedLaw):
-        given = law if isinstance(law, str) else type(law).__name__
+        kind = law if isinstance(law, str) else type(law).__name__
         raise ValueError(
-            f"{wrapper} needs a set-valued law such as Coulomb or Stribeck, but {given!r} was given. A law that is"
-            " a function of velocity or has a state of its own goes into Friction without a wrapper."
+            f"{owner} needs a set-valued law such as Coulomb or Stribeck, but {kind!r} was given. A law that is a"
+            " function of velocity or has a state goes into Friction directly."
         )
     return law
 
