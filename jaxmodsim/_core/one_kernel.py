@@ -78,15 +78,15 @@ def _jvp(primals: Any, tangents: Any, **marks: Any) -> tuple[Any, Any]:
     return value, tangent if isinstance(tangent, ad.Zero) else _mark.bind(tangent, value, **marks)
 
 
-def _transpose(cotangent: Any, *given: Any, result: bool, runs: int) -> list[Any]:
+def _transpose(cotangent: Any, *operands: Any, result: bool, runs: int) -> list[Any]:
     if not isinstance(cotangent, ad.Zero):
-        cotangent = _mark.bind(cotangent, *given[1:], result=not result, runs=runs)
-    return [cotangent] + [None] * len(given[1:])
+        cotangent = _mark.bind(cotangent, *operands[1:], result=not result, runs=runs)
+    return [cotangent] + [None] * len(operands[1:])
 
 
-def _batch(given: Any, axes: Any, *, result: bool, runs: int) -> tuple[Any, Any]:
-    size = next(x.shape[axis] for x, axis in zip(given, axes, strict=True) if axis is not None)
-    return _mark.bind(*given, result=result, runs=runs * size), axes[0]
+def _batch(operands: Any, axes: Any, *, result: bool, runs: int) -> tuple[Any, Any]:
+    size = next(x.shape[axis] for x, axis in zip(operands, axes, strict=True) if axis is not None)
+    return _mark.bind(*operands, result=result, runs=runs * size), axes[0]
 
 
 def _lower(ctx: Any, x: Any, *_: Any, result: bool, runs: int) -> list[Any]:
@@ -190,19 +190,19 @@ def _kind(operation: Any) -> str:
     XLA uses a library for matrix products from 8 x 8 on and for sums of many terms, and several cores for large arrays.
     A scatter to one index is a write of a slice.
     """
-    kind, given = operation.name.removeprefix("stablehlo."), operation.operands
+    kind, operands = operation.name.removeprefix("stablehlo."), operation.operands
     size = max((math.prod(x.type.shape) for x in operation.results), default=0)
     if kind == "scatter":
-        indices = given[(len(given) - 1) // 2].type.shape
+        indices = operands[(len(operands) - 1) // 2].type.shape
         places = re.search(r"index_vector_dim = (\d+)", str(operation.attributes["scatter_dimension_numbers"]))
         vector = int(places[1]) if places else 0
         return "one_scatter" if math.prod(n for i, n in enumerate(indices) if i != vector) == 1 else kind
     if kind == "dot_general":
-        fits = size * math.prod(given[0].type.shape) <= _MOST_PRODUCTS
+        fits = size * math.prod(operands[0].type.shape) <= _MOST_PRODUCTS
     elif kind == "while":
         fits = sum(math.prod(x.type.shape) for x in operation.results) <= _MOST_CARRIED
     elif kind == "reduce":
-        fits = math.prod(given[0].type.shape) <= _MOST_TERMS
+        fits = math.prod(operands[0].type.shape) <= _MOST_TERMS
     else:
         fits = kind in _MOVES or size <= _MOST_ENTRIES
     return kind if fits else f"large {kind}"

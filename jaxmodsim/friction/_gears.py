@@ -237,7 +237,7 @@ class ServoGear(AbstractSetValuedLaw):
 
     def modelica(self) -> str:
         """Modelica's friction components depend on no torques."""
-        return "friction that depends on the torques of motor and load: write its equation in a model of your own"
+        return "friction that depends on the torques of motor and load: write its equation in a custom model"
 
 
 def _or(value: Number | None, other: Number) -> Number:

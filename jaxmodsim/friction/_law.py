@@ -291,7 +291,7 @@ class AbstractKarnoppLaw(AbstractLaw):
 
 
 class AbstractDynamicLaw(AbstractLaw):
-    """A law with a state of its own."""
+    """A law with an internal state."""
 
     @abc.abstractmethod
     def initial_state(self, v: Float[Array, "..."]) -> PyTree:
@@ -321,7 +321,7 @@ class AbstractDynamicLaw(AbstractLaw):
         """Modelica's friction components have no state of their own."""
         return (
             f"state of their own, which {type(self).__name__} has. Export its force in steady slip, as a Stribeck, or"
-            " write its equations in a model of your own"
+            " write its equations in a custom model"
         )
 
 

@@ -206,8 +206,8 @@ def _with_number(old: Array | StateDependent, number: Array | None, name: str) -
     if isinstance(old, StateDependent):
         return StateDependent(_with_number(old.number, number, name), old.fn)
     if number is None or jnp.shape(number) != jnp.shape(old):
-        given = "None" if number is None else f"the shape {jnp.shape(number)}"
-        raise ValueError(f"asymmetric: {name} must have the shape {jnp.shape(old)} for negative slip, but got {given}.")
+        got = "None" if number is None else f"the shape {jnp.shape(number)}"
+        raise ValueError(f"asymmetric: {name} must have the shape {jnp.shape(old)} for negative slip, but got {got}.")
     return number
 
 

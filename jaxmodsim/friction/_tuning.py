@@ -296,7 +296,7 @@ def _refusal(law: AbstractLaw) -> str:
     if isinstance(law, AbstractForceLaw | AbstractSetValuedLaw):
         return (
             f"max_stable_step: the force of {name} jumps at v = 0, where every step chatters. simulate runs Coulomb and"
-            " Stribeck by events, whatever the step; Regularized(law, width) makes them smooth and has a largest step."
+            " Stribeck by events, at any step; Regularized(law, width) is smooth and has a largest stable step."
         )
     if isinstance(law, AbstractKarnoppLaw):
         return (

@@ -192,12 +192,12 @@ def body_rates(turn: Float[Array, "3 3"], rate: Float[Array, "3 3"]) -> Float[Ar
     return 0.5 * jnp.stack([skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]])
 
 
-def _moving(position: PositionFn, q: Array, qd: Array, params: PyTree, what: str) -> tuple[Array, Array]:
+def _moving(position: PositionFn, q: Array, qd: Array, params: PyTree, owner: str) -> tuple[Array, Array]:
     _check_indices(position, q, params)
     x, v = jax.jvp(lambda q: position(q, params), (q,), (qd,))
     if x.shape != (3,):
         raise ValueError(
-            f"{what}: position returned the shape {x.shape}, but (3,) is needed: x, y, z [m], with z upwards. For"
+            f"{owner}: position returned the shape {x.shape}, but (3,) is needed: x, y, z [m], with z upwards. For"
             " horizontal plane motion set z to zero."
         )
     return x, v
