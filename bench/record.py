@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from jaxmodsim._core.provenance import describe_machine
+from jaxmodsim._core.system import describe_machine
 from jaxmodsim._core.timing import measure
 
 # What benches write: the results of one are no change to the next.

@@ -1,7 +1,7 @@
 """Differentiable mechanics with friction: Lagrangians in, motion, figures and fits out.
 
-Scenes: Scene, AppliedForce, Friction, Switch, Signal, AbstractEffect; Constraint, VelocityConstraint, consistent;
-    Contact, with Poisson or HuntCrossley, end_stops, backlash.
+Scenes: Scene, AppliedForce, Friction, Switch, Signal, AbstractEffect; Constraint, VelocityConstraint;
+    Contact, with Poisson or HuntCrossley, end_stops, backlash; project_initial_state.
 Mechanics: point_mass, rigid_body; Chart, Cylindrical, Spherical.
 Friction laws: Viscous, Curve, Coulomb, Stribeck, Dahl, LuGre, ElastoPlastic, MaxwellSlip, Armstrong; in the wrappers
     Regularized, DeadZone, Sign, Bristle; with asymmetric, scaled_by; of gears Geared, ServoGear.
@@ -25,7 +25,7 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 from typing import Any as _Any
 
-from ._core.provenance import versions as _versions
+from ._core.system import versions as _versions
 
 if TYPE_CHECKING:
     from . import metrics as metrics
@@ -102,7 +102,7 @@ if TYPE_CHECKING:
     from .scene import Switch as Switch
     from .simulation import SimulationError as SimulationError
     from .simulation import Trajectory as Trajectory
-    from .simulation import consistent as consistent
+    from .simulation import project_initial_state as project_initial_state
     from .simulation import simulate as simulate
     from .simulation import simulate_to_accuracy as simulate_to_accuracy
     from .solvers import EventController as EventController
@@ -184,7 +184,7 @@ _LATER = {
     "plot": (),
     "problems": (),
     "scene": ("AbstractEffect", "AppliedForce", "Friction", "Scene", "Signal", "Switch"),
-    "simulation": ("SimulationError", "Trajectory", "consistent", "simulate", "simulate_to_accuracy"),
+    "simulation": ("SimulationError", "Trajectory", "project_initial_state", "simulate", "simulate_to_accuracy"),
     "solvers": ("EventController", "EventSolver", "Gauss", "ImplicitFriction", "Rodas5P", "StoredSteps"),
     "sweeps": ("sweep",),
 }

@@ -18,7 +18,7 @@ NAMES: dict[str, Any] = {}
 @pytest.fixture(autouse=True)
 def loud(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING, "jaxmodsim")
-    speed.remark_on_single_precision.cache_clear()
+    speed.warn_about_single_precision.cache_clear()
     if not NAMES:
         block = re.search(r"```python\n(.*?)```", PAGE, re.DOTALL)
         assert block is not None
@@ -49,9 +49,9 @@ def test_a_line_of_the_user_is_named(tmp_path: Path) -> None:
 
 
 def test_a_long_compilation_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
-    speed.remark_on_compilation(2.9, ())
+    speed.warn_about_compilation(2.9, ())
     assert not caplog.records
-    speed.remark_on_compilation(3.1, ())
+    speed.warn_about_compilation(3.1, ())
     assert "Compiling this scene took 3.1 s" in caplog.text
     assert '("jax_compilation_cache_dir", "/path/of/a/folder")' in caplog.text
 
@@ -60,7 +60,7 @@ def test_whoever_keeps_programs_is_not_told_how(caplog: pytest.LogCaptureFixture
     before = jax.config.values["jax_compilation_cache_dir"]
     try:
         jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-        speed.remark_on_compilation(3.1, ())
+        speed.warn_about_compilation(3.1, ())
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
-    assert "compile anew. logging" in caplog.text
+    assert "compiles again. logging" in caplog.text

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import pytest
 
 from jaxmodsim import tune_cpu
-from jaxmodsim._core.speed import recommend_tuning, remark_on_compilation
+from jaxmodsim._core.speed import recommend_tuning, warn_about_compilation
 
 
 def test_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
     jnp.zeros(1).block_until_ready()
     monkeypatch.delenv("XLA_FLAGS", raising=False)
-    with pytest.raises(RuntimeError, match="comes too late: JAX has already started its backend"):
+    with pytest.raises(RuntimeError, match="has no effect, because JAX has already started its backend"):
         tune_cpu()
 
 
@@ -64,11 +64,11 @@ def test_runs_without_it_say_so_once(
 
 def test_what_a_loop_makes_is_told_from_what_shares_a_line(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING, "jaxmodsim")
-    remark_on_compilation(0.0, (lambda: 1, lambda: 2, lambda: 3, lambda: 4))
+    warn_about_compilation(0.0, (lambda: 1, lambda: 2, lambda: 3, lambda: 4))
     assert not caplog.records
     made = [lambda: 1 for _ in range(4)]
     for each in made:
-        remark_on_compilation(0.0, (each,))
+        warn_about_compilation(0.0, (each,))
     assert len(caplog.records) == 1
     assert "test_speed.py:" in caplog.text
     assert "compiled for the third time" in caplog.text

@@ -16,8 +16,8 @@ import numpy as np
 
 import jaxmodsim as jms
 from bench.record import OURS, Call, Result, importable, timed
+from jaxmodsim._core.arrays import fusion_barrier, opaque_one
 from jaxmodsim._core.cholesky import solve_positive_definite
-from jaxmodsim._core.fusion import fusion_barrier, opaque_one
 from jaxmodsim.problems import n_link_pendulum
 from jaxmodsim.scene import State, vector_field
 

@@ -56,10 +56,10 @@ scene = jms.Scene(
 )
 
 # %% [markdown]
-# A start that is only about right: `consistent` moves it to the nearest one that closes the loop.
+# `project_initial_state` moves an approximate start to the nearest state that closes the loop.
 
 # %%
-q0, qd0 = jms.consistent(scene, [0.6, -0.2, 1.0], [12.0, 0.0, 0.0])
+q0, qd0 = jms.project_initial_state(scene, [0.6, -0.2, 1.0], [12.0, 0.0, 0.0])
 run = jms.simulate(scene, q0, qd0, 3.0, ts=jnp.linspace(0.0, 3.0, 601))
 pin = run.reactions["pin"].multiplier
 print(f"{run.result} The pin bears up to {float(jnp.max(jnp.linalg.norm(pin, axis=1))):.0f} N.")

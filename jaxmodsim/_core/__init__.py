@@ -1,1 +1,1 @@
-"""What knows no mechanics: small linear algebra in scalars, what XLA needs, parameters with range and unit, files."""
+"""Infrastructure without mechanics: linear algebra in scalars, compilation, parameters with ranges, errors, files."""

@@ -1,24 +1,23 @@
-"""Linear algebra for the small systems of mechanics, written out in scalars.
+"""Small symmetric systems, written out in scalars: positive definite, or semidefinite with redundant rows.
 
-XLA fuses scalar operations across a whole solver step, but a call into LAPACK in the loop stops it. Systems
-above the sizes given here go to LAPACK, where its own speed pays for the call.
+XLA fuses scalar operations across a whole solver step; a call of LAPACK in the loop prevents that. Larger systems use
+LAPACK, where its speed outweighs the cost of the call.
 """
 
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 MAX_UNROLLED_CHOLESKY = 12
 
 
 def cholesky_pivots(matrix: Float[Array, "n n"]) -> Float[Array, " n"]:
-    """Pivots of the Cholesky factorisation, each divided by the diagonal entry it started from.
+    """Pivots of the Cholesky factorization, each divided by its diagonal entry of the matrix.
 
-    A symmetric matrix is positive definite if and only if every pivot is positive. A ratio near the rounding unit
-    says that the row depends linearly on the ones before it. Pivots after the first one that is not positive are
-    meaningless.
+    A symmetric matrix is positive definite if and only if every pivot is positive. A ratio near the rounding unit means
+    that the row depends linearly on previous rows. Pivots after the first one that is not positive are meaningless.
 
     **Arguments:**
 
@@ -26,8 +25,8 @@ def cholesky_pivots(matrix: Float[Array, "n n"]) -> Float[Array, " n"]:
 
     **Returns:**
 
-    Shape `[n]`, dimensionless: at most 1 where the matrix is positive definite; where the diagonal entry itself
-    is not positive, that entry (so never positive).
+    Shape `[n]`, dimensionless: at most 1 if the matrix is positive definite. For a diagonal entry that is not positive,
+    the result is that entry.
     """
     n = matrix.shape[0]
     rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
@@ -45,10 +44,10 @@ def cholesky_pivots(matrix: Float[Array, "n n"]) -> Float[Array, " n"]:
 
 
 def solve_positive_definite(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Solve a symmetric positive definite system, by L D L^T written out for n <= 12, by Cholesky of LAPACK above.
+    """Solve a symmetric positive definite system, by L D L^T in scalars for n <= 12, by LAPACK's Cholesky above.
 
-    That is Cholesky without roots: alone it takes a third of the time, as a root and a quotient for each pivot wait
-    for each other, and under `jax.vmap` less still, as XLA computes quotients once (see `factor_lu`).
+    L D L^T is Cholesky without roots. A single solution takes a third of the time, because a root and a quotient per
+    pivot depend on each other. Under `jax.vmap` it takes less, because XLA computes quotients once (see `factor_lu`).
 
     **Arguments:**
 
@@ -57,16 +56,15 @@ def solve_positive_definite(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]
 
     **Returns:**
 
-    The solution, shape `[n]`. Where a pivot is negative, NaN (for n = 1 the quotient): callers who must know
-    which row is at fault ask `cholesky_pivots`.
+    The solution, shape `[n]`; NaN if a pivot is negative (for n = 1 the quotient). `cholesky_pivots` finds the row.
     """
     return factor_positive_definite(matrix)(rhs)
 
 
 def factor_positive_definite(matrix: Float[Array, "n n"]) -> Callable[[Array], Array]:
-    """Factor as `solve_positive_definite` does; returns the solver, for one right-hand side `[n]` or several `[n, k]`.
+    """Factor as `solve_positive_definite` does; return a solver for one right-hand side `[n]` or several `[n, k]`.
 
-    Several go through as vectors of length k, which keeps what is traced and compiled small.
+    Several are processed as vectors of length k, which keeps the traced program small.
     """
     n = matrix.shape[0]
     if n == 1:
@@ -95,3 +93,55 @@ def factor_positive_definite(matrix: Float[Array, "n n"]) -> Callable[[Array], A
         return jnp.stack(x)
 
     return solve
+
+
+# Steps of refinement: each multiplies the error of the shift by the shift over the smallest eigenvalue.
+_REFINEMENTS = 2
+
+
+def solve_balanced(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, " n"]:
+    """`solve_semidefinite` with all rows active and with weights that scale every diagonal entry to one."""
+    diagonal = jnp.diagonal(matrix)
+    weight = 1.0 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
+    return solve_semidefinite(matrix, rhs, weight, jnp.ones(rhs.shape, bool))
+
+
+def solve_semidefinite(
+    matrix: Float[Array, "n n"], rhs: Float[Array, " n"], weight: Float[Array, " n"], active: Bool[Array, " n"]
+) -> Float[Array, " n"]:
+    """Solve the active rows of a symmetric positive semidefinite system; if they are redundant, with least norm.
+
+    **Arguments:**
+
+    - `matrix`: shape `[n, n]`.
+    - `rhs`: shape `[n]`, in the range of the matrix.
+    - `weight`: shape `[n]`, > 0: the solution minimizes the sum of `(x_i/weight_i)^2`. Constant under differentiation.
+    - `active`: which rows are active; the unknowns of the others are zero.
+
+    **Returns:**
+
+    The solution, shape `[n]`. It is exact up to rounding if the matrix, scaled by the weights to a largest entry of
+    one, has no eigenvalues between 0 and 1e-4.
+    """
+    n = rhs.shape[0]
+    if n == 1:
+        diagonal = matrix[0]
+        return jnp.where(active, rhs / jnp.where(diagonal > 0, diagonal, jnp.inf), 0.0)
+    weight = jax.lax.stop_gradient(weight)
+    both = active[:, None] & active[None, :]
+    scaled = jnp.where(both, matrix * weight[:, None] * weight[None, :], 0.0)
+    scale = jnp.max(scaled)
+    scale = jnp.where(scale > 0, scale, 1.0)
+    scaled, right = scaled / scale, jnp.where(active, weight * rhs, 0.0) / scale
+    # A shift keeps the factors of redundant rows finite, and selects the solution of least norm. Refinement removes its
+    # error, down to rounding if the rows are not redundant.
+    shift = float(jnp.finfo(rhs.dtype).eps) ** 0.5
+    shifted = scaled + jnp.eye(n, dtype=rhs.dtype) * jnp.where(active, shift, 1.0)[None, :]
+    solve = factor_positive_definite(shifted)
+    solution = solve(right)
+    for _ in range(_REFINEMENTS):
+        solution = solution + solve(right - jnp.sum(scaled * solution[None, :], axis=1))
+    # In the null space of the matrix the solution contains rounding divided by the shift. Two more solves isolate that
+    # part: they scale the other components by (shift/eigenvalue)^2.
+    solution = solution - shift**2 * solve(solve(solution))
+    return jnp.where(active, weight * solution, 0.0)

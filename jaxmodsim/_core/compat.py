@@ -1,9 +1,9 @@
-"""Private interfaces of JAX, jaxlib, equinox, diffrax and Python, each group of them behind a probe.
+"""Private interfaces of JAX, jaxlib, equinox, diffrax and Python, in groups behind probes.
 
 Such interfaces may change with any release. Each group is probed when this module is imported; `AVAILABLE` names the
-groups that are present. Code that needs a missing group takes a path through public interfaces, and one warning names
-the losses. Only `to_c` and `to_javascript` have no such path: they raise an error that names the versions to install.
-The environment variable `JAXMODSIM_PROBES_OFF` switches groups off, as in `kernels,programs` or `all`.
+available groups. Code that needs a missing group uses public interfaces instead, and one warning lists the losses. Only
+`to_c` and `to_javascript` have no alternative: they raise an error with the versions to install. The environment
+variable `JAXMODSIM_PROBES_OFF` disables groups: `kernels,programs`, or `all`.
 """
 
 import logging
@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any, final
 
 import jax
 
-from .provenance import versions
+from .system import versions
 
 AVAILABLE: set[str] = set()
 _OFF = set(os.environ.get("JAXMODSIM_PROBES_OFF", "").split(","))
 _LOSSES: list[str] = []
 
-if not TYPE_CHECKING:  # stand-ins for names that are missing
+if not TYPE_CHECKING:  # substitutes for missing names
     ClosedJaxpr = Jaxpr = JaxprEqn = Literal = Primitive = UndefinedPrimal = jaxpr_as_fun = object
     ad = batching = mlir = ir = stablehlo = eqxi = diffrax_loop = lax_loop = xla_bridge = object
     get_opaque_trace_state = object  # each call returns a new object, so no two states are equal
@@ -38,14 +38,14 @@ def _probe(group: str, loss: str) -> Iterator[None]:
             raise ImportError("switched off")
         AVAILABLE.add(group)
     except (ImportError, AttributeError) as error:
-        globals().update(before)  # a group is present as a whole or not at all
+        globals().update(before)  # a group is available as a whole or not at all
         _LOSSES.append(f"{group} ({error}): {loss}")
 
 
 def _need(owner: object, names: str) -> None:
-    """Raise where an object, or the fields of a class, lack one of these names."""
-    found = {*dir(owner), *getattr(owner, "__annotations__", ())}
-    if missing := sorted(set(names.split()) - found):
+    """Raise if an object, or the fields of a class, lack one of these names."""
+    existing = {*dir(owner), *getattr(owner, "__annotations__", ())}
+    if missing := sorted(set(names.split()) - existing):
         raise AttributeError(f"{getattr(owner, '__name__', owner)} has no {', '.join(missing)}")
 
 
@@ -75,7 +75,7 @@ with _probe("kernels", "single runs and their derivatives take several times as 
     from jaxlib.mlir import ir as ir
     from jaxlib.mlir.dialects import stablehlo as stablehlo
 
-    # If XLA cannot compile a marked call, it ends the process. So only versions that were tested pass.
+    # XLA ends the process if it cannot compile a marked call, so only tested versions pass.
     if jaxlib.version.__version_info__[:2] != (0, 10):
         raise ImportError(f"not tested with jaxlib {jaxlib.version.__version__}")
 
@@ -115,7 +115,7 @@ with _probe("last_line", "the cause of an error inside jax.jit is not repeated a
 
 if _LOSSES:
     logging.getLogger("jaxmodsim").warning(
-        "Private interfaces that make jaxmodsim fast are off with %s. %s.",
+        "Private interfaces that make jaxmodsim fast are disabled with %s. %s.",
         ", ".join(map(" ".join, versions("jax", "equinox", "diffrax").items())),
         ". ".join(_LOSSES),
     )
@@ -133,7 +133,7 @@ def backend_has_started() -> bool:
 
 @final
 class _Hook:
-    """Python calls it with an error that nobody caught."""
+    """Hook that Python calls with an uncaught error."""
 
     def __init__(
         self,
@@ -148,7 +148,7 @@ class _Hook:
 
 
 def after_traceback(say: Callable[[BaseException], None]) -> None:
-    """Call `say` with the error that ends the program, after Python has printed its traceback.
+    """Call `say` with the error that ends the program, after Python's traceback.
 
     Only the first call has an effect.
     """

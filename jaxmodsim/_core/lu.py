@@ -1,4 +1,4 @@
-"""LU factorisation written out in scalars, without the operations on what is known to be zero."""
+"""LU factorization in scalars, which skips operations on known zeros."""
 
 import functools
 import operator
@@ -13,32 +13,32 @@ from jaxtyping import Array, Float, Inexact, PyTree
 
 MAX_UNROLLED_LU = 12
 
-# An array, or one of NumPy's scalars where the number is known while tracing.
+# An array, or a NumPy scalar for a number that is known while tracing.
 Scalar: TypeAlias = Inexact[Array, ""] | np.generic
 LinearSolver: TypeAlias = Callable[[list[Array]], list[Array]]
-_Entry: TypeAlias = Any  # a `Scalar`: type checkers know no arithmetic of `np.generic`
+_Entry: TypeAlias = Any  # a `Scalar`; type checkers know no arithmetic of `np.generic`
 _Rows: TypeAlias = list[list[_Entry]]
 
 
 class _Pattern(NamedTuple):
-    """Rows whose known entries are written here, and whose others (None) are in a list."""
+    """Rows of a matrix with its known entries; None stands for an unknown entry."""
 
     rows: tuple[tuple[_Entry, ...], ...]
 
     @classmethod
     def of(cls, rows: _Rows) -> tuple["_Pattern", list[Array]]:
         """The pattern of a matrix, and the list of its unknown entries."""
-        pattern = cls(tuple(tuple(x if is_known(x) else None for x in row) for row in rows))
-        return pattern, [x for row in rows for x in row if not is_known(x)]
+        pattern = cls(tuple(tuple(x if is_constant(x) else None for x in row) for row in rows))
+        return pattern, [x for row in rows for x in row if not is_constant(x)]
 
     def fill(self, unknown: list[Array], known: object = None) -> _Rows:
-        """The matrix again; with the known entries in it replaced by another number, if one is given."""
+        """The matrix with these unknown entries; the number `known`, if any, replaces all known entries."""
         left = iter(unknown)
         return [[next(left) if x is None else x if known is None else known for x in row] for row in self.rows]
 
 
 class _Shape(NamedTuple):
-    """What is known of a factored matrix while tracing: order of elimination, patterns, and pairs of rows to swap."""
+    """Static data of a factored matrix: order of elimination, patterns, and pairs of rows that may be swapped."""
 
     order: tuple[int, ...]
     matrix: _Pattern
@@ -46,49 +46,49 @@ class _Shape(NamedTuple):
     pairs: tuple[tuple[int, int], ...]
 
 
-def is_known(x: object) -> bool:
+def is_constant(x: object) -> bool:
     """Whether a number is known while tracing."""
     return isinstance(x, np.generic)
 
 
 def is_zero(x: object) -> bool:
     """Whether a number is known to be zero while tracing."""
-    return is_known(x) and bool(x == 0)
+    return is_constant(x) and bool(x == 0)
 
 
 def product(row: Sequence[_Entry], x: Sequence[Array]) -> Array:
-    """Of a row that is not zero and a vector, without the terms that are known to be zero."""
+    """Product of a row that is not zero and a vector, without terms that are known to be zero."""
     terms: list[_Entry] = [a * b for a, b in zip(row, x, strict=True) if not is_zero(a)]
     return functools.reduce(operator.add, terms)
 
 
 def factor_lu(rows: Sequence[Sequence[Scalar]], *, pivot: bool) -> LinearSolver:
-    """LU factorisation written out in scalars; returns the solver of the factored system.
+    """LU factorization in scalars; returns the solver of the factored system.
 
-    Pivoting is a bubble of conditional row swaps, without a branch. Still it costs a factor of 2.7 under `jax.vmap`,
-    because the swapped rows enter so many sums that XLA computes them over and over. Without it the elimination is
-    stable where the symmetric part of the matrix, in some scaling of the unknowns, is positive: so for
-    `I/(gamma dt) - J` of a dissipative system, and of any system whose growing modes the step resolves. Then, too, the
-    unknowns are eliminated in the order that leaves most of the known zeros what they are: of a mechanism first the
-    coordinates, whose rates are the velocities, and the bristles, each of which knows its own velocity alone.
+    Pivoting is a sequence of conditional row swaps without branches. It costs a factor of 2.7 under `jax.vmap`, because
+    XLA recomputes the swapped rows in many sums. Elimination without pivoting is stable if the symmetric part of the
+    matrix is positive in some scaling of the unknowns. This holds for `I/(gamma dt) - J` of a dissipative system, and
+    of any system with growing modes that the step resolves. Without pivoting the order of elimination preserves most
+    known zeros. In a mechanism the first unknowns are the coordinates, whose rates are the velocities, and the
+    bristles, each of which depends on its own velocity alone.
 
-    Quotients are kept as divisions: XLA never recomputes a division in several kernels, as it does sums and
-    products, and that alone is worth a factor of three under `jax.vmap`.
+    Quotients remain divisions: XLA recomputes sums and products in several kernels, but never a division. This saves a
+    factor of three under `jax.vmap`.
 
     **Arguments:**
 
-    - `rows`: the matrix as n rows of n scalars; those known while tracing as NumPy's scalars.
+    - `rows`: the matrix as n rows of n scalars; entries that are known while tracing are NumPy scalars.
     - `pivot`: whether to swap rows so that every pivot is the largest in its column.
 
     **Returns:**
 
     A function from a right-hand side (n scalars) to the solution (n scalars), differentiable in the matrix and the
-    right-hand side. A singular matrix, or without pivoting a zero pivot, gives values that are not finite.
+    right-hand side. For a singular matrix, or for a zero pivot without pivoting, its values are not finite.
     """
     n = len(rows)
     order = tuple(range(n)) if pivot else _order(rows)
-    # The factors stay differentiable although the rule of `_solve` ignores their tangents: transposed in reverse
-    # mode, a solve is plain arithmetic on the factors, and derivatives of that (Hessians) go through the elimination.
+    # The rule of `_solve` ignores tangents of the factors, but they must be differentiable: the transposed solve of
+    # reverse mode is plain arithmetic on the factors, and its derivatives (Hessians) pass through the elimination.
     table, swaps = _eliminate([[rows[i][j] for j in order] for i in order], pivot)
     factors, unknown_factors = _Pattern.of(table)
     matrix, unknown = _Pattern.of([list(row) for row in rows])
@@ -97,9 +97,9 @@ def factor_lu(rows: Sequence[Sequence[Scalar]], *, pivot: bool) -> LinearSolver:
 
 
 def invert(matrix: Float[Array, "n n"], *, pivot: bool) -> Callable[[Array], Array]:
-    """Solver of a system too large to be written out, by the inverse, in a loop of rank-one updates.
+    """Solver of a system that is too large for scalars, by the inverse, in a loop of rank-one updates.
 
-    LAPACK would leave the loop of the steps at every call: 341 us for a step with 18 unknowns, and 47 us by this.
+    A step with 18 unknowns takes 47 us; with LAPACK, whose calls leave the loop over steps, it takes 341 us.
 
     **Arguments:**
 
@@ -108,8 +108,8 @@ def invert(matrix: Float[Array, "n n"], *, pivot: bool) -> Callable[[Array], Arr
 
     **Returns:**
 
-    A function from a right-hand side to the solution, shape `[n]`, differentiable in both. A singular matrix gives
-    values that are not finite.
+    A function from a right-hand side to the solution, shape `[n]`, differentiable in the matrix and the right-hand
+    side. For a singular matrix its values are not finite.
     """
     places = jnp.arange(matrix.shape[0])
 
@@ -124,7 +124,7 @@ def invert(matrix: Float[Array, "n n"], *, pivot: bool) -> Callable[[Array], Arr
         others = jnp.where(here[None, :], 0.0, a) - jnp.where(here, 0.0, a[:, k])[:, None] * row[None, :]
         return jnp.where(here[:, None], row[None, :], others), order
 
-    # Derivatives are those of the solution: none goes through the elimination.
+    # Derivatives are those of the solution; none passes through the elimination.
     inverse, order = jax.lax.fori_loop(0, matrix.shape[0], eliminate, (jax.lax.stop_gradient(matrix), places))
 
     def product(a: Array, x: Array) -> Array:
@@ -139,7 +139,7 @@ def invert(matrix: Float[Array, "n n"], *, pivot: bool) -> Callable[[Array], Arr
 
 
 def _order(rows: Sequence[Sequence[Scalar]]) -> tuple[int, ...]:
-    """Order of elimination: next the unknown whose elimination can fill the fewest zeros (Markowitz 1957)."""
+    """Order of elimination by Markowitz (1957): the next unknown is the one that can fill the fewest zeros."""
     left = set(range(len(rows)))
     across = {i: {j for j in left if j == i or not is_zero(rows[i][j])} for i in left}
     order: list[int] = []
@@ -155,7 +155,7 @@ def _order(rows: Sequence[Sequence[Scalar]]) -> tuple[int, ...]:
 
 
 def _eliminate(table: _Rows, pivot: bool) -> tuple[_Rows, dict[tuple[int, int], Array]]:
-    """Both factors in one table, and for each pair of rows that may have been swapped whether they were."""
+    """Both factors in one table, and the condition for each possible swap of two rows."""
     n, swaps = len(table), {}
     for k in range(n):
         for i in range(k + 1, n if pivot else 0):
@@ -175,7 +175,7 @@ def _eliminate(table: _Rows, pivot: bool) -> tuple[_Rows, dict[tuple[int, int], 
 
 
 def _choose(condition: Array, a: _Entry, b: _Entry) -> _Entry:
-    return a if is_known(a) and is_known(b) and a == b else jnp.where(condition, a, b)
+    return a if is_constant(a) and is_constant(b) and a == b else jnp.where(condition, a, b)
 
 
 def _reduce(x: _Entry, a: _Entry, b: _Entry) -> _Entry:
@@ -203,7 +203,7 @@ def _substitute(table: _Rows, swaps: dict[tuple[int, int], Array], rhs: list[_En
 def _solve(
     shape: _Shape, matrix: list[Array], factors: list[Array], swaps: list[Array], rhs: list[Array]
 ) -> list[Array]:
-    """Solve with factors at hand; the rule below spares the derivative a pass through the elimination."""
+    """Solve with known factors; the rule below keeps derivatives out of the elimination."""
     del matrix
     table = shape.factors.fill(factors)
     y = _substitute(table, dict(zip(shape.pairs, swaps, strict=True)), [rhs[i] for i in shape.order])
@@ -214,7 +214,7 @@ def _solve(
 def _solve_jvp(
     shape: _Shape, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
 ) -> tuple[list[Array], list[Array]]:
-    """A x = b gives A dx = db - dA x."""
+    """From A x = b follows A dx = db - dA x."""
     matrix, factors, swaps, rhs = primals
     matrix_dot, _, _, rhs_dot = tangents
     x = _solve(shape, matrix, factors, swaps, rhs)

@@ -1,8 +1,8 @@
-"""Equations `x = free - A p(x)` with A positive semidefinite and `p` mostly increasing, however steep it is.
+"""Equations `x = free - A p(x)` with A positive semidefinite and `p` mostly increasing, of any steepness.
 
-They are what an implicit step leaves of friction: x the slip velocities, p the impulses, A the mobility. Where p is
-steep at x = 0 and level elsewhere, as friction is, plain Newton steps jump back and forth across it. Here they are kept
-between points where the sign is known, so that the search always ends.
+An implicit step with friction leads to these equations: x are the slip velocities, p the impulses, A the mobility. Like
+friction, p is steep at x = 0 and level elsewhere, so plain Newton steps jump back and forth across zero. A bracket of
+points with known signs limits the steps here, so that the search always ends.
 """
 
 from collections.abc import Callable
@@ -14,22 +14,22 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .lu import MAX_UNROLLED_LU, factor_lu, invert
 
-# Evaluations of one search along a line, and Newton steps of several unknowns.
+# Largest numbers of evaluations in one line search, and of Newton steps for several unknowns.
 _MOST_EVALUATIONS = 200
 _MOST_STEPS = 200
-# Newton steps after which decreasing parts of p are left out of its model.
+# Newton steps after which the model of p ignores decreasing parts.
 _PATIENCE = 15
-# Every so many evaluations the bracket is halved whatever Newton's method says.
+# Period of evaluations that halve the bracket instead of a Newton step.
 _HALVES = 4
-# Rounding units of its terms below which a residual counts as zero, and above which a solution is none.
+# Residual, in rounding units of its terms, below which it counts as zero, and above which the solution is rejected.
 _ROUNDING = 4.0
 _LOST = 1e4
-# Part of its first size below which a residual along a line is small enough for the next Newton step.
+# Fraction of its first value below which the residual of a line search is small enough for the next Newton step.
 _ENOUGH = 0.25
 
 
 class RisingRoot(NamedTuple):
-    """Root `x`, whether it was found to rounding, and how many evaluations that took."""
+    """Root `x`, whether it is exact to rounding, and the number of evaluations."""
 
     x: Float[Array, ""]
     solved: Bool[Array, ""]
@@ -52,17 +52,17 @@ def rising_root(
 ) -> RisingRoot:
     """Root of a function on `x > 0` that is negative at 0 and rises through the root, by Newton steps in a bracket.
 
-    Where a Newton step leaves the bracket the search goes on from its lower end, as functions that rise steeply there
-    and level off lie below their tangent, and Newton steps from that side do not pass the root; or in the middle,
-    geometrically as long as the ends differ by much. Of several roots it is one near `first`, where the function
-    passes from below zero to above. Not differentiable: see `solve_monotone`.
+    If a Newton step leaves the bracket, the search continues from its lower end: functions that rise steeply there and
+    level off lie below their tangent, so Newton steps from that side do not pass the root. Otherwise it continues in
+    the middle, geometrically while the ends differ by a large factor. Of several roots it finds one near `first` where
+    the function changes from negative to positive. Not differentiable, see `solve_monotone`.
 
     **Arguments:**
 
     - `fn`: `fn(x)` -> the value, and the size below which it counts as zero.
-    - `first`: where to begin, >= 0; a root itself if zero.
-    - `above`: where the function is known not to be negative, or infinity.
-    - `least`: the lower end of the bracket to begin with, > 0: as near to 0 as makes no difference.
+    - `first`: start value, >= 0; 0 is a root itself.
+    - `above`: a point where the function is not negative, or infinity.
+    - `least`: initial lower end of the bracket, > 0: negligibly small.
     """
     eps = float(jnp.finfo(first.dtype).eps)
 
@@ -94,7 +94,7 @@ def _between(below: Array, above: Array, least: Array) -> Array:
 
 
 class Monotone(NamedTuple):
-    """Solution `x`, whether it was found, and how many evaluations (one unknown) or Newton steps (several) it took."""
+    """Solution `x`, whether it is valid, and the number of evaluations (one unknown) or Newton steps (several)."""
 
     x: Float[Array, " n"]
     solved: Bool[Array, ""]
@@ -109,16 +109,16 @@ def solve_monotone(
 ) -> Monotone:
     """Solve `x = free - A p(x)`.
 
-    One unknown is found by `rising_root`, several by Newton steps with a search along each, which takes the places
-    where a block vanishes for the kinks that they are in steep equations. Where `p` is not increasing there may be
-    several solutions: it is one near that for constant p.
+    `rising_root` finds one unknown. Several unknowns need Newton steps with line searches, which start between the
+    points where a block vanishes: steep equations have kinks there. If `p` is not increasing there may be several
+    solutions; the result is one near that for constant p.
 
-    Derivatives, forward and reverse, are those of the exact solution by the implicit function theorem; no
-    differentiation runs through the search.
+    Forward and reverse derivatives are those of the exact solution, by the implicit function theorem. They do not pass
+    through the search.
 
     **Arguments:**
 
-    - `fn`: p, of x as a whole; each block of p depends on the same block of x alone.
+    - `fn`: p as a function of x; each block of p depends only on the same block of x.
     - `free`: shape `[n]`.
     - `coupling`: A, symmetric and positive semidefinite, shape `[n, n]`.
     - `blocks`: sizes of the blocks.
@@ -132,7 +132,7 @@ def solve_monotone(
 
     solution = (_solve_one if free.shape[0] == 1 else _solve_several)(value, free0, a, blocks)
     x = jax.lax.stop_gradient(solution.x)
-    # At x = 0 a law may have no derivative; it has one on either side.
+    # A law may have no derivative at x = 0, but it has one on either side.
     aside = jnp.where(x == 0, tiny, x)
     residual = aside - free + _times(coupling, fn(aside))
     slopes = _slopes(value, aside, blocks)[1]
@@ -172,7 +172,7 @@ def _newton(coupling: Array, slopes: Array, residual: Array) -> Array:
 
 
 def _solve_one(fn: Callable[[Array], Array], free: Array, coupling: Array, blocks: tuple[int, ...]) -> Monotone:
-    """Along x from 0 in the direction in which the root lies."""
+    """Search from x = 0 in the direction of the root."""
     del blocks
     eps, tiny = float(jnp.finfo(free.dtype).eps), float(jnp.finfo(free.dtype).tiny)
     free0, a = free[0], coupling[0, 0]
@@ -191,7 +191,7 @@ def _solve_one(fn: Callable[[Array], Array], free: Array, coupling: Array, block
 
 class _RootIterate(NamedTuple):
     x: Array
-    # With `x = free - A push` but for rounding.
+    # `x = free - A push` up to rounding.
     push: Array
     settled: Array
     # Largest residual in rounding units of its terms.
@@ -200,9 +200,9 @@ class _RootIterate(NamedTuple):
 
 
 def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, blocks: tuple[int, ...]) -> Monotone:
-    """Newton steps, each as long as the derivative along it of the energy that x minimises says.
+    """Newton steps with a length from the derivative, along the step, of the energy that x minimizes.
 
-    That derivative is `s.(p(x) - push)`; where p has no potential, or decreases, it still says how far to go.
+    That derivative is `s.(p(x) - push)`. It also determines the length if p has no potential or decreases.
     """
     eps = float(jnp.finfo(free.dtype).eps)
 
@@ -212,7 +212,7 @@ def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, b
         size = jnp.abs(value) + _times(jnp.abs(slopes), jnp.abs(s.x))
         scale = jnp.abs(s.x) + jnp.abs(free) + _times(jnp.abs(coupling), size)
         misfit = jnp.max(jnp.abs(residual) / jnp.where(scale > 0, eps * scale, 1.0))
-        # Where p decreases, Newton steps may run in circles, and those of a model that does not decrease do not.
+        # If p decreases, Newton steps may cycle; those of an increasing model do not.
         slopes = jnp.where(s.tries < _PATIENCE, slopes, _increasing(slopes))
         step = _newton(coupling, slopes, residual)
         change = value - s.push + _times(slopes, step)
@@ -220,12 +220,12 @@ def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, b
         step = jnp.where(descends, step, -residual)
         change = jnp.where(descends, change, value - s.push)
         still = jnp.all(jnp.abs(step) <= eps * jnp.abs(s.x))
-        # By how much p itself rounds is not known: where x is as good as found, it ends with the progress.
+        # The rounding error of p is unknown: close to the solution the search ends when progress stops.
         ends = (misfit <= _LOST) & (misfit >= 0.5 * s.misfit)
         settled = (misfit <= _ROUNDING) | still | ends
         first = jnp.sum(step * (value - s.push))
         length = _length(fn, s.x, s.push, step, change, blocks, first, settled)
-        # Blocks of several unknowns may have no potential, and steps circle there, too, until some are cut short.
+        # Blocks of several unknowns may have no potential; shorter steps then end their cycles.
         short = (s.tries >= 2 * _PATIENCE) & (s.tries % 3 == 0)
         length = jnp.where(settled, 0.0, jnp.where(short, 0.5, 1.0) * length)
         return _RootIterate(s.x + length * step, s.push + length * change, settled, misfit, s.tries + 1)
@@ -238,10 +238,10 @@ def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, b
 
 
 def _increasing(slopes: Array) -> Array:
-    """Slopes without a decreasing part: the diagonal raised until it dominates."""
-    even = 0.5 * (slopes + slopes.T)
-    beside = jnp.sum(jnp.abs(even), axis=1) - jnp.abs(jnp.diagonal(even))
-    return slopes + jnp.diag(jnp.maximum(beside - jnp.diagonal(even), 0.0))
+    """Slopes without a decreasing part: a larger diagonal makes the symmetric part diagonally dominant."""
+    symmetric = 0.5 * (slopes + slopes.T)
+    off_diagonal = jnp.sum(jnp.abs(symmetric), axis=1) - jnp.abs(jnp.diagonal(symmetric))
+    return slopes + jnp.diag(jnp.maximum(off_diagonal - jnp.diagonal(symmetric), 0.0))
 
 
 def _length(
@@ -254,7 +254,7 @@ def _length(
     first: Array,
     settled: Array,
 ) -> Array:
-    """Length of a Newton step, at most 1, along which the derivative begins with `first` < 0; 1 where `settled`."""
+    """Length of a Newton step, at most 1; the derivative along it begins with `first` < 0. 1 if `settled`."""
 
     def along(length: ArrayLike) -> Array:
         return jnp.sum(step * (fn(x + length * step) - push - length * change))

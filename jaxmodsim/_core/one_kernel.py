@@ -1,4 +1,4 @@
-"""A function that XLA compiles, on CPU, as one kernel."""
+"""Compilation of a function as one kernel of XLA on CPU."""
 
 import math
 import re
@@ -12,15 +12,15 @@ from .compat import AVAILABLE, Primitive, ad, batching, ir, mlir
 from .compat import stablehlo as hlo
 
 _Tree = TypeVar("_Tree")
-# A kernel runs on one core, and its arrays shall fit the cache of that core.
+# A kernel runs on one core, and its arrays should fit into the cache of that core.
 _MOST_AT_ONCE = 64
-# Entries of the first factor times those of the product, terms of a sum, entries of other results.
+# Largest numbers of entries of the first factor times those of the product, of terms of a sum, of entries otherwise.
 _MOST_PRODUCTS, _MOST_TERMS, _MOST_ENTRIES = 256, 1000, 100_000
-# Entries that a loop hands on. A kernel has one buffer for all it computes, and one above 32 MB comes fresh from the
-# system at every call: belt oscillator, gradient with room for 200 000 and 262 144 steps: 4.8 and 20 ms; not in one
-# kernel 3 ms.
+# Largest number of entries of a loop state. A kernel has one buffer for all its values, and the system allocates a
+# buffer above 32 MB at every call. Gradient of the belt oscillator with memory for 200 000 steps 4.8 ms, for 262 144
+# steps 20 ms; in several kernels 3 ms.
 _MOST_CARRIED = 4_000_000
-# What XLA's emitter of whole functions holds. Anything else needs the services of a run: LAPACK, callbacks, threads.
+# Operations that XLA can emit in one function. Others need the services of a run: LAPACK, callbacks, threads.
 _HOLDS = frozenset(
     """
     abs add and atan2 bitcast_convert broadcast_in_dim case cbrt ceil clamp compare concatenate constant convert cosine
@@ -32,17 +32,17 @@ _HOLDS = frozenset(
     chlo.is_neg_inf chlo.is_pos_inf chlo.lgamma chlo.next_after chlo.sinh chlo.square chlo.tan
     """.split()  # noqa: SIM905 - a list has a line for each
 )
-# Those that make or hand on the buffers of a run, of whatever size.
+# Operations that create or move buffers, of any size.
 _MOVES = {"broadcast_in_dim", "case", "constant", "dynamic_slice", "dynamic_update_slice", "if", "reshape"}
 
 
 def in_one_kernel(function: Callable[..., _Tree], *args: Any) -> _Tree:
-    """The result of `function(*args)`, and its derivatives, computed in one kernel each where XLA runs on CPU.
+    """Evaluate `function(*args)` in one kernel on CPU, and each of its derivatives in another.
 
-    XLA on CPU makes a kernel of every few operations, compiles each by itself, and calls one after the other. A call
-    takes 0.1 us, far more than the few numbers of a mechanical system. A call with the attribute `xla_cpu_small_call`,
-    which XLA gives to small loops, becomes one kernel, loops and all. On other platforms, with more than 64 runs side
-    by side, and with operations that such a kernel cannot hold, all stays as it is.
+    XLA on CPU compiles a separate kernel for every few operations, and calls one after another. A call takes 0.1 us,
+    far more than the arithmetic of a mechanical system. A call with the attribute `xla_cpu_small_call`, which XLA gives
+    to small loops, becomes one kernel, loops included. The function has no effect on other platforms, with more than 64
+    runs in a batch, and for operations that such a kernel does not support.
 
     **Arguments:**
 
@@ -56,11 +56,11 @@ def in_one_kernel(function: Callable[..., _Tree], *args: Any) -> _Tree:
 
 
 def _marker() -> Any:
-    """An identity on what goes into the call and on what comes out.
+    """An identity on the arguments and results of the call.
 
-    Its lowering sees the call that a value comes from. What comes out of the call of a derivative in reverse mode is
-    the cotangent of what went in. A tangent keeps the value beside it, so that the mark of the run is not dropped where
-    only the derivative is asked for.
+    Its lowering inspects the call that computes a value. The results of a derivative in reverse mode are the cotangents
+    of the arguments. A tangent carries its value, so that JAX keeps the mark of the run even if only the derivative is
+    used.
     """
     mark = Primitive("mark_one_kernel")
     mark.def_impl(lambda x, *_, **__: x)
@@ -78,19 +78,19 @@ def _jvp(primals: Any, tangents: Any, **marks: Any) -> tuple[Any, Any]:
     return value, tangent if isinstance(tangent, ad.Zero) else _mark.bind(tangent, value, **marks)
 
 
-def _transpose(cotangent: Any, *given: Any, result: bool, runs: int) -> list[Any]:
+def _transpose(cotangent: Any, *operands: Any, result: bool, runs: int) -> list[Any]:
     if not isinstance(cotangent, ad.Zero):
-        cotangent = _mark.bind(cotangent, *given[1:], result=not result, runs=runs)
-    return [cotangent] + [None] * len(given[1:])
+        cotangent = _mark.bind(cotangent, *operands[1:], result=not result, runs=runs)
+    return [cotangent] + [None] * len(operands[1:])
 
 
-def _batch(given: Any, axes: Any, *, result: bool, runs: int) -> tuple[Any, Any]:
-    size = next(x.shape[axis] for x, axis in zip(given, axes, strict=True) if axis is not None)
-    return _mark.bind(*given, result=result, runs=runs * size), axes[0]
+def _batch(operands: Any, axes: Any, *, result: bool, runs: int) -> tuple[Any, Any]:
+    size = next(x.shape[axis] for x, axis in zip(operands, axes, strict=True) if axis is not None)
+    return _mark.bind(*operands, result=result, runs=runs * size), axes[0]
 
 
 def _lower(ctx: Any, x: Any, *_: Any, result: bool, runs: int) -> list[Any]:
-    call = getattr(x.owner, "operation", None)  # of an argument it is a block, which is none
+    call = getattr(x.owner, "operation", None)  # the owner of an argument is a block without operation
     alone = getattr(ctx.module_context.axis_context, "num_devices", None) in (None, 1)
     if result and runs <= _MOST_AT_ONCE and alone and call is not None and call.name == "func.call":
         _mark_call(ctx, call)
@@ -98,20 +98,20 @@ def _lower(ctx: Any, x: Any, *_: Any, result: bool, runs: int) -> list[Any]:
 
 
 def _mark_call(ctx: Any, call: Any) -> None:
-    """Give the call its attribute, and a function of its own that needs all its arguments."""
+    """Set the attribute of the call, and call a copy of the function that uses all its arguments."""
     functions = ctx.module_context.symbol_table
     function = functions[_callee(call)].operation
     block = function.regions[0].blocks[0]
     if "mhlo.frontend_attributes" in call.attributes:
-        return  # marked already, by another of its results
+        return  # already marked by another result
     ending = block.operations[len(block.operations) - 1].operation
-    given, results = ([x for x in values if _size(x)] for values in (block.arguments, ending.operands))
-    if not given or not results or any(isinstance(x.type.element_type, ir.ComplexType) for x in [*given, *results]):
+    inputs, results = ([x for x in values if _size(x)] for values in (block.arguments, ending.operands))
+    if not inputs or not results or any(isinstance(x.type.element_type, ir.ComplexType) for x in [*inputs, *results]):
         return
     if not all(kind in _HOLDS for kind in _operations(functions, function, set())):
         return
     with ir.InsertionPoint(call):
-        # Else XLA replaces an argument that is known by its number inside of the function, where nothing uses it then.
+        # Without a barrier XLA substitutes a constant argument inside the function, which then leaves it unused.
         for i, x in enumerate(call.operands):
             call.operands[i] = hlo.optimization_barrier([x])
     with ir.InsertionPoint(function):
@@ -122,16 +122,17 @@ def _mark_call(ctx: Any, call: Any) -> None:
     call.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(attributes)
     block = own.regions[0].blocks[0]
     ending = block.operations[len(block.operations) - 1].operation
-    # Arrays of no entries take part in nothing.
+    # Empty arrays are not computed.
     smallest = min((i for i, x in enumerate(ending.operands) if _size(x)), key=lambda i: _size(ending.operands[i]))
     with ir.InsertionPoint(ending):
         ending.operands[smallest] = _needing(ending.operands[smallest], [x for x in block.arguments if _size(x)])
 
 
 def _needing(x: Any, all_of: list[Any]) -> Any:
-    """`x`, computed with all the others: XLA ends the process over an argument of such a call that nothing uses.
+    """`x`, computed with all other arguments: XLA ends the process if such a call has an unused argument.
 
-    Of any integer n, n (n + 1) is even: its last bit, which is zero, changes no bit of `x`, but XLA does not know.
+    For any integer n the product n (n + 1) is even. Its last bit is zero and changes no bit of `x`, but XLA does not
+    know that.
     """
     number = reduce(hlo.add, map(_any_number, all_of))
     number_type = ir.RankedTensorType.get([], ir.IntegerType.get_signless(32))
@@ -152,7 +153,7 @@ def _bits(x: Any) -> Any:
 
 
 def _any_number(x: Any) -> Any:
-    """An integer made of the first entry."""
+    """An integer from the first entry."""
     lowest, highest, steps = (mlir.dense_int_array([n] * len(x.type.shape)) for n in (0, 1, 1))
     entry = hlo.slice(x, lowest, highest, steps)
     entry = _bits(hlo.reshape(ir.RankedTensorType.get([], x.type.element_type), entry))
@@ -168,7 +169,7 @@ def _callee(call: Any) -> str:
 
 
 def _operations(functions: Any, function: Any, seen: set[str]) -> Iterator[str]:
-    """Kinds of the operations in a function, and in those it calls."""
+    """Kinds of the operations in a function and in the functions that it calls."""
     todo = [function]
     while todo:
         for region in todo.pop().regions:
@@ -184,24 +185,24 @@ def _operations(functions: Any, function: Any, seen: set[str]) -> Iterator[str]:
 
 
 def _kind(operation: Any) -> str:
-    """Name of an operation without its dialect; of one that is too large for the kernel, a name that it does not hold.
+    """Name of an operation without its dialect; a name outside `_HOLDS` if the operation is too large for the kernel.
 
-    XLA leaves products of matrices from 8 x 8 on and sums of many terms to a library; arithmetic of large arrays is for
-    several cores. A scatter to one place is a slice that is written.
+    XLA uses a library for matrix products from 8 x 8 on and for sums of many terms, and several cores for large arrays.
+    A scatter to one index is a write of a slice.
     """
-    kind, given = operation.name.removeprefix("stablehlo."), operation.operands
+    kind, operands = operation.name.removeprefix("stablehlo."), operation.operands
     size = max((math.prod(x.type.shape) for x in operation.results), default=0)
     if kind == "scatter":
-        indices = given[(len(given) - 1) // 2].type.shape
+        indices = operands[(len(operands) - 1) // 2].type.shape
         places = re.search(r"index_vector_dim = (\d+)", str(operation.attributes["scatter_dimension_numbers"]))
         vector = int(places[1]) if places else 0
         return "one_scatter" if math.prod(n for i, n in enumerate(indices) if i != vector) == 1 else kind
     if kind == "dot_general":
-        fits = size * math.prod(given[0].type.shape) <= _MOST_PRODUCTS
+        fits = size * math.prod(operands[0].type.shape) <= _MOST_PRODUCTS
     elif kind == "while":
         fits = sum(math.prod(x.type.shape) for x in operation.results) <= _MOST_CARRIED
     elif kind == "reduce":
-        fits = math.prod(given[0].type.shape) <= _MOST_TERMS
+        fits = math.prod(operands[0].type.shape) <= _MOST_TERMS
     else:
         fits = kind in _MOVES or size <= _MOST_ENTRIES
     return kind if fits else f"large {kind}"

@@ -1,4 +1,4 @@
-"""Numbers of a scene: how they are converted, in which range they are allowed, and how both are reported."""
+"""Numbers of a scene: their conversion, admissible ranges and error messages."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .state_dependent import StateDependent, as_state_function, nominal
+from .arrays import is_known
+from .functions import StateDependent, as_state_function, nominal
 
 if TYPE_CHECKING:
-    Number: TypeAlias = Any  # a plain number in the call: type checkers do not see the converter of `parameter`
+    Number: TypeAlias = Any  # callers pass plain numbers; type checkers ignore the converter of `parameter`
     Vector: TypeAlias = Any
-    NumberOrState: TypeAlias = Any  # a number, or what has one at a state of the mechanism
+    NumberOrState: TypeAlias = Any  # a number, or a function of the state
 else:
     Number: TypeAlias = Float[Array, ""]
     Vector: TypeAlias = Float[Array, " n"]
@@ -26,26 +26,26 @@ _Numbers: TypeAlias = Float[Array | np.ndarray, "..."]
 
 
 class Default(float):
-    """A number that was left out: it takes the floating type of the numbers beside it."""
+    """A default value, which takes the floating type of the other numbers."""
 
 
 def is_weak(number: object) -> bool:
-    """Whether JAX lets the type of a number give way to that of others."""
+    """Whether the type of a number is weak: JAX converts it to the type of other numbers."""
     return getattr(number, "weak_type", isinstance(number, float))
 
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """Admissible range and unit of a parameter: above (or at) a number, or another parameter, and below a number.
+    """Admissible range and unit of a parameter.
 
     **Arguments:**
 
     - `unit`: SI unit, as printed.
-    - `lower`: lower limit; a string names another parameter of the same object; None for no limit.
-    - `strict`: whether the lower limit itself is excluded.
+    - `lower`: lower limit, a number or the name of another parameter of the same object; None for no limit.
+    - `strict`: whether the lower limit is excluded.
     - `upper`: upper limit, included; None for no limit.
-    - `most`: a fit looks no further than this many times the parameter that `lower` names; None for no limit.
-    - `execution`: whether the parameter says how a law is run and not what it is; a fit leaves it alone by itself.
+    - `most`: upper limit in a fit, as a multiple of the parameter that `lower` names; None for no limit.
+    - `execution`: whether the parameter belongs to the numerical method and not to the law; by default a fit keeps it.
     """
 
     unit: str
@@ -57,7 +57,7 @@ class Range:
 
     @property
     def text(self) -> str:
-        """The range in words, such as `> 0 N/m`."""
+        """The range as text, such as `finite and > 0 [N/m]`."""
         unit = f" [{self.unit}]" if self.unit else ""
         if self.lower is None and self.upper is None:
             return f"a finite number{unit}"
@@ -69,7 +69,7 @@ class Range:
     def holds(self, value: _Numbers, others: Mapping[str, _Numbers]) -> Bool[Array | np.ndarray | np.bool_, "..."]:
         """Whether `value` is in range, elementwise; `others` are the parameters of the same object by name.
 
-        Without JAX where the value is of NumPy.
+        NumPy evaluates a NumPy array, without JAX.
         """
         finite = np.isfinite(value) if isinstance(value, np.ndarray) else jnp.isfinite(value)
         if self.upper is not None:
@@ -80,14 +80,14 @@ class Range:
         return finite & ((value > lower) if self.strict else (value >= lower))
 
     def check(self, value: _Numbers, *, name: str, others: Mapping[str, _Numbers] | None = None) -> None:
-        """Refuse numbers out of range, where they are known now (not traced); `others` as in `holds`.
+        """Refuse numbers out of range unless they are traced; `others` as in `holds`.
 
         **Raises:**
 
-        - `ValueError` that names `name`, the range and the value.
+        - `ValueError` with `name`, the range and the value.
         """
         limit = None if others is None or not isinstance(self.lower, str) else others[self.lower]
-        if any(isinstance(x, jax.core.Tracer) for x in (value, limit)):
+        if not is_known(value, limit):
             return
         if not np.all(self.holds(np.asarray(value), {} if limit is None else {str(self.lower): np.asarray(limit)})):
             against = "" if limit is None else f" ({self.lower} = {limit})"
@@ -95,11 +95,11 @@ class Range:
 
 
 def as_number(value: object, *, name: str) -> Float[Array, ""]:
-    """Convert to a real floating scalar; integers become floating, a dtype that is given is kept.
+    """Convert to a real floating scalar; integers are converted, floating types are kept.
 
     **Raises:**
 
-    - `ValueError` naming `name`, what was given and what is needed.
+    - `ValueError` with `name`, the value and the requirement.
     """
     array = as_real(value, name=name)
     if array.shape != ():
@@ -111,7 +111,7 @@ def as_number(value: object, *, name: str) -> Float[Array, ""]:
 
 
 def as_real(value: object, *, name: str) -> Float[Array, "..."]:
-    """Convert to a real floating array of any shape; see `as_number`. Of a `Default` the type stays weak."""
+    """Convert to a real floating array of any shape; see `as_number`. The type of a `Default` remains weak."""
     if isinstance(value, Default):
         return jnp.asarray(float(value))
     if isinstance(value, jax.Array | np.ndarray | np.number | int | float) and not isinstance(value, bool):
@@ -122,9 +122,9 @@ def as_real(value: object, *, name: str) -> Float[Array, "..."]:
             try:
                 return jnp.asarray(value, dtype=dtype)  # a stated dtype also makes a weak type strong
             except OverflowError as error:
-                raise ValueError(f"{name} is a number beyond all that a {dtype} can hold.") from error
-    given = value if isinstance(value, str | bool) else getattr(value, "dtype", type(value).__name__)
-    raise ValueError(f"{name} must be a real number or an array of real numbers, but {given!r} was given.")
+                raise ValueError(f"{name} is too large for {dtype}.") from error
+    kind = value if isinstance(value, str | bool) else getattr(value, "dtype", type(value).__name__)
+    raise ValueError(f"{name} must be a real number or an array of real numbers, but {kind!r} was given.")
 
 
 def as_vector(value: object, *, name: str) -> Float[Array, " n"]:
@@ -132,13 +132,13 @@ def as_vector(value: object, *, name: str) -> Float[Array, " n"]:
 
     **Raises:**
 
-    - `ValueError` naming `name`, what was given and what is needed.
+    - `ValueError` with `name`, the value and the requirement.
     """
     if isinstance(value, list | tuple):
         value = jnp.stack([as_number(x, name=name) for x in value]) if value else jnp.zeros(0)
     array = as_real(value, name=name)
     if array.ndim > 1 or array.size == 0:
-        raise ValueError(f"{name} has shape {array.shape}, but numbers in a row, shape [n], are needed.")
+        raise ValueError(f"{name} has shape {array.shape}, but a vector of numbers, shape [n], is needed.")
     return jnp.reshape(array, (-1,))
 
 
@@ -153,7 +153,7 @@ def parameter(
     most: float | None = None,
     **field: Any,
 ) -> Any:
-    """Dataclass field of an `eqx.Module` that holds one number with a unit and an admissible range.
+    """Dataclass field of an `eqx.Module` for one number with a unit and an admissible range.
 
     **Arguments:**
 
@@ -168,7 +168,7 @@ def parameter(
 
 
 def parameter_or(name: str, unit: str, instead: tuple[type, ...], *, lower: float, upper: float, default: float) -> Any:
-    """A `parameter` in whose place an object of the types `instead` may stand, with parameters of its own."""
+    """A `parameter` that may also be an object of the types `instead`, with its own parameters."""
     convert = partial(_unless_instance, instead=instead, name=name)
     return eqx.field(converter=convert, metadata={"range": Range(unit, lower, upper=upper)}, default=Default(default))
 
@@ -180,7 +180,7 @@ def _unless_instance(value: object, *, instead: tuple[type, ...], name: str) -> 
 def optional_parameter(
     name: str, unit: str, *, lower: float | str | None = None, strict: bool = False, most: float | None = None
 ) -> Any:
-    """A `parameter` that may be left out, and then is None."""
+    """A `parameter` with the default None."""
     convert = partial(_unless_none, convert=as_number, name=name)
     return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower, strict, most=most)})
 
@@ -191,13 +191,13 @@ def vector_parameter(name: str, unit: str, *, lower: float | str | None = None, 
 
 
 def optional_vector_parameter(name: str, unit: str, *, lower: float | str | None = None) -> Any:
-    """A `vector_parameter` that may be left out, and then is None."""
+    """A `vector_parameter` with the default None."""
     convert = partial(_unless_none, convert=as_vector, name=name)
     return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower)})
 
 
 def state_parameter(name: str) -> Any:
-    """Field that holds a function of the mechanism's state, of either sign, or a number where it is constant."""
+    """Field for a function of the mechanism's state, of either sign, or a constant number."""
     return eqx.field(converter=partial(_of_state, name=name))
 
 
@@ -216,7 +216,7 @@ def _unless_none(value: object, *, convert: Callable[..., object], name: str) ->
 
 
 def ranges_of(module: eqx.Module) -> dict[str, Range]:
-    """Ranges of the parameters that `module` holds, by name; one that is not a number has none."""
+    """Ranges of the parameters of `module` that are numbers, by name."""
     return {
         f.name: f.metadata["range"]
         for f in dataclasses.fields(module)
@@ -225,7 +225,7 @@ def ranges_of(module: eqx.Module) -> dict[str, Range]:
 
 
 def range_checks(module: eqx.Module) -> list[tuple[str, Array]]:
-    """For each parameter of `module`: the sentence that says what is needed, and whether that holds."""
+    """For each parameter of `module`: the requirement as a sentence, and whether it holds."""
     values = {name: nominal(getattr(module, name)) for name in ranges_of(module)}
     owner = type(module).__name__
     return [
@@ -235,11 +235,11 @@ def range_checks(module: eqx.Module) -> list[tuple[str, Array]]:
 
 
 def check_ranges(module: eqx.Module) -> None:
-    """Check the parameters of `module` that are known now (not being traced).
+    """Check the parameters of `module` that are not traced.
 
     **Raises:**
 
-    - `ValueError` naming the parameter, its range and the value given.
+    - `ValueError` with the parameter, its range and the value.
     """
     values = {name: nominal(getattr(module, name)) for name in ranges_of(module)}
     for name, allowed in ranges_of(module).items():
@@ -247,9 +247,9 @@ def check_ranges(module: eqx.Module) -> None:
 
 
 def modules_of(tree: object, path: str = "") -> Iterator[tuple[str, eqx.Module]]:
-    """Every `eqx.Module` inside `tree` (itself included), with its path such as `.effects[0].law`.
+    """Every `eqx.Module` inside `tree`, itself included, with its path such as `.effects[0].law`.
 
-    And those that a module says it implies by a property `implied`: modules by name, made from its fields.
+    The property `implied` of a module adds modules by name, which it builds from its fields.
     """
     if isinstance(tree, eqx.Module):
         yield path, tree

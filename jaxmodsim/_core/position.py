@@ -1,4 +1,4 @@
-"""Functions of the coordinates that may also ask for the parameters."""
+"""Functions of the coordinates and of the parameters, as parts of pytrees."""
 
 import inspect
 from collections.abc import Callable
@@ -13,42 +13,42 @@ from .parameters import Range, as_number, as_real
 
 
 class PositionFn(eqx.Module):
-    """A function `place(q)` or `place(q, params)`, called as the latter."""
+    """A function `place(q)` or `place(q, params)`; the call takes both arguments."""
 
     place: Callable[..., ArrayLike]
     with_params: bool = eqx.field(static=True)
     name: str = eqx.field(static=True)
 
     def __call__(self, q: Float[Array, " dof"], params: PyTree) -> Array:
-        """What the function gives."""
+        """The result of the function, of floating type."""
         value = real_array(self.place(q, params) if self.with_params else self.place(q), name=self.name)
         return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(q.dtype)
 
 
 def as_position_fn(value: Any, *, name: str) -> PositionFn:
-    """Make a function of `q`, or of `q` and `params`, fit to sit in a pytree.
+    """Convert a function of `q`, or of `q` and `params`, to part of a pytree.
 
-    Which of the two it is follows from the arguments without a default that it takes.
+    The number of its arguments without a default distinguishes the two.
 
     **Raises:**
 
-    - `ValueError` if `value` cannot be called, or takes neither one nor two arguments.
+    - `ValueError` if `value` is not callable, or needs more than two arguments.
     """
     if isinstance(value, PositionFn):
         return value
     function = as_function(value, name=name)
     try:
-        taken = inspect.signature(value).parameters.values()
-    except (TypeError, ValueError):  # a function written in C does not say
+        arguments = inspect.signature(value).parameters.values()
+    except (TypeError, ValueError):  # functions in C have no signature
         return PositionFn(function, False, name)
-    needed = [x for x in taken if x.default is x.empty and x.kind in (x.POSITIONAL_ONLY, x.POSITIONAL_OR_KEYWORD)]
+    needed = [x for x in arguments if x.default is x.empty and x.kind in (x.POSITIONAL_ONLY, x.POSITIONAL_OR_KEYWORD)]
     if len(needed) > 2:
         raise ValueError(f"{name} must be a function of q, or of q and params, but it takes {len(needed)} arguments.")
     return PositionFn(function, len(needed) == 2, name)
 
 
 class ScalarOrFn(eqx.Module):
-    """A number, or a function of the parameters that returns one."""
+    """A number, or a function `amount(params)` that returns one."""
 
     amount: Callable[..., ArrayLike] | Array
 
@@ -58,11 +58,11 @@ class ScalarOrFn(eqx.Module):
 
 
 def as_scalar_or_fn(value: object, *, name: str, allowed: Range, array: bool = False) -> ScalarOrFn:
-    """Make a number, or a function of `params`, fit to sit in a pytree; with `array` also an array of numbers.
+    """Convert a number, or a function of `params`, to part of a pytree; with `array` also an array of numbers.
 
     **Raises:**
 
-    - `ValueError` if it is none of these, or a number out of the range `allowed`.
+    - `ValueError` for other types, or if a number is out of the range `allowed`.
     """
     if isinstance(value, ScalarOrFn):
         return value

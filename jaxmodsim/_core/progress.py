@@ -1,4 +1,4 @@
-"""One line of text that says how far something has come: the same in a terminal, a notebook and a command."""
+"""A line that reports progress in a terminal, a notebook or a command."""
 
 import shutil
 import sys
@@ -10,31 +10,31 @@ from typing import ParamSpec
 
 P = ParamSpec("P")
 
-# The line is written again after so many seconds, for the time in it.
+# Interval of updates, which show the elapsed time [s].
 _EVERY = 1.0
 
 
 @contextmanager
 def reported(
-    progress: bool | Callable[P, None], title: str, words: Callable[P, str]
+    progress: bool | Callable[P, None], title: str, text_of: Callable[P, str]
 ) -> Iterator[Callable[P, None] | None]:
-    """What is called as something goes on: a function that was given, one that shows a line, or None.
+    """The callback of an argument `progress`: a function of the user, one that shows a line, or None.
 
     **Arguments:**
 
-    - `progress`: what the user gave: a function, True for the line, False for nothing.
-    - `title`: begins the line.
-    - `words`: text of the line from what a function would be called with.
+    - `progress`: a function, True for the line, or False for no report.
+    - `title`: start of the line.
+    - `text_of`: text of the line from the arguments of the callback.
 
     **Raises:**
 
-    - `ValueError` if `progress` is something else.
+    - `ValueError` for other values of `progress`.
     """
     if callable(progress):
         yield progress
     elif progress is True:
         with progress_line(title) as show:
-            yield lambda *given, **named: show(words(*given, **named))
+            yield lambda *args, **kwargs: show(text_of(*args, **kwargs))
     elif progress is False:
         yield None
     else:
@@ -43,15 +43,15 @@ def reported(
 
 @contextmanager
 def progress_line(title: str, text: str = "compiling") -> Iterator[Callable[[str], None]]:
-    """A line on standard output with the time since its begin; yields what changes its text.
+    """Show a line on standard output with the elapsed time; yield the function that changes its text.
 
-    In a terminal and in a notebook the line is written over itself; its last text stays, or nothing where there never
-    was another than the first. Elsewhere, in a file or pipe, only the last text is written, to standard error.
+    In a terminal and in a notebook the line overwrites itself; the last text remains, unless it is the initial text. In
+    a file or pipe only the last text appears, on standard error.
 
     **Arguments:**
 
-    - `title`: begins the line.
-    - `text`: follows, until there is something to report.
+    - `title`: start of the line.
+    - `text`: initial text.
     """
     line = _StatusLine(title, text)
     thread = threading.Thread(target=line.keep_time, daemon=True)
@@ -67,16 +67,16 @@ def progress_line(title: str, text: str = "compiling") -> Iterator[Callable[[str
 
 
 class _StatusLine:
-    """A line on a stream, and what is written of it."""
+    """A line on a stream."""
 
     def __init__(self, title: str, text: str) -> None:
         self.title, self.text, self.changed = title, text, False
         self.began, self.written = time.perf_counter(), 0
         self.stream, self.closed, self.lock = sys.stdout, threading.Event(), threading.Lock()
         self.terminal = self.stream.isatty()
-        # Notebooks obey a carriage return, too.
+        # Notebooks also support carriage returns.
         self.rewritten = self.terminal or type(self.stream).__module__.startswith("ipykernel")
-        if not self.rewritten:  # where output goes to a file or another program, it is the result alone
+        if not self.rewritten:  # a file or another program receives only the result
             self.stream = sys.stderr
 
     def show(self, text: str) -> None:
@@ -86,23 +86,23 @@ class _StatusLine:
             self.write()
 
     def keep_time(self) -> None:
-        """Write the line again and again, until it is closed."""
+        """Update the line until it is closed."""
         self.write()
         while not self.closed.wait(_EVERY):
             self.write()
 
     def write(self) -> None:
-        """Write the line over itself."""
+        """Overwrite the line."""
         with self.lock:
             text = self.whole()
-            if self.terminal:  # a line that is broken in two cannot be written over
+            if self.terminal:  # a wrapped line cannot be overwritten
                 text = text[: shutil.get_terminal_size().columns - 1]
             self.stream.write(f"\r{text.ljust(self.written)}")
             self.stream.flush()
             self.written = len(text)
 
     def close(self) -> None:
-        """Leave the last text."""
+        """Write the last text, or clear the initial one."""
         if not self.rewritten:
             self.stream.write(f"{self.whole()}\n" if self.changed else "")
         elif self.changed:
@@ -113,24 +113,24 @@ class _StatusLine:
         self.stream.flush()
 
     def whole(self) -> str:
-        """Title, the time since the begin, text."""
+        """Title, elapsed time and text."""
         return f"{self.title} {minutes(time.perf_counter() - self.began)}: {self.text}"
 
 
 def minutes(seconds: float) -> str:
-    """A time as 0:07 or 1:02:03."""
+    """A time such as 0:07 or 1:02:03."""
     whole = round(seconds)
     hours = f"{whole // 3600}:{whole // 60 % 60:02d}" if whole >= 3600 else f"{whole // 60}"
     return f"{hours}:{whole % 60:02d}"
 
 
 def iteration_words(number: int, rmse: float, values: Mapping[str, float] | None = None) -> str:
-    """An iteration of a fit: its number, the RMSE, the parameters."""
+    """Text for an iteration of a fit: its number, the RMSE and the parameters."""
     numbers = {"RMSE": rmse, **(values or {})}
     return f"iteration {number}: " + ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
 
 
 def candidate_words(name: str, fold: int | None, number: int, rmse: float) -> str:
-    """An iteration of a fit of one model among several."""
-    held = "" if fold is None else f", fold {fold + 1} held back"
+    """Text for an iteration of the fit of one model among several."""
+    held = "" if fold is None else f", fold {fold + 1} held out"
     return f"{name}{held}, {iteration_words(number, rmse)}"

@@ -1,18 +1,19 @@
-"""Objects that print as a short table, and show it in a notebook."""
+"""Objects that print as a short table, also in notebooks."""
 
 from functools import singledispatch
 from html import escape
 from typing import NamedTuple
 
-import jax.core
 import numpy as np
+
+from .arrays import is_known
 
 # Lines of a printed table.
 _MOST_ROWS = 22
 
 
 class Table(NamedTuple):
-    """What an object prints: a title, columns with their heads, and sentences below."""
+    """A printed table: a title, columns with headers, and notes below."""
 
     title: str
     head: tuple[str, ...]
@@ -20,21 +21,21 @@ class Table(NamedTuple):
     notes: tuple[str, ...] = ()
 
     def shortened(self) -> "Table":
-        """With as many rows as a screen holds, and a note of how many are left out."""
-        left = len(self.rows) - _MOST_ROWS
-        if left <= 0:
+        """The table with at most as many rows as fit on a screen, and a note on the number of omitted rows."""
+        omitted = len(self.rows) - _MOST_ROWS
+        if omitted <= 0:
             return self
-        return self._replace(rows=self.rows[:_MOST_ROWS], notes=(f"... and {left} more", *self.notes))
+        return self._replace(rows=self.rows[:_MOST_ROWS], notes=(f"... and {omitted} more", *self.notes))
 
     def text(self) -> str:
-        """Aligned columns."""
+        """The table as text with aligned columns."""
         widths = [max(map(len, column)) for column in zip(self.head, *self.rows, strict=True)] if self.rows else []
         lines = [self.head, *self.rows] if self.rows else []
         aligned = ["  ".join([f"{x:{n}}" for x, n in zip(line, widths, strict=True)]).rstrip() for line in lines]
         return "\n".join([self.title, *(f"  {line}" for line in aligned), *self.notes])
 
     def html(self) -> str:
-        """A table of HTML."""
+        """The table as HTML."""
         head = "".join(f"<th style='text-align:left'>{escape(x)}</th>" for x in self.head)
         rows = ["".join(f"<td style='text-align:left'>{escape(x)}</td>" for x in row) for row in self.rows]
         body = f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>" if rows else ""
@@ -43,12 +44,12 @@ class Table(NamedTuple):
 
 @singledispatch
 def table_of(thing: object) -> Table:
-    """What `thing` prints; registered by the room that knows it."""
+    """The table that `thing` prints; the subpackage of its type registers it."""
     return Table(type(thing).__name__, (), [])
 
 
 class AbstractReadable:
-    """What prints by `table_of`, and shows the same in a notebook."""
+    """An object that prints its `table_of`, also in a notebook."""
 
     def __str__(self) -> str:
         """The table as text."""
@@ -59,9 +60,11 @@ class AbstractReadable:
 
 
 def short(x: object) -> str:
-    """A number, or an array of them, in a few characters."""
-    if isinstance(x, jax.core.Tracer) or not hasattr(x, "dtype"):
-        return "traced" if isinstance(x, jax.core.Tracer) else str(x)
+    """Short text for a number or an array of numbers."""
+    if not is_known(x):
+        return "traced"
+    if not hasattr(x, "dtype"):
+        return str(x)
     array = np.asarray(x)
     if array.ndim == 0 or array.size <= 4:
         return str(np.vectorize(lambda value: f"{value:.6g}", otypes=[object])(array).tolist()).replace("'", "")

@@ -1,4 +1,4 @@
-"""Functions whose derivatives stay finite at zero."""
+"""Functions with finite derivatives at zero."""
 
 import jax
 import jax.numpy as jnp
@@ -9,23 +9,23 @@ from jaxtyping import Array, Float
 def safe_power(base: Float[Array, "..."], exponent: Float[Array, "..."]) -> Float[Array, "..."]:
     """`base**exponent` for `base >= 0` and `exponent > 0`; value and derivatives are zero at `base = 0`.
 
-    The derivative of a plain power is NaN there: by the exponent through `log(0)`, by the base for exponents
-    below one. The inner `where` keeps that branch from being evaluated at zero at all.
+    The derivatives of a plain power are NaN there: with respect to the exponent by `log(0)`, with respect to the base
+    for exponents below one. The inner `where` prevents the evaluation at zero.
     """
     positive = base > 0
     return jnp.where(positive, jnp.where(positive, base, 1.0) ** exponent, 0.0)
 
 
 def magnitude(v: Float[Array, "..."]) -> Float[Array, ""]:
-    """Absolute value of a number, Euclidean norm of a vector; the derivative is zero at zero."""
+    """Absolute value of a number, or Euclidean norm of a vector; the derivative is zero at zero."""
     return jnp.abs(v) if jnp.ndim(v) == 0 else safe_norm(v)
 
 
 @jax.custom_jvp
 def bounded_ratio(v: Float[Array, "..."], scale: Float[Array, ""]) -> Float[Array, "..."]:
-    """`|v|/scale`, but no more than the fourth root of the largest number: powers up to four do not overflow.
+    """`|v|/scale`, bounded by the fourth root of the largest floating-point number: powers up to four do not overflow.
 
-    What falls with that ratio is long gone there; without the bound its derivative is zero times infinity.
+    Functions that decay with the ratio are zero at the bound; without it their derivative is zero times infinity.
     """
     return jnp.minimum(jnp.abs(v) / scale, _most(v))
 
@@ -39,8 +39,7 @@ def _bounded_ratio_jvp(
 ) -> tuple[Array, Array]:
     """Derivatives of `|v|/scale`, zero beyond the bound.
 
-    Those of the minimum and of the absolute value as JAX has them took a fifth of the time of a step of LuGre's box in
-    batches.
+    JAX's own derivatives of the minimum and the absolute value took a fifth of a step of the LuGre box in batches.
     """
     (v, scale), (dv, dscale) = primals, tangents
     ratio = bounded_ratio(v, scale)
@@ -56,18 +55,18 @@ bounded_ratio.defjvp(_bounded_ratio_jvp, symbolic_zeros=True)
 
 
 def decay_mean(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """`(1 - exp(-x))/x` for `x >= 0`, the mean of a decay from 1 over x of its time constants; 1 at `x = 0`."""
+    """`(1 - exp(-x))/x` for `x >= 0`, the mean of a decay from 1 over x time constants; 1 at `x = 0`."""
     small = x < 1e-4
     safe = jnp.where(small, 1.0, x)
     return jnp.where(small, 1.0 - 0.5 * x + x * x / 6.0, -jnp.expm1(-safe) / safe)
 
 
 def safe_norm(x: Float[Array, "..."], *, axis: int = -1) -> Float[Array, "..."]:
-    """Euclidean norm along `axis`; its derivative is zero where `x` vanishes, and NaN there by a plain norm.
+    """Euclidean norm along `axis`, with a derivative of zero at `x = 0`, where that of a plain norm is NaN.
 
-    The entries are divided by the largest first, so that no square underflows: only zero has the norm zero.
+    Division by the largest entry prevents underflow of the squares: only zero has the norm zero.
     """
-    # The norm does not depend on the divisor, so neither does its derivative.
+    # The norm does not depend on the divisor, and neither does its derivative.
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True))
     vanishes = largest == 0
     scale = jnp.where(vanishes, 1.0, largest)

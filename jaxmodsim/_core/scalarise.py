@@ -1,4 +1,4 @@
-"""Small arrays taken apart: a function of arrays, evaluated in scalars."""
+"""Evaluation of a function of small arrays in scalars."""
 
 import abc
 import functools
@@ -8,22 +8,21 @@ from contextvars import ContextVar
 from typing import Any, TypeAlias
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from .arrays import fusion_barrier, is_known, opaque_one
 from .compat import AVAILABLE, ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
-from .fusion import fusion_barrier, opaque_one
-from .lu import is_known
+from .lu import is_constant
 
-# Arrays with more entries stay whole: tables, and what is looked up in them. Twelve coordinates make squares of 144.
+# Largest number of entries of an array in scalars; tables and look-ups remain whole. 12 coordinates have 144 squares.
 MAX_ENTRIES = 144
-# A function whose other values have more entries than this in all is left as it is: it would take too long to compile.
+# Largest number of scalars of a function; above, compilation in scalars takes too long.
 MAX_SCALARS = 8000
 
-# Applied to every entry by itself.
+# Operations on single entries.
 _ELEMENTWISE = {
     *("add", "add_any", "sub", "mul", "div", "neg", "abs", "sign", "max", "min", "rem", "square", "integer_pow", "pow"),
     *("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
@@ -31,54 +30,53 @@ _ELEMENTWISE = {
     *("eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "xor", "select_n", "is_finite", "convert_element_type"),
     *("copy", "stop_gradient", "clamp", "round"),
 }
-# Costly functions that XLA counts as cheap and computes again wherever their result is needed.
+# Expensive functions that XLA treats as cheap, and recomputes wherever their result is used.
 _REPEATED = {"sin", "cos", "tan"}
 _SUMS = {"reduce_sum", "cumsum", "dot_general"}
 _CALLS = {"jit", "pjit", "closed_call", "core_call"}
 
-# Whether a function is being traced to be taken apart: those that it calls are, with it.
+# Whether a function is being traced for scalars: the functions that it calls are then part of it.
 _within: ContextVar[bool] = ContextVar("within", default=False)
 
 
 class AbstractSymbol(abc.ABC):
-    """A scalar that stands for what a program is going to compute, of the type `dtype`."""
+    """A scalar of a generated program, of the type `dtype`."""
 
     dtype: np.dtype
 
 
-# Entries of an array: scalars, those known while tracing as NumPy's. Every other value is one array, not taken apart.
+# Entries of an array: scalars, or NumPy scalars if they are known while tracing. Any other value is one whole array.
 Parts: TypeAlias = np.ndarray
 Value: TypeAlias = Array | np.ndarray | np.generic | AbstractSymbol
 Params: TypeAlias = dict[str, Any]  # as JAX has them
 
 
 def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "..."]) -> PyTree:
-    """`fn(*args)`, with every small array on the way taken apart into scalars.
+    """Evaluate `fn(*args)` with scalars in place of small arrays.
 
-    XLA on CPU fuses operations on arrays of two to eight entries badly, and computes what they share over and over; of
-    scalars it makes one function, and under `jax.vmap` a few kernels over the batch. Besides, what is known while
-    tracing (the zeros and ones of unit vectors) is carried through sums and products, equal terms are formed once,
-    and so are sines and cosines (see `once`). Functions with a derivative of their own, loops and whatever else is
-    not known here get their arrays whole.
+    XLA on CPU fuses operations on arrays of two to eight entries badly, and recomputes shared terms. From scalars it
+    builds one function, and under `jax.vmap` a few kernels over the batch. In addition, known numbers (the zeros and
+    ones of unit vectors) pass through sums and products while tracing, and equal terms, sines and cosines are computed
+    once (see `fusion_barrier`). Functions with their own derivative, loops and unsupported operations receive whole
+    arrays.
 
     **Arguments:**
 
-    - `fn`: a function that JAX can trace. Where its values have one entry each or more than `MAX_SCALARS` in all, and
-      outside of `jax.jit` and the like, it is evaluated as it is; what of it asks for scalars itself is then.
+    - `fn`: a function that JAX can trace. The result is that of the plain call outside `jax.jit` and similar
+      transformations, if all values are scalars, or if they have more than `MAX_SCALARS` entries in total.
     - `args`: pytrees of arrays and numbers.
-    - `seed`: numbers not known while compiling. Where the first of them is not finite, the result may not be, either.
+    - `seed`: numbers that are unknown while compiling. If the first is not finite, the result may not be finite.
 
     **Returns:**
 
-    What `fn` returns, equal but for rounding and for zero times infinity, which is zero if that zero is a constant.
+    The result of `fn` up to rounding, except that zero times infinity is zero if that zero is a constant.
     """
     if _within.get() or "jaxprs" not in AVAILABLE:
         return fn(*args)
     closed, shapes = trace_in_arrays(fn, *args)
     leaves = [x if hasattr(x, "shape") else jnp.asarray(x) for x in jtu.tree_leaves(args)]
     sizes = [size for size in _sizes(closed.jaxpr) if size <= MAX_ENTRIES]
-    traced = any(isinstance(x, jax.core.Tracer) for x in leaves)
-    if not traced or sum(sizes) > MAX_SCALARS:
+    if is_known(*leaves) or sum(sizes) > MAX_SCALARS:
         return fn(*args)
     if max(sizes, default=0) > 1:
         unit = opaque_one(jax.lax.stop_gradient(jnp.ravel(seed)[0]))
@@ -89,7 +87,7 @@ def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "...
 
 
 def trace_in_arrays(fn: Callable[..., PyTree], *args: PyTree) -> tuple[ClosedJaxpr, PyTree]:
-    """`fn(*args)` traced with nothing in it taken apart, and the shapes of what it returns."""
+    """Trace of `fn(*args)` in whole arrays, and the shapes of its result."""
     outside = _within.set(True)
     try:
         return jax.make_jaxpr(fn, return_shape=True)(*args)
@@ -98,18 +96,18 @@ def trace_in_arrays(fn: Callable[..., PyTree], *args: PyTree) -> tuple[ClosedJax
 
 
 def columns_of(linear: Callable[..., list[Value]], unit: Float[Array, ""], *like: ArrayLike) -> list[list[Value]]:
-    """The matrix of a linear function of scalars, column by column; zeros and ones that its structure shows are known.
+    """Columns of the matrix of a linear function of scalars, with structural zeros and ones as known numbers.
 
     **Arguments:**
 
-    - `linear`: takes scalars and returns a list of them, as the second result of `jax.linearize` does.
+    - `linear`: a function from scalars to a list of scalars, such as the second result of `jax.linearize`.
     - `unit`: a one from `opaque_one`.
-    - `like`: scalars of the types of its arguments.
+    - `like`: scalars with the types of its arguments.
 
     **Returns:**
 
-    For each argument the values for it alone being one: NumPy's scalars where they are known while tracing (zeros of
-    what does not depend on it, ones of what it is itself), arrays elsewhere.
+    For each argument the values of `linear` if that argument is one and all others are zero: NumPy scalars for values
+    that are known while tracing, otherwise arrays.
     """
     types = [jnp.result_type(x) for x in like]
     if "jaxprs" not in AVAILABLE:
@@ -155,7 +153,7 @@ def _whole(x: Any) -> Any:
     """A value as one array."""
     if not is_apart(x):
         return x
-    # Row by row: XLA finds the entries of a stack again, but not behind a reshape.
+    # Row by row: XLA recognizes the entries of a stack, but not after a reshape.
     return jnp.asarray(x[()]) if x.shape == () else jnp.stack([_whole(x[i, ...]) for i in range(len(x))])
 
 
@@ -164,9 +162,9 @@ def is_apart(x: object) -> bool:
 
 
 class AbstractScalars(abc.ABC):
-    """Evaluates a traced function entry by entry; remembers what it has computed.
+    """Evaluates a traced function entry by entry, and reuses equal terms.
 
-    Entries are NumPy's scalars where they are known while tracing, and else what `scalar` makes of them.
+    Entries are NumPy scalars if they are known while tracing, otherwise results of `scalar`.
     """
 
     def __init__(self) -> None:
@@ -174,14 +172,14 @@ class AbstractScalars(abc.ABC):
 
     @abc.abstractmethod
     def scalar(self, compute: Callable[..., Value], name: str, params: Params, operands: list[Value]) -> Value:
-        """One scalar from scalars, by the operation `name` of JAX, which is `compute(*operands, **params)`."""
+        """One scalar by the operation `name` of JAX, `compute(*operands, **params)`."""
 
     @abc.abstractmethod
     def whole(self, eqn: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
-        """Outputs of an equation that is not taken apart here."""
+        """Outputs of an equation on whole arrays."""
 
     def parts(self, x: Any) -> Parts:
-        """A value taken apart."""
+        """A value as an array of scalars."""
         if is_apart(x):
             return x
         if isinstance(x, np.ndarray):
@@ -193,7 +191,7 @@ class AbstractScalars(abc.ABC):
         return self.memory[id(x)][1]
 
     def run(self, jaxpr: Jaxpr, consts: Sequence[ArrayLike], args: Sequence[Value]) -> list[Value]:
-        """Values of the outputs, apart or whole."""
+        """Values of the outputs, in scalars or whole."""
         values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(_constant, consts), *args], strict=True))
 
         def read(atom: Any) -> Value:
@@ -229,8 +227,8 @@ class AbstractScalars(abc.ABC):
         return self.whole(eqn, inputs)
 
     def apply(self, compute: Callable[..., Value], name: str, params: Params, operands: list[Value]) -> Value:
-        """One scalar from scalars."""
-        if all(map(is_known, operands)) and name in _KNOWN:
+        """One scalar by an operation on scalars, or a known or equal one."""
+        if all(map(is_constant, operands)) and name in _KNOWN:
             return np.asarray(_KNOWN[name](params, *operands))[()]
         short = _shorten(name, operands)
         if short is not None:
@@ -238,10 +236,10 @@ class AbstractScalars(abc.ABC):
         key = (
             name,
             str(params),
-            *(np.asarray(x).tobytes() + x.dtype.str.encode() if is_known(x) else id(x) for x in operands),
+            *(np.asarray(x).tobytes() + x.dtype.str.encode() if is_constant(x) else id(x) for x in operands),
         )
         if key not in self.memory:
-            # The operands are kept, for an id is that of one object only while it lives.
+            # The memory keeps the operands alive, so that their ids remain unique.
             self.memory[key] = operands, self.scalar(compute, name, params, operands)
         return self.memory[key][1]
 
@@ -285,12 +283,12 @@ class _Scalars(AbstractScalars):
         self.unit = unit
 
     def scalar(self, compute: Callable[..., Value], name: str, params: Params, operands: list[Value]) -> Value:
-        """The operation itself."""
+        """The operation of JAX."""
         out = compute(*operands, **params)
         return fusion_barrier(out, self.unit) if name in _REPEATED else out
 
     def whole(self, eqn: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        """Outputs of an equation that gets its arrays whole."""
+        """Outputs of an equation on whole arrays."""
         bound = eqn.primitive.get_bind_params(eqn.params)
         functions, params = bound if isinstance(bound, tuple) else ((), bound)
         out = eqn.primitive.bind(*functions, *map(_whole, inputs), **params)
@@ -298,27 +296,27 @@ class _Scalars(AbstractScalars):
 
 
 def _constant(x: ArrayLike) -> Value:
-    return x if isinstance(x, jax.core.Tracer) else np.asarray(x)
+    return np.asarray(x) if is_known(x) else x
 
 
 def _shorten(name: str, operands: list[Value]) -> Value | None:
-    """Sums, products and quotients with zero or one, and choices that are known or make no difference; else None."""
+    """Result of a sum, product or quotient with zero or one, or of a trivial choice; otherwise None."""
     if name in ("add", "add_any", "mul"):
         for a, b in (operands, operands[::-1]):
-            if is_known(a) and a == 0:
+            if is_constant(a) and a == 0:
                 return a if name == "mul" else b
-            if is_known(a) and a == 1 and name == "mul":
+            if is_constant(a) and a == 1 and name == "mul":
                 return b
     if name == "select_n":
         chosen, *cases = operands
-        if is_known(chosen):
+        if is_constant(chosen):
             return cases[int(np.asarray(chosen))]
-        # The derivative of |v| by anything else is zero on either side.
-        if all(map(is_known, cases)) and all(x == cases[0] for x in cases):
+        # Equal known cases: for example, the derivative of |v| by an unrelated variable is zero on both sides.
+        if all(map(is_constant, cases)) and all(x == cases[0] for x in cases):
             return cases[0]
-    if name == "div" and is_known(operands[0]) and operands[0] == 0:
+    if name == "div" and is_constant(operands[0]) and operands[0] == 0:
         return operands[0]
-    if name == "sub" and is_known(operands[1]) and operands[1] == 0:
+    if name == "sub" and is_constant(operands[1]) and operands[1] == 0:
         return operands[0]
     return None
 
@@ -353,7 +351,7 @@ def _iota(params: Params) -> Parts:
     return _array(shape, lambda i: np.dtype(params["dtype"]).type(i[dimension]))
 
 
-# Which entry goes where.
+# Operations that move entries.
 _MOVES: dict[str, Callable[..., Parts]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda params, *xs: np.concatenate(xs, params["dimension"]),
@@ -367,7 +365,7 @@ _MOVES: dict[str, Callable[..., Parts]] = {
     "transpose": lambda params, x: x.transpose(params["permutation"]),
 }
 
-# What is computed while tracing if the operands are known.
+# Operations that are evaluated while tracing if their operands are known.
 _KNOWN: dict[str, Callable[..., ArrayLike]] = {
     "add": lambda _, a, b: a + b,
     "add_any": lambda _, a, b: a + b,

@@ -11,21 +11,21 @@ _BURST = 5
 
 
 def measure(calls: dict[str, Callable[[], object]], rounds: int, limit_s: float = 30.0) -> dict[str, dict[str, PyTree]]:
-    """Time several calls in turns, so that a drift of the machine's speed meets them all alike.
+    """Time several calls in turns, so that drift of the machine's speed affects all alike.
 
-    The first call of each, which compiles, is timed apart. Then in every round each call has its turn: a fast one
-    (below 20 ms) is called once to warm the caches that the others have emptied, then timed five times in a row; a
-    slow one is timed once. Each call must wait for its own result.
+    The first call of each, which compiles, is timed separately. Then every call has one turn per round. A fast call
+    (below 20 ms) runs once to warm the caches, and then five times for the timing; a slow call runs once. Each call
+    must wait for its own result.
 
     **Arguments:**
 
     - `calls`: functions without arguments, by name.
     - `rounds`: number of turns of each.
-    - `limit_s`: a call that has taken this long in all [s] sits out the remaining rounds, but has at least one.
+    - `limit_s`: total time [s] after which a call skips the remaining rounds; it has at least one.
 
     **Returns:**
 
-    For each name `first_s`, `median_s`, `quartiles_s`, `minimum_s`, `repetitions`; or `failed`, the reason.
+    For each name `first_s`, `median_s`, `quartiles_s`, `minimum_s` and `repetitions`; or `failed`, the error.
     """
     report: dict[str, dict[str, PyTree]] = {}
     seconds: dict[str, list[float]] = {}
@@ -33,7 +33,7 @@ def measure(calls: dict[str, Callable[[], object]], rounds: int, limit_s: float 
         try:
             first = _seconds(call)
             second = _seconds(call)
-        except Exception as error:  # a peer that fails is a result
+        except Exception as error:  # a failure is a result, too
             report[name] = {"failed": f"{type(error).__name__}: {str(error).strip().splitlines()[0][:400]}"}
             continue
         report[name] = {"first_s": first, "slow": second > _SLOW}

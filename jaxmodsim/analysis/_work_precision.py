@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from .._core.provenance import describe_machine
+from .._core.system import describe_machine
 from .._core.timing import measure
 from ..scene import Scene, elements
 from ..simulation import Trajectory, default_solver, evaluations_per_step

@@ -8,8 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._core.extra import extra
-from .._core.files import written_whole
+from .._core.system import extra, written_whole
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -132,7 +132,7 @@ def sweep(
     which is run: use only files that you trust.
 
     \[run] has q0, qd0, t1; ts, a list or {start, stop, count}; t0, rtol, atol,
-    dt, dtmax, max_steps, max_events, hold_chatter, project.
+    dt, dtmax, max_steps, max_events, stick_on_chatter, project.
 
     \[over] has an entry for each dimension, all combinations of which are run:
     a list; {from, to, count, spacing = "linear" or "log"}; a table of lists

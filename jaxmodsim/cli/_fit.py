@@ -25,11 +25,11 @@ from ..identify import (
     design_input,
     expected_error,
     fit,
+    is_step_size_limited,
     predict,
     profile,
     remarks,
     rough_axis,
-    step_shows,
 )
 from ..plot import comparison_figure, design_figure, fit_figure, score_figure
 from ..scene import Scene, scene_numbers
@@ -103,7 +103,12 @@ def _fitted(plan: Plan) -> Fitted:
     started = time.perf_counter()
     substeps = plan.substeps or 1
     fitted = _fitted_with(plan, substeps)
-    while plan.substeps is None and substeps < _MOST_SUBSTEPS and step_shows(fitted.result) and not fitted.interrupted:
+    while (
+        plan.substeps is None
+        and substeps < _MOST_SUBSTEPS
+        and is_step_size_limited(fitted.result)
+        and not fitted.interrupted
+    ):
         substeps *= _FINER
         fitted = _fitted_with(plan, substeps)
     judged = _judged(replace(fitted, substeps=substeps))

@@ -10,8 +10,8 @@ from importlib import metadata
 import numpy as np
 import pandas as pd
 
-from .._core.files import jsonable
-from .._core.units import axis_unit
+from .._core.arguments import axis_unit
+from .._core.system import jsonable
 from ..identify import (
     Comparison,
     ExpectedError,

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from .._core.files import jsonable
+from .._core.system import jsonable
 from ..identify import FitResult, InputDesign
 from ..plot import Figure
 

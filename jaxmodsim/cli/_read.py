@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from .._core.arguments import nearest
-from .._core.units import axis_unit
+from .._core.arguments import axis_unit, nearest
 from ..identify import Record, clock_offset, sampling_gaps, unexplained_force
 from ._files import Columns, read_columns
 from ._logs import Channel, held_on

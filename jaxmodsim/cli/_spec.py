@@ -38,7 +38,7 @@ class _RunTable(_table.AbstractTable):
     dtmax: _table.Number | None = None
     max_steps: _table.Whole | None = None
     max_events: _table.Whole | None = None
-    hold_chatter: _table.Switch | None = None
+    stick_on_chatter: _table.Switch | None = None
     project: _table.Switch | None = None
 
 

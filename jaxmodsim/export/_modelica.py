@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .._core.state_dependent import need_values
+from .._core.functions import need_values
 from ..friction import AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw, Geared
 
 # Speeds at which the table is held against the law, spaced evenly in the logarithm over so many decades, and evenly.

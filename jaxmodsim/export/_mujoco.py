@@ -4,7 +4,7 @@ from xml.sax.saxutils import quoteattr
 
 from jaxtyping import Array
 
-from .._core.state_dependent import need_values
+from .._core.functions import need_values
 from ..friction import AbstractLaw
 
 # As hard as MuJoCo's dry friction gets: with its default the joint creeps a thousand times faster.

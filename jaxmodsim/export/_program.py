@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._core.compat import AVAILABLE, ClosedJaxpr, JaxprEqn
-from .._core.lu import is_known
+from .._core.lu import is_constant
 from .._core.scalarise import AbstractScalars, AbstractSymbol, Params, Parts, Value, is_apart
 
 _COMPARISONS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
@@ -129,7 +129,7 @@ class _StatementWriter(AbstractScalars):
 
     def scalar(self, compute: Callable[..., Any], name: str, params: Params, operands: list[Any]) -> Any:
         """A statement, or what is the same without one."""
-        if all(map(is_known, operands)):
+        if all(map(is_constant, operands)):
             return np.asarray(compute(*operands, **params))[()]
         first = operands[0]
         if name == "convert_element_type":
@@ -137,14 +137,14 @@ class _StatementWriter(AbstractScalars):
             return first if kind == first.dtype else self.converted(compute, first, params)
         if name in ("copy", "stop_gradient"):
             return first
-        if name in ("and", "or") and first.dtype == bool and any(map(is_known, operands)):
-            known, other = operands if is_known(first) else operands[::-1]
+        if name in ("and", "or") and first.dtype == bool and any(map(is_constant, operands)):
+            known, other = operands if is_constant(first) else operands[::-1]
             return other if bool(known) == (name == "and") else known
         if name == "sub" and first is operands[1]:
             return np.zeros((), first.dtype)[()]
         if name == "neg" and first in self.origin and self.origin[first].name == "neg":
             return self.origin[first].operands[0]
-        if name == "div" and is_known(operands[1]) and operands[1] == 1:
+        if name == "div" and is_constant(operands[1]) and operands[1] == 1:
             return first
         if name == "select_n" and operands[1] is operands[2] and len(operands) == 3:
             return operands[1]
@@ -171,7 +171,7 @@ class _StatementWriter(AbstractScalars):
     def converted(self, compute: Callable[..., Value], x: Symbol, params: Params) -> Value:
         """In another type; numbers to choose from are, and not what is chosen."""
         made = self.origin.get(x)
-        if made is None or made.name != "select_n" or not all(map(is_known, made.operands[1:])):
+        if made is None or made.name != "select_n" or not all(map(is_constant, made.operands[1:])):
             return self.assign("convert_element_type", [x], np.dtype(params["new_dtype"]))
         chosen, *cases = made.operands
         cases = [self.scalar(compute, "convert_element_type", params, [case]) for case in cases]
@@ -275,14 +275,14 @@ class _StatementWriter(AbstractScalars):
             _, name, operands = self.origin[x]
             if name == "and":
                 open_ += operands
-            if name != "lt" or not is_known(operands[1]):
+            if name != "lt" or not is_constant(operands[1]):
                 continue
             for carry in carries:
                 step = self.origin.get(carry.after) if isinstance(carry.after, Symbol) else None
                 counts = step is not None and step.name == "add" and step.operands[0] is carry.symbol
-                if operands[0] is carry.symbol and is_known(carry.start) and step is not None and counts:
+                if operands[0] is carry.symbol and is_constant(carry.start) and step is not None and counts:
                     by = step.operands[1]
-                    if is_known(by) and by == 1:
+                    if is_constant(by) and by == 1:
                         found.append(int(np.asarray(operands[1])) - int(np.asarray(carry.start)))
         if not found:
             raise ValueError("while, a loop without a known limit of its passes")
@@ -291,7 +291,7 @@ class _StatementWriter(AbstractScalars):
     def branch(self, branches: Sequence[ClosedJaxpr], inputs: list[Value]) -> list[Value]:
         """Arms of which one is taken."""
         (index,) = self.parts(inputs[0]).flat
-        if is_known(index):
+        if is_constant(index):
             chosen = branches[int(np.clip(int(index), 0, len(branches) - 1))]
             return self.run(chosen.jaxpr, chosen.consts, inputs[1:])
         arms = []
@@ -316,7 +316,7 @@ def _known_array(x: Value) -> np.ndarray | None:
     """An array all of whose entries are known; None for others."""
     if not isinstance(x, np.ndarray) or not is_apart(x):
         return np.asarray(x)
-    if x.size == 0 or not all(map(is_known, x.flat)):
+    if x.size == 0 or not all(map(is_constant, x.flat)):
         return None
     return np.asarray(x.tolist(), x.flat[0].dtype).reshape(x.shape)
 

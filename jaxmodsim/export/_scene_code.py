@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._core.arguments import as_whole
+from .._core.arrays import PerDof, Scalar
 from .._core.scalarise import trace_in_arrays
-from .._core.shapes import PerDof, Scalar
-from ..scene import Friction, Scene, State, check_scene, check_step, elements, scene_step, signals_of, vector_field
+from ..scene import Scene, State, check_scene, check_step, elements, scene_step, signals_of, vector_field
 from ._languages import JAVASCRIPT, C, Language, write_program
 from ._program import Symbol, program_of
 
@@ -221,7 +221,7 @@ def _routines(scene: Scene, y: State) -> list[_Routine]:
             lambda scene, y, t0, t1: scene_step(scene, t0, t1, y),
         ),
     ]
-    if any(isinstance(each, Friction) for each in scene.effects):
+    if scene.friction:
         purpose = "Force that makes up for friction at the motion in y; states of the laws in y go from t0 to t1."
         routines.append(
             _Routine("friction", purpose, ("t0", "t1"), ("force", dof), [*force, *own], _friction_feed_forward)
@@ -233,12 +233,11 @@ def _friction_feed_forward(scene: Scene, y: State, t0: Scalar, t1: Scalar) -> tu
     """Generalised force [N or N m] against friction, and the states of the laws after the time from t0 to t1."""
     scene = scene.bind_state(t0, y.q, y.qd)
     total, after = jnp.zeros_like(y.q), dict(y.z)
-    for name, effect in zip(scene.names, scene.effects, strict=True):
-        if isinstance(effect, Friction):
-            v = effect.slip(t0, y.q, y.qd, scene.params)
-            force, z = effect.step_exact(v, y.z.get(name), t1 - t0, effect.load(t0, y.q, y.qd, scene.params))
-            total = total + -effect.apply_force(y.q, force, scene.params)
-            after |= {name: z} if name in y.z else {}
+    for name, effect in scene.friction.items():
+        v = effect.slip(t0, y.q, y.qd, scene.params)
+        force, z = effect.step_exact(v, y.z.get(name), t1 - t0, effect.load(t0, y.q, y.qd, scene.params))
+        total = total + -effect.apply_force(y.q, force, scene.params)
+        after |= {name: z} if name in y.z else {}
     return total, after
 
 

@@ -1,4 +1,4 @@
-"""Armstrong's seven parameters."""
+"""Armstrong's law with seven parameters."""
 
 import math
 from collections.abc import Mapping
@@ -7,17 +7,15 @@ from typing import ClassVar, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._core.arrays import Scalar
+from .._core.functions import nominal
 from .._core.parameters import Number, parameter
-from .._core.shapes import Scalar
-from .._core.state_dependent import nominal
-from ._bristle import advance_elastoplastic, slip_fraction
-from ._law import MOST_STICTION, AbstractDynamicLaw, register_law
-from ._law_case import LawCase, stribeck_case
-from ._passivity import Passivity
+from ._bristles import advance_elastoplastic, slip_fraction
+from ._law import MOST_STICTION, AbstractDynamicLaw, LawCase, Passivity, register_law, stribeck_case
 
-# Part of its limit over which the contact gives way.
+# Fraction of its limit over which the contact yields.
 _CORNER = 0.02
-# Slip velocity, in Stribeck velocities, below which a contact rests wherever it is.
+# Slip velocity over vs below which the contact counts as resting.
 _SLIDES = 1e-3
 
 
@@ -25,9 +23,9 @@ class ArmstrongState(NamedTuple):
     """State of `Armstrong`.
 
     - `z`: deflection of the contact [m].
-    - `rise`: Stribeck friction there is, as a share of Fs - Fc.
-    - `magnitude`: what it would be at no speed; in stick the same as `rise`.
-    - `slips`: 1 from when the contact has given way until it moves back, 0 from then on.
+    - `rise`: current Stribeck friction, as a fraction of Fs - Fc.
+    - `magnitude`: value of `rise` in the limit of zero speed; in stick it follows `rise`.
+    - `slips`: 1 in slip, from yielding until the motion reverses; 0 in stick.
     """
 
     z: Scalar
@@ -40,15 +38,14 @@ class ArmstrongState(NamedTuple):
 class Armstrong(AbstractDynamicLaw):
     """Armstrong's model of seven parameters: stiff in stick, Stribeck friction with memory in slip, rising stiction.
 
-    In stick `F = sigma0 z + Fv v`; in slip `F = (Fc + (Fs - Fc) rise) sign(v) + Fv v`. In slip `rise` goes to
-    `magnitude/(1 + (v/vs)^2)` with the time constant `tau`, which is frictional memory; in stick it grows to 1 like
-    `t/(t + gamma)` from where it was, and the magnitude of the next slip is what it has become. The contact slips from
-    when it has given way until it moves back or comes to rest: a rule that the paper leaves open.
+    In stick `F = sigma0 z + Fv v`; in slip `F = (Fc + (Fs - Fc) rise) sign(v) + Fv v`. In slip `rise` tends to
+    `magnitude/(1 + (v/vs)^2)` with the time constant `tau`, which is frictional memory. In stick `rise` grows to 1 like
+    `t/(t + gamma)`, and its last value becomes the magnitude of the next slip. Slip begins when the contact yields and
+    ends when the motion reverses or stops: the paper leaves this rule open.
 
-    Three things differ from the paper, so that the model is one set of differential equations: the lag is of first
-    order where the paper has a pure delay of tau; stiction grows by `rise' = (1 - rise)^2/gamma`, which is the paper's
-    `t/(t + gamma)` if nothing is left at the beginning of stick; and the magnitude follows the rise in stick with the
-    time constant tau.
+    Three differences to the paper make the model a single set of differential equations. The lag is of first order,
+    instead of a pure delay of tau. Stiction grows by `rise' = (1 - rise)^2/gamma`, which is the paper's `t/(t + gamma)`
+    if rise = 0 at the beginning of stick. The magnitude follows the rise in stick with the time constant tau.
 
     **Arguments:**
 
@@ -58,7 +55,7 @@ class Armstrong(AbstractDynamicLaw):
     - `vs`: Stribeck velocity [m/s], > 0.
     - `Fv`: viscous coefficient [N s/m], >= 0.
     - `tau`: time constant of frictional memory [s], > 0.
-    - `gamma`: time of rest after which half of the stiction is back if none was left [s], > 0.
+    - `gamma`: time of rest [s] in which the Stribeck friction grows from 0 to one half, > 0.
 
     **Raises:**
 
@@ -91,28 +88,27 @@ class Armstrong(AbstractDynamicLaw):
         "magnitude' = (rise - magnitude)/tau in stick, 0 in slip",
     )
     limitations: ClassVar[Mapping[str, str]] = {
-        "characteristic": "After a reversal there is as much Stribeck friction as the slip left and the rest brought"
-        " back."
+        "characteristic": "Stribeck friction after a reversal depends on the previous slip and on the time at rest."
     }
     mujoco_lacks: ClassVar[str] = (
-        ", for the stiction of its bristle neither rises with time nor has a memory: fit a LuGre and export that"
+        ": the stiction of its bristle does not grow with time and has no memory. Fit a LuGre and export that"
     )
 
     def _moves(self, v: Scalar) -> Scalar:
-        """How far the speed `v` [m/s] is one of sliding, 0 to 1."""
+        """Weight of sliding at the velocity `v` [m/s], from 0 at rest to 1."""
         return jnp.minimum(jnp.abs(v) / (_SLIDES * self.vs), 1.0)
 
     def _limit(self, rise: Scalar) -> Scalar:
-        """Deflection [m] at which the contact slides."""
+        """Deflection [m] at which the contact slips."""
         return (self.Fc + (self.Fs - self.Fc) * rise) / self.sigma0
 
     def _steady(self, v: Scalar) -> Scalar:
-        """What is left of the magnitude in steady slip at `v` [m/s]."""
+        """Fraction of the magnitude that remains in steady slip at `v` [m/s]."""
         ratio = v / self.vs
         return 1.0 / (1.0 + ratio * ratio)
 
     def initial_state(self, v: Float[Array, "..."]) -> ArmstrongState:
-        """Undeflected after a long rest."""
+        """Undeflected contact after a long rest."""
         return ArmstrongState(jnp.zeros_like(v), jnp.ones_like(v), jnp.ones_like(v), jnp.zeros_like(v))
 
     def zdot(self, v: Scalar, z: ArmstrongState) -> ArmstrongState:
@@ -131,7 +127,7 @@ class Armstrong(AbstractDynamicLaw):
         )
 
     def _turn(self) -> Scalar:
-        """Slip [m] over which the contact goes over from stick to slip, and back."""
+        """Slip [m] over which the contact changes from stick to slip, and back."""
         return _CORNER * self.Fc / self.sigma0
 
     def force_given_zdot(self, v: Scalar, z: ArmstrongState, rate: ArmstrongState) -> Scalar:
@@ -143,9 +139,9 @@ class Armstrong(AbstractDynamicLaw):
         return 0.5 * self.sigma0 * z.z * z.z
 
     def step_exact(self, v: Scalar, z: ArmstrongState, dt: Scalar) -> ArmstrongState:
-        """State after `dt` [s] at constant `v` [m/s], of any length: first in stick, then in slip, each exactly."""
+        """State after any time `dt` [s] at constant `v` [m/s]: first in stick, then in slip, each exact."""
         corner, distance = jnp.asarray(_CORNER, z.z.dtype), jnp.abs(v) * dt
-        # Back, then along, and of that what the contact does not follow.
+        # Slip until the deflection is zero after a reversal, then slip that the contact does not follow.
         back = jnp.minimum(distance, jnp.where(v * z.z < 0, jnp.abs(z.z), 0.0))
         lost = jnp.maximum(
             distance - jnp.abs(advance_elastoplastic(v, z.z, dt, self._limit(z.rise), corner) - z.z), 0.0
@@ -162,11 +158,11 @@ class Armstrong(AbstractDynamicLaw):
         return ArmstrongState(advance_elastoplastic(v, z.z, dt, self._limit(rise), corner), rise, magnitude, slips)
 
     def passivity(self) -> Passivity:
-        """Always passive: an element lags only towards the side that it is loaded on, so `sigma0 z (v - z') >= 0`."""
-        words = "Armstrong is always passive: the contact gives way only towards the side that it is loaded on."
-        return Passivity(True, float(nominal(self.Fv)), math.inf, words)
+        """Always passive: the contact slips only in the direction of its load, so `sigma0 z (v - z') >= 0`."""
+        condition = "Armstrong is always passive: the contact slips only in the direction of its load."
+        return Passivity(True, float(nominal(self.Fv)), math.inf, condition)
 
     @classmethod
     def cases(cls) -> tuple[LawCase, ...]:
-        """A stiction that is half back after a second."""
+        """A Stribeck friction that grows to one half in one second."""
         return (stribeck_case("Armstrong", cls.standard(tau=0.01, gamma=1.0), lambda x: 1.0 / (1.0 + x * x)),)

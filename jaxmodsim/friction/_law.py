@@ -1,23 +1,23 @@
-"""What a friction law is. Sign: the force is positive when it opposes positive slip."""
+"""Base classes, registry and examples of friction laws. The force is positive when it opposes positive slip."""
 
 import abc
 import dataclasses
 import inspect
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._core.arrays import PerDof, Scalar
+from .._core.functions import bind_state, is_state_dependent, nominal
 from .._core.parameters import check_ranges, ranges_of
 from .._core.readable import AbstractReadable
-from .._core.shapes import PerDof, Scalar
-from .._core.state_dependent import bind_state, is_state_dependent, nominal
-from ._law_case import STANDARD, LawCase, steady_curve
-from ._passivity import Passivity
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractClassVar
@@ -27,41 +27,104 @@ else:
 
 _Law = TypeVar("_Law", bound="AbstractLaw")
 
-# Limitation of laws whose friction does not fall as slip begins.
-# A fit looks for Fs up to this many times Fc. Beyond it the peak at zero velocity is so high and narrow that samples
-# which pass through it in a moment trade it against vs, and what is fitted fails on the next record.
+# A fit searches Fs up to this many times Fc. Above that, the peak at zero velocity is so narrow that few samples lie in
+# it: the fit then trades its height against vs, and the result fails on the next record.
 MOST_STICTION = 5.0
-NO_STRIBECK_EFFECT = "Without a Stribeck effect friction does not depend on slip velocity but for the viscous part."
+STRIBECK_CURVE = "g(v) = Fc + (Fs - Fc) exp(-(v/vs)^2)"
 NO_STICTION_IN_MUJOCO = (
     " with Fs > Fc: its dry friction is one force, in stick and in slip. Export a LuGre with the same Fc and Fs, and"
     " sigma0 as stiff as the step allows, or leave the stiction out"
 )
+# Limitations, which tables show.
+NO_STRIBECK_EFFECT = "Without a Stribeck effect, only the viscous part of the force depends on slip velocity."
 _NO_MEMORY = {
-    "break-away": "The limit of stick is a number, whatever the load did before.",
+    "break-away": "The limit of stick is constant and does not depend on the load history.",
     "lag": "The force is a function of velocity: no memory, no lag.",
 }
-_JUMPS = {"presliding": "The force is a function of velocity and jumps as the velocity reverses."}
+_JUMPS = {"presliding": "The force is a function of velocity and jumps when the velocity reverses."}
+
+# Parameters of Canudas de Wit and others 1995, IEEE TAC 40:419: forces [N], Stribeck velocity [m/s], stiffness [N/m],
+# damping and viscous coefficients [N s/m]. The width of smooth laws [m/s] is a hundredth of the Stribeck velocity, so
+# that it resolves the fall of the curve.
+STANDARD = {
+    "sigma0": 1e5, "sigma1": math.sqrt(1e5), "sigma2": 0.4, "Fc": 1.0, "Fs": 1.5, "vs": 1e-3, "Fv": 0.4, "width": 1e-5,
+}  # fmt: skip
+
+
+class LawCase(NamedTuple):
+    """A law with numbers, which benches and tests run.
+
+    - `name`: label in tables and figures.
+    - `law`: the law.
+    - `steady`: closed form of its force [N] in steady slip at the velocities v [m/s], v not zero.
+    - `dt`: fixed step [s] that a simulation needs; None for adaptive steps.
+    """
+
+    name: str
+    law: Any
+    steady: Callable[[np.ndarray], np.ndarray]
+    dt: float | None = None
+
+
+def steady_curve(
+    Fc: float, Fs: float, Fv: float, fall: Callable[[np.ndarray], np.ndarray] = lambda x: np.exp(-x * x)
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Steady force that falls from Fs to Fc by `fall(|v|/vs)`, with a viscous part."""
+    return lambda v: (Fc + (Fs - Fc) * fall(np.abs(v) / STANDARD["vs"])) * np.sign(v) + Fv * v
+
+
+def stribeck_case(
+    name: str, law: eqx.Module, fall: Callable[[np.ndarray], np.ndarray] = lambda x: np.exp(-x * x)
+) -> LawCase:
+    """An example whose force in steady slip is the standard Stribeck curve with its viscous part."""
+    return LawCase(name, law, steady_curve(STANDARD["Fc"], STANDARD["Fs"], STANDARD["Fv"], fall))
+
+
+@dataclass(frozen=True)
+class Passivity:
+    """Result of `check_passivity`. Its truth value is `ok`, and `print` shows it as a sentence.
+
+    - `ok`: whether the law is passive.
+    - `margin`: viscous coefficient [N s/m] that could be removed before the law stops being passive. A negative margin
+      is the coefficient that must be added; -inf if no viscous coefficient helps.
+    - `speed`: slip speed [m/s] up to which the law returns no more energy than it received; infinite if at all speeds.
+    - `condition`: the condition for passivity, with the law's numbers.
+    """
+
+    ok: bool
+    margin: float
+    speed: float
+    condition: str
+
+    def __bool__(self) -> bool:
+        return self.ok
+
+    def __str__(self) -> str:
+        """All fields in one or two sentences."""
+        if self.ok:
+            return f"Passive, with a margin of {self.margin:g} N s/m. {self.condition}"
+        return f"Not passive from {self.speed:g} m/s on; margin {self.margin:g} N s/m. {self.condition}"
 
 
 class AbstractLaw(AbstractReadable, eqx.Module):
-    """A friction law: knows its slip velocity [m/s or rad/s] and its own state, nothing of the mechanism.
+    """A friction law: a function of slip velocity [m/s or rad/s] and its own state, independent of the mechanism.
 
-    Its class says all that is known of it; `register_law` makes it known to the command line, the benches and tables.
-    Besides the parameters and methods of its kind it may say:
+    The class holds all information about the law; `register_law` makes it available to the command line, the benches
+    and the tables. Besides the parameters and methods of its kind it may define:
 
-    - `description`, `equations`: in a few words, and as plain formulas: the force, then what that is made of.
+    - `description`, `equations`: a short description, and plain formulas: first the force, then its terms.
     - `execution`: how `simulate` runs it.
-    - `valid_at_any_speed`: whether the force may be evaluated up to the largest number there is.
-    - `limitations`: experiments of the behaviour bench that the law misses whatever its numbers, and why.
-    - `mujoco_lacks`: why MuJoCo has not such a law, and what to do; read after its name.
-    - `example`, `example_step`: numbers that `STANDARD` has not, and the fixed step [s] that the law needs if it does.
+    - `valid_at_any_speed`: whether the force is valid up to the largest floating-point number.
+    - `limitations`: experiments of the behaviour bench that the law fails for all parameters, with reasons.
+    - `mujoco_lacks`: why MuJoCo has no such law, and the remedy; the name of the law precedes it.
+    - `example`, `example_step`: parameters that are not in `STANDARD`, and the fixed step [s] if the law needs one.
     """
 
-    # Whether the law makes the equations of motion stiff, which decides the default solver.
+    # Whether the law makes the equations of motion stiff: it selects the default solver.
     stiff: AbstractClassVar[bool]
     description: ClassVar[str] = ""
     equations: ClassVar[tuple[str, ...]] = ()
-    execution: ClassVar[str] = "as it is"
+    execution: ClassVar[str] = "integrated directly"
     valid_at_any_speed: ClassVar[bool] = False
     limitations: ClassVar[Mapping[str, str]] = {}
     mujoco_lacks: ClassVar[str] = (
@@ -75,15 +138,15 @@ class AbstractLaw(AbstractReadable, eqx.Module):
         check_ranges(self)
 
     def bind_state(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> "AbstractLaw":
-        """The law as it is at a state of the mechanism; another one only where `scaled_by` made it depend on that."""
+        """The law with its parameters at a state of the mechanism; itself if none of them depends on the state."""
         return bind_state(self, t, q, qd, params) if is_state_dependent(self) else self
 
     def formulas(self) -> tuple[str, ...]:
-        """The equations of this law; of one that says none the names of its parameters."""
+        """The equations of this law; the names of its parameters if it defines none."""
         return self.equations or (f"{type(self).__name__}({', '.join(ranges_of(self))})",)
 
     def known_limitations(self) -> dict[str, str]:
-        """Experiments that the law misses with these numbers, and why."""
+        """Experiments that the law fails with these numbers, with reasons."""
         limitations = dict(self.limitations)
         Fc, Fs = (nominal(getattr(self, name, None)) for name in ("Fc", "Fs"))
         if Fc is not None and (Fs is None or not bool((Fs > Fc).any())):
@@ -92,21 +155,21 @@ class AbstractLaw(AbstractReadable, eqx.Module):
         return limitations if passivity is None or passivity.ok else limitations | {"passivity": passivity.condition}
 
     def passivity(self) -> Passivity | None:
-        """Whether the law is passive, from a closed form; None to have `check_passivity` search."""
+        """Passivity from a closed form; with None `check_passivity` searches instead."""
         return None
 
     def mujoco(self) -> dict[str, PyTree] | str:
-        """The law in MuJoCo: attributes with their numbers; or what MuJoCo lacks, and what to do.
+        """The law in MuJoCo: attributes with their values, or a sentence on the feature that MuJoCo lacks.
 
-        Of a `joint`, `frictionloss` [N] and `damping` [N s/m]; of a motor, `damping` and `lugre`, the numbers sigma0,
+        A `joint` has `frictionloss` [N] and `damping` [N s/m]; a motor has `damping` and `lugre`, the values of sigma0,
         sigma1, Fc, Fs and vs.
         """
         return f"{type(self).__name__}{self.mujoco_lacks}"
 
     def modelica(self) -> str:
-        """What Modelica's friction components lack of the law, and what to do; empty where they have it.
+        """The feature that Modelica's friction components lack, and the remedy; empty if they can represent the law.
 
-        They have a range of forces at rest, and any function of slip velocity that goes on from there.
+        They have a range of forces at rest, and any function of slip velocity that continues it.
         """
         return (
             f"{type(self).__name__}: they take set-valued laws and Viscous. Write the force as a Stribeck, with"
@@ -115,16 +178,16 @@ class AbstractLaw(AbstractReadable, eqx.Module):
 
     @classmethod
     def standard(cls: type[_Law], **others: object) -> _Law:
-        """The law with the standard parameters, as far as it has them, and others."""
+        """The law with the standard values of its parameters, overridden by `others`."""
         names = [field.name for field in dataclasses.fields(cls)]
         return cls(**{name: STANDARD[name] for name in names if name in STANDARD} | dict(cls.example) | others)
 
     @classmethod
     def cases(cls) -> tuple[LawCase, ...]:
-        """Examples of the law that benches and tests run; none, and they leave it out.
+        """Examples of the law that benches and tests run; they skip a law without examples.
 
-        By default the standard law, with the Stribeck curve for its force in steady slip; none if `STANDARD` and
-        `example` have not all that it needs.
+        By default the standard law, with the Stribeck curve as its force in steady slip; none if `STANDARD` and
+        `example` lack a parameter that it requires.
         """
         needed = {field.name for field in dataclasses.fields(cls) if field.default is dataclasses.MISSING}
         if not needed <= {*STANDARD, *cls.example}:
@@ -136,11 +199,11 @@ class AbstractLaw(AbstractReadable, eqx.Module):
 
     @classmethod
     def fit_start(cls, m: float, Fc: float, Fv: float, v_max: float) -> "AbstractLaw | None":
-        """The law with which a fit of an axis starts; None, and it is no candidate.
+        """The law with which a fit of an axis starts; None excludes it from the candidates.
 
         **Arguments:**
 
-        - `m`: mass [kg], `Fc`, `Fv`: Coulomb force [N] and viscous coefficient [N s/m], of a linear regression.
+        - `m`: mass [kg], `Fc`, `Fv`: Coulomb force [N] and viscous coefficient [N s/m] from a linear regression.
         - `v_max`: largest speed of the record [m/s].
         """
         return None
@@ -154,7 +217,7 @@ class AbstractForceLaw(AbstractLaw):
     limitations: ClassVar[Mapping[str, str]] = {
         **_JUMPS,
         **_NO_MEMORY,
-        "creep": "A function of velocity holds a load only by moving.",
+        "creep": "A function of velocity carries a load only while it moves.",
     }
 
     @abc.abstractmethod
@@ -163,9 +226,9 @@ class AbstractForceLaw(AbstractLaw):
 
 
 class AbstractSetValuedLaw(AbstractLaw):
-    """A law whose force at rest may be anything up to a limit: a rule for slip and a limit of stick.
+    """A law with a force in slip, and any force up to a limit in stick.
 
-    By itself it runs exactly, by events; `Regularized`, `DeadZone` and `Sign` run it in other ways.
+    `simulate` runs it exactly, by events; `Regularized`, `DeadZone`, `Sign` and `Bristle` run it in other ways.
     """
 
     execution: ClassVar[str] = "exactly, by events; or in a wrapper"
@@ -175,23 +238,23 @@ class AbstractSetValuedLaw(AbstractLaw):
     def sliding_force(self, v: Scalar) -> Scalar:
         """Magnitude [N] of the dry part of the force in slip at velocity `v` [m/s], never negative.
 
-        At `v = 0` its limit from above.
+        At `v = 0` it is the limit from positive velocities.
         """
 
     @abc.abstractmethod
     def viscous_force(self, v: Scalar) -> Scalar:
-        """Part of the force [N] that is a smooth function of `v` [m/s], zero at rest."""
+        """Smooth part of the force [N] at velocity `v` [m/s], zero at rest."""
 
     @abc.abstractmethod
     def static_limit(self, direction: Scalar) -> Scalar:
-        """Largest force [N] in stick against a load that pulls towards `direction` (+1 or -1)."""
+        """Largest force [N] in stick against a load in `direction` (+1 or -1)."""
 
     def modelica(self) -> str:
-        """Modelica's friction components are such laws."""
+        """Modelica's friction components are set-valued laws."""
         return ""
 
     def lugre_numbers(self, vs: float) -> dict[str, PyTree] | None:
-        """Parameters of LuGre but sigma0 and sigma1 that give its steady force; None where it has no such force.
+        """Parameters of LuGre, without sigma0 and sigma1, that give the same steady force; None if there are none.
 
         **Arguments:**
 
@@ -201,7 +264,7 @@ class AbstractSetValuedLaw(AbstractLaw):
 
 
 class AbstractKarnoppLaw(AbstractLaw):
-    """A law that balances the load in a band about rest: its force there depends on the other forces."""
+    """A law whose force balances the load in a band of velocities about rest."""
 
     limitations: ClassVar[Mapping[str, str]] = _NO_MEMORY
 
@@ -211,29 +274,28 @@ class AbstractKarnoppLaw(AbstractLaw):
 
     @abc.abstractmethod
     def static_limit(self, direction: Scalar) -> Scalar:
-        """Largest holding force [N] against a load that pulls towards `direction` (+1 or -1)."""
+        """Largest holding force [N] against a load in `direction` (+1 or -1)."""
 
     @abc.abstractmethod
     def force(self, v: Scalar) -> Scalar:
         """Friction force [N] at velocity `v` [m/s] outside the band."""
 
     def passivity(self) -> Passivity:
-        """Not passive: in the band the force is the load, whatever direction the band is crossed in."""
+        """Not passive: in the band the force equals the load, whatever the direction of motion."""
         worst = max(float(self.static_limit(jnp.asarray(side))) for side in (1.0, -1.0))
-        words = (
-            f"In the band about rest the force of {type(self).__name__} is the load, up to {worst:g} N in either"
-            " direction: a load that brakes is cancelled, by a force that pushes along the motion. The law inside, run"
-            " by events, does not do that."
+        condition = (
+            f"In the band about rest the force of {type(self).__name__} equals the load, up to {worst:g} N in either"
+            " direction: against a braking load it pushes along the motion. The wrapped law, run by events, does not."
         )
-        return Passivity(worst == 0, -math.inf if worst > 0 else 0.0, 0.0 if worst > 0 else math.inf, words)
+        return Passivity(worst == 0, -math.inf if worst > 0 else 0.0, 0.0 if worst > 0 else math.inf, condition)
 
 
 class AbstractDynamicLaw(AbstractLaw):
-    """A law with a state of its own."""
+    """A law with an internal state."""
 
     @abc.abstractmethod
     def initial_state(self, v: Float[Array, "..."]) -> PyTree:
-        """State at rest and unloaded, for slip of the shape of `v`."""
+        """Unloaded state at rest, for slip velocities with the shape of `v`."""
 
     @abc.abstractmethod
     def zdot(self, v: Float[Array, "..."], z: PyTree) -> PyTree:
@@ -241,7 +303,7 @@ class AbstractDynamicLaw(AbstractLaw):
 
     @abc.abstractmethod
     def force_given_zdot(self, v: Float[Array, "..."], z: PyTree, rate: PyTree) -> Float[Array, "..."]:
-        """Friction force [N] at slip velocity `v` [m/s], the state `z`, and a rate of that: damping in the bristle."""
+        """Friction force [N] at slip velocity `v` [m/s], state `z` and its rate, on which bristle damping acts."""
 
     def force(self, v: Float[Array, "..."], z: PyTree) -> Float[Array, "..."]:
         """Friction force [N] at slip velocity `v` [m/s] and state `z`."""
@@ -249,27 +311,27 @@ class AbstractDynamicLaw(AbstractLaw):
 
     @abc.abstractmethod
     def stored_energy(self, z: PyTree) -> Scalar:
-        """Energy [J] held in the state `z`."""
+        """Energy [J] stored in the state `z`."""
 
     @abc.abstractmethod
     def step_exact(self, v: Float[Array, "..."], z: PyTree, dt: Scalar) -> PyTree:
-        """State after the time `dt` [s] at constant slip velocity `v` [m/s]: bounded at any step, however stiff."""
+        """State after the time `dt` [s] at constant slip velocity `v` [m/s], bounded for any step and stiffness."""
 
     def modelica(self) -> str:
         """Modelica's friction components have no state of their own."""
         return (
             f"state of their own, which {type(self).__name__} has. Export its force in steady slip, as a Stribeck, or"
-            " write its equations in a model of your own"
+            " write its equations in a custom model"
         )
 
 
 class AbstractPlanarLaw(AbstractDynamicLaw):
-    """A dynamic law whose slip may also be a vector, shape `[2]` or `[3]`; its state then has as many components.
+    """A dynamic law whose slip may also be a vector, shape `[2]` or `[3]`; its state then has the same shape.
 
-    What depends on speed depends on the magnitude of slip, so that the components are coupled.
+    The magnitude of the slip velocity is its speed, which couples the components.
     """
 
-    execution: ClassVar[str] = "as it is, in the plane too"
+    execution: ClassVar[str] = "integrated directly, also in the plane"
 
 
 # Registered laws by name.
@@ -277,15 +339,15 @@ _LAWS: dict[str, type[AbstractLaw]] = {}
 
 
 def register_law(law: type[_Law]) -> type[_Law]:
-    """Make a law known by the name of its class: a decorator of final classes.
+    """Class decorator that registers a law under the name of its class.
 
-    From then on it is a `kind` in the files of `jaxmodsim sweep`, and stands in the table of laws. With `cases()` the
-    behaviour bench of the repository runs it (`python -m bench behaviour`), with `fit_start()` it is a model of
+    A registered law is a `kind` in the files of `jaxmodsim sweep` and a row in the table of laws. With `cases()` the
+    behaviour bench of the repository runs it (`python -m bench behaviour`); with `fit_start()` it is a model of
     `jaxmodsim fit`.
 
     **Arguments:**
 
-    - `law`: a final class derived from one of the kinds of law, such as `AbstractForceLaw`.
+    - `law`: a final class that derives from a kind of law, such as `AbstractForceLaw`.
 
     **Returns:**
 
@@ -293,12 +355,14 @@ def register_law(law: type[_Law]) -> type[_Law]:
 
     **Raises:**
 
-    - `ValueError` for what is no such class, and for a name that another class has.
+    - `ValueError` if `law` is not such a class, or its name is taken.
     """
     if not (isinstance(law, type) and issubclass(law, AbstractLaw)) or inspect.isabstract(law):
-        raise ValueError(f"register_law needs a final class of laws, as of AbstractForceLaw, but {law!r} was given.")
+        raise ValueError(
+            f"register_law needs a final class of laws, derived from one such as AbstractForceLaw; given: {law!r}."
+        )
     if law.__name__ in _LAWS:
-        raise ValueError(f"register_law: there is a law {law.__name__} already; give the class another name.")
+        raise ValueError(f"register_law: there is a law {law.__name__} already; rename the class.")
     _LAWS[law.__name__] = law
     return law
 

@@ -1,4 +1,4 @@
-"""Generalised Maxwell slip."""
+"""The generalised Maxwell-slip law."""
 
 import math
 from typing import ClassVar
@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core.arrays import Scalar
+from .._core.functions import nominal
 from .._core.parameters import (
     Number,
     Vector,
@@ -15,41 +17,37 @@ from .._core.parameters import (
     parameter,
     vector_parameter,
 )
-from .._core.shapes import Scalar
-from .._core.state_dependent import nominal
-from ._bristle import advance_elastoplastic, slip_fraction, stribeck_curve
-from ._law import AbstractDynamicLaw, register_law
-from ._law_case import STANDARD, LawCase, steady_curve, stribeck_case
-from ._passivity import Passivity
+from ._bristles import advance_elastoplastic, slip_fraction, stribeck_curve
+from ._law import STANDARD, AbstractDynamicLaw, LawCase, Passivity, register_law, steady_curve, stribeck_case
 
 
 @register_law
 class MaxwellSlip(AbstractDynamicLaw):
-    """Elastic elements in parallel, each of which gives way at its own force: hysteresis with non-local memory.
+    """Elastic elements in parallel that yield at different forces: hysteresis with non-local memory.
 
     Element i is a spring of stiffness `k_i` that slips at the force `s_i(v) = Fc_i + (Fs_i - Fc_i) exp(-(v/vs)^2)`, and
-    sticks again when the velocity reverses; `F = sum_i k_i z_i + sigma2 v`. Loops within loops close where they began,
-    as in Leuven's model. With one element and a small `corner` it is a spring in series with Coulomb friction.
+    sticks again when the velocity reverses; `F = sum_i k_i z_i + sigma2 v`. Nested hysteresis loops close, as in the
+    Leuven model. With one element and a small `corner` it is a spring in series with Coulomb friction.
 
-    A spring that stopped dead would make the rates jump, and chatter where the limit changes with velocity. So an
-    element follows the surface up to `1 - corner` of its limit and gives way over the rest:
+    A sudden transition from stick to slip would make the rates jump, and chatter if the limit depends on velocity. So
+    an element follows the surface up to `1 - corner` of its limit and yields gradually above:
     `z' = v (1 - max(0, u - 1 + corner)/corner)` with `u = k z sign(v)/s_i(v)`. With `C` an element beyond its limit
-    (the speed has risen) falls back as in the generalised model, `F_i' = sign(v) C (alpha_i - F_i/s(v))`, s the sum of
-    all s_i and `alpha_i = Fc_i/sum Fc`, which is a lag in time.
+    (after an increase of speed) returns as in the generalised model, `F_i' = sign(v) C (alpha_i - F_i/s(v))`, a lag in
+    time. Here s is the sum of all s_i, and `alpha_i = Fc_i/sum Fc`.
 
     **Arguments:**
 
     - `k`: stiffness of each element [N/m], > 0, shape `[n]`.
     - `Fc`: Coulomb force of each element [N], > 0, shape `[n]`.
     - `Fs`: stiction force of each element [N], >= Fc, shape `[n]`; by default Fc.
-    - `vs`: Stribeck velocity [m/s], > 0; needed with Fs.
-    - `C`: attraction to the limit from beyond [N/s], > 0; by default as fast as the corner.
+    - `vs`: Stribeck velocity [m/s], > 0; required with Fs.
+    - `C`: attraction to the limit from beyond [N/s], > 0; by default the return follows from `corner`.
     - `sigma2`: viscous coefficient [N s/m], >= 0.
-    - `corner`: part of its limit over which an element gives way, > 0 and <= 1.
+    - `corner`: fraction of its limit over which an element yields, > 0 and <= 1.
 
     **Raises:**
 
-    - `ValueError` if a parameter is out of range or no number, or lengths differ.
+    - `ValueError` if a parameter is out of range or no number, or if lengths differ.
 
     ??? cite "Reference"
 
@@ -71,7 +69,7 @@ class MaxwellSlip(AbstractDynamicLaw):
     sigma2: Number = parameter("sigma2", "N s/m", lower=0.0, default=0.0)
     corner: Number = parameter("corner", "1", lower=0.0, strict=True, upper=1.0, execution=True, default=0.02)
     stiff: ClassVar[bool] = True
-    description: ClassVar[str] = "any number of elements: non-local memory"
+    description: ClassVar[str] = "elements in parallel: non-local memory"
     equations: ClassVar[tuple[str, ...]] = (
         "sum(k z) + sigma2 v",
         "z' = v (1 - max(0, u - 1 + corner)/corner)",
@@ -79,20 +77,20 @@ class MaxwellSlip(AbstractDynamicLaw):
         "s(v) = Fc + (Fs - Fc) exp(-(v/vs)^2)",
     )
     mujoco_lacks: ClassVar[str] = (
-        ", for its bristle yields all the way, and not at a limit: fit a Dahl or LuGre and export that"
+        ": its bristle yields at any force, not at a limit. Fit a Dahl or LuGre and export that"
     )
 
     def __check_init__(self) -> None:
-        """Refuse elements that are not complete."""
+        """Refuse incomplete elements."""
         for name in ("Fc", "Fs"):
-            given = getattr(self, name)
-            if given is not None and jnp.shape(given) != jnp.shape(self.k):
+            force = getattr(self, name)
+            if force is not None and jnp.shape(force) != jnp.shape(self.k):
                 raise ValueError(
                     f"MaxwellSlip: {name} must have one number for each of the {jnp.shape(self.k)[0]} elements of k,"
-                    f" but it has the shape {jnp.shape(given)}."
+                    f" but it has the shape {jnp.shape(force)}."
                 )
         if (self.Fs is None) != (self.vs is None):
-            raise ValueError("MaxwellSlip: Fs and vs make the Stribeck effect together; give both or none.")
+            raise ValueError("MaxwellSlip: the Stribeck effect needs both Fs and vs; give both or none.")
 
     def limit(self, v: Scalar) -> Float[Array, " n"]:
         """Force [N] at which each element slips at velocity `v` [m/s]."""
@@ -101,7 +99,7 @@ class MaxwellSlip(AbstractDynamicLaw):
         return stribeck_curve(v, self.Fc, self.Fs, self.vs)
 
     def _attraction(self, limit: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Rate [1/s] at which an element beyond its limit falls back to it."""
+        """Rate [1/s] at which an element beyond its limit returns to it."""
         return self.C * self.Fc / jnp.sum(self.Fc) / limit
 
     def initial_state(self, v: Float[Array, "..."]) -> Float[Array, " n"]:
@@ -126,7 +124,7 @@ class MaxwellSlip(AbstractDynamicLaw):
         return 0.5 * jnp.sum(self.k * z * z)
 
     def step_exact(self, v: Scalar, z: Float[Array, " n"], dt: Scalar) -> Float[Array, " n"]:
-        """Deflections [m] after `dt` [s] at constant `v` [m/s], exactly."""
+        """Exact deflections [m] after `dt` [s] at constant `v` [m/s]."""
         limit = self.limit(v)
         after = advance_elastoplastic(v, z, dt, limit / self.k, self.corner)
         if self.C is None:
@@ -137,14 +135,14 @@ class MaxwellSlip(AbstractDynamicLaw):
         return jnp.where(u > 1.0, falling, after)
 
     def passivity(self) -> Passivity:
-        """Always passive: an element lags only towards the side that it is loaded on, so `k z (v - z') >= 0`."""
-        words = "MaxwellSlip is always passive: an element lags only towards the side that it is loaded on."
-        return Passivity(True, float(nominal(self.sigma2)), math.inf, words)
+        """Always passive: an element slips only in the direction of its load, so `k z (v - z') >= 0`."""
+        condition = "MaxwellSlip is always passive: an element slips only in the direction of its load."
+        return Passivity(True, float(nominal(self.sigma2)), math.inf, condition)
 
     @classmethod
     def cases(cls) -> tuple[LawCase, ...]:
-        """One element; four, the first of which gives way at a sixth of the deflection of all; and with lag."""
-        # Shares of the elements in stiffness and in force.
+        """One element; four elements; four elements with lag."""
+        # Fractions of the total stiffness and force. The first element yields at 1/16 of the last one's deflection.
         stiffness, force = np.array([0.4, 0.3, 0.2, 0.1]), np.array([0.1, 0.2, 0.3, 0.4])
         sigma0, Fc, Fs, Fv = (STANDARD[name] for name in ("sigma0", "Fc", "Fs", "Fv"))
         four = {"k": sigma0 * stiffness, "Fc": Fc * force, "sigma2": Fv}

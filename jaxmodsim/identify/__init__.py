@@ -48,5 +48,5 @@ from .uncertainty._profile import Profile as Profile
 from .uncertainty._profile import profile as profile
 from .uncertainty._residual_tests import residual_tests as residual_tests
 from .uncertainty._result import FitResult as FitResult
+from .uncertainty._result import is_step_size_limited as is_step_size_limited
 from .uncertainty._result import remarks as remarks
-from .uncertainty._result import step_shows as step_shows

@@ -1,4 +1,4 @@
-"""From a Lagrangian to equations of motion; constraints and their reactions; coordinates and their frames."""
+"""Equations of motion from a Lagrangian; constraints, contacts and their reactions; bodies and charts."""
 
 from ._bodies import point_mass as point_mass
 from ._bodies import rigid_body as rigid_body
@@ -17,6 +17,10 @@ from ._constraints import project as project
 from ._constraints import rates as rates
 from ._contact import BoundContact as BoundContact
 from ._contact import Contact as Contact
+from ._contact import HuntCrossley as HuntCrossley
+from ._contact import Poisson as Poisson
+from ._contact import backlash as backlash
+from ._contact import end_stops as end_stops
 from ._lagrange import Lagrangian as Lagrangian
 from ._lagrange import MotionEquations as MotionEquations
 from ._lagrange import acceleration as acceleration
@@ -26,7 +30,3 @@ from ._lagrange import momentum as momentum
 from ._lagrange import motion_equations as motion_equations
 from ._lagrange import quadratic as quadratic
 from ._lagrange import velocity as velocity
-from ._restitution import HuntCrossley as HuntCrossley
-from ._restitution import Poisson as Poisson
-from ._stops import backlash as backlash
-from ._stops import end_stops as end_stops

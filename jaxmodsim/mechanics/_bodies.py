@@ -1,4 +1,4 @@
-"""Lagrangians of bodies whose place is a function of the coordinates."""
+"""Lagrangians of bodies whose position is a function of the coordinates."""
 
 import abc
 from collections.abc import Callable
@@ -7,22 +7,21 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from .._core.arrays import PerDof, Scalar, is_known
+from .._core.cholesky import solve_balanced
 from .._core.functions import as_function
-from .._core.index_check import check_indices
 from .._core.parameters import Default, Range
 from .._core.position import PositionFn, ScalarOrFn, as_position_fn, as_scalar_or_fn
 from .._core.safe import safe_norm
-from .._core.semidefinite import solve_balanced
-from .._core.shapes import PerDof, Scalar
+from .._core.trace_checks import check_indices
 
 _MASS, _INERTIA, _GRAVITY = Range("kg", 0.0, strict=True), Range("kg m^2"), Range("m/s^2")
 _ON_EARTH = Default(9.81)
-# Part of the largest moment of inertia that counts as rounding.
+# Fraction of the largest moment of inertia that counts as rounding.
 _ROUNDING = 1e-6
 
 
@@ -43,7 +42,7 @@ class AbstractBody(eqx.Module):
 
 
 class Bodies(AbstractBody):
-    """Several Lagrangians together."""
+    """A sum of Lagrangians."""
 
     parts: tuple[Callable[..., Any], ...]
 
@@ -58,11 +57,11 @@ class Bodies(AbstractBody):
 def _parts(lagrangian: Any) -> tuple[Callable[..., Any], ...]:
     if isinstance(lagrangian, Bodies):
         return lagrangian.parts
-    return (as_function(lagrangian, name="What is added to a body"),)
+    return (as_function(lagrangian, name="The term added to a body"),)
 
 
 class PointMass(AbstractBody):
-    """Lagrangian of a point mass; made by `point_mass`."""
+    """Lagrangian of a point mass, from `point_mass`."""
 
     m: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="point_mass m", allowed=_MASS))
     position: PositionFn = eqx.field(converter=partial(as_position_fn, name="point_mass position"))
@@ -75,10 +74,10 @@ class PointMass(AbstractBody):
         return 0.5 * m * jnp.sum(v**2) - m * self.gravity(params) * x[2]
 
     def reaction(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, "3"]:
-        """Force [N] of the path or surface on the mass, normal to it, from curvature and gravity, shape `[3]`.
+        """Normal force [N] of the path or surface on the mass, from curvature and gravity, shape `[3]`.
 
-        It is the normal part of `m (d2x/dt2 + g ez)`, which the accelerations along the path do not enter. Normal
-        components of further forces on the mass are to be taken off: they are not known here.
+        It is the normal part of `m (d2x/dt2 + g ez)`, which does not depend on accelerations along the path. Subtract
+        the normal components of other forces on the mass, which the Lagrangian does not contain.
         """
         _check_indices(self.position, q, params)
 
@@ -95,7 +94,7 @@ class PointMass(AbstractBody):
         return load - jnp.sum(tangents * share[:, None], axis=0)
 
     def normal_force(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
-        """Magnitude [N] of `reaction`, to be given to `Friction(normal_force=bead.normal_force)`."""
+        """Magnitude [N] of `reaction`, for `Friction(normal_force=bead.normal_force)`."""
         return safe_norm(self.reaction(t, q, qd, params))
 
 
@@ -111,26 +110,26 @@ def point_mass(m: Any, position: Any, gravity: Any = _ON_EARTH) -> PointMass:
 
     **Arguments:**
 
-    - `m`: mass [kg], > 0, or `m(params)`, so that a number in `params` serves several functions.
+    - `m`: mass [kg], > 0, or a function `m(params)`, so that several functions can share a number in `params`.
     - `position`: `position(q)` or `position(q, params)` in space [m], shape `[3]`, z upwards.
     - `gravity`: acceleration [m/s^2] along -z, or a function of `params`; by default 9.81.
 
     **Returns:**
 
-    A function `L(t, q, qd, params)` [J] with the methods `reaction` and `normal_force`: what a path or surface does to
-    the mass. Its numbers are leaves of the scene.
+    A function `L(t, q, qd, params)` [J] with the methods `reaction` and `normal_force`, the force of a path or surface
+    on the mass. Its numbers are leaves of the scene.
 
     **Raises:**
 
-    - `ValueError` for what is no number or no function, and (at the run) if `position` returns another shape or uses an
-      index beyond the coordinates.
+    - `ValueError` if an argument is neither a number nor a function, and (in the run) if `position` returns another
+      shape or uses an index out of range.
     """
     return PointMass(m, position, gravity)
 
 
 def _inertia(value: object) -> ScalarOrFn:
     inertia = as_scalar_or_fn(value, name="rigid_body inertia", allowed=_INERTIA, array=True)
-    if callable(inertia.amount) or isinstance(inertia.amount, jax.core.Tracer):
+    if callable(inertia.amount) or not is_known(inertia.amount):
         return inertia
     known = np.asarray(inertia.amount)
     rounding = _ROUNDING * np.abs(known).max(initial=0.0)
@@ -138,12 +137,12 @@ def _inertia(value: object) -> ScalarOrFn:
     if tensor and np.abs(known - known.T).max() > rounding:
         raise ValueError(f"rigid_body inertia must be symmetric, but {known.tolist()} was given.")
     if (moments := np.linalg.eigvalsh(known) if tensor else known).min(initial=0.0) < -rounding * tensor:
-        raise ValueError(f"rigid_body inertia must have moments >= 0 [kg m^2], but those given are {moments.tolist()}.")
+        raise ValueError(f"rigid_body inertia must have moments >= 0 [kg m^2], but they are {moments.tolist()}.")
     return inertia
 
 
 class RigidBody(AbstractBody):
-    """Lagrangian of a rigid body; made by `rigid_body`."""
+    """Lagrangian of a rigid body, from `rigid_body`."""
 
     m: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="rigid_body m", allowed=_MASS))
     inertia: ScalarOrFn = eqx.field(converter=_inertia)
@@ -168,17 +167,17 @@ class RigidBody(AbstractBody):
 
 
 def rigid_body(m: Any, inertia: Any, position: Any, orientation: Any, gravity: Any = _ON_EARTH) -> RigidBody:
-    """Lagrangian of a rigid body by the motion of its centre of mass and of a frame fixed in it.
+    """Lagrangian of a rigid body, from the motion of its centre of mass and of a body-fixed frame.
 
     **Arguments:**
 
     - `m`: mass [kg], > 0, or `m(params)`.
-    - `inertia`: moments of inertia [kg m^2] about the centre of mass, or a function of `params`: with an angle the one
-      about its axis; with a matrix the principal ones along the axes of the body frame, shape `[3]`, or the tensor in
-      that frame, shape `[3, 3]`, symmetric. None of the moments is negative.
+    - `inertia`: moments of inertia [kg m^2] about the centre of mass, >= 0, or a function of `params`. For an angle,
+      the moment about its axis; for a matrix, the principal moments along the axes of the body frame, shape `[3]`, or
+      the symmetric tensor in that frame, shape `[3, 3]`.
     - `position`: `position(q)` or `position(q, params)` of the centre of mass [m], shape `[3]`, z upwards.
-    - `orientation`: `orientation(q)` or `orientation(q, params)`: the rotation matrix, shape `[3, 3]`, whose columns
-      are the axes of the body frame in fixed components; or, for plane motion, the angle [rad] about a fixed axis.
+    - `orientation`: `orientation(q)` or `orientation(q, params)`: the rotation matrix, shape `[3, 3]`, with the axes of
+      the body frame as columns; or, for plane motion, the angle [rad] about a fixed axis.
     - `gravity`: acceleration [m/s^2] along -z, or a function of `params`; by default 9.81.
 
     **Returns:**
@@ -187,32 +186,32 @@ def rigid_body(m: Any, inertia: Any, position: Any, orientation: Any, gravity: A
 
     **Raises:**
 
-    - `ValueError` for what is no number or no function, and (at the run) for wrong shapes and for
-      indices beyond the coordinates.
+    - `ValueError` if an argument is neither a number nor a function, and (in the run) for wrong shapes and for indices
+      out of range.
     """
     return RigidBody(m, inertia, position, orientation, gravity)
 
 
 def body_rates(turn: Float[Array, "3 3"], rate: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """Angular velocity [rad/s] of a frame in its own components, from its rotation matrix and that one's rate."""
+    """Angular velocity [rad/s] of a frame in its own components, from its rotation matrix and the matrix rate."""
     skew = jnp.sum(turn[:, :, None] * rate[:, None, :], axis=0)
     return 0.5 * jnp.stack([skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]])
 
 
-def _moving(position: PositionFn, q: Array, qd: Array, params: PyTree, what: str) -> tuple[Array, Array]:
+def _moving(position: PositionFn, q: Array, qd: Array, params: PyTree, owner: str) -> tuple[Array, Array]:
     _check_indices(position, q, params)
     x, v = jax.jvp(lambda q: position(q, params), (q,), (qd,))
     if x.shape != (3,):
         raise ValueError(
-            f"{what}: position returned the shape {x.shape}, but (3,) is needed: x, y, z [m]. For motion in a plane"
-            " keep the third one zero, with z upwards."
+            f"{owner}: position returned the shape {x.shape}, but (3,) is needed: x, y, z [m], with z upwards. For"
+            " horizontal plane motion set z to zero."
         )
     return x, v
 
 
 def _check_indices(place: PositionFn, q: Array, params: PyTree) -> None:
-    """Refuse indices out of range where a body is called by itself; a scene looks at its whole Lagrangian."""
-    if not isinstance(q, jax.core.Tracer):
+    """Refuse indices out of range if a body is called directly; a scene checks its whole Lagrangian."""
+    if is_known(q):
         check_indices(place, q, params, name=place.name)
 
 

@@ -1,8 +1,8 @@
-"""Constraints: what they say about position and velocity, their multipliers, and the way back onto them.
+"""Constraints: equations of position and velocity, their multipliers, and the projection onto them.
 
-With the velocity constraints `w(t, q, qd) = 0` of all constraints together and `J = dw/dqd`, accelerations `a` without
-them become `qdd = a + M^-1 J^T lambda`, where `J M^-1 J^T lambda = -(J a + bias)`. Redundant constraints leave that
-matrix singular: the motion is unique, and of all multipliers the smallest are taken.
+All constraints together have the velocity equations `w(t, q, qd) = 0` with `J = dw/dqd`. They change the unconstrained
+accelerations `a` to `qdd = a + M^-1 J^T lambda`, where `J M^-1 J^T lambda = -(J a + bias)`. For redundant constraints
+that matrix is singular: the motion is unique, and the multipliers are those of least norm.
 """
 
 import abc
@@ -18,14 +18,13 @@ from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
 from .._core.arguments import as_label
-from .._core.cholesky import factor_positive_definite
+from .._core.arrays import PerDof, Scalar
+from .._core.cholesky import factor_positive_definite, solve_balanced
 from .._core.functions import as_function, result_shape
-from .._core.index_check import traced
 from .._core.parameters import Number, check_ranges, parameter
 from .._core.position import PositionFn, as_position_fn
 from .._core.safe import safe_norm
-from .._core.semidefinite import solve_balanced
-from .._core.shapes import PerDof, Scalar
+from .._core.trace_checks import traced
 
 
 def as_at(value: Any) -> PositionFn | None:
@@ -34,15 +33,15 @@ def as_at(value: Any) -> PositionFn | None:
 
 
 class AbstractConstraint(eqx.Module):
-    """One or several equations that the motion obeys, each with a multiplier."""
+    """One or several equations of the motion, each with a multiplier."""
 
-    # By which the constraint is known in the results and to friction; None for the class's own.
+    # Name of the constraint in the results and for friction; None for the default name.
     if TYPE_CHECKING:
         name = cast("str | None", None)  # not a field, which would come before those of the constraints
         stabilise = cast("Array", None)
     else:
         name: AbstractVar[str | None]
-        # Rate [1/s] at which errors die out.
+        # Rate [1/s] at which errors decay.
         stabilise: AbstractVar[Number]
 
     def __check_init__(self) -> None:
@@ -51,11 +50,11 @@ class AbstractConstraint(eqx.Module):
 
     @abc.abstractmethod
     def error(self, t: Scalar, q: PerDof, params: PyTree) -> Float[Array, " m"] | None:
-        """What is zero where the position is admissible, shape `[m]`; None where no position is excluded."""
+        """Residual of the position, shape `[m]`; None for a constraint on velocities alone."""
 
     @abc.abstractmethod
     def rate(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, " m"]:
-        """What is zero where the velocity is admissible, shape `[m]`."""
+        """Residual of the velocity, shape `[m]`."""
 
     @abc.abstractmethod
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
@@ -63,15 +62,15 @@ class AbstractConstraint(eqx.Module):
 
     @abc.abstractmethod
     def force(self, t: Scalar, q: PerDof, params: PyTree, multiplier: Float[Array, " m"]) -> Float[Array, "..."] | None:
-        """Cartesian force [N] at the constrained point; None where no point is known."""
+        """Cartesian force [N] at the constrained point; None without a point."""
 
     @abc.abstractmethod
     def per_multiplier(self, t: Scalar, q: PerDof, params: PyTree) -> Scalar:
-        """Magnitude [N] of the force at a multiplier of one, for a single equation."""
+        """Magnitude [N] of the force for a multiplier of one, for a single equation."""
 
 
 class AbstractPositionConstraint(AbstractConstraint):
-    """Something that is said about the position of a point, or about the coordinates themselves."""
+    """A constraint on the position of a point, or on the coordinates."""
 
     if TYPE_CHECKING:
         at = cast("PositionFn | None", None)
@@ -80,59 +79,60 @@ class AbstractPositionConstraint(AbstractConstraint):
 
     @abc.abstractmethod
     def value(self, t: Scalar, x: Float[Array, "..."], params: PyTree) -> Float[Array, "..."]:
-        """What is said of the position `x`, or of the coordinates where `at` is None; a number or shape `[m]`."""
+        """Residual at the position `x`, or at the coordinates if `at` is None; a number or shape `[m]`."""
 
     def error(self, t: Scalar, q: PerDof, params: PyTree) -> Float[Array, " m"]:
-        """The value at the coordinates, shape `[m]`."""
+        """Residual at the coordinates, shape `[m]`."""
         return self._values(t, q if self.at is None else self.at(q, params), params)
 
     def _values(self, t: Scalar, x: Float[Array, "..."], params: PyTree) -> Float[Array, " m"]:
         return jnp.ravel(jnp.asarray(self.value(t, x, params), x.dtype))
 
     def rate(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, " m"]:
-        """Its time derivative, shape `[m]`."""
+        """Time derivative of the residual, shape `[m]`."""
         return jax.jvp(lambda t, q: self.error(t, q, params), (t, q), (jnp.ones_like(t), qd))[1]
 
-    def check_value(self, fn: Callable[..., Any], what: str, q: PerDof, params: PyTree, name: str) -> None:
-        """Check that `fn`, which `what` calls as in "phi of Constraint", returns a number or a vector."""
+    def check_value(self, fn: Callable[..., Any], role: str, q: PerDof, params: PyTree, name: str) -> None:
+        """Check that `fn`, with a `role` such as "phi of Constraint", returns a number or a vector."""
         place = {"q": q}
         if self.at is not None:
-            place = {"x": traced(self.at, q=q, params=params, name=f"at of {what.split()[-1]} {name!r}")}
-        _check_vector(f"{what} {name!r}", fn, t=q[0], **place, params=params)
+            place = {"x": traced(self.at, q=q, params=params, name=f"at of {role.split()[-1]} {name!r}")}
+        _check_vector(f"{role} {name!r}", fn, t=q[0], **place, params=params)
 
     def force(self, t: Scalar, q: PerDof, params: PyTree, multiplier: Float[Array, " m"]) -> Float[Array, "..."] | None:
-        """`(d value/dx)^T lambda` [N], of the shape of `at`'s positions."""
+        """`(d value/dx)^T lambda` [N], with the shape of the result of `at`."""
         if self.at is None:
             return None
         _, pull = jax.vjp(lambda x: self._values(t, x, params), self.at(q, params))
         return pull(multiplier)[0]
 
     def per_multiplier(self, t: Scalar, q: PerDof, params: PyTree) -> Scalar:
-        """Length of d value/dx; one where `at` is not given, so that the value must be a length along the normal."""
+        """Length of d value/dx; one without `at`, where the value must be a length along the normal."""
         force = self.force(t, q, params, jnp.ones(1, q.dtype))
         return jnp.ones_like(t) if force is None else safe_norm(jnp.ravel(force))
 
 
 class Constraint(AbstractPositionConstraint):
-    """A holonomic constraint `phi(t, q, params) = 0`, kept by the force of its multiplier.
+    """A holonomic constraint `phi(t, q, params) = 0`, enforced by the force of its multiplier.
 
-    The equations of motion are `M qdd = load + Q + J^T lambda` with `J = dphi/dq`: the multiplier is positive where it
-    pushes towards larger phi (so that of a rod under tension, `phi = |x| - l`, is negative). Where phi is a length
-    measured along the normal, it is the normal force in newtons. What can only push, a floor, is a `Contact`.
+    The equations of motion are `M qdd = load + Q + J^T lambda` with `J = dphi/dq`: a positive multiplier pushes towards
+    larger phi. For example, that of a rod under tension, `phi = |x| - l`, is negative. If phi is a length along the
+    normal, the multiplier is the normal force in newtons. A constraint that can only push, such as a floor, is a
+    `Contact`.
 
     **Arguments:**
 
     - `phi`: `phi(t, q, params)`, a scalar or shape `[m]`, any unit. With `at`, `phi(t, x, params)` of the position x.
     - `at`: `at(q)` or `at(q, params)`, the position [m] of the constrained point, or of several in an array of any
-      shape. Then the force of constraint is known in space, whatever the unit of phi.
-    - `stabilise`: rate [1/s], >= 0, at which an error of position dies out: the accelerations obey
-      `phi'' + 2 stabilise phi' + stabilise^2 phi = 0` (Baumgarte 1972). By default none, as `simulate` projects the
+      shape. With it `run.reactions` has the force in space, for any unit of phi.
+    - `stabilise`: rate [1/s], >= 0, at which a position error decays: the accelerations obey
+      `phi'' + 2 stabilise phi' + stabilise^2 phi = 0` (Baumgarte 1972). By default 0, because `simulate` projects the
       state onto the constraint after every step.
     - `name`: name in `run.reactions`, and for `Friction(normal_force=name)`.
 
     **Raises:**
 
-    - `ValueError` for functions that are none, numbers out of range, and (at the run) for wrong shapes.
+    - `ValueError` if an argument is not a function or out of range, and (in the run) for wrong shapes.
 
     ??? cite "Reference"
 
@@ -152,7 +152,7 @@ class Constraint(AbstractPositionConstraint):
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Constraint name"))
 
     def value(self, t: Scalar, x: Float[Array, "..."], params: PyTree) -> Float[Array, "..."]:
-        """Phi."""
+        """The value of phi."""
         return self.phi(t, x, params)
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
@@ -161,15 +161,15 @@ class Constraint(AbstractPositionConstraint):
 
 
 class VelocityConstraint(AbstractConstraint):
-    """A constraint on velocities that no function of position expresses: rolling, a blade that does not slip sideways.
+    """A nonholonomic constraint on velocities: rolling, or a blade that does not slip sideways.
 
     The equations of motion are `M qdd = load + Q + A^T lambda` with `A = dpsi/dqd`.
 
     **Arguments:**
 
-    - `psi`: `psi(t, q, qd, params)`, zero in admissible motion, a scalar or shape `[m]`; linear in qd. (Where it is
-      not, A as it stands is Chetaev's rule.)
-    - `stabilise`: rate [1/s], >= 0, at which an error of velocity dies out: `psi' + stabilise psi = 0`.
+    - `psi`: `psi(t, q, qd, params)`, zero in admissible motion, a scalar or shape `[m]`; linear in qd. (For a nonlinear
+      psi the matrix A follows Chetaev's rule.)
+    - `stabilise`: rate [1/s], >= 0, at which a velocity error decays: `psi' + stabilise psi = 0`.
     - `name`: name in `run.reactions`.
 
     **Raises:**
@@ -182,10 +182,10 @@ class VelocityConstraint(AbstractConstraint):
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="VelocityConstraint name"))
 
     def error(self, t: Scalar, q: PerDof, params: PyTree) -> None:
-        """No position is excluded."""
+        """None: the constraint does not exclude positions."""
 
     def rate(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, " m"]:
-        """psi, shape `[m]`."""
+        """The value of psi, shape `[m]`."""
         return jnp.ravel(jnp.asarray(self.psi(t, q, qd, params), q.dtype))
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
@@ -193,35 +193,35 @@ class VelocityConstraint(AbstractConstraint):
         _check_vector(f"psi of VelocityConstraint {name!r}", self.psi, t=q[0], q=q, qd=qd, params=params)
 
     def force(self, t: Scalar, q: PerDof, params: PyTree, multiplier: Float[Array, " m"]) -> None:
-        """The point is not known."""
+        """None: the constraint has no point."""
 
     def per_multiplier(self, t: Scalar, q: PerDof, params: PyTree) -> Scalar:
-        """One: psi must be a velocity."""
+        """One, if psi is a velocity."""
         return jnp.ones_like(t)
 
 
-def _check_vector(what: str, fn: Callable[..., Any], **args: Any) -> None:
-    shape = result_shape(fn, **args, name=what)
+def _check_vector(role: str, fn: Callable[..., Any], **args: Any) -> None:
+    shape = result_shape(fn, **args, name=role)
     if shape is None or len(shape) > 1 or shape == (0,):
-        given = "no array" if shape is None else f"shape {shape}"
+        result = "no array" if shape is None else f"shape {shape}"
         raise ValueError(
-            f"{what} must return one number or a vector, but it returned {given}. Return jnp.array([...]) with one"
+            f"{role} must return one number or a vector, but it returned {result}. Return jnp.array([...]) with one"
             " entry for each equation."
         )
 
 
-# Newton steps of a projection; the error of a step of integration is squared in each.
+# Newton steps of a projection: each squares the error of an integration step.
 _NEWTON = 2
 
 Constraints = Sequence[AbstractConstraint]
 
 
 class LinearizedConstraints(NamedTuple):
-    """All constraints of a mechanism at one state; m equations.
+    """All m equations of the constraints at one state.
 
     - `rows`: J, shape `[m, dof]`.
-    - `bias`: rate of w where qdd = 0, with the stabilising terms, shape `[m]`.
-    - `reach`: rows `M^-1 J_k`, the accelerations of unit multipliers, shape `[m, dof]`.
+    - `bias`: rate of w for qdd = 0, with the stabilization terms, shape `[m]`.
+    - `minv_jt`: rows `M^-1 J_k`, the accelerations by unit multipliers, shape `[m, dof]`.
     - `matrix`: `J M^-1 J^T`, shape `[m, m]`.
     """
 
@@ -231,30 +231,30 @@ class LinearizedConstraints(NamedTuple):
     matrix: Float[Array, "m m"]
 
     def multipliers(self, qdd: PerDof) -> Float[Array, " m"]:
-        """Multipliers that make accelerations `qdd` admissible."""
+        """Multipliers that make the accelerations `qdd` admissible."""
         return -solve_balanced(self.matrix, _times(self.rows, qdd) + self.bias)
 
     def multiplier_response(self, qdd: PerDof) -> Float[Array, " m"]:
-        """What multipliers change if the accelerations without constraints change by `qdd`."""
+        """Change of the multipliers if the unconstrained accelerations change by `qdd`."""
         return -solve_balanced(self.matrix, _times(self.rows, qdd))
 
     def respond(self, qdd: PerDof) -> PerDof:
-        """Change of the accelerations within the constraints, where it is `qdd` without them."""
+        """Change of the accelerations if the unconstrained accelerations change by `qdd`."""
         return qdd + self.apply_force(self.multiplier_response(qdd))
 
     def apply_force(self, multipliers: Float[Array, " m"]) -> PerDof:
-        """Accelerations that multipliers make."""
+        """Accelerations by the multipliers."""
         return jnp.sum(self.minv_jt * multipliers[:, None], axis=0)
 
     def force(self, multipliers: Float[Array, " m"]) -> PerDof:
-        """Generalised force of multipliers."""
+        """Generalised force of the multipliers."""
         return jnp.sum(self.rows * multipliers[:, None], axis=0)
 
 
 def linearize_constraints(
     constraints: Constraints, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, mass: Float[Array, "dof dof"]
 ) -> LinearizedConstraints:
-    """The constraints at one state of a mechanism with the mass matrix `mass`."""
+    """Linearize the constraints at one state of a mechanism with the mass matrix `mass`."""
 
     def along(t: Array, q: Array) -> Array:
         return rates(constraints, t, q, params)(qd)
@@ -265,18 +265,17 @@ def linearize_constraints(
         error, rate = each.error(t, q, params), jnp.asarray(each.stabilise, q.dtype)
         damped = rate * w[part] if error is None else 2.0 * rate * w[part] + rate**2 * error
         bias = bias.at[part].add(damped)
-    reach, matrix = _reach(rows, mass)
-    return LinearizedConstraints(rows, bias, reach, matrix)
+    return LinearizedConstraints(rows, bias, *_mobility(rows, mass))
 
 
 def parts(constraints: Constraints, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> list[slice]:
-    """Where the equations of each constraint stand among those of all."""
+    """Slice of the equations of each constraint."""
     ends = list(accumulate(jax.eval_shape(each.rate, t, q, qd, params).shape[0] for each in constraints))
     return [slice(start, end) for start, end in zip([0, *ends], ends, strict=False)]
 
 
 def errors(constraints: Constraints, t: Scalar, params: PyTree) -> Callable[[PerDof], Float[Array, " h"]]:
-    """All that holonomic constraints say about the coordinates, as a function of these; h = 0 where there are none."""
+    """Residuals of all holonomic constraints as a function of the coordinates; h = 0 if there are none."""
 
     def at(q: Array) -> Array:
         holonomic = [each.error(t, q, params) for each in constraints]
@@ -286,7 +285,7 @@ def errors(constraints: Constraints, t: Scalar, params: PyTree) -> Callable[[Per
 
 
 def rates(constraints: Constraints, t: Scalar, q: PerDof, params: PyTree) -> Callable[[PerDof], Float[Array, " m"]]:
-    """All that constraints say about the velocities, as a function of these."""
+    """Residuals of all constraints as a function of the velocities."""
 
     def at(qd: Array) -> Array:
         return jnp.concatenate([each.rate(t, q, qd, params) for each in constraints])
@@ -297,48 +296,49 @@ def rates(constraints: Constraints, t: Scalar, q: PerDof, params: PyTree) -> Cal
 def project(
     constraints: Constraints, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, mass: Float[Array, "dof dof"]
 ) -> tuple[PerDof, PerDof]:
-    """Coordinates and velocities moved onto the constraints, the shortest way in the metric of the masses.
+    """Project coordinates and velocities onto the constraints, by least changes in the metric of the mass matrix.
 
-    Two Newton steps for the coordinates, with the mass matrix held; then the smallest impulses for the velocities.
+    Two Newton steps with a constant mass matrix change the coordinates; then the smallest impulses change the
+    velocities.
     """
     error = errors(constraints, t, params)
     if error(q).shape != (0,):
         for _ in range(_NEWTON):
-            reach, matrix = _reach(_jacobian(error, q), mass)
-            q = q - jnp.sum(reach * solve_balanced(matrix, error(q))[:, None], axis=0)
+            minv_jt, matrix = _mobility(_jacobian(error, q), mass)
+            q = q - jnp.sum(minv_jt * solve_balanced(matrix, error(q))[:, None], axis=0)
     rate = rates(constraints, t, q, params)
-    reach, matrix = _reach(_jacobian(rate, qd), mass)
-    return q, qd - jnp.sum(reach * solve_balanced(matrix, rate(qd))[:, None], axis=0)
+    minv_jt, matrix = _mobility(_jacobian(rate, qd), mass)
+    return q, qd - jnp.sum(minv_jt * solve_balanced(matrix, rate(qd))[:, None], axis=0)
 
 
 def constraint_residual(
     constraints: Constraints, t: Scalar, q: PerDof, qd: PerDof, params: PyTree
 ) -> tuple[Scalar, Scalar]:
-    """How far coordinates and velocities are from the constraints, relative to their own size or to one.
+    """Distances of coordinates and velocities from the constraints, relative to their own size or to one.
 
-    Each error is divided by the length of its gradient, which makes it a distance from its own surface: constraints
-    that contradict each other show, too. Without derivatives.
+    Each residual is divided by the length of its gradient. This distance from its own surface also reveals constraints
+    that contradict each other. No derivatives.
     """
     q, qd = jax.lax.stop_gradient((q, qd))
 
-    def far(fn: Callable[[Array], Array], x: Array) -> Array:
+    def distance_from(fn: Callable[[Array], Array], x: Array) -> Array:
         error, rows = fn(x), _jacobian(fn, x)
         slope = safe_norm(rows, axis=1)
         distance = jnp.abs(error) / jnp.where(slope > 0, slope, 1.0)
         return jnp.max(distance, initial=0.0) / jnp.maximum(1.0, jnp.max(jnp.abs(x)))
 
-    return far(errors(constraints, t, params), q), far(rates(constraints, t, q, params), qd)
+    return distance_from(errors(constraints, t, params), q), distance_from(rates(constraints, t, q, params), qd)
 
 
 def _jacobian(fn: object, x: PerDof) -> Float[Array, "m dof"]:
-    """Jacobian by rows: there are never more independent constraints than coordinates."""
+    """Jacobian in reverse mode: there are never more independent constraints than coordinates."""
     return jax.jacrev(fn)(x)  # pyright: ignore[reportArgumentType]
 
 
-def _reach(rows: Float[Array, "m dof"], mass: Float[Array, "dof dof"]) -> tuple[Array, Array]:
-    """Accelerations of unit multipliers, and what they do to each constraint."""
-    reach = factor_positive_definite(mass)(rows.T).T
-    return reach, jnp.sum(rows[:, None, :] * reach[None, :, :], axis=2)
+def _mobility(rows: Float[Array, "m dof"], mass: Float[Array, "dof dof"]) -> tuple[Array, Array]:
+    """Rows `M^-1 J_k`, and `J M^-1 J^T`."""
+    minv_jt = factor_positive_definite(mass)(rows.T).T
+    return minv_jt, jnp.sum(rows[:, None, :] * minv_jt[None, :, :], axis=2)
 
 
 def _times(rows: Float[Array, "m dof"], vector: PerDof) -> Float[Array, " m"]:

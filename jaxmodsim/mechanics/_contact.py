@@ -1,4 +1,4 @@
-"""Unilateral contact: a gap that opens, closes and strikes."""
+"""Unilateral contacts, which open, close and strike; laws of impact; end stops and backlash."""
 
 from collections.abc import Callable
 from functools import partial
@@ -7,48 +7,142 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._core.arguments import as_label
+from .._core.arrays import PerDof, Scalar, is_known
 from .._core.functions import as_function
-from .._core.parameters import Number, parameter_or
-from .._core.position import PositionFn
-from .._core.shapes import PerDof, Scalar
+from .._core.parameters import Default, Number, Range, check_ranges, parameter, parameter_or
+from .._core.position import PositionFn, ScalarOrFn, as_position_fn, as_scalar_or_fn
+from .._core.safe import safe_power
 from ._constraints import AbstractConstraint, AbstractPositionConstraint, as_at
-from ._restitution import HuntCrossley, Poisson
 
-# Rounding units in a gap, of the terms that it is made of.
+# Newton steps to the speed after an impact; at low speed each of the first steps only halves the error.
+_NEWTON = 60
+
+
+class Poisson(eqx.Module):
+    """Poisson's law of impact: a contact returns at least the fraction `e` of its compression impulse in expansion.
+
+    The compression impulses are those of an impact without restitution. Each expansion impulse is at least `e` times
+    the compression impulse, and larger if the gap would close otherwise. Closed contacts take part with their own `e`.
+    Friction obeys Coulomb's law in each phase, with the slip at the end of the phase.
+
+    Without friction an impact never gains energy, for any coefficients: twice the compression impulses are admissible
+    in expansion and restore the energy, and the actual impulses minimize it. With friction the same holds for equal
+    coefficients.
+
+    **Arguments:**
+
+    - `e`: coefficient, 0 to 1.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @book{pfeiffer1996multibody,
+            author={Pfeiffer, F. and Glocker, C.}, title={Multibody Dynamics with Unilateral Contacts},
+            publisher={Wiley}, year={1996}, note={chapter 8},
+        }
+        ```
+    """
+
+    e: Number = parameter("e", "", lower=0.0, upper=1.0)
+
+    def __check_init__(self) -> None:
+        """Refuse a coefficient out of range."""
+        check_ranges(self)
+
+
+class HuntCrossley(eqx.Module):
+    """A compliant contact with the force `k d^n (1 + 3/2 damping d')` at the penetration d > 0, but never a pull.
+
+    The contact has no impacts and no modes. A body that strikes at the speed v leaves at `restitution(v) v`, where the
+    coefficient is about `1 - damping v`. The duration of contact scales as `stiffness**(-1/(n + 1))`, and so does the
+    difference to a rigid contact with that coefficient. The contact stores the energy `k d^(n + 1)/(n + 1)`.
+
+    **Arguments:**
+
+    - `stiffness`: k [N/m^n], > 0.
+    - `exponent`: n, >= 1; 3/2 for spheres (Hertz).
+    - `damping`: [s/m], >= 0.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{hunt1975coefficient,
+            author={Hunt, K. H. and Crossley, F. R. E.},
+            title={Coefficient of restitution interpreted as damping in vibroimpact},
+            journal={Journal of Applied Mechanics}, volume={42}, number={2}, pages={440--445}, year={1975},
+        }
+        ```
+    """
+
+    stiffness: Number = parameter("stiffness", "N/m^n", lower=0.0, strict=True)
+    exponent: Number = parameter("exponent", "", lower=1.0, default=1.5)
+    damping: Number = parameter("damping", "s/m", lower=0.0, default=0.0)
+
+    def __check_init__(self) -> None:
+        """Refuse numbers out of range."""
+        check_ranges(self)
+
+    def force(self, depth: Scalar, rate: Scalar) -> Scalar:
+        """Force [N] at the penetration `depth` [m] and its rate [m/s]; zero if the contact is open."""
+        elastic = self.stiffness * safe_power(jnp.maximum(depth, 0.0), self.exponent)
+        return elastic * jnp.maximum(1.0 + 1.5 * self.damping * rate, 0.0)
+
+    def stored_energy(self, depth: Scalar) -> Scalar:
+        """Energy [J] stored at the penetration `depth` [m]."""
+        power = self.exponent + 1.0
+        return self.stiffness * safe_power(jnp.maximum(depth, 0.0), power) / power
+
+    def restitution(self, speed: Float[Array, ""] | float) -> Float[Array, ""]:
+        """Coefficient of restitution of a single body that strikes at `speed` [m/s], > 0.
+
+        With `y = 3/2 damping speed` it solves `(1 + e) y = log((1 + y)/(1 - e y))`, for any mass, k and n.
+        """
+        y = 1.5 * self.damping * speed
+        c = 1.0 + y - jnp.log1p(y)  # u - log(u) = c for u = 1 - e y, from below
+
+        def step(_: object, u: Array) -> Array:
+            return u + (u - jnp.log(u) - c) * u / jnp.where(u < 1.0, 1.0 - u, 1.0)
+
+        u = jax.lax.stop_gradient(jax.lax.fori_loop(0, _NEWTON, step, jnp.exp(-c)))
+        return jnp.where(y > 1e-6, (1.0 - step(0, u)) / jnp.where(y > 1e-6, y, 1.0), 1.0 - y / 1.5)
+
+
+# Rounding error of a gap, in rounding units of its terms.
 _ROUNDING = 4.0
 
 
 class Contact(AbstractPositionConstraint):
-    """A unilateral contact `gap(t, q, params) >= 0`: open, closed, or struck at an instant.
+    """A unilateral contact `gap(t, q, params) >= 0` that is open or closed, with impacts.
 
-    While it is closed the contact is a constraint whose multiplier pushes, >= 0, towards a larger gap, and it opens
-    where the multiplier falls to zero. Where the gap closes with the velocity `w < 0`, an impact makes it `-e w`
-    (Newton's law of impact, e the coefficient of restitution); where several contacts are struck at one instant, or
-    some are closed, the impulses solve `w_i(after) + e_i w_i(before) >= 0`, `impulse_i >= 0`, one of the two zero
-    (Moreau 1988). `Poisson` is another law, and `HuntCrossley` makes the contact compliant instead. Impacts that
-    accumulate end in a closed contact, where the next rebound, relative to the surface, is lost in rounding. Friction
-    by events whose load is the contact takes part in its impacts, by Coulomb's law for the impulses.
+    A closed contact is a constraint with a multiplier >= 0, which pushes towards a larger gap; it opens when the
+    multiplier falls to zero. If the gap closes with the velocity `w < 0`, an impact changes the velocity to `-e w`
+    (Newton's law of impact, with the coefficient of restitution e). For simultaneous impacts, or impacts while other
+    contacts are closed, the impulses solve `w_i(after) + e_i w_i(before) >= 0`, `impulse_i >= 0`, one of the two zero
+    (Moreau 1988). `Poisson` is another law, and `HuntCrossley` makes the contact compliant. A series of accumulating
+    impacts ends in a closed contact when rounding hides the next rebound. Event-driven friction under the load of the
+    contact takes part in its impacts, by Coulomb's law for the impulses.
 
-    The contacts of a scene stand among its constraints; their modes are 0, open, and 1, closed. Where the gap is a
-    length along the normal, the multiplier is the normal force in newtons; `Friction(normal_force=name)` takes it as
-    its load.
+    The contacts of a scene belong to its constraints; their modes are 0, open, and 1, closed. If the gap is a length
+    along the normal, the multiplier is the normal force in newtons, which `Friction(normal_force=name)` uses as its
+    load.
 
     **Arguments:**
 
     - `gap`: `gap(t, q, params)`, one number, not negative at the start. With `at`, `gap(t, x, params)` of the
       position x.
-    - `restitution`: coefficient e of Newton's law, 0 to 1; 0 for a landing without bounce. Or `Poisson(e)`, or
+    - `restitution`: coefficient e of Newton's law, 0 to 1; 0 for an impact without rebound. Or `Poisson(e)`, or
       `HuntCrossley(stiffness)`.
-    - `at`: `at(q)` or `at(q, params)`, the position [m] of the point of contact; then the normal force is known in
-      newtons whatever the unit of the gap.
+    - `at`: `at(q)` or `at(q, params)`, the position [m] of the point of contact; the normal force is then in newtons
+      for any unit of the gap.
     - `name`: name in `run.reactions`, `run.mode` and `run.events`, and for `Friction(normal_force=name)`.
 
     **Raises:**
 
-    - `ValueError` for functions that are none, a restitution out of range, and (at the run) for wrong shapes.
+    - `ValueError` if an argument is not a function or out of range, and (in the run) for wrong shapes.
 
     ??? cite "Reference"
 
@@ -72,7 +166,7 @@ class Contact(AbstractPositionConstraint):
 
     @property
     def coefficient(self) -> Scalar:
-        """Coefficient of restitution by either law of impact; zero of a contact that gives way."""
+        """Coefficient of restitution of both laws of impact; zero for a compliant contact."""
         law = self.restitution
         if isinstance(law, HuntCrossley):
             return jnp.zeros_like(law.stiffness)
@@ -80,7 +174,7 @@ class Contact(AbstractPositionConstraint):
 
     @property
     def compliant(self) -> HuntCrossley | None:
-        """The force of a contact that gives way; None for one with impacts and modes."""
+        """The law of a compliant contact; None for a contact with impacts and modes."""
         return self.restitution if isinstance(self.restitution, HuntCrossley) else None
 
     def value(self, t: Scalar, x: Float[Array, "..."], params: PyTree) -> Float[Array, "..."]:
@@ -88,7 +182,7 @@ class Contact(AbstractPositionConstraint):
         return self.gap(t, x, params)
 
     def rounding(self, t: Scalar, q: PerDof, params: PyTree) -> Scalar:
-        """Rounding error of the gap, from the coordinates and the time that it is made of; constant."""
+        """Rounding error of the gap due to coordinates and time, without derivatives."""
         t, q, params = jax.lax.stop_gradient((t, q, params))
         by_t, by_q = jax.grad(lambda t, q: self.error(t, q, params)[0], (0, 1))(t, q)
         return _ROUNDING * float(jnp.finfo(q.dtype).eps) * (jnp.abs(by_t * t) + jnp.sum(jnp.abs(by_q * q)))
@@ -98,13 +192,13 @@ class Contact(AbstractPositionConstraint):
         self.check_value(self.gap, "gap of Contact", q, params, name)
         if (shape := jax.eval_shape(self.error, q[0], q, params).shape) != (1,):
             raise ValueError(
-                f"Contact {name!r}: gap must return one number, but it returned {shape[0]}. Give each contact a Contact"
-                " of its own."
+                f"Contact {name!r}: gap must return one number, but it returned {shape[0]}. Define one Contact for each"
+                " gap."
             )
 
 
 class BoundContact(AbstractConstraint):
-    """A contact in a mode: the constraint that it is while `closed` is 1, and none while that is 0."""
+    """A contact in a mode: a constraint if `closed` is 1, without effect if it is 0."""
 
     contact: Contact
     closed: Float[Array, ""]
@@ -112,25 +206,117 @@ class BoundContact(AbstractConstraint):
 
     @property
     def name(self) -> str | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """That of the contact."""
+        """Name of the contact."""
         return self.contact.name
 
     def error(self, t: Scalar, q: PerDof, params: PyTree) -> Float[Array, "1"]:
-        """The gap, or zero."""
+        """The gap; zero if the contact is open."""
         return self.closed * self.contact.error(t, q, params)
 
     def rate(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, "1"]:
-        """The velocity of the gap, or zero."""
+        """The velocity of the gap; zero if the contact is open."""
         return self.closed * self.contact.rate(t, q, qd, params)
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
-        """As the contact."""
+        """Check the contact."""
         self.contact.check(q, qd, params, name)
 
     def force(self, t: Scalar, q: PerDof, params: PyTree, multiplier: Float[Array, "1"]) -> Float[Array, "..."] | None:
-        """As the contact; the multiplier is zero while it is open."""
+        """Force of the contact; the multiplier is zero if the contact is open."""
         return self.contact.force(t, q, params, multiplier)
 
     def per_multiplier(self, t: Scalar, q: PerDof, params: PyTree) -> Scalar:
-        """As the contact."""
+        """Magnitude of the contact's force for a multiplier of one."""
         return self.contact.per_multiplier(t, q, params)
+
+
+_NO_BOUNCE = Default(0.0)
+
+
+class _Stop(eqx.Module):
+    """The gap `side along(q) + share limit` of a stop."""
+
+    along: PositionFn
+    limit: ScalarOrFn
+    side: float = eqx.field(static=True)
+    share: float = eqx.field(static=True)
+
+    def __call__(self, t: Scalar, q: PerDof, params: PyTree) -> Array:
+        """The gap."""
+        return self.side * self.along(q, params) + self.share * self.limit(params)
+
+
+def end_stops(
+    along: Any, *, lower: Any = None, upper: Any = None, restitution: Any = _NO_BOUNCE, name: str = "stop"
+) -> tuple[Contact, ...]:
+    """Contacts that keep a displacement within a range, for the constraints of a scene.
+
+    ```python
+    scene = jms.Scene(lagrangian, constraints=jms.end_stops(lambda q: q[0], lower=0.0, upper=0.2, restitution=0.3))
+    ```
+
+    **Arguments:**
+
+    - `along`: `along(q)` or `along(q, params)`, one number [m or rad].
+    - `lower`, `upper`: ends of the range [m or rad], lower < upper, finite numbers or functions of `params`; None for
+      no stop at that end.
+    - `restitution`: as in `Contact`.
+    - `name`: prefix of the names `name_lower` and `name_upper` of the contacts.
+
+    **Raises:**
+
+    - `ValueError` if both ends are None, if lower >= upper, and as `Contact`.
+    """
+    if lower is None and upper is None:
+        raise ValueError("end_stops needs lower, upper or both, but none was given: pass lower=0.0, for example.")
+    finite = Range("m or rad")
+    stops = tuple(
+        (end, as_scalar_or_fn(limit, name=f"end_stops {end}", allowed=finite), side, -side)
+        for end, limit, side in (("lower", lower, 1.0), ("upper", upper, -1.0))
+        if limit is not None
+    )
+    amounts = [limit.amount for _, limit, _, _ in stops]
+    if len(amounts) == 2 and is_known(*amounts) and not any(map(callable, amounts)):
+        least, most = (np.asarray(x) for x in amounts)
+        if not least < most:
+            raise ValueError(
+                f"end_stops needs lower < upper [m or rad], but lower={least:g} and upper={most:g} were given: swap"
+                " them, or omit one."
+            )
+    return tuple(_contact(along, *stop, restitution, name, "end_stops") for stop in stops)
+
+
+def backlash(along: Any, width: Any, *, restitution: Any = _NO_BOUNCE, name: str = "backlash") -> tuple[Contact, ...]:
+    """Contacts on both sides of the play between two parts, such as the teeth of two gears.
+
+    ```python
+    scene = jms.Scene(lagrangian, constraints=jms.backlash(lambda q: q[0] - 50.0 * q[1], lambda p: p["play"]))
+    ```
+
+    **Arguments:**
+
+    - `along`: `along(q)` or `along(q, params)`: displacement of one part relative to the other [m or rad], zero in the
+      middle of the play.
+    - `width`: the play [m or rad], > 0: the displacement stays within half of it on both sides. A number, of which each
+      contact holds a copy, or a function of `params`.
+    - `restitution`: as in `Contact`.
+    - `name`: prefix of the names `name_lower` and `name_upper` of the contacts.
+
+    **Raises:**
+
+    - `ValueError` for a width that is not positive, and as `Contact`.
+    """
+    play = as_scalar_or_fn(width, name="backlash width", allowed=Range("m or rad", 0.0, strict=True))
+    return tuple(
+        _contact(along, end, play, side, 0.5, restitution, name, "backlash")
+        for end, side in (("lower", 1.0), ("upper", -1.0))
+    )
+
+
+def _contact(
+    along: Any, end: str, limit: ScalarOrFn, side: float, share: float, restitution: Any, name: object, caller: str
+) -> Contact:
+    if not (isinstance(name, str) and name):
+        raise ValueError(f"{caller} name must be a text that is not empty, but {name!r} was given.")
+    place = as_position_fn(along, name=f"{caller} along")
+    return Contact(_Stop(place, limit, side, share), restitution=restitution, name=f"{name}_{end}")

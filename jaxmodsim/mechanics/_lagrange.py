@@ -1,4 +1,4 @@
-"""Equations of motion from a Lagrangian, by automatic differentiation; momenta in place of velocities."""
+"""Equations of motion from a Lagrangian, by automatic differentiation; energies and canonical momenta."""
 
 from collections.abc import Callable
 from functools import partial
@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from .._core.arrays import PerDof, Scalar
 from .._core.cholesky import MAX_UNROLLED_CHOLESKY, solve_positive_definite
 from .._core.scalarise import in_scalars
-from .._core.shapes import PerDof, Scalar
 
 Lagrangian: TypeAlias = Callable[[Any, Array, Array, Any], Array]
 
@@ -19,8 +19,8 @@ class MotionEquations(NamedTuple):
     """The Euler-Lagrange equations at one state, `mass @ qdd = load + Q`.
 
     - `mass`: mass matrix d2L/dqd2, shape `[dof, dof]` [kg for lengths, kg m^2 for angles].
-    - `load`: `dL/dq - d2L/dqd dq qd - d2L/dqd dt`, shape `[dof]` [N or N m]: what the Lagrangian itself
-      contributes (gravity, springs, centrifugal and Coriolis terms).
+    - `load`: `dL/dq - d2L/dqd dq qd - d2L/dqd dt`, shape `[dof]` [N or N m]: the forces in the
+      Lagrangian (gravity, springs, centrifugal and Coriolis terms).
     """
 
     mass: Float[Array, "dof dof"]
@@ -30,16 +30,16 @@ class MotionEquations(NamedTuple):
 def motion_equations(lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> MotionEquations:
     """Mass matrix and load of `d/dt dL/dqd - dL/dq = Q` at one state.
 
-    The momentum dL/dqd is linearised once. Its derivative along (1, qd, 0) gives the bias and along the unit
-    velocities the mass matrix, so the Hessian by q is never formed. Up to 12 coordinates all of this is evaluated in
-    scalars (`in_scalars`); above, and where the Lagrangian is too large for that, in arrays as it is written.
+    The momentum dL/dqd is linearized once. Its derivative along (1, qd, 0) is the bias, and those along the unit
+    velocities are the mass matrix, so the Hessian with respect to q is never formed. Up to 12 coordinates the
+    evaluation is in scalars (`in_scalars`), unless the Lagrangian is too large; otherwise in arrays.
 
     **Arguments:**
 
     - `lagrangian`: `L(t, q, qd, params)`, a scalar [J].
     - `t`: time [s].
     - `q`, `qd`: generalised coordinates and velocities, shape `[dof]`.
-    - `params`: whatever the Lagrangian takes.
+    - `params`: parameters of the Lagrangian.
 
     **Returns:**
 
@@ -89,9 +89,8 @@ def energies(lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, params: P
 
     **Returns:**
 
-    `(T, V)`: `T = qd @ mass @ qd / 2`, and `V` the rest of the energy function `qd @ dL/dqd - L`. For coordinates
-    that move by themselves (a rotating frame), `V` holds the centrifugal potential, and their sum is the Jacobi
-    integral.
+    `(T, V)`: `T = qd @ mass @ qd / 2`, and `V` is the remainder of the energy function `qd @ dL/dqd - L`. In moving
+    coordinates (a rotating frame), `V` contains the centrifugal potential, and the sum is the Jacobi integral.
     """
     momentum = jax.grad(lagrangian, argnums=2)(t, q, qd, params)
     mass = motion_equations(lagrangian, t, q, qd, params).mass
@@ -105,14 +104,14 @@ def momentum(lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, params: P
 
 
 def velocity(lagrangian: Lagrangian, t: Scalar, q: PerDof, p: PerDof, params: PyTree) -> PerDof:
-    """Velocities that belong to the momenta `p`, of a Lagrangian that is quadratic in the velocities."""
+    """Velocities for the momenta `p`, if the Lagrangian is quadratic in the velocities."""
     still = jnp.zeros_like(p)
     mass = motion_equations(lagrangian, t, q, still, params).mass
     return solve_positive_definite(mass, p - momentum(lagrangian, t, q, still, params))
 
 
 def quadratic(lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Array:
-    """Whether the mass matrix is the same at `qd` as at rest and at other velocities, to half of the digits."""
+    """Whether the mass matrix is the same at rest, at `qd` and at other velocities, to half of the digits."""
     at = [motion_equations(lagrangian, t, q, v, params).mass for v in (jnp.zeros_like(qd), qd, qd + 1.0)]
     largest = jnp.max(jnp.abs(at[0]))
     change = jnp.maximum(jnp.max(jnp.abs(at[1] - at[0])), jnp.max(jnp.abs(at[2] - at[0])))

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._core.arguments import as_float
+from .._core.functions import nominal
 from .._core.readable import AbstractReadable, Table, short, table_of
-from .._core.state_dependent import nominal
 from ..friction import AbstractLaw
 from ..scene import AppliedForce, Friction, Scene, read_element
 from ._branch import FOLD, Branch

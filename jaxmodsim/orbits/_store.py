@@ -12,7 +12,7 @@ from typing import TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from .._core.extra import extra
+from .._core.system import extra
 from ..scene import Scene, scene_numbers
 from ._branch import SpecialOrbit
 from ._describe import describe

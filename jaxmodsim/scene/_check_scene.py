@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from .._core.functions import depends_on, real_array
-from .._core.index_check import traced
+from .._core.trace_checks import traced
 from ..mechanics import AbstractConstraint
 from ._dynamics import State
 from ._scene import Scene

@@ -3,7 +3,7 @@
 import re
 from typing import NamedTuple
 
-from .._core.units import check_unit
+from .._core.arguments import check_unit
 
 _LABEL = re.compile(r"\s*([^\[\]]*[^\[\]\s])\s*(?:\[\s*([^\[\]]*[^\[\]\s])\s*\])?\s*")
 

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._core.arrays import PerDof, Scalar
 from .._core.cholesky import factor_positive_definite
 from .._core.functions import depends_on
 from .._core.scalarise import in_scalars
-from .._core.shapes import PerDof, Scalar
 from ..mechanics import (
     Contact,
     LinearizedConstraints,
@@ -34,7 +34,6 @@ from ._event_driven import (
 from ._karnopp import karnopp_forces
 from ._scene import Scene
 from .forces._effect import Action, Power
-from .forces._friction import Friction
 
 # Rounding units by which the mobility within constraints may be wrong.
 _ROUNDING = 256.0
@@ -322,7 +321,7 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     params = scene.params
     equations = motion_equations(scene.lagrangian, t, q, qd, params)
     linearized = (
-        linearize_constraints(scene.bind_modes(mode).constraints, t, q, qd, params, equations.mass)
+        linearize_constraints(scene.constraints_in(mode), t, q, qd, params, equations.mass)
         if scene.constraints
         else None
     )
@@ -331,7 +330,7 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     compliant = _compliant(scene, t, y) if scene.compliant else None
     if compliant is not None:
         rhs = rhs + compliant.generalised
-    holding, sides = {}, {}
+    sides = {}
     if scene.switches and mode is not None:
         sides = dict(zip(scene.switches, jax.lax.stop_gradient(scene.split_modes(mode)[2]), strict=True))
     for name, effect in zip(scene.names, scene.effects, strict=True):
@@ -343,9 +342,7 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
             action = effect.act(t, q, qd, y.z.get(name), params)
         actions[name] = action
         rhs = rhs + action.generalised
-        if isinstance(effect, Friction) and effect.karnopp:
-            holding[name] = effect
-    if holding:
+    if holding := {name: each for name, each in scene.friction.items() if each.karnopp}:
         held = karnopp_forces(holding, actions, mobility.accelerate, mobility.respond, rhs, t, q, qd, params)
         for name, action in held.items():
             rhs = rhs + action.generalised - actions[name].generalised

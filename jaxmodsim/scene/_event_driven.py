@@ -21,10 +21,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .._core.arrays import PerDof, Scalar
+from .._core.cholesky import solve_semidefinite
 from .._core.lu import factor_lu
 from .._core.safe import safe_norm
-from .._core.semidefinite import solve_semidefinite
-from .._core.shapes import PerDof, Scalar
 from .forces._friction import Friction
 
 # Rounding units in the load of a sticking element, of its limits.

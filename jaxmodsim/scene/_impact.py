@@ -17,10 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._core.cholesky import factor_positive_definite
+from .._core.arrays import PerDof, Scalar
+from .._core.cholesky import factor_positive_definite, solve_semidefinite
 from .._core.lu import factor_lu
-from .._core.semidefinite import solve_semidefinite
-from .._core.shapes import PerDof, Scalar
 from ..mechanics import LinearizedConstraints, Poisson, linearize_constraints, motion_equations
 from ._scene import Scene
 

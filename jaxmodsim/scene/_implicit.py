@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._core.arrays import Scalar
 from .._core.cholesky import factor_positive_definite
 from .._core.monotone import solve_monotone
-from .._core.shapes import Scalar
 from ..friction import Sign
 from ..mechanics import linearize_constraints, motion_equations
 from ._dynamics import Mobility, State
@@ -51,9 +51,7 @@ def check_step(scene: Scene) -> None:
         raise ValueError(
             f"ImplicitFriction takes no forces of contacts ({', '.join(scene.compliant)}): use another solver."
         )
-    for name, effect in zip(scene.names, scene.effects, strict=True):
-        if not isinstance(effect, Friction):
-            continue
+    for name, effect in scene.friction.items():
         law, start = type(effect.law).__name__, f"ImplicitFriction: friction {name!r}"
         if effect.event_driven or isinstance(effect.law, Sign):
             raise ValueError(
@@ -87,11 +85,10 @@ def scene_step(scene: Scene, t0: Scalar, t1: Scalar, y: State) -> tuple[State, B
         linearize_constraints(scene.constraints, t0, q, qd, params, equations.mass) if scene.constraints else None
     )
     mobility = Mobility(factor_positive_definite(equations.mass), linearized)
-    rhs, elements = equations.load, {}
+    elements = {name: _element(effect, t0, t1, q, qd, params) for name, effect in scene.friction.items()}
+    rhs = equations.load
     for name, effect in zip(scene.names, scene.effects, strict=True):
-        if isinstance(effect, Friction):
-            elements[name] = _element(effect, t0, t1, q, qd, params)
-        else:
+        if name not in elements:
             rhs = rhs + effect.act(t0, q, qd, y.z.get(name), params).generalised
     free = qd + h * mobility.accelerate(rhs)
     if not elements:

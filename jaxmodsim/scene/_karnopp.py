@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._core.shapes import PerDof, Scalar
+from .._core.arrays import PerDof, Scalar
 from ..friction import AbstractKarnoppLaw
 from .forces._effect import Action
 from .forces._friction import Friction

@@ -7,21 +7,19 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .._core.fusion import fusion_barrier, opaque_one
+from .._core.arrays import PerDof, Scalar, fusion_barrier, opaque_one
 from .._core.lu import Scalar as Entry
 from .._core.lu import factor_lu, product
 from .._core.scalarise import columns_of, in_scalars
-from .._core.shapes import PerDof, Scalar
 from ..mechanics import inverse_dynamics
 from ._dynamics import State
 from ._scene import Scene
-from .forces._friction import Friction
 
 
 def has_linear_solver(scene: Scene) -> bool:
     """Whether `linear_solver` knows the scene: no constraints, no switches, no friction by accelerations."""
     depends = scene.event_driven or scene.reaction_loaded or scene.switches
-    return not (depends or scene.constraints or any(isinstance(x, Friction) and x.karnopp for x in scene.effects))
+    return not (depends or scene.constraints or any(each.karnopp for each in scene.friction.values()))
 
 
 def linear_solver(

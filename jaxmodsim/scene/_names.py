@@ -10,8 +10,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
+from .._core.functions import StateDependent
 from .._core.parameters import Range, ranges_of
-from .._core.state_dependent import StateDependent
 from ..friction import AbstractAsymmetric
 from ._quantities import in_units_of, slip_unit
 from ._scene import Scene
@@ -96,9 +96,8 @@ def scene_units(scene: eqx.Module) -> dict[str, str]:
     """Unit of each number that has a known one, by the names of `scene_numbers`."""
     units = {name: allowed.unit for name, allowed in scene_ranges(scene).items()}
     if isinstance(scene, Scene):
-        for name, effect in zip(scene.names, scene.effects, strict=True):
-            if isinstance(effect, Friction):
-                units[f"{name}.belt_velocity"] = slip_unit(scene, effect).replace(" ", "/s ", 1) + "/s"
+        for name, effect in scene.friction.items():
+            units[f"{name}.belt_velocity"] = slip_unit(scene, effect).replace(" ", "/s ", 1) + "/s"
     return units
 
 

@@ -5,11 +5,11 @@ import re
 from dataclasses import replace
 
 import jax
-import jax.core
 import jax.numpy as jnp
 
+from .._core.arguments import axis_unit
+from .._core.arrays import is_known
 from .._core.parameters import Range
-from .._core.units import axis_unit
 from ._coordinates import Quantity, read_label
 from ._scene import Scene
 from .forces._effect import AbstractEffect
@@ -72,7 +72,7 @@ def slip_unit(scene: Scene, friction: Friction) -> str:
     if jax.eval_shape(along, q, params).shape != ():
         return "m"
     slopes = jax.jacfwd(along)(q, params)
-    if isinstance(slopes, jax.core.Tracer):
+    if not is_known(slopes):
         return "m or rad"
     within = {unit for unit, slope in zip(units, slopes, strict=True) if slope != 0}
     return (

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core.extra import extra
-from .._core.shapes import PerDof, Scalar
+from .._core.arrays import PerDof, Scalar
+from .._core.system import extra
 from ._scene import Scene
 from .forces._effect import AbstractEffect
 

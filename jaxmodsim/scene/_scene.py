@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
+from .._core.arrays import PerDof, Scalar
 from .._core.functions import as_function
 from .._core.parameters import as_real, is_weak
 from .._core.readable import AbstractReadable
-from .._core.shapes import PerDof, Scalar
 from ..friction import AbstractLaw
 from ..mechanics import AbstractConstraint, BoundContact, Contact, Lagrangian, Poisson
 from ._coordinates import as_coordinates, read_label
@@ -154,13 +154,13 @@ class Scene(AbstractReadable, eqx.Module):
             raise ValueError(
                 f"Names of coordinates must be their own, but {', '.join(taken)}. Rename one of each pair."
             )
-        if self.event_driven and any(isinstance(x, Friction) and x.karnopp for x in self.effects):
+        if self.event_driven and any(each.karnopp for each in self.friction.values()):
             raise ValueError(
                 f"{', '.join(self.event_driven)}: set-valued laws of one scene run either all by events or all by"
                 " DeadZone, as each must know the forces of the others. Wrap all of them in DeadZone, or none."
             )
-        for name, effect in zip(self.names, self.effects, strict=True):
-            if not isinstance(effect, Friction) or effect.load_constraint is None:
+        for name, effect in self.friction.items():
+            if effect.load_constraint is None:
                 continue
             if effect.load_constraint not in self.constraint_names:
                 known = ", ".join(repr(x) for x in self.constraint_names) or "none"
@@ -226,13 +226,14 @@ class Scene(AbstractReadable, eqx.Module):
         return (*self.names, *self.constraint_names)
 
     @property
+    def friction(self) -> dict[str, Friction]:
+        """The friction elements by name."""
+        return {name: each for name, each in zip(self.names, self.effects, strict=True) if isinstance(each, Friction)}
+
+    @property
     def event_driven(self) -> dict[str, Friction]:
         """The friction elements that run by events, by name, in the order of their modes."""
-        return {
-            name: effect
-            for name, effect in zip(self.names, self.effects, strict=True)
-            if isinstance(effect, Friction) and effect.event_driven
-        }
+        return {name: each for name, each in self.friction.items() if each.event_driven}
 
     @property
     def contacts(self) -> dict[str, Contact]:
@@ -295,11 +296,8 @@ class Scene(AbstractReadable, eqx.Module):
     @property
     def reaction_loaded(self) -> dict[str, Friction]:
         """The other friction elements whose load is the reaction of a constraint, by name."""
-        return {
-            name: effect
-            for name, effect in zip(self.names, self.effects, strict=True)
-            if isinstance(effect, Friction) and not effect.event_driven and effect.load_constraint is not None
-        }
+        others = {name: each for name, each in self.friction.items() if not each.event_driven}
+        return {name: each for name, each in others.items() if each.load_constraint is not None}
 
     @property
     def loaded(self) -> tuple[str, ...]:
@@ -324,19 +322,17 @@ class Scene(AbstractReadable, eqx.Module):
             return self
         driven = signals_at(self.params, t, linear=False)
         lagrangian = _Driven(self.lagrangian, driven) if signals_of(driven) else self.lagrangian
-        return self._with(lagrangian=lagrangian, params=signals_at(driven, t))
+        return dataclasses.replace(self, lagrangian=lagrangian, params=signals_at(driven, t))
 
-    def bind_modes(self, mode: Array | None) -> "Scene":
-        """The scene with each contact as the constraint that it is in its mode, if any; itself without contacts.
-
-        `mode` holds those of `mode_names`.
+    def constraints_in(self, mode: Array | None) -> tuple[AbstractConstraint, ...]:
+        """The constraints with each contact bound to its mode; `mode` holds the modes of `mode_names`.
 
         **Raises:**
 
-        - `ValueError` for contacts without modes.
+        - `ValueError` if the scene has contacts and `mode` is None.
         """
         if not self._all_contacts:
-            return self
+            return self.constraints
         if self.contacts and mode is None:
             raise ValueError(
                 f"{', '.join(self.contacts)}: contacts open and close by events, so that position and velocity do not"
@@ -347,25 +343,17 @@ class Scene(AbstractReadable, eqx.Module):
         def bound(x: Contact) -> BoundContact:
             return BoundContact(x, next(modes) if x.compliant is None else jnp.zeros_like(x.compliant.stiffness))
 
-        return self._with(constraints=tuple(bound(x) if isinstance(x, Contact) else x for x in self.constraints))
+        return tuple(bound(x) if isinstance(x, Contact) else x for x in self.constraints)
 
     def step_from(self, t: Scalar) -> "Scene":
         """The scene for a step from `t` up to the next sample: signals are what they are there, without jumps."""
-        return self._with(params=signals_from(self.params, t)) if signals_of(self.params) else self
-
-    def _with(self, **parts: Any) -> "Scene":
-        scene = object.__new__(Scene)
-        for field in dataclasses.fields(Scene):
-            object.__setattr__(scene, field.name, parts.get(field.name, getattr(self, field.name)))
-        return scene
+        return dataclasses.replace(self, params=signals_from(self.params, t)) if signals_of(self.params) else self
 
     def bind_state(self, t: Scalar, q: PerDof, qd: PerDof) -> "Scene":
         """The scene with its signals and laws as they are at this state; itself where nothing depends on that."""
         if (scene := self.bind_time(t)) is not self:
             return scene.bind_state(t, q, qd)
-        effects = tuple(
-            each.bind_state(t, q, qd, self.params) if isinstance(each, Friction) else each for each in self.effects
-        )
+        effects = tuple(each.bind_state(t, q, qd, self.params) for each in self.effects)
         if all(a is b for a, b in zip(effects, self.effects, strict=True)):
             return self
         return eqx.tree_at(lambda scene: scene.effects, self, effects)

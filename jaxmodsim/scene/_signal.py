@@ -4,15 +4,13 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.arguments import as_flag, as_reals
+from .._core.arrays import Scalar, after, entry, is_known
 from .._core.parameters import as_vector
-from .._core.shapes import Scalar
-from .._core.sorted_times import after, entry
 
 
 def _samples(x: object, *, name: str) -> Float[Array, " n"]:
@@ -62,12 +60,12 @@ class Signal(eqx.Module):
                 f"Signal needs one value for each time, but t has the shape {self.t.shape} and values"
                 f" {self.values.shape}."
             )
-        if isinstance(self.t, jax.core.Tracer):
+        if not is_known(self.t):
             return
         t = np.asarray(self.t)
         if not (np.isfinite(t).all() and (np.diff(t) > 0).all()):
             raise ValueError("Signal: t must be finite and increase from sample to sample.")
-        if not isinstance(self.values, jax.core.Tracer) and (bad := np.flatnonzero(~np.isfinite(self.values))).size:
+        if is_known(self.values) and (bad := np.flatnonzero(~np.isfinite(self.values))).size:
             raise ValueError(
                 f"Signal: values must be finite, but the one at t = {t[bad[0]]:g} is {self.values[bad[0]]}"
                 f" ({bad.size} such of {t.size}). Leave such samples out."

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
+from .._core.arrays import Scalar
 from .._core.scalarise import in_scalars
-from .._core.shapes import Scalar
 from ..mechanics import Contact
 from ._dynamics import Dynamics, State, from_dynamics, vector_field
 from ._impact import impact

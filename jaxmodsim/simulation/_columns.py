@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
-from .._core.extra import extra
+from .._core.arrays import is_known
+from .._core.system import extra
 from ..scene import Quantity, Scene, quantity_of
-from ._run_request import is_known
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -44,9 +44,8 @@ def at_time(fn: _Function) -> _Function:
 
 def project(t: Float[Array, ""], y: State, scene: Scene, mode: Array | None) -> State:
     """State moved onto the constraints of these modes; the scene is that of time `t`."""
-    scene = scene.bind_modes(mode)
     mass = motion_equations(scene.lagrangian, t, y.q, y.qd, scene.params).mass
-    q, qd = projected(scene.constraints, t, y.q, y.qd, scene.params, mass)
+    q, qd = projected(scene.constraints_in(mode), t, y.q, y.qd, scene.params, mass)
     return y._replace(q=q, qd=qd)
 
 

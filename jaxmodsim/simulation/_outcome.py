@@ -6,19 +6,19 @@ from typing import Any, NamedTuple
 import diffrax as dfx
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._core.arrays import is_known
 from .._core.cholesky import cholesky_pivots
 from .._core.functions import depends_on
 from .._core.parameters import check_ranges, modules_of, range_checks
 from .._core.scalarise import in_scalars
 from ..friction import DeadZone, Regularized, Sign
 from ..mechanics import constraint_residual, motion_equations, quadratic
-from ..scene import Friction, Scene, State, check_scene, describe_series, from_dynamics, quantity_of
+from ..scene import Scene, State, check_scene, describe_series, from_dynamics, quantity_of
 from ..solvers import ACCUMULATION, TOO_MANY
 
 # Codes of how a run ended; `outcome_messages` has the sentence of each.
@@ -53,7 +53,7 @@ _GENERAL = (
     "The limit of mode changes was reached before t1: pass a larger max_events.",
     "At a saved time an element sticks under a load beyond its limit: a short pulse was stepped over, as nothing moves"
     " in stick and the steps grow. Pass dtmax, the longest step that cannot miss it, or a fixed step dt.",
-    "The initial state does not obey the constraints: pass q0, qd0 = jaxmodsim.consistent(scene, q0, qd0), which finds"
+    "The initial state does not obey the constraints: pass q0, qd0 = jaxmodsim.project_initial_state(scene, q0, qd0),"
     " the nearest state that does.",
     "The constraints are not kept: they contradict each other here, have become dependent (a singular configuration),"
     " or drift without bound (project=False).",
@@ -127,7 +127,7 @@ class RunResult(eqx.Module):
 
     def __str__(self) -> str:
         """The sentence."""
-        return "Traced: known outside of jax.jit." if isinstance(self.code, jax.core.Tracer) else self.message
+        return "Traced: known outside of jax.jit." if not is_known(self.code) else self.message
 
     __repr__ = __str__
 
@@ -156,8 +156,8 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
         else f"The step size fell below what the time can resolve at contact {name!r}: its impacts and openings follow"
         f" each other too fast. Pass larger tolerances, {_SOFTER}"
         if name in scene.contacts
-        else f"The mode changes of {name!r} accumulate: chatter between stick and slip. Pass hold_chatter=True to hold"
-        " it in stick from there on."
+        else f"The mode changes of {name!r} accumulate: chatter between stick and slip. Pass stick_on_chatter=True to"
+        " keep it in stick from there on."
         for name, width in zip(scene.mode_names, scene.mode_widths(dof), strict=True)
         for _ in range(width)
     )
@@ -172,8 +172,7 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
 
 def _load_functions(scene: Scene) -> dict[str, Callable[..., Any]]:
     """Loads of friction elements that are functions, by name of the element."""
-    elements = zip(scene.names, scene.effects, strict=True)
-    loads = {name: each.normal_force for name, each in elements if isinstance(each, Friction)}
+    loads = {name: each.normal_force for name, each in scene.friction.items()}
     return {name: load for name, load in loads.items() if callable(load)}
 
 
@@ -216,7 +215,7 @@ def start_code(
         code = jnp.where(_unique(now, t, y, mode), code, offsets.checks)
     code = _blame_mass(code, _pivots(now, t, y), 16 * dof * float(jnp.finfo(y.q.dtype).eps), True)
     if scene.constraints:
-        code = _violation(now, now.bind_modes(mode).constraints, t, y, code)
+        code = _violation(now, now.constraints_in(mode), t, y, code)
     widths = [module.width for _, module in modules_of(scene) if isinstance(module, Regularized)]
     if atol is not None and widths:
         code = jnp.where(atol <= jnp.min(jnp.stack([jnp.min(width) for width in widths])), code, TOO_NARROW)
@@ -281,7 +280,7 @@ def end_code(
         unique = jax.lax.map(lambda at: _unique(scene, at[0], at[1], mode), looks)  # traced and compiled once
         code = jnp.where(early & ~jnp.all(unique), offsets.checks, code)
     if scene.constraints:
-        kept = constraint_residual(now.bind_modes(mode).constraints, t, y.q, y.qd, now.params)[0] <= _KEPT
+        kept = constraint_residual(now.constraints_in(mode), t, y.q, y.qd, now.params)[0] <= _KEPT
         code = jnp.where(kept | ~finite, code, DRIFTED)
         code = jnp.where((_penetration(now, t, y) <= _CONSISTENT**0.5) | ~finite, code, PENETRATES)
     eps = float(jnp.finfo(y.q.dtype).eps)

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .._core.arrays import is_known
 from ._observe import find_series, read_series
-from ._run_request import is_known
 from ._solve import Nodes, solve
 from ._trajectory import Trajectory, trajectory
 

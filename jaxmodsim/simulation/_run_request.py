@@ -8,16 +8,16 @@ from typing import Any, NamedTuple
 import diffrax as dfx
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._core.arguments import as_flag, as_mapping, as_names, as_whole, check_real, did_you_mean
+from .._core.arrays import is_known
 from .._core.parameters import is_weak
-from .._core.speed import remark_on_single_precision
-from ..scene import Friction, Scene, State, check_step
+from .._core.speed import warn_about_single_precision
+from ..scene import Scene, State, check_step
 from ..solvers import ImplicitFriction
 from ._integrated_system import Series
 
@@ -48,7 +48,7 @@ class Plugin:
 class RunChoices:
     """What of a run is compiled in.
 
-    - `max_steps`, `max_events`, `hold_chatter`, `project`: as for `simulate`.
+    - `max_steps`, `max_events`, `stick_on_chatter`, `project`: as for `simulate`.
     - `log`: entries of the log of events, of which later ones are counted alone.
     - `audited`: whether the work integrals run beside the motion.
     - `series`: a number that is kept at the ends of all steps; None for none.
@@ -56,7 +56,7 @@ class RunChoices:
 
     max_steps: int
     max_events: int
-    hold_chatter: bool
+    stick_on_chatter: bool
     project: bool
     log: int = 0
     audited: bool = False
@@ -109,7 +109,7 @@ def run_request(
     adjoint: dfx.AbstractAdjoint | None = None,
     max_steps: int = MOST_STEPS,
     max_events: int = MOST_EVENTS,
-    hold_chatter: bool = False,
+    stick_on_chatter: bool = False,
     project: bool = True,
     record: tuple[str, ...] = (),
 ) -> RunRequest:
@@ -158,7 +158,7 @@ def run_request(
         RunChoices(
             as_whole(max_steps, name="max_steps"),
             max_events,
-            as_flag(hold_chatter, name="hold_chatter"),
+            as_flag(stick_on_chatter, name="stick_on_chatter"),
             as_flag(project, name="project"),
             *_recorded(record, bool(scene.contacts), max_events, known),
         ),
@@ -180,14 +180,6 @@ def _recorded(record: tuple[str, ...], has_contacts: bool, max_events: int, know
     if "events" in record or (audited and has_contacts):  # what impacts lose is read from the log
         return max_events, audited
     return min(_LOGGED, max_events) if known else 0, audited
-
-
-def is_known(*values: object) -> bool:
-    """Whether none of the values is traced by JAX."""
-    for value in values:  # noqa: SIM110 - a generator takes three times as long
-        if isinstance(value, jax.core.Tracer):
-            return False
-    return True
 
 
 def _array(value: PyTree, dtype: np.dtype) -> Any:
@@ -240,12 +232,12 @@ def _check_span(t0: ArrayLike, t1: ArrayLike, array: dict[str, Any]) -> None:
 
 def _check_slips(scene: Scene, q0: jax.Array | np.ndarray, t0: jax.Array | np.ndarray) -> None:
     """Refuse the velocity of a belt that is a number where slip is a vector."""
-    for i, effect in enumerate(scene.effects):
-        if not isinstance(effect, Friction) or effect.along is None or callable(effect.belt_velocity):
+    for name, effect in scene.friction.items():
+        if effect.along is None or callable(effect.belt_velocity):
             continue
         # Asked first, as the rest takes time.
         if is_known(effect.belt_velocity) and np.any(np.asarray(effect.belt_velocity) != 0):
-            effect.check_belt(q0, scene.bind_time(jnp.asarray(t0)).params, scene.names[i])
+            effect.check_belt(q0, scene.bind_time(jnp.asarray(t0)).params, name)
 
 
 def _own_states(scene: Scene, q0: jax.Array | np.ndarray, z0: dict[str, PyTree], dtype: np.dtype) -> dict[str, PyTree]:
@@ -279,7 +271,7 @@ def _check_values(array: dict[str, Any]) -> None:
     if "rtol" in known and "atol" in known and known["rtol"] + known["atol"] <= 0:
         raise ValueError("rtol and atol must not both be zero.")
     if "rtol" in known and known["rtol"] < _SINGLE and array["rtol"].dtype == np.float32:
-        remark_on_single_precision()
+        warn_about_single_precision()
     for name in ("dt", "dtmax"):
         if name in known and known[name] <= 0:
             raise ValueError(f"{name} must be positive, but it is {array[name]}.")

@@ -16,13 +16,14 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, PyTree
 
 from .._core.arguments import as_flag
+from .._core.arrays import is_known
 from .._core.functions import Function
-from .._core.last_line import LastLines
-from .._core.speed import recommend_tuning, remark_on_compilation, remark_on_fixed_steps, remark_on_rounding
+from .._core.speed import recommend_tuning, warn_about_compilation, warn_about_fixed_steps, warn_about_rounding
+from .._core.user_errors import LastLines
 from ..scene import Scene, State, vector_field
 from ..solvers import Gauss, ImplicitFriction, Rodas5P
 from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages, violation_code
-from ._run_request import MOST_EVENTS, MOST_STEPS, RunRequest, is_known, run_request
+from ._run_request import MOST_EVENTS, MOST_STEPS, RunRequest, run_request
 from ._solve import RunOutput, compiled_runs, default_solver, solve
 from ._trajectory import Trajectory, trajectory
 
@@ -50,7 +51,7 @@ def simulate(
     adjoint: dfx.AbstractAdjoint | None = None,
     max_steps: int = MOST_STEPS,
     max_events: int = MOST_EVENTS,
-    hold_chatter: bool = False,
+    stick_on_chatter: bool = False,
     project: bool = True,
     record: tuple[str, ...] = (),
     throw: bool = True,
@@ -66,7 +67,7 @@ def simulate(
     - `scene`: the `Scene`.
     - `q0`, `qd0`: initial coordinates and velocities, shape `[dof]`. Of an element that sticks at t0 the slip velocity
       is taken away, and with it the derivative by that velocity. They must obey the constraints to six digits, and are
-      then moved onto them; `jaxmodsim.consistent` finds such states.
+      then moved onto them; `jaxmodsim.project_initial_state` finds such states.
     - `t1`: end time [s], >= t0.
     - `t0`: start time [s].
     - `ts`: times [s] at which the run is kept, increasing, within `[t0, t1]`; by default the end alone, in arrays of
@@ -95,8 +96,8 @@ def simulate(
     - `max_steps`: limit of the number of steps. Derivatives set memory aside for the state before each of them.
     - `max_events`: limit of the number of instants at which set-valued laws change modes. Inside `jax.jit`, and where
       events are recorded, `run.events` has as many entries for each such law, so a smaller one is faster there.
-    - `hold_chatter`: whether an element whose mode changes accumulate is held in stick, with whatever force that takes,
-      be it above the limit, instead of ending the run.
+    - `stick_on_chatter`: whether an element with accumulating mode changes remains in stick, by a force that may exceed
+      its limit, instead of ending the run.
     - `project`: whether the state is moved onto the constraints after every step, and wherever it is kept, by the
       smallest changes in the metric of the masses. Without, constraints hold for the accelerations alone and drift with
       the error of integration, but for their own `stabilise`.
@@ -112,11 +113,11 @@ def simulate(
 
     **Raises:**
 
-    - `ValueError` for wrong shapes, types or ranges, before anything runs; for `accuracy` where numbers are traced.
-    - `SimulationError` if the run ended early and `throw` is set. Inside
-      `jax.jit`, `jax.vmap` or `jax.grad` the same sentence comes as equinox's run-time error, and once more as the
-      last line behind the traceback. That calls Python, and JAX keeps no compiled program that does in its persistent
-      cache: pass `throw=False` there, and read `run.result`.
+    - `ValueError` for wrong shapes, types or ranges, before the run.
+    - `SimulationError` if the run ends early and `throw` is set. Inside `jax.jit`, `jax.vmap` or `jax.grad` it is a
+      run-time error of equinox with the same message, which also appears after the traceback. This error calls Python,
+      and JAX does not keep programs with callbacks in its persistent cache. To cache such programs, pass `throw=False`
+      and read `run.result`.
     """
     recommend_tuning()
     throw = as_flag(throw, name="throw")
@@ -133,7 +134,7 @@ def simulate(
         adjoint=adjoint,
         max_steps=max_steps,
         max_events=max_events,
-        hold_chatter=hold_chatter,
+        stick_on_chatter=stick_on_chatter,
         project=project,
         record=record,
     )
@@ -142,7 +143,7 @@ def simulate(
     compiled, began = compiled_runs(), time.perf_counter()
     solved = solve(request)
     if compiled_runs() > compiled:
-        remark_on_compilation(time.perf_counter() - began, _functions(scene))
+        warn_about_compilation(time.perf_counter() - began, _functions(scene))
     if throw:
         solved = _raise_early_end(request, solved)
         _check_rounding(request, solved)
@@ -160,7 +161,7 @@ def _check_rounding(request: RunRequest, solved: RunOutput) -> None:
     if solved.t.dtype == jnp.float32 and request.dt is None and is_known(steps, request.rtol):
         rounding = 0.5 * float(jnp.finfo(jnp.float32).eps) * math.sqrt(int(steps))
         if rounding > _ROUNDING * float(request.rtol):
-            remark_on_rounding()
+            warn_about_rounding()
 
 
 def _check_fixed_steps(request: RunRequest, solved: RunOutput) -> None:
@@ -180,7 +181,7 @@ def _check_fixed_steps(request: RunRequest, solved: RunOutput) -> None:
     jacobian = jax.jacfwd(lambda x: ravel_pytree(vector_field(t, as_state(x), scene.bind_time(t), mode))[0])(numbers)
     reach = float(dt) * max(abs(np.linalg.eigvals(np.asarray(jacobian))), default=0.0)
     if reach > _LONGEST:
-        remark_on_fixed_steps(type(solver).__name__, float(dt), float(dt) * _LONGEST / reach)
+        warn_about_fixed_steps(type(solver).__name__, float(dt), float(dt) * _LONGEST / reach)
 
 
 def _functions(scene: Scene) -> list[object]:

@@ -36,7 +36,7 @@ from ..solvers import (
     StoredSteps,
     first_step,
     trial_step,
-    unchecked,
+    without_error_checks,
 )
 from ._integrated_system import AugmentedState, Instant, IntegratedSystem, RunFunctions, Work, project
 from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, end_code, start_code
@@ -140,7 +140,7 @@ def _solver(
             solver,
             functions.guards,
             functions.reset,
-            on_zeno=functions.on_zeno if request.choices.hold_chatter or scene.contacts else None,
+            on_zeno=functions.on_zeno if request.choices.stick_on_chatter or scene.contacts else None,
             project=functions.project_and_stick if functions.projects or functions.sticks else None,
             samples=samples,
             rtol=functions.tolerances[0],
@@ -206,7 +206,7 @@ def _functions(request: RunRequest) -> RunFunctions:
         (request.rtol, request.atol),
         bool(scene.bilateral or scene.contacts) and request.choices.project,
         scene.stick_drifts,
-        request.choices.hold_chatter,
+        request.choices.stick_on_chatter,
         scene.mode_widths(request.q0.shape[0]),
     )
 
@@ -306,7 +306,7 @@ def _integrate(request: RunRequest) -> RunOutput:
         )
 
     # What diffrax checks of them, that they point forward, increase and lie within the run, `_well_posed` has.
-    solution = unchecked(integrate, first, ts)
+    solution = without_error_checks(integrate, first, ts)
     assert solution.ts is not None
     assert solution.ys is not None
     (rows, events), ending, log = solution.ys[0], None, None
@@ -329,7 +329,7 @@ def _integrate(request: RunRequest) -> RunOutput:
     (y, work), (end_state, _) = (y, end[1]) if request.choices.audited else ((y, None), (end[1], None))
     ended = _ended(request, end[0], end_state, rate, end[2], solution.result, ending)
     code = jnp.where(starts, ended, start)
-    if exact and not request.choices.hold_chatter:
+    if exact and not request.choices.stick_on_chatter:
         code = jnp.where((code == SUCCESS) & missed, MISSED_EVENT, code)
     nodes = None if series is None else Nodes(solution.ts[-1], *solution.ys[-1])
     return RunOutput(t, y, modes, code, None if ts is None else (end[0], end_state), stats, log, work, nodes)

@@ -15,13 +15,14 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from .._core.arguments import as_flag
-from .._core.index_check import check_indices
+from .._core.arrays import is_known
+from .._core.trace_checks import check_indices
 from ..scene import Scene
 from ._accuracy import Accuracy, Attempt, CostScaling
 from ._evaluations import evaluations_per_step
 from ._observe import named_series
 from ._outcome import SUCCESS, SimulationError, describe_failure
-from ._run_request import MOST_EVENTS, MOST_STEPS, Plugin, RunRequest, is_known, run_request
+from ._run_request import MOST_EVENTS, MOST_STEPS, Plugin, RunRequest, run_request
 from ._solve import RunOutput, default_solver, solve
 from ._trajectory import Trajectory, trajectory
 
@@ -193,7 +194,7 @@ def simulate_to_accuracy(
     adjoint: dfx.AbstractAdjoint | None = None,
     max_steps: int = MOST_STEPS,
     max_events: int = MOST_EVENTS,
-    hold_chatter: bool = False,
+    stick_on_chatter: bool = False,
     project: bool = True,
     throw: bool = True,
 ) -> Trajectory:
@@ -241,7 +242,7 @@ def simulate_to_accuracy(
         adjoint=adjoint,
         max_steps=max_steps,
         max_events=max_events,
-        hold_chatter=hold_chatter,
+        stick_on_chatter=stick_on_chatter,
         project=project,
     )
     asked = _asked(request, accuracy)

@@ -14,6 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from .._core.arrays import is_known
 from .._core.compat import get_opaque_trace_state
 from .._core.readable import AbstractReadable, Table, short, table_of
 from ..mechanics import momentum
@@ -24,7 +25,7 @@ from ._columns import Columns, columns
 from ._energy_ledger import EnergyLedger, event_losses, ledger
 from ._integrated_system import Series, Work
 from ._outcome import SUCCESS, RunResult, SimulationError, outcome_messages
-from ._run_request import RunRequest, is_known
+from ._run_request import RunRequest
 from ._solve import RunOutput, solve, solve_start
 
 if TYPE_CHECKING:
@@ -215,7 +216,7 @@ class Trajectory(AbstractReadable):
         return {name: modes[..., i] for i, name in enumerate(self.scene.mode_names)}
 
     @property
-    def mode_words(self) -> dict[str, dict[int, str]]:
+    def mode_labels(self) -> dict[str, dict[int, str]]:
         """What the numbers of `mode` mean, by name, in the words of `ModeChange`."""
         scene = self.scene
         widths = dict(zip(scene.mode_names, scene.mode_widths(self.q.shape[-1]), strict=True))
@@ -328,7 +329,7 @@ class Trajectory(AbstractReadable):
         if is_known(t):
             count = int(np.isfinite(t).sum())
             t, *modes = (x[:count] for x in (t, *modes))
-        words = self.mode_words
+        words = self.mode_labels
         labels = tuple((name, tuple(words.get(name, {}).items())) for name in self.scene.part_names)
         return Events(t, *modes, labels=labels)
 

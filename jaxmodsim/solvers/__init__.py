@@ -12,7 +12,7 @@ from ._rodas5p import Rodas5P as Rodas5P
 from ._rosenbrock import RosenbrockTableau as RosenbrockTableau
 from ._rosenbrock import rosenbrock_step as rosenbrock_step
 from ._stored_steps import StoredSteps as StoredSteps
-from ._unchecked import unchecked as unchecked
+from ._without_error_checks import without_error_checks as without_error_checks
 from .events._controller import EventController as EventController
 from .events._samples import SampledJumps as SampledJumps
 from .events._solver import EventSolver as EventSolver

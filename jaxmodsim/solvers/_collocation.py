@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from .._core.fusion import fusion_barrier, opaque_one
+from .._core.arrays import fusion_barrier, opaque_one
 from .._core.lu import MAX_UNROLLED_LU, factor_lu, invert
 from ._state_layout import Layout, Parts, State
 

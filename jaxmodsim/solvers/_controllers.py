@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
-from .._core.sorted_times import after, is_one_of
+from .._core.arrays import after, is_one_of
 from ._wrapper import AbstractControllerWrapper
 
 # Part of a step by which it may end before or behind the time that is meant.

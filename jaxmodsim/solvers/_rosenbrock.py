@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from .._core.fusion import fusion_barrier, opaque_one
+from .._core.arrays import fusion_barrier, opaque_one
 from .._core.lu import LinearSolver, factor_lu, invert, is_zero
 from .._core.scalarise import columns_of
 from ._state_layout import Layout, Parts, State

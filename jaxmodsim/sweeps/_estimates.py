@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .._core.extra import extra
+from .._core.system import extra
 
 # Runs, and elementary effects of a parameter, below which a class is too small for indices of its own.
 _LEAST_RUNS, _LEAST_EFFECTS = 128, 8

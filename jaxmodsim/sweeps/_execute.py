@@ -10,8 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._core.extra import extra
 from .._core.speed import cores
+from .._core.system import extra
 from ._compute import Computed, Work, compute
 
 # A block: its number, the numbers of its runs, and the order in which they are run.

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from .._core.extra import extra
+from .._core.system import extra
 from ._estimates import Estimate
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._core.arguments import as_names
-from .._core.index_check import check_indices
+from .._core.trace_checks import check_indices
 from ..simulation import Trajectory, named_series
 from ._grid import RESERVED
 

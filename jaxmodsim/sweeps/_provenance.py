@@ -7,7 +7,7 @@ import jax
 import jax.tree_util as jtu
 import numpy as np
 
-from .._core.provenance import versions
+from .._core.system import versions
 from ..scene import scene_numbers
 from ..simulation import default_solver
 from ._compute import Work, program

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._core.extra import extra
+from .._core.system import extra
 from ._compute import Computed
 from ._grid import Blocks
 from ._layout import NOT_RUN, ResultLayout, Variable

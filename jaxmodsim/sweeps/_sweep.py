@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from .._core.arguments import as_whole
-from .._core.extra import extra
 from .._core.progress import reported
-from .._core.provenance import commit
+from .._core.system import commit, extra
 from ..scene import Scene
 from ._compute import GROUP, Work, runs_per_call
 from ._execute import Task, in_threads, run_on_executor

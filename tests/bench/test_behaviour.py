@@ -14,8 +14,8 @@ from bench.behaviour.run import EXPERIMENTS, run_bench
 from bench.layout import Recorded
 from bench.studies import behaviour
 from jaxmodsim import SimulationError, friction
+from jaxmodsim._core.functions import StateDependent
 from jaxmodsim._core.parameters import modules_of
-from jaxmodsim._core.state_dependent import StateDependent
 from jaxmodsim.friction import AbstractLaw, Dahl, LuGre
 
 BENCH = {each.name: each for each in law_cases()}

@@ -27,7 +27,7 @@ from jaxmodsim import (
     sweep,
 )
 from jaxmodsim._core.compat import AVAILABLE
-from jaxmodsim._core.index_check import traced
+from jaxmodsim._core.trace_checks import traced
 from jaxmodsim.problems import named_problems
 from jaxmodsim.scene import State, check_scene
 

@@ -85,7 +85,7 @@ def test_words() -> None:
     assert words(SweepProgress(20_000, 20_000, 1002)) == "20,000 of 20,000 runs, 1,002 failed"
     assert SweepWords()(SweepProgress(10, 40, 0)) == "compiling, 10 of 40 runs are there"
     assert SweepWords()(SweepProgress(40, 40, 3)) == "40 of 40 runs, 3 failed"
-    assert candidate_words("LuGre", 1, 3, 0.00123456) == "LuGre, fold 2 held back, iteration 3: RMSE 0.001235"
+    assert candidate_words("LuGre", 1, 3, 0.00123456) == "LuGre, fold 2 held out, iteration 3: RMSE 0.001235"
     assert [minutes(x) for x in (0.2, 59.6, 3599.0, 3725.0)] == ["0:00", "1:00", "59:59", "1:02:05"]
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmodsim._core.fusion import opaque_one
+from jaxmodsim._core.arrays import opaque_one
 from jaxmodsim._core.scalarise import columns_of, in_scalars
 
 TABLE = np.array([[0.0, 1.0, 2.0], [0.0, 0.0, 0.5], [1.0, -1.0, 3.0]])

@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim._core import step_functions
-from jaxmodsim._core.index_check import traced
+from jaxmodsim._core import trace_checks
+from jaxmodsim._core.trace_checks import traced
 
 PARAMS = {"ts": 1.0, "F": 2.0, "grid": jnp.arange(3.0)}
 
 
 @pytest.fixture
 def remarks(caplog):
-    step_functions._remark.cache_clear()
+    trace_checks._warn.cache_clear()
     caplog.set_level(logging.WARNING, logger="jaxmodsim")
     return caplog
 

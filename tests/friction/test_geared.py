@@ -10,7 +10,7 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim import Bristle, Coulomb, Dahl, Geared, ServoGear, Stribeck, asymmetric, scaled_by
-from jaxmodsim.friction._servo_sets import PUBLISHED
+from jaxmodsim.friction._gears import published_servo_gears
 from jaxmodsim.scene import State, vector_field
 
 DRIVE, BACK, SPEED, LOAD = 0.25, 0.4, 3.0, 0.7
@@ -177,9 +177,12 @@ def test_it_stands_beside_lugre_and_an_elastic_joint() -> None:
         (lambda: Geared(Coulomb(0.1), -0.1, spring), "Fc must be finite and >= 0"),
         (lambda: Geared(Coulomb(0.1), "a", spring), "Geared drive and back must be a real number"),
         (lambda: Geared(Coulomb(0.1), 0.1, "a"), "Geared torque must be a real number"),
-        (lambda: Bristle(cast(Any, jms.Viscous(0.1)), 1e-3), "Bristle executes a set-valued law"),
+        (lambda: Bristle(cast(Any, jms.Viscous(0.1)), 1e-3), "Bristle needs a set-valued law"),
         (lambda: Bristle(Coulomb(0.1), 0.0), "h must be finite and > 0"),
-        (lambda: jms.to_mujoco(Geared(Coulomb(0.1), 0.2, 1.0)), "MuJoCo has no Geared: its joints do not know"),
+        (
+            lambda: jms.to_mujoco(Geared(Coulomb(0.1), 0.2, 1.0)),
+            "MuJoCo has no Geared: the friction of its joints does not depend",
+        ),
         (lambda: jms.to_mujoco(Bristle(Coulomb(0.1), 1e-3)), "MuJoCo has no Bristle"),
         (lambda: jms.to_modelica(Geared(Coulomb(0.1), 0.2, 1.0), 1.0), "rotary gear"),
         (lambda: jms.to_modelica(Geared(Coulomb(0.1), 0.2, 1.0, 1.1), 1.0, rotary=True), "up to 1.1"),
@@ -214,6 +217,7 @@ def test_a_torque_of_the_wrong_shape_is_refused() -> None:
 
 
 ACTUATORS = ("mx64", "mx106", "erob80_50", "erob80_100")
+PUBLISHED = published_servo_gears()
 
 
 def reference(p: dict[str, float], tau_m: float, tau_e: float, v: float) -> float:
@@ -232,7 +236,7 @@ def reference(p: dict[str, float], tau_m: float, tau_e: float, v: float) -> floa
 @pytest.mark.parametrize("model", ["M1", "M2", "M3", "M4", "M5", "M6"])
 @pytest.mark.parametrize("actuator", ACTUATORS)
 def test_the_published_models_are_their_formulas(actuator: str, model: str) -> None:
-    numbers, speeds = PUBLISHED[actuator, model], np.array([1e-3, 0.4, 1.7, 5.0])
+    numbers, speeds = PUBLISHED[actuator][model], np.array([1e-3, 0.4, 1.7, 5.0])
     for tau_m, tau_e in ((1.3, -0.8), (0.5, -0.9), (-1.1, 0.4), (0.6, 0.3)):
         law = ServoGear.published(actuator, model, tau_m, tau_e)
         force = jax.vmap(lambda v, law=law: law.sliding_force(v) + law.viscous_force(v))(jnp.asarray(speeds))
@@ -242,7 +246,7 @@ def test_the_published_models_are_their_formulas(actuator: str, model: str) -> N
 
 @pytest.mark.parametrize("actuator", ACTUATORS)
 def test_efficiency_and_self_locking_of_the_directional_model(actuator: str) -> None:
-    p = {**PUBLISHED[actuator, "M5"], "Kc": 0.0, "Kcs": 0.0, "Kv": 0.0}
+    p = {**PUBLISHED[actuator]["M5"], "Kc": 0.0, "Kcs": 0.0, "Kv": 0.0}
     for v in (1e-3, 0.5, 4.0):
         fall = np.exp(-((v / p["vs"]) ** p["alpha"]))
         Km, Ke = p["Km"] + fall * p["Kms"], p["Ke"] + fall * p["Kes"]
@@ -300,14 +304,14 @@ def test_a_servo_on_a_pendulum_sticks_and_slips() -> None:
 
 
 def test_derivatives_of_the_richest_model_equal_differences() -> None:
-    law: Any = ServoGear(1.3, -0.8, **PUBLISHED["mx106", "M6"])
+    law: Any = ServoGear(1.3, -0.8, **PUBLISHED["mx106"]["M6"])
 
     def force(law: ServoGear, v: Any) -> Any:
         return law.sliding_force(v) + law.viscous_force(v)
 
     for v in (0.3, -1.2):
         slopes = jax.grad(lambda law, v=v: force(law, jnp.array(v)))(law)
-        for name in ("motor", "external", *PUBLISHED["mx106", "M6"]):
+        for name in ("motor", "external", *PUBLISHED["mx106"]["M6"]):
             step = 1e-6 * max(float(getattr(law, name)), 1e-2)
             sides = [
                 eqx.tree_at(lambda x, n=name: getattr(x, n), law, getattr(law, name) + side * step) for side in (1, -1)

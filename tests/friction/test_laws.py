@@ -24,8 +24,8 @@ from jaxmodsim import (
     friction,
     scaled_by,
 )
+from jaxmodsim._core.functions import nominal
 from jaxmodsim._core.parameters import modules_of, parameter, ranges_of
-from jaxmodsim._core.state_dependent import nominal
 from jaxmodsim.friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw
 
 from ..helpers.differences import flat, gradient_by_differences
@@ -326,15 +326,15 @@ def test_the_table_covers_every_law_and_every_modifier() -> None:
         (lambda: Coulomb(jnp.ones(2)), r"Fc has shape \(2,\), but one number is needed"),
         (
             lambda: Regularized(cast(Any, Viscous(1.0)), 0.1),
-            "Regularized executes a set-valued law .* but 'Viscous' is none",
+            "Regularized needs a set-valued law .* but 'Viscous' was given",
         ),
-        (lambda: Sign(cast(Any, "coulomb")), "Sign executes a set-valued law .* but 'coulomb' is none"),
+        (lambda: Sign(cast(Any, "coulomb")), "Sign needs a set-valued law .* but 'coulomb' was given"),
         (
             lambda: DeadZone(cast(Any, Sign(Coulomb(1.0))), 0.1),
-            "DeadZone executes a set-valued law .* but 'Sign' is none",
+            "DeadZone needs a set-valued law .* but 'Sign' was given",
         ),
         (lambda: asymmetric(BRISTLE, sigma0=2.0), "sigma0 stores energy, so it must be the same"),
-        (lambda: asymmetric(asymmetric(Coulomb(1.0), Fc=2.0), Fc=2.0), "a law that is asymmetric already"),
+        (lambda: asymmetric(asymmetric(Coulomb(1.0), Fc=2.0), Fc=2.0), "an asymmetric law was given"),
         (lambda: asymmetric(cast(Any, "coulomb"), Fc=2.0), "asymmetric needs a law .* but 'coulomb'"),
         (lambda: scaled_by(cast(Any, "coulomb"), factor), "scaled_by needs a law, but 'coulomb'"),
         (lambda: scaled_by(Coulomb(1.0), cast(Any, 2.0)), "scaled_by fn must be a function, but 2.0"),
@@ -345,8 +345,8 @@ def test_the_table_covers_every_law_and_every_modifier() -> None:
         (lambda: scaled_by(Coulomb(1.0), Number(jnp.ones(()))), "fn holds numbers of its own"),
         (lambda: MaxwellSlip([1.0, 2.0], [1.0]), r"Fc must have one number for each of the 2 elements of k"),
         (lambda: MaxwellSlip([1.0, 2.0], [1.0, 1.0], Fs=[1.0, 2.0]), "give both or none"),
-        (lambda: MaxwellSlip(jnp.ones((2, 2)), 1.0), r"k has shape \(2, 2\), but numbers in a row"),
-        (lambda: MaxwellSlip([], []), r"k has shape \(0,\), but numbers in a row"),
+        (lambda: MaxwellSlip(jnp.ones((2, 2)), 1.0), r"k has shape \(2, 2\), but a vector of numbers"),
+        (lambda: MaxwellSlip([], []), r"k has shape \(0,\), but a vector of numbers"),
         (lambda: asymmetric(Coulomb(1.0), Fv=2.0), r"among Fc .*given: Fv"),
         (lambda: asymmetric(Coulomb(1.0)), "given: none"),
         (lambda: asymmetric(Coulomb(1.0), Fc=-2.0), r"Fc must be finite and >= 0 \[N\], but -2.0 was given"),

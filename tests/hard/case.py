@@ -32,7 +32,7 @@ class SceneTask(eqx.Module):
       `qd0[i]`.
     - `read`: the number asked for, of the `Trajectory`.
     - `numbers`: numbers for `simulate` by name: `rtol`, `atol`, `t0`, `ts`, `dt`, `dtmax`.
-    - `choices`: what else is passed on: `solver`, `max_steps`, `max_events`, `hold_chatter`.
+    - `choices`: what else is passed on: `solver`, `max_steps`, `max_events`, `stick_on_chatter`.
     """
 
     scene: Scene

@@ -162,7 +162,7 @@ def _chatter() -> list[HardCase]:
             "chatter_held",
             why,
             naive,
-            motion(scene, [0.0], [0.0], 1.8, by="ramp", read=position, hold_chatter=True),
+            motion(scene, [0.0], [0.0], 1.8, by="ramp", read=position, stick_on_chatter=True),
             lambda _: 0.0,
             asks="position at 1.8 s, held in stick [m]",
             scale=1.0,

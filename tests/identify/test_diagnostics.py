@@ -323,8 +323,8 @@ class NotFinite(AbstractForceLaw):
 @pytest.mark.parametrize(
     ("call", "text"),
     [
-        (lambda: check_passivity(VARYING), r"ask law.bind_state\(t, q, qd, params\)"),
-        (lambda: max_stable_step(VARYING), r"ask law.bind_state\(t, q, qd, params\)"),
+        (lambda: check_passivity(VARYING), r"Pass the law at a state, law.bind_state\(t, q, qd, params\)"),
+        (lambda: max_stable_step(VARYING), r"Pass the law at a state, law.bind_state\(t, q, qd, params\)"),
         (lambda: check_passivity(jms.Viscous(1.0), v_max=0.0), "v_max must be finite"),
         (lambda: check_passivity(NotFinite()), "not finite at v = 1000 m/s"),
         (lambda: damping_sigma1(0.0, 1.0), "m must be finite and > 0"),

@@ -23,8 +23,8 @@ import scipy.io
 from hypothesis import strategies as st
 
 import jaxmodsim as jms
-from jaxmodsim._core import files
-from jaxmodsim._core.files import written_whole
+from jaxmodsim._core import system
+from jaxmodsim._core.system import written_whole
 from jaxmodsim.analysis import Row, WorkPrecision, load_work_precision
 from jaxmodsim.cli import _output, _read
 from jaxmodsim.identify import FitResult
@@ -223,7 +223,7 @@ def test_what_was_begun_elsewhere_is_not_in_the_way(tmp_path: Path) -> None:
 def test_killed_while_it_writes(tmp_path: Path) -> None:
     """What was there last is there whole, at whatever moment the process ends."""
     path, draw = tmp_path / "kept", random.Random(3)
-    module = Path(files.__file__)
+    module = Path(system.__file__)
     code = (
         "import importlib.util, itertools\n"
         f"spec = importlib.util.spec_from_file_location('files', {str(module)!r})\n"
@@ -235,7 +235,7 @@ def test_killed_while_it_writes(tmp_path: Path) -> None:
         "            file.write(bytes([i % 256]) * 20_000)\n"
         "    print(i, flush=True)\n"
     )
-    assert importlib.util.find_spec("jaxmodsim._core.files") is not None
+    assert importlib.util.find_spec("jaxmodsim._core.system") is not None
     for _ in range(5):
         process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None

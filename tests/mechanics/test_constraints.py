@@ -20,11 +20,11 @@ from jaxmodsim import (
     Scene,
     SimulationError,
     VelocityConstraint,
-    consistent,
     point_mass,
+    project_initial_state,
     simulate,
 )
-from jaxmodsim._core.semidefinite import solve_semidefinite
+from jaxmodsim._core.cholesky import solve_semidefinite
 from jaxmodsim.scene import State, forward_dynamics, vector_field
 from jaxmodsim.scene._event_driven import _loads
 
@@ -191,24 +191,24 @@ def test_a_blade_that_turns_steadily_goes_in_a_circle() -> None:
 
 
 def test_consistent_states_are_found() -> None:
-    q, qd = consistent(PENDULUM, [1.5, -1.0], [1.0, 1.0])
+    q, qd = project_initial_state(PENDULUM, [1.5, -1.0], [1.0, 1.0])
     np.testing.assert_allclose(q, LENGTH * np.array([1.5, -1.0]) / np.hypot(1.5, 1.0), rtol=1e-12)
     np.testing.assert_allclose(q @ qd, 0.0, atol=1e-13)
     np.testing.assert_allclose(qd, np.array([1.0, 1.0]) - q * (q @ np.ones(2)) / LENGTH**2, atol=1e-12)
-    held, rate = consistent(PENDULUM, [1.5, -1.0], [1.0, 0.0], hold=[0])
+    held, rate = project_initial_state(PENDULUM, [1.5, -1.0], [1.0, 0.0], hold=[0])
     np.testing.assert_allclose(held, [1.5, -np.sqrt(LENGTH**2 - 1.5**2)], rtol=1e-12)
     np.testing.assert_allclose(rate, [1.0, 1.5 / np.sqrt(LENGTH**2 - 1.5**2)], rtol=1e-12)
 
 
 def test_inconsistent_states_are_refused() -> None:
-    with pytest.raises(SimulationError, match=r"does not obey the constraints: pass q0, qd0 = jaxmodsim.consistent"):
+    with pytest.raises(SimulationError, match=r"constraints: pass q0, qd0 = jaxmodsim.project_initial_state"):
         simulate(PENDULUM, [1.5, -1.0], [0.0, 0.0], 1.0)
     with pytest.raises(SimulationError, match="does not obey the constraints"):
         simulate(PENDULUM, [0.0, -2.0], [0.1, 0.1], 1.0)
-    with pytest.raises(SimulationError, match=r"No position near .* with the coordinates \(0,\) held.*still off by"):
-        consistent(PENDULUM, [2.5, -1.0], [0.0, 0.0], hold=[0])
+    with pytest.raises(SimulationError, match=r"No position near .* \(0,\) held: the residual of the last"):
+        project_initial_state(PENDULUM, [2.5, -1.0], [0.0, 0.0], hold=[0])
     with pytest.raises(ValueError, match=r"hold must be indices of coordinates, 0 to 1, .*but \[2\]"):
-        consistent(PENDULUM, [2.5, -1.0], [0.0, 0.0], hold=[2])
+        project_initial_state(PENDULUM, [2.5, -1.0], [0.0, 0.0], hold=[2])
 
 
 def test_constraints_that_contradict_each_other_end_the_run() -> None:

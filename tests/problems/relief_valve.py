@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from jaxmodsim._core.shapes import PerDof, Scalar
+from jaxmodsim._core.arrays import PerDof, Scalar
 from jaxmodsim.friction import Viscous
 from jaxmodsim.mechanics import Contact
 from jaxmodsim.scene import AbstractEffect, Action, Friction, Power, Scene

@@ -38,7 +38,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "belt": (lambda: jms.Friction(COULOMB, belt_velocity=math.inf), "belt_velocity must be a finite number"),
     "ends exchanged": (
         lambda: jms.end_stops(across, lower=1.0, upper=0.0),
-        "end_stops needs lower < upper [m or rad], but lower=1 and upper=0 were given: exchange them",
+        "end_stops needs lower < upper [m or rad], but lower=1 and upper=0 were given: swap them",
     ),
     "ends equal": (lambda: jms.end_stops(across, lower=1, upper=1.0), "end_stops needs lower < upper"),
     "end of infinity": (lambda: jms.end_stops(across, upper=math.inf), "end_stops upper must be a finite number"),
@@ -52,7 +52,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "gravity": (lambda: jms.point_mass(1.0, place, math.nan), "point_mass gravity must be a finite number"),
     "inertia": (
         lambda: jms.rigid_body(1.0, -0.1, place, across),
-        "rigid_body inertia must have moments >= 0 [kg m^2], but those given are -0.1",
+        "rigid_body inertia must have moments >= 0 [kg m^2], but they are -0.1",
     ),
     "principal inertia": (lambda: jms.rigid_body(1.0, np.array([1.0, -2.0, 1.0]), place, across), "[1.0, -2.0, 1.0]"),
     "tensor": (lambda: jms.rigid_body(1.0, np.diag([1.0, 1.0, -2.0]), place, across), "moments >= 0"),
@@ -65,14 +65,14 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "numbers of nothing": (lambda: jms.Scene(energy, params={"a": [1.0, None]}), "params['a'][1] is None"),
     "unit": (
         lambda: jms.Scene(energy, coordinates=("x [furlong]",)),
-        "The coordinate 'x [furlong]' has the unit 'furlong', where 'furlong' is not known. A unit is made of m, km",
+        "The coordinate 'x [furlong]' has the unit 'furlong', where 'furlong' is not known. Units are products,",
     ),
     "unit in full": (
         lambda: jms.Scene(energy, coordinates=("x [meters/s]",)),
         "'meters' is not known. Did you mean 'm'?",
     ),
     "unit in capitals": (lambda: jms.Scene(energy, coordinates=("x [KG m]",)), "'KG' is not known. Did you mean 'kg'?"),
-    "fall": (lambda: jms.Stribeck(1.0, 2.0, 0.1, fall=jnp.sinh), "fall must be 1 at 0, where slip begins at Fs, but"),
+    "fall": (lambda: jms.Stribeck(1.0, 2.0, 0.1, fall=jnp.sinh), "fall(0) must be 1, so that slip begins at Fs"),
 }
 
 

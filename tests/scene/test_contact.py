@@ -207,7 +207,7 @@ def test_chatter_is_named_or_held() -> None:
     # The step before ends on the event to 1e-5 of its length.
     np.testing.assert_allclose(early.t_end, 1.0, atol=1e-5)
     np.testing.assert_allclose(early.forces["pad"][0], 0.5)
-    held = simulate(law, [0.0], [0.0], 1.8, hold_chatter=True)
+    held = simulate(law, [0.0], [0.0], 1.8, stick_on_chatter=True)
     # To the absolute tolerance of the run.
     np.testing.assert_allclose(held.q, 0.0, atol=1e-9)
     np.testing.assert_array_equal(held.modes, [[0.0]])

@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from jaxmodsim import AppliedForce, Coulomb, Friction, Rodas5P, Scene, Signal, check_gradients, sensitivity, simulate
-from jaxmodsim._core.speed import remark_on_fixed_steps
+from jaxmodsim._core.speed import warn_about_fixed_steps
 
 from ..helpers.differences import central_difference
 
@@ -324,7 +324,7 @@ def test_fixed_steps_that_are_too_long_are_remarked_on(name: str, caplog: Any) -
     exact = slopes_at_rest(1.0, 400.0, 4.0, 10.0)[0]
 
     def slope(dt: float) -> float:
-        remark_on_fixed_steps.cache_clear()
+        warn_about_fixed_steps.cache_clear()
         caplog.clear()
         run = lambda scene: simulate(scene, [-G / 400.0], [0.0], 10.0, dt=dt, solver=SOLVERS[name]).q[-1, 0]  # noqa: E731
         return float(jax.grad(run)(MASS).params["m"])
@@ -341,7 +341,7 @@ def test_fixed_steps_that_are_too_long_are_remarked_on(name: str, caplog: Any) -
             assert "dt=0.2 s" in caplog.text
             assert "Pass dt <= 0.1 s" in caplog.text
         # A plain run is not looked at.
-        remark_on_fixed_steps.cache_clear()
+        warn_about_fixed_steps.cache_clear()
         caplog.clear()
         simulate(MASS, [-G / 400.0], [0.0], 10.0, dt=0.2, solver=SOLVERS[name])
         assert "fixed steps" not in caplog.text

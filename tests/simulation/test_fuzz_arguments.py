@@ -89,14 +89,14 @@ CALLS = {
     "simulate": Call(
         jms.simulate,
         {"scene": SCENE, **MOTION, "t1": 1.0, "t0": 0.0, "ts": T, "z0": None, "rtol": 1e-6, "atol": 1e-9, "dt": None,
-         "dtmax": None, "solver": None, "adjoint": None, "max_steps": 9, "max_events": 9, "hold_chatter": False,
+         "dtmax": None, "solver": None, "adjoint": None, "max_steps": 9, "max_events": 9, "stick_on_chatter": False,
          "project": True, "record": (), "throw": True},
     ),
     "simulate_to_accuracy": Call(
         jms.simulate_to_accuracy,
         {"scene": SCENE, **MOTION, "t1": 1.0, "accuracy": 1e-3, "observable": None, "throw": True},
     ),
-    "consistent": Call(jms.consistent, {"scene": SCENE, **MOTION, "t0": 0.0, "hold": ()}),
+    "project_initial_state": Call(jms.project_initial_state, {"scene": SCENE, **MOTION, "t0": 0.0, "hold": ()}),
     "Record": Call(
         jms.Record,
         {"t": T, "measured": T, "inputs": {"u": T}, "name": "r", "linear": ("u",), "noise": 0.1,
@@ -264,18 +264,18 @@ def test_functions_that_return_garbage_are_refused_by_name(name: str, kind: str)
 
 # What was an error from deep inside, or was taken, when it was found.
 FOUND = [
-    ("LuGre", "Fc", "huge", "Fc is a number beyond all that a float64 can hold"),
+    ("LuGre", "Fc", "huge", "Fc is too large for float64"),
     ("Coulomb", "Fs", "array of text", "Fs must be a real number"),
     ("Stribeck", "fall", "text", "fall must be a function"),
     ("Friction", "name", "matrix", "Friction name must be a text"),
     ("Signal", "linear", "None", "Signal linear must be True or False"),
     ("scaled_by", "parameters", "object", "scaled_by parameters must be a list of names"),
-    ("simulate", "z0", "text", "z0 must be a mapping by names"),
+    ("simulate", "z0", "text", "z0 must be a mapping with names as keys"),
     ("simulate", "throw", "matrix", "throw must be True or False"),
     ("simulate", "max_steps", "huge", "max_steps must be a positive integer, but one of 401 digits"),
-    ("consistent", "q0", "complex array", "q0 must hold real numbers"),
-    ("consistent", "scene", "None", "consistent needs a Scene"),
-    ("Record", "inputs", "True", "inputs must be a mapping by names"),
+    ("project_initial_state", "q0", "complex array", "q0 must hold real numbers"),
+    ("project_initial_state", "scene", "None", "project_initial_state needs a Scene"),
+    ("Record", "inputs", "True", "inputs must be a mapping with names as keys"),
     ("Record", "t", "complex array", "column 't' must hold real numbers"),
     ("part", "start", "text", "start must hold real numbers"),
     ("windows", "seconds", "None", "seconds must hold real numbers"),
@@ -300,11 +300,11 @@ def test_what_was_not_refused_by_name(name: str, argument: str, kind: str, text:
     ("name", "kind", "text"),
     [
         ("lagrangian", "zero", "The Lagrangian must return one number .* that depends on the state"),
-        ("lagrangian", "text", "What the Lagrangian returns must hold real numbers, but 'text'"),
-        ("applied force", "complex array", "What fn of AppliedForce 'applied' returns must hold real numbers"),
-        ("along", "None", "What Friction along returns must be an array of real numbers, but it is None"),
-        ("normal_force", "complex", "normal_force.* returns must hold real numbers"),
-        ("phi", "text", "What phi of Constraint 'constraint' returns must hold real numbers"),
+        ("lagrangian", "text", "The result of the Lagrangian must hold real numbers, but 'text'"),
+        ("applied force", "complex array", "The result of fn of AppliedForce 'applied' must hold real numbers"),
+        ("along", "None", "The result of Friction along must be an array of real numbers, but it is None"),
+        ("normal_force", "complex", "normal_force.* must hold real numbers"),
+        ("phi", "text", "The result of phi of Constraint 'constraint' must hold real numbers"),
     ],
 )
 def test_what_a_function_returned_was_not_refused_by_name(name: str, kind: str, text: str) -> None:

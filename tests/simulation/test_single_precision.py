@@ -89,7 +89,7 @@ def pulled(kind: Any, t1: float, rtol: float) -> jms.Trajectory:
 
 def test_rounding_of_a_stiff_bristle_is_remarked_on_once(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING, "jaxmodsim")
-    speed.remark_on_rounding.cache_clear()
+    speed.warn_about_rounding.cache_clear()
     short, larger, double = pulled(F, 1.0, 1e-6), pulled(F, 10.0, 1e-4), pulled(np.float64, 10.0, 1e-6)
     assert "rounding" not in caplog.text
     run = pulled(F, 10.0, 1e-6)
@@ -105,6 +105,6 @@ def test_rounding_of_a_stiff_bristle_is_remarked_on_once(caplog: pytest.LogCaptu
 
 def test_nothing_is_said_where_numbers_are_traced(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING, "jaxmodsim")
-    speed.remark_on_rounding.cache_clear()
+    speed.warn_about_rounding.cache_clear()
     jax.jit(lambda t1: pulled(F, t1, 1e-6).q)(10.0)
     assert "rounding" not in caplog.text

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..._core.arguments import as_float, as_label, as_mapping, as_names, as_reals
-from ..._core.device import on_device
+from ..._core.arrays import on_device
 
 
 @runtime_checkable

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..._core.index_check import traced
 from ..._core.parameters import check_ranges, modules_of
 from ..._core.progress import reported
+from ..._core.trace_checks import traced
 from ...scene import Scene, State, check_scene, scene_numbers, scene_ranges
 from ..model._observe import first_coordinate
 from ..model._parameters import FreeParameters, chosen_entries, split_entries, split_ranges

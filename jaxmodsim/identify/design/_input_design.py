@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._core.files import jsonable, written_whole
+from ..._core.system import jsonable, written_whole
 
 # Of the relative standard error, above which a number counts as not determined, and of the correlation.
 _VAGUE, _ALIKE = 0.5, 0.98

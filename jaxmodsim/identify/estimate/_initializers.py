@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ..._core.device import on_device
+from ..._core.arrays import on_device
 from ..._core.speed import cores
 from ._problem import FitProblem
 from ._search import SearchOptions, SearchState, solve, start_search, steps_side_by_side

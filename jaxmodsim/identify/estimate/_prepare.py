@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float
 
 from ..._core.arguments import as_float, as_names, as_reals
-from ..._core.device import on_device
+from ..._core.arrays import on_device
 from ..._core.parameters import Range, check_ranges, modules_of
 from ...scene import Scene, State, check_scene, scene_numbers, scene_ranges
 from ..data._record import Record, Windows, cut, runs_of, slip_channel, start_errors, start_state

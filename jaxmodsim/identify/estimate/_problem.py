@@ -12,7 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float
 
-from ..._core.device import on_device
+from ..._core.arrays import on_device
 from ..._core.parameters import Number, check_ranges, parameter
 from ...scene import State, replace_numbers, scene_numbers
 from ..data._record import Runs, slip_channel

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from ..._core.device import on_device
+from ..._core.arrays import on_device
 from ..data._record import Windows
 from ._problem import AbstractLoss, Box, FitProblem
 

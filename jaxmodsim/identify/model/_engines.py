@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ..._core.device import on_device
+from ..._core.arrays import on_device
 from ...friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw
 from ...scene import Scene, Signal, State, replace_numbers, scene_numbers, vector_field
 from ...simulation import Trajectory, simulate

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ..._core.arguments import as_mapping, did_you_mean
-from ..._core.device import on_device
-from ..._core.index_check import traced
+from ..._core.arrays import on_device
+from ..._core.trace_checks import traced
 from ...scene import Friction, Scene, State, forward_dynamics
 from ..data._record import Record
 

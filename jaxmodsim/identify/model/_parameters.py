@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..._core.device import on_device
+from ..._core.arrays import on_device
 from ..._core.parameters import Range
 from ...friction import AbstractLaw
 from ...scene import Scene, replace_numbers, scene_numbers

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..._core.device import on_device
+from ..._core.arrays import on_device
 from ..._core.parameters import ranges_of
 from ..._core.progress import candidate_words, reported
 from ...friction import AbstractLaw

@@ -7,8 +7,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from ..._core.device import on_device
-from ..._core.files import jsonable
+from ..._core.arrays import on_device
+from ..._core.system import jsonable
 from ..estimate._problem import AbstractLoss
 from ..estimate._search import SearchResult, cost_of, weighted_by
 from ..estimate._search import by_channel as residual_by_channel

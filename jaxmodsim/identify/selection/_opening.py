@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._core.device import on_device
+from ..._core.arrays import on_device
 from ..data._record import Record, Runs, sample_noise
 from ..estimate._problem import FitProblem, Prior
 from ..estimate._search import SearchOptions, SearchResult, SearchState, solve, start_search, step

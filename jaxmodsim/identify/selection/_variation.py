@@ -6,7 +6,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._core.device import on_device
+from ..._core.arrays import on_device
 from ..estimate._search import SearchResult, channels_seen
 from ..estimate._search import by_channel as residual_by_channel
 from ..uncertainty._estimate import covariance_of

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import special  # scipy.stats takes most of a second to import
 
-from ..._core.device import on_device
+from ..._core.arrays import on_device
 from ..data._record import Record
 from ..estimate._problem import FitProblem
 from ..estimate._search import SearchState, by_channel, start_search, step, weighted_by

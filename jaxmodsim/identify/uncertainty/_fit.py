@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._core.arguments import as_float, as_mapping, as_names, as_whole
-from ..._core.device import on_device
+from ..._core.arrays import on_device
+from ..._core.functions import is_state_dependent
 from ..._core.parameters import Range
 from ..._core.progress import iteration_words, reported
-from ..._core.state_dependent import is_state_dependent
 from ...friction import AbstractLaw
 from ...scene import Scene, scene_numbers, scene_ranges
 from ..data._clock import sampling_gaps

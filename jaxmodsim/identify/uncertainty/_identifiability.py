@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._core.device import on_device
+from ..._core.arrays import on_device
 from ..._core.parameters import modules_of
 from ...friction import AbstractAsymmetric, AbstractLaw, Dahl, ElastoPlastic, LuGre, MaxwellSlip
 from ...scene import Friction, Scene, replace_numbers, scene_numbers

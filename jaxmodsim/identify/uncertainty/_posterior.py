@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..._core.arguments import as_whole
-from ..._core.extra import extra
+from ..._core.system import extra
 from ._estimate import ParameterEstimate
 from ._log_density import LogDensity, log_density
 from ._result import FitResult

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy import special  # scipy.stats takes most of a second to import
 
 from ..._core.arguments import as_whole
-from ..._core.device import on_device
+from ..._core.arrays import on_device
 from ..estimate._problem import FitProblem, Prior
 from ..estimate._search import SearchOptions, SearchResult, SearchState, cost_of, start_search, step, weighted_by
 from ._estimate import BLOCKS, ROUNDING, ParameterEstimate, floored_inverse

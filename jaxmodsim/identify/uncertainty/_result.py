@@ -15,8 +15,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..._core.files import jsonable, written_whole
 from ..._core.readable import AbstractReadable, Table, table_of
+from ..._core.system import jsonable, written_whole
 from ..data._record import Record, resolution, sample_noise
 from ..estimate._search import SearchResult, ended_by_itself
 from ..model._parameters import with_numbers
@@ -239,12 +239,12 @@ def remarks(result: FitResult) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def step_shows(result: FitResult) -> bool:
+def is_step_size_limited(result: FitResult) -> bool:
     """Whether the integration steps between samples are so few that they show beside what the model misses."""
-    return _step_shows(result.diagnostics)
+    return _step_size_limits(result.diagnostics)
 
 
-def _step_shows(diagnostics: FitDiagnostics) -> bool:
+def _step_size_limits(diagnostics: FitDiagnostics) -> bool:
     errors, moved = list(diagnostics.rmse.values()), diagnostics.step_error
     return moved is not None and len(errors) == 1 and moved > _STEP_SHOWS * errors[0]
 
@@ -263,7 +263,7 @@ def _of_the_search(diagnostics: FitDiagnostics, records: tuple[Record, ...]) -> 
     sentences = []
     if not ended_by_itself(diagnostics.ending):
         sentences.append(f"The search {diagnostics.ending}: do not trust the standard errors.")
-    if _step_shows(diagnostics):
+    if _step_size_limits(diagnostics):
         sentences.append(
             f"The integration step shows: with four times as many the output moves by {diagnostics.step_error:.2g}"
             f" (root mean square) against an RMSE of {next(iter(diagnostics.rmse.values())):.2g}. Raise substeps."

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from ..._core.arguments import as_label
+from ..._core.arrays import PerDof, Scalar
 from ..._core.functions import as_function, result_shape
 from ..._core.position import PositionFn, as_position_fn
-from ..._core.shapes import PerDof, Scalar
 from ._effect import AbstractEffect, Action, Power
 
 

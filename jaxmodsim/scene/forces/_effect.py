@@ -7,7 +7,7 @@ import equinox as eqx
 from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
-from ..._core.shapes import PerDof, Scalar
+from ..._core.arrays import PerDof, Scalar
 
 
 class Action(NamedTuple):
@@ -41,6 +41,10 @@ class AbstractEffect(eqx.Module):
         name = cast("str | None", None)  # not a field, which would come before those of the effects
     else:
         name: AbstractVar[str | None]
+
+    def bind_state(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> "AbstractEffect":
+        """The effect with its parameters at a state of the mechanism; itself if none of them depends on the state."""
+        return self
 
     @property
     @abc.abstractmethod

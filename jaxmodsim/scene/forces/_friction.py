@@ -6,19 +6,17 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
 from ..._core.arguments import as_label
-from ..._core.functions import as_function, result_shape
-from ..._core.index_check import traced
+from ..._core.arrays import PerDof, Scalar
+from ..._core.functions import StateDependent, as_function, is_state_dependent, result_shape
 from ..._core.parameters import Default, Number, Range, as_number, check_ranges, modules_of, optional_parameter
 from ..._core.position import PositionFn, as_position_fn
 from ..._core.safe import safe_norm
-from ..._core.shapes import PerDof, Scalar
-from ..._core.state_dependent import StateDependent, is_state_dependent
+from ..._core.trace_checks import traced
 from ...friction import (
     AbstractAsymmetric,
     AbstractDynamicLaw,

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
-from ..._core.fusion import fusion_barrier, opaque_one
-from ..._core.sorted_times import is_one_of
+from ..._core.arrays import fusion_barrier, is_one_of, opaque_one
 from .._controllers import end_at
 from .._equation import check_ode
 from .._wrapper import AbstractControllerWrapper

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..._core.fusion import fusion_barrier
+from ..._core.arrays import fusion_barrier
 
 # Refinements of a root. It only says where the next attempt of a step shall end.
 _REFINEMENTS = 4

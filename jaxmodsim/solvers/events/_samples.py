@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ..._core.sorted_times import is_one_of
+from ..._core.arrays import is_one_of
 
 
 class Landing(NamedTuple):

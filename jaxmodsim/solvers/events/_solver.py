@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ..._core.fusion import fusion_barrier, opaque_one
+from ..._core.arrays import fusion_barrier, opaque_one
 from .._projected import projected
 from .._wrapper import AbstractSolverWrapper
 from ._guard_scan import GuardScan, arrives, first_root, instant, scan_guards

@@ -1,4 +1,4 @@
-"""States that obey the constraints."""
+"""Projection of an initial state onto the constraints."""
 
 from collections.abc import Callable, Sequence
 
@@ -7,17 +7,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._core.arguments import check_real
-from .._core.cholesky import factor_positive_definite
-from .._core.semidefinite import solve_balanced
+from .._core.cholesky import factor_positive_definite, solve_balanced
 from ..mechanics import errors, motion_equations, rates
 from ..scene import Scene, State, check_scene
 from ._outcome import SimulationError
 
-# Newton's iteration is long over by then, or will not end.
+# Steps of Newton's method: far more than a convergent iteration needs.
 _STEPS = 50
 
 
-def consistent(
+def project_initial_state(
     scene: Scene,
     q0: ArrayLike | list[float],
     qd0: ArrayLike | list[float],
@@ -25,30 +24,30 @@ def consistent(
     t0: ArrayLike = 0.0,
     hold: Sequence[int] = (),
 ) -> tuple[Float[Array, " dof"], Float[Array, " dof"]]:
-    """Find a state near the one given that obeys the constraints of a scene.
+    """Project a state onto the constraints of a scene.
 
-    Newton's iteration with the smallest changes in the metric of the masses; then the velocities by the smallest
-    impulses.
+    Newton's method changes the position by the least amount in the metric of the mass matrix; then the smallest
+    impulses change the velocities.
 
     **Arguments:**
 
     - `scene`: the `Scene`.
-    - `q0`, `qd0`: where to begin, shape `[dof]`.
+    - `q0`, `qd0`: approximate position and velocity, shape `[dof]`.
     - `t0`: time [s], for constraints that move.
     - `hold`: indices of the coordinates that keep their position and velocity (the angle of a crank).
 
     **Returns:**
 
-    `(q0, qd0)`, to be passed to `simulate`.
+    `(q0, qd0)`, for `simulate`.
 
     **Raises:**
 
-    - `SimulationError` where none is found: a position or velocity that the constraints exclude (a linkage that does
-      not close), or one that `hold` leaves no freedom for.
-    - `ValueError` for shapes and indices that are wrong.
+    - `SimulationError` if there is no such state near q0 and qd0: the constraints exclude it (a linkage that does not
+      close), or `hold` leaves no freedom.
+    - `ValueError` for wrong shapes and indices.
     """
     if not isinstance(scene, Scene):
-        raise ValueError(f"consistent needs a Scene, but a {type(scene).__name__} was given.")
+        raise ValueError(f"project_initial_state needs a Scene, but a {type(scene).__name__} was given.")
     for name, value in (("q0", q0), ("qd0", qd0), ("t0", t0)):
         check_real(value, name=name)
     kind = jnp.result_type(float, *jax.tree_util.tree_leaves(scene))
@@ -66,38 +65,38 @@ def consistent(
     if not scene.bilateral:
         return q, qd
     free = jnp.asarray([float(i not in hold) for i in range(dof)], kind)
-    q, qd, off = _find(scene, t, q, qd, free)
+    q, qd, off = _project(scene, t, q, qd, free)
     eps = float(jnp.finfo(kind).eps)
-    for error, what in zip(off, ("position", "velocity"), strict=True):
+    for error, quantity in zip(off, ("position", "velocity"), strict=True):
         if not float(error) <= 1e3 * eps * max(1.0, float(jnp.max(jnp.abs(q))), float(jnp.max(jnp.abs(qd)))):
             held = f" with the coordinates {tuple(hold)} held" if hold else ""
             raise SimulationError(
-                f"No {what} near q0 = {q0}, qd0 = {qd0} obeys the constraints{held}: the nearest found, q = {q},"
-                f" qd = {qd}, is still off by {float(error):.3g}. Begin nearer to a solution, or see whether"
-                " there is one."
+                f"No {quantity} near q0 = {q0}, qd0 = {qd0} obeys the constraints{held}: the residual of the last"
+                f" iterate, q = {q}, qd = {qd}, is {float(error):.3g}. Start closer to a solution, and check that one"
+                " exists."
             )
     return q, qd
 
 
 @jax.jit
-def _find(scene: Scene, t: Array, q: Array, qd: Array, free: Array) -> tuple[Array, Array, tuple[Array, Array]]:
-    """Position, velocity, and by how much the constraints are still violated."""
+def _project(scene: Scene, t: Array, q: Array, qd: Array, free: Array) -> tuple[Array, Array, tuple[Array, Array]]:
+    """Position, velocity, and the residuals of the constraints."""
     scene = scene.bind_time(t)
     constraints, params = scene.bilateral, scene.params
     mass = motion_equations(scene.lagrangian, t, q, qd, params).mass
     inverse = factor_positive_definite(mass)(jnp.eye(q.shape[0], dtype=q.dtype))
     inverse = inverse * free[:, None] * free[None, :]
 
-    def back(fn: Callable[[Array], Array], x: Array) -> Array:
-        """Step that takes `fn` to zero, to first order."""
+    def newton_step(fn: Callable[[Array], Array], x: Array) -> Array:
+        """Newton step of least change towards `fn(x) = 0`."""
         value, rows = fn(x), jax.jacrev(fn)(x)
-        reach = rows @ inverse
-        return reach.T @ solve_balanced(reach @ rows.T, value)
+        weighted = rows @ inverse
+        return weighted.T @ solve_balanced(weighted @ rows.T, value)
 
     position, off = errors(constraints, t, params), jnp.zeros_like(t)
     if position(q).shape != (0,):
-        q = jax.lax.fori_loop(0, _STEPS, lambda _, q: q - back(position, q), q)
+        q = jax.lax.fori_loop(0, _STEPS, lambda _, q: q - newton_step(position, q), q)
         off = jnp.max(jnp.abs(position(q)))
     velocity = rates(constraints, t, q, params)
-    qd = qd - back(velocity, qd)
+    qd = qd - newton_step(velocity, qd)
     return q, qd, (off, jnp.max(jnp.abs(velocity(qd))))

@@ -1,1 +1,0 @@
-"""Laws that depend on direction, or on the state of the mechanism."""

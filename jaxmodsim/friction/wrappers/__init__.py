@@ -1,1 +1,0 @@
-"""Other ways to run a set-valued law."""
