@@ -152,7 +152,7 @@ class Scene(AbstractReadable, eqx.Module):
         owners |= {f"{each}_dot": "a velocity" for each in coordinates} | dict.fromkeys(self.names, "an effect")
         if taken := [f"{name!r} is also that of {owners[name]}" for name in coordinates if name in owners]:
             raise ValueError(
-                f"Names of coordinates must be their own, but {', '.join(taken)}. Rename one of each pair."
+                f"A coordinate needs a name of its own: {', '.join(taken)}. Rename one of each pair."
             )
         if self.event_driven and any(each.karnopp for each in self.friction.values()):
             raise ValueError(

@@ -190,7 +190,7 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "coordinate of an effect's name": (
         lambda: Scene(free, effects=(Friction(Viscous(1.0)),), coordinates=("friction [m]",)),
-        "Names of coordinates must differ from others: 'friction' is also that of an effect",
+        "A coordinate needs a name of its own: 'friction' is also that of an effect",
     ),
     "coordinates of the names of an effect and of the time": (
         lambda: Scene(free, effects=(Friction(Viscous(1.0)),), coordinates=("friction [m]", "t [m]")),
