@@ -105,7 +105,7 @@ def test_the_cheapest(found: WorkPrecision) -> None:
     with pytest.raises(ValueError, match=f"the best is {best:.1e}") as said:
         found.cheapest(1e-11)
     assert "tighter tolerances" in str(said.value)
-    with pytest.raises(ValueError, match="'vmap', but measured were: run"):
+    with pytest.raises(ValueError, match=r"has measured \(run\), but is 'vmap'"):
         found.cheapest(1e-3, cost="vmap")
     with pytest.raises(ValueError, match="references disagree"):
         found.cheapest(1e-18)
@@ -144,11 +144,11 @@ def test_the_figure_shows_every_method(found: WorkPrecision) -> None:
     figure = work_precision_figure(found)
     left, right = figure.axes
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["Rodas5P", "Tsit5", "wide", "narrow", "Euler (1 of 2 failed)", "error of the model"]
+    assert labels == ["Rodas5P", "Tsit5", "wide", "narrow", "Euler (1 of 2 failed)", "modelling error"]
     assert "failed: Euler, dt = 0.1 s: SimulationError" in figure.get_supxlabel()
     assert "[ms]" in left.get_ylabel()
-    assert right.get_ylabel() == "evaluations of the field [1]"
-    with pytest.raises(ValueError, match="'forward', but measured were: run"):
+    assert right.get_ylabel() == "evaluations of the vector field [1]"
+    with pytest.raises(ValueError, match=r"has measured \(run\), but is 'forward'"):
         work_precision_figure(found, cost="forward")
 
 
