@@ -117,7 +117,9 @@ class WorkPrecision:
           error is below what the references can tell.
         """
         if cost not in self.costs:
-            raise ValueError(f"cost must be one that the study has measured ({', '.join(self.costs)}), but is {cost!r}.")
+            raise ValueError(
+                f"cost must be one that the study has measured ({', '.join(self.costs)}), but is {cost!r}."
+            )
         done = [row for row in self.rows if row.error is not None]
         if not done:
             raise ValueError("Every method failed: " + "; ".join(f"{row.method}: {row.failed}" for row in self.rows))
