@@ -22,7 +22,7 @@ FILES = sorted(ROOT.rglob("*.py"))
 CORE = {"_core": 3300, "mechanics": 1450, "friction": 3000, "scene": 3500, "solvers": 3900, "simulation": 3000}
 APPLICATIONS = {
     "metrics": 550,
-    "analysis": 2050,
+    "analysis": 2000,
     "orbits": 3300,
     "identify": 9600,
     "sweeps": 2500,
