@@ -23,7 +23,7 @@ CORE = {"_core": 3300, "mechanics": 1450, "friction": 3000, "scene": 3500, "solv
 APPLICATIONS = {
     "metrics": 550,
     "analysis": 2000,
-    "orbits": 3300,
+    "orbits": 3100,
     "identify": 9600,
     "sweeps": 2500,
     "export": 1150,
