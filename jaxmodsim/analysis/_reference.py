@@ -191,4 +191,4 @@ def _tight(
         x = {name: jnp.asarray(value, jnp.float64) for name, value in question.values.items()}
         derivatives = jax.jacfwd(question.last)(x, scene, start, setting, **options)
         gradient = {name: float(derivatives[name]) for name in question.values}
-    return y, happened(run), gradient
+    return y, mode_changes_of(run), gradient

@@ -12,6 +12,7 @@ from ._equilibrium import Equilibrium, nearest_oscillation, prepare_rest, rest_s
 from ._neutral import anchored
 from ._newton import Condition, newton
 from ._orbit import PeriodicOrbit, describe
+from ._orbit_step import OrbitStep, step_at
 from ._periodic_orbit import prepare
 from ._rest import rest_at
 from ._return_map import OrbitError, OrbitProblem, PeriodFn, Section, SettledState, ShotOrbit, pack

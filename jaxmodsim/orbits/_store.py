@@ -15,7 +15,8 @@ import numpy as np
 from .._core.extra import extra
 from ..scene import Scene, scene_numbers
 from ._branch import BifurcationPoint
-from ._orbit import describe
+from ._orbit import PeriodicOrbit, describe
+from ._orbit_step import OrbitStep
 from ._return_map import OrbitError, OrbitProblem, ShotOrbit, evaluate, pack
 
 # Kind, value, index, phase, period, state and direction.

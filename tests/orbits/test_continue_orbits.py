@@ -96,7 +96,9 @@ def test_fold_of_the_ball_is_that_of_its_closed_form(ball):
     with pytest.raises(ValueError, match="parameters must be the names of two"):
         continue_bifurcation(scene, point, ("A", "A"), span, period=table_period)
     with pytest.raises(ValueError, match="point must be a bifurcation of a branch: fold,"):
-        continue_bifurcation(scene, dataclasses.replace(point, kind="grazing"), ("A", "omega"), span, period=table_period)
+        continue_bifurcation(
+            scene, dataclasses.replace(point, kind="grazing"), ("A", "omega"), span, period=table_period
+        )
 
 
 @pytest.mark.deep
