@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxmodsim as jms
-from jaxmodsim.problems import belt_oscillator, pulled_box, ramped_box
+from jaxmodsim.problems import belt_oscillator, bristles, ramped_box
 
 LUGRE = ("sigma0", "sigma1", "sigma2", "Fc", "Fs", "vs")
 MAX_STEPS = 1_000_000
@@ -228,5 +228,7 @@ class Belt:
 # Positions of interest reach 2 mm (z) to 50 m (x).
 TESTBENCH = Box(ramped_box.scene, (750.0, 0.0, 0.1, 1.5, 1.75, 0.2), 2.0, 1.0, 0.0, 10.0, 101, 1e-3, 1e-3, 1e-9)
 # The bristle reaches 15 um; with a finer absolute tolerance all solvers take longer for the same error.
-PULLED = Box(pulled_box.scene, (1e5, math.sqrt(1e5), 0.4, 1.0, 1.5, 1e-3), 1.0, 0.2, 2.0, 20.0, 4001, 1e-4, 1e-6, 1e-7)
+PULLED = Box(
+    bristles.pulled_box, (1e5, math.sqrt(1e5), 0.4, 1.0, 1.5, 1e-3), 1.0, 0.2, 2.0, 20.0, 4001, 1e-4, 1e-6, 1e-7
+)
 BELT = Belt()

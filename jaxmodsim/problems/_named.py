@@ -12,6 +12,7 @@ from ..scene import Scene
 from . import (
     belt_oscillator,
     braked_spring,
+    bristles,
     cart_pole,
     cartesian_pendulum,
     charged_particle,
@@ -19,9 +20,7 @@ from . import (
     four_bar,
     knife_edge,
     n_link_pendulum,
-    pulled_box,
     ramped_box,
-    slipping_bristle,
     spherical_pendulum,
     stick_slip_pendulum,
     turntable_puck,
@@ -99,13 +98,13 @@ def _lugre_box() -> NamedProblem:
 
 
 def _pulled_box() -> NamedProblem:
-    return _case("pulled_box", pulled_box.scene(), [0.0], [0.0], 20.0, "q[0]", max_steps=200_000)
+    return _case("pulled_box", bristles.pulled_box(), [0.0], [0.0], 20.0, "q[0]", max_steps=200_000)
 
 
 def _slipping_bristle() -> NamedProblem:
     law, v, t1 = ramped_box.lugre(), 0.1, 0.05
-    force = law.sigma0 * slipping_bristle.deflection(jnp.asarray(t1), law, v) + law.sigma2 * v
-    return _case("slipping_bristle", slipping_bristle.scene(law, v), [0.0], [0.0], t1, "friction", float(force))
+    force = law.sigma0 * bristles.deflection(jnp.asarray(t1), law, v) + law.sigma2 * v
+    return _case("slipping_bristle", bristles.slipping_bristle(law, v), [0.0], [0.0], t1, "friction", float(force))
 
 
 def _braked_spring() -> NamedProblem:

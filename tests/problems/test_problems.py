@@ -43,6 +43,8 @@ from ..helpers.mechanisms import (
     rod_on_rough_floor,
 )
 from ..helpers.symbolic import TIME, symbolic_motion
+from . import rod_on_rough_floor as rod_problem
+from . import rolling_disc as disc_problem
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -139,14 +141,12 @@ def test_rod_on_a_rough_floor(mu: float) -> None:
     one, m = rod_on_rough_floor(mu), ROD["m"]
     qdd, reactions, uniqueness = look(one.scene, one.q, one.qd, one.mode)
     side = jnp.sign(ROD_SLIP)
-    compliance = problems.rod_on_rough_floor.compliance(ROD_ANGLE, side, m=m, mu=mu)
-    smooth = problems.rod_on_rough_floor.compliance(ROD_ANGLE, m=m, mu=0.0)
+    compliance = rod_problem.compliance(ROD_ANGLE, side, m=m, mu=mu)
+    smooth = rod_problem.compliance(ROD_ANGLE, m=m, mu=0.0)
     np.testing.assert_allclose(smooth, (1 + 3 * np.cos(ROD_ANGLE) ** 2) / m, rtol=1e-14)
     # Friction that lifts the tip never takes the solution away.
     np.testing.assert_allclose(uniqueness, np.minimum(compliance / smooth, 1.0), atol=1e-12)
-    normal = jax.vmap(lambda f, w, s: problems.rod_on_rough_floor.normal_force(f, w, s, **{**ROD, "mu": mu}))(
-        ROD_ANGLE, ROD_RATE, side
-    )
+    normal = jax.vmap(lambda f, w, s: rod_problem.normal_force(f, w, s, **{**ROD, "mu": mu}))(ROD_ANGLE, ROD_RATE, side)
     np.testing.assert_allclose(reactions["floor"].multiplier[:, 0], normal, rtol=1e-11)
     assert bool(jnp.any(compliance < 0)) == (mu > 4 / 3)
     np.testing.assert_array_equal(jnp.isnan(qdd).any(axis=1), compliance < 0)
@@ -155,11 +155,11 @@ def test_rod_on_a_rough_floor(mu: float) -> None:
 def test_the_paradox_begins_at_four_thirds() -> None:
     """Where 1 + 3 cos^2 and 3 mu sin cos touch: tan f = 2, at mu = 4/3."""
     f = jnp.linspace(0.01, 1.56, 100_001)
-    least = [float(jnp.min(problems.rod_on_rough_floor.compliance(f, m=1.0, mu=mu))) for mu in (1.333, 4 / 3, 1.334)]
+    least = [float(jnp.min(rod_problem.compliance(f, m=1.0, mu=mu))) for mu in (1.333, 4 / 3, 1.334)]
     assert least[0] > 0
     np.testing.assert_allclose(least[1], 0.0, atol=1e-8)
     assert least[2] < 0
-    at_two = problems.rod_on_rough_floor.compliance(jnp.arctan(2.0), m=1.0, mu=4 / 3)
+    at_two = rod_problem.compliance(jnp.arctan(2.0), m=1.0, mu=4 / 3)
     np.testing.assert_allclose(at_two, 0.0, atol=1e-15)
 
 
@@ -437,10 +437,10 @@ def test_four_bar_stays_closed() -> None:
 @pytest.mark.deep
 def test_runs_of_the_rolling_disc() -> None:
     """A steady circle closes; any other motion rolls on and keeps its energy."""
-    scene, turn, lean = problems.rolling_disc.scene(**DISC), -1.3, 0.4
-    spin = float(problems.rolling_disc.steady_spin(lean, turn, **but(DISC, "m")))
+    scene, turn, lean = disc_problem.scene(**DISC), -1.3, 0.4
+    spin = float(disc_problem.steady_spin(lean, turn, **but(DISC, "m")))
     q0 = jnp.array([0.0, 0.0, 0.0, lean, 0.0])
-    qd0 = problems.rolling_disc.velocity(q0, jnp.array([turn, 0.0, spin]), R=DISC["R"])
+    qd0 = disc_problem.velocity(q0, jnp.array([turn, 0.0, spin]), R=DISC["R"])
     period = 2 * np.pi / abs(turn)
     how: dict[str, Any] = {"ts": np.linspace(0.0, period, 17), "rtol": 1e-10, "atol": 1e-12}
     run = simulate(scene, q0, qd0, period, **how)
@@ -450,21 +450,19 @@ def test_runs_of_the_rolling_disc() -> None:
     np.testing.assert_allclose(np.hypot(run.q[:, 0], run.q[:, 1] - radius), abs(radius), rtol=1e-8)
     np.testing.assert_allclose(run.q[-1], [0.0, 0.0, turn * period, lean, spin * period], atol=1e-7)
 
-    qd0 = problems.rolling_disc.velocity(q0, jnp.array([0.5, -1.0, 6.0]), R=DISC["R"])
+    qd0 = disc_problem.velocity(q0, jnp.array([0.5, -1.0, 6.0]), R=DISC["R"])
     run = simulate(scene, q0, qd0, period, **how)
     assert np.ptp(run.q[:, 3]) > 0.3
     energy = total(scene, run)
     np.testing.assert_allclose(energy, energy[0], rtol=1e-8)
-    rolls = jax.vmap(lambda q, w: problems.rolling_disc.velocity(q, w, R=DISC["R"]))(run.q, run.qd[:, 2:])
+    rolls = jax.vmap(lambda q, w: disc_problem.velocity(q, w, R=DISC["R"]))(run.q, run.qd[:, 2:])
     np.testing.assert_allclose(run.qd, rolls, atol=1e-13)
 
 
 def slipping_rod(mu: float, angle: float, rate: float, end: Callable[..., float]) -> tuple[float, float]:
     """Time and angle at which `end(angle, rate)` falls through zero; in slip the angle moves by itself."""
-    q, qd = problems.rod_on_rough_floor.state(angle, rate, 1e6, l=ROD["l"])
-    turn = jax.jit(
-        lambda f, w: problems.rod_on_rough_floor.acceleration(q.at[2].set(f), qd.at[2].set(w), **{**ROD, "mu": mu})[2]
-    )
+    q, qd = rod_problem.state(angle, rate, 1e6, l=ROD["l"])
+    turn = jax.jit(lambda f, w: rod_problem.acceleration(q.at[2].set(f), qd.at[2].set(w), **{**ROD, "mu": mu})[2])
 
     def stop(t: float, y: Any) -> float:
         del t
@@ -485,7 +483,7 @@ def weight_left(angle: float, rate: float) -> float:
 
 def compliance_left(angle: float, rate: float) -> float:
     del rate
-    return float(problems.rod_on_rough_floor.compliance(jnp.asarray(angle), m=ROD["m"], mu=2.0)) - 1e-6
+    return float(rod_problem.compliance(jnp.asarray(angle), m=ROD["m"], mu=2.0)) - 1e-6
 
 
 @pytest.mark.deep
@@ -493,8 +491,8 @@ def test_the_rod_lifts_off_and_its_run_ends_where_the_paradox_begins() -> None:
     ts = jnp.linspace(0.0, 0.5, 101)
 
     def run(mu: float, state: tuple[float, float, float]) -> Any:
-        scene = problems.rod_on_rough_floor.scene(**{**ROD, "mu": mu})
-        q0, qd0 = problems.rod_on_rough_floor.state(*state, l=ROD["l"])
+        scene = rod_problem.scene(**{**ROD, "mu": mu})
+        q0, qd0 = rod_problem.state(*state, l=ROD["l"])
         return simulate(scene, q0, qd0, 0.5, ts=ts, rtol=1e-9, atol=1e-11, throw=False)
 
     # Lift-off.
