@@ -27,7 +27,7 @@ APPLICATIONS = {
     "identify": 9600,
     "sweeps": 2500,
     "export": 1150,
-    "problems": 3000,
+    "problems": 2650,
     "plot": 1600,
     "cli": 3400,
 }

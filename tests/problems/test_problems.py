@@ -60,7 +60,7 @@ def test_accelerations(name: str) -> None:
 def test_tension_of_the_pendulum() -> None:
     """By the angle from straight down, m (l f'^2 + g cos f), towards the pivot."""
     one, rod = case("pendulum in a plane"), found("pendulum in a plane").reactions["rod"]
-    m, l, g = PENDULUM.values()  # noqa: E741
+    m, l, g = PENDULUM.values()
     angle = np.arctan2(one.q[:, 0], -one.q[:, 1])
     rate = (one.q[:, 0] * one.qd[:, 1] - one.q[:, 1] * one.qd[:, 0]) / l**2
     tension = m * (l * rate**2 + g * np.cos(angle))
@@ -72,7 +72,7 @@ def test_tension_of_the_pendulum() -> None:
 
 
 def test_reaction_of_the_sphere() -> None:
-    m, l, g = PENDULUM.values()  # noqa: E741
+    m, l, g = PENDULUM.values()
     rod = found("pendulum in space").reactions["rod"]
     radial = jax.vmap(lambda a, w: problems.spherical_pendulum.reaction(a, w, m=m, R=l, g=g))(ANGLES, ANGLE_RATES)
     assert_equal(rod.multiplier[:, 0], radial)
@@ -202,14 +202,14 @@ def body(m: Any, inertia: Any, x: Any, z: Any, angle: Any, g: Any) -> Any:
     return (m * (x.diff(TIME) ** 2 + z.diff(TIME) ** 2) + inertia * sympy.diff(angle, TIME) ** 2) / 2 - m * g * z
 
 
-def bar(m: Any, l: Any, x: Any, z: Any, angle: Any, g: Any) -> Any:  # noqa: E741
+def bar(m: Any, l: Any, x: Any, z: Any, angle: Any, g: Any) -> Any:
     """Lagrangian of a uniform bar that begins at (x, z), and its end."""
     c, s = sympy.cos(angle), sympy.sin(angle)
     return body(m, m * l**2 / 12, x + l * c / 2, z + l * s / 2, angle, g), x + l * c, z + l * s
 
 
 def symbolic_cart_pole() -> Any:
-    (M, m, l, g, force), numbers = values("M m l g force", CART)  # noqa: E741
+    (M, m, l, g, force), numbers = values("M m l g force", CART)
     x, f = dynamicsymbols("x f")
     pole = body(m, m * l**2 / 12, x + l * sympy.sin(f) / 2, l * sympy.cos(f) / 2, f, g)
     return symbolic_motion(pole + M * x.diff() ** 2 / 2, [x, f], numbers, forces=[force, 0])
@@ -225,14 +225,14 @@ def symbolic_bead() -> Any:
 
 
 def symbolic_pendulum(names: str) -> Any:
-    (m, l, g), numbers = values("m l g", PENDULUM)  # noqa: E741
+    (m, l, g), numbers = values("m l g", PENDULUM)
     q = list(dynamicsymbols(names))
     energy = m * sum(x.diff() ** 2 for x in q) / 2 - m * g * q[-1]
     return symbolic_motion(energy, q, numbers, holonomic=[sympy.sqrt(sum(x**2 for x in q)) - l])
 
 
 def symbolic_slider_crank() -> Any:
-    (m1, m2, m3, r, l, g, torque), numbers = values("m1 m2 m3 r l g torque", CRANK)  # noqa: E741
+    (m1, m2, m3, r, l, g, torque), numbers = values("m1 m2 m3 r l g torque", CRANK)
     f, b, x, y = dynamicsymbols("f b x y")
     crank, x1, z1 = bar(m1, r, sympy.Integer(0), sympy.Integer(0), f, g)
     rod, x2, z2 = bar(m2, l, x1, z1, b, g)
@@ -271,14 +271,14 @@ def symbolic_knife_edge() -> Any:
 
 
 def symbolic_rod() -> Any:
-    (m, l, g), numbers = values("m l g", ROD)  # noqa: E741
+    (m, l, g), numbers = values("m l g", ROD)
     x, y, f = dynamicsymbols("x y f")
     return symbolic_motion(body(m, m * l**2 / 12, x, y, f, g), [x, y, f], numbers, holonomic=[y - l * sympy.sin(f) / 2])
 
 
 def symbolic_foucault() -> Any:
     """From the velocity in a frame that does not turn, less what is quadratic in Omega."""
-    (m, l, g, Omega, latitude), numbers = values("m l g Omega latitude", FOUCAULT)  # noqa: E741
+    (m, l, g, Omega, latitude), numbers = values("m l g Omega latitude", FOUCAULT)
     x, y = dynamicsymbols("x y")
     spin = Omega * sympy.sin(latitude)
     square = (x.diff() - spin * y) ** 2 + (y.diff() + spin * x) ** 2 - spin**2 * (x**2 + y**2)
@@ -396,7 +396,7 @@ def test_the_swings_of_foucaults_pendulum_turn() -> None:
 
 def test_over_both_poles() -> None:
     """From the bottom over the top and back, in the time of the elliptic integral; the angles fail at either pole."""
-    m, l, g = PENDULUM.values()  # noqa: E741
+    m, l, g = PENDULUM.values()
     speed = 2.2 * np.sqrt(g * l)
     half = 2.0 * l / speed * ellipk(4.0 * g * l / speed**2)
     run = simulate(
@@ -468,7 +468,7 @@ def slipping_rod(mu: float, angle: float, rate: float, end: Callable[..., float]
         del t
         return end(*y)
 
-    setattr(stop, "terminal", True)  # noqa: B010 (an attribute of a function)
+    setattr(stop, "terminal", True)
     solved: Any = solve_ivp(
         lambda _, y: [y[1], float(turn(*y))], (0.0, 0.5), [angle, rate], events=stop, rtol=1e-10, atol=1e-12
     )
