@@ -468,7 +468,7 @@ def slipping_rod(mu: float, angle: float, rate: float, end: Callable[..., float]
         del t
         return end(*y)
 
-    setattr(stop, "terminal", True)
+    setattr(stop, "terminal", True)  # noqa: B010 (an attribute of a function)
     solved: Any = solve_ivp(
         lambda _, y: [y[1], float(turn(*y))], (0.0, 0.5), [angle, rate], events=stop, rtol=1e-10, atol=1e-12
     )
