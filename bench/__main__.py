@@ -1,4 +1,4 @@
-"""The benches as one suite: each in a process of its own, one after the other, then the tables of the documentation.
+"""The suite of benches: each runs in its own process, one after the other, then the tables of the pages are rendered.
 
 python -m bench [NAME ...] [--list] [--smoke [--jobs N]] [--out DIR]
 """
@@ -30,7 +30,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 @dataclass
 class Run:
-    """A run of one bench: how it ended, and after how long; None before."""
+    """A run of one bench: its exit code, None before the end, and its duration [s]."""
 
     name: str
     code: int | None = None
@@ -40,32 +40,30 @@ class Run:
 @app.command()
 def main(
     names: Annotated[
-        list[str] | None, typer.Argument(help="Benches by name or its beginning, such as lugre; all without.")
+        list[str] | None, typer.Argument(help="Names of benches, or their beginnings, such as lugre; by default all.")
     ] = None,
-    show: Annotated[bool, typer.Option("--list", help="Say what there is, and run nothing.")] = False,
-    smoke: Annotated[
-        bool, typer.Option("--smoke", help="Small configurations that show that everything runs; nothing is kept.")
-    ] = False,
-    jobs: Annotated[int, typer.Option(min=1, help="Benches at a time; more than one only with --smoke.")] = 1,
+    show: Annotated[bool, typer.Option("--list", help="List the benches, and run none.")] = False,
+    smoke: Annotated[bool, typer.Option("--smoke", help="Run small configurations, and record nothing.")] = False,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of benches at a time; more than one needs --smoke.")] = 1,
     out: Annotated[
-        Path | None, typer.Option(help="Folder of results and figures; by default they are recorded for the pages.")
+        Path | None,
+        typer.Option(help="Folder of results and figures; by default they go to bench/results and the pages."),
     ] = None,
 ) -> None:
     """Run the benches one after the other, and render the tables of the documentation.
 
-    The result of a bench is recorded when it has ended well, on a clean commit alone; Ctrl-C leaves those of the
-    finished ones.
+    A result is recorded if the bench succeeds on a clean commit. After Ctrl-C the results of finished benches stay.
     """
     for name in names or []:
         if not any(each.startswith(name) for each in REPORTS):
-            raise typer.BadParameter(f"no bench is called {name!r}; there are {', '.join(REPORTS)}")
+            raise typer.BadParameter(f"no bench begins with {name!r}; there are: {', '.join(REPORTS)}")
     runs = [Run(name) for name in REPORTS if not names or name.startswith(tuple(names))]
     if show:
         for run in runs:
             print(f"{run.name:<24} {REPORTS[run.name].says}")
         return
     if jobs > 1 and not smoke:
-        raise typer.BadParameter("benches that run at the same time disturb each other: --jobs needs --smoke")
+        raise typer.BadParameter("--jobs needs --smoke, because simultaneous benches disturb each other")
     interrupted = _run_all(runs, jobs, smoke, out)
     for run in runs:
         ended = "not finished" if run.code is None else f"exit code {run.code}, {run.seconds:.0f} s"
@@ -79,7 +77,7 @@ def main(
 
 
 def _run_all(runs: list[Run], jobs: int, smoke: bool, out: Path | None) -> bool:
-    """Run them, `jobs` at a time; whether Ctrl-C came in between."""
+    """Run benches, `jobs` at a time; returns whether Ctrl-C interrupted them."""
     started: list[subprocess.Popen[bytes]] = []
 
     def one(run: Run) -> None:
@@ -87,7 +85,7 @@ def _run_all(runs: list[Run], jobs: int, smoke: bool, out: Path | None) -> bool:
             command = [sys.executable, "-m", "bench.one", run.name, scratch, *(["--smoke"] if smoke else [])]
             quiet = {"stdout": log, "stderr": subprocess.STDOUT} if jobs > 1 else {}
             began = time.perf_counter()
-            # Of Ctrl-C this process hears first, and hands it on.
+            # Ctrl-C reaches this process alone, which then ends the others.
             started.append(process := subprocess.Popen(command, start_new_session=True, cwd=ROOT, **quiet))  # pyright: ignore
             code = process.wait()
             if stopped:
@@ -115,13 +113,13 @@ def _run_all(runs: list[Run], jobs: int, smoke: bool, out: Path | None) -> bool:
 
 
 def _keep(name: str, scratch: Path, smoke: bool, out: Path | None) -> None:
-    """Put result and figures in their places."""
+    """Copy result and figures to their folders."""
     result = scratch / f"{name}.json"
     if out is not None:
         shutil.copytree(scratch, out, dirs_exist_ok=True)
     elif result.exists() and not smoke:
         if not json.loads(result.read_text())["provenance"]["clean"]:
-            print(f"{name} is not recorded, as there are uncommitted changes: commit them, and run it again.")
+            print(f"{name} is not recorded because of uncommitted changes: commit them, and run it again.")
             return
         shutil.copy(result, RESULTS)
         for figure in scratch.glob("*.png"):

@@ -1,46 +1,14 @@
-"""The matrix: each case with its task, the quantities that are measured of every peer, tolerances and goal."""
-
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+"""The cases of the matrix: for each its task, the quantities measured for every peer, tolerances and goal."""
 
 import numpy as np
 
 from bench import quantities as measured
-from bench.record import Result
-from bench.tasks import BELT, PULLED, TESTBENCH, Belt, Box
+from bench.tasks import BELT, PULLED, TESTBENCH, Case
 
 
 def half_decades(first: float, last: float) -> tuple[float, ...]:
-    """Tolerances 10^first, 10^(first - 1/2), ... down to 10^last: alike for every solver."""
+    """Tolerances 10^first, 10^(first - 1/2), ... down to 10^last, the same for every solver."""
     return tuple(float(10.0**k) for k in np.arange(first, last - 0.25, -0.5))
-
-
-@dataclass(frozen=True)
-class Case:
-    """A column of the matrix.
-
-    - `task`: scene, closed form or reference.
-    - `quantities`: functions of `bench.quantities`.
-    - `ladder`: tolerances; each peer is measured at the loosest one whose error `measure` is at most `goal`, at
-      "chosen".
-    - `goal`: None for the error of `jaxmodsim` at 1e-6, but for 5 %.
-    - `small`: peers of a small run; `packages`: those whose versions matter; `settings`: numbers that captions name.
-    """
-
-    name: str
-    task: Box | Belt
-    quantities: tuple[Callable[[Any], None], ...]
-    ladder: tuple[float, ...]
-    measure: str
-    goal: float | None = 1e-6
-    small: tuple[str, ...] = ("jaxmodsim", "diffrax Heun", "CVODES (CasADi)", "CVODE (scikit-sundae)")
-    packages: tuple[str, ...] = ("diffrax", "casadi", "scikit-sundae", "scipy", "numpy")
-    settings: dict[str, Any] = field(default_factory=dict)
-
-    def result(self) -> Result:
-        """An empty result."""
-        return Result(self.name, self.packages, {"atol_over_rtol": self.task.atol, "t1": self.task.t1} | self.settings)
 
 
 _ONE_AND_MANY = (measured.errors, measured.run_time, measured.batch, measured.derivatives)

@@ -1,13 +1,13 @@
-"""The quantities of the matrix: each a function that measures all peers of a case side by side, and adds rows.
+"""The quantities of the matrix: each is a function that measures all peers of a case in turns, and adds rows.
 
-Times are medians of interleaved repetitions, compilation apart, which the time of the first call includes. Every peer
-is measured at the loosest tolerance of the case's ladder that reaches the goal: rows at "chosen".
+Times are medians of interleaved repetitions, without the compilation, which is part of the first call. Every peer is
+measured at the loosest tolerance of the ladder that reaches the goal: rows at "chosen".
 """
 
 import time
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import diffrax as dfx
 import jax
@@ -16,10 +16,7 @@ import numpy as np
 
 from bench.peers import GROUPS, LOOP, SWEEP, Peer, makers
 from bench.record import OURS, Result, importable, timed
-from bench.tasks import Box
-
-if TYPE_CHECKING:
-    from bench.cases import Case
+from bench.tasks import Box, Case
 
 CHOSEN = "chosen"
 TIGHT = 1e-6
@@ -29,17 +26,17 @@ TIGHT = 1e-6
 class Matrix:
     """One case while it is measured.
 
-    - `peers`: by name; `chosen`: the tolerance of each peer that reaches the goal.
+    - `peers`: by name. `chosen`: loosest tolerance of each peer that reaches the goal.
     """
 
-    case: "Case"
+    case: Case
     smoke: bool
     result: Result
     peers: dict[str, Peer]
     chosen: dict[str, float]
 
     def rounds(self, count: int) -> int:
-        """Repetitions; of a small run one."""
+        """Number of repetitions; one in a smoke run."""
         return 1 if self.smoke else count
 
     def able(self) -> dict[str, Peer]:
@@ -47,8 +44,8 @@ class Matrix:
         return {name: peer for name, peer in self.peers.items() if name in self.chosen}
 
 
-def run_case(case: "Case", smoke: bool) -> Result:
-    """All quantities of a case, one after the other."""
+def run_case(case: Case, smoke: bool) -> Result:
+    """Measure all quantities of a case, one after the other."""
     result = case.result()
     wanted = {name: make for name, make in makers(case.task).items() if not smoke or name in case.small}
     matrix = Matrix(case, smoke, result, importable(result, wanted), {})
@@ -58,7 +55,7 @@ def run_case(case: "Case", smoke: bool) -> Result:
 
 
 def errors(m: Matrix) -> None:
-    """Errors and steps at every tolerance, and the loosest tolerance that reaches the goal."""
+    """Measure errors and steps at every tolerance, and choose the loosest tolerance that reaches the goal."""
     case, task = m.case, m.case.task
     runs = {name: peer.record for name, peer in m.peers.items()}
     tight = [rtol for rtol in case.ladder if case.goal or rtol == TIGHT]
@@ -81,14 +78,14 @@ def errors(m: Matrix) -> None:
                     m.result.add(quantity, value, unit, peer=name, at=at)
             if reached and case.name == "pulled_spring" and name != OURS:
                 break
-        if goal is None:  # that of ours at 1e-6, and ours is the first
+        if goal is None:  # jaxmodsim is the first peer
             goal = 1.05 * next(r["value"] for r in m.result.rows if r["quantity"] == case.measure and r["at"] == TIGHT)
             m.chosen[OURS] = TIGHT
             m.result.add("rtol", TIGHT, at=CHOSEN)
 
 
 def run_time(m: Matrix) -> None:
-    """One run that returns the end state, as a user calls it, and the same of ours inside of `jax.jit`."""
+    """Time one run that returns the end state, as a user calls it, and for jaxmodsim also inside `jax.jit`."""
     calls: dict[tuple[str, str, Any], Any] = {}
     p = jnp.asarray(m.case.task.numbers)
     for name, peer in m.able().items():
@@ -107,7 +104,7 @@ def _at(traced: Any, rtol: float, adjoint: Any, p: Any) -> Any:
 
 
 def batch(m: Matrix) -> None:
-    """Runs with different parameters in one call, in every way each peer has; a loop over 64 of them."""
+    """Time runs with different parameters, by every batch method of each peer; loops have 64 runs."""
     count = 8 if m.smoke else 1024
     sets, task, few = m.case.task.sets(count), m.case.task, min(count, 64)
     calls, sizes = {}, {}
@@ -128,10 +125,9 @@ def batch(m: Matrix) -> None:
 
 
 def derivatives(m: Matrix) -> None:
-    """Forward Jacobian and reverse gradient of the end by the parameters, and the run that they differentiate.
+    """Time the forward Jacobian and the reverse gradient of the end state by the parameters, and the plain run.
 
-    All are jitted and called alike. The tolerance is that of the run, which says nothing on derivatives: their errors
-    are recorded.
+    All are jitted. The tolerance is that of the run. It does not bound the errors of derivatives, which are recorded.
     """
     task, calls = m.case.task, {}
     p, exact = jnp.asarray(task.numbers), task.exact_gradient()
@@ -155,7 +151,7 @@ def _wait(function: Any, *given: Any) -> Any:
 
 
 def time_at_each_tolerance(m: Matrix, only: tuple[str, ...] = ()) -> None:
-    """One run at every tolerance that the errors were taken at."""
+    """Time one run at every tolerance of the errors."""
     rows = [row for row in m.result.rows if row["quantity"] == "steps" and row["at"] != CHOSEN]
     done = [(row["peer"], row["at"]) for row in rows if row["peer"] in (only or m.peers)]
     calls = {(name, rtol): m.peers[name].once(rtol) for name, rtol in done}
@@ -164,12 +160,12 @@ def time_at_each_tolerance(m: Matrix, only: tuple[str, ...] = ()) -> None:
 
 
 def our_time_at_each(m: Matrix) -> None:
-    """The same of ours alone."""
+    """Time one run of jaxmodsim at every tolerance."""
     time_at_each_tolerance(m, (OURS,))
 
 
 def compilation(m: Matrix) -> None:
-    """Time to trace and compile a run and its gradient, from cleared caches: of a run the shortest of three."""
+    """Time to trace and compile a run and its gradient, with cleared caches; for a run the shortest of three."""
     p = jnp.asarray(m.case.task.numbers)
     for name, peer in m.peers.items():
         if peer.traced:
@@ -182,13 +178,13 @@ def compilation(m: Matrix) -> None:
 def _compiled(function: Any, p: Any) -> float:
     jax.clear_caches()
     start = time.perf_counter()
-    # A function of its own, which nothing has seen.
+    # A new function, which no cache knows.
     jax.jit(lambda p: function(p)).lower(p).compile()
     return time.perf_counter() - start
 
 
 def rk4(m: Matrix) -> None:
-    """Errors of RK4: the published step, one that is stable, and the one of the published reference."""
+    """Measure errors of RK4 with the published step, a stable step, and the step of the published reference."""
     task: Any = m.case.task
     for h in (1e-3,) if m.smoke else (1e-3, 5e-5, 1e-5):
         m.result.add("steps", round(task.t1 / h), peer="RK4, here", at=h)

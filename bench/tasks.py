@@ -1,4 +1,4 @@
-"""What the cases of the matrix ask: scene, numbers, reference answer and measures of error.
+"""The tasks of the matrix: scene, parameters, reference solution and error measures; and the class of its cases.
 
 - `lugre_testbench`: a box of 2 kg on a table, pulled by the force `1 N/s * t` for 10 s from rest, with LuGre friction;
 - `pulled_spring`: a box of 1 kg, pulled for 20 s through a spring of 2 N/m whose end moves at 0.1 m/s, with the law of
@@ -10,7 +10,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -20,7 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxmodsim as jms
-from jaxmodsim.problems import belt_oscillator, pulled_box, ramped_box
+from bench.record import Result
+from jaxmodsim.problems import belt_oscillator, bristles, ramped_box
 
 LUGRE = ("sigma0", "sigma1", "sigma2", "Fc", "Fs", "vs")
 MAX_STEPS = 1_000_000
@@ -228,5 +229,33 @@ class Belt:
 # Positions of interest reach 2 mm (z) to 50 m (x).
 TESTBENCH = Box(ramped_box.scene, (750.0, 0.0, 0.1, 1.5, 1.75, 0.2), 2.0, 1.0, 0.0, 10.0, 101, 1e-3, 1e-3, 1e-9)
 # The bristle reaches 15 um; with a finer absolute tolerance all solvers take longer for the same error.
-PULLED = Box(pulled_box.scene, (1e5, math.sqrt(1e5), 0.4, 1.0, 1.5, 1e-3), 1.0, 0.2, 2.0, 20.0, 4001, 1e-4, 1e-6, 1e-7)
+PULLED = Box(
+    bristles.pulled_box, (1e5, math.sqrt(1e5), 0.4, 1.0, 1.5, 1e-3), 1.0, 0.2, 2.0, 20.0, 4001, 1e-4, 1e-6, 1e-7
+)
 BELT = Belt()
+
+
+@dataclass(frozen=True)
+class Case:
+    """A column of the matrix.
+
+    - `task`: scene, and closed form or reference.
+    - `quantities`: functions of `bench.quantities`, which measure all peers.
+    - `ladder`: tolerances. Each peer is measured at the loosest one whose error `measure` is at most `goal`.
+    - `goal`: None for 1.05 times the error of `jaxmodsim` at 1e-6.
+    - `small`: peers of a smoke run. `packages`: packages whose versions are recorded. `settings`: numbers in captions.
+    """
+
+    name: str
+    task: Box | Belt
+    quantities: tuple[Callable[[Any], None], ...]
+    ladder: tuple[float, ...]
+    measure: str
+    goal: float | None = 1e-6
+    small: tuple[str, ...] = ("jaxmodsim", "diffrax Heun", "CVODES (CasADi)", "CVODE (scikit-sundae)")
+    packages: tuple[str, ...] = ("diffrax", "casadi", "scikit-sundae", "scipy", "numpy")
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def result(self) -> Result:
+        """An empty result."""
+        return Result(self.name, self.packages, {"atol_over_rtol": self.task.atol, "t1": self.task.t1} | self.settings)

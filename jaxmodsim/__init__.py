@@ -11,7 +11,7 @@ Runs: simulate, simulate_to_accuracy; they give a Trajectory, or raise a Simulat
 Solvers: Rodas5P, Gauss, ImplicitFriction; EventSolver and EventController; StoredSteps, an adjoint.
 Analysis: energy_audit (EnergyAudit), sensitivity (Sensitivity), check_gradients (GradientCheck), cyclic_coordinates;
     work_precision (WorkPrecision), Method, formulations.
-Periodic orbits: periodic_orbit (PeriodicOrbit), continue_orbits (Branch), hunting (Hunting); where they begin:
+Periodic orbits: periodic_orbit (PeriodicOrbit), continue_orbits (Branch); where they begin:
 equilibrium (Equilibrium), continue_equilibria.
 Records: fit, fit_law, Record, FitResult.
 Many runs: sweep.
@@ -87,12 +87,10 @@ if TYPE_CHECKING:
     from .mechanics import rigid_body as rigid_body
     from .orbits import Branch as Branch
     from .orbits import Equilibrium as Equilibrium
-    from .orbits import Hunting as Hunting
     from .orbits import PeriodicOrbit as PeriodicOrbit
     from .orbits import continue_equilibria as continue_equilibria
     from .orbits import continue_orbits as continue_orbits
     from .orbits import equilibrium as equilibrium
-    from .orbits import hunting as hunting
     from .orbits import periodic_orbit as periodic_orbit
     from .scene import AbstractEffect as AbstractEffect
     from .scene import AppliedForce as AppliedForce
@@ -173,12 +171,10 @@ _LATER = {
     "orbits": (
         "Branch",
         "Equilibrium",
-        "Hunting",
         "PeriodicOrbit",
         "continue_equilibria",
         "continue_orbits",
         "equilibrium",
-        "hunting",
         "periodic_orbit",
     ),
     "plot": (),

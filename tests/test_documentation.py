@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from bench import render
+from bench.cases import CASES
+from bench.tables import REPORTS
 
 from .helpers import law_table, snippets
 
@@ -163,3 +165,9 @@ def test_the_code_of_the_readme_runs(tmp_path: Path) -> None:
     script = tmp_path / "page.py"
     script.write_text(code + 'assert run.result.ok and run.q.shape == (1001, 1) and "friction" in run.forces\n')
     subprocess.run([sys.executable, str(script)], cwd=ROOT, check=True)
+
+
+@pytest.mark.quick
+def test_benches_named_by_the_command_line_exist() -> None:
+    studies = {path.stem for path in (ROOT / "bench" / "studies").glob("[!_]*.py")}
+    assert set(REPORTS) == studies | set(CASES)

@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -16,48 +17,51 @@ from jaxtyping import Array, PyTree
 from ..scene import Scene, elements, read_element, replace_elements
 from ..simulation import Trajectory, simulate
 from ..solvers import StoredSteps
-from . import _words as words
 from ._differences import (
     Agreement,
     DerivativeEstimate,
+    Grazing,
     Histories,
     History,
     Probe,
     Sample,
+    changed,
     estimate,
+    first_difference,
     grazing,
     kink,
     probe,
     usable,
 )
 
-Verdict = Literal["agree", "part", "modes change", "grazing", "kink", "unclear", "no differences"]
+Verdict = Literal["agree", "disagree", "modes change", "grazing", "kink", "unclear", "no differences"]
 
-# Admissible relative differences, by bytes of the type: between derivatives and differences, between the two modes.
+# Tolerances by bytes of the type: of derivatives against differences, and of forward against reverse mode.
 _RTOL = {8: 1e-3, 4: 1e-2}
 _RTOL_MODES = {8: 1e-6, 4: 1e-3}
-# Differences with an estimated error above this part of the derivative say nothing.
+# Differences with a larger relative error are inconclusive.
 _UNCLEAR = 0.1
-# Adjoints whose steps keep the tolerance for derivatives; None stands for the default.
+# Derivatives below this fraction of the largest, each per relative change of its number, count as zero.
+_TINY = 1e-3
+_MODES = {0: "stick", 1: "forward slip", -1: "backward slip"}
 _INTERFACE = (
-    "check_gradients needs a function fn(scene, simulate) that returns one number and runs the scene with the"
-    " `simulate` it is given, as in: def fn(scene, simulate=jaxmodsim.simulate): return simulate(scene, [1.0], [0.0],"
+    "check_gradients needs a function fn(scene, simulate) that runs the scene with its argument `simulate` and returns"
+    " one number, as in: def fn(scene, simulate=jaxmodsim.simulate): return simulate(scene, [1.0], [0.0],"
     " 5.0).q[-1, 0]."
 )
 
 
 @dataclass(frozen=True)
 class NumberCheck:
-    """The derivative of a function by one number of a scene, three times.
+    """The derivative of a function by one number of a scene, from three methods.
 
     - `name`, `value`: of the number.
     - `forward`, `reverse`: the derivative by `jax.jvp` and by `jax.grad`.
-    - `differences`, `error`, `step`: the derivative by finite differences, its estimated error, and the smaller one
-      of the two steps it was extrapolated from; NaN where there is none.
-    - `verdict`: `agree`; `part`; `modes change`, `grazing` or `kink` (not differentiable here, see
-      `check_gradients`); `unclear` (the differences are too noisy to tell); `no differences` (the runs next to this one
-      fail).
-    - `remarks`: what it means and what to do, in sentences.
+    - `differences`, `error`, `step`: the derivative by finite differences, its estimated error, and the smaller of the
+      two steps of the extrapolation; NaN without differences.
+    - `verdict`: `agree`; `disagree`; `modes change`, `grazing` or `kink` (not differentiable here, see
+      `check_gradients`); `unclear` (the differences are too noisy); `no differences` (the runs next to this one fail).
+    - `remarks`: sentences that explain the verdict and advise.
     """
 
     name: str
@@ -73,14 +77,14 @@ class NumberCheck:
 
 @dataclass(frozen=True)
 class GradientCheck:
-    """What `check_gradients` found; print it.
+    """The result of `check_gradients`, which prints as a table.
 
     - `value`: of the function.
-    - `dtype`: floating type that it was computed in.
+    - `dtype`: floating type of the function.
     - `numbers`: a `NumberCheck` for each number, by name.
-    - `remarks`: in sentences, of all numbers and of the check as a whole.
-    - `ok`: whether all derivatives agree with each other and with the differences. Remarks may still say how far
-      from here that ends.
+    - `remarks`: sentences about the numbers and the check as a whole.
+    - `ok`: whether all derivatives agree with each other and with the differences. Remarks may still limit the range
+      in which they do.
     """
 
     value: float
@@ -122,42 +126,41 @@ def check_gradients(
     jax.grad(end)(scene)
     ```
 
-    The function gets the `simulate` to use as its second argument, so that the modes of the runs are watched. Give it
-    `jaxmodsim.simulate` as a default, and it serves `jax.grad` as it is. It may run several scenes, also others made of
-    this one; initial values and times are checked if it takes them from `scene.params`. Do not put it inside `jax.jit`:
-    `simulate` compiles by itself.
+    The function must run the scene with its second argument `simulate`, which records the modes of the runs. With
+    `jaxmodsim.simulate` as the default of that argument, the same function works with `jax.grad`. The function may run
+    several scenes, including others made from this one. Initial values and times are checked if it reads them from
+    `scene.params`. Do not put the function inside `jax.jit`: `simulate` compiles by itself.
 
-    **Differences.** Each number is changed by +-1 % of itself and by a fourth of that four times (float32: 4 %, three
-    times), each run anew. Of these steps those count from which on, down to the smallest, no run has failed and all
-    have the same modes as the run in the middle. Two successive steps are extrapolated (Richardson); the pair with the
-    smallest estimated error is reported, with the smaller one of its steps. The error is what the smaller step would
-    have changed by, plus the noise of the runs, as seen at the smallest steps, over the step. If runs fail on one
-    side (out of range), the differences are one-sided.
+    **Differences.** The function is evaluated at +-1 % of each number and at four more steps, each a quarter of the one
+    before (float32: 4 %, three more). A step is used if its runs and those of all smaller steps succeed with the modes
+    of the unperturbed run. Richardson extrapolation combines two successive steps; the pair with the smallest estimated
+    error is reported, with its smaller step. The error estimate is the correction of the extrapolation, plus the noise
+    of the runs over the step. If runs fail on one side (out of range), the differences are one-sided.
 
     **Not differentiable here.**
 
-    - `modes change`: the mode changes of an effect (before, after, of each effect in order) are others at
-      one of the two smallest steps. Where this happens further away, within the largest step, the derivative is
-      right, and a remark says how near that is. An event that just fails to happen, such as a load that almost
-      reaches the limit of stick, is seen in this way and no other: if it happens within the largest step.
-      Effects whose changes only swap their order count as unchanged.
-    - `grazing`: derivatives and differences part or are unclear, and the time of an event goes as a square root that
-      ends within 5 % of the number, as that of an event whose guard crosses zero at a vanishing rate. If they agree
-      there is a remark only. An event that is far from grazing in each number alone, but close to it in a combination
-      of them, is not seen.
-    - `kink`: the modes are the same, but the slopes from below and above differ at the three smallest steps, as
-      from `abs` or `maximum` at their corner.
+    - `modes change`: the sequence of mode changes of an effect differs at one of the two smallest steps. If it differs
+      at larger steps only, the derivative is right, and a remark gives the distance. This is also the only check for
+      events that just fail to happen, such as a load that almost reaches the limit of stick. Mode changes of two
+      effects that swap their order count as unchanged.
+    - `grazing`: derivatives and differences disagree or are unclear, and the time of an event follows a square root
+      that ends within 5 % of the number. A guard that crosses zero at a vanishing rate has such an event. If
+      derivatives and differences agree, a remark names the event. Grazing in a combination of numbers alone is not
+      detected.
+    - `kink`: the modes are the same, but the slopes from below and above differ at the three smallest steps, as at the
+      corner of `abs` or `maximum`.
 
     **Arguments:**
 
     - `fn`: `fn(scene, simulate)` -> a real scalar.
     - `scene`: the `Scene` at which to check.
-    - `names`: of the numbers to check, as in `jaxmodsim.scene.scene_numbers`, with `[i]` behind for one entry of an
+    - `names`: names of the numbers to check, as in `jaxmodsim.scene.scene_numbers`, with `[i]` for one entry of an
       array; by default all.
-    - `scales`: by name, what the steps are relative to, > 0; by default the number's absolute value, and 1 if it is 0.
-    - `rtol`: admissible relative deviation from the differences, beside three times their estimated error; by
-      default 1e-3, in float32 1e-2. Forward and reverse mode must agree to 1e-6, in float32 to 1e-3. What is tiny
-      beside the function, its other derivatives and the `atol` of its runs counts as zero.
+    - `scales`: by name, the magnitude to which the steps are relative, > 0; by default the absolute value of the
+      number, or 1 if it is 0.
+    - `rtol`: largest relative deviation from the differences, in addition to three times their estimated error; by
+      default 1e-3, in float32 1e-2. Forward and reverse mode must agree to 1e-6, in float32 to 1e-3. Derivatives that
+      are tiny relative to the function, its other derivatives and the `atol` of its runs count as zero.
 
     **Returns:**
 
@@ -165,14 +168,14 @@ def check_gradients(
 
     **Raises:**
 
-    - `ValueError` if `fn` does not take `simulate`, does not use it, or gives no finite real scalar; if the scene has
-      no numbers, or not those that were named.
+    - `ValueError` if `fn` does not take `simulate`, does not use it, or returns no finite real scalar; if the scene has
+      no numbers, or none of a name in `names`.
     - `SimulationError` if the run at `scene` itself ends early.
     """
     entries = _entries(scene, names, scales or {})
     runs: list[Trajectory] = []
     evaluate = functools.partial(_evaluate, fn, scene, runs, _recording(runs))
-    value, watched, noise, adjoints = _first(fn, scene, runs)
+    value, recorded, atol, adjoints = _first(fn, scene, runs)
     itemsize = min(x.dtype.itemsize for x in (value, *jtu.tree_leaves(scene)))
     if itemsize not in _RTOL:
         raise ValueError(f"check_gradients works in float32 and float64, but the scene holds {value.dtype}.")
@@ -186,7 +189,7 @@ def check_gradients(
         float(np.finfo(f"f{itemsize}").eps),
         _RTOL[itemsize] if rtol is None else rtol,
         _RTOL_MODES[itemsize],
-        max([noise, abs(float(value)), *(s for s in slopes if np.isfinite(s))]),
+        max([atol, abs(float(value)), *(s for s in slopes if np.isfinite(s))]),
     )
     numbers = {}
     for name, x in entries.items():
@@ -194,12 +197,13 @@ def check_gradients(
         evaluations = probe(sample, sample(x), scale[name], itemsize)
         numbers[name] = _judge(name, evaluations, forward[name], reverse[name], scale[name], limits)
     remarks = [remark for number in numbers.values() for remark in number.remarks]
-    if adjoints and any(number.verdict == "part" for number in numbers.values()):
-        remarks.append(words.adjoint(adjoints))
-    if not watched:
+    if adjoints and any(number.verdict == "disagree" for number in numbers.values()):
         remarks.append(
-            "Runs inside jax.jit or jax.vmap cannot be watched: changes of modes and grazing go unseen there."
+            f"The steps of a run with adjoint={' or '.join(adjoints)} control the error of the motion alone, which can"
+            " leave derivatives wrong. Omit adjoint: by default the steps control the error of the derivatives too."
         )
+    if not recorded:
+        remarks.append("Modes of runs inside jax.jit or jax.vmap are not recorded: mode changes and grazing go unseen.")
     return GradientCheck(float(value), f"float{8 * itemsize}", numbers, tuple(remarks))
 
 
@@ -213,7 +217,7 @@ def _entries(scene: object, names: Sequence[str] | None, scales: Mapping[str, fl
     wanted = list(numbers) if names is None else [names] if isinstance(names, str) else list(names)
     for name in (*wanted, *scales):
         if name not in numbers:
-            raise ValueError(f"The scene has no number {name!r}; it has: {', '.join(numbers)}.")
+            raise ValueError(f"The scene has no number {name!r}; there are: {', '.join(numbers)}.")
     if not wanted:
         raise ValueError("names is empty: name at least one number, or leave it out to check all.")
     for name, scale in scales.items():
@@ -234,9 +238,11 @@ def _recording(runs: list[Trajectory]) -> Callable[..., Trajectory]:
 
 
 def _first(fn: Callable[..., Any], scene: Scene, runs: list[Trajectory]) -> tuple[Array, bool, float, tuple[str, ...]]:
-    """The value at the scene, whether its runs can be watched, their atol, and the adjoints that diffrax has for them.
+    """The value at the scene, whether its runs are recorded, their atol, and the diffrax adjoints that they use.
 
-    What cannot be checked is refused.
+    **Raises:**
+
+    - `ValueError` for a function that cannot be checked.
     """
     if not callable(fn):
         raise ValueError(f"{_INTERFACE} A {type(fn).__name__} was given.")
@@ -252,10 +258,10 @@ def _first(fn: Callable[..., Any], scene: Scene, runs: list[Trajectory]) -> tupl
     if not runs:
         raise ValueError(f"{_INTERFACE} This function did not call it.")
     if not np.isfinite(value):
-        raise ValueError(f"fn gives {value} at this scene, which has no derivative.")
-    watched = [run for run in runs if not _traced(run)]
-    atol = max((float(run.request.atol) for run in watched), default=0.0)
-    complete = len(watched) == len(runs)
+        raise ValueError(f"fn must return a finite number, but it returned {value} at this scene.")
+    recorded = [run for run in runs if not _traced(run)]
+    atol = max((float(run.request.atol) for run in recorded), default=0.0)
+    complete = len(recorded) == len(runs)
     adjoints = [run.request.adjoint.rest for run in runs if run.request.adjoint is not None]
     others = {type(each).__name__ for each in adjoints if not isinstance(each, StoredSteps)}
     runs.clear()
@@ -286,7 +292,7 @@ def _evaluate(
     name: str,
     x: float,
 ) -> Sample:
-    """The function with one number replaced."""
+    """Evaluate the function with one number of the scene replaced."""
     changed_scene = replace_elements(scene, {name: x})
     x = read_element(changed_scene, name)  # as rounded to its type
     runs.clear()
@@ -297,7 +303,7 @@ def _evaluate(
     histories: Histories = {}
     for i, run in enumerate(r for r in runs if not _traced(r)):
         histories.update({(i, effect): history for effect, history in _histories(run).items()})
-    return Sample(x, value, histories, "" if np.isfinite(value) else f"fn gives {value}.")
+    return Sample(x, value, histories, "" if np.isfinite(value) else f"fn returns {value}.")
 
 
 def _histories(run: Trajectory) -> dict[str, History]:
@@ -315,31 +321,124 @@ def _histories(run: Trajectory) -> dict[str, History]:
 def _judge(
     name: str, evaluations: Probe, forward: float, reverse: float, scale: float, limits: Agreement
 ) -> NumberCheck:
-    """The verdict on one number, and the sentences that go with it."""
+    """The verdict on one number, with its remarks."""
     center, guess = evaluations.center, estimate(evaluations, limits.eps)
     shown = guess or DerivativeEstimate(float("nan"), float("nan"), float("nan"), "")
     number = functools.partial(NumberCheck, name, center.x, forward, reverse, shown.value, shown.error, shown.step)
     sides = [(side, usable(center, side)) for side in (evaluations.below, evaluations.above)]
-    ends = tuple(words.end(name, center, side[first - 1]) for side, first in sides if first)
+    ends = tuple(_end_remark(name, center, side[first - 1]) for side, first in sides if first)
     if any(len(side) - 2 < first and not side[first - 1].trouble for side, first in sides):
-        return number("modes change", (*ends, words.modes_change(name)))
+        remark = (
+            f"{name}: not differentiable here, as far as the steps can resolve: the modes change next to this value,"
+            " and a gradient is valid on one side at most. Move away from this value before you use a gradient."
+        )
+        return number("modes change", (*ends, remark))
     if guess is None:
-        return number("no differences", (*ends, words.no_differences(name)))
+        remark = f"{name}: too few runs near this value succeed. Pass smaller steps by scales={{{name!r}: ...}}."
+        return number("no differences", (*ends, remark))
     if guess.sides != "both":
-        ends = (*ends, words.one_sided(name, guess))
+        ends = (*ends, f"{name}: the differences are from {guess.sides} only.")
     least = limits.rtol * limits.size / scale
     corner = kink(evaluations)
     if corner is not None and abs(corner[1] - corner[0]) > max(limits.rtol * max(map(abs, corner)), least):
-        return number("kink", (words.kink(name, corner), *ends))
+        remark = (
+            f"{name}: not differentiable here: the slope is {corner[0]:.7g} from below and {corner[1]:.7g} from above,"
+            " with the same modes. Look for abs, maximum, sign or where at a corner, or move away from this value."
+        )
+        return number("kink", (remark, *ends))
     near = grazing(evaluations, scale)
-    touch = () if near is None else (words.grazing(name, center.x, near),)
-    part = words.parting(name, forward, reverse, guess, limits, scale)
+    touch = () if near is None else (_grazing_remark(name, center.x, near),)
+    disagreements = _disagreement_remarks(name, forward, reverse, guess, limits, scale)
     size = max(abs(forward), abs(reverse), abs(guess.value))
     unclear = 3 * guess.error > max(_UNCLEAR * size, least)
-    if near is not None and (part or unclear):
-        return number("grazing", (*touch, *part, *ends))
-    if part:
-        return number("part", (*part, *ends))
+    if near is not None and (disagreements or unclear):
+        return number("grazing", (*touch, *disagreements, *ends))
+    if disagreements:
+        return number("disagree", (*disagreements, *ends))
     if unclear:
-        return number("unclear", (words.unclear(name, guess), *ends))
+        remark = (
+            f"{name}: the differences have an error of {guess.error:.1g} and are inconclusive. Tighten rtol and atol of"
+            f" simulate, or pass other steps by scales={{{name!r}: ...}}."
+        )
+        return number("unclear", (remark, *ends))
     return number("agree", (*touch, *ends))
+
+
+def _end_remark(name: str, center: Sample, beside: Sample) -> str:
+    """Why the differences end at the evaluation `beside`: it fails, or its modes are others."""
+    place = f"{name}: at {beside.x:.7g}, {_percent(beside.x - center.x, center.x)} from here,"
+    if beside.trouble:
+        return f"{place} the run fails: {beside.trouble}"
+    key = changed(center.histories, beside.histories)
+    assert key is not None
+    here, there = (sample.histories.get(key) for sample in (center, beside))
+    k = first_difference(here, there) if here and there else 0
+    text = f"{place} the sequence of modes differs: change {k + 1} of {key[1]!r}{_run(key[0])}"
+    old, new = _change(here, k), _change(there, k)
+    if new is None:
+        return f"{text}, {old} here, does not happen there."
+    if old is None:
+        return f"{text}, {new}, happens there only."
+    return f"{text} is {new} in place of {old}."
+
+
+def _grazing_remark(name: str, x: float, near: Grazing) -> str:
+    return (
+        f"{name}: grazing suspected: the time of the event of {near.effect!r} at t = {near.t:.6g}{_run(near.run)}"
+        f" follows a square root that ends near {name} = {near.vanishes:.6g}, {_percent(near.vanishes - x, x)} from"
+        " here, with infinite derivatives. A gradient is valid within a small part of that distance."
+    )
+
+
+def _disagreement_remarks(
+    name: str, forward: float, reverse: float, guess: DerivativeEstimate, limits: Agreement, scale: float
+) -> tuple[str, ...]:
+    """How the three derivatives disagree; empty if they agree."""
+    derivatives = {"forward mode": forward, "reverse mode": reverse}
+    bad = [mode for mode, value in derivatives.items() if not math.isfinite(value)]
+    if bad:
+        return (
+            f"{name}: the derivative by {' and '.join(bad)} is not finite, but the differences give {guess.value:.7g}."
+            " Look for a square root, norm or power at zero, and for where() around a division by zero.",
+        )
+    texts = []
+    size, least = max(abs(forward), abs(reverse)), limits.size / scale
+    if abs(forward - reverse) > limits.rtol_modes * (size + least):
+        texts.append(
+            f"{name}: forward and reverse mode disagree by {_percent(forward - reverse, size)}: {forward:.7g} and"
+            f" {reverse:.7g}. Look for a custom_vjp or custom_jvp in the functions that fn calls."
+        )
+    wrong = {
+        mode: value
+        for mode, value in derivatives.items()
+        if abs(value - guess.value)
+        > limits.rtol * (max(abs(value), abs(guess.value)) + _TINY * least) + 3 * guess.error
+    }
+    if wrong:
+        value = max(wrong.values(), key=lambda v: abs(v - guess.value))
+        who = "both modes give" if len(wrong) == 2 else f"{next(iter(wrong))} gives"
+        why = (
+            "The number is cut off from the result: look for stop_gradient, float() or numpy in fn and in the scene."
+            if value == 0
+            else "Look for stop_gradient, custom_jvp or custom_vjp, and for loose tolerances or a large dt of simulate."
+        )
+        texts.append(
+            f"{name}: {who} {value:.7g}, but the differences give {guess.value:.7g} (+- {guess.error:.1g}), an error"
+            f" of {_percent(value - guess.value, guess.value)}. {why}"
+        )
+    return tuple(texts)
+
+
+def _change(history: History | None, k: int) -> str | None:
+    if history is None or k >= len(history.changes):
+        return None
+    before, after = history.changes[k]
+    return f"{_MODES[before]} to {_MODES[after]} at t = {history.t[k]:.6g}"
+
+
+def _run(index: int) -> str:
+    return f" in run {index + 1}" if index else ""
+
+
+def _percent(change: float, of: float) -> str:
+    return f"{100 * abs(change / of):.2g} %" if of else f"{abs(change):.2g}"

@@ -1,16 +1,16 @@
-"""Finite differences that know their own error, and histories of modes along the way."""
+"""Finite differences with error estimates, and the mode histories of the runs behind them."""
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-# Largest step relative to the number, and how many there are, each a quarter of the one before; by bytes of the type.
+# Largest step relative to the number, and number of steps, each a quarter of the one before; by bytes of the type.
 STEPS = {8: (1e-2, 5), 4: (4e-2, 4)}
 _RATIO = 4.0
-# Estimates at two steps count as one value, and not as noise, if they differ by less.
+# Estimates at two steps are consistent if they differ by less than this fraction.
 _SAME = 0.3
-# An event is near grazing if its time has a square root within this part of the number.
+# An event is near grazing if its time has a square root within this fraction of the number.
 _NEAR = 0.05
 
 
@@ -27,7 +27,7 @@ Histories = dict[tuple[int, str], History]
 
 
 class Sample(NamedTuple):
-    """One evaluation: where, the value, the modes on the way, and what went wrong (nothing, if empty)."""
+    """One evaluation of the function: the number, the value, the mode histories, and an error message or ""."""
 
     x: float
     value: float
@@ -36,7 +36,7 @@ class Sample(NamedTuple):
 
 
 class Probe(NamedTuple):
-    """Evaluations about one number: in the middle, and below and above it from the largest step to the smallest."""
+    """Evaluations around one number: at it, and below and above it from the largest step to the smallest."""
 
     center: Sample
     below: list[Sample]
@@ -44,7 +44,7 @@ class Probe(NamedTuple):
 
 
 class DerivativeEstimate(NamedTuple):
-    """A derivative by differences: value, estimated error, smaller one of the two steps it is from, and its sides."""
+    """A derivative by differences: value, estimated error, smaller one of its two steps, and side or `both`."""
 
     value: float
     error: float
@@ -53,12 +53,12 @@ class DerivativeEstimate(NamedTuple):
 
 
 class Agreement(NamedTuple):
-    """What counts as equal.
+    """Tolerances of the comparison.
 
     - `itemsize`, `eps`: bytes and rounding unit of the floating type.
     - `rtol`, `rtol_modes`: relative, between derivatives and differences, and between forward and reverse mode.
     - `size`: the largest of the function, its changes per relative change of a number, and the absolute tolerance of
-      the runs; what is tiny beside it is zero.
+      the runs. Much smaller derivatives count as zero.
     """
 
     itemsize: int
@@ -69,7 +69,7 @@ class Agreement(NamedTuple):
 
 
 class Grazing(NamedTuple):
-    """An event whose time has a square root nearby: where it is, and at which value of the number it would vanish."""
+    """An event near grazing: its run, effect and time [s], and the value of the number at which it vanishes."""
 
     run: int
     effect: str
@@ -78,14 +78,14 @@ class Grazing(NamedTuple):
 
 
 def probe(sample: Callable[[float], Sample], center: Sample, scale: float, itemsize: int) -> Probe:
-    """Evaluate at all steps."""
+    """Evaluate the function at all steps."""
     largest, count = STEPS[itemsize]
     steps = [scale * largest / _RATIO**j for j in range(count)]
     return Probe(center, [sample(center.x - h) for h in steps], [sample(center.x + h) for h in steps])
 
 
 def usable(center: Sample, side: list[Sample]) -> int:
-    """From which index on all evaluations of a side worked and had the modes of the one in the middle."""
+    """First index from which on all evaluations of a side succeed with the modes of the center."""
     first = len(side)
     while first and not side[first - 1].trouble and not changed(center.histories, side[first - 1].histories):
         first -= 1
@@ -93,7 +93,7 @@ def usable(center: Sample, side: list[Sample]) -> int:
 
 
 def changed(one: Histories, other: Histories) -> tuple[int, str] | None:
-    """Run and effect whose modes differ; the first in time, if several do."""
+    """Run and effect with the earliest difference of modes; None without a difference."""
     empty = History(0.0, np.zeros(0), ())
     differing = []
     for key in {**one, **other}:
@@ -105,7 +105,7 @@ def changed(one: Histories, other: Histories) -> tuple[int, str] | None:
 
 
 def first_difference(one: History, other: History) -> int:
-    """Index of the first change that differs."""
+    """Index of the first mode change that differs."""
     pairs = zip(one.changes, other.changes, strict=False)
     shorter = min(len(one.changes), len(other.changes))
     return next((k for k, (a, b) in enumerate(pairs) if a != b), shorter)
@@ -114,8 +114,8 @@ def first_difference(one: History, other: History) -> int:
 def estimate(evaluations: Probe, eps: float) -> DerivativeEstimate | None:
     """Derivative by Richardson's extrapolation of the pair of steps with the smallest estimated error.
 
-    The error is that of the smaller step before it is extrapolated, plus the noise of the evaluations over that
-    step. The noise is measured at the smallest steps, by what does not follow the powers of the step there.
+    The error is the correction of the extrapolation, plus the noise of the evaluations over the smaller step. The
+    noise is the deviation from the powers of the step at the smallest steps.
     """
     center, count = evaluations.center, len(evaluations.above)
     below, above = usable(center, evaluations.below), usable(center, evaluations.above)
@@ -140,7 +140,7 @@ def estimate(evaluations: Probe, eps: float) -> DerivativeEstimate | None:
     for j in range(len(pairs) - 1, 0, -1):
         change = (slopes[j] - slopes[j - 1]) / (_RATIO**order - 1)
         value, error = slopes[j] + change, abs(change) + noise / steps[j]
-        # What smaller steps contradict, beyond their own errors, is wrong by as much.
+        # The error is at least the distance to the estimates at smaller steps, less their own errors.
         error = max([error, *(abs(value - v) - e for v, e in smaller)])
         smaller.append((value, error))
         if best is None or error < best.error:
@@ -149,7 +149,7 @@ def estimate(evaluations: Probe, eps: float) -> DerivativeEstimate | None:
 
 
 def kink(evaluations: Probe) -> tuple[float, float] | None:
-    """Slopes below and above, where they differ by about the same at the three smallest steps."""
+    """Slopes below and above, if their difference is nearly constant over the three smallest steps."""
     count, center = len(evaluations.above), evaluations.center
     if max(usable(center, evaluations.below), usable(center, evaluations.above)) > count - 3:
         return None
@@ -162,11 +162,11 @@ def kink(evaluations: Probe) -> tuple[float, float] | None:
 
 
 def grazing(evaluations: Probe, scale: float) -> Grazing | None:
-    """The first event whose time bends as a square root does close to where it ends.
+    """The first event whose time follows a square root that ends nearby.
 
-    If an event vanishes where the number p reaches c, its time goes as `t* - a sqrt(|p - c|)` near there, and
-    `c = p + t'/(2 t'')`. Counted are events whose time moves (by more than a tenth of the time since the event before,
-    per relative change of the number) and whose second difference is the same at two steps, so is no noise.
+    If an event vanishes where the number p reaches c, its time is `t* - a sqrt(|p - c|)` near there, and
+    `c = p + t'/(2 t'')`. An event counts if its time moves by more than a tenth of the time since the event before, per
+    relative change of the number, and if its second differences at two steps agree, which excludes noise.
     """
     center, count = evaluations.center, len(evaluations.above)
     first = max(usable(center, evaluations.below), usable(center, evaluations.above))

@@ -1,4 +1,4 @@
-"""What the runs of a problem converge to: the reference that errors are measured against."""
+"""Reference solutions, against which `work_precision` measures errors."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,20 +17,20 @@ from ..simulation import SimulationError, Trajectory, simulate
 from ..solvers import Rodas5P
 from ._sensitivity import observed, with_values
 
-# Absolute tolerance for a relative one, as in the defaults of `simulate`.
+# Ratio of the absolute to the relative tolerance, as in the defaults of `simulate`.
 ATOL = 1e-3
-# Steps that a reference may take, in those that a method may.
+# Largest number of steps of a reference, as a multiple of `max_steps`.
 _PATIENCE = 20
 
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of every run.
+    """The problem and the observable of a study.
 
     - `q0`, `qd0`, `t1`, `ts`: as for `simulate`.
     - `observe`, `label`, `unit`: the observable.
     - `values`: of the numbers by which the last value of the observable is differentiated.
-    - `max_steps`: limit of a run.
+    - `max_steps`: largest number of steps of a run.
     """
 
     q0: np.ndarray
@@ -50,7 +50,7 @@ class Question:
     def run(
         self, scene: Scene, start: dict[str, Array], setting: Mapping[str, object], **options: object
     ) -> Trajectory:
-        """A run; `setting` holds tolerances or a step."""
+        """Run the problem; `setting` holds the tolerances or the step."""
         return simulate(scene, **start, t1=self.t1, ts=self.ts, **{"max_steps": self.max_steps, **setting, **options})
 
     def last(
@@ -66,26 +66,26 @@ class Question:
         return jnp.ravel(self.observe(self.run(scene, start, setting, throw=False, **options)))[-1]
 
 
-class Happened(NamedTuple):
-    """Mode changes of a run: when [s], of which effect, and into which mode."""
+class ModeChanges(NamedTuple):
+    """Mode changes of a run: their times [s], and pairs of the index of the effect and its new mode."""
 
     t: Float[np.ndarray, " events"]
-    what: Int[np.ndarray, "events 2"]
+    modes: Int[np.ndarray, "events 2"]
 
 
-class Converged(NamedTuple):
-    """What runs of a scene converge to.
+class Reference(NamedTuple):
+    """The reference solution of a scene.
 
     - `y`: the observable.
-    - `events`: mode changes; None of a scene that has none.
-    - `gradient`: of the observable's last value, by name; None where it is not asked for.
-    - `disagreement`: of the observable between two references, relative to its scale; `events_disagreement` [s] and
-      `gradient_disagreement` likewise, zero where there is nothing to compare.
-    - `how`: how it was found, in words.
+    - `events`: mode changes; None for a scene without modes.
+    - `gradient`: of the last value of the observable, by name; None if no gradient is measured.
+    - `disagreement`: of the observable between two references, relative to its scale. `events_disagreement` [s] and
+      `gradient_disagreement` likewise, zero without a second reference.
+    - `how`: the methods of both references as text.
     """
 
     y: np.ndarray
-    events: Happened | None
+    events: ModeChanges | None
     gradient: dict[str, float] | None
     disagreement: float
     events_disagreement: float
@@ -98,24 +98,24 @@ def in_type(scene: Scene, dtype: object) -> Scene:
     return jtu.tree_map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, scene)
 
 
-def happened(run: Trajectory) -> Happened | None:
-    """Mode changes of a run; None where there are no modes."""
+def mode_changes_of(run: Trajectory) -> ModeChanges | None:
+    """Mode changes of a run; None for a scene without modes."""
     if run.modes is None:
         return None
     events = run.events
-    there = np.isfinite(events.t)
-    return Happened(np.asarray(events.t)[there], np.stack([events.effect, events.after], axis=1)[there])
+    finite = np.isfinite(events.t)
+    return ModeChanges(np.asarray(events.t)[finite], np.stack([events.effect, events.after], axis=1)[finite])
 
 
-def event_error(one: Happened, other: Happened) -> float | None:
-    """Largest difference of times [s]; None where other events happened."""
-    if one.what.shape != other.what.shape or (one.what != other.what).any():
+def event_error(one: ModeChanges, other: ModeChanges) -> float | None:
+    """Largest difference of times [s]; None if the sequences of modes differ."""
+    if one.modes.shape != other.modes.shape or (one.modes != other.modes).any():
         return None
     return float(np.max(np.abs(one.t - other.t), initial=0.0))
 
 
 def gradient_error(one: dict[str, float], other: dict[str, float]) -> float:
-    """Largest relative difference of a derivative, of those that are not zero."""
+    """Largest relative difference of the derivatives; absolute for those that are zero."""
     return max(abs(one[name] - x) / (abs(x) or 1.0) for name, x in other.items())
 
 
@@ -124,10 +124,10 @@ def scale_of(y: np.ndarray) -> float:
     return float(np.max(np.abs(y))) or 1.0
 
 
-def converged(
+def find_reference(
     scene: Scene, question: Question, rtol: float, *, closed: np.ndarray | None, scale: float | None, agreement: float
-) -> Converged:
-    """Runs of two solvers at a tight tolerance, or one beside a closed form, that must agree.
+) -> Reference:
+    """Compute the reference by two solvers at a tight tolerance, or by a closed form and one solver.
 
     **Raises:**
 
@@ -155,14 +155,14 @@ def converged(
         at = int(np.argmax(apart))
         raise RuntimeError(
             f"The references disagree: {question.label} is {np.ravel(ys[0])[at]:.12g} by {how[0]} and"
-            f" {np.ravel(ys[1])[at]:.12g} by {how[1]}, {disagreement:.1e} of its scale, where {agreement:.1e} is"
-            " allowed. End earlier if the motion is chaotic, ask for looser tolerances, pass a closed form as"
-            " reference, or allow more by agreement."
+            f" {np.ravel(ys[1])[at]:.12g} by {how[1]}. The difference of {disagreement:.1e} of the scale exceeds"
+            f" agreement={agreement:.1e}. Reduce t1 if the motion is chaotic, loosen the tolerances, or pass a closed"
+            " form as reference or a larger agreement."
         )
     events, other = solutions[0][1], solutions[-1][1]
     times = None if events is None or other is None else event_error(events, other)
     gradient, second = solutions[0][2], solutions[-1][2]
-    return Converged(
+    return Reference(
         ys[0],
         events if times is not None else None,
         gradient,
@@ -175,15 +175,15 @@ def converged(
 
 def _tight(
     scene: Scene, question: Question, solver: object, rtol: float
-) -> tuple[np.ndarray, Happened | None, dict[str, float] | None]:
-    """Observable, mode changes and gradient at a tight tolerance."""
+) -> tuple[np.ndarray, ModeChanges | None, dict[str, float] | None]:
+    """Observable, mode changes and gradient by one solver at a tight tolerance."""
     setting, start = {"rtol": rtol, "atol": ATOL * rtol}, question.start(jnp.float64)
     options = {"solver": solver, "max_steps": _PATIENCE * question.max_steps}
     try:
         run = question.run(scene, start, setting, **options)
     except SimulationError as error:
         raise RuntimeError(
-            f"The reference by {type(solver).__name__} at rtol = {rtol:.0e} failed: {error} Its limit of steps is"
+            f"The reference by {type(solver).__name__} at rtol = {rtol:.0e} failed: {error} It may take"
             f" {_PATIENCE} times max_steps."
         ) from error
     y, gradient = np.asarray(observed(question.observe(run))), None
@@ -191,4 +191,4 @@ def _tight(
         x = {name: jnp.asarray(value, jnp.float64) for name, value in question.values.items()}
         derivatives = jax.jacfwd(question.last)(x, scene, start, setting, **options)
         gradient = {name: float(derivatives[name]) for name in question.values}
-    return y, happened(run), gradient
+    return y, mode_changes_of(run), gradient

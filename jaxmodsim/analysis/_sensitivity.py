@@ -1,4 +1,4 @@
-"""`sensitivity`: how much each number of a scene matters to what is observed along a run."""
+"""`sensitivity`: derivatives of an observable by the numbers of a scene, normalised and ranked."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,29 +24,28 @@ from ..simulation import Trajectory, named_series, simulate
 
 _MODES = ("forward", "reverse")
 
-# Cost in plain runs, measured on two shared cores for LuGre's test bench and the belt oscillator with 44 events.
+# Cost in units of a plain run, measured on two cores for the LuGre test bench and a belt oscillator with 44 events.
 # Forward: 1.6 to 3.0 for 6 parameters, 2.0 to 3.5 for 24, 3.3 to 10 for 96. Reverse: 8 to 20 for one output (3 to 5
-# after `tune_cpu`), 4.5 to 18 for four; it compiles two to three times as long.
+# after `tune_cpu`), 4.5 to 18 for four, with a two to three times longer compilation.
 _FORWARD, _PER_PARAMETER = 2.0, 0.1
 _REVERSE, _PER_OUTPUT = 8.0, 1.0
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """What `sensitivity` found; print it, or draw it by `jaxmodsim.plot.sensitivity_figure`.
+    """The result of `sensitivity`, which prints as a table; `jaxmodsim.plot.sensitivity_figure` draws it.
 
-    - `label`, `unit`: of the observable, as far as they are known.
+    - `label`, `unit`: of the observable, if known.
     - `t`: times of the run [s], shape `[time]`.
     - `observable`: its values y, shape `[time]`, `[k]` or `[]`.
-    - `values`: of the parameters p, by name; `units` of those that declare one.
+    - `values`: of the parameters p, by name; `units`: of the parameters that declare one.
     - `derivatives`: dy/dp by name, of the shape of the observable.
     - `normalised`: `p dy/dp / scale` by name: the relative change of y per relative change of p. The scale is the rms
-      of y over the run where y is a function of time, and the magnitude of each y where it is not. A parameter that is
-      zero counts as changed by one unit, an observable whose scale is zero as having the scale of one unit; `remarks`
-      names them.
+      of y over the run if y is a function of time, else the magnitude of each y. A zero p or scale is replaced by one
+      unit; `remarks` says so.
     - `ranking`: pairs of name and rms of the normalised sensitivity, the largest first.
     - `mode`: of differentiation, `forward` or `reverse`.
-    - `remarks`: in sentences.
+    - `remarks`: sentences on replaced zeros and on mode changes.
     """
 
     label: str
@@ -63,7 +62,7 @@ class Sensitivity:
 
     @property
     def over_time(self) -> bool:
-        """Whether the observable is a function of time, and not numbers of the run as a whole."""
+        """Whether the observable is a function of time."""
         return _over_time(self.observable, self.t)
 
     def __str__(self) -> str:
@@ -94,7 +93,7 @@ def sensitivity(
     mode: str | None = None,
     **options: object,
 ) -> Sensitivity:
-    """Derivatives of what is observed along a run by numbers of its scene, exact, through all mode changes.
+    """Differentiate an observable of a run by numbers of its scene, exactly, through all mode changes.
 
     ```python
     result = jaxmodsim.sensitivity(scene, "q[0]", q0=[1.0], qd0=[0.0], t1=5.0, ts=jnp.linspace(0.0, 5.0, 101))
@@ -102,23 +101,23 @@ def sensitivity(
     jaxmodsim.sensitivity(scene, lambda run: run.events.t[2], ("m", "friction.Fc"), q0=[1.0], qd0=[0.0], t1=5.0)
     ```
 
-    The scene runs once to see its events and again for the derivatives. A forward Jacobian costs about 2 + 0.1 n plain
-    runs for n parameters, a reverse one about 8 + m for m numbers observed; the cheaper one is taken, which is reverse
-    for many parameters (more than 70 for one number) and few outputs. Tolerances control the motion and its
-    derivatives, as described in `StoredSteps`.
+    The scene runs once to count its events and again for the derivatives. In units of a plain run, a forward Jacobian
+    costs about 2 + 0.1 n for n parameters, a reverse one about 8 + m for m observed numbers. The default is the cheaper
+    one: reverse for more than 70 parameters of one number. Tolerances control the motion and its derivatives, as
+    described in `StoredSteps`.
 
     **Arguments:**
 
-    - `scene`: the `Scene`; its numbers must be known (not traced).
-    - `observable`: function of the `Trajectory` that returns real numbers: shape `[time]` for those at the times of the
-      run, or `[]` or `[k]` for numbers of the run as a whole, such as `run.events.t[2]`. Or a name: `q[0]`, `qd[0]`, or
-      of an effect for its force, with `[i]` for a component.
-    - `wrt`: names of numbers as in `jaxmodsim.scene.scene_numbers`, with `[i]` behind for one entry of an array, whose
-      own name stands for all; and `q0[0]`, `qd0[0]` for the initial state. By default all numbers of the scene but
-      zeros, values of signals, and what says how a law is run and not what it is (`width`).
+    - `scene`: the `Scene`, with concrete (not traced) numbers.
+    - `observable`: function of the `Trajectory` that returns real numbers: of shape `[time]` for a series at the saved
+      times, or `[]` or `[k]` for numbers of the whole run, such as `run.events.t[2]`. Or a name: `q[0]`, `qd[0]`, or
+      the name of an effect for its force, with `[i]` for a component.
+    - `wrt`: names of numbers as in `jaxmodsim.scene.scene_numbers`, with `[i]` for one entry of an array and without it
+      for all; and `q0[0]`, `qd0[0]` for the initial state. By default all numbers of the scene except zeros, values of
+      signals, and numerical settings of laws (`width`).
     - `q0`, `qd0`, `t1`, `ts`: as for `simulate`.
     - `mode`: `"forward"` or `"reverse"`; by default the cheaper one.
-    - `options`: further arguments of `simulate`, but not `adjoint` and `throw`.
+    - `options`: further arguments of `simulate`, except `adjoint` and `throw`.
 
     **Returns:**
 
@@ -126,7 +125,7 @@ def sensitivity(
 
     **Raises:**
 
-    - `ValueError` for names that are unknown or given twice, an observable that is no function, does not give real
+    - `ValueError` for unknown or repeated names, and for an observable that is not callable, does not return real
       numbers of a shape above, or is not finite (`run.events.t` is padded with infinity).
     - `SimulationError` if the run ends early.
     """
@@ -134,16 +133,14 @@ def sensitivity(
         raise ValueError(f"sensitivity needs a Scene, but a {type(scene).__name__} was given.")
     for name in ("adjoint", "throw"):
         if name in options:
-            raise ValueError(
-                f"sensitivity sets {name} itself: leave it out, and choose by mode='forward' or 'reverse'."
-            )
+            raise ValueError(f"sensitivity sets {name} itself: omit it, and choose mode='forward' or mode='reverse'.")
     if mode not in (None, *_MODES):
-        raise ValueError(f"mode must be 'forward', 'reverse' or left out for the cheaper one, but {mode!r} was given.")
+        raise ValueError(f"mode must be 'forward', 'reverse' or None for the cheaper one, but {mode!r} was given.")
     values = chosen_numbers(scene, q0, qd0, wrt)
-    given: dict[str, Any] = {**options, "ts": ts}
-    run = simulate(scene, q0, qd0, t1, **given)
-    if run.modes is not None:  # a traced run would hold room for all events that are allowed
-        given["max_events"] = run.log_size
+    arguments: dict[str, Any] = {**options, "ts": ts}
+    run = simulate(scene, q0, qd0, t1, **arguments)
+    if run.modes is not None:  # a traced run would reserve memory for the largest allowed number of events
+        arguments["max_events"] = run.log_size
     observe, label, unit = observable_of(scene, observable)
     y = observed(observe(run))
     if mode is None:
@@ -152,7 +149,7 @@ def sensitivity(
 
     def at(x: dict[str, Array]) -> Array:
         changed, start = with_values(scene, {"q0": run.request.q0, "qd0": run.request.qd0}, x)
-        return jnp.asarray(observe(simulate(changed, **start, t1=t1, throw=False, **given)))
+        return jnp.asarray(observe(simulate(changed, **start, t1=t1, throw=False, **arguments)))
 
     differentiate = jax.jacfwd if mode == "forward" else jax.jacrev
     derivatives = differentiate(at)({name: jnp.asarray(x, y.dtype) for name, x in values.items()})
@@ -175,7 +172,7 @@ def chosen_numbers(scene: Scene, q0: object, qd0: object, wrt: Sequence[str] | s
         left = {name for name, x in numbers.items() if id(x) in samples or (name in ranges and ranges[name].execution)}
         chosen = [name for name, (leaf, _) in elements(scene).items() if leaf not in left and known[name] != 0]
         if not chosen:
-            raise ValueError("The scene has no numbers but zeros: name what to differentiate by, such as wrt='q0[0]'.")
+            raise ValueError("All numbers of the scene are zero: name those to differentiate by, as in wrt='q0[0]'.")
         return {name: known[name] for name in chosen}
     for name, start in (("q0", q0), ("qd0", qd0)):
         known |= {f"{name}[{i}]": float(x) for i, x in enumerate(np.ravel(np.asarray(start)))}
@@ -184,13 +181,13 @@ def chosen_numbers(scene: Scene, q0: object, qd0: object, wrt: Sequence[str] | s
     chosen = []
     for name in [wrt] if isinstance(wrt, str) else wrt:
         if name not in groups and name not in known:
-            raise ValueError(f"wrt names {name!r}, but the numbers are: {', '.join(known)}.")
+            raise ValueError(f"wrt names {name!r}, which is no number of the scene; there are: {', '.join(known)}.")
         chosen += groups.get(name, [name])
     for name in chosen:
         if chosen.count(name) > 1:
             raise ValueError(f"wrt names {name!r} twice.")
     if not chosen:
-        raise ValueError("wrt is empty: name at least one number, or leave it out for those that are not zero.")
+        raise ValueError("wrt is empty: name at least one number, or omit it for all that are not zero.")
     return {name: known[name] for name in chosen}
 
 
@@ -209,7 +206,7 @@ def observable_of(
     scene: Scene,
     observable: str | Callable[[Trajectory], ArrayLike],
 ) -> tuple[Callable[[Trajectory], ArrayLike], str, str]:
-    """What is observed, its label and its unit."""
+    """The observable as a function, its label and its unit."""
     if isinstance(observable, str):
         label, unit = quantity_of(scene, observable)
         return partial(named_series, name=observable), label, unit
@@ -223,7 +220,12 @@ def observable_of(
 
 
 def observed(y: Any) -> Array:
-    """What the observable gave, if that can be differentiated."""
+    """The value of an observable as an array.
+
+    **Raises:**
+
+    - `ValueError` unless it is differentiable.
+    """
     dtype, shape = getattr(y, "dtype", None), getattr(y, "shape", None)
     if dtype is None or shape is None or not jnp.issubdtype(dtype, jnp.floating) or len(shape) > 1 or 0 in shape:
         given = f"an array of shape {shape} and type {dtype}" if dtype is not None else f"{y!r}"
@@ -233,8 +235,8 @@ def observed(y: Any) -> Array:
         )
     if not np.isfinite(y).all():
         raise ValueError(
-            f"observable is not finite: {np.asarray(y)}. Times of events are padded with infinity: pick those that"
-            " happen, as in run.events.t[0]."
+            f"observable must be finite, but it returned {np.asarray(y)}. Times of events are padded with infinity:"
+            " pick events that happen, as in run.events.t[0]."
         )
     return jnp.asarray(y)
 
@@ -242,20 +244,20 @@ def observed(y: Any) -> Array:
 def _normalised(
     y: Array, run: Trajectory, values: Mapping[str, float], derivatives: Mapping[str, Array]
 ) -> tuple[dict[str, Array], tuple[str, ...]]:
-    """Derivatives relative to parameters and observable, and what is to be said of them."""
+    """Derivatives relative to parameters and observable, and the remarks."""
     remarks = []
     scale = jnp.full(y.shape, _rms(y), y.dtype) if _over_time(y, run.t) else jnp.abs(y)
     if not (scale > 0).all():
-        remarks.append("The observable is zero: there its scale counts as one unit.")
+        remarks.append("The observable is zero at some times: its scale there is taken as one unit.")
         scale = jnp.where(scale > 0, scale, 1.0)
     zero = [name for name, x in values.items() if x == 0]
     if zero:
-        remarks.append(f"Zero, and counted as changed by one unit: {', '.join(zero)}.")
+        remarks.append(f"These parameters are zero, and their change is taken as one unit: {', '.join(zero)}.")
     events = int(run.stats.get("num_events", 0))
     if events:
         remarks.append(
-            f"The run has {events} instants of mode changes: derivatives hold as long as these stay the same, which"
-            " jaxmodsim.check_gradients looks at."
+            f"The run has mode changes at {events} times: derivatives are valid while their sequence stays the same."
+            " jaxmodsim.check_gradients checks that."
         )
     return {name: (x or 1.0) * derivatives[name] / scale for name, x in values.items()}, tuple(remarks)
 

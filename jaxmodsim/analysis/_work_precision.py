@@ -1,12 +1,13 @@
-"""`work_precision`: what an extra digit costs, method by method."""
+"""`work_precision`: the error of several methods against their time and steps."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,19 +15,130 @@ from jaxtyping import Array, ArrayLike
 
 from .._core.system import describe_machine
 from .._core.timing import measure
-from ..scene import Scene, elements
+from ..friction import AbstractSetValuedLaw, DeadZone, LuGre, Regularized
+from ..scene import Friction, Scene, elements
 from ..simulation import Trajectory, default_solver, evaluations_per_step
-from ._methods import Method, default_methods
-from ._reference import ATOL, Converged, Question, converged, event_error, gradient_error, happened, in_type, scale_of
+from ..solvers import Rodas5P
+from ._reference import (
+    ATOL,
+    Question,
+    Reference,
+    event_error,
+    find_reference,
+    gradient_error,
+    in_type,
+    mode_changes_of,
+    scale_of,
+)
 from ._sensitivity import chosen_numbers, observable_of, observed
 from ._work_rows import Row, Timing, WorkPrecision
 
-# Numbers of a gradient that are none of the scene.
+# Prefixes of the names of initial values, which are no numbers of the scene.
 _START = ("q0[", "qd0[")
 COSTS = ("run", "vmap", "forward", "reverse")
-# Tolerance of the references: so much tighter than the tightest asked for, down to what rounding allows.
+# Tolerance of the references relative to the smallest tolerance of the study, and its smallest value.
 _TIGHTER, _TIGHTEST = 1e-3, 1e-12
 _PACKAGES = ("jaxmodsim", "jax", "jaxlib", "diffrax", "equinox", "numpy")
+_DTYPES = ("float32", "float64")
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method to run a problem. Each of its settings becomes a row of `work_precision`.
+
+    - `solver`: any diffrax solver, or `jaxmodsim.Rodas5P`, `Gauss`, `ImplicitFriction`; by default the choice of
+      `simulate`.
+    - `scene`: another formulation of the problem with the same coordinates, such as one of `formulations`; None for the
+      scene of the problem.
+    - `steps`: fixed time steps [s], > 0, in place of tolerances.
+    - `dtype`: `"float32"` or `"float64"`; by default that of the scene.
+    """
+
+    solver: dfx.AbstractSolver | None = None
+    scene: Scene | None = None
+    steps: Sequence[float] | None = None
+    dtype: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        if self.solver is not None and not isinstance(self.solver, dfx.AbstractSolver):
+            raise ValueError(f"solver must be a diffrax solver, as in diffrax.Tsit5(), but {self.solver!r} was given.")
+        if self.scene is not None and not isinstance(self.scene, Scene):
+            raise ValueError(f"scene must be a Scene, but a {type(self.scene).__name__} was given.")
+        if self.steps is not None and (not len(self.steps) or any(not x > 0 for x in self.steps)):
+            raise ValueError(f"steps must be fixed steps [s], > 0, as in (1e-3, 1e-4), but {self.steps!r} was given.")
+        if self.dtype not in (None, *_DTYPES):
+            raise ValueError(f"dtype must be 'float32' or 'float64', but {self.dtype!r} was given.")
+
+
+def default_methods(scene: Scene) -> dict[str, Method]:
+    """Methods with solvers that suit the scene."""
+    if scene.mode_names:
+        solvers = (Rodas5P(), dfx.Tsit5())
+    elif any(effect.stiff for effect in scene.effects):
+        solvers = (Rodas5P(), dfx.Kvaerno5(), dfx.Tsit5())
+    else:
+        solvers = (dfx.Tsit5(), dfx.Dopri8(), Rodas5P())
+    return {type(solver).__name__: Method(solver) for solver in solvers}
+
+
+def formulations(scene: Scene, *, width: float, sigma0: float | None = None, sigma1: float = 0.0) -> dict[str, Scene]:
+    """Replace the set-valued laws of a scene by other formulations.
+
+    ```python
+    methods = {"exact": Method()}
+    for name, other in formulations(scene, width=1e-3).items():
+        methods[name] = Method(scene=other, steps=(1e-3, 1e-4) if name == "DeadZone" else None)
+    ```
+
+    `DeadZone` needs fixed time steps, because its vector field jumps at the edges of the band.
+
+    **Arguments:**
+
+    - `scene`: a `Scene` with event-driven set-valued laws (`Coulomb`, `Stribeck`).
+    - `width`: of `Regularized` and `DeadZone` [m/s or rad/s], > 0.
+    - `sigma0`: bristle stiffness of `LuGre` [N/m], > 0; None to omit this formulation. `width` is then also the
+      Stribeck velocity that replaces the stiction of `Coulomb`.
+    - `sigma1`: bristle damping of `LuGre` [N s/m], >= 0.
+
+    **Returns:**
+
+    Scenes by the names `Regularized`, `DeadZone` and, with `sigma0`, `LuGre`.
+
+    **Raises:**
+
+    - `ValueError` if no law of the scene is set-valued, if numbers are out of range, or with `sigma0` if a law is
+      neither `Coulomb` nor the Gaussian `Stribeck`.
+    """
+    if not isinstance(scene, Scene):
+        raise ValueError(f"formulations needs a Scene, but a {type(scene).__name__} was given.")
+    at = [i for i, effect in enumerate(scene.effects) if isinstance(effect, Friction) and effect.event_driven]
+    if not at:
+        raise ValueError(
+            "formulations needs a set-valued law, but the scene has none. It replaces Coulomb, Stribeck and laws made"
+            " of them."
+        )
+
+    def laws(scene: Scene) -> list[Any]:
+        return [scene.effects[i].law for i in at]  # pyright: ignore[reportAttributeAccessIssue]
+
+    scenes = {
+        "Regularized": eqx.tree_at(laws, scene, [Regularized(law, width) for law in laws(scene)]),
+        "DeadZone": eqx.tree_at(laws, scene, [DeadZone(law, width) for law in laws(scene)]),
+    }
+    if sigma0 is not None:
+        scenes["LuGre"] = eqx.tree_at(laws, scene, [_bristle(law, width, sigma0, sigma1) for law in laws(scene)])
+    return scenes
+
+
+def _bristle(law: AbstractSetValuedLaw, width: float, sigma0: float, sigma1: float) -> LuGre:
+    numbers = law.lugre_numbers(width)
+    if numbers is None:
+        raise ValueError(
+            f"LuGre replaces Coulomb and the Gaussian Stribeck, but the law is {law}. Omit sigma0, and build a scene"
+            " with LuGre yourself."
+        )
+    return LuGre(sigma0=sigma0, sigma1=sigma1, **numbers)
 
 
 def work_precision(
@@ -49,7 +161,7 @@ def work_precision(
     max_steps: int = 100_000,
     name: str = "scene",
 ) -> WorkPrecision:
-    """Run a scene by several methods at several tolerances: errors against times and steps.
+    """Run a scene by several methods at several tolerances, and compare errors with times and steps.
 
     ```python
     problem = jaxmodsim.problems.named_problems()["lugre_box"]()
@@ -59,46 +171,45 @@ def work_precision(
     jaxmodsim.plot.work_precision_figure(study).savefig("lugre_box.png")
     ```
 
-    **Reference.** Two solvers at a tolerance a thousand times tighter than the tightest asked for (1e-12 at the
-    tightest), `Rodas5P` and an explicit one, must agree; or one and a closed form. Their disagreement is kept: smaller
-    errors are noise. A method with a `scene` of its own is also held against what that formulation converges to, found
-    in the same way, so that the error of the model stands apart from that of the integration; where that is not
-    found (a field that jumps), the error stays whole.
+    **Reference.** Two solvers, `Rodas5P` and an explicit one, must agree at a tolerance of 1e-3 times the smallest in
+    `tolerances`, but at least 1e-12; or one solver and a closed form. The result holds their disagreement: smaller
+    errors are noise. A method with its own `scene` is also compared with the reference of that formulation, which
+    separates the modelling error from the integration error. If that reference fails, as for a field that jumps, the
+    row has the total error alone.
 
-    **Times** are of warm calls of `simulate`, or of compiled functions of it, all methods in turns, with compiling
-    apart. All runs of a vmap are alike, which is the best case: a batch waits for its slowest run. Gradients are
-    those of the last value of the observable.
+    **Times** are those of warm calls of `simulate` or of compiled functions of it, with the methods in turns. The
+    compilation time is separate. All runs of a vmap are equal, which is the best case: a batch waits for its slowest
+    run. Gradients are those of the last value of the observable.
 
     **Arguments:**
 
     - `scene`, `q0`, `qd0`, `t1`, `ts`: as for `simulate`.
-    - `observable`: what errors are of: a name, as in `"q[0]"`, or of an effect for its force; or a function of the
-      `Trajectory` that returns real numbers of shape `[time]`, `[k]` or `[]`.
+    - `observable`: the quantity whose errors are measured: a name such as `"q[0]"`, the name of an effect for its
+      force, or a function of the `Trajectory` that returns real numbers of shape `[time]`, `[k]` or `[]`.
     - `methods`: a `Method` for each name; by default solvers that suit the scene.
-    - `tolerances`: relative ones, > 0; absolute ones are a thousandth of them.
+    - `tolerances`: relative tolerances, > 0; the absolute ones are a thousandth of them.
     - `reference`: a closed form of the observable: numbers of its shape, or a function of the times.
-    - `agreement`: largest disagreement of the references, relative to the scale; by default the tightest tolerance.
+    - `agreement`: largest disagreement of the references, relative to the scale; by default the smallest tolerance.
     - `wrt`: numbers for the gradient, as for `sensitivity`; by default, if a gradient is timed, all that are not zero.
-    - `costs`: what is timed, of `run`, `vmap`, `forward`, `reverse` (gradients).
-    - `batch`: runs of the vmap.
-    - `rounds`, `limit_s`: how often each call is timed, and after how many seconds in all no more.
-    - `max_steps`: limit of a run. Of fixed steps as many as they make are allowed.
+    - `costs`: the timed calls: `run`, and any of `vmap`, `forward`, `reverse` (gradients).
+    - `batch`: number of runs of the vmap.
+    - `rounds`, `limit_s`: number of times each call is timed, and limit of the total time [s].
+    - `max_steps`: largest number of steps of a run. Fixed time steps have no limit.
     - `name`: of the problem, for table and figure.
 
     **Returns:**
 
-    A `WorkPrecision`. A method that fails stays in it, with the reason.
+    A `WorkPrecision`, in which failed methods have rows with the reason.
 
     **Raises:**
 
-    - `ValueError` for arguments that are wrong, and where JAX computes in single precision, as the reference needs
-      double precision.
+    - `ValueError` for invalid arguments, and if JAX computes in single precision: the reference needs double precision.
     - `RuntimeError` if the references disagree or fail.
     """
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise ValueError(
-            "work_precision needs references in double precision: call jax.config.update('jax_enable_x64', True) first,"
-            " and give methods that run in single precision Method(dtype='float32')."
+            "work_precision needs references in double precision: call jax.config.update('jax_enable_x64', True) first."
+            " Pass Method(dtype='float32') for runs in single precision."
         )
     if not isinstance(scene, Scene):
         raise ValueError(f"work_precision needs a Scene, but {scene!r} was given.")
@@ -116,17 +227,17 @@ def work_precision(
         costs = tuple(costs) if {"forward", "reverse"} & set(costs) else (*costs, "forward")
     smallest = min(tolerances) if tolerances else 1e-6
     rtol, agreement = max(_TIGHTER * smallest, _TIGHTEST), smallest if agreement is None else agreement
-    target = converged(scene, question, rtol, closed=closed, scale=None, agreement=agreement)
+    target = find_reference(scene, question, rtol, closed=closed, scale=None, agreement=agreement)
     scale = scale_of(target.y)
-    limits: dict[int, Converged | str] = {}
+    limits: dict[int, Reference | str] = {}
     for method in methods.values():
         if method.scene is not None and id(method.scene) not in limits:
             try:
-                limits[id(method.scene)] = converged(
+                limits[id(method.scene)] = find_reference(
                     method.scene, question, rtol, closed=None, scale=scale, agreement=agreement
                 )
             except RuntimeError as error:
-                limits[id(method.scene)] = f"No limit of this formulation was found: {error}"
+                limits[id(method.scene)] = f"This formulation has no reference: {error}"
     candidates = [
         (prepared, setting)
         for prepared in [_prepared(name, method, scene, question, batch) for name, method in methods.items()]
@@ -172,13 +283,13 @@ def _check(methods: dict[str, Method], tolerances: list[float], costs: Sequence[
                 f"methods[{name!r}] must be a Method, as in Method(diffrax.Tsit5()), but {method!r} was given."
             )
     if not methods:
-        raise ValueError("methods is empty: name at least one, or leave it out for those that suit the scene.")
+        raise ValueError("methods is empty: name at least one, or omit it for solvers that suit the scene.")
     if any(not x > 0 for x in tolerances):
         raise ValueError(f"tolerances must be > 0, but {tolerances} were given.")
     if not tolerances and any(method.steps is None for method in methods.values()):
-        raise ValueError("tolerances is empty: give some, or every method its steps.")
+        raise ValueError("tolerances is empty: pass some, or steps for every method.")
     if isinstance(costs, str) or "run" not in costs or not set(costs) <= set(COSTS):
-        raise ValueError(f"costs must be 'run' and others of {', '.join(COSTS)}, but {costs!r} was given.")
+        raise ValueError(f"costs must be 'run' and any of {', '.join(COSTS[1:])}, but {costs!r} was given.")
     for name, number in (("batch", batch), ("rounds", rounds)):
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:
             raise ValueError(f"{name} must be a positive integer, but {number!r} was given.")
@@ -191,7 +302,7 @@ def _settings(method: Method, tolerances: Sequence[float]) -> list[dict[str, flo
 
 
 class _PreparedMethod(NamedTuple):
-    """A method, ready to run: what makes each of the costs at a setting, compiled once for all settings."""
+    """A method with its calls, one for each cost, which are compiled once for all settings."""
 
     name: str
     method: Method
@@ -207,10 +318,10 @@ def _prepared(name: str, method: Method, scene: Scene, question: Question, batch
     lacking = [one for one in question.values if not one.startswith(_START) and one not in elements(scene)]
     if lacking:
         raise ValueError(
-            f"The scene of methods[{name!r}] has no number {', '.join(lacking)}: name in wrt what all of them have."
+            f"wrt must name numbers that all scenes have, but that of methods[{name!r}] has no {', '.join(lacking)}."
         )
     solver = default_solver(scene, start["q0"].size, fixed) if method.solver is None else method.solver
-    # All steps of a ladder that was asked for are allowed.
+    # Fixed time steps have no limit.
     allowed = max(question.max_steps, *(math.ceil(question.t1 / dt) + 1 for dt in method.steps or ()), 1)
     options: dict[str, object] = {"solver": solver, "max_steps": allowed}
 
@@ -238,7 +349,7 @@ def _prepared(name: str, method: Method, scene: Scene, question: Question, batch
 
 
 class _Timed(NamedTuple):
-    """What a method gave at a setting, by the costs, and the times of that or why it failed."""
+    """Results of a method at a setting, by cost, and their times or the reasons of failure."""
 
     given: dict[str, Any]
     reports: dict[str, dict[str, Any]]
@@ -247,7 +358,7 @@ class _Timed(NamedTuple):
 def _measured(
     candidates: list[tuple[_PreparedMethod, dict[str, float]]], costs: Sequence[str], rounds: int, limit_s: float
 ) -> list[_Timed]:
-    """Everything timed, cost after cost, all candidates in turns; those that cannot run are left out of the rest."""
+    """Time all candidates in turns, cost after cost, without those that have failed before."""
     outcomes = [_Timed({}, {}) for _ in candidates]
 
     def call(i: int, cost: str) -> None:
@@ -265,7 +376,7 @@ def _measured(
 def _timings(
     candidates: list[tuple[_PreparedMethod, dict[str, float]]], outcomes: list[_Timed], batch: int
 ) -> list[dict[str, Timing]]:
-    """Timings of each candidate; what is compiled for the first setting of a method serves the others."""
+    """Timings of each candidate; all settings of a method share the compilation of its first one."""
     compiled: dict[tuple[str, str], float] = {}
     timings: list[dict[str, Timing]] = []
     for (prepared, _), outcome in zip(candidates, outcomes, strict=True):
@@ -286,11 +397,11 @@ def _row(
     outcome: _Timed,
     timings: dict[str, Timing],
     question: Question,
-    target: Converged,
-    limit: Converged | str | None,
+    target: Reference,
+    limit: Reference | str | None,
     scale: float,
 ) -> Row:
-    """Errors of a candidate beside its times."""
+    """The row of a candidate, with errors and times."""
     prepared, setting = candidate
     row = Row(prepared.name, setting.get("rtol"), setting.get("dt"), str(prepared.dtype))
     failed = [report["failed"] for report in outcome.reports.values() if "failed" in report]
@@ -309,11 +420,12 @@ def _row(
         remarks.append(limit)
     else:
         numerical, model = apart(y, limit.y), apart(limit.y, target.y)
-    events, there = None, happened(run)
-    if target.events is not None and there is not None:
-        events = event_error(there, target.events)
+    events, changes = None, mode_changes_of(run)
+    if target.events is not None and changes is not None:
+        events = event_error(changes, target.events)
         if events is None:
-            remarks.append(f"Other mode changes than in the reference: {there.t.size}, there {target.events.t.size}.")
+            counts = f"{changes.t.size} changes, in the reference {target.events.t.size}"
+            remarks.append(f"The sequence of modes differs from that of the reference: {counts}.")
     derivatives = [outcome.given[cost] for cost in ("forward", "reverse") if cost in outcome.given]
     gradient = None
     if derivatives and target.gradient is not None:

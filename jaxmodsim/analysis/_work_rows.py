@@ -1,4 +1,4 @@
-"""What `work_precision` returns: rows, a table, a file."""
+"""The result of `work_precision`: rows, a table, a file."""
 
 import hashlib
 import json
@@ -18,10 +18,10 @@ _KIND, _VERSION = "jaxmodsim work precision", 3
 
 @dataclass(frozen=True)
 class Timing:
-    """Time of a call [s]: what compiling it took, then median and quartiles of warm ones.
+    """Times of a call [s]: compilation, then median and quartiles of warm calls.
 
-    `compile` is what the first call of the method took beyond a warm one; next to nothing where this process has
-    compiled the same before.
+    `compile` is the time of the first call of the method in excess of a warm one. It is small if the process has
+    compiled the same program before.
     """
 
     compile: float
@@ -32,20 +32,20 @@ class Timing:
 
 @dataclass(frozen=True)
 class Row:
-    """One method at one setting. None stands for what does not apply.
+    """One method at one setting. Fields that do not apply are None.
 
     - `method`: its name.
     - `rtol` or `dt`: the relative tolerance, or the fixed step [s].
     - `dtype`: floating type of the run.
-    - `failed`: why there is no result; empty where there is one.
-    - `error`: largest error of the observable over the saved times, relative to its scale. Of this `numerical` is the
-      distance from what the formulation itself converges to, and `model` that limit's distance from the reference.
-    - `events`: largest error of the time of an event [s], where the same events happen as in the reference.
-    - `gradient`: largest relative error of a derivative of the observable's last value.
-    - `steps`, `rejected`: all steps, and how many of them were rejected.
-    - `evaluations`: of the vector field in all steps, Jacobians among them; None for methods that iterate.
+    - `failed`: the reason of a failure, or "".
+    - `error`: largest error of the observable over the saved times, relative to its scale. Its part `numerical` is the
+      distance from the reference of the same formulation, and `model` the distance between both references.
+    - `events`: largest error of the time of an event [s], if the sequence of modes is that of the reference.
+    - `gradient`: largest relative error of a derivative of the last value of the observable.
+    - `steps`, `rejected`: number of all steps, and of rejected steps.
+    - `evaluations`: of the vector field in all steps, including Jacobians; None for methods that iterate.
     - `times`: a `Timing` for each of the costs: `run`, `vmap` (for each run of the batch), `forward`, `reverse`.
-    - `remarks`: in sentences.
+    - `remarks`: sentences on missing entries.
     """
 
     method: str
@@ -66,25 +66,25 @@ class Row:
 
     @property
     def setting(self) -> str:
-        """Tolerance or step in words."""
+        """Tolerance or step as text."""
         return f"rtol = {self.rtol:.0e}" if self.dt is None else f"dt = {self.dt:.3g} s"
 
     def time(self, cost: str = "run") -> float:
-        """Median time [s] of a cost; NaN where it was not measured."""
+        """Median time [s] of a cost; NaN if it was not measured."""
         timing = (self.times or {}).get(cost)
         return float("nan") if timing is None else timing.median
 
 
 @dataclass(frozen=True)
 class WorkPrecision:
-    """Error against work, method by method; print it, keep it, draw it by `jaxmodsim.plot.work_precision_figure`.
+    """Errors and costs, method by method. It prints as a table; `jaxmodsim.plot.work_precision_figure` draws it.
 
-    - `problem`: name of what was run; `observable`, `unit`, `when`: what was asked of it; `scale`: what errors of it
-      are relative to, in that unit.
-    - `reference`: how the reference was found. `disagreement`: of the references, relative to the scale; errors below
-      it say no more than that they are. `events_disagreement` [s], `gradient_disagreement`: likewise.
-    - `costs`: what was timed; `batch`: runs of the vmap.
-    - `rows`: a `Row` for each method and setting, failures among them.
+    - `problem`: name of the problem. `observable`, `unit`, `when`: the observable, its unit and times. `scale`: the
+      magnitude to which errors are relative, in that unit.
+    - `reference`: the methods of the references. `disagreement`: of the references, relative to the scale; smaller
+      errors are not resolved. `events_disagreement` [s], `gradient_disagreement`: likewise.
+    - `costs`: the timed calls; `batch`: number of runs of the vmap.
+    - `rows`: a `Row` for each method and setting, including failures.
     - `machine`: processor, versions, date, commit.
     """
 
@@ -103,27 +103,28 @@ class WorkPrecision:
     machine: dict[str, object]
 
     def cheapest(self, error: float, *, cost: str = "run") -> Row:
-        """The row with the least time among those whose error is no larger.
+        """The fastest row up to an error.
 
         **Arguments:**
 
-        - `error`: relative to the scale, > 0.
+        - `error`: largest error, relative to the scale, > 0.
         - `cost`: one of `costs`.
 
         **Raises:**
 
-        - `ValueError` if no row is that exact; it says which one comes next. Or if the cost was not measured, or the
-          error is below what the references can tell.
+        - `ValueError` if all rows have a larger error (the text names the best), if the cost was not measured, or if
+          the error is below the disagreement of the references.
         """
         if cost not in self.costs:
-            raise ValueError(f"cost is {cost!r}, but measured were: {', '.join(self.costs)}.")
+            raise ValueError(
+                f"cost must be one that the study has measured ({', '.join(self.costs)}), but is {cost!r}."
+            )
         done = [row for row in self.rows if row.error is not None]
         if not done:
             raise ValueError("Every method failed: " + "; ".join(f"{row.method}: {row.failed}" for row in self.rows))
         if not error >= self.disagreement:
             raise ValueError(
-                f"error = {error:.1e} is below {self.disagreement:.1e}, by which the references disagree: no row can"
-                " be shown to be that exact."
+                f"error must be at least {self.disagreement:.1e}, by which the references disagree, but is {error:.1e}."
             )
         enough = [row for row in done if row.error is not None and row.error <= error]
         if not enough:
@@ -135,7 +136,7 @@ class WorkPrecision:
         return min(enough, key=lambda row: row.time(cost))
 
     def table(self) -> "pd.DataFrame":
-        """The rows as a pandas `DataFrame`, for sorting and files.
+        """The rows as a pandas `DataFrame`.
 
         **Raises:**
 
@@ -144,7 +145,7 @@ class WorkPrecision:
         return extra("pandas", "table", "cli").DataFrame([_columns(row, self.costs) for row in self.rows])
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write all of it as JSON, whole or not at all; `load_work_precision` reads it.
+        """Write a JSON file, atomically; `load_work_precision` reads it.
 
         **Raises:**
 
@@ -157,9 +158,9 @@ class WorkPrecision:
             file.write(text.encode() + b"\n")
 
     def __str__(self) -> str:
-        """A table, and what it is about."""
+        """A table with the problem, failures, remarks and reference."""
         heads = ["method", "setting", "error", "numerical", "model", "events [s]", "gradient", "steps", "evaluations"]
-        heads += [f"{_COSTS[cost]} [ms]" for cost in self.costs] + ["compile [s]"]
+        heads += [f"{cost} [ms]" for cost in self.costs] + ["compile [s]"]
         floors = {"error": self.disagreement, "numerical": self.disagreement, "model": self.disagreement}
         floors |= {"events [s]": self.events_disagreement, "gradient": self.gradient_disagreement}
         cells = [[_cell(row, head, floors, self.costs) for head in heads] for row in self.rows if not row.failed]
@@ -177,9 +178,6 @@ class WorkPrecision:
         )
 
 
-_COSTS = {"run": "run", "vmap": "vmap", "forward": "forward", "reverse": "reverse"}
-
-
 def _cell(row: Row, head: str, floors: dict[str, float], costs: Sequence[str]) -> str:
     if head in ("method", "setting"):
         return str(getattr(row, head))
@@ -189,7 +187,7 @@ def _cell(row: Row, head: str, floors: dict[str, float], costs: Sequence[str]) -
     if name in ("steps", "evaluations"):
         return str(getattr(row, name) or "")
     for cost in costs:
-        if head == f"{_COSTS[cost]} [ms]":
+        if head == f"{cost} [ms]":
             return f"{1e3 * row.time(cost):.3g}"
     value = getattr(row, name)
     if value is None:
@@ -211,7 +209,7 @@ def _aligned(lines: list[list[str]]) -> list[str]:
 
 
 def _columns(row: Row, costs: Sequence[str]) -> dict[str, object]:
-    """A row of the table."""
+    """The columns of a row."""
     columns: dict[str, object] = {
         "method": row.method,
         "rtol": row.rtol,
@@ -234,29 +232,29 @@ def _columns(row: Row, costs: Sequence[str]) -> dict[str, object]:
 
 
 def _digest(body: dict[str, object]) -> str:
-    """Tells whether a number has changed, which JSON itself does not."""
+    """Checksum that reveals changed numbers."""
     return hashlib.sha256(json.dumps(body).encode()).hexdigest()
 
 
 def load_work_precision(path: str | os.PathLike[str]) -> WorkPrecision:
-    """Read what `WorkPrecision.save` wrote.
+    """Read a file of `WorkPrecision.save`.
 
     **Raises:**
 
-    - `ValueError` for a file that is damaged or something else.
+    - `ValueError` for a damaged file, or one of another kind.
     - `OSError` if it cannot be read.
     """
     try:
         body = json.loads(Path(path).read_bytes())
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged, or no JSON: {error}") from error
+        raise ValueError(f"{path} is damaged or not a JSON file: {error}") from error
     if not isinstance(body, dict) or body.pop("kind", None) != _KIND:
-        raise ValueError(f"{path} was not written by WorkPrecision.save: it does not say {_KIND!r}.")
+        raise ValueError(f"{path} was not written by WorkPrecision.save: its kind is not {_KIND!r}.")
     version = body.pop("format", None)
     if version != _VERSION:
         raise ValueError(f"{path} has the format {version!r}, but this version reads format {_VERSION}.")
     if body.pop("sha256", None) != _digest(body):
-        raise ValueError(f"{path} is damaged, or was changed by hand: its checksum is another one.")
+        raise ValueError(f"{path} is damaged or was edited: its checksum is wrong.")
     try:
         rows = tuple(_row(row) for row in body.pop("rows"))
         return WorkPrecision(**{**body, "costs": tuple(body["costs"]), "rows": rows})

@@ -1,4 +1,4 @@
-"""Numbers of a run as a whole: when it breaks away, its period, its peaks, what it loses, how it moves."""
+"""Scalar metrics of a run: break-away time, period, peaks, dissipated energy, share of stick, kind of motion."""
 
 from ._amounts import dissipated as dissipated
 from ._amounts import final as final
@@ -6,7 +6,6 @@ from ._amounts import peak as peak
 from ._metric import Metric as Metric
 from ._metric import classes as classes
 from ._motion import mode_changes as mode_changes
-from ._motion import mode_sequence as mode_sequence
 from ._motion import motion_kind as motion_kind
 from ._motion import stick_share as stick_share
 from ._times import break_away as break_away

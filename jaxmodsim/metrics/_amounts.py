@@ -1,4 +1,4 @@
-"""How large something is in a run."""
+"""Metrics that are amounts: peaks, final values, dissipated energy."""
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -10,14 +10,14 @@ from ._metric import Metric
 def peak(of: str) -> Metric:
     """Largest magnitude of a coordinate, velocity or force in a run.
 
-    From t0 to the end, whatever the saved times: the scene is run twice more. The first run finds the eight steps in
-    which the series may be largest, the second one samples each of them at 16 times, with a parabola between these; and
-    in a scene with events the series counts just before and after each of them, which takes the run of `run.events`.
+    The peak is taken from t0 to the end, between saved times too, which needs two more runs of the scene. The first run
+    finds the eight steps with the largest candidates. The second samples each of these at 16 times and fits a parabola.
+    In a scene with events the values just before and after each event count too, from the run of `run.events`.
 
-    The error is that of the run's own dense output, plus up to 1e-6 of the peak where a step is a radian of the fastest
-    motion. Among more than eight peaks that differ by less than the estimates within a step, about 1e-3 of the
-    amplitude, any one may be taken. Derivatives are those at the fixed time of a smooth peak, where the series is
-    stationary, and those along the event of a corner; by the ends of the run they are not taken.
+    The error is that of the dense output, plus up to 1e-6 of the peak if a step is a radian of the fastest motion. If
+    more than eight peaks differ by less than about 1e-3 of the amplitude, the result may be any of them. Derivatives
+    are taken at the fixed time of a smooth peak, where the series is stationary, or along the event of a corner. They
+    do not include the dependence on t0 and t1.
 
     ```python
     metrics.peak("friction")(run), metrics.peak("qd[0]")(run)
@@ -29,7 +29,7 @@ def peak(of: str) -> Metric:
 
     **Raises:**
 
-    - `ValueError` when called, if the run has nothing of that name.
+    - `ValueError` when called, for an unknown name.
     """
     return Metric(f"peak |{of}|", named_unit(of), _peak, (of,))
 
@@ -51,7 +51,7 @@ def final(of: str) -> Metric:
 
     **Raises:**
 
-    - `ValueError` when called, if the run has nothing of that name.
+    - `ValueError` when called, for an unknown name.
     """
     return Metric(f"final {of}", named_unit(of), _final, (of,))
 
@@ -61,9 +61,9 @@ def _final(run: Trajectory, of: str) -> Array:
 
 
 def dissipated(effect: str | None = None) -> Metric:
-    """Energy [J] lost in friction from t0 to the last saved time; see `Trajectory.energy`.
+    """Energy [J] dissipated from t0 to the last saved time; see `Trajectory.energy`.
 
-    Runs the scene once more, with the work integrals beside it, unless the run recorded its energy.
+    Needs one more run of the scene, with its work integrals, unless the run recorded its energy.
 
     ```python
     metrics.dissipated("friction")(run), metrics.dissipated()(run)
@@ -71,11 +71,11 @@ def dissipated(effect: str | None = None) -> Metric:
 
     **Arguments:**
 
-    - `effect`: name of an effect that loses energy; None for all of them together.
+    - `effect`: name of a dissipative effect; None for the sum of all.
 
     **Raises:**
 
-    - `ValueError` when called, if the run has no such effect.
+    - `ValueError` when called, for an unknown or conservative effect.
     """
     return Metric("dissipated" if effect is None else f"dissipated in {effect}", "J", _dissipated, (effect,))
 
@@ -85,5 +85,5 @@ def _dissipated(run: Trajectory, effect: str | None) -> Array:
     if effect is None:
         return sum((each[-1] for each in lost.values()), jnp.zeros_like(run.t[-1]))
     if effect not in lost:
-        raise ValueError(f"No energy is lost in {effect!r}; effects that lose some are: {', '.join(lost) or 'none'}.")
+        raise ValueError(f"{effect!r} dissipates no energy; dissipative effects are: {', '.join(lost) or 'none'}.")
     return lost[effect][-1]

@@ -1,4 +1,4 @@
-"""What a metric of a run is."""
+"""The class of metrics, and metrics from functions of your own."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ from ..simulation import Trajectory
 
 @dataclass(frozen=True)
 class Metric:
-    """A function of a `Trajectory` that gives one number; two of equal fields are equal, and compile once.
+    """A scalar function of a `Trajectory`. Metrics with equal fields are equal, and compile once.
 
-    Works under `jax.jit`, `jax.vmap` and `jax.grad`, on runs with events and without. NaN where a run has no such
-    number, as the period of one that comes to rest.
+    Works under `jax.jit`, `jax.vmap` and `jax.grad`, on runs with and without events. The result is NaN if it is not
+    defined for the run, such as the period of a run that comes to rest.
 
-    - `label`: what it is, for tables and figures. `unit`: its unit; "1" where it has none.
+    - `label`: name in tables and figures. `unit`: its unit; "1" for pure numbers.
     - `measure`: called as `measure(run, *arguments)`.
-    - `arguments`: what else it depends on.
-    - `read`: what an integer stands for, called as `read(value, *arguments)`; None for a quantity.
+    - `arguments`: further arguments of `measure`, hashable.
+    - `read`: gives the meaning of an integer, called as `read(value, *arguments)`; None for a quantity.
     """
 
     label: str
@@ -35,7 +35,7 @@ class Metric:
         return jnp.asarray(self.measure(run, *self.arguments))
 
     def describe(self, value: ArrayLike) -> str:
-        """What a value stands for: of a class of motion its name, of a quantity the number with its unit."""
+        """A value as text: the name of a class of motion, or a number with its unit."""
         number = float(np.asarray(value))
         if self.read is not None:
             return self.read(int(number), *self.arguments)
@@ -43,7 +43,7 @@ class Metric:
 
 
 def classes(fn: Callable[[Trajectory], object], names: tuple[str, ...] | list[str]) -> Metric:
-    """Classes of motion by a function of your own, as for laws without modes.
+    """Classify motions by a function of your own, for instance for laws without modes.
 
     ```python
     kind = metrics.classes(lambda run: jnp.where(jnp.abs(run.qd[-1, 0]) < 1e-3, 0, 1), ("rests", "moves"))
@@ -51,8 +51,8 @@ def classes(fn: Callable[[Trajectory], object], names: tuple[str, ...] | list[st
 
     **Arguments:**
 
-    - `fn`: function of a `Trajectory` that returns an index into `names`; must work under `jax.jit`.
-    - `names`: of the classes.
+    - `fn`: function of a `Trajectory` that returns an index into `names` and works under `jax.jit`.
+    - `names`: names of the classes.
 
     **Returns:**
 
@@ -64,7 +64,7 @@ def classes(fn: Callable[[Trajectory], object], names: tuple[str, ...] | list[st
     """
     names = as_names(names, name="names")
     if not names:
-        raise ValueError("names must hold a name for each class, as in ('rests', 'moves'), but it is empty.")
+        raise ValueError("names needs a name for each class, as in ('rests', 'moves'), but it is empty.")
     if not callable(fn):
         raise ValueError(f"fn must be a function of a Trajectory, but {fn!r} was given.")
     return Metric("kind of motion", "1", _class_of, (fn, names), _class_name)

@@ -1,4 +1,4 @@
-"""When something happens in a run."""
+"""Metrics that are times: break-away and period."""
 
 import math
 
@@ -7,20 +7,17 @@ from jaxtyping import Array, Float
 
 from ..simulation import Trajectory, named_series
 from ._metric import Metric
-from ._names import changes_of, is_exact, last_two, magnitude_of, slip_of
-
-# Periods since the last return after which a cycle has ended.
-_ALIVE = 1.5
+from ._motion import ALIVE, changes_of, cycle_of, is_event_driven, magnitude_of, slip_of
 
 
 def break_away(element: str = "friction", *, distance: float | None = None) -> Metric:
-    """Time [s] at which a friction element breaks away; NaN where it never does.
+    """Time [s] at which a friction element breaks away; NaN if it never does.
 
-    Of a law that runs by events the first event in which it leaves stick. Other laws creep from the start on: there it
-    is the instant at which the slip since t0 first exceeds `distance`. Slip is the integral of the slip velocity, which
-    counts as a straight line between the saved times `ts`, so the time is right to the square of their distance. With
-    `distance`, laws that run by events are measured in the same way; there the slip has a corner between two samples,
-    and derivatives are right to no more than their distance over the time since the corner.
+    For an event-driven element this is the first event that leaves stick. Other laws creep from the start: for these it
+    is the time at which the slip since t0 first exceeds `distance`. Slip is the integral of the slip velocity by
+    trapezoids between the saved times `ts`, with an error of the order of their spacing squared. With `distance`,
+    event-driven elements are measured in the same way. Their slip has a corner between two samples, which leaves
+    derivatives with a relative error of up to the spacing over the time since the corner.
 
     ```python
     metrics.break_away("friction", distance=5e-3)(run)
@@ -29,12 +26,12 @@ def break_away(element: str = "friction", *, distance: float | None = None) -> M
     **Arguments:**
 
     - `element`: name of the friction element.
-    - `distance`: slip that counts as broken away [m or rad], > 0: well above the deflection of a bristle at its
-      limit, `Fs/sigma0`. To be given for laws that do not run by events.
+    - `distance`: slip [m or rad] that counts as break-away, > 0. It must be well above the largest deflection of a
+      bristle, `Fs/sigma0`. Required if the element is not event-driven.
 
     **Raises:**
 
-    - `ValueError` if `distance` is not positive; when called, if the run has no such element, or needs a `distance`.
+    - `ValueError` if `distance` is not positive; when called, if the run has no such element, or requires `distance`.
     """
     if distance is not None and not (math.isfinite(distance) and distance > 0):
         raise ValueError(f"distance must be a positive number of metres or radians, but {distance!r} was given.")
@@ -44,10 +41,10 @@ def break_away(element: str = "friction", *, distance: float | None = None) -> M
 def _break_away(run: Trajectory, element: str, distance: float | None) -> Array:
     if distance is not None:
         return _slipped(run, element, distance)
-    if not is_exact(run, element):
+    if not is_event_driven(run, element):
         raise ValueError(
-            f"The law of {element!r} does not run by events and creeps from the start on: say which slip counts as"
-            " broken away, as in break_away(distance=1e-3)."
+            f"The law of {element!r} is not event-driven and creeps from the start: pass the slip that counts as"
+            " break-away, as in break_away(distance=1e-3)."
         )
     events, own = changes_of(run, element)
     leaves = own & (events.before == 0)
@@ -56,7 +53,7 @@ def _break_away(run: Trajectory, element: str, distance: float | None) -> Array:
 
 
 def _slipped(run: Trajectory, element: str, distance: float) -> Array:
-    """First time at which the slip since t0 exceeds a distance, by parabolas between the samples."""
+    """First time at which the slip since t0 exceeds a distance, by a parabola between two samples."""
     t, v = slip_of(run, element)
     steps = jnp.where(jnp.isfinite(t[1:]), jnp.diff(t), 0.0)
     pieces = 0.5 * jnp.expand_dims(steps, range(1, v.ndim)) * (v[1:] + v[:-1])
@@ -75,7 +72,7 @@ def _slipped(run: Trajectory, element: str, distance: float) -> Array:
 
 
 def _crossings(t: Float[Array, " n"], x: Float[Array, " n"]) -> tuple[Array, Array]:
-    """Where x crosses zero upwards between two samples, by straight lines, and whether it does."""
+    """Time of an upward zero crossing in each interval between samples, by linear interpolation, and a mask of them."""
     crosses = (x[:-1] < 0) & (x[1:] >= 0) & jnp.isfinite(t[1:])
     rise = jnp.where(crosses, x[1:] - x[:-1], 1.0)
     step, before = (jnp.where(crosses, each, 0.0) for each in (t[1:] - t[:-1], x[:-1]))
@@ -83,13 +80,12 @@ def _crossings(t: Float[Array, " n"], x: Float[Array, " n"]) -> tuple[Array, Arr
 
 
 def period(of: str = "friction", *, since: float | None = None, swing: float = 1e-3) -> Metric:
-    """Period [s] of a limit cycle; NaN where there is none.
+    """Period [s] of a limit cycle; NaN without a cycle.
 
-    Of a friction element that runs by events the time between its last two events into stick. Of a coordinate or
-    velocity (or a force) the mean time between its upward crossings of its mean, interpolated between the saved times
-    `ts`. A cycle that returns in other than the same time each time has no single one: then this is one of them, or
-    their mean. A cycle that has not returned for one and a half periods at the end of the run has ended, and counts as
-    none.
+    For an event-driven friction element it is the time between its last two events into stick. For a coordinate,
+    velocity or force it is the mean time between upward crossings of the mean, interpolated between the saved times
+    `ts`. If return times vary, the result is the last of them for events and their mean for crossings. A cycle that has
+    not returned in the last 1.5 periods of the run counts as ended, which gives NaN.
 
     ```python
     metrics.period("friction")(run), metrics.period("q[0]", since=20.0)(run)
@@ -98,17 +94,16 @@ def period(of: str = "friction", *, since: float | None = None, swing: float = 1
     **Arguments:**
 
     - `of`: name of a friction element, or `q[0]`, `qd[0]`.
-    - `since`: time [s] from which on saved times count; by default the middle of the run, so that the transient is
-      over. Unused for events.
-    - `swing`: least part of its swing in the whole run that a series has since then to count as a cycle. Unused for
-      events.
+    - `since`: first time [s] that counts; by default the middle of the run, to skip the transient. Unused for events.
+    - `swing`: smallest range since then, as a fraction of the range in the whole run, that counts as a cycle, 0 to 1.
+      Unused for events.
 
     **Raises:**
 
-    - `ValueError` if `swing` is not between 0 and 1; when called, if the run has nothing of that name.
+    - `ValueError` if `swing` is not between 0 and 1; when called, for an unknown name.
     """
     if not 0 <= swing < 1:
-        raise ValueError(f"swing must be a part of one, 0 <= swing < 1, but {swing!r} was given.")
+        raise ValueError(f"swing must be a fraction, 0 <= swing < 1, but {swing!r} was given.")
     return Metric(f"period of {of}", "s", _period, (of, since, swing))
 
 
@@ -129,16 +124,9 @@ def _period(run: Trajectory, of: str, since: float | None, swing: float) -> Arra
     several = count >= 2
     mean_gap = jnp.where(several, latest - earliest, 0.0) / jnp.maximum(count - 1, 1)
     swings = _swing(x, counts) > swing * _swing(x, jnp.isfinite(run.t))
-    alive = several & swings & (run.t_end - latest <= _ALIVE * mean_gap)
+    alive = several & swings & (run.t_end - latest <= ALIVE * mean_gap)
     return jnp.where(alive, mean_gap, jnp.nan)
 
 
 def _swing(x: Float[Array, " n"], these: Array) -> Array:
     return jnp.max(jnp.where(these, x, -jnp.inf)) - jnp.min(jnp.where(these, x, jnp.inf))
-
-
-def cycle_of(run: Trajectory, element: str) -> tuple[Array, Array]:
-    """Time [s] between the last two events into stick of an element, and whether that goes on to the end."""
-    events, own = changes_of(run, element)
-    last, gap, two = last_two(events.t, own & (events.after == 0))
-    return gap, two & (run.t_end - last <= _ALIVE * gap)

@@ -1,26 +1,31 @@
-"""`continue_equilibria`: a branch of equilibria over a number of the scene, and where orbits begin on it."""
+"""`continue_equilibria`: branches of equilibria, and the Hopf points at which orbits begin."""
 
 from __future__ import annotations  # `help` shows types as they are written here
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import ArrayLike
 
 from .._core.arguments import as_float, as_whole
 from ..scene import Scene, replace_elements
-from ._branch import CROSSING, FOLD, HOPF, Branch, SpecialOrbit
-from ._continue import check_parameter, follow, read_span
-from ._equilibrium import Equilibrium, described_rest, nearest_oscillation, prepare_rest, refuse_time, rest_scale
-from ._rest import RestPoint, solve_rest
-from ._rest_step import RestStep, rest_step_at, tangent_at
-from ._special import in_order, root_on_step
+from ._branch import (
+    CROSSING,
+    HOPF,
+    AbstractStep,
+    BifurcationPoint,
+    Branch,
+    check_parameter,
+    follow,
+    read_span,
+    tangent_at,
+)
+from ._equilibrium import Equilibrium, describe_rest, nearest_oscillation, prepare_rest, refuse_time, rest_scale
+from ._rest import RestPoint, RestProblem, solve_rest
 
-# Real part of a pair of eigenvalues, relative to their size, that is none.
+# A pair of eigenvalues is on the imaginary axis if the ratio of real to imaginary part is smaller.
 _AXIS = 1e-6
-
-_Test = Callable[[RestStep, RestPoint], float]
 
 
 def continue_equilibria(
@@ -35,16 +40,16 @@ def continue_equilibria(
 ) -> Branch[Equilibrium]:
     """Follow equilibria over a number of the scene, by pseudo-arclength continuation.
 
-    It passes folds, and names and locates what is special: folds, branch points, and Hopf points, where a pair of
-    complex eigenvalues crosses the imaginary axis and a branch of periodic orbits begins: `continue_orbits` takes such
-    a point as its guess.
+    The branch passes folds. It locates folds, branch points, and Hopf points, at which a pair of complex eigenvalues
+    crosses the imaginary axis and a branch of periodic orbits begins: `continue_orbits` takes a Hopf point as its
+    guess.
 
     **Arguments:**
 
-    - `scene`, `q0`, `ends`: as for `equilibrium`, which finds the first one, at the first value of `span`.
+    - `scene`, `q0`, `ends`: as for `equilibrium`, which finds the first equilibrium, at the first value of `span`.
     - `parameter`: name of a number of the scene, such as `"friction.belt_velocity"`.
-    - `span`: `(first, last)` value. The branch goes from the first towards the last, and ends where it leaves the span.
-    - `step`: longest step, 0 to 1: the change of the parameter in parts of the span, and of the state in parts of its
+    - `span`: `(first, last)` value. The branch goes from the first towards the last, and ends when it leaves the span.
+    - `step`: longest step, 0 to 1: the change of the parameter relative to the span, and of the state relative to its
       size.
     - `max_equilibria`: largest number of equilibria.
 
@@ -54,57 +59,73 @@ def continue_equilibria(
 
     **Raises:**
 
-    - `ValueError` as `equilibrium`, and for a parameter that is not there.
-    - `OrbitError` where there is no first equilibrium. A branch that cannot be followed further ends there, and says
-      so.
+    - `ValueError` as `equilibrium`, and for an unknown parameter.
+    - `OrbitError` if the first equilibrium is not found. Where the continuation fails later the branch ends, and
+      `Branch.ending` has the reason.
     """
     first, last = read_span(span)
     check_parameter(scene, parameter)
     step, most = as_float(step, name="step", lower=0.0), as_whole(max_equilibria, name="max_equilibria")
     problem, x, dof = prepare_rest(replace_elements(scene, {parameter: first}), q0, ends, parameter)
-    point, _ = solve_rest(problem, x, first, dof, rest_scale(x, dof, abs(last - first)))
-    refuse_time(problem, point, dof)
-    change = np.linalg.lstsq(point.by[:, :-1], -point.by[:, -1], rcond=None)[0]
-    scale = rest_scale(point.x, dof, abs(last - first), change)
-    sense = np.append(np.zeros(len(x)), last - first)
-    steps = [rest_step_at(problem, point, scale, sense, dof)]
-    points: list[SpecialOrbit[Equilibrium]] = []
-    ending = follow(steps, points, sorted((first, last)), step, most, _locate)
+    shot, _ = solve_rest(problem, x, first, dof, rest_scale(x, dof, abs(last - first)))
+    refuse_time(problem, shot, dof)
+    change = np.linalg.lstsq(shot.by[:, :-1], -shot.by[:, -1], rcond=None)[0]
+    scale = rest_scale(shot.x, dof, abs(last - first), change)
+    tangent = tangent_at(shot, scale, np.append(np.zeros(len(x)), last - first) / scale)
+    steps: list[EquilibriumStep] = [EquilibriumStep(problem, shot, describe_rest(problem, shot, dof), scale, tangent)]
+    points: list[BifurcationPoint[Equilibrium]] = []
+    ending = follow(steps, points, (first, last), step, most)
     values = np.array([each.shot.value for each in steps])
     return Branch(parameter, values, tuple(each.orbit for each in steps), tuple(points), ending)
 
 
-def _locate(one: RestStep, two: RestStep, length: float, index: int) -> list[SpecialOrbit[Equilibrium]]:
-    """Special equilibria on the step of this length from the one to the other, in order along it."""
-    tests: dict[str, _Test] = {FOLD: _turning, CROSSING: _crossing, HOPF: _oscillating}
-    located: list[tuple[float, SpecialOrbit[Equilibrium]]] = []
-    for kind, test in tests.items():
-        at = root_on_step(one, partial(test, one), length, (test(one, one.shot), test(one, two.shot)))
-        if at is None:
-            continue
-        shot = one.corrected(at)[0]
-        made = described_rest(one.problem, shot, len(one.orbit.q))
-        if kind == HOPF:
-            rate = nearest_oscillation(made.eigenvalues)
-            if not abs(rate.real) < _AXIS * rate.imag:
-                continue  # two real eigenvalues of opposite signs: a saddle that contracts as much as it expands
-        located.append((at, SpecialOrbit(kind, shot.value, index, made, np.zeros(0))))
-    return in_order(located)
+@dataclass(frozen=True)
+class EquilibriumStep(AbstractStep[RestPoint, Equilibrium]):
+    """An equilibrium of a branch, as `AbstractStep`."""
+
+    problem: RestProblem
+    shot: RestPoint
+    orbit: Equilibrium
+    scale: np.ndarray
+    tangent: np.ndarray
+
+    def corrected(self, length: float) -> tuple[RestPoint, int]:
+        """The equilibrium at this distance along the tangent, and the number of iterations."""
+        unknowns = self.shot.unknowns
+        ahead = unknowns + length * self.tangent * self.scale
+
+        def along(point: RestPoint) -> tuple[float, np.ndarray]:
+            return float(self.tangent @ ((point.unknowns - unknowns) / self.scale)) - length, self.tangent
+
+        return solve_rest(self.problem, ahead[:-1], float(ahead[-1]), len(self.orbit.q), self.scale, along)
+
+    def moved_to(self, shot: RestPoint) -> EquilibriumStep:
+        """The step that begins at an equilibrium, with the tangent in the same sense."""
+        orbit = describe_rest(self.problem, shot, len(self.orbit.q))
+        return EquilibriumStep(self.problem, shot, orbit, self.scale, tangent_at(shot, self.scale, self.tangent))
+
+    def tests(self) -> dict[str, Callable[[RestPoint], float]]:
+        """Test functions of the eigenvalues."""
+        return {CROSSING: _crossing, HOPF: _oscillating}
+
+    def bifurcation(self, kind: str, length: float, index: int) -> BifurcationPoint[Equilibrium] | None:
+        """The bifurcation at this distance; None for two real eigenvalues of opposite signs, a neutral saddle."""
+        shot, _ = self.corrected(length)
+        rest = describe_rest(self.problem, shot, len(self.orbit.q))
+        rate = nearest_oscillation(rest.eigenvalues)
+        if kind == HOPF and not abs(rate.real) < _AXIS * rate.imag:
+            return None
+        return BifurcationPoint(kind, shot.value, index, rest, np.zeros(0))
 
 
-def _turning(one: RestStep, point: RestPoint) -> float:
-    """How the parameter changes along the branch."""
-    return float(tangent_at(point, one.scale, one.tangent)[-1])
-
-
-def _crossing(_one: RestStep, point: RestPoint) -> float:
-    """The product of all eigenvalues, in the size of the largest."""
-    values = np.linalg.eigvals(point.linearised)
+def _crossing(shot: RestPoint) -> float:
+    """The product of all eigenvalues, relative to the largest."""
+    values = np.linalg.eigvals(shot.linearised)
     return float(np.prod(values / np.max(np.abs(values))).real)
 
 
-def _oscillating(_one: RestStep, point: RestPoint) -> float:
-    """The product of all sums of two eigenvalues, each relative to their sizes."""
-    values = np.linalg.eigvals(point.linearised)
+def _oscillating(shot: RestPoint) -> float:
+    """The product of all sums of two eigenvalues, each relative to their magnitudes."""
+    values = np.linalg.eigvals(shot.linearised)
     i, j = np.triu_indices(len(values), 1)
     return float(np.prod((values[i] + values[j]) / (np.abs(values[i]) + np.abs(values[j]))).real) if len(i) else 1.0

@@ -1,4 +1,4 @@
-"""`equilibrium`: a scene and a guess in, a state that stays where it is out."""
+"""`equilibrium`: find a state of a scene that is at rest."""
 
 from __future__ import annotations  # `help` shows types as they are written here
 
@@ -16,27 +16,27 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from .._core.arguments import check_real
 from .._core.readable import AbstractReadable, Table, short, table_of
 from ..scene import Scene, State, check_scene, from_dynamics, quantity_of
-from ._orbit import NEUTRAL, complex_words
+from ._orbit import NEUTRAL, format_complex
 from ._periodic_orbit import check_known
 from ._rest import RestPoint, RestProblem, rest_at, rest_equations, solve_rest
 from ._return_map import OrbitError, pack, unpack
 
-# Times [s] at which an equilibrium is looked at again, and distance from it in its scales that is none.
+# Times [s] at which an equilibrium is checked again, and the tolerance in its scales.
 _OTHER_TIMES, _SAME = (0.381966, 2.236068, 31.622777), 1e-6
-# Coordinates [m or rad] and own states of effects below this size are zero but for rounding, and such a part of others
-# says nothing of their magnitude.
+# Coordinates [m or rad] and states of effects below the first are rounding errors. Those below the second, relative to
+# the largest of their kind, do not define a scale.
 _ROUNDING, _NOTHING = 1e-12, 1e-6
 
 
 class Equilibrium(AbstractReadable, eqx.Module):
-    """A state of a scene that stays where it is: rest, or steady sliding on what moves below.
+    """An equilibrium of a scene: rest, or steady sliding on a moving surface.
 
     `q` and `z` have derivatives by all numbers of the scene.
 
-    - `q`, `z`: coordinates, and the effects' own states, as of `simulate`; velocities are zero.
-    - `eigenvalues`: of the linearised equations of motion [1/s], complex, shape `[k]`, by real part from the greatest;
-      within the constraints, bristles included. None, `k = 0`, at the end of a set.
-    - `ends`: the friction elements that stick, and the direction in which each is at its limit there.
+    - `q`, `z`: coordinates and states of effects, as in `simulate`. Velocities are zero.
+    - `eigenvalues`: of the equations of motion, linearised within the constraints, bristles included [1/s]; complex,
+      shape `[k]`, in order of falling real part. Empty, `k = 0`, at the end of a set.
+    - `ends`: direction of the limiting friction force of each element in stick, by name.
     - `scene`: the scene.
     """
 
@@ -48,17 +48,17 @@ class Equilibrium(AbstractReadable, eqx.Module):
 
     @property
     def state(self) -> State:
-        """The state."""
+        """Coordinates, velocities and states of effects."""
         return State(self.q, jnp.zeros_like(self.q), self.z)
 
     @property
     def amplitude(self) -> Float[Array, " dof"]:
-        """Zero: it does not move, shape `[dof]`."""
+        """Zeros, shape `[dof]`, for comparison with orbits."""
         return jnp.zeros_like(self.q)
 
     @property
     def period(self) -> float:
-        """Period [s] of the small oscillation that grows or dies out slowest; infinite where there is none."""
+        """Period [s] of the least damped small oscillation; infinite without oscillations."""
         rate = nearest_oscillation(self.eigenvalues)
         return 2.0 * np.pi / rate.imag if rate.imag else np.inf
 
@@ -69,7 +69,7 @@ class Equilibrium(AbstractReadable, eqx.Module):
 
     @property
     def stability(self) -> str:
-        """Stable, unstable and by which eigenvalue, or undecided to first order."""
+        """`stable`, `unstable` with the eigenvalue, or `neutral` if first order does not decide."""
         if self.ends:
             return "neutral: the end of a set of equilibria that friction holds"
         size = np.max(np.abs(self.eigenvalues), initial=0.0)
@@ -78,11 +78,11 @@ class Equilibrium(AbstractReadable, eqx.Module):
             return "stable"
         if first.real <= NEUTRAL * size:
             return "neutral: an eigenvalue is on the imaginary axis, and stability is not decided to first order"
-        return f"unstable: an eigenvalue of {complex_words(first)} 1/s"
+        return f"unstable: an eigenvalue of {format_complex(first)} 1/s"
 
 
 def nearest_oscillation(eigenvalues: np.ndarray) -> complex:
-    """The complex eigenvalue, of positive imaginary part, whose real part is least beside it; 0 without one."""
+    """The eigenvalue with a positive imaginary part and the smallest ratio of real to imaginary part; 0 without one."""
     above = eigenvalues[np.imag(eigenvalues) > 0]
     return complex(above[np.argmin(np.abs(np.real(above)) / np.imag(above))]) if len(above) else 0.0j
 
@@ -90,18 +90,17 @@ def nearest_oscillation(eigenvalues: np.ndarray) -> complex:
 def equilibrium(scene: Scene, q0: ArrayLike | list[float], *, ends: Mapping[str, int] | None = None) -> Equilibrium:
     """Find an equilibrium, stable or not, by Newton's iteration on the equations of motion.
 
-    Set-valued friction that slips on a moving surface (`belt_velocity`) goes on slipping: steady sliding. Where its
-    surface is at rest it sticks, and the equilibria form a set, of which the ends are found: those where its force is
-    at its limit.
+    Set-valued friction on a moving surface (`belt_velocity`) slips at the equilibrium: steady sliding. On a surface at
+    rest it sticks, and the equilibria form a set. The function finds the ends of the set, with friction at its limit.
 
     The state has first derivatives by all numbers of the scene, forward and reverse, by the implicit function theorem.
 
     **Arguments:**
 
-    - `scene`: the `Scene`, in float64, which does not depend on time; with contacts open.
-    - `q0`: where the iteration begins, shape `[dof]`; with the own states of effects as a run begins.
-    - `ends`: of each friction element that sticks, by name, 1 for the end of the set from which it would slide
-      forwards, -1 for that from which it would slide backwards.
+    - `scene`: the `Scene`, in float64, independent of time, with contacts open.
+    - `q0`: start of the iteration, shape `[dof]`. States of effects start as in a run.
+    - `ends`: for each friction element in stick, by name, 1 for the end of the set from which it would slide forwards,
+      -1 for the end from which it would slide backwards.
 
     **Returns:**
 
@@ -109,46 +108,46 @@ def equilibrium(scene: Scene, q0: ArrayLike | list[float], *, ends: Mapping[str,
 
     **Raises:**
 
-    - `ValueError` for wrong arguments, float32, a scene with a `Switch`, inside `jax.jit` or `jax.vmap`, and for `ends`
-      of other elements than those that stick.
-    - `OrbitError` where there is no convergence, the equilibrium is one of a family, the scene depends on time, or a
-      contact is closed.
+    - `ValueError` for invalid arguments, float32, a scene with a `Switch`, inside `jax.jit` or `jax.vmap`, and if the
+      names in `ends` are not those of the elements in stick.
+    - `OrbitError` if the iteration does not converge, the equilibrium is one of a family, the scene depends on time, or
+      a contact is closed.
     """
     known = jtu.tree_map(jax.lax.stop_gradient, scene)
     problem, x, dof = prepare_rest(known, q0, ends, None)
     point, _ = solve_rest(problem, x, 0.0, dof, rest_scale(x, dof, 1.0))
     refuse_time(problem, point, dof)
-    made = described_rest(problem, point, dof)
+    rest = describe_rest(problem, point, dof)
     if not any(isinstance(leaf, jax.core.Tracer) for leaf in jtu.tree_leaves(scene)):
-        return made
-    # One step of Newton from where it is solved.
+        return rest
+    # One step of Newton from the solution has the derivatives of the implicit function theorem.
     at = rest_equations(problem, scene, jnp.asarray(point.x), jnp.zeros(()), dof)
     inverse = np.linalg.pinv(point.rows @ point.by[:, :-1]) @ point.rows
     change = jnp.asarray(inverse) @ jnp.concatenate([at.rate, at.held])
     state = unpack(scene, jnp.asarray(point.x) + jax.lax.stop_gradient(change) - change, dof)
-    return replace(made, q=state.q, z=state.z, scene=scene)
+    return replace(rest, q=state.q, z=state.z, scene=scene)
 
 
 def prepare_rest(
     scene: Scene, q0: ArrayLike | list[float], ends: Mapping[str, int] | None, parameter: str | None
 ) -> tuple[RestProblem, np.ndarray, int]:
-    """The equations of an equilibrium, a state to begin with, and the number of coordinates.
+    """The problem of an equilibrium, a start, and the number of coordinates.
 
     **Raises:**
 
-    - `ValueError` for wrong arguments.
+    - `ValueError` for invalid arguments.
     """
     check_known(scene, "equilibrium")
     check_real(q0, name="q0")
     q = jnp.asarray(q0, float)
     if q.ndim != 1 or not q.shape[0]:
         raise ValueError(f"q0 must have the shape [dof], but it has {q.shape}.")
-    y, dof, given = State(q, jnp.zeros_like(q), scene.initial_state(q)), q.shape[0], dict(ends or {})
+    y, dof, ends = State(q, jnp.zeros_like(q), scene.initial_state(q)), q.shape[0], dict(ends or {})
     check_scene(scene, y)
     if scene.switches:
         raise ValueError(
-            f"equilibrium takes no switches, but the scene has {', '.join(scene.switches)}: give the force of one side"
-            " as an AppliedForce."
+            f"equilibrium does not support switches, but the scene has {', '.join(scene.switches)}: replace each by the"
+            " force of one side, as an AppliedForce."
         )
     numbers, rows = sum(scene.mode_widths(dof)), _rows_of(scene, dof)
     mode, sides = jnp.zeros(numbers) if numbers else None, jnp.zeros(numbers - len(scene.contacts))
@@ -163,31 +162,31 @@ def prepare_rest(
     planar = [name for name in still if rows[name].stop - rows[name].start > 1]
     if planar:
         raise ValueError(
-            f"{planar[0]} sticks in a plane, where the equilibria form a set whose border is a curve, not ends. Give"
-            " its surface a velocity, or friction along each direction of its own."
+            f"{planar[0]} sticks in a plane, where the set of equilibria has a curve as its border, and no ends. Give"
+            " its surface a velocity, or use one friction element for each direction."
         )
-    if set(given) != set(still) or not all(side in (1, -1) for side in given.values()):
+    if set(ends) != set(still) or not all(side in (1, -1) for side in ends.values()):
         need = "ends={" + ", ".join(f"{name!r}: 1" for name in still) + "}"
         mend = (
-            f"{', '.join(still)} sticks, and where friction sticks the equilibria form a set: pass {need} for the end"
-            " of it from which it would slide forwards, -1 for backwards"
+            f"{', '.join(still)} sticks, and the equilibria form a set: pass {need} for the end from which it would"
+            " slide forwards, or -1 for backwards"
             if still
-            else "nothing sticks, and an equilibrium is no set with ends: leave them out"
+            else "nothing sticks, and an equilibrium has no ends: omit them"
         )
-        raise ValueError(f"At rest {mend}; ends={given or None!r} was given.")
-    for name, side in given.items():
+        raise ValueError(f"At rest {mend}; ends={ends or None!r} was given.")
+    for name, side in ends.items():
         sides = sides.at[rows[name]].set(side)
     return RestProblem(scene, mode, sides, parameter), np.asarray(pack(y)), dof
 
 
 def _rows_of(scene: Scene, dof: int) -> dict[str, slice]:
-    """Where the modes of each friction element are that runs by events."""
+    """The rows of the modes of each event-driven friction element."""
     stops = np.cumsum([0, *scene.mode_widths(dof)]).tolist()
     return {name: slice(*pair) for name, *pair in zip(scene.event_driven, stops, stops[1:], strict=False)}
 
 
 def rest_scale(x: np.ndarray, dof: int, span: float, tangent: np.ndarray | float = 0.0) -> np.ndarray:
-    """Magnitudes of the unknowns, with their change over the span; of what is nearly zero that of its like, or 1."""
+    """Magnitudes of the unknowns or their change over the span; small entries have that of their kind, or 1."""
     scale = np.ones(len(x) + 1)
     size = np.maximum(np.abs(x), np.abs(tangent) * span)
     for part in (slice(0, dof), slice(2 * dof, len(x))):
@@ -199,25 +198,25 @@ def rest_scale(x: np.ndarray, dof: int, span: float, tangent: np.ndarray | float
 
 
 def refuse_time(problem: RestProblem, point: RestPoint, dof: int) -> None:
-    """Refuse an equilibrium that is none at another time.
+    """Check that the equilibrium is the same at other times.
 
     **Raises:**
 
-    - `OrbitError` where the scene depends on time.
+    - `OrbitError` if the scene depends on time.
     """
     scale = rest_scale(point.x, dof, 1.0)
     for t in _OTHER_TIMES:
         by, residual = rest_at(problem, point.x, point.value, dof, t).scaled(scale)
         if np.max(np.abs(np.linalg.lstsq(by[:, :-1], residual, rcond=None)[0])) > _SAME:
             raise OrbitError(
-                f"The scene depends on time: at t = {t:g} s the equilibrium of t = 0 is none. Write it in coordinates"
-                " that come to rest, such as the lag behind a drive that turns on; a periodic force has periodic"
-                " orbits, and periodic_orbit finds them."
+                f"The scene depends on time: the equilibrium at t = 0 is no equilibrium at t = {t:g} s. Use coordinates"
+                " that come to rest, such as the lag behind a drive at constant speed. For a periodic force use"
+                " periodic_orbit."
             )
 
 
-def described_rest(problem: RestProblem, point: RestPoint, dof: int) -> Equilibrium:
-    """What is known of an equilibrium."""
+def describe_rest(problem: RestProblem, point: RestPoint, dof: int) -> Equilibrium:
+    """The equilibrium at a solution of its equations."""
     scene = problem.with_value(point.value)
     values, sides = np.zeros(0, complex), np.asarray(problem.ends)
     ends = {name: int(sides[part][0]) for name, part in _rows_of(scene, dof).items() if np.any(sides[part])}
@@ -234,7 +233,7 @@ def _(rest: Equilibrium) -> Table:
     if isinstance(rest.q, jax.core.Tracer):
         return Table("Equilibrium, traced", (), [])
     rows = [(quantity_of(rest.scene, f"q[{i}]").label, short(x)) for i, x in enumerate(rest.q)]
-    notes = [f"eigenvalues {', '.join(map(complex_words, rest.eigenvalues))} 1/s"] if len(rest.eigenvalues) else []
+    notes = [f"eigenvalues {', '.join(map(format_complex, rest.eigenvalues))} 1/s"] if len(rest.eigenvalues) else []
     if np.isfinite(rest.period):
         notes.append(f"period of small oscillations {rest.period:.6g} s")
     sides = [f"{name}, {'forwards' if side > 0 else 'backwards'}" for name, side in rest.ends.items()]

@@ -1,4 +1,4 @@
-"""Directions in which nothing says where an orbit is: shifts of the machine, and coordinates that stick throughout."""
+"""Neutral directions, in which an orbit has no unique position: shifts of the machine, coordinates in stick."""
 
 from dataclasses import replace
 
@@ -9,16 +9,16 @@ import numpy as np
 from ..scene import Scene, quantity_of
 from ._return_map import OrbitError, OrbitProblem, SettledState, ShotOrbit, evaluate
 
-# Length of the shift under which a scene must stay the same, in the extent of the motion.
+# Length of the shift that tests whether a scene is invariant, relative to the extent of the motion.
 _SHIFT = 7.3
-# Derivatives of the return map that are those of a shift, or of a coordinate that sticks; and residuals that are equal.
+# Tolerances of the derivatives of the return map for a shift and for a coordinate in stick, and of equal residuals.
 _SHIFTED, _STUCK, _SAME = 1e-7, 1e-6, 1e-6
-# Part of the range of a coordinate by which it differs after a period if it moves on.
+# A coordinate advances if its change after a period exceeds this fraction of its range.
 _MOVES_ON = 0.9
 
 
 def anchored(problem: OrbitProblem, start: SettledState, dof: int) -> tuple[OrbitProblem, SettledState]:
-    """With the segments of the start, its place in directions in which nothing says where the orbit is, and its plane.
+    """The problem with the segments, anchor, neutral directions and plane of a start.
 
     The plane of an orbit of unknown period is normal to the flow at the start, in the scales.
     """
@@ -37,9 +37,9 @@ def anchored(problem: OrbitProblem, start: SettledState, dof: int) -> tuple[Orbi
 
 
 def pin(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, dof: int) -> OrbitProblem:
-    """With the shifts that the scene is invariant under, and with the start of the orbit fixed along them.
+    """The problem with the invariant shifts of the scene, along which the start of the orbit is pinned.
 
-    `point` is near the orbit. It is fixed along coordinates that stick throughout, too: those of `problem.held`.
+    `point` is near the orbit. The start is also pinned along coordinates that stick throughout, of `problem.held`.
     """
     s = scale[: point.x.shape[1]]
     names = tuple(name for name in problem.held if len(_held(problem, (name,), point, s, dof)))
@@ -50,7 +50,7 @@ def pin(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, dof: int) ->
 
 
 def neutral_directions(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, dof: int) -> np.ndarray:
-    """An orthonormal basis of these directions in the scales of the state, shape `[n, k]`."""
+    """An orthonormal basis of the neutral directions in the scales of the state, shape `[n, k]`."""
     s = scale[: point.x.shape[1]]
     shifts, sizes, _ = np.linalg.svd(np.asarray(problem.free) * s / s[:, None])
     columns = np.hstack([shifts[:, sizes > 0.5], _held(problem, problem.held, point, s, dof).T])
@@ -59,34 +59,34 @@ def neutral_directions(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarra
 
 
 def moving_on(scene: Scene, moved: np.ndarray, extent: np.ndarray) -> str:
-    """A sentence that names coordinates that move on in a period; `extent` is half the range of each [m or rad]."""
+    """A sentence that names coordinates that advance in a period; `extent` is half the range of each [m or rad]."""
     far = np.flatnonzero(np.abs(moved[: len(extent)]) > 2.0 * _MOVES_ON * extent)
     if not len(far):
         return ""
     names = ", ".join(f"{quantity_of(scene, f'q[{i}]').name} by {moved[i]:.6g}" for i in far)
     return (
-        f" In a period the machine moves on, {names}, and a shift by that changes its motion. An orbit that advances"
-        " needs a scene that is the same after each shift of these coordinates: its forces, friction and gaps."
+        f" In a period the machine advances, {names}, but such a shift changes its motion. An orbit that advances needs"
+        " a scene whose forces, friction and gaps are the same after any shift of these coordinates."
     )
 
 
 def differs(one: ShotOrbit, other: ShotOrbit, scale: np.ndarray) -> bool:
-    """Whether the run from one start does not lead as far as that from another one, beyond the errors of both."""
+    """Whether the residuals of two shots differ by more than their errors."""
     growth = max(1.0, float(np.max(np.abs(np.linalg.eigvals(one.maps)))))
     apart = np.abs(one.residual - other.residual)[: one.x.size] / scale[: one.x.size]
     return bool(other.failure) or not float(np.max(apart)) < _SAME * growth
 
 
 def shifted(problem: OrbitProblem, point: ShotOrbit, by: np.ndarray, dof: int) -> ShotOrbit:
-    """The same with all starts, and the anchor, shifted."""
+    """The shot with all starts and the anchor shifted."""
     problem = eqx.tree_at(lambda p: p.anchor, problem, problem.anchor + by)
     return evaluate(problem, point.x + by, point.period, point.values, dof)
 
 
 def _held(problem: OrbitProblem, names: tuple[str, ...], point: ShotOrbit, s: np.ndarray, dof: int) -> np.ndarray:
-    """Directions in which these elements hold the coordinates for the whole period, shape `[rows, n]`, scaled.
+    """Scaled directions in which these elements hold the coordinates for the whole period, shape `[rows, n]`.
 
-    What sticks is a number that every run keeps: a left eigenvector of the monodromy matrix with the eigenvalue 1.
+    A coordinate in stick is conserved: it is a left eigenvector of the monodromy matrix with the eigenvalue 1.
     """
     scene = problem.with_values(point.values).bind_time(problem.spans[0, 0] * point.period)
     monodromy, rows = point.monodromy * s / s[:, None], [np.zeros((0, len(s)))]
@@ -117,7 +117,7 @@ def _shifts(problem: OrbitProblem, point: ShotOrbit, s: np.ndarray, dof: int, he
 
 
 def _same_gaps(problem: OrbitProblem, point: ShotOrbit, by: np.ndarray, dof: int) -> bool:
-    """Whether contacts are as far away after a shift: they may be open all along."""
+    """Whether a shift keeps the gaps of contacts, which matters for contacts that never close in the run."""
     scene, t = problem.with_values(point.values), problem.spans[0, 0] * point.period
     one, other = (jnp.asarray(x[:dof]) for x in (point.x[0], point.x[0] + by))
     apart = [each.error(t, one, scene.params) - each.error(t, other, scene.params) for each in scene.contacts.values()]

@@ -1,4 +1,4 @@
-"""`periodic_orbit`: a scene and a guess in, an orbit that returns to itself out."""
+"""`periodic_orbit`: find a periodic orbit of a scene by shooting."""
 
 from __future__ import annotations  # `help` shows types as they are written here
 
@@ -15,10 +15,9 @@ from jaxtyping import Array, ArrayLike, PyTree
 
 from .._core.arguments import as_float, as_whole, check_real
 from ..scene import Scene, State
-from ._describe import Extremes, describe
 from ._neutral import anchored, differs, moving_on, shifted
-from ._newton import newton, scaled
-from ._orbit import PeriodicOrbit
+from ._newton import newton
+from ._orbit import Extremes, PeriodicOrbit, describe
 from ._return_map import (
     OrbitError,
     OrbitProblem,
@@ -33,11 +32,11 @@ from ._return_map import (
 )
 from ._settle import SettledState, cut, run_for, settled
 
-# Periods of the force until a run has settled, where nothing else is asked for.
+# Default duration of the run that settles, in periods of the force.
 _PERIODS = 20
-# A direction in which the derivative of the return map is one to so many digits.
+# Relative singular value of the equations below which the orbit may be one of a family.
 _FAMILY = 1e-7
-# At another time, in periods, a scene that does not depend on it ends in the same state.
+# Time shift, in periods, that tests whether a scene depends on time.
 _OTHER_TIME = 0.381966
 
 _States: TypeAlias = ArrayLike | list[float] | list[list[float]]
@@ -57,30 +56,28 @@ def periodic_orbit(
 ) -> PeriodicOrbit:
     """Find a periodic orbit by shooting: Newton's iteration on the run over one period, or over segments of it.
 
-    The run has its events, and derivatives through them. It finds unstable orbits as well as stable ones; a simulation
-    for `settle` seconds, which starts the search, comes near to stable ones alone.
+    Newton's iteration finds stable and unstable orbits, with derivatives through all events. The search starts with a
+    simulation for `settle` seconds, which approaches stable orbits only.
 
     The state, the period and the extrema of the orbit have first derivatives by all numbers of the scene, forward and
     reverse, by the implicit function theorem: `jax.grad(lambda s: periodic_orbit(s, ...).period)(scene)`.
 
     **Arguments:**
 
-    - `scene`: the `Scene`, in float64. Coordinates must return, or advance by the same amount in each period in a scene
-      that a shift of them does not change, such as a box that is pulled over a floor.
-    - `guess`: `(q0, qd0)`, shape `[dof]` each, or of a forced orbit `[segments, dof]`, then where each of the equally
-      long segments starts; or a `PeriodicOrbit`, of another scene for instance, which is then where
-      Newton's iteration starts.
+    - `scene`: the `Scene`, in float64. Coordinates must return after a period. They may also advance by the same amount
+      in each period if the scene is invariant under such a shift, such as a box that is pulled over a floor.
+    - `guess`: `(q0, qd0)`, shape `[dof]` each; for a forced orbit also `[segments, dof]`, the starts of segments of
+      equal duration. Or a `PeriodicOrbit`, for instance of another scene, at which Newton's iteration starts.
     - `period`: period [s] of a forced orbit, > 0, which begins at t = 0: a number, or a function of `params`, as in
-      `lambda p: 2 * jnp.pi / p["omega"]`, so that it changes with them. None for an orbit of a scene that does not
-      depend on time, whose period is then found.
-    - `section`: `section(q, qd)` -> a number that is zero where an orbit of unknown period begins, and rises. By
-      default it begins in the middle of the longest phase without a change of modes, in slip if there is one.
-    - `settle`: how long [s] the run from the guess lasts, >= 0. Of a forced orbit it is rounded to periods, by default
-      20. Of an orbit of unknown period it is needed where the guess is no orbit, and in its second half the state has
-      to return.
-    - `segments`: number of runs into which the period is cut, >= 1. Their starts are unknowns too (multiple shooting):
-      for orbits so unstable that an error of the start grows out of all digits in a period.
-    - `rtol`, `atol`: tolerances of the runs, as of `simulate`.
+      `lambda p: 2 * jnp.pi / p["omega"]`. None for a scene that is independent of time, whose period is an unknown.
+    - `section`: `section(q, qd)` -> a number that is zero and rising at the start of an orbit of unknown period. By
+      default the start is the middle of the longest phase without a change of modes, in slip if possible.
+    - `settle`: duration [s] of the run from the guess, >= 0. For a forced orbit it is rounded to periods, by default
+      20. For an orbit of unknown period it is required, unless the guess is an orbit, and the state must return in its
+      second half.
+    - `segments`: number of runs for the period, >= 1, whose starts are unknowns (multiple shooting). Use more for
+      orbits so unstable that rounding errors at the start dominate after a period.
+    - `rtol`, `atol`: tolerances of the runs, as for `simulate`.
 
     **Returns:**
 
@@ -88,9 +85,9 @@ def periodic_orbit(
 
     **Raises:**
 
-    - `ValueError` for wrong arguments, float32, and inside `jax.jit` or `jax.vmap`.
-    - `OrbitError` where there is no convergence, the run does not return or comes to rest, the section is degenerate,
-      the orbit is one of a family, or the scene depends on time otherwise than `period` says.
+    - `ValueError` for invalid arguments, float32, and inside `jax.jit` or `jax.vmap`.
+    - `OrbitError` if the iteration does not converge, the run does not return or comes to rest, the section is
+      degenerate, the orbit is one of a family, or the scene depends on time with another period.
 
     ??? cite "Reference"
 
@@ -121,11 +118,11 @@ def prepare(
     parameters: tuple[str, ...] = (),
     segments: int = 1,
 ) -> tuple[OrbitProblem, SettledState, int]:
-    """The equations of an orbit, a start with the magnitudes of all unknowns, and the number of coordinates.
+    """The problem of an orbit, a start with the magnitudes of all unknowns, and the number of coordinates.
 
     **Raises:**
 
-    - `ValueError` for wrong arguments; `OrbitError` where nothing settles.
+    - `ValueError` for invalid arguments; `OrbitError` if the run does not settle.
     """
     check_known(scene, "periodic_orbit")
     _check_functions(period, section)
@@ -136,7 +133,9 @@ def prepare(
     phase = jnp.zeros(())
     if isinstance(guess, PeriodicOrbit):
         phase = jax.lax.stop_gradient(guess.t0 / guess.period)
-    number = period if period is None or callable(period) else _Constant(as_float(period, name="period", lower=0.0))
+    number = (
+        period if period is None or callable(period) else _ConstantPeriod(as_float(period, name="period", lower=0.0))
+    )
     none = jnp.zeros((0, 0))
     problem = OrbitProblem(
         *(scene, phase, relative, absolute, empty, empty, empty, number, section, parameters, none, none)
@@ -154,23 +153,23 @@ def prepare(
     start = start._replace(scale=np.concatenate([*[state_scale] * count, of_period, np.ones(len(parameters))]))
     problem, start = anchored(problem, start, dof)
     if not isinstance(guess, PeriodicOrbit) and state.q.ndim == 1:
-        # What a shift does not change begins where the guess is.
+        # Along invariant shifts the orbit begins at the guess.
         x = start.x + np.asarray(problem.free) @ (np.asarray(pack(state)) - start.x[0])
         start, problem = start._replace(x=x), replace(problem, anchor=jnp.asarray(x[0]))
     return problem, start, dof
 
 
 def _segment_starts(problem: OrbitProblem, states: State, count: int) -> SettledState:
-    """A start from states for all segments, equally long.
+    """A start from the states at the starts of all segments, of equal duration.
 
     **Raises:**
 
-    - `ValueError` for another number of them, and where the period is not known.
+    - `ValueError` for another number of states, and if the period is unknown.
     """
     if problem.period is None or len(states.q) != count:
         raise ValueError(
-            f"guess has {len(states.q)} states, of which there must be one for each segment of a forced orbit; but"
-            f" segments is {count}, and {'no period' if problem.period is None else 'a period'} was given."
+            f"guess has {len(states.q)} states, which needs a forced orbit with as many segments, but segments is"
+            f" {count}, and {'no period' if problem.period is None else 'a period'} was given."
         )
     period, cuts = float(problem.period(problem.scene.params)), np.arange(count) / count
     each = [jtu.tree_map(lambda a, i=i: a[i], states) for i in range(count)]
@@ -180,8 +179,8 @@ def _segment_starts(problem: OrbitProblem, states: State, count: int) -> Settled
     return cut(problem, runs, period, count)._replace(x=x, cuts=cuts)
 
 
-class _Constant(eqx.Module):
-    """A period that is a number."""
+class _ConstantPeriod(eqx.Module):
+    """A period that does not depend on the parameters."""
 
     seconds: float
 
@@ -196,8 +195,8 @@ def _settle(problem: OrbitProblem, settle: float | None) -> float:
         return as_float(settle, name="settle", lower=None if problem.period is not None else 0.0)
     if problem.period is None:
         raise ValueError(
-            "An orbit of unknown period needs settle, the time [s] of the simulation that the search starts with, some"
-            " tens of periods for one that attracts slowly; or pass period, if the scene is forced."
+            "An orbit of unknown period needs settle, the duration [s] of the simulation that starts the search: some"
+            " tens of periods for an orbit that attracts slowly. Pass period if the scene is forced."
         )
     return _PERIODS * float(problem.period(problem.scene.params))
 
@@ -219,24 +218,25 @@ def _state(scene: Scene, guess: Guess) -> State:
 
 
 def check_known(scene: Scene, name: str) -> None:
-    """Refuse what is no scene, and numbers that are not known or in float32.
+    """Check that a scene has concrete numbers in float64.
 
     **Raises:**
 
-    - `ValueError` in the name of the function that searches.
+    - `ValueError` that mentions the function `name`.
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"{name} needs a Scene, but a {type(scene).__name__} was given.")
     if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(scene)):
         raise ValueError(
-            "Orbits and equilibria are searched for by numbers that are known, which they are not inside jax.jit and"
-            " jax.vmap: call it outside. jax.grad and jax.jacfwd work."
+            f"{name} needs concrete numbers, but those of the scene are traced by jax.jit or jax.vmap: call it outside"
+            " of these. jax.grad and jax.jacfwd work."
         )
     kind = jnp.result_type(float, *jtu.tree_leaves(scene))
     if kind != jnp.float64 or any(x.dtype == jnp.float32 for x in jtu.tree_leaves(scene)):
         raise ValueError(
-            "Orbits and equilibria need float64: in float32 the run itself misses its start by more than what tells an"
-            ' orbit from its neighbours. Call jax.config.update("jax_enable_x64", True) before the scene is made.'
+            f"{name} needs float64, because errors of float32 exceed the differences between neighbouring solutions."
+            " Call"
+            ' jax.config.update("jax_enable_x64", True) before you create the scene.'
         )
 
 
@@ -244,15 +244,17 @@ def _check_functions(period: object, section: object) -> None:
     if section is not None and not callable(section):
         raise ValueError(f"section must be a function of q and qd, but {section!r} was given.")
     if section is not None and period is not None:
-        raise ValueError("section is for orbits of unknown period; a forced one begins at t = 0. Pass one of the two.")
+        raise ValueError(
+            "section is for orbits of unknown period; a forced orbit begins at t = 0. Pass section or period."
+        )
 
 
 def shoot(problem: OrbitProblem, start: SettledState, dof: int) -> ShotOrbit:
-    """The orbit near the start, at the values that the parameters have in the scene.
+    """The orbit near the start, at the values of the parameters in the scene.
 
     **Raises:**
 
-    - `OrbitError` where there is none, the scene depends on time otherwise than the period says, or there is a family.
+    - `OrbitError` if there is none, if the scene depends on time with another period, or if there is a family.
     """
     try:
         point, _ = newton(problem, start.x, start.period, problem.values, dof, start.scale)
@@ -261,17 +263,17 @@ def shoot(problem: OrbitProblem, start: SettledState, dof: int) -> ShotOrbit:
     _refuse_clock(problem, point, start.scale, dof)
     advance = point.advance[:dof]
     if np.any(advance) and differs(point, shifted(problem, point, point.advance, dof), start.scale):
-        raise OrbitError(f"The run does not go on as an orbit.{moving_on(problem.scene, advance, 0.0 * advance)}")
+        raise OrbitError(f"The run does not continue as an orbit.{moving_on(problem.scene, advance, 0.0 * advance)}")
     _refuse_family(problem, point, start.scale, dof)
     return point
 
 
 def _refuse_clock(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, dof: int) -> None:
-    """Refuse an orbit that does not return at other times: a period later, or at any time if it has no given period.
+    """Check that the orbit returns at other times: a period later, or at any time if the period is unknown.
 
     **Raises:**
 
-    - `OrbitError` where the scene depends on time otherwise than the period says.
+    - `OrbitError` if the scene depends on time with another period.
     """
     moved = problem.phase + (_OTHER_TIME if problem.autonomous else 1.0)
     later = evaluate(eqx.tree_at(lambda p: p.phase, problem, moved), point.x, point.period, point.values, dof)
@@ -279,40 +281,41 @@ def _refuse_clock(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, do
         return
     if problem.autonomous:
         raise OrbitError(
-            "The scene depends on time: from the same state at another time it goes elsewhere. Pass period, that of its"
-            ' forces, as in period=lambda p: 2 * jnp.pi / p["omega"].'
+            "The scene depends on time: a run from the same state at another time differs. Pass the period of its"
+            " forces,"
+            ' as in period=lambda p: 2 * jnp.pi / p["omega"].'
         )
     raise OrbitError(
-        "The run does not go on as an orbit: the forces of the scene do not repeat after the period"
-        f" {point.period:.6g} s. Pass a multiple of theirs."
+        "The run does not continue as an orbit: the forces of the scene do not repeat after the period"
+        f" {point.period:.6g} s. Pass a multiple of their period."
     )
 
 
 def _refuse_family(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, dof: int) -> None:
-    """Refuse an orbit that has others beside it, not only to first order.
+    """Check that the orbit is isolated, or that its neighbours are orbits to first order only.
 
     **Raises:**
 
-    - `OrbitError` where a multiplier is 1 and the state a small way along its direction returns as well.
+    - `OrbitError` if a multiplier is 1 and a state a small distance along its direction returns as well.
     """
-    by = scaled(point, scale)[:, : len(point.residual)]
+    by = point.scaled(scale)[0][:, : len(point.residual)]
     _, sizes, rows = np.linalg.svd(by)
     if sizes[-1] > _FAMILY * sizes[0]:
         return
     size, away = point.x.size, 1e-3 * rows[-1] * scale[: len(rows)]
     period = point.period + (away[size] if problem.autonomous else 0.0)
     beside = evaluate(problem, point.x + away[:size].reshape(point.x.shape), period, point.values, dof)
-    # Of a fold the residual there would be of the second order, 1e-6.
+    # At a fold this residual would be of second order, 1e-6.
     if not beside.failure and _miss(beside, scale) < 1e-8:
         raise OrbitError(
-            "The orbit is not alone but one of a family, with a multiplier of exactly 1 beside those that every orbit"
-            " has: nothing in the scene says which one. A conservative scene has such families, a bristle that never"
-            " gives way, and dry friction at certain frequencies; a little damping, or another frequency, leaves one."
+            "The orbit is one of a family: it has another multiplier of exactly 1, and the scene does not determine"
+            " which orbit. Examples are conservative scenes, a bristle that never slips, and dry friction at certain"
+            " frequencies. Add a little damping, or change the frequency."
         )
 
 
 def _miss(point: ShotOrbit, scale: np.ndarray) -> float:
-    """By how much the states miss the next ones, in the scales."""
+    """Largest residual of the states, in the scales."""
     size = point.x.size
     return float(np.max(np.abs(point.residual[:size]) / scale[:size]))
 
@@ -320,7 +323,7 @@ def _miss(point: ShotOrbit, scale: np.ndarray) -> float:
 def _with_derivatives(
     problem: OrbitProblem, point: ShotOrbit, orbit: PeriodicOrbit, extrema: tuple[Extremes, Extremes]
 ) -> PeriodicOrbit:
-    """The orbit with the derivatives of the implicit function theorem: one step of Newton from where it is solved."""
+    """The orbit with the derivatives of the implicit function theorem, by one step of Newton from the solution."""
     dof, size, scene, spans = orbit.q.shape[0], point.x.size, problem.scene, problem.spans
     inverse = np.linalg.inv(point.by[:, : len(point.residual)])
     x, period = jnp.asarray(point.x), jnp.asarray(point.period)
@@ -340,21 +343,20 @@ def _with_derivatives(
     struck = [name for x in extrema for name in x.struck]
     order = np.argsort(times, kind="stable")
     place = np.argsort(order, kind="stable"), np.tile(np.arange(dof), 2)
-    made, end = jnp.zeros(len(times)), x[0]
+    extremes, end = jnp.zeros(len(times)), x[0]
     for y, span in zip(x, spans, strict=True):
         run = run_segment(problem, scene, y, period, span, dof, jnp.asarray([*times[order], np.inf]))
         end = end_of(run)
-        # The times are right to some digits alone: a parabola leads from there to where the velocity is zero.
-        there = run.q[place] - 0.5 * run.qd[place] ** 2 / acceleration
+        # The times are approximate: a parabola leads from the state at that time to the extremum.
+        extremum = run.q[place] - 0.5 * run.qd[place] ** 2 / acceleration
         for i, name in enumerate(struck):
             if name:
-                there = there.at[i].add(
-                    _to_impact(scene, name, times[i], run.q[place[0][i]], run.qd[place[0][i]])[i % dof]
-                )
-        made = jnp.where(times >= float(span[0]) * point.period, there, made)
+                q, qd = run.q[place[0][i]], run.qd[place[0][i]]
+                extremum = extremum.at[i].add(_to_impact(scene, name, times[i], q, qd)[i % dof])
+        extremes = jnp.where(times >= float(span[0]) * point.period, extremum, extremes)
     lowest, highest = (
         value + (x - jax.lax.stop_gradient(x))
-        for value, x in zip((orbit.lowest, orbit.highest), made.reshape(2, dof), strict=True)
+        for value, x in zip((orbit.lowest, orbit.highest), extremes.reshape(2, dof), strict=True)
     )
     q, qd, z = unpack(scene, x[0], dof)
     advance = (problem.free @ (end - x[0]))[:dof]
@@ -362,6 +364,6 @@ def _with_derivatives(
 
 
 def _to_impact(scene: Scene, name: str, t: float, q: Array, qd: Array) -> Array:
-    """The way from a state just before an impact to it; its derivative is that of the time of the impact."""
+    """Displacement from a state just before an impact to it, with the derivative of the time of the impact."""
     contact, params, time = scene.contacts[name], scene.bind_time(jnp.asarray(t)).params, jnp.asarray(t)
     return -qd * contact.error(time, q, params)[0] / contact.rate(time, q, qd, params)[0]

@@ -1,4 +1,4 @@
-"""The equations of an equilibrium, their derivatives, and Newton's iteration for them."""
+"""The equations of an equilibrium with their derivatives, and Newton's iteration for them."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from ..scene import Scene, State, from_dynamics, replace_elements
 from ._return_map import OrbitError, pack, unpack
 
 _ITERATIONS, _HALVINGS = 50, 8
-# Steps in the scales of the unknowns: where the iteration ends, and where it has converged if it comes no further.
+# Steps in the scales of the unknowns: the iteration ends at the first, and has converged at the second if it stalls.
 _GOAL, _ENOUGH = 1e-14, 1e-9
-# Singular values below this part of the largest one are no directions.
+# Relative size of singular values that count as zero.
 _RANK = 1e-11
 
 
 class RestProblem(eqx.Module):
-    """What has to be at rest.
+    """The problem of an equilibrium.
 
-    - `mode`: modes of slip of the friction elements, zero of those that stick, and zeros of contacts, which are open;
-      None where there are none.
-    - `ends`: direction in which the friction force of each row that sticks is at its limit; zero of the others.
-    - `parameter`: a number of the scene that is one of the unknowns; None where there is none.
+    - `mode`: modes of the friction elements, zero in stick, and zeros for contacts, which are open; None for a scene
+      without modes.
+    - `ends`: direction of the limiting friction force of each row in stick; zero for the others.
+    - `parameter`: name of a number of the scene that is an unknown, or None.
     """
 
     scene: Scene
@@ -43,11 +43,11 @@ class RestProblem(eqx.Module):
 
 
 class RestEquations(NamedTuple):
-    """Left-hand sides at a state, all of which vanish at an equilibrium, and what tells whether the modes hold.
+    """Residuals at a state, which vanish at an equilibrium, and the quantities that confirm the modes.
 
-    - `rate`: of the state, in the end of a set with friction at its limits, shape `[n]`.
+    - `rate`: of the state, with friction at its limits in stick, shape `[n]`.
     - `held`: errors and rates of constraints, shape `[c]`.
-    - `slip`: slip velocities of the friction elements with modes; `gaps`: of contacts [m].
+    - `slip`: slip velocities of the friction elements with modes. `gaps`: of contacts [m].
     """
 
     rate: Float[Array, " n"]
@@ -65,7 +65,7 @@ def rest_equations(problem: RestProblem, scene: Scene, x: Array, t: Array, dof: 
         if not n:
             return d.rate, jnp.zeros(0, x.dtype)
         limit = jnp.where(problem.ends > 0, d.friction.upper[:n], d.friction.lower[:n])
-        # Accelerations where the elements that stick are at their limits: zero where the limits are what holds them.
+        # Accelerations with the elements in stick at their limits: zero if the limits balance all other forces.
         excess = jnp.where(problem.ends != 0, d.friction.force[:n] - problem.ends * limit, 0.0)
         qdd = d.rate.qd + jnp.sum(d.friction_elements.minv_jt[:n] * excess[:, None], axis=0)
         return d.rate._replace(qd=qdd), d.friction_elements.v[:n]
@@ -83,17 +83,17 @@ def rest_equations(problem: RestProblem, scene: Scene, x: Array, t: Array, dof: 
 @eqx.filter_jit
 def _evaluated(problem: RestProblem, unknowns: Array, t: Array, dof: int) -> tuple[Array, RestEquations]:
     def at(unknowns: Array) -> tuple[Array, RestEquations]:
-        made = rest_equations(problem, problem.with_value(unknowns[-1]), unknowns[:-1], t, dof)
-        return jnp.concatenate([made.rate, made.held]), made
+        equations = rest_equations(problem, problem.with_value(unknowns[-1]), unknowns[:-1], t, dof)
+        return jnp.concatenate([equations.rate, equations.held]), equations
 
     return jax.jacfwd(at, has_aux=True)(unknowns)
 
 
 @dataclass(frozen=True)
 class RestPoint:
-    """A state and a value of the parameter, and the equations there.
+    """The equations at a state and a value of the parameter.
 
-    - `residual`: shape `[n + c]`; `by`: its derivatives by state and parameter, shape `[n + c, n + 1]`.
+    - `residual`: shape `[n + c]`. `by`: its derivatives by state and parameter, shape `[n + c, n + 1]`.
     """
 
     x: np.ndarray
@@ -103,12 +103,12 @@ class RestPoint:
 
     @property
     def unknowns(self) -> np.ndarray:
-        """What the columns of `by` belong to."""
+        """State and parameter, in the order of the columns of `by`."""
         return np.append(self.x, self.value)
 
     @property
     def basis(self) -> np.ndarray:
-        """The directions of the state within the constraints, shape `[n, k]`."""
+        """Basis of the states within the constraints, shape `[n, k]`."""
         n = len(self.x)
         if len(self.by) == n:
             return np.eye(n)
@@ -117,49 +117,49 @@ class RestPoint:
 
     @property
     def rows(self) -> np.ndarray:
-        """What of the equations counts: rates within the constraints, and the constraints, shape `[k + c, n + c]`."""
+        """Projector of the equations on rates within the constraints, and the constraints, shape `[k + c, n + c]`."""
         n, held = len(self.x), np.eye(len(self.by) - len(self.x))
         return np.block([[self.basis.T, np.zeros((self.basis.shape[1], len(held)))], [np.zeros((len(held), n)), held]])
 
     def scaled(self, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives by the unknowns in their scales, and residuals, of what counts, with rows of one size."""
+        """Derivatives of the projected equations by the scaled unknowns, and residuals, with rows of unit size."""
         by, residual = self.rows @ self.by * scale, self.rows @ self.residual
         size = np.maximum(np.max(np.abs(by), axis=1), 1e-300)
         return by / size[:, None], residual / size
 
     @property
     def linearised(self) -> np.ndarray:
-        """The rates' derivatives by the state within the constraints, shape `[k, k]`."""
+        """Derivatives of the rates by the state, within the constraints, shape `[k, k]`."""
         n = len(self.x)
         return self.basis.T @ self.by[:n, :n] @ self.basis
 
 
 def rest_at(problem: RestProblem, x: np.ndarray, value: float, dof: int, t: float = 0.0) -> RestPoint:
-    """The equations at these unknowns.
+    """Evaluate the equations.
 
     **Raises:**
 
-    - `OrbitError` where they are not finite, or the modes are not those of the problem.
+    - `OrbitError` if they are not finite.
     """
-    by, made = jax.device_get(_evaluated(problem, jnp.asarray([*x, value]), jnp.asarray(t), dof))
-    residual = np.concatenate([made.rate, made.held])
+    by, equations = jax.device_get(_evaluated(problem, jnp.asarray([*x, value]), jnp.asarray(t), dof))
+    residual = np.concatenate([equations.rate, equations.held])
     if not (np.isfinite(by).all() and np.isfinite(residual).all()):
-        raise OrbitError("The equations of motion are not finite there.")
+        raise OrbitError("The equations of motion are not finite at this state.")
     return RestPoint(x, value, residual, by)
 
 
-# Rows that are added to the equations: their residual and derivatives at a point.
+# Residual and derivatives of an additional equation at a point.
 _Extra = Callable[[RestPoint], tuple[float, np.ndarray]]
 
 
 def solve_rest(
     problem: RestProblem, x: np.ndarray, value: float, dof: int, scale: np.ndarray, extra: _Extra | None = None
 ) -> tuple[RestPoint, int]:
-    """Newton's iteration; with `extra` the parameter is one of the unknowns. Returns the number of iterations too.
+    """Solve the equations. With `extra` the parameter is an unknown. Returns the number of iterations too.
 
     **Raises:**
 
-    - `OrbitError` where it does not converge, ends where the modes are others, or there is a family of equilibria.
+    - `OrbitError` if the iteration does not converge, if the modes differ at its end, or for a family of equilibria.
     """
     point, last = rest_at(problem, x, value, dof), np.inf
     for i in range(_ITERATIONS):
@@ -172,13 +172,13 @@ def solve_rest(
         start = point.unknowns
         for halving in range(_HALVINGS):
             unknowns = start + step * 0.5**halving
-            unknowns[dof : 2 * dof] = 0.0  # exactly, for modes go by it
+            unknowns[dof : 2 * dof] = 0.0  # exact zeros, because modes depend on them
             point = rest_at(problem, unknowns[:-1], float(unknowns[-1]), dof)
             if size < _ENOUGH or _size(point, scale, extra) < before:
                 break
     raise OrbitError(
-        f"No convergence to an equilibrium in {_ITERATIONS} iterations; the last step was {last:.3g} of its size. Begin"
-        " nearer to it."
+        f"No convergence to an equilibrium in {_ITERATIONS} iterations: the last relative step is {last:.3g}. Begin"
+        " nearer to the equilibrium."
     )
 
 
@@ -197,18 +197,18 @@ def _step(point: RestPoint, scale: np.ndarray, extra: _Extra | None) -> np.ndarr
     step, _, rank, _ = np.linalg.lstsq(by, -residual, rcond=_RANK)
     if extra is None and rank < by.shape[1] and np.max(np.abs(residual)) < _ENOUGH:
         raise OrbitError(
-            "The equilibrium is not alone but one of a family: nothing in the scene says where it is. So it is with a"
-            " coordinate without a spring, and with a bristle that stands still, as of LuGre on a surface at rest; give"
-            " the surface a velocity, or take the set-valued law, whose sets of equilibria have ends."
+            "The equilibrium is one of a family: the scene does not determine its place. Examples are a coordinate"
+            " without a spring, and a bristle at rest, as of LuGre on a surface at rest. Give the surface a velocity,"
+            " or use a set-valued law, whose set of equilibria has ends."
         )
     return scale * (np.append(step, 0.0) if extra is None else step)
 
 
 def _refuse_other_modes(problem: RestProblem, point: RestPoint, dof: int) -> None:
-    _, made = _evaluated(problem, jnp.asarray(point.unknowns), jnp.zeros(()), dof)
-    if problem.mode is not None and made.slip.shape[0]:
-        mode = problem.mode[: made.slip.shape[0]]
-        if bool(jnp.any(jnp.sign(mode) != jnp.sign(made.slip))):
+    _, equations = _evaluated(problem, jnp.asarray(point.unknowns), jnp.zeros(()), dof)
+    if problem.mode is not None and equations.slip.shape[0]:
+        mode = problem.mode[: equations.slip.shape[0]]
+        if bool(jnp.any(jnp.sign(mode) != jnp.sign(equations.slip))):
             raise OrbitError("A friction element begins to stick, or to slip the other way: its surface is at rest.")
-    if bool(jnp.any(made.gaps <= 0)):
-        raise OrbitError("A contact is closed there, and equilibria are sought with contacts open.")
+    if bool(jnp.any(equations.gaps <= 0)):
+        raise OrbitError("A contact is closed at the equilibrium, but equilibrium supports open contacts alone.")

@@ -1,4 +1,4 @@
-"""The return map of a scene, its derivatives, and the equations of an orbit."""
+"""The return map of a scene with its derivatives, and the equations of a periodic orbit."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,28 +15,29 @@ from jaxtyping import Array, Float, PyTree
 from ..scene import Scene, State, read_element, replace_elements
 from ..simulation import Trajectory, outcome_messages, simulate
 
-# Period [s] from the parameters of the scene.
+# Period [s] as a function of the parameters of the scene.
 PeriodFn: TypeAlias = Callable[[PyTree], Array | float]
-# A function of q and qd that is zero where an orbit begins.
+# A function of q and qd that is zero at the start of an orbit.
 Section: TypeAlias = Callable[[Array, Array], Array | float]
 
 MAX_STEPS, MAX_EVENTS = 65536, 4096
 
 
 class OrbitError(RuntimeError):
-    """No periodic orbit, or not one alone; the message says why, and what to do."""
+    """The search for an orbit or equilibrium fails, or finds one of a family; the message says why."""
 
 
 class OrbitProblem(eqx.Module):
-    """What has to return to itself.
+    """The problem of a periodic orbit.
 
-    - `phase`: time at which forced orbits begin, in periods.
-    - `period`: of a forced orbit, from the parameters of the scene; None where the period is unknown.
-    - `cuts`: where the segments of the period begin, in periods after its start; the first at 0.
-    - `parameters`: numbers of the scene that are unknowns too.
-    - `normal`, `anchor`: the plane in which an orbit of unknown period begins: `normal . (x - anchor) = 0`. With a
-      `section` that takes its place.
-    - `free`: projector on the shifts of coordinates under which the scene stays the same; along them the orbit may
+    - `phase`: start time of forced orbits, in periods.
+    - `rtol`, `atol`: tolerances of the runs.
+    - `normal`, `anchor`: the plane in which an orbit of unknown period begins: `normal . (x - anchor) = 0`. A
+      `section` replaces the plane.
+    - `cuts`: starts of the segments, in periods after the start of the orbit; the first is 0.
+    - `period`: of a forced orbit, a function of the parameters of the scene; None if the period is unknown.
+    - `parameters`: names of the numbers of the scene that are unknowns.
+    - `free`: projector on the shifts of coordinates under which the scene is invariant, along which the orbit may
       advance. `pinned`: projector on these and on the directions in which elements stick throughout; in all of them
       the orbit begins at `anchor`. Shape `[n, n]` each.
     - `held`: names of the friction elements that stick throughout.
@@ -63,12 +64,12 @@ class OrbitProblem(eqx.Module):
 
     @property
     def spans(self) -> Float[Array, "segments 2"]:
-        """Where the segments begin and end, in periods."""
+        """Start and end of each segment, in periods."""
         return self.phase + jnp.stack([self.cuts, jnp.append(self.cuts[1:], 1.0)], axis=1)
 
     @property
     def values(self) -> np.ndarray:
-        """Values that the parameters have in the scene."""
+        """Values of the parameters in the scene."""
         return np.array([read_element(self.scene, name) for name in self.parameters])
 
     def with_values(self, values: Array | np.ndarray) -> Scene:
@@ -80,34 +81,34 @@ class OrbitProblem(eqx.Module):
         return unknown if self.period is None else jnp.asarray(self.period(scene.params), unknown.dtype)
 
     def closure(self, start: Array | np.ndarray, end: Array | np.ndarray) -> Array | np.ndarray:
-        """Zero where the state at the end is that at the start, but for the advance, and the start is in its place."""
+        """Zero if the end is the start plus an allowed advance, and the start is at the anchor in pinned directions."""
         miss = end - start
         return miss - self.free @ miss + self.pinned @ (start - self.anchor)
 
     def plane(self, x: Array, dof: int) -> Array:
-        """Zero where an orbit of unknown period may begin."""
+        """Zero at an allowed start of an orbit of unknown period."""
         if self.section is not None:
             return jnp.asarray(self.section(x[:dof], x[dof : 2 * dof]), x.dtype)
         return jnp.sum(self.normal * (x - self.anchor))
 
 
 def pack(state: State) -> Float[Array, " n"]:
-    """Coordinates, velocities and own states of effects in one vector."""
+    """Coordinates, velocities and states of effects in one vector."""
     return ravel_pytree(tuple(state))[0]
 
 
 def unpack(scene: Scene, x: Array, dof: int) -> State:
-    """The state in such a vector."""
+    """The inverse of `pack`."""
     shape = tuple(State(x[:dof], x[:dof], scene.initial_state(x[:dof])))
     return State(*ravel_pytree(shape)[1](x))
 
 
 class Returned(NamedTuple):
-    """The state after a segment, and derivatives.
+    """The state after a segment, with derivatives.
 
-    - `x`: at its end, shape `[n]`; `by`: its derivatives by start, unknown period and parameters, `[n, unknowns]`.
-    - `plane`, `plane_by`: of `OrbitProblem.plane` at its start.
-    - `code`: how the run ended.
+    - `x`: state at the end, shape `[n]`. `by`: its derivatives by start, period and parameters, `[n, unknowns]`.
+    - `plane`, `plane_by`: value and gradient of `OrbitProblem.plane` at the start.
+    - `code`: result code of the run.
     """
 
     x: Float[Array, " n"]
@@ -127,7 +128,7 @@ def run_segment(
     times: Array | None = None,
     max_steps: int = 16384,
 ) -> Trajectory:
-    """The run from x over a segment; at these times [s] as far as they are inside it, else at its end alone."""
+    """The run from x over a segment, saved at these times [s], clipped to the segment, or at its end alone."""
     y = unpack(scene, x, dof)
     t0, t1 = span * period
     return simulate(
@@ -165,15 +166,15 @@ def _returned(problem: OrbitProblem, span: Array, unknowns: Array, dof: int) -> 
 
 
 class ShotOrbit(NamedTuple):
-    """Starts of the segments, a period [s] and values of the parameters, and what becomes of them in a period.
+    """The equations of an orbit at given unknowns: starts of the segments, period and parameters.
 
-    - `x`: shape `[segments, n]`; `values`: `[parameters]`.
+    - `x`: starts, shape `[segments, n]`. `period`: [s]. `values`: of the parameters, `[parameters]`.
     - `maps`: derivatives of the state after each segment by the state before it, `[segments, n, n]`.
-    - `flows`: rates of the state at the starts, `[segments, n]`; of unknown period.
+    - `flows`: rates of the state at the starts, `[segments, n]`, if the period is unknown.
     - `advance`: change of the state in a period along the shifts of the scene, `[n]`.
-    - `residual`: of the equations, `[segments n]`, and one more with the plane; `by`: their derivatives by starts,
-      period (of unknown period alone) and parameters.
-    - `failure`: how the run ended early; "" where it did not.
+    - `residual`: of the equations, `[segments n]`, and one more for the plane if the period is unknown. `by`: their
+      derivatives by starts, period (if unknown) and parameters.
+    - `failure`: why the run ended early, or "".
     """
 
     x: np.ndarray
@@ -188,7 +189,7 @@ class ShotOrbit(NamedTuple):
 
     @property
     def value(self) -> float:
-        """Of the parameter along which a branch is followed, the last one."""
+        """Value of the parameter along which a branch is followed, the last one."""
         return float(self.values[-1])
 
     @property
@@ -201,18 +202,27 @@ class ShotOrbit(NamedTuple):
 
     @property
     def unknowns(self) -> np.ndarray:
-        """What the columns of `by` belong to."""
+        """The unknowns, in the order of the columns of `by`."""
         period = [self.period] if len(self.residual) > self.x.size else []
         return np.array([*self.x.ravel(), *period, *self.values])
 
+    def scaled(self, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives by the unknowns in their scales, and residuals.
+
+        Rows of the state have the scale of the state, that of the plane its largest derivative.
+        """
+        size = self.x.size
+        rows = np.append(scale[:size], np.max(np.abs(self.by[size:] * scale), axis=1, initial=1e-300))
+        return self.by * scale / rows[:, None], self.residual / rows
+
 
 class SettledState(NamedTuple):
-    """Where the search starts.
+    """The start of the search.
 
-    - `x`: states at the begins of the segments, `[segments, n]`; `cuts`: when these are, in periods after the first.
+    - `x`: starts of the segments, `[segments, n]`. `cuts`: their times, in periods after the first.
     - `period`: [s].
     - `scale`: magnitudes of the state and the period, `[n + 1]`.
-    - `held`: names of the friction elements that stick throughout; `moving`: a sentence on coordinates that move on.
+    - `held`: names of the friction elements that stick throughout. `moving`: a sentence on coordinates that advance.
     """
 
     x: np.ndarray
@@ -227,7 +237,7 @@ def evaluate(problem: OrbitProblem, x: np.ndarray, period: float, values: np.nda
     """The equations of an orbit at these unknowns."""
     (count, n), spans = x.shape, np.asarray(problem.spans)
     starts = [jnp.asarray([*y, period, *values]) for y in x]
-    # Of a shape that does not depend on how many segments there are: one program serves any number of them.
+    # The shape does not depend on the number of segments: one program serves any number.
     alone = replace(problem, cuts=problem.cuts[:0], held=())
     made = jax.device_get([_returned(alone, span, y, dof) for span, y in zip(problem.spans, starts, strict=True)])
     by = np.zeros((x.size, x.size + 1 + len(values)))

@@ -1,4 +1,4 @@
-"""Where the search for an orbit starts: a simulation that settles."""
+"""The start of the search for an orbit: a simulation that settles."""
 
 from collections.abc import Sequence
 
@@ -11,22 +11,22 @@ from ..simulation import SimulationError, Trajectory, simulate
 from ._neutral import anchored, moving_on
 from ._return_map import MAX_EVENTS, MAX_STEPS, OrbitError, OrbitProblem, Section, SettledState
 
-# Times at which a run is looked at.
+# Number of saved times of a run.
 _TIMES = 4001
-# Distance of two states of a run, in its extent, that is a return.
+# A run returns if two states are nearer than this, relative to its extent.
 _NEAR = 0.02
-# And the largest one, where a run comes no nearer.
+# Largest such distance, if the run comes no nearer.
 _FAR = 0.2
-# Distance of the begin of a segment from changes of modes that is enough, in segments.
+# Sufficient distance of the start of a segment from changes of modes, in segments.
 _CLEAR = 0.1
-# Tolerances of a run within which its range is no motion.
+# A range below this number of tolerances of the run is no motion.
 _NOISE = 10.0
-# Part of the run at its end in which returns are looked for.
+# Returns are searched for in this last fraction of the run.
 _LAST = 0.5
 
 
 def run_for(problem: OrbitProblem, state: State, t0: float, ts: np.ndarray) -> Trajectory:
-    """A run of the scene from t0 to the last of these times."""
+    """A run of the scene from t0 to the last of the times `ts`."""
     try:
         return simulate(
             *(problem.scene, state.q, state.qd, ts[-1]),
@@ -43,7 +43,7 @@ def run_for(problem: OrbitProblem, state: State, t0: float, ts: np.ndarray) -> T
 
 
 def states_of(*runs: Trajectory) -> np.ndarray:
-    """States along runs one after the other, shape `[time, n]`."""
+    """States along consecutive runs, shape `[time, n]`."""
     return np.concatenate([_states(run) for run in runs])
 
 
@@ -59,25 +59,25 @@ def modes_of(run: Trajectory) -> np.ndarray:
 
 
 def held(run: Trajectory) -> np.ndarray:
-    """How many elements stick, and contacts are closed, at each time of a run, shape `[time]`."""
+    """Number of elements in stick and of closed contacts at each time of a run, shape `[time]`."""
     return np.sum(modes_of(run) == np.asarray([holding_mode(run, name) for name in run.mode]), axis=1)
 
 
 def holding_mode(run: Trajectory, name: str) -> float:
-    """The mode in which an element takes motion away: stick, a closed contact; NaN for a switch."""
+    """The mode in which an element holds a velocity at zero: stick, or a closed contact; NaN for a switch."""
     return 0.0 if name in run.scene.event_driven else 1.0 if name in run.scene.contacts else np.nan
 
 
 def held_throughout(runs: Sequence[Trajectory], since: int = 0) -> tuple[str, ...]:
-    """Names of the friction elements that stick at all times of the runs, from this index of each on."""
+    """Names of the friction elements that stick at all times of the runs, from the index `since` on."""
     names = runs[0].scene.event_driven
     return tuple(name for name in names if not any(np.any(run.mode[name][since:]) for run in runs))
 
 
 def begins(at: np.ndarray, modes: np.ndarray, held: np.ndarray, segments: int) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of states for the segments to begin at, and when that is: about equally long, if possible in slip.
+    """Indices of the states at which segments begin, and their times: about equally long, if possible in slip.
 
-    `at` are the times of the states in periods, from 0 up; they need not be in order.
+    `at` are the times of the states in periods, from 0 on, in any order.
     """
     order = np.argsort(at, kind="stable")
     changes = at[order][1:][np.any(np.diff(modes[order], axis=0) != 0, axis=1)]
@@ -95,7 +95,7 @@ def settled(problem: OrbitProblem, state: State, settle: float, section: Section
 
     **Raises:**
 
-    - `OrbitError` where the run comes to rest, or does not return.
+    - `OrbitError` if the run comes to rest, or does not return.
     """
     if problem.period is not None:
         period = float(problem.period(problem.scene.params))
@@ -135,9 +135,9 @@ def cut(problem: OrbitProblem, runs: Sequence[Trajectory], period: float, segmen
 
 
 def magnitudes(problem: OrbitProblem, x: np.ndarray, dof: int, period: float) -> np.ndarray:
-    """Half the range of each entry of the state along a run, and the period; of what does not move its magnitude.
+    """Half the range of each entry of the state along a run, and the period; entries at rest have their magnitude.
 
-    A range within the errors of the run is no motion. The velocity of a coordinate has at least the magnitude of the
+    A range within the errors of the run counts as rest. The velocity of a coordinate has at least the magnitude of the
     coordinate over the period.
     """
     half, size = 0.5 * np.ptp(x, axis=0), np.max(np.abs(x), axis=0)
@@ -148,7 +148,7 @@ def magnitudes(problem: OrbitProblem, x: np.ndarray, dof: int, period: float) ->
 
 
 def _return_time(ts: np.ndarray, x: np.ndarray, moving: str) -> float:
-    """How long before its end a run was last in the same state; from the last piece of its path backwards."""
+    """Time [s] since the run was last in its final state, searched backwards along its path."""
     begin, way = x[1:][::-1] - x[-1], (x[:-1] - x[1:])[::-1]
     length = np.sum(way * way, axis=1)
     part = np.clip(-np.sum(begin * way, axis=1) / np.where(length > 0, length, 1.0), 0.0, 1.0)
@@ -156,8 +156,8 @@ def _return_time(ts: np.ndarray, x: np.ndarray, moving: str) -> float:
     away = np.flatnonzero(apart > 0.5)
     if not len(away):
         raise OrbitError(
-            "The run comes to rest, or does not move enough to have a period. Begin elsewhere; an equilibrium is no"
-            " periodic orbit."
+            "The run comes to rest, or does not move enough to have a period. Begin at another state. An equilibrium is"
+            " no periodic orbit."
         )
     first = int(away[0])
     later = apart[first:]
@@ -165,21 +165,21 @@ def _return_time(ts: np.ndarray, x: np.ndarray, moving: str) -> float:
     near = [int(i) for i in lowest if later[i] < max(_NEAR, 3.0 * np.min(later[lowest]))]
     if not near or later[near[0]] > _FAR:
         raise OrbitError(
-            "The run does not return to where it was in the second half of `settle`: pass a longer `settle`, or there"
-            f" is no stable orbit here.{moving}"
+            "The run does not return to an earlier state in the second half of `settle`. Pass a longer `settle`, unless"
+            f" there is no stable orbit here.{moving}"
         )
     return float((first + near[0] + part[first + near[0]]) * (ts[1] - ts[0]))
 
 
 def _beginning(run: Trajectory, x: np.ndarray, last: np.ndarray, section: Section | None) -> int:
-    """Index of a state for an orbit to begin at: on the section, or where no mode changes for longest, in slip."""
+    """Index of the start of an orbit: on the section, or in the middle of its longest phase, in slip if possible."""
     if section is not None:
         values = np.asarray([float(section(run.q[i], run.qd[i])) for i in last])
         up = np.flatnonzero((values[:-1] < 0) & (values[1:] >= 0))
         if not len(up):
             raise OrbitError(
-                f"The section is not crossed from below along the orbit: its values go from {values.min():.4g} to"
-                f" {values.max():.4g}. Pass one that is zero on it, or none."
+                f"The section is not crossed from below along the orbit: its values range from {values.min():.4g} to"
+                f" {values.max():.4g}. Pass a section that is zero on the orbit, or none."
             )
         return int(last[up[-1]])
     if run.modes is None:
@@ -189,7 +189,7 @@ def _beginning(run: Trajectory, x: np.ndarray, last: np.ndarray, section: Sectio
     cuts = np.flatnonzero(np.any(modes[1:] != modes[:-1], axis=1)) + 1
     pieces = np.split(np.arange(len(last)), cuts)
     if len(pieces) > 1 and np.array_equal(modes[-1], modes[0]):
-        # The ends of the period are in one phase.
+        # The first and the last piece are one phase.
         pieces = [np.concatenate([pieces[-1], pieces[0]]), *pieces[1:-1]]
     piece = min(pieces, key=lambda each: (stuck[each[0]], -len(each)))
     return int(last[piece[len(piece) // 2]])

@@ -1,4 +1,4 @@
-"""Where a branch of periodic orbits begins on another branch: at a period doubling, and at a Hopf point."""
+"""First orbits of branches that begin on another branch, at a period doubling or a Hopf point."""
 
 from dataclasses import dataclass
 
@@ -7,41 +7,40 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from ..scene import Scene, replace_elements
-from ._branch import DOUBLING, HOPF, SpecialOrbit
-from ._describe import describe
+from ._branch import DOUBLING, HOPF, BifurcationPoint
 from ._equilibrium import Equilibrium, nearest_oscillation, prepare_rest, rest_scale
 from ._neutral import anchored
 from ._newton import Condition, newton
-from ._orbit import PeriodicOrbit
+from ._orbit import PeriodicOrbit, describe
+from ._orbit_step import OrbitStep, step_at
 from ._periodic_orbit import prepare
 from ._rest import rest_at
 from ._return_map import OrbitError, OrbitProblem, PeriodFn, Section, SettledState, ShotOrbit, pack
-from ._step import BranchStep, step_at
 
-# First step to the orbits of twice the period, in the extent of the orbit.
+# First step to the orbits of twice the period, relative to the extent of the orbit.
 _BESIDE = 0.02
-# Amplitude of the first orbit at a Hopf point, in the size of the state there: the least one, which is doubled until
-# parameter or period have changed by so much of span or period, and made smaller where they have by too much.
+# Smallest amplitude of the first orbit at a Hopf point, relative to the size of the state. It is doubled until the
+# parameter or the period has changed by the second number, relative to span or period, and reduced beyond the third.
 _LEAST, _CHANGE, _FAR, _TRIES = 1e-3, 1e-3, 1e-2, 16
-# Part of the largest entry of an eigenvector below which an entry is zero.
+# Relative size of the entries of an eigenvector that count as zero.
 _STILL = 1e-9
 
 
-def beside(
+def first_step(
     scene: Scene,
-    point: SpecialOrbit,
+    point: BifurcationPoint,
     parameter: str,
     span: tuple[float, float],
     period: float | PeriodFn | None,
     section: Section | None,
     rtol: float,
     atol: float,
-) -> BranchStep:
-    """The first orbit of the branch that begins at a special orbit, or equilibrium.
+) -> OrbitStep:
+    """The first orbit of the branch that begins at a bifurcation.
 
     **Raises:**
 
-    - `ValueError` where none begins; `OrbitError` where it is not found.
+    - `ValueError` if none begins there; `OrbitError` if it is not found.
     """
     orbit = point.orbit
     if (DOUBLING if isinstance(orbit, PeriodicOrbit) else HOPF) != point.kind:
@@ -50,22 +49,22 @@ def beside(
         raise ValueError(
             f"The branch starts at {parameter} = {point.value:.6g}, which must be within span, but {span} was given."
         )
-    there, length = replace_elements(scene, {parameter: point.value}), abs(span[1] - span[0])
+    at_point, length = replace_elements(scene, {parameter: point.value}), abs(span[1] - span[0])
     if isinstance(orbit, PeriodicOrbit):
-        doubled = None if period is None else _Twice(period)
-        problem, start, dof = prepare(there, orbit, doubled, section, None, rtol, atol, (parameter,))
+        doubled = None if period is None else _TwicePeriod(period)
+        problem, start, dof = prepare(at_point, orbit, doubled, section, None, rtol, atol, (parameter,))
         return _doubled(problem, start, point, length, dof)
     if period is not None or section is not None:
         raise ValueError(
-            "Orbits that begin at a Hopf point have their own period and start: pass neither period nor section."
+            "The period and the start of orbits at a Hopf point are computed: pass neither period nor section."
         )
-    return _born(there, point, parameter, length, (rtol, atol))
+    return _at_hopf_point(at_point, point, parameter, length, (rtol, atol))
 
 
 def _doubled(
-    problem: OrbitProblem, start: SettledState, point: SpecialOrbit[PeriodicOrbit], span: float, dof: int
-) -> BranchStep:
-    """Beside a period doubling, along its direction."""
+    problem: OrbitProblem, start: SettledState, point: BifurcationPoint[PeriodicOrbit], span: float, dof: int
+) -> OrbitStep:
+    """The first orbit of twice the period, in the direction of a period doubling."""
     twice = 2.0 * start.period if problem.autonomous else start.period
     n, scale = start.x.size, start.scale.copy()
     scale[-1] = span
@@ -75,26 +74,25 @@ def _doubled(
     tangent[:n] = point.direction / scale[:n]
     tangent /= np.linalg.norm(tangent)
     shot = newton(problem, start.x, twice, np.array([point.value]), dof, scale)[0]
-    here = BranchStep(problem, shot, point.orbit, scale, tangent)
-    shot, _ = here.corrected(_BESIDE)
-    return here.described(shot)
+    at_point = OrbitStep(problem, shot, point.orbit, scale, tangent)
+    return at_point.moved_to(at_point.corrected(_BESIDE)[0])
 
 
 @dataclass(frozen=True)
-class _Twice:
-    """Two periods."""
+class _TwicePeriod:
+    """Twice a period."""
 
     period: float | PeriodFn
 
     def __call__(self, params: PyTree) -> Array | float:
-        """Their length [s]."""
+        """Twice the period [s]."""
         return 2.0 * (self.period(params) if callable(self.period) else self.period)
 
 
-def _born(
-    scene: Scene, point: SpecialOrbit[Equilibrium], parameter: str, span: float, tolerances: tuple[float, float]
-) -> BranchStep:
-    """A small orbit beside a Hopf point, which begins on the real part of the eigenvector."""
+def _at_hopf_point(
+    scene: Scene, point: BifurcationPoint[Equilibrium], parameter: str, span: float, tolerances: tuple[float, float]
+) -> OrbitStep:
+    """A small orbit at a Hopf point, which begins on the real part of the eigenvector."""
     rest, dof = point.orbit, len(point.orbit.q)
     centre, (wave, extent), born = np.asarray(pack(rest.state)), _wave(scene, rest), rest.period
     n, empty, (rtol, atol) = len(centre), jnp.zeros(0), map(jnp.asarray, tolerances)
@@ -102,7 +100,7 @@ def _born(
     problem = OrbitProblem(scene, jnp.zeros(()), rtol, atol, empty, empty, empty, None, None, (parameter,), none, none)
     along = wave / extent
     row = np.append(along / (along @ along), [0.0, 0.0])
-    first: BranchStep | None = None
+    first: OrbitStep | None = None
     x, period, value, amplitude = centre + _LEAST * wave, born, point.value, _LEAST
     for _ in range(_TRIES):
         scale = np.append(amplitude * extent, [period, span])
@@ -116,7 +114,7 @@ def _born(
             shot, _ = newton(here, x[None, :], period, np.array([value]), dof, scale, (condition,))
             change = max(abs(shot.value - point.value) / span, abs(shot.period / born - 1.0))
             if change > _FAR:
-                raise OrbitError("The orbit is not next to the Hopf point.")
+                raise OrbitError("The orbit is not near the Hopf point.")
         except OrbitError:
             if first is not None:
                 return first
@@ -127,18 +125,18 @@ def _born(
         first = step_at(here, shot, describe(here, shot, dof)[0], np.array([span]), sense)
         if change > _CHANGE:
             return first
-        # Parameter and period change by the square of the amplitude.
+        # Parameter and period change with the square of the amplitude.
         amplitude, x = 2.0 * amplitude, centre + 2.0 * (shot.x[0] - centre)
         period, value = 4.0 * shot.period - 3.0 * born, 4.0 * shot.value - 3.0 * point.value
     if first is None:
-        raise OrbitError("No orbit is found next to the Hopf point: the equations may not be smooth there.")
+        raise OrbitError("No orbit is found near the Hopf point: the equations may not be smooth there.")
     return first
 
 
 def _wave(scene: Scene, rest: Equilibrium) -> tuple[np.ndarray, np.ndarray]:
-    """State, without its rest, along the small oscillation at a Hopf point, and the extent of each entry.
+    """Displacement of the state in the small oscillation at a Hopf point, and the extent of each entry.
 
-    As large as makes a coordinate move by its size; of the phase at which the state is farthest from rest.
+    A coordinate moves by its size. The phase is that with the largest displacement of the state.
     """
     x, dof = np.asarray(pack(rest.state)), len(rest.q)
     problem = prepare_rest(scene, rest.q, None, None)[0]
@@ -148,5 +146,5 @@ def _wave(scene: Scene, rest: Equilibrium) -> tuple[np.ndarray, np.ndarray]:
     wave = point.basis @ vectors[:, np.argmin(np.abs(values - nearest_oscillation(values.astype(complex))))]
     wave = wave / np.max(np.abs(wave[:dof]) / size[:dof])
     extent = np.where(np.abs(wave) > _STILL * np.max(np.abs(wave)), np.abs(wave), size)
-    turn = np.sum((wave / extent) ** 2)
-    return np.real(wave * np.exp(-0.5j * np.angle(turn))), extent
+    phase = 0.5 * np.angle(np.sum((wave / extent) ** 2))
+    return np.real(wave * np.exp(-1j * phase)), extent

@@ -1,4 +1,4 @@
-"""A branch on disk: written as it grows, gone on with by the same call."""
+"""A branch on disk, written as it grows, from which the same call resumes."""
 
 import json
 import os
@@ -14,35 +14,35 @@ import numpy as np
 
 from .._core.system import extra
 from ..scene import Scene, scene_numbers
-from ._branch import SpecialOrbit
-from ._describe import describe
+from ._branch import BifurcationPoint
+from ._orbit import PeriodicOrbit, describe
+from ._orbit_step import OrbitStep
 from ._return_map import OrbitError, OrbitProblem, ShotOrbit, evaluate, pack
-from ._step import BranchStep
 
 # Kind, value, index, phase, period, state and direction.
 _StoredPoint: TypeAlias = tuple[str, float, int, float, float, list[float], list[float]]
 
-# Orbits between two times that a branch is written.
+# Number of orbits between two writes.
 _OFTEN = 20
 
 
 class BranchStore:
-    """A Zarr store of the orbits of a branch: states, periods and values, and what is known of them.
+    """A Zarr store of a branch: states, periods and values of its orbits, and derived quantities.
 
     **Raises:**
 
-    - `ValueError` if the folder holds something else, or another branch.
+    - `ValueError` if the folder is no store of a branch, or of another branch.
     """
 
     def __init__(self, path: Path, scene: Scene, parameter: str, span: Sequence[float]) -> None:
-        """Read what is there."""
+        """Open a store, or prepare a new one."""
         self._path, self.steps = path, 0
         numbers = {name: np.asarray(x).tolist() for name, x in scene_numbers(scene).items()}
         self._about = {"parameter": parameter, "span": list(span), "numbers": numbers}
         self._arrays: dict[str, np.ndarray] = {}
         self._points: list[_StoredPoint] = []
         if self._before.exists() and not path.exists():
-            os.rename(self._before, path)  # the process was killed in that moment
+            os.rename(self._before, path)  # the process was killed between the two renames of `write`
         if not path.exists():
             return
         try:
@@ -51,17 +51,18 @@ class BranchStore:
             self._arrays = {name: np.asarray(x) for name, x in stored.items()}
         except (KeyError, ValueError, OSError) as error:
             raise ValueError(
-                f"{path} exists and is no store of a branch ({type(error).__name__}): name another one, or remove it."
+                f"{path} is no store of a branch ({type(error).__name__}): pass another folder as out, or remove it."
             ) from error
         changed = [name for name, x in self._about.items() if about.get(name) != x]
         if changed:
             raise ValueError(
-                f"{path} holds another branch; what differs: {', '.join(changed)}. Name another store, or remove it."
+                f"{path} holds another branch, which differs in: {', '.join(changed)}. Pass another folder as out, or"
+                " remove it."
             )
         self.steps = len(self._arrays["value"])
 
-    def read(self, begin: BranchStep) -> tuple[list[BranchStep], list[SpecialOrbit]]:
-        """The orbits that are there, computed again from their states."""
+    def read(self, begin: OrbitStep) -> tuple[list[OrbitStep], list[BifurcationPoint[PeriodicOrbit]]]:
+        """The stored orbits and bifurcations, computed again from their states."""
         steps, points, dof = [], [], len(begin.orbit.q)
         stored = zip(*(self._arrays[name] for name in ("state", "period", "value", "tangent", "phase")), strict=True)
         for x, period, value, sense, phase in stored:
@@ -71,22 +72,23 @@ class BranchStore:
         for kind, value, index, phase, period, x, direction in self._points:
             problem = replace(begin.problem, phase=jnp.asarray(phase))
             shot = self._shot(problem, np.asarray(x), period, value, dof)
-            points.append(SpecialOrbit(kind, value, index, describe(problem, shot, dof)[0], np.asarray(direction)))
+            orbit = describe(problem, shot, dof)[0]
+            points.append(BifurcationPoint(kind, value, index, orbit, np.asarray(direction)))
         return steps, points
 
     def _shot(self, problem: OrbitProblem, x: np.ndarray, period: float, value: float, dof: int) -> ShotOrbit:
         shot = evaluate(problem, x[None], period, np.array([value]), dof)
         if shot.failure:
-            raise OrbitError(f"An orbit of {self._path} does not run any more: {shot.failure}")
+            raise OrbitError(f"The run of an orbit stored in {self._path} fails: {shot.failure}")
         return shot
 
-    def write_often(self, steps: list[BranchStep], points: list[SpecialOrbit]) -> None:
-        """Write where there are some more."""
+    def write_often(self, steps: list[OrbitStep], points: list[BifurcationPoint[PeriodicOrbit]]) -> None:
+        """Write the branch after every twentieth orbit."""
         if len(steps) % _OFTEN == 0:
             self.write(steps, points)
 
-    def write(self, steps: list[BranchStep], points: list[SpecialOrbit]) -> None:
-        """Write all of it, in the place of what was there."""
+    def write(self, steps: list[OrbitStep], points: list[BifurcationPoint[PeriodicOrbit]]) -> None:
+        """Write the whole branch, and replace the former store atomically."""
         orbits = [each.orbit for each in steps]
         multipliers = np.array([each.multipliers for each in orbits])
         rows = {
@@ -102,12 +104,12 @@ class BranchStore:
             "multipliers_imaginary": (("orbit", "multiplier"), np.imag(multipliers)),
             "stable": ("orbit", [each.stable for each in orbits]),
         }
-        special: list[_StoredPoint] = []
+        stored: list[_StoredPoint] = []
         for each in points:
             x, phase = np.asarray(pack(each.orbit.state)).tolist(), float(each.orbit.t0 / each.orbit.period)
             period, direction = float(each.orbit.period), each.direction.tolist()
-            special.append((each.kind, each.value, each.index, phase, period, x, direction))
-        attrs = {"branch": json.dumps(self._about), "points": json.dumps(special)}
+            stored.append((each.kind, each.value, each.index, phase, period, x, direction))
+        attrs = {"branch": json.dumps(self._about), "points": json.dumps(stored)}
         data = extra("xarray").Dataset({name: (dims, np.array(x)) for name, (dims, x) in rows.items()}, attrs=attrs)
         self._path.parent.mkdir(parents=True, exist_ok=True)
         scratch = self._path.with_name(f".{self._path.name}.{uuid.uuid4().hex}")
@@ -120,5 +122,5 @@ class BranchStore:
 
     @property
     def _before(self) -> Path:
-        """Where the store is for the moment in which another one takes its place."""
+        """Path of the former store while it is replaced."""
         return self._path.with_name(f".{self._path.name}.before")

@@ -17,8 +17,7 @@ from scipy.interpolate import CubicHermiteSpline
 from .._core.arguments import as_float, as_whole
 from .._core.position import as_position_fn
 from ..simulation import Trajectory
-from ._figure import Figure
-from ._style import BLUE, GREY
+from ._style import BLUE, GREY, Figure
 
 _MOST_FRAMES = 5000
 _BUTTONS = {

@@ -1,4 +1,4 @@
-"""A map of a sweep."""
+"""Maps of a sweep over two dimensions."""
 
 import textwrap
 from collections.abc import Hashable, Iterable, Mapping
@@ -13,22 +13,21 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from .._core.arguments import did_you_mean
-from ._figure import Figure
-from ._style import BLUE, GREEN, RED, plain_ticks, with_unit
+from ._style import BLUE, GREEN, RED, Figure, plain_ticks, with_unit
 
 if TYPE_CHECKING:
     import xarray as xr
 
 _CLASSES = ("#cfdceb", BLUE, "#e3a73f", GREEN, "#8c6bb1", "#5ab4ac", "#b15928", "#666666")
-# Integers without names that are few enough to have an entry of the legend each.
+# Integers without names have a legend entry each, up to this number.
 _FEW = len(_CLASSES)
-# Runs that failed, by reason, the most frequent first; runs that were not computed.
+# Colours of failed runs by reason, the most frequent first; of runs that were not computed.
 _FAILED, _NOT_RUN = ("#1a1a1a", "#6b4a2b", "#8a8a8a"), "#f6f1dc"
 _CURVES = ("-", "--", ":", "-.")
-# A map of more cells than these is an image inside vector graphics.
+# A map with more cells is rasterized in vector graphics.
 _CELLS = 2500
 
-# Codes beside those of failed runs: a run that was not computed, as in `result`; one that gave no number all the same.
+# Codes beside those of `result`: a run that was not computed, and a completed run whose value is no number.
 _UNRUN, _NAN = -1, -2
 
 # Curves over a map: label to x and y.
@@ -39,7 +38,7 @@ Curves: TypeAlias = Mapping[str, tuple[object, object]]
 class _Side:
     """An axis of a map.
 
-    - `label`: its name and unit; `edges`: of the cells, one more than there are; `log`: whether it is logarithmic.
+    - `label`: its name and unit; `edges`: of the cells, one more than the number of cells; `log`: logarithmic or not.
     """
 
     label: str
@@ -48,7 +47,7 @@ class _Side:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """From the smallest to the largest value, whatever the order of the cells."""
+        """The smallest and the largest value."""
         return float(self.edges.min()), float(self.edges.max())
 
 
@@ -62,27 +61,27 @@ def map2d(
     classes: Mapping[int, str] | None = None,
     boundary: Curves | None = None,
 ) -> Figure:
-    """A variable of a sweep over two dimensions.
+    """Draw a variable of a sweep over two dimensions.
 
-    An axis is logarithmic where its values are more evenly spaced in their logarithms than as they are. Runs that
-    failed and runs that were not computed have colours of their own, and the legend says how many they are, and why.
+    An axis is logarithmic if the logarithms of its values are more evenly spaced than the values. Failed runs and runs
+    that were not computed have their own colours; the legend counts them and gives the reasons.
 
     **Arguments:**
 
     - `dataset`: from `jaxmodsim.sweep`.
-    - `name`: the variable, with two dimensions; its attribute `units` goes to the colour bar. There is a legend instead
-      where its values have names, from `classes` or from its attributes `flag_values` and `flag_meanings`, and where
-      they are integers and at most eight different ones.
-    - `x`, `y`: what the axes show: a dimension, or a number that changes along one. By default the last dimension goes
-      to the right, as in xarray. Their attribute `units` goes to the labels.
+    - `name`: the variable, with two dimensions; its attribute `units` labels the colour bar. A legend replaces the bar
+      if the values have names, from `classes` or the attributes `flag_values` and `flag_meanings`, or are at most eight
+      different integers.
+    - `x`, `y`: a dimension, or a coordinate that varies along one, for each axis. The default for `x` is the last
+      dimension, as in xarray. The attribute `units` of a coordinate goes to its label.
     - `title`: above the map.
     - `classes`: a name for each value of the variable.
     - `boundary`: curves over the map: label to x and y, of the shape `[points]` each.
 
     **Raises:**
 
-    - `ValueError` for unknown names, a number of dimensions other than two, values of an axis that neither rise nor
-      fall, are no numbers, or less than two, and values without a name in `classes`.
+    - `ValueError` for unknown names, a number of dimensions other than two, axis values that are not monotonic, not
+      numbers, or fewer than two, and values without a name in `classes`.
     """
     values, across, up = _read(dataset, name, x, y)
     cells = np.asarray(values, float)
@@ -107,9 +106,9 @@ def map2d(
     plain_ticks(axes.xaxis, axes.yaxis)
     axes.set_title(title, fontsize=11)
     if entries:
-        # What the numbers are stands beside the bar, or here; names say it themselves.
-        counted = names is not None and list(names.values()) == [f"{value:g}" for value in names]
-        head = label if counted else None
+        # Bare numbers need the name of the variable as a title; names of classes do not.
+        bare = names is not None and list(names.values()) == [f"{value:g}" for value in names]
+        head = label if bare else None
         figure.legend(handles=entries, loc="outside lower center", ncols=2, fontsize=9, title=head)
     return figure
 
@@ -130,8 +129,8 @@ def _read(dataset: "xr.Dataset", name: str, x: str | None, y: str | None) -> "tu
         right = left.pop(0)
     if left or right is None or upwards is None:
         have = f"{name!r} has {len(values.dims)}: {', '.join(map(str, values.dims)) or 'none'}"
-        mend = f" Take one place of the others first: dataset.isel({dict.fromkeys(left, -1)})." if left else ""
-        raise ValueError(f"A map has two dimensions, but {have}.{mend}")
+        mend = f" Select one index of the others first: dataset.isel({dict.fromkeys(left, -1)})." if left else ""
+        raise ValueError(f"map2d needs a variable with two dimensions, but {have}.{mend}")
     across, up = _side(dataset, right, x), _side(dataset, upwards, y)
     return values.transpose(upwards, right), across, up
 
@@ -144,7 +143,7 @@ def _check_known(kind: str, name: object, known: Iterable[object]) -> None:
 
 
 def _dimension(dataset: "xr.Dataset", values: "xr.DataArray", given: str) -> Hashable:
-    """The dimension that a name of an axis means: itself, or that of a number that changes along it alone."""
+    """The dimension of an axis name: itself, or the dimension of the coordinate of that name."""
     along = {dim: dim for dim in values.dims}
     along |= {each: c.dims[0] for each, c in dataset.coords.items() if len(c.dims) == 1 and c.dims[0] in values.dims}
     _check_known("axis", given, along)
@@ -152,7 +151,7 @@ def _dimension(dataset: "xr.Dataset", values: "xr.DataArray", given: str) -> Has
 
 
 def _side(dataset: "xr.Dataset", dim: Hashable, given: str | None) -> _Side:
-    """The axis of a dimension, by the number of that name, by the first that changes along it, or by plain counting."""
+    """The axis of a dimension: the coordinate of that name, the first that varies along it, or the index."""
     along = [name for name, coordinate in dataset.coords.items() if coordinate.dims == (dim,)]
     name = given if given in along else dim if dim in along or not along else along[0]
     coordinate = dataset[name]
@@ -164,8 +163,8 @@ def _side(dataset: "xr.Dataset", dim: Hashable, given: str | None) -> _Side:
     steps = np.diff(values.astype(float))
     if not ((steps > 0).all() or (steps < 0).all()):
         raise ValueError(
-            f"The values of the axis {name!r} must rise or fall throughout: use dataset.sortby({name!r}), or name"
-            " another number that changes along it."
+            f"The values of the axis {name!r} must be monotonic: use dataset.sortby({name!r}), or name another"
+            " coordinate that varies along it."
         )
     log = bool((values > 0).all()) and values.size > 2 and _spread(np.log(values)) < _spread(values)
     label = with_unit(str(coordinate.attrs.get("long_name", name)), str(coordinate.attrs.get("units", "")))
@@ -173,13 +172,13 @@ def _side(dataset: "xr.Dataset", dim: Hashable, given: str | None) -> _Side:
 
 
 def _spread(values: np.ndarray) -> float:
-    """How uneven the steps are: zero where all are equal."""
+    """Standard deviation of the steps over their mean: zero for equal steps."""
     steps = np.diff(values.astype(float))
     return float(np.std(steps) / abs(np.mean(steps)))
 
 
 def _edges(values: np.ndarray, log: bool) -> np.ndarray:
-    """Edges of cells half way between the values, those at the ends as far out as the next ones are in."""
+    """Edges of cells half way between the values; the outer edges are as far from their value as the inner ones."""
     x = np.log(values) if log else values.astype(float)
     middle = 0.5 * (x[1:] + x[:-1])
     edges = np.concatenate([[2.0 * x[0] - middle[0]], middle, [2.0 * x[-1] - middle[-1]]])
@@ -187,7 +186,7 @@ def _edges(values: np.ndarray, log: bool) -> np.ndarray:
 
 
 def _codes(dataset: "xr.Dataset", values: "xr.DataArray") -> np.ndarray:
-    """How each run of a map ended; of a map of that itself, whether it was run."""
+    """The result code of each run; in a map of `result` itself only whether the run was computed."""
     result = dataset["result"] if "result" in dataset.data_vars else None
     if result is None or not set(result.dims) <= set(values.dims):
         return np.zeros(values.shape, int)
@@ -196,19 +195,19 @@ def _codes(dataset: "xr.Dataset", values: "xr.DataArray") -> np.ndarray:
 
 
 def _flags(values: "xr.DataArray") -> dict[int, str]:
-    """Names of values, from the attributes."""
+    """Names of values, from the attributes of the variable."""
     return dict(zip(values.attrs.get("flag_values", ()), values.attrs.get("flag_meanings", ()), strict=False))
 
 
-def _names(values: "xr.DataArray", there: np.ndarray, classes: Mapping[int, str] | None) -> dict[int, str] | None:
-    """A name for each class of the variable; None where it has none."""
-    distinct = np.unique(there)
+def _names(values: "xr.DataArray", shown: np.ndarray, classes: Mapping[int, str] | None) -> dict[int, str] | None:
+    """A name for each class of the variable; None for a variable without classes."""
+    distinct = np.unique(shown)
     named = dict(classes) if classes is not None else _flags(values)
     if named:
         nameless = [f"{value:g}" for value in distinct if value not in named]
         if nameless:
             known = ", ".join(f"{value:g}" for value in named)
-            raise ValueError(f"Only {known} of {values.name!r} have names, but there is also {nameless[0]}.")
+            raise ValueError(f"{values.name!r} has the value {nameless[0]}, but only {known} have names in classes.")
         return named
     few = 0 < distinct.size <= _FEW and bool((distinct == np.round(distinct)).all())
     return {int(value): f"{value:g}" for value in distinct} if few else None
@@ -220,7 +219,7 @@ def _draw(axes: Axes, across: _Side, up: _Side, cells: np.ndarray, **style: Any)
 
 
 def _draw_classes(axes: Axes, across: _Side, up: _Side, cells: np.ndarray, names: dict[int, str]) -> list[Patch]:
-    """One colour for each class, and an entry of the legend for each that occurs."""
+    """Draw one colour for each class; returns a legend entry for each class that occurs."""
     colours = [_CLASSES[i % _FEW] for i in range(len(names))]
     entries = []
     place = np.full(cells.shape, np.nan)
@@ -235,7 +234,7 @@ def _draw_classes(axes: Axes, across: _Side, up: _Side, cells: np.ndarray, names
 def _draw_failures(
     axes: Axes, across: _Side, up: _Side, codes: np.ndarray, sentences: Mapping[int, str]
 ) -> list[Patch]:
-    """Runs that have no number, by reason; `codes` are 0 for all others."""
+    """Draw runs without a number, coloured by reason; `codes` are 0 for all others."""
     reasons, counts = np.unique(codes[codes != 0], return_counts=True)
     place, entries = np.full(codes.shape, np.nan), []
     failed = sorted(((n, code) for code, n in zip(reasons, counts, strict=True) if code != _UNRUN), reverse=True)
@@ -265,5 +264,5 @@ def _draw_curves(axes: Axes, curves: Curves) -> list[Line2D]:
 
 
 def _folded(text: str) -> str:
-    """Short enough for a legend."""
+    """A text folded and shortened for a legend."""
     return textwrap.fill(textwrap.shorten(text, 110, placeholder=" ..."), 56)

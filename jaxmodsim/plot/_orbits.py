@@ -1,4 +1,4 @@
-"""Periodic orbits and branches of them."""
+"""Figures of periodic orbits and their branches."""
 
 from collections.abc import Sequence
 
@@ -8,8 +8,7 @@ from matplotlib.axes import Axes
 from ..orbits import Branch, PeriodicOrbit
 from ..scene import quantity_of, scene_units
 from ..simulation import Trajectory
-from ._figure import Figure
-from ._style import BLUE, COLOURS, GREY, RED, legend_beside, panel_letters, with_unit
+from ._style import BLUE, COLOURS, GREY, RED, Figure, legend_beside, panel_letters, with_unit
 
 _MARKERS = {
     "fold": "s",
@@ -22,14 +21,14 @@ _MARKERS = {
     "grazing": "X",
     "order of modes": "x",
 }
-# Range of an axis of periods, in the period, that is not made larger: what hardly changes should look so.
+# Smallest range of a period axis, relative to the period: small changes are to look small.
 _LEAST_RANGE = 0.05
-# Powers of ten of numbers that are written out.
+# Powers of ten between which tick labels are plain numbers.
 _PLAIN = (-3, 4)
 
 
 def orbit_figure(orbit: PeriodicOrbit) -> Figure:
-    """A periodic orbit in the phase plane of each coordinate, coloured by the modes.
+    """Plot a periodic orbit in the phase plane of each coordinate, coloured by mode.
 
     **Arguments:**
 
@@ -48,15 +47,15 @@ def orbit_figure(orbit: PeriodicOrbit) -> Figure:
 
 
 def branch_figure(branch: Branch[PeriodicOrbit], coordinate: int = 0, *, beside: Sequence[Branch] = ()) -> Figure:
-    """A branch: amplitude and, where it changes by itself, period over the parameter; and orbits in the phase plane.
+    """Plot amplitude and, for autonomous scenes, period over the parameter, and three orbits in the phase plane.
 
-    Lines are full where orbits are stable, dashed where they are not.
+    Solid lines are stable orbits, dashed lines unstable ones.
 
     **Arguments:**
 
     - `branch`: from `jaxmodsim.continue_orbits`.
     - `coordinate`: index of the coordinate.
-    - `beside`: branches over the same parameter whose amplitudes are drawn too, of equilibria for instance.
+    - `beside`: other branches over the same parameter, such as equilibria, whose amplitudes are drawn too.
     """
     orbits = branch.orbits
     autonomous = orbits[0].autonomous
@@ -103,19 +102,19 @@ def _draw_branch(axis: Axes, branch: Branch, values: np.ndarray) -> None:
 
 
 def _draw_orbit(axis: Axes, orbit: PeriodicOrbit, i: int, known: list[str]) -> None:
-    """One coordinate and its velocity; a colour for each combination of modes, the stuck ones thick."""
+    """Draw one coordinate and its velocity, with a colour for each combination of modes and thick lines in stick."""
     q, qd = (np.concatenate([np.asarray(getattr(run, name))[:, i] for run in orbit.runs]) for name in ("q", "qd"))
-    combinations = _modes_in_words(orbit)
+    combinations = _modes(orbit)
     named = set(axis.get_legend_handles_labels()[1])
     for start in range(len(q) - 1):
-        words = combinations[start]
-        colour = COLOURS[known.index(words) % len(COLOURS)]
-        stuck = "stick" in words or "closed" in words
-        label = f"_{words}" if words in named else words  # once in a legend
+        modes = combinations[start]
+        colour = COLOURS[known.index(modes) % len(COLOURS)]
+        stuck = "stick" in modes or "closed" in modes
+        label = f"_{modes}" if modes in named else modes  # one legend entry for each
         axis.plot(q[start : start + 2], qd[start : start + 2], color=colour, lw=2.6 if stuck else 1.3, label=label)
-        if stuck:  # on the ground it is a point
+        if stuck:  # stick on ground at rest is a single point
             axis.plot(q[start], qd[start], "o", color=colour, ms=4, zorder=3)
-        named.add(words)
+        named.add(modes)
     (name, unit), (rate, rate_unit) = (quantity_of(orbit.runs[0].scene, f"{kind}[{i}]") for kind in ("q", "qd"))
     axis.set(xlabel=with_unit(name, unit), ylabel=with_unit(rate, rate_unit))
     axis.ticklabel_format(scilimits=_PLAIN)
@@ -123,22 +122,21 @@ def _draw_orbit(axis: Axes, orbit: PeriodicOrbit, i: int, known: list[str]) -> N
 
 def _known(*orbits: PeriodicOrbit) -> list[str]:
     """All combinations of modes, in the order of their colours."""
-    return sorted({words for orbit in orbits for words in _modes_in_words(orbit)})
+    return sorted({modes for orbit in orbits for modes in _modes(orbit)})
 
 
-def _modes_in_words(orbit: PeriodicOrbit) -> list[str]:
-    """Modes on each piece between two times of the runs, after the events at its begin."""
-    return [words for run in orbit.runs for words in _modes_of_run(run)]
+def _modes(orbit: PeriodicOrbit) -> list[str]:
+    """The combination of modes from each saved time on, after the events at that time."""
+    return [modes for run in orbit.runs for modes in _modes_of_run(run)]
 
 
 def _modes_of_run(run: Trajectory) -> list[str]:
-    words = run.mode_labels
     if run.modes is None:
         return ["orbit"] * len(run.t)
-    columns = [[words[name][int(x)] for x in np.asarray(mode)] for name, mode in run.mode.items()]
-    alone = len(columns) == 1
-    names = list(run.mode)
+    columns = [[run.mode_labels[name][int(x)] for x in np.asarray(mode)] for name, mode in run.mode.items()]
+    if len(columns) == 1:
+        return columns[0]
     return [
-        row[0] if alone else ", ".join(f"{name} {mode}" for name, mode in zip(names, row, strict=True))
+        ", ".join(f"{name} {mode}" for name, mode in zip(run.mode, row, strict=True))
         for row in zip(*columns, strict=True)
     ]

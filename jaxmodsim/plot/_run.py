@@ -7,18 +7,17 @@ from matplotlib.axes import Axes
 
 from ..scene import Friction, quantity_of
 from ..simulation import Trajectory
-from ._figure import Figure
-from ._style import COLOURS, GREY, legend_beside, panel_letters
+from ._style import COLOURS, GREY, Figure, legend_beside, panel_letters
 
 _SHADE = "#d9d9d9"
 
 
 def run(trajectory: Trajectory) -> Figure:
-    """Coordinates, velocities and friction forces of a run against time, with the time in stick shaded.
+    """Plot coordinates, velocities and friction forces of a run against time, with stick phases shaded.
 
-    One panel for the coordinates of each unit, one for their velocities, and one for each friction element. Time in
-    stick is that of elements that run by events: shaded in the panel of the element, and in all panels where it is the
-    only one. Names and units are those of `Scene(..., coordinates=...)`.
+    Coordinates with one unit share a panel, as do their velocities; each friction element has its own. Stick phases are
+    those of event-driven elements. They are shaded in the panel of the element, or in all panels if it is the only one.
+    Names and units are those of `Scene(..., coordinates=...)`.
 
     ```python
     jaxmodsim.plot.run(jaxmodsim.simulate(scene, q0, qd0, t1, ts=jnp.linspace(0.0, t1, 1001)))
@@ -26,17 +25,17 @@ def run(trajectory: Trajectory) -> Figure:
 
     **Arguments:**
 
-    - `trajectory`: the run, kept at some times `ts`.
+    - `trajectory`: the run, saved at two or more times `ts`.
 
     **Raises:**
 
-    - `ValueError` for a run that holds one time alone, and for a batch of runs.
+    - `ValueError` for a run saved at a single time, and for a batch of runs.
     """
     scene, table = trajectory.scene, trajectory.columns
     if len(table.time) < 2:
         raise ValueError(
-            f"A run is drawn over the times that it was kept at, but this one has {len(table.time)}: pass the times, as"
-            " in simulate(..., ts=jnp.linspace(t0, t1, 1001))."
+            f"plot.run needs a run saved at two or more times, but it has {len(table.time)}: pass the times, as in"
+            " simulate(..., ts=jnp.linspace(t0, t1, 1001))."
         )
     panels: list[tuple[str, dict[str, np.ndarray]]] = []
     for kind in ("q", "qd"):
@@ -81,7 +80,7 @@ def _draw(axis: Axes, t: np.ndarray, unit: str, lines: Mapping[str, np.ndarray])
 
 
 def _stick_intervals(trajectory: Trajectory) -> dict[str, list[tuple[float, float]]]:
-    """Begin and end of each time in stick [s], of each element that runs by events."""
+    """Start and end times [s] of the stick phases of each event-driven element."""
     scene, events = trajectory.scene, trajectory.events
     intervals: dict[str, list[tuple[float, float]]] = {}
     begin, end = float(trajectory.request.t0), float(trajectory.t_end)

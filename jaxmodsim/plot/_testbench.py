@@ -6,18 +6,17 @@ import numpy as np
 from matplotlib.colors import LogNorm
 
 from ..problems.testbench import RampRun
-from ._figure import Figure
-from ._style import BLUE, COLOURS, GREY, RED, panel_letters
+from ._style import BLUE, COLOURS, GREY, RED, Figure, panel_letters
 
 
 def ramp_figure(title: str, runs: Sequence[RampRun], zoom: tuple[float, float] = (0.0, 3.0)) -> Figure:
-    """Velocity, velocity about zero, and applied and friction force against time, one row for each run.
+    """Plot velocity, velocity near zero, and applied and friction force against time, one row for each run.
 
     **Arguments:**
 
     - `title`: of the figure.
-    - `runs`: the runs.
-    - `zoom`: time span [s] of the second and third column, in which the stick phase lies.
+    - `runs`: one row each.
+    - `zoom`: time span [s] of the second and third column, which contains the stick phase.
     """
     figure = Figure(figsize=(14, 0.6 + 2.7 * len(runs)), layout="constrained")
     axes = figure.subplots(len(runs), 3, squeeze=False, width_ratios=(1, 1, 1.2))
@@ -28,7 +27,7 @@ def ramp_figure(title: str, runs: Sequence[RampRun], zoom: tuple[float, float] =
             axis.set(ylabel="velocity [m/s]")
         early = run.velocity[run.applied <= 1.4]
         reach = max(2.0 * float(np.max(np.abs(early), initial=0.0)), 2e-3)
-        middle.set(xlim=zoom, ylim=(-reach, reach), title="about zero")
+        middle.set(xlim=zoom, ylim=(-reach, reach), title="near zero")
         left.set(title=run.label, xlim=(0.0, 10.0))
         right.plot(run.t, run.applied, color=GREY, lw=1.4, ls="--", label="applied force")
         right.plot(run.t, run.friction, color=RED, lw=1.0, label="friction force")
@@ -54,7 +53,7 @@ def stick_figure(
     sigma1: np.ndarray,
     oscillation: np.ndarray,
 ) -> Figure:
-    """How LuGre's stick oscillates: friction in stick for a few parameters, and a map over sigma0 and sigma1.
+    """Plot the oscillation of LuGre friction in stick: against time, and its amplitude over sigma0 and sigma1.
 
     **Arguments:**
 
@@ -62,7 +61,7 @@ def stick_figure(
     - `friction`: friction force [N] by label, shape `[time]`.
     - `applied`: applied force [N], shape `[time]`.
     - `sigma0`, `sigma1`: axes of the map [N/m], [N s/m].
-    - `oscillation`: amplitude of friction about the applied force in stick [N], shape `[sigma0, sigma1]`.
+    - `oscillation`: amplitude [N] of friction about the applied force in stick, shape `[sigma0, sigma1]`.
     """
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.15, 1))

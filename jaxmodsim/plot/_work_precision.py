@@ -1,11 +1,10 @@
-"""Work against precision."""
+"""Work-precision diagrams."""
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from ..analysis import Row, WorkPrecision
-from ._figure import Figure
-from ._style import COLOURS, GREY, RED, panel_letters, plain_ticks, with_unit
+from ._style import COLOURS, GREY, RED, Figure, panel_letters, plain_ticks, with_unit
 
 _MARKERS = "osD^vPX*"
 _LABELS = {
@@ -17,11 +16,11 @@ _LABELS = {
 
 
 def work_precision_figure(study: WorkPrecision, *, cost: str = "run") -> Figure:
-    """Time and evaluations of the field over the error: the lower left is the better place.
+    """Plot time and evaluations of the vector field over the error: lower left is better.
 
-    Bars are quartiles. Where one method iterates, and its evaluations are not known, steps take their place. A
-    grey band holds errors by which the references themselves disagree; dotted lines are errors of formulations, which
-    no tolerance takes away. Failures stand below, with the reason.
+    Error bars are quartiles. If the evaluations of an iterative method are unknown, steps replace them. In the grey
+    band the references disagree. Dotted lines are modelling errors, which no tolerance removes. Failures are listed
+    below the panels, with the reason.
 
     **Arguments:**
 
@@ -30,10 +29,10 @@ def work_precision_figure(study: WorkPrecision, *, cost: str = "run") -> Figure:
 
     **Raises:**
 
-    - `ValueError` if the cost was not measured.
+    - `ValueError` for a cost that the study has not measured.
     """
     if cost not in study.costs:
-        raise ValueError(f"cost is {cost!r}, but measured were: {', '.join(study.costs)}.")
+        raise ValueError(f"cost must be one that the study has measured ({', '.join(study.costs)}), but is {cost!r}.")
     failures = _failures(study)
     height = 4.4 + 0.2 * len(failures)
     figure = Figure(figsize=(11.5, height), layout="constrained")
@@ -61,11 +60,11 @@ def work_precision_figure(study: WorkPrecision, *, cost: str = "run") -> Figure:
         axes.grid(which="major", alpha=0.3)
         _mark_floor(axes, study.disagreement)
     left.set(ylabel=_LABELS[cost].format(batch=study.batch), title="Time: lower left is better")
-    right.set(ylabel="evaluations of the field [1]" if counted else "steps [1]", title="Work")
+    right.set(ylabel="evaluations of the vector field [1]" if counted else "steps [1]", title="Work")
     plain_ticks(left.yaxis, right.yaxis)
     panel_letters((left, right))
     if any(row.model for row in study.rows):
-        handles += left.plot([], [], color=GREY, ls=":", label="error of the model")
+        handles += left.plot([], [], color=GREY, ls=":", label="modelling error")
     figure.legend(handles=handles, fontsize=9, frameon=False, loc="outside right upper")
     figure.suptitle(f"{study.problem}: {study.observable} {study.when}", fontsize=11)
     if failures:
@@ -74,7 +73,7 @@ def work_precision_figure(study: WorkPrecision, *, cost: str = "run") -> Figure:
 
 
 def _failures(study: WorkPrecision) -> list[str]:
-    """A line for each failure, cut to the width of the figure."""
+    """A line for each failure, shortened to the width of the figure."""
     lines = [f"failed: {row.method}, {row.setting}: {row.failed}" for row in study.rows if row.failed]
     return [line if len(line) <= 170 else f"{line[:167]}..." for line in lines]
 
@@ -84,7 +83,7 @@ def _scale(study: WorkPrecision) -> str:
 
 
 def _shown(row: Row, study: WorkPrecision) -> float:
-    """The error, at the floor where the references cannot tell, and where it is zero at the rounding unit."""
+    """The error, or the disagreement of the references or the rounding unit if that is larger."""
     return max(row.error or 0.0, study.disagreement, float(np.finfo(float).eps))
 
 

@@ -1,8 +1,9 @@
-"""Reference systems by name, one module each: its scene, its numbers and its exact or reference solution."""
+"""Reference problems, one module each, with its scene, its parameters and its exact or reference solution."""
 
 from . import belt_oscillator as belt_oscillator
 from . import bouncing_ball as bouncing_ball
 from . import braked_spring as braked_spring
+from . import bristles as bristles
 from . import cart_pole as cart_pole
 from . import cartesian_pendulum as cartesian_pendulum
 from . import charged_particle as charged_particle
@@ -11,12 +12,8 @@ from . import foucault_pendulum as foucault_pendulum
 from . import four_bar as four_bar
 from . import knife_edge as knife_edge
 from . import n_link_pendulum as n_link_pendulum
-from . import pulled_box as pulled_box
 from . import ramped_box as ramped_box
-from . import rod_on_rough_floor as rod_on_rough_floor
-from . import rolling_disc as rolling_disc
 from . import slider_crank as slider_crank
-from . import slipping_bristle as slipping_bristle
 from . import spherical_pendulum as spherical_pendulum
 from . import spiral_bead as spiral_bead
 from . import stick_slip_pendulum as stick_slip_pendulum

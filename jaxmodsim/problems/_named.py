@@ -1,4 +1,4 @@
-"""Runs of the reference systems by name: what a solver can be tried on."""
+"""Runs of the reference problems by name, on which solvers can be tried."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,6 +12,7 @@ from ..scene import Scene
 from . import (
     belt_oscillator,
     braked_spring,
+    bristles,
     cart_pole,
     cartesian_pendulum,
     charged_particle,
@@ -19,9 +20,7 @@ from . import (
     four_bar,
     knife_edge,
     n_link_pendulum,
-    pulled_box,
     ramped_box,
-    slipping_bristle,
     spherical_pendulum,
     stick_slip_pendulum,
     turntable_puck,
@@ -35,10 +34,10 @@ class NamedProblem:
     - `name`: as in `named_problems`.
     - `scene`: the `Scene`.
     - `q0`, `qd0`: coordinates and velocities at t = 0, shape `[dof]`.
-    - `t1`: end [s].
-    - `observable`: what is asked, at t1: `q[0]`, `qd[0]`, or an effect's name for its force.
-    - `exact`: its value by a closed form, in the precision JAX runs in; None where there is none.
-    - `max_steps`: that a run at a relative tolerance of 1e-10 may need.
+    - `t1`: end time [s].
+    - `observable`: the quantity of interest at t1: `q[0]`, `qd[0]`, or the name of an effect for its force.
+    - `exact`: its value by a closed form, in the precision of JAX, or None.
+    - `max_steps`: sufficient number of steps at a relative tolerance of 1e-10.
     """
 
     name: str
@@ -58,7 +57,7 @@ class NamedProblem:
 
 
 def named_problems() -> dict[str, Callable[[], NamedProblem]]:
-    """Functions that make each `NamedProblem`, by its name. Nothing is computed before one is called.
+    """Functions that build each `NamedProblem`, by name.
 
     ```python
     case = named_problems()["braked_spring"]()
@@ -66,11 +65,11 @@ def named_problems() -> dict[str, Callable[[], NamedProblem]]:
     run.q[-1, 0] - case.exact
     ```
 
-    Set-valued friction with a closed form: `coulomb_box`, `braked_spring`, `belt_oscillator`, `stick_slip_pendulum`;
-    without: `stribeck_belt`, `coupled_belts`, `cart_pole`, `turntable_puck` (in the plane). Bristles: `lugre_box`,
-    `pulled_box` (stiff), `slipping_bristle` (closed form). Smooth: `spherical_pendulum` and `charged_particle` (closed
-    forms), `double_pendulum`. With constraints: `cartesian_spherical_pendulum` and `knife_edge` (closed forms),
-    `four_bar`.
+    - Set-valued friction with a closed form: `coulomb_box`, `braked_spring`, `belt_oscillator`, `stick_slip_pendulum`.
+    - Set-valued friction: `stribeck_belt`, `coupled_belts`, `cart_pole`, `turntable_puck` (in the plane).
+    - Bristles: `lugre_box`, `pulled_box` (stiff), `slipping_bristle` (closed form).
+    - Smooth: `spherical_pendulum` and `charged_particle` (closed forms), `double_pendulum`.
+    - Constraints: `cartesian_spherical_pendulum` and `knife_edge` (closed forms), `four_bar`.
     """
     return dict(_CASES)
 
@@ -99,13 +98,13 @@ def _lugre_box() -> NamedProblem:
 
 
 def _pulled_box() -> NamedProblem:
-    return _case("pulled_box", pulled_box.scene(), [0.0], [0.0], 20.0, "q[0]", max_steps=200_000)
+    return _case("pulled_box", bristles.pulled_box(), [0.0], [0.0], 20.0, "q[0]", max_steps=200_000)
 
 
 def _slipping_bristle() -> NamedProblem:
     law, v, t1 = ramped_box.lugre(), 0.1, 0.05
-    force = law.sigma0 * slipping_bristle.deflection(jnp.asarray(t1), law, v) + law.sigma2 * v
-    return _case("slipping_bristle", slipping_bristle.scene(law, v), [0.0], [0.0], t1, "friction", float(force))
+    force = law.sigma0 * bristles.deflection(jnp.asarray(t1), law, v) + law.sigma2 * v
+    return _case("slipping_bristle", bristles.slipping_bristle(law, v), [0.0], [0.0], t1, "friction", float(force))
 
 
 def _braked_spring() -> NamedProblem:
@@ -137,12 +136,12 @@ def _coupled_belts() -> NamedProblem:
 
 
 def _stick_slip_pendulum() -> NamedProblem:
-    """From turn to turn until it sticks, where its weight cannot overcome the friction."""
+    """The exact angle is that of the first turning point at which the weight cannot overcome friction."""
     p, start = stick_slip_pendulum.PARAMS, 1.2
-    place, numbers = start, {name: p[name] for name in ("m", "l", "g", "Fc")}
-    while p["m"] * p["g"] * p["l"] * abs(np.sin(place)) > p["Fs"]:
-        place = float(stick_slip_pendulum.turn(place, **numbers))
-    return _case("stick_slip_pendulum", stick_slip_pendulum.scene(), [start], [0.0], 10.0, "q[0]", place)
+    angle, numbers = start, {name: p[name] for name in ("m", "l", "g", "Fc")}
+    while p["m"] * p["g"] * p["l"] * abs(np.sin(angle)) > p["Fs"]:
+        angle = float(stick_slip_pendulum.turn(angle, **numbers))
+    return _case("stick_slip_pendulum", stick_slip_pendulum.scene(), [start], [0.0], 10.0, "q[0]", angle)
 
 
 def _cart_pole() -> NamedProblem:
@@ -163,7 +162,7 @@ def _spherical_pendulum() -> NamedProblem:
 
 
 def _cartesian_spherical_pendulum() -> NamedProblem:
-    """The spherical pendulum again, its place held on the sphere by a constraint."""
+    """The spherical pendulum in Cartesian coordinates, with a constraint."""
     phi, turn, t1 = 1.8, 2.0, 5.0
     q0, qd0 = [np.sin(phi), 0.0, np.cos(phi)], [0.0, turn * np.sin(phi), 0.0]
     exact = float(np.cos(spherical_pendulum.motion(t1, phi, turn)))

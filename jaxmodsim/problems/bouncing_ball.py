@@ -1,4 +1,4 @@
-"""A ball that bounces on the floor: infinitely many events in a finite time."""
+"""A ball that bounces on the floor, with infinitely many events in a finite time."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ def falling(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
 
 
 class BouncingBall(eqx.Module):
-    """A point mass falling on a floor that gives a part of its speed back, as functions for `jaxmodsim.EventSolver`.
+    """A point mass that bounces on a floor, as functions for `jaxmodsim.EventSolver`.
 
     ```python
     ball = BouncingBall(e=0.5)
@@ -25,13 +25,12 @@ class BouncingBall(eqx.Module):
     diffrax.diffeqsolve(diffrax.ODETerm(ball.field), solver, 0.0, 1.0, None, start, ...)
     ```
 
-    What is integrated is (height [m], velocity [m/s]), positive upwards, shape `[2]`; the mode is 0, and 1 once the
-    ball lies on the floor, which only `hold` makes it do. The instants of the bounces: `bounces`; the
-    motion: `motion`; the end of all bounces: `rest`.
+    The state is (height [m], velocity [m/s]), positive upwards, shape `[2]`. The mode is 0 in flight, and 1 at rest on
+    the floor after `hold`. `bounces` has the times of the bounces, `motion` the motion, `rest` the time of the rest.
 
     **Arguments:**
 
-    - `e`: coefficient of restitution, > 0, below 1 if it is to come to rest.
+    - `e`: coefficient of restitution, > 0; the ball comes to rest for e < 1.
     - `g`: gravity [m/s^2], > 0.
     """
 
@@ -39,16 +38,16 @@ class BouncingBall(eqx.Module):
     g: Number = parameter("g", "m/s^2", lower=0.0, strict=True, default=9.81)
 
     def __check_init__(self) -> None:
-        """Refuse numbers out of range."""
+        """Check the ranges of the parameters."""
         check_ranges(self)
 
     def dropped(self, h: ArrayLike) -> Float[Array, "2"]:
-        """What is integrated, at rest at the height `h` [m], > 0."""
+        """The state at rest at the height `h` [m], > 0."""
         h = jnp.asarray(h, self.g.dtype)
         return jnp.stack([h, jnp.zeros_like(h)])
 
     def field(self, t: object, s: EventState, args: object) -> EventState:
-        """Rate: in free fall, or zero on the floor."""
+        """Rate of the state: free fall, or zero at rest on the floor."""
         return s.rate(jnp.where(s.mode > 0.5, 0.0, jnp.stack([s.y[1], -self.g])))
 
     def guards(self, t: object, s: EventState, args: object) -> Float[Array, "1"]:
@@ -56,11 +55,11 @@ class BouncingBall(eqx.Module):
         return s.y[:1]
 
     def reset(self, t: object, s: EventState, args: object, fired: Bool[Array, "1"]) -> EventState:
-        """Bounce: the velocity changes its sign and keeps the part e."""
+        """Bounce: multiply the velocity by -e."""
         return s._replace(y=jnp.stack([jnp.zeros_like(s.y[0]), -self.e * s.y[1]]))
 
     def hold(self, t: object, s: EventState, args: object, fired: Bool[Array, "1"]) -> EventState:
-        """Come to rest on the floor."""
+        """Stop the ball on the floor."""
         return s._replace(y=jnp.zeros_like(s.y), mode=jnp.ones_like(s.mode))
 
 
@@ -69,7 +68,7 @@ def _height(t: Array, q: Array, p: dict[str, Array]) -> Array:
 
 
 def scene(*, e: ArrayLike, g: ArrayLike = 9.81, m: ArrayLike = 1.0) -> Scene:
-    """The ball at the height `q[0]` [m] over the floor, whose contact is called `floor`.
+    """The ball at the height `q[0]` [m] over the contact `floor`.
 
     **Arguments:**
 
@@ -81,11 +80,11 @@ def scene(*, e: ArrayLike, g: ArrayLike = 9.81, m: ArrayLike = 1.0) -> Scene:
 
 
 def bounces(n: int, *, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81) -> Float[Array, " n"]:
-    """Times [s] of the first `n` bounces, dropped from `h` at t = 0: `sqrt(2 h/g) (1 + 2 (e + e^2 + ...))`.
+    """Times [s] of the first `n` bounces after a drop from `h` at t = 0: `sqrt(2 h/g) (1 + 2 (e + e^2 + ...))`.
 
     **Arguments:**
 
-    - `n`: how many, > 0.
+    - `n`: number of bounces, > 0.
     - `h`: height [m], > 0.
     - `e`: coefficient of restitution, > 0.
     - `g`: gravity [m/s^2], > 0.
@@ -95,7 +94,7 @@ def bounces(n: int, *, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81) -> Float
 
 
 def rest(*, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81) -> Float[Array, ""]:
-    """Time [s] at which all bounces are over: `sqrt(2 h/g) (1 + e)/(1 - e)`; e < 1, else as `bounces`."""
+    """Time [s] at which the ball comes to rest: `sqrt(2 h/g) (1 + e)/(1 - e)` for e < 1; arguments as for `bounces`."""
     e = jnp.asarray(e)
     return jnp.sqrt(2.0 * h / jnp.asarray(g)) * (1.0 + e) / (1.0 - e)
 
@@ -103,11 +102,10 @@ def rest(*, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81) -> Float[Array, ""]
 def motion(
     t: Float[Array, "..."], *, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Height [m] and velocity [m/s] at the times `t` [s], dropped from `h` at t = 0; shape as `t`.
+    """Height [m] and velocity [m/s] at the times `t` [s], after a drop from `h` at t = 0; shape as `t`.
 
-    The time that is left before rest, in units of what is left after the first bounce, falls by the factor e from
-    bounce to bounce, so its logarithm counts them. From bounce n on it is a throw at `e^n sqrt(2 g h)`. Arguments as
-    for `rest`, t >= 0.
+    The time left before rest falls by the factor e from bounce to bounce, so its logarithm counts the bounces. After
+    bounce n the motion is a throw at `e^n sqrt(2 g h)`. Arguments as for `rest`, t >= 0.
     """
     g = jnp.asarray(g)
     fall, end = jnp.sqrt(2.0 * h / g), rest(h=h, e=e, g=g)

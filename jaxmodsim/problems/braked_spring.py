@@ -1,4 +1,4 @@
-"""A mass on a spring with Coulomb friction: it stops after a whole number of half cycles."""
+"""A mass on a spring with Coulomb friction, which stops after a whole number of half cycles."""
 
 from typing import NamedTuple
 
@@ -8,13 +8,13 @@ from jaxtyping import Array, ArrayLike, Float
 from ..friction import Coulomb
 from ..scene import AppliedForce, Friction, Scene
 
-# A set of numbers with stiction, and what follows from it: 12 half cycles, at rest [s] from STOP on.
+# Parameters with stiction. They give 12 half cycles, and rest from the time STOP [s] on.
 PARAMS = {"m": 1.3, "k": 2.7, "Fc": 0.11, "Fs": 0.15, "x0": 1.0}
 STOP = 26.158986444602
 
 
 class Rest(NamedTuple):
-    """Where the mass comes to rest: after `half_cycles`, at the time `t` [s], in the place `x` [m]."""
+    """The final rest: number of half cycles, time `t` [s] and position `x` [m]."""
 
     half_cycles: Float[Array, ""]
     t: Float[Array, ""]
@@ -53,7 +53,7 @@ def _drive(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
 
 
 def driven_spring(law: object, *, m: ArrayLike = 2.0, k: ArrayLike = 20.0) -> Scene:
-    """Mass on a spring on a rough table under a force, as records are made with.
+    """Mass on a spring on a rough table under a given force, for synthetic records.
 
     **Arguments:**
 
@@ -63,17 +63,17 @@ def driven_spring(law: object, *, m: ArrayLike = 2.0, k: ArrayLike = 20.0) -> Sc
 
     **Returns:**
 
-    A `Scene` with one coordinate [m] and the effects `drive`, the force `u` [N] (0 by default; a `Signal` or the input
-    of a `Record` takes its place), and `friction`.
+    A `Scene` with one coordinate [m] and the effects `drive`, the force `u` [N], and `friction`. The parameter `u` is
+    0; a `Signal` or the input of a `Record` replaces it.
     """
     effects = (AppliedForce(_drive, name="drive"), Friction(law))
     return Scene(_lagrangian, params={"m": m, "k": k, "u": 0.0}, effects=effects, coordinates=("x [m]",))
 
 
 def rest(*, x0: ArrayLike, m: ArrayLike, k: ArrayLike, Fc: ArrayLike, Fs: ArrayLike | None = None) -> Rest:
-    """Where and when the mass comes to rest, started at rest from x0.
+    """Position and time of the final rest, after a start at rest at x0.
 
-    With `d = Fc/k`: after `N = ceil((x0 - Fs/k)/(2 d))` half cycles, at `t = N pi sqrt(m/k)` and
+    With `d = Fc/k`, the mass stops after `N = ceil((x0 - Fs/k)/(2 d))` half cycles, at `t = N pi sqrt(m/k)` and
     `x = (-1)^N (x0 - 2 N d)`. So `dx/dFc = -(-1)^N 2 N/k` and `dx/dx0 = (-1)^N`.
 
     **Arguments:**
@@ -81,8 +81,8 @@ def rest(*, x0: ArrayLike, m: ArrayLike, k: ArrayLike, Fc: ArrayLike, Fs: ArrayL
     - `x0`: initial deflection [m], > 0.
     - `m`: mass [kg], > 0.
     - `k`: stiffness [N/m], > 0.
-    - `Fc`: force in slip [N], > 0.
-    - `Fs`: largest force in stick [N], >= Fc; by default Fc.
+    - `Fc`: friction force in slip [N], > 0.
+    - `Fs`: break-away force [N], >= Fc; by default Fc.
 
     **Returns:**
 
@@ -97,10 +97,10 @@ def rest(*, x0: ArrayLike, m: ArrayLike, k: ArrayLike, Fc: ArrayLike, Fs: ArrayL
 def motion(
     t: Float[Array, "..."], *, x0: ArrayLike, m: ArrayLike, k: ArrayLike, Fc: ArrayLike, Fs: ArrayLike | None = None
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Position [m] and velocity [m/s] at the times `t` [s], started at rest from x0 at t = 0; shape as `t`.
+    """Position [m] and velocity [m/s] at the times `t` [s], after a start at rest at x0; shape as `t`.
 
-    In half cycle n, with `d = Fc/k` and `w = sqrt(k/m)`: `x = (-1)^n [d + (x0 - (2 n + 1) d) cos(w t - n pi)]`; at
-    rest from the end of the last one on. Arguments as for `rest`, t >= 0.
+    In half cycle n, with `d = Fc/k` and `w = sqrt(k/m)`: `x = (-1)^n [d + (x0 - (2 n + 1) d) cos(w t - n pi)]`. The
+    mass is at rest after the last half cycle. Arguments as for `rest`, t >= 0.
     """
     end = rest(x0=x0, m=m, k=k, Fc=Fc, Fs=Fs)
     d, w = Fc / jnp.asarray(k), jnp.sqrt(k / jnp.asarray(m))

@@ -40,23 +40,24 @@ def scene(
     g: ArrayLike = PARAMS["g"],
     force: ArrayLike | None = None,
 ) -> Scene:
-    """Uniform rod hinged on a cart that moves along a level track, in a vertical plane.
+    """Uniform rod hinged to a cart on a level track, in a vertical plane.
 
-    The coordinates are the place of the cart x [m] and the angle of the pole [rad] from upright, positive where the
-    pole leans towards larger x.
+    The coordinates are the position x of the cart [m] and the angle of the pole from upright [rad], positive towards
+    larger x.
 
     **Arguments:**
 
     - `law`: friction law between cart and track, with forces in newtons; None for no friction.
     - `M`: mass of the cart [kg], > 0.
-    - `m`: mass of the pole [kg], > 0, spread evenly over its length.
+    - `m`: mass of the uniform pole [kg], > 0.
     - `l`: length of the pole [m], > 0.
     - `g`: gravity [m/s^2].
-    - `force`: constant push on the cart along x [N]; None for none.
+    - `force`: constant force on the cart along x [N]; None for no force.
 
     **Returns:**
 
-    A `Scene`, with the effects `push` and `friction` where they are asked for. Its exact accelerations: `acceleration`.
+    A `Scene`, with the effects `push` (with a force) and `friction` (with a law). `acceleration` has its exact
+    accelerations.
     """
     params: dict[str, ArrayLike] = {"M": M, "m": m, "l": l, "g": g}
     effects: tuple[AbstractEffect, ...] = () if law is None else (Friction(law, along=_track),)
@@ -89,7 +90,7 @@ def acceleration(
 
     - `q`, `qd`: (x, f) [m, rad] and their rates, shape `[2]`.
     - `M`, `m`, `l`, `g`: as for `scene`.
-    - `force`: F [N], of all forces on the cart along x.
+    - `force`: sum F of all forces on the cart along x [N].
 
     **Returns:**
 

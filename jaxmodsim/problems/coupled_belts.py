@@ -1,4 +1,4 @@
-"""Two masses on one belt, each on a spring of its own and coupled by a third."""
+"""Two masses on one belt, each on its own spring, coupled by a third spring."""
 
 from typing import NamedTuple
 
@@ -8,14 +8,14 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from ..friction import Coulomb
 from ..scene import Friction, Scene
 
-# Masses [kg], stiffnesses [N/m] to the ground and between the masses, belt [m/s].
+# Masses [kg], stiffnesses to the ground and between the masses [N/m], belt velocity [m/s].
 PARAMS = {"m1": 1.0, "m2": 1.6, "k1": 100.0, "k2": 130.0, "coupling": 35.0, "belt": 0.1}
-# Forces [N] in slip and largest in stick, of either mass.
+# Friction forces of both masses [N], in slip and at break-away.
 LAWS = ({"Fc": 5.0, "Fs": 8.0}, {"Fc": 6.0, "Fs": 9.5})
 
 
 class FirstSlip(NamedTuple):
-    """The first slip: at the time `t` [s], of the mass `which` (0 or 1), with both at the position `x` [m]."""
+    """The first slip: its time `t` [s], the index `which` of the mass, and the position `x` of both masses [m]."""
 
     t: Float[Array, ""]
     which: Int[Array, ""]
@@ -48,12 +48,12 @@ def scene(
 ) -> Scene:
     """Two masses on a belt: `m1 x1'' = -k1 x1 - c (x1 - x2) - F1`, `m2 x2'' = -k2 x2 + c (x1 - x2) - F2`.
 
-    While one mass sticks, the slip of the other changes its load; they come to slip in turns that follow no simple
-    pattern. Between events the motion is linear.
+    The slip of one mass changes the load of the other. The masses slip in an irregular order. Between events the motion
+    is linear.
 
     **Arguments:**
 
-    - `laws`: friction laws of the two masses; None for Coulomb friction by `LAWS`.
+    - `laws`: friction laws of the two masses; None for Coulomb friction with `LAWS`.
     - `m1`, `m2`: masses [kg], > 0.
     - `k1`, `k2`: stiffnesses of the springs to the ground [N/m], > 0, relaxed at q = 0.
     - `coupling`: stiffness c of the spring between the masses [N/m], >= 0, relaxed at q[0] = q[1].
@@ -61,7 +61,7 @@ def scene(
 
     **Returns:**
 
-    A `Scene` with two coordinates [m] and the effects `first` and `second`. Its start: `first_slip`.
+    A `Scene` with two coordinates [m] and the effects `first` and `second`. `first_slip` has its first event.
     """
     one, two = (Coulomb(**law) for law in LAWS) if laws is None else laws
     return Scene(
@@ -76,20 +76,20 @@ def scene(
 
 
 def first_slip(*, k1: ArrayLike, k2: ArrayLike, belt: ArrayLike, Fs1: ArrayLike, Fs2: ArrayLike) -> FirstSlip:
-    """When, where and which of the two slips first, if both start in stick from q = 0.
+    """The first slip after a start of both masses in stick at q = 0.
 
-    Until then both go with the belt and the spring between them stays relaxed: mass i slips when `k_i belt t` reaches
+    Both masses move with the belt, and the spring between them stays relaxed. Mass i slips when `k_i belt t` reaches
     its limit, so `t = min(Fs1/k1, Fs2/k2)/belt`.
 
     **Arguments:**
 
     - `k1`, `k2`: stiffnesses to the ground [N/m], > 0.
     - `belt`: velocity of the belt [m/s], > 0.
-    - `Fs1`, `Fs2`: largest forces in stick [N], >= 0.
+    - `Fs1`, `Fs2`: break-away forces [N], >= 0.
 
     **Returns:**
 
     A `FirstSlip`.
     """
-    places = jnp.stack([jnp.asarray(Fs1) / k1, jnp.asarray(Fs2) / k2])
-    return FirstSlip(jnp.min(places) / belt, jnp.argmin(places), jnp.min(places))
+    positions = jnp.stack([jnp.asarray(Fs1) / k1, jnp.asarray(Fs2) / k2])
+    return FirstSlip(jnp.min(positions) / belt, jnp.argmin(positions), jnp.min(positions))

@@ -1,6 +1,7 @@
 """A box on a table, pulled by a force that rises with time: the test bench of friction models.
 
-Mass 2 kg, force `ramp * t`, at rest at t = 0, ten seconds (NTNU course TTK4130, exercise 9, problem 2).
+The box has a mass of 2 kg, and is at rest at t = 0. The force is `ramp * t`, for 10 s (NTNU course TTK4130, exercise 9,
+problem 2).
 """
 
 import jax.numpy as jnp
@@ -13,8 +14,8 @@ COULOMB = {"Fc": 1.5}
 STRIBECK = {"Fc": 1.5, "Fs": 1.75, "vs": 0.2, "Fv": 0.1}
 LUGRE = {"sigma0": 750.0, "sigma1": 0.0, "sigma2": 0.1, "Fc": 1.5, "Fs": 1.75, "vs": 0.2}
 
-# Velocity [m/s] and bristle deflection [m] at t = 10 s with LUGRE and a ramp of 1 N/s, on which four solvers
-# agree at tight tolerances.
+# Velocity [m/s] and bristle deflection [m] at t = 10 s with LUGRE and a ramp of 1 N/s. Four solvers agree on these
+# values at tight tolerances.
 LUGRE_V10 = 15.694099521
 LUGRE_Z10 = 0.0020000000
 
@@ -39,7 +40,7 @@ def scene(law: object = None, *, ramp: ArrayLike = 1.0, m: ArrayLike = 2.0) -> S
     **Returns:**
 
     A `Scene` with one coordinate [m] and the effects `pull` and (with a law) `friction`. Without friction
-    `v(t) = v0 + ramp t^2/(2 m)`; with dry friction up to `Fs` the box rests until `t = Fs/ramp`.
+    `v(t) = v0 + ramp t^2/(2 m)`; with a break-away force `Fs` the box rests until `t = Fs/ramp`.
     """
     friction = () if law is None else (Friction(law),)
     return Scene(
@@ -51,15 +52,15 @@ def scene(law: object = None, *, ramp: ArrayLike = 1.0, m: ArrayLike = 2.0) -> S
 
 
 def coulomb() -> Coulomb:
-    """The box's Coulomb law."""
+    """The Coulomb law of the box."""
     return Coulomb(**COULOMB)
 
 
 def stribeck() -> Stribeck:
-    """The box's law with stiction, Stribeck effect and viscous friction."""
+    """The law of the box with stiction, Stribeck effect and viscous friction."""
     return Stribeck(**STRIBECK)
 
 
 def lugre(**changes: ArrayLike) -> LuGre:
-    """The box's LuGre law, with `changes` to its parameters."""
+    """The LuGre law of the box, with `changes` to its parameters."""
     return LuGre(**{**LUGRE, **changes})

@@ -1,4 +1,4 @@
-"""A pendulum with dry friction in its joint: it comes to rest anywhere in a range about the bottom."""
+"""A pendulum with dry friction in its joint, which comes to rest within a range about the bottom."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ..friction import Coulomb
 from ..scene import Friction, Scene
 
-# Mass [kg], length [m], gravity [m/s^2] and the torques of the joint [N m] in slip and at most in stick.
+# Mass [kg], length [m], gravity [m/s^2], and friction torques of the joint in slip and at break-away [N m].
 PARAMS = {"m": 1.0, "l": 0.5, "g": 9.81, "Fc": 0.4, "Fs": 0.6}
 
 
@@ -22,32 +22,31 @@ def scene(
 
     **Arguments:**
 
-    - `law`: friction law of the joint, its forces torques [N m] and its velocities [rad/s]; None for Coulomb friction
-      by `PARAMS`.
+    - `law`: friction law of the joint, of torques [N m] and angular velocities [rad/s]; None for Coulomb friction with
+      `PARAMS`.
     - `m`: mass [kg], > 0.
     - `l`: length [m], > 0.
     - `g`: gravity [m/s^2].
 
     **Returns:**
 
-    A `Scene` with one coordinate, the angle from the bottom [rad], and the effect `friction`. Its turning points:
-    `turn`; it stays at rest where `m g l |sin q| <= Fs`.
+    A `Scene` with one coordinate, the angle from the bottom [rad], and the effect `friction`. `turn` has its turning
+    points. It stays at rest if `m g l |sin q| <= Fs`.
     """
-    numbers = PARAMS
-    law = Coulomb(Fc=numbers["Fc"], Fs=numbers["Fs"]) if law is None else law
+    law = Coulomb(Fc=PARAMS["Fc"], Fs=PARAMS["Fs"]) if law is None else law
     return Scene(_lagrangian, params={"m": m, "l": l, "g": g}, effects=(Friction(law),), coordinates=("angle [rad]",))
 
 
 def turn(start: ArrayLike, *, m: ArrayLike, l: ArrayLike, g: ArrayLike, Fc: ArrayLike) -> Float[Array, ""]:
-    """Angle [rad] at which the pendulum turns next, let go at rest at `start`.
+    """Angle [rad] of the next turning point, after a start at rest at `start`.
 
-    The energy lost is the torque times the angle swept: `m g l (cos b - cos a) = Fc (a + b)` from `a = |start|` to b
-    on the other side. With the angle swept 2 s, that is `sin(a - s) sin(s)/s = Fc/(m g l)`, whose left-hand side falls
-    from sin a at s = 0 to 0 at s = a, so that there is one root if sin a is larger than the right-hand side.
+    The dissipated energy is the torque times the angle of the swing: `m g l (cos b - cos a) = Fc (a + b)` from
+    `a = |start|` to b on the other side. With 2 s for this angle, `sin(a - s) sin(s)/s = Fc/(m g l)`. The left-hand
+    side falls from sin a at s = 0 to 0 at s = a, so there is one root if sin a exceeds the right-hand side.
 
     **Arguments:**
 
-    - `start`: angle at rest [rad], |start| <= pi/2, where the pendulum does not stick.
+    - `start`: angle at rest [rad], |start| <= pi/2, at which the pendulum does not stick.
     - `m`: mass [kg], > 0.
     - `l`: length [m], > 0.
     - `g`: gravity [m/s^2], > 0.
@@ -55,7 +54,7 @@ def turn(start: ArrayLike, *, m: ArrayLike, l: ArrayLike, g: ArrayLike, Fc: Arra
 
     **Returns:**
 
-    The angle with its sign: opposite to that of `start` if the pendulum passes the bottom. Differentiable.
+    The signed angle, opposite to `start` if the pendulum passes the bottom. Differentiable.
     """
     start, share = jnp.asarray(start), jnp.asarray(Fc) / (jnp.asarray(m) * g * l)
     a = jnp.abs(start)
@@ -70,6 +69,6 @@ def turn(start: ArrayLike, *, m: ArrayLike, l: ArrayLike, g: ArrayLike, Fc: Arra
 
     ratio, fixed = jax.lax.stop_gradient(share), jax.lax.stop_gradient(a)
     s, _ = jax.lax.fori_loop(0, 60, halve, (jnp.zeros_like(fixed), fixed))
-    # One step of Newton, which also carries the derivatives.
+    # One step of Newton carries the derivatives.
     s = s - lack(s, a, share) / jax.grad(lack)(s, fixed, ratio)
     return -jnp.sign(start) * (2.0 * s - a)

@@ -106,7 +106,7 @@ def test_lugre_in_single_precision_without_events() -> None:
     def stopped(scene: jms.Scene, simulate: Any) -> Any:
         return slide(scene, simulate) + jax.lax.stop_gradient(scene.params["box"][1])
 
-    assert verdicts(jms.check_gradients(stopped, lugre_box(), names=names[:2])) == {"box[1]": "part"}
+    assert verdicts(jms.check_gradients(stopped, lugre_box(), names=names[:2])) == {"box[1]": "disagree"}
 
 
 @jax.custom_jvp
@@ -128,7 +128,7 @@ def test_a_wrong_rule_and_a_stopped_gradient_are_named() -> None:
         return end(scene, simulate) - square(scene.params["m"])
 
     check = jms.check_gradients(off, spring(**BRAKED), names=FREE)
-    assert verdicts(check) == {"m": "part"}
+    assert verdicts(check) == {"m": "disagree"}
     (remark,) = check.remarks
     assert remark.startswith("m: both modes give -4.2")
     assert "custom_jvp" in remark
@@ -138,7 +138,7 @@ def test_a_wrong_rule_and_a_stopped_gradient_are_named() -> None:
         return run - jax.lax.stop_gradient(run) + jax.lax.stop_gradient(scene.effects[1].law.Fs)  # type: ignore[union-attr]
 
     check = jms.check_gradients(stopped, spring(**BRAKED), names=["friction.Fs"])
-    assert verdicts(check) == {"friction.Fs": "part"}
+    assert verdicts(check) == {"friction.Fs": "disagree"}
     assert "cut off from the result" in check.remarks[0]
 
 
@@ -152,7 +152,7 @@ def test_the_edge_of_another_number_of_half_cycles() -> None:
     check = jms.check_gradients(end, spring(**{**BRAKED, "x0": 1.005 * edge}), names=["x0"])
     assert check.ok
     (remark,) = check.remarks
-    assert "1 % from here, the sequence of modes is another: change 1 of 'friction'" in remark
+    assert "1 % from here, the sequence of modes differs: change 1 of 'friction'" in remark
 
 
 def test_a_load_that_peaks_at_the_limit() -> None:
@@ -160,7 +160,7 @@ def test_a_load_that_peaks_at_the_limit() -> None:
     limit = BRAKED["Fs"]
     above = jms.check_gradients(end, spring(**{**BOX, "A": 1.02 * limit}), names=["A"])
     assert above.ok
-    assert "A: grazing suspected: the event of 'friction' at t = 1.372" in above.remarks[0]
+    assert "A: grazing suspected: the time of the event of 'friction' at t = 1.372" in above.remarks[0]
 
     close = jms.check_gradients(end, spring(**{**BOX, "A": 1.0002 * limit}), names=["A", "m"])
     assert verdicts(close) == {"A": "grazing"}
@@ -194,14 +194,14 @@ def test_kinks_and_ends_of_ranges() -> None:
     assert "must be finite and >= Fc" in str(check)
 
 
-def test_runs_that_cannot_be_watched() -> None:
+def test_traced_runs_are_not_recorded() -> None:
     def hidden(scene: jms.Scene, simulate: Any) -> Any:
         jax.eval_shape(lambda: slide(scene, simulate))
         return slide(scene, simulate)
 
     check = jms.check_gradients(hidden, lugre_box(), names=["box[0]"])
     assert check.ok
-    assert "cannot be watched" in check.remarks[-1]
+    assert "are not recorded" in check.remarks[-1]
 
 
 @jax.custom_vjp
@@ -221,9 +221,9 @@ backward_only.defvjp(lambda x: (x, None), lambda _, g: (g,))
         (lambda scene, simulate: simulate(scene, [0.0], [0.0], 5.0).q[-1], {}, r"one real number .* shape \(1,\)"),
         (lambda scene, simulate: float(slide(scene, simulate)), {}, "one real number .* but it returned"),
         (lambda scene, simulate: jnp.argmax(simulate(scene, [0.0], [0.0], 5.0).q[-1]), {}, "one real number .* int"),
-        (lambda scene, simulate: slide(scene, simulate) / 0.0, {}, "fn gives -?inf"),
+        (lambda scene, simulate: slide(scene, simulate) / 0.0, {}, "finite number, but it returned -?inf"),
         (lambda scene, simulate: backward_only(slide(scene, simulate)), {}, "custom_vjp"),
-        (slide, {"names": ["k"]}, r"no number 'k'; it has: box\[0\], box\[1\]"),
+        (slide, {"names": ["k"]}, r"no number 'k'; there are: box\[0\], box\[1\]"),
         (slide, {"names": []}, "names is empty"),
         (slide, {"scales": {"box[0]": 0.0}}, r"scales\['box\[0\]'\] must be a positive number"),
     ],

@@ -125,7 +125,7 @@ def test_zeros_count_as_one_unit_and_say_so() -> None:
     assert any("observable is zero" in remark for remark in found.remarks)
 
 
-def test_what_says_how_a_law_is_run_is_left_out() -> None:
+def test_numerical_settings_of_laws_are_left_out() -> None:
     law = jms.Regularized(jms.Coulomb(0.5), 1e-3)
     scene = jms.Scene(free, params={"m": 2.0, "unused": 0.0}, effects=(jms.Friction(law),))
     found = jms.sensitivity(scene, "q[0]", q0=[1.0], qd0=[1.0], t1=1.0, ts=[0.0, 1.0])
@@ -137,17 +137,21 @@ def test_what_says_how_a_law_is_run_is_left_out() -> None:
 @pytest.mark.parametrize(
     ("observable", "more", "text"),
     [
-        ("qd[0]", {"wrt": "friction.Fk"}, r"names 'friction.Fk', but the numbers are: m, friction.sigma0"),
+        (
+            "qd[0]",
+            {"wrt": "friction.Fk"},
+            r"names 'friction.Fk', which is no number of the scene; there are: m, friction.sigma0",
+        ),
         ("qd[0]", {"wrt": ("m", "m")}, "twice"),
         ("qd[0]", {"wrt": ()}, "empty"),
         ("qd[0]", {"mode": "backward"}, "'forward', 'reverse'"),
-        ("qd[0]", {"adjoint": None}, "leave it out"),
+        ("qd[0]", {"adjoint": None}, "omit it"),
         ("qd[1]", {}, r"there are: q\[0\], qd\[0\], applied\[0\], friction"),
         ("friction[0]", {}, "No observable"),
         ("", {}, "No observable"),
         (lambda run: run.q, {}, "Pick one"),
         (lambda run: 1.0, {}, "returned 1.0"),
-        (lambda run: run.qd[:, 0] / 0.0, {}, "not finite"),
+        (lambda run: run.qd[:, 0] / 0.0, {}, "must be finite"),
     ],
 )
 def test_garbage_is_refused(observable: Any, more: Any, text: str) -> None:

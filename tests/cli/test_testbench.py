@@ -179,7 +179,7 @@ def test_bristle_under_constant_slip_follows_its_closed_form() -> None:
     law = problems.ramped_box.lugre()
     for v, z0 in ((0.01, 0.0), (-0.03, 1e-3)):
         motion = jms.simulate(
-            problems.slipping_bristle.scene(law, v),
+            problems.bristles.slipping_bristle(law, v),
             [0.0],
             [0.0],
             1.0,
@@ -188,7 +188,7 @@ def test_bristle_under_constant_slip_follows_its_closed_form() -> None:
             rtol=1e-10,
             atol=1e-14,
         )
-        exact = problems.slipping_bristle.deflection(ts, law, v, z0=z0)
+        exact = problems.bristles.deflection(ts, law, v, z0=z0)
         np.testing.assert_allclose(motion.z["friction"], exact, rtol=1e-8)
         stepped = jax.vmap(lambda t, v=v, z0=z0: law.step_exact(jnp.asarray(v), jnp.asarray(z0), t))(ts)
         np.testing.assert_allclose(stepped, exact, rtol=1e-13)

@@ -11,10 +11,11 @@ from scipy.integrate import solve_ivp
 
 from jaxmodsim.friction import Coulomb
 from jaxmodsim.mechanics import Constraint, Spherical
-from jaxmodsim.problems import cartesian_pendulum, four_bar, rod_on_rough_floor, spherical_pendulum
+from jaxmodsim.problems import cartesian_pendulum, four_bar, spherical_pendulum
 from jaxmodsim.scene import AppliedForce, Friction, Scene
 from jaxmodsim.simulation import Trajectory
 
+from ..problems import rod_on_rough_floor
 from .case import Answer, FunctionTask, HardCase, SceneTask, end_time, motion, position
 
 FAMILY = "geometry"

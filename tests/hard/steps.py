@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from jaxmodsim.friction import AbstractLaw, LuGre, Regularized, Viscous, max_stable_step
-from jaxmodsim.problems import ramped_box, slipping_bristle
+from jaxmodsim.problems import bristles, ramped_box
 from jaxmodsim.scene import Scene
 from jaxmodsim.simulation import Trajectory, simulate
 from jaxmodsim.solvers import ImplicitFriction, Rodas5P
@@ -59,7 +59,7 @@ def formulations() -> dict[str, Formulation]:
     each = [
         Formulation(
             "bristle in slip",
-            slipping_bristle.scene(bristle, _V),
+            bristles.slipping_bristle(bristle, _V),
             {"friction": jnp.asarray(steady * (1.0 + 1e-6))},
             0.0,
             bristle,

@@ -8,7 +8,7 @@ from jaxtyping import Array
 from scipy.integrate import solve_ivp
 
 from jaxmodsim.friction import LuGre, Regularized, Viscous
-from jaxmodsim.problems import ramped_box, slipping_bristle
+from jaxmodsim.problems import bristles, ramped_box
 from jaxmodsim.scene import Scene
 from jaxmodsim.simulation import Trajectory
 from jaxmodsim.solvers import ImplicitFriction, Rodas5P
@@ -183,7 +183,7 @@ def _bristle_steady() -> HardCase:
         return level / sigma0
 
     law = LuGre(sigma0=1e9, sigma1=0.0, sigma2=0.1, Fc=1.5, Fs=1.75, vs=0.2)
-    task = motion(slipping_bristle.scene(law, v), [0.0], [0.0], t1, by="friction.sigma0", read=_deflection)
+    task = motion(bristles.slipping_bristle(law, v), [0.0], [0.0], t1, by="friction.sigma0", read=_deflection)
     return HardCase(
         "bristle_at_speed",
         "sigma0 = 1e9 N/m at 0.1 m/s: the bristle settles at a rate of 6e7/s and stays for a second.",
@@ -207,7 +207,7 @@ def _implicit_long_step() -> HardCase:
 
     law = LuGre(sigma0=1e9, sigma1=0.0, sigma2=0.1, Fc=1.5, Fs=1.75, vs=0.2)
     task = motion(
-        slipping_bristle.scene(law, v),
+        bristles.slipping_bristle(law, v),
         [0.0],
         [0.0],
         t1,

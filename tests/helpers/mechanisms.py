@@ -11,6 +11,9 @@ import numpy as np
 from jaxmodsim import Scene, problems
 from jaxmodsim.scene import ConstraintReaction, State, forward_dynamics, vector_field
 
+from ..problems import rod_on_rough_floor as rod_problem
+from ..problems import rolling_disc as disc_problem
+
 SAMPLES = 50
 # Each side is a sum of a few terms, right to some roundings: compare with the largest around.
 ROUNDING = 1e-12
@@ -18,8 +21,8 @@ ROUNDING = 1e-12
 PENDULUM = {"m": 0.7, "l": 1.9, "g": 9.7}
 SPIRAL = {"m": 0.7, "R": 1.9, "a": 0.35, "g": 9.7}
 MU = 0.2
-DISC = dict(problems.rolling_disc.PARAMS)
-ROD = {**problems.rod_on_rough_floor.PARAMS, "mu": 0.5}
+DISC = dict(disc_problem.PARAMS)
+ROD = {**rod_problem.PARAMS, "mu": 0.5}
 FOUCAULT = {"m": 2.0, "l": 1.3, "g": 9.7, "Omega": 0.4, "latitude": 0.8}
 PARTICLE = dict(problems.charged_particle.PARAMS)
 CART = {**problems.cart_pole.PARAMS, "force": 1.7}
@@ -108,9 +111,9 @@ def four_bar(crossed: bool = False) -> Case:
 
 def rolling_disc() -> Case:
     q = draw(-4, 4, 5).at[:, 3].set(draw(-1.2, 1.2, seed=7))
-    qd = jax.vmap(lambda q, w: problems.rolling_disc.velocity(q, w, R=DISC["R"]))(q, draw(-5, 5, 3, seed=6))
-    closed = lambda q, qd: problems.rolling_disc.acceleration(q, qd, **but(DISC, "m"))  # noqa: E731
-    return Case(problems.rolling_disc.scene(**DISC), q, qd, closed)
+    qd = jax.vmap(lambda q, w: disc_problem.velocity(q, w, R=DISC["R"]))(q, draw(-5, 5, 3, seed=6))
+    closed = lambda q, qd: disc_problem.acceleration(q, qd, **but(DISC, "m"))  # noqa: E731
+    return Case(disc_problem.scene(**DISC), q, qd, closed)
 
 
 def knife_edge() -> Case:
@@ -124,13 +127,11 @@ ROD_ANGLE, ROD_RATE, ROD_SLIP = draw(0.1, 3.0), draw(-2.9, 2.9, seed=6), draw(-5
 
 
 def rod_on_rough_floor(mu: float = ROD["mu"]) -> Case:
-    q, qd = jax.vmap(lambda f, w, v: problems.rod_on_rough_floor.state(f, w, v, l=ROD["l"]))(
-        ROD_ANGLE, ROD_RATE, ROD_SLIP
-    )
+    q, qd = jax.vmap(lambda f, w, v: rod_problem.state(f, w, v, l=ROD["l"]))(ROD_ANGLE, ROD_RATE, ROD_SLIP)
     numbers = {**ROD, "mu": mu}
-    closed = lambda q, qd: problems.rod_on_rough_floor.acceleration(q, qd, **numbers)  # noqa: E731
+    closed = lambda q, qd: rod_problem.acceleration(q, qd, **numbers)  # noqa: E731
     modes = jnp.stack([jnp.sign(ROD_SLIP), jnp.ones_like(ROD_SLIP)], axis=1)  # in slip, on the floor
-    return Case(problems.rod_on_rough_floor.scene(**numbers), q, qd, closed, modes)
+    return Case(rod_problem.scene(**numbers), q, qd, closed, modes)
 
 
 def foucault_pendulum() -> Case:

@@ -135,9 +135,9 @@ def test_a_scene_on_another_day_and_its_figure(axis):
     assert given.counts.all()
     assert given.between["x"][0] == 0.0
     labels = [text.get_text() for text in plot.score_figure(other).axes[0].findobj(Text)]
-    assert any(f"it holds {100 * other.shares['x']:.0f} %" in label for label in labels)
+    assert any(f"contains {100 * other.shares['x']:.0f} %" in label for label in labels)
     alone = [text.get_text() for text in plot.score_figure(other.score).axes[0].findobj(Text)]
-    assert not any("it holds" in label for label in alone)
+    assert not any("contains" in label for label in alone)
 
 
 def test_short_records_show_their_start_by_half_of_them(axis):

@@ -24,10 +24,9 @@ OF_EVENTS = (
     metrics.mode_changes(),
     metrics.stick_share(),
     metrics.motion_kind(),
-    metrics.mode_sequence(most=20),
     metrics.peak("friction"),
 )
-BREAK_AWAY, PERIOD, CHANGES, SHARE, KIND, SEQUENCE, PEAK = range(7)
+BREAK_AWAY, PERIOD, CHANGES, SHARE, KIND, PEAK = range(6)
 BELTS = jnp.array([0.08, 0.1, 0.16])
 # For differences by Fs. The runs are right to about 1e-9: with this step the differences are to 1e-6.
 STEP = 1e-3
@@ -37,6 +36,10 @@ def on_belt(belt: Any, fs: Any = BELT["Fs"], **more: Any) -> Any:
     """A run in stick from the start on."""
     scene = problems.belt_oscillator.scene(jms.Coulomb(BELT["Fc"], fs), belt=belt)
     return jms.simulate(scene, [0.0], jnp.stack([jnp.asarray(belt)]), 6.0, throw=False, **TIGHT, **more)
+
+
+def modes_after_events(run: Any) -> list[int]:
+    return [int(x) for x in run.events.after[np.isfinite(run.events.t)]]
 
 
 def values(belt: Any, fs: Any) -> list[Any]:
@@ -70,10 +73,7 @@ def test_belt_oscillator_keeps_its_closed_form(batch: list[np.ndarray]) -> None:
     np.testing.assert_array_equal(batch[CHANGES], 2 * cycles + 1 + (rest > exact.slip))
     stuck = begins + cycles * exact.stick + np.maximum(rest - exact.slip, 0.0)
     np.testing.assert_allclose(batch[SHARE], stuck / 6.0, rtol=1e-8)
-    for kind, sequence, count in zip(batch[KIND], batch[SEQUENCE], batch[CHANGES], strict=True):
-        assert OF_EVENTS[KIND].describe(kind) == "stick-slip cycle"
-        words = OF_EVENTS[SEQUENCE].describe(sequence).split(" > ")
-        assert words == (["stick", "slip-"] * int(count))[: int(count) + 1]
+    assert [OF_EVENTS[KIND].describe(kind) for kind in batch[KIND]] == ["stick-slip cycle"] * 3
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +85,8 @@ def alone() -> Any:
 def test_eager_as_compiled_and_mapped(alone: Any, batch: list[np.ndarray]) -> None:
     for metric, mapped in zip(OF_EVENTS, batch, strict=True):
         np.testing.assert_allclose(metric(alone), mapped[1], rtol=1e-9, err_msg=metric.label)
+    changes = modes_after_events(alone)
+    assert changes == ([-1, 0] * len(changes))[: int(batch[CHANGES][1])]
 
 
 def test_derivatives_of_break_away_and_period(lanes: list[np.ndarray]) -> None:
@@ -192,16 +194,15 @@ def test_a_spring_that_stops() -> None:
     scene = problems.braked_spring.scene(problems.braked_spring.coulomb())
     half = float(rest.t / rest.half_cycles)
 
-    def kind(t1: float, x0: float = 0.3) -> tuple[str, str]:
+    def kind(t1: float, x0: float = 0.3) -> tuple[str, list[int]]:
         run = jms.simulate(scene, [x0], [0.0], t1, **TIGHT)
-        what, how = metrics.motion_kind(), metrics.mode_sequence()
-        return what.describe(what(run)), how.describe(how(run))
+        return metrics.motion_kind().describe(metrics.motion_kind()(run)), modes_after_events(run)
 
     assert int(rest.half_cycles) == 3
-    assert kind(float(rest.t) + 1.0) == ("sticks for good", "slip- > slip+ > slip- > stick")
-    assert kind(2.5 * half) == ("slips back and forth", "slip- > slip+ > slip-")
-    assert kind(0.5 * half) == ("slips for good", "slip-")
-    assert kind(3.0, x0=0.01) == ("never slips", "stick")
+    assert kind(float(rest.t) + 1.0) == ("sticks for good", [1, -1, 0])
+    assert kind(2.5 * half) == ("slips back and forth", [1, -1])
+    assert kind(0.5 * half) == ("slips for good", [])
+    assert kind(3.0, x0=0.01) == ("never slips", [])
     run = jms.simulate(scene, [0.3], [0.0], 2.0 * float(rest.t), **TIGHT)
     np.testing.assert_allclose(metrics.stick_share()(run), 0.5, rtol=1e-9)
     np.testing.assert_allclose(metrics.stick_share(since=0.5 * float(rest.t))(run), 2 / 3, rtol=1e-9)
@@ -214,18 +215,10 @@ def test_several_elements(alone: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jms.Trajectory, "events", property(lambda run: Events(*columns)))
     run = made(alone, problems.coupled_belts.scene(), modes=jnp.array([[-1.0, 0.0]]), end=jnp.asarray(4.0))
     names = ("first", "second")
-    sequence, kind = metrics.mode_sequence(*names), metrics.motion_kind(*names)
-    assert sequence.describe(sequence(run)) == "first stick, second stick > first slip- > second slip+ > second stick"
+    kind = metrics.motion_kind(*names)
     assert kind.describe(kind(run)) == "first slips for good, second sticks for good"
     assert [int(metrics.mode_changes(name)(run)) for name in names] == [1, 2]
     assert [float(metrics.stick_share(name)(run)) for name in names] == [0.25, 0.75]
-    assert metrics.mode_sequence("second").describe(metrics.mode_sequence("second")(run)) == "stick > slip+ > stick"
-
-
-def test_sequences_that_are_too_long_are_one_class(alone: Any) -> None:
-    short = metrics.mode_sequence(most=3)
-    assert short.describe(short(alone)) == "more than 3 changes"
-    assert int(metrics.mode_sequence()(alone)) == int(metrics.mode_sequence(most=20)(alone)) > 2**20
 
 
 def test_single_precision(alone: Any) -> None:
@@ -235,11 +228,6 @@ def test_single_precision(alone: Any) -> None:
     single = dataclasses.replace(single, request=request)
     assert metrics.period()(single).dtype == metrics.break_away()(single).dtype == jnp.float32
     np.testing.assert_allclose(metrics.period()(single), metrics.period()(alone), rtol=1e-4)
-    # Of the sequence, all digits; it has 11 changes or fewer.
-    sequence = metrics.mode_sequence()
-    assert int(np.float32(sequence(single))) == int(sequence(alone))
-    with pytest.raises(ValueError, match="pass most=11"):
-        metrics.mode_sequence(most=20)(single)
 
 
 def test_peaks_between_saved_times() -> None:
@@ -293,7 +281,7 @@ def test_dahl_loses_its_closed_form_in_each_cycle() -> None:
         np.testing.assert_allclose(metrics.dissipated()(run), lost[-1], rtol=1e-12)
     expected = 4 * fc * (amplitude - fc / sigma0 * np.tanh(sigma0 * amplitude / fc))
     np.testing.assert_allclose(lost[1] - lost[0], expected, rtol=1e-6)
-    with pytest.raises(ValueError, match="lose some are: friction"):
+    with pytest.raises(ValueError, match="dissipative effects are: friction"):
         metrics.dissipated("brake")(run)
 
 
@@ -322,8 +310,7 @@ def test_peak_of_a_force() -> None:
         (lambda: metrics.break_away(distance=-1.0), "positive number of metres"),
         (lambda: metrics.stick_share(rest=0.0), "positive speed"),
         (lambda: metrics.period(swing=1.0), "swing"),
-        (lambda: metrics.mode_sequence(most=26), "from 1 to 25"),
-        (lambda: metrics.mode_sequence("a", "a"), "once"),
+        (lambda: metrics.motion_kind("a", "a"), "once"),
         (lambda: metrics.motion_kind(*(str(i) for i in range(11))), "up to 10"),
         (lambda: metrics.classes(lambda run: 0, ()), "name for each class"),
     ],
@@ -338,10 +325,9 @@ def test_garbage_is_refused_when_made(make: Any, text: str) -> None:
     [
         (metrics.break_away(), r"break_away\(distance=1e-3\)"),
         (metrics.break_away("brake"), "'brake'; there are: friction"),
-        (metrics.mode_changes(), "does not run by events"),
+        (metrics.mode_changes(), "not event-driven"),
         (metrics.stick_share(), "rest=1e-4"),
         (metrics.motion_kind(), "classes"),
-        (metrics.mode_sequence(), "classes"),
         (metrics.peak("q[1]"), r"'q\[1\]'; there are: q\[0\] \(x\), qd\[0\] \(x_dot\), pull\[0\], friction"),
         (metrics.final("pull"), "No observable"),
         (metrics.period("brake"), "No observable"),

@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 
 import jaxmodsim as jms
 from jaxmodsim.mechanics import Contact
-from jaxmodsim.orbits import OrbitError, continue_special
+from jaxmodsim.orbits import OrbitError, continue_bifurcation
 
 from ..problems import vibrating_table
 
@@ -64,7 +64,7 @@ def test_period_doubling_of_the_ball_is_that_of_its_closed_form(ball):
     assert list(branch.stable) == [x < exact for x in branch.values]
     # Over the restitution it is followed as exactly.
     scene, span = vibrating_table.scene(**BALL), (BALL["e"], 0.7)
-    curve = continue_special(scene, point, ("A", "table.restitution"), span, period=table_period, step=0.3)
+    curve = continue_bifurcation(scene, point, ("A", "table.restitution"), span, period=table_period, step=0.3)
     A, e = curve.values.T
     table = np.pi * g * (1 - e) / ((1 + e) * omega)
     np.testing.assert_allclose(A, np.hypot(2 * (1 + e**2) * g / (1 + e) ** 2 / omega, table) / omega, rtol=1e-8)
@@ -90,13 +90,15 @@ def test_fold_of_the_ball_is_that_of_its_closed_form(ball):
     assert "end of the span" in branch.ending
     assert not branch.stable[-1]
     scene, span = vibrating_table.scene(**BALL), (omega, 1.1 * omega)
-    curve = continue_special(scene, point, ("A", "omega"), span, period=table_period, step=0.3)
+    curve = continue_bifurcation(scene, point, ("A", "omega"), span, period=table_period, step=0.3)
     A, omega = curve.values.T
     np.testing.assert_allclose(A, np.pi * g * (1 - e) / ((1 + e) * omega**2), rtol=1e-8)
     with pytest.raises(ValueError, match="parameters must be the names of two"):
-        continue_special(scene, point, ("A", "A"), span, period=table_period)
-    with pytest.raises(ValueError, match="A curve starts at a special orbit of a branch: fold,"):
-        continue_special(scene, dataclasses.replace(point, kind="grazing"), ("A", "omega"), span, period=table_period)
+        continue_bifurcation(scene, point, ("A", "A"), span, period=table_period)
+    with pytest.raises(ValueError, match="point must be a bifurcation of a branch: fold,"):
+        continue_bifurcation(
+            scene, dataclasses.replace(point, kind="grazing"), ("A", "omega"), span, period=table_period
+        )
 
 
 @pytest.mark.deep
@@ -264,7 +266,7 @@ def test_folds_of_duffing_and_a_branch_that_goes_on_from_its_store(tmp_path):
         np.testing.assert_allclose(np.min(np.abs(point.orbit.multipliers - 1.0)), 0.0, atol=1e-5)
     # One of them over the hardening of the spring, against branches at other values of it.
     fold = whole.points[0]
-    curve = continue_special(duffing(0.8), fold, ("W", "a"), (0.05, 0.07), period=of_frequency, step=0.5)
+    curve = continue_bifurcation(duffing(0.8), fold, ("W", "a"), (0.05, 0.07), period=of_frequency, step=0.5)
     i = len(curve.orbits) // 2
     (W, a), nearby = curve.values[i], (curve.orbits[i].q, curve.orbits[i].qd)
     scene = jms.Scene(spring, params={"a": a, "W": W}, effects=duffing(W).effects)
@@ -281,7 +283,7 @@ def test_folds_of_duffing_and_a_branch_that_goes_on_from_its_store(tmp_path):
     again = follow(out=tmp_path / "duffing", progress=lambda count, _: rest.append(count))
     assert rest[0] == seen[-1] + 1
     np.testing.assert_allclose([x.value for x in again.points], [x.value for x in whole.points], rtol=1e-7)
-    with pytest.raises(ValueError, match="holds another branch; what differs: span"):
+    with pytest.raises(ValueError, match="holds another branch, which differs in: span"):
         jms.continue_orbits(
             duffing(0.8), ([0.0], [0.0]), "W", (0.8, 2.0), period=of_frequency, out=tmp_path / "duffing"
         )

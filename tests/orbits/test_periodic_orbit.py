@@ -143,7 +143,7 @@ def test_a_family_of_orbits_is_refused():
     # At W = 1/2 any part of a free swing, which closes in a half period, may be added; this is an orbit without one.
     f, at = 0.05, 1.0
     start = ([4 / 3 * np.cos(at) + f * (1 - np.cos(2 * at))], [-2 / 3 * np.sin(at) + f * np.sin(2 * at)])
-    with pytest.raises(OrbitError, match="one of a family, with a multiplier of exactly 1"):
+    with pytest.raises(OrbitError, match="one of a family: it has another multiplier of exactly 1"):
         jms.periodic_orbit(den_hartog(0.5, f, at), start, period=of_frequency, settle=0.0)
 
 
@@ -294,5 +294,5 @@ def test_what_goes_wrong_is_named(van_der_pol):
     with pytest.raises(ValueError, match="outside"):
         jax.jit(lambda s: jms.periodic_orbit(s, start, settle=60.0).period)(VAN_DER_POL)
     single = eqx.tree_at(lambda s: s.params["mu"], VAN_DER_POL, jnp.float32(1.0))
-    with pytest.raises(ValueError, match="need float64"):
+    with pytest.raises(ValueError, match="needs float64"):
         jms.periodic_orbit(single, start, settle=60.0)

@@ -149,10 +149,10 @@ def each_mistake() -> Iterator[tuple[str, Any, dict[str, Any], str]]:
     yield "axis", dataset(), {"name": "kind", "x": "velocity"}, "no axis 'velocity'; there are: k, v, load"
     yield "twice", dataset(), {"name": "kind", "x": "v", "y": "load"}, "both lie along the dimension 'v'"
     shuffled = dataset().isel(k=[0, 2, 1, 3, 4])
-    yield "order", shuffled, {"name": "kind"}, r"axis 'k' must rise or fall.*sortby\('k'\)"
+    yield "order", shuffled, {"name": "kind"}, r"axis 'k' must be monotonic.*sortby\('k'\)"
     yield "text", dataset().assign_coords(k=list("abcde")), {"name": "kind"}, "axis 'k' needs numbers"
     yield "single", dataset().isel(k=[0]), {"name": "kind"}, "axis 'k' has a single value"
-    yield "classes", dataset(), {"name": "kind", "classes": {0: "slides"}}, "there is also 1"
+    yield "classes", dataset(), {"name": "kind", "classes": {0: "slides"}}, "the value 1, but only 0"
 
 
 @pytest.mark.parametrize(

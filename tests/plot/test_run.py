@@ -137,7 +137,7 @@ def test_no_figure_needs_pyplot() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == r"b'\x89PNG' False" + "\n"
     files = Path(plot.__file__ or "").parent.glob("*.py")
-    assert [file.name for file in files if "matplotlib.figure" in file.read_text()] == ["_figure.py"]
+    assert [file.name for file in files if "matplotlib.figure" in file.read_text()] == ["_style.py"]
 
 
 def test_places_of_a_mechanism_may_need_its_numbers() -> None:

@@ -29,7 +29,7 @@ def scene(
     *,
     gap: ArrayLike = 0.0,
     m: ArrayLike = PARAMS["m"],
-    l: ArrayLike = PARAMS["l"],  # noqa: E741
+    l: ArrayLike = PARAMS["l"],
     g: ArrayLike = PARAMS["g"],
     e: ArrayLike = PARAMS["e"],
 ) -> Scene:

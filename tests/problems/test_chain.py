@@ -82,7 +82,7 @@ def test_two_links_are_the_double_pendulum_of_the_textbooks() -> None:
 def symbolic_chain(n: int) -> tuple[Any, list[Any], dict[Any, float]]:
     """Lagrangian, coordinates and parameters of the chain, by the positions of its masses."""
     q = list(dynamicsymbols(f"q:{n}"))
-    m, l, g = sympy.symbols(f"m:{n}"), sympy.symbols(f"l:{n}"), sympy.Symbol("g")  # noqa: E741
+    m, l, g = sympy.symbols(f"m:{n}"), sympy.symbols(f"l:{n}"), sympy.Symbol("g")
     x = z = energy = sympy.Integer(0)
     for i in range(n):
         x, z = x + l[i] * sympy.sin(q[i]), z - l[i] * sympy.cos(q[i])

@@ -43,6 +43,8 @@ from ..helpers.mechanisms import (
     rod_on_rough_floor,
 )
 from ..helpers.symbolic import TIME, symbolic_motion
+from . import rod_on_rough_floor as rod_problem
+from . import rolling_disc as disc_problem
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -58,7 +60,7 @@ def test_accelerations(name: str) -> None:
 def test_tension_of_the_pendulum() -> None:
     """By the angle from straight down, m (l f'^2 + g cos f), towards the pivot."""
     one, rod = case("pendulum in a plane"), found("pendulum in a plane").reactions["rod"]
-    m, l, g = PENDULUM.values()  # noqa: E741
+    m, l, g = PENDULUM.values()
     angle = np.arctan2(one.q[:, 0], -one.q[:, 1])
     rate = (one.q[:, 0] * one.qd[:, 1] - one.q[:, 1] * one.qd[:, 0]) / l**2
     tension = m * (l * rate**2 + g * np.cos(angle))
@@ -70,7 +72,7 @@ def test_tension_of_the_pendulum() -> None:
 
 
 def test_reaction_of_the_sphere() -> None:
-    m, l, g = PENDULUM.values()  # noqa: E741
+    m, l, g = PENDULUM.values()
     rod = found("pendulum in space").reactions["rod"]
     radial = jax.vmap(lambda a, w: problems.spherical_pendulum.reaction(a, w, m=m, R=l, g=g))(ANGLES, ANGLE_RATES)
     assert_equal(rod.multiplier[:, 0], radial)
@@ -139,14 +141,12 @@ def test_rod_on_a_rough_floor(mu: float) -> None:
     one, m = rod_on_rough_floor(mu), ROD["m"]
     qdd, reactions, uniqueness = look(one.scene, one.q, one.qd, one.mode)
     side = jnp.sign(ROD_SLIP)
-    compliance = problems.rod_on_rough_floor.compliance(ROD_ANGLE, side, m=m, mu=mu)
-    smooth = problems.rod_on_rough_floor.compliance(ROD_ANGLE, m=m, mu=0.0)
+    compliance = rod_problem.compliance(ROD_ANGLE, side, m=m, mu=mu)
+    smooth = rod_problem.compliance(ROD_ANGLE, m=m, mu=0.0)
     np.testing.assert_allclose(smooth, (1 + 3 * np.cos(ROD_ANGLE) ** 2) / m, rtol=1e-14)
     # Friction that lifts the tip never takes the solution away.
     np.testing.assert_allclose(uniqueness, np.minimum(compliance / smooth, 1.0), atol=1e-12)
-    normal = jax.vmap(lambda f, w, s: problems.rod_on_rough_floor.normal_force(f, w, s, **{**ROD, "mu": mu}))(
-        ROD_ANGLE, ROD_RATE, side
-    )
+    normal = jax.vmap(lambda f, w, s: rod_problem.normal_force(f, w, s, **{**ROD, "mu": mu}))(ROD_ANGLE, ROD_RATE, side)
     np.testing.assert_allclose(reactions["floor"].multiplier[:, 0], normal, rtol=1e-11)
     assert bool(jnp.any(compliance < 0)) == (mu > 4 / 3)
     np.testing.assert_array_equal(jnp.isnan(qdd).any(axis=1), compliance < 0)
@@ -155,11 +155,11 @@ def test_rod_on_a_rough_floor(mu: float) -> None:
 def test_the_paradox_begins_at_four_thirds() -> None:
     """Where 1 + 3 cos^2 and 3 mu sin cos touch: tan f = 2, at mu = 4/3."""
     f = jnp.linspace(0.01, 1.56, 100_001)
-    least = [float(jnp.min(problems.rod_on_rough_floor.compliance(f, m=1.0, mu=mu))) for mu in (1.333, 4 / 3, 1.334)]
+    least = [float(jnp.min(rod_problem.compliance(f, m=1.0, mu=mu))) for mu in (1.333, 4 / 3, 1.334)]
     assert least[0] > 0
     np.testing.assert_allclose(least[1], 0.0, atol=1e-8)
     assert least[2] < 0
-    at_two = problems.rod_on_rough_floor.compliance(jnp.arctan(2.0), m=1.0, mu=4 / 3)
+    at_two = rod_problem.compliance(jnp.arctan(2.0), m=1.0, mu=4 / 3)
     np.testing.assert_allclose(at_two, 0.0, atol=1e-15)
 
 
@@ -202,14 +202,14 @@ def body(m: Any, inertia: Any, x: Any, z: Any, angle: Any, g: Any) -> Any:
     return (m * (x.diff(TIME) ** 2 + z.diff(TIME) ** 2) + inertia * sympy.diff(angle, TIME) ** 2) / 2 - m * g * z
 
 
-def bar(m: Any, l: Any, x: Any, z: Any, angle: Any, g: Any) -> Any:  # noqa: E741
+def bar(m: Any, l: Any, x: Any, z: Any, angle: Any, g: Any) -> Any:
     """Lagrangian of a uniform bar that begins at (x, z), and its end."""
     c, s = sympy.cos(angle), sympy.sin(angle)
     return body(m, m * l**2 / 12, x + l * c / 2, z + l * s / 2, angle, g), x + l * c, z + l * s
 
 
 def symbolic_cart_pole() -> Any:
-    (M, m, l, g, force), numbers = values("M m l g force", CART)  # noqa: E741
+    (M, m, l, g, force), numbers = values("M m l g force", CART)
     x, f = dynamicsymbols("x f")
     pole = body(m, m * l**2 / 12, x + l * sympy.sin(f) / 2, l * sympy.cos(f) / 2, f, g)
     return symbolic_motion(pole + M * x.diff() ** 2 / 2, [x, f], numbers, forces=[force, 0])
@@ -225,14 +225,14 @@ def symbolic_bead() -> Any:
 
 
 def symbolic_pendulum(names: str) -> Any:
-    (m, l, g), numbers = values("m l g", PENDULUM)  # noqa: E741
+    (m, l, g), numbers = values("m l g", PENDULUM)
     q = list(dynamicsymbols(names))
     energy = m * sum(x.diff() ** 2 for x in q) / 2 - m * g * q[-1]
     return symbolic_motion(energy, q, numbers, holonomic=[sympy.sqrt(sum(x**2 for x in q)) - l])
 
 
 def symbolic_slider_crank() -> Any:
-    (m1, m2, m3, r, l, g, torque), numbers = values("m1 m2 m3 r l g torque", CRANK)  # noqa: E741
+    (m1, m2, m3, r, l, g, torque), numbers = values("m1 m2 m3 r l g torque", CRANK)
     f, b, x, y = dynamicsymbols("f b x y")
     crank, x1, z1 = bar(m1, r, sympy.Integer(0), sympy.Integer(0), f, g)
     rod, x2, z2 = bar(m2, l, x1, z1, b, g)
@@ -271,14 +271,14 @@ def symbolic_knife_edge() -> Any:
 
 
 def symbolic_rod() -> Any:
-    (m, l, g), numbers = values("m l g", ROD)  # noqa: E741
+    (m, l, g), numbers = values("m l g", ROD)
     x, y, f = dynamicsymbols("x y f")
     return symbolic_motion(body(m, m * l**2 / 12, x, y, f, g), [x, y, f], numbers, holonomic=[y - l * sympy.sin(f) / 2])
 
 
 def symbolic_foucault() -> Any:
     """From the velocity in a frame that does not turn, less what is quadratic in Omega."""
-    (m, l, g, Omega, latitude), numbers = values("m l g Omega latitude", FOUCAULT)  # noqa: E741
+    (m, l, g, Omega, latitude), numbers = values("m l g Omega latitude", FOUCAULT)
     x, y = dynamicsymbols("x y")
     spin = Omega * sympy.sin(latitude)
     square = (x.diff() - spin * y) ** 2 + (y.diff() + spin * x) ** 2 - spin**2 * (x**2 + y**2)
@@ -396,7 +396,7 @@ def test_the_swings_of_foucaults_pendulum_turn() -> None:
 
 def test_over_both_poles() -> None:
     """From the bottom over the top and back, in the time of the elliptic integral; the angles fail at either pole."""
-    m, l, g = PENDULUM.values()  # noqa: E741
+    m, l, g = PENDULUM.values()
     speed = 2.2 * np.sqrt(g * l)
     half = 2.0 * l / speed * ellipk(4.0 * g * l / speed**2)
     run = simulate(
@@ -437,10 +437,10 @@ def test_four_bar_stays_closed() -> None:
 @pytest.mark.deep
 def test_runs_of_the_rolling_disc() -> None:
     """A steady circle closes; any other motion rolls on and keeps its energy."""
-    scene, turn, lean = problems.rolling_disc.scene(**DISC), -1.3, 0.4
-    spin = float(problems.rolling_disc.steady_spin(lean, turn, **but(DISC, "m")))
+    scene, turn, lean = disc_problem.scene(**DISC), -1.3, 0.4
+    spin = float(disc_problem.steady_spin(lean, turn, **but(DISC, "m")))
     q0 = jnp.array([0.0, 0.0, 0.0, lean, 0.0])
-    qd0 = problems.rolling_disc.velocity(q0, jnp.array([turn, 0.0, spin]), R=DISC["R"])
+    qd0 = disc_problem.velocity(q0, jnp.array([turn, 0.0, spin]), R=DISC["R"])
     period = 2 * np.pi / abs(turn)
     how: dict[str, Any] = {"ts": np.linspace(0.0, period, 17), "rtol": 1e-10, "atol": 1e-12}
     run = simulate(scene, q0, qd0, period, **how)
@@ -450,21 +450,19 @@ def test_runs_of_the_rolling_disc() -> None:
     np.testing.assert_allclose(np.hypot(run.q[:, 0], run.q[:, 1] - radius), abs(radius), rtol=1e-8)
     np.testing.assert_allclose(run.q[-1], [0.0, 0.0, turn * period, lean, spin * period], atol=1e-7)
 
-    qd0 = problems.rolling_disc.velocity(q0, jnp.array([0.5, -1.0, 6.0]), R=DISC["R"])
+    qd0 = disc_problem.velocity(q0, jnp.array([0.5, -1.0, 6.0]), R=DISC["R"])
     run = simulate(scene, q0, qd0, period, **how)
     assert np.ptp(run.q[:, 3]) > 0.3
     energy = total(scene, run)
     np.testing.assert_allclose(energy, energy[0], rtol=1e-8)
-    rolls = jax.vmap(lambda q, w: problems.rolling_disc.velocity(q, w, R=DISC["R"]))(run.q, run.qd[:, 2:])
+    rolls = jax.vmap(lambda q, w: disc_problem.velocity(q, w, R=DISC["R"]))(run.q, run.qd[:, 2:])
     np.testing.assert_allclose(run.qd, rolls, atol=1e-13)
 
 
 def slipping_rod(mu: float, angle: float, rate: float, end: Callable[..., float]) -> tuple[float, float]:
     """Time and angle at which `end(angle, rate)` falls through zero; in slip the angle moves by itself."""
-    q, qd = problems.rod_on_rough_floor.state(angle, rate, 1e6, l=ROD["l"])
-    turn = jax.jit(
-        lambda f, w: problems.rod_on_rough_floor.acceleration(q.at[2].set(f), qd.at[2].set(w), **{**ROD, "mu": mu})[2]
-    )
+    q, qd = rod_problem.state(angle, rate, 1e6, l=ROD["l"])
+    turn = jax.jit(lambda f, w: rod_problem.acceleration(q.at[2].set(f), qd.at[2].set(w), **{**ROD, "mu": mu})[2])
 
     def stop(t: float, y: Any) -> float:
         del t
@@ -485,7 +483,7 @@ def weight_left(angle: float, rate: float) -> float:
 
 def compliance_left(angle: float, rate: float) -> float:
     del rate
-    return float(problems.rod_on_rough_floor.compliance(jnp.asarray(angle), m=ROD["m"], mu=2.0)) - 1e-6
+    return float(rod_problem.compliance(jnp.asarray(angle), m=ROD["m"], mu=2.0)) - 1e-6
 
 
 @pytest.mark.deep
@@ -493,8 +491,8 @@ def test_the_rod_lifts_off_and_its_run_ends_where_the_paradox_begins() -> None:
     ts = jnp.linspace(0.0, 0.5, 101)
 
     def run(mu: float, state: tuple[float, float, float]) -> Any:
-        scene = problems.rod_on_rough_floor.scene(**{**ROD, "mu": mu})
-        q0, qd0 = problems.rod_on_rough_floor.state(*state, l=ROD["l"])
+        scene = rod_problem.scene(**{**ROD, "mu": mu})
+        q0, qd0 = rod_problem.state(*state, l=ROD["l"])
         return simulate(scene, q0, qd0, 0.5, ts=ts, rtol=1e-9, atol=1e-11, throw=False)
 
     # Lift-off.

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..mechanics import VelocityConstraint, rigid_body
-from ..scene import Scene
+from jaxmodsim.mechanics import VelocityConstraint, rigid_body
+from jaxmodsim.scene import Scene
 
 # Mass [kg], radius [m], moment of inertia about the axle in units of m R^2 (1/2 a disc, 1 a hoop), gravity [m/s^2].
 PARAMS = {"m": 0.8, "R": 0.5, "k": 0.5, "g": 9.81}

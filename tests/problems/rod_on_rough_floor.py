@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..friction import Coulomb
-from ..mechanics import Contact, rigid_body
-from ..scene import Friction, Scene
+from jaxmodsim.friction import Coulomb
+from jaxmodsim.mechanics import Contact, rigid_body
+from jaxmodsim.scene import Friction, Scene
 
 # Mass [kg], length [m], coefficient of friction and gravity [m/s^2].
 PARAMS = {"m": 1.0, "l": 2.0, "mu": 0.5, "g": 9.81}
