@@ -14,9 +14,9 @@ from .._core.files import jsonable
 from .._core.units import axis_unit
 from ..identify import (
     Comparison,
-    ExpectedError,
     FitResult,
     InputDesign,
+    PredictionError,
     Profile,
     RecordAgreement,
     RecordPrediction,
@@ -50,7 +50,7 @@ class Fitted:
     comparison: Comparison | None = None
     predictions: tuple[RecordPrediction, ...] = ()
     agreement: RecordAgreement | None = None
-    expected: ExpectedError | None = None
+    expected: PredictionError | None = None
     substeps: int = 1
     seconds: float = 0.0
 

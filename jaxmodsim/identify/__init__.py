@@ -22,7 +22,7 @@ from .estimate._staged import Staged as Staged
 from .model._axis import AxisModel as AxisModel
 from .model._axis import axis_models as axis_models
 from .model._axis import axis_scene as axis_scene
-from .model._axis import rough_axis as rough_axis
+from .model._axis import estimate_axis as estimate_axis
 from .model._engines import Controller as Controller
 from .model._engines import law_force as law_force
 from .model._engines import replay as replay
@@ -32,12 +32,12 @@ from .selection._compare import Candidate as Candidate
 from .selection._compare import compare as compare
 from .selection._compare import compare_laws as compare_laws
 from .selection._comparison import Comparison as Comparison
-from .selection._prediction import ExpectedError as ExpectedError
+from .selection._prediction import PredictionError as PredictionError
 from .selection._prediction import RecordPrediction as RecordPrediction
-from .selection._prediction import expected_error as expected_error
 from .selection._prediction import predict as predict
+from .selection._prediction import prediction_error as prediction_error
 from .selection._score import Score as Score
-from .selection._score import score as score
+from .selection._score import evaluate_on as evaluate_on
 from .uncertainty._coverage import coverage as coverage
 from .uncertainty._fit import fit as fit
 from .uncertainty._fit import fit_law as fit_law
@@ -48,5 +48,5 @@ from .uncertainty._profile import Profile as Profile
 from .uncertainty._profile import profile as profile
 from .uncertainty._residual_tests import residual_tests as residual_tests
 from .uncertainty._result import FitResult as FitResult
+from .uncertainty._result import is_step_size_limited as is_step_size_limited
 from .uncertainty._result import remarks as remarks
-from .uncertainty._result import step_shows as step_shows

@@ -19,17 +19,17 @@ def design_figure(design: InputDesign, *, caption: str = "") -> Figure:
     figure = Figure(figsize=(12, 6.4), layout="constrained")
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.35, 1))[0]
     axes = left.subplots(3, 1, sharex=True)
-    limits, start = design.limits, design.best.q_ref[0]
+    limits, best, sine = design.limits, design.best, design.baseline
     quantity, unit, force = ("angle", "rad", "N m") if limits.rotary else ("position", "m", "N")
     factor, small = small_unit(unit)
     panels = (
-        (quantity, small, factor, design.best.q_ref, design.plain.q_ref, limits.travel, start),
-        ("velocity", f"{unit}/s", 1.0, design.best.qd_ref, design.plain.qd_ref, limits.speed, 0.0),
-        ("torque" if limits.rotary else "force", force, 1.0, design.best.force, design.plain.force, limits.force, 0.0),
+        (quantity, small, factor, best.q_ref, sine.q_ref, limits.travel, best.q_ref[0]),
+        ("velocity", f"{unit}/s", 1.0, best.qd_ref, sine.qd_ref, limits.speed, 0.0),
+        ("torque" if limits.rotary else "force", force, 1.0, best.force, sine.force, limits.force, 0.0),
     )
-    for axis, (quantity, unit, scale, best, plain, limit, middle) in zip(axes, panels, strict=True):
-        axis.plot(design.best.t, scale * plain, color="#c8c8c8", lw=1.2, label="plain sine")
-        axis.plot(design.best.t, scale * best, color=BLUE, lw=1.3, label="designed")
+    for axis, (quantity, unit, scale, designed, baseline, limit, middle) in zip(axes, panels, strict=True):
+        axis.plot(best.t, scale * baseline, color="#c8c8c8", lw=1.2, label="plain sine")
+        axis.plot(best.t, scale * designed, color=BLUE, lw=1.3, label="designed")
         for side in (-1.0, 1.0) if limit is not None else ():
             level = scale * (middle + side * (limit or 0.0))
             axis.axhline(level, color=RED, lw=1.0, ls="--", label="limit" if side > 0 else "_")
@@ -48,7 +48,7 @@ def design_figure(design: InputDesign, *, caption: str = "") -> Figure:
 def _error_bars(axis: Axes, design: InputDesign) -> None:
     """Predicted relative errors, designed against plain; a number that is zero has none and is left out."""
     names = [name for name, value in design.values.items() if value]
-    pairs = (("plain sine", "#c8c8c8", design.plain.errors, 0.2), ("designed", BLUE, design.best.errors, -0.2))
+    pairs = (("plain sine", "#c8c8c8", design.baseline.errors, 0.2), ("designed", BLUE, design.best.errors, -0.2))
     finite = [
         100 * errors[name] / abs(design.values[name])
         for _, _, errors, _ in pairs

@@ -35,7 +35,7 @@ def score_figure(
 
     **Arguments:**
 
-    - `score`: from `jaxmodsim.identify.score` or `predict`, of one channel; the latter with its band.
+    - `score`: from `jaxmodsim.identify.evaluate_on` or `predict`, of one channel; the latter with its band.
     - `quantity`, `unit`: what was measured.
     - `caption`: a line for the source of the record.
     """

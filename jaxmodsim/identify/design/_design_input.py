@@ -94,7 +94,7 @@ def design_input(
     dt: float = 1e-3,
     q0: ArrayLike | list[float] | None = None,
     observe: Callable[[Array, Array], Array] = first_coordinate,
-    input: str = "u",
+    input_name: str = "u",
     harmonics: int = 12,
     criterion: Criterion = d_optimal,
     prior: FitResult | None = None,
@@ -131,7 +131,7 @@ def design_input(
     - `dt`: time between samples [s].
     - `q0`: position of rest at the start, shape `[1]`; by default zero.
     - `observe`: `observe(q, qd)`, what will be recorded; by default the first coordinate.
-    - `input`: name of the entry of `params` that is the driving force; the equations must be linear in it.
+    - `input_name`: name of the entry of `params` that is the driving force; the equations must be linear in it.
     - `harmonics`: highest frequency of the motion in periods per duration; the motion has twice as many weights.
     - `criterion`: function of the information matrix of the relative numbers, the larger the better: `d_optimal`,
       `a_optimal`, `e_optimal` or one's own.
@@ -154,7 +154,7 @@ def design_input(
     _check(
         {"duration": duration, "dt": dt}, {"noise": noise, "uncertainty": uncertainty}, harmonics, max_steps, criterion
     )
-    axis, parameters, scale = _axis(scene, free, q0, observe, input, noise)
+    axis, parameters, scale = _axis(scene, free, q0, observe, input_name, noise)
     samples = round(duration / dt) + 1
     stride = max((samples - 1) // _COARSE, 1)
     prior_information = np.zeros((len(scale), len(scale)))
@@ -179,16 +179,14 @@ def design_input(
 
     fine, coarse = task(samples), task((samples - 1) // stride + 1)
     sines = [_fill(_coarse_share, coarse, column) for column in np.eye(2 * harmonics)[:harmonics]]
-    plain = max(sines, key=lambda x: float(_judge(coarse, jnp.asarray(x, float))[0]))
+    baseline = max(sines, key=lambda x: float(_judge(coarse, jnp.asarray(x, float))[0]))
     with reported(progress, "next input", lambda number, value: f"iteration {number}: criterion {value:.4g}") as report:
-        best, ending = _improve(coarse, sines, plain, seed, max_steps, report)
-    designed, compared = (
-        _excitation(fine, _fill(_fine_share, fine, x), parameters.names, scale) for x in (best, plain)
-    )
+        best, ending = _improve(coarse, sines, baseline, seed, max_steps, report)
+    designed, sine = (_excitation(fine, _fill(_fine_share, fine, x), parameters.names, scale) for x in (best, baseline))
     units = {name: allowed.unit for name, allowed in split_ranges(scene_numbers(scene), scene_ranges(scene)).items()}
     return InputDesign(
         best=designed,
-        plain=compared,
+        baseline=sine,
         values={name: float(parameters.start[name]) for name in parameters.names},
         units={name: units.get(name, "") for name in parameters.names},
         limits=limits,
@@ -227,21 +225,21 @@ def _axis(
     free: Sequence[str],
     q0: ArrayLike | list[float] | None,
     observe: Callable[[Array, Array], Array],
-    input: str,
+    input_name: str,
     noise: float,
 ) -> tuple[DrivenAxis, FreeParameters, Float[np.ndarray, " free"]]:
     """The machine, its free numbers, and their units."""
     params = scene.params
-    if not isinstance(params, dict) or input not in params or jnp.shape(params[input]) != ():
+    if not isinstance(params, dict) or input_name not in params or jnp.shape(params[input_name]) != ():
         have = ", ".join(params) if isinstance(params, dict) else "no dict"
-        raise ValueError(f"The input {input!r} must be a single number in the scene's params ({have}).")
+        raise ValueError(f"The input {input_name!r} must be a single number in the scene's params ({have}).")
     if scene.mode_names:
         raise ValueError(
             f"design_input differentiates a run with fixed steps, but {', '.join(scene.mode_names)} would need"
             " events: wrap a law, as in Regularized(law, width)."
         )
-    if input in free:
-        raise ValueError(f"{input} is the input and cannot be free.")
+    if input_name in free:
+        raise ValueError(f"{input_name} is the input and cannot be free.")
     position = jnp.asarray([0.0] if q0 is None else q0, float)
     if position.shape != (1,) or scene.constraints:
         raise ValueError(
@@ -262,11 +260,13 @@ def _axis(
     start = dict(parameters.start)
     scale, slopes = relative_numbers({k: float(x) for k, x in start.items()}, parameters.followed, parameters.names)
     columns = {name: jnp.asarray(column, float) for name, column in slopes.items()}
-    axis = DrivenAxis(scene, start, columns, position, jnp.asarray(noise, float), input, observe)
+    axis = DrivenAxis(scene, start, columns, position, jnp.asarray(noise, float), input_name, observe)
     still = jnp.full(3, position[0])
     force = feed_forward(axis, jnp.asarray([0.0, 1e-3, 2e-3]), still, jnp.zeros_like(still))
     if not np.all(np.isfinite(force)):
-        raise ValueError(f"The input {input!r} does not move the first coordinate, or the model is not finite at rest.")
+        raise ValueError(
+            f"The input {input_name!r} does not move the first coordinate, or the model is not finite at rest."
+        )
     return axis, parameters, scale
 
 
@@ -370,7 +370,12 @@ def _merit(task: _Task, x: Float[np.ndarray, " weights"]) -> float:
 
 
 def _improve(
-    task: _Task, sines: list[np.ndarray], plain: np.ndarray, seed: int, max_steps: int, progress: DesignProgress | None
+    task: _Task,
+    sines: list[np.ndarray],
+    baseline: np.ndarray,
+    seed: int,
+    max_steps: int,
+    progress: DesignProgress | None,
 ) -> tuple[Float[np.ndarray, " weights"], str]:
     """The best motion found from the best of some random ones; the best sine if none is better."""
     # Weights in units of the largest sine of their frequency.
@@ -378,7 +383,7 @@ def _improve(
     rng = np.random.default_rng(seed)
     tried = [_fill(_coarse_share, task, lengths * rng.standard_normal(lengths.size)) for _ in range(_TRIED)]
     tried.sort(key=lambda x: -_merit(task, x))
-    best, best_merit, ending, count = plain, _merit(task, plain), "converged", 0
+    best, best_merit, ending, count = baseline, _merit(task, baseline), "converged", 0
     for start in tried[:_IMPROVED]:
         weights, how, count = _climb(task, start, lengths, max_steps, progress, count)
         filled = _fill(_coarse_share, task, weights)

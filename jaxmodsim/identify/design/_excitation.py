@@ -29,7 +29,7 @@ class DrivenAxis(eqx.Module):
     - `slopes`: their derivatives by x, shape `[free]` each.
     - `q0`: position at the start, where the axis rests, shape `[1]`.
     - `noise`: standard deviation of one sample of what is observed, in its unit.
-    - `input`: the entry of the scene's params that is the force.
+    - `input_name`: the entry of the scene's params that is the force.
     - `observe`: `observe(q, qd)`, what is recorded.
     """
 
@@ -38,7 +38,7 @@ class DrivenAxis(eqx.Module):
     slopes: dict[str, Array]
     q0: Float[Array, " one"]
     noise: Float[Array, ""]
-    input: str = eqx.field(static=True)
+    input_name: str = eqx.field(static=True)
     observe: Callable[[Array, Array], Array] = eqx.field(static=True)
 
     def at(self, x: Float[Array, " free"]) -> Scene:
@@ -89,7 +89,7 @@ def feed_forward(
     scene = axis.scene
 
     def acceleration(force: float, t: Array, y: State) -> Array:
-        params: dict[str, object] = {**scene.params, axis.input: jnp.full((), force, q.dtype)}
+        params: dict[str, object] = {**scene.params, axis.input_name: jnp.full((), force, q.dtype)}
         driven = Scene(scene.lagrangian, params=params, effects=scene.effects)
         return vector_field(t, y, driven).qd[0]
 
@@ -124,7 +124,7 @@ def _record(
     substeps: int = 1,
 ) -> Float[Array, " time"]:
     """What is observed on an axis of these numbers under a force that is held from each sample to the next."""
-    return replay(scene, t, {axis.input: force}, axis.q0, jnp.zeros_like(axis.q0), substeps, observe)
+    return replay(scene, t, {axis.input_name: force}, axis.q0, jnp.zeros_like(axis.q0), substeps, observe)
 
 
 def driven_motion(

@@ -105,7 +105,7 @@ class InputDesign:
     """An input that tells most about the numbers that are to be found, within limits.
 
     - `best`: the designed input.
-    - `plain`: the best single sine within the same limits and of the same duration.
+    - `baseline`: the best single sine within the same limits and of the same duration.
     - `values`, `units`: the free numbers that it was designed for, and the unit of each that declares one.
     - `limits`: the `Limits`.
     - `noise`: standard deviation of a sample that was reckoned with.
@@ -114,7 +114,7 @@ class InputDesign:
     """
 
     best: Excitation
-    plain: Excitation
+    baseline: Excitation
     values: dict[str, float]
     units: dict[str, str]
     limits: AxisLimits
@@ -173,7 +173,7 @@ class InputDesign:
     def rows(self) -> list[tuple[str, float, float, float, str]]:
         """Rows of a table: name, value, predicted standard error, that of the plain sine, unit."""
         return [
-            (name, value, self.best.errors[name], self.plain.errors[name], self.units[name])
+            (name, value, self.best.errors[name], self.baseline.errors[name], self.units[name])
             for name, value in self.values.items()
         ]
 

@@ -32,7 +32,7 @@ def _drive(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
 
 
 @dataclass(frozen=True)
-class RoughAxis:
+class AxisEstimate:
     """A first idea of an axis: mass [kg], viscous [N s/m] and Coulomb friction [N], offset [N], top speed [m/s].
 
     And when it starts [s], on the clock of the record.
@@ -46,7 +46,7 @@ class RoughAxis:
     start: float = 0.0
 
 
-def rough_axis(record: Record) -> RoughAxis:
+def estimate_axis(record: Record) -> AxisEstimate:
     """Start values by linear regression of the force on acceleration, velocity and its sign.
 
     Differentiated positions are noisy, so they are smoothed first; the simulation then does the real work.
@@ -78,7 +78,7 @@ def rough_axis(record: Record) -> RoughAxis:
             " change the sign of one of them (on the command line, --units force=-1)."
         )
     scale = float(np.sqrt(np.mean(u**2))) or 1.0
-    return RoughAxis(
+    return AxisEstimate(
         m if m > 0 else scale / max(float(np.max(np.abs(a))), 1e-12),
         Fv if Fv > 0 else _FRICTION_SHARE * scale / top,
         Fc if Fc > 0 else _FRICTION_SHARE * scale,
@@ -88,22 +88,22 @@ def rough_axis(record: Record) -> RoughAxis:
     )
 
 
-def _coulomb(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
+def _coulomb(estimate: AxisEstimate) -> tuple[AbstractEffect, ...]:
     return (
-        Friction(Coulomb(rough.Fc), name="dry"),
-        Friction(Viscous(rough.Fv), name="viscous"),
+        Friction(Coulomb(estimate.Fc), name="dry"),
+        Friction(Viscous(estimate.Fv), name="viscous"),
     )
 
 
-def _asymmetric(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
+def _asymmetric(estimate: AxisEstimate) -> tuple[AbstractEffect, ...]:
     return (
-        Friction(asymmetric(Coulomb(rough.Fc), Fc=rough.Fc), name="dry"),
-        Friction(asymmetric(Viscous(rough.Fv), Fv=rough.Fv), name="viscous"),
+        Friction(asymmetric(Coulomb(estimate.Fc), Fc=estimate.Fc), name="dry"),
+        Friction(asymmetric(Viscous(estimate.Fv), Fv=estimate.Fv), name="viscous"),
     )
 
 
-def _no_params(rough: RoughAxis) -> dict[str, float]:
-    del rough
+def _no_params(estimate: AxisEstimate) -> dict[str, float]:
+    del estimate
     return {}
 
 
@@ -113,16 +113,16 @@ class AxisModel:
 
     **Arguments:**
 
-    - `effects`: what acts on the axis beside the drive, with start values from the rough ones.
+    - `effects`: what acts on the axis beside the drive, with start values from an estimate of the axis.
     - `free`: names of the numbers that are fitted.
     - `description`: for tables.
-    - `params`: further entries of the scene's params that the effects read, from the rough values, by name.
+    - `params`: further entries of the scene's params that the effects read, by name, from an estimate of the axis.
     """
 
-    effects: Callable[[RoughAxis], tuple[AbstractEffect, ...]]
+    effects: Callable[[AxisEstimate], tuple[AbstractEffect, ...]]
     free: tuple[str, ...]
     description: str
-    params: Callable[[RoughAxis], dict[str, float]] = _no_params
+    params: Callable[[AxisEstimate], dict[str, float]] = _no_params
 
 
 # Models of more than one friction element.
@@ -149,8 +149,8 @@ def _one_law(kind: type[AbstractLaw]) -> AxisModel | None:
     if example is None:
         return None
 
-    def effects(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
-        law: Any = kind.fit_start(rough.m, rough.Fc, rough.Fv, rough.top)
+    def effects(estimate: AxisEstimate) -> tuple[AbstractEffect, ...]:
+        law: Any = kind.fit_start(estimate.m, estimate.Fc, estimate.Fv, estimate.top)
         return (Friction(law, name="friction"),)
 
     numbers = [f"friction.{name}" for name, allowed in ranges_of(example).items() if not allowed.execution]
@@ -159,7 +159,7 @@ def _one_law(kind: type[AbstractLaw]) -> AxisModel | None:
 
 def axis_scene(
     model: AxisModel,
-    rough: RoughAxis,
+    estimate: AxisEstimate,
     start: Mapping[str, float] | None = None,
     fixed: Mapping[str, float] | None = None,
 ) -> Scene:
@@ -168,15 +168,16 @@ def axis_scene(
     **Arguments:**
 
     - `model`: one of `axis_models()`.
-    - `rough`: values to start from, as `rough_axis` finds them.
+    - `estimate`: values to start from, as `estimate_axis` finds them.
     - `start`, `fixed`: other values by the names of `jaxmodsim.scene.scene_numbers`.
 
     **Returns:**
 
     A `Scene` whose `params` are `m` [kg], `offset` [N], the input `u` [N], and those of the model.
     """
-    offset = rough.offset if "offset" in model.free else 0.0
-    params = {"m": rough.m, "offset": offset, "u": 0.0, **model.params(rough)}
-    scene = Scene(_axis_lagrangian, params=params, effects=(AppliedForce(_drive, name="drive"), *model.effects(rough)))
+    offset = estimate.offset if "offset" in model.free else 0.0
+    params = {"m": estimate.m, "offset": offset, "u": 0.0, **model.params(estimate)}
+    effects = (AppliedForce(_drive, name="drive"), *model.effects(estimate))
+    scene = Scene(_axis_lagrangian, params=params, effects=effects)
     given = {**(start or {}), **(fixed or {})}
     return replace_numbers(scene, {name: jnp.asarray(x, float) for name, x in given.items()})

@@ -19,12 +19,12 @@ from ..uncertainty._result import FitResult
 from ._agreement import RecordAgreement
 from ._comparison import penalty
 from ._opening import opening
-from ._score import Score, record_problem, score
+from ._score import Score, evaluate_on, record_problem
 from ._variation import VARIATION, change_between, covariances, mean_variances, output_changes, search_of
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExpectedError:
+class PredictionError:
     """Root mean square error to expect in one channel of a new record like those that were fitted, by its causes.
 
     - `model`: what the model misses in the records that were fitted, noise included, corrected for what the fit took
@@ -63,7 +63,7 @@ class RecordPrediction:
     - `level`: share of the samples that the band is to hold. `lower`, `upper`: the band, by channel, in its unit, shape
       `[samples]` each.
     - `model`, `parameters`, `between`: standard deviations of the output by cause, by channel, shape `[samples]` each;
-      see `ExpectedError`.
+      see `PredictionError`.
     - `variation`: standard deviation of the friction level from record to record that was assumed, as a share of it.
     - `records`: number of records that showed how parameters change; 1 where it is assumed alone.
     """
@@ -140,7 +140,7 @@ def predict(
 
     **Arguments:**
 
-    - `result`, `record`, `q0`, `qd0`: see `score`.
+    - `result`, `record`, `q0`, `qd0`: see `evaluate_on`.
     - `level`: share of the samples that the band is to hold, 0 < level < 1.
     - `variation`: standard deviation of the friction level from record to record, as a share of it, >= 0.
     - `agreement`: from `agreement(result)`, where several records were fitted.
@@ -151,14 +151,14 @@ def predict(
 
     **Raises:**
 
-    - `ValueError` for numbers out of range or an agreement of another fit, and as `score` does.
+    - `ValueError` for numbers out of range or an agreement of another fit, and as `evaluate_on` does.
     - `RuntimeError` where the model gives values that are not finite.
     """
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1, but it is {level!r}.")
     search = search_of(result, "A prediction")
     own, between = covariances(result, variation, agreement)
-    judged = score(result, record, q0=q0, qd0=qd0)
+    judged = evaluate_on(result, record, q0=q0, qd0=qd0)
     problem, noise = record_problem(result, record, (judged.q0, judged.qd0)), search.problem.noise
     channels, samples = sorted(record.channels), len(record.t)
     shown = opening(problem.runs)[0] if q0 is None and problem.local else np.zeros(samples, bool)
@@ -194,9 +194,9 @@ def predict(
     )
 
 
-def expected_error(
+def prediction_error(
     result: FitResult, *, variation: float = VARIATION, agreement: RecordAgreement | None = None
-) -> dict[str, ExpectedError]:
+) -> dict[str, PredictionError]:
     """The error to expect on a new record of the same motion as those that were fitted, by channel, in its unit.
 
     **Arguments:**
@@ -212,7 +212,7 @@ def expected_error(
     own, between = covariances(result, variation, agreement)
     known, changed, excess = mean_variances(search, own), change_between(search, between), model_excess(search)
     return {
-        name: ExpectedError(
+        name: PredictionError(
             model=float(level) * float(np.sqrt(excess[name])),
             parameters=float(level) * float(np.sqrt(known[name])),
             between=float(level) * float(np.sqrt(changed[name])),

@@ -91,7 +91,7 @@ class StartFitted:
     ending: str
 
 
-def score(result: FitResult, record: Record, *, q0: _Start = None, qd0: _Start = None) -> Score:
+def evaluate_on(result: FitResult, record: Record, *, q0: _Start = None, qd0: _Start = None) -> Score:
     """Run a fitted model on another record, to which nothing is fitted but where it starts.
 
     The start is fitted to the first samples alone: 20, or as many more as show the velocity to 0.2 % of the speed of

@@ -128,7 +128,7 @@ class FitResult(AbstractReadable):
 
     @staticmethod
     def load(path: str | PathLike[str], model: eqx.Module | None = None) -> "FitResult":
-        """A result that `save` wrote. It can do all but run the model: no `profile` and no `score`.
+        """A result that `save` wrote. It can do all but run the model: no `profile` and no `evaluate_on`.
 
         **Arguments:**
 
@@ -239,12 +239,12 @@ def remarks(result: FitResult) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def step_shows(result: FitResult) -> bool:
+def is_step_size_limited(result: FitResult) -> bool:
     """Whether the integration steps between samples are so few that they show beside what the model misses."""
-    return _step_shows(result.diagnostics)
+    return _is_step_size_limited(result.diagnostics)
 
 
-def _step_shows(diagnostics: FitDiagnostics) -> bool:
+def _is_step_size_limited(diagnostics: FitDiagnostics) -> bool:
     errors, moved = list(diagnostics.rmse.values()), diagnostics.step_error
     return moved is not None and len(errors) == 1 and moved > _STEP_SHOWS * errors[0]
 
@@ -263,7 +263,7 @@ def _of_the_search(diagnostics: FitDiagnostics, records: tuple[Record, ...]) -> 
     sentences = []
     if not ended_by_itself(diagnostics.ending):
         sentences.append(f"The search {diagnostics.ending}: do not trust the standard errors.")
-    if _step_shows(diagnostics):
+    if _is_step_size_limited(diagnostics):
         sentences.append(
             f"The integration step shows: with four times as many the output moves by {diagnostics.step_error:.2g}"
             f" (root mean square) against an RMSE of {next(iter(diagnostics.rmse.values())):.2g}. Raise substeps."
