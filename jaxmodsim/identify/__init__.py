@@ -1,10 +1,10 @@
 """Identification: numbers of scenes and laws from measured records."""
 
-from .data._clock import clock_offset as clock_offset
-from .data._clock import sampling_gaps as sampling_gaps
-from .data._clock import unexplained_force as unexplained_force
 from .data._record import Record as Record
-from .data._record import start_state as start_state
+from .data._signals import clock_offset as clock_offset
+from .data._signals import sampling_gaps as sampling_gaps
+from .data._signals import start_state as start_state
+from .data._signals import unexplained_force as unexplained_force
 from .design._design_input import design_input as design_input
 from .design._input_design import AxisLimits as AxisLimits
 from .design._input_design import InputDesign as InputDesign
@@ -34,15 +34,15 @@ from .selection._compare import compare_laws as compare_laws
 from .selection._comparison import Comparison as Comparison
 from .selection._prediction import PredictionError as PredictionError
 from .selection._prediction import RecordPrediction as RecordPrediction
+from .selection._prediction import Score as Score
+from .selection._prediction import evaluate_on as evaluate_on
 from .selection._prediction import predict as predict
 from .selection._prediction import prediction_error as prediction_error
-from .selection._score import Score as Score
-from .selection._score import evaluate_on as evaluate_on
 from .uncertainty._coverage import coverage as coverage
 from .uncertainty._fit import fit as fit
 from .uncertainty._fit import fit_law as fit_law
-from .uncertainty._log_density import log_density as log_density
 from .uncertainty._posterior import Posterior as Posterior
+from .uncertainty._posterior import log_density as log_density
 from .uncertainty._posterior import sample_posterior as sample_posterior
 from .uncertainty._profile import Profile as Profile
 from .uncertainty._profile import profile as profile

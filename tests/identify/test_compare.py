@@ -12,7 +12,7 @@ from jaxmodsim import plot
 from jaxmodsim.identify import Candidate, Comparison, Continuation, compare, compare_laws, law_force, replay
 from jaxmodsim.identify.data._record import cut, runs_of
 from jaxmodsim.identify.selection._compare import _blocks
-from jaxmodsim.identify.selection._memory import correlation_time
+from jaxmodsim.identify.uncertainty._residual_tests import correlation_time
 from jaxmodsim.problems.braked_spring import driven_spring
 
 DT, NOISE, WIDTH = 5e-3, 2e-5, 5e-3

@@ -20,7 +20,7 @@ from jaxmodsim.identify import (
 )
 from jaxmodsim.identify.design import _design_input
 from jaxmodsim.identify.design._design_input import _axis, _coarse_share, _judge, _known, _Task
-from jaxmodsim.identify.design._excitation import driven_motion, feed_forward, motion_basis, sensitivities
+from jaxmodsim.identify.design._input_design import driven_motion, feed_forward, motion_basis, sensitivities
 from jaxmodsim.identify.model._axis import AxisEstimate
 from jaxmodsim.plot import design_figure
 from jaxmodsim.scene import replace_numbers

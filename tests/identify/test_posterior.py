@@ -18,7 +18,7 @@ from jaxmodsim.identify.estimate._search import SearchOptions, solve_with_noise
 from jaxmodsim.identify.model._engines import ModelOutput
 from jaxmodsim.identify.model._parameters import FreeParameters
 from jaxmodsim.identify.uncertainty._fit import result_of
-from jaxmodsim.identify.uncertainty._log_density import _SoftBox
+from jaxmodsim.identify.uncertainty._posterior import _SoftBox
 from jaxmodsim.identify.uncertainty._result import FitResult
 from jaxmodsim.plot import posterior_figure
 
@@ -177,7 +177,7 @@ def test_it_refuses_what_it_cannot_do(tmp_path) -> None:
         with pytest.raises(ValueError, match="At least 4 draws, a warmup of 20 and 2 chains are needed"):
             sample_posterior(result, **numbers)
     result.save(tmp_path / "fit.npz")
-    with pytest.raises(ValueError, match="a result loaded from a file cannot"):
+    with pytest.raises(ValueError, match="a loaded result does not have"):
         log_density(FitResult.load(tmp_path / "fit.npz"))
 
 

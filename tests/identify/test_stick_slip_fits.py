@@ -8,7 +8,7 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim.identify import Controller, axis_models, axis_scene, estimate_axis, remarks, replay
-from jaxmodsim.identify.data._record import sample_noise
+from jaxmodsim.identify.data._signals import sample_noise
 
 from ..helpers.axis_records import slide
 

@@ -1,6 +1,5 @@
 """Measured records: samples, windows as arrays of one shape, and positions differentiated."""
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
@@ -26,17 +25,6 @@ class TableColumn(Protocol):
 Column: TypeAlias = ArrayLike | Sequence[object] | TableColumn
 # Name of a single channel that was given none.
 SINGLE = "measured"
-# Samples at the beginning of a record, from which position and velocity are estimated.
-_SAMPLES = 20
-# A value stands out that is so many times as far from the median of its neighbours as nearly all others are, and as far
-# as samples go from one to the next.
-_NEIGHBOURS, _STANDS_OUT, _NEARLY_ALL = 5, 10.0, 0.95
-# Values are on a grid that lie off it by less than this share of its step; keeps divisions by a level finite.
-_ON_A_GRID, _TINY = 1e-3, 1e-300
-# Smoothing: one sample to either side for so many of the record, and never fewer than so many to either side.
-_SAMPLES_A_SIDE, _LEAST_SPAN = 1000, 3
-# Orders of the differences that show noise, into how many parts of how many samples at least a record is cut.
-_ORDERS, _PARTS, _LEAST_PART = (2, 3, 4, 5, 6), 32, 32
 
 
 class Record:
@@ -323,112 +311,3 @@ def runs_of(records: tuple[Record, ...], windows: Windows) -> Runs:
         {name: column(np.where(np.isfinite(x), x, 0.0)) for name, x in instants_by_effect.items()},
         {name: column(np.isfinite(x).astype(float)) for name, x in instants_by_effect.items()},
     )
-
-
-class SmoothedMotion(NamedTuple):
-    """A smoothed motion, shape `[samples]` each, and how many samples at either end the smoothing spoils."""
-
-    x: Float[np.ndarray, " samples"]
-    v: Float[np.ndarray, " samples"]
-    a: Float[np.ndarray, " samples"]
-    edge: int
-
-
-def smooth(x: Float[np.ndarray, " samples"], span: int) -> Float[np.ndarray, " samples"]:
-    """Weighted mean over `span` samples to either side."""
-    from scipy.signal import convolve, windows  # most of a second to import, and only needed here
-
-    kernel = windows.hann(2 * span + 3)[1:-1]
-    return convolve(np.pad(x, span, mode="edge"), kernel / kernel.sum(), mode="valid", method="direct")
-
-
-def smooth_span(samples: int) -> int:
-    """Samples to either side over which a record of so many is smoothed."""
-    return max(samples // _SAMPLES_A_SIDE, _LEAST_SPAN)
-
-
-def outliers(x: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
-    """Samples that stand out from their neighbours to either side, as those of a sensor that drops out do."""
-    deviation, steps = np.abs(x - _local_median(x)), np.abs(np.diff(x))
-    step = float(np.median(steps[steps > 0])) if steps.any() else 0.0
-    usual = max(float(np.quantile(deviation, _NEARLY_ALL)), step)
-    return deviation > _STANDS_OUT * usual
-
-
-def without_outliers(x: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """The samples, with the median of their neighbours in place of those that stand out."""
-    bad = outliers(x)
-    return np.where(bad, _local_median(x), x) if bad.any() else x
-
-
-def sample_noise(x: Float[np.ndarray, " samples"]) -> float:
-    """Standard deviation of the noise that samples do not share with their neighbours; at least that of rounding.
-
-    Differences of the order that leaves least of the motion; the median over parts of the record, so that impacts and
-    outliers decide nothing. Steps of a sensor of resolution r have a standard deviation of r/sqrt(12).
-    """
-    levels = [np.inf]
-    for order in _ORDERS:
-        squares = np.diff(x, order) ** 2 / math.comb(2 * order, order)
-        parts = np.array_split(squares, max(min(squares.size // _LEAST_PART, _PARTS), 1))
-        levels.append(float(np.sqrt(np.median([np.mean(part) for part in parts]))) if squares.size else np.inf)
-    rounding = float(np.finfo(float).eps * np.max(np.abs(x)))
-    seen = min(levels) if np.isfinite(min(levels)) else 0.0
-    return max(seen, resolution(x) / 12.0**0.5, rounding, _TINY)
-
-
-def _local_median(x: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    side = _NEIGHBOURS // 2
-    return np.median(np.lib.stride_tricks.sliding_window_view(np.pad(x, side, mode="edge"), _NEIGHBOURS), axis=-1)
-
-
-def differentiate(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> SmoothedMotion:
-    """Velocity and acceleration of a position, smoothed before either differentiation."""
-    span = smooth_span(len(t))
-    position = smooth(x, span)
-    v = smooth(np.gradient(position, t), span)
-    return SmoothedMotion(position, v, np.gradient(v, t), 3 * span)
-
-
-def start_state(record: Record, channel: str | None = None) -> tuple[float, float]:
-    """Position and velocity at the first sample, by a parabola through the first 20.
-
-    **Arguments:**
-
-    - `record`: its `channel`, by default the only one, is a position [m or rad].
-
-    **Returns:**
-
-    Position and velocity.
-    """
-    x = without_outliers(record.measured if channel is None else record.channels[channel])
-    powers = _start_powers(record.t)
-    return tuple(np.linalg.lstsq(powers, x[: len(powers)])[0][:2].tolist())
-
-
-def start_errors(record: Record, channel: str) -> float:
-    """Standard error of the velocity of `start_state` over the noise of the channel [1/s].
-
-    Larger where the first samples lie off the parabola by more than the noise: they are too far apart for it.
-    """
-    x = without_outliers(record.channels[channel])
-    powers = _start_powers(record.t)
-    first = x[: len(powers)]
-    off = np.sqrt(np.mean((first - powers @ np.linalg.lstsq(powers, first)[0]) ** 2))
-    return float(np.linalg.norm(np.linalg.pinv(powers)[1])) * max(1.0, float(off) / sample_noise(x))
-
-
-def _start_powers(t: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "first powers"]:
-    """The parabola through the first samples, as a matrix: by time since the first one."""
-    count = min(_SAMPLES, len(t))
-    return np.vander(t[:count] - t[0], min(3, count), increasing=True)
-
-
-def resolution(x: Float[np.ndarray, " samples"]) -> float:
-    """Step of the values of a sensor, all of which are multiples of it apart; 0 where there is none."""
-    values = np.unique(x)
-    steps = np.diff(values)
-    if not steps.size:
-        return 0.0
-    step = float(np.median(steps[steps < 1.5 * np.min(steps)]))
-    return step if np.max(np.abs(steps / step - np.round(steps / step))) < _ON_A_GRID else 0.0

@@ -17,8 +17,18 @@ from ..model._observe import first_coordinate
 from ..model._parameters import FreeParameters, chosen_entries, split_entries, split_ranges
 from ..uncertainty._estimate import correlation_of, floored_inverse
 from ..uncertainty._result import FitResult
-from ._excitation import DrivenAxis, driven_motion, feed_forward, motion_basis, relative_numbers, sensitivities
-from ._input_design import AxisLimits, Excitation, InputDesign, d_optimal
+from ._input_design import (
+    AxisLimits,
+    DrivenAxis,
+    Excitation,
+    InputDesign,
+    d_optimal,
+    driven_motion,
+    feed_forward,
+    motion_basis,
+    relative_numbers,
+    sensitivities,
+)
 
 # Called after each iteration with its number, over all starts, and the criterion as it stands.
 DesignProgress: TypeAlias = Callable[[int, float], None]

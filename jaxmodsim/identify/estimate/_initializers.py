@@ -35,12 +35,27 @@ class AbstractInitializer(eqx.Module):
         """A better `x`, and the root mean squares, in noise levels, of all starts that were tried, best first."""
 
 
+def as_initializers(initializer: object) -> tuple[AbstractInitializer, ...]:
+    """One initializer or several, as a tuple.
+
+    **Raises:**
+
+    - `ValueError` for anything else.
+    """
+    several = (initializer,) if isinstance(initializer, AbstractInitializer) else initializer
+    if not isinstance(several, tuple | list) or not all(isinstance(each, AbstractInitializer) for each in several):
+        raise ValueError(
+            f"initializer must be one such as Staged(), or several of them, but {initializer!r} was given."
+        )
+    return tuple(several)
+
+
 def run_initializers(
     initializers: AbstractInitializer | Sequence[AbstractInitializer], problem: FitProblem, options: SearchOptions
 ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
     """Where the search starts after one initializer or several, each from where the one before it ended."""
     x, starts = problem.x0, ()
-    for each in (initializers,) if isinstance(initializers, AbstractInitializer) else initializers:
+    for each in as_initializers(initializers):
         x, starts = each.initialize(problem, x, options)
     return x, tuple(starts)
 

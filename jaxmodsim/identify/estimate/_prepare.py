@@ -1,7 +1,8 @@
 """From a scene, records and what is asked to the arrays of a `FitProblem`."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeAlias
 
 import equinox as eqx
@@ -11,15 +12,16 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float
 
-from ..._core.arguments import as_float, as_names, as_reals
+from ..._core.arguments import as_float, as_mapping, as_names, as_reals, as_whole
 from ..._core.device import on_device
 from ..._core.parameters import Range, check_ranges, modules_of
 from ...scene import Scene, State, check_scene, scene_numbers, scene_ranges
-from ..data._record import Record, Windows, cut, runs_of, slip_channel, start_errors, start_state
+from ..data._record import Record, Windows, cut, runs_of, slip_channel
+from ..data._signals import start_errors, start_state
 from ..model._engines import DELAY, Controller, EventEngine, ReplayEngine
 from ..model._observe import Observable, by_channel, check_observables, coordinates_seen
 from ..model._parameters import FreeParameters, chosen_entries, split_entries, split_ranges
-from ._problem import AbstractLoss, FitProblem, Prior, local_names
+from ._problem import AbstractLoss, FitProblem, Prior, SquaredLoss, local_names
 from ._search import SearchResult, channels_seen
 
 # Mode changes of one run by events that the arrays of a fit have room for.
@@ -61,22 +63,37 @@ class MultipleShooting:
             raise ValueError(f"jump must be two numbers > 0, of positions and of velocities, but it is {self.jump!r}.")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """What `fit` was asked for, beside scene, records and names; see there."""
+class FitOptions(eqx.Module):
+    """The arguments of `fit` that define the problem, converted and checked; see there."""
 
     observe: Observable | Mapping[str, Observable]
-    q0: StartState | None
-    qd0: StartState | None
-    limits: Mapping[str, tuple[float | None, float | None]]
-    loss: AbstractLoss
-    substeps: int
-    accuracy: float
-    delay: Mapping[str, float] = field(default_factory=dict)
-    passive: tuple[str, ...] = ()
-    prior: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    q0: StartState | None = None
+    qd0: StartState | None = None
+    delay: Mapping[str, float] = eqx.field(
+        default=None, converter=partial(as_mapping, name="delay", example="{'u': 1e-3}")
+    )
+    limits: Mapping[str, tuple[float | None, float | None]] = eqx.field(
+        default=None, converter=partial(as_mapping, name="limits", example="{'m': (0.0, 5.0)}")
+    )
+    passive: tuple[str, ...] = eqx.field(default=(), converter=partial(as_names, name="passive"))
+    prior: Mapping[str, tuple[float, float]] = eqx.field(
+        default=None, converter=partial(as_mapping, name="prior", example="{'m': (95.0, 5.0)}")
+    )
+    loss: AbstractLoss = eqx.field(default=None, converter=lambda loss: SquaredLoss() if loss is None else loss)
     controller: Controller | None = None
     shooting: MultipleShooting | None = None
+    substeps: int = eqx.field(default=1, converter=partial(as_whole, name="substeps"))
+    accuracy: float = eqx.field(default=1e-8, converter=partial(as_float, name="accuracy", lower=0.0))
+
+    def __check_init__(self) -> None:
+        """Refuse objects of another kind."""
+        for name, value, kind, words in (
+            ("loss", self.loss, AbstractLoss, "a loss such as Huber()"),
+            ("controller", self.controller, Controller | None, "a Controller"),
+            ("shooting", self.shooting, MultipleShooting | None, "a MultipleShooting"),
+        ):
+            if not isinstance(value, kind):
+                raise ValueError(f"{name} must be {words}, but {value!r} was given.")
 
 
 @dataclass(frozen=True)
@@ -90,7 +107,7 @@ class Prepared:
     given: frozenset[str]
 
 
-def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str], settings: Settings) -> Prepared:
+def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str], options: FitOptions) -> Prepared:
     """Check everything and build the problem.
 
     **Raises:**
@@ -101,26 +118,26 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
     _check_inputs(scene, several)
     for _, module in modules_of(scene):
         check_ranges(module)
-    states = _states(scene, several, settings)
-    observables = by_channel(settings.observe, several)
+    states = _states(scene, several, options)
+    observables = by_channel(options.observe, several)
     check_observables(observables, scene, _first(states))
     own = local_names(_first(states))
     local, shared = _sorted_out(free, own)
-    if settings.shooting is not None:
-        shot = settings.shooting
+    if options.shooting is not None:
+        shot = options.shooting
         local = tuple(name for name in own if shot.jump is not None or not name.startswith("z0"))
-    unknown = _unknown(settings, observables, own, local)
-    numbers, ranges = _numbers(scene, several, settings)
+    unknown = _unknown(options, observables, own, local)
+    numbers, ranges = _numbers(scene, several, options)
     single = split_entries(numbers)
     whole = scene_numbers(scene)
     chosen = shared if isinstance(shared, str) else chosen_entries({**whole, **numbers}, shared)
     driven = sorted(set(chosen) & set(several[0].inputs))
     if driven:
         raise ValueError(f"{driven[0]} is driven by the record and cannot be free.")
-    parameters = FreeParameters.of(single, ranges, chosen, _passive(settings.passive, numbers))
-    windows = cut(several, None if settings.shooting is None else settings.shooting.window)
+    parameters = FreeParameters.of(single, ranges, chosen, _passive(options.passive, numbers))
+    windows = cut(several, None if options.shooting is None else options.shooting.window)
     base = _bases(scene, several, windows, states, observables)
-    engine = _engine(scene, several, settings, observables, states.q.shape[1])
+    engine = _engine(scene, several, options, observables, states.q.shape[1])
     names = (*dict(observables), *(slip_channel(x) for x in dict.fromkeys(e for r in several for e in r.slips)))
     noise = {name: on_device(_level(name, several)) for name in names}
     problem = FitProblem(
@@ -130,9 +147,9 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
         base,
         runs_of(several, windows),
         noise,
-        settings.loss,
-        _prior(settings.prior, parameters.names),
-        _jump(settings.shooting, windows, base),
+        options.loss,
+        _prior(options.prior, parameters.names),
+        _jump(options.shooting, windows, base),
         len(unknown),
         _shown_by_opening(several, observables, (*local, *unknown), unknown, states.q.shape[1]),
     )
@@ -173,14 +190,14 @@ def _check_inputs(scene: Scene, records: tuple[Record, ...]) -> None:
                 )
 
 
-def _states(scene: Scene, records: tuple[Record, ...], settings: Settings) -> State:
+def _states(scene: Scene, records: tuple[Record, ...], options: FitOptions) -> State:
     """Initial states of the records, with a leading axis of records."""
     count = len(records)
-    given = {"q0": settings.q0, "qd0": settings.qd0}
+    given = {"q0": options.q0, "qd0": options.qd0}
     given = {name: x if x is None else as_reals(x, name=name) for name, x in given.items()}
     sizes = {np.shape(x)[-1] for x in given.values() if x is not None and np.ndim(x) > 0}
     dof = max(sizes, default=1)
-    observables = by_channel(settings.observe, records)
+    observables = by_channel(options.observe, records)
     measured = [np.stack(each) for each in zip(*(measured_start(x, observables, dof) for x in records), strict=True)]
     starts = []
     for value, seen in zip(given.values(), measured, strict=True):
@@ -188,8 +205,8 @@ def _states(scene: Scene, records: tuple[Record, ...], settings: Settings) -> St
         fine = array.shape in ((dof,), (count, dof)) and np.isfinite(array).all()
         if not fine:
             raise ValueError(
-                f"q0 and qd0 must be finite and of one shape [dof] or [records, dof], but q0 = {settings.q0} and"
-                f" qd0 = {settings.qd0}."
+                f"q0 and qd0 must be finite and of one shape [dof] or [records, dof], but q0 = {options.q0} and"
+                f" qd0 = {options.qd0}."
             )
         starts.append(np.broadcast_to(array, (count, dof)))
     q, qd = (on_device(np.array(x, jnp.result_type(float))) for x in starts)
@@ -205,15 +222,15 @@ def initial_states(scene: Scene, q: Float[Array, "runs dof"], qd: Float[Array, "
 
 
 def _unknown(
-    settings: Settings, observables: tuple[tuple[str, Observable], ...], own: tuple[str, ...], local: tuple[str, ...]
+    options: FitOptions, observables: tuple[tuple[str, Observable], ...], own: tuple[str, ...], local: tuple[str, ...]
 ) -> tuple[str, ...]:
     """Names of the coordinates and velocities at the first sample that a channel shows and no one gave."""
-    if settings.shooting is not None:
+    if options.shooting is not None:
         return ()
     dof = sum(name.startswith("q0[") for name in own)
     seen = set(coordinates_seen(observables, dof).values())
     shown = {f"q0[{i}]": {f"q[{i}]"} for i in range(dof)} | {f"qd0[{i}]": {f"q[{i}]", f"qd[{i}]"} for i in range(dof)}
-    given = {"q0": settings.q0 is not None, "qd0": settings.qd0 is not None}
+    given = {"q0": options.q0 is not None, "qd0": options.qd0 is not None}
     return tuple(
         name for name, by in shown.items() if by & seen and name not in local and not given[name.partition("[")[0]]
     )
@@ -260,13 +277,13 @@ def _sorted_out(free: Sequence[str], own: tuple[str, ...]) -> tuple[tuple[str, .
 
 
 def _numbers(
-    scene: Scene, records: tuple[Record, ...], settings: Settings
+    scene: Scene, records: tuple[Record, ...], options: FitOptions
 ) -> tuple[dict[str, Array], dict[str, Range]]:
     """All numbers that may be free, delays included, and their ranges, entry by entry."""
     whole = scene_numbers(scene)
     ranges = split_ranges(whole, scene_ranges(scene))
-    delays = {name: settings.delay.get(name, 0.0) for name in records[0].inputs}
-    for name, given in settings.delay.items():
+    delays = {name: options.delay.get(name, 0.0) for name in records[0].inputs}
+    for name, given in options.delay.items():
         late = as_float(given, name=f"delay of {name!r}")
         if name not in delays or late < 0:
             raise ValueError(
@@ -275,7 +292,7 @@ def _numbers(
             )
     numbers = split_entries(whole) | {DELAY + name: on_device(float(late)) for name, late in delays.items()}
     ranges |= {DELAY + name: Range("s", 0.0) for name in delays}
-    for name, span in settings.limits.items():
+    for name, span in options.limits.items():
         low, high = _limits(name, span)
         upper, _, base = name.partition("/")
         if base and upper in ranges and ranges[upper].lower == base:
@@ -332,23 +349,23 @@ def _bases(
 def _engine(
     scene: Scene,
     records: tuple[Record, ...],
-    settings: Settings,
+    options: FitOptions,
     observables: tuple[tuple[str, Observable], ...],
     dof: int,
 ) -> ReplayEngine | EventEngine:
     linear = records[0].linear
-    delays = {DELAY + name: on_device(float(late)) for name, late in settings.delay.items()}
+    delays = {DELAY + name: on_device(float(late)) for name, late in options.delay.items()}
     slips = tuple(dict.fromkeys(effect for record in records for effect in record.slips))
     fixed_steps = not scene.mode_names or (not scene.constraints and set(scene.mode_widths(dof)) == {1})
     if fixed_steps and not slips:
-        return ReplayEngine(scene, delays, settings.controller, observables, linear, settings.substeps)
-    if settings.controller is not None:
+        return ReplayEngine(scene, delays, options.controller, observables, linear, options.substeps)
+    if options.controller is not None:
         raise ValueError(
             "A controller runs with fixed steps, which pass stick and slip along a line, but neither constraints, nor"
             " slip in a plane, nor slip instants in a record: wrap the laws, as in Regularized(law, width)."
         )
     return EventEngine(
-        scene, delays, observables, linear, slips, settings.accuracy, _ATOL_SHARE * settings.accuracy, _MAX_EVENTS
+        scene, delays, observables, linear, slips, options.accuracy, _ATOL_SHARE * options.accuracy, _MAX_EVENTS
     )
 
 

@@ -2,6 +2,7 @@
 
 import abc
 import re
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..._core.device import on_device
 from ..._core.parameters import Number, check_ranges, parameter
@@ -216,6 +217,35 @@ class FitProblem(eqx.Module):
         unasked = jnp.arange(len(self.local)) >= self.reported
         known = {name: jnp.where(unasked[None, :], _HELD, each) for name, each in self.known.items()}
         return eqx.tree_at(lambda p: p.known, self, known)
+
+    def pinned(
+        self, x: Float[Array, " n"], information: Float[np.ndarray, "n n"], free: Collection[str] = ()
+    ) -> "FitProblem":
+        """The problem with all parameters but `free` held at `x`, by a prior: only arrays differ.
+
+        Each parameter moves by no more than a millionth of its standard error by `information`, the Fisher information
+        of the parameters. The weight leaves a quarter of the digits, so that the normal equations are well scaled.
+        """
+        mean = self.at(x).vector
+        stiff = float(np.finfo(mean.dtype).eps) ** -0.25
+        known = np.sqrt(np.maximum(np.diag(information)[: len(mean)], 0.0))  # rounding may make it negative
+        size = np.abs(mean)
+        weight = stiff * np.maximum(known, 1 / np.where(size > 0, size, 1.0))
+        moves = np.array([name in free for name in self.free.names], bool)
+        held = Prior(
+            on_device(np.where(moves, np.asarray(self.prior.mean), mean)),
+            on_device(np.where(moves, np.asarray(self.prior.weight), weight).astype(mean.dtype)),
+        )
+        return eqx.tree_at(lambda p: p.prior, self, held)
+
+    def counting(self, mask: Bool[np.ndarray, "runs samples"], *, slips: bool = True) -> "FitProblem":
+        """The problem in which only the samples of the mask count, and with `slips` the slip instants of their runs."""
+        own = np.any(mask, axis=1, keepdims=True) & slips
+        runs = self.runs._replace(
+            weight={name: on_device(np.asarray(weight) * mask) for name, weight in self.runs.weight.items()},
+            slip_weight={name: on_device(np.asarray(weight) * own) for name, weight in self.runs.slip_weight.items()},
+        )
+        return eqx.tree_at(lambda p: p.runs, self, runs)
 
     @property
     def reported(self) -> int:

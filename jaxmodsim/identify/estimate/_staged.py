@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ...friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw
 from ...scene import Friction, Scene, State, scene_ranges, vector_field
-from ..data._record import differentiate, smooth, smooth_span
+from ..data._signals import differentiate, smooth, smooth_span
 from ..model._engines import with_values
 from ..model._observe import coordinates_seen
 from ._initializers import AbstractInitializer

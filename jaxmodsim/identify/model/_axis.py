@@ -11,7 +11,8 @@ from jaxtyping import Array
 from ..._core.parameters import ranges_of
 from ...friction import AbstractLaw, Coulomb, Viscous, asymmetric, laws
 from ...scene import AbstractEffect, AppliedForce, Friction, Scene, replace_numbers
-from ..data._record import Record, differentiate, smooth, smooth_span, without_outliers
+from ..data._record import Record
+from ..data._signals import differentiate, smooth, smooth_span, without_outliers
 
 # Share of the variance of a force below which a regression explains it well enough to tell that its sign is wrong.
 _EXPLAINED = 0.5

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import special  # scipy.stats takes most of a second to import
 
+from ..._core.arguments import as_share
 from ..._core.device import on_device
 from ..data._record import Record
 from ..estimate._problem import FitProblem
@@ -326,8 +327,7 @@ def interval(
 
     - `ValueError` unless 0 < level < 1.
     """
-    if not 0 < level < 1:
-        raise ValueError(f"level must lie between 0 and 1, but it is {level}.")
+    level = as_share(level, name="level")
     low, high = limits
     margin = float(special.stdtrit(BLOCKS - 1, 0.5 + level / 2)) * error
     if logarithmic and value > low:

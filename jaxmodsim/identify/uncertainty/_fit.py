@@ -9,17 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._core.arguments import as_float, as_mapping, as_names, as_whole
+from ..._core.arguments import as_float, as_whole
 from ..._core.device import on_device
 from ..._core.parameters import Range
 from ..._core.progress import iteration_words, reported
 from ..._core.state_dependent import is_state_dependent
 from ...friction import AbstractLaw
 from ...scene import Scene, scene_numbers, scene_ranges
-from ..data._clock import sampling_gaps
-from ..data._record import Record, Windows, cut, outliers, runs_of
-from ..estimate._initializers import AbstractInitializer, run_initializers
-from ..estimate._prepare import MultipleShooting, Settings, StartState, prepare, step_error
+from ..data._record import Record, Windows, cut, runs_of
+from ..data._signals import outliers, sampling_gaps
+from ..estimate._initializers import AbstractInitializer, as_initializers, run_initializers
+from ..estimate._prepare import FitOptions, MultipleShooting, StartState, prepare, step_error
 from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
 from ..estimate._search import (
     Progress,
@@ -50,12 +50,6 @@ _ROUGH = (
     " derivatives say, so rounding or the integration steps decide them. Raise substeps; pass a set-valued law such as"
     " Coulomb itself, without Regularized; if the model misses nothing but rounding, there is nothing to estimate."
 )
-_KINDS = {
-    "scene": "a Scene",
-    "loss": "a loss such as Huber()",
-    "controller": "a Controller",
-    "shooting": "a MultipleShooting",
-}
 
 
 def fit(
@@ -131,54 +125,42 @@ def fit(
     - `ValueError` for names that are unknown, a start beyond its limits, inputs the scene has no entry for.
     - `RuntimeError` if the model is not finite at its start values.
     """
-    loss = SquaredLoss() if loss is None else loss
-    _check_kinds(scene, loss, controller, shooting)
-    initializer = _initializers(initializer)
-    settings = Settings(
+    options = FitOptions(
         observe=observe,
         q0=q0,
         qd0=qd0,
-        delay=as_mapping(delay, name="delay", example="{'u': 1e-3}"),
-        limits=as_mapping(limits, name="limits", example="{'m': (0.0, 5.0)}"),
-        passive=as_names(passive, name="passive"),
-        prior=as_mapping(prior, name="prior", example="{'m': (95.0, 5.0)}"),
+        delay=delay,
+        limits=limits,
+        passive=passive,
+        prior=prior,
         loss=loss,
         controller=controller,
         shooting=shooting,
-        substeps=as_whole(substeps, name="substeps"),
-        accuracy=as_float(accuracy, name="accuracy", lower=0.0),
+        substeps=substeps,
+        accuracy=accuracy,
     )
-    limit, rtol = as_whole(max_steps, name="max_steps"), as_float(rtol, name="rtol", lower=0.0)
+    initializers = as_initializers(initializer)
+    rtol, max_steps = as_float(rtol, name="rtol", lower=0.0), as_whole(max_steps, name="max_steps")
     with reported(progress, "fit", iteration_words) as report:
-        prepared, options = prepare(scene, records, free, settings), SearchOptions(rtol, limit, report)
-        x, starts = run_initializers(initializer, prepared.problem.held, options)
-        search = solve_freed(prepared.problem, x, options, prepared.given)
-    values = search.problem.at(search.state.x).values
-    error = step_error(search)
-    return result_of(
-        search, prepared.records, prepared.windows, prepared.units, with_values(scene, values), error, starts
-    )
+        return fit_scene(scene, records, free, options, initializers, SearchOptions(rtol, max_steps, report))
 
 
-def _check_kinds(scene: object, loss: object, controller: object, shooting: object) -> None:
-    """Refuse objects of another kind."""
-    for name, value, kind in (
-        ("scene", scene, Scene),
-        ("loss", loss, AbstractLoss),
-        ("controller", controller, Controller | None),
-        ("shooting", shooting, MultipleShooting | None),
-    ):
-        if not isinstance(value, kind):
-            raise ValueError(f"{name} must be {_KINDS[name]}, but {value!r} was given.")
-
-
-def _initializers(initializer: object) -> tuple[AbstractInitializer, ...]:
-    several = (initializer,) if isinstance(initializer, AbstractInitializer) else initializer
-    if not isinstance(several, tuple | list) or not all(isinstance(each, AbstractInitializer) for each in several):
-        raise ValueError(
-            f"initializer must be one such as Staged(), or several of them, but {initializer!r} was given."
-        )
-    return tuple(several)
+def fit_scene(
+    scene: Scene,
+    records: Record | Sequence[Record],
+    free: Sequence[str],
+    options: FitOptions,
+    initializers: Sequence[AbstractInitializer],
+    search_options: SearchOptions,
+) -> FitResult:
+    """`fit` with its arguments checked."""
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene must be a Scene, but {scene!r} was given.")
+    prepared = prepare(scene, records, free, options)
+    x, starts = run_initializers(initializers, prepared.problem.held, search_options)
+    search = solve_freed(prepared.problem, x, search_options, prepared.given)
+    model = with_values(scene, search.problem.at(search.state.x).values)
+    return result_of(search, prepared.records, prepared.windows, prepared.units, model, step_error(search), starts)
 
 
 def fit_law(

@@ -1,4 +1,4 @@
-"""Samples of the posterior of a fit by NUTS, whether they can be relied on, and the fit's intervals beside theirs."""
+"""The posterior of a fit: its density for samplers, unconstrained and whitened, and samples of it by NUTS."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -11,12 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..._core.arguments import as_whole
+from ..._core.arguments import as_share, as_whole
 from ..._core.extra import extra
+from ..estimate._problem import FitProblem
+from ..estimate._search import SearchResult
 from ._estimate import ParameterEstimate
-from ._log_density import LogDensity, log_density
 from ._result import FitResult
 
+# What a number without effect is taken to be known by where coordinates are scaled: x is about 1 in size.
+_LEAST_INFORMATION = 1.0
+# Added to the scaled normal matrix: its factor exists whatever is not determined.
+_JITTER = 1e-12
+# Where a fit ended on a limit, the density starts beside it: by these shares of a standard error and of the range.
+_BESIDE, _BESIDE_RANGE = float(np.log(2.0)), 0.25
+_LARGEST_MEMORY = 0.98
 # Largest R-hat and fewest effective samples a chain of chains that can be relied on: Vehtari et al. 2021.
 _RHAT, _EFFECTIVE_A_CHAIN = 1.01, 100
 # Acceptance aimed at. Fixed steps through a kink of a friction law leave small jumps in the density, which no step of
@@ -26,6 +34,200 @@ _ACCEPTANCE = 0.75
 _SCATTER = 1.0
 # Ratio of the standard deviation to that of the fit from which on the two are said to differ.
 _DIFFERS = 0.15
+
+
+@eqx.filter_custom_jvp
+def _residual(x: Float[Array, " n"], problem: FitProblem) -> Float[Array, " rows"]:
+    return problem.evaluate(x)[0]
+
+
+@_residual.def_jvp
+def _(primals: tuple[Array, FitProblem], tangents: tuple[Array | None, PyTree]) -> tuple[Array, Array]:
+    """All columns in one forward sweep: cheaper than backwards for a few unknowns, and right through events."""
+    residual, jacobian = primals[1].evaluate(primals[0])
+    return residual, jnp.zeros_like(residual) if tangents[0] is None else jacobian @ tangents[0]
+
+
+class _SoftBox(eqx.Module):
+    """The real line to the inside of bounds, and linear from a few widths off them on.
+
+    `x = v + width (softplus(-(v - lower)/width) - softplus((v - upper)/width))`
+    """
+
+    lower: Float[Array, " n"]
+    upper: Float[Array, " n"]
+    width: Float[Array, " n"]
+
+    def inside(self, v: Float[Array, " n"]) -> Float[Array, " n"]:
+        below, above = (v - self.lower) / self.width, (v - self.upper) / self.width
+        return v + self.width * (jax.nn.softplus(-below) - jax.nn.softplus(above))
+
+    def log_slope(self, v: Float[Array, " n"]) -> Float[Array, " n"]:
+        below, above = (v - self.lower) / self.width, (v - self.upper) / self.width
+        constant = jnp.log(-jnp.expm1(-(self.upper - self.lower) / self.width))  # 0 without two bounds
+        return jax.nn.log_sigmoid(below) + jax.nn.log_sigmoid(-above) + constant
+
+    def outside(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The v of an x strictly inside."""
+        over, under = (x - self.lower) / self.width, (self.upper - x) / self.width
+        return x + self.width * (jnp.log(-jnp.expm1(-over)) - jnp.log(-jnp.expm1(-under)))
+
+
+class LogDensity(eqx.Module):
+    """Logarithm of the posterior density of all unknowns of a fit, up to a constant: `density(u)`, u of shape `[n]`.
+
+    - `names`: of the unknowns: parameters, initial states, then the standard deviation `noise.CHANNEL` of each channel
+      and the correlation `memory.CHANNEL` of its noise from one sample to the next.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    _problem: FitProblem
+    _box: _SoftBox
+    _centre: Float[Array, " n"]
+    _factor: Float[Array, "n n"]
+
+    @property
+    def start(self) -> Float[Array, " n"]:
+        """The u of the fit: zeros. A standard deviation of the fit is about 1 in any direction of u."""
+        return jnp.zeros_like(self._centre)
+
+    @eqx.filter_jit
+    def __call__(self, u: Float[Array, " n"]) -> Float[Array, ""]:
+        """The logarithm of the density at `u`, up to a constant; minus infinity where the model is not finite."""
+        problem = self._problem
+        v, level, memory = self._parts(u)
+        x, size = self._box.inside(v), len(problem.free.names)
+        residual = _residual(x, problem)
+        # Flat in the parameters, not in their coordinates; a parameter's limit depends on others only before it, so
+        # that the determinant is the product of the diagonal.
+        slopes = jnp.diagonal(problem.free.slopes(x[:size]))
+        total = jnp.sum(self._box.log_slope(v)) + jnp.sum(jnp.log(jnp.abs(slopes)))
+        total = total - 0.5 * jnp.sum(residual[problem.samples :] ** 2)
+        for name, (rows, weight) in problem.by_channel(residual).items():
+            rho = memory.get(name, jnp.zeros_like(level[name]))
+            counted, runs = jnp.sum(weight), jnp.sum(jnp.max(weight, axis=1))
+            standard = jnp.where(weight > 0, _innovations(rows, rho), 0.0) * jnp.exp(-level[name])
+            total = total - problem.loss.cost(jnp.reshape(standard, (-1,))) - counted * level[name]
+            total = total + 0.5 * runs * jnp.log1p(-(rho**2))
+            total = total + (jnp.log1p(-(rho**2)) if name in memory else 0.0)  # flat in the memory, not in its artanh
+        return jnp.where(jnp.isfinite(total), total, -jnp.inf)
+
+    def values(self, u: Float[Array, " n"]) -> dict[str, Float[Array, ""]]:
+        """The unknowns at `u` by name, in their units."""
+        return dict(zip(self.names, self.vector(u), strict=True))
+
+    def vector(self, u: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The unknowns at `u` in the order of `names`, in their units."""
+        problem = self._problem
+        v, level, memory = self._parts(u)
+        x = self._box.inside(v)
+        values = [*problem.free.vector(x[: len(problem.free.names)])]
+        start = problem.starts(x) if problem.local else None
+        values += [] if start is None else [*jnp.reshape(jax.vmap(problem.taken)(start), (-1,))]
+        none = jnp.zeros((), v.dtype)
+        values += [
+            problem.noise[name] * jnp.exp(t) / jnp.sqrt(1.0 - memory.get(name, none) ** 2) for name, t in level.items()
+        ]
+        return jnp.stack([*values, *memory.values()])
+
+    def _parts(self, u: Float[Array, " n"]) -> tuple[Array, dict[str, Array], dict[str, Array]]:
+        """Coordinates, logarithms of the innovations' level over the noise, and memories."""
+        v = self._centre + self._factor @ u
+        count, channels = self._box.width.shape[0], tuple(self._problem.columns)
+        level = {name: v[count + i] for i, name in enumerate(channels)}
+        first = count + len(channels)
+        remembering = [name for name in channels if name in self._problem.runs.weight]
+        return v[:count], level, {name: jnp.tanh(v[first + i]) for i, name in enumerate(remembering)}
+
+
+def log_density(result: FitResult) -> LogDensity:
+    """The posterior density of a fit as a function of one vector, for blackjax, numpyro and other samplers.
+
+    `density = log_density(result)` has the logarithm of the density at `density(u)`, `jax.grad(density)(u)` as its
+    gradient, the unknowns by name at `density.values(u)`, and the fit at `density.start`. u is unconstrained, and
+    whitened by the covariance of the fit. Unknown are all free parameters, initial states and delays, and of each
+    channel the level of its noise and how it is correlated from one sample to the next, AR(1): normal for
+    `SquaredLoss`, with the tails of a robust loss otherwise. Instants of break-away have noise without memory. Before
+    the record all parameters within their limits are equally likely, correlations too, noise levels in the logarithm;
+    `prior` of `fit` counts as well. What the record does not determine needs one.
+
+    With runs by events the density jumps wherever a change in the sequence of events makes the output jump. Samplers
+    by gradient do not see it: make such laws `Regularized` where stick and slip change with the parameters.
+
+    **Arguments:**
+
+    - `result`: a fit that was not loaded from a file.
+
+    **Raises:**
+
+    - `ValueError` of a result that was loaded.
+    """
+    search = result.search_for("The posterior")
+    problem = search.problem
+    residual, jacobian = problem.loss.weighted(search.state.residual, search.state.jacobian)
+    split, level, memory = problem.by_channel(residual), {}, {}
+    for name, (rows, weight) in split.items():
+        square = jnp.maximum(jnp.sum(rows**2), jnp.finfo(rows.dtype).tiny)
+        rho = jnp.clip(jnp.sum(rows[:, 1:] * rows[:, :-1]) / square, -_LARGEST_MEMORY, _LARGEST_MEMORY)
+        if name in problem.runs.weight:
+            memory[name] = rho
+        rho = memory.get(name, jnp.zeros_like(rho))
+        left = jnp.sum(jnp.where(weight > 0, _innovations(rows, rho), 0.0) ** 2)
+        level[name] = 0.5 * jnp.log(jnp.maximum(left, jnp.finfo(rows.dtype).tiny) / jnp.sum(weight))
+    box, v, factor = _coordinates_of(search, jacobian, level, memory)
+    counted = {name: jnp.sum(weight) for name, (_, weight) in split.items()}
+    deviations = [1.0 / jnp.sqrt(2.0 * counted[name]) for name in level]
+    deviations += [1.0 / jnp.sqrt(counted[name] * (1.0 - rho**2)) for name, rho in memory.items()]
+    beside = jnp.stack([*level.values(), *(jnp.arctanh(rho) for rho in memory.values())])
+    n, more = v.shape[0], beside.shape[0]
+    whole = jnp.zeros((n + more, n + more), v.dtype)
+    whole = whole.at[:n, :n].set(factor).at[n:, n:].set(jnp.diag(jnp.stack(deviations)))
+    names = list(problem.free.names)
+    if problem.local:
+        records = result.provenance.records
+        runs = [f"{each.name}/" if len(records) > 1 else "" for each in records]
+        if len(records) != problem.count:
+            runs = [f"window {i}/" for i in range(problem.count)]
+        names += [prefix + name for prefix in runs for name in problem.local]
+    names += [f"noise.{name}" for name in level] + [f"memory.{name}" for name in memory]
+    return LogDensity(tuple(names), problem, box, jnp.concatenate([v, beside]), whole)
+
+
+def _coordinates_of(
+    search: SearchResult, jacobian: Float[Array, "rows n"], level: dict[str, Array], memory: dict[str, Array]
+) -> tuple[_SoftBox, Float[Array, " n"], Float[Array, "n n"]]:
+    """Bounds made soft, the fit's coordinates, and a factor of their covariance, the noise taken as it was left."""
+    problem, columns = search.problem, []
+    for column in jacobian.T:
+        parts = []
+        for name, (rows, weight) in problem.by_channel(column).items():
+            filtered = _innovations(rows, memory.get(name, jnp.zeros((), rows.dtype)))
+            parts.append(jnp.reshape(jnp.where(weight > 0, filtered, 0.0) * jnp.exp(-level[name]), (-1,)))
+        columns.append(jnp.concatenate([*parts, column[problem.samples :]]))
+    filtered = jnp.stack(columns, axis=1)
+    n = jacobian.shape[1]
+    matrix = filtered.T @ filtered + _LEAST_INFORMATION * jnp.eye(n, dtype=jacobian.dtype)
+    lower, upper, _ = problem.box
+    width = jnp.sqrt(jnp.diagonal(_factor(matrix) @ _factor(matrix).T))
+    box = _SoftBox(lower, upper, width)
+    off = jnp.minimum(_BESIDE * width, _BESIDE_RANGE * (upper - lower))
+    v = box.outside(jnp.clip(search.state.x, lower + off, upper - off))
+    slope = jnp.exp(box.log_slope(v))
+    return box, v, _factor(matrix * jnp.outer(slope, slope) + jnp.diag(_LEAST_INFORMATION * (1.0 - slope)))
+
+
+def _factor(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """A factor L of the inverse: `L L' = matrix^-1`."""
+    scale = jnp.sqrt(jnp.diagonal(matrix))
+    eye = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
+    root = jnp.linalg.cholesky(matrix / jnp.outer(scale, scale) + _JITTER * eye)
+    return jax.scipy.linalg.solve_triangular(root.T, eye) / scale[:, None]
+
+
+def _innovations(rows: Float[Array, "runs samples"], memory: Float[Array, ""]) -> Float[Array, "runs samples"]:
+    """What of each residual does not follow from the one before; all of one standard deviation."""
+    first = rows[:, :1] * jnp.sqrt(1.0 - memory**2)
+    return jnp.concatenate([first, rows[:, 1:] - memory * rows[:, :-1]], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +257,7 @@ class Posterior:
 
         - `ValueError` unless 0 < level < 1.
         """
-        if not 0 < level < 1:
-            raise ValueError(f"level must lie between 0 and 1, but it is {level}.")
+        level = as_share(level, name="level")
         edges = [0.5 - level / 2, 0.5 + level / 2]
         return {name: (float(low), float(high)) for name, (low, high) in self._quantiles(edges).items()}
 

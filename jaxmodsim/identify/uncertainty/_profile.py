@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import special  # scipy.stats takes most of a second to import
 
-from ..._core.arguments import as_whole
+from ..._core.arguments import as_share, as_whole
 from ..._core.device import on_device
 from ..estimate._problem import FitProblem, Prior
 from ..estimate._search import SearchOptions, SearchResult, SearchState, cost_of, start_search, step, weighted_by
@@ -191,22 +191,19 @@ def profile(result: FitResult, name: str, *, points: int = 6, level: float = 0.9
 
     - `ValueError` for another name or level, or of a result that was loaded.
     """
-    names = _search_of(result).problem.free.names
+    names = result.search_for("A profile").problem.free.names
     if name not in names:
         raise ValueError(f"{name!r} has no profile; the parameters that have one are: {', '.join(names)}.")
-    if not 0 < level < 1:
-        raise ValueError(f"level must lie between 0 and 1, but it is {level}.")
-    if isinstance(points, bool) or not isinstance(points, int) or points < 2:
-        raise ValueError(f"points must be an integer >= 2, but it is {points!r}.")
+    level, points = as_share(level, name="level"), as_whole(points, name="points", least=2)
     limit = as_whole(max_steps, name="max_steps", least=0)
     threshold = float(special.fdtri(1, BLOCKS - 1, level))
     first, left, times = result, limit, 0
     while isinstance(curve := _along(result, name, points, level, -_BELOW * threshold if left else -math.inf), _Point):
         times += 1
-        before = _search_of(result)
+        before = result.search_for("A profile")
         x = on_device(curve.x)
         result = searched_on(result, x, SearchOptions(max_steps=left), times, f"from a better value of {name}")
-        left = max(left - _search_of(result).iterations + before.iterations, 0)
+        left = max(left - result.search_for("A profile").iterations + before.iterations, 0)
     notes = list(curve.notes)
     if times:
         fell = ", ".join(f"{x:.6g} to {result.diagnostics.rmse[k]:.6g}" for k, x in first.diagnostics.rmse.items())
@@ -222,16 +219,10 @@ def profile(result: FitResult, name: str, *, points: int = 6, level: float = 0.9
     return replace(curve, notes=tuple(notes))
 
 
-def _search_of(result: FitResult) -> SearchResult:
-    if result.search is None:
-        raise ValueError("A profile needs the search, which a loaded result does not have: fit again.")
-    return result.search
-
-
 def _along(result: FitResult, name: str, points: int, level: float, least: float) -> Profile | _Point:
     """The profile of a fit, or the first point whose ratio is below `least`."""
     threshold = float(special.fdtri(1, BLOCKS - 1, level))
-    search = _search_of(result)
+    search = result.search_for("A profile")
     line, tangent = _line_of(result.estimate, search, name)
     estimate, names = result.values[name], search.problem.free.names
     start = _Point(line.coordinate(estimate), np.asarray(search.state.x), 0.0, line.best)

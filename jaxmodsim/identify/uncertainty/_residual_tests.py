@@ -8,8 +8,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy import special  # scipy.stats takes most of a second to import
 
+from ..estimate._search import SearchResult
+from ..estimate._search import by_channel as residual_by_channel
 from ..model._observe import RecordedMotion
-from ._estimate import lag_number
+from ._estimate import BLOCKS, lag_number
 from ._result import FitResult
 
 # A trend or an input is named in words from this share of the variance on, at this probability of chance.
@@ -20,6 +22,9 @@ _WHITE_BAND = 1.96
 _LEAST_VARIANCE = 0.1
 # Samples for each lag that is looked at, at least, and lags in units of the memory.
 _SAMPLES_A_LAG, _MEMORIES = 5, 3
+# Independent samples that a block must hold for its scores to be independent of those of the next one; the number of
+# blocks if there are too few samples for the usual number.
+_WORTH, _FEW = 4, 6
 # Keeps divisions by what may vanish finite.
 _TINY = 1e-300
 _MEANING = {
@@ -277,3 +282,27 @@ def _cross(e: np.ndarray, u: np.ndarray, correlation: np.ndarray, memory: int, l
     # As if the lags were independent (Sidak), which is on the safe side.
     chance = -math.expm1(len(looked_at) * math.log1p(-min(p, 1 - 1e-16)))
     return Cross(float(values[best]), interval * float(looked_at[best]), chance)
+
+
+def independent_blocks(search: SearchResult) -> int:
+    """Number of blocks of samples with independent scores: few and long ones if the residual's correlation is long."""
+    return BLOCKS if effective_samples(search) >= _WORTH * BLOCKS else _FEW
+
+
+def effective_samples(search: SearchResult) -> float:
+    """Number of samples over the correlation of the residual, `n / (1 + 2 sum of autocorrelations)`, of all series."""
+    total = 0.0
+    for residual, weight in residual_by_channel(search.problem, search.state.residual).values():
+        for row, counts in zip(residual, weight, strict=True):
+            series = row[counts > 0]
+            total += len(series) / correlation_time(series)
+    return total
+
+
+def correlation_time(series: Float[np.ndarray, " samples"]) -> float:
+    """`1 + 2 sum of autocorrelations`, >= 1, by Geyer's initial positive sequence."""
+    around = series - np.mean(series) if len(series) else series
+    if len(series) < 2 or not np.any(around):
+        return 1.0
+    correlation = autocorrelation(around)
+    return max(2 * float(np.sum(correlation[: positive_lags(correlation)])) - 1.0, 1.0)

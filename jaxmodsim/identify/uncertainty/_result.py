@@ -17,7 +17,8 @@ from jaxtyping import Float
 
 from ..._core.files import jsonable, written_whole
 from ..._core.readable import AbstractReadable, Table, table_of
-from ..data._record import Record, resolution, sample_noise
+from ..data._record import Record
+from ..data._signals import resolution, sample_noise
 from ..estimate._search import SearchResult, ended_by_itself
 from ..model._parameters import with_numbers
 from ._estimate import FitDiagnostics, FitProvenance, IdentifiabilityIssue, ParameterEstimate
@@ -110,6 +111,17 @@ class FitResult(AbstractReadable):
         if len(rmse) > 1:
             raise ValueError(f"There are the channels {', '.join(rmse)}: take theirs from `diagnostics.rmse`.")
         return next(iter(rmse.values()))
+
+    def search_for(self, purpose: str) -> SearchResult:
+        """The search, which a result that was loaded from a file does not have.
+
+        **Raises:**
+
+        - `ValueError` naming the purpose, for a loaded result.
+        """
+        if self.search is None:
+            raise ValueError(f"{purpose} needs the search of the fit, which a loaded result does not have: fit again.")
+        return self.search
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write everything but the model's functions and the search into one file, whole or not at all.
