@@ -268,7 +268,7 @@ def _axis(
     numbers, ranges = split_entries(whole), split_ranges(whole, scene_ranges(scene))
     parameters = FreeParameters.of(numbers, ranges, chosen_entries(whole, free))
     start = dict(parameters.start)
-    scale, slopes = relative_numbers({k: float(x) for k, x in start.items()}, parameters.followed, parameters.names)
+    scale, slopes = relative_numbers({k: float(x) for k, x in start.items()}, parameters.following, parameters.names)
     columns = {name: jnp.asarray(column, float) for name, column in slopes.items()}
     axis = DrivenAxis(scene, start, columns, position, jnp.asarray(noise, float), input_name, observe)
     still = jnp.full(3, position[0])

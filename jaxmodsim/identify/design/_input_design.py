@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._core.files import jsonable, written_whole
+from ..._core.readable import AbstractReadable, Table, table_of
 from ...scene import Scene, State, replace_numbers, scene_numbers, vector_field
 from ...solvers import rosenbrock_step
 from ..model._engines import RODAS3, replay
@@ -111,7 +112,7 @@ class Excitation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class InputDesign:
+class InputDesign(AbstractReadable):
     """An input that tells most about the numbers that are to be found, within limits.
 
     - `best`: the designed input.
@@ -220,16 +221,18 @@ class InputDesign:
         with written_whole(path) as file:
             np.savetxt(file, columns, fmt="%.9g", delimiter=",", header="t,q_ref,qd_ref,force", comments="")
 
-    def __str__(self) -> str:
-        """A table of predicted errors against those of a plain sine, and remarks."""
-        width = max(len(name) for name in self.values)
-        lines = [f"{'':{width}}  {'value':>13}  {'std. error':>11}  {'in %':>8}  {'plain sine':>11}  unit"]
-        for name, value, error, plain, unit in self.rows():
-            share = f"{100 * error / abs(value):8.2g}" if value else f"{'-':>8}"
-            lines.append(f"{name:{width}}  {value:13.6g}  {error:11.2g}  {share}  {plain:11.2g}  {unit}")
-        used = ", ".join(f"{name} {100 * share:.0f} %" for name, share in self.used.items())
-        span = f"{len(self.best.t)} samples, {self.best.t[-1] - self.best.t[0]:g} s, noise {self.noise:g}; used: {used}"
-        return "\n".join([*lines, span, *self.remarks])
+
+@table_of.register
+def _(design: InputDesign) -> Table:
+    best = design.best
+    rows = [
+        (name, f"{value:.6g}", f"{error:.2g}", f"{100 * error / abs(value):.2g}" if value else "-", f"{sine:.2g}", unit)
+        for name, value, error, sine, unit in design.rows()
+    ]
+    head = ("parameter", "value", "standard error", "in %", "of a plain sine", "unit")
+    used = ", ".join(f"{name} {100 * share:.0f} %" for name, share in design.used.items())
+    title = f"{len(best.t)} samples, {best.t[-1] - best.t[0]:g} s, noise {design.noise:g}; used: {used}"
+    return Table(title, head, rows, design.remarks)
 
 
 class DrivenAxis(eqx.Module):

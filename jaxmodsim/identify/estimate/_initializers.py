@@ -242,7 +242,7 @@ class FromSmaller(AbstractInitializer):
         size = len(problem.free.names)
         here = {name: self.values[last_part(name)] for name in problem.free.names if last_part(name) in self.values}
         over = np.asarray(problem.free.coordinates(problem.at(x).values | here))
-        rest = np.array([name not in here and problem.free.limit_of(name) is not None for name in problem.free.names])
+        rest = np.array([name not in here and isinstance(problem.free[name].base, str) for name in problem.free.names])
         own = np.asarray(x)[size:]
         starts = [x, *(on_device(np.concatenate([each, own])) for each in (over, np.where(rest, 0.0, over)))]
         ends = [solve(problem, each, options).state for each in (starts if np.any(rest) else starts[:2])]

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..._core.arguments import as_share, as_whole
 from ..._core.extra import extra
+from ..._core.readable import AbstractReadable, Table, table_of
 from ..estimate._problem import FitProblem
 from ..estimate._search import SearchResult
 from ._estimate import ParameterEstimate
@@ -230,8 +231,8 @@ def _innovations(rows: Float[Array, "runs samples"], memory: Float[Array, ""]) -
     return jnp.concatenate([first, rows[:, 1:] - memory * rows[:, :-1]], axis=1)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Posterior:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Posterior(AbstractReadable):
     """Samples of all unknowns of a fit from their posterior.
 
     - `draws`: by name, shape `[chains, draws]` each, in the units of the parameters.
@@ -259,10 +260,7 @@ class Posterior:
         """
         level = as_share(level, name="level")
         edges = [0.5 - level / 2, 0.5 + level / 2]
-        return {name: (float(low), float(high)) for name, (low, high) in self._quantiles(edges).items()}
-
-    def _quantiles(self, shares: list[float]) -> dict[str, np.ndarray]:
-        return {name: np.quantile(x, shares) for name, x in self.draws.items()}
+        return {name: tuple(np.quantile(x, edges).tolist()) for name, x in self.draws.items()}
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -294,25 +292,32 @@ class Posterior:
                     )
         return tuple(sentences)
 
-    def __str__(self) -> str:
-        """A table of the unknowns, the fit's standard error beside, and what to think of it."""
-        errors, values, rows = self.estimate.errors, self.estimate.values, self._quantiles([0.025, 0.975])
-        width = max(len(name) for name in self.draws)
-        lines = [
-            f"{'':{width}}  {'mean':>13}  {'std. dev.':>11}  {'95 % interval':>25}  {'fit':>13}  {'std. error':>11}"
-            f"  {'R-hat':>6}  {'samples':>7}"
-        ]
-        for name, x in self.draws.items():
-            low, high = rows[name]
-            fitted = f"{values[name]:13.6g}  {errors[name]:11.2g}" if name in values else f"{'':13}  {'':11}"
-            lines.append(
-                f"{name:{width}}  {x.mean():13.6g}  {x.std():11.2g}  {low:12.5g} {high:12.5g}  {fitted}"
-                f"  {self.rhat[name]:6.3f}  {self.effective[name]:7.0f}"
-            )
-        chains, draws = next(iter(self.draws.values())).shape
-        return "\n".join([*lines, f"{chains} chains of {draws} draws, {self.divergences} divergences", *self.remarks])
+    def __repr__(self) -> str:
+        return str(self)
 
-    __repr__ = __str__
+
+@table_of.register
+def _(posterior: Posterior) -> Table:
+    estimate, edges, rows = posterior.estimate, posterior.intervals(), []
+    for name, x in posterior.draws.items():
+        low, high = edges[name]
+        fitted = name in estimate.values
+        rows.append(
+            (
+                name,
+                f"{x.mean():.6g}",
+                f"{x.std():.2g}",
+                f"{low:.5g} to {high:.5g}",
+                f"{estimate.values[name]:.6g}" if fitted else "",
+                f"{estimate.errors[name]:.2g}" if fitted else "",
+                f"{posterior.rhat[name]:.3f}",
+                f"{posterior.effective[name]:.0f}",
+            )
+        )
+    chains, draws = next(iter(posterior.draws.values())).shape
+    head = ("unknown", "mean", "std. dev.", "95 % interval", "fit", "std. error", "R-hat", "effective samples")
+    title = f"{chains} chains of {draws} draws, {posterior.divergences} divergences"
+    return Table(title, head, rows, posterior.remarks)
 
 
 def sample_posterior(

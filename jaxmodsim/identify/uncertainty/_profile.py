@@ -234,7 +234,7 @@ def _along(result: FitResult, name: str, points: int, level: float, least: float
             return lowest
     down, up = sides
     path = [*reversed(down.points), start, *up.points]
-    others = [{k: float(x) for k, x in _values(line.problem, point.x).items()} for point in path]
+    others = [line.problem.at(on_device(point.x)).values for point in path]
     ends = [end.u if math.isinf(end.u) else line.value(end.u) for end in (down, up)]
     if line.floor is not None and math.isinf(ends[0]):
         ends[0] = line.floor
@@ -251,14 +251,9 @@ def _along(result: FitResult, name: str, points: int, level: float, least: float
         cost=np.array([point.cost for point in path]),
         interval=(ends[0], ends[1]),
         notes=tuple(end.note for end in (down, up) if end.note),
-        others={k: np.array([values[k] for values in others]) for k in names if k != name},
+        others={k: np.array([float(values[k]) for values in others]) for k in names if k != name},
         result=result,
     )
-
-
-def _values(problem: FitProblem, x: np.ndarray) -> dict[str, np.ndarray]:
-    values = problem.at(on_device(x)).values
-    return {name: values[name] for name in problem.free.names}
 
 
 def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tuple[_Line, np.ndarray]:
@@ -278,7 +273,7 @@ def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tu
     inflation = error**2 / by_losses if by_losses > 0 else math.nan
     inflation = max(inflation, _LEAST_INFLATION * variance) if math.isfinite(inflation) else variance
     inflation = max(inflation, 1e-300)
-    floor, limits = None, problem.free.fixed_limits(name)
+    floor, limits = None, problem.free[name].fixed_limits
     if name in estimate.logarithmic:
         floor = limits[0]
     size_of = abs(value) if floor is None else value - floor

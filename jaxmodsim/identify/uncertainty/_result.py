@@ -136,7 +136,9 @@ class FitResult(AbstractReadable):
         with written_whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr(_TEXT, text)
             for name, array in arrays.items():
-                archive.writestr(f"{name}.npy", _bytes(array))
+                buffer = io.BytesIO()
+                np.lib.format.write_array(buffer, array, allow_pickle=False)
+                archive.writestr(f"{name}.npy", buffer.getvalue())
 
     @staticmethod
     def load(path: str | PathLike[str], model: eqx.Module | None = None) -> "FitResult":
@@ -187,16 +189,8 @@ class FitResult(AbstractReadable):
         )
 
     def __str__(self) -> str:
-        """A table of the parameters, and what the record cannot tell."""
-        estimate, rmse, intervals = self.estimate, self.diagnostics.rmse, self.estimate.intervals()
-        width = max(len(name) for name in estimate.values)
-        lines = [f"{'':{width}}  {'value':>13}  {'std. error':>11}  {'95 % interval':>25}  unit"]
-        for name, value, error, _, unit in estimate.rows():
-            low, high = intervals[name]
-            lines.append(f"{name:{width}}  {value:13.6g}  {error:11.2g}  {low:12.5g} {high:12.5g}  {unit}")
-        errors = ", ".join(f"{'' if len(rmse) == 1 else name + ' '}{x:.6g}" for name, x in rmse.items())
-        ending = f"RMSE {errors}; {self.diagnostics.evaluations} evaluations, {self.diagnostics.ending}"
-        return "\n".join([*lines, ending, *remarks(self)])
+        """A table of all parameters, and the remarks."""
+        return table_of(self).text()
 
     __repr__ = __str__
 
@@ -212,7 +206,8 @@ def _(result: FitResult) -> Table:
     errors = ", ".join(f"{name} {x:.6g}" for name, x in result.diagnostics.rmse.items())
     names = ", ".join(record.name for record in result.provenance.records)
     head = ("parameter", "value", "standard error", "95 % interval")
-    return Table(f"Fit to {names}, RMSE {errors}", head, rows, (result.diagnostics.ending, *remarks(result)))
+    ending = f"{result.diagnostics.evaluations} evaluations, {result.diagnostics.ending}"
+    return Table(f"Fit to {names}, RMSE {errors}", head, rows, (ending, *remarks(result)))
 
 
 def remarks(result: FitResult) -> tuple[str, ...]:
@@ -355,12 +350,6 @@ def _read_fields(path: str | PathLike[str], wanted: list[str]) -> dict[str, Any]
         return {name: _unpacked(body[name], arrays) for name in wanted}
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"{path} is damaged: {error!r}") from error
-
-
-def _bytes(array: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    np.lib.format.write_array(buffer, array, allow_pickle=False)
-    return buffer.getvalue()
 
 
 def _packed(x: object, name: str, arrays: dict[str, np.ndarray]) -> object:
