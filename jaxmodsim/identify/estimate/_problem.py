@@ -1,4 +1,4 @@
-"""The problem of a fit as arrays: coordinates in, weighted residuals and their Jacobian out; what residuals cost."""
+"""The problem of a fit as arrays, from coordinates to weighted residuals and their Jacobian, and the losses."""
 
 import abc
 import re
@@ -47,10 +47,10 @@ class AbstractLoss(eqx.Module):
     def weighted(
         self, residual: Float[Array, " m"], jacobian: Float[Array, "m n"]
     ) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
-        """Residual and Jacobian whose least squares have the gradient of the cost and nearly its curvature.
+        """Residual and Jacobian of a least-squares problem with the gradient of the cost and nearly its curvature.
 
         Triggs et al. 2000, Bundle adjustment, section 4.3, without the second derivative of rho, which is negative
-        and may take the definiteness away.
+        and may make the matrix indefinite.
         """
         if not self.robust:
             return residual, jacobian
@@ -69,7 +69,7 @@ class SquaredLoss(AbstractLoss):
 
 
 class Huber(AbstractLoss):
-    """Squares up to `limit` noise levels and the distance beyond: outliers pull with a bounded force.
+    """Quadratic up to `limit` noise levels and linear beyond: the influence of outliers is bounded.
 
     **Arguments:**
 
@@ -90,7 +90,7 @@ class Huber(AbstractLoss):
 
 
 class Cauchy(AbstractLoss):
-    """`limit^2 log(1 + s/limit^2)`: far outliers have no pull at all.
+    """`limit^2 log(1 + s/limit^2)`: the influence of far outliers vanishes.
 
     **Arguments:**
 
@@ -158,16 +158,10 @@ def taken(state: State, names: tuple[str, ...]) -> Float[Array, " local"]:
 
 
 class Prior(eqx.Module):
-    """What was known before: a mean and the inverse of a standard deviation for each parameter, 0 where nothing was."""
+    """Prior knowledge: a mean and the inverse of a standard deviation for each parameter, 0 for none."""
 
     mean: Float[Array, " free"]
     weight: Float[Array, " free"]
-
-
-def _without_dust(jacobian: Float[Array, "rows n"]) -> Float[Array, "rows n"]:
-    """The Jacobian with zeros in columns of nothing but rounding: of a velocity that stick takes away at the start."""
-    size = jnp.sqrt(jnp.sum(jacobian**2, axis=0))
-    return jnp.where(size > float(jnp.finfo(size.dtype).eps) ** 1.5 * jnp.max(size), jacobian, 0.0)
 
 
 class FitProblem(eqx.Module):
@@ -176,16 +170,15 @@ class FitProblem(eqx.Module):
     The vector x holds the coordinates of the free parameters, then, run by run, the free numbers of the initial states
     as differences from `base`.
 
-    - `engine`: `engine(values, start, run)`, what the model sees.
+    - `engine`: `engine(values, start, run)`, the output of the model.
     - `free`: the parameters. `local`: names of the free numbers of each initial state; the last `nuisance` of them are
-      fitted because no one knows them, and not reported.
-    - `base`: initial states, with a leading axis of runs; None where a model has none.
+      unknown, so they are fitted, but not reported.
+    - `base`: initial states, with a leading axis of runs; None for a model without states.
     - `runs`: the samples. `noise`: standard deviation of each channel.
     - `jump`: inverse standard deviation of the jump of each number of the state from one window to the next, 0 where
-      windows do not go on; shape `[runs - 1, numbers]`; None where there are no windows.
-    - `known`: of the free numbers of the initial states, what the first samples of a channel show: inverse standard
-      deviation of their difference from `base` times the noise of that channel, 0 where nothing is known; by channel,
-      shape `[runs, local]`.
+      a window does not continue; shape `[runs - 1, numbers]`; None without windows.
+    - `known`: knowledge of the initial states from the first samples of a channel: inverse standard deviations of the
+      differences from `base`, times the noise of that channel, 0 for none; by channel, shape `[runs, local]`.
     """
 
     engine: Any
@@ -202,20 +195,20 @@ class FitProblem(eqx.Module):
 
     @property
     def start_weights(self) -> Float[Array, "runs local"] | None:
-        """Inverse standard deviations of the free numbers of the initial states; None where nothing is known."""
+        """Inverse standard deviations of the free numbers of the initial states; None if nothing is known."""
         weights = [each / self.noise[name] for name, each in self.known.items()]
         return jnp.sum(jnp.stack(weights), axis=0) if weights else None
 
     @property
     def held(self) -> "FitProblem":
-        """The problem whose unasked starts stay at `base`: arrays alone differ, so nothing compiles again.
+        """The problem whose unreported starts stay at `base`: only arrays differ, so nothing compiles again.
 
-        A search far from the optimum would else let them take up what the parameters still have wrong.
+        In a search far from the optimum they would otherwise take up the errors of the parameters.
         """
         if not self.nuisance:
             return self
-        unasked = jnp.arange(len(self.local)) >= self.reported
-        known = {name: jnp.where(unasked[None, :], _HELD, each) for name, each in self.known.items()}
+        unreported = jnp.arange(len(self.local)) >= self.reported
+        known = {name: jnp.where(unreported[None, :], _HELD, each) for name, each in self.known.items()}
         return eqx.tree_at(lambda p: p.known, self, known)
 
     def pinned(
@@ -249,7 +242,7 @@ class FitProblem(eqx.Module):
 
     @property
     def reported(self) -> int:
-        """Number of the first entries of `local` that were asked for."""
+        """Number of the entries of `local` that are reported, the first ones."""
         return len(self.local) - self.nuisance
 
     @property
@@ -259,7 +252,7 @@ class FitProblem(eqx.Module):
 
     @property
     def x0(self) -> Float[Array, " n"]:
-        """Where the search starts."""
+        """Start of the search."""
         x0 = np.asarray(self.free.x0)
         return on_device(np.concatenate([x0, np.zeros(self.count * len(self.local), x0.dtype)]))
 
@@ -280,7 +273,7 @@ class FitProblem(eqx.Module):
         return x[:size], jnp.reshape(x[size:], (self.count, len(self.local)))
 
     def at(self, x: ArrayLike) -> ParameterPoint:
-        """The parameters at an x that is known, shape `[n]`."""
+        """The parameters at a known x, shape `[n]`."""
         return self.free.at(np.asarray(x)[: len(self.free.names)])
 
     def start_of(self, base: State | None, moved: Float[Array, " local"]) -> State | None:
@@ -298,7 +291,7 @@ class FitProblem(eqx.Module):
         return jax.vmap(self.start_of)(self.base, self.split(x)[1])
 
     def seen(self, x: Float[Array, " n"]) -> ModelOutput:
-        """What the model makes of each run, with a leading axis of runs."""
+        """Output of the model for each run, with a leading axis of runs."""
         values = self.free.values(self.split(x)[0])
         return jax.vmap(lambda start, run: self.engine(values, start, run))(self.starts(x), self.runs)
 
@@ -323,9 +316,9 @@ class FitProblem(eqx.Module):
         return self._weigh(seen, run), ravel_pytree(start)[0], ravel_pytree(seen.end)[0]
 
     def evaluate(self, x: Float[Array, " n"]) -> tuple[Float[Array, " rows"], Float[Array, "rows n"]]:
-        """Residual and Jacobian: of all samples, of what was known before, of the links between windows, of the starts.
+        """Residual and Jacobian: of all samples, the prior, the links between windows, the knowledge of the starts.
 
-        All columns of a run go side by side in one forward sweep, which keeps nothing of its steps.
+        All columns of a run are computed in one forward sweep, which stores no steps.
         """
         shared, own = self.split(x)
 
@@ -341,7 +334,8 @@ class FitProblem(eqx.Module):
         else:
             value, slope = jax.vmap(run)(self.base, self.runs, own)
         rows = [jnp.reshape(value[0], (-1,)), self.prior.weight * (self.free.vector(shared) - self.prior.mean)]
-        columns = [self._spread(slope[0]), self._pad(self.prior.weight[:, None] * self.free.slopes(shared))]
+        of_prior = self.prior.weight[:, None] * self.free.slopes(shared)
+        columns = [self._spread(slope[0]), jnp.pad(of_prior, ((0, 0), (0, self.count * len(self.local))))]
         if self.jump is not None:
             rows.append(jnp.reshape(self.jump * (value[2][:-1] - value[1][1:]), (-1,)))
             here = self._spread(self.jump[:, :, None] * slope[2][:-1])
@@ -351,10 +345,14 @@ class FitProblem(eqx.Module):
         if known is not None:
             rows.append(jnp.reshape(known * own, (-1,)))
             columns.append(jnp.pad(jnp.diag(jnp.reshape(known, (-1,))), ((0, 0), (shared.shape[0], 0))))
-        return jnp.concatenate(rows), _without_dust(jnp.concatenate(columns))
+        jacobian = jnp.concatenate(columns)
+        # Columns of nothing but rounding become zero: those of a velocity that stick takes away at the start.
+        size = jnp.sqrt(jnp.sum(jacobian**2, axis=0))
+        tiny = float(jnp.finfo(size.dtype).eps) ** 1.5 * jnp.max(size)
+        return jnp.concatenate(rows), jnp.where(size > tiny, jacobian, 0.0)
 
     def _spread(self, slope: Float[Array, "some m k"], first: int = 0) -> Float[Array, "rows n"]:
-        """Derivatives of runs `first` and on by their own x, as rows by all of x."""
+        """Derivatives of the runs from `first` on by their own x, as rows by all of x."""
         some, rows, _ = slope.shape
         size, own = len(self.free.names), len(self.local)
         shared = jnp.reshape(slope[..., :size], (some * rows, size))
@@ -365,11 +363,8 @@ class FitProblem(eqx.Module):
         block = block.at[place, :, place + first, :].set(slope[..., size:])
         return jnp.concatenate([shared, jnp.reshape(block, (some * rows, self.count * own))], axis=1)
 
-    def _pad(self, slope: Float[Array, "rows free"]) -> Float[Array, "rows n"]:
-        return jnp.pad(slope, ((0, 0), (0, self.count * len(self.local))))
-
     def with_number(self, name: str, factor: float) -> "FitProblem":
-        """The problem with a number of the model, which is not free, this many times larger."""
+        """The problem with a fixed number of the model multiplied by a factor."""
         numbers = scene_numbers(self.engine.model)
         if name not in numbers:
             raise ValueError(f"The model has no number {name!r}; it has: {', '.join(numbers)}.")
@@ -379,15 +374,16 @@ class FitProblem(eqx.Module):
     @property
     def columns(self) -> dict[str, Float[Array, "runs samples"]]:
         """Weight of each channel by name, slip instants last, in the order of the residual."""
-        # Compiled code sorts the entries of a dict, so the order is that of the names everywhere.
+        # Compiled code sorts the entries of a dict, so all orders are those of the names.
         columns = {name: self.runs.weight[name] for name in sorted(self.runs.weight)}
         return columns | {slip_channel(name): self.runs.slip_weight[name] for name in sorted(self.runs.slip_weight)}
 
-    def by_channel(self, rows: _Rows) -> dict[str, tuple[_Rows, Array]]:
+    def by_channel(self, rows: _Rows) -> dict[str, tuple[_Rows, _Rows]]:
         """Rows of the residual, shape `[rows]`, and weights of each channel, shape `[runs, samples]` each."""
         table, split, at = rows[: self.samples].reshape(self.count, -1), {}, 0
         for name, weight in self.columns.items():
-            split[name] = table[:, at : at + weight.shape[1]], weight
+            own = np.asarray(weight) if isinstance(rows, np.ndarray) else weight
+            split[name] = table[:, at : at + weight.shape[1]], own
             at += weight.shape[1]
         return split
 

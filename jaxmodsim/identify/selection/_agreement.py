@@ -17,7 +17,6 @@ from ...friction import AbstractLaw
 from ...scene import Scene, scene_numbers, scene_ranges
 from ..estimate._problem import FitProblem
 from ..estimate._search import SearchOptions, SearchResult, channels_seen, solve
-from ..estimate._search import by_channel as residual_by_channel
 from ..model._parameters import split_ranges
 from ..uncertainty._estimate import covariance_of
 from ..uncertainty._residual_tests import independent_blocks
@@ -374,7 +373,7 @@ def mean_variances(search: SearchResult, covariance: _Matrix) -> dict[str, float
     problem, size = search.problem, len(search.problem.free.names)
     slopes = problem.at(search.state.x).slopes
     jacobian = np.asarray(search.state.jacobian)[: problem.samples, :size] @ np.linalg.pinv(slopes)
-    split = residual_by_channel(problem, np.sum((jacobian @ covariance) * jacobian, axis=1))
+    split = problem.by_channel(np.sum((jacobian @ covariance) * jacobian, axis=1))
     return {name: max(float(np.mean(x[weight > 0])), 0.0) for name, (x, weight) in split.items()}
 
 

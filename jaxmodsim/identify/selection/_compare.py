@@ -22,7 +22,6 @@ from ..estimate._initializers import AbstractInitializer, Continuation, FromSmal
 from ..estimate._prepare import FitOptions, StartState, initial_states, measured_start, prepare
 from ..estimate._problem import AbstractLoss, FitProblem
 from ..estimate._search import Progress, SearchOptions, SearchResult, SearchState, solve
-from ..estimate._search import by_channel as residual_by_channel
 from ..model._engines import DELAY
 from ..model._observe import Observable, by_channel, first_coordinate
 from ..model._parameters import split_entries
@@ -380,7 +379,7 @@ def _evaluated(
 def _parts(problem: FitProblem, state: SearchState, block: Int[np.ndarray, "runs samples"]) -> tuple[Part, ...]:
     """Residuals in the units of their channels, for each run and block with samples that count."""
     parts: dict[tuple[int, int], Part] = {}
-    for name, (residual, weight) in residual_by_channel(problem, state.residual).items():
+    for name, (residual, weight) in problem.by_channel(np.asarray(state.residual)).items():
         level = float(problem.noise[name])
         # Slip instants all go with the first sample of their run.
         number = block if block.shape == weight.shape else np.broadcast_to(block[:, :1], weight.shape)

@@ -12,7 +12,6 @@ from ..._core.files import jsonable
 from ..._core.readable import AbstractReadable, Table, table_of
 from ..estimate._problem import AbstractLoss
 from ..estimate._search import SearchResult, cost_of, weighted_by
-from ..estimate._search import by_channel as residual_by_channel
 from ..uncertainty._estimate import sample_blocks
 from ..uncertainty._residual_tests import effective_samples
 from ..uncertainty._result import FitResult
@@ -396,8 +395,8 @@ def _mean(variances: Mapping[str, float], search: SearchResult, levels: Mapping[
 
 def _fitted_error(search: SearchResult, levels: Mapping[str, float]) -> float:
     """Error of all samples that count."""
-    split = residual_by_channel(search.problem, search.state.residual)
-    residual = {name: float(search.problem.noise[name]) * x[weight > 0] for name, (x, weight) in split.items()}
+    noise = search.problem.noise
+    residual = {name: float(noise[name]) * x[weight > 0] for name, (x, weight) in search.residuals.items()}
     return float(_root(residual, search.problem.loss, levels))
 
 

@@ -21,7 +21,6 @@ from ..data._signals import sample_noise
 from ..estimate._prepare import measured_start
 from ..estimate._problem import FitProblem, Prior, SquaredLoss
 from ..estimate._search import SearchOptions, SearchResult, SearchState, channels_seen, solve, start_search, step
-from ..estimate._search import by_channel as residual_by_channel
 from ..model._engines import DELAY, EventEngine, ReplayEngine, with_values
 from ..model._parameters import FreeParameters
 from ..uncertainty._result import FitResult
@@ -520,7 +519,7 @@ def prediction_error(
 
 def _model_excess(search: SearchResult) -> dict[str, float]:
     """Mean square of the residual, by channel, in squared noise levels, corrected for the degrees of freedom."""
-    split = residual_by_channel(search.problem, search.state.residual)
+    split = search.residuals
     taken = penalty(search) / max(sum(int(np.sum(weight > 0)) for _, weight in split.values()), 1)
     return {name: float(np.mean(x[weight > 0] ** 2)) * (1 + taken) for name, (x, weight) in split.items()}
 

@@ -14,7 +14,7 @@ from ..._core.arguments import as_share
 from ..._core.device import on_device
 from ..data._record import Record
 from ..estimate._problem import FitProblem
-from ..estimate._search import SearchState, by_channel, start_search, step, weighted_by
+from ..estimate._search import SearchState, start_search, step, weighted_by
 from ..model._observe import RecordedMotion, motion_of
 
 # Blocks of samples: enough for the scatter of the scores of a dozen parameters, and each far longer than what the
@@ -466,7 +466,7 @@ def sample_blocks(problem: FitProblem, blocks: int = BLOCKS) -> tuple[Int[np.nda
 
 def _passes_for_white(problem: FitProblem, residual: Float[np.ndarray, " rows"]) -> bool:
     """Whether the test of Ljung and Box (1978, Biometrika 65:297) finds no memory in any channel."""
-    for name, (rows, weight) in by_channel(problem, residual.astype(float)).items():
+    for name, (rows, weight) in problem.by_channel(residual.astype(float)).items():
         if name not in problem.runs.weight:
             continue  # instants have no neighbours
         counted = float(np.sum(weight))

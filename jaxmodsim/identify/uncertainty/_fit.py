@@ -25,7 +25,6 @@ from ..estimate._search import (
     Progress,
     SearchOptions,
     SearchResult,
-    by_channel,
     continued,
     solve_freed,
     solve_with_noise,
@@ -255,25 +254,23 @@ def result_of(
     starts: tuple[float, ...] = (),
 ) -> FitResult:
     """The result of a search: estimate, diagnostics, provenance."""
-    problem, state = search.problem, search.state
-    names, at_start, values = list(problem.free.names), [], []
-    shared, own = np.split(np.asarray(state.x), [len(names)])
-    kept = list(range(len(names)))
-    values += problem.at(state.x).vector.tolist()
-    at_start += [float(problem.free.start[name]) for name in names]
-    whole = len(set(windows.record)) == len(windows.record)
-    if whole and problem.local:
-        base, shown = _first_states(search), problem.reported
+    problem, state, free = search.problem, search.state, search.problem.free
+    names, size, shown = list(free.names), len(free.names), problem.reported
+    values, at_start = problem.at(state.x).vector.tolist(), [float(free.start[name]) for name in names]
+    kept = list(range(size))
+    if problem.base is not None and len(set(windows.record)) == len(windows.record):
+        starts = np.asarray(jax.vmap(problem.taken)(problem.base))[:, :shown]
+        ends = starts + np.asarray(problem.split(state.x)[1])[:, :shown]
         for i, record in enumerate(records):
             prefix = "" if len(records) == 1 else f"{record.name}/"
             names += [prefix + name for name in problem.local[:shown]]
-            at_start += base[i, :shown].tolist()
-            values += (base[i] + own.reshape(len(records), -1)[i])[:shown].tolist()
-            kept += [len(shared) + i * len(problem.local) + k for k in range(shown)]
+            at_start += starts[i].tolist()
+            values += ends[i].tolist()
+            kept += [size + i * len(problem.local) + k for k in range(shown)]
     covariance = covariance_of(problem, state, kept)
     outputs, rmse = _stitched(search, records, windows)
-    free, scales = problem.free, natural_scales(problem, state, kept)
-    signed = [*(kind == "line" for kind in free.kinds), *(True for _ in names[len(free.names) :])]
+    scales = natural_scales(problem, state, kept)
+    signed = [kind == "line" for kind in free.kinds] + [True] * (len(names) - size)
     estimate = ParameterEstimate(
         values=dict(zip(names, values, strict=True)),
         start=dict(zip(names, at_start, strict=True)),
@@ -282,13 +279,17 @@ def result_of(
         white=covariance.white,
         information=covariance.information,
         logarithmic=tuple(name for name, kind in zip(free.names, free.kinds, strict=True) if kind == "log"),
-        bounds=free.limits(shared) | {name: (-np.inf, np.inf) for name in names[len(free.names) :]},
+        bounds=free.limits(state.x[:size]) | {name: (-np.inf, np.inf) for name in names[size:]},
         natural={name: float(x) if each else 0.0 for name, x, each in zip(names, scales, signed, strict=True)},
     )
+    if problem.base is None:
+        coordinates = {"x": "q[0]"} if "x" in problem.runs.inputs else {}
+    else:
+        coordinates = coordinates_seen(problem.engine.observables, problem.base.q.shape[-1])
     provenance = FitProvenance(
         records=records,
         outputs=outputs,
-        coordinates=_coordinates(search),
+        coordinates=coordinates,
         numbers={name: np.asarray(x) for name, x in scene_numbers(model).items()},
         model=model,
     )
@@ -305,8 +306,12 @@ def result_of(
             *_issues(estimate, provenance, search, covariance.refused),
         ),
     )
-    search = replace(search, windows=windows)
-    return FitResult(estimate=estimate, diagnostics=diagnostics, provenance=provenance, search=search)
+    return FitResult(
+        estimate=estimate,
+        diagnostics=diagnostics,
+        provenance=provenance,
+        search=replace(search, windows=windows),
+    )
 
 
 def searched_on(result: FitResult, x: Float[Array, " n"], options: SearchOptions, times: int, where: str) -> FitResult:
@@ -323,14 +328,6 @@ def searched_on(result: FitResult, x: Float[Array, " n"], options: SearchOptions
     error = None if result.diagnostics.step_error is None else step_error(search)
     units, starts = result.estimate.units, result.diagnostics.starts
     return result_of(search, provenance.records, before.windows, units, model, error, starts)
-
-
-def _coordinates(search: SearchResult) -> dict[str, str]:
-    """Which channels, or inputs of a law, are coordinates and velocities."""
-    base = search.problem.base
-    if base is None:
-        return {"x": "q[0]"} if "x" in search.problem.runs.inputs else {}
-    return coordinates_seen(search.problem.engine.observables, base.q.shape[-1])
 
 
 def _issues(
@@ -390,24 +387,16 @@ def _sample_issues(records: tuple[Record, ...], squares: bool) -> tuple[Identifi
     return tuple(IdentifiabilityIssue(sentence, ()) for sentence in issues)
 
 
-def _first_states(search: SearchResult) -> np.ndarray:
-    """Free numbers of the initial states before the fit, shape `[runs, local]`."""
-    base = search.problem.base
-    assert base is not None
-    return np.asarray(jax.vmap(search.problem.taken)(base))
-
-
 def _stitched(
     search: SearchResult, records: tuple[Record, ...], windows: Windows
 ) -> tuple[tuple[dict[str, np.ndarray], ...], dict[str, float]]:
     """The model's output along each record, and the root mean squares of the differences."""
     problem = search.problem
-    split = by_channel(problem, search.state.residual)
     outputs: list[dict[str, np.ndarray]] = [
         {name: np.array(x) for name, x in record.channels.items()} for record in records
     ]
     rmse = {}
-    for name, (residual, weight) in split.items():
+    for name, (residual, weight) in search.residuals.items():
         level = float(problem.noise[name])
         rmse[name] = level * float(np.sqrt(np.sum(residual[weight > 0] ** 2) / max(np.sum(weight > 0), 1)))
         for run, (i, first, last) in enumerate(zip(windows.record, windows.first, windows.last, strict=True)):

@@ -9,7 +9,6 @@ from jaxtyping import Float
 from scipy import special  # scipy.stats takes most of a second to import
 
 from ..estimate._search import SearchResult
-from ..estimate._search import by_channel as residual_by_channel
 from ..model._observe import RecordedMotion
 from ._estimate import BLOCKS, lag_number
 from ._result import FitResult
@@ -292,7 +291,7 @@ def independent_blocks(search: SearchResult) -> int:
 def effective_samples(search: SearchResult) -> float:
     """Number of samples over the correlation of the residual, `n / (1 + 2 sum of autocorrelations)`, of all series."""
     total = 0.0
-    for residual, weight in residual_by_channel(search.problem, search.state.residual).values():
+    for residual, weight in search.residuals.values():
         for row, counts in zip(residual, weight, strict=True):
             series = row[counts > 0]
             total += len(series) / correlation_time(series)
