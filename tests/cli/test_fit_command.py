@@ -143,7 +143,7 @@ def test_a_better_fit_that_a_profile_comes_upon_is_the_fit(run_command, files, t
     assert "stopped at the limit of 2 iterations (max_steps)" in stopped
     assert found["ending"] in after
     assert "continued once from a better value of" in found["ending"]
-    assert "went on from there in" in " ".join(stopped.split())
+    assert "continued from there in" in " ".join(stopped.split())
     assert found["ending"] in Page((out / "report.html").read_text()).text
 
 

@@ -190,7 +190,7 @@ def test_a_profile_goes_on_from_a_better_value():
     assert curve.estimate == curve.result.values["w"]
     assert curve.interval[0] < np.sign(curve.estimate) * 3.0 < curve.interval[1]
     assert np.min(curve.ratio) > -1e-3
-    assert "search went on from there in" in curve.notes[-1]
+    assert "search continued from there in" in curve.notes[-1]
     assert "; continued once from a better value of w" in str(curve.result)
     assert curve.result.diagnostics.evaluations > result.diagnostics.evaluations
     assert not any("do not trust" in remark for remark in remarks(curve.result))
@@ -473,7 +473,7 @@ def test_a_residual_with_a_cause_names_it():
     late = np.roll(rng.standard_normal(T.size), 0)
     follows = judged(noise + 0.05 * np.roll(late, 7), {"u": late}, motion)
     assert follows.inputs["u"].lag == pytest.approx(7 * (T[1] - T[0]))
-    assert any("goes with the input u" in remark for remark in follows.remarks)
+    assert any("correlated with the input u" in remark for remark in follows.remarks)
     heavy = judged(rng.standard_t(4, T.size), {}, motion)
     assert any("tails are heavy" in remark for remark in heavy.remarks)
     assert trend_over("t", np.zeros(T.size), T).p == 1.0

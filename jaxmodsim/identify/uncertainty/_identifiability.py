@@ -55,11 +55,12 @@ class Element(NamedTuple):
 
     def own(self, *symbols: str) -> tuple[str, ...]:
         """Free parameters of this element with these symbols, of both directions and all entries."""
-        own = {
-            name: name.removeprefix(self.prefix).rpartition(".") for name in self.free if name.startswith(self.prefix)
-        }
-        sides = ("", "forward", "backward")
-        return tuple(name for name, (side, _, x) in own.items() if side in sides and x.split("[")[0] in symbols)
+        sides, names = ("", "forward", "backward"), []
+        for name in self.free:
+            side, _, symbol = name.removeprefix(self.prefix).rpartition(".")
+            if name.startswith(self.prefix) and side in sides and symbol.split("[")[0] in symbols:
+                names.append(name)
+        return tuple(names)
 
     def number(self, symbol: str) -> np.ndarray | None:
         """A number of the law; that of forward slip if it depends on the direction."""
@@ -116,7 +117,7 @@ def _bristle_share(slip: Slip, sigma0: float, Fc: float, Fs: float, vs: float) -
 def idle_elements(element: Element) -> IdentifiabilityIssue | None:
     """Some of several elastic elements never slip."""
     k, Fc = element.number("k"), element.number("Fc")
-    if k is None or Fc is None or k.shape != Fc.shape:
+    if k is None or Fc is None or np.ndim(k) != 1 or np.shape(k) != np.shape(Fc):
         return None
     reached = np.zeros_like(k)
     for slip in element.slips:
