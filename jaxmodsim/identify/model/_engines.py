@@ -16,7 +16,7 @@ from ...scene import Scene, Signal, State, from_dynamics, replace_numbers, scene
 from ...simulation import Trajectory, simulate
 from ...solvers import RosenbrockTableau, rosenbrock_step
 from ..data._record import Runs
-from ._observe import Observable, first_coordinate, needs_forces, observed, observer
+from ._observe import Observables, first_coordinate, needs_forces, observed, observer
 from ._parameters import join_entries
 
 # Slip velocity [m/s] that counts as none, and the distance from a change of mode, in steps, at which it is reached.
@@ -303,7 +303,7 @@ class ReplayEngine(eqx.Module):
     model: Scene
     delays: dict[str, Array]
     controller: Controller | None
-    observables: tuple[tuple[str, Observable], ...] = eqx.field(static=True)
+    observables: Observables = eqx.field(static=True)
     linear: frozenset[str] = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
 
@@ -329,7 +329,7 @@ class EventEngine(eqx.Module):
 
     model: Scene
     delays: dict[str, Array]
-    observables: tuple[tuple[str, Observable], ...] = eqx.field(static=True)
+    observables: Observables = eqx.field(static=True)
     linear: frozenset[str] = eqx.field(static=True)
     slips: tuple[str, ...] = eqx.field(static=True)
     rtol: float = eqx.field(static=True)

@@ -18,6 +18,8 @@ from ..data._record import Record
 
 # `observe(q, qd)`, or "q[0]", "qd[1]", or the name of an effect, whose force is meant.
 Observable: TypeAlias = Callable[[Array, Array], Array] | str
+# What each channel observes, as a hashable mapping.
+Observables: TypeAlias = tuple[tuple[str, Observable], ...]
 _STATE = re.compile(r"(q|qd)\[(\d+)\]")
 # Two states at which a function that observes a coordinate tells itself apart from others.
 _PROBES = ((0.73, -1.31), (-0.29, 0.57))
@@ -29,9 +31,7 @@ def first_coordinate(q: Array, qd: Array) -> Array:
     return q[0]
 
 
-def by_channel(
-    observe: Observable | Mapping[str, Observable], records: tuple[Record, ...]
-) -> tuple[tuple[str, Observable], ...]:
+def by_channel(observe: Observable | Mapping[str, Observable], records: tuple[Record, ...]) -> Observables:
     """What each channel of the records observes.
 
     **Raises:**
@@ -55,7 +55,7 @@ def by_channel(
     return tuple((channel, observe[channel]) for channel in channels)
 
 
-def check_observables(observables: tuple[tuple[str, Observable], ...], scene: Scene, y: State) -> None:
+def check_observables(observables: Observables, scene: Scene, y: State) -> None:
     """Refuse what is no number of the scene.
 
     **Raises:**
@@ -90,7 +90,7 @@ def _shape(observable: Observable, y: State, scene: Scene) -> tuple[int, ...] | 
 
 
 def observer(
-    observables: tuple[tuple[str, Observable], ...],
+    observables: Observables,
 ) -> Callable[[Array, State, Scene, Array | None], dict[str, Array]]:
     """A function of time, state, scene and modes that returns what each channel sees."""
 
@@ -133,7 +133,7 @@ class Slip(NamedTuple):
     v: Float[np.ndarray, " samples"]
 
 
-def coordinates_seen(observables: tuple[tuple[str, Observable], ...], dof: int) -> dict[str, str]:
+def coordinates_seen(observables: Observables, dof: int) -> dict[str, str]:
     """Which channels are a coordinate or a velocity, `q[0]` or `qd[0]`, by channel."""
     seen = {}
     for channel, observable in observables:

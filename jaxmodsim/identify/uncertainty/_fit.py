@@ -157,7 +157,7 @@ def fit_scene(
         raise ValueError(f"scene must be a Scene, but {scene!r} was given.")
     prepared = prepare(scene, records, free, options)
     x, starts = run_initializers(initializers, prepared.problem.held, search_options)
-    search = solve_freed(prepared.problem, x, search_options, prepared.given)
+    search = solve_freed(prepared.problem, x, search_options, prepared.known_noise)
     model = with_values(scene, search.problem.at(search.state.x).values)
     return result_of(search, prepared.records, prepared.windows, prepared.units, model, step_error(search), starts)
 
