@@ -155,7 +155,7 @@ def test_it_says_what_is_wrong(posterior: Posterior) -> None:
         posterior, rhat={**posterior.rhat, "A": 1.3}, effective={**posterior.effective, "k": 9.0}, divergences=3
     )
     text = str(wrong)
-    assert "The chains do not tell the same (R-hat of A 1.3" in text
+    assert "The chains do not agree (R-hat of A 1.3" in text
     assert "k has 9 effective samples, fewer than the 400" in text
     assert "3 samples diverged" in text
     wide = replace(posterior, draws={**posterior.draws, "A": 2 + 2 * (posterior.draws["A"] - 2)})

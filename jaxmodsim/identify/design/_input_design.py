@@ -170,8 +170,8 @@ class InputDesign(AbstractReadable):
         reach = float(np.max(np.abs(self.best.q_ref - self.best.q_ref[0])))
         if off > _OFF * reach:
             remarks.append(
-                f"The force alone does not keep the model on its reference: it is off by up to {off:.2g} m. Control"
-                " position and velocity of the axis, or choose a shorter dt."
+                f"The force alone does not keep the model on its reference: it is off by up to {off:.2g} m."
+                " Control position and velocity of the axis, or choose a shorter dt."
             )
         if self.ending != "converged":
             remarks.append(f"The search {self.ending}: more steps or another seed may find a better input.")

@@ -19,21 +19,21 @@ from ..estimate._search import SearchResult
 from ._estimate import ParameterEstimate
 from ._result import FitResult
 
-# What a number without effect is taken to be known by where coordinates are scaled: x is about 1 in size.
+# Information about a number without effect, for the scale of its coordinate: x is about 1 in size.
 _LEAST_INFORMATION = 1.0
-# Added to the scaled normal matrix: its factor exists whatever is not determined.
+# Added to the scaled normal matrix, so that it has a factor.
 _JITTER = 1e-12
-# Where a fit ended on a limit, the density starts beside it: by these shares of a standard error and of the range.
+# If a fit ended on a limit, the density starts beside it: by these shares of a standard error and of the range.
 _BESIDE, _BESIDE_RANGE = float(np.log(2.0)), 0.25
 _LARGEST_MEMORY = 0.98
-# Largest R-hat and fewest effective samples a chain of chains that can be relied on: Vehtari et al. 2021.
+# Largest R-hat and fewest effective samples per chain of reliable chains: Vehtari et al. 2021.
 _RHAT, _EFFECTIVE_A_CHAIN = 1.01, 100
-# Acceptance aimed at. Fixed steps through a kink of a friction law leave small jumps in the density, which no step of
-# NUTS is short enough for: at 0.85 it takes three times as many gradients.
+# Target acceptance. Fixed steps through a kink of a friction law leave small jumps in the density, for which no step of
+# NUTS is short enough: 0.85 takes three times as many gradients.
 _ACCEPTANCE = 0.75
-# Chains start by this many standard deviations of the fit about it, so that R-hat sees whether they forget where.
+# Chains start scattered by this many standard deviations of the fit, so that R-hat shows whether they mix.
 _SCATTER = 1.0
-# Ratio of the standard deviation to that of the fit from which on the two are said to differ.
+# Relative difference of the standard deviation from the standard error of the fit that is reported.
 _DIFFERS = 0.15
 
 
@@ -44,13 +44,13 @@ def _residual(x: Float[Array, " n"], problem: FitProblem) -> Float[Array, " rows
 
 @_residual.def_jvp
 def _(primals: tuple[Array, FitProblem], tangents: tuple[Array | None, PyTree]) -> tuple[Array, Array]:
-    """All columns in one forward sweep: cheaper than backwards for a few unknowns, and right through events."""
+    """All columns in one forward sweep: cheaper than reverse mode for a few unknowns, and exact through events."""
     residual, jacobian = primals[1].evaluate(primals[0])
     return residual, jnp.zeros_like(residual) if tangents[0] is None else jacobian @ tangents[0]
 
 
 class _SoftBox(eqx.Module):
-    """The real line to the inside of bounds, and linear from a few widths off them on.
+    """Map from the real line to the inside of bounds, linear beyond a few widths from them.
 
     `x = v + width (softplus(-(v - lower)/width) - softplus((v - upper)/width))`
     """
@@ -94,13 +94,13 @@ class LogDensity(eqx.Module):
 
     @eqx.filter_jit
     def __call__(self, u: Float[Array, " n"]) -> Float[Array, ""]:
-        """The logarithm of the density at `u`, up to a constant; minus infinity where the model is not finite."""
+        """The logarithm of the density at `u`, up to a constant; minus infinity if the model is not finite."""
         problem = self._problem
         v, level, memory = self._parts(u)
         x, size = self._box.inside(v), len(problem.free.names)
         residual = _residual(x, problem)
-        # Flat in the parameters, not in their coordinates; a parameter's limit depends on others only before it, so
-        # that the determinant is the product of the diagonal.
+        # Flat in the parameters, not in their coordinates. A limit depends only on parameters before it, so the
+        # determinant is the product of the diagonal.
         slopes = jnp.diagonal(problem.free.slopes(x[:size]))
         total = jnp.sum(self._box.log_slope(v)) + jnp.sum(jnp.log(jnp.abs(slopes)))
         total = total - 0.5 * jnp.sum(residual[problem.samples :] ** 2)
@@ -110,7 +110,7 @@ class LogDensity(eqx.Module):
             standard = jnp.where(weight > 0, _innovations(rows, rho), 0.0) * jnp.exp(-level[name])
             total = total - problem.loss.cost(jnp.reshape(standard, (-1,))) - counted * level[name]
             total = total + 0.5 * runs * jnp.log1p(-(rho**2))
-            total = total + (jnp.log1p(-(rho**2)) if name in memory else 0.0)  # flat in the memory, not in its artanh
+            total = total + (jnp.log1p(-(rho**2)) if name in memory else 0.0)  # flat in the correlation
         return jnp.where(jnp.isfinite(total), total, -jnp.inf)
 
     def values(self, u: Float[Array, " n"]) -> dict[str, Float[Array, ""]]:
@@ -144,16 +144,16 @@ class LogDensity(eqx.Module):
 def log_density(result: FitResult) -> LogDensity:
     """The posterior density of a fit as a function of one vector, for blackjax, numpyro and other samplers.
 
-    `density = log_density(result)` has the logarithm of the density at `density(u)`, `jax.grad(density)(u)` as its
-    gradient, the unknowns by name at `density.values(u)`, and the fit at `density.start`. u is unconstrained, and
-    whitened by the covariance of the fit. Unknown are all free parameters, initial states and delays, and of each
-    channel the level of its noise and how it is correlated from one sample to the next, AR(1): normal for
-    `SquaredLoss`, with the tails of a robust loss otherwise. Instants of break-away have noise without memory. Before
-    the record all parameters within their limits are equally likely, correlations too, noise levels in the logarithm;
-    `prior` of `fit` counts as well. What the record does not determine needs one.
+    With `density = log_density(result)`, `density(u)` is the logarithm of the density, `jax.grad(density)(u)` its
+    gradient, `density.values(u)` the unknowns by name, and `density.start` the fit. u is unconstrained, and whitened by
+    the covariance of the fit. Unknowns are all free parameters, initial states and delays, and for each channel the
+    level of its noise and its correlation from sample to sample, AR(1). The noise is normal for `SquaredLoss`, and
+    has the tails of a robust loss otherwise. Slip instants have uncorrelated noise. The prior is uniform in parameters
+    within their limits, in correlations, and in the logarithm of noise levels, times `prior` of `fit`. Parameters that
+    the record does not determine need such a prior.
 
-    With runs by events the density jumps wherever a change in the sequence of events makes the output jump. Samplers
-    by gradient do not see it: make such laws `Regularized` where stick and slip change with the parameters.
+    In runs by events the density jumps where a change in the sequence of events makes the output jump. Samplers by
+    gradient do not see this: make such laws `Regularized` if stick and slip change with the parameters.
 
     **Arguments:**
 
@@ -161,7 +161,7 @@ def log_density(result: FitResult) -> LogDensity:
 
     **Raises:**
 
-    - `ValueError` of a result that was loaded.
+    - `ValueError` for a loaded result.
     """
     search = result.search_for("The posterior")
     problem = search.problem
@@ -197,7 +197,7 @@ def log_density(result: FitResult) -> LogDensity:
 def _coordinates_of(
     search: SearchResult, jacobian: Float[Array, "rows n"], level: dict[str, Array], memory: dict[str, Array]
 ) -> tuple[_SoftBox, Float[Array, " n"], Float[Array, "n n"]]:
-    """Bounds made soft, the fit's coordinates, and a factor of their covariance, the noise taken as it was left."""
+    """Soft bounds, the coordinates of the fit, and a factor of their covariance at the estimated noise."""
     problem, columns = search.problem, []
     for column in jacobian.T:
         parts = []
@@ -226,7 +226,7 @@ def _factor(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def _innovations(rows: Float[Array, "runs samples"], memory: Float[Array, ""]) -> Float[Array, "runs samples"]:
-    """What of each residual does not follow from the one before; all of one standard deviation."""
+    """Residuals less their prediction from the previous one, all with one standard deviation."""
     first = rows[:, :1] * jnp.sqrt(1.0 - memory**2)
     return jnp.concatenate([first, rows[:, 1:] - memory * rows[:, :-1]], axis=1)
 
@@ -236,10 +236,10 @@ class Posterior(AbstractReadable):
     """Samples of all unknowns of a fit from their posterior.
 
     - `draws`: by name, shape `[chains, draws]` each, in the units of the parameters.
-    - `rhat`: by name, from ranks of split chains; 1 where all chains tell the same (Vehtari et al. 2021, Bayesian
-      Analysis 16:667). `effective`: by name, as how many independent samples they count, for the bulk or the tails,
-      whichever is fewer.
-    - `divergences`: samples at which the integration of NUTS went astray.
+    - `rhat`: by name, from ranks of split chains; 1 for chains that agree (Vehtari et al. 2021, Bayesian Analysis
+      16:667). `effective`: number of equivalent independent samples by name, for the bulk or the tails, whichever is
+      less.
+    - `divergences`: number of samples at which the integration of NUTS diverged.
     - `gradients`: number of gradients that all chains took, warm-up not included.
     - `estimate`: of the fit, for comparison.
     """
@@ -252,7 +252,7 @@ class Posterior(AbstractReadable):
     estimate: ParameterEstimate
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Intervals by name, with as much of the posterior below as above.
+        """Intervals by name, with equal probability below and above.
 
         **Raises:**
 
@@ -264,12 +264,12 @@ class Posterior(AbstractReadable):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Whether the samples can be relied on, and where they differ from the fit, in sentences."""
+        """Reliability of the samples, and differences from the fit, in sentences."""
         sentences = []
         worst = max(self.rhat, key=lambda name: self.rhat[name] if math.isfinite(self.rhat[name]) else math.inf)
         if not self.rhat[worst] <= _RHAT:
             sentences.append(
-                f"The chains do not tell the same (R-hat of {worst} {self.rhat[worst]:.3g}, {_RHAT} at most):"
+                f"The chains do not agree (R-hat of {worst} {self.rhat[worst]:.3g}, {_RHAT} at most):"
                 " take more draws and warmup, or a prior for what the record does not determine."
             )
         fewest, chains = min(self.effective, key=self.effective.__getitem__), next(iter(self.draws.values())).shape[0]
@@ -280,8 +280,8 @@ class Posterior(AbstractReadable):
             )
         if self.divergences:
             sentences.append(
-                f"{self.divergences} samples diverged: the density has corners or jumps there, and what is beyond them"
-                " may be missing."
+                f"{self.divergences} samples diverged: the density has corners or jumps there, and the region beyond"
+                " them may be missing."
             )
         for name, error in self.estimate.errors.items():
             if name in self.draws and math.isfinite(error) and error > 0:
@@ -325,13 +325,13 @@ def sample_posterior(
 ) -> Posterior:
     """Sample the posterior of a fit by NUTS (Hoffman, Gelman 2014, JMLR 15:1593), on `log_density(result)`.
 
-    By blackjax, the chains side by side on all cores; each adapts its step and the covariance of its unknowns during
-    the warm-up, in windows, as Stan does.
+    With blackjax, the chains in parallel on all cores. Each adapts its step and the covariance of its unknowns in
+    windows of the warm-up, as in Stan.
 
     **Arguments:**
 
-    - `result`: a fit that was not loaded from a file; what it takes to be known before, see `log_density`.
-    - `draws`: samples that each chain keeps, >= 4. `warmup`: samples before them, which are not kept, >= 20.
+    - `result`: a fit that was not loaded from a file; for the prior, see `log_density`.
+    - `draws`: samples of each chain, >= 4. `warmup`: samples before them, which are dropped, >= 20.
     - `chains`: number of chains, >= 2.
     - `seed`: of the random numbers.
 
@@ -341,8 +341,8 @@ def sample_posterior(
 
     **Raises:**
 
-    - `ImportError` without blackjax, which the extra `posterior` brings along.
-    - `ValueError` of a result that was loaded, or numbers out of range.
+    - `ImportError` without blackjax, which is in the extra `posterior`.
+    - `ValueError` for a loaded result, or numbers out of range.
     """
     blackjax = extra("blackjax", "sample_posterior", "posterior")
     draws, warmup, chains = (
@@ -354,7 +354,7 @@ def sample_posterior(
         )
     density = log_density(result)
     keys = jax.random.split(jax.random.key(seed), chains)
-    # Side by side under vmap all chains would wait at each draw for the one with the longest path.
+    # In threads, since under vmap all chains would wait at each draw for the longest path.
     with ThreadPoolExecutor() as pool:
         several = pool.map(lambda key: _sampled(density, key, blackjax, draws, warmup), keys)
         u, diverged, steps = (jnp.stack(x) for x in zip(*several, strict=True))
@@ -385,10 +385,10 @@ def _summary(
 def _sampled(
     density: LogDensity, key: Array, blackjax: ModuleType, draws: int, warmup: int
 ) -> tuple[Float[Array, "draws n"], Bool[Array, " draws"], Int[Array, " draws"]]:
-    """Draws of one chain, whether they diverged, and how many gradients each took."""
+    """Draws of one chain, whether they diverged, and the number of gradients of each."""
     start_key, warm_key, draw_key = jax.random.split(key, 3)
     start = density.start + _SCATTER * jax.random.normal(start_key, density.start.shape, density.start.dtype)
-    start = jnp.where(jnp.isfinite(density(start)), start, density.start)  # the model may not run that far off
+    start = jnp.where(jnp.isfinite(density(start)), start, density.start)  # the model may fail that far away
     adaptation = blackjax.window_adaptation(
         blackjax.nuts, density, is_mass_matrix_diagonal=False, target_acceptance_rate=_ACCEPTANCE
     )
