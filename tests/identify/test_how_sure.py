@@ -604,7 +604,7 @@ def test_a_file_puts_its_numbers_into_a_model(result, presliding, tmp_path):
         {k: np.asarray(x) for k, x in scene_numbers(result.model).items()},  # pyright: ignore[reportArgumentType]
     )
     other = jms.Scene(lagrangian, params={"m": 1.0, "k": 1.0}, effects=(jms.Friction(jms.Coulomb(1.0)),))
-    with pytest.raises(ValueError, match=r"not the one that was fitted: it lacks .*viscous.Fv"):
+    with pytest.raises(ValueError, match=r"not the fitted one: it lacks .*viscous.Fv"):
         FitResult.load(path, other)
     presliding.save(path)
     law = FitResult.load(path, jms.LuGre(**{**LUGRE, "sigma0": 1.0})).model

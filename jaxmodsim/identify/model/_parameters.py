@@ -16,7 +16,7 @@ from ..._core.parameters import Range
 from ...friction import AbstractLaw
 from ...scene import Scene, replace_numbers, scene_numbers
 
-# What a parameter is measured from: a number, another parameter, or sigma1, Fs and Fc of a law that is to be passive.
+# Lower limit of a parameter: a number, another parameter, or sigma1, Fs and Fc of a law that must be passive.
 Floor: TypeAlias = float | str | tuple[str, str, str] | None
 # Bound of logarithmic coordinates, short of overflow, and their longest step in one iteration: a linearisation says
 # nothing about a change by more than such a factor.
@@ -28,7 +28,7 @@ _Known = TypeVar("_Known", float, Array, np.ndarray)
 
 
 def entry_names(name: str, number: ArrayLike) -> tuple[str, ...]:
-    """Names of the entries of a number; that of a single one is its own."""
+    """Names of the entries of a number; a single number has its own name."""
     return tuple(f"{name}[{i}]" for i in range(jnp.size(number))) if jnp.ndim(number) == 1 else (name,)
 
 
@@ -56,7 +56,7 @@ def split_ranges(numbers: Mapping[str, Array], ranges: Mapping[str, Range]) -> d
 
 
 def join_entries(numbers: Mapping[str, Array], values: Mapping[str, Array]) -> dict[str, Array]:
-    """Whole numbers with the entries in `values` replaced, those that have any."""
+    """Numbers with entries in `values`, with these replaced."""
     joined: dict[str, Array] = {}
     for name, number in numbers.items():
         entries = entry_names(name, number)
@@ -81,7 +81,7 @@ def with_numbers(model: eqx.Module, numbers: Mapping[str, np.ndarray]) -> eqx.Mo
 
     **Raises:**
 
-    - `ValueError` if its numbers are others by name or shape.
+    - `ValueError` if its numbers have other names or shapes.
     """
     if not isinstance(model, Scene | AbstractLaw):
         raise ValueError(f"model must be a Scene or a law, but {model!r} was given.")
@@ -89,13 +89,13 @@ def with_numbers(model: eqx.Module, numbers: Mapping[str, np.ndarray]) -> eqx.Mo
     missing, extra = [k for k in numbers if k not in own], [k for k in own if k not in numbers]
     if missing or extra:
         raise ValueError(
-            f"The model is not the one that was fitted: it lacks {', '.join(missing) or 'nothing'}, and has"
-            f" {', '.join(extra) or 'nothing'} that was not there."
+            f"The model is not the fitted one: it lacks {', '.join(missing) or 'nothing'}, and has"
+            f" {', '.join(extra) or 'nothing'} in addition."
         )
     for name, number in numbers.items():
         if np.shape(number) != np.shape(own[name]):
             raise ValueError(
-                f"The model is not the one that was fitted: {name} has the shape {np.shape(own[name])}, but"
+                f"The model is not the fitted one: {name} has the shape {np.shape(own[name])}, but"
                 f" {np.shape(number)} was fitted."
             )
     return replace_numbers(model, {k: jnp.asarray(x) for k, x in numbers.items()})
