@@ -1,4 +1,4 @@
-"""Measured records: samples, windows as arrays of one shape, and positions differentiated."""
+"""Measured records, and their windows as arrays of one shape."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
@@ -14,7 +14,7 @@ from ..._core.device import on_device
 
 @runtime_checkable
 class TableColumn(Protocol):
-    """A column of a table (pandas, xarray, polars): what NumPy makes an array of."""
+    """A column of a table (pandas, xarray, polars) that NumPy can convert."""
 
     def __array__(self, *arguments: object, **options: object) -> np.ndarray:
         """As an array."""
@@ -23,30 +23,30 @@ class TableColumn(Protocol):
 
 # Samples of one channel, shape `[samples]`.
 Column: TypeAlias = ArrayLike | Sequence[object] | TableColumn
-# Name of a single channel that was given none.
+# Default name of a single channel.
 SINGLE = "measured"
 
 
 class Record:
-    """Samples of a measurement: what was measured, and the inputs that drove the machine.
+    """Samples of a measurement: outputs, and the inputs that drove the machine.
 
     **Arguments:**
 
     - `t`: times of the samples [s], increasing, shape `[samples]`, at least two.
-    - `measured`: measured output at these times, shape `[samples]`; or several by name, `{"x": ..., "force": ...}`.
-    - `inputs`: inputs by name, shape `[samples]` each. In a fit an input drives the entry of the scene's `params` of
-      the same name.
+    - `measured`: measured output at these times, shape `[samples]`; or several outputs by name,
+      `{"x": ..., "force": ...}`.
+    - `inputs`: inputs by name, shape `[samples]` each. In a fit each drives the entry of the scene's `params` of the
+      same name.
     - `name`: for figures and tables.
-    - `linear`: names of the inputs that run in straight lines from sample to sample; the others are held until the
-      next.
-    - `noise`: standard deviation of the noise of each channel by its name, in its unit, > 0; one number where there is
-      one channel. A fit estimates those that are not given. That of slip instants is `"friction slips"`.
+    - `linear`: names of the inputs that are interpolated linearly; the others are held until the next sample.
+    - `noise`: standard deviation of the noise of each channel by its name, in its unit, > 0; one number for a single
+      channel. A fit estimates the others. The channel of slip instants is `"friction slips"`.
     - `slips`: instants [s] at which friction elements broke away, by the name of the effect in the scene, increasing.
 
     **Raises:**
 
-    - `ValueError` naming the column and the first sample at fault, for NaN, times that do not increase, or lengths
-      that differ.
+    - `ValueError` naming the column and the first wrong sample, for NaN, times that do not increase, or different
+      lengths.
     """
 
     t: Float[np.ndarray, " samples"]
@@ -73,7 +73,7 @@ class Record:
         inputs = as_mapping(inputs, name="inputs", example="{'u': force}")
         slips = as_mapping(slips, name="slips", example="{'friction': [0.5, 1.5]}")
         if not outputs:
-            raise ValueError(f"{name}: measured must hold one channel at least.")
+            raise ValueError(f"{name}: measured must hold at least one channel.")
         self.t = _column(t, "t", None, name)
         shape = self.t.shape
         self.channels = {label: _column(column, label, shape, name) for label, column in outputs.items()}
@@ -110,22 +110,22 @@ class Record:
 
     @property
     def measured(self) -> Float[np.ndarray, " samples"]:
-        """The one channel of a record that has one.
+        """The only channel.
 
         **Raises:**
 
-        - `ValueError` if it has several: take them from `channels`.
+        - `ValueError` for several: use `channels`.
         """
         if len(self.channels) > 1:
-            raise ValueError(f"{self.name} has the channels {', '.join(self.channels)}: say which.")
+            raise ValueError(f"{self.name} has the channels {', '.join(self.channels)}: use Record.channels.")
         return next(iter(self.channels.values()))
 
     def part(self, start: float, end: float, name: str | None = None) -> "Record":
-        """The samples from `start` to `end` [s], both included; times stay as they are.
+        """The samples from `start` to `end` [s], both included, with the same times.
 
         **Raises:**
 
-        - `ValueError` if fewer than two samples lie there.
+        - `ValueError` for fewer than two samples.
         """
         start, end = as_float(start, name="start"), as_float(end, name="end")
         inside = np.flatnonzero((self.t >= start) & (self.t <= end))
@@ -136,7 +136,7 @@ class Record:
         return self.samples(int(inside[0]), int(inside[-1]) + 1, name)
 
     def samples(self, first: int, last: int, name: str | None = None) -> "Record":
-        """Samples `first` up to, and without, `last`."""
+        """Samples from `first` to `last`, without the last."""
         keep = slice(first, last)
         t = self.t[keep]
         slips = {effect: instants[(instants >= t[0]) & (instants <= t[-1])] for effect, instants in self.slips.items()}
@@ -155,10 +155,10 @@ class Record:
 
         **Raises:**
 
-        - `ValueError` if a window would hold fewer than two samples.
+        - `ValueError` for windows of fewer than two samples.
         """
         seconds = as_float(seconds, name="seconds", lower=0.0)
-        parts = min(float(self.t[-1] - self.t[0]) / seconds, float(len(self.t)))  # which is too many already
+        parts = min(float(self.t[-1] - self.t[0]) / seconds, float(len(self.t)))  # one a sample at most
         count = max(round(parts), 1)
         if 2 * count > len(self.t):
             raise ValueError(
@@ -217,9 +217,9 @@ def _instants(instants: Column, effect: str, t: np.ndarray, name: str) -> Float[
 class Runs(NamedTuple):
     """Records, or windows of them, padded to the same length, with a leading axis of runs.
 
-    - `t`: times [s]; the last one is repeated where a run is shorter than the longest.
-    - `inputs`, `measured`: by name. `weight`: 1 where a sample counts, 0 where not, by channel.
-    - `slips`: instants by effect, `slip_weight` their weights.
+    - `t`: times [s]; shorter runs repeat their last one.
+    - `inputs`, `measured`: by name. `weight`: 1 for a sample that counts, 0 for others, by channel.
+    - `slips`: instants by effect. `slip_weight`: their weights.
     """
 
     t: Float[Array, "runs samples"]
@@ -231,11 +231,11 @@ class Runs(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """Where the runs come from.
+    """The windows of records that are the runs.
 
-    - `record`, `first`, `last`: index of the record and its samples `first` to `last`, of each run; the last sample
-      is also the first of the next run where `linked`.
-    - `linked`: whether the next run goes on from the end of this one, shape `[runs - 1]`.
+    - `record`, `first`, `last`: index of the record and of its first and last sample, for each run; the last sample is
+      also the first of the next run if they are `linked`.
+    - `linked`: whether the next run continues from the end of this one, shape `[runs - 1]`.
     """
 
     record: tuple[int, ...]
@@ -245,11 +245,11 @@ class Windows(NamedTuple):
 
 
 def cut(records: tuple[Record, ...], window: float | None) -> Windows:
-    """Whole records, or windows of nearly this length [s]; each ends with the first sample of the next.
+    """Whole records, or windows of about this length [s]; each ends with the first sample of the next.
 
     **Raises:**
 
-    - `ValueError` if the window is shorter than two samples.
+    - `ValueError` for a window shorter than two samples.
     """
     record, first, last, linked = [], [], [], []
     steps = None
@@ -262,7 +262,7 @@ def cut(records: tuple[Record, ...], window: float | None) -> Windows:
         samples = len(each.t)
         edges = [0, samples - 1] if steps is None else [*range(0, samples - 1, steps), samples - 1]
         if len(edges) > 2 and edges[-1] - edges[-2] < (steps or 0) // 4:
-            del edges[-2]  # too short to say anything about its own start
+            del edges[-2]  # too short to show its own start
         for a, b in pairwise(edges):
             record.append(i)
             first.append(a)

@@ -8,31 +8,31 @@ from jaxtyping import Bool, Float
 
 from ._record import Record
 
-# Samples at the beginning of a record, from which position and velocity are estimated.
+# First samples of a record, from which position and velocity are estimated.
 _SAMPLES = 20
-# A value stands out that is so many times as far from the median of its neighbours as nearly all others are, and as far
-# as samples go from one to the next.
+# Neighbours of a sample. An outlier is this many times as far from their median as nearly all other samples, and as the
+# usual step from sample to sample.
 _NEIGHBOURS, _STANDS_OUT, _NEARLY_ALL = 5, 10.0, 0.95
-# Values are on a grid that lie off it by less than this share of its step; keeps divisions by a level finite.
+# Tolerance of values on a grid, as a share of its step. Keeps divisions finite.
 _ON_A_GRID, _TINY = 1e-3, 1e-300
-# Smoothing: one sample to either side for so many of the record, and never fewer than so many to either side.
+# Smoothing: one sample to either side for so many of the record, and at least so many.
 _SAMPLES_A_SIDE, _LEAST_SPAN = 1000, 3
-# Orders of the differences that show noise, into how many parts of how many samples at least a record is cut.
+# Orders of the differences that show noise; number of parts of a record, and samples in a part at least.
 _ORDERS, _PARTS, _LEAST_PART = (2, 3, 4, 5, 6), 32, 32
-# An interval so many times the median is a gap, unless more than this share of all intervals are as long.
+# An interval of so many medians is a gap, unless more than this share of all intervals are as long.
 _GAP, _FEW = 5.0, 0.01
-# Slower than this share of the top speed friction may be anything.
+# Samples slower than this share of the top speed are left out.
 _MOVING = 0.05
-# Largest offset that is looked for, as a share of the record, and in samples.
+# Largest offset, as a share of the record, and in samples.
 _FURTHEST_SHARE, _FURTHEST = 0.1, 500
-# Iterations of the golden section by which the minimum is found between two samples.
+# Iterations of the golden section between two samples, and its ratio.
 _REFINED, _GOLDEN = 40, 0.5 * (math.sqrt(5.0) - 1.0)
-# Samples in motion that tell four regressors from chance.
+# Least number of moving samples for four regressors.
 _LEAST_MOVING = 100
 
 
 class SmoothedMotion(NamedTuple):
-    """A smoothed motion, shape `[samples]` each, and how many samples at either end the smoothing spoils."""
+    """A smoothed motion, shape `[samples]` each, and the number of samples at either end that smoothing distorts."""
 
     x: Float[np.ndarray, " samples"]
     v: Float[np.ndarray, " samples"]
@@ -49,12 +49,12 @@ def smooth(x: Float[np.ndarray, " samples"], span: int) -> Float[np.ndarray, " s
 
 
 def smooth_span(samples: int) -> int:
-    """Samples to either side over which a record of so many is smoothed."""
+    """Samples to either side in the smoothing of a record."""
     return max(samples // _SAMPLES_A_SIDE, _LEAST_SPAN)
 
 
 def outliers(x: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
-    """Samples that stand out from their neighbours to either side, as those of a sensor that drops out do."""
+    """Samples that differ from their neighbours on both sides, as from a sensor that drops out."""
     deviation, steps = np.abs(x - _local_median(x)), np.abs(np.diff(x))
     step = float(np.median(steps[steps > 0])) if steps.any() else 0.0
     usual = max(float(np.quantile(deviation, _NEARLY_ALL)), step)
@@ -62,16 +62,16 @@ def outliers(x: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
 
 
 def without_outliers(x: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """The samples, with the median of their neighbours in place of those that stand out."""
+    """The samples with outliers replaced by the median of their neighbours."""
     bad = outliers(x)
     return np.where(bad, _local_median(x), x) if bad.any() else x
 
 
 def sample_noise(x: Float[np.ndarray, " samples"]) -> float:
-    """Standard deviation of the noise that samples do not share with their neighbours; at least that of rounding.
+    """Standard deviation of uncorrelated noise; at least that of rounding.
 
-    Differences of the order that leaves least of the motion; the median over parts of the record, so that impacts and
-    outliers decide nothing. Steps of a sensor of resolution r have a standard deviation of r/sqrt(12).
+    From differences of the order that leaves least of the motion. The median over parts of the record is robust to
+    impacts and outliers. Steps of a sensor of resolution r have a standard deviation of r/sqrt(12).
     """
     levels = [np.inf]
     for order in _ORDERS:
@@ -97,11 +97,11 @@ def differentiate(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " sampl
 
 
 def start_state(record: Record, channel: str | None = None) -> tuple[float, float]:
-    """Position and velocity at the first sample, by a parabola through the first 20.
+    """Position and velocity at the first sample, by a parabola through the first 20 samples.
 
     **Arguments:**
 
-    - `record`: its `channel`, by default the only one, is a position [m or rad].
+    - `record`: with a position [m or rad]. `channel`: its name; by default the only one.
 
     **Returns:**
 
@@ -115,7 +115,7 @@ def start_state(record: Record, channel: str | None = None) -> tuple[float, floa
 def start_errors(record: Record, channel: str) -> float:
     """Standard error of the velocity of `start_state` over the noise of the channel [1/s].
 
-    Larger where the first samples lie off the parabola by more than the noise: they are too far apart for it.
+    Larger if the first samples differ from the parabola by more than the noise, being too far apart.
     """
     x = without_outliers(record.channels[channel])
     powers = _start_powers(record.t)
@@ -125,13 +125,13 @@ def start_errors(record: Record, channel: str) -> float:
 
 
 def _start_powers(t: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "first powers"]:
-    """The parabola through the first samples, as a matrix: by time since the first one."""
+    """Powers of time since the first sample, for a parabola through the first samples."""
     count = min(_SAMPLES, len(t))
     return np.vander(t[:count] - t[0], min(3, count), increasing=True)
 
 
 def resolution(x: Float[np.ndarray, " samples"]) -> float:
-    """Step of the values of a sensor, all of which are multiples of it apart; 0 where there is none."""
+    """Resolution of a sensor, of which all differences of values are multiples; 0 for none."""
     values = np.unique(x)
     steps = np.diff(values)
     if not steps.size:
@@ -141,19 +141,19 @@ def resolution(x: Float[np.ndarray, " samples"]) -> float:
 
 
 def sampling_gaps(record: Record) -> tuple[int, ...]:
-    """Numbers of the samples after which some are missing.
+    """Numbers of the samples before gaps.
 
-    A record whose intervals differ throughout has none.
+    A record with irregular intervals has none.
     """
     steps = np.diff(record.t)
     long = np.flatnonzero(steps > _GAP * np.median(steps))
     return tuple(long.tolist()) if long.size <= max(_FEW * steps.size, 1) else ()
 
 
-class _Explained(NamedTuple):
-    """What the motion of a record explains of a force: the regressors where it moves, as an orthonormal basis.
+class _Regression(NamedTuple):
+    """Regression of a force on the motion of a record: the regressors of moving samples, as an orthonormal basis.
 
-    - `basis`, shape `[moving, 4]`, at the times `t`. `middle`, `force`: the force, smoothed as the motion is.
+    - `basis`, shape `[moving, 4]`, at the times `t`. `middle`, `force`: the force, smoothed like the motion.
     """
 
     basis: Float[np.ndarray, "moving 4"]
@@ -161,15 +161,15 @@ class _Explained(NamedTuple):
     middle: Float[np.ndarray, " samples"]
     force: Float[np.ndarray, " samples"]
 
-    def left(self, offset: float) -> tuple[float, float]:
-        """Sum of squares of the force `offset` [s] before that is not explained, and of its scatter."""
+    def residual(self, offset: float) -> tuple[float, float]:
+        """Sum of squares of the residual of the force `offset` [s] earlier, and of its scatter."""
         shifted = np.interp(self.t - offset, self.middle, self.force)
-        missed = shifted - self.basis @ (self.basis.T @ shifted)
-        return float(missed @ missed), float(np.sum((shifted - np.mean(shifted)) ** 2))
+        residual = shifted - self.basis @ (self.basis.T @ shifted)
+        return float(residual @ residual), float(np.sum((shifted - np.mean(shifted)) ** 2))
 
 
-def _explained(record: Record, name: str, furthest: int) -> _Explained | None:
-    """Regressors of the force: acceleration, velocity, its direction, and one. None where the motion is too short."""
+def _regression(record: Record, name: str, furthest: int) -> _Regression | None:
+    """Regressors of the force: acceleration, velocity, its sign, and one. None for a short motion."""
     t, span, u = record.t, smooth_span(len(record.t)), record.inputs[name]
     edge = 2 * span + furthest + 2
     if len(t) <= 2 * edge or not np.ptp(u) or not np.ptp(record.measured):
@@ -185,12 +185,12 @@ def _explained(record: Record, name: str, furthest: int) -> _Explained | None:
         return None
     columns = np.column_stack([np.gradient(v, t), v, smoothed(np.sign(v)), np.ones_like(v)])[moving]
     basis = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), _TINY))[0]
-    # A held value stands for the interval that follows it.
-    return _Explained(basis, t[moving], t + 0.5 * float(np.median(np.diff(t))), smoothed(u))
+    # A held value belongs to the interval after it.
+    return _Regression(basis, t[moving], t + 0.5 * float(np.median(np.diff(t))), smoothed(u))
 
 
 def unexplained_force(record: Record, name: str = "u") -> float:
-    """Share of the variance of a force that does not go with the motion: with acceleration, velocity, its direction.
+    """Share of the variance of a force that acceleration, velocity and its sign do not explain.
 
     **Arguments:**
 
@@ -198,20 +198,20 @@ def unexplained_force(record: Record, name: str = "u") -> float:
 
     **Returns:**
 
-    The share, 0 to 1; 0 where the motion is too short to tell.
+    The share, 0 to 1; 0 for a motion that is too short.
     """
-    explained = _explained(record, name, 0)
-    if explained is None:
+    regression = _regression(record, name, 0)
+    if regression is None:
         return 0.0
-    left, scatter = explained.left(0.0)
-    return left / max(scatter, _TINY)
+    residual, scatter = regression.residual(0.0)
+    return residual / max(scatter, _TINY)
 
 
 def clock_offset(record: Record, name: str = "u") -> tuple[float, float]:
-    """By how much an input comes before the force that the motion shows, as from a clock that differs.
+    """Time by which an input is ahead of the force that the motion shows, as from a different clock.
 
-    The force is regressed on acceleration, velocity and its direction, with the input shifted against them; the shift
-    that leaves least is the offset, to a tenth of the interval of the samples or better.
+    The input is shifted against its regressors, which are acceleration, velocity and its sign. The shift with the least
+    residual is the offset, to a tenth of the interval of the samples or better.
 
     **Arguments:**
 
@@ -219,27 +219,27 @@ def clock_offset(record: Record, name: str = "u") -> tuple[float, float]:
 
     **Returns:**
 
-    The offset [s], positive where the input is early, and the root mean square that is left with the shift, as a share
-    of what is left without it. `(0, 1)` where the motion is too short to tell.
+    The offset [s], positive for an early input, and the root mean square of the residual with the shift, relative to
+    that without it. `(0, 1)` for a motion that is too short.
     """
     interval, furthest = float(np.median(np.diff(record.t))), int(min(_FURTHEST_SHARE * len(record.t), _FURTHEST))
-    explained = _explained(record, name, furthest)
-    if explained is None or furthest < 1:
+    regression = _regression(record, name, furthest)
+    if regression is None or furthest < 1:
         return 0.0, 1.0
 
-    def left(offset: float) -> float:
-        return explained.left(offset)[0]
+    def squares(offset: float) -> float:
+        return regression.residual(offset)[0]
 
     def least(first: int, last: int, step: int) -> int:
-        return min(range(max(first, -furthest), min(last, furthest) + 1, step), key=lambda k: left(interval * k))
+        return min(range(max(first, -furthest), min(last, furthest) + 1, step), key=lambda k: squares(interval * k))
 
-    # A smoothed force changes little over a quarter of the span: so far apart are the offsets of a first look.
+    # First on a coarse grid: a smoothed force changes little over a quarter of the span.
     step = max(smooth_span(len(record.t)) // 4, 1)
     best = least(-furthest, furthest, step)
     best = least(best - step, best + step, 1)
     low, high = (interval * min(max(best + side, -furthest), furthest) for side in (-1, 1))
     for _ in range(_REFINED):
         a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        low, high = (low, b) if left(a) < left(b) else (a, high)
+        low, high = (low, b) if squares(a) < squares(b) else (a, high)
     offset = 0.5 * (low + high)
-    return offset, math.sqrt(left(offset) / max(left(0.0), _TINY))
+    return offset, math.sqrt(squares(offset) / max(squares(0.0), _TINY))
