@@ -30,7 +30,7 @@ def comparison_figure(comparison: Comparison, *, unit: str = "m", caption: str =
         axis.barh(i - 0.17, factor * each.held_back, 0.4, color=colour, alpha=0.75)
         (parts,) = axis.plot(factor * each.parts, height, "o", color="white", mec="black", ms=4)
         bar = axis.errorbar(
-            factor * each.held_back, i - 0.17, xerr=factor * each.error, color="black", capsize=4, lw=1.2
+            factor * each.held_back, i - 0.17, xerr=factor * each.standard_error, color="black", capsize=4, lw=1.2
         )
         axis.barh(i + 0.2, factor * each.fitted, 0.24, color=GREY)
         parts.set_label("" if i else "each part that was held back")

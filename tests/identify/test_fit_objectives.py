@@ -279,7 +279,7 @@ def test_records_refuse_what_cannot_be():
         jms.Record(t, x, linear=("u",))
     with pytest.raises(ValueError, match="slips of 'friction' must be increasing times within"):
         jms.Record(t, x, slips={"friction": [3.0]})
-    with pytest.raises(ValueError, match="use Record.channels"):
+    with pytest.raises(ValueError, match=r"use Record\.channels"):
         _ = jms.Record(t, {"a": x, "b": x}).measured
     with pytest.raises(ValueError, match=r"windows of 1.0 s cannot be cut from 3 samples"):
         jms.Record(t, x).windows(1.0)

@@ -4,7 +4,7 @@ import abc
 import threading
 from collections.abc import Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,6 +17,8 @@ from ..._core.speed import cores
 from ._problem import FitProblem
 from ._search import SearchOptions, SearchState, solve, start_search, steps_side_by_side
 
+# Start of a search, and the root mean squares, in noise levels, at the ends of all trial starts, best first.
+Initialized: TypeAlias = tuple[Float[Array, " n"], tuple[float, ...]]
 # Number of searches in a compiled batch.
 _GROUP = 32
 # Share of the cost by which the fit from a smaller model must be better to be used.
@@ -29,10 +31,8 @@ class AbstractInitializer(eqx.Module):
     """A method for the start of a search."""
 
     @abc.abstractmethod
-    def initialize(
-        self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions
-    ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
-        """A better `x`, and the root mean squares, in noise levels, at the ends of all starts, best first."""
+    def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
+        """A better `x`, and the ends of all starts."""
 
 
 def as_initializers(initializer: object) -> tuple[AbstractInitializer, ...]:
@@ -52,7 +52,7 @@ def as_initializers(initializer: object) -> tuple[AbstractInitializer, ...]:
 
 def run_initializers(
     initializers: AbstractInitializer | Sequence[AbstractInitializer], problem: FitProblem, options: SearchOptions
-) -> tuple[Float[Array, " n"], tuple[float, ...]]:
+) -> Initialized:
     """The start of the search by one initializer or several, each from the end of the previous one."""
     x, starts = problem.x0, ()
     for each in as_initializers(initializers):
@@ -111,9 +111,7 @@ class MultiStart(AbstractInitializer):
         drawn[0] = here
         return np.concatenate([drawn, np.broadcast_to(np.asarray(x[size:]), (self.count, x.shape[0] - size))], axis=1)
 
-    def initialize(
-        self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions
-    ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
+    def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
         """Search from all starts; the best end, and the root mean squares of all ends in noise levels, best first.
 
         The worse starts are dropped after a few evaluations, in two rounds.
@@ -211,9 +209,7 @@ class Continuation(AbstractInitializer):
                 f"Continuation needs stages >= 1 and factor > 1, but they are {self.stages} and {self.factor}."
             )
 
-    def initialize(
-        self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions
-    ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
+    def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
         """The end of the last fit before the actual one."""
         if self.name in problem.free.names:
             raise ValueError(f"Continuation in {self.name}, which is free: name a fixed number.")
@@ -234,9 +230,7 @@ class FromSmaller(AbstractInitializer):
 
     values: dict[str, Array]
 
-    def initialize(
-        self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions
-    ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
+    def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
         """The best end."""
         size = len(problem.free.names)
         here = {name: self.values[last_part(name)] for name in problem.free.names if last_part(name) in self.values}
@@ -287,9 +281,7 @@ class Stochastic(AbstractInitializer):
         if self.batch < 1 or self.steps < 1:
             raise ValueError(f"Stochastic needs batch >= 1 and steps >= 1, but they are {self.batch} and {self.steps}.")
 
-    def initialize(
-        self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions
-    ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
+    def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
         """The end of the last step; Ctrl-C ends at the previous step."""
         if problem.jump is not None:
             raise ValueError(

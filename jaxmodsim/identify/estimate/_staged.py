@@ -14,7 +14,7 @@ from ...scene import Friction, Scene, State, scene_ranges, vector_field
 from ..data._signals import differentiate, smooth, smooth_span
 from ..model._engines import with_values
 from ..model._observe import coordinates_seen
-from ._initializers import AbstractInitializer
+from ._initializers import AbstractInitializer, Initialized
 from ._problem import Box, FitProblem, SquaredLoss
 from ._search import SearchOptions, SearchState, levenberg_marquardt_step, start_search
 
@@ -62,9 +62,7 @@ class Staged(AbstractInitializer):
     - `ValueError` (at the fit) for several coordinates, or without a measured position.
     """
 
-    def initialize(
-        self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions
-    ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
+    def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
         """Coordinates of the start values."""
         sampled = _sampled(problem)
         units = _units(problem)

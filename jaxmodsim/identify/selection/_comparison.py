@@ -1,7 +1,7 @@
 """The result of a comparison: held-out errors, information criteria, and the simplest sufficient model."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -75,15 +75,15 @@ class Ranked:
     """One model of a comparison.
 
     - `name`, `description`: of the model. `parameters`: number of all fitted numbers, initial states included.
-    - `held_back`, `error`: root mean square held-out error, and its standard error; only the start of each part was
-      fitted, to its first samples. `start_fitted`: the error with starts fitted to all of each part; None for laws,
-      which have none.
+    - `held_back`, `standard_error`: root mean square held-out error, and its standard error; only the start of each
+      part was fitted, to its first samples. `start_fitted`: the error with starts fitted to all of each part; None for
+      laws, which have none.
     - `parts`: the root mean square errors of the held-out parts, shape `[parts]`.
     - `expected`: root mean square error to expect on a new record. Its square is that of `held_back`, plus the
       variances that uncertain parameters add over whole records and that a varying friction level adds. With held-out
       records, which show these, it is `held_back`.
-    - `over`, `over_error`: `expected` less that of the best model, and the standard error of this difference, from the
-      differences in each part.
+    - `over_the_best`, `over_the_best_standard_error`: `expected` less that of the best model, and the standard error of
+      this difference, from the differences in each part.
     - `fitted`: root mean square error of the fit to everything.
     - `takeuchi`, `bic`: information criteria less the least of all models; see `Comparison`.
     - `penalty`: effective number of parameters, of Takeuchi's criterion.
@@ -94,11 +94,11 @@ class Ranked:
     description: str
     parameters: int
     held_back: float
-    error: float
+    standard_error: float
     parts: Float[np.ndarray, " parts"]
     expected: float
-    over: float
-    over_error: float
+    over_the_best: float
+    over_the_best_standard_error: float
     start_fitted: float | None
     fitted: float
     takeuchi: float
@@ -184,7 +184,7 @@ class Comparison(AbstractReadable):
             if each is best
             or (
                 each.held_back <= _AS_GOOD * best.held_back
-                and (each.over <= each.over_error or bool(best.undetermined))
+                and (each.over_the_best <= each.over_the_best_standard_error or bool(best.undetermined))
             )
         ]
         return min(near, key=lambda each: (bool(each.undetermined), each.parameters, each.expected)).name
@@ -196,24 +196,7 @@ class Comparison(AbstractReadable):
     def table(self) -> list[dict[str, object]]:
         """Rows by rank, then the models that failed or were not finished, of types that JSON knows."""
         rows: list[dict[str, object]] = [
-            {
-                "name": each.name,
-                "description": each.description,
-                "parameters": each.parameters,
-                "held_back": each.held_back,
-                "standard_error": each.error,
-                "parts": each.parts.tolist(),
-                "expected": each.expected,
-                "over_the_best": each.over,
-                "over_the_best_standard_error": each.over_error,
-                "start_fitted": each.start_fitted,
-                "fitted": each.fitted,
-                "takeuchi": each.takeuchi,
-                "bic": each.bic,
-                "penalty": each.penalty,
-                "undetermined": list(each.undetermined),
-                "failed": None,
-            }
+            {**asdict(each), "parts": each.parts.tolist(), "undetermined": list(each.undetermined), "failed": None}
             for each in self.ranked
         ]
         rows.extend({"name": name, "failed": reason} for name, reason in self.failures.items())
@@ -231,15 +214,16 @@ class Comparison(AbstractReadable):
             text += f", {simple.expected:.4g} to expect on a new record"
         simpler = [each for each in self.ranked if each.parameters < best.parameters]
         if simple is not best:
+            over, error = simple.over_the_best, simple.over_the_best_standard_error
             text += (
-                f"; {best.name} with {best.parameters} is expected to be better by {simple.over:.2g}, which is"
-                f" {'within' if simple.over <= simple.over_error else 'more than'} one standard error,"
-                f" {simple.over_error:.2g}."
+                f"; {best.name} with {best.parameters} is expected to be better by {over:.2g}, which is"
+                f" {'within' if over <= error else 'more than'} one standard error, {error:.2g}."
             )
         elif simpler:
+            near = simpler[0]
             text += (
-                f", the least of all; with fewer parameters {simpler[0].name} is worse by {simpler[0].over:.2g},"
-                f" standard error {simpler[0].over_error:.2g}."
+                f", the least of all; with fewer parameters {near.name} is worse by {near.over_the_best:.2g}, standard"
+                f" error {near.over_the_best_standard_error:.2g}."
             )
         else:
             text += ", the least of all."
@@ -272,9 +256,10 @@ def _(comparison: Comparison) -> Table:
             "all fitted", "Takeuchi", "BIC")  # fmt: skip
     rows, notes = [], []
     for each in comparison.ranked:
-        over = "" if each is comparison.ranked[0] else f"{each.over:.3g} +- {each.over_error:.2g}"
+        over = f"{each.over_the_best:.3g} +- {each.over_the_best_standard_error:.2g}"
         start_fitted = "" if each.start_fitted is None else f"{each.start_fitted:.4g}"
-        numbers = f"{each.held_back:.4g}", f"{each.error:.2g}", f"{each.expected:.4g}", over, start_fitted
+        over = "" if each is comparison.ranked[0] else over
+        numbers = f"{each.held_back:.4g}", f"{each.standard_error:.2g}", f"{each.expected:.4g}", over, start_fitted
         criteria = f"{each.fitted:.4g}", f"{each.takeuchi:.1f}", f"{each.bic:.1f}"
         rows.append((each.name, str(each.parameters), *numbers, *criteria))
         if each.undetermined:
@@ -333,7 +318,10 @@ def comparison_of(
     ranked = []
     for name in order:
         held_back, root, least = (float(np.sqrt(x)) for x in (means[name], expected[name], expected[best]))
-        together, starts = root + least, kept[name].start_fitted
+        error = _standard_error(losses[name], count) / (2 * held_back) if held_back > 0 else 0.0
+        difference = _standard_error(losses[name] - losses[best], count)
+        difference = difference / (root + least) if root + least else 0.0
+        starts = kept[name].start_fitted
         start_fitted = None
         if starts:
             weights = [sum(len(x) for x in part.values()) for part in starts]
@@ -345,11 +333,11 @@ def comparison_of(
                 description=descriptions.get(name, ""),
                 parameters=size[name],
                 held_back=held_back,
-                error=float(_standard_error(losses[name], count) / (2 * held_back)) if held_back > 0 else 0.0,
+                standard_error=error,
                 parts=np.sqrt(losses[name]),
                 expected=root,
-                over=root - least,
-                over_error=float(_standard_error(losses[name] - losses[best], count) / together) if together else 0.0,
+                over_the_best=root - least,
+                over_the_best_standard_error=difference,
                 start_fitted=start_fitted,
                 fitted=fitted[name],
                 takeuchi=float(takeuchi[name] - min(takeuchi.values())),
