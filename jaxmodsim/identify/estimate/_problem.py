@@ -1,7 +1,6 @@
 """The problem of a fit as arrays, from coordinates to weighted residuals and their Jacobian, and the losses."""
 
 import abc
-import re
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..._core.device import on_device
 from ..._core.parameters import Number, check_ranges, parameter
@@ -28,7 +27,6 @@ else:
 _Rows = TypeVar("_Rows", Array, np.ndarray)
 # Inverse standard deviation of a start that is held, in noise levels.
 _HELD = 1e6
-_LOCAL = re.compile(r"(q0|qd0)\[(\d+)\]|z0\.(.+?)(?:\[(\d+)\])?")
 
 
 class AbstractLoss(eqx.Module):
@@ -117,44 +115,21 @@ class Box(NamedTuple):
     longest: Float[Array, " n"]
 
 
-def local_names(y: State) -> tuple[str, ...]:
-    """Names of the numbers of an initial state: `q0[0]`, `qd0[0]`, `z0.friction`."""
+def _flat_names(y: State) -> list[str]:
+    """Name of each entry of the flattened state; "" for those that cannot be free."""
     dof = y.q.shape[0]
     names = [f"q0[{i}]" for i in range(dof)] + [f"qd0[{i}]" for i in range(dof)]
-    for effect, z in y.z.items():
-        if isinstance(z, jnp.ndarray):
+    for effect, z in sorted(y.z.items()):
+        if isinstance(z, jnp.ndarray) and z.ndim < 2:
             names += [f"z0.{effect}"] if z.ndim == 0 else [f"z0.{effect}[{i}]" for i in range(z.shape[0])]
-    return tuple(names)
-
-
-def placed(base: State, names: tuple[str, ...], values: Float[Array, " local"]) -> State:
-    """The state with the numbers of these names replaced."""
-    q, qd, z = base.q, base.qd, dict(base.z)
-    for i, name in enumerate(names):
-        match = _LOCAL.fullmatch(name)
-        assert match is not None
-        if match[1] == "q0":
-            q = q.at[int(match[2])].set(values[i])
-        elif match[1] == "qd0":
-            qd = qd.at[int(match[2])].set(values[i])
         else:
-            effect = match[3]
-            z[effect] = values[i] if match[4] is None else z[effect].at[int(match[4])].set(values[i])
-    return State(q, qd, z)
+            names += [""] * sum(jnp.size(leaf) for leaf in jtu.tree_leaves(z))
+    return names
 
 
-def taken(state: State, names: tuple[str, ...]) -> Float[Array, " local"]:
-    """The numbers of these names; the inverse of `placed`."""
-    numbers = []
-    for name in names:
-        match = _LOCAL.fullmatch(name)
-        assert match is not None
-        if match[1] is not None:
-            numbers.append((state.q if match[1] == "q0" else state.qd)[int(match[2])])
-        else:
-            z = state.z[match[3]]
-            numbers.append(z if match[4] is None else z[int(match[4])])
-    return jnp.stack(numbers) if numbers else jnp.zeros(0)
+def local_names(y: State) -> tuple[str, ...]:
+    """Names of the numbers of an initial state: `q0[0]`, `qd0[0]`, `z0.friction`."""
+    return tuple(filter(None, _flat_names(y)))
 
 
 class Prior(eqx.Module):
@@ -280,11 +255,16 @@ class FitProblem(eqx.Module):
         """Initial state of one run."""
         if base is None or not self.local:
             return base
-        return placed(base, self.local, self.taken(base) + moved)
+        flat, unflatten = ravel_pytree(base)
+        return unflatten(flat.at[self._free_entries(base)].add(moved))
 
-    def taken(self, state: State) -> Float[Array, " local"]:
+    def local_values(self, state: State) -> Float[Array, " local"]:
         """The free numbers of an initial state."""
-        return taken(state, self.local)
+        return ravel_pytree(state)[0][self._free_entries(state)]
+
+    def _free_entries(self, state: State) -> Int[np.ndarray, " local"]:
+        names = _flat_names(state)
+        return np.array([names.index(name) for name in self.local], int)
 
     def starts(self, x: Float[Array, " n"]) -> State | None:
         """Initial states at `x`, with a leading axis of runs."""
@@ -338,9 +318,8 @@ class FitProblem(eqx.Module):
         columns = [self._spread(slope[0]), jnp.pad(of_prior, ((0, 0), (0, self.count * len(self.local))))]
         if self.jump is not None:
             rows.append(jnp.reshape(self.jump * (value[2][:-1] - value[1][1:]), (-1,)))
-            here = self._spread(self.jump[:, :, None] * slope[2][:-1])
-            there = self._spread(self.jump[:, :, None] * slope[1][1:], first=1)
-            columns.append(here - there)
+            ends = self._spread(self.jump[:, :, None] * slope[2][:-1])
+            columns.append(ends - self._spread(self.jump[:, :, None] * slope[1][1:], first=1))
         known = self.start_weights
         if known is not None:
             rows.append(jnp.reshape(known * own, (-1,)))

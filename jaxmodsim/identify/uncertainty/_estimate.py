@@ -207,7 +207,7 @@ def covariance_estimate(
     slopes: Float[np.ndarray, "n n"],
     blocks: Int[np.ndarray, " rows"],
     count: int,
-    kept: int,
+    parameters: int,
     white: bool,
 ) -> CovarianceEstimate:
     """Covariance `H^-1 S H^-1` with S from the scatter of the scores of blocks of samples.
@@ -227,7 +227,7 @@ def covariance_estimate(
     - `extra`: rows of the Jacobian that are no samples: the prior, links between windows.
     - `slopes`: derivatives of the parameters by x.
     - `blocks`, `count`: number of each row's block, and of blocks.
-    - `kept`: number of parameters, the first entries of x; the others are nuisance.
+    - `parameters`: number of parameters, the first entries of x; the others are nuisance.
     - `white`: whether the residual passes for white noise.
     """
     rounding = ROUNDING * float(np.finfo(jacobian.dtype).eps)
@@ -256,14 +256,16 @@ def covariance_estimate(
     change = slopes / scale
 
     def of_parameters(middle: np.ndarray) -> np.ndarray:
-        covariance = (change @ middle @ change.T)[:kept, :kept]
-        np.fill_diagonal(covariance, np.where(silent[:kept], np.inf, np.diagonal(covariance)))
+        covariance = (change @ middle @ change.T)[:parameters, :parameters]
+        np.fill_diagonal(covariance, np.where(silent[:parameters], np.inf, np.diagonal(covariance)))
         return covariance
 
-    back = np.linalg.pinv(slopes[:kept, :kept])
-    cross = (matrix / size)[:kept, kept:]
-    known = (matrix / size)[:kept, :kept] - cross @ floored_inverse((matrix / size)[kept:, kept:], rounding) @ cross.T
-    information = back.T @ (known * size[:kept, :kept]) @ back
+    back = np.linalg.pinv(slopes[:parameters, :parameters])
+    cross = (matrix / size)[:parameters, parameters:]
+    known = (matrix / size)[:parameters, :parameters] - cross @ floored_inverse(
+        (matrix / size)[parameters:, parameters:], rounding
+    ) @ cross.T
+    information = back.T @ (known * size[:parameters, :parameters]) @ back
     return CovarianceEstimate(of_parameters(bread @ meat @ bread), of_parameters(bread @ if_white @ bread), information)
 
 
@@ -337,14 +339,14 @@ def interval(
 
 
 def covariance_of(
-    problem: FitProblem, state: SearchState, kept: Sequence[int], blocks: int = BLOCKS
+    problem: FitProblem, state: SearchState, entries: Sequence[int], blocks: int = BLOCKS
 ) -> CovarianceEstimate:
-    """The covariance of the entries `kept` of x; the others are nuisance.
+    """The covariance of the entries `entries` of x; the others are nuisance.
 
     In NumPy, since its many small matrices would take seconds to compile.
     """
     if not derivatives_hold(problem, state):
-        unknown, none = np.diag(np.full(len(kept), np.inf)), np.zeros((len(kept), len(kept)))
+        unknown, none = np.diag(np.full(len(entries), np.inf)), np.zeros((len(entries), len(entries)))
         return CovarianceEstimate(unknown, unknown, none, refused=True)
     numbers, count = sample_blocks(problem, blocks)
     rows, size = problem.samples, len(problem.free.names)
@@ -353,13 +355,13 @@ def covariance_of(
     slopes[:size, :size] = problem.at(state.x).slopes
     white = _passes_for_white(problem, residual)
     extra = np.asarray(state.jacobian)[rows:]
-    order = np.array([*kept, *(k for k in range(slopes.shape[0]) if k not in set(kept))])
+    order = np.array([*entries, *(k for k in range(slopes.shape[0]) if k not in set(entries))])
     jacobian, extra, slopes = jacobian[:, order], extra[:, order], slopes[np.ix_(order, order)]
-    return covariance_estimate(residual, jacobian, extra, slopes, numbers, count, len(kept), white)
+    return covariance_estimate(residual, jacobian, extra, slopes, numbers, count, len(entries), white)
 
 
-def natural_scales(problem: FitProblem, state: SearchState, kept: Sequence[int]) -> Float[np.ndarray, " kept"]:
-    """Changes of the parameters `kept` that move the output by as much as the samples scatter; 0 without effect."""
+def natural_scales(problem: FitProblem, state: SearchState, entries: Sequence[int]) -> Float[np.ndarray, " entries"]:
+    """Changes of the parameters `entries` that move the output by as much as the samples scatter; 0 without effect."""
     size = len(problem.free.names)
     slopes = np.diag(problem.at(state.x).slopes)
     jacobian = np.asarray(state.jacobian, float)[: problem.samples]
@@ -367,13 +369,13 @@ def natural_scales(problem: FitProblem, state: SearchState, kept: Sequence[int])
     for name, weight in problem.runs.weight.items():
         x = np.asarray(problem.runs.measured[name])[np.asarray(weight) > 0]
         scatter.append(x.size * (np.std(x) / float(problem.noise[name])) ** 2 if x.size else 0.0)
-    moved = np.linalg.norm(jacobian[:, list(kept)], axis=0)
-    moved = moved / np.array([abs(slopes[k]) if k < size else 1.0 for k in kept])
+    moved = np.linalg.norm(jacobian[:, list(entries)], axis=0)
+    moved = moved / np.array([abs(slopes[k]) if k < size else 1.0 for k in entries])
     return np.where(moved > 0, np.sqrt(sum(scatter)) / np.where(moved > 0, moved, 1.0), 0.0)
 
 
 def offsets_left(
-    problem: FitProblem, state: SearchState, kept: Sequence[int], errors: Float[np.ndarray, " kept"]
+    problem: FitProblem, state: SearchState, entries: Sequence[int], errors: Float[np.ndarray, " entries"]
 ) -> dict[str, tuple[float, float]]:
     """Constant offsets of channels, with standard errors, in the units of the channels.
 
@@ -382,7 +384,7 @@ def offsets_left(
 
     **Arguments:**
 
-    - `kept`: entries of x whose parameters count. `errors`: their standard errors.
+    - `entries`: entries of x whose parameters count. `errors`: their standard errors.
     """
     if problem.loss.robust:
         return {}
@@ -408,7 +410,7 @@ def offsets_left(
         slopes = np.eye(len(x))
         slopes[: len(problem.free.names), : len(problem.free.names)] = problem.at(x).slopes
         moved = slopes @ (offset * taken / np.where(size > 0, size, 1.0))
-        far = np.abs(moved[list(kept)]) > errors
+        far = np.abs(moved[list(entries)]) > errors
         if abs(offset) > _BEYOND * math.sqrt(variance) and far.any():
             # The model lacks the offset of the sensor.
             offsets[channel] = (

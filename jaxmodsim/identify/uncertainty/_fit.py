@@ -255,19 +255,19 @@ def result_of(
     problem, state, free = search.problem, search.state, search.problem.free
     names, size, shown = list(free.names), len(free.names), problem.reported
     values, at_start = problem.at(state.x).vector.tolist(), [float(free.start[name]) for name in names]
-    kept = list(range(size))
+    entries = list(range(size))
     if problem.base is not None and len(set(windows.record)) == len(windows.record):
-        starts = np.asarray(jax.vmap(problem.taken)(problem.base))[:, :shown]
+        starts = np.asarray(jax.vmap(problem.local_values)(problem.base))[:, :shown]
         ends = starts + np.asarray(problem.split(state.x)[1])[:, :shown]
         for i, record in enumerate(records):
             prefix = "" if len(records) == 1 else f"{record.name}/"
             names += [prefix + name for name in problem.local[:shown]]
             at_start += starts[i].tolist()
             values += ends[i].tolist()
-            kept += [size + i * len(problem.local) + k for k in range(shown)]
-    covariance = covariance_of(problem, state, kept)
+            entries += [size + i * len(problem.local) + k for k in range(shown)]
+    covariance = covariance_of(problem, state, entries)
     outputs, rmse = _stitched(search, records, windows)
-    scales = natural_scales(problem, state, kept)
+    scales = natural_scales(problem, state, entries)
     signed = [kind == "line" for kind in free.kinds] + [True] * (len(names) - size)
     estimate = ParameterEstimate(
         values=dict(zip(names, values, strict=True)),
@@ -300,7 +300,7 @@ def result_of(
         starts=starts,
         single_precision=jnp.result_type(float) == jnp.float32,
         issues=(
-            *_offset_issues(estimate, search, kept),
+            *_offset_issues(estimate, search, entries),
             *_issues(estimate, provenance, search, covariance.refused),
         ),
     )
@@ -346,7 +346,7 @@ def _issues(
 
 
 def _offset_issues(
-    estimate: ParameterEstimate, search: SearchResult, kept: Sequence[int]
+    estimate: ParameterEstimate, search: SearchResult, entries: Sequence[int]
 ) -> tuple[IdentifiabilityIssue, ...]:
     """Constant offsets of sensors."""
     errors = np.array(list(estimate.errors.values()))
@@ -358,7 +358,7 @@ def _offset_issues(
             " than their standard errors, so their intervals do not hold. Subtract it from the record and fit again.",
             (),
         )
-        for channel, (offset, error) in offsets_left(search.problem, search.state, kept, errors).items()
+        for channel, (offset, error) in offsets_left(search.problem, search.state, entries, errors).items()
     )
 
 

@@ -124,7 +124,7 @@ class LogDensity(eqx.Module):
         x = self._box.inside(v)
         values = [*problem.free.vector(x[: len(problem.free.names)])]
         start = problem.starts(x) if problem.local else None
-        values += [] if start is None else [*jnp.reshape(jax.vmap(problem.taken)(start), (-1,))]
+        values += [] if start is None else [*jnp.reshape(jax.vmap(problem.local_values)(start), (-1,))]
         none = jnp.zeros((), v.dtype)
         values += [
             problem.noise[name] * jnp.exp(t) / jnp.sqrt(1.0 - memory.get(name, none) ** 2) for name, t in level.items()
