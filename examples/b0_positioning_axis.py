@@ -25,8 +25,8 @@ from jaxmodsim.identify import (
     axis_models,
     axis_scene,
     compare,
+    estimate_axis,
     fit,
-    rough_axis,
 )
 from jaxmodsim.plot import fit_figure
 
@@ -49,10 +49,10 @@ def models() -> dict[str, AxisModel]:
     """Two models of the library, and the second with the drift."""
     asymmetric = axis_models()["asymmetric"]
     drifting = AxisModel(
-        effects=lambda rough: (jms.AppliedForce(drift_force, name="drift"), *asymmetric.effects(rough)),
+        effects=lambda estimate: (jms.AppliedForce(drift_force, name="drift"), *asymmetric.effects(estimate)),
         free=("m", "drift", *(name for name in asymmetric.free if name != "m")),
         description="as asymmetric, with a part of the drive's offset that dies away over the time tau",
-        params=lambda rough: {"drift": 0.0, "tau": DRIFT_TIME, "t0": rough.start},
+        params=lambda estimate: {"drift": 0.0, "tau": DRIFT_TIME, "t0": estimate.start},
     )
     return {"coulomb": axis_models()["coulomb"], "asymmetric": asymmetric, "drifting": drifting}
 
@@ -64,13 +64,13 @@ def main(record_file: Path, out: Path, smoke: bool = False) -> None:
         return
     t, q, _, u = np.loadtxt(record_file, delimiter=",", skiprows=1).T
     record = jms.Record(t, q, {"u": DRIVE_GAIN * u}, name="EMPS")
-    rough = rough_axis(record)
+    estimate = estimate_axis(record)
     out.mkdir(parents=True, exist_ok=True)
     fitted = models()
     for name in ("coulomb",) if smoke else fitted:
         model = fitted[name]
         result = fit(
-            axis_scene(model, rough),
+            axis_scene(model, estimate),
             record,
             model.free,
             limits={"m": (0.0, None)},
@@ -79,7 +79,7 @@ def main(record_file: Path, out: Path, smoke: bool = False) -> None:
         print(f"\n{name}: {model.description}\n{result}\nfour steps for every sample move it by {moved:.4f} mm")
         fit_figure(result, caption=SOURCE).savefig(out / f"b0_emps_{name}.png", dpi=130)
     if not smoke:
-        candidates = {name: Candidate(axis_scene(x, rough), x.free, x.description) for name, x in fitted.items()}
+        candidates = {name: Candidate(axis_scene(x, estimate), x.free, x.description) for name, x in fitted.items()}
         print(f"\n{compare(candidates, record, limits={'m': (0.0, None)})}")
     print(f"wrote figures to {out}")
 

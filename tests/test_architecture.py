@@ -47,7 +47,7 @@ SCRIPTS = [
     path for each in ("tests", "bench", "examples", "docs") for path in (Path(__file__).parents[1] / each).rglob("*.py")
 ]
 
-MAX_FILE_LINES = 500
+MAX_FILE_LINES = 600
 MAX_FUNCTION_LINES = 80
 LONG_FUNCTIONS: dict[str, str] = {}  # "file:function" -> reason
 

@@ -19,7 +19,7 @@ import numpy as np
 
 import jaxmodsim as jms
 from bench.record import Result
-from jaxmodsim.identify import axis_models, axis_scene, replay, rough_axis
+from jaxmodsim.identify import axis_models, axis_scene, estimate_axis, replay
 
 # Beside the repository and not in it: A. Janot, M. Gautier, M. Brunot, "Data set and reference models of EMPS",
 # Workshop on Nonlinear System Identification Benchmarks, 2019.
@@ -63,7 +63,7 @@ def _rmse(record: jms.Record, model: str, parameters: dict[str, Any], substeps: 
     """RMSE [m] of a fitted model with `substeps` integration steps for every sample."""
     values = {name: x["value"] for name, x in parameters.items()}
     q0, qd0 = (jnp.asarray([values.pop(name)]) for name in ("q0[0]", "qd0[0]"))
-    scene = axis_scene(axis_models()[model], rough_axis(record), values)
+    scene = axis_scene(axis_models()[model], estimate_axis(record), values)
     inputs = {name: jnp.asarray(x) for name, x in record.inputs.items()}
     run = jax.jit(replay, static_argnums=5)
     position = run(scene, jnp.asarray(record.t), inputs, q0, qd0, substeps)

@@ -20,9 +20,9 @@ from jaxmodsim.identify import (
     axis_models,
     axis_scene,
     compare,
+    estimate_axis,
     predict,
     replay,
-    rough_axis,
 )
 
 # Mass [kg], LuGre's numbers but Fs [N], how much friction depends on position over which length [m], offset [N].
@@ -100,7 +100,7 @@ def record(level: float, stiction: float, rng: np.random.Generator, name: str) -
 
 
 def _compared(one: jms.Record) -> Comparison:
-    rough = rough_axis(one)
+    rough = estimate_axis(one)
     models = {name: axis_models()[name] for name in LAWS}
     candidates = {name: Candidate(axis_scene(model, rough), model.free) for name, model in models.items()}
     return compare(candidates, one, limits={"m": (0.0, None)})

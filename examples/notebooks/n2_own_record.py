@@ -67,7 +67,7 @@ print(*identify.remarks(result) or ["No remarks."], sep="\n")
 plot.fit_figure(result)
 
 # %%
-judged = identify.score(result, held_out)
+judged = identify.evaluate_on(result, held_out)
 print(f"on the second record: {1e6 * judged.rmse['measured']:.1f} um, with noise of 20 um")
 
 # %% [markdown]

@@ -60,6 +60,19 @@ def as_float(value: object, *, name: str, lower: float | None = None) -> float:
     return float(array)
 
 
+def as_share(value: object, *, name: str) -> float:
+    """One number that is known, above 0 and below 1.
+
+    **Raises:**
+
+    - `ValueError` naming `name` and what was given.
+    """
+    array = as_reals(value, name=name)
+    if array.shape != () or not 0 < array < 1:
+        raise ValueError(f"{name} must lie between 0 and 1, but it is {value!r}.")
+    return float(array)
+
+
 def as_whole(value: object, *, name: str, least: int = 1) -> int:
     """Convert an integer, `least` or more, that fits into 63 bits.
 

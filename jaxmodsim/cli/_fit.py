@@ -23,13 +23,13 @@ from ..identify import (
     agreement,
     compare,
     design_input,
-    expected_error,
+    estimate_axis,
     fit,
     is_step_size_limited,
     predict,
+    prediction_error,
     profile,
     remarks,
-    rough_axis,
 )
 from ..plot import comparison_figure, design_figure, fit_figure, score_figure
 from ..scene import Scene, scene_numbers
@@ -103,12 +103,8 @@ def _fitted(plan: Plan) -> Fitted:
     started = time.perf_counter()
     substeps = plan.substeps or 1
     fitted = _fitted_with(plan, substeps)
-    while (
-        plan.substeps is None
-        and substeps < _MOST_SUBSTEPS
-        and is_step_size_limited(fitted.result)
-        and not fitted.interrupted
-    ):
+    may_refine = plan.substeps is None
+    while may_refine and substeps < _MOST_SUBSTEPS and is_step_size_limited(fitted.result) and not fitted.interrupted:
         substeps *= _FINER
         fitted = _fitted_with(plan, substeps)
     judged = _judged(replace(fitted, substeps=substeps))
@@ -124,7 +120,7 @@ def _judged(fitted: Fitted) -> Fitted:
         fitted,
         predictions=tuple(predict(fitted.result, record, agreement=agreed) for record in fitted.plan.held_out),
         agreement=agreed,
-        expected=expected_error(fitted.result, agreement=agreed)["measured"],
+        expected=prediction_error(fitted.result, agreement=agreed)["measured"],
     )
 
 
@@ -267,7 +263,7 @@ def _designed(request: FitRequest, fitted: Fitted) -> InputDesign:
     result, records = fitted.result, fitted.result.provenance.records
     positions = np.concatenate([record.measured for record in records])
     low, high = float(np.min(positions)), float(np.max(positions))
-    top = request.max_speed or max(rough_axis(record).top for record in records if np.ptp(record.measured) > 0)
+    top = request.max_speed or max(estimate_axis(record).top for record in records if np.ptp(record.measured) > 0)
     limits = AxisLimits(
         request.max_force or max(float(np.max(np.abs(record.inputs["u"]))) for record in records),
         top,

@@ -14,9 +14,9 @@ from .._core.arguments import axis_unit
 from .._core.system import jsonable
 from ..identify import (
     Comparison,
-    ExpectedError,
     FitResult,
     InputDesign,
+    PredictionError,
     Profile,
     RecordAgreement,
     RecordPrediction,
@@ -50,7 +50,7 @@ class Fitted:
     comparison: Comparison | None = None
     predictions: tuple[RecordPrediction, ...] = ()
     agreement: RecordAgreement | None = None
-    expected: ExpectedError | None = None
+    expected: PredictionError | None = None
     substeps: int = 1
     seconds: float = 0.0
 
@@ -235,10 +235,10 @@ def model_table(comparison: Comparison, unit: str) -> pd.DataFrame:
             "model": [each.name for each in comparison.ranked],
             "parameters": [each.parameters for each in comparison.ranked],
             f"held back, RMSE [m{unit}]": [1e3 * each.held_back for each in comparison.ranked],
-            f"standard error [m{unit}]": [1e3 * each.error for each in comparison.ranked],
+            f"standard error [m{unit}]": [1e3 * each.standard_error for each in comparison.ranked],
             f"new record, RMSE to expect [m{unit}]": [1e3 * each.expected for each in comparison.ranked],
-            f"over the best [m{unit}]": [1e3 * each.over for each in comparison.ranked],
-            f"its standard error [m{unit}]": [1e3 * each.over_error for each in comparison.ranked],
+            f"over the best [m{unit}]": [1e3 * each.over_the_best for each in comparison.ranked],
+            f"its standard error [m{unit}]": [1e3 * each.over_the_best_standard_error for each in comparison.ranked],
             f"start fitted, RMSE [m{unit}]": [
                 math.nan if each.start_fitted is None else 1e3 * each.start_fitted for each in comparison.ranked
             ],

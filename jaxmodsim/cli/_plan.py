@@ -19,7 +19,7 @@ from ..identify import (
     Staged,
     axis_models,
     axis_scene,
-    rough_axis,
+    estimate_axis,
 )
 from ..scene import Scene, scene_numbers
 from ._read import DROPS, AxisColumns, offset_note, read_records
@@ -109,8 +109,8 @@ def plan_of(request: FitRequest) -> Plan:
     # A record that stands still, or that nothing drives, may go beside others that do not.
     driven = [record for record in together if np.ptp(record.measured) > 0 and np.ptp(record.inputs["u"]) > 0]
     for record in driven:
-        rough_axis(record)
-    rough = rough_axis(max(records, key=lambda record: len(record.t)))
+        estimate_axis(record)
+    rough = estimate_axis(max(records, key=lambda record: len(record.t)))
     rough = replace(rough, start=min(float(record.t[0]) for record in records))
     numbers = {name: _numbers(axis_scene(axis_models()[name], rough)) for name in names}
     fixed, start = _values("--fix", request.fix, numbers), _values("--start", request.start, numbers)

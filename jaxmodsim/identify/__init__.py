@@ -1,10 +1,10 @@
 """Identification: numbers of scenes and laws from measured records."""
 
-from .data._clock import clock_offset as clock_offset
-from .data._clock import sampling_gaps as sampling_gaps
-from .data._clock import unexplained_force as unexplained_force
 from .data._record import Record as Record
-from .data._record import start_state as start_state
+from .data._signals import clock_offset as clock_offset
+from .data._signals import sampling_gaps as sampling_gaps
+from .data._signals import start_state as start_state
+from .data._signals import unexplained_force as unexplained_force
 from .design._design_input import design_input as design_input
 from .design._input_design import AxisLimits as AxisLimits
 from .design._input_design import InputDesign as InputDesign
@@ -22,7 +22,7 @@ from .estimate._staged import Staged as Staged
 from .model._axis import AxisModel as AxisModel
 from .model._axis import axis_models as axis_models
 from .model._axis import axis_scene as axis_scene
-from .model._axis import rough_axis as rough_axis
+from .model._axis import estimate_axis as estimate_axis
 from .model._engines import Controller as Controller
 from .model._engines import law_force as law_force
 from .model._engines import replay as replay
@@ -32,17 +32,17 @@ from .selection._compare import Candidate as Candidate
 from .selection._compare import compare as compare
 from .selection._compare import compare_laws as compare_laws
 from .selection._comparison import Comparison as Comparison
-from .selection._prediction import ExpectedError as ExpectedError
+from .selection._prediction import PredictionError as PredictionError
 from .selection._prediction import RecordPrediction as RecordPrediction
-from .selection._prediction import expected_error as expected_error
+from .selection._prediction import Score as Score
+from .selection._prediction import evaluate_on as evaluate_on
 from .selection._prediction import predict as predict
-from .selection._score import Score as Score
-from .selection._score import score as score
+from .selection._prediction import prediction_error as prediction_error
 from .uncertainty._coverage import coverage as coverage
 from .uncertainty._fit import fit as fit
 from .uncertainty._fit import fit_law as fit_law
-from .uncertainty._log_density import log_density as log_density
 from .uncertainty._posterior import Posterior as Posterior
+from .uncertainty._posterior import log_density as log_density
 from .uncertainty._posterior import sample_posterior as sample_posterior
 from .uncertainty._profile import Profile as Profile
 from .uncertainty._profile import profile as profile

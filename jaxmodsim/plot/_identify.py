@@ -47,7 +47,7 @@ def score_figure(
 
     **Arguments:**
 
-    - `score`: from `jaxmodsim.identify.score` or `predict`, with one channel. A prediction is drawn with its band.
+    - `score`: from `jaxmodsim.identify.evaluate_on` or `predict`, of one channel; a prediction with its band.
     - `quantity`, `unit`: name and unit of the measured channel.
     - `caption`: line below the figure, such as the source of the record.
     """
@@ -270,7 +270,7 @@ def comparison_figure(comparison: Comparison, *, unit: str = "m", caption: str =
         axis.barh(i - 0.17, factor * each.held_back, 0.4, color=colour, alpha=0.75)
         (parts,) = axis.plot(factor * each.parts, height, "o", color="white", mec="black", ms=4)
         bar = axis.errorbar(
-            factor * each.held_back, i - 0.17, xerr=factor * each.error, color="black", capsize=4, lw=1.2
+            factor * each.held_back, i - 0.17, xerr=factor * each.standard_error, color="black", capsize=4, lw=1.2
         )
         axis.barh(i + 0.2, factor * each.fitted, 0.24, color=GREY)
         parts.set_label("" if i else "each held-out part")
@@ -303,17 +303,17 @@ def design_figure(design: InputDesign, *, caption: str = "") -> Figure:
     figure = Figure(figsize=(12, 6.4), layout="constrained")
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.35, 1))[0]
     axes = left.subplots(3, 1, sharex=True)
-    limits, start = design.limits, design.best.q_ref[0]
+    limits, best, sine = design.limits, design.best, design.baseline
     quantity, unit, force = ("angle", "rad", "N m") if limits.rotary else ("position", "m", "N")
     factor, small = small_unit(unit)
     panels = (
-        (quantity, small, factor, design.best.q_ref, design.plain.q_ref, limits.travel, start),
-        ("velocity", f"{unit}/s", 1.0, design.best.qd_ref, design.plain.qd_ref, limits.speed, 0.0),
-        ("torque" if limits.rotary else "force", force, 1.0, design.best.force, design.plain.force, limits.force, 0.0),
+        (quantity, small, factor, best.q_ref, sine.q_ref, limits.travel, best.q_ref[0]),
+        ("velocity", f"{unit}/s", 1.0, best.qd_ref, sine.qd_ref, limits.speed, 0.0),
+        ("torque" if limits.rotary else "force", force, 1.0, best.force, sine.force, limits.force, 0.0),
     )
-    for axis, (quantity, unit, scale, best, plain, limit, middle) in zip(axes, panels, strict=True):
-        axis.plot(design.best.t, scale * plain, color="#c8c8c8", lw=1.2, label="plain sine")
-        axis.plot(design.best.t, scale * best, color=BLUE, lw=1.3, label="designed")
+    for axis, (quantity, unit, scale, designed, baseline, limit, middle) in zip(axes, panels, strict=True):
+        axis.plot(best.t, scale * baseline, color="#c8c8c8", lw=1.2, label="plain sine")
+        axis.plot(best.t, scale * designed, color=BLUE, lw=1.3, label="designed")
         for side in (-1.0, 1.0) if limit is not None else ():
             level = scale * (middle + side * (limit or 0.0))
             axis.axhline(level, color=RED, lw=1.0, ls="--", label="limit" if side > 0 else "_")
@@ -332,7 +332,7 @@ def design_figure(design: InputDesign, *, caption: str = "") -> Figure:
 def _error_bars(axis: Axes, design: InputDesign) -> None:
     """Draw predicted relative errors, designed against plain. Zero values have no relative error and are left out."""
     names = [name for name, value in design.values.items() if value]
-    pairs = (("plain sine", "#c8c8c8", design.plain.errors, 0.2), ("designed", BLUE, design.best.errors, -0.2))
+    pairs = (("plain sine", "#c8c8c8", design.baseline.errors, 0.2), ("designed", BLUE, design.best.errors, -0.2))
     finite = [
         100 * errors[name] / abs(design.values[name])
         for _, _, errors, _ in pairs

@@ -151,9 +151,7 @@ class Scene(AbstractReadable, eqx.Module):
         owners = {"t": "the time", "time": "the time"}
         owners |= {f"{each}_dot": "a velocity" for each in coordinates} | dict.fromkeys(self.names, "an effect")
         if taken := [f"{name!r} is also that of {owners[name]}" for name in coordinates if name in owners]:
-            raise ValueError(
-                f"A coordinate needs a name of its own: {', '.join(taken)}. Rename one of each pair."
-            )
+            raise ValueError(f"A coordinate needs a name of its own: {', '.join(taken)}. Rename one of each pair.")
         if self.event_driven and any(each.karnopp for each in self.friction.values()):
             raise ValueError(
                 f"{', '.join(self.event_driven)}: set-valued laws of one scene run either all by events or all by"

@@ -16,8 +16,8 @@ import scipy.io
 from jaxmodsim.cli import _fit
 from jaxmodsim.cli._read import AxisColumns, read_record, read_records
 from jaxmodsim.cli._units import given_units
-from jaxmodsim.identify import FitResult, Record, axis_models, axis_scene, fit, remarks, rough_axis
-from jaxmodsim.identify.model._axis import RoughAxis
+from jaxmodsim.identify import FitResult, Record, axis_models, axis_scene, estimate_axis, fit, remarks
+from jaxmodsim.identify.model._axis import AxisEstimate
 
 from ..helpers.axis_records import GAIN, TRUTH, axis_frame
 
@@ -143,7 +143,7 @@ def test_a_better_fit_that_a_profile_comes_upon_is_the_fit(run_command, files, t
     assert "stopped at the limit of 2 iterations (max_steps)" in stopped
     assert found["ending"] in after
     assert "continued once from a better value of" in found["ending"]
-    assert "went on from there in" in " ".join(stopped.split())
+    assert "continued from there in" in " ".join(stopped.split())
     assert found["ending"] in Page((out / "report.html").read_text()).text
 
 
@@ -260,7 +260,7 @@ def test_records_of_one_name_are_told_apart_by_their_folders(tmp_path):
 
 
 def test_rough_values_come_from_the_record(files):
-    rough = rough_axis(read_record(Path(files[0]), NAMES).parts[0])
+    rough = estimate_axis(read_record(Path(files[0]), NAMES).parts[0])
     assert rough.m == pytest.approx(TRUTH["m"], rel=0.2)
     assert rough.Fc == pytest.approx(TRUTH["dry.Fc"], rel=0.5)
 
@@ -288,7 +288,7 @@ STILL = np.zeros(len(FRAME))
 )
 def test_records_from_which_no_axis_can_be_told_are_refused(run_command, tmp_path, columns, text):
     with pytest.raises(ValueError, match=text):
-        rough_axis(record_of(FRAME, **columns))
+        estimate_axis(record_of(FRAME, **columns))
     FRAME.assign(**columns).to_csv(tmp_path / "run.csv", index=False)
     check_refusal(run_command, tmp_path / "out", text, str(tmp_path / "run.csv"), *COLUMNS)
 
@@ -307,14 +307,14 @@ def test_records_that_tell_little_are_not_refused_for_their_sign(kind):
     v = np.gradient(q, t)
     friction = 3.0 * np.sign(v) + 8.0 * v
     u = rng.standard_normal(t.size) if kind == "noise" else friction + 5.0 * np.gradient(v, t) + 0.7
-    rough = rough_axis(Record(t, q + 1e-7 * rng.standard_normal(t.size), {"u": u}))
+    rough = estimate_axis(Record(t, q + 1e-7 * rng.standard_normal(t.size), {"u": u}))
     assert min(rough.m, rough.Fc, rough.Fv) > 0
 
 
 @pytest.mark.parametrize("volt", [-FRAME["volt"].to_numpy(), STILL], ids=["sign", "no force"])
 def test_a_fit_that_follows_nothing_says_so(volt):
     """With start values of one's own the search goes on, to a model that stands still."""
-    record, rough = record_of(FRAME, volt=volt), RoughAxis(5.0, 8.0, 3.0, 0.7, 0.5)
+    record, rough = record_of(FRAME, volt=volt), AxisEstimate(5.0, 8.0, 3.0, 0.7, 0.5)
     model = axis_models()["coulomb"]
     result = fit(axis_scene(model, rough), record, model.free, limits={"m": (0.0, 50.0)})
     assert any("the model follows nothing of the record" in remark for remark in remarks(result))
@@ -327,7 +327,7 @@ def test_the_clock_of_a_record_makes_no_difference(name):
 
     def values(start: float) -> dict[str, float]:
         record = record_of(FRAME, time=t + start)
-        scene = axis_scene(model, rough_axis(record))
+        scene = axis_scene(model, estimate_axis(record))
         limits = {"m": (0.0, 50.0)}
         return fit(scene, record, model.free, limits=limits, substeps=2, max_steps=4).values
 

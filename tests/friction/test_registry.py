@@ -13,7 +13,7 @@ import jaxmodsim as jms
 from bench.behaviour.experiment import Verdict, law_cases
 from bench.behaviour.run import run_bench
 from jaxmodsim.friction import STANDARD, AbstractForceLaw, LawCase, _law, check_passivity, laws, parameter, register_law
-from jaxmodsim.identify import axis_models, axis_scene, rough_axis
+from jaxmodsim.identify import axis_models, axis_scene, estimate_axis
 from jaxmodsim.scene import scene_numbers
 
 from ..helpers.law_cases import CASES, cases_of_registered_laws
@@ -129,7 +129,7 @@ def test_it_is_a_candidate_of_a_fit(registered: type[SoftCoulomb], run_command: 
     model = axis_models()["softcoulomb"]
     assert model.free == ("m", "offset", "friction.Fc", "friction.Fv")
     t = np.linspace(0.0, 6.0, 200)
-    scene = axis_scene(model, rough_axis(jms.Record(t, np.sin(t), {"u": np.cos(t)})))
+    scene = axis_scene(model, estimate_axis(jms.Record(t, np.sin(t), {"u": np.cos(t)})))
     assert any(isinstance(getattr(effect, "law", None), registered) for effect in scene.effects)
     assert set(model.free) <= set(scene_numbers(scene)) | {"m", "offset"}
     path = tmp_path / "record.csv"

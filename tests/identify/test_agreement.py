@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim.identify import agreement, axis_models, axis_scene, law_force, rough_axis
+from jaxmodsim.identify import agreement, axis_models, axis_scene, estimate_axis, law_force
 
 from ..helpers.axis_records import slide
 
@@ -58,7 +58,8 @@ def test_friction_that_changed_by_a_newton_is_seen_through_its_correlation_with_
     model, found = axis_models()["coulomb"], []
     for seed in range(6):
         days = [axis_day("one", 2 * seed, 20.0), axis_day("other", 2 * seed + 1, 21.2)]
-        each = agreement(jms.fit(axis_scene(model, rough_axis(days[0])), days, model.free, limits={"m": (0.0, None)}))
+        scene = axis_scene(model, estimate_axis(days[0]))
+        each = agreement(jms.fit(scene, days, model.free, limits={"m": (0.0, None)}))
         found.append(each.differing)
         k = each.names.index("dry.Fc")
         if "dry.Fc" in each.differing:

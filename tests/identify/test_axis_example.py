@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxmodsim.identify import axis_scene, fit, rough_axis
+from jaxmodsim.identify import axis_scene, estimate_axis, fit
 
 from ..cli.test_fit_command import FRAME, record_of
 
@@ -23,7 +23,7 @@ def test_the_clock_of_a_record_makes_no_difference():
 
     def values(start: float) -> dict[str, float]:
         record = record_of(FRAME, time=t + start)
-        scene = axis_scene(model, rough_axis(record), {"tau": 1.0})
+        scene = axis_scene(model, estimate_axis(record), {"tau": 1.0})
         limits = {"m": (0.0, 50.0)}
         return fit(scene, record, model.free, limits=limits, substeps=2, max_steps=4).values
 

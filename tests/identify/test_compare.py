@@ -12,7 +12,7 @@ from jaxmodsim import plot
 from jaxmodsim.identify import Candidate, Comparison, Continuation, compare, compare_laws, law_force, replay
 from jaxmodsim.identify.data._record import cut, runs_of
 from jaxmodsim.identify.selection._compare import _blocks
-from jaxmodsim.identify.selection._memory import correlation_time
+from jaxmodsim.identify.uncertainty._residual_tests import correlation_time
 from jaxmodsim.problems.braked_spring import driven_spring
 
 DT, NOISE, WIDTH = 5e-3, 2e-5, 5e-3
@@ -66,7 +66,7 @@ def test_the_truth_is_named_and_what_has_more_parameters_is_not(comparison):
     assert by_name["stribeck"].start_fitted == pytest.approx(NOISE, rel=0.06)
     assert by_name["stribeck"].start_fitted < by_name["stribeck"].held_back < 1.5 * NOISE
     assert by_name["coulomb"].held_back > 10 * NOISE
-    assert by_name["viscous"].over > by_name["viscous"].over_error
+    assert by_name["viscous"].over_the_best > by_name["viscous"].over_the_best_standard_error
 
 
 def test_a_model_starts_also_from_where_a_part_of_it_ended():
@@ -188,7 +188,9 @@ def test_correlation_time_of_a_series_that_remembers():
 
 def test_what_determines_its_parameters_comes_first_among_those_that_are_as_good(comparison):
     best, second, *_ = comparison.ranked
-    near = replace(second, over=0.5 * best.error, over_error=best.error, parameters=best.parameters - 1)
+    near = replace(
+        second, over_the_best=0.5 * error, over_the_best_standard_error=error, parameters=best.parameters - 1
+    )
     assert replace(comparison, ranked=(best, near)).simplest == near.name
     unknown = replace(near, undetermined=("friction.vs",))
     assert replace(comparison, ranked=(best, unknown)).simplest == best.name

@@ -7,7 +7,7 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim.identify import FitResult, remarks, replay
-from jaxmodsim.identify.data._record import resolution, sample_noise
+from jaxmodsim.identify.data._signals import resolution, sample_noise
 
 from ..helpers.sprung import sprung
 

@@ -20,8 +20,8 @@ from jaxmodsim.identify import (
 )
 from jaxmodsim.identify.design import _design_input
 from jaxmodsim.identify.design._design_input import _axis, _coarse_share, _judge, _known, _Task
-from jaxmodsim.identify.design._excitation import driven_motion, feed_forward, motion_basis, sensitivities
-from jaxmodsim.identify.model._axis import RoughAxis
+from jaxmodsim.identify.design._input_design import driven_motion, feed_forward, motion_basis, sensitivities
+from jaxmodsim.identify.model._axis import AxisEstimate
 from jaxmodsim.plot import design_figure
 from jaxmodsim.scene import replace_numbers
 
@@ -36,7 +36,7 @@ TRUTH = {"friction.sigma0": 8e4, "friction.sigma1": 400.0, "friction.Fs": 10.0, 
 
 
 def box():
-    return axis_scene(MODEL, RoughAxis(m=10.0, Fv=40.0, Fc=8.0, offset=-1.0, top=0.1), TRUTH)
+    return axis_scene(MODEL, AxisEstimate(m=10.0, Fv=40.0, Fc=8.0, offset=-1.0, top=0.1), TRUTH)
 
 
 def shorten(patch, tried, improved):
@@ -72,7 +72,7 @@ def fits(design):
         scene = replace_numbers(box(), {name: jnp.asarray(x, float) for name, x in start.items()})
         return jms.fit(scene, measured(each, seed), MODEL.free, q0=[0.0], qd0=[0.0], limits={"m": (0.0, None)})
 
-    plain = fit(design.plain, 8, wrong)
+    plain = fit(design.baseline, 8, wrong)
     return [*(fit(design.best, seed, plain.values) for seed in range(8)), plain]
 
 
@@ -130,7 +130,7 @@ def test_sensitivities_are_those_of_the_simulated_record(design):
 
 
 def _moved(axis, x):
-    return type(axis)(axis.at(x), axis.start, axis.slopes, axis.q0, axis.noise, axis.input, axis.observe)
+    return type(axis)(axis.at(x), axis.start, axis.slopes, axis.q0, axis.noise, axis.input_name, axis.observe)
 
 
 def every_goal(information):
@@ -139,7 +139,7 @@ def every_goal(information):
 
 def test_gradients_of_goals_and_limits_equal_finite_differences():
     # A smooth law: the kink of LuGre at rest would be seen by the differences and not by the derivative.
-    exact = axis_scene(axis_models()["coulomb"], RoughAxis(10.0, 40.0, 8.0, -1.0, 0.1))
+    exact = axis_scene(axis_models()["coulomb"], AxisEstimate(10.0, 40.0, 8.0, -1.0, 0.1))
     scene = jms.formulations(exact, width=0.02)["Regularized"]
     axis, parameters, _ = _axis(scene, ("m", "dry.Fc", "viscous.Fv"), None, lambda q, qd: q[0], "u", NOISE)
     t = np.linspace(0.0, 1.0, 101)
@@ -201,7 +201,7 @@ def test_fits_are_as_good_as_predicted_and_better_than_those_of_a_plain_sine(des
     # A fit reckons its errors from 32 blocks of its residual, of which a few tell nearly all.
     assert np.mean(ratios) == pytest.approx(1.0, rel=0.3)
     assert better >= 4
-    gain = np.linalg.slogdet(design.best.information)[1] - np.linalg.slogdet(design.plain.information)[1]
+    gain = np.linalg.slogdet(design.best.information)[1] - np.linalg.slogdet(design.baseline.information)[1]
     assert gain > 2 * len(design.values) * np.log(1.5)  # errors lower by a third in the geometric mean
 
 
@@ -332,8 +332,8 @@ def test_wrong_limits_are_refused(limits, text):
     [
         ({"free": ("mass",)}, "'mass', but the numbers are: m, offset"),
         ({"free": ("u",)}, "u is the input"),
-        ({"input": "force"}, r"'force' must be a single number in the scene's params \(m, offset, u\)"),
-        ({"input": "m", "free": ("offset",)}, "does not move the first coordinate"),
+        ({"input_name": "force"}, r"'force' must be a single number in the scene's params \(m, offset, u\)"),
+        ({"input_name": "m", "free": ("offset",)}, "does not move the first coordinate"),
         ({"duration": -1.0}, "duration must be finite and > 0 s"),
         ({"noise": 0.0}, "noise must be finite and > 0"),
         ({"harmonics": 0}, "harmonics must be at least 1"),

@@ -16,7 +16,7 @@ from jaxmodsim.identify import (
     Staged,
     start_state,
 )
-from jaxmodsim.identify.estimate._prepare import Settings, prepare
+from jaxmodsim.identify.estimate._prepare import FitOptions, prepare
 from jaxmodsim.identify.model._engines import delayed, run_samples
 from jaxmodsim.identify.model._observe import observer
 from jaxmodsim.problems import belt_oscillator
@@ -42,22 +42,8 @@ def sprung(m=2.0, Fc=1.5, sigma0=600.0):
     return sprung_mass(DRIVE, jms.Friction(law), m=m, gain=1.0)
 
 
-def settings(**asked):
-    plain = {
-        "observe": "q[0]",
-        "q0": None,
-        "qd0": None,
-        "delay": {},
-        "limits": {},
-        "passive": (),
-        "prior": {},
-        "loss": SquaredLoss(),
-        "controller": None,
-        "shooting": None,
-        "substeps": 1,
-        "accuracy": 1e-9,
-    }
-    return Settings(**{**plain, **asked})
+def options(**changes):
+    return FitOptions(**{"observe": "q[0]", "accuracy": 1e-9, **changes})
 
 
 OBSERVED = (("x", "q[0]"), ("v", "qd[0]"), ("F", "friction"))
@@ -142,7 +128,7 @@ def gradient_and_differences(problem, x, steps):
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_gradient_of_every_objective_equals_finite_differences(name, full):
     scene, which, free, asked = OBJECTIVES[name]
-    problem = prepare(scene(), full if which == "all" else only_x(full), free, settings(**asked)).problem
+    problem = prepare(scene(), full if which == "all" else only_x(full), free, options(**asked)).problem
     # Off the start, so that no coordinate lies on its limit and nothing vanishes by symmetry.
     x = problem.x0 + 0.01 * jnp.sin(jnp.arange(1.0, problem.x0.size + 1)) * (
         jnp.where(jnp.arange(problem.x0.size) < len(problem.free.names), 1.0, 1e-2)
@@ -157,7 +143,7 @@ def test_gradient_of_every_objective_equals_finite_differences(name, full):
 def test_gradient_of_a_fit_through_events_equals_finite_differences(belt):
     scene = belt_oscillator.scene(jms.Stribeck(**belt_oscillator.STRIBECK))
     free = ("friction.Fc", "friction.Fs", "k")
-    problem = prepare(scene, belt, free, settings(q0=[0.0], qd0=[0.0])).problem
+    problem = prepare(scene, belt, free, options(q0=[0.0], qd0=[0.0])).problem
     x = problem.x0 + jnp.asarray([0.01, -0.02, 0.015])
     # Larger steps than above: event times are found to the accuracy of the run, not to rounding.
     exact, differences = gradient_and_differences(problem, x, [1e-4] * 3)
@@ -293,7 +279,7 @@ def test_records_refuse_what_cannot_be():
         jms.Record(t, x, linear=("u",))
     with pytest.raises(ValueError, match="slips of 'friction' must be increasing times within"):
         jms.Record(t, x, slips={"friction": [3.0]})
-    with pytest.raises(ValueError, match="say which"):
+    with pytest.raises(ValueError, match=r"use Record\.channels"):
         _ = jms.Record(t, {"a": x, "b": x}).measured
     with pytest.raises(ValueError, match=r"windows of 1.0 s cannot be cut from 3 samples"):
         jms.Record(t, x).windows(1.0)

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 import jaxmodsim as jms
 from jaxmodsim._core.parameters import Range
-from jaxmodsim.identify import FitResult, law_force, profile, remarks, replay, residual_tests, score
+from jaxmodsim.identify import FitResult, evaluate_on, law_force, profile, remarks, replay, residual_tests
 from jaxmodsim.identify.data._record import cut, runs_of
 from jaxmodsim.identify.estimate._problem import FitProblem, Prior, SquaredLoss
 from jaxmodsim.identify.estimate._search import SearchOptions, solve_with_noise
@@ -190,7 +190,7 @@ def test_a_profile_goes_on_from_a_better_value():
     assert curve.estimate == curve.result.values["w"]
     assert curve.interval[0] < np.sign(curve.estimate) * 3.0 < curve.interval[1]
     assert np.min(curve.ratio) > -1e-3
-    assert "search went on from there in" in curve.notes[-1]
+    assert "search continued from there in" in curve.notes[-1]
     assert "; continued once from a better value of w" in str(curve.result)
     assert curve.result.diagnostics.evaluations > result.diagnostics.evaluations
     assert not any("do not trust" in remark for remark in remarks(curve.result))
@@ -370,7 +370,7 @@ def result(parts) -> FitResult:
 
 @pytest.fixture(scope="module")
 def scored(result, parts):
-    return score(result, parts[1])
+    return evaluate_on(result, parts[1])
 
 
 def test_a_profile_of_a_simulated_record_compiles_nothing(result):
@@ -473,7 +473,7 @@ def test_a_residual_with_a_cause_names_it():
     late = np.roll(rng.standard_normal(T.size), 0)
     follows = judged(noise + 0.05 * np.roll(late, 7), {"u": late}, motion)
     assert follows.inputs["u"].lag == pytest.approx(7 * (T[1] - T[0]))
-    assert any("goes with the input u" in remark for remark in follows.remarks)
+    assert any("correlated with the input u" in remark for remark in follows.remarks)
     heavy = judged(rng.standard_t(4, T.size), {}, motion)
     assert any("tails are heavy" in remark for remark in heavy.remarks)
     assert trend_over("t", np.zeros(T.size), T).p == 1.0
@@ -509,35 +509,36 @@ def test_a_record_that_was_not_fitted_is_scored(scored, parts, clean):
 
 def test_a_start_that_takes_up_an_error_of_the_model_is_a_remark(result, parts):
     other = jms.Record(parts[1].t, parts[1].channels, {"u": 0.8 * parts[1].inputs["u"]}, "weak")
-    found = score(result, other)
+    found = evaluate_on(result, other)
     assert found.start_fitted is not None
     assert found.start_fitted.rmse["x"] < found.rmse["x"]
     assert any("standard errors from what its first samples show" in each for each in found.remarks)
     nothing = jms.Record(parts[1].t, parts[1].channels, {"u": np.full(len(parts[1].t), 1e200)}, "overflow")
     with pytest.raises(RuntimeError, match="not finite"):
-        score(result, nothing)
+        evaluate_on(result, nothing)
 
 
 def test_a_start_that_is_given_is_not_moved(result, parts):
-    given = score(result, parts[0], q0=[0.05], qd0=[0.1])
+    given = evaluate_on(result, parts[0], q0=[0.05], qd0=[0.1])
     np.testing.assert_allclose(given.outputs["x"], result.provenance.outputs[0]["x"], rtol=0, atol=1e-12)
-    assert score(result, parts[0], q0=[0.05], qd0=[0.0]).rmse["x"] > 10 * given.rmse["x"]  # from rest, which it was not
+    from_rest = evaluate_on(result, parts[0], q0=[0.05], qd0=[0.0])
+    assert from_rest.rmse["x"] > 10 * given.rmse["x"]  # it was not at rest
     with pytest.raises(ValueError, match="give q0 and qd0, or neither"):
-        score(result, parts[0], q0=[0.05])
+        evaluate_on(result, parts[0], q0=[0.05])
     with pytest.raises(ValueError, match=r"q0 must be finite and of the shape \(1,\)"):
-        score(result, parts[0], q0=[0.0, 0.0], qd0=[0.0])
+        evaluate_on(result, parts[0], q0=[0.0, 0.0], qd0=[0.0])
     other = jms.Record(parts[0].t, {"y": parts[0].channels["x"]}, parts[0].inputs)
     with pytest.raises(ValueError, match="has the channel 'y', but the fit observed: x"):
-        score(result, other)
+        evaluate_on(result, other)
     with pytest.raises(ValueError, match="has the inputs none"):
-        score(result, jms.Record(parts[0].t, parts[0].channels))
+        evaluate_on(result, jms.Record(parts[0].t, parts[0].channels))
 
 
 def test_a_law_is_scored_on_another_motion(presliding):
     t = np.arange(0.0, 1.0, 5e-3)
     x = 2e-5 * np.sin(2 * np.pi * 2 * t)
     force = np.asarray(law_force(jms.LuGre(**LUGRE), jnp.asarray(t), jnp.asarray(x)))
-    other = score(presliding, jms.Record(t, force, {"x": x}, "other"))
+    other = evaluate_on(presliding, jms.Record(t, force, {"x": x}, "other"))
     assert other.q0 is None
     assert other.rmse["measured"] < 0.02
     assert other.fit["measured"] > 85
@@ -589,7 +590,7 @@ def test_a_file_gives_back_every_bit(odd, tmp_path):
     with pytest.raises(ValueError, match="loaded result"):
         profile(again, "m")
     with pytest.raises(ValueError, match="loaded result"):
-        score(again, odd.record)
+        evaluate_on(again, odd.record)
     again.save(path)  # what was loaded can be kept again
     assert same(FitResult.load(path).provenance.numbers, odd.provenance.numbers)
 
@@ -603,7 +604,7 @@ def test_a_file_puts_its_numbers_into_a_model(result, presliding, tmp_path):
         {k: np.asarray(x) for k, x in scene_numbers(result.model).items()},  # pyright: ignore[reportArgumentType]
     )
     other = jms.Scene(lagrangian, params={"m": 1.0, "k": 1.0}, effects=(jms.Friction(jms.Coulomb(1.0)),))
-    with pytest.raises(ValueError, match=r"not the one that was fitted: it lacks .*viscous.Fv"):
+    with pytest.raises(ValueError, match=r"not the fitted one: it lacks .*viscous.Fv"):
         FitResult.load(path, other)
     presliding.save(path)
     law = FitResult.load(path, jms.LuGre(**{**LUGRE, "sigma0": 1.0})).model

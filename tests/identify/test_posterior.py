@@ -18,7 +18,7 @@ from jaxmodsim.identify.estimate._search import SearchOptions, solve_with_noise
 from jaxmodsim.identify.model._engines import ModelOutput
 from jaxmodsim.identify.model._parameters import FreeParameters
 from jaxmodsim.identify.uncertainty._fit import result_of
-from jaxmodsim.identify.uncertainty._log_density import _SoftBox
+from jaxmodsim.identify.uncertainty._posterior import _SoftBox
 from jaxmodsim.identify.uncertainty._result import FitResult
 from jaxmodsim.plot import posterior_figure
 
@@ -155,7 +155,7 @@ def test_it_says_what_is_wrong(posterior: Posterior) -> None:
         posterior, rhat={**posterior.rhat, "A": 1.3}, effective={**posterior.effective, "k": 9.0}, divergences=3
     )
     text = str(wrong)
-    assert "The chains do not tell the same (R-hat of A 1.3" in text
+    assert "The chains do not agree (R-hat of A 1.3" in text
     assert "k has 9 effective samples, fewer than the 400" in text
     assert "3 samples diverged" in text
     wide = replace(posterior, draws={**posterior.draws, "A": 2 + 2 * (posterior.draws["A"] - 2)})
@@ -177,7 +177,7 @@ def test_it_refuses_what_it_cannot_do(tmp_path) -> None:
         with pytest.raises(ValueError, match="At least 4 draws, a warmup of 20 and 2 chains are needed"):
             sample_posterior(result, **numbers)
     result.save(tmp_path / "fit.npz")
-    with pytest.raises(ValueError, match="a result loaded from a file cannot"):
+    with pytest.raises(ValueError, match="a loaded result does not have"):
         log_density(FitResult.load(tmp_path / "fit.npz"))
 
 

@@ -9,7 +9,7 @@ from matplotlib.text import Text
 
 import jaxmodsim as jms
 from jaxmodsim import plot
-from jaxmodsim.identify import agreement, expected_error, law_force, predict, replay, score
+from jaxmodsim.identify import agreement, evaluate_on, law_force, predict, prediction_error, replay
 from jaxmodsim.identify.selection._agreement import _between, _covariance_between
 from jaxmodsim.problems.braked_spring import driven_spring
 
@@ -56,7 +56,7 @@ def test_the_deviation_of_a_changing_level_is_half_the_difference_of_two_runs():
     # The coordinates of the fit are logarithms of Fc: 1 % at a step of 10 %.
     assert found.between["measured"] == pytest.approx(expected, rel=0.01, abs=1e-6)
     assert found.model["measured"] == pytest.approx(NOISE, rel=0.08)
-    total = expected_error(result)["measured"]
+    total = prediction_error(result)["measured"]
     assert total.total**2 == pytest.approx(total.model**2 + total.parameters**2 + total.between**2)
     assert total.unchanged**2 == pytest.approx(total.model**2 + total.parameters**2)
     assert total.between == pytest.approx(np.sqrt(np.mean(expected**2)), rel=0.1)  # of the first day's motion
@@ -126,7 +126,7 @@ def test_a_scene_on_another_day_and_its_figure(axis):
     other = predict(axis, driven(1.05, 1, "other"))
     assert other.shares["x"] > 0.85
     assert predict(axis, driven(1.05, 1, "other"), variation=0.0).shares["x"] < 0.7
-    assert other.score.rmse == score(axis, driven(1.05, 1, "other")).rmse
+    assert other.score.rmse == evaluate_on(axis, driven(1.05, 1, "other")).rmse
     assert not other.counts[:20].any()  # 20 samples of so little noise show the start
     assert other.counts[20:].all()
     assert "from its first 20 samples" in str(other)
@@ -141,10 +141,10 @@ def test_a_scene_on_another_day_and_its_figure(axis):
 
 
 def test_short_records_show_their_start_by_half_of_them(axis):
-    short = score(axis, driven(1.0, 1, "short", 8))
+    short = evaluate_on(axis, driven(1.0, 1, "short", 8))
     assert np.isfinite(short.rmse["x"])
     with pytest.raises(ValueError, match=r"tiny has 5 samples, too few .* 6 are needed"):
-        score(axis, driven(1.0, 1, "tiny", 5))
+        evaluate_on(axis, driven(1.0, 1, "tiny", 5))
     candidate = jms.identify.Candidate(spring(0.8), ("m", "friction.Fc"))
     with pytest.raises(ValueError, match=r"first\[0\] has 4 samples"):
         jms.identify.compare({"coulomb": candidate}, driven(1.0, 0, "first", 16), observe={"x": "q[0]"})
@@ -160,9 +160,9 @@ def test_wrong_questions_are_refused(axis, tmp_path):
             predict(axis, other, variation=variation)
     two = fitted(day("first", 0), day("second", 1))
     with pytest.raises(ValueError, match=r"The agreement is of Fc.*take agreement\(result\)"):
-        expected_error(axis, agreement=agreement(two))
+        prediction_error(axis, agreement=agreement(two))
     axis.save(tmp_path / "axis.npz")
     with pytest.raises(ValueError, match="fit again"):
         predict(jms.FitResult.load(tmp_path / "axis.npz"), other)
     with pytest.raises(ValueError, match="fit again"):
-        expected_error(dataclasses.replace(axis, search=None))
+        prediction_error(dataclasses.replace(axis, search=None))

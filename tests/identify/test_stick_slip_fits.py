@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim.identify import Controller, axis_models, axis_scene, remarks, replay, rough_axis
-from jaxmodsim.identify.data._record import sample_noise
+from jaxmodsim.identify import Controller, axis_models, axis_scene, estimate_axis, remarks, replay
+from jaxmodsim.identify.data._signals import sample_noise
 
 from ..helpers.axis_records import slide
 
@@ -46,7 +46,7 @@ def axis(friction, m: float = 3.02, k: float = 0.0) -> jms.Scene:
 
 def test_an_axis_that_stands_still_is_found_within_its_intervals():
     record, model = dwelling(), axis_models()["coulomb"]
-    result = jms.fit(axis_scene(model, rough_axis(record)), record, (*model.free, "q0", "qd0"))
+    result = jms.fit(axis_scene(model, estimate_axis(record)), record, (*model.free, "q0", "qd0"))
     assert result.diagnostics.ending == "converged"
     for name, (low, high) in result.estimate.intervals().items():
         assert low < TRUTH.get(name, 0.0) < high, name
@@ -203,7 +203,7 @@ def test_a_controller_and_an_observed_force_pass_stick():
 
 def test_a_velocity_that_stick_takes_away_has_no_effect():
     record = dwelling(8.0, 500.0, 110)  # its derivative is rounding, on which a search must not step
-    scene, free = axis_scene(axis_models()["coulomb"], rough_axis(record)), (*TRUTH, "q0", "qd0")
+    scene, free = axis_scene(axis_models()["coulomb"], estimate_axis(record)), (*TRUTH, "q0", "qd0")
     result = jms.fit(scene, record, free, q0=[record.measured[0]], qd0=[0.0])
     assert "qd0[0] has no effect on this record." in remarks(result)
     assert result.diagnostics.ending == "converged"

@@ -1,6 +1,5 @@
-"""Measured records: samples, windows as arrays of one shape, and positions differentiated."""
+"""Measured records, and their windows as arrays of one shape."""
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
@@ -15,7 +14,7 @@ from ..._core.arrays import on_device
 
 @runtime_checkable
 class TableColumn(Protocol):
-    """A column of a table (pandas, xarray, polars): what NumPy makes an array of."""
+    """A column of a table (pandas, xarray, polars) that NumPy can convert."""
 
     def __array__(self, *arguments: object, **options: object) -> np.ndarray:
         """As an array."""
@@ -24,41 +23,30 @@ class TableColumn(Protocol):
 
 # Samples of one channel, shape `[samples]`.
 Column: TypeAlias = ArrayLike | Sequence[object] | TableColumn
-# Name of a single channel that was given none.
+# Default name of a single channel.
 SINGLE = "measured"
-# Samples at the beginning of a record, from which position and velocity are estimated.
-_SAMPLES = 20
-# A value stands out that is so many times as far from the median of its neighbours as nearly all others are, and as far
-# as samples go from one to the next.
-_NEIGHBOURS, _STANDS_OUT, _NEARLY_ALL = 5, 10.0, 0.95
-# Values are on a grid that lie off it by less than this share of its step; keeps divisions by a level finite.
-_ON_A_GRID, _TINY = 1e-3, 1e-300
-# Smoothing: one sample to either side for so many of the record, and never fewer than so many to either side.
-_SAMPLES_A_SIDE, _LEAST_SPAN = 1000, 3
-# Orders of the differences that show noise, into how many parts of how many samples at least a record is cut.
-_ORDERS, _PARTS, _LEAST_PART = (2, 3, 4, 5, 6), 32, 32
 
 
 class Record:
-    """Samples of a measurement: what was measured, and the inputs that drove the machine.
+    """Samples of a measurement: outputs, and the inputs that drove the machine.
 
     **Arguments:**
 
     - `t`: times of the samples [s], increasing, shape `[samples]`, at least two.
-    - `measured`: measured output at these times, shape `[samples]`; or several by name, `{"x": ..., "force": ...}`.
-    - `inputs`: inputs by name, shape `[samples]` each. In a fit an input drives the entry of the scene's `params` of
-      the same name.
+    - `measured`: measured output at these times, shape `[samples]`; or several outputs by name,
+      `{"x": ..., "force": ...}`.
+    - `inputs`: inputs by name, shape `[samples]` each. In a fit each drives the entry of the scene's `params` of the
+      same name.
     - `name`: for figures and tables.
-    - `linear`: names of the inputs that run in straight lines from sample to sample; the others are held until the
-      next.
-    - `noise`: standard deviation of the noise of each channel by its name, in its unit, > 0; one number where there is
-      one channel. A fit estimates those that are not given. That of slip instants is `"friction slips"`.
+    - `linear`: names of the inputs that are interpolated linearly; the others are held until the next sample.
+    - `noise`: standard deviation of the noise of each channel by its name, in its unit, > 0; one number for a single
+      channel. A fit estimates the others. The channel of slip instants is `"friction slips"`.
     - `slips`: instants [s] at which friction elements broke away, by the name of the effect in the scene, increasing.
 
     **Raises:**
 
-    - `ValueError` naming the column and the first sample at fault, for NaN, times that do not increase, or lengths
-      that differ.
+    - `ValueError` naming the column and the first wrong sample, for NaN, times that do not increase, or different
+      lengths.
     """
 
     t: Float[np.ndarray, " samples"]
@@ -85,7 +73,7 @@ class Record:
         inputs = as_mapping(inputs, name="inputs", example="{'u': force}")
         slips = as_mapping(slips, name="slips", example="{'friction': [0.5, 1.5]}")
         if not outputs:
-            raise ValueError(f"{name}: measured must hold one channel at least.")
+            raise ValueError(f"{name}: measured must hold at least one channel.")
         self.t = _column(t, "t", None, name)
         shape = self.t.shape
         self.channels = {label: _column(column, label, shape, name) for label, column in outputs.items()}
@@ -122,22 +110,22 @@ class Record:
 
     @property
     def measured(self) -> Float[np.ndarray, " samples"]:
-        """The one channel of a record that has one.
+        """The only channel.
 
         **Raises:**
 
-        - `ValueError` if it has several: take them from `channels`.
+        - `ValueError` for several: use `channels`.
         """
         if len(self.channels) > 1:
-            raise ValueError(f"{self.name} has the channels {', '.join(self.channels)}: say which.")
+            raise ValueError(f"{self.name} has the channels {', '.join(self.channels)}: use Record.channels.")
         return next(iter(self.channels.values()))
 
     def part(self, start: float, end: float, name: str | None = None) -> "Record":
-        """The samples from `start` to `end` [s], both included; times stay as they are.
+        """The samples from `start` to `end` [s], both included, with the same times.
 
         **Raises:**
 
-        - `ValueError` if fewer than two samples lie there.
+        - `ValueError` for fewer than two samples.
         """
         start, end = as_float(start, name="start"), as_float(end, name="end")
         inside = np.flatnonzero((self.t >= start) & (self.t <= end))
@@ -148,7 +136,7 @@ class Record:
         return self.samples(int(inside[0]), int(inside[-1]) + 1, name)
 
     def samples(self, first: int, last: int, name: str | None = None) -> "Record":
-        """Samples `first` up to, and without, `last`."""
+        """Samples from `first` to `last`, without the last."""
         keep = slice(first, last)
         t = self.t[keep]
         slips = {effect: instants[(instants >= t[0]) & (instants <= t[-1])] for effect, instants in self.slips.items()}
@@ -167,10 +155,10 @@ class Record:
 
         **Raises:**
 
-        - `ValueError` if a window would hold fewer than two samples.
+        - `ValueError` for windows of fewer than two samples.
         """
         seconds = as_float(seconds, name="seconds", lower=0.0)
-        parts = min(float(self.t[-1] - self.t[0]) / seconds, float(len(self.t)))  # which is too many already
+        parts = min(float(self.t[-1] - self.t[0]) / seconds, float(len(self.t)))  # one a sample at most
         count = max(round(parts), 1)
         if 2 * count > len(self.t):
             raise ValueError(
@@ -229,9 +217,9 @@ def _instants(instants: Column, effect: str, t: np.ndarray, name: str) -> Float[
 class Runs(NamedTuple):
     """Records, or windows of them, padded to the same length, with a leading axis of runs.
 
-    - `t`: times [s]; the last one is repeated where a run is shorter than the longest.
-    - `inputs`, `measured`: by name. `weight`: 1 where a sample counts, 0 where not, by channel.
-    - `slips`: instants by effect, `slip_weight` their weights.
+    - `t`: times [s]; shorter runs repeat their last one.
+    - `inputs`, `measured`: by name. `weight`: 1 for a sample that counts, 0 for others, by channel.
+    - `slips`: instants by effect. `slip_weight`: their weights.
     """
 
     t: Float[Array, "runs samples"]
@@ -243,11 +231,11 @@ class Runs(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """Where the runs come from.
+    """The windows of records that are the runs.
 
-    - `record`, `first`, `last`: index of the record and its samples `first` to `last`, of each run; the last sample
-      is also the first of the next run where `linked`.
-    - `linked`: whether the next run goes on from the end of this one, shape `[runs - 1]`.
+    - `record`, `first`, `last`: index of the record and of its first and last sample, for each run; the last sample is
+      also the first of the next run if they are `linked`.
+    - `linked`: whether the next run continues from the end of this one, shape `[runs - 1]`.
     """
 
     record: tuple[int, ...]
@@ -257,11 +245,11 @@ class Windows(NamedTuple):
 
 
 def cut(records: tuple[Record, ...], window: float | None) -> Windows:
-    """Whole records, or windows of nearly this length [s]; each ends with the first sample of the next.
+    """Whole records, or windows of about this length [s]; each ends with the first sample of the next.
 
     **Raises:**
 
-    - `ValueError` if the window is shorter than two samples.
+    - `ValueError` for a window shorter than two samples.
     """
     record, first, last, linked = [], [], [], []
     steps = None
@@ -274,7 +262,7 @@ def cut(records: tuple[Record, ...], window: float | None) -> Windows:
         samples = len(each.t)
         edges = [0, samples - 1] if steps is None else [*range(0, samples - 1, steps), samples - 1]
         if len(edges) > 2 and edges[-1] - edges[-2] < (steps or 0) // 4:
-            del edges[-2]  # too short to say anything about its own start
+            del edges[-2]  # too short to show its own start
         for a, b in pairwise(edges):
             record.append(i)
             first.append(a)
@@ -323,112 +311,3 @@ def runs_of(records: tuple[Record, ...], windows: Windows) -> Runs:
         {name: column(np.where(np.isfinite(x), x, 0.0)) for name, x in instants_by_effect.items()},
         {name: column(np.isfinite(x).astype(float)) for name, x in instants_by_effect.items()},
     )
-
-
-class SmoothedMotion(NamedTuple):
-    """A smoothed motion, shape `[samples]` each, and how many samples at either end the smoothing spoils."""
-
-    x: Float[np.ndarray, " samples"]
-    v: Float[np.ndarray, " samples"]
-    a: Float[np.ndarray, " samples"]
-    edge: int
-
-
-def smooth(x: Float[np.ndarray, " samples"], span: int) -> Float[np.ndarray, " samples"]:
-    """Weighted mean over `span` samples to either side."""
-    from scipy.signal import convolve, windows  # most of a second to import, and only needed here
-
-    kernel = windows.hann(2 * span + 3)[1:-1]
-    return convolve(np.pad(x, span, mode="edge"), kernel / kernel.sum(), mode="valid", method="direct")
-
-
-def smooth_span(samples: int) -> int:
-    """Samples to either side over which a record of so many is smoothed."""
-    return max(samples // _SAMPLES_A_SIDE, _LEAST_SPAN)
-
-
-def outliers(x: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
-    """Samples that stand out from their neighbours to either side, as those of a sensor that drops out do."""
-    deviation, steps = np.abs(x - _local_median(x)), np.abs(np.diff(x))
-    step = float(np.median(steps[steps > 0])) if steps.any() else 0.0
-    usual = max(float(np.quantile(deviation, _NEARLY_ALL)), step)
-    return deviation > _STANDS_OUT * usual
-
-
-def without_outliers(x: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """The samples, with the median of their neighbours in place of those that stand out."""
-    bad = outliers(x)
-    return np.where(bad, _local_median(x), x) if bad.any() else x
-
-
-def sample_noise(x: Float[np.ndarray, " samples"]) -> float:
-    """Standard deviation of the noise that samples do not share with their neighbours; at least that of rounding.
-
-    Differences of the order that leaves least of the motion; the median over parts of the record, so that impacts and
-    outliers decide nothing. Steps of a sensor of resolution r have a standard deviation of r/sqrt(12).
-    """
-    levels = [np.inf]
-    for order in _ORDERS:
-        squares = np.diff(x, order) ** 2 / math.comb(2 * order, order)
-        parts = np.array_split(squares, max(min(squares.size // _LEAST_PART, _PARTS), 1))
-        levels.append(float(np.sqrt(np.median([np.mean(part) for part in parts]))) if squares.size else np.inf)
-    rounding = float(np.finfo(float).eps * np.max(np.abs(x)))
-    seen = min(levels) if np.isfinite(min(levels)) else 0.0
-    return max(seen, resolution(x) / 12.0**0.5, rounding, _TINY)
-
-
-def _local_median(x: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    side = _NEIGHBOURS // 2
-    return np.median(np.lib.stride_tricks.sliding_window_view(np.pad(x, side, mode="edge"), _NEIGHBOURS), axis=-1)
-
-
-def differentiate(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> SmoothedMotion:
-    """Velocity and acceleration of a position, smoothed before either differentiation."""
-    span = smooth_span(len(t))
-    position = smooth(x, span)
-    v = smooth(np.gradient(position, t), span)
-    return SmoothedMotion(position, v, np.gradient(v, t), 3 * span)
-
-
-def start_state(record: Record, channel: str | None = None) -> tuple[float, float]:
-    """Position and velocity at the first sample, by a parabola through the first 20.
-
-    **Arguments:**
-
-    - `record`: its `channel`, by default the only one, is a position [m or rad].
-
-    **Returns:**
-
-    Position and velocity.
-    """
-    x = without_outliers(record.measured if channel is None else record.channels[channel])
-    powers = _start_powers(record.t)
-    return tuple(np.linalg.lstsq(powers, x[: len(powers)])[0][:2].tolist())
-
-
-def start_errors(record: Record, channel: str) -> float:
-    """Standard error of the velocity of `start_state` over the noise of the channel [1/s].
-
-    Larger where the first samples lie off the parabola by more than the noise: they are too far apart for it.
-    """
-    x = without_outliers(record.channels[channel])
-    powers = _start_powers(record.t)
-    first = x[: len(powers)]
-    off = np.sqrt(np.mean((first - powers @ np.linalg.lstsq(powers, first)[0]) ** 2))
-    return float(np.linalg.norm(np.linalg.pinv(powers)[1])) * max(1.0, float(off) / sample_noise(x))
-
-
-def _start_powers(t: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "first powers"]:
-    """The parabola through the first samples, as a matrix: by time since the first one."""
-    count = min(_SAMPLES, len(t))
-    return np.vander(t[:count] - t[0], min(3, count), increasing=True)
-
-
-def resolution(x: Float[np.ndarray, " samples"]) -> float:
-    """Step of the values of a sensor, all of which are multiples of it apart; 0 where there is none."""
-    values = np.unique(x)
-    steps = np.diff(values)
-    if not steps.size:
-        return 0.0
-    step = float(np.median(steps[steps < 1.5 * np.min(steps)]))
-    return step if np.max(np.abs(steps / step - np.round(steps / step))) < _ON_A_GRID else 0.0

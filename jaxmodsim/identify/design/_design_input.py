@@ -1,4 +1,4 @@
-"""`design_input`: what to measure next, by gradient on the Fisher information."""
+"""`design_input`: the most informative input for the next measurement, by gradients of the Fisher information."""
 
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from ..._core.arguments import as_whole
 from ..._core.parameters import check_ranges, modules_of
 from ..._core.progress import reported
 from ..._core.trace_checks import traced
@@ -17,38 +18,47 @@ from ..model._observe import first_coordinate
 from ..model._parameters import FreeParameters, chosen_entries, split_entries, split_ranges
 from ..uncertainty._estimate import correlation_of, floored_inverse
 from ..uncertainty._result import FitResult
-from ._excitation import DrivenAxis, driven_motion, feed_forward, motion_basis, relative_numbers, sensitivities
-from ._input_design import AxisLimits, Excitation, InputDesign, d_optimal
+from ._input_design import (
+    AxisLimits,
+    DrivenAxis,
+    Excitation,
+    InputDesign,
+    d_optimal,
+    driven_motion,
+    feed_forward,
+    motion_basis,
+    relative_numbers,
+    sensitivities,
+)
 
 # Called after each iteration with its number, over all starts, and the criterion as it stands.
 DesignProgress: TypeAlias = Callable[[int, float], None]
 Criterion: TypeAlias = Callable[[Array], Array]
-# The search runs on so many samples; the result is judged on all of them.
+# The search uses so many samples; the result is evaluated on all of them.
 _COARSE = 625
-# Random motions that are tried, and how many of the best are improved.
+# Number of random motions, and of the best ones that are improved.
 _TRIED, _IMPROVED = 16, 2
-# The smooth maximum of magnitudes is `log(sum(exp(_SHARP x)))/_SHARP`; of fifty equal ones it is 4 % too high.
+# The smooth maximum of magnitudes is `log(sum(exp(_SHARP x)))/_SHARP`; for fifty equal ones it is 4 % too high.
 _SHARP = 100.0
-# Kept from every limit, so that rounding in a file does no harm.
+# Distance from every limit, against rounding in a file.
 _MARGIN = 1e-3
-# Largest weight, in amplitudes of the largest sine of its frequency.
+# Largest weight, relative to the largest sine of its frequency.
 _WIDEST = 2.0
-# Stands for a criterion that is not finite.
+# Value of a criterion that is not finite.
 _NOT_FINITE = -1e6
-# Relative standard error that the search takes as known beforehand: keeps the criterion finite where nothing
-# is learned.
+# Relative standard error of a prior in the search: keeps the criterion finite for numbers without effect.
 _IGNORANCE = 100.0
-# Samples that the fastest harmonic needs in a period.
+# Least number of samples in a period of the fastest harmonic.
 _SAMPLES_A_PERIOD = 20
-# Price of a deviation beyond what is allowed, in the criterion, and from which share of it on.
+# Penalty of a deviation beyond the allowed one, in the criterion, and the share of it from which it applies.
 _PRICE, _PRICED_FROM = 10.0, 1.05
-# Relative change at which SLSQP ends.
+# Relative tolerance of SLSQP.
 _FTOL = 1e-4
-# How closely a motion fills its limits; by which factor it shrinks until it keeps them, and where it is given up.
+# Tolerance with which a motion fills its limits; factor by which it shrinks to keep them; size at which it fails.
 _FILLED, _SHRINK, _VANISHED = 1e-3, 0.8, 1e-13
-# Smallest eigenvalue of a scaled information matrix against the largest one; what is added to its diagonal, in eps.
+# Smallest eigenvalue of a scaled information matrix, relative to the largest; addition to its diagonal, in eps.
 _LEAST, _DEFINITE = 1e-15, 1e3
-# Where only the force is limited: a travel [m] beyond any.
+# Travel [m] of the first trial if only the force is limited.
 _FAR = 1e3
 
 
@@ -58,10 +68,10 @@ class _Task(eqx.Module):
     - `axis`: the machine.
     - `t`: times, shape `[time]`.
     - `shapes`, `rates`: `motion_basis` at these times.
-    - `inverse`: one by the limits of force, speed and travel, 0 for no limit, shape `[3]`.
-    - `weight`: samples of the record for one of these.
-    - `prior`: information from before.
-    - `uncertainty`: relative error that the numbers may have now.
+    - `inverse`: reciprocals of the limits of force, speed and travel, 0 for no limit, shape `[3]`.
+    - `weight`: samples of the record for each of these.
+    - `prior`: information of an earlier fit.
+    - `uncertainty`: relative error of the current numbers.
     - `criterion`: function of the information matrix.
     """
 
@@ -94,7 +104,7 @@ def design_input(
     dt: float = 1e-3,
     q0: ArrayLike | list[float] | None = None,
     observe: Callable[[Array, Array], Array] = first_coordinate,
-    input: str = "u",
+    input_name: str = "u",
     harmonics: int = 12,
     criterion: Criterion = d_optimal,
     prior: FitResult | None = None,
@@ -103,44 +113,44 @@ def design_input(
     max_steps: int = 30,
     progress: bool | DesignProgress = False,
 ) -> InputDesign:
-    """Design the input whose record tells most about the numbers of an axis, within limits.
+    """Design the input whose record is most informative about the numbers of an axis, within limits.
 
-    What is designed is a motion, a sum of sines and cosines that fades in and out, because an axis led by a force alone
-    drifts away; the force for it follows from the model by inverse dynamics. The information is `J'J/noise^2`, with J
-    the derivative by the free numbers of what `fit` simulates, open loop, under that force. The criterion is improved
-    by sequential quadratic programming (SLSQP of scipy) on exact gradients from several starts, on a coarser grid if
-    there are many samples. The result is scaled to fill the limits on the full grid, in the reference and in runs of
-    the model with one and with four integration steps for every sample.
+    The design is a motion, a sum of sines and cosines that fades in and out, since an axis under a designed force would
+    drift away. The force for it follows from the model by inverse dynamics. The information is `J'J/noise^2`, with J
+    the derivative, by the free numbers, of the open-loop simulation in `fit` under that force. The criterion is
+    improved by sequential quadratic programming (SLSQP of SciPy) on exact gradients from several starts, on a coarser
+    grid if there are many samples. The result is scaled to fill the limits on the full grid, in the reference and in
+    runs of the model with one and with four integration steps for every sample.
 
-    Slow motion on the brink of sticking tells most on paper, but a model whose numbers are a little off leaves such a
-    motion altogether. So an error of `uncertainty` in any one number may move the simulated record, to first order, by
-    no more than the record's own reach. That does not promise that a fit converges from numbers which are so far
-    off: start it from the numbers the design was made for, and judge it by its RMSE against the noise.
+    The information is largest for slow motion close to sticking, but a model with slightly wrong numbers does not
+    follow such a motion. So an error of `uncertainty` in any one number may move the simulated record, to first order,
+    by no more than the range of the record. A fit from such numbers may still not converge: start it from the numbers
+    of the design, and compare its RMSE with the noise.
 
-    A design is the best one for the numbers the scene has: take those of a first fit. Standard errors are those of a
-    right model and white noise.
+    A design is optimal for the numbers of the scene: use those of a first fit. Standard errors assume a right model and
+    white noise.
 
     **Arguments:**
 
     - `scene`: model of one coordinate; its `params` must be a dict with an entry for the input.
-    - `free`: names of the numbers that are to be found, as for `fit`.
-    - `limits`: the `Limits` of input, first coordinate and its velocity. Keep a reserve for what the model does not
-      know, and for the drive's own controller.
+    - `free`: names of the numbers to fit, as for `fit`.
+    - `limits`: the `AxisLimits` of input, first coordinate and its velocity. Keep a reserve for errors of the model
+      and for the drive's own controller.
     - `duration`: of the record [s].
-    - `noise`: standard deviation of one sample of what is observed, in its unit, > 0.
+    - `noise`: standard deviation of one sample of the observed quantity, in its unit, > 0.
     - `dt`: time between samples [s].
     - `q0`: position of rest at the start, shape `[1]`; by default zero.
-    - `observe`: `observe(q, qd)`, what will be recorded; by default the first coordinate.
-    - `input`: name of the entry of `params` that is the driving force; the equations must be linear in it.
+    - `observe`: `observe(q, qd)`, the recorded quantity; by default the first coordinate.
+    - `input_name`: name of the entry of `params` that is the driving force; the equations must be linear in it.
     - `harmonics`: highest frequency of the motion in periods per duration; the motion has twice as many weights.
     - `criterion`: function of the information matrix of the relative numbers, the larger the better: `d_optimal`,
-      `a_optimal`, `e_optimal` or one's own.
-    - `prior`: an earlier fit, whose knowledge of the free numbers is added to that of the record.
-    - `uncertainty`: relative error that the numbers of the scene may have now, > 0: 0.1 for 10 %.
+      `a_optimal`, `e_optimal` or your own.
+    - `prior`: an earlier fit, whose information about the free numbers is added to that of the record.
+    - `uncertainty`: relative error of the current numbers of the scene, > 0: 0.1 for 10 %.
     - `seed`: of the random starts.
     - `max_steps`: limit of iterations from each start.
     - `progress`: True for a line of text, or a function that is called after each iteration with its number and the
-      criterion of its motion, which may still be beyond a limit. Ctrl-C ends the search with the best so far.
+      criterion of its motion, which may still exceed a limit. Ctrl-C ends the search with the best so far.
 
     **Returns:**
 
@@ -149,12 +159,12 @@ def design_input(
     **Raises:**
 
     - `ValueError` for names that are unknown, a scene that has several coordinates or needs events, an input that is
-      not in the scene or does not move it, limits that allow no motion.
+      not in the scene or does not move it, or limits that allow no motion.
     """
     _check(
         {"duration": duration, "dt": dt}, {"noise": noise, "uncertainty": uncertainty}, harmonics, max_steps, criterion
     )
-    axis, parameters, scale = _axis(scene, free, q0, observe, input, noise)
+    axis, parameters, scale = _axis(scene, free, q0, observe, input_name, noise)
     samples = round(duration / dt) + 1
     stride = max((samples - 1) // _COARSE, 1)
     prior_information = np.zeros((len(scale), len(scale)))
@@ -179,16 +189,14 @@ def design_input(
 
     fine, coarse = task(samples), task((samples - 1) // stride + 1)
     sines = [_fill(_coarse_share, coarse, column) for column in np.eye(2 * harmonics)[:harmonics]]
-    plain = max(sines, key=lambda x: float(_judge(coarse, jnp.asarray(x, float))[0]))
+    baseline = max(sines, key=lambda x: float(_judge(coarse, jnp.asarray(x, float))[0]))
     with reported(progress, "next input", lambda number, value: f"iteration {number}: criterion {value:.4g}") as report:
-        best, ending = _improve(coarse, sines, plain, seed, max_steps, report)
-    designed, compared = (
-        _excitation(fine, _fill(_fine_share, fine, x), parameters.names, scale) for x in (best, plain)
-    )
+        best, ending = _improve(coarse, sines, baseline, seed, max_steps, report)
+    designed, sine = (_excitation(fine, _fill(_fine_share, fine, x), parameters.names, scale) for x in (best, baseline))
     units = {name: allowed.unit for name, allowed in split_ranges(scene_numbers(scene), scene_ranges(scene)).items()}
     return InputDesign(
         best=designed,
-        plain=compared,
+        baseline=sine,
         values={name: float(parameters.start[name]) for name in parameters.names},
         units={name: units.get(name, "") for name in parameters.names},
         limits=limits,
@@ -201,13 +209,12 @@ def design_input(
 def _check(
     times: dict[str, float], numbers: dict[str, float], harmonics: int, max_steps: int, criterion: object
 ) -> None:
-    for unit, given in ((" s", times), ("", numbers)):
-        for label, number in given.items():
+    for unit, arguments in ((" s", times), ("", numbers)):
+        for label, number in arguments.items():
             if not np.isfinite(number) or number <= 0:
                 raise ValueError(f"{label} must be finite and > 0{unit}, but {number!r} was given.")
     for label, count in (("harmonics", harmonics), ("max_steps", max_steps)):
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise ValueError(f"{label} must be at least 1, an integer, but {count!r} was given.")
+        as_whole(count, name=label)
     duration, dt = times["duration"], times["dt"]
     samples = min(round(duration / dt) + 1, _COARSE)
     if samples < _SAMPLES_A_PERIOD * harmonics:
@@ -227,25 +234,25 @@ def _axis(
     free: Sequence[str],
     q0: ArrayLike | list[float] | None,
     observe: Callable[[Array, Array], Array],
-    input: str,
+    input_name: str,
     noise: float,
 ) -> tuple[DrivenAxis, FreeParameters, Float[np.ndarray, " free"]]:
     """The machine, its free numbers, and their units."""
     params = scene.params
-    if not isinstance(params, dict) or input not in params or jnp.shape(params[input]) != ():
+    if not isinstance(params, dict) or input_name not in params or jnp.shape(params[input_name]) != ():
         have = ", ".join(params) if isinstance(params, dict) else "no dict"
-        raise ValueError(f"The input {input!r} must be a single number in the scene's params ({have}).")
+        raise ValueError(f"The input {input_name!r} must be a single number in the scene's params ({have}).")
     if scene.mode_names:
         raise ValueError(
             f"design_input differentiates a run with fixed steps, but {', '.join(scene.mode_names)} would need"
             " events: wrap a law, as in Regularized(law, width)."
         )
-    if input in free:
-        raise ValueError(f"{input} is the input and cannot be free.")
+    if input_name in free:
+        raise ValueError(f"{input_name} is the input and cannot be free.")
     position = jnp.asarray([0.0] if q0 is None else q0, float)
     if position.shape != (1,) or scene.constraints:
         raise ValueError(
-            f"design_input leads one coordinate along a motion, so q0 must have the shape (1,) and the scene no"
+            f"design_input designs the motion of one coordinate, so q0 must have the shape (1,) and the scene no"
             f" constraints, but q0 has the shape {position.shape} and there are {len(scene.constraints)} constraints."
             " For a mechanism of several coordinates, design for one axis with the others held."
         )
@@ -260,41 +267,43 @@ def _axis(
     numbers, ranges = split_entries(whole), split_ranges(whole, scene_ranges(scene))
     parameters = FreeParameters.of(numbers, ranges, chosen_entries(whole, free))
     start = dict(parameters.start)
-    scale, slopes = relative_numbers({k: float(x) for k, x in start.items()}, parameters.followed, parameters.names)
+    scale, slopes = relative_numbers({k: float(x) for k, x in start.items()}, parameters.following, parameters.names)
     columns = {name: jnp.asarray(column, float) for name, column in slopes.items()}
-    axis = DrivenAxis(scene, start, columns, position, jnp.asarray(noise, float), input, observe)
+    axis = DrivenAxis(scene, start, columns, position, jnp.asarray(noise, float), input_name, observe)
     still = jnp.full(3, position[0])
     force = feed_forward(axis, jnp.asarray([0.0, 1e-3, 2e-3]), still, jnp.zeros_like(still))
     if not np.all(np.isfinite(force)):
-        raise ValueError(f"The input {input!r} does not move the first coordinate, or the model is not finite at rest.")
+        raise ValueError(
+            f"The input {input_name!r} does not move the first coordinate, or the model is not finite at rest."
+        )
     return axis, parameters, scale
 
 
 def _known(
     prior: FitResult, names: tuple[str, ...], scale: Float[np.ndarray, " free"]
 ) -> Float[np.ndarray, "free free"]:
-    """Information of an earlier fit on the relative numbers; none on those it did not determine."""
+    """Information of an earlier fit on the relative numbers; 0 for undetermined ones."""
     information = np.zeros((len(names), len(names)))
     known = [name for name in names if 0.0 < prior.errors.get(name, 0.0) < np.inf]
     if not known:
         raise ValueError(f"prior knows none of {', '.join(names)}; it fitted {', '.join(prior.values)}.")
-    there = [list(prior.values).index(name) for name in known]
+    fitted = [list(prior.values).index(name) for name in known]
     here = [names.index(name) for name in known]
     errors = np.array([prior.errors[name] for name in known]) / scale[here]
-    covariance = prior.estimate.correlation[np.ix_(there, there)] * np.outer(errors, errors)
+    covariance = prior.estimate.correlation[np.ix_(fitted, fitted)] * np.outer(errors, errors)
     information[np.ix_(here, here)] = np.linalg.pinv(covariance, hermitian=True)
     return information
 
 
 @eqx.filter_jit
 def _coarse_share(task: _Task, x: Float[Array, " weights"]) -> Float[Array, ""]:
-    """The largest share of a limit, by the reference and the force for it."""
+    """The largest share of a limit, by the reference and its force."""
     return jnp.max(jnp.abs(task.shares(x, feed_forward(task.axis, task.t, *task.motion(x)))))
 
 
 @eqx.filter_jit
 def _fine_share(task: _Task, x: Float[Array, " weights"]) -> Float[Array, ""]:
-    """The largest share of a limit, also by the model under the force, with one and four steps for every sample."""
+    """The largest share of a limit, also by runs of the model with one and four steps for every sample."""
     axis = task.axis
     force = feed_forward(axis, task.t, *task.motion(x))
     shares = [jnp.max(jnp.abs(task.shares(x, force)))]
@@ -307,7 +316,7 @@ def _fine_share(task: _Task, x: Float[Array, " weights"]) -> Float[Array, ""]:
 def _fill(
     share: Callable[[_Task, Array], Array], task: _Task, x: Float[np.ndarray, " weights"]
 ) -> Float[np.ndarray, " weights"]:
-    """The motion made as large as the limits allow."""
+    """The motion scaled to the limits."""
     x = np.asarray(x)
     kinematic = np.array([np.max(np.abs(task.rates @ x)), np.max(np.abs(task.shapes @ x))])
     largest = np.max(kinematic * np.asarray(task.inverse[1:]))
@@ -323,7 +332,7 @@ def _fill(
             needed = 100.0 * float(share(task, jnp.asarray(low * x, float)))
             raise ValueError(
                 f"No motion keeps the limits: the axis at rest takes {needed:.0f} % of one. Raise the limit of force,"
-                " or take the constant load off the axis."
+                " or remove the constant load from the axis."
             )
     while high > (1.0 + _FILLED) * low:
         middle = 0.5 * (low + high)
@@ -332,10 +341,10 @@ def _fill(
 
 
 def _worth(task: _Task, force: Float[Array, " time"]) -> Float[Array, " 2"]:
-    """The criterion, and the largest deviation of the record, in its reach, by a number as wrong as it may be."""
+    """The criterion, and the largest deviation of the record by `uncertainty` in a number, relative to its range."""
     record, columns = sensitivities(task.axis, task.t, force)
     information = task.weight * columns.T @ columns + task.prior
-    # Rounding must not make a singular matrix indefinite.
+    # Keeps a singular matrix from becoming indefinite by rounding.
     little = _DEFINITE * jnp.finfo(force.dtype).eps * jnp.diag(information) + 1.0 / _IGNORANCE**2
     deviation = task.uncertainty * columns / jnp.max(jnp.abs(record - record[0]))
     return jnp.stack([task.criterion(information + jnp.diag(little)), _largest(jnp.reshape(deviation, (1, -1)))[0]])
@@ -350,7 +359,7 @@ def _largest(x: Float[Array, "rows n"]) -> Float[Array, " rows"]:
 def _judge(
     task: _Task, x: Float[Array, " weights"]
 ) -> tuple[Float[Array, ""], Float[Array, " weights"], Float[Array, " 4"], Float[Array, "4 weights"]]:
-    """The criterion, and the use of what is allowed of force, speed, travel and deviation, with their derivatives."""
+    """The criterion, and the shares of the limits of force, speed, travel and deviation, with their derivatives."""
     force, pull = jax.vjp(lambda x: feed_forward(task.axis, task.t, *task.motion(x)), x)
 
     def used(x: Array, force: Array) -> Array:
@@ -364,22 +373,27 @@ def _judge(
 
 
 def _merit(task: _Task, x: Float[np.ndarray, " weights"]) -> float:
-    """The criterion, less a price of too large a deviation; the limits are held otherwise."""
+    """The criterion, less a penalty of too large a deviation; scaling keeps the limits."""
     criterion, _, used, _ = _judge(task, jnp.asarray(x, float))
     return float(criterion) - _PRICE * max(float(used[3]) - _PRICED_FROM, 0.0)
 
 
 def _improve(
-    task: _Task, sines: list[np.ndarray], plain: np.ndarray, seed: int, max_steps: int, progress: DesignProgress | None
+    task: _Task,
+    sines: list[np.ndarray],
+    baseline: np.ndarray,
+    seed: int,
+    max_steps: int,
+    progress: DesignProgress | None,
 ) -> tuple[Float[np.ndarray, " weights"], str]:
-    """The best motion found from the best of some random ones; the best sine if none is better."""
+    """The best motion from the best of some random ones; the best sine if none is better."""
     # Weights in units of the largest sine of their frequency.
     lengths = np.tile([float(np.max(np.abs(x))) for x in sines], 2)
     rng = np.random.default_rng(seed)
-    tried = [_fill(_coarse_share, task, lengths * rng.standard_normal(lengths.size)) for _ in range(_TRIED)]
-    tried.sort(key=lambda x: -_merit(task, x))
-    best, best_merit, ending, count = plain, _merit(task, plain), "converged", 0
-    for start in tried[:_IMPROVED]:
+    candidates = [_fill(_coarse_share, task, lengths * rng.standard_normal(lengths.size)) for _ in range(_TRIED)]
+    candidates.sort(key=lambda x: -_merit(task, x))
+    best, best_merit, ending, count = baseline, _merit(task, baseline), "converged", 0
+    for start in candidates[:_IMPROVED]:
         weights, how, count = _climb(task, start, lengths, max_steps, progress, count)
         filled = _fill(_coarse_share, task, weights)
         merit = _merit(task, filled)
@@ -393,7 +407,7 @@ def _improve(
 def _climb(
     task: _Task, start: np.ndarray, lengths: np.ndarray, max_steps: int, progress: DesignProgress | None, count: int
 ) -> tuple[Float[np.ndarray, " weights"], str, int]:
-    """Improve the criterion by SLSQP; also says how it ended, and counts the iterations on."""
+    """Improve the criterion by SLSQP; returns also the ending and the number of iterations so far."""
     seen: dict[bytes, list[np.ndarray]] = {}
 
     def judged(y: np.ndarray) -> list[np.ndarray]:
@@ -401,7 +415,7 @@ def _climb(
         if key not in seen:
             seen.clear()
             judgement = [np.asarray(x, float) for x in _judge(task, jnp.asarray(lengths * y, float))]
-            # A step far beyond the limits, where the model is not finite: bad enough for the line search to turn back.
+            # Far beyond the limits the model is not finite: a bad value makes the line search turn back.
             finite = all(np.isfinite(x).all() for x in judgement)
             seen[key] = (
                 judgement
@@ -422,11 +436,11 @@ def _climb(
         if progress is not None:
             progress(count, criterion)
 
-    there = np.append(np.flatnonzero(np.asarray(task.inverse)), 3)
+    limited = np.append(np.flatnonzero(np.asarray(task.inverse)), 3)
     within = {
         "type": "ineq",
-        "fun": lambda y: 1.0 - judged(y)[2][there],
-        "jac": lambda y: -judged(y)[3][there] * lengths,
+        "fun": lambda y: 1.0 - judged(y)[2][limited],
+        "jac": lambda y: -judged(y)[3][limited] * lengths,
     }
     try:
         optimum = optimize.minimize(
@@ -434,7 +448,7 @@ def _climb(
             latest,
             jac=lambda y: -judged(y)[1] * lengths,
             method="SLSQP",
-            # Far beyond the limits an axis is so sensitive that the criterion runs away.
+            # Far beyond the limits an axis is so sensitive that the criterion diverges.
             bounds=[(-_WIDEST, _WIDEST)] * latest.size,
             constraints=[within],
             callback=report,
@@ -449,7 +463,7 @@ def _climb(
 def _excitation(
     task: _Task, x: Float[np.ndarray, " weights"], names: tuple[str, ...], scale: Float[np.ndarray, " free"]
 ) -> Excitation:
-    """A motion with its force, a run of the model, and what a record would tell."""
+    """A motion with its force, a run of the model, and the information in a record."""
     q_ref, qd_ref, force, q, qd, columns = (np.asarray(each, float) for each in _run(task, jnp.asarray(x, float)))
     information = columns.T @ columns
     covariance = _inverse(information + np.asarray(task.prior, float))
@@ -477,7 +491,7 @@ def _run(task: _Task, x: Float[Array, " weights"]) -> tuple[Array, ...]:
 
 
 def _inverse(information: Float[np.ndarray, "free free"]) -> Float[np.ndarray, "free free"]:
-    """Inverse with eigenvalues kept off zero; infinite variance where nothing is known."""
+    """Inverse with eigenvalues bounded from below; infinite variance where nothing is known."""
     scale = np.sqrt(np.diag(information))
     silent = scale == 0
     scale = np.where(silent, 1.0, scale)

@@ -1,38 +1,49 @@
-"""What a good experiment is, and an input design: the motion, its force, and what a record of it would tell."""
+"""The best input for an axis: criteria, limits, the motion with its force, and the information of its record."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..._core.readable import AbstractReadable, Table, table_of
 from ..._core.system import jsonable, written_whole
+from ...scene import Scene, State, replace_numbers, scene_numbers, vector_field
+from ...solvers import rosenbrock_step
+from ..model._engines import RODAS3, replay
+from ..model._parameters import join_entries
 
-# Of the relative standard error, above which a number counts as not determined, and of the correlation.
+# Relative standard error above which a number is undetermined; correlation above which two are indistinguishable.
 _VAGUE, _ALIKE = 0.5, 0.98
-# Share of a limit from which on it counts as reached, and of the travel from which on a deviation is told.
+# Share of a limit from which it is reached, and of the travel from which a deviation is reported.
 _REACHED, _OFF = 0.98, 0.05
+# Share of the duration over which a motion fades in, and out.
+_FADE = 0.1
 
 
 def d_optimal(information: Float[Array, "free free"]) -> Float[Array, ""]:
-    """Mean logarithm of the eigenvalues: a small volume of the confidence ellipsoid, whatever the units."""
+    """Mean logarithm of the eigenvalues: minimises the volume of the confidence ellipsoid."""
     return jnp.linalg.slogdet(information)[1] / information.shape[0]
 
 
 def a_optimal(information: Float[Array, "free free"]) -> Float[Array, ""]:
-    """Minus the logarithm of the mean variance of the relative errors."""
+    """Minus the logarithm of the mean variance: minimises the mean of the squared relative errors."""
     return -jnp.log(jnp.trace(jnp.linalg.inv(information)) / information.shape[0])
 
 
 def e_optimal(information: Float[Array, "free free"]) -> Float[Array, ""]:
-    """Logarithm of the smallest eigenvalue: the combination of numbers that is known worst is known best."""
+    """Logarithm of the smallest eigenvalue: minimises the error of the worst-known combination."""
     return jnp.log(jnp.maximum(jnp.linalg.eigvalsh(information)[0], jnp.finfo(information.dtype).tiny))
 
 
 @dataclass(frozen=True)
 class AxisLimits:
-    """What an axis may be asked for; None for no limit.
+    """Limits of an axis; None for no limit.
 
     **Arguments:**
 
@@ -44,7 +55,7 @@ class AxisLimits:
 
     **Raises:**
 
-    - `ValueError` for a limit that is no positive finite number, or if there is none at all.
+    - `ValueError` for a limit that is no positive finite number, or without any limit.
     """
 
     force: float | None = None
@@ -53,39 +64,37 @@ class AxisLimits:
     rotary: bool = False
 
     def __post_init__(self) -> None:
-        given = self.given
-        if not given:
+        if not self.active:
             raise ValueError(
                 "AxisLimits needs at least one of force [N], speed [m/s] and travel [m]: without any, the best input is"
-                " an infinite one."
+                " infinite."
             )
-        for name, (value, unit) in given.items():
+        for name, (value, unit) in self.active.items():
             if isinstance(value, bool) or not np.isfinite(value) or value <= 0:
                 raise ValueError(f"The limit of {name} must be finite and > 0 {unit}, but it is {value!r}.")
 
     @property
-    def given(self) -> dict[str, tuple[float, str]]:
-        """Value and unit of each limit that there is, by name."""
+    def active(self) -> dict[str, tuple[float, str]]:
+        """Value and unit of each limit, by name."""
         units = ("N m", "rad/s", "rad") if self.rotary else ("N", "m/s", "m")
-        values = {"force": self.force, "speed": self.speed, "travel": self.travel}
-        each = {name: (value, unit) for (name, value), unit in zip(values.items(), units, strict=True)}
-        return {name: (value, unit) for name, (value, unit) in each.items() if value is not None}
+        limits = zip(("force", "speed", "travel"), (self.force, self.speed, self.travel), units, strict=True)
+        return {name: (value, unit) for name, value, unit in limits if value is not None}
 
     def __str__(self) -> str:
-        return ", ".join(f"{name} {value:g} {unit}" for name, (value, unit) in self.given.items())
+        return ", ".join(f"{name} {value:g} {unit}" for name, (value, unit) in self.active.items())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Excitation:
-    """A motion that starts and ends at rest, the force that the model needs for it, and what a record of it would tell.
+    """A motion that starts and ends at rest, its force in the model, and the information in a record of it.
 
     - `t`: times [s], evenly spaced, shape `[time]`.
-    - `q_ref`, `qd_ref`: position [m] and velocity [m/s] that are asked for.
-    - `force`: force [N] that leads the model along them, held from each sample to the next.
-    - `q`, `qd`: position and velocity of the model under this force alone, with no feedback.
+    - `q_ref`, `qd_ref`: reference position [m] and velocity [m/s].
+    - `force`: force [N] for them in the model, held from each sample to the next.
+    - `q`, `qd`: position and velocity of the model under this force, without feedback.
     - `information`: Fisher information of the free numbers, each in units of itself (of 1 if it is zero): the inverse
-      is the covariance of the relative errors. Of the record alone, without any prior. Shape `[free, free]`.
-    - `errors`: predicted standard errors by name, in the unit of the number; infinite where nothing is learned.
+      is the covariance of the relative errors. Of the record alone, without a prior. Shape `[free, free]`.
+    - `errors`: predicted standard errors by name, in the unit of the number; infinite for a number without effect.
     - `correlation`: of the errors, shape `[free, free]`.
     """
 
@@ -101,20 +110,20 @@ class Excitation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class InputDesign:
-    """An input that tells most about the numbers that are to be found, within limits.
+class InputDesign(AbstractReadable):
+    """The most informative input for the free numbers, within limits.
 
     - `best`: the designed input.
-    - `plain`: the best single sine within the same limits and of the same duration.
-    - `values`, `units`: the free numbers that it was designed for, and the unit of each that declares one.
-    - `limits`: the `Limits`.
-    - `noise`: standard deviation of a sample that was reckoned with.
-    - `ending`: how the search ended.
+    - `baseline`: the best single sine within the same limits and of the same duration.
+    - `values`, `units`: the free numbers of the design, and the unit of each that declares one.
+    - `limits`: the `AxisLimits`.
+    - `noise`: assumed standard deviation of a sample.
+    - `ending`: why the search ended.
     - `single_precision`: whether it was computed in float32.
     """
 
     best: Excitation
-    plain: Excitation
+    baseline: Excitation
     values: dict[str, float]
     units: dict[str, str]
     limits: AxisLimits
@@ -131,11 +140,11 @@ class InputDesign:
             "speed": max(np.max(np.abs(best.qd_ref)), np.max(np.abs(best.qd))),
             "travel": max(np.max(np.abs(q - best.q_ref[0])) for q in (best.q_ref, best.q)),
         }
-        return {name: float(peaks[name]) / value for name, (value, _) in self.limits.given.items()}
+        return {name: float(peaks[name]) / value for name, (value, _) in self.limits.active.items()}
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What the design rests on and what it cannot do, in words."""
+        """Limitations of the design, in words."""
         remarks = []
         where = f"Within {self.limits}"
         for name, value in self.values.items():
@@ -161,34 +170,34 @@ class InputDesign:
         reach = float(np.max(np.abs(self.best.q_ref - self.best.q_ref[0])))
         if off > _OFF * reach:
             remarks.append(
-                f"The force alone leaves the motion by up to {off:.2g} m even in the model: lead the axis by position"
-                " and velocity, or choose a shorter dt."
+                f"The force alone does not keep the model on its reference: it is off by up to {off:.2g} m."
+                " Control position and velocity of the axis, or choose a shorter dt."
             )
         if self.ending != "converged":
             remarks.append(f"The search {self.ending}: more steps or another seed may find a better input.")
         if self.single_precision:
-            remarks.append("Computed in single precision: enable jax_enable_x64 for numbers that you mean to use.")
+            remarks.append("Computed in single precision: enable jax_enable_x64 for reliable numbers.")
         return tuple(remarks)
 
     def rows(self) -> list[tuple[str, float, float, float, str]]:
-        """Rows of a table: name, value, predicted standard error, that of the plain sine, unit."""
+        """Rows of a table: name, value, predicted standard error, that of the best sine, unit."""
         return [
-            (name, value, self.best.errors[name], self.plain.errors[name], self.units[name])
+            (name, value, self.best.errors[name], self.baseline.errors[name], self.units[name])
             for name, value in self.values.items()
         ]
 
     def to_dict(self) -> dict[str, object]:
-        """All but the samples, as JSON knows it: errors that are infinite are None."""
+        """Everything except the samples, in types of JSON; infinite errors are None."""
         return jsonable(
             {
                 "duration": float(self.best.t[-1] - self.best.t[0]),
                 "samples": len(self.best.t),
                 "noise": self.noise,
-                "limits": {name: value for name, (value, _) in self.limits.given.items()},
+                "limits": {name: value for name, (value, _) in self.limits.active.items()},
                 "used": self.used,
                 "parameters": {
-                    name: {"value": value, "standard_error": error, "standard_error_of_a_sine": plain, "unit": unit}
-                    for name, value, error, plain, unit in self.rows()
+                    name: {"value": value, "standard_error": error, "standard_error_of_a_sine": sine, "unit": unit}
+                    for name, value, error, sine, unit in self.rows()
                 },
                 "information": {"names": list(self.values), "matrix": self.best.information.tolist()},
                 "ending": self.ending,
@@ -197,10 +206,10 @@ class InputDesign:
         )
 
     def to_csv(self, path: str | Path) -> None:
-        """Write `t` [s], `q_ref` [m], `qd_ref` [m/s], `force` [N] with a header line: the whole file or none.
+        """Write `t` [s], `q_ref` [m], `qd_ref` [m/s], `force` [N] with a header line, atomically.
 
-        A drive that tracks a motion takes `q_ref` and `qd_ref`, with `force` as its feed-forward if it has one; for one
-        that takes a force, `force` is held from each sample to the next. Record the force that was applied in fact.
+        Pass `q_ref` and `qd_ref` to a drive that tracks a motion, with `force` as feed-forward; pass `force`, held from
+        each sample to the next, to a drive that takes a force. Record the force that was actually applied.
 
         **Raises:**
 
@@ -210,13 +219,163 @@ class InputDesign:
         with written_whole(path) as file:
             np.savetxt(file, columns, fmt="%.9g", delimiter=",", header="t,q_ref,qd_ref,force", comments="")
 
-    def __str__(self) -> str:
-        """A table of predicted errors against those of a plain sine, and remarks."""
-        width = max(len(name) for name in self.values)
-        lines = [f"{'':{width}}  {'value':>13}  {'std. error':>11}  {'in %':>8}  {'plain sine':>11}  unit"]
-        for name, value, error, plain, unit in self.rows():
-            share = f"{100 * error / abs(value):8.2g}" if value else f"{'-':>8}"
-            lines.append(f"{name:{width}}  {value:13.6g}  {error:11.2g}  {share}  {plain:11.2g}  {unit}")
-        used = ", ".join(f"{name} {100 * share:.0f} %" for name, share in self.used.items())
-        span = f"{len(self.best.t)} samples, {self.best.t[-1] - self.best.t[0]:g} s, noise {self.noise:g}; used: {used}"
-        return "\n".join([*lines, span, *self.remarks])
+
+@table_of.register
+def _(design: InputDesign) -> Table:
+    best = design.best
+    rows = [
+        (name, f"{value:.6g}", f"{error:.2g}", f"{100 * error / abs(value):.2g}" if value else "-", f"{sine:.2g}", unit)
+        for name, value, error, sine, unit in design.rows()
+    ]
+    head = ("parameter", "value", "standard error", "in %", "of a plain sine", "unit")
+    used = ", ".join(f"{name} {100 * share:.0f} %" for name, share in design.used.items())
+    title = f"{len(best.t)} samples, {best.t[-1] - best.t[0]:g} s, noise {design.noise:g}; used: {used}"
+    return Table(title, head, rows, design.remarks)
+
+
+class DrivenAxis(eqx.Module):
+    """A scene of one coordinate and one input, with its free numbers.
+
+    Numbers are relative: `x[i]` is the change of the i-th free number in units of `scale[i]`. Arrays of the same shapes
+    reuse compiled code.
+
+    - `scene`: the model.
+    - `start`: numbers that move with the free ones, by name.
+    - `slopes`: their derivatives by x, shape `[free]` each.
+    - `q0`: position at the start, where the axis rests, shape `[1]`.
+    - `noise`: standard deviation of one sample of the observed quantity, in its unit.
+    - `input_name`: the entry of the scene's params that is the force.
+    - `observe`: `observe(q, qd)`, the recorded quantity.
+    """
+
+    scene: Scene
+    start: dict[str, Array]
+    slopes: dict[str, Array]
+    q0: Float[Array, " one"]
+    noise: Float[Array, ""]
+    input_name: str = eqx.field(static=True)
+    observe: Callable[[Array, Array], Array] = eqx.field(static=True)
+
+    def at(self, x: Float[Array, " free"]) -> Scene:
+        """The scene with its free numbers moved by `x`."""
+        values = {name: start + jnp.sum(self.slopes[name] * x) for name, start in self.start.items()}
+        return replace_numbers(self.scene, join_entries(scene_numbers(self.scene), values))
+
+
+def motion_basis(
+    t: Float[np.ndarray, " time"], harmonics: int
+) -> tuple[Float[np.ndarray, "time weights"], Float[np.ndarray, "time weights"]]:
+    """Displacements and velocities whose sums are motions: sines, then cosines, faded in and out.
+
+    The k-th of either kind has k periods in the whole time. The fading is a polynomial of degree 5 with first two
+    derivatives zero at either end, so that each motion starts and ends in the same place, at rest, without
+    acceleration.
+    """
+    whole = t[-1] - t[0]
+    ends = np.minimum(t - t[0], t[-1] - t) / (_FADE * whole)
+    s = np.clip(ends, 0.0, 1.0)
+    side = np.where(t - t[0] < 0.5 * whole, 1.0, -1.0) / (_FADE * whole)
+    fade = (s**3 * (10.0 - 15.0 * s + 6.0 * s**2))[:, None]
+    slope = (30.0 * s**2 * (1.0 - s) ** 2 * side)[:, None]
+    rate = 2.0 * np.pi * np.arange(1, harmonics + 1) / whole
+    angle = np.outer(t - t[0], rate)
+    wave = np.hstack([np.sin(angle), np.cos(angle)])
+    wave_rate = np.hstack([rate * np.cos(angle), -rate * np.sin(angle)])
+    return fade * wave, slope * wave + fade * wave_rate
+
+
+def feed_forward(
+    axis: DrivenAxis, t: Float[Array, " time"], q: Float[Array, " time"], qd: Float[Array, " time"]
+) -> Float[Array, " time"]:
+    """Force, held from each sample to the next, for a motion of the axis; the last one is not used.
+
+    Inverse dynamics: the state of the friction follows from the motion alone. The force over a sample gives the change
+    of velocity over it, by the acceleration in the middle, which is linear in the force.
+
+    **Arguments:**
+
+    - `t`: times of the samples [s].
+    - `q`, `qd`: motion at the samples [m], [m/s].
+
+    **Returns:**
+
+    The force at each sample [N].
+    """
+    scene = axis.scene
+
+    def acceleration(force: float, t: Array, y: State) -> Array:
+        params: dict[str, object] = {**scene.params, axis.input_name: jnp.full((), force, q.dtype)}
+        driven = Scene(scene.lagrangian, params=params, effects=scene.effects)
+        return vector_field(t, y, driven).qd[0]
+
+    def advance(z: dict[str, object], sample: tuple[Array, ...]) -> tuple[dict[str, object], Array]:
+        start, step, q0, qd0, q1, qd1 = sample
+
+        def state(t: Array, z: dict[str, object]) -> State:
+            share = (t - start) / step
+            return State(jnp.reshape(q0 + share * (q1 - q0), (1,)), jnp.reshape(qd0 + share * (qd1 - qd0), (1,)), z)
+
+        end = z
+        if jtu.tree_leaves(z):
+            end = rosenbrock_step(
+                RODAS3, lambda t, z: vector_field(t, state(t, z), scene).z, start, step, z, pivot=True
+            ).y1
+        middle = start + 0.5 * step
+        y = state(middle, jtu.tree_map(lambda a, b: 0.5 * (a + b), z, end))
+        free = acceleration(0.0, middle, y)
+        return end, ((qd1 - qd0) / step - free) / (acceleration(1.0, middle, y) - free)
+
+    samples = (t[:-1], jnp.diff(t), q[:-1], qd[:-1], q[1:], qd[1:])
+    _, force = jax.lax.scan(advance, scene.initial_state(q[:1]), samples)
+    return jnp.concatenate([force, force[-1:]])
+
+
+def _record(
+    axis: DrivenAxis,
+    scene: Scene,
+    t: Float[Array, " time"],
+    force: Float[Array, " time"],
+    observe: Callable[[Array, Array], Array],
+    substeps: int = 1,
+) -> Float[Array, " time"]:
+    """The observed quantity under a force that is held from each sample to the next."""
+    return replay(scene, t, {axis.input_name: force}, axis.q0, jnp.zeros_like(axis.q0), substeps, observe)
+
+
+def driven_motion(
+    axis: DrivenAxis, t: Float[Array, " time"], force: Float[Array, " time"], substeps: int = 1
+) -> Float[Array, "2 time"]:
+    """Position and velocity of the model under a force, without feedback."""
+
+    def part(position: Array) -> Array:
+        return _record(axis, axis.scene, t, force, lambda q, qd: jnp.where(position, q[0], qd[0]), substeps)
+
+    return jax.vmap(part)(jnp.array([True, False]))
+
+
+def sensitivities(
+    axis: DrivenAxis, t: Float[Array, " time"], force: Float[Array, " time"]
+) -> tuple[Float[Array, " time"], Float[Array, "time free"]]:
+    """The observed quantity under a force, and its derivatives by the free numbers, in noise levels."""
+
+    def record(x: Array) -> Array:
+        return _record(axis, axis.at(x), t, force, axis.observe) / axis.noise
+
+    size = next(iter(axis.slopes.values())).shape[0]
+    zero, units = jnp.zeros(size, force.dtype), jnp.eye(size, dtype=force.dtype)
+    return jax.vmap(lambda unit: jax.jvp(record, (zero,), (unit,)), out_axes=(None, 1))(units)
+
+
+def relative_numbers(
+    values: Mapping[str, float], followed: Mapping[str, str], free: tuple[str, ...]
+) -> tuple[Float[np.ndarray, " free"], dict[str, np.ndarray]]:
+    """Units of the free numbers, and derivatives of all moving numbers by the free ones in these units.
+
+    The unit is the number itself, so that errors are relative; 1 for a number that is zero. A fixed number that is
+    limited by a free one moves with its limit, as in a fit.
+    """
+    scale = np.array([abs(values[name]) or 1.0 for name in free])
+    slopes: dict[str, np.ndarray] = {}
+    for name in values:  # limits come before what they limit
+        slopes[name] = scale * (np.array(free) == name) if name in free else slopes[followed[name]]
+    return scale, slopes

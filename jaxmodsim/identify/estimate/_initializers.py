@@ -1,10 +1,10 @@
-"""Where a search starts: many starts side by side, an easier problem first, or a few records at a time."""
+"""Initializers of a search: many starts in one batch, an easier problem first, or a few records at a time."""
 
 import abc
 import threading
 from collections.abc import Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,45 +17,59 @@ from ..._core.speed import cores
 from ._problem import FitProblem
 from ._search import SearchOptions, SearchState, solve, start_search, steps_side_by_side
 
-# Searches that are run as one.
+# Start of a search, and the root mean squares, in noise levels, at the ends of all trial starts, best first.
+Initialized: TypeAlias = tuple[Float[Array, " n"], tuple[float, ...]]
+# Number of searches in a compiled batch.
 _GROUP = 32
-# Share of the cost by which the fit from a smaller model must be better to be taken.
+# Share of the cost by which the fit from a smaller model must be better to be used.
 _BETTER = 1e-3
-# Rounds of several starts: share of the evaluations, and share of the starts that is kept after it.
+# Rounds of several starts: share of the evaluations, and share of the starts kept after it.
 _ROUNDS = ((0.25, 0.25), (0.25, 0.125), (1.0, 0.0))
 
 
 class AbstractInitializer(eqx.Module):
-    """How to find where a search starts."""
+    """A method for the start of a search."""
 
     @abc.abstractmethod
-    def initialize(
-        self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions
-    ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
-        """A better `x`, and the root mean squares, in noise levels, of all starts that were tried, best first."""
+    def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
+        """A better `x`, and the ends of all starts."""
+
+
+def as_initializers(initializer: object) -> tuple[AbstractInitializer, ...]:
+    """One initializer or several, as a tuple.
+
+    **Raises:**
+
+    - `ValueError` for anything else.
+    """
+    several = (initializer,) if isinstance(initializer, AbstractInitializer) else initializer
+    if not isinstance(several, tuple | list) or not all(isinstance(each, AbstractInitializer) for each in several):
+        raise ValueError(
+            f"initializer must be one such as Staged(), or several of them, but {initializer!r} was given."
+        )
+    return tuple(several)
 
 
 def run_initializers(
     initializers: AbstractInitializer | Sequence[AbstractInitializer], problem: FitProblem, options: SearchOptions
-) -> tuple[Float[Array, " n"], tuple[float, ...]]:
-    """Where the search starts after one initializer or several, each from where the one before it ended."""
+) -> Initialized:
+    """The start of the search by one initializer or several, each from the end of the previous one."""
     x, starts = problem.x0, ()
-    for each in (initializers,) if isinstance(initializers, AbstractInitializer) else initializers:
+    for each in as_initializers(initializers):
         x, starts = each.initialize(problem, x, options)
     return x, tuple(starts)
 
 
 class MultiStart(AbstractInitializer):
-    """Many searches side by side from starts that cover the neighbourhood of the given one; the best is taken.
+    """Many searches in one batch from starts around the current one; the best end is used.
 
     **Arguments:**
 
-    - `count`: number of starts, the given one among them, >= 1.
-    - `spread`: factor by which parameters that must be positive, and distances from limits, are drawn larger or smaller
-      than they start, uniformly in the logarithm, > 1. Parameters without limits are drawn within their own size of
-      where they start.
+    - `count`: number of starts, the current one included, >= 1.
+    - `spread`: largest factor or divisor of positive parameters, and of distances from limits, uniform in the
+      logarithm, > 1. Parameters without limits are drawn within their own size around the start.
     - `steps`: limit of evaluations of each search.
-    - `seed`: of the scrambled Sobol sequence that the starts are drawn from.
+    - `seed`: of the scrambled Sobol sequence of starts.
 
     **Raises:**
 
@@ -76,7 +90,7 @@ class MultiStart(AbstractInitializer):
             )
 
     def starts(self, problem: FitProblem, x: Float[Array, " n"]) -> Float[np.ndarray, "count n"]:
-        """Where the searches start; the first one at `x`."""
+        """The starts, the first one at `x`."""
         from scipy.stats import qmc  # most of a second to import, and only needed here
 
         size = len(problem.free.names)
@@ -97,12 +111,10 @@ class MultiStart(AbstractInitializer):
         drawn[0] = here
         return np.concatenate([drawn, np.broadcast_to(np.asarray(x[size:]), (self.count, x.shape[0] - size))], axis=1)
 
-    def initialize(
-        self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions
-    ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
+    def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
         """Search from all starts; the best end, and the root mean squares of all ends in noise levels, best first.
 
-        After a few evaluations the worse ones are given up, in two rounds.
+        The worse starts are dropped after a few evaluations, in two rounds.
         """
         state = starts_of(problem, jnp.asarray(self.starts(problem, x)))
         ends: list[np.ndarray] = []
@@ -121,14 +133,14 @@ class MultiStart(AbstractInitializer):
 def side_by_side(
     problem: FitProblem, axes: PyTree[int | None], state: SearchState, options: SearchOptions, steps: int
 ) -> SearchState:
-    """Go on with many searches, for at most so many evaluations each; Ctrl-C ends all with the best so far.
+    """Continue many searches, for at most `steps` evaluations each; Ctrl-C ends all with the best so far.
 
-    They go in groups of one size, shared out among threads, one for each core: a compiled loop over small states uses
-    one core, and groups of one size compile once.
+    They run in groups of one size, which compile once, on one thread for each core, since a compiled loop over small
+    states uses one core.
 
     **Arguments:**
 
-    - `axes`: which numbers of the problem differ from search to search, as for `equinox.filter_vmap`; None for none.
+    - `axes`: numbers of the problem that differ from search to search, as for `equinox.filter_vmap`; None for none.
     - `state`: with a leading axis of searches.
     """
     searches = state.x.shape[0]
@@ -148,7 +160,7 @@ def side_by_side(
 
     with ThreadPoolExecutor(cores()) as pool:
         try:
-            run(0, 1)  # compiles; the others find it done
+            run(0, 1)  # compiles once, for all threads
             list(pool.map(run, range(len(states)), [steps - 1, *(steps for _ in states[1:])]))
         except KeyboardInterrupt:
             stopped.set()
@@ -170,20 +182,20 @@ def problem_at(problem: FitProblem, axes: PyTree[int | None], rows: Array | int)
 
 
 class Continuation(AbstractInitializer):
-    """Fit with a larger number first, and bring it down: what is stiff or sharp becomes so little by little.
+    """Fit with a larger number first, and reduce it in stages, from a smooth problem to the stiff one.
 
-    Made for the width of `Regularized`, over which friction changes its sign: wide, the cost is smooth and has few
+    For the width of `Regularized`, over which friction changes its sign: a wide one makes the cost smooth, with few
     minima.
 
     **Arguments:**
 
     - `name`: name of the number, as `jaxmodsim.scene.scene_numbers` gives it: `"friction.width"`; it must not be free.
-    - `factor`: how many times larger it is at first, > 1.
-    - `stages`: number of fits before the one asked for, >= 1; the factor falls to 1 in equal ratios.
+    - `factor`: of the number in the first fit, > 1.
+    - `stages`: number of fits before the actual one, >= 1; the factor falls to 1 in equal ratios.
 
     **Raises:**
 
-    - `ValueError` for a number out of range, or (at the fit) a name that the scene has not, or that is free.
+    - `ValueError` for a number out of range, or (at the fit) an unknown or a free name.
     """
 
     name: str = eqx.field(static=True)
@@ -197,12 +209,10 @@ class Continuation(AbstractInitializer):
                 f"Continuation needs stages >= 1 and factor > 1, but they are {self.stages} and {self.factor}."
             )
 
-    def initialize(
-        self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions
-    ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
-        """Where the last but one of the fits ended."""
+    def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
+        """The end of the last fit before the actual one."""
         if self.name in problem.free.names:
-            raise ValueError(f"Continuation in {self.name}: a number that is free cannot be given.")
+            raise ValueError(f"Continuation in {self.name}, which is free: name a fixed number.")
         for stage in range(self.stages):
             factor = self.factor ** (1 - stage / self.stages)
             x = solve(problem.with_number(self.name, factor), x, options).state.x
@@ -210,44 +220,42 @@ class Continuation(AbstractInitializer):
 
 
 class FromSmaller(AbstractInitializer):
-    """Search also from where a model with fewer parameters ended, so that one with more is not left behind it.
+    """Search also from the fit of a model with fewer parameters, so that a larger model does not fit worse.
 
-    Its parameters are taken over, and the others start as they were given; or at their limit by another one, as
-    Fs = Fc, where they have no effect and the model is the smaller one.
+    The other parameters start at their own start values, or at their limit by another parameter, such as Fs = Fc, where
+    they have no effect.
 
-    - `values`: those that were fitted, by the last part of their names, as Fc in friction.Fc.
+    - `values`: the fitted ones, by the last part of their names, as Fc in friction.Fc.
     """
 
     values: dict[str, Array]
 
-    def initialize(
-        self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions
-    ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
-        """The best of the ends."""
+    def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
+        """The best end."""
         size = len(problem.free.names)
         here = {name: self.values[last_part(name)] for name in problem.free.names if last_part(name) in self.values}
         over = np.asarray(problem.free.coordinates(problem.at(x).values | here))
-        rest = np.array([name not in here and problem.free.limit_of(name) is not None for name in problem.free.names])
+        rest = np.array([name not in here and isinstance(problem.free[name].base, str) for name in problem.free.names])
         own = np.asarray(x)[size:]
         starts = [x, *(on_device(np.concatenate([each, own])) for each in (over, np.where(rest, 0.0, over)))]
         ends = [solve(problem, each, options).state for each in (starts if np.any(rest) else starts[:2])]
         costs = [float(np.nan_to_num(float(end.cost), nan=np.inf)) for end in ends]
-        # An end that is no better is the same fit, which is then the one without the smaller model.
+        # Without a real gain, the end from the own start is the fit.
         best = int(np.argmin(costs))
         return ends[best if costs[best] < (1 - _BETTER) * costs[0] else 0].x, ()
 
 
 def last_part(name: str) -> str:
-    """Of the name of a number: Fc of friction.Fc."""
+    """Last part of the name of a number: Fc of friction.Fc."""
     return name.rsplit(".", 1)[-1]
 
 
 class Stochastic(AbstractInitializer):
-    """Gradient steps on a few runs at a time, for more records than one would run in every iteration.
+    """Stochastic gradient steps on a few runs at a time, for many records.
 
-    Each step takes the gradient of the mean loss of `batch` runs, drawn without replacement until all have had their
-    turn, in the coordinates in which limits are bounds. The fit that follows uses all records; with `max_steps=1` it
-    only evaluates them.
+    Each step uses the gradient of the mean loss of `batch` runs, drawn without replacement until all are used, in the
+    coordinates in which limits are bounds. The fit that follows uses all records; with `max_steps=1` it only evaluates
+    them.
 
     **Arguments:**
 
@@ -258,8 +266,7 @@ class Stochastic(AbstractInitializer):
 
     **Raises:**
 
-    - `ValueError` for a number out of range, or (at the fit) windows that are linked, or more runs in a batch than
-      there are.
+    - `ValueError` for a number out of range, or (at the fit) linked windows, or a batch larger than the number of runs.
     """
 
     optimiser: Hashable = eqx.field(static=True)
@@ -268,19 +275,17 @@ class Stochastic(AbstractInitializer):
     seed: int = eqx.field(static=True, default=0)
 
     def __check_init__(self) -> None:
-        """Refuse what is no optimiser, and numbers out of range."""
+        """Refuse other objects than optimisers, and numbers out of range."""
         if not (hasattr(self.optimiser, "init") and hasattr(self.optimiser, "update")):
             raise ValueError(f"optimiser must be one of optax, as optax.adam(0.05), but it is {self.optimiser!r}.")
         if self.batch < 1 or self.steps < 1:
             raise ValueError(f"Stochastic needs batch >= 1 and steps >= 1, but they are {self.batch} and {self.steps}.")
 
-    def initialize(
-        self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions
-    ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
-        """Where the last step ended; Ctrl-C ends at the step before."""
+    def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
+        """The end of the last step; Ctrl-C ends at the previous step."""
         if problem.jump is not None:
             raise ValueError(
-                "Stochastic() draws runs by themselves: give MultipleShooting no jump, or leave Stochastic out."
+                "Stochastic() needs independent runs: pass MultipleShooting without jump, or no Stochastic()."
             )
         if self.batch > problem.count:
             raise ValueError(f"Stochastic() draws {self.batch} runs at a time, but there are {problem.count}.")
@@ -302,13 +307,13 @@ class Stochastic(AbstractInitializer):
                     shown = {name: float(values[name]) for name in problem.free.names}
                     options.progress(number + 1, float(jnp.sqrt(2 * cost)), shown)
         except KeyboardInterrupt:
-            pass  # the fit that follows goes on from here, and may be interrupted itself
+            pass  # the fit continues from here
         return x, ()
 
 
 @eqx.filter_jit
 def _gradient(problem: FitProblem, x: Float[Array, " n"], drawn: Array) -> tuple[Array, Array]:
-    """Mean loss of a sample of these runs, and its gradient by all of x."""
+    """Mean loss of the drawn runs per sample, and its gradient by all of x."""
     shared, own = problem.split(x)
     some = eqx.tree_at(
         lambda p: (p.base, p.runs, p.known),

@@ -1,7 +1,8 @@
-"""From a scene, records and what is asked to the arrays of a `FitProblem`."""
+"""From a scene, records and options to the arrays of a `FitProblem`."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeAlias
 
 import equinox as eqx
@@ -11,26 +12,27 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float
 
-from ..._core.arguments import as_float, as_names, as_reals
+from ..._core.arguments import as_float, as_mapping, as_names, as_reals, as_whole
 from ..._core.arrays import on_device
 from ..._core.parameters import Range, check_ranges, modules_of
 from ...scene import Scene, State, check_scene, scene_numbers, scene_ranges
-from ..data._record import Record, Windows, cut, runs_of, slip_channel, start_errors, start_state
+from ..data._record import Record, Windows, cut, runs_of, slip_channel
+from ..data._signals import start_errors, start_state
 from ..model._engines import DELAY, Controller, EventEngine, ReplayEngine
-from ..model._observe import Observable, by_channel, check_observables, coordinates_seen
+from ..model._observe import Observable, Observables, by_channel, check_observables, coordinates_seen
 from ..model._parameters import FreeParameters, chosen_entries, split_entries, split_ranges
-from ._problem import AbstractLoss, FitProblem, Prior, local_names
+from ._problem import AbstractLoss, FitProblem, Prior, SquaredLoss, local_names
 from ._search import SearchResult, channels_seen
 
-# Mode changes of one run by events that the arrays of a fit have room for.
+# Largest number of mode changes in one run by events.
 _MAX_EVENTS = 1024
-# Absolute tolerance of runs by events against the relative one.
+# Absolute tolerance of runs by events, relative to the relative one.
 _ATOL_SHARE = 1e-3
-# How many times more integration steps show what the step makes of the output.
+# Factor of the integration steps that shows their error in the output.
 _FINER = 4
 
-# Standard errors by which the velocity at the start may differ from what the first samples show: so many that what they
-# say counts hardly twice, beside the fit to them.
+# Standard deviation of the velocity at the start around that of the first samples, in its standard errors: large
+# enough that the samples, which are fitted as well, hardly count twice.
 _DOUBT = 4.0
 
 # Coordinates or velocities at the first sample, shape `[dof]` or `[records, dof]`.
@@ -39,17 +41,16 @@ StartState: TypeAlias = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[Arra
 
 @dataclass(frozen=True)
 class MultipleShooting:
-    """Multiple shooting: a record is run in windows, each from a state of its own that is fitted, too.
+    """Multiple shooting: a record is run in windows, each from its own initial state, which is fitted, too.
 
-    For records so long, or motions so unstable, that a run from the first sample to the last loses its way.
+    For records too long, or motions too unstable, for one run from the first sample to the last.
 
     **Arguments:**
 
     - `window`: length [s].
     - `jump`: standard deviations of the jumps of positions [m or rad] and of velocities [m/s or rad/s] from the end of
-      one window to the start of the next, both > 0: what the model may have wrong over one window, and what is given
-      to disturbances. The states of friction laws count as positions. None: the windows know nothing of each other, and
-      friction laws start unloaded.
+      one window to the start of the next, both > 0: the error of the model and of disturbances over one window. The
+      states of friction laws count as positions. None: the windows are independent, and friction laws start unloaded.
     """
 
     window: float
@@ -61,36 +62,51 @@ class MultipleShooting:
             raise ValueError(f"jump must be two numbers > 0, of positions and of velocities, but it is {self.jump!r}.")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """What `fit` was asked for, beside scene, records and names; see there."""
+class FitOptions(eqx.Module):
+    """The arguments of `fit` that define the problem, converted and checked; see there."""
 
     observe: Observable | Mapping[str, Observable]
-    q0: StartState | None
-    qd0: StartState | None
-    limits: Mapping[str, tuple[float | None, float | None]]
-    loss: AbstractLoss
-    substeps: int
-    accuracy: float
-    delay: Mapping[str, float] = field(default_factory=dict)
-    passive: tuple[str, ...] = ()
-    prior: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    q0: StartState | None = None
+    qd0: StartState | None = None
+    delay: Mapping[str, float] = eqx.field(
+        default=None, converter=partial(as_mapping, name="delay", example="{'u': 1e-3}")
+    )
+    limits: Mapping[str, tuple[float | None, float | None]] = eqx.field(
+        default=None, converter=partial(as_mapping, name="limits", example="{'m': (0.0, 5.0)}")
+    )
+    passive: tuple[str, ...] = eqx.field(default=(), converter=partial(as_names, name="passive"))
+    prior: Mapping[str, tuple[float, float]] = eqx.field(
+        default=None, converter=partial(as_mapping, name="prior", example="{'m': (95.0, 5.0)}")
+    )
+    loss: AbstractLoss = eqx.field(default=None, converter=lambda loss: SquaredLoss() if loss is None else loss)
     controller: Controller | None = None
     shooting: MultipleShooting | None = None
+    substeps: int = eqx.field(default=1, converter=partial(as_whole, name="substeps"))
+    accuracy: float = eqx.field(default=1e-8, converter=partial(as_float, name="accuracy", lower=0.0))
+
+    def __check_init__(self) -> None:
+        """Refuse objects of another kind."""
+        for name, value, kind, words in (
+            ("loss", self.loss, AbstractLoss, "a loss such as Huber()"),
+            ("controller", self.controller, Controller | None, "a Controller"),
+            ("shooting", self.shooting, MultipleShooting | None, "a MultipleShooting"),
+        ):
+            if not isinstance(value, kind):
+                raise ValueError(f"{name} must be {words}, but {value!r} was given.")
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A problem, the records and windows behind it, units by name, and the channels whose noise was given."""
+    """A problem, its records and windows, units by name, and the channels with known noise."""
 
     problem: FitProblem
     records: tuple[Record, ...]
     windows: Windows
     units: dict[str, str]
-    given: frozenset[str]
+    known_noise: frozenset[str]
 
 
-def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str], settings: Settings) -> Prepared:
+def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str], options: FitOptions) -> Prepared:
     """Check everything and build the problem.
 
     **Raises:**
@@ -101,26 +117,26 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
     _check_inputs(scene, several)
     for _, module in modules_of(scene):
         check_ranges(module)
-    states = _states(scene, several, settings)
-    observables = by_channel(settings.observe, several)
+    states = _states(scene, several, options)
+    observables = by_channel(options.observe, several)
     check_observables(observables, scene, _first(states))
     own = local_names(_first(states))
-    local, shared = _sorted_out(free, own)
-    if settings.shooting is not None:
-        shot = settings.shooting
-        local = tuple(name for name in own if shot.jump is not None or not name.startswith("z0"))
-    unknown = _unknown(settings, observables, own, local)
-    numbers, ranges = _numbers(scene, several, settings)
+    local, shared = _split_free(free, own)
+    if options.shooting is not None:
+        linked = options.shooting.jump is not None
+        local = tuple(name for name in own if linked or not name.startswith("z0"))
+    unknown = _unknown(options, observables, own, local)
+    numbers, ranges = _numbers(scene, several, options)
     single = split_entries(numbers)
     whole = scene_numbers(scene)
     chosen = shared if isinstance(shared, str) else chosen_entries({**whole, **numbers}, shared)
     driven = sorted(set(chosen) & set(several[0].inputs))
     if driven:
         raise ValueError(f"{driven[0]} is driven by the record and cannot be free.")
-    parameters = FreeParameters.of(single, ranges, chosen, _passive(settings.passive, numbers))
-    windows = cut(several, None if settings.shooting is None else settings.shooting.window)
+    parameters = FreeParameters.of(single, ranges, chosen, _passive(options.passive, numbers))
+    windows = cut(several, None if options.shooting is None else options.shooting.window)
     base = _bases(scene, several, windows, states, observables)
-    engine = _engine(scene, several, settings, observables, states.q.shape[1])
+    engine = _engine(scene, several, options, observables, states.q.shape[1])
     names = (*dict(observables), *(slip_channel(x) for x in dict.fromkeys(e for r in several for e in r.slips)))
     noise = {name: on_device(_level(name, several)) for name in names}
     problem = FitProblem(
@@ -130,15 +146,15 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
         base,
         runs_of(several, windows),
         noise,
-        settings.loss,
-        _prior(settings.prior, parameters.names),
-        _jump(settings.shooting, windows, base),
+        options.loss,
+        _prior(options.prior, parameters.names),
+        _jump(options.shooting, windows, base),
         len(unknown),
         _shown_by_opening(several, observables, (*local, *unknown), unknown, states.q.shape[1]),
     )
-    given = frozenset(name for record in several for name in record.noise)
+    known = frozenset(name for record in several for name in record.noise)
     units = {name: allowed.unit for name, allowed in ranges.items()}
-    return Prepared(problem, several, windows, units, given)
+    return Prepared(problem, several, windows, units, known)
 
 
 def _several(records: object) -> tuple[Record, ...]:
@@ -173,23 +189,20 @@ def _check_inputs(scene: Scene, records: tuple[Record, ...]) -> None:
                 )
 
 
-def _states(scene: Scene, records: tuple[Record, ...], settings: Settings) -> State:
+def _states(scene: Scene, records: tuple[Record, ...], options: FitOptions) -> State:
     """Initial states of the records, with a leading axis of records."""
-    count = len(records)
-    given = {"q0": settings.q0, "qd0": settings.qd0}
-    given = {name: x if x is None else as_reals(x, name=name) for name, x in given.items()}
-    sizes = {np.shape(x)[-1] for x in given.values() if x is not None and np.ndim(x) > 0}
-    dof = max(sizes, default=1)
-    observables = by_channel(settings.observe, records)
+    count, known = len(records), {"q0": options.q0, "qd0": options.qd0}
+    known = {name: x if x is None else as_reals(x, name=name) for name, x in known.items()}
+    dof = max((np.shape(x)[-1] for x in known.values() if x is not None and np.ndim(x) > 0), default=1)
+    observables = by_channel(options.observe, records)
     measured = [np.stack(each) for each in zip(*(measured_start(x, observables, dof) for x in records), strict=True)]
     starts = []
-    for value, seen in zip(given.values(), measured, strict=True):
-        array = seen if value is None else value
-        fine = array.shape in ((dof,), (count, dof)) and np.isfinite(array).all()
-        if not fine:
+    for value, shown in zip(known.values(), measured, strict=True):
+        array = shown if value is None else value
+        if array.shape not in ((dof,), (count, dof)) or not np.isfinite(array).all():
             raise ValueError(
-                f"q0 and qd0 must be finite and of one shape [dof] or [records, dof], but q0 = {settings.q0} and"
-                f" qd0 = {settings.qd0}."
+                f"q0 and qd0 must be finite and of one shape [dof] or [records, dof], but q0 = {options.q0} and"
+                f" qd0 = {options.qd0}."
             )
         starts.append(np.broadcast_to(array, (count, dof)))
     q, qd = (on_device(np.array(x, jnp.result_type(float))) for x in starts)
@@ -205,30 +218,30 @@ def initial_states(scene: Scene, q: Float[Array, "runs dof"], qd: Float[Array, "
 
 
 def _unknown(
-    settings: Settings, observables: tuple[tuple[str, Observable], ...], own: tuple[str, ...], local: tuple[str, ...]
+    options: FitOptions, observables: Observables, own: tuple[str, ...], local: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """Names of the coordinates and velocities at the first sample that a channel shows and no one gave."""
-    if settings.shooting is not None:
+    """Names of the unknown coordinates and velocities at the first sample that a channel shows."""
+    if options.shooting is not None:
         return ()
     dof = sum(name.startswith("q0[") for name in own)
     seen = set(coordinates_seen(observables, dof).values())
     shown = {f"q0[{i}]": {f"q[{i}]"} for i in range(dof)} | {f"qd0[{i}]": {f"q[{i}]", f"qd[{i}]"} for i in range(dof)}
-    given = {"q0": settings.q0 is not None, "qd0": settings.qd0 is not None}
+    known = {"q0": options.q0 is not None, "qd0": options.qd0 is not None}
     return tuple(
-        name for name, by in shown.items() if by & seen and name not in local and not given[name.partition("[")[0]]
+        name for name, by in shown.items() if by & seen and name not in local and not known[name.partition("[")[0]]
     )
 
 
 def _shown_by_opening(
     records: tuple[Record, ...],
-    observables: tuple[tuple[str, Observable], ...],
+    observables: Observables,
     local: tuple[str, ...],
     unknown: tuple[str, ...],
     dof: int,
 ) -> dict[str, Array]:
-    """What the first samples of positions show of velocities that no one gave; see `FitProblem.known`.
+    """Knowledge of unknown velocities from the first samples of positions; see `FitProblem.known`.
 
-    A machine that stands still forgets its first velocity at once: nothing else would hold it in the search.
+    It holds them in the search: a machine in stick loses its first velocity at once, so no other sample shows it.
     """
     known = {}
     for channel, seen in coordinates_seen(observables, dof).items():
@@ -246,8 +259,8 @@ def _first(states: State) -> State:
     return jax.tree.map(lambda x: on_device(np.asarray(x)[0]), states)
 
 
-def _sorted_out(free: Sequence[str], own: tuple[str, ...]) -> tuple[tuple[str, ...], Sequence[str]]:
-    """Names of initial states among `free`, and the others."""
+def _split_free(free: Sequence[str], own: tuple[str, ...]) -> tuple[tuple[str, ...], Sequence[str]]:
+    """Names of initial states in `free`, and the other names."""
     if isinstance(free, str):
         return (), free  # refused where it is used
     free = as_names(free, name="free")
@@ -260,14 +273,14 @@ def _sorted_out(free: Sequence[str], own: tuple[str, ...]) -> tuple[tuple[str, .
 
 
 def _numbers(
-    scene: Scene, records: tuple[Record, ...], settings: Settings
+    scene: Scene, records: tuple[Record, ...], options: FitOptions
 ) -> tuple[dict[str, Array], dict[str, Range]]:
-    """All numbers that may be free, delays included, and their ranges, entry by entry."""
+    """All numbers that can be free, delays included, and their ranges, entry by entry."""
     whole = scene_numbers(scene)
     ranges = split_ranges(whole, scene_ranges(scene))
-    delays = {name: settings.delay.get(name, 0.0) for name in records[0].inputs}
-    for name, given in settings.delay.items():
-        late = as_float(given, name=f"delay of {name!r}")
+    delays = {name: options.delay.get(name, 0.0) for name in records[0].inputs}
+    for name, delay in options.delay.items():
+        late = as_float(delay, name=f"delay of {name!r}")
         if name not in delays or late < 0:
             raise ValueError(
                 f"delay of {name!r} is {late!r}, but it must be a time >= 0 of one of the inputs"
@@ -275,8 +288,12 @@ def _numbers(
             )
     numbers = split_entries(whole) | {DELAY + name: on_device(float(late)) for name, late in delays.items()}
     ranges |= {DELAY + name: Range("s", 0.0) for name in delays}
-    for name, span in settings.limits.items():
-        low, high = _limits(name, span)
+    for name, span in options.limits.items():
+        if not isinstance(span, tuple | list) or len(span) != 2:
+            raise ValueError(
+                f"limits of {name!r} must be (lower, upper), None for none, as in (0.0, None), but {span!r} was given."
+            )
+        low, high = (None if x is None else as_float(x, name=f"limits of {name!r}") for x in span)
         upper, _, base = name.partition("/")
         if base and upper in ranges and ranges[upper].lower == base:
             ranges[upper] = replace(ranges[upper], most=high)
@@ -285,7 +302,7 @@ def _numbers(
             raise ValueError(f"limits: {name} is no number of the scene; there are: {', '.join(numbers)}.")
         declared = ranges.get(name, Range(""))
         if isinstance(declared.lower, str) and low is not None:
-            raise ValueError(f"limits: {name} is limited by {declared.lower} already.")
+            raise ValueError(f"limits: {name} is already limited by {declared.lower}.")
         if low is not None and (declared.lower is None or float(low) >= float(declared.lower)):
             declared = replace(declared, lower=float(low), strict=low == 0)
         if high is not None and (declared.upper is None or float(high) <= declared.upper):
@@ -312,7 +329,7 @@ def _bases(
     records: tuple[Record, ...],
     windows: Windows,
     states: State,
-    observables: tuple[tuple[str, Observable], ...],
+    observables: Observables,
 ) -> State:
     """Initial state of each run: that of its record, or what was measured where a window begins."""
     dof = states.q.shape[1]
@@ -332,61 +349,50 @@ def _bases(
 def _engine(
     scene: Scene,
     records: tuple[Record, ...],
-    settings: Settings,
-    observables: tuple[tuple[str, Observable], ...],
+    options: FitOptions,
+    observables: Observables,
     dof: int,
 ) -> ReplayEngine | EventEngine:
     linear = records[0].linear
-    delays = {DELAY + name: on_device(float(late)) for name, late in settings.delay.items()}
+    delays = {DELAY + name: on_device(float(late)) for name, late in options.delay.items()}
     slips = tuple(dict.fromkeys(effect for record in records for effect in record.slips))
     fixed_steps = not scene.mode_names or (not scene.constraints and set(scene.mode_widths(dof)) == {1})
     if fixed_steps and not slips:
-        return ReplayEngine(scene, delays, settings.controller, observables, linear, settings.substeps)
-    if settings.controller is not None:
+        return ReplayEngine(scene, delays, options.controller, observables, linear, options.substeps)
+    if options.controller is not None:
         raise ValueError(
             "A controller runs with fixed steps, which pass stick and slip along a line, but neither constraints, nor"
             " slip in a plane, nor slip instants in a record: wrap the laws, as in Regularized(law, width)."
         )
     return EventEngine(
-        scene, delays, observables, linear, slips, settings.accuracy, _ATOL_SHARE * settings.accuracy, _MAX_EVENTS
+        scene, delays, observables, linear, slips, options.accuracy, _ATOL_SHARE * options.accuracy, _MAX_EVENTS
     )
 
 
 def _level(channel: str, records: tuple[Record, ...]) -> float:
-    """Noise level that was given, or to begin with how much the channel changes at all."""
-    given = [record.noise[channel] for record in records if channel in record.noise]
-    if given:
-        if len(set(given)) > 1:
-            raise ValueError(f"noise of {channel!r} differs between the records: {given}. Give one for all of them.")
-        return given[0]
+    """Known noise level, or the standard deviation of the channel to begin with."""
+    known = [record.noise[channel] for record in records if channel in record.noise]
+    if known:
+        if len(set(known)) > 1:
+            raise ValueError(f"noise of {channel!r} differs between the records: {known}. Pass one for all of them.")
+        return known[0]
     values = [record.channels[channel] for record in records if channel in record.channels]
-    # Of instants, what they would be off by if each came one sample late.
+    # The interval of the samples, for slip instants.
     size = float(np.std(np.concatenate(values))) if values else float(np.median(np.diff(records[0].t)))
     return size or 1.0
 
 
-def _limits(name: str, span: object) -> tuple[float | None, float | None]:
-    """Lower and upper limit of a number, either of which may be None."""
-    if not isinstance(span, tuple | list) or len(span) != 2:
-        raise ValueError(
-            f"limits of {name!r} must be (lower, upper), None for none, as in (0.0, None), but {span!r} was given."
-        )
-    low, high = (None if x is None else as_float(x, name=f"limits of {name!r}") for x in span)
-    return low, high
-
-
 def _prior(prior: Mapping[str, tuple[float, float]], names: tuple[str, ...]) -> Prior:
-    for name, given in prior.items():
+    mean, weight = np.zeros(len(names)), np.zeros(len(names))
+    for name, pair in prior.items():
         if name not in names:
             raise ValueError(f"prior names {name!r}, but the free parameters are: {', '.join(names)}.")
-        pair = isinstance(given, tuple | list) and len(given) == 2
-        deviation = [as_float(x, name=f"prior of {name!r}") for x in given][1] if pair else 0.0
-        if not deviation > 0:
-            raise ValueError(f"prior of {name} must be a mean and a standard deviation > 0, but it is {prior[name]}.")
-    return Prior(
-        on_device([float(prior[name][0]) if name in prior else 0.0 for name in names]),
-        on_device([1 / float(prior[name][1]) if name in prior else 0.0 for name in names]),
-    )
+        numbers = [as_float(x, name=f"prior of {name!r}") for x in pair] if isinstance(pair, tuple | list) else []
+        if len(numbers) != 2 or not numbers[1] > 0:
+            raise ValueError(f"prior of {name} must be a mean and a standard deviation > 0, but it is {pair}.")
+        mean[names.index(name)], weight[names.index(name)] = numbers[0], 1 / numbers[1]
+    dtype = jnp.result_type(float)
+    return Prior(on_device(mean.astype(dtype)), on_device(weight.astype(dtype)))
 
 
 def _jump(shooting: MultipleShooting | None, windows: Windows, base: State) -> Array | None:
@@ -404,17 +410,14 @@ def _jump(shooting: MultipleShooting | None, windows: Windows, base: State) -> A
 
 
 def step_error(search: SearchResult) -> float | None:
-    """Root mean square by which the model's output moves with four times as many integration steps, over the noise.
+    """Root mean square change of the output with four times as many integration steps.
 
-    None where there are no such steps, or several channels.
+    None without such steps, or for several channels.
     """
     problem = search.problem
     if not isinstance(problem.engine, ReplayEngine) or len(problem.noise) > 1:
         return None
-    engine = problem.engine
-    finer = ReplayEngine(
-        engine.model, engine.delays, engine.controller, engine.observables, engine.linear, _FINER * engine.substeps
-    )
+    finer = replace(problem.engine, substeps=_FINER * problem.engine.substeps)
     fine = channels_seen(eqx.tree_at(lambda p: p.engine, problem, finer), search.state.x)
     name, weight = next((name, np.asarray(weight)) for name, weight in problem.columns.items())
     coarse = np.asarray(search.state.residual)[: problem.samples].reshape(weight.shape) * float(problem.noise[name])
@@ -422,12 +425,10 @@ def step_error(search: SearchResult) -> float | None:
     return float(np.sqrt(np.sum(moved[weight > 0] ** 2) / np.sum(weight)))
 
 
-def measured_start(
-    record: Record, observables: tuple[tuple[str, Observable], ...], dof: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates and velocities at the first sample, as far as they were measured; the others are zero."""
+def measured_start(record: Record, observables: Observables, dof: int) -> tuple[np.ndarray, np.ndarray]:
+    """Measured coordinates and velocities at the first sample; zero for the others."""
     q, qd = np.zeros(dof), np.zeros(dof)
-    # Velocities last: where one was measured, it is not the slope of a position.
+    # Velocities last: a measured one replaces the slope of a position.
     for channel, name in sorted(coordinates_seen(observables, dof).items(), key=lambda each: each[1]):
         i = int(name.split("[")[1][:-1])
         if channel in record.channels and i < dof:

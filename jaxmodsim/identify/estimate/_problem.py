@@ -1,7 +1,7 @@
-"""The problem of a fit as arrays: coordinates in, weighted residuals and their Jacobian out; what residuals cost."""
+"""The problem of a fit as arrays, from coordinates to weighted residuals and their Jacobian, and the losses."""
 
 import abc
-import re
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..._core.arrays import on_device
 from ..._core.parameters import Number, check_ranges, parameter
@@ -27,7 +27,6 @@ else:
 _Rows = TypeVar("_Rows", Array, np.ndarray)
 # Inverse standard deviation of a start that is held, in noise levels.
 _HELD = 1e6
-_LOCAL = re.compile(r"(q0|qd0)\[(\d+)\]|z0\.(.+?)(?:\[(\d+)\])?")
 
 
 class AbstractLoss(eqx.Module):
@@ -46,10 +45,10 @@ class AbstractLoss(eqx.Module):
     def weighted(
         self, residual: Float[Array, " m"], jacobian: Float[Array, "m n"]
     ) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
-        """Residual and Jacobian whose least squares have the gradient of the cost and nearly its curvature.
+        """Residual and Jacobian of a least-squares problem with the gradient of the cost and nearly its curvature.
 
         Triggs et al. 2000, Bundle adjustment, section 4.3, without the second derivative of rho, which is negative
-        and may take the definiteness away.
+        and may make the matrix indefinite.
         """
         if not self.robust:
             return residual, jacobian
@@ -68,7 +67,7 @@ class SquaredLoss(AbstractLoss):
 
 
 class Huber(AbstractLoss):
-    """Squares up to `limit` noise levels and the distance beyond: outliers pull with a bounded force.
+    """Quadratic up to `limit` noise levels and linear beyond: the influence of outliers is bounded.
 
     **Arguments:**
 
@@ -89,7 +88,7 @@ class Huber(AbstractLoss):
 
 
 class Cauchy(AbstractLoss):
-    """`limit^2 log(1 + s/limit^2)`: far outliers have no pull at all.
+    """`limit^2 log(1 + s/limit^2)`: the influence of far outliers vanishes.
 
     **Arguments:**
 
@@ -116,57 +115,28 @@ class Box(NamedTuple):
     longest: Float[Array, " n"]
 
 
-def local_names(y: State) -> tuple[str, ...]:
-    """Names of the numbers of an initial state: `q0[0]`, `qd0[0]`, `z0.friction`."""
+def _flat_names(y: State) -> list[str]:
+    """Name of each entry of the flattened state; "" for those that cannot be free."""
     dof = y.q.shape[0]
     names = [f"q0[{i}]" for i in range(dof)] + [f"qd0[{i}]" for i in range(dof)]
-    for effect, z in y.z.items():
-        if isinstance(z, jnp.ndarray):
+    for effect, z in sorted(y.z.items()):
+        if isinstance(z, jnp.ndarray) and z.ndim < 2:
             names += [f"z0.{effect}"] if z.ndim == 0 else [f"z0.{effect}[{i}]" for i in range(z.shape[0])]
-    return tuple(names)
-
-
-def placed(base: State, names: tuple[str, ...], values: Float[Array, " local"]) -> State:
-    """The state with the numbers of these names replaced."""
-    q, qd, z = base.q, base.qd, dict(base.z)
-    for i, name in enumerate(names):
-        match = _LOCAL.fullmatch(name)
-        assert match is not None
-        if match[1] == "q0":
-            q = q.at[int(match[2])].set(values[i])
-        elif match[1] == "qd0":
-            qd = qd.at[int(match[2])].set(values[i])
         else:
-            effect = match[3]
-            z[effect] = values[i] if match[4] is None else z[effect].at[int(match[4])].set(values[i])
-    return State(q, qd, z)
+            names += [""] * sum(jnp.size(leaf) for leaf in jtu.tree_leaves(z))
+    return names
 
 
-def taken(state: State, names: tuple[str, ...]) -> Float[Array, " local"]:
-    """The numbers of these names; the inverse of `placed`."""
-    numbers = []
-    for name in names:
-        match = _LOCAL.fullmatch(name)
-        assert match is not None
-        if match[1] is not None:
-            numbers.append((state.q if match[1] == "q0" else state.qd)[int(match[2])])
-        else:
-            z = state.z[match[3]]
-            numbers.append(z if match[4] is None else z[int(match[4])])
-    return jnp.stack(numbers) if numbers else jnp.zeros(0)
+def local_names(y: State) -> tuple[str, ...]:
+    """Names of the numbers of an initial state: `q0[0]`, `qd0[0]`, `z0.friction`."""
+    return tuple(filter(None, _flat_names(y)))
 
 
 class Prior(eqx.Module):
-    """What was known before: a mean and the inverse of a standard deviation for each parameter, 0 where nothing was."""
+    """Prior knowledge: a mean and the inverse of a standard deviation for each parameter, 0 for none."""
 
     mean: Float[Array, " free"]
     weight: Float[Array, " free"]
-
-
-def _without_dust(jacobian: Float[Array, "rows n"]) -> Float[Array, "rows n"]:
-    """The Jacobian with zeros in columns of nothing but rounding: of a velocity that stick takes away at the start."""
-    size = jnp.sqrt(jnp.sum(jacobian**2, axis=0))
-    return jnp.where(size > float(jnp.finfo(size.dtype).eps) ** 1.5 * jnp.max(size), jacobian, 0.0)
 
 
 class FitProblem(eqx.Module):
@@ -175,16 +145,15 @@ class FitProblem(eqx.Module):
     The vector x holds the coordinates of the free parameters, then, run by run, the free numbers of the initial states
     as differences from `base`.
 
-    - `engine`: `engine(values, start, run)`, what the model sees.
+    - `engine`: `engine(values, start, run)`, the output of the model.
     - `free`: the parameters. `local`: names of the free numbers of each initial state; the last `nuisance` of them are
-      fitted because no one knows them, and not reported.
-    - `base`: initial states, with a leading axis of runs; None where a model has none.
+      unknown, so they are fitted, but not reported.
+    - `base`: initial states, with a leading axis of runs; None for a model without states.
     - `runs`: the samples. `noise`: standard deviation of each channel.
     - `jump`: inverse standard deviation of the jump of each number of the state from one window to the next, 0 where
-      windows do not go on; shape `[runs - 1, numbers]`; None where there are no windows.
-    - `known`: of the free numbers of the initial states, what the first samples of a channel show: inverse standard
-      deviation of their difference from `base` times the noise of that channel, 0 where nothing is known; by channel,
-      shape `[runs, local]`.
+      a window does not continue; shape `[runs - 1, numbers]`; None without windows.
+    - `known`: knowledge of the initial states from the first samples of a channel: inverse standard deviations of the
+      differences from `base`, times the noise of that channel, 0 for none; by channel, shape `[runs, local]`.
     """
 
     engine: Any
@@ -201,25 +170,54 @@ class FitProblem(eqx.Module):
 
     @property
     def start_weights(self) -> Float[Array, "runs local"] | None:
-        """Inverse standard deviations of the free numbers of the initial states; None where nothing is known."""
+        """Inverse standard deviations of the free numbers of the initial states; None if nothing is known."""
         weights = [each / self.noise[name] for name, each in self.known.items()]
         return jnp.sum(jnp.stack(weights), axis=0) if weights else None
 
     @property
     def held(self) -> "FitProblem":
-        """The problem whose unasked starts stay at `base`: arrays alone differ, so nothing compiles again.
+        """The problem whose unreported starts stay at `base`: only arrays differ, so nothing compiles again.
 
-        A search far from the optimum would else let them take up what the parameters still have wrong.
+        In a search far from the optimum they would otherwise take up the errors of the parameters.
         """
         if not self.nuisance:
             return self
-        unasked = jnp.arange(len(self.local)) >= self.reported
-        known = {name: jnp.where(unasked[None, :], _HELD, each) for name, each in self.known.items()}
+        unreported = jnp.arange(len(self.local)) >= self.reported
+        known = {name: jnp.where(unreported[None, :], _HELD, each) for name, each in self.known.items()}
         return eqx.tree_at(lambda p: p.known, self, known)
+
+    def pinned(
+        self, x: Float[Array, " n"], information: Float[np.ndarray, "n n"], free: Collection[str] = ()
+    ) -> "FitProblem":
+        """The problem with all parameters but `free` held at `x`, by a prior: only arrays differ.
+
+        Each parameter moves by no more than a millionth of its standard error by `information`, the Fisher information
+        of the parameters. The weight leaves a quarter of the digits, so that the normal equations are well scaled.
+        """
+        mean = self.at(x).vector
+        stiff = float(np.finfo(mean.dtype).eps) ** -0.25
+        known = np.sqrt(np.maximum(np.diag(information)[: len(mean)], 0.0))  # rounding may make it negative
+        size = np.abs(mean)
+        weight = stiff * np.maximum(known, 1 / np.where(size > 0, size, 1.0))
+        moves = np.array([name in free for name in self.free.names], bool)
+        held = Prior(
+            on_device(np.where(moves, np.asarray(self.prior.mean), mean)),
+            on_device(np.where(moves, np.asarray(self.prior.weight), weight).astype(mean.dtype)),
+        )
+        return eqx.tree_at(lambda p: p.prior, self, held)
+
+    def counting(self, mask: Bool[np.ndarray, "runs samples"], *, slips: bool = True) -> "FitProblem":
+        """The problem in which only the samples of the mask count, and with `slips` the slip instants of their runs."""
+        own = np.any(mask, axis=1, keepdims=True) & slips
+        runs = self.runs._replace(
+            weight={name: on_device(np.asarray(weight) * mask) for name, weight in self.runs.weight.items()},
+            slip_weight={name: on_device(np.asarray(weight) * own) for name, weight in self.runs.slip_weight.items()},
+        )
+        return eqx.tree_at(lambda p: p.runs, self, runs)
 
     @property
     def reported(self) -> int:
-        """Number of the first entries of `local` that were asked for."""
+        """Number of the entries of `local` that are reported, the first ones."""
         return len(self.local) - self.nuisance
 
     @property
@@ -229,7 +227,7 @@ class FitProblem(eqx.Module):
 
     @property
     def x0(self) -> Float[Array, " n"]:
-        """Where the search starts."""
+        """Start of the search."""
         x0 = np.asarray(self.free.x0)
         return on_device(np.concatenate([x0, np.zeros(self.count * len(self.local), x0.dtype)]))
 
@@ -250,25 +248,30 @@ class FitProblem(eqx.Module):
         return x[:size], jnp.reshape(x[size:], (self.count, len(self.local)))
 
     def at(self, x: ArrayLike) -> ParameterPoint:
-        """The parameters at an x that is known, shape `[n]`."""
+        """The parameters at a known x, shape `[n]`."""
         return self.free.at(np.asarray(x)[: len(self.free.names)])
 
     def start_of(self, base: State | None, moved: Float[Array, " local"]) -> State | None:
         """Initial state of one run."""
         if base is None or not self.local:
             return base
-        return placed(base, self.local, self.taken(base) + moved)
+        flat, unflatten = ravel_pytree(base)
+        return unflatten(flat.at[self._free_entries(base)].add(moved))
 
-    def taken(self, state: State) -> Float[Array, " local"]:
+    def local_values(self, state: State) -> Float[Array, " local"]:
         """The free numbers of an initial state."""
-        return taken(state, self.local)
+        return ravel_pytree(state)[0][self._free_entries(state)]
+
+    def _free_entries(self, state: State) -> Int[np.ndarray, " local"]:
+        names = _flat_names(state)
+        return np.array([names.index(name) for name in self.local], int)
 
     def starts(self, x: Float[Array, " n"]) -> State | None:
         """Initial states at `x`, with a leading axis of runs."""
         return jax.vmap(self.start_of)(self.base, self.split(x)[1])
 
     def seen(self, x: Float[Array, " n"]) -> ModelOutput:
-        """What the model makes of each run, with a leading axis of runs."""
+        """Output of the model for each run, with a leading axis of runs."""
         values = self.free.values(self.split(x)[0])
         return jax.vmap(lambda start, run: self.engine(values, start, run))(self.starts(x), self.runs)
 
@@ -293,9 +296,9 @@ class FitProblem(eqx.Module):
         return self._weigh(seen, run), ravel_pytree(start)[0], ravel_pytree(seen.end)[0]
 
     def evaluate(self, x: Float[Array, " n"]) -> tuple[Float[Array, " rows"], Float[Array, "rows n"]]:
-        """Residual and Jacobian: of all samples, of what was known before, of the links between windows, of the starts.
+        """Residual and Jacobian: of all samples, the prior, the links between windows, the knowledge of the starts.
 
-        All columns of a run go side by side in one forward sweep, which keeps nothing of its steps.
+        All columns of a run are computed in one forward sweep, which stores no steps.
         """
         shared, own = self.split(x)
 
@@ -311,20 +314,24 @@ class FitProblem(eqx.Module):
         else:
             value, slope = jax.vmap(run)(self.base, self.runs, own)
         rows = [jnp.reshape(value[0], (-1,)), self.prior.weight * (self.free.vector(shared) - self.prior.mean)]
-        columns = [self._spread(slope[0]), self._pad(self.prior.weight[:, None] * self.free.slopes(shared))]
+        of_prior = self.prior.weight[:, None] * self.free.slopes(shared)
+        columns = [self._spread(slope[0]), jnp.pad(of_prior, ((0, 0), (0, self.count * len(self.local))))]
         if self.jump is not None:
             rows.append(jnp.reshape(self.jump * (value[2][:-1] - value[1][1:]), (-1,)))
-            here = self._spread(self.jump[:, :, None] * slope[2][:-1])
-            there = self._spread(self.jump[:, :, None] * slope[1][1:], first=1)
-            columns.append(here - there)
+            ends = self._spread(self.jump[:, :, None] * slope[2][:-1])
+            columns.append(ends - self._spread(self.jump[:, :, None] * slope[1][1:], first=1))
         known = self.start_weights
         if known is not None:
             rows.append(jnp.reshape(known * own, (-1,)))
             columns.append(jnp.pad(jnp.diag(jnp.reshape(known, (-1,))), ((0, 0), (shared.shape[0], 0))))
-        return jnp.concatenate(rows), _without_dust(jnp.concatenate(columns))
+        jacobian = jnp.concatenate(columns)
+        # Columns of nothing but rounding become zero: those of a velocity that stick takes away at the start.
+        size = jnp.sqrt(jnp.sum(jacobian**2, axis=0))
+        tiny = float(jnp.finfo(size.dtype).eps) ** 1.5 * jnp.max(size)
+        return jnp.concatenate(rows), jnp.where(size > tiny, jacobian, 0.0)
 
     def _spread(self, slope: Float[Array, "some m k"], first: int = 0) -> Float[Array, "rows n"]:
-        """Derivatives of runs `first` and on by their own x, as rows by all of x."""
+        """Derivatives of the runs from `first` on by their own x, as rows by all of x."""
         some, rows, _ = slope.shape
         size, own = len(self.free.names), len(self.local)
         shared = jnp.reshape(slope[..., :size], (some * rows, size))
@@ -335,11 +342,8 @@ class FitProblem(eqx.Module):
         block = block.at[place, :, place + first, :].set(slope[..., size:])
         return jnp.concatenate([shared, jnp.reshape(block, (some * rows, self.count * own))], axis=1)
 
-    def _pad(self, slope: Float[Array, "rows free"]) -> Float[Array, "rows n"]:
-        return jnp.pad(slope, ((0, 0), (0, self.count * len(self.local))))
-
     def with_number(self, name: str, factor: float) -> "FitProblem":
-        """The problem with a number of the model, which is not free, this many times larger."""
+        """The problem with a fixed number of the model multiplied by a factor."""
         numbers = scene_numbers(self.engine.model)
         if name not in numbers:
             raise ValueError(f"The model has no number {name!r}; it has: {', '.join(numbers)}.")
@@ -349,15 +353,16 @@ class FitProblem(eqx.Module):
     @property
     def columns(self) -> dict[str, Float[Array, "runs samples"]]:
         """Weight of each channel by name, slip instants last, in the order of the residual."""
-        # Compiled code sorts the entries of a dict, so the order is that of the names everywhere.
+        # Compiled code sorts the entries of a dict, so all orders are those of the names.
         columns = {name: self.runs.weight[name] for name in sorted(self.runs.weight)}
         return columns | {slip_channel(name): self.runs.slip_weight[name] for name in sorted(self.runs.slip_weight)}
 
-    def by_channel(self, rows: _Rows) -> dict[str, tuple[_Rows, Array]]:
+    def by_channel(self, rows: _Rows) -> dict[str, tuple[_Rows, _Rows]]:
         """Rows of the residual, shape `[rows]`, and weights of each channel, shape `[runs, samples]` each."""
         table, split, at = rows[: self.samples].reshape(self.count, -1), {}, 0
         for name, weight in self.columns.items():
-            split[name] = table[:, at : at + weight.shape[1]], weight
+            own = np.asarray(weight) if isinstance(rows, np.ndarray) else weight
+            split[name] = table[:, at : at + weight.shape[1]], own
             at += weight.shape[1]
         return split
 

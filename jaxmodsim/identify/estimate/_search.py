@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt within a box, one visible iteration after the other, alone or many side by side."""
+"""Levenberg-Marquardt within bounds, one iteration per call, for one search or a batch of searches."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,32 +16,31 @@ from ._problem import AbstractLoss, Box, FitProblem
 
 # `x` -> residual and its Jacobian.
 Evaluate: TypeAlias = Callable[[Float[Array, " n"]], tuple[Float[Array, " m"], Float[Array, "m n"]]]
-# A step whose effect on the residual is smaller than this against the residual itself is lost in rounding.
+# A step that changes the residual by less than this, in units of its rounding error, is lost in rounding.
 _ROUNDING = 8.0
 _LARGEST_DAMPING = 1e14
-# Damping of the first step, and what a refused one multiplies it by.
+# Damping of the first step, and its factor after a rejected one.
 _DAMPING, _GROWTH = 1e-3, 2.0
-# The cost is flat to second order around its minimum, so it must be known better than the parameters.
+# The cost is flat to second order around its minimum, so its tolerance is smaller than that of the parameters.
 _FLAT = 0.1
-# Models that stick and slip by fixed steps have a cost with small steps in it, on which a search never ends by itself:
-# it has settled after so many evaluations in a row that each lowered the cost by less than so many `rtol` of itself.
+# Fixed steps through stick and slip leave small steps in the cost, on which a search never converges. It has settled
+# after so many evaluations in a row that each lowered the cost by less than so many `rtol` of itself.
 _PATIENCE, _SLOW = 8, 10.0
-# Iterations after which a search that has not ended begins anew where it is. A long curved valley leaves it with a
-# damping that suits the last bend only.
+# Iterations after which a search restarts where it is: in a long curved valley its damping suits the last bend only.
 _ROUND = 100
 # Called after each iteration with its number, the root mean square of the residual and the parameters by name.
 Progress: TypeAlias = Callable[[int, float, dict[str, float]], None]
-# Noise levels that are estimated are estimated again until they settle.
+# Noise levels are estimated up to so many times, until they change by less than this share.
 _NOISE_ROUNDS, _NOISE_SETTLED = 6, 0.02
 ENDINGS = {1: "converged", 2: "settled where the cost is no smoother than the steps of the model"}
 
 
 class SearchState(NamedTuple):
-    """Where the search stands.
+    """The state of a search.
 
     - `x`, `residual`, `jacobian`, `cost`: the best so far; the cost is half the sum of losses.
-    - `damping`, `growth`: of the next step, and what a refused one multiplies it by.
-    - `steps`: number of evaluations; `slow`: of these, the last ones that changed little.
+    - `damping`, `growth`: of the next step, and the factor of the damping after a rejected one.
+    - `steps`: number of evaluations; `slow`: number of the last ones that changed the cost little.
     - `done`: 1 where it converged, 2 where it settled on a cost that is not smooth, else 0.
     """
 
@@ -57,7 +56,7 @@ class SearchState(NamedTuple):
 
 
 def start_search(x: Float[Array, " n"], rows: int) -> SearchState:
-    """A search that knows nothing yet: its first iteration evaluates `x`."""
+    """A new search, whose first iteration evaluates `x`."""
     cost, damping, growth = (on_device(np.asarray(each, x.dtype)) for each in (np.inf, _DAMPING, _GROWTH))
     residual = on_device(np.zeros(rows, x.dtype))
     jacobian = on_device(np.zeros((rows, x.shape[0]), x.dtype))
@@ -68,7 +67,7 @@ def start_search(x: Float[Array, " n"], rows: int) -> SearchState:
 def levenberg_marquardt_step(
     evaluate: Evaluate, loss: AbstractLoss, box: Box, state: SearchState, rtol: Float[Array, ""]
 ) -> SearchState:
-    """One iteration: a trial point, which is taken if it is better.
+    """One iteration: a trial point, which is accepted if it is better.
 
     Normal equations in columns of unit length; parameters on a bound that the gradient pushes outwards stay there,
     the others move and are clipped (Kanzow, Yamashita, Fukushima 2004, J. Comput. Appl. Math. 172:375). The damping
@@ -123,7 +122,7 @@ def levenberg_marquardt_step(
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """How a search is run: relative tolerance, limit of iterations, who is told."""
+    """Relative tolerance, limit of iterations, and progress function of a search."""
 
     rtol: float = 1e-6
     max_steps: int = 400
@@ -132,9 +131,9 @@ class SearchOptions:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Where a search ended: the problem with the noise levels it ended with, the last iterate, and how it ended.
+    """The end of a search: the problem with its last noise levels, the best iterate, and the reason.
 
-    - `windows`: what its runs are of; None until it is the search of a result.
+    - `windows`: of the records that are its runs; None until it is the search of a result.
     """
 
     problem: FitProblem
@@ -144,18 +143,23 @@ class SearchResult:
     windows: Windows | None = None
 
     @property
+    def residuals(self) -> dict[str, tuple[Float[np.ndarray, "runs samples"], Float[np.ndarray, "runs samples"]]]:
+        """Residual in noise levels and weight of each channel."""
+        return self.problem.by_channel(np.asarray(self.state.residual))
+
+    @property
     def converged(self) -> bool:
-        """Whether it ended by itself."""
+        """Whether it ended before any limit."""
         return ended_by_itself(self.ending)
 
 
 def ended_by_itself(ending: str) -> bool:
-    """Whether the words for the end of a search are of one that needed no limit."""
+    """Whether an `ending` is that of a search that ended before any limit."""
     return ending.startswith(tuple(ENDINGS.values()))
 
 
 def continued(ending: str, times: int, where: str) -> str:
-    """The words for the end of a search with how often it went on by itself, and where."""
+    """An `ending` with the number of continuations, and where these started."""
     often = "once" if times == 1 else f"{times} times"
     return f"{ending}; continued {often} {where}" if times else ending
 
@@ -168,18 +172,19 @@ def step(problem: FitProblem, state: SearchState, rtol: Array) -> SearchState:
 
 @eqx.filter_jit
 def steps_side_by_side(problem: FitProblem, axes: PyTree[int | None], states: SearchState, rtol: Array) -> SearchState:
-    """One iteration of many searches; `axes` says which numbers of the problem differ."""
+    """One iteration of a batch of searches; `axes`: which numbers of the problem have a leading axis."""
     one = lambda problem, state: levenberg_marquardt_step(problem.evaluate, problem.loss, problem.box, state, rtol)  # noqa: E731
     moved = eqx.filter_vmap(one, in_axes=(axes, 0))(problem, states)
-    return jax.tree.map(lambda new, old: jnp.where(_beside(states.done > 0, old), old, new), moved, states)
 
+    def keep(new: Array, old: Array) -> Array:
+        done = jnp.reshape(states.done > 0, (-1,) + (1,) * (old.ndim - 1))
+        return jnp.where(done, old, new)
 
-def _beside(done: Array, like: Array) -> Array:
-    return jnp.reshape(done, done.shape + (1,) * (like.ndim - 1))
+    return jax.tree.map(keep, moved, states)
 
 
 def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> SearchResult:
-    """Search from `x`; after each hundred iterations it goes on with a damping as at the start, to the limit of all.
+    """Search from `x`; the damping is reset after every hundred iterations.
 
     **Raises:**
 
@@ -190,7 +195,7 @@ def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
     unknown = x.shape[0]
     if counted <= unknown:
         raise ValueError(
-            f"{counted} samples are too few for {unknown} unknowns: free parameters, and starts that are not given."
+            f"{counted} samples are too few for {unknown} unknowns: free parameters and unknown initial states."
         )
     rtol = on_device(np.asarray(options.rtol, x.dtype))
     state, best, rounds = start_search(x, problem.rows), None, 0
@@ -216,7 +221,7 @@ def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
                 return SearchResult(problem, state, int(state.steps), continued(ENDINGS[int(state.done)], rounds, at))
     except KeyboardInterrupt:
         if best is None:
-            raise  # nothing was computed yet
+            raise
         return SearchResult(problem, best, int(best.steps), "interrupted; these are the best values so far")
     ending = f"stopped at the limit of {options.max_steps} iterations (max_steps)"
     return SearchResult(problem, state, int(state.steps), continued(ending, rounds, at))
@@ -224,18 +229,18 @@ def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
 
 @eqx.filter_jit
 def channels_seen(problem: FitProblem, x: Float[Array, " n"]) -> dict[str, Float[Array, "runs samples"]]:
-    """What the model makes of each channel at `x`."""
+    """Output of the model in each channel at `x`."""
     return problem.seen(x).channels
 
 
 @eqx.filter_jit
 def cost_of(loss: AbstractLoss, residual: Float[Array, " m"]) -> Float[Array, ""]:
-    """Half the sum of the losses of a residual that is known."""
+    """Half the sum of the losses of a residual."""
     return loss.cost(residual)
 
 
 def weighted_by(loss: AbstractLoss, state: SearchState) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
-    """Residual and Jacobian of a search whose least squares have the gradient of the cost, see `AbstractLoss`."""
+    """Residual and Jacobian of a search, weighted as `AbstractLoss.weighted` says."""
     pair = state.residual, state.jacobian
     residual, jacobian = _weighted(loss, *pair) if loss.robust else pair
     return np.asarray(residual), np.asarray(jacobian)
@@ -254,33 +259,33 @@ def _rms(problem: FitProblem, state: SearchState) -> float:
 
 
 def solve_freed(
-    problem: FitProblem, x: Float[Array, " n"], options: SearchOptions, given: frozenset[str]
+    problem: FitProblem, x: Float[Array, " n"], options: SearchOptions, known: frozenset[str]
 ) -> SearchResult:
-    """`solve_with_noise`, after a search in which starts that no one asked for are held where they were measured."""
+    """`solve_with_noise`, after a search with the unreported starts held where they were measured."""
     first = solve(problem.held, x, options) if problem.nuisance else None
     if first is None or not first.converged:
-        return first or solve_with_noise(problem, x, options, given)
-    search = solve_with_noise(problem, first.state.x, options, given)
+        return first or solve_with_noise(problem, x, options, known)
+    search = solve_with_noise(problem, first.state.x, options, known)
     return replace(search, iterations=first.iterations + search.iterations)
 
 
 def solve_with_noise(
-    problem: FitProblem, x: Float[Array, " n"], options: SearchOptions, given: frozenset[str]
+    problem: FitProblem, x: Float[Array, " n"], options: SearchOptions, known: frozenset[str]
 ) -> SearchResult:
-    """Search, then estimate the noise levels that were not `given` from what is left, until both settle.
+    """Search, then estimate the noise levels that are not `known` from the residual, until both settle.
 
-    The maximum of the likelihood over parameters and unknown noise levels, one after the other. Where there is one
-    channel and squares are summed, the level does not move the optimum.
+    This maximises the likelihood over parameters and noise levels in turn. For least squares with one channel the level
+    does not move the optimum.
     """
     search = solve(problem, x, options)
-    if not set(problem.noise) - given:
+    if not set(problem.noise) - known:
         return search
     single = (
         len(problem.noise) == 1 and not problem.loss.robust and float(np.max(np.asarray(problem.prior.weight))) == 0
     )
     single = single and problem.jump is None
     for _ in range(_NOISE_ROUNDS):
-        levels = estimated_noise(search, given)
+        levels = estimated_noise(search, known)
         changes = [abs(float(levels[k]) / float(search.problem.noise[k]) - 1) for k in levels]
         problem = eqx.tree_at(lambda p: p.noise, search.problem, levels)
         if single or search.ending.startswith("interrupted") or max(changes) < _NOISE_SETTLED:
@@ -290,23 +295,17 @@ def solve_with_noise(
     return search
 
 
-def estimated_noise(search: SearchResult, given: frozenset[str]) -> dict[str, Array]:
-    """Standard deviation of what is left of each channel; the median's, where a loss must not hear outliers."""
+def estimated_noise(search: SearchResult, known: frozenset[str]) -> dict[str, Array]:
+    """Standard deviation of the residual of each channel; for a robust loss, from the median."""
     problem, levels = search.problem, dict(search.problem.noise)
-    for name, (residual, weight) in by_channel(problem, search.state.residual).items():
-        if name in given:
+    for name, (residual, weight) in search.residuals.items():
+        if name in known:
             continue
         own = residual[weight > 0]
         size = 1.4826 * np.median(np.abs(own)) if problem.loss.robust else np.sqrt(np.mean(own**2))
         floor = 10 * float(jnp.finfo(levels[name].dtype).eps)  # of a model that is exact
         levels[name] = on_device(np.asarray(levels[name]) * np.asarray(max(float(size), floor), levels[name].dtype))
     return levels
-
-
-def by_channel(problem: FitProblem, residual: Array | np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Residual in noise levels and weight of each channel, shape `[runs, samples]`."""
-    split = problem.by_channel(np.asarray(residual))
-    return {name: (rows, np.asarray(weight)) for name, (rows, weight) in split.items()}
 
 
 def _rescaled(search: SearchResult, problem: FitProblem) -> SearchResult:

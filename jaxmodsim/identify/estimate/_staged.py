@@ -1,4 +1,4 @@
-"""Start values that need no guess: from dimensions, from the balance of forces in slip, from reversals."""
+"""Start values without a guess: from dimensions, from the balance of forces in slip, from reversals."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
@@ -11,30 +11,30 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ...friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw
 from ...scene import Friction, Scene, State, scene_ranges, vector_field
-from ..data._record import differentiate, smooth, smooth_span
+from ..data._signals import differentiate, smooth, smooth_span
 from ..model._engines import with_values
 from ..model._observe import coordinates_seen
-from ._initializers import AbstractInitializer
+from ._initializers import AbstractInitializer, Initialized
 from ._problem import Box, FitProblem, SquaredLoss
 from ._search import SearchOptions, SearchState, levenberg_marquardt_step, start_search
 
 # Slip faster than this share of the top speed counts as steady: the states of friction laws have settled.
 _STEADY = 0.02
 _STEPS = 60
-# A value this many times larger or smaller than its unit asks for is none that a record could show.
+# A value that differs from the size of its unit by more than this factor is not plausible.
 _FAR = 1e3
 # Damping of the bristle at the start, as a share of what is critical for the mass in stick.
 _DAMPING = 0.3
-# Time [s] that is long against what a bristle needs to yield at any speed that counts as slip.
+# Time [s] in which a bristle settles at any slip speed.
 _LONG = 1e6
 # A parameter shows in the balance of forces if its column is at least this share of the longest.
 _SHOWS = 1e-6
 
 
 class _Sampled(NamedTuple):
-    """What is known at each sample, shape `[samples]` each; inside `jax.vmap` at one of them.
+    """Time, position, velocity, acceleration, inputs, and the measured friction force or None.
 
-    Time, position, velocity, acceleration, inputs, and the measured friction force, or None.
+    Shape `[samples]` each; inside `jax.vmap` at one of them.
     """
 
     t: Array
@@ -46,26 +46,24 @@ class _Sampled(NamedTuple):
 
 
 class Staged(AbstractInitializer):
-    """Start values from the record itself, whatever the scene's numbers are, in stages.
+    """Start values from the record itself, independent of the numbers of the scene, in stages.
 
-    1. Parameters of friction laws get the size that their unit asks for, from the greatest force, speed and travel.
-    2. The balance of forces along the smoothed motion, with the force that friction settles to at constant speed,
-       gives all numbers that show there (mass, offset, Fc, Fs, vs, sigma2) without a simulation.
-    3. The slope of the force over the displacement after reversals gives stiffness (sigma0); the damping of
-       a bristle starts with a share of the critical one.
+    1. Parameters of friction laws get a size by their unit, from the greatest force, speed and travel.
+    2. The balance of forces along the smoothed motion, with the friction of steady slip, gives all numbers that show in
+       it (mass, offset, Fc, Fs, vs, sigma2) without a simulation.
+    3. The slope of the force over the displacement after reversals gives stiffness (sigma0); the damping of a bristle
+       starts at a share of the critical one.
 
-    The fit that follows determines everything together. For one coordinate whose position is measured, and for laws
-    under a measured motion.
+    The fit then determines all parameters together. For one coordinate with measured position, and for laws under a
+    measured motion.
 
     **Raises:**
 
-    - `ValueError` (at the fit) where there are several coordinates, or no position was measured.
+    - `ValueError` (at the fit) for several coordinates, or without a measured position.
     """
 
-    def initialize(
-        self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions
-    ) -> tuple[Float[Array, " n"], tuple[float, ...]]:
-        """Coordinates of the values found."""
+    def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
+        """Coordinates of the start values."""
         sampled = _sampled(problem)
         units = _units(problem)
         values = {name: float(value) for name, value in problem.free.values(x[: len(units)]).items()}
@@ -73,7 +71,12 @@ class Staged(AbstractInitializer):
         values |= {name: sizes[unit] for name, unit in units.items() if unit in sizes}
         start = problem.free.coordinates(values)
         balance, known = _fit_balance(problem, sampled, start, options)
-        values |= {name: _within(x, sizes.get(units[name])) for name, x in balance.items() if known[name]}
+        for name, x in balance.items():
+            if known[name]:
+                size = sizes.get(units[name])
+                # The balance of forces may give an implausible value.
+                fine = size is None or x == 0 or size / _FAR < abs(x) < _FAR * size
+                values[name] = x if fine else float(np.copysign(size or 0.0, x))
         blind = [name for name in units if not known[name]]
         stiffness = _reversal_slope(problem, sampled, values) or sizes["N/m"]
         mass = _mass(problem, values)
@@ -82,13 +85,7 @@ class Staged(AbstractInitializer):
                 values[name] = stiffness
             elif units[name] == "N s/m" and mass is not None:
                 values[name] = _DAMPING * 2 * float(np.sqrt(mass * stiffness))
-        size = len(problem.free.names)
-        return jnp.concatenate([problem.free.coordinates(values), x[size:]]), ()
-
-
-def _within(x: float, size: float | None) -> float:
-    """A value, unless the balance of forces took it beyond all proportion."""
-    return x if size is None or x == 0 or size / _FAR < abs(x) < _FAR * size else float(np.copysign(size, x))
+        return jnp.concatenate([problem.free.coordinates(values), x[len(units) :]]), ()
 
 
 def _units(problem: FitProblem) -> dict[str, str]:
@@ -98,18 +95,26 @@ def _units(problem: FitProblem) -> dict[str, str]:
 
 
 def _sampled(problem: FitProblem) -> _Sampled:
-    """All runs, one after the other, without what the smoothing spoils at their ends."""
+    """All runs, concatenated, without their ends, which smoothing distorts."""
     parts = []
     law_alone = problem.base is None
     if problem.base is not None and problem.base.q.shape[1] != 1:
-        raise ValueError("Staged() needs a scene with one coordinate; give start values, or MultiStart(...).")
+        raise ValueError("Staged() needs a scene with one coordinate; pass start values, or MultiStart(...).")
+    position = ""
+    if not law_alone:
+        seen = coordinates_seen(problem.engine.observables, 1)
+        position = next((name for name, entry in seen.items() if entry == "q[0]"), "")
+        if not position:
+            raise ValueError(
+                "Staged() needs a channel that is the position, observe='q[0]'; pass start values, or MultiStart(...)."
+            )
     for run in range(problem.count):
         samples = jax.tree.map(lambda x, run=run: np.asarray(x[run]), problem.runs)
         weight = next(iter(samples.weight.values()))
         count = int(np.flatnonzero(weight)[-1]) + 1
         t = samples.t[:count]
         inputs = {name: column[:count] for name, column in samples.inputs.items()}
-        x = inputs["x"] if law_alone else samples.measured[_position(problem)][:count]
+        x = inputs["x"] if law_alone else samples.measured[position][:count]
         motion = differentiate(t, x)
         span = smooth_span(count)
         force = None
@@ -119,26 +124,9 @@ def _sampled(problem: FitProblem) -> _Sampled:
                 force = force / np.maximum(inputs["normal"], 1e-12)
         inside = slice(motion.edge, -motion.edge) if count > 4 * motion.edge else slice(None)
         smoothed = {name: smooth(column, span)[inside] for name, column in inputs.items()}
-        parts.append(
-            (
-                t[inside],
-                motion.x[inside],
-                motion.v[inside],
-                motion.a[inside],
-                smoothed,
-                None if force is None else force[inside],
-            )
-        )
+        columns = (t, motion.x, motion.v, motion.a)
+        parts.append((*(x[inside] for x in columns), smoothed, None if force is None else force[inside]))
     return _Sampled(*jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *parts))
-
-
-def _position(problem: FitProblem) -> str:
-    from_state = [name for name, seen in coordinates_seen(problem.engine.observables, 1).items() if seen == "q[0]"]
-    if not from_state:
-        raise ValueError(
-            "Staged() needs a channel that is the position, observe='q[0]'; give start values, or MultiStart(...)."
-        )
-    return from_state[0]
 
 
 def _sizes(problem: FitProblem, sampled: _Sampled, values: dict[str, float]) -> dict[str, float]:
@@ -159,7 +147,7 @@ def _driven(scene: Scene, inputs: dict[str, Array]) -> Scene:
 
 
 def _required(problem: FitProblem, values: Mapping[str, ArrayLike]) -> Callable[[_Sampled], Array]:
-    """Generalised force that friction must have at a sample, by the equations of motion without friction."""
+    """Generalised friction force at a sample, by the equations of motion without friction."""
     scene = with_values(problem.engine.model, {name: jnp.asarray(x) for name, x in values.items()})
     others = tuple(effect for effect in scene.effects if not isinstance(effect, Friction))
 
@@ -175,7 +163,7 @@ def _required(problem: FitProblem, values: Mapping[str, ArrayLike]) -> Callable[
 
 
 def _settled(law: AbstractLaw, v: Array) -> Array:
-    """Force of a law at constant velocity, long after it began."""
+    """Force of a law in steady slip."""
     if isinstance(law, AbstractDynamicLaw):
         z = law.step_exact(v, law.initial_state(v), jnp.asarray(_LONG, v.dtype))
         return law.force(v, z)
@@ -183,11 +171,11 @@ def _settled(law: AbstractLaw, v: Array) -> Array:
         return jnp.sign(v) * law.sliding_force(v) + law.viscous_force(v)
     if isinstance(law, AbstractForceLaw):
         return law.force(v)
-    raise ValueError(f"Staged() does not know the force that {type(law).__name__} settles to; give start values.")
+    raise ValueError(f"Staged() does not know the force of {type(law).__name__} in steady slip; pass start values.")
 
 
 def _friction(problem: FitProblem, values: Mapping[str, ArrayLike]) -> Callable[[_Sampled], Array]:
-    """Generalised friction force at a sample, settled."""
+    """Generalised friction force at a sample, in steady slip."""
     scene = with_values(problem.engine.model, values)
     if isinstance(scene, AbstractLaw):
         return lambda s: _settled(scene.bind_state(s.t, s.q[None], s.v[None], s.inputs), s.v)
@@ -207,7 +195,7 @@ def _friction(problem: FitProblem, values: Mapping[str, ArrayLike]) -> Callable[
 
 
 def _slip(problem: FitProblem) -> Callable[[_Sampled], Array]:
-    """The smallest slip velocity of the friction elements at a sample; one that sticks says nothing in slip."""
+    """The smallest slip speed of the friction elements at a sample: all must slip in the balance of forces."""
     scene = problem.engine.model
     if isinstance(scene, AbstractLaw):
         return lambda s: jnp.abs(s.v)
@@ -224,7 +212,7 @@ def _slip(problem: FitProblem) -> Callable[[_Sampled], Array]:
 def _fit_balance(
     problem: FitProblem, sampled: _Sampled, x: Float[Array, " free"], options: SearchOptions
 ) -> tuple[dict[str, float], dict[str, bool]]:
-    """Parameters by the balance of forces in steady slip, and which of them show in it."""
+    """Parameters by the balance of forces in steady slip, and whether they show in it."""
     state = start_search(x, sampled.v.shape[0])
     for _ in range(_STEPS):
         state = _balance_step(problem, sampled, state, jnp.asarray(options.rtol, x.dtype))
@@ -256,7 +244,7 @@ def _balance_step(problem: FitProblem, sampled: _Sampled, state: SearchState, rt
 
 
 def _reversal_slope(problem: FitProblem, sampled: _Sampled, values: dict[str, float]) -> float | None:
-    """Median slope [N/m] of the friction force over the displacement after reversals, until it has changed its sign."""
+    """Median slope [N/m] of the friction force over the displacement after reversals, until its sign has changed."""
     x = np.asarray(sampled.q)
     if sampled.force is not None:
         force = np.asarray(sampled.force)
@@ -275,7 +263,7 @@ def _reversal_slope(problem: FitProblem, sampled: _Sampled, values: dict[str, fl
 
 
 def _mass(problem: FitProblem, values: dict[str, float]) -> float | None:
-    """Mass at the first state; None for a law alone."""
+    """Mass at the first state; None for a law by itself."""
     if problem.base is None:
         return None
     scene = with_values(problem.engine.model, {name: jnp.asarray(x) for name, x in values.items()})

@@ -11,13 +11,14 @@ from jaxtyping import Array
 from ..._core.parameters import ranges_of
 from ...friction import AbstractLaw, Coulomb, Viscous, asymmetric, laws
 from ...scene import AbstractEffect, AppliedForce, Friction, Scene, replace_numbers
-from ..data._record import Record, differentiate, smooth, smooth_span, without_outliers
+from ..data._record import Record
+from ..data._signals import differentiate, smooth, smooth_span, without_outliers
 
-# Share of the variance of a force below which a regression explains it well enough to tell that its sign is wrong.
+# Share of the variance of a force below which a regression explains it well enough to detect a wrong sign.
 _EXPLAINED = 0.5
-# Slower than this share of the top speed a sample says little of friction in slip.
+# Samples slower than this share of the top speed are left out.
 _MOVING = 0.05
-# Where the regression gives no positive number: friction as a share of the root mean square of the force.
+# Friction as a share of the root mean square of the force, if the regression gives no positive number.
 _FRICTION_SHARE = 0.1
 
 
@@ -32,10 +33,11 @@ def _drive(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
 
 
 @dataclass(frozen=True)
-class RoughAxis:
-    """A first idea of an axis: mass [kg], viscous [N s/m] and Coulomb friction [N], offset [N], top speed [m/s].
+class AxisEstimate:
+    """First estimates of an axis.
 
-    And when it starts [s], on the clock of the record.
+    - `m`: mass [kg]. `Fv`, `Fc`: viscous [N s/m] and Coulomb friction [N]. `offset`: constant force [N].
+    - `top`: largest speed [m/s]. `start`: first time of the record [s].
     """
 
     m: float
@@ -46,15 +48,15 @@ class RoughAxis:
     start: float = 0.0
 
 
-def rough_axis(record: Record) -> RoughAxis:
-    """Start values by linear regression of the force on acceleration, velocity and its sign.
+def estimate_axis(record: Record) -> AxisEstimate:
+    """Start values of a fit, by linear regression of the force on acceleration, velocity and its sign.
 
-    Differentiated positions are noisy, so they are smoothed first; the simulation then does the real work.
+    Positions are smoothed before they are differentiated.
 
     **Raises:**
 
-    - `ValueError` naming the record, where the position or the force never changes, and where the force has the wrong
-      sign: mass and friction that explain it would be negative.
+    - `ValueError` naming the record, if the position or the force never changes, or if the force has the wrong sign:
+      mass and friction would be negative.
     """
     for column, what in ((record.measured, "position"), (record.inputs["u"], "force")):
         if np.ptp(column) == 0.0:
@@ -73,12 +75,12 @@ def rough_axis(record: Record) -> RoughAxis:
     left = float(np.sum((u[moving] - columns @ weights) ** 2))
     if m < 0 and dissipated < 0 and left < _EXPLAINED * (len(columns) - 4) * np.var(u[moving]):
         raise ValueError(
-            f"{record.name}: the force goes against the motion: it is that of a mass (or moment of inertia) of {m:.3g}"
-            f" and of friction that drives with {-dissipated:.3g} W. Force and position count in opposite directions:"
-            " change the sign of one of them (on the command line, --units force=-1)."
+            f"{record.name}: the force goes against the motion: the mass (or moment of inertia) would be {m:.3g}, and"
+            f" friction would drive with {-dissipated:.3g} W. Force and position have opposite directions: change the"
+            " sign of one of them (on the command line, --units force=-1)."
         )
     scale = float(np.sqrt(np.mean(u**2))) or 1.0
-    return RoughAxis(
+    return AxisEstimate(
         m if m > 0 else scale / max(float(np.max(np.abs(a))), 1e-12),
         Fv if Fv > 0 else _FRICTION_SHARE * scale / top,
         Fc if Fc > 0 else _FRICTION_SHARE * scale,
@@ -88,69 +90,60 @@ def rough_axis(record: Record) -> RoughAxis:
     )
 
 
-def _coulomb(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
-    return (
-        Friction(Coulomb(rough.Fc), name="dry"),
-        Friction(Viscous(rough.Fv), name="viscous"),
-    )
-
-
-def _asymmetric(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
-    return (
-        Friction(asymmetric(Coulomb(rough.Fc), Fc=rough.Fc), name="dry"),
-        Friction(asymmetric(Viscous(rough.Fv), Fv=rough.Fv), name="viscous"),
-    )
-
-
-def _no_params(rough: RoughAxis) -> dict[str, float]:
-    del rough
-    return {}
-
-
 @dataclass(frozen=True)
 class AxisModel:
-    """A model of the axis, `m q'' = u - offset + forces of its effects`.
+    """A model of an axis, `m q'' = u - offset + forces of its effects`.
 
     **Arguments:**
 
-    - `effects`: what acts on the axis beside the drive, with start values from the rough ones.
+    - `effects`: the effects beside the drive, with start values from an estimate of the axis.
     - `free`: names of the numbers that are fitted.
     - `description`: for tables.
-    - `params`: further entries of the scene's params that the effects read, from the rough values, by name.
+    - `params`: further entries of the scene's params that the effects read, by name, from an estimate of the axis.
     """
 
-    effects: Callable[[RoughAxis], tuple[AbstractEffect, ...]]
+    effects: Callable[[AxisEstimate], tuple[AbstractEffect, ...]]
     free: tuple[str, ...]
     description: str
-    params: Callable[[RoughAxis], dict[str, float]] = _no_params
+    params: Callable[[AxisEstimate], dict[str, float]] | None = None
 
 
 # Models of more than one friction element.
 _COMBINATIONS = {
-    "coulomb": AxisModel(_coulomb, ("m", "offset", "dry.Fc", "viscous.Fv"), "Coulomb friction and viscous friction"),
+    "coulomb": AxisModel(
+        lambda estimate: (
+            Friction(Coulomb(estimate.Fc), name="dry"),
+            Friction(Viscous(estimate.Fv), name="viscous"),
+        ),
+        ("m", "offset", "dry.Fc", "viscous.Fv"),
+        "Coulomb friction and viscous friction",
+    ),
     "asymmetric": AxisModel(
-        _asymmetric,
+        lambda estimate: (
+            Friction(asymmetric(Coulomb(estimate.Fc), Fc=estimate.Fc), name="dry"),
+            Friction(asymmetric(Viscous(estimate.Fv), Fv=estimate.Fv), name="viscous"),
+        ),
         ("m", "dry.forward.Fc", "dry.backward.Fc", "viscous.forward.Fv", "viscous.backward.Fv"),
         "Coulomb and viscous friction, each with a value for either direction; a constant offset is part"
-        " of the difference of the Coulomb forces and held at zero",
+        " of the difference of the Coulomb forces, and is held at zero",
     ),
 }
 
 
 def axis_models() -> dict[str, AxisModel]:
-    """Models of an axis by name: combinations of simple laws, and each registered law that says where a fit starts."""
+    """Models of an axis by name: combinations of simple laws, and each registered law with start values for a fit."""
     models = {name.lower(): _one_law(law) for name, law in laws().items()}
     return _COMBINATIONS | {name: model for name, model in models.items() if model is not None}
 
 
 def _one_law(kind: type[AbstractLaw]) -> AxisModel | None:
-    """The axis with one friction law; None where it does not say a start."""
+    """The axis with one friction law; None for a law without start values."""
     example = kind.fit_start(1.0, 1.0, 1.0, 1.0)
     if example is None:
         return None
 
-    def effects(rough: RoughAxis) -> tuple[AbstractEffect, ...]:
-        law: Any = kind.fit_start(rough.m, rough.Fc, rough.Fv, rough.top)
+    def effects(estimate: AxisEstimate) -> tuple[AbstractEffect, ...]:
+        law: Any = kind.fit_start(estimate.m, estimate.Fc, estimate.Fv, estimate.top)
         return (Friction(law, name="friction"),)
 
     numbers = [f"friction.{name}" for name, allowed in ranges_of(example).items() if not allowed.execution]
@@ -159,7 +152,7 @@ def _one_law(kind: type[AbstractLaw]) -> AxisModel | None:
 
 def axis_scene(
     model: AxisModel,
-    rough: RoughAxis,
+    estimate: AxisEstimate,
     start: Mapping[str, float] | None = None,
     fixed: Mapping[str, float] | None = None,
 ) -> Scene:
@@ -168,15 +161,16 @@ def axis_scene(
     **Arguments:**
 
     - `model`: one of `axis_models()`.
-    - `rough`: values to start from, as `rough_axis` finds them.
+    - `estimate`: start values, from `estimate_axis`.
     - `start`, `fixed`: other values by the names of `jaxmodsim.scene.scene_numbers`.
 
     **Returns:**
 
     A `Scene` whose `params` are `m` [kg], `offset` [N], the input `u` [N], and those of the model.
     """
-    offset = rough.offset if "offset" in model.free else 0.0
-    params = {"m": rough.m, "offset": offset, "u": 0.0, **model.params(rough)}
-    scene = Scene(_axis_lagrangian, params=params, effects=(AppliedForce(_drive, name="drive"), *model.effects(rough)))
-    given = {**(start or {}), **(fixed or {})}
-    return replace_numbers(scene, {name: jnp.asarray(x, float) for name, x in given.items()})
+    offset = estimate.offset if "offset" in model.free else 0.0
+    params = {"m": estimate.m, "offset": offset, "u": 0.0, **(model.params(estimate) if model.params else {})}
+    effects = (AppliedForce(_drive, name="drive"), *model.effects(estimate))
+    scene = Scene(_axis_lagrangian, params=params, effects=effects)
+    numbers = {**(start or {}), **(fixed or {})}
+    return replace_numbers(scene, {name: jnp.asarray(x, float) for name, x in numbers.items()})

@@ -1,4 +1,4 @@
-"""What a model makes of a record: a scene by fixed steps or by events, a law under a measured motion."""
+"""Output of a model for a record: a scene by fixed steps or by events, a law under a measured motion."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeAlias, TypeVar
@@ -8,21 +8,26 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..._core.arrays import on_device
 from ...friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw
-from ...scene import Scene, Signal, State, replace_numbers, scene_numbers, vector_field
+from ...scene import Scene, Signal, State, from_dynamics, replace_numbers, scene_numbers, start, switch, vector_field
 from ...simulation import Trajectory, simulate
 from ...solvers import RosenbrockTableau, rosenbrock_step
 from ..data._record import Runs
-from ._observe import Observable, first_coordinate, needs_forces, observed, observer
+from ._observe import Observables, first_coordinate, needs_forces, observed, observer
 from ._parameters import join_entries
-from ._stick_slip import first_modes, pass_modes, settle
 
+# Slip velocity [m/s] below which an element sticks; tolerance of the instant of a mode change, in steps.
+_REST, _LANDED = 1e-12, 1e-9
+# Largest number of trials of one step; number after which every other trial is a bisection.
+_MOST, _NEWTON = 256, 8
+
+_constant = jax.lax.stop_gradient
 # Order 3, L-stable, stiffly accurate, three field evaluations (Sandu et al. 1997, Atmospheric Environment 31:3459).
-# Of order 3 because a held input has no more smoothness between samples than its samples carry, and three evaluations
-# instead of eight make the replay of a long record three times cheaper.
+# A held input leaves no smoothness for a higher order, and three evaluations instead of eight make the replay of a long
+# record three times cheaper.
 RODAS3 = RosenbrockTableau(
     gamma=0.5,
     stage=np.array([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0], [2.0, 0.0, 1.0, 0.0]]),
@@ -32,25 +37,137 @@ RODAS3 = RosenbrockTableau(
     solution=np.array([2.0, 0.0, 1.0, 1.0]),
     error=np.array([0.0, 0.0, 0.0, 1.0]),
 )
-# `observe(t, y, scene, mode)`, what is seen of a state; the scene is as the inputs drive it, the modes of its
-# set-valued laws are None where it has none.
+# `observe(t, y, scene, mode)`, the observed quantities; the scene has its inputs at t, and the mode is None without
+# set-valued laws.
 Observe: TypeAlias = Callable[[Array, State, Scene, Array | None], PyTree[Array]]
 Inputs: TypeAlias = dict[str, Float[Array, " samples"]]
-# Limit of the steps of a run by events; each sample of a held input ends one.
+# Largest number of steps of a run by events; each sample of a held input ends a step.
 _STEPS_A_RUN, _STEPS_A_SAMPLE = 16384, 4
-# What names of delays of inputs start with.
+# Prefix of the names of delays of inputs.
 DELAY = "delay."
 _Model = TypeVar("_Model", bound=eqx.Module)
 
 
+class _PartialStep(NamedTuple):
+    """A partial step: the state at `t`, the rest of the step `left` [s], and the next trial.
+
+    - `lower`, `upper`, `trial`: lengths [s]; the next change of mode is between the first two if `upper < left`.
+    - `trials`: number of trials in this step so far.
+    """
+
+    t: Float[Array, ""]
+    left: Float[Array, ""]
+    y: State
+    mode: Float[Array, " modes"]
+    lower: Float[Array, ""]
+    upper: Float[Array, ""]
+    trial: Float[Array, ""]
+    trials: Int[Array, ""]
+
+
+# Compiled by themselves, since a step evaluates them several times: traced and linearised once.
+@jax.jit
+def _guards(t: Array, y: State, scene: Scene, mode: Array) -> Float[Array, " modes"]:
+    """One for each element, positive while its mode holds."""
+    rest = jnp.asarray(_REST, y.q.dtype)
+    return from_dynamics(lambda d: d.guards(rest, (rest, rest)), t, y, scene, mode)[0]
+
+
+_field = jax.jit(vector_field)
+_switch = jax.jit(switch)
+
+
+def first_modes(t: Array, y: State, scene: Scene) -> tuple[State, Float[Array, " modes"]]:
+    """State and modes at the beginning of a run."""
+    mode = jnp.zeros(len(scene.mode_names), y.q.dtype)
+    return start(t, y, scene, mode, jnp.asarray(_REST, y.q.dtype))
+
+
+def settle(t: Array, y: State, scene: Scene, mode: Array) -> tuple[State, Float[Array, " modes"]]:
+    """State and modes at a sample, where inputs may jump."""
+    return _switch(t, y, scene, mode, _guards(t, y, scene, mode) < 0, jnp.asarray(_REST, y.q.dtype))
+
+
+def pass_modes(
+    tableau: RosenbrockTableau,
+    scene_at: Callable[[Array], Scene],
+    t: Float[Array, ""],
+    dt: Float[Array, ""],
+    y: State,
+    mode: Float[Array, " modes"],
+) -> tuple[State, Float[Array, " modes"]]:
+    """Advance a state by `dt`, through all changes of mode; NaN after too many.
+
+    A trial step that violates a guard is shortened by Newton's method on the guard, within a bracket, until it ends on
+    the change. The derivative of the instant is that of the guard over its rate, so forward derivatives have the right
+    jump.
+
+    **Arguments:**
+
+    - `tableau`: the method.
+    - `scene_at`: the scene with its inputs at a time.
+    - `t`, `dt`: start and length of the step [s].
+    - `y`, `mode`: consistent at `t`.
+    """
+    landed, rest = _LANDED * dt, jnp.asarray(_REST, y.q.dtype)
+
+    def go_on(at: _PartialStep) -> Bool[Array, ""]:
+        return (at.left > 0) & (at.trials < _MOST)
+
+    def attempt(at: _PartialStep) -> _PartialStep:
+        def field(t: Array, y: State) -> State:
+            return _field(t, y, scene_at(t), at.mode)
+
+        whole = at.trial >= at.left
+        length = jnp.where(whole, at.left, at.trial)
+        y1 = rosenbrock_step(tableau, field, at.t, length, at.y, pivot=True).y1
+        t1 = at.t + length
+        slope = field(t1, y1)
+        guards, falls = jax.jvp(lambda t, y: _guards(t, y, scene_at(t), at.mode), (t1, y1), (jnp.ones_like(t1), slope))
+        falls = _constant(falls)
+        away = -_constant(guards) / jnp.where(falls < 0, falls, -1.0)
+        fired = (falls < 0) & (jnp.abs(away) <= landed)
+        missed = (guards < 0) & ~fired
+        over = jnp.any(missed)
+        lands = ~over & jnp.any(fired)
+        passes = lands | (~over & whole)
+
+        # The instant of the first guard that fires: the value of the trial with the derivative of the guard.
+        first = fired & (away == jnp.min(jnp.where(fired, away, jnp.inf)))
+        late = jnp.sum(jnp.where(first, (_constant(guards) - guards) / jnp.where(first, falls, 1.0), 0.0))
+        late = jnp.where(lands, late / jnp.maximum(jnp.sum(first), 1), 0.0)
+        before = jtu.tree_map(lambda y, f: y + late * f, y1, slope)
+        instant, left = t1 + late, at.left - length - late
+        after, mode = _switch(instant, before, scene_at(instant), at.mode, fired & lands, rest)
+        after = jtu.tree_map(lambda a, b: jnp.where(lands, a, b), after, before)
+
+        lower, upper = jnp.where(over, at.lower, length), jnp.where(over, length, at.upper)
+        ahead = jnp.where(falls < 0, length + away, jnp.inf)
+        newton = jnp.min(jnp.where(missed | ~over, ahead, jnp.inf))
+        inside = (newton > lower) & (newton < upper) & ((at.trials < _NEWTON) | (at.trials % 2 == 0))
+        trial = jnp.where(inside, newton, 0.5 * (lower + upper))
+        retry = at._replace(lower=lower, upper=upper, trial=trial)
+        onward = _PartialStep(
+            instant, left, after, jnp.where(lands, mode, at.mode), jnp.zeros_like(dt), left, left, at.trials
+        )
+        moved = jtu.tree_map(lambda a, b: jnp.where(passes, a, b), onward, retry)
+        lengths = {name: _constant(getattr(moved, name)) for name in ("lower", "upper", "trial")}
+        return moved._replace(**lengths, trials=at.trials + 1)
+
+    begin = _PartialStep(t, dt, y, mode, jnp.zeros_like(dt), dt, dt, jnp.zeros((), int))
+    end = jax.lax.while_loop(go_on, attempt, begin)
+    stuck = end.left > 0
+    return jtu.tree_map(lambda x: jnp.where(stuck, jnp.nan, x), end.y), end.mode
+
+
 class Controller(eqx.Module):
-    """A controller that runs once per sample, as a drive does; what it puts out is held until the next sample.
+    """A controller that runs once per sample, as in a drive; its output is held until the next sample.
 
     **Arguments:**
 
     - `fn`: `fn(t, q, qd, memory, params) -> (outputs, memory)`: the entries of `params` that it sets, by name, and its
-      own state (an integral, a filter) for the next sample. `params` holds the scene's numbers and the inputs of the
-      record, such as the reference, so gains that are entries of it can be fitted.
+      own state (an integral, a filter) for the next sample. `params` holds the scene's numbers, so that gains can be
+      fitted, and the inputs of the record, such as the reference.
     - `memory`: its state at the first sample, a pytree of numbers.
     """
 
@@ -80,14 +197,14 @@ def run_samples(
     - `t`: times of the samples [s].
     - `inputs`: samples by name of the entry of `params` they drive.
     - `y0`: state at the first sample.
-    - `observe`: what is seen of each sample.
+    - `observe`: the observed quantities at each sample.
     - `substeps`: steps from sample to sample.
-    - `linear`: inputs that run in straight lines from sample to sample; the others are held.
-    - `controller`: what closes a loop around the scene.
+    - `linear`: inputs that are interpolated linearly; the others are held.
+    - `controller`: closes a loop around the scene.
 
     **Returns:**
 
-    What was observed at each sample, with a leading axis of samples, and the state at the last one.
+    The observed quantities with a leading axis of samples, and the state at the last one.
     """
     exact = bool(scene.mode_names)
 
@@ -117,7 +234,7 @@ def run_samples(
             return rosenbrock_step(RODAS3, field, start + k * step, step, y, pivot=True).y1, None
 
         moved = substep(0, (y, mode)) if substeps == 1 else jax.lax.fori_loop(0, substeps, substep, (y, mode))
-        # Records of different lengths that run side by side repeat their last time.
+        # Shorter records in a batch repeat their last time.
         moved = jtu.tree_map(lambda new, old: jnp.where(dt > 0, new, old), moved, (y, mode))
         return (moved, memory), seen
 
@@ -151,7 +268,7 @@ def replay(
 
     - `scene`, `t`, `inputs`, `substeps`: see `run_samples`.
     - `q0`, `qd0`: state at the first sample.
-    - `observe`: `observe(q, qd)`, the number that is compared with the record; by default the first coordinate.
+    - `observe`: `observe(q, qd)`, the observed number; by default the first coordinate.
 
     **Returns:**
 
@@ -173,7 +290,7 @@ def _driven(scene: Scene, held: dict[str, Array]) -> Scene:
 
 
 class ModelOutput(NamedTuple):
-    """What a model gives for one run: channels, slip instants, and the state at the last sample."""
+    """Output of a model for one run: channels, slip instants, and the state at the last sample."""
 
     channels: dict[str, Float[Array, " samples"]]
     slips: dict[str, Float[Array, " instants"]]
@@ -186,7 +303,7 @@ class ReplayEngine(eqx.Module):
     model: Scene
     delays: dict[str, Array]
     controller: Controller | None
-    observables: tuple[tuple[str, Observable], ...] = eqx.field(static=True)
+    observables: Observables = eqx.field(static=True)
     linear: frozenset[str] = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
 
@@ -208,11 +325,11 @@ class ReplayEngine(eqx.Module):
 
 
 class EventEngine(eqx.Module):
-    """A scene with contacts, or whose slip instants were recorded, by tolerances; NaN where the run ends early."""
+    """A scene by error-controlled steps with events, for contacts and slip instants; NaN if the run ends early."""
 
     model: Scene
     delays: dict[str, Array]
-    observables: tuple[tuple[str, Observable], ...] = eqx.field(static=True)
+    observables: Observables = eqx.field(static=True)
     linear: frozenset[str] = eqx.field(static=True)
     slips: tuple[str, ...] = eqx.field(static=True)
     rtol: float = eqx.field(static=True)
@@ -252,7 +369,7 @@ class EventEngine(eqx.Module):
         return ModelOutput(channels, self._slips(scene, done, run), end)
 
     def _slips(self, scene: Scene, done: Trajectory, run: Runs) -> dict[str, Array]:
-        """The first instants at which elements broke away; the end of the run for those that did not come."""
+        """The first instants at which elements break away; the end of the run for missing ones."""
         if not self.slips:
             return {}
         events, instants = done.events, {}
@@ -266,7 +383,7 @@ class EventEngine(eqx.Module):
 
 
 def with_values(model: _Model, values: Mapping[str, ArrayLike]) -> _Model:
-    """The scene or law with numbers of these names replaced; delays are none of them."""
+    """The scene or law with numbers of these names replaced; delays are ignored."""
     own = {
         name: x if isinstance(x, jax.Array) else on_device(x)
         for name, x in values.items()
@@ -281,9 +398,9 @@ def delayed(
     linear: frozenset[str],
     values: dict[str, Array],
 ) -> dict[str, Float[Array, " samples"]]:
-    """Inputs that come later by the `delay.*` [s] among the values, which may be a fraction of a sample.
+    """Inputs delayed by the `delay.*` [s] among the values, which may be a fraction of a sample.
 
-    A held input that jumps between two samples is replaced by its mean over the interval: the impulse is exact, and
+    A held input that jumps between two samples is replaced by its mean over the interval. So the impulse is exact, and
     the derivative by the delay exists.
     """
     shifted = dict(inputs)
@@ -296,7 +413,7 @@ def delayed(
             continue
         dt = jnp.diff(t)
         impulse = jnp.concatenate([jnp.zeros(1, x.dtype), jnp.cumsum(dt * x[:-1])])
-        # Outside the record the first and the last sample go on.
+        # The first and the last sample continue outside the record.
         late = t - tau
         at = (
             jnp.interp(late, t, impulse) + x[0] * jnp.minimum(late - t[0], 0.0) + x[-1] * jnp.maximum(late - t[-1], 0.0)
@@ -333,7 +450,7 @@ def law_force(
     - `t`: times [s], increasing.
     - `x`: slip displacement [m] at these times; the velocity is constant from sample to sample.
     - `normal`: normal load [N] for laws whose forces are per newton of load.
-    - `inputs`: what the functions of `scaled_by` find in `params`, by name.
+    - `inputs`: entries of `params` for the functions of `scaled_by`, by name.
 
     **Returns:**
 
@@ -344,9 +461,9 @@ def law_force(
     - `ValueError` for a law whose force depends on more than its own motion.
     """
     if not isinstance(law, AbstractDynamicLaw | AbstractForceLaw):
-        raise ValueError(f"{type(law).__name__} cannot run by itself: its force depends on the load it holds.")
+        raise ValueError(f"{type(law).__name__} cannot run by itself: its force depends on the load.")
     dt = jnp.diff(t)
-    v = jnp.diff(x) / jnp.where(dt > 0, dt, 1.0)  # records side by side repeat their last time
+    v = jnp.diff(x) / jnp.where(dt > 0, dt, 1.0)  # shorter records in a batch repeat their last time
 
     def at(t: Array, x: Array, v: Array, params: PyTree) -> Any:
         return law.bind_state(t, x[None], v[None], params)

@@ -1,4 +1,4 @@
-"""What a record measured: functions of the motion, or names; and the motion as far as the channels show it."""
+"""Observed quantities of a record, functions or names, and the motion that its channels show."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -16,23 +16,23 @@ from ..._core.trace_checks import traced
 from ...scene import Friction, Scene, State, forward_dynamics
 from ..data._record import Record
 
-# `observe(q, qd)`, or "q[0]", "qd[1]", or the name of an effect, whose force is meant.
+# `observe(q, qd)`, or "q[0]", "qd[1]", or the name of an effect, for its force.
 Observable: TypeAlias = Callable[[Array, Array], Array] | str
+# What each channel observes, as a hashable mapping.
+Observables: TypeAlias = tuple[tuple[str, Observable], ...]
 _STATE = re.compile(r"(q|qd)\[(\d+)\]")
-# Two states at which a function that observes a coordinate tells itself apart from others.
+# Two states that identify a function which returns a coordinate.
 _PROBES = ((0.73, -1.31), (-0.29, 0.57))
 
 
 def first_coordinate(q: Array, qd: Array) -> Array:
-    """The first coordinate, which is what a position sensor on one axis sees."""
+    """The first coordinate, as from a position sensor on one axis."""
     del qd
     return q[0]
 
 
-def by_channel(
-    observe: Observable | Mapping[str, Observable], records: tuple[Record, ...]
-) -> tuple[tuple[str, Observable], ...]:
-    """What each channel of the records observes.
+def by_channel(observe: Observable | Mapping[str, Observable], records: tuple[Record, ...]) -> Observables:
+    """The observable of each channel of the records.
 
     **Raises:**
 
@@ -55,8 +55,8 @@ def by_channel(
     return tuple((channel, observe[channel]) for channel in channels)
 
 
-def check_observables(observables: tuple[tuple[str, Observable], ...], scene: Scene, y: State) -> None:
-    """Refuse what is no number of the scene.
+def check_observables(observables: Observables, scene: Scene, y: State) -> None:
+    """Refuse observables that are no numbers of the scene.
 
     **Raises:**
 
@@ -76,23 +76,20 @@ def check_observables(observables: tuple[tuple[str, Observable], ...], scene: Sc
                 raise ValueError(
                     f"observe: {channel} observes {observable!r}, but there are: {', '.join(known)}.{hint}"
                 )
-        shape = _shape(observable, y, scene)
-        if shape != ():
+        if callable(observable):
+            value = traced(observable, name="observe(q, qd)", q=y.q, qd=y.qd)
+        else:
+            look = observer(((channel, observable),))
+            value = jax.eval_shape(lambda look=look: look(jnp.zeros((), y.q.dtype), y, scene, None))[channel]
+        if (shape := getattr(value, "shape", None)) != ():
             what = "observe(q, qd)" if not isinstance(observable, str) else f"{observable!r}"
             raise ValueError(f"{what} returned the shape {shape}, but one number, shape (), is needed.")
 
 
-def _shape(observable: Observable, y: State, scene: Scene) -> tuple[int, ...] | None:
-    if callable(observable):
-        return getattr(traced(observable, name="observe(q, qd)", q=y.q, qd=y.qd), "shape", None)
-    look = lambda: observer(((".", observable),))(jnp.zeros((), y.q.dtype), y, scene, None)["."]  # noqa: E731
-    return getattr(jax.eval_shape(look), "shape", None)
-
-
 def observer(
-    observables: tuple[tuple[str, Observable], ...],
+    observables: Observables,
 ) -> Callable[[Array, State, Scene, Array | None], dict[str, Array]]:
-    """A function of time, state, scene and modes that returns what each channel sees."""
+    """A function of time, state, scene and modes that returns the observed number of each channel."""
 
     def observe(t: Array, y: State, scene: Scene, mode: Array | None) -> dict[str, Array]:
         forces = forward_dynamics(t, y, scene, mode).forces if any(needs_forces(x) for _, x in observables) else {}
@@ -107,7 +104,7 @@ def needs_forces(observable: Observable) -> bool:
 
 
 def observed(observable: Observable, q: Array, qd: Array, forces: Mapping[str, Array]) -> Array:
-    """What is seen where the effects have these forces."""
+    """The observed number for these forces of the effects."""
     if callable(observable):
         return observable(q, qd)
     entry = _STATE.fullmatch(observable)
@@ -133,8 +130,8 @@ class Slip(NamedTuple):
     v: Float[np.ndarray, " samples"]
 
 
-def coordinates_seen(observables: tuple[tuple[str, Observable], ...], dof: int) -> dict[str, str]:
-    """Which channels are a coordinate or a velocity, `q[0]` or `qd[0]`, by channel."""
+def coordinates_seen(observables: Observables, dof: int) -> dict[str, str]:
+    """Coordinates and velocities among the channels, such as `q[0]`, by channel."""
     seen = {}
     for channel, observable in observables:
         if observable is first_coordinate:
@@ -148,7 +145,7 @@ def coordinates_seen(observables: tuple[tuple[str, Observable], ...], dof: int) 
 
 
 def _recognised(observable: Callable[[Array, Array], Array], dof: int) -> str:
-    """The entry of q or qd that a function returns."""
+    """The entry of q or qd that a function returns, or ""."""
     matches = {f"{x}[{i}]" for x in ("q", "qd") for i in range(dof)}
     for a, b in _PROBES:
         q, qd = a + 0.11 * np.arange(dof), b - 0.17 * np.arange(dof)
@@ -161,7 +158,7 @@ def _recognised(observable: Callable[[Array, Array], Array], dof: int) -> str:
 
 
 def motion_of(record: Record, outputs: Mapping[str, np.ndarray], seen: Mapping[str, str]) -> RecordedMotion:
-    """The motion that the model ran through, or that an input of a law gave; velocities by difference if need be."""
+    """The motion of the model, or of the input of a law; velocities by differentiation if they are not observed."""
     q: dict[int, np.ndarray] = {}
     qd: dict[int, np.ndarray] = {}
     for channel, name in seen.items():
@@ -175,22 +172,19 @@ def motion_of(record: Record, outputs: Mapping[str, np.ndarray], seen: Mapping[s
 
 
 def slip_of(effect: Friction | None, motion: RecordedMotion, params: PyTree, dof: int) -> Slip | None:
-    """Slip of an element, or the motion of a law by itself; None for a vector, or if not all of the motion is known."""
+    """Slip of an element, or the motion of a law by itself; None for a vector or an unknown motion."""
     if set(motion.q) != set(range(dof)):
         return None
     if effect is None:
-        return _slipped(motion.t, motion.qd[0])
-    q, qd = (np.stack([each[i] for i in range(dof)], axis=1) for each in (motion.q, motion.qd))
-    v = np.asarray(_slips(effect, params, *(on_device(each) for each in (motion.t, q, qd))))
+        v = motion.qd[0]
+    else:
+        q, qd = (np.stack([each[i] for i in range(dof)], axis=1) for each in (motion.q, motion.qd))
+        v = np.asarray(_slips(effect, params, *(on_device(each) for each in (motion.t, q, qd))))
     if v.ndim > 1 or not np.isfinite(v).all():
         return None
-    return _slipped(motion.t, v)
+    return Slip(motion.t, np.concatenate([[0.0], np.cumsum(0.5 * np.diff(motion.t) * (v[1:] + v[:-1]))]), v)
 
 
 @eqx.filter_jit
 def _slips(effect: Friction, params: PyTree, t: Array, q: Array, qd: Array) -> Array:
     return jax.vmap(lambda t, q, qd: effect.slip(t, q, qd, params))(t, q, qd)
-
-
-def _slipped(t: np.ndarray, v: np.ndarray) -> Slip:
-    return Slip(t, np.concatenate([[0.0], np.cumsum(0.5 * np.diff(t) * (v[1:] + v[:-1]))]), v)

@@ -16,20 +16,19 @@ from ..._core.parameters import Range
 from ...friction import AbstractLaw
 from ...scene import Scene, replace_numbers, scene_numbers
 
-# What a parameter is measured from: a number, another parameter, or sigma1, Fs and Fc of a law that is to be passive.
+# Lower limit of a parameter: a number, another parameter, or sigma1, Fs and Fc of a law that must be passive.
 Floor: TypeAlias = float | str | tuple[str, str, str] | None
-# Logarithmic coordinates stop short of overflow, and one iteration does not change a parameter by more than this factor
-# to a power: the curvature of a model over more decades is nothing that a linearisation knows.
+# Bound of logarithmic coordinates, short of overflow, and their longest step in one iteration: a linearisation says
+# nothing about a change by more than such a factor.
 _MOST_DECADES, _LONGEST_LOG_STEP = 60.0, 1.5
 # Least distance from a limit that a logarithm is taken of, and least unit of a parameter without limits.
 _LEAST_DISTANCE, _LEAST_UNIT = 1e-30, 1e-12
 
-_Number = TypeVar("_Number", float, Array, np.ndarray)
-_Known = TypeVar("_Known", Array, np.ndarray)
+_Known = TypeVar("_Known", float, Array, np.ndarray)
 
 
 def entry_names(name: str, number: ArrayLike) -> tuple[str, ...]:
-    """Names of the entries of a number; that of a single one is its own."""
+    """Names of the entries of a number; a single number has its own name."""
     return tuple(f"{name}[{i}]" for i in range(jnp.size(number))) if jnp.ndim(number) == 1 else (name,)
 
 
@@ -57,7 +56,7 @@ def split_ranges(numbers: Mapping[str, Array], ranges: Mapping[str, Range]) -> d
 
 
 def join_entries(numbers: Mapping[str, Array], values: Mapping[str, Array]) -> dict[str, Array]:
-    """Whole numbers with the entries in `values` replaced, those that have any."""
+    """Numbers with entries in `values`, with these replaced."""
     joined: dict[str, Array] = {}
     for name, number in numbers.items():
         entries = entry_names(name, number)
@@ -82,7 +81,7 @@ def with_numbers(model: eqx.Module, numbers: Mapping[str, np.ndarray]) -> eqx.Mo
 
     **Raises:**
 
-    - `ValueError` if its numbers are others by name or shape.
+    - `ValueError` if its numbers have other names or shapes.
     """
     if not isinstance(model, Scene | AbstractLaw):
         raise ValueError(f"model must be a Scene or a law, but {model!r} was given.")
@@ -90,41 +89,112 @@ def with_numbers(model: eqx.Module, numbers: Mapping[str, np.ndarray]) -> eqx.Mo
     missing, extra = [k for k in numbers if k not in own], [k for k in own if k not in numbers]
     if missing or extra:
         raise ValueError(
-            f"The model is not the one that was fitted: it lacks {', '.join(missing) or 'nothing'}, and has"
-            f" {', '.join(extra) or 'nothing'} that was not there."
+            f"The model is not the fitted one: it lacks {', '.join(missing) or 'nothing'}, and has"
+            f" {', '.join(extra) or 'nothing'} in addition."
         )
     for name, number in numbers.items():
         if np.shape(number) != np.shape(own[name]):
             raise ValueError(
-                f"The model is not the one that was fitted: {name} has the shape {np.shape(own[name])}, but"
+                f"The model is not the fitted one: {name} has the shape {np.shape(own[name])}, but"
                 f" {np.shape(number)} was fitted."
             )
     return replace_numbers(model, {k: jnp.asarray(x) for k, x in numbers.items()})
 
 
+class ParameterCoordinate(eqx.Module):
+    """One parameter of a fit and its coordinate x, about 1 in size, in which all limits are bounds.
+
+    - `kind`: of the coordinate.
+        - "log": `floor + unit exp(x)`, above a number.
+        - "above": `floor + unit x` with x >= 0, at or above a number or another parameter (Fs >= Fc).
+        - "ratio": `floor (1 + unit x)`, from another parameter to `most` times it.
+        - "line": `unit x`, without limits.
+        - "follow": `floor + unit`, of a parameter that is not free but limited by a free one.
+    - `base`: name of the parameter that is the floor, or names of the sigma1, Fs and Fc of a law that must be passive;
+      None if the floor is the number `floor`.
+    - `upper`, `most`: largest value and largest ratio to the base, infinite for no limit.
+    """
+
+    name: str = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+    base: str | tuple[str, str, str] | None = eqx.field(static=True)
+    floor: Array
+    unit: Array
+    upper: Array
+    most: Array
+
+    @staticmethod
+    def of(name: str, values: Mapping[str, float], floor: Floor, declared: Range) -> "ParameterCoordinate":
+        """The coordinate of a free parameter that starts at its value, above a floor and in its declared range."""
+        value, upper, most = values[name], math.inf if declared.upper is None else declared.upper, math.inf
+        if declared.most is not None and isinstance(floor, float):
+            upper = max(declared.most * values[str(declared.lower)], value)
+        elif declared.most is not None and isinstance(floor, str) and values[floor] > 0:
+            # A start beyond the largest ratio raises it.
+            most = max(declared.most, value / values[floor])
+        _check_start(name, values, floor, declared.strict, upper)
+        distance = value - _floor(floor, values)
+        if floor is None:
+            kind, unit = "line", max(abs(value), _LEAST_UNIT) if value else 1.0
+        elif math.isfinite(most):
+            kind, unit = "ratio", distance / _floor(floor, values) or 1.0
+        else:
+            kind = "log" if declared.strict and isinstance(floor, float | int) else "above"
+            unit = distance if distance > 0 else abs(value) or 1.0
+        base = floor if isinstance(floor, str | tuple) else None
+        number = 0.0 if isinstance(floor, str | tuple | None) else float(floor)
+        return ParameterCoordinate(name, kind, base, *(on_device(each) for each in (number, unit, upper, most)))
+
+    @staticmethod
+    def following(name: str, base: str, values: Mapping[str, float]) -> "ParameterCoordinate":
+        """A parameter that keeps its distance from a base that moves."""
+        distance = on_device(values[name] - values[base])
+        return ParameterCoordinate(name, "follow", base, on_device(0.0), distance, on_device(np.inf), on_device(np.inf))
+
+    def floor_at(self, values: Mapping[str, _Known]) -> _Known | Array:
+        """The lower limit where the other parameters have these values."""
+        return self.floor if self.base is None else _floor(self.base, values)
+
+    def value(self, x: Array | None, values: Mapping[str, Array]) -> Array:
+        """The parameter at x, where those before it have these values."""
+        floor = self.floor_at(values)
+        if x is None:
+            return floor + self.unit
+        over = self.unit * (jnp.exp(x) if self.kind == "log" else x)
+        return floor * (1.0 + over) if self.kind == "ratio" else floor + over
+
+    def coordinate(self, values: Mapping[str, Array]) -> Array:
+        """The x at which the parameter has its value among these."""
+        floor, value = self.floor_at(values), values[self.name]
+        over = (value / floor - 1.0 if self.kind == "ratio" else value - floor) / self.unit
+        return jnp.log(jnp.maximum(over, _LEAST_DISTANCE)) if self.kind == "log" else over
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bound of x."""
+        least = {"line": -jnp.inf, "log": -_MOST_DECADES, "above": 0.0, "ratio": 0.0}[self.kind]
+        most = ((self.most - 1.0) if self.kind == "ratio" else self.upper - self.floor) / self.unit
+        most = jnp.minimum(jnp.log(most), _MOST_DECADES) if self.kind == "log" else most
+        return jnp.asarray(least, most.dtype), most
+
+    @property
+    def fixed_limits(self) -> tuple[float, float]:
+        """Lower and upper limit of the parameter that are numbers, infinite if there are none."""
+        line = self.kind == "line" or self.base is not None
+        return -math.inf if line else float(self.floor), float(self.upper)
+
+
 class FreeParameters(eqx.Module):
-    """Names, start values and limits of the parameters of a fit.
+    """The parameters of a fit, by a vector x with one coordinate for each.
 
-    Each has a coordinate x, about 1 in size: a parameter that must be greater than a number is `floor + unit exp(x)`;
-    one that may also reach its lower limit is `floor + unit x` with x >= 0, where the limit may be another parameter
-    (Fs >= Fc); one that is also at most so many times that other is `floor (1 + unit x)`; one without limits is
-    `unit x`. So all limits are bounds of x, and one may be reached exactly. A parameter that is not free, but whose
-    limit is, keeps its distance from it: with Fs = Fc at the start, it stays so.
-
-    - `names`: of the free parameters, in the order they were given.
-    - `following`: names of the parameters that are not free but follow one that is.
+    - `names`: of the free parameters, in the order they were named.
+    - `entries`: the free parameters, and those that follow one, each after its base.
+    - `start`: start values of the entries, and values of fixed parameters that are bases, by name.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
-    following: tuple[str, ...] = eqx.field(static=True)
-    _order: tuple[str, ...] = eqx.field(static=True)
-    _kinds: tuple[str, ...] = eqx.field(static=True)
-    _bases: tuple[str | tuple[str, str, str] | None, ...] = eqx.field(static=True)
+    entries: tuple[ParameterCoordinate, ...]
     start: dict[str, Array]
-    _floors: dict[str, Array]
-    _units: dict[str, Array]
-    _upper: dict[str, Array]
-    _most: dict[str, Array]
 
     @staticmethod
     def of(
@@ -139,13 +209,14 @@ class FreeParameters(eqx.Module):
 
         - `numbers`: all numbers by name.
         - `ranges`: their ranges, by name.
-        - `free`: names of those to fit.
-        - `passive`: names of the sigma1, Fs and Fc that the free sigma2 of a LuGre law must go with for it to be
-          passive, `sigma2 >= sigma1 (Fs - Fc)/Fc`, by the name of that sigma2.
+        - `free`: names of those to fit. A parameter limited by a free one keeps its distance: if Fs = Fc at the start,
+          it stays so.
+        - `passive`: names of the sigma1, Fs and Fc that keep a LuGre law with a free sigma2 passive,
+          `sigma2 >= sigma1 (Fs - Fc)/Fc`, by the name of that sigma2.
 
         **Raises:**
 
-        - `ValueError` for a name that is unknown, given twice or no single number, or a start beyond its limits.
+        - `ValueError` for a name that is unknown, repeated or no single number, or a start beyond its limits.
         """
         _check_names(numbers, free)
         values = {name: float(jnp.asarray(x)) for name, x in numbers.items() if jnp.shape(x) == ()}
@@ -154,96 +225,58 @@ class FreeParameters(eqx.Module):
             name for name, r in ranges.items() if name not in (*free, *following) and r.lower in (*free, *following)
         ]:
             following += more
-        moving = (*free, *following)
         floors: dict[str, Floor] = {}
-        for name in moving:
-            floors[name] = ranges[name].lower if name in ranges else None
-            if isinstance(floors[name], str) and floors[name] not in moving:
-                floors[name] = values[str(floors[name])]  # a limit that is fixed is a number
+        for name in (*free, *following):
+            lower = ranges[name].lower if name in ranges else None
+            fixed = isinstance(lower, str) and lower not in (*free, *following)
+            floors[name] = values[str(lower)] if fixed else lower
         floors |= {name: names for name, names in (passive or {}).items() if name in free}
         order: list[str] = []
-        for name in moving:
+        for name in floors:
             _append_after(name, floors, order)
-        strict = {name for name in free if name in ranges and ranges[name].strict}
-        upper = {name: most for name in free if name in ranges and (most := ranges[name].upper) is not None}
-        upper |= {
-            name: max(most * values[str(ranges[name].lower)], values[name])
-            for name in free
-            if name in ranges and isinstance(floors[name], float) and (most := ranges[name].most) is not None
-        }
-        # Of a limit that starts at zero there is no multiple. Whoever starts with more is not held back.
-        most = {
-            name: max(most, values[name] / values[base])
-            for name in free
-            if isinstance(base := floors[name], str) and (most := ranges[name].most) is not None and values[base] > 0
-        }
-        for name in free:
-            _check_start(name, values, floors[name], name in strict, upper.get(name))
-        kinds = {
-            name: "follow"
+        entries = tuple(
+            ParameterCoordinate.following(name, str(floors[name]), values)
             if name in following
-            else "line"
-            if floors[name] is None
-            else "ratio"
-            if name in most
-            else "log"
-            if name in strict and isinstance(floors[name], float | int)
-            else "above"
+            else ParameterCoordinate.of(name, values, floors[name], ranges.get(name, Range("")))
             for name in order
-        }
-        numeric = {name: x for name, x in floors.items() if isinstance(x, float | int)}
-        units = {name: _unit(kinds[name], values, name, floors[name]) for name in order}
-        beside = {each: values[each] for x in floors.values() if isinstance(x, tuple) for each in x}
-        start = beside | {name: values[name] for name in order}
-        start |= {
-            name: max(values[name], _base(floors[name], values)) for name in free if kinds[name] in ("above", "ratio")
-        }
-        return FreeParameters(
-            names=tuple(free),
-            following=tuple(following),
-            _order=tuple(order),
-            _kinds=tuple(kinds[name] for name in order),
-            _bases=tuple(x if isinstance(x := floors[name], str | tuple) else None for name in order),
-            start={name: on_device(x) for name, x in start.items()},
-            _floors={name: on_device(numeric.get(name, 0.0)) for name in order},
-            _units={name: on_device(x) for name, x in units.items()},
-            _upper={name: on_device(x) for name, x in upper.items()},
-            _most={name: on_device(x) for name, x in most.items()},
         )
-
-    @property
-    def followed(self) -> dict[str, str]:
-        """What each parameter follows that is not free but moves with one that is."""
-        bases = dict(zip(self._order, self._bases, strict=True))
-        return {name: str(bases[name]) for name in self.following}
+        start = {each: values[each] for floor in floors.values() if isinstance(floor, tuple) for each in floor}
+        for each in entries:
+            inside = each.kind in ("above", "ratio")
+            start[each.name] = max(values[each.name], _floor(floors[each.name], values) if inside else -math.inf)
+        return FreeParameters(tuple(free), entries, {name: on_device(x) for name, x in start.items()})
 
     @staticmethod
     def none() -> "FreeParameters":
         """Nothing is free."""
-        return FreeParameters((), (), (), (), (), {}, {}, {}, {}, {})
+        return FreeParameters((), (), {})
 
-    def _kind(self, name: str) -> str:
-        return self._kinds[self._order.index(name)]
+    @property
+    def following(self) -> dict[str, str]:
+        """The base of each parameter that is not free but follows one that is, by name."""
+        return {each.name: str(each.base) for each in self.entries if each.kind == "follow"}
 
-    def _floor(self, name: str, values: Mapping[str, _Known]) -> _Known | Array | np.floating:
-        base = self._bases[self._order.index(name)]
-        if base is None:
-            return self._floors[name]
-        return values[base] if isinstance(base, str) else _passive_floor(*(values[each] for each in base))
+    @property
+    def free(self) -> tuple[ParameterCoordinate, ...]:
+        """The free parameters in the order of `names`."""
+        entries = {each.name: each for each in self.entries}
+        return tuple(entries[name] for name in self.names)
+
+    def __getitem__(self, name: str) -> ParameterCoordinate:
+        return self.free[self.names.index(name)]
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kind of each coordinate in the order of `names`."""
+        return tuple(each.kind for each in self.free)
 
     def values(self, x: Float[Array, " free"]) -> dict[str, Array]:
         """The parameters at `x`, and those that follow them."""
-        values = dict(self.start)  # what a floor names and is not free stays as it is
-        for name, kind in zip(self._order, self._kinds, strict=True):
-            floor = self._floor(name, values)
-            if kind == "follow":
-                start = self._floor(name, self.start)
-                values[name] = floor + (self.start[name] - start)
-                continue
-            here = x[self.names.index(name)]
-            over = self._units[name] * (jnp.exp(here) if kind == "log" else here)
-            values[name] = floor * (1.0 + over) if kind == "ratio" else floor + over
-        return {name: values[name] for name in self._order}
+        values = dict(self.start)  # a fixed base stays as it is
+        for each in self.entries:
+            here = None if each.kind == "follow" else x[self.names.index(each.name)]
+            values[each.name] = each.value(here, values)
+        return {each.name: values[each.name] for each in self.entries}
 
     def coordinates(self, values: Mapping[str, ArrayLike]) -> Float[Array, " free"]:
         """The x at which the parameters are these `values`, moved into the limits."""
@@ -251,15 +284,6 @@ class FreeParameters(eqx.Module):
         return _coordinates(
             self, {**self.start, **{name: on_device(np.asarray(x, dtype)) for name, x in values.items()}}
         )
-
-    def _coordinates(self, known: Mapping[str, Array]) -> Float[Array, " free"]:
-        coordinates: dict[str, Array] = {}
-        for name in self.names:
-            floor, kind = self._floor(name, known), self._kind(name)
-            over = (known[name] / floor - 1.0 if kind == "ratio" else known[name] - floor) / self._units[name]
-            coordinates[name] = jnp.log(jnp.maximum(over, _LEAST_DISTANCE)) if kind == "log" else over
-        lower, upper = self.bounds
-        return jnp.clip(_stack([coordinates[name] for name in self.names]), lower, upper)
 
     @property
     def x0(self) -> Float[Array, " free"]:
@@ -269,53 +293,23 @@ class FreeParameters(eqx.Module):
     @property
     def bounds(self) -> tuple[Float[Array, " free"], Float[Array, " free"]]:
         """Lower and upper bounds of x."""
-        least = {"line": -jnp.inf, "log": -_MOST_DECADES, "above": 0.0, "ratio": 0.0}
-        lower = _stack([jnp.asarray(least[self._kind(name)], float) for name in self.names])
-        upper = []
-        for name in self.names:
-            if name in self._upper:
-                most = (self._upper[name] - self._floors[name]) / self._units[name]
-                upper.append(jnp.log(most) if self._kind(name) == "log" else most)
-            elif name in self._most:
-                upper.append((self._most[name] - 1.0) / self._units[name])
-            else:
-                upper.append(jnp.asarray(_MOST_DECADES if self._kind(name) == "log" else jnp.inf, float))
-        return lower, _stack(upper)
+        pairs = [each.bounds for each in self.free]
+        return _stack([lower for lower, _ in pairs]), _stack([upper for _, upper in pairs])
 
     def limits(self, x: ArrayLike) -> dict[str, tuple[float, float]]:
         """Lower and upper limit of each parameter where the others are as at `x`."""
         values = {name: np.asarray(each) for name, each in {**self.start, **self.at(x).values}.items()}
-        floors = {name: float(self._floor(name, values)) for name in self.names}
-        return {
-            name: (
-                -math.inf if self._kind(name) == "line" else floors[name],
-                float(self._most[name]) * floors[name]
-                if name in self._most
-                else float(self._upper.get(name, math.inf)),
-            )
-            for name in self.names
-        }
-
-    def limit_of(self, name: str) -> str | None:
-        """Name of the parameter that is the lower limit of this one, as Fc of Fs."""
-        base = self._bases[self._order.index(name)]
-        return base if isinstance(base, str) else None
-
-    def fixed_limits(self, name: str) -> tuple[float, float]:
-        """Lower and upper limit of a parameter that are numbers, infinite where they are none."""
-        line = self._kind(name) == "line" or self._bases[self._order.index(name)] is not None
-        low = -math.inf if line else float(self._floors[name])
-        return low, float(self._upper.get(name, math.inf))
+        limits = {}
+        for each in self.free:
+            floor = float(each.floor_at(values))
+            upper = float(each.most) * floor if each.kind == "ratio" else float(each.upper)
+            limits[each.name] = (-math.inf if each.kind == "line" else floor, upper)
+        return limits
 
     @property
     def longest(self) -> Float[Array, " free"]:
         """Longest change of x in one iteration."""
-        return jnp.asarray([_LONGEST_LOG_STEP if self._kind(name) == "log" else jnp.inf for name in self.names])
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """Kind of each coordinate: "line", "above" (a limit), "ratio" (to a limit) or "log" (of a distance from it)."""
-        return tuple(self._kind(name) for name in self.names)
+        return jnp.asarray([_LONGEST_LOG_STEP if kind == "log" else jnp.inf for kind in self.kinds])
 
     def vector(self, x: Float[Array, " free"]) -> Float[Array, " free"]:
         """The parameters at `x` as a vector in the order of `names`."""
@@ -329,7 +323,7 @@ class FreeParameters(eqx.Module):
         return jax.jacfwd(self.vector)(x)
 
     def at(self, x: ArrayLike) -> "ParameterPoint":
-        """The parameters at `x`, shape `[free]`, which is known; for what is not compiled itself."""
+        """The parameters at a known `x`, shape `[free]`, as NumPy arrays."""
         values, slopes, lower, upper = _parameters_at(self, on_device(x))
         values = {name: np.asarray(each) for name, each in values.items()}
         vector = np.array([values[name] for name in self.names], lower.dtype)
@@ -356,8 +350,8 @@ def _parameters_at(free: FreeParameters, x: Float[Array, " free"]) -> tuple[dict
 
 
 @eqx.filter_jit
-def _coordinates(free: FreeParameters, known: dict[str, Array]) -> Float[Array, " free"]:
-    return free._coordinates(known)
+def _coordinates(free: FreeParameters, values: dict[str, Array]) -> Float[Array, " free"]:
+    return jnp.clip(_stack([each.coordinate(values) for each in free.free]), *free.bounds)
 
 
 def _stack(entries: list[Array]) -> Float[Array, " free"]:
@@ -376,22 +370,21 @@ def _check_names(numbers: Mapping[str, ArrayLike], free: Sequence[str]) -> None:
             raise ValueError(f"{name} is an array of shape {jnp.shape(numbers[name])}; only single numbers fit.")
 
 
-def _check_start(name: str, values: Mapping[str, float], floor: Floor, strict: bool, upper: float | None) -> None:
+def _check_start(name: str, values: Mapping[str, float], floor: Floor, strict: bool, upper: float) -> None:
     value = values[name]
     if isinstance(floor, str | float | int):
-        least = values[floor] if isinstance(floor, str) else floor
+        least = _floor(floor, values)
         if value < least or (strict and value == least):
             shown = f"{floor} = {least:g}" if isinstance(floor, str) else f"{floor:g}"
             raise ValueError(f"The start {name} = {value:g} must lie above its limit {shown}.")
-    if upper is not None:
-        if isinstance(floor, str | tuple):
-            raise ValueError(f"{name} is limited by {floor} and by {upper:g}: free only one of the two.")
-        if value > upper:
-            raise ValueError(f"The start {name} = {value:g} must lie below its limit {upper:g}.")
+    if upper < math.inf and isinstance(floor, str | tuple):
+        raise ValueError(f"{name} is limited by {floor} and by {upper:g}: free only one of the two.")
+    if value > upper:
+        raise ValueError(f"The start {name} = {value:g} must lie below its limit {upper:g}.")
 
 
 def _append_after(name: str, floors: Mapping[str, Floor], order: list[str]) -> None:
-    """Append a name to the order after all that it is measured from."""
+    """Append a name to the order, after its bases."""
     if name in order:
         return
     floor = floors.get(name)
@@ -401,24 +394,9 @@ def _append_after(name: str, floors: Mapping[str, Floor], order: list[str]) -> N
     order.append(name)
 
 
-def _passive_floor(sigma1: _Number, Fs: _Number, Fc: _Number) -> _Number:
-    return sigma1 * (Fs - Fc) / Fc
-
-
-def _base(floor: Floor, values: Mapping[str, float]) -> float:
-    if floor is None:
-        return 0.0
+def _floor(floor: Floor, values: Mapping[str, _Known]) -> _Known | float:
+    """The number that a parameter is measured from; that of a passive law is `sigma1 (Fs - Fc)/Fc`."""
     if isinstance(floor, tuple):
-        return _passive_floor(*(values[name] for name in floor))
-    return values[floor] if isinstance(floor, str) else float(floor)
-
-
-def _unit(kind: str, values: Mapping[str, float], name: str, floor: Floor) -> float:
-    """Size of a step of one in x: the distance from the limit, or where there is none, of the value."""
-    value = values[name]
-    if kind == "line":
-        return max(abs(value), _LEAST_UNIT) if value else 1.0
-    distance = value - _base(floor, values)
-    if kind == "ratio":
-        return distance / _base(floor, values) or 1.0
-    return distance if distance > 0 else (abs(value) or 1.0)
+        sigma1, Fs, Fc = (values[each] for each in floor)
+        return sigma1 * (Fs - Fc) / Fc
+    return values[floor] if isinstance(floor, str) else floor or 0.0

@@ -1,4 +1,4 @@
-"""`compare`, `compare_laws`: which of several models, judged by what was held back from the fit."""
+"""`compare`, `compare_laws`: several models fitted to the same records and ranked by held-out error."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,42 +11,40 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..._core.arguments import as_whole
 from ..._core.arrays import on_device
 from ..._core.parameters import ranges_of
 from ..._core.progress import candidate_words, reported
 from ...friction import AbstractLaw
 from ...scene import Scene, State, scene_numbers
 from ..data._record import Record, Runs, cut, runs_of
-from ..estimate._initializers import AbstractInitializer, Continuation, FromSmaller, last_part
-from ..estimate._prepare import Settings, StartState, measured_start, prepare
-from ..estimate._problem import AbstractLoss, FitProblem, SquaredLoss
+from ..estimate._initializers import AbstractInitializer, Continuation, FromSmaller, as_initializers, last_part
+from ..estimate._prepare import FitOptions, StartState, initial_states, measured_start, prepare
+from ..estimate._problem import AbstractLoss, FitProblem
 from ..estimate._search import Progress, SearchOptions, SearchResult, SearchState, solve
-from ..estimate._search import by_channel as residual_by_channel
 from ..model._engines import DELAY
 from ..model._observe import Observable, by_channel, first_coordinate
 from ..model._parameters import split_entries
-from ..uncertainty._fit import fit, fit_law
+from ..uncertainty._fit import fit_law, fit_scene
 from ..uncertainty._result import FitResult
 from ._comparison import Comparison, CrossValidated, Part, comparison_of
-from ._opening import after, begin, check_lengths, counting, pinned, sample_counts, shown_starts, unknown_starts
+from ._prediction import after, begin, check_lengths, sample_counts, shown_starts
 
-# Called after each iteration with the name of the model, the number of the fold that is held back (None: nothing is),
+# Called after each iteration with the name of the model, the number of the held-out fold (None: the fit to everything),
 # the number of the iteration and the root mean square of the residual.
 CompareProgress: TypeAlias = Callable[[str, int | None, int, float], None]
-# Relative tolerance of runs by events, as in `fit`.
-_ACCURACY = 1e-8
-# Relative tolerance of the fits with something held back: their errors are wanted to three digits, and start close.
+# Relative tolerance of the fits to all but a fold, which start close to the optimum: three digits of the error.
 _ENOUGH = 1e-4
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model that is to be compared.
+    """A model for `compare`.
 
     **Arguments:**
 
     - `scene`: with start values; for `compare_laws` a law.
-    - `free`: names of the numbers to fit, as for `fit`; for a law None for those that `fit_law` takes by itself.
+    - `free`: names of the numbers to fit, as for `fit`; for a law None for the default of `fit_law`.
     - `description`: for tables.
     """
 
@@ -55,50 +53,27 @@ class Candidate:
     description: str = ""
 
 
-def _from_smaller(free: Sequence[str], judged: Mapping[str, CrossValidated]) -> tuple[AbstractInitializer, ...]:
-    """From the fit of the largest model all of whose parameters are among `free`, by the last parts of their names."""
-    names = {last_part(name) for name in free}
-    fitted = [
-        {last_part(name): on_device(each.values[name]) for name in _finished(each.search).problem.free.names}
-        for each, _, _ in judged.values()
-    ]
-    nested = [values for values in fitted if set(values) <= names]
-    return (FromSmaller(max(nested, key=len)),) if nested else ()
-
-
 @dataclass(frozen=True, kw_only=True)
-class _Asked:
-    """What `compare` was asked for that is the same for all candidates; see there."""
+class CompareOptions:
+    """The arguments of `compare` that are the same for all candidates; see there."""
 
     records: tuple[Record, ...]
     hold_out: tuple[Record, ...]
     folds: int
-    observe: Observable | Mapping[str, Observable]
-    q0: StartState | None
-    qd0: StartState | None
-    limits: Mapping[str, tuple[float | None, float | None]]
-    loss: AbstractLoss
-    initializer: tuple[AbstractInitializer, ...]
-    substeps: int
+    fit: FitOptions
+    initializers: tuple[AbstractInitializer, ...]
     max_steps: int
-    progress: CompareProgress | None = None
 
-    def settings(self, scene: Scene, q0: StartState | None, qd0: StartState | None) -> Settings:
-        """As `prepare` wants them, with the limits that are for this scene."""
-        limits = {name: each for name, each in self.limits.items() if _base(name) in _names(scene, self.records)}
-        return Settings(
-            observe=self.observe,
-            q0=q0,
-            qd0=qd0,
-            limits=limits,
-            loss=self.loss,
-            substeps=self.substeps,
-            accuracy=_ACCURACY,
-        )
+    def fit_of(self, scene: Scene, **starts: StartState) -> FitOptions:
+        """The options of a fit of this scene, with the limits of its numbers."""
+        names = _names(scene, self.records)
+        limits = {name: each for name, each in self.fit.limits.items() if _limited(name) in names}
+        return replace(self.fit, limits=limits, **starts)
 
-    def options(self, name: str, fold: int | None) -> SearchOptions:
-        """Of a search in which this fold is held back."""
-        return SearchOptions(_ENOUGH, self.max_steps, _told(self.progress, name, fold))
+    @property
+    def windows(self) -> tuple[Record, ...]:
+        """All records cut into their windows."""
+        return tuple(each for record in self.records for each in record.windows(_span(record) / self.folds))
 
 
 def compare(
@@ -117,31 +92,30 @@ def compare(
     max_steps: int = 400,
     progress: bool | CompareProgress = False,
 ) -> Comparison:
-    """Fit several models to the same records, and judge each by its error on what it was not fitted to.
+    """Fit several models to the same records, and rank them by held-out error.
 
-    Each record is cut into `folds` windows. In turn one window of each record is held back: the model is fitted to the
-    others, then run over the window that was held back with these parameters. Every window starts from a state that its
-    first samples show: 20, or as many more as show the velocity to 0.2 % of the speed of the record, a twentieth at
-    most. The other samples of what was held back are judged. The error with a start that is fitted to all of them
-    stands beside it and judges nothing. The states of friction laws where a window begins are those of the fit to
-    whole records. With `hold_out` the model is fitted to `records`, and run over the whole of each of those in the same
-    way.
+    Each record is cut into `folds` windows. In turn one window of each record is held out: the model is fitted to the
+    others, then run over the held-out window with these parameters. Every window starts from a state that its first
+    samples show: 20, or as many more as show the velocity to 0.2 % of the speed of the record, at most a twentieth. The
+    error is that of the other samples. The error with a start fitted to all samples is reported beside it, for
+    information. The states of friction laws at the start of a window are those of the fit to whole records. With
+    `hold_out` the model is fitted to `records`, and run over the whole of each held-out record in the same way.
 
-    Models are fitted in the order of their numbers of parameters, each also from where the largest one before it ended
-    whose parameters, by the last part of their names, it has all: what is part of it should not fit better.
+    Models are fitted in the order of their numbers of parameters. Each starts also from the end of the largest earlier
+    one whose parameters, by the last part of their names, it has all, so that it does not fit worse than its part.
 
     **Arguments:**
 
     - `candidates`: the models by name.
     - `records`: a record or several, as for `fit`.
     - `folds`: windows of each record, >= 2; of a record in `hold_out` the parts from which the standard error comes.
-    - `hold_out`: records that are kept for the judgement; then `records` are not cut.
+    - `hold_out`: records that are only used for the held-out error; `records` are then not cut.
     - `observe`, `q0`, `qd0`, `loss`, `substeps`, `max_steps`: see `fit`.
     - `limits`, `initializer`: see `fit`; a limit of, or a `Continuation` in, a number that a candidate does not have is
-      none for it.
+      ignored for it.
     - `progress`: True for a line of text, or a function that is called after each iteration with the model's name,
-      the fold that is held back (None: the fit to everything), the iteration and the RMSE. Ctrl-C ends the comparison
-      with the models that were finished.
+      the held-out fold (None: the fit to everything), the iteration and the RMSE. Ctrl-C ends the comparison with the
+      finished models.
 
     **Returns:**
 
@@ -149,49 +123,40 @@ def compare(
 
     **Raises:**
 
-    - `ValueError` for fewer than two folds, parts that are too short to be judged by, no candidates, limits that no
-      candidate has, and as `fit` does.
+    - `ValueError` for fewer than two folds, parts that are too short, no candidates, limits that no candidate has, and
+      as `fit` does.
     """
-    several = (records,) if isinstance(records, Record) else tuple(records)
-    others = (hold_out,) if isinstance(hold_out, Record) else tuple(hold_out)
-    initializers = (initializer,) if isinstance(initializer, AbstractInitializer) else tuple(initializer)
-    loss = SquaredLoss() if loss is None else loss
-    asked = _Asked(
-        records=several,
-        hold_out=others,
-        folds=folds,
-        observe=observe,
-        q0=q0,
-        qd0=qd0,
-        limits=limits or {},
-        loss=loss,
-        initializer=initializers,
-        substeps=substeps,
-        max_steps=max_steps,
-    )
     _check(candidates, folds)
+    options = CompareOptions(
+        records=(records,) if isinstance(records, Record) else tuple(records),
+        hold_out=(hold_out,) if isinstance(hold_out, Record) else tuple(hold_out),
+        folds=folds,
+        fit=FitOptions(observe=observe, q0=q0, qd0=qd0, limits=limits, loss=loss, substeps=substeps),
+        initializers=as_initializers(initializer),
+        max_steps=as_whole(max_steps, name="max_steps"),
+    )
     known = set()
     for name, candidate in candidates.items():
-        if not isinstance(candidate.scene, Scene) or candidate.free is None:
+        scene = candidate.scene
+        if not isinstance(scene, Scene) or candidate.free is None:
             raise ValueError(
                 f"{name}: compare needs a scene and the names of its free numbers; for laws, compare_laws."
             )
-        known |= _names(candidate.scene, several)
-        # Wrong names show before the first model has taken its time.
-        base = prepare(candidate.scene, several, candidate.free, asked.settings(candidate.scene, q0, qd0)).problem.base
-        parts = others or [each for record in several for each in record.windows(_span(record) / folds)]
-        check_lengths(parts, 0 if base is None else base.q.shape[1] + base.qd.shape[1])
-    unknown = [name for name in asked.limits if _base(name) not in known]
-    unknown += [each.name for each in initializers if isinstance(each, Continuation) and each.name not in known]
+        known |= _names(scene, options.records)
+        # Refuse wrong names before the first model has taken its time.
+        base = prepare(scene, options.records, candidate.free, options.fit_of(scene)).problem.base
+        check_lengths(options.hold_out or options.windows, 0 if base is None else base.q.shape[1] + base.qd.shape[1])
+    unknown = [name for name in options.fit.limits if _limited(name) not in known]
+    unknown += [each.name for each in options.initializers if isinstance(each, Continuation) and each.name not in known]
     if unknown:
         raise ValueError(f"{unknown[0]} is no number of any candidate; there are: {', '.join(sorted(known))}.")
     judges = {
-        name: partial(_validate_scene, name, candidate, asked)
+        name: partial(_validate_scene, name, candidate, options)
         for name, candidate in sorted(candidates.items(), key=lambda item: len(item[1].free or ()))
     }
     description = {name: candidate.description for name, candidate in candidates.items()}
-    by = f"{folds} folds" if not others else ", ".join(record.name for record in others)
-    return _compared(judges, description, by, progress, new_records=bool(others))
+    by = ", ".join(record.name for record in options.hold_out) or f"{folds} folds"
+    return _compared(judges, description, by, progress, new_records=bool(options.hold_out))
 
 
 def compare_laws(
@@ -204,9 +169,9 @@ def compare_laws(
     max_steps: int = 400,
     progress: bool | CompareProgress = False,
 ) -> Comparison:
-    """Fit several friction laws to a measured force under a measured motion, and judge each by what was held back.
+    """Fit several friction laws to a measured force under a measured motion, and rank them by held-out error.
 
-    Each record is cut into `folds` blocks in time. In turn one is held back: the law runs through the whole record,
+    Each record is cut into `folds` blocks in time. In turn one is held out: the law runs through the whole record,
     from rest and unloaded, but the samples of the block do not count in the fit.
 
     **Arguments:**
@@ -227,7 +192,7 @@ def compare_laws(
     _check(laws, folds)
     candidates = {name: x if isinstance(x, Candidate) else Candidate(x, None) for name, x in laws.items()}
 
-    own = (initializer,) if isinstance(initializer, AbstractInitializer) else tuple(initializer)
+    own = as_initializers(initializer)
 
     def judge(
         name: str, candidate: Candidate, report: CompareProgress | None, judged: Mapping[str, CrossValidated]
@@ -235,16 +200,16 @@ def compare_laws(
         law = candidate.scene
         if not isinstance(law, AbstractLaw):
             raise ValueError(f"{name}: compare_laws needs friction laws; for scenes, compare.")
-        told = _told(report, name, None)
+        initializers = (*own, *_from_smaller(tuple(ranges_of(law)), judged))
+        told = _progress_of(report, name, None) or False
         result = fit_law(
-            law, records, candidate.free, loss=loss, initializer=(*own, *_from_smaller(tuple(ranges_of(law)), judged)),
-            max_steps=max_steps, progress=told or False,
-        )  # fmt: skip
+            law, records, candidate.free, loss=loss, initializer=initializers, max_steps=max_steps, progress=told
+        )
         search = _finished(result.search)
         problem, held = search.problem, []
         block = _blocks(problem.runs, folds)
         for fold in range(folds):
-            options = SearchOptions(_ENOUGH, max_steps, _told(report, name, fold))
+            options = SearchOptions(_ENOUGH, max_steps, _progress_of(report, name, fold))
             held += _held_back(problem, search.state.x, result, block == fold, block, options)[0]
         return CrossValidated(result, tuple(held), ())
 
@@ -263,25 +228,36 @@ def _check(candidates: Mapping[str, object], folds: int) -> None:
         raise ValueError(f"folds must be at least 2, an integer, but {folds!r} was given.")
 
 
-def _base(name: str) -> str:
+def _limited(name: str) -> str:
     """The number that a limit is for: friction.Fs of "friction.Fs/friction.Fc"."""
     return name.partition("/")[0]
 
 
 def _names(scene: Scene, records: tuple[Record, ...]) -> set[str]:
-    """Names of all that can have a limit."""
+    """Names of all numbers that can have a limit."""
     return {*split_entries(scene_numbers(scene)), *(DELAY + name for record in records for name in record.inputs)}
 
 
-def _told(progress: CompareProgress | None, name: str, fold: int | None) -> Progress | None:
+def _progress_of(progress: CompareProgress | None, name: str, fold: int | None) -> Progress | None:
     if progress is None:
         return None
 
-    def told(iteration: int, rms: float, values: dict[str, float]) -> None:
+    def report(iteration: int, rms: float, values: dict[str, float]) -> None:
         del values
         progress(name, fold, iteration, rms)
 
-    return told
+    return report
+
+
+def _from_smaller(free: Sequence[str], judged: Mapping[str, CrossValidated]) -> tuple[AbstractInitializer, ...]:
+    """From the fit of the largest model all of whose parameters are among `free`, by the last parts of their names."""
+    names = {last_part(name) for name in free}
+    fitted = [
+        {last_part(name): on_device(each.values[name]) for name in _finished(each.search).problem.free.names}
+        for each, _, _ in judged.values()
+    ]
+    nested = [values for values in fitted if set(values) <= names]
+    return (FromSmaller(max(nested, key=len)),) if nested else ()
 
 
 def _compared(
@@ -292,7 +268,7 @@ def _compared(
     *,
     new_records: bool,
 ) -> Comparison:
-    """All candidates one after the other, each told of those before it, whatever becomes of each."""
+    """Judge one candidate after the other, each with the earlier ones; keep the reasons of failures."""
     judged: dict[str, CrossValidated] = {}
     failures: dict[str, str] = {}
     with reported(progress, "compare", candidate_words) as report:
@@ -301,7 +277,7 @@ def _compared(
                 judged[name] = judge(report, judged)
             except KeyboardInterrupt:
                 if not judged:
-                    raise  # nothing is finished
+                    raise
                 break
             except RuntimeError as error:
                 failures[name] = str(error).splitlines()[0]
@@ -322,50 +298,45 @@ def _finished(search: SearchResult | None) -> SearchResult:
 def _validate_scene(
     name: str,
     candidate: Candidate,
-    asked: _Asked,
+    options: CompareOptions,
     report: CompareProgress | None,
     judged: Mapping[str, CrossValidated],
 ) -> CrossValidated:
-    """The fit to everything, then what each held-back part makes of a fit without it."""
-    scene, free, asked = candidate.scene, candidate.free, replace(asked, progress=report)
+    """The fit to everything, then the residuals of each held-out part in a fit without it."""
+    scene, free, folds = candidate.scene, candidate.free, options.folds
     assert isinstance(scene, Scene)
     assert free is not None
-    numbers = _names(scene, asked.records)
-    settings = asked.settings(scene, asked.q0, asked.qd0)
-    own = [each for each in asked.initializer if not isinstance(each, Continuation) or each.name in numbers]
-    result = fit(
+    numbers = _names(scene, options.records)
+    own = [each for each in options.initializers if not isinstance(each, Continuation) or each.name in numbers]
+
+    def search_options(fold: int | None) -> SearchOptions:
+        return SearchOptions(_ENOUGH, options.max_steps, _progress_of(report, name, fold))
+
+    result = fit_scene(
         scene,
-        asked.records,
+        options.records,
         free,
-        observe=asked.observe,
-        q0=asked.q0,
-        qd0=asked.qd0,
-        limits=settings.limits,
-        loss=asked.loss,
-        initializer=[*own, *_from_smaller(free, judged)],
-        substeps=asked.substeps,
-        max_steps=asked.max_steps,
-        progress=_told(asked.progress, name, None) or False,
+        options.fit_of(scene),
+        (*own, *_from_smaller(free, judged)),
+        replace(search_options(None), rtol=SearchOptions.rtol),
     )
     search = _finished(result.search)
-    if asked.hold_out:
-        problem = _apart(scene, asked.hold_out, _measured_starts(search, asked), search, asked)
-        block = _blocks(problem.runs, asked.folds)
-        x = _at(problem, search)
-        return CrossValidated(result, *_evaluated(problem, x, result, block, asked.options(name, 0)))
-    windows = [each for record in asked.records for each in record.windows(_span(record) / asked.folds)]
-    problem = _apart(scene, tuple(windows), _reached(search, asked.records, asked.folds), search, asked)
-    fold = np.arange(problem.count) % asked.folds
+    if options.hold_out:
+        problem = _with_own_starts(scene, options.hold_out, _measured_starts(search, options), search, options)
+        block = _blocks(problem.runs, folds)
+        x = _with_starts_of(problem, search)
+        return CrossValidated(result, *_evaluated(problem, x, result, block, search_options(0)))
+    reached = _reached(search, options.records, folds)
+    problem = _with_own_starts(scene, options.windows, reached, search, options)
+    fold = np.arange(problem.count) % folds
     block = np.broadcast_to(fold[:, None], problem.runs.t.shape)
-    # Windows start as their first samples show. Free starts would take up errors of the model in the windows that are
-    # fitted, and the parameters would then not fit a window whose start does not.
-    x, options = _at(problem, search), asked.options(name, None)
-    tied = shown_starts(problem, _finished(begin(pinned(problem, x, result), x, options)))
-    everything = _finished(solve(tied, x, options))
-    parts = [
-        _held_back(tied, everything.state.x, result, block == k, block, asked.options(name, k))
-        for k in range(asked.folds)
-    ]
+    # Windows start as their first samples show. Free starts would take up errors of the model in the fitted windows,
+    # and the parameters would then not fit a window whose start does not.
+    x = _with_starts_of(problem, search)
+    pinned = problem.pinned(x, result.estimate.information)
+    tied = shown_starts(problem, _finished(begin(pinned, x, search_options(None))))
+    everything = _finished(solve(tied, x, search_options(None)))
+    parts = [_held_back(tied, everything.state.x, result, block == k, block, search_options(k)) for k in range(folds)]
     held, fitted = zip(*parts, strict=True)
     return CrossValidated(result, sum(held, ()), sum(fitted, ()))
 
@@ -378,9 +349,9 @@ def _held_back(
     block: Int[np.ndarray, "runs samples"],
     options: SearchOptions,
 ) -> tuple[tuple[Part, ...], tuple[Part, ...]]:
-    """Fit from `x` without the samples in the mask; what is left of these, as `_evaluated` gives it."""
-    fitted = _finished(solve(counting(problem, ~mask), x, options)).state.x
-    return _evaluated(counting(problem, mask), fitted, result, block, options)
+    """Fit from `x` without the samples in the mask, and evaluate these."""
+    fitted = _finished(solve(problem.counting(~mask), x, options)).state.x
+    return _evaluated(problem.counting(mask), fitted, result, block, options)
 
 
 def _evaluated(
@@ -390,11 +361,12 @@ def _evaluated(
     block: Int[np.ndarray, "runs samples"],
     options: SearchOptions,
 ) -> tuple[tuple[Part, ...], tuple[Part, ...]]:
-    """Residual with the parameters at `x`, from starts that the first samples show, and from starts fitted to all.
+    """Residuals with the parameters at `x`, from starts that the first samples show, and from starts fitted to all.
 
-    Of the samples that count; behind the first ones, where there are starts.
+    Of the samples that count, without the opening where there are starts.
     """
-    fixed = unknown_starts(pinned(problem, x, result))
+    pinned = problem.pinned(x, result.estimate.information)
+    fixed = eqx.tree_at(lambda p: p.known, pinned, {name: 0 * each for name, each in problem.known.items()})
     if not problem.local:
         search = _finished(solve(fixed, x, options))
         return _parts(search.problem, search.state, block), ()
@@ -405,9 +377,9 @@ def _evaluated(
 
 
 def _parts(problem: FitProblem, state: SearchState, block: Int[np.ndarray, "runs samples"]) -> tuple[Part, ...]:
-    """Residuals in the units of their channels, for each run and block that has samples that count."""
+    """Residuals in the units of their channels, for each run and block with samples that count."""
     parts: dict[tuple[int, int], Part] = {}
-    for name, (residual, weight) in residual_by_channel(problem, state.residual).items():
+    for name, (residual, weight) in problem.by_channel(np.asarray(state.residual)).items():
         level = float(problem.noise[name])
         # Slip instants all go with the first sample of their run.
         number = block if block.shape == weight.shape else np.broadcast_to(block[:, :1], weight.shape)
@@ -427,24 +399,26 @@ def _span(record: Record) -> float:
     return float(record.t[-1] - record.t[0])
 
 
-def _at(problem: FitProblem, search: SearchResult) -> Float[Array, " n"]:
-    """The parameters that were found, and the start states of the problem as they are."""
+def _with_starts_of(problem: FitProblem, search: SearchResult) -> Float[Array, " n"]:
+    """The parameters of the search, and the starts of the problem."""
     size = len(problem.free.names)
     return on_device(np.concatenate([np.asarray(search.state.x)[:size], np.asarray(problem.x0)[size:]]))
 
 
-def _apart(scene: Scene, records: tuple[Record, ...], starts: State, search: SearchResult, asked: _Asked) -> FitProblem:
-    """Records that each run from a free state of their own, with the noise levels that were found."""
+def _with_own_starts(
+    scene: Scene, records: tuple[Record, ...], starts: State, search: SearchResult, options: CompareOptions
+) -> FitProblem:
+    """The problem of records that each run from a free state, with the noise levels of the search."""
     free = (*search.problem.free.names, "q0", "qd0")
-    problem = prepare(scene, records, free, asked.settings(scene, starts.q, starts.qd)).problem
+    problem = prepare(scene, records, free, options.fit_of(scene, q0=starts.q, qd0=starts.qd)).problem
     noise = {name: search.problem.noise.get(name, level) for name, level in problem.noise.items()}
-    # Nothing is known of them yet; with weights of zero what is known later changes arrays alone, and compiles nothing.
+    # Weights of zero: nothing is known of the starts yet, and nothing compiles again once it is.
     known = {name: on_device(np.zeros((problem.count, len(problem.local)))) for name in list(noise)[:1]}
     return eqx.tree_at(lambda p: (p.base, p.noise), replace(problem, known=known), (starts, noise))
 
 
 def _reached(search: SearchResult, records: tuple[Record, ...], folds: int) -> State:
-    """States of the fit where windows begin, with a leading axis of windows: runs that end there."""
+    """States of the fit where windows begin, with a leading axis of windows."""
     problem, x = search.problem, search.state.x
     before = []
     for i, record in enumerate(records):
@@ -470,18 +444,15 @@ def _ends(problem: FitProblem, x: Array, own: Int[Array, " runs"], runs: Runs) -
     return first, jax.vmap(lambda start, run: problem.engine(values, start, run).end)(starts, runs)
 
 
-def _measured_starts(search: SearchResult, asked: _Asked) -> State:
-    """States where the records that are held out begin: what was measured, else where the first record begins."""
+def _measured_starts(search: SearchResult, options: CompareOptions) -> State:
+    """States where the held-out records begin: as measured, or else where the first fitted record begins."""
     base = search.problem.base
     assert base is not None
-    observables = by_channel(asked.observe, asked.hold_out)
+    observables = by_channel(options.fit.observe, options.hold_out)
     q, qd = [], []
-    for record in asked.hold_out:
+    for record in options.hold_out:
         start = measured_start(record, observables, base.q.shape[1])
         # What was not measured comes as zero.
         q.append(np.where(start[0] != 0, start[0], base.q[0]))
         qd.append(np.where(start[1] != 0, start[1], base.qd[0]))
-    scene = search.problem.engine.model
-    return jax.vmap(lambda q, qd: State(q, qd, scene.initial_state(q)))(
-        jnp.asarray(np.stack(q)), jnp.asarray(np.stack(qd))
-    )
+    return initial_states(search.problem.engine.model, jnp.asarray(np.stack(q)), jnp.asarray(np.stack(qd)))

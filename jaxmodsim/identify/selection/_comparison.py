@@ -1,35 +1,37 @@
-"""What a comparison of models says: errors on what was held back, criteria, and the simplest model that suffices."""
+"""The result of a comparison: held-out errors, information criteria, and the simplest sufficient model."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
 from ..._core.arrays import on_device
+from ..._core.readable import AbstractReadable, Table, table_of
 from ..._core.system import jsonable
 from ..estimate._problem import AbstractLoss
 from ..estimate._search import SearchResult, cost_of, weighted_by
-from ..estimate._search import by_channel as residual_by_channel
 from ..uncertainty._estimate import sample_blocks
+from ..uncertainty._residual_tests import effective_samples
 from ..uncertainty._result import FitResult
-from ._memory import effective_samples
-from ._variation import VARIATION, change_between, covariances, mean_variances, search_of
+from ._agreement import VARIATION, change_between, covariances, mean_variances
 
-# Directions of the parameters known this much worse than the best one are nothing that double precision can weigh.
+# Directions of the parameters whose information is below this share of the largest are lost in rounding.
 _LEAST = 1e-10
-# What is left of each channel, in its unit, of one part of the records.
+# Residual of each channel, in its unit, in one part of the records.
 Part: TypeAlias = dict[str, np.ndarray]
-# A standard error beyond this share of the value says that the record does not determine it; so does a value that went
-# further from its start than this factor.
+# A parameter is not determined if its standard error is above this share of its value, or if it has moved by more than
+# this factor from its start.
 _SHARE, _FAR = 0.5, 1e6
-# Errors on what was held back that differ by no more than this factor are the same for whoever uses the model.
+# Held-out errors that differ by no more than this factor make no difference in use.
 _AS_GOOD = 1.1
+# Undetermined parameters that the conclusion names.
+_MOST_NAMES = 4
 
 
 def deviance(search: SearchResult) -> float:
-    """Minus twice the logarithm of the likelihood at the noise levels of the fit, but for a constant.
+    """Minus twice the logarithm of the likelihood at the noise levels of the fit, up to a constant.
 
     `sum over channels of n ln(noise^2) + sum of losses`; with levels estimated by least squares, `n ln(RSS/n) + n`.
     """
@@ -42,10 +44,10 @@ def deviance(search: SearchResult) -> float:
 def penalty(search: SearchResult) -> float:
     """Trace of `H^-1 S` of Takeuchi (1976, Suri-Kagaku 153:12): information H, covariance S of the scores.
 
-    The number of parameters where the residual is white noise of its level, more where it is correlated. S comes from
-    the scatter of the scores of blocks of samples, as in the covariance of the estimate; that one has H^-1 on both
-    sides, which leaves nothing to be read where parameters are hardly told apart, so the trace is formed in the
-    principal directions of H. A direction that the record does not determine counts as one parameter.
+    It is the number of parameters for a residual of white noise, and larger for a correlated one. S comes from the
+    scatter of the scores of blocks of samples, as in the covariance of the estimate. The trace is formed in the
+    principal directions of H, since H^-1 is useless for parameters that are hardly distinguishable. A direction that
+    the record does not determine counts as one parameter.
     """
     rows = search.problem.samples
     residual, jacobian = (each[:rows] for each in weighted_by(search.problem.loss, search.state))
@@ -61,7 +63,7 @@ def penalty(search: SearchResult) -> float:
 
 
 class CrossValidated(NamedTuple):
-    """A fit, and the residuals of what was held back from it; those with starts fitted to it, where there are any."""
+    """A fit, and the residuals of its held-out parts; those with starts fitted to these, if the model has states."""
 
     result: FitResult
     held: tuple[Part, ...]
@@ -72,16 +74,16 @@ class CrossValidated(NamedTuple):
 class Ranked:
     """One model of a comparison.
 
-    - `name`, `description`: what it is. `parameters`: number of all that was fitted, initial states included.
-    - `held_back`, `error`: root mean square error on what was held back, and its standard error; nothing but
-      the start of each part was fitted to it, and that to its first samples. `start_fitted`: the error with starts
-      fitted to all of each part; None for laws, which have none.
-    - `parts`: the root mean square errors of the parts that were held back, shape `[parts]`.
-    - `expected`: root mean square error to expect on a new record: `held_back` and, squares added, what the uncertainty
-      of the parameters adds over whole records and what a friction level that varies between records adds. Where
-      records were held out, these show it themselves, and it is `held_back`.
-    - `over`, `over_error`: by how much it is expected to err more than the best model, and the standard error of this
-      difference, from the differences in each part.
+    - `name`, `description`: of the model. `parameters`: number of all fitted numbers, initial states included.
+    - `held_back`, `standard_error`: root mean square held-out error, and its standard error; only the start of each
+      part was fitted, to its first samples. `start_fitted`: the error with starts fitted to all of each part; None for
+      laws, which have none.
+    - `parts`: the root mean square errors of the held-out parts, shape `[parts]`.
+    - `expected`: root mean square error to expect on a new record. Its square is that of `held_back`, plus the
+      variances that uncertain parameters add over whole records and that a varying friction level adds. With held-out
+      records, which show these, it is `held_back`.
+    - `over_the_best`, `over_the_best_standard_error`: `expected` less that of the best model, and the standard error of
+      this difference, from the differences in each part.
     - `fitted`: root mean square error of the fit to everything.
     - `takeuchi`, `bic`: information criteria less the least of all models; see `Comparison`.
     - `penalty`: effective number of parameters, of Takeuchi's criterion.
@@ -92,11 +94,11 @@ class Ranked:
     description: str
     parameters: int
     held_back: float
-    error: float
+    standard_error: float
     parts: Float[np.ndarray, " parts"]
     expected: float
-    over: float
-    over_error: float
+    over_the_best: float
+    over_the_best_standard_error: float
     start_fitted: float | None
     fitted: float
     takeuchi: float
@@ -106,37 +108,35 @@ class Ranked:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """Models, ranked by the error to expect on a new record, from that on what was held back from the fit.
+class Comparison(AbstractReadable):
+    """Models, ranked by the error to expect on a new record, from their held-out error.
 
-    What is added to the squared error on parts that were held back is `J V J'`, by the covariance V of the parameters
-    and the derivatives J of the output of the fit to everything: parts begin anew and are short, and hide what
-    uncertain parameters make of a whole record. A friction level that varies from record to record by 4 % (standard
-    deviation) adds the same to all models, as it is the machine that varies: as much as the model with the least error
-    on what was held back says, of those whose parameters the records determine if there are any.
+    Held-out parts begin anew and are short, which hides the effect of uncertain parameters on a whole record. So
+    `J V J'` is added to the squared error, with the covariance V of the parameters and the derivatives J of the output
+    of the fit to everything. A friction level that varies from record to record by 4 % (standard deviation) adds the
+    same to all models, since the machine varies. This variance is that of the model with the least held-out error, of
+    those whose parameters the records determine if there are any.
 
-    Errors are root mean squares in the unit of the channel where there is one, in noise levels (as given, or the least
-    that any model found) where there are several; with another loss than squares, roots of the mean loss. The standard
-    error of the mean square comes from its scatter over the parts that were held back. These are few and their fits
-    share samples, so it is a rough one (Bengio, Grandvalet 2004, J. Mach. Learn. Res. 5:1089).
+    Errors are root mean squares in the unit of a single channel. With several channels they are in noise levels (known,
+    or the least of any model); with another loss than squares, they are roots of the mean loss. The standard error of
+    the mean square comes from its scatter over the held-out parts. It is an approximation: the parts are few, and their
+    fits share samples (Bengio, Grandvalet 2004, J. Mach. Learn. Res. 5:1089).
 
-    Two criteria judge by the fit to everything, residuals correlated in time allowed for. With D the deviance
+    Two criteria rank the fits to everything, with residuals correlated in time. With D the deviance
     `sum of n ln(noise^2) + sum of losses`, k parameters, n samples:
 
     - Takeuchi's `(D + 2 trace(H^-1 S)) m/n`, H the information, S the covariance of the scores, from their scatter
       over blocks of samples. For white residuals the trace is k and m = n, and this is Akaike's criterion.
     - BIC with effective samples, `D m/n + k ln(m)`.
 
-    m is the number of effective samples, n over the correlation of the residual, by Geyer's initial positive sequence.
-    It is that of the model which fits best: its residual is nearest to the noise, and with an m of its own for each
-    model different things would be compared. It brings both criteria to one scale: a difference of 2 is little, one of
-    10 much.
+    m is the number of effective samples: n over the correlation of the residual, by Geyer's initial positive sequence.
+    It is that of the best fit, whose residual is nearest to the noise; a separate m for each model would compare
+    different things. It brings both criteria to one scale: a difference of 2 is small, one of 10 large.
 
     - `ranked`: the models, best first. `failures`: reasons, by the name of the model. `left`: names of the models that
       were not finished when the comparison was interrupted.
     - `results`: the fits to everything, by name.
-    - `by`: what was held back, in words. `samples`, `effective`: number of samples, and how many independent ones they
-      are worth.
+    - `by`: the held-out parts, in words. `samples`, `effective`: number of samples, and of equivalent independent ones.
     """
 
     ranked: tuple[Ranked, ...]
@@ -155,66 +155,48 @@ class Comparison:
 
         - `ValueError` if no model could be fitted.
         """
-        return self._first.name
+        if not self.ranked:
+            reasons = " ".join(f"{name}: {reason}" for name, reason in self.failures.items())
+            raise ValueError(f"No model could be fitted. {reasons}")
+        return self.ranked[0].name
 
     @property
     def simplest(self) -> str:
-        """Name of the simplest model that is expected to be no worse than the best by more than one standard error.
+        """Name of the simplest model that is no worse than the best by more than one standard error.
 
-        Nor may its error on what was held back be larger by more than a tenth: with few parts the standard error is
-        rough. A tenth alone counts where the records do not determine all parameters of the best.
+        Its held-out error must also be larger by no more than a tenth, since with few parts the standard error is
+        uncertain. Only the second condition counts if the records do not determine all parameters of the best.
 
-        The simplest is the one with the fewest parameters among those whose parameters the records determine, and among
-        the others where there is none of these: what nothing determines is not known of another motion.
+        The simplest has the fewest parameters among the models whose parameters the records determine, or among all if
+        there are none: undetermined parameters say nothing about another motion.
 
-        The one-standard-error rule of Breiman et al. (1984, Classification and Regression Trees, section 3.4.3), with
-        the standard error of the difference from the best one, which leaves out what is hard for all of them.
+        This is the one-standard-error rule of Breiman et al. (1984, Classification and Regression Trees, section
+        3.4.3), with the standard error of the difference from the best model, which excludes errors common to all.
 
         **Raises:**
 
         - `ValueError` if no model could be fitted.
         """
-        best = self._first
+        best = self._of(self.best)
         near = [
             each
             for each in self.ranked
             if each is best
             or (
                 each.held_back <= _AS_GOOD * best.held_back
-                and (each.over <= each.over_error or bool(best.undetermined))
+                and (each.over_the_best <= each.over_the_best_standard_error or bool(best.undetermined))
             )
         ]
         return min(near, key=lambda each: (bool(each.undetermined), each.parameters, each.expected)).name
 
-    @property
-    def _first(self) -> Ranked:
-        if not self.ranked:
-            reasons = " ".join(f"{name}: {reason}" for name, reason in self.failures.items())
-            raise ValueError(f"No model could be fitted. {reasons}")
-        return self.ranked[0]
+    def _of(self, name: str) -> Ranked:
+        return next(each for each in self.ranked if each.name == name)
 
     @property
     def table(self) -> list[dict[str, object]]:
         """Rows by rank, then the models that failed or were not finished, of types that JSON knows."""
         rows: list[dict[str, object]] = [
-            {
-                "name": each.name,
-                "description": each.description,
-                "parameters": each.parameters,
-                "held_back": each.held_back,
-                "standard_error": each.error,
-                "parts": each.parts.tolist(),
-                "expected": each.expected,
-                "over_the_best": each.over,
-                "over_the_best_standard_error": each.over_error,
-                "start_fitted": each.start_fitted,
-                "fitted": each.fitted,
-                "takeuchi": each.takeuchi,
-                "bic": each.bic,
-                "penalty": each.penalty,
-                "undetermined": list(each.undetermined),
-                "failed": None,
-            }
+            {**asdict(each), "parts": each.parts.tolist(), "undetermined": list(each.undetermined), "failed": None}
             for each in self.ranked
         ]
         rows.extend({"name": name, "failed": reason} for name, reason in self.failures.items())
@@ -222,68 +204,38 @@ class Comparison:
 
     @property
     def conclusion(self) -> str:
-        """The simplest model that suffices, in a sentence or two."""
-        best, chosen = self._first, self.simplest
-        by_name = {each.name: each for each in self.ranked}
-        simple = by_name[chosen]
-        what = f" ({simple.description})" if simple.description else ""
-        said = (
-            f"The simplest sufficient law is {chosen}{what}: {simple.parameters} parameters, error on what was held"
-            f" back {simple.held_back:.4g}"
+        """The simplest sufficient model, in a sentence or two."""
+        best, simple = self._of(self.best), self._of(self.simplest)
+        text = (
+            f"The simplest sufficient law is {simple.name}{f' ({simple.description})' if simple.description else ''}:"
+            f" {simple.parameters} parameters, held-out error {simple.held_back:.4g}"
         )
         if simple.expected > simple.held_back:
-            said += f", {simple.expected:.4g} to expect on a new record"
+            text += f", {simple.expected:.4g} to expect on a new record"
+        simpler = [each for each in self.ranked if each.parameters < best.parameters]
         if simple is not best:
-            near = simple.over <= simple.over_error
-            said += (
-                f"; {best.name} with {best.parameters} is expected to be better by {simple.over:.2g}, which is"
-                f" {'within' if near else 'more than'} one standard error, {simple.over_error:.2g}."
+            over, error = simple.over_the_best, simple.over_the_best_standard_error
+            text += (
+                f"; {best.name} with {best.parameters} is expected to be better by {over:.2g}, which is"
+                f" {'within' if over <= error else 'more than'} one standard error, {error:.2g}."
+            )
+        elif simpler:
+            near = simpler[0]
+            text += (
+                f", the least of all; with fewer parameters {near.name} is worse by {near.over_the_best:.2g}, standard"
+                f" error {near.over_the_best_standard_error:.2g}."
             )
         else:
-            simpler = [each for each in self.ranked if each.parameters < best.parameters]
-            said += ", the least of all"
-            if simpler:
-                said += (
-                    f"; with fewer parameters {simpler[0].name} is worse by {simpler[0].over:.2g}, standard error"
-                    f" {simpler[0].over_error:.2g}"
-                )
-            said += "."
-        for name in dict.fromkeys((chosen, best.name)):
-            if by_name[name].undetermined:
-                names = _listed(by_name[name].undetermined)
-                said += f" But the records do not determine {names} of {name}: do not use these values."
-        return said
-
-    def __str__(self) -> str:
-        """A ranked table that ends with the conclusion."""
-        width = max(len(str(row["name"])) for row in self.table)
-        lines = [
-            f"{'':{width}}  {'param.':>6}  {'held back':>10}  {'std. error':>10}  {'new record':>10}"
-            f"  {'over the best':>21}"
-            f"  {'start fitted':>12}  {'all fitted':>10}"
-            f"  {'Takeuchi':>9}  {'BIC':>9}"
-        ]
-        for each in self.ranked:
-            over = "" if each is self.ranked[0] else f"{each.over:10.3g} +- {each.over_error:7.2g}"
-            lines.append(
-                f"{each.name:{width}}  {each.parameters:6d}  {each.held_back:10.4g}  {each.error:10.2g}"
-                f"  {each.expected:10.4g}  {over:>21}"
-                f"  {'' if each.start_fitted is None else f'{each.start_fitted:.4g}':>12}"
-                f"  {each.fitted:10.4g}  {each.takeuchi:9.1f}  {each.bic:9.1f}"
-            )
-        lines += [f"{each.name}: the records do not determine {', '.join(each.undetermined)}." for each in self.ranked
-                  if each.undetermined]  # fmt: skip
-        lines += [f"{name}: failed. {reason}" for name, reason in self.failures.items()]
-        lines.append(
-            f"Held back: {self.by}. {self.samples} samples, worth {self.effective:.0f} independent ones. Criteria: less"
-            " the least."
-        )
-        if self.left:
-            lines.append(f"Interrupted; not finished: {', '.join(self.left)}.")
-        return "\n".join([*lines, self.conclusion] if self.ranked else lines)
+            text += ", the least of all."
+        for each in dict.fromkeys((simple.name, best.name)):
+            if names := self._of(each).undetermined:
+                listed = ", ".join(names[:_MOST_NAMES])
+                listed += f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+                text += f" But the records do not determine {listed} of {each}: do not use these values."
+        return text
 
     def to_dict(self) -> dict[str, object]:
-        """All of it but the samples and the models, as JSON knows it: numbers that are not finite are None."""
+        """Everything except samples and models, in types of JSON; numbers that are not finite are None."""
         return jsonable(
             {
                 "held_back": self.by,
@@ -298,6 +250,33 @@ class Comparison:
         )
 
 
+@table_of.register
+def _(comparison: Comparison) -> Table:
+    head = ("model", "parameters", "held out", "standard error", "new record", "over the best", "start fitted",
+            "all fitted", "Takeuchi", "BIC")  # fmt: skip
+    rows, notes = [], []
+    for each in comparison.ranked:
+        over = f"{each.over_the_best:.3g} +- {each.over_the_best_standard_error:.2g}"
+        start_fitted = "" if each.start_fitted is None else f"{each.start_fitted:.4g}"
+        over = "" if each is comparison.ranked[0] else over
+        numbers = f"{each.held_back:.4g}", f"{each.standard_error:.2g}", f"{each.expected:.4g}", over, start_fitted
+        criteria = f"{each.fitted:.4g}", f"{each.takeuchi:.1f}", f"{each.bic:.1f}"
+        rows.append((each.name, str(each.parameters), *numbers, *criteria))
+        if each.undetermined:
+            notes.append(f"{each.name}: the records do not determine {', '.join(each.undetermined)}.")
+    notes += [f"{name}: failed. {reason}" for name, reason in comparison.failures.items()]
+    notes.append("Criteria: less the least.")
+    if comparison.left:
+        notes.append(f"Interrupted; not finished: {', '.join(comparison.left)}.")
+    if comparison.ranked:
+        notes.append(comparison.conclusion)
+    title = (
+        f"Held out: {comparison.by}. {comparison.samples} samples, equivalent to {comparison.effective:.0f} independent"
+        " ones."
+    )
+    return Table(title, head, rows, tuple(notes))
+
+
 def comparison_of(
     judged: Mapping[str, CrossValidated],
     failures: Mapping[str, str],
@@ -307,28 +286,28 @@ def comparison_of(
     *,
     new_records: bool,
 ) -> Comparison:
-    """Rank what was judged; what is not finite failed. `new_records`: whether whole records were held back."""
-    failures, kept = dict(failures), {}
-    for name, each in judged.items():
-        finite = all(np.isfinite(x).all() for part in each.held for x in part.values())
-        if finite:
-            kept[name] = each
-        else:
-            failures[name] = "Its error on what was held back is not finite."
+    """Rank the models; one whose error is not finite has failed. `new_records`: whether whole records were held out."""
+    kept = {
+        name: each
+        for name, each in judged.items()
+        if all(np.isfinite(x).all() for part in each.held for x in part.values())
+    }
+    not_finite = [name for name in judged if name not in kept]
+    failures = {**failures, **dict.fromkeys(not_finite, "Its held-out error is not finite.")}
     if not kept:
         return Comparison(ranked=(), failures=failures, left=left, results={}, by=by, samples=0, effective=0.0)
-    searches = {name: search_of(each.result, "A comparison") for name, each in kept.items()}
+    searches = {name: each.result.search_for("A comparison") for name, each in kept.items()}
     levels = {
         channel: min(float(each.problem.noise[channel]) for each in searches.values())
         for channel in next(iter(searches.values())).problem.noise
     }
-    fitted = {name: float(_root(_fitted(each), each.problem.loss, levels)) for name, each in searches.items()}
+    fitted = {name: _fitted_error(each, levels) for name, each in searches.items()}
     samples = int(np.sum(next(iter(searches.values())).problem.weights > 0))
     effective = effective_samples(searches[min(fitted, key=lambda name: fitted[name])])
     losses = {name: _losses(each.held, searches[name].problem.loss, levels) for name, each in kept.items()}
     count = np.array([sum(len(x) for x in part.values()) for part in next(iter(kept.values())).held])
     means = {name: float(np.sum(count * loss) / np.sum(count)) for name, loss in losses.items()}
-    expected = dict(means) if new_records else _expected(means, kept, levels)
+    expected = dict(means) if new_records else _expected(means, kept, searches, levels)
     order = sorted(expected, key=lambda name: expected[name])
     best = order[0]
     d = {name: deviance(each) for name, each in searches.items()}
@@ -339,19 +318,27 @@ def comparison_of(
     ranked = []
     for name in order:
         held_back, root, least = (float(np.sqrt(x)) for x in (means[name], expected[name], expected[best]))
-        together = root + least
+        error = _standard_error(losses[name], count) / (2 * held_back) if held_back > 0 else 0.0
+        difference = _standard_error(losses[name] - losses[best], count)
+        difference = difference / (root + least) if root + least else 0.0
+        starts = kept[name].start_fitted
+        start_fitted = None
+        if starts:
+            weights = [sum(len(x) for x in part.values()) for part in starts]
+            loss = _losses(starts, searches[name].problem.loss, levels)
+            start_fitted = float(np.sqrt(np.average(loss, weights=weights)))
         ranked.append(
             Ranked(
                 name=name,
                 description=descriptions.get(name, ""),
                 parameters=size[name],
                 held_back=held_back,
-                error=float(_standard_error(losses[name], count) / (2 * held_back)) if held_back > 0 else 0.0,
+                standard_error=error,
                 parts=np.sqrt(losses[name]),
                 expected=root,
-                over=root - least,
-                over_error=float(_standard_error(losses[name] - losses[best], count) / together) if together else 0.0,
-                start_fitted=_mean_root(kept[name].start_fitted, searches[name].problem.loss, levels),
+                over_the_best=root - least,
+                over_the_best_standard_error=difference,
+                start_fitted=start_fitted,
                 fitted=fitted[name],
                 takeuchi=float(takeuchi[name] - min(takeuchi.values())),
                 bic=float(bic[name] - min(bic.values())),
@@ -359,12 +346,11 @@ def comparison_of(
                 undetermined=_undetermined(kept[name].result),
             )
         )
-    results = {name: kept[name].result for name in order}
     return Comparison(
         ranked=tuple(ranked),
         failures=failures,
         left=left,
-        results=results,
+        results={name: kept[name].result for name in order},
         by=by,
         samples=samples,
         effective=effective,
@@ -372,10 +358,12 @@ def comparison_of(
 
 
 def _expected(
-    means: Mapping[str, float], judged: Mapping[str, CrossValidated], levels: Mapping[str, float]
+    means: Mapping[str, float],
+    judged: Mapping[str, CrossValidated],
+    searches: Mapping[str, SearchResult],
+    levels: Mapping[str, float],
 ) -> dict[str, float]:
     """Mean loss to expect on a new record, by the name of the model."""
-    searches = {name: search_of(each.result, "A comparison") for name, each in judged.items()}
     covariance = {name: covariances(each.result, VARIATION, None) for name, each in judged.items()}
     best = min(means, key=lambda name: (bool(_undetermined(judged[name].result)), means[name]))
     between = _mean(change_between(searches[best], covariance[best][1]), searches[best], levels)
@@ -393,26 +381,16 @@ def _mean(variances: Mapping[str, float], search: SearchResult, levels: Mapping[
     return (next(iter(levels.values())) ** 2 if len(levels) == 1 else 1.0) * total
 
 
-def _listed(names: tuple[str, ...], most: int = 4) -> str:
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
-
-
-def _fitted(search: SearchResult) -> Part:
-    """Residual of all samples that count, in the units of the channels."""
-    split = residual_by_channel(search.problem, search.state.residual)
-    return {name: float(search.problem.noise[name]) * x[weight > 0] for name, (x, weight) in split.items()}
+def _fitted_error(search: SearchResult, levels: Mapping[str, float]) -> float:
+    """Error of all samples that count."""
+    noise = search.problem.noise
+    residual = {name: float(noise[name]) * x[weight > 0] for name, (x, weight) in search.residuals.items()}
+    return float(_root(residual, search.problem.loss, levels))
 
 
 def _losses(parts: tuple[Part, ...], loss: AbstractLoss, levels: Mapping[str, float]) -> Float[np.ndarray, " parts"]:
     """Mean loss of each part, in the squared unit of the channel if there is one."""
     return np.array([_root(part, loss, levels) ** 2 for part in parts])
-
-
-def _mean_root(parts: tuple[Part, ...], loss: AbstractLoss, levels: Mapping[str, float]) -> float | None:
-    """Root of the mean loss of all parts; None of none."""
-    count = [sum(len(x) for x in part.values()) for part in parts]
-    return float(np.sqrt(np.average(_losses(parts, loss, levels), weights=count))) if parts else None
 
 
 def _root(part: Part, loss: AbstractLoss, levels: Mapping[str, float]) -> float:
@@ -430,12 +408,11 @@ def _standard_error(values: np.ndarray, count: np.ndarray) -> float:
 
 
 def _undetermined(result: FitResult) -> tuple[str, ...]:
-    """Names of parameters without effect, with errors of the size of their value, or that ran away."""
-    estimate, errors = result.estimate, result.errors
-
-    def free_of_doubt(name: str, value: float) -> bool:
+    """Names of parameters without effect, with errors of the size of their value, or far from their start."""
+    estimate, names = result.estimate, []
+    for name, value in estimate.values.items():
         start = abs(estimate.start[name])
-        ran = start > 0 and abs(value) > _FAR * start
-        return not ran and (value in estimate.bounds[name] or errors[name] <= _SHARE * estimate.scale(name))
-
-    return tuple(name for name, value in estimate.values.items() if not free_of_doubt(name, value))
+        known = value in estimate.bounds[name] or result.errors[name] <= _SHARE * estimate.scale(name)
+        if not known or (start > 0 and abs(value) > _FAR * start):
+            names.append(name)
+    return tuple(names)

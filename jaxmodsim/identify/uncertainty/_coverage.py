@@ -1,4 +1,4 @@
-"""Whether intervals keep their promise: the same fit of many synthetic records whose truth is known."""
+"""Coverage of confidence intervals: the same fit of many synthetic records whose truth is known."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +9,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.arguments import as_share, as_whole
+from ..._core.readable import AbstractReadable, Table, table_of
 from ..estimate._initializers import AbstractInitializer, problem_at, run_initializers, side_by_side, starts_of
 from ..estimate._problem import FitProblem
 from ..estimate._search import SearchOptions, SearchState
@@ -17,12 +19,12 @@ from ._result import FitResult
 
 
 @dataclass(frozen=True, kw_only=True)
-class Coverage:
-    """How often intervals held the truth.
+class Coverage(AbstractReadable):
+    """The share of confidence intervals that hold the truth.
 
-    - `level`: what was promised; `shares`: what was seen, by name.
+    - `level`: of the intervals; `shares`: of the repeats whose interval holds the truth, by name.
     - `truth`: by name. `values`, `errors`: of every repeat, shape `[repeats]`, by name.
-    - `converged`: number of repeats whose search ended by itself.
+    - `converged`: number of repeats whose search converged.
     """
 
     level: float
@@ -32,17 +34,18 @@ class Coverage:
     errors: dict[str, Float[np.ndarray, " repeats"]]
     converged: int
 
-    def __str__(self) -> str:
-        """A table."""
-        width = max(len(name) for name in self.shares)
-        repeats = len(next(iter(self.values.values())))
-        lines = [f"{'':{width}}  {'truth':>12}  {'scatter':>10}  {'std. error':>10}  covered"]
-        for name, share in self.shares.items():
-            # Half the width that holds 68 %: a repeat that went astray shows in the share that is covered.
-            low, high = np.quantile(self.values[name], [0.1587, 0.8413])
-            scatter, error = 0.5 * (high - low), np.median(self.errors[name])
-            lines.append(f"{name:{width}}  {self.truth[name]:12.5g}  {scatter:10.2g}  {error:10.2g}  {share:7.1%}")
-        return "\n".join([*lines, f"{repeats} repeats, {self.converged} converged; promised {self.level:.0%}"])
+
+@table_of.register
+def _(coverage: Coverage) -> Table:
+    rows = []
+    for name, share in coverage.shares.items():
+        # Half the width that holds 68 %: insensitive to single repeats that failed, which the share counts.
+        low, high = np.quantile(coverage.values[name], [0.1587, 0.8413])
+        error = np.median(coverage.errors[name])
+        rows.append((name, f"{coverage.truth[name]:.5g}", f"{0.5 * (high - low):.2g}", f"{error:.2g}", f"{share:.1%}"))
+    repeats = len(next(iter(coverage.values.values())))
+    title = f"{repeats} repeats, {coverage.converged} converged; nominal coverage {coverage.level:.0%}"
+    return Table(title, ("parameter", "truth", "scatter", "standard error", "covered"), rows)
 
 
 def coverage(
@@ -57,7 +60,7 @@ def coverage(
 ) -> Coverage:
     """Repeat a fit on synthetic records: its own output as the truth, with new noise of the estimated level.
 
-    Every repeat starts where the fit itself started, and all of them run side by side.
+    Every repeat starts where the fit itself started, and all of them run in one batch.
 
     **Arguments:**
 
@@ -65,7 +68,7 @@ def coverage(
     - `repeats`: number of records, >= 2.
     - `level`: of the intervals, between 0 and 1.
     - `memory`: correlation of the noise from one sample to the next, >= 0 and < 1; 0 is white noise.
-    - `initializer`: how each repeat finds where its search starts; see `fit`.
+    - `initializer`: of each repeat; see `fit`.
     - `steps`: limit of evaluations of each repeat.
     - `seed`: of the noise.
 
@@ -77,20 +80,19 @@ def coverage(
 
     - `ValueError` for a result that was loaded, for several channels, or numbers out of range.
     """
-    if result.search is None:
-        raise ValueError("coverage fits again, which a result loaded from a file cannot: fit, then ask it.")
-    problem = result.search.problem
+    search = result.search_for("Coverage")
+    problem, repeats, level = search.problem, as_whole(repeats, name="repeats", least=2), as_share(level, name="level")
     if len(problem.noise) > 1:
-        raise ValueError("coverage knows one channel; the fit has several.")
-    if repeats < 2 or not 0 <= memory < 1:
-        raise ValueError(f"repeats must be >= 2 and memory in [0, 1), but they are {repeats} and {memory}.")
+        raise ValueError(f"coverage needs a fit with one channel, but it has {len(problem.noise)}.")
+    if not 0 <= memory < 1:
+        raise ValueError(f"memory must be >= 0 and < 1, but it is {memory!r}.")
     name = next(iter(problem.noise))
     rng = np.random.default_rng(seed)
-    seen = np.asarray(jnp.reshape(result.search.state.residual[: problem.samples], (problem.count, -1)))
-    truth = np.asarray(problem.runs.measured[name]) + float(problem.noise[name]) * seen
+    residual = np.asarray(jnp.reshape(search.state.residual[: problem.samples], (problem.count, -1)))
+    truth = np.asarray(problem.runs.measured[name]) + float(problem.noise[name]) * residual
     noise = float(problem.noise[name]) * _correlated(rng.standard_normal((repeats, *truth.shape)), memory)
     several = eqx.tree_at(lambda p: p.runs.measured[name], problem, jnp.asarray(truth + noise))
-    # A problem with nothing but the measured samples different from repeat to repeat.
+    # Only the measured samples differ from repeat to repeat.
     axes = eqx.tree_at(
         lambda p: p.runs.measured[name], jtu.tree_map(lambda _: None, problem), 0, is_leaf=lambda x: x is None
     )

@@ -1,4 +1,4 @@
-"""Estimates with their covariance, from residuals that may be correlated in time, of any size, of a model that errs."""
+"""Estimates with their covariance, for residuals of any size that may be correlated in time."""
 
 import math
 from collections.abc import Sequence
@@ -10,51 +10,50 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import special  # scipy.stats takes most of a second to import
 
+from ..._core.arguments import as_share
 from ..._core.arrays import on_device
 from ..data._record import Record
 from ..estimate._problem import FitProblem
-from ..estimate._search import SearchState, by_channel, start_search, step, weighted_by
+from ..estimate._search import SearchState, start_search, step, weighted_by
 from ..model._observe import RecordedMotion, motion_of
 
-# Blocks of samples: enough for the scatter of the scores of a dozen parameters, and each far longer than what the
-# residual of a mechanism is correlated over, which steps of a sensor in slow motion make long.
+# Blocks of samples: enough for the scatter of the scores of a dozen parameters, each much longer than the correlation
+# of the residual of a mechanism, which sensor steps in slow motion make long.
 BLOCKS = 16
 
-# Smallest eigenvalue of a scaled normal matrix against the largest one, in units of rounding.
+# Smallest eigenvalue of a scaled normal matrix, relative to the largest one, in units of rounding.
 ROUNDING = 10.0
 
-# A block of samples whose share of the information leaves a determinant below this decides something alone, and has no
-# residual to be judged by.
+# A block of samples whose information leaves a determinant below this determines something alone: it has no residual.
 _ALONE = 1e-6
 
-# An offset counts beyond so many standard errors; share of a constant that is nothing once the parameters have moved.
+# An offset is reported beyond so many standard errors; share of a constant below which the parameters take it up.
 _BEYOND, _NO_PART = 4.0, 1e-8
 
-# Lags of tests for whiteness: a decade of samples, and at most one for so many samples. Probability below which
-# residuals do not pass for white, and what keeps divisions by what may vanish finite.
+# Lags of tests for whiteness for a decade of samples, and samples for each lag at least. Probability below which a
+# residual is not white. Keeps divisions finite.
 _LAGS_A_DECADE, _SAMPLES_A_LAG = 10, 5
 _CHANCE, _TINY = 0.01, 1e-30
 
-# Derivatives are tried over this share of a standard error; they hold if they miss no more than this share of the
-# change.
+# Derivatives are tested over this share of a standard error; their error must be below this share of the change.
 _TRIED, _HOLDS = 0.1, 0.5
-# Share of the largest information from which on an axis counts as determined.
+# Share of the largest information from which an axis is determined.
 _SEEN = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
 class ParameterEstimate:
-    """Fitted parameters, and how sure they are.
+    """Fitted parameters and their uncertainty.
 
     - `values`, `start`: by name. `units`: unit of each parameter that declares one.
-    - `covariance`, `white`: of the parameters, shape `[free, free]`, in the order of `values`; the first takes the
-      correlation of the residual in time into account, the second is what it would be if the residual were white noise.
-      They hold for the model being right but for noise.
+    - `covariance`, `white`: of the parameters, shape `[free, free]`, in the order of `values`; the first with the
+      correlation of the residual in time, the second for a residual of white noise. Both assume that the model is right
+      except for noise.
     - `information`: Fisher information of the parameters, shape `[free, free]`, the noise at its level.
     - `logarithmic`: names of the parameters that must be positive; their intervals are symmetric in the logarithm.
     - `bounds`: lower and upper limit of each parameter at the estimate.
-    - `natural`: of a parameter that may have either sign, the change with which the model's output moves by as much as
-      the measured samples scatter (of a constant force: the forces in the record); 0 of the others.
+    - `natural`: for a parameter of either sign, the change that moves the output by as much as the measured samples
+      scatter (for a constant force: the forces in the record); 0 for the others.
     """
 
     values: dict[str, float]
@@ -68,7 +67,7 @@ class ParameterEstimate:
     natural: dict[str, float] = field(default_factory=dict)
 
     def scale(self, name: str) -> float:
-        """What a standard error is small or large against: the value; of either sign at least its natural scale."""
+        """The scale of a standard error: the value, or the natural scale if that is larger."""
         return max(abs(self.values[name]), self.natural.get(name, 0.0))
 
     @property
@@ -103,7 +102,7 @@ class ParameterEstimate:
 
 @dataclass(frozen=True)
 class IdentifiabilityIssue:
-    """What the motion lacks, and the free parameters that it leaves unknown."""
+    """A deficiency of the motion, in a sentence, and the free parameters that it leaves unknown."""
 
     sentence: str
     about: tuple[str, ...]
@@ -111,16 +110,16 @@ class IdentifiabilityIssue:
 
 @dataclass(frozen=True, kw_only=True)
 class FitDiagnostics:
-    """How a fit went, and what is left in its residual.
+    """The course of a fit, and its residual.
 
     - `rmse`: root mean square of output less measured value, by channel, in its unit.
-    - `noise`: standard deviation of each channel, as given or as estimated.
-    - `ending`: how the search ended. `evaluations`: how often the model and its derivatives were computed.
-    - `step_error`: root mean square by which the output moves with four times as many integration steps; None where
-      there are none.
-    - `starts`: root mean square, in noise levels, that each of several starts ended with, best first.
+    - `noise`: standard deviation of each channel, known or estimated.
+    - `ending`: why the search ended. `evaluations`: of the model and its derivatives.
+    - `step_error`: root mean square change of the output with four times as many integration steps; None without such
+      steps.
+    - `starts`: root mean square, in noise levels, at the end from each of several starts, best first.
     - `single_precision`: whether it was computed in float32.
-    - `issues`: what the motion lacks, and which parameters that leaves unknown; part of the remarks.
+    - `issues`: deficiencies of the motion, with the parameters that they leave unknown; part of the remarks.
     """
 
     rmse: dict[str, float]
@@ -135,11 +134,11 @@ class FitDiagnostics:
 
 @dataclass(frozen=True, kw_only=True)
 class FitProvenance:
-    """What was fitted to what.
+    """The records and the model of a fit.
 
-    - `records`: what was fitted. `outputs`: the model's output at their times, by channel, one dict a record.
-    - `coordinates`: channels (of a law by itself, inputs) that are a coordinate or a velocity, as `q[0]`, by name.
-    - `numbers`: all numbers of the model by name, those that were not fitted included.
+    - `records`: the fitted records. `outputs`: the model's output at their times, by channel, one dict a record.
+    - `coordinates`: channels (for a law by itself, inputs) that are a coordinate or a velocity, as `q[0]`, by name.
+    - `numbers`: all numbers of the model by name, fixed ones included.
     - `model`: the scene or law with the fitted numbers; None in a result that was loaded without one.
     """
 
@@ -159,7 +158,7 @@ class FitProvenance:
 
     @property
     def motions(self) -> tuple[RecordedMotion, ...]:
-        """Coordinates and velocities as far as the model's output shows them, one a record."""
+        """Coordinates and velocities that the model's output shows, one a record."""
         return tuple(
             motion_of(record, outputs, self.coordinates)
             for record, outputs in zip(self.records, self.outputs, strict=True)
@@ -167,12 +166,13 @@ class FitProvenance:
 
 
 class CovarianceEstimate(NamedTuple):
-    """How sure an estimate is.
+    """The uncertainty of an estimate.
 
-    - `covariance`: of the parameters, correlation of the residual in time taken into account.
-    - `white`: what it would be if the residual were white noise.
-    - `information`: Fisher information of the samples, in noise levels, and of the prior, the other numbers unknown.
-    - `refused`: whether the derivatives do not hold, see `derivatives_hold`; then the variances are infinite.
+    - `covariance`: of the parameters, with the correlation of the residual in time.
+    - `white`: the covariance for a residual of white noise.
+    - `information`: Fisher information of the samples, in noise levels, and of the prior, with the other numbers
+      unknown.
+    - `refused`: whether the derivatives do not hold, see `derivatives_hold`; the variances are then infinite.
     """
 
     covariance: Float[np.ndarray, "free free"]
@@ -207,27 +207,27 @@ def covariance_estimate(
     slopes: Float[np.ndarray, "n n"],
     blocks: Int[np.ndarray, " rows"],
     count: int,
-    kept: int,
+    parameters: int,
     white: bool,
 ) -> CovarianceEstimate:
     """Covariance `H^-1 S H^-1` with S from the scatter of the scores of blocks of samples.
 
-    Residuals may be correlated in any way within a block. Each block's score `J_b' r_b` is divided by what the block
-    itself took from its residual, `(I - J_b'J_b H^-1)^-1`, which makes the sum the jackknife over blocks (Bell,
-    McCaffrey 2002, Survey Methodology 28:169): without it errors come out too small where few samples decide.
+    Residuals may be correlated in any way within a block. Each block's score `J_b' r_b` is corrected for the fit to the
+    block itself by `(I - J_b'J_b H^-1)^-1`, which makes the sum the jackknife over blocks (Bell, McCaffrey 2002, Survey
+    Methodology 28:169). Otherwise errors are too small if few samples determine a parameter.
 
-    So few blocks leave the scatter uncertain: by a quarter in a variance. Where the residual passes for white
-    noise, S is shrunk towards what it is for such noise, by the share of their squared difference that chance explains
-    (Ledoit, Wolf 2003, J. Empirical Finance 10:603; Schaefer, Strimmer 2005, Stat. Appl. Genet. Mol. Biol. 4:32), in
-    coordinates in which the latter is the unit matrix.
+    With so few blocks a variance is uncertain by a quarter. If the residual passes for white noise, S is shrunk towards
+    that of white noise, by the share of their squared difference that chance explains (Ledoit, Wolf 2003, J. Empirical
+    Finance 10:603; Schaefer, Strimmer 2005, Stat. Appl. Genet. Mol. Biol. 4:32), in coordinates in which the latter is
+    the unit matrix.
 
     **Arguments:**
 
     - `residual`, `jacobian`: of the samples, by the coordinates x.
-    - `extra`: rows of the Jacobian that are no samples: what was known before, links between windows.
+    - `extra`: rows of the Jacobian that are no samples: the prior, links between windows.
     - `slopes`: derivatives of the parameters by x.
     - `blocks`, `count`: number of each row's block, and of blocks.
-    - `kept`: number of parameters, the first entries of x; the others are nuisance.
+    - `parameters`: number of parameters, the first entries of x; the others are nuisance.
     - `white`: whether the residual passes for white noise.
     """
     rounding = ROUNDING * float(np.finfo(jacobian.dtype).eps)
@@ -256,21 +256,23 @@ def covariance_estimate(
     change = slopes / scale
 
     def of_parameters(middle: np.ndarray) -> np.ndarray:
-        covariance = (change @ middle @ change.T)[:kept, :kept]
-        np.fill_diagonal(covariance, np.where(silent[:kept], np.inf, np.diagonal(covariance)))
+        covariance = (change @ middle @ change.T)[:parameters, :parameters]
+        np.fill_diagonal(covariance, np.where(silent[:parameters], np.inf, np.diagonal(covariance)))
         return covariance
 
-    back = np.linalg.pinv(slopes[:kept, :kept])
-    cross = (matrix / size)[:kept, kept:]
-    known = (matrix / size)[:kept, :kept] - cross @ floored_inverse((matrix / size)[kept:, kept:], rounding) @ cross.T
-    information = back.T @ (known * size[:kept, :kept]) @ back
+    back = np.linalg.pinv(slopes[:parameters, :parameters])
+    cross = (matrix / size)[:parameters, parameters:]
+    known = (matrix / size)[:parameters, :parameters] - cross @ floored_inverse(
+        (matrix / size)[parameters:, parameters:], rounding
+    ) @ cross.T
+    information = back.T @ (known * size[:parameters, :parameters]) @ back
     return CovarianceEstimate(of_parameters(bread @ meat @ bread), of_parameters(bread @ if_white @ bread), information)
 
 
 def _chance(
     scores: Float[np.ndarray, "blocks n"], difference: Float[np.ndarray, "n n"], bread: Float[np.ndarray, "n n"]
 ) -> float:
-    """Share of a squared difference of S that chance explains; none where a direction is not determined."""
+    """Share of a squared difference of S that chance explains; 0 if a direction is not determined."""
     try:
         root = np.linalg.cholesky(bread)
     except np.linalg.LinAlgError:
@@ -282,9 +284,9 @@ def _chance(
 
 
 def floored_inverse(matrix: Float[np.ndarray, "n n"], least: float) -> Float[np.ndarray, "n n"]:
-    """Inverse of a scaled normal matrix, with eigenvalues kept off zero.
+    """Inverse of a scaled normal matrix, with eigenvalues bounded from below.
 
-    A direction that the record says nothing about gets a huge error, not none.
+    A direction that the record does not determine gets a huge error.
 
     **Arguments:**
 
@@ -298,7 +300,7 @@ def floored_inverse(matrix: Float[np.ndarray, "n n"], least: float) -> Float[np.
 
 
 def correlation_of(covariance: Float[np.ndarray, "free free"]) -> Float[np.ndarray, "free free"]:
-    """Correlation of estimates by their covariance; none with those of which nothing is known."""
+    """Correlation of estimates by their covariance; 0 with undetermined ones."""
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     safe = np.where((errors > 0) & np.isfinite(errors), errors, 1.0)
     known = np.isfinite(covariance) & np.isfinite(np.add.outer(errors, errors))
@@ -310,15 +312,15 @@ def correlation_of(covariance: Float[np.ndarray, "free free"]) -> Float[np.ndarr
 def interval(
     value: float, error: float, limits: tuple[float, float], logarithmic: bool, level: float
 ) -> tuple[float, float]:
-    """Interval by Student's t with one degree of freedom less than there are blocks of samples.
+    """Interval by Student's t, with one degree of freedom less than blocks of samples.
 
-    Symmetric in the logarithm of the distance from the lower limit for a parameter that must stay above it, cut at the
-    limits for others.
+    For a parameter that must stay above its lower limit, it is symmetric in the logarithm of the distance from it. For
+    others it is cut at the limits.
 
     **Arguments:**
 
     - `value`, `error`: estimate and its standard error.
-    - `limits`: lower and upper limit of the parameter, infinite where it has none.
+    - `limits`: lower and upper limit of the parameter, infinite for none.
     - `logarithmic`: whether it must stay above its lower limit.
     - `level`: of confidence, between 0 and 1.
 
@@ -326,8 +328,7 @@ def interval(
 
     - `ValueError` unless 0 < level < 1.
     """
-    if not 0 < level < 1:
-        raise ValueError(f"level must lie between 0 and 1, but it is {level}.")
+    level = as_share(level, name="level")
     low, high = limits
     margin = float(special.stdtrit(BLOCKS - 1, 0.5 + level / 2)) * error
     if logarithmic and value > low:
@@ -338,14 +339,14 @@ def interval(
 
 
 def covariance_of(
-    problem: FitProblem, state: SearchState, kept: Sequence[int], blocks: int = BLOCKS
+    problem: FitProblem, state: SearchState, entries: Sequence[int], blocks: int = BLOCKS
 ) -> CovarianceEstimate:
-    """How sure the estimate is; the entries `kept` of x are parameters, the others nuisance.
+    """The covariance of the entries `entries` of x; the others are nuisance.
 
-    Without JAX: its many small matrices take seconds to compile.
+    In NumPy, since its many small matrices would take seconds to compile.
     """
     if not derivatives_hold(problem, state):
-        unknown, none = np.diag(np.full(len(kept), np.inf)), np.zeros((len(kept), len(kept)))
+        unknown, none = np.diag(np.full(len(entries), np.inf)), np.zeros((len(entries), len(entries)))
         return CovarianceEstimate(unknown, unknown, none, refused=True)
     numbers, count = sample_blocks(problem, blocks)
     rows, size = problem.samples, len(problem.free.names)
@@ -354,18 +355,13 @@ def covariance_of(
     slopes[:size, :size] = problem.at(state.x).slopes
     white = _passes_for_white(problem, residual)
     extra = np.asarray(state.jacobian)[rows:]
-    order = np.array([*kept, *(k for k in range(slopes.shape[0]) if k not in set(kept))])
+    order = np.array([*entries, *(k for k in range(slopes.shape[0]) if k not in set(entries))])
     jacobian, extra, slopes = jacobian[:, order], extra[:, order], slopes[np.ix_(order, order)]
-    return covariance_estimate(residual, jacobian, extra, slopes, numbers, count, len(kept), white)
+    return covariance_estimate(residual, jacobian, extra, slopes, numbers, count, len(entries), white)
 
 
-def natural_scales(problem: FitProblem, state: SearchState, kept: Sequence[int]) -> Float[np.ndarray, " kept"]:
-    """Changes of parameters with which the output moves by as much as the samples scatter; 0 of those without effect.
-
-    **Arguments:**
-
-    - `kept`: entries of x whose parameters are meant.
-    """
+def natural_scales(problem: FitProblem, state: SearchState, entries: Sequence[int]) -> Float[np.ndarray, " entries"]:
+    """Changes of the parameters `entries` that move the output by as much as the samples scatter; 0 without effect."""
     size = len(problem.free.names)
     slopes = np.diag(problem.at(state.x).slopes)
     jacobian = np.asarray(state.jacobian, float)[: problem.samples]
@@ -373,22 +369,22 @@ def natural_scales(problem: FitProblem, state: SearchState, kept: Sequence[int])
     for name, weight in problem.runs.weight.items():
         x = np.asarray(problem.runs.measured[name])[np.asarray(weight) > 0]
         scatter.append(x.size * (np.std(x) / float(problem.noise[name])) ** 2 if x.size else 0.0)
-    moved = np.linalg.norm(jacobian[:, list(kept)], axis=0)
-    moved = moved / np.array([abs(slopes[k]) if k < size else 1.0 for k in kept])
+    moved = np.linalg.norm(jacobian[:, list(entries)], axis=0)
+    moved = moved / np.array([abs(slopes[k]) if k < size else 1.0 for k in entries])
     return np.where(moved > 0, np.sqrt(sum(scatter)) / np.where(moved > 0, moved, 1.0), 0.0)
 
 
 def offsets_left(
-    problem: FitProblem, state: SearchState, kept: Sequence[int], errors: Float[np.ndarray, " kept"]
+    problem: FitProblem, state: SearchState, entries: Sequence[int], errors: Float[np.ndarray, " entries"]
 ) -> dict[str, tuple[float, float]]:
-    """Constants by which channels seem to read too high, with standard errors, in the units of the channels.
+    """Constant offsets of channels, with standard errors, in the units of the channels.
 
-    One Gauss-Newton step with the offset as one more parameter. Only offsets that are far beyond their error, and with
-    which a parameter moves by more than its own; none of a channel whose offset the start takes up.
+    One Gauss-Newton step with the offset as one more parameter. Only offsets far beyond their standard error that move
+    a parameter by more than its own; none of a channel whose offset the start takes up.
 
     **Arguments:**
 
-    - `kept`: entries of x whose parameters count. `errors`: their standard errors.
+    - `entries`: entries of x whose parameters count. `errors`: their standard errors.
     """
     if problem.loss.robust:
         return {}
@@ -397,7 +393,7 @@ def offsets_left(
     size = np.linalg.norm(jacobian, axis=0)
     scaled = jacobian / np.where(size > 0, size, 1.0)
     numbers, count = sample_blocks(problem)
-    found = {}
+    offsets = {}
     for channel in problem.runs.weight:
         column = np.concatenate([np.asarray(w) * (name == channel) for name, w in problem.columns.items()], axis=1)
         column = np.concatenate([column.reshape(-1), np.zeros(problem.rows - rows)])
@@ -414,40 +410,40 @@ def offsets_left(
         slopes = np.eye(len(x))
         slopes[: len(problem.free.names), : len(problem.free.names)] = problem.at(x).slopes
         moved = slopes @ (offset * taken / np.where(size > 0, size, 1.0))
-        far = np.abs(moved[list(kept)]) > errors
+        far = np.abs(moved[list(entries)]) > errors
         if abs(offset) > _BEYOND * math.sqrt(variance) and far.any():
-            # The model lacks what the sensor reads too high.
-            found[channel] = (
+            # The model lacks the offset of the sensor.
+            offsets[channel] = (
                 offset * float(problem.noise[channel]),
                 math.sqrt(variance) * float(problem.noise[channel]),
             )
-    return found
+    return offsets
 
 
 def derivatives_hold(problem: FitProblem, state: SearchState) -> bool:
-    """Whether the output changes as its derivatives say, over a small part of the standard errors that these give.
+    """Whether the output changes as its derivatives predict, over a small part of the standard errors.
 
-    It does not where the output is as rough as rounding, or as the integration steps, leave it: derivatives are then
-    too large by many powers of ten, and standard errors too small, down to below the rounding of the parameter.
+    It does not if rounding or the integration steps make the output rough. Derivatives are then too large by many
+    powers of ten, and standard errors too small, down to below the rounding of the parameter.
     """
     x, box = np.asarray(state.x), problem.box
     jacobian, residual = (np.asarray(each).astype(float) for each in (state.jacobian, state.residual))
     scale = np.sqrt(np.sum(jacobian**2, axis=0))
-    # Columns of rounding are those of parameters without effect.
+    # Columns of rounding belong to parameters without effect.
     scale = np.where(scale > float(np.finfo(x.dtype).eps) * np.max(scale), scale, np.inf)
     values, vectors = np.linalg.eigh(np.nan_to_num((jacobian / scale).T @ (jacobian / scale)))
     rounding = ROUNDING * float(np.finfo(x.dtype).eps) * max(values[-1], _TINY)
     level = np.sqrt(np.mean(residual[: problem.samples][problem.weights > 0] ** 2))
     axes = _TRIED * level * vectors / np.sqrt(np.maximum(values, rounding)) / scale[:, None]
-    # Along axes that are not determined the output is not linear over standard errors. Coordinates are about 1 in size.
+    # Along undetermined axes the output is not linear over a standard error. Coordinates are about 1 in size.
     axes = axes[:, values > _SEEN * values[-1]]
     farthest = float(np.finfo(x.dtype).eps) ** (1 / 3)
     move = np.sum(axes * np.minimum(1.0, farthest / np.maximum(np.max(np.abs(axes), axis=0), _TINY)), axis=1)
     inside = np.clip(move, np.asarray(box.lower) - x, np.asarray(box.upper) - x)
     trial = (x + inside).astype(x.dtype)
-    # The first evaluation of a search: the program is that of the fit.
-    there = step(problem, start_search(on_device(trial), problem.rows), on_device(np.asarray(0.0, x.dtype)))
-    missed = np.linalg.norm(np.asarray(there.residual) - residual - jacobian @ inside)
+    # The first step of a search only evaluates x, by the compiled program of the fit.
+    trial_state = step(problem, start_search(on_device(trial), problem.rows), on_device(np.asarray(0.0, x.dtype)))
+    missed = np.linalg.norm(np.asarray(trial_state.residual) - residual - jacobian @ inside)
     return bool(missed < _HOLDS * np.linalg.norm(jacobian @ move))
 
 
@@ -465,10 +461,10 @@ def sample_blocks(problem: FitProblem, blocks: int = BLOCKS) -> tuple[Int[np.nda
 
 
 def _passes_for_white(problem: FitProblem, residual: Float[np.ndarray, " rows"]) -> bool:
-    """Whether the test of Ljung and Box (1978, Biometrika 65:297) finds no memory in any channel."""
-    for name, (rows, weight) in by_channel(problem, residual.astype(float)).items():
+    """Whether the test of Ljung and Box (1978, Biometrika 65:297) finds no correlation in any channel."""
+    for name, (rows, weight) in problem.by_channel(residual.astype(float)).items():
         if name not in problem.runs.weight:
-            continue  # instants have no neighbours
+            continue  # slip instants are no series
         counted = float(np.sum(weight))
         e = np.where(weight > 0, rows - np.sum(rows) / counted, 0.0)
         lags = lag_number(rows.shape[1])

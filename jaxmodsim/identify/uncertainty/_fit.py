@@ -9,23 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._core.arguments import as_float, as_mapping, as_names, as_whole
+from ..._core.arguments import as_float, as_whole
 from ..._core.arrays import on_device
-from ..._core.functions import is_state_dependent
 from ..._core.parameters import Range
 from ..._core.progress import iteration_words, reported
 from ...friction import AbstractLaw
 from ...scene import Scene, scene_numbers, scene_ranges
-from ..data._clock import sampling_gaps
-from ..data._record import Record, Windows, cut, outliers, runs_of
-from ..estimate._initializers import AbstractInitializer, run_initializers
-from ..estimate._prepare import MultipleShooting, Settings, StartState, prepare, step_error
+from ..data._record import Record, Windows, cut, runs_of
+from ..data._signals import outliers, sampling_gaps
+from ..estimate._initializers import AbstractInitializer, as_initializers, run_initializers
+from ..estimate._prepare import FitOptions, MultipleShooting, StartState, prepare, step_error
 from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
 from ..estimate._search import (
     Progress,
     SearchOptions,
     SearchResult,
-    by_channel,
     continued,
     solve_freed,
     solve_with_noise,
@@ -46,16 +44,10 @@ from ._identifiability import identifiability_issues
 from ._result import FitResult, uncertain_of
 
 _ROUGH = (
-    "Standard errors are refused: over a tenth of those that the derivatives give, the output does not change as the"
-    " derivatives say, so rounding or the integration steps decide them. Raise substeps; pass a set-valued law such as"
-    " Coulomb itself, without Regularized; if the model misses nothing but rounding, there is nothing to estimate."
+    "Standard errors are refused: over a tenth of a standard error the output does not change as its derivatives"
+    " predict, because of rounding or the integration steps. Raise substeps; pass a set-valued law such as Coulomb"
+    " itself, without Regularized. If the residual is only rounding, there is nothing to estimate."
 )
-_KINDS = {
-    "scene": "a Scene",
-    "loss": "a loss such as Huber()",
-    "controller": "a Controller",
-    "shooting": "a MultipleShooting",
-}
 
 
 def fit(
@@ -82,43 +74,41 @@ def fit(
 ) -> FitResult:
     """Fit numbers of a scene so that its simulation follows measured records.
 
-    The inputs drive the scene, nothing measured is fed back, and the sum of squares of `observe - measured`, each
-    channel in units of its noise, is minimised over all samples by Levenberg-Marquardt within bounds, on the exact
-    derivatives of the simulated run. It has fixed steps from sample to sample; set-valued laws stick and slip exactly,
-    and every change of mode on the way is located. Scenes with contacts or constraints under set-valued laws, slip in a
-    plane, and records with slip instants are run by tolerances.
+    The inputs drive the scene, without feedback of measured values. Levenberg-Marquardt within bounds, on the exact
+    derivatives of the simulation, minimises the sum of squares of `observe - measured` over all samples, each channel
+    in units of its noise. The simulation has fixed steps from sample to sample. Set-valued laws stick and slip exactly,
+    and every change of mode is located. Scenes with contacts or constraints under set-valued laws, slip in a plane, and
+    records with slip instants use error-controlled steps.
 
     **Arguments:**
 
     - `scene`: the model with start values; its `params` must be a dict with an entry for each input of the records.
     - `records`: a `Record` or several; each has the same inputs.
     - `free`: names of the numbers to fit, as `jaxmodsim.scene.scene_numbers` gives them: `("m", "friction.Fc")`;
-      the name of an array stands for all its entries, `friction.k[0]` for one. Of initial states `q0[0]`, `qd0[0]`,
-      `z0.friction` (or `q0`, `qd0`, `z0` for all), fitted for each record by itself; of the delay [s] of an input
-      `delay.u`. Laws' parameters stay in their ranges; one that is not free but limited by one that is (Fs by Fc)
-      keeps its distance from it.
-    - `observe`: what a record measured: a function `observe(q, qd)` that returns one number, `"q[0]"`, `"qd[0]"`, or
-      the name of an effect, whose force is meant; with several channels a dict of these by channel.
-    - `q0`, `qd0`: state at the first sample, shape `[dof]` or `[records, dof]`, where it is known exactly. By default
-      coordinates that a channel shows, and their velocities, are fitted for each record by itself, and not reported;
-      the others are 0, and at rest.
-    - `delay`: by how much inputs come later than recorded [s], >= 0; where they start if they are free.
+      the name of an array stands for all its entries, `friction.k[0]` for one. Initial states are `q0[0]`, `qd0[0]`,
+      `z0.friction` (or `q0`, `qd0`, `z0` for all), fitted for each record separately; the delay [s] of an input is
+      `delay.u`. Parameters of laws stay in their ranges; a fixed one that is limited by a free one (Fs by Fc) keeps its
+      distance from it.
+    - `observe`: the measured quantity: a function `observe(q, qd)` that returns one number, `"q[0]"`, `"qd[0]"`, or
+      the name of an effect, for its force; with several channels a dict of these by channel.
+    - `q0`, `qd0`: state at the first sample, shape `[dof]` or `[records, dof]`, if it is known exactly. By default
+      coordinates that a channel shows, and their velocities, are fitted for each record separately, and not reported;
+      the others start at 0, at rest.
+    - `delay`: delays of inputs relative to the record [s], >= 0; start values if they are free.
     - `limits`: lower and upper limits of numbers beyond the declared ones, None for none: `{"m": (0.0, 5.0)}`. A lower
-      limit of 0 is excluded. A fit looks for Fs up to 5 Fc, or the ratio it starts with;
-      `{"friction.Fs/friction.Fc": (None, 8.0)}` says another limit of such a ratio, None for none.
-    - `passive`: names of the friction effects with a LuGre law that has to be passive, `sigma2 >= sigma1 (Fs - Fc)/Fc`;
+      limit of 0 is excluded. The limit of Fs is 5 Fc, or the ratio at the start;
+      `{"friction.Fs/friction.Fc": (None, 8.0)}` sets another limit of such a ratio, None for none.
+    - `passive`: names of the friction effects with a LuGre law that must be passive, `sigma2 >= sigma1 (Fs - Fc)/Fc`;
       their sigma2 must be free.
-    - `prior`: what was known before: mean and standard deviation by name, `{"m": (95.0, 5.0)}`.
-    - `loss`: of a residual in noise levels; `SquaredLoss` by default, `Huber` and `Cauchy` where there are outliers.
+    - `prior`: prior knowledge: mean and standard deviation by name, `{"m": (95.0, 5.0)}`.
+    - `loss`: of a residual in noise levels; `SquaredLoss` by default, `Huber` or `Cauchy` for outliers.
     - `controller`: a `Controller` that closes a loop around the scene.
     - `shooting`: `MultipleShooting`, to run in windows.
-    - `initializer`: how to find where the search starts, one after the other: `Staged()`, `MultiStart(...)`,
-      `Continuation(...)`.
+    - `initializer`: of the search, one or several in sequence: `Staged()`, `MultiStart(...)`, `Continuation(...)`.
     - `substeps`: integration steps between two samples.
-    - `accuracy`: relative tolerance of runs by tolerances.
+    - `accuracy`: relative tolerance of error-controlled steps.
     - `rtol`: relative change of the residual at which the search ends.
-    - `max_steps`: limit of iterations. Up to it a search goes on by itself, every hundred of them with a damping as at
-      the start; the result says how often.
+    - `max_steps`: limit of iterations. The damping is reset after every hundred of them; the result reports how often.
     - `progress`: True for a line of text, or a function that is called after each iteration with its number, the RMSE
       and the parameters. Ctrl-C ends the fit with the best so far.
 
@@ -128,57 +118,45 @@ def fit(
 
     **Raises:**
 
-    - `ValueError` for names that are unknown, a start beyond its limits, inputs the scene has no entry for.
+    - `ValueError` for unknown names, a start beyond its limits, or inputs without an entry in the scene.
     - `RuntimeError` if the model is not finite at its start values.
     """
-    loss = SquaredLoss() if loss is None else loss
-    _check_kinds(scene, loss, controller, shooting)
-    initializer = _initializers(initializer)
-    settings = Settings(
+    options = FitOptions(
         observe=observe,
         q0=q0,
         qd0=qd0,
-        delay=as_mapping(delay, name="delay", example="{'u': 1e-3}"),
-        limits=as_mapping(limits, name="limits", example="{'m': (0.0, 5.0)}"),
-        passive=as_names(passive, name="passive"),
-        prior=as_mapping(prior, name="prior", example="{'m': (95.0, 5.0)}"),
+        delay=delay,
+        limits=limits,
+        passive=passive,
+        prior=prior,
         loss=loss,
         controller=controller,
         shooting=shooting,
-        substeps=as_whole(substeps, name="substeps"),
-        accuracy=as_float(accuracy, name="accuracy", lower=0.0),
+        substeps=substeps,
+        accuracy=accuracy,
     )
-    limit, rtol = as_whole(max_steps, name="max_steps"), as_float(rtol, name="rtol", lower=0.0)
+    initializers = as_initializers(initializer)
+    rtol, max_steps = as_float(rtol, name="rtol", lower=0.0), as_whole(max_steps, name="max_steps")
     with reported(progress, "fit", iteration_words) as report:
-        prepared, options = prepare(scene, records, free, settings), SearchOptions(rtol, limit, report)
-        x, starts = run_initializers(initializer, prepared.problem.held, options)
-        search = solve_freed(prepared.problem, x, options, prepared.given)
-    values = search.problem.at(search.state.x).values
-    error = step_error(search)
-    return result_of(
-        search, prepared.records, prepared.windows, prepared.units, with_values(scene, values), error, starts
-    )
+        return fit_scene(scene, records, free, options, initializers, SearchOptions(rtol, max_steps, report))
 
 
-def _check_kinds(scene: object, loss: object, controller: object, shooting: object) -> None:
-    """Refuse objects of another kind."""
-    for name, value, kind in (
-        ("scene", scene, Scene),
-        ("loss", loss, AbstractLoss),
-        ("controller", controller, Controller | None),
-        ("shooting", shooting, MultipleShooting | None),
-    ):
-        if not isinstance(value, kind):
-            raise ValueError(f"{name} must be {_KINDS[name]}, but {value!r} was given.")
-
-
-def _initializers(initializer: object) -> tuple[AbstractInitializer, ...]:
-    several = (initializer,) if isinstance(initializer, AbstractInitializer) else initializer
-    if not isinstance(several, tuple | list) or not all(isinstance(each, AbstractInitializer) for each in several):
-        raise ValueError(
-            f"initializer must be one such as Staged(), or several of them, but {initializer!r} was given."
-        )
-    return tuple(several)
+def fit_scene(
+    scene: Scene,
+    records: Record | Sequence[Record],
+    free: Sequence[str],
+    options: FitOptions,
+    initializers: Sequence[AbstractInitializer],
+    search_options: SearchOptions,
+) -> FitResult:
+    """`fit` with its arguments checked."""
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene must be a Scene, but {scene!r} was given.")
+    prepared = prepare(scene, records, free, options)
+    x, starts = run_initializers(initializers, prepared.problem.held, search_options)
+    search = solve_freed(prepared.problem, x, search_options, prepared.known_noise)
+    model = with_values(scene, search.problem.at(search.state.x).values)
+    return result_of(search, prepared.records, prepared.windows, prepared.units, model, step_error(search), starts)
 
 
 def fit_law(
@@ -194,8 +172,8 @@ def fit_law(
 ) -> FitResult:
     """Fit a friction law to a measured friction force under a measured motion.
 
-    The law's state is advanced exactly over each sample at constant velocity, so any sampling rate is stable and
-    the measured position needs no differentiation but in viscous terms.
+    The law's state is advanced exactly over each sample at constant velocity. So any sampling rate is stable, and only
+    viscous terms differentiate the measured position.
 
     **Arguments:**
 
@@ -204,8 +182,8 @@ def fit_law(
       `inputs` holds the slip displacement `x` [m] and, if the law's forces are per newton of load, the normal load
       `normal` [N]. The law starts at rest and unloaded.
     - `free`: names of the law's parameters to fit, `k[0]` for one entry of an array; by default all but those that
-      start on their limit (`sigma1 = 0`) and the `width` of a wrapper and the `corner` of Maxwell slip, which are how
-      the law is run and not what it is.
+      start on their limit (`sigma1 = 0`) and the `width` of a wrapper and the `corner` of Maxwell slip, which are
+      numerical.
     - `loss`, `initializer`, `rtol`, `max_steps`, `progress`: see `fit`.
 
     **Returns:**
@@ -228,7 +206,7 @@ def fit_law(
     chosen = _off_limits(single, ranges) if free is None else chosen_entries(numbers, free)
     parameters = FreeParameters.of(single, ranges, chosen)
     windows = cut(several, None)
-    given = {name: level for each in several for name, level in each.noise.items()}
+    noise = {name: level for each in several for name, level in each.noise.items()}
     size = float(np.std(np.concatenate([each.measured for each in several]))) or 1.0
     problem = FitProblem(
         LawEngine(law),
@@ -236,14 +214,14 @@ def fit_law(
         (),
         None,
         runs_of(several, windows),
-        {name: on_device(given.get(name, size)) for name in several[0].channels},
+        {name: on_device(noise.get(name, size)) for name in several[0].channels},
         SquaredLoss() if loss is None else loss,
         Prior(*(on_device(np.zeros(len(parameters.names))) for _ in range(2))),
     )
     with reported(progress, "fit", iteration_words) as report:
         options = SearchOptions(rtol, as_whole(max_steps, name="max_steps"), report)
         x, starts = run_initializers(initializer, problem, options)
-        search = solve_with_noise(problem, x, options, frozenset(given))
+        search = solve_with_noise(problem, x, options, frozenset(noise))
     per_load = " per N" if "normal" in several[0].inputs else ""
     units = {
         name: allowed.unit + (per_load if allowed.unit.startswith("N") else "") for name, allowed in ranges.items()
@@ -253,7 +231,7 @@ def fit_law(
 
 
 def _off_limits(numbers: dict[str, Array], ranges: dict[str, Range]) -> tuple[str, ...]:
-    """Names of the parameters that can be free where they start."""
+    """Names of the parameters that start off their limits and are not numerical."""
     free = []
     for name, value in numbers.items():
         lower = ranges[name].lower if name in ranges else None
@@ -273,25 +251,23 @@ def result_of(
     starts: tuple[float, ...] = (),
 ) -> FitResult:
     """The result of a search: estimate, diagnostics, provenance."""
-    problem, state = search.problem, search.state
-    names, at_start, values = list(problem.free.names), [], []
-    shared, own = np.split(np.asarray(state.x), [len(names)])
-    kept = list(range(len(names)))
-    values += problem.at(state.x).vector.tolist()
-    at_start += [float(problem.free.start[name]) for name in names]
-    whole = len(set(windows.record)) == len(windows.record)
-    if whole and problem.local:
-        base, shown = _first_states(search), problem.reported
+    problem, state, free = search.problem, search.state, search.problem.free
+    names, size, shown = list(free.names), len(free.names), problem.reported
+    values, at_start = problem.at(state.x).vector.tolist(), [float(free.start[name]) for name in names]
+    entries = list(range(size))
+    if problem.base is not None and len(set(windows.record)) == len(windows.record):
+        starts = np.asarray(jax.vmap(problem.local_values)(problem.base))[:, :shown]
+        ends = starts + np.asarray(problem.split(state.x)[1])[:, :shown]
         for i, record in enumerate(records):
             prefix = "" if len(records) == 1 else f"{record.name}/"
             names += [prefix + name for name in problem.local[:shown]]
-            at_start += base[i, :shown].tolist()
-            values += (base[i] + own.reshape(len(records), -1)[i])[:shown].tolist()
-            kept += [len(shared) + i * len(problem.local) + k for k in range(shown)]
-    covariance = covariance_of(problem, state, kept)
+            at_start += starts[i].tolist()
+            values += ends[i].tolist()
+            entries += [size + i * len(problem.local) + k for k in range(shown)]
+    covariance = covariance_of(problem, state, entries)
     outputs, rmse = _stitched(search, records, windows)
-    free, scales = problem.free, natural_scales(problem, state, kept)
-    signed = [*(kind == "line" for kind in free.kinds), *(True for _ in names[len(free.names) :])]
+    scales = natural_scales(problem, state, entries)
+    signed = [kind == "line" for kind in free.kinds] + [True] * (len(names) - size)
     estimate = ParameterEstimate(
         values=dict(zip(names, values, strict=True)),
         start=dict(zip(names, at_start, strict=True)),
@@ -300,13 +276,17 @@ def result_of(
         white=covariance.white,
         information=covariance.information,
         logarithmic=tuple(name for name, kind in zip(free.names, free.kinds, strict=True) if kind == "log"),
-        bounds=free.limits(shared) | {name: (-np.inf, np.inf) for name in names[len(free.names) :]},
+        bounds=free.limits(state.x[:size]) | {name: (-np.inf, np.inf) for name in names[size:]},
         natural={name: float(x) if each else 0.0 for name, x, each in zip(names, scales, signed, strict=True)},
     )
+    if problem.base is None:
+        coordinates = {"x": "q[0]"} if "x" in problem.runs.inputs else {}
+    else:
+        coordinates = coordinates_seen(problem.engine.observables, problem.base.q.shape[-1])
     provenance = FitProvenance(
         records=records,
         outputs=outputs,
-        coordinates=_coordinates(search),
+        coordinates=coordinates,
         numbers={name: np.asarray(x) for name, x in scene_numbers(model).items()},
         model=model,
     )
@@ -319,22 +299,25 @@ def result_of(
         starts=starts,
         single_precision=jnp.result_type(float) == jnp.float32,
         issues=(
-            *_offset_issues(estimate, search, kept),
+            *_offset_issues(estimate, search, entries),
             *_issues(estimate, provenance, search, covariance.refused),
         ),
     )
-    search = replace(search, windows=windows)
-    return FitResult(estimate=estimate, diagnostics=diagnostics, provenance=provenance, search=search)
+    return FitResult(
+        estimate=estimate,
+        diagnostics=diagnostics,
+        provenance=provenance,
+        search=replace(search, windows=windows),
+    )
 
 
 def searched_on(result: FitResult, x: Float[Array, " n"], options: SearchOptions, times: int, where: str) -> FitResult:
-    """The result of the same fit, its search continued from `x`; `where` that is, in words, for the so many-th time."""
-    before, provenance = result.search, result.provenance
-    assert before is not None
+    """The result of the same fit with its search continued from `x`; `times`, `where`: of continuations, in words."""
+    before, provenance = result.search_for("A continued search"), result.provenance
     assert before.windows is not None
     assert provenance.model is not None
-    given = frozenset(name for record in provenance.records for name in record.noise)
-    search = solve_with_noise(before.problem, x, options, given)
+    known = frozenset(name for record in provenance.records for name in record.noise)
+    search = solve_with_noise(before.problem, x, options, known)
     ending = continued(search.ending, times, where)
     search = replace(search, iterations=before.iterations + search.iterations, ending=ending)
     model = with_values(provenance.model, search.problem.at(search.state.x).values)
@@ -343,18 +326,10 @@ def searched_on(result: FitResult, x: Float[Array, " n"], options: SearchOptions
     return result_of(search, provenance.records, before.windows, units, model, error, starts)
 
 
-def _coordinates(search: SearchResult) -> dict[str, str]:
-    """Which channels, or inputs of a law, are coordinates and velocities."""
-    base = search.problem.base
-    if base is None:
-        return {"x": "q[0]"} if "x" in search.problem.runs.inputs else {}
-    return coordinates_seen(search.problem.engine.observables, base.q.shape[-1])
-
-
 def _issues(
     estimate: ParameterEstimate, provenance: FitProvenance, search: SearchResult, refused: bool
 ) -> tuple[IdentifiabilityIssue, ...]:
-    """Causes in the motion for what the figures call uncertain; or that there are no such figures."""
+    """Causes in the motion of uncertain parameters, or the reason for refused standard errors."""
     uncertain, model, base = uncertain_of(estimate), provenance.model, search.problem.base
     of_samples = _sample_issues(provenance.records, isinstance(search.problem.loss, SquaredLoss))
     if refused:
@@ -370,9 +345,9 @@ def _issues(
 
 
 def _offset_issues(
-    estimate: ParameterEstimate, search: SearchResult, kept: Sequence[int]
+    estimate: ParameterEstimate, search: SearchResult, entries: Sequence[int]
 ) -> tuple[IdentifiabilityIssue, ...]:
-    """A sensor that reads too high throughout."""
+    """Constant offsets of sensors."""
     errors = np.array(list(estimate.errors.values()))
     if search.problem.base is None or not np.isfinite(float(search.state.cost)):
         return ()
@@ -382,12 +357,12 @@ def _offset_issues(
             " than their standard errors, so their intervals do not hold. Subtract it from the record and fit again.",
             (),
         )
-        for channel, (offset, error) in offsets_left(search.problem, search.state, kept, errors).items()
+        for channel, (offset, error) in offsets_left(search.problem, search.state, entries, errors).items()
     )
 
 
 def _sample_issues(records: tuple[Record, ...], squares: bool) -> tuple[IdentifiabilityIssue, ...]:
-    """Samples that are missing, and ones that stand out where nothing gives them less weight."""
+    """Gaps, and outliers in a fit by least squares."""
     issues = []
     for record in records:
         gaps = sampling_gaps(record)
@@ -396,7 +371,7 @@ def _sample_issues(records: tuple[Record, ...], squares: bool) -> tuple[Identifi
             more = f", and {len(gaps) - 1} times more" if len(gaps) > 1 else ""
             issues.append(
                 f"{record.name}: samples are missing from {record.t[k]:g} to {record.t[k + 1]:g} s{more}. Inputs are"
-                " held or interpolated over it, which they hardly were: cut the record there (Record.part)."
+                " held or interpolated over the gap, which is hardly right: cut the record there (Record.part)."
             )
         for channel, x in record.channels.items() if squares else ():
             count = int(np.count_nonzero(outliers(x)))
@@ -408,24 +383,16 @@ def _sample_issues(records: tuple[Record, ...], squares: bool) -> tuple[Identifi
     return tuple(IdentifiabilityIssue(sentence, ()) for sentence in issues)
 
 
-def _first_states(search: SearchResult) -> np.ndarray:
-    """Free numbers of the initial states before the fit, shape `[runs, local]`."""
-    base = search.problem.base
-    assert base is not None
-    return np.asarray(jax.vmap(search.problem.taken)(base))
-
-
 def _stitched(
     search: SearchResult, records: tuple[Record, ...], windows: Windows
 ) -> tuple[tuple[dict[str, np.ndarray], ...], dict[str, float]]:
     """The model's output along each record, and the root mean squares of the differences."""
     problem = search.problem
-    split = by_channel(problem, search.state.residual)
     outputs: list[dict[str, np.ndarray]] = [
         {name: np.array(x) for name, x in record.channels.items()} for record in records
     ]
     rmse = {}
-    for name, (residual, weight) in split.items():
+    for name, (residual, weight) in search.residuals.items():
         level = float(problem.noise[name])
         rmse[name] = level * float(np.sqrt(np.sum(residual[weight > 0] ** 2) / max(np.sum(weight > 0), 1)))
         for run, (i, first, last) in enumerate(zip(windows.record, windows.first, windows.last, strict=True)):

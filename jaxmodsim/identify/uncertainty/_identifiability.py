@@ -1,4 +1,4 @@
-"""What a record cannot tell: causes in the motion, and combinations of parameters that are not determined."""
+"""Identifiability: what the motion of a record lacks, and combinations of parameters that it does not determine."""
 
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -8,37 +8,37 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from ..._core.arrays import on_device
 from ..._core.parameters import modules_of
-from ...friction import AbstractAsymmetric, AbstractLaw, Dahl, ElastoPlastic, LuGre, MaxwellSlip
+from ...friction import AbstractAsymmetric, AbstractLaw
 from ...scene import Friction, Scene, replace_numbers, scene_numbers
 from ..model._observe import RecordedMotion, Slip, slip_of
 from ._estimate import FitDiagnostics, IdentifiabilityIssue, ParameterEstimate
 
-# A bristle below this share of its limit is in presliding.
+# A bristle that stays below this share of its limit is in presliding.
 _NEAR_LIMIT = 0.9
-# Speeds in units of vs up to which the Stribeck curve falls, and samples there that make it seen.
+# The Stribeck curve falls up to this speed, in units of vs, and shows in at least so many samples there.
 _CURVE, _SEEN = 2.0, 5
-# Slip back of less than this share of the largest speed is none.
+# Slip back below this share of the largest speed is none.
 _NO_REVERSAL = 0.02
-# Largest over smallest speed in slip from which on viscous and Coulomb friction tell themselves apart.
+# Largest over smallest slip speed from which viscous and Coulomb friction are distinguishable.
 _SPEED_SPAN = 1.3
-# Share of the friction force that inertia must have to be seen.
+# Share of the friction force from which inertia shows.
 _INERTIA = 0.05
-# A combination known worse than this, relative to its parameters, is called undetermined.
+# A combination with a larger standard error, relative to its parameters, is undetermined.
 _WEAK = 0.3
-# Entries of a direction below this share of the largest do not belong to it; those nearer than this are equal.
+# Entries of a direction below this share of the largest are left out; changes that differ by less are equal.
 _PART, _EQUAL = 0.2, 0.15
 
 
 class Element(NamedTuple):
-    """A friction element as its records moved it.
+    """A friction element with its slip in the records.
 
     - `name`: of its effect, empty for a law by itself. `law`: its law.
     - `slips`: one a record. `numbers`: all numbers of the model by name. `free`: names of the free ones.
-    - `alike`: names of the other free ones that the figures hardly tell apart from each.
+    - `alike`: names of the other free numbers with a large correlation, by name.
     """
 
     name: str
@@ -48,71 +48,65 @@ class Element(NamedTuple):
     free: tuple[str, ...]
     alike: Mapping[str, tuple[str, ...]]
 
+    @property
+    def prefix(self) -> str:
+        """Prefix of its numbers' names."""
+        return f"{self.name}." if self.name else ""
+
     def own(self, *symbols: str) -> tuple[str, ...]:
         """Free parameters of this element with these symbols, of both directions and all entries."""
-        prefix = f"{self.name}." if self.name else ""
-        return tuple(
-            name
-            for name in self.free
-            if name.startswith(prefix) and name.rsplit(".", 1)[-1].split("[")[0] in symbols and _under(name, prefix)
-        )
+        sides, names = ("", "forward", "backward"), []
+        for name in self.free:
+            side, _, symbol = name.removeprefix(self.prefix).rpartition(".")
+            if name.startswith(self.prefix) and side in sides and symbol.split("[")[0] in symbols:
+                names.append(name)
+        return tuple(names)
 
     def number(self, symbol: str) -> np.ndarray | None:
-        """A number of the law; that of forward slip where it depends on the direction."""
-        prefix = f"{self.name}." if self.name else ""
-        for name in (prefix + symbol, f"{prefix}forward.{symbol}"):
-            if name in self.numbers:
-                return self.numbers[name]
-        return None
-
-    def has(self, *kinds: type) -> bool:
-        """Whether a law of these kinds is in it."""
-        return any(isinstance(module, kinds) for _, module in modules_of(self.law))
+        """A number of the law; that of forward slip if it depends on the direction."""
+        return self.numbers.get(self.prefix + symbol, self.numbers.get(f"{self.prefix}forward.{symbol}"))
 
     @property
     def speeds(self) -> np.ndarray:
         """Slip speeds of all records."""
         return np.abs(np.concatenate([slip.v for slip in self.slips]))
 
-    @property
-    def label(self) -> str:
-        """For sentences about one element of several."""
-        return f"{self.name}: " if self.name not in ("", "friction") else ""
+    def issue(self, sentence: str, about: tuple[str, ...]) -> IdentifiabilityIssue | None:
+        """An issue about some parameters, whose names replace `{}`; None if there are none."""
+        label = f"{self.name}: " if self.name not in ("", "friction") else ""
+        return IdentifiabilityIssue(label + sentence.format(_listed(about)), about) if about else None
 
 
-def _under(name: str, prefix: str) -> bool:
-    """Whether the rest of a name is a symbol, or one of a direction."""
-    return name.removeprefix(prefix).rpartition(".")[0] in ("", "forward", "backward")
+def _are(about: tuple[str, ...]) -> str:
+    return "are" if len(about) > 1 else "is"
 
 
 def presliding(element: Element) -> IdentifiabilityIssue | None:
     """The bristle never comes near its limit."""
-    if element.has(MaxwellSlip):
-        return _idle_elements(element)
-    sigma0, Fc = element.number("sigma0"), element.number("Fc")
-    if not element.has(LuGre, Dahl, ElastoPlastic) or sigma0 is None or Fc is None:
+    sigma0, Fc, Fs, vs = (element.number(symbol) for symbol in ("sigma0", "Fc", "Fs", "vs"))
+    if sigma0 is None or Fc is None:
         return None
-    Fs, vs = element.number("Fs"), element.number("vs")
-    level = (float(Fc), float(Fc if Fs is None else Fs), float(1.0 if vs is None else vs))
-    share = max(_bristle_share(slip, float(sigma0), *level) for slip in element.slips)
+    Fs, vs = (Fc if Fs is None else Fs), (1.0 if vs is None else vs)
+    share = max(_bristle_share(slip, *(float(x) for x in (sigma0, Fc, Fs, vs))) for slip in element.slips)
+    if share >= _NEAR_LIMIT:
+        return None
+    stroke = 0.0
+    for x in (slip.x for slip in element.slips):
+        turns = np.flatnonzero(np.diff(np.sign(np.diff(x))) != 0) + 1
+        stroke = max(stroke, float(np.max(np.abs(np.diff(x[[0, *turns.tolist(), len(x) - 1]])))))
     about = element.own("Fc", "Fs", "vs", "Fba", "vd", "sigma2")
-    if share >= _NEAR_LIMIT or not about:
-        return None
-    rest = "cannot be told apart" if len(about) > 1 else "is not seen"
-    stroke = max(_largest_stroke(slip.x) for slip in element.slips)
-    return IdentifiabilityIssue(
-        f"{element.label}This record never leaves presliding: between reversals it slips {stroke:.2g} at most, and the"
-        f" bristle reaches {100 * share:.0f} % of its limit ({level[1] / float(sigma0):.2g}):"
-        f" {_listed(about)} {rest}.",
+    return element.issue(
+        f"This record never leaves presliding: between reversals it slips {stroke:.2g} at most, and the bristle reaches"
+        f" {100 * share:.0f} % of its limit ({float(Fs) / float(sigma0):.2g}): {{}}"
+        f" {'cannot be told apart' if len(about) > 1 else 'is not seen'}.",
         about,
     )
 
 
 def _bristle_share(slip: Slip, sigma0: float, Fc: float, Fs: float, vs: float) -> float:
-    """Largest deflection of a LuGre bristle in units of that of steady slip."""
-    x = slip.x.tolist()
+    """Largest deflection of a bristle, relative to that of steady slip."""
     z, largest = 0.0, 0.0
-    for dx, v in zip(np.diff(x).tolist(), np.abs(slip.v[1:]).tolist(), strict=True):
+    for dx, v in zip(np.diff(slip.x).tolist(), np.abs(slip.v[1:]).tolist(), strict=True):
         limit = (Fc + (Fs - Fc) * math.exp(-((v / vs) ** 2))) / sigma0
         end = math.copysign(limit, dx)
         z = end + (z - end) * math.exp(-min(abs(dx) / limit, 700.0)) if limit > 0 else 0.0
@@ -120,15 +114,10 @@ def _bristle_share(slip: Slip, sigma0: float, Fc: float, Fs: float, vs: float) -
     return largest
 
 
-def _largest_stroke(x: np.ndarray) -> float:
-    """Largest way between two reversals."""
-    turns = np.flatnonzero(np.diff(np.sign(np.diff(x))) != 0) + 1
-    return float(np.max(np.abs(np.diff(x[[0, *turns.tolist(), len(x) - 1]]))))
-
-
-def _idle_elements(element: Element) -> IdentifiabilityIssue | None:
+def idle_elements(element: Element) -> IdentifiabilityIssue | None:
+    """Some of several elastic elements never slip."""
     k, Fc = element.number("k"), element.number("Fc")
-    if k is None or Fc is None:
+    if k is None or Fc is None or np.ndim(k) != 1 or np.shape(k) != np.shape(Fc):
         return None
     reached = np.zeros_like(k)
     for slip in element.slips:
@@ -137,59 +126,46 @@ def _idle_elements(element: Element) -> IdentifiabilityIssue | None:
             z = np.clip(z + dx, -Fc / k, Fc / k)
             reached = np.maximum(reached, np.abs(z) * k / Fc)
     about = tuple(f for f in element.own("Fc") if reached[int(f.rsplit("[", 1)[1][:-1])] < _NEAR_LIMIT)
-    if not about:
-        return None
-    return IdentifiabilityIssue(
-        f"{element.label}Elements that never slip in this record: {_listed(about)} cannot be seen.", about
-    )
+    return element.issue("Elements that never slip in this record: {} cannot be seen.", about)
 
 
 def never_sticks(element: Element) -> IdentifiabilityIssue | None:
     """It slips all the time in one direction, so that the bristle never deflects anew."""
-    about = element.own("sigma0", "sigma1", "Fs", "vs", "Fba") if element.number("sigma0") is not None else ()
-    if not about:
+    if element.number("sigma0") is None:
         return None
     for slip in element.slips:
         top = float(np.max(np.abs(slip.v)))
         if np.min(slip.v) <= 0.1 * top and np.max(slip.v) >= -0.1 * top:
             return None
-    return IdentifiabilityIssue(
-        f"{element.label}This record never sticks nor reverses: {_listed(about)}"
-        f" {'are' if len(about) > 1 else 'is'} not seen.",
-        about,
-    )
+    about = element.own("sigma0", "sigma1", "Fs", "vs", "Fba")
+    return element.issue(f"This record never sticks nor reverses: {{}} {_are(about)} not seen.", about)
 
 
 def stribeck_unseen(element: Element) -> IdentifiabilityIssue | None:
     """Too few samples on the falling part of the Stribeck curve."""
-    vs = element.number("vs")
-    about = element.own("Fs", "vs", "exponent")
-    if vs is None or not about:
+    if (vs := element.number("vs")) is None:
         return None
-    speeds, moving = element.speeds, 1e-3 * float(np.max(element.speeds))
-    count = int(np.sum((speeds < _CURVE * vs) & (speeds > min(moving, 0.1 * float(vs)))))
+    speeds, about = element.speeds, element.own("Fs", "vs", "exponent")
+    moving = min(1e-3 * float(np.max(speeds)), 0.1 * float(vs))
+    count = int(np.sum((speeds < _CURVE * vs) & (speeds > moving)))
     if count >= _SEEN:
         return None
-    return IdentifiabilityIssue(
-        f"{element.label}Only {count} samples slip more slowly than {_CURVE:g} vs = {_CURVE * float(vs):.2g}, where the"
-        f" Stribeck curve falls: {_listed(about)} {'are' if len(about) > 1 else 'is'} not seen.",
+    return element.issue(
+        f"Only {count} samples slip more slowly than {_CURVE:g} vs = {_CURVE * float(vs):.2g}, where the Stribeck curve"
+        f" falls: {{}} {_are(about)} not seen.",
         about,
     )
 
 
 def stribeck_not_passed(element: Element) -> IdentifiabilityIssue | None:
     """It never slips faster than the Stribeck curve falls."""
-    vs = element.number("vs")
-    about = element.own("Fc", "Fs", "vs", "sigma2", "Fv")
-    if vs is None or not about:
+    vs, top = element.number("vs"), float(np.max(element.speeds))
+    if vs is None or top >= _CURVE * float(vs):
         return None
-    top = float(np.max(element.speeds))
-    if top >= _CURVE * float(vs):
-        return None
-    return IdentifiabilityIssue(
-        f"{element.label}The speed never exceeds {_CURVE:g} vs (at most {top:.2g} against vs = {float(vs):.2g}), so the"
-        f" Stribeck curve is not passed: {_listed(about)} cannot be told apart.",
-        about,
+    return element.issue(
+        f"The speed never exceeds {_CURVE:g} vs (at most {top:.2g} against vs = {float(vs):.2g}), so the Stribeck curve"
+        " is not passed: {} cannot be told apart.",
+        element.own("Fc", "Fs", "vs", "sigma2", "Fv"),
     )
 
 
@@ -200,41 +176,32 @@ def one_direction(element: Element) -> IdentifiabilityIssue | None:
     forwards = low >= -_NO_REVERSAL * high
     if not (forwards or high <= -_NO_REVERSAL * low):
         return None
-    if element.has(AbstractAsymmetric):
-        unseen = "backward" if forwards else "forward"
-        level = about = tuple(
-            f for f in element.free if f.startswith(f"{element.name}.{unseen}." if element.name else unseen)
-        )
-        text = "nothing is seen of {}"
-    else:
-        level = element.own("Fc")
-        about = tuple(dict.fromkeys([*level, *(other for name in level for other in element.alike.get(name, ()))]))
-        text = "a constant force and {} look the same"
-    if not about:
-        return None
-    text = text.format(_listed(level))
-    return IdentifiabilityIssue(f"{element.label}This record moves in one direction only: {text}.", about)
+    text = "This record moves in one direction only:"
+    if any(isinstance(module, AbstractAsymmetric) for _, module in modules_of(element.law)):
+        unseen = f"{element.prefix}{'backward' if forwards else 'forward'}"
+        return element.issue(f"{text} nothing is seen of {{}}.", tuple(f for f in element.free if f.startswith(unseen)))
+    level = element.own("Fc")
+    about = tuple(dict.fromkeys([*level, *(other for name in level for other in element.alike.get(name, ()))]))
+    return element.issue(f"{text} a constant force and {_listed(level)} look the same.", about)
 
 
 def one_speed(element: Element) -> IdentifiabilityIssue | None:
     """It slips at one speed."""
-    speeds = element.speeds
+    speeds, about = element.speeds, element.own("Fc", "Fv", "sigma2")
     moving = speeds[speeds > 0.05 * np.max(speeds)]
-    about = element.own("Fc", "Fv", "sigma2")
     if len(about) < 2 or not moving.size:
         return None
     low, high = np.percentile(moving, [5.0, 95.0])
     if high > _SPEED_SPAN * low:
         return None
-    return IdentifiabilityIssue(
-        f"{element.label}This record slips at nearly one speed ({low:.2g} to {high:.2g}): {_listed(about)} cannot be"
-        " told apart.",
-        about,
+    return element.issue(
+        f"This record slips at nearly one speed ({low:.2g} to {high:.2g}): {{}} cannot be told apart.", about
     )
 
 
 RULES: tuple[Callable[[Element], IdentifiabilityIssue | None], ...] = (
     presliding,
+    idle_elements,
     never_sticks,
     one_direction,
     stribeck_not_passed,
@@ -251,28 +218,28 @@ def identifiability_issues(
     free: tuple[str, ...],
     uncertain: Mapping[str, tuple[str, ...]],
 ) -> tuple[IdentifiabilityIssue, ...]:
-    """Causes for what is uncertain among the free parameters.
+    """Causes in the motion of uncertain free parameters.
 
     **Arguments:**
 
     - `model`: the fitted scene, or a law by itself.
     - `motions`: one a record. `dof`: number of coordinates.
     - `numbers`: all numbers of the model by name. `free`: names of the fitted ones.
-    - `uncertain`: those that the figures call uncertain, each with the others that it is hardly told apart from.
+    - `uncertain`: the uncertain ones, each with the others that have a large correlation with it.
     """
     motions = tuple(motions)
+    frictions: list[tuple[str, AbstractLaw, Friction | None, PyTree]] = []
     if isinstance(model, Scene):
-        frictions = [(name, each) for name, each in zip(model.names, model.effects, strict=True)
-                     if isinstance(each, Friction)]  # fmt: skip
-        laws = [(name, each.law, [slip_of(each, motion, model.params, dof) for motion in motions])
-                for name, each in frictions if any(f.startswith(f"{name}.") for f in free)]  # fmt: skip
+        for name, effect in zip(model.names, model.effects, strict=True):
+            if isinstance(effect, Friction) and any(f.startswith(f"{name}.") for f in free):
+                frictions.append((name, effect.law, effect, model.params))
     else:
-        laws = [("", model, [slip_of(None, motion, None, dof) for motion in motions])]
+        frictions.append(("", model, None, None))
     issues: list[IdentifiabilityIssue | None] = []
-    for name, law, slips in laws:
-        known = tuple(slip for slip in slips if slip is not None)
-        if len(known) == len(slips):
-            element = Element(name, law, known, numbers, free, uncertain)
+    for name, law, effect, params in frictions:
+        slips = tuple(slip for motion in motions if (slip := slip_of(effect, motion, params, dof)) is not None)
+        if len(slips) == len(motions):
+            element = Element(name, law, slips, numbers, free, uncertain)
             issues += [rule(element) for rule in RULES]
     if dof == 1 and isinstance(model, Scene):
         issues.append(slow(model, motions, numbers, tuple(f for f in free if f in uncertain)))
@@ -299,7 +266,10 @@ def slow(
     for name in doubtful:
         if "." in name or name not in scene_numbers(scene) or np.ndim(numbers[name]):
             continue
-        change = _mass(scene, name, float(numbers[name]), motions[0])
+        value, start = float(numbers[name]), motions[0]
+        point = tuple(on_device(each) for each in (start.t[0], start.q[0][:1], start.qd[0][:1]))
+        masses = (_mass(replace_numbers(scene, {name: on_device(x)}), *point) for x in (1.01 * value, value))
+        change = float(np.subtract(*(float(mass) for mass in masses))) / 0.01
         force = abs(change) * float(np.sqrt(np.mean(acceleration**2)))
         if change != 0.0 and force < _INERTIA * max(friction):
             about.append(name)
@@ -313,31 +283,20 @@ def slow(
     )
 
 
-def _mass(scene: Scene, name: str, value: float, motion: RecordedMotion) -> float:
-    """Part of the mass that is due to a parameter."""
-
-    def mass(number: float) -> float:
-        t, q, qd = (on_device(each) for each in (motion.t[0], motion.q[0][:1], motion.qd[0][:1]))
-        return float(_inertia(replace_numbers(scene, {name: on_device(number)}), t, q, qd))
-
-    return (mass(1.01 * value) - mass(value)) / 0.01
-
-
 @eqx.filter_jit
-def _inertia(scene: Scene, t: Array, q: Float[Array, " one"], qd: Float[Array, " one"]) -> Array:
+def _mass(scene: Scene, t: Array, q: Float[Array, " one"], qd: Float[Array, " one"]) -> Array:
     return jax.hessian(lambda qd: scene.lagrangian(t, q, qd, scene.params))(qd)[0, 0]
 
 
 def _listed(names: Iterable[str]) -> str:
-    *most, last = names
-    return f"{', '.join(most)} and {last}" if most else last
+    return " and ".join(", ".join(names).rsplit(", ", 1))
 
 
 @dataclass(frozen=True)
 class SloppyDirection:
-    """A way in which the parameters can change together without the record telling.
+    """A combined change of parameters that hardly changes the output.
 
-    - `names`: of the parameters that take part, the strongest first.
+    - `names`: of its parameters, the strongest first.
     - `changes`: their changes relative to the scale of the estimate or the start, whichever is larger; the largest 1.
     - `error`: standard error along it, relative in the same way.
     - `sentence`: in words.
@@ -376,19 +335,18 @@ def sloppy_directions(
         parts = tuple(names[i] for i in order)
         sentence = _sentence(estimate, parts, vector[order], error, size[order])
         directions.append(SloppyDirection(parts, tuple(float(vector[i]) for i in order), error, sentence))
-    return [direction for direction in directions if not _covered(direction, directions)]
 
+    def is_arbitrary(direction: SloppyDirection) -> bool:
+        # Every combination of its parameters is weak, so that none is to be named.
+        return sum(set(other.names) <= set(direction.names) for other in directions) >= len(direction.names)
 
-def _covered(direction: SloppyDirection, directions: list[SloppyDirection]) -> bool:
-    """Whether every combination of its parameters is weak, so that there is none to be named."""
-    parts = set(direction.names)
-    return sum(set(other.names) <= parts for other in directions) >= len(parts)
+    return [direction for direction in directions if not is_arbitrary(direction)]
 
 
 def _inflation(estimate: ParameterEstimate, diagnostics: FitDiagnostics, keep: list[int]) -> float:
-    """What correlation in time and the true size of the residual make of a variance by the Fisher information.
+    """Factor of a variance by the Fisher information for correlation in time and the true size of the residual.
 
-    From the parameters that are known well: of the others the covariance is no more than a large number.
+    From the well-known parameters, since the covariance of the others is only a large number.
     """
     level = float(np.mean([(diagnostics.rmse[name] / noise) ** 2 for name, noise in diagnostics.noise.items()]))
     sizes = np.array([estimate.scale(name) for name in estimate.values])[keep]

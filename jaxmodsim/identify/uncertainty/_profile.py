@@ -1,4 +1,4 @@
-"""Profile likelihood: how badly the best fit does where one parameter is held at other values."""
+"""Profile likelihood: the cost of the best fit with one parameter held at other values."""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import special  # scipy.stats takes most of a second to import
 
-from ..._core.arguments import as_whole
+from ..._core.arguments import as_share, as_whole
 from ..._core.arrays import on_device
 from ..estimate._problem import FitProblem, Prior
 from ..estimate._search import SearchOptions, SearchResult, SearchState, cost_of, start_search, step, weighted_by
@@ -18,21 +18,21 @@ from ._estimate import BLOCKS, ROUNDING, ParameterEstimate, floored_inverse
 from ._fit import searched_on
 from ._result import FitResult
 
-# Weight of what holds the parameter, in its standard errors: it gives way by a millionth of one.
+# Weight that holds the parameter, per standard error: it moves by a millionth of one.
 _STIFF = 1e3
-# How far to walk before an end is called open: by this factor, or by so many sizes of a parameter that has a sign.
+# How far to walk before an end is open: by this factor, or by so many sizes of a parameter of either sign.
 _FAR_FACTOR, _FAR_SIZES = 1e4, 1e3
-# A ratio of more thresholds than this at the next point is a leap.
+# A ratio of more thresholds than this at the next point is a jump.
 _LEAP = 4.0
-# How well the ratio must be known at a point, and what a search never does without.
+# Tolerance of the ratio at a point; largest tolerance, and most iterations, of a search.
 _PRECISE, _LARGEST_RTOL, _ITERATIONS = 2e-3, 1e-4, 40
-# Shorter and longer steps of the walk, and how closely the end of an interval is found, as a share of the distance.
+# Smallest and largest change of the step of the walk; tolerance of the end of an interval, as a share of the distance.
 _SHORTER, _LONGER, _CLOSE = 0.3, 3.0, 1e-2
-# From a point that fits better than the estimate by this share of the threshold the search goes on.
+# The search continues from a point that fits better than the estimate by this share of the threshold.
 _BELOW = 0.1
-# Scatter over blocks below this share of the residual's variance says next to nothing.
+# Scatter over blocks below this share of the residual's variance is chance.
 _LEAST_INFLATION = 0.5
-# Unit of the walk where there is no standard error, as a share of the value.
+# Unit of the walk without a standard error, as a share of the value.
 _UNKNOWN_UNIT = 0.1
 
 
@@ -42,19 +42,18 @@ class Profile:
 
     - `name`, `unit`: of the parameter. `estimate`, `error`: as the fit gave them.
     - `values`: of the parameter, increasing, shape `[points]`.
-    - `ratio`: by how much the sum of losses is larger than at the estimate, in units of what the covariance of the
-      fit makes of one squared standard error; shape `[points]`. It is `((value - estimate)/error)^2` where the model is
-      linear. In other words: the logarithm of the likelihood ratio, times two, with the variance of the residual as it
-      was estimated, divided by the ratio of `covariance` to `white` (at least 1/2), by which correlated residuals know
-      less than white ones.
+    - `ratio`: increase of the sum of losses over that at the estimate, relative to the increase at one standard error
+      of the covariance; shape `[points]`. For a linear model it is `((value - estimate)/error)^2`. It is twice the
+      logarithm of the likelihood ratio with the estimated variance of the residual, divided by the ratio of
+      `covariance` to `white` (at least 1/2), which accounts for correlation.
     - `cost`: half the sum of losses in noise levels, shape `[points]`.
-    - `floor`: the limit of a parameter that must lie above a number, and is walked in the logarithm; None for others.
+    - `floor`: the number that the parameter must lie above, which is then walked in the logarithm; None for others.
     - `level`, `threshold`: of the interval, and the ratio at its ends: the quantile of F with 1 and 31 degrees of
       freedom (blocks of samples less one), the square of Student's t in the intervals of the estimate.
-    - `interval`: where the ratio stays below the threshold; infinite or on a limit where the record sets no end.
-    - `notes`: why an end is open, in words.
+    - `interval`: where the ratio is below the threshold; infinite or on a limit if the record sets no end.
+    - `notes`: reasons for open ends, in words.
     - `others`: the other parameters along it by name, shape `[points]` each.
-    - `result`: the fit that this is the profile of: the one that was given, or a better one that was reached from it.
+    - `result`: the fit of this profile: the argument, or a better one that was reached from it.
     """
 
     name: str
@@ -73,7 +72,7 @@ class Profile:
     result: FitResult
 
     def __str__(self) -> str:
-        """The interval and why an end of it is open."""
+        """The interval and the reasons for open ends."""
         low, high = self.interval
         width = min(abs(self.estimate - low), abs(high - self.estimate))
         # Two digits of the width of the interval.
@@ -96,7 +95,7 @@ class _Point(NamedTuple):
 
 
 class _End(NamedTuple):
-    """The points of one side, away from the estimate, the coordinate of its end and why it is open."""
+    """The points of one side, away from the estimate, the coordinate of its end and the reason for an open one."""
 
     points: list[_Point]
     u: float
@@ -105,12 +104,12 @@ class _End(NamedTuple):
 
 @dataclass(frozen=True)
 class _Line:
-    """One parameter and the coordinate `u` in which its values are walked: its logarithm if it must be positive.
+    """One parameter and the coordinate `u` of the walk: its logarithm if it must be positive.
 
-    - `unit`: standard error in u, or a guess where there is none.
-    - `inflation`: sum of losses that one squared standard error costs.
+    - `unit`: standard error in u, or a guess.
+    - `inflation`: increase of the sum of losses at one standard error.
     - `reach`: how far to walk in u; `limits`: of u.
-    - `best`: cost of the fit. `known`: mean and weight of what was known of the parameter before.
+    - `best`: cost of the fit. `known`: mean and weight of the prior.
     """
 
     name: str
@@ -131,13 +130,13 @@ class _Line:
         return value if self.floor is None else math.log(value - self.floor)
 
     def cost(self, residual: np.ndarray, value: float) -> float:
-        """Cost without the row that holds the parameter, and with what was known of it before."""
+        """Cost without the row that holds the parameter, and with its prior."""
         rows = np.array(residual)
         rows[self.problem.samples + self.index] = self.known[1] * (value - self.known[0])
         return float(cost_of(self.problem.loss, on_device(rows)))
 
     def refit(self, u: float, guess: np.ndarray) -> _Point | None:
-        """The best fit with the parameter at u; None where the model is not finite."""
+        """The best fit with the parameter at u; None if the model is not finite."""
         problem, i = self.problem, self.index
         value = self.value(u)
         slope = 1.0 if self.floor is None else value - self.floor
@@ -167,21 +166,20 @@ class _Line:
 def profile(result: FitResult, name: str, *, points: int = 6, level: float = 0.95, max_steps: int = 400) -> Profile:
     """Profile likelihood of one parameter: all others, and free initial states, are fitted again at each value.
 
-    Unlike the intervals of the estimate it holds where the model is far from linear, and shows what the record leaves
-    open: it walks both ways from the estimate, in the logarithm of a parameter that must be positive, until the fit is
-    worse than the level allows. The noise levels stay as they are. Costs a few evaluations a point, and compiles
-    nothing.
+    Unlike the intervals of the estimate it holds for models far from linear, and shows open intervals. It walks both
+    ways from the estimate, in the logarithm of a parameter that must be positive, until the fit is worse than the level
+    allows. The noise levels stay fixed. It costs a few evaluations a point, and compiles nothing.
 
-    Where a value fits better than the estimate, the search had ended too early, or in a worse minimum. It goes on from
-    there with all parameters, and the profile is that of the fit where it ends, `Profile.result`; the notes say so.
+    If a value fits better than the estimate, the search had ended too early, or in a worse minimum. It continues from
+    there with all parameters, and the profile is that of its end, `Profile.result`; the notes report it.
 
     **Arguments:**
 
     - `result`: a fit that was not loaded from a file.
     - `name`: of a free parameter that is no initial state.
-    - `points`: about how many on either side, at least 2.
+    - `points`: approximate number on either side, at least 2.
     - `level`: of the interval, between 0 and 1.
-    - `max_steps`: limit of all iterations of searches that go on from better values.
+    - `max_steps`: limit of all iterations of searches that continue from better values.
 
     **Returns:**
 
@@ -191,47 +189,38 @@ def profile(result: FitResult, name: str, *, points: int = 6, level: float = 0.9
 
     - `ValueError` for another name or level, or of a result that was loaded.
     """
-    names = _search_of(result).problem.free.names
+    names = result.search_for("A profile").problem.free.names
     if name not in names:
         raise ValueError(f"{name!r} has no profile; the parameters that have one are: {', '.join(names)}.")
-    if not 0 < level < 1:
-        raise ValueError(f"level must lie between 0 and 1, but it is {level}.")
-    if isinstance(points, bool) or not isinstance(points, int) or points < 2:
-        raise ValueError(f"points must be an integer >= 2, but it is {points!r}.")
+    level, points = as_share(level, name="level"), as_whole(points, name="points", least=2)
     limit = as_whole(max_steps, name="max_steps", least=0)
     threshold = float(special.fdtri(1, BLOCKS - 1, level))
     first, left, times = result, limit, 0
     while isinstance(curve := _along(result, name, points, level, -_BELOW * threshold if left else -math.inf), _Point):
         times += 1
-        before = _search_of(result)
+        before = result.search_for("A profile")
         x = on_device(curve.x)
         result = searched_on(result, x, SearchOptions(max_steps=left), times, f"from a better value of {name}")
-        left = max(left - _search_of(result).iterations + before.iterations, 0)
+        left = max(left - result.search_for("A profile").iterations + before.iterations, 0)
     notes = list(curve.notes)
     if times:
         fell = ", ".join(f"{x:.6g} to {result.diagnostics.rmse[k]:.6g}" for k, x in first.diagnostics.rmse.items())
         notes.append(
             f"A value of {name} fitted better than the estimate: {'one search' if times == 1 else f'{times} searches'}"
-            f" went on from there in {limit - left} iterations, and the RMSE fell from {fell}."
+            f" continued from there in {limit - left} iterations, and the RMSE fell from {fell}."
         )
     if np.min(curve.ratio) < -_BELOW * threshold:
         notes.append(
             f"Some value of {name} fits better than the estimate, but the limit of {limit} iterations (max_steps) of"
-            " searches that go on from there is used up."
+            " searches that continue from there is reached."
         )
     return replace(curve, notes=tuple(notes))
-
-
-def _search_of(result: FitResult) -> SearchResult:
-    if result.search is None:
-        raise ValueError("A profile needs the search, which a loaded result does not have: fit again.")
-    return result.search
 
 
 def _along(result: FitResult, name: str, points: int, level: float, least: float) -> Profile | _Point:
     """The profile of a fit, or the first point whose ratio is below `least`."""
     threshold = float(special.fdtri(1, BLOCKS - 1, level))
-    search = _search_of(result)
+    search = result.search_for("A profile")
     line, tangent = _line_of(result.estimate, search, name)
     estimate, names = result.values[name], search.problem.free.names
     start = _Point(line.coordinate(estimate), np.asarray(search.state.x), 0.0, line.best)
@@ -243,7 +232,7 @@ def _along(result: FitResult, name: str, points: int, level: float, least: float
             return lowest
     down, up = sides
     path = [*reversed(down.points), start, *up.points]
-    others = [{k: float(x) for k, x in _values(line.problem, point.x).items()} for point in path]
+    others = [line.problem.at(on_device(point.x)).values for point in path]
     ends = [end.u if math.isinf(end.u) else line.value(end.u) for end in (down, up)]
     if line.floor is not None and math.isinf(ends[0]):
         ends[0] = line.floor
@@ -260,18 +249,13 @@ def _along(result: FitResult, name: str, points: int, level: float, least: float
         cost=np.array([point.cost for point in path]),
         interval=(ends[0], ends[1]),
         notes=tuple(end.note for end in (down, up) if end.note),
-        others={k: np.array([values[k] for values in others]) for k in names if k != name},
+        others={k: np.array([float(values[k]) for values in others]) for k in names if k != name},
         result=result,
     )
 
 
-def _values(problem: FitProblem, x: np.ndarray) -> dict[str, np.ndarray]:
-    values = problem.at(on_device(x)).values
-    return {name: values[name] for name in problem.free.names}
-
-
 def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tuple[_Line, np.ndarray]:
-    """The line, and the derivative of the best x by the parameter as the linear model has it."""
+    """The line, and the derivative of the best x by the parameter in the linear model."""
     problem, state = search.problem, search.state
     i, size = problem.free.names.index(name), len(problem.free.names)
     value, error = estimate.values[name], estimate.errors[name]
@@ -282,12 +266,12 @@ def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tu
     residual, _ = weighted_by(problem.loss, state)
     counted = float(np.sum(problem.weights > 0))
     variance = float(np.sum(residual[: problem.samples] ** 2)) / max(counted - state.x.shape[0], 1)
-    # A squared standard error costs error^2 / by_losses, which is the variance of white residuals. Where one block of
-    # samples decides, the scatter over blocks may say next to nothing by chance, and half of that is the least.
+    # One standard error costs error^2 / by_losses: the variance, for white residuals. If one block of samples
+    # determines the parameter, the scatter over blocks may be small by chance, so half the variance is the least.
     inflation = error**2 / by_losses if by_losses > 0 else math.nan
     inflation = max(inflation, _LEAST_INFLATION * variance) if math.isfinite(inflation) else variance
     inflation = max(inflation, 1e-300)
-    floor, limits = None, problem.free.fixed_limits(name)
+    floor, limits = None, problem.free[name].fixed_limits
     if name in estimate.logarithmic:
         floor = limits[0]
     size_of = abs(value) if floor is None else value - floor
@@ -305,7 +289,7 @@ def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tu
 
 
 def _inverse_normal(problem: FitProblem, state: SearchState) -> np.ndarray:
-    """Inverse of the normal matrix of the fit by x, with directions that nothing is known of made very long."""
+    """Inverse of the normal matrix of the fit by x, very large in undetermined directions."""
     weighted = weighted_by(problem.loss, state)[1].astype(float)
     matrix = weighted.T @ weighted
     scale = np.sqrt(np.diag(matrix))
@@ -317,9 +301,9 @@ def _inverse_normal(problem: FitProblem, state: SearchState) -> np.ndarray:
 def _walk(
     line: _Line, start: _Point, tangent: np.ndarray, side: float, threshold: float, points: int, least: float
 ) -> _End:
-    """Walk away from the estimate until the ratio reaches the threshold, or there is nothing more to see.
+    """Walk away from the estimate until the ratio reaches the threshold, a limit or the reach.
 
-    A ratio below `least` ends it, too: there is a better fit to be had.
+    A ratio below `least` also ends the walk: there is a better fit.
     """
     aim = math.sqrt(threshold) / points
     pace, slope, path = aim * line.unit, tangent, [start]
@@ -338,7 +322,7 @@ def _walk(
         u = limit if side * (limit - u) < 0 else u
         point = _try(line, u, last, slope)
         if point is not None and point.ratio > _LEAP * threshold:
-            # A leap may be a search that went astray from a guess that was too bold.
+            # A jump may be a failed search from a guess too far away.
             again = line.refit(point.u, last.x)
             point = point if again is None or again.ratio > point.ratio else again
         if point is None:
@@ -359,7 +343,7 @@ def _walk(
 
 
 def _try(line: _Line, u: float, last: _Point, slope: np.ndarray) -> _Point | None:
-    """A point at u, or nearer to the last one where the model is not finite there."""
+    """A point at u, or nearer to the last one if the model is not finite there."""
     for _ in range(5):
         for guess in (last.x + slope * (u - last.u), last.x):
             point = line.refit(u, guess)
@@ -374,9 +358,9 @@ def _root(point: _Point) -> float:
 
 
 def _crossing(line: _Line, inner: _Point, outer: _Point, threshold: float) -> tuple[list[_Point], float]:
-    """Points on the way to where the ratio is the threshold, between two that lie on either side, and that place.
+    """Points between two on either side of the threshold, and the coordinate where the ratio crosses it.
 
-    The root of the ratio is a straight line for a linear model, so it is what is interpolated.
+    The root of the ratio is interpolated, since it is linear for a linear model.
     """
     wanted, added = math.sqrt(threshold), []
 

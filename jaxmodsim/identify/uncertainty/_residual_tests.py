@@ -1,4 +1,4 @@
-"""What is left in the residual of a fit: whether it is noise, how long it remembers, and what it goes with."""
+"""Tests of the residual of a fit: whiteness, normality, correlation in time and with motion and inputs."""
 
 import math
 from collections.abc import Mapping
@@ -8,34 +8,38 @@ import numpy as np
 from jaxtyping import Float
 from scipy import special  # scipy.stats takes most of a second to import
 
+from ..estimate._search import SearchResult
 from ..model._observe import RecordedMotion
-from ._estimate import lag_number
+from ._estimate import BLOCKS, lag_number
 from ._result import FitResult
 
-# A trend or an input is named in words from this share of the variance on, at this probability of chance.
+# A trend or an input is reported from this share of the variance, below this p-value.
 _SHARE, _CHANCE = 0.01, 0.01
 # Normal quantile of 95 %, two-sided: the band of the autocorrelation of white noise, times the root of the samples.
 _WHITE_BAND = 1.96
-# Least variance of a correlation in units of that of white noise: negative memories must not make it vanish.
+# Least variance of a correlation, relative to that of white noise: negative correlations must not make it vanish.
 _LEAST_VARIANCE = 0.1
-# Samples for each lag that is looked at, at least, and lags in units of the memory.
+# Least number of samples for each lag, and lags relative to the correlation time.
 _SAMPLES_A_LAG, _MEMORIES = 5, 3
-# Keeps divisions by what may vanish finite.
+# Independent samples that a block must hold for its scores to be independent of those of the next one; the number of
+# blocks if there are too few samples for the usual number.
+_WORTH, _FEW = 4, 6
+# Keeps divisions finite.
 _TINY = 1e-300
 _MEANING = {
     "q": "something that depends on position may be missing (friction, stiffness, gear ratio)",
-    "qd": "friction may depend on velocity in another way, or a signal comes late",
-    "t": "something drifts (temperature, wear, a sensor)",
+    "qd": "friction may depend on velocity in another way, or a signal may be late",
+    "t": "something may drift (temperature, wear, a sensor)",
 }
 
 
 @dataclass(frozen=True)
 class Trend:
-    """A straight line of the residual over something.
+    """Linear regression of the residual on a coordinate, a velocity or time.
 
-    - `over`: what, such as `q[0]`, `qd[0]` or `t`. `slope`: per unit of that.
+    - `over`: `q[0]`, `qd[0]`, `t`, and so on. `slope`: per unit of that.
     - `share`: of the residual's variance, 0 to 1.
-    - `p`: probability of a slope as large by chance, the correlation of the residual in time taken into account.
+    - `p`: probability of a slope as large by chance, with the correlation of the residual in time.
     """
 
     over: str
@@ -46,7 +50,7 @@ class Trend:
 
 @dataclass(frozen=True)
 class Cross:
-    """Largest correlation of the residual with an input that came `lag` [s] before, and its p-value over all lags."""
+    """Largest correlation of the residual with an input `lag` [s] earlier, and its p-value over all lags."""
 
     correlation: float
     lag: float
@@ -55,15 +59,15 @@ class Cross:
 
 @dataclass(frozen=True)
 class ChannelTests:
-    """Tests of the residual of one channel of one record; each p is the probability of as much by chance.
+    """Tests of the residual of one channel of one record; each p is the probability of at least as much by chance.
 
-    - `samples`, `independent`: number of samples, and of independent ones that would tell as much of a mean.
+    - `samples`, `independent`: number of samples, and of independent ones that determine a mean as well.
     - `length`: correlation length [s], the sum of the autocorrelation over positive lags times the interval: 0 for
-      white noise and where that sum is negative, the time constant where it decays exponentially.
-    - `whiteness`: p of the test of Ljung and Box over `lags` lags. `autocorrelation`: at lags from 0 on, at
-      least to `lags`, further where the memory is longer.
-    - `skewness`, `kurtosis`: the second in excess of the normal one. `normality`: p of both together by Jarque and
-      Bera, for correlated series (Lobato, Velasco 2004, Econometric Theory 20:671).
+      white noise and for a negative sum, the time constant for an exponential decay.
+    - `whiteness`: p of the test of Ljung and Box over `lags` lags. `autocorrelation`: at lags from 0, at least to
+      `lags`, further for a longer correlation.
+    - `skewness`, `kurtosis`: the second is the excess over that of a normal distribution. `normality`: p of both
+      together by Jarque and Bera, for correlated series (Lobato, Velasco 2004, Econometric Theory 20:671).
     - `trends`: over position, velocity and time. `inputs`: by name.
     """
 
@@ -83,7 +87,7 @@ class ChannelTests:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What the tests mean, in words."""
+        """The meaning of the tests, in words."""
         sentences = []
         for trend in self.trends:
             if trend.p < _CHANCE and trend.share > _SHARE:
@@ -92,19 +96,19 @@ class ChannelTests:
         for name, cross in self.inputs.items():
             if cross.p < _CHANCE and cross.correlation**2 > _SHARE:
                 sentences.append(
-                    f"It goes with the input {name} of {cross.lag:.3g} s before (correlation {cross.correlation:+.2f}):"
+                    f"It is correlated with the input {name} of {cross.lag:.3g} s earlier ({cross.correlation:+.2f}):"
                     " the model leaves some of its effect unexplained."
                 )
         if self.whiteness < _CHANCE and self.length == 0:
             lag = 1 + int(np.argmax(np.abs(self.autocorrelation[1:])))
             sentences.append(
-                "It is not white, but has no memory that would make samples tell less: its autocorrelation is"
+                "It is not white, but without positive correlation that makes samples redundant: its autocorrelation is"
                 f" {self.autocorrelation[lag]:+.2f} at lag {lag}."
             )
         elif self.whiteness < _CHANCE:
             sentences.append(
-                f"It is not white: it remembers over {self.length:.3g} s, so that {self.samples} samples tell as much"
-                f" as {self.independent:.0f} independent ones."
+                f"It is not white: it is correlated over {self.length:.3g} s, so {self.samples} samples are equivalent"
+                f" to {self.independent:.0f} independent ones."
             )
         if self.normality < _CHANCE:
             tails = "heavy" if self.kurtosis > 0 else "light"
@@ -119,12 +123,12 @@ class ResidualTests:
     channels: tuple[ChannelTests, ...]
 
     def __str__(self) -> str:
-        """A table, and what it means in words."""
+        """A table, and its meaning in words."""
         lines = []
         for each in self.channels:
             lines += [
-                f"{each.record}, {each.channel}: {each.samples} samples, as good as {each.independent:.0f} independent"
-                f" ones; correlation length {each.length:.3g} s",
+                f"{each.record}, {each.channel}: {each.samples} samples, equivalent to {each.independent:.0f}"
+                f" independent ones; correlation length {each.length:.3g} s",
                 f"  {'white (Ljung-Box, ' + str(each.lags) + ' lags)':34} p = {each.whiteness:.2g}",
                 f"  {'normal (Jarque-Bera)':34} p = {each.normality:.2g}   skewness {each.skewness:+.2f},"
                 f" excess kurtosis {each.kurtosis:+.2f}",
@@ -144,9 +148,9 @@ class ResidualTests:
 
 
 def residual_tests(result: FitResult) -> ResidualTests:
-    """Whether the residuals of a fit are noise, how long they remember, and what they go with.
+    """Test whether the residuals of a fit are noise, and what they are correlated with.
 
-    Position and velocity are those of the model's output, where a channel shows them.
+    Positions and velocities are those of the model's output, as far as channels show them.
     """
     provenance, tests = result.provenance, []
     for record, residuals, motion in zip(provenance.records, provenance.residuals, provenance.motions, strict=True):
@@ -162,14 +166,17 @@ def channel_tests(
     inputs: Mapping[str, Float[np.ndarray, " samples"]],
     motion: RecordedMotion,
 ) -> ChannelTests:
-    """Tests of one residual; samples are taken to be at regular times."""
+    """Tests of one residual, with samples at regular times."""
     n, interval = len(residual), float(np.median(np.diff(motion.t)))
     e = np.asarray(residual, float) - np.mean(residual)
     lags = lag_number(n)
     correlation = autocorrelation(e)
     memory = remembered(correlation)
-    # Negative correlation makes samples tell more of a mean, but of nothing else: they are not counted as more than n.
+    # Negative correlation helps the mean alone, so samples count as n at most.
     tau = max(1 + 2 * float(np.sum(correlation[1:memory])), 1.0)
+    # Ljung, Box 1978, Biometrika 65:297.
+    statistic = n * (n + 2) * float(np.sum(correlation[1 : lags + 1] ** 2 / (n - np.arange(1, lags + 1))))
+    whiteness = float(special.chdtrc(lags, statistic))
     skewness, kurtosis, normality = _normality(e, correlation, memory)
     regressors = {f"q[{i}]": x for i, x in motion.q.items()} | {f"qd[{i}]": x for i, x in motion.qd.items()}
     regressors["t"] = motion.t
@@ -182,7 +189,7 @@ def channel_tests(
         n / tau,
         interval * (tau - 1) / 2,
         lags,
-        _ljung_box(correlation, lags),
+        whiteness,
         correlation[: min(max(lags, 4 * memory), n - 1) + 1],
         skewness,
         kurtosis,
@@ -193,7 +200,7 @@ def channel_tests(
 
 
 def autocorrelation(e: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """Autocorrelation at all lags from 0 on; zero but at lag 0 where nothing varies."""
+    """Autocorrelation at all lags from 0; that of a constant is 1 at lag 0 and 0 at the others."""
     return _covariances(e, e) / max(float(e @ e), _TINY) if e @ e > 0 else np.eye(1, len(e))[0]
 
 
@@ -207,7 +214,7 @@ def _covariances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def positive_lags(correlation: Float[np.ndarray, " lags"]) -> int:
     """Number of lags, 0 included, up to which sums of two neighbours stay positive (Geyer 1992, Stat. Sci. 7:473).
 
-    Beyond, an estimated autocorrelation is nothing but noise.
+    Beyond, an estimated autocorrelation is only noise.
     """
     even = len(correlation) - len(correlation) % 2
     ends = np.flatnonzero(correlation[:even].reshape(-1, 2).sum(axis=1) <= 0)
@@ -215,17 +222,10 @@ def positive_lags(correlation: Float[np.ndarray, " lags"]) -> int:
 
 
 def remembered(correlation: Float[np.ndarray, " lags"]) -> int:
-    """`positive_lags`; short memories end where a value is no longer outside the band of white noise."""
+    """`positive_lags`, but not beyond the first value within the band of white noise."""
     inside = np.abs(correlation[1:]) < _WHITE_BAND / math.sqrt(len(correlation))
     first = 1 + int(np.argmax(inside)) if np.any(inside) else len(correlation)
     return max(min(positive_lags(correlation), first), 1)
-
-
-def _ljung_box(correlation: np.ndarray, lags: int) -> float:
-    """Probability of as much autocorrelation by chance (Ljung, Box 1978, Biometrika 65:297)."""
-    n = len(correlation)
-    statistic = n * (n + 2) * float(np.sum(correlation[1 : lags + 1] ** 2 / (n - np.arange(1, lags + 1))))
-    return float(special.chdtrc(lags, statistic))
 
 
 def _normality(e: np.ndarray, correlation: np.ndarray, memory: int) -> tuple[float, float, float]:
@@ -249,7 +249,7 @@ def _variance_of_correlation(correlation: np.ndarray, memory: int, other: np.nda
 
 
 def trend_over(name: str, e: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> Trend:
-    """Linear regression; what is left of the residual says how sure the slope is."""
+    """Linear regression, with the standard error of the slope from its own residual."""
     x = x - np.mean(x)
     slope = float(e @ x / (x @ x))
     left = e - slope * x
@@ -257,13 +257,13 @@ def trend_over(name: str, e: Float[np.ndarray, " samples"], x: Float[np.ndarray,
     share = 1 - float(left @ left) / whole if whole > 0 else 0.0
     correlation = autocorrelation(left)
     variance = _variance_of_correlation(correlation, remembered(correlation), x)
-    # The correlation under the hypothesis that there is none, in units of what is left.
+    # The correlation under the null hypothesis, relative to the residual of the regression.
     score = abs(slope) * math.sqrt(float(x @ x)) / max(math.sqrt(float(left @ left)), _TINY)
     return Trend(name, slope, share, float(2 * special.ndtr(-score / math.sqrt(variance))) if whole > 0 else 1.0)
 
 
 def _cross(e: np.ndarray, u: np.ndarray, correlation: np.ndarray, memory: int, lags: int, interval: float) -> Cross:
-    """Correlation with the input at 0 and `lags` more lags up to the memory of the residual, and at least so many."""
+    """Largest correlation with the input over `lags + 1` lags, up to the correlation time or `lags`."""
     u = u - np.mean(u)
     size = math.sqrt(float(e @ e) * float(u @ u))
     if size == 0:
@@ -274,6 +274,30 @@ def _cross(e: np.ndarray, u: np.ndarray, correlation: np.ndarray, memory: int, l
     best = int(np.argmax(np.abs(values)))
     deviation = math.sqrt(_variance_of_correlation(correlation, memory, u))
     p = float(2 * special.ndtr(-abs(values[best]) / deviation))
-    # As if the lags were independent (Sidak), which is on the safe side.
+    # Sidak correction, conservative since the lags are dependent.
     chance = -math.expm1(len(looked_at) * math.log1p(-min(p, 1 - 1e-16)))
     return Cross(float(values[best]), interval * float(looked_at[best]), chance)
+
+
+def independent_blocks(search: SearchResult) -> int:
+    """Number of blocks of samples with independent scores: few and long ones if the residual's correlation is long."""
+    return BLOCKS if effective_samples(search) >= _WORTH * BLOCKS else _FEW
+
+
+def effective_samples(search: SearchResult) -> float:
+    """Number of independent samples, `n / (1 + 2 sum of autocorrelations)`, of all series of the residual."""
+    total = 0.0
+    for residual, weight in search.residuals.values():
+        for row, counts in zip(residual, weight, strict=True):
+            series = row[counts > 0]
+            total += len(series) / correlation_time(series)
+    return total
+
+
+def correlation_time(series: Float[np.ndarray, " samples"]) -> float:
+    """`1 + 2 sum of autocorrelations`, >= 1, by Geyer's initial positive sequence."""
+    around = series - np.mean(series) if len(series) else series
+    if len(series) < 2 or not np.any(around):
+        return 1.0
+    correlation = autocorrelation(around)
+    return max(2 * float(np.sum(correlation[: positive_lags(correlation)])) - 1.0, 1.0)

@@ -1,4 +1,4 @@
-"""A fitted model, with how sure it is, what its records cannot tell, and files of it."""
+"""The result of a fit: parameters, remarks on what the records do not determine, and its files."""
 
 import io
 import json
@@ -16,28 +16,28 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._core.readable import AbstractReadable, Table, table_of
-from ..._core.system import jsonable, written_whole
-from ..data._record import Record, resolution, sample_noise
+from ..data._record import Record
+from ..data._signals import resolution, sample_noise
 from ..estimate._search import SearchResult, ended_by_itself
 from ..model._parameters import with_numbers
 from ._estimate import FitDiagnostics, FitProvenance, IdentifiabilityIssue, ParameterEstimate
 from ._identifiability import sloppy_directions
 
-# Relative errors and correlations from which on a parameter is called uncertain, in looking for a cause.
+# Relative standard error, and correlation, from which a parameter is uncertain, in the search for a cause.
 _UNCERTAIN, _ALIKE = 0.1, 0.98
-# Standard error against the value from which on a parameter is called not determined, and how many pairs are named.
+# Relative standard error from which a parameter is undetermined; number of pairs that are named.
 _UNKNOWN, _PAIRS = 0.5, 4
-# Share of the scatter of a channel from which on an RMSE says that nothing is followed.
+# Share of the scatter of a channel from which the RMSE is that of a constant.
 _FOLLOWS = 0.95
 # Excess of the mean square error over the noise from sample to sample that is reported: at least this share, and so
-# many times the root of the number of samples, which are four standard deviations of the ratio.
+# many times one over the root of the number of samples, which is four standard deviations of the ratio.
 _EXCESS, _SCATTER = 0.2, 15.0
-# Share of the RMSE from which on the effect of the integration step is reported.
+# Share of the RMSE from which the error of the integration step is reported.
 _STEP_SHOWS = 0.1
 
 _KIND, _VERSION, _TEXT = "jaxmodsim fit result", 2, "result.json"
 _PARTS = {"estimate": ParameterEstimate, "diagnostics": FitDiagnostics, "provenance": FitProvenance}
-# What is not kept in a file: functions.
+# Functions are not saved.
 _LEFT_OUT = ("model",)
 
 
@@ -45,8 +45,8 @@ _LEFT_OUT = ("model",)
 class FitResult(AbstractReadable):
     """A fitted model.
 
-    - `estimate`: parameters with their covariance. `diagnostics`: how the fit went. `provenance`: records and model.
-    - `search`: where the search ended, for further questions; None in a result that was loaded.
+    - `estimate`: parameters with their covariance. `diagnostics`: of the fit. `provenance`: records and model.
+    - `search`: the end of the search, which other functions start from; None in a result that was loaded.
     """
 
     estimate: ParameterEstimate
@@ -71,15 +71,15 @@ class FitResult(AbstractReadable):
 
     @property
     def record(self) -> Record:
-        """The record, where there is one.
+        """The record, if there is only one.
 
         **Raises:**
 
-        - `ValueError` if there are several.
+        - `ValueError` for several.
         """
         records = self.provenance.records
         if len(records) > 1:
-            raise ValueError(f"{len(records)} records were fitted: take them from `provenance.records`.")
+            raise ValueError(f"{len(records)} records were fitted: read `provenance.records` instead.")
         return next(iter(records))
 
     @property
@@ -108,13 +108,24 @@ class FitResult(AbstractReadable):
         """
         rmse = self.diagnostics.rmse
         if len(rmse) > 1:
-            raise ValueError(f"There are the channels {', '.join(rmse)}: take theirs from `diagnostics.rmse`.")
+            raise ValueError(f"There are the channels {', '.join(rmse)}: read `diagnostics.rmse` instead.")
         return next(iter(rmse.values()))
 
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write everything but the model's functions and the search into one file, whole or not at all.
+    def search_for(self, purpose: str) -> SearchResult:
+        """The search, which a result that was loaded from a file does not have.
 
-        A zip of one JSON text and of arrays (`numpy.load` opens it, too), in which every number stays what it is.
+        **Raises:**
+
+        - `ValueError` naming the purpose, for a loaded result.
+        """
+        if self.search is None:
+            raise ValueError(f"{purpose} needs the search of the fit, which a loaded result does not have: fit again.")
+        return self.search
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write everything except the model's functions and the search into one file, atomically.
+
+        A zip of one JSON text and of arrays (`numpy.load` opens it, too), in which all numbers are exact.
         """
         arrays: dict[str, np.ndarray] = {}
         parts = {name: value for part in _PARTS for name, value in vars(getattr(self, part)).items()}
@@ -124,21 +135,22 @@ class FitResult(AbstractReadable):
         with written_whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr(_TEXT, text)
             for name, array in arrays.items():
-                archive.writestr(f"{name}.npy", _bytes(array))
+                buffer = io.BytesIO()
+                np.lib.format.write_array(buffer, array, allow_pickle=False)
+                archive.writestr(f"{name}.npy", buffer.getvalue())
 
     @staticmethod
     def load(path: str | PathLike[str], model: eqx.Module | None = None) -> "FitResult":
-        """A result that `save` wrote. It can do all but run the model: no `profile` and no `score`.
+        """A result that `save` wrote. It cannot run the model, so `profile` and `evaluate_on` refuse it.
 
         **Arguments:**
 
         - `path`: of the file.
-        - `model`: the scene or law that was fitted, with any numbers; `model` of the result is this one with all its
-          numbers as they were.
+        - `model`: the fitted scene or law, with any numbers; the result has it with the fitted numbers.
 
         **Raises:**
 
-        - `ValueError` for a file that is damaged or something else, or a model whose numbers have other names.
+        - `ValueError` for a damaged or a different file, or a model with numbers of other names.
         - `OSError` if the file cannot be read.
         """
         names = {part: [field.name for field in fields(kind)] for part, kind in _PARTS.items()}
@@ -148,7 +160,7 @@ class FitResult(AbstractReadable):
         return FitResult(**parts, search=None)
 
     def to_dict(self) -> dict[str, object]:
-        """All but the samples and the model, as JSON knows it: numbers that are not finite are None."""
+        """Everything except samples and model, in types of JSON; numbers that are not finite are None."""
         estimate, diagnostics, intervals = self.estimate, self.diagnostics, self.estimate.intervals()
         return jsonable(
             {
@@ -175,16 +187,8 @@ class FitResult(AbstractReadable):
         )
 
     def __str__(self) -> str:
-        """A table of the parameters, and what the record cannot tell."""
-        estimate, rmse, intervals = self.estimate, self.diagnostics.rmse, self.estimate.intervals()
-        width = max(len(name) for name in estimate.values)
-        lines = [f"{'':{width}}  {'value':>13}  {'std. error':>11}  {'95 % interval':>25}  unit"]
-        for name, value, error, _, unit in estimate.rows():
-            low, high = intervals[name]
-            lines.append(f"{name:{width}}  {value:13.6g}  {error:11.2g}  {low:12.5g} {high:12.5g}  {unit}")
-        errors = ", ".join(f"{'' if len(rmse) == 1 else name + ' '}{x:.6g}" for name, x in rmse.items())
-        ending = f"RMSE {errors}; {self.diagnostics.evaluations} evaluations, {self.diagnostics.ending}"
-        return "\n".join([*lines, ending, *remarks(self)])
+        """A table of all parameters, and the remarks."""
+        return table_of(self).text()
 
     __repr__ = __str__
 
@@ -200,57 +204,54 @@ def _(result: FitResult) -> Table:
     errors = ", ".join(f"{name} {x:.6g}" for name, x in result.diagnostics.rmse.items())
     names = ", ".join(record.name for record in result.provenance.records)
     head = ("parameter", "value", "standard error", "95 % interval")
-    return Table(f"Fit to {names}, RMSE {errors}", head, rows, (result.diagnostics.ending, *remarks(result)))
+    ending = f"{result.diagnostics.evaluations} evaluations, {result.diagnostics.ending}"
+    return Table(f"Fit to {names}, RMSE {errors}", head, rows, (ending, *remarks(result)))
 
 
 def remarks(result: FitResult) -> tuple[str, ...]:
-    """What the records of a fit cannot tell, in sentences: what spoils the figures, what is not determined, and why.
+    """Limitations of a fit, in sentences: causes of wrong standard errors, undetermined parameters, and the reasons.
 
-    What an issue of the motion, or a weak combination, has explained is not said again of each parameter and pair.
+    Parameters and pairs that an issue of the motion or a weak combination explains are not listed again.
     """
     estimate, diagnostics = result.estimate, result.diagnostics
     errors, bounds = estimate.errors, estimate.bounds
     explained = {name for issue in diagnostics.issues for name in issue.about}
-    sentences = _of_the_search(diagnostics, result.provenance.records)
+    sentences = _of_the_search(result)
     silent = [name for name in estimate.values if not np.isfinite(errors[name]) and name not in explained]
     sentences += [f"{name} has no effect on this record." for name in silent]
     sentences += [issue.sentence for issue in diagnostics.issues]
-    sentences += _above_the_noise(diagnostics, result.provenance.records)
+    sentences += _above_the_noise(result)
     for name, value in estimate.values.items():
         if np.isfinite(errors[name]) and value in bounds[name]:
             sentences.append(f"{name} ended on its limit {value:g}.")
     directions = sloppy_directions(estimate, diagnostics, explained)
     sentences += [direction.sentence for direction in directions]
-    told = explained | {name for direction in directions for name in direction.names}
+    named = explained | {name for direction in directions for name in direction.names}
     for name, value in estimate.values.items():
         share = errors[name] / scale if (scale := estimate.scale(name)) else np.inf
-        if _UNKNOWN < share < np.inf and value not in bounds[name] and name not in told:
+        if _UNKNOWN < share < np.inf and value not in bounds[name] and name not in named:
             of = "its value" if scale == abs(value) else f"{scale:.2g}, which would move the motion by its own size"
             sentences.append(
                 f"{name} is not determined by this record: its standard error is {100 * share:.0f} % of {of}."
             )
-    pairs = [(a, b, c) for a, b, c in _alike(estimate) if not {a, b} <= told]
+    pairs = [(a, b, c) for a, b, c in _alike(estimate) if not {a, b} <= named]
     for a, b, c in pairs[:_PAIRS]:
         sentences.append(f"{a} and {b} are hardly told apart (correlation {c:+.3f}).")
     if len(pairs) > _PAIRS:
         sentences.append(f"{len(pairs) - _PAIRS} more pairs have correlations as large: see `estimate.correlation`.")
     if diagnostics.single_precision:
-        sentences.append("Computed in single precision: enable jax_enable_x64 for numbers that you mean to use.")
+        sentences.append("Computed in single precision: enable jax_enable_x64 for reliable numbers.")
     return tuple(sentences)
 
 
 def is_step_size_limited(result: FitResult) -> bool:
-    """Whether the integration steps between samples are so few that they show beside what the model misses."""
-    return _step_size_limits(result.diagnostics)
-
-
-def _step_size_limits(diagnostics: FitDiagnostics) -> bool:
-    errors, moved = list(diagnostics.rmse.values()), diagnostics.step_error
-    return moved is not None and len(errors) == 1 and moved > _STEP_SHOWS * errors[0]
+    """Whether more integration steps between samples would change the RMSE of a fit with one channel."""
+    errors, change = list(result.diagnostics.rmse.values()), result.diagnostics.step_error
+    return change is not None and len(errors) == 1 and change > _STEP_SHOWS * errors[0]
 
 
 def uncertain_of(estimate: ParameterEstimate) -> dict[str, tuple[str, ...]]:
-    """Parameters that are not well known, each with those that it is hardly told apart from."""
+    """Uncertain parameters, each with those that have a large correlation with it."""
     pairs, errors, uncertain = _alike(estimate), estimate.errors, {}
     for name, value in estimate.values.items():
         others = tuple(b if a == name else a for a, b, _ in pairs if name in (a, b))
@@ -259,32 +260,32 @@ def uncertain_of(estimate: ParameterEstimate) -> dict[str, tuple[str, ...]]:
     return uncertain
 
 
-def _of_the_search(diagnostics: FitDiagnostics, records: tuple[Record, ...]) -> list[str]:
-    sentences = []
+def _of_the_search(result: FitResult) -> list[str]:
+    diagnostics, sentences = result.diagnostics, []
     if not ended_by_itself(diagnostics.ending):
         sentences.append(f"The search {diagnostics.ending}: do not trust the standard errors.")
-    if _step_size_limits(diagnostics):
+    if is_step_size_limited(result):
         sentences.append(
             f"The integration step shows: with four times as many the output moves by {diagnostics.step_error:.2g}"
             f" (root mean square) against an RMSE of {next(iter(diagnostics.rmse.values())):.2g}. Raise substeps."
         )
     for channel, rmse in diagnostics.rmse.items():
-        columns = [record.channels[channel] for record in records if channel in record.channels]
+        columns = _columns(result, channel)
         scatter = np.sqrt(np.mean(np.concatenate([x - np.mean(x) for x in columns]) ** 2)) if columns else 0.0
         if columns and rmse > _FOLLOWS * scatter > 0:
             sentences.append(
                 f"{channel}: the model follows nothing of the record; its RMSE of {rmse:.2g} is no less than that of a"
-                f" constant, {scatter:.2g}. Is the input the right column, has it the right sign and unit?"
+                f" constant, {scatter:.2g}. Check column, sign and unit of the input."
             )
     return sentences
 
 
-def _above_the_noise(diagnostics: FitDiagnostics, records: tuple[Record, ...]) -> list[str]:
+def _above_the_noise(result: FitResult) -> list[str]:
     sentences = []
-    for channel, rmse in diagnostics.rmse.items():
-        columns = [record.channels[channel] for record in records if channel in record.channels]
+    for channel, rmse in result.diagnostics.rmse.items():
+        columns = _columns(result, channel)
         samples = sum(x.size for x in columns)
-        # Where a machine stands, rounding to a step takes up to half of it.
+        # At rest, rounding to a sensor step has an error of up to half of it.
         levels = [max(sample_noise(x), 0.5 * resolution(x)) for x in columns]
         noise = math.sqrt(sum(x.size * level**2 for x, level in zip(columns, levels, strict=True)) / max(samples, 1))
         if columns and rmse**2 > (1 + max(_EXCESS, _SCATTER / math.sqrt(samples))) * noise**2:
@@ -293,6 +294,10 @@ def _above_the_noise(diagnostics: FitDiagnostics, records: tuple[Record, ...]) -
                 " misses part of the motion, or the noise is correlated in time."
             )
     return sentences
+
+
+def _columns(result: FitResult, channel: str) -> list[np.ndarray]:
+    return [record.channels[channel] for record in result.provenance.records if channel in record.channels]
 
 
 def _alike(estimate: ParameterEstimate) -> list[tuple[str, str, float]]:
@@ -308,11 +313,11 @@ def _alike(estimate: ParameterEstimate) -> list[tuple[str, str, float]]:
 
 
 def _read_fields(path: str | PathLike[str], wanted: list[str]) -> dict[str, Any]:
-    """The fields of a result by name, all but those that files do not keep.
+    """The saved fields of a result by name.
 
     **Raises:**
 
-    - `ValueError` for a file that is damaged or something else.
+    - `ValueError` for a damaged or a different file.
     - `OSError` if there is none.
     """
     content = io.BytesIO(Path(path).read_bytes())
@@ -326,10 +331,10 @@ def _read_fields(path: str | PathLike[str], wanted: list[str]) -> dict[str, Any]
                 for name in archive.namelist()
                 if name.endswith(".npy")
             }
-    except Exception as error:  # whatever the bytes of a damaged file lead the reader into
-        raise ValueError(f"{path} is no result that FitResult.save wrote, or it is damaged: {error}") from error
+    except Exception as error:  # damaged bytes can raise anything
+        raise ValueError(f"{path} was not written by FitResult.save, or it is damaged: {error}") from error
     if not isinstance(text, dict) or text.get("kind") != _KIND:
-        raise ValueError(f"{path} is no result of a fit: it does not say {_KIND!r}.")
+        raise ValueError(f"{path} is no result of a fit: its kind is not {_KIND!r}.")
     if text.get("format") != _VERSION:
         raise ValueError(
             f"{path} has the format {text.get('format')!r}, written by jaxmodsim {text.get('jaxmodsim')}, but this"
@@ -345,14 +350,8 @@ def _read_fields(path: str | PathLike[str], wanted: list[str]) -> dict[str, Any]
         raise ValueError(f"{path} is damaged: {error!r}") from error
 
 
-def _bytes(array: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    np.lib.format.write_array(buffer, array, allow_pickle=False)
-    return buffer.getvalue()
-
-
 def _packed(x: object, name: str, arrays: dict[str, np.ndarray]) -> object:
-    """As JSON knows it; arrays aside, numbers that JSON does not know as words."""
+    """In types of JSON, with numbers that are not finite as text; appends to `arrays`."""
     if isinstance(x, Record):
         parts = {
             "t": x.t, "channels": x.channels, "inputs": x.inputs, "name": x.name, "linear": tuple(sorted(x.linear)),
@@ -371,7 +370,7 @@ def _packed(x: object, name: str, arrays: dict[str, np.ndarray]) -> object:
     if isinstance(x, float) and not math.isfinite(x):
         return {"float": str(x)}
     if isinstance(x, np.generic) or not (x is None or isinstance(x, str | bool | int | float)):
-        raise TypeError(f"{name} is a {type(x).__name__}, which no file of a result has room for.")
+        raise TypeError(f"{name} is a {type(x).__name__}, which cannot be saved in the file of a result.")
     return x
 
 
