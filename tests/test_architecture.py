@@ -29,7 +29,7 @@ APPLICATIONS = {
     "export": 1150,
     "problems": 3000,
     "plot": 1650,
-    "cli": 3400,
+    "cli": 3050,
 }
 LABORATORY = ("tests", "bench")
 ROOMS = (*CORE, *APPLICATIONS)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxmodsim.cli._logs import Channel, held_on
-from jaxmodsim.cli._read import AxisColumns, read_record
-from jaxmodsim.cli._units import given_units
+from jaxmodsim.cli._files import Channel
+from jaxmodsim.cli._records import AxisColumns, held_on, read_record
+from jaxmodsim.cli._units import parse_units
 
 from ..helpers.axis_records import GAIN
 
@@ -133,7 +133,7 @@ def test_clocks_are_brought_together_and_their_offset_is_reported(kind, tmp_path
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_clock_that_is_wrong_shows(kind, tmp_path):
     path, names = FORMATS[kind](tmp_path, FORCE, TU + 0.1 - EARLY)
-    read = read_record(path, AxisColumns("t", names["position"], names["force"], given_units([])))
+    read = read_record(path, AxisColumns("t", names["position"], names["force"], parse_units([])))
     assert offset_of(read.notes[0]) == pytest.approx(1e3 * (EARLY - 0.1), abs=0.1)
 
 

@@ -11,8 +11,7 @@ import pandas as pd
 from .._core.arguments import nearest
 from .._core.units import axis_unit
 from ..identify import Record, clock_offset, sampling_gaps, unexplained_force
-from ._files import Columns, read_columns
-from ._logs import Channel, held_on
+from ._files import Channel, Columns, read_columns
 from ._units import Unit, column_unit, split_header
 
 # What --drop may name.
@@ -161,6 +160,18 @@ def _on_one_clock(table: Columns, path: Path, columns: AxisColumns) -> tuple[Col
         f"{path.name}: {headers[1]!r} is resampled to the times of {headers[0]!r}. As the motion shows, the clock of"
         f" the force is {1e3 * abs(offset):.2f} ms {'early' if offset >= 0 else 'late'} against that of the position."
     ]
+
+
+def held_on(force: Channel, t: np.ndarray) -> np.ndarray:
+    """Values that are held from sample to sample as their means over the intervals from each time of `t` to the next.
+
+    Its integral over time stays what it is, whichever of the two clocks is faster.
+    """
+    end = max(float(t[-1]), float(force.t[-1])) + 1.0
+    edges = np.append(force.t, end)
+    integral = np.concatenate([[0.0], np.cumsum(np.diff(edges) * force.values)])
+    ends = np.append(t, 2 * t[-1] - t[-2] if t.size > 1 else end)
+    return np.diff(np.interp(ends, edges, integral)) / np.diff(ends)
 
 
 def _header(table: Columns, path: Path, role: str, wanted: str) -> str:
