@@ -256,7 +256,7 @@ def test_records_of_one_name_are_told_apart_by_their_folders(tmp_path):
         path.parent.mkdir()
         axis_frame().to_csv(path, index=False)
     assert [record.parts[0].name for record in read_records(paths, NAMES)] == ["a/run.csv", "b/run.csv"]
-    with pytest.raises(ValueError, match=r"run\.csv is given twice"):
+    with pytest.raises(ValueError, match=r"run\.csv is listed twice"):
         read_records([paths[0], tmp_path / "b" / ".." / "a" / "run.csv"], NAMES)
 
 
@@ -396,8 +396,11 @@ def test_wrong_options_are_one_sentence_and_exit_code_two(run_command, files, tm
         ("", "no CSV file with a header line"),
         ("time,pos,volt\n0,1,2\n1,x,2\n", "'pos' holds 'x' in sample 1"),
         ("time,pos,volt\n0,1,2\n1,,2\n", "'pos' has 1 values that are not finite, the first in sample 1.*--drop nan"),
-        ("time,pos,volt\n0,1,2\n0,1,2\n1,1,2\n", "'time' has 1 samples at the time of the one before: 1. The times"),
-        ("time,pos,volt\n" + "".join(f"{max(k, 1)},1,2\n" for k in range(9)), "before: 1. Leave .*--drop repeated"),
+        (
+            "time,pos,volt\n0,1,2\n0,1,2\n1,1,2\n",
+            "'time' has 1 samples with the time of the sample before: 1. Their times",
+        ),
+        ("time,pos,volt\n" + "".join(f"{max(k, 1)},1,2\n" for k in range(9)), "before: 1. Omit .*--drop repeated"),
         ("time,pos,volt\n1,1,2\n2,1,2\n0,1,2\n", "'time' goes back 1 times, first from 2 s to 0 s in sample 2"),
         ("1,1,2\n2,1,2\n0,1,2\n", "no CSV file with a header line: the first line holds numbers"),
         ("time [s],phi_deg,volt [mA]\n0,1,2\n1,1,3\n", "no column 'pos' .*has: time .s., phi_deg"),
@@ -436,8 +439,8 @@ def test_matlab_vectors_of_other_lengths_and_folders_are_refused(run_command, fi
     check_refusal(run_command, out, "no column 'pos' .*it has: time, volt", str(path), *COLUMNS)
     check_refusal(run_command, out, "is a folder; a file is needed", str(tmp_path))
     check_refusal(run_command, out, "There is no file", str(tmp_path / "none.csv"))
-    check_refusal(run_command, out, "is given twice", files[0], files[0], *COLUMNS)
-    check_refusal(run_command, out, "is given twice", files[0], "--held-out", files[0], *COLUMNS)
+    check_refusal(run_command, out, "is listed twice", files[0], files[0], *COLUMNS)
+    check_refusal(run_command, out, "is listed twice", files[0], "--held-out", files[0], *COLUMNS)
     code, _, errors = run_command("fit", files[0], *COLUMNS, "--out", files[0])
     assert code == 2
     assert "is a file; a folder is needed" in errors

@@ -74,8 +74,8 @@ def test_these_are_fitted_right(run_command, tmp_path, name):
 
 
 NAMED = {
-    "milliseconds": (changed(time=1e3 * (T - 10.0), pos=1e3 * Q), FORCE, "so: --units time=ms,position=mm."),
-    "velocity": (changed(pos=VELOCITY), FORCE, "'pos' as with a velocity, not as with a position"),
+    "milliseconds": (changed(time=1e3 * (T - 10.0), pos=1e3 * Q), FORCE, "use --units time=ms,position=mm."),
+    "velocity": (changed(pos=VELOCITY), FORCE, "'pos' as on a velocity, not as on a position"),
     "drive signal": (FRAME, (), "'volt' is read as a force in SI units. If it is a drive signal"),
     "early force": (changed(volt=np.roll(U, -6)), FORCE, r"'volt' comes 15 ms too early"),
     "late force": (changed(volt=np.roll(U, 6)), FORCE, r"'volt' comes 15 ms too late"),
@@ -152,9 +152,7 @@ def test_a_record_is_cut_where_samples_are_missing(tmp_path):
     assert read.parts[0].t[-1] < 11
     assert read.parts[1].t[0] > 11.5
     (note,) = read.notes
-    assert note.startswith(
-        "run: samples are missing from 10.9975 to 11.5025 s; the parts between are fitted as 2 records"
-    )
+    assert note.startswith("run: samples are missing from 10.9975 to 11.5025 s; the parts are fitted as 2 records")
     # Times that jitter, or differ throughout, are no gaps.
     for steps in (1.0 + RANDOM.random(99), RANDOM.exponential(size=99)):
         assert not sampling_gaps(Record(np.cumsum(steps), steps, {"u": steps}))
@@ -166,11 +164,11 @@ def test_samples_without_values_or_of_no_new_time_are_left_out(tmp_path):
     hollow.loc[[33], "volt"] = np.inf
     read = read_record(written(tmp_path, hollow), names(f"force={GAIN}", "nan"))
     assert len(read.parts[0].t) == len(FRAME) - 3
-    assert read.notes == ("run.csv: 3 samples with values that are not finite are left out.",)
+    assert read.notes == ("run.csv: 3 samples with values that are not finite are omitted.",)
     twice = pd.concat([FRAME.iloc[:100], FRAME.iloc[99:]])
     read = read_record(written(tmp_path, twice), names(f"force={GAIN}", "nan", "repeated"))
     np.testing.assert_array_equal(read.parts[0].t, T)
-    assert read.notes == ("run.csv: 1 samples at the time of the one before are left out.",)
+    assert read.notes == ("run.csv: 1 samples with the time of the sample before are omitted.",)
 
 
 def test_dates_are_times(tmp_path):
