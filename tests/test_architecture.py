@@ -25,7 +25,7 @@ APPLICATIONS = {
     "analysis": 2050,
     "orbits": 3300,
     "identify": 9600,
-    "sweeps": 2500,
+    "sweeps": 2150,
     "export": 1150,
     "problems": 3000,
     "plot": 1650,

@@ -1,4 +1,4 @@
-"""One line of text that says how far something has come: the same in a terminal, a notebook and a command."""
+"""A line of text that reports progress in a terminal, a notebook or a file."""
 
 import shutil
 import sys
@@ -10,21 +10,21 @@ from typing import ParamSpec
 
 P = ParamSpec("P")
 
-# The line is written again after so many seconds, for the time in it.
-_EVERY = 1.0
+# Seconds between two updates of the time in the line, and between two lines in a file or pipe.
+_EVERY, _EVERY_IN_FILE = 1.0, 20.0
 
 
 @contextmanager
 def reported(
     progress: bool | Callable[P, None], title: str, words: Callable[P, str]
 ) -> Iterator[Callable[P, None] | None]:
-    """What is called as something goes on: a function that was given, one that shows a line, or None.
+    """The function to call with reports of progress: the user's own, one that shows a line, or None.
 
     **Arguments:**
 
-    - `progress`: what the user gave: a function, True for the line, False for nothing.
-    - `title`: begins the line.
-    - `words`: text of the line from what a function would be called with.
+    - `progress`: the user's choice: a function, True for the line, False for nothing.
+    - `title`: first part of the line.
+    - `words`: converts a report to the text of the line.
 
     **Raises:**
 
@@ -34,7 +34,7 @@ def reported(
         yield progress
     elif progress is True:
         with progress_line(title) as show:
-            yield lambda *given, **named: show(words(*given, **named))
+            yield lambda *report, **named: show(words(*report, **named))
     elif progress is False:
         yield None
     else:
@@ -43,40 +43,38 @@ def reported(
 
 @contextmanager
 def progress_line(title: str, text: str = "compiling") -> Iterator[Callable[[str], None]]:
-    """A line on standard output with the time since its begin; yields what changes its text.
+    """A line with a title, the elapsed time and a text; yields the function that changes the text.
 
-    In a terminal and in a notebook the line is written over itself; its last text stays, or nothing where there never
-    was another than the first. Elsewhere, in a file or pipe, only the last text is written, to standard error.
+    In a terminal or a notebook, the line on standard output overwrites itself. Its last text remains, or nothing if the
+    text never changed. In a file or pipe, standard error gets a line every 20 s, and the last text.
 
     **Arguments:**
 
-    - `title`: begins the line.
-    - `text`: follows, until there is something to report.
+    - `title`: first part of the line.
+    - `text`: text before the first report.
     """
     line = _StatusLine(title, text)
     thread = threading.Thread(target=line.keep_time, daemon=True)
-    if line.rewritten:
-        thread.start()
+    thread.start()
     try:
         yield line.show
     finally:
         line.closed.set()
-        if line.rewritten:
-            thread.join()
+        thread.join()
         line.close()
 
 
 class _StatusLine:
-    """A line on a stream, and what is written of it."""
+    """The state of a progress line and its stream."""
 
     def __init__(self, title: str, text: str) -> None:
         self.title, self.text, self.changed = title, text, False
         self.began, self.written = time.perf_counter(), 0
         self.stream, self.closed, self.lock = sys.stdout, threading.Event(), threading.Lock()
         self.terminal = self.stream.isatty()
-        # Notebooks obey a carriage return, too.
+        # Notebooks support a carriage return, too.
         self.rewritten = self.terminal or type(self.stream).__module__.startswith("ipykernel")
-        if not self.rewritten:  # where output goes to a file or another program, it is the result alone
+        if not self.rewritten:  # in a file or pipe, standard output holds the result alone
             self.stream = sys.stderr
 
     def show(self, text: str) -> None:
@@ -86,51 +84,49 @@ class _StatusLine:
             self.write()
 
     def keep_time(self) -> None:
-        """Write the line again and again, until it is closed."""
-        self.write()
-        while not self.closed.wait(_EVERY):
+        """Write the line at regular intervals until it is closed."""
+        if self.rewritten:
+            self.write()
+        while not self.closed.wait(_EVERY if self.rewritten else _EVERY_IN_FILE):
             self.write()
 
     def write(self) -> None:
-        """Write the line over itself."""
+        """Overwrite the line, or add one to a file."""
         with self.lock:
             text = self.whole()
-            if self.terminal:  # a line that is broken in two cannot be written over
+            if self.terminal:  # a wrapped line cannot be overwritten
                 text = text[: shutil.get_terminal_size().columns - 1]
-            self.stream.write(f"\r{text.ljust(self.written)}")
+            self.stream.write(f"\r{text.ljust(self.written)}" if self.rewritten else f"{text}\n")
             self.stream.flush()
             self.written = len(text)
 
     def close(self) -> None:
-        """Leave the last text."""
-        if not self.rewritten:
-            self.stream.write(f"{self.whole()}\n" if self.changed else "")
-        elif self.changed:
+        """Write the last text, or erase a line that never changed."""
+        if self.changed:
             self.write()
-            self.stream.write("\n")
-        else:
-            self.stream.write(f"\r{' ' * self.written}\r")
+        if self.rewritten:
+            self.stream.write("\n" if self.changed else f"\r{' ' * self.written}\r")
         self.stream.flush()
 
     def whole(self) -> str:
-        """Title, the time since the begin, text."""
+        """Title, elapsed time and text."""
         return f"{self.title} {minutes(time.perf_counter() - self.began)}: {self.text}"
 
 
 def minutes(seconds: float) -> str:
-    """A time as 0:07 or 1:02:03."""
+    """A duration as 0:07 or 1:02:03."""
     whole = round(seconds)
     hours = f"{whole // 3600}:{whole // 60 % 60:02d}" if whole >= 3600 else f"{whole // 60}"
     return f"{hours}:{whole % 60:02d}"
 
 
 def iteration_words(number: int, rmse: float, values: Mapping[str, float] | None = None) -> str:
-    """An iteration of a fit: its number, the RMSE, the parameters."""
+    """An iteration of a fit: number, RMSE and parameters."""
     numbers = {"RMSE": rmse, **(values or {})}
     return f"iteration {number}: " + ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
 
 
 def candidate_words(name: str, fold: int | None, number: int, rmse: float) -> str:
-    """An iteration of a fit of one model among several."""
+    """An iteration of a fit in a comparison of models."""
     held = "" if fold is None else f", fold {fold + 1} held back"
     return f"{name}{held}, {iteration_words(number, rmse)}"

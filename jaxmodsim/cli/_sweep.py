@@ -15,7 +15,7 @@ import numpy as np
 from .._core.progress import progress_line
 from .._core.speed import tune_cpu
 from ..plot import map2d
-from ..sweeps import SweepPlan, SweepProgress, SweepWords, plan_sweep, sweep
+from ..sweeps import SweepPlan, SweepProgress, SweepProgressText, plan_sweep, sweep
 from ._options import Interrupted, SweepRequest
 from ._output import frame_of, say, show_paths, show_table, write
 from ._spec import SweepSpec, read_sweep_spec
@@ -66,7 +66,7 @@ def _run(request: SweepRequest, spec: SweepSpec) -> None:
     with _executor(request) as executor:
         try:
             with progress_line("sweep") as show:
-                words = SweepWords()
+                words = SweepProgressText()
 
                 def report(now: SweepProgress) -> None:
                     reports.append(now)

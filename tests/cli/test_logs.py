@@ -139,7 +139,7 @@ def test_a_clock_that_is_wrong_shows(kind, tmp_path):
 
 def offset_of(note: str) -> float:
     """Milliseconds by which the note calls the force early."""
-    match = re.search(r"clock of the force is ([\d.]+) ms (early|late) against", note)
+    match = re.search(r"clock of the force is ([\d.]+) ms (early|late) relative", note)
     assert match is not None, note
     return float(match[1]) * (1 if match[2] == "early" else -1)
 

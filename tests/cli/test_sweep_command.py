@@ -157,7 +157,7 @@ def test_ctrl_c_says_what_is_kept_and_the_same_command_goes_on(
 
     command = ("sweep", spec(ROOT), "--out", str(tmp_path / "root.zarr"), "--chunk", "3")
     with monkeypatch.context() as patch:
-        patch.setattr(_sweep, "SweepWords", lambda: interrupting)
+        patch.setattr(_sweep, "SweepProgressText", lambda: interrupting)
         code, _, errors = run_command(*command)
     assert code == 130
     assert "6 of 30 runs are stored in" in errors
@@ -229,7 +229,7 @@ def each_mistake() -> Iterator[tuple[str, str, str, str]]:
     yield "count", "count = 11", "count = 11.5", r"\[run.ts\]: count must be a whole number > 0, but 11.5"
     yield "no end", "t1 = 0.5\n", "", "needs t1"
     yield "zipped", "k = [50, 80, 120]", "k = 50", r"\[over.pair\]: k must be a list"
-    yield "unequal", "k = [50, 80, 120]", "k = [50]", "equally many"
+    yield "unequal", "k = [50, 80, 120]", "k = [50]", "must have the same length"
     yield "axis", "[0.0, 0.1]", "0.1", r"\[over\]: qd0\[0\] must be a list or a table, but 0.1"
     yield "spacing", "[0.0, 0.1]", '{from = 0, to = 1, count = 3, spacing = "lin"}', "linear, log, but 'lin'"
     yield "log", "[0.0, 0.1]", '{from = 0, to = 1, count = 3, spacing = "log"}', r'\[over."qd0\[0\]"\]: from and to'
@@ -265,8 +265,8 @@ def each_mistake_with_a_file() -> Iterator[tuple[str, str, str, str]]:
     yield "file", '"model.py"', '"models.py"', "models.py' is missing"
     yield "broken", '"model.py"', '"broken.py"', "running broken.py failed with ZeroDivisionError"
     yield "key", "[over]", "m = 1\n[over]", "no key 'm'; the keys are problem, file, object"
-    yield "run", "[over]", "[run]\nt1 = 1\n[over]", "t1 has no place beside a function"
-    yield "arguments", "a = {", "c = {", r"over must name what the function takes, \(a, b\), but it names c, b"
+    yield "run", "[over]", "[run]\nt1 = 1\n[over]", "a function takes no t1"
+    yield "arguments", "a = {", "c = {", r"over must name the arguments of the function, \(a, b\), but it names c, b"
     yield "failing", '"root"', '"fails"', r"model.py, line \d+: ZeroDivisionError: division by zero"
 
 
