@@ -26,7 +26,7 @@ APPLICATIONS = {
     "orbits": 3300,
     "identify": 9600,
     "sweeps": 2150,
-    "export": 1150,
+    "export": 1100,
     "problems": 3000,
     "plot": 1650,
     "cli": 3050,
