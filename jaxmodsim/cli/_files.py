@@ -54,7 +54,7 @@ def read_columns(path: Path) -> Columns:
     except ImportError as error:
         raise ValueError(str(error)) from error
     except Exception as error:  # the readers raise anything for damaged files
-        raise ValueError(f"{path} is damaged or no {ending} file: {_one_line(error)}") from error
+        raise ValueError(f"{path} is damaged or not a {ending} file: {_one_line(error)}") from error
 
 
 def _csv(path: Path) -> Columns:
@@ -63,17 +63,17 @@ def _csv(path: Path) -> Columns:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         if b"\x00" in raw:
-            raise ValueError(f"{path} is no CSV file with a header line: {_one_line(error)}") from error
+            raise ValueError(f"{path} is not a CSV file with a header line: {_one_line(error)}") from error
         text = raw.decode("latin-1")  # the usual encoding of degree and micro signs
     separator, decimal = _separators(text[:_HEAD_BYTES])
     try:
         frame = pd.read_csv(io.StringIO(text), sep=separator, decimal=decimal, skipinitialspace=True)
     except (ValueError, pd.errors.ParserError) as error:
-        raise ValueError(f"{path} is no CSV file with a header line: {_one_line(error)}") from error
+        raise ValueError(f"{path} is not a CSV file with a header line: {_one_line(error)}") from error
     names = [str(name).strip() for name in frame.columns]
     if names and all(_POINT_NUMBER.fullmatch(name) for name in names):
         raise ValueError(
-            f"{path} is no CSV file with a header line: the first line holds numbers. Add the names of the columns"
+            f"{path} is not a CSV file with a header line: the first line holds numbers. Add the names of the columns"
             " above them."
         )
     return {name: frame.iloc[:, i] for i, name in enumerate(names)}
@@ -104,7 +104,7 @@ def _mat(path: Path) -> Columns:
     if reading.returncode != 0:
         last = reading.stderr.decode(errors="replace").strip().splitlines()[-1:]
         why = " ".join(last) if reading.returncode > 0 else "the reader crashes"
-        raise ValueError(f"{path} is damaged or no MATLAB file: {why}")
+        raise ValueError(f"{path} is damaged or not a MATLAB file: {why}")
     with np.load(io.BytesIO(reading.stdout), allow_pickle=False) as arrays:
         # MATLAB has no vectors, only matrices with a single row or column.
         vectors = {name[1:]: np.ravel(x) for name, x in arrays.items() if x.size == max(x.shape, default=0)}

@@ -198,7 +198,9 @@ def _numbers(table: Columns, path: Path, header: str) -> np.ndarray:
     if pd.api.types.is_datetime64_any_dtype(column):
         return (column - column.iloc[0]).dt.total_seconds().to_numpy(float)
     bad = int(np.argmax(np.isnan(np.asarray(pd.to_numeric(column, errors="coerce"), float))))
-    raise ValueError(f"{path.name}: column {header!r} holds {column.iloc[bad]!r} in sample {bad}, which is no number.")
+    raise ValueError(
+        f"{path.name}: column {header!r} holds {column.iloc[bad]!r} in sample {bad}, which is not a number."
+    )
 
 
 def _rotary(path: Path, headers: Mapping[str, str], units: Mapping[str, Unit]) -> bool | None:

@@ -49,7 +49,7 @@ def to_modelica(
     **Raises:**
 
     - `ValueError` if the component does not support the law, with the reason and the remedy; for a law by `scaled_by`;
-      if a number is out of range or the name is no identifier.
+      if a number is out of range or the name is not an identifier.
     """
     if not isinstance(law, AbstractLaw):
         raise ValueError(f"to_modelica needs a law, but {law!r} was given.")

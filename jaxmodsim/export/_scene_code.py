@@ -127,7 +127,7 @@ def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
     **Raises:**
 
     - `ValueError` for an unsupported operation of JAX, a loop without a bound, a friction element that
-      `ImplicitFriction` does not support, a constraint, a `Signal`, and a name that is no identifier.
+      `ImplicitFriction` does not support, a constraint, a `Signal`, and a name that is not an identifier.
     """
     return _scene_code(scene, dof, name, C, "to_c")
 

@@ -90,8 +90,8 @@ def grid(over: object) -> Grid:
 
 def _axis(name: object, entry: Any) -> GridAxis:
     if not isinstance(name, str):
-        raise ValueError(f"over must map names to values, but {name!r} is no name.")
-    # A DataFrame is no Mapping, but has the same interface.
+        raise ValueError(f"over must map names to values, but {name!r} is not a name.")
+    # A DataFrame is not a Mapping, but has the same interface.
     zipped = isinstance(entry, Mapping) or hasattr(entry, "columns")
     values = {each: _numbers(each, entry[each]) for each in entry} if zipped else {name: _numbers(name, entry)}
     if not values:
@@ -107,7 +107,7 @@ def _axis(name: object, entry: Any) -> GridAxis:
 
 def _numbers(name: object, entry: object) -> np.ndarray:
     if not isinstance(name, str):
-        raise ValueError(f"over must map names to values, but {name!r} is no name.")
+        raise ValueError(f"over must map names to values, but {name!r} is not a name.")
     try:
         values = np.asarray(entry)
     except ValueError as error:

@@ -9,7 +9,7 @@ from ._compute import Work, compute, runs_per_call
 from ._grid import Grid
 from ._run import CAP, out_of_steps
 
-# The trial has at most one in so many of the runs.
+# The trial has at most 1/16 of the runs.
 _SHARE = 16
 # Factor by which the cap of the trial grows.
 _GROWTH = 8

@@ -308,7 +308,7 @@ def _check_same(path: Path, provenance: dict[str, object]) -> None:
         then = json.loads(extra("zarr").open_group(path, mode="r").attrs[_ATTRIBUTE])
     except (KeyError, ValueError, OSError, TypeError) as error:
         raise ValueError(
-            f"{path} exists and is no store of a sweep ({type(error).__name__}): use another folder, or remove it."
+            f"{path} exists and is not a store of a sweep ({type(error).__name__}): use another folder, or remove it."
         ) from error
     changes = _differences(then, provenance)
     if changes:

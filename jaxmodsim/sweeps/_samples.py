@@ -64,7 +64,7 @@ def sobol(ranges: Mapping[str, Span], count: int, *, seed: int = 0) -> dict[str,
 
     **Raises:**
 
-    - `ValueError` for a wrong range, with its name, and a count that is no power of two.
+    - `ValueError` for a wrong range, with its name, and a count that is not a power of two.
     """
     check_ranges(ranges)
     check_power(count)

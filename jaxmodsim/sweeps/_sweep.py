@@ -227,7 +227,7 @@ def _runs_per_block(request: Request, platform: str, chunk: int | None) -> int:
 
     **Raises:**
 
-    - `ValueError` if `chunk` is no positive integer.
+    - `ValueError` if `chunk` is not a positive integer.
     """
     if chunk is not None:
         return as_whole(chunk, name="chunk")

@@ -393,7 +393,7 @@ def test_wrong_options_are_one_sentence_and_exit_code_two(run_command, files, tm
 @pytest.mark.parametrize(
     ("content", "text"),
     [
-        ("", "no CSV file with a header line"),
+        ("", "not a CSV file with a header line"),
         ("time,pos,volt\n0,1,2\n1,x,2\n", "'pos' holds 'x' in sample 1"),
         ("time,pos,volt\n0,1,2\n1,,2\n", "'pos' has 1 values that are not finite, the first in sample 1.*--drop nan"),
         (
@@ -402,7 +402,7 @@ def test_wrong_options_are_one_sentence_and_exit_code_two(run_command, files, tm
         ),
         ("time,pos,volt\n" + "".join(f"{max(k, 1)},1,2\n" for k in range(9)), "before: 1. Omit .*--drop repeated"),
         ("time,pos,volt\n1,1,2\n2,1,2\n0,1,2\n", "'time' goes back 1 times, first from 2 s to 0 s in sample 2"),
-        ("1,1,2\n2,1,2\n0,1,2\n", "no CSV file with a header line: the first line holds numbers"),
+        ("1,1,2\n2,1,2\n0,1,2\n", "not a CSV file with a header line: the first line holds numbers"),
         ("time [s],phi_deg,volt [mA]\n0,1,2\n1,1,3\n", "no column 'pos' .*has: time .s., phi_deg"),
         ("time,pos,volt\n0,1,2\n", "two samples or more"),
         ("time,pos,volt\n0,1,2\n.01,1,2\n.02,1,3\n", "the position never changes"),
@@ -417,10 +417,10 @@ def test_bad_tables_are_one_sentence_and_exit_code_two(run_command, tmp_path, co
 @pytest.mark.parametrize(
     ("name", "content", "text"),
     [
-        ("a.parquet", b"PAR1 and no more", "damaged or no .parquet file"),
-        ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(105) + b"\x00\x01IM" + bytes(7), "damaged or no MATLAB file"),
+        ("a.parquet", b"PAR1 and no more", "damaged or not a .parquet file"),
+        ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(105) + b"\x00\x01IM" + bytes(7), "damaged or not a MATLAB file"),
         ("a.mat", b"MATLAB 7.3 MAT-file" + b" " * 105 + b"\x00\x02IM" + bytes(800), "MATLAB 7.3 .*'-v7'"),
-        ("a.csv", b"\xff\xfe\x00\x80", "no CSV file"),
+        ("a.csv", b"\xff\xfe\x00\x80", "not a CSV file"),
         ("a.xlsx", b"PK", "must be one of .csv, .txt, .parquet, .mat, .mf4"),
         ("axis", b"", "must be one of"),
     ],

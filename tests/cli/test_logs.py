@@ -174,5 +174,5 @@ def test_what_is_missing_to_read_them_is_named(ending, module, extra, tmp_path, 
 def test_damaged_logs_are_refused(ending, module, tmp_path):
     pytest.importorskip(module)
     (tmp_path / f"run{ending}").write_bytes(b"no such thing" * 20)
-    with pytest.raises(ValueError, match=rf"run{ending} is damaged or no {ending} file"):
+    with pytest.raises(ValueError, match=rf"run{ending} is damaged or not a {ending} file"):
         read_record(tmp_path / f"run{ending}", AxisColumns("t", "q", "u", {}))

@@ -210,7 +210,7 @@ def test_problems_and_laws_that_a_spec_may_name() -> None:
 
 def each_mistake() -> Iterator[tuple[str, str, str, str]]:
     """What is replaced in a SPEC by what, and what the error says."""
-    yield "no toml", 'problem = "belt_oscillator"', "problem =", "spec.toml is no TOML: .*line 3"
+    yield "no toml", 'problem = "belt_oscillator"', "problem =", "spec.toml is not TOML: .*line 3"
     yield "table", "[observe]", "[observed]", "no key 'observed'; the keys are .*Did you mean 'observe'"
     yield "no scene", "[scene]", "[observe.scene]", "scene is missing"
     yield "problem", '"belt_oscillator"', '"belt"', r"\[scene\]: problem must be one of.*'belt' was given"

@@ -157,7 +157,7 @@ def test_a_record_that_would_end_the_process_that_reads_it(tmp_path: Path) -> No
     spoilt = bytearray(path.read_bytes())
     spoilt[176] ^= 0xFF
     path.write_bytes(spoilt)
-    with pytest.raises(ValueError, match=r"record.mat is damaged or no MATLAB file: reading it ends the process"):
+    with pytest.raises(ValueError, match=r"record.mat is damaged or not a MATLAB file: the reader crashes"):
         _records.read_record(path, _records.AxisColumns("t", "q", "u", {}))
 
 
