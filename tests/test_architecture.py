@@ -25,11 +25,11 @@ APPLICATIONS = {
     "analysis": 2000,
     "orbits": 3100,
     "identify": 9600,
-    "sweeps": 2500,
-    "export": 1150,
-    "problems": 2650,
-    "plot": 1600,
-    "cli": 3400,
+    "sweeps": 2150,
+    "export": 1100,
+    "problems": 3000,
+    "plot": 1650,
+    "cli": 3050,
 }
 LABORATORY = ("tests", "bench")
 ROOMS = (*CORE, *APPLICATIONS)

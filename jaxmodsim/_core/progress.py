@@ -1,4 +1,4 @@
-"""A line that reports progress in a terminal, a notebook or a command."""
+"""A line of text that reports progress in a terminal, a notebook or a file."""
 
 import shutil
 import sys
@@ -10,21 +10,21 @@ from typing import ParamSpec
 
 P = ParamSpec("P")
 
-# Interval of updates, which show the elapsed time [s].
-_EVERY = 1.0
+# Seconds between two updates of the time in the line, and between two lines in a file or pipe.
+_EVERY, _EVERY_IN_FILE = 1.0, 20.0
 
 
 @contextmanager
 def reported(
     progress: bool | Callable[P, None], title: str, text_of: Callable[P, str]
 ) -> Iterator[Callable[P, None] | None]:
-    """The callback of an argument `progress`: a function of the user, one that shows a line, or None.
+    """The function to call with reports of progress: the user's own, one that shows a line, or None.
 
     **Arguments:**
 
-    - `progress`: a function, True for the line, or False for no report.
-    - `title`: start of the line.
-    - `text_of`: text of the line from the arguments of the callback.
+    - `progress`: the user's choice: a function, True for the line, False for nothing.
+    - `title`: first part of the line.
+    - `text_of`: converts a report to the text of the line.
 
     **Raises:**
 
@@ -34,7 +34,7 @@ def reported(
         yield progress
     elif progress is True:
         with progress_line(title) as show:
-            yield lambda *args, **kwargs: show(text_of(*args, **kwargs))
+            yield lambda *report, **named: show(text_of(*report, **named))
     elif progress is False:
         yield None
     else:
@@ -43,40 +43,38 @@ def reported(
 
 @contextmanager
 def progress_line(title: str, text: str = "compiling") -> Iterator[Callable[[str], None]]:
-    """Show a line on standard output with the elapsed time; yield the function that changes its text.
+    """A line with a title, the elapsed time and a text; yields the function that changes the text.
 
-    In a terminal and in a notebook the line overwrites itself; the last text remains, unless it is the initial text. In
-    a file or pipe only the last text appears, on standard error.
+    In a terminal or a notebook, the line on standard output overwrites itself. Its last text remains, or nothing if the
+    text never changed. In a file or pipe, standard error gets a line every 20 s, and the last text.
 
     **Arguments:**
 
-    - `title`: start of the line.
-    - `text`: initial text.
+    - `title`: first part of the line.
+    - `text`: text before the first report.
     """
     line = _StatusLine(title, text)
     thread = threading.Thread(target=line.keep_time, daemon=True)
-    if line.rewritten:
-        thread.start()
+    thread.start()
     try:
         yield line.show
     finally:
         line.closed.set()
-        if line.rewritten:
-            thread.join()
+        thread.join()
         line.close()
 
 
 class _StatusLine:
-    """A line on a stream."""
+    """The state of a progress line and its stream."""
 
     def __init__(self, title: str, text: str) -> None:
         self.title, self.text, self.changed = title, text, False
         self.began, self.written = time.perf_counter(), 0
         self.stream, self.closed, self.lock = sys.stdout, threading.Event(), threading.Lock()
         self.terminal = self.stream.isatty()
-        # Notebooks also support carriage returns.
+        # Notebooks support a carriage return, too.
         self.rewritten = self.terminal or type(self.stream).__module__.startswith("ipykernel")
-        if not self.rewritten:  # a file or another program receives only the result
+        if not self.rewritten:  # in a file or pipe, standard output holds the result alone
             self.stream = sys.stderr
 
     def show(self, text: str) -> None:
@@ -86,30 +84,28 @@ class _StatusLine:
             self.write()
 
     def keep_time(self) -> None:
-        """Update the line until it is closed."""
-        self.write()
-        while not self.closed.wait(_EVERY):
+        """Write the line at regular intervals until it is closed."""
+        if self.rewritten:
+            self.write()
+        while not self.closed.wait(_EVERY if self.rewritten else _EVERY_IN_FILE):
             self.write()
 
     def write(self) -> None:
-        """Overwrite the line."""
+        """Overwrite the line, or add one to a file."""
         with self.lock:
             text = self.whole()
             if self.terminal:  # a wrapped line cannot be overwritten
                 text = text[: shutil.get_terminal_size().columns - 1]
-            self.stream.write(f"\r{text.ljust(self.written)}")
+            self.stream.write(f"\r{text.ljust(self.written)}" if self.rewritten else f"{text}\n")
             self.stream.flush()
             self.written = len(text)
 
     def close(self) -> None:
-        """Write the last text, or clear the initial one."""
-        if not self.rewritten:
-            self.stream.write(f"{self.whole()}\n" if self.changed else "")
-        elif self.changed:
+        """Write the last text, or erase a line that never changed."""
+        if self.changed:
             self.write()
-            self.stream.write("\n")
-        else:
-            self.stream.write(f"\r{' ' * self.written}\r")
+        if self.rewritten:
+            self.stream.write("\n" if self.changed else f"\r{' ' * self.written}\r")
         self.stream.flush()
 
     def whole(self) -> str:
@@ -118,19 +114,19 @@ class _StatusLine:
 
 
 def minutes(seconds: float) -> str:
-    """A time such as 0:07 or 1:02:03."""
+    """A duration as 0:07 or 1:02:03."""
     whole = round(seconds)
     hours = f"{whole // 3600}:{whole // 60 % 60:02d}" if whole >= 3600 else f"{whole // 60}"
     return f"{hours}:{whole % 60:02d}"
 
 
 def iteration_words(number: int, rmse: float, values: Mapping[str, float] | None = None) -> str:
-    """Text for an iteration of a fit: its number, the RMSE and the parameters."""
+    """An iteration of a fit: number, RMSE and parameters."""
     numbers = {"RMSE": rmse, **(values or {})}
     return f"iteration {number}: " + ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
 
 
 def candidate_words(name: str, fold: int | None, number: int, rmse: float) -> str:
-    """Text for an iteration of the fit of one model among several."""
+    """An iteration of a fit in a comparison of models."""
     held = "" if fold is None else f", fold {fold + 1} held out"
     return f"{name}{held}, {iteration_words(number, rmse)}"

@@ -5,21 +5,17 @@ import sys
 
 
 def main() -> None:
-    """Entry point; errors of the user's are one sentence and exit code 2."""
+    """Entry point; an error of the user is one sentence on stderr and exit code 2."""
     try:
-        import rich
-        import typer
+        from ._app import run
     except ImportError as error:
         sys.stderr.write(f"jaxmodsim: the command line needs {error.name}: pip install 'jaxmodsim[cli]'\n")
         sys.exit(2)
-    del rich, typer
-    from ._app import run
-
     try:
         run()
     except SystemExit as ending:
         if ending.code == 130:
-            # XLA may still be compiling what Ctrl-C interrupted, and crashes if the interpreter ends under it.
+            # After Ctrl-C XLA may still be compiling, and crashes if the interpreter ends meanwhile.
             sys.stdout.flush()
             sys.stderr.flush()
             os._exit(130)

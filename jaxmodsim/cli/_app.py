@@ -1,14 +1,14 @@
 """The commands. Everything heavy is imported inside them, so that --help and usage errors come at once."""
 
 import logging
+import subprocess
 import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from . import _options
-from ._options import Interrupted, Out
+from ._options import FitRequest, Interrupted, Out, SpecFile, SweepRequest, command_of
 
 app = typer.Typer(
     name="jaxmodsim",
@@ -20,7 +20,7 @@ app = typer.Typer(
 
 
 def run() -> None:
-    """Run the command line; an error that a user can mend is one sentence on stderr and exit code 2."""
+    """Run the command line; an error that a user can fix is one sentence on stderr and exit code 2."""
     try:
         app()
     except (ValueError, OSError, RuntimeError) as error:
@@ -30,27 +30,27 @@ def run() -> None:
         sys.stderr.write(f"jaxmodsim: {ending}\n")
         sys.exit(130)
     except SystemExit as ending:
-        if ending.code == 130:  # what typer makes of Ctrl-C
+        if ending.code == 130:  # from typer, on Ctrl-C
             sys.stderr.write("jaxmodsim: interrupted; nothing was written\n")
         raise
 
 
 def _start() -> None:
-    """An application may set what a library must not: double precision, XLA's treatment of small loops, a cache."""
+    """Set what an application may set and a library must not: double precision, XLA's flags, a compilation cache."""
     import jax
 
     from .._core.speed import tune_cpu
     from ._cache import use_cache
 
     tune_cpu()
-    logging.getLogger("jaxmodsim").setLevel(logging.ERROR)  # what takes time shows its progress
+    logging.getLogger("jaxmodsim").setLevel(logging.ERROR)  # long computations show a progress line
     jax.config.update("jax_enable_x64", True)
     use_cache()
 
 
 @app.command()
 def demo(out: Out = Path("jaxmodsim-demo")) -> None:
-    """The test bench, and a LuGre fit to a synthetic record whose truth is known."""
+    """Run the test bench, and fit LuGre to a synthetic record with known parameters."""
     _start()
     from ._demo import run_demo
 
@@ -59,107 +59,67 @@ def demo(out: Out = Path("jaxmodsim-demo")) -> None:
 
 @app.command("testbench")
 def bench_models(out: Out = Path("jaxmodsim-testbench")) -> None:
-    """A box under a rising force with one friction model after the other: figures, a table, a LuGre sweep."""
+    """Run a box under a rising force with each friction model: figures, a table, a LuGre sweep."""
     _start()
-    from ._report import report_testbench
+    from ._demo import report_testbench
 
     report_testbench(out)
 
 
 @app.command()
-def fit(
-    record: _options.Records,
-    time: _options.Time = "t",
-    position: _options.Position = "q",
-    force: _options.Force = "u",
-    units: _options.Units = None,
-    drop: _options.Drop = None,
-    laws: _options.Laws = "coulomb",
-    free: _options.Free = None,
-    start: _options.Start = None,
-    fix: _options.Fix = None,
-    limit: _options.Limit = None,
-    held_out: _options.HeldOut = None,
-    folds: _options.Folds = None,
-    loss: _options.Loss = "squares",
-    begin: _options.Begin = "rough",
-    starts: _options.Starts = 1,
-    max_steps: _options.MaxSteps = 400,
-    substeps: _options.Substeps = None,
-    out: Out = Path("jaxmodsim-fit"),
-    report: _options.Report = None,
-    next_input: _options.NextInput = None,
-    max_force: _options.MaxForce = None,
-    max_speed: _options.MaxSpeed = None,
-    max_travel: _options.MaxTravel = None,
-    duration: _options.Duration = None,
-) -> None:
+@command_of(FitRequest)
+def fit(request: FitRequest) -> None:
     """Fit mass, offset and friction of one axis to records of position and applied force, by open-loop simulation.
 
-    Ctrl-C ends the search; what it has found by then is written, and the exit code is 130.
+    Ctrl-C ends the search; its result so far is written, and the exit code is 130.
     """
     _start()
     from ._fit import run_fit
-    from ._plan import FitRequest
 
-    run_fit(
-        FitRequest(
-            record, (time, position, force), units or [], drop or [], laws, free or [], start or [], fix or [],
-            limit or [], held_out or [], folds, loss, begin, starts, max_steps, substeps, out, report, next_input,
-            max_force, max_speed, max_travel, duration,
-        )
-    )  # fmt: skip
+    run_fit(request)
 
 
 @app.command()
-def sweep(
-    spec: _options.Spec,
-    out: _options.Store = None,
-    figure: _options.FigureFile = None,
-    chunk: _options.Chunk = None,
-    workers: _options.Workers = None,
-    scheduler: _options.Scheduler = None,
-    dry_run: _options.DryRun = False,
-) -> None:
-    r"""Run a scene for many numbers, as a SPEC says, into a Zarr store; the same command goes on where one ended.
+@command_of(SweepRequest)
+def sweep(request: SweepRequest) -> None:
+    r"""Run a scene over ranges of its numbers into a Zarr store, as a SPEC says. The same command resumes a sweep.
 
-    SPEC is a TOML file of four tables; names with dots or brackets stand in
-    quotes.
+    SPEC is a TOML file of four tables; names with dots or brackets need quotes.
 
     \[scene] is problem = "belt_oscillator" (any of jaxmodsim.problems) with its
     numbers, and a table law with kind = "LuGre" and its numbers. Or it is
-    file = "model.py" and object = "scene", a Scene or a function of that file,
-    which is run: use only files that you trust.
+    file = "model.py" and object = "scene", a Scene or a function of that file.
+    The file is executed: use only files that you trust.
 
     \[run] has q0, qd0, t1; ts, a list or {start, stop, count}; t0, rtol, atol,
     dt, dtmax, max_steps, max_events, stick_on_chatter, project.
 
-    \[over] has an entry for each dimension, all combinations of which are run:
+    \[over] has an entry for each dimension; all combinations are run. It is
     a list; {from, to, count, spacing = "linear" or "log"}; a table of lists
     that change together; or {latin_hypercube = {m = \[1, 2],
     k = \[10, 1e4, "log"]}, count, seed}, or the same with sobol.
 
-    \[observe] has an entry for each thing to keep: "q\[0]", "qd\[0]", or the name
+    \[observe] has an entry for each result: "q\[0]", "qd\[0]", or the name
     of an effect for its force; or {of = "qd\[0]", take = "max", unit = "m/s"},
     where take is end, max, min, mean, rms, peak (the largest magnitude) or ptp
-    (from the lowest to the highest).
+    (the largest minus the smallest value).
     """
     _start()
-    from ._sweep import SweepRequest, run_sweep
+    from ._sweep import run_sweep
 
-    run_sweep(SweepRequest(spec, out, figure, chunk, workers, scheduler, dry_run))
+    run_sweep(request)
 
 
 @app.command()
-def orbit(spec: _options.Spec, out: Out = Path("jaxmodsim-orbit")) -> None:
+def orbit(spec: SpecFile, out: Out = Path("jaxmodsim-orbit")) -> None:
     r"""Find a periodic orbit, as a SPEC says: its period, extent, stability and modes.
 
     SPEC is a TOML file; \[scene] as for jaxmodsim sweep.
 
-    \[orbit] has q0 and qd0, from where a simulation settles for settle seconds.
-    A forced orbit has period, in seconds, or frequency, the name of the number
-    that is the angular frequency of the force; without, the period is found.
-    Also rtol, atol.
+    \[orbit] has q0 and qd0, the state from which a simulation settles for
+    settle seconds. A forced orbit has period, in seconds, or frequency, the
+    name of the number that is the angular frequency of the force. Without
+    both, the period is computed. Also rtol, atol.
     """
     _start()
     from ._orbits import run_orbit
@@ -168,13 +128,13 @@ def orbit(spec: _options.Spec, out: Out = Path("jaxmodsim-orbit")) -> None:
 
 
 @app.command()
-def branch(spec: _options.Spec, out: Out = Path("jaxmodsim-branch")) -> None:
-    r"""Follow a periodic orbit over a number, through folds, and name where it changes; goes on where one ended.
+def branch(spec: SpecFile, out: Out = Path("jaxmodsim-branch")) -> None:
+    r"""Continue a periodic orbit in a parameter, through folds, and locate bifurcations. The same command resumes it.
 
     SPEC is that of jaxmodsim orbit with one more table: \[branch] has parameter,
-    the name of the number, from and to; step, the longest step as a part of
-    that; max_orbits; start = "Hopf" for orbits from the first Hopf point of the
-    equilibria on, which are followed from q0.
+    the name of the number, from and to; step, the longest step as a fraction of
+    that range; max_orbits; start = "Hopf" for orbits from the first Hopf point
+    of the equilibria, which are continued from q0.
     """
     _start()
     from ._orbits import run_branch
@@ -186,30 +146,42 @@ def branch(spec: _options.Spec, out: Out = Path("jaxmodsim-branch")) -> None:
 def run_benches(
     arguments: Annotated[
         list[str] | None,
-        typer.Argument(metavar="NAME", help="Benches, such as a0, and options of python -m bench; all without."),
+        typer.Argument(metavar="NAME", help="Benches, such as a0, and options of python -m bench; by default all."),
     ] = None,
 ) -> None:
-    """Run the benches of a clone of the repository: what things cost and how near they come, measured side by side.
+    """Run the benches of a clone of the repository, which measure time and accuracy.
 
-    They are no part of the installed package: this is `python -m bench` in a clone, and takes its options --list,
-    --smoke, --jobs, --out and --jaxonomy.
+    The installed package has no benches: this runs `python -m bench` in the clone around the working directory, with
+    its options --list, --smoke, --jobs, --out and --jaxonomy.
     """
-    from ._bench import run_bench_suite
-
-    raise typer.Exit(run_bench_suite(arguments or []))
+    # The package's own clone comes last: in another clone, its benches are meant.
+    folders = dict.fromkeys([Path.cwd(), Path(__file__).resolve().parents[2]])
+    root = next((folder for folder in folders if (folder / "bench" / "__main__.py").is_file()), None)
+    if root is None:
+        raise ValueError(
+            f"there is no folder bench in {' or '.join(map(str, folders))}: benches are not installed with the package."
+            " Run this in a clone of the repository, installed by pip install -e '.[bench]'."
+        )
+    with subprocess.Popen([sys.executable, str(root / "bench"), *(arguments or [])]) as process:
+        while True:
+            try:
+                raise typer.Exit(process.wait())
+            except KeyboardInterrupt:  # the suite ends by itself
+                continue
 
 
 @app.command()
 def cache(
     clear: Annotated[bool, typer.Option("--clear", help="Delete them.")] = False,
     check: Annotated[
-        bool, typer.Option("--check", help="Run a scene in two processes: does the second one compile less?")
+        bool, typer.Option("--check", help="Run a scene in two processes and test that the second compiles less.")
     ] = False,
 ) -> None:
-    """Compiled programs that commands keep for the next ones: where, how many, how large.
+    """Report the compiled programs that commands keep on disk: folder, number and size.
 
     A command that runs again compiles nothing. JAX_COMPILATION_CACHE_DIR names another folder,
-    JAX_ENABLE_COMPILATION_CACHE=false turns it off. Exit code 1 if --check finds no program of the first process.
+    JAX_ENABLE_COMPILATION_CACHE=false disables the cache. The exit code is 1 if --check finds that the second process
+    used no program of the first.
     """
     from ._cache import check_cache, report_cache
 

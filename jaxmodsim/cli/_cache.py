@@ -1,4 +1,4 @@
-"""Compiled programs, kept from one command to the next by JAX's persistent compilation cache."""
+"""JAX's persistent compilation cache, which keeps compiled programs from one command to the next."""
 
 import os
 import subprocess
@@ -6,13 +6,12 @@ import sys
 from pathlib import Path
 
 import jax
-import pandas as pd
 
-from ._output import say, show_table
+from ._output import frame_of, say, show_table
 
 _SHORTEST = "jax_persistent_cache_min_compile_time_secs"
 
-# A first run, as a script makes it. JAX logs for each program whether it found it, and why it did not keep it.
+# A script with its first run. JAX logs for each program whether the cache has it, and why it does not store it.
 _FIRST_RUN = """
 import time
 began = time.perf_counter(), time.process_time()
@@ -30,13 +29,13 @@ jms.simulate(scene, [0.0], [0.0], 2.0)
 print(time.perf_counter() - began[0], time.process_time() - began[1])
 """
 _FOUND, _MISSING = "Persistent compilation cache hit", "PERSISTENT COMPILATION CACHE MISS"
-# What stands in the log of a run that found nothing, and what that means.
+# Causes of misses by texts in the log.
 _REASONS = {
-    "Loading XLA:CPU AOT result": "XLA rejects them: they name processor features that it does not find here. If they"
-    " come from another machine, delete them with jaxmodsim cache --clear. If not, XLA has a fault on this processor:"
-    " try another version of jaxlib.",
+    "Loading XLA:CPU AOT result": "XLA rejects them: they name processor features that this machine lacks. If they come"
+    " from another machine, delete them with jaxmodsim cache --clear. If not, XLA misreads this processor: try another"
+    " version of jaxlib.",
     "Error reading": "They cannot be read: delete them with jaxmodsim cache --clear.",
-    "Error writing": "They cannot be written: free space on the disk, or name another folder,"
+    "Error writing": "They cannot be written: free space on the disk, or name another folder by"
     " JAX_COMPILATION_CACHE_DIR.",
     "because it took <": "They compile in less than JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS: set it to 0.",
     "is less than threshold": "They are smaller than JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES: set it to 0.",
@@ -44,9 +43,9 @@ _REASONS = {
 
 
 def cache_folder() -> Path:
-    """Folder of the cache: the one JAX has been given, or `jaxmodsim` in the folder of the user's caches."""
-    if given := jax.config.values["jax_compilation_cache_dir"]:
-        return Path(given)
+    """Folder of the cache: that of JAX's configuration, or `jaxmodsim` in the user's cache folder."""
+    if configured := jax.config.values["jax_compilation_cache_dir"]:
+        return Path(configured)
     if sys.platform == "win32":
         caches = os.environ.get("LOCALAPPDATA") or "~/AppData/Local"
     elif sys.platform == "darwin":
@@ -57,9 +56,9 @@ def cache_folder() -> Path:
 
 
 def use_cache() -> None:
-    """Let this process, and those it starts, keep what they compile in the folder and take from there what is there.
+    """Enable the cache for this process and those it starts.
 
-    Where the folder cannot be written the command goes on without, and says so on stderr.
+    If the folder cannot be written, the command runs without a cache and prints a message to stderr.
     """
     if not jax.config.values["jax_enable_compilation_cache"]:
         return
@@ -68,11 +67,11 @@ def use_cache() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):
             raise PermissionError(f"{folder} cannot be written")
-    except (OSError, RuntimeError) as error:  # RuntimeError where the user has no home folder
+    except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home folder
         sys.stderr.write(f"jaxmodsim: compiled programs are not kept for the next command: {error}\n")
         jax.config.update("jax_enable_compilation_cache", False)
         return
-    # JAX by itself leaves out what compiles in less than a second, which is most of what a command compiles.
+    # JAX's default stores no program that compiles in less than a second, which is most of them.
     shortest = float(os.environ.get(_SHORTEST.upper(), 0.0))
     for name, value in {"jax_compilation_cache_dir": str(folder), _SHORTEST: shortest}.items():
         jax.config.update(name, value)
@@ -80,7 +79,7 @@ def use_cache() -> None:
 
 
 def report_cache(clear: bool) -> None:
-    """Say what the cache holds; with `clear` delete that first."""
+    """Print the content of the cache; with `clear`, delete it."""
     folder = cache_folder()
     programs = [(path, path.stat().st_size) for path in folder.glob("*-cache")]
     held = f"{len(programs)} compiled programs, {sum(size for _, size in programs) / 1e6:.3g} MB"
@@ -89,11 +88,11 @@ def report_cache(clear: bool) -> None:
             path.unlink(missing_ok=True)
         say(f"{folder}: deleted {held}.")
     else:
-        say(f"{folder}: {held}. --clear deletes them; JAX_ENABLE_COMPILATION_CACHE=false keeps none.")
+        say(f"{folder}: {held}. --clear deletes them; JAX_ENABLE_COMPILATION_CACHE=false disables the cache.")
 
 
 def check_cache() -> bool:
-    """Run a small scene in two new processes, and say what each took from the cache; whether the second took any."""
+    """Run a small scene in two new processes and print their use of the cache; True if the second one used it."""
     use_cache()
     if not jax.config.values["jax_enable_compilation_cache"]:
         say("The cache is off: JAX_ENABLE_COMPILATION_CACHE is false, or its folder cannot be written.")
@@ -107,7 +106,7 @@ def check_cache() -> bool:
         wall, cpu = map(float, done.stdout.split())
         rows.append((process, log.count(_FOUND), log.count(_MISSING), wall, cpu))
     columns = ("process", "programs from the cache", "compiled", "import and first run [s]", "processor time [s]")
-    show_table(pd.DataFrame(rows, columns=columns), f"Compiled programs in {cache_folder()}")
+    show_table(frame_of(rows, *columns), f"Compiled programs in {cache_folder()}")
     found = rows[-1][1]
     if not found:
         say(f"The second process found no programs of the first. {reason(log)}")
@@ -115,5 +114,5 @@ def check_cache() -> bool:
 
 
 def reason(log: str) -> str:
-    """Why a process found no programs, from what JAX and XLA logged."""
+    """The cause of misses, from the log of JAX and XLA."""
     return next((reason for text, reason in _REASONS.items() if text in log), "JAX logs no reason.")

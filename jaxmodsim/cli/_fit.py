@@ -1,4 +1,4 @@
-"""`jaxmodsim fit`: one axis, from records of position and applied force."""
+"""`jaxmodsim fit`: fit one axis to records of position and applied force."""
 
 import re
 import signal
@@ -29,61 +29,44 @@ from ..identify import (
     predict,
     prediction_error,
     profile,
-    remarks,
 )
 from ..plot import comparison_figure, design_figure, fit_figure, score_figure
 from ..scene import Scene, scene_numbers
-from ._fitted import (
-    Findings,
-    Fitted,
-    agreement_table,
-    headline,
-    origin,
-    parameter_table,
-    record_table,
-    sample_table,
-    summary,
-    with_units,
-)
-from ._options import Interrupted
+from ._options import FitRequest, Interrupted
+from ._outcome import FitOutcome, record_table, sample_table, with_units
 from ._output import Content, say, show_paths, show_table, write
-from ._plan import FitRequest, Plan, plan_of
-from ._report_html import report_page
+from ._plan import FitPlan, plan_of
+from ._report import report_page
 
-# Integration steps between two samples are raised by this factor, to so many at most.
+# Factor by which integration steps between two samples are refined, and their largest number.
 _FINER, _MOST_SUBSTEPS = 4, 64
-# Width of friction made smooth for the design of an input, in top speeds.
+# Width of the smooth friction for the design of an input, in top speeds.
 _SMOOTH = 1e-3
-# Parameters whose likelihood a report profiles, and about how many points on either side.
+# Number of parameters that a report profiles, and of points on either side.
 _PROFILED, _POINTS = 2, 4
 
 
 def run_fit(request: FitRequest) -> None:
-    """Fit, print, and write what was asked for; each part as soon as it is there.
+    """Fit, print and write the results, each part as soon as it is computed.
 
     **Raises:**
 
-    - `ValueError` as `plan_of` does.
-    - `Interrupted` after Ctrl-C, once all that was computed is written.
+    - `ValueError` as `plan_of`.
+    - `Interrupted` after Ctrl-C, once all results are written.
     """
-    plan = plan_of(request)
-    fitted = _fitted(plan)
-    _show(fitted)
-    findings = Findings(fitted, (), None, origin())
-    paths = write(request.out, _files(findings))
-    interrupted = fitted.interrupted
-    profiles: tuple[Profile, ...] = ()
-    design = None
+    outcome = _outcome_of(plan_of(request))
+    _show(outcome)
+    paths = write(request.out, _files(outcome))
+    interrupted = outcome.interrupted
     try:
         if request.report is not None and not interrupted:
-            better, profiles = _profiled(fitted)
-            if better is not fitted:
-                fitted = better
-                _show(fitted)
-                findings = Findings(fitted, profiles, None, findings.origin)
-                write(request.out, _files(findings))
+            fitted, outcome = outcome.result, _profiled(outcome)
+            if outcome.result is not fitted:
+                _show(outcome)
+                write(request.out, _files(outcome))
         if request.next_input is not None:
-            design = _designed(request, fitted)
+            design = _designed(request, outcome)
+            outcome = replace(outcome, design=design)
             say(f"Next input, for {request.next_input}:\n{design}")
             paths += write(request.next_input.parent, {request.next_input.name: design})
             paths += write(request.out, {"next.png": design_figure(design), "next.json": design.to_dict()})
@@ -91,59 +74,59 @@ def run_fit(request: FitRequest) -> None:
     except KeyboardInterrupt:
         interrupted = True
     if request.report is not None:
-        findings = Findings(fitted, profiles, design, findings.origin)
-        paths += write(request.report, {"report.html": report_page(findings)})
+        paths += write(request.report, {"report.html": report_page(outcome)})
     show_paths(paths)
     if interrupted:
-        raise Interrupted("interrupted; what was found until then is written")
+        raise Interrupted("interrupted; the results so far are written")
 
 
-def _fitted(plan: Plan) -> Fitted:
-    """Fit the one model, or compare several; with more integration steps between samples as long as these show."""
+def _outcome_of(plan: FitPlan) -> FitOutcome:
+    """Fit the model, or compare several; refine the integration steps between samples until they have no effect."""
     started = time.perf_counter()
     substeps = plan.substeps or 1
-    fitted = _fitted_with(plan, substeps)
-    may_refine = plan.substeps is None
-    while may_refine and substeps < _MOST_SUBSTEPS and is_step_size_limited(fitted.result) and not fitted.interrupted:
+    outcome = _fitted(plan, substeps)
+    while plan.substeps is None and is_step_size_limited(outcome.result) and not outcome.interrupted:
+        if substeps >= _MOST_SUBSTEPS:
+            break
         substeps *= _FINER
-        fitted = _fitted_with(plan, substeps)
-    judged = _judged(replace(fitted, substeps=substeps))
-    return replace(judged, seconds=time.perf_counter() - started)
+        outcome = _fitted(plan, substeps)
+    outcome = _validated(replace(outcome, substeps=substeps))
+    return replace(outcome, seconds=time.perf_counter() - started)
 
 
-def _judged(fitted: Fitted) -> Fitted:
-    """With predictions, the agreement of the records, and the error to expect: not for whoever pressed Ctrl-C."""
-    if fitted.interrupted:
-        return fitted
-    agreed = agreement(fitted.result) if len(fitted.plan.records) > 1 else None
-    return replace(
-        fitted,
-        predictions=tuple(predict(fitted.result, record, agreement=agreed) for record in fitted.plan.held_out),
-        agreement=agreed,
-        expected=prediction_error(fitted.result, agreement=agreed)["measured"],
-    )
+def _fitted(plan: FitPlan, substeps: int) -> FitOutcome:
+    """Fit the one model, or compare several and take the simplest one that is as good as the best.
 
-
-def _fitted_with(plan: Plan, substeps: int) -> Fitted:
-    """Fit the one model, or compare several and take the simplest that is as good as the best.
-
-    A model is fitted in the same way alone and among others, so that its numbers are the same.
+    A model is fitted alone in the same way as among others, so that its numbers are the same.
     """
     if plan.compared:
         comparison = _compared(plan, substeps)
         model = comparison.simplest
-        return Fitted(plan, model, with_units(comparison.results[model], plan.rotary), comparison)
+        return FitOutcome(plan, model, with_units(comparison.results[model], plan.rotary), comparison)
     ((model, candidate),) = plan.candidates.items()
     scene, free = candidate.scene, candidate.free
     assert isinstance(scene, Scene)
     assert free is not None
     result = fit_with_progress(scene, plan.records, free, limits=plan.limits, substeps=substeps, **plan.options)
-    return Fitted(plan, model, with_units(result, plan.rotary))
+    return FitOutcome(plan, model, with_units(result, plan.rotary))
+
+
+def _validated(outcome: FitOutcome) -> FitOutcome:
+    """Add predictions, the agreement of the records and the expected error, unless Ctrl-C was pressed."""
+    if outcome.interrupted:
+        return outcome
+    agreed = agreement(outcome.result) if len(outcome.plan.records) > 1 else None
+    return replace(
+        outcome,
+        predictions=tuple(predict(outcome.result, record, agreement=agreed) for record in outcome.plan.held_out),
+        agreement=agreed,
+        expected=prediction_error(outcome.result, agreement=agreed)["measured"],
+    )
 
 
 @contextmanager
 def _ctrl_c() -> Iterator[Callable[[], None]]:
-    """Ctrl-C ends all searches of a fit, where it would only end the one that goes on; yields what ends the others."""
+    """Let Ctrl-C end all searches, and not only the one in progress; yields a function that ends a later one."""
     before = signal.getsignal(signal.SIGINT)
     pressed = threading.Event()
 
@@ -162,22 +145,22 @@ def _ctrl_c() -> Iterator[Callable[[], None]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _compared(plan: Plan, substeps: int) -> Comparison:
-    judged: dict[str, Any] = {"hold_out": plan.held_out} if plan.folds is None else {"folds": plan.folds}
+def _compared(plan: FitPlan, substeps: int) -> Comparison:
+    validation: dict[str, Any] = {"hold_out": plan.held_out} if plan.folds is None else {"folds": plan.folds}
     with progress_line("compare") as show, _ctrl_c() as end:
 
         def progress(name: str, fold: int | None, step: int, rms: float) -> None:
             show(candidate_words(name, fold, step, rms))
             end()
 
-        options = {**judged, **plan.options, "substeps": substeps, "progress": progress}
+        options = {**validation, **plan.options, "substeps": substeps, "progress": progress}
         return compare(plan.candidates, plan.records, limits=plan.limits, **options)
 
 
 def fit_with_progress(
     scene: Scene, records: Record | Sequence[Record], free: Sequence[str], **options: Any
 ) -> FitResult:
-    """`fit` with a line that shows how it goes."""
+    """`fit` with a progress line."""
     with progress_line("fit") as show, _ctrl_c() as end:
 
         def progress(step: int, rms: float, values: dict[str, float]) -> None:
@@ -187,68 +170,56 @@ def fit_with_progress(
         return fit(scene, records, free, progress=progress, **options)
 
 
-def _show(fitted: Fitted) -> None:
-    result = fitted.result
-    for line in headline(fitted):
+def _show(outcome: FitOutcome) -> None:
+    records = outcome.result.provenance.records
+    for line in outcome.headline():
         say(line)
-    if fitted.comparison is not None:
-        say(str(fitted.comparison))
-    names = ", ".join(record.name for record in result.provenance.records)
-    show_table(parameter_table(result), f"{names}: {fitted.model}, {fitted.description}")
-    if len(result.provenance.records) + len(fitted.scores) > 1:
-        show_table(record_table(fitted), "Records")
-    if fitted.agreement is not None:
-        show_table(agreement_table(fitted.agreement), "What the records have in common, and what varies")
-    how = result.diagnostics
-    say(f"RMSE {result.rmse:.6g} {fitted.unit}; {how.evaluations} evaluations, {how.ending}")
-    for remark in remarks(result):
-        say(f"- {remark}")
-    samples = sum(len(record.t) for record in result.provenance.records)
-    steps = f"{fitted.substeps} integration step{'s' if fitted.substeps > 1 else ''} from one to the next"
-    say(f"{samples} samples, {steps}; {fitted.seconds:.1f} s with compilation")
+    if outcome.comparison is not None:
+        say(str(outcome.comparison))
+    say(f"\n{outcome.title}\n{outcome.result}")
+    if len(records) + len(outcome.scores) > 1:
+        show_table(record_table(outcome), "Records")
+    if outcome.agreement is not None:
+        say(f"Agreement of the records\n{outcome.agreement}")
+    steps = f"{outcome.substeps} integration step{'s' if outcome.substeps > 1 else ''} from one to the next"
+    samples = sum(len(record.t) for record in records)
+    say(f"{samples} samples, {steps}; {outcome.seconds:.1f} s with compilation")
 
 
-def _files(findings: Findings) -> dict[str, Content]:
+def _files(outcome: FitOutcome) -> dict[str, Content]:
     """Figures, tables, JSON and the result by file name."""
-    fitted, result = findings.fitted, findings.fitted.result
-    files: dict[str, Content] = {}
-    single, seen = len(result.provenance.records) == 1, fitted.measured
+    result, files = outcome.result, {}
     for i, record in enumerate(result.provenance.records):
-        files["fit.png" if single else f"fit_{_numbered(i, record)}.png"] = fit_figure(result, record=i, **seen)
-    for i, held_out in enumerate(fitted.predictions):
-        files[f"held_out_{_numbered(i, held_out.score.record)}.png"] = score_figure(held_out, **seen)
-    if fitted.comparison is not None:
-        files["comparison.png"] = comparison_figure(fitted.comparison)
-    return {
-        **files,
-        "fit.csv": sample_table(fitted),
-        "fit.json": summary(findings),
-        "fit.npz": result,
-    }
+        name = "fit.png" if len(result.provenance.records) == 1 else f"fit_{_numbered(i, record)}.png"
+        files[name] = fit_figure(result, record=i, **outcome.measured)
+    for i, held_out in enumerate(outcome.predictions):
+        files[f"held_out_{_numbered(i, held_out.score.record)}.png"] = score_figure(held_out, **outcome.measured)
+    if outcome.comparison is not None:
+        files["comparison.png"] = comparison_figure(outcome.comparison)
+    return files | {"fit.csv": sample_table(outcome), "fit.json": outcome.summary(), "fit.npz": result}
 
 
 def _numbered(i: int, record: Record) -> str:
-    """A part of a file name that is like the record's, and differs from all others."""
-    alike = re.sub(r"[^\w.-]+", "_", record.name)
-    return f"{i + 1}_{alike}"
+    """A part of a file name, similar to the name of the record and unique."""
+    similar = re.sub(r"[^\w.-]+", "_", record.name)
+    return f"{i + 1}_{similar}"
 
 
-def _profiled(fitted: Fitted) -> tuple[Fitted, tuple[Profile, ...]]:
-    """Profiles of the least known parameters, and the fit that they are of: a better one, where one came upon it."""
+def _profiled(outcome: FitOutcome) -> FitOutcome:
+    """Add profiles of the least certain parameters; of a better fit, if a profile finds one."""
     profiles: list[Profile] = []
-    for name in _least_known(fitted):
+    for name in _least_certain(outcome):
         with progress_line("likelihood profile", name):
-            profiles.append(profile(fitted.result, name, points=_POINTS))
-        if profiles[-1].result is not fitted.result:
+            profiles.append(profile(outcome.result, name, points=_POINTS))
+        if profiles[-1].result is not outcome.result:
             say(f"{profiles[-1].notes[-1]} This is the fit from here on:")
-            return _profiled(_judged(replace(fitted, result=profiles[-1].result)))
-    return fitted, tuple(profiles)
+            return _profiled(_validated(replace(outcome, result=profiles[-1].result)))
+    return replace(outcome, profiles=tuple(profiles))
 
 
-def _least_known(fitted: Fitted) -> list[str]:
-    """Parameters of the scene with the largest relative standard errors that are finite and off their limits."""
-    result = fitted.result
-    numbers = scene_numbers(fitted.scene)
+def _least_certain(outcome: FitOutcome) -> list[str]:
+    """Parameters of the scene with the largest finite relative standard errors, except those at a limit."""
+    result, numbers = outcome.result, scene_numbers(outcome.scene)
     shares = {
         name: result.errors[name] / abs(value)
         for name, value in result.values.items()
@@ -258,9 +229,9 @@ def _least_known(fitted: Fitted) -> list[str]:
     return sorted(known, key=lambda name: -shares[name])[:_PROFILED]
 
 
-def _designed(request: FitRequest, fitted: Fitted) -> InputDesign:
-    """An input for the next record: limits and duration by default those of the records, the noise that of the fit."""
-    result, records = fitted.result, fitted.result.provenance.records
+def _designed(request: FitRequest, outcome: FitOutcome) -> InputDesign:
+    """An input for the next record, with the noise of the fit; limits and duration default to those of the records."""
+    result, records = outcome.result, outcome.result.provenance.records
     positions = np.concatenate([record.measured for record in records])
     low, high = float(np.min(positions)), float(np.max(positions))
     top = request.max_speed or max(estimate_axis(record).top for record in records if np.ptp(record.measured) > 0)
@@ -268,10 +239,10 @@ def _designed(request: FitRequest, fitted: Fitted) -> InputDesign:
         request.max_force or max(float(np.max(np.abs(record.inputs["u"]))) for record in records),
         top,
         request.max_travel or 0.5 * (high - low),
-        rotary=fitted.plan.rotary,
+        rotary=outcome.plan.rotary,
     )
-    numbers, scene = scene_numbers(fitted.scene), fitted.scene
-    if scene.event_driven:  # which a design by derivatives of all samples cannot pass
+    numbers, scene = scene_numbers(outcome.scene), outcome.scene
+    if scene.event_driven:  # a design needs derivatives of all samples, which events do not have
         scene = formulations(scene, width=_SMOOTH * top)["Regularized"]
     design = design_input(
         scene,

@@ -1,176 +1,189 @@
-"""Options of the command line with their help: imported at once, so nothing heavy in here."""
+"""Arguments and options of the commands with their help: imported at once, so nothing heavy in here."""
 
+import inspect
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 import typer
+from typer.models import OptionInfo
+
+Options = TypeVar("Options")
 
 
 class Interrupted(Exception):
-    """Ctrl-C, after which what had been computed was written; the text says so."""
+    """Ctrl-C, after which the results computed so far were written; the text says so."""
 
 
-Out = Annotated[Path, typer.Option(help="Folder for figures, tables and JSON; made if it is not there.")]
+def command_of(record: type[Options]) -> Callable[[Callable[[Options], None]], Callable[..., None]]:
+    """Make a command of a function of one options record: each field of the dataclass is an argument or an option."""
+
+    def command_for(function: Callable[[Options], None]) -> Callable[..., None]:
+        def command(**options: Any) -> None:
+            function(record(**options))
+
+        parameters = []
+        for each in fields(record):  # pyright: ignore[reportArgumentType] # a dataclass
+            default = each.default if each.default_factory is MISSING else each.default_factory()
+            default = inspect.Parameter.empty if default is MISSING else default
+            kind = inspect.Parameter.KEYWORD_ONLY
+            parameters.append(inspect.Parameter(each.name, kind, default=default, annotation=each.type))
+        command.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
+        command.__name__, command.__doc__ = function.__name__, function.__doc__
+        return command
+
+    return command_for
+
+
+def _option(panel: str | None, text: str, metavar: str | None = None, flag: str | None = None) -> OptionInfo:
+    return typer.Option(*([flag] if flag else []), help=text, metavar=metavar, rich_help_panel=panel)
+
+
+Out = Annotated[Path, typer.Option(help="Folder for figures, tables and JSON; created if missing.")]
+SpecFile = Annotated[Path, typer.Argument(help="TOML file of the tables described above.", metavar="SPEC")]
 
 # Panels of `jaxmodsim fit --help`.
-_COLUMNS, _MODEL, _JUDGED, _SEARCH, _NEXT = "Columns", "Model", "Judging it", "Search", "The next record"
+_COLUMNS, _MODEL, _VALIDATION, _SEARCH, _NEXT = "Columns", "Model", "Validation", "Search", "The next record"
 
-Records = Annotated[
-    list[Path],
-    typer.Argument(
-        help="Records, fitted together: .csv with a header line, .parquet, .mat; of loggers .mf4, .tdms, .mcap, .bag."
-    ),
-]
-Time = Annotated[str, typer.Option(help="Column of time.", rich_help_panel=_COLUMNS)]
-Position = Annotated[
-    str, typer.Option(help="Column of measured position or angle; or of velocity.", rich_help_panel=_COLUMNS)
-]
-Force = Annotated[
-    str, typer.Option(help="Column of the applied force or torque, or drive signal.", rich_help_panel=_COLUMNS)
-]
-Units = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="What the columns time, position and force are in, as in time=ms,position=deg,force=12.5; by default"
-        r" what their names say, `phi \[deg]` or `phi_deg`, or SI. A number is SI units per unit of the column. An"
-        " angle or a torque makes the axis a rotary one.",
-        metavar="COLUMN=UNIT,...",
-        rich_help_panel=_COLUMNS,
-    ),
-]
-Drop = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Samples to leave out: nan, those without a finite value; repeated, those at the time of the one before.",
-        metavar="nan,repeated",
-        rich_help_panel=_COLUMNS,
-    ),
-]
-Laws = Annotated[
-    str,
-    typer.Option(
-        help="Friction of the axis: coulomb, asymmetric, stribeck, lugre. Several, with commas between, or `all` are"
-        " judged by what was held back, and the simplest that is as good as the best is taken.",
-        metavar="A,B,...|all",
-        rich_help_panel=_MODEL,
-    ),
-]
-Free = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Parameters to fit, names with commas between, repeatable; by default those of the law, to which +NAME"
-        r" adds one. Also q0 and qd0, to report where records start, and delay.u of the force \[s].",
-        metavar="NAME,...|+NAME",
-        rich_help_panel=_MODEL,
-    ),
-]
-Start = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Start value in SI units; by default estimated from the longest record. Repeatable.",
-        metavar="NAME=VALUE",
-        rich_help_panel=_MODEL,
-    ),
-]
-Fix = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Value in SI units that is not fitted. Repeatable.", metavar="NAME=VALUE", rich_help_panel=_MODEL
-    ),
-]
-Limit = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Limits of a parameter in SI units; either side may be left out: m=80:, vs=:0.1. Repeatable.",
-        metavar="NAME=LOW:HIGH",
-        rich_help_panel=_MODEL,
-    ),
-]
-HeldOut = Annotated[
-    list[Path] | None,
-    typer.Option(
-        help="Record to judge by; nothing but its start is fitted to it. Repeatable.", rich_help_panel=_JUDGED
-    ),
-]
-Folds = Annotated[
-    int | None,
-    typer.Option(
-        help="Judge by cross-validation instead: cut each record into so many parts, and hold back one after the"
-        " other. Several laws without --held-out are judged so with 4.",
-        rich_help_panel=_JUDGED,
-    ),
-]
-Loss = Annotated[
-    str,
-    typer.Option(help="squares; huber or cauchy, where there are outliers.", rich_help_panel=_SEARCH),
-]
-Begin = Annotated[
-    str,
-    typer.Option(
-        help="Where the search begins: rough, by regression of the force on the smoothed motion; staged, by the"
-        " balance of forces with the law itself, and by reversals.",
-        rich_help_panel=_SEARCH,
-    ),
-]
-Starts = Annotated[
-    int,
-    typer.Option(help="Searches from so many starts around it, of which the best is taken.", rich_help_panel=_SEARCH),
-]
-MaxSteps = Annotated[
-    int,
-    typer.Option(help="Limit of iterations of a search, up to which it goes on by itself.", rich_help_panel=_SEARCH),
-]
-Substeps = Annotated[
-    int | None,
-    typer.Option(
-        help="Integration steps between two samples; by default as many as it takes until they no longer show.",
-        rich_help_panel=_SEARCH,
-    ),
-]
-Report = Annotated[
-    Path | None, typer.Option(help="Folder for report.html: all of it in one file, to attach to a report.")
-]
-NextInput = Annotated[
-    Path | None,
-    typer.Option(
-        "--next",
-        help="CSV file for the motion and force of the next record that would tell most, from the middle of"
-        " the travel that was recorded.",
-        rich_help_panel=_NEXT,
-    ),
-]
-MaxForce = Annotated[
-    float | None, typer.Option(help="Its largest force [N]; by default the records'.", rich_help_panel=_NEXT)
-]
-MaxSpeed = Annotated[
-    float | None, typer.Option(help=r"Its largest speed \[m/s]; by default the records'.", rich_help_panel=_NEXT)
-]
-MaxTravel = Annotated[
-    float | None,
-    typer.Option(
-        help=r"Its largest distance from the start to either side \[m]; by default half the records' travel.",
-        rich_help_panel=_NEXT,
-    ),
-]
-Duration = Annotated[
-    float | None,
-    typer.Option(help=r"Its duration \[s]; by default that of the longest record.", rich_help_panel=_NEXT),
-]
 
-Spec = Annotated[Path, typer.Argument(help="TOML file that says what to run; see above.")]
-Store = Annotated[
-    Path | None,
-    typer.Option(help="Folder of the Zarr store; made if it is not there, gone on with if it is.", metavar="STORE"),
-]
-FigureFile = Annotated[
-    Path | None, typer.Option(help="Map of the first variable, where there are two dimensions.", metavar="PNG")
-]
-Chunk = Annotated[int | None, typer.Option(help="Largest number of runs that are computed and written as one.", min=1)]
-Workers = Annotated[
-    int | None,
-    typer.Option(help="Processes of a local Dask cluster; by default threads of this process.", min=1),
-]
-Scheduler = Annotated[
-    str | None, typer.Option(help="Address of the scheduler of a Dask cluster that is there.", metavar="ADDRESS")
-]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be run, and run nothing.")]
+@dataclass(frozen=True, kw_only=True)
+class FitRequest:
+    """Arguments and options of `jaxmodsim fit`, as typed."""
+
+    records: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Records, fitted together: .csv with a header line, .parquet, .mat; logger files .mf4, .tdms, .mcap,"
+            " .bag.",
+            metavar="RECORD",
+        ),
+    ]
+    time: Annotated[str, _option(_COLUMNS, "Column of time.")] = "t"
+    position: Annotated[str, _option(_COLUMNS, "Column of measured position, angle or velocity.")] = "q"
+    force: Annotated[str, _option(_COLUMNS, "Column of the applied force or torque, or of a drive signal.")] = "u"
+    units: Annotated[
+        list[str],
+        _option(
+            _COLUMNS,
+            "Units of the columns time, position and force, as in time=ms,position=deg,force=12.5. The default is the"
+            r" unit in the column's name, `phi \[deg]` or `phi_deg`, or else SI. A number is SI units per unit of the"
+            " column. An angle or a torque makes the axis rotary.",
+            "COLUMN=UNIT,...",
+        ),
+    ] = field(default_factory=list)
+    drop: Annotated[
+        list[str],
+        _option(
+            _COLUMNS,
+            "Samples to leave out: nan, those with a value that is not finite; repeated, those with the time of the"
+            " sample before.",
+            "nan,repeated",
+        ),
+    ] = field(default_factory=list)
+    laws: Annotated[
+        str,
+        _option(
+            _MODEL,
+            "Friction of the axis: coulomb, asymmetric, stribeck, lugre. Several, separated by commas, or `all` are"
+            " compared by held-out error; the simplest law that is as good as the best is taken.",
+            "A,B,...|all",
+        ),
+    ] = "coulomb"
+    free: Annotated[
+        list[str],
+        _option(
+            _MODEL,
+            "Parameters to fit, names separated by commas, repeatable. The default is those of the law, to which +NAME"
+            r" adds one. Also q0 and qd0, to report the initial states, and delay.u, the delay of the force \[s].",
+            "NAME,...|+NAME",
+        ),
+    ] = field(default_factory=list)
+    start: Annotated[
+        list[str],
+        _option(
+            _MODEL,
+            "Start value in SI units; the default is estimated from the longest record. Repeatable.",
+            "NAME=VALUE",
+        ),
+    ] = field(default_factory=list)
+    fix: Annotated[
+        list[str], _option(_MODEL, "Value in SI units of a parameter that is not fitted. Repeatable.", "NAME=VALUE")
+    ] = field(default_factory=list)
+    limit: Annotated[
+        list[str],
+        _option(
+            _MODEL,
+            "Limits of a parameter in SI units; either side may be omitted: m=80:, vs=:0.1. Repeatable.",
+            "NAME=LOW:HIGH",
+        ),
+    ] = field(default_factory=list)
+    held_out: Annotated[
+        list[Path],
+        _option(_VALIDATION, "Record for validation; only its initial state is fitted to it. Repeatable."),
+    ] = field(default_factory=list)
+    folds: Annotated[
+        int | None,
+        _option(
+            _VALIDATION,
+            "Validate by cross-validation instead: cut each record into this many parts and hold out one after the"
+            " other. The default for several laws without --held-out is 4.",
+        ),
+    ] = None
+    loss: Annotated[str, _option(_SEARCH, "squares; huber or cauchy for records with outliers.")] = "squares"
+    initializer: Annotated[
+        str,
+        _option(
+            _SEARCH,
+            "Start of the search: regression of the force on the smoothed motion; staged, from the balance of forces"
+            " with the law itself and from reversals.",
+        ),
+    ] = "regression"
+    starts: Annotated[int, _option(_SEARCH, "Number of searches from starts around it; the best one is taken.")] = 1
+    max_steps: Annotated[int, _option(_SEARCH, "Largest number of iterations of a search.")] = 400
+    substeps: Annotated[
+        int | None,
+        _option(
+            _SEARCH,
+            "Integration steps between two samples; by default refined until the step size has no visible effect.",
+        ),
+    ] = None
+    out: Out = Path("jaxmodsim-fit")
+    report: Annotated[Path | None, _option(None, "Folder for report.html, a page in one file.")] = None
+    next_input: Annotated[
+        Path | None,
+        _option(
+            _NEXT,
+            "CSV file for the motion and force of the most informative next record. It starts in the middle of the"
+            " recorded travel.",
+            flag="--next",
+        ),
+    ] = None
+    max_force: Annotated[float | None, _option(_NEXT, "Largest force [N]; default: that of the records.")] = None
+    max_speed: Annotated[float | None, _option(_NEXT, r"Largest speed \[m/s]; default: that of the records.")] = None
+    max_travel: Annotated[
+        float | None,
+        _option(_NEXT, r"Largest distance from the start \[m]; default: half the travel of the records."),
+    ] = None
+    duration: Annotated[float | None, _option(_NEXT, r"Duration \[s]; default: that of the longest record.")] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepRequest:
+    """Arguments and options of `jaxmodsim sweep`, as typed."""
+
+    spec: SpecFile
+    out: Annotated[
+        Path | None, _option(None, "Folder of the Zarr store; created if missing, resumed if it exists.", "STORE")
+    ] = None
+    figure: Annotated[
+        Path | None, _option(None, "Map of the first variable; needs a sweep over two dimensions.", "PNG")
+    ] = None
+    chunk: Annotated[
+        int | None, typer.Option(help="Largest number of runs that are computed and written together.", min=1)
+    ] = None
+    workers: Annotated[
+        int | None, typer.Option(help="Processes of a local Dask cluster; by default threads of this process.", min=1)
+    ] = None
+    scheduler: Annotated[str | None, _option(None, "Address of a running Dask scheduler.", "ADDRESS")] = None
+    dry_run: Annotated[bool, _option(None, "Print the plan of the sweep and run nothing.", flag="--dry-run")] = False

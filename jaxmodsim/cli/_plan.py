@@ -1,15 +1,16 @@
-"""What `jaxmodsim fit` was asked for: as it was typed, and checked."""
+"""The plan of `jaxmodsim fit`: its options, checked, and its records, read."""
 
 import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .._core.arguments import did_you_mean
 from ..identify import (
+    AxisModel,
     Candidate,
     Cauchy,
     Huber,
@@ -21,54 +22,28 @@ from ..identify import (
     axis_scene,
     estimate_axis,
 )
-from ..scene import Scene, scene_numbers
-from ._read import DROPS, AxisColumns, offset_note, read_records
-from ._units import given_units, option_hint
+from ..scene import scene_numbers
+from ._options import FitRequest
+from ._records import DROPS, AxisColumns, offset_note, read_records
+from ._units import parse_units
 
 _LOSSES = {"squares": SquaredLoss, "huber": Huber, "cauchy": Cauchy}
-_INITIALIZERS = ("rough", "staged")
-# Beside the numbers of the scene: the state at the first sample of each record, and the delay of the force.
+_INITIALIZERS = {"regression": (), "staged": (Staged(),)}
+# Free parameters beside the numbers of the scene: the state at the first sample of each record, the delay of the force.
 _ALSO_FREE = ("q0", "qd0", "z0", "delay.u")
 
-
-@dataclass(frozen=True)
-class FitRequest:
-    """The arguments of `jaxmodsim fit`, as they were typed; see its --help."""
-
-    records: Sequence[Path]
-    columns: tuple[str, str, str]
-    units: Sequence[str]
-    drop: Sequence[str]
-    laws: str
-    free: Sequence[str]
-    start: Sequence[str]
-    fix: Sequence[str]
-    limit: Sequence[str]
-    held_out: Sequence[Path]
-    folds: int | None
-    loss: str
-    begin: str
-    starts: int
-    max_steps: int
-    substeps: int | None
-    out: Path
-    report: Path | None
-    next_input: Path | None
-    max_force: float | None
-    max_speed: float | None
-    max_travel: float | None
-    duration: float | None
+Limits = dict[str, tuple[float | None, float | None]]
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What is to be fitted.
+class FitPlan:
+    """The arguments of a fit or a comparison.
 
-    - `candidates`: models by name, one where there is nothing to compare.
-    - `compared`: whether they are compared, or one is scored on folds. `folds`: how many, None for the default.
-    - `records`, `held_out`: records that are fitted, and that are not.
-    - `limits`: of parameters, for `fit`. `options`: further arguments of it.
-    - `substeps`: None for as many as it takes. `rotary`: whether the axis is. `notes`: how the files were read.
+    - `candidates`: models by name; a single one where nothing is compared.
+    - `compared`: whether models are compared, or one is cross-validated. `folds`: how many; None for the default.
+    - `records`, `held_out`: records to fit, and records for validation.
+    - `limits`: limits of parameters. `options`: further arguments of `fit`.
+    - `substeps`: None to refine them. `rotary`: whether the axis is rotary. `notes`: sentences on reading the files.
     """
 
     candidates: dict[str, Candidate]
@@ -76,91 +51,94 @@ class Plan:
     folds: int | None
     records: tuple[Record, ...]
     held_out: tuple[Record, ...]
-    limits: dict[str, tuple[float | None, float | None]]
+    limits: Limits
     options: dict[str, Any]
     substeps: int | None
     rotary: bool
     notes: tuple[str, ...]
 
 
-def plan_of(request: FitRequest) -> Plan:
-    """Read the records and check everything; what is to be known of how they were read goes to stderr at once.
+def plan_of(request: FitRequest) -> FitPlan:
+    """Check all options and read the records; notes on reading them go to stderr.
 
     **Raises:**
 
-    - `ValueError` for an option that names something unknown, or that does not go with another one; as `read_records`.
+    - `ValueError` for an unknown name in an option, and for options that exclude each other; as `read_records`.
     """
     _check(request)
-    names = _laws(request)
-    loss = _LOSSES[_known("--loss", request.loss, _LOSSES)]()
-    _known("--begin", request.begin, _INITIALIZERS)
-    columns = AxisColumns(*request.columns, given_units(request.units), _drops(request.drop))
-    read = read_records([*request.records, *request.held_out], columns)
+    models = _models(request)
+    options = {
+        "loss": _LOSSES[_known("--loss", request.loss, _LOSSES)](),
+        "initializer": [
+            *_INITIALIZERS[_known("--initializer", request.initializer, _INITIALIZERS)],
+            *([MultiStart(request.starts)] if request.starts > 1 else []),
+        ],
+        "max_steps": request.max_steps,
+    }
+    units = parse_units(request.units)
+    dropped = frozenset(_known("--drop", kind, DROPS, "kind of sample") for kind in _listed(request.drop))
+    columns = AxisColumns(request.time, request.position, request.force, units, dropped)
+    files = read_records([*request.records, *request.held_out], columns)
     records, held_out = (
-        tuple(part for file in files for part in file.parts)
-        for files in (read[: len(request.records)], read[len(request.records) :])
+        tuple(part for file in some for part in file.parts)
+        for some in (files[: len(request.records)], files[len(request.records) :])
     )
-    together = (*records, *held_out)
-    notes = [note for file in read for note in file.notes]
+    notes = [note for file in files for note in file.notes]
     if not any("delay.u" in text for text in request.free):
-        notes += [note for record in together for note in offset_note(record, columns.force)]
+        notes += [note for record in (*records, *held_out) for note in offset_note(record, columns.force)]
     for note in notes:
         sys.stderr.write(f"Note: {note}\n")
-    # A record that stands still, or that nothing drives, may go beside others that do not.
-    driven = [record for record in together if np.ptp(record.measured) > 0 and np.ptp(record.inputs["u"]) > 0]
-    for record in driven:
-        estimate_axis(record)
-    rough = estimate_axis(max(records, key=lambda record: len(record.t)))
-    rough = replace(rough, start=min(float(record.t[0]) for record in records))
-    numbers = {name: _numbers(axis_scene(axis_models()[name], rough)) for name in names}
-    fixed, start = _values("--fix", request.fix, numbers), _values("--start", request.start, numbers)
-    listed = tuple(name.strip() for text in request.free for name in text.split(",") if name.strip())
-    chosen = tuple(name for name in listed if not name.startswith("+"))
-    added = tuple(name.removeprefix("+") for name in listed if name.startswith("+"))
+    # A record that stands still, or that nothing drives, is useful only beside others.
+    for record in (*records, *held_out):
+        if np.ptp(record.measured) > 0 and np.ptp(record.inputs["u"]) > 0:
+            estimate_axis(record)
+    axis = estimate_axis(max(records, key=lambda record: len(record.t)))
+    axis = replace(axis, start=min(float(record.t[0]) for record in records))
+    # Neither the input nor the velocity of a belt, which an axis does not have, can be set.
+    numbers = {
+        name: [x for x in scene_numbers(axis_scene(model, axis)) if x != "u" and not x.endswith("belt_velocity")]
+        for name, model in models.items()
+    }
+    start, fixed = _values("--start", request.start, numbers), _values("--fix", request.fix, numbers)
+    chosen = [name for name in _listed(request.free) if not name.startswith("+")]
+    added = [name.removeprefix("+") for name in _listed(request.free) if name.startswith("+")]
     for name in (*chosen, *added):
-        _known("--free", name, (*next(iter(numbers.values())), *_ALSO_FREE), listed=name.split("[")[0].split(".")[0])
+        _known("--free", name, (*next(iter(numbers.values())), *_ALSO_FREE), stem=name.split("[")[0].split(".")[0])
     for option, others in (("--start", start), ("--free", (*chosen, *added))):
-        both = sorted(set(fixed) & set(others))
-        if both:
+        if both := sorted(set(fixed) & set(others)):
             raise ValueError(f"{both[0]} stands in {option} and in --fix: it can be fitted or fixed, not both.")
     candidates = {}
-    for name in names:
-        model = axis_models()[name]
-        own = [{key: x for key, x in given.items() if key in numbers[name]} for given in (start, fixed)]
-        free = tuple(dict.fromkeys(each for each in (*(chosen or model.free), *added) if each not in fixed))
-        candidates[name] = Candidate(axis_scene(model, rough, *own), free, model.description)
-    limits = {"m": (0.0, None)} | _limits(request.limit, numbers)
-    options = {"loss": loss, "initializer": _initializers(request), "max_steps": request.max_steps}
-    compared = len(names) > 1 or request.folds is not None
-    rotary = any(file.rotary for file in read)
-    return Plan(
-        candidates, compared, request.folds, records, held_out, limits, options, request.substeps, rotary, tuple(notes)
+    for name, model in models.items():
+        own = [{key: x for key, x in values.items() if key in numbers[name]} for values in (start, fixed)]
+        free = tuple(dict.fromkeys(x for x in (*(chosen or model.free), *added) if x not in fixed))
+        candidates[name] = Candidate(axis_scene(model, axis, *own), free, model.description)
+    return FitPlan(
+        candidates,
+        compared=len(models) > 1 or request.folds is not None,
+        folds=request.folds,
+        records=records,
+        held_out=held_out,
+        limits={"m": (0.0, None)} | _limits(request.limit, numbers),
+        options=options,
+        substeps=request.substeps,
+        rotary=any(file.rotary for file in files),
+        notes=tuple(notes),
     )
-
-
-def _initializers(request: FitRequest) -> list[Staged | MultiStart]:
-    """Where a search starts."""
-    staged = [Staged()] if request.begin == "staged" else []
-    return [*staged, *([MultiStart(request.starts)] if request.starts > 1 else [])]
 
 
 def _check(request: FitRequest) -> None:
     for option, path in (("--out", request.out), ("--report", request.report)):
         if path is not None and path.exists() and not path.is_dir():
             raise ValueError(f"{option} {path} is a file; a folder is needed.")
-    if request.starts < 1:
-        raise ValueError(f"--starts must be at least 1, but it is {request.starts}.")
-    if request.max_steps < 1:
-        raise ValueError(f"--max-steps must be at least 1, but it is {request.max_steps}.")
-    if request.substeps is not None and request.substeps < 1:
-        raise ValueError(f"--substeps must be at least 1, but it is {request.substeps}.")
-    if request.folds is not None and request.folds < 2:
-        raise ValueError(f"--folds must be at least 2, but it is {request.folds}.")
+    least = {"--starts": 1, "--max-steps": 1, "--substeps": 1, "--folds": 2}
+    counts = (request.starts, request.max_steps, request.substeps, request.folds)
+    for (option, low), count in zip(least.items(), counts, strict=True):
+        if count is not None and count < low:
+            raise ValueError(f"{option} must be at least {low}, but it is {count}.")
     if request.folds is not None and request.held_out:
-        raise ValueError("--folds and --held-out do not go together: a model is judged by one of them.")
+        raise ValueError("--folds and --held-out exclude each other: a model is validated by one of them.")
     numbers = {"force": request.max_force, "speed": request.max_speed, "travel": request.max_travel}
-    given = {f"--max-{name}": x for name, x in numbers.items()} | {"--duration": request.duration}
-    for option, number in given.items():
+    for option, number in ({f"--max-{x}": n for x, n in numbers.items()} | {"--duration": request.duration}).items():
         if number is not None and request.next_input is None:
             raise ValueError(f"{option} belongs to --next FILE.csv, which is missing.")
         if number is not None and not (math.isfinite(number) and number > 0):
@@ -169,58 +147,53 @@ def _check(request: FitRequest) -> None:
         raise ValueError(f"--next {request.next_input} is a folder; a file is needed.")
 
 
-def _laws(request: FitRequest) -> tuple[str, ...]:
-    given = dict.fromkeys(name.strip() for name in request.laws.split(",") if name.strip())
-    names = tuple(axis_models()) if "all" in given else tuple(given)
+def _models(request: FitRequest) -> dict[str, AxisModel]:
+    """The models that --laws names."""
+    known, names = axis_models(), _listed([request.laws])
     if not names:
         raise ValueError(f"--laws needs a law, several as A,B, or `all`, but {request.laws!r} was given.")
-    for name in names:
-        _known("--laws", name, axis_models(), "law")
+    names = list(known) if "all" in names else [_known("--laws", name, known, "law") for name in names]
     if len(names) > 1 and any(not name.strip().startswith("+") for text in request.free for name in text.split(",")):
         raise ValueError(
-            "--free does not go with several --laws, each of which has its own parameters: use --fix, or --free +NAME."
+            "--free excludes several --laws, each of which has its own parameters: use --fix, or --free +NAME."
         )
-    return names
+    return {name: known[name] for name in names}
 
 
-def _drops(texts: Sequence[str]) -> frozenset[str]:
-    kinds = [kind.strip() for text in texts for kind in text.split(",") if kind.strip()]
-    return frozenset(_known("--drop", kind, DROPS, "kind of sample") for kind in kinds)
+def _listed(texts: Sequence[str]) -> list[str]:
+    """Names that are separated by commas, each once."""
+    return list(dict.fromkeys(name.strip() for text in texts for name in text.split(",") if name.strip()))
 
 
-def _numbers(scene: Scene) -> tuple[str, ...]:
-    """Names of the numbers that may be given: neither the input nor the velocity of a belt, which an axis has not."""
-    return tuple(name for name in scene_numbers(scene) if name != "u" and not name.endswith("belt_velocity"))
-
-
-def _known(option: str, name: str, known: Iterable[str], noun: str = "name", listed: str | None = None) -> str:
-    """The name, if there is such a one."""
+def _known(option: str, name: str, known: Iterable[str], noun: str = "name", stem: str | None = None) -> str:
+    """The name, if it or its stem is known."""
     known = tuple(known)
-    if name in known or listed in known:
+    if name in known or stem in known:
         return name
-    hint = option_hint(name, known)
-    raise ValueError(f"{option}: there is no {noun} {name!r}; the {noun}s are: {', '.join(known)}.{hint}")
+    raise ValueError(
+        f"{option}: there is no {noun} {name!r}; the {noun}s are: {', '.join(known)}.{did_you_mean(name, known)}"
+    )
 
 
-def _of_any(option: str, name: str, numbers: Mapping[str, Sequence[str]]) -> str:
-    return _known(option, name, dict.fromkeys(each for own in numbers.values() for each in own), "parameter")
+def _known_of_any(option: str, name: str, numbers: Mapping[str, Sequence[str]]) -> str:
+    return _known(option, name, dict.fromkeys(x for own in numbers.values() for x in own), "parameter")
 
 
 def _values(option: str, texts: Sequence[str], numbers: Mapping[str, Sequence[str]]) -> dict[str, float]:
-    """Read NAME=VALUE; a name must be one of a model at least."""
+    """Parse NAME=VALUE; at least one of the models must have the name."""
     values: dict[str, float] = {}
     for text in texts:
         name, equals, number = text.partition("=")
         value = _number(number)
         if not equals or value is None:
             raise ValueError(f"{option} needs NAME=VALUE with a number, but {text!r} was given.")
-        values[_of_any(option, name, numbers)] = value
+        values[_known_of_any(option, name, numbers)] = value
     return values
 
 
-def _limits(texts: Sequence[str], numbers: Mapping[str, Sequence[str]]) -> dict[str, tuple[float | None, float | None]]:
-    """Read NAME=LOW:HIGH, where either may be left out."""
-    limits: dict[str, tuple[float | None, float | None]] = {}
+def _limits(texts: Sequence[str], numbers: Mapping[str, Sequence[str]]) -> Limits:
+    """Parse NAME=LOW:HIGH, where either side may be omitted."""
+    limits: Limits = {}
     for text in texts:
         name, _, span = text.partition("=")
         low, colon, high = span.partition(":")
@@ -228,11 +201,11 @@ def _limits(texts: Sequence[str], numbers: Mapping[str, Sequence[str]]) -> dict[
         wrong = (low.strip() and least is None) or (high.strip() and most is None)
         if not colon or wrong or (least is None and most is None):
             raise ValueError(
-                f"--limit needs NAME=LOW:HIGH with numbers, one of which may be left out, but {text!r} was given."
+                f"--limit needs NAME=LOW:HIGH with numbers, one of which may be omitted, but {text!r} was given."
             )
         if least is not None and most is not None and not least < most:
             raise ValueError(f"--limit {text}: the lower limit must be below the upper one.")
-        limits[_of_any("--limit", name, numbers)] = (0.0 if name == "m" and least is None else least, most)
+        limits[_known_of_any("--limit", name, numbers)] = (0.0 if name == "m" and least is None else least, most)
     return limits
 
 

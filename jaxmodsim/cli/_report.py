@@ -1,107 +1,94 @@
-"""`jaxmodsim testbench`: figures, table and sweep of the test bench."""
+"""The report on a fit: one HTML page with its figures inside, no scripts, no network."""
 
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+import base64
+import io
 
-import numpy as np
+import jinja2
 import pandas as pd
 
-from .._core.progress import progress_line
-from .._core.speed import cores
-from ..plot import ramp_figure, stick_figure
-from ..problems.testbench import RampResult, ramp_cases, run_ramp, stick_sweep
-from ._output import Content, show_paths, show_table, write
+from ..identify import InputDesign, remarks, residual_tests
+from ..plot import Figure, comparison_figure, design_figure, fit_figure, profile_figure, result_figure, score_figure
+from ._outcome import FitOutcome, agreement_table, record_table
+from ._output import frame_of
 
-PARTS = {
-    "a": "a: Coulomb friction by sign(v)",
-    "b": "b: Coulomb friction, exact and regularised",
-    "c": "c: Karnopp's dead zone",
-    "d": "d: stiction, Stribeck effect and viscous friction, exact and regularised",
-    "e": "e: LuGre",
-}
+# Magnitude of a correlation above which its cell is marked.
+_STRONG = 0.9
 
 
-def report_testbench(out: Path) -> None:
-    """Run the bench, print its tables, write everything to `out`."""
-    show_paths(write(out, testbench_files()))
+def report_page(outcome: FitOutcome) -> str:
+    """The page. All text that comes from files or the command line is escaped."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("jaxmodsim.cli", "."), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    environment.filters |= {"html": _html, "png": _png}
+    result, measured = outcome.result, outcome.measured
+    first, *others = result.provenance.records
+    figures = [(first.name, result_figure(result, units={"measured": measured["unit"]}))]
+    figures += [(record.name, fit_figure(result, record=i, **measured)) for i, record in enumerate(others, 1)]
+    intervals = result.estimate.intervals()
+    parameters = [
+        (name, value, error, *intervals[name], start, unit)
+        for name, value, error, start, unit in result.estimate.rows()
+    ]
+    return environment.get_template("report.html.jinja").render(
+        outcome=outcome,
+        result=result,
+        records=record_table(outcome),
+        parameters=frame_of(parameters, "parameter", "value", "standard error", "95 % from", "to", "start", "unit"),
+        remarks=remarks(result),
+        held=", ".join(f"{name} = {value:.6g}" for name, value in outcome.held.items()),
+        figures=figures,
+        residual_tests=residual_tests(result),
+        strong=_STRONG,
+        scores=[(f"{x.score.record.name}, held out", score_figure(x, **measured), x) for x in outcome.predictions],
+        agreement=None if outcome.agreement is None else agreement_table(outcome.agreement),
+        comparison=_comparison(outcome),
+        profiles=[(profile, profile_figure(profile)) for profile in outcome.profiles],
+        design=None if outcome.design is None else _design(outcome.design, measured["unit"]),
+    )
 
 
-def testbench_files() -> dict[str, Content]:
-    """Run the bench and print its tables; returns figures, tables and JSON by file name."""
-    cases = ramp_cases()
-    with progress_line("test bench") as show, ThreadPoolExecutor(cores()) as pool:
-        grid_of_runs = pool.submit(stick_sweep)  # compiles longest
-        # Neighbours are alike: apart from each other, the second finds compiled what it needs.
-        apart = cases[::2] + cases[1::2]
-        for case, _ in zip(apart, pool.map(run_ramp, apart), strict=True):
-            show(f"{case.part}: {case.label}")
-        show("LuGre over sigma0 and sigma1")
-        sweep = grid_of_runs.result()
-    measured = [run_ramp(case) for case in cases]  # compiled by now, and timed alone
-    table, grid = _table(measured), _grid(sweep)
-    show_table(table, "A box of 2 kg under a force rising with time")
-    show_table(grid, "LuGre in stick over sigma0 and sigma1")
-    curves = _curves(measured)
-    files: dict[str, Content] = {
-        f"testbench_{part}.png": ramp_figure(title, [m.run for m in measured if m.case.part == part])
-        for part, title in PARTS.items()
+def _comparison(outcome: FitOutcome) -> dict[str, object] | None:
+    compared, unit = outcome.comparison, f"RMSE [{outcome.measured['unit']}]"
+    if compared is None:
+        return None
+    columns = {
+        "name": "model",
+        "parameters": "parameters",
+        "held_back": f"held out, {unit}",
+        "standard_error": "standard error",
+        "expected": f"new record, {unit}",
+        "over_the_best": "above the best",
+        "over_the_best_standard_error": "its standard error",
+        "start_fitted": f"start fitted, {unit}",
+        "fitted": f"fitted, {unit}",
+        "undetermined": "not determined",
     }
-    chosen = ((1, 0), (0, 0), (1, 2), (2, 0))
-    gaps = {
-        f"sigma0 {sweep['sigma0'][i]:g}, sigma1 {sweep['sigma1'][j]:g}": sweep["gap"][i, j] + sweep["t"]
-        for i, j in chosen
-    }
-    files["testbench_stick.png"] = stick_figure(
-        sweep["t"], gaps, sweep["t"], sweep["sigma0"], sweep["sigma1"], sweep["oscillation"]
-    )
-    files["testbench.csv"] = table
-    files["testbench_stick.csv"] = grid
-    files["testbench_curves.csv"] = curves
-    files["testbench.json"] = {"models": table.to_dict("records"), "stick": grid.to_dict("records")}
-    return files
+    table = pd.DataFrame(compared.table[: len(compared.ranked)])[list(columns)].astype({"start_fitted": float})
+    table["undetermined"] = [", ".join(each.undetermined) or "-" for each in compared.ranked]
+    sentences = [compared.conclusion, f"Held out: {compared.by}."]
+    sentences += [f"{name} failed: {reason}" for name, reason in compared.failures.items()]
+    sentences += [f"{name} was not finished." for name in compared.left]
+    return {"table": table.rename(columns=columns), "sentences": sentences, "drawing": comparison_figure(compared)}
 
 
-def _table(measured: list[RampResult]) -> pd.DataFrame:
-    return pd.DataFrame(
-        {
-            "part": [m.case.part for m in measured],
-            "model": [m.case.label for m in measured],
-            "away [s]": [m.break_away for m in measured],
-            "crossings": [m.crossings for m in measured],
-            "v(10 s) [m/s]": [float(m.run.velocity[-1]) if m.ok else float("nan") for m in measured],
-            "steps": [m.steps for m in measured],
-            "run [ms]": [round(m.milliseconds, 2) for m in measured],
-            "ending": [m.ending for m in measured],
-        }
-    )
+def _design(design: InputDesign, unit: str) -> dict[str, object]:
+    t, used = design.best.t, ", ".join(f"{name} {100 * share:.0f} %" for name, share in design.used.items())
+    sentences = [
+        f"{len(t)} samples over {t[-1] - t[0]:g} s; limits: {design.limits}; used: {used}.",
+        f"Assumed noise: {1e3 * design.noise:.4g} m{unit}, the residual of this fit.",
+        *design.remarks,
+    ]
+    table = frame_of(design.rows(), "parameter", "value", "predicted standard error", "of a plain sine", "unit")
+    return {"table": table, "sentences": sentences, "drawing": design_figure(design)}
 
 
-def _grid(sweep: dict[str, np.ndarray]) -> pd.DataFrame:
-    sigma0, sigma1 = np.meshgrid(sweep["sigma0"], sweep["sigma1"], indexing="ij")
-    return pd.DataFrame(
-        {
-            "sigma0 [N/m]": sigma0.ravel(),
-            "sigma1 [N s/m]": sigma1.ravel(),
-            "oscillation [mN]": 1e3 * sweep["oscillation"].ravel(),
-            "creep until 1.5 s [mm]": 1e3 * sweep["creep"].ravel(),
-            "v(10 s) [m/s]": sweep["speed10"].ravel(),
-            "steps": sweep["steps"].ravel(),
-        }
-    )
+def _html(frame: pd.DataFrame) -> str:
+    with pd.option_context("display.max_colwidth", None):
+        return frame.to_html(index=False, border=0, na_rep="-", float_format="{:.5g}".format)
 
 
-def _curves(measured: list[RampResult]) -> pd.DataFrame:
-    """Every curve of the figures, one row for each model and time."""
-    return pd.concat(
-        pd.DataFrame(
-            {
-                "part": m.case.part,
-                "model": m.case.label,
-                "t [s]": m.run.t,
-                "velocity [m/s]": m.run.velocity,
-                "applied [N]": m.run.applied,
-                "friction [N]": m.run.friction,
-            }
-        )
-        for m in measured
-    )
+def _png(figure: Figure) -> str:
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=110)
+    return base64.b64encode(drawn.getvalue()).decode("ascii")

@@ -1,4 +1,4 @@
-"""`jaxmodsim sweep`: many runs by a SPEC, into a store."""
+"""`jaxmodsim sweep`: many runs, as a SPEC says, into a store."""
 
 import logging
 import signal
@@ -7,129 +7,94 @@ import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from .._core.progress import progress_line
 from .._core.speed import tune_cpu
 from ..plot import map2d
-from ..sweeps import SweepPlan, SweepProgress, SweepWords, plan_sweep, sweep
-from ._options import Interrupted
-from ._output import say, show_paths, show_table, write
-from ._spec import Spec, read_spec
-from ._spec_scene import MODEL
+from ..sweeps import SweepPlan, SweepProgress, SweepProgressText, plan_sweep, sweep
+from ._options import Interrupted, SweepRequest
+from ._output import frame_of, say, show_paths, show_table, write
+from ._spec import SweepSpec, read_sweep_spec
+from ._toml import MODEL
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
-@dataclass(frozen=True)
-class SweepRequest:
-    """The arguments of `jaxmodsim sweep`, as they were typed; see its --help."""
-
-    spec: Path
-    out: Path | None
-    figure: Path | None
-    chunk: int | None
-    workers: int | None
-    scheduler: str | None
-    dry_run: bool
-
-
 def run_sweep(request: SweepRequest) -> None:
-    """Run what the SPEC says, print how it went, and draw what was asked for.
+    """Run the sweep of the SPEC, print a summary, and draw the figure.
 
     **Raises:**
 
-    - `ValueError` as `read_spec` and `sweep` do, and for options that do not go together.
-    - `Interrupted` after Ctrl-C, with what is kept.
+    - `ValueError` as `read_sweep_spec` and `sweep`, and for options that exclude each other.
+    - `Interrupted` after Ctrl-C, with the number of runs that are stored.
     """
-    _check(request)
+    if request.out is None and not request.dry_run:
+        raise ValueError("--out STORE is missing: the folder of the results, or --dry-run for none.")
+    if request.workers is not None and request.scheduler is not None:
+        raise ValueError("--workers and --scheduler exclude each other: the runs go to one cluster.")
+    if request.figure is not None and (request.figure.is_dir() or request.figure.suffix.lower() != ".png"):
+        raise ValueError(f"--figure must be a file that ends in .png, but it is {request.figure}.")
     try:
-        _run(request, read_spec(request.spec))
+        _run(request, read_sweep_spec(request.spec))
     except ImportError as error:  # of the extra
         raise ValueError(str(error)) from error
-    except Exception as error:  # whatever the functions of a file do
-        line = _line_of_model(error)
-        if line is None:
+    except Exception as error:  # the functions of a file may raise anything
+        file = getattr(sys.modules.get(MODEL), "__file__", None)
+        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+        if file is None or not frames:
             raise
+        line = f"{Path(file).name}, line {frames[-1].lineno}"
         raise ValueError(f"{line}: {type(error).__name__}: {error}") from error
 
 
-def _line_of_model(error: Exception) -> str | None:
-    """Where in the file of a SPEC an error comes from; None where it does not."""
-    file = getattr(sys.modules.get(MODEL), "__file__", None)
-    frames = traceback.extract_tb(error.__traceback__)
-    in_model = [frame for frame in frames if frame.filename == file]
-    return f"{Path(file).name}, line {in_model[-1].lineno}" if file is not None and in_model else None
-
-
-def _check(request: SweepRequest) -> None:
-    if request.out is None and not request.dry_run:
-        raise ValueError("--out STORE is missing: the folder that the results go to, or --dry-run for none.")
-    if request.workers is not None and request.scheduler is not None:
-        raise ValueError("--workers and --scheduler do not go together: the runs go to one cluster.")
-    if request.figure is not None and (request.figure.is_dir() or request.figure.suffix.lower() != ".png"):
-        raise ValueError(f"--figure must be a file that ends in .png, but it is {request.figure}.")
-
-
-def _run(request: SweepRequest, spec: Spec) -> None:
+def _run(request: SweepRequest, spec: SweepSpec) -> None:
     arguments: dict[str, Any] = {"chunk": request.chunk, **spec.run}
-    drawn = ""
-    if request.dry_run or request.figure is not None:
-        laid = plan_sweep(spec.system, spec.over, spec.observe, **arguments)
-        drawn = next(iter(laid.variables))
-        if request.figure is not None:
-            _check_figure(spec, laid, drawn)
-        if request.dry_run:
-            _show_plan(laid)
-            return
-    assert request.out is not None
-    seen: list[SweepProgress] = []
+    plan = plan_sweep(spec.system, spec.over, spec.observe, **arguments)
+    drawn = next(iter(plan.variables))
+    if request.figure is not None:
+        _check_figure(spec, plan, drawn)
+    if request.dry_run or request.out is None:
+        _show_plan(plan)
+        return
+    reports: list[SweepProgress] = []
     started = time.perf_counter()
     with _executor(request) as executor:
         try:
             with progress_line("sweep") as show:
-                words = SweepWords()
+                words = SweepProgressText()
 
                 def report(now: SweepProgress) -> None:
-                    seen.append(now)
+                    reports.append(now)
                     show(words(now))
 
-                results = sweep(
-                    spec.system,
-                    spec.over,
-                    spec.observe,
-                    out=request.out,
-                    executor=executor,
-                    progress=report,
-                    **arguments,
-                )
+                options = {"out": request.out, "executor": executor, "progress": report, **arguments}
+                results = sweep(spec.system, spec.over, spec.observe, **options)
         except KeyboardInterrupt:
-            if not seen:
+            if not reports:
                 raise
             raise Interrupted(
-                f"interrupted; {seen[-1].done:,} of {seen[-1].total:,} runs are kept in {request.out}, and the same"
-                " command goes on with the others"
+                f"interrupted; {reports[-1].done:,} of {reports[-1].total:,} runs are stored in {request.out}, and the"
+                " same command resumes the sweep"
             ) from None
-    _show_summary(results, seen, time.perf_counter() - started, request.out)
+    _show_summary(results, reports, time.perf_counter() - started, request.out)
     if request.figure is not None:
         figure = map2d(results, drawn, title=request.spec.stem)
         show_paths(write(request.figure.parent, {request.figure.name: figure}))
 
 
-def _check_figure(spec: Spec, laid: SweepPlan, name: str) -> None:
-    """Refuse what cannot be drawn before hours are spent on it."""
-    dims, _ = laid.variables[name]
-    if len(dims) != 2 or len(laid.dims) != 2:
+def _check_figure(spec: SweepSpec, plan: SweepPlan, name: str) -> None:
+    """Refuse a figure that cannot be drawn before the runs."""
+    dims, _ = plan.variables[name]
+    if len(dims) != 2 or len(plan.dims) != 2:
         raise ValueError(f"--figure needs a first variable over two dimensions, but {name!r} has {', '.join(dims)}.")
-    for dim, swept in laid.swept.items():
-        given = spec.over[dim]
-        values = np.asarray(given[swept[0]] if isinstance(given, dict) else given, float)
+    for dim, swept in plan.swept.items():
+        entry = spec.over[dim]
+        values = np.asarray(entry[swept[0]] if isinstance(entry, dict) else entry, float)
         steps = np.diff(values, axis=0)
         if values.ndim > 1 or values.size < 2 or not ((steps > 0).all() or (steps < 0).all()):
             raise ValueError(
@@ -140,14 +105,14 @@ def _check_figure(spec: Spec, laid: SweepPlan, name: str) -> None:
 
 @contextmanager
 def _executor(request: SweepRequest) -> Iterator[object]:
-    """A cluster, here or elsewhere; None for the threads of this process."""
+    """A local or remote cluster; None for the threads of this process."""
     if request.workers is None and request.scheduler is None:
         yield None
         return
     import cloudpickle
     from dask.distributed import Client, LocalCluster
 
-    if MODEL in sys.modules:  # workers do not have the file
+    if MODEL in sys.modules:  # workers cannot import the file
         cloudpickle.register_pickle_by_value(sys.modules[MODEL])
     if request.scheduler is not None:
         try:
@@ -157,7 +122,7 @@ def _executor(request: SweepRequest) -> Iterator[object]:
         with client:
             yield client
         return
-    # Ctrl-C reaches every process of the terminal; it is this one that ends the others, and what ends late is killed.
+    # Ctrl-C reaches every process of the terminal: the workers ignore it, and this process ends them.
     options: dict[str, Any] = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.ERROR}
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -169,24 +134,23 @@ def _executor(request: SweepRequest) -> Iterator[object]:
         yield client
 
 
-def _show_plan(laid: SweepPlan) -> None:
-    dims = [(name, size, ", ".join(laid.swept[name])) for name, size in laid.dims.items()]
-    show_table(pd.DataFrame(dims, columns=["dimension", "values", "what changes"]), "What would be swept")
-    kept = [(name, " x ".join(dims), unit or "-") for name, (dims, unit) in laid.variables.items()]
-    show_table(pd.DataFrame(kept, columns=["variable", "over", "unit"]), "What would be kept")
-    say(f"{laid.runs:,} runs, in {laid.chunks:,} chunks of up to {laid.runs_per_chunk:,}; nothing was run.")
+def _show_plan(plan: SweepPlan) -> None:
+    dims = [(name, size, ", ".join(plan.swept[name])) for name, size in plan.dims.items()]
+    show_table(frame_of(dims, "dimension", "values", "numbers that change"), "Dimensions")
+    variables = [(name, " x ".join(dims), unit or "-") for name, (dims, unit) in plan.variables.items()]
+    show_table(frame_of(variables, "variable", "over", "unit"), "Results")
+    say(f"{plan.runs:,} runs, in {plan.chunks:,} chunks of up to {plan.runs_per_chunk:,}; nothing was run.")
 
 
-def _show_summary(results: "xr.Dataset", seen: list[SweepProgress], seconds: float, out: Path) -> None:
+def _show_summary(results: "xr.Dataset", reports: list[SweepProgress], seconds: float, out: Path) -> None:
     codes, counts = np.unique(np.asarray(results["result"]), return_counts=True)
     sentences = results["result"].attrs["flag_meanings"]
     rows = [(f"{n:,}", sentences[code]) for code, n in zip(codes, counts, strict=True)]
-    show_table(pd.DataFrame(rows, columns=["runs", "how they ended"]), f"{seen[-1].total:,} runs")
-    now = seen[-1].done - seen[0].done
-    if now:
-        before = f", {seen[0].done:,} were there before" if seen[0].done else ""
-        say(f"{now:,} run in {seconds:.1f} s with compilation, {now / seconds:,.0f}/s{before}.")
-    else:
-        say("All were there before.")
+    first, last = reports[0], reports[-1]
+    show_table(frame_of(rows, "runs", "ending"), f"{last.total:,} runs")
+    if first.done:
+        say(f"{first.done:,} of {first.total:,} runs were already stored.")
+    if computed := last.done - first.done:
+        say(f"{computed:,} runs in {seconds:.1f} s with compilation, {computed / seconds:,.0f}/s.")
     size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
-    say(f"{out.resolve()}: {size / 1e6:,.3g} MB; read it by xarray.open_zarr.")
+    say(f"{out.resolve()}: {size / 1e6:,.3g} MB; open it with xarray.open_zarr.")

@@ -1,11 +1,11 @@
-"""Units of the columns of a record: as they were given, as the header says, or SI."""
+"""Units of the columns of a record: from --units, from the header, or SI."""
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from .._core.arguments import nearest
+from .._core.arguments import did_you_mean
 
 # SI units per unit, by quantity.
 _FACTORS = {
@@ -26,14 +26,14 @@ _SPELLINGS = {
     "sec": "s", "seconds": "s", "msec": "ms", "degree": "deg", "degrees": "deg", "1/min": "rpm", "min-1": "rpm",
     "turns": "rev", "volt": "V", "ampere": "A",
 }  # fmt: skip
-# What a column may hold. A drive signal becomes a force by a factor that must be given.
+# Quantities of each column. A drive signal needs a factor to become a force.
 _ROLES = {
     "time": ("time",),
     "position": ("length", "angle", "velocity", "angular velocity"),
     "force": ("force", "torque"),
 }
 _DRIVE = ("current", "voltage")
-# At the end of a name without brackets these mean something else as often: q_m, F_min, u_in.
+# At the end of a name without brackets, these often mean something else: q_m, F_min, u_in.
 _AMBIGUOUS = ("m", "in", "min", "h", "rev")
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)?\s*(.*?)\s*\Z", re.DOTALL)
 _IN_BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*\Z", re.DOTALL)
@@ -43,30 +43,28 @@ _IN_BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*\Z", re.DO
 class Unit:
     """A unit.
 
-    - `factor`: SI units per unit. `quantity`: None for a plain factor. `text`: as it was written.
-    - `scaled`: whether a number was given with it.
+    - `factor`: SI units per unit. `quantity`: None for a plain factor. `text`: as typed.
     """
 
     factor: float
     quantity: str | None
     text: str
-    scaled: bool = False
 
     @property
     def rotary(self) -> bool | None:
-        """Whether it belongs to a rotary axis; None for those that belong to any."""
+        """Whether the unit implies a rotary axis; None if it implies neither kind."""
         if self.quantity in ("angle", "angular velocity", "torque"):
             return True
         return False if self.quantity in ("length", "velocity", "force") else None
 
     @property
     def velocity(self) -> bool:
-        """Whether it is one of velocity."""
+        """Whether the unit is one of velocity."""
         return self.quantity in ("velocity", "angular velocity")
 
 
 def known_unit(text: str) -> Unit | None:
-    """The unit that is written so, in any usual spelling; None if it is none."""
+    """The unit with this name, in any usual spelling; None for another text."""
     plain = re.sub(r"[\s*·⋅.]", "", text.replace("µ", "u").replace("μ", "u").replace("°", "deg"))
     plain = _SPELLINGS.get(plain, plain)
     quantity = _QUANTITIES.get(plain)
@@ -74,7 +72,7 @@ def known_unit(text: str) -> Unit | None:
 
 
 def split_header(header: str) -> tuple[str, Unit | None]:
-    """Name and unit of a column: `phi [deg]`, `phi (deg)` or `phi_deg`; without a unit the header is the name."""
+    """Name and unit of a column: `phi [deg]`, `phi (deg)` or `phi_deg`. Without a unit, the header is the name."""
     brackets = _IN_BRACKETS.match(header)
     if brackets is not None:
         unit = known_unit(brackets[2] if brackets[2] is not None else brackets[3])
@@ -90,26 +88,26 @@ def split_header(header: str) -> tuple[str, Unit | None]:
     return header, None
 
 
-def given_units(texts: Sequence[str]) -> dict[str, Unit]:
-    """Read `time=ms,position=deg,force=12.5 N`.
+def parse_units(texts: Sequence[str]) -> dict[str, Unit]:
+    """Parse `time=ms,position=deg,force=12.5 N`.
 
     **Raises:**
 
-    - `ValueError` for a column or unit that is unknown, a unit of another quantity, and a factor of zero.
+    - `ValueError` for an unknown column or unit, a unit of another quantity, and a factor of zero.
     """
     units: dict[str, Unit] = {}
     for entry in (part for text in texts for part in text.split(",") if part.strip()):
         role, equals, text = (part.strip() for part in entry.partition("="))
         if role not in _ROLES or not equals:
             raise ValueError(
-                "--units needs COLUMN=UNIT with commas between, where COLUMN is time, position or force, as in"
+                "--units needs COLUMN=UNIT, separated by commas, where COLUMN is time, position or force, as in"
                 f" time=ms,position=deg,force=12.5, but {entry.strip()!r} was given."
             )
-        units[role] = _given(role, text)
+        units[role] = _parse_unit(role, text)
     return units
 
 
-def _given(role: str, text: str) -> Unit:
+def _parse_unit(role: str, text: str) -> Unit:
     match = _NUMBER.match(text)
     assert match is not None  # matches everything
     number, name = match[1], match[2]
@@ -117,63 +115,55 @@ def _given(role: str, text: str) -> Unit:
     if not (math.isfinite(factor) and factor != 0) or (number is None and not name):
         raise ValueError(f"--units {role}={text}: the factor must be finite and not zero.")
     if not name:
-        return Unit(factor, None, text, scaled=True)
-    # Newtons per ampere are newtons for each unit of the column.
+        return Unit(factor, None, text)
+    # N/A is newtons per unit of the column.
     unit = known_unit(name) or (known_unit(name.split("/")[0]) if role == "force" else None)
     allowed = [each for quantity in _ROLES[role] for each in _FACTORS[quantity]]
     if unit is None:
         raise ValueError(
             f"--units {role}={text}: there is no unit {name!r}; the units are: {', '.join(allowed)}."
-            f"{option_hint(name, allowed)}"
+            f"{did_you_mean(name, allowed)}"
         )
     if unit.quantity in _DRIVE:
-        raise ValueError(f"--units {role}={text}: {drive_sentence(unit)}")
+        raise ValueError(f"--units {role}={text}: {_drive_sentence(unit)}")
     if unit.quantity not in _ROLES[role]:
         raise ValueError(
             f"--units {role}={text}: {name} is a unit of {unit.quantity}; the units are: {', '.join(allowed)}."
         )
-    return Unit(factor * unit.factor, unit.quantity, text, scaled=number is not None)
+    return Unit(factor * unit.factor, unit.quantity, text)
 
 
-def option_hint(name: str, allowed: Iterable[str]) -> str:
-    """A question whether the nearest one was meant, written as on the command line; "" where none is near."""
-    near = nearest(name, allowed)
-    return f" Did you mean {near}?" if near else ""
-
-
-def drive_sentence(unit: Unit) -> str:
-    """What is missing where a drive signal stands for the force."""
+def _drive_sentence(unit: Unit) -> str:
+    """Error for a drive signal in the place of the force."""
     return (
-        f"{unit.text} is a unit of {unit.quantity}, from which the force follows by a factor: give the newtons (or N m)"
-        f" for each {unit.text} of the column, as in --units force=12.5."
+        f"{unit.text} is a unit of {unit.quantity}, which needs a factor to become a force: give the newtons (or N m)"
+        f" per {unit.text} of the column, as in --units force=12.5."
     )
 
 
-def column_unit(role: str, header: str, given: Unit | None) -> tuple[Unit, str]:
-    """The unit of a column, and a sentence where the header contradicts what was given; "" where it does not.
+def column_unit(role: str, header: str, option: Unit | None) -> tuple[Unit, str]:
+    """The unit of a column, and a note if the header contradicts the `option` --units, else "".
 
     **Raises:**
 
-    - `ValueError` for a header with the unit of a drive signal, or of another quantity, where nothing was given.
+    - `ValueError` without the option, for a header with the unit of a drive signal or of another quantity.
     """
     in_header = split_header(header)[1]
-    if given is None:
+    if option is None:
         if in_header is None:
             return Unit(1.0, None, ""), ""
         if role == "force" and in_header.quantity in _DRIVE:
-            raise ValueError(f"column {header!r}: {drive_sentence(in_header)}")
+            raise ValueError(f"column {header!r}: {_drive_sentence(in_header)}")
         if in_header.quantity not in _ROLES[role]:
             raise ValueError(
                 f"column {header!r} is in {in_header.text}, a unit of {in_header.quantity}, and cannot be the {role}."
                 f" Name another column by --{role}, or the unit by --units {role}=UNIT."
             )
         return in_header, ""
-    quantity = given.quantity or (in_header.quantity if in_header and in_header.quantity in _ROLES[role] else None)
-    unit = Unit(given.factor, quantity, given.text, given.scaled)
+    quantity = option.quantity or (in_header.quantity if in_header and in_header.quantity in _ROLES[role] else None)
+    unit = Unit(option.factor, quantity, option.text)
     if in_header is None or in_header.quantity in _DRIVE:
         return unit, ""
     if in_header.quantity == unit.quantity and math.isclose(abs(in_header.factor), abs(unit.factor), rel_tol=1e-9):
         return unit, ""
-    return unit, (
-        f"column {header!r} says {in_header.text}, but --units {role}={given.text} was given: what was given is taken."
-    )
+    return unit, f"column {header!r} says {in_header.text}, but --units {role}={option.text} takes precedence."

@@ -9,13 +9,13 @@ import numpy as np
 
 from ._program import Assign, Block, Choice, Entry, Loop, Program, Symbol
 
-# Written alike in both languages; operands are names or literals.
+# Forms that are the same in both languages; operands are names or literals.
 _FORMS = {
     **{"add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}", "copy": "{0}"},
     **{"lt": "{0} < {1}", "le": "{0} <= {1}", "gt": "{0} > {1}", "ge": "{0} >= {1}"},
     **{"eq": "{0} == {1}", "ne": "{0} != {1}", "and": "{0} && {1}", "or": "{0} || {1}", "xor": "{0} != {1}"},
     "not": "!{0}",
-    # The difference of an infinite number with itself is NaN.
+    # inf - inf is NaN.
     "is_finite": "{0} - {0} == 0",
     "select_n": "{0} ? {2} : {1}",
     "sign": "{0} > 0 ? 1 : {0} < 0 ? -1 : {0}",
@@ -29,13 +29,13 @@ _ON_BOTH |= {"exp", "expm1", "log", "log1p", "sqrt", "cbrt", "floor", "ceil", "p
 
 
 class Language(NamedTuple):
-    """How a language writes what the two do not write alike.
+    """The forms in which a language differs from the other.
 
-    - `name`: to call it by.
-    - `types`: of the scalars that it has, by kind and size of NumPy's types; "" where none is written.
+    - `name`: of the language.
+    - `types`: names of scalar types, by kind and size of NumPy's types; "" if declarations have none.
     - `functions`: by the operations of JAX.
     - `suffixes`: of literals and functions, by type.
-    - `constant`, `variable`: words before the declaration of a name with its type, or without.
+    - `constant`, `variable`: keywords of declarations.
     - `specials`: booleans, infinity and NaN.
     """
 
@@ -52,7 +52,7 @@ class Language(NamedTuple):
 
         **Raises:**
 
-        - `ValueError` naming a type that the language has not.
+        - `ValueError` naming an unsupported type.
         """
         kind = "i" if dtype.kind in "iu" else dtype.kind + str(8 * dtype.itemsize)
         if kind not in self.types:
@@ -60,7 +60,7 @@ class Language(NamedTuple):
         return self.types[kind]
 
     def literal(self, x: np.generic) -> str:
-        """A number that reads back as it is."""
+        """A literal with the exact value of a number."""
         if x.dtype.kind == "b":
             return self.specials["true" if x else "false"]
         if x.dtype.kind in "iu":
@@ -71,11 +71,11 @@ class Language(NamedTuple):
         return self.specials["nan"] if math.isnan(value) else str(x) + self.suffixes.get(self.type_of(x.dtype), "")
 
     def expression(self, assign: Assign, operands: list[str]) -> str:
-        """The operation.
+        """An operation as an expression.
 
         **Raises:**
 
-        - `ValueError` naming an operation that the language has not.
+        - `ValueError` naming an unsupported operation.
         """
         name, dtype = assign.name, assign.operands[0].dtype
         integer = dtype.kind in "iu"
@@ -94,7 +94,7 @@ class Language(NamedTuple):
         return f"{self.functions[name]}{self.suffixes.get(self.type_of(dtype), '')}({', '.join(operands)})"
 
     def conversion(self, old: np.dtype, new: np.dtype, x: str) -> str:
-        """The same number in another type."""
+        """A number converted to another type."""
         if old.kind == "b":
             return f"{x} ? 1 : 0"
         if new.kind == "b":
@@ -129,11 +129,11 @@ JAVASCRIPT = Language(
 
 
 def write_program(program: Program, outputs: list[str], language: Language, indent: str) -> list[str]:
-    """Lines of code that compute the results of a program, and put each where `outputs` say, or "return" it.
+    """Lines of code that compute the results of a program and assign them to `outputs`, or "return" them.
 
     **Raises:**
 
-    - `ValueError` naming an operation or a type that the language has not.
+    - `ValueError` naming an unsupported operation or type.
     """
     text = _BlockText(language)
     lines = text.block(program.block, indent)
@@ -143,7 +143,7 @@ def write_program(program: Program, outputs: list[str], language: Language, inde
 
 
 class _BlockText:
-    """Writes statements, and gives names to their results."""
+    """Writes statements and names their results."""
 
     def __init__(self, language: Language) -> None:
         self.language = language
@@ -183,7 +183,7 @@ class _BlockText:
         yield from self.block(loop.head, "  ")
         yield f"  if (!{self.value(loop.condition)}) break;"
         yield from self.block(loop.body, "  ")
-        # What another carry was in this pass is read before that is changed.
+        # A value that is another carry is copied before that carry changes.
         changed = {carry.symbol for carry in loop.carries}
         after = []
         for carry in loop.carries:

@@ -1,4 +1,4 @@
-"""A traced function as a list of statements on scalars: what there is to write in another language."""
+"""A traced function as a list of statements on scalars, for translation to another language."""
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
@@ -16,13 +16,13 @@ from .._core.scalarise import AbstractScalars, AbstractSymbol, Params, Parts, Va
 _COMPARISONS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
 _FOLDS = {"reduce_max": jax.lax.max, "reduce_min": jax.lax.min}
 _FOLDS |= {"reduce_and": jax.lax.bitwise_and, "reduce_or": jax.lax.bitwise_or}
-# What only moves entries, whose places are known.
+# Operations that move entries to known positions.
 _INDEXED = {"gather", "scatter", "dynamic_slice", "dynamic_update_slice"}
 _FUNCTIONS = {"custom_jvp_call", "custom_vjp_call"}
 
 
 class Symbol(AbstractSymbol):
-    """A scalar of the program: a result of a statement, or an argument, which has its name from the beginning."""
+    """A scalar of the program: the result of a statement, or an argument, which already has a name."""
 
     def __init__(self, dtype: np.dtype, name: str | None = None) -> None:
         self.dtype = np.dtype(dtype)
@@ -41,7 +41,7 @@ class Assign(NamedTuple):
 
 
 class Carry(NamedTuple):
-    """What a loop carries: `symbol` is `start` in the first pass and `after` in the next one."""
+    """A variable of a loop: `symbol` is `start` in the first iteration and `after` in the next one."""
 
     symbol: Symbol
     start: Entry
@@ -49,7 +49,7 @@ class Carry(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """At most `bound` passes, each of `head`, an end of the loop unless `condition`, and `body`."""
+    """At most `bound` iterations of `head`, an exit unless `condition` is true, and `body`."""
 
     bound: int
     carries: list[Carry]
@@ -59,7 +59,7 @@ class Loop(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """The arm with the number `chosen`, or else the last one; each a block with the values that it gives to `outs`."""
+    """The arm with the index `chosen`, or else the last one; each arm is a block with the values of `outs`."""
 
     chosen: Entry
     outs: list[Symbol]
@@ -71,30 +71,30 @@ Block: TypeAlias = list[Statement]
 
 
 class Program(NamedTuple):
-    """Statements, and the results that they lead to."""
+    """Statements and their results."""
 
     block: Block
     results: list[Entry]
 
 
 def program_of(closed: ClosedJaxpr, arguments: Sequence[Symbol]) -> Program:
-    """The statements of a traced function whose arguments are scalars, without those that nothing depends on.
+    """The statements of a traced function of scalars, without those that do not affect a result.
 
     **Raises:**
 
-    - `ValueError` naming an operation that is not known here.
-    - `RuntimeError` where this release of JAX shows no statements.
+    - `ValueError` naming an unknown operation.
+    - `RuntimeError` if this release of JAX does not provide the traced statements.
     """
     if "jaxprs" not in AVAILABLE:
         raise RuntimeError(
-            "to_c and to_javascript read functions that JAX has traced, by jax.extend.core, which differs in"
+            "to_c and to_javascript read traced functions by jax.extend.core, which is different in"
             f" jax {jax.__version__}. Install jax>=0.10,<0.11."
         )
     writer = _StatementWriter()
     inputs: list[Value] = [_scalar_array(x) for x in arguments]
     outputs = writer.run(closed.jaxpr, closed.consts, inputs)
     results = [x for each in outputs for x in writer.parts(each).flat]
-    # Results are written over the arguments: what is an argument itself is read before.
+    # Results overwrite arguments: a result that is an argument itself is copied first.
     copied = [writer.assign("copy", [x]) if isinstance(x, Symbol) and x.name else x for x in results]
     return Program(_needed(writer.block, set(filter(_is_symbol, copied))), copied)
 
@@ -114,7 +114,7 @@ def _is_symbol(x: object) -> bool:
 
 
 class _StatementWriter(AbstractScalars):
-    """Writes a statement for every scalar that is not known."""
+    """Writes a statement for every scalar that is not a constant."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -128,7 +128,7 @@ class _StatementWriter(AbstractScalars):
         return out
 
     def scalar(self, compute: Callable[..., Any], name: str, params: Params, operands: list[Any]) -> Any:
-        """A statement, or what is the same without one."""
+        """A statement, or an equal value without one."""
         if all(map(is_constant, operands)):
             return np.asarray(compute(*operands, **params))[()]
         first = operands[0]
@@ -169,16 +169,16 @@ class _StatementWriter(AbstractScalars):
         return self.assign("add" if name == "add_any" else name, operands)
 
     def converted(self, compute: Callable[..., Value], x: Symbol, params: Params) -> Value:
-        """In another type; numbers to choose from are, and not what is chosen."""
-        made = self.origin.get(x)
-        if made is None or made.name != "select_n" or not all(map(is_constant, made.operands[1:])):
+        """Convert to another type; of a selection from constants, the constants are converted."""
+        origin = self.origin.get(x)
+        if origin is None or origin.name != "select_n" or not all(map(is_constant, origin.operands[1:])):
             return self.assign("convert_element_type", [x], np.dtype(params["new_dtype"]))
-        chosen, *cases = made.operands
+        chosen, *cases = origin.operands
         cases = [self.scalar(compute, "convert_element_type", params, [case]) for case in cases]
         return self.apply(jax.lax.select_n, "select_n", {}, [chosen, *cases])
 
     def power(self, x: Value, exponent: int) -> Value:
-        """By products, as JAX computes it."""
+        """Products, in the order of JAX."""
         out: Value = _one(x.dtype)
         for digit in bin(abs(exponent))[:1:-1]:
             if digit == "1":
@@ -187,7 +187,7 @@ class _StatementWriter(AbstractScalars):
         return out if exponent >= 0 else self.apply(jax.lax.div, "div", {}, [_one(x.dtype), out])
 
     def whole(self, eqn: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
-        """Loops, branches, calls, and what moves entries to places that are known."""
+        """Loops, branches, calls, and operations that move entries to known positions."""
         name, params = eqn.primitive.name, eqn.params
         if name in _FUNCTIONS:
             called = params["call_jaxpr"]
@@ -219,7 +219,7 @@ class _StatementWriter(AbstractScalars):
         return out
 
     def move(self, eqn: JaxprEqn, inputs: list[Value], known: list[np.ndarray | None]) -> Parts:
-        """Entries of the operand and the updates where the operation takes their numbers to."""
+        """The entries of the operands, rearranged as the operation rearranges their indices."""
         entries: list[Any] = []
         numbered: list[Any] = []
         for x, places in zip(inputs, known, strict=True):
@@ -237,7 +237,7 @@ class _StatementWriter(AbstractScalars):
 
     @contextmanager
     def inner_block(self) -> Iterator[Block]:
-        """A block of its own: what is computed in it is not known after it."""
+        """A nested block; its results are not available after it."""
         block, memory = self.block, self.memory
         self.block, self.memory = [], dict(memory)
         try:
@@ -246,7 +246,7 @@ class _StatementWriter(AbstractScalars):
             self.block, self.memory = block, memory
 
     def loop(self, params: Params, inputs: list[Value]) -> list[Value]:
-        """A loop that counts its passes up to a limit."""
+        """A loop with a bounded number of iterations."""
         test, body = params["cond_jaxpr"], params["body_jaxpr"]
         n_test, n_body = params["cond_nconsts"], params["body_nconsts"]
         test_consts, body_consts = inputs[:n_test], inputs[n_test : n_test + n_body]
@@ -266,15 +266,15 @@ class _StatementWriter(AbstractScalars):
         return list(symbols)
 
     def bound(self, condition: Entry, carries: list[Carry]) -> int:
-        """Most passes of a loop, from a counter that the condition compares with a limit."""
-        found, open_ = [], [condition]
-        while open_:
-            x = open_.pop()
+        """Largest number of iterations, from a counter that the condition compares with a constant."""
+        bounds, conjuncts = [], [condition]
+        while conjuncts:
+            x = conjuncts.pop()
             if not isinstance(x, Symbol) or x not in self.origin:
                 continue
             _, name, operands = self.origin[x]
             if name == "and":
-                open_ += operands
+                conjuncts += operands
             if name != "lt" or not is_constant(operands[1]):
                 continue
             for carry in carries:
@@ -283,13 +283,13 @@ class _StatementWriter(AbstractScalars):
                 if operands[0] is carry.symbol and is_constant(carry.start) and step is not None and counts:
                     by = step.operands[1]
                     if is_constant(by) and by == 1:
-                        found.append(int(np.asarray(operands[1])) - int(np.asarray(carry.start)))
-        if not found:
-            raise ValueError("while, a loop without a known limit of its passes")
-        return min(found)
+                        bounds.append(int(np.asarray(operands[1])) - int(np.asarray(carry.start)))
+        if not bounds:
+            raise ValueError("while, a loop without a known limit of its iterations")
+        return min(bounds)
 
     def branch(self, branches: Sequence[ClosedJaxpr], inputs: list[Value]) -> list[Value]:
-        """Arms of which one is taken."""
+        """Arms, one of which is executed."""
         (index,) = self.parts(inputs[0]).flat
         if is_constant(index):
             chosen = branches[int(np.clip(int(index), 0, len(branches) - 1))]
@@ -305,7 +305,7 @@ class _StatementWriter(AbstractScalars):
 
 
 def _symbols(like: np.ndarray, dtype: np.dtype | None = None) -> Parts:
-    """New symbols, of the types of these entries."""
+    """New symbols with the types of these entries."""
     out = np.empty(like.shape, object)
     for i in np.ndindex(*like.shape):
         out[i] = Symbol(like[i].dtype if dtype is None else dtype)
@@ -313,7 +313,7 @@ def _symbols(like: np.ndarray, dtype: np.dtype | None = None) -> Parts:
 
 
 def _known_array(x: Value) -> np.ndarray | None:
-    """An array all of whose entries are known; None for others."""
+    """A constant array; None if any entry is not constant."""
     if not isinstance(x, np.ndarray) or not is_apart(x):
         return np.asarray(x)
     if x.size == 0 or not all(map(is_constant, x.flat)):
@@ -322,7 +322,7 @@ def _known_array(x: Value) -> np.ndarray | None:
 
 
 def _needed(block: Block, live: set[Symbol]) -> Block:
-    """The statements on which the symbols `live` depend; what these need from before the block is added to `live`."""
+    """The statements on which the symbols `live` depend; adds their inputs to `live`."""
     kept: Block = []
     for statement in reversed(block):
         if isinstance(statement, Assign):
@@ -346,7 +346,7 @@ def _needed(block: Block, live: set[Symbol]) -> Block:
 
 
 def _needed_loop(loop: Loop, live: set[Symbol]) -> Loop:
-    """With the carries alone that the results or its end depend on."""
+    """The loop with those carries alone that affect its results or its end."""
     _add(live, [loop.condition])
     head, body, carries, size = [], [], [], -1
     while size < len(live):

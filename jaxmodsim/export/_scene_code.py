@@ -1,4 +1,4 @@
-"""A scene as C99, for a drive or a controller, and as JavaScript, for a page."""
+"""A scene as C99, for a drive or controller, and as JavaScript, for a web page."""
 
 import json
 import re
@@ -68,13 +68,13 @@ const {name} = (() => {{
 
 
 class _Routine(NamedTuple):
-    """A function to write.
+    """A function of the generated code.
 
-    - `purpose`: what it does, for the comment above it.
-    - `times`: names of its first arguments, which the numbers p and the state y follow.
-    - `extra`: name and size of an array that it fills, or none.
-    - `results`: where its results go.
-    - `fn`: `fn(scene, y, *times)` -> a pytree of as many numbers.
+    - `purpose`: the comment above it.
+    - `times`: names of its first arguments; the numbers p and the state y follow.
+    - `extra`: name and size of an array for its results, or None.
+    - `results`: the variables of its results.
+    - `fn`: `fn(scene, y, *times)` -> a pytree of these results.
     """
 
     name: str
@@ -86,25 +86,25 @@ class _Routine(NamedTuple):
 
 
 def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
-    """C99 of a scene: its right-hand side, steps of `ImplicitFriction`, and a feed-forward of its friction.
+    """C99 code of a scene: its right-hand side, steps of `ImplicitFriction`, and a friction feed-forward.
 
-    For a drive: put the text into `NAME.c` of its project, and the prototypes at its head into a header. The functions
-    allocate nothing, have no state of their own, and every loop has a limit that stands in the code:
+    For a drive, copy the text to `NAME.c` of its project, and the prototypes at its beginning to a header. The
+    functions allocate no memory and have no internal state, and every loop has a constant bound:
 
     - `NAME_rate(t, p, y, rate)`: rates of the state `y`, for an observer or another solver.
-    - `NAME_step(t0, t1, p, y)`: one step of `ImplicitFriction`, in place; 0 where its equations were not solved.
-    - `NAME_run(t, h, steps, p, y)`: such steps one after another, those of `simulate(..., dt=h)`.
-    - `NAME_friction(t0, t1, p, y, force)`, where there is friction: what the drive adds in every cycle to make up for
-      it. Put the planned coordinates and velocities into `y`; the states of the laws in there are moved on.
+    - `NAME_step(t0, t1, p, y)`: one step of `ImplicitFriction`, in place; returns 0 if its equations were not solved.
+    - `NAME_run(t, h, steps, p, y)`: several steps, the same as `simulate(..., dt=h)`.
+    - `NAME_friction(t0, t1, p, y, force)`, for scenes with friction: the force that compensates friction in each cycle.
+      Write the planned coordinates and velocities to `y`; the function advances the states of the laws in `y`.
 
-    `p` are the numbers of the scene by the names of an enumeration, `p[NAME_p_friction_Fc]`; begin with those that it
-    was written with, `NAME_numbers`, and with the state at rest, `NAME_rest`. What is measured or commanded in every
-    cycle, a torque or a temperature, is such a number. Where nothing depends on the time itself, give the times 0 and
-    h, which keep their digits however long it runs.
+    `p` has the numbers of the scene at the indices of an enumeration, `p[NAME_p_friction_Fc]`. Initial values are
+    `NAME_numbers`, the numbers of the exported scene, and `NAME_rest`, the state at rest. An input of each cycle, such
+    as a torque or a temperature, is a number in `p`. If nothing depends on time explicitly, pass the times 0 and h,
+    which avoids rounding of large times.
 
-    Numbers are `double` for a scene of float64 and `float` for one of float32, for units without `double`. An
-    evaluation is that of JAX to four units in the last place of its terms, if the compiler neither reorders sums nor
-    takes NaN for impossible (no `-ffast-math`).
+    Numbers are `double` for a scene in float64 and `float` for one in float32, for units without `double`. Results
+    equal those of JAX to four units in the last place of their terms, if the compiler neither reorders sums nor ignores
+    NaN (no `-ffast-math`).
 
     ```c
     static double y[press_Y], u[press_DOF];        /* q, qd, bristle; begins as a copy of press_rest */
@@ -115,10 +115,10 @@ def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
 
     **Arguments:**
 
-    - `scene`: the `Scene`. Set-valued laws in the wrapper `Regularized`; no constraints; in the place of a `Signal` a
-      number, which the caller sets.
+    - `scene`: the `Scene`. Set-valued laws need the wrapper `Regularized`. Constraints are not supported; replace a
+      `Signal` by a number, which the caller sets.
     - `dof`: number of coordinates.
-    - `name`: what the names in the code begin with, an identifier.
+    - `name`: prefix of the names in the code, an identifier.
 
     **Returns:**
 
@@ -126,17 +126,17 @@ def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
 
     **Raises:**
 
-    - `ValueError` naming what cannot be written: an operation of JAX, a loop without a limit, a friction element that
-      `ImplicitFriction` does not take, a constraint, a `Signal`; for a name that is no identifier.
+    - `ValueError` for an unsupported operation of JAX, a loop without a bound, a friction element that
+      `ImplicitFriction` does not support, a constraint, a `Signal`, and a name that is not an identifier.
     """
     return _scene_code(scene, dof, name, C, "to_c")
 
 
 def to_javascript(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
-    """JavaScript of a scene in float64: an object with the functions of `to_c`.
+    """JavaScript code of a scene in float64: an object with the functions of `to_c`.
 
-    `NAME.step(t0, t1, p, y)` and the others take arrays of numbers; `NAME.names` and `NAME.numbers` are the names and
-    values of p, `NAME.states` the names of y, `NAME.rest` its values at rest.
+    `NAME.step(t0, t1, p, y)` and the others take arrays of numbers. `NAME.names` and `NAME.numbers` are the names and
+    values of p, `NAME.states` the names of y, and `NAME.rest` its values at rest.
 
     **Arguments:**
 
@@ -148,7 +148,7 @@ def to_javascript(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
 
     **Raises:**
 
-    - `ValueError` as `to_c`, and for a scene of float32, which JavaScript has not.
+    - `ValueError` as `to_c`, and for a scene in float32, which JavaScript does not support.
     """
     return _scene_code(scene, dof, name, JAVASCRIPT, "to_javascript")
 
@@ -161,12 +161,12 @@ def _scene_code(scene: Scene, dof: int, name: str, language: Language, caller: s
     dof = as_whole(dof, name="dof")
     if scene.constraints:
         raise ValueError(
-            f"{caller} writes scenes without constraints, but there are {', '.join(map(repr, scene.constraint_names))}:"
-            " choose coordinates that are independent."
+            f"{caller} does not support constraints, but the scene has {', '.join(map(repr, scene.constraint_names))}:"
+            " use independent coordinates."
         )
     if signals_of(scene.params):
         raise ValueError(
-            f"{caller} does not write a Signal: put a number in its place, which the caller sets before every step."
+            f"{caller} does not support a Signal: replace it by a number, which the caller sets before every step."
         )
     check_step(scene)
     start = jnp.zeros(dof, jnp.result_type(*(jtu.tree_leaves(scene) or [float])))
@@ -182,7 +182,9 @@ def _scene_code(scene: Scene, dof: int, name: str, language: Language, caller: s
         return _JAVASCRIPT_TEXT.format(**fields, **names, exported=", ".join(text))
     places = {f"{name}_p_{re.sub('[^0-9A-Za-z]+', '_', each).strip('_')}": each for each in elements(scene)}
     if len(places) < len(elements(scene)):
-        raise ValueError(f"{caller}: numbers of the scene come to one name in C: {', '.join(elements(scene))}.")
+        raise ValueError(
+            f"{caller}: several numbers of the scene have the same name in C: {', '.join(elements(scene))}."
+        )
     real = language.type_of(start.dtype)
     run = f"int {name}_run({real} t, {real} h, long steps, const {real} p[{name}_P], {real} y[{name}_Y])"
     return _C_TEXT.format(
@@ -230,7 +232,7 @@ def _routines(scene: Scene, y: State) -> list[_Routine]:
 
 
 def _friction_feed_forward(scene: Scene, y: State, t0: Scalar, t1: Scalar) -> tuple[PerDof, dict[str, PyTree]]:
-    """Generalised force [N or N m] against friction, and the states of the laws after the time from t0 to t1."""
+    """Generalised force [N or N m] that compensates friction, and the states of the laws at t1."""
     scene = scene.bind_state(t0, y.q, y.qd)
     total, after = jnp.zeros_like(y.q), dict(y.z)
     for name, effect in scene.friction.items():
@@ -260,9 +262,9 @@ def _routine_text(routine: _Routine, scene: Scene, y: State, language: Language,
         lines = write_program(program, routine.results, language, "    " if javascript else "  ")
     except ValueError as error:
         raise ValueError(
-            f"{caller} cannot write {error}, which `{routine.name}` of the scene needs. It writes arithmetic,"
-            " elementary functions and choices (jnp.where) of single numbers and of small arrays: make that part of"
-            " the Lagrangian, force or law of these."
+            f"{caller} does not support {error}, which `{routine.name}` of the scene needs. It supports arithmetic,"
+            " elementary functions and choices (jnp.where) of scalars and small arrays: express the Lagrangian, force"
+            " or law by these."
         ) from error
     if javascript:
         arguments = ", ".join([*routine.times, "p", "y", *([routine.extra[0]] if routine.extra else [])])
@@ -284,7 +286,7 @@ def _c_signature(routine: _Routine, name: str, real: str) -> str:
 
 
 def _filled(like: PyTree, entries: list[Array]) -> PyTree:
-    """The pytree with these scalars for the entries of its arrays."""
+    """The pytree with these scalars as the entries of its arrays."""
     leaves, left = [], iter(entries)
     for leaf in jtu.tree_leaves(like):
         part = [next(left) for _ in range(np.size(leaf))]
@@ -293,7 +295,7 @@ def _filled(like: PyTree, entries: list[Array]) -> PyTree:
 
 
 def _state_names(y: State) -> list[str]:
-    """Names of the entries of a state: q[0], qd[0], and friction.z of the law's own."""
+    """Names of the entries of a state: q[0], qd[0], and friction.z for the state of a law."""
     names = []
     for path, leaf in jtu.tree_leaves_with_path(y):
         words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]

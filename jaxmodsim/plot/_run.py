@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..scene import Friction, quantity_of
+from ..scene import quantity_of
 from ..simulation import Trajectory
 from ._style import COLOURS, GREY, Figure, legend_beside, panel_letters
 
@@ -44,7 +44,7 @@ def run(trajectory: Trajectory) -> Figure:
             name, unit = quantity_of(scene, f"{kind}[{i}]")
             by_unit.setdefault(unit, {})[name] = table.values[name]
         panels += by_unit.items()
-    elements = [name for name, x in zip(scene.names, scene.effects, strict=True) if isinstance(x, Friction)]
+    elements = list(scene.friction)
     of_element = {len(panels) + i: name for i, name in enumerate(elements)}
     for name in elements:
         parts = {key: x for key, x in table.values.items() if key == name or key.startswith(f"{name}[")}

@@ -1,4 +1,4 @@
-"""How many steps the runs of a sweep take, found out by running a few of them first."""
+"""Prediction of the number of steps of each run of a sweep, from a trial of a few runs."""
 
 from dataclasses import dataclass, replace
 from math import comb
@@ -9,19 +9,19 @@ from ._compute import Work, compute, runs_per_call
 from ._grid import Grid
 from ._run import CAP, out_of_steps
 
-# Part of all runs that the trial takes at most.
+# The trial has at most 1/16 of the runs.
 _SHARE = 16
-# By what the number of steps grows that runs may take before they are set aside.
+# Factor by which the cap of the trial grows.
 _GROWTH = 8
-# Sweeps of fewer runs are run without a look ahead.
+# Smaller sweeps have no trial.
 _SMALL = 1024
-# Part of the runs that may come to the cap.
+# Largest share of runs that may reach the cap.
 _LATE = 0.05
-# Runs of the trial for each coefficient of the prediction.
+# Runs of the trial per coefficient of the prediction.
 _PER_COEFFICIENT = 4
-# Part of the trace that is added to the normal equations, which may be singular.
+# Ridge of the normal equations, which may be singular, relative to their trace.
 _RIDGE = 1e-10
-# Ratio of the largest to the smallest of values that are all positive from which their logarithm counts.
+# Ratio of the largest to the smallest positive value above which the prediction uses the logarithm.
 _WIDE = 5.0
 
 
@@ -29,8 +29,8 @@ _WIDE = 5.0
 class Prediction:
     """Logarithm of the number of steps as a polynomial in the numbers of a run.
 
-    - `names`: of the numbers; `logs`: whether the logarithm is taken; `centre`, `scale`: of each.
-    - `coefficients`: of all products of up to `degree` of them.
+    - `names`: the numbers; `logs`: whether to use the logarithm; `centre`, `scale`: for normalisation.
+    - `coefficients`: of all products of up to `degree` numbers.
     """
 
     names: tuple[str, ...]
@@ -41,17 +41,17 @@ class Prediction:
     coefficients: np.ndarray
 
     def order(self, numbers: dict[str, np.ndarray]) -> np.ndarray:
-        """The runs, those of the fewest steps first."""
+        """Indices of the runs, those with the fewest steps first."""
         x = (_columns(numbers, self.names, self.logs) - self.centre) / self.scale
         steps = np.einsum("nk,k->n", _products(x, self.degree), self.coefficients)
         return np.argsort(steps, kind="stable")
 
 
 def predict_steps(work: Work, grid: Grid, runs: int) -> tuple[Work, Prediction | None]:
-    """Choose after how many steps runs are set aside, and how to sort them; neither where the limit is not known.
+    """Choose the cap of steps and the order of the runs; neither if the limit of steps is unknown.
 
-    The trial has as many runs as one call of compiled code takes in blocks of so many `runs`: drawn at random, but
-    always the same ones. The results do not depend on it.
+    The trial fills one call of compiled code for blocks of `runs`. Its runs are drawn at random with a fixed seed. The
+    results of the sweep do not depend on it.
     """
     limit = work.run.max_steps
     if limit is None:
@@ -63,7 +63,7 @@ def predict_steps(work: Work, grid: Grid, runs: int) -> tuple[Work, Prediction |
     drawn = np.unique(np.random.default_rng(0).integers(grid.size, size=count))
     numbers = grid.numbers_at(drawn)
     while True:
-        # Runs that come to the cap are not run again here.
+        # Without a second computation of the runs that reach the cap.
         trial = compute(replace(work, run=work.run.within(cap), cap=None), numbers, np.arange(drawn.size))
         if cap == limit or out_of_steps(trial.code).mean() <= _LATE:
             break
@@ -79,7 +79,7 @@ def _prediction(numbers: dict[str, np.ndarray], steps: np.ndarray) -> Prediction
     x = (x - centre) / scale
     degree = max(d for d in (0, 1, 2, 3) if comb(x.shape[1] + d, d) * _PER_COEFFICIENT <= steps.size)
     products = _products(x, degree)
-    # Sums by einsum: threads of a BLAS go on spinning when their work is done, and take the cores from the runs.
+    # einsum, as the threads of a BLAS spin after their work and take the cores from the runs.
     square = np.einsum("ni,nj->ij", products, products)
     square += _RIDGE * np.trace(square) * np.eye(square.shape[0])
     coefficients = np.linalg.solve(square, np.einsum("ni,n->i", products, np.log(np.maximum(steps, 1))))

@@ -1,4 +1,4 @@
-"""Samples that fill a box of parameters evenly."""
+"""Space-filling samples of a box of parameters."""
 
 import math
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ Span: TypeAlias = tuple[float, float] | tuple[float, float, str] | object
 
 
 def latin_hypercube(ranges: Mapping[str, Span], count: int, *, seed: int = 0) -> dict[str, np.ndarray]:
-    """Random samples with one in each of `count` equally likely strata of every parameter.
+    """Random samples, one in each of `count` equally likely strata of every parameter.
 
     ```python
     columns = sweeps.latin_hypercube({"m": (1.0, 2.0), "friction.Fc": (0.1, 10.0, "log")}, 200)
@@ -23,8 +23,8 @@ def latin_hypercube(ranges: Mapping[str, Span], count: int, *, seed: int = 0) ->
 
     **Arguments:**
 
-    - `ranges`: by the name of a parameter `(low, high)` for a uniform distribution between them, `(low, high, "log")`
-      for one whose logarithm is uniform, or a frozen distribution such as `scipy.stats.norm(2.0, 0.1)`.
+    - `ranges`: by the name of a parameter: `(low, high)` for a uniform distribution, `(low, high, "log")` for a uniform
+      distribution of the logarithm, or a frozen distribution such as `scipy.stats.norm(2.0, 0.1)`.
     - `count`: number of samples, > 0.
     - `seed`: of the random numbers.
 
@@ -34,20 +34,20 @@ def latin_hypercube(ranges: Mapping[str, Span], count: int, *, seed: int = 0) ->
 
     **Raises:**
 
-    - `ValueError` for a range that is none, with its name, and for a count below one.
+    - `ValueError` for a wrong range, with its name, and for a count below one.
     """
     check_ranges(ranges)
     count, seed = as_whole(count, name="count"), as_whole(seed, name="seed", least=0)
-    from scipy.stats import qmc  # half a second, for those who sample
+    from scipy.stats import qmc  # takes half a second to import
 
     return spread(ranges, qmc.LatinHypercube(len(ranges), rng=np.random.default_rng(seed)).random(count))
 
 
 def sobol(ranges: Mapping[str, Span], count: int, *, seed: int = 0) -> dict[str, np.ndarray]:
-    """Scrambled Sobol' points: more even than `latin_hypercube` in several parameters at once.
+    """Scrambled Sobol' points, which fill several dimensions more evenly than `latin_hypercube`.
 
-    Their balance rests on a number of points that is a power of two; with others, means are worse than with fewer
-    points (Owen 2020, arXiv:2008.08051), so others are refused.
+    The number of points must be a power of two: other numbers are less balanced than a smaller power of two (Owen 2020,
+    arXiv:2008.08051).
 
     ```python
     columns = sweeps.sobol({"m": (1.0, 2.0), "friction.Fc": (0.1, 10.0, "log")}, 256)
@@ -64,18 +64,18 @@ def sobol(ranges: Mapping[str, Span], count: int, *, seed: int = 0) -> dict[str,
 
     **Raises:**
 
-    - `ValueError` for a range that is none, with its name, and a count that is no power of two.
+    - `ValueError` for a wrong range, with its name, and a count that is not a power of two.
     """
     check_ranges(ranges)
     check_power(count)
     seed = as_whole(seed, name="seed", least=0)
-    from scipy.stats import qmc  # half a second, for those who sample
+    from scipy.stats import qmc  # takes half a second to import
 
     return spread(ranges, qmc.Sobol(len(ranges), rng=np.random.default_rng(seed)).random(count))
 
 
 def check_ranges(ranges: Mapping[str, Span]) -> None:
-    """Refuse ranges that are none."""
+    """Check ranges of parameters."""
     if not isinstance(ranges, Mapping) or not ranges:
         raise ValueError(
             f"ranges must name at least one parameter, as in {{'m': (1.0, 2.0)}}, but {ranges!r} was given."
@@ -92,17 +92,17 @@ def check_ranges(ranges: Mapping[str, Span]) -> None:
         low, high = span[:2]
         real = all(isinstance(x, int | float | np.number) and math.isfinite(x) for x in (low, high))
         if not real or not low < high:
-            raise ValueError(f"The range of {name!r} must go from a finite number to a larger one, but is {span!r}.")
+            raise ValueError(f"The range of {name!r} must be finite with low < high, but is {span!r}.")
         if log and not low > 0:
             raise ValueError(f"The logarithmic range of {name!r} must begin above zero, but is {span!r}.")
 
 
 def check_power(count: int) -> None:
-    """Refuse a number of Sobol' points that is no power of two."""
+    """Check a number of Sobol' points, which must be a power of two."""
     count = as_whole(count, name="count")
     if count & (count - 1):
         below = 1 << (int(count).bit_length() - 1)
-        raise ValueError(f"Sobol' points come in powers of two, but count={count}: take {below} or {2 * below}.")
+        raise ValueError(f"count must be a power of two for Sobol' points, but is {count}: use {below} or {2 * below}.")
 
 
 def spread(ranges: Mapping[str, Span], unit: Float[np.ndarray, "count names"]) -> dict[str, np.ndarray]:
@@ -111,8 +111,8 @@ def spread(ranges: Mapping[str, Span], unit: Float[np.ndarray, "count names"]) -
     for name, column in columns.items():
         if not np.isfinite(column).all():
             raise ValueError(
-                f"The distribution of {name!r} has samples that are not finite, where the method goes to its ends: give"
-                " it ends, as in scipy.stats.truncnorm, or a range (low, high)."
+                f"The distribution of {name!r} has samples that are not finite, as the method uses its end points: use"
+                " a bounded one, such as scipy.stats.truncnorm, or a range (low, high)."
             )
     return columns
 

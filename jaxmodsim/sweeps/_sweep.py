@@ -1,11 +1,13 @@
-"""`sweep`: a scene, or any function, run for many numbers."""
+"""`sweep`: a scene, or any function, run for many numbers; its plan and its progress."""
 
+import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from math import prod
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -13,30 +15,81 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from .._core.arguments import as_whole
-from .._core.progress import reported
+from .._core.progress import minutes, reported
 from .._core.system import commit, extra
 from ..scene import Scene
-from ._compute import GROUP, Work, runs_per_call
-from ._execute import Task, in_threads, run_on_executor
+from ._compute import GROUP, Task, Work, in_threads, run_on_executor, runs_per_call
 from ._grid import Blocks, blocks, grid
-from ._layout import layout
-from ._predict import Prediction, predict_steps
-from ._progress import Progress, SweepProgress, SweepWords
-from ._provenance import describe, package_versions, provenance, solver_of
-from ._request import Request, request
-from ._results import AbstractResults, Memory, Store
+from ._predict import predict_steps
+from ._request import Request, request_of
+from ._results import AbstractResults, Memory, Store, describe, layout, package_versions, provenance, solver_of
 
 if TYPE_CHECKING:
     import xarray as xr
 
-# Runs of a block: that many take a fraction of a second of short runs, and little room.
+# Largest number of runs in a block: short runs of it take a fraction of a second.
 _RUNS = 16384
-# A sweep is cut into at least so many blocks, as far as each keeps a group of runs.
+# Least number of blocks of a sweep, if each has a group of runs or more.
 _BLOCKS = 16
-# Room that the results of a block may take [bytes].
+# Largest size of the results of a block [bytes].
 _ROOM = 64_000_000
-# Runs of a block on an accelerator, which runs all of them as one.
+# Largest number of runs in a block on an accelerator, which computes all of them together.
 _RUNS_ON_ACCELERATOR = 1 << 18
+
+
+@dataclass(frozen=True)
+class SweepProgress:
+    """The progress of a sweep.
+
+    - `done`, `total`: numbers of runs; runs that were already stored count as done.
+    - `failed`: number of runs, of those done, that ended early.
+    """
+
+    done: int
+    total: int
+    failed: int
+
+
+Progress: TypeAlias = Callable[[SweepProgress], None]
+
+
+class SweepProgressText:
+    """Converts reports of progress to text, with the pace since the first report and the time left at that pace."""
+
+    def __init__(self) -> None:
+        self._stored: int | None = None
+        self._began = 0.0
+
+    def __call__(self, now: SweepProgress) -> str:
+        """The text."""
+        if self._stored is None:  # runs that were already stored do not count for the pace
+            self._stored, self._began = now.done, time.perf_counter()
+        count = f"{now.done:,} of {now.total:,} runs"
+        if now.done > self._stored:
+            pace = (now.done - self._stored) / max(time.perf_counter() - self._began, 1e-3)
+            left = f", {pace:,.0f}/s, {minutes((now.total - now.done) / pace)} left" if now.done < now.total else ""
+            return f"{count}, {now.failed:,} failed{left}"
+        if now.done == now.total:
+            return f"{count} already stored, {now.failed:,} failed"
+        return f"{count} already stored, compiling" if now.done else "compiling"
+
+
+@dataclass(frozen=True)
+class SweepPlan:
+    """The plan of a sweep.
+
+    - `dims`: number of points along each dimension.
+    - `swept`: the numbers that change along each dimension.
+    - `runs`: number of runs; `chunks`: number of chunks, of up to `runs_per_chunk` runs each.
+    - `variables`: dimensions and unit of each variable of the result; unit "" if unknown.
+    """
+
+    dims: dict[str, int]
+    swept: dict[str, tuple[str, ...]]
+    runs: int
+    chunks: int
+    runs_per_chunk: int
+    variables: dict[str, tuple[tuple[str, ...], str]]
 
 
 def sweep(
@@ -66,102 +119,129 @@ def sweep(
     runs["amplitude"].sel(k=100.0, method="nearest")
     ```
 
-    Runs are computed in narrow groups that fit the cache, one thread for each core; where a sweep has more than 1024
-    of them, a few are run first, to sort the others by the number of steps that they will take. A run that takes many
-    more steps than its neighbours leaves them, and is run again among others like it. The numbers are those of single
-    calls of `simulate` to rounding.
+    Runs are computed in small groups that fit the cache, in one thread per core. For more than 1024 runs, a trial of a
+    few predicts the number of steps of the others, which are sorted by it. A run with many more steps than its
+    neighbours leaves its group, and is computed again with other slow runs. The results equal those of single calls of
+    `simulate` up to rounding.
 
     **Arguments:**
 
     - `system`: a `Scene`; or a function that is called with the numbers of a run by name and returns real numbers, a
-      dictionary of them, or a run (`simulate(..., throw=False)`) that is then observed. Functions must be traceable by
-      JAX, and are compared by identity: define them once.
-    - `over`: what changes. A name with an array of values is a dimension; all combinations of the dimensions are run. A
-      name with a mapping (or table) of several names to equally long arrays is one dimension along which they change
-      together, as in `{"sample": jaxmodsim.sweeps.latin_hypercube(...)}`. Names are those of the numbers of the scene
-      (`jaxmodsim.scene.scene_numbers`, `[i]` behind for an entry of an array), and `q0`, `qd0`, `q0[i]`, `qd0[i]`,
-      `t0`, `t1`, `rtol`, `atol`, `dt`, `dtmax`. Values of a number that is an array have the shape `[n, ...]`.
-    - `observe`: what is kept, by name: a function of the `Trajectory` that returns real numbers, a name (`q[0]`,
-      `qd[0]`, or of an effect for its force) that is read at `ts` or, without, at the end, a
-      `jaxmodsim.sweeps.Derivative`, or one of these with its unit, as in `(function, "s")`. Or names alone.
-    - `q0`, `qd0`, `t1`: as for `simulate`; left out where they are in `over`.
-    - `out`: folder of a Zarr store. Results are written there chunk by chunk; a call that finds results of the same
-      sweep goes on with them. Without, they are kept in memory.
-    - `executor`: a `dask.distributed.Client` or a `concurrent.futures.Executor`, to whose workers chunks are sent; by
-      default threads of this process.
-    - `devices`: JAX devices to share the chunks among; by default all of this process.
-    - `chunk`: largest number of runs that are computed, sent and written as one; by default up to 16384, fewer where
-      results are large.
+      dictionary of them, or a run (`simulate(..., throw=False)`) to observe. Functions must be traceable by JAX, and
+      are compared by identity: define them once.
+    - `over`: the numbers that change. A name with an array of values is a dimension; all combinations of the dimensions
+      are run. A name with a mapping (or table) of several names to arrays of the same length is one dimension along
+      which they change together, as in `{"sample": jaxmodsim.sweeps.latin_hypercube(...)}`. Names are those of the
+      numbers of the scene (`jaxmodsim.scene.scene_numbers`, with `[i]` for an entry of an array), and `q0`, `qd0`,
+      `q0[i]`, `qd0[i]`, `t0`, `t1`, `rtol`, `atol`, `dt`, `dtmax`. Values of an array have the shape `[n, ...]`.
+    - `observe`: the observables by name. Each is a function of the `Trajectory` that returns real numbers, a name
+      (`q[0]`, `qd[0]`, or an effect for its force), which is evaluated at `ts`, or at the end without `ts`, a
+      `jaxmodsim.sweeps.Derivative`, or one of these with its unit, as in `(function, "s")`. Or a list of names.
+    - `q0`, `qd0`, `t1`: as for `simulate`; omitted if they are in `over`.
+    - `out`: folder of a Zarr store, to which results are written chunk by chunk. A call that finds results of the same
+      sweep resumes it. Without `out`, results are kept in memory.
+    - `executor`: a `dask.distributed.Client` or a `concurrent.futures.Executor`, which computes the chunks; by default
+      threads of this process.
+    - `devices`: JAX devices that share the chunks; by default all devices of this process.
+    - `chunk`: largest number of runs that are computed, sent and written together; by default up to 16384, fewer for
+      large results.
     - `progress`: True for a line of text, or a function that is called with a `jaxmodsim.sweeps.SweepProgress` after
       each chunk.
-    - `options`: further arguments of `simulate`, `ts` among them, but not `throw` and `adjoint`.
+    - `options`: further arguments of `simulate`, such as `ts`, but not `throw` and `adjoint`.
 
     **Returns:**
 
-    An `xarray.Dataset`: what is observed over the dimensions of the sweep (and `time`), NaN where a run failed;
-    `result`, how each ended (0 where all went well; the sentences are in its attribute `flag_meanings`; -1 where it has
-    not been run); `num_steps`; and as attributes all that the numbers follow from. With `out` values are read when they
-    are asked for. Ctrl-C ends a sweep in memory with what has been run; with `out` it raises, and the next call goes
-    on.
+    An `xarray.Dataset` over the dimensions of the sweep (and `time`): the observables, NaN for runs that failed;
+    `result`, the code of each run (0 for success; the attribute `flag_meanings` has the sentences; -1 for runs that
+    were not computed); `num_steps`; and, as attributes, everything that determines the results. With `out`, values are
+    read on access. Ctrl-C ends a sweep in memory with its results so far; with `out` it raises, and the next call
+    resumes.
 
     **Raises:**
 
-    - `ValueError` for wrong names, shapes, types or ranges, before anything runs; and where `out` holds the results of
-      another scene, other numbers, code, or versions.
-    - `ImportError` where the extra `sweep` is not installed.
+    - `ValueError` for wrong names, shapes, types or ranges, before anything runs; and if `out` holds the results of
+      another scene, other numbers, code or versions.
+    - `ImportError` without the extra `sweep`.
     """
-    with reported(progress, "sweep", SweepWords()) as report:
-        for needed in ("xarray", "zarr"):  # rather now than after the runs
-            extra(needed)
-        asked = request(system, grid(over), observe, {"q0": q0, "qd0": qd0, "t1": t1, **options})
-        places: list[Any] = list(devices) if devices is not None else jax.local_devices()
-        runs = runs_per_block(asked, places[0].platform, chunk)
-        cut = blocks(asked.grid.shape, runs)
-        group = GROUP if places[0].platform == "cpu" else runs
-        work = Work(asked.run, asked.fixed, None, group, jnp.result_type(float) == jnp.float64)
-        results = _results(asked, work, cut, out)
+    with reported(progress, "sweep", SweepProgressText()) as report:
+        for library in ("xarray", "zarr"):  # a missing one is better reported before the runs
+            extra(library)
+        request = request_of(system, grid(over), observe, {"q0": q0, "qd0": qd0, "t1": t1, **options})
+        chosen: list[Any] = list(devices) if devices is not None else jax.local_devices()
+        runs = _runs_per_block(request, chosen[0].platform, chunk)
+        cut = blocks(request.grid.shape, runs)
+        group = GROUP if chosen[0].platform == "cpu" else runs
+        work = Work(request.run, request.fixed, None, group, jnp.result_type(float) == jnp.float64)
+        attrs = {
+            "system": describe(request),
+            "solver": solver_of(request),
+            "made_by": f"jaxmodsim {package_versions()['jaxmodsim']}",
+            "commit": commit(),
+        }
+        origin = layout(request), cut, attrs, provenance(request, work, cut.extent)
+        results = Memory(*origin) if out is None else Store(Path(out), *origin)
         try:
-            _run(asked, work, cut, results, executor, places, report)
+            _run(request, work, cut, results, executor, chosen, report)
         except KeyboardInterrupt:
             if out is not None:
-                raise KeyboardInterrupt(f"Interrupted; call sweep again with out={str(out)!r} to go on.") from None
-            warnings.warn("sweep was interrupted: runs that have not been run have the result -1.", stacklevel=2)
+                raise KeyboardInterrupt(f"Interrupted; call sweep again with out={str(out)!r} to resume.") from None
+            warnings.warn("sweep was interrupted: runs that were not computed have the result -1.", stacklevel=2)
         return results.dataset()
 
 
-def runs_per_block(asked: Request, platform: str, chunk: int | None) -> int:
-    """Runs of a block.
+def plan_sweep(
+    system: Scene | Callable[..., object],
+    over: Mapping[str, object],
+    observe: Mapping[str, object] | Sequence[str] | str | None = None,
+    *,
+    chunk: int | None = None,
+    **arguments: object,
+) -> SweepPlan:
+    """Check the arguments of a sweep as `sweep` does, and return its plan.
+
+    **Arguments:**
+
+    - `system`, `over`, `observe`, `chunk`: as for `sweep`.
+    - `arguments`: further arguments of `sweep` for `simulate`.
 
     **Raises:**
 
-    - `ValueError` if `chunk` is no positive integer.
+    - `ValueError` as `sweep` does, before anything runs.
+    """
+    request = request_of(system, grid(over), observe, arguments)
+    cut = blocks(request.grid.shape, _runs_per_block(request, jax.local_devices()[0].platform, chunk))
+    result = layout(request)
+    return SweepPlan(
+        {axis.name: axis.size for axis in request.grid.axes},
+        {axis.name: tuple(axis.values) for axis in request.grid.axes},
+        request.grid.size,
+        len(cut),
+        prod(cut.extent),
+        {x.name: ((*result.dims, *x.dims), str(x.attrs.get("units", ""))) for x in result.variables},
+    )
+
+
+def _runs_per_block(request: Request, platform: str, chunk: int | None) -> int:
+    """Number of runs in a block.
+
+    **Raises:**
+
+    - `ValueError` if `chunk` is not a positive integer.
     """
     if chunk is not None:
         return as_whole(chunk, name="chunk")
-    room = sum(np.prod(x.shape, initial=1.0) * x.dtype.itemsize for x in asked.shapes.values.values())
+    room = sum(np.prod(x.shape, initial=1.0) * x.dtype.itemsize for x in request.shapes.values.values())
     if platform != "cpu":
         return max(min(_RUNS_ON_ACCELERATOR, int(_ROOM / room)), 1)
-    even = -(-asked.grid.size // (_BLOCKS * GROUP)) * GROUP
-    # Whole calls of compiled code, where there are enough runs for that.
+    even = -(-request.grid.size // (_BLOCKS * GROUP)) * GROUP
+    # A multiple of the runs in a call of compiled code.
     call = runs_per_call(even, GROUP)
     even = -(-even // call) * call
     return max(min(_RUNS, even, int(_ROOM / room)), 1)
 
 
-def _results(asked: Request, work: Work, cut: Blocks, out: str | PathLike[str] | None) -> AbstractResults:
-    laid = layout(asked)
-    attrs = {
-        "system": describe(asked),
-        "solver": solver_of(asked),
-        "made_by": f"jaxmodsim {package_versions()['jaxmodsim']}",
-        "commit": commit(),
-    }
-    about = provenance(asked, work, cut.extent)
-    return Memory(laid, cut, attrs, about) if out is None else Store(Path(out), laid, cut, attrs, about)
-
-
 def _run(
-    asked: Request,
+    request: Request,
     work: Work,
     cut: Blocks,
     results: AbstractResults,
@@ -169,30 +249,29 @@ def _run(
     devices: list[object],
     report: Progress | None,
 ) -> None:
-    """Run the blocks that are not there yet."""
-    left, done, failed = [], 0, 0
+    """Compute the blocks that are not stored yet."""
+    missing, done, failed = [], 0, 0
     for block in range(len(cut)):
         codes = results.done(block)
         if codes is None:
-            left.append(block)
+            missing.append(block)
         else:
             done, failed = done + codes.size, failed + int((codes != 0).sum())
     if report is not None:
-        report(SweepProgress(done, asked.grid.size, failed))
-    if not left:
+        report(SweepProgress(done, request.grid.size, failed))
+    if not missing:
         return
-    work, prediction = predict_steps(work, asked.grid, prod(cut.extent))
-    tasks = _tasks(asked, cut, left, prediction)
-    came = in_threads(work, tasks, devices) if executor is None else run_on_executor(work, tasks, executor)
-    for block, computed in came:
-        results.write(block, computed)
-        done, failed = done + computed.code.size, failed + int((computed.code != 0).sum())
+    work, prediction = predict_steps(work, request.grid, prod(cut.extent))
+
+    def tasks() -> Iterator[Task]:
+        for block in missing:
+            index = cut.index(block).ravel()
+            numbers = request.grid.numbers_at(index)
+            yield block, numbers, np.arange(index.size) if prediction is None else prediction.order(numbers)
+
+    computed = in_threads(work, tasks(), devices) if executor is None else run_on_executor(work, tasks(), executor)
+    for block, part in computed:
+        results.write(block, part)
+        done, failed = done + part.code.size, failed + int((part.code != 0).sum())
         if report is not None:
-            report(SweepProgress(done, asked.grid.size, failed))
-
-
-def _tasks(asked: Request, cut: Blocks, left: list[int], prediction: Prediction | None) -> Iterator[Task]:
-    for block in left:
-        index = cut.index(block).ravel()
-        numbers = asked.grid.numbers_at(index)
-        yield block, numbers, np.arange(index.size) if prediction is None else prediction.order(numbers)
+            report(SweepProgress(done, request.grid.size, failed))

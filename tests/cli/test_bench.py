@@ -12,7 +12,7 @@ import pytest
 from bench import render
 from bench.layout import Recorded, Table, Targets
 from bench.tables import REPORTS
-from jaxmodsim.cli import _bench
+from jaxmodsim.cli import _app
 
 ROOT = Path(__file__).parents[2]
 RESULTS = sorted((ROOT / "bench" / "results").glob("*.json"))
@@ -122,7 +122,7 @@ def test_an_interrupt_leaves_finished_results(suite):
 
 def test_the_command_says_where_it_looked(run_command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(_bench, "__file__", str(tmp_path / "site-packages" / "jaxmodsim" / "cli" / "_bench.py"))
+    monkeypatch.setattr(_app, "__file__", str(tmp_path / "site-packages" / "jaxmodsim" / "cli" / "_app.py"))
     code, _, errors = run_command("bench")
     assert code == 2
     assert f"there is no folder bench in {tmp_path} or {tmp_path / 'site-packages'}" in errors

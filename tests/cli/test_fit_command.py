@@ -14,16 +14,15 @@ import pytest
 import scipy.io
 
 from jaxmodsim.cli import _fit
-from jaxmodsim.cli._read import AxisColumns, read_record, read_records
-from jaxmodsim.cli._units import given_units
+from jaxmodsim.cli._records import AxisColumns, read_record, read_records
+from jaxmodsim.cli._units import parse_units
 from jaxmodsim.identify import FitResult, Record, axis_models, axis_scene, estimate_axis, fit, remarks
-from jaxmodsim.identify.model._axis import AxisEstimate
 
 from ..helpers.axis_records import GAIN, TRUTH, axis_frame
 
 COLUMNS = ("--time", "time", "--position", "pos", "--force", "volt", "--units", f"force={GAIN}")
-MODEL = ("--limit", "m=:50", "--begin", "staged")
-NAMES = AxisColumns("time", "pos", "volt", given_units([f"force={GAIN}"]))
+MODEL = ("--limit", "m=:50", "--initializer", "staged")
+NAMES = AxisColumns("time", "pos", "volt", parse_units([f"force={GAIN}"]))
 
 
 def write_mat(path: Path, columns: dict[Any, Any]) -> None:
@@ -85,12 +84,12 @@ def test_several_records_are_fitted_together_and_a_held_out_one_is_scored(fitted
     assert found["held_out"]["test"]["measured"] < 4e-4
     assert "held out" in text
     # The same friction in all three; the band allows for a level that varies, and is wide.
-    assert found["headline"][3].startswith("On a new record of this motion expect to miss by ")
+    assert found["headline"][3].startswith("On a new record of this motion expect an error of ")
     assert "as these 2 records show" in found["headline"][3]
     assert "Of test 100 % of the samples lie within the band for 90 %." in found["headline"][3]
     assert found["held_out_within_band"]["test"]["measured"] == 1.0
     assert {row["parameter"] for row in found["agreement"]} == set(TRUTH)
-    assert "What the records have in common, and what varies" in text
+    assert "Agreement of the records" in text
     assert sorted(path.name for path in out.iterdir()) == [
         "fit.csv", "fit.json", "fit.npz", "fit_1_run_b_1.png", "fit_2_run2.png", "held_out_1_test.png", "report",
     ]  # fmt: skip
@@ -120,7 +119,8 @@ def test_a_report_is_one_page_that_needs_nothing_else(fitted):
         assert kind == "data:image/png;base64"
         assert base64.b64decode(data).startswith(b"\x89PNG")
     for text in ("run <b>1", "run2", "test", "m q'' = u - offset - F_dry - F_viscous", "Fc sign(v)", "N s/m",
-                 "jaxmodsim fit", "jax 0.", "95 %", "in common", "90 % band", "Correlation", "likelihood"):  # fmt: skip
+                 "jaxmodsim fit", "jax 0.", "95 %", "Agreement of the records",
+                 "90 % band", "Correlation", "likelihood"):  # fmt: skip
         assert text in page.text, text
     result = json.loads((out / "fit.json").read_text())
     for remark in result["remarks"]:
@@ -166,7 +166,7 @@ def test_ctrl_c_keeps_what_was_found(run_command, files, tmp_path, monkeypatch):
     assert code == 130
     progress, said = errors.splitlines()
     assert progress.startswith("fit 0:")
-    assert said == "jaxmodsim: interrupted; what was found until then is written"
+    assert said == "jaxmodsim: interrupted; the results so far are written"
     found = json.loads((out / "fit.json").read_text())
     assert found["ending"].startswith("interrupted")
     assert seen == [1, 2]
@@ -187,7 +187,7 @@ def test_models_are_compared(run_command, files, tmp_path):
         ["coulomb", "asymmetric"],
         ["asymmetric", "coulomb"],
     )
-    assert found["headline"][3].startswith("One record cannot tell what changes from day to day. On a new record")
+    assert found["headline"][3].startswith("A single record cannot show changes from day to day. On a new record")
     assert "a friction level that varies by 4 % from record to record (assumed)" in text.splitlines()[3]
     assert found["comparison"]["conclusion"] in text
     assert (out / "comparison.png").stat().st_size > 10_000
@@ -255,7 +255,7 @@ def test_records_of_one_name_are_told_apart_by_their_folders(tmp_path):
         path.parent.mkdir()
         axis_frame().to_csv(path, index=False)
     assert [record.parts[0].name for record in read_records(paths, NAMES)] == ["a/run.csv", "b/run.csv"]
-    with pytest.raises(ValueError, match=r"run\.csv is given twice"):
+    with pytest.raises(ValueError, match=r"run\.csv is listed twice"):
         read_records([paths[0], tmp_path / "b" / ".." / "a" / "run.csv"], NAMES)
 
 
@@ -349,11 +349,11 @@ def check_refusal(run_command, out: Path, text: str, *command: str) -> None:
     ("change", "text"),
     [
         (("--position", "poss"), "no column 'poss' .*time, pos, volt.* Did you mean --position pos"),
-        (("--laws", "coulom"), "no law 'coulom'; the laws are: coulomb, asymmetric.* Did you mean coulomb"),
-        (("--laws", "coulomb,lugr"), "no law 'lugr'.* Did you mean lugre"),
+        (("--laws", "coulom"), "no law 'coulom'; the laws are: coulomb, asymmetric.* Did you mean 'coulomb'"),
+        (("--laws", "coulomb,lugr"), "no law 'lugr'.* Did you mean 'lugre'"),
         (("--laws", " ,"), "--laws needs a law, several as A,B, or `all`, but ' ,' was given"),
-        (("--laws", "all", "--free", "m"), "--free does not go with several --laws"),
-        (("--free", "m,dry.Fs"), "no name 'dry.Fs'; .* Did you mean dry.Fc"),
+        (("--laws", "all", "--free", "m"), "--free excludes several --laws"),
+        (("--free", "m,dry.Fs"), "no name 'dry.Fs'; .* Did you mean 'dry.Fc'"),
         (("--free", "m", "--fix", "m=2"), "m stands in --free and in --fix"),
         (("--start", "m"), "--start needs NAME=VALUE"),
         (("--start", "m=heavy"), "--start needs NAME=VALUE"),
@@ -367,7 +367,7 @@ def check_refusal(run_command, out: Path, text: str, *command: str) -> None:
         (("--limit", "dry.Fc=100:200"), "dry.Fc must be .*but it is"),
         (("--units", "force=0"), "--units force=0: the factor must be finite and not zero"),
         (("--units", "force=12", "--units", "mass=kg"), "--units needs COLUMN=UNIT .*but 'mass=kg' was given"),
-        (("--units", "position=mmm"), "no unit 'mmm'; the units are: m, mm.* Did you mean mm"),
+        (("--units", "position=mmm"), "no unit 'mmm'; the units are: m, mm.* Did you mean 'mm'"),
         (("--units", "time=mm"), "mm is a unit of length; the units are: s, ms"),
         (("--units", "force=mA"), "mA is a unit of current, .*as in --units force=12.5"),
         (("--units", "position=deg,force=N"), "'pos' is in deg and 'volt' in N, but a rotary axis needs"),
@@ -377,7 +377,7 @@ def check_refusal(run_command, out: Path, text: str, *command: str) -> None:
         (("--starts", "0"), "--starts must be at least 1"),
         (("--folds", "1"), "--folds must be at least 2"),
         (("--loss", "absolute"), "no name 'absolute'; the names are: squares, huber, cauchy"),
-        (("--begin", "stage"), "no name 'stage'; .* Did you mean staged"),
+        (("--initializer", "stage"), "no name 'stage'; .* Did you mean 'staged'"),
         (("--time", "volt"), "times must increase, but column 'volt'"),
         (("--max-force", "3"), "--max-force belongs to --next"),
         (("--fix", "dry.width=1e-6"), "there is no parameter 'dry.width'; the parameters are: m, offset, dry.Fc"),
@@ -392,13 +392,16 @@ def test_wrong_options_are_one_sentence_and_exit_code_two(run_command, files, tm
 @pytest.mark.parametrize(
     ("content", "text"),
     [
-        ("", "no CSV file with a header line"),
+        ("", "not a CSV file with a header line"),
         ("time,pos,volt\n0,1,2\n1,x,2\n", "'pos' holds 'x' in sample 1"),
         ("time,pos,volt\n0,1,2\n1,,2\n", "'pos' has 1 values that are not finite, the first in sample 1.*--drop nan"),
-        ("time,pos,volt\n0,1,2\n0,1,2\n1,1,2\n", "'time' has 1 samples at the time of the one before: 1. The times"),
-        ("time,pos,volt\n" + "".join(f"{max(k, 1)},1,2\n" for k in range(9)), "before: 1. Leave .*--drop repeated"),
+        (
+            "time,pos,volt\n0,1,2\n0,1,2\n1,1,2\n",
+            "'time' has 1 samples with the time of the sample before: 1. Their times",
+        ),
+        ("time,pos,volt\n" + "".join(f"{max(k, 1)},1,2\n" for k in range(9)), "before: 1. Omit .*--drop repeated"),
         ("time,pos,volt\n1,1,2\n2,1,2\n0,1,2\n", "'time' goes back 1 times, first from 2 s to 0 s in sample 2"),
-        ("1,1,2\n2,1,2\n0,1,2\n", "no CSV file with a header line: the first line holds numbers"),
+        ("1,1,2\n2,1,2\n0,1,2\n", "not a CSV file with a header line: the first line holds numbers"),
         ("time [s],phi_deg,volt [mA]\n0,1,2\n1,1,3\n", "no column 'pos' .*has: time .s., phi_deg"),
         ("time,pos,volt\n0,1,2\n", "two samples or more"),
         ("time,pos,volt\n0,1,2\n.01,1,2\n.02,1,3\n", "the position never changes"),
@@ -413,10 +416,10 @@ def test_bad_tables_are_one_sentence_and_exit_code_two(run_command, tmp_path, co
 @pytest.mark.parametrize(
     ("name", "content", "text"),
     [
-        ("a.parquet", b"PAR1 and no more", "damaged or no Parquet file"),
-        ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(105) + b"\x00\x01IM" + bytes(7), "damaged or no MATLAB file"),
+        ("a.parquet", b"PAR1 and no more", "damaged or not a .parquet file"),
+        ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(105) + b"\x00\x01IM" + bytes(7), "damaged or not a MATLAB file"),
         ("a.mat", b"MATLAB 7.3 MAT-file" + b" " * 105 + b"\x00\x02IM" + bytes(800), "MATLAB 7.3 .*'-v7'"),
-        ("a.csv", b"\xff\xfe\x00\x80", "no CSV file"),
+        ("a.csv", b"\xff\xfe\x00\x80", "not a CSV file"),
         ("a.xlsx", b"PK", "must be one of .csv, .txt, .parquet, .mat, .mf4"),
         ("axis", b"", "must be one of"),
     ],
@@ -435,8 +438,8 @@ def test_matlab_vectors_of_other_lengths_and_folders_are_refused(run_command, fi
     check_refusal(run_command, out, "no column 'pos' .*it has: time, volt", str(path), *COLUMNS)
     check_refusal(run_command, out, "is a folder; a file is needed", str(tmp_path))
     check_refusal(run_command, out, "There is no file", str(tmp_path / "none.csv"))
-    check_refusal(run_command, out, "is given twice", files[0], files[0], *COLUMNS)
-    check_refusal(run_command, out, "is given twice", files[0], "--held-out", files[0], *COLUMNS)
+    check_refusal(run_command, out, "is listed twice", files[0], files[0], *COLUMNS)
+    check_refusal(run_command, out, "is listed twice", files[0], "--held-out", files[0], *COLUMNS)
     code, _, errors = run_command("fit", files[0], *COLUMNS, "--out", files[0])
     assert code == 2
     assert "is a file; a folder is needed" in errors

@@ -77,7 +77,7 @@ def check_ending(ending: tuple[int, str, str]) -> None:
 
 FIT_OPTIONS = (
     "--time", "--position", "--force", "--units", "--drop", "--max-steps", "--laws", "--free", "--start", "--fix",
-    "--limit", "--held-out", "--folds", "--loss", "--begin", "--starts", "--substeps", "--report", "--next",
+    "--limit", "--held-out", "--folds", "--loss", "--initializer", "--starts", "--substeps", "--report", "--next",
     "--max-force", "--max-speed", "--max-travel", "--duration", "--out",
 )  # fmt: skip
 SWEEP_OPTIONS = ("--out", "--figure", "--chunk", "--dry-run", "--help")
@@ -85,9 +85,9 @@ WORDS = (
     "t", "q", "u", "m", "Fc", "coulomb", "lugre", "stribeck", "all", "coulomb,lugre", "m=1", "m=", "=1", "m=nan", "m=:",
     "m=1:0", "m=0:", "time=ms", "position=deg", "force=mA", "force=0", "nan,repeated", "+delay.u",
     "m=-1:1e400", "friction.Fc=1", "friction.Fc=-1", "friction.width=0", "q0", "q0[0]", "q0[9]",
-    "delay.u", "squares", "huber", "staged", "rough", "0", "1", "-1", "2", "3.5", "nan", "inf", "1e400", "", " ", "--",
-    "-", "good.csv", "none.csv", "folder", "bytes.csv", "folder/none.csv", "good.csv/a", "a.png", "a.pdf", "a,b", "[",
-    "[bold]", "\\", "'", "é", "\u2028", "x" * 300, "belt.toml", "root.toml", "model.py", "None", "True",
+    "delay.u", "squares", "huber", "staged", "regression", "0", "1", "-1", "2", "3.5", "nan", "inf", "1e400", "", " ",
+    "--", "-", "good.csv", "none.csv", "folder", "bytes.csv", "folder/none.csv", "good.csv/a", "a.png", "a.pdf", "a,b",
+    "[", "[bold]", "\\", "'", "é", "\u2028", "x" * 300, "belt.toml", "root.toml", "model.py", "None", "True",
 )  # fmt: skip
 
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxmodsim.cli._logs import Channel, held_on
-from jaxmodsim.cli._read import AxisColumns, read_record
-from jaxmodsim.cli._units import given_units
+from jaxmodsim.cli._files import Channel
+from jaxmodsim.cli._records import AxisColumns, held_on, read_record
+from jaxmodsim.cli._units import parse_units
 
 from ..helpers.axis_records import GAIN
 
@@ -133,13 +133,13 @@ def test_clocks_are_brought_together_and_their_offset_is_reported(kind, tmp_path
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_clock_that_is_wrong_shows(kind, tmp_path):
     path, names = FORMATS[kind](tmp_path, FORCE, TU + 0.1 - EARLY)
-    read = read_record(path, AxisColumns("t", names["position"], names["force"], given_units([])))
+    read = read_record(path, AxisColumns("t", names["position"], names["force"], parse_units([])))
     assert offset_of(read.notes[0]) == pytest.approx(1e3 * (EARLY - 0.1), abs=0.1)
 
 
 def offset_of(note: str) -> float:
     """Milliseconds by which the note calls the force early."""
-    match = re.search(r"clock of the force is ([\d.]+) ms (early|late) against", note)
+    match = re.search(r"clock of the force is ([\d.]+) ms (early|late) relative", note)
     assert match is not None, note
     return float(match[1]) * (1 if match[2] == "early" else -1)
 
@@ -174,5 +174,5 @@ def test_what_is_missing_to_read_them_is_named(ending, module, extra, tmp_path, 
 def test_damaged_logs_are_refused(ending, module, tmp_path):
     pytest.importorskip(module)
     (tmp_path / f"run{ending}").write_bytes(b"no such thing" * 20)
-    with pytest.raises(ValueError, match=rf"run{ending} is damaged or no {ending} file"):
+    with pytest.raises(ValueError, match=rf"run{ending} is damaged or not a {ending} file"):
         read_record(tmp_path / f"run{ending}", AxisColumns("t", "q", "u", {}))

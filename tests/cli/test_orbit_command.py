@@ -93,7 +93,7 @@ def test_a_branch_begins_at_a_hopf_point(spec, tmp_path, run_command):
     assert "no Hopf point" in errors
     code, _, errors = run_command("branch", spec(HOPF.replace("rtol = 1e-8", "settle = 1.0")))
     assert code == 2
-    assert 'with start = "Hopf" leave period, frequency and settle out' in errors
+    assert 'with start = "Hopf" omit period, frequency and settle' in errors
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_a_branch_begins_at_a_hopf_point(spec, tmp_path, run_command):
     [
         (BELT.replace("settle = 20.0", ""), "needs settle"),
         (BELT.replace("settle = 20.0", 'frequency = "omega"'), "frequency must be the name of an entry of params"),
-        (BELT.replace("settle = 20.0", 'frequency = "m"\nperiod = 1.0'), "period and frequency are given"),
+        (BELT.replace("settle = 20.0", 'frequency = "m"\nperiod = 1.0'), "period and frequency exclude each other"),
         (BELT.replace("q0", "q1", 1), "q0 is missing"),
         (BELT + "[branches]\n", "there is no key 'branches'"),
     ],

@@ -8,9 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from jaxmodsim.cli._plan import FitRequest, plan_of
-from jaxmodsim.cli._read import AxisColumns, read_record
-from jaxmodsim.cli._units import Unit, given_units, known_unit, split_header
+from jaxmodsim.cli._options import FitRequest
+from jaxmodsim.cli._plan import plan_of
+from jaxmodsim.cli._records import AxisColumns, read_record
+from jaxmodsim.cli._units import Unit, known_unit, parse_units, split_header
 from jaxmodsim.identify import Record, axis_models, clock_offset, sampling_gaps
 
 from ..helpers.axis_records import GAIN, TRUTH, axis_frame
@@ -57,7 +58,7 @@ RIGHT = {
     "outliers, robust": (changed(pos=Q + SPIKES), (*FORCE, "--loss", "huber"), ""),
     "other unit given": (
         FRAME.rename(columns={"pos": "pos [mm]"}), ("--units", f"position=m,force={GAIN}"),
-        r"column 'pos [mm]' says mm, but --units position=m was given: what was given is taken",
+        r"column 'pos [mm]' says mm, but --units position=m takes precedence",
     ),
 }  # fmt: skip
 
@@ -73,8 +74,8 @@ def test_these_are_fitted_right(run_command, tmp_path, name):
 
 
 NAMED = {
-    "milliseconds": (changed(time=1e3 * (T - 10.0), pos=1e3 * Q), FORCE, "so: --units time=ms,position=mm."),
-    "velocity": (changed(pos=VELOCITY), FORCE, "'pos' as with a velocity, not as with a position"),
+    "milliseconds": (changed(time=1e3 * (T - 10.0), pos=1e3 * Q), FORCE, "use --units time=ms,position=mm."),
+    "velocity": (changed(pos=VELOCITY), FORCE, "'pos' as on a velocity, not as on a position"),
     "drive signal": (FRAME, (), "'volt' is read as a force in SI units. If it is a drive signal"),
     "early force": (changed(volt=np.roll(U, -6)), FORCE, r"'volt' comes 15 ms too early"),
     "late force": (changed(volt=np.roll(U, 6)), FORCE, r"'volt' comes 15 ms too late"),
@@ -98,7 +99,7 @@ def test_a_rotary_axis_has_its_units(run_command, tmp_path):
     assert read.right
     units = {name: entry["unit"] for name, entry in read.found["parameters"].items()}
     assert units == {"m": "kg m^2", "offset": "N m", "dry.Fc": "N m", "viscous.Fv": "N m s/rad"}
-    assert "it misses the measured angle by" in read.headline[1]
+    assert "the model misses the measured angle by" in read.headline[1]
     assert read.headline[0].startswith("Coulomb: m ")
     assert "kg m^2 (+-" in read.headline[0]
     assert list(pd.read_csv(tmp_path / "out" / "fit.csv").columns)[3:] == [
@@ -121,7 +122,7 @@ def test_integration_steps_are_raised_until_they_no_longer_show(run_command, tmp
 
 
 def names(units: str = f"force={GAIN}", *drop: str) -> AxisColumns:
-    return AxisColumns("time", "pos", "volt", given_units([units]), frozenset(drop))
+    return AxisColumns("time", "pos", "volt", parse_units([units]), frozenset(drop))
 
 
 def written(folder: Path, frame: pd.DataFrame, sep: str = ",", decimal: str = ".", encoding: str = "utf-8") -> Path:
@@ -151,9 +152,7 @@ def test_a_record_is_cut_where_samples_are_missing(tmp_path):
     assert read.parts[0].t[-1] < 11
     assert read.parts[1].t[0] > 11.5
     (note,) = read.notes
-    assert note.startswith(
-        "run: samples are missing from 10.9975 to 11.5025 s; the parts between are fitted as 2 records"
-    )
+    assert note.startswith("run: samples are missing from 10.9975 to 11.5025 s; the parts are fitted as 2 records")
     # Times that jitter, or differ throughout, are no gaps.
     for steps in (1.0 + RANDOM.random(99), RANDOM.exponential(size=99)):
         assert not sampling_gaps(Record(np.cumsum(steps), steps, {"u": steps}))
@@ -165,11 +164,11 @@ def test_samples_without_values_or_of_no_new_time_are_left_out(tmp_path):
     hollow.loc[[33], "volt"] = np.inf
     read = read_record(written(tmp_path, hollow), names(f"force={GAIN}", "nan"))
     assert len(read.parts[0].t) == len(FRAME) - 3
-    assert read.notes == ("run.csv: 3 samples with values that are not finite are left out.",)
+    assert read.notes == ("run.csv: 3 samples with values that are not finite are omitted.",)
     twice = pd.concat([FRAME.iloc[:100], FRAME.iloc[99:]])
     read = read_record(written(tmp_path, twice), names(f"force={GAIN}", "nan", "repeated"))
     np.testing.assert_array_equal(read.parts[0].t, T)
-    assert read.notes == ("run.csv: 1 samples at the time of the one before are left out.",)
+    assert read.notes == ("run.csv: 1 samples with the time of the sample before are omitted.",)
 
 
 def test_dates_are_times(tmp_path):
@@ -198,12 +197,12 @@ def test_units_in_headers(header, name, factor):
 
 
 def test_units_that_are_given():
-    units = given_units(["time=ms, position = 2 deg", "force=-1.5e2"])
+    units = parse_units(["time=ms, position = 2 deg", "force=-1.5e2"])
     assert {role: unit.factor for role, unit in units.items()} == pytest.approx(
         {"time": 1e-3, "position": np.pi / 90, "force": -150.0}
     )
     assert units["position"].rotary
-    assert given_units(["force=35.15 N/V"])["force"] == Unit(35.15, "force", "35.15 N/V", scaled=True)
+    assert parse_units(["force=35.15 N/V"])["force"] == Unit(35.15, "force", "35.15 N/V")
     assert known_unit("mNm") == known_unit("mN m") or known_unit("mN·m")
     assert known_unit("furlong") is None
 
@@ -227,20 +226,15 @@ def test_a_current_becomes_a_force_by_a_factor(run_command, tmp_path):
     path = written(tmp_path, FRAME.rename(columns={"volt": "volt [mA]"}))
     code, _, errors = run_command("fit", str(path), *COLUMNS, "--out", str(tmp_path / "out"))
     assert code == 2
-    assert errors.startswith("jaxmodsim: run.csv: column 'volt [mA]': mA is a unit of current, from which the force")
+    assert errors.startswith("jaxmodsim: run.csv: column 'volt [mA]': mA is a unit of current, which needs a factor")
     np.testing.assert_allclose(read_record(path, names()).parts[0].inputs["u"], GAIN * U, rtol=1e-12)
 
 
 @pytest.mark.parametrize("free", [(), ("+delay.u",)])
 def test_a_parameter_can_be_added_to_those_of_the_law(capsys, tmp_path, free):
     path = written(tmp_path, changed(volt=np.roll(U, -6)))
-    request = FitRequest(
-        records=[path], columns=("time", "pos", "volt"), units=[FORCE[1]], drop=(), laws="coulomb,lugre", free=free,
-        start=(), fix=(), limit=(), held_out=(), folds=None, loss="squares", begin="rough", starts=1, max_steps=9,
-        substeps=None, out=tmp_path, report=None, next_input=None, max_force=None, max_speed=None, max_travel=None,
-        duration=None,
-    )  # fmt: skip
-    plan = plan_of(request)
+    columns = {"time": "time", "position": "pos", "force": "volt"}
+    plan = plan_of(FitRequest(records=[path], **columns, units=[FORCE[1]], laws="coulomb,lugre", free=[*free]))
     for name, candidate in plan.candidates.items():
         assert candidate.free == (*axis_models()[name].free, *(each.removeprefix("+") for each in free))
     # What is fitted is no surprise.

@@ -12,8 +12,8 @@ import xarray as xr
 
 import jaxmodsim as jms
 from jaxmodsim.cli import _sweep
-from jaxmodsim.cli._spec import Reduced, read_spec
-from jaxmodsim.cli._spec_scene import PROBLEMS, known_laws
+from jaxmodsim.cli._spec import Reduced, read_sweep_spec
+from jaxmodsim.cli._toml import PROBLEMS, known_laws
 from jaxmodsim.plot import map2d
 from jaxmodsim.problems import belt_oscillator
 from jaxmodsim.sweeps import SweepProgress, latin_hypercube, plan_sweep, sobol
@@ -122,12 +122,12 @@ def test_a_function_of_a_file_is_drawn_and_failures_are_told(
     np.testing.assert_allclose(found["root"][5], 2.0 + np.array([1.0, 10.0, 100.0]))
     assert "The function gave NaN." in text
     assert "27 " in text
-    assert "30 run in" in text
+    assert "30 runs in" in text
     assert (tmp_path / "map" / "a.png").read_bytes().startswith(b"\x89PNG")
     assert drawn == ["root"]
     again = run_command(*command, "--chunk", "6")
     assert again[0] == 0
-    assert "All were there before." in again[1]
+    assert "30 of 30 runs were already stored." in again[1]
     code, _, errors = run_command("sweep", spec(ROOT.replace("8,", "9,")), "--out", str(tmp_path / "root.zarr"))
     assert code == 2
     assert "holds the results of another sweep" in errors
@@ -157,16 +157,16 @@ def test_ctrl_c_says_what_is_kept_and_the_same_command_goes_on(
 
     command = ("sweep", spec(ROOT), "--out", str(tmp_path / "root.zarr"), "--chunk", "3")
     with monkeypatch.context() as patch:
-        patch.setattr(_sweep, "SweepWords", lambda: interrupting)
+        patch.setattr(_sweep, "SweepProgressText", lambda: interrupting)
         code, _, errors = run_command(*command)
     assert code == 130
-    assert "6 of 30 runs are kept in" in errors
-    assert "goes on" in errors
+    assert "6 of 30 runs are stored in" in errors
+    assert "resumes the sweep" in errors
     code, text, _ = run_command(*command)
     assert code == 0
     # What was at work when it was interrupted is not waited for, and run again.
-    assert "24 run in" in text
-    assert "6 were there before" in text
+    assert "24 runs in" in text
+    assert "6 of 30 runs were already stored" in text
     assert np.isfinite(xr.open_zarr(tmp_path / "root.zarr", consolidated=False)["root"]).sum() == 27
 
 
@@ -176,7 +176,7 @@ def test_processes_get_the_model_by_value(run_command: Command, spec: Callable[[
         warnings.simplefilter("ignore")  # the cluster's own
         code, text, errors = run_command("sweep", spec(ROOT), "--out", str(tmp_path / "root.zarr"), "--workers", "1")
     assert code == 0, errors
-    assert "30 run in" in text
+    assert "30 runs in" in text
     found = xr.open_zarr(tmp_path / "root.zarr", consolidated=False)
     np.testing.assert_allclose(found["root"][5], 2.0 + np.array([1.0, 10.0, 100.0]))
 
@@ -185,13 +185,13 @@ def test_samples_are_those_of_the_library(spec: Callable[[str], str]) -> None:
     text = ROOT[: ROOT.index("[over]")] + '[over]\ns = {KIND = {a = [1, 2], b = [1, 100, "log"]}, count = 8, seed = 3}'
     ranges: dict[str, Any] = {"a": (1.0, 2.0), "b": (1.0, 100.0, "log")}
     for kind, drawn in (("latin_hypercube", latin_hypercube), ("sobol", sobol)):
-        found = read_spec(Path(spec(text.replace("KIND", kind)))).over["s"]
+        found = read_sweep_spec(Path(spec(text.replace("KIND", kind)))).over["s"]
         for name, values in drawn(ranges, 8, seed=3).items():
             np.testing.assert_array_equal(found[name], values)
 
 
 def test_the_plan_is_what_sweep_gives(spec: Callable[[str], str]) -> None:
-    asked = read_spec(Path(spec(ROOT)))
+    asked = read_sweep_spec(Path(spec(ROOT)))
     laid = plan_sweep(asked.system, asked.over, chunk=3)
     found = jms.sweep(asked.system, asked.over, chunk=3)
     assert laid.dims == dict(found.sizes) == {"a": 10, "b": 3}
@@ -210,13 +210,13 @@ def test_problems_and_laws_that_a_spec_may_name() -> None:
 
 def each_mistake() -> Iterator[tuple[str, str, str, str]]:
     """What is replaced in a SPEC by what, and what the error says."""
-    yield "no toml", 'problem = "belt_oscillator"', "problem =", "spec.toml is no TOML: .*line 3"
-    yield "table", "[observe]", "[observed]", "no key 'observed'; there may be .*Did you mean 'observe'"
+    yield "no toml", 'problem = "belt_oscillator"', "problem =", "spec.toml is not TOML: .*line 3"
+    yield "table", "[observe]", "[observed]", "no key 'observed'; the keys are .*Did you mean 'observe'"
     yield "no scene", "[scene]", "[observe.scene]", "scene is missing"
     yield "problem", '"belt_oscillator"', '"belt"', r"\[scene\]: problem must be one of.*'belt' was given"
     yield "neither", 'problem = "belt_oscillator"', "", "either problem or file .* neither is given"
     yield "both", "m = 1\n", 'file = "model.py"\n', "both are given"
-    yield "number", "m = 1\n", "mass = 1\n", r"\[scene\]: there is no key 'mass'; there may be .*belt"
+    yield "number", "m = 1\n", "mass = 1\n", r"\[scene\]: there is no key 'mass'; the keys are .*belt"
     yield "text", "m = 1\n", 'm = "one"\n', "m must be a number or a list of numbers, but 'one' was given"
     yield "law", '"Coulomb"', '"Coulom"', r"\[scene.law.law\]: kind must be one of.*Did you mean 'Coulomb'"
     yield "kind", 'kind = "Coulomb", ', "", r"\[scene.law.law\]: kind is missing"
@@ -229,12 +229,12 @@ def each_mistake() -> Iterator[tuple[str, str, str, str]]:
     yield "count", "count = 11", "count = 11.5", r"\[run.ts\]: count must be a whole number > 0, but 11.5"
     yield "no end", "t1 = 0.5\n", "", "needs t1"
     yield "zipped", "k = [50, 80, 120]", "k = 50", r"\[over.pair\]: k must be a list"
-    yield "unequal", "k = [50, 80, 120]", "k = [50]", "equally many"
+    yield "unequal", "k = [50, 80, 120]", "k = [50]", "must have the same length"
     yield "axis", "[0.0, 0.1]", "0.1", r"\[over\]: qd0\[0\] must be a list or a table, but 0.1"
     yield "spacing", "[0.0, 0.1]", '{from = 0, to = 1, count = 3, spacing = "lin"}', "linear, log, but 'lin'"
     yield "log", "[0.0, 0.1]", '{from = 0, to = 1, count = 3, spacing = "log"}', r'\[over."qd0\[0\]"\]: from and to'
     yield "name", '"qd0[0]" =', '"friction.fs" =', "Did you mean 'friction.Fs'"
-    yield "both samplers", "[0.0, 0.1]", "{sobol = {}, latin_hypercube = {}, count = 2}", "one of them draws"
+    yield "both samplers", "[0.0, 0.1]", "{sobol = {}, latin_hypercube = {}, count = 2}", "exclude each other"
     yield "ranges", "[0.0, 0.1]", "{sobol = {m = [2, 1]}, count = 2}", r"sobol: The range of 'm'"
     yield "take", 'take = "max"', 'take = "maximum"', r"\[observe.fastest\]: take must be one of end.*'maximum'"
     yield "of", 'of = "friction", ', "", r"\[observe.effective\]: of is missing"
@@ -262,11 +262,11 @@ def test_mistakes_in_a_spec_are_named(
 
 def each_mistake_with_a_file() -> Iterator[tuple[str, str, str, str]]:
     yield "object", '"root"', '"rot"', "object must be a Scene or a function of model.py.*lagrangian.*mean 'root'"
-    yield "file", '"model.py"', '"models.py"', "models.py' is not there"
+    yield "file", '"model.py"', '"models.py"', "models.py' is missing"
     yield "broken", '"model.py"', '"broken.py"', "running broken.py failed with ZeroDivisionError"
-    yield "key", "[over]", "m = 1\n[over]", "no key 'm'; there may be problem, file, object"
-    yield "run", "[over]", "[run]\nt1 = 1\n[over]", "t1 has no place beside a function"
-    yield "arguments", "a = {", "c = {", r"over must name what the function takes, \(a, b\), but it names c, b"
+    yield "key", "[over]", "m = 1\n[over]", "no key 'm'; the keys are problem, file, object"
+    yield "run", "[over]", "[run]\nt1 = 1\n[over]", "a function takes no t1"
+    yield "arguments", "a = {", "c = {", r"over must name the arguments of the function, \(a, b\), but it names c, b"
     yield "failing", '"root"', '"fails"', r"model.py, line \d+: ZeroDivisionError: division by zero"
 
 
@@ -289,7 +289,7 @@ def test_mistakes_in_the_command_line(run_command: Command, spec: Callable[[str]
     sample = ROOT.replace("a = {from = -1, to = 8, count = 10}", "a = {sobol = {a = [1, 2]}, count = 8}")
     for text, arguments, words in (
         (ROOT, (), "--out STORE is missing"),
-        (ROOT, (*store, "--workers", "2", "--scheduler", "tcp://a:1"), "do not go together"),
+        (ROOT, (*store, "--workers", "2", "--scheduler", "tcp://a:1"), "exclude each other"),
         (ROOT, (*store, "--figure", "a.pdf"), "ends in .png"),
         (ROOT, (*store, "--chunk", "0"), "--chunk"),
         (sample, (*store, "--figure", "a.png"), "that rise or fall, but 'a'"),

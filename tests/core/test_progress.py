@@ -2,7 +2,7 @@
 
 import io
 import re
-from contextlib import redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from typing import Any
 
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ import pytest
 import jaxmodsim as jms
 from jaxmodsim._core import progress
 from jaxmodsim._core.progress import candidate_words, minutes, progress_line, reported
-from jaxmodsim.sweeps import SweepProgress, SweepWords
+from jaxmodsim.sweeps import SweepProgress, SweepProgressText
 
 from ..helpers.sprung import sprung
 
@@ -64,7 +64,23 @@ def test_a_line_is_no_wider_than_the_terminal(monkeypatch: pytest.MonkeyPatch) -
     assert max(map(len, terminal.lines())) == 39
 
 
-def test_off_a_terminal_only_the_last_text_is_written(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_gets_a_line_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "_EVERY_IN_FILE", 0.01)
+    with redirect_stderr(io.StringIO()) as file, redirect_stdout(io.StringIO()) as out, progress_line("sweep") as show:
+        while file.getvalue().count("\n") < 2:
+            pass
+        show("4 of 9 runs")
+        seen = file.getvalue().count("4 of 9 runs")
+        while file.getvalue().count("4 of 9 runs") < seen + 2:
+            pass
+    lines = file.getvalue().splitlines()
+    assert re.fullmatch(rf"sweep {TIME}: compiling", lines[0])
+    assert all(re.fullmatch(rf"sweep {TIME}: (compiling|4 of 9 runs)", line) for line in lines)
+    assert lines[-1].endswith("4 of 9 runs")
+    assert out.getvalue() == ""
+
+
+def test_a_short_computation_writes_only_its_last_text_to_a_file(capsys: pytest.CaptureFixture[str]) -> None:
     with progress_line("fit") as show:
         show("iteration 1")
         show("iteration 2")
@@ -77,14 +93,14 @@ def test_off_a_terminal_only_the_last_text_is_written(capsys: pytest.CaptureFixt
 
 
 def test_words() -> None:
-    words = SweepWords()
+    words = SweepProgressText()
     assert words(SweepProgress(0, 20_000, 0)) == "compiling"
     assert re.fullmatch(
         rf"5,000 of 20,000 runs, 1,002 failed, [\d,]+/s, {TIME} left", words(SweepProgress(5000, 20_000, 1002))
     )
     assert words(SweepProgress(20_000, 20_000, 1002)) == "20,000 of 20,000 runs, 1,002 failed"
-    assert SweepWords()(SweepProgress(10, 40, 0)) == "compiling, 10 of 40 runs are there"
-    assert SweepWords()(SweepProgress(40, 40, 3)) == "40 of 40 runs, 3 failed"
+    assert SweepProgressText()(SweepProgress(10, 40, 0)) == "10 of 40 runs already stored, compiling"
+    assert SweepProgressText()(SweepProgress(40, 40, 3)) == "40 of 40 runs already stored, 3 failed"
     assert candidate_words("LuGre", 1, 3, 0.00123456) == "LuGre, fold 2 held out, iteration 3: RMSE 0.001235"
     assert [minutes(x) for x in (0.2, 59.6, 3599.0, 3725.0)] == ["0:00", "1:00", "59:59", "1:02:05"]
 

@@ -181,7 +181,7 @@ def test_modelica_declarations() -> None:
         (asymmetric(jms.Viscous(1.0), Fv=2.0), "depends on the direction", "depends on the direction"),
         (asymmetric(jms.LuGre(**BOX), Fs=2.0), "depends on the direction", "depends on the direction"),
         (VARYING, r"Pass the law at a state, law.bind_state\(t", r"Pass the law at a state, law.bind_state\(t"),
-        (jms.Coulomb(0.0, 1.0), "one force", "above zero if it is"),
+        (jms.Coulomb(0.0, 1.0), "one force", "must be > 0 if the limit"),
     ],
 )
 def test_laws_that_the_target_has_not_are_refused(law: Any, mujoco: str | None, modelica: str | None) -> None:

@@ -26,7 +26,7 @@ import jaxmodsim as jms
 from jaxmodsim._core import system
 from jaxmodsim._core.system import written_whole
 from jaxmodsim.analysis import Row, WorkPrecision, load_work_precision
-from jaxmodsim.cli import _output, _read
+from jaxmodsim.cli import _output, _records
 from jaxmodsim.identify import FitResult
 from jaxmodsim.identify.uncertainty._estimate import FitDiagnostics, FitProvenance, ParameterEstimate
 from jaxmodsim.plot import Figure
@@ -134,7 +134,7 @@ def test_damaged_records_are_records_or_refused(ending: str, share: float, tmp_p
         path.write_bytes(spoilt if length < 0.5 else spoilt[: int((2 * length - 1) * len(whole))])
         words = "record"
         try:
-            found = _read.read_record(path, _read.AxisColumns("t", "q", "u", {}))
+            found = _records.read_record(path, _records.AxisColumns("t", "q", "u", {}))
             assert all(np.isfinite(part.measured).all() for part in found.parts)
         except ValueError as refusal:
             words = str(refusal)
@@ -147,7 +147,7 @@ def test_a_table_of_a_head_alone_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "record.csv"
     path.write_text("t,q,u\n")
     with pytest.raises(ValueError, match=r"record: columns must have one shape .*'t' has \(0,\)"):
-        _read.read_record(path, _read.AxisColumns("t", "q", "u", {}))
+        _records.read_record(path, _records.AxisColumns("t", "q", "u", {}))
 
 
 def test_a_record_that_would_end_the_process_that_reads_it(tmp_path: Path) -> None:
@@ -157,8 +157,8 @@ def test_a_record_that_would_end_the_process_that_reads_it(tmp_path: Path) -> No
     spoilt = bytearray(path.read_bytes())
     spoilt[176] ^= 0xFF
     path.write_bytes(spoilt)
-    with pytest.raises(ValueError, match=r"record.mat is damaged or no MATLAB file: reading it ends the process"):
-        _read.read_record(path, _read.AxisColumns("t", "q", "u", {}))
+    with pytest.raises(ValueError, match=r"record.mat is damaged or not a MATLAB file: the reader crashes"):
+        _records.read_record(path, _records.AxisColumns("t", "q", "u", {}))
 
 
 @contextmanager

@@ -62,5 +62,5 @@ def test_garbage_is_refused(draw: Any, ranges: Any, count: int, text: str) -> No
 
 
 def test_sobol_wants_a_power_of_two() -> None:
-    with pytest.raises(ValueError, match="take 64 or 128"):
+    with pytest.raises(ValueError, match="use 64 or 128"):
         sobol({"m": (1.0, 2.0)}, 100)

@@ -221,28 +221,28 @@ def test_ctrl_c_keeps_what_has_been_run() -> None:
 
 def each_mistake() -> Iterator[tuple[str, dict[str, Any], str]]:
     yield "misspelt", {"over": {"friction.sigma_0": SIGMA0}}, "Did you mean 'friction.sigma0'"
-    yield "no mapping", {"over": [1.0]}, "over must say what to sweep"
+    yield "no mapping", {"over": [1.0]}, "over must name the numbers to sweep"
     yield "empty", {"over": {"m": []}}, "at least one value"
     yield "number", {"over": {"m": 1.0}}, "sequence of at least one value"
     yield "text", {"over": {"solver": ["a", "b"]}}, "cannot be swept"
     yield "nan", {"over": {"m": [1.0, np.nan]}}, r"at \[1\] it is nan"
     yield "ragged", {"over": {"m": [[1.0], [1.0, 2.0]]}}, "'m' in over must be an array"
-    yield "unequal", {"over": {"s": {"m": [1.0, 2.0], "friction.Fc": [1.0]}}}, "equally many"
+    yield "unequal", {"over": {"s": {"m": [1.0, 2.0], "friction.Fc": [1.0]}}}, "must have the same length"
     yield "nothing zipped", {"over": {"s": {}}}, "is empty"
     yield "twice", {"over": {"m": [1.0], "s": {"m": [1.0]}}}, "names 'm' twice"
-    yield "reserved", {"over": {"result": {"m": [1.0]}}}, "cannot have the name 'result'"
+    yield "reserved", {"over": {"result": {"m": [1.0]}}}, "cannot use the name 'result'"
     yield "both", {"over": {"t1": [1.0]}}, "t1 is given"
     yield "shape", {"over": {"m": [[1.0, 2.0]]}}, r"shape \[n\]"
     yield "no state", {"q0": None}, "needs q0"
     yield "index", {"over": {"q0[1]": [1.0]}}, "q0\\[0\\]"
     yield "observable", {"observe": {"v": "qd[7]"}}, "No observable has the name 'qd\\[7\\]'"
-    yield "nothing observed", {"observe": None}, "observe must say what to keep"
+    yield "nothing observed", {"observe": None}, "observe must name the results of each run"
     yield "no function", {"observe": {"v": 3.0}}, "must be a function of the run"
     yield "not numbers", {"observe": {"v": lambda run: run}}, "must be an array of real numbers"
     yield "complex", {"observe": {"v": lambda run: 1j * run.q}}, "must be real"
     yield "wrt", {"observe": {"v": Derivative("q[0]", "friction.fc")}}, "Did you mean 'friction.Fc'"
     yield "throw", {"throw": True}, "no argument 'throw'"
-    yield "option", {"max_step": 3}, "no argument 'max_step'"
+    yield "option", {"max_step": 3}, "no argument 'max_step'.*Did you mean 'max_steps'"
     yield "value", {"t1": -1.0}, "t1 must not be before t0"
     yield "ts", {"ts": [0.0, 99.0]}, "ts must lie within"
     yield "t1 of a run", {"over": {"t1": [4.0, 2.0]}, "t1": None}, "ts must lie within .* every run, from 0 to 2"
@@ -277,11 +277,13 @@ def test_mistakes_with_a_function(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # as users have it
     with pytest.raises(ValueError, match="needs a Scene or a function"):
         jms.sweep(3.0, {"a": [1.0]})  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="qd0 has no place beside a function"):
+    with pytest.raises(ValueError, match="a function takes no qd0"):
         jms.sweep(lambda a: a, {"a": [1.0]}, qd0=[0.0])
-    with pytest.raises(ValueError, match="observe reads a run"):
+    with pytest.raises(ValueError, match=r"no argument 'chunks'\. Did you mean 'chunk'"):
+        jms.sweep(lambda a: a, {"a": [1.0]}, chunks=4)
+    with pytest.raises(ValueError, match="observe needs a run"):
         jms.sweep(lambda a: a, {"a": [1.0]}, ["q[0]"])
-    with pytest.raises(ValueError, match="say by observe"):
+    with pytest.raises(ValueError, match="name the results to keep by observe"):
         jms.sweep(lambda a: jms.simulate(SCENE, [0.0], [a], 1.0, throw=False), {"a": [1.0]})
 
 

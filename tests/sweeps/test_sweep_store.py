@@ -139,7 +139,7 @@ def test_results_of_something_else_are_refused(whole: Path, tmp_path: Path) -> N
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "a.txt").write_text("mine")
     for path in (tmp_path / "notes", tmp_path / "notes" / "a.txt"):
-        with pytest.raises(ValueError, match="is no store of a sweep"):
+        with pytest.raises(ValueError, match="is not a store of a sweep"):
             store(path)
     assert (tmp_path / "notes" / "a.txt").read_text() == "mine"
 

@@ -1,19 +1,22 @@
-"""Laws as the Modelica Standard Library has them."""
+"""Laws as components of the Modelica Standard Library and of MuJoCo."""
 
 import math
+from xml.sax.saxutils import quoteattr
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from .._core.functions import need_values
 from ..friction import AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw, Geared
 
-# Speeds at which the table is held against the law, spaced evenly in the logarithm over so many decades, and evenly.
+# Number of speeds at which the table is compared with the law, spaced logarithmically over so many decades, and evenly.
 _POINTS, _DECADES = 6000, 12
-# Part of the tolerance that is used, for what lies between those speeds.
+# Used fraction of the tolerance; the rest allows for errors between those speeds.
 _SHARE = 0.9
+# The hardest setting of MuJoCo's dry friction; the default creeps a thousand times faster.
+_HARD = "0.9999 0.9999 0.001"
 
 Table = Float[np.ndarray, "row width"]
 
@@ -21,14 +24,14 @@ Table = Float[np.ndarray, "row width"]
 def to_modelica(
     law: AbstractLaw, v_max: float, *, name: str = "friction", rtol: float = 1e-3, rotary: bool = False
 ) -> str:
-    """Declaration of the Modelica Standard Library's friction component with the numbers of a law.
+    """Declare the friction component of the Modelica Standard Library for a law.
 
-    `SupportFriction` (translational) and `BearingFriction` (rotational) are set-valued laws, run exactly by
-    events, as here: a table of the force in slip over the speed, interpolated linearly, and the limit of stick as a
-    multiple (`peak`) of the table's first force. The rows are placed where the law bends.
+    `SupportFriction` (translational) and `BearingFriction` (rotational) are set-valued laws, simulated exactly by
+    events. They have a table of the sliding force over the speed, interpolated linearly, and the static limit as a
+    multiple (`peak`) of the first force of the table. The rows of the table follow the curvature of the law.
 
     `Geared` becomes a `LossyGear` of ratio 1, whose efficiencies and bearing friction over the speed are the same law.
-    It knows the torque that it transmits, so `torque` is left out.
+    The component computes the transmitted torque itself, so `torque` is not exported.
 
     **Arguments:**
 
@@ -36,8 +39,8 @@ def to_modelica(
       axis also `Geared`, without stiction and with back-driving coefficients below one.
     - `v_max`: speed up to which the table follows the law [m/s or rad/s], > 0; the component extends its last segment.
     - `name`: name of the component, a Modelica identifier.
-    - `rtol`: largest error of the interpolated force relative to the law's, > 0 and < 1.
-    - `rotary`: whether for a rotary axis.
+    - `rtol`: largest relative error of the interpolated force, > 0 and < 1.
+    - `rotary`: whether the axis is rotary.
 
     **Returns:**
 
@@ -45,8 +48,8 @@ def to_modelica(
 
     **Raises:**
 
-    - `ValueError` if the component has not the law, saying what it lacks and what to do; for a law by `scaled_by`; if a
-      number is out of range or the name is no identifier.
+    - `ValueError` if the component does not support the law, with the reason and the remedy; for a law by `scaled_by`;
+      if a number is out of range or the name is not an identifier.
     """
     if not isinstance(law, AbstractLaw):
         raise ValueError(f"to_modelica needs a law, but {law!r} was given.")
@@ -73,7 +76,7 @@ def to_modelica(
 
 
 def _both_ways(law: AbstractLaw, speeds: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], float]:
-    """Force [N] in slip, the same in both directions, and the limit of stick."""
+    """Sliding force [N], the same in both directions, and the static limit."""
     lacks = law.modelica()
     if lacks or not isinstance(law, AbstractSetValuedLaw | AbstractForceLaw):
         raise ValueError(f"to_modelica: Modelica's friction components have no {lacks or type(law).__name__}.")
@@ -83,24 +86,24 @@ def _both_ways(law: AbstractLaw, speeds: Float[np.ndarray, " n"]) -> tuple[Float
         limits = [float(law.static_limit(jnp.asarray(side))) for side in (1.0, -1.0)]
     if not np.allclose([limits[0], *forward], [limits[1], *backward], rtol=1e-6, atol=0.0):
         raise ValueError(
-            "to_modelica: Modelica's friction components have no friction that depends on the direction: export the law"
-            " of one direction, or the mean of both."
+            "to_modelica: Modelica's friction components do not support friction that depends on the direction: export"
+            " the law of one direction, or the mean of both."
         )
     level, limit = forward[0], float(limits[0])
     if not np.isfinite(forward).all() or limit < level or (level == 0 and limit > 0):
         raise ValueError(
-            "to_modelica: the limit of stick must be at least the force of slip at v = 0, above zero if it is, and all"
-            f" forces finite; given: {limit:g} N in stick, {level:g} N in slip."
+            "to_modelica: the static limit must be at least the sliding force at v = 0, which must be > 0 if the limit"
+            f" is, and all forces finite, but the limit is {limit:g} N and the sliding force {level:g} N."
         )
     return forward, limit
 
 
 def _lossy_gear(law: Geared, speeds: Float[np.ndarray, " n"], rtol: float, rotary: bool) -> str:
-    """Rows of speed, efficiencies of driving and back-driving, and bearing friction in either case.
+    """Rows of speed, efficiencies for driving and back-driving, and bearing friction in either case.
 
-    With the torque u on the motor's side the component loses `(1 - eta1) u + tau1` driving and `(1 - 1/eta2) u + tau2`
-    driven back, which is `F0 + mu |u - F|` for `eta1 = 1/(1 + mu_drive)`, `tau1 = eta1 F0`, `eta2 = 1 - mu_back`,
-    `tau2 = F0/eta2`.
+    With the torque u on the motor side, the component loses `(1 - eta1) u + tau1` when driving and
+    `(1 - 1/eta2) u + tau2` when driven back. This is `F0 + mu |u - F|` for `eta1 = 1/(1 + mu_drive)`,
+    `tau1 = eta1 F0`, `eta2 = 1 - mu_back`, `tau2 = F0/eta2`.
     """
     parts = [law.law, law.drive, law.drive if law.back is None else law.back]
     for part in parts:
@@ -109,16 +112,16 @@ def _lossy_gear(law: Geared, speeds: Float[np.ndarray, " n"], rtol: float, rotar
     held, slides = np.array([rest, drive_rest, back_rest]), np.array([idle[0], drive[0], back[0]])
     if not rotary or not np.allclose(held, slides, rtol=1e-6, atol=0.0) or np.max(back) >= 1.0:
         raise ValueError(
-            "to_modelica: LossyGear is a rotary gear (rotary=True) without stiction (Fs = Fc) that does not lock"
-            f" itself (coefficients of back-driving below 1); given: {rotary=}, limits of stick {held} over forces in"
-            f" slip {slides}, coefficients of back-driving up to {np.max(back):g}."
+            "to_modelica: LossyGear needs rotary=True, no stiction (Fs = Fc) and no self-locking (back-driving"
+            f" coefficients below 1), but {rotary=}, the static limits are {held}, the sliding forces {slides} and the"
+            f" back-driving coefficients up to {np.max(back):g}."
         )
     drives, driven = 1.0 / (1.0 + drive), 1.0 - back
     return _written(_table(speeds, np.stack([drives, driven, drives * idle, idle / driven], axis=1), rtol))
 
 
 def _forces(law: AbstractSetValuedLaw | AbstractForceLaw, v: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Force [N] in slip; at rest its limit from above."""
+    """Sliding force [N]; at rest its limit for small positive speeds."""
     if isinstance(law, AbstractForceLaw):
         return np.asarray(jax.vmap(law.force)(jnp.asarray(v)), float)
     side = np.where(np.signbit(v), -1.0, 1.0)
@@ -128,11 +131,11 @@ def _forces(law: AbstractSetValuedLaw | AbstractForceLaw, v: Float[np.ndarray, "
 
 
 def _table(v: Float[np.ndarray, " n"], values: Float[np.ndarray, "n column"], rtol: float) -> Table:
-    """Rows (v, values), each as far from the last as a straight line between them stays within the tolerance."""
+    """Rows (v, values), as far apart as linear interpolation between them stays within the tolerance."""
     rows, last = [0], v.size - 1
     while rows[-1] < last:
         start = rows[-1]
-        # The next row lies between `near`, which does, and `far`, which does not.
+        # Bisection: the tolerance holds up to `near`, and not up to `far`.
         near, far = start + 1, start + 2
         while far < last and _straight(v, values, start, far, rtol):
             near, far = far, start + 2 * (far - start)
@@ -149,7 +152,7 @@ def _table(v: Float[np.ndarray, " n"], values: Float[np.ndarray, "n column"], rt
 def _straight(
     v: Float[np.ndarray, " n"], values: Float[np.ndarray, "n column"], i: int, j: int, rtol: float
 ) -> Bool[np.ndarray, ""] | np.bool_:
-    """Whether the straight line between two rows is within the tolerance of the law."""
+    """Whether linear interpolation between two rows is within the tolerance."""
     between = slice(i, j + 1)
     line = values[i] + (values[j] - values[i]) * ((v[between, None] - v[i]) / (v[j] - v[i]))
     return np.all(np.abs(line - values[between]) <= _SHARE * rtol * np.abs(values[between]))
@@ -157,3 +160,55 @@ def _straight(
 
 def _written(table: Table) -> str:
     return "; ".join(", ".join(f"{x:.10g}" for x in row) for row in table)
+
+
+def to_mujoco(law: AbstractLaw, joint: str = "joint") -> str:
+    """MJCF, the XML of MuJoCo, for a law on a hinge or slide joint.
+
+    `Viscous`, `Coulomb` without stiction and `Stribeck` with Fs = Fc become an element `joint`, whose attributes belong
+    on the joint of that name. `LuGre` and `Dahl` become an element `actuator` for the model: a motor without input or
+    current, which has the same LuGre friction (MuJoCo 4.0 or later). For a mass under a force ramp, MuJoCo agrees with
+    `simulate` to first order in its step.
+
+    MuJoCo's dry friction is a soft constraint: a sticking joint creeps in proportion to the load. `solimpfriction` sets
+    the hardest constraint, and is optional.
+
+    **Arguments:**
+
+    - `law`: the law.
+    - `joint`: name of the joint in the model.
+
+    **Returns:**
+
+    One XML element.
+
+    **Raises:**
+
+    - `ValueError` if MuJoCo does not support the law, with the reason and the remedy; for a law by `scaled_by`.
+    """
+    if not isinstance(law, AbstractLaw):
+        raise ValueError(f"to_mujoco needs a law, but {law!r} was given.")
+    need_values(law, "to_mujoco")
+    numbers = law.mujoco()
+    if isinstance(numbers, str):
+        raise ValueError(f"to_mujoco: MuJoCo has no {numbers}.")
+    return _motor(joint, **numbers) if "lugre" in numbers else _joint(joint, **numbers)
+
+
+def _joint(name: str, **numbers: Array) -> str:
+    values = {key: float(value) for key, value in numbers.items()}
+    attributes = [f'{key}="{value!r}"' for key, value in values.items()]
+    if values.get("frictionloss"):
+        attributes.append(f'solimpfriction="{_HARD}"')
+    return f"<joint name={quoteattr(name)} {' '.join(attributes)}/>"
+
+
+def _motor(joint: str, damping: float | Array, lugre: tuple[float | Array, ...]) -> str:
+    bristle = " ".join(repr(float(x)) for x in lugre)
+    return (
+        "<actuator>\n"
+        f'  <dcmotor name={quoteattr(joint + "_friction")} joint={quoteattr(joint)} input="none"'
+        f' resistance="1" motorconst="0"\n'
+        f'           damping="{float(damping)!r}" lugre="{bristle}"/>\n'
+        "</actuator>"
+    )
