@@ -207,7 +207,7 @@ class Dynamics(NamedTuple):
         still = elements.magnitude(v) <= jnp.maximum(rounding, rest)
         rest = self._speed_of_rest(rest)
         mode = next_modes(
-            elements, elements.slipping(jax.lax.stop_gradient(v), rest), still, jnp.zeros_like(still), rest
+            elements, elements.slip_mode(jax.lax.stop_gradient(v), rest), still, jnp.zeros_like(still), rest
         )
         return self._stick(mode), mode
 
@@ -222,7 +222,7 @@ class Dynamics(NamedTuple):
         v = jax.lax.stop_gradient(elements.v[: mode.size])
         turned = struck & (elements.magnitude(v) > rest)
         fired = (fired & ~turned) | (elements.in_rows(stopped) & ~elements.sticks(mode))
-        mode = jnp.where(turned, elements.slipping(v, self._speed_of_rest(rest)), mode)
+        mode = jnp.where(turned, elements.slip_mode(v, self._speed_of_rest(rest)), mode)
         return self.switch_friction(fired, mode, rest)
 
     def switch_friction(
@@ -351,15 +351,15 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
             rhs = rhs + action.generalised - actions[name].generalised
             actions[name] = action
     qdd = mobility.solve(rhs)
-    multipliers = None
+    multipliers, reported = None, linearized
     if linearized is not None:
         multipliers = linearized.multipliers(qdd)
         qdd = qdd + linearized.apply_force(multipliers)
         if compliant is not None:
             multipliers = multipliers + compliant.force
-            linearized = linearized._replace(rows=linearized.rows + compliant.rate)  # from here on to be reported
+            reported = linearized._replace(rows=linearized.rows + compliant.rate)
     if not (scene.event_driven or scene.reaction_loaded):
-        return Dynamics(t, y, mode, scene, actions, qdd, None, None, linearized, multipliers, None)
+        return Dynamics(t, y, mode, scene, actions, qdd, None, None, reported, multipliers, None)
 
     units = {name: each.force_per_load(t, q, qd, y.z.get(name), params) for name, each in scene.reaction_loaded.items()}
     pushes = [-each.apply_force(q, units[name][0], params) for name, each in scene.reaction_loaded.items()]
@@ -367,24 +367,26 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     def loads(rows: Array, widths: tuple[int, ...]) -> Loads | None:
         return _loads(scene, mobility, t, y, rows, widths, multipliers)
 
-    floor = mobility.least if linearized is not None else None
+    least_mobility = mobility.least if linearized is not None else None
     friction = [*scene.event_driven.values()]
     modes = jnp.zeros(0, q.dtype) if mode is None else scene.split_modes(mode)[0]
-    elements = assemble_friction(friction, pushes, mobility.respond, floor, loads, t, q, qd, params, qdd, modes)
-    settled = solve_friction_forces(elements, modes)
-    forces = [settled.force[part] for part in elements.parts]
+    elements = assemble_friction(
+        friction, pushes, mobility.respond, least_mobility, loads, t, q, qd, params, qdd, modes
+    )
+    solved = solve_friction_forces(elements, modes)
+    forces = [solved.force[part] for part in elements.parts]
     for force, (name, effect) in zip(forces, scene.event_driven.items(), strict=False):
         force = force if force.ndim == 0 else effect.stretch(force)
         actions[name] = Action(effect.apply_force(q, force, params), force)
     for force, push, name in zip(forces[len(friction) :], pushes, scene.reaction_loaded, strict=True):
         unit, rate = units[name]
         actions[name] = Action(-force * push, force * unit, rate)
-    qdd = qdd - jnp.sum(elements.minv_jt * settled.force[:, None], axis=0)
+    qdd = qdd - jnp.sum(elements.minv_jt * solved.force[:, None], axis=0)
     if (within := mobility.constraints) is not None and multipliers is not None:
         taken = sum(actions[name].generalised for name in (*scene.event_driven, *scene.reaction_loaded))
         multipliers = multipliers + within.multiplier_response(mobility.solve(jnp.asarray(taken)))
-    uniqueness = settled.margin if scene.loaded else None
-    return Dynamics(t, y, mode, scene, actions, qdd, elements, settled, linearized, multipliers, uniqueness)
+    uniqueness = solved.margin if scene.loaded else None
+    return Dynamics(t, y, mode, scene, actions, qdd, elements, solved, reported, multipliers, uniqueness)
 
 
 def _loads(
