@@ -127,7 +127,7 @@ class EventController(AbstractControllerWrapper):
         controller_state: _ControllerState,
     ) -> tuple[Any, Any, Any, Any, _ControllerState, dfx.RESULTS]:
         """As the wrapped controller, but reject a step that passes an event or does not resolve the guards."""
-        old, seen = controller_state, y1_candidate.memory
+        old, seen = controller_state, y1_candidate.report
         keep, inner_t0, inner_t1, jump, inner, result = self.controller.adapt_step_size(
             t0, t1, y0.y, y1_candidate.y, args, y_error, error_order, old.inner
         )

@@ -1,33 +1,13 @@
 """Jumps of sampled values at times that are known."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..._core.sorted_times import is_one_of
-
-
-class Landing(NamedTuple):
-    """How a step ends, as regards events.
-
-    - `fired`, `first`: the guards that fire, and the one of them that does so first, shape `[guards]`.
-    - `missed`: whether the step has passed a root.
-    - `landed`: whether it ends on one.
-    - `happens`: whether the state is to be reset.
-    - `next_root`: see `EventMemory`.
-    - `near`: how far the root may be from the end of the step, in steps.
-    """
-
-    fired: Bool[Array, " guards"]
-    first: Bool[Array, " guards"]
-    missed: Bool[Array, ""]
-    landed: Bool[Array, ""]
-    happens: Bool[Array, ""]
-    next_root: Float[Array, ""]
-    near: Float[Array, ""]
+from ._state import Landing
 
 
 class SampledJumps(eqx.Module):

@@ -16,8 +16,8 @@ from .._wrapper import AbstractSolverWrapper
 from ._guard_scan import GuardScan, arrives, first_root, instant, scan_guards
 from ._passage import LATITUDE, Landed, pass_event
 from ._policy import AbstractGuardPolicy, Conditions, Crossings
-from ._samples import Landing, SampledJumps, on_jump
-from ._state import ACCUMULATION, ONGOING, TOO_MANY, EventLog, EventMemory, EventState, write
+from ._samples import SampledJumps, on_jump
+from ._state import ACCUMULATION, ONGOING, TOO_MANY, EventLog, EventMemory, EventState, Landing, StepReport, write
 
 # How far beside the root a step may end, as a fraction of the last steps, and of the time since the last event; from
 # there the state is carried to the root, with an error of the third power of that distance.
@@ -212,20 +212,18 @@ class EventSolver(AbstractSolverWrapper):
         zero = jnp.zeros((), jnp.result_type(t0, *jtu.tree_leaves(y0)))
         t0 = jnp.asarray(t0, zero.dtype)
         one = zero + 1.0
-        memory = EventMemory(zero, zero, zero, zero, zero, one, one)
-        state = EventState(y0, mode, t0, zero, zero, zero, None, memory)
-        guard = self._guards(t0, state, args)
+        state = EventState(y0, mode, t0, zero, zero, zero, None, StepReport(zero, one, one))
+        guard = eqx.filter_eval_shape(self._guards, t0, state, args)
         log = None
         entries = self.max_events if self.log is None else self.log
         if entries:
 
-            def rows(x: Array) -> Array:
+            def rows(x: Any) -> Array:
                 return jnp.zeros((entries, *x.shape), x.dtype)
 
             pair = jtu.tree_map(rows, (y0, mode))
             log = EventLog(jnp.full(entries, jnp.inf, zero.dtype), rows(guard), pair, pair)
-        memory = memory._replace(guard=guard, armed=_flags(self._policy.armed_at_start(guard), guard))
-        return state._replace(fired=jnp.zeros_like(guard), log=log, memory=memory)
+        return state._replace(fired=jnp.zeros(guard.shape, guard.dtype), log=log)
 
     def _guards(self, t: Any, state: EventState, args: PyTree) -> Float[Array, " guards"]:
         return self._guards_and_limits(t, state, args)[0]
@@ -244,15 +242,17 @@ class EventSolver(AbstractSolverWrapper):
         return self.solver.func(dfx.ODETerm(_Field(terms)), t0, y0.y, (y0, args))
 
     def init(self, terms: PyTree, t0: Any, t1: Any, y0: EventState, args: PyTree) -> Any:
-        """State of the wrapped solver, the longest of the last steps, and a time one first step before the start."""
+        """State of the wrapped solver, and an `EventMemory`."""
         inner = self.solver.init(dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0, args))
-        return inner, _constant(t1 - t0), _constant(t0 - (t1 - t0))
+        guard, first = self._guards(*_held((t0, y0, args))), _constant(t1 - t0)
+        none, armed = jnp.zeros((), int), self._policy.armed_at_start(guard)
+        return inner, EventMemory(guard, armed, none, jnp.zeros_like(first), first, _constant(t0 - (t1 - t0)))
 
     def step(
         self, terms: PyTree, t0: Any, t1: Any, y0: EventState, args: PyTree, solver_state: PyTree, made_jump: Any
     ) -> tuple[EventState, PyTree, dict[str, PyTree], PyTree, dfx.RESULTS]:
-        """A step of the wrapped solver, a look at the guards along it, and the reset where it ends on an event."""
-        inner, pace, begin = solver_state
+        """A step of the wrapped solver, a scan of the guards along it, and the reset where it ends on an event."""
+        inner, memory = solver_state[0], _held(solver_state[1])
         whole, args = args, args if self.samples is None else self.samples.freeze_args(t0, args)
         y1, error, dense, inner, result = self.solver.step(
             dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0._replace(log=None), args), inner, made_jump
@@ -264,40 +264,35 @@ class EventSolver(AbstractSolverWrapper):
         # Around t0 = 0 the resolution of time is that of the step itself.
         length = _constant(t1 - t0)
         resolution = 4.0 * float(jnp.finfo(length.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-        seen, end, root = self._look(path, (t0, t1), y0._replace(y=y1), args, resolution)
+        seen, end, root = self._look(path, (t0, t1), y0._replace(y=y1), memory, args, resolution)
         # Where nothing moves steps grow without measure, and tell nothing of the motion that the event begins.
-        measure = jnp.minimum(length, _GROW * pace)
+        measure = jnp.minimum(length, _GROW * memory.pace)
         jumps = None if self.samples is None else self.samples.at(t1, length)
-        landing = self._land(seen, (end, root), (t1, length, resolution, y0.t), (measure, pace), jumps)
+        landing = self._land(seen, (end, root), (t1, length, resolution, y0.t), (measure, memory.pace), jumps)
         next_root = fusion_barrier(landing.next_root, unit)
-        landed = fusion_barrier(_flags(landing.landed, next_root), unit) > 0.5
-        landing = landing._replace(next_root=next_root, landed=landed, happens=landed)
+        landed = fusion_barrier(_flags(landing.landed, next_root), unit)
+        landing = landing._replace(next_root=next_root, landed=landed > 0.5, happens=landed > 0.5)
         if jumps is not None:
             landing = on_jump(landing, jumps)
         step_factor = jnp.min(jnp.where(landing.fired, seen.landing_factor, seen.step_factor))
-        memory = y0.memory._replace(
-            guard=end,
-            armed=_flags(seen.armed, end),
-            landed=_flags(landed, next_root),
-            next_root=landing.next_root,
-            step_factor=fusion_barrier(step_factor, unit),
-        )
-        state1 = y0._replace(y=y1, memory=memory)
-        state1, (t_event, slope) = jax.lax.cond(
+        report = StepReport(landed, landing.next_root, fusion_barrier(step_factor, unit))
+        pace = jnp.maximum(measure, _FORGET_STEPS * memory.pace)
+        at_end = y0._replace(y=y1, report=report), memory._replace(guard=end, armed=seen.armed, pace=pace)
+        (state1, memory), (t_event, slope) = jax.lax.cond(
             landing.happens,
-            lambda: self._jump(terms, t1, state1, landing, (root, landing.near * length, begin), (args, whole)),
-            lambda: (state1, (jnp.asarray(t1), jtu.tree_map(jnp.zeros_like, y1))),
+            lambda: self._jump(terms, t1, at_end, landing, (root, landing.near * length), (args, whole)),
+            lambda: (at_end, (jnp.asarray(t1), jtu.tree_map(jnp.zeros_like, y1))),
         )
         begins = jnp.where(landing.happens, _constant(t_event) - instant(resolution), t1)
         dense = {"inner": dense, "state0": y0, "state1": state1, "event": (begins, slope)}
-        pace = jnp.maximum(measure, _FORGET_STEPS * pace)
-        return state1, error, dense, (inner, pace, begin), result
+        return state1, error, dense, (inner, memory), result
 
     def _look(
         self,
         path: dfx.AbstractLocalInterpolation,
         times: tuple[Array, Array],
         state: EventState,
+        memory: EventMemory,
         args: PyTree,
         resolution: Array,
     ) -> tuple[GuardScan, Float[Array, " guards"], Float[Array, " guards"]]:
@@ -316,8 +311,7 @@ class EventSolver(AbstractSolverWrapper):
         tolerances = jnp.asarray(_constant(self.rtol), end.dtype), _constant(jnp.maximum(atol[0], atol[-1]))
         length = _constant(t1 - t0)
         blur = _constant(resolution) / jnp.where(length > 0, length, 1.0)
-        memory = state.memory
-        seen = scan_guards((memory.guard, one, two, end), middle, memory.armed > 0.5, tolerances, blur, unit)
+        seen = scan_guards((memory.guard, one, two, end), middle, memory.armed, tolerances, blur, unit)
         return seen, end, _constant(root[-1])
 
     def _land(
@@ -379,17 +373,16 @@ class EventSolver(AbstractSolverWrapper):
         self,
         terms: PyTree,
         t: Any,
-        state: EventState,
+        at_end: tuple[EventState, EventMemory],
         landing: Landing,
-        places: tuple[Array, Array, Array],
+        places: tuple[Array, Array],
         sides: tuple[PyTree, PyTree],
-    ) -> tuple[EventState, tuple[Array, PyTree]]:
+    ) -> tuple[tuple[EventState, EventMemory], tuple[Array, PyTree]]:
         """Carry the state to the root of the first guard, reset it there, and carry it back to `t`.
 
         Returned with the time from which on the new state holds, and the rate of y there.
         """
-        (root, near, begin), (args, whole), (fired, first) = places, sides, landing[:2]
-        memory = state.memory
+        (state, memory), (root, near), (args, whole), (fired, first) = at_end, places, sides, landing[:2]
         # After the event arguments are those of the step that begins there.
         new_args = whole if self.samples is None else self.samples.freeze_args(t, whole)
 
@@ -406,7 +399,7 @@ class EventSolver(AbstractSolverWrapper):
             before = state._replace(y=y)
             after = self.reset(t_event, before, whole, fired)
             if self.on_zeno is not None:
-                held, dense = self.on_zeno(t_event, before, whole, fired), _spread(t_event, state, begin)[1]
+                held, dense = self.on_zeno(t_event, before, whole, fired), _spread(t_event, state.t, memory)[1]
                 after = jtu.tree_map(lambda a, b: jnp.where(dense, a, b), held, after)
             return after.y, after.mode
 
@@ -414,10 +407,10 @@ class EventSolver(AbstractSolverWrapper):
         level = jnp.sum(jnp.where(first, root, 0.0))
         arrives = jnp.any(first & (memory.guard > 0))
         early, level = jnp.where(arrives, 0.0, level / jnp.abs(rate)), jnp.where(arrives, level, 0.0)
-        landed = Landed(t, state.y, state.mode, first, (level, rate), memory.landed > 0.5, near, state.t)
+        landed = Landed(t, state.y, state.mode, first, (level, rate), landing.landed, near, state.t)
         passage = pass_event(landed, evaluate, (args, new_args), reset)
         t_event, values, (y, mode, slope) = passage.t, passage.guards, passage.after
-        spread, dense = _spread(t_event, state, begin)
+        spread, dense = _spread(t_event, state.t, memory)
         ends = dense & (self.on_zeno is None)
         status = jnp.where(ends, jnp.asarray(ACCUMULATION, spread.dtype), ONGOING)
         # A reset that changes nothing is no event.
@@ -429,21 +422,16 @@ class EventSolver(AbstractSolverWrapper):
         def rises() -> Bool[Array, " guards"]:
             return self._guard_rates(t_event, state._replace(y=y, mode=mode), slope, new_args) > 0
 
-        armed = self._policy.armed_after(clear, fired, memory.armed > 0.5, rises)
+        armed = self._policy.armed_after(clear, fired, memory.armed, rises)
         if self.on_zeno is not None:
             armed = jnp.where(dense, values > 0, armed)
         flags = _flags(fired, values)
         entry = EventLog(t_event, flags, (passage.before, state.mode), (y, mode))
         log = None if state.log is None else jtu.tree_map(lambda a, b: write(a, index, b), state.log, entry)
-        after = memory._replace(guard=_constant(values), armed=_flags(armed, values))
-        passed = state._replace(y=passage.y, mode=mode, memory=after)
-        after_reset = passed._replace(
-            t=t_event,
-            events=events,
-            status=status,
-            fired=flags,
-            log=log,
-            memory=after._replace(resets=memory.resets + 1.0, spread=spread),
+        passed = state._replace(y=passage.y, mode=mode), memory._replace(guard=_constant(values), armed=armed)
+        after_reset = (
+            passed[0]._replace(t=t_event, events=events, status=status, fired=flags, log=log),
+            passed[1]._replace(resets=memory.resets + 1, spread=spread),
         )
         event = t_event - early, slope
         if self.event_mode is None and (self.samples is None or self.samples.times is None):
@@ -457,11 +445,11 @@ class EventSolver(AbstractSolverWrapper):
         return modes if self.event_mode is None else tuple(self.event_mode(mode) for mode in modes)
 
 
-def _spread(t_event: Array, state: EventState, begin: Array) -> tuple[Array, Bool[Array, ""]]:
-    """The longest of the last intervals between events, and whether they accumulate."""
-    since, memory = t_event - state.t, state.memory
+def _spread(t_event: Array, last: Array, memory: EventMemory) -> tuple[Array, Bool[Array, ""]]:
+    """The longest of the last intervals between events, the latest one since `last`, and whether they accumulate."""
+    since = t_event - last
     spread = _constant(jnp.where(memory.resets == 0, since, jnp.maximum(since, _FORGET_INTERVALS * memory.spread)))
-    return spread, _accumulates(spread, _constant(t_event), begin) & (memory.resets >= _FEWEST)
+    return spread, _accumulates(spread, _constant(t_event), memory.begin) & (memory.resets >= _FEWEST)
 
 
 def _accumulates(spread: Array, t: Array, begin: Array) -> Array:
