@@ -24,7 +24,7 @@ from jaxmodsim._core.fusion import opaque_one
 from jaxmodsim._core.index_check import check_indices, traced
 from jaxmodsim._core.scalarise import columns_of, in_scalars
 from jaxmodsim.export._program import program_of
-from jaxmodsim.solvers._unchecked import calls_back, unchecked
+from jaxmodsim.solvers._error_checks import calls_back, without_error_checks
 
 ROOT = Path(__file__).parents[2]
 GROUPS = {"backends", "jaxprs", "kernels", "last_line", "programs", "stored_steps", "trace_state"}
@@ -83,7 +83,7 @@ def test_functions_stay_whole(none_available: Callable[[], None]) -> None:
 
     x, program = jnp.array([0.3, 2.0]), str(jax.make_jaxpr(rotated)(jnp.ones(2)))
     assert str(jax.make_jaxpr(lambda x: in_scalars(rotated, x, seed=x))(jnp.ones(2))) == program
-    assert str(jax.make_jaxpr(lambda x: unchecked(rotated, x))(jnp.ones(2))) == program
+    assert str(jax.make_jaxpr(lambda x: without_error_checks(rotated, x))(jnp.ones(2))) == program
     columns: Any = columns_of(lambda a, b: [2.0 * a, 3.0 * b - a], opaque_one(x[0]), *x)
     assert [list(map(float, column)) for column in columns] == [[2.0, -1.0], [0.0, 3.0]]
     beyond = lambda q: q[5]  # noqa: E731
@@ -96,7 +96,7 @@ def test_functions_stay_whole(none_available: Callable[[], None]) -> None:
 def test_checks_stay_where_they_cannot_be_left_out(none_available: Callable[[], None]) -> None:
     none_available()
     checked = lambda x: eqx.error_if(x, x < 0.0, "negative")  # noqa: E731
-    assert calls_back(jax.make_jaxpr(lambda x: unchecked(checked, x))(1.0).jaxpr)
+    assert calls_back(jax.make_jaxpr(lambda x: without_error_checks(checked, x))(1.0).jaxpr)
 
 
 def test_stored_steps_fall_back_on_an_adjoint_of_diffrax(

@@ -16,8 +16,8 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim import problems
-from jaxmodsim.solvers import unchecked
-from jaxmodsim.solvers._unchecked import calls_back
+from jaxmodsim.solvers import without_error_checks
+from jaxmodsim.solvers._error_checks import calls_back
 
 TIMES = np.linspace(0.0, 1.0, 5)
 
@@ -184,12 +184,12 @@ def test_checks_of_a_scenes_own_functions_stay() -> None:
         eqx.filter_jit(end)(jnp.full(1, 0.01))
 
 
-def test_unchecked_leaves_out_the_checks_of_its_arguments_alone() -> None:
+def test_checks_of_arguments_alone_are_left_out() -> None:
     def checked(x: Any, y: Any) -> Any:
         x = eqx.error_if(2.0 * jnp.array(x), x < 0, "x is negative")
         return jnp.sum(x**2) * eqx.error_if(y + 1.0, y < 0, "y is negative")
 
-    call = eqx.filter_jit(lambda x, y: unchecked(lambda x: checked(x, y), x))
+    call = eqx.filter_jit(lambda x, y: without_error_checks(lambda x: checked(x, y), x))
     x, y = jnp.asarray([-1.0, 2.0]), jnp.asarray(0.5)
     np.testing.assert_allclose(call(x, y), 30.0)
     np.testing.assert_allclose(jax.jit(jax.grad(call))(x, y), [-12.0, 24.0])
@@ -197,4 +197,4 @@ def test_unchecked_leaves_out_the_checks_of_its_arguments_alone() -> None:
     np.testing.assert_allclose(jax.vmap(call, in_axes=(0, None))(jnp.stack([x, x]), y), [30.0, 30.0])
     with pytest.raises(eqx.EquinoxRuntimeError, match="y is negative"):
         call(x, -y)
-    assert unchecked(lambda x, y: (x, y), jnp.ones(1), None)[1] is None
+    assert without_error_checks(lambda x, y: (x, y), jnp.ones(1), None)[1] is None

@@ -11,7 +11,7 @@ ONGOING, ACCUMULATION, TOO_MANY = 0.0, 1.0, 2.0
 
 
 class EventLog(NamedTuple):
-    """Events in the order of time; entries that were not needed hold an infinite time and zeros.
+    """Events in the order of time; unused entries have an infinite time and zeros.
 
     - `t`: times [s], shape `[max_events]`.
     - `fired`: 1 for each guard that fired, shape `[max_events, guards]`.
@@ -67,7 +67,7 @@ class EventState(NamedTuple):
 
 
 class EventMemory(NamedTuple):
-    """What `EventSolver` keeps from step to step, beside the state of the wrapped solver; constant in derivatives.
+    """Memory of `EventSolver` from step to step, beside the state of the wrapped solver; constant in derivatives.
 
     - `guard`, `armed`: values of the guards at the end of the last step, and which are armed, shape `[guards]`.
     - `resets`: number of calls of `reset`.
@@ -85,14 +85,14 @@ class EventMemory(NamedTuple):
 
 
 class Landing(NamedTuple):
-    """How a step ends, as regards events.
+    """Events at the end of a step.
 
-    - `fired`, `first`: the guards that fire, and the one of them that does so first, shape `[guards]`.
+    - `fired`, `first`: the guards that fire, and the first of them, shape `[guards]`.
     - `missed`: whether the step has passed a root.
     - `landed`: whether it ends on one.
     - `happens`: whether the state is to be reset.
     - `next_root`: see `StepReport`.
-    - `near`: how far the root may be from the end of the step, in steps.
+    - `near`: the largest distance of the root from the end of the step, in steps.
     """
 
     fired: Bool[Array, " guards"]

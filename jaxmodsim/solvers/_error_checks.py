@@ -1,4 +1,4 @@
-"""Calls without the run-time checks that a library makes of its arguments."""
+"""Calls without the run-time checks by which a library validates its arguments."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,21 +11,21 @@ from jaxtyping import Array
 from .._core.compat import AVAILABLE, ClosedJaxpr, Literal
 
 
-def unchecked(fn: Callable[..., Any], *args: Array | None) -> Any:
+def without_error_checks(fn: Callable[..., Any], *args: Array | None) -> Any:
     """`fn(*args)` without the checks by `equinox.error_if` of the arguments themselves.
 
     Such a check calls back to Python if it fails. JAX does not keep a program with a callback in its persistent
-    compilation cache, and inside of `jax.vmap` one failed check ends the whole batch. So the caller makes the same
-    checks, and says by numbers how they ended.
+    compilation cache, and inside `jax.vmap` one failed check ends the whole batch. The caller therefore makes the same
+    checks, and returns their results as numbers.
 
-    Only checks that hand through one of `args`, a copy or a multiple of it (times where they run backward) are left
-    out. Those of values computed from them otherwise stay, and so do all in loops and in functions with a derivative of
-    their own: checks that belong to others are kept. Derivatives are those of `fn`, as a check is an identity.
+    This leaves out only checks that return one of `args`, a copy or a multiple of it (times that run backward). Checks
+    of other values stay, and so do all checks in loops and in functions with a derivative of their own. Derivatives are
+    those of `fn`, as a check is an identity.
 
     **Arguments:**
 
     - `fn`: a function of arrays that returns a pytree of arrays. It may close over traced values.
-    - `args`: arrays, or None. If none of them is traced, nothing is compiled, and `fn` is called as it is.
+    - `args`: arrays, or None. If none of them is traced, nothing is compiled, and this calls `fn` itself.
     """
     if "jaxprs" not in AVAILABLE or not any(isinstance(x, jax.core.Tracer) for x in args):
         return fn(*args)
@@ -35,7 +35,7 @@ def unchecked(fn: Callable[..., Any], *args: Array | None) -> Any:
 
 
 def _run(closed: ClosedJaxpr, inputs: list[Any], given: list[Any]) -> list[Any]:
-    """Evaluate a traced function; `given` are the values whose checks are left out; it grows by their multiples."""
+    """Evaluate a traced function without the checks of the values `given`, to which this adds their multiples."""
     jaxpr = closed.jaxpr
     values: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *inputs], strict=True))
 
@@ -67,11 +67,11 @@ def _step(eqn: Any, operands: list[Any], given: list[Any]) -> list[Any]:
 
 
 def calls_back(jaxpr: Any) -> bool:
-    """Whether a traced function calls Python anywhere while it runs."""
+    """Whether a traced function calls Python while it runs."""
     return any("callback" in eqn.primitive.name or any(map(calls_back, _inner(eqn))) for eqn in jaxpr.eqns)
 
 
 def _inner(eqn: Any) -> list[Any]:
-    """Traced functions inside of an equation: bodies, branches, and functions with a derivative of their own."""
+    """Traced functions inside an equation: bodies, branches, and functions with a derivative of their own."""
     inside = [x for value in eqn.params.values() for x in (value if isinstance(value, tuple | list) else (value,))]
     return [getattr(x, "jaxpr", x) for x in inside if hasattr(getattr(x, "jaxpr", x), "eqns")]
