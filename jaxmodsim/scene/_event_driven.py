@@ -414,7 +414,7 @@ def renew_slip(
 def stick_violation(
     elements: FrictionElements, forces: FrictionForces, mode: Float[Array, " modes"]
 ) -> Float[Array, " modes"]:
-    """By how much the force of each sticking element exceeds its limit, in limits; 0 in slip."""
+    """Excess of the force of each sticking element over its limit, in limits; 0 in slip."""
     n = mode.shape[0]
     force, upper, lower = (x[:n] for x in forces[:3])
     limit = jnp.where(force > 0, upper, lower)
