@@ -132,7 +132,7 @@ def _modes_in_words(orbit: PeriodicOrbit) -> list[str]:
 
 
 def _modes_of_run(run: Trajectory) -> list[str]:
-    words = run.mode_words
+    words = run.mode_labels
     if run.modes is None:
         return ["orbit"] * len(run.t)
     columns = [[words[name][int(x)] for x in np.asarray(mode)] for name, mode in run.mode.items()]
