@@ -154,7 +154,7 @@ def prepare_rest(
     if mode is not None and sides.size:
         t = jnp.zeros(())
         slip = from_dynamics(
-            lambda d: d.friction_elements.slipping(d.friction_elements.v[: sides.size], t),
+            lambda d: d.friction_elements.slip_mode(d.friction_elements.v[: sides.size], t),
             *(t, y, scene.bind_time(t), mode),
         )
         mode = mode.at[: sides.size].set(slip)

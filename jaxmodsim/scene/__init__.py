@@ -1,6 +1,6 @@
-"""Scenes: what is in them, and the vector field that follows."""
+"""Scenes, their parts, and their vector fields."""
 
-from . import _readable as _readable  # what they print
+from . import _readable as _readable  # registers their tables
 from ._check_scene import check_scene as check_scene
 from ._coordinates import Quantity as Quantity
 from ._dynamics import ConstraintReaction as ConstraintReaction

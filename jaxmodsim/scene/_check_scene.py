@@ -1,4 +1,4 @@
-"""What a scene's functions return is checked before it runs."""
+"""Checks of the values that a scene's functions return, before it runs."""
 
 from typing import Any
 
@@ -15,12 +15,12 @@ from ._signal import signals_at, signals_of
 
 
 def check_scene(scene: Scene, y: State) -> None:
-    """Check shapes of everything the scene's functions return, and the indices that they use.
+    """Check the shapes of all values that the scene's functions return, and the indices that they use.
 
     **Raises:**
 
     - `ValueError` naming the function, the shape it returned and the shape that is needed, or the index that is out of
-      range; see `traced` for those that are seen; or for names of more or fewer coordinates than there are.
+      range (see `traced` for the indices that it checks); also if the number of coordinate names is wrong.
     """
     t, named = y.q[0], len(scene.coordinates)
     if named not in (0, y.q.shape[0]):
@@ -62,7 +62,7 @@ def check_scene(scene: Scene, y: State) -> None:
 
 
 def _check_at_rest(constraint: AbstractConstraint, t: Array, y: State, params: PyTree, name: str) -> None:
-    """Refuse a constraint that a linear signal moves: `params` have those as signals, and all else as numbers."""
+    """Refuse a constraint that a linear signal moves; in `params` only linear signals are signals, the rest numbers."""
 
     def at(time: Array) -> Array:
         there = signals_at(params, time)

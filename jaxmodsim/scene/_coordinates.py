@@ -1,4 +1,4 @@
-"""Coordinates that have names and units."""
+"""Names and units of coordinates."""
 
 import re
 from typing import NamedTuple
@@ -9,14 +9,14 @@ _LABEL = re.compile(r"\s*([^\[\]]*[^\[\]\s])\s*(?:\[\s*([^\[\]]*[^\[\]\s])\s*\])
 
 
 class Quantity(NamedTuple):
-    """Name and unit of a series along a run; the unit is empty where none is known."""
+    """Name and unit of a series along a run; the unit is empty if unknown."""
 
     name: str
     unit: str
 
     @property
     def label(self) -> str:
-        """The name with its unit in brackets, where there is one."""
+        """The name, with its unit in brackets if it has one."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
@@ -29,11 +29,11 @@ def read_label(text: str) -> Quantity:
 
 
 def as_coordinates(given: object) -> tuple[str, ...]:
-    """Texts such as "x [m]", one for each coordinate, of different names and known units.
+    """Texts such as "x [m]", one for each coordinate, with different names and known units.
 
     **Raises:**
 
-    - `ValueError` naming what was given and what is needed.
+    - `ValueError` naming the argument and the requirement.
     """
     if not isinstance(given, tuple | list) or not all(isinstance(x, str) and _LABEL.fullmatch(x) for x in given):
         raise ValueError(

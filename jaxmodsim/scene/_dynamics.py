@@ -1,4 +1,4 @@
-"""The equations of motion of a scene, with only the terms it holds, and what a run asks beside them."""
+"""The equations of motion of a scene, with only the terms that it has, and the further functions of a run."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias, TypeVar
@@ -35,20 +35,19 @@ from ._karnopp import karnopp_forces
 from ._scene import Scene
 from .forces._effect import Action, Power
 
-# Rounding units by which the mobility within constraints may be wrong.
+# Error of the mobility within constraints, in rounding units.
 _ROUNDING = 256.0
 
 _Value = TypeVar("_Value")
 
-# Modes of the set-valued friction elements; None where the scene has none.
+# Modes of a scene, an array; None without modes.
 Modes: TypeAlias = Any
 
 
 class State(NamedTuple):
     """State of a scene: coordinates and velocities, shape `[dof]`, and the effects' own states by name.
 
-    The modes of set-valued friction elements and of contacts come beside it, an array in the order of
-    `Scene.mode_names`, or None where there are none.
+    Modes are a separate array, in the order of `Scene.mode_names`, or None without modes.
     """
 
     q: PerDof
@@ -57,12 +56,12 @@ class State(NamedTuple):
 
 
 class ConstraintReaction(NamedTuple):
-    """What a constraint does; along a run with a leading axis of time.
+    """Forces of a constraint; along a run with a leading axis of time.
 
     - `multiplier`: multipliers, shape `[m]`.
     - `generalised`: generalised force `J^T lambda`, shape `[dof]` [N or N m].
-    - `force`: Cartesian force [N] on the constrained point, of the shape of its position; None where the constraint has
-      no `at`.
+    - `force`: Cartesian force [N] on the constrained point, of the shape of its position; None if the constraint has no
+      `at`.
     """
 
     multiplier: Float[Array, "*time m"]
@@ -71,16 +70,16 @@ class ConstraintReaction(NamedTuple):
 
 
 class Dynamics(NamedTuple):
-    """What happens at one state, see `forward_dynamics`.
+    """Accelerations and forces at one state, see `forward_dynamics`.
 
     - `t`, `y`, `mode`: time, state and modes.
-    - `scene`: with its signals and laws as they are at this state.
-    - `actions`: of every effect, by name.
+    - `scene`: the scene with its signals and laws at this state.
+    - `actions`: actions of all effects, by name.
     - `qdd`: accelerations.
     - `elements`, `friction`: the friction elements that depend on accelerations, and their forces, or None.
-    - `constraints`, `multipliers`: of all constraints, or None.
-    - `uniqueness`: what is left of the uniqueness of loads that are reactions, see `FrictionForces.margin`; the
-      equations hold where it is positive. None without such loads.
+    - `constraints`, `multipliers`: rows and multipliers of all constraints, or None.
+    - `uniqueness`: margin of uniqueness of loads that are reactions, see `FrictionForces.margin`; the equations hold if
+      it is positive. None without such loads.
     """
 
     t: Scalar
@@ -97,12 +96,12 @@ class Dynamics(NamedTuple):
 
     @property
     def rate(self) -> State:
-        """Rate of the state; NaN where the equations do not hold."""
+        """Rate of the state; NaN if the equations do not hold."""
         return self._valid_rate(self.qdd)
 
     @property
     def canonical_rate(self) -> State:
-        """Rates of coordinates and momenta: `p' = dL/dq + Q + J^T lambda`, in the place of qd."""
+        """Rates of coordinates, and of momenta, `p' = dL/dq + Q + J^T lambda`, in the place of qd."""
         push = jax.grad(self.scene.lagrangian, argnums=1)(self.t, self.y.q, self.y.qd, self.scene.params)
         for action in self.actions.values():
             push = push + action.generalised
@@ -122,7 +121,7 @@ class Dynamics(NamedTuple):
 
     @property
     def reactions(self) -> dict[str, ConstraintReaction]:
-        """What each constraint does, by name."""
+        """Forces of each constraint, by name."""
         if self.constraints is None or self.multipliers is None:
             return {}
         scene, t, y = self.scene, self.t, self.y
@@ -139,10 +138,10 @@ class Dynamics(NamedTuple):
 
     @property
     def power(self) -> dict[str, Power]:
-        """Power [W] from outside into the mechanism and its effects, and absorbed by friction: of each by its name.
+        """Power [W] from outside into the mechanism and its effects, and power absorbed by friction, by effect name.
 
-        Besides, under the name of a constraint what its motion in time supplies, and under `lagrangian` what a
-        Lagrangian does that depends on time by itself, `-dL/dt`; not there where it does not.
+        Further entries are the power that the prescribed motion of a constraint supplies, by its name, and `-dL/dt`
+        under `lagrangian`, if the Lagrangian depends on time.
         """
         scene, y = self.scene, self.y
         powers = {
@@ -166,10 +165,10 @@ class Dynamics(NamedTuple):
     def guards(self, rest: Scalar, tolerances: tuple[Array, Array]) -> tuple[Float[Array, " guards"], ...]:
         """Guards that are positive while the modes hold, and their tolerances; see `friction_guards`.
 
-        Of a contact that is open the gap, of one that is closed its multiplier. A gap counts as closed only where it is
-        negative by more than its rounding: behind an impact, and where a contact opens, it begins from zero. Of a
-        switch its guard, times its mode. Of scenes with contacts there follow the values that guards have at their
-        events: of a gap its rounding.
+        The guard of an open contact is its gap, that of a closed one its multiplier. A gap closes only below zero by
+        more than its rounding, because it starts from zero after an impact and when a contact opens. The guard of a
+        switch is multiplied by its mode. Scenes with contacts also return the values of the guards at their events,
+        which for gaps is the rounding.
         """
         friction, gaps, sides = self._modes
         guards, atol, roots = [], [], [jnp.zeros_like(friction)]
@@ -194,7 +193,7 @@ class Dynamics(NamedTuple):
         return tuple(jnp.concatenate(each) for each in (guards, atol, *([roots] if gaps.size else [])))
 
     def start_friction(self, rest: Scalar) -> tuple[State, Float[Array, " n"]]:
-        """State, and modes of the friction elements, to begin with; they do not depend on those in `mode`."""
+        """Initial state, and modes of the friction elements, which do not depend on those in `mode`."""
         t, y, scene, elements = self.t, self.y, self.scene, self.friction_elements
         speed = []
         for each in scene.event_driven.values():
@@ -206,22 +205,22 @@ class Dynamics(NamedTuple):
         still = elements.magnitude(v) <= jnp.maximum(rounding, rest)
         rest = self._speed_of_rest(rest)
         mode = next_modes(
-            elements, elements.slipping(jax.lax.stop_gradient(v), rest), still, jnp.zeros_like(still), rest
+            elements, elements.slip_mode(jax.lax.stop_gradient(v), rest), still, jnp.zeros_like(still), rest
         )
         return self._stick(mode), mode
 
     def switch_struck(
         self, fired: Bool[Array, " n"], stopped: Bool[Array, " elements"], struck: Bool[Array, ""], rest: Scalar
     ) -> tuple[State, Float[Array, " n"]]:
-        """State and modes of the friction elements behind an impact, which may turn a slip, and end a stick.
+        """State and modes of the friction elements after an impact, which may reverse a slip, and end a stick.
 
-        `stopped` are the elements whose slip it has taken; `struck` is False where no velocity has changed.
+        `stopped`: the elements that the impact has stopped. `struck`: whether it has changed a velocity.
         """
         elements, mode = self.friction_elements, self._elements
         v = jax.lax.stop_gradient(elements.v[: mode.size])
         turned = struck & (elements.magnitude(v) > rest)
         fired = (fired & ~turned) | (elements.in_rows(stopped) & ~elements.sticks(mode))
-        mode = jnp.where(turned, elements.slipping(v, self._speed_of_rest(rest)), mode)
+        mode = jnp.where(turned, elements.slip_mode(v, self._speed_of_rest(rest)), mode)
         return self.switch_friction(fired, mode, rest)
 
     def switch_friction(
@@ -232,12 +231,12 @@ class Dynamics(NamedTuple):
         mode, fired = renew_slip(elements, mode, fired, rest) if elements.planes else (mode, fired)
         sticks = elements.sticks(mode)
         new = next_modes(elements, mode, sticks | fired, fired & sticks, rest)
-        # What is left of a slip in the plane that stops goes, whatever follows: it says nothing of the next direction.
+        # The remaining slip of a plane that stops is removed in any case: it does not determine the next direction.
         stops = elements.in_planes(elements.sticks(new), lambda part: fired[part] | elements.sticks(new)[part])
         return self.y._replace(qd=stop_slip(elements, self.y.qd, stops)), new
 
     def hold(self, fired: Bool[Array, " guards"]) -> tuple[State, Float[Array, " n"]]:
-        """State and modes where the friction elements that `fired` stick, whatever their limits."""
+        """State and modes if the friction elements that `fired` stick, regardless of their limits."""
         (modes, *others), elements = self._modes, self.friction_elements
         n = modes.size
         held = elements.in_planes(fired[:n], lambda part: jnp.any(fired[part]))
@@ -245,7 +244,7 @@ class Dynamics(NamedTuple):
         return self.stick(mode), mode
 
     def stick(self, mode: Modes) -> State:
-        """State with the slip velocity of elements that stick in `mode`, which drifts, set to zero."""
+        """State without the slip velocity of elements that stick in `mode`, which drifts from zero."""
         return self._stick(mode[: self._elements.size])
 
     def _stick(self, mode: Float[Array, " n"]) -> State:
@@ -268,14 +267,14 @@ class Dynamics(NamedTuple):
 
     @property
     def contact_forces(self) -> Float[Array, " n"]:
-        """Multipliers of the contacts, negative where one that is closed would pull."""
+        """Multipliers of the contacts, negative if a closed one would pull."""
         assert self.multipliers is not None
         pushes = by_constraint(self.scene, self.t, self.y, self.multipliers)
         return jnp.concatenate([pushes[name] for name in self.scene.contacts])
 
     @property
     def stick_violation(self) -> Float[Array, " n"]:
-        """By how much the force of each sticking element exceeds its limit, in limits; 0 in slip."""
+        """Excess of the force of each sticking element over its limit, in limits; 0 in slip."""
         if not self._elements.size:
             return self._elements
         assert self.friction is not None
@@ -283,13 +282,13 @@ class Dynamics(NamedTuple):
 
     @property
     def friction_elements(self) -> FrictionElements:
-        """`elements` of a scene that has them."""
+        """`elements` of a scene with such elements."""
         assert self.elements is not None
         return self.elements
 
 
 class Mobility(NamedTuple):
-    """How the mechanism answers forces: `solve` without its constraints, the methods within them."""
+    """Accelerations of the mechanism by forces: `solve` without its constraints, the methods within them."""
 
     solve: Callable[[Array], Array]
     constraints: LinearizedConstraints | None
@@ -309,13 +308,13 @@ class Mobility(NamedTuple):
         return free if self.constraints is None else self.constraints.respond(free)
 
     def least(self, row: PerDof) -> Scalar:
-        """Mobility [1/kg] along a direction that rounding can tell from none, where constraints take it away."""
+        """Least mobility [1/kg] along a direction within constraints that is above rounding."""
         eps = float(jnp.finfo(row.dtype).eps)
         return _ROUNDING * eps * jnp.sum(row * self.solve(row))
 
 
 def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> Dynamics:
-    """Solve for the accelerations, and for the forces that depend on them, in the modes `mode`."""
+    """Solve for the accelerations, and for the forces that depend on them, for the modes `mode`."""
     q, qd = y.q, y.qd
     scene = scene.bind_state(t, q, qd)
     params = scene.params
@@ -348,15 +347,15 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
             rhs = rhs + action.generalised - actions[name].generalised
             actions[name] = action
     qdd = mobility.solve(rhs)
-    multipliers = None
+    multipliers, reported = None, linearized
     if linearized is not None:
         multipliers = linearized.multipliers(qdd)
         qdd = qdd + linearized.apply_force(multipliers)
         if compliant is not None:
             multipliers = multipliers + compliant.force
-            linearized = linearized._replace(rows=linearized.rows + compliant.rate)  # from here on to be reported
+            reported = linearized._replace(rows=linearized.rows + compliant.rate)
     if not (scene.event_driven or scene.reaction_loaded):
-        return Dynamics(t, y, mode, scene, actions, qdd, None, None, linearized, multipliers, None)
+        return Dynamics(t, y, mode, scene, actions, qdd, None, None, reported, multipliers, None)
 
     units = {name: each.force_per_load(t, q, qd, y.z.get(name), params) for name, each in scene.reaction_loaded.items()}
     pushes = [-each.apply_force(q, units[name][0], params) for name, each in scene.reaction_loaded.items()]
@@ -364,24 +363,26 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     def loads(rows: Array, widths: tuple[int, ...]) -> Loads | None:
         return _loads(scene, mobility, t, y, rows, widths, multipliers)
 
-    floor = mobility.least if linearized is not None else None
+    least_mobility = mobility.least if linearized is not None else None
     friction = [*scene.event_driven.values()]
     modes = jnp.zeros(0, q.dtype) if mode is None else scene.split_modes(mode)[0]
-    elements = assemble_friction(friction, pushes, mobility.respond, floor, loads, t, q, qd, params, qdd, modes)
-    settled = solve_friction_forces(elements, modes)
-    forces = [settled.force[part] for part in elements.parts]
+    elements = assemble_friction(
+        friction, pushes, mobility.respond, least_mobility, loads, t, q, qd, params, qdd, modes
+    )
+    solved = solve_friction_forces(elements, modes)
+    forces = [solved.force[part] for part in elements.parts]
     for force, (name, effect) in zip(forces, scene.event_driven.items(), strict=False):
         force = force if force.ndim == 0 else effect.stretch(force)
         actions[name] = Action(effect.apply_force(q, force, params), force)
     for force, push, name in zip(forces[len(friction) :], pushes, scene.reaction_loaded, strict=True):
         unit, rate = units[name]
         actions[name] = Action(-force * push, force * unit, rate)
-    qdd = qdd - jnp.sum(elements.minv_jt * settled.force[:, None], axis=0)
+    qdd = qdd - jnp.sum(elements.minv_jt * solved.force[:, None], axis=0)
     if (within := mobility.constraints) is not None and multipliers is not None:
         taken = sum(actions[name].generalised for name in (*scene.event_driven, *scene.reaction_loaded))
         multipliers = multipliers + within.multiplier_response(mobility.solve(jnp.asarray(taken)))
-    uniqueness = settled.margin if scene.loaded else None
-    return Dynamics(t, y, mode, scene, actions, qdd, elements, settled, linearized, multipliers, uniqueness)
+    uniqueness = solved.margin if scene.loaded else None
+    return Dynamics(t, y, mode, scene, actions, qdd, elements, solved, reported, multipliers, uniqueness)
 
 
 def _loads(
@@ -393,9 +394,9 @@ def _loads(
     widths: tuple[int, ...],
     multipliers: Any,
 ) -> Loads | None:
-    """Normal forces of the constraints that load friction, and what the elements take off them.
+    """Normal forces of the constraints that load friction, and their change by the friction forces.
 
-    Of each element there are as many `rows` as `widths` says.
+    `widths`: the number of `rows` of each element.
     """
     names = scene.loaded
     if not names:
@@ -417,7 +418,7 @@ def _loads(
 
 
 def _compliant(scene: Scene, t: Array, y: State) -> Action:
-    """Forces of the contacts that give way, among the multipliers of all constraints, and in `rate` their rows."""
+    """Forces of the compliant contacts, among the multipliers of all constraints, and in `rate` their rows."""
     where, dof = parts(scene.constraints, t, y.q, y.qd, scene.params), y.q.shape[0]
     force = jnp.zeros(where[-1].stop, y.q.dtype)
     rows = jnp.zeros((where[-1].stop, dof), y.q.dtype)
@@ -430,7 +431,7 @@ def _compliant(scene: Scene, t: Array, y: State) -> Action:
 
 
 def by_constraint(scene: Scene, t: Array, y: State, values: Array) -> dict[str, Array]:
-    """What there is one of for each equation (multipliers, rows), by the names of the constraints."""
+    """An array over the equations (multipliers, rows) in parts, by the names of the constraints."""
     where = parts(scene.constraints, t, y.q, y.qd, scene.params)
     return {name: values[part] for name, part in zip(scene.constraint_names, where, strict=True)}
 
@@ -438,11 +439,11 @@ def by_constraint(scene: Scene, t: Array, y: State, values: Array) -> dict[str, 
 def from_dynamics(get: Callable[[Dynamics], _Value], t: Scalar, y: State, scene: Scene, mode: Modes = None) -> _Value:
     """`get(forward_dynamics(t, y, scene, mode))`, a pytree of arrays, evaluated in scalars as a whole.
 
-    Laws, loads and solves are small arrays like the terms of the Lagrangian; see `in_scalars`.
+    Laws, loads and solves have small arrays like the terms of the Lagrangian; see `in_scalars`.
     """
     return in_scalars(lambda t, y, mode: get(forward_dynamics(t, y, scene, mode)), t, y, mode, seed=y.q)
 
 
 def vector_field(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> State:
-    """Right-hand side of `y' = field(t, y)`; NaN where the equations do not hold, see `Dynamics.uniqueness`."""
+    """Right-hand side of `y' = field(t, y)`; NaN if the equations do not hold, see `Dynamics.uniqueness`."""
     return from_dynamics(lambda dynamics: dynamics.rate, t, y, scene, mode)

@@ -1,12 +1,12 @@
-"""Impacts: what velocities and modes become at the instant at which gaps close.
+"""Impacts: velocities and modes after the instant at which gaps close.
 
-Contacts that touch take impulses p along their gaps, friction elements that they load take r against their slip. With
-the velocities w of gaps and v of slips, and the matrix A of what unit impulses do to them within the bilateral
-constraints, `(w, v)(after) = (w, v) + A (p, -r)`. For each contact `p >= 0`, `w(after) + e w >= 0`, one of the two
-zero; for each friction element Coulomb's law of the impulses: stick, `v(after) = 0` and `-mu p <= r <= mu p`, or slip
-in either direction, `r = +-mu p` with the sign of `v(after)`. The coefficient mu is that of the law in slip at zero
-velocity. This is a complementarity problem (Moreau 1988; Pfeiffer and Glocker 1996, chapter 8), solved by trying all
-combinations. `Poisson` solves it twice, in compression and in expansion.
+Contacts that touch receive impulses p along their gaps; friction elements that they load receive impulses r against
+their slip. The velocities w of gaps and v of slips change by `(w, v)(after) = (w, v) + A (p, -r)`, where A maps unit
+impulses to velocities within the bilateral constraints. Each contact has `p >= 0`, `w(after) + e w >= 0`, one of the
+two zero. Each friction element obeys Coulomb's law of impulses: stick, `v(after) = 0` and `-mu p <= r <= mu p`, or
+slip, `r = +-mu p` with the sign of `v(after)`. The coefficient mu is that of the law in slip at zero velocity. This is
+a complementarity problem (Moreau 1988; Pfeiffer and Glocker 1996, chapter 8), solved by trying all combinations.
+`Poisson` solves it twice, in compression and in expansion.
 """
 
 from itertools import product
@@ -23,9 +23,9 @@ from .._core.lu import factor_lu
 from ..mechanics import LinearizedConstraints, Poisson, linearize_constraints, motion_equations
 from ._scene import Scene
 
-# Rounding units of the velocities of all coordinates, below which a gap or a slip has no velocity.
+# A gap or a slip has no velocity below this number of rounding units of the velocities of all coordinates.
 _ROUNDING = 64.0
-# Steps of refinement of systems that may be singular, as in `solve_semidefinite`.
+# Refinement steps for systems that may be singular, as in `solve_semidefinite`.
 _REFINEMENTS = 2
 
 _constant = jax.lax.stop_gradient
@@ -57,19 +57,19 @@ def impact(
     rest: Scalar,
     bounces: Bool[Array, " contacts"] | None,
 ) -> tuple[PerDof, Float[Array, " contacts"], Bool[Array, " elements"]]:
-    """What comes after the instant at which those contacts `fired`.
+    """Velocities and modes after the instant at which the contacts `fired`.
 
-    Contacts that are closed and have fired open: their multiplier has fallen to zero. Those that are open and have
-    fired are struck. Struck contacts whose gap has no velocity afterwards are closed.
+    Closed contacts that fired open: their multiplier has fallen to zero. Open contacts that fired are struck. Struck
+    contacts whose gap has no velocity afterwards are closed.
 
     **Arguments:**
 
     - `t`, `q`, `qd`, `scene`: the instant; the scene is that of time `t`.
     - `closed`: modes before.
-    - `fired`: contacts whose guards have.
-    - `rest`: velocity [m/s] that counts as none.
-    - `bounces`: which contacts give back a part of their velocity; None where impacts have accumulated, and what is
-      left of the velocity of a gap, be it away from the contact, is below what time resolves: it is taken away.
+    - `fired`: contacts whose guards fired.
+    - `rest`: speed of rest [m/s].
+    - `bounces`: which contacts rebound; None if impacts have accumulated. The remaining velocity of a gap, of either
+      sign, is then below what time resolves, and is removed.
 
     **Returns:**
 
@@ -79,7 +79,7 @@ def impact(
     mass = motion_equations(scene.lagrangian, t, q, qd, params).mass
     gaps = linearize_constraints(contacts, t, q, qd, params, mass)
     rubbing = scene.impact_friction
-    # The velocity of a gap that moves by itself counts, too.
+    # Velocities of gaps include prescribed motion.
     w = jnp.concatenate([each.rate(t, q, qd, params) for each in contacts])
     touches = jnp.where(closed > 0, ~fired, fired)
     struck, rows, reach = _struck(t, (q, qd), scene, mass, gaps, touches)
@@ -103,7 +103,7 @@ def impact(
     closes = touches & still[:n]
     qd = qd + jnp.sum(reach * impulse[:, None], axis=0)
     if rubbing:
-        # What rounding leaves of the velocity of a gap that closes is large beside what a step may be wrong by.
+        # The rounding error in the velocity of a gap that closes is large against the admissible error of a step.
         left = jnp.concatenate([each.rate(t, q, qd, params) for each in contacts])
         rest_of = solve_semidefinite(struck.delassus[:n, :n], jnp.where(closes, -left, 0.0), jnp.ones_like(w), closes)
         qd = qd + jnp.sum(reach[:n] * rest_of[:, None], axis=0)
@@ -122,7 +122,7 @@ def _struck(
     gaps: LinearizedConstraints,
     touches: Bool[Array, " n"],
 ) -> tuple[_Struck, Float[Array, "k dof"], Float[Array, "k dof"]]:
-    """The struck mechanism, its rows d(w, v)/dqd, and the velocities that unit impulses make."""
+    """The struck mechanism, its rows d(w, v)/dqd, and the velocities of unit impulses."""
     (q, qd), rows, reach, rubbing = state, gaps.rows, gaps.minv_jt, scene.impact_friction
     if rubbing:
         along = jnp.stack([each.direction(q, scene.params) for each in rubbing.values()])
@@ -147,12 +147,12 @@ def _struck(
 
 
 def _impulses(struck: _Struck, v: Float[Array, " k"], least: Float[Array, " n"]) -> Float[Array, " k"]:
-    """Impulses (p, -r) from velocities `v`, those of gaps with what restitution adds; `p >= least` in place of zero.
+    """Impulses (p, -r) from velocities `v`, those of gaps with restitution; `p >= least` instead of zero.
 
-    All combinations are tried, and the one that violates the conditions least is taken: without friction, of a positive
-    definite matrix, exactly one violates none (Cottle, Pang, Stone: The Linear Complementarity Problem, 1992, theorem
-    3.3.7). With friction there may be several: the first in the order stick, slip forward, slip backward. Of redundant
-    contacts the smallest impulses.
+    This tries all combinations, and takes the one that violates the conditions least. Without friction, and with a
+    positive definite matrix, exactly one violates none (Cottle, Pang, Stone: The Linear Complementarity Problem, 1992,
+    theorem 3.3.7). With friction there may be several; this takes the first in the order stick, slip forward, slip
+    backward. Redundant contacts get the smallest impulses.
     """
     n, m = struck.loads.shape[1], struck.loads.shape[0]
     if m == 0 and n == 1:
@@ -167,7 +167,7 @@ def _impulses(struck: _Struck, v: Float[Array, " k"], least: Float[Array, " n"])
 def _solve(
     struck: _Struck, v: Float[Array, " k"], least: Float[Array, " n"], combination: Float[Array, " k"]
 ) -> Float[Array, " k"]:
-    """Impulses where contacts at 1 push until their gaps rest, and elements stick at 0 or slip in a direction."""
+    """Impulses for a combination: contacts at 1 push until their gaps rest, elements stick at 0 or slip at +-1."""
     a, n, m = struck.delassus, struck.loads.shape[1], struck.loads.shape[0]
     pushes, slips = combination[:n] > 0, combination[n:]
     given = jnp.concatenate([jnp.where(pushes, 0.0, least), jnp.zeros(m, v.dtype)])
@@ -175,7 +175,7 @@ def _solve(
     if m == 0:
         return given + solve_semidefinite(a, jnp.where(pushes, rhs, 0.0), jnp.ones_like(v), pushes & struck.touches)
     free = jnp.concatenate([pushes & struck.touches, slips == 0])
-    # Slip friction is what its contact pushes times a coefficient: its columns go into those of the contacts.
+    # Slip friction is the impulse of its contact times a coefficient: its columns are added to those of contacts.
     share = jnp.where(slips > 0, -struck.forward, jnp.where(slips < 0, struck.backward, 0.0))[:, None] * struck.loads
     given = given.at[n:].set(jnp.sum(share * given[None, :n], axis=1))
     rhs = -v - jnp.sum(a * given[None, :], axis=1)
@@ -189,7 +189,7 @@ def _solve(
 def _solve_singular(
     matrix: Float[Array, "k k"], rhs: Float[Array, " k"], free: Bool[Array, " k"]
 ) -> Float[Array, " k"]:
-    """As `solve_semidefinite`, of a matrix that friction makes unsymmetric."""
+    """As `solve_semidefinite`, for a matrix that friction makes unsymmetric."""
     k = rhs.shape[0]
     scale = jnp.max(jnp.abs(matrix))
     scale = jnp.where(scale > 0, scale, 1.0)
@@ -210,7 +210,7 @@ def _solve_singular(
 def _violation(
     struck: _Struck, v: Float[Array, " k"], least: Float[Array, " n"], combination: Float[Array, " k"]
 ) -> Scalar:
-    """The largest velocity by which a combination misses the conditions."""
+    """The largest velocity by which a combination violates the conditions."""
     n, slips = struck.loads.shape[1], combination[struck.loads.shape[1] :]
     impulse = _solve(struck, v, least, combination)
     after = v + jnp.sum(struck.delassus * impulse[None, :], axis=1)

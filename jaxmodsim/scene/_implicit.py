@@ -18,9 +18,9 @@ from .forces._friction import Friction
 
 
 class _StepElement(NamedTuple):
-    """A friction element at the beginning of a step.
+    """A friction element at the start of a step.
 
-    - `effect`: with the law as it is there; `load`: its normal load, or None.
+    - `effect`: the element, with its law at that state; `load`: its normal load, or None.
     - `rows`: slip velocities per unit of the velocities, shape `[components, dof]`.
     - `belt`: velocity of the surface at the end of the step, shape `[components]`.
     - `planar`: whether slip is a vector.
@@ -39,11 +39,11 @@ class _StepElement(NamedTuple):
 
 
 def check_step(scene: Scene) -> None:
-    """Check that `scene_step` can step the scene.
+    """Check that `scene_step` supports the scene.
 
     **Raises:**
 
-    - `ValueError` naming the friction element or the contact that it cannot step, and what to do.
+    - `ValueError` naming the unsupported friction element or contact, and the remedy.
     """
     if events := {**scene.contacts, **scene.switches}:
         raise ValueError(f"ImplicitFriction takes no events, by which {', '.join(events)} changes: use another solver.")
@@ -74,8 +74,9 @@ def check_step(scene: Scene) -> None:
 def scene_step(scene: Scene, t0: Scalar, t1: Scalar, y: State) -> tuple[State, Bool[Array, ""]]:
     """State at `t1` after one step from `y` at `t0`, of order 1, and whether its equations were solved.
 
-    Masses, directions, loads and all forces but friction are those at t0. Friction is that of the slip velocity and the
-    state at t1: `v1 = v_free - h D M^-1 D^T F(v1, advance(v1, z0, h))`. Coordinates follow with the velocities at t1.
+    Masses, directions, loads and all forces except friction are those at t0. Friction is that of the slip velocity and
+    the state at t1: `v1 = v_free - h D M^-1 D^T F(v1, advance(v1, z0, h))`. Coordinates follow with the velocities at
+    t1.
     """
     q, qd, h = y.q, y.qd, t1 - t0
     scene = scene.bind_state(t0, q, qd)

@@ -1,4 +1,4 @@
-"""Forces of friction elements that hold in a band about rest (`DeadZone`)."""
+"""Forces of friction elements that stick in a band of velocities about rest (`DeadZone`)."""
 
 from collections.abc import Callable
 
@@ -11,7 +11,7 @@ from ..friction import AbstractKarnoppLaw
 from .forces._effect import Action
 from .forces._friction import Friction
 
-# Sweeps of projected Gauss-Seidel over holding elements that are coupled through the mechanism.
+# Sweeps of projected Gauss-Seidel over sticking elements that the mechanism couples.
 _SWEEPS = 50
 
 
@@ -26,19 +26,19 @@ def karnopp_forces(
     qd: PerDof,
     params: PyTree,
 ) -> dict[str, Action]:
-    """What keeps the slip velocity constant, within the limits of stick.
+    """Forces that keep the slip velocities constant, within the limits of stick.
 
-    With directions D (rows), the slip acceleration is `D qdd + dD/dt qd - belt'`; each holding force F enters it
+    With directions D (rows), the slip acceleration is `D qdd + dD/dt qd - belt'`; each sticking force F enters it
     as `-D W D^T F`. Elements are solved one after the other, several of them in repeated sweeps, which
     converge because that matrix is positive semidefinite.
 
     **Arguments:**
 
-    - `elements`: by name.
-    - `slipping`: their actions as if they slipped, which `rhs` contains.
-    - `accelerate`: accelerations under a generalised force, constraints kept.
-    - `respond`: what W does: the change of accelerations with a generalised force.
-    - `rhs`: generalised force with everything in it.
+    - `elements`: the elements by name.
+    - `slipping`: their actions in slip, which `rhs` contains.
+    - `accelerate`: maps a generalised force to accelerations within the constraints.
+    - `respond`: W, the change of accelerations with a generalised force.
+    - `rhs`: generalised force of all effects.
     """
     names = list(elements)
     active, limits, rows = [], [], []

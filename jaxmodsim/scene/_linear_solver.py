@@ -17,7 +17,7 @@ from ._scene import Scene
 
 
 def has_linear_solver(scene: Scene) -> bool:
-    """Whether `linear_solver` knows the scene: no constraints, no switches, no friction by accelerations."""
+    """Whether `linear_solver` supports the scene: no constraints, switches or friction by accelerations."""
     depends = scene.event_driven or scene.reaction_loaded or scene.switches
     return not (depends or scene.constraints or any(each.karnopp for each in scene.friction.values()))
 
@@ -34,8 +34,8 @@ def linear_solver(
         dR(x_qd/shift, x_qd, shift x_qd, x_z) = -dR(rhs_q/shift, 0, -rhs_qd, 0)
         shift x_z - dz'(x_qd/shift, x_qd, x_z) = rhs_z + dz'(rhs_q/shift, 0, 0)
 
-    where dR and dz' are the derivatives along their arguments. Of these `factor_lu` eliminates the states of effects
-    first, each of which knows only itself, so that a full matrix is left for the velocities alone.
+    where dR and dz' are the derivatives along their arguments. `factor_lu` eliminates the states of effects first; each
+    depends on itself alone, so that the matrix of the velocities alone is full.
 
     **Arguments:**
 
@@ -71,7 +71,7 @@ def linear_solver(
         return -residual, rhs_z + rate
 
     def rows(linear: Callable[..., tuple[Array, Array]], *like: Array) -> list[tuple[Entry, ...]]:
-        # Kept: otherwise every use of an entry would compute it, 58 us in place of 5 for a step of three links.
+        # With a barrier: otherwise every use of an entry computes it, 58 us instead of 5 for a step of three links.
         columns = columns_of(lambda *x: [*jnp.concatenate(fusion_barrier(linear(*x), unit))], unit, *like)
         return list(zip(*columns, strict=True))
 
@@ -87,7 +87,7 @@ def linear_solver(
 
 
 def _balance(t: Scalar, y: State, qdd: PerDof, scene: Scene) -> tuple[PerDof, Float[Array, " entries"]]:
-    """Generalised force that is missing to the accelerations `qdd`, and the rates of the states of the effects."""
+    """Generalised force that the accelerations `qdd` lack, and the rates of the states of the effects."""
     q, qd = y.q, y.qd
     scene = scene.bind_state(t, q, qd)
     missing, rates = inverse_dynamics(scene.lagrangian, t, q, qd, qdd, scene.params), {}

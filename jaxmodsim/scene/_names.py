@@ -1,4 +1,4 @@
-"""Every number of a scene, or of a law alone, by a name that a person would type."""
+"""Names of the numbers of a scene, or of a law alone."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -18,7 +18,7 @@ from ._scene import Scene
 from ._signal import Signal
 from .forces._friction import Friction
 
-# Levels of the scene that say nothing about a number.
+# Levels of the scene that do not appear in names.
 _SILENT = ("law", "place", "amount", "number")
 
 _Module = TypeVar("_Module", bound=eqx.Module)
@@ -27,14 +27,14 @@ _Module = TypeVar("_Module", bound=eqx.Module)
 def scene_numbers(scene: eqx.Module) -> dict[str, Array]:
     """All numbers of a scene, or of another module such as a law, by name.
 
-    Entries of `params` go by their key (`m`, nested ones `arm.m`), numbers of an effect by `effect.number`
-    (`friction.Fc`, `friction.belt_velocity`); wrapped laws add no level of their own (`friction.width`), the two
-    sides of a law that depends on direction do (`friction.forward.Fc`). Those of a law alone go by what is left of that
-    (`Fc`, `forward.Fc`). Of a `Signal` there are its values (`u.values`); its times are constants.
+    The name of an entry of `params` is its key (`m`, nested `arm.m`), that of a number of an effect is `effect.number`
+    (`friction.Fc`, `friction.belt_velocity`). Wrapped laws add no level (`friction.width`); the two sides of a law that
+    depends on direction do (`friction.forward.Fc`). The names of a law alone have no effect in front (`Fc`,
+    `forward.Fc`). A `Signal` has its values (`u.values`); its times are constants.
 
     **Raises:**
 
-    - `ValueError` if two numbers come to the same name; give one of the effects a name.
+    - `ValueError` if two numbers have the same name; give one of the effects another name.
     """
     return {name: leaf for name, leaf in _named_leaves(scene) if name is not None}
 
@@ -55,7 +55,7 @@ def _named_leaves(scene: eqx.Module) -> list[tuple[str | None, Any]]:
 
 
 def _owners(scene: eqx.Module, path: tuple[Any, ...]) -> list[Any]:
-    """What holds the leaf at `path`, from the scene inwards."""
+    """The objects around the leaf at `path`, from the scene inwards."""
     owners: list[Any] = [scene]
     for key in path[:-1]:
         owners.append(_step(owners[-1], key))
@@ -65,7 +65,7 @@ def _owners(scene: eqx.Module, path: tuple[Any, ...]) -> list[Any]:
 def scene_ranges(scene: eqx.Module) -> dict[str, Range]:
     """Admissible range of each number that has one, by the names of `scene_numbers`.
 
-    A limit by another number carries that number's full name.
+    A limit that is another number has that number's full name.
     """
     leaves, _ = jtu.tree_flatten_with_path(scene)
     ranges: dict[str, Range] = {}
@@ -93,7 +93,7 @@ def scene_ranges(scene: eqx.Module) -> dict[str, Range]:
 
 
 def scene_units(scene: eqx.Module) -> dict[str, str]:
-    """Unit of each number that has a known one, by the names of `scene_numbers`."""
+    """Unit of each number with a known unit, by the names of `scene_numbers`."""
     units = {name: allowed.unit for name, allowed in scene_ranges(scene).items()}
     if isinstance(scene, Scene):
         for name, effect in scene.friction.items():
@@ -102,7 +102,7 @@ def scene_units(scene: eqx.Module) -> dict[str, str]:
 
 
 def replace_numbers(scene: _Module, values: dict[str, Any]) -> _Module:
-    """The scene or law with the numbers of these names replaced; the names are those of `scene_numbers`."""
+    """The scene or law with new values of the numbers of these names, which are those of `scene_numbers`."""
     leaves = [leaf if name is None else values.get(name, leaf) for name, leaf in _named_leaves(scene)]
     return jtu.tree_unflatten(jtu.tree_structure(scene), leaves)
 
@@ -133,7 +133,7 @@ def _telling(words: list[str]) -> list[str]:
 
 
 def elements(scene: Scene) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Each single number by name: the name of its array, and where it is in there."""
+    """Each single number by name: the name of its array, and its index there."""
     return {
         leaf + (f"[{','.join(map(str, index))}]" if index else ""): (leaf, index)
         for leaf, array in scene_numbers(scene).items()
@@ -148,7 +148,7 @@ def read_element(scene: Scene, name: str) -> float:
 
 
 def replace_elements(scene: Scene, values: Mapping[str, Any]) -> Scene:
-    """The scene with these single numbers replaced."""
+    """The scene with new values of these single numbers."""
     known, numbers, changed = elements(scene), scene_numbers(scene), {}
     for name, value in values.items():
         leaf, index = known[name]

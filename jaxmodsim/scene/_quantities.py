@@ -1,4 +1,4 @@
-"""Names and units of what a run holds: coordinates, velocities, forces."""
+"""Names and units of the series of a run: coordinates, velocities, forces."""
 
 import math
 import re
@@ -21,11 +21,11 @@ _FORCES = {"m": "N", "rad": "N m", "m or rad": "N or N m", "": ""}
 
 
 def quantity_of(scene: Scene, series: str) -> Quantity:
-    """What `q[0]`, `qd[0]`, or the force of an effect (`friction`, `pull[0]`) is called, with its unit.
+    """Name and unit of `q[0]`, `qd[0]`, or of the force of an effect (`friction`, `pull[0]`).
 
-    The velocity of `x [m]` is `x_dot [m/s]`. Coordinates without names keep `q[0]`, as "m or rad"; so do forces whose
-    unit depends on that, and friction along a displacement that is no sum or difference of coordinates, as "N or N m".
-    A name that is none of these has no unit.
+    The velocity of `x [m]` is `x_dot [m/s]`. A coordinate without a name is `q[0]`, in "m or rad". Forces whose unit
+    depends on that, and friction along a displacement other than a sum or difference of coordinates, are in "N or N m".
+    Other names have no unit.
     """
     state, component = _STATE.fullmatch(series), _COMPONENT.fullmatch(series)
     if state is not None and int(state[2]) < (len(scene.coordinates) or math.inf):
@@ -39,7 +39,7 @@ def quantity_of(scene: Scene, series: str) -> Quantity:
 
 
 def describe_series(scene: Scene, series: str) -> str:
-    """The series as functions know it, and what it is called, as in `q[1] (theta)`."""
+    """The series by its name in functions and by its own name, as in `q[1] (theta)`."""
     name = quantity_of(scene, series).name
     return series if name == series else f"{series} ({name})"
 
@@ -64,7 +64,7 @@ def _force_unit(scene: Scene, effect: AbstractEffect, index: int) -> str:
 
 
 def slip_unit(scene: Scene, friction: Friction) -> str:
-    """Unit of the displacement that friction acts along: of the coordinates that it is a sum or a difference of."""
+    """Unit of the displacement that friction acts along: that of its coordinates if it is their sum or difference."""
     units = [read_label(text).unit for text in scene.coordinates]
     if friction.along is None or not units:
         return units[0] if units else "m or rad"

@@ -1,4 +1,4 @@
-"""What scenes and laws print; gradients by them are such, too."""
+"""Tables of scenes and laws, and of gradients with their structure."""
 
 from textwrap import shorten
 
@@ -14,13 +14,13 @@ from .forces._friction import Friction
 
 
 def _numbers(thing: eqx.Module) -> list[tuple[str, ...]]:
-    """Each number by its name and unit. A derivative has the name and the unit of what it is taken by."""
+    """Each number by its name and unit. A derivative has the name and the unit of its number."""
     units = scene_units(thing)
     return [(Quantity(name, units.get(name, "")).label, short(x)) for name, x in scene_numbers(thing).items()]
 
 
 def _called(law: AbstractLaw) -> str:
-    """The law's kind, with what is inside of a wrapper or a law for both directions."""
+    """The law's kind, with the law inside a wrapper or a law for both directions."""
     both = isinstance(law, AbstractAsymmetric)
     inside = getattr(law, "forward" if both else "law", None)
     kind = "asymmetric" if both else type(law).__name__

@@ -1,4 +1,4 @@
-"""Robots from the files of other programs: URDF and MJCF to a scene."""
+"""Scenes of robots from URDF and MJCF files."""
 
 from collections.abc import Sequence
 from os import PathLike
@@ -25,7 +25,7 @@ _FIXED: _Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class _Joint(NamedTuple):
-    """A joint in the frame of its body: number of its coordinate, which is `reference` in the pose of the file."""
+    """A joint in the frame of its body; its coordinate of this number is `reference` in the pose of the file."""
 
     name: str
     slides: bool
@@ -36,7 +36,7 @@ class _Joint(NamedTuple):
 
 
 class _Link(NamedTuple):
-    """A body in the frame of its parent, whose number is -1 for the ground."""
+    """A body in the frame of its parent; the number of the ground is -1."""
 
     name: str
     parent: int
@@ -46,7 +46,7 @@ class _Link(NamedTuple):
 
 
 class _Frame(NamedTuple):
-    """A frame: rotation matrix and origin in space; angular velocity and velocity of the origin in its own axes."""
+    """A frame: rotation matrix and origin in space; angular velocity and velocity of the origin in its axes."""
 
     turn: Float[Array, "3 3"]
     origin: Float[Array, "3"]
@@ -93,28 +93,27 @@ def read_robot(source: str | PathLike[str], effects: Sequence[AbstractEffect] = 
     """The scene of a robot from a URDF or MJCF file: links, revolute and prismatic joints, gravity.
 
     The joints are the coordinates, in the order of the file. Numbers of the links are entries of `params`, known or
-    free in a fit: `params["link"]` holds `mass` [kg], `center` (of mass, [m], shape `[3]`) and `inertia` (about it,
-    xx, yy, zz, xy, xz, yz [kg m^2], shape `[6]`) in the axes of the link's frame. `params["armature"]` are the inertias
-    of rotors as the joints feel them [kg m^2 or kg], shape `[dof]`, and `params["gravity"]` [m/s^2], shape `[3]`.
-    Branches, fixed joints and several joints of one link are allowed. What the file says of friction, damping,
-    actuators, limits and contacts is left out: friction is `Friction(law, along=lambda q: q[i], name="joint")` in
-    `effects`.
+    free in a fit: `params["link"]` has `mass` [kg], `center` (of mass, [m], shape `[3]`) and `inertia` (about it,
+    xx, yy, zz, xy, xz, yz [kg m^2], shape `[6]`) in the axes of the link's frame. `params["armature"]` has the inertias
+    of rotors, referred to the joints [kg m^2 or kg], shape `[dof]`, and `params["gravity"]` is in m/s^2, shape `[3]`.
+    Branches, fixed joints and several joints of one link are supported. Friction, damping, actuators, limits and
+    contacts in the file are ignored; add friction as `Friction(law, along=lambda q: q[i], name="joint")` in `effects`.
 
     **Arguments:**
 
     - `source`: path of the file, or its text, which begins with `<`.
-    - `effects`: of the scene, friction of joints and their drives. A drive that needs numbers of its own takes
+    - `effects`: effects of the scene, such as friction of joints and drives. A drive with numbers of its own reads
       them from `params`: `Scene(robot.lagrangian, {**robot.params, "u": 0.0}, effects)`.
 
     **Returns:**
 
-    A `Scene`, its coordinates with the names of the joints.
+    A `Scene`; the names of the joints are those of its coordinates.
 
     **Raises:**
 
-    - `ImportError` without mujoco, which reads the file and which the extra `robots` brings along.
-    - `ValueError` for a file it cannot read, and, by name, for free and ball joints, springs, tendons and closed
-      loops or coupled joints (`equality`, `mimic`).
+    - `ImportError` without mujoco, which reads the file; the extra `robots` installs it.
+    - `ValueError` for a file that MuJoCo cannot read, and for free and ball joints, springs, tendons, closed loops and
+      coupled joints (`equality`, `mimic`), which it names.
     """
     kind: type[MjModel] = extra("mujoco", "read_robot", "robots").MjModel
     text = str(source)
@@ -143,7 +142,7 @@ def read_robot(source: str | PathLike[str], effects: Sequence[AbstractEffect] = 
 
 
 def _check(model: "MjModel") -> None:
-    """Refuse what has no place in the Lagrangian."""
+    """Refuse parts that the Lagrangian cannot represent."""
     kinds = {0: "free", 1: "ball"}
     for i, kind in enumerate(model.jnt_type.tolist()):
         name = model.joint(i).name or f"joint{i + 1}"
@@ -225,7 +224,7 @@ def _symmetric(x: Float[Array, "6"]) -> Float[Array, "3 3"]:
     return jnp.stack([jnp.stack([x[0], x[3], x[4]]), jnp.stack([x[3], x[1], x[5]]), jnp.stack([x[4], x[5], x[2]])])
 
 
-# Written as sums of products: so they are taken apart into scalars where equations of motion are made.
+# Sums of products, which `in_scalars` takes apart in the equations of motion.
 def _rotated(turn: Array, x: Array) -> Array:
     return jnp.sum(turn * x[None, :], axis=1)
 

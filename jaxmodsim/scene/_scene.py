@@ -1,4 +1,4 @@
-"""What is in a scene: data only."""
+"""The data of a scene."""
 
 import dataclasses
 import math
@@ -24,8 +24,8 @@ from .forces._effect import AbstractEffect
 from .forces._friction import Friction
 from .forces._switch import Switch
 
-# The test of uniqueness looks at every corner of the box of slopes, two to this power; an impact tries stick, and slip
-# in either direction, of each element: three to this power.
+# The test of uniqueness takes every corner of the box of slopes, two to this power; an impact tries stick, and slip in
+# either direction, for each element, three to this power.
 _MOST_LOADS = 4
 # An impact tries every set of contacts that may push: two to this power.
 _MOST_CONTACTS = 6
@@ -33,7 +33,7 @@ _MOST_CONTACTS = 6
 
 def _params(params: PyTree) -> PyTree:
     def convert(path: Any, leaf: Any) -> Any:
-        within_module = bool(path) and isinstance(path[-1], jtu.GetAttrKey)  # of a field that is left out
+        within_module = bool(path) and isinstance(path[-1], jtu.GetAttrKey)  # an optional field
         if isinstance(leaf, Signal) or (leaf is None and within_module):
             return leaf
         name = f"params{jtu.keystr(path)}"
@@ -48,13 +48,13 @@ def _params(params: PyTree) -> PyTree:
 
 
 class _Driven(eqx.Module):
-    """A Lagrangian whose parameters change with time, so that its derivative by t counts their rates."""
+    """A Lagrangian whose parameters change with time, so that its derivative by t contains their rates."""
 
     lagrangian: Lagrangian
     params: PyTree
 
     def __call__(self, t: Any, q: Any, qd: Any, params: PyTree) -> Any:
-        """The Lagrangian with its own parameters as they are at `t`."""
+        """The Lagrangian with its own parameters at time `t`."""
         return self.lagrangian(t, q, qd, signals_at(self.params, t))
 
 
@@ -86,7 +86,7 @@ def _constraints(constraints: Any) -> tuple[AbstractConstraint, ...]:
 
 
 def _names(things: Any, default: Callable[[Any], str]) -> tuple[str, ...]:
-    """Name of each: its own, or its kind's with a number from the second of the kind on."""
+    """Name of each thing: its own, or that of its kind with a number from the second of the kind on."""
     taken = {each.name for each in things if each.name is not None}
     names: list[str] = []
     for each in things:
@@ -100,31 +100,30 @@ def _names(things: Any, default: Callable[[Any], str]) -> tuple[str, ...]:
 
 
 class Scene(AbstractReadable, eqx.Module):
-    """A mechanism, the effects on it, and the constraints it obeys.
+    """A mechanism, the effects on it, and its constraints.
 
-    A scene is a pytree whose leaves are all its numbers, so `jax.grad`, `jax.vmap` and `equinox.tree_at` work on it,
-    and changing a number never recompiles. Functions are compared by identity: define a Lagrangian once, not as a
-    fresh lambda in every call.
+    A scene is a pytree whose leaves are all its numbers. `jax.grad`, `jax.vmap` and `equinox.tree_at` work on it, and a
+    change of a number never recompiles. Functions are compared by identity: define a Lagrangian once, not as a new
+    lambda in every call.
 
     **Arguments:**
 
-    - `lagrangian`: `L(t, q, qd, params)` -> energy [J], a scalar; a pure JAX function, q and qd of shape `[dof]`. An
-      index beyond that is refused at the run, here and in the functions of effects and constraints, where it is a
-      number or an array of numbers. JAX itself takes another entry in silence: so it is with an index that is computed
-      from q, qd or `params`, or that counts a loop of `jax.lax`.
-    - `params`: pytree of real numbers, arrays or `Signal`s for the Lagrangian and the applied forces, mostly a
-      mapping by names. Integers become floating; what is no number (sizes, options, None) belongs into the functions.
+    - `lagrangian`: `L(t, q, qd, params)` -> energy [J], a scalar; a pure JAX function, q and qd of shape `[dof]`. The
+      run raises an error for an index beyond that, here and in the functions of effects and constraints, if it is a
+      number or an array of numbers. JAX silently uses another entry for an index out of range; that still holds for
+      indices that are computed from q, qd or `params`, or that count a loop of `jax.lax`.
+    - `params`: pytree of real numbers, arrays or `Signal`s for the Lagrangian and the applied forces, usually a
+      mapping by names. Integers become floating; other values (sizes, options, None) belong in the functions.
     - `effects`: tuple of `AppliedForce`, `Friction` and `Switch`.
-    - `constraints`: tuple of `Constraint` and `VelocityConstraint`, for coordinates that are not independent, and of
-      `Contact`.
+    - `constraints`: tuple of `Constraint` and `VelocityConstraint`, for dependent coordinates, and of `Contact`.
     - `coordinates`: names of the coordinates with their units, such as `("x [m]", "phi [rad]")`, for messages, tables
-      and figures. A unit is a product or quotient of SI units or of mm, deg and the like; `-` stands for none. In
-      functions and names of what is observed they remain `q[0]`, `q[1]`.
+      and figures. A unit is a product or quotient of SI units or of mm, deg and the like; `-` means no unit. Functions
+      and names of observed series use `q[0]`, `q[1]`.
 
     **Raises:**
 
-    - `ValueError` naming the entry that is no number, no effect, or has another's name, a unit that is not known, and
-      friction that rests on a constraint that is not there; at the run for a number of `coordinates` that q0 has not.
+    - `ValueError` for an entry of a wrong type, two entries of one name, an unknown unit, and friction whose load is an
+      unknown constraint; at the run if the number of `coordinates` is not that of q0.
     """
 
     lagrangian: Lagrangian = eqx.field(converter=partial(as_function, name="Scene lagrangian"))
@@ -135,7 +134,7 @@ class Scene(AbstractReadable, eqx.Module):
     coordinates: tuple[str, ...] = eqx.field(default=(), static=True, converter=as_coordinates)
 
     def __check_init__(self) -> None:
-        """Refuse two things of one name, and what does not go together; settle types of numbers that were left out."""
+        """Refuse equal names and parts that exclude each other; give default numbers the type of the others."""
         self._settle_defaults()
         given = [each.name for each in self.effects if each.name is not None]
         for name in given:
@@ -195,7 +194,7 @@ class Scene(AbstractReadable, eqx.Module):
             )
 
     def _settle_defaults(self) -> None:
-        """Give the numbers of weak type the floating type of the others, where there are some."""
+        """Give numbers of weak type the floating type of the others, if there are others."""
         numbers = [x for x in jtu.tree_leaves(self) if eqx.is_inexact_array(x)]
         kinds = {x.dtype for x in numbers if not is_weak(x)}
         if not kinds or not any(is_weak(x) for x in numbers):
@@ -210,17 +209,17 @@ class Scene(AbstractReadable, eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Name of each effect: its own, or its kind's with a number from the second of the kind on."""
+        """Name of each effect: its own, or that of its kind with a number from the second of the kind on."""
         return _names(self.effects, lambda effect: effect.default_name)
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
-        """Name of each constraint, made as those of effects."""
+        """Name of each constraint, by the rule for effects."""
         return _names(self.constraints, lambda each: "contact" if isinstance(each, Contact) else "constraint")
 
     @property
     def part_names(self) -> tuple[str, ...]:
-        """Names of the effects, then of the constraints: what indices of events count."""
+        """Names of the effects, then of the constraints, in the order of the indices in events."""
         return (*self.names, *self.constraint_names)
 
     @property
@@ -240,12 +239,12 @@ class Scene(AbstractReadable, eqx.Module):
 
     @property
     def switches(self) -> dict[str, Switch]:
-        """The effects that change at events of their own, by name."""
+        """The effects that change at their own events, by name."""
         return {name: each for name, each in zip(self.names, self.effects, strict=True) if isinstance(each, Switch)}
 
     @property
     def compliant(self) -> dict[str, Contact]:
-        """The contacts that give way, which have no modes, by name."""
+        """The compliant contacts, which have no modes, by name."""
         return {name: each for name, each in self._all_contacts.items() if each.compliant is not None}
 
     @property
@@ -255,27 +254,27 @@ class Scene(AbstractReadable, eqx.Module):
 
     @property
     def impact_friction(self) -> dict[str, Friction]:
-        """The friction elements that take part in impacts: those by events under the reaction of a contact, by name."""
+        """The friction elements that take part in impacts, event-driven ones loaded by a contact, by name."""
         return {name: each for name, each in self.event_driven.items() if each.load_constraint in self.contacts}
 
     @property
     def bilateral(self) -> tuple[AbstractConstraint, ...]:
-        """The other constraints, which hold at all times."""
+        """The constraints that hold at all times."""
         return tuple(each for each in self.constraints if not isinstance(each, Contact))
 
     @property
     def mode_names(self) -> tuple[str, ...]:
-        """What has a mode, in the order of the modes: friction elements that run by events, contacts, switches."""
+        """Names of the things with a mode, in the order of the modes: event-driven friction, contacts, switches."""
         return (*self.event_driven, *self.contacts, *self.switches)
 
     def split_modes(self, modes: Array) -> tuple[Array, Array, Array]:
-        """What there is one of for each mode: of the friction elements, of the contacts, and of the switches."""
+        """An array over the modes in three parts: of the friction elements, of the contacts, and of the switches."""
         end = modes.shape[0] - len(self.switches)
         start = end - len(self.contacts)
         return modes[:start], modes[start:end], modes[end:]
 
     def mode_widths(self, dof: int) -> tuple[int, ...]:
-        """How many numbers the mode of each thing is: one, or of friction in a plane as many as slip has components."""
+        """Number of entries of each mode: one, or for friction in a plane that of the components of slip."""
         q = jnp.zeros(dof)  # only shapes matter
         params = self.bind_time(jnp.zeros(())).params
         shapes = [each.slip_shape(q, params) for each in self.event_driven.values()]
@@ -288,7 +287,7 @@ class Scene(AbstractReadable, eqx.Module):
 
     @property
     def stick_drifts(self) -> bool:
-        """Whether stick drifts with the error of integration: not where it holds one coordinate at a constant speed."""
+        """Whether stick drifts with the error of integration, unless it holds one coordinate at a constant speed."""
         return any(each.along is not None or callable(each.belt_velocity) for each in self.event_driven.values())
 
     @property
@@ -305,7 +304,7 @@ class Scene(AbstractReadable, eqx.Module):
 
     @property
     def checks(self) -> tuple[str, ...]:
-        """What may end the equations of motion, in words: a `Dynamics.uniqueness` that is not positive, or nothing."""
+        """Sentences for a `Dynamics.uniqueness` that is not positive, which ends the equations of motion."""
         if not self.loaded:
             return ()
         return (
@@ -357,7 +356,7 @@ class Scene(AbstractReadable, eqx.Module):
         return eqx.tree_at(lambda scene: scene.effects, self, effects)
 
     def initial_state(self, q: PerDof) -> dict[str, PyTree]:
-        """Own state of each effect that has one, at rest, by effect name."""
+        """State of each effect with a state of its own, at rest, by name."""
         params = self.bind_time(q[0]).params  # only shapes matter
         states = {name: effect.initial_state(q, params) for name, effect in zip(self.names, self.effects, strict=True)}
         return {name: state for name, state in states.items() if state is not None}

@@ -14,35 +14,35 @@ from .._core.parameters import as_vector
 
 
 def _samples(x: object, *, name: str) -> Float[Array, " n"]:
-    """A vector; a column of a table (pandas, polars, xarray) becomes the array that it stands for."""
+    """A vector; a column of a table (pandas, polars, xarray) becomes its array."""
     if isinstance(x, range) or (hasattr(x, "__array__") and not isinstance(x, jax.Array | np.ndarray | np.generic)):
         x = as_reals(x, name=name)
     return as_vector(x, name=name)
 
 
 class Signal(eqx.Module):
-    """A sampled function of time, as an entry of `Scene` parameters: functions find its number at time t there.
+    """A sampled function of time, as an entry of `Scene` parameters: functions get its value at time t there.
 
     ```python
     scene = jaxmodsim.Scene(L, params={"m": 2.0, "u": jaxmodsim.Signal(t, u)},
                             effects=(jaxmodsim.AppliedForce(lambda t, q, qd, p: p["u"][None]),))
     ```
 
-    Each value is held from its sample to the next one, so that the signal jumps at its samples and has the new value
-    there; or, with `linear`, neighbours are joined by straight lines. Before the first sample it has the first value,
-    after the last one the last. Steps of `simulate` end on the samples.
+    Each value holds from its sample to the next one, so that the signal jumps at its samples and has the new value
+    there. With `linear`, straight lines join the samples. Before the first sample it has the first value, after the
+    last one the last. Steps of `simulate` end on the samples.
 
-    Derivatives are those by `values`; the times are constants. In a Lagrangian a linear signal counts with its rate,
-    while a held one that energy depends on changes it by a jump that `run.energy` has no work for. Displacements
-    (`along`, `at`) and constraints see the number, but not that it moves: give what moves them as a function of t.
-    Constraints and gaps that a linear signal moves are refused.
+    Derivatives are with respect to `values`; the times are constants. A Lagrangian uses the rate of a linear signal;
+    the jumps of a held signal change the energy by jumps that `run.energy` does not contain. Displacements (`along`,
+    `at`) and constraints use the value of a signal without its rate: give their motion as a function of t. Constraints
+    and gaps that a linear signal moves raise an error.
 
     **Arguments:**
 
-    - `t`: times of the samples [s], increasing, shape `[samples]`: an array, a list, or a column of a table, as
-      `Record` takes them.
+    - `t`: times of the samples [s], increasing, shape `[samples]`: an array, a list, or a column of a table, as for
+      `Record`.
     - `values`: values there, any unit, shape `[samples]`.
-    - `linear`: whether values are interpolated and not held.
+    - `linear`: whether values are interpolated instead of held.
 
     **Raises:**
 
@@ -54,7 +54,7 @@ class Signal(eqx.Module):
     linear: bool = eqx.field(default=False, static=True, converter=lambda x: as_flag(x, name="Signal linear"))
 
     def __check_init__(self) -> None:
-        """Refuse what is no function of time."""
+        """Refuse samples that do not define a function of time."""
         if self.t.shape != self.values.shape:
             raise ValueError(
                 f"Signal needs one value for each time, but t has the shape {self.t.shape} and values"
@@ -72,7 +72,7 @@ class Signal(eqx.Module):
             )
 
     def piece(self, t: Scalar) -> "Piece":
-        """What the signal is from the last sample at or before `t` on, up to the next one."""
+        """The signal from the last sample at or before `t` to the next one."""
         times = jax.lax.stop_gradient(self.t)
         last = times.shape[0] - 1
         i = after(times, t) - 1
@@ -87,7 +87,7 @@ class Signal(eqx.Module):
 
 
 class Piece(eqx.Module):
-    """A signal between two of its samples: a number, or a straight line that goes on beyond them."""
+    """A signal between two of its samples: a number, or a straight line that continues beyond them."""
 
     signal: Signal
     value: Scalar
@@ -111,7 +111,7 @@ def signals_of(tree: Any) -> list[Any]:
 
 
 def signals_at(tree: Any, t: Scalar, *, held: bool = True, linear: bool = True) -> Any:
-    """`tree` with the number at `t` in the place of each signal that is held, or linear."""
+    """`tree` with the value at `t` in the place of each signal of these kinds."""
 
     def value(x: Any) -> Any:
         if not _is_signal(x):
@@ -125,12 +125,12 @@ def signals_at(tree: Any, t: Scalar, *, held: bool = True, linear: bool = True) 
 
 
 def signals_from(tree: Any, t: Scalar) -> Any:
-    """`tree` with the piece that each signal begins or is in at `t`, for a step from there."""
+    """`tree` with the piece of each signal from `t` on, for a step from there."""
     return jax.tree.map(lambda x: x.piece(t) if isinstance(x, Signal) else x, tree, is_leaf=_is_signal)
 
 
 def sample_times(tree: Any, *, linear: bool) -> Float[Array, " n"] | None:
-    """Times of all samples in `tree` in order, those of linear signals where wanted; None for none."""
+    """Times of all samples in `tree` in order, with `linear` those of linear signals, too; None without signals."""
     times = [jax.lax.stop_gradient(x.t) for x in signals_of(tree) if linear or not x.linear]
     if len(times) < 2:
         return times[0] if times else None

@@ -1,4 +1,4 @@
-"""Modes at the start of a run, and modes and velocities behind its events."""
+"""Modes at the start of a run, and modes and velocities after its events."""
 
 import equinox as eqx
 import jax
@@ -13,17 +13,17 @@ from ._dynamics import Dynamics, State, from_dynamics, vector_field
 from ._impact import impact
 from ._scene import Scene
 
-# A rebound closes its contact at once if it rises to less than so many rounding errors of the gap, or lasts less than
-# this part of the time, in square roots of its rounding unit and in units.
+# A rebound closes its contact at once if it rises to less than this number of rounding errors of the gap, or lasts less
+# than this part of the time: a multiple of the square root of its rounding unit, at least a number of rounding units.
 _RESOLVED, _LONG, _RESOLVED_TIME = 32.0, 1e-3, 2048.0
 
 
 def start(
     t: Scalar, y: State, scene: Scene, mode: Float[Array, " modes"], rest: Scalar
 ) -> tuple[State, Float[Array, " modes"]]:
-    """State and modes to begin with: elements with no more slip velocity than `rest` or rounding stick if they can.
+    """Initial state and modes: elements with a slip velocity of at most `rest`, or rounding, stick if they can.
 
-    Contacts without gap and without velocity are closed. Of `mode` only the shape counts.
+    Contacts without gap and without velocity are closed. Only the shape of `mode` counts.
     """
     slips, closed, sides = scene.split_modes(mode)
     if scene.contacts:
@@ -48,7 +48,7 @@ def _start_contacts(t: Scalar, y: State, scene: Scene, rest: Scalar) -> Float[Ar
 
 
 def _start_switches(t: Scalar, y: State, scene: Scene, mode: Float[Array, " modes"]) -> Float[Array, " switches"]:
-    """On which sides the guards are; one of zero is where it goes."""
+    """Sides of the guards; a guard of zero has the side of its rate."""
     rate, params = vector_field(t, y, scene, mode), scene.bind_time(t).params
 
     def guards(t: Array, q: Array, qd: Array) -> Array:
@@ -73,9 +73,9 @@ def switch(
     rest: Scalar,
     elastic: bool = True,
 ) -> tuple[State, Float[Array, " modes"]]:
-    """State and modes after the guards that `fired`; `elastic` is False where impacts have accumulated.
+    """State and modes after the guards that `fired`; `elastic` is False if impacts have accumulated.
 
-    The impact and the friction behind it are two functions for `in_scalars`, of which one would be too large for it.
+    The impact and the friction after it are two functions of `in_scalars`, as one would be too large for it.
     """
     slips, closed, sides = scene.split_modes(mode)
     slip_fired, contact_fired, side_fired = scene.split_modes(fired)
@@ -88,7 +88,7 @@ def switch(
         return y, _join(slips, sides)
 
     if scene.switches:
-        # What a switch lifts opens at the same instant, so that its time has the derivative of the switch.
+        # A contact that a switch lifts opens at the same instant, so that its time has the derivative of the switch.
         push = from_dynamics(lambda d: d.contact_forces, t, y, scene, _join(slips, closed, sides))
         contact_fired = contact_fired | ((closed > 0) & (push < 0))
 
@@ -109,11 +109,11 @@ def switch(
 
 
 def _bounces(t: Scalar, y: State, scene: Scene, mode: Float[Array, " modes"]) -> Bool[Array, " contacts"]:
-    """Which contacts give back velocity: those in contact already, and those whose rebound can be told from rest.
+    """Which contacts rebound: those that are closed already, and those whose rebound is resolved.
 
-    After a rebound with the velocity w a gap that accelerates by a < 0 is `w^2/(2 |a|)` wide at most, and closes after
-    `2 w/|a|`. Both are relative to the surface, which may move. Where one rebound cannot be told from rest, all that
-    follow it cannot: to first order in w their impulses, and those of friction under them, are those of rest.
+    After a rebound with the velocity w a gap that accelerates by a < 0 is at most `w^2/(2 |a|)` wide, and closes after
+    `2 w/|a|`. Both are relative to the surface, which may move. If one rebound is not resolved, no later one is: to
+    first order in w their impulses, and those of friction under them, are those of rest.
     """
     held = jtu.tree_map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, (t, y, scene, mode))
     eps = float(jnp.finfo(y.q.dtype).eps)

@@ -1,4 +1,4 @@
-"""What `simulate_to_accuracy` chose, and what it went by."""
+"""Report of `simulate_to_accuracy`: the chosen run, and all runs of the search."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -7,7 +7,7 @@ import diffrax as dfx
 
 
 class CostScaling(NamedTuple):
-    """Predicted steps for another accuracy, as multiples of those that were made.
+    """Predicted steps for another accuracy, as multiples of the steps of the run.
 
     - `better`: for an error ten times smaller, >= 1.
     - `worse`: for an error ten times larger, <= 1.
@@ -21,12 +21,12 @@ class CostScaling(NamedTuple):
 class Attempt:
     """One run of the search.
 
-    - `solver`: name of its method, with "bounded" behind it where the search bounded the step.
+    - `solver`: name of its method, followed by "bounded" if the search bounded the step.
     - `rtol`, `atol`: its tolerances.
     - `num_steps`: its steps, rejected ones included.
-    - `evaluations`: evaluations of the vector field in one step, the Jacobian of a Rosenbrock method counted as one for
-      each entry of the state; None of methods for which that is not fixed.
-    - `estimate`: of its error, in the measure of `Accuracy.asked`; infinite if the run ended early.
+    - `evaluations`: evaluations of the vector field in one step; the Jacobian of a Rosenbrock method counts as one for
+      each entry of the state. None for methods without a fixed number.
+    - `estimate`: estimate of its error, in the measure of `Accuracy.asked`; infinite if the run ended early.
     """
 
     solver: str
@@ -39,17 +39,17 @@ class Attempt:
 
 @dataclass(frozen=True, eq=False)
 class Accuracy:
-    """What was chosen for an accuracy that was asked for; print it.
+    """The choice for a requested accuracy; print it.
 
-    - `asked`: the accuracy.
-    - `estimate`: of the error of the run, in the same measure; at most `asked` where that was reached.
-    - `solver`, `rtol`, `atol`: what the run was made with; `options` holds them as arguments of `simulate`.
+    - `asked`: the requested accuracy.
+    - `estimate`: estimate of the error of the run, in the same measure; at most `asked` if the search reached it.
+    - `solver`, `rtol`, `atol`: method and tolerances of the run; `options` has them as arguments of `simulate`.
     - `num_steps`: steps of the run.
-    - `cost_scaling`: steps for ten times better and ten times worse, as multiples of `num_steps`, by the
+    - `cost_scaling`: steps for an error ten times smaller and ten times larger, as multiples of `num_steps`, by the
       observed slope.
-    - `attempts`: all runs of the search, in the order in which they were made.
-    - `remark`: what kept the search from the accuracy, in a sentence; empty where it was reached.
-    - `dtmax`: longest step [s] where the search has bounded it; it is among the `options` then.
+    - `attempts`: all runs of the search, in their order.
+    - `remark`: why the search did not reach the accuracy, in a sentence; empty if it did.
+    - `dtmax`: longest step [s] if the search has bounded it; `options` then contains it.
     """
 
     asked: float
@@ -65,17 +65,17 @@ class Accuracy:
 
     @property
     def reached(self) -> bool:
-        """Whether the estimate is within what was asked for."""
+        """Whether the estimate is within the requested accuracy."""
         return not self.remark
 
     @property
     def options(self) -> dict[str, dfx.AbstractSolver | float]:
-        """Arguments for `simulate` that make this run again, also where its numbers are traced."""
+        """Arguments for `simulate` that repeat this run, also with traced numbers."""
         bound = {} if self.dtmax is None else {"dtmax": self.dtmax}
         return {"solver": self.solver, "rtol": self.rtol, "atol": self.atol, **bound}
 
     def __str__(self) -> str:
-        """The choice in a sentence, what ten times better and worse would cost, and a table of the runs."""
+        """The choice in a sentence, the cost of ten times smaller and larger errors, and a table of the runs."""
         name = type(self.solver).__name__
         lines = [
             f"accuracy {self.asked:.3g}: {name} at rtol {self.rtol:.3g}, {self.num_steps} steps, error about"

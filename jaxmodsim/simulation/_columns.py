@@ -1,4 +1,4 @@
-"""A run as named columns, and as a table of them."""
+"""A run as named columns, and as tables of them."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 
 class Columns(NamedTuple):
-    """What a run holds at its times, those that an early end left unreached aside.
+    """Columns of a run at the times that it reached.
 
-    - `time`: [s], shape `[time]`.
+    - `time`: times [s], shape `[time]`.
     - `values`: coordinates, velocities, forces of effects and modes by name, shape `[time]` each.
-    - `units`: of them.
+    - `units`: their units.
     """
 
     time: Float[np.ndarray, " time"]
@@ -27,20 +27,20 @@ class Columns(NamedTuple):
     units: dict[str, str]
 
     def to_dataframe(self) -> "pd.DataFrame":
-        """As a DataFrame over time; units in its `attrs`."""
+        """A DataFrame over time, with the units in its `attrs`."""
         pandas = extra("pandas", "to_dataframe")
         table = pandas.DataFrame(self.values, index=pandas.Index(self.time, name="time"))
         table.attrs["units"] = {"time": "s", **self.units}
         return table
 
     def to_xarray(self) -> "xr.Dataset":
-        """As a Dataset over time; units in the attributes of its variables."""
+        """A Dataset over time, with the units in the attributes of its variables."""
         variables = {name: (("time",), x, {"units": self.units[name]}) for name, x in self.values.items()}
         return extra("xarray", "to_xarray").Dataset(variables, {"time": (("time",), self.time, {"units": "s"})})
 
 
 def columns(scene: Scene, t: Array, q: Array, qd: Array, forces: dict[str, Array], modes: dict[str, Array]) -> Columns:
-    """Lay out a run.
+    """The columns of a run.
 
     **Raises:**
 

@@ -1,4 +1,4 @@
-"""Where the energy of a run is, and where it came from and went."""
+"""Energies of a run by place: kinetic, potential, stored, supplied and dissipated."""
 
 from typing import NamedTuple
 
@@ -16,12 +16,12 @@ from ._run_request import RunRequest
 class EnergyLedger(NamedTuple):
     """Energies of a run [J], shape `[time]` each.
 
-    - `kinetic`, `potential`: of the Lagrangian.
-    - `stored`: in the own state of each effect that has one, and in each compliant contact, by name.
-    - `supplied`: brought in since t0, by the names of `Dynamics.power`.
-    - `dissipated`: lost since t0 in each effect, or compliant contact, that absorbs power, by name: what it absorbed,
-      less what it has stored.
-    - `before`: kinetic, potential and stored energy of the state that was given at t0, shape `[]`.
+    - `kinetic`, `potential`: energies of the Lagrangian.
+    - `stored`: energy in the state of each effect with a state, and in each compliant contact, by name.
+    - `supplied`: energy supplied since t0, by the names of `Dynamics.power`.
+    - `dissipated`: energy lost since t0 in each effect, or compliant contact, that absorbs power, by name: the absorbed
+      energy less the stored energy.
+    - `before`: kinetic, potential and stored energy of the state in the arguments at t0, shape `[]`.
     """
 
     kinetic: Float[Array, " time"]
@@ -33,7 +33,7 @@ class EnergyLedger(NamedTuple):
 
     @property
     def balance(self) -> Float[Array, " time"]:
-        """Energy there is and energy dissipated, less energy supplied and that of the start: what is unaccounted."""
+        """Present and dissipated energy, less supplied energy and that at the start: the error of the account."""
         total = self.kinetic + self.potential - self.before
         total = sum((*self.stored.values(), *self.dissipated.values()), total)
         return total - sum(self.supplied.values(), jnp.zeros_like(total))
@@ -61,12 +61,12 @@ def ledger(request: RunRequest, t: Float[Array, " time"], y: State, work: Work) 
 def event_losses(
     request: RunRequest, t: Float[Array, " time"], start: State, log: EventLog | None
 ) -> Float[Array, " time"]:
-    """Energy [J] that was lost at events up to the times `t`, and at t0 where the state given was not admissible.
+    """Energy [J] lost at events up to the times `t`, and at t0 by the projection of the state in the arguments.
 
     **Arguments:**
 
-    - `start`: the state that the run began with.
-    - `log`: of the events; None for a scene without modes.
+    - `start`: the first state of the run.
+    - `log`: the log of events; None for a scene without modes.
     """
     scene = request.scene
     lost = _energy(scene, request.t0, request.initial_state) - _energy(scene, request.t0, start)
@@ -85,7 +85,7 @@ def event_losses(
 
 
 def _stored(t: Array, y: State, scene: Scene) -> dict[str, Array]:
-    """In the states of effects, and in contacts that give way."""
+    """Stored energy in the states of effects, and in compliant contacts."""
     stored = {
         name: jnp.asarray(effect.stored_energy(y.z[name]), y.q.dtype)
         for name, effect in zip(scene.names, scene.effects, strict=True)

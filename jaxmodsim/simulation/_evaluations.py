@@ -1,4 +1,4 @@
-"""Evaluations of the vector field: the measure of work by which methods are compared."""
+"""Evaluations of the vector field, the measure of work of a method."""
 
 import diffrax as dfx
 import jax.tree_util as jtu
@@ -11,8 +11,8 @@ from ._trajectory import Trajectory
 def evaluations_per_step(solver: dfx.AbstractSolver, run: Trajectory) -> int | None:
     """Evaluations of the vector field in one step of a run, rejected or not; None for methods that iterate.
 
-    One for each stage; a stage that is the last one of the step before counts once (`diffrax.Tsit5`). The Jacobian of
-    `Rodas5P` counts as one for each entry of the state, its derivative by time as one.
+    One for each stage; a stage that is equal to the last one of the step before counts once (`diffrax.Tsit5`). The
+    Jacobian of `Rodas5P` counts as one for each entry of the state, its time derivative as one.
     """
     if isinstance(solver, Rodas5P):
         entries = sum(np.size(x) for x in jtu.tree_leaves((run.q, run.qd, run.z))) // run.t.shape[0]

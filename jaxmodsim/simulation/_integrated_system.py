@@ -1,4 +1,4 @@
-"""What a run integrates, and the functions that diffrax is given for it."""
+"""The integrated state of a run, and its functions for diffrax."""
 
 from collections.abc import Callable
 from functools import partial, wraps
@@ -30,9 +30,9 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def at_time(fn: _Function) -> _Function:
-    """`fn(self, t, y, scene, ...)` with the signals of the scene as they are at `t`.
+    """`fn(self, t, y, scene, ...)` with the signals of the scene at time `t`.
 
-    diffrax gives the time beside the scene: here, where its calls arrive, the one is bound into the other.
+    diffrax passes time and scene separately; this binds the time into the scene at the boundary to diffrax.
     """
 
     @wraps(fn)
@@ -49,15 +49,15 @@ def project(t: Float[Array, ""], y: State, scene: Scene, mode: Array | None) -> 
     return y._replace(q=q, qd=qd)
 
 
-# Energy [J] that went through a scene since t0, by the names of `Dynamics.power`: supplied from outside, and absorbed.
+# Energy [J] supplied from outside and absorbed since t0, by the names of `Dynamics.power`.
 Work: TypeAlias = dict[str, Power]
 
 
 class AugmentedState(NamedTuple):
-    """What is integrated beside the motion.
+    """The integrated state of an audited run.
 
-    - `motion`: a `State`, with momenta in the place of velocities where the run is canonical.
-    - `work`: the energy that went through the scene.
+    - `motion`: a `State`, with momenta in the place of velocities if the run is canonical.
+    - `work`: the energy supplied and absorbed.
     """
 
     motion: State
@@ -65,9 +65,9 @@ class AugmentedState(NamedTuple):
 
 
 class IntegratedSystem(NamedTuple):
-    """What is integrated: a `State`, with momenta in the place of velocities where `canonical`.
+    """The integrated state: a `State`, with momenta in the place of velocities if `canonical`.
 
-    In an `audited` run it is an `AugmentedState`. Scenes are those of the time that stands before them, see `at_time`.
+    In an `audited` run it is an `AugmentedState`. Arguments `t, ..., scene` are a scene at the time `t`, see `at_time`.
     """
 
     audited: bool
@@ -75,26 +75,26 @@ class IntegratedSystem(NamedTuple):
 
     @at_time
     def start(self, t: Array, state: State, scene: Scene, mode: Array | None) -> PyTree:
-        """What the run starts from."""
+        """Initial integrated state."""
         y = self._inner(t, state, scene)
         if not self.audited:
             return y
         return AugmentedState(y, jtu.tree_map(jnp.zeros_like, forward_dynamics(t, state, scene, mode).power))
 
     def state(self, t: Array, y: PyTree, scene: Scene) -> State:
-        """The state in what is integrated."""
+        """The `State` in the integrated state."""
         y = y.motion if isinstance(y, AugmentedState) else y
         if not self.canonical:
             return y
         return y._replace(qd=velocity(scene.lagrangian, t, y.q, y.qd, scene.params))
 
     def replace(self, t: Array, y: PyTree, state: State, scene: Scene) -> PyTree:
-        """With another state."""
+        """The integrated state with another `State`."""
         inner = self._inner(t, state, scene)
         return y._replace(motion=inner) if isinstance(y, AugmentedState) else inner
 
     def result(self, t: Array, y: PyTree, scene: Scene) -> PyTree:
-        """What is kept of it: the state, in an audited run a pair of it and `Work`."""
+        """The saved part: the `State`, in an audited run a pair of it and `Work`."""
         state = self.state(t, y, scene)
         return (state, y.work) if self.audited else state
 
@@ -109,7 +109,7 @@ class IntegratedSystem(NamedTuple):
         return AugmentedState(rate, power) if audited else rate
 
     def advance(self, t0: Array, t1: Array, y: PyTree, scene: Scene) -> tuple[PyTree, Array]:
-        """One step of `ImplicitFriction`, and whether it was solved; work is done at the powers at its end."""
+        """One step of `ImplicitFriction`, and whether it was solved; work uses the powers at its end."""
         state, solved = scene_step(scene, t0, t1, self.state(t0, y, scene))
         if not self.audited:
             return state, solved
@@ -122,7 +122,7 @@ class IntegratedSystem(NamedTuple):
     def linear_solver(
         self, t: Array, y: State, scene: Scene, rate: State, shift: Array, pivot: bool
     ) -> Callable[[State], State]:
-        """The linear systems of a step of `Rodas5P`, of a run that is neither audited nor canonical."""
+        """The linear systems of a step of `Rodas5P`, for a run that is neither audited nor canonical."""
         return linear_solver(t, y, rate.qd, scene, shift=shift, pivot=pivot)
 
     def _inner(self, t: Array, state: State, scene: Scene) -> State:
@@ -132,7 +132,7 @@ class IntegratedSystem(NamedTuple):
 
 
 class Series(NamedTuple):
-    """A number along a run: `q` or `qd` of the coordinate `i`, or a `force` of an `effect`, its component `i`."""
+    """A series along a run: `q` or `qd` of the coordinate `i`, or the component `i` of the `force` of an `effect`."""
 
     kind: str
     effect: str
@@ -140,36 +140,36 @@ class Series(NamedTuple):
 
 
 class Instant(NamedTuple):
-    """The rate of a state, and by how much the force of each sticking element exceeds its limit, in limits."""
+    """The rate of a state, and the excess of the force of each sticking element over its limit, in limits."""
 
     rate: State
     stick_violation: Float[Array, "..."]
 
 
-# A step of a scene with events or constraints evaluates large fields a dozen times. Traced as one function each, they
-# are traced, linearised and transposed once.
+# A step of a scene with events or constraints evaluates large fields a dozen times. As functions of jit they are
+# traced, linearised and transposed once.
 _derivative = partial(jax.jit, static_argnums=0)(at_time(IntegratedSystem.derivative))
 _guards = jax.jit(lambda t, y, scene, mode, *limits: from_dynamics(lambda d: d.guards(*limits), t, y, scene, mode))
 
 
 class RunFunctions(eqx.Module):
-    """The functions of a run; those of a state `s` in the form that `EventSolver` takes, for runs with modes."""
+    """The functions of a run; for runs with modes those of a state `s` are functions of `EventSolver`."""
 
     system: IntegratedSystem = eqx.field(static=True)
-    # Slip velocity [m/s] that counts as none.
+    # Speed of rest [m/s].
     rest: Float[Array, ""]
-    # Relative and absolute, of the limits of stick and of slip velocities.
+    # Relative tolerance of the limits of stick, absolute tolerance of slip velocities.
     tolerances: tuple[Float[Array, ""], Float[Array, ""]]
-    # What drifts with the error of integration and is put right after every step: off the constraints, out of stick.
+    # Whether each step ends with a projection onto the constraints, and onto zero slip in stick, which drift.
     projects: bool = eqx.field(static=True)
     sticks: bool = eqx.field(static=True)
     # Whether chatter is held in stick.
     holds: bool = eqx.field(static=True)
-    # How many numbers the mode of each thing is.
+    # Number of entries of each mode.
     widths: tuple[int, ...] = eqx.field(static=True)
 
     def plain_derivative(self, t: Any, y: PyTree, scene: Scene, mode: Array | None = None) -> PyTree:
-        """Right-hand side in these modes; None in a run without."""
+        """Right-hand side for these modes; None in a run without modes."""
         return _derivative(self.system, t, y, scene, mode)
 
     def derivative(self, t: Any, s: EventState, scene: Scene) -> EventState:
@@ -183,32 +183,32 @@ class RunFunctions(eqx.Module):
 
     @at_time
     def begin(self, t: Array, y: PyTree, scene: Scene, mode: Array) -> tuple[PyTree, Array]:
-        """State and modes to begin with, whatever `mode` is."""
+        """Initial state and modes; only the shape of `mode` counts."""
         state = self.system.state(t, y, scene)
         state, mode = start(t, state, scene, mode, self.rest)
         return self.system.replace(t, y, state, scene), mode
 
     @at_time
     def reset(self, t: Array, s: EventState, scene: Scene, fired: Array) -> EventState:
-        """Change of modes, and impacts; the state as it is where there is neither."""
+        """State after changes of modes and impacts; the same state without them."""
         return self._switch(t, s, scene, fired, True)
 
     def _switch(self, t: Array, s: EventState, scene: Scene, fired: Array, elastic: bool) -> EventState:
         before = self.system.state(t, s.y, scene)
         state, mode = switch(t, before, scene, s.mode, fired, self.rest, elastic)
         after = self.system.replace(t, s.y, state, scene)
-        if scene.contacts:  # where a contact closes; the derivative, too, or the next step would move it
+        if scene.contacts:  # a contact may have closed; the derivative, too, or the next step would move it
             after = self.project(t, after, scene, mode)
         changed = jnp.any(mode != s.mode) | jnp.any(state.qd != before.qd)
         return s._replace(y=jtu.tree_map(lambda a, b: jnp.where(changed, a, b), after, s.y), mode=mode)
 
     def event_mode(self, mode: Array) -> Array:
-        """What of the modes an event changes: not the velocities that those of slip in a plane are."""
+        """The parts of the modes that an event changes: without the reference velocities of planes."""
         return mode_numbers(mode, self.widths)
 
     @at_time
     def on_zeno(self, t: Array, s: EventState, scene: Scene, fired: Array) -> EventState:
-        """Stick of what chatters, where that is to be held, and closed contacts where impacts accumulate."""
+        """Stick of chattering elements, if these are held in stick, and closed contacts if impacts accumulate."""
         n = scene.split_modes(fired)[0].shape[0]
         if scene.contacts:
             s = self._switch(t, s, scene, fired if self.holds else fired.at[:n].set(False), False)
@@ -223,14 +223,14 @@ class RunFunctions(eqx.Module):
 
     @at_time
     def project(self, t: Array, y: PyTree, scene: Scene, mode: Array | None = None) -> PyTree:
-        """Back onto the constraints."""
+        """The integrated state, projected onto the constraints."""
         if not self.projects:
             return y
         return self.system.replace(t, y, project(t, self.system.state(t, y, scene), scene, mode), scene)
 
     @at_time
     def project_and_stick(self, t: Array, s: EventState, scene: Scene) -> EventState:
-        """Back onto the constraints, and into stick."""
+        """The state, projected onto the constraints and into stick."""
         s = s._replace(y=self.project(t, s.y, scene, s.mode))
         return self._stick(t, s, scene) if self.sticks else s
 
@@ -238,7 +238,7 @@ class RunFunctions(eqx.Module):
     def observe(
         self, t: Array, y: PyTree, scene: Scene, mode: Array | None, series: Series
     ) -> tuple[Float[Array, ""], Float[Array, ""] | None]:
-        """A number of a state and its rate; that of a force is not known."""
+        """A series at a state, and its rate; None for the rate of a force."""
         state = self.system.state(t, y, scene)
         if series.kind == "q":
             return state.q[series.i], state.qd[series.i]
@@ -249,7 +249,7 @@ class RunFunctions(eqx.Module):
 
     @at_time
     def keep(self, t: Array, y: PyTree, scene: Scene, mode: Array | None) -> tuple[PyTree, Instant | None]:
-        """What is kept of a saved state, which comes from dense output and obeys nothing; in a run with modes more."""
+        """The saved part of a state of dense output, projected; in a run with modes an `Instant`, too."""
         y = self.project(t, y, scene, mode)
         if mode is None:
             return self.system.result(t, y, scene), None

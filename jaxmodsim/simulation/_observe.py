@@ -1,4 +1,4 @@
-"""What can be observed along a run by name."""
+"""Series along a run by name."""
 
 import re
 
@@ -39,18 +39,18 @@ def read_series(run: Trajectory, series: Series) -> Float[Array, " time"]:
 
 
 def named_series(run: Trajectory, name: str) -> Float[Array, " time"]:
-    """What `name` says along a run, at its times.
+    """The series `name` at the times of a run.
 
     `q[0]` and `qd[0]` are coordinates and velocities, the name of an effect is its force, with `[i]` for a component.
 
     **Raises:**
 
-    - `ValueError` for a name that is none of them.
+    - `ValueError` for any other name.
     """
     return read_series(run, find_series(run, name))
 
 
 def named_unit(name: str) -> str:
-    """Unit of a series; whether a coordinate is a length or an angle, its user knows."""
+    """Unit of a series; a coordinate is a length or an angle."""
     state = _STATE.fullmatch(name)
     return "N or N m" if state is None else "m or rad" if state[1] == "q" else "m/s or rad/s"

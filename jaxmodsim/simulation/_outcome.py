@@ -1,4 +1,4 @@
-"""How a run ended: a code inside compiled code, a sentence outside."""
+"""Outcome of a run: a code inside compiled code, a sentence outside."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ from ..mechanics import constraint_residual, motion_equations, quadratic
 from ..scene import Scene, State, check_scene, describe_series, from_dynamics, quantity_of
 from ..solvers import ACCUMULATION, TOO_MANY
 
-# Codes of how a run ended; `outcome_messages` has the sentence of each.
+# Codes of the outcomes of a run; `outcome_messages` has the sentence of each.
 (
     SUCCESS,
     MAX_STEPS,
@@ -38,9 +38,9 @@ from ..solvers import ACCUMULATION, TOO_MANY
     FIRST_MASS,
 ) = range(13)
 
-# Correction of the initial state, relative to its size or to one, below which it is meant to obey the constraints.
+# Largest admissible correction of the initial state onto the constraints, relative to its size or to one.
 _CONSISTENT = 1e-6
-# Correction of the last state above which the constraints are not kept.
+# Largest admissible correction of the last state.
 _KEPT = 1e-2
 
 _GENERAL = (
@@ -66,7 +66,7 @@ _GENERAL = (
     " to this later has missed an impact: pass smaller tolerances or dtmax, or compute in float64.",
 )
 
-# What else the sentences of early ends say of scenes whose forces may chatter, and of those with contacts.
+# Additions to the sentences of early ends for scenes whose forces may chatter, and for those with contacts.
 _CHATTER = {
     MAX_STEPS: " A law that chatters (Sign, or jnp.sign of a velocity in a force of your own) never gets through its"
     " zero crossings with adaptive steps: Friction(Coulomb(Fc)) sticks exactly.",
@@ -92,18 +92,18 @@ def _offsets(scene: Scene, dof: int) -> _Offsets:
 
 
 class Ending(NamedTuple):
-    """What the last event says: whether events ended the run, and which guards fired in it."""
+    """The last event: whether it ended the run, and which guards fired in it."""
 
     status: Float[Array, ""]
     fired: Float[Array, " guards"]
 
 
 class SimulationError(RuntimeError):
-    """A run that ended early; the message says how, when, and what to do."""
+    """A run that ended early; the message has the cause, the time and the remedy."""
 
 
 class RunResult(eqx.Module):
-    """How a run ended.
+    """Outcome of a run.
 
     - `code`: 0 for a run that reached t1; an index into `messages` otherwise. Under `jax.vmap` one per run.
     - `messages`: the sentence for each code.
@@ -133,7 +133,7 @@ class RunResult(eqx.Module):
 
 
 def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
-    """The sentence for each code that a run of this scene can end with."""
+    """The sentence for each outcome that a run of this scene can have."""
     mass = tuple(
         f"The mass matrix is singular or indefinite at coordinate {describe_series(scene, f'q[{i}]')}: its inertia is"
         " not positive" + (" once the motion of the coordinates before it is taken out." if i else ".")
@@ -177,7 +177,7 @@ def _load_functions(scene: Scene) -> dict[str, Callable[..., Any]]:
 
 
 def _has_load(fn: Callable[..., Any], scene: Scene, t: Float[Array, ""], y: State) -> Bool[Array, ""]:
-    """Whether a load that depends on neither time nor state is in range; True of one that does."""
+    """Whether a constant load is in range; True for a load that depends on time or state."""
     dof = y.q.shape[0]
 
     def load(state: Array) -> Array:
@@ -200,7 +200,7 @@ def start_code(
     atol: Float[Array, ""] | None,
     canonical: bool,
 ) -> Int[Array, ""]:
-    """What is wrong before the first step: a parameter out of range, a state off the constraints, a field of NaN.
+    """Code of an error before the first step: a parameter out of range, a violated constraint, a field of NaN.
 
     `atol` is None in a run of fixed steps.
     """
@@ -229,14 +229,14 @@ def start_code(
 
 @jax.jit
 def violation_code(scene: Scene, t: Float[Array, ""], y: State) -> Int[Array, ""]:
-    """Whether an initial state violates constraints or contacts: a small program, to ask before that of the run."""
+    """Code of an initial state that violates constraints or contacts: a small program before that of the run."""
     check_scene(scene, y._replace(z=scene.initial_state(y.q)))
     now = scene.bind_time(t)
     return _violation(now, now.bilateral, t, y, jnp.asarray(SUCCESS))
 
 
 def _violation(scene: Scene, constraints: Any, t: Array, y: State, code: Array) -> Int[Array, ""]:
-    """`code`, or that of an initial state off these constraints, or of a gap below zero."""
+    """`code`, or that of an initial state that violates these constraints, or that of a gap below zero."""
     if constraints:
         off, turned = constraint_residual(constraints, t, y.q, y.qd, scene.params)
         code = jnp.where((off <= _CONSISTENT) & (turned <= _CONSISTENT), code, INCONSISTENT)
@@ -253,9 +253,9 @@ def end_code(
     ending: Ending | None,
     ahead: Float[Array, ""],
 ) -> Int[Array, ""]:
-    """What ended the run, from diffrax's result, the last state and the last event.
+    """Code of the outcome, from diffrax's result, the last state and the last event.
 
-    `ahead` is the time [s] by which the next step may have failed.
+    `ahead` is the time [s] within which the next step may have failed.
     """
     early, now = ~dfx.is_okay(result), scene.bind_time(t)
     code = jnp.where(result == dfx.RESULTS.dt_min_reached, STEP_TOO_SMALL, NOT_FINITE)
@@ -274,7 +274,7 @@ def end_code(
     finite = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (y.q, y.qd, rate.qd)]).all()
     code = jnp.where(early & ~finite, NOT_FINITE, code)
     if scene.checks:
-        # The run ends in front of the place where the equations cease to hold: look a little further.
+        # The run ends just before the equations cease to hold: test the state a little later.
         beyond = y._replace(q=y.q + ahead * y.qd, qd=y.qd + ahead * rate.qd)
         looks = jtu.tree_map(lambda *x: jnp.stack(x), (t + ahead, beyond), (t, y))
         unique = jax.lax.map(lambda at: _unique(scene, at[0], at[1], mode), looks)  # traced and compiled once
@@ -284,7 +284,7 @@ def end_code(
         code = jnp.where(kept | ~finite, code, DRIFTED)
         code = jnp.where((_penetration(now, t, y) <= _CONSISTENT**0.5) | ~finite, code, PENETRATES)
     eps = float(jnp.finfo(y.q.dtype).eps)
-    # A run that stopped in front of a singular mass matrix cannot have come closer than its smallest step.
+    # A run that stopped before a singular mass matrix cannot be closer to it than its smallest step.
     tolerance = jnp.where(early, eps**0.5, 16 * y.q.shape[0] * eps)
     return _blame_mass(code, _pivots(now, t, y), tolerance, jnp.all(jnp.isfinite(y.q)) & jnp.all(jnp.isfinite(y.qd)))
 
@@ -294,13 +294,13 @@ def _gaps(scene: Scene, t: Array, y: State) -> Float[Array, " contacts"]:
 
 
 def _penetration(scene: Scene, t: Array, y: State) -> Float[Array, ""]:
-    """The deepest that a gap is below zero, relative to the coordinates or to one."""
+    """Largest penetration of a gap, relative to the coordinates or to one."""
     deepest = jnp.min(_gaps(scene, t, y)) if scene.contacts else jnp.zeros_like(t)
     return -deepest / jnp.maximum(1.0, jnp.max(jnp.abs(y.q)))
 
 
 def _unique(scene: Scene, t: Array, y: State, mode: Array | None) -> Bool[Array, ""]:
-    """Whether friction under reactions has a unique solution, in a scene with some."""
+    """Whether friction under reactions has a unique solution, in a scene with such friction."""
     margin = from_dynamics(lambda d: d.uniqueness, t, y, scene, mode)
     assert margin is not None
     return margin > 0
@@ -319,13 +319,13 @@ def _pivots(scene: Scene, t: Float[Array, ""], y: State) -> Float[Array, " dof"]
 def _blame_mass(
     code: Int[Array, ""], pivots: Float[Array, " dof"], tolerance: Array | float, known: Array | bool
 ) -> Int[Array, ""]:
-    """Replace `code` by that of the first coordinate whose pivot is not above `tolerance`, where `known`."""
+    """Replace `code` by that of the first coordinate whose pivot is not above `tolerance`, if `known`."""
     bad = ~(pivots > tolerance)
     return jnp.where(jnp.any(bad) & known, FIRST_MASS + jnp.argmax(bad), code)
 
 
 def describe_failure(scene: Scene, t: float, y: State, code: int) -> str:
-    """The sentence for a failed run whose values are known, with time, state, and the coordinates or value at fault."""
+    """The sentence for a failed run with known values, with time, state, and the coordinates or value in error."""
     dof = y.q.shape[0]
     text = outcome_messages(scene, dof)[code]
     if FIRST_MASS <= code < FIRST_MASS + dof:

@@ -1,4 +1,4 @@
-"""The largest magnitude of a series in a run, between saved times too."""
+"""The largest magnitude of a series in a run, also between saved times."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from ._observe import find_series, read_series
 from ._solve import Nodes, solve
 from ._trajectory import Trajectory, trajectory
 
-# Steps of the run in which the peak is sought, those with the largest estimates, and samples in each of them.
+# Number of steps with the largest estimates that are searched for the peak, and of samples in each of them.
 _INTERVALS, _SAMPLES = 8, 16
 # Relative difference up to which a peak counts as that of an event, whose time has a derivative.
 _CORNER = 1e-6
@@ -27,7 +27,7 @@ def peak_of(run: Trajectory, name: str) -> Float[Array, ""]:
 
 
 def _between(run: Trajectory, name: str) -> Float[Array, ""]:
-    """The largest magnitude within steps: a first repeat of the run says which steps, a second one samples these."""
+    """The largest magnitude within steps: a first repeat of the run selects steps, a second one samples them."""
     series = find_series(run, name)
     plain = run.request._replace(ts=None).choosing(log=0, audited=False)
     nodes = solve(jax.lax.stop_gradient(plain.choosing(max_steps=_most_steps(run), series=series))).nodes
@@ -37,7 +37,7 @@ def _between(run: Trajectory, name: str) -> Float[Array, ""]:
     start, length = nodes.t[chosen], nodes.t[chosen + 1] - nodes.t[chosen]
     within = jnp.isfinite(length)
     start, length = jnp.where(within, start, run.t_end), jnp.where(within, length, 0.0)
-    # Open intervals: at their ends an event may have changed the series.
+    # Open intervals, as an event may have changed the series at their ends.
     share = (jnp.arange(_SAMPLES, dtype=start.dtype) + 0.5) / _SAMPLES
     ts = start[:, None] + share[None, :] * length[:, None]
     ts = jnp.clip(jax.lax.stop_gradient(ts), plain.t0, run.t_end)
@@ -48,7 +48,7 @@ def _between(run: Trajectory, name: str) -> Float[Array, ""]:
 
 
 def _most_steps(run: Trajectory) -> int:
-    """A bound on the number of steps, in powers of two where it is known: another one compiles anew."""
+    """A bound on the number of steps, a power of two if that is known: each bound compiles a program."""
     count, most = run.stats["num_steps"], run.request.choices.max_steps
     return min(most, 1 << max(int(count), 64).bit_length()) if is_known(count) else most
 
@@ -65,7 +65,7 @@ def _largest(nodes: Nodes) -> Int[Array, " intervals"]:
 
 
 def _slopes(step: Float[Array, " steps"], x: Float[Array, " nodes"]) -> Float[Array, " nodes"]:
-    """Slopes at the nodes, of the parabola through each and its neighbours."""
+    """Slopes at the nodes of the parabolas through each node and its neighbours."""
     slope = jnp.diff(x) / jnp.where(step > 0, step, 1.0)
     both = step[:-1] + step[1:]
     inner = (step[1:] * slope[:-1] + step[:-1] * slope[1:]) / jnp.where(both > 0, both, 1.0)
@@ -73,7 +73,7 @@ def _slopes(step: Float[Array, " steps"], x: Float[Array, " nodes"]) -> Float[Ar
 
 
 def _turns(step: Float[Array, " steps"], x: Float[Array, " nodes"], v: Float[Array, " nodes"]) -> Array:
-    """Where x turns within a step by the cubic through its ends with their slopes `v`; else zero."""
+    """Value of the turning point of x within a step, by the cubic through its ends with slopes `v`; zero without."""
     turns = v[:-1] * v[1:] < 0
     x0, x1, v0, v1 = x[:-1], x[1:], v[:-1], v[1:]
     s = v0 / jnp.where(turns, v0 - v1, 1.0)
@@ -84,7 +84,7 @@ def _turns(step: Float[Array, " steps"], x: Float[Array, " nodes"], v: Float[Arr
 def _vertex(x: Float[Array, " samples"]) -> Float[Array, ""]:
     """Largest magnitude within a step by the parabola through the largest sample and its neighbours.
 
-    The place of the vertex counts as a constant: there the series is stationary, or the step ends.
+    The position of the vertex is a constant: the series is stationary there, or the step ends.
     """
     fixed = jnp.abs(jax.lax.stop_gradient(x))
     j = jnp.clip(jnp.argmax(fixed), 1, _SAMPLES - 2)
@@ -93,7 +93,7 @@ def _vertex(x: Float[Array, " samples"]) -> Float[Array, ""]:
     before, here, after = jax.lax.stop_gradient(y)
     bend = before - 2.0 * here + after
     d = 0.5 * (before - after) / jnp.where(bend < 0, bend, -1.0)
-    # As far as the ends of the step, half a sample beyond the outer ones; without a vertex the largest sample.
+    # Up to the ends of the step, half a sample beyond the outer ones; without a vertex the largest sample.
     least, most = jnp.where(j == 1, -1.5, -1.0), jnp.where(j == _SAMPLES - 2, 1.5, 1.0)
     d = jnp.clip(jnp.where(bend < 0, d, jnp.sign(after - before) * most), least, most)
     return 0.5 * d * (d - 1.0) * y[0] + (1.0 - d**2) * y[1] + 0.5 * d * (d + 1.0) * y[2]

@@ -1,4 +1,4 @@
-"""What is asked of a run: the arguments of `simulate`, checked and converted."""
+"""Request of a run: the arguments of `simulate`, checked and converted."""
 
 import math
 from dataclasses import dataclass, replace
@@ -24,7 +24,8 @@ from ._integrated_system import Series
 MOST_STEPS, MOST_EVENTS = 16384, 1024
 # Relative tolerance below which single precision does not reach.
 _SINGLE = 0.99e-6
-# Events that every run logs. Belt oscillator, 60 s with 108 events: 8, 16 and 64 entries take 4, 9 and 19 % of time.
+# Number of events that every run logs. A belt oscillator over 60 s with 108 events takes 4, 9 and 19 % longer with 8,
+# 16 and 64 entries.
 _LOGGED = 16
 _RECORDS = ("events", "energy")
 
@@ -32,26 +33,26 @@ _RECORDS = ("events", "energy")
 @partial(jtu.register_dataclass, data_fields=("arrays",), meta_fields=("rest",))
 @dataclass(frozen=True)
 class Plugin:
-    """A solver or an adjoint that was given: its arrays are numbers of the run, the rest of it is compiled in."""
+    """A solver or an adjoint: its arrays are numbers of the run, the rest is compiled in."""
 
     arrays: PyTree
     rest: Any
 
     @property
     def whole(self) -> Any:
-        """As it was given."""
+        """The solver or adjoint itself."""
         return eqx.combine(self.arrays, self.rest)
 
 
 @jtu.register_static
 @dataclass(frozen=True)
 class RunChoices:
-    """What of a run is compiled in.
+    """Choices of a run that are compiled in.
 
     - `max_steps`, `max_events`, `stick_on_chatter`, `project`: as for `simulate`.
-    - `log`: entries of the log of events, of which later ones are counted alone.
-    - `audited`: whether the work integrals run beside the motion.
-    - `series`: a number that is kept at the ends of all steps; None for none.
+    - `log`: entries of the log of events; later events are counted, not logged.
+    - `audited`: whether the run integrates the work, too.
+    - `series`: a series that is saved at the ends of all steps, or None.
     """
 
     max_steps: int
@@ -64,12 +65,12 @@ class RunChoices:
 
 
 class RunRequest(NamedTuple):
-    """A run that is asked for: the arguments of `simulate`, checked and converted to arrays of one floating type."""
+    """The arguments of `simulate`, checked and converted to arrays of one floating type."""
 
     scene: Scene
     q0: Float[Array, " dof"]
     qd0: Float[Array, " dof"]
-    # Initial own states of effects that do not start at rest.
+    # Initial states of effects that do not start at rest.
     z0: dict[str, PyTree]
     t0: Float[Array, ""]
     t1: Float[Array, ""]
@@ -84,7 +85,7 @@ class RunRequest(NamedTuple):
 
     @property
     def initial_state(self) -> State:
-        """State at t0: effects whose state is not given start at rest."""
+        """State at t0; effects without an entry in `z0` start at rest."""
         return State(self.q0, self.qd0, self.scene.initial_state(self.q0) | self.z0)
 
     def choosing(self, **choices: Any) -> "RunRequest":
@@ -117,7 +118,7 @@ def run_request(
 
     **Raises:**
 
-    - `ValueError` naming the argument, what was given and what is needed.
+    - `ValueError` naming the argument, its value and the requirement.
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"simulate needs a Scene, but a {type(scene).__name__} was given.")
@@ -168,8 +169,7 @@ def run_request(
 def _recorded(record: tuple[str, ...], has_contacts: bool, max_events: int, known: bool) -> tuple[int, bool]:
     """Entries of the log of events, and whether the work is recorded.
 
-    A run whose numbers are known logs its first events. One that is differentiated would carry the log through its
-    derivatives.
+    A run with known numbers logs its first events. A traced run does not: a derivative would carry the log.
     """
     for name in as_names(record, name="record"):
         if name not in _RECORDS:
@@ -177,23 +177,23 @@ def _recorded(record: tuple[str, ...], has_contacts: bool, max_events: int, know
                 f"record holds {name!r}, which is none of {', '.join(_RECORDS)}.{did_you_mean(name, _RECORDS)}"
             )
     audited = "energy" in record
-    if "events" in record or (audited and has_contacts):  # what impacts lose is read from the log
+    if "events" in record or (audited and has_contacts):  # losses of impacts come from the log
         return max_events, audited
     return min(_LOGGED, max_events) if known else 0, audited
 
 
 def _array(value: PyTree, dtype: np.dtype) -> Any:
-    """As an array of `dtype`: NumPy for what is known (cheaper to hand over), JAX for what is traced or on a device."""
+    """An array of `dtype`: NumPy for known values (cheaper to pass), JAX for values that are traced or on a device."""
     if isinstance(value, jax.Array):
         return value if value.dtype == dtype else value.astype(dtype)
     return np.asarray(value, dtype)
 
 
 def _converted(scene: Scene, given: dict[str, Any]) -> tuple[Scene, dict[str, Any], bool]:
-    """The scene, numbers as arrays of the type that it has with the initial state, and whether none is traced."""
+    """The scene, the numbers as arrays of the common type of scene and initial state, and whether none is traced."""
     for name in ("q0", "qd0", "ts"):
         value = given.get(name)
-        # A list may hold numbers that are traced, as in qd0=[scene.params["v"]].
+        # A list may contain traced numbers, as in qd0=[scene.params["v"]].
         if isinstance(value, list | tuple) and not is_known(*value):
             given[name] = jnp.asarray(value)
     for name, value in given.items():
@@ -205,7 +205,7 @@ def _converted(scene: Scene, given: dict[str, Any]) -> tuple[Scene, dict[str, An
     if not jnp.issubdtype(dtype, jnp.floating):
         dtype = jnp.result_type(float)
     if any(is_weak(x) for x in leaves[:-2]):
-        # Numbers put in by `jnp.asarray(2.0)` or as Python's own would else compile the run once more.
+        # Numbers from `jnp.asarray(2.0)` or from Python would otherwise compile the run once more.
         scene = jtu.tree_map(lambda x: jnp.asarray(x, dtype) if is_weak(x) else x, scene)
     array = {name: _array(value, dtype) for name, value in given.items()}
     for name in ("q0", "qd0"):
@@ -221,7 +221,7 @@ def _converted(scene: Scene, given: dict[str, Any]) -> tuple[Scene, dict[str, An
 
 
 def _check_span(t0: ArrayLike, t1: ArrayLike, array: dict[str, Any]) -> None:
-    """Refuse times that differ, but not in the type the run has: it would end where it begins, and all be well."""
+    """Refuse times that differ, but are equal in the type of the run, which would end at its start without an error."""
     known = is_known(t0, t1, array["t0"], array["t1"])  # inside `jax.jit` arithmetic of known arrays is traced
     if known and np.asarray(array["t0"]) == np.asarray(array["t1"]) and np.asarray(t0) != np.asarray(t1):
         raise ValueError(
@@ -235,13 +235,13 @@ def _check_slips(scene: Scene, q0: jax.Array | np.ndarray, t0: jax.Array | np.nd
     for name, effect in scene.friction.items():
         if effect.along is None or callable(effect.belt_velocity):
             continue
-        # Asked first, as the rest takes time.
+        # This test comes first, as the rest takes time.
         if is_known(effect.belt_velocity) and np.any(np.asarray(effect.belt_velocity) != 0):
             effect.check_belt(q0, scene.bind_time(jnp.asarray(t0)).params, name)
 
 
 def _own_states(scene: Scene, q0: jax.Array | np.ndarray, z0: dict[str, PyTree], dtype: np.dtype) -> dict[str, PyTree]:
-    """Convert and check the initial own states that were given."""
+    """Convert and check the initial states of effects."""
     z0 = as_mapping(z0, name="z0", example="{'friction': 0.0}")
     states = scene.initial_state(jnp.asarray(q0, dtype))
     for name, state in z0.items():
@@ -257,8 +257,8 @@ def _own_states(scene: Scene, q0: jax.Array | np.ndarray, z0: dict[str, PyTree],
 
 
 def _check_values(array: dict[str, Any]) -> None:
-    """Check the values that are known now; those that are traced are checked in the run."""
-    # Comparing numbers of Python takes a tenth of the time that arrays without dimensions take.
+    """Check the known values; the run checks traced ones."""
+    # Comparisons of Python numbers take a tenth of the time of those of arrays without dimensions.
     known = {
         name: value.item() if value.ndim == 0 else np.asarray(value) for name, value in array.items() if is_known(value)
     }

@@ -1,6 +1,6 @@
-"""`simulate`: a scene in, a trajectory out."""
+"""`simulate`, which runs a scene."""
 
-from __future__ import annotations  # `help` shows types as they are written here
+from __future__ import annotations  # `help` then shows the names of types
 
 import math
 import time
@@ -28,9 +28,9 @@ from ._solve import RunOutput, compiled_runs, default_solver, solve
 from ._trajectory import Trajectory, trajectory
 
 _IMPLICIT = (dfx.AbstractImplicitSolver, Gauss, ImplicitFriction, Rodas5P)
-# Longest fixed step of an explicit solver, times the fastest rate, for which a derivative is trusted.
+# Longest fixed step of an explicit solver, times the fastest rate, without a warning about derivatives.
 _LONGEST = 2.0
-# Multiple of the relative tolerance above which the rounding of the steps in single precision is remarked on.
+# Multiple of the relative tolerance above which rounding of the steps in single precision gives a warning.
 _ROUNDING = 2.0
 
 
@@ -58,54 +58,54 @@ def simulate(
 ) -> Trajectory:
     """Run a scene from `t0` to `t1`.
 
-    Compiled on the first call for a scene of this structure; changing numbers, of the scene or of the arguments,
-    compiles nothing anew. All numbers run in the floating type of the scene and the initial state together; numbers
-    that were left out, as the `belt_velocity` of `Friction`, follow the others.
+    The first call for a scene of this structure compiles a program; changes of numbers, in the scene or in the
+    arguments, do not compile another one. All numbers have the common floating type of scene and initial state;
+    defaults, such as the `belt_velocity` of `Friction`, take it, too.
 
     **Arguments:**
 
     - `scene`: the `Scene`.
-    - `q0`, `qd0`: initial coordinates and velocities, shape `[dof]`. Of an element that sticks at t0 the slip velocity
-      is taken away, and with it the derivative by that velocity. They must obey the constraints to six digits, and are
+    - `q0`, `qd0`: initial coordinates and velocities, shape `[dof]`. An element that sticks at t0 loses its slip
+      velocity, and with it the derivative with respect to that. They must obey the constraints to six digits, and are
       then moved onto them; `jaxmodsim.project_initial_state` finds such states.
     - `t1`: end time [s], >= t0.
     - `t0`: start time [s].
-    - `ts`: times [s] at which the run is kept, increasing, within `[t0, t1]`; by default the end alone, in arrays of
+    - `ts`: times [s] at which the run is saved, increasing, within `[t0, t1]`; by default the end alone, in arrays of
       length one.
-    - `z0`: initial own states of effects, by effect name; those left out start at rest.
-    - `rtol`, `atol`: relative and absolute tolerance of the local error. What is smaller than `atol` is not resolved:
-      let it lie below the smallest velocity [m/s] and deflection [m] that decide anything. Above the width of a
-      `Regularized` law it is refused. In float32 the rounding of n steps is about 6e-8 sqrt(n) of the state: where that
-      exceeds `rtol`, as with the many steps of a stiff bristle, a remark is logged once.
-    - `dt`: fixed step [s], > 0, instead of tolerances. A sample of a `Signal` in between divides the step. Derivatives
-      of a scene at rest need `dt` below 2 over its fastest rate [1/s] with explicit solvers; outside of `jax.jit` a
-      longer one is remarked on, once.
-    - `dtmax`: longest step [s], > 0. Steps resolve the load of what sticks to `rtol` of its limit, as long as the load
-      is smooth on the scale of its own derivatives. What cannot be seen is a pulse out of rest that is shorter than a
-      step: give it as a `Signal`, on whose samples steps end, or bound the step by its length. Where a missed pulse
-      shows at a saved time, the run fails.
-    - `solver`: any diffrax solver. By default `Rodas5P` where an effect is stiff (LuGre, `Regularized`) or, on one
+    - `z0`: initial states of effects, by effect name; others start at rest.
+    - `rtol`, `atol`: relative and absolute tolerance of the local error. Values below `atol` are not resolved: choose
+      it below the smallest velocity [m/s] and deflection [m] that matter. It must not be above the width of a
+      `Regularized` law. In float32 the rounding of n steps is about 6e-8 sqrt(n) of the state; if that exceeds `rtol`,
+      as with the many steps of a stiff bristle, one warning is logged.
+    - `dt`: fixed step [s], > 0, instead of tolerances. A sample of a `Signal` within a step divides it. Derivatives
+      of a scene at rest need `dt` below 2 over its fastest rate [1/s] with explicit solvers; outside `jax.jit` a
+      longer step logs one warning.
+    - `dtmax`: longest step [s], > 0. Steps resolve the load of a sticking element to `rtol` of its limit, if the load
+      is smooth on the scale of its derivatives. A pulse from rest that is shorter than a step may be missed: pass it as
+      a `Signal`, on whose samples steps end, or bound the step by its length. The run fails if a missed pulse shows at
+      a saved time.
+    - `solver`: any diffrax solver. By default `Rodas5P` if an effect is stiff (LuGre, `Regularized`) or, on one
       coordinate, runs by events (set-valued laws); `diffrax.Tsit5` otherwise. `ImplicitFriction` for fixed steps that
       may be too long for the stiffness of friction.
-    - `adjoint`: how the run is differentiated. By default `StoredSteps()`, in either mode: `jax.grad`, `jax.jacfwd`,
-      `jax.hessian`. The steps of a run that is differentiated keep `rtol` for the derivative, too.
+    - `adjoint`: method of differentiation. By default `StoredSteps()`, for both modes: `jax.grad`, `jax.jacfwd`,
+      `jax.hessian`. The steps of a differentiated run keep `rtol` for the derivative, too.
       `StoredSteps(every=k)` needs a k-th of the memory. Adjoints of diffrax control the error of the state alone, so
-      their derivatives are wrong where little moves. `diffrax.ForwardMode()` is for forward mode alone and stores
-      nothing. `diffrax.RecursiveCheckpointAdjoint` makes steps again from checkpoints: their rounding differs from that
-      of the run, and through events derivatives lose digits. Not `diffrax.BacksolveAdjoint`.
-    - `max_steps`: limit of the number of steps. Derivatives set memory aside for the state before each of them.
-    - `max_events`: limit of the number of instants at which set-valued laws change modes. Inside `jax.jit`, and where
-      events are recorded, `run.events` has as many entries for each such law, so a smaller one is faster there.
-    - `stick_on_chatter`: whether an element with accumulating mode changes remains in stick, by a force that may exceed
-      its limit, instead of ending the run.
-    - `project`: whether the state is moved onto the constraints after every step, and wherever it is kept, by the
-      smallest changes in the metric of the masses. Without, constraints hold for the accelerations alone and drift with
-      the error of integration, but for their own `stabilise`.
-    - `record`: `"events"`, `"energy"` or both: what the run records beside the motion. What it does not record takes
-      another run when `run.events` or `run.energy` is read first. Outside of `jax.jit`, `jax.vmap` and `jax.grad` every
-      run records its first 16 events. With `"energy"` the steps are chosen for the work, too.
-    - `throw`: whether a run that ends early raises; otherwise `run.result` says how it ended, and what was computed
-      is kept.
+      their derivatives are wrong near rest. `diffrax.ForwardMode()` supports forward mode alone and stores
+      nothing. `diffrax.RecursiveCheckpointAdjoint` repeats steps from checkpoints: their rounding differs from that
+      of the run, and derivatives through events lose digits. `diffrax.BacksolveAdjoint` is not supported.
+    - `max_steps`: limit of the number of steps. Derivatives reserve memory for the state before each of them.
+    - `max_events`: limit of the number of instants at which set-valued laws change modes. Inside `jax.jit`, and with
+      recorded events, `run.events` has this number of entries for each such law, so that a smaller one is faster.
+    - `stick_on_chatter`: whether an element whose mode changes accumulate stays in stick, by any force, even above its
+      limit, instead of ending the run.
+    - `project`: whether the state is projected onto the constraints after every step, and when it is saved, by the
+      smallest changes in the metric of the masses. Without it, constraints hold for the accelerations alone, and drift
+      with the error of integration, apart from their own `stabilise`.
+    - `record`: `"events"`, `"energy"` or both, recorded during the run. Otherwise the first access to `run.events` or
+      `run.energy` repeats the run. Outside `jax.jit`, `jax.vmap` and `jax.grad` every run records its first 16 events.
+      With `"energy"` the steps are chosen for the work, too.
+    - `throw`: whether a run that ends early raises an error; otherwise `run.result` has the outcome, and the trajectory
+      the part that was computed.
 
     **Returns:**
 
@@ -152,10 +152,10 @@ def simulate(
 
 
 def _check_rounding(request: RunRequest, solved: RunOutput) -> None:
-    """Remark on a run in single precision whose steps round by more than its tolerance.
+    """Log a warning for a run in single precision whose rounding exceeds its tolerance.
 
-    Roundings add up as the square root of their number. On a box that a spring pulls by 1 m, with LuGre bristles of
-    1e3 to 1e7 N/m and 300 to 4000 steps, the error was 0.5 to 3.2 times `eps/2 sqrt(steps)`.
+    Rounding errors grow as the square root of the number of steps. For a box that a spring pulls by 1 m, with LuGre
+    bristles of 1e3 to 1e7 N/m and 300 to 4000 steps, the error was 0.5 to 3.2 times `eps/2 sqrt(steps)`.
     """
     steps = solved.stats["num_steps"]
     if solved.t.dtype == jnp.float32 and request.dt is None and is_known(steps, request.rtol):
@@ -165,10 +165,10 @@ def _check_rounding(request: RunRequest, solved: RunOutput) -> None:
 
 
 def _check_fixed_steps(request: RunRequest, solved: RunOutput) -> None:
-    """Remark on explicit fixed steps, of a run that is differentiated, beyond about the limit of stability.
+    """Log a warning for explicit fixed steps, of a differentiated run, beyond about the limit of stability.
 
-    At rest the motion stays right there, and the derivative grows without bound. The rate is the spectral radius of the
-    vector field at the end of the run. It is known outside of `jax.jit` alone.
+    At rest the motion stays accurate, but the derivative grows without bound. The rate is the spectral radius of the
+    vector field at the end of the run, which is known outside `jax.jit` alone.
     """
     if request.dt is None or is_known(*jtu.tree_leaves(request)):
         return
@@ -191,7 +191,7 @@ def _functions(scene: Scene) -> list[object]:
 
 
 def _check_initial_state(request: RunRequest) -> None:
-    """Raise for a known initial state that violates constraints or contacts, before the run is compiled."""
+    """Raise an error for a known initial state that violates constraints or contacts, before the compilation."""
     start = request.t0, request.q0, request.qd0
     if is_known(*jtu.tree_leaves((request.scene, start))):
         t0, q0, qd0 = map(jnp.asarray, start)
@@ -202,7 +202,7 @@ def _check_initial_state(request: RunRequest) -> None:
 
 
 def _raise_early_end(request: RunRequest, solved: RunOutput) -> RunOutput:
-    """Raise for a run that ended early: at once where its values are known, by a run-time check where traced."""
+    """Raise an error for a run that ended early: at once for known values, by a run-time check for traced ones."""
     if is_known(solved.code):
         code = int(solved.code)
         if code != SUCCESS:

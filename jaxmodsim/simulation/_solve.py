@@ -42,23 +42,23 @@ from ._integrated_system import AugmentedState, Instant, IntegratedSystem, RunFu
 from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, end_code, start_code
 from ._run_request import RunRequest
 
-# Part of the absolute tolerance below which a slip velocity counts as none.
+# Speed of rest, as a part of the absolute tolerance.
 _REST = 1e-3
-# Part of its limit by which a sticking element's force may exceed it at a saved time, for the error of dense output.
+# Admissible excess of a sticking element's force over its limit at a saved time, due to the error of dense output.
 _OVERLOAD = 1e-2
 
 # Gains of the step size control, proportional and integral: diffrax's own, and those for Rosenbrock methods. Of 16
-# pairs on LuGre's box, the 1995 set on a spring and the spherical pendulum, at tolerances of 1e-4 to 1e-8, these made
-# about half of the error in as many steps, with a third fewer of them rejected. Not where events start anew again and
-# again: steps grow more slowly (belt oscillator, 1e-8: 468 in place of 423).
+# pairs, on LuGre's box, the 1995 set on a spring and the spherical pendulum, at tolerances of 1e-4 to 1e-8, these gave
+# about half of the error in as many steps, with a third fewer rejections. Runs with events use diffrax's gains, as
+# steps grow more slowly with the others (belt oscillator, 1e-8: 468 instead of 423 steps).
 _GAINS = (0.0, 1.0)
 _ROSENBROCK_GAINS = (0.25, 0.5)
-# Coordinates and states of effects up to which their linear systems are written out in scalars; see `_structured`.
+# Number of coordinates and states of effects up to which their linear systems are unrolled; see `_structured`.
 _MOST_UNKNOWNS = 24
 
 
 class Nodes(NamedTuple):
-    """A number at t0 and at the ends of all steps: times, values and rates (None if not known), infinite beyond."""
+    """A series at t0 and at the ends of all steps: times, infinite if unused, values, and rates or None."""
 
     t: Float[Array, " nodes"]
     x: Float[Array, " nodes"]
@@ -66,17 +66,17 @@ class Nodes(NamedTuple):
 
 
 class RunOutput(NamedTuple):
-    """What a run gives: saved times and states, the outcome, the end that was reached, and the numbers of steps.
+    """Output of a run: saved times and states, the outcome, the end, and the numbers of steps.
 
-    And what the request asks for beside that: a log of events, the work at the saved times, a series; else None.
+    If requested also a log of events, the work at the saved times and a series; else None.
     """
 
     t: Float[Array, " time"]
     y: State
-    # Of the set-valued friction elements, shape `[time, elements]`; None where there are none.
+    # Modes, shape `[time, modes]`; None without modes.
     mode: Array | None
     code: Int[Array, ""]
-    # None where the end alone is kept, and so is in `t` and `y` already: every output of compiled code costs time.
+    # None if the end alone is saved, which is then in `t` and `y`: every output of compiled code costs time.
     end: tuple[Float[Array, ""], State] | None
     stats: dict[str, Array]
     log: EventLog | None
@@ -85,35 +85,35 @@ class RunOutput(NamedTuple):
 
 
 def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolver:
-    """Rodas5P where the scene is stiff, or runs by events on one coordinate or in the plane; Tsit5 otherwise.
+    """Rodas5P if the scene is stiff, or runs by events on one coordinate or in the plane; Tsit5 otherwise.
 
-    Every step of a run with events looks at the guards, whatever the method. On one coordinate Rodas5P makes the fewest
-    of those whose dense output keeps the tolerance, and is twice as fast as Tsit5 under vmap; on more of them its
-    Jacobian costs more than that, most of all in compile time. Exact friction in the plane is stiff where slip is slow:
-    its direction follows that of the load.
+    Every step of a run with events evaluates the guards, for any method. On one coordinate Rodas5P makes the fewest
+    steps of the methods whose dense output keeps the tolerance, and is twice as fast as Tsit5 under vmap. On several
+    coordinates its Jacobian costs more than that, above all in compile time. Exact friction in the plane is stiff for
+    slow slip, whose direction follows that of the load.
     """
     stiff = scene.stiff or sum(scene.mode_widths(dof)) > len(scene.mode_names)
     return Rodas5P(pivot=fixed_step) if stiff or (scene.mode_names and dof == 1) else dfx.Tsit5()
 
 
 def _structured(request: RunRequest) -> bool:
-    """Whether the systems of `Rodas5P` are solved by `linear_solver`, from the structure of mechanics.
+    """Whether `linear_solver` solves the systems of `Rodas5P`, from the structure of mechanics.
 
-    A step of 2, 3 and 6 links with LuGre joints takes 2.4, 4.8 and 9.3 us so, and 2.4, 5.6 and 37 us with the Jacobian
-    (two shared cores, float64). On one coordinate 1.4 and 1.2 us.
+    A step of 2, 3 and 6 links with LuGre joints takes 2.4, 4.8 and 9.3 us with it, and 2.4, 5.6 and 37 us with the
+    Jacobian (two shared cores, float64). On one coordinate 1.4 and 1.2 us.
     """
     unknowns = sum(np.size(x) for x in jtu.tree_leaves((request.q0, request.scene.initial_state(request.q0))))
     return request.q0.shape[0] > 1 and unknowns <= _MOST_UNKNOWNS and has_linear_solver(request.scene)
 
 
 def _shortest(request: RunRequest) -> Float[Array, ""]:
-    """Shortest step [s]: what time resolves."""
+    """Shortest step [s], the resolution of time."""
     span = jnp.maximum(jnp.abs(request.t0), jnp.abs(request.t1))
     return float(jnp.finfo(span.dtype).eps) * span
 
 
 def _tolerances(request: RunRequest) -> tuple[Array, Array]:
-    """Relative and absolute; of what is zero and stays so, the error is zero and not 0/0."""
+    """Relative and absolute tolerance; the latter positive, so that the error of a constant zero is zero, not 0/0."""
     return request.rtol, jnp.maximum(request.atol, float(jnp.finfo(request.atol.dtype).tiny))
 
 
@@ -128,7 +128,7 @@ def _error_control(request: RunRequest, solver: dfx.AbstractSolver) -> dfx.Abstr
 def _solver(
     solver: dfx.AbstractSolver, functions: RunFunctions, scene: Scene, request: RunRequest
 ) -> dfx.AbstractSolver:
-    """`solver`, wrapped in what the scene needs: events, projections, signals."""
+    """`solver`, wrapped for the events, projections and signals of the scene."""
     if isinstance(solver, ImplicitFriction):
         solver = ImplicitFriction(functions.system.advance)
     freeze_args, samples = None, None
@@ -167,7 +167,7 @@ def _controller(request: RunRequest, solver: dfx.AbstractSolver) -> dfx.Abstract
 
 
 def _plugins(request: RunRequest, system: IntegratedSystem) -> tuple[Any, Any]:
-    """Solver and adjoint: those that were given, or the defaults."""
+    """Solver and adjoint: those of the request, or the defaults."""
     solver = default_solver(request.scene, request.q0.shape[0], request.dt is not None)
     if request.solver is not None:
         solver = request.solver.whole
@@ -177,7 +177,7 @@ def _plugins(request: RunRequest, system: IntegratedSystem) -> tuple[Any, Any]:
 
 
 def _well_posed(request: RunRequest) -> Bool[Array, ""]:
-    """Whether times and tolerances make a run; known ones are checked before, with a sentence of their own."""
+    """Whether times and tolerances are valid; known values have been checked before, with their own errors."""
     t0, t1, ts, rtol, atol = request.t0, request.t1, request.ts, request.rtol, request.atol
     steps = [step for step in (request.dt, request.dtmax) if step is not None]
     fine = (t0 <= t1) & (rtol >= 0) & (atol >= 0) & (rtol + atol > 0)
@@ -185,12 +185,12 @@ def _well_posed(request: RunRequest) -> Bool[Array, ""]:
         fine &= step > 0
     if ts is not None:
         fine &= (t0 <= ts[0]) & jnp.all(ts[1:] >= ts[:-1]) & (ts[-1] <= t1)
-    # With ends that are finite and order, ts are so, too.
+    # Between finite ends increasing ts are finite, too.
     return fine & jnp.isfinite(jnp.stack([t0, t1, rtol, atol, *steps])).all()
 
 
 class _Start(NamedTuple):
-    """What a run begins with: state, modes, its rate, and the first step [s]."""
+    """Start of a run: state, modes, rate, and the first step [s]."""
 
     y: PyTree
     mode: Array | None
@@ -214,8 +214,8 @@ def _functions(request: RunRequest) -> RunFunctions:
 def _start(request: RunRequest, functions: RunFunctions, order: Any) -> _Start:
     """The start of a run whose method has an error estimate of this order.
 
-    Everything is evaluated in a loop, which is compiled once: modes to begin with, the rate, and another one for the
-    first step. In reverse mode it is evaluated again.
+    A loop, which is compiled once, evaluates the initial modes, the rate, and another rate for the first step. Reverse
+    mode evaluates it again.
     """
     scene, t0, exact = request.scene, request.t0, bool(request.scene.mode_names)
     initial = request.initial_state
@@ -250,7 +250,7 @@ def _start(request: RunRequest, functions: RunFunctions, order: Any) -> _Start:
 
 
 def _start_code(request: RunRequest, functions: RunFunctions, mode: Array | None, rate: PyTree) -> Int[Array, ""]:
-    """What is wrong before the first step, where the first state has that rate."""
+    """Code of an error before the first step; `rate` is that of the first state."""
     rate = rate.motion if isinstance(rate, AugmentedState) else rate
     atol = None if request.dt is not None else request.atol
     start = start_code(request.scene, request.t0, request.initial_state, rate, mode, atol, functions.system.canonical)
@@ -258,7 +258,7 @@ def _start_code(request: RunRequest, functions: RunFunctions, mode: Array | None
 
 
 def _integrate(request: RunRequest) -> RunOutput:
-    """Run diffrax; with modes only where the scene has them, with a log, work and a series only where asked for."""
+    """Run diffrax, with modes if the scene has them, and with a log, work and a series if requested."""
     scene, exact, series = request.scene, bool(request.scene.mode_names), request.choices.series
     functions = _functions(request)
     method, adjoint = _plugins(request, functions.system)
@@ -266,13 +266,13 @@ def _integrate(request: RunRequest) -> RunOutput:
     y0, mode, rate, first = _start(request, functions, method.error_order(dfx.ODETerm(functions.plain_derivative)))
     controller = _controller(request, method)
     start = _start_code(request, functions, mode, rate)
-    # A run that cannot start does not try to: it ends at t0, where diffrax wants its saving times, too.
+    # A run that cannot start ends at t0; diffrax needs its saved times there, too.
     starts = start == SUCCESS
     ts = None if request.ts is None else jnp.where(starts, request.ts, request.t0)
     if isinstance(solver, EventSolver):
         y0 = solver.start(request.t0, y0, mode, scene)
 
-    # As it is: what states are on constraints and in stick, all at once after the run.
+    # Without projections, which `_kept` applies to all saved states after the run.
     def saved(t: Array, y: PyTree, scene: Scene) -> tuple[PyTree, Array | None]:
         del t, scene
         return (y.y, y.mode) if isinstance(y, EventState) else (y, None)
@@ -301,11 +301,11 @@ def _integrate(request: RunRequest) -> RunOutput:
             adjoint=adjoint,
             max_steps=request.choices.max_steps,
             throw=False,
-            # Traced from the beginning, as `EventController` makes it: the step is traced once, not for each kind.
+            # Traced from the start, as `EventController` returns it: the step is traced once, not for each type.
             made_jump=jnp.asarray(False) if exact else None,
         )
 
-    # What diffrax checks of them, that they point forward, increase and lie within the run, `_well_posed` has.
+    # `_well_posed` has checked their order and range, as diffrax would.
     solution = without_error_checks(integrate, first, ts)
     assert solution.ts is not None
     assert solution.ys is not None
@@ -323,7 +323,7 @@ def _integrate(request: RunRequest) -> RunOutput:
         t, y, modes = jtu.tree_map(lambda x: x[1:], (t, y, modes))
     if instants is not None:
         rate = jtu.tree_map(lambda x: x[0], instants.rate)
-        if ts is not None:  # an element that sticks under a load beyond its limit: an event was stepped over
+        if ts is not None:  # an element that sticks under a load beyond its limit: the run has missed an event
             beyond = jnp.any(instants.stick_violation[1:] > _OVERLOAD, axis=1)
             missed = jnp.any(beyond & jnp.isfinite(t))
     (y, work), (end_state, _) = (y, end[1]) if request.choices.audited else ((y, None), (end[1], None))
@@ -351,7 +351,7 @@ def _ended(
     result: dfx.RESULTS,
     ending: Ending | None,
 ) -> Array:
-    """How the run ended, if it began; the rate is None where nothing has given it yet."""
+    """Code of the outcome of a run that started; the rate is None if it is not known yet."""
     span = jnp.maximum(jnp.abs(request.t0), jnp.abs(request.t1))
     ahead = float(jnp.finfo(span.dtype).eps) ** 0.5 * span if request.dt is None else request.dt
     rate = vector_field(t, y, request.scene, mode) if rate is None else rate
@@ -361,7 +361,7 @@ def _ended(
 def _kept(
     request: RunRequest, functions: RunFunctions, starts: Array, t: Array, rows: tuple[PyTree, Array | None]
 ) -> tuple[Array, PyTree, Array | None, Instant | None]:
-    """Times, results, modes and more of the end and of all saved times: infinite where they were not reached.
+    """Times, results, modes and an `Instant` at the end and at all saved times; infinite at times not reached.
 
     A run that did not start has reached times up to t0.
     """
@@ -371,7 +371,7 @@ def _kept(
     def fill(x: Array, filling: Array | float) -> Array:
         return jnp.where(jnp.expand_dims(reached, tuple(range(1, x.ndim))), x, filling)
 
-    # What was not reached is evaluated at the end of the run.
+    # Rows at times that were not reached are evaluated at the end of the run.
     t_there, (y, modes) = jtu.tree_map(lambda x: fill(x, x[:1]), (t, rows))
     y, instants = jax.lax.map(lambda row: functions.keep(row[0], row[1], request.scene, row[2]), (t_there, y, modes))
     t, y, modes = jtu.tree_map(lambda x: fill(x, jnp.inf), (t, y, modes))
@@ -385,13 +385,13 @@ def solve(request: RunRequest) -> RunOutput:
 
 
 def compiled_runs() -> int:
-    """How many programs `solve` has compiled."""
+    """Number of programs that `solve` has compiled."""
     return programs_of(solve)
 
 
 @jax.jit
 def solve_start(request: RunRequest) -> State:
-    """The state a run begins with: on the constraints, and at rest where elements stick."""
+    """The first state of a run: on the constraints, and without slip of sticking elements."""
     functions = _functions(request)
     y0 = _start(request, functions, 1).y
     return functions.system.state(request.t0, y0, request.scene.bind_time(request.t0))

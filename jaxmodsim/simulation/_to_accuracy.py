@@ -1,4 +1,4 @@
-"""Runs of an accuracy that is asked for: two methods, compared until their difference is small."""
+"""Runs with a requested accuracy: two methods, compared until their difference is small."""
 
 import math
 from collections.abc import Callable
@@ -27,25 +27,24 @@ from ._solve import RunOutput, default_solver, solve
 from ._trajectory import Trajectory, trajectory
 
 _ACCURACIES = (1e-12, 1e-1)
-# Tolerances are looked for between these: so many rounding errors of a number, and a number. Absolute ones are this
-# part of relative ones, as by default.
+# Range of relative tolerances: a number of rounding units, and a number. Absolute tolerances are this part of them, as
+# by default.
 _TIGHTEST, _LOOSEST, _ABSOLUTE = 50.0, 0.1, 1e-3
-# Errors are differences to two references, runs by different methods. As parts of the accuracy: the tolerance at which
-# these are tried first, and how far they may be apart; and how far they may be from two more of ten times looser ones.
+# Errors are differences to two references, runs by different methods. In parts of the accuracy: the first tolerance of
+# the references, their admissible difference, and that to two runs with ten times looser tolerances.
 _AHEAD, _AGREE, _NEAR = 1e-2, 0.25, 0.5
-# Difference of the whole state at which two runs have nothing to do with each other, whatever is observed.
+# Difference of the whole state above which two runs are unrelated, for any observable.
 _APART = 0.1
-# Fall of the difference of two runs from tolerances this many times looser below which they do not converge.
+# Two runs converge if their difference falls by at least this factor from tolerances this many times looser.
 _LOOSER, _FALL = 1e3, 30.0
-# An estimate this many times what is uncertain of it says how the error follows the tolerance.
+# An estimate of at least this multiple of its uncertainty shows the order of the error in the tolerance.
 _KNOWN = 4.0
-# Magnitude of an observable below which errors are relative to this instead.
+# Least magnitude of an observable to which errors are relative.
 _SMALLEST = 1e-6
-# In stick nothing that is integrated moves, and methods that are left to themselves make the same steps. Those of the
-# one that is compared with are no longer than this part of the run, so that it looks at the loads in other places; and
-# its place among the methods.
+# In stick the integrated state is constant, and all methods make the same steps. Steps of the second method are
+# therefore no longer than this part of the run, so that it samples the loads at other times; and its index.
 _PART, _BOUNDED = 127.0, 2
-# Saved times that are too few to show magnitudes and chaos, and how many do.
+# Fewer saved times than the first number do not show magnitudes and chaos; the second number does.
 _FEW, _TIMES = 11, 101
 
 
@@ -54,7 +53,7 @@ Observe: TypeAlias = Callable[[Trajectory], ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class _TrialRun:
-    """A run of the search, with what is compared: the observable and the state, of the shape `[..., columns]`."""
+    """A run of the search, with the compared observable and state, shape `[..., columns]`."""
 
     run: Trajectory
     which: int
@@ -63,7 +62,7 @@ class _TrialRun:
     atol: float
     observed: np.ndarray
     state: np.ndarray
-    # How it ended early, if it did.
+    # The sentence of an early end, or empty.
     failure: str
 
     @property
@@ -91,7 +90,7 @@ class _TrialRun:
 
 @dataclass(frozen=True)
 class _AccuracySearch:
-    """What is searched for, and what was run: by the tolerance and the place of the method among `solvers`."""
+    """The search and its runs, by the tolerance and the index of the method in `solvers`."""
 
     request: RunRequest
     asked: float
@@ -106,17 +105,17 @@ class _AccuracySearch:
 
     @property
     def second(self) -> int:
-        """Place of the method that the first one is compared with."""
+        """Index of the method for comparison with the first one."""
         return len(self.solvers) - 1
 
     def run(self, rtol: float, which: int) -> _TrialRun:
-        """The run by one of the methods at a tolerance; made once."""
+        """The run by one of the methods at a tolerance, made once."""
         if (rtol, which) not in self.made:
             self.made[rtol, which] = self.make(rtol, which, self.request)
         return self.made[rtol, which]
 
     def along(self, rtol: float, which: int) -> _TrialRun:
-        """The same run, kept at more times where few are saved."""
+        """The same run, saved at more times if it has few."""
         if self.request.ts is not None and self.request.ts.shape[0] >= _FEW:
             return self.run(rtol, which)
         if (rtol, which) not in self.seen:
@@ -125,7 +124,7 @@ class _AccuracySearch:
         return self.seen[rtol, which]
 
     def failure(self, rtol: float, which: int) -> str:
-        """How the run by one of the methods at a tolerance ended early; nothing if it did not."""
+        """Sentence of an early end of the run by one of the methods at a tolerance; empty if it reached t1."""
         return self.run(rtol, which).failure or self.along(rtol, which).failure
 
     def make(self, rtol: float, which: int, request: RunRequest) -> _TrialRun:
@@ -142,7 +141,7 @@ class _AccuracySearch:
         return _TrialRun(run, which, solver, rtol, atol, observed, _states(run), failure)
 
     def pair(self, rtol: float) -> tuple[_TrialRun, ...]:
-        """Runs by both methods; by one of them at two tolerances where the other does not reach the end."""
+        """Runs by both methods; by one of them at two tolerances if the other does not reach the end."""
         good = [which for which in (0, self.second) if not self.failure(rtol, which)]
         runs = tuple(self.run(rtol, which) for which in good)
         if len(good) != 1:
@@ -155,10 +154,7 @@ class _AccuracySearch:
 
 @dataclass(frozen=True)
 class _References:
-    """Two runs that errors are taken against, how far they are apart, and the magnitudes of what is observed.
-
-    And a remark if they are too far apart.
-    """
+    """Two reference runs, their difference, the magnitudes of the observable, and a remark if they do not agree."""
 
     runs: tuple[_TrialRun, ...]
     size: np.ndarray
@@ -166,11 +162,11 @@ class _References:
     remark: str
 
     def error(self, made: _TrialRun) -> float:
-        """Difference to the farther one."""
+        """Difference to the farther reference."""
         return max(_error(made, each, self.size) for each in self.runs)
 
     def estimate(self, made: _TrialRun) -> float:
-        """Of the error of a run: its difference, and what is uncertain of that."""
+        """Estimate of the error of a run: its difference to the references, and the uncertainty of that."""
         return self.error(made) + self.gap if made.ok else math.inf
 
 
@@ -200,26 +196,26 @@ def simulate_to_accuracy(
 ) -> Trajectory:
     """Run a scene with the solver and the tolerances that give a global accuracy for the least work.
 
-    They are searched for by about ten runs of two methods: the run with the least work is taken whose difference to
+    The search makes about ten runs of two methods. It takes the run with the least work among those whose difference to
     tighter runs by either method is within the accuracy. In scenes with events the second method makes steps of at most
-    1/127 of the run, unless `dtmax` bounds both, so that the two look at different places. What steps over a short
-    pulse in all of them is not seen: `dtmax`.
+    1/127 of the run, unless `dtmax` bounds both, so that the two methods do not miss the same load. A short pulse that
+    all runs miss is not detected: pass `dtmax`.
 
-    Errors are relative to the largest magnitude of the observable at the saved times (of fewer than 11, at 101 times
-    along the run), or to 1e-6 of its unit where it stays below that.
+    Errors are relative to the largest magnitude of the observable at the saved times (with fewer than 11, at 101 times
+    along the run), or to 1e-6 of its unit if the magnitude is below that.
 
     **Arguments:**
 
     Those of `simulate` without `rtol`, `atol` and `dt`, and:
 
     - `accuracy`: largest error of the observable, from 1e-12 to 0.1.
-    - `observable`: `"q[0]"`, `"qd[0]"`, the name of an effect for its force (`[i]` behind for a component), or a
+    - `observable`: `"q[0]"`, `"qd[0]"`, the name of an effect for its force (followed by `[i]` for a component), or a
       function of the `Trajectory` that returns numbers of shape `[]`, `[time]` or `[time, k]`, each column relative to
-      its own largest magnitude among the numbers returned. By default all coordinates and velocities, each relative to
-      its own.
-    - `solver`: where given, the tolerances alone are chosen.
-    - `throw`: whether a run that ends early, or an accuracy that is not reached, raises. Otherwise `run.result` says
-      how the run ended, or `run.accuracy.remark` what kept the search from the accuracy.
+      its largest magnitude among the returned numbers. By default all coordinates and velocities, each relative to
+      its own magnitude.
+    - `solver`: the method; the search then chooses the tolerances alone.
+    - `throw`: whether a run that ends early, or an accuracy that is not reached, raises an error. Otherwise
+      `run.result` has the outcome, and `run.accuracy.remark` the reason.
 
     **Returns:**
 
@@ -228,8 +224,8 @@ def simulate_to_accuracy(
 
     **Raises:**
 
-    - `ValueError` as `simulate`, and where numbers are traced (`jax.jit`, `jax.vmap`, `jax.grad`).
-    - `SimulationError` if the run ended early, or no run of the accuracy was found, and `throw` is set.
+    - `ValueError` as `simulate`, and for traced numbers (`jax.jit`, `jax.vmap`, `jax.grad`).
+    - `SimulationError` if the run ended early, or no run has the accuracy, and `throw` is set.
     """
     throw = as_flag(throw, name="throw")
     request = run_request(
@@ -264,7 +260,7 @@ def _observe(observable: str | Observe | None) -> Observe:
 
 
 def _search(search: _AccuracySearch, choices: tuple[int, ...], own: bool, throw: bool) -> Trajectory:
-    """The run with the least work; `choices` are the methods that it may be of, see `_references` for `own`."""
+    """The run with the least work; `choices` are the admissible methods, see `_references` for `own`."""
     asked = search.asked
     rtol = _round(max(_AHEAD * asked, search.tightest))
     first = search.pair(rtol)
@@ -297,7 +293,7 @@ def _check_known(tree: PyTree) -> None:
 
 
 def _asked(request: RunRequest, accuracy: float) -> float:
-    """The accuracy, if it can be searched for."""
+    """The accuracy, checked."""
     _check_known((request, accuracy))
     if isinstance(accuracy, bool) or not isinstance(accuracy, int | float | np.number):
         raise ValueError(f"accuracy must be a known number, as in accuracy=1e-6, but {accuracy!r} was given.")
@@ -311,8 +307,8 @@ def _asked(request: RunRequest, accuracy: float) -> float:
 def _solvers(request: RunRequest) -> tuple[tuple[dfx.AbstractSolver, ...], tuple[int, ...]]:
     """Two methods, and which of them may be chosen; in scenes with events the second one again, for bounded steps.
 
-    Where nothing is stiff a method of order 8 is cheaper at tight tolerances. Of stiff scenes all other methods at hand
-    take far more work, so that one of them serves as a check only; so does any beside a method that was given.
+    Without stiffness a method of order 8 is cheaper at tight tolerances. For stiff scenes all other available methods
+    take far more work, so that one of them is a check only; so is the second method if the first one is an argument.
     """
     default = default_solver(request.scene, request.q0.shape[0], False)
     stiff = request.scene.stiff
@@ -358,9 +354,9 @@ def _size(values: np.ndarray) -> np.ndarray:
 
 
 def _references(search: _AccuracySearch, rtol: float, own: bool) -> _References:
-    """The first two runs, from a tolerance downwards, that agree; if none do, the nearest.
+    """The first two runs that agree, from a tolerance downwards; if none do, the nearest.
 
-    Magnitudes are those along the run, of a function (`own`) those of what it returns.
+    Magnitudes are those along the run, for a function (`own`) those of its values.
     """
     nearest = None
     while True:
@@ -384,13 +380,13 @@ def _references(search: _AccuracySearch, rtol: float, own: bool) -> _References:
 
 
 def _confirmed(search: _AccuracySearch, references: _References, rtol: float) -> bool:
-    """Whether a pair from a looser tolerance is near, too: in chaos two runs may meet in one number by accident."""
+    """Whether a pair with a looser tolerance is near, too: in chaos two runs may agree in one number by chance."""
     looser = search.pair(_round(10 * rtol))
     return len(looser) == 2 and max(map(references.error, looser)) <= _NEAR * search.asked
 
 
 def _remark(search: _AccuracySearch, nearest: _References, rtol: float) -> str:
-    """Why two runs do not agree, and what to do."""
+    """Why two runs do not agree, and the remedy."""
     names = " and ".join(dict.fromkeys(each.name for each in nearest.runs))
     text = (
         f"accuracy={search.asked:g} was not reached: the best two runs, by {names} at rtol {nearest.runs[0].rtol:g},"
@@ -398,7 +394,7 @@ def _remark(search: _AccuracySearch, nearest: _References, rtol: float) -> str:
     )
     ended = [text for text in (search.failure(rtol, 0), search.failure(rtol, search.second)) if text]
     looser = search.pair(_round(_LOOSER * nearest.runs[0].rtol))
-    # Runs that are apart do not converge, be it that a single number of them differs less than that of others.
+    # Unrelated runs do not converge, even if a single number of them differs less than in others.
     converges = nearest.gap < _APART and len(looser) == 2
     falls = converges and nearest.gap < _error(looser[0], looser[1], nearest.size) / _FALL
     if len(ended) == 2:
@@ -410,26 +406,26 @@ def _remark(search: _AccuracySearch, nearest: _References, rtol: float) -> str:
         )
     if falls:
         return (
-            f"{text} That is rounding, as this motion enlarges it: ask for less, or for a shorter run. A motion that"
+            f"{text} That is rounding, which this motion amplifies: ask for less, or for a shorter run. A motion that"
             " doubles small differences again and again (chaos) loses digits in proportion to time."
         )
     return (
         f"{text} Tighter tolerances do not bring them together: the motion is chaotic over this time, or the observable"
-        " jumps at a saved time (a force or a mode where an event happens). Ask for a shorter run, or for something"
-        " that does not hang on the phase."
+        " jumps at a saved time (a force or a mode at an event). Ask for a shorter run, or for an observable that does"
+        " not depend on the phase."
     )
 
 
 def _early(search: _AccuracySearch, rtol: float, throw: bool) -> Trajectory:
-    """What becomes of runs that end early: the sentence of the first."""
+    """Result if runs end early: an error with the sentence of the first, or that run."""
     if throw:
         failure = search.failure(rtol, 0) or search.failure(rtol, search.second)
-        raise SimulationError(f"For accuracy={search.asked:g} runs at rtol {rtol:g} were made to check by. {failure}")
+        raise SimulationError(f"accuracy={search.asked:g} needs runs at rtol {rtol:g} for comparison. {failure}")
     return search.run(rtol, 0).run
 
 
 def _failure(request: RunRequest, solved: RunOutput) -> str:
-    """How a run ended early; nothing if it did not."""
+    """Sentence of an early end; empty if the run reached t1."""
     if int(solved.code) == SUCCESS:
         return ""
     t, y = solved.end or (solved.t[-1], jtu.tree_map(lambda x: x[-1], solved.y))
@@ -458,10 +454,10 @@ def _chosen(search: _AccuracySearch, references: _References, best: _TrialRun, e
 
 
 def _cost_scaling(attempts: list[Attempt], rtol: float, gap: float) -> CostScaling:
-    """Steps for ten times better and worse, from the next tighter and the next looser run of the same method."""
+    """Steps for ten times smaller and larger errors, from the next tighter and looser run of the same method."""
     runs = sorted((run for run in attempts if math.isfinite(run.estimate)), key=lambda r: r.rtol)
     place = [run.rtol for run in runs].index(rtol)
-    # Powers of ten in steps for one in the tolerance, and in the tolerance for one in the error, where that is known.
+    # Powers of ten in steps for one in the tolerance, and in the tolerance for one in the error, if that is known.
     slopes = [math.log10(a.num_steps / b.num_steps) / math.log10(b.rtol / a.rtol) for a, b in pairwise(runs)]
     known = [run for run in runs if run.estimate > _KNOWN * gap]
     order = 1.0
@@ -474,5 +470,5 @@ def _cost_scaling(attempts: list[Attempt], rtol: float, gap: float) -> CostScali
 
 
 def _round(x: float) -> float:
-    """Three digits, to be read and copied."""
+    """`x` with three digits, for readers."""
     return float(f"{x:.3g}")

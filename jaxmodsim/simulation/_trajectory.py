@@ -72,7 +72,7 @@ class ModeChange(NamedTuple):
 
     - `t`: time [s]; `effect`: name of the element.
     - `before`, `after`: `"stick"`, or `"forward"` or `"backward"` for positive and negative slip, `"slip"` in the
-      plane; of a contact `"open"` or `"closed"`; of a switch `"above"` or `"below"`.
+      plane; for a contact `"open"` or `"closed"`; for a switch `"above"` or `"below"`.
     """
 
     t: float
@@ -94,14 +94,14 @@ _CONTACT_MODES, _SWITCH_MODES = {0: "open", 1: "closed"}, {1: "above", -1: "belo
 class Energy(AbstractReadable):
     """Energies along a run [J], shape `[time]` each.
 
-    - `kinetic`, `potential`: of the Lagrangian; see `jaxmodsim.mechanics.energies`.
-    - `stored`: in the states of friction laws (bristles).
-    - `work_in`: brought in since t0 by applied forces, belts, constraints that move in time, and explicit time
-      dependence of the Lagrangian.
-    - `dissipated`: lost in friction since t0. Of dynamic laws under a `normal_force` the energy in the state counts as
-      lost until it comes back, as under a load that changes it is no function of the state.
-    - `balance`: kinetic + potential + stored + dissipated - work_in, less its value at t0: zero but for the error
-      of the integration.
+    - `kinetic`, `potential`: energies of the Lagrangian; see `jaxmodsim.mechanics.energies`.
+    - `stored`: energy in the states of friction laws (bristles).
+    - `work_in`: energy supplied since t0 by applied forces, belts, moving constraints, and explicit time dependence of
+      the Lagrangian.
+    - `dissipated`: energy lost in friction since t0. For dynamic laws with a `normal_force` the energy in the state
+      counts as lost until it returns, because with a variable load it is no function of the state.
+    - `balance`: kinetic + potential + stored + dissipated - work_in, less its value at t0: the error of the
+      integration.
     """
 
     kinetic: Float[Array, "*runs time"]
@@ -121,22 +121,22 @@ class Energy(AbstractReadable):
 )
 @dataclass(frozen=True, repr=False)
 class Trajectory(AbstractReadable):
-    """A run of a scene. Everything but the motion itself is computed when it is asked for.
+    """A run of a scene. Forces, events and energies are computed on first access.
 
-    What the run has not recorded takes another run: more than its first 16 events, and energies. Each such run is made
-    once, and its results stay with this object, not with copies of it, such as `jax.jit` and `jax.tree.map` make. A
-    branch or a loop in `jax.jit` (`jax.lax.cond`, `jax.lax.scan`) that reads them first makes that run for itself.
+    More than the first 16 events, and energies, are not saved during the run and require a second run. Each such run
+    is made once, and its results stay with this object, not with copies of it by `jax.jit` or `jax.tree.map`. A branch
+    or a loop in `jax.jit` (`jax.lax.cond`, `jax.lax.scan`) that reads them first makes its own run.
     `simulate(..., record=("events", "energy"))` records them in the run.
 
-    - `t`: times [s], shape `[time]`; `ts`, or the end alone. Times that an early end left unreached are infinite.
+    - `t`: times [s], shape `[time]`; `ts`, or the end alone. Times after an early end are infinite.
     - `q`, `qd`: coordinates and velocities, shape `[time, dof]`.
-    - `z`: own states of effects, by effect name; each with a leading time axis.
-    - `modes`: of the friction elements that run by events, contacts and switches, shape `[time, modes]`; None where
-      there are none. By name: `mode`.
+    - `z`: states of effects, by effect name; each with a leading time axis.
+    - `modes`: modes of event-driven friction elements, contacts and switches, shape `[time, modes]`, or None. By name:
+      `mode`.
     - `counts`: `stats` as arrays.
-    - `accuracy`: what was chosen for the accuracy that was asked for; None where none was.
+    - `accuracy`: the report of `simulate_to_accuracy`; None without.
 
-    A run inside `jax.vmap` is read inside it, or by `jax.vmap(lambda run: run.forces)(runs)`.
+    Read a run of `jax.vmap` inside it, or by `jax.vmap(lambda run: run.forces)(runs)`.
     """
 
     t: Float[Array, " *time"]
@@ -148,13 +148,13 @@ class Trajectory(AbstractReadable):
     code: Int[Array, "..."]
     end: Float[Array, "..."] | None
     request: RunRequest
-    # What the run has recorded: a log of its first events, and the work at the saved times.
+    # Records of the run: a log of its first events, and the work at the saved times.
     log: EventLog | None = None
     work: Work | None = None
     accuracy: Accuracy | None = None
-    # What was read from repeats of the run, by name; no part of the pytree.
+    # Results of repeats of the run, by name; not in the pytree.
     _repeats: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
-    # Where values may be kept: those that are traced further inside must not outlive that.
+    # The trace in which results may be stored: those of an inner trace must not outlive it.
     _home: object = field(default_factory=get_opaque_trace_state, init=False, repr=False, compare=False)
 
     __repr__ = AbstractReadable.__str__
@@ -182,15 +182,15 @@ class Trajectory(AbstractReadable):
 
     @property
     def result(self) -> RunResult:
-        """How the run ended: `run.result.ok`, `run.result.message`."""
+        """Outcome of the run: `run.result.ok`, `run.result.message`."""
         return RunResult(self.code, outcome_messages(self.scene, self.q.shape[-1]))
 
     @property
     def forces(self) -> dict[str, Array]:
         """Force of each effect along the run, by effect name.
 
-        Of `Friction` the friction force [N], shape `[time]`, positive when it opposes positive slip; of
-        `AppliedForce` what its function returns, shape `[time, ...]`.
+        For `Friction` the friction force [N], shape `[time]`, positive when it opposes positive slip; for
+        `AppliedForce` the value of its function, shape `[time, ...]`.
         """
         self._one_run("forces")
         forces = _forces(self.scene, self.t, self._states(), self.modes)
@@ -198,17 +198,17 @@ class Trajectory(AbstractReadable):
 
     @property
     def reactions(self) -> dict[str, ConstraintReaction]:
-        """What each constraint does along the run, by its name: multipliers, generalised and Cartesian force."""
+        """Forces of each constraint along the run, by name: multipliers, generalised and Cartesian force."""
         self._one_run("reactions")
         reactions = _reactions(self.scene, self.t, self._states(), self.modes)
         return {name: reactions[name] for name in self.scene.constraint_names}
 
     @property
     def mode(self) -> dict[str, Array]:
-        """Mode of each friction element that runs by events, contact and switch, by name, shape `[time]`.
+        """Mode of each event-driven friction element, contact and switch, by name, shape `[time]`.
 
-        Of friction 0 in stick, else +-1, in the plane 1: slip is then in the direction of the force in `forces`. Of a
-        contact 0 while it is open, 1 while it is closed; of a switch the sign of its guard.
+        Friction: 0 in stick, else the sign of slip, 1 in the plane, where `forces` has the direction. Contacts: 0 open,
+        1 closed. Switches: the sign of the guard.
         """
         if self.modes is None:
             return {}
@@ -217,7 +217,7 @@ class Trajectory(AbstractReadable):
 
     @property
     def mode_labels(self) -> dict[str, dict[int, str]]:
-        """What the numbers of `mode` mean, by name, in the words of `ModeChange`."""
+        """Labels of the numbers of `mode`, by name, as in `ModeChange`."""
         scene = self.scene
         widths = dict(zip(scene.mode_names, scene.mode_widths(self.q.shape[-1]), strict=True))
         words = {name: _MODES if width == 1 else _PLANE_MODES for name, width in widths.items()}
@@ -225,7 +225,7 @@ class Trajectory(AbstractReadable):
 
     @property
     def events(self) -> Events:
-        """Mode changes along the run; where the run logged fewer, the first reading runs the scene once more."""
+        """Mode changes along the run; if the run did not log all of them, the first access repeats the run."""
         self._one_run("events")
         if self.modes is None:
             none = jnp.zeros(0, int)
@@ -239,10 +239,10 @@ class Trajectory(AbstractReadable):
 
     @property
     def event_forces(self) -> dict[str, Array]:
-        """Force of each effect just before and after each change of mode, by effect name; needs the run of `events`.
+        """Force of each effect just before and after each change of mode, by effect name; repeats the run as `events`.
 
         Shape `[instants, 2, ...]`, padded with NaN. At a break-away the force before is the limit in stick. Several
-        elements that change at one instant have one entry here.
+        elements that change at one instant have one entry.
         """
         self._one_run("event_forces")
         if self.modes is None:
@@ -250,7 +250,7 @@ class Trajectory(AbstractReadable):
         return self._once("event_forces", lambda: _event_forces(self.scene, self._log()))
 
     def event_sides(self, series: Series) -> Float[Array, "instants 2"]:
-        """A number just before and after each change of mode, zero in entries that were not needed."""
+        """A series just before and after each change of mode; zero in unused entries."""
         if self.modes is None:
             return jnp.zeros((0, 2), self.t.dtype)
         log, (kind, effect, index) = self._log(), series
@@ -269,22 +269,22 @@ class Trajectory(AbstractReadable):
 
     @property
     def ledger(self) -> EnergyLedger:
-        """Energies by their places, from the work integrals; the first reading runs the scene once more for these.
+        """Energies by place, and the work of each effect; the first access repeats the run with the work integrals.
 
-        What each effect brought in and lost; `jaxmodsim.energy_audit` adds them up.
+        `jaxmodsim.energy_audit` sums them.
         """
         self._one_run("ledger")
         return self._once("ledger", lambda: ledger(self.request, self.t, self._states(), self._audited()[0]))
 
     @property
     def event_losses(self) -> Float[Array, " time"]:
-        """Energy [J] lost since t0 at events; needs the run of `events`."""
+        """Energy [J] lost since t0 at events; repeats the run as `events`."""
         self._one_run("event_losses")
         return self._lost(None if self.modes is None else self._log())
 
     @property
     def energy(self) -> Energy:
-        """Energies and their balance along the run, as `ledger` has them; what is lost in impacts is dissipated."""
+        """Energies and their balance along the run, sums of `ledger`; losses of impacts count as dissipated."""
         self._one_run("energy")
         book, zero = self.ledger, jnp.zeros_like(self.t)
         stored, supplied, dissipated = (
@@ -295,7 +295,7 @@ class Trajectory(AbstractReadable):
 
     @property
     def columns(self) -> Columns:
-        """Coordinates, velocities, forces and modes at the times that were reached, by name, with their units."""
+        """Coordinates, velocities, forces and modes at the times that the run reached, by name, with units."""
         return columns(self.scene, self.t, self.q, self.qd, self.forces, self.mode)
 
     def to_dataframe(self) -> "pd.DataFrame":
@@ -308,17 +308,17 @@ class Trajectory(AbstractReadable):
 
     @property
     def log_size(self) -> int:
-        """Length of a log that holds all events: as many as needed, in powers of two; another one compiles anew."""
+        """Length of a log for all events, a power of two, as each length compiles a program."""
         count, size = self.stats.get("num_events", 0), self.request.choices.max_events
         return size if not is_known(count) else min(size, 1 << max(int(count), 8).bit_length())
 
     def _log(self) -> EventLog:
-        """The log of all events: that of the run, if it has room for them, or of another run."""
+        """The log of all events: that of the run, if it is long enough, or that of a repeat."""
         most, count = self.request.choices.max_events, self.stats["num_events"]
         needed = min(int(count), most) if is_known(count) else most
         if self.log is not None and self.log.t.shape[0] >= needed:
             return self.log
-        # Events do not depend on saved times, which are checked already where they are known.
+        # Events do not depend on saved times; known ones are already checked.
         ts = None if is_known(self.request.ts) else self.request.ts
         again = self.request._replace(ts=ts).choosing(log=self.log_size, audited=False)
         return self._once("log", lambda: solve(again).log)
@@ -334,14 +334,14 @@ class Trajectory(AbstractReadable):
         return Events(t, *modes, labels=labels)
 
     def _audited(self) -> tuple[Work, EventLog | None]:
-        """The work at the saved times, and with contacts the log of all events, from which their losses are read.
+        """The work at the saved times, and with contacts the log of all events, which has their losses.
 
-        Of this run where it recorded them, else of another one.
+        They come from this run if it recorded them, else from a repeat.
 
         **Raises:**
 
-        - `SimulationError` if this run reached t1 and that one does not, where rounding decides. Inside compiled code
-          the work is infinite from there on instead.
+        - `SimulationError` if this run reached t1 and the repeat does not, due to rounding. Inside compiled code the
+          work is infinite after the end of the repeat.
         """
         if self.work is not None:
             return self.work, self.log
@@ -359,10 +359,10 @@ class Trajectory(AbstractReadable):
         return event_losses(self.request, self.t, solve_start(self.request), log)
 
     def _once(self, name: str, make: Callable[[], _Value]) -> _Value:
-        """A value that takes a repeat of the run, made where it is not there yet."""
+        """A value from a repeat of the run, made once."""
         if name in self._repeats:
             return self._repeats[name]
-        # Of a run whose numbers are known so is the value, also where the caller is being traced.
+        # The value of a run with known numbers is known, also if the caller is being traced.
         known = is_known(*jtu.tree_leaves(self))
         with jax.core.eval_context() if known else nullcontext():
             value = make()
@@ -417,7 +417,7 @@ def _(energy: Energy) -> Table:
 
 
 def trajectory(request: RunRequest, solved: RunOutput) -> Trajectory:
-    """The run that was solved."""
+    """The trajectory of a solved run."""
     y, end = solved.y, None if solved.end is None else solved.end[0]
     motion = solved.t, y.q, y.qd, y.z, solved.mode
     return Trajectory(*motion, solved.stats, solved.code, end, request, solved.log, solved.work)
@@ -455,7 +455,7 @@ def _event_forces(scene: Scene, log: EventLog) -> dict[str, Array]:
 
 
 def _reached(t: Array, tree: PyTree) -> PyTree:
-    """Arrays along a run, infinite at the times that an early end left unreached."""
+    """Arrays along a run, infinite at times after an early end."""
     reached = jnp.isfinite(t)
     return jtu.tree_map(lambda x: jnp.where(jnp.expand_dims(reached, range(1, x.ndim)), x, jnp.inf), tree)
 
@@ -466,7 +466,7 @@ def _events(scene: Scene, log: EventLog) -> tuple[Array, Array, Array, Array]:
     widths = scene.mode_widths(log.before[0].q.shape[-1])
     before, after, fired = (mode_numbers(x, widths) for x in (log.before[1], log.after[1], log.fired))
     indices = jnp.asarray([scene.part_names.index(name) for name in scene.mode_names])
-    # What happens to contacts that fire is an event, be it an impact that leaves them open.
+    # Every firing of a contact is an event, also an impact that leaves it open.
     strikes = jnp.asarray([[name in scene.contacts for name in scene.mode_names]]) & (fired > 0.5)
     changed = jnp.ravel(((before != after) | strikes) & jnp.isfinite(log.t)[:, None])
     order = jnp.argsort(~changed, stable=True)

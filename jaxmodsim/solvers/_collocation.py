@@ -1,4 +1,4 @@
-"""One step of Gauss collocation, solved down to rounding, on pytree states."""
+"""One step of Gauss collocation, solved to rounding, on pytree states."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from .._core.lu import MAX_UNROLLED_LU, factor_lu, invert
 from ._state_layout import Layout, Parts, State
 
 MAX_ITERATIONS = 50
-# The last changes of a solved step are rounding: below this power of the unit of rounding, relative to the unknown
-# itself, or below this number of units of the largest unknown, as where forces cancel.
+# The last changes of a solved step are rounding: below this power of the rounding unit relative to the unknown, or
+# below this number of rounding units of the largest unknown, if forces cancel.
 _POWER = 0.5
 _UNITS = 256.0
 
@@ -40,8 +40,8 @@ class GaussCollocation:
     r"""Coefficients of the Gauss method with `s` stages, an implicit Runge-Kutta method of order `2 s`.
 
     With increments `l_j = dt b_j f(t + c_j dt, y_j)` its stages are `y_i = y + sum_j m_ij l_j`, `m_ij = a_ij/b_j`, and
-    `y1 = y + sum_j l_j`. In this form the method is symplectic if `m_ij + m_ji = 1`, whatever rounding did to `b`.
-    `coupling` meets that exactly, so that the rounding of coefficients makes no drift.
+    `y1 = y + sum_j l_j`. In this form the method is symplectic if `m_ij + m_ji = 1`, for any rounding of `b`.
+    `coupling` satisfies that exactly, so that the rounding of coefficients causes no drift.
 
     **Arguments:**
 
@@ -65,21 +65,21 @@ class GaussCollocation:
     lower: np.ndarray
 
     def coupling(self, dtype: Any) -> np.ndarray:
-        """`m` in the numbers of `dtype`, with `m_ij + m_ji = 1` without rounding."""
+        """`m` in numbers of `dtype`, with `m_ij + m_ji = 1` without rounding."""
         lower = np.tril(self.lower, -1).astype(dtype)
         upper = np.triu((1.0 - lower.T).astype(dtype), 1)
         return lower + upper + 0.5 * np.eye(self.nodes.size, dtype=dtype)
 
     def guess(self) -> np.ndarray:
-        """Weights that carry the slopes of a step on to the next one of the same length, shape `[stages, stages]`."""
+        """Weights that extrapolate slopes to the next step of the same length, shape `[stages, stages]`."""
         return _lagrange(self.nodes - 1.0, self.nodes)
 
     def inner(self) -> np.ndarray:
-        """Nodes whose slopes the dense output takes in besides those of both ends."""
+        """Nodes whose slopes the dense output uses besides those of both ends."""
         return self.nodes[[0, -1]] if self.nodes.size > 2 else np.zeros(0)
 
     def dense(self) -> np.ndarray:
-        """Weights from slopes less the mean slope, at 0, `inner` and 1, to the `K` of `CollocationStep`."""
+        """Weights that map slopes, less the mean slope, at 0, `inner` and 1 to the `K` of `CollocationStep`."""
         points = np.concatenate([[0.0], self.inner(), [1.0]])
         return np.linalg.inv(_bend(points, points.size))
 
@@ -103,7 +103,7 @@ GAUSS = {
 
 
 class CollocationMemory(NamedTuple):
-    """What a step leaves to the next: the slopes of its stages, and what rounding took from its end."""
+    """Memory from a step to the next: the slopes of its stages, and the rounding error of its end."""
 
     slopes: list[Parts]
     rest: Parts
@@ -111,13 +111,13 @@ class CollocationMemory(NamedTuple):
 
 @dataclass(frozen=True)
 class CollocationStep:
-    """What one step gives.
+    """Result of one step.
 
-    - `y1`: the state at its end; NaN where the stages were not found.
+    - `y1`: the state at its end; NaN if the iteration did not converge.
     - `dense`: vectors `K` of `y(t + s dt) = (1-s) y0 + s (y1 + (1-s) (K_1 + s (K_2 + ...)))`.
     - `memory`: for the next step.
-    - `solved`: whether the stages were found.
-    - `iterations`: how often the stages were computed.
+    - `solved`: whether the iteration converged.
+    - `iterations`: number of evaluations of the stages.
     """
 
     y1: State
@@ -133,13 +133,13 @@ class _SolvedStages(NamedTuple):
     iterations: Array
 
 
-# Of `solved` and `iterations`.
+# Tangents of `solved` and `iterations`.
 _NO_TANGENTS: Any = (None, None)
 
 
 class _StageIteration(NamedTuple):
     slopes: list[Parts]
-    # The largest change of any stage's slope by the last iteration, and the smallest such change so far but zero.
+    # The largest change of any stage's slope in the last iteration, and the smallest such change above zero so far.
     change: Parts
     least: Parts
     settled: Array
@@ -184,13 +184,13 @@ def _points(method: GaussCollocation, dt: Array, y: Parts, rest: Parts, slopes: 
 def _slopes(
     method: GaussCollocation, rates: Rates, t0: Array, dt: Array, y: Parts, rest: Parts, slopes: list[Parts]
 ) -> list[Parts]:
-    """The map whose fixed point are the slopes of the stages."""
+    """The map whose fixed point is the slopes of the stages."""
     points = _points(method, dt, y, rest, slopes)
     return [rates(t0 + float(c) * dt, point) for c, point in zip(method.nodes, points, strict=True)]
 
 
 def _small(method: GaussCollocation, dt: Array, y: Parts, search: _StageIteration) -> Array:
-    """Whether the last change of every unknown is rounding, as it is not where the iteration diverges."""
+    """Whether the last change of every unknown is rounding, which is not so if the iteration diverges."""
     steps = _increments(method, dt, search.slopes)
     scales = [jnp.abs(x) + _sum([jnp.abs(step[m]) for step in steps]) for m, x in enumerate(y)]
     overall = reduce(jnp.maximum, [jnp.max(scale) for scale in scales])
@@ -204,11 +204,11 @@ def _small(method: GaussCollocation, dt: Array, y: Parts, search: _StageIteratio
 
 @eqx.filter_custom_jvp
 def _solve(stages: int, rates: Rates, t0: Array, dt: Array, y: Parts, rest: Parts, guess: list[Parts]) -> _SolvedStages:
-    """Slopes of the stages by fixed-point iteration; zeros where it does not converge.
+    """Slopes of the stages by fixed-point iteration; zeros if it does not converge.
 
-    The iteration goes on until no unknown changes less than it did before: a tolerance, however small, would leave an
-    error of one sign, and energy would drift. To look only after every second iteration is faster, and is not misled
-    where changes of positions and of momenta alternate.
+    The iteration continues until no unknown changes less than before: any tolerance would leave an error of one sign,
+    and energy would drift. A check after every second iteration is faster, and robust if changes of positions and of
+    momenta alternate.
     """
     method, unit = GAUSS[stages], opaque_one(t0)
 
@@ -266,9 +266,9 @@ def _solve_linear(
             for i in range(s)
             for p in range(n)
         ]
-        # Where the fixed-point iteration converged, the spectral radius of what is taken from the unit matrix is well
-        # below one, so that pivots are near one unless the field shears strongly. Swaps would cost a factor of three,
-        # and a minute of compile time at twelve unknowns.
+        # If the fixed-point iteration converged, the unit matrix less this one has a spectral radius well below one, so
+        # that pivots are near one unless the field shears strongly. Swaps would cost a factor of three, and a minute of
+        # compile time at twelve unknowns.
         x = factor_lu(rows, pivot=False)([b for slope in rhs for b in slope])
         return [[x[i * n + p].astype(b.dtype) for p, b in enumerate(slope)] for i, slope in enumerate(rhs)]
     matrix = jnp.eye(s * n, dtype=dtype) - jnp.concatenate([jnp.kron(a[i : i + 1], jacobians[i]) for i in range(s)])
@@ -281,7 +281,7 @@ def _solve_linear(
 
 @_solve.def_jvp
 def _solve_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_SolvedStages, Any]:
-    """Implicit function theorem at the solution; the guess and what rounding left have no derivative."""
+    """Implicit function theorem at the solution; guess and rounding errors have no derivative."""
     stages, rates, t0, dt, y, rest, guess = primals
     method = GAUSS[stages]
     solution = _solve(stages, rates, t0, dt, y, rest, guess)
@@ -322,8 +322,8 @@ def collocation_step(
     - `field`: `(t, y) -> dy/dt`, differentiable by JAX.
     - `t0`, `dt`: start and length of the step, scalars.
     - `y0`: state at `t0`, any pytree of real floating arrays.
-    - `memory`: what the step before left, or `collocation_start`. Its slopes only start the iteration; its `rest`,
-      below one unit of rounding, is added to `y0`.
+    - `memory`: that of the step before, or `collocation_start`. Its slopes only start the iteration; its `rest`,
+      below one rounding unit, is added to `y0`.
 
     **Returns:**
 
@@ -339,7 +339,7 @@ def collocation_step(
     rates = eqx.filter_closure_convert(flow, t0, y)
     slopes, solved, iterations = _solve(stages, rates, t0, dt, y, memory.rest, jax.lax.stop_gradient(guess))
 
-    # Compensated summation: what rounding takes from y1 goes to the next step.
+    # Compensated summation: the rounding error of y1 is added in the next step.
     moves = [_sum([r, *column]) for r, *column in zip(memory.rest, *_increments(method, dt, slopes), strict=True)]
     y1 = [x + move for x, move in zip(y, moves, strict=True)]
     rest = [move - (end - x) for x, end, move in zip(y, y1, moves, strict=True)]

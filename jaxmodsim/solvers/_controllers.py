@@ -1,4 +1,4 @@
-"""Step size control: that stops at the first value that is not finite, and that ends steps at given times."""
+"""Step size controllers: one that stops at the first value that is not finite, one that ends steps at given times."""
 
 from typing import Any, cast
 
@@ -11,20 +11,20 @@ from jaxtyping import Array, Float, PyTree
 from .._core.arrays import after, is_one_of
 from ._wrapper import AbstractControllerWrapper
 
-# Part of a step by which it may end before or behind the time that is meant.
+# Part of a step by which it may end before or after the required time.
 _STRETCH = 1e-6
 
 
 class FiniteSteps(dfx.AbstractStepSizeController):
-    """Constant steps that end the run, at its last finite state, instead of carrying NaN to the end.
+    """Constant steps that end the run at its last finite state, instead of NaN to the end.
 
-    A step that something else makes shorter (an event, a sample) is followed by one over the rest of it.
+    After a step that an event or a sample has shortened, the next step covers the rest of it.
     """
 
     inner: dfx.ConstantStepSize = dfx.ConstantStepSize()
 
     def wrap(self, direction: Any) -> "FiniteSteps":
-        """Constant steps know no direction."""
+        """Constant steps have no direction."""
         del direction
         return self
 
@@ -55,16 +55,16 @@ class FiniteSteps(dfx.AbstractStepSizeController):
         next_t1 = jnp.where(shorter, target, next_t1)
         state = jtu.tree_map(lambda a, b: jnp.where(shorter, a, b), old, new), next_t1
         finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y1_candidate)]).all()
-        # diffrax has no code for a value that is not finite; this is the nearest that step control does not use.
+        # diffrax has no code for a value that is not finite; this is the nearest code that step control does not use.
         failure = cast(dfx.RESULTS, dfx.RESULTS.nonlinear_divergence)
         result = dfx.RESULTS.where(finite, dfx.RESULTS.successful, failure)
         return finite, jnp.where(finite, next_t0, t0), next_t1, jump, state, result
 
 
 def end_at(times: Float[Array, " n"], t0: Any, t1: Any, stretch: Any = True) -> Any:
-    """End of a step from `t0` that is to end at `t1`, with the next one of `times` in the place of what lies behind it.
+    """End of a step from `t0` to `t1`, or the next one of `times` if that is earlier.
 
-    With `stretch` also in the place of what lies just before it, so that no step over a tiny rest is left.
+    With `stretch` also if that is just after `t1`, so that no tiny step remains.
     """
     last = times.shape[0] - 1
     i = after(times, t0)
@@ -74,12 +74,12 @@ def end_at(times: Float[Array, " n"], t0: Any, t1: Any, stretch: Any = True) -> 
 
 
 class StepsTo(AbstractControllerWrapper):
-    """Wrap a step size controller so that steps end on given times, and a new start is made there.
+    """Wrap a step size controller so that steps end on given times, where the method starts anew.
 
-    For runs with events `EventController` does the same, so that one place decides where a step ends. Unlike
-    `diffrax.ClipStepSizeController(jump_ts=...)` it takes constant steps, too, and steps end on the times themselves
-    and not one rounding unit before them. With adaptive steps the two make about as many: 52 and 52 where nothing is
-    stiff, 463 and 458 with LuGre friction under a signal of 11 samples.
+    `EventController` does the same in runs with events. Unlike `diffrax.ClipStepSizeController(jump_ts=...)` this
+    controller takes constant steps, too, and steps end on the times themselves, not one rounding unit before them. The
+    numbers of adaptive steps are about equal: 52 and 52 without stiffness, 463 and 458 with LuGre friction under a
+    signal of 11 samples.
 
     **Arguments:**
 

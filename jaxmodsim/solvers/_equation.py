@@ -1,4 +1,4 @@
-"""The equation in the terms that diffrax hands to a solver, in its own time."""
+"""The equation in the terms that diffrax passes to a solver, in its own time."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,7 +10,7 @@ from jaxtyping import Array, PyTree
 
 
 def check_ode(terms: PyTree, *, method: str) -> None:
-    """Refuse terms of anything but an ordinary differential equation.
+    """Refuse all terms other than those of an ordinary differential equation.
 
     **Raises:**
 
@@ -47,8 +47,8 @@ def in_own_time(
 ) -> tuple[Callable[[Array, PyTree], PyTree], Array, Array]:
     """Vector field, start and length of a step in the time of the equation, which may run backward.
 
-    diffrax always steps forward: where t1 < t0, through negative times, with a field that is not negated. The
-    direction is in the control of its terms.
+    diffrax always steps forward: if t1 < t0, through negative times, with a field that is not negated. The control of
+    its terms has the direction.
     """
     t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
     direction = jnp.asarray(terms.contr(jnp.zeros_like(t0), jnp.ones_like(t0)), t0.dtype)

@@ -19,20 +19,19 @@ def first_step(
     tolerances: tuple[Float[Array, ""], Float[Array, ""]],
     shortest: Float[Array, ""],
 ) -> Float[Array, ""]:
-    r"""Guess at the first step [s], from the field at two points.
+    r"""Guess of the first step [s], from the field at two points.
 
-    That of the literature below, which diffrax takes, too, with two changes. It is not longer than the time in which
-    the field changes by itself: a stiff method may step over the transient of a bristle and be right at the end of
-    the step, but not at times saved inside it. And it is a number where a state of zero without an absolute tolerance
-    has no scale.
+    This is the guess of the reference, as in diffrax, with two changes. It is not longer than the time in which the
+    field changes by its own magnitude: a stiff method may step over the transient of a bristle and be accurate at the
+    end of the step, but not at times saved inside it. And it is finite for a state of zero with `atol = 0`.
 
     **Arguments:**
 
     - `y0`: the start.
-    - `slopes`: the rates of y there, and at the end of an Euler step of length `trial_step`.
+    - `slopes`: the rates of y at the start, and at the end of an Euler step of length `trial_step`.
     - `order`: of the error estimate.
     - `tolerances`: relative and absolute.
-    - `shortest`: the shortest step that there is [s].
+    - `shortest`: the shortest admissible step [s].
 
     ??? cite "Reference"
 
@@ -67,7 +66,7 @@ def _size(tree: PyTree, y0: PyTree, tolerances: tuple[Array, Array]) -> Array:
 
 
 def _try_out(y0: PyTree, slope: PyTree, tolerances: tuple[Array, Array]) -> tuple[Array, Array, Array]:
-    """Size of the rate, whether it and the state have one, and a step to try out."""
+    """Size of the rate, whether rate and state have a scale, and a trial step."""
     d0, d1 = _size(y0, y0, tolerances), _size(slope, y0, tolerances)
     known = (d0 >= 1e-5) & (d1 >= 1e-5)
     return d1, known, jnp.where(known, 0.01 * d0 / jnp.where(known, d1, 1.0), 1e-6)

@@ -13,24 +13,24 @@ from ._state_layout import PolynomialInterpolation
 
 
 class Gauss(dfx.AbstractSolver):
-    """Gauss-Legendre collocation with fixed steps, for long runs that shall keep the structure of mechanics.
+    """Gauss-Legendre collocation with fixed steps, for long runs that preserve the structure of mechanics.
 
     An implicit Runge-Kutta method of order `2 stages` (one stage: the implicit midpoint rule). It is symplectic and
     symmetric: on canonical equations in (q, p) energy does not drift but stays within the method's error, and
-    quadratic invariants (angular momentum, the energy of linear systems) are kept to rounding. On other
+    quadratic invariants (angular momentum, the energy of linear systems) hold to rounding. On other
     equations it is an accurate method without damping.
 
-    Usable wherever diffrax takes a solver of an `ODETerm` with constant steps, forward and backward in time, on any
-    pytree of real floating arrays, in float32 and float64. Adaptive steps would cost the structure: there is no error
-    estimate, and diffrax's adaptive controllers refuse the method. Dense output has the order of the method.
+    It works in `diffrax.diffeqsolve` with an `ODETerm` and constant steps, forward and backward in time, on any
+    pytree of real floating arrays, in float32 and float64. Adaptive steps would destroy the structure: there is no
+    error estimate, and diffrax's adaptive controllers refuse the method. Dense output has the order of the method.
 
-    The stages are found by fixed-point iteration down to rounding, about 12 to 18 evaluations of each stage at 20 steps
-    per period. Its limit is stiffness: `dt` times the fastest rate must stay below about 1, 1.5, 2 for 1, 2, 3 stages.
+    Fixed-point iteration solves the stages to rounding, with about 12 to 18 evaluations of each stage at 20 steps per
+    period. Its limit is stiffness: `dt` times the fastest rate must stay below about 1, 1.5, 2 for 1, 2, 3 stages.
     A step whose iteration does not converge within 50 evaluations ends the run with
     `diffrax.RESULTS.nonlinear_divergence` and NaN.
 
-    Derivatives, forward and reverse, are those of the exact stages by the implicit function theorem. Rounding in the
-    sum of steps is carried along in the solver's state (compensated summation), where derivatives do not see it.
+    Derivatives, forward and reverse, are those of the exact stages by the implicit function theorem. The solver's state
+    carries the rounding of the sum of steps (compensated summation), which has no derivative.
 
     **Arguments:**
 
@@ -70,7 +70,7 @@ class Gauss(dfx.AbstractSolver):
         return 2 * self.stages
 
     def init(self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> CollocationMemory:
-        """What the first step starts from; terms and states of a wrong type are refused here."""
+        """Memory for the first step; refuses terms and states of a wrong type."""
         check_ode(terms, method="Gauss")
         check_floating(y0, method="Gauss")
         field, start, _ = in_own_time(terms, t0, t1, args)

@@ -1,4 +1,4 @@
-"""ImplicitFriction: fixed steps that hold however stiff friction is, as a diffrax solver."""
+"""ImplicitFriction: fixed steps that are stable for friction of any stiffness, as a diffrax solver."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar, cast
@@ -8,24 +8,24 @@ from jaxtyping import PyTree
 
 
 class ImplicitFriction(dfx.AbstractSolver):
-    """Fixed steps that are implicit in friction alone, and hold at any stiffness of it.
+    """Fixed steps that are implicit in friction alone, and stable for friction of any stiffness.
 
-    For steps that are given, by a control loop or by the sampling of a record:
-    `simulate(..., dt=1e-3, solver=ImplicitFriction())`. A step from t to t + h takes masses, directions, loads and all
-    other forces as they are at t, and friction as it is at t + h: the state of the law moves by its own solution at
-    constant slip velocity, and the slip velocities solve `v = v_free - h D M^-1 D^T F(v)`, by a search in a bracket
-    that always ends. Coordinates follow with the new velocities (semi-implicit Euler). So a bristle's deflection stays
-    within its limit, and in stick velocities go to zero, whatever the step and the stiffness, in float32 as in float64.
-    Bristles that a step does not resolve cost no accuracy: their damping acts by its impulse over the step.
+    Use it for steps that a control loop or the sampling of a record prescribes:
+    `simulate(..., dt=1e-3, solver=ImplicitFriction())`. A step from t to t + h evaluates masses, directions, loads and
+    all other forces at t, and friction at t + h. The state of the law moves by its own solution at constant slip
+    velocity. The slip velocities solve `v = v_free - h D M^-1 D^T F(v)`, by a bracketing search that always ends.
+    Coordinates follow with the new velocities (semi-implicit Euler). A bristle's deflection stays within its limit, and
+    velocities in stick go to zero, for any step and stiffness, in float32 and float64. Bristles that a step does not
+    resolve cost no accuracy: their damping acts by its impulse over the step.
 
-    Order 1; there is no error estimate. What the mechanism has of fast motion by itself must be resolved: springs of
-    angular frequency w need `h w < 2`. Friction may be any law with a state of its own or function of slip velocity
-    (`Viscous`, `Regularized` of any width, a function of yours), along displacements or in the plane, within
-    constraints; not a set-valued law, and not under the reaction of a constraint. Where a step is so long that stick
-    and slip are both solutions, as with the Stribeck effect, it takes the one near the motion before.
+    The order is 1, without an error estimate. Steps must resolve the fast motion of the mechanism itself: springs of
+    angular frequency w need `h w < 2`. Friction may be any law with a state of its own, or a function of slip velocity
+    (`Viscous`, `Regularized` of any width, your own function), along displacements or in the plane, within
+    constraints. Set-valued laws, and loads that are reactions of constraints, are not supported. If a step is so long
+    that stick and slip are both solutions, as with the Stribeck effect, it takes the one near the motion before.
 
-    Several elements, or slip in the plane, are found by Newton steps with a search along each. Equations that these do
-    not solve (rare: in float32, coupled planar contacts whose deflection a step passes 10^7 times) end the run with
+    Newton steps with a line search solve for several elements, or for slip in the plane. Equations that they do not
+    solve (rare: in float32, coupled planar contacts whose deflection a step passes 10^7 times) end the run with
     `diffrax.RESULTS.nonlinear_divergence`.
 
     `run.forces` gives the law's force at the saved state; between steps states are interpolated linearly. Derivatives,
@@ -33,7 +33,7 @@ class ImplicitFriction(dfx.AbstractSolver):
 
     **Arguments:**
 
-    - `advance`: `advance(t0, t1, y, args)` -> `(y1, solved)`, the step itself; `jaxmodsim.simulate` puts it there.
+    - `advance`: `advance(t0, t1, y, args)` -> `(y1, solved)`, the step itself, which `jaxmodsim.simulate` sets.
 
     ??? cite "Reference"
 

@@ -1,4 +1,4 @@
-"""The derivative of a run from the steps that were made, in either mode."""
+"""The derivative of a run from its accepted steps, in both modes."""
 
 from collections.abc import Callable
 from functools import partial
@@ -16,23 +16,23 @@ from .._core.compat import eqxi, lax_loop
 
 
 class StepPlan(NamedTuple):
-    """What is known of a run while compiling."""
+    """Properties of a run that are known while compiling."""
 
     interpolation_cls: Callable[..., dfx.AbstractPath]
     # Of each `SubSaveAt`: t0, t1 and steps.
     subs: list[tuple[bool, bool, int]]
-    # Whether the solver is told of jumps.
+    # Whether the solver receives a flag for jumps.
     jumps: bool
-    # Whether the steps are constant: their times move with the ends of the run.
+    # Whether the steps are constant, so that their times move with the ends of the run.
     even: bool
     every: int
 
 
 class StepInputs(NamedTuple):
-    """What a run is differentiated by."""
+    """Inputs of a run that have derivatives."""
 
     step: Callable[..., PyTree]
-    # Of each `SubSaveAt`, its function and its times.
+    # For each `SubSaveAt` its function and its times.
     fns: list[Callable[[Array, PyTree], PyTree]]
     times: list[PyTree]
     t0: Array
@@ -42,17 +42,17 @@ class StepInputs(NamedTuple):
 
 
 class StepRecord(NamedTuple):
-    """What accepted steps began with, one or an array of them."""
+    """Start of an accepted step, or of an array of them."""
 
     t0: Array
     t1: Array
     made_jump: PyTree
-    # Of the steps whose state is kept: y and the solver's state.
+    # y and the solver's state, for the steps whose state is stored.
     began: tuple[PyTree, PyTree]
 
 
 class RecordedRun(NamedTuple):
-    """A run that was made, and what its derivative is taken of."""
+    """A finished run."""
 
     inputs: StepInputs
     final: PyTree
@@ -61,42 +61,42 @@ class RecordedRun(NamedTuple):
 
 
 class RunTangents(NamedTuple):
-    """Of what a run gives: derivatives, or cotangents. None is zero."""
+    """Derivatives or cotangents of the outputs of a run. None is zero."""
 
     y: PyTree
     solver_state: PyTree
-    # Of each `SubSaveAt`: values and times.
+    # For each `SubSaveAt` values and times.
     saved: list[tuple[PyTree, PyTree]]
     dense_infos: PyTree
-    # Of the steps, where these are differentiated, too.
+    # Those of the steps, if these have derivatives, too.
     steps: StepRecord | None
 
 
 class AbstractOverSteps:
-    """What both modes share: the parts of a run as functions of what they are differentiated by."""
+    """The part that both modes share: parts of a run as functions of the differentiated numbers."""
 
     def __init__(self, by: StepInputs, run: RecordedRun):
         self.inputs, self.final, self.steps, self.how = run
         program = run.inputs[:2]
-        # The differentiated numbers of the step and of what is saved, None elsewhere, and the rest.
+        # The differentiated numbers of the step and of the functions of `SaveAt`, None elsewhere, and the rest.
         self.numbers = jtu.tree_map(lambda d, x: None if d is None else x, by[:2], program, is_leaf=is_none)
         self.constants = jtu.tree_map(lambda d, x: x if d is None else None, by[:2], program, is_leaf=is_none)
         self.count = jnp.asarray(run.final.num_accepted_steps)
         self.saves = [x for x in jtu.tree_leaves(run.final.save_state, is_leaf=is_save_state) if is_save_state(x)]
 
     def times(self, k: Array) -> tuple[tuple[Array, Array], bool | Array]:
-        """Ends of a step, and whether a jump was made before it."""
+        """Ends of a step, and whether there was a jump before it."""
         t0, t1, jump = jtu.tree_map(lambda x: x[k], self.steps[:3])
         return (t0, t1), jump if self.how.jumps else False
 
     def stored(self, k: Array) -> tuple[PyTree, PyTree]:
-        """The state that is kept of this step, or of the one before it that is kept."""
+        """The stored state of this step, or of the last stored step before it."""
         return jtu.tree_map(lambda x: x[k // self.how.every], self.steps.began)
 
     def ends_by_run(self, k: Array, ends: tuple[Array, Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        """Derivatives of the ends of a step, of each by t0 and by t1 of the run."""
+        """Derivatives of each end of a step with respect to t0 and t1 of the run."""
         t0, t1 = self.inputs.t0, self.inputs.t1
-        if self.how.even:  # the first step has the length that was given, the others divide the run evenly
+        if self.how.even:  # the first step has the length dt0, the others divide the run evenly
             part = lambda j, t: (t - t0) / (t1 - t0) * ((j != 1) | (t == t1))  # noqa: E731
             start, end = part(k, ends[0]), part(k + 1, ends[1])
             return (1.0 - start, start), (1.0 - end, end)
@@ -106,7 +106,7 @@ class AbstractOverSteps:
     def advance(
         self, rest: PyTree, jump: bool | Array, began: PyTree, ends: tuple[Array, Array], numbers: PyTree
     ) -> PyTree:
-        """One step: numbers of state, solver's state and dense output, and the rest of these."""
+        """One step: floating arrays of state, solver's state and dense output, and the rest of these."""
         step, (y, state) = eqx.combine(numbers[0], self.constants[0]), eqx.combine(began, rest)
         y, _, dense, state, _ = step(*ends, y, state, jump)
         return eqx.partition((y, state, dense), eqx.is_inexact_array)
@@ -118,21 +118,21 @@ class AbstractOverSteps:
         return y, state
 
     def value(self, i: int, t: Array, y: PyTree, rest: PyTree, numbers: PyTree) -> PyTree:
-        """What the i-th `SubSaveAt` keeps of a state."""
+        """The value that the i-th `SubSaveAt` saves of a state."""
         fn = eqx.combine(numbers[1][i], self.constants[1][i])
         return _numbers(fn(t, eqx.combine(y, rest)))
 
     def at_time(
         self, i: int, rest: PyTree, t: Array, dense: PyTree, ends: tuple[Array, Array], numbers: PyTree
     ) -> PyTree:
-        """What it keeps at a time within a step."""
+        """The value that it saves at a time within a step."""
         y = self.how.interpolation_cls(t0=ends[0], t1=ends[1], **eqx.combine(dense, rest)).evaluate(t)
         return self.value(i, t, *eqx.partition(y, eqx.is_inexact_array), numbers)
 
     def at_the_end(self, i: int) -> tuple[Array, Array]:
-        """Whether the i-th `SubSaveAt` keeps the last state beside others, and whether it has all of its times there.
+        """Whether the i-th `SubSaveAt` saves the last state at t1, and whether the run has no length.
 
-        That is so in a run of no length, which makes no step.
+        A run of no length makes no step, and saves all times of `ts` at its end.
         """
         (_, t1, steps), times = self.how.subs[i], self.inputs.times[i]
         last = jnp.asarray(t1 and steps != 1)
@@ -141,20 +141,20 @@ class AbstractOverSteps:
         return last, (self.inputs.t0 == self.inputs.t1) & (times is not None)
 
     def rows_at_once(self, i: int, empty: Array) -> Array:
-        """Which entries are those of a run of no length."""
+        """Which entries are the times of `ts` in a run of no length."""
         size, t0, times = self.saves[i].ts.shape[0], self.how.subs[i][0], self.inputs.times[i]
         at = jnp.arange(size) - t0
         return empty & (at >= 0) & (at < (0 if times is None else times.shape[0]))
 
 
 class _Ahead(NamedTuple):
-    """Derivatives on the way forward, of the state before the step `k` and of what was kept so far."""
+    """State of forward mode: derivatives of the state before the step `k`, and of the rows saved so far."""
 
     k: Int[Array, ""]
     began: tuple[PyTree, PyTree]
-    # The state itself where not every one is stored.
+    # The state itself, unless every state is stored.
     state: PyTree
-    # Of each `SubSaveAt`: how many entries it has kept, how many of its own times, and their derivatives.
+    # For each `SubSaveAt` the number of saved rows, the number of times of `ts` among them, and their derivatives.
     saved: list[Int[Array, ""]]
     timed: list[Int[Array, ""]]
     rows: list[tuple[PyTree, Array]]
@@ -172,7 +172,7 @@ class ForwardOverSteps(AbstractOverSteps):
         self.d_times = [_filled(d, t) for d, t in zip(by.times, run.inputs.times, strict=True)]
 
     def result(self) -> RunTangents:
-        """Derivatives of what the run gave."""
+        """Derivatives of the outputs of the run."""
         ahead = lax_loop(
             lambda ahead: ahead.k < self.count,
             self.over_step,
@@ -184,14 +184,14 @@ class ForwardOverSteps(AbstractOverSteps):
         return RunTangents(y, solver_state, self.after_the_run(ahead), ahead.dense, ahead.steps)
 
     def write(self, rows: PyTree, i: int, at: Array, pred: PyTree, of: PyTree, change: PyTree) -> PyTree:
-        """With the derivative of what the i-th `SubSaveAt` keeps of time and state, if `pred`."""
+        """`rows` with the derivative of the value that the i-th `SubSaveAt` saves of time and state, if `pred`."""
         y, rest = eqx.partition(of[1], eqx.is_inexact_array)
         value = lambda t, y, n: self.value(i, t, y, rest, n)  # noqa: E731
         _, row = jax.jvp(value, (of[0], y, self.numbers), (*change, self.by[:2]))
         return _set(rows, at, (row, change[0]), pred)
 
     def before_the_run(self) -> _Ahead:
-        """Of the first state, and of what is kept of it."""
+        """Derivatives of the first state, and of the rows saved at t0."""
         inputs, began = self.inputs, (self.inputs.y0, self.inputs.solver_state)
         d_began = _filled((self.by.y0, self.by.solver_state), began)
         rows = [jtu.tree_map(jnp.zeros_like, (_numbers(save.ys), save.ts)) for save in self.saves]
@@ -210,7 +210,7 @@ class ForwardOverSteps(AbstractOverSteps):
         )
 
     def over_step(self, ahead: _Ahead) -> _Ahead:
-        """From the start of a step to its end."""
+        """Derivatives from the start of a step to its end."""
         k, every = ahead.k, self.how.every
         ends, jump = self.times(k)
         state = self.stored(k)
@@ -264,7 +264,7 @@ class ForwardOverSteps(AbstractOverSteps):
         return saved + 1, timed + 1, _set(rows, saved, (row, d_t), True)
 
     def after_the_run(self, ahead: _Ahead) -> list[tuple[PyTree, Array]]:
-        """Of everything that is kept."""
+        """Derivatives of all saved rows."""
         final, (d_y, _), rows = self.final, ahead.began, ahead.rows
         d_t = jnp.where(final.tprev == self.inputs.t1, self.d_t1, 0.0)
         for i, (_, t1, every_row) in enumerate(self.how.subs):
@@ -281,24 +281,24 @@ class ForwardOverSteps(AbstractOverSteps):
 
 
 class _Back(NamedTuple):
-    """Cotangents on the way back, of the state after the step `k` and of what does not change, and what is left."""
+    """State of reverse mode: cotangents of the state after the step `k` and of constants, and the rows that remain."""
 
     k: Int[Array, ""]
     began: tuple[PyTree, PyTree]
-    # The states of the last steps made again, where not every one is stored.
+    # The repeated states of the last block of steps, unless every state is stored.
     states: PyTree
     numbers: PyTree
     t0: Array
     t1: Array
-    # By the times of each `SubSaveAt`; None where it has none.
+    # For the times of each `SubSaveAt`; None without.
     times: list[PyTree]
-    # Of each `SubSaveAt`: entries, and its own times among them, that are not treated yet.
+    # For each `SubSaveAt` the number of rows that remain, and of times of `ts` among them.
     saved: list[Int[Array, ""]]
     timed: list[Int[Array, ""]]
 
 
 class _Pulled(NamedTuple):
-    """Cotangents that one saved time adds: of the dense output of its step, the ends of that, and the numbers."""
+    """Cotangents to which saved times add: of the dense output of a step, of its ends, and of the numbers."""
 
     saved: Int[Array, ""]
     timed: Int[Array, ""]
@@ -314,7 +314,7 @@ class ReverseOverSteps(AbstractOverSteps):
     def __init__(self, by: StepInputs, run: RecordedRun, cts: RunTangents):
         super().__init__(by, run)
         self.by, self.cts = by, cts
-        # Cotangents of values and times that each `SubSaveAt` kept; None where nothing of it is differentiated.
+        # Cotangents of the values and times of each `SubSaveAt`; None if nothing depends on them.
         self.rows = [
             _filled(ct, (kept.ys, kept.ts)) if jtu.tree_leaves(ct) else None
             for ct, kept in zip(cts.saved, self.saves, strict=True)
@@ -330,11 +330,11 @@ class ReverseOverSteps(AbstractOverSteps):
         return jtu.tree_map(lambda asked, ct: None if asked is None else ct, self.by, cts, is_leaf=is_none)
 
     def row(self, i: int, index: Array, where: bool | Array = True) -> PyTree:
-        """Cotangents of one entry, of values and time; zero unless `where`."""
+        """Cotangents of the values and the time of one row; zero unless `where`."""
         return jtu.tree_map(lambda c: jnp.where(where, c[index], 0.0), self.rows[i])
 
     def pull_value(self, i: int, t: Array, y: PyTree, ct: tuple[PyTree, Array], back: _Back) -> tuple[Array, _Back]:
-        """The cotangent of the time of an entry; those of state and numbers are added."""
+        """Cotangent of the time of a row; those of state and numbers are added to `back`."""
         y, rest = eqx.partition(y, eqx.is_inexact_array)
         _, pull = jax.vjp(lambda t, y, n: self.value(i, t, y, rest, n), t, y, self.numbers)
         ct_t, ct_y, more = pull(ct[0])
@@ -342,7 +342,7 @@ class ReverseOverSteps(AbstractOverSteps):
         return ct_t + ct[1], back._replace(began=began, numbers=_add(back.numbers, more))
 
     def after_the_run(self) -> _Back:
-        """Cotangents of the last state, from that and from what was kept at the end."""
+        """Cotangents of the last state, from its own and from the rows saved at the end."""
         final, (t0, t1), cts = self.final, (self.inputs.t0, self.inputs.t1), self.cts
         first, every = (self.inputs.y0, self.inputs.solver_state), self.how.every
         back = _Back(
@@ -372,7 +372,7 @@ class ReverseOverSteps(AbstractOverSteps):
         return back
 
     def before_the_run(self, back: _Back) -> _Back:
-        """With the cotangents of what was kept at t0."""
+        """Cotangents of the first state, with those of the rows saved at t0."""
         for i, (t0, _, _) in enumerate(self.how.subs):
             if t0 and self.rows[i] is not None:
                 ct = self.row(i, jnp.asarray(0))
@@ -381,7 +381,7 @@ class ReverseOverSteps(AbstractOverSteps):
         return back
 
     def state(self, back: _Back) -> tuple[PyTree, PyTree]:
-        """The state before a step, and the states of the steps between that and the last one that is stored."""
+        """The state before a step, and the states of the steps from the last stored one to that."""
         k, every, states = back.k, self.how.every, back.states
         if states is None:
             return self.stored(k), None
@@ -397,7 +397,7 @@ class ReverseOverSteps(AbstractOverSteps):
         return jtu.tree_map(lambda xs: xs[k - start], states), states
 
     def over_step(self, back: _Back) -> _Back:
-        """From the end of a step to its start."""
+        """Cotangents from the end of a step to its start."""
         k = back.k
         (ends, jump), (state, states) = self.times(k), self.state(back)
         began, rest = eqx.partition(state, eqx.is_inexact_array)

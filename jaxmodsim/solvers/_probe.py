@@ -1,4 +1,4 @@
-"""A probe: one tangent beside the state, whose error limits the steps of a run that is differentiated."""
+"""A probe: one tangent beside the state, whose error limits the steps of a differentiated run."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,24 +14,24 @@ from jaxtyping import Array, PyTree
 
 from .events._state import EventState
 
-# Change in a number that is zero, and so has no magnitude of its own.
+# Change in a number that is zero, which has no magnitude.
 _OF_ZERO = 1e-3
-# Error allowed in the tangent, in parts of `rtol`: of what does not move, and how many times more of what does. There
-# the error of the state limits the steps, too. Parts of its own tolerance from which on the latter counts.
+# Admissible error of the tangent at rest, in parts of `rtol`; the factor by which it is larger in motion, where the
+# error of the state limits the steps, too; the error of the state in motion, in parts of its tolerance.
 _AT_REST, _IN_MOTION, _MOVES = 0.1, 150.0, 0.01
-# A tangent counts as no smaller than this part of the largest in its array.
+# Least magnitude of a tangent, in parts of the largest in its array.
 _OF_ARRAY = 1e-3
-# Errors of a tangent that are noise, in parts of `atol`, in roundings of the state and of the tangent itself.
+# Errors of a tangent that are noise: in parts of `atol`, in roundings of the state, and in roundings of the tangent.
 _OF_ATOL, _ROUNDINGS, _RESOLVED = 1e-6, 16.0, 64.0
 
 
 class ProbeTangent(NamedTuple):
-    """The tangent of the state and of the solver's state, and the largest values of the former so far."""
+    """The tangents of the state and of the solver's state, and the largest values of the former so far."""
 
     tangent: tuple[PyTree, PyTree]
     largest: PyTree
-    # 0 in a first step at whose end a projection moves the tangent by what the projection's own numbers change: a jump
-    # that no shorter step makes smaller, and no error. Else 1.
+    # 0 in a first step with a projection, else 1. That projection changes the tangent by a jump, which is no error and
+    # does not shrink with the step.
     counts: Array
 
 
@@ -48,7 +48,7 @@ def without_probe(y: PyTree) -> PyTree:
 
 
 def direction(numbers: PyTree, asked: PyTree) -> PyTree:
-    """A change in the numbers that a run is differentiated by, of their magnitude and of signs and parts at random."""
+    """A change of the differentiated numbers of a run, of their magnitude, with random signs and factors."""
     rng = np.random.default_rng(35)
 
     def change(is_asked: Any, x: Any) -> Any:
@@ -64,7 +64,7 @@ def direction(numbers: PyTree, asked: PyTree) -> PyTree:
 def start(
     t0: Array, y0: PyTree, solver_state: PyTree, change: PyTree, project: Callable[[Array, PyTree], PyTree] | None
 ) -> Probed:
-    """The state a run begins with, and the change in it, as a projection leaves it."""
+    """The initial state of a run, and its change after the projection."""
     tangent = _filled(change, y0)
     if project is not None:
         numbers, rest = eqx.partition(y0, eqx.is_inexact_array)
@@ -76,14 +76,14 @@ def start(
 
 
 class ProbedStep(NamedTuple):
-    """A step of a solver that takes the probe along."""
+    """A step of a solver that advances the probe, too."""
 
     step: PyTree
     change: PyTree
     controller: PyTree
 
     def __call__(self, t0: Array, t1: Array, y: Probed, state: PyTree, jump: Any) -> tuple[Any, ...]:
-        """The step, whose error estimate is a pair of that of the state and of the size of that of the probe."""
+        """The step; its error estimate is a pair: that of the state, and the size of that of the probe."""
         held, probe = y.y, y.probe
         numbers = jtu.tree_map(lambda d, x: None if d is None else x, self.change, self.step, is_leaf=_is_none)
         rest = jtu.tree_map(lambda d, x: x if d is None else None, self.change, self.step, is_leaf=_is_none)
@@ -105,7 +105,7 @@ class ProbedStep(NamedTuple):
         return Probed(y1, after), (error, errors), dense, state1, result
 
     def _size(self, error: PyTree, error_of_probe: PyTree, largest: PyTree, y: PyTree) -> Array:
-        """Size of the probe's error, 1 where it is as large as it may be."""
+        """Size of the probe's error in parts of its tolerance."""
         control = _pid(self.controller)[0]
         rtol, atol = lax.stop_gradient((control.rtol, control.atol))
 
@@ -121,7 +121,7 @@ class ProbedStep(NamedTuple):
 
 
 class ProbedController(NamedTuple):
-    """What diffrax's loop asks of a step size controller, with the error of the probe in its norm."""
+    """A step size controller for diffrax's loop, with the error of the probe in its norm."""
 
     controller: PyTree
 
@@ -142,7 +142,7 @@ class ProbedController(NamedTuple):
 
 
 def has_error_control(controller: PyTree) -> bool:
-    """Whether the steps are those that an error estimate allows."""
+    """Whether an error estimate determines the steps."""
     return len(_pid(controller)) == 1
 
 
@@ -164,7 +164,7 @@ def _integrated(y: PyTree) -> PyTree:
 
 
 def _moving(y: PyTree) -> PyTree:
-    """The state without the log of events, on which nothing depends."""
+    """The state without the log of events, which no other value depends on."""
     return y._replace(log=None) if isinstance(y, EventState) else y
 
 
@@ -173,7 +173,7 @@ def _with_moving(y: PyTree, moving: PyTree) -> PyTree:
 
 
 def _filled(change: PyTree, like: PyTree) -> PyTree:
-    """`change`, with zeros where it is None, or all zero."""
+    """`change` with zeros in the place of None; zeros if it is None itself."""
     like = eqx.filter(like, eqx.is_inexact_array)
     if change is None:
         return jtu.tree_map(jnp.zeros_like, like)

@@ -1,4 +1,4 @@
-"""A solver wrapper that gives each step its own arguments, and moves the state back onto what it has to obey."""
+"""A solver wrapper that gives each step its own arguments, and projects the state after each step."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -14,14 +14,14 @@ from ._wrapper import AbstractSolverWrapper
 class Projected(AbstractSolverWrapper):
     """Wrap a diffrax solver so that every step ends with a projection, or has arguments of its own.
 
-    The order is that of the wrapped solver, as what a projection takes away is at most the error of the step. Dense
-    output inside a step is that of the wrapped solver, not projected.
+    The order is that of the wrapped solver, as a projection removes at most the error of the step. Dense output inside
+    a step is that of the wrapped solver, not projected.
 
     **Arguments:**
 
     - `solver`: any solver of an `ODETerm`.
     - `project`: `project(t, y, args)` -> `y`; None for no projection.
-    - `freeze_args`: `freeze_args(t0, args)` -> `args` of a step that begins at t0; None for those of the run.
+    - `freeze_args`: `freeze_args(t0, args)` -> `args` of a step that begins at t0; None for the `args` of the run.
     """
 
     term_structure: ClassVar = dfx.ODETerm
@@ -54,15 +54,15 @@ class Projected(AbstractSolverWrapper):
 
 
 def projected(y: PyTree, error: PyTree | None, there: PyTree) -> tuple[PyTree, PyTree | None]:
-    """The end of a step after its projection, and the error estimate with what that moved.
+    """The end of a step after its projection, and the error estimate, at least as large as the projection.
 
-    A projection takes away an error of the step. Where it takes more than the estimate says, as beside a singular
-    configuration, whose constraints hold some velocities by rounding alone, the step was too long.
+    A projection removes an error of the step. The step was too long if the projection is larger than the estimate, as
+    near a singular configuration, where constraints determine some velocities by rounding alone.
 
     **Arguments:**
 
     - `y`, `error`: end of the step, and its error estimate, of the same structure; None for a method without one.
-    - `there`: the end, projected.
+    - `there`: the end after the projection.
     """
     if error is None:
         return there, None

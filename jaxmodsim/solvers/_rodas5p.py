@@ -127,7 +127,7 @@ RODAS5P = RosenbrockTableau(
 )
 
 
-# diffrax asks for a step several times over. As one function it is traced, linearised and transposed once.
+# diffrax traces a step several times. As one function of jit it is traced, linearised and transposed once.
 @eqx.filter_jit
 def _step(method: "Rodas5P", terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> RosenbrockStep:
     field, start, length = in_own_time(terms, t0, t1, args)
@@ -140,19 +140,19 @@ def _step(method: "Rodas5P", terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: 
 class Rodas5P(dfx.AbstractAdaptiveSolver):
     """Steinebach's Rodas5P for stiff equations: eight stages, order 5, L-stable, no iteration.
 
-    Usable wherever diffrax takes a solver of an `ODETerm`, forward and backward in time, with adaptive or fixed steps
-    and any adjoint, on any pytree of real floating arrays, in float32 and float64. Up to 12 state entries the linear
-    algebra is written out in scalars, so that XLA compiles a step as a few loops; above, it is loops over rows.
+    It works in `diffrax.diffeqsolve` with an `ODETerm`, forward and backward in time, with adaptive or fixed steps and
+    any adjoint, on any pytree of real floating arrays, in float32 and float64. Up to 12 state entries the linear
+    algebra is unrolled to scalars, so that XLA compiles a step as a few loops; above, it is loops over rows.
     Dense output has order 4.
 
     **Arguments:**
 
-    - `pivot`: whether the eliminations swap rows. Under error control they need not: a step
-      that a bad pivot spoils is rejected. With fixed steps nothing would notice, so `simulate(..., dt=...)` sets it.
+    - `pivot`: whether the eliminations swap rows. Error control makes that unnecessary: it rejects a step with a bad
+      pivot. Fixed steps have no such check, so `simulate(..., dt=...)` sets `pivot`.
     - `linear_solver`: `linear_solver(t, y, args, rate, shift, pivot)` -> the function from `rhs` to the solution of
-      `(shift I - J) x = rhs`, both as `y`, where J is the Jacobian of the field at (t, y), and `rate` the field there.
-      By default J is formed, column by column. `jaxmodsim.simulate` puts there one that uses the structure of
-      mechanics, where a scene has several coordinates; all derivatives must go through it.
+      `(shift I - J) x = rhs`, both of the structure of `y`, with the Jacobian J of the field at (t, y), and the field
+      `rate` there. By default J is formed column by column. `jaxmodsim.simulate` sets a solver that uses the structure
+      of mechanics, for scenes with several coordinates; it must be differentiable in all numbers.
 
     **Raises:**
 
@@ -187,7 +187,7 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
         return 5
 
     def init(self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> None:
-        """The method keeps nothing from step to step; terms and states of a wrong type are refused here."""
+        """No memory from step to step; refuses terms and states of a wrong type."""
         del t0, t1, args
         check_ode(terms, method="Rodas5P")
         check_floating(y0, method="Rodas5P")

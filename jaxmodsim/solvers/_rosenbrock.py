@@ -14,16 +14,16 @@ from .._core.lu import LinearSolver, factor_lu, invert, is_zero
 from .._core.scalarise import columns_of
 from ._state_layout import Layout, Parts, State
 
-# Up to this many state entries the stages are written out, above they are one loop, which halves the program. Two
-# shared cores, float64: a box with one LuGre bristle (3 entries) takes 43 us a run written out and 73 us in a loop
-# under vmap over 256 runs, alone 132 and 142 us; a double pendulum with two (6 entries) 933 and 733 us, alone 920 and
-# 1 040 us, and its reverse gradient compiles in 21 and 12 s.
+# Up to this many state entries the stages are unrolled; above they are one loop, which halves the program. On two
+# shared cores in float64, a box with one LuGre bristle (3 entries) takes 43 us a run unrolled and 73 us in a loop under
+# vmap over 256 runs, 132 and 142 us alone. A double pendulum with two bristles (6 entries) takes 933 and 733 us, 920
+# and 1 040 us alone, and its reverse gradient compiles in 21 and 12 s.
 _MAX_WRITTEN_OUT = 4
 
-# From time, state, field there and a shift to the solver of `(shift I - J) x = rhs`, J the Jacobian of the field.
+# Maps time, state, field there and a shift to the solver of `(shift I - J) x = rhs`, J the Jacobian of the field.
 ShiftedSolver: TypeAlias = Callable[[Array, State, State, Array], Callable[[State], State]]
-# The field at a node of the tableau, moved by a sum of increments; and the increment of a stage from the field there,
-# its sum of increments (None for none) and its share of the time derivative.
+# The field at a node of the tableau, at a point moved by a sum of increments; and the increment of a stage from the
+# field there, its sum of increments (None for none) and its share of the time derivative.
 _Slope: TypeAlias = Callable[[ArrayLike, Parts], Parts]
 _Increment: TypeAlias = Callable[[Parts, Parts | None, ArrayLike], Parts]
 
@@ -34,7 +34,7 @@ class RosenbrockTableau:
 
     With `W = I/(dt gamma) - J`, stage i solves
     `W k_i = f(t + c_i dt, y + sum_j a_ij k_j) + (1/dt) sum_j c_ij k_j + dt d_i f_t`, and
-    `y1 = y + sum_j b_j k_j`, error estimate `sum_j e_j k_j`. Rows that are equal share one field evaluation.
+    `y1 = y + sum_j b_j k_j`, error estimate `sum_j e_j k_j`. Equal rows share one field evaluation.
 
     **Arguments:**
 
@@ -45,7 +45,7 @@ class RosenbrockTableau:
     - `time`: `d_i`, shape `[stages]`.
     - `solution`, `error`: `b`, `e`, shape `[stages]`.
     - `dense`: `H` of the dense output `y(t + s dt) = (1-s) y0 + s (y1 + (1-s) (K_1 + s (K_2 + s K_3)))`,
-      `K = H k`, shape `[3, stages]`; None where the method has none.
+      `K = H k`, shape `[3, stages]`; None for a method without dense output.
     """
 
     gamma: float
@@ -59,7 +59,7 @@ class RosenbrockTableau:
 
 
 class RosenbrockStep(NamedTuple):
-    """What one step gives: the state at its end, the error estimate, and the vectors `K` of the dense output."""
+    """Result of one step: the state at its end, the error estimate, and the vectors `K` of the dense output."""
 
     y1: State
     error: State
@@ -67,7 +67,7 @@ class RosenbrockStep(NamedTuple):
 
 
 def _combine(weights: np.ndarray, terms: list[Parts]) -> Parts:
-    """`sum_j weights_j terms_j`, with zero weights left out and unit weights not multiplied; one must not be zero."""
+    """`sum_j weights_j terms_j`, without zero weights and without products by one; one weight must not be zero."""
     scaled = [
         term if weight == 1.0 else [float(weight) * x for x in term]
         for weight, term in zip(weights, terms, strict=False)
@@ -84,7 +84,7 @@ def _add(a: Parts, b: Parts) -> Parts:
 
 
 def _linearise(flow: Callable[[Array, Parts], Parts], t: Array, parts: Parts, layout: Layout) -> tuple[Parts, Any, Any]:
-    """Field, its time derivative and its Jacobian from one linearisation; what is known of the latter as NumPy's."""
+    """Field, its time derivative and its Jacobian from one linearisation; known entries of the latter are NumPy's."""
     f0, push = jax.linearize(lambda t, *parts: flow(t, list(parts)), t, *parts)
     if layout.unrolled:
         f_t, *columns = columns_of(push, opaque_one(t), t, *parts)
@@ -106,7 +106,7 @@ def _factor(jacobian: Any, shift: Array, layout: Layout, pivot: bool) -> LinearS
 
 
 def _written_out(tableau: RosenbrockTableau, f0: Parts, slope_at: _Slope, increment: _Increment) -> list[Parts]:
-    """The increments of all stages."""
+    """The increments of all stages, unrolled."""
     stages: list[Parts] = []
     slope = f0
     for i, (a, c) in enumerate(zip(tableau.stage, tableau.coupling, strict=True)):
@@ -117,10 +117,10 @@ def _written_out(tableau: RosenbrockTableau, f0: Parts, slope_at: _Slope, increm
 
 
 def _looped(tableau: RosenbrockTableau, f0: Parts, slope_at: _Slope, increment: _Increment) -> list[Parts]:
-    """The same in a loop over the stages; those to come count as zero."""
+    """The increments of all stages in a loop; increments of later stages count as zero."""
     n = len(tableau.nodes)
 
-    # An array over the stages for each part: as one matrix, a batch of 256 boxes takes eight times as long.
+    # One array over the stages for each part: with one matrix a batch of 256 boxes takes eight times as long.
     def stage(stages: Parts, row: tuple[Array, ...]) -> tuple[Parts, None]:
         i, a, c, node, time = row
 
@@ -154,17 +154,16 @@ def rosenbrock_step(
     - `field`: `(t, y) -> dy/dt`, differentiable by JAX.
     - `t0`, `dt`: start and length of the step, scalars.
     - `y0`: state at `t0`, any pytree of real floating arrays.
-    - `pivot`: whether the elimination swaps rows; see `factor_lu`. Under error control it need not: a step that a bad
-      pivot spoils is rejected, and the next has other pivots.
-    - `linear_solver`: solves the systems of the stages, where that takes less than all columns of the Jacobian, which
-      is what is done without it.
+    - `pivot`: whether the elimination swaps rows; see `factor_lu`. Error control makes that unnecessary: it rejects a
+      step with a bad pivot, and the next step has other pivots.
+    - `linear_solver`: solves the systems of the stages; by default all columns of the Jacobian are formed.
 
     **Returns:**
 
     A `RosenbrockStep`.
     """
-    # Under vmap and reverse mode, runs that have finished make steps of length zero that nobody uses; 1/dt would make
-    # their derivatives NaN, and zero times NaN is NaN. A short step in its place keeps them finite.
+    # Under vmap and in reverse mode finished runs make unused steps of length zero. With 1/dt their derivatives would
+    # be NaN, and zero times NaN is NaN. A short step keeps them finite.
     short = float(jnp.finfo(dt.dtype).eps) ** 0.5 * jnp.maximum(jnp.abs(t0), 1.0)
     dt = jnp.where(dt == 0, short, dt)
     layout = Layout(y0)
@@ -194,7 +193,7 @@ def rosenbrock_step(
 
     def slope_at(node: ArrayLike, move: Parts) -> Parts:
         point = _add(parts, move)
-        if not layout.unrolled:  # as vectors: every entry of the field would compute its own sum of stages
+        if not layout.unrolled:  # for vectors: every entry of the field would compute its own sum of stages
             point = fusion_barrier(point, opaque_one(t0))
         return flow(t0 + jnp.asarray(node, dt.dtype) * dt, point)
 

@@ -1,4 +1,4 @@
-"""How solver steps hold a state, and what it is between their ends."""
+"""Layout of a state in the steps of a solver, and dense output between their ends."""
 
 from typing import Any, TypeAlias
 
@@ -14,7 +14,7 @@ Parts: TypeAlias = list[Array]
 
 
 class Layout:
-    """How a pytree state maps to the parts the step computes with: one scalar per entry, or one long vector."""
+    """Map between a pytree state and the parts of a step: one scalar per entry, or one long vector."""
 
     def __init__(self, y: State):
         leaves, self.structure = jtu.tree_flatten(y)
@@ -62,7 +62,7 @@ class PolynomialInterpolation(dfx.AbstractLocalInterpolation):
         del left
         if t1 is not None:
             return jtu.tree_map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
-        # A step of length zero is one of a finished run under vmap; see `rosenbrock_step`.
+        # A finished run under vmap makes steps of length zero; see `rosenbrock_step`.
         length = self.t1 - self.t0
         s = (t0 - self.t0) / jnp.where(length == 0, 1.0, length)
 

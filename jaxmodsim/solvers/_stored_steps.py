@@ -1,4 +1,4 @@
-"""Forward and reverse mode from the steps that were made."""
+"""Forward and reverse mode over the accepted steps of a run."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
@@ -32,32 +32,30 @@ _TWICE = "StoredSteps does not differentiate a derivative in reverse mode: take 
 
 
 class StoredSteps(dfx.AbstractAdjoint):
-    """Derivatives of the steps that were made, each step differentiated once, forward or from the last to the first.
+    """Derivatives of the accepted steps, each differentiated once, in the order of time or in the reverse order.
 
-    The run keeps what every accepted step began with. Forward mode (`jax.jvp`, `jax.jacfwd`) goes over `jax.jvp` of
-    these steps, reverse mode (`jax.grad`, `jax.jacrev`) back over `jax.vjp` of them. `jax.hessian` and other forward
-    over reverse or forward over forward derivatives work likewise. Nothing is computed a second time in another order,
-    so rounding, which events and error control would enlarge, does not enter: the derivative is that of the run, to
-    rounding, at any tolerance. The times of the steps, and with them the work of the step size controller, count as
-    constants; those of constant steps, by which diffrax divides a run evenly, move with its ends. Rejected steps cost
-    nothing.
+    The run stores the state at the start of every accepted step. Forward mode (`jax.jvp`, `jax.jacfwd`) applies
+    `jax.jvp` to these steps, reverse mode (`jax.grad`, `jax.jacrev`) applies `jax.vjp` to them in reverse order.
+    `jax.hessian` and other derivatives forward over reverse, or forward over forward, work likewise. The derivative is
+    that of the run, to rounding, at any tolerance: no step is repeated with other rounding, which events and error
+    control would amplify. Times of steps, and thus the step size controller, count as constants. Constant steps, by
+    which diffrax divides a run evenly, move with its ends. Rejected steps cost nothing.
 
-    Derivatives hold by the initial state, by everything in `args`, terms and solver, by `t0`, `t1`, the times in
-    `SaveAt(ts=...)`, and by what their functions close over. A run that ended early gives the derivative of the part
-    that was integrated.
+    Derivatives hold for the initial state, for everything in `args`, terms and solver, for `t0`, `t1`, the times in
+    `SaveAt(ts=...)`, and for the numbers that their functions close over. A run that ends early gives the derivative of
+    the integrated part.
 
-    Memory, only where a derivative is taken: `max_steps / every` times the size of the state and of the solver's state,
-    `every` times the same in reverse mode, and `max_steps` times two times.
+    Memory, only for derivatives: `max_steps / every` times the size of the state and of the solver's state, `every`
+    times the same in reverse mode, and two times for each of `max_steps`.
 
     **Arguments:**
 
-    - `every`: keep the state of every such step, at least 1; those between are made again, at their recorded times.
-    - `probe`: whether the error of a derivative limits the steps, too, where a `diffrax.PIDController` chooses them. A
-      run that is differentiated then carries its tangent in one random direction of the differentiated numbers, each
-      changed by its magnitude. The error estimate of this tangent enters the norm of the step size control, relative to
-      the largest values of its components so far. Without it, steps grow without bound where nothing moves, and the
-      derivatives of such a run are wrong. The differentiated run makes other steps than the plain run; both keep the
-      tolerance.
+    - `every`: 1 to store the state of every step, n of every n-th; the others are repeated at their recorded times.
+    - `probe`: whether the error of a derivative limits the steps, too, if a `diffrax.PIDController` chooses them. A
+      differentiated run then carries its tangent in one random direction of the differentiated numbers, each changed
+      by its magnitude. The error estimate of this tangent enters the norm of the step size control, relative to the
+      largest values of its components so far. Without it steps grow without limit at rest, and the derivatives of such
+      a run are wrong. The differentiated run makes other steps than the plain run; both keep the tolerance.
 
     **Raises:**
 
@@ -89,7 +87,7 @@ class StoredSteps(dfx.AbstractAdjoint):
     ) -> tuple[PyTree, dict[str, Any]]:
         """See `diffrax.AbstractAdjoint`."""
         if max_steps is None:
-            raise ValueError("StoredSteps keeps every step and needs a bound on their number, but max_steps=None.")
+            raise ValueError("StoredSteps stores every step and needs a bound on their number, but max_steps=None.")
         if event is not None:
             raise ValueError("StoredSteps does not differentiate diffrax's terminating event: use EventSolver.")
         solver = _differentiable_in_both_modes(solver)
@@ -117,7 +115,7 @@ class StoredSteps(dfx.AbstractAdjoint):
         begin, order = init_state, solver.error_order(terms)
         y0, args_of_step = begin.y, (begin.tprev, begin.tnext, begin.y, begin.solver_state)
 
-        # Numbers of the terms, of the solver and of `args`, and what their functions close over, become leaves.
+        # Numbers of the terms, the solver, `args` and the closures of their functions become leaves.
         def step(t0: Array, t1: Array, y: PyTree, state: PyTree, jump: bool | Array) -> PyTree:
             return solver.step(terms, t0, t1, y, args, state, jump)
 
@@ -147,7 +145,7 @@ class StoredSteps(dfx.AbstractAdjoint):
 
 
 class _Fixed(NamedTuple):
-    """What it is not differentiated by."""
+    """Inputs of a run without a derivative."""
 
     controller: PyTree
     saveat: PyTree
@@ -158,14 +156,14 @@ class _Fixed(NamedTuple):
     max_steps: int
     error_order: PyTree
     how: StepPlan
-    # After every step, from time and state to the state; None without.
+    # The projection after every step, from time and state to the state; None without one.
     project: Callable[[Array, PyTree], PyTree] | None
-    # Whether a probe limits the steps of a run that is differentiated.
+    # Whether a probe limits the steps of a differentiated run.
     probe: bool
 
 
 class _Solver(NamedTuple):
-    """What diffrax's loop asks of a solver, with a step that is traced already."""
+    """A solver for diffrax's loop, with a traced step."""
 
     advance: Callable[..., PyTree]
     order: PyTree
@@ -196,7 +194,7 @@ def _is_sub(x: object) -> bool:
 
 
 def _differentiable_in_both_modes(solver: PyTree) -> PyTree:
-    """With loops over the stages of diffrax's Runge-Kutta methods that either mode can go through."""
+    """The solver, with loops over the stages of diffrax's Runge-Kutta methods that both modes can differentiate."""
     is_method = lambda x: isinstance(x, dfx.AbstractRungeKutta) and x.scan_kind is None  # noqa: E731
 
     def bounded(x: PyTree) -> PyTree:
@@ -208,7 +206,7 @@ def _differentiable_in_both_modes(solver: PyTree) -> PyTree:
 def _tells_of_jumps(
     controller: PyTree, args: PyTree, state: PyTree, order: PyTree, step: Callable[..., PyTree]
 ) -> bool:
-    """Whether `made_jump` is traced: diffrax keeps it a Python boolean where the controller never tells of a jump."""
+    """Whether `made_jump` is traced: diffrax keeps it a Python boolean if the controller never reports a jump."""
 
     def made_jump(controller: PyTree, args: PyTree, state: PyTree) -> bool | Array:
         t0, t1, y0 = state.tprev, state.tnext, state.y
@@ -219,15 +217,15 @@ def _tells_of_jumps(
 
 
 def _traced_once(fn: Callable[..., PyTree], *args: PyTree) -> Callable[..., PyTree]:
-    """`fn`, traced at `args`, as a pytree of what it closes over; its program is one equation in those that call it."""
+    """`fn`, traced at `args`, as a pytree of its closure; its program is one equation in the programs that call it."""
     numbers, program = eqx.partition(eqx.filter_closure_convert(fn, *args), eqx.is_array)
     return eqx.Partial(eqx.filter_jit(lambda numbers, *args: eqx.combine(numbers, program)(*args)), numbers)
 
 
 def _solve(inputs: StepInputs, fixed: _Fixed, by: StepInputs | None) -> PyTree:
-    """The final state of diffrax's loop; where the run is differentiated by something, the steps, too.
+    """The final state of diffrax's loop; for a differentiated run the steps, too.
 
-    Then a probe limits the steps, if they are those that an error estimate allows.
+    A probe then limits the steps, if an error estimate determines them.
     """
     every, size, kept, keeps = fixed.how.every, fixed.max_steps, [], by is not None
     y0, step, controller = inputs.y0, inputs.step, fixed.controller
@@ -302,8 +300,8 @@ def _beginning(state: PyTree) -> StepRecord:
     return StepRecord(state.tprev, state.tnext, jnp.asarray(state.made_jump), (y, state.solver_state))
 
 
-# The run and its derivative are primitives, the second linear in the tangents and with a transpose of its own. So one
-# function has a rule for either mode.
+# The run and its derivative are primitives; the second is linear in the tangents and has a transpose of its own. One
+# function thus has a rule for both modes.
 def _struct(tree: PyTree) -> PyTree:
     return jtu.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype) if isinstance(x, ShapedArray) else x, tree)
 
@@ -313,7 +311,7 @@ def _aval(tree: PyTree) -> PyTree:
 
 
 def _array(x: PyTree) -> PyTree:
-    """Constants of a program come in other forms, too."""
+    """`x` as an array, unless JAX asks for its cotangent; constants of a program may have other types."""
     return x if _is_asked(x) or isinstance(x, jax.Array) else jnp.asarray(x)
 
 
@@ -341,7 +339,7 @@ def _make_jvp(primals: PyTree, tangents: PyTree) -> PyTree:
         run = eqx.filter_closure_convert(lambda inputs: _solve(inputs, fixed, asked), inputs)
     final, steps = eqxi.filter_primitive_bind(_run_p, run, inputs, fixed, True)
     if jtu.tree_leaves(by):
-        # Under vmap this makes a batch of each input where the run is one: only then is the transpose right.
+        # Under vmap this gives each input a batch if the run has one, which the transpose needs.
         one = jnp.where(final.num_accepted_steps >= 0, 1.0, 0.0)
         by = jtu.tree_map(lambda d: d * one.astype(d.dtype), by)
         change = eqxi.filter_primitive_bind(_change_p, by, RecordedRun(inputs, final, steps, fixed.how), keeps)
@@ -379,7 +377,7 @@ def _make_transpose(inputs: PyTree, cts: PyTree) -> PyTree:
 
 
 def _change(by: StepInputs, run: RecordedRun, keeps: bool) -> RunTangents:
-    """What a run changes by if its inputs do."""
+    """Change of a run by a change of its inputs."""
     return _once(ForwardOverSteps(by, run, keeps).result())
 
 

@@ -1,4 +1,4 @@
-"""What all wrappers of a solver, or of a step size controller, take from it."""
+"""Base classes of wrappers of a solver, and of a step size controller."""
 
 from typing import Any, cast
 
@@ -9,16 +9,16 @@ from jaxtyping import PyTree
 
 
 class AbstractSolverWrapper(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolver):
-    """A solver made of another one, with its order and what diffrax sets and reads of it."""
+    """A wrapper of another solver, with its order and the attributes that diffrax sets and reads."""
 
     @property
     def root_finder(self) -> PyTree:
-        """That of the wrapped solver, if it is implicit: diffrax gives it the tolerances of the controller."""
+        """Root finder of the wrapped solver, if it is implicit: diffrax gives it the tolerances of the controller."""
         return cast(dfx.AbstractImplicitSolver, self.solver).root_finder
 
     @property
     def scan_kind(self) -> PyTree:
-        """That of the wrapped solver, if it is a Runge-Kutta method: diffrax sets it for the kind of derivative."""
+        """Kind of loop of the wrapped solver, if it is a Runge-Kutta method: diffrax sets it for the adjoint."""
         return cast(dfx.AbstractRungeKutta, self.solver).scan_kind
 
     def order(self, terms: PyTree) -> int | None:
@@ -31,7 +31,7 @@ class AbstractSolverWrapper(dfx.AbstractAdaptiveSolver, dfx.AbstractWrappedSolve
 
 
 class AbstractControllerWrapper(dfx.AbstractAdaptiveStepSizeController):
-    """A step size controller made of another one, with what implicit solvers read of it."""
+    """A wrapper of another step size controller, with the attributes that implicit solvers read."""
 
     controller: eqx.AbstractVar[dfx.AbstractStepSizeController]
 

@@ -127,6 +127,15 @@ def test_what_is_known_is_not_computed() -> None:
     np.testing.assert_array_equal(jax.jit(scalar(columns))(X), columns(X))
 
 
+def test_a_zero_that_is_known_takes_away_infinity_and_another_one_does_not() -> None:
+    def fn(x: Any) -> Any:
+        return jnp.array([0.0, 1.0]) * jnp.stack([jnp.exp(x[0]), x[1]]) + jnp.zeros(2) * x[0] * jnp.exp(x[0])
+
+    x = jnp.array([1e9, 3.0])
+    np.testing.assert_array_equal(jax.jit(lambda x: in_scalars(fn, x, seed=x))(x), [0.0, 3.0])
+    assert np.isnan(jax.jit(lambda x: in_scalars(lambda x: x * jnp.exp(x[::-1]), x, seed=x))(jnp.array([0.0, 1e9]))[0])
+
+
 def test_equal_terms_are_formed_once() -> None:
     found = primitives(scalar(lambda x: jnp.sin(x) * jnp.sin(x) + jnp.sum(jnp.sin(x)) * jnp.cos(x)), X)
     assert (found["sin"], found["cos"]) == (3, 3)

@@ -171,7 +171,7 @@ def test_float32_floor_is_named(pendulum: jms.Trajectory) -> None:
 
 
 def test_too_few_steps_are_said(pendulum: jms.Trajectory) -> None:
-    with pytest.raises(jms.SimulationError, match=r"runs at rtol 1e-08 were made to check by\. The step limit"):
+    with pytest.raises(jms.SimulationError, match=r"needs runs at rtol 1e-08 for comparison\. The step limit"):
         again(pendulum, accuracy=1e-6, max_steps=16)
     run = again(pendulum, accuracy=1e-6, max_steps=16, throw=False)
     assert run.accuracy is None

@@ -171,6 +171,38 @@ def test_closed_form_of_a_start_time() -> None:
     np.testing.assert_allclose(slopes, right, rtol=1e-10)
 
 
+@pytest.mark.parametrize("every", [1, 3])
+def test_the_derivative_is_that_of_the_steps(every: int) -> None:
+    """y' = -k y in ten steps of Euler, not of the equation: y_j = (1 - 0.2 k)^j, and lines between them."""
+    at = np.array([0.25, 0.6, 2.0])  # within a step, at the end of one, at the end of the run
+
+    def saved(k: Any) -> Any:
+        solution = dfx.diffeqsolve(
+            dfx.ODETerm(lambda t, y, k: -k * y),
+            dfx.Euler(),
+            0.0,
+            2.0,
+            0.2,
+            jnp.ones(()),
+            k,
+            saveat=dfx.SaveAt(subs=[dfx.SubSaveAt(steps=2, t0=True), dfx.SubSaveAt(ts=jnp.asarray(at), t1=True)]),
+            adjoint=StoredSteps(every),
+            max_steps=16,
+        )
+        steps, times = solution.ys  # pyright: ignore[reportGeneralTypeIssues]
+        return jnp.concatenate([steps[:6], times])
+
+    def exact(k: Any) -> Any:
+        steps = (1.0 - 0.2 * k) ** jnp.arange(11)
+        between = [steps[j] * (1.0 - k * (t - 0.2 * j)) for j, t in ((1, at[0]), (2, at[1]))]
+        return jnp.concatenate([steps[::2], jnp.stack(between), steps[10:], steps[10:]])
+
+    k = jnp.asarray(0.7)
+    np.testing.assert_allclose(saved(k), exact(k), rtol=1e-13)
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jax.jit(mode(saved))(k), jax.jacfwd(exact)(k), rtol=1e-12)
+
+
 def test_vmap_and_float32() -> None:
     """Runs of different lengths in one batch are as each alone; in float32 to its rounding."""
     t1 = jnp.linspace(1.5, 3.0, 3)

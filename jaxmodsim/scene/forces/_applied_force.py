@@ -21,20 +21,20 @@ def _at(value: Any) -> PositionFn | None:
 
 
 class AppliedForce(AbstractEffect):
-    """A force given as a function, on the coordinates or at a point.
+    """A force that is a function, on the coordinates or at a point.
 
     **Arguments:**
 
     - `fn`: `fn(t, q, qd, params)` returns the force: without `at` the generalised force, shape `[dof]` [N or N m];
-      with `at` a Cartesian force [N] of the shape that `at` returns. Numbers that are to be differentiated or
-      swept belong into `params` (or into the leaves of an `eqx.Module` passed as `fn`).
+      with `at` a Cartesian force [N] of the shape that `at` returns. Put numbers for derivatives or sweeps into
+      `params` (or into the leaves of an `eqx.Module` passed as `fn`).
     - `at`: `at(q)` or `at(q, params)` returns the position of the point of attack [m]; the force is mapped to the
       coordinates by the transposed Jacobian of `at`.
     - `name`: name in `run.forces`.
 
     **Raises:**
 
-    - `ValueError` if `fn` or `at` is no function, or (at the run) returns a wrong shape.
+    - `ValueError` if `fn` or `at` is not a function, or (at the run) returns a wrong shape.
     """
 
     fn: Callable[..., Any] = eqx.field(converter=partial(as_function, name="AppliedForce fn"))
@@ -48,7 +48,7 @@ class AppliedForce(AbstractEffect):
 
     @property
     def stiff(self) -> bool:
-        """Applied forces are taken to be smooth."""
+        """Applied forces count as smooth."""
         return False
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
@@ -69,7 +69,7 @@ class AppliedForce(AbstractEffect):
         return None
 
     def act(self, t: Scalar, q: PerDof, qd: PerDof, z: PyTree, params: PyTree) -> Action:
-        """Force as given, and mapped to the coordinates."""
+        """The force, and the generalised force that it makes."""
         force = jnp.asarray(self.fn(t, q, qd, params), q.dtype)
         at = self.at
         if at is None:
@@ -78,9 +78,9 @@ class AppliedForce(AbstractEffect):
         return Action(pull(force)[0], force)
 
     def power(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, action: Action) -> Power:
-        """All of it comes from outside."""
+        """All power comes from outside."""
         return Power(jnp.sum(action.generalised * qd))
 
     def stored_energy(self, z: PyTree) -> float:
-        """Nothing is stored."""
+        """An applied force stores no energy."""
         return 0.0

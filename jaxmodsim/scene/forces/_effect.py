@@ -1,4 +1,4 @@
-"""What an effect is: something that puts a force on the mechanism."""
+"""Base class of effects, which are forces on the mechanism."""
 
 import abc
 from typing import TYPE_CHECKING, NamedTuple, cast
@@ -11,11 +11,11 @@ from ..._core.arrays import PerDof, Scalar
 
 
 class Action(NamedTuple):
-    """What an effect does at one state.
+    """Forces of an effect at one state.
 
     - `generalised`: generalised force on each coordinate, shape `[dof]` [N or N m].
     - `force`: the force in the effect's own terms, as reported along a run.
-    - `rate`: time derivative of the effect's own state; None where it has none.
+    - `rate`: time derivative of the effect's own state; None without one.
     """
 
     generalised: PerDof
@@ -24,9 +24,9 @@ class Action(NamedTuple):
 
 
 class Power(NamedTuple):
-    """Power [W] that an effect brings in from outside, and that it absorbs (loses or stores).
+    """Power [W] that an effect supplies from outside, and power that it absorbs (loses or stores).
 
-    None for an effect that never absorbs any: what is zero by nature is not integrated.
+    `absorbed` is None for an effect that never absorbs power: a constant zero is not integrated.
     """
 
     supplied: Scalar
@@ -36,7 +36,7 @@ class Power(NamedTuple):
 class AbstractEffect(eqx.Module):
     """A force on the mechanism, with or without a state of its own."""
 
-    # By which the effect is known in the results; None for the class's own.
+    # Name of the effect in the results; None for that of the class.
     if TYPE_CHECKING:
         name = cast("str | None", None)  # not a field, which would come before those of the effects
     else:
@@ -49,7 +49,7 @@ class AbstractEffect(eqx.Module):
     @property
     @abc.abstractmethod
     def default_name(self) -> str:
-        """Name in the results where the user gave none."""
+        """Name in the results without a name from the user."""
 
     @property
     @abc.abstractmethod
@@ -66,7 +66,7 @@ class AbstractEffect(eqx.Module):
 
     @abc.abstractmethod
     def act(self, t: Scalar, q: PerDof, qd: PerDof, z: PyTree, params: PyTree) -> Action:
-        """Forces and the rate of the own state `z`."""
+        """Forces, and the rate of the effect's state `z`."""
 
     @abc.abstractmethod
     def power(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, action: Action) -> Power:
@@ -74,4 +74,4 @@ class AbstractEffect(eqx.Module):
 
     @abc.abstractmethod
     def stored_energy(self, z: PyTree) -> Scalar | float:
-        """Energy [J] held in the own state."""
+        """Energy [J] in the effect's state."""

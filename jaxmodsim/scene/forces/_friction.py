@@ -1,4 +1,4 @@
-"""Where a friction law acts."""
+"""Friction elements: a law along a displacement of the mechanism."""
 
 from collections.abc import Callable
 from functools import partial
@@ -31,7 +31,7 @@ from ...friction import (
 )
 from ._effect import AbstractEffect, Action, Power
 
-# Part of an earlier slip velocity below which the direction of slip in the plane is rounded off.
+# Part of the reference velocity below which the direction of slip in the plane is rounded off.
 _FLOOR = 1e-2
 
 
@@ -73,7 +73,7 @@ def _load(value: Any) -> Any:
 
 
 def _role(x: StateDependent) -> str:
-    """What a function of the state is to its law."""
+    """Role of a function of the state in its law."""
     return "the torque" if x.number is None else "scaled_by's fn"
 
 
@@ -85,30 +85,30 @@ class Friction(AbstractEffect):
 
     **Arguments:**
 
-    - `law`: how friction depends on slip; a plain function of slip velocity does, too. A set-valued law (`Coulomb`,
-      `Stribeck`) runs exactly, by events: in stick the slip velocity is zero and the force is what that takes, up to
-      the law's limit. `Regularized`, `DeadZone` and `Sign` run it in other ways.
+    - `law`: friction as a function of slip, a law or a plain function of slip velocity. A set-valued law (`Coulomb`,
+      `Stribeck`) runs exactly, by events: in stick the slip velocity is zero, and the force is the one that keeps it
+      zero, up to the law's limit. `Regularized`, `DeadZone` and `Sign` run it in other ways.
     - `along`: `along(q)` or `along(q, params)`. A scalar displacement [m or rad]; by default the one coordinate. Or the
-      position of the contact [m], shape `[2]` or `[3]`: with one coordinate slip is the velocity along its path,
-      positive for a rising coordinate; with several it is a vector, and so is the friction force: of a law that is a
-      function of slip opposite to it, of the magnitude that the law gives at the magnitude of slip; of `LuGre` and
-      `Dahl` with a bristle that is a vector, too; of a set-valued law in stick any vector up to the limit.
-    - `belt_velocity`: velocity [m/s or rad/s] of the surface, a number or a continuous function of t (a jump would
-      carry with it what sticks); where slip is a vector, a function that returns one.
+      position of the contact [m], shape `[2]` or `[3]`. With one coordinate slip is the velocity along its path,
+      positive for a rising coordinate. With several, slip and friction force are vectors. The force of a law that is a
+      function of slip is opposite to slip, with the law's value at the magnitude of slip; `LuGre` and `Dahl` have a
+      vector bristle; a set-valued law in stick has any vector up to the limit.
+    - `belt_velocity`: velocity [m/s or rad/s] of the surface, a number or a continuous function of t (sticking parts
+      would follow a jump); for slip that is a vector, a function that returns one.
     - `normal_force`: load [N]: a number >= 0, `normal_force(t, q, qd, params)`, or the name of a `Constraint`, whose
       reaction is the load; friction and reaction are then solved together. The law's forces are per newton of
-      load (`Fc` is the coefficient of friction). Where a function of t, q or qd is negative, the parts have lifted
-      off, and there is no friction; one that depends on `params` alone must be >= 0, too. By default the law's
+      load (`Fc` is the coefficient of friction). If a function of t, q or qd is negative, the parts have lifted
+      off, and there is no friction; a function of `params` alone must be >= 0. By default the law's
       forces are in newtons.
     - `name`: name in `run.forces`.
-    - `ellipse`: where slip is a vector of two components, friction across over friction along the first one, > 0: the
-      limit of friction is an ellipse with these half-axes, and the direction that of greatest dissipation. By
-      default 1, a circle. The law sees the slip (v_1, ellipse v_2), so that the power is what it makes of that.
+    - `ellipse`: for slip of two components, the ratio of friction across to friction along the first component, > 0:
+      the limit of friction is an ellipse with these half-axes, and its direction is that of greatest dissipation. By
+      default 1, a circle. The law receives the slip (v_1, ellipse v_2).
 
     **Raises:**
 
-    - `ValueError` for a law that is none, numbers out of range, and (at the run) for wrong shapes or for `along`
-      missing where there are several coordinates.
+    - `ValueError` for an unknown law, numbers out of range, and (at the run) for wrong shapes, or without `along` if
+      there are several coordinates.
     """
 
     law: AbstractLaw = eqx.field(converter=_law)
@@ -127,7 +127,7 @@ class Friction(AbstractEffect):
         check_ranges(self)
 
     def bind_state(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> "Friction":
-        """With the law as it is at this state; itself where the law does not depend on that."""
+        """The element with its law at this state; itself if the law does not depend on the state."""
         if not is_state_dependent(self.law):
             return self
         return eqx.tree_at(lambda x: x.law, self, self.law.bind_state(t, q, qd, params))
@@ -139,12 +139,12 @@ class Friction(AbstractEffect):
 
     @property
     def stiff(self) -> bool:
-        """As the law says."""
+        """Whether the law is stiff."""
         return self.law.stiff
 
     @property
     def karnopp(self) -> bool:
-        """Whether the law needs to know the other forces (`DeadZone`)."""
+        """Whether the law needs the other forces (`DeadZone`)."""
         return isinstance(self.law, AbstractKarnoppLaw)
 
     @property
@@ -158,7 +158,7 @@ class Friction(AbstractEffect):
         return self.normal_force.constraint if isinstance(self.normal_force, ReactionLoad) else None
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
-        """Check that displacement, belt velocity and load have the shapes they need."""
+        """Check the shapes of displacement, belt velocity and load."""
         shape = self._shape(q, params, name)
         if self.along is None and q.shape != (1,):
             raise ValueError(
@@ -204,7 +204,7 @@ class Friction(AbstractEffect):
         return result_shape(self.along, q=q, params=params, name=f"along of Friction {name!r}")
 
     def check_belt(self, q: Any, params: PyTree, name: str) -> None:
-        """Refuse a slip that is a vector beside the velocity of a belt that is a number other than zero."""
+        """Refuse a belt velocity that is a nonzero number if slip is a vector."""
         assert self.along is not None
         slip = self._shape(q, params, name)
         if slip != ():
@@ -214,13 +214,13 @@ class Friction(AbstractEffect):
             )
 
     def initial_state(self, q: PerDof, params: PyTree) -> PyTree:
-        """State of the law; None where it has none."""
+        """State of the law; None without one."""
         if not isinstance(self.law, AbstractDynamicLaw):
             return None
         return self.law.initial_state(jnp.zeros(self.slip_shape(q, params), q.dtype))
 
     def slip_shape(self, q: PerDof, params: PyTree) -> tuple[int, ...]:
-        """Shape of the slip: () or, where `along` is a position that moves in several directions, that of a vector."""
+        """Shape of the slip: (), or that of a vector if `along` is a position that moves in several directions."""
         if self.along is None or q.shape == (1,):
             return ()
         return traced(
@@ -230,7 +230,7 @@ class Friction(AbstractEffect):
     def direction(self, q: PerDof, params: PyTree) -> Float[Array, "*components dof"]:
         """Gradient d along/dq of the slip: the generalised force of a unit force along the displacement.
 
-        Of a vector one for each component, as the law sees them.
+        A vector has one for each component, scaled by `ellipse`.
         """
         if self.along is None:
             return jnp.ones_like(q)
@@ -241,7 +241,7 @@ class Friction(AbstractEffect):
         return jax.vmap(self.stretch, in_axes=1, out_axes=1)(jax.jacrev(self.along)(q, params))
 
     def _pace(self, q: Float[Array, "1"], params: PyTree) -> Scalar:
-        """Displacement per unit of the one coordinate; of a position the length of its tangent."""
+        """Displacement per unit of the one coordinate; for a position the length of its tangent."""
         tangent = self._moves(q, jnp.ones_like(q), params)
         return tangent if tangent.ndim == 0 else safe_norm(tangent)
 
@@ -257,7 +257,7 @@ class Friction(AbstractEffect):
         return jnp.asarray(fn(t), t.dtype) if callable(fn) else fn
 
     def slip(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, "..."]:
-        """Slip velocity [m/s or rad/s], a scalar, or a vector where `along` is a position that moves freely."""
+        """Slip velocity [m/s or rad/s], a scalar, or a vector if `along` is a position in several directions."""
         if self.along is None:
             return qd[0] - self.belt(t)
         if q.shape == (1,):
@@ -267,11 +267,11 @@ class Friction(AbstractEffect):
     def slip_and_rate(
         self, t: Scalar, q: PerDof, qd: PerDof, qdd: PerDof, params: PyTree
     ) -> tuple[Float[Array, "*components"], Float[Array, "*components"]]:
-        """Slip velocity, and its rate where the accelerations are `qdd`."""
+        """Slip velocity, and its rate for the accelerations `qdd`."""
         return jax.jvp(lambda t, q, qd: self.slip(t, q, qd, params), (t, q, qd), (jnp.ones_like(t), qd, qdd))
 
     def load(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar | None:
-        """Normal load [N], never negative; None where the law's forces are in newtons, or per newton of a reaction."""
+        """Normal load [N], never negative; None if the law's forces are in newtons, or per newton of a reaction."""
         fn = self.normal_force
         if fn is None or isinstance(fn, ReactionLoad):
             return None
@@ -296,12 +296,12 @@ class Friction(AbstractEffect):
     def slip_force(self, v: Scalar, direction: Scalar, load: Scalar | None) -> Scalar:
         """Force [N] of a set-valued law in slip at velocity `v` towards `direction` (+1 or -1).
 
-        A trial step may run past the end of the slip. There the law goes on as a straight line, so that the field is
+        A trial step may run past the end of the slip. The law continues there as a straight line, so that the field is
         smooth in the step.
         """
         assert isinstance(self.law, AbstractSetValuedLaw)
         law, speed = self.law, direction * v
-        # On the side of the slip even at zero: a law may have other parameters for either direction.
+        # On the side of the slip even at zero: a law may have other parameters for each direction.
         rest = direction * float(jnp.finfo(v.dtype).tiny)
         _, slope = jax.jvp(law.sliding_force, (rest,), (direction,))
         slope = jnp.where(jnp.isfinite(slope), slope, 0.0)
@@ -313,12 +313,12 @@ class Friction(AbstractEffect):
     def slip_force_in_plane(
         self, v: Float[Array, " d"], reference: Float[Array, " d"], load: Scalar | None
     ) -> Float[Array, " d"]:
-        """Force [N] of a set-valued law in slip at the velocity `v`, a vector: that at its magnitude, along it.
+        """Force [N] of a set-valued law in slip at the velocity `v`, a vector, in its direction.
 
-        A trial step may run past the end of the slip. On a line through rest slip and force go on as those of a scalar
-        slip, with the sign of the component of `v` along `reference`, an earlier velocity. Where that component is
-        below 1e-2 of `reference` the direction of the force goes over into that of `reference`, so that the force is a
-        smooth function of `v` at rest, too.
+        A trial step may run past the end of the slip. On a line through rest slip and force continue as those of a
+        scalar slip, with the sign of the component of `v` along `reference`, an earlier velocity. If that component is
+        below 1e-2 of `reference`, the direction of the force changes smoothly to that of `reference`, so that the force
+        is a smooth function of `v` at rest, too.
         """
         speed = safe_norm(reference)
         direction = reference / jnp.where(speed > 0, speed, 1.0)
@@ -348,7 +348,7 @@ class Friction(AbstractEffect):
     ) -> tuple[Float[Array, "..."], PyTree]:
         """Friction force over, and state of the law after, the time `dt` [s] at constant slip velocity `v`.
 
-        Damping in a bristle is that of its mean rate, so that its impulse is right however far the bristle has gone.
+        Damping in a bristle is that of its mean rate, so that its impulse is exact for any change of the bristle.
         """
         v = self.stretch(v)
         if isinstance(self.law, AbstractDynamicLaw):
@@ -362,7 +362,7 @@ class Friction(AbstractEffect):
         return (force if load is None else load * force), z
 
     def stretch(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
-        """What the law sees of a slip, and what its force is to the mechanism."""
+        """A slip, or a force, scaled by `ellipse`: from the mechanism to the law, and back."""
         return x if self.ellipse is None else x * jnp.stack([jnp.ones_like(self.ellipse), self.ellipse])
 
     def act(self, t: Scalar, q: PerDof, qd: PerDof, z: PyTree, params: PyTree) -> Action:
@@ -373,20 +373,20 @@ class Friction(AbstractEffect):
         return Action(self.apply_force(q, force, params), force, rate)
 
     def power(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, action: Action) -> Power:
-        """The belt brings in -F times its velocity; slip absorbs F times the slip velocity."""
+        """The belt supplies -F times its velocity; slip absorbs F times the slip velocity."""
         return Power(-jnp.sum(action.force * self.belt(t)), jnp.sum(action.force * self.slip(t, q, qd, params)))
 
     def stored_energy(self, z: PyTree) -> Scalar | float:
-        """Energy [J] in the law's state, for laws in newtons; under a load of its own, or varying, it has none."""
+        """Energy [J] in the law's state, for laws in newtons; 0 with a load, or parameters that vary."""
         if isinstance(self.law, AbstractDynamicLaw) and self.normal_force is None and not is_state_dependent(self.law):
             return self.law.stored_energy(z)
         return 0.0
 
 
 def _mean_rate(law: AbstractDynamicLaw, v: Float[Array, "..."], z: PyTree, after: PyTree, dt: Array) -> PyTree:
-    """Mean rate of a state that goes from `z` to `after` in `dt` [s] at constant slip velocity.
+    """Mean rate of a state that changes from `z` to `after` in `dt` [s] at constant slip velocity.
 
-    It lies between those of the ends: where they differ by less than the quotient is rounded, they say it better.
+    It lies between the rates at both ends, which are more accurate than the quotient if that is dominated by rounding.
     """
 
     def mean(before: Array, after: Array, first: Array, last: Array) -> Array:
@@ -397,7 +397,7 @@ def _mean_rate(law: AbstractDynamicLaw, v: Float[Array, "..."], z: PyTree, after
 
 
 def _of_slip(force: Callable[..., Any], v: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Force of a function of slip; where slip is a vector, in its direction and as large as that of its magnitude."""
+    """Force of a function of slip; for a vector in its direction, with the function's value at its magnitude."""
     if v.ndim == 0:
         return force(v)
     speed = safe_norm(v)

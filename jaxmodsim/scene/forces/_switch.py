@@ -1,4 +1,4 @@
-"""A force that changes at events of the user's own."""
+"""A force that changes at events of the user."""
 
 from collections.abc import Callable
 from functools import partial
@@ -19,16 +19,16 @@ def _force(value: object, *, name: str) -> Callable[..., Any] | None:
 
 
 class Switch(AbstractEffect):
-    """A force that changes where a function of time and state passes through zero, or an event without any force.
+    """A force that changes when a function of time and state passes through zero, or an event without a force.
 
     ```python
     spring = Switch(lambda t, q, qd, p: q[0], above=lambda t, q, qd, p: -p["k"] * q)  # acts where q[0] > 0
     pulse = Switch(lambda t, q, qd, p: t - p["begin"], above=lambda t, q, qd, p: p["F"])
     ```
 
-    The guard is one event function of the run. Each passage through zero ends a step, stands in `run.events`, and
-    contributes to derivatives (the saltation matrix), so that they hold by switching times and thresholds too. A
-    `jnp.where` in an `AppliedForce` gives none of these. Both forces are evaluated at all times and must be finite on
+    The guard is one event function of the run. Each passage through zero ends a step, is an entry of `run.events`, and
+    contributes to derivatives (the saltation matrix), so that derivatives of switching times and thresholds hold, too.
+    A `jnp.where` in an `AppliedForce` gives none of these. Both forces are evaluated at all times and must be finite on
     either side. A guard along which both forces push back to zero (sliding mode) ends the run as chatter.
 
     **Arguments:**
@@ -41,7 +41,7 @@ class Switch(AbstractEffect):
 
     **Raises:**
 
-    - `ValueError` if one of these is no function, or (at the run) returns a wrong shape.
+    - `ValueError` if one of these is not a function, or (at the run) returns a wrong shape.
     """
 
     guard: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Switch guard"))
@@ -56,7 +56,7 @@ class Switch(AbstractEffect):
 
     @property
     def stiff(self) -> bool:
-        """Its forces are taken to be smooth on either side."""
+        """Forces count as smooth on either side."""
         return False
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
@@ -79,19 +79,19 @@ class Switch(AbstractEffect):
         return None
 
     def act(self, t: Scalar, q: PerDof, qd: PerDof, z: PyTree, params: PyTree) -> Action:
-        """Unknown without the mode."""
+        """An error: the force depends on the mode."""
         raise ValueError(
             f"Switch {self.name or self.default_name!r} changes by events, so that position and velocity do not tell"
             " its force: run the scene by jaxmodsim.simulate, with an adaptive solver."
         )
 
     def act_on(self, side: Scalar, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Action:
-        """The force on this side of the guard, 1 above and -1 below; NaN where the guard is."""
+        """The force on this side of the guard, 1 above and -1 below; NaN if the guard is NaN."""
         above, below = (
             jnp.zeros_like(q) if fn is None else jnp.asarray(fn(t, q, qd, params), q.dtype)
             for fn in (self.above, self.below)
         )
-        # A guard that is not a number has no side: the run ends with a sentence instead of going on.
+        # A guard that is NaN has no side: the run ends with an error.
         force = jnp.where(jnp.isnan(self.value(t, q, qd, params)), jnp.nan, jnp.where(side > 0, above, below))
         return Action(force, force)
 
@@ -100,9 +100,9 @@ class Switch(AbstractEffect):
         return jnp.asarray(self.guard(t, q, qd, params), q.dtype)
 
     def power(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, action: Action) -> Power:
-        """All of it comes from outside."""
+        """All power comes from outside."""
         return Power(jnp.sum(action.generalised * qd))
 
     def stored_energy(self, z: PyTree) -> float:
-        """Nothing is stored."""
+        """A switch stores no energy."""
         return 0.0

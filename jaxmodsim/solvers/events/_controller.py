@@ -15,18 +15,18 @@ from .._equation import check_ode
 from .._wrapper import AbstractControllerWrapper
 from ._state import ACCUMULATION, TOO_MANY, EventState
 
-# Attempts in a row that may be rejected only because they do not resolve the guards: each is at most 0.9, at least 0.2
-# times as long as the one before. After that a guard that jumps is taken as it is.
+# Limit of successive attempts that are rejected only because they do not resolve the guards; each is 0.2 to 0.9 times
+# as long as the one before. After that the guards count as resolved: a guard may jump.
 _MAX_DOUBTS = 12
 _SHRINK, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
-# A step whose successor may be this much longer was not limited by its error.
+# The error did not limit a step if the next step may be this many times as long.
 _UNLIMITED = 5.0
 
 # The shortest step towards an event, in steps.
 _SHORTEST = 1e-9
-# An event this close ahead, in steps, is where the next step shall end.
+# The next step ends at an event that is at most this many steps ahead.
 _CLOSE = 0.1
-# A step whose successor is at least this much of it was wrong by little.
+# The error of a rejected step is small if the next attempt is at least this part of it.
 _MILD = 0.3
 
 _BACKWARD = "EventSolver runs forward in time, but t1 < t0: count time the other way, and negate the vector field."
@@ -35,11 +35,11 @@ _constant = jax.lax.stop_gradient
 
 
 class _ControllerState(NamedTuple):
-    """What the controller keeps.
+    """State of the controller.
 
     - `inner`: state of the wrapped controller.
-    - `usual`: step that the error last allowed where it was the error that limited it.
-    - `doubts`: how many attempts since the last accepted step were rejected because the guards were not resolved.
+    - `usual`: the last length of step that the error limited.
+    - `doubts`: number of attempts, since the last accepted step, that were rejected for unresolved guards.
     """
 
     inner: PyTree
@@ -50,18 +50,18 @@ class _ControllerState(NamedTuple):
 class EventController(AbstractControllerWrapper):
     """Wrap a step size controller so that steps end on the events that `EventSolver` sees.
 
-    A step that passes a root of a guard is rejected and aimed at it, until one lands; the step after an event is as
-    long as the error last allowed. A step that does not resolve the guards is made smaller. Everything else is the
-    wrapped controller's.
+    A step that passes a root of a guard is rejected and aimed at the root, until one lands. The step after an event is
+    as long as the error last allowed. A step that does not resolve the guards is repeated with a shorter length. The
+    wrapped controller decides all else.
 
-    A step ends at a root before it ends at one of the given `times`, and there before it ends at the end of the run:
-    a step that is aimed at a root is never made longer to reach a time that is close behind the root.
+    Roots take precedence over `times`, and `times` over the end of the run: a step that is aimed at a root is never
+    extended to a time just behind it.
 
     **Arguments:**
 
     - `controller`: any diffrax step size controller, adaptive or constant.
-    - `times`: increasing times at which a step shall end and a new start be made, shape `[n]`; None for none.
-    - `direction`: 1 where time is known to run forward; by default the run looks at it.
+    - `times`: increasing times at which a step ends and the method starts anew, shape `[n]`; None for none.
+    - `direction`: 1 if time is known to run forward; by default a run-time check.
 
     **Raises:**
 
@@ -91,7 +91,7 @@ class EventController(AbstractControllerWrapper):
     def init(
         self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, dt0: Any, args: PyTree, func: Any, error_order: Any
     ) -> tuple[Any, _ControllerState]:
-        """First step of the wrapped controller, on the part of the state that is integrated."""
+        """First step of the wrapped controller, which sees the integrated part of the state."""
         check_ode(terms, method="EventSolver")
         if not isinstance(y0, EventState):
             raise ValueError(
@@ -99,7 +99,7 @@ class EventController(AbstractControllerWrapper):
                 " pass events: leave the adjoint out, or take diffrax.ForwardMode()."
             )
         if not isinstance(self.direction, int):
-            # diffrax has turned the times where t1 < t0; the direction of a run of no length is -1, too.
+            # diffrax has negated the times if t1 < t0; the direction of a run of no length is -1, too.
             t0 = eqx.error_if(t0, (self.direction < 0) & (t0 < t1), _BACKWARD)
 
         def inner_func(terms: PyTree, t: Any, y: PyTree, args: PyTree) -> PyTree:
@@ -126,7 +126,7 @@ class EventController(AbstractControllerWrapper):
         controller_state: _ControllerState,
     ) -> tuple[Any, Any, Any, Any, _ControllerState, dfx.RESULTS]:
         """As the wrapped controller, but reject a step that passes an event or does not resolve the guards."""
-        old, seen = controller_state, y1_candidate.memory
+        old, seen = controller_state, y1_candidate.report
         keep, inner_t0, inner_t1, jump, inner, result = self.controller.adapt_step_size(
             t0, t1, y0.y, y1_candidate.y, args, y_error, error_order, old.inner
         )
@@ -143,7 +143,7 @@ class EventController(AbstractControllerWrapper):
         unlimited = proposed > _UNLIMITED * length
         usual = jnp.where(accept & ~unlimited, proposed, old.usual)
         step = jnp.minimum(proposed, jnp.clip(_SHRINK * factor, _SMALLEST, _LARGEST) * length)
-        # A step that failed by little still knows where the event is.
+        # A step with a small error still locates the event.
         near = proposed > _MILD * length
         step = jnp.where(keep, step, jnp.where(near, jnp.minimum(proposed, next_root * length), proposed))
         # Just in front of an event, go straight to it.

@@ -1,4 +1,4 @@
-"""Where functions of time that are known at five points of a step fall through zero, and how well that is known."""
+"""Roots of functions of time that are known at five points of a step, and the resolution of these roots."""
 
 from functools import reduce
 from typing import NamedTuple
@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..._core.arrays import fusion_barrier
 
-# Refinements of a root. It only says where the next attempt of a step shall end.
+# Newton iterations for a root, which is only the end of the next attempt.
 _REFINEMENTS = 4
 # A root this close to the start of a step, in steps, is at the start.
 _ZERO = 1e-3
@@ -31,14 +31,14 @@ Flags = Bool[Array, " n"]
 
 
 class GuardScan(NamedTuple):
-    """What five values of a function in a step say about it, elementwise.
+    """Properties of functions, elementwise, from five values of each in a step.
 
-    - `armed`: whether it counts as positive at some time of the step.
+    - `armed`: whether the function counts as positive at some time of the step.
     - `crosses`: whether it falls through zero after it was positive or armed.
-    - `root`: where it does so first, as a fraction of the step, roughly; 1 where it does not.
-    - `ahead`: how far behind the end it would do so if it went on straight, or how far before the end it would have
-      done so (negative), in steps; infinite where it does not fall.
-    - `step_factor`: by which factor the length of the step may change before the values say too little.
+    - `root`: estimate of its first fall, as a fraction of the step; 1 without one.
+    - `ahead`: distance in steps from the end to the root of its tangent there, negative before the end; infinite if the
+      function does not fall.
+    - `step_factor`: the factor by which the length of the step may change before it no longer resolves the function.
     - `landing_factor`: the same for a step that ends on a root of the function.
     - `cubic`: the coefficients of the cubic through the values.
     """
@@ -52,7 +52,7 @@ class GuardScan(NamedTuple):
     cubic: tuple[Numbers, Numbers, Numbers, Numbers]
 
     def slopes(self, place: Array) -> tuple[Numbers, Numbers]:
-        """First and second derivative of the cubic at this place, in steps."""
+        """First and second derivative of the cubic at a fraction `place` of the step, in steps."""
         _, c1, c2, c3 = self.cubic
         return c1 + place * (2.0 * c2 + place * 3.0 * c3), 2.0 * c2 + place * 6.0 * c3
 
@@ -67,12 +67,12 @@ def scan_guards(
 ) -> GuardScan:
     """First fall through zero of functions known at 0, 1/3, 1/2, 2/3 and 1 of a step.
 
-    Between the points each is the cubic through the first, second, fourth and fifth, whose own minimum, unless it may
-    be due to the error of the cubic, counts as another point. A function that is not armed must be seen positive, or
-    rise from zero at the start, before it can fall.
+    Between the points a function is the cubic through its first, second, fourth and fifth value. The minimum of the
+    cubic counts as another point, unless the error of the cubic may have made it. A function that is not armed must be
+    positive at a point, or rise from zero at the start, before it can fall.
 
     The value in the middle gives the error of the cubic. A step is resolved if third difference and error are small
-    beside the range of the values, so that no oscillation is taken for a slow change, and beside the headroom: the
+    against the range of the values, so that no oscillation looks like a slow change, and against the headroom: the
     least distance from zero inside the step.
 
     **Arguments:**
@@ -81,9 +81,9 @@ def scan_guards(
     - `middle`: at 1/2, shape `[n]`.
     - `armed`: whether a function counts as positive at the start, whatever its value there. If it is armed, not
       positive and does not rise, it falls at once.
-    - `tolerances`: size of what need not be seen, relative to the largest magnitude in the step, and absolute.
-    - `blur`: rounding error of the places in the step.
-    - `unit`: a one, see `once`.
+    - `tolerances`: depth of a fall that may be missed, relative to the largest magnitude in the step, and absolute.
+    - `blur`: rounding error of the points, as a fraction of the step.
+    - `unit`: an `opaque_one`.
 
     **Returns:**
 
@@ -102,7 +102,7 @@ def scan_guards(
     rtol = jnp.maximum(rtol, _ROUNDING * float(jnp.finfo(third.dtype).eps))
     tolerance = rtol * jnp.maximum(jnp.abs(high), jnp.abs(low)) + atol + blur * spread
 
-    # The minimum of a cubic, in the form of the quadratic formula that stays exact as c3 goes to zero.
+    # The minimum of a cubic, by the form of the quadratic formula that is accurate for small c3.
     discriminant = c2 * c2 - 3.0 * c1 * c3
     denominator = c2 + jnp.sqrt(jnp.where(discriminant > 0, discriminant, 1.0))
     inside = (discriminant > 0) & (denominator > 0) & (c1 < 0) & (-c1 < denominator)
@@ -111,7 +111,7 @@ def scan_guards(
 
     error = _LARGEST * jnp.abs(middle - (g0 + 0.5 * (c1 + 0.5 * (c2 + 0.5 * c3))))
 
-    # Points in the order of time, the minimum among them; the first one below zero closes the bracket.
+    # Points from the last to the first, the minimum among them: the first one below zero closes the bracket.
     rises = (c1 > 0) & (g0 >= -_ZERO * c1)
     high1 = armed | rises
     high_middle = high1 | (g1 > 0)
@@ -140,7 +140,7 @@ def scan_guards(
     for point, value in ((1 / 3, g1), (1 / 2, middle), (2 / 3, g2)):
         later = (point < end) & (value > 0)
         start, high = jnp.where(later, point, start), jnp.where(later, value, high)
-    # Not left of the middle: a function that rises from zero at the start has a root there that is not meant.
+    # Not left of the middle of the bracket: a function that rises from zero has a root at the start, which is no fall.
     secant = start + (end - start) * jnp.clip(high / jnp.where(high > low, high - low, 1.0), 0.5, 1.0)
     at_once = armed & (g0 <= 0) & (g1 < 0) & (c1 <= 0)
     root = fusion_barrier(jnp.where(crosses, jnp.where(at_once, 0.0, secant), 1.0), unit)
@@ -165,9 +165,9 @@ def scan_guards(
 def _step_factors(
     third: Numbers, error: Numbers, spread: Numbers, headroom: Numbers, tolerance: Numbers
 ) -> tuple[Numbers, Numbers]:
-    """By which factors the length of the step may change: anyhow, and where it ends on a root.
+    """Admissible factors of the length of the step: in general, and for a step that ends on a root.
 
-    The third difference goes with the third power of the step, the error of the cubic with the fourth.
+    The third difference scales with the third power of the step, the error of the cubic with the fourth.
     """
     cubic = jnp.minimum(_CUBIC_OF_RANGE * spread, _CUBIC_OF_HEADROOM * headroom) + tolerance
     quartic = jnp.minimum(_ERROR_OF_RANGE * spread, _ERROR_OF_HEADROOM * headroom) + tolerance
@@ -182,7 +182,7 @@ def _ratio(allowed: Numbers, size: Numbers) -> Numbers:
 def first_root(scan: GuardScan, passed: Flags) -> Float[Array, ""]:
     """The earliest root in a step among the functions that `passed` marks; 1 if it marks none.
 
-    Which function is the first is judged by the rough roots; its own is then refined by Newton's iteration.
+    The estimates of the roots decide which function is the first; Newton's iteration refines its root.
     """
     rough = jnp.where(passed, scan.root, 1.0)
     first = jnp.min(rough)
@@ -197,12 +197,12 @@ def first_root(scan: GuardScan, passed: Flags) -> Float[Array, ""]:
 
 
 def instant(resolution: Array) -> Array:
-    """How long [time] before an event a saved time is that of the event, where time has this resolution."""
+    """Interval [time] before an event within which a saved time counts as that of the event."""
     return max(_INSTANT, _INSTANT_OF_ROOT / float(jnp.finfo(resolution.dtype).eps) ** 0.5) * resolution
 
 
 def arrives(seen: GuardScan, end: Array, root: Array, resolution: Array) -> Flags:
-    """Which guards are at their events within an instant, though not yet at zero, and come from above.
+    """Which guards fall from above and reach their events within an `instant`, though they are not yet at zero.
 
     `resolution` is that of time, in steps.
     """

@@ -9,26 +9,26 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-# What the step and the passage measure of the way to a root may differ by this factor.
+# Factor by which the distance to a root in the step and in the passage may differ.
 LATITUDE = 4.0
 
 # Evaluations: at the end of the step, halfway, at the root; after the reset there, halfway, at the end of the step.
 _ROOT, _RESET, _LAST, _COUNT = 2, 3, 4, 6
-# Where the next evaluation is, in ways from the end of the step, or from the root; at the root by the rest.
+# Position of the next evaluation, in ways from the end of the step, or from the root; at the root the remaining way.
 _SHARES = (0.5, 1.0, 0.0, -0.5, -1.0, 0.0)
 
 _constant = jax.lax.stop_gradient
 
 
 class Landed(NamedTuple):
-    """Where a step ended.
+    """End of a step on an event.
 
     - `t`, `y`, `mode`: the end of the step.
-    - `first`: marks the guard whose root the event is, shape `[guards]`.
+    - `first`: marks the guard whose root is the event, shape `[guards]`.
     - `fall`: the value of that guard at its root, and its rate along the motion; constant.
     - `on_root`: whether it has a root.
-    - `near`: how far the root may be [time].
-    - `earliest`: time before which the event cannot be.
+    - `near`: the largest distance of the root [time].
+    - `earliest`: lower bound of the time of the event.
     """
 
     t: Float[Array, ""]
@@ -42,7 +42,7 @@ class Landed(NamedTuple):
 
 
 class Passage(NamedTuple):
-    """What happened.
+    """An event.
 
     - `t`: time of the event.
     - `before`: y before the reset; the mode is that of the step.
@@ -58,7 +58,7 @@ class Passage(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """Between two evaluations: where the next one is, where this half of the way began, and how long it is."""
+    """State between two evaluations: the next point, the origin of this half of the way, and its length."""
 
     t: Float[Array, ""]
     y: PyTree
@@ -76,17 +76,17 @@ def pass_event(
 ) -> Passage:
     """Carry a state from the end of a step to the root of a guard, reset it, and carry it back.
 
-    The way to the root is zero but for the error of the landing; its derivatives are those of the time of the event, to
-    second order, so that those of the result are exact: two Newton steps with one rate, on flows of second order.
+    The way to the root is as short as the error of the landing. Its first and second derivatives are those of the time
+    of the event: it takes two Newton steps with one rate, on flows of second order.
 
-    Field and guards are evaluated in a loop, which is compiled once, and differentiated once. Its derivative in reverse
-    mode evaluates them again: what they keep else are hundreds of numbers.
+    A loop evaluates field and guards, so that they are compiled once, and differentiated once. Reverse mode evaluates
+    them again, because their residuals are hundreds of numbers.
 
     **Arguments:**
 
-    - `landed`: where the step ended.
+    - `landed`: the end of the step.
     - `evaluate`: `evaluate(t, y, mode, args)` -> the rate of y, and the guards.
-    - `args`: those before and after the event.
+    - `args`: arguments before and after the event.
     - `reset`: `reset(t, y)` -> y and mode after the event.
     """
     level, rate = landed.fall
@@ -101,7 +101,7 @@ def pass_event(
         origin = _choose(begins, (t, y), place.origin)
         rates, guards = evaluate(t, y, mode, _choose(behind, args[1], args[0]))
         newton = (level - jnp.sum(jnp.where(landed.first, guards, 0.0))) / rate
-        # A guard that a reset has violated fires where it stands: it has no root here, or one before that reset.
+        # A guard that a reset has violated fires at the end of the step: it has no root here, or one before the reset.
         on_root = jnp.where(
             i == 0,
             landed.on_root
@@ -133,5 +133,5 @@ def pass_event(
 
 
 def _choose(where: Bool[Array, ""], one: PyTree, other: PyTree) -> PyTree:
-    """`one` or `other`; what is the same in both stays as it is."""
+    """`one` or `other`, without an operation on leaves that are the same object in both."""
     return jtu.tree_map(lambda a, b: a if a is b else jnp.where(where, a, b), one, other)

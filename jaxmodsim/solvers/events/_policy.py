@@ -1,4 +1,4 @@
-"""The two kinds of guards: crossings that are noted, and conditions that have to hold."""
+"""The two kinds of guards: crossings, and conditions that have to hold."""
 
 import abc
 from collections.abc import Callable
@@ -9,18 +9,18 @@ from jaxtyping import Array, Bool, Float
 
 from ._guard_scan import GuardScan
 
-# Where a step is to end if conditions have to hold after it: this part of the landing distance behind the root, and at
-# most this part of what is left of the step. In front of the root is no motion after the event: a slip that begins
-# touches rest there, and would end again.
+# End of a step if conditions have to hold after it: this part of the landing distance behind the root, at most this
+# part of the rest of the step. The motion after the event does not exist before the root: a slip that begins would
+# touch rest there, and end again.
 _BEYOND, _BEYOND_OF_REST = 0.3, 0.5
-# Within 100 rounding units of time before the end of a run diffrax ends no step.
+# diffrax ends no step within 100 rounding units of time before the end of a run.
 _UNPLACED = 128.0
 
 Flags = Bool[Array, " guards"]
 
 
 class AbstractGuardPolicy(eqx.Module):
-    """When a guard is armed, when it fires at the end of a step, and where a step towards its root is to end."""
+    """Conditions under which a guard is armed and fires, and the end of a step towards its root."""
 
     @abc.abstractmethod
     def armed_at_start(self, guard: Float[Array, " guards"]) -> Flags:
@@ -28,25 +28,25 @@ class AbstractGuardPolicy(eqx.Module):
 
     @abc.abstractmethod
     def fires(self, here: Flags, scan: GuardScan, end: Array, length: Array, t1: Array) -> Flags:
-        """Which guards fire at the end of a step, if those that are `here` are on a root; `end` are their values."""
+        """Which guards fire at the end of a step; those that are `here` are on a root, `end` are their values."""
 
     @abc.abstractmethod
     def next_end(self, root: Array, passed: Array, near: tuple[Array, Array]) -> Array:
-        """Where a step is to end that goes to `root`, in steps of this one.
+        """End of the next step towards `root`, in steps of this one.
 
-        `passed` says whether this step has passed the root; `near` are the landing distance and the length of a step.
+        `passed`: whether this step has passed the root. `near`: the landing distance and the length of a step.
         """
 
     @abc.abstractmethod
     def armed_after(self, clear: Flags, fired: Flags, armed: Flags, rises: Callable[[], Flags]) -> Flags:
         """Which guards are armed after an event.
 
-        Those are `clear` that are far enough above zero; `rises()` says which of them rise from the reset.
+        `clear`: the guards that are far enough above zero. `rises()`: the guards that rise from the reset.
         """
 
 
 class Crossings(AbstractGuardPolicy):
-    """Guards whose falls through zero are noted, each once."""
+    """Guards whose falls through zero count, each once."""
 
     def armed_at_start(self, guard: Float[Array, " guards"]) -> Flags:
         """Those that are positive."""
@@ -63,7 +63,7 @@ class Crossings(AbstractGuardPolicy):
         return root
 
     def armed_after(self, clear: Flags, fired: Flags, armed: Flags, rises: Callable[[], Flags]) -> Flags:
-        """What rises from the reset will fall again, be it as low as rounding."""
+        """A guard that rises from the reset will fall again, even if it is as small as rounding."""
         return clear | (~fired & armed) | (fired & rises())
 
 

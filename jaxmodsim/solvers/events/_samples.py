@@ -1,58 +1,38 @@
 """Jumps of sampled values at times that are known."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..._core.arrays import is_one_of
-
-
-class Landing(NamedTuple):
-    """How a step ends, as regards events.
-
-    - `fired`, `first`: the guards that fire, and the one of them that does so first, shape `[guards]`.
-    - `missed`: whether the step has passed a root.
-    - `landed`: whether it ends on one.
-    - `happens`: whether the state is to be reset.
-    - `next_root`: see `EventMemory`.
-    - `near`: how far the root may be from the end of the step, in steps.
-    """
-
-    fired: Bool[Array, " guards"]
-    first: Bool[Array, " guards"]
-    missed: Bool[Array, ""]
-    landed: Bool[Array, ""]
-    happens: Bool[Array, ""]
-    next_root: Float[Array, ""]
-    near: Float[Array, ""]
+from ._state import Landing
 
 
 class SampledJumps(eqx.Module):
-    """What `EventSolver` has to know of arguments that hold sampled values.
+    """Sampled values in the arguments of a run with events.
 
     **Arguments:**
 
-    - `freeze_args`: `freeze_args(t0, args)` -> `args` of a step that begins at t0, without what jumps at its end; the
-      reset at the end of the step gets `args` as they are.
-    - `times`: at which fields and guards jump, increasing, shape `[n]`, among the `times` of the controller; None for
-      none. There `reset` is called, with no guard marked, and what it changes of the modes is an event.
+    - `freeze_args`: `freeze_args(t0, args)` -> `args` of a step that begins at t0, without the jump at its end; the
+      reset at the end of the step gets `args` themselves.
+    - `times`: times at which fields and guards jump, increasing, shape `[n]`, among the `times` of the controller; None
+      for none. `reset` is called there with no guard marked; a change of the modes is an event.
     """
 
     freeze_args: Callable[[Array, PyTree], PyTree]
     times: Float[Array, " n"] | None = None
 
     def at(self, t: Array, length: Array) -> Bool[Array, ""] | None:
-        """Whether a step of this length ends on a jump; None if no step does."""
+        """Whether a step of this length ends on a jump; None without jumps."""
         return None if self.times is None else is_one_of(self.times, t) & (length > 0)
 
 
 def on_jump(landing: Landing, jumps: Bool[Array, ""]) -> Landing:
     """The landing of a step that may end on a jump.
 
-    What was in sight is no more, and the root of a guard that fires with the jump is the jump.
+    The estimate of the next root is void after the jump. The root of a guard that fires with the jump is the jump.
     """
     resets = jumps & ~landing.missed
     return landing._replace(

@@ -16,32 +16,32 @@ from .._wrapper import AbstractSolverWrapper
 from ._guard_scan import GuardScan, arrives, first_root, instant, scan_guards
 from ._passage import LATITUDE, Landed, pass_event
 from ._policy import AbstractGuardPolicy, Conditions, Crossings
-from ._samples import Landing, SampledJumps, on_jump
-from ._state import ACCUMULATION, ONGOING, TOO_MANY, EventLog, EventMemory, EventState, write
+from ._samples import SampledJumps, on_jump
+from ._state import ACCUMULATION, ONGOING, TOO_MANY, EventLog, EventMemory, EventState, Landing, StepReport, write
 
-# How far beside the root a step may end, as a fraction of the last steps, and of the time since the last event; from
-# there the state is carried to the root, with an error of the third power of that distance.
+# Landing distance, the largest distance of the end of a step from a root, as a fraction of the last steps, and of the
+# time since the last event. The state is carried over that distance with an error of its third power.
 _LANDING, _LANDING_OF_INTERVAL = 1e-5, 1e-2
-# A step this much shorter than the last ones has no length.
+# A step that is at most this part of the last ones counts as one without length.
 _SHORT = 1e-6
 # Events accumulate where the longest of the last intervals is below this part of the time since the start, times the
 # square root of the rounding unit.
 _ACCUMULATION = 1e-3
-# Weights that the last intervals between events, and the last steps, keep at each new one. Of intervals it is small:
-# those of a ball that gives little back are rounding before a larger weight has forgotten the first of them.
+# Weights of the last intervals between events, and of the last steps, at each new one. That of intervals is small: the
+# intervals of a ball with little restitution are rounding before a larger weight has forgotten the first of them.
 _FORGET_INTERVALS, _FORGET_STEPS = 0.05, 0.25
 # A step counts as no longer than this many of those before it.
 _GROW = 2.0
-# Events that few do not accumulate.
+# Fewer events than this do not accumulate.
 _FEWEST = 8
 
 _constant = jax.lax.stop_gradient
 
 
 class _EventInterpolation(dfx.AbstractLocalInterpolation):
-    """Dense output of the wrapped solver inside a step; from the event at its end on the state after that.
+    """Dense output of the wrapped solver inside a step, and the state after the event from that event on.
 
-    `event` is the time from which on that state holds, and the rate of y there.
+    `event` is the time from which the state after it holds, and the rate of y there.
     """
 
     t0: Any
@@ -62,7 +62,7 @@ class _EventInterpolation(dfx.AbstractLocalInterpolation):
 
 
 class _Field(eqx.Module):
-    """Vector field of the part that is integrated; the state it belongs to comes with the arguments."""
+    """Vector field of the integrated part; the arguments hold the state that it belongs to."""
 
     terms: PyTree
 
@@ -74,7 +74,7 @@ class _Field(eqx.Module):
 class EventSolver(AbstractSolverWrapper):
     """Wrap a diffrax solver so that the solution passes through events: resets, changes of mode, counters.
 
-    To be used together with `EventController`:
+    Use it together with `EventController`:
 
     ```python
     def field(t, s, args):  # s.y is integrated, s.mode is constant between events
@@ -95,68 +95,66 @@ class EventSolver(AbstractSolverWrapper):
     solution.ys.y, solution.ys.log.t
     ```
 
-    Saving, dense output, progress meters and adjoints of diffrax work as without events, but for `BacksolveAdjoint`,
-    whose adjoint equation knows of no resets. Time runs forward.
+    Saving, dense output, progress meters and adjoints of diffrax work as without events, except `BacksolveAdjoint`,
+    whose adjoint equation has no resets. Time runs forward.
 
-    **What an event is.** Let `g_i(t)` be guard i along the solution on `[t0, t1]`. A guard is *armed* or waits. It
+    **Events.** Let `g_i(t)` be guard i along the solution on `[t0, t1]`. A guard is *armed* or waits. It
     fires at the first `t_event > t0` where it is armed, `g_i(t_event) = 0`, and `g_i < 0` right after: events are
-    crossings from above to below (give `-g` for the other direction, both for both). An event at `t0` itself does not
-    fire, one at `t1` does, so that runs over `[t0, t1]` and `[t1, t2]` together have the events of one over
-    `[t0, t2]`.
+    crossings from above to below (pass `-g` for the other direction, both for both). An event at `t0` itself does not
+    fire, one at `t1` does, so that runs over `[t0, t1]` and `[t1, t2]` together have the events of one over `[t0, t2]`.
 
     - *At the start* the guards with `g_i(t0) > 0` are armed. The others wait until they are positive: a guard that is
       violated on entry, or zero and falling, does not fire; one that is zero and rising is armed as it rises.
     - *At an event* all armed guards whose roots lie within the landing distance (1e-5 of a step) of the first one
-      fire together, in one call of `reset` with all of them marked in `fired`. Later roots in the same step are looked
-      for again after the reset.
-    - *After an event* the guards that fired wait until they are positive, so that each crossing fires once; those that
-      were armed stay so. A guard that the reset has made negative therefore fires at once. In such a chain
-      the derivatives take the times of the later events for fixed; a `reset` that settles everything in one
-      call is exact.
+      fire together, in one call of `reset` with all of them marked in `fired`. Later roots in the same step are
+      searched again after the reset.
+    - *After an event* the guards that fired wait until they are positive, so that each crossing fires once; other armed
+      guards stay armed. A guard that the reset has made negative therefore fires at once. In such a chain
+      the derivatives treat the times of the later events as constants; a `reset` that does everything in one
+      call has exact derivatives.
     - *With `enforce`* all guards are armed at all times: one that is violated at the start fires at once, and one that
       its own reset leaves violated fires again and again, until the events accumulate.
     - *Within a step* a guard is the cubic through its values at 0, 1/3, 2/3 (from dense output) and 1. Its value at 1/2
-      tells the error of the cubic, and a step in which error or cubic share are not small beside the variation of the
-      guard and its distance from zero is made smaller (up to twelve times, which is where a guard that jumps is taken
-      as it is). So a guard that is smooth on the scale of the steps is resolved to `rtol` where it comes near to zero,
-      whether or not anything that is integrated moves. What remains undetectable is what happens between the five
-      points and shows at none of them: a spike in a guard that was at rest before. Let a step end there (`dtmax`, or
-      `times` of the controller).
+      gives the error of the cubic. A step is repeated with a shorter length if error or third difference are not small
+      against the variation of the guard and its distance from zero (at most twelve times, for guards that jump). A
+      guard that is smooth on the scale of the steps is therefore resolved to `rtol` near zero, whether or not the
+      integrated state moves. A spike between the five points that shows at none of them is not detected. Let a step end
+      there (`dtmax`, or `times` of the controller).
 
     The event is located on steps of the solver, not on its dense output: a step that passes a root is
-    rejected and ends on it. The saved value at an event, and at t1 if that is one, is the one after the reset; times
-    that differ by 1e-12 of their value are one (64 rounding units in float32).
+    rejected, and repeated to end on the root. The saved value at an event, and at t1 if that is one, is the one after
+    the reset; times that differ by 1e-12 of their value are equal (64 rounding units in float32).
 
     **Derivatives.** From the end of the step the state is carried to the root, reset there, and carried back with the
-    new field. The way is zero but for the landing error, while its derivative is that of the event's time: the result
+    new field. The way is as short as the landing error, and its derivative is that of the event time: the result
     is the saltation matrix `DR + (f_plus - DR f_minus - D_t R) (x) Dg / (D_t g + Dg f_minus)`, and times in the log are
-    differentiable. Second derivatives hold too, where the adjoint gives any. A guard that touches zero without crossing
-    (grazing) has no derivative.
+    differentiable. Second derivatives hold too, if the adjoint supports them. A guard that touches zero without
+    crossing (grazing) has no derivative.
 
-    **Where events accumulate** (a ball coming to rest, chatter): if the last intervals between events shrink below 1e-3
-    sqrt(eps) of the time since the start, the run ends with `status = 1` in the state and diffrax's result
-    `dt_min_reached`; with `on_zeno`, that function takes the place of `reset` there, and guards that are not positive
+    **Accumulation of events** (a ball that comes to rest, chatter): if the last intervals between events fall below
+    1e-3 sqrt(eps) of the time since the start, the run ends with `status = 1` in the state and diffrax's result
+    `dt_min_reached`. With `on_zeno`, that function replaces `reset` there, and guards that are not positive
     after it wait. After `max_events` events the next one ends the run with `status = 2` and `max_steps_reached`.
 
     **Arguments:**
 
     - `solver`: the diffrax solver of an `ODETerm`: explicit, `Rodas5P`, `diffrax.Kvaerno5`.
-    - `guards`: `guards(t, s, args)` -> shape `[guards]`; `s` is an `EventState` of which `s.y` and `s.mode` are yours.
-      Or a tuple of that and, of the same shape, by how much each guard may be wrong beside `rtol` of its magnitude,
-      and the value that it has at its event: it fires at zero, below that, so that rounding does not fire it again;
-      times in between hold the state after the event.
+    - `guards`: `guards(t, s, args)` -> shape `[guards]`; `s` is an `EventState` with your `s.y` and `s.mode`. Or a
+      tuple of that and two arrays of the same shape: the error that each guard may have beside `rtol` of its magnitude,
+      and its value at its event. The guard fires at zero, below that value, so that rounding does not fire it again;
+      times in between have the state after the event.
     - `reset`: `reset(t, s, args, fired)` -> `s` with another `y` or `mode` (by `s._replace`); `fired` are booleans,
       shape `[guards]`.
     - `on_zeno`: as `reset`, for events that accumulate; by default the run ends there.
     - `project`: `project(t, s, args)` -> `s`, applied after every step, for invariants that drift.
-    - `enforce`: whether the guards are conditions that have to hold, not crossings that are to be noted.
-    - `samples`: a `SampledJumps` where `args` hold sampled values; None where they do not.
-    - `rtol`: the part of its largest magnitude in a step by which a guard may fall below zero, and return, unseen.
-    - `event_mode`: `event_mode(mode)` -> what of the mode an event changes; a reset that changes other parts of it
-      alone, as to choose other coordinates, is no event. By default all of it.
+    - `enforce`: whether the guards are conditions that have to hold, instead of crossings.
+    - `samples`: a `SampledJumps` if `args` hold sampled values.
+    - `rtol`: the part of its largest magnitude in a step by which a guard may fall below zero, and return, undetected.
+    - `event_mode`: `event_mode(mode)` -> the part of the mode that an event changes. A reset that changes only other
+      parts, such as the choice of coordinates, is no event. By default all of it.
     - `max_events`: limit of the number of events, > 0.
-    - `log`: number of entries of the `EventLog` that the state carries; later events are counted, not logged. By
-      default `max_events`; with 0 there is no log.
+    - `log`: number of entries of the `EventLog` in the state; later events are counted, not logged. By default
+      `max_events`; 0 for no log.
 
     ??? cite "Reference"
 
@@ -170,7 +168,7 @@ class EventSolver(AbstractSolverWrapper):
         ```
     """
 
-    # Wider than `ODETerm`, so that `EventController` refuses other terms by a sentence.
+    # Wider than `ODETerm`, so that `EventController` refuses other terms with its own error.
     term_structure: ClassVar = dfx.AbstractTerm
     solver: dfx.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
     guards: Callable[..., Any]
@@ -199,33 +197,32 @@ class EventSolver(AbstractSolverWrapper):
         return Conditions() if self.enforce else Crossings()
 
     def start(self, t0: Any, y0: PyTree, mode: PyTree = None, args: PyTree = None) -> EventState:
-        """State to begin with, to be passed to `diffeqsolve` as `y0`.
+        """Initial state, the `y0` of `diffeqsolve`.
 
         **Arguments:**
 
         - `t0`: start time.
-        - `y0`: what the vector field integrates, any pytree.
-        - `mode`: what is constant between events (modes, counters), any pytree of numbers; they become floating.
+        - `y0`: the part that the vector field integrates, any pytree.
+        - `mode`: the part that is constant between events (modes, counters), any pytree of numbers; they become
+          floating.
         - `args`: as for `diffeqsolve`.
         """
         y0, mode = jtu.tree_map(_real, (y0, mode))
         zero = jnp.zeros((), jnp.result_type(t0, *jtu.tree_leaves(y0)))
         t0 = jnp.asarray(t0, zero.dtype)
         one = zero + 1.0
-        memory = EventMemory(zero, zero, zero, zero, zero, one, one)
-        state = EventState(y0, mode, t0, zero, zero, zero, None, memory)
-        guard = self._guards(t0, state, args)
+        state = EventState(y0, mode, t0, zero, zero, zero, None, StepReport(zero, one, one))
+        guard = eqx.filter_eval_shape(self._guards, t0, state, args)
         log = None
         entries = self.max_events if self.log is None else self.log
         if entries:
 
-            def rows(x: Array) -> Array:
+            def rows(x: Any) -> Array:
                 return jnp.zeros((entries, *x.shape), x.dtype)
 
             pair = jtu.tree_map(rows, (y0, mode))
             log = EventLog(jnp.full(entries, jnp.inf, zero.dtype), rows(guard), pair, pair)
-        memory = memory._replace(guard=guard, armed=_flags(self._policy.armed_at_start(guard), guard))
-        return state._replace(fired=jnp.zeros_like(guard), log=log, memory=memory)
+        return state._replace(fired=jnp.zeros(guard.shape, guard.dtype), log=log)
 
     def _guards(self, t: Any, state: EventState, args: PyTree) -> Float[Array, " guards"]:
         return self._guards_and_limits(t, state, args)[0]
@@ -244,15 +241,17 @@ class EventSolver(AbstractSolverWrapper):
         return self.solver.func(dfx.ODETerm(_Field(terms)), t0, y0.y, (y0, args))
 
     def init(self, terms: PyTree, t0: Any, t1: Any, y0: EventState, args: PyTree) -> Any:
-        """State of the wrapped solver, the longest of the last steps, and a time one first step before the start."""
+        """State of the wrapped solver, and an `EventMemory`."""
         inner = self.solver.init(dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0, args))
-        return inner, _constant(t1 - t0), _constant(t0 - (t1 - t0))
+        guard, first = self._guards(*_held((t0, y0, args))), _constant(t1 - t0)
+        none, armed = jnp.zeros((), int), self._policy.armed_at_start(guard)
+        return inner, EventMemory(guard, armed, none, jnp.zeros_like(first), first, _constant(t0 - (t1 - t0)))
 
     def step(
         self, terms: PyTree, t0: Any, t1: Any, y0: EventState, args: PyTree, solver_state: PyTree, made_jump: Any
     ) -> tuple[EventState, PyTree, dict[str, PyTree], PyTree, dfx.RESULTS]:
-        """A step of the wrapped solver, a look at the guards along it, and the reset where it ends on an event."""
-        inner, pace, begin = solver_state
+        """A step of the wrapped solver, a scan of the guards along it, and the reset where it ends on an event."""
+        inner, memory = solver_state[0], _held(solver_state[1])
         whole, args = args, args if self.samples is None else self.samples.freeze_args(t0, args)
         y1, error, dense, inner, result = self.solver.step(
             dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0._replace(log=None), args), inner, made_jump
@@ -261,50 +260,45 @@ class EventSolver(AbstractSolverWrapper):
             y1, error = projected(y1, error, self.project(t1, y0._replace(y=y1), args).y)
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
         unit = opaque_one(_constant(t1 - t0))
-        # Around t0 = 0 the resolution of time is that of the step itself.
+        # Near t0 = 0 the resolution of time is that of the step itself.
         length = _constant(t1 - t0)
         resolution = 4.0 * float(jnp.finfo(length.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-        seen, end, root = self._look(path, (t0, t1), y0._replace(y=y1), args, resolution)
-        # Where nothing moves steps grow without measure, and tell nothing of the motion that the event begins.
-        measure = jnp.minimum(length, _GROW * pace)
+        seen, end, root = self._look(path, (t0, t1), y0._replace(y=y1), memory, args, resolution)
+        # At rest steps grow without limit, and their length says nothing about the motion after the event.
+        measure = jnp.minimum(length, _GROW * memory.pace)
         jumps = None if self.samples is None else self.samples.at(t1, length)
-        landing = self._land(seen, (end, root), (t1, length, resolution, y0.t), (measure, pace), jumps)
+        landing = self._land(seen, (end, root), (t1, length, resolution, y0.t), (measure, memory.pace), jumps)
         next_root = fusion_barrier(landing.next_root, unit)
-        landed = fusion_barrier(_flags(landing.landed, next_root), unit) > 0.5
-        landing = landing._replace(next_root=next_root, landed=landed, happens=landed)
+        landed = fusion_barrier(_flags(landing.landed, next_root), unit)
+        landing = landing._replace(next_root=next_root, landed=landed > 0.5, happens=landed > 0.5)
         if jumps is not None:
             landing = on_jump(landing, jumps)
         step_factor = jnp.min(jnp.where(landing.fired, seen.landing_factor, seen.step_factor))
-        memory = y0.memory._replace(
-            guard=end,
-            armed=_flags(seen.armed, end),
-            landed=_flags(landed, next_root),
-            next_root=landing.next_root,
-            step_factor=fusion_barrier(step_factor, unit),
-        )
-        state1 = y0._replace(y=y1, memory=memory)
-        state1, (t_event, slope) = jax.lax.cond(
+        report = StepReport(landed, landing.next_root, fusion_barrier(step_factor, unit))
+        pace = jnp.maximum(measure, _FORGET_STEPS * memory.pace)
+        at_end = y0._replace(y=y1, report=report), memory._replace(guard=end, armed=seen.armed, pace=pace)
+        (state1, memory), (t_event, slope) = jax.lax.cond(
             landing.happens,
-            lambda: self._jump(terms, t1, state1, landing, (root, landing.near * length, begin), (args, whole)),
-            lambda: (state1, (jnp.asarray(t1), jtu.tree_map(jnp.zeros_like, y1))),
+            lambda: self._jump(terms, t1, at_end, landing, (root, landing.near * length), (args, whole)),
+            lambda: (at_end, (jnp.asarray(t1), jtu.tree_map(jnp.zeros_like, y1))),
         )
         begins = jnp.where(landing.happens, _constant(t_event) - instant(resolution), t1)
         dense = {"inner": dense, "state0": y0, "state1": state1, "event": (begins, slope)}
-        pace = jnp.maximum(measure, _FORGET_STEPS * pace)
-        return state1, error, dense, (inner, pace, begin), result
+        return state1, error, dense, (inner, memory), result
 
     def _look(
         self,
         path: dfx.AbstractLocalInterpolation,
         times: tuple[Array, Array],
         state: EventState,
+        memory: EventMemory,
         args: PyTree,
         resolution: Array,
     ) -> tuple[GuardScan, Float[Array, " guards"], Float[Array, " guards"]]:
-        """What the guards do in a step that ends at `state`, their values there, and those that they have at events."""
+        """Scan of the guards in a step that ends at `state`, their values there, and their values at events."""
         t0, t1 = times
         places = [t0 + (t1 - t0) * part for part in (1 / 3, 1 / 2, 2 / 3)]
-        # Constant before the guards are evaluated, so that nothing of them is differentiated.
+        # Constants, so that the guards have no derivative.
         state, args, ends = _held((state, args, [(t, path.evaluate(t)) for t in places] + [(t1, state.y)]))
         looks = jtu.tree_map(lambda *x: jnp.stack(x), *ends)
         values, atol, root = jax.lax.map(
@@ -312,12 +306,11 @@ class EventSolver(AbstractSolverWrapper):
         )
         unit = opaque_one(_constant(t1 - t0))
         one, middle, two, end = fusion_barrier(_constant([*values]), unit)
-        # Where limits vanish at one end of the step, the other tells their size.
+        # If limits vanish at one end of the step, the other end gives their size.
         tolerances = jnp.asarray(_constant(self.rtol), end.dtype), _constant(jnp.maximum(atol[0], atol[-1]))
         length = _constant(t1 - t0)
         blur = _constant(resolution) / jnp.where(length > 0, length, 1.0)
-        memory = state.memory
-        seen = scan_guards((memory.guard, one, two, end), middle, memory.armed > 0.5, tolerances, blur, unit)
+        seen = scan_guards((memory.guard, one, two, end), middle, memory.armed, tolerances, blur, unit)
         return seen, end, _constant(root[-1])
 
     def _land(
@@ -328,16 +321,16 @@ class EventSolver(AbstractSolverWrapper):
         paces: tuple[Array, Array],
         jumps: Bool[Array, ""] | None,
     ) -> Landing:
-        """Which guards fire at the end of a step, and where the next one is to end.
+        """Which guards fire at the end of a step, and the end of the next step.
 
-        `ends` are the guards there and what they are at events; `step` are its end, its length, the resolution of time
-        and the time of the last event; `paces` the length of the last steps, with this one and without.
+        `ends`: values of the guards there, and at events. `step`: its end, its length, the resolution of time and the
+        time of the last event. `paces`: the length of the last steps, with this one and without.
         """
         (end, root), (t1, length, resolution, last), (measure, pace) = ends, step, paces
         divisor, tiny = jnp.where(length > 0, length, 1.0), float(jnp.finfo(length.dtype).tiny)
 
         def landing(place: Array) -> Array:
-            """How far [time] the root of each guard may be from this place; one that is not zero is a rounding."""
+            """Largest distance [time] of the root of each guard from this place; values at events are rounding."""
             slope, bend = seen.slopes(jnp.minimum(place, 1.0))
             blur = jnp.abs(slope) + jnp.sqrt(jnp.maximum(slope * slope + 2.0 * root * jnp.abs(bend), tiny))
             since = _constant(t1 - last) + (jnp.minimum(place, 2.0) - 1.0) * length
@@ -346,17 +339,17 @@ class EventSolver(AbstractSolverWrapper):
 
         near = landing(jnp.ones_like(length))
         shortest = jnp.maximum(_SHORT * pace, 2.0 * _constant(resolution))
-        if jumps is not None:  # an event before a jump is not one with it
+        if jumps is not None:  # an event before a jump is another event
             near = jnp.where(jumps, _constant(resolution), near)
         near = near / divisor
-        # One that has just fallen through zero may look flat to the cubic; below a root that is a rounding it is one.
+        # The cubic of a guard that has just fallen may be flat: within `root`, a rounding, it is at its root.
         here = (seen.armed & (jnp.abs(seen.ahead) <= near)) | (seen.crosses & (1.0 - seen.root <= near))
         here = here | ((end <= 0) & (end >= -root) & (seen.slopes(jnp.ones(()))[0] < 0))
         here = self._policy.fires(here, seen, end, length, t1) | arrives(seen, end, root, resolution / divisor)
-        # One that fires at the start of the step does so where the step is the shortest.
+        # A guard whose root is at the start of a step fires if the step has the shortest length.
         here = here | (seen.crosses & (seen.root * length <= resolution) & (length <= shortest))
         passed = seen.crosses & ~here
-        # Without a root inside, the next one may be in sight: then the next step shall end there.
+        # Without a root inside the step, the next step ends at the next root, if the tangents show one.
         sight = jnp.min(jnp.where(seen.armed, seen.ahead, jnp.inf))
         missed = jnp.any(passed)
         landed = jnp.any(here) & ~missed & (length > 0)
@@ -370,7 +363,7 @@ class EventSolver(AbstractSolverWrapper):
         return Landing(fired, first, missed, landed, landed, next_end, near)
 
     def _guard_rates(self, t: Array, state: EventState, slope: PyTree, args: PyTree) -> Float[Array, " guards"]:
-        """Along the motion; constant, so that nothing of them is differentiated."""
+        """Rates of the guards along the motion; constant."""
         t, state, slope, args = _held((t, state, slope, args))
         along = jnp.ones_like(t), slope
         return jax.jvp(lambda t, y: self._guards(t, state._replace(y=y), args), (t, state.y), along)[1]
@@ -379,18 +372,17 @@ class EventSolver(AbstractSolverWrapper):
         self,
         terms: PyTree,
         t: Any,
-        state: EventState,
+        at_end: tuple[EventState, EventMemory],
         landing: Landing,
-        places: tuple[Array, Array, Array],
+        places: tuple[Array, Array],
         sides: tuple[PyTree, PyTree],
-    ) -> tuple[EventState, tuple[Array, PyTree]]:
+    ) -> tuple[tuple[EventState, EventMemory], tuple[Array, PyTree]]:
         """Carry the state to the root of the first guard, reset it there, and carry it back to `t`.
 
-        Returned with the time from which on the new state holds, and the rate of y there.
+        Returned with the time from which the new state holds, and the rate of y there.
         """
-        (root, near, begin), (args, whole), (fired, first) = places, sides, landing[:2]
-        memory = state.memory
-        # After the event arguments are those of the step that begins there.
+        (state, memory), (root, near), (args, whole), (fired, first) = at_end, places, sides, landing[:2]
+        # Arguments after the event are those of the step that begins there.
         new_args = whole if self.samples is None else self.samples.freeze_args(t, whole)
 
         def evaluate(t: Array, y: PyTree, mode: PyTree, args: PyTree) -> tuple[PyTree, Array]:
@@ -406,18 +398,18 @@ class EventSolver(AbstractSolverWrapper):
             before = state._replace(y=y)
             after = self.reset(t_event, before, whole, fired)
             if self.on_zeno is not None:
-                held, dense = self.on_zeno(t_event, before, whole, fired), _spread(t_event, state, begin)[1]
+                held, dense = self.on_zeno(t_event, before, whole, fired), _spread(t_event, state.t, memory)[1]
                 after = jtu.tree_map(lambda a, b: jnp.where(dense, a, b), held, after)
             return after.y, after.mode
 
-        # A guard that arrives has its event where it is `root`, any other one where it fires, by so much later.
+        # The event of a guard that arrives is at its value `root`, that of others at zero, `early` later.
         level = jnp.sum(jnp.where(first, root, 0.0))
         arrives = jnp.any(first & (memory.guard > 0))
         early, level = jnp.where(arrives, 0.0, level / jnp.abs(rate)), jnp.where(arrives, level, 0.0)
-        landed = Landed(t, state.y, state.mode, first, (level, rate), memory.landed > 0.5, near, state.t)
+        landed = Landed(t, state.y, state.mode, first, (level, rate), landing.landed, near, state.t)
         passage = pass_event(landed, evaluate, (args, new_args), reset)
         t_event, values, (y, mode, slope) = passage.t, passage.guards, passage.after
-        spread, dense = _spread(t_event, state, begin)
+        spread, dense = _spread(t_event, state.t, memory)
         ends = dense & (self.on_zeno is None)
         status = jnp.where(ends, jnp.asarray(ACCUMULATION, spread.dtype), ONGOING)
         # A reset that changes nothing is no event.
@@ -429,43 +421,38 @@ class EventSolver(AbstractSolverWrapper):
         def rises() -> Bool[Array, " guards"]:
             return self._guard_rates(t_event, state._replace(y=y, mode=mode), slope, new_args) > 0
 
-        armed = self._policy.armed_after(clear, fired, memory.armed > 0.5, rises)
+        armed = self._policy.armed_after(clear, fired, memory.armed, rises)
         if self.on_zeno is not None:
             armed = jnp.where(dense, values > 0, armed)
         flags = _flags(fired, values)
         entry = EventLog(t_event, flags, (passage.before, state.mode), (y, mode))
         log = None if state.log is None else jtu.tree_map(lambda a, b: write(a, index, b), state.log, entry)
-        after = memory._replace(guard=_constant(values), armed=_flags(armed, values))
-        passed = state._replace(y=passage.y, mode=mode, memory=after)
-        after_reset = passed._replace(
-            t=t_event,
-            events=events,
-            status=status,
-            fired=flags,
-            log=log,
-            memory=after._replace(resets=memory.resets + 1.0, spread=spread),
+        passed = state._replace(y=passage.y, mode=mode), memory._replace(guard=_constant(values), armed=armed)
+        after_reset = (
+            passed[0]._replace(t=t_event, events=events, status=status, fired=flags, log=log),
+            passed[1]._replace(resets=memory.resets + 1, spread=spread),
         )
         event = t_event - early, slope
         if self.event_mode is None and (self.samples is None or self.samples.times is None):
             return after_reset, event
-        # Samples at which nothing happens, and resets that are no events, say nothing of whether events accumulate.
+        # Samples without a change, and resets that are no events, do not count as accumulation.
         chatters = jnp.any(fired) if self.event_mode is None else jnp.any(fired) & ~_differ(state.mode, mode)
         return jtu.tree_map(lambda a, b: jnp.where(happened | chatters, a, b), after_reset, passed), event
 
     def _event_modes(self, *modes: PyTree) -> tuple[PyTree, ...]:
-        """What of the modes an event changes."""
+        """The parts of the modes that an event changes."""
         return modes if self.event_mode is None else tuple(self.event_mode(mode) for mode in modes)
 
 
-def _spread(t_event: Array, state: EventState, begin: Array) -> tuple[Array, Bool[Array, ""]]:
-    """The longest of the last intervals between events, and whether they accumulate."""
-    since, memory = t_event - state.t, state.memory
+def _spread(t_event: Array, last: Array, memory: EventMemory) -> tuple[Array, Bool[Array, ""]]:
+    """The longest of the last intervals between events, the latest one since `last`, and whether they accumulate."""
+    since = t_event - last
     spread = _constant(jnp.where(memory.resets == 0, since, jnp.maximum(since, _FORGET_INTERVALS * memory.spread)))
-    return spread, _accumulates(spread, _constant(t_event), begin) & (memory.resets >= _FEWEST)
+    return spread, _accumulates(spread, _constant(t_event), memory.begin) & (memory.resets >= _FEWEST)
 
 
 def _accumulates(spread: Array, t: Array, begin: Array) -> Array:
-    """Whether intervals between events of `spread` at most are none on the scale of the run, or not resolved at `t`."""
+    """Whether intervals of at most `spread` between events vanish on the scale of the run, or below rounding of `t`."""
     eps = float(jnp.finfo(spread.dtype).eps)
     return spread <= jnp.maximum(_ACCUMULATION * eps**0.5 * (t - begin), 64.0 * eps * jnp.abs(t))
 
@@ -480,7 +467,7 @@ def _differ(one: PyTree, other: PyTree) -> Bool[Array, ""]:
 
 
 def _flags(x: Bool[Array, "..."], like: Array) -> Array:
-    """Ones and zeros in the type of `like`, as the state holds them."""
+    """Ones and zeros in the type of `like`, for the state."""
     return jnp.where(x, 1.0, jnp.zeros_like(like))
 
 

@@ -4,14 +4,14 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 # Why events ended a run: they accumulate (Zeno, chatter), or there were more than allowed.
 ONGOING, ACCUMULATION, TOO_MANY = 0.0, 1.0, 2.0
 
 
 class EventLog(NamedTuple):
-    """Events in the order of time; entries that were not needed hold an infinite time and zeros.
+    """Events in the order of time; unused entries have an infinite time and zeros.
 
     - `t`: times [s], shape `[max_events]`.
     - `fired`: 1 for each guard that fired, shape `[max_events, guards]`.
@@ -24,21 +24,14 @@ class EventLog(NamedTuple):
     after: tuple[PyTree, PyTree]
 
 
-class EventMemory(NamedTuple):
-    """What `EventSolver` tells `EventController`, and keeps from event to event.
+class StepReport(NamedTuple):
+    """The report of a step to `EventController`.
 
-    - `guard`, `armed`: values of the guards at this state, and 1 for each that is armed, shape `[guards]`.
-    - `resets`: number of calls of `reset`.
-    - `spread`: the longest of the last intervals between them.
     - `landed`: 1 where the step ended on a root.
-    - `next_root`: where the next root is or seems to be, in steps from the start of this one.
-    - `step_factor`: by which factor the length of the step may change before the guards are not resolved.
+    - `next_root`: position of the next root, or its estimate, in steps from the start of this one.
+    - `step_factor`: the factor by which the length of the step may change before it no longer resolves the guards.
     """
 
-    guard: Float[Array, "*s guards"]
-    armed: Float[Array, "*s guards"]
-    resets: Float[Array, "..."]
-    spread: Float[Array, "..."]
     landed: Float[Array, "..."]
     next_root: Float[Array, "..."]
     step_factor: Float[Array, "..."]
@@ -47,14 +40,16 @@ class EventMemory(NamedTuple):
 class EventState(NamedTuple):
     """State of a run with events; made by `EventSolver.start`.
 
-    - `y`: what the vector field integrates.
-    - `mode`: what is constant between events.
+    diffrax converts every leaf of a state to the type of time. Counts and flags in it are therefore floating.
+
+    - `y`: the part that the vector field integrates.
+    - `mode`: the part that is constant between events.
     - `t`: time of the last event, or of the start.
     - `events`: number of events so far: of resets that changed something.
     - `status`: 0; 1 where events accumulate; 2 where there were more than allowed.
     - `fired`: 1 for each guard that fired in the last event, shape `[guards]`.
     - `log`: an `EventLog`, or None.
-    - `memory`: of the solver itself.
+    - `report`: the report of the last step to the controller.
     """
 
     y: PyTree
@@ -64,11 +59,49 @@ class EventState(NamedTuple):
     status: Float[Array, "..."]
     fired: Float[Array, "*s guards"]
     log: EventLog | None
-    memory: EventMemory
+    report: StepReport
 
     def rate(self, dy: PyTree) -> "EventState":
-        """What a vector field returns: `dy` for `y`, and zero for everything else, which is constant in a step."""
+        """The value of a vector field: `dy` for `y`, and zero for everything else, which is constant in a step."""
         return jtu.tree_map(jnp.zeros_like, self)._replace(y=dy)
+
+
+class EventMemory(NamedTuple):
+    """Memory of `EventSolver` from step to step, beside the state of the wrapped solver; constant in derivatives.
+
+    - `guard`, `armed`: values of the guards at the end of the last step, and which are armed, shape `[guards]`.
+    - `resets`: number of calls of `reset`.
+    - `spread`: the longest of the last intervals between them [time].
+    - `pace`: the longest of the last steps [time].
+    - `begin`: a time one first step before the start.
+    """
+
+    guard: Float[Array, " guards"]
+    armed: Bool[Array, " guards"]
+    resets: Int[Array, ""]
+    spread: Float[Array, ""]
+    pace: Float[Array, ""]
+    begin: Float[Array, ""]
+
+
+class Landing(NamedTuple):
+    """Events at the end of a step.
+
+    - `fired`, `first`: the guards that fire, and the first of them, shape `[guards]`.
+    - `missed`: whether the step has passed a root.
+    - `landed`: whether it ends on one.
+    - `happens`: whether the state is to be reset.
+    - `next_root`: see `StepReport`.
+    - `near`: the largest distance of the root from the end of the step, in steps.
+    """
+
+    fired: Bool[Array, " guards"]
+    first: Bool[Array, " guards"]
+    missed: Bool[Array, ""]
+    landed: Bool[Array, ""]
+    happens: Bool[Array, ""]
+    next_root: Float[Array, ""]
+    near: Float[Array, ""]
 
 
 def write(log: Array, index: Array, entry: Array) -> Array:
