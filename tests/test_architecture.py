@@ -28,7 +28,7 @@ APPLICATIONS = {
     "sweeps": 2500,
     "export": 1150,
     "problems": 3000,
-    "plot": 1650,
+    "plot": 1700,
     "cli": 3400,
 }
 LABORATORY = ("tests", "bench")
