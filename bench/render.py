@@ -1,6 +1,6 @@
 """The one report: tables of recorded results, in the layouts of `tables.py`, put into the pages that name them.
 
-README.md and docs/*.md say where the tables of `bench/results/NAME.json` go:
+README.md and the pages under docs/ say where the tables of `bench/results/NAME.json` go:
 
     <!-- bench:NAME -->
     <!-- /bench -->
@@ -48,7 +48,7 @@ def _markdown(lines: list[list[str]]) -> str:
 
 def pages() -> list[Path]:
     """README.md and the pages under docs/."""
-    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def render(page: Path, results: Path) -> str:
@@ -72,7 +72,7 @@ def render(page: Path, results: Path) -> str:
 
 def main() -> None:
     """Render, or check."""
-    parser = argparse.ArgumentParser(description="Put the tables of the results into README.md and docs/*.md.")
+    parser = argparse.ArgumentParser(description="Put the tables of the results into the README and the docs.")
     parser.add_argument("--check", action="store_true", help="only say whether the pages are up to date")
     check = parser.parse_args().check
     # All before the first is written: an error leaves every page as it was.
