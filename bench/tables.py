@@ -24,13 +24,13 @@ class Report:
 def _lugre(setting: str) -> tuple[Table | Targets, ...]:
     one = Table(
         f"LuGre test bench at an error of at most 1e-6, medians, all in one process, {setting} `jaxmodsim.tune_cpu()`."
-        " Run: of jaxmodsim a whole call of `simulate`, of diffrax one of a jitted function, of CVODES one of CasADi's"
-        " integrator. Differentiated run: the jitted function of six parameters whose derivatives are measured.",
+        " Run: a call of `simulate`, of a jitted function (diffrax), or of CasADi's integrator (CVODES). Differentiated"
+        " run: a call of the jitted function of six parameters whose derivatives are measured.",
         ("rtol", "steps", "error of v", "run", "differentiated run", "jacobian", "gradient", "error of the gradient"),
         where=CHOSEN,
     )
     many = Table(
-        "{runs} runs of it with different parameters (in loops {runs_of_a_loop}), error of the end velocity.",
+        "{runs} runs with different parameters ({runs_of_a_loop} in loops), error of the end velocity.",
         MANY, ("peer", "at"),
     )  # fmt: skip
 
@@ -39,30 +39,34 @@ def _lugre(setting: str) -> tuple[Table | Targets, ...]:
         jitted, cvodes = r.number("differentiated run", **CHOSEN), r.number("run", peer=CVODES, **CHOSEN)
         fastest = min(r.number("run", peer=name, **CHOSEN) for name in r.all_of("run", "peer") if "diffrax" in name)
         return [
-            ("one run against CVODES", ">= 8", cvodes / own),
-            ("the same, ours jitted", ">= 8", cvodes / jitted),
-            ("one run against the fastest of diffrax", ">= 20", fastest / own),
-            ("the same, ours jitted as it is", ">= 20", fastest / jitted),
-            ("one run against Kvaerno5", "", r.number("run", peer=KVAERNO5, **CHOSEN) / own),
+            ("CVODES over a call of `simulate`", ">= 8", cvodes / own),
+            ("CVODES over a jitted run", ">= 8", cvodes / jitted),
+            ("fastest solver of diffrax over a call of `simulate`", ">= 20", fastest / own),
+            ("fastest solver of diffrax over a jitted run", ">= 20", fastest / jitted),
+            ("Kvaerno5 over a call of `simulate`", "", r.number("run", peer=KVAERNO5, **CHOSEN) / own),
             *(
-                (f"many runs by `{way}` against CVODES one by one", ">= 200", loop / r.number("run of many", at=way))
+                (f"CVODES one by one over many runs by `{way}`", ">= 200", loop / r.number("run of many", at=way))
                 for way in (VMAP, GROUPS, SWEEP)
             ),
             ("Jacobian in runs", "<= 2.5", r.number("jacobian", **CHOSEN) / jitted),
             ("reverse gradient in runs", "<= 4", r.number("gradient", **CHOSEN) / jitted),
         ]
 
-    return one, many, Targets("Targets on the LuGre test bench.", targets)
+    return one, many, Targets("Ratios on the LuGre test bench.", targets)
 
 
 def _stick_slip(r: Recorded) -> list[tuple[str, str, float]]:
     jitted, call = r.number("run in `jax.jit`", **TIGHT), r.number("run", **TIGHT)
     scipy = [r.number("run", peer=name, **CHOSEN) for name in r.all_of("run", "peer") if name.startswith("scipy")]
     return [
-        ("scipy RK45, against a whole call", ">= 200", r.number("run", peer="scipy RK45", **TIGHT) / call),
-        ("fastest method of scipy at our error", ">= 200", min(scipy, default=float("nan")) / call),
-        ("legs in `lax.scan`, against a jitted run", ">= 1", r.number("run", peer=SCANNED, **TIGHT) / jitted),
-        ("one run alone, to one of many", ">= 15", jitted / r.number(MANY[0], at=VMAP)),
+        ("RK45 of SciPy over a call of `simulate`", ">= 200", r.number("run", peer="scipy RK45", **TIGHT) / call),
+        (
+            "fastest method of SciPy at the same error over a call of `simulate`",
+            ">= 200",
+            min(scipy, default=float("nan")) / call,
+        ),
+        ("legs in `lax.scan` over a jitted run", ">= 1", r.number("run", peer=SCANNED, **TIGHT) / jitted),
+        ("a single run over a run of a batch", ">= 15", jitted / r.number(MANY[0], at=VMAP)),
     ]
 
 
@@ -71,8 +75,10 @@ def _accelerations(r: Recorded) -> list[tuple[str, str, float]]:
         return r.number(way, case=n, key="minimum") / r.number(way, case=n, peer=peer, key="minimum")
 
     sizes, ways = r.all_of("loop", "case"), ("loop", "many", "many in a loop")
-    hand = [(f"time by hand, n = {n}, {way}", "<= 1.3", ratio(n, way, HAND)) for n in sizes[:3] for way in ways]
-    return hand + [(f"time of MuJoCo, n = {n}, many", "< 1", ratio(n, "many", "MuJoCo")) for n in sizes if int(n) <= 6]
+    hand = [
+        (f"over equations by hand, n = {n}, {way}", "<= 1.3", ratio(n, way, HAND)) for n in sizes[:3] for way in ways
+    ]
+    return hand + [(f"over MuJoCo, n = {n}, many", "< 1", ratio(n, "many", "MuJoCo")) for n in sizes if int(n) <= 6]
 
 
 def _first_calls(r: Recorded) -> list[tuple[str, str, float]]:
@@ -85,13 +91,13 @@ def _first_calls(r: Recorded) -> list[tuple[str, str, float]]:
 
     return [
         *(
-            (f"{way}, in first runs of two viscous joints: {name}", f"<= {most}", r.number(way, case=name) / viscous)
+            (f"{way} over first run of two viscous joints: {name}", f"<= {most}", r.number(way, case=name) / viscous)
             for way, limits in asked.items()
             for name, most in zip(scenes, limits, strict=True)
         ),
         *((f"reverse gradient in runs: {name}", "<= 3", runs("gradient", name)) for name in scenes[:3]),
         *((f"forward Jacobian in runs: {name}", "<= 2.5", runs("jacobian", name)) for name in scenes[:3]),
-        (f"step of the default solver in steps of Tsit5: {six}", "<= 4",
+        (f"step of the default solver over a step of Tsit5: {six}", "<= 4",
          r.number("step of run", case=six) / r.number("step of run by Tsit5", case=six)),
         (f"first run [s]: {six}", "<= 6", r.number("first run", case=six)),
         (f"first gradient [s]: {six}", "<= 20", r.number("first gradient", case=six)),
@@ -102,12 +108,12 @@ def _sweep(r: Recorded) -> list[tuple[str, str, float]]:
     ours, kills, count = r.number("run", at=SWEEP), r.settings.get("kills", 0), r.settings["many"]
     processes = next(iter(r.all_of("run", "at", peer=CVODES)), "")
     return [
-        ("against CVODES on all cores", ">= 60", r.number("run", peer=CVODES, at=processes) / ours),
-        ("against Kvaerno5 under plain `vmap`", ">= 100", r.number("run", peer=KVAERNO5, at="plain vmap") / ours),
-        ("against our own solver under plain `vmap`", "", r.number("run", at="plain vmap") / ours),
-        (f"{count:,} runs into a store: runs per second", "", count / r.number("many runs into a store")),
-        ("the same: peak memory [GiB]", "< 2", r.number("peak memory of many runs") / 2**30),
-        (f"killed {kills} times: the same store, bit for bit", ">= 1", r.number("same store after kills")),
+        ("CVODES on all cores over `sweep`", ">= 60", r.number("run", peer=CVODES, at=processes) / ours),
+        ("Kvaerno5 under plain `vmap` over `sweep`", ">= 100", r.number("run", peer=KVAERNO5, at="plain vmap") / ours),
+        ("the same solver under plain `vmap` over `sweep`", "", r.number("run", at="plain vmap") / ours),
+        (f"{count:,} runs into a store [runs per second]", "", count / r.number("many runs into a store")),
+        ("peak memory of these [GiB]", "< 2", r.number("peak memory of many runs") / 2**30),
+        (f"store after {kills} kills bit-identical (1: yes)", ">= 1", r.number("same store after kills")),
     ]
 
 
@@ -117,7 +123,7 @@ def _errors(of: str) -> tuple[str, ...]:
 
 REPORTS = {
     "lugre_testbench": Report("LuGre's test bench: one run, many, derivatives.", "speed", _lugre("with")),
-    "lugre_testbench_untuned": Report("The same without `tune_cpu`.", "speed", _lugre("without")),
+    "lugre_testbench_untuned": Report("The same without `tune_cpu`.", "benchmarks", _lugre("without")),
     "lugre_work_precision": Report(
         "LuGre's test bench: time against error, tolerance by tolerance.", "accuracy",
         (Table("Time of one run at each rtol, medians.", ("run",), ("at",), ("peer",)),),
@@ -134,11 +140,11 @@ REPORTS = {
                 ),
                 ("case",),
             ),
-            Targets("Targets on first calls and derivatives.", _first_calls),
+            Targets("First calls and derivatives.", _first_calls),
         ),
     ),
     "pulled_spring": Report(
-        "LuGre's law of 1995, pulled through a spring: error against steps, time of a run.", "speed",
+        "LuGre's law of 1995, pulled through a spring: error against steps, time of a run.", "accuracy",
         (
             Table(
                 "LuGre friction of 1995 pulled through a spring, {t1:g} s: largest error of the friction force, of"
@@ -170,7 +176,7 @@ REPORTS = {
             ),
             Table("{runs} runs with different parameters, error of the position at the end.", MANY, ("peer", "at")),
             Table("Time to trace and compile.", ("compilation", "compilation of the gradient")),
-            Targets("Targets on stick-slip: time of the other in ours.", _stick_slip),
+            Targets("Stick-slip: time of the other program over ours.", _stick_slip),
         ),
     ),
     "accelerations": Report(
@@ -182,7 +188,7 @@ REPORTS = {
                 " evaluations with a step of Euler. Many: 1024 states in one call; MuJoCo's over all cores.",
                 ("loop", "many", "many in a loop"), ("case",), ("quantity", "peer"), shown="minimum",
             ),
-            Targets("Targets: time of jaxmodsim in that of its peers.", _accelerations),
+            Targets("Accelerations: time of jaxmodsim over that of the other program.", _accelerations),
         ),
     ),
     "long_runs": Report(
@@ -245,7 +251,7 @@ REPORTS = {
                 " `jaxmodsim.tune_cpu()`.",
                 ("rtol", "run", "error"), ("peer", "at"),
             ),
-            Targets("Targets on sweeps: ratios of times, unless said.", _sweep),
+            Targets("Sweeps: ratios of times, unless a unit is given.", _sweep),
         ),
     ),
     "behaviour": Report(
