@@ -312,7 +312,8 @@ REPORTS = {
             ("share", "converged", "time"), ("case",), ("quantity", "at"),
         ), Table(
             "Fits with default options and an unknown start of the record. Held: share of {repeats} repeats whose 95 %"
-            " interval contains the truth. Remark: share that report a constant offset of the sensor.",
+            " interval contains the truth. Remark: share that report a constant offset of the sensor;"
+            " in the last column also those whose intervals all hold.",
             ("held", "remark on an offset", "remark, or all hold"), ("case",), ("quantity", "at"),
         )),
     ),
