@@ -126,7 +126,11 @@ class Targets:
     rows: Callable[[Recorded], list[tuple[str, str, float]]]
 
     def cells(self, found: Recorded) -> list[list[str]]:
-        """Heading, and the lines."""
+        """Heading, and the lines, without the targets: of interest to users."""
+        return [["ratio or quantity", "measured"], *([label, _plain(value)] for label, _, value in self.rows(found))]
+
+    def verdicts(self, found: Recorded) -> list[list[str]]:
+        """The same with the targets, and whether each is met."""
         return [["ratio or quantity", "target", "measured", "met"]] + [
             [label, target, _plain(value), _verdict(target, value)] for label, target, value in self.rows(found)
         ]

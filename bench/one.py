@@ -38,7 +38,7 @@ def main(name: str, out: Path, *, smoke: bool) -> None:
         return
     result.write(out, smoke=smoke)
     recorded = Recorded.read(out / f"{name}.json")
-    print(report(recorded))
+    print(report(recorded), report(recorded, targets=True))
     figures.write(recorded, out)
 
 

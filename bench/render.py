@@ -1,9 +1,11 @@
 """The one report: tables of recorded results, in the layouts of `tables.py`, put into the pages that name them.
 
-README.md and docs/*.md say where the tables of `bench/results/NAME.json` go:
+README.md and the pages under docs/ say where the tables of `bench/results/NAME.json` go:
 
     <!-- bench:NAME -->
     <!-- /bench -->
+
+and `<!-- bench:NAME targets -->` where its targets go, with the verdict on each.
 
     python bench/render.py            writes the pages
     python bench/render.py --check    changes nothing, exits with 1 if a page is out of date
@@ -18,37 +20,38 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 sys.path.insert(0, str(ROOT))  # for `bench`, where this file is run as a script
 
-from bench.layout import Recorded, machine_line  # noqa: E402
+from bench.layout import Recorded, Targets, machine_line  # noqa: E402
 from bench.tables import REPORTS  # noqa: E402
 
-_BLOCK = re.compile(r"(<!-- bench:([\w-]+) -->\n)(.*?)(<!-- /bench -->)", re.DOTALL)
+_BLOCK = re.compile(r"(<!-- bench:([\w-]+)( targets)? -->\n)(.*?)(<!-- /bench -->)", re.DOTALL)
+_NUMBER = re.compile(r"-?[\d,.]+(e[-+]?\d+)?|-|")
 
 
-def report(found: Recorded) -> str:
-    """All tables of a result in Markdown; the last caption says where they were made and what was not run."""
-    shown = REPORTS[found.name].tables
+def report(found: Recorded, targets: bool = False) -> str:
+    """All tables of a result in Markdown, or those of its targets; the last caption says where they were made."""
+    shown = [each for each in REPORTS[found.name].tables if isinstance(each, Targets) or not targets]
     parts = []
     for number, table in enumerate(shown):
         caption = table.caption.format(**{name.replace(" ", "_"): value for name, value in found.settings.items()})
         if number + 1 == len(shown):
             missing = "; ".join(f"{name} ({why})" for name, why in found.not_run.items())
             caption += f" {machine_line(found.provenance)}" + (f" Not run: {missing}." if missing else "")
-        parts.append(f"{_markdown(table.cells(found))}\n*{caption.strip()}*\n")
+        cells = table.verdicts(found) if targets and isinstance(table, Targets) else table.cells(found)
+        parts.append(f"{_markdown(cells)}\n*{caption.strip()}*\n")
     return "\n".join(parts)
 
 
 def _markdown(lines: list[list[str]]) -> str:
-    """The first column is text and the others are aligned to the right."""
+    """Columns of numbers are aligned to the right."""
     heading, *rows = lines
+    rules = ["---:" if all(map(_NUMBER.fullmatch, column)) else "---" for column in zip(*rows, strict=True)]
     escaped = [[text.replace("|", "\\|") for text in row] for row in rows]
-    return "".join(
-        "| " + " | ".join(line) + " |\n" for line in (heading, ["---", *("---:" for _ in heading[1:])], *escaped)
-    )
+    return "".join("| " + " | ".join(line) + " |\n" for line in (heading, rules, *escaped))
 
 
 def pages() -> list[Path]:
     """README.md and the pages under docs/."""
-    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def render(page: Path, results: Path) -> str:
@@ -62,7 +65,7 @@ def render(page: Path, results: Path) -> str:
         found = Recorded.read(path)
         if found.smoke:
             sys.exit(f"{path.name} comes from a smoke run, which measures nothing.")
-        return f"{match[1]}\n{report(found)}\n{match[4]}"
+        return f"{match[1]}\n{report(found, bool(match[3]))}\n{match[5]}"
 
     opened, closed = text.count("<!-- bench:"), text.count("<!-- /bench -->")
     if not opened == closed == len(_BLOCK.findall(text)):
@@ -72,7 +75,7 @@ def render(page: Path, results: Path) -> str:
 
 def main() -> None:
     """Render, or check."""
-    parser = argparse.ArgumentParser(description="Put the tables of the results into README.md and docs/*.md.")
+    parser = argparse.ArgumentParser(description="Put the tables of the results into the README and the docs.")
     parser.add_argument("--check", action="store_true", help="only say whether the pages are up to date")
     check = parser.parse_args().check
     # All before the first is written: an error leaves every page as it was.

@@ -24,13 +24,13 @@ class Report:
 def _lugre(setting: str) -> tuple[Table | Targets, ...]:
     one = Table(
         f"LuGre test bench at an error of at most 1e-6, medians, all in one process, {setting} `jaxmodsim.tune_cpu()`."
-        " Run: of jaxmodsim a whole call of `simulate`, of diffrax one of a jitted function, of CVODES one of CasADi's"
-        " integrator. Differentiated run: the jitted function of six parameters whose derivatives are measured.",
+        " Run: a call of `simulate`, of a jitted function (diffrax), or of CasADi's integrator (CVODES). Differentiated"
+        " run: a call of the jitted function of six parameters whose derivatives are measured.",
         ("rtol", "steps", "error of v", "run", "differentiated run", "jacobian", "gradient", "error of the gradient"),
         where=CHOSEN,
     )
     many = Table(
-        "{runs} runs of it with different parameters (in loops {runs_of_a_loop}), error of the end velocity.",
+        "{runs} runs with different parameters ({runs_of_a_loop} in loops), error of the end velocity.",
         MANY, ("peer", "at"),
     )  # fmt: skip
 
@@ -39,30 +39,34 @@ def _lugre(setting: str) -> tuple[Table | Targets, ...]:
         jitted, cvodes = r.number("differentiated run", **CHOSEN), r.number("run", peer=CVODES, **CHOSEN)
         fastest = min(r.number("run", peer=name, **CHOSEN) for name in r.all_of("run", "peer") if "diffrax" in name)
         return [
-            ("one run against CVODES", ">= 8", cvodes / own),
-            ("the same, ours jitted", ">= 8", cvodes / jitted),
-            ("one run against the fastest of diffrax", ">= 20", fastest / own),
-            ("the same, ours jitted as it is", ">= 20", fastest / jitted),
-            ("one run against Kvaerno5", "", r.number("run", peer=KVAERNO5, **CHOSEN) / own),
+            ("CVODES over a call of `simulate`", ">= 8", cvodes / own),
+            ("CVODES over a jitted run", ">= 8", cvodes / jitted),
+            ("fastest solver of diffrax over a call of `simulate`", ">= 20", fastest / own),
+            ("fastest solver of diffrax over a jitted run", ">= 20", fastest / jitted),
+            ("Kvaerno5 over a call of `simulate`", "", r.number("run", peer=KVAERNO5, **CHOSEN) / own),
             *(
-                (f"many runs by `{way}` against CVODES one by one", ">= 200", loop / r.number("run of many", at=way))
+                (f"CVODES one by one over many runs by `{way}`", ">= 200", loop / r.number("run of many", at=way))
                 for way in (VMAP, GROUPS, SWEEP)
             ),
             ("Jacobian in runs", "<= 2.5", r.number("jacobian", **CHOSEN) / jitted),
             ("reverse gradient in runs", "<= 4", r.number("gradient", **CHOSEN) / jitted),
         ]
 
-    return one, many, Targets("Targets on the LuGre test bench.", targets)
+    return one, many, Targets("Ratios on the LuGre test bench.", targets)
 
 
 def _stick_slip(r: Recorded) -> list[tuple[str, str, float]]:
     jitted, call = r.number("run in `jax.jit`", **TIGHT), r.number("run", **TIGHT)
     scipy = [r.number("run", peer=name, **CHOSEN) for name in r.all_of("run", "peer") if name.startswith("scipy")]
     return [
-        ("scipy RK45, against a whole call", ">= 200", r.number("run", peer="scipy RK45", **TIGHT) / call),
-        ("fastest method of scipy at our error", ">= 200", min(scipy, default=float("nan")) / call),
-        ("legs in `lax.scan`, against a jitted run", ">= 1", r.number("run", peer=SCANNED, **TIGHT) / jitted),
-        ("one run alone, to one of many", ">= 15", jitted / r.number(MANY[0], at=VMAP)),
+        ("RK45 of SciPy over a call of `simulate`", ">= 200", r.number("run", peer="scipy RK45", **TIGHT) / call),
+        (
+            "fastest method of SciPy at the same error over a call of `simulate`",
+            ">= 200",
+            min(scipy, default=float("nan")) / call,
+        ),
+        ("legs in `lax.scan` over a jitted run", ">= 1", r.number("run", peer=SCANNED, **TIGHT) / jitted),
+        ("a single run over a run of a batch", ">= 15", jitted / r.number(MANY[0], at=VMAP)),
     ]
 
 
@@ -71,8 +75,10 @@ def _accelerations(r: Recorded) -> list[tuple[str, str, float]]:
         return r.number(way, case=n, key="minimum") / r.number(way, case=n, peer=peer, key="minimum")
 
     sizes, ways = r.all_of("loop", "case"), ("loop", "many", "many in a loop")
-    hand = [(f"time by hand, n = {n}, {way}", "<= 1.3", ratio(n, way, HAND)) for n in sizes[:3] for way in ways]
-    return hand + [(f"time of MuJoCo, n = {n}, many", "< 1", ratio(n, "many", "MuJoCo")) for n in sizes if int(n) <= 6]
+    hand = [
+        (f"over equations by hand, n = {n}, {way}", "<= 1.3", ratio(n, way, HAND)) for n in sizes[:3] for way in ways
+    ]
+    return hand + [(f"over MuJoCo, n = {n}, many", "< 1", ratio(n, "many", "MuJoCo")) for n in sizes if int(n) <= 6]
 
 
 def _first_calls(r: Recorded) -> list[tuple[str, str, float]]:
@@ -85,13 +91,13 @@ def _first_calls(r: Recorded) -> list[tuple[str, str, float]]:
 
     return [
         *(
-            (f"{way}, in first runs of two viscous joints: {name}", f"<= {most}", r.number(way, case=name) / viscous)
+            (f"{way} over first run of two viscous joints: {name}", f"<= {most}", r.number(way, case=name) / viscous)
             for way, limits in asked.items()
             for name, most in zip(scenes, limits, strict=True)
         ),
         *((f"reverse gradient in runs: {name}", "<= 3", runs("gradient", name)) for name in scenes[:3]),
         *((f"forward Jacobian in runs: {name}", "<= 2.5", runs("jacobian", name)) for name in scenes[:3]),
-        (f"step of the default solver in steps of Tsit5: {six}", "<= 4",
+        (f"step of the default solver over a step of Tsit5: {six}", "<= 4",
          r.number("step of run", case=six) / r.number("step of run by Tsit5", case=six)),
         (f"first run [s]: {six}", "<= 6", r.number("first run", case=six)),
         (f"first gradient [s]: {six}", "<= 20", r.number("first gradient", case=six)),
@@ -102,12 +108,12 @@ def _sweep(r: Recorded) -> list[tuple[str, str, float]]:
     ours, kills, count = r.number("run", at=SWEEP), r.settings.get("kills", 0), r.settings["many"]
     processes = next(iter(r.all_of("run", "at", peer=CVODES)), "")
     return [
-        ("against CVODES on all cores", ">= 60", r.number("run", peer=CVODES, at=processes) / ours),
-        ("against Kvaerno5 under plain `vmap`", ">= 100", r.number("run", peer=KVAERNO5, at="plain vmap") / ours),
-        ("against our own solver under plain `vmap`", "", r.number("run", at="plain vmap") / ours),
-        (f"{count:,} runs into a store: runs per second", "", count / r.number("many runs into a store")),
-        ("the same: peak memory [GiB]", "< 2", r.number("peak memory of many runs") / 2**30),
-        (f"killed {kills} times: the same store, bit for bit", ">= 1", r.number("same store after kills")),
+        ("CVODES on all cores over `sweep`", ">= 60", r.number("run", peer=CVODES, at=processes) / ours),
+        ("Kvaerno5 under plain `vmap` over `sweep`", ">= 100", r.number("run", peer=KVAERNO5, at="plain vmap") / ours),
+        ("the same solver under plain `vmap` over `sweep`", "", r.number("run", at="plain vmap") / ours),
+        (f"{count:,} runs into a store [runs per second]", "", count / r.number("many runs into a store")),
+        ("peak memory of these [GiB]", "< 2", r.number("peak memory of many runs") / 2**30),
+        (f"store after {kills} kills bit-identical (1: yes)", ">= 1", r.number("same store after kills")),
     ]
 
 
@@ -117,38 +123,38 @@ def _errors(of: str) -> tuple[str, ...]:
 
 REPORTS = {
     "lugre_testbench": Report("LuGre's test bench: one run, many, derivatives.", "speed", _lugre("with")),
-    "lugre_testbench_untuned": Report("The same without `tune_cpu`.", "speed", _lugre("without")),
+    "lugre_testbench_untuned": Report("The same without `tune_cpu`.", "benchmarks", _lugre("without")),
     "lugre_work_precision": Report(
         "LuGre's test bench: time against error, tolerance by tolerance.", "accuracy",
         (Table("Time of one run at each rtol, medians.", ("run",), ("at",), ("peer",)),),
     ),
     "first_calls": Report(
-        "What the first call of a scene costs, and its derivatives.", "speed",
+        "Compile time of a scene and its derivatives.", "speed",
         (
             Table(
-                "First calls, traced and compiled, in processor time; warm calls of jitted functions, medians. Runs"
-                " with {samples} saved times, derivatives by six numbers (belt: five), with `jaxmodsim.tune_cpu()`.",
+                "First calls: processor time of tracing and compilation. Warm calls of jitted functions: medians. Runs"
+                " have {samples} saved times, derivatives six parameters (belt: five). With `jaxmodsim.tune_cpu()`.",
                 (
                     "first run", "first gradient", "first jacobian", "equations of run", "equations of gradient",
                     "steps of run", "run", "gradient", "jacobian",
                 ),
                 ("case",),
             ),
-            Targets("Targets on first calls and derivatives.", _first_calls),
+            Targets("First calls and derivatives.", _first_calls),
         ),
     ),
     "pulled_spring": Report(
-        "LuGre's law of 1995, pulled through a spring: error against steps, time of a run.", "speed",
+        "LuGre's law of 1995, pulled through a spring: error against steps, time of a run.", "accuracy",
         (
             Table(
-                "LuGre friction of 1995 pulled through a spring, {t1:g} s: largest error of the friction force, of"
-                " which"
-                " the largest is 1.5 N, by rtol; of RK4, whose steps of 10 us confirm the reference, by step [s].",
+                "LuGre friction of 1995 pulled through a spring, {t1:g} s: largest error of the friction force, whose"
+                " maximum is 1.5 N. At: rtol, or the step [s] of RK4, which confirms the reference with steps of 10"
+                " us.",
                 ("steps", "error of F in newtons", "run"), ("peer", "at"), where={"peer": (OURS, "RK4, here")},
             ),
             Table(
-                "The same to relative errors of at most 1e-6, of velocity and friction force both, over the run,"
-                " medians, all in one process, with `jaxmodsim.tune_cpu()`.",
+                "The same with relative errors of velocity and friction force of at most 1e-6 over the run. Medians,"
+                " all in one process, with `jaxmodsim.tune_cpu()`.",
                 ("rtol", "steps", "error of v", "error of F", "run", "run in `jax.jit`"), where=CHOSEN,
             ),
         ),
@@ -157,32 +163,30 @@ REPORTS = {
         "A minute of stick and slip, 122 events: one run, many, gradient, compilation.", "stick_slip",
         (
             Table(
-                "Belt oscillator, {t1:g} s and {events} events, at rtol 1e-6; error of the position at the end (it"
-                " moves"
-                " by 0.06 m) against the closed form; medians, all in one process, with `jaxmodsim.tune_cpu()`.",
+                "Belt oscillator, {t1:g} s and {events} events, at rtol 1e-6. Error of the final position against the"
+                " closed form; the amplitude is 0.03 m. Medians, all in one process, with `jaxmodsim.tune_cpu()`.",
                 ("error of x", "run", "run in `jax.jit`"), where=TIGHT,
             ),
             Table(
-                "The same at the loosest tolerance that makes the error no larger than ours; reverse gradient by Fc,"
-                " Fs,"
-                " k, m, vb; a whole call of `simulate`.",
+                "The same at the loosest tolerance with an error at most that of jaxmodsim. Reverse gradient with"
+                " respect to Fc, Fs, k, m and vb. Run: a call of `simulate`.",
                 ("rtol", "run", "gradient", "error of the gradient"), where=CHOSEN,
             ),
-            Table("{runs} runs with different parameters, error of the position at the end.", MANY, ("peer", "at")),
+            Table("{runs} runs with different parameters, error of the final position.", MANY, ("peer", "at")),
             Table("Time to trace and compile.", ("compilation", "compilation of the gradient")),
-            Targets("Targets on stick-slip: time of the other in ours.", _stick_slip),
+            Targets("Stick-slip: time of the other program over ours.", _stick_slip),
         ),
     ),
     "accelerations": Report(
         "Accelerations of a chain of n links: in a loop, and many at once.", "accelerations",
         (
             Table(
-                "Accelerations of a chain of n links, per evaluation: shortest of interleaved repetitions, all in one"
-                " process, with `jaxmodsim.tune_cpu()`. By hand: the faster of arrays and scalars. Loop: dependent"
-                " evaluations with a step of Euler. Many: 1024 states in one call; MuJoCo's over all cores.",
+                "Time of one evaluation for n links: minimum of interleaved repetitions, all in one process, with"
+                " `jaxmodsim.tune_cpu()`. By hand: the faster of arrays and scalars. Loop: dependent evaluations with a"
+                " step of Euler. Many: 1024 states in one call, of MuJoCo on all cores.",
                 ("loop", "many", "many in a loop"), ("case",), ("quantity", "peer"), shown="minimum",
             ),
-            Targets("Targets: time of jaxmodsim in that of its peers.", _accelerations),
+            Targets("Accelerations: time of jaxmodsim over that of the other program.", _accelerations),
         ),
     ),
     "long_runs": Report(
@@ -191,7 +195,7 @@ REPORTS = {
             Table(
                 "Spherical pendulum, {periods} periods of {period:.2f} s: relative errors of the energy and of the"
                 " angular momentum about the vertical, error of the angle phi against its closed form. Growth: exponent"
-                " of time over the last two decades, where the angle is not lost (swing {swing:.2f} rad). One run"
+                " of time over the last two decades, unless the error exceeds the swing of {swing:.2f} rad. One run"
                 " each.",
                 ("steps", "run", *_errors("energy"), _errors("momentum")[0], *_errors("phi")[1:]),
                 where={"case": "spherical pendulum", "at": ""},
@@ -199,16 +203,13 @@ REPORTS = {
         ),
     ),
     "hard_cases": Report(
-        "Hard cases by this and by other programs.", "hard_cases",
+        "Hard cases in this and in other programs.", "hard_cases",
         (
             Table(
-                "How many of the hard cases below each program was asked, and what came of them. diffrax and scipy:"
-                " `Fc sign(v)` for dry friction, rtol {rtol:g}, atol {atol:g}; Kvaerno5 where rates are high."
-                " Admissible"
-                " is for `jaxmodsim` the tolerance of the case, for the others {generous:g} times that and at least"
-                " {least:g}. Where a case has no answer, an error is right, whatever it says. No answer: in {limit:g}"
-                " s,"
-                " compilation included.",
+                "Number of hard cases by outcome. diffrax and SciPy: `Fc sign(v)` for dry friction, rtol {rtol:g}, atol"
+                " {atol:g}; Kvaerno5 for high rates. The admissible error is the tolerance of the case for `jaxmodsim`,"
+                " and {generous:g} times that, at least {least:g}, for the others. Where a case has no answer, any"
+                " error message counts as right. No answer: after {limit:g} s, compilation included.",
                 ("cases",), columns=("at",),
             ),
             Table("Case by case.", ("verdict",), ("case",), ("peer",)),
@@ -218,42 +219,42 @@ REPORTS = {
         "Reverse mode against forward mode: derivatives of the same steps.", "limits",
         (
             Table(
-                "Reverse mode against forward mode, which may differ by rounding alone: differences relative to the"
-                " derivative, or to the answer over the number where that is larger. Named problems by all numbers of"
-                " their scenes, at rtol 1e-6, 1e-9 and 1e-12; hard cases (stiffness, rest and reversal, many events,"
-                " gradients) by theirs. Tuned: with `jaxmodsim.tune_cpu()`.",
+                "Difference between reverse and forward mode, which may differ by rounding only: relative to the"
+                " derivative, or to result over parameter if that is larger. Named problems with respect to all numbers"
+                " of their scenes, at rtol 1e-6, 1e-9 and 1e-12; hard cases (stiffness, rest and reversal, many events,"
+                " gradients) with respect to theirs. Tuned: with `jaxmodsim.tune_cpu()`.",
                 ("derivatives", "median", "largest", "above 1e-11"), ("case", "at"),
             ),
-            Table("Those above {shown:g}.", ("difference", "why it is hard"), ("case", "at")),
+            Table("Differences above {shown:g}.", ("difference", "why it is hard"), ("case", "at")),
         ),
     ),
     "ensemble": Report(
-        "Ensembles on the device at hand, in both precisions.", "sweeps",
+        "Ensembles on one device, in both precisions.", "sweeps",
         (Table(
             "{runs:,} runs in one call on {device}: the Lorenz system from 0 to 1 by Tsit5 of diffrax at 1e-8 (float32:"
-            " 1e-6), and the LuGre test bench at 1e-4. Error: the largest at the end, of 16"
-            " runs, relative where the value is above 1.",
+            " 1e-6), and the LuGre test bench at 1e-4. Error: largest final error of 16 runs, relative for values above"
+            " 1.",
             ("time of all", "runs a second", "error"), ("case", "at"),
         ),),
     ),
     "sweep": Report(
-        "Many runs: on all cores, into a store, killed and begun again.", "sweeps",
+        "Many runs: on all cores, into a store, killed and resumed.", "sweeps",
         (
             Table(
-                "{runs} runs of the LuGre test bench with different parameters, {t1:g} s each, all in turns; error of"
-                " the end velocity. Tolerances: the loosest at which the nominal run stays within 1e-6. With"
+                "{runs} runs of the LuGre test bench with different parameters, {t1:g} s each, interleaved; error of"
+                " the final velocity. Tolerance: the loosest with an error of the nominal run of at most 1e-6. With"
                 " `jaxmodsim.tune_cpu()`.",
                 ("rtol", "run", "error"), ("peer", "at"),
             ),
-            Targets("Targets on sweeps: ratios of times, unless said.", _sweep),
+            Targets("Sweeps: ratios of times, unless a unit is given.", _sweep),
         ),
     ),
     "behaviour": Report(
         "Friction laws in the standard experiments.", "laws",
         (
-            Table("What the experiments find, and their limits.", ("number", "unit", "limit"), ("case",)),
+            Table("Quantities of the experiments, and their limits.", ("number", "unit", "limit"), ("case",)),
             Table(
-                "Whether each law keeps the limit of each experiment, and its number; **no**: a known limitation.",
+                "Whether each law keeps the limit of each experiment, with its value; **no**: a known limitation.",
                 ("verdict",), columns=("case",),
             ),
         ),
@@ -261,28 +262,27 @@ REPORTS = {
     "friction_models": Report(
         "Friction models on the test bench.", "laws",
         (Table(
-            "A box of 2 kg under a force rising by 1 N/s (where not said otherwise), 10 s. Break-away: friction falls"
-            " behind the applied force by 0.05 N for good.",
+            "A box of 2 kg under a force that rises by 1 N/s unless the name says otherwise, 10 s. Break-away: from"
+            " then on friction is at least 0.05 N below the applied force.",
             ("break-away", "zero crossings", "steps", "run", "ending"), ("peer", "case"),
         ),),
     ),
     "bouncing_ball": Report(
         "A ball bounces to rest: events, compliant contacts, MuJoCo.", "theory",
         (Table(
-            "A ball dropped from 1 m, e = 1/2: height and its derivative by the initial height after {bouncing} s,"
-            " between bounces; height and energy after {rest} s, at rest, both zero. At: rtol, or the step h [s], with"
-            " springs whose contacts take 0.2 sqrt(h) seconds.",
+            "A ball dropped from 1 m, e = 1/2: height after {bouncing} s, between bounces, and its derivative with"
+            " respect to the initial height; height and energy after {rest} s, at rest, both zero in closed form. At:"
+            " rtol, or the step h [s], with springs whose contacts take 0.2 sqrt(h) seconds.",
             ("error of the height", "error of its derivative", "height at rest", "energy at rest", "run"),
             ("peer", "at"),
         ),),
     ),
     "periodic_orbit": Report(
-        "Periodic orbits by shooting, beside simulations until they have settled.", "orbits",
+        "Periodic orbits by shooting, and by simulations that settle.", "orbits",
         (Table(
-            "Numbers with closed forms: by `periodic_orbit`, which gives the multipliers too and says that it has"
-            " converged, and by a simulation that is taken to have settled. rtol {rtol:g}; Den Hartog's oscillator at"
-            " {W:g} rad/s, mass, stiffness and amplitude of the force 1. At: how long the simulation lasts, from rest;"
-            " with one the search starts too.",
+            "Quantities with closed forms, by `periodic_orbit` and by the end of a simulation. rtol {rtol:g}. Den"
+            " Hartog's oscillator at {W:g} rad/s, with mass, stiffness and amplitude of the force 1. At: duration of"
+            " the simulation from rest, which `periodic_orbit` also starts with.",
             ("error", "run"), ("case", "peer", "at"),
         ),),
     ),
@@ -290,30 +290,30 @@ REPORTS = {
         "`jaxmodsim fit` on a measured axis.", "measured_record",
         (Table(
             "EMPS record, {samples:,} samples, open-loop error of the position over the whole record, and in four parts"
-            " that were held back one after the other. Asked for: {goal} mm with at most 8 parameters. One command,"
-            " {seconds} s.",
+            " held out one after the other. Target: {goal} mm with at most 8 parameters. One command, {seconds} s.",
             ("parameters", "RMSE", "RMSE with 5 steps a sample", "held back", "standard error", "not determined"),
         ),),
     ),
     "new_records": Report(
-        "Whether a fit to one record keeps its word on another one.", "identification",
+        "Coverage of the bands of a fit for another record.", "identification",
         (
             Table(
-                "{pairs} synthetic pairs of records of an axis with LuGre friction, which depends on position by 5 %,"
-                " too; its level differs by 0 to {largest:g} % (drawn). A law is chosen by folds of the first record;"
-                " errors on the second, and its samples within bands for 90 %.",
+                "{pairs} synthetic pairs of records of an axis with LuGre friction, which varies by 5 % with position."
+                " Its level differs by 0 to {largest:g} % (random). Folds of the first record choose the law; errors"
+                " and samples within 90 % bands are those of the second.",
                 ("samples in the band", "within 10 % of the best", "median error"), ("case",), ("quantity", "at"),
             ),
         ),
     ),
     "coverage": Report(
-        "How often 95 % intervals hold the truth.", "identification",
+        "Coverage of 95 % confidence intervals.", "identification",
         (Table(
-            "Share of {repeats} repeats whose 95 % interval held the truth; starts wrong by up to a factor of ten.",
+            "Share of {repeats} repeats whose 95 % interval contains the truth; starts wrong by up to a factor of ten.",
             ("share", "converged", "time"), ("case",), ("quantity", "at"),
         ), Table(
-            "Fits by the defaults, where nobody says where the record starts: share of {repeats} repeats whose 95 %"
-            " interval held the truth, that remark a constant offset of the sensor, and that remark one or hold all.",
+            "Fits with default options and an unknown start of the record. Held: share of {repeats} repeats whose 95 %"
+            " interval contains the truth. Remark: share that report a constant offset of the sensor;"
+            " in the last column also those whose intervals all hold.",
             ("held", "remark on an offset", "remark, or all hold"), ("case",), ("quantity", "at"),
         )),
     ),

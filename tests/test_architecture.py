@@ -28,7 +28,7 @@ APPLICATIONS = {
     "sweeps": 2150,
     "export": 1100,
     "problems": 3000,
-    "plot": 1650,
+    "plot": 1700,
     "cli": 3050,
 }
 LABORATORY = ("tests", "bench")

@@ -81,10 +81,15 @@ def page(example: Path, shown: Shown) -> str:
     """Markdown of one example: what it is, its figures, what it prints, its code."""
     code = example.read_text()
     title, _, text = (ast.get_docstring(ast.parse(code)) or "").partition("\n")
+    every = examples()
+    place = every.index(example)
+    before, after = every[place - 1], every[(place + 1) % len(every)]
     figures = "\n\n".join(f"![{title}]({path.name})" for path in shown.figures)
     return (
-        f"# {title.rstrip('.').split(': ')[0]}\n\n{title}\n{text}\n\n{figures}\n\n"
-        f"*{shown.seconds:.0f} s of processor time here, start and compilation included. It prints:*\n\n"
+        f"# {title.rstrip('.').split(': ')[0]}\n\n"
+        f"[Previous]({before.stem}.md) | [Gallery](../gallery.md) | [Next]({after.stem}.md)\n\n"
+        f"{title}\n{text}\n\n{figures}\n\n"
+        f"*{shown.seconds:.0f} s of processor time, start and compilation included. Output:*\n\n"
         f"```text\n{shown.printed}```\n\n`examples/{example.name}`:\n\n```python\n{code}```\n"
     )
 

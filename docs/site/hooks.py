@@ -29,7 +29,7 @@ _LIVE = ROOT / "docs" / "live" / "build.py"
 _SHIM = "https://unpkg.com/iframe-worker/shim"
 _SIMULATE = """# Live
 
-Every move of a slider runs the machine again, here in the browser. [Alone on a page](live.html)
+Every move of a slider runs the machine again, here in the browser. [Open full screen](live.html)
 
 <iframe src="live.html" title="Simulation" style="width: 100%; height: 80vh; border: 0"></iframe>
 """
@@ -87,6 +87,8 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
             target = "index.md"
         elif path in _COPIES:
             target = _COPIES[path]
+        elif path == "docs/live/page.html":
+            target = "simulate.md"
         elif path.startswith("examples/"):
             target = path.removesuffix(".py") + ".md"
         elif path.startswith("jaxmodsim/"):

@@ -183,7 +183,8 @@ def test_tables_pivot_rows(recorded):
     ]  # fmt: skip
     assert Table("", ("run",), ("case",), ("peer",), {"peer": ("z", "x|y")}).cells(found)[1] == ["a", "3", "failed"]
     targets = Targets("", lambda r: [("a", ">= 2", r.number("steps", case="a")), ("b", "< 1", r.number("no"))])
-    assert targets.cells(found)[1:] == [["a", ">= 2", "7", "yes"], ["b", "< 1", "-", "not measured"]]
+    assert targets.verdicts(found)[1:] == [["a", ">= 2", "7", "yes"], ["b", "< 1", "-", "not measured"]]
+    assert targets.cells(found)[1:] == [["a", "7"], ["b", "-"]]
 
 
 def test_tables_are_rendered_into_their_blocks(recorded, tmp_path, monkeypatch):
@@ -197,6 +198,15 @@ def test_tables_are_rendered_into_their_blocks(recorded, tmp_path, monkeypatch):
     assert "old" not in rendered
     page.write_text(rendered)
     assert render.render(page, tmp_path) == rendered
+    targets = Targets("Ratios.", lambda r: [("a", ">= 2", 7.0)])
+    monkeypatch.setitem(REPORTS, "coverage", type(report)("", "", (Table("Times.", ("run",)), targets)))
+    page.write_text("<!-- bench:coverage -->\n<!-- /bench -->\n<!-- bench:coverage targets -->\n<!-- /bench -->\n")
+    shown, asked = render.render(page, tmp_path).split("<!-- bench:coverage targets -->")
+    assert "Times." in shown
+    assert "Times." not in asked
+    assert "| a | 7 |" in shown
+    assert "| a | >= 2 | 7 | yes |" in asked
+    page.write_text(rendered)
     recorded.write_text(recorded.read_text().replace('"smoke": false', '"smoke": true'))
     with pytest.raises(SystemExit, match="comes from a smoke run"):
         render.render(page, tmp_path)

@@ -1,5 +1,9 @@
 """Runs as figures, films and tables: names, units, stick, and what a notebook gets to see."""
 
+import base64
+import io
+import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -95,9 +99,11 @@ def test_what_cannot_be_drawn_says_why(belt: Trajectory) -> None:
         plot.animate(belt, lambda q: jnp.zeros(2))
     with pytest.raises(ValueError, match="finite places"):
         plot.animate(belt, lambda q: jnp.full((1, 2), jnp.nan))
+    with pytest.raises(ValueError, match="has no signal 'torque': its signals are x, x_dot, friction, friction_mode"):
+        plot.animate(belt, lambda q: jnp.zeros((1, 2)), signals=("torque",))
     with pytest.raises(ValueError, match="more than 5000: pass a larger speed"):
         plot.animate(belt, lambda q: jnp.zeros((1, 2)), speed=1e-3)
-    with pytest.raises(ValueError, match=r"ends in \.gif or \.html, but 'film\.avi' was given"):
+    with pytest.raises(ValueError, match=r"ends in \.gif, \.webp or \.html, but 'film\.avi' was given"):
         plot.animate(belt, lambda q: jnp.zeros((1, 2))).save("film.avi")
 
 
@@ -106,20 +112,34 @@ def test_films(belt: Trajectory, tmp_path: Path) -> None:
         del p
         return jnp.stack([jnp.zeros(2), jnp.stack([q[0], 0.0 * q[0]])]), jnp.array([[0.0, 1.0]])
 
-    film = plot.animate(belt, block, fps=4, speed=0.5)
+    film = plot.animate(belt, block, signals=("friction", "x"), fps=4, speed=0.5)
     film.save(tmp_path / "film.gif")
+    film.save(tmp_path / "film.webp")
     film.save(str(tmp_path / "film.html"))
-    with Image.open(tmp_path / "film.gif") as image:
-        assert getattr(image, "n_frames", 0) == 2 * 2 * 4 + 1
+    for name in ("film.gif", "film.webp"):
+        with Image.open(tmp_path / name) as image:
+            assert getattr(image, "n_frames", 0) == 2 * 2 * 4 + 1
     html = (tmp_path / "film.html").read_text()
-    assert html.count("data:image/png") == 17
-    assert html.count("<button") == 9
+    frames = json.loads(re.findall(r"const frames = (.+);", html)[0])
+    assert len(frames) == 17
+    assert html.count("<button") == 1
     assert "https:" not in html
-    assert "fa-" not in html
+    # The page composes what the image file shows.
+    back = re.findall(r"url\(data:image/webp;base64,(.+?)\)", html)[0]
+    shown = [Image.open(io.BytesIO(base64.b64decode(data))).convert("RGBA") for data in (back, *frames)]
+    with Image.open(tmp_path / "film.webp") as image:
+        for i in (0, 8, 16):
+            image.seek(i)
+            assert Image.alpha_composite(shown[0], shown[1 + i]) == image.convert("RGBA")
     in_space = plot.animate(belt, lambda q: jnp.stack([jnp.stack([q[0], q[0] ** 2, 1.0 - q[0]])]), fps=1)
     in_space.save(tmp_path / "space.gif")
     with Image.open(tmp_path / "space.gif") as image:
         assert image.size == (500, 500)
+
+
+def test_a_film_of_five_seconds_is_small(belt: Trajectory) -> None:
+    film = plot.animate(belt, lambda q: jnp.stack([jnp.zeros(2), q[0] * jnp.ones(2)]), signals=("x",), speed=0.4)
+    assert len(film._repr_html_()) < 1_000_000
 
 
 def test_a_notebook_shows_figures_and_films(belt: Trajectory) -> None:
@@ -128,7 +148,7 @@ def test_a_notebook_shows_figures_and_films(belt: Trajectory) -> None:
     shown, _ = DisplayFormatter().format(figure)
     assert shown["image/png"][:4] == b"\x89PNG"
     shown, _ = DisplayFormatter().format(plot.animate(belt, lambda q: jnp.zeros((1, 2)), fps=1))
-    assert "data:image/png" in shown["text/html"]
+    assert "data:image/webp" in shown["text/html"]
 
 
 def test_no_figure_needs_pyplot() -> None:
@@ -143,4 +163,4 @@ def test_no_figure_needs_pyplot() -> None:
 def test_places_of_a_mechanism_may_need_its_numbers() -> None:
     run = simulate(problems.four_bar.scene(), *problems.four_bar.state(0.7, 8.0), 0.2, ts=jnp.linspace(0.0, 0.2, 5))
     film = plot.animate(run, lambda q, p: jnp.stack([p["a"] * jnp.stack([jnp.cos(q[0]), 0.0, jnp.sin(q[0])])]), fps=20)
-    assert "data:image/png" in film._repr_html_()
+    assert "data:image/webp" in film._repr_html_()
