@@ -2,6 +2,7 @@
 
 from ._controllers import FiniteSteps as FiniteSteps
 from ._controllers import StepsTo as StepsTo
+from ._error_checks import without_error_checks as without_error_checks
 from ._first_step import first_step as first_step
 from ._first_step import trial_step as trial_step
 from ._gauss import Gauss as Gauss
@@ -12,7 +13,6 @@ from ._rodas5p import Rodas5P as Rodas5P
 from ._rosenbrock import RosenbrockTableau as RosenbrockTableau
 from ._rosenbrock import rosenbrock_step as rosenbrock_step
 from ._stored_steps import StoredSteps as StoredSteps
-from ._without_error_checks import without_error_checks as without_error_checks
 from .events._controller import EventController as EventController
 from .events._samples import SampledJumps as SampledJumps
 from .events._solver import EventSolver as EventSolver

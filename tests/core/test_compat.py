@@ -24,7 +24,7 @@ from jaxmodsim._core.arrays import opaque_one
 from jaxmodsim._core.scalarise import columns_of, in_scalars
 from jaxmodsim._core.trace_checks import check_indices, traced
 from jaxmodsim.export._program import program_of
-from jaxmodsim.solvers._without_error_checks import calls_back, without_error_checks
+from jaxmodsim.solvers._error_checks import calls_back, without_error_checks
 
 ROOT = Path(__file__).parents[2]
 GROUPS = {"backends", "jaxprs", "kernels", "last_line", "programs", "stored_steps", "trace_state"}

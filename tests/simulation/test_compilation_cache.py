@@ -17,7 +17,7 @@ import pytest
 import jaxmodsim as jms
 from jaxmodsim import problems
 from jaxmodsim.solvers import without_error_checks
-from jaxmodsim.solvers._without_error_checks import calls_back
+from jaxmodsim.solvers._error_checks import calls_back
 
 TIMES = np.linspace(0.0, 1.0, 5)
 
@@ -184,7 +184,7 @@ def test_checks_of_a_scenes_own_functions_stay() -> None:
         eqx.filter_jit(end)(jnp.full(1, 0.01))
 
 
-def test_without_error_checks_leaves_out_the_checks_of_its_arguments_alone() -> None:
+def test_checks_of_arguments_alone_are_left_out() -> None:
     def checked(x: Any, y: Any) -> Any:
         x = eqx.error_if(2.0 * jnp.array(x), x < 0, "x is negative")
         return jnp.sum(x**2) * eqx.error_if(y + 1.0, y < 0, "y is negative")

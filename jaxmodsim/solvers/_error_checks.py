@@ -1,4 +1,4 @@
-"""Calls without the run-time checks of their arguments."""
+"""Calls without the run-time checks by which a library validates its arguments."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,20 +12,20 @@ from .._core.compat import AVAILABLE, ClosedJaxpr, Literal
 
 
 def without_error_checks(fn: Callable[..., Any], *args: Array | None) -> Any:
-    """Evaluate `fn(*args)` without the checks of `args` by `equinox.error_if`.
+    """`fn(*args)` without the checks by `equinox.error_if` of the arguments themselves.
 
-    A failed check calls Python. JAX does not keep a program with a callback in its persistent compilation cache, and
-    inside `jax.vmap` one failed check ends the whole batch. The caller therefore makes the same checks, and reports
-    them by result codes.
+    Such a check calls back to Python if it fails. JAX does not keep a program with a callback in its persistent
+    compilation cache, and inside `jax.vmap` one failed check ends the whole batch. The caller therefore makes the same
+    checks, and returns their results as numbers.
 
-    The function removes only checks that pass through one of `args`, or a copy or a multiple of it (times that run
-    backward). Checks of other values remain, and so do all checks in loops and in functions with their own derivative.
-    Derivatives are those of `fn`, since a check is an identity.
+    This leaves out only checks that return one of `args`, a copy or a multiple of it (times that run backward). Checks
+    of other values stay, and so do all checks in loops and in functions with a derivative of their own. Derivatives are
+    those of `fn`, as a check is an identity.
 
     **Arguments:**
 
     - `fn`: a function of arrays that returns a pytree of arrays. It may close over traced values.
-    - `args`: arrays, or None. If none of them is traced, the result is that of the plain call.
+    - `args`: arrays, or None. If none of them is traced, nothing is compiled, and this calls `fn` itself.
     """
     if "jaxprs" not in AVAILABLE or is_known(*args):
         return fn(*args)
@@ -35,7 +35,7 @@ def without_error_checks(fn: Callable[..., Any], *args: Array | None) -> Any:
 
 
 def _run(closed: ClosedJaxpr, inputs: list[Any], given: list[Any]) -> list[Any]:
-    """Evaluate a traced function without the checks of the values `given`; their multiples are added to the list."""
+    """Evaluate a traced function without the checks of the values `given`, to which this adds their multiples."""
     jaxpr = closed.jaxpr
     values: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *inputs], strict=True))
 
@@ -67,11 +67,11 @@ def _step(eqn: Any, operands: list[Any], given: list[Any]) -> list[Any]:
 
 
 def calls_back(jaxpr: Any) -> bool:
-    """Whether a traced function contains a callback to Python."""
+    """Whether a traced function calls Python while it runs."""
     return any("callback" in eqn.primitive.name or any(map(calls_back, _inner(eqn))) for eqn in jaxpr.eqns)
 
 
 def _inner(eqn: Any) -> list[Any]:
-    """Traced functions inside an equation: bodies, branches, and functions with their own derivative."""
+    """Traced functions inside an equation: bodies, branches, and functions with a derivative of their own."""
     inside = [x for value in eqn.params.values() for x in (value if isinstance(value, tuple | list) else (value,))]
     return [getattr(x, "jaxpr", x) for x in inside if hasattr(getattr(x, "jaxpr", x), "eqns")]
