@@ -1,4 +1,4 @@
-"""The one report: tables of recorded results, in the layouts of `tables.py`, put into the pages that name them.
+"""Render the tables of recorded results, with the layouts of `tables.py`, into the pages that name them.
 
 README.md and docs/*.md say where the tables of `bench/results/NAME.json` go:
 
@@ -25,7 +25,7 @@ _BLOCK = re.compile(r"(<!-- bench:([\w-]+) -->\n)(.*?)(<!-- /bench -->)", re.DOT
 
 
 def report(found: Recorded) -> str:
-    """All tables of a result in Markdown; the last caption says where they were made and what was not run."""
+    """All tables of a result in Markdown; the last caption has the provenance and the peers that were not run."""
     shown = REPORTS[found.name].tables
     parts = []
     for number, table in enumerate(shown):
@@ -38,7 +38,7 @@ def report(found: Recorded) -> str:
 
 
 def _markdown(lines: list[list[str]]) -> str:
-    """The first column is text and the others are aligned to the right."""
+    """A table in Markdown, with all columns but the first aligned to the right."""
     heading, *rows = lines
     escaped = [[text.replace("|", "\\|") for text in row] for row in rows]
     return "".join(
@@ -47,12 +47,12 @@ def _markdown(lines: list[list[str]]) -> str:
 
 
 def pages() -> list[Path]:
-    """README.md and the pages under docs/."""
+    """Paths of README.md and of the pages under docs/."""
     return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def render(page: Path, results: Path) -> str:
-    """Text of `page` with every marked block replaced by the tables of the result it names."""
+    """Text of `page`, with each marked block replaced by the tables of its result."""
     text = page.read_text()
 
     def block(match: re.Match[str]) -> str:
@@ -71,11 +71,11 @@ def render(page: Path, results: Path) -> str:
 
 
 def main() -> None:
-    """Render, or check."""
+    """Render the pages, or check them."""
     parser = argparse.ArgumentParser(description="Put the tables of the results into README.md and docs/*.md.")
     parser.add_argument("--check", action="store_true", help="only say whether the pages are up to date")
     check = parser.parse_args().check
-    # All before the first is written: an error leaves every page as it was.
+    # All pages are rendered before the first is written, so that an error leaves them unchanged.
     rendered = {page: render(page, HERE / "results") for page in pages()}
     outdated = [page for page, text in rendered.items() if page.read_text() != text]
     names = ", ".join(page.relative_to(ROOT).as_posix() for page in outdated)
