@@ -26,14 +26,14 @@ from bench.scenes import SCENES
 PACKAGE = f"{Path(jaxmodsim.__file__).parent}/"
 RECORD = Path(__file__).parents[1] / "tests" / "equations.json"
 LINES = 40
-# "vprim" is what one of the others becomes in a batch.
+# "vprim" is one of the others in a batch.
 _TRACED_LATER = ("run", "change_of_run", "vprim")
 Chain: TypeAlias = tuple[Any, ...]
 Way: TypeAlias = Literal["run", "gradient", "jacobian", "batch"]
 
 
 def equations(jaxpr: Any, within: Chain = (), called: set[Any] | None = None) -> Iterator[Chain]:
-    """All equations of a traced function, as often as XLA receives them, each before those that it is `within`.
+    """All equations of a traced function, as often as XLA receives them, each with the equations that it is `within`.
 
     `called`: functions of `jax.jit` that have been counted.
     """
@@ -60,29 +60,31 @@ def traced(name: str, way: Way) -> list[Chain]:
 
 
 def functions(chain: Chain) -> list[str]:
-    """Functions of the package that an equation comes from, the innermost first."""
-    tracebacks = [eqn.source_info.traceback for eqn in chain]  # each ends where the function of the next begins
+    """Functions of the package that emit an equation, innermost first."""
+    tracebacks = [eqn.source_info.traceback for eqn in chain]  # each ends at the function of the next
     frames = (frame for each in tracebacks if each for frame in each.frames if frame.file_name.startswith(PACKAGE))
     return list(dict.fromkeys(f"{x.file_name.removeprefix(PACKAGE)}:{x.function_name}" for x in frames)) or ["(none)"]
 
 
 def recorded() -> dict[str, dict[Way, int]]:
-    """The counts that the tests hold, by scene."""
+    """The recorded counts of the tests, by scene."""
     return json.loads(RECORD.read_text())["scenes"]
 
 
 def main(
-    names: Annotated[list[str] | None, typer.Argument(help="Scenes of bench/scenes.py; all recorded without.")] = None,
-    of: Annotated[Way, typer.Option(help="What is traced.")] = "run",
-    record: Annotated[bool, typer.Option("--record", help="Record the counts that the tests hold.")] = False,
+    names: Annotated[
+        list[str] | None, typer.Argument(help="Scenes of bench/scenes.py; by default the recorded ones.")
+    ] = None,
+    of: Annotated[Way, typer.Option(help="Function to trace.")] = "run",
+    record: Annotated[bool, typer.Option("--record", help="Record the counts for the tests.")] = False,
 ) -> None:
-    """List the equations of scenes by the functions of the package that they come from.
+    """List the equations of scenes by the functions of the package that emit them.
 
     "own" are those of the function itself, "with inner" also those of functions that it calls.
     """
     for name in names or recorded():
         if name not in SCENES:
-            raise typer.BadParameter(f"no scene is called {name!r}; there are {', '.join(SCENES)}")
+            raise typer.BadParameter(f"no scene is called {name!r}; there are: {', '.join(SCENES)}")
         if record:
             _record(name)
             continue
@@ -104,5 +106,5 @@ def _record(name: str) -> None:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    logging.getLogger("jaxmodsim").setLevel(logging.ERROR)  # nothing is run, so no hint on how to run it faster
+    logging.getLogger("jaxmodsim").setLevel(logging.ERROR)  # no hints on speed, because nothing is run
     typer.run(main)

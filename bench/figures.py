@@ -11,19 +11,19 @@ from matplotlib.figure import Figure
 from bench.layout import OURS, Recorded
 from bench.tables import HAND
 
-# Okabe and Ito, Color universal design, 2008: told apart without red and green.
+# Okabe and Ito, Color universal design, 2008: distinct for colour-blind readers.
 BLUE, RED, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#8a8a8a"
 _COLOURS = (BLUE, RED, GREEN, "#cc79a7", GREY, "#e69f00", "#56b4e9", "#000000")
 
 
 def save(figure: Figure, path: Path, dpi: int = 150) -> None:
-    """Write a figure, and close it."""
+    """Write and close a figure."""
     figure.savefig(path, dpi=dpi)
     plt.close(figure)
 
 
 def accelerations(r: Recorded) -> Figure:
-    """Time over the number of links, one panel for each way to measure."""
+    """Plot time over the number of links, with a panel for each method of measurement."""
     figure, axes = plt.subplots(1, 2, figsize=(9.0, 4.3), sharey=True, layout="constrained")
     sizes = r.all_of("loop", "case")
     for panel, way in zip(axes, ("loop", "many"), strict=True):
@@ -41,7 +41,7 @@ def accelerations(r: Recorded) -> Figure:
 
 
 def lugre_work_precision(r: Recorded) -> Figure:
-    """Work-precision diagram: the lower left is the better place."""
+    """Plot a work-precision diagram: lower left is better."""
     figure, axes = plt.subplots(figsize=(7.0, 4.6), layout="constrained")
     for marker, peer in zip("osD^v<>PX*", r.all_of("run", "peer"), strict=False):
         ladder = r.all_of("run", "at", peer=peer)
@@ -58,7 +58,7 @@ def lugre_work_precision(r: Recorded) -> Figure:
 
 
 def long_runs(r: Recorded) -> Figure:
-    """Errors of the energy and of the angle over periods, one line for each solver."""
+    """Plot errors of the energy and of the angle over periods, with a line for each solver."""
     figure, axes = plt.subplots(1, 2, figsize=(13.0, 5.0), layout="constrained")
     titles = {
         "error of energy": "Energy: no drift with Gauss (solid), linear with the others",
@@ -78,9 +78,9 @@ def long_runs(r: Recorded) -> Figure:
 
 
 def hard(r: Recorded) -> Figure:
-    """Errors of hard cases in what is admissible, so that 1 is the limit; cases without a number have none."""
+    """Plot errors of hard cases relative to the admissible error."""
     cases = r.all_of("passes", "case")
-    rows, least = np.arange(len(cases)), 1e-12  # what is exact is drawn at the edge
+    rows, least = np.arange(len(cases)), 1e-12  # exact results are drawn at the edge
     figure, axes = plt.subplots(figsize=(8.5, 1.4 + 0.19 * len(cases)), layout="constrained")
     for marker, kind in zip("osDv", r.all_of("error", "at"), strict=False):
         errors = np.array([r.number("error", case=case, at=kind) for case in cases])
@@ -109,7 +109,7 @@ def hard(r: Recorded) -> Figure:
 
 
 def hard_steps(r: Recorded) -> Figure:
-    """Largest stable fixed steps, found by running, over those of theory."""
+    """Plot largest stable fixed steps by simulation over those by theory."""
     figure, axes = plt.subplots(figsize=(7.5, 4.2), layout="constrained")
     solvers = r.all_of("step found", "peer")
     steps = {
@@ -127,7 +127,7 @@ def hard_steps(r: Recorded) -> Figure:
     return figure
 
 
-# Figures by name, each with the bench whose result it shows.
+# Figures by name, each with its bench.
 FIGURES: dict[str, tuple[str, Callable[[Recorded], Figure]]] = {
     **{each.__name__: (each.__name__, each) for each in (accelerations, lugre_work_precision, long_runs)},
     **{each.__name__: ("hard_cases", each) for each in (hard, hard_steps)},

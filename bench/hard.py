@@ -1,4 +1,4 @@
-"""All hard cases under every transform, in several processes, and the largest stable steps: rows of a result."""
+"""All hard cases under every transform, in several processes, and the largest stable steps, as rows of a result."""
 
 import math
 import multiprocessing
@@ -22,13 +22,13 @@ KINDS = {
     "energy balance": ("float64", ("energy",)),
     "value or derivative, float32": ("float32", (*VALUES, *SLOPES)),
 }
-# Cases that a process checks. Each compiles tens of programs, a program takes several maps of memory, and Linux gives a
-# process no more than 65 530 of those.
+# Number of cases for each process. A case compiles tens of programs, each with several memory maps, and Linux allows a
+# process 65 530 maps.
 _PORTION = 12
 
 
 def add_errors(result: Result, reports: Iterable[CaseReport]) -> None:
-    """Errors over what is admissible, so that 1 is the limit, and whether each case passes."""
+    """Add errors relative to the admissible error, and whether each case passes."""
     for report in reports:
         about = {"case": f"{report.case.family}: `{report.case.name}`"}
         for kind, (dtype, transforms) in KINDS.items():
@@ -38,7 +38,7 @@ def add_errors(result: Result, reports: Iterable[CaseReport]) -> None:
 
 
 def add_steps(result: Result, names: Sequence[str], solvers: Sequence[str] = tuple(EXPLICIT)) -> None:
-    """Largest stable fixed steps [s] of explicit methods, by theory and found by running."""
+    """Add largest stable fixed steps [s] of explicit methods, by theory and by simulation."""
     for name in names:
         law = formulations()[name]
         for solver in solvers:
@@ -49,7 +49,7 @@ def add_steps(result: Result, names: Sequence[str], solvers: Sequence[str] = tup
 def check_many(
     names: Sequence[str], transforms: Sequence[str] = TRANSFORMS, dtypes: Sequence[str] = DTYPES
 ) -> list[CaseReport]:
-    """Reports on cases, in this order, also where a process was killed; each is printed as it is found."""
+    """Reports on cases in this order, printed as they arrive. A killed process gives reports too."""
     cases, jobs = hard_cases(), multiprocessing.cpu_count()
     reports: dict[str, CaseReport] = {}
     order = sorted(names, key=lambda name: name not in LONG)
@@ -69,7 +69,7 @@ def _result(future: Future[tuple[CheckFinding, ...]]) -> tuple[CheckFinding, ...
     try:
         return future.result()
     except BrokenProcessPool as error:
-        # That of this case, or of another one that was begun with it.
+        # The process of this case, or of another one in the same batch.
         return (CheckFinding("alone", "float64", math.nan, False, f"A process was killed: {error}"),)
 
 
@@ -77,7 +77,7 @@ def _begin() -> None:
     jax.config.update("jax_enable_x64", True)
 
 
-# Cases of one structure share what is compiled, and a process makes them once.
+# Cases with the same structure share compiled programs. A process creates all cases once.
 _cases = cache(hard_cases)
 
 
@@ -85,5 +85,5 @@ def _found(name: str, transforms: tuple[str, ...], dtypes: tuple[str, ...]) -> t
     try:
         return check(_cases()[name], transforms, dtypes).findings
     except Exception as error:
-        # Whatever it is, the other cases go on.
+        # The other cases continue after any error.
         return (CheckFinding("alone", "float64", math.nan, False, f"{type(error).__name__}: {error}"),)

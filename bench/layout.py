@@ -1,4 +1,4 @@
-"""Recorded results as they are read, and what a table shows of them."""
+"""Recorded results, and the layouts of tables."""
 
 import json
 import math
@@ -15,7 +15,7 @@ Value = float | str | None
 
 @dataclass(frozen=True)
 class Recorded:
-    """A result as it was written."""
+    """A recorded result."""
 
     name: str
     smoke: bool
@@ -27,29 +27,29 @@ class Recorded:
 
     @classmethod
     def read(cls, path: Path) -> "Recorded":
-        """From its file."""
+        """Read a file."""
         found = cls(**json.loads(path.read_text()))
         found.known.update({tuple(row[key] for key in ("case", "peer", "quantity", "at")): row for row in found.rows})
         return found
 
     def get(self, quantity: str, *, peer: str = OURS, at: Any = "", case: str = "", key: str = "value") -> Value:
-        """A value; None where there is none."""
+        """A value, or None."""
         return self.known.get((case or self.name, peer, quantity, at), {}).get(key)
 
     def number(self, quantity: str, **where: Any) -> float:
-        """A number; NaN where there is none."""
+        """A number, or NaN."""
         value = self.get(quantity, **where)
         return float(value) if isinstance(value, int | float) else math.nan
 
     def all_of(self, quantity: str, key: str, **where: Any) -> list[Any]:
-        """What rows of a quantity have under a key such as `at`, in their order, each once."""
+        """Distinct values of a key such as `at` in the rows of a quantity, in order."""
         rows = (row for row in self.rows if row["quantity"] == quantity)
         return list(dict.fromkeys(row[key] for row in rows if all(row[k] == v for k, v in where.items())))
 
 
 @dataclass(frozen=True)
 class Table:
-    """A layout: rows of the result, pivoted.
+    """The layout of a table: rows of the result, pivoted.
 
     - `caption`: names settings in braces, as `str.format` does.
     - `quantities`: those that are shown.
@@ -97,12 +97,12 @@ def _in(value: Any, wanted: Any) -> bool:
 
 
 def _name(value: Any) -> str:
-    """A key or a setting as a text."""
+    """A key or a setting as text."""
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def _scale(rows: list[dict[str, Any]]) -> tuple[float, str]:
-    """Factor and unit that make the times of a column readable."""
+    """Readable factor and unit for the times of a column."""
     numbers = [abs(row["value"]) for row in rows if isinstance(row["value"], float) and row["value"]]
     if rows[0]["unit"] != "s" or not numbers:
         return 1.0, rows[0]["unit"]
@@ -120,7 +120,7 @@ def _text(value: Value, scale: float) -> str:
 
 @dataclass(frozen=True)
 class Targets:
-    """A table of targets: label, target such as `>= 8` (empty where there is none), and how it is computed."""
+    """A table of targets; `of` gives label, target such as `>= 8` or "", and value of each."""
 
     caption: str
     rows: Callable[[Recorded], list[tuple[str, str, float]]]
@@ -155,7 +155,7 @@ def _plain(value: float) -> str:
 
 
 def machine_line(provenance: dict[str, Any]) -> str:
-    """One line that names processor, versions, date and commit."""
+    """A line with processor, versions, date and commit."""
     versions = ", ".join(f"{name} {version}" for name, version in provenance["versions"].items())
     state = "" if provenance["clean"] else " with uncommitted changes"
     return (

@@ -1,4 +1,4 @@
-"""Run one bench in this process, and write its result and figures into a folder: `python -m bench` starts this.
+"""Run one bench in this process, and write its result and figures into a folder, as `python -m bench` does.
 
 python -m bench.one NAME OUT [--smoke]
 """
@@ -10,8 +10,8 @@ from pathlib import Path
 
 
 def main(name: str, out: Path, *, smoke: bool) -> None:
-    """Run it with the settings that all share: tuned for the CPU if the case does not say otherwise, and in float64."""
-    if smoke:  # times mean nothing: programs are compiled in the quickest way
+    """Run a bench in float64, and tuned for the CPU unless its name ends in `_untuned`."""
+    if smoke:  # times are meaningless, so programs are compiled without optimisation
         os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
     import jax
     import matplotlib as mpl

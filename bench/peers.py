@@ -1,4 +1,4 @@
-"""The peers of the matrix: `jaxmodsim`, and what a careful user would write by hand for one case with another program.
+"""The peers of the matrix: `jaxmodsim`, and careful implementations of each case with other programs.
 
 `jaxmodsim` gets the scene, and looks for all modes of stick and slip. The others get the equations written by hand, and
 of the belt know that stick and slip towards one side alternate for ever, which is the better bargain for them. A maker
@@ -23,13 +23,13 @@ from bench.tasks import LUGRE, MAX_STEPS, Belt, Box
 
 KVAERNO5, CVODES, SUNDAE = "diffrax Kvaerno5", "CVODES (CasADi)", "CVODE (scikit-sundae)"
 SCANNED = "legs in `lax.scan`"
-# Ways of running many sets.
+# Batch methods.
 VMAP, GROUPS, SWEEP, LOOP = "vmap", "lax.map, 64 at a time", "sweep", "loop"
 
 
 @dataclass(frozen=True)
 class Peer:
-    """One way of making a run.
+    """A program that runs a case.
 
     - `once`: `once(rtol)` returns a function without arguments that makes one run and waits for the end state.
     - `record`: `record(rtol)` returns what `errors` of the task judges, and the number of steps, None if unknown.
@@ -46,7 +46,7 @@ class Peer:
 
 
 def makers(task: Box | Belt) -> dict[str, Callable[[], Any]]:
-    """By name, what makes each peer of a case.
+    """Functions that build each peer of a case, by name.
 
     Of diffrax's own solvers for the box these are the fastest on the testbench, implicit and explicit, and two of
     higher order.
@@ -69,7 +69,7 @@ def makers(task: Box | Belt) -> dict[str, Callable[[], Any]]:
 
 
 def batched(traced: Callable[..., Any]) -> dict[str, Callable[[float, np.ndarray], Call]]:
-    """One call over many sets, at once and in groups."""
+    """One call over many sets of parameters, at once and in groups."""
 
     def many(over: Callable[..., Any], rtol: float, sets: np.ndarray) -> Call:
         run, given = jax.jit(lambda sets: over(lambda p: traced(p, rtol), sets)), jnp.asarray(sets)
@@ -108,7 +108,7 @@ def _end_velocity(run: jms.Trajectory) -> Any:
 def diffrax_run(
     task: Box, p: Any, rtol: Any, solver: Any, *, ts: Any = None, stacked: bool = False, adjoint: Any = None
 ) -> Any:
-    """A run by plain diffrax with its default controller; the state is a tuple of scalars, or one vector."""
+    """A run by plain diffrax with its default controller; the state is a tuple of scalars or a vector."""
 
     def stacked_field(t: Any, y: Any, p: Any) -> Any:
         return jnp.stack(task.field(t, (y[0], y[1], y[2]), p))
@@ -123,7 +123,7 @@ def diffrax_run(
 
 
 def by_diffrax(task: Box, solver: Any, *, stacked: bool = False, differentiated: bool = False) -> Peer:
-    """Plain diffrax; `stacked`: whether one vector beats scalars as the state of one run. In batches scalars win."""
+    """Plain diffrax. `stacked`: whether the state of a single run is a vector; batches use scalars."""
     p = jnp.asarray(task.numbers)
     end = jax.jit(lambda p, rtol: diffrax_run(task, p, rtol, solver, stacked=stacked).ys)
 
@@ -154,7 +154,7 @@ def by_diffrax(task: Box, solver: Any, *, stacked: bool = False, differentiated:
 
 
 def looped(task: Box, solver: Callable[[float, Any], Callable[[np.ndarray], Any]]) -> Peer:
-    """A peer outside JAX, which runs many sets one after the other.
+    """A peer outside JAX, which runs sets of parameters one after the other.
 
     - `solver`: `solver(rtol, ts)` returns a function of the six numbers, which returns the states at `ts` (at some
       times up to the end without) and a function that says how many steps were made.
@@ -163,7 +163,7 @@ def looped(task: Box, solver: Callable[[float, Any], Callable[[np.ndarray], Any]
 
     def record(rtol: float) -> tuple[np.ndarray, int]:
         states = solver(rtol, task.times)(p)[0]
-        # The steps are those of a run that keeps them all.
+        # The number of steps is that of a run that saves all of them.
         states = states if len(states) == task.samples else np.vstack([np.zeros(3), states])
         return states, solver(rtol, None)(p)[1]()
 
@@ -175,7 +175,7 @@ def looped(task: Box, solver: Callable[[float, Any], Callable[[np.ndarray], Any]
 
 
 def by_casadi(task: Box) -> Peer:
-    """CVODES with a Jacobian from CasADi's own derivatives."""
+    """CVODES with a Jacobian by CasADi."""
     import casadi
 
     t, p, y = casadi.SX.sym("t"), casadi.SX.sym("p", 6), casadi.SX.sym("y", 3)
@@ -196,7 +196,7 @@ def by_casadi(task: Box) -> Peer:
 
 
 def by_sundae(task: Box) -> Peer:
-    """CVODE by scikit-sundae: field compiled by numba, Jacobian by differences, as one by hand takes more steps."""
+    """CVODE by scikit-sundae, with a field compiled by numba; a Jacobian by differences takes fewer steps."""
     import numba
     from sksundae.cvode import CVODE
 
@@ -232,7 +232,7 @@ def by_sundae(task: Box) -> Peer:
 
 
 def by_scipy(task: Box, method: str) -> Peer:
-    """A method of `solve_ivp`, its field in plain Python: for three numbers faster than NumPy."""
+    """A method of `solve_ivp`, with its field in plain Python, which is faster than NumPy for three numbers."""
     from scipy.integrate import solve_ivp
 
     def run(rtol: float, ts: Any, p: np.ndarray) -> Any:
@@ -252,7 +252,7 @@ def by_scipy(task: Box, method: str) -> Peer:
     return looped(task, lambda rtol, ts: partial(run, rtol, ts))
 
 
-# The belt: of the peers each judges the end positions of all sets.
+# The belt: each peer is judged by the end positions of all sets.
 
 
 def _judged(task: Belt, run: Callable[[np.ndarray, float], float]) -> Callable[[float], tuple[np.ndarray, None]]:
@@ -284,7 +284,7 @@ def _leg(task: Belt, t: Any, y: Any, p: Any, rtol: Any, *, sticks: bool) -> tupl
         del t, given
         return args[1] - args[2] * y[0] if sticks else y[1] - args[4]
 
-    # The load that is left falls through zero; the slip velocity starts at zero, is negative, and rises through it.
+    # The remaining load falls through zero; the slip velocity starts at zero, is negative, and rises through zero.
     event = dfx.Event(guard, optx.Newton(rtol, task.atol * rtol, optx.rms_norm), direction=not sticks)
     done = dfx.diffeqsolve(
         dfx.ODETerm(field), dfx.Tsit5(), t, task.t1, None, y, args=p, event=event, max_steps=4096, throw=False,
@@ -297,7 +297,7 @@ def _leg(task: Belt, t: Any, y: Any, p: Any, rtol: Any, *, sticks: bool) -> tupl
 
 
 def legs_scanned(task: Belt) -> Peer:
-    """A `lax.scan` over cycles of two legs; those after the end have no length."""
+    """A `lax.scan` over cycles of two legs; legs after the end have no duration."""
 
     def traced(p: Any, rtol: Any, adjoint: Any = None) -> Any:
         del adjoint
@@ -315,7 +315,7 @@ def legs_scanned(task: Belt) -> Peer:
 
 
 def scipy_legs(task: Belt, method: str) -> Peer:
-    """`solve_ivp` with terminal events, started anew at each."""
+    """`solve_ivp` with terminal events, restarted at each."""
     from scipy.integrate import solve_ivp
 
     def run(p: np.ndarray, rtol: float) -> float:

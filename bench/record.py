@@ -1,4 +1,4 @@
-"""The one format of all results: rows of case, peer, quantity, value and unit, and where they come from."""
+"""The format of all results: rows of case, peer, quantity, value and unit, with their provenance."""
 
 import json
 import math
@@ -11,7 +11,7 @@ from typing import Any
 from jaxmodsim._core.system import describe_machine
 from jaxmodsim._core.timing import measure
 
-# What benches write: the results of one are no change to the next.
+# Paths that benches write, whose changes do not make a commit unclean.
 WRITTEN = ("bench/results", "README.md", "docs")
 OURS = "jaxmodsim"
 
@@ -21,15 +21,15 @@ Value = float | str | None
 
 @dataclass
 class Result:
-    """What a bench found.
+    """The result of a bench.
 
     - `name`: of the bench.
-    - `packages`: those whose versions matter, besides JAX.
-    - `settings`: numbers that captions name.
+    - `packages`: packages whose versions are recorded, besides JAX.
+    - `settings`: numbers in captions.
     - `rows`: dictionaries with `case`, `peer`, `quantity`, `at` (a setting such as a tolerance), `value` and `unit`;
       those of times also with `quartiles`, `minimum`, `repetitions` and `first`, the time of the first call, which
       compiles. The value of a peer that failed is a text that begins with "failed".
-    - `not_run`: peers that cannot be imported, and why.
+    - `not_run`: peers that cannot be imported, with the reasons.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Result:
     def add_time(
         self, quantity: str, found: Mapping[str, Any], *, case: str = "", peer: str = OURS, at: Any = ""
     ) -> None:
-        """Add what `timed` found for one call."""
+        """Add the times of one call, from `timed`."""
         row = _row(case or self.name, peer, quantity, at)
         if "failed" in found:
             self.rows.append(row | {"value": f"failed: {found['failed']}", "unit": "s"})
@@ -75,7 +75,7 @@ def _row(case: str, peer: str, quantity: str, at: Any) -> dict[str, Any]:
 
 
 def timed(calls: Mapping[Any, Call], rounds: int, *, per: Mapping[Any, int] | int = 1, limit_s: float = 30.0) -> Any:
-    """What `measure` finds for calls in turns, by the same keys, each divided by the runs that a call makes, `per`."""
+    """Times of calls in turns, by `measure`, with the same keys, divided by the number of runs in a call, `per`."""
     report = measure(dict(calls), rounds, limit_s)  # pyright: ignore[reportArgumentType] - any key will do
     for key, found in report.items():
         count = per if isinstance(per, int) else per[key]
@@ -86,7 +86,7 @@ def timed(calls: Mapping[Any, Call], rounds: int, *, per: Mapping[Any, int] | in
 
 
 def importable(result: Result, makers: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
-    """What each maker makes, by the names of the peers; one that cannot import its package is noted and left out."""
+    """The peers by name; a peer that cannot import its package is recorded and left out."""
     made = {}
     for name, make in makers.items():
         try:

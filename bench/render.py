@@ -1,4 +1,4 @@
-"""The one report: tables of recorded results, in the layouts of `tables.py`, put into the pages that name them.
+"""Render the tables of recorded results, with the layouts of `tables.py`, into the pages that name them.
 
 README.md and the pages under docs/ say where the tables of `bench/results/NAME.json` go:
 
@@ -55,7 +55,7 @@ def pages() -> list[Path]:
 
 
 def render(page: Path, results: Path) -> str:
-    """Text of `page` with every marked block replaced by the tables of the result it names."""
+    """Text of `page`, with each marked block replaced by the tables of its result."""
     text = page.read_text()
 
     def block(match: re.Match[str]) -> str:
@@ -78,7 +78,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Put the tables of the results into the README and the docs.")
     parser.add_argument("--check", action="store_true", help="only say whether the pages are up to date")
     check = parser.parse_args().check
-    # All before the first is written: an error leaves every page as it was.
+    # All pages are rendered before the first is written, so that an error leaves them unchanged.
     rendered = {page: render(page, HERE / "results") for page in pages()}
     outdated = [page for page, text in rendered.items() if page.read_text() != text]
     names = ", ".join(page.relative_to(ROOT).as_posix() for page in outdated)

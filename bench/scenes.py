@@ -1,4 +1,4 @@
-"""Scenes whose equations are counted and whose first calls are timed: runs that are differentiated by their numbers.
+"""Scenes whose equations are counted and whose first calls are timed, differentiated by their parameters.
 
 Chains have links of one metre and one kilogram and friction in each joint; they start at rest, raised.
 """
@@ -20,7 +20,7 @@ JOINT = np.array([100.0, 1.0, 0.05, 0.2, 0.3, 0.1])  # sigma0, sigma1, sigma2, F
 
 
 class Task(NamedTuple):
-    """A run of a scene that is made of numbers, a pytree of arrays."""
+    """A run of a scene that is built from parameters, a pytree of arrays."""
 
     make: Callable[[Any], jms.Scene]
     numbers: Any
@@ -29,13 +29,13 @@ class Task(NamedTuple):
     t1: float
 
     def total(self, p: Any, **options: Any) -> tuple[Any, Any]:
-        """Sum of the saved positions of the run with the numbers `p`, and its steps."""
+        """Sum of the saved positions of the run with the parameters `p`, and its number of steps."""
         ts = np.linspace(0.0, self.t1, SAMPLES)
         run = jms.simulate(self.make(p), self.q0, self.qd0, self.t1, ts=ts, throw=False, **options)
         return jnp.sum(run.q), run.stats["num_steps"]
 
     def ways(self) -> dict[str, Callable[[Any], Any]]:
-        """The run, its derivatives and a batch of it, as functions of the numbers."""
+        """The run, its derivatives and a batch of it, as functions of the parameters."""
         return {
             "run": self.total,
             "gradient": jax.grad(self.total, has_aux=True),
@@ -56,12 +56,12 @@ def chain(n: int, law: Callable[[Any], Any]) -> Task:
 
 
 def fixed(scene: jms.Scene, q0: Any, qd0: Any, t1: float) -> Task:
-    """A scene as it is, differentiated by all of its numbers."""
+    """A given scene, differentiated by all of its numbers."""
     return Task(lambda p: p, jax.tree.map(lambda x: jnp.asarray(x, float), scene), np.array(q0), np.array(qd0), t1)
 
 
 def shaken_table() -> jms.Scene:
-    """A ball that bounces over a table that shakes, with friction along it."""
+    """A ball that bounces on a vibrating table, with friction along it."""
 
     def lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
         del t
@@ -73,16 +73,16 @@ def shaken_table() -> jms.Scene:
 
 
 def lugre(p: Any) -> jms.LuGre:
-    """The law of six numbers."""
+    """A LuGre law with six parameters."""
     return jms.LuGre(*(p[i] for i in range(6)))
 
 
 def coulomb(p: Any) -> jms.Coulomb:
-    """The law of one of them."""
+    """A law with one of these parameters."""
     return jms.Coulomb(p[3])
 
 
-# Those whose first calls are timed.
+# Scenes whose first calls are timed.
 TIMED: dict[str, Callable[[], Task]] = {
     VISCOUS: lambda: chain(2, lambda p: jms.Viscous(p[2])),
     "LuGre box": lambda: Task(TESTBENCH.scene, np.array(TESTBENCH.numbers), np.zeros(1), np.zeros(1), TESTBENCH.t1),

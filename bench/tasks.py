@@ -31,13 +31,13 @@ MAX_STEPS = 1_000_000
 class Box:
     """A run with LuGre friction: `mass x'' = rate t - stiffness x - F(v, z)` from rest; states are (x, v, z).
 
-    - `make`: scene from the law.
-    - `numbers`: of the law, in the order of `LUGRE`.
+    - `make`: builds the scene from the law.
+    - `numbers`: parameters of the law, in the order of `LUGRE`.
     - `mass` [kg], `rate` [N/s], `stiffness` [N/m], `t1` [s].
     - `samples`: number of equispaced times over which errors are taken.
-    - `atol`: absolute tolerance for a relative one.
-    - `bristle`: order of its deflection [m].
-    - `confirmed`: relative difference to which RK4 with steps of 10 us must confirm the reference.
+    - `atol`: ratio of the absolute to the relative tolerance.
+    - `bristle`: magnitude of the bristle deflection [m].
+    - `confirmed`: largest relative difference between the reference and RK4 with steps of 10 us.
     """
 
     make: Callable[[Any], jms.Scene]
@@ -53,11 +53,11 @@ class Box:
 
     @property
     def times(self) -> np.ndarray:
-        """Times over which errors are taken [s]."""
+        """Times of the error measures [s]."""
         return np.linspace(0.0, self.t1, self.samples)
 
     def scene(self, p: Any) -> jms.Scene:
-        """The scene of the six numbers."""
+        """The scene with six parameters of the law."""
         return self.make(jms.LuGre(*(p[i] for i in range(6))))
 
     def simulate(self, p: Any, rtol: Any, **options: Any) -> jms.Trajectory:
@@ -66,11 +66,11 @@ class Box:
         return jms.simulate(self.scene(p), [0.0], [0.0], self.t1, **given)
 
     def load(self, t: Any, x: Any) -> Any:
-        """Force on the box besides friction [N]."""
+        """Force on the box without friction [N]."""
         return self.rate * t - self.stiffness * x if self.stiffness else self.rate * t
 
     def field(self, t: Any, y: Any, p: Any) -> Any:
-        """The vector field by hand, for JAX: a tuple of three scalars."""
+        """A vector field by hand for JAX: a tuple of three scalars."""
         sigma0, sigma1, sigma2, coulomb, stiction, vs = (p[i] for i in range(6))
         x, v, z = y
         ratio = v / vs
@@ -90,7 +90,7 @@ class Box:
         return np.stack([run.q[:, 0], run.qd[:, 0], run.z["friction"]], axis=1), int(run.stats["num_steps"])
 
     def rk4_states(self, h: float) -> np.ndarray:
-        """States at the times of the task by the classical method of order 4, with steps of about `h`."""
+        """States at the times of the task by RK4 with steps of about `h`."""
         count = round(self.t1 / (self.samples - 1) / h)
         h = self.t1 / (self.samples - 1) / count
 
@@ -119,7 +119,7 @@ class Box:
     @cached_property
     def reference(self) -> np.ndarray:
         """States by `simulate` at 1e-12, with friction as a fourth column; RK4 must confirm them."""
-        # The absolute tolerance suits the smallest of the state, the bristle.
+        # The absolute tolerance suits the smallest entry of the state, the bristle deflection.
         states, _ = self.our_states(1e-12, 1e-11 * self.bristle)
         other = self.rk4_states(1e-5)
         disagreement = float(np.max(np.abs(states - other) / np.abs(other).max(axis=0)))
@@ -137,7 +137,7 @@ class Box:
         return found | {"error of v and F": (both, "1"), "error of F in newtons": (float(worst[3]), "N")}
 
     def sets(self, count: int) -> np.ndarray:
-        """Sets of the six parameters, within 20 %, `sigma1` from 0 to 10 N s/m; always the same."""
+        """Fixed sets of the six parameters, within 20 %, with `sigma1` from 0 to 10 N s/m."""
         rng, nominal = np.random.default_rng(20240229), np.array(self.numbers)
         sets = nominal * (1.0 + 0.2 * rng.uniform(-1.0, 1.0, (count, 6)))
         sets[:, 1] = rng.uniform(0.0, 10.0, count)
@@ -149,7 +149,7 @@ class Box:
         return np.asarray(jax.jit(jax.vmap(lambda p: self.simulate(p, 1e-11).qd[-1, 0]))(jnp.asarray(sets)))
 
     def exact_gradient(self) -> np.ndarray:
-        """Derivatives of the end velocity by the six parameters, of a run at 1e-13 of the field written by hand."""
+        """Derivatives of the end velocity by the six parameters, from a run of the field by hand at 1e-13."""
         tight, start = dfx.PIDController(rtol=1e-13, atol=self.atol * 1e-13), (jnp.zeros(()),) * 3
 
         def run(p: Any) -> Any:
@@ -161,9 +161,10 @@ class Box:
         return np.asarray(jax.jit(jax.jacfwd(run))(jnp.asarray(self.numbers)))
 
     def gradient_error(self, found: np.ndarray, exact: np.ndarray) -> float:
-        """Largest error, by the logarithms of the parameters (`sigma1`: per N s/m), relative to the largest of all.
+        """Largest error of the gradient by the logarithms of the parameters, relative to its largest entry.
 
-        Derivatives by `sigma0` and `sigma1` are next to nothing, so that an error relative to each says little.
+        That of `sigma1`, which may be 0, is per N s/m. Derivatives by `sigma0` and `sigma1` are nearly zero, so errors
+        relative to each of them say little.
         """
         scale = np.where(np.array(self.numbers) == 0.0, 1.0, np.array(self.numbers))
         return float(np.max(np.abs(found - exact) * scale) / np.max(np.abs(exact) * scale))
@@ -171,7 +172,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Belt:
-    """The belt oscillator, with its closed form; it starts at x = 0 at the speed of the belt.
+    """The belt oscillator with its closed form, started at x = 0 with the velocity of the belt.
 
     - `numbers`: Fc [N], Fs [N], k [N/m], m [kg], vb [m/s].
     - `t1` [s].
@@ -200,13 +201,13 @@ class Belt:
         return belt_oscillator.motion(jnp.asarray(self.t1), **self.named(p))[0]
 
     def sets(self, count: int) -> np.ndarray:
-        """Sets of the five parameters, within 3 % of the nominal ones; always the same."""
+        """Fixed sets of the five parameters, within 3 % of the nominal ones."""
         rng = np.random.default_rng(20240229)
         return np.array(self.numbers) * (1.0 + 0.03 * rng.uniform(-1.0, 1.0, (count, 5)))
 
     @property
     def judged(self) -> np.ndarray:
-        """The sets over which errors are taken: the nominal one and 16 others."""
+        """Sets for the error measures: the nominal one and 16 others."""
         return np.vstack([self.numbers, self.sets(16)])
 
     def exact_ends(self, sets: np.ndarray) -> np.ndarray:
@@ -226,7 +227,7 @@ class Belt:
         return float(np.max(np.abs(found / exact - 1.0)))
 
 
-# Positions of interest reach 2 mm (z) to 50 m (x).
+# The state ranges from 2 mm (z) to 50 m (x).
 TESTBENCH = Box(ramped_box.scene, (750.0, 0.0, 0.1, 1.5, 1.75, 0.2), 2.0, 1.0, 0.0, 10.0, 101, 1e-3, 1e-3, 1e-9)
 # The bristle reaches 15 um; with a finer absolute tolerance all solvers take longer for the same error.
 PULLED = Box(

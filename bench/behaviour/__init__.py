@@ -1,1 +1,1 @@
-"""The behaviour bench: what each friction law does in the standard experiments, and what it does not."""
+"""The behaviour bench: all friction laws in the standard experiments."""

@@ -1,4 +1,4 @@
-"""A law under a prescribed slip velocity, without a mechanism: its static characteristic, and its lag."""
+"""A law under a prescribed slip velocity, without a mechanism: static characteristic and frictional lag."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -17,12 +17,12 @@ from jaxmodsim.friction import (
     AbstractSetValuedLaw,
 )
 
-# Samples of every drive: of one length, so that each law is compiled once for all experiments.
+# Number of samples of every drive, the same for all, so that each law is compiled once.
 SAMPLES = 8192
 
 
 class Response(NamedTuple):
-    """What a law does under a drive, shape `[samples]` each.
+    """Response of a law to a drive, shape `[samples]` each.
 
     - `force`: at the end of the sample [N].
     - `work`: taken up by friction in the sample [J], by the trapezoidal rule.
@@ -79,26 +79,26 @@ def _slip_force(law: AbstractLaw, v: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def needs_load(law: AbstractLaw, v: float) -> bool:
-    """Whether the force at the slip velocity `v` [m/s] is that of the load, so that no motion by itself gives it."""
+    """Whether the force at the slip velocity `v` [m/s] is the load, which a prescribed motion does not define."""
     return isinstance(law, AbstractKarnoppLaw) and bool(law.holds(jnp.asarray(v)))
 
 
-NEEDS_LOAD = "In its band the force is the load, which a prescribed motion does not say."
+NEEDS_LOAD = "In the Karnopp band the force is the load, which a prescribed motion does not define."
 
 
 def path(*places: float, samples: int) -> np.ndarray:
-    """Displacements [m] of a way from place to place, each leg with the same number of samples, without the start."""
+    """Displacements [m] along legs between positions, with the same number of samples each, without the start."""
     legs = [np.linspace(a, b, samples + 1)[1:] for a, b in pairwise(places)]
     return np.concatenate(legs)
 
 
 _SPEEDS, _HELD = 64, 32
-# Every speed is held for a way of many deflections, and for longer than any lag of the laws.
+# Every speed is held for many deflections, and for longer than any lag of the laws.
 _WAY, _TIME = 40.0 * DEFLECTION, 1.0
 
 
 def _characteristic(case: LawCase) -> LawMeasurement:
-    """Slide at speeds that rise and fall again, in steps, forward and then backward."""
+    """Slide with stepwise rising and falling speeds, forward and then backward."""
     speeds = np.geomspace(0.2 * VS, 100.0 * VS, _SPEEDS)
     sweep = np.concatenate([speeds, speeds[::-1]])
     held = np.concatenate([sweep, -sweep])
@@ -125,7 +125,8 @@ def _characteristic(case: LawCase) -> LawMeasurement:
     )
 
 
-# A hundredth of the Coulomb force: a fiftieth of the fall from stiction, and more than any width or corner explains.
+# The threshold is a hundredth of the Coulomb force, a fiftieth of the fall from stiction. It exceeds the effect of any
+# width or corner.
 CHARACTERISTIC = Experiment(
     "characteristic",
     "Static characteristic: steady friction at rising and falling speed, forward and backward",
@@ -138,7 +139,7 @@ CHARACTERISTIC = Experiment(
     log_x=True,
 )
 
-# Velocity oscillates about its mean without changing sign, in Stribeck velocities; angular frequencies [1/s].
+# Mean and amplitude of the velocity in Stribeck velocities, without a change of sign; angular frequencies [1/s].
 _MEAN, _SWING = 1.5, 1.2
 _FREQUENCIES = (1.0, 10.0, 25.0)
 _PERIODS = 4
@@ -153,11 +154,11 @@ def _loop(case: LawCase, frequency: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lag(case: LawCase) -> LawMeasurement:
-    """Oscillate the velocity and hold friction at rising against friction at falling velocity."""
+    """Oscillate the velocity, and compare friction at rising and falling velocity."""
     loops = {frequency: _loop(case, frequency) for frequency in _FREQUENCIES}
     v, force = loops[_FREQUENCIES[-1]]
     half = v.size // 2
-    # Samples lie symmetrically about the turning points, so those of the way down mirror those of the way up.
+    # Samples are symmetric about the turning points, so those at falling velocity mirror those at rising velocity.
     difference = float(np.mean(force[:half] - force[half:][::-1]))
     lines = [FigureLine(f"{frequency:g} rad/s", 1e3 * v, force) for frequency, (v, force) in loops.items()]
     steady = FigureLine("steady curve", 1e3 * v[:half], case.steady(v[:half]), reference=True)
@@ -169,7 +170,7 @@ def _lag(case: LawCase) -> LawMeasurement:
     )
 
 
-# A hundredth of the Coulomb force: the loop is then as wide as a line of the figure.
+# The threshold is a hundredth of the Coulomb force, the width of a line in the figure.
 LAG = Experiment(
     "lag",
     "Frictional lag: friction against a velocity that oscillates without changing sign",

@@ -1,4 +1,4 @@
-"""Laws on the bench, an experiment, and its result: a measurement, and the threshold that makes a verdict of it."""
+"""Laws of the bench, experiments, their measurements, and verdicts by a threshold."""
 
 import enum
 import math
@@ -12,9 +12,9 @@ from jaxmodsim.friction import STANDARD, LawCase, LuGre, Stribeck, asymmetric, l
 from jaxmodsim.simulation import SimulationError
 
 FC, FS, VS, SIGMA0, WIDTH = (STANDARD[name] for name in ("Fc", "Fs", "vs", "sigma0", "width"))
-# Deflection [m] at which a contact of this stiffness breaks away.
+# Deflection [m] of a contact of this stiffness at break-away.
 DEFLECTION = FS / SIGMA0
-# Backward over forward friction of the asymmetric law.
+# Ratio of backward to forward friction of the asymmetric law.
 BACKWARD = 1.3
 
 
@@ -23,7 +23,7 @@ def _double(t: Array, q: Array, qd: Array, p: object) -> float:
 
 
 def law_cases() -> tuple[LawCase, ...]:
-    """Examples of all registered laws that have some, and of laws with modifiers."""
+    """Examples of all registered laws, and of laws with modifiers."""
     stribeck, viscous = Stribeck.cases()[0].steady, STANDARD["Fv"]
     halved = Stribeck.standard(Fc=0.5 * FC, Fs=0.5 * FS, Fv=0.5 * viscous)
     worn = asymmetric(LuGre.standard(), Fc=BACKWARD * FC, Fs=BACKWARD * FS)
@@ -39,12 +39,12 @@ def law_cases() -> tuple[LawCase, ...]:
     )
 
 
-# A number below that is not told from zero: all limits are far above it, or zero but for rounding.
+# Smaller numbers count as zero: all thresholds are far above this value, or zero up to rounding.
 _NONE = 5e-4
 
 
 class Verdict(enum.Enum):
-    """How a law did in an experiment."""
+    """Verdict of an experiment on a law."""
 
     PASS = "pass"
     FAIL = "FAIL"
@@ -54,17 +54,17 @@ class Verdict(enum.Enum):
 
 @dataclass(frozen=True)
 class Threshold:
-    """What a number must keep to pass.
+    """The limit of a number.
 
-    - `value`: the threshold, in the unit of the number.
-    - `at_most`: whether the number must be at most that; at least that otherwise.
+    - `value`: in the unit of the number.
+    - `at_most`: whether the limit is an upper one.
     """
 
     value: float
     at_most: bool
 
     def keeps(self, number: float) -> bool:
-        """Whether `number` keeps the threshold; NaN never does."""
+        """Whether `number` is within the limit; NaN is not."""
         return number <= self.value if self.at_most else number >= self.value
 
 
@@ -72,9 +72,9 @@ class Threshold:
 class FigureLine:
     """A curve of a figure.
 
-    - `label`: what it is.
-    - `x`, `y`: in the units of the experiment's axes.
-    - `reference`: whether it is what the law is held against.
+    - `label`: in the legend.
+    - `x`, `y`: in the units of the axes.
+    - `reference`: whether it is the reference for the law.
     """
 
     label: str
@@ -85,10 +85,10 @@ class FigureLine:
 
 @dataclass(frozen=True)
 class LawMeasurement:
-    """What was measured on one law.
+    """A measurement on one law.
 
-    - `number`: in the unit of the experiment; NaN where the experiment does not apply.
-    - `sentence`: what it says of the law.
+    - `number`: in the unit of the experiment; NaN if the experiment does not apply.
+    - `sentence`: interpretation of the number.
     - `lines`: curves for the figure.
     """
 
@@ -98,7 +98,7 @@ class LawMeasurement:
 
     @property
     def rounded(self) -> str:
-        """The number with two digits, in few characters; empty where there is none, and 0 for what is next to none."""
+        """The number with two digits; "" for NaN, and 0 for values near zero."""
         if math.isnan(self.number):
             return ""
         if abs(self.number) < _NONE:
@@ -112,9 +112,9 @@ class LawMeasurement:
 class ExperimentResult:
     """A measurement and its verdict.
 
-    - `verdict`: `PASS`, `FAIL`, `KNOWN_LIMITATION` (misses the threshold, as is known of such laws), `NOT_APPLICABLE`.
+    - `verdict`: `PASS`, `FAIL`, `KNOWN_LIMITATION` (a failure that the law declares), `NOT_APPLICABLE`.
     - `measured`: number, sentence and curves.
-    - `reason`: why such a law misses the threshold, or why the experiment does not apply; empty otherwise.
+    - `reason`: reason of a known limitation, or why the experiment does not apply; otherwise "".
     """
 
     verdict: Verdict
@@ -127,13 +127,13 @@ class Experiment:
     """A standard experiment on a friction law.
 
     - `name`: short, for tables and file names.
-    - `title`: what is looked at, for the figure.
-    - `quantity`: what the number is.
+    - `title`: of the figure.
+    - `quantity`: name of the number.
     - `unit`: of the number.
-    - `threshold`: what the number must keep to pass.
-    - `axes`: labels of the figure's axes, with units.
-    - `measure`: does the experiment on one law.
-    - `window`: range of the figure's vertical axis, the same for all laws.
+    - `threshold`: limit of the number.
+    - `axes`: labels of the axes, with units.
+    - `measure`: performs the experiment on one law.
+    - `window`: range of the vertical axis, the same for all laws.
     - `log_x`: whether the horizontal axis is logarithmic.
     """
 
@@ -148,10 +148,10 @@ class Experiment:
     log_x: bool = False
 
     def __call__(self, case: LawCase) -> ExperimentResult:
-        """Do the experiment on a law and judge what comes out.
+        """Perform the experiment on a law, and judge the number.
 
-        A number beyond the threshold is a failure, unless the law says why it must miss it (`known_limitations`). A law
-        that says so and keeps the threshold passes. A run that ends early is a failure.
+        A number beyond the threshold is a failure, unless the law declares it in `known_limitations`. A law that
+        declares it but keeps the threshold passes. A run that ends early is a failure.
         """
         try:
             measured = self.measure(case)

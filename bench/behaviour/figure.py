@@ -1,4 +1,4 @@
-"""Laws in the standard experiments."""
+"""Figures of the standard experiments."""
 
 from collections.abc import Mapping
 
@@ -17,13 +17,13 @@ VERDICTS = {
 
 
 def behaviour_figure(experiment: Experiment, outcomes: Mapping[str, ExperimentResult], columns: int = 5) -> Figure:
-    """An experiment on all laws, a panel for each: its curves, its verdict and its number.
+    """Plot an experiment on all laws, with a panel for each: curves, verdict and number.
 
     **Arguments:**
 
     - `experiment`: from `bench.behaviour.run.EXPERIMENTS`.
-    - `outcomes`: what it found, by the name of the law.
-    - `columns`: panels in a row.
+    - `outcomes`: results by the name of the law.
+    - `columns`: number of panels in a row.
     """
     rows = -(-len(outcomes) // columns)
     figure = Figure(figsize=(3.1 * columns, 0.9 + 2.3 * rows), layout="constrained")

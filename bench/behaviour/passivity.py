@@ -1,4 +1,4 @@
-"""Energy of closed cycles."""
+"""Passivity: energy dissipated in closed cycles."""
 
 from typing import NamedTuple
 
@@ -12,14 +12,14 @@ _HALF = SAMPLES // (2 * _PERIODS)
 
 
 class Cycle(NamedTuple):
-    """Half a period of slip velocity [m/s] and durations of the samples [s]; the other half is its negative."""
+    """Slip velocity [m/s] and durations of the samples [s] over half a period; the other half has the opposite sign."""
 
     v: np.ndarray
     dt: np.ndarray
 
 
 def sines() -> list[Cycle]:
-    """Sines over amplitudes from a hundredth to a hundred deflections, at three frequencies."""
+    """Sines with amplitudes from 0.01 to 100 deflections, at three frequencies."""
     phase = np.pi * (np.arange(_HALF) + 0.5) / _HALF
     return [
         Cycle(2.0 * np.pi * f * a * DEFLECTION * np.sin(phase), np.full(_HALF, 0.5 / f / _HALF))
@@ -29,7 +29,7 @@ def sines() -> list[Cycle]:
 
 
 def random_cycles(count: int = 20) -> list[Cycle]:
-    """Sums of ten odd harmonics with random amplitudes and phases, over sizes from presliding to slip."""
+    """Sums of ten odd harmonics with random amplitudes and phases, from presliding to slip."""
     rng, phase = np.random.default_rng(0), np.pi * (np.arange(_HALF) + 0.5) / _HALF
     odd = np.arange(1, 21, 2)
     cycles = []
@@ -42,9 +42,9 @@ def random_cycles(count: int = 20) -> list[Cycle]:
 
 
 def pulses() -> list[Cycle]:
-    """Slow slip that loads the bristles, with short fast pulses in it that do not leave them the time to yield.
+    """Slow slip that loads the bristles, with fast pulses that are too short for relaxation.
 
-    This is where a law whose damping force is too large for its viscous part gives back more than it has taken.
+    In such cycles a law whose damping is too large for its viscous part returns more energy than it has absorbed.
     """
     slow, fast = 14, 2
     cycles = []
@@ -57,7 +57,7 @@ def pulses() -> list[Cycle]:
 
 
 def balance(case: LawCase, cycle: Cycle) -> tuple[float, np.ndarray]:
-    """Dissipated energy over turned over energy in the last period, and the energy taken up in it so far [J]."""
+    """Ratio of dissipated energy to absolute work in the last period, and the dissipation along it."""
     v = np.tile(np.concatenate([cycle.v, -cycle.v]), _PERIODS)
     dt = np.tile(cycle.dt, 2 * _PERIODS)
     run = respond(case.law, v, dt)
@@ -68,7 +68,7 @@ def balance(case: LawCase, cycle: Cycle) -> tuple[float, np.ndarray]:
 
 
 def _measure(case: LawCase) -> LawMeasurement:
-    """Go through closed cycles of all kinds; the least that is dissipated in one of them."""
+    """Drive closed cycles of all kinds, and measure the smallest dissipation."""
     if needs_load(case.law, 0.0):
         return LawMeasurement(float("nan"), NEEDS_LOAD)
     families = {"sines": sines(), "random": random_cycles(), "pulses": pulses()}
@@ -87,7 +87,7 @@ def _measure(case: LawCase) -> LawMeasurement:
     )
 
 
-# Rounding and the trapezoidal rule; a law that is not passive misses it by far.
+# The threshold allows for rounding and the trapezoidal rule; laws that are not passive are far below it.
 PASSIVITY = Experiment(
     "passivity",
     "Passivity: energy dissipated in the closed cycle that dissipates least, of sines, random motions and pulses",

@@ -1,24 +1,24 @@
-"""Presliding: friction as a function of displacement, and what it remembers of turning points."""
+"""Presliding: friction as a function of displacement, and its memory of turning points."""
 
 import numpy as np
 
 from bench.behaviour.drive import NEEDS_LOAD, SAMPLES, needs_load, path, respond
 from bench.behaviour.experiment import DEFLECTION, VS, Experiment, FigureLine, LawCase, LawMeasurement, Threshold
 
-# Velocity of the motion [m/s]: so slow that friction depends on displacement alone.
+# Velocity of the motion [m/s], so small that friction depends on displacement alone.
 _SLOW = 0.01 * VS
 _LEG = 512
 # Turning points of the inner loop, in amplitudes; the outer loop turns at +-1.
 _INNER = (0.8, -0.4)
-# A loop that loses less than this part of swing times way is elastic.
+# A loop is elastic if it dissipates less than this fraction of force range times distance.
 _ELASTIC = 0.01
 
 
 def _cycles(case: LawCase, inner: bool) -> tuple[np.ndarray, np.ndarray]:
     """Displacement [m] and force [N] of a loop of ten legs, and a last leg with or without an inner loop.
 
-    That one rises from -1 to 0.8, turns back to -0.4, comes again to 0.8 and goes on to 1, or goes there without
-    turning: on the outer loop both have the same samples. What follows only fills the drive.
+    The last leg rises from -1 to 0.8, returns to -0.4, rises to 0.8 again and continues to 1, or rises directly to 1.
+    On the outer loop both have the same samples. The remaining samples fill the drive.
     """
     low, high = -DEFLECTION, DEFLECTION
     turn, back = _INNER[0] * DEFLECTION, _INNER[1] * DEFLECTION
@@ -35,14 +35,14 @@ def _cycles(case: LawCase, inner: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _loss(x: np.ndarray, force: np.ndarray) -> float:
-    """Energy [J] that the last whole cycle loses."""
+    """Energy [J] dissipated in the last full cycle."""
     last = slice(8 * _LEG - 1, 10 * _LEG)
     x, force = x[last], force[last]
     return float(np.sum(0.5 * (force[1:] + force[:-1]) * np.diff(x)))
 
 
 def _presliding(case: LawCase) -> LawMeasurement:
-    """Go back and forth over the break-away deflection and look at the first step after a turn."""
+    """Cycle over the break-away deflection, and measure the first step after a turn."""
     if needs_load(case.law, _SLOW):
         return LawMeasurement(float("nan"), NEEDS_LOAD)
     x, force = _cycles(case, inner=False)
@@ -59,30 +59,30 @@ def _presliding(case: LawCase) -> LawMeasurement:
 
 
 def _memory(case: LawCase) -> LawMeasurement:
-    """Put a loop inside the loop and look at whether the outer one goes on as if it had not been."""
+    """Insert an inner loop, and measure the change of the outer loop after it."""
     if needs_load(case.law, _SLOW):
         return LawMeasurement(float("nan"), NEEDS_LOAD)
     (x_inner, with_inner), (x, without) = _cycles(case, inner=True), _cycles(case, inner=False)
     swing = float(np.ptp(without[8 * _LEG : 10 * _LEG]))
     start = 11 * _LEG
-    # From the closing of the inner loop on; where it closes, and every point up to the next turn.
+    # From the point at which the inner loop closes to the next turn.
     rest_with, rest_without = with_inner[start + 2 * _LEG - 1 :][: _LEG + 1], without[start - 1 :][: _LEG + 1]
     lines = (
         FigureLine("without inner loop", 1e6 * x[8 * _LEG : 10 * _LEG], without[8 * _LEG : 10 * _LEG], reference=True),
         FigureLine("with inner loop", 1e6 * x_inner[10 * _LEG : 14 * _LEG], with_inner[10 * _LEG : 14 * _LEG]),
     )
     if not PRESLIDING.threshold.keeps(_presliding(case).number):
-        return LawMeasurement(float("nan"), "There is no presliding to remember anything.", lines)
+        return LawMeasurement(float("nan"), "There is no presliding, and no memory of it.", lines)
     if _loss(x, without) < _ELASTIC * swing * 2.0 * DEFLECTION:
-        return LawMeasurement(float("nan"), "Presliding is elastic: there is nothing to remember.", lines)
+        return LawMeasurement(float("nan"), "Presliding is elastic, without hysteresis.", lines)
     return LawMeasurement(
         float(np.max(np.abs(rest_with - rest_without))) / swing,
-        "After an inner loop the outer one goes on with this change, in swings of the force.",
+        "Change of the outer loop after an inner loop, relative to the range of the force.",
         lines,
     )
 
 
-# A tenth of the swing in one sample, which is a 256th of the way: a spring as stiff as that would be 25 times
+# The threshold is a tenth of the force range in one sample, a 256th of the distance: the stiffness of a spring 25 times
 # stiffer than the contact.
 PRESLIDING = Experiment(
     "presliding",
@@ -94,7 +94,8 @@ PRESLIDING = Experiment(
     (-1.7, 1.7),
     _presliding,
 )
-# A two-hundredth of the swing: between elements that give way over a fiftieth of their limit, and laws with one state.
+# The threshold is 1/200 of the force range: between elements that yield over a fiftieth of their limit, and laws with
+# one state.
 MEMORY = Experiment(
     "memory",
     "Non-local memory: an inner loop in the presliding hysteresis, and the outer loop after it",

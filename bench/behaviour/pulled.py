@@ -1,4 +1,4 @@
-"""A mass with friction under a load: the one scene of the experiments that need inertia."""
+"""A mass with friction under a load: the scene of the experiments with inertia."""
 
 from typing import NamedTuple
 
@@ -26,14 +26,14 @@ from jaxmodsim.simulation import simulate
 from jaxmodsim.solvers import Rodas5P
 
 MASS = 1.0
-# Saved times of every run: of one length, so that each law is compiled once for all experiments.
+# Number of saved times of every run, the same for all, so that each law is compiled once.
 TIMES = 4001
 _MAX_STEPS = 2**19
 _RTOL, _ATOL = 1e-6, 1e-10
 _QUIET = {"k": 0.0, "pull": 0.0, "ramp": 0.0, "load": 0.0, "shake": 0.0, "frequency": 0.0}
-# Time constant with which load and vibration come [s]: many periods of the mass on its contact.
+# Time constant of the rise of load and vibration [s]: many periods of the mass on its contact.
 _PUT_ON = 0.1
-# Way [m] per sample and number of samples over which a contact that has slid is unloaded.
+# Distance [m] per sample and number of samples of the unloading of a contact after slip.
 _BACK, _BACK_SAMPLES = 0.002 / SIGMA0, 2000
 
 
@@ -53,7 +53,7 @@ def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
 def _load(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
     spring = p["k"] * (p["pull"] * t - q[0])
     shaken = p["load"] + p["shake"] * jnp.sin(2.0 * jnp.pi * p["frequency"] * t)
-    # Put on so gently that nothing swings beyond it.
+    # The load rises so slowly that there is no overshoot.
     return jnp.reshape(spring + p["ramp"] * t + shaken * -jnp.expm1(-t / _PUT_ON), (1,))
 
 
@@ -76,7 +76,7 @@ def move(case: LawCase, t1: float, *, z0: object = None, dtmax: float = 1.0, **l
         start = {"friction": law.initial_state(jnp.zeros(())) if z0 is None else z0}
     else:
         start = None
-    # Heun's method sees the jumps of the laws that need a fixed step twice in a step, and no more often.
+    # Laws with jumps need a fixed step; Heun's method evaluates them only twice per step.
     solver = dfx.Heun() if fixed else None if isinstance(law, AbstractSetValuedLaw) else Rodas5P()
     steps: dict[str, PyTree] = {"dt": case.dt} if fixed else {"dtmax": dtmax}
     run = simulate(
@@ -99,13 +99,13 @@ def move(case: LawCase, t1: float, *, z0: object = None, dtmax: float = 1.0, **l
 
 
 def after_slip(case: LawCase) -> PyTree:
-    """State of a dynamic law that has just slid fast and was unloaded; None of laws without a state."""
+    """State of a dynamic law after fast slip and unloading; None for laws without a state."""
     return _after_slip(case.law) if isinstance(case.law, AbstractDynamicLaw) else None
 
 
 @jax.jit
 def _after_slip(law: AbstractDynamicLaw) -> PyTree:
-    """Slide for one second, then go back, and keep the state at which the force at rest is least."""
+    """Slide for one second, then return; gives the state with the smallest force at rest."""
     rest = jnp.zeros(())
     here = law.bind_state(rest, rest[None], rest[None], {})
     assert isinstance(here, AbstractDynamicLaw)
@@ -123,12 +123,12 @@ def _after_slip(law: AbstractDynamicLaw) -> PyTree:
 
 # Rates of the load [N/s].
 RATES = np.geomspace(0.1, 100.0, 7)
-# Largest load [N], and the velocity [m/s] from which on the mass slides.
+# Largest load [N], and the smallest velocity [m/s] of sliding.
 _MOST, _SLIDES = 1.7 * FS, 10.0 * VS
 
 
 def _break_away(case: LawCase) -> LawMeasurement:
-    """Pull a mass harder and harder; the largest friction before it slides, at slow and at fast rates."""
+    """Pull a mass with a rising force; measure the largest friction before it slides, at slow and fast rates."""
     z0 = after_slip(case)
     forces = []
     for rate in RATES:
@@ -146,7 +146,7 @@ def _break_away(case: LawCase) -> LawMeasurement:
     )
 
 
-# A twentieth: what measurements of break-away forces resolve.
+# The threshold is 5 %, the resolution of measured break-away forces.
 BREAK_AWAY = Experiment(
     "break-away",
     "Break-away force against the rate of the load, shortly after a slip",
@@ -161,12 +161,12 @@ BREAK_AWAY = Experiment(
 
 # Mean load [N], vibration [N] at the frequency [Hz], duration [s]; the load stays below the Coulomb force of 1 N.
 _LOAD, _SHAKE, _FREQUENCY, _CREEPS = 0.4, 0.2, 5.0, 10.0
-# Spans of time [s], whole periods each, between whose mean positions the mass drifts.
+# Time spans [s] of whole periods, between whose mean positions the drift is measured.
 _EARLY, _LATE = (1.0, 2.0), (9.0, 10.0)
 
 
 def _creep(case: LawCase) -> LawMeasurement:
-    """Load a mass at rest, and see how far it goes once the load has come."""
+    """Load a mass at rest, and measure its drift under the constant load."""
     run = move(case, _CREEPS, load=_LOAD, shake=_SHAKE, frequency=_FREQUENCY, dtmax=0.1 / _FREQUENCY)
     early, late = (run.q[(run.t > start) & (run.t <= end)].mean() for start, end in (_EARLY, _LATE))
     drift = 1e6 * float(abs(late - early))
@@ -177,7 +177,7 @@ def _creep(case: LawCase) -> LawMeasurement:
     )
 
 
-# A hundredth of the break-away deflection.
+# The threshold is a hundredth of the break-away deflection.
 CREEP = Experiment(
     "creep",
     "Creep: a mass under 0.4 N and a vibration of 0.2 N at 5 Hz, below break-away",
@@ -191,14 +191,14 @@ CREEP = Experiment(
 
 # Stiffness [N/m], velocity of the spring's end [m/s] and duration [s].
 _K, _PULL, _T1 = 2.0, 0.1, 40.0
-# Velocity that counts as rest, as part of the pull: above the creep of smooth laws and Karnopp's band, and an
-# undamped oscillation that touches zero stays below it for 2 % of its period. A mean over so many samples to either
-# side, of 10 ms, which the vibration of the mass on its contact does not disturb.
+# Largest velocity of rest, relative to the pull: above the creep of smooth laws and the Karnopp band. An undamped
+# oscillation that touches zero is below it for 2 % of its period. The velocity is averaged over this number of samples
+# to either side, 10 ms, to suppress the vibration of the mass on its contact.
 _REST, _SPAN = 2e-3, 5
 
 
 def _stick_slip(case: LawCase) -> LawMeasurement:
-    """Pull, and look at the second half of the run for times of rest."""
+    """Pull the mass, and measure the time at rest in the second half of the run."""
     run = move(case, _T1, k=_K, pull=_PULL, dtmax=0.1)
     late = run.t >= 0.5 * _T1
     ahead, behind = np.roll(run.q, -_SPAN), np.roll(run.q, _SPAN)
@@ -216,7 +216,7 @@ def _stick_slip(case: LawCase) -> LawMeasurement:
     )
 
 
-# A tenth of the time at rest: five times of what an oscillation without stick can have.
+# The threshold is a tenth of the time at rest, five times that of an oscillation without stick.
 STICK_SLIP = Experiment(
     "stick-slip",
     "Stick-slip: a mass of 1 kg pulled through a spring of 2 N/m at 0.1 m/s",

@@ -1,4 +1,4 @@
-"""The bench: every law in every experiment."""
+"""Run all laws in all experiments."""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +13,7 @@ from bench.behaviour.pulled import BREAK_AWAY, CREEP, STICK_SLIP
 EXPERIMENTS: dict[str, Experiment] = {
     each.name: each for each in (CHARACTERISTIC, PRESLIDING, MEMORY, BREAK_AWAY, LAG, STICK_SLIP, CREEP, PASSIVITY)
 }
-# Laws on the bench at a time: nearly all of the time goes into compilation, which does not need the interpreter's lock.
+# Number of laws at a time: most time is compilation, which releases the interpreter lock.
 _WORKERS = 2
 
 
@@ -23,7 +23,7 @@ def run_bench(
     *,
     progress: Callable[[str], object] | None = None,
 ) -> dict[str, dict[str, ExperimentResult]]:
-    """Do the experiments on the laws.
+    """Perform the experiments on the laws.
 
     **Arguments:**
 

@@ -1,1 +1,1 @@
-"""Benches with a logic of their own; each has a `main(smoke)` that returns a `Result`."""
+"""Benches outside the matrix; each has a function `main(smoke, out)` that returns a `Result`."""

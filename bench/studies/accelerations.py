@@ -1,8 +1,8 @@
-"""One evaluation of the accelerations of a chain of n links: in a loop, and 1024 at once.
+"""Time of the accelerations of a chain of n links: in a loop, and for 1024 states at once.
 
 Point masses of 0.5 to 2 kg on links of 0.5 to 2 m, angles from straight down [rad]. By hand: the closed form, once in
-arrays and once in scalars with everything this library knows about XLA on CPU. In a loop, dependent evaluations are
-each followed by a step of Euler, as a single evaluation takes less time than calling it does.
+arrays and once in scalars, optimised for XLA on CPU. In a loop, each evaluation is followed by an Euler step, because a
+single evaluation takes less time than its call.
 """
 
 import os
@@ -26,12 +26,12 @@ LOOP, BATCH, BATCH_LOOP = "loop", "many", "many in a loop"
 STEP, G = 1e-4, 9.81
 # Calls by way, and the accelerations at the many states.
 Made = tuple[dict[str, Call], Any]
-# Written out in scalars, larger chains take minutes to compile.
+# Larger chains in scalars take minutes to compile.
 LARGEST_WRITTEN_OUT = 12
 
 
 def main(smoke: bool, out: Path) -> Result:
-    """Every size by all peers, side by side."""
+    """Measure every size with all peers, in turns."""
     del out
     result = Result("accelerations", ("mujoco", "numpy"), {"step": STEP})
     for n in (2,) if smoke else (1, 2, 3, 4, 6, 8, 12, 16, 24, 32):
@@ -77,7 +77,7 @@ def chain_numbers(n: int) -> dict[str, Any]:
 
 
 def _ours(q: Any, qd: Any, scene: jms.Scene) -> Any:
-    """From the Lagrangian."""
+    """Accelerations from the Lagrangian."""
     return vector_field(jnp.zeros_like(q[0]), State(q, qd, {}), scene).qd
 
 
@@ -86,7 +86,7 @@ def _arrays(q: Any, qd: Any, scene: jms.Scene) -> Any:
 
 
 def _scalars(q: Any, qd: Any, scene: jms.Scene) -> Any:
-    """Sines formed once, an elimination in quotients."""
+    """Accelerations in scalars, with sines computed once and an elimination by quotients."""
     n, p, unit = q.shape[0], scene.params, opaque_one(q[0])
     m, l, w = ([x[i] for i in range(n)] for x in (p["m"], p["l"], qd))  # noqa: E741
     s, c = ([fusion_barrier(fn(q[i]), unit) for i in range(n)] for fn in (jnp.sin, jnp.cos))
@@ -104,7 +104,7 @@ def _scalars(q: Any, qd: Any, scene: jms.Scene) -> Any:
 
 
 def _compiled(fn: Any, n: int, q: Any, qd: Any, single: int, batches: int) -> Made:
-    """By JAX, compiled."""
+    """Functions compiled by JAX."""
     chain, many = n_link_pendulum.scene(n, **chain_numbers(n)), jax.vmap(fn, (0, 0, None))
     one, all_of_them = (jnp.asarray(q[0]), jnp.asarray(qd[0])), (jnp.asarray(q), jnp.asarray(qd))
     programs = {
@@ -119,7 +119,7 @@ def _compiled(fn: Any, n: int, q: Any, qd: Any, single: int, batches: int) -> Ma
 
 
 def _euler(fn: Any, count: int, q: Any, qd: Any, chain: jms.Scene) -> Any:
-    """`count` evaluations, each at the state the last one led to."""
+    """`count` dependent evaluations, each at the state after the previous one."""
 
     def step(_: Any, state: Any) -> Any:
         q, qd = state
@@ -129,7 +129,7 @@ def _euler(fn: Any, count: int, q: Any, qd: Any, chain: jms.Scene) -> Any:
 
 
 def _mujoco(n: int, q: np.ndarray, qd: np.ndarray, single: int) -> Made:
-    """Nested bodies on hinges, without contacts and constraints; its angles are those from link to link."""
+    """MuJoCo with nested bodies on hinges, without contacts and constraints; its angles are relative."""
     import mujoco as engine
     from mujoco.rollout import Rollout
 

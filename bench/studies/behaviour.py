@@ -1,4 +1,4 @@
-"""What each friction law does in the standard experiments, and whether that is known of it."""
+"""Friction laws in the standard experiments, with verdicts and known limitations."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ WORDS = {"pass": "yes", "known limitation": "**no**", "n/a": "-"}
 
 
 def main(smoke: bool, out: Path) -> Result:
-    """Run every law through every experiment; a small run takes two laws.
+    """Run every law through every experiment; a smoke run has two laws.
 
     **Raises:**
 
@@ -37,7 +37,7 @@ def main(smoke: bool, out: Path) -> Result:
         result.add("number", each.quantity, case=each.name)
         result.add("unit", each.unit, case=each.name)
         result.add("limit", f"{'<=' if each.threshold.at_most else '>='} {each.threshold.value:g}", case=each.name)
-    for name in ("memory", "creep"):  # those that docs/laws.md shows
+    for name in ("memory", "creep"):  # figures of docs/laws.md
         figure = behaviour_figure(EXPERIMENTS[name], {law: of[name] for law, of in outcomes.items()})
         save(figure, out / f"behaviour_{name}.png", dpi=90)
     return result

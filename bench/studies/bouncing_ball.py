@@ -1,6 +1,7 @@
-"""A ball that bounces to rest: events, a compliant contact by hand, and MuJoCo; each over its steps or tolerances.
+"""A ball that bounces to rest, by events, a compliant contact by hand, and MuJoCo, for several steps or tolerances.
 
-Dropped from 1 m, e = 1/2; both others have a linear spring and damper for that e, stiffer with smaller steps.
+The ball drops from 1 m with e = 1/2. The compliant contacts have a linear spring and damper for this e, which is
+stiffer for smaller steps.
 """
 
 import math
@@ -21,20 +22,20 @@ E, G, BOUNCING, AT_REST = 0.5, 9.81, 0.8, 2.5
 
 
 def _restitution(damping: float) -> float:
-    """Of a spring and damper that do not pull (Schwager and Poeschel, Granular Matter 9:465, 2007)."""
+    """Restitution of a spring and damper that do not pull (Schwager and Poeschel, Granular Matter 9:465, 2007)."""
     s = math.sqrt(1.0 - damping**2)
     return math.exp(-damping / s * (math.pi - math.atan(2.0 * damping * s / (1.0 - 2.0 * damping**2))))
 
 
-# Part of critical damping.
+# Damping relative to critical damping.
 DAMPING = brentq(lambda damping: _restitution(damping) - E, 0.01, 0.6)
-# (h, t) -> height and velocity at t, dropped from h.
+# (h, t) -> height and velocity at t, after a drop from h.
 Run = Callable[[Any, float], Any]
 _SCENE = bouncing_ball.scene(e=E)
 
 
 def main(smoke: bool, out: Path) -> Result:
-    """Errors of height and derivative between bounces, height and energy at rest, and the time of a run."""
+    """Measure errors of height and derivative between bounces, height and energy at rest, and the time of a run."""
     del out
     result = Result("bouncing_ball", ("mujoco", "diffrax"), {"bouncing": BOUNCING, "rest": AT_REST})
     steps = (1e-3,) if smoke else (1e-3, 1e-4, 1e-5)
@@ -71,7 +72,7 @@ def _events(rtol: float) -> Run:
 
 
 def _frequency(dt: float) -> float:
-    """Of the spring [rad/s]: a contact takes fewer seconds and more steps where steps are smaller."""
+    """Frequency of the spring [rad/s]: for smaller steps a contact is shorter and has more steps."""
     return math.pi / (0.2 * math.sqrt(dt))
 
 

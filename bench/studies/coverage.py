@@ -1,9 +1,9 @@
-"""Whether 95 % intervals hold the truth 95 times in 100: LuGre's six parameters, and starts that nobody gives.
+"""Coverage of 95 % confidence intervals: the six parameters of LuGre, and fits with default initial states.
 
-A mass on a spring, driven through stick and slip, 2 000 samples of its position. Every repeat has noise of its own,
-white or with a memory, starts from parameters wrong by up to a factor of ten, and is fitted side by side with the
-others. Then mass, Coulomb and viscous friction from records of 600 samples, each of a motion of its own, by the default
-`fit`: white noise, a sensor with steps of 1 mm, and one with an offset of 5 mm, where a remark is right, too.
+A mass on a spring is driven through stick and slip, with 2 000 samples of its position. Every repeat has its own noise,
+white or correlated, starts from parameters wrong by up to a factor of ten, and is fitted in one batch with the others.
+Then the default `fit` estimates mass, Coulomb and viscous friction from records of 600 samples, each of another motion:
+with white noise, a sensor resolution of 1 mm, or a sensor offset of 5 mm, for which a remark is right too.
 """
 
 import time
@@ -31,7 +31,7 @@ SENSORS: dict[str, Measure] = {
 
 
 def main(smoke: bool, out: Path) -> Result:
-    """Fit once, then repeat on synthetic records."""
+    """Fit once, then repeat with synthetic records."""
     del out
     repeats = 4 if smoke else 200
     free = tuple(f"friction.{name}" for name in ("sigma0", "sigma1", "sigma2", "Fc", "Fs", "vs"))
@@ -50,7 +50,7 @@ def main(smoke: bool, out: Path) -> Result:
 
 
 def _default_start(result: Result, label: str, measure: Measure, repeats: int) -> None:
-    """Fits by the defaults: how often intervals hold, and how often a remark says that the sensor has an offset."""
+    """Measure the coverage of default fits, and the share of fits with a remark on a sensor offset."""
     rng, t, zero = np.random.default_rng(0), 5e-3 * np.arange(600), jnp.zeros(1)
     rates = 2 * np.pi * rng.uniform([0.15, 0.7, 1.5], [0.55, 1.1, 1.9], (repeats, 3))
     phases = rng.uniform(0, 2 * np.pi, (repeats, 3, 1))
@@ -84,20 +84,20 @@ DRIVE = jms.AppliedForce(_drive)
 
 
 def sprung(*numbers: float) -> jms.Scene:
-    """A driven mass on a spring with LuGre friction of these six numbers."""
+    """A driven mass on a spring with LuGre friction of these six parameters."""
     friction = jms.Friction(jms.LuGre(*numbers))
     return jms.Scene(_lagrangian, params={"m": 1.0, "k": 200.0, "u": 0.0}, effects=(DRIVE, friction))
 
 
 def dry(m: float, Fc: float, Fv: float) -> jms.Scene:
-    """A driven mass on a spring with smooth Coulomb friction and a viscous part."""
+    """A driven mass on a spring with smooth Coulomb friction and viscous friction."""
     friction = jms.Friction(jms.Regularized(jms.Coulomb(Fc), 1e-2), name="friction")
     effects = (DRIVE, friction, jms.Friction(jms.Viscous(Fv), name="viscous"))
     return jms.Scene(_lagrangian, params={"m": m, "k": 20.0, "u": 0.0}, effects=effects)
 
 
 def driven_record() -> jms.Record:
-    """2 000 samples of its position under a drive of three sines."""
+    """2 000 samples of the position under a force of three sines."""
     t, zero = np.arange(2000) * 2e-3, jnp.zeros(1)
     u = 3 * np.sin(2 * np.pi * 0.7 * t) + 2 * np.sin(2 * np.pi * 1.9 * t) + 1.2 * np.sin(2 * np.pi * 0.31 * t)
     run = jax.jit(replay, static_argnums=(5, 6))

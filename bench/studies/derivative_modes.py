@@ -1,8 +1,8 @@
-"""Reverse mode against forward mode: derivatives of the same steps, which may differ by rounding alone.
+"""Reverse mode against forward mode: derivatives of the same steps, which differ by rounding alone.
 
-Every named problem, by all numbers of its scene at three tolerances, and the hard cases of `FAMILIES` that have a
-derivative, by their number; as users have it, and with `tune_cpu`, each in a process of its own. Differences are
-relative to the derivative, or to the scale of the answer over the number where that is larger.
+The functions are the named problems, by all numbers of their scenes at three tolerances, and the hard cases of
+`FAMILIES` with a derivative, by their number. Each runs with and without `tune_cpu`, in its own process. Differences
+are relative to the derivative, or to the scale of the answer over the number if that is larger.
 """
 
 import multiprocessing
@@ -28,14 +28,14 @@ PROBLEMS, HARD = "named problems", "hard cases"
 FAMILIES = ("stiffness", "rest and reversal", "many events", "gradients")
 RTOLS = (1e-6, 1e-9, 1e-12)
 TUNED = {"": False, "tuned": True}
-# Difference above which a case is listed.
+# Cases with a larger difference are listed.
 SHOWN = 1e-11
 
 Found: TypeAlias = "tuple[str, str, float, str]"
 
 
 def main(smoke: bool, out: Path) -> Result:
-    """The largest differences; a small run looks at one case of each kind, in one way."""
+    """Record the largest differences; a smoke run has one case of each kind."""
     del out
     result = Result("derivative_modes", ("diffrax",), {"shown": SHOWN})
     context = multiprocessing.get_context("spawn")
@@ -65,7 +65,7 @@ def _begin(tuned: bool) -> None:
 
 
 def _all(smoke: bool) -> list[Found]:
-    """Group, name, difference and reason of every derivative."""
+    """Group, name, difference and reason for every derivative."""
     found = []
     for name in ("braked_spring",) if smoke else named_problems():
         found += _problem(named_problems()[name]())
@@ -112,7 +112,7 @@ def _modes(fn: Callable[..., Array]) -> Callable[..., tuple[Array, tuple[Array, 
 
 
 def _difference(forward: Array, reverse: tuple[Array, Array], x: Array) -> float:
-    """The largest one, between derivatives, the second with the scale of the answer."""
+    """The largest relative difference of derivatives."""
     scale, other = reverse
     one, other, size = (np.atleast_1d(each) for each in (forward, other, x))
     measure = np.maximum(np.abs(one), abs(float(scale)) / np.where(size == 0, 1.0, np.abs(size)))

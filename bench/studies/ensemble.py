@@ -2,8 +2,8 @@
 
 The Lorenz system is that of C. Utkarsh et al., "Automated translation and accelerated solving of differential equations
 on multiple GPU platforms", Computer Methods in Applied Mechanics and Engineering 419:116591, 2024: from (1, 0, 0) over
-one second with sigma = 10, beta = 8/3 and rho from 0 to 21, by diffrax's Tsit5 as it is. In single precision tolerances
-are no finer than it resolves. On a GPU: `pip install "jax[cuda13]"`, then `python -m bench ensemble`.
+one second with sigma = 10, beta = 8/3 and rho from 0 to 21, by Tsit5 of diffrax. Single precision has coarser
+tolerances. On a GPU: `pip install "jax[cuda13]"`, then `python -m bench ensemble`.
 """
 
 from collections.abc import Callable
@@ -24,13 +24,13 @@ LORENZ, BOX = "Lorenz system", "LuGre test bench"
 RHO = 21.0
 # Relative tolerances, by case and precision.
 RTOL = {LORENZ: {"float64": 1e-8, "float32": 1e-6}, BOX: {"float64": 1e-4, "float32": 1e-4}}
-# Runs in a call on a processor and on a GPU, and runs whose errors are taken.
+# Number of runs in a call on a CPU and on a GPU, and number of runs with error measures.
 RUNS = {"cpu": 2**13, "gpu": 2**23}
 JUDGED = 16
 
 
 def main(smoke: bool, out: Path) -> Result:
-    """Time of all runs in one call, in both precisions, and their errors."""
+    """Measure the time of all runs in one call, in both precisions, and their errors."""
     del out
     device = jax.devices()[0]
     count = 64 if smoke else RUNS.get(device.platform, RUNS["gpu"])
@@ -68,7 +68,7 @@ def _lorenz_field(_t: Array, y: tuple[Array, Array, Array], rho: Array) -> tuple
 
 
 def _lorenz(rho: Array, rtol: float) -> Array:
-    """The third coordinate at the end."""
+    """The final third coordinate."""
     one, tolerance = jnp.ones_like(rho), jnp.asarray(rtol, rho.dtype)
     solution = dfx.diffeqsolve(
         *(dfx.ODETerm(_lorenz_field), dfx.Tsit5(), 0.0 * one, one, None, (one, 0.0 * one, 0.0 * one), rho),
@@ -88,5 +88,5 @@ def _lorenz_end(rho: float) -> float:
 
 
 def _box(numbers: Array, rtol: float) -> Array:
-    """The velocity at the end [m/s]."""
+    """The final velocity [m/s]."""
     return TESTBENCH.simulate(numbers, jnp.asarray(rtol, numbers.dtype), throw=False).qd[-1, 0]

@@ -1,8 +1,8 @@
-"""What the first call of a scene costs, traced and compiled, and what its derivatives cost after that.
+"""Cost of the first call of a scene, traced and compiled, and of its derivatives.
 
-Processor time, since compiling uses all cores: of a run with 51 saved times, and of derivatives of the sum of its
-positions by six numbers (five of the belt); and the equations that XLA receives. Warm times are those of jitted
-functions.
+Times are processor times, because compilation uses all cores: of a run with 51 saved times, and of derivatives of the
+sum of its positions by six parameters (five of the belt). The number of equations that XLA receives is recorded too.
+Warm times are those of jitted functions.
 """
 
 import time
@@ -20,10 +20,10 @@ from bench.scenes import SAMPLES, SIX, TIMED, chain
 
 
 def main(smoke: bool, out: Path) -> Result:
-    """All scenes, after one that is not counted; a small run takes two."""
+    """Measure all scenes, after one for warm-up; a smoke run has two."""
     del out
     result = Result("first_calls", ("diffrax",), {"samples": SAMPLES})
-    once = chain(1, lambda p: jms.Viscous(p[2]))  # what JAX itself must load is no scene's
+    once = chain(1, lambda p: jms.Viscous(p[2]))  # JAX loads its own modules here
     jax.jit(once.ways()["gradient"]).lower(jnp.asarray(once.numbers)).compile()
     for name in list(TIMED)[: 2 if smoke else None]:
         task = TIMED[name]()

@@ -8,7 +8,7 @@ from jaxmodsim.problems.testbench import ramp_cases, run_ramp
 
 
 def main(smoke: bool, out: Path) -> Result:
-    """Run every model; a small run one."""
+    """Run every model; a smoke run has one."""
     del out
     result = Result("friction_models", ("diffrax",))
     for case in ramp_cases()[: 1 if smoke else None]:

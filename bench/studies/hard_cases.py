@@ -1,13 +1,12 @@
-"""Hard cases by `jaxmodsim` and by what people would use without it: right, silently wrong, error, no answer.
+"""Hard cases by `jaxmodsim` and by other programs: right, silently wrong, error, no answer.
 
-diffrax and scipy get the same equations of motion, with `Fc sign(v)` for dry friction, all else as they come: mass
-matrices are solved with care, constraints are differentiated twice, which is more than most would write; missing are
-the events, and the projection onto constraints. `jaxmodsim` gets each case as it is defined, and is held to the
-tolerance of the case, the others to a hundred times that, and no tighter than 1e-3. Where no number is right but an
-error, any error is right, whatever it says. Every program runs every case in a process of its own, with 60 s for it,
-compilation included.
+diffrax and scipy get the same equations of motion, with `Fc sign(v)` for dry friction. Mass matrices are solved
+accurately and constraints are differentiated twice, but there are no events and no projection onto constraints.
+`jaxmodsim` gets each case as defined, with the tolerance of the case; the others have a hundred times this tolerance,
+and at least 1e-3. If a case has no answer, any error is right. Every program runs every case in its own process, with
+60 s for compilation and run.
 
-Then `jaxmodsim` runs every case under every transform, in both floating types, which takes most of an hour; the largest
+Then `jaxmodsim` runs every case under every transform, in both floating types, which takes most of an hour. The largest
 stable step of each explicit method is found by bisection. The figures of docs/hard_cases.md show both.
 """
 
@@ -40,9 +39,9 @@ from tests.hard.steps import formulations
 
 RIGHT, WRONG, ERROR, NONE = "right", "silently wrong", "error", "no answer"
 RTOL, ATOL, LIMIT = 1e-6, 1e-9, 60.0
-# Admissible error of the others, in that of ours, and at least, relative to the scale of the answer.
+# Admissible error of the others, as a multiple of ours, and at least relative to the scale of the answer.
 GENEROUS, LEAST = 100.0, 1e-3
-# Some of each family that are runs of a scene: all of them by all programs take hours, most of them spent on waiting.
+# A selection of each family of runs of a scene: all cases by all programs take hours.
 CASES = (
     *("bristle_stiff", "zero_start", "force_equals_limit", "dip_of_slip", "belt_turns", "shaken_table"),
     *("pole_start", "painleve_rod", "resting_place"),
@@ -50,7 +49,7 @@ CASES = (
 
 
 def main(smoke: bool, out: Path) -> Result:
-    """Ask, and check all cases; a small run asks one case of each kind of program, and checks one case in one way."""
+    """Compare all programs, and check all cases; a smoke run has one case."""
     del out
     result = Result("hard_cases", ("diffrax", "scipy", "numpy"))
     result.settings |= {"rtol": RTOL, "atol": ATOL, "limit": LIMIT, "generous": GENEROUS, "least": LEAST}
@@ -82,13 +81,13 @@ def main(smoke: bool, out: Path) -> Result:
 
 
 def _asked(case: HardCase, program: str) -> bool:
-    """Whether a program is asked a case; diffrax's implicit solver where rates are high."""
+    """Whether a program runs a case; the implicit solver of diffrax runs stiff cases."""
     stiff = isinstance(case.task, SceneTask) and any(effect.stiff for effect in case.task.scene.effects)
     return program != "diffrax Kvaerno5" or stiff or case.family == "stiffness"
 
 
 def _ask(name: str, program: str) -> dict[str, Any]:
-    """Verdict of a program on a case, in a process of its own, within `LIMIT` from where it is imported."""
+    """Verdict of a program on a case, in its own process, within `LIMIT` after its import."""
     context = multiprocessing.get_context("spawn")
     receive, send = context.Pipe(duplex=False)
     process = context.Process(target=_work, args=(name, program, send))
@@ -111,7 +110,7 @@ def _ask(name: str, program: str) -> dict[str, Any]:
 
 
 def _work(name: str, program: str, send: Any) -> None:
-    """The process: the answer goes into the pipe, after a sign that imports are done."""
+    """The process: it sends a sign after its imports, and then the answer."""
     jms.tune_cpu()
     jax.config.update("jax_enable_x64", True)
     case = hard_cases()[name]
@@ -123,7 +122,7 @@ def _work(name: str, program: str, send: Any) -> None:
 
 
 def _ours(case: HardCase) -> dict[str, Any]:
-    """By `check`, alone in float64, to the tolerance of the case."""
+    """Verdict by `check`, in float64, to the tolerance of the case."""
     verdict = check(case, transforms=("alone",), dtypes=("float64",))
     sentences = "; ".join(finding.sentence for finding in verdict.findings)
     if verdict.ok:
@@ -136,7 +135,7 @@ def _judge(case: HardCase) -> Callable[[float], tuple[bool, str]]:
     """Whether a number is right, and a sentence."""
     assert isinstance(case.task, SceneTask)
     found = case.exact(case.task.x) if case.exact else case.second() if case.second else None
-    if found is None:  # an error is all that is right
+    if found is None:  # an error is the right answer
         return lambda value: (False, f"{value:.9g}, and there is no such number")
     right, scale = float(found), case.scale if case.scale is not None else abs(float(found)) or 1.0
     limit = max(GENEROUS * case.tolerance, LEAST) * scale
@@ -153,7 +152,7 @@ def _judged(judge: Any, compute: Callable[[], float], *, error_is_right: bool) -
 
 
 def _named(error: Exception) -> str:
-    """Kind of an error, and its first line; from compiled code the stack comes before that."""
+    """Kind of an error, and its first line after the stack of compiled code."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip(" -")]
     named = [line.split("EquinoxRuntimeError: ")[1] for line in lines if "EquinoxRuntimeError: " in line]
     return f"{type(error).__name__}: {([*named, *lines] or ['without words'])[0][:200]}"
@@ -172,7 +171,7 @@ def _value(case: HardCase, program: str) -> float:
 
 
 def _with_signs(scene: jms.Scene) -> jms.Scene:
-    """The scene with `Fc sign(v)` in the place of every set-valued law."""
+    """The scene with `Fc sign(v)` for every set-valued law."""
 
     def signed(effect: Any) -> Any:
         if isinstance(effect, jms.Friction) and isinstance(effect.law, AbstractSetValuedLaw):
@@ -192,7 +191,7 @@ def _rate(t: Any, y: State, scene: jms.Scene) -> State:
 
 
 def _run(t_end: Any, states: State) -> SimpleNamespace:
-    """What the answer of a case is read of, with a leading axis of time as a `Trajectory` has."""
+    """The states from which the answer of a case is read, with a leading time axis as in a `Trajectory`."""
     return SimpleNamespace(q=states.q, qd=states.qd, z=states.z, t_end=t_end)
 
 

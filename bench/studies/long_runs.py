@@ -1,10 +1,10 @@
 """Long runs: energy, momentum and motion over 100 000 periods.
 
-A spherical pendulum, regular and away from the poles, by fixed steps of `Gauss` on momenta and by adaptive solvers on
-velocities. Energy counts from the lowest point of the sphere; the angle phi is held against its closed form, a Jacobi
-elliptic function. Errors are the largest over windows of one period; the growth is the slope of their logarithm over
-that of time in the last two decades: 0 for errors that stay, 1 for linear drift. It is not given for the angle where
-that is lost, with errors above 0.1 rad. Times are those of one run each, compiled before.
+The problem is a spherical pendulum, regular and away from the poles, by fixed steps of `Gauss` with momenta and by
+adaptive solvers with velocities. Energy is relative to the lowest point of the sphere. The angle phi has a closed form,
+a Jacobi elliptic function. Errors are the largest over windows of one period. Their growth is the slope of their
+logarithm over that of time in the last two decades: 0 for bounded errors, 1 for linear drift. It is omitted for angle
+errors above 0.1 rad. Times are those of one run each, after compilation.
 """
 
 import itertools
@@ -24,9 +24,9 @@ from jaxmodsim.problems import spherical_pendulum
 
 G, PHI0, SPIN0 = 9.81, 2.0, 2.0
 PERIODS, LIMIT = 100_000, 1_000_000_000
-# Steps that are powers of two, so that time is without rounding; a window of somewhat more than one period.
+# Steps are powers of two, so that times are exact; a window is slightly longer than one period.
 DT, SAMPLES = 1.0 / 32.0, 36
-# Errors of the angle [rad] above which its growth means nothing; its swing is 0.65.
+# Angle errors [rad] above this value have no growth; the range of the angle is 0.65.
 LOST = 0.1
 LONG: dict[str, dict[str, Any]] = {
     "Gauss(1), dt 1/32 s": {"solver": jms.Gauss(1), "dt": DT},
@@ -42,7 +42,7 @@ LONG: dict[str, dict[str, Any]] = {
 
 
 def main(smoke: bool, out: Path) -> Result:
-    """All solvers; a small run takes one."""
+    """Run all solvers; a smoke run has one."""
     del out
     closed, periods = Closed(), 300 if smoke else PERIODS
     result = Result("long_runs", ("diffrax", "scipy", "numpy"), {"period": closed.period, "periods": periods})
@@ -84,7 +84,7 @@ def main(smoke: bool, out: Path) -> Result:
 
 
 class Closed:
-    """Closed form of the spherical pendulum let go at a turning point of phi, unit mass and radius.
+    """Closed form of the spherical pendulum from a turning point of phi, with unit mass and radius.
 
     `u = cos(phi)` obeys `u'^2 = 2 g (u - u1)(u - u2)(u - u3)` and moves between u1 and u2, the start.
     """
@@ -110,7 +110,7 @@ class Closed:
 
 
 def _windows(periods: int, period: float) -> np.ndarray:
-    """Times of saving, shape `[windows, SAMPLES]`: windows of a period, spread evenly over the logarithm of time."""
+    """Saved times, shape `[windows, SAMPLES]`: windows of a period, evenly spaced in the logarithm of time."""
     last = int(periods * period / DT) - SAMPLES
     starts = np.unique(np.geomspace(period / DT, last, 36).astype(int))
     kept = [starts[0]]
@@ -119,7 +119,7 @@ def _windows(periods: int, period: float) -> np.ndarray:
 
 
 def _growth(t: np.ndarray, error: np.ndarray, lost: float = math.inf) -> float | None:
-    """Slope of log error over log t in the last two decades; None where errors are beyond `lost` in most of them."""
+    """Slope of log error over log t in the last two decades; None if most errors there exceed `lost`."""
     late = t >= 0.01 * t[-1]
     use = late & (error > 0) & (np.maximum.accumulate(error) < lost)
     return float(np.polyfit(np.log(t[use]), np.log(error[use]), 1)[0]) if 2 * use.sum() > late.sum() else None

@@ -1,8 +1,8 @@
-"""`jaxmodsim fit` on the measured EMPS record of a positioning axis: error, held-back error, and what is left open.
+"""`jaxmodsim fit` on the measured EMPS record of a positioning axis: errors and undetermined parameters.
 
-One command fits all models to the whole record and to what is left when one of four parts is held back, start-up and
-compilation included. Each fitted model is then run once more with five integration steps for every sample: an error
-that changed would be an artefact of the step.
+One command fits all models to the whole record and to three of its four parts in turn, including start-up and
+compilation. Each fitted model is then run with five integration steps per sample, to check that the error does not
+depend on the step.
 """
 
 import json
@@ -21,13 +21,13 @@ import jaxmodsim as jms
 from bench.record import Result
 from jaxmodsim.identify import axis_models, axis_scene, estimate_axis, replay
 
-# Beside the repository and not in it: A. Janot, M. Gautier, M. Brunot, "Data set and reference models of EMPS",
+# Outside the repository: A. Janot, M. Gautier, M. Brunot, "Data set and reference models of EMPS",
 # Workshop on Nonlinear System Identification Benchmarks, 2019.
 EMPS, EMPS_GAIN = Path(__file__).parents[3] / "shared" / "data" / "emps" / "train.csv", 35.15065188248547
 
 
 def main(smoke: bool, out: Path) -> Result | None:
-    """Fit and check; a small run fits one model to a part, and without the record there is nothing to do."""
+    """Fit and check; a smoke run fits one model to a part. Without the record there is no result."""
     del out
     if not EMPS.exists():
         print(f"skipped: there is no record at {EMPS}")

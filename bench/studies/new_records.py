@@ -1,8 +1,8 @@
-"""Whether a fit to one record keeps its word on another one: bands, and the choice of a law.
+"""Predictions of a fit for a new record: prediction bands, and the selected law.
 
-Synthetic pairs of records of an axis with LuGre friction whose level differs from the first record to the second, and
-that depends on position, which no candidate knows. Laws are fitted to the first record and one is chosen by folds of
-it; then all of them run on the second.
+The records are synthetic pairs of an axis with LuGre friction. The friction level differs between both records and
+depends on position, unlike in all candidates. Laws are fitted to the first record, and one is selected by
+cross-validation on it; then all of them are run on the second record.
 """
 
 from pathlib import Path
@@ -25,16 +25,16 @@ from jaxmodsim.identify import (
     replay,
 )
 
-# Mass [kg], LuGre's numbers but Fs [N], how much friction depends on position over which length [m], offset [N].
+# Mass [kg], parameters of LuGre except Fs [N], share and length [m] of the dependence on position, offset [N].
 MASS, LUGRE, RIPPLE, PITCH, OFFSET = 50.0, (1e5, 1000.0, 120.0, 20.0, 0.03), 0.05, 0.005, 2.0
-# Fs over Fc.
+# Ratio of Fs to Fc.
 STICTION = (1.1, 1.3)
 SAMPLES, STEP, NOISE, LARGEST = 2000, 4e-3, 2e-6, 0.1
 LAWS = ("coulomb", "asymmetric", "stribeck", "lugre")
 
 
 def main(smoke: bool, out: Path) -> Result:
-    """All pairs, half of them with little stiction and half with more."""
+    """Run all pairs, half of them with low stiction and half with high stiction."""
     del out
     pairs, rng = 1 if smoke else 20, np.random.default_rng(0)
     result = Result("new_records", (), {"pairs": 2 * pairs, "largest": 100 * LARGEST})
@@ -53,7 +53,7 @@ def main(smoke: bool, out: Path) -> Result:
 
 
 class _Pair(NamedTuple):
-    """The law that the first record chose, and of every law the error [m] and the share in the band on the second."""
+    """The law selected on the first record, and for every law its error [m] and band coverage on the second."""
 
     chosen: str
     errors: dict[str, float]
@@ -90,7 +90,7 @@ _run = jax.jit(replay, static_argnums=5)
 
 
 def record(level: float, stiction: float, rng: np.random.Generator, name: str) -> jms.Record:
-    """A record of the axis with this friction level: the same motion each time, but for a disturbance of its own."""
+    """A record of the axis with this friction level: the same motion with another disturbance each time."""
     t = STEP * np.arange(SAMPLES)
     u = OFFSET + 60.0 * np.sin(2 * np.pi * 0.5 * t) + 25.0 * np.sin(2 * np.pi * 1.3 * t + 1.0)
     u = u + sum(6.0 * np.sin(2 * np.pi * rate * t + rng.uniform(0, 2 * np.pi)) for rate in (0.8, 2.1, 3.7))

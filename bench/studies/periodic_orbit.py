@@ -1,6 +1,7 @@
-"""Periodic orbits by shooting, beside simulations until they have settled: error and time for the same number.
+"""Periodic orbits by shooting and by simulation until settled: errors and times of the same quantity.
 
-The period of the belt oscillator, and the amplitude of Den Hartog's oscillator with dry friction; both in closed form.
+The quantities are the period of the belt oscillator, and the amplitude of Den Hartog's oscillator with dry friction.
+Both have closed forms.
 """
 
 import math
@@ -17,16 +18,16 @@ from bench.record import Result, timed
 from jaxmodsim.problems import belt_oscillator
 
 # Settling [s] and tolerance; frequency [rad/s] at mass, stiffness and force amplitude one, and two friction forces [N]:
-# the weaker one lets a free swing die out slowly.
+# with the smaller one free oscillations decay slowly.
 SETTLE, RTOL, W, FORCES = 20.0, 1e-10, 0.7, (0.2, 0.02)
 BELT = "period of the belt oscillator"
 
-# A way to the number.
+# A method.
 Way = Callable[[], float]
 
 
 def main(smoke: bool, out: Path) -> Result:
-    """Relative error and time of each way to the numbers."""
+    """Measure relative error and time of each method."""
     del out
     result = Result("periodic_orbit", ("diffrax",), {"rtol": RTOL, "W": W})
     exact = {BELT: float(belt_oscillator.cycle(**belt_oscillator.PARAMS).period)}
@@ -65,7 +66,7 @@ def _belt_orbit() -> float:
 
 
 def _belt_run() -> float:
-    """Between the last two times at which it breaks away."""
+    """Time between the last two break-away events."""
     run = jms.simulate(_BELT, [0.0], [0.0], SETTLE, rtol=RTOL, atol=1e-2 * RTOL)
     times = np.asarray(run.events.t)
     slips = times[np.isfinite(times) & (np.asarray(run.events.before) == 0)]
@@ -90,6 +91,6 @@ def _den_hartog_orbit(scene: jms.Scene) -> float:
 
 
 def _den_hartog_run(scene: jms.Scene, end: float) -> float:
-    """Deflection at the end, the time of a turning point by the closed form."""
+    """Final deflection, at the time of a turning point by the closed form."""
     options = {"rtol": RTOL, "atol": 1e-2 * RTOL, "max_steps": 1_000_000, "max_events": 5000}
     return float(jms.simulate(scene, [0.0], [0.0], end, **options).q[-1, 0])

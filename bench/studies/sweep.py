@@ -1,8 +1,8 @@
 """Many runs of the LuGre testbench: `sweep` on all cores, CVODES in as many processes, Kvaerno5 under plain `vmap`.
 
-Every solver gets the loosest tolerance at which the velocity of the nominal run stays within 1e-6 of the reference. All
-run the same sets of parameters. Measured besides: a million runs into a store and the memory they take, and a
-store whose process is killed again and again.
+Every solver has the loosest tolerance at which the velocity of the nominal run stays within 1e-6 of the reference. All
+run the same sets of parameters. Further measures are a million runs into a store with their memory, and a store whose
+process is killed repeatedly.
 """
 
 import concurrent.futures as cf
@@ -33,7 +33,7 @@ GOAL = 1e-6
 
 
 def main(smoke: bool, out: Path) -> Result:
-    """All parts; a small run leaves out the slow peers."""
+    """Run all parts; a smoke run omits the slow peers."""
     del out
     result = Result("sweep", ("diffrax", "casadi", "xarray", "zarr", "numpy"), {"t1": TESTBENCH.t1})
     wanted = (OURS,) if smoke else (OURS, KVAERNO5, CVODES)
@@ -52,12 +52,12 @@ def _loosest(peer: Peer) -> float:
 
 
 def cvodes_velocities(rtol: float, sets: np.ndarray) -> np.ndarray:
-    """End velocities by CVODES, one after another; run in a process of its own."""
+    """End velocities by CVODES, one after another, in a separate process."""
     return makers(TESTBENCH)[CVODES]().many[LOOP](rtol, sets)()
 
 
 def _side_by_side(result: Result, peers: dict[str, Peer], rtol: dict[str, float], count: int, rounds: int) -> None:
-    """The same runs by all; CVODES in as many processes as there are cores, started and warmed before."""
+    """Time the same runs by all; CVODES has a warm process for each core."""
     sets, cores = TESTBENCH.sets(count), os.cpu_count() or 1
     result.settings["runs"] = count
     with cf.ProcessPoolExecutor(cores, multiprocessing.get_context("spawn")) as pool:
@@ -85,7 +85,7 @@ def _command(count: int, rtol: float, store: Path) -> list[str]:
 
 
 def _million(result: Result, count: int) -> None:
-    """A process of its own runs them into a store; its peak memory is what the kernel counted."""
+    """Run into a store in a separate process, and record its peak memory from the kernel."""
     with tempfile.TemporaryDirectory() as folder:
         command = _command(count, 1e-5, Path(folder) / "store.zarr")
         done = subprocess.run(command, check=True, capture_output=True, text=True)
@@ -96,7 +96,7 @@ def _million(result: Result, count: int) -> None:
 
 
 def into_store(count: int, rtol: float, store: Path) -> None:
-    """A sweep into a store, in a process of its own; says each chunk, and at the end what it took."""
+    """A sweep into a store, in a separate process, which prints each chunk and finally its time."""
     jms.tune_cpu()
     jax.config.update("jax_enable_x64", True)
     sets = TESTBENCH.sets(count)
@@ -109,7 +109,7 @@ def into_store(count: int, rtol: float, store: Path) -> None:
 
 
 def _killed(result: Result, rtol: float, times: int) -> None:
-    """A sweep whose process is killed at random moments, and begun again each time; against one that was not."""
+    """Compare a sweep whose process is killed and restarted at random times with an undisturbed one."""
     draw = random.Random(7)
     with tempfile.TemporaryDirectory() as folder:
         whole, broken = Path(folder) / "whole.zarr", Path(folder) / "broken.zarr"

@@ -1,4 +1,4 @@
-"""Pendulums in Cartesian coordinates, held by a constraint: in a plane, and in space, where no pole is in the way."""
+"""Pendulums in Cartesian coordinates with a constraint, in a plane and in space, without the poles of angles."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -24,7 +24,7 @@ _SPACE_BOB = point_mass(lambda p: p["m"], _in_space, lambda p: p["g"])
 
 
 def scene(*, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Scene:
-    """Point mass on a massless rod, by its coordinates (x, z) [m] from the pivot in a vertical plane, z upwards.
+    """Point mass on a massless rod, with coordinates (x, z) [m] from the pivot in a vertical plane, z upwards.
 
     **Arguments:**
 
@@ -34,18 +34,18 @@ def scene(*, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Sce
 
     **Returns:**
 
-    A `Scene` with the constraint `rod`, `sqrt(x^2 + z^2) = l`: its multiplier is the force of the rod on the mass [N],
-    positive outwards, so the `tension` with a minus sign. Its exact accelerations: `acceleration`.
+    A `Scene` with the constraint `rod`, `sqrt(x^2 + z^2) = l`. Its multiplier is the force of the rod on the mass [N],
+    positive outwards: minus the `tension`. `acceleration` has its exact accelerations.
     """
     rod = Constraint(_stretch, at=_in_plane, name="rod")
     return Scene(_PLANE_BOB, params={"m": m, "l": l, "g": g}, constraints=(rod,), coordinates=("x [m]", "z [m]"))
 
 
 def cartesian_spherical_pendulum(*, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Scene:
-    """The spherical pendulum by its coordinates (x, y, z) [m] from the pivot, z upwards.
+    """The spherical pendulum with coordinates (x, y, z) [m] from the pivot, z upwards.
 
-    It passes the top and the bottom as any other place, where the angles of `spherical_pendulum` fail. Arguments and
-    results as for `scene`; the multiplier is `spherical_pendulum.reaction`.
+    It passes the top and the bottom, at which the angles of `spherical_pendulum` are singular. Arguments and results as
+    for `scene`; the multiplier is `spherical_pendulum.reaction`.
     """
     rod = Constraint(_stretch, at=_in_space, name="rod")
     return Scene(
@@ -56,9 +56,9 @@ def cartesian_spherical_pendulum(*, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: A
 def tension(
     q: Float[Array, " dim"], qd: Float[Array, " dim"], *, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81
 ) -> Float[Array, ""]:
-    """Tension of the rod [N], positive where it pulls the mass inwards: `m (v^2 - g z)/l`.
+    """Tension of the rod [N], positive if it pulls the mass inwards: `m (v^2 - g z)/l`.
 
-    In a plane, with the angle f from straight down, that is `m (l f'^2 + g cos(f))`.
+    In a plane, with the angle f from straight down, the tension is `m (l f'^2 + g cos(f))`.
 
     **Arguments:**
 
@@ -71,7 +71,7 @@ def tension(
 def acceleration(
     q: Float[Array, " dim"], qd: Float[Array, " dim"], *, l: ArrayLike = 1.0, g: ArrayLike = 9.81
 ) -> Float[Array, " dim"]:
-    """Accelerations [m/s^2] by Newton's law, from gravity and the tension; the mass drops out.
+    """Accelerations [m/s^2] by Newton's law, from gravity and the tension; they do not depend on the mass.
 
     Arguments as for `tension`.
     """

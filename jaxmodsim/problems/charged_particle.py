@@ -1,4 +1,4 @@
-"""A charged particle in steady electric and magnetic fields: a force that depends on the velocity and does no work."""
+"""A charged particle in constant fields, with a magnetic force that depends on the velocity and does no work."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -26,9 +26,9 @@ def scene(
     B: ArrayLike = PARAMS["B"],
     E: ArrayLike | tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Scene:
-    """Charged point mass in a uniform magnetic field along z, with or without a uniform electric field.
+    """Charged point mass in a uniform magnetic field along z and a uniform electric field.
 
-    The coordinates are (x, y, z) [m]; no gravity.
+    The coordinates are (x, y, z) [m]. There is no gravity.
 
     **Arguments:**
 
@@ -39,11 +39,11 @@ def scene(
 
     **Returns:**
 
-    A `Scene` without effects. Its exact motion: `motion`.
+    A `Scene` without effects. `motion` has its exact motion.
 
     **Raises:**
 
-    - `ValueError` if E has another shape.
+    - `ValueError` if E has the wrong shape.
     """
     field = jnp.asarray(E, float)
     if field.shape != (3,):
@@ -62,9 +62,9 @@ def acceleration(
     B: ArrayLike = PARAMS["B"],
     E: ArrayLike | tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Float[Array, "3"]:
-    """Accelerations [m/s^2] by the force of Lorentz: `m v' = charge (E + v x B)`.
+    """Accelerations [m/s^2] by the Lorentz force: `m v' = charge (E + v x B)`.
 
-    Arguments as for `scene`, velocities `qd` [m/s]; the place `q` [m] does not matter.
+    Arguments as for `scene`, with velocities `qd` [m/s]. The position `q` [m] is unused.
     """
     bent = B * jnp.stack([qd[1], -qd[0], jnp.zeros_like(qd[2])])
     return jnp.asarray(charge) * (jnp.asarray(E, qd.dtype) + bent) / m
@@ -82,8 +82,8 @@ def motion(
 ) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"]]:
     """Positions [m] and velocities [m/s] at the times `t` [s], in closed form.
 
-    With the cyclotron frequency w = charge B/m and u = x + i y: circles `u' = d + (u0' - d) exp(-i w t)` about a centre
-    that drifts at `d = (Ey - i Ex)/B`; along z a uniform acceleration.
+    With the cyclotron frequency w = charge B/m and u = x + i y, `u' = d + (u0' - d) exp(-i w t)`: the particle circles
+    a centre that drifts at `d = (Ey - i Ex)/B`. Along z the acceleration is uniform.
 
     **Arguments:**
 

@@ -1,11 +1,11 @@
-"""Foucault's pendulum: the plane of its swings turns as the ground turns beneath it."""
+"""Foucault's pendulum, whose plane of oscillation turns with the rotation of the Earth."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..scene import Scene
 
-# Mass [kg], length [m], gravity [m/s^2], turning of the Earth [rad/s] and latitude [rad]: the Pantheon, Paris.
+# Mass [kg], length [m], gravity [m/s^2], rotation rate of the Earth [rad/s] and latitude [rad]: the Pantheon, Paris.
 PARAMS = {"m": 28.0, "l": 67.0, "g": 9.81, "Omega": 7.2921159e-5, "latitude": 0.8527}
 
 
@@ -24,22 +24,22 @@ def scene(
     Omega: ArrayLike = PARAMS["Omega"],
     latitude: ArrayLike = PARAMS["latitude"],
 ) -> Scene:
-    """Small swings of a pendulum on a turning Earth, by a Lagrangian with a term linear in the velocities.
+    """Small oscillations of a pendulum on the rotating Earth, with a Lagrangian that is linear in Omega.
 
-    `L = m (x'^2 + y'^2)/2 + m Omega sin(latitude) (x y' - y x') - m g (x^2 + y^2)/(2 l)`: the coordinates are the
-    deflections to the east and to the north [m]. What is quadratic in Omega, the centrifugal force, is part of gravity.
+    `L = m (x'^2 + y'^2)/2 + m Omega sin(latitude) (x y' - y x') - m g (x^2 + y^2)/(2 l)`. The coordinates are the
+    deflections to the east and to the north [m]. The centrifugal force, quadratic in Omega, is part of gravity.
 
     **Arguments:**
 
     - `m`: mass [kg], > 0.
     - `l`: length [m], > 0.
     - `g`: gravity [m/s^2], > 0.
-    - `Omega`: rate at which the Earth turns [rad/s].
-    - `latitude`: [rad], positive in the north.
+    - `Omega`: rotation rate of the Earth [rad/s].
+    - `latitude`: [rad], positive north of the equator.
 
     **Returns:**
 
-    A `Scene` without effects. Its exact motion: `motion`; in angles, the plane of the swings turns at `precession`.
+    A `Scene` without effects. `motion` has its exact motion, and `precession` the rate of its plane of oscillation.
     """
     return Scene(
         _lagrangian,
@@ -49,7 +49,7 @@ def scene(
 
 
 def precession(*, Omega: ArrayLike = PARAMS["Omega"], latitude: ArrayLike = PARAMS["latitude"]) -> Float[Array, ""]:
-    """Rate [rad/s] at which the plane of the swings turns, from east to north: `-Omega sin(latitude)`."""
+    """Rotation rate [rad/s] of the plane of oscillation, from east to north: `-Omega sin(latitude)`."""
     return -jnp.asarray(Omega) * jnp.sin(jnp.asarray(latitude))
 
 
@@ -65,8 +65,8 @@ def motion(
 ) -> Float[Array, "... 2"]:
     """Deflections [m] at the times `t` [s], in closed form.
 
-    In a frame that turns at the precession p about the vertical the motion is that of a spring, with
-    `n^2 = g/l + p^2`. So, with u = x + i y: `u = exp(i p t) (u0 cos(n t) + (u0' - i p u0) sin(n t)/n)`.
+    In a frame that rotates about the vertical at the precession p the motion is that of a spring with
+    `n^2 = g/l + p^2`. With u = x + i y: `u = exp(i p t) (u0 cos(n t) + (u0' - i p u0) sin(n t)/n)`.
 
     **Arguments:**
 

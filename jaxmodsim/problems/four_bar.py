@@ -1,4 +1,4 @@
-"""A four-bar linkage: three moving links in a loop that constraints close."""
+"""A four-bar linkage: three moving links in a loop that is closed by constraints."""
 
 import jax
 import jax.numpy as jnp
@@ -7,8 +7,8 @@ from jaxtyping import Array, ArrayLike, Float
 from ..mechanics import Constraint, rigid_body
 from ..scene import Scene
 
-# Lengths [m] of crank, coupler, rocker and ground, masses [kg] of crank, coupler and rocker, gravity [m/s^2]: by
-# Grashof's rule the crank turns fully, as the shortest and longest link together are shorter than the others.
+# Lengths [m] of crank, coupler, rocker and ground, masses [kg] of crank, coupler and rocker, gravity [m/s^2]. By
+# Grashof's rule the crank turns fully, because the shortest and longest links together are shorter than the others.
 PARAMS = {"a": 0.2, "b": 0.5, "c": 0.45, "d": 0.6, "m1": 0.4, "m2": 1.0, "m3": 0.9, "g": 9.81}
 
 
@@ -62,9 +62,9 @@ def scene(
 ) -> Scene:
     """Crank about the origin, rocker about (d, 0), and a coupler between their ends, in a vertical plane, y upwards.
 
-    The coordinates are the angles of crank, coupler and rocker [rad], each counterclockwise from the x axis; crank and
-    rocker point away from the ground, the coupler from crank to rocker. The links are uniform. States that close the
-    loop: `state`.
+    The coordinates are the angles of crank, coupler and rocker [rad], counterclockwise from the x axis. Crank and
+    rocker point away from the ground, the coupler points from crank to rocker. The links are uniform. `state` has
+    admissible states.
 
     **Arguments:**
 
@@ -74,8 +74,8 @@ def scene(
 
     **Returns:**
 
-    A `Scene` without effects, with the constraint `closure`, two equations: the ends of coupler and rocker meet. Its
-    multipliers are the force [N] of the coupler on the rocker, (x, y). Its exact motion: `acceleration`.
+    A `Scene` without effects. Its constraint `closure` has two equations, by which the ends of coupler and rocker meet;
+    the multipliers are the force [N] of the coupler on the rocker, (x, y). `acceleration` has the exact accelerations.
     """
     params = {"a": a, "b": b, "c": c, "d": d, "m1": m1, "m2": m2, "m3": m3, "g": g}
     return Scene(
@@ -98,17 +98,17 @@ def state(
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Coordinates and velocities of `scene` at an angle of the crank [rad] and its rate [rad/s].
 
-    The joint of coupler and rocker is where the circles of radius b about the end of the crank and c about (d, 0) meet:
-    on the line between their centres at `(s^2 + b^2 - c^2)/(2 s)` from the first, s their distance, and to its left
-    (seen from the first; to its right if `crossed`). The rates follow from the velocity of that joint across coupler
-    and rocker: `rod' = a sin(rocker - crank)/(b sin(coupler - rocker)) crank'`, and
+    The joint of coupler and rocker is an intersection of the circles of radius b about the end of the crank and of
+    radius c about (d, 0). With the distance s of the centres, it is at `(s^2 + b^2 - c^2)/(2 s)` from the first centre
+    along the line between them, and to the left of the line (to the right if `crossed`). The velocity of the joint
+    gives the rates `coupler' = a sin(rocker - crank)/(b sin(coupler - rocker)) crank'` and
     `rocker' = a sin(coupler - crank)/(c sin(coupler - rocker)) crank'`.
 
     **Arguments:**
 
     - `angle`, `rate`: of the crank [rad], [rad/s].
-    - `a`, `b`, `c`, `d`: as for `scene`; NaN comes out where they cannot close.
-    - `crossed`: which of the two ways to close it.
+    - `a`, `b`, `c`, `d`: as for `scene`. The result is NaN if the loop cannot close.
+    - `crossed`: whether coupler and ground cross.
     """
     angle, rate = jnp.asarray(angle, float), jnp.asarray(rate, float)
     a, b, c, d = (jnp.asarray(x, float) for x in (a, b, c, d))
@@ -139,11 +139,11 @@ def acceleration(
     g: ArrayLike = PARAMS["g"],
     crossed: bool = False,
 ) -> Float[Array, "3"]:
-    """Accelerations of all three angles [rad/s^2], from the equation of motion of the crank angle f alone.
+    """Accelerations of all three angles [rad/s^2], from the equation of motion of the crank angle f.
 
-    `J f'' + (dJ/df)/2 f'^2 + dV/df = 0`, with the rates k = d(angles)/df of `state` in the reduced inertia
+    `J f'' + (dJ/df)/2 f'^2 + dV/df = 0`, with the rates k = d(angles)/df of `state`, the reduced inertia
     `J = m1 a^2/3 + m2 (a^2 + b^2 k2^2/3 + a b k2 cos(coupler - f)) + m3 c^2 k3^2/3` and
-    `V = g (m1 a sin(f)/2 + m2 (a sin(f) + b sin(coupler)/2) + m3 c sin(rocker)/2)`; those of coupler and rocker are
+    `V = g (m1 a sin(f)/2 + m2 (a sin(f) + b sin(coupler)/2) + m3 c sin(rocker)/2)`; coupler and rocker have
     `k f'' + (dk/df) f'^2`. Arguments as for `scene` and `state`.
     """
     a, b, c, d, m1, m2, m3, g = (jnp.asarray(x, angle.dtype) for x in (a, b, c, d, m1, m2, m3, g))

@@ -1,4 +1,4 @@
-"""A blade on an inclined plane that cannot slip sideways: instead of sliding down it draws cycloids across."""
+"""A blade on an inclined plane that cannot slip sideways, and moves across the plane on cycloids."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -28,22 +28,22 @@ def scene(
     slope: ArrayLike = PARAMS["slope"],
     g: ArrayLike = PARAMS["g"],
 ) -> Scene:
-    """Blade on a smooth inclined plane, free to turn and to slide along its edge only.
+    """Blade on a smooth inclined plane that turns freely and slides along its edge only.
 
-    The coordinates are the place of its centre of mass, where the edge touches, x down the plane and y across [m], and
-    the heading [rad], in which (cos, sin) is the direction of the edge.
+    The coordinates are the position of its centre of mass and contact, x down the plane and y across [m], and the
+    heading h [rad], with the edge in the direction (cos(h), sin(h)).
 
     **Arguments:**
 
     - `m`: mass [kg], > 0.
     - `I`: moment of inertia about the normal of the plane [kg m^2], > 0.
-    - `slope`: angle of the plane against the level [rad].
+    - `slope`: inclination of the plane [rad].
     - `g`: gravity [m/s^2].
 
     **Returns:**
 
-    A `Scene` without effects, with the constraint `edge`, whose multiplier is the force [N] of the plane on the blade
-    across the edge, positive to its left; see `force`. Its exact motion: `motion`.
+    A `Scene` without effects. Its constraint `edge` has as multiplier the `force` [N] of the plane on the blade across
+    the edge, positive to its left. `motion` has its exact motion.
     """
     edge = VelocityConstraint(_sideways, name="edge")
     return Scene(
@@ -62,24 +62,24 @@ def motion(
     slope: ArrayLike = PARAMS["slope"],
     g: ArrayLike = PARAMS["g"],
 ) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"]]:
-    """Coordinates and velocities at the times `t` [s], started from the origin at t = 0 with the edge down the plane.
+    """Coordinates and velocities at the times `t` [s], after a start at the origin with the edge down the plane.
 
-    The heading is w t. Along the edge gravity accelerates by `b cos(w t)`, b = g sin(slope), so the speed is
+    The heading is w t. The acceleration along the edge is `b cos(w t)` with b = g sin(slope), so the speed is
     `v + (b/w) sin(w t)`, and `x = (b/(2 w^2)) sin(w t)^2 + (v/w) sin(w t)`,
-    `y = (b/(2 w^2)) (w t - sin(w t) cos(w t)) + (v/w) (1 - cos(w t))`: from rest a cycloid, along which the blade
-    moves across the plane by `b/(2 w)` on the average and never down (A. M. Bloch, Nonholonomic Mechanics and Control,
-    2003, section 1.6).
+    `y = (b/(2 w^2)) (w t - sin(w t) cos(w t)) + (v/w) (1 - cos(w t))`. From rest the path is a cycloid: the blade moves
+    across the plane at the mean velocity `b/(2 w)`, and does not descend on average (A. M. Bloch, Nonholonomic
+    Mechanics and Control, 2003, section 1.6).
 
     **Arguments:**
 
     - `t`: times [s].
     - `turn`: rate of the heading w [rad/s], not zero.
-    - `speed`: along the edge at t = 0, v [m/s].
+    - `speed`: initial speed v along the edge [m/s].
     - `slope`, `g`: as for `scene`.
 
     **Returns:**
 
-    (q, qd), each of the shape of `t` and one axis of three more.
+    (q, qd), each of the shape of `t` with an additional last axis of size 3.
     """
     b, w = g * jnp.sin(jnp.asarray(slope)), jnp.asarray(turn)
     sine, cosine = jnp.sin(w * t), jnp.cos(w * t)

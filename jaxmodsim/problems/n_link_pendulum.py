@@ -1,4 +1,4 @@
-"""A chain of point masses on massless links that swings in a vertical plane; with two links, the double pendulum."""
+"""A chain of point masses on massless links in a vertical plane; with two links, the double pendulum."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +9,7 @@ from ..scene import Scene
 
 
 def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    # Sums over the links up to each mass. As products: XLA on CPU has a fast one of those, but not of `jnp.cumsum`.
+    # Sums over the links up to each mass, as products, because XLA on CPU has no fast `jnp.cumsum`.
     upto = np.tri(q.shape[0], dtype=q.dtype)
     x = upto @ (p["l"] * jnp.cos(q) * qd)
     z = upto @ (p["l"] * jnp.sin(q) * qd)
@@ -18,11 +18,11 @@ def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
 
 
 def scene(n: int, *, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Scene:
-    """Chain of n point masses on massless links in a vertical plane, hung up at the origin, gravity along -z.
+    """Chain of n point masses on massless links in a vertical plane, suspended at the origin, gravity along -z.
 
-    The coordinates are the angles of the links [rad], each from straight down and all in the same sense, not from
-    link to link: mass k is at `x = sum_i l_i sin(q_i)`, `z = -sum_i l_i cos(q_i)` over the links i <= k. Without
-    friction, and chaotic from two links on.
+    The coordinates are the absolute angles of the links [rad] from straight down: mass k is at `x = sum_i l_i
+    sin(q_i)`, `z = -sum_i l_i cos(q_i)` over the links i <= k. There is no friction. The motion is chaotic for two or
+    more links.
 
     **Arguments:**
 
@@ -33,11 +33,11 @@ def scene(n: int, *, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81
 
     **Returns:**
 
-    A `Scene` without effects; its exact accelerations: `acceleration`.
+    A `Scene` without effects. `acceleration` has its exact accelerations.
 
     **Raises:**
 
-    - `ValueError` if `n` is not a positive integer, or `m` or `l` has another length.
+    - `ValueError` if `n` is not a positive integer, or `m` or `l` has the wrong length.
     """
     if isinstance(n, bool) or not isinstance(n, int) or n < 1:
         raise ValueError(f"n must be a positive integer, but {n!r} was given.")
@@ -56,7 +56,7 @@ def double_pendulum(*, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.
 def _each(x: ArrayLike, name: str, n: int) -> Array:
     array = jnp.asarray(x, float)
     if array.shape not in ((), (n,)):
-        raise ValueError(f"{name} has the shape {array.shape}, but a chain of {n} links needs one number or ({n},).")
+        raise ValueError(f"{name} must be one number or have the shape ({n},) for {n} links, but it has {array.shape}.")
     return jnp.broadcast_to(array, (n,))
 
 
@@ -65,10 +65,9 @@ def acceleration(
 ) -> Float[Array, " n"]:
     """Accelerations of the chain, from its equations of motion in closed form.
 
-    With `c_ij = (m_max(i,j) + ... + m_n) l_i l_j` they read, for every link i,
-    `sum_j c_ij (cos(q_i - q_j) q_j'' + sin(q_i - q_j) q_j'^2) + (m_i + ... + m_n) g l_i sin(q_i) = 0`: the
-    Euler-Lagrange equations of the textbooks for two links (L. D. Landau and E. M. Lifshitz, Mechanics, section 5,
-    problem 1, gives that Lagrangian), written for n.
+    With `c_ij = (m_max(i,j) + ... + m_n) l_i l_j` the equation of link i is
+    `sum_j c_ij (cos(q_i - q_j) q_j'' + sin(q_i - q_j) q_j'^2) + (m_i + ... + m_n) g l_i sin(q_i) = 0`. This extends the
+    equations for two links, with the Lagrangian of L. D. Landau and E. M. Lifshitz, Mechanics, section 5, problem 1.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""A slider-crank: closed by constraints, with friction under the force that presses the slider to its guide."""
+"""A slider-crank with constraints, and friction in proportion to the force of the guide on the slider."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ PARAMS = {"m1": 0.6, "m2": 0.9, "m3": 1.4, "r": 0.3, "l": 0.8, "g": 9.81}
 
 
 class SliderCrankForces(NamedTuple):
-    """What the free bodies of the slider-crank say.
+    """Accelerations and joint forces of the slider-crank.
 
     - `qdd`: accelerations of (crank, rod, x, y) [rad/s^2, m/s^2], shape `[4]`.
     - `bearing`: force of the ground on the crank [N], (x, y), shape `[2]`.
@@ -92,25 +92,25 @@ def scene(
     torque: ArrayLike | None = None,
     mu: ArrayLike | None = None,
 ) -> Scene:
-    """A crank about the origin, a rod from its end, and a slider at the end of the rod, in a vertical plane, y upwards.
+    """Crank about the origin, rod from its end, and slider at the end of the rod, in a vertical plane, y upwards.
 
-    The coordinates are the angles of crank and rod [rad], each counterclockwise from the x axis and towards the slider,
-    and the place (x, y) of the slider [m]. Crank and rod are uniform. States that close the loop: `state`.
+    The coordinates are the angles of crank and rod [rad], counterclockwise from the x axis and towards the slider, and
+    the position (x, y) of the slider [m]. Crank and rod are uniform. `state` has admissible states.
 
     **Arguments:**
 
     - `m1`, `m2`, `m3`: masses of crank, rod and slider [kg], > 0.
     - `r`, `l`: lengths of crank and rod [m], 0 < r < l for full turns.
     - `g`: gravity [m/s^2].
-    - `torque`: constant torque on the crank [N m]; None for none.
-    - `mu`: coefficient of Coulomb friction, >= 0, between slider and guide, which holds the slider from both sides;
-      None for no friction.
+    - `torque`: constant torque on the crank [N m]; None for no torque.
+    - `mu`: coefficient of Coulomb friction between slider and guide, >= 0; None for no friction. The guide holds the
+      slider from both sides.
 
     **Returns:**
 
     A `Scene` with the constraints `pin`, two equations, whose force [N] on (rod, slider) has the shape `[2, 3]`, and
-    `guide`, y = 0, whose multiplier is the force of the guide on the slider [N]; and where they are asked for the
-    effects `drive` and `friction`. Its exact motion: `acceleration`, `forces`.
+    `guide`, y = 0, whose multiplier is the force of the guide on the slider [N]. With a torque it has the effect
+    `drive`, with friction the effect `friction`. `acceleration` and `forces` have its exact motion.
     """
     params: dict[str, ArrayLike] = {"m1": m1, "m2": m2, "m3": m3, "r": r, "l": l, "g": g}
     effects: tuple[AbstractEffect, ...] = ()
@@ -158,7 +158,7 @@ def acceleration(
     torque: ArrayLike = 0.0,
     force: ArrayLike = 0.0,
 ) -> Float[Array, ""]:
-    """Angular acceleration of the crank [rad/s^2], from the equation of motion of the crank angle alone.
+    """Angular acceleration of the crank [rad/s^2], from the equation of motion of the crank angle.
 
     With f the angle of the crank, b that of the rod, c = r/l and C = cos(b) = sqrt(1 - c^2 sin(f)^2), the loop gives
     `b' = db/df = -c cos(f)/C`, `b'' = c sin(f) (1 - b'^2)/C`, the slider `x' = r sin(f) (b' - 1)`, and the middle of
@@ -169,7 +169,7 @@ def acceleration(
     **Arguments:**
 
     - `angle`, `rate`: of the crank [rad], [rad/s].
-    - `force`: on the slider along x [N], such as friction.
+    - `force`: force on the slider along x [N], such as friction.
     - All others: as for `scene`.
     """
     numbers = (m1, m2, m3, r, l, g, torque, force)
@@ -201,12 +201,12 @@ def forces(
     torque: ArrayLike = 0.0,
     mu: ArrayLike = 0.0,
 ) -> SliderCrankForces:
-    """Accelerations and all joint forces, by Newton's and Euler's laws for the three bodies cut free.
+    """Accelerations and all joint forces, by the Newton-Euler equations of the three free bodies.
 
-    Ten linear equations: for crank and rod the forces along x and y and the moments about their middles, for the slider
-    the forces, and that the ends of rod and slider have the same acceleration. Friction is `-mu |N| sign(x')`, so they
-    are solved for either sign of the guide's force N, and the solution is taken that has the sign it was found with
-    (one has, for mu not too large). Arguments as for `acceleration`; the slider moves.
+    There are ten linear equations: forces along x and y and moments about the centres for crank and rod, forces for the
+    slider, and equal accelerations of the ends of rod and slider. Friction is `-mu |N| sign(x')`. The equations are
+    solved for both signs of the guide force N, and the consistent solution is returned, which is unique for small mu.
+    Arguments as for `acceleration`. The slider must move.
     """
     numbers = (m1, m2, m3, r, l, g, torque, mu)
     m1, m2, m3, r, l, g, torque, mu = (jnp.asarray(x, angle.dtype) for x in numbers)

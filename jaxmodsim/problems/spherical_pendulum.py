@@ -27,7 +27,7 @@ def scene(*, m: ArrayLike = 1.0, R: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Sce
 
     **Returns:**
 
-    A `Scene` without effects; its exact accelerations: `acceleration`.
+    A `Scene` without effects. `acceleration` has its exact accelerations.
     """
     return Scene(_lagrangian, params={"m": m, "R": R, "g": g}, coordinates=("phi [rad]", "theta [rad]"))
 
@@ -35,7 +35,7 @@ def scene(*, m: ArrayLike = 1.0, R: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Sce
 def acceleration(
     q: Float[Array, "2"], qd: Float[Array, "2"], *, R: ArrayLike = 1.0, g: ArrayLike = 9.81
 ) -> Float[Array, "2"]:
-    """Accelerations of the spherical pendulum, in closed form; the mass drops out.
+    """Accelerations of the spherical pendulum in closed form; they do not depend on the mass.
 
     `phi'' = sin(phi) cos(phi) theta'^2 + (g/R) sin(phi)`, `theta'' = -2 cot(phi) phi' theta'` (NTNU course TTK4130,
     exercise 9, problem 1).
@@ -58,9 +58,9 @@ def acceleration(
 def reaction(
     q: Float[Array, "2"], qd: Float[Array, "2"], *, m: ArrayLike = 1.0, R: ArrayLike = 1.0, g: ArrayLike = 9.81
 ) -> Float[Array, ""]:
-    """Radial force of constraint [N] of the sphere on the mass, positive outwards.
+    """Radial constraint force [N] of the sphere on the mass, positive outwards.
 
-    `m (g cos(phi) - R phi'^2 - R sin(phi)^2 theta'^2)`; the tangential components vanish. Arguments as for
+    The force is `m (g cos(phi) - R phi'^2 - R sin(phi)^2 theta'^2)`; its tangential components vanish. Arguments as for
     `scene`, coordinates and rates as for `acceleration`.
     """
     return jnp.asarray(m) * (g * jnp.cos(q[0]) - R * qd[0] ** 2 - R * (jnp.sin(q[0]) * qd[1]) ** 2)
@@ -71,23 +71,22 @@ def motion(
 ) -> Float[np.ndarray, "..."]:
     """Angle phi [rad] at the times `t` [s], from a turning point at t = 0, in closed form; NumPy, float64.
 
-    With u = cos(phi), c = g/R and `l = sin(phi)^2 theta'` [1/s], energy and angular momentum give
-    `u'^2 = 2 c (u - a) (u - b) (u - w)`, whose root `a` is the u of the start and whose others obey, with
-    `s = l^2/(2 c (1 - a^2))`, `x^2 - s x - 1 - a s = 0`; the larger, w, is above 1. Between a and b it swings as
-    `u = b + (a - b) cn(n t)^2/dn(n t)^2` if the start is the upper turning point (a > b), and as
-    `u = a + (b - a) sn(n t)^2` if it is the lower one, where with the lower one, a', and the upper one, b',
-    `n = sqrt(c (w - a')/2)`, and the parameter of Jacobi's functions is `(b' - a')/(w - a')` (E. T. Whittaker, A
-    Treatise on the Analytical Dynamics of Particles and Rigid Bodies, section 55).
+    Let u = cos(phi), c = g/R and `l = sin(phi)^2 theta'` [1/s]. Energy and angular momentum give
+    `u'^2 = 2 c (u - a) (u - b) (u - w)`. The root `a` is the initial u. With `s = l^2/(2 c (1 - a^2))` the other roots
+    obey `x^2 - s x - 1 - a s = 0`; the larger one, w, exceeds 1. If the start is the upper turning point (a > b),
+    `u = b + (a - b) cn(n t)^2/dn(n t)^2`, else `u = a + (b - a) sn(n t)^2`. With the smaller and the larger of a and b,
+    a' and b', `n = sqrt(c (w - a')/2)`, and the parameter of Jacobi's functions is `(b' - a')/(w - a')` (E. T.
+    Whittaker, A Treatise on the Analytical Dynamics of Particles and Rigid Bodies, section 55).
 
     **Arguments:**
 
     - `t`: times [s].
-    - `phi`: angle from the +z axis at t = 0 [rad], where phi' = 0; 0 < phi < pi.
+    - `phi`: angle from the +z axis at t = 0 [rad], with phi' = 0; 0 < phi < pi.
     - `turn`: theta' at t = 0 [rad/s], not zero.
     - `R`: radius [m], > 0.
     - `g`: gravity [m/s^2], > 0.
     """
-    from scipy.special import ellipj  # slow to import, and only needed here
+    from scipy.special import ellipj  # slow to import
 
     start, c = np.cos(phi), g / R
     share = (turn * np.sin(phi)) ** 2 / (2.0 * c)

@@ -1,4 +1,4 @@
-"""A bead on a spherical spiral, with or without viscous drag and dry friction."""
+"""A bead on a spherical spiral, optionally with viscous drag and dry friction."""
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ class SphericalSpiral(eqx.Module):
     **Arguments:**
 
     - `R`: radius [m], > 0.
-    - `a`: turns are the closer the smaller it is [1/rad], any finite number.
+    - `a`: parameter of the spiral [1/rad], any finite number; small values give close turns.
     """
 
     R: Number = parameter("R", "m", lower=0.0, strict=True)
@@ -90,11 +90,15 @@ def normal_force(
 ) -> Float[Array, ""]:
     """Magnitude [N] of the force of the wire on the bead across the path, in closed form.
 
-    Newton's law in the spherical frame (r, phi, theta), with `sin(phi) = 1/sqrt(1 + u)` and u = a^2 theta^2, so
-    `phi' = -a/(1 + u) theta'` and `phi'' = 2 a^3 theta/(1 + u)^2 theta'^2` for a steady theta', as theta'' acts along
-    the path. What gravity and curvature leave over is `f_r = m (g cos(phi) - R phi'^2 - R sin(phi)^2 theta'^2)`,
-    `f_phi = m (R phi'' - R sin(phi) cos(phi) theta'^2 - g sin(phi))`, `f_theta = 2 m R cos(phi) phi' theta'`; along the
-    surface only its part across the tangent, which is (0, phi', sin(phi) theta') in this frame.
+    Newton's law is used in the spherical frame (r, phi, theta), with `sin(phi) = 1/sqrt(1 + u)` and u = a^2 theta^2.
+    Since theta'' acts along the path, it may be zero, so `phi' = -a/(1 + u) theta'` and
+    `phi'' = 2 a^3 theta/(1 + u)^2 theta'^2`. The force has the components
+
+    - `f_r = m (g cos(phi) - R phi'^2 - R sin(phi)^2 theta'^2)`,
+    - `f_phi = m (R phi'' - R sin(phi) cos(phi) theta'^2 - g sin(phi))`,
+    - `f_theta = 2 m R cos(phi) phi' theta'`,
+
+    less the part of `(f_phi, f_theta)` along the tangent (phi', sin(phi) theta').
 
     **Arguments:**
 
@@ -126,9 +130,9 @@ def acceleration(
     """Acceleration theta'' [rad/s^2] of the moving bead in closed form, shape `[1]`.
 
     With u = a^2 theta^2: `theta'' = a^2 theta (1 + 2 a^2 + u) / ((1 + u)(1 + a^2 + u)) theta'^2
-    - (g/R) a sqrt(1 + u)/(1 + a^2 + u) - (k/m) theta'` (NTNU course TTK4130, exercise 9, problem 1), less
-    `mu N/(m s) sign(theta')` for friction, with N by `normal_force` and the length of the path for each
-    radian `s = R sqrt(1 + a^2 + u)/(1 + u)`.
+    - (g/R) a sqrt(1 + u)/(1 + a^2 + u) - (k/m) theta'` (NTNU course TTK4130, exercise 9, problem 1).
+    Friction subtracts `mu N/(m s) sign(theta')`, with N from `normal_force` and the length of the path per radian
+    `s = R sqrt(1 + a^2 + u)/(1 + u)`.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""The test bench: a box on a table under a rising force, with one friction model after the other."""
+"""The test bench: a box on a table under a rising force, with several friction models."""
 
 import time
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ T1 = 10.0
 MASS = 2.0
 FIXED_STEP = 0.01
 REGULARISED_WIDTH = 1e-3
-# In stick friction equals the applied force; it has broken away when it falls behind by more than this for good [N].
+# In stick friction equals the applied force. Break-away is the last time with a difference below this value [N].
 BREAK_AWAY_GAP = 0.05
-# Time span in which the oscillation in stick is measured: after the transient, well before break-away [s].
+# Time span of the measured oscillation in stick, after the transient and well before break-away [s].
 STICK_SPAN = (0.2, 1.2)
 SIGMA0 = (75.0, 750.0, 7500.0, 75000.0)
 SIGMA1 = (0.0, 5.0, 20.0, 80.0)
@@ -30,7 +30,7 @@ class RampCase:
     """One run of the bench.
 
     - `part`: part of the exercise, a to e.
-    - `label`: what is run.
+    - `label`: description in tables and figures.
     - `law`: friction law.
     - `ramp`: rise of the applied force [N/s].
     - `v0`: initial velocity [m/s].
@@ -49,13 +49,13 @@ class RampCase:
 
 @dataclass(frozen=True)
 class RampRun:
-    """A run of the ramped box, ready to be drawn.
+    """Series of a run of the ramped box.
 
-    - `label`: what was run.
+    - `label`: description in tables and figures.
     - `t`: times [s].
     - `velocity`: velocity of the box [m/s].
     - `applied`, `friction`: forces [N].
-    - `note`: a sentence for the figure, such as how the run ended.
+    - `note`: a sentence for the figure, such as the reason of an early end.
     """
 
     label: str
@@ -68,7 +68,7 @@ class RampRun:
 
 @dataclass(frozen=True)
 class RampResult:
-    """A case that was run, with the numbers of its line in the table."""
+    """A case with its run, and the numbers of its row in the table."""
 
     case: RampCase
     run: RampRun
@@ -81,7 +81,7 @@ class RampResult:
 
 
 def ramp_cases() -> list[RampCase]:
-    """The runs of the exercise's parts a to e; b and d exactly, by events, and in their regularised form."""
+    """The runs of parts a to e of the exercise; b and d both event-driven and regularised."""
     coulomb, stribeck = ramped_box.coulomb(), ramped_box.stribeck()
     return [
         RampCase("a", "sign, 1 N/s, adaptive", Sign(coulomb)),
@@ -107,9 +107,9 @@ def ramp_cases() -> list[RampCase]:
 
 
 def run_ramp(case: RampCase) -> RampResult:
-    """Run a case and take its numbers; the second, warm run is timed."""
+    """Run a case and compute its numbers; the second, warm run is timed."""
     scene = ramped_box.scene(case.law, ramp=case.ramp, m=MASS)
-    # With a fixed step every step is seen, which is where a chattering velocity shows.
+    # The saved times contain every fixed step, which reveals chattering.
     ts = jnp.linspace(0.0, T1, 1001)
 
     def go() -> Trajectory:
@@ -138,7 +138,7 @@ def run_ramp(case: RampCase) -> RampResult:
 
 
 def _break_away(result: Trajectory, run: RampRun) -> float:
-    """Time of the event, or that after which friction stays behind the applied force; NaN where it never equals it."""
+    """Time of the break-away event, or the last time at which friction equals the applied force; NaN without one."""
     if result.mode:
         return float(break_away()(result))
     stuck = np.flatnonzero(np.abs(run.applied - run.friction) <= BREAK_AWAY_GAP)
@@ -148,7 +148,7 @@ def _break_away(result: Trajectory, run: RampRun) -> float:
 
 
 def _oscillation(t: np.ndarray, gap: np.ndarray, sigma0: float) -> np.ndarray:
-    """Amplitude of `gap` [N] at the bristle's own frequency sqrt(sigma0/m) in the stick span, about a parabola."""
+    """Amplitude of `gap` [N] about a parabola, at the natural frequency sqrt(sigma0/m) of the bristle, in stick."""
     inside = (t >= STICK_SPAN[0]) & (t <= STICK_SPAN[1])
     phase = np.sqrt(sigma0 / MASS) * t[inside]
     basis = np.column_stack([np.vander(t[inside], 3), np.cos(phase), np.sin(phase)])
@@ -157,7 +157,7 @@ def _oscillation(t: np.ndarray, gap: np.ndarray, sigma0: float) -> np.ndarray:
 
 
 def stick_sweep() -> dict[str, np.ndarray]:
-    """LuGre over a grid of sigma0 and sigma1, as one vmap.
+    """Run LuGre friction over a grid of sigma0 and sigma1, in one vmap.
 
     **Returns:**
 

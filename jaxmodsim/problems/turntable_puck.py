@@ -1,4 +1,4 @@
-"""A puck on a turntable that spins up: dry friction in the plane lets it go at a speed in closed form."""
+"""A puck on an accelerating turntable, with dry friction in the plane and a break-away speed in closed form."""
 
 from typing import NamedTuple
 
@@ -8,16 +8,16 @@ from jaxtyping import Array, ArrayLike, Float
 from ..friction import Coulomb
 from ..scene import Friction, Scene
 
-# Mass [kg], angular acceleration [rad/s^2], gravity [m/s^2], radius of the puck [m], coefficient of friction.
+# Mass [kg], angular acceleration [rad/s^2], gravity [m/s^2], initial radius of the puck [m], friction coefficient.
 PARAMS = {"m": 0.5, "alpha": 0.8, "g": 9.81, "r0": 0.5, "mu": 0.3}
 
 
 class BreakAway(NamedTuple):
-    """When the puck begins to slip.
+    """The beginning of slip.
 
     - `t`: time [s].
-    - `angle`: of the turntable since t = 0 [rad].
-    - `direction`: of the slip, from the radius, against the rotation [rad].
+    - `angle`: rotation of the turntable since t = 0 [rad].
+    - `direction`: angle of the slip from the radius, against the rotation [rad].
     """
 
     t: Float[Array, "..."]
@@ -39,16 +39,16 @@ def _load(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
 
 
 def scene(law: object = None, *, ellipse: ArrayLike | None = None) -> Scene:
-    """Puck on a turntable at the speed `alpha t`, in coordinates that turn with it.
+    """Puck on a turntable at the angular velocity `alpha t`, in coordinates that rotate with it.
 
     **Arguments:**
 
-    - `law`: friction law per newton of load; by default `Coulomb(mu)` of `PARAMS`.
-    - `ellipse`: friction across over friction along the first coordinate; see `Friction`.
+    - `law`: friction law per newton of load; None for `Coulomb(mu)` with `PARAMS`.
+    - `ellipse`: ratio of friction across to friction along the first coordinate; see `Friction`.
 
     **Returns:**
 
-    A `Scene` with the position [m] on the turntable for coordinates and the effect `friction`. Begin at rest at
+    A `Scene` with the position on the turntable [m] as coordinates and the effect `friction`. Start at rest at
     `[r0, 0]`.
     """
     friction = Friction(
@@ -64,13 +64,13 @@ def break_away(
     r0: ArrayLike = PARAMS["r0"],
     g: ArrayLike = PARAMS["g"],
 ) -> BreakAway:
-    """Where the load in stick, `m r sqrt(w^4 + alpha^2)` of centrifugal and Euler acceleration, reaches `mu m g`.
+    """The time at which the inertial force in stick, `m r sqrt(w^4 + alpha^2)`, reaches `mu m g`.
 
     **Arguments:**
 
-    - `mu`: static coefficient of friction, > alpha r0/g: otherwise the puck slips from the start, and t is NaN.
+    - `mu`: coefficient of static friction, > alpha r0/g. Otherwise the puck slips from the start, and t is NaN.
     - `alpha`: angular acceleration [rad/s^2], > 0.
-    - `r0`: radius of the puck [m], > 0.
+    - `r0`: distance of the puck from the axis [m], > 0.
     - `g`: gravity [m/s^2], > 0.
     """
     w = ((jnp.asarray(mu) * g / r0) ** 2 - jnp.asarray(alpha) ** 2) ** 0.25

@@ -1,4 +1,4 @@
-"""A worm drive that locks itself."""
+"""A self-locking worm drive."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -7,8 +7,8 @@ from ..friction import Coulomb
 from ..mechanics import Constraint
 from ..scene import AppliedForce, Friction, Scene
 
-# Moments of inertia of worm and wheel [kg m^2], their pitch radii [m], lead angle [rad], coefficient of friction, and
-# the torques of motor and load [N m].
+# Moments of inertia [kg m^2] and pitch radii [m] of worm and wheel, lead angle [rad], coefficient of friction, and
+# torques of motor and load [N m].
 PARAMS = {"J1": 1e-4, "J2": 2e-2, "r1": 0.01, "r2": 0.04, "lead": 0.12, "mu": 0.15, "motor": 0.0, "load": 8.0}
 
 
@@ -21,12 +21,12 @@ def _torques(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
 
 
 def _across(t: Array, q: Array, p: dict[str, Array]) -> Array:
-    """Overlap of the teeth, across them."""
+    """Overlap of the teeth across their flanks."""
     return p["r2"] * q[1] * jnp.cos(p["lead"]) - p["r1"] * q[0] * jnp.sin(p["lead"])
 
 
 def _along(q: Array, p: dict[str, Array]) -> Array:
-    """Slide of the teeth on each other."""
+    """Sliding distance along the teeth."""
     return p["r1"] * q[0] * jnp.cos(p["lead"]) + p["r2"] * q[1] * jnp.sin(p["lead"])
 
 
@@ -41,11 +41,11 @@ def scene(
     motor: ArrayLike = PARAMS["motor"],
     load: ArrayLike = PARAMS["load"],
 ) -> Scene:
-    """Worm and wheel, rigid, with Coulomb friction between the teeth under the force that these transmit.
+    """Rigid worm and wheel, with Coulomb friction in proportion to the transmitted force.
 
-    The coordinates are the angles of worm and wheel [rad], with `r2 wheel = r1 worm tan(lead)`. The wheel's load turns
-    it back. With the friction angle `phi = atan(mu)` the drive locks itself where phi >= lead: no load turns the
-    worm. Initial states: `state`.
+    The coordinates are the angles of worm and wheel [rad], with `r2 wheel = r1 worm tan(lead)`. The load drives the
+    wheel backwards. With the friction angle `phi = atan(mu)` the drive is self-locking for phi >= lead: no load turns
+    the worm. `state` has initial states.
 
     **Arguments:**
 
@@ -53,13 +53,13 @@ def scene(
     - `r1`, `r2`: pitch radii of worm and wheel [m], > 0.
     - `lead`: lead angle of the worm [rad], > 0 and < pi/2.
     - `mu`: coefficient of friction between the teeth, >= 0.
-    - `motor`: torque on the worm [N m]; `load`: on the wheel, against positive angles [N m].
+    - `motor`: torque on the worm [N m]. `load`: torque on the wheel against positive angles [N m].
 
     **Returns:**
 
     A `Scene` with the constraint `mesh`, whose multiplier is the normal force between the teeth [N], and the effect
-    `friction` along the teeth. In slip it follows `acceleration`. While the load drives, friction loses its unique
-    solution (jamming) where `J1/r1^2 < (J2/r2^2) tan(lead) tan(phi - lead)`, and the run ends.
+    `friction` along the teeth. In slip it follows `acceleration`. If the load drives the worm and
+    `J1/r1^2 < (J2/r2^2) tan(lead) tan(phi - lead)`, the friction force is not unique (jamming), and the run ends.
     """
     mesh = Constraint(_across, name="mesh")
     friction = Friction(Coulomb(mu), along=_along, normal_force="mesh")
@@ -79,7 +79,7 @@ def state(
 
     **Arguments:**
 
-    - `speed`: of the worm [rad/s].
+    - `speed`: angular velocity of the worm [rad/s].
     - `r1`, `r2`, `lead`: as for `scene`.
     """
     speed = jnp.asarray(speed, float)
@@ -87,10 +87,10 @@ def state(
 
 
 def efficiency(lead: ArrayLike, mu: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Output over input power in steady motion, of the motor that drives, and of the load that drives it back.
+    """Efficiencies in steady motion, driven by the motor and by the load.
 
-    `tan(lead)/tan(lead + phi)` and `tan(lead - phi)/tan(lead)` with `phi = atan(mu)`; the second one is 0 where the
-    drive locks itself, phi >= lead. For `Geared` on the worm: `1/(1 + mu_drive)` and `1 - mu_back`.
+    They are `tan(lead)/tan(lead + phi)` and `tan(lead - phi)/tan(lead)` with `phi = atan(mu)`. The second one is 0 for
+    a self-locking drive, phi >= lead. For `Geared` on the worm they are `1/(1 + mu_drive)` and `1 - mu_back`.
 
     **Arguments:**
 
@@ -111,10 +111,10 @@ def holding_torques(
     lead: ArrayLike = PARAMS["lead"],
     mu: ArrayLike = PARAMS["mu"],
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Least and largest motor torque [N m] at which the drive at rest stays locked.
+    """Smallest and largest motor torque [N m] at which the drive stays at rest.
 
-    `r1 (load/r2) tan(lead - phi)` and `r1 (load/r2) tan(lead + phi)`: with a positive load the first one is negative
-    where the drive locks itself, and the motor must push to lower the load.
+    They are `r1 (load/r2) tan(lead - phi)` and `r1 (load/r2) tan(lead + phi)`. For a positive load and a self-locking
+    drive the first one is negative: the motor must push to lower the load.
 
     **Arguments:**
 
@@ -139,23 +139,23 @@ def acceleration(
 ) -> Float[Array, ""]:
     """Angular acceleration of the worm [rad/s^2] in slip, in closed form.
 
-    `(motor/r1 - (load/r2) T)/(J1/r1^2 + J2/r2^2 tan(lead) T)/r1` with `T = tan(lead + phi)` where the motor drives and
-    `tan(lead - phi)` where the load does. That is decided by the direction of slip and by the side of the teeth that
-    bear, whose force `n = load/r2 + J2/r2^2 tan(lead) r1 worm''` over cos is positive where the wheel is pushed.
+    It is `(motor/r1 - (load/r2) T)/(J1/r1^2 + J2/r2^2 tan(lead) T)/r1`, with `T = tan(lead + phi)` if the motor drives
+    and `T = tan(lead - phi)` if the load drives. This depends on the direction of slip and on the loaded flank: the
+    tooth force along the wheel, `load/r2 + J2/r2^2 tan(lead) r1 worm''`, is positive if the worm pushes the wheel.
 
     **Arguments:**
 
-    - `direction`: sign of the worm's speed.
-    - the others: as for `scene`.
+    - `direction`: sign of the velocity of the worm.
+    - All others: as for `scene`.
     """
     mass1, mass2 = jnp.asarray(J1) / jnp.square(r1), jnp.asarray(J2) / jnp.square(r2)
     push, force, slope = jnp.asarray(motor) / r1, jnp.asarray(load) / r2, jnp.tan(lead)
 
     def solution(side: float) -> tuple[Array, Array]:
-        """Acceleration of the worm's pitch line, and the force on the wheel, with the teeth bearing on one side."""
+        """Acceleration of the pitch line of the worm, and force on the wheel, with one flank loaded."""
         T = jnp.tan(lead + side * direction * jnp.arctan(mu))
         rate = (push - force * T) / (mass1 + mass2 * slope * T)
         return rate, force + mass2 * slope * rate
 
-    forward, bears = solution(1.0)
-    return jnp.where(bears >= 0, forward, solution(-1.0)[0]) / r1
+    forward, tooth_force = solution(1.0)
+    return jnp.where(tooth_force >= 0, forward, solution(-1.0)[0]) / r1

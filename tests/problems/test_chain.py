@@ -133,5 +133,7 @@ def test_number_of_links_is_checked(n: Any, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_number_of_masses_is_checked() -> None:
-    with pytest.raises(ValueError, match=r"m has the shape \(3,\), but a chain of 2 links needs one number or \(2,\)"):
+    with pytest.raises(
+        ValueError, match=r"m must be one number or have the shape \(2,\) for 2 links, but it has \(3,\)"
+    ):
         problems.n_link_pendulum.double_pendulum(m=np.ones(3))
