@@ -255,17 +255,17 @@ def covariance_estimate(
         meat = meat + _chance(scores, meat - if_white, bread) * (if_white - meat)
     change = slopes / scale
 
+    first, nuisance = slice(parameters), slice(parameters, None)
+
     def of_parameters(middle: np.ndarray) -> np.ndarray:
-        covariance = (change @ middle @ change.T)[:parameters, :parameters]
-        np.fill_diagonal(covariance, np.where(silent[:parameters], np.inf, np.diagonal(covariance)))
+        covariance = (change @ middle @ change.T)[first, first]
+        np.fill_diagonal(covariance, np.where(silent[first], np.inf, np.diagonal(covariance)))
         return covariance
 
-    back = np.linalg.pinv(slopes[:parameters, :parameters])
-    cross = (matrix / size)[:parameters, parameters:]
-    known = (matrix / size)[:parameters, :parameters] - cross @ floored_inverse(
-        (matrix / size)[parameters:, parameters:], rounding
-    ) @ cross.T
-    information = back.T @ (known * size[:parameters, :parameters]) @ back
+    back, normal = np.linalg.pinv(slopes[first, first]), matrix / size
+    cross = normal[first, nuisance]
+    known = normal[first, first] - cross @ floored_inverse(normal[nuisance, nuisance], rounding) @ cross.T
+    information = back.T @ (known * size[first, first]) @ back
     return CovarianceEstimate(of_parameters(bread @ meat @ bread), of_parameters(bread @ if_white @ bread), information)
 
 

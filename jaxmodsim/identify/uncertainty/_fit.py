@@ -256,13 +256,13 @@ def result_of(
     values, at_start = problem.at(state.x).vector.tolist(), [float(free.start[name]) for name in names]
     entries = list(range(size))
     if problem.base is not None and len(set(windows.record)) == len(windows.record):
-        starts = np.asarray(jax.vmap(problem.local_values)(problem.base))[:, :shown]
-        ends = starts + np.asarray(problem.split(state.x)[1])[:, :shown]
+        before = np.asarray(jax.vmap(problem.local_values)(problem.base))[:, :shown]
+        after = before + np.asarray(problem.split(state.x)[1])[:, :shown]
         for i, record in enumerate(records):
             prefix = "" if len(records) == 1 else f"{record.name}/"
             names += [prefix + name for name in problem.local[:shown]]
-            at_start += starts[i].tolist()
-            values += ends[i].tolist()
+            at_start += before[i].tolist()
+            values += after[i].tolist()
             entries += [size + i * len(problem.local) + k for k in range(shown)]
     covariance = covariance_of(problem, state, entries)
     outputs, rmse = _stitched(search, records, windows)
