@@ -211,7 +211,7 @@ def test_a_spring_that_stops() -> None:
 
 def test_several_elements(alone: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Changes of each as they are given: `first` leaves stick for good, `second` at the same time, and comes back."""
-    t, effect, before, after = [jnp.array(x) for x in ([1.0, 1.0, 2.0, jnp.inf], [0, 1, 1, -1], [0, 0, 1, -1], [-1, 1, 0, -1])]
+    t, effect, before, after = map(jnp.array, ([1.0, 1.0, 2.0, jnp.inf], [0, 1, 1, -1], [0, 0, 1, -1], [-1, 1, 0, -1]))
     monkeypatch.setattr(jms.Trajectory, "events", property(lambda run: Events(t, effect, before, after)))
     run = made(alone, problems.coupled_belts.scene(), modes=jnp.array([[-1.0, 0.0]]), end=jnp.asarray(4.0))
     names = ("first", "second")
