@@ -296,6 +296,7 @@ def arm(law: Any) -> jms.Scene:
     return jms.Scene(kinetic, params, (jms.AppliedForce(push), jms.Friction(law)), coordinates=("angle [rad]",))
 
 
+@pytest.mark.deep
 def test_a_servo_on_a_pendulum_sticks_and_slips() -> None:
     scene = arm(ServoGear.published("mx106", "M6", motor, gravity))
     run = jms.simulate(scene, [0.0], [0.0], 2.0, ts=jnp.linspace(0.0, 2.0, 201), rtol=1e-8, atol=1e-10)

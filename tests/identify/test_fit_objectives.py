@@ -140,6 +140,7 @@ def test_gradient_of_every_objective_equals_finite_differences(name, full):
     np.testing.assert_allclose(exact, differences, rtol=2e-5, atol=1e-6 * np.max(np.abs(exact)))
 
 
+@pytest.mark.deep
 def test_gradient_of_a_fit_through_events_equals_finite_differences(belt):
     scene = belt_oscillator.scene(jms.Stribeck(**belt_oscillator.STRIBECK))
     free = ("friction.Fc", "friction.Fs", "k")

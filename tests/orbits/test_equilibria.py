@@ -99,6 +99,7 @@ def test_orbits_from_there_turn_back_where_they_come_to_stick(sliding):
         jms.continue_orbits(belt(jms.Stribeck(**LAW), 1.0), sliding.points[0], SPEED, (1.0, 0.3), period=1.0)
 
 
+@pytest.mark.deep
 def test_orbits_that_stick_turn_back_where_stick_shrinks_to_a_point():
     scene, span = belt(jms.Stribeck(**LAW), 0.61), (0.61, 0.66)
     branch = jms.continue_orbits(scene, ([0.0], [0.61]), SPEED, span, settle=20.0, step=0.4, rtol=1e-9)

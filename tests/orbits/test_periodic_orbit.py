@@ -48,6 +48,7 @@ def van_der_pol():
     return jms.periodic_orbit(VAN_DER_POL, ([0.0], [0.5]), settle=60.0)
 
 
+@pytest.mark.deep
 def test_belt_oscillator_has_the_period_of_its_closed_form(belt):
     cycle = belt_oscillator.cycle(**belt_oscillator.PARAMS)
     np.testing.assert_allclose(belt.period, cycle.period, rtol=1e-9)
@@ -61,6 +62,7 @@ def test_belt_oscillator_has_the_period_of_its_closed_form(belt):
     assert {(before, after) for _, before, after in belt.sequence} == {("backward", "stick"), ("stick", "backward")}
 
 
+@pytest.mark.deep
 def test_segments_of_a_period_change_nothing(belt):
     orbit = jms.periodic_orbit(belt_oscillator.scene(), belt, segments=4)
     assert len(orbit.runs) == 4
@@ -77,6 +79,7 @@ def test_multipliers_of_stick_and_of_an_unknown_period_are_exact(belt):
     assert "stable" in str(belt)
 
 
+@pytest.mark.deep
 def test_period_of_the_belt_has_the_derivatives_of_its_closed_form_forward_and_reverse(belt):
     scene = belt_oscillator.scene()
     exact = jax.grad(lambda p: belt_oscillator.cycle(**p).period)(dict(belt_oscillator.PARAMS))
@@ -214,6 +217,7 @@ def test_van_der_pol(van_der_pol):
     assert van_der_pol.multipliers[0] == 1.0
 
 
+@pytest.mark.deep
 def test_multipliers_of_random_scenes_are_those_of_finite_differences():
     random, checked = np.random.default_rng(3), 0
     while checked < 50:

@@ -108,6 +108,7 @@ def ramp(t: Any, q: Any, qd: Any, p: Any) -> Any:
     return jnp.stack([3.0 * t - t * t, 0.0 * t])
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("law", [Coulomb(1.0, 1.4), Stribeck(1.0, 1.4, 0.1, 0.3)])
 def test_on_a_line_it_is_the_scalar_law(law: Any) -> None:
     runs = [
@@ -248,6 +249,7 @@ def test_the_load_may_be_a_reaction_or_a_number() -> None:
     np.testing.assert_allclose(reaction.forces["friction"][-1], [1.0, 0.5], atol=1e-10)
 
 
+@pytest.mark.deep
 def test_on_an_ellipse_friction_is_the_point_of_greatest_dissipation() -> None:
     """In slip against 10 000 points of the ellipse; break-away where the load passes it."""
     ratio, v = 0.5, np.array([0.3, -0.7])
@@ -264,6 +266,7 @@ def test_on_an_ellipse_friction_is_the_point_of_greatest_dissipation() -> None:
     np.testing.assert_allclose(run.events.t[0], limit, rtol=1e-10)
 
 
+@pytest.mark.deep
 def test_energy_float32_and_batches() -> None:
     """The energy balance closes over slip and stick; in float32 the stop is right to rounding, in batches too."""
     run = simulate(PUCK, [0.0, 0.0], [3.0, 4.0], 8.0, ts=np.linspace(0.0, 8.0, 9), **TIGHT)
@@ -318,6 +321,7 @@ def test_feet_of_a_bar_share_a_pull_along_it() -> None:
     np.testing.assert_allclose(run.q[-1], [1.0 / (6.0 * MASS), 0.0, 0.0], atol=1e-6)
 
 
+@pytest.mark.deep
 def test_a_bar_pushed_across_at_one_end_pivots_about_the_other() -> None:
     """Constant angular acceleration, until the force that keeps the foot in place reaches its limit."""
     push = LIMIT + 1.0

@@ -40,6 +40,7 @@ TABLES = [
 ]  # fmt: skip
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("numbers", [{}, TIGHT], ids=["default", "tight"])
 def test_a_ball_settles_on_an_oscillating_table(numbers):
     base = vibrating_table.scene()
@@ -60,6 +61,7 @@ def test_a_ball_settles_on_an_oscillating_table(numbers):
         assert abs(run.mode_changes[-1].t - right.closes[0]) < 1e-6
 
 
+@pytest.mark.deep
 def test_a_ball_leaves_a_table_that_falls_faster_and_settles_again():
     A, omega, e = 0.02, 25.0, 0.2
 
@@ -154,6 +156,7 @@ def test_impacts_that_break_a_box_loose_from_dry_friction(numbers):
     np.testing.assert_allclose(q, np.array([0.0, 0.5]) + np.array(right) * [1.0, -1.0], rtol=0, atol=1e-8)
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_restitution_under_friction_does_not_move_the_resting_place(derivative):
     """A block thrown onto a rough floor: what bounces take from its impulse and give to its time is the same."""

@@ -116,6 +116,7 @@ def test_gradients_by_every_number_equal_finite_differences(reverse_gradient: An
     np.testing.assert_allclose(ours, slopes, rtol=1e-6, atol=1e-9 * np.abs(slopes).max())
 
 
+@pytest.mark.deep
 def test_forward_derivatives_equal_reverse(reverse_gradient: Any) -> None:
     """Also by `diffrax.ForwardMode`, which goes through the whole run and not only through its steps."""
     point = fixed_point()
