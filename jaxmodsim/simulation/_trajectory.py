@@ -42,7 +42,8 @@ class Events(AbstractReadable):
 
     Friction laws with stick, contacts and switches change modes. Elements that change at the same instant have one
     entry each. An impact is an entry of its contact, from open to open if the gap opens again. Inside `jax.jit`,
-    `jax.vmap` and `jax.grad` the number of entries is fixed: the arrays are padded with infinity and -1.
+    `jax.vmap` and `jax.grad` the number of entries is fixed: the arrays are padded with infinity and -1. Elsewhere they
+    are NumPy arrays of the entries alone.
 
     - `t`: time [s], differentiable.
     - `effect`: index of the effect in the scene; contacts follow the effects, in the order of the constraints.
@@ -51,10 +52,10 @@ class Events(AbstractReadable):
     - `labels`: name of each effect and contact, and the words for its modes.
     """
 
-    t: Float[Array, "*runs events"]
-    effect: Int[Array, "*runs events"]
-    before: Int[Array, "*runs events"]
-    after: Int[Array, "*runs events"]
+    t: Float[Array | np.ndarray, "*runs events"]
+    effect: Int[Array | np.ndarray, "*runs events"]
+    before: Int[Array | np.ndarray, "*runs events"]
+    after: Int[Array | np.ndarray, "*runs events"]
     labels: tuple[tuple[str, tuple[tuple[int, str], ...]], ...] = ()
 
     __repr__ = AbstractReadable.__str__
@@ -104,12 +105,12 @@ class Energy(AbstractReadable):
       integration.
     """
 
-    kinetic: Float[Array, "*runs time"]
-    potential: Float[Array, "*runs time"]
-    stored: Float[Array, "*runs time"]
-    work_in: Float[Array, "*runs time"]
-    dissipated: Float[Array, "*runs time"]
-    balance: Float[Array, "*runs time"]
+    kinetic: Float[Array | np.ndarray, "*runs time"]
+    potential: Float[Array | np.ndarray, "*runs time"]
+    stored: Float[Array | np.ndarray, "*runs time"]
+    work_in: Float[Array | np.ndarray, "*runs time"]
+    dissipated: Float[Array | np.ndarray, "*runs time"]
+    balance: Float[Array | np.ndarray, "*runs time"]
 
     __repr__ = AbstractReadable.__str__
 
@@ -327,8 +328,9 @@ class Trajectory(AbstractReadable):
         """Events with the words for their modes; as many as happened, where that is known."""
         t, *modes = _events(self.scene, self._log())
         if is_known(t):
-            count = int(np.isfinite(t).sum())
-            t, *modes = (x[:count] for x in (t, *modes))
+            # JAX would give the last entry for an index beyond it; NumPy raises an IndexError.
+            t, *modes = map(np.asarray, (t, *modes))
+            t, *modes = (x[np.isfinite(t)] for x in (t, *modes))
         words = self.mode_labels
         labels = tuple((name, tuple(words.get(name, {}).items())) for name in self.scene.part_names)
         return Events(t, *modes, labels=labels)

@@ -86,7 +86,7 @@ def test_two_elements_on_one_coordinate_share_in_proportion_to_their_limits() ->
     both = scene(Friction(Coulomb(1.0)), Friction(Coulomb(2.0, 3.0)), r=1.0)
     run = simulate(both, [0.0], [0.0], 6.0, ts=np.array([2.0, 3.9, 6.0]), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(run.events.t[:2], 4.0, rtol=1e-7)
-    np.testing.assert_array_equal(run.events.effect[:3], [1, 2, -1])
+    np.testing.assert_array_equal(run.events.effect, [1, 2])
     np.testing.assert_allclose(run.forces["friction"][:2], [0.5, 0.975], rtol=1e-7)
     np.testing.assert_allclose(run.forces["friction_2"][:2], [1.5, 2.925], rtol=1e-7)
     np.testing.assert_allclose(run.qd[:, 0], [0.0, 0.0, (36 - 16) / 2 - 3 * 2], atol=1e-6)

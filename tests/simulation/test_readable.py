@@ -82,6 +82,8 @@ def test_mode_changes_are_in_words_and_without_padding(run: jms.Trajectory) -> N
         ("friction", "stick", "backward"),
     ]
     np.testing.assert_array_equal([change.t for change in changes], run.events.t)
+    with pytest.raises(IndexError):
+        _ = run.events.t[3]
     smooth = jms.simulate(jms.problems.n_link_pendulum.scene(1), [0.1], [0.0], 0.1)
     assert smooth.mode_changes == ()
 
