@@ -187,7 +187,7 @@ class FitProblem(eqx.Module):
         return eqx.tree_at(lambda p: p.known, self, known)
 
     def pinned(
-        self, x: Float[Array, " n"], information: Float[np.ndarray, "n n"], free: Collection[str] = ()
+        self, x: Float[Array, " n"], information: Float[np.ndarray, "known known"], free: Collection[str] = ()
     ) -> "FitProblem":
         """The problem with all parameters but `free` held at `x`, by a prior: only arrays differ.
 

@@ -71,12 +71,12 @@ class Staged(AbstractInitializer):
         values |= {name: sizes[unit] for name, unit in units.items() if unit in sizes}
         start = problem.free.coordinates(values)
         balance, known = _fit_balance(problem, sampled, start, options)
-        for name, x in balance.items():
+        for name, value in balance.items():
             if known[name]:
                 size = sizes.get(units[name])
                 # The balance of forces may give an implausible value.
-                fine = size is None or x == 0 or size / _FAR < abs(x) < _FAR * size
-                values[name] = x if fine else float(np.copysign(size or 0.0, x))
+                fine = size is None or value == 0 or size / _FAR < abs(value) < _FAR * size
+                values[name] = value if fine else float(np.copysign(size or 0.0, value))
         blind = [name for name in units if not known[name]]
         stiffness = _reversal_slope(problem, sampled, values) or sizes["N/m"]
         mass = _mass(problem, values)
