@@ -1,10 +1,15 @@
-"""The two shapes that stand in most signatures."""
+"""Types of numbers and functions that most signatures have."""
 
+from collections.abc import Callable
 from typing import TypeAlias
 
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree, ScalarLike
 
 # One number.
 Scalar: TypeAlias = Float[Array, ""]
 # One number for each coordinate.
 PerDof: TypeAlias = Float[Array, " dof"]
+# One number or flag as diffrax passes it: an array, or a number of Python.
+Real: TypeAlias = ScalarLike
+# A function of arrays.
+Fn: TypeAlias = Callable[..., PyTree]
