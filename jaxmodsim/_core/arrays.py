@@ -1,17 +1,21 @@
 """Array types, conversion of known numbers, look-up in increasing times, and fusion barriers."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TypeAlias, TypeVar
 
 import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree, ScalarLike, Shaped
 
 Scalar: TypeAlias = Float[Array, ""]
 # One number per coordinate.
 PerDof: TypeAlias = Float[Array, " dof"]
+# One number or flag as diffrax passes it: an array, or a number of Python.
+Real: TypeAlias = ScalarLike
+# A function of arrays.
+Fn: TypeAlias = Callable[..., PyTree]
 _Tree = TypeVar("_Tree")
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
-from .._core.arrays import after, is_one_of
+from .._core.arrays import Fn, Real, after, is_one_of
 from ._wrapper import AbstractControllerWrapper
 
 # Part of a step by which it may end before or after the required time.
@@ -23,29 +23,29 @@ class FiniteSteps(dfx.AbstractStepSizeController):
 
     inner: dfx.ConstantStepSize = dfx.ConstantStepSize()
 
-    def wrap(self, direction: Any) -> "FiniteSteps":
+    def wrap(self, direction: Real) -> "FiniteSteps":
         """Constant steps have no direction."""
         del direction
         return self
 
     def init(
-        self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, dt0: Any, args: PyTree, func: Any, error_order: Any
-    ) -> tuple[Any, Any]:
+        self, terms: PyTree, t0: Real, t1: Real, y0: PyTree, dt0: Real | None, args: PyTree, func: Fn, error_order: Any
+    ) -> tuple[Real, PyTree]:
         """As `diffrax.ConstantStepSize`."""
         end, state = self.inner.init(terms, t0, t1, y0, dt0, args, func, error_order)
         return end, (state, end)
 
     def adapt_step_size(
         self,
-        t0: Any,
-        t1: Any,
+        t0: Real,
+        t1: Real,
         y0: PyTree,
         y1_candidate: PyTree,
         args: PyTree,
         y_error: PyTree,
-        error_order: Any,
+        error_order: PyTree,
         controller_state: PyTree,
-    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:
+    ) -> tuple[Real, Real, Real, Real, PyTree, dfx.RESULTS]:
         """Keep the step if all of its result is finite."""
         old, target = controller_state
         _, next_t0, next_t1, jump, new, _ = self.inner.adapt_step_size(
@@ -61,12 +61,12 @@ class FiniteSteps(dfx.AbstractStepSizeController):
         return finite, jnp.where(finite, next_t0, t0), next_t1, jump, state, result
 
 
-def end_at(times: Float[Array, " n"], t0: Any, t1: Any, stretch: Any = True) -> Any:
+def end_at(times: Float[Array, " n"], t0: Real, t1: Real, stretch: Real = True) -> Array:
     """End of a step from `t0` to `t1`, or the next one of `times` if that is earlier.
 
     With `stretch` also if that is just after `t1`, so that no tiny step remains.
     """
-    last = times.shape[0] - 1
+    t0, t1, last = jnp.asarray(t0), jnp.asarray(t1), times.shape[0] - 1
     i = after(times, t0)
     time = jax.lax.dynamic_index_in_dim(times, jnp.minimum(i, last), keepdims=False).astype(t1.dtype)
     longest = jnp.where(stretch, 1.0 + _STRETCH, 1.0) * (t1 - t0)
@@ -94,28 +94,28 @@ class StepsTo(AbstractControllerWrapper):
         self.controller = controller
         self.times = times
 
-    def wrap(self, direction: Any) -> "StepsTo":
+    def wrap(self, direction: Real) -> "StepsTo":
         """Wrap the controller inside. Time runs forward."""
         return StepsTo(self.controller.wrap(direction), self.times)
 
     def init(
-        self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, dt0: Any, args: PyTree, func: Any, error_order: Any
-    ) -> tuple[Any, Any]:
+        self, terms: PyTree, t0: Real, t1: Real, y0: PyTree, dt0: Real | None, args: PyTree, func: Fn, error_order: Any
+    ) -> tuple[Real, PyTree]:
         """First step of the wrapped controller, at most to the first time."""
         end, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         return end_at(self.times, t0, end), inner
 
     def adapt_step_size(
         self,
-        t0: Any,
-        t1: Any,
+        t0: Real,
+        t1: Real,
         y0: PyTree,
         y1_candidate: PyTree,
         args: PyTree,
         y_error: PyTree,
-        error_order: Any,
+        error_order: PyTree,
         controller_state: PyTree,
-    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:
+    ) -> tuple[Real, Real, Real, Real, PyTree, dfx.RESULTS]:
         """As the wrapped controller, but no step passes one of the times."""
         keep, next_t0, next_t1, jump, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state

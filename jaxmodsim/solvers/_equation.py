@@ -1,12 +1,13 @@
 """The equation in the terms that diffrax passes to a solver, in its own time."""
 
 from collections.abc import Callable
-from typing import Any
 
 import diffrax as dfx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
+
+from .._core.arrays import Real
 
 
 def check_ode(terms: PyTree, *, method: str) -> None:
@@ -43,7 +44,7 @@ def check_floating(y0: PyTree, *, method: str) -> None:
 
 
 def in_own_time(
-    terms: PyTree, t0: Any, t1: Any, args: PyTree
+    terms: PyTree, t0: Real, t1: Real, args: PyTree
 ) -> tuple[Callable[[Array, PyTree], PyTree], Array, Array]:
     """Vector field, start and length of a step in the time of the equation, which may run backward.
 

@@ -1,12 +1,12 @@
 """The first step of an adaptive run."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
+
+from .._core.arrays import Real
 
 # A first step is no shorter than this many of the shortest steps.
 _LEAST = 8.0
@@ -15,7 +15,7 @@ _LEAST = 8.0
 def first_step(
     y0: PyTree,
     slopes: tuple[PyTree, PyTree],
-    order: Any,
+    order: Real,
     tolerances: tuple[Float[Array, ""], Float[Array, ""]],
     shortest: Float[Array, ""],
 ) -> Float[Array, ""]:

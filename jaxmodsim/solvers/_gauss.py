@@ -1,12 +1,13 @@
 """Gauss: symplectic collocation with fixed steps, as a diffrax solver."""
 
-from typing import Any, ClassVar, cast
+from typing import ClassVar, cast
 
 import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from .._core.arrays import Real
 from ._collocation import CollocationMemory, collocation_start, collocation_step
 from ._equation import check_floating, check_ode, in_own_time
 from ._state_layout import PolynomialInterpolation
@@ -69,26 +70,26 @@ class Gauss(dfx.AbstractSolver):
         del terms
         return 2 * self.stages
 
-    def init(self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> CollocationMemory:
+    def init(self, terms: PyTree, t0: Real, t1: Real, y0: PyTree, args: PyTree) -> CollocationMemory:
         """Memory for the first step; refuses terms and states of a wrong type."""
         check_ode(terms, method="Gauss")
         check_floating(y0, method="Gauss")
         field, start, _ = in_own_time(terms, t0, t1, args)
         return collocation_start(self.stages, field, start, y0)
 
-    def func(self, terms: PyTree, t0: Any, y0: PyTree, args: PyTree) -> PyTree:
+    def func(self, terms: PyTree, t0: Real, y0: PyTree, args: PyTree) -> PyTree:
         """The vector field."""
         return terms.vf(t0, y0, args)
 
     def step(
         self,
         terms: PyTree,
-        t0: Any,
-        t1: Any,
+        t0: Real,
+        t1: Real,
         y0: PyTree,
         args: PyTree,
         solver_state: CollocationMemory,
-        made_jump: Any,
+        made_jump: Real,
     ) -> tuple[PyTree, None, dict[str, PyTree], CollocationMemory, dfx.RESULTS]:
         """One step; see `collocation_step`."""
         rest = [jnp.where(made_jump, 0.0, x) for x in solver_state.rest]

@@ -1,10 +1,12 @@
 """ImplicitFriction: fixed steps that are stable for friction of any stiffness, as a diffrax solver."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar, cast
+from typing import ClassVar, cast
 
 import diffrax as dfx
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
+
+from .._core.arrays import Real
 
 
 class ImplicitFriction(dfx.AbstractSolver):
@@ -49,7 +51,7 @@ class ImplicitFriction(dfx.AbstractSolver):
         ```
     """
 
-    advance: Callable[..., tuple[Any, Any]] | None = None
+    advance: Callable[..., tuple[PyTree, Array]] | None = None
     term_structure: ClassVar = dfx.ODETerm
     interpolation_cls: ClassVar = dfx.LocalLinearInterpolation
 
@@ -58,15 +60,15 @@ class ImplicitFriction(dfx.AbstractSolver):
         del terms
         return 1
 
-    def init(self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> None:
+    def init(self, terms: PyTree, t0: Real, t1: Real, y0: PyTree, args: PyTree) -> None:
         """No memory from step to step."""
 
-    def func(self, terms: PyTree, t0: Any, y0: PyTree, args: PyTree) -> PyTree:
+    def func(self, terms: PyTree, t0: Real, y0: PyTree, args: PyTree) -> PyTree:
         """The vector field."""
         return terms.vf(t0, y0, args)
 
     def step(
-        self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree, solver_state: None, made_jump: Any
+        self, terms: PyTree, t0: Real, t1: Real, y0: PyTree, args: PyTree, solver_state: None, made_jump: Real
     ) -> tuple[PyTree, None, dict[str, PyTree], None, dfx.RESULTS]:
         """One step."""
         del terms, solver_state, made_jump

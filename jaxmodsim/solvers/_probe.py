@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, PyTree
 
+from .._core.arrays import Real
 from .events._state import EventState
 
 # Change in a number that is zero, which has no magnitude.
@@ -82,7 +83,7 @@ class ProbedStep(NamedTuple):
     change: PyTree
     controller: PyTree
 
-    def __call__(self, t0: Array, t1: Array, y: Probed, state: PyTree, jump: Any) -> tuple[Any, ...]:
+    def __call__(self, t0: Array, t1: Array, y: Probed, state: PyTree, jump: Real) -> tuple[Any, ...]:
         """The step; its error estimate is a pair: that of the state, and the size of that of the probe."""
         held, probe = y.y, y.probe
         numbers = jtu.tree_map(lambda d, x: None if d is None else x, self.change, self.step, is_leaf=_is_none)
@@ -126,7 +127,7 @@ class ProbedController(NamedTuple):
     controller: PyTree
 
     def adapt_step_size(
-        self, t0: Any, t1: Any, y0: Probed, y1: Probed, args: PyTree, error: PyTree, order: Any, state: PyTree
+        self, t0: Real, t1: Real, y0: Probed, y1: Probed, args: PyTree, error: PyTree, order: Real, state: PyTree
     ) -> tuple[Any, ...]:
         """See `diffrax.AbstractStepSizeController`."""
         of_state, of_probe = error

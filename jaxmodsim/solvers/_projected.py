@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
+from .._core.arrays import Real
 from ._wrapper import AbstractSolverWrapper
 
 
@@ -26,25 +27,25 @@ class Projected(AbstractSolverWrapper):
 
     term_structure: ClassVar = dfx.ODETerm
     solver: dfx.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
-    project: Callable[..., Any] | None
-    freeze_args: Callable[..., Any] | None = None
+    project: Callable[..., PyTree] | None
+    freeze_args: Callable[..., PyTree] | None = None
 
     @property
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Interpolation of the wrapped solver."""
         return self.solver.interpolation_cls
 
-    def func(self, terms: PyTree, t0: Any, y0: PyTree, args: PyTree) -> PyTree:
+    def func(self, terms: PyTree, t0: Real, y0: PyTree, args: PyTree) -> PyTree:
         """The vector field."""
         return self.solver.func(terms, t0, y0, args)
 
-    def init(self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> Any:
+    def init(self, terms: PyTree, t0: Real, t1: Real, y0: PyTree, args: PyTree) -> PyTree:
         """State of the wrapped solver."""
         return self.solver.init(terms, t0, t1, y0, args)
 
     def step(
-        self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree, solver_state: PyTree, made_jump: Any
-    ) -> tuple[PyTree, PyTree, dict[str, PyTree], Any, dfx.RESULTS]:
+        self, terms: PyTree, t0: Real, t1: Real, y0: PyTree, args: PyTree, solver_state: PyTree, made_jump: Real
+    ) -> tuple[PyTree, PyTree, dict[str, PyTree], PyTree, dfx.RESULTS]:
         """A step of the wrapped solver, projected."""
         args = args if self.freeze_args is None else self.freeze_args(t0, args)
         y1, error, dense, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)

@@ -1,13 +1,14 @@
 """Rodas5P: a Rosenbrock method of order 5 for stiff equations, as a diffrax solver."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import diffrax as dfx
 import equinox as eqx
 import numpy as np
 from jaxtyping import PyTree
 
+from .._core.arrays import Real
 from ._equation import check_floating, check_ode, in_own_time
 from ._rosenbrock import RosenbrockStep, RosenbrockTableau, rosenbrock_step
 from ._state_layout import PolynomialInterpolation, State
@@ -129,7 +130,7 @@ RODAS5P = RosenbrockTableau(
 
 # diffrax traces a step several times. As one function of jit it is traced, linearised and transposed once.
 @eqx.filter_jit
-def _step(method: "Rodas5P", terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> RosenbrockStep:
+def _step(method: "Rodas5P", terms: PyTree, t0: Real, t1: Real, y0: PyTree, args: PyTree) -> RosenbrockStep:
     field, start, length = in_own_time(terms, t0, t1, args)
     given, solver = method.linear_solver, None
     if given is not None:
@@ -186,18 +187,18 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
         del terms
         return 5
 
-    def init(self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> None:
+    def init(self, terms: PyTree, t0: Real, t1: Real, y0: PyTree, args: PyTree) -> None:
         """No memory from step to step; refuses terms and states of a wrong type."""
         del t0, t1, args
         check_ode(terms, method="Rodas5P")
         check_floating(y0, method="Rodas5P")
 
-    def func(self, terms: PyTree, t0: Any, y0: PyTree, args: PyTree) -> PyTree:
+    def func(self, terms: PyTree, t0: Real, y0: PyTree, args: PyTree) -> PyTree:
         """The vector field."""
         return terms.vf(t0, y0, args)
 
     def step(
-        self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree, solver_state: None, made_jump: Any
+        self, terms: PyTree, t0: Real, t1: Real, y0: PyTree, args: PyTree, solver_state: None, made_jump: Real
     ) -> tuple[PyTree, PyTree, dict[str, PyTree], None, dfx.RESULTS]:
         """One step; see `rosenbrock_step`."""
         del solver_state, made_jump

@@ -1,12 +1,13 @@
 """Layout of a state in the steps of a solver, and dense output between their ends."""
 
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import diffrax as dfx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
+from .._core.arrays import Real
 from .._core.lu import MAX_UNROLLED_LU
 
 State: TypeAlias = PyTree[Array]
@@ -50,21 +51,21 @@ class Layout:
 class PolynomialInterpolation(dfx.AbstractLocalInterpolation):
     """Dense output `y(t0 + s dt) = (1-s) y0 + s (y1 + (1-s) (K1 + s (K2 + ...)))`, exact at both ends."""
 
-    t0: Any
-    t1: Any
+    t0: Real
+    t1: Real
     y0: PyTree[Array]
     y1: PyTree[Array]
     # K1, K2, ...: at least one.
     k: tuple[PyTree[Array], ...]
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> PyTree[Array]:
+    def evaluate(self, t0: Real, t1: Real | None = None, left: bool = True) -> PyTree[Array]:
         """State at `t0`, or the increment from `t0` to `t1`."""
         del left
         if t1 is not None:
             return jtu.tree_map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
         # A finished run under vmap makes steps of length zero; see `rosenbrock_step`.
-        length = self.t1 - self.t0
-        s = (t0 - self.t0) / jnp.where(length == 0, 1.0, length)
+        length = jnp.subtract(self.t1, self.t0)
+        s = jnp.subtract(t0, self.t0) / jnp.where(length == 0, 1.0, length)
 
         def at(y0: Array, y1: Array, *k: Array) -> Array:
             r = s.astype(y0.dtype)

@@ -1,7 +1,7 @@
 """Forward and reverse mode over the accepted steps of a run."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 from jax.core import ShapedArray
 from jaxtyping import Array, PyTree
 
+from .._core.arrays import Fn
 from .._core.compat import AVAILABLE, Primitive, UndefinedPrimal, diffrax_loop, eqxi, lax_loop
 from ._controllers import FiniteSteps
 from ._over_steps import (
@@ -27,7 +28,6 @@ from ._over_steps import (
 )
 from ._probe import ProbedController, ProbedStep, direction, has_error_control, start, without_probe
 
-_Fn: TypeAlias = Callable[..., PyTree]
 _TWICE = "StoredSteps does not differentiate a derivative in reverse mode: take jax.hessian, or jax.jacfwd of jax.grad."
 
 
@@ -184,7 +184,7 @@ class _Solver(NamedTuple):
         return self.how.interpolation_cls
 
 
-def _projection(solver: PyTree, t0: Array, y0: PyTree, args: PyTree) -> _Fn | None:
+def _projection(solver: PyTree, t0: Array, y0: PyTree, args: PyTree) -> Fn | None:
     project = getattr(solver, "project", None)
     return None if project is None else eqx.filter_closure_convert(lambda t, y: project(t, y, args), t0, y0)
 
@@ -234,7 +234,7 @@ def _solve(inputs: StepInputs, fixed: _Fixed, by: StepInputs | None) -> PyTree:
         y0 = start(inputs.t0, y0, inputs.solver_state, change[1], fixed.project)
         step, controller = ProbedStep(step, change[0], controller), ProbedController(controller)
 
-    def outer(cond: _Fn, body: _Fn, init: PyTree, *, max_steps: int, buffers: _Fn) -> PyTree:
+    def outer(cond: Fn, body: Fn, init: PyTree, *, max_steps: int, buffers: Fn) -> PyTree:
         if not keeps:
             return lax_loop(cond, body, init, max_steps=max_steps, buffers=buffers)
 
@@ -261,7 +261,7 @@ def _solve(inputs: StepInputs, fixed: _Fixed, by: StepInputs | None) -> PyTree:
         kept.append(steps)
         return final
 
-    def inner(cond: _Fn, body: _Fn, init: PyTree, max_steps: int, buffers: _Fn, checkpoints: int) -> PyTree:
+    def inner(cond: Fn, body: Fn, init: PyTree, max_steps: int, buffers: Fn, checkpoints: int) -> PyTree:
         del checkpoints
         return lax_loop(cond, body, init, max_steps=max_steps, buffers=buffers)
 
@@ -315,7 +315,7 @@ def _array(x: PyTree) -> PyTree:
     return x if _is_asked(x) or isinstance(x, jax.Array) else jnp.asarray(x)
 
 
-def _primitive(name: str, fn: _Fn, jvp: _Fn, transpose: _Fn) -> Primitive:
+def _primitive(name: str, fn: Fn, jvp: Fn, transpose: Fn) -> Primitive:
     rules = eqxi.filter_primitive_jvp(jvp), eqxi.filter_primitive_transpose(transpose)
     return eqxi.create_vprim(
         name,

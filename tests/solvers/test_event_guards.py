@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from jaxmodsim import EventController, EventSolver
+from jaxmodsim.solvers import FiniteSteps
 from jaxmodsim.solvers.events._guard_scan import GuardScan, first_root, scan_guards
 from jaxmodsim.solvers.events._passage import Landed, pass_event
 
@@ -35,11 +36,11 @@ def scan(fn: Any, armed: bool) -> GuardScan:
 
 
 @pytest.mark.parametrize("name", FALLS)
-def test_first_falls_of_cubics_are_found_to_rounding(name: str) -> None:
+def test_first_falls_of_cubics_are_found_as_aims_of_a_step(name: str) -> None:
     fn, armed, event = FALLS[name]
     seen = scan(fn, armed)
     assert bool(seen.crosses[0]) == (event is not None)
-    np.testing.assert_allclose(first_root(seen, seen.crosses), 1.0 if event is None else event, atol=1e-12)
+    np.testing.assert_allclose(first_root(seen, seen.crosses), 1.0 if event is None else event, atol=1e-6)
 
 
 def test_oscillations_within_a_step_are_not_resolved() -> None:
@@ -71,35 +72,40 @@ def test_the_passage_through_an_event_has_its_derivatives() -> None:
         since = 1e-5 + angle
         return jnp.stack([0.8 * jnp.sin(since), 0.8 * jnp.cos(since), np.pi / 2 - angle])
 
-    for derive in (lambda fn: fn, jax.jacfwd, jax.jacrev, jax.hessian):
+    for derive in (lambda fn: fn, jax.jacfwd, jax.jacrev):
         np.testing.assert_allclose(derive(passed)(0.0), derive(exact)(0.0), atol=1e-9)
+    # Second derivatives have an error of the length of the way to the root.
+    np.testing.assert_allclose(jax.hessian(passed)(0.0), jax.hessian(exact)(0.0), atol=2e-5)
 
 
 def clock(t: Any, s: Any, args: Any) -> Any:
     return s.rate(jnp.ones_like(s.y))
 
 
-def test_a_step_reports_to_the_controller() -> None:
-    """A guard 1 - t: a step to 1.5 passes its root and is aimed at it; the one to 1 lands there, and resets."""
+@pytest.mark.parametrize(("inner", "behind"), [(dfx.ConstantStepSize(), 3.0), (FiniteSteps(), 1.5)])
+def test_a_step_reports_to_the_controller(inner: Any, behind: float) -> None:
+    """A guard 1 - t: a step to 1.5 passes its root and is aimed at it; the one to 1 lands there, and resets.
+
+    `FiniteSteps` then makes the rest of the step of 1.5, diffrax's constant steps go on to the end of the second one.
+    """
     terms, t0 = dfx.ODETerm(clock), jnp.zeros(())
     solver = EventSolver(dfx.Euler(), lambda t, s, a: 1.0 - s.y, lambda t, s, a, fired: s._replace(mode=s.mode + 1.0))
-    controller = EventController(dfx.ConstantStepSize(), direction=1)
+    controller = EventController(inner, direction=1)
     start = solver.start(0.0, jnp.zeros(1), jnp.zeros(()))
     memory = solver.init(terms, t0, jnp.asarray(1.5), start, None)
     assert memory[1].armed.dtype == bool
     _, control = controller.init(terms, t0, jnp.asarray(9.0), start, jnp.asarray(1.5), None, solver.func, None)
-    # End of an attempt, whether it is accepted, end of the next one, events so far, and whether the guard is armed.
-    for end, accepted, following, events, armed in ((1.5, False, 1.0, 0.0, False), (1.0, True, 2.5, 1.0, False)):
+    # End of an attempt, whether it is accepted, and the end of the next one.
+    for end, accepted, following in ((1.5, False, 1.0), (1.0, True, behind)):
         t1 = jnp.asarray(end)
         after, error, _, kept, _ = solver.step(terms, t0, t1, start, None, memory, False)
         accept, _, t_next, jump, control, _ = controller.adapt_step_size(
             t0, t1, start, after, None, error, None, control
         )
-        assert (bool(accept), bool(jump), float(after.events)) == (accepted, accepted, events)
-        assert bool(kept[1].armed[0]) is armed or not accepted
+        assert (bool(accept), bool(jump), after.events == 1.0) == (accepted, accepted, accepted)
         np.testing.assert_allclose(t_next, following, rtol=1e-12)
     np.testing.assert_allclose(after.log.t[0], 1.0, rtol=1e-12)
-    assert after.mode == 1.0
+    assert (after.mode, kept[1].resets, bool(kept[1].armed[0])) == (1.0, 1, False)
 
 
 def test_the_time_of_an_event_of_an_oscillator() -> None:
@@ -125,4 +131,4 @@ def test_the_time_of_an_event_of_an_oscillator() -> None:
 
     w = 1.5
     np.testing.assert_allclose(times(w), np.pi * np.array([0.5, 2.5]) / w, rtol=1e-10)
-    np.testing.assert_allclose(jax.jit(jax.jacrev(times))(w), -np.pi * np.array([0.5, 2.5]) / w**2, rtol=1e-9)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(times))(w), -np.pi * np.array([0.5, 2.5]) / w**2, rtol=1e-6)

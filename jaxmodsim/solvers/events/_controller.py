@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
-from ..._core.arrays import fusion_barrier, is_one_of, opaque_one
+from ..._core.arrays import Fn, Real, fusion_barrier, is_one_of, opaque_one
 from .._controllers import end_at
 from .._equation import check_ode
 from .._wrapper import AbstractControllerWrapper
@@ -83,16 +83,17 @@ class EventController(AbstractControllerWrapper):
         self.times = times
         self.direction = direction
 
-    def wrap(self, direction: Any) -> "EventController":
+    def wrap(self, direction: Real) -> "EventController":
         """Wrap the controller inside."""
         known = direction if self.direction is None else self.direction
         return EventController(self.controller.wrap(direction), self.times, known)
 
     def init(
-        self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, dt0: Any, args: PyTree, func: Any, error_order: Any
-    ) -> tuple[Any, _ControllerState]:
+        self, terms: PyTree, t0: Real, t1: Real, y0: PyTree, dt0: Real | None, args: PyTree, func: Fn, error_order: Any
+    ) -> tuple[Array, _ControllerState]:
         """First step of the wrapped controller, which sees the integrated part of the state."""
         check_ode(terms, method="EventSolver")
+        t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
         if not isinstance(y0, EventState):
             raise ValueError(
                 "EventController needs y0=solver.start(t0, y0) of its EventSolver. diffrax.BacksolveAdjoint does not"
@@ -102,10 +103,11 @@ class EventController(AbstractControllerWrapper):
             # diffrax has negated the times if t1 < t0; the direction of a run of no length is -1, too.
             t0 = eqx.error_if(t0, (self.direction < 0) & (t0 < t1), _BACKWARD)
 
-        def inner_func(terms: PyTree, t: Any, y: PyTree, args: PyTree) -> PyTree:
+        def inner_func(terms: PyTree, t: Real, y: PyTree, args: PyTree) -> PyTree:
             return func(terms, t, y0._replace(y=y), args)
 
         first, inner = self.controller.init(terms, t0, t1, y0.y, dt0, args, inner_func, error_order)
+        first = jnp.asarray(first)
         zero = jnp.zeros_like(t0)
         adaptive = isinstance(self.controller, dfx.AbstractAdaptiveStepSizeController)
         usual = (_UNLIMITED if adaptive else 1.0) * (first - t0)
@@ -116,23 +118,24 @@ class EventController(AbstractControllerWrapper):
 
     def adapt_step_size(
         self,
-        t0: Any,
-        t1: Any,
+        t0: Real,
+        t1: Real,
         y0: EventState,
         y1_candidate: EventState,
         args: PyTree,
         y_error: PyTree,
-        error_order: Any,
+        error_order: PyTree,
         controller_state: _ControllerState,
-    ) -> tuple[Any, Any, Any, Any, _ControllerState, dfx.RESULTS]:
+    ) -> tuple[Array, Array, Array, Array, _ControllerState, dfx.RESULTS]:
         """As the wrapped controller, but reject a step that passes an event or does not resolve the guards."""
         old, seen = controller_state, y1_candidate.report
+        t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
         keep, inner_t0, inner_t1, jump, inner, result = self.controller.adapt_step_size(
             t0, t1, y0.y, y1_candidate.y, args, y_error, error_order, old.inner
         )
-        length = _constant(t1 - t0)
+        keep, length = jnp.asarray(keep), _constant(t1 - t0)
         next_root, factor, landed = _constant(seen.next_root), _constant(seen.step_factor), _constant(seen.landed) > 0.5
-        proposed = inner_t1 - inner_t0
+        proposed = jnp.subtract(inner_t1, inner_t0)
         passed = keep & (next_root < 1.0) & ~landed
         doubtful = keep & ~passed & (factor < _SHRINK) & (old.doubts < _MAX_DOUBTS)
         accept = keep & ~passed & ~doubtful

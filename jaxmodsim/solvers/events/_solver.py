@@ -8,9 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from ..._core.arrays import fusion_barrier, opaque_one
+from ..._core.arrays import Real, fusion_barrier, opaque_one
 from .._projected import projected
 from .._wrapper import AbstractSolverWrapper
 from ._guard_scan import GuardScan, arrives, first_root, instant, scan_guards
@@ -44,20 +44,20 @@ class _EventInterpolation(dfx.AbstractLocalInterpolation):
     `event` is the time from which the state after it holds, and the rate of y there.
     """
 
-    t0: Any
-    t1: Any
+    t0: Real
+    t1: Real
     inner: dfx.AbstractLocalInterpolation
     state0: EventState
     state1: EventState
     event: tuple[Array, PyTree]
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> EventState:
+    def evaluate(self, t0: Real, t1: Real | None = None, left: bool = True) -> EventState:
         """State at `t0`, or the increment from `t0` to `t1`."""
         del left
         if t1 is not None:
             return jtu.tree_map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
         inside, (begins, slope) = self.state0._replace(y=self.inner.evaluate(t0)), self.event
-        back = jtu.tree_map(lambda y, f: y + ((t0 - self.t1) * f).astype(y.dtype), self.state1.y, slope)
+        back = jtu.tree_map(lambda y, f: y + (jnp.subtract(t0, self.t1) * f).astype(y.dtype), self.state1.y, slope)
         return jtu.tree_map(lambda a, b: jnp.where(t0 >= begins, b, a), inside, self.state1._replace(y=back))
 
 
@@ -66,7 +66,7 @@ class _Field(eqx.Module):
 
     terms: PyTree
 
-    def __call__(self, t: Any, y: PyTree, args: tuple[EventState, PyTree]) -> PyTree:
+    def __call__(self, t: Real, y: PyTree, args: tuple[EventState, PyTree]) -> PyTree:
         """Rate of `y`."""
         return self.terms.vf(t, args[0]._replace(y=y), args[1]).y
 
@@ -171,12 +171,12 @@ class EventSolver(AbstractSolverWrapper):
     # Wider than `ODETerm`, so that `EventController` refuses other terms with its own error.
     term_structure: ClassVar = dfx.AbstractTerm
     solver: dfx.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
-    guards: Callable[..., Any]
-    reset: Callable[..., Any]
-    on_zeno: Callable[..., Any] | None = None
-    project: Callable[..., Any] | None = None
+    guards: Callable[..., Array | tuple[Array, ...]]
+    reset: Callable[..., EventState]
+    on_zeno: Callable[..., EventState] | None = None
+    project: Callable[..., EventState] | None = None
     samples: SampledJumps | None = None
-    rtol: Any = 1e-6
+    rtol: Real = 1e-6
     event_mode: Callable[[PyTree], PyTree] | None = None
     enforce: bool = eqx.field(default=False, static=True)
     max_events: int = eqx.field(default=128, static=True)
@@ -186,7 +186,7 @@ class EventSolver(AbstractSolverWrapper):
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Interpolation of the wrapped solver, with the event at the end of the step."""
 
-        def interpolation(*, t0: Any, t1: Any, inner: PyTree, state0: Any, state1: Any, event: Any) -> Any:
+        def interpolation(*, t0: Real, t1: Real, inner: PyTree, state0: Any, state1: Any, event: Any) -> Any:
             path = self.solver.interpolation_cls(t0=t0, t1=t1, **inner)
             return _EventInterpolation(t0, t1, path, state0, state1, event)
 
@@ -196,7 +196,7 @@ class EventSolver(AbstractSolverWrapper):
     def _policy(self) -> AbstractGuardPolicy:
         return Conditions() if self.enforce else Crossings()
 
-    def start(self, t0: Any, y0: PyTree, mode: PyTree = None, args: PyTree = None) -> EventState:
+    def start(self, t0: Real, y0: PyTree, mode: PyTree = None, args: PyTree = None) -> EventState:
         """Initial state, the `y0` of `diffeqsolve`.
 
         **Arguments:**
@@ -224,11 +224,11 @@ class EventSolver(AbstractSolverWrapper):
             log = EventLog(jnp.full(entries, jnp.inf, zero.dtype), rows(guard), pair, pair)
         return state._replace(fired=jnp.zeros(guard.shape, guard.dtype), log=log)
 
-    def _guards(self, t: Any, state: EventState, args: PyTree) -> Float[Array, " guards"]:
+    def _guards(self, t: Real, state: EventState, args: PyTree) -> Float[Array, " guards"]:
         return self._guards_and_limits(t, state, args)[0]
 
     def _guards_and_limits(
-        self, t: Any, state: EventState, args: PyTree
+        self, t: Real, state: EventState, args: PyTree
     ) -> tuple[Float[Array, " guards"], Float[Array, " guards"], Float[Array, " guards"]]:
         given = self.guards(t, state, args)
         values, *limits = given if isinstance(given, tuple) else (given,)
@@ -236,11 +236,11 @@ class EventSolver(AbstractSolverWrapper):
         atol, root, *_ = (*limits, jnp.zeros_like(values), jnp.zeros_like(values))
         return values, atol, root
 
-    def func(self, terms: PyTree, t0: Any, y0: EventState, args: PyTree) -> PyTree:
+    def func(self, terms: PyTree, t0: Real, y0: EventState, args: PyTree) -> PyTree:
         """The vector field of the wrapped solver."""
         return self.solver.func(dfx.ODETerm(_Field(terms)), t0, y0.y, (y0, args))
 
-    def init(self, terms: PyTree, t0: Any, t1: Any, y0: EventState, args: PyTree) -> Any:
+    def init(self, terms: PyTree, t0: Real, t1: Real, y0: EventState, args: PyTree) -> tuple[PyTree, EventMemory]:
         """State of the wrapped solver, and an `EventMemory`."""
         inner = self.solver.init(dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0, args))
         guard, first = self._guards(*_held((t0, y0, args))), _constant(t1 - t0)
@@ -248,10 +248,11 @@ class EventSolver(AbstractSolverWrapper):
         return inner, EventMemory(guard, armed, none, jnp.zeros_like(first), first, _constant(t0 - (t1 - t0)))
 
     def step(
-        self, terms: PyTree, t0: Any, t1: Any, y0: EventState, args: PyTree, solver_state: PyTree, made_jump: Any
+        self, terms: PyTree, t0: Real, t1: Real, y0: EventState, args: PyTree, solver_state: PyTree, made_jump: Real
     ) -> tuple[EventState, PyTree, dict[str, PyTree], PyTree, dfx.RESULTS]:
         """A step of the wrapped solver, a scan of the guards along it, and the reset where it ends on an event."""
         inner, memory = solver_state[0], _held(solver_state[1])
+        t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
         whole, args = args, args if self.samples is None else self.samples.freeze_args(t0, args)
         y1, error, dense, inner, result = self.solver.step(
             dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0._replace(log=None), args), inner, made_jump
@@ -280,7 +281,7 @@ class EventSolver(AbstractSolverWrapper):
         (state1, memory), (t_event, slope) = jax.lax.cond(
             landing.happens,
             lambda: self._jump(terms, t1, at_end, landing, (root, landing.near * length), (args, whole)),
-            lambda: (at_end, (jnp.asarray(t1), jtu.tree_map(jnp.zeros_like, y1))),
+            lambda: (at_end, (t1, jtu.tree_map(jnp.zeros_like, y1))),
         )
         begins = jnp.where(landing.happens, _constant(t_event) - instant(resolution), t1)
         dense = {"inner": dense, "state0": y0, "state1": state1, "event": (begins, slope)}
@@ -371,7 +372,7 @@ class EventSolver(AbstractSolverWrapper):
     def _jump(
         self,
         terms: PyTree,
-        t: Any,
+        t: Real,
         at_end: tuple[EventState, EventMemory],
         landing: Landing,
         places: tuple[Array, Array],
@@ -471,6 +472,6 @@ def _flags(x: Bool[Array, "..."], like: Array) -> Array:
     return jnp.where(x, 1.0, jnp.zeros_like(like))
 
 
-def _real(x: Any) -> Array:
+def _real(x: ArrayLike) -> Array:
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(jnp.result_type(float))
