@@ -205,7 +205,7 @@ def _modes_at_ends(run: Trajectory, name: str, events: Events, own: Array) -> tu
     """Mode of an element at t0 and at the end of a run: 0 in stick, else the sign of its slip velocity."""
     constant = run.mode[name][-1].astype(int)
     if not own.shape[0]:
-        return kept, kept
+        return constant, constant
     first, last = jnp.argmax(own), own.shape[0] - 1 - jnp.argmax(own[::-1])
     changed = jnp.any(own)
     return jnp.where(changed, events.before[first], constant), jnp.where(changed, events.after[last], constant)

@@ -17,6 +17,7 @@ from jaxmodsim.cli import _fit
 from jaxmodsim.cli._records import AxisColumns, read_record, read_records
 from jaxmodsim.cli._units import parse_units
 from jaxmodsim.identify import FitResult, Record, axis_models, axis_scene, estimate_axis, fit, remarks
+from jaxmodsim.identify.model._axis import AxisEstimate
 
 from ..helpers.axis_records import GAIN, TRUTH, axis_frame
 

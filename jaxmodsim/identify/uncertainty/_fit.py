@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from ..._core.arguments import as_float, as_whole
 from ..._core.arrays import on_device
+from ..._core.functions import is_state_dependent
 from ..._core.parameters import Range
 from ..._core.progress import iteration_words, reported
 from ...friction import AbstractLaw

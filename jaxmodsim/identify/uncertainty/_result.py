@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._core.readable import AbstractReadable, Table, table_of
+from ..._core.system import jsonable, written_whole
 from ..data._record import Record
 from ..data._signals import resolution, sample_noise
 from ..estimate._search import SearchResult, ended_by_itself
