@@ -100,7 +100,7 @@ def parse_units(texts: Sequence[str]) -> dict[str, Unit]:
         role, equals, text = (part.strip() for part in entry.partition("="))
         if role not in _ROLES or not equals:
             raise ValueError(
-                "--units needs COLUMN=UNIT, separated by commas, where COLUMN is time, position or force, as in"
+                "--units needs COLUMN=UNIT entries, separated by commas, where COLUMN is time, position or force, as in"
                 f" time=ms,position=deg,force=12.5, but {entry.strip()!r} was given."
             )
         units[role] = _parse_unit(role, text)

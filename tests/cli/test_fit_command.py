@@ -423,7 +423,7 @@ def test_bad_tables_are_one_sentence_and_exit_code_two(run_command, tmp_path, co
         ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(105) + b"\x00\x01IM" + bytes(7), "damaged or not a MATLAB file"),
         ("a.mat", b"MATLAB 7.3 MAT-file" + b" " * 105 + b"\x00\x02IM" + bytes(800), "MATLAB 7.3 .*'-v7'"),
         ("a.csv", b"\xff\xfe\x00\x80", "not a CSV file"),
-        ("a.xlsx", b"PK", "must be one of .csv, .txt, .parquet, .mat, .mf4"),
+        ("a.xlsx", b"PK", "must be one of .csv, .txt, .mat, .parquet, .mf4"),
         ("axis", b"", "must be one of"),
     ],
 )

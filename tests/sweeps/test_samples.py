@@ -47,7 +47,7 @@ def test_seeds(draw: Any) -> None:
         ({"m": (1.0,)}, 4, r"range of 'm' must be \(low, high\)"),
         ({"m": (1.0, 2.0, "lin")}, 4, "'log'"),
         ({"m": 2.0}, 4, "frozen distribution"),
-        ({"m": (2.0, 2.0)}, 4, "to a larger one"),
+        ({"m": (2.0, 2.0)}, 4, "low < high"),
         ({"m": (0.0, np.inf)}, 4, "finite"),
         ({"m": ("a", "b")}, 4, "finite"),
         ({"m": (0.0, 1.0, "log")}, 4, "begin above zero"),
