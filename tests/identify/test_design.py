@@ -337,7 +337,7 @@ def test_wrong_limits_are_refused(limits, text):
         ({"input_name": "m", "free": ("offset",)}, "does not move the first coordinate"),
         ({"duration": -1.0}, "duration must be finite and > 0 s"),
         ({"noise": 0.0}, "noise must be finite and > 0"),
-        ({"harmonics": 0}, "harmonics must be at least 1"),
+        ({"harmonics": 0}, "harmonics must be a positive integer"),
         ({"harmonics": 100}, "6 samples in a period of the fastest, but 20 are needed"),
         ({"q0": [0.0, 0.0]}, r"q0 has the shape \(2,\)"),
         ({"observe": lambda q, qd: q}, r"observe\(q, qd\) returned the shape \(1,\)"),

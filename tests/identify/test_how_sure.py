@@ -445,7 +445,7 @@ def test_residuals_that_alternate_have_no_negative_memory(residual):
     assert each.independent == T.size
     assert each.whiteness < 1e-6
     assert 0 <= each.normality <= 1
-    assert any("not white, but has no memory" in remark for remark in each.remarks)
+    assert any("not white, but without positive correlation" in remark for remark in each.remarks)
     assert not any("remembers" in remark for remark in each.remarks)
 
 
@@ -615,8 +615,8 @@ def test_a_file_puts_its_numbers_into_a_model(result, presliding, tmp_path):
 @pytest.mark.parametrize(
     ("spoil", "text"),
     [
-        (lambda path: path.write_text("m = 2.0"), "no result that FitResult.save wrote, or it is damaged"),
-        (lambda path: path.write_bytes(path.read_bytes()[:2000]), "no result that FitResult.save wrote"),
+        (lambda path: path.write_text("m = 2.0"), "not written by FitResult.save, or it is damaged"),
+        (lambda path: path.write_bytes(path.read_bytes()[:2000]), "not written by FitResult.save"),
         (lambda path: flip(path), "damaged"),
         (lambda path: rewrite(path, {"kind": "other"}), "is no result of a fit"),
         (lambda path: rewrite(path, {"format": 99}), "has the format 99, written by jaxmodsim"),
