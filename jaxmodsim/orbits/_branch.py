@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Generic, TypeVar
 
 import equinox as eqx
 import numpy as np
@@ -15,7 +15,8 @@ from .._core.readable import AbstractReadable, Table, table_of
 from ..scene import Scene, elements
 from ._equilibrium import Equilibrium
 from ._orbit import PeriodicOrbit
-from ._return_map import OrbitError
+from ._rest import RestPoint
+from ._return_map import OrbitError, ShotOrbit
 
 FOLD, DOUBLING, TORUS, CROSSING, HOPF = "fold", "period doubling", "Neimark-Sacker", "branch point", "Hopf"
 ONSET, LOSS, GRAZING, ORDER = "onset of stick", "loss of stick", "grazing", "order of modes"
@@ -37,6 +38,9 @@ _ROOT = 1e-10
 _JUMP = 1e-3
 
 OrbitT = TypeVar("OrbitT", PeriodicOrbit, Equilibrium)
+# A solution of the equations of an orbit, or of those of an equilibrium.
+SolutionT = TypeVar("SolutionT", ShotOrbit, RestPoint)
+StepT = TypeVar("StepT", bound="AbstractStep")
 
 
 class BifurcationPoint(eqx.Module, Generic[OrbitT]):
@@ -124,27 +128,6 @@ def _(branch: Branch) -> Table:
     return Table(title, head, rows, (branch.ending,))
 
 
-class Solution(Protocol):
-    """A solution of the equations of an orbit or equilibrium, with their derivatives."""
-
-    @property
-    def value(self) -> float:
-        """Value of the parameter along which the branch is followed."""
-        ...
-
-    @property
-    def unknowns(self) -> np.ndarray:
-        """The unknowns in one vector, with the parameter last."""
-        ...
-
-    def scaled(self, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives by the scaled unknowns, `[equations, unknowns]`, and residuals, with rows of unit size."""
-        ...
-
-
-SolutionT = TypeVar("SolutionT", bound=Solution)
-
-
 class AbstractStep(abc.ABC, Generic[SolutionT, OrbitT]):
     """An orbit or equilibrium of a branch, and the tangent along which the branch goes on.
 
@@ -163,7 +146,7 @@ class AbstractStep(abc.ABC, Generic[SolutionT, OrbitT]):
         """The solution at this distance along the tangent, and the number of iterations."""
 
     @abc.abstractmethod
-    def moved_to(self, shot: SolutionT) -> Self:
+    def moved_to(self: StepT, shot: SolutionT) -> StepT:
         """The step that begins at a solution, with the tangent in the same sense."""
 
     @abc.abstractmethod
@@ -174,26 +157,28 @@ class AbstractStep(abc.ABC, Generic[SolutionT, OrbitT]):
     def bifurcation(self, kind: str, length: float, index: int) -> BifurcationPoint[OrbitT] | None:
         """The bifurcation at a root of a test function, at this distance along the tangent; None if there is none."""
 
-    def mode_change(self, other: Self, length: float, index: int) -> tuple[float, BifurcationPoint[OrbitT]] | None:
+    def mode_change(
+        self, other: AbstractStep[SolutionT, OrbitT], length: float, index: int
+    ) -> tuple[float, BifurcationPoint[OrbitT]] | None:
         """The change of the sequence of modes before the next orbit, and its distance; None without one."""
         del other, length, index
         return None
 
-    def corner(self, index: int) -> tuple[Self, BifurcationPoint[OrbitT]] | None:
+    def corner(self: StepT, index: int) -> tuple[StepT, BifurcationPoint[OrbitT]] | None:
         """The next orbit behind a corner of the branch, and the bifurcation at the corner; None without a corner."""
         del index
         return None
 
 
-def tangent_at(shot: Solution, scale: np.ndarray, sense: np.ndarray, *rows: np.ndarray) -> np.ndarray:
+def tangent_at(shot: ShotOrbit | RestPoint, scale: np.ndarray, sense: np.ndarray, *rows: np.ndarray) -> np.ndarray:
     """Unit tangent of the solutions in their scales, in the sense of a scaled vector; `rows` are further equations."""
     tangent = np.linalg.svd(np.vstack([shot.scaled(scale)[0], *rows]))[2][-1]
     return tangent if tangent @ sense >= 0 else -tangent
 
 
 def follow(
-    steps: list[AbstractStep[SolutionT, OrbitT]],
-    points: list[BifurcationPoint[OrbitT]] | None,
+    steps: list[StepT],
+    points: list[BifurcationPoint] | None,
     span: Sequence[float],
     longest: float,
     most: int,
@@ -252,15 +237,13 @@ def _length_to_end(now: AbstractStep, low: float, high: float) -> float:
     return np.inf if rate == 0 or distance <= 0 else (1.0 + 1e-6) * distance / abs(rate)
 
 
-def _bifurcations(
-    one: AbstractStep[SolutionT, OrbitT], two: AbstractStep[SolutionT, OrbitT], length: float, index: int
-) -> list[BifurcationPoint[OrbitT]]:
+def _bifurcations(one: StepT, two: StepT, length: float, index: int) -> list[BifurcationPoint]:
     """Bifurcations on a step of this length between two orbits, in order along it."""
 
-    def turning(shot: SolutionT) -> float:
+    def turning(shot: ShotOrbit | RestPoint) -> float:
         return float(tangent_at(shot, one.scale, one.tangent)[-1])
 
-    located: list[tuple[float, BifurcationPoint[OrbitT]]] = []
+    located: list[tuple[float, BifurcationPoint]] = []
     for kind, test in {FOLD: turning, **one.tests()}.items():
         end = float(two.tangent[-1]) if kind == FOLD else test(two.shot)
         at = _root(one, test, length, (test(one.shot), end))
@@ -275,9 +258,7 @@ def _bifurcations(
     return [point for _, point in sorted(located, key=lambda pair: pair[0])]
 
 
-def _root(
-    one: AbstractStep[SolutionT, OrbitT], test: Callable[[SolutionT], float], length: float, ends: tuple[float, float]
-) -> float | None:
+def _root(one: AbstractStep, test: Callable[..., float], length: float, ends: tuple[float, float]) -> float | None:
     """Distance at which a test function is zero; None without a root, or if orbits near it are not found."""
     if not ends[0] * ends[1] < 0:
         return None

@@ -17,7 +17,7 @@ from ._branch import BifurcationPoint, Branch, check_parameter, follow, read_spa
 from ._equilibrium import Equilibrium
 from ._newton import Condition, newton
 from ._orbit import PeriodicOrbit, describe
-from ._orbit_step import TESTS, OrbitStep, critical_condition, step_at
+from ._orbit_step import TESTS, critical_condition, step_at
 from ._periodic_orbit import Guess, prepare, shoot
 from ._return_map import PeriodFn, Section, ShotOrbit
 from ._starts import first_step
@@ -96,7 +96,7 @@ def continue_orbits(
         sense[-1] = last - first
         begin = step_at(problem, shot, describe(problem, shot, dof)[0], np.array([abs(last - first)]), sense)
     store = None if out is None else BranchStore(Path(out), scene, parameter, (first, last))
-    steps: list[OrbitStep] = [begin]
+    steps = [begin]
     points: list[BifurcationPoint[PeriodicOrbit]] = []
     if store is not None and store.steps:
         steps, points = store.read(begin)
@@ -206,7 +206,7 @@ def continue_bifurcation(
     fixed = Condition(from_first, lambda _: np.abs(np.sign(sense)))
     conditions = (critical_condition(problem, test, scale, dof), fixed)
     shot, _ = newton(problem, start.x, start.period, problem.values, dof, scale, conditions)
-    steps: list[OrbitStep] = [step_at(problem, shot, describe(problem, shot, dof)[0], spans, sense, test)]
+    steps = [step_at(problem, shot, describe(problem, shot, dof)[0], spans, sense, test)]
     with reported(progress, "curve", lambda count, value: f"{count} orbits, {other} = {value:.6g}") as report:
 
         def grown() -> None:

@@ -72,7 +72,7 @@ def continue_equilibria(
     change = np.linalg.lstsq(shot.by[:, :-1], -shot.by[:, -1], rcond=None)[0]
     scale = rest_scale(shot.x, dof, abs(last - first), change)
     tangent = tangent_at(shot, scale, np.append(np.zeros(len(x)), last - first) / scale)
-    steps: list[EquilibriumStep] = [EquilibriumStep(problem, shot, describe_rest(problem, shot, dof), scale, tangent)]
+    steps = [EquilibriumStep(problem, shot, describe_rest(problem, shot, dof), scale, tangent)]
     points: list[BifurcationPoint[Equilibrium]] = []
     ending = follow(steps, points, (first, last), step, most)
     values = np.array([each.shot.value for each in steps])

@@ -124,7 +124,7 @@ class OrbitStep(AbstractStep[ShotOrbit, PeriodicOrbit]):
         )
 
     def mode_change(
-        self, other: OrbitStep, length: float, index: int
+        self, other: AbstractStep[ShotOrbit, PeriodicOrbit], length: float, index: int
     ) -> tuple[float, BifurcationPoint[PeriodicOrbit]] | None:
         """The change of the sequence of modes before the next orbit, located by bisection."""
         before, after = _cycle(self.orbit.sequence), _cycle(other.orbit.sequence)
