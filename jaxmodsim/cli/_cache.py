@@ -28,7 +28,7 @@ scene = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2 - 50.0 * q[0] ** 2, {}, [
 jms.simulate(scene, [0.0], [0.0], 2.0)
 print(time.perf_counter() - began[0], time.process_time() - began[1])
 """
-_FOUND, _MISSING = "Persistent compilation cache hit", "PERSISTENT COMPILATION CACHE MISS"
+_HIT, _MISS = "Persistent compilation cache hit", "PERSISTENT COMPILATION CACHE MISS"
 # Causes of misses by texts in the log.
 _REASONS = {
     "Loading XLA:CPU AOT result": "XLA rejects them: they name processor features that this machine lacks. If they come"
@@ -104,13 +104,13 @@ def check_cache() -> bool:
             raise RuntimeError(f"the scene does not run in a new process: {done.stderr.strip().splitlines()[-1]}")
         log = done.stderr
         wall, cpu = map(float, done.stdout.split())
-        rows.append((process, log.count(_FOUND), log.count(_MISSING), wall, cpu))
+        rows.append((process, log.count(_HIT), log.count(_MISS), wall, cpu))
     columns = ("process", "programs from the cache", "compiled", "import and first run [s]", "processor time [s]")
     show_table(frame_of(rows, *columns), f"Compiled programs in {cache_folder()}")
-    found = rows[-1][1]
-    if not found:
+    hits = rows[-1][1]
+    if not hits:
         say(f"The second process found no programs of the first. {reason(log)}")
-    return found > 0
+    return hits > 0
 
 
 def reason(log: str) -> str:

@@ -180,7 +180,7 @@ def _show(outcome: FitOutcome) -> None:
     if len(records) + len(outcome.scores) > 1:
         show_table(record_table(outcome), "Records")
     if outcome.agreement is not None:
-        say(f"Agreement of the records\n{outcome.agreement}")
+        say(f"\nAgreement of the records\n{outcome.agreement}")
     steps = f"{outcome.substeps} integration step{'s' if outcome.substeps > 1 else ''} from one to the next"
     samples = sum(len(record.t) for record in records)
     say(f"{samples} samples, {steps}; {outcome.seconds:.1f} s with compilation")

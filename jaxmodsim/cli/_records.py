@@ -93,37 +93,42 @@ def read_record(path: Path, columns: AxisColumns, name: str | None = None) -> Ax
     - `ValueError` for a damaged file or an unknown format, a missing column, a column that is not numeric, NaN,
       different lengths, or times that do not increase; `OSError` if the file cannot be read.
     """
-    table, notes = read_columns(path), []
-    if any(isinstance(column, Channel) for column in table.values()):
-        table, notes = _on_one_clock(table, path, columns)
-    headers = {role: _header(table, path, role, wanted) for role, wanted in columns.names.items()}
+    table, name = read_columns(path), name or path.stem
     try:
-        read = {role: column_unit(role, header, columns.units.get(role)) for role, header in headers.items()}
+        parts, rotary, notes = _parts_of(table, columns, name)
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from error
+    return AxisRecord(parts, rotary, tuple(f"{name}: {note}" for note in notes))
+
+
+def _parts_of(table: Columns, columns: AxisColumns, name: str) -> tuple[tuple[Record, ...], bool | None, list[str]]:
+    """The parts of the record, whether the axis is rotary, and sentences on reading it."""
+    notes: list[str] = []
+    if any(isinstance(column, Channel) for column in table.values()):
+        table, notes = _on_one_clock(table, columns)
+    headers = {role: _header(table, role, wanted) for role, wanted in columns.names.items()}
+    read = {role: column_unit(role, header, columns.units.get(role)) for role, header in headers.items()}
     units = {role: unit for role, (unit, _) in read.items()}
-    notes += [f"{path.name}: {sentence}" for _, sentence in read.values() if sentence]
-    rotary = _rotary(path, headers, units)
-    arrays = {role: _numbers(table, path, header) for role, header in headers.items()}
+    notes += [sentence for _, sentence in read.values() if sentence]
+    rotary = _rotary(headers, units)
+    arrays = {role: _numbers(table, header) for role, header in headers.items()}
     lengths = {header: arrays[role].size for role, header in headers.items()}
     if len(set(lengths.values())) > 1:
-        raise ValueError(
-            f"{path.name}: columns must have the same length, but they have"
-            f" {', '.join(f'{length} ({header!r})' for header, length in lengths.items())}."
-        )
+        each = ", ".join(f"{length} ({header!r})" for header, length in lengths.items())
+        raise ValueError(f"columns must have the same length, but they have {each}.")
     arrays = {role: units[role].factor * array for role, array in arrays.items()}
-    arrays, dropped = _checked(path, arrays, headers, columns.drop)
+    arrays, dropped = _checked(arrays, headers, columns.drop)
     t, position, force = arrays["time"], arrays["position"], arrays["force"]
-    name = name or path.stem
+    notes += dropped
     if units["position"].velocity:
         position = _integral(t, position)
         notes.append(
-            f"{name}: column {headers['position']!r} is a velocity; its integral is fitted as the position, which"
-            " accumulates the noise of the velocity."
+            f"column {headers['position']!r} is a velocity; its integral is fitted as the position, which accumulates"
+            " the noise of the velocity."
         )
     record = Record(t, position, {"u": force}, name=name)
     parts, gaps = _parts(record)
-    return AxisRecord(parts, rotary, (*notes, *dropped, *gaps, *_doubts(record, headers, units, rotary)))
+    return parts, rotary, [*notes, *gaps, *_doubts(record, headers, units, rotary)]
 
 
 def offset_note(record: Record, force: str) -> tuple[str, ...]:
@@ -138,9 +143,9 @@ def offset_note(record: Record, force: str) -> tuple[str, ...]:
     )
 
 
-def _on_one_clock(table: Columns, path: Path, columns: AxisColumns) -> tuple[Columns, list[str]]:
+def _on_one_clock(table: Columns, columns: AxisColumns) -> tuple[Columns, list[str]]:
     """Position and force of a logger at the times of the position, within the time span of the force."""
-    headers = [_header(table, path, role, columns.names[role]) for role in ("position", "force")]
+    headers = [_header(table, role, columns.names[role]) for role in ("position", "force")]
     position, force = (table[header] for header in headers)
     if not (isinstance(position, Channel) and isinstance(force, Channel)):
         return table, []
@@ -149,7 +154,7 @@ def _on_one_clock(table: Columns, path: Path, columns: AxisColumns) -> tuple[Col
     last = force.t[-1] + float(np.median(np.diff(force.t))) if force.t.size > 1 else force.t[-1]
     both = (position.t >= force.t[0]) & (position.t < last)
     if np.count_nonzero(both) < _LEAST_PART:
-        raise ValueError(f"{path.name}: {headers[0]!r} and {headers[1]!r} have almost no times in common.")
+        raise ValueError(f"{headers[0]!r} and {headers[1]!r} have almost no times in common.")
     t, q = position.t[both], position.values[both]
     resampled = held_on(force, t)
     try:
@@ -157,9 +162,8 @@ def _on_one_clock(table: Columns, path: Path, columns: AxisColumns) -> tuple[Col
     except ValueError:  # wrong samples are reported later, by column
         offset = 0.0
     return {columns.time: t, headers[0]: q, headers[1]: resampled}, [
-        f"{path.name}: {headers[1]!r} is resampled to the times of {headers[0]!r}. According to the motion, the clock"
-        f" of the force is {1e3 * abs(offset):.2f} ms {'early' if offset >= 0 else 'late'} relative to that of the"
-        " position."
+        f"{headers[1]!r} is resampled to the times of {headers[0]!r}. According to the motion, the clock of the force"
+        f" is {1e3 * abs(offset):.2f} ms {'early' if offset >= 0 else 'late'} relative to that of the position."
     ]
 
 
@@ -172,7 +176,7 @@ def held_on(force: Channel, t: np.ndarray) -> np.ndarray:
     return np.diff(np.interp(ends, edges, integral)) / np.diff(ends)
 
 
-def _header(table: Columns, path: Path, role: str, wanted: str) -> str:
+def _header(table: Columns, role: str, wanted: str) -> str:
     """The column of this name, with or without its unit."""
     if wanted in table:
         return wanted
@@ -183,12 +187,11 @@ def _header(table: Columns, path: Path, role: str, wanted: str) -> str:
     near = nearest(wanted, [*table, *bare.values()])
     hint = f" Did you mean --{role} {near}?" if near else ""
     other = " A velocity also works: --position NAME --units position=m/s." if role == "position" else ""
-    raise ValueError(
-        f"{path.name} has no column {wanted!r} (--{role}); it has: {', '.join(table) or 'none'}.{hint or other}"
-    )
+    known = ", ".join(table) or "none"
+    raise ValueError(f"there is no column {wanted!r} (--{role}); the file has: {known}.{hint or other}")
 
 
-def _numbers(table: Columns, path: Path, header: str) -> np.ndarray:
+def _numbers(table: Columns, header: str) -> np.ndarray:
     column = pd.Series(table[header])
     if column.empty:
         return np.zeros(0)
@@ -197,17 +200,15 @@ def _numbers(table: Columns, path: Path, header: str) -> np.ndarray:
     if pd.api.types.is_datetime64_any_dtype(column):
         return (column - column.iloc[0]).dt.total_seconds().to_numpy(float)
     bad = int(np.argmax(np.isnan(np.asarray(pd.to_numeric(column, errors="coerce"), float))))
-    raise ValueError(
-        f"{path.name}: column {header!r} holds {column.iloc[bad]!r} in sample {bad}, which is not a number."
-    )
+    raise ValueError(f"column {header!r} holds {column.iloc[bad]!r} in sample {bad}, which is not a number.")
 
 
-def _rotary(path: Path, headers: Mapping[str, str], units: Mapping[str, Unit]) -> bool | None:
+def _rotary(headers: Mapping[str, str], units: Mapping[str, Unit]) -> bool | None:
     """Whether the units imply a rotary axis; those of position and force must agree."""
     kinds = {unit.rotary for unit in units.values() if unit.rotary is not None}
     if len(kinds) > 1:
         raise ValueError(
-            f"{path.name}: {headers['position']!r} is in {units['position'].text} and {headers['force']!r} in"
+            f"{headers['position']!r} is in {units['position'].text} and {headers['force']!r} in"
             f" {units['force'].text}, but a rotary axis needs an angle and a torque, a linear one a length and a force."
             " Use --units of one kind, with the factor of the gear or lever between them."
         )
@@ -215,7 +216,7 @@ def _rotary(path: Path, headers: Mapping[str, str], units: Mapping[str, Unit]) -
 
 
 def _checked(
-    path: Path, arrays: dict[str, np.ndarray], headers: Mapping[str, str], drop: frozenset[str]
+    arrays: dict[str, np.ndarray], headers: Mapping[str, str], drop: frozenset[str]
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """The samples without those of the kinds in `drop`, and a sentence for each kind.
 
@@ -228,20 +229,20 @@ def _checked(
     for role, bad in infinite.items():
         if bad.size and "nan" not in drop:
             raise ValueError(
-                f"{path.name}: column {headers[role]!r} has {bad.size} values that are not finite, the first in sample"
+                f"column {headers[role]!r} has {bad.size} values that are not finite, the first in sample"
                 f" {bad[0]}. Fill them, or omit these samples by --drop nan."
             )
     bad = np.unique(np.concatenate(list(infinite.values())))
     if bad.size:
         arrays = {role: np.delete(array, bad) for role, array in arrays.items()}
         samples = np.delete(samples, bad)
-        notes.append(f"{path.name}: {bad.size} samples with values that are not finite are omitted.")
+        notes.append(f"{bad.size} samples with values that are not finite are omitted.")
     steps = np.diff(arrays["time"])
     back, repeated = 1 + np.flatnonzero(steps < 0), 1 + np.flatnonzero(steps == 0)
     if back.size:
         k = back[0]
         raise ValueError(
-            f"{path.name}: times must increase, but column {headers['time']!r} goes back {back.size} times, first from"
+            f"times must increase, but column {headers['time']!r} goes back {back.size} times, first from"
             f" {arrays['time'][k - 1]:g} s to {arrays['time'][k]:g} s in sample {samples[k]}. Sort the samples by time;"
             " if the clock was reset, save the samples after it as a separate record."
         )
@@ -252,12 +253,12 @@ def _checked(
             "Their times seem rounded: export more digits." if rounded else "Omit these samples by --drop repeated."
         )
         raise ValueError(
-            f"{path.name}: times must increase, but column {headers['time']!r} has {repeated.size} samples with the"
+            f"times must increase, but column {headers['time']!r} has {repeated.size} samples with the"
             f" time of the sample before: {named}. {remedy}"
         )
     if repeated.size:
         arrays = {role: np.delete(array, repeated) for role, array in arrays.items()}
-        notes.append(f"{path.name}: {repeated.size} samples with the time of the sample before are omitted.")
+        notes.append(f"{repeated.size} samples with the time of the sample before are omitted.")
     return arrays, notes
 
 
@@ -274,7 +275,7 @@ def _parts(record: Record) -> tuple[tuple[Record, ...], list[str]]:
     where = ", ".join(f"from {record.t[k]:g} to {record.t[k + 1]:g} s" for k in gaps[:_NAMED])
     more = f" and {len(gaps) - _NAMED} more" if len(gaps) > _NAMED else ""
     return parts, [
-        f"{record.name}: samples are missing {where}{more}; the parts are fitted as {len(parts)} records, each with its"
+        f"samples are missing {where}{more}; the parts are fitted as {len(parts)} records, each with its"
         " own initial state."
     ]
 
@@ -291,12 +292,12 @@ def _doubts(record: Record, headers: Mapping[str, str], units: Mapping[str, Unit
         as_velocity = Record(record.t, _integral(record.t, record.measured), record.inputs)
         if left > _UNEXPLAINED and unexplained_force(as_velocity) < _BETTER * left:
             sentences.append(
-                f"{record.name}: the force depends on {headers['position']!r} as on a velocity, not as on a position."
+                f"the force depends on {headers['position']!r} as on a velocity, not as on a position."
                 " If it is a velocity, use --units position=m/s."
             )
     if not units["force"].text and headers["force"].lower() in _DRIVE_NAMES:
         sentences.append(
-            f"{record.name}: {headers['force']!r} is read as a force in SI units. If it is a drive signal, state the"
+            f"{headers['force']!r} is read as a force in SI units. If it is a drive signal, state the"
             " newtons (or N m) per unit, as in --units force=12.5: mass and friction scale with it."
         )
     interval, span = float(np.median(np.diff(record.t))), float(np.ptp(record.measured))
@@ -308,7 +309,7 @@ def _doubts(record: Record, headers: Mapping[str, str], units: Mapping[str, Unit
     if doubts:
         names = " and ".join(f"{headers[role]!r}" for role, _, _ in doubts)
         sentences.append(
-            f"{record.name}: {' and '.join(symptom for _, symptom, _ in doubts)}, with {names} in SI units. For other"
+            f"{' and '.join(symptom for _, symptom, _ in doubts)}, with {names} in SI units. For other"
             f" units use --units {','.join(f'{role}={other}' for role, _, other in doubts)}."
         )
     return sentences

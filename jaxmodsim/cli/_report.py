@@ -66,10 +66,11 @@ def _comparison(outcome: FitOutcome) -> dict[str, object] | None:
     }
     table = pd.DataFrame(compared.table[: len(compared.ranked)])[list(columns)].astype({"start_fitted": float})
     table["undetermined"] = [", ".join(each.undetermined) or "-" for each in compared.ranked]
+    table.columns = pd.Index(columns.values())
     sentences = [compared.conclusion, f"Held out: {compared.by}."]
     sentences += [f"{name} failed: {reason}" for name, reason in compared.failures.items()]
     sentences += [f"{name} was not finished." for name in compared.left]
-    return {"table": table.rename(columns=columns), "sentences": sentences, "drawing": comparison_figure(compared)}
+    return {"table": table, "sentences": sentences, "drawing": comparison_figure(compared)}
 
 
 def _design(design: InputDesign, unit: str) -> dict[str, object]:

@@ -272,7 +272,7 @@ def _shares(labels: np.ndarray, describe: Callable[[float], str]) -> dict[str, f
     """Share of the runs with each label, largest first."""
     kinds, counts = np.unique(labels, return_counts=True)
     order = np.argsort(-counts, kind="stable")
-    return {describe(kinds[i]): float(counts[i] / labels.size) for i in order}
+    return {describe(float(kinds[i])): float(counts[i] / labels.size) for i in order}
 
 
 def _check_losses(runs: "xr.Dataset", ok: np.ndarray, use: np.ndarray) -> None:

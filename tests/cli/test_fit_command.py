@@ -438,7 +438,7 @@ def test_matlab_vectors_of_other_lengths_and_folders_are_refused(run_command, fi
     write_mat(path, {"time": np.arange(3.0), "pos": np.arange(4.0), "volt": np.arange(3.0)})
     check_refusal(run_command, out, r"3 \('time'\), 4 \('pos'\), 3 \('volt'\)", str(path), *COLUMNS)
     write_mat(path, {"time": np.arange(3.0), "pos": np.eye(3), "volt": np.arange(3.0)})
-    check_refusal(run_command, out, "no column 'pos' .*it has: time, volt", str(path), *COLUMNS)
+    check_refusal(run_command, out, "no column 'pos' .*the file has: time, volt", str(path), *COLUMNS)
     check_refusal(run_command, out, "is a folder; a file is needed", str(tmp_path))
     check_refusal(run_command, out, "There is no file", str(tmp_path / "none.csv"))
     check_refusal(run_command, out, "is listed twice", files[0], files[0], *COLUMNS)

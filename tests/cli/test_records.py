@@ -164,11 +164,11 @@ def test_samples_without_values_or_of_no_new_time_are_left_out(tmp_path):
     hollow.loc[[33], "volt"] = np.inf
     read = read_record(written(tmp_path, hollow), names(f"force={GAIN}", "nan"))
     assert len(read.parts[0].t) == len(FRAME) - 3
-    assert read.notes == ("run.csv: 3 samples with values that are not finite are omitted.",)
+    assert read.notes == ("run: 3 samples with values that are not finite are omitted.",)
     twice = pd.concat([FRAME.iloc[:100], FRAME.iloc[99:]])
     read = read_record(written(tmp_path, twice), names(f"force={GAIN}", "nan", "repeated"))
     np.testing.assert_array_equal(read.parts[0].t, T)
-    assert read.notes == ("run.csv: 1 samples with the time of the sample before are omitted.",)
+    assert read.notes == ("run: 1 samples with the time of the sample before are omitted.",)
 
 
 def test_dates_are_times(tmp_path):
@@ -233,8 +233,10 @@ def test_a_current_becomes_a_force_by_a_factor(run_command, tmp_path):
 @pytest.mark.parametrize("free", [(), ("+delay.u",)])
 def test_a_parameter_can_be_added_to_those_of_the_law(capsys, tmp_path, free):
     path = written(tmp_path, changed(volt=np.roll(U, -6)))
-    columns = {"time": "time", "position": "pos", "force": "volt"}
-    plan = plan_of(FitRequest(records=[path], **columns, units=[FORCE[1]], laws="coulomb,lugre", free=[*free]))
+    request = FitRequest(
+        records=[path], time="time", position="pos", force="volt", units=[FORCE[1]], laws="coulomb,lugre", free=[*free]
+    )
+    plan = plan_of(request)
     for name, candidate in plan.candidates.items():
         assert candidate.free == (*axis_models()[name].free, *(each.removeprefix("+") for each in free))
     # What is fitted is no surprise.
