@@ -83,7 +83,7 @@ def clock(t: Any, s: Any, args: Any) -> Any:
 
 
 def test_a_step_reports_to_the_controller() -> None:
-    """A guard 1 - t: a step to 1.5 passes its root and is aimed at it; the one to 1 lands and resets; the rest follows."""
+    """A guard 1 - t: a step to 1.5 passes its root; the next one ends there and resets; then comes the rest."""
     terms, t0 = dfx.ODETerm(clock), jnp.zeros(())
     solver = EventSolver(dfx.Euler(), lambda t, s, a: 1.0 - s.y, lambda t, s, a, fired: s._replace(mode=s.mode + 1.0))
     controller = EventController(FiniteSteps(), direction=1)
