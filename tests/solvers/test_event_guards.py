@@ -24,6 +24,7 @@ FALLS: dict[str, tuple[Any, bool, float | None]] = {
     "violated, not armed": (lambda s: -0.1 - s, False, None),
     "violated, armed": (lambda s: -0.1 - s, True, 0.0),
     "zero and rising, not armed": (lambda s: s * (0.8 - s), False, 0.8),
+    "zero and rising, back before a sample": (lambda s: s * (0.2 - s), False, 0.2),
 }
 
 
