@@ -359,7 +359,8 @@ class ReverseOverSteps(AbstractOverSteps):
         reached = final.tprev == t1
         for i, (_, sub_t1, every_row) in enumerate(self.how.subs):
             last, empty = self.at_the_end(i)
-            count, rows, times = back.saved[i] - last, self.rows[i], self.inputs.times[i]
+            # With `steps` above 1 diffrax counts a row at t1 in any case, and writes it only if it is the last one.
+            count, rows, times = back.saved[i] - (last | (every_row > 1)), self.rows[i], self.inputs.times[i]
             if rows is not None and (times is not None or (sub_t1 and every_row != 1)):
                 ct = self.row(i, count, last)
                 if times is not None:

@@ -81,6 +81,8 @@ def test_guards_fall_through_zero_at_the_limits() -> None:
     for load, guard in ((1.0, 0.0), (-1.0, 0.0), (0.5, 0.375), (0.0, 0.5)):
         elements = scalars(free_slip_acceleration=[2.0 * load, load])
         forces = solve_friction_forces(elements, jnp.zeros(2))
+        np.testing.assert_allclose(forces.force[0], load, atol=1e-14)
+        forces = forces._replace(force=jnp.array([load, 0.0]))  # without rounding
         value, error = friction_guards(elements, forces, jnp.zeros(2), REST, TOLERANCES)
         np.testing.assert_allclose(value[0], guard, atol=1e-14)
         assert value[0] > 0  # not at the limit itself: rounding must not end a stick

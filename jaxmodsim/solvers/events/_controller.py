@@ -133,7 +133,7 @@ class EventController(AbstractControllerWrapper):
         keep, inner_t0, inner_t1, jump, inner, result = self.controller.adapt_step_size(
             t0, t1, y0.y, y1_candidate.y, args, y_error, error_order, old.inner
         )
-        keep, length = jnp.asarray(keep), _constant(t1 - t0)
+        length = _constant(t1 - t0)
         next_root, factor, landed = _constant(seen.next_root), _constant(seen.step_factor), _constant(seen.landed) > 0.5
         proposed = jnp.subtract(inner_t1, inner_t0)
         passed = keep & (next_root < 1.0) & ~landed
