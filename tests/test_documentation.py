@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -178,3 +179,14 @@ def test_the_code_of_the_readme_runs(tmp_path: Path) -> None:
 def test_benches_named_by_the_command_line_exist() -> None:
     studies = {path.stem for path in (ROOT / "bench" / "studies").glob("[!_]*.py")}
     assert set(REPORTS) == studies | set(CASES)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(
+    ("file", "pattern"),
+    [("CITATION.cff", r"^version: (.+)$"), ("CHANGELOG.md", r"^## (\S+)")],
+    ids=["citation", "changes"],
+)
+def test_the_version_is_that_of_the_package(file: str, pattern: str) -> None:
+    found = re.findall(pattern, (ROOT / file).read_text(), re.MULTILINE)
+    assert found[0] == tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
