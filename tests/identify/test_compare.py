@@ -188,9 +188,8 @@ def test_correlation_time_of_a_series_that_remembers():
 
 def test_what_determines_its_parameters_comes_first_among_those_that_are_as_good(comparison):
     best, second, *_ = comparison.ranked
-    near = replace(
-        second, over_the_best=0.5 * error, over_the_best_standard_error=error, parameters=best.parameters - 1
-    )
+    over, error = 0.5 * best.standard_error, best.standard_error
+    near = replace(second, over_the_best=over, over_the_best_standard_error=error, parameters=best.parameters - 1)
     assert replace(comparison, ranked=(best, near)).simplest == near.name
     unknown = replace(near, undetermined=("friction.vs",))
     assert replace(comparison, ranked=(best, unknown)).simplest == best.name
