@@ -24,7 +24,7 @@ APPLICATIONS = {
     "metrics": 650,
     "analysis": 2050,
     "orbits": 3300,
-    "identify": 9300,
+    "identify": 9250,
     "sweeps": 2500,
     "export": 1150,
     "problems": 3000,
