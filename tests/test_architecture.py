@@ -24,7 +24,7 @@ APPLICATIONS = {
     "metrics": 550,
     "analysis": 2000,
     "orbits": 3100,
-    "identify": 9300,
+    "identify": 9250,
     "sweeps": 2150,
     "export": 1100,
     "problems": 3000,

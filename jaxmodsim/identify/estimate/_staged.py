@@ -65,7 +65,8 @@ class Staged(AbstractInitializer):
     def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
         """Coordinates of the start values."""
         sampled = _sampled(problem)
-        units = _units(problem)
+        ranges = scene_ranges(problem.engine.model)
+        units = {name: ranges[name].unit if name in ranges else "" for name in problem.free.names}
         values = {name: float(value) for name, value in problem.free.values(x[: len(units)]).items()}
         sizes = _sizes(problem, sampled, values)
         values |= {name: sizes[unit] for name, unit in units.items() if unit in sizes}
@@ -86,12 +87,6 @@ class Staged(AbstractInitializer):
             elif units[name] == "N s/m" and mass is not None:
                 values[name] = _DAMPING * 2 * float(np.sqrt(mass * stiffness))
         return jnp.concatenate([problem.free.coordinates(values), x[len(units) :]]), ()
-
-
-def _units(problem: FitProblem) -> dict[str, str]:
-    """Unit of each free parameter, "" for those without."""
-    ranges = scene_ranges(problem.engine.model)
-    return {name: ranges[name].unit if name in ranges else "" for name in problem.free.names}
 
 
 def _sampled(problem: FitProblem) -> _Sampled:

@@ -151,7 +151,7 @@ class ParameterCoordinate(eqx.Module):
         distance = on_device(values[name] - values[base])
         return ParameterCoordinate(name, "follow", base, on_device(0.0), distance, on_device(np.inf), on_device(np.inf))
 
-    def floor_at(self, values: Mapping[str, _Known]) -> _Known | Array:
+    def floor_at(self, values: Mapping[str, _Known]) -> _Known | Array | float:
         """The lower limit where the other parameters have these values."""
         return self.floor if self.base is None else _floor(self.base, values)
 

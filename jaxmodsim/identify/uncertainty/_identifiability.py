@@ -268,8 +268,8 @@ def slow(
             continue
         value, start = float(numbers[name]), motions[0]
         point = tuple(on_device(each) for each in (start.t[0], start.q[0][:1], start.qd[0][:1]))
-        masses = (_mass(replace_numbers(scene, {name: on_device(x)}), *point) for x in (1.01 * value, value))
-        change = float(np.subtract(*(float(mass) for mass in masses))) / 0.01
+        more, mass = (float(_mass(replace_numbers(scene, {name: on_device(x)}), *point)) for x in (1.01 * value, value))
+        change = (more - mass) / 0.01
         force = abs(change) * float(np.sqrt(np.mean(acceleration**2)))
         if change != 0.0 and force < _INERTIA * max(friction):
             about.append(name)
