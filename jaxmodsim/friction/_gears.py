@@ -1,9 +1,8 @@
 """Gear friction, which depends on the transmitted torque or on the torques of motor and load."""
 
-import functools
 import tomllib
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from importlib import resources
 from typing import Any, ClassVar, TypeAlias
 
@@ -104,7 +103,7 @@ class Geared(AbstractSetValuedLaw):
 Torque: TypeAlias = Callable[..., ArrayLike] | ArrayLike
 
 
-@functools.cache
+@cache
 def published_servo_gears() -> dict[str, dict[str, dict[str, float]]]:
     """Published parameters of `ServoGear` by actuator and model; the file `servo_gears.toml` names their source."""
     return tomllib.loads(resources.files("jaxmodsim.friction").joinpath("servo_gears.toml").read_text("utf-8"))
