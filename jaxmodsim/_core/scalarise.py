@@ -295,7 +295,7 @@ class _Scalars(AbstractScalars):
         return list(out) if eqn.primitive.multiple_results else [out]
 
 
-def _constant(x: ArrayLike) -> Value:
+def _constant(x: Any) -> Value:
     return np.asarray(x) if is_known(x) else x
 
 

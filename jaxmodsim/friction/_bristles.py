@@ -2,8 +2,10 @@
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
@@ -25,7 +27,7 @@ from ._law import (
     stribeck_case,
 )
 from ._passivity import first_negative, least_on, logarithmic
-from ._wrappers import AbstractWrapper, set_valued_law
+from ._wrappers import AbstractWrapper, need_set_valued
 
 _ONE_STATE = {"memory": "One state stores one turning point."}
 _YIELDS = {"creep": "The bristle yields at any load, and slightly more when loaded than when unloaded."}
@@ -428,7 +430,7 @@ class Bristle(AbstractWrapper, AbstractDynamicLaw):
     - `ValueError` if `law` is not set-valued or `h` is out of range.
     """
 
-    law: AbstractSetValuedLaw = set_valued_law("Bristle")
+    law: AbstractSetValuedLaw = eqx.field(converter=partial(need_set_valued, owner="Bristle"))
     h: Number = parameter("h", "m", lower=0.0, strict=True)
     stiff: ClassVar[bool] = True
     description: ClassVar[str] = "one bristle, whose limit is 1 at any load"

@@ -1,8 +1,8 @@
 """Gear friction, which depends on the transmitted torque or on the torques of motor and load."""
 
-import functools
 import tomllib
 from collections.abc import Callable
+from functools import cache, partial
 from importlib import resources
 from typing import Any, ClassVar, TypeAlias
 
@@ -14,7 +14,7 @@ from .._core.arrays import Scalar
 from .._core.parameters import Number, NumberOrState, as_number, optional_parameter, parameter, state_parameter
 from ._law import AbstractSetValuedLaw, register_law
 from ._static import Coulomb, exponential, stribeck_power
-from ._wrappers import set_valued_law
+from ._wrappers import need_set_valued
 
 
 def _per_torque(value: Any) -> AbstractSetValuedLaw:
@@ -53,7 +53,7 @@ class Geared(AbstractSetValuedLaw):
     - `ValueError` if a law is not set-valued, a coefficient is out of range, or `torque` is no function and no number.
     """
 
-    law: AbstractSetValuedLaw = set_valued_law("Geared")
+    law: AbstractSetValuedLaw = eqx.field(converter=partial(need_set_valued, owner="Geared"))
     drive: AbstractSetValuedLaw = eqx.field(converter=_per_torque)
     torque: NumberOrState = state_parameter("Geared torque")
     back: AbstractSetValuedLaw | None = eqx.field(default=None, converter=_unless_none)
@@ -103,7 +103,7 @@ class Geared(AbstractSetValuedLaw):
 Torque: TypeAlias = Callable[..., ArrayLike] | ArrayLike
 
 
-@functools.cache
+@cache
 def published_servo_gears() -> dict[str, dict[str, dict[str, float]]]:
     """Published parameters of `ServoGear` by actuator and model; the file `servo_gears.toml` names their source."""
     return tomllib.loads(resources.files("jaxmodsim.friction").joinpath("servo_gears.toml").read_text("utf-8"))

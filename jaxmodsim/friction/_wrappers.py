@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -49,12 +49,13 @@ class AbstractWrapper(AbstractLaw):
         return (case._replace(dt=cls.example_step),)
 
 
-def set_valued_law(owner: str) -> Any:
-    """Field of the law `owner`, for the set-valued law that it contains."""
-    return eqx.field(converter=partial(_need_set_valued, owner=owner))
+def need_set_valued(law: object, owner: str) -> AbstractSetValuedLaw:
+    """Refuse a law that is not set-valued as a part of the law `owner`.
 
+    **Raises:**
 
-def _need_set_valued(law: object, owner: str) -> AbstractSetValuedLaw:
+    - `ValueError` with `owner` and the kind of law.
+    """
     if not isinstance(law, AbstractSetValuedLaw):
         kind = law if isinstance(law, str) else type(law).__name__
         raise ValueError(
@@ -82,7 +83,7 @@ class Regularized(AbstractWrapper, AbstractForceLaw):
     - `ValueError` if `law` is not set-valued or `width` is out of range.
     """
 
-    law: AbstractSetValuedLaw = set_valued_law("Regularized")
+    law: AbstractSetValuedLaw = eqx.field(converter=partial(need_set_valued, owner="Regularized"))
     width: Number = parameter("width", "m/s", lower=0.0, strict=True, execution=True)
     stiff: ClassVar[bool] = True
     description: ClassVar[str] = "smooth over `width`; creeps below the limit"
@@ -135,7 +136,7 @@ class DeadZone(AbstractWrapper, AbstractKarnoppLaw):
         ```
     """
 
-    law: AbstractSetValuedLaw = set_valued_law("DeadZone")
+    law: AbstractSetValuedLaw = eqx.field(converter=partial(need_set_valued, owner="DeadZone"))
     width: Number = parameter("width", "m/s", lower=0.0, strict=True, execution=True)
     stiff: ClassVar[bool] = False
     description: ClassVar[str] = "Karnopp: velocities up to `width` count as rest"
@@ -173,7 +174,7 @@ class Sign(AbstractWrapper, AbstractForceLaw):
     - `ValueError` if `law` is not set-valued.
     """
 
-    law: AbstractSetValuedLaw = set_valued_law("Sign")
+    law: AbstractSetValuedLaw = eqx.field(converter=partial(need_set_valued, owner="Sign"))
     stiff: ClassVar[bool] = False
     description: ClassVar[str] = "plain `sign(v)`, to demonstrate why it fails"
     equations: ClassVar[tuple[str, ...]] = ("sliding_force(v) sign(v) + viscous_force(v)",)
