@@ -7,13 +7,13 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree, ScalarLike, Shaped
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree, Shaped
 
 Scalar: TypeAlias = Float[Array, ""]
 # One number per coordinate.
 PerDof: TypeAlias = Float[Array, " dof"]
 # One number or flag as diffrax passes it: an array, or a number of Python.
-Real: TypeAlias = ScalarLike
+Real: TypeAlias = Shaped[ArrayLike, ""]
 # A function of arrays.
 Fn: TypeAlias = Callable[..., PyTree]
 _Tree = TypeVar("_Tree")

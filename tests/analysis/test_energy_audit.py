@@ -89,7 +89,7 @@ def test_power_of_the_other_named_problems(name: str) -> None:
     assert_accounted(scene, q, qd, z, mode)
 
 
-def test_a_wrong_power_would_show() -> None:
+def test_a_wrong_power_has_a_closing_error() -> None:
     """The balance above is no identity: with the force scaled behind its back it is off."""
 
     class Forgetful(AppliedForce):
@@ -134,7 +134,7 @@ def test_each_effect_has_its_own_account() -> None:
     np.testing.assert_allclose(audit.closing_error, 0.0, atol=1e-6)
 
 
-def test_bristles_store_what_they_have_not_lost() -> None:
+def test_bristles_store_the_energy_that_they_have_not_dissipated() -> None:
     scene = Scene(
         lambda t, q, qd, p: 0.5 * qd[0] ** 2,
         effects=(AppliedForce(lambda t, q, qd, p: jnp.stack([1.0 * t]), name="pull"), Friction(LuGre(**LUGRE))),
@@ -154,7 +154,7 @@ def test_cyclic_coordinates() -> None:
         jax.jit(lambda scene: jnp.asarray(cyclic_coordinates(scene, 2)))(problems.spherical_pendulum.scene())
 
 
-def test_the_momentum_of_a_cyclic_coordinate_is_kept() -> None:
+def test_the_momentum_of_a_cyclic_coordinate_is_constant() -> None:
     scene = problems.spherical_pendulum.scene()
     run = simulate(scene, [2.0, 0.0], [0.3, 1.1], 10.0, ts=jnp.linspace(0.0, 10.0, 11), rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(run.momentum[:, 1], np.sin(2.0) ** 2 * 1.1, rtol=1e-9)

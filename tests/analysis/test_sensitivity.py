@@ -116,7 +116,7 @@ def test_many_parameters_and_one_output_run_in_reverse() -> None:
     assert len(plot.sensitivity_figure(found).axes) == 1
 
 
-def test_zeros_count_as_one_unit_and_say_so() -> None:
+def test_zeros_count_as_one_unit_with_a_remark() -> None:
     scene = jms.Scene(free, params={"m": 2.0}, effects=(jms.Friction(jms.Viscous(0.5)),))
     found = jms.sensitivity(scene, "friction", ("qd0", "friction.Fv"), q0=[0.0], qd0=[0.0], t1=1.0, ts=[0.0, 1.0])
     assert set(found.derivatives) == {"qd0[0]", "friction.Fv"}

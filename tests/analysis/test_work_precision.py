@@ -64,7 +64,7 @@ def test_events(found: WorkPrecision) -> None:
     assert all(row.events is None for row in rows_of(found, "wide"))
 
 
-def test_the_error_of_the_model_stands_apart(found: WorkPrecision) -> None:
+def test_the_modelling_error_is_separate(found: WorkPrecision) -> None:
     """It is of order 1 in the width and no tolerance changes it; the numerical error goes on to fall."""
     wide, narrow = rows_of(found, "wide"), rows_of(found, "narrow")
     assert wide[0].model == wide[1].model
@@ -76,7 +76,7 @@ def test_the_error_of_the_model_stands_apart(found: WorkPrecision) -> None:
         np.testing.assert_allclose(known(tight.error), known(tight.model), rtol=0.02)
 
 
-def test_a_failure_stays(found: WorkPrecision) -> None:
+def test_a_failed_method_has_a_row(found: WorkPrecision) -> None:
     """With its reason, in everything that is shown."""
     failed, fine = rows_of(found, "Euler")
     assert failed.dt == 0.1
@@ -111,7 +111,7 @@ def test_the_cheapest(found: WorkPrecision) -> None:
         found.cheapest(1e-18)
 
 
-def test_a_file_keeps_all(found: WorkPrecision, tmp_path: Path) -> None:
+def test_a_study_survives_its_file(found: WorkPrecision, tmp_path: Path) -> None:
     path = tmp_path / "found.json"
     found.save(path)
     assert load_work_precision(path) == found
@@ -124,7 +124,7 @@ def test_a_file_keeps_all(found: WorkPrecision, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_files_that_are_something_else(found: WorkPrecision, tmp_path: Path) -> None:
+def test_damaged_and_other_files_are_refused(found: WorkPrecision, tmp_path: Path) -> None:
     path = tmp_path / "found.json"
     for text, words in (("{", "damaged"), ('{"a": 1}', "not written by"), ("[]", "not written by")):
         path.write_text(text)

@@ -273,7 +273,7 @@ def test_periods_by_crossings() -> None:
     assert np.isnan(metrics.period("q[0]")(swing(1.7, t)))
 
 
-def test_dahl_loses_its_closed_form_in_each_cycle() -> None:
+def test_dahl_dissipates_its_closed_form_in_each_cycle() -> None:
     """`4 Fc [A - Fc/sigma0 tanh(sigma0 A/Fc)]`, with a mass so heavy that friction does not disturb its swing."""
     sigma0, fc, amplitude = 750.0, 1.5, 2e-2
     scene = problems.braked_spring.scene(jms.Dahl(sigma0, fc), m=1e9, k=1e9)
@@ -288,7 +288,7 @@ def test_dahl_loses_its_closed_form_in_each_cycle() -> None:
         metrics.dissipated("brake")(run)
 
 
-def test_rest_of_laws_without_modes() -> None:
+def test_stick_share_of_laws_without_modes() -> None:
     """Up to which share of its limit a bristle creeps slower than 1e-4 m/s, and when a box that sticks gets faster."""
     share = metrics.stick_share(rest=1e-4)
     # A bristle under a ramp creeps at v = (ramp/sigma0)/(1 - F/Fc).
@@ -318,7 +318,7 @@ def test_peak_of_a_force() -> None:
         (lambda: metrics.classes(lambda run: 0, ()), "name for each class"),
     ],
 )
-def test_garbage_is_refused_when_made(make: Any, text: str) -> None:
+def test_invalid_arguments_are_refused(make: Any, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         make()
 
@@ -336,6 +336,6 @@ def test_garbage_is_refused_when_made(make: Any, text: str) -> None:
         (metrics.period("brake"), "No observable"),
     ],
 )
-def test_garbage_is_refused_when_called(metric: Metric, text: str) -> None:
+def test_invalid_runs_are_refused(metric: Metric, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         metric(bristle())

@@ -233,7 +233,7 @@ def test_grazing_is_where_the_amplitude_without_impacts_reaches_the_stop():
 
 
 @pytest.mark.deep
-def test_changes_that_swap_are_no_grazing():
+def test_mode_changes_that_swap_their_order_are_no_grazing():
     """Two oscillators of one damping pass zero at once where their stiffnesses are equal."""
 
     def two(_t, q, qd, p):
@@ -251,7 +251,7 @@ def test_changes_that_swap_are_no_grazing():
     np.testing.assert_allclose([point.value for point in branch.points], 3.0, rtol=1e-6)
 
 
-def test_folds_of_duffing_and_a_branch_that_goes_on_from_its_store(tmp_path):
+def test_folds_of_duffing_and_a_branch_that_resumes_from_its_store(tmp_path):
     def follow(**options):
         return jms.continue_orbits(
             duffing(0.8), ([0.0], [0.0]), "W", (0.8, 2.2), period=of_frequency, step=0.1, **options

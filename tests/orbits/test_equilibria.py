@@ -79,7 +79,7 @@ def test_steady_sliding_loses_its_stability_where_damping_and_slope_cancel(slidi
 
 
 @pytest.mark.deep
-def test_orbits_from_there_turn_back_where_they_come_to_stick(sliding):
+def test_orbits_from_a_hopf_point_turn_back_at_the_onset_of_stick(sliding):
     branch = jms.continue_orbits(
         belt(jms.Stribeck(**LAW), 1.0), sliding.points[0], SPEED, (1.0, 0.3), step=0.5, rtol=1e-9
     )
@@ -100,7 +100,7 @@ def test_orbits_from_there_turn_back_where_they_come_to_stick(sliding):
 
 
 @pytest.mark.deep
-def test_orbits_that_stick_turn_back_where_stick_shrinks_to_a_point():
+def test_orbits_with_stick_turn_back_where_stick_shrinks_to_a_point():
     scene, span = belt(jms.Stribeck(**LAW), 0.61), (0.61, 0.66)
     branch = jms.continue_orbits(scene, ([0.0], [0.61]), SPEED, span, settle=20.0, step=0.4, rtol=1e-9)
     (point,) = branch.points
@@ -221,7 +221,7 @@ def test_two_elements_have_four_corners():
         np.testing.assert_allclose(jms.equilibrium(scene, [0.0, 0.0], ends={"a": a, "b": b}).q, exact, rtol=1e-12)
 
 
-def test_constraints_take_eigenvalues_away():
+def test_constraints_reduce_the_number_of_eigenvalues():
     rest = jms.equilibrium(cartesian_pendulum.scene(l=2.0), [0.1, -0.9])
     np.testing.assert_allclose(rest.q, [0.0, -2.0], atol=1e-12)
     np.testing.assert_allclose(rest.eigenvalues, np.sqrt(9.81 / 2.0) * np.array([1j, -1j]), atol=1e-10)
@@ -232,7 +232,7 @@ def pulled(t, q, qd, p):
     return 0.5 * qd[0] ** 2 - 0.5 * (q[0] - p["mu"] * t) ** 2
 
 
-def test_what_has_no_equilibrium_is_refused():
+def test_scenes_without_an_equilibrium_are_refused():
     with pytest.raises(OrbitError, match=r"depends on time.*lag behind a drive"):
         jms.equilibrium(jms.Scene(pulled, params={"mu": 1.0}), [0.0])
     with pytest.raises(OrbitError, match="one of a family"):

@@ -30,7 +30,7 @@ def on_a_hill(a, segments):
 # Multipliers of 1e6 and 4e13.
 @pytest.mark.deep
 @pytest.mark.parametrize("a", [2.2, 5.0])
-def test_an_orbit_of_which_a_run_over_the_period_knows_nothing(a):
+def test_an_orbit_too_unstable_for_a_run_over_the_period(a):
     scene, orbit = on_a_hill(a, 8)
     np.testing.assert_allclose(orbit.q, [-1 / (1 + a**2)], rtol=1e-10)
     np.testing.assert_allclose(orbit.amplitude, [1 / (1 + a**2)], rtol=1e-8)
@@ -46,7 +46,7 @@ def test_an_orbit_of_which_a_run_over_the_period_knows_nothing(a):
     np.testing.assert_allclose(slopes["W"], -2 / (1 + a**2) ** 2, rtol=1e-8)
 
 
-def test_where_one_run_does_not_do_and_garbage():
+def test_single_shooting_fails_and_invalid_arguments_are_refused():
     with pytest.raises(OrbitError, match="pass more `segments`"):
         on_a_hill(5.0, 1)
     scene, orbit = on_a_hill(2.2, 4)

@@ -189,7 +189,7 @@ def extent_beside_a_held_mass(k=0.5, W=0.7, place=0.3):
 
 
 @pytest.mark.parametrize("place", [0.0, 0.3])
-def test_a_mass_that_sticks_throughout_is_held_in_its_place(place):
+def test_a_mass_that_sticks_throughout_keeps_its_position(place):
     scene, guess = beside_a_held_mass(), ([0.0, place], [0.0, 0.0])
     orbit = jms.periodic_orbit(scene, guess, period=of_frequency)
     extent = extent_beside_a_held_mass(place=place)
@@ -212,7 +212,7 @@ def test_a_mass_that_sticks_throughout_is_held_in_its_place(place):
         np.testing.assert_allclose(reverse[name], (above - below) / (2 * h), rtol=1e-7)
 
 
-def test_a_branch_with_a_held_mass_ends_where_its_friction_gives_way():
+def test_a_branch_with_a_held_mass_ends_at_its_break_away():
     scene, guess = beside_a_held_mass(0.6), ([0.0, 0.1], [0.0, 0.0])
     branch = jms.continue_orbits(scene, guess, "k", (0.5, 1.2), period=of_frequency, step=0.2)
     (place,) = {round(float(x.q[1]), 12) for x in branch.orbits}

@@ -275,7 +275,7 @@ def test_a_section_is_where_the_orbit_begins(van_der_pol):
     np.testing.assert_allclose(orbit.period, van_der_pol.period, rtol=1e-10)
 
 
-def test_what_goes_wrong_is_named(van_der_pol):
+def test_failures_raise_errors_that_name_the_cause(van_der_pol):
     start = ([0.0], [0.5])
     with pytest.raises(OrbitError, match="not crossed from below"):
         jms.periodic_orbit(VAN_DER_POL, start, settle=60.0, section=lambda q, qd: q[0] - 5.0)

@@ -82,7 +82,7 @@ def test_axes_have_names_units_scales_and_edges() -> None:
     np.testing.assert_array_equal(np.ma.getmaskarray(mesh.get_array()), dataset()["result"] != 0)
 
 
-def test_axes_may_be_chosen_and_fall() -> None:
+def test_axes_can_be_chosen_and_can_fall() -> None:
     axes = map2d(dataset(), "amplitude", x="k", y="load").axes[0]
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("stiffness [N/m]", "load")
     other = map2d(dataset().isel(k=slice(None, None, -1)), "amplitude", y="load").axes[0]
@@ -93,7 +93,7 @@ def test_axes_may_be_chosen_and_fall() -> None:
     np.testing.assert_allclose(bare.get_ylim(), (-0.5, 4.5))
 
 
-def test_lanes_without_a_number_say_why_and_how_many() -> None:
+def test_runs_without_a_number_are_counted_by_reason() -> None:
     entries = legend(map2d(dataset(), "amplitude"))
     assert list(entries) == ["2 of 20 failed: The limit was met", "1 of 20 not run"]
     figure = map2d(dataset(), "amplitude")
@@ -124,7 +124,7 @@ def test_classes_have_a_legend_instead_of_a_bar() -> None:
     assert counted.legends[0].get_title().get_text() == "count"
 
 
-def test_how_runs_ended_is_a_map_too() -> None:
+def test_map_of_result_codes() -> None:
     entries = legend(map2d(dataset(), "result"))
     assert list(entries) == ["It went well.", "The limit was met: raise it.", "1 of 20 not run"]
 
@@ -158,13 +158,13 @@ def each_mistake() -> Iterator[tuple[str, Any, dict[str, Any], str]]:
 @pytest.mark.parametrize(
     ("given", "arguments", "text"), [x[1:] for x in each_mistake()], ids=[x[0] for x in each_mistake()]
 )
-def test_mistakes_are_named(given: Any, arguments: dict[str, Any], text: str) -> None:
+def test_mistakes_raise_errors_that_name_the_cause(given: Any, arguments: dict[str, Any], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         map2d(given, **arguments)
 
 
 @pytest.mark.parametrize("zeta", [0.003, 0.1, 0.5, 0.9])
-def test_onset_speed_is_where_the_free_swing_just_comes_up_to_the_belt(zeta: float) -> None:
+def test_onset_speed_is_where_the_free_oscillation_just_reaches_the_belt_velocity(zeta: float) -> None:
     """The free swing itself, on a fine grid of time: its velocity past the first minimum, over that of the belt."""
     numbers = NUMBERS | {"c": 2.0 * zeta * np.sqrt(1.3 * 60.0)}
     w, u = np.sqrt(60.0 / 1.3), np.sqrt(1.0 - zeta**2)
@@ -179,7 +179,7 @@ def test_onset_speed_is_where_the_free_swing_just_comes_up_to_the_belt(zeta: flo
     np.testing.assert_allclose(slope, (ahead - behind) / 2e-3, rtol=1e-7)
 
 
-def test_onset_speed_at_its_ends() -> None:
+def test_onset_speed_at_the_limits_of_damping() -> None:
     """Small damping has a formula, critical damping no stick-slip; arrays broadcast, float32 is kept."""
     k = np.array([1e2, 1e6])
     small = belt_oscillator.onset_speed(k=k, **(NUMBERS | {"c": 1e-4}))

@@ -115,7 +115,7 @@ def test_symbolic_multipliers() -> None:
     np.testing.assert_allclose(skate.multipliers, [-0.7 * G / 2], rtol=1e-12)
 
 
-def test_energy_of_a_double_pendulum_is_kept() -> None:
+def test_energy_of_a_double_pendulum_is_constant() -> None:
     """Two links through a quarter turn, against the energy it started from."""
     scene = problems.n_link_pendulum.double_pendulum(m=np.array([1.0, 0.7]), l=np.array([0.8, 1.1]))
     run = simulate(scene, [1.5, -0.4], [0.0, 0.0], 2.0, rtol=1e-10, atol=1e-12)

@@ -49,7 +49,7 @@ def test_newtons_cradle():
 
 
 @pytest.mark.deep
-def test_a_block_rocks_as_housner_says():
+def test_a_block_rocks_as_in_the_formulas_of_housner():
     start, p = 0.02, rocking_block.PARAMS
     quarter = float(rocking_block.quarter_period(start))
     q0, qd0 = rocking_block.state(start)
@@ -67,7 +67,7 @@ def test_a_block_rocks_as_housner_says():
 
 
 @pytest.mark.deep
-def test_a_gripper_catches_what_falls():
+def test_a_gripper_catches_a_falling_object():
     d, v0 = gripper.PARAMS["d"], gripper.PARAMS["v0"]
 
     def end(mu, **more):
@@ -89,7 +89,7 @@ def test_a_gripper_catches_what_falls():
     np.testing.assert_array_equal(end(0.1).mode["friction"], 1)
 
 
-def test_of_stacked_blocks_the_upper_one_stays_behind():
+def test_the_upper_one_of_stacked_blocks_lags_behind():
     slips = stacked_blocks.slips()
     ts = jnp.asarray([0.9 * slips.floor, 0.5 * (slips.floor + slips.between), 1.5 * slips.between])
     run = jms.simulate(stacked_blocks.scene(), [0.0, 0.0], [0.0, 0.0], ts[-1], ts=ts, rtol=1e-10, atol=1e-12)

@@ -17,7 +17,7 @@ EXACT = {
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_runs_to_where_the_closed_form_says(name: str) -> None:
+def test_runs_end_at_the_closed_form(name: str) -> None:
     case = named_problems()[name]()
     assert case.name == name
     run = simulate(case.scene, case.q0, case.qd0, case.t1, rtol=1e-10, atol=1e-12, max_steps=case.max_steps)
@@ -28,7 +28,7 @@ def test_runs_to_where_the_closed_form_says(name: str) -> None:
         np.testing.assert_allclose(value, case.exact, atol=1e-8)
 
 
-def test_a_case_is_made_anew_and_the_registry_is_a_copy() -> None:
+def test_cases_are_new_and_the_registry_is_a_copy() -> None:
     named_problems().clear()
     assert len(named_problems()) >= 12
 

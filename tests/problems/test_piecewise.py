@@ -58,7 +58,7 @@ def test_ramp_in_closed_form():
     assert motion.q[0] == pytest.approx(0.125 * s**2 + 1e-4 * s**3 / 12.0, rel=1e-9)
 
 
-def test_undamped_spring_stops_where_it_must():
+def test_undamped_spring_stops_at_its_closed_form():
     """Every half swing loses 2 Fc/k: from 10.3 Fc/k five of them leave 0.3, where it sticks."""
     motion = linear_stick_slip.motion(box([], k=8.0, limits=(1.0, 1.0)), np.array([10.3 / 8.0]), np.zeros(1), 20.0)
     assert motion.q[0] == pytest.approx(-0.3 / 8.0, rel=1e-10)

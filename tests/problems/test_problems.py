@@ -163,7 +163,7 @@ def test_the_paradox_begins_at_four_thirds() -> None:
     np.testing.assert_allclose(at_two, 0.0, atol=1e-15)
 
 
-def test_each_number_of_the_bead_sits_in_one_place() -> None:
+def test_each_parameter_of_the_bead_is_stored_once() -> None:
     """So the derivative of its acceleration by a parameter of the scene is that of the closed form."""
     q, qd, mode = jnp.array([1.3]), jnp.array([-2.1]), jnp.array([-1.0])
     numbers = {**SPIRAL, "k": 0.8}

@@ -33,7 +33,7 @@ def test_the_locked_drive_holds_to_rounding(load: float) -> None:
         assert end({"load": load, "mu": ROUGH, "motor": motor}, 0.0).mode["friction"][-1] == side
 
 
-def test_it_locks_itself_from_the_lead_angle_on() -> None:
+def test_the_drive_is_self_locking_from_the_lead_angle_on() -> None:
     lead = worm_drive.PARAMS["lead"]
     for over in (1e-9, -1e-9):
         run = end({"mu": float(np.tan(lead * (1.0 + over)))}, 0.0)
@@ -77,7 +77,7 @@ def test_efficiency_in_steady_motion_to_rounding() -> None:
         assert float(force) == pytest.approx(float(motor) - load * ratio, abs=1e-12)
 
 
-def test_jamming_is_named() -> None:
+def test_jamming_raises_an_error_that_names_it() -> None:
     # A heavy wheel on a light worm: J1/r1^2 < (J2/r2^2) tan(lead) tan(phi - lead).
     with pytest.raises(jms.SimulationError, match="jamming"):
         end({"mu": 0.6, "J1": 1e-6, "J2": 1.0}, -3.0)
