@@ -48,8 +48,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for source, target in _COPIES.items():
         text = (ROOT / source).read_text().replace("](docs/", "](").replace("](README.md", "](index.md")
         files.append(File.generated(config, target, content=text))
-    worker = Path(__file__).with_name("worker.js")
-    files.append(File.generated(config, "assets/worker.js", abs_src_path=str(worker)))
+    for name in ("worker.js", "site.css"):
+        path = Path(__file__).with_name(name)
+        files.append(File.generated(config, f"assets/{name}", abs_src_path=str(path)))
     for room in api.rooms():
         files.append(File.generated(config, f"api/{room}.md", content=api.page(room)))
     for example in gallery.examples():
