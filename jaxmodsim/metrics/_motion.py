@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._core.safe import safe_norm
@@ -211,7 +212,7 @@ def _modes_at_ends(run: Trajectory, name: str, events: Events, own: Array) -> tu
     return jnp.where(changed, events.before[first], constant), jnp.where(changed, events.after[last], constant)
 
 
-def _last_two(t: Float[Array, " events"], these: Array) -> tuple[Array, Array, Array]:
+def _last_two(t: Float[Array | np.ndarray, " events"], these: Array) -> tuple[Array, Array, Array]:
     """Time [s] of the last of these events, time since the one before, and whether there are two.
 
     Times of missing events are zero, and so are their gradients.
