@@ -34,7 +34,7 @@ def run(trajectory: Trajectory) -> Figure:
     scene, table = trajectory.scene, trajectory.columns
     if len(table.time) < 2:
         raise ValueError(
-            f"plot.run needs a run saved at two or more times, but it has {len(table.time)}: pass the times, as in"
+            f"A plot of a run needs two saved times or more, but this one has {len(table.time)}: pass the times, as in"
             " simulate(..., ts=jnp.linspace(t0, t1, 1001))."
         )
     panels: list[tuple[str, dict[str, np.ndarray]]] = []
