@@ -58,7 +58,7 @@ _GENERAL = (
     "The constraints are not kept: they contradict each other here, have become dependent (a singular configuration),"
     " or drift without bound (project=False).",
     "Gauss works with momenta, and needs a Lagrangian that is quadratic in the velocities: use another solver.",
-    "atol is above the width [m/s] of a Regularized law: the error control does not resolve motion within the width, and"
+    "atol is above the width [m/s] of a Regularized law: the error control does not resolve motion within it, and"
     " a break-away comes late. Pass atol no larger than the width.",
     "The times or tolerances do not make a run: t1 must not be before t0, ts must increase within [t0, t1], dt and"
     " dtmax must be positive, rtol and atol not negative and not both zero, and all of them finite.",
