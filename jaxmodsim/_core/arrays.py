@@ -1,7 +1,7 @@
 """Array types, conversion of known numbers, look-up in increasing times, and fusion barriers."""
 
 from collections.abc import Callable, Sequence
-from typing import TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import jax
 import jax.core
@@ -13,7 +13,10 @@ Scalar: TypeAlias = Float[Array, ""]
 # One number per coordinate.
 PerDof: TypeAlias = Float[Array, " dof"]
 # One number or flag as diffrax passes it: an array, or a number of Python.
-Real: TypeAlias = Shaped[ArrayLike, ""]
+if TYPE_CHECKING:
+    Real: TypeAlias = Any  # type checkers know no arithmetic of such a union
+else:
+    Real: TypeAlias = Shaped[ArrayLike, ""]
 # A function of arrays.
 Fn: TypeAlias = Callable[..., PyTree]
 _Tree = TypeVar("_Tree")

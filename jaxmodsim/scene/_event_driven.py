@@ -242,7 +242,9 @@ def assemble_friction(
     planar = PlanarSlip(*(jnp.stack(column) for column in columns[6:])) if planes else None
     widths += [1] * len(reaction_loaded)
     loaded = loads(jnp.stack(directions), tuple(widths))
-    return FrictionElements(v, rate, delassus, jnp.stack(minv_jt), *forces, planar, loaded, tuple(planes))
+    return FrictionElements(
+        v, rate, delassus, jnp.stack(minv_jt), *forces, planar=planar, loads=loaded, planes=tuple(planes)
+    )
 
 
 def solve_friction_forces(

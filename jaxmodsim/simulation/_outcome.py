@@ -48,8 +48,8 @@ _GENERAL = (
     "The step limit was reached before t1: pass a larger max_steps, a larger dt or looser tolerances.",
     "The step size fell below what the time can resolve: the vector field jumps or is singular there. Pass atol > 0"
     " where something comes to rest.",
-    "The vector field gave a value that is not finite (NaN or infinity). With a fixed step this is also how a"
-    " step too long for the stiffness ends: pass a smaller dt, or solver=jaxmodsim.Rodas5P().",
+    "The vector field gave a value that is not finite (NaN or infinity). A fixed step that is too long for the"
+    " stiffness ends the same way: pass a smaller dt, or solver=jaxmodsim.Rodas5P().",
     "The limit of mode changes was reached before t1: pass a larger max_events.",
     "At a saved time an element sticks under a load beyond its limit: a short pulse was stepped over, as nothing moves"
     " in stick and the steps grow. Pass dtmax, the longest step that cannot miss it, or a fixed step dt.",
@@ -58,12 +58,12 @@ _GENERAL = (
     "The constraints are not kept: they contradict each other here, have become dependent (a singular configuration),"
     " or drift without bound (project=False).",
     "Gauss works with momenta, and needs a Lagrangian that is quadratic in the velocities: use another solver.",
-    "atol is above the width [m/s] of a Regularized law: what happens within the width is below what the error control"
-    " sees, and a break-away comes late. Pass atol no larger than the width.",
+    "atol is above the width [m/s] of a Regularized law: the error control does not resolve motion within it, and"
+    " a break-away comes late. Pass atol no larger than the width.",
     "The times or tolerances do not make a run: t1 must not be before t0, ts must increase within [t0, t1], dt and"
     " dtmax must be positive, rtol and atol not negative and not both zero, and all of them finite.",
-    "A contact is violated: its gap is negative. A run has to begin where all gaps are zero or positive; one that comes"
-    " to this later has missed an impact: pass smaller tolerances or dtmax, or compute in float64.",
+    "A contact is violated: its gap is negative. A run must start with gaps that are zero or positive; a later negative"
+    " gap is a missed impact: pass smaller tolerances or dtmax, or compute in float64.",
 )
 
 # Additions to the sentences of early ends for scenes whose forces may chatter, and for those with contacts.

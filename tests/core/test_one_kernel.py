@@ -1,5 +1,7 @@
 """Programs compiled as one kernel: what is marked, and that it computes the same."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -94,6 +96,17 @@ def test_few_runs_side_by_side_are_one_kernel_and_many_are_not():
         x = jnp.arange(float(runs))
         assert (_MARK in call.lower(x).as_text()) == marked
         np.testing.assert_array_equal(call(x), x / 32)
+
+
+def test_another_call_of_the_same_function_keeps_its_own():
+    decay = jax.jit(lambda x: jax.lax.fori_loop(0, 5, lambda _, x: 0.5 * x, x))
+    both = jax.jit(lambda x: (in_one_kernel(decay, x), decay(2.0 * x)))
+    text = both.lower(X).as_text()
+    assert text.count(_MARK) == 1
+    marked, plain = re.findall(r"call @(\S+?)\(", text)[:2]
+    assert marked != plain
+    for one, factor in zip(both(X), (1.0, 2.0), strict=True):
+        np.testing.assert_array_equal(one, factor * X / 32)
 
 
 def test_a_run_and_its_gradient_are_kernels(pendulum):

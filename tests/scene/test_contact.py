@@ -39,7 +39,7 @@ def random_contact(rng: np.random.Generator, n: int, stiction: bool) -> Friction
     level = limit * rng.uniform(0.5, 1.0, n) if stiction else limit
     base = 3.0 * rng.normal(size=n) * np.diag(coupling)
     numbers = (np.zeros(n), base, coupling, directions, level, -level, limit, limit)
-    return FrictionElements(*(jnp.asarray(x) for x in numbers))
+    return FrictionElements(*(jnp.asarray(x) for x in numbers), planar=None, loads=None, planes=())
 
 
 @jax.jit

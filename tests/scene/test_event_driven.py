@@ -35,7 +35,9 @@ def scalars(**numbers: Any) -> FrictionElements:
         "lower": [1.0, 1.0],
     }
     loads = numbers.pop("loads", None)
-    return FrictionElements(**{name: jnp.asarray(x, float) for name, x in (usual | numbers).items()}, loads=loads)
+    return FrictionElements(
+        **{name: jnp.asarray(x, float) for name, x in (usual | numbers).items()}, planar=None, loads=loads, planes=()
+    )
 
 
 def plane(v: Any, free: Any = (0.0, 0.0, 0.0)) -> FrictionElements:

@@ -101,7 +101,8 @@ def test_a_step_reports_to_the_controller() -> None:
         )
         assert (bool(accept), bool(jump), after.events == 1.0) == (accepted, accepted, accepted)
         np.testing.assert_allclose(t_next, following, rtol=1e-12)
-    np.testing.assert_allclose(after.log.t[0], 1.0, rtol=1e-12)
+    log: Any = after.log
+    np.testing.assert_allclose(log.t[0], 1.0, rtol=1e-12)
     assert (after.mode, kept[1].resets, bool(kept[1].armed[0])) == (1.0, 1, False)
 
 
