@@ -130,7 +130,8 @@ def test_films(belt: Trajectory, tmp_path: Path) -> None:
     with Image.open(tmp_path / "film.webp") as image:
         for i in (0, 8, 16):
             image.seek(i)
-            assert Image.alpha_composite(shown[0], shown[1 + i]) == image.convert("RGBA")
+            composed = Image.alpha_composite(shown[0], shown[1 + i])
+            np.testing.assert_array_equal(np.asarray(composed), np.asarray(image.convert("RGBA")))
     in_space = plot.animate(belt, lambda q: jnp.stack([jnp.stack([q[0], q[0] ** 2, 1.0 - q[0]])]), fps=1)
     in_space.save(tmp_path / "space.gif")
     with Image.open(tmp_path / "space.gif") as image:
