@@ -27,8 +27,8 @@ APPLICATIONS = {
     "identify": 9250,
     "sweeps": 2150,
     "export": 1100,
-    "problems": 3000,
-    "plot": 1700,
+    "problems": 2700,
+    "plot": 1650,
     "cli": 3050,
 }
 LABORATORY = ("tests", "bench")
