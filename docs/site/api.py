@@ -6,6 +6,20 @@ from pathlib import Path
 PACKAGE = Path(__file__).resolve().parents[2] / "jaxmodsim"
 # Rooms without an interface: the command line has a page of its own, what is in _core is private.
 _NONE = ("_core", "cli")
+# Names with which most users begin, then those that `jaxmodsim` itself exports, come first on a page.
+_FIRST = (
+    "simulate",
+    "Trajectory",
+    "Events",
+    "Scene",
+    "Friction",
+    "AppliedForce",
+    "fit",
+    "Record",
+    "FitResult",
+    "sweep",
+)
+_ELSEWHERE = "*The names above are in `jaxmodsim` itself, those below in this module alone.*"
 
 
 def rooms() -> list[str]:
@@ -25,11 +39,28 @@ def page(room: str) -> str:
     """Markdown of a room: its docstring, then an entry for each name."""
     summary = ast.get_docstring(ast.parse((PACKAGE / room / "__init__.py").read_text()))
     lines = [f"# {room}", "", summary or "", ""]
-    for name in public_names(room):
+    everyday = _everyday()
+    names = sorted(public_names(room), key=lambda name: _rank(name, everyday))  # equal ranks stay in order
+    for name, before in zip(names, [names[0], *names], strict=False):
         short = name.rpartition(".")[2]
+        if before.rpartition(".")[2] in everyday and short not in everyday:
+            lines += [_ELSEWHERE, ""]
         # Constants have no docstring, and some are names of an unpacked tuple, which mkdocstrings does not see.
         lines += [f"## `{short}` {{#{name}}}", "", _comment(name), ""] if short.isupper() else [f"::: {name}", ""]
     return "\n".join(lines)
+
+
+def _everyday() -> set[str]:
+    """Names that `jaxmodsim` itself exports."""
+    nodes = ast.walk(ast.parse((PACKAGE / "__init__.py").read_text()))
+    return {alias.name for node in nodes if isinstance(node, ast.ImportFrom) and node.level for alias in node.names}
+
+
+def _rank(name: str, everyday: set[str]) -> int:
+    short = name.rpartition(".")[2]
+    if short in _FIRST:
+        return _FIRST.index(short)
+    return len(_FIRST) + (short not in everyday)
 
 
 def _comment(name: str) -> str:
