@@ -10,7 +10,6 @@ _NONE = ("_core", "cli")
 _FIRST = (
     "simulate",
     "Trajectory",
-    "Events",
     "Scene",
     "Friction",
     "AppliedForce",

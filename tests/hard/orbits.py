@@ -341,7 +341,7 @@ def cases() -> list[HardCase]:
             "orbit_in_single_precision",
             "Shooting in float32.",
             "A residual that never falls, or an orbit that is none.",
-            RefusedCalls({"float32": _single}, {"float32": "need float64"}),
+            RefusedCalls({"float32": _single}, {"float32": "needs float64"}),
             asks="a sentence that asks for float64",
         ),
     ]
