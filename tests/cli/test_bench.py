@@ -74,7 +74,7 @@ def test_results_of_what_ended_well_are_recorded_and_a_failure_shows(suite):
 def test_nothing_is_recorded_with_uncommitted_changes(suite):
     code, text = suite("dirty")
     assert code == 0
-    assert "dirty is not recorded, as there are uncommitted changes" in text
+    assert "dirty is not recorded because of uncommitted changes" in text
     assert [path.name for path in (suite.folder / "results").iterdir()] == ["bad.json"]
 
 
@@ -88,7 +88,7 @@ def test_small_runs_two_at_a_time_leave_nothing(suite, tmp_path):
 
 @pytest.mark.parametrize(
     ("arguments", "text"),
-    [(("--jobs", "2"), "--jobs needs"), (("zz",), "no bench is called 'zz'; there are good, bad")],
+    [(("--jobs", "2"), "--jobs needs"), (("zz",), "no bench is called 'zz'; there are: good, bad")],
 )
 def test_usage_errors(suite, arguments, text):
     code, printed = suite(*arguments)
