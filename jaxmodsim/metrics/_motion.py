@@ -173,7 +173,7 @@ def magnitude_of(x: Float[Array, "time ..."]) -> Float[Array, " time"]:
 
 def changes_of(run: Trajectory, name: str) -> tuple[Events, Array]:
     """Events of a run, and a mask of those that are mode changes of this element."""
-    events = run.events
+    events = jax.tree.map(jnp.asarray, run.events)  # where an index may be traced
     return events, (events.effect == run.scene.names.index(name)) & jnp.isfinite(events.t)
 
 
