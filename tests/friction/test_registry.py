@@ -137,7 +137,7 @@ def test_it_is_a_candidate_of_a_fit(registered: type[SoftCoulomb], run_command: 
     code, _, errors = run_command("fit", str(path), "--laws", "softcoulom")
     assert code == 2
     assert "softcoulomb" in errors.split("the laws are")[1]
-    assert "Did you mean softcoulomb?" in errors
+    assert "Did you mean 'softcoulomb'?" in errors
 
 
 @pytest.mark.quick
