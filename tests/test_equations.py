@@ -71,5 +71,7 @@ def test_equations_are_listed_and_recorded(
     assert sum(own for _, _, own in rows) == count
     inner = {name: inner for name, inner, _ in rows}
     assert count > inner["simulation/_solve.py:solve"] > inner["scene/_dynamics.py:forward_dynamics"] > 0
-    with pytest.raises(typer.BadParameter, match="no scene is called 'a box'; there are: two viscous joints, LuGre box"):
+    with pytest.raises(
+        typer.BadParameter, match="no scene is called 'a box'; there are: two viscous joints, LuGre box"
+    ):
         census.main(["a box"])
