@@ -88,7 +88,7 @@ def test_small_runs_two_at_a_time_leave_nothing(suite, tmp_path):
 
 @pytest.mark.parametrize(
     ("arguments", "text"),
-    [(("--jobs", "2"), "--jobs needs"), (("zz",), "no bench is called 'zz'; there are: good, bad")],
+    [(("--jobs", "2"), "--jobs needs"), (("zz",), "no bench begins with 'zz'; there are: good, bad")],
 )
 def test_usage_errors(suite, arguments, text):
     code, printed = suite(*arguments)
