@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _Value = TypeVar("_Value")
 
 
-@partial(jtu.register_dataclass, data_fields=("t", "effect", "before", "after"), meta_fields=("labels",))
+@jtu.register_dataclass
 @dataclass(frozen=True, repr=False)
 class Events(AbstractReadable):
     """Mode changes along a run in order of time; `print` shows them in words.
@@ -56,12 +56,12 @@ class Events(AbstractReadable):
     effect: Int[Array | np.ndarray, "*runs events"]
     before: Int[Array | np.ndarray, "*runs events"]
     after: Int[Array | np.ndarray, "*runs events"]
-    labels: tuple[tuple[str, tuple[tuple[int, str], ...]], ...] = ()
+    labels: tuple[tuple[str, tuple[tuple[int, str], ...]], ...] = field(default=(), metadata={"static": True})
 
     __repr__ = AbstractReadable.__str__
 
-    def changes(self) -> tuple["ModeChange", ...]:
-        """The entries in words; outside of `jax.jit`."""
+    def _in_words(self) -> tuple["ModeChange", ...]:
+        """The entries in words, for `print` and `Trajectory.mode_changes`; outside of `jax.jit`."""
         columns = (np.asarray(x).tolist() for x in (self.t, self.effect, self.before, self.after))
         happened = [entry for entry in zip(*columns, strict=True) if entry[0] < math.inf]
         words = [(name, dict(modes)) for name, modes in self.labels]
@@ -86,11 +86,7 @@ _MODES, _PLANE_MODES = {0: "stick", 1: "forward", -1: "backward"}, {0: "stick", 
 _CONTACT_MODES, _SWITCH_MODES = {0: "open", 1: "closed"}, {1: "above", -1: "below"}
 
 
-@partial(
-    jtu.register_dataclass,
-    data_fields=("kinetic", "potential", "stored", "work_in", "dissipated", "balance"),
-    meta_fields=(),
-)
+@jtu.register_dataclass
 @dataclass(frozen=True, repr=False)
 class Energy(AbstractReadable):
     """Energies along a run [J], shape `[time]` each.
@@ -236,7 +232,7 @@ class Trajectory(AbstractReadable):
     @property
     def mode_changes(self) -> tuple[ModeChange, ...]:
         """`events` in words; outside of `jax.jit`."""
-        return self.events.changes()
+        return self.events._in_words()
 
     @property
     def event_forces(self) -> dict[str, Array]:
@@ -404,7 +400,7 @@ def _(run: Trajectory) -> Table:
 def _(events: Events) -> Table:
     if not is_known(events.t) or events.t.ndim != 1:
         return Table(f"Events, times of shape {events.t.shape}", (), [])
-    rows = [(f"{t:.6g}", *words) for t, *words in events.changes()]
+    rows = [(f"{t:.6g}", *words) for t, *words in events._in_words()]
     return Table(f"{len(rows)} mode changes", ("t [s]", "effect", "before", "after"), rows)
 
 
