@@ -185,11 +185,7 @@ def cycle_of(run: Trajectory, element: str) -> tuple[Array, Array]:
 
 
 def _element_of(run: Trajectory, name: str) -> Friction:
-    elements = {
-        known: effect
-        for known, effect in zip(run.scene.names, run.scene.effects, strict=True)
-        if isinstance(effect, Friction)
-    }
+    elements = run.scene.friction
     if name not in elements:
         raise ValueError(f"The scene has no friction element {name!r}; there are: {', '.join(elements) or 'none'}.")
     return elements[name]

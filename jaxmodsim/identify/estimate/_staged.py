@@ -174,7 +174,7 @@ def _friction(problem: FitProblem, values: Mapping[str, ArrayLike]) -> Callable[
     scene = with_values(problem.engine.model, values)
     if isinstance(scene, AbstractLaw):
         return lambda s: _settled(scene.bind_state(s.t, s.q[None], s.v[None], s.inputs), s.v)
-    elements = [effect for effect in scene.effects if isinstance(effect, Friction)]
+    elements = list(scene.friction.values())
 
     def friction(s: _Sampled) -> Array:
         here = _driven(scene, s.inputs)
@@ -194,7 +194,7 @@ def _slip(problem: FitProblem) -> Callable[[_Sampled], Array]:
     scene = problem.engine.model
     if isinstance(scene, AbstractLaw):
         return lambda s: jnp.abs(s.v)
-    elements = [effect for effect in scene.effects if isinstance(effect, Friction)]
+    elements = list(scene.friction.values())
 
     def slip(s: _Sampled) -> Array:
         here = _driven(scene, s.inputs)

@@ -230,8 +230,8 @@ def identifiability_issues(
     motions = tuple(motions)
     frictions: list[tuple[str, AbstractLaw, Friction | None, PyTree]] = []
     if isinstance(model, Scene):
-        for name, effect in zip(model.names, model.effects, strict=True):
-            if isinstance(effect, Friction) and any(f.startswith(f"{name}.") for f in free):
+        for name, effect in model.friction.items():
+            if any(f.startswith(f"{name}.") for f in free):
                 frictions.append((name, effect.law, effect, model.params))
     else:
         frictions.append(("", model, None, None))
