@@ -29,7 +29,7 @@ def cholesky_pivots(matrix: Float[Array, "n n"]) -> Float[Array, " n"]:
     the result is that entry.
     """
     n = matrix.shape[0]
-    rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
+    rows = [list(jnp.unstack(row)) for row in jnp.unstack(matrix)]
     ratios = []
     for k in range(n):
         diagonal = matrix[k, k]
@@ -72,7 +72,7 @@ def factor_positive_definite(matrix: Float[Array, "n n"]) -> Callable[[Array], A
     if n > MAX_UNROLLED_CHOLESKY:
         lower = jnp.linalg.cholesky(matrix)
         return lambda rhs: jax.scipy.linalg.cho_solve((lower, True), rhs)
-    rows = [[matrix[i, j] for j in range(i + 1)] for i in range(n)]
+    rows = [list(jnp.unstack(row)) for row in jnp.unstack(matrix)]
     factors: dict[tuple[int, int], Array] = {}
     for k in range(n):
         rows[k][k] = jnp.where(rows[k][k] > 0, rows[k][k], jnp.nan)
@@ -82,7 +82,7 @@ def factor_positive_definite(matrix: Float[Array, "n n"]) -> Callable[[Array], A
                 rows[i][j] = rows[i][j] - factors[i, k] * rows[j][k]
 
     def solve(rhs: Array) -> Array:
-        x = [rhs[i] for i in range(n)]
+        x = list(jnp.unstack(rhs))
         for k in range(n):
             for i in range(k + 1, n):
                 x[i] = x[i] - factors[i, k] * x[k]

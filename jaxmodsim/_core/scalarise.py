@@ -185,8 +185,7 @@ class AbstractScalars(abc.ABC):
         if isinstance(x, np.ndarray):
             return _array(x.shape, lambda index: x[index])
         if id(x) not in self.memory:
-            flat = jnp.reshape(x, -1)
-            entries = iter([jax.lax.index_in_dim(flat, i, keepdims=False) for i in range(flat.size)])
+            entries = iter(jnp.unstack(jnp.reshape(x, -1)))
             self.memory[id(x)] = x, _array(x.shape, lambda _: next(entries))
         return self.memory[id(x)][1]
 

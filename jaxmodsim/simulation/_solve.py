@@ -1,5 +1,6 @@
 """The compiled part of a run."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -257,6 +258,18 @@ def _start_code(request: RunRequest, functions: RunFunctions, mode: Array | None
     return jnp.where(_well_posed(request), start, ILL_POSED)
 
 
+def _field(functions: RunFunctions, method: dfx.AbstractSolver, exact: bool) -> Callable[..., PyTree]:
+    """The vector field of a run, with modes if `exact`.
+
+    The stages of an explicit Runge-Kutta method are one loop. Reverse mode evaluates the field of each stage again: an
+    array for each of its intermediate numbers took most of the time to compile a gradient.
+    """
+    field = functions.derivative if exact else functions.plain_derivative
+    if not isinstance(method, dfx.AbstractERK):
+        return field
+    return jax.checkpoint(lambda *at: field(*at), prevent_cse=False)
+
+
 def _integrate(request: RunRequest) -> RunOutput:
     """Run diffrax, with modes if the scene has them, and with a log, work and a series if requested."""
     scene, exact, series = request.scene, bool(request.scene.mode_names), request.choices.series
@@ -289,7 +302,7 @@ def _integrate(request: RunRequest) -> RunOutput:
         subs = [dfx.SubSaveAt(t1=True, fn=last)] + ([] if ts is None else [dfx.SubSaveAt(ts=ts, fn=saved)])
         subs += [] if series is None else [dfx.SubSaveAt(t0=True, steps=True, fn=observed)]
         return dfx.diffeqsolve(
-            dfx.ODETerm(functions.derivative if exact else functions.plain_derivative),
+            dfx.ODETerm(_field(functions, method, exact)),
             solver,
             request.t0,
             jnp.where(starts, request.t1, request.t0),
@@ -371,9 +384,10 @@ def _kept(
     def fill(x: Array, filling: Array | float) -> Array:
         return jnp.where(jnp.expand_dims(reached, tuple(range(1, x.ndim))), x, filling)
 
-    # Rows at times that were not reached are evaluated at the end of the run.
+    # Rows at times that were not reached are evaluated at the end of the run. Reverse mode evaluates each row again.
     t_there, (y, modes) = jtu.tree_map(lambda x: fill(x, x[:1]), (t, rows))
-    y, instants = jax.lax.map(lambda row: functions.keep(row[0], row[1], request.scene, row[2]), (t_there, y, modes))
+    keep = lambda row: functions.keep(row[0], row[1], request.scene, row[2])  # noqa: E731
+    y, instants = jax.lax.map(jax.checkpoint(keep, prevent_cse=False), (t_there, y, modes))
     t, y, modes = jtu.tree_map(lambda x: fill(x, jnp.inf), (t, y, modes))
     return t, y, modes, instants
 
