@@ -451,7 +451,8 @@ def next_modes(
     n = mode.shape[0]
     wider = 1.0 + 16.0 * float(jnp.finfo(mode.dtype).eps)
     before = solve_friction_forces(elements, mode)
-    load = elements.onset_mode(before.force[:n], rest)
+    # The direction is that of the nearer limit, which may be zero in one direction (a freewheel).
+    load = elements.onset_mode((before.force - 0.5 * (before.upper - before.lower))[:n], rest)
     mode = jnp.where(still, jnp.where(at_limit, load, jnp.zeros_like(mode)), mode)
     scale = 1e-6 * jnp.max(jnp.abs(elements.delassus) * jnp.maximum(before.upper, before.lower)[None, :], axis=1)[:n]
 
