@@ -50,9 +50,9 @@ def friction_stop(p: Numbers) -> Setup:
     def lagrangian(t, q, qd, p):
         return masses(t, q, qd, p) - 0.5 * p["c"] * (q[0] + 0.25) ** 2
 
-    stops = jms.end_stops(lambda q: q[0], lower=-0.4, upper=0.4, restitution=0.0)
+    stop = jms.Contact(lambda t, q, p: q[0] + 0.4, restitution=0.0, name="lower")
     scene = jms.Scene(
-        lagrangian, {"m": p["m"][None], "c": p["c"]}, (jms.Friction(_stribeck(p), name="stop2"),), constraints=stops
+        lagrangian, {"m": p["m"][None], "c": p["c"]}, (jms.Friction(_stribeck(p), name="stop2"),), constraints=(stop,)
     )
     return Setup(scene, np.zeros(1), np.array([-5.0]))
 
@@ -104,6 +104,7 @@ CASES = (
         modes=((0.0605969540595, "stop2 forward"), (0.201105639685, "stop2 backward"), (0.341616547959, "stop2 forward"),
                (0.482140109526, "stop2 backward"), (0.622692612163, "stop2 forward"),
                (0.763328813916, "stop2 backward"), (0.904204209026, "stop2 forward"), (1.04597406053, "stop2 stick")),
+        note="Without the upper stop, which the mass does not reach.",
     ),
     _case(
         "ElastoGap", elasto_gap, {"m": 1.0, "c": 10.0, "d": 1.5}, 5.0,
