@@ -162,12 +162,12 @@ def target_velocity(vx: float = 9.0, vy: float = -4.5) -> tuple[np.ndarray, int]
 
     slope = jax.jit(jax.jacfwd(end, has_aux=True))
     v = jnp.array([vx, vy])
-    for count in range(1, 21):
+    count, change = 0, v
+    while jnp.max(jnp.abs(change)) > 1e-12 and count < 20:
+        count += 1
         jacobian, place = slope(v)
         change = jnp.linalg.solve(jacobian, place - jnp.array([-2.0, 1.5]))
         v = v - change
-        if jnp.max(jnp.abs(change)) < 1e-12:
-            break
     return np.asarray(v), count
 
 

@@ -5,6 +5,7 @@ exponential of a matrix, or, where neither exists, an integration by DOP853 at 1
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -175,10 +176,11 @@ def switched(
         if not crossed:
             path.until(piece, end)
             return
-        roots = []
-        for at, i in crossed:
-            roots.append((_root(lambda t, i=i: signs[i] * guards(t, motion.refined(t))[i], ts[at], ts[at + 1]), i))
-        root, i = min(roots)
+
+        def inside(i: int, t: float, motion: Any = motion, signs: Any = signs) -> float:
+            return signs[i] * guards(t, motion.refined(t))[i]
+
+        root, i = min((_root(partial(inside, i), ts[at], ts[at + 1]), i) for at, i in crossed)
         path.y, path.t = np.asarray(motion.refined(root), float), root
         signs = np.where(np.arange(count) == i, -signs, signs)
 

@@ -156,8 +156,8 @@ def one_way_clutch_disengaged(j1, j2, load, torque) -> Reference:
     return Reference(np.array([path.y[0], path.y[2], path.y[1] - path.y[0], path.y[3] - path.y[2]]), path.events)
 
 
-# A lossy gear of ratio r: J1 r w' = tau1 - lambda - F, J2 w' = r lambda + tau2 with the speed w of inertia 2, the torque
-# lambda > 0 in the mesh, and F = k lambda: k = 1/eta - 1 if the gear drives (w > 0), and -(1 - eta) if it is driven.
+# A lossy gear of ratio r: J1 r w' = tau1 - lambda - F, J2 w' = r lambda + tau2 with the speed w of inertia 2, the
+# torque lambda > 0 in the mesh, and F = k lambda: k = 1/eta - 1 if the gear drives (w > 0), and -(1 - eta) if it is driven.
 def lossy_gear_demo1(j1, j2, eta, drive, load) -> Reference:
     """A gear with losses locks, drives and is driven; torques are functions of time alone."""
     wave, push = Wave(drive, TWO_PI), [Wave(-load), Wave(0.25 * load, power=1)]
@@ -185,8 +185,8 @@ def lossy_gear_demo1(j1, j2, eta, drive, load) -> Reference:
 def lossy_gear_demo2(j1, j2, eta, drive, load, bearing) -> Reference:
     """The same with friction `bearing (1 + |w1|)` in the bearing of inertia 1: a linear system in each mode.
 
-    At rest both elements hold, and no equation says which share of the torque each has. The one that lets go last begins
-    the motion: the gear forwards, the bearing backwards.
+    At rest both elements hold, and no equation says which share of the torque each has. The one that lets go last
+    begins the motion: the gear forwards, the bearing backwards.
     """
 
     def factor(sign):
@@ -213,7 +213,7 @@ def lossy_gear_demo2(j1, j2, eta, drive, load, bearing) -> Reference:
 
 
 def lossy_gear_demo3(j1, j2, bearing) -> Reference:
-    """Equal inertias and bearings stop together, without a torque in the mesh; the load after 0.5 s is within the limit."""
+    """Equal inertias and bearings stop together, without a torque in the mesh; the later load does not move them."""
     stop = 10.0 * (j1 + j2) / (2.0 * bearing)
     return Reference(np.array([5.0 * stop, 0.0]), [(stop, "gear stick")])
 

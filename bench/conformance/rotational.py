@@ -189,7 +189,9 @@ def simple_gear_shift(p: Numbers) -> Setup:
     return Setup(scene, np.zeros(2), np.zeros(2))
 
 
-def _case(name: str, make, numbers: dict[str, float], t1: float, outputs, observe, published, reference, **more) -> Case:
+def _case(
+    name: str, make, numbers: dict[str, float], t1: float, outputs, observe, published, reference, **more
+) -> Case:
     def exact(**numbers: float):
         return reference(*numbers.values())
 

@@ -6,8 +6,8 @@ import numpy as np
 import jaxmodsim as jms
 from bench.conformance import references_translational as references
 from bench.conformance.case import Case, Numbers, Setup
-from bench.conformance.rotational import eddy_current_brake, gap_force
 from bench.conformance.references import eddy_current_brake as exact_eddy_current_brake
+from bench.conformance.rotational import eddy_current_brake, gap_force
 
 SOURCE = "modelica/ModelicaStandardLibrary @ bd753330a, Modelica/Mechanics/Translational/Examples/{}.mo"
 RESULTS = "modelica/MAP-LIB_ReferenceResults @ d6a2b9b2, Modelica/Mechanics/Translational/Examples/{0}/{0}.csv"
@@ -40,7 +40,9 @@ def brake(p: Numbers) -> Setup:
 def friction(p: Numbers) -> Setup:
     """A mass with Stribeck friction under a sine force."""
     force = jms.AppliedForce(lambda t, q, qd, p: p["force"] * jnp.sin(0.5 * jnp.pi * t)[None])
-    scene = jms.Scene(masses, {"m": p["m"][None], "force": p["force"]}, (force, jms.Friction(_stribeck(p), name="stop1")))
+    scene = jms.Scene(
+        masses, {"m": p["m"][None], "force": p["force"]}, (force, jms.Friction(_stribeck(p), name="stop1"))
+    )
     return Setup(scene, np.zeros(1), np.zeros(1))
 
 
@@ -69,7 +71,9 @@ def elasto_gap(p: Numbers) -> Setup:
     return Setup(jms.Scene(masses, params, (jms.AppliedForce(forces),)), np.full(2, 2.0), np.zeros(2))
 
 
-def _case(name: str, make, numbers: dict[str, float], t1: float, outputs, observe, published, reference, **more) -> Case:
+def _case(
+    name: str, make, numbers: dict[str, float], t1: float, outputs, observe, published, reference, **more
+) -> Case:
     def exact(**numbers: float):
         return reference(*numbers.values())
 
@@ -101,9 +105,10 @@ CASES = (
         "Friction, stop2", friction_stop, {"m": 1.0, "Fv": 1.0, "Fc": 3.0, "Fs": 5.0, "fexp": 2.0, "c": 500.0}, 5.0,
         ("stop2.s [m]", "stop2.v [m/s]"), _end, (-0.24751584799147497, -1.0136235951133056e-10),
         references.friction_stop, by=("Fc", "Fs", "m"), compared=("stop2",),
-        modes=((0.0605969540595, "stop2 forward"), (0.201105639685, "stop2 backward"), (0.341616547959, "stop2 forward"),
-               (0.482140109526, "stop2 backward"), (0.622692612163, "stop2 forward"),
-               (0.763328813916, "stop2 backward"), (0.904204209026, "stop2 forward"), (1.04597406053, "stop2 stick")),
+        modes=((0.0605969540595, "stop2 forward"), (0.201105639685, "stop2 backward"),
+               (0.341616547959, "stop2 forward"), (0.482140109526, "stop2 backward"),
+               (0.622692612163, "stop2 forward"), (0.763328813916, "stop2 backward"),
+               (0.904204209026, "stop2 forward"), (1.04597406053, "stop2 stick")),
         note="Without the upper stop, which the mass does not reach.",
     ),
     _case(
