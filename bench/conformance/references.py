@@ -157,7 +157,8 @@ def one_way_clutch_disengaged(j1, j2, load, torque) -> Reference:
 
 
 # A lossy gear of ratio r: J1 r w' = tau1 - lambda - F, J2 w' = r lambda + tau2 with the speed w of inertia 2, the
-# torque lambda > 0 in the mesh, and F = k lambda: k = 1/eta - 1 if the gear drives (w > 0), and -(1 - eta) if it is driven.
+# torque lambda > 0 in the mesh, and F = k lambda: k = 1/eta - 1 if the gear drives (w > 0), and -(1 - eta) if it is
+# driven.
 def lossy_gear_demo1(j1, j2, eta, drive, load) -> Reference:
     """A gear with losses locks, drives and is driven; torques are functions of time alone."""
     wave, push = Wave(drive, TWO_PI), [Wave(-load), Wave(0.25 * load, power=1)]
