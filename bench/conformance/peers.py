@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 from bench.peers import by_casadi
+from bench.studies.bouncing_ball import restitution
 from bench.tasks import Box
 from jaxmodsim.problems import bristles
 
@@ -193,9 +195,9 @@ def mujoco_friction(step: float) -> Callable[[], np.ndarray]:
 def _elastic(step: float, e: float) -> str:
     """A contact as a spring and damper of about ten steps with this restitution."""
     frequency = math.pi / (10.0 * step)
-    damping = 0.0 if e == 1.0 else -math.log(e) / math.hypot(math.pi, math.log(e))
+    damping = 0.0 if e == 1.0 else brentq(lambda damping: restitution(damping) - e, 1e-6, 0.6)
     return (
-        '<default><geom condim="1" solimp="0.99 0.99 0.001"'
+        '<default><geom condim="1" solimp="0.9999 0.9999 0.001"'
         f' solref="{-(frequency**2)} {-2.0 * damping * frequency}"/></default>'
     )
 

@@ -142,3 +142,10 @@ def test_an_element_at_its_limit_slips_towards_that_limit(force):
     )  # fmt: skip
     at = jnp.array([True])
     assert next_modes(freewheel, jnp.zeros(1), at, at, REST)[0] == 1.0
+
+
+def test_stick_without_a_normal_force_leaves_the_forces_of_the_others_exact():
+    """The multipliers of elements that are not redundant do not depend on their limits, here one of zero."""
+    limits = {"upper": [1.0, 0.0], "lower": [1.0, 0.0]}
+    elements = scalars(free_slip_acceleration=[1.0, 2.0], delassus=[[2.0, 1.0], [1.0, 3.0]], **limits)
+    np.testing.assert_allclose(solve_friction_forces(elements, jnp.zeros(2)).force, [0.2, 0.6], rtol=1e-10)
