@@ -5,8 +5,6 @@ import pytest
 
 from bench.conformance import gradients, impacts, peers, rotational, translational
 from bench.conformance.case import same_order
-from bench.layout import Recorded
-from bench.studies import conformance
 
 CASES = {case.name: case for each in (rotational, translational, impacts, gradients) for case in each.CASES}
 # Published at a tolerance of 1e-6: 2e-5 of the values, and more where a stop or a temperature adds up.
@@ -79,11 +77,3 @@ def test_scipy_agrees_with_the_references(name):
     """The equations of the legs, written a second time, against the references."""
     method = "LSODA" if "lugre" in name else "DOP853"
     np.testing.assert_allclose(peers.PEERS[name][0](method)(1e-10), CASES[name].exact().values, rtol=1e-7, atol=1e-7)
-
-
-@pytest.mark.deep
-def test_a_smoke_run_fills_the_tables(tmp_path):
-    result = conformance.main(True, tmp_path)
-    result.write(tmp_path, smoke=True)
-    found = Recorded.read(tmp_path / "conformance.json")
-    assert found.all_of("error of ours", "case") == list(conformance.SMOKE)

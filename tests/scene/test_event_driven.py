@@ -133,13 +133,11 @@ def test_the_number_of_a_mode_says_whether_a_plane_slips() -> None:
 @pytest.mark.parametrize("force", [-1e-17, 0.0, 1e-17])
 def test_an_element_at_its_limit_slips_towards_that_limit(force):
     """A freewheel at its limit of zero goes forwards, whatever the sign of the rounding in its force."""
-    freewheel = FrictionElements(
-        **{name: jnp.array([value]) for name, value in {
-            "v": 0.0, "free_slip_acceleration": force, "positive_slip": 0.0, "negative_slip": -100.0, "upper": 0.0,
-            "lower": 100.0,
-        }.items()},
-        delassus=jnp.eye(1), minv_jt=jnp.eye(1),
-    )  # fmt: skip
+    numbers = {
+        "v": [0.0], "free_slip_acceleration": [force], "delassus": [[1.0]], "minv_jt": [[1.0]],
+        "positive_slip": [0.0], "negative_slip": [-100.0], "upper": [0.0], "lower": [100.0],
+    }  # fmt: skip
+    freewheel = scalars(**numbers)
     at = jnp.array([True])
     assert next_modes(freewheel, jnp.zeros(1), at, at, REST)[0] == 1.0
 
