@@ -286,6 +286,47 @@ REPORTS = {
             ("error", "run"), ("case", "peer", "at"),
         ),),
     ),
+    "conformance": Report(
+        "Public cases of others: published figures, references, derivatives, other programs.", "conformance",
+        (
+            Table(
+                "Largest errors over the outputs of a case, in their units, against the independent reference. Event"
+                " times: largest error; events: number that agree in order, of those in our run if it has more."
+                " Derivatives: largest difference from central differences of the reference, relative to the largest"
+                " derivative. Run with derivatives: a warm call.",
+                (
+                    "error of the published values", "error of ours", "events", "error of event times in seconds",
+                    "published modes", "error of derivatives", "run with derivatives",
+                ),
+                ("case",),
+            ),
+            Table("Outputs at the end.", ("published", "reference", "ours"), ("case", "at")),
+            Table(
+                "Derivatives of the first output.", ("difference of the reference", "our derivative"), ("case", "at"),
+            ),
+            Table(
+                "Task 1: derivatives of the height by height, velocity and the force in the first of 480 steps.",
+                ("derivative",), ("at",), ("peer",), where={"case": "task 1"},
+            ),
+            Table(
+                "Task 2: distance from the target at the end of each program's optimisation, by the closed form."
+                " Others: 1000 iterations. Here: Newton's method.",
+                ("distance from the target", "runs"), where={"case": "task 2"},
+            ),
+            Table(
+                "Task 3: loss at the end of each program's optimisation. Others: 1000 iterations. Here: BFGS. The least"
+                " loss over all controls is {least}; a lower one is an error of discretisation.",
+                ("loss", "loss above the least", "runs"), where={"case": "task 3"},
+            ),
+            Table(
+                "Five cases in other programs: largest error of the outputs, and the time of one run, medians. At:"
+                " rtol, or the step of MuJoCo [s]. SciPy runs legs with terminal events, in an order written by hand."
+                " Contacts of MuJoCo are springs and dampers that take ten steps.",
+                ("error", "run"), ("case", "peer", "at"),
+            ),
+            Table("Sources, and what differs.", ("source", "published results", "remark"), ("case",)),
+        ),
+    ),
     "measured_axis": Report(
         "`jaxmodsim fit` on a measured axis.", "measured_record",
         (Table(

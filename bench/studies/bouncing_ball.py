@@ -21,14 +21,14 @@ from jaxmodsim.problems import bouncing_ball
 E, G, BOUNCING, AT_REST = 0.5, 9.81, 0.8, 2.5
 
 
-def _restitution(damping: float) -> float:
+def restitution(damping: float) -> float:
     """Restitution of a spring and damper that do not pull (Schwager and Poeschel, Granular Matter 9:465, 2007)."""
     s = math.sqrt(1.0 - damping**2)
     return math.exp(-damping / s * (math.pi - math.atan(2.0 * damping * s / (1.0 - 2.0 * damping**2))))
 
 
 # Damping relative to critical damping.
-DAMPING = brentq(lambda damping: _restitution(damping) - E, 0.01, 0.6)
+DAMPING = brentq(lambda damping: restitution(damping) - E, 0.01, 0.6)
 # (h, t) -> height and velocity at t, after a drop from h.
 Run = Callable[[Any, float], Any]
 _SCENE = bouncing_ball.scene(e=E)

@@ -27,6 +27,8 @@ from .._core.lu import factor_lu
 from .._core.safe import safe_norm
 from .forces._friction import Friction
 
+# Least weight of an element among redundant ones, relative to the largest.
+_LEAST_SHARE = 1e-2
 # Rounding units in the load of a sticking element, of its limits.
 _LOAD_ROUNDING = 100.0
 
@@ -329,11 +331,12 @@ def _multipliers(
 
     Where sticking elements are redundant (two on one coordinate), the equations do not determine the share of each.
     This takes the solution with the smallest sum of `f_i^2/limit_i`: elements in parallel then share in proportion to
-    their limits and reach them together.
+    their limits and reach them together, unless a limit is less than 1 % of the largest one: `solve_semidefinite` is
+    inaccurate for weights that small.
     """
     weight = 0.5 * (elements.upper + elements.lower)
     largest = jnp.max(weight)
-    weight = jnp.maximum(weight / jnp.where(largest > 0, largest, 1.0), 1e-6)
+    weight = jnp.maximum(weight / jnp.where(largest > 0, largest, 1.0), _LEAST_SHARE)
     return solve_semidefinite(elements.delassus, drive, jnp.sqrt(jnp.where(largest > 0, weight, 1.0)), sticks)
 
 
@@ -451,7 +454,8 @@ def next_modes(
     n = mode.shape[0]
     wider = 1.0 + 16.0 * float(jnp.finfo(mode.dtype).eps)
     before = solve_friction_forces(elements, mode)
-    load = elements.onset_mode(before.force[:n], rest)
+    # The direction is that of the nearer limit, which may be zero in one direction (a freewheel).
+    load = elements.onset_mode((before.force - 0.5 * (before.upper - before.lower))[:n], rest)
     mode = jnp.where(still, jnp.where(at_limit, load, jnp.zeros_like(mode)), mode)
     scale = 1e-6 * jnp.max(jnp.abs(elements.delassus) * jnp.maximum(before.upper, before.lower)[None, :], axis=1)[:n]
 

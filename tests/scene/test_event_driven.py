@@ -128,3 +128,22 @@ def test_modes_after_an_instant_at_rest() -> None:
 def test_the_number_of_a_mode_says_whether_a_plane_slips() -> None:
     modes = jnp.array([[0.0, 1e-9, -1.0], [0.0, 0.0, 1.0]])
     np.testing.assert_array_equal(mode_numbers(modes, (2, 1)), [[1.0, -1.0], [0.0, 1.0]])
+
+
+@pytest.mark.parametrize("force", [-1e-17, 0.0, 1e-17])
+def test_an_element_at_its_limit_slips_towards_that_limit(force):
+    """A freewheel at its limit of zero goes forwards, whatever the sign of the rounding in its force."""
+    numbers = {
+        "v": [0.0], "free_slip_acceleration": [force], "delassus": [[1.0]], "minv_jt": [[1.0]],
+        "positive_slip": [0.0], "negative_slip": [-100.0], "upper": [0.0], "lower": [100.0],
+    }  # fmt: skip
+    freewheel = scalars(**numbers)
+    at = jnp.array([True])
+    assert next_modes(freewheel, jnp.zeros(1), at, at, REST)[0] == 1.0
+
+
+def test_stick_without_a_normal_force_leaves_the_forces_of_the_others_exact():
+    """The multipliers of elements that are not redundant do not depend on their limits, here one of zero."""
+    limits = {"upper": [1.0, 0.0], "lower": [1.0, 0.0]}
+    elements = scalars(free_slip_acceleration=[1.0, 2.0], delassus=[[2.0, 1.0], [1.0, 3.0]], **limits)
+    np.testing.assert_allclose(solve_friction_forces(elements, jnp.zeros(2)).force, [0.2, 0.6], rtol=1e-10)

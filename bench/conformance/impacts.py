@@ -1,0 +1,119 @@
+"""Cases of other simulators with friction or impacts: EXUDYN, nosnoc."""
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.integrate import solve_ivp
+
+import jaxmodsim as jms
+from bench.conformance.case import Case, Numbers, Reference, Setup
+from bench.conformance.motion import Path, Wave, driven, integrated, linear
+from jaxmodsim.friction import lorentzian
+
+
+def pulled_lugre(p: Numbers) -> Setup:
+    """A mass pulled through a spring at 0.1 m/s, with LuGre friction."""
+
+    def lagrangian(t, q, qd, p):
+        return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * (0.1 * t - q[0]) ** 2
+
+    law = jms.LuGre(sigma0=1e5, sigma1=np.sqrt(1e5), sigma2=p["sigma2"], Fc=p["Fc"], Fs=p["Fs"], vs=1e-3)
+    return Setup(jms.Scene(lagrangian, {"m": p["m"], "k": p["k"]}, (jms.Friction(law),)), np.zeros(1), np.zeros(1))
+
+
+def exact_pulled_lugre(m, k, sigma2, Fc, Fs) -> Reference:
+    """The three equations by hand, by Radau of SciPy at 1e-11."""
+    sigma0, sigma1 = 1e5, np.sqrt(1e5)
+
+    def field(t, y):
+        level = Fc + (Fs - Fc) * np.exp(-((y[1] / 1e-3) ** 2))
+        rate = y[1] - sigma0 * abs(y[1]) / level * y[2]
+        return [y[1], (k * (0.1 * t - y[0]) - sigma0 * y[2] - sigma1 * rate - sigma2 * y[1]) / m, rate]
+
+    done = solve_ivp(field, (0.0, 25.0), [0.0] * 3, "Radau", rtol=1e-11, atol=1e-15)
+    return Reference(done.y[:2, -1], [])
+
+
+def two_balls(p: Numbers) -> Setup:
+    """Two balls on a line under gravity, joined by a spring; the lower one bounces."""
+
+    def lagrangian(t, q, qd, p):
+        spring = 0.5 * p["k"] * (q[1] - q[0] - 1.0) ** 2
+        return 0.5 * jnp.sum(qd**2) - p["g"] * jnp.sum(q) - spring
+
+    ground = jms.Contact(lambda t, q, p: q[0] - 0.2, restitution=p["e"], name="ground")
+    scene = jms.Scene(lagrangian, {"k": p["k"], "g": p["g"]}, constraints=(ground,))
+    return Setup(scene, np.array([1.0, 2.0]), np.zeros(2))
+
+
+def exact_two_balls(k, g, e) -> Reference:
+    """Exponentials of a matrix from impact to impact."""
+    stiff = k * np.array([[-1.0, 1.0], [1.0, -1.0]])
+    a = np.block([[np.zeros((2, 2)), np.eye(2)], [stiff, np.zeros((2, 2))]])
+    piece = linear(a, np.array([0.0, 0.0, -g - k, -g + k]))
+    path = Path([1.0, 2.0, 0.0, 0.0])
+    while path.to_zero(piece, lambda t, y: y[0] - 0.2, 1.0, "ground open"):
+        path.y[2] *= -e
+    return Reference(path.y, path.events)
+
+
+def slip_stick(p: Numbers) -> Setup:
+    """A mass on a spring on a belt at 0.2 m/s, with friction that falls as 1/(1 + |v|)."""
+
+    def lagrangian(t, q, qd, p):
+        return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
+
+    law = jms.Stribeck(Fc=0.0, Fs=p["Fs"], vs=1.0, exponent=1.0, fall=lorentzian)
+    belt = jms.Friction(law, belt_velocity=0.2, name="belt")
+    return Setup(jms.Scene(lagrangian, {"m": p["m"], "k": p["k"]}, (belt,)), np.array([-0.8]), np.array([-1.0]))
+
+
+def exact_slip_stick(m, k, Fs) -> Reference:
+    """Slip on either side of the belt's velocity, and stick up to Fs."""
+
+    def slip(sign):
+        return integrated(lambda t, y: np.array([y[1], (-k * y[0] - sign * Fs / (1.0 + sign * (y[1] - 0.2))) / m]))
+
+    path, sign = Path([-0.8, -1.0]), -1.0
+    while path.to_zero(slip(sign), lambda t, y: y[1] - 0.2, 40.0):
+        path.y[1] = 0.2
+        if abs(k * path.y[0]) < Fs:
+            path.log("belt stick")
+            carried = driven([([0.0], Wave(0.0))])
+            if not path.to_zero(carried, lambda t, y: k * y[0] - Fs, 40.0):
+                break
+        sign = -1.0 if path.y[0] > 0 else 1.0
+        path.log("belt backward" if sign < 0 else "belt forward")
+    return Reference(path.y, path.events)
+
+
+def _case(name, source, make, numbers, t1, outputs, observe, published, reference, **more) -> Case:
+    return Case(
+        name, source, numbers, make, t1, outputs, observe, lambda **n: reference(*n.values()), published, **more
+    )
+
+
+def _end(q, qd):
+    return q[0], qd[0]
+
+
+CASES = (
+    _case(
+        "EXUDYN lugreFrictionTest", "jgerstmayr/EXUDYN @ e44aca1b, main/pythonDev/Examples/lugreFrictionTest.py",
+        pulled_lugre, {"m": 1.0, "k": 2.0, "sigma2": 0.4, "Fc": 1.0, "Fs": 1.5}, 25.0, ("x [m]", "v [m/s]"), _end,
+        (1.908839199226505, 9.424154590959904e-06), exact_pulled_lugre, by=("k", "Fc", "Fs"),
+        options={"atol": 1e-15, "rtol": 1e-11},
+        note="Published: DOPRI5 with steps of 50 us. Reference: Radau of SciPy, whose own error is about 1e-10.",
+    ),
+    _case(
+        "nosnoc two_balls_cls", "nosnoc/nosnoc @ 0abef401, benchmarks/two_balls_cls/two_balls_spring_matlab.m",
+        two_balls, {"k": 1e4, "g": 9.81, "e": 0.8}, 1.0, ("q1 [m]", "q2 [m]", "v1 [m/s]", "v2 [m/s]"),
+        lambda q, qd: (*q, *qd), (), exact_two_balls, by=("e", "k", "g"),
+        note="The repository compares with ode15s and has no numbers.",
+    ),
+    _case(
+        "nosnoc periodic_slip_stick_codim1",
+        "nosnoc/nosnoc @ 0abef401, examples/periodic_slip_stick/periodic_slip_stick_codim1.m",
+        slip_stick, {"m": 1.0, "k": 1.0, "Fs": 1.0}, 40.0, ("x1 [m]", "x2 [m/s]"), _end, (), exact_slip_stick,
+        by=("m", "k", "Fs"), note="The repository has figures, and no numbers.",
+    ),
+)  # fmt: skip
