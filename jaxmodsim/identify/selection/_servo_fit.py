@@ -1,0 +1,290 @@
+"""`fit_servo`: a servo from several records, judged by records that are left out, and its predictions with a band."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..._core.arguments import as_share
+from ..._core.arrays import on_device
+from ..._core.system import jsonable
+from ...scene import replace_numbers, scene_numbers, scene_ranges
+from ..data._record import SINGLE, Record, cut, runs_of
+from ..estimate._problem import FitProblem, Prior, SquaredLoss
+from ..estimate._search import SearchOptions, solve
+from ..model._parameters import FreeParameters
+from ..model._servo import SERVO_LAWS, Servo, ServoEngine, servo_windows
+from ..uncertainty._fit import result_of
+from ..uncertainty._result import FitResult
+
+# Scale of the error of a model [rad], and number of independent samples in all records: they weigh the prior.
+_ERROR, _INDEPENDENT = 0.02, 16.0
+# Standard deviation of the prior around the start values, as a share of them; of an angle [rad].
+_PRIOR, _PRIOR_ANGLE = 0.5, 0.05
+# Limits where they are narrower than those of the law.
+_LIMITS = {
+    "kt": (0.02, 3.0), "R": (0.1, 60.0), "armature": (1e-5, 0.1), "gear.vs": (0.01, 10.0), "gear.alpha": (0.2, 5.0),
+}  # fmt: skip
+# Length of the windows of the first search [s]; iterations and tolerance of both searches.
+_WINDOW, _MOST, _RTOL = 0.42, 40, 2e-3
+# Least half width of a band [rad]; shares of the travel that a band may take as an error.
+_LEAST, _SHARES = 2e-3, (0.0, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2)
+_KIND = "jaxmodsim servo fit"
+
+Numbers = dict[str, float]
+Prior_ = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServoFit:
+    """A servo fitted to records, and the same fit without each group of them.
+
+    - `law`: one of `SERVO_LAWS`. `result`: the fit to all records; None if it was loaded.
+    - `model`: the servo with the fitted numbers. `members`: numbers of the fits without one group each, by group.
+    - `left_out`, `fitted`: mean absolute error [rad] of each record of a group that was left out, and of the fit to
+      all, by group and by record.
+    - `band`: the half width of a band is `factor sqrt(least^2 + spread^2 + (share travel)^2)` at the level `level`.
+    - `evaluations`: number of evaluations of the gradient, by fit.
+    """
+
+    law: str
+    model: Servo
+    members: dict[str, Numbers]
+    left_out: dict[str, dict[str, float]]
+    fitted: dict[str, float]
+    band: dict[str, float]
+    evaluations: dict[str, int]
+    result: FitResult | None = None
+
+    def to_dict(self) -> dict[str, object]:
+        """Everything except the samples, in types of JSON."""
+        numbers = {name: float(x) for name, x in scene_numbers(self.model).items()}
+        return jsonable(
+            {
+                "kind": _KIND, "law": self.law, "numbers": numbers, "members": self.members,
+                "left_out": self.left_out, "fitted": self.fitted, "band": self.band, "evaluations": self.evaluations,
+                "fit": None if self.result is None else self.result.to_dict(),
+            }
+        )  # fmt: skip
+
+    @staticmethod
+    def load(path: str | PathLike[str]) -> "ServoFit":
+        """The fit of a JSON file that holds `to_dict`, alone or as its entry `servo`.
+
+        **Raises:**
+
+        - `ValueError` for another file.
+        """
+        try:
+            body = json.loads(Path(path).read_text("utf-8"))
+        except ValueError as error:
+            raise ValueError(f"{path} is no JSON file: {error}") from error
+        body = body.get("servo", body) if isinstance(body, dict) else {}
+        if body.get("kind") != _KIND:
+            raise ValueError(f"{path} is no fit of a servo: its kind is not {_KIND!r}.")
+        numbers = body["numbers"]
+        model = Servo.start(body["law"], numbers["inertia"], numbers["gravity"])
+        model = replace_numbers(model, {name: on_device(np.asarray(x, float)) for name, x in numbers.items()})
+        names = ("law", "members", "left_out", "fitted", "band", "evaluations")
+        return ServoFit(model=model, **{name: body[name] for name in names})
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServoPrediction:
+    """Angle of a servo with a band for the share `level` of its samples, shape `[samples]` each [rad].
+
+    - `record`: the record. `q`, `lower`, `upper`: prediction and band. `spread`: of the fits without one group.
+    """
+
+    record: Record
+    q: Float[np.ndarray, " samples"]
+    lower: Float[np.ndarray, " samples"]
+    upper: Float[np.ndarray, " samples"]
+    spread: Float[np.ndarray, " samples"]
+    level: float
+
+    @property
+    def error(self) -> float:
+        """Mean absolute error [rad] where the record has the measured angle."""
+        return float(np.mean(np.abs(self.q - self.record.measured)))
+
+    @property
+    def inside(self) -> float:
+        """Share of the measured samples in the band."""
+        return float(np.mean((self.lower <= self.record.measured) & (self.record.measured <= self.upper)))
+
+
+def fit_servo(
+    records: Sequence[Record],
+    law: str = "MQ",
+    *,
+    inertia: float,
+    gravity: float,
+    groups: Mapping[str, Sequence[str]] | None = None,
+    prior: Prior_ | None = None,
+    level: float = 0.9,
+    progress: Callable[[str], None] | None = None,
+) -> ServoFit:
+    """Fit a servo with a pendulum to records in open loop, then again without each group of records.
+
+    The first search runs in overlapping windows of 0.4 s, which has few local minima, the second over whole records.
+
+    **Arguments:**
+
+    - `records`: from `servo_record`, all with `kp` or all with `duty`.
+    - `law`: one of `SERVO_LAWS`.
+    - `inertia`: of the pendulum [kg m^2]. `gravity`: its torque at a right angle [N m].
+    - `groups`: names of records that are left out together, by the name of the group; by default each record alone.
+    - `prior`: mean and standard deviation by name, such as those of a data sheet: `{"kt": (0.37, 0.05)}`.
+    - `level`: share of the samples in a band, 0 < level < 1.
+    - `progress`: called with the name of each fit that begins.
+
+    **Returns:**
+
+    A `ServoFit`.
+
+    **Raises:**
+
+    - `ValueError` for an unknown law or group, or fewer than two records.
+    """
+    if law not in SERVO_LAWS:
+        raise ValueError(f"law must be one of {', '.join(SERVO_LAWS)}, but {law!r} was given.")
+    records, level = tuple(records), as_share(level, name="level")
+    names = [record.name for record in records]
+    groups = {name: (name,) for name in names} if groups is None else {k: tuple(v) for k, v in groups.items()}
+    unknown = [name for group in groups.values() for name in group if name not in names]
+    if unknown:
+        raise ValueError(f"groups names {unknown[0]!r}, but the records are: {', '.join(names)}.")
+    if len(records) < 2:
+        raise ValueError("fit_servo needs two records at least, since it leaves out one after the other.")
+    start = Servo.start(law, inertia, gravity)
+    whole = _problem(start, law, records, prior or {})
+    windows = [window for record in records for window in servo_windows(record, _WINDOW)]
+    owner = np.repeat(np.arange(len(records)), [len(servo_windows(record, _WINDOW)) for record in records])
+    first = _problem(start, law, tuple(windows), prior or {})
+    evaluations: dict[str, int] = {}
+
+    def search(name: str, keep: np.ndarray):
+        if progress is not None:
+            progress(name)
+        some = first.counting(np.broadcast_to(keep[owner][:, None], first.runs.t.shape), slips=False)
+        one = solve(some, some.x0, SearchOptions(_RTOL, _MOST))
+        rest = whole.counting(np.broadcast_to(keep[:, None], whole.runs.t.shape), slips=False)
+        two = solve(rest, one.state.x, SearchOptions(_RTOL, _MOST))
+        evaluations[name] = one.iterations + two.iterations
+        return two
+
+    everything = search("all records", np.ones(len(records), bool))
+    members, residuals, left_out = {}, [], {}
+    for name, group in groups.items():
+        out = np.isin(names, group)
+        if out.all():
+            continue
+        x = search(f"without {name}", ~out).state.x
+        members[name] = {k: float(v) for k, v in whole.at(x).values.items()}
+        errors = _angles(whole, x) - np.asarray(whole.runs.measured[SINGLE])
+        residuals.append((out, errors))
+        counts = np.asarray(whole.runs.weight[SINGLE]) > 0
+        left_out[name] = {names[i]: float(np.mean(np.abs(errors[i][counts[i]]))) for i in np.flatnonzero(out)}
+    x = everything.state.x
+    model = replace_numbers(start, dict(whole.at(x).values))
+    units = {name: allowed.unit for name, allowed in scene_ranges(start).items()}
+    result = result_of(everything, records, cut(records, None), units, model)
+    counts = np.asarray(whole.runs.weight[SINGLE]) > 0
+    errors = np.abs(_angles(whole, x) - np.asarray(whole.runs.measured[SINGLE]))
+    fit = ServoFit(
+        law=law, model=model, members=members, left_out=left_out,
+        fitted={names[i]: float(np.mean(errors[i][counts[i]])) for i in range(len(records))},
+        band={}, evaluations=evaluations, result=result,
+    )  # fmt: skip
+    return replace(fit, band=_calibrated(fit, whole, residuals, counts, level))
+
+
+def predict_servo(fit: ServoFit, record: Record) -> ServoPrediction:
+    """The angle of a fitted servo for a record of commands, with a band.
+
+    **Arguments:**
+
+    - `fit`: from `fit_servo` or `ServoFit.load`.
+    - `record`: from `servo_record`, with or without the measured angle.
+    """
+    runs = runs_of((record,), cut((record,), None))
+    run = jax.tree.map(lambda x: x[0], runs)
+    engine = jax.jit(lambda values: ServoEngine(fit.model)(values, None, run).channels[SINGLE])
+    free = next(iter(fit.members.values()), {})
+    numbers = scene_numbers(fit.model)
+    own = {name: numbers[name] for name in free}
+    q = np.asarray(engine(own))
+    others = np.stack([q, *(np.asarray(engine({k: on_device(np.asarray(v, float)) for k, v in member.items()}))
+                            for member in fit.members.values())])  # fmt: skip
+    centre = np.median(others, axis=0)
+    spread = np.std(others, axis=0)
+    half = _half(fit.band, spread, centre)
+    return ServoPrediction(
+        record=record, q=centre, lower=centre - half, upper=centre + half, spread=spread, level=fit.band["level"]
+    )
+
+
+def _half(band: Mapping[str, float], spread: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Half width of the band; the travel is the largest distance from the start so far."""
+    travel = np.maximum.accumulate(np.abs(q - q[..., :1]), axis=-1)
+    return band["factor"] * np.sqrt(band["least"] ** 2 + spread**2 + (band["share"] * travel) ** 2)
+
+
+def _calibrated(
+    fit: ServoFit, problem: FitProblem, residuals: list[tuple[np.ndarray, np.ndarray]], counts: np.ndarray, level: float
+) -> dict[str, float]:
+    """The narrowest band that holds the share `level` of the samples of records that were left out, each weighing alike."""
+    free = problem.free
+    everything = [_angles(problem, free.coordinates(own)) for own in fit.members.values()]
+    centre = np.asarray(problem.runs.measured[SINGLE])
+    spread = np.std(np.stack(everything), axis=0)
+    best: dict[str, float] = {}
+    for share in _SHARES:
+        unit = _half({"factor": 1.0, "least": _LEAST, "share": share}, spread, centre)
+        ratios = [np.abs(errors[i] / unit[i])[counts[i]] for out, errors in residuals for i in np.flatnonzero(out)]
+        weights = np.concatenate([np.full(x.size, 1.0 / x.size) for x in ratios])
+        every = np.concatenate(ratios)
+        order = np.argsort(every)
+        reached = np.cumsum(weights[order]) / np.sum(weights)
+        factor = float(every[order][min(np.searchsorted(reached, level), every.size - 1)])
+        width = float(np.mean([np.mean(factor * unit[i][counts[i]]) for out, _ in residuals for i in np.flatnonzero(out)]))
+        if not best or width < best["mean"]:
+            best = {"level": level, "factor": factor, "least": _LEAST, "share": share, "mean": width}
+    return best
+
+
+def _problem(start: Servo, law: str, records: tuple[Record, ...], prior: Prior_) -> FitProblem:
+    """The problem of a fit of these records, with the noise of `_INDEPENDENT` samples."""
+    numbers, ranges, names = scene_numbers(start), dict(scene_ranges(start)), Servo.free(law)
+    for name in names:
+        low, high = _LIMITS.get(name, (ranges[name].lower, ranges[name].upper))
+        ranges[name] = replace(ranges[name], lower=low, upper=high, strict=low is not None)
+    free = FreeParameters.of(numbers, ranges, names)
+    means = np.array([float(numbers[name]) for name in names])
+    deviations = np.array([_PRIOR_ANGLE if name == "tilt" else _PRIOR * abs(float(numbers[name])) for name in names])
+    for i, name in enumerate(names):
+        means[i], deviations[i] = prior.get(name, (means[i], deviations[i]))
+    runs = runs_of(records, cut(records, None))
+    samples = float(np.sum(np.asarray(runs.weight[SINGLE])))
+    noise = on_device(np.asarray(_ERROR * np.sqrt(samples / _INDEPENDENT)))
+    return FitProblem(
+        ServoEngine(start), free, (), None, runs, {SINGLE: noise}, SquaredLoss(),
+        Prior(on_device(means), on_device(1 / deviations)),
+    )  # fmt: skip
+
+
+def _angles(problem: FitProblem, x: Array) -> Float[np.ndarray, "runs samples"]:
+    return np.asarray(_run(problem, x))
+
+
+@eqx.filter_jit
+def _run(problem: FitProblem, x: Array) -> Array:
+    values = problem.free.values(x)
+    return jax.vmap(lambda run: problem.engine(values, None, run).channels[SINGLE])(problem.runs)
