@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._core.arguments import as_share
+from ..._core.arguments import as_share, axis_unit
 from ..._core.arrays import on_device
 from ..._core.system import jsonable
 from ...scene import replace_numbers, scene_numbers, scene_ranges
@@ -35,10 +35,12 @@ _LIMITS = {
 _WINDOW, _MOST, _RTOL = 0.42, 40, 2e-3
 # Least half width of a band [rad]; shares of the travel that a band may take as an error.
 _LEAST, _SHARES = 2e-3, (0.0, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2)
+# Share of the standard deviation of the prior above which an error is that of the prior; correlation that is reported.
+_VAGUE, _TOGETHER = 0.5, 0.9
 _KIND = "jaxmodsim servo fit"
 
 Numbers = dict[str, float]
-Prior_ = Mapping[str, tuple[float, float]]
+PriorNumbers = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +53,7 @@ class ServoFit:
       all, by group and by record.
     - `band`: the half width of a band is `factor sqrt(least^2 + spread^2 + (share travel)^2)` at the level `level`.
     - `evaluations`: number of evaluations of the gradient, by fit.
+    - `prior`: mean and standard deviation of each parameter. `from_duty`: whether the records have the measured duty.
     """
 
     law: str
@@ -60,7 +63,38 @@ class ServoFit:
     fitted: dict[str, float]
     band: dict[str, float]
     evaluations: dict[str, int]
+    prior: dict[str, tuple[float, float]]
+    from_duty: bool
     result: FitResult | None = None
+
+    @property
+    def left_out_error(self) -> float:
+        """Mean absolute error [rad] of the records that were left out, each group weighing alike."""
+        return float(np.mean([np.mean(list(group.values())) for group in self.left_out.values()]))
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Sentences on parameters that the records do not determine; none for a loaded fit."""
+        if self.result is None:
+            return ()
+        errors, values = self.result.errors, self.result.values
+        vague = [name for name, x in values.items() if not errors[name] < _VAGUE * self.prior[name][1]]
+        estimate, names = self.result.estimate, list(values)
+        pairs = [
+            f"{names[j]} and {names[i]} ({estimate.correlation[i, j]:+.2f})"
+            for i in range(len(names)) for j in range(i) if abs(estimate.correlation[i, j]) > _TOGETHER
+        ]  # fmt: skip
+        lines = []
+        if vague:
+            lines.append(f"The records hardly determine {', '.join(vague)}: their errors are those of the prior.")
+        if pairs:
+            lines.append(f"Correlated, so that only combinations are determined: {', '.join(pairs)}.")
+        apart = {name: np.ptp([own[name] for own in self.members.values()]) / abs(values[name]) for name in ("kt", "R")}
+        lines.append(
+            f"kt and R depend on the friction law: without one group of records kt changes by"
+            f" {100 * apart['kt']:.0f} % and R by {100 * apart['R']:.0f} %. State those of a data sheet as a prior."
+        )
+        return tuple(lines)
 
     def to_dict(self) -> dict[str, object]:
         """Everything except the samples, in types of JSON."""
@@ -69,6 +103,7 @@ class ServoFit:
             {
                 "kind": _KIND, "law": self.law, "numbers": numbers, "members": self.members,
                 "left_out": self.left_out, "fitted": self.fitted, "band": self.band, "evaluations": self.evaluations,
+                "prior": self.prior, "from_duty": self.from_duty,
                 "fit": None if self.result is None else self.result.to_dict(),
             }
         )  # fmt: skip
@@ -91,7 +126,7 @@ class ServoFit:
         numbers = body["numbers"]
         model = Servo.start(body["law"], numbers["inertia"], numbers["gravity"])
         model = replace_numbers(model, {name: on_device(np.asarray(x, float)) for name, x in numbers.items()})
-        names = ("law", "members", "left_out", "fitted", "band", "evaluations")
+        names = ("law", "members", "left_out", "fitted", "band", "evaluations", "prior", "from_duty")
         return ServoFit(model=model, **{name: body[name] for name in names})
 
 
@@ -127,7 +162,7 @@ def fit_servo(
     inertia: float,
     gravity: float,
     groups: Mapping[str, Sequence[str]] | None = None,
-    prior: Prior_ | None = None,
+    prior: PriorNumbers | None = None,
     level: float = 0.9,
     progress: Callable[[str], None] | None = None,
 ) -> ServoFit:
@@ -194,14 +229,15 @@ def fit_servo(
         left_out[name] = {names[i]: float(np.mean(np.abs(errors[i][counts[i]]))) for i in np.flatnonzero(out)}
     x = everything.state.x
     model = replace_numbers(start, dict(whole.at(x).values))
-    units = {name: allowed.unit for name, allowed in scene_ranges(start).items()}
+    units = {name: axis_unit(allowed.unit, True) for name, allowed in scene_ranges(start).items()}
     result = result_of(everything, records, cut(records, None), units, model)
     counts = np.asarray(whole.runs.weight[SINGLE]) > 0
     errors = np.abs(_angles(whole, x) - np.asarray(whole.runs.measured[SINGLE]))
     fit = ServoFit(
         law=law, model=model, members=members, left_out=left_out,
         fitted={names[i]: float(np.mean(errors[i][counts[i]])) for i in range(len(records))},
-        band={}, evaluations=evaluations, result=result,
+        band={}, evaluations=evaluations, prior=_priors(start, law, prior or {}),
+        from_duty="duty" in records[0].inputs, result=result,
     )  # fmt: skip
     return replace(fit, band=_calibrated(fit, whole, residuals, counts, level))
 
@@ -260,17 +296,14 @@ def _calibrated(
     return best
 
 
-def _problem(start: Servo, law: str, records: tuple[Record, ...], prior: Prior_) -> FitProblem:
+def _problem(start: Servo, law: str, records: tuple[Record, ...], prior: PriorNumbers) -> FitProblem:
     """The problem of a fit of these records, with the noise of `_INDEPENDENT` samples."""
     numbers, ranges, names = scene_numbers(start), dict(scene_ranges(start)), Servo.free(law)
     for name in names:
         low, high = _LIMITS.get(name, (ranges[name].lower, ranges[name].upper))
         ranges[name] = replace(ranges[name], lower=low, upper=high, strict=low is not None)
     free = FreeParameters.of(numbers, ranges, names)
-    means = np.array([float(numbers[name]) for name in names])
-    deviations = np.array([_PRIOR_ANGLE if name == "tilt" else _PRIOR * abs(float(numbers[name])) for name in names])
-    for i, name in enumerate(names):
-        means[i], deviations[i] = prior.get(name, (means[i], deviations[i]))
+    means, deviations = np.array([*_priors(start, law, prior).values()]).T
     runs = runs_of(records, cut(records, None))
     samples = float(np.sum(np.asarray(runs.weight[SINGLE])))
     noise = on_device(np.asarray(_ERROR * np.sqrt(samples / _INDEPENDENT)))
@@ -278,6 +311,13 @@ def _problem(start: Servo, law: str, records: tuple[Record, ...], prior: Prior_)
         ServoEngine(start), free, (), None, runs, {SINGLE: noise}, SquaredLoss(),
         Prior(on_device(means), on_device(1 / deviations)),
     )  # fmt: skip
+
+
+def _priors(start: Servo, law: str, prior: PriorNumbers) -> dict[str, tuple[float, float]]:
+    """Mean and standard deviation of each free parameter."""
+    numbers = {name: float(scene_numbers(start)[name]) for name in Servo.free(law)}
+    own = {name: (x, _PRIOR_ANGLE if name == "tilt" else _PRIOR * x) for name, x in numbers.items()}
+    return own | {name: (float(mean), float(deviation)) for name, (mean, deviation) in prior.items()}
 
 
 def _angles(problem: FitProblem, x: Array) -> Float[np.ndarray, "runs samples"]:
