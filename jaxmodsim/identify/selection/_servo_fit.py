@@ -33,8 +33,10 @@ _LIMITS = {
 }  # fmt: skip
 # Length of the windows of the first search [s]; iterations and tolerance of both searches.
 _WINDOW, _MOST, _RTOL = 0.42, 40, 2e-3
-# Least half width of a band [rad]; shares of the travel that a band may take as an error.
-_LEAST, _SHARES = 2e-3, (0.0, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2)
+# Error of a band [rad] before its factor, and shares of the travel that it may take as an error.
+_LEAST, _SHARES = 0.01, (0.05, 0.1)
+# Median absolute deviation of a normal distribution, in standard deviations.
+_MAD = 0.6745
 # Share of the standard deviation of the prior above which an error is that of the prior; correlation that is reported.
 _VAGUE, _TOGETHER = 0.5, 0.9
 _KIND = "jaxmodsim servo fit"
@@ -257,14 +259,18 @@ def predict_servo(fit: ServoFit, record: Record) -> ServoPrediction:
     numbers = scene_numbers(fit.model)
     own = {name: numbers[name] for name in free}
     q = np.asarray(engine(own))
-    others = np.stack([q, *(np.asarray(engine({k: on_device(np.asarray(v, float)) for k, v in member.items()}))
-                            for member in fit.members.values())])  # fmt: skip
-    centre = np.median(others, axis=0)
-    spread = np.std(others, axis=0)
-    half = _half(fit.band, spread, centre)
-    return ServoPrediction(
-        record=record, q=centre, lower=centre - half, upper=centre + half, spread=spread, level=fit.band["level"]
-    )
+    members = [
+        np.asarray(engine({k: on_device(np.asarray(v, float)) for k, v in member.items()}))
+        for member in fit.members.values()
+    ]
+    spread = _spread(q, np.stack(members))
+    half = _half(fit.band, spread, q)
+    return ServoPrediction(record=record, q=q, lower=q - half, upper=q + half, spread=spread, level=fit.band["level"])
+
+
+def _spread(q: np.ndarray, members: np.ndarray) -> np.ndarray:
+    """Standard deviation of the fits without one group around the fit to all, robust against single ones."""
+    return np.median(np.abs(members - q), axis=0) / _MAD
 
 
 def _half(band: Mapping[str, float], spread: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -278,9 +284,10 @@ def _calibrated(
 ) -> dict[str, float]:
     """The narrowest band that holds the share `level` of the samples of records that were left out, each weighing alike."""
     free = problem.free
-    everything = [_angles(problem, free.coordinates(own)) for own in fit.members.values()]
-    centre = np.asarray(problem.runs.measured[SINGLE])
-    spread = np.std(np.stack(everything), axis=0)
+    members = [_angles(problem, free.coordinates(own)) for own in fit.members.values()]
+    numbers = {name: float(scene_numbers(fit.model)[name]) for name in free.names}
+    centre = _angles(problem, free.coordinates(numbers))
+    spread = _spread(centre, np.stack(members))
     best: dict[str, float] = {}
     for share in _SHARES:
         unit = _half({"factor": 1.0, "least": _LEAST, "share": share}, spread, centre)
