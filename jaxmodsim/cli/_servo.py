@@ -163,8 +163,9 @@ def ranking_of(fits: dict[str, ServoFit]) -> pd.DataFrame:
               for kind in ("trajectory", "gain")}  # fmt: skip
         own = [1e3 * float(np.mean(by[kind])) if by[kind] else math.nan for kind in by]
         fitted = 1e3 * float(np.mean(list(fit.fitted.values())))
-        rows.append((fit.law, len(Servo.free(fit.law)), fitted, 1e3 * fit.left_out_error, *own, max(fit.evaluations.values()),
-                     sum(fit.evaluations.values())))  # fmt: skip
+        counts = fit.evaluations.values()
+        errors = fitted, 1e3 * fit.left_out_error, *own
+        rows.append((fit.law, len(Servo.free(fit.law)), *errors, max(counts), sum(counts)))
     return frame_of(
         rows, "law", "parameters", "fitted [mrad]", "left out [mrad]", "trajectory left out", "gain left out",
         "evaluations of a fit", "of all fits",

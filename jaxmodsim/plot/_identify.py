@@ -6,7 +6,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
-from ..identify import Comparison, FitResult, InputDesign, Record, RecordPrediction, Score, ServoPrediction, residual_tests
+from ..identify import (
+    Comparison,
+    FitResult,
+    InputDesign,
+    Record,
+    RecordPrediction,
+    Score,
+    ServoPrediction,
+    residual_tests,
+)
 from ._style import (
     BLUE,
     COLOURS,

@@ -16,8 +16,6 @@ from ._engines import ModelOutput, with_values
 
 # Duty of the motor per radian and gain of the firmware: 4096 counts a turn, gain in 1/256, full duty 885.
 DUTY_PER_RADIAN = 4096 / (2 * np.pi) / 256 / 885
-# Steps between two samples.
-_SUBSTEPS = 3
 # Percentile and length [s] of the moving window that show the supply while the bridge conducts.
 _CONDUCTING, _SPAN = 10, 0.2
 # Columns that drive a servo; `kp` or `duty` closes the loop.
@@ -110,15 +108,16 @@ class Servo(eqx.Module):
     def step(self, q: Array, qd: Array, h: Array, inputs: Mapping[str, Array]) -> tuple[Array, Array]:
         """One step of the time stepping of Moreau: friction is at most what brings the velocity to zero.
 
-        Viscous friction and induced voltage are implicit, so that any step is stable.
+        Torques are those of the angle in the middle of the step; viscous friction and induced voltage are implicit.
         """
+        middle = q + 0.5 * h * qd
         if "kp" in inputs:
-            duty = jnp.clip(inputs["kp"] * (inputs["q_goal"] - q) * DUTY_PER_RADIAN, -1.0, 1.0)
+            duty = jnp.clip(inputs["kp"] * (inputs["q_goal"] - middle) * DUTY_PER_RADIAN, -1.0, 1.0)
         else:
             duty = inputs["duty"]
         enabled, mass = inputs["torque_enable"], self.inertia + self.armature
-        motor, external = self.motor(duty, inputs["volts"], enabled, qd), -self.gravity * jnp.sin(q - self.tilt)
-        damped = mass + h * (self.gear.Kv + enabled * self.kt**2 / self.R)
+        motor, external = self.motor(duty, inputs["volts"], enabled, qd), -self.gravity * jnp.sin(middle - self.tilt)
+        damped = mass + 0.5 * h * (self.gear.Kv + enabled * self.kt**2 / self.R)
         free = qd + h * (motor + external - self.gear.viscous_force(qd)) / damped
         most = h * self.friction(motor, external, qd) / damped
         after = jnp.where(jnp.abs(free) <= most, 0.0, free - jnp.sign(free) * most)
@@ -130,6 +129,7 @@ class ServoEngine(eqx.Module):
     """A servo over the samples of a record, in equal steps between two of them; inputs are held."""
 
     model: Servo
+    substeps: int = eqx.field(static=True, default=3)
 
     def __call__(self, values: dict[str, Array], start: None, run: Runs) -> ModelOutput:
         """The angle with these values."""
@@ -140,8 +140,8 @@ class ServoEngine(eqx.Module):
         def advance(carry: tuple[Array, Array], sample: tuple[Array, dict[str, Array]]) -> tuple[tuple, Array]:
             (q, qd), (dt, held) = carry, sample
             before = q
-            for _ in range(_SUBSTEPS):
-                q, qd = servo.step(q, qd, dt / _SUBSTEPS, held)
+            for _ in range(self.substeps):
+                q, qd = servo.step(q, qd, dt / self.substeps, held)
             return (q, qd), before
 
         dt = jnp.diff(run.t, append=run.t[-1:])

@@ -128,8 +128,9 @@ class ServoFit:
         numbers = body["numbers"]
         model = Servo.start(body["law"], numbers["inertia"], numbers["gravity"])
         model = replace_numbers(model, {name: on_device(np.asarray(x, float)) for name, x in numbers.items()})
-        names = ("law", "members", "left_out", "fitted", "band", "evaluations", "prior", "from_duty")
-        return ServoFit(model=model, **{name: body[name] for name in names})
+        names = ("law", "members", "left_out", "fitted", "band", "evaluations", "from_duty")
+        prior = {name: (float(mean), float(deviation)) for name, (mean, deviation) in body["prior"].items()}
+        return ServoFit(model=model, prior=prior, **{name: body[name] for name in names})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,7 +283,10 @@ def _half(band: Mapping[str, float], spread: np.ndarray, q: np.ndarray) -> np.nd
 def _calibrated(
     fit: ServoFit, problem: FitProblem, residuals: list[tuple[np.ndarray, np.ndarray]], counts: np.ndarray, level: float
 ) -> dict[str, float]:
-    """The narrowest band that holds the share `level` of the samples of records that were left out, each weighing alike."""
+    """The narrowest band that holds the share `level` of the samples of records that were left out.
+
+    Each record weighs alike.
+    """
     free = problem.free
     members = [_angles(problem, free.coordinates(own)) for own in fit.members.values()]
     numbers = {name: float(scene_numbers(fit.model)[name]) for name in free.names}
@@ -297,7 +301,9 @@ def _calibrated(
         order = np.argsort(every)
         reached = np.cumsum(weights[order]) / np.sum(weights)
         factor = float(every[order][min(np.searchsorted(reached, level), every.size - 1)])
-        width = float(np.mean([np.mean(factor * unit[i][counts[i]]) for out, _ in residuals for i in np.flatnonzero(out)]))
+        width = float(
+            np.mean([np.mean(factor * unit[i][counts[i]]) for out, _ in residuals for i in np.flatnonzero(out)])
+        )
         if not best or width < best["mean"]:
             best = {"level": level, "factor": factor, "least": _LEAST, "share": share, "mean": width}
     return best
