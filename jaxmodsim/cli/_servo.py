@@ -184,7 +184,7 @@ def record_errors(fit: ServoFit) -> pd.DataFrame:
 def _column(table: Columns, name: str, option: str) -> np.ndarray:
     if name not in table:
         raise ValueError(f"there is no column {name!r} ({option}); the file has: {', '.join(table)}.")
-    numbers = pd.to_numeric(pd.Series(np.asarray(table[name])), errors="coerce").to_numpy(float)
+    numbers = np.asarray(pd.to_numeric(pd.Series(np.asarray(table[name])), errors="coerce"), float)
     if not np.isfinite(numbers).all():
         raise ValueError(f"column {name!r} has no finite number in sample {int(np.argmin(np.isfinite(numbers)))}.")
     return numbers
@@ -233,14 +233,15 @@ def _pendulum(text: str) -> tuple[float, float]:
 
 
 def _prior(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Parse NAME=MEAN:DEVIATION."""
     prior = {}
     for text in texts:
-        match = re.fullmatch(r"([\w.]+)=([^:]+):([^:]+)", text)
+        name, _, numbers = text.partition("=")
         try:
-            name, mean, deviation = match.groups() if match else ("", "nan", "nan")
-            prior[name] = (float(mean), float(deviation))
+            mean, deviation = (float(x) for x in numbers.split(":"))
         except ValueError:
-            prior[""] = (math.nan, math.nan)
-        if not (match and math.isfinite(prior[name][0]) and prior[name][1] > 0):
+            mean = deviation = math.nan
+        if not (math.isfinite(mean) and deviation > 0):
             raise ValueError(f"--prior needs NAME=MEAN:DEVIATION with a deviation > 0, but {text!r} was given.")
+        prior[name] = (mean, deviation)
     return prior

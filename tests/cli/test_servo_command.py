@@ -80,7 +80,7 @@ def test_angle_gain_and_start_come_from_columns_or_options(folder, run_command) 
     summary = json.loads((out / "both.json").read_text())
     assert summary["mean_absolute_error"] < 0.02
     run(run_command, "predict", fit, str(folder / "both.csv"), "--q0", "0.05", "--out", str(out))
-    assert pd.read_csv(out / "both.csv")["q"][0] == pytest.approx(0.05)
+    assert pd.read_csv(out / "both.csv")["q"].to_numpy()[0] == pytest.approx(0.05)
 
 
 def test_fit_from_the_measured_duty_predicts_from_it(folder, run_command) -> None:

@@ -50,7 +50,8 @@ def simulate_servo(
             def stops(time: float, y: np.ndarray, side: float = side, at: float = at) -> float:
                 return side * y[1] if time > at + 1e-9 else 1.0
 
-            stops.terminal, stops.direction = True, -1.0
+            for name, value in (("terminal", True), ("direction", -1.0)):  # as SciPy asks for it
+                setattr(stops, name, value)
             run = solve_ivp(slope, (at, end), [q, v], rtol=1e-8, atol=1e-10, events=stops)
             q, v, at = float(run.y[0, -1]), float(run.y[1, -1]), float(run.t[-1])
             if run.status == 0:

@@ -1,6 +1,7 @@
 """Servos: the simulation against SciPy with events, recovery of known parameters, bands, and measured records."""
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -21,6 +22,10 @@ MODEL = Servo(
     **PENDULUM,
     **{name: TRUE[name] for name in ("kt", "R", "armature", "tilt", "Kq")},
 )
+
+
+def fitted(records: Sequence[Record], law: str = "MQ", groups: Mapping[str, Sequence[str]] | None = None) -> ServoFit:
+    return fit_servo(records, law, inertia=PENDULUM["inertia"], gravity=PENDULUM["gravity"], groups=groups)
 
 
 def synthetic(kind: str, kp: float, seconds: float = 2.5, noise: float = 0.0) -> Record:
@@ -67,7 +72,7 @@ def test_gradients_are_those_of_differences() -> None:
 @pytest.fixture(scope="module")
 def fit() -> ServoFit:
     kinds = [("sine", 100.0), ("sine", 400.0), ("lift", 200.0), ("lift", 400.0), ("chirp", 200.0)]
-    return fit_servo([synthetic(kind, kp, noise=4e-4) for kind, kp in kinds], "MQ", **PENDULUM)
+    return fitted([synthetic(kind, kp, noise=4e-4) for kind, kp in kinds])
 
 
 def test_known_parameters_are_recovered(fit: ServoFit) -> None:
@@ -103,7 +108,7 @@ def test_measured_records_left_out_are_predicted_better_than_by_published_parame
         records.append(servo_record(*columns, kp=float(path.stem[2:5]), name=path.stem))
     names = [record.name for record in records]
     groups = {kind: [name for name in names if kind in name] for kind in ("lift_and_drop", "sin_sin", "up_and_down")}
-    fit = fit_servo(records, "MQ", **PENDULUM, groups=groups)
+    fit = fitted(records, groups=groups)
     assert fit.left_out_error < 0.036  # the published M6 at these gains
     at_100 = [group[name] for group in fit.left_out.values() for name in group if name.startswith("kp100")]
     assert np.mean(at_100) < 0.0185
@@ -122,11 +127,11 @@ def test_wrong_arguments_are_named() -> None:
     with pytest.raises(ValueError, match="gain kp of its position loop or the measured duty"):
         servo_record(t, None, t, t, t)
     with pytest.raises(ValueError, match="law must be one of M1"):
-        fit_servo([record, record], "M9", **PENDULUM)
+        fitted([record, record], "M9")
     with pytest.raises(ValueError, match="two records at least"):
-        fit_servo([record], "M1", **PENDULUM)
+        fitted([record], "M1")
     with pytest.raises(ValueError, match="groups names 'other'"):
-        fit_servo([record], "M1", **PENDULUM, groups={"a": ["other"]})
+        fitted([record], "M1", {"a": ["other"]})
     with pytest.raises(ValueError, match="kt must be"):
         Servo(MODEL.gear, **PENDULUM, kt=-1.0)
 

@@ -17,7 +17,7 @@ from ..._core.system import jsonable
 from ...scene import replace_numbers, scene_numbers, scene_ranges
 from ..data._record import SINGLE, Record, cut, runs_of
 from ..estimate._problem import FitProblem, Prior, SquaredLoss
-from ..estimate._search import SearchOptions, solve
+from ..estimate._search import SearchOptions, SearchResult, solve
 from ..model._parameters import FreeParameters
 from ..model._servo import SERVO_LAWS, Servo, ServoEngine, servo_windows
 from ..uncertainty._fit import result_of
@@ -208,7 +208,7 @@ def fit_servo(
     first = _problem(start, law, tuple(windows), prior or {})
     evaluations: dict[str, int] = {}
 
-    def search(name: str, keep: np.ndarray):
+    def search(name: str, keep: np.ndarray) -> SearchResult:
         if progress is not None:
             progress(name)
         some = first.counting(np.broadcast_to(keep[owner][:, None], first.runs.t.shape), slips=False)
