@@ -21,6 +21,8 @@ GROUPS = ("lift_and_drop", "sin_sin", "up_and_down", "kp100", "kp200", "kp400")
 # Mean absolute errors [mrad] of the published parameters at gains 100, 200, 400, over four trajectories.
 PUBLISHED = {"M6, published": (17.1, 41.4, 56.5), "M1, published": (49.8, 55.1, 63.1)}
 GAINS = (100, 200, 400)
+# XL330-M288 at 5 V (ROBOTIS e-manual): stall at 0.52 N m and 1.47 A.
+DATA_SHEET = ("--prior", "kt=0.354:0.035", "--prior", "R=3.4:0.34")
 
 
 def main(smoke: bool, out: Path) -> Result | None:
@@ -38,14 +40,9 @@ def main(smoke: bool, out: Path) -> Result | None:
         report = _fit(paths, folder / "fit", "M3" if smoke else "all")
         result.settings["seconds"] = round(time.perf_counter() - started)
         result.settings["evaluations"] = max(row["of all fits"] for row in report["ranking"])
-        for row in report["ranking"]:
-            law = report["laws"][row["law"]]
-            result.add("parameters", row["parameters"], peer=row["law"])
-            result.add("fitted", row["fitted [mrad]"], "mrad", peer=row["law"])
-            result.add("trajectory left out", row["trajectory left out"], "mrad", peer=row["law"])
-            result.add("gain left out", row["gain left out"], "mrad", peer=row["law"])
-            for gain in GAINS:
-                result.add(f"gain {gain}", _at_gain(law, gain), "mrad", peer=row["law"])
+        _add_ranking(result, report)
+        known = _fit(paths, folder / "known", report["model"], *DATA_SHEET)
+        _add_ranking(result, known, ", data sheet")
         for peer, errors in PUBLISHED.items():
             for gain, error in zip(GAINS, errors, strict=True):
                 result.add(f"gain {gain}", error, "mrad", peer=peer)
@@ -63,6 +60,17 @@ def _records(folder: Path, smoke: bool) -> list[Path]:
     for path in short:
         path.write_text("".join((XL330 / path.name).read_text().splitlines(keepends=True)[:501]))
     return short
+
+
+def _add_ranking(result: Result, report: dict[str, Any], suffix: str = "") -> None:
+    for row in report["ranking"]:
+        law, peer = report["laws"][row["law"]], {"peer": row["law"] + suffix}
+        result.add("parameters", row["parameters"], **peer)
+        result.add("fitted", row["fitted [mrad]"], "mrad", **peer)
+        result.add("trajectory left out", row["trajectory left out"], "mrad", **peer)
+        result.add("gain left out", row["gain left out"], "mrad", **peer)
+        for gain in GAINS:
+            result.add(f"gain {gain}", _at_gain(law, gain), "mrad", **peer)
 
 
 def _at_gain(law: dict[str, Any], gain: int) -> float | None:
@@ -92,8 +100,8 @@ def _predict_left_out(result: Result, paths: Sequence[Path], group: str, folder:
         result.add("half band", 1e3 * row["half_band"], "mrad", **case)
 
 
-def _fit(paths: Sequence[Path], folder: Path, laws: str) -> dict[str, Any]:
-    _command("fit", *map(str, paths), "--axis", "servo", "--laws", laws, "--out", str(folder))
+def _fit(paths: Sequence[Path], folder: Path, laws: str, *options: str) -> dict[str, Any]:
+    _command("fit", *map(str, paths), "--axis", "servo", "--laws", laws, "--out", str(folder), *options)
     return json.loads((folder / "fit.json").read_text())
 
 

@@ -20,7 +20,6 @@ from ._output import Content, frame_of, say, show_paths, show_table, write
 # Full duty as the servo reports it; standard gravity [m/s^2].
 _FULL_DUTY, _GRAVITY = 885.0, 9.80665
 _GAIN_IN_NAME = re.compile(r"kp[_=]?(\d+(?:\.\d+)?)", re.IGNORECASE)
-_Request = FitRequest | PredictRequest
 
 
 def run_servo_fit(request: FitRequest) -> None:
@@ -32,7 +31,7 @@ def run_servo_fit(request: FitRequest) -> None:
     """
     laws, prior = _laws(request.laws), _prior(request.prior)
     mass, length = _pendulum(request.pendulum)
-    records = tuple(read_servo(path, request) for path in request.records)
+    records = tuple(read_servo(path, request)[0] for path in request.records)
     names = [record.name for record in records]
     for i, name in enumerate(names):
         if name in names[:i]:
@@ -79,7 +78,7 @@ def run_servo_prediction(request: PredictRequest) -> None:
     """
     fit, files, rows = ServoFit.load(request.fit), {}, []
     for path in request.records:
-        record, measured = read_servo(path, request), request.position in read_columns(path)
+        record, measured = read_servo(path, request)
         if ("duty" in record.inputs) != fit.from_duty:
             wanted = "the measured duty: add --duty COLUMN" if fit.from_duty else "commands: omit --duty"
             raise ValueError(f"{request.fit.name} was fitted to {wanted}.")
@@ -110,28 +109,31 @@ def prediction_summary(fit: ServoFit, prediction: ServoPrediction, measured: boo
     return summary
 
 
-def read_servo(path: Path, request: _Request) -> Record:
-    """A record of a servo from a file.
+def read_servo(path: Path, request: FitRequest | PredictRequest) -> tuple[Record, bool]:
+    """A record of a servo from a file, and whether it has the measured angle.
+
+    A prediction needs no angle; if only its first samples have one, the first is the start.
 
     **Raises:**
 
     - `ValueError` naming the file, for a missing column, values that are not finite, or an unknown gain.
     """
-    table = read_columns(path)
+    table, q, q0 = read_columns(path), None, None
     try:
-        t, goal, volts = (_column(table, name, option) for name, option in (
-            (request.time, "--time"), (request.goal, "--goal"), (request.supply, "--supply")))  # fmt: skip
+        t, goal = _column(table, request.time, "--time"), _column(table, request.goal, "--goal")
+        volts = _column(table, request.supply, "--supply")
         on = _column(table, request.enable, "--enable") if request.enable in table else np.ones_like(t)
-        q = _column(table, request.position, "--position")[:] if request.position in table else None
-        if q is None and isinstance(request, FitRequest):
-            _column(table, request.position, "--position")
-        kp = duty = None
-        if request.duty is not None:
-            duty = _column(table, request.duty, "--duty") / _FULL_DUTY
-        else:
-            kp = _gain(table, path, request.gain)
-        q0 = request.q0 if isinstance(request, PredictRequest) else None
-        return servo_record(t, q, goal, volts, on, kp=kp, duty=duty, q0=q0, name=path.stem)
+        if isinstance(request, FitRequest):
+            q = _column(table, request.position, "--position")
+        elif request.position in table:
+            angle = _numbers(table, request.position)
+            q = angle if np.isfinite(angle).all() else None
+            q0 = float(angle[0]) if np.isfinite(angle[0]) else None
+        if isinstance(request, PredictRequest) and request.q0 is not None:
+            q0 = request.q0
+        duty = None if request.duty is None else _column(table, request.duty, "--duty") / _FULL_DUTY
+        kp = _gain(table, path, request.gain) if duty is None else None
+        return servo_record(t, q, goal, volts, on, kp=kp, duty=duty, q0=q0, name=path.stem), q is not None
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from error
 
@@ -181,10 +183,14 @@ def record_errors(fit: ServoFit) -> pd.DataFrame:
     return frame_of(rows, "record", "fitted", "trajectory left out", "gain left out")
 
 
+def _numbers(table: Columns, name: str) -> np.ndarray:
+    return np.asarray(pd.to_numeric(pd.Series(np.asarray(table[name])), errors="coerce"), float)
+
+
 def _column(table: Columns, name: str, option: str) -> np.ndarray:
     if name not in table:
         raise ValueError(f"there is no column {name!r} ({option}); the file has: {', '.join(table)}.")
-    numbers = np.asarray(pd.to_numeric(pd.Series(np.asarray(table[name])), errors="coerce"), float)
+    numbers = _numbers(table, name)
     if not np.isfinite(numbers).all():
         raise ValueError(f"column {name!r} has no finite number in sample {int(np.argmin(np.isfinite(numbers)))}.")
     return numbers

@@ -83,6 +83,17 @@ def test_angle_gain_and_start_come_from_columns_or_options(folder, run_command) 
     assert pd.read_csv(out / "both.csv")["q"].to_numpy()[0] == pytest.approx(0.05)
 
 
+def test_first_angle_alone_is_the_start(folder, run_command) -> None:
+    new = frame("chirp", 150).assign(kp=150.0)
+    new.loc[1:, "q"] = np.nan
+    new.loc[0, "q"] = 0.03
+    new.to_csv(folder / "started.csv", index=False)
+    fit, out = str(folder / "fit" / "fit.json"), folder / "started"
+    run(run_command, "predict", fit, str(folder / "started.csv"), "--out", str(out))
+    assert pd.read_csv(out / "started.csv")["q"].to_numpy()[0] == pytest.approx(0.03)
+    assert "mean_absolute_error" not in json.loads((out / "started.json").read_text())
+
+
 def test_fit_from_the_measured_duty_predicts_from_it(folder, run_command) -> None:
     out = folder / "duty"
     run(run_command, "fit", *records(folder)[:3], "--axis", "servo", "--laws", "MQ", "--duty", "pwm", "--out", str(out))
