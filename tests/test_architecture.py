@@ -24,12 +24,12 @@ APPLICATIONS = {
     "metrics": 550,
     "analysis": 2000,
     "orbits": 3100,
-    "identify": 9250,
+    "identify": 9850,
     "sweeps": 2150,
     "export": 1100,
     "problems": 2700,
     "plot": 1650,
-    "cli": 3050,
+    "cli": 3400,
 }
 LABORATORY = ("tests", "bench")
 ROOMS = (*CORE, *APPLICATIONS)

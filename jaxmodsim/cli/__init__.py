@@ -1,4 +1,4 @@
-"""The command line: `jaxmodsim demo | testbench | fit | sweep | orbit | branch | bench | cache`."""
+"""The command line: `jaxmodsim demo | testbench | fit | predict | sweep | orbit | branch | bench | cache`."""
 
 import os
 import sys

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from ._options import FitRequest, Interrupted, Out, SpecFile, SweepRequest, command_of
+from ._options import FitRequest, Interrupted, Out, PredictRequest, SpecFile, SweepRequest, command_of
 
 app = typer.Typer(
     name="jaxmodsim",
@@ -71,12 +71,34 @@ def bench_models(out: Out = Path("jaxmodsim-testbench")) -> None:
 def fit(request: FitRequest) -> None:
     """Fit mass, offset and friction of one axis to records of position and applied force, by open-loop simulation.
 
+    With --axis servo: motor and gear friction of a position servo, from command and supply.
+
     Ctrl-C ends the search; its result so far is written, and the exit code is 130.
     """
     _start()
+    if request.axis == "servo":
+        from ._servo import run_servo_fit
+
+        run_servo_fit(request)
+        return
+    if request.axis != "driven":
+        raise ValueError(f"--axis must be driven or servo, but {request.axis!r} was given.")
     from ._fit import run_fit
 
     run_fit(request)
+
+
+@app.command()
+@command_of(PredictRequest)
+def predict(request: PredictRequest) -> None:
+    """Predict the angle of a fitted servo for new commands, with a band for 90 % of the samples.
+
+    Writes for each RECORD a CSV of t, q, lower and upper, a JSON summary and a figure.
+    """
+    _start()
+    from ._servo import run_servo_prediction
+
+    run_servo_prediction(request)
 
 
 @app.command()

@@ -45,6 +45,7 @@ SpecFile = Annotated[Path, typer.Argument(help="TOML file of the tables describe
 
 # Panels of `jaxmodsim fit --help`.
 _COLUMNS, _MODEL, _VALIDATION, _SEARCH, _NEXT = "Columns", "Model", "Validation", "Search", "The next record"
+_SERVO = "Servo"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,6 +167,92 @@ class FitRequest:
         _option(_NEXT, r"Largest distance from the start \[m]; default: half the travel of the records."),
     ] = None
     duration: Annotated[float | None, _option(_NEXT, r"Duration \[s]; default: that of the longest record.")] = None
+    axis: Annotated[
+        str,
+        _option(
+            _SERVO,
+            "driven, an axis under the force of --force; or servo, a position servo that turns a pendulum, from columns"
+            " of command and supply. --laws are then M1 to M6 and MQ, by default all. Of the other options, a servo"
+            " takes --time, --position and --out.",
+            "driven|servo",
+        ),
+    ] = "driven"
+    goal: Annotated[str, _option(_SERVO, r"Column of the commanded angle \[rad].")] = "q_goal"
+    supply: Annotated[str, _option(_SERVO, r"Column of the supply \[V].")] = "volts"
+    enable: Annotated[str, _option(_SERVO, "Column that is 0 while the motor is off; without it always on.")] = (
+        "torque_enable"
+    )
+    gain: Annotated[
+        str | None,
+        _option(
+            _SERVO,
+            "Gain of the position loop: a number, or a column. The default is the column kp, or the number after kp in"
+            " the name of the file.",
+            "NUMBER|COLUMN",
+        ),
+    ] = None
+    duty: Annotated[
+        str | None,
+        _option(
+            _SERVO,
+            "Simulate from the measured duty in this column, from -885 to 885, and not from the command.",
+            "COLUMN",
+        ),
+    ] = None
+    pendulum: Annotated[
+        str,
+        _option(_SERVO, r"Mass \[kg] and distance \[m] of the pendulum from the servo.", "MASS,LENGTH"),
+    ] = "0.49,0.1"
+    prior: Annotated[
+        list[str],
+        _option(
+            _SERVO,
+            "Mean and standard deviation of a parameter, such as those of a data sheet: kt=0.37:0.05. Repeatable.",
+            "NAME=MEAN:DEVIATION",
+        ),
+    ] = field(default_factory=list)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PredictRequest:
+    """Arguments and options of `jaxmodsim predict`, as typed."""
+
+    fit: Annotated[Path, typer.Argument(help="fit.json of jaxmodsim fit --axis servo.", metavar="FIT")]
+    records: Annotated[
+        list[Path],
+        typer.Argument(help="Records of command and supply; with the angle, its error is reported.", metavar="RECORD"),
+    ]
+    time: Annotated[str, _option(_COLUMNS, "Column of time.")] = "t"
+    position: Annotated[
+        str, _option(_COLUMNS, "Column of the measured angle, if any: its first sample is the start.")
+    ] = "q"
+    goal: Annotated[str, _option(_COLUMNS, r"Column of the commanded angle \[rad].")] = "q_goal"
+    supply: Annotated[str, _option(_COLUMNS, r"Column of the supply \[V].")] = "volts"
+    enable: Annotated[str, _option(_COLUMNS, "Column that is 0 while the motor is off; without it always on.")] = (
+        "torque_enable"
+    )
+    gain: Annotated[
+        str | None,
+        _option(
+            None,
+            "Gain of the position loop: a number, or a column. The default is the column kp, or the number after kp in"
+            " the name of the file.",
+            "NUMBER|COLUMN",
+        ),
+    ] = None
+    duty: Annotated[
+        str | None,
+        _option(
+            _COLUMNS,
+            "Simulate from the measured duty in this column, from -885 to 885, if the fit did.",
+            "COLUMN",
+        ),
+    ] = None
+    q0: Annotated[
+        float | None,
+        _option(None, r"Angle at rest at the first sample \[rad]; default: that of --position, or of --goal."),
+    ] = None
+    out: Out = Path("jaxmodsim-predict")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,6 +26,9 @@ from .model._axis import estimate_axis as estimate_axis
 from .model._engines import Controller as Controller
 from .model._engines import law_force as law_force
 from .model._engines import replay as replay
+from .model._servo import SERVO_LAWS as SERVO_LAWS
+from .model._servo import Servo as Servo
+from .model._servo import servo_record as servo_record
 from .selection._agreement import RecordAgreement as RecordAgreement
 from .selection._agreement import agreement as agreement
 from .selection._compare import Candidate as Candidate
@@ -38,6 +41,10 @@ from .selection._prediction import Score as Score
 from .selection._prediction import evaluate_on as evaluate_on
 from .selection._prediction import predict as predict
 from .selection._prediction import prediction_error as prediction_error
+from .selection._servo_fit import ServoFit as ServoFit
+from .selection._servo_fit import ServoPrediction as ServoPrediction
+from .selection._servo_fit import fit_servo as fit_servo
+from .selection._servo_fit import predict_servo as predict_servo
 from .uncertainty._coverage import coverage as coverage
 from .uncertainty._fit import fit as fit
 from .uncertainty._fit import fit_law as fit_law

@@ -13,6 +13,7 @@ from ._identify import fit_figure as fit_figure
 from ._identify import loops_figure as loops_figure
 from ._identify import result_figure as result_figure
 from ._identify import score_figure as score_figure
+from ._identify import servo_figure as servo_figure
 from ._identify import truth_figure as truth_figure
 from ._map import map2d as map2d
 from ._orbits import branch_figure as branch_figure

@@ -6,7 +6,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
-from ..identify import Comparison, FitResult, InputDesign, Record, RecordPrediction, Score, residual_tests
+from ..identify import (
+    Comparison,
+    FitResult,
+    InputDesign,
+    Record,
+    RecordPrediction,
+    Score,
+    ServoPrediction,
+    residual_tests,
+)
 from ._style import (
     BLUE,
     COLOURS,
@@ -69,6 +78,34 @@ def _add_band(figure: Figure, prediction: RecordPrediction, factor: float) -> No
     above.fill_between(t, lower, upper, color=GREEN, alpha=0.25, lw=0, label=label)
     below.fill_between(t, factor * (lower - output), factor * (upper - output), color=GREEN, alpha=0.25, lw=0)
     above.legend(loc="upper right")
+
+
+def servo_figure(prediction: ServoPrediction, *, measured: bool = True, caption: str = "") -> Figure:
+    """Plot the predicted angle of a servo with its band, the command, and the measured angle.
+
+    **Arguments:**
+
+    - `prediction`: from `jaxmodsim.identify.predict_servo`.
+    - `measured`: whether the record has the measured angle.
+    - `caption`: line below the figure, such as the source of the record.
+    """
+    record = prediction.record
+    figure = Figure(figsize=(11, 5), layout="constrained")
+    axis = figure.subplots()
+    band = f"band for {100 * prediction.level:g} % of the samples"
+    axis.fill_between(record.t, prediction.lower, prediction.upper, color=GREEN, alpha=0.25, lw=0, label=band)
+    if measured:
+        axis.plot(record.t, record.measured, color=GREY, lw=2.4, label="measured")
+    axis.plot(record.t, prediction.q, color=RED, lw=1.1, label="simulated, open loop")
+    low, high = float(np.min(prediction.lower)), float(np.max(prediction.upper))
+    axis.plot(record.t, np.clip(record.inputs["q_goal"], low, high), color=BLUE, lw=0.7, label="command, clipped")
+    error = f": mean absolute error {1e3 * prediction.error:.3g} mrad" if measured else ""
+    figure.suptitle(f"{record.name}{error}")
+    axis.set(xlabel="time [s]", ylabel="angle [rad]")
+    legend_above(axis)
+    if caption:
+        figure.supxlabel(caption, fontsize=8, color=GREY)
+    return figure
 
 
 def _followed(
