@@ -47,6 +47,10 @@ def mode_numbers(modes: Float[Array, "*time modes"], widths: tuple[int, ...]) ->
     """Modes as one number for each thing: a sign, or for a plane 1 in slip and 0 in stick.
 
     `widths` says how many numbers the mode of each thing has.
+
+    **Returns:**
+
+    The numbers, shape `[time, things]`, floating like `modes`.
     """
     if all(width == 1 for width in widths):
         return modes
