@@ -22,7 +22,7 @@ FILES = sorted(ROOT.rglob("*.py"))
 CORE = {"_core": 3250, "mechanics": 1600, "friction": 3000, "scene": 3700, "solvers": 3900, "simulation": 3150}
 APPLICATIONS = {
     "metrics": 550,
-    "analysis": 2000,
+    "analysis": 2100,
     "orbits": 3100,
     "identify": 9250,
     "sweeps": 2150,

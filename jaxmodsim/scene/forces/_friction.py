@@ -357,7 +357,12 @@ class Friction(AbstractEffect):
     def force_per_load(
         self, t: Scalar, q: PerDof, qd: PerDof, z: PyTree, params: PyTree
     ) -> tuple[Float[Array, "..."], PyTree]:
-        """The law's force, in newtons or per newton of load, and the rate of its state."""
+        """The law's force, in newtons or per newton of load, and the rate of its state.
+
+        **Raises:**
+
+        - `TypeError` for a set-valued law, whose force depends on a mode.
+        """
         v = self.stretch(self.slip(t, q, qd, params))
         if isinstance(self.law, AbstractDynamicLaw):
             return self.stretch(self.law.force(v, z)), self.law.zdot(v, z)
