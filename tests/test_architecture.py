@@ -26,7 +26,7 @@ APPLICATIONS = {
     "orbits": 3100,
     "identify": 9250,
     "sweeps": 2150,
-    "export": 1100,
+    "export": 1150,
     "problems": 2700,
     "plot": 1650,
     "cli": 3050,
