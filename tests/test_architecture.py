@@ -21,7 +21,7 @@ FILES = sorted(ROOT.rglob("*.py"))
 # private to the package. The number is the budget of lines of a room: to raise it is a decision, whose commit says why.
 CORE = {"_core": 3250, "mechanics": 1600, "friction": 3000, "scene": 3700, "solvers": 3950, "simulation": 3150}
 APPLICATIONS = {
-    "metrics": 550,
+    "metrics": 650,
     "analysis": 2100,
     "orbits": 3100,
     "identify": 9250,
