@@ -23,7 +23,7 @@ CORE = {"_core": 3250, "mechanics": 1600, "friction": 3000, "scene": 3700, "solv
 APPLICATIONS = {
     "metrics": 650,
     "analysis": 2100,
-    "orbits": 3100,
+    "orbits": 3200,
     "identify": 9250,
     "sweeps": 2150,
     "export": 1150,

@@ -62,6 +62,19 @@ def continue_equilibria(
     - `ValueError` as `equilibrium`, and for an unknown parameter.
     - `OrbitError` if the first equilibrium is not found. Where the continuation fails later the branch ends, and
       `Branch.ending` has the reason.
+
+    **Example:**
+
+    ```python
+    belt = jms.problems.belt_oscillator
+    scene = belt.scene(belt.stribeck(), c=2.0)
+    branch = jms.continue_equilibria(scene, [0.06], "friction.belt_velocity", (0.05, 0.5), step=0.1)
+    print([(round(branch.values[i], 3), bool(branch.stable[i])) for i in (0, -1)])
+    ```
+
+    ```text
+    [(np.float64(0.05), False), (np.float64(0.5), True)]
+    ```
     """
     first, last = read_span(span)
     check_parameter(scene, parameter)
