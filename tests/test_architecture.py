@@ -24,7 +24,7 @@ APPLICATIONS = {
     "metrics": 650,
     "analysis": 2100,
     "orbits": 3200,
-    "identify": 9250,
+    "identify": 9400,
     "sweeps": 2150,
     "export": 1150,
     "problems": 2700,
