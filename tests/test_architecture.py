@@ -28,7 +28,7 @@ APPLICATIONS = {
     "sweeps": 2150,
     "export": 1150,
     "problems": 2700,
-    "plot": 1650,
+    "plot": 1700,
     "cli": 3050,
 }
 LABORATORY = ("tests", "bench")
