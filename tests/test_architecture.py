@@ -27,7 +27,7 @@ APPLICATIONS = {
     "identify": 9400,
     "sweeps": 2150,
     "export": 1150,
-    "problems": 2700,
+    "problems": 2900,
     "plot": 1700,
     "cli": 3050,
 }
