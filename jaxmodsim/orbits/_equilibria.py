@@ -69,11 +69,11 @@ def continue_equilibria(
     belt = jms.problems.belt_oscillator
     scene = belt.scene(belt.stribeck(), c=2.0)
     branch = jms.continue_equilibria(scene, [0.06], "friction.belt_velocity", (0.05, 0.5), step=0.1)
-    print([(round(branch.values[i], 3), bool(branch.stable[i])) for i in (0, -1)])
+    print(branch.values[[0, -1]].round(2), branch.stable[[0, -1]])
     ```
 
     ```text
-    [(np.float64(0.05), False), (np.float64(0.5), True)]
+    [0.05 0.5 ] [False  True]
     ```
     """
     first, last = read_span(span)

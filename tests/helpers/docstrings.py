@@ -8,7 +8,6 @@ import ast
 import importlib
 import inspect
 import io
-import os
 import re
 import sys
 import tempfile
@@ -127,6 +126,5 @@ if __name__ == "__main__":
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    os.environ.setdefault("MPLBACKEND", "Agg")
     for path in map(Path, sys.argv[1:]):
         path.write_text(with_output(path.read_text()))
