@@ -19,16 +19,16 @@ FILES = sorted(ROOT.rglob("*.py"))
 # never in the wheel. Rooms are in the order of their imports: a room imports only rooms above it, imports for type
 # checkers included; what it takes from another room is among that room's public names. `_core` has none: all of it is
 # private to the package. The number is the budget of lines of a room: to raise it is a decision, whose commit says why.
-CORE = {"_core": 3250, "mechanics": 1400, "friction": 2750, "scene": 3500, "solvers": 3900, "simulation": 3050}
+CORE = {"_core": 3300, "mechanics": 1600, "friction": 3000, "scene": 3700, "solvers": 3950, "simulation": 3200}
 APPLICATIONS = {
-    "metrics": 550,
-    "analysis": 2000,
-    "orbits": 3100,
-    "identify": 9850,
+    "metrics": 650,
+    "analysis": 2100,
+    "orbits": 3200,
+    "identify": 10000,
     "sweeps": 2150,
-    "export": 1100,
-    "problems": 2700,
-    "plot": 1650,
+    "export": 1150,
+    "problems": 2900,
+    "plot": 1750,
     "cli": 3400,
 }
 LABORATORY = ("tests", "bench")

@@ -160,6 +160,25 @@ def parameter(
     - `name`: name of the field, for error messages.
     - `unit`, `lower`, `strict`, `upper`, `execution`, `most`: see `Range`.
     - `field`: further arguments of `equinox.field`, such as `default`.
+
+    **Returns:**
+
+    The field; it converts its value to a floating array of shape `[]`.
+
+    **Example:**
+
+    ```python
+    import equinox as eqx
+
+    class Spring(eqx.Module):
+        k: jax.Array = jms.friction.parameter("k", "N/m", lower=0.0)
+
+    print(Spring(k=3))
+    ```
+
+    ```text
+    Spring(k=f64[])
+    ```
     """
     allowed = Range(unit, lower, strict, upper, execution, most)
     if "default" in field:

@@ -44,6 +44,16 @@ def tune_cpu(while_loop_bytes: int = 1_000_000) -> None:
     - `RuntimeError` if JAX has already computed something, since the option then has no effect. A second call does
       nothing, nor does a call in a process that inherits `XLA_FLAGS` with the option, such as a dask worker.
     - `ValueError` if `while_loop_bytes` is not a positive integer.
+
+    **Example:**
+
+    *Not run in the tests: JAX has already started there.*
+
+    ```python
+    import jaxmodsim as jms
+
+    jms.tune_cpu()  # before the first array of JAX
+    ```
     """
     while_loop_bytes = as_whole(while_loop_bytes, name="while_loop_bytes")
     flags = os.environ.get("XLA_FLAGS", "")

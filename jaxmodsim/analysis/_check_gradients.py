@@ -85,6 +85,20 @@ class GradientCheck:
     - `remarks`: sentences about the numbers and the check as a whole.
     - `ok`: whether all derivatives agree with each other and with the differences. Remarks may still limit the range
       in which they do.
+
+    **Example:**
+
+    ```python
+    def end(scene, simulate=jms.simulate):
+        return simulate(scene, [1.0], [0.0], 2.0).q[-1, 0]
+
+    check = jms.check_gradients(end, jms.problems.braked_spring.scene(), names=("k",))
+    print(check.numbers["k"].verdict, check.remarks)
+    ```
+
+    ```text
+    agree ()
+    ```
     """
 
     value: float
@@ -117,14 +131,6 @@ def check_gradients(
     rtol: float | None = None,
 ) -> GradientCheck:
     """Compare forward-mode, reverse-mode and finite-difference derivatives of a function of a scene.
-
-    ```python
-    def end(scene, simulate=jaxmodsim.simulate):
-        return simulate(scene, [1.0], [0.0], 5.0).q[-1, 0]
-
-    print(jaxmodsim.check_gradients(end, scene))
-    jax.grad(end)(scene)
-    ```
 
     The function must run the scene with its second argument `simulate`, which records the modes of the runs. With
     `jaxmodsim.simulate` as the default of that argument, the same function works with `jax.grad`. The function may run
@@ -171,6 +177,20 @@ def check_gradients(
     - `ValueError` if `fn` does not take `simulate`, does not use it, or returns no finite real scalar; if the scene has
       no numbers, or none of a name in `names`.
     - `SimulationError` if the run at `scene` itself ends early.
+
+    **Example:**
+
+    ```python
+    def end(scene, simulate=jms.simulate):
+        return simulate(scene, [1.0], [0.0], 2.0).q[-1, 0]
+
+    scene = jms.problems.braked_spring.scene()
+    print(jms.check_gradients(end, scene).ok, f"{jax.grad(end)(scene).params['k']:.5f} m/(N/m)")
+    ```
+
+    ```text
+    True -0.13685 m/(N/m)
+    ```
     """
     entries = _entries(scene, names, scales or {})
     runs: list[Trajectory] = []

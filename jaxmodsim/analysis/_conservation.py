@@ -30,6 +30,19 @@ class EnergyAudit:
       state: the integration error.
 
     `print(audit)` shows the end of the run.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    run = jms.simulate(scene, [0.0], [0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 301))
+    audit = jms.energy_audit(run)
+    print(f"{audit.potential[-1]:.4f} J in the spring, closed within 1 uJ: {abs(audit.closing_error).max() < 1e-6}")
+    ```
+
+    ```text
+    0.0670 J in the spring, closed within 1 uJ: True
+    ```
     """
 
     t: Float[Array, " time"]
@@ -70,6 +83,19 @@ def energy_audit(run: Trajectory) -> EnergyAudit:
     **Raises:**
 
     - `ValueError` for a batch of runs: use `jax.vmap(jaxmodsim.energy_audit)(runs)`.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    run = jms.simulate(scene, [0.0], [0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 301))
+    audit = jms.energy_audit(run)
+    print(f"{audit.work['friction'][-1]:.4f} J from the belt, {audit.dissipated['friction'][-1]:.4f} J dissipated")
+    ```
+
+    ```text
+    1.4250 J from the belt, 1.3169 J dissipated
+    ```
     """
     book, losses = run.ledger, run.event_losses
     return EnergyAudit(
@@ -108,6 +134,17 @@ def cyclic_coordinates(scene: Scene, dof: int) -> tuple[int, ...]:
     **Raises:**
 
     - `ValueError` inside `jax.jit`, `jax.vmap` or `jax.grad`, where numbers are traced.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.spherical_pendulum.scene()  # polar angle and azimuth
+    print(jms.cyclic_coordinates(scene, dof=2))
+    ```
+
+    ```text
+    (1,)
+    ```
     """
     if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(scene)):
         raise ValueError(

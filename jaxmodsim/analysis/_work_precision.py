@@ -52,6 +52,22 @@ class Method:
       scene of the problem.
     - `steps`: fixed time steps [s], > 0, in place of tolerances.
     - `dtype`: `"float32"` or `"float64"`; by default that of the scene.
+
+    **Raises:**
+
+    - `ValueError` for a field of another type, and steps that are not positive.
+
+    **Example:**
+
+    ```python
+    rough = jms.problems.braked_spring.scene(jms.DeadZone(jms.Coulomb(Fc=0.1), width=1e-3))
+    methods = {"events": jms.Method(jms.Rodas5P()), "band": jms.Method(scene=rough, steps=(1e-3, 1e-4))}
+    print(methods["band"].steps)
+    ```
+
+    ```text
+    (0.001, 0.0001)
+    ```
     """
 
     solver: dfx.AbstractSolver | None = None
@@ -85,12 +101,6 @@ def default_methods(scene: Scene) -> dict[str, Method]:
 def formulations(scene: Scene, *, width: float, sigma0: float | None = None, sigma1: float = 0.0) -> dict[str, Scene]:
     """Replace the set-valued laws of a scene by other formulations.
 
-    ```python
-    methods = {"exact": Method()}
-    for name, other in formulations(scene, width=1e-3).items():
-        methods[name] = Method(scene=other, steps=(1e-3, 1e-4) if name == "DeadZone" else None)
-    ```
-
     `DeadZone` needs fixed time steps, because its vector field jumps at the edges of the band.
 
     **Arguments:**
@@ -109,6 +119,20 @@ def formulations(scene: Scene, *, width: float, sigma0: float | None = None, sig
 
     - `ValueError` if no law of the scene is set-valued, if numbers are out of range, or with `sigma0` if a law is
       neither `Coulomb` nor the Gaussian `Stribeck`.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    methods = {"exact": jms.Method()}
+    for name, other in jms.formulations(scene, width=1e-3, sigma0=1e5).items():
+        methods[name] = jms.Method(scene=other, steps=(1e-3, 1e-4) if name == "DeadZone" else None)
+    print(list(methods))
+    ```
+
+    ```text
+    ['exact', 'Regularized', 'DeadZone', 'LuGre']
+    ```
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"formulations needs a Scene, but a {type(scene).__name__} was given.")
@@ -163,14 +187,6 @@ def work_precision(
 ) -> WorkPrecision:
     """Run a scene by several methods at several tolerances, and compare errors with times and steps.
 
-    ```python
-    problem = jaxmodsim.problems.named_problems()["lugre_box"]()
-    study = jaxmodsim.work_precision(**problem.arguments)
-    print(study)
-    study.cheapest(1e-6)
-    jaxmodsim.plot.work_precision_figure(study).savefig("lugre_box.png")
-    ```
-
     **Reference.** Two solvers, `Rodas5P` and an explicit one, must agree at a tolerance of 1e-3 times the smallest in
     `tolerances`, but at least 1e-12; or one solver and a closed form. The result holds their disagreement: smaller
     errors are noise. A method with its own `scene` is also compared with the reference of that formulation, which
@@ -205,6 +221,21 @@ def work_precision(
 
     - `ValueError` for invalid arguments, and if JAX computes in single precision: the reference needs double precision.
     - `RuntimeError` if the references disagree or fail.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.braked_spring.scene(m=1.0, k=1.0)
+    methods = {"Tsit5": jms.Method(diffrax.Tsit5())}
+    study = jms.work_precision(scene, [1.0], [0.0], 10.0, methods=methods, tolerances=(1e-4, 1e-6), rounds=1)
+    for row in study.rows:
+        print(f"rtol {row.rtol:g}: {row.steps} steps, error {row.error:.1e}")
+    ```
+
+    ```text
+    rtol 0.0001: 21 steps, error 6.4e-05
+    rtol 1e-06: 56 steps, error 5.9e-07
+    ```
     """
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise ValueError(

@@ -86,6 +86,19 @@ class WorkPrecision:
     - `costs`: the timed calls; `batch`: number of runs of the vmap.
     - `rows`: a `Row` for each method and setting, including failures.
     - `machine`: processor, versions, date, commit.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.braked_spring.scene(m=1.0, k=1.0)
+    methods = {"Tsit5": jms.Method(diffrax.Tsit5())}
+    study = jms.work_precision(scene, [1.0], [0.0], 10.0, methods=methods, tolerances=(1e-4, 1e-6), rounds=1)
+    print(study.cheapest(1e-5).method, study.cheapest(1e-5).rtol)
+    ```
+
+    ```text
+    Tsit5 1e-06
+    ```
     """
 
     problem: str
@@ -238,6 +251,10 @@ def _digest(body: dict[str, object]) -> str:
 
 def load_work_precision(path: str | os.PathLike[str]) -> WorkPrecision:
     """Read a file of `WorkPrecision.save`.
+
+    **Returns:**
+
+    The `WorkPrecision` that was saved.
 
     **Raises:**
 

@@ -50,6 +50,16 @@ def to_modelica(
 
     - `ValueError` if the component does not support the law, with the reason and the remedy; for a law by `scaled_by`;
       if a number is out of range or the name is not an identifier.
+
+    **Example:**
+
+    ```python
+    print(jms.to_modelica(jms.Coulomb(Fc=5.0, Fs=8.0), v_max=1.0))
+    ```
+
+    ```text
+    Modelica.Mechanics.Translational.Components.SupportFriction friction(f_pos=[0, 5; 1, 5], peak=1.6);
+    ```
     """
     if not isinstance(law, AbstractLaw):
         raise ValueError(f"to_modelica needs a law, but {law!r} was given.")
@@ -185,6 +195,16 @@ def to_mujoco(law: AbstractLaw, joint: str = "joint") -> str:
     **Raises:**
 
     - `ValueError` if MuJoCo does not support the law, with the reason and the remedy; for a law by `scaled_by`.
+
+    **Example:**
+
+    ```python
+    print(jms.to_mujoco(jms.Coulomb(Fc=1.5), joint="slide"))
+    ```
+
+    ```text
+    <joint name="slide" frictionloss="1.5" solimpfriction="0.9999 0.9999 0.001"/>
+    ```
     """
     if not isinstance(law, AbstractLaw):
         raise ValueError(f"to_mujoco needs a law, but {law!r} was given.")

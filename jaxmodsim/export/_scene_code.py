@@ -106,6 +106,8 @@ def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
     equal those of JAX to four units in the last place of their terms, if the compiler neither reorders sums nor ignores
     NaN (no `-ffast-math`).
 
+    The feed-forward in a control loop:
+
     ```c
     static double y[press_Y], u[press_DOF];        /* q, qd, bristle; begins as a copy of press_rest */
     y[0] = q_plan, y[1] = qd_plan;                 /* every millisecond */
@@ -128,6 +130,18 @@ def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
 
     - `ValueError` for an unsupported operation of JAX, a loop without a bound, a friction element that
       `ImplicitFriction` does not support, a constraint, a `Signal`, and a name that is not an identifier.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.ramped_box.scene(jms.problems.ramped_box.lugre())
+    code = jms.to_c(scene, name="box")
+    print(next(line for line in code.splitlines() if "box_step" in line))
+    ```
+
+    ```text
+    int box_step(double t0, double t1, const double p[box_P], double y[box_Y]);
+    ```
     """
     return _scene_code(scene, dof, name, C, "to_c")
 
@@ -149,6 +163,18 @@ def to_javascript(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
     **Raises:**
 
     - `ValueError` as `to_c`, and for a scene in float32, which JavaScript does not support.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.ramped_box.scene(jms.problems.ramped_box.lugre())
+    code = jms.to_javascript(scene, name="box")
+    print(next(line for line in code.splitlines() if "states" in line).strip())
+    ```
+
+    ```text
+    const states = ["q[0]", "qd[0]", "friction.z"];
+    ```
     """
     return _scene_code(scene, dof, name, JAVASCRIPT, "to_javascript")
 

@@ -61,6 +61,18 @@ class Armstrong(AbstractDynamicLaw):
 
     - `ValueError` if a parameter is out of range or no number.
 
+    **Example:**
+
+    ```python
+    law = jms.Armstrong(sigma0=1e5, Fc=1.0, Fs=1.5, vs=0.01, Fv=0.4, tau=1e-3, gamma=1.0)
+    z = law.step_exact(jnp.array(0.01), law.initial_state(jnp.array(0.0)), jnp.array(1.0))
+    print(f"{law.force(jnp.array(0.01), z):.3f} N")
+    ```
+
+    ```text
+    1.254 N
+    ```
+
     ??? cite "Reference"
 
         ```bibtex

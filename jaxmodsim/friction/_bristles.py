@@ -128,6 +128,18 @@ class Dahl(AbstractPlanarLaw):
 
     - `ValueError` if a parameter is out of range or no number.
 
+    **Example:**
+
+    ```python
+    law = jms.Dahl(sigma0=1e4, Fc=2.0)
+    z = law.step_exact(jnp.array(0.01), jnp.array(0.0), jnp.array(0.02))  # slip by 0.2 mm
+    print(f"{law.force(jnp.array(0.01), z):.3f} N")
+    ```
+
+    ```text
+    1.264 N
+    ```
+
     ??? cite "Reference"
 
         ```bibtex
@@ -207,6 +219,18 @@ class LuGre(AbstractPlanarLaw):
     **Raises:**
 
     - `ValueError` if a parameter is out of range or no number.
+
+    **Example:**
+
+    ```python
+    law = jms.LuGre(sigma0=1e5, sigma1=300.0, sigma2=0.4, Fc=1.0, Fs=1.5, vs=0.01)
+    z = law.step_exact(jnp.array(0.01), jnp.array(0.0), jnp.array(1.0))  # slip by 10 mm
+    print(f"{law.force(jnp.array(0.01), z):.3f} N with {law.sigma2 * 0.01:.3f} N of viscous friction")
+    ```
+
+    ```text
+    1.188 N with 0.004 N of viscous friction
+    ```
 
     ??? cite "Reference"
 
@@ -319,6 +343,18 @@ class ElastoPlastic(AbstractDynamicLaw):
 
     - `ValueError` if a parameter is out of range or no number.
 
+    **Example:**
+
+    ```python
+    law = jms.ElastoPlastic(sigma0=1e5, sigma1=300.0, sigma2=0.4, Fba=0.7, Fc=1.0, Fs=1.5, vs=0.01)
+    z = law.step_exact(jnp.array(1e-3), jnp.array(0.0), jnp.array(5e-3))  # slip by 5 um: elastic
+    print(f"{law.sigma0 * z:.3f} N")
+    ```
+
+    ```text
+    0.500 N
+    ```
+
     ??? cite "Reference"
 
         ```bibtex
@@ -428,6 +464,18 @@ class Bristle(AbstractWrapper, AbstractDynamicLaw):
     **Raises:**
 
     - `ValueError` if `law` is not set-valued or `h` is out of range.
+
+    **Example:**
+
+    ```python
+    law = jms.Bristle(jms.Coulomb(Fc=2.0), h=1e-4)
+    z = law.step_exact(jnp.array(0.01), jnp.array(0.0), jnp.array(0.01))  # slip by h
+    print(f"{law.force(jnp.array(0.01), z):.3f} N")
+    ```
+
+    ```text
+    1.264 N
+    ```
     """
 
     law: AbstractSetValuedLaw = eqx.field(converter=partial(need_set_valued, owner="Bristle"))

@@ -51,6 +51,21 @@ class Geared(AbstractSetValuedLaw):
     **Raises:**
 
     - `ValueError` if a law is not set-valued, a coefficient is out of range, or `torque` is no function and no number.
+
+    **Example:**
+
+    ```python
+    def torque(t, q, qd, p):
+        return p["load"]
+
+    gear = jms.Geared(jms.Coulomb(Fc=0.1), drive=0.2, back=0.3, torque=torque)
+    law = gear.bind_state(jnp.array(0.0), jnp.zeros(1), jnp.zeros(1), {"load": jnp.array(2.0)})
+    print(jax.vmap(law.sliding_force)(jnp.array([1.0, -1.0])), "N m, driving and back-driving")
+    ```
+
+    ```text
+    [0.5 0.7] N m, driving and back-driving
+    ```
     """
 
     law: AbstractSetValuedLaw = eqx.field(converter=partial(need_set_valued, owner="Geared"))
@@ -150,6 +165,18 @@ class ServoGear(AbstractSetValuedLaw):
     **Raises:**
 
     - `ValueError` if a parameter is out of range, or a torque is neither a function nor a number.
+
+    **Example:**
+
+    ```python
+    gear = jms.ServoGear(motor=lambda t, q, qd, p: p["u"], external=-0.5, Kc=0.1, Kv=0.05, Km=0.2)
+    law = gear.bind_state(jnp.array(0.0), jnp.zeros(1), jnp.zeros(1), {"u": jnp.array(1.0)})
+    print(law.sliding_force(jnp.array(1.0)), "N m")  # Kc + |Km tau_m - Ke tau_e|
+    ```
+
+    ```text
+    0.4 N m
+    ```
 
     ??? cite "Reference"
 

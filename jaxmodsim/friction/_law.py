@@ -368,5 +368,10 @@ def register_law(law: type[_Law]) -> type[_Law]:
 
 
 def laws() -> Mapping[str, type[AbstractLaw]]:
-    """The registered laws by name, those of the package first."""
+    """The registered laws by name, those of the package first.
+
+    **Returns:**
+
+    A read-only mapping from the name of each class to the class.
+    """
     return MappingProxyType(_LAWS)

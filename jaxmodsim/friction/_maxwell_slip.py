@@ -49,6 +49,18 @@ class MaxwellSlip(AbstractDynamicLaw):
 
     - `ValueError` if a parameter is out of range or no number, or if lengths differ.
 
+    **Example:**
+
+    ```python
+    law = jms.MaxwellSlip(k=[1e5, 5e4], Fc=[0.4, 0.6])
+    z = law.step_exact(jnp.array(1e-3), jnp.zeros(2), jnp.array(8e-3))  # slip by 8 um: one element yields
+    print((law.k * z).round(3), "N")
+    ```
+
+    ```text
+    [0.4 0.4] N
+    ```
+
     ??? cite "Reference"
 
         ```bibtex

@@ -161,6 +161,17 @@ def asymmetric(law: _Law, **backward: object) -> _Law:
     **Raises:**
 
     - `ValueError` if the law lacks a parameter, a value is out of range, or `law` is not such a law.
+
+    **Example:**
+
+    ```python
+    law = jms.asymmetric(jms.Coulomb(Fc=2.0), Fc=3.0)
+    print(jax.vmap(law.sliding_force)(jnp.array([0.1, -0.1])), "N")
+    ```
+
+    ```text
+    [2. 3.] N
+    ```
     """
     inner = getattr(law, "law", None)
     if isinstance(inner, AbstractLaw):
@@ -235,6 +246,18 @@ def scaled_by(law: _Law, fn: object, parameters: Sequence[str] | None = None) ->
     - `ValueError` if `law` is not a law, `fn` is not a function, or the law lacks a parameter.
 
     The factor must keep the parameters in their ranges (Fs >= Fc); runs do not check that.
+
+    **Example:**
+
+    ```python
+    law = jms.scaled_by(jms.Coulomb(Fc=2.0), lambda t, q, qd, p: 1.0 + 0.1 * q[0])
+    here = law.bind_state(jnp.array(0.0), jnp.array([5.0]), jnp.zeros(1), {})
+    print(here.sliding_force(jnp.array(0.1)), "N")
+    ```
+
+    ```text
+    3.0 N
+    ```
     """
     if not isinstance(law, AbstractLaw):
         raise ValueError(f"scaled_by needs a law, but {law!r} was given; convert a function of velocity by Curve(fn).")

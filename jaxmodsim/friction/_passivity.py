@@ -42,7 +42,20 @@ def check_passivity(law: AbstractLaw, *, v_max: float = 1e3) -> Passivity:
 
     **Raises:**
 
-    - `ValueError` if `law` is not a law, depends on the state of the mechanism, or has a force that is not finite.
+    - `ValueError` if `law` is not a law, depends on the state of the mechanism, or has a force that is not finite; if
+      `v_max` is out of range.
+
+    **Example:**
+
+    ```python
+    law = jms.LuGre(sigma0=1e5, sigma1=300.0, sigma2=0.4, Fc=1.0, Fs=1.5, vs=0.01)
+    result = jms.check_passivity(law)
+    print(result.ok, f"margin {result.margin:.1f} N s/m")
+    ```
+
+    ```text
+    False margin -149.6 N s/m
+    ```
 
     ??? cite "Reference"
 
@@ -145,9 +158,6 @@ def _dissipation(law: AbstractDynamicLaw, slips: jax.Array, times: jax.Array, sp
 def _dtype(law: AbstractLaw) -> np.dtype:
     """Floating type of the law's numbers."""
     return jnp.result_type(float, *[x.dtype for x in jax.tree.leaves(law) if eqx.is_inexact_array(x)][:1])
-
-
-np.ndarray = np.ndarray
 
 
 def logarithmic(low: float, high: float, per_decade: int = 200) -> np.ndarray:

@@ -40,6 +40,17 @@ class Viscous(AbstractForceLaw):
     **Raises:**
 
     - `ValueError` if `Fv` is out of range or no number.
+
+    **Example:**
+
+    ```python
+    law = jms.Viscous(Fv=2.0)
+    print(law.force(jnp.array(0.5)), "N")
+    ```
+
+    ```text
+    1.0 N
+    ```
     """
 
     Fv: Number = parameter("Fv", "N s/m", lower=0.0)
@@ -83,6 +94,17 @@ class Curve(AbstractForceLaw):
     **Raises:**
 
     - `ValueError` if `fn` is not a function or `gain` is out of range.
+
+    **Example:**
+
+    ```python
+    law = jms.Curve(jnp.tanh, gain=3.0)
+    print(f"{law.force(jnp.array(0.5)):.3f} N")
+    ```
+
+    ```text
+    1.386 N
+    ```
     """
 
     fn: Callable[..., ArrayLike] = eqx.field(converter=partial(as_function, name="Curve fn"))
@@ -116,6 +138,17 @@ class Coulomb(AbstractSetValuedLaw):
     **Raises:**
 
     - `ValueError` if a parameter is out of range or no number.
+
+    **Example:**
+
+    ```python
+    law = jms.Coulomb(Fc=5.0, Fs=8.0)
+    print(law.sliding_force(jnp.array(0.1)), law.static_limit(jnp.array(1.0)), "N")
+    ```
+
+    ```text
+    5.0 8.0 N
+    ```
     """
 
     Fc: Number = parameter("Fc", "N", lower=0.0)
@@ -169,7 +202,12 @@ def exponential(x: Scalar) -> Scalar:
 
 
 def lorentzian(x: Scalar) -> Scalar:
-    """`1/(1 + x)`, the fall of the Lorentzian Stribeck curve (Hess and Soom 1990, Journal of Tribology 112:147)."""
+    """`1/(1 + x)`, the fall of the Lorentzian Stribeck curve (Hess and Soom 1990, Journal of Tribology 112:147).
+
+    **Returns:**
+
+    The factor, shape `[]`, 1 at x = 0.
+    """
     return 1.0 / (1.0 + x)
 
 
@@ -219,6 +257,17 @@ class Stribeck(AbstractSetValuedLaw):
     **Raises:**
 
     - `ValueError` if a parameter is out of range or no number.
+
+    **Example:**
+
+    ```python
+    law = jms.Stribeck(Fc=1.0, Fs=1.5, vs=0.01, Fv=0.4)
+    print(jax.vmap(law.sliding_force)(jnp.array([0.0, 0.01, 0.1])).round(3), "N")
+    ```
+
+    ```text
+    [1.5   1.184 1.   ] N
+    ```
 
     ??? cite "Reference"
 

@@ -81,6 +81,17 @@ class Regularized(AbstractWrapper, AbstractForceLaw):
     **Raises:**
 
     - `ValueError` if `law` is not set-valued or `width` is out of range.
+
+    **Example:**
+
+    ```python
+    law = jms.Regularized(jms.Coulomb(Fc=5.0), width=1e-3)
+    print(jax.vmap(law.force)(jnp.array([0.0, 1e-3, 1e-2])).round(3), "N")
+    ```
+
+    ```text
+    [0.    3.808 5.   ] N
+    ```
     """
 
     law: AbstractSetValuedLaw = eqx.field(converter=partial(need_set_valued, owner="Regularized"))
@@ -123,6 +134,18 @@ class DeadZone(AbstractWrapper, AbstractKarnoppLaw):
     **Raises:**
 
     - `ValueError` if `law` is not set-valued or `width` is out of range.
+
+    **Example:**
+
+    ```python
+    law = jms.DeadZone(jms.Coulomb(Fc=1.5), width=1e-3)
+    run = jms.simulate(jms.problems.ramped_box.scene(law), [0.0], [0.0], 3.0, dt=1e-3)
+    print(f"{run.qd[-1, 0]:.2f} m/s")
+    ```
+
+    ```text
+    0.56 m/s
+    ```
 
     ??? cite "Reference"
 
@@ -172,6 +195,17 @@ class Sign(AbstractWrapper, AbstractForceLaw):
     **Raises:**
 
     - `ValueError` if `law` is not set-valued.
+
+    **Example:**
+
+    ```python
+    law = jms.Sign(jms.Coulomb(Fc=5.0))
+    print(jax.vmap(law.force)(jnp.array([-0.1, 0.0, 0.1])), "N")
+    ```
+
+    ```text
+    [-5.  0.  5.] N
+    ```
     """
 
     law: AbstractSetValuedLaw = eqx.field(converter=partial(need_set_valued, owner="Sign"))

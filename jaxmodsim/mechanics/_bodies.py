@@ -101,11 +101,6 @@ class PointMass(AbstractBody):
 def point_mass(m: Any, position: Any, gravity: Any = _ON_EARTH) -> PointMass:
     """Lagrangian of a point mass whose position is a function of the coordinates.
 
-    ```python
-    bead = jms.point_mass(0.1, lambda q: 0.3 * jnp.stack([jnp.cos(q[0]), jnp.sin(q[0]), 0.0 * q[0]]))
-    scene = jms.Scene(bead)
-    ```
-
     Bodies add up: `jms.point_mass(...) + jms.rigid_body(...) + spring`, with `spring(t, q, qd, params)` any Lagrangian.
 
     **Arguments:**
@@ -123,6 +118,18 @@ def point_mass(m: Any, position: Any, gravity: Any = _ON_EARTH) -> PointMass:
 
     - `ValueError` if an argument is neither a number nor a function, and (in the run) if `position` returns another
       shape or uses an index out of range.
+
+    **Example:**
+
+    ```python
+    bead = jms.point_mass(0.1, lambda q: 0.3 * jnp.stack([jnp.sin(q[0]), 0.0 * q[0], -jnp.cos(q[0])]))
+    scene = jms.Scene(bead)
+    print(f"{bead(jnp.array(0.0), jnp.zeros(1), jnp.ones(1), {}):.4f} J")
+    ```
+
+    ```text
+    0.2988 J
+    ```
     """
     return PointMass(m, position, gravity)
 
@@ -188,6 +195,21 @@ def rigid_body(m: Any, inertia: Any, position: Any, orientation: Any, gravity: A
 
     - `ValueError` if an argument is neither a number nor a function, and (in the run) for wrong shapes and for indices
       out of range.
+
+    **Example:**
+
+    ```python
+    def center(q):  # of a rod of 1 m, hinged at its end
+        return 0.5 * jnp.stack([jnp.sin(q[0]), 0.0 * q[0], -jnp.cos(q[0])])
+
+    rod = jms.rigid_body(2.0, 2.0 / 12.0, center, orientation=lambda q: q[0])
+    equations = jms.mechanics.motion_equations(rod, jnp.array(0.0), jnp.zeros(1), jnp.zeros(1), {})
+    print(equations.mass.round(4))  # m l^2/3
+    ```
+
+    ```text
+    [[0.6667]]
+    ```
     """
     return RigidBody(m, inertia, position, orientation, gravity)
 

@@ -123,6 +123,16 @@ class Cylindrical(AbstractChart):
 
     On the axis, r = 0, the tangent along theta vanishes, and e_theta is `e_z x e_r`. For r < 0 the tangent and e_theta
     point backwards: the frame is left-handed.
+
+    **Example:**
+
+    ```python
+    print(jms.Cylindrical().acceleration(q=[2.0, 0.0, 0.0], qd=[0.0, 3.0, 0.0], qdd=[0.0, 0.0, 0.0]), "m/s^2")
+    ```
+
+    ```text
+    [-18.   0.   0.] m/s^2
+    ```
     """
 
     def position(self, q: _Triples) -> Float[Array, "... 3"]:
@@ -142,6 +152,16 @@ class Spherical(AbstractChart):
     formulas above hold. (At phi = pi a floating-point sine is not zero, so no tangent vanishes.) At r = 0 there is no
     frame. For sin(phi) < 0 the tangent along theta and e_theta point backwards: the frame is left-handed. For r < 0
     both e_phi and e_theta change sign.
+
+    **Example:**
+
+    ```python
+    print(jms.Spherical().velocity(q=[2.0, jnp.pi / 2, 0.0], qd=[0.0, 0.0, 3.0]).round(6), "m/s")
+    ```
+
+    ```text
+    [0. 0. 6.] m/s
+    ```
     """
 
     def position(self, q: _Triples) -> Float[Array, "... 3"]:
@@ -166,6 +186,17 @@ class Chart(AbstractChart):
 
     - `ValueError` if `position` is not a function or uses an index out of range, or (from every method) if it returns
       anything but three real numbers.
+
+    **Example:**
+
+    ```python
+    parabolic = jms.Chart(lambda q: jnp.stack([q[0] * q[1], 0.5 * (q[0] ** 2 - q[1] ** 2), q[2]]))
+    print(parabolic.scale_factors([3.0, 4.0, 0.0]))
+    ```
+
+    ```text
+    [5. 5. 1.]
+    ```
     """
 
     function: Callable[..., Any]

@@ -134,6 +134,19 @@ class Constraint(AbstractPositionConstraint):
 
     - `ValueError` if an argument is not a function or out of range, and (in the run) for wrong shapes.
 
+    **Example:**
+
+    ```python
+    rod = jms.Constraint(lambda t, q, p: jnp.hypot(q[0], q[1]) - 1.0, name="rod")
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * jnp.sum(qd**2) - 9.81 * q[1], constraints=(rod,))
+    run = jms.simulate(scene, [0.0, -1.0], [1.0, 0.0], 1.0, ts=[0.0, 1.0])
+    print(f"{run.reactions['rod'].multiplier[0, 0]:.2f} N")  # -(m g + m v^2/l)
+    ```
+
+    ```text
+    -10.81 N
+    ```
+
     ??? cite "Reference"
 
         ```bibtex
@@ -174,7 +187,20 @@ class VelocityConstraint(AbstractConstraint):
 
     **Raises:**
 
-    - As `Constraint`.
+    - `ValueError` as `Constraint`.
+
+    **Example:**
+
+    ```python
+    blade = jms.VelocityConstraint(lambda t, q, qd, p: qd[0] * jnp.sin(q[2]) - qd[1] * jnp.cos(q[2]))
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * jnp.sum(qd**2), constraints=(blade,))
+    run = jms.simulate(scene, [0.0, 0.0, 0.0], [1.0, 0.0, 1.0], jnp.pi)  # a half circle
+    print(run.q.round(3))
+    ```
+
+    ```text
+    [[0.    2.    3.142]]
+    ```
     """
 
     psi: Callable[..., Any] = eqx.field(converter=partial(as_function, name="VelocityConstraint psi"))
@@ -254,7 +280,12 @@ class LinearizedConstraints(NamedTuple):
 def linearize_constraints(
     constraints: Constraints, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, mass: Float[Array, "dof dof"]
 ) -> LinearizedConstraints:
-    """Linearize the constraints at one state of a mechanism with the mass matrix `mass`."""
+    """Linearize the constraints at one state of a mechanism with the mass matrix `mass`.
+
+    **Returns:**
+
+    The `LinearizedConstraints` of all m equations.
+    """
 
     def along(t: Array, q: Array) -> Array:
         return rates(constraints, t, q, params)(qd)
@@ -269,13 +300,23 @@ def linearize_constraints(
 
 
 def parts(constraints: Constraints, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> list[slice]:
-    """Slice of the equations of each constraint."""
+    """Slice of the equations of each constraint.
+
+    **Returns:**
+
+    A slice of the m equations for each constraint, in their order.
+    """
     ends = list(accumulate(jax.eval_shape(each.rate, t, q, qd, params).shape[0] for each in constraints))
     return [slice(start, end) for start, end in zip([0, *ends], ends, strict=False)]
 
 
 def errors(constraints: Constraints, t: Scalar, params: PyTree) -> Callable[[PerDof], Float[Array, " h"]]:
-    """Residuals of all holonomic constraints as a function of the coordinates; h = 0 if there are none."""
+    """Residuals of all holonomic constraints as a function of the coordinates; h = 0 if there are none.
+
+    **Returns:**
+
+    A function from q, shape `[dof]`, to the residuals, shape `[h]`, in the units of the constraints.
+    """
 
     def at(q: Array) -> Array:
         holonomic = [each.error(t, q, params) for each in constraints]
@@ -285,7 +326,12 @@ def errors(constraints: Constraints, t: Scalar, params: PyTree) -> Callable[[Per
 
 
 def rates(constraints: Constraints, t: Scalar, q: PerDof, params: PyTree) -> Callable[[PerDof], Float[Array, " m"]]:
-    """Residuals of all constraints as a function of the velocities."""
+    """Residuals of all constraints as a function of the velocities.
+
+    **Returns:**
+
+    A function from qd, shape `[dof]`, to the residuals, shape `[m]`, in the units of the constraints per second.
+    """
 
     def at(qd: Array) -> Array:
         return jnp.concatenate([each.rate(t, q, qd, params) for each in constraints])
@@ -300,6 +346,10 @@ def project(
 
     Two Newton steps with a constant mass matrix change the coordinates; then the smallest impulses change the
     velocities.
+
+    **Returns:**
+
+    Coordinates and velocities, shape `[dof]` each.
     """
     error = errors(constraints, t, params)
     if error(q).shape != (0,):
@@ -318,6 +368,10 @@ def constraint_residual(
 
     Each residual is divided by the length of its gradient. This distance from its own surface also reveals constraints
     that contradict each other. No derivatives.
+
+    **Returns:**
+
+    Both distances, shape `[]` each, >= 0.
     """
     q, qd = jax.lax.stop_gradient((q, qd))
 

@@ -37,6 +37,21 @@ class Poisson(eqx.Module):
 
     - `e`: coefficient, 0 to 1.
 
+    **Raises:**
+
+    - `ValueError` if `e` is out of range or no number.
+
+    **Example:**
+
+    ```python
+    floor = jms.Contact(lambda t, q, p: q[0], restitution=jms.Poisson(0.5))
+    print(floor.coefficient)
+    ```
+
+    ```text
+    0.5
+    ```
+
     ??? cite "Reference"
 
         ```bibtex
@@ -66,6 +81,22 @@ class HuntCrossley(eqx.Module):
     - `stiffness`: k [N/m^n], > 0.
     - `exponent`: n, >= 1; 3/2 for spheres (Hertz).
     - `damping`: [s/m], >= 0.
+
+    **Raises:**
+
+    - `ValueError` if a parameter is out of range or no number.
+
+    **Example:**
+
+    ```python
+    law = jms.HuntCrossley(stiffness=1e8, damping=0.2)
+    floor = jms.Contact(lambda t, q, p: q[0], restitution=law)
+    print(f"{law.force(jnp.array(1e-4), jnp.array(0.0)):.1f} N, e = {law.restitution(0.5):.3f} at 0.5 m/s")
+    ```
+
+    ```text
+    100.0 N, e = 0.909 at 0.5 m/s
+    ```
 
     ??? cite "Reference"
 
@@ -143,6 +174,18 @@ class Contact(AbstractPositionConstraint):
     **Raises:**
 
     - `ValueError` if an argument is not a function or out of range, and (in the run) for wrong shapes.
+
+    **Example:**
+
+    ```python
+    floor = jms.Contact(lambda t, q, p: q[0], restitution=0.5, name="floor")
+    ball = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2 - 9.81 * q[0], constraints=(floor,))
+    print(jms.simulate(ball, [1.0], [0.0], 1.0).events.t.round(3))
+    ```
+
+    ```text
+    [0.452 0.903]
+    ```
 
     ??? cite "Reference"
 
@@ -251,10 +294,6 @@ def end_stops(
 ) -> tuple[Contact, ...]:
     """Contacts that keep a displacement within a range, for the constraints of a scene.
 
-    ```python
-    scene = jms.Scene(lagrangian, constraints=jms.end_stops(lambda q: q[0], lower=0.0, upper=0.2, restitution=0.3))
-    ```
-
     **Arguments:**
 
     - `along`: `along(q)` or `along(q, params)`, one number [m or rad].
@@ -263,9 +302,24 @@ def end_stops(
     - `restitution`: as in `Contact`.
     - `name`: prefix of the names `name_lower` and `name_upper` of the contacts.
 
+    **Returns:**
+
+    A contact for each end, the lower one first, for `Scene(constraints=...)`.
+
     **Raises:**
 
-    - `ValueError` if both ends are None, if lower >= upper, and as `Contact`.
+    - `ValueError` if both ends are None, if lower >= upper, for a name that is not a text, and as `Contact`.
+
+    **Example:**
+
+    ```python
+    stops = jms.end_stops(lambda q: q[0], lower=0.0, upper=0.2, restitution=0.3)
+    print([contact.name for contact in stops])
+    ```
+
+    ```text
+    ['stop_lower', 'stop_upper']
+    ```
     """
     if lower is None and upper is None:
         raise ValueError("end_stops needs lower, upper or both, but none was given: pass lower=0.0, for example.")
@@ -289,10 +343,6 @@ def end_stops(
 def backlash(along: Any, width: Any, *, restitution: Any = _NO_BOUNCE, name: str = "backlash") -> tuple[Contact, ...]:
     """Contacts on both sides of the play between two parts, such as the teeth of two gears.
 
-    ```python
-    scene = jms.Scene(lagrangian, constraints=jms.backlash(lambda q: q[0] - 50.0 * q[1], lambda p: p["play"]))
-    ```
-
     **Arguments:**
 
     - `along`: `along(q)` or `along(q, params)`: displacement of one part relative to the other [m or rad], zero in the
@@ -302,9 +352,24 @@ def backlash(along: Any, width: Any, *, restitution: Any = _NO_BOUNCE, name: str
     - `restitution`: as in `Contact`.
     - `name`: prefix of the names `name_lower` and `name_upper` of the contacts.
 
+    **Returns:**
+
+    The contacts at the lower and the upper end, for `Scene(constraints=...)`.
+
     **Raises:**
 
-    - `ValueError` for a width that is not positive, and as `Contact`.
+    - `ValueError` for a width that is not positive, a name that is not a text, and as `Contact`.
+
+    **Example:**
+
+    ```python
+    teeth = jms.backlash(lambda q: q[0] - 50.0 * q[1], lambda p: p["play"])
+    print([contact.name for contact in teeth])
+    ```
+
+    ```text
+    ['backlash_lower', 'backlash_upper']
+    ```
     """
     play = as_scalar_or_fn(width, name="backlash width", allowed=Range("m or rad", 0.0, strict=True))
     return tuple(

@@ -61,7 +61,12 @@ def _momentum(
 def inverse_dynamics(
     lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, qdd: PerDof, params: PyTree
 ) -> Float[Array, " dof"]:
-    """Generalised force `d/dt dL/dqd - dL/dq` [N or N m] under which the accelerations are `qdd`, shape `[dof]`."""
+    """Generalised force `d/dt dL/dqd - dL/dq` under which the accelerations are `qdd`.
+
+    **Returns:**
+
+    The force [N or N m], shape `[dof]`.
+    """
     _, rate, by_q = jax.jvp(_momentum(lagrangian, params), (t, q, qd), (jnp.ones_like(t), qd, qdd), has_aux=True)
     return rate - by_q
 
@@ -79,7 +84,12 @@ def _differentiate(lagrangian: Lagrangian, t: Array, q: Array, qd: Array, params
 def acceleration(
     lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, force: PerDof | float = 0.0
 ) -> PerDof:
-    """Accelerations `qdd` under the generalised force `force` [N or N m], shape `[dof]`; see `motion_equations`."""
+    """Accelerations under a generalised force; see `motion_equations`.
+
+    **Returns:**
+
+    The accelerations `qdd`, shape `[dof]`, under `force` [N or N m].
+    """
     equations = motion_equations(lagrangian, t, q, qd, params)
     return solve_positive_definite(equations.mass, equations.load + force)
 
@@ -99,19 +109,34 @@ def energies(lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, params: P
 
 
 def momentum(lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> PerDof:
-    """Canonical momenta `dL/dqd`, shape `[dof]` [kg m/s for lengths, kg m^2/s for angles]."""
+    """Canonical momenta `dL/dqd`.
+
+    **Returns:**
+
+    The momenta [kg m/s for lengths, kg m^2/s for angles], shape `[dof]`.
+    """
     return jax.grad(lagrangian, argnums=2)(t, q, qd, params)
 
 
 def velocity(lagrangian: Lagrangian, t: Scalar, q: PerDof, p: PerDof, params: PyTree) -> PerDof:
-    """Velocities for the momenta `p`, if the Lagrangian is quadratic in the velocities."""
+    """Velocities for the momenta `p`, if the Lagrangian is quadratic in the velocities.
+
+    **Returns:**
+
+    The velocities, shape `[dof]`.
+    """
     still = jnp.zeros_like(p)
     mass = motion_equations(lagrangian, t, q, still, params).mass
     return solve_positive_definite(mass, p - momentum(lagrangian, t, q, still, params))
 
 
 def quadratic(lagrangian: Lagrangian, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Array:
-    """Whether the mass matrix is the same at rest, at `qd` and at other velocities, to half of the digits."""
+    """Whether the mass matrix is the same at rest, at `qd` and at other velocities, to half of the digits.
+
+    **Returns:**
+
+    A boolean, shape `[]`.
+    """
     at = [motion_equations(lagrangian, t, q, v, params).mass for v in (jnp.zeros_like(qd), qd, qd + 1.0)]
     largest = jnp.max(jnp.abs(at[0]))
     change = jnp.maximum(jnp.max(jnp.abs(at[1] - at[0])), jnp.max(jnp.abs(at[2] - at[0])))

@@ -19,17 +19,29 @@ def peak(of: str) -> Metric:
     are taken at the fixed time of a smooth peak, where the series is stationary, or along the event of a corner. They
     do not include the dependence on t0 and t1.
 
-    ```python
-    metrics.peak("friction")(run), metrics.peak("qd[0]")(run)
-    ```
-
     **Arguments:**
 
     - `of`: `q[0]`, `qd[0]`, or the name of an effect for its force, with `[i]` for a component.
 
+    **Returns:**
+
+    A `Metric`, in the unit of the series: N or N m, m or rad, m/s or rad/s.
+
     **Raises:**
 
     - `ValueError` when called, for an unknown name.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    run = jms.simulate(scene, [0.0], [0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 301))
+    print(f"{jms.metrics.peak('qd[0]')(run):.4f} m/s")
+    ```
+
+    ```text
+    0.3162 m/s
+    ```
     """
     return Metric(f"peak |{of}|", named_unit(of), _peak, (of,))
 
@@ -41,17 +53,29 @@ def _peak(run: Trajectory, of: str) -> Array:
 def final(of: str) -> Metric:
     """Value of a coordinate, velocity or force at the last saved time of a run.
 
-    ```python
-    metrics.final("q[0]")(run)
-    ```
-
     **Arguments:**
 
     - `of`: `q[0]`, `qd[0]`, or the name of an effect for its force, with `[i]` for a component.
 
+    **Returns:**
+
+    A `Metric`, in the unit of the series: N or N m, m or rad, m/s or rad/s.
+
     **Raises:**
 
     - `ValueError` when called, for an unknown name.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    run = jms.simulate(scene, [0.0], [0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 301))
+    print(f"{jms.metrics.final('q[0]')(run):.4f} m")
+    ```
+
+    ```text
+    0.0366 m
+    ```
     """
     return Metric(f"final {of}", named_unit(of), _final, (of,))
 
@@ -65,17 +89,29 @@ def dissipated(effect: str | None = None) -> Metric:
 
     Needs one more run of the scene, with its work integrals, unless the run recorded its energy.
 
-    ```python
-    metrics.dissipated("friction")(run), metrics.dissipated()(run)
-    ```
-
     **Arguments:**
 
     - `effect`: name of a dissipative effect; None for the sum of all.
 
+    **Returns:**
+
+    A `Metric` in J.
+
     **Raises:**
 
     - `ValueError` when called, for an unknown or conservative effect.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    run = jms.simulate(scene, [0.0], [0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 301))
+    print(f"{jms.metrics.dissipated('friction')(run):.4f} J, all effects {jms.metrics.dissipated()(run):.4f} J")
+    ```
+
+    ```text
+    1.3169 J, all effects 1.3169 J
+    ```
     """
     return Metric("dissipated" if effect is None else f"dissipated in {effect}", "J", _dissipated, (effect,))
 

@@ -45,10 +45,6 @@ class Metric:
 def classes(fn: Callable[[Trajectory], object], names: tuple[str, ...] | list[str]) -> Metric:
     """Classify motions by a function of your own, for instance for laws without modes.
 
-    ```python
-    kind = metrics.classes(lambda run: jnp.where(jnp.abs(run.qd[-1, 0]) < 1e-3, 0, 1), ("rests", "moves"))
-    ```
-
     **Arguments:**
 
     - `fn`: function of a `Trajectory` that returns an index into `names` and works under `jax.jit`.
@@ -60,7 +56,20 @@ def classes(fn: Callable[[Trajectory], object], names: tuple[str, ...] | list[st
 
     **Raises:**
 
-    - `ValueError` if `names` is empty.
+    - `ValueError` if `names` is empty or `fn` is not a function.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    run = jms.simulate(scene, [0.0], [0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 301))
+    kind = jms.metrics.classes(lambda run: jnp.where(jnp.abs(run.qd[-1, 0]) < 1e-3, 0, 1), ("rests", "moves"))
+    print(kind.describe(kind(run)))
+    ```
+
+    ```text
+    moves
+    ```
     """
     names = as_names(names, name="names")
     if not names:

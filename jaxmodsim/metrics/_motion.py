@@ -18,17 +18,29 @@ _KINDS = ("never slips", "sticks for good", "stick-slip cycle", "slips back and 
 def mode_changes(element: str = "friction") -> Metric:
     """Number of mode changes of an event-driven friction element.
 
-    ```python
-    metrics.mode_changes("friction")(run)
-    ```
-
     **Arguments:**
 
     - `element`: name of the friction element.
 
+    **Returns:**
+
+    A `Metric`, a whole number.
+
     **Raises:**
 
     - `ValueError` when called, if the run has no such element, or the element is not event-driven.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    run = jms.simulate(scene, [0.0], [0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 301))
+    print(jms.metrics.mode_changes("friction")(run))
+    ```
+
+    ```text
+    6
+    ```
     """
     return Metric(f"mode changes of {element}", "1", _mode_changes, (element,))
 
@@ -45,19 +57,31 @@ def stick_share(element: str = "friction", *, since: float | None = None, rest: 
     the saved times `ts`: an interval counts as stick if the mean slip speed, by trapezoids, is at most `rest`. That
     share is a step function of the parameters.
 
-    ```python
-    metrics.stick_share("friction", since=10.0)(run), metrics.stick_share("friction", rest=1e-4)(run)
-    ```
-
     **Arguments:**
 
     - `element`: name of the friction element.
     - `since`: start of the measurement [s]; by default t0.
     - `rest`: largest slip speed [m/s or rad/s] that counts as stick, > 0. Required if the element is not event-driven.
 
+    **Returns:**
+
+    A `Metric` without a unit.
+
     **Raises:**
 
     - `ValueError` if `rest` is not positive; when called, if the run has no such element, or requires `rest`.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    run = jms.simulate(scene, [0.0], [0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 301))
+    print(f"{jms.metrics.stick_share('friction', since=1.0)(run):.3f}")
+    ```
+
+    ```text
+    0.600
+    ```
     """
     if rest is not None and not rest > 0:
         raise ValueError(f"rest must be a positive speed, but {rest!r} was given.")
@@ -93,20 +117,32 @@ def motion_kind(*elements: str) -> Metric:
 
     A run with fewer than three cycles is classified by its end.
 
-    ```python
-    kind = metrics.motion_kind("friction")
-    kind.describe(kind(run))
-    ```
-
     **Arguments:**
 
     - `elements`: names of event-driven friction elements; by default `friction`. The kinds of several elements are
       digits in base 5.
 
+    **Returns:**
+
+    A `Metric`, a whole number from 0 to `5**len(elements) - 1`.
+
     **Raises:**
 
     - `ValueError` for more than 10 elements or a repeated one; when called, if the run has no such element, or the
       element is not event-driven.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    run = jms.simulate(scene, [0.0], [0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 301))
+    kind = jms.metrics.motion_kind("friction")
+    print(kind.describe(kind(run)))
+    ```
+
+    ```text
+    stick-slip cycle
+    ```
     """
     elements = elements or ("friction",)
     if len(set(elements)) < len(elements):

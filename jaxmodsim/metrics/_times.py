@@ -19,19 +19,31 @@ def break_away(element: str = "friction", *, distance: float | None = None) -> M
     event-driven elements are measured in the same way. Their slip has a corner between two samples, which leaves
     derivatives with a relative error of up to the spacing over the time since the corner.
 
-    ```python
-    metrics.break_away("friction", distance=5e-3)(run)
-    ```
-
     **Arguments:**
 
     - `element`: name of the friction element.
     - `distance`: slip [m or rad] that counts as break-away, > 0. It must be well above the largest deflection of a
       bristle, `Fs/sigma0`. Required if the element is not event-driven.
 
+    **Returns:**
+
+    A `Metric` in s.
+
     **Raises:**
 
     - `ValueError` if `distance` is not positive; when called, if the run has no such element, or requires `distance`.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    run = jms.simulate(scene, [0.0], [0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 301))
+    print(f"{jms.metrics.break_away('friction')(run):.4f} s")
+    ```
+
+    ```text
+    0.8100 s
+    ```
     """
     if distance is not None and not (math.isfinite(distance) and distance > 0):
         raise ValueError(f"distance must be a positive number of metres or radians, but {distance!r} was given.")
@@ -87,10 +99,6 @@ def period(of: str = "friction", *, since: float | None = None, swing: float = 1
     `ts`. If return times vary, the result is the last of them for events and their mean for crossings. A cycle that has
     not returned in the last 1.5 periods of the run counts as ended, which gives NaN.
 
-    ```python
-    metrics.period("friction")(run), metrics.period("q[0]", since=20.0)(run)
-    ```
-
     **Arguments:**
 
     - `of`: name of a friction element, or `q[0]`, `qd[0]`.
@@ -98,9 +106,25 @@ def period(of: str = "friction", *, since: float | None = None, swing: float = 1
     - `swing`: smallest range since then, as a fraction of the range in the whole run, that counts as a cycle, 0 to 1.
       Unused for events.
 
+    **Returns:**
+
+    A `Metric` in s.
+
     **Raises:**
 
     - `ValueError` if `swing` is not between 0 and 1; when called, for an unknown name.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    run = jms.simulate(scene, [0.0], [0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 301))
+    print(f"{jms.metrics.period('friction')(run):.4f} s")
+    ```
+
+    ```text
+    0.9785 s
+    ```
     """
     if not 0 <= swing < 1:
         raise ValueError(f"swing must be a fraction, 0 <= swing < 1, but {swing!r} was given.")

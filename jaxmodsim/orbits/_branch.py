@@ -72,6 +72,19 @@ class Branch(AbstractReadable, eqx.Module, Generic[OrbitT]):
     - `orbits`: a `PeriodicOrbit` or an `Equilibrium` each, in order along the branch.
     - `points`: `BifurcationPoint`s in order along the branch.
     - `ending`: a sentence that says why the branch ends.
+
+    **Example:**
+
+    ```python
+    belt = jms.problems.belt_oscillator
+    scene = belt.scene(belt.stribeck(), c=2.0)
+    branch = jms.continue_equilibria(scene, [0.06], "friction.belt_velocity", (0.05, 0.5), step=0.1)
+    print([f"{point.kind} at {point.value:.4f} m/s" for point in branch.points])
+    ```
+
+    ```text
+    ['Hopf at 0.3544 m/s']
+    ```
     """
 
     parameter: str = eqx.field(static=True)

@@ -74,6 +74,18 @@ def continue_orbits(
     - `OrbitError` if the first orbit is not found. Where the continuation fails later the branch ends, and
       `Branch.ending` has the reason.
 
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    branch = jms.continue_orbits(scene, ([0.0], [0.0]), "k", (100.0, 110.0), settle=20.0, step=0.5)
+    print(f"periods from {branch.period[0]:.4f} to {branch.period[-1]:.4f} s, all stable: {branch.stable.all()}")
+    ```
+
+    ```text
+    periods from 0.9785 to 0.9091 s, all stable: True
+    ```
+
     ??? cite "Reference"
 
         ```bibtex

@@ -62,6 +62,19 @@ def continue_equilibria(
     - `ValueError` as `equilibrium`, and for an unknown parameter.
     - `OrbitError` if the first equilibrium is not found. Where the continuation fails later the branch ends, and
       `Branch.ending` has the reason.
+
+    **Example:**
+
+    ```python
+    belt = jms.problems.belt_oscillator
+    scene = belt.scene(belt.stribeck(), c=2.0)
+    branch = jms.continue_equilibria(scene, [0.06], "friction.belt_velocity", (0.05, 0.5), step=0.1)
+    print(branch.values[[0, -1]].round(2), branch.stable[[0, -1]])
+    ```
+
+    ```text
+    [0.05 0.5 ] [False  True]
+    ```
     """
     first, last = read_span(span)
     check_parameter(scene, parameter)

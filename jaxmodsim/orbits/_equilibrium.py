@@ -38,6 +38,18 @@ class Equilibrium(AbstractReadable, eqx.Module):
       shape `[k]`, in order of falling real part. Empty, `k = 0`, at the end of a set.
     - `ends`: direction of the limiting friction force of each element in stick, by name.
     - `scene`: the scene.
+
+    **Example:**
+
+    ```python
+    belt = jms.problems.belt_oscillator
+    sliding = jms.equilibrium(belt.scene(belt.stribeck()), [0.06])
+    print(sliding.stability)
+    ```
+
+    ```text
+    unstable: an eigenvalue of 5.69101+8.22268j 1/s
+    ```
     """
 
     q: Float[Array, " dof"]
@@ -112,6 +124,18 @@ def equilibrium(scene: Scene, q0: ArrayLike | list[float], *, ends: Mapping[str,
       names in `ends` are not those of the elements in stick.
     - `OrbitError` if the iteration does not converge, the equilibrium is one of a family, the scene depends on time, or
       a contact is closed.
+
+    **Example:**
+
+    ```python
+    belt = jms.problems.belt_oscillator
+    sliding = jms.equilibrium(belt.scene(belt.stribeck()), [0.06])
+    print(sliding.q.round(5), sliding.eigenvalues.round(3))
+    ```
+
+    ```text
+    [0.07366] [5.691+8.223j 5.691-8.223j]
+    ```
     """
     known = jtu.tree_map(jax.lax.stop_gradient, scene)
     problem, x, dof = prepare_rest(known, q0, ends, None)

@@ -53,6 +53,18 @@ class PeriodicOrbit(AbstractReadable, eqx.Module):
     - `stick`: fraction of the period in which each friction element sticks or each contact is closed, by name. A
       coordinate that sticks throughout stays at the guess, or where the run from the guess settles.
     - `advance`: advance of each coordinate in a period [m or rad], shape `[dof]`; zero for those that return.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    orbit = jms.periodic_orbit(scene, ([0.0], [0.0]), settle=20.0)
+    print(f"amplitude {orbit.amplitude[0]:.5f} m, stick {100 * orbit.stick['friction']:.2f} %, {orbit.stability}")
+    ```
+
+    ```text
+    amplitude 0.03162 m, stick 61.32 %, stable
+    ```
     """
 
     t0: Float[Array, ""]

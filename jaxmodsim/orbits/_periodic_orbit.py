@@ -89,6 +89,18 @@ def periodic_orbit(
     - `OrbitError` if the iteration does not converge, the run does not return or comes to rest, the section is
       degenerate, the orbit is one of a family, or the scene depends on time with another period.
 
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    orbit = jms.periodic_orbit(scene, ([0.0], [0.0]), settle=20.0)
+    print(f"{orbit.period:.6f} s")
+    ```
+
+    ```text
+    0.978509 s
+    ```
+
     ??? cite "Reference"
 
         ```bibtex

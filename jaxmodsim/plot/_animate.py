@@ -175,14 +175,6 @@ def animate(
 ) -> Animation:
     """A mechanism in motion: points of it, joined by lines, with signals of the run drawn beside it.
 
-    ```python
-    def links(q, p):  # of a pendulum, q the angle from straight down: pivot and bob [m]
-        return jnp.array([[0.0, 0.0], [p["l"] * jnp.sin(q[0]), -p["l"] * jnp.cos(q[0])]])
-
-
-    jaxmodsim.plot.animate(run, links, signals=("joint",)).save("pendulum.gif")
-    ```
-
     Between the times that a run was kept at, the coordinates are cubics with its velocities.
 
     **Arguments:**
@@ -204,6 +196,17 @@ def animate(
 
     - `ValueError` for places of another shape or that are not finite, a signal that the run does not have, a run
       that holds one time alone, and more than 5000 frames.
+
+    **Example:**
+
+    ```python
+    def spring(q, p):  # from the wall to the mass [m]
+        return jnp.array([[-1.0, 0.0], [q[0], 0.0]])
+
+    scene = jms.problems.braked_spring.scene()
+    run = jms.simulate(scene, [0.5], [0.0], 1.0, ts=jnp.linspace(0.0, 1.0, 11))
+    jms.plot.animate(run, spring, fps=5).save("spring.gif")
+    ```
     """
     fps, speed = as_whole(fps, name="fps"), as_float(speed, name="speed", lower=0.0)
     kept, first = np.unique(trajectory.t[np.isfinite(trajectory.t)], return_index=True)

@@ -42,6 +42,10 @@ def fit_figure(
     - `record`: index of the record.
     - `quantity`, `unit`: name and unit of the measured channel.
     - `caption`: line below the figure, such as the source of the record.
+
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
     """
     (residual,) = result.residuals[record].values()
     rmse = float(np.sqrt(np.mean(residual**2)))
@@ -59,6 +63,10 @@ def score_figure(
     - `score`: from `jaxmodsim.identify.evaluate_on` or `predict`, of one channel; a prediction with its band.
     - `quantity`, `unit`: name and unit of the measured channel.
     - `caption`: line below the figure, such as the source of the record.
+
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
     """
     prediction = score if isinstance(score, RecordPrediction) else None
     shown = score.score if isinstance(score, RecordPrediction) else score
@@ -135,6 +143,10 @@ def loops_figure(result: FitResult, *, caption: str = "") -> Figure:
 
     - `result`: a fit by `fit_law`.
     - `caption`: line below the figure, such as the source of the record.
+
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
     """
     record, figure = result.record, Figure(figsize=(11, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.3, 1))
@@ -162,6 +174,10 @@ def truth_figure(result: FitResult, truth: Mapping[str, float]) -> Figure:
 
     - `result`: the fit.
     - `truth`: true values, not zero, by the parameter names of the fit.
+
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
     """
     figure = Figure(figsize=(7.5, 0.9 + 0.45 * len(truth)), layout="constrained")
     axis: Axes = figure.subplots()
@@ -184,6 +200,10 @@ def result_figure(result: FitResult, *, record: int = 0, units: Mapping[str, str
     - `result`: the fit.
     - `record`: index of the record.
     - `units`: units of the channels by name, for the axes.
+
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
 
     **Raises:**
 
@@ -295,6 +315,10 @@ def comparison_figure(comparison: Comparison, *, unit: str = "m", caption: str =
     - `unit`: unit of the errors; "1" for several channels, whose errors are in noise levels.
     - `caption`: line below the figure, such as the source of the records.
 
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
+
     **Raises:**
 
     - `ValueError` if no model could be fitted.
@@ -336,6 +360,10 @@ def design_figure(design: InputDesign, *, caption: str = "") -> Figure:
 
     - `design`: from `jaxmodsim.identify.design_input`.
     - `caption`: line below the figure.
+
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
     """
     figure = Figure(figsize=(12, 6.4), layout="constrained")
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.35, 1))[0]

@@ -78,6 +78,10 @@ def map2d(
     - `classes`: a name for each value of the variable.
     - `boundary`: curves over the map: label to x and y, of the shape `[points]` each.
 
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
+
     **Raises:**
 
     - `ValueError` for unknown names, a number of dimensions other than two, axis values that are not monotonic, not

@@ -33,6 +33,10 @@ def orbit_figure(orbit: PeriodicOrbit) -> Figure:
     **Arguments:**
 
     - `orbit`: from `jaxmodsim.periodic_orbit`.
+
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
     """
     dof = len(orbit.q)
     figure = Figure(figsize=(4.6 * dof + 2.2, 4.2), layout="constrained")
@@ -56,6 +60,10 @@ def branch_figure(branch: Branch[PeriodicOrbit], coordinate: int = 0, *, beside:
     - `branch`: from `jaxmodsim.continue_orbits`.
     - `coordinate`: index of the coordinate.
     - `beside`: other branches over the same parameter, such as equilibria, whose amplitudes are drawn too.
+
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
     """
     orbits = branch.orbits
     autonomous = orbits[0].autonomous

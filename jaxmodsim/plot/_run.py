@@ -19,17 +19,25 @@ def run(trajectory: Trajectory) -> Figure:
     those of event-driven elements. They are shaded in the panel of the element, or in all panels if it is the only one.
     Names and units are those of `Scene(..., coordinates=...)`.
 
-    ```python
-    jaxmodsim.plot.run(jaxmodsim.simulate(scene, q0, qd0, t1, ts=jnp.linspace(0.0, t1, 1001)))
-    ```
-
     **Arguments:**
 
     - `trajectory`: the run, saved at two or more times `ts`.
 
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
+
     **Raises:**
 
     - `ValueError` for a run saved at a single time, and for a batch of runs.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    run = jms.simulate(scene, [0.0], [0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 301))
+    jms.plot.run(run).savefig("run.png")
+    ```
     """
     scene, table = trajectory.scene, trajectory.columns
     if len(table.time) < 2:

@@ -17,6 +17,10 @@ def ramp_figure(title: str, runs: Sequence[RampRun], zoom: tuple[float, float] =
     - `title`: of the figure.
     - `runs`: one row each.
     - `zoom`: time span [s] of the second and third column, which contains the stick phase.
+
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
     """
     figure = Figure(figsize=(14, 0.6 + 2.7 * len(runs)), layout="constrained")
     axes = figure.subplots(len(runs), 3, squeeze=False, width_ratios=(1, 1, 1.2))
@@ -62,6 +66,10 @@ def stick_figure(
     - `applied`: applied force [N], shape `[time]`.
     - `sigma0`, `sigma1`: axes of the map [N/m], [N s/m].
     - `oscillation`: amplitude [N] of friction about the applied force in stick, shape `[sigma0, sigma1]`.
+
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
     """
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.15, 1))

@@ -23,6 +23,10 @@ def sensitivity_figure(sensitivity: Sensitivity, *, most: int = 8) -> Figure:
 
     - `sensitivity`: from `jaxmodsim.sensitivity`. An observable that is no function of time has bars alone.
     - `most`: largest number of parameters, taken from the top of the ranking.
+
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
     """
     ranking = sensitivity.ranking[:most]
     colours = {name: COLOURS[i % len(COLOURS)] for i, (name, _) in enumerate(ranking)}
@@ -68,6 +72,10 @@ def indices_figure(sensitivity: GlobalSensitivity, *, caption: str = "") -> Figu
 
     - `sensitivity`: from `jaxmodsim.sweeps.global_sensitivity`.
     - `caption`: a line below.
+
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
     """
     index, names = "S1" if sensitivity.method == "sobol" else "mu_star", sensitivity.names
     panels, at = sensitivity.indices, np.arange(len(names))
@@ -101,6 +109,10 @@ def profile_figure(profile: Profile) -> Figure:
     **Arguments:**
 
     - `profile`: from `jaxmodsim.identify.profile`.
+
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
     """
     others = {name: x for name, x in profile.others.items() if x.size}
     figure = Figure(figsize=(8, 4.0 + (2.6 if others else 0.0)), layout="constrained")
@@ -146,6 +158,10 @@ def posterior_figure(posterior: Posterior) -> Figure:
     **Arguments:**
 
     - `posterior`: from `jaxmodsim.identify.sample_posterior`. Only its first ten unknowns are drawn.
+
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
     """
     names, estimate = list(posterior.draws)[:10], posterior.estimate
     fitted, values = list(estimate.values), np.array([*estimate.values.values()])

@@ -27,6 +27,10 @@ def work_precision_figure(study: WorkPrecision, *, cost: str = "run") -> Figure:
     - `study`: from `jaxmodsim.work_precision`.
     - `cost`: one of its `costs`.
 
+    **Returns:**
+
+    A matplotlib figure, which a notebook shows; `figure.savefig(path)` writes it.
+
     **Raises:**
 
     - `ValueError` for a cost that the study has not measured.

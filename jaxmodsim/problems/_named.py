@@ -59,17 +59,27 @@ class NamedProblem:
 def named_problems() -> dict[str, Callable[[], NamedProblem]]:
     """Functions that build each `NamedProblem`, by name.
 
-    ```python
-    case = named_problems()["braked_spring"]()
-    run = jaxmodsim.simulate(case.scene, case.q0, case.qd0, case.t1, max_steps=case.max_steps)
-    run.q[-1, 0] - case.exact
-    ```
-
     - Set-valued friction with a closed form: `coulomb_box`, `braked_spring`, `belt_oscillator`, `stick_slip_pendulum`.
     - Set-valued friction: `stribeck_belt`, `coupled_belts`, `cart_pole`, `turntable_puck` (in the plane).
     - Bristles: `lugre_box`, `pulled_box` (stiff), `slipping_bristle` (closed form).
     - Smooth: `spherical_pendulum` and `charged_particle` (closed forms), `double_pendulum`.
     - Constraints: `cartesian_spherical_pendulum` and `knife_edge` (closed forms), `four_bar`.
+
+    **Returns:**
+
+    A new dictionary; each function takes no arguments.
+
+    **Example:**
+
+    ```python
+    case = jms.problems.named_problems()["charged_particle"]()
+    run = jms.simulate(case.scene, case.q0, case.qd0, case.t1, max_steps=case.max_steps)
+    print(abs(jms.simulation.named_series(run, case.observable)[-1] - case.exact) < 1e-4)
+    ```
+
+    ```text
+    True
+    ```
     """
     return dict(_CASES)
 

@@ -64,12 +64,22 @@ def scene(
 
 
 def coulomb() -> Coulomb:
-    """The Coulomb law of `PARAMS`, with stiction."""
+    """The Coulomb law of `PARAMS`, with stiction.
+
+    **Returns:**
+
+    A `Coulomb` law.
+    """
     return Coulomb(Fc=PARAMS["Fc"], Fs=PARAMS["Fs"])
 
 
 def stribeck(exponent: ArrayLike = 2.0) -> Stribeck:
-    """The Stribeck law of `STRIBECK`, with this exponent."""
+    """The Stribeck law of `STRIBECK`, with this exponent.
+
+    **Returns:**
+
+    A `Stribeck` law.
+    """
     return Stribeck(**STRIBECK, exponent=exponent)
 
 
@@ -109,6 +119,10 @@ def motion(
 
     The mass moves with the belt until the first slip, at `Fs/(k belt)`, and then follows `cycle`. Arguments as for
     `cycle`, t >= 0.
+
+    **Returns:**
+
+    Position and velocity, of the shape of `t` each.
     """
     whole = cycle(m=m, k=k, belt=belt, Fc=Fc, Fs=Fs)
     w, middle = jnp.sqrt(k / jnp.asarray(m)), Fc / jnp.asarray(k)

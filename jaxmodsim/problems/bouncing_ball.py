@@ -11,19 +11,17 @@ from ..solvers import EventState
 
 
 def falling(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
-    """Lagrangian [J] of a mass `m` [kg] at the height `q[0]` [m] under gravity `g` [m/s^2]."""
+    """Lagrangian [J] of a mass `m` [kg] at the height `q[0]` [m] under gravity `g` [m/s^2].
+
+    **Returns:**
+
+    The Lagrangian, shape `[]`.
+    """
     return 0.5 * p["m"] * qd[0] ** 2 - p["m"] * p["g"] * q[0]
 
 
 class BouncingBall(eqx.Module):
     """A point mass that bounces on a floor, as functions for `jaxmodsim.EventSolver`.
-
-    ```python
-    ball = BouncingBall(e=0.5)
-    solver = jaxmodsim.EventSolver(diffrax.Tsit5(), ball.guards, ball.reset, on_zeno=ball.hold)
-    start = solver.start(0.0, ball.dropped(h=1.0), mode=0.0)
-    diffrax.diffeqsolve(diffrax.ODETerm(ball.field), solver, 0.0, 1.0, None, start, ...)
-    ```
 
     The state is (height [m], velocity [m/s]), positive upwards, shape `[2]`. The mode is 0 in flight, and 1 at rest on
     the floor after `hold`. `bounces` has the times of the bounces, `motion` the motion, `rest` the time of the rest.
@@ -32,6 +30,25 @@ class BouncingBall(eqx.Module):
 
     - `e`: coefficient of restitution, > 0; the ball comes to rest for e < 1.
     - `g`: gravity [m/s^2], > 0.
+
+    **Raises:**
+
+    - `ValueError` if a parameter is out of range or no number.
+
+    **Example:**
+
+    ```python
+    ball = jms.problems.bouncing_ball.BouncingBall(e=0.5)
+    solver = jms.EventSolver(diffrax.Tsit5(), ball.guards, ball.reset, on_zeno=ball.hold)
+    control = jms.EventController(diffrax.PIDController(rtol=1e-8, atol=1e-8))
+    start, field = solver.start(0.0, ball.dropped(h=1.0), mode=0.0), diffrax.ODETerm(ball.field)
+    solution = diffrax.diffeqsolve(field, solver, 0.0, 2.0, None, start, stepsize_controller=control)
+    print(solution.ys.y, solution.ys.mode)  # at rest since 1.35 s
+    ```
+
+    ```text
+    [[0. 0.]] [1.]
+    ```
     """
 
     e: Number = parameter("e", "", lower=0.0, strict=True)
@@ -75,6 +92,14 @@ def scene(*, e: ArrayLike, g: ArrayLike = 9.81, m: ArrayLike = 1.0) -> Scene:
     - `e`: coefficient of restitution, 0 to 1.
     - `g`: gravity [m/s^2], > 0.
     - `m`: mass [kg], > 0.
+
+    **Returns:**
+
+    A `Scene` with one coordinate [m]. Dropped from `h` it follows `motion`.
+
+    **Raises:**
+
+    - `ValueError` if `e` is out of range.
     """
     return Scene(falling, params={"m": m, "g": g}, constraints=(Contact(_height, restitution=e, name="floor"),))
 
@@ -88,13 +113,22 @@ def bounces(n: int, *, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81) -> Float
     - `h`: height [m], > 0.
     - `e`: coefficient of restitution, > 0.
     - `g`: gravity [m/s^2], > 0.
+
+    **Returns:**
+
+    The times, shape `[n]`.
     """
     powers = jnp.asarray(e) ** jnp.arange(1, n)
     return jnp.sqrt(2.0 * h / jnp.asarray(g)) * jnp.concatenate([jnp.ones(1), 1.0 + 2.0 * jnp.cumsum(powers)])
 
 
 def rest(*, h: ArrayLike, e: ArrayLike, g: ArrayLike = 9.81) -> Float[Array, ""]:
-    """Time [s] at which the ball comes to rest: `sqrt(2 h/g) (1 + e)/(1 - e)` for e < 1; arguments as for `bounces`."""
+    """Time [s] at which the ball comes to rest: `sqrt(2 h/g) (1 + e)/(1 - e)` for e < 1; arguments as for `bounces`.
+
+    **Returns:**
+
+    The time, shape `[]`.
+    """
     e = jnp.asarray(e)
     return jnp.sqrt(2.0 * h / jnp.asarray(g)) * (1.0 + e) / (1.0 - e)
 
@@ -106,6 +140,10 @@ def motion(
 
     The time left before rest falls by the factor e from bounce to bounce, so its logarithm counts the bounces. After
     bounce n the motion is a throw at `e^n sqrt(2 g h)`. Arguments as for `rest`, t >= 0.
+
+    **Returns:**
+
+    Height and velocity, of the shape of `t` each; zero after the rest.
     """
     g = jnp.asarray(g)
     fall, end = jnp.sqrt(2.0 * h / g), rest(h=h, e=e, g=g)

@@ -26,7 +26,12 @@ def _lagrangian(t: Array, q: Array, qd: Array, p: dict[str, Array]) -> Array:
 
 
 def coulomb() -> Coulomb:
-    """The Coulomb law of `PARAMS`."""
+    """The Coulomb law of `PARAMS`.
+
+    **Returns:**
+
+    A `Coulomb` law.
+    """
     return Coulomb(Fc=PARAMS["Fc"], Fs=PARAMS["Fs"])
 
 
@@ -101,6 +106,10 @@ def motion(
 
     In half cycle n, with `d = Fc/k` and `w = sqrt(k/m)`: `x = (-1)^n [d + (x0 - (2 n + 1) d) cos(w t - n pi)]`. The
     mass is at rest after the last half cycle. Arguments as for `rest`, t >= 0.
+
+    **Returns:**
+
+    Position and velocity, of the shape of `t` each.
     """
     end = rest(x0=x0, m=m, k=k, Fc=Fc, Fs=Fs)
     d, w = Fc / jnp.asarray(k), jnp.sqrt(k / jnp.asarray(m))

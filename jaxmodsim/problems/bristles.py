@@ -73,6 +73,10 @@ def deflection(t: Float[Array, "..."], law: LuGre, v: ArrayLike, *, z0: ArrayLik
     - `law`: the LuGre law.
     - `v`: slip velocity [m/s]; at v = 0 the deflection is constant.
     - `z0`: deflection at t = 0 [m].
+
+    **Returns:**
+
+    The deflection.
     """
     v = jnp.asarray(v)
     stribeck_curve = law.Fc + (law.Fs - law.Fc) * jnp.exp(-((v / law.vs) ** 2))

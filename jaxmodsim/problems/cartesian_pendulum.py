@@ -46,6 +46,10 @@ def cartesian_spherical_pendulum(*, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: A
 
     It passes the top and the bottom, at which the angles of `spherical_pendulum` are singular. Arguments and results as
     for `scene`; the multiplier is `spherical_pendulum.reaction`.
+
+    **Returns:**
+
+    A `Scene` with three coordinates [m] and the constraint `rod`.
     """
     rod = Constraint(_stretch, at=_in_space, name="rod")
     return Scene(
@@ -64,6 +68,10 @@ def tension(
 
     - `q`, `qd`: position [m] and velocity [m/s], (x, z) or (x, y, z), with |q| = l and q . qd = 0.
     - `m`, `l`, `g`: as for `scene`.
+
+    **Returns:**
+
+    The tension, shape `[]`.
     """
     return jnp.asarray(m) * (jnp.sum(qd**2) - g * q[-1]) / l
 
@@ -74,6 +82,10 @@ def acceleration(
     """Accelerations [m/s^2] by Newton's law, from gravity and the tension; they do not depend on the mass.
 
     Arguments as for `tension`.
+
+    **Returns:**
+
+    The accelerations, of the shape of `q`.
     """
     pull = tension(q, qd, m=1.0, l=l, g=g) / l
     return jnp.asarray(-pull * q).at[-1].add(-jnp.asarray(g, q.dtype))

@@ -65,6 +65,10 @@ def acceleration(
     """Accelerations [m/s^2] by the Lorentz force: `m v' = charge (E + v x B)`.
 
     Arguments as for `scene`, with velocities `qd` [m/s]. The position `q` [m] is unused.
+
+    **Returns:**
+
+    The accelerations, shape `[3]`.
     """
     bent = B * jnp.stack([qd[1], -qd[0], jnp.zeros_like(qd[2])])
     return jnp.asarray(charge) * (jnp.asarray(E, qd.dtype) + bent) / m
@@ -90,6 +94,10 @@ def motion(
     - `t`: times [s].
     - `q0`, `qd0`: position and velocity at t = 0, shape `[3]`.
     - `m`, `charge`, `B`, `E`: as for `scene`; charge and B not zero.
+
+    **Returns:**
+
+    Positions and velocities, shape `[..., 3]` each.
     """
     push, w = jnp.asarray(E, float), charge * jnp.asarray(B) / m
     drift = (push[1] - 1j * push[0]) / B

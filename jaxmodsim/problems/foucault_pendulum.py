@@ -49,7 +49,12 @@ def scene(
 
 
 def precession(*, Omega: ArrayLike = PARAMS["Omega"], latitude: ArrayLike = PARAMS["latitude"]) -> Float[Array, ""]:
-    """Rotation rate [rad/s] of the plane of oscillation, from east to north: `-Omega sin(latitude)`."""
+    """Rotation rate [rad/s] of the plane of oscillation, from east to north: `-Omega sin(latitude)`.
+
+    **Returns:**
+
+    The rate, shape `[]`.
+    """
     return -jnp.asarray(Omega) * jnp.sin(jnp.asarray(latitude))
 
 
@@ -73,6 +78,10 @@ def motion(
     - `t`: times [s].
     - `q0`, `qd0`: deflections [m] and velocities [m/s] at t = 0.
     - `l`, `g`, `Omega`, `latitude`: as for `scene`.
+
+    **Returns:**
+
+    The deflections (x, y), shape `[..., 2]`.
     """
     p = precession(Omega=Omega, latitude=latitude)
     n = jnp.sqrt(g / jnp.asarray(l) + p**2)
@@ -93,6 +102,10 @@ def acceleration(
     """Accelerations [m/s^2]: `x'' = -(g/l) x + 2 s y'`, `y'' = -(g/l) y - 2 s x'`, s = Omega sin(latitude).
 
     Arguments as for `scene`, `q` and `qd` of shape `[2]`.
+
+    **Returns:**
+
+    The accelerations, shape `[2]`.
     """
     s, stiffness = jnp.asarray(Omega) * jnp.sin(jnp.asarray(latitude)), jnp.asarray(g) / l
     return 2.0 * s * jnp.stack([qd[1], -qd[0]]) - stiffness * q

@@ -109,6 +109,10 @@ def state(
     - `angle`, `rate`: of the crank [rad], [rad/s].
     - `a`, `b`, `c`, `d`: as for `scene`. The result is NaN if the loop cannot close.
     - `crossed`: whether coupler and ground cross.
+
+    **Returns:**
+
+    `(q0, qd0)` for `simulate`: the angles of crank, coupler and rocker [rad] and their rates [rad/s], shape `[3]`.
     """
     angle, rate = jnp.asarray(angle, float), jnp.asarray(rate, float)
     a, b, c, d = (jnp.asarray(x, float) for x in (a, b, c, d))
@@ -145,6 +149,10 @@ def acceleration(
     `J = m1 a^2/3 + m2 (a^2 + b^2 k2^2/3 + a b k2 cos(coupler - f)) + m3 c^2 k3^2/3` and
     `V = g (m1 a sin(f)/2 + m2 (a sin(f) + b sin(coupler)/2) + m3 c sin(rocker)/2)`; coupler and rocker have
     `k f'' + (dk/df) f'^2`. Arguments as for `scene` and `state`.
+
+    **Returns:**
+
+    The accelerations of crank, coupler and rocker, shape `[3]`.
     """
     a, b, c, d, m1, m2, m3, g = (jnp.asarray(x, angle.dtype) for x in (a, b, c, d, m1, m2, m3, g))
 

@@ -98,6 +98,10 @@ def acceleration(
 
     - `q`, `qd`: (x, y, h) and their rates, shape `[3]`; the velocity u is along the edge.
     - `slope`, `g`: as for `scene`.
+
+    **Returns:**
+
+    The accelerations of (x, y, h), shape `[3]`.
     """
     sine, cosine = jnp.sin(q[2]), jnp.cos(q[2])
     u = cosine * qd[0] + sine * qd[1]
@@ -116,6 +120,10 @@ def force(
     """Force [N] of the plane across the edge, positive to its left: `m (u h' + g sin(slope) sin(h))`.
 
     Arguments as for `acceleration`, `m` [kg], > 0.
+
+    **Returns:**
+
+    The force, shape `[]`.
     """
     u = jnp.cos(q[2]) * qd[0] + jnp.sin(q[2]) * qd[1]
     return jnp.asarray(m) * (u * qd[2] + g * jnp.sin(jnp.asarray(slope)) * jnp.sin(q[2]))

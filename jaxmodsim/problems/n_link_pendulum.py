@@ -49,7 +49,12 @@ def scene(n: int, *, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81
 
 
 def double_pendulum(*, m: ArrayLike = 1.0, l: ArrayLike = 1.0, g: ArrayLike = 9.81) -> Scene:
-    """The chain of two links; see `scene`."""
+    """The chain of two links; see `scene`.
+
+    **Returns:**
+
+    A `Scene` with two coordinates [rad].
+    """
     return scene(2, m=m, l=l, g=g)
 
 

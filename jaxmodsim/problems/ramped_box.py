@@ -52,15 +52,30 @@ def scene(law: object = None, *, ramp: ArrayLike = 1.0, m: ArrayLike = 2.0) -> S
 
 
 def coulomb() -> Coulomb:
-    """The Coulomb law of the box."""
+    """The Coulomb law of the box.
+
+    **Returns:**
+
+    A `Coulomb` law.
+    """
     return Coulomb(**COULOMB)
 
 
 def stribeck() -> Stribeck:
-    """The law of the box with stiction, Stribeck effect and viscous friction."""
+    """The law of the box with stiction, Stribeck effect and viscous friction.
+
+    **Returns:**
+
+    A `Stribeck` law.
+    """
     return Stribeck(**STRIBECK)
 
 
 def lugre(**changes: ArrayLike) -> LuGre:
-    """The LuGre law of the box, with `changes` to its parameters."""
+    """The LuGre law of the box, with `changes` to its parameters.
+
+    **Returns:**
+
+    A `LuGre` law.
+    """
     return LuGre(**{**LUGRE, **changes})

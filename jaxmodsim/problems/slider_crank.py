@@ -135,6 +135,10 @@ def state(
     """Coordinates and velocities of `scene` at an angle of the crank [rad] and its rate [rad/s].
 
     The slider is on the side of larger x: `sin(rod) = -(r/l) sin(crank)` with cos(rod) > 0.
+
+    **Returns:**
+
+    `(q0, qd0)` for `simulate`, shape `[4]` each.
     """
     angle, rate, ratio = jnp.asarray(angle, float), jnp.asarray(rate, float), jnp.asarray(r) / l
     sine, cosine = jnp.sin(angle), jnp.cos(angle)
@@ -171,6 +175,10 @@ def acceleration(
     - `angle`, `rate`: of the crank [rad], [rad/s].
     - `force`: force on the slider along x [N], such as friction.
     - All others: as for `scene`.
+
+    **Returns:**
+
+    The angular acceleration, shape `[]`.
     """
     numbers = (m1, m2, m3, r, l, g, torque, force)
     m1, m2, m3, r, l, g, torque, force = (jnp.asarray(x, angle.dtype) for x in numbers)
@@ -207,6 +215,10 @@ def forces(
     slider, and equal accelerations of the ends of rod and slider. Friction is `-mu |N| sign(x')`. The equations are
     solved for both signs of the guide force N, and the consistent solution is returned, which is unique for small mu.
     Arguments as for `acceleration`. The slider must move.
+
+    **Returns:**
+
+    `SliderCrankForces`.
     """
     numbers = (m1, m2, m3, r, l, g, torque, mu)
     m1, m2, m3, r, l, g, torque, mu = (jnp.asarray(x, angle.dtype) for x in numbers)

@@ -62,6 +62,10 @@ def reaction(
 
     The force is `m (g cos(phi) - R phi'^2 - R sin(phi)^2 theta'^2)`; its tangential components vanish. Arguments as for
     `scene`, coordinates and rates as for `acceleration`.
+
+    **Returns:**
+
+    The force, shape `[]`.
     """
     return jnp.asarray(m) * (g * jnp.cos(q[0]) - R * qd[0] ** 2 - R * (jnp.sin(q[0]) * qd[1]) ** 2)
 
@@ -85,6 +89,10 @@ def motion(
     - `turn`: theta' at t = 0 [rad/s], not zero.
     - `R`: radius [m], > 0.
     - `g`: gravity [m/s^2], > 0.
+
+    **Returns:**
+
+    The angle, of the shape of `t`.
     """
     from scipy.special import ellipj  # slow to import
 

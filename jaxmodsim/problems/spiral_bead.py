@@ -104,6 +104,10 @@ def normal_force(
 
     - `q`, `qd`: theta [rad] and its rate [rad/s], shape `[1]`.
     - `m`, `R`, `a`, `g`: as for `scene`.
+
+    **Returns:**
+
+    The magnitude, shape `[]`.
     """
     theta, rate, a = q[0], qd[0], jnp.asarray(a)
     opened = 1.0 + (a * theta) ** 2
@@ -138,6 +142,10 @@ def acceleration(
 
     - `q`, `qd`: theta [rad] and its rate [rad/s], shape `[1]`.
     - `m`, `R`, `a`, `g`, `k`, `mu`: as for `scene`.
+
+    **Returns:**
+
+    The acceleration, shape `[1]`.
     """
     theta, rate, a2 = q[0], qd[0], jnp.square(jnp.asarray(a))
     u = a2 * theta**2

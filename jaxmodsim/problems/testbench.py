@@ -81,7 +81,12 @@ class RampResult:
 
 
 def ramp_cases() -> list[RampCase]:
-    """The runs of parts a to e of the exercise; b and d both event-driven and regularised."""
+    """The runs of parts a to e of the exercise; b and d both event-driven and regularised.
+
+    **Returns:**
+
+    The cases in the order of the exercise.
+    """
     coulomb, stribeck = ramped_box.coulomb(), ramped_box.stribeck()
     return [
         RampCase("a", "sign, 1 N/s, adaptive", Sign(coulomb)),
@@ -107,7 +112,12 @@ def ramp_cases() -> list[RampCase]:
 
 
 def run_ramp(case: RampCase) -> RampResult:
-    """Run a case and compute its numbers; the second, warm run is timed."""
+    """Run a case and compute its numbers; the second, warm run is timed.
+
+    **Returns:**
+
+    A `RampResult`; a run that ends early is a result, too.
+    """
     scene = ramped_box.scene(case.law, ramp=case.ramp, m=MASS)
     # The saved times contain every fixed step, which reveals chattering.
     ts = jnp.linspace(0.0, T1, 1001)
@@ -164,6 +174,10 @@ def stick_sweep() -> dict[str, np.ndarray]:
     `t` [s]; `sigma0` [N/m], `sigma1` [N s/m]; `oscillation` [N]: amplitude of friction about the applied force in
     stick; `creep` [m]: displacement at 1.5 s; `speed10` [m/s]: velocity at the end; `steps`; each of
     shape `[sigma0, sigma1]`; and `gap` [N], friction less applied force, `[sigma0, sigma1, time]`.
+
+    **Raises:**
+
+    - `RuntimeError` if a run ends early.
     """
     ts = jnp.linspace(0.0, T1, 2001)
 

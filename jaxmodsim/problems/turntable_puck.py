@@ -72,6 +72,10 @@ def break_away(
     - `alpha`: angular acceleration [rad/s^2], > 0.
     - `r0`: distance of the puck from the axis [m], > 0.
     - `g`: gravity [m/s^2], > 0.
+
+    **Returns:**
+
+    A `BreakAway`.
     """
     w = ((jnp.asarray(mu) * g / r0) ** 2 - jnp.asarray(alpha) ** 2) ** 0.25
     return BreakAway(w / alpha, 0.5 * w * w / alpha, jnp.arctan2(jnp.asarray(alpha), w * w))

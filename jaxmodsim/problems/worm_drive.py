@@ -81,6 +81,10 @@ def state(
 
     - `speed`: angular velocity of the worm [rad/s].
     - `r1`, `r2`, `lead`: as for `scene`.
+
+    **Returns:**
+
+    `(q0, qd0)` for `simulate`, shape `[2]` each.
     """
     speed = jnp.asarray(speed, float)
     return jnp.zeros(2), jnp.stack([speed, speed * jnp.asarray(r1) / r2 * jnp.tan(lead)])
@@ -95,6 +99,10 @@ def efficiency(lead: ArrayLike, mu: ArrayLike) -> tuple[Float[Array, "..."], Flo
     **Arguments:**
 
     - `lead`, `mu`: as for `scene`.
+
+    **Returns:**
+
+    Both efficiencies, of the common shape of the arguments.
     """
     angle = jnp.arctan(mu)
     return (
@@ -119,6 +127,10 @@ def holding_torques(
     **Arguments:**
 
     - `load`, `r1`, `r2`, `lead`, `mu`: as for `scene`.
+
+    **Returns:**
+
+    Both torques, of the common shape of the arguments.
     """
     force, angle = jnp.asarray(load) / r2, jnp.arctan(mu)
     ends = [r1 * force * jnp.tan(lead - angle), r1 * force * jnp.tan(lead + angle)]
@@ -147,6 +159,10 @@ def acceleration(
 
     - `direction`: sign of the velocity of the worm.
     - All others: as for `scene`.
+
+    **Returns:**
+
+    The acceleration, shape `[]`.
     """
     mass1, mass2 = jnp.asarray(J1) / jnp.square(r1), jnp.asarray(J2) / jnp.square(r2)
     push, force, slope = jnp.asarray(motor) / r1, jnp.asarray(load) / r2, jnp.tan(lead)

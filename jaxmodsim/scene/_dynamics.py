@@ -314,7 +314,12 @@ class Mobility(NamedTuple):
 
 
 def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> Dynamics:
-    """Solve for the accelerations, and for the forces that depend on them, for the modes `mode`."""
+    """Solve for the accelerations, and for the forces that depend on them, for the modes `mode`.
+
+    **Returns:**
+
+    The `Dynamics` at this state: accelerations `qdd`, shape `[dof]`, forces, reactions, powers and guards.
+    """
     q, qd = y.q, y.qd
     scene = scene.bind_state(t, q, qd)
     params = scene.params
@@ -440,10 +445,19 @@ def from_dynamics(get: Callable[[Dynamics], _Value], t: Scalar, y: State, scene:
     """`get(forward_dynamics(t, y, scene, mode))`, a pytree of arrays, evaluated in scalars as a whole.
 
     Laws, loads and solves have small arrays like the terms of the Lagrangian; see `in_scalars`.
+
+    **Returns:**
+
+    The result of `get`.
     """
     return in_scalars(lambda t, y, mode: get(forward_dynamics(t, y, scene, mode)), t, y, mode, seed=y.q)
 
 
 def vector_field(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> State:
-    """Right-hand side of `y' = field(t, y)`; NaN if the equations do not hold, see `Dynamics.uniqueness`."""
+    """Right-hand side of `y' = field(t, y)`; NaN if the equations do not hold, see `Dynamics.uniqueness`.
+
+    **Returns:**
+
+    The rates, a `State`: velocities, accelerations, and rates of the effects' states.
+    """
     return from_dynamics(lambda dynamics: dynamics.rate, t, y, scene, mode)

@@ -77,6 +77,10 @@ def scene_step(scene: Scene, t0: Scalar, t1: Scalar, y: State) -> tuple[State, B
     Masses, directions, loads and all forces except friction are those at t0. Friction is that of the slip velocity and
     the state at t1: `v1 = v_free - h D M^-1 D^T F(v1, advance(v1, z0, h))`. Coordinates follow with the velocities at
     t1.
+
+    **Returns:**
+
+    `(State, solved)`, the second a boolean of shape `[]`.
     """
     q, qd, h = y.q, y.qd, t1 - t0
     scene = scene.bind_state(t0, q, qd)

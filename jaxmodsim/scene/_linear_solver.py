@@ -17,7 +17,12 @@ from ._scene import Scene
 
 
 def has_linear_solver(scene: Scene) -> bool:
-    """Whether `linear_solver` supports the scene: no constraints, switches or friction by accelerations."""
+    """Whether `linear_solver` supports the scene: no constraints, switches or friction by accelerations.
+
+    **Returns:**
+
+    A `bool`.
+    """
     depends = scene.event_driven or scene.reaction_loaded or scene.switches
     return not (depends or scene.constraints or any(each.karnopp for each in scene.friction.values()))
 

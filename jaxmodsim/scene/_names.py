@@ -32,9 +32,24 @@ def scene_numbers(scene: eqx.Module) -> dict[str, Array]:
     depends on direction do (`friction.forward.Fc`). The names of a law alone have no effect in front (`Fc`,
     `forward.Fc`). A `Signal` has its values (`u.values`); its times are constants.
 
+    **Returns:**
+
+    The arrays by name, in the order of the leaves.
+
     **Raises:**
 
     - `ValueError` if two numbers have the same name; give one of the effects another name.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    print(list(jms.scene.scene_numbers(scene)))
+    ```
+
+    ```text
+    ['k', 'm', 'friction.Fc', 'friction.Fs', 'friction.belt_velocity']
+    ```
     """
     return {name: leaf for name, leaf in _named_leaves(scene) if name is not None}
 
@@ -66,6 +81,10 @@ def scene_ranges(scene: eqx.Module) -> dict[str, Range]:
     """Admissible range of each number that has one, by the names of `scene_numbers`.
 
     A limit that is another number has that number's full name.
+
+    **Returns:**
+
+    The ranges by name.
     """
     leaves, _ = jtu.tree_flatten_with_path(scene)
     ranges: dict[str, Range] = {}
@@ -93,7 +112,12 @@ def scene_ranges(scene: eqx.Module) -> dict[str, Range]:
 
 
 def scene_units(scene: eqx.Module) -> dict[str, str]:
-    """Unit of each number with a known unit, by the names of `scene_numbers`."""
+    """Unit of each number with a known unit, by the names of `scene_numbers`.
+
+    **Returns:**
+
+    The units by name, such as `N s/m`; `""` for a number without a unit.
+    """
     units = {name: allowed.unit for name, allowed in scene_ranges(scene).items()}
     if isinstance(scene, Scene):
         for name, effect in scene.friction.items():
@@ -102,7 +126,16 @@ def scene_units(scene: eqx.Module) -> dict[str, str]:
 
 
 def replace_numbers(scene: _Module, values: dict[str, Any]) -> _Module:
-    """The scene or law with new values of the numbers of these names, which are those of `scene_numbers`."""
+    """The scene or law with new values of the numbers of these names, which are those of `scene_numbers`.
+
+    **Returns:**
+
+    A new object of the same structure. Unknown names have no effect; ranges are not checked.
+
+    **Raises:**
+
+    - `ValueError` as `scene_numbers`.
+    """
     leaves = [leaf if name is None else values.get(name, leaf) for name, leaf in _named_leaves(scene)]
     return jtu.tree_unflatten(jtu.tree_structure(scene), leaves)
 
@@ -133,7 +166,16 @@ def _telling(words: list[str]) -> list[str]:
 
 
 def elements(scene: Scene) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Each single number by name: the name of its array, and its index there."""
+    """Each single number by name: the name of its array, and its index there.
+
+    **Returns:**
+
+    Name, such as `friction.k[0]`, to `(friction.k, (0,))`; a number alone has the empty index `()`.
+
+    **Raises:**
+
+    - `ValueError` as `scene_numbers`.
+    """
     return {
         leaf + (f"[{','.join(map(str, index))}]" if index else ""): (leaf, index)
         for leaf, array in scene_numbers(scene).items()
@@ -142,13 +184,31 @@ def elements(scene: Scene) -> dict[str, tuple[str, tuple[int, ...]]]:
 
 
 def read_element(scene: Scene, name: str) -> float:
-    """A single number."""
+    """A single number.
+
+    **Returns:**
+
+    The number as a `float`, in its own unit.
+
+    **Raises:**
+
+    - `KeyError` for a name that is not in `elements`.
+    """
     leaf, index = elements(scene)[name]
     return float(np.asarray(scene_numbers(scene)[leaf])[index])
 
 
 def replace_elements(scene: Scene, values: Mapping[str, Any]) -> Scene:
-    """The scene with new values of these single numbers."""
+    """The scene with new values of these single numbers.
+
+    **Returns:**
+
+    A new scene of the same structure.
+
+    **Raises:**
+
+    - `KeyError` for a name that is not in `elements`.
+    """
     known, numbers, changed = elements(scene), scene_numbers(scene), {}
     for name, value in values.items():
         leaf, index = known[name]

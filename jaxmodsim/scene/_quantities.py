@@ -26,6 +26,10 @@ def quantity_of(scene: Scene, series: str) -> Quantity:
     The velocity of `x [m]` is `x_dot [m/s]`. A coordinate without a name is `q[0]`, in "m or rad". Forces whose unit
     depends on that, and friction along a displacement other than a sum or difference of coordinates, are in "N or N m".
     Other names have no unit.
+
+    **Returns:**
+
+    A `Quantity` of name and unit.
     """
     state, component = _STATE.fullmatch(series), _COMPONENT.fullmatch(series)
     if state is not None and int(state[2]) < (len(scene.coordinates) or math.inf):
@@ -39,7 +43,12 @@ def quantity_of(scene: Scene, series: str) -> Quantity:
 
 
 def describe_series(scene: Scene, series: str) -> str:
-    """The series by its name in functions and by its own name, as in `q[1] (theta)`."""
+    """The series by its name in functions and by its own name, as in `q[1] (theta)`.
+
+    **Returns:**
+
+    The text.
+    """
     name = quantity_of(scene, series).name
     return series if name == series else f"{series} ({name})"
 

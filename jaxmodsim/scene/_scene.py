@@ -124,6 +124,26 @@ class Scene(AbstractReadable, eqx.Module):
 
     - `ValueError` for an entry of a wrong type, two entries of one name, an unknown unit, and friction whose load is an
       unknown constraint; at the run if the number of `coordinates` is not that of q0.
+
+    **Example:**
+
+    ```python
+    def pendulum(t, q, qd, p):
+        return 0.5 * p["m"] * (p["l"] * qd[0]) ** 2 + p["m"] * 9.81 * p["l"] * jnp.cos(q[0])
+
+    hinge = jms.Friction(jms.Coulomb(Fc=0.1), name="hinge")
+    print(jms.Scene(pendulum, {"m": 1.0, "l": 0.5}, (hinge,), coordinates=("phi [rad]",)))
+    ```
+
+    ```text
+    Scene of pendulum in phi [rad]
+      number                       value
+      l                            0.5
+      m                            1
+      hinge.Fc [N m]               0.1
+      hinge.belt_velocity [rad/s]  0
+    effects: hinge (Coulomb)
+    ```
     """
 
     lagrangian: Lagrangian = eqx.field(converter=partial(as_function, name="Scene lagrangian"))

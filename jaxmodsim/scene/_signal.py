@@ -23,11 +23,6 @@ def _samples(x: object, *, name: str) -> Float[Array, " n"]:
 class Signal(eqx.Module):
     """A sampled function of time, as an entry of `Scene` parameters: functions get its value at time t there.
 
-    ```python
-    scene = jaxmodsim.Scene(L, params={"m": 2.0, "u": jaxmodsim.Signal(t, u)},
-                            effects=(jaxmodsim.AppliedForce(lambda t, q, qd, p: p["u"][None]),))
-    ```
-
     Each value holds from its sample to the next one, so that the signal jumps at its samples and has the new value
     there. With `linear`, straight lines join the samples. Before the first sample it has the first value, after the
     last one the last. Steps of `simulate` end on the samples.
@@ -46,7 +41,20 @@ class Signal(eqx.Module):
 
     **Raises:**
 
-    - `ValueError` for shapes that differ, and times that are not finite or do not increase.
+    - `ValueError` for shapes that differ, times that are not finite or do not increase, and values that are not finite.
+
+    **Example:**
+
+    ```python
+    drive = jms.AppliedForce(lambda t, q, qd, p: p["u"][None])
+    u = jms.Signal([0.0, 1.0], [4.0, 0.0])  # 4 N for 1 s
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * p["m"] * qd[0] ** 2, {"m": 2.0, "u": u}, (drive,))
+    print(jms.simulate(scene, [0.0], [0.0], 2.0).qd.round(6), "m/s")
+    ```
+
+    ```text
+    [[2.]] m/s
+    ```
     """
 
     t: Any = eqx.field(converter=lambda x: _samples(x, name="Signal t"))
@@ -106,7 +114,12 @@ def _is_signal(x: Any) -> bool:
 
 
 def signals_of(tree: Any) -> list[Any]:
-    """The signals in `tree`."""
+    """The signals in `tree`.
+
+    **Returns:**
+
+    A list of `Signal`s, in the order of the leaves.
+    """
     return [x for x in jax.tree.leaves(tree, is_leaf=_is_signal) if _is_signal(x)]
 
 
@@ -130,7 +143,12 @@ def signals_from(tree: Any, t: Scalar) -> Any:
 
 
 def sample_times(tree: Any, *, linear: bool) -> Float[Array, " n"] | None:
-    """Times of all samples in `tree` in order, with `linear` those of linear signals, too; None without signals."""
+    """Times of all samples in `tree` in order, with `linear` those of linear signals, too; None without signals.
+
+    **Returns:**
+
+    The times [s], increasing, shape `[n]`, repeated for equal times of several signals; or None.
+    """
     times = [jax.lax.stop_gradient(x.t) for x in signals_of(tree) if linear or not x.linear]
     if len(times) < 2:
         return times[0] if times else None

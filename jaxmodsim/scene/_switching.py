@@ -24,6 +24,10 @@ def start(
     """Initial state and modes: elements with a slip velocity of at most `rest`, or rounding, stick if they can.
 
     Contacts without gap and without velocity are closed. Only the shape of `mode` counts.
+
+    **Returns:**
+
+    `(State, modes)`: modes of shape `[modes]`, in the order of `Scene.mode_names`.
     """
     slips, closed, sides = scene.split_modes(mode)
     if scene.contacts:
@@ -76,6 +80,10 @@ def switch(
     """State and modes after the guards that `fired`; `elastic` is False if impacts have accumulated.
 
     The impact and the friction after it are two functions of `in_scalars`, as one would be too large for it.
+
+    **Returns:**
+
+    `(State, modes)`: modes of shape `[modes]`, in the order of `Scene.mode_names`.
     """
     slips, closed, sides = scene.split_modes(mode)
     slip_fired, contact_fired, side_fired = scene.split_modes(fired)

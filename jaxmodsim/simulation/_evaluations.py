@@ -13,6 +13,10 @@ def evaluations_per_step(solver: dfx.AbstractSolver, run: Trajectory) -> int | N
 
     One for each stage; a stage that is equal to the last one of the step before counts once (`diffrax.Tsit5`). The
     Jacobian of `Rodas5P` counts as one for each entry of the state, its time derivative as one.
+
+    **Returns:**
+
+    The number, or None.
     """
     if isinstance(solver, Rodas5P):
         entries = sum(np.size(x) for x in jtu.tree_leaves((run.q, run.qd, run.z))) // run.t.shape[0]

@@ -45,6 +45,19 @@ def project_initial_state(
     - `SimulationError` if there is no such state near q0 and qd0: the constraints exclude it (a linkage that does not
       close), or `hold` leaves no freedom.
     - `ValueError` for wrong shapes and indices.
+
+    **Example:**
+
+    ```python
+    rod = jms.Constraint(lambda t, q, p: jnp.hypot(q[0], q[1]) - 1.0)
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * jnp.sum(qd**2), constraints=(rod,))
+    q0, qd0 = jms.project_initial_state(scene, [0.6, -0.9], [1.0, 0.0], hold=(0,))
+    print(q0.round(6), qd0.round(6))
+    ```
+
+    ```text
+    [ 0.6 -0.8] [1.   0.75]
+    ```
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"project_initial_state needs a Scene, but a {type(scene).__name__} was given.")

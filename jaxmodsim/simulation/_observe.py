@@ -43,6 +43,10 @@ def named_series(run: Trajectory, name: str) -> Float[Array, " time"]:
 
     `q[0]` and `qd[0]` are coordinates and velocities, the name of an effect is its force, with `[i]` for a component.
 
+    **Returns:**
+
+    The series, shape `[time]`.
+
     **Raises:**
 
     - `ValueError` for any other name.
@@ -51,6 +55,11 @@ def named_series(run: Trajectory, name: str) -> Float[Array, " time"]:
 
 
 def named_unit(name: str) -> str:
-    """Unit of a series; a coordinate is a length or an angle."""
+    """Unit of a series; a coordinate is a length or an angle.
+
+    **Returns:**
+
+    The unit, such as `m/s or rad/s`.
+    """
     state = _STATE.fullmatch(name)
     return "N or N m" if state is None else "m or rad" if state[1] == "q" else "m/s or rad/s"

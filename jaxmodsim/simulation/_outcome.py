@@ -99,7 +99,22 @@ class Ending(NamedTuple):
 
 
 class SimulationError(RuntimeError):
-    """A run that ended early; the message has the cause, the time and the remedy."""
+    """A run that ended early; the message has the cause, the time and the remedy.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.braked_spring.scene()
+    try:
+        jms.simulate(scene, [1.0], [0.0], 100.0, max_steps=10)
+    except jms.SimulationError as error:
+        print(str(error).split(". ")[0])
+    ```
+
+    ```text
+    The step limit was reached before t1: pass a larger max_steps, a larger dt or looser tolerances
+    ```
+    """
 
 
 class RunResult(eqx.Module):
@@ -133,7 +148,12 @@ class RunResult(eqx.Module):
 
 
 def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
-    """The sentence for each outcome that a run of this scene can have."""
+    """The sentence for each outcome that a run of this scene can have.
+
+    **Returns:**
+
+    The sentences; the code of a run is an index into them.
+    """
     mass = tuple(
         f"The mass matrix is singular or indefinite at coordinate {describe_series(scene, f'q[{i}]')}: its inertia is"
         " not positive" + (" once the motion of the coordinates before it is taken out." if i else ".")

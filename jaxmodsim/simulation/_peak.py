@@ -16,7 +16,16 @@ _CORNER = 1e-6
 
 
 def peak_of(run: Trajectory, name: str) -> Float[Array, ""]:
-    """Largest magnitude of a series from t0 to the end of a run, see `metrics.peak`."""
+    """Largest magnitude of a series from t0 to the end of a run, see `metrics.peak`.
+
+    **Returns:**
+
+    The magnitude, shape `[]`, with derivatives.
+
+    **Raises:**
+
+    - `ValueError` for an unknown name.
+    """
     series = find_series(run, name)
     x = read_series(run, series)
     saved = jnp.max(jnp.where(jnp.isfinite(run.t), jnp.abs(x), 0.0))

@@ -116,6 +116,10 @@ def run_request(
 ) -> RunRequest:
     """Check and convert the arguments of `simulate`.
 
+    **Returns:**
+
+    A `RunRequest`.
+
     **Raises:**
 
     - `ValueError` naming the argument, its value and the requirement.

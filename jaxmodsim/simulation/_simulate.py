@@ -118,6 +118,21 @@ def simulate(
       run-time error of equinox with the same message, which also appears after the traceback. This error calls Python,
       and JAX does not keep programs with callbacks in its persistent cache. To cache such programs, pass `throw=False`
       and read `run.result`.
+
+    **Example:**
+
+    ```python
+    def lagrangian(t, q, qd, p):
+        return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
+
+    scene = jms.Scene(lagrangian, {"m": 1.0, "k": 4.0}, (jms.Friction(jms.Coulomb(Fc=0.6)),))
+    run = jms.simulate(scene, q0=[1.0], qd0=[0.0], t1=6.0, ts=jnp.linspace(0.0, 6.0, 5))
+    print(run.q[:, 0].round(4), "m")
+    ```
+
+    ```text
+    [ 1.     -0.6915  0.3781 -0.0778 -0.1   ] m
+    ```
     """
     recommend_tuning()
     throw = as_flag(throw, name="throw")

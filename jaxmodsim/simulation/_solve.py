@@ -92,6 +92,10 @@ def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolv
     steps of the methods whose dense output keeps the tolerance, and is twice as fast as Tsit5 under vmap. On several
     coordinates its Jacobian costs more than that, above all in compile time. Exact friction in the plane is stiff for
     slow slip, whose direction follows that of the load.
+
+    **Returns:**
+
+    The solver; with `fixed_step`, Rodas5P swaps rows.
     """
     stiff = scene.stiff or sum(scene.mode_widths(dof)) > len(scene.mode_names)
     return Rodas5P(pivot=fixed_step) if stiff or (scene.mode_names and dof == 1) else dfx.Tsit5()

@@ -226,6 +226,18 @@ def simulate_to_accuracy(
 
     - `ValueError` as `simulate`, and for traced numbers (`jax.jit`, `jax.vmap`, `jax.grad`).
     - `SimulationError` if the run ended early, or no run has the accuracy, and `throw` is set.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.braked_spring.scene(m=1.0, k=1.0)
+    run = jms.simulate_to_accuracy(scene, [1.0], [0.0], 10.0, accuracy=1e-6)
+    print(f"{run.q[-1, 0]:.5f} m, in closed form {jnp.cos(10.0):.5f} m")
+    ```
+
+    ```text
+    -0.83907 m, in closed form -0.83907 m
+    ```
     """
     throw = as_flag(throw, name="throw")
     request = run_request(

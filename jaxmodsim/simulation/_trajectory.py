@@ -134,6 +134,20 @@ class Trajectory(AbstractReadable):
     - `accuracy`: the report of `simulate_to_accuracy`; None without.
 
     Read a run of `jax.vmap` inside it, or by `jax.vmap(lambda run: run.forces)(runs)`.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.belt_oscillator.scene()
+    run = jms.simulate(scene, [0.0], [0.0], 3.0, ts=jnp.linspace(0.0, 3.0, 301))
+    print(run.result, run.q.shape, run.stats["num_events"])
+    print(f"friction at 0.5 s: {run.forces['friction'][50]:.3f} N")
+    ```
+
+    ```text
+    The run reached t1. (301, 1) 6
+    friction at 0.5 s: -4.900 N
+    ```
     """
 
     t: Float[Array, " *time"]

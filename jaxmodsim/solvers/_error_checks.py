@@ -26,6 +26,10 @@ def without_error_checks(fn: Callable[..., Any], *args: Array | None) -> Any:
 
     - `fn`: a function of arrays that returns a pytree of arrays. It may close over traced values.
     - `args`: arrays, or None. If none of them is traced, nothing is compiled, and this calls `fn` itself.
+
+    **Returns:**
+
+    The result of `fn`.
     """
     if "jaxprs" not in AVAILABLE or not any(isinstance(x, jax.core.Tracer) for x in args):
         return fn(*args)

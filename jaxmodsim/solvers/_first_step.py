@@ -33,6 +33,10 @@ def first_step(
     - `tolerances`: relative and absolute.
     - `shortest`: the shortest admissible step [s].
 
+    **Returns:**
+
+    The step [s], shape `[]`, at least `shortest`.
+
     ??? cite "Reference"
 
         ```bibtex
@@ -56,7 +60,12 @@ def first_step(
 
 
 def trial_step(y0: PyTree, slope: PyTree, tolerances: tuple[Float[Array, ""], Float[Array, ""]]) -> Float[Array, ""]:
-    """Length [s] of the Euler step at whose end `first_step` needs the field."""
+    """Length [s] of the Euler step at whose end `first_step` needs the field.
+
+    **Returns:**
+
+    The length [s], shape `[]`.
+    """
     return jax.lax.stop_gradient(_try_out(y0, slope, tolerances)[2])
 
 

@@ -42,6 +42,19 @@ class Gauss(dfx.AbstractSolver):
     - `ValueError` for another number of stages, and (while tracing) for complex or integer states, and for
       terms other than an `ODETerm`.
 
+    **Example:**
+
+    ```python
+    pendulum = diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], -jnp.sin(y[0])]))  # angle, momentum
+    solution = diffrax.diffeqsolve(pendulum, jms.Gauss(3), 0.0, 100.0, 0.1, jnp.array([1.0, 0.0]))
+    q, p = solution.ys[-1]
+    print(abs(0.5 * p**2 - jnp.cos(q) + jnp.cos(1.0)) < 1e-8)  # change of the energy
+    ```
+
+    ```text
+    True
+    ```
+
     ??? cite "Reference"
 
         Collocation: section II.1.3; symplecticity and quadratic invariants: IV.2 and VI.4; rounding: VIII.5.

@@ -37,6 +37,23 @@ class ImplicitFriction(dfx.AbstractSolver):
 
     - `advance`: `advance(t0, t1, y, args)` -> `(y1, solved)`, the step itself, which `jaxmodsim.simulate` sets.
 
+    **Raises:**
+
+    - `ValueError` (at the run) outside `jaxmodsim.simulate`, without `dt`, and for friction or contacts that it does
+      not support.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.ramped_box.scene(jms.problems.ramped_box.lugre())
+    run = jms.simulate(scene, [0.0], [0.0], 3.0, dt=0.01, solver=jms.ImplicitFriction())
+    print(f"{run.qd[-1, 0]:.3f} m/s after {run.stats['num_steps']} steps")
+    ```
+
+    ```text
+    0.461 m/s after 300 steps
+    ```
+
     ??? cite "Reference"
 
         Steps that find velocities and forces of friction together:

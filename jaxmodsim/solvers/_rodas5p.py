@@ -159,6 +159,19 @@ class Rodas5P(dfx.AbstractAdaptiveSolver):
 
     - `ValueError` (while tracing) for complex or integer states, and for terms other than an `ODETerm`.
 
+    **Example:**
+
+    ```python
+    stiff = diffrax.ODETerm(lambda t, y, args: 1e4 * (jnp.cos(t) - y))
+    control = diffrax.PIDController(rtol=1e-6, atol=1e-6)
+    solution = diffrax.diffeqsolve(stiff, jms.Rodas5P(), 0.0, 1.0, None, jnp.zeros(1), stepsize_controller=control)
+    print(solution.stats["num_accepted_steps"], "steps to", solution.ys[-1].round(5))
+    ```
+
+    ```text
+    22 steps to [0.54039]
+    ```
+
     ??? cite "Reference"
 
         ```bibtex

@@ -62,6 +62,20 @@ class StoredSteps(dfx.AbstractAdjoint):
     - `ValueError` for `every` below 1, `max_steps=None`, and diffrax's own terminating `event`.
     - `RuntimeError` for reverse mode of a derivative.
 
+    **Example:**
+
+    ```python
+    def end(scene):
+        return jms.simulate(scene, [1.0], [0.0], 2.0, adjoint=jms.StoredSteps(every=4)).q[-1, 0]
+
+    slope = jax.grad(end)(jms.problems.braked_spring.scene())
+    print(f"{slope.params['k']:.5f} m/(N/m)")
+    ```
+
+    ```text
+    -0.13685 m/(N/m)
+    ```
+
     ??? cite "Reference"
 
         Tangents in the error norm:

@@ -30,11 +30,6 @@ Observable: TypeAlias = Callable[[Trajectory], object] | str
 class Derivative:
     """Derivatives of an observable by numbers of the run, for `observe` of `sweep`.
 
-    ```python
-    slopes = jaxmodsim.sweeps.Derivative("qd[0]", ("m", "friction.Fc"))
-    jaxmodsim.sweep(scene, {"k": stiffnesses}, {"v": "qd[0]", "dv": slopes}, ...)
-    ```
-
     They are computed in forward mode, through all events, together with the run: n derivatives cost about `2 + 0.1 n`
     plain runs.
 
@@ -43,6 +38,23 @@ class Derivative:
     - `of`: the observable, a function of the run or a name.
     - `wrt`: names of single numbers, as in `over`: of the scene, or `q0[0]`, `t1` and so on. A tuple gives the result a
       dimension with their names; a single name does not.
+
+    **Raises:**
+
+    - `ValueError` for no names, and for repeated ones.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.braked_spring.scene()
+    observe = {"x": "q[0]", "dx": jms.sweeps.Derivative("q[0]", ("k", "m"))}
+    runs = jms.sweep(scene, {"k": [2.0, 3.0]}, observe, q0=[1.0], qd0=[0.0], t1=2.0)
+    print(runs["dx"].dims, runs["dx"].values.round(4).tolist())
+    ```
+
+    ```text
+    ('k', 'dx_wrt') [[-0.3807, 0.5857], [-0.0523, 0.1206]]
+    ```
     """
 
     of: Observable

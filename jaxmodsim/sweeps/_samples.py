@@ -16,11 +16,6 @@ Span: TypeAlias = tuple[float, float] | tuple[float, float, str] | object
 def latin_hypercube(ranges: Mapping[str, Span], count: int, *, seed: int = 0) -> dict[str, np.ndarray]:
     """Random samples, one in each of `count` equally likely strata of every parameter.
 
-    ```python
-    columns = sweeps.latin_hypercube({"m": (1.0, 2.0), "friction.Fc": (0.1, 10.0, "log")}, 200)
-    jaxmodsim.sweep(scene, {"sample": columns}, {"end": "q[0]"}, q0=[0.0], qd0=[0.0], t1=5.0)
-    ```
-
     **Arguments:**
 
     - `ranges`: by the name of a parameter: `(low, high)` for a uniform distribution, `(low, high, "log")` for a uniform
@@ -35,6 +30,18 @@ def latin_hypercube(ranges: Mapping[str, Span], count: int, *, seed: int = 0) ->
     **Raises:**
 
     - `ValueError` for a wrong range, with its name, and for a count below one.
+
+    **Example:**
+
+    ```python
+    columns = jms.sweeps.latin_hypercube({"m": (1.0, 2.0), "friction.Fc": (0.1, 10.0, "log")}, 200)
+    print(columns["m"].shape, (columns["friction.Fc"] < 1.0).mean())
+    over = {"sample": columns}  # for `sweep`
+    ```
+
+    ```text
+    (200,) 0.5
+    ```
     """
     check_ranges(ranges)
     count, seed = as_whole(count, name="count"), as_whole(seed, name="seed", least=0)
@@ -49,10 +56,6 @@ def sobol(ranges: Mapping[str, Span], count: int, *, seed: int = 0) -> dict[str,
     The number of points must be a power of two: other numbers are less balanced than a smaller power of two (Owen 2020,
     arXiv:2008.08051).
 
-    ```python
-    columns = sweeps.sobol({"m": (1.0, 2.0), "friction.Fc": (0.1, 10.0, "log")}, 256)
-    ```
-
     **Arguments:**
 
     - `ranges`, `seed`: as for `latin_hypercube`.
@@ -65,6 +68,17 @@ def sobol(ranges: Mapping[str, Span], count: int, *, seed: int = 0) -> dict[str,
     **Raises:**
 
     - `ValueError` for a wrong range, with its name, and a count that is not a power of two.
+
+    **Example:**
+
+    ```python
+    columns = jms.sweeps.sobol({"m": (1.0, 2.0), "friction.Fc": (0.1, 10.0, "log")}, 256)
+    print(columns["m"].shape, (columns["friction.Fc"] < 1.0).mean())
+    ```
+
+    ```text
+    (256,) 0.5
+    ```
     """
     check_ranges(ranges)
     check_power(count)

@@ -115,16 +115,6 @@ def global_sensitivity(
 ) -> GlobalSensitivity:
     """Compute the effect of parameters on observables over the whole ranges of the parameters.
 
-    ```python
-    result = sweeps.global_sensitivity(
-        scene,
-        {"period": metrics.period(), "peak": metrics.peak("friction")},
-        {"friction.Fs": (5.0, 9.0), "k": (50.0, 200.0, "log")},
-        q0=[0.0], qd0=[0.1], t1=10.0, ts=jnp.linspace(0.0, 10.0, 201), max_events=64,
-    )
-    print(result)
-    ```
-
     **Sobol' indices** (`method="sobol"`) divide the variance of an observable among the parameters: `S1` is the share
     of a parameter alone, `ST` the share with all its interactions. They cost `count (D + 2)` runs for D parameters.
     **Elementary effects** (`method="morris"`) are changes of the observable as one parameter crosses its range:
@@ -166,6 +156,21 @@ def global_sensitivity(
     - `ValueError` for wrong ranges, names or counts, observables with several numbers, and if failed runs remove more
       than 20 % of the design.
     - `ImportError` without the extra `sweep`.
+
+    **Example:**
+
+    ```python
+    def deflection(F, k):
+        return F / k
+
+    result = jms.sweeps.global_sensitivity(deflection, None, {"F": (1.0, 2.0), "k": (50.0, 200.0, "log")}, count=512)
+    (indices,) = result.indices.values()
+    print(dict(zip(result.names, indices.values["ST"].round(1).tolist(), strict=True)))
+    ```
+
+    ```text
+    {'F': 0.2, 'k': 0.8}
+    ```
     """
     if method not in _INDICES:
         raise ValueError(f"method must be 'sobol' or 'morris', but {method!r} was given.")

@@ -109,16 +109,6 @@ def sweep(
 ) -> "xr.Dataset":
     """Run a scene, or any function, for many numbers, on all cores, in bounded memory.
 
-    ```python
-    runs = jaxmodsim.sweep(
-        scene,
-        over={"k": np.linspace(50.0, 200.0, 100), "friction.belt_velocity": np.geomspace(0.01, 1.0, 100)},
-        observe={"amplitude": (lambda run: jnp.ptp(run.q[:, 0]), "m"), "x": "q[0]"},
-        q0=[0.0], qd0=[0.0], t1=20.0, ts=jnp.linspace(0.0, 20.0, 201),
-    )
-    runs["amplitude"].sel(k=100.0, method="nearest")
-    ```
-
     Runs are computed in small groups that fit the cache, in one thread per core. For more than 1024 runs, a trial of a
     few predicts the number of steps of the others, which are sorted by it. A run with many more steps than its
     neighbours leaves its group, and is computed again with other slow runs. The results equal those of single calls of
@@ -162,6 +152,18 @@ def sweep(
     - `ValueError` for wrong names, shapes, types or ranges, before anything runs; and if `out` holds the results of
       another scene, other numbers, code or versions.
     - `ImportError` without the extra `sweep`.
+
+    **Example:**
+
+    ```python
+    scene = jms.problems.braked_spring.scene()
+    runs = jms.sweep(scene, {"k": np.linspace(2.0, 3.0, 3)}, {"x": "q[0]"}, q0=[1.0], qd0=[0.0], t1=2.0)
+    print(runs["x"].sel(k=2.5).values.round(4), runs["x"].dims)
+    ```
+
+    ```text
+    -0.933 ('k',)
+    ```
     """
     with reported(progress, "sweep", SweepProgressText()) as report:
         for library in ("xarray", "zarr"):  # a missing one is better reported before the runs
@@ -203,6 +205,10 @@ def plan_sweep(
 
     - `system`, `over`, `observe`, `chunk`: as for `sweep`.
     - `arguments`: further arguments of `sweep` for `simulate`.
+
+    **Returns:**
+
+    A `SweepPlan`.
 
     **Raises:**
 

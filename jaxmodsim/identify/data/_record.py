@@ -47,6 +47,17 @@ class Record:
 
     - `ValueError` naming the column and the first wrong sample, for NaN, times that do not increase, or different
       lengths.
+
+    **Example:**
+
+    ```python
+    record = jms.Record([0.0, 0.1, 0.2], {"x": [0.0, 0.01, 0.03]}, {"u": [1.0, 1.0, 0.0]}, name="step")
+    print(record.part(0.1, 0.2).channels["x"])
+    ```
+
+    ```text
+    [0.01 0.03]
+    ```
     """
 
     t: Float[np.ndarray, " samples"]

@@ -144,6 +144,10 @@ def sampling_gaps(record: Record) -> tuple[int, ...]:
     """Numbers of the samples before gaps.
 
     A record with irregular intervals has none.
+
+    **Returns:**
+
+    Indices of the samples, increasing.
     """
     steps = np.diff(record.t)
     long = np.flatnonzero(steps > _GAP * np.median(steps))

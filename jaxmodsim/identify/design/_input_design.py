@@ -27,17 +27,32 @@ _FADE = 0.1
 
 
 def d_optimal(information: Float[Array, "free free"]) -> Float[Array, ""]:
-    """Mean logarithm of the eigenvalues: minimises the volume of the confidence ellipsoid."""
+    """Mean logarithm of the eigenvalues: minimises the volume of the confidence ellipsoid.
+
+    **Returns:**
+
+    The criterion, shape `[]`.
+    """
     return jnp.linalg.slogdet(information)[1] / information.shape[0]
 
 
 def a_optimal(information: Float[Array, "free free"]) -> Float[Array, ""]:
-    """Minus the logarithm of the mean variance: minimises the mean of the squared relative errors."""
+    """Minus the logarithm of the mean variance: minimises the mean of the squared relative errors.
+
+    **Returns:**
+
+    The criterion, shape `[]`.
+    """
     return -jnp.log(jnp.trace(jnp.linalg.inv(information)) / information.shape[0])
 
 
 def e_optimal(information: Float[Array, "free free"]) -> Float[Array, ""]:
-    """Logarithm of the smallest eigenvalue: minimises the error of the worst-known combination."""
+    """Logarithm of the smallest eigenvalue: minimises the error of the worst-known combination.
+
+    **Returns:**
+
+    The criterion, shape `[]`.
+    """
     return jnp.log(jnp.maximum(jnp.linalg.eigvalsh(information)[0], jnp.finfo(information.dtype).tiny))
 
 

@@ -51,6 +51,10 @@ class MultipleShooting:
     - `jump`: standard deviations of the jumps of positions [m or rad] and of velocities [m/s or rad/s] from the end of
       one window to the start of the next, both > 0: the error of the model and of disturbances over one window. The
       states of friction laws count as positions. None: the windows are independent, and friction laws start unloaded.
+
+    **Raises:**
+
+    - `ValueError` for jumps that are not positive, and (at the fit) for a window that is too short.
     """
 
     window: float

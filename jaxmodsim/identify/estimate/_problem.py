@@ -72,6 +72,10 @@ class Huber(AbstractLoss):
     **Arguments:**
 
     - `limit`: in noise levels, > 0; 1.345 keeps 95 % of the efficiency of least squares on normal noise (Huber 1964).
+
+    **Raises:**
+
+    - `ValueError` if `limit` is out of range or no number.
     """
 
     limit: Number = parameter("limit", "1", lower=0.0, strict=True, default=1.345)
@@ -93,6 +97,10 @@ class Cauchy(AbstractLoss):
     **Arguments:**
 
     - `limit`: in noise levels, > 0; 2.385 keeps 95 % of the efficiency of least squares on normal noise.
+
+    **Raises:**
+
+    - `ValueError` if `limit` is out of range or no number.
     """
 
     limit: Number = parameter("limit", "1", lower=0.0, strict=True, default=2.385)

@@ -53,6 +53,14 @@ def estimate_axis(record: Record) -> AxisEstimate:
 
     Positions are smoothed before they are differentiated.
 
+    **Arguments:**
+
+    - `record`: of one position [m or rad], with the input `u` [N or N m].
+
+    **Returns:**
+
+    An `AxisEstimate`.
+
     **Raises:**
 
     - `ValueError` naming the record, if the position or the force never changes, or if the force has the wrong sign:
@@ -131,7 +139,12 @@ _COMBINATIONS = {
 
 
 def axis_models() -> dict[str, AxisModel]:
-    """Models of an axis by name: combinations of simple laws, and each registered law with start values for a fit."""
+    """Models of an axis by name: combinations of simple laws, and each registered law with start values for a fit.
+
+    **Returns:**
+
+    The models by name.
+    """
     models = {name.lower(): _one_law(law) for name, law in laws().items()}
     return _COMBINATIONS | {name: model for name, model in models.items() if model is not None}
 

@@ -499,6 +499,10 @@ def prediction_error(
     - `result`: a fit that was not loaded from a file.
     - `variation`, `agreement`: see `predict`.
 
+    **Returns:**
+
+    A `PredictionError` by channel.
+
     **Raises:**
 
     - `ValueError` for a loaded result, or a variation or an agreement that `predict` refuses.

@@ -121,6 +121,23 @@ def fit(
 
     - `ValueError` for unknown names, a start beyond its limits, or inputs without an entry in the scene.
     - `RuntimeError` if the model is not finite at its start values.
+
+    **Example:**
+
+    ```python
+    t = jnp.linspace(0.0, 4.0, 201)
+    inputs = {"u": 6.0 * jnp.sin(3.0 * t)}
+    machine = jms.problems.braked_spring.driven_spring(jms.Viscous(1.5), m=2.0)
+    x = jms.identify.replay(machine, t, inputs, jnp.zeros(1), jnp.zeros(1))  # a synthetic record
+    record = jms.Record(t, x + 1e-5 * jax.random.normal(jax.random.key(0), x.shape), inputs)
+    start = jms.problems.braked_spring.driven_spring(jms.Viscous(1.0), m=2.5)
+    result = jms.fit(start, record, ("m", "friction.Fv"))
+    print({name: round(value, 3) for name, value in result.values.items()})
+    ```
+
+    ```text
+    {'m': 2.0, 'friction.Fv': 1.5}
+    ```
     """
     options = FitOptions(
         observe=observe,
@@ -194,6 +211,21 @@ def fit_law(
     **Raises:**
 
     - `ValueError` for unknown names or inputs, or a law that cannot run by itself.
+
+    **Example:**
+
+    ```python
+    t = jnp.linspace(0.0, 2.0, 401)
+    x = 1e-3 * jnp.sin(jnp.pi * t)
+    force = jms.identify.law_force(jms.Dahl(sigma0=2e4, Fc=3.0), t, x)  # a synthetic record
+    noisy = force + 1e-3 * jax.random.normal(jax.random.key(0), t.shape)
+    result = jms.fit_law(jms.Dahl(sigma0=1e4, Fc=2.0), jms.Record(t, noisy, {"x": x}))
+    print({name: f"{value:.4g}" for name, value in result.values.items()})
+    ```
+
+    ```text
+    {'sigma0': '2e+04', 'Fc': '3'}
+    ```
     """
     several = (record,) if isinstance(record, Record) else tuple(record)
     for each in several:

@@ -159,6 +159,10 @@ def log_density(result: FitResult) -> LogDensity:
 
     - `result`: a fit that was not loaded from a file.
 
+    **Returns:**
+
+    A `LogDensity`.
+
     **Raises:**
 
     - `ValueError` for a loaded result.

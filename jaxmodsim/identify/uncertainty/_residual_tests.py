@@ -151,6 +151,10 @@ def residual_tests(result: FitResult) -> ResidualTests:
     """Test whether the residuals of a fit are noise, and what they are correlated with.
 
     Positions and velocities are those of the model's output, as far as channels show them.
+
+    **Returns:**
+
+    A `ResidualTests`, which prints as a table.
     """
     provenance, tests = result.provenance, []
     for record, residuals, motion in zip(provenance.records, provenance.residuals, provenance.motions, strict=True):

@@ -48,6 +48,22 @@ class FitResult(AbstractReadable):
 
     - `estimate`: parameters with their covariance. `diagnostics`: of the fit. `provenance`: records and model.
     - `search`: the end of the search, which other functions start from; None in a result that was loaded.
+
+    **Example:**
+
+    ```python
+    t = jnp.linspace(0.0, 2.0, 401)
+    x = 1e-3 * jnp.sin(jnp.pi * t)
+    force = jms.identify.law_force(jms.Dahl(sigma0=2e4, Fc=3.0), t, x)  # a synthetic record
+    noisy = force + 0.1 * jax.random.normal(jax.random.key(0), t.shape)
+    result = jms.fit_law(jms.Dahl(sigma0=1e4, Fc=2.0), jms.Record(t, noisy, {"x": x}))
+    low, high = result.estimate.intervals()["Fc"]
+    print(f"Fc between {low:.3f} and {high:.3f} N, residual {result.rmse:.3f} N")
+    ```
+
+    ```text
+    Fc between 2.975 and 3.001 N, residual 0.102 N
+    ```
     """
 
     estimate: ParameterEstimate
@@ -213,6 +229,10 @@ def remarks(result: FitResult) -> tuple[str, ...]:
     """Limitations of a fit, in sentences: causes of wrong standard errors, undetermined parameters, and the reasons.
 
     Parameters and pairs that an issue of the motion or a weak combination explains are not listed again.
+
+    **Returns:**
+
+    The sentences.
     """
     estimate, diagnostics = result.estimate, result.diagnostics
     errors, bounds = estimate.errors, estimate.bounds
@@ -246,7 +266,12 @@ def remarks(result: FitResult) -> tuple[str, ...]:
 
 
 def is_step_size_limited(result: FitResult) -> bool:
-    """Whether more integration steps between samples would change the RMSE of a fit with one channel."""
+    """Whether more integration steps between samples would change the RMSE of a fit with one channel.
+
+    **Returns:**
+
+    A `bool`.
+    """
     errors, change = list(result.diagnostics.rmse.values()), result.diagnostics.step_error
     return change is not None and len(errors) == 1 and change > _STEP_SHOWS * errors[0]
 

@@ -35,6 +35,18 @@ class AppliedForce(AbstractEffect):
     **Raises:**
 
     - `ValueError` if `fn` or `at` is not a function, or (at the run) returns a wrong shape.
+
+    **Example:**
+
+    ```python
+    drive = jms.AppliedForce(lambda t, q, qd, p: p["F"] * jnp.ones(1), name="drive")
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * p["m"] * qd[0] ** 2, {"m": 2.0, "F": 4.0}, (drive,))
+    print(jms.simulate(scene, [0.0], [0.0], 1.0).qd.round(6), "m/s")
+    ```
+
+    ```text
+    [[2.]] m/s
+    ```
     """
 
     fn: Callable[..., Any] = eqx.field(converter=partial(as_function, name="AppliedForce fn"))

@@ -34,7 +34,43 @@ class Power(NamedTuple):
 
 
 class AbstractEffect(eqx.Module):
-    """A force on the mechanism, with or without a state of its own."""
+    """A force on the mechanism, with or without a state of its own.
+
+    A subclass has the field `name` and the methods below; its numbers are fields, too.
+
+    **Example:**
+
+    ```python
+    class Drag(jms.AbstractEffect):
+        c: float  # N s^2/m^2
+        name: str | None = None
+        default_name = "drag"
+        stiff = False
+
+        def check(self, q, qd, params, name):
+            pass
+
+        def initial_state(self, q, params):
+            return None
+
+        def act(self, t, q, qd, z, params):
+            force = self.c * jnp.abs(qd) * qd
+            return jms.scene.Action(-force, force)
+
+        def power(self, t, q, qd, params, action):
+            return jms.scene.Power(0.0 * t, jnp.sum(action.force * qd))
+
+        def stored_energy(self, z):
+            return 0.0
+
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, {}, (Drag(c=1.0),))
+    print(f"{jms.simulate(scene, [0.0], [1.0], 1.0).qd[-1, 0]:.4f} m/s")  # 1/(1 + c t)
+    ```
+
+    ```text
+    0.5000 m/s
+    ```
+    """
 
     # Name of the effect in the results; None for that of the class.
     if TYPE_CHECKING:

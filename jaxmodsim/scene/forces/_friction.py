@@ -109,6 +109,23 @@ class Friction(AbstractEffect):
 
     - `ValueError` for an unknown law, numbers out of range, and (at the run) for wrong shapes, or without `along` if
       there are several coordinates.
+
+    **Example:**
+
+    ```python
+    belt = jms.Friction(jms.Coulomb(Fc=5.0, Fs=8.0), belt_velocity=0.1)
+    spring = jms.problems.braked_spring.scene(m=1.0, k=100.0)
+    scene = jms.Scene(spring.lagrangian, spring.params, (belt,), coordinates=spring.coordinates)
+    print(jms.simulate(scene, [0.0], [0.1], 2.0, ts=jnp.linspace(0.0, 2.0, 301)).events)
+    ```
+
+    ```text
+    3 mode changes
+      t [s]    effect    before    after
+      0.8      friction  stick     backward
+      1.17851  friction  backward  stick
+      1.77851  friction  stick     backward
+    ```
     """
 
     law: AbstractLaw = eqx.field(converter=_law)
@@ -204,7 +221,12 @@ class Friction(AbstractEffect):
         return result_shape(self.along, q=q, params=params, name=f"along of Friction {name!r}")
 
     def check_belt(self, q: Any, params: PyTree, name: str) -> None:
-        """Refuse a belt velocity that is a nonzero number if slip is a vector."""
+        """Refuse a belt velocity that is a nonzero number if slip is a vector.
+
+        **Raises:**
+
+        - `ValueError` naming the element and the shape of its slip.
+        """
         assert self.along is not None
         slip = self._shape(q, params, name)
         if slip != ():
@@ -335,7 +357,12 @@ class Friction(AbstractEffect):
     def force_per_load(
         self, t: Scalar, q: PerDof, qd: PerDof, z: PyTree, params: PyTree
     ) -> tuple[Float[Array, "..."], PyTree]:
-        """The law's force, in newtons or per newton of load, and the rate of its state."""
+        """The law's force, in newtons or per newton of load, and the rate of its state.
+
+        **Raises:**
+
+        - `TypeError` for a set-valued law, whose force depends on a mode.
+        """
         v = self.stretch(self.slip(t, q, qd, params))
         if isinstance(self.law, AbstractDynamicLaw):
             return self.stretch(self.law.force(v, z)), self.law.zdot(v, z)

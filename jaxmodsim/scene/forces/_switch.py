@@ -21,11 +21,6 @@ def _force(value: object, *, name: str) -> Callable[..., Any] | None:
 class Switch(AbstractEffect):
     """A force that changes when a function of time and state passes through zero, or an event without a force.
 
-    ```python
-    spring = Switch(lambda t, q, qd, p: q[0], above=lambda t, q, qd, p: -p["k"] * q)  # acts where q[0] > 0
-    pulse = Switch(lambda t, q, qd, p: t - p["begin"], above=lambda t, q, qd, p: p["F"])
-    ```
-
     The guard is one event function of the run. Each passage through zero ends a step, is an entry of `run.events`, and
     contributes to derivatives (the saltation matrix), so that derivatives of switching times and thresholds hold, too.
     A `jnp.where` in an `AppliedForce` gives none of these. Both forces are evaluated at all times and must be finite on
@@ -42,6 +37,18 @@ class Switch(AbstractEffect):
     **Raises:**
 
     - `ValueError` if one of these is not a function, or (at the run) returns a wrong shape.
+
+    **Example:**
+
+    ```python
+    spring = jms.Switch(lambda t, q, qd, p: q[0], above=lambda t, q, qd, p: -p["k"] * q)  # acts where q[0] > 0
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, {"k": 4.0}, (spring,))
+    print(jms.simulate(scene, [-1.0], [1.0], 4.0).events.t.round(4), "s")
+    ```
+
+    ```text
+    [1.     2.5708] s
+    ```
     """
 
     guard: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Switch guard"))

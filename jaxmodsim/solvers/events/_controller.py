@@ -67,6 +67,21 @@ class EventController(AbstractControllerWrapper):
 
     - `ValueError` where the state is not from `EventSolver.start`, as under `diffrax.BacksolveAdjoint`.
     - `RuntimeError` at run time, by `equinox.error_if`, where t1 < t0.
+
+    **Example:**
+
+    ```python
+    ball = jms.problems.bouncing_ball.BouncingBall(e=0.5)
+    solver = jms.EventSolver(diffrax.Tsit5(), ball.guards, ball.reset)
+    control = jms.EventController(diffrax.PIDController(rtol=1e-8, atol=1e-8))
+    start, field = solver.start(0.0, ball.dropped(h=1.0), mode=0.0), diffrax.ODETerm(ball.field)
+    solution = diffrax.diffeqsolve(field, solver, 0.0, 0.8, None, start, stepsize_controller=control)
+    print(solution.ys.y.round(4))
+    ```
+
+    ```text
+    [[ 0.1761 -1.2038]]
+    ```
     """
 
     controller: dfx.AbstractStepSizeController

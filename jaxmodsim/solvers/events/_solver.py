@@ -74,27 +74,6 @@ class _Field(eqx.Module):
 class EventSolver(AbstractSolverWrapper):
     """Wrap a diffrax solver so that the solution passes through events: resets, changes of mode, counters.
 
-    Use it together with `EventController`:
-
-    ```python
-    def field(t, s, args):  # s.y is integrated, s.mode is constant between events
-        return s.rate(jnp.array([s.y[1], -9.81]))
-
-    def guards(t, s, args):
-        return s.y[:1]
-
-    def reset(t, s, args, fired):
-        return s._replace(y=jnp.array([0.0, -0.8 * s.y[1]]))
-
-    solver = EventSolver(diffrax.Tsit5(), guards, reset)
-    controller = EventController(diffrax.PIDController(rtol=1e-8, atol=1e-8))
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(field), solver, 0.0, 1.0, None, solver.start(0.0, jnp.array([1.0, 0.0])),
-        stepsize_controller=controller,
-    )
-    solution.ys.y, solution.ys.log.t
-    ```
-
     Saving, dense output, progress meters and adjoints of diffrax work as without events, except `BacksolveAdjoint`,
     whose adjoint equation has no resets. Time runs forward.
 
@@ -155,6 +134,29 @@ class EventSolver(AbstractSolverWrapper):
     - `max_events`: limit of the number of events, > 0.
     - `log`: number of entries of the `EventLog` in the state; later events are counted, not logged. By default
       `max_events`; 0 for no log.
+
+    **Example:**
+
+    ```python
+    def field(t, s, args):  # s.y is integrated, s.mode is constant between events
+        return s.rate(jnp.array([s.y[1], -9.81]))
+
+    def guards(t, s, args):
+        return s.y[:1]
+
+    def reset(t, s, args, fired):
+        return s._replace(y=jnp.array([0.0, -0.8 * s.y[1]]))
+
+    solver = jms.EventSolver(diffrax.Tsit5(), guards, reset)
+    control = jms.EventController(diffrax.PIDController(rtol=1e-8, atol=1e-8))
+    start, term = solver.start(0.0, jnp.array([1.0, 0.0])), diffrax.ODETerm(field)
+    solution = diffrax.diffeqsolve(term, solver, 0.0, 0.8, None, start, stepsize_controller=control)
+    print(solution.ys.y.round(4), solution.ys.log.t[0, :2].round(4))
+    ```
+
+    ```text
+    [[0.6392 0.125 ]] [0.4515    inf]
+    ```
 
     ??? cite "Reference"
 
