@@ -28,7 +28,7 @@ from .._core.safe import safe_norm
 from .forces._friction import Friction
 
 # Least weight of an element among redundant ones, relative to the largest.
-_LEAST_SHARE = 1e-4
+_LEAST_SHARE = 1e-2
 # Rounding units in the load of a sticking element, of its limits.
 _LOAD_ROUNDING = 100.0
 
@@ -335,8 +335,8 @@ def _multipliers(
 
     Where sticking elements are redundant (two on one coordinate), the equations do not determine the share of each.
     This takes the solution with the smallest sum of `f_i^2/limit_i`: elements in parallel then share in proportion to
-    their limits and reach them together, unless a limit is less than 1e-4 of the largest one: `solve_semidefinite` is
-    inaccurate for smaller weights.
+    their limits and reach them together, unless a limit is less than 1 % of the largest one: `solve_semidefinite` is
+    inaccurate for weights that small.
     """
     weight = 0.5 * (elements.upper + elements.lower)
     largest = jnp.max(weight)
