@@ -96,6 +96,10 @@ def servo_figure(prediction: ServoPrediction, *, measured: bool = True, caption:
     - `prediction`: from `jaxmodsim.identify.predict_servo`.
     - `measured`: whether the record has the measured angle.
     - `caption`: line below the figure, such as the source of the record.
+
+    **Returns:**
+
+    The figure.
     """
     record = prediction.record
     figure = Figure(figsize=(11, 5), layout="constrained")

@@ -181,6 +181,10 @@ def servo_record(
     - `kp`: gain of the firmware, to simulate the position loop; or `duty`: the measured duty from -1 to 1.
     - `q0`: angle at the first sample [rad]; by default that of q, or of q_goal.
 
+    **Returns:**
+
+    A `Record` whose inputs are those of `Servo`.
+
     **Raises:**
 
     - `ValueError` unless one of kp and duty is there, and as `Record`.

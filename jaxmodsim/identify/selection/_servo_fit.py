@@ -252,6 +252,10 @@ def predict_servo(fit: ServoFit, record: Record) -> ServoPrediction:
 
     - `fit`: from `fit_servo` or `ServoFit.load`.
     - `record`: from `servo_record`, with or without the measured angle.
+
+    **Returns:**
+
+    A `ServoPrediction`.
     """
     runs = runs_of((record,), cut((record,), None))
     run = jax.tree.map(lambda x: x[0], runs)
