@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -83,6 +85,12 @@ def timed(calls: Mapping[Any, Call], rounds: int, *, per: Mapping[Any, int] | in
             found |= {name: found[name] / count for name in ("median_s", "minimum_s")}
             found["quartiles_s"] = [x / count for x in found["quartiles_s"]]
     return report
+
+
+def command(*arguments: str) -> None:
+    """Run `jaxmodsim` with these arguments in a process of its own, compilation included."""
+    whole = [sys.executable, "-c", "from jaxmodsim.cli import main; main()", *arguments]
+    subprocess.run(whole, check=True, capture_output=True)
 
 
 def importable(result: Result, makers: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:

@@ -6,8 +6,6 @@ depend on the step.
 """
 
 import json
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -18,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxmodsim as jms
-from bench.record import Result
+from bench.record import Result, command
 from jaxmodsim.identify import axis_models, axis_scene, estimate_axis, replay
 
 # Outside the repository: A. Janot, M. Gautier, M. Brunot, "Data set and reference models of EMPS",
@@ -40,9 +38,8 @@ def main(smoke: bool, out: Path) -> Result | None:
         record = jms.Record(t, q, {"u": EMPS_GAIN * u}, name="EMPS")
         result.settings["samples"] = len(t)
         how = ("--laws", "coulomb" if smoke else "all", "--free", "+q0,+qd0")
-        command = [sys.executable, "-c", "from jaxmodsim.cli import main; main()", "fit", str(path), *how]
         started = time.perf_counter()
-        subprocess.run([*command, "--units", f"force={EMPS_GAIN}", "--out", folder], check=True, capture_output=True)
+        command("fit", str(path), *how, "--units", f"force={EMPS_GAIN}", "--out", folder)
         result.settings["seconds"] = round(time.perf_counter() - started)
         report = json.loads((Path(folder) / "fit.json").read_text())
     if smoke:

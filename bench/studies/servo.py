@@ -5,15 +5,13 @@ each gain, one command fits the others, and `jaxmodsim predict` predicts the rec
 """
 
 import json
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.record import Result
+from bench.record import Result, command
 
 # Outside the repository: M. Duclusaud, G. Passault, V. Padois, O. Ly, arXiv 2410.08650; github.com/Rhoban/bam.
 XL330 = Path(__file__).parents[3] / "shared" / "data" / "xl330"
@@ -91,7 +89,7 @@ def _predict_left_out(result: Result, paths: Sequence[Path], group: str, folder:
     if not out or len(out) == len(paths):
         return
     _fit([path for path in paths if path not in out], folder, law)
-    _command("predict", str(folder / "fit.json"), *map(str, out), "--out", str(folder))
+    command("predict", str(folder / "fit.json"), *map(str, out), "--out", str(folder))
     for path in out:
         row = json.loads((folder / f"{path.stem}.json").read_text())
         case = {"case": path.stem, "at": "gain" if group.startswith("kp") else "trajectory"}
@@ -101,10 +99,5 @@ def _predict_left_out(result: Result, paths: Sequence[Path], group: str, folder:
 
 
 def _fit(paths: Sequence[Path], folder: Path, laws: str, *options: str) -> dict[str, Any]:
-    _command("fit", *map(str, paths), "--axis", "servo", "--laws", laws, "--out", str(folder), *options)
+    command("fit", *map(str, paths), "--axis", "servo", "--laws", laws, "--out", str(folder), *options)
     return json.loads((folder / "fit.json").read_text())
-
-
-def _command(*arguments: str) -> None:
-    command = [sys.executable, "-c", "from jaxmodsim.cli import main; main()", *arguments]
-    subprocess.run(command, check=True, capture_output=True)

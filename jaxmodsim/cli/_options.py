@@ -47,6 +47,20 @@ SpecFile = Annotated[Path, typer.Argument(help="TOML file of the tables describe
 _COLUMNS, _MODEL, _VALIDATION, _SEARCH, _NEXT = "Columns", "Model", "Validation", "Search", "The next record"
 _SERVO = "Servo"
 
+# Options of `fit` and `predict` for a servo.
+_Goal = Annotated[str, _option(_SERVO, r"Column of the commanded angle \[rad].")]
+_Supply = Annotated[str, _option(_SERVO, r"Column of the supply \[V].")]
+_Enable = Annotated[str, _option(_SERVO, "Column that is 0 while the motor is off; without it always on.")]
+_Gain = Annotated[
+    str | None,
+    _option(
+        _SERVO,
+        "Gain of the position loop: a number, or a column. The default is the column kp, or the number after kp in"
+        " the name of the file.",
+        "NUMBER|COLUMN",
+    ),
+]
+
 
 @dataclass(frozen=True, kw_only=True)
 class FitRequest:
@@ -177,20 +191,10 @@ class FitRequest:
             "driven|servo",
         ),
     ] = "driven"
-    goal: Annotated[str, _option(_SERVO, r"Column of the commanded angle \[rad].")] = "q_goal"
-    supply: Annotated[str, _option(_SERVO, r"Column of the supply \[V].")] = "volts"
-    enable: Annotated[str, _option(_SERVO, "Column that is 0 while the motor is off; without it always on.")] = (
-        "torque_enable"
-    )
-    gain: Annotated[
-        str | None,
-        _option(
-            _SERVO,
-            "Gain of the position loop: a number, or a column. The default is the column kp, or the number after kp in"
-            " the name of the file.",
-            "NUMBER|COLUMN",
-        ),
-    ] = None
+    goal: _Goal = "q_goal"
+    supply: _Supply = "volts"
+    enable: _Enable = "torque_enable"
+    gain: _Gain = None
     duty: Annotated[
         str | None,
         _option(
@@ -226,24 +230,14 @@ class PredictRequest:
     position: Annotated[
         str, _option(_COLUMNS, "Column of the measured angle, if any: its first sample is the start.")
     ] = "q"
-    goal: Annotated[str, _option(_COLUMNS, r"Column of the commanded angle \[rad].")] = "q_goal"
-    supply: Annotated[str, _option(_COLUMNS, r"Column of the supply \[V].")] = "volts"
-    enable: Annotated[str, _option(_COLUMNS, "Column that is 0 while the motor is off; without it always on.")] = (
-        "torque_enable"
-    )
-    gain: Annotated[
-        str | None,
-        _option(
-            None,
-            "Gain of the position loop: a number, or a column. The default is the column kp, or the number after kp in"
-            " the name of the file.",
-            "NUMBER|COLUMN",
-        ),
-    ] = None
+    goal: _Goal = "q_goal"
+    supply: _Supply = "volts"
+    enable: _Enable = "torque_enable"
+    gain: _Gain = None
     duty: Annotated[
         str | None,
         _option(
-            _COLUMNS,
+            _SERVO,
             "Simulate from the measured duty in this column, from -885 to 885, if the fit did.",
             "COLUMN",
         ),

@@ -87,9 +87,8 @@ def run_servo_prediction(request: PredictRequest) -> None:
         files[f"{record.name}.csv"] = pd.DataFrame(table)
         files[f"{record.name}.json"] = prediction_summary(fit, prediction, measured)
         files[f"{record.name}.png"] = servo_figure(prediction, measured=measured)
-        half = 1e3 * float(np.mean(0.5 * (prediction.upper - prediction.lower)))
         errors = (1e3 * prediction.error, 100 * prediction.inside) if measured else (math.nan, math.nan)
-        rows.append((record.name, len(record.t), half, *errors))
+        rows.append((record.name, len(record.t), 1e3 * prediction.half_band, *errors))
     columns = "record", "samples", "half band [mrad]", "mean absolute error [mrad]", "in the band [%]"
     show_table(frame_of(rows, *columns), f"{fit.law}, band for {100 * fit.band['level']:g} % of the samples")
     show_paths(write(request.out, files))
@@ -100,7 +99,7 @@ def prediction_summary(fit: ServoFit, prediction: ServoPrediction, measured: boo
     record = prediction.record
     summary: dict[str, object] = {
         "record": record.name, "law": fit.law, "samples": len(record.t), "q0": float(record.inputs["start.q"][0]),
-        "level": prediction.level, "half_band": float(np.mean(0.5 * (prediction.upper - prediction.lower))),
+        "level": prediction.level, "half_band": prediction.half_band,
     }  # fmt: skip
     if "kp" in record.inputs:
         summary["gain"] = float(record.inputs["kp"][0])

@@ -271,7 +271,7 @@ def _field(functions: RunFunctions, method: dfx.AbstractSolver, exact: bool) -> 
     field = functions.derivative if exact else functions.plain_derivative
     if not isinstance(method, dfx.AbstractERK):
         return field
-    return jax.checkpoint(lambda *at: field(*at), prevent_cse=False)
+    return jax.checkpoint(lambda *at: field(*at), prevent_cse=False)  # a method of a module with arrays has no hash
 
 
 def _integrate(request: RunRequest) -> RunOutput:

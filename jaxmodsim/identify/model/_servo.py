@@ -18,8 +18,6 @@ from ._engines import ModelOutput, with_values
 DUTY_PER_RADIAN = 4096 / (2 * np.pi) / 256 / 885
 # Percentile and length [s] of the moving window that show the supply while the bridge conducts.
 _CONDUCTING, _SPAN = 10, 0.2
-# Columns that drive a servo; `kp` or `duty` closes the loop.
-SERVO_INPUTS = ("q_goal", "volts", "torque_enable")
 # Names of the start in the inputs of a record: constant columns.
 _START = ("start.q", "start.qd")
 
@@ -33,16 +31,7 @@ SERVO_LAWS: dict[str, tuple[str, ...]] = {
     "M6": ("Kc", "Kv", "Kcs", "vs", "alpha", "Km", "Kms", "Ke", "Kes", "Kmq", "Keq"),
     "MQ": ("Kc", "Kv", "Kcs", "vs", "Km", "Ke", "Kq"),
 }
-SERVO_LAW_TEXT = {
-    "M1": "Coulomb and viscous friction",
-    "M2": "M1 and Stribeck friction",
-    "M3": "M1 and friction per torque",
-    "M4": "M2 and friction per torque, also in its Stribeck part",
-    "M5": "M4 with different coefficients of motor and load",
-    "M6": "M5 and a Stribeck part per squared torque",
-    "MQ": "M2 with different coefficients of motor and load, and friction per squared motor torque at all speeds",
-}
-# Start values, and limits where they are narrower than those of the law.
+# Start values.
 _GEAR_START = {
     "Kc": 0.01, "Kv": 0.008, "Kcs": 0.01, "vs": 0.5, "alpha": 1.0, "Km": 0.3, "Kms": 0.05, "Ke": 0.05, "Kes": 0.05,
     "Kmq": 0.5, "Keq": 0.5,
@@ -86,9 +75,8 @@ class Servo(eqx.Module):
     def start(cls, law: str, inertia: float, gravity: float) -> "Servo":
         """Start values of a fit with one of `SERVO_LAWS`."""
         names = SERVO_LAWS[law]
-        gear = ServoGear(0.0, 0.0, **{"Kc": 0.0, "Kv": 0.0} | {k: _GEAR_START[k] for k in names if k in _GEAR_START})
-        if "vs" in names and "alpha" not in names:
-            gear = ServoGear(0.0, 0.0, **{k: _GEAR_START[k] for k in (*[n for n in names if n != "Kq"], "alpha")})
+        own = {name for name in names if name != "Kq"} | ({"alpha"} if "vs" in names else set())
+        gear = ServoGear(0.0, 0.0, **{name: _GEAR_START[name] for name in own})
         return cls(gear, inertia, gravity, Kq=0.2 if "Kq" in names else 0.0)
 
     @staticmethod

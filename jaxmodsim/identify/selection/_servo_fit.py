@@ -137,20 +137,24 @@ class ServoFit:
 class ServoPrediction:
     """Angle of a servo with a band for the share `level` of its samples, shape `[samples]` each [rad].
 
-    - `record`: the record. `q`, `lower`, `upper`: prediction and band. `spread`: of the fits without one group.
+    - `record`: the record. `q`, `lower`, `upper`: prediction and band.
     """
 
     record: Record
     q: Float[np.ndarray, " samples"]
     lower: Float[np.ndarray, " samples"]
     upper: Float[np.ndarray, " samples"]
-    spread: Float[np.ndarray, " samples"]
     level: float
 
     @property
     def error(self) -> float:
         """Mean absolute error [rad] where the record has the measured angle."""
         return float(np.mean(np.abs(self.q - self.record.measured)))
+
+    @property
+    def half_band(self) -> float:
+        """Mean half width of the band [rad]."""
+        return float(np.mean(0.5 * (self.upper - self.lower)))
 
     @property
     def inside(self) -> float:
@@ -203,9 +207,10 @@ def fit_servo(
         raise ValueError("fit_servo needs two records at least, since it leaves out one after the other.")
     start = Servo.start(law, inertia, gravity)
     whole = _problem(start, law, records, prior or {})
-    windows = [window for record in records for window in servo_windows(record, _WINDOW)]
-    owner = np.repeat(np.arange(len(records)), [len(servo_windows(record, _WINDOW)) for record in records])
-    first = _problem(start, law, tuple(windows), prior or {})
+    parts = [servo_windows(record, _WINDOW) for record in records]
+    owner = np.repeat(np.arange(len(records)), [len(own) for own in parts])
+    first = _problem(start, law, tuple(window for own in parts for window in own), prior or {})
+    measured, counts = np.asarray(whole.runs.measured[SINGLE]), np.asarray(whole.runs.weight[SINGLE]) > 0
     evaluations: dict[str, int] = {}
 
     def search(name: str, keep: np.ndarray) -> SearchResult:
@@ -218,31 +223,30 @@ def fit_servo(
         evaluations[name] = one.iterations + two.iterations
         return two
 
+    def error(angles: np.ndarray, i: int | np.integer) -> float:
+        return float(np.mean(np.abs(angles[i] - measured[i])[counts[i]]))
+
     everything = search("all records", np.ones(len(records), bool))
-    members, residuals, left_out = {}, [], {}
+    members, without, left_out = {}, [], {}
     for name, group in groups.items():
         out = np.isin(names, group)
         if out.all():
             continue
         x = search(f"without {name}", ~out).state.x
         members[name] = {k: float(v) for k, v in whole.at(x).values.items()}
-        errors = _angles(whole, x) - np.asarray(whole.runs.measured[SINGLE])
-        residuals.append((out, errors))
-        counts = np.asarray(whole.runs.weight[SINGLE]) > 0
-        left_out[name] = {names[i]: float(np.mean(np.abs(errors[i][counts[i]]))) for i in np.flatnonzero(out)}
+        angles = _angles(whole, x)
+        without.append((np.flatnonzero(out), angles))
+        left_out[name] = {names[i]: error(angles, i) for i in np.flatnonzero(out)}
     x = everything.state.x
-    model = replace_numbers(start, dict(whole.at(x).values))
+    model, centre = replace_numbers(start, dict(whole.at(x).values)), _angles(whole, x)
     units = {name: axis_unit(allowed.unit, True) for name, allowed in scene_ranges(start).items()}
-    result = result_of(everything, records, cut(records, None), units, model)
-    counts = np.asarray(whole.runs.weight[SINGLE]) > 0
-    errors = np.abs(_angles(whole, x) - np.asarray(whole.runs.measured[SINGLE]))
-    fit = ServoFit(
+    return ServoFit(
         law=law, model=model, members=members, left_out=left_out,
-        fitted={names[i]: float(np.mean(errors[i][counts[i]])) for i in range(len(records))},
-        band={}, evaluations=evaluations, prior=_priors(start, law, prior or {}),
-        from_duty="duty" in records[0].inputs, result=result,
+        fitted={names[i]: error(centre, i) for i in range(len(records))},
+        band=_calibrated(centre, without, measured, counts, level),
+        evaluations=evaluations, prior=_priors(start, law, prior or {}), from_duty="duty" in records[0].inputs,
+        result=result_of(everything, records, cut(records, None), units, model),
     )  # fmt: skip
-    return replace(fit, band=_calibrated(fit, whole, residuals, counts, level))
 
 
 def predict_servo(fit: ServoFit, record: Record) -> ServoPrediction:
@@ -260,17 +264,14 @@ def predict_servo(fit: ServoFit, record: Record) -> ServoPrediction:
     runs = runs_of((record,), cut((record,), None))
     run = jax.tree.map(lambda x: x[0], runs)
     engine = jax.jit(lambda values: ServoEngine(fit.model)(values, None, run).channels[SINGLE])
-    free = next(iter(fit.members.values()), {})
     numbers = scene_numbers(fit.model)
-    own = {name: numbers[name] for name in free}
-    q = np.asarray(engine(own))
+    q = np.asarray(engine({name: numbers[name] for name in Servo.free(fit.law)}))
     members = [
         np.asarray(engine({k: on_device(np.asarray(v, float)) for k, v in member.items()}))
         for member in fit.members.values()
     ]
-    spread = _spread(q, np.stack(members))
-    half = _half(fit.band, spread, q)
-    return ServoPrediction(record=record, q=q, lower=q - half, upper=q + half, spread=spread, level=fit.band["level"])
+    half = _half(fit.band, _spread(q, np.stack(members)), q)
+    return ServoPrediction(record=record, q=q, lower=q - half, upper=q + half, level=fit.band["level"])
 
 
 def _spread(q: np.ndarray, members: np.ndarray) -> np.ndarray:
@@ -285,29 +286,30 @@ def _half(band: Mapping[str, float], spread: np.ndarray, q: np.ndarray) -> np.nd
 
 
 def _calibrated(
-    fit: ServoFit, problem: FitProblem, residuals: list[tuple[np.ndarray, np.ndarray]], counts: np.ndarray, level: float
+    centre: np.ndarray,
+    without: list[tuple[np.ndarray, np.ndarray]],
+    measured: np.ndarray,
+    counts: np.ndarray,
+    level: float,
 ) -> dict[str, float]:
     """The narrowest band that holds the share `level` of the samples of records that were left out.
 
-    Each record weighs alike.
+    Each record weighs alike. `centre`: angles of the fit to all records. `without`: for each group the records that
+    were left out, and the angles of the fit without them.
     """
-    free = problem.free
-    members = [_angles(problem, free.coordinates(own)) for own in fit.members.values()]
-    numbers = {name: float(scene_numbers(fit.model)[name]) for name in free.names}
-    centre = _angles(problem, free.coordinates(numbers))
-    spread = _spread(centre, np.stack(members))
+    spread = _spread(centre, np.stack([angles for _, angles in without]))
+    errors = [(i, np.abs(angles[i] - measured[i])[counts[i]]) for out, angles in without for i in out]
     best: dict[str, float] = {}
     for share in _SHARES:
         unit = _half({"factor": 1.0, "least": _LEAST, "share": share}, spread, centre)
-        ratios = [np.abs(errors[i] / unit[i])[counts[i]] for out, errors in residuals for i in np.flatnonzero(out)]
+        units = [unit[i][counts[i]] for i, _ in errors]
+        ratios = [error / own for (_, error), own in zip(errors, units, strict=True)]
         weights = np.concatenate([np.full(x.size, 1.0 / x.size) for x in ratios])
         every = np.concatenate(ratios)
         order = np.argsort(every)
         reached = np.cumsum(weights[order]) / np.sum(weights)
         factor = float(every[order][min(np.searchsorted(reached, level), every.size - 1)])
-        width = float(
-            np.mean([np.mean(factor * unit[i][counts[i]]) for out, _ in residuals for i in np.flatnonzero(out)])
-        )
+        width = float(np.mean([np.mean(factor * own) for own in units]))
         if not best or width < best["mean"]:
             best = {"level": level, "factor": factor, "least": _LEAST, "share": share, "mean": width}
     return best
