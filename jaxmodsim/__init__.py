@@ -6,7 +6,7 @@ Mechanics: point_mass, rigid_body; Chart, Cylindrical, Spherical.
 Friction laws: Viscous, Curve, Coulomb, Stribeck, Dahl, LuGre, ElastoPlastic, MaxwellSlip, Armstrong; in the wrappers
     Regularized, DeadZone, Sign, Bristle; with asymmetric, scaled_by; of gears Geared, ServoGear.
 About laws: check_passivity, damping_sigma1, regularized_width, max_stable_step; to_mujoco, to_modelica.
-Scenes elsewhere: to_c, to_javascript.
+Scenes elsewhere: to_c.
 Runs: simulate, simulate_to_accuracy; they give a Trajectory, or raise a SimulationError.
 Solvers: Rodas5P, Gauss, ImplicitFriction; EventSolver and EventController; StoredSteps, an adjoint.
 Analysis: energy_audit (EnergyAudit), sensitivity (Sensitivity), check_gradients (GradientCheck), cyclic_coordinates;
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from .analysis import sensitivity as sensitivity
     from .analysis import work_precision as work_precision
     from .export import to_c as to_c
-    from .export import to_javascript as to_javascript
     from .export import to_modelica as to_modelica
     from .export import to_mujoco as to_mujoco
     from .friction import Armstrong as Armstrong
@@ -128,7 +127,7 @@ _LATER = {
         "sensitivity",
         "work_precision",
     ),
-    "export": ("to_c", "to_javascript", "to_modelica", "to_mujoco"),
+    "export": ("to_c", "to_modelica", "to_mujoco"),
     "friction": (
         "Armstrong",
         "Bristle",

@@ -2,8 +2,8 @@
 
 Such interfaces may change with any release. Each group is probed when this module is imported; `AVAILABLE` names the
 available groups. Code that needs a missing group uses public interfaces instead, and one warning lists the losses. Only
-`to_c` and `to_javascript` have no alternative: they raise an error with the versions to install. The environment
-variable `JAXMODSIM_PROBES_OFF` disables groups: `kernels,programs`, or `all`.
+`to_c` has no alternative: it raises an error with the versions to install. The environment variable
+`JAXMODSIM_PROBES_OFF` disables groups: `kernels,programs`, or `all`.
 """
 
 import logging
@@ -52,7 +52,7 @@ def _need(owner: object, names: str) -> None:
 with _probe(
     "jaxprs",
     "runs and derivatives take several times as long, and JAX keeps no compiled run in its persistent cache; indices"
-    " out of range and step functions in functions of a scene are not reported; to_c and to_javascript raise an error",
+    " out of range and step functions in functions of a scene are not reported; to_c raises an error",
 ):
     from jax.extend.core import ClosedJaxpr as ClosedJaxpr
     from jax.extend.core import Jaxpr as Jaxpr

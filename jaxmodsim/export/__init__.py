@@ -3,4 +3,3 @@
 from ._laws import to_modelica as to_modelica
 from ._laws import to_mujoco as to_mujoco
 from ._scene_code import to_c as to_c
-from ._scene_code import to_javascript as to_javascript

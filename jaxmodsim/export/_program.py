@@ -87,8 +87,8 @@ def program_of(closed: ClosedJaxpr, arguments: Sequence[Symbol]) -> Program:
     """
     if "jaxprs" not in AVAILABLE:
         raise RuntimeError(
-            "to_c and to_javascript read traced functions by jax.extend.core, which is different in"
-            f" jax {jax.__version__}. Install jax>=0.10,<0.11."
+            f"to_c reads traced functions by jax.extend.core, which is different in jax {jax.__version__}."
+            " Install jax>=0.10,<0.11."
         )
     writer = _StatementWriter()
     inputs: list[Value] = [_scalar_array(x) for x in arguments]

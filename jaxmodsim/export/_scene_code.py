@@ -1,6 +1,5 @@
-"""A scene as C99, for a drive or controller, and as JavaScript, for a web page."""
+"""A scene as C99, for a drive, a controller or a web page."""
 
-import json
 import re
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,7 +13,7 @@ from .._core.arguments import as_whole
 from .._core.arrays import PerDof, Scalar
 from .._core.scalarise import trace_in_arrays
 from ..scene import Scene, State, check_scene, check_step, elements, scene_step, signals_of, vector_field
-from ._languages import JAVASCRIPT, C, Language, write_program
+from ._c_code import literal, type_of, write_program
 from ._program import Symbol, program_of
 
 _C_TEXT = """\
@@ -45,25 +44,6 @@ const {real} {name}_rest[{name}_Y] = {{{rest}}};
   }}
   return 1;
 }}
-"""
-_JAVASCRIPT_TEXT = """\
-// {name}: a scene of jaxmodsim as JavaScript. Generated; change the scene, not this file. Units are SI.
-const {name} = (() => {{
-  const names = {names};
-  const numbers = [{numbers}];
-  const states = {states};
-  const rest = [{rest}];
-
-{routines}
-  // Steps of the length h from the time t, one after another; false if one was not solved.
-  function run(t, h, steps, p, y) {{
-    for (let i = 0; i < steps; ++i) {{
-      if (!step(t + i * h, t + (i + 1) * h, p, y)) return false;
-    }}
-    return true;
-  }}
-  return {{ names, numbers, states, rest, run, {exported} }};
-}})();
 """
 
 
@@ -143,78 +123,37 @@ def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
     int box_step(double t0, double t1, const double p[box_P], double y[box_Y]);
     ```
     """
-    return _scene_code(scene, dof, name, C, "to_c")
-
-
-def to_javascript(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
-    """JavaScript code of a scene in float64: an object with the functions of `to_c`.
-
-    `NAME.step(t0, t1, p, y)` and the others take arrays of numbers. `NAME.names` and `NAME.numbers` are the names and
-    values of p, `NAME.states` the names of y, and `NAME.rest` its values at rest.
-
-    **Arguments:**
-
-    As for `to_c`.
-
-    **Returns:**
-
-    The text of one script, which declares the constant `name`.
-
-    **Raises:**
-
-    - `ValueError` as `to_c`, and for a scene in float32, which JavaScript does not support.
-
-    **Example:**
-
-    ```python
-    scene = jms.problems.ramped_box.scene(jms.problems.ramped_box.lugre())
-    code = jms.to_javascript(scene, name="box")
-    print(next(line for line in code.splitlines() if "states" in line).strip())
-    ```
-
-    ```text
-    const states = ["q[0]", "qd[0]", "friction.z"];
-    ```
-    """
-    return _scene_code(scene, dof, name, JAVASCRIPT, "to_javascript")
-
-
-def _scene_code(scene: Scene, dof: int, name: str, language: Language, caller: str) -> str:
     if not isinstance(scene, Scene):
-        raise ValueError(f"{caller} needs a Scene, but {scene!r} was given.")
+        raise ValueError(f"to_c needs a Scene, but {scene!r} was given.")
     if not (isinstance(name, str) and name.isidentifier() and name.isascii()):
-        raise ValueError(f"{caller}: name must be an identifier such as 'press', but {name!r} was given.")
+        raise ValueError(f"to_c: name must be an identifier such as 'press', but {name!r} was given.")
     dof = as_whole(dof, name="dof")
     if scene.constraints:
         raise ValueError(
-            f"{caller} does not support constraints, but the scene has {', '.join(map(repr, scene.constraint_names))}:"
+            f"to_c does not support constraints, but the scene has {', '.join(map(repr, scene.constraint_names))}:"
             " use independent coordinates."
         )
     if signals_of(scene.params):
         raise ValueError(
-            f"{caller} does not support a Signal: replace it by a number, which the caller sets before every step."
+            "to_c does not support a Signal: replace it by a number, which the caller sets before every step."
         )
     check_step(scene)
     start = jnp.zeros(dof, jnp.result_type(*(jtu.tree_leaves(scene) or [float])))
     y = State(start, start, scene.initial_state(start))
     check_scene(scene, y)
-    routines = _routines(scene, y)
-    text = {each.name: _routine_text(each, scene, y, language, name, caller) for each in routines}
-    fields = {"name": name, "routines": "\n".join(text.values())}
-    for field, tree in (("numbers", scene), ("rest", y)):
-        fields[field] = ", ".join(language.literal(x) for leaf in jtu.tree_leaves(tree) for x in np.ravel(leaf))
-    if language is JAVASCRIPT:
-        names = {"names": json.dumps([*elements(scene)]), "states": json.dumps(_state_names(y))}
-        return _JAVASCRIPT_TEXT.format(**fields, **names, exported=", ".join(text))
     places = {f"{name}_p_{re.sub('[^0-9A-Za-z]+', '_', each).strip('_')}": each for each in elements(scene)}
     if len(places) < len(elements(scene)):
-        raise ValueError(
-            f"{caller}: several numbers of the scene have the same name in C: {', '.join(elements(scene))}."
-        )
-    real = language.type_of(start.dtype)
+        raise ValueError(f"to_c: several numbers of the scene have the same name in C: {', '.join(elements(scene))}.")
+    routines, real = _routines(scene, y), type_of(start.dtype)
     run = f"int {name}_run({real} t, {real} h, long steps, const {real} p[{name}_P], {real} y[{name}_Y])"
+    numbers, rest = (
+        ", ".join(literal(x) for leaf in jtu.tree_leaves(tree) for x in np.ravel(leaf)) for tree in (scene, y)
+    )
     return _C_TEXT.format(
-        **fields,
+        name=name,
+        routines="\n".join(_routine_text(each, scene, y, name) for each in routines),
+        numbers=numbers,
+        rest=rest,
         places="\n".join(f"  {place}, /* {each} */" for place, each in places.items()),
         states=", ".join(_state_names(y)),
         size=len(_state_names(y)),
@@ -269,8 +208,7 @@ def _friction_feed_forward(scene: Scene, y: State, t0: Scalar, t1: Scalar) -> tu
     return total, after
 
 
-def _routine_text(routine: _Routine, scene: Scene, y: State, language: Language, name: str, caller: str) -> str:
-    """The function in C or JavaScript."""
+def _routine_text(routine: _Routine, scene: Scene, y: State, name: str) -> str:
     numbers, states = [], []
     for like, symbols, array in ((scene, numbers, "p"), (y, states, "y")):
         kinds = [leaf.dtype for leaf in jtu.tree_leaves(like) for _ in range(np.size(leaf))]
@@ -282,22 +220,16 @@ def _routine_text(routine: _Routine, scene: Scene, y: State, language: Language,
 
     like = [[jnp.zeros((), x.dtype) for x in symbols] for symbols in (times, numbers, states)]
     closed, _ = trace_in_arrays(flat, *like)
-    javascript = language is JAVASCRIPT
     try:
-        program = program_of(closed, [*times, *numbers, *states])
-        lines = write_program(program, routine.results, language, "    " if javascript else "  ")
+        lines = write_program(program_of(closed, [*times, *numbers, *states]), routine.results)
     except ValueError as error:
         raise ValueError(
-            f"{caller} does not support {error}, which `{routine.name}` of the scene needs. It supports arithmetic,"
+            f"to_c does not support {error}, which `{routine.name}` of the scene needs. It supports arithmetic,"
             " elementary functions and choices (jnp.where) of scalars and small arrays: express the Lagrangian, force"
             " or law by these."
         ) from error
-    if javascript:
-        arguments = ", ".join([*routine.times, "p", "y", *([routine.extra[0]] if routine.extra else [])])
-        head = [f"  // {routine.purpose}", f"  function {routine.name}({arguments}) {{"]
-        return "\n".join([*head, *lines, "  }\n"])
     unused = [x for x in (*routine.times, "p", "y") if not re.search(rf"\b{x}\b", "\n".join(lines))]
-    head = [f"/* {routine.purpose} */", _c_signature(routine, name, language.type_of(y.q.dtype)) + " {"]
+    head = [f"/* {routine.purpose} */", _c_signature(routine, name, type_of(y.q.dtype)) + " {"]
     return "\n".join([*head, *(f"  (void){x};" for x in unused), *lines, "}\n"])
 
 

@@ -1,7 +1,6 @@
-"""Scenes as C99 and JavaScript: compiled, run, and compared with JAX."""
+"""Scenes as C99: compiled, run, and compared with JAX."""
 
 import functools
-import json
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -15,16 +14,14 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim import to_c, to_javascript
+from jaxmodsim import to_c
 from jaxmodsim._core.compat import AVAILABLE
 from jaxmodsim.problems import belt_oscillator, ramped_box
 from jaxmodsim.scene import State, vector_field
 
 pytestmark = pytest.mark.skipif("jaxprs" not in AVAILABLE, reason="needs the programs that JAX traces")
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-NODE = shutil.which("node")
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="needs a C compiler: cc, gcc or clang")
-needs_node = pytest.mark.skipif(NODE is None, reason="needs node, which runs JavaScript")
 FLAGS = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Wmissing-prototypes", "-O1"]
 CHECKED = ["-fsanitize=undefined,address", "-fno-sanitize-recover=all"]
 
@@ -287,26 +284,6 @@ def test_a_scene_of_float32_is_written_in_float(tmp_path: Path) -> None:
     np.testing.assert_allclose(after[0, :2], [run.q[-1, 0], run.qd[-1, 0]], rtol=1e-3)
 
 
-@needs_node
-@pytest.mark.parametrize("name", ["coulomb belt", "arm with two laws"])
-def test_a_run_in_javascript_is_that_of_simulate(name: str) -> None:
-    scene, dof = scene_of(name)
-    y0, h, t1 = random_states(scene, dof, 2)[1] * 0.1, 1e-3, 3.0
-    start = state_of(scene, y0, dof)
-    run = jms.simulate(scene, start.q, start.qd, t1, z0=start.z, dt=h, solver=jms.ImplicitFriction())
-    script = to_javascript(scene, dof, name="it")
-    script += f"const y = {json.dumps(y0.tolist())}; const ok = it.run(0, {h}, {round(t1 / h)}, it.numbers, y);"
-    script += "console.log(JSON.stringify([ok, y, it.names, it.states]));"
-    assert NODE is not None
-    done = subprocess.run([NODE, "-"], input=script, capture_output=True, text=True, check=True)
-    solved, after, names, states = json.loads(done.stdout)
-    assert solved
-    expected = flat((run.q[-1], run.qd[-1], {key: z[-1] for key, z in (run.z or {}).items()}))
-    np.testing.assert_allclose(after, expected, rtol=1e-9, atol=1e-12)
-    assert len(names) == flat(scene).size
-    assert states[0] == "q[0]"
-
-
 def test_the_state_at_rest_is_that_of_the_laws() -> None:
     """Armstrong's law has rested long: its stiction is whole."""
     law = jms.Armstrong(1e4, 1.0, 1.5, 0.01, 0.2, 0.1, 1.0)
@@ -352,9 +329,8 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_cannot_be_written_is_refused_by_name(case: str) -> None:
     make, text = REFUSED[case]
-    for export in (to_c, to_javascript):
-        with pytest.raises(ValueError, match=text):
-            export(make())
+    with pytest.raises(ValueError, match=text):
+        to_c(make())
 
 
 def test_wrong_arguments_are_refused() -> None:
@@ -367,7 +343,3 @@ def test_wrong_arguments_are_refused() -> None:
         to_c(with_force(lambda t, q, qd, p: q[:1]), 2)
     with pytest.raises(ValueError, match="have the same name in C"):
         to_c(jms.Scene(one_mass, params={"m": 1.0, "a.b": 1.0, "a_b": 1.0}))
-    with pytest.raises(ValueError, match="JavaScript has no float32"):
-        to_javascript(jtu.tree_map(lambda x: jnp.asarray(x, jnp.float32), box))
-    with pytest.raises(ValueError, match="to_javascript does not support erf of float64"):
-        to_javascript(with_force(lambda t, q, qd, p: jax.lax.erf(q)))
