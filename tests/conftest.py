@@ -15,7 +15,7 @@ import jaxtyping
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
-from .helpers import fuzz
+from .helpers import deep, fuzz
 
 # Nearly all of the time goes into tracing and compiling, hardly any into running. Code that LLVM has not optimized, and
 # XLA's older way to emit fused loops, straight as LLVM code and in one piece, are compiled soonest. XLA ends the
@@ -104,6 +104,23 @@ class ByModule(LoadScopeScheduling):
     def _split_scope(self, nodeid: str) -> str:
         module = nodeid.split("::")[0]
         return nodeid if Path(module).stem in _APART else module
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--processor-times", type=Path, help="folder for the processor time of each test")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if folder := config.getoption("--processor-times"):
+        config.pluginmanager.register(deep.ProcessorTimes(folder))
+
+
+@pytest.hookimpl(tryfirst=True)  # before `-m` selects
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    listed = deep.listed()
+    for item in items:
+        if deep.is_listed(item.nodeid, listed):
+            item.add_marker(pytest.mark.deep)
 
 
 @pytest.hookimpl(optionalhook=True)  # there is no such hook without processes

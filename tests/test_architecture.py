@@ -12,6 +12,8 @@ import pytest
 
 import jaxmodsim
 
+from .helpers import deep
+
 ROOT = Path(jaxmodsim.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
 
@@ -268,6 +270,13 @@ def test_a_class_has_one_meaning() -> None:
             files.setdefault(node.name.lstrip("_"), set()).add(str(path.relative_to(ROOT)))
     twice = {name: where for name, where in files.items() if len(where) > 1}
     assert not twice, f"classes of one name: {twice}"
+
+
+def test_the_listed_deep_tests_exist() -> None:
+    for line in deep.listed():
+        path, _, name = line.partition("::")
+        text = (Path(__file__).parents[1] / path).read_text()
+        assert not name or f"def {name.split('[')[0]}(" in text, f"tests/deep.txt: {line} does not exist."
 
 
 def test_the_rules_can_be_broken(tmp_path: Path) -> None:

@@ -16,13 +16,6 @@ EXAMPLES = {
     for name, thing in {**PUBLIC, "_core.speed.tune_cpu": jaxmodsim.tune_cpu}.items()
     if isinstance(thing.__doc__, str) and (section := docstrings.example(thing.__doc__))
 }
-DEEP = {  # seconds of processor time each
-    *("analysis.GradientCheck", "analysis.Sensitivity", "analysis.check_gradients", "analysis.sensitivity"),
-    *("identify.FitResult", "identify.fit", "identify.fit_law", "sweeps.Derivative", "orbits.Branch"),
-    *("orbits.PeriodicOrbit", "orbits.continue_equilibria", "orbits.continue_orbits", "orbits.periodic_orbit"),
-    *("analysis.EnergyAudit", "analysis.energy_audit"),
-    *("simulation.simulate_to_accuracy", "metrics.dissipated", "metrics.peak", "solvers.EventSolver"),
-}
 
 
 @pytest.mark.quick
@@ -80,9 +73,7 @@ def test_sections_that_lack_are_seen() -> None:
     assert docstrings.lacking(nothing) == []
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.deep] if name in DEEP else []) for name in EXAMPLES]
-)
+@pytest.mark.parametrize("name", EXAMPLES)
 def test_an_example_prints_what_its_docstring_shows(name: str) -> None:
     """Written by `python -m tests.helpers.docstrings FILE`."""
     blocks = snippets.snippets(EXAMPLES[name])

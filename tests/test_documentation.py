@@ -22,7 +22,6 @@ _LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 DOCS = ROOT / "docs"
 PAGES_WITH_CODE = [page for page in PAGES if page.is_relative_to(DOCS) and snippets.snippets(page.read_text())]
-SLOW_PAGES = {"sweeps.md", "orbits.md"}  # a minute of processor time each
 
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
@@ -151,11 +150,7 @@ def test_figures_of_the_paper_are_those_of_the_tables() -> None:
     assert keys == {key for group in re.findall(r"\[(@[^\]]+)\]", paper) for key in re.findall(r"@(\w+)", group)}
 
 
-@pytest.mark.parametrize(
-    "page",
-    [pytest.param(page, marks=[pytest.mark.deep] if page.name in SLOW_PAGES else []) for page in PAGES_WITH_CODE],
-    ids=lambda page: page.name,
-)
+@pytest.mark.parametrize("page", PAGES_WITH_CODE, ids=lambda page: page.name)
 def test_the_code_of_a_page_prints_what_the_page_shows(page: Path) -> None:
     """Written by `python -m tests.helpers.snippets PAGE`."""
     assert snippets.printed_by(page) == [snippet.printed for snippet in snippets.snippets(page.read_text())]

@@ -16,8 +16,6 @@ from jaxmodsim.problems import named_problems
 from .hard.case import SceneTask
 from .hard.catalogue import hard_cases
 
-pytestmark = pytest.mark.deep
-
 MARK = "xla_cpu_small_call"
 # Kernels of a run, of its gradient (the run, then its steps backward), and of a directional derivative.
 KERNELS = {"run": 1, "gradient": 2, "tangent": 1}

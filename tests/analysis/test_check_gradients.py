@@ -61,7 +61,6 @@ def bare_energy(t: Any, q: Any, qd: Any, p: Any) -> Any:
     return 0.5 * qd[0] ** 2
 
 
-@pytest.mark.deep
 def test_stick_slip_agrees_with_differences_and_closed_form() -> None:
     check = jms.check_gradients(end, spring(**BRAKED), names=FREE)
     assert check.ok, str(check)
@@ -91,7 +90,6 @@ def test_break_away_agrees_and_a_belt_at_rest_is_named() -> None:
     assert all(name in text for name in check.numbers)
 
 
-@pytest.mark.deep
 def test_lugre_in_single_precision_without_events() -> None:
     names = ("box[0]", "box[1]", "friction.sigma1", "friction.sigma2", "friction.Fc", "friction.Fs", "friction.vs")
     check = jms.check_gradients(slide, lugre_box(), names=names)

@@ -31,7 +31,6 @@ LUGRE = jms.LuGre(sigma0=750.0, sigma1=1.0, sigma2=0.1, Fc=1.5, Fs=1.75, vs=0.2)
 BENCH = jms.Scene(free, params={"m": 2.0}, effects=(ramp, jms.Friction(LUGRE)))
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_resting_place_and_time_of_a_braked_spring(mode: Any) -> None:
     """Through all reversals, against the derivatives of the closed form."""

@@ -152,7 +152,6 @@ def test_the_figure_shows_every_method(found: WorkPrecision) -> None:
         work_precision_figure(found, cost="forward")
 
 
-@pytest.mark.deep
 def test_gradients_against_a_closed_form() -> None:
     """A free oscillator: x = x0 cos(w t), so dx/dk = -x0 sin(w t) t w/(2 k)."""
     m, k, x0, t1 = 1.3, 2.7, 1.0, 3.0

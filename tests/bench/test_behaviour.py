@@ -56,7 +56,6 @@ def test_every_law_and_wrapper_is_on_the_bench():
     assert wanted <= shown, f"not on the bench: {sorted(wanted - shown)}"
 
 
-@pytest.mark.deep
 def test_no_law_fails_but_by_a_known_limitation(outcomes):
     failed = [
         f"{law}, {name}: {outcome.measured.number:.3g}. {outcome.measured.sentence}"

@@ -32,7 +32,6 @@ def test_values_and_events(name):
     check(name, derivatives=False)
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize("name", [name for name in CASES if name != REFUSED])
 def test_values_events_and_derivatives(name):
     check(name, derivatives=True)
@@ -52,13 +51,11 @@ def check(name, *, derivatives):
         np.testing.assert_allclose(ours.derivatives, slopes, rtol=1e-6, atol=1e-6 * np.max(np.abs(slopes)))
 
 
-@pytest.mark.deep
 def test_a_gear_without_a_torque_in_its_mesh_is_refused_with_the_reason():
     with pytest.raises(RuntimeError, match="Friction under the reaction of 'mesh' has lost its unique solution"):
         CASES[REFUSED].ours(derivatives=False)
 
 
-@pytest.mark.deep
 def test_the_optima_of_two_tasks():
     velocity, _ = gradients.target_velocity()
     np.testing.assert_allclose(velocity, gradients.exact_target_velocity(), rtol=1e-11)

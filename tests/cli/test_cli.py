@@ -37,7 +37,6 @@ def measured():
     return {case.label: run_ramp(case) for case in ramp_cases()}
 
 
-@pytest.mark.deep
 def test_testbench_models_do_what_the_exercise_says(measured):
     by_part = {part: [m for m in measured.values() if m.case.part == part] for part in "abcde"}
     adaptive, slow, steep = by_part["a"]

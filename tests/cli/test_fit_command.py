@@ -71,7 +71,6 @@ def fitted(run_command, files, tmp_path_factory):
     return out, text
 
 
-@pytest.mark.deep
 def test_several_records_are_fitted_together_and_a_held_out_one_is_scored(fitted):
     out, text = fitted
     found = json.loads((out / "fit.json").read_text())
@@ -96,7 +95,6 @@ def test_several_records_are_fitted_together_and_a_held_out_one_is_scored(fitted
     ]  # fmt: skip
 
 
-@pytest.mark.deep
 def test_samples_and_result_are_kept(fitted):
     out, _ = fitted
     frame = pd.read_csv(out / "fit.csv")
@@ -211,7 +209,6 @@ def test_one_record_and_law_give_one_fit_whatever_else_is_asked(run_command, fil
             assert other[name]["standard_error"] == pytest.approx(entry["standard_error"], rel=0.01)
 
 
-@pytest.mark.deep
 def test_the_next_input_is_written(run_command, files, tmp_path, monkeypatch):
     out = tmp_path / "out"
     monkeypatch.setattr(_fit, "design_input", partial(_fit.design_input, max_steps=2))

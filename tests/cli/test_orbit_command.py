@@ -80,7 +80,6 @@ def test_a_branch_is_written_and_gone_on_with(spec, tmp_path, run_command):
     assert run_command(*arguments)[1] == out
 
 
-@pytest.mark.deep
 def test_a_branch_begins_at_a_hopf_point(spec, tmp_path, run_command):
     code, out, _ = run_command("branch", spec(HOPF), "--out", str(tmp_path / "out"))
     assert code == 0

@@ -109,7 +109,6 @@ def test_a_rotary_axis_has_its_units(run_command, tmp_path):
     ]
 
 
-@pytest.mark.deep
 def test_integration_steps_are_raised_until_they_no_longer_show(run_command, tmp_path):
     changed(pos=Q + 5e-5 * RANDOM.standard_normal(T.size)).to_csv(tmp_path / "run.csv", index=False)
     options = (*COLUMNS, *FORCE, "--max-steps", "12", "--laws", "lugre")  # whose bristle is stiff

@@ -79,7 +79,6 @@ def test_the_gear_locks_itself_from_a_coefficient_of_one_on(over: float) -> None
         np.testing.assert_array_equal(run.q[-1], [0.0, -LOAD / 20.0])
 
 
-@pytest.mark.deep
 def test_the_gear_drives_locks_and_is_driven_back() -> None:
     law = Geared(Stribeck(Fc=0.05, Fs=0.08, vs=0.1, Fv=0.01), Stribeck(0.2, 0.25, 0.1), spring, 0.3)
     scene = joint(law, 2.0, w=0.7, c=0.3)
@@ -151,7 +150,6 @@ def test_temperature_and_position_scale_it() -> None:
     np.testing.assert_allclose(inside.sliding_force(v), factor * plain.law.sliding_force(v) + load, rtol=1e-14)
 
 
-@pytest.mark.deep
 def test_it_stands_beside_lugre_and_an_elastic_joint() -> None:
     """Motor bearings with LuGre friction, and a mesh whose friction grows with the torque."""
     bearings = jms.LuGre(sigma0=200.0, sigma1=0.5, sigma2=0.01, Fc=0.05, Fs=0.08, vs=0.1)
@@ -296,7 +294,6 @@ def arm(law: Any) -> jms.Scene:
     return jms.Scene(kinetic, params, (jms.AppliedForce(push), jms.Friction(law)), coordinates=("angle [rad]",))
 
 
-@pytest.mark.deep
 def test_a_servo_on_a_pendulum_sticks_and_slips() -> None:
     scene = arm(ServoGear.published("mx106", "M6", motor, gravity))
     run = jms.simulate(scene, [0.0], [0.0], 2.0, ts=jnp.linspace(0.0, 2.0, 201), rtol=1e-8, atol=1e-10)

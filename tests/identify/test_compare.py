@@ -54,7 +54,6 @@ def comparison() -> Comparison:
     return compare(candidates(), _record(0), q0=[0.0], limits=LIMITS)
 
 
-@pytest.mark.deep
 def test_the_truth_is_named_and_what_has_more_parameters_is_not(comparison):
     assert comparison.simplest == "stribeck"
     assert set(comparison.results) == set(candidates())
@@ -69,7 +68,6 @@ def test_the_truth_is_named_and_what_has_more_parameters_is_not(comparison):
     assert by_name["viscous"].over_the_best > by_name["viscous"].over_the_best_standard_error
 
 
-@pytest.mark.deep
 def test_a_model_starts_also_from_where_a_part_of_it_ended():
     far = jms.Regularized(jms.Stribeck(Fc=2.0, Fs=9.0, vs=3.0, Fv=30.0), WIDTH)
     free = ("m", "friction.Fc", "friction.Fv", "friction.Fs", "friction.vs")
@@ -80,7 +78,6 @@ def test_a_model_starts_also_from_where_a_part_of_it_ended():
     assert found["stribeck"].fitted < found["coulomb"].fitted
 
 
-@pytest.mark.deep
 def test_the_criteria_agree_and_count_parameters_where_the_residual_is_white(comparison):
     by_name = {each.name: each for each in comparison.ranked}
     assert min(by_name.values(), key=lambda each: each.bic).name == "stribeck"

@@ -113,7 +113,6 @@ def test_the_force_leads_the_axis_along_the_motion_with_order_two():
     assert np.log2(off[0] / off[1]) == pytest.approx(2.0, abs=0.3)
 
 
-@pytest.mark.deep
 def test_sensitivities_are_those_of_the_simulated_record(design):
     axis, _, scale = _axis(box(), MODEL.free, None, lambda q, qd: q[0], "u", NOISE)
     t, force = as_arrays(design.best)

@@ -140,7 +140,6 @@ def test_gradient_of_every_objective_equals_finite_differences(name, full):
     np.testing.assert_allclose(exact, differences, rtol=2e-5, atol=1e-6 * np.max(np.abs(exact)))
 
 
-@pytest.mark.deep
 def test_gradient_of_a_fit_through_events_equals_finite_differences(belt):
     scene = belt_oscillator.scene(jms.Stribeck(**belt_oscillator.STRIBECK))
     free = ("friction.Fc", "friction.Fs", "k")
@@ -151,7 +150,6 @@ def test_gradient_of_a_fit_through_events_equals_finite_differences(belt):
     np.testing.assert_allclose(exact, differences, rtol=1e-4)
 
 
-@pytest.mark.deep
 def test_fit_through_events_finds_back_from_half_wrong(belt):
     start = belt_oscillator.scene(jms.Stribeck(Fc=2.5, Fs=12.0, vs=0.1, Fv=0.3), k=150.0)
     result = jms.fit(start, belt, ("friction.Fc", "friction.Fs", "friction.vs", "k"), q0=[0.0], initializer=Staged())

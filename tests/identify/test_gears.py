@@ -4,7 +4,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import jaxmodsim as jms
 from jaxmodsim import Bristle, ServoGear
@@ -85,7 +84,6 @@ def swing(numbers: dict[str, float]) -> jms.Scene:
     return jms.Scene(kinetic, {"J": 0.05, "mgl": 1.5, "motor": 0.0}, (jms.AppliedForce(push), jms.Friction(law)))
 
 
-@pytest.mark.deep
 def test_the_richest_model_from_angles_of_a_pendulum() -> None:
     t, rest, records = np.arange(0.0, 20.0, 5e-3), jnp.zeros(1), []
     for i, (size, f, phase) in enumerate([(1.1, 0.31, 0.0), (0.8, 0.9, 1.2), (1.8, 1.7, 0.3), (1.1, 0.13, 2.0)]):

@@ -148,7 +148,6 @@ def test_numbers_out_of_range_are_refused(make, text):
         make()
 
 
-@pytest.mark.deep
 @pytest.mark.skipif(
     not (DATA / "presliding").exists(), reason="the measured presliding record is not beside the repository"
 )

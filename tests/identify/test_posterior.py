@@ -187,7 +187,6 @@ def test_without_blackjax_the_error_names_the_extra(monkeypatch: pytest.MonkeyPa
         sample_posterior(fitted(noisy()))
 
 
-@pytest.mark.deep
 def test_delays_and_free_starts_and_events_are_among_the_unknowns() -> None:
     scene = sprung_mass(DRIVE, jms.Friction(jms.Coulomb(0.4)), m=1.0)
     t = np.linspace(0.0, 1.0, 101)

@@ -98,7 +98,6 @@ def test_new_command_and_gain_are_predicted_in_the_band(fit: ServoFit, tmp_path:
     np.testing.assert_allclose(again.upper, prediction.upper, rtol=0, atol=1e-12)
 
 
-@pytest.mark.deep
 @pytest.mark.skipif(not XL330.exists(), reason="no records of the servo in ../shared/data/xl330")
 def test_measured_records_left_out_are_predicted_better_than_by_published_parameters() -> None:
     records = []

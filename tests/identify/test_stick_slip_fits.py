@@ -115,7 +115,6 @@ def test_a_residual_of_nothing_but_rounding_gives_no_standard_errors():
     assert set(result.errors.values()) == {np.inf}
 
 
-@pytest.mark.deep
 def test_a_record_of_many_samples_and_a_scene_that_starts_far_away_are_fitted():
     record = dwelling(20.0)
     result = jms.fit(axis(jms.Coulomb(3.0), m=2.5), record, (*TRUTH, "q0", "qd0"))
@@ -129,7 +128,6 @@ RUNS = {
 }
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize(("law", "linear"), RUNS.values(), ids=RUNS)
 def test_steps_from_sample_to_sample_are_the_run_by_events(law, linear):
     t = np.arange(401) / 100.0
@@ -156,7 +154,6 @@ def two_masses(p) -> jms.Scene:
     )
 
 
-@pytest.mark.deep
 def test_two_elements_and_their_derivatives():
     t = jnp.arange(601) / 200.0
     u = 6.0 * jnp.sin(5.0 * t) + 2.0 * jnp.sin(13.0 * t)

@@ -82,7 +82,6 @@ def alone() -> Any:
     return on_belt(BELTS[1])
 
 
-@pytest.mark.deep
 def test_eager_as_compiled_and_mapped(alone: Any, batch: list[np.ndarray]) -> None:
     for metric, mapped in zip(OF_EVENTS, batch, strict=True):
         np.testing.assert_allclose(metric(alone), mapped[1], rtol=1e-9, err_msg=metric.label)
@@ -90,7 +89,6 @@ def test_eager_as_compiled_and_mapped(alone: Any, batch: list[np.ndarray]) -> No
     assert changes == ([-1, 0] * len(changes))[: int(batch[CHANGES][1])]
 
 
-@pytest.mark.deep
 def test_derivatives_of_break_away_and_period(lanes: list[np.ndarray]) -> None:
     """Against the closed form, and against differences."""
     chosen = (BREAK_AWAY, PERIOD, PEAK, SHARE)
@@ -232,7 +230,6 @@ def test_single_precision(alone: Any) -> None:
     np.testing.assert_allclose(metrics.period()(single), metrics.period()(alone), rtol=1e-4)
 
 
-@pytest.mark.deep
 def test_peaks_between_saved_times() -> None:
     """A swing sin(w t) that is saved at its zeros: the samples say nothing of its amplitude."""
 

@@ -52,7 +52,6 @@ def ball_branch(ball, guess, to, **options):
     )
 
 
-@pytest.mark.deep
 def test_period_doubling_of_the_ball_is_that_of_its_closed_form(ball):
     branch = ball_branch(ball, None, 0.95e-3, step=0.1)
     (point,) = branch.points
@@ -101,7 +100,6 @@ def test_fold_of_the_ball_is_that_of_its_closed_form(ball):
         )
 
 
-@pytest.mark.deep
 def test_branch_of_a_forced_oscillator_with_dry_friction_and_its_loss_of_stick():
     effects = (jms.AppliedForce(swing), jms.Friction(jms.Coulomb(0.5)), jms.Friction(jms.Viscous(0.1)))
     scene = jms.Scene(spring, params={"a": 0.0, "W": 0.55}, effects=effects)
@@ -217,7 +215,6 @@ def gap_to_the_stop(_t, q, p):
     return p["stop"] - q[0]
 
 
-@pytest.mark.deep
 def test_grazing_is_where_the_amplitude_without_impacts_reaches_the_stop():
     W, c = 0.8, 0.3
     amplitude = 1 / np.hypot(1 - W**2, c * W)
@@ -232,7 +229,6 @@ def test_grazing_is_where_the_amplitude_without_impacts_reaches_the_stop():
     assert list(branch.stable) == [x > amplitude for x in branch.values]
 
 
-@pytest.mark.deep
 def test_mode_changes_that_swap_their_order_are_no_grazing():
     """Two oscillators of one damping pass zero at once where their stiffnesses are equal."""
 

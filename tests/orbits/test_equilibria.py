@@ -78,7 +78,6 @@ def test_steady_sliding_loses_its_stability_where_damping_and_slope_cancel(slidi
     assert "unstable: an eigenvalue of" in str(sliding.orbits[-1])
 
 
-@pytest.mark.deep
 def test_orbits_from_a_hopf_point_turn_back_at_the_onset_of_stick(sliding):
     branch = jms.continue_orbits(
         belt(jms.Stribeck(**LAW), 1.0), sliding.points[0], SPEED, (1.0, 0.3), step=0.5, rtol=1e-9
@@ -99,7 +98,6 @@ def test_orbits_from_a_hopf_point_turn_back_at_the_onset_of_stick(sliding):
         jms.continue_orbits(belt(jms.Stribeck(**LAW), 1.0), sliding.points[0], SPEED, (1.0, 0.3), period=1.0)
 
 
-@pytest.mark.deep
 def test_orbits_with_stick_turn_back_where_stick_shrinks_to_a_point():
     scene, span = belt(jms.Stribeck(**LAW), 0.61), (0.61, 0.66)
     branch = jms.continue_orbits(scene, ([0.0], [0.61]), SPEED, span, settle=20.0, step=0.4, rtol=1e-9)

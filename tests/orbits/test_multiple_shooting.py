@@ -28,7 +28,6 @@ def on_a_hill(a, segments):
 
 
 # Multipliers of 1e6 and 4e13.
-@pytest.mark.deep
 @pytest.mark.parametrize("a", [2.2, 5.0])
 def test_an_orbit_too_unstable_for_a_run_over_the_period(a):
     scene, orbit = on_a_hill(a, 8)

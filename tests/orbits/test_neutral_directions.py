@@ -66,7 +66,6 @@ def test_a_box_that_is_pulled_over_a_floor_advances_as_its_closed_form(advancing
     assert list(segments.multipliers) == [1.0, 0.0]
 
 
-@pytest.mark.deep
 def test_the_advance_has_the_derivatives_of_its_closed_form(advancing):
     def advance(scene):
         return jms.periodic_orbit(scene, advancing, period=of_frequency, rtol=1e-12, atol=1e-14).advance[0]
@@ -131,7 +130,6 @@ def the_box(q):
     return q[1]
 
 
-@pytest.mark.deep
 def test_an_orbit_of_unknown_period_advances():
     # Van der Pol's oscillator, which is not disturbed, pulls a box with the force F0 + q0.
     friction = jms.Friction(jms.Coulomb(1.5), along=the_box)
@@ -156,7 +154,6 @@ def wall(_t, q, _p):
     return 200.0 - q[0]
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize(
     "scene",
     [

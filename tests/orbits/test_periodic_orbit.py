@@ -48,7 +48,6 @@ def van_der_pol():
     return jms.periodic_orbit(VAN_DER_POL, ([0.0], [0.5]), settle=60.0)
 
 
-@pytest.mark.deep
 def test_belt_oscillator_has_the_period_of_its_closed_form(belt):
     cycle = belt_oscillator.cycle(**belt_oscillator.PARAMS)
     np.testing.assert_allclose(belt.period, cycle.period, rtol=1e-9)
@@ -62,7 +61,6 @@ def test_belt_oscillator_has_the_period_of_its_closed_form(belt):
     assert {(before, after) for _, before, after in belt.sequence} == {("backward", "stick"), ("stick", "backward")}
 
 
-@pytest.mark.deep
 def test_segments_of_a_period_change_nothing(belt):
     orbit = jms.periodic_orbit(belt_oscillator.scene(), belt, segments=4)
     assert len(orbit.runs) == 4
@@ -79,7 +77,6 @@ def test_multipliers_of_stick_and_of_an_unknown_period_are_exact(belt):
     assert "stable" in str(belt)
 
 
-@pytest.mark.deep
 def test_period_of_the_belt_has_the_derivatives_of_its_closed_form_forward_and_reverse(belt):
     scene = belt_oscillator.scene()
     exact = jax.grad(lambda p: belt_oscillator.cycle(**p).period)(dict(belt_oscillator.PARAMS))
@@ -127,7 +124,6 @@ def the_plane(q):
     return q
 
 
-@pytest.mark.deep
 def test_dry_friction_in_the_plane_has_the_orbit_of_that_along_the_force():
     axis = np.array([0.6, 0.8])
     effects = (jms.AppliedForce(swing_along), jms.Friction(jms.Coulomb(0.5), along=the_plane))
@@ -158,7 +154,6 @@ def test_a_scene_that_depends_on_time_needs_its_period():
         jms.periodic_orbit(scene, ([1.0], [0.0]), period=3.0, settle=60.0)
 
 
-@pytest.mark.deep
 def test_ball_on_a_vibrating_table():
     p = {**vibrating_table.PARAMS, "A": 0.9e-3}
     T = 2 * np.pi / p["omega"]
@@ -177,7 +172,6 @@ def test_ball_on_a_vibrating_table():
     np.testing.assert_allclose([orbit.lowest[0], orbit.highest[0]], [struck, struck + p["g"] * T**2 / 8], rtol=1e-9)
 
 
-@pytest.mark.deep
 def test_the_lowest_of_a_valve_that_strikes_is_its_seat():
     """The greatest lift is that of samples, and derivatives are differences, which of the seat is zero."""
 
@@ -217,7 +211,6 @@ def test_van_der_pol(van_der_pol):
     assert van_der_pol.multipliers[0] == 1.0
 
 
-@pytest.mark.deep
 def test_multipliers_of_random_scenes_are_those_of_finite_differences():
     random, checked = np.random.default_rng(3), 0
     while checked < 50:
@@ -243,7 +236,6 @@ def test_multipliers_of_random_scenes_are_those_of_finite_differences():
         checked += 1
 
 
-@pytest.mark.deep
 def test_derivatives_of_random_belts_are_those_of_finite_differences(belt):
     random, scene = np.random.default_rng(5), belt_oscillator.scene()
     usual = {name: float(x) for name, x in scene_numbers(scene).items()}

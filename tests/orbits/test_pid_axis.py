@@ -39,7 +39,6 @@ def run_on(orbit, kd):
     return 0.5 * np.ptp(np.asarray(run.q[:, 0]))
 
 
-@pytest.mark.deep
 def test_the_limit_cycle_vanishes_where_simulations_come_to_rest(branch):
     fold = next(point.value for point in branch.points if point.kind == "fold")
     last = max((each for each in branch.orbits if each.stable), key=lambda each: float(each.period))
@@ -48,7 +47,6 @@ def test_the_limit_cycle_vanishes_where_simulations_come_to_rest(branch):
     assert list(branch.stable) == sorted(branch.stable, reverse=True)
 
 
-@pytest.mark.deep
 def test_limit_cycle_of_an_axis(branch):
     orbit = branch.orbits[0]
     assert orbit.stable

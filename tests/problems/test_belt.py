@@ -229,7 +229,6 @@ rest_slopes = jax.jit(jax.jacrev(lambda n: problems.braked_spring.rest(**n)))
 period_slopes = jax.jit(jax.grad(lambda n: problems.belt_oscillator.cycle(**n).period))
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize("derivatives", [forward, reverse], ids=["forward", "reverse"])
 def test_derivatives_of_braked_spring_and_belt_oscillator(derivatives: Any) -> None:
     """One test for both, and for single events, as they share the compiled code."""

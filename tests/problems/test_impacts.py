@@ -48,7 +48,6 @@ def test_newtons_cradle():
         newtons_cradle.scene(8)
 
 
-@pytest.mark.deep
 def test_a_block_rocks_as_in_the_formulas_of_housner():
     start, p = 0.02, rocking_block.PARAMS
     quarter = float(rocking_block.quarter_period(start))
@@ -66,7 +65,6 @@ def test_a_block_rocks_as_in_the_formulas_of_housner():
     np.testing.assert_allclose(energy, jnp.asarray([begun, begun, kept, kept]), rtol=1e-7)
 
 
-@pytest.mark.deep
 def test_a_gripper_catches_a_falling_object():
     d, v0 = gripper.PARAMS["d"], gripper.PARAMS["v0"]
 

@@ -434,7 +434,6 @@ def test_four_bar_stays_closed() -> None:
     np.testing.assert_allclose(energy, energy[0], rtol=1e-7)
 
 
-@pytest.mark.deep
 def test_runs_of_the_rolling_disc() -> None:
     """A steady circle closes; any other motion rolls on and keeps its energy."""
     scene, turn, lean = disc_problem.scene(**DISC), -1.3, 0.4
@@ -486,7 +485,6 @@ def compliance_left(angle: float, rate: float) -> float:
     return float(rod_problem.compliance(jnp.asarray(angle), m=ROD["m"], mu=2.0)) - 1e-6
 
 
-@pytest.mark.deep
 def test_the_rod_lifts_off_and_its_run_ends_where_the_paradox_begins() -> None:
     ts = jnp.linspace(0.0, 0.5, 101)
 

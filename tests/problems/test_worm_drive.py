@@ -83,7 +83,6 @@ def test_jamming_raises_an_error_that_names_it() -> None:
         end({"mu": 0.6, "J1": 1e-6, "J2": 1.0}, -3.0)
 
 
-@pytest.mark.deep
 def test_gradients_equal_those_of_the_closed_form() -> None:
     names = ("J1", "J2", "lead", "mu", "motor", "load")
     numbers = {name: jnp.array(worm_drive.PARAMS[name]) for name in names} | {"motor": jnp.array(0.9)}

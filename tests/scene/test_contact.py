@@ -92,7 +92,6 @@ def test_two_elements_on_one_coordinate_share_in_proportion_to_their_limits() ->
     np.testing.assert_allclose(run.qd[:, 0], [0.0, 0.0, (36 - 16) / 2 - 3 * 2], atol=1e-6)
 
 
-@pytest.mark.deep
 def test_redundant_elements_in_series_give_no_nan() -> None:
     """Two masses, each on the ground, and an element between them: three constraints for two velocities."""
     three = scene(

@@ -34,7 +34,6 @@ def _disc(law, friction, **params):
     )
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize("law", [0.8, jms.Poisson(0.8)])
 def test_an_oblique_impact_of_a_disc(law):
     """It slides all through, in either direction, or sticks: the impulse then takes all of the slip."""
@@ -146,7 +145,6 @@ def _double_pendulum(law):
     )
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize(("law", "gains"), [(0.5, True), (jms.Poisson(0.5), False)])
 def test_where_newtons_law_gains_energy_poissons_does_not(law, gains):
     """The double pendulum of Kane and Levinson, Dynamics: Theory and Applications, 1985."""

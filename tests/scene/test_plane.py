@@ -108,7 +108,6 @@ def ramp(t: Any, q: Any, qd: Any, p: Any) -> Any:
     return jnp.stack([3.0 * t - t * t, 0.0 * t])
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize("law", [Coulomb(1.0, 1.4), Stribeck(1.0, 1.4, 0.1, 0.3)])
 def test_on_a_line_it_is_the_scalar_law(law: Any) -> None:
     runs = [
@@ -186,7 +185,6 @@ def after_break_away(mu: float, stiction: float, t1: float) -> np.ndarray:
     return end.y[:2, -1]
 
 
-@pytest.mark.deep
 def test_the_turntable_lets_the_puck_go_at_the_speed_in_closed_form() -> None:
     """With and without stiction; the way from there on by a second solver; derivatives of the time in both modes."""
     mu = turntable_puck.PARAMS["mu"]
@@ -214,7 +212,6 @@ def test_the_turntable_lets_the_puck_go_at_the_speed_in_closed_form() -> None:
             np.testing.assert_allclose(derivative(stiction * mu), slope, rtol=1e-8)
 
 
-@pytest.mark.deep
 def test_the_load_may_be_a_reaction_or_a_number() -> None:
     """A block on a floor that presses harder and harder, in three coordinates and in two."""
     lift = 0.2
@@ -249,7 +246,6 @@ def test_the_load_may_be_a_reaction_or_a_number() -> None:
     np.testing.assert_allclose(reaction.forces["friction"][-1], [1.0, 0.5], atol=1e-10)
 
 
-@pytest.mark.deep
 def test_on_an_ellipse_friction_is_the_point_of_greatest_dissipation() -> None:
     """In slip against 10 000 points of the ellipse; break-away where the load passes it."""
     ratio, v = 0.5, np.array([0.3, -0.7])
@@ -266,7 +262,6 @@ def test_on_an_ellipse_friction_is_the_point_of_greatest_dissipation() -> None:
     np.testing.assert_allclose(run.events.t[0], limit, rtol=1e-10)
 
 
-@pytest.mark.deep
 def test_energy_float32_and_batches() -> None:
     """The energy balance closes over slip and stick; in float32 the stop is right to rounding, in batches too."""
     run = simulate(PUCK, [0.0, 0.0], [3.0, 4.0], 8.0, ts=np.linspace(0.0, 8.0, 9), **TIGHT)
@@ -311,7 +306,6 @@ def bar(left: float, right: float, pull: float, push: float) -> Scene:
     return Scene(bar_alone, params={"pull": pull, "push": push}, effects=(AppliedForce(on_bar), *feet))
 
 
-@pytest.mark.deep
 def test_feet_of_a_bar_share_a_pull_along_it() -> None:
     """The equations leave the shares open: each foot takes its part in proportion to its limit, and both let go."""
     run = simulate(bar(1.0, 2.0, pull=1.0, push=0.0), [0.0] * 3, [0.0] * 3, 4.0, ts=np.array([1.5, 4.0]), **TIGHT)
@@ -321,7 +315,6 @@ def test_feet_of_a_bar_share_a_pull_along_it() -> None:
     np.testing.assert_allclose(run.q[-1], [1.0 / (6.0 * MASS), 0.0, 0.0], atol=1e-6)
 
 
-@pytest.mark.deep
 def test_a_bar_pushed_across_at_one_end_pivots_about_the_other() -> None:
     """Constant angular acceleration, until the force that keeps the foot in place reaches its limit."""
     push = LIMIT + 1.0

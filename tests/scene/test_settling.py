@@ -40,7 +40,6 @@ TABLES = [
 ]  # fmt: skip
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize("numbers", [{}, TIGHT], ids=["default", "tight"])
 def test_a_ball_settles_on_an_oscillating_table(numbers):
     base = vibrating_table.scene()
@@ -61,7 +60,6 @@ def test_a_ball_settles_on_an_oscillating_table(numbers):
         assert abs(run.mode_changes[-1].t - right.closes[0]) < 1e-6
 
 
-@pytest.mark.deep
 def test_a_ball_leaves_a_table_that_falls_faster_and_settles_again():
     A, omega, e = 0.02, 25.0, 0.2
 
@@ -82,7 +80,6 @@ def _accelerated(t, q, p):
     return q[0] - 0.5 * p["a"] * t**2
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_a_table_that_accelerates_is_a_floor_in_another_gravity(derivative):
     """The end of all bounces, and its derivatives by restitution and acceleration."""
@@ -156,7 +153,6 @@ def test_impacts_that_break_a_box_loose_from_dry_friction(numbers):
     np.testing.assert_allclose(q, np.array([0.0, 0.5]) + np.array(right) * [1.0, -1.0], rtol=0, atol=1e-8)
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_restitution_under_friction_does_not_move_the_resting_place(derivative):
     """A block thrown onto a rough floor: what bounces take from its impulse and give to its time is the same."""

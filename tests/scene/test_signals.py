@@ -81,7 +81,6 @@ def test_a_held_signal_is_constant_inputs_one_after_the_other() -> None:
     assert changes >= 3
 
 
-@pytest.mark.deep
 def test_derivatives_by_values() -> None:
     weights = np.array([1.0, 0.7])
     reverse = jax.jit(jax.grad(lambda u: jnp.sum(weights * held(u))))(jnp.asarray(U))
@@ -161,7 +160,6 @@ def switches(x: Any, adjoint: Any) -> Any:
     return jms.simulate(scene, [0.0], x[:1], 10.0, adjoint=adjoint, max_events=4).events.t[:2]
 
 
-@pytest.mark.deep
 def test_times_of_events_are_differentiable() -> None:
     """The box comes to rest where `m v0 + k t^2/2 = Fc t`, and breaks loose where `k t = Fs`."""
     v, k = 0.1, 0.5

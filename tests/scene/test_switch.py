@@ -35,7 +35,6 @@ def test_a_switching_time_has_its_derivative():
     assert gradient["m"] == pytest.approx(-42.875, rel=1e-9)
 
 
-@pytest.mark.deep
 def test_a_switching_time_has_its_second_derivative():
     def by_begin(begin):
         return place(jms.Scene(lagrangian, params={**PUSHED.params, "begin": begin}, effects=PUSHED.effects))
@@ -112,7 +111,6 @@ def test_two_linear_systems_take_turns(of_linear):
     np.testing.assert_allclose(events.t, times, rtol=1e-9)
 
 
-@pytest.mark.deep
 def test_derivatives_of_two_linear_systems_are_those_of_the_exponentials(of_linear):
     forward = jax.jit(jax.jacfwd(lambda scene: of_linear(scene).q[-1, 0]))(LINEAR).params
     reverse = jax.jit(jax.grad(lambda scene: of_linear(scene).q[-1, 0]))(LINEAR).params
@@ -181,7 +179,6 @@ def test_a_spiral_that_turns_at_the_unit_circle():
     np.testing.assert_allclose(by_radius, x / r + spin, rtol=1e-7, atol=1e-6)
 
 
-@pytest.mark.deep
 def test_an_event_without_a_force_has_a_time_with_derivatives():
     # A free fall from h passes the light barrier at height b at sqrt(2 (h - b)/g).
     barrier = jms.Switch(lambda t, q, qd, p: q[0] - p["b"], name="barrier")
@@ -218,7 +215,6 @@ def test_a_switch_breaks_a_stick_at_its_instant():
     assert changes[0].t == changes[1].t
 
 
-@pytest.mark.deep
 def test_a_switch_throws_a_ball_off_the_floor():
     # It lies there, until at t = 3 a force of 5 g lifts it with 4 g.
     scene = jms.Scene(
@@ -284,7 +280,6 @@ def test_wrong_functions_are_refused():
         jms.simulate(PUSHED, [0.0], [0.0], 1.0, dt=0.1, solver=jms.ImplicitFriction())
 
 
-@pytest.mark.deep
 def test_an_orbit_passes_switches():
     """x'' + 0.3 x' + k x = cos 2t, with k = 1 for x < 0 and 5 for x > 0, against DOP853 from crossing to crossing."""
     stop = jms.Switch(lambda t, q, qd, p: q[0], above=lambda t, q, qd, p: -p["k"] * q, name="stop")

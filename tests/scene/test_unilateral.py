@@ -53,7 +53,6 @@ def test_a_ball_bounces_to_rest_on_the_floor():
     assert (np.diff(run.event_losses) >= -1e-13).all()
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
 def test_derivatives_of_the_end_of_all_bounces(derivative):
     start = {"h": 1.0, "e": 0.5}
@@ -63,7 +62,6 @@ def test_derivatives_of_the_end_of_all_bounces(derivative):
         np.testing.assert_allclose(ours[name], closed[name], rtol=1e-8)
 
 
-@pytest.mark.deep
 def test_gradient_through_a_hundred_impacts():
     impacts = 100
 
@@ -136,7 +134,6 @@ def test_several_contacts_at_one_instant():
     np.testing.assert_allclose([each.multiplier[-1, 0] for each in run.reactions.values()], 9.81 / 2, rtol=1e-9)
 
 
-@pytest.mark.deep
 def test_backlash_between_a_motor_and_its_load():
     """The motor runs through the play and strikes: momentum and Newton's law, then both accelerate together."""
     play, torque = 0.2, 0.5
@@ -163,7 +160,6 @@ def test_backlash_between_a_motor_and_its_load():
     np.testing.assert_allclose(jax.jit(jax.grad(end))(jnp.asarray(play)), -1 / 8, rtol=1e-8)
 
 
-@pytest.mark.deep
 def test_an_impact_within_a_constraint():
     """A pendulum in Cartesian coordinates strikes a wall at its lowest point: the rod holds, the speed is e times."""
     e, g, start = 0.5, 9.81, 0.6
@@ -187,7 +183,6 @@ def test_an_impact_within_a_constraint():
     np.testing.assert_allclose(run.event_losses, np.where(after, (1 - e**2) * full, 0.0), atol=1e-8)
 
 
-@pytest.mark.deep
 def test_poissons_law():
     """A ball strikes one that lies on a floor: the floor gives its impulse back, which Newton's law cannot say."""
     m1, m2, v = 2.0, 3.0, 1.5
@@ -304,7 +299,6 @@ def test_an_impact_at_either_end_of_a_run():
     np.testing.assert_allclose(run.q[-1, 0], 0.5 * 0.05 - 0.5 * 9.81 * 0.05**2, rtol=1e-10)
 
 
-@pytest.mark.deep
 def test_a_saved_time_and_an_end_at_an_impact_hold_the_state_after_it():
     """At the default tolerances, at impacts of the closed form and at those that a run has noted."""
     for h, e in ((1.0, 0.5), (0.37, 0.8), (20.0, 0.3)):

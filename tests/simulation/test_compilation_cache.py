@@ -94,7 +94,6 @@ print(json.dumps({**found, "kept": kept, "events": int(run.stats["num_events"]),
 """
 
 
-@pytest.mark.deep
 def test_the_next_process_compiles_nothing(tmp_path: Path) -> None:
     """Of a run with events and its gradient, the second process takes every program from the first."""
     environment = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}

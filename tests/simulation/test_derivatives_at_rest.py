@@ -90,7 +90,6 @@ def test_a_mass_that_hangs(solver: str) -> None:
             assert error(found, m, k, c, t, rtol) < 10.0, (m, k, c, t, rtol)
 
 
-@pytest.mark.deep
 def test_the_published_scene_in_every_mode() -> None:
     """k = 400 N/m, c = 4 N s/m, 1 kg: steps that see the state alone give 637 and -1e13 here."""
 
@@ -169,7 +168,6 @@ def arm() -> tuple[Scene, list[float], float]:
     return scene, list(pose), float(slope)
 
 
-@pytest.mark.deep
 def test_an_arm_that_holds_a_pose() -> None:
     """By `jax.grad`, and by `sensitivity`, in both of its modes."""
     scene, pose, exact = arm()
@@ -250,7 +248,6 @@ def test_at_rest_on_a_mass_that_sticks(solver: str) -> None:
         assert error(slopes(dict(MASS.params), t), 1.0, 400.0, 4.0, t, 1e-6) < 10.0
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_steady_sliding(solver: str) -> None:
     """A mass on a spring that a belt holds at Fc/k, by force and stiffness."""

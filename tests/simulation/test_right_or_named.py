@@ -155,7 +155,6 @@ def test_events_are_in_order_and_as_many_at_every_tolerance() -> None:
         np.testing.assert_allclose(run.q[-1], end[:2], atol=1e3 * rtol)
 
 
-@pytest.mark.deep
 def test_gradients_pass_where_differences_converge() -> None:
     def end(scene: jms.Scene, simulate: Any = jms.simulate) -> Any:
         return simulate(scene, [0.0, 0.0], [0.0, 0.0], 1.43, rtol=1e-8, atol=1e-11).q[-1, 0]

@@ -116,7 +116,6 @@ def test_gradients_by_every_number_equal_finite_differences(reverse_gradient: An
     np.testing.assert_allclose(ours, slopes, rtol=1e-6, atol=1e-9 * np.abs(slopes).max())
 
 
-@pytest.mark.deep
 def test_forward_derivatives_equal_reverse(reverse_gradient: Any) -> None:
     """Also by `diffrax.ForwardMode`, which goes through the whole run and not only through its steps."""
     point = fixed_point()
@@ -341,7 +340,6 @@ def test_the_page_of_code_that_must_always_work() -> None:
     np.testing.assert_allclose(gradient.effects[1].law.Fc, by_fc, rtol=1e-4)
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize(("ts", "probe"), [(None, False), (jnp.linspace(0.0, 3.0, 7), False), (None, True)])
 def test_gradients_under_vmap_are_right_in_lanes_that_finish_early(ts: Any, probe: bool) -> None:
     """Finished lanes take steps of length zero until the last one is through; these must not reach the derivative."""

@@ -88,7 +88,6 @@ def compared(name: str) -> Compared:
     return Compared(family, codes, np.max(np.abs(ends - right) / admissible, axis=1), events, expected)
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize("name", NAMES)
 def test_runs_reach_the_end(name: str) -> None:
     found = compared(name)
@@ -121,7 +120,6 @@ def test_few_members_are_left_out(name: str) -> None:
     assert family.left_out <= 2 + 0.1 * len(family.members)
 
 
-@pytest.mark.deep
 def test_accuracy_is_met_or_its_lack_is_said() -> None:
     asked = 1e-6
     for member in draw_family("shaken_box", 24 if is_deep() else 4, seed=1).members:

@@ -189,7 +189,6 @@ def test_simulate_refuses_backsolve(scene: Scene) -> None:
         simulate(scene, [1.0], [0.0], 1.0, adjoint=dfx.BacksolveAdjoint())
 
 
-@pytest.mark.deep
 @pytest.mark.parametrize("scene", [SPRING, BRAKED], ids=["smooth", "events"])
 def test_simulate_takes_the_other_adjoints(scene: Scene) -> None:
     def end(k: Any, adjoint: Any, rtol: Any = 1e-6) -> Any:
@@ -216,7 +215,6 @@ def test_simulate_takes_the_other_adjoints(scene: Scene) -> None:
         np.testing.assert_allclose(slope(mode, StoredSteps(every, probe=False), 1e-9), tight, rtol=1e-11)
 
 
-@pytest.mark.deep
 def test_derivatives_of_a_resting_place_are_exact_to_rounding() -> None:
     """x'' + x in -[-1, 1] from (12, 6): half circles about +-1, the first of radius sqrt(13^2 + 6^2), to a rest.
 
@@ -235,7 +233,6 @@ def test_derivatives_of_a_resting_place_are_exact_to_rounding() -> None:
             np.testing.assert_allclose(slope(jnp.array([12.0, 6.0]), rtol), exact, rtol=admissible)
 
 
-@pytest.mark.deep
 def test_second_derivatives_through_events() -> None:
     """Place of rest of a braked spring by its stiffness, twice: (-1)^n (x0 - 2 n Fc/k).
 

@@ -283,7 +283,6 @@ def test_trap_a_double_crossing_in_one_step() -> None:
     np.testing.assert_allclose(ours.ys.log.t[0, 0], 0.04, rtol=1e-12)
 
 
-@pytest.mark.deep
 def test_batches_with_different_numbers_of_events_do_not_disturb_each_other() -> None:
     """Values and gradients of a batch, one lane of which accumulates events, equal those of the runs alone."""
 

@@ -105,7 +105,6 @@ def test_steps_between_those_kept_are_made_again(every: int, wanted: dict[str, A
             np.testing.assert_allclose(slopes[name], wanted[name], rtol=1e-10, err_msg=name)
 
 
-@pytest.mark.deep
 def test_second_derivatives() -> None:
     """Forward over reverse and twice forward; reverse over reverse says what to take."""
     names = ("mu", "f", "x0")
@@ -204,7 +203,6 @@ def test_the_derivative_is_that_of_the_steps(every: int) -> None:
         np.testing.assert_allclose(jax.jit(mode(saved))(k), jax.jacfwd(exact)(k), rtol=1e-12)
 
 
-@pytest.mark.deep
 def test_vmap_and_float32() -> None:
     """Runs of different lengths in one batch are as each alone; in float32 to its rounding."""
     t1 = jnp.linspace(1.5, 3.0, 3)

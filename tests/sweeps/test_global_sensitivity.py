@@ -133,7 +133,6 @@ def belt(request: pytest.FixtureRequest) -> GlobalSensitivity:
     return of_belts(request.param, 256 if request.param == "sobol" else 40, belt=(0.03, 0.2), k=(80.0, 120.0))
 
 
-@pytest.mark.deep
 def test_belts_that_stick_and_that_do_not(belt: GlobalSensitivity) -> None:
     """It sticks where its swing reaches the velocity of the belt: |q0 - Fc/k| sqrt(k/m) > belt."""
     k, v = (np.asarray(belt.runs[name]) for name in ("k", "friction.belt_velocity"))

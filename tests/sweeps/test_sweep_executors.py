@@ -44,7 +44,6 @@ def assert_same(one: xr.Dataset, other: xr.Dataset) -> None:
     np.testing.assert_array_equal(one["num_steps"], other["num_steps"])
 
 
-@pytest.mark.deep
 def test_two_devices(found: xr.Dataset, tmp_path: Path) -> None:
     """Two devices in one process are asked for before JAX starts, so in a process of its own."""
     script = (
