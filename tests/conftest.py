@@ -106,13 +106,9 @@ class ByModule(LoadScopeScheduling):
         return nodeid if Path(module).stem in _APART else module
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--processor-times", type=Path, help="folder for the processor time of each test")
-
-
 def pytest_configure(config: pytest.Config) -> None:
-    if folder := config.getoption("--processor-times"):
-        config.pluginmanager.register(deep.ProcessorTimes(folder))
+    if folder := os.environ.get("PROCESSOR_TIMES"):
+        config.pluginmanager.register(deep.ProcessorTimes(Path(folder)))
 
 
 @pytest.hookimpl(tryfirst=True)  # before `-m` selects

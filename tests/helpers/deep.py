@@ -3,7 +3,7 @@
 A line names a test, a function with all its parameters, or a file. To measure anew:
 
 ```sh
-python -m pytest -n 2 -m "" --processor-times build/times     # seconds and names, a file for each process
+PROCESSOR_TIMES=build/times python -m pytest -n 2 -m ""     # seconds and names, a file for each process
 ```
 """
 
