@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from ._options import FitRequest, Interrupted, Out, PredictRequest, SpecFile, SweepRequest, command_of
+from ._options import FitRequest, Interrupted, Out, PredictRequest, SpecFile, SweepRequest, check_axis, command_of
 
 app = typer.Typer(
     name="jaxmodsim",
@@ -75,14 +75,13 @@ def fit(request: FitRequest) -> None:
 
     Ctrl-C ends the search; its result so far is written, and the exit code is 130.
     """
+    check_axis(request)
     _start()
     if request.axis == "servo":
         from ._servo import run_servo_fit
 
         run_servo_fit(request)
         return
-    if request.axis != "driven":
-        raise ValueError(f"--axis must be driven or servo, but {request.axis!r} was given.")
     from ._fit import run_fit
 
     run_fit(request)

@@ -64,11 +64,11 @@ def run_fit(request: FitRequest) -> None:
             if outcome.result is not fitted:
                 _show(outcome)
                 write(request.out, _files(outcome))
-        if request.next_input is not None:
+        if request.next is not None:
             design = _designed(request, outcome)
             outcome = replace(outcome, design=design)
-            say(f"Next input, for {request.next_input}:\n{design}")
-            paths += write(request.next_input.parent, {request.next_input.name: design})
+            say(f"Next input, for {request.next}:\n{design}")
+            paths += write(request.next.parent, {request.next.name: design})
             paths += write(request.out, {"next.png": design_figure(design), "next.json": design.to_dict()})
             interrupted = interrupted or design.ending == "was interrupted"
     except KeyboardInterrupt:

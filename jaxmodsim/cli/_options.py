@@ -97,14 +97,15 @@ class FitRequest:
         ),
     ] = field(default_factory=list)
     laws: Annotated[
-        str,
+        str | None,
         _option(
             _MODEL,
-            "Friction of the axis: coulomb, asymmetric, stribeck, lugre. Several, separated by commas, or `all` are"
-            " compared by held-out error; the simplest law that is as good as the best is taken.",
+            "Friction of the axis: coulomb (the default), asymmetric, stribeck, lugre. Several, separated by commas, or"
+            " `all` are compared by held-out error; the simplest law that is as good as the best is taken. A servo has"
+            " the laws M1 to M6 and MQ, by default all.",
             "A,B,...|all",
         ),
-    ] = "coulomb"
+    ] = None
     free: Annotated[
         list[str],
         _option(
@@ -165,13 +166,12 @@ class FitRequest:
     ] = None
     out: Out = Path("jaxmodsim-fit")
     report: Annotated[Path | None, _option(None, "Folder for report.html, a page in one file.")] = None
-    next_input: Annotated[
+    next: Annotated[
         Path | None,
         _option(
             _NEXT,
             "CSV file for the motion and force of the most informative next record. It starts in the middle of the"
             " recorded travel.",
-            flag="--next",
         ),
     ] = None
     max_force: Annotated[float | None, _option(_NEXT, "Largest force [N]; default: that of the records.")] = None
@@ -186,8 +186,7 @@ class FitRequest:
         _option(
             _SERVO,
             "driven, an axis under the force of --force; or servo, a position servo that turns a pendulum, from columns"
-            " of command and supply. --laws are then M1 to M6 and MQ, by default all. Of the other options, a servo"
-            " takes --time, --position and --out.",
+            " of command and supply. A servo takes the options of this panel, --time, --position, --laws and --out.",
             "driven|servo",
         ),
     ] = "driven"
@@ -215,6 +214,27 @@ class FitRequest:
             "NAME=MEAN:DEVIATION",
         ),
     ] = field(default_factory=list)
+
+
+def check_axis(request: FitRequest) -> None:
+    """Check that options of one kind of axis are not given for the other.
+
+    **Raises:**
+
+    - `ValueError` naming an option without meaning for the axis, or an unknown axis.
+    """
+    if request.axis not in ("driven", "servo"):
+        raise ValueError(f"--axis must be driven or servo, but {request.axis!r} was given.")
+    for each in fields(request):
+        default = each.default if each.default_factory is MISSING else each.default_factory()
+        if (
+            each.name in ("records", "time", "position", "laws", "out", "axis")
+            or getattr(request, each.name) == default
+        ):
+            continue
+        option = each.type.__metadata__[0]  # pyright: ignore[reportAttributeAccessIssue] # an Annotated
+        if (option.rich_help_panel == _SERVO) != (request.axis == "servo"):
+            raise ValueError(f"--{each.name.replace('_', '-')} does not belong to --axis {request.axis}.")
 
 
 @dataclass(frozen=True, kw_only=True)

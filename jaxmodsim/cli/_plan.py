@@ -139,17 +139,17 @@ def _check(request: FitRequest) -> None:
         raise ValueError("--folds and --held-out exclude each other: a model is validated by one of them.")
     numbers = {"force": request.max_force, "speed": request.max_speed, "travel": request.max_travel}
     for option, number in ({f"--max-{x}": n for x, n in numbers.items()} | {"--duration": request.duration}).items():
-        if number is not None and request.next_input is None:
+        if number is not None and request.next is None:
             raise ValueError(f"{option} belongs to --next FILE.csv, which is missing.")
         if number is not None and not (math.isfinite(number) and number > 0):
             raise ValueError(f"{option} must be finite and > 0, but it is {number}.")
-    if request.next_input is not None and request.next_input.is_dir():
-        raise ValueError(f"--next {request.next_input} is a folder; a file is needed.")
+    if request.next is not None and request.next.is_dir():
+        raise ValueError(f"--next {request.next} is a folder; a file is needed.")
 
 
 def _models(request: FitRequest) -> dict[str, AxisModel]:
     """The models that --laws names."""
-    known, names = axis_models(), _listed([request.laws])
+    known, names = axis_models(), _listed(["coulomb" if request.laws is None else request.laws])
     if not names:
         raise ValueError(f"--laws needs a law, several as A,B, or `all`, but {request.laws!r} was given.")
     names = list(known) if "all" in names else [_known("--laws", name, known, "law") for name in names]

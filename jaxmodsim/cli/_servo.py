@@ -217,11 +217,11 @@ def _gain(table: Columns, path: Path, gain: str | None) -> float:
     return value
 
 
-def _laws(text: str) -> tuple[str, ...]:
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    if names in (["all"], ["coulomb"]):  # the default of an axis
+def _laws(text: str | None) -> tuple[str, ...]:
+    names = ["all"] if text is None else [name.strip() for name in text.split(",") if name.strip()]
+    if names == ["all"]:
         return tuple(SERVO_LAWS)
-    for name in names:
+    for name in names or [""]:
         if name not in SERVO_LAWS:
             raise ValueError(f"--laws: a servo has the laws {', '.join(SERVO_LAWS)}, but {name!r} was given.")
     return tuple(names)

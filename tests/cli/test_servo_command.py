@@ -116,6 +116,13 @@ def test_wrong_options_and_files_are_named(folder, run_command) -> None:
         "a servo has the laws": ["fit", *records(folder), "--axis", "servo", "--laws", "lugre"],
         "there is no parameter 'kv'": ["fit", *records(folder), "--axis", "servo", "--prior", "kv=1:2"],
         "--prior needs NAME=MEAN:DEVIATION": ["fit", *records(folder), "--axis", "servo", "--prior", "kt=1"],
+        "a servo has the laws M1, M2, M3, M4, M5, M6, MQ, but 'coulomb'": [
+            *("fit", *records(folder), "--axis", "servo", "--laws", "coulomb"),
+        ],
+        "--units does not belong to --axis servo": ["fit", *records(folder), "--axis", "servo", "--units", "time=ms"],
+        "--free does not belong to --axis servo": ["fit", *records(folder), "--axis", "servo", "--free", "m"],
+        "--next does not belong to --axis servo": ["fit", *records(folder), "--axis", "servo", "--next", "next.csv"],
+        "--gain does not belong to --axis driven": ["fit", *records(folder), "--gain", "100"],
         "--axis must be driven or servo": ["fit", *records(folder), "--axis", "arm"],
     }
     for message, arguments in cases.items():

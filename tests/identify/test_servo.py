@@ -129,6 +129,10 @@ def test_wrong_arguments_are_named() -> None:
         fitted([record, record], "M9")
     with pytest.raises(ValueError, match="two records at least"):
         fitted([record], "M1")
+    with pytest.raises(ValueError, match="groups needs a group of some of the records"):
+        fitted([record, record], groups={})
+    with pytest.raises(ValueError, match="groups needs a group of some of the records"):
+        fitted([record, record], groups={"all": [record.name]})
     with pytest.raises(ValueError, match="groups names 'other'"):
         fitted([record], "M1", {"a": ["other"]})
     with pytest.raises(ValueError, match="kt must be"):

@@ -183,6 +183,7 @@ def fit_servo(
     - `law`: one of `SERVO_LAWS`.
     - `inertia`: of the pendulum [kg m^2]. `gravity`: its torque at a right angle [N m].
     - `groups`: names of records that are left out together, by the name of the group; by default each record alone.
+      A group of all records is not left out.
     - `prior`: mean and standard deviation by name, such as those of a data sheet: `{"kt": (0.37, 0.05)}`.
     - `level`: share of the samples in a band, 0 < level < 1.
     - `progress`: called with the name of each fit that begins.
@@ -193,7 +194,7 @@ def fit_servo(
 
     **Raises:**
 
-    - `ValueError` for an unknown law or group, or fewer than two records.
+    - `ValueError` for an unknown law or record, fewer than two records, or no group of some of them.
     """
     if law not in SERVO_LAWS:
         raise ValueError(f"law must be one of {', '.join(SERVO_LAWS)}, but {law!r} was given.")
@@ -205,6 +206,9 @@ def fit_servo(
         raise ValueError(f"groups names {unknown[0]!r}, but the records are: {', '.join(names)}.")
     if len(records) < 2:
         raise ValueError("fit_servo needs two records at least, since it leaves out one after the other.")
+    groups = {name: group for name, group in groups.items() if group and not set(names) <= set(group)}
+    if not groups:
+        raise ValueError("groups needs a group of some of the records, but every group given has none or all of them.")
     start = Servo.start(law, inertia, gravity)
     whole = _problem(start, law, records, prior or {})
     parts = [servo_windows(record, _WINDOW) for record in records]
@@ -230,8 +234,6 @@ def fit_servo(
     members, without, left_out = {}, [], {}
     for name, group in groups.items():
         out = np.isin(names, group)
-        if out.all():
-            continue
         x = search(f"without {name}", ~out).state.x
         members[name] = {k: float(v) for k, v in whole.at(x).values.items()}
         angles = _angles(whole, x)
