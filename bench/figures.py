@@ -57,6 +57,22 @@ def lugre_work_precision(r: Recorded) -> Figure:
     return figure
 
 
+def lugre_testbench(r: Recorded) -> Figure:
+    """Plot times of one run, and of one of many, as bars on a logarithmic axis."""
+    figure, axes = plt.subplots(1, 2, figsize=(8.4, 3.8), sharey=True, layout="constrained")
+    peers = r.all_of("run of many", "peer")[::-1]
+    one = [1e3 * r.number("run", peer=peer, at="chosen") for peer in peers]
+    ways = {peer: r.all_of("run of many", "at", peer=peer) for peer in peers}
+    many = [1e3 * min(r.number("run of many", peer=peer, at=way) for way in ways[peer]) for peer in peers]
+    for panel, letter, times, title in zip(axes, "ab", (one, many), ("one run", "one of many runs"), strict=True):
+        colours = [BLUE if peer == OURS else GREY for peer in peers]
+        bars = panel.barh(peers, times, color=colours)
+        panel.bar_label(bars, [f"{time:.2g}" for time in times], padding=3, fontsize=9)
+        panel.set(xscale="log", xlabel="time [ms]", title=title, xlim=(0.3 * min(times), 4.0 * max(times)))
+        panel.set_title(letter, loc="left", fontweight="bold")
+    return figure
+
+
 def long_runs(r: Recorded) -> Figure:
     """Plot errors of the energy and of the angle over periods, with a line for each solver."""
     figure, axes = plt.subplots(1, 2, figsize=(13.0, 5.0), layout="constrained")
@@ -129,7 +145,10 @@ def hard_steps(r: Recorded) -> Figure:
 
 # Figures by name, each with its bench.
 FIGURES: dict[str, tuple[str, Callable[[Recorded], Figure]]] = {
-    **{each.__name__: (each.__name__, each) for each in (accelerations, lugre_work_precision, long_runs)},
+    **{
+        each.__name__: (each.__name__, each)
+        for each in (accelerations, lugre_testbench, lugre_work_precision, long_runs)
+    },
     **{each.__name__: ("hard_cases", each) for each in (hard, hard_steps)},
 }
 

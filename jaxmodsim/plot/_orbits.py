@@ -67,8 +67,11 @@ def branch_figure(branch: Branch[PeriodicOrbit], coordinate: int = 0, *, beside:
     """
     orbits = branch.orbits
     autonomous = orbits[0].autonomous
-    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(1.3, 1.0))
+    figure = Figure(figsize=(9.0, 5.0), layout="constrained")
+    rows = [["amplitude", "orbits"], ["period", "orbits"]] if autonomous else [["amplitude", "orbits"]]
+    sizes = {"height_ratios": (2.2, 1.0)[: len(rows)], "width_ratios": (1.3, 1.0)}
+    panels = figure.subplot_mosaic(rows, **sizes)
+    left, right = panels["amplitude"], panels["orbits"]
     scene = orbits[0].runs[0].scene
     name, unit = quantity_of(scene, f"q[{coordinate}]")
     for each in (branch, *beside):
@@ -77,15 +80,18 @@ def branch_figure(branch: Branch[PeriodicOrbit], coordinate: int = 0, *, beside:
             amplitude = float(point.orbit.amplitude[coordinate])
             left.plot(point.value, amplitude, _MARKERS[point.kind], color=RED, ms=7, zorder=4, label=point.kind)
     parameter = with_unit(branch.parameter, scene_units(scene).get(branch.parameter, ""))
-    left.set(xlabel=parameter, ylabel=with_unit(f"amplitude of {name}", unit))
+    left.set(xlabel="" if autonomous else parameter, ylabel=with_unit(f"amplitude of {name}", unit))
     left.ticklabel_format(axis="y", scilimits=_PLAIN)
     if autonomous:
-        of_period = left.twinx()
-        of_period.plot(branch.values, branch.period, color=GREY, lw=0.9, label="period")
-        of_period.set_ylabel("period [s]", color=GREY)
-        middle = np.mean(of_period.get_ylim())
-        if np.ptp(of_period.get_ylim()) < _LEAST_RANGE * middle:
-            of_period.set_ylim((1.0 - 0.5 * _LEAST_RANGE) * middle, (1.0 + 0.5 * _LEAST_RANGE) * middle)
+        period = panels["period"]
+        period.sharex(left)
+        left.tick_params(labelbottom=False)
+        period.plot(branch.values, branch.period, color=GREY, lw=1.3)
+        period.set(xlabel=parameter, ylabel="period [s]")
+        period.ticklabel_format(axis="y", scilimits=_PLAIN)
+        middle = np.mean(period.get_ylim())
+        if np.ptp(period.get_ylim()) < _LEAST_RANGE * middle:
+            period.set_ylim((1.0 - 0.5 * _LEAST_RANGE) * middle, (1.0 + 0.5 * _LEAST_RANGE) * middle)
     handles = dict(zip(*reversed(left.get_legend_handles_labels()), strict=True))
     left.legend(handles.values(), handles.keys(), fontsize=9, frameon=False)
     shown = sorted({0, len(orbits) // 2, len(orbits) - 1})
@@ -95,7 +101,7 @@ def branch_figure(branch: Branch[PeriodicOrbit], coordinate: int = 0, *, beside:
     right.legend(fontsize=9, frameon=False, loc="upper right")
     values = ", ".join(f"{branch.values[i]:.4g}" for i in shown)
     right.set_title(f"{branch.parameter} = {values}", fontsize=10)
-    panel_letters((left, right))
+    panel_letters(panels.values())
     return figure
 
 

@@ -38,8 +38,8 @@ def test_a_branch_is_drawn_with_its_stability_and_period(branch: Branch) -> None
     rests = jms.continue_equilibria(
         belt_oscillator.scene(belt_oscillator.stribeck(), c=2.0), [0.0], branch.parameter, (0.8, 0.1), step=0.5
     )
-    beside = branch_figure(branch, beside=(rests,)).axes[0]
-    assert beside.get_xlabel() == "friction.belt_velocity [m/s]"
+    beside, _, below = branch_figure(branch, beside=(rests,)).axes
+    assert below.get_xlabel() == "friction.belt_velocity [m/s]"
     legend = beside.get_legend()
     assert legend is not None
     assert {text.get_text() for text in legend.get_texts()} == {"stable", "unstable", "Hopf"}
