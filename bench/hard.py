@@ -1,4 +1,4 @@
-"""All hard cases under every transform, in several processes, and the largest stable steps, as rows of a result."""
+"""All hard cases in several processes, and the largest stable steps, as rows of a result."""
 
 import math
 import multiprocessing
@@ -11,17 +11,9 @@ import jax
 
 from bench.record import Result
 from tests.hard.catalogue import LONG, hard_cases
-from tests.hard.check import DTYPES, TRANSFORMS, CaseReport, CheckFinding, check
+from tests.hard.check import DTYPES, CaseReport, CheckFinding, check
 from tests.hard.steps import EXPLICIT, formulations, largest_step, theory
 
-VALUES, SLOPES = ("alone", "jit", "vmap"), ("forward", "reverse")
-# Kinds of errors by name: floating type and transforms.
-KINDS = {
-    "value, float64": ("float64", VALUES),
-    "derivative, float64": ("float64", SLOPES),
-    "energy balance": ("float64", ("energy",)),
-    "value or derivative, float32": ("float32", (*VALUES, *SLOPES)),
-}
 # Number of cases for each process. A case compiles tens of programs, each with several memory maps, and Linux allows a
 # process 65 530 maps.
 _PORTION = 12
@@ -31,9 +23,9 @@ def add_errors(result: Result, reports: Iterable[CaseReport]) -> None:
     """Add errors relative to the admissible error, and whether each case passes."""
     for report in reports:
         about = {"case": f"{report.case.family}: `{report.case.name}`"}
-        for kind, (dtype, transforms) in KINDS.items():
-            error = report.worst(dtype, transforms)
-            result.add("error", None if math.isnan(error) else error, at=kind, **about)
+        for dtype in DTYPES:
+            error = report.worst(dtype)
+            result.add("error", None if math.isnan(error) else error, at=dtype, **about)
         result.add("passes", "yes" if report.ok else "**no**", **about)
 
 
@@ -46,9 +38,7 @@ def add_steps(result: Result, names: Sequence[str], solvers: Sequence[str] = tup
             result.add("step found", largest_step(law, EXPLICIT[solver]), "s", case=name, peer=solver)
 
 
-def check_many(
-    names: Sequence[str], transforms: Sequence[str] = TRANSFORMS, dtypes: Sequence[str] = DTYPES
-) -> list[CaseReport]:
+def check_many(names: Sequence[str]) -> list[CaseReport]:
     """Reports on cases in this order, printed as they arrive. A killed process gives reports too."""
     cases, jobs = hard_cases(), multiprocessing.cpu_count()
     reports: dict[str, CaseReport] = {}
@@ -57,10 +47,10 @@ def check_many(
     for first in range(0, len(order), jobs * _PORTION):
         portion = order[first : first + jobs * _PORTION]
         with ProcessPoolExecutor(jobs, context, initializer=_begin) as pool:
-            futures = {pool.submit(_found, name, tuple(transforms), tuple(dtypes)): name for name in portion}
+            futures = {pool.submit(_found, name): name for name in portion}
             for future in as_completed(futures):
                 report = reports[futures[future]] = CaseReport(cases[futures[future]], _result(future))
-                failed = [f"{each.transform}, {each.dtype}: {each.sentence}" for each in report.findings if not each.ok]
+                failed = [f"{each.dtype}: {each.sentence}" for each in report.findings if not each.ok]
                 print(f"{report.case.name}: {'; '.join(failed) or 'pass'}", flush=True)
     return [reports[name] for name in names]
 
@@ -81,9 +71,9 @@ def _begin() -> None:
 _cases = cache(hard_cases)
 
 
-def _found(name: str, transforms: tuple[str, ...], dtypes: tuple[str, ...]) -> tuple[CheckFinding, ...]:
+def _found(name: str) -> tuple[CheckFinding, ...]:
     try:
-        return check(_cases()[name], transforms, dtypes).findings
+        return check(_cases()[name], ["alone"]).findings
     except Exception as error:
         # The other cases continue after any error.
         return (CheckFinding("alone", "float64", math.nan, False, f"{type(error).__name__}: {error}"),)
