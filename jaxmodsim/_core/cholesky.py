@@ -99,40 +99,45 @@ def factor_positive_definite(matrix: Float[Array, "n n"]) -> Callable[[Array], A
 _REFINEMENTS = 2
 
 
-def solve_balanced(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, " n"]:
+def solve_balanced(matrix: Float[Array, "n n"], rhs: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """`solve_semidefinite` with all rows active and with weights that scale every diagonal entry to one."""
     diagonal = jnp.diagonal(matrix)
     weight = 1.0 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
-    return solve_semidefinite(matrix, rhs, weight, jnp.ones(rhs.shape, bool))
+    return solve_semidefinite(matrix, rhs, weight, jnp.ones(diagonal.shape, bool))
 
 
 def solve_semidefinite(
-    matrix: Float[Array, "n n"], rhs: Float[Array, " n"], weight: Float[Array, " n"], active: Bool[Array, " n"]
-) -> Float[Array, " n"]:
+    matrix: Float[Array, "n n"], rhs: Float[Array, "n *k"], weight: Float[Array, " n"], active: Bool[Array, " n"]
+) -> Float[Array, "n *k"]:
     """Solve the active rows of a symmetric positive semidefinite system; if they are redundant, with least norm.
 
     **Arguments:**
 
     - `matrix`: shape `[n, n]`.
-    - `rhs`: shape `[n]`, in the range of the matrix.
+    - `rhs`: shape `[n]`, or `[n, k]` for k right-hand sides; in the range of the matrix.
     - `weight`: shape `[n]`, > 0: the solution minimizes the sum of `(x_i/weight_i)^2`. Constant under differentiation.
     - `active`: which rows are active; the unknowns of the others are zero.
 
     **Returns:**
 
-    The solution, shape `[n]`. It is exact up to rounding if the matrix, scaled by the weights to a largest entry of
-    one, has no eigenvalues between 0 and 1e-4.
+    The solution, of the shape of `rhs`. It is exact up to rounding if the matrix, scaled by the weights to a largest
+    entry of one, has no eigenvalues between 0 and 1e-4.
     """
     n = rhs.shape[0]
+
+    def each(row: Array) -> Array:
+        """Values of the rows, for every right-hand side."""
+        return row[:, None] if rhs.ndim == 2 else row
+
     if n == 1:
-        diagonal = matrix[0]
-        return jnp.where(active, rhs / jnp.where(diagonal > 0, diagonal, jnp.inf), 0.0)
+        diagonal = each(matrix[0])
+        return jnp.where(each(active), rhs / jnp.where(diagonal > 0, diagonal, jnp.inf), 0.0)
     weight = jax.lax.stop_gradient(weight)
     both = active[:, None] & active[None, :]
     scaled = jnp.where(both, matrix * weight[:, None] * weight[None, :], 0.0)
     scale = jnp.max(scaled)
     scale = jnp.where(scale > 0, scale, 1.0)
-    scaled, right = scaled / scale, jnp.where(active, weight * rhs, 0.0) / scale
+    scaled, right = scaled / scale, jnp.where(each(active), each(weight) * rhs, 0.0) / scale
     # A shift keeps the factors of redundant rows finite, and selects the solution of least norm. Refinement removes its
     # error, down to rounding if the rows are not redundant.
     shift = float(jnp.finfo(rhs.dtype).eps) ** 0.5
@@ -140,8 +145,9 @@ def solve_semidefinite(
     solve = factor_positive_definite(shifted)
     solution = solve(right)
     for _ in range(_REFINEMENTS):
-        solution = solution + solve(right - jnp.sum(scaled * solution[None, :], axis=1))
+        product = jnp.sum((scaled[:, :, None] if rhs.ndim == 2 else scaled) * solution[None], axis=1)
+        solution = solution + solve(right - product)
     # In the null space of the matrix the solution contains rounding divided by the shift. Two more solves isolate that
     # part: they scale the other components by (shift/eigenvalue)^2.
     solution = solution - shift**2 * solve(solve(solution))
-    return jnp.where(active, weight * solution, 0.0)
+    return jnp.where(each(active), each(weight) * solution, 0.0)

@@ -260,17 +260,17 @@ class LinearizedConstraints(NamedTuple):
         """Multipliers that make the accelerations `qdd` admissible."""
         return -solve_balanced(self.matrix, _times(self.rows, qdd) + self.bias)
 
-    def multiplier_response(self, qdd: PerDof) -> Float[Array, " m"]:
-        """Change of the multipliers if the unconstrained accelerations change by `qdd`."""
+    def multiplier_response(self, qdd: Float[Array, "dof *k"]) -> Float[Array, "m *k"]:
+        """Change of the multipliers if the unconstrained accelerations change by `qdd`, one or several."""
         return -solve_balanced(self.matrix, _times(self.rows, qdd))
 
-    def respond(self, qdd: PerDof) -> PerDof:
-        """Change of the accelerations if the unconstrained accelerations change by `qdd`."""
+    def respond(self, qdd: Float[Array, "dof *k"]) -> Float[Array, "dof *k"]:
+        """Change of the accelerations if the unconstrained accelerations change by `qdd`, one or several."""
         return qdd + self.apply_force(self.multiplier_response(qdd))
 
-    def apply_force(self, multipliers: Float[Array, " m"]) -> PerDof:
+    def apply_force(self, multipliers: Float[Array, "m *k"]) -> Float[Array, "dof *k"]:
         """Accelerations by the multipliers."""
-        return jnp.sum(self.minv_jt * multipliers[:, None], axis=0)
+        return _times(self.minv_jt.T, multipliers)
 
     def force(self, multipliers: Float[Array, " m"]) -> PerDof:
         """Generalised force of the multipliers."""
@@ -395,5 +395,6 @@ def _mobility(rows: Float[Array, "m dof"], mass: Float[Array, "dof dof"]) -> tup
     return minv_jt, jnp.sum(rows[:, None, :] * minv_jt[None, :, :], axis=2)
 
 
-def _times(rows: Float[Array, "m dof"], vector: PerDof) -> Float[Array, " m"]:
-    return jnp.sum(rows * vector[None, :], axis=1)
+def _times(matrix: Float[Array, "m n"], vectors: Float[Array, "n *k"]) -> Float[Array, "m *k"]:
+    """Product with one vector, or with several as columns, written as a sum: see `in_scalars`."""
+    return jnp.sum((matrix if vectors.ndim == 1 else matrix[:, :, None]) * vectors[None], axis=1)

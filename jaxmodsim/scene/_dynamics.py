@@ -302,15 +302,15 @@ class Mobility(NamedTuple):
             else free + self.constraints.apply_force(self.constraints.multipliers(free))
         )
 
-    def respond(self, force: PerDof) -> PerDof:
-        """Change of the accelerations with the generalised force."""
+    def respond(self, force: Float[Array, "dof *k"]) -> Float[Array, "dof *k"]:
+        """Change of the accelerations with the generalised force, one or several."""
         free = self.solve(force)
         return free if self.constraints is None else self.constraints.respond(free)
 
-    def least(self, row: PerDof) -> Scalar:
-        """Least mobility [1/kg] along a direction within constraints that is above rounding."""
-        eps = float(jnp.finfo(row.dtype).eps)
-        return _ROUNDING * eps * jnp.sum(row * self.solve(row))
+    def least(self, rows: Float[Array, "n dof"]) -> Float[Array, " n"]:
+        """Least mobility [1/kg] along each direction within constraints that is above rounding."""
+        eps = float(jnp.finfo(rows.dtype).eps)
+        return _ROUNDING * eps * jnp.sum(rows.T * self.solve(rows.T), axis=0)
 
 
 def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> Dynamics:
@@ -413,11 +413,11 @@ def _loads(
     chosen = dict(zip(scene.constraint_names, scene.constraints, strict=True))
     at = jnp.concatenate([where[name] for name in names])
     size = jnp.stack([chosen[name].per_multiplier(t, y.q, scene.params) for name in names])
-    yields = [mobility.constraints.multiplier_response(mobility.solve(row)) for row in rows]
+    yields = mobility.constraints.multiplier_response(mobility.solve(rows.T))
     return Loads(
         jnp.asarray([[float(name == each) for name in names] for each in loaded], y.q.dtype),
         size * multipliers[at],
-        size[:, None] * jnp.stack([each[at] for each in yields], axis=1),
+        size[:, None] * yields[at],
         jnp.asarray([0.0 if isinstance(chosen[name], Contact) else -1.0 for name in names], y.q.dtype),
     )
 

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._core.arrays import PerDof, Scalar
@@ -206,9 +207,9 @@ def assemble_friction(
     - `friction`: elements with a mode.
     - `reaction_loaded`: for each element without a mode, which a reaction loads, the generalised force that it takes
       away per newton of load.
-    - `respond`: maps a generalised force to accelerations within the constraints.
-    - `least_mobility`: maps a direction to the least mobility [1/kg] above rounding; None without constraints, where
-      nothing cancels.
+    - `respond`: maps generalised forces, as columns, to accelerations within the constraints.
+    - `least_mobility`: maps directions, as rows, to the least mobilities [1/kg] above rounding; None without
+      constraints, where nothing cancels.
     - `loads`: the `Loads`, from the directions of all rows and the number of rows of each element.
     - `t`, `q`, `qd`, `params`: the state.
     - `mode`: modes, from which planes take their reference velocities.
@@ -237,20 +238,19 @@ def assemble_friction(
         rows += [(v[i], rate[i], zero, zero, upper, lower, force[i], onset) for i in range(v.shape[0])]
     directions += reaction_loaded
     rows += [(zero, zero, one, one, one, one, zero, zero) for _ in reaction_loaded]
-    minv_jt = [respond(row) for row in directions]
-    delassus = jnp.stack([jnp.stack([jnp.sum(row * each) for each in minv_jt]) for row in directions])
+    along = jnp.stack(directions)
+    minv_jt = respond(along.T).T
+    delassus = jnp.sum(along[:, None, :] * minv_jt[None], axis=2)
     if least_mobility is not None:
         # Where constraints leave a direction no mobility (a slider at its dead centre), no force holds it. Rounding may
         # leave a mobility of zero or less, which would look as if no force were needed.
-        delassus = delassus + jnp.diag(jnp.stack([least_mobility(row) for row in directions]))
+        delassus = delassus + jnp.diag(least_mobility(along))
     columns = [*zip(*rows, strict=True)]
     v, rate, *forces = (jnp.stack(column) for column in columns[:6])
     planar = PlanarSlip(*(jnp.stack(column) for column in columns[6:])) if planes else None
     widths += [1] * len(reaction_loaded)
-    loaded = loads(jnp.stack(directions), tuple(widths))
-    return FrictionElements(
-        v, rate, delassus, jnp.stack(minv_jt), *forces, planar=planar, loads=loaded, planes=tuple(planes)
-    )
+    loaded = loads(along, tuple(widths))
+    return FrictionElements(v, rate, delassus, minv_jt, *forces, planar=planar, loads=loaded, planes=tuple(planes))
 
 
 def solve_friction_forces(
@@ -272,24 +272,26 @@ def solve_friction_forces(
 
         slip_force = elements.in_planes(slip_force, in_plane)
 
-    def with_stick(slip_force: Array, free: Array | float) -> Array:
-        """Slip forces, and the multipliers of stick beside them, where slip accelerations without both are `free`."""
-        drive = free - jnp.sum(elements.delassus * jnp.where(sticks, 0.0, slip_force)[None, :], axis=1)
-        return jnp.where(sticks, _multipliers(elements, drive, sticks), slip_force)
-
     if elements.loads is None:
-        force = with_stick(slip_force, elements.free_slip_acceleration)
+        slipping = jnp.where(sticks, 0.0, slip_force)
+        drive = elements.free_slip_acceleration - jnp.sum(elements.delassus * slipping[None, :], axis=1)
+        force = jnp.where(sticks, _multipliers(elements, drive, sticks), slip_force)
         return FrictionForces(force, elements.upper, elements.lower, jnp.ones_like(elements.v[0]))
+    # Forces are linear in the loads. Columns: the slip forces without loads, beside the accelerations without friction;
+    # then the slip forces by one newton of each load alone.
     on, coupling = elements.loads.on, elements.loads.normal_coupling
-    count = on.shape[1]
     loaded = jnp.sum(on, axis=1)
-    fixed = with_stick(jnp.where(loaded > 0, 0.0, slip_force), elements.free_slip_acceleration)
-    per_load = jnp.stack([with_stick(on[:, k] * slip_force, 0.0) for k in range(count)])
+    slip_forces = jnp.concatenate([jnp.where(loaded > 0, 0.0, slip_force)[:, None], on * slip_force[:, None]], axis=1)
+    slipping = jnp.where(sticks[:, None], 0.0, slip_forces)
+    free = jnp.pad(elements.free_slip_acceleration[:, None], ((0, 0), (0, on.shape[1])))
+    drive = free - jnp.sum(elements.delassus[:, :, None] * slipping[None], axis=1)
+    forces = jnp.where(sticks[:, None], _multipliers(elements, drive, sticks), slip_forces)
+    fixed, per_load = forces[:, 0], forces[:, 1:]
     normal = elements.loads.normal - jnp.sum(coupling * fixed[None, :], axis=1)
-    gain = jnp.sum(coupling[:, None, :] * per_load[None, :, :], axis=2)
+    gain = jnp.sum(coupling[:, :, None] * per_load[None], axis=1)
     load, margin = _solve_loads(normal, gain, elements.loads.pulls)
     factor = jnp.where(loaded > 0, jnp.sum(on * load[None, :], axis=1), 1.0)
-    force = fixed + jnp.sum(per_load * load[:, None], axis=0)
+    force = fixed + jnp.sum(per_load * load[None, :], axis=1)
     return FrictionForces(force, factor * elements.upper, factor * elements.lower, margin)
 
 
@@ -303,34 +305,50 @@ def _solve_loads(
     Systems of linear interval equations, Linear Algebra and its Applications 126:39, 1989).
     """
     k = normal.shape[0]
-    slope = jnp.where(normal > 0, 1.0, pulls)
     if k == 1:
+        slope = jnp.where(normal > 0, 1.0, pulls)
         load = slope * normal / (1.0 + gain[0] * slope)
         return load, jnp.minimum(1.0 + gain[0, 0], 1.0 + gain[0, 0] * pulls[0])
 
-    def rows(slope: Array) -> list[list[Array]]:
-        return [[gain[i, j] * slope[j] + (1.0 if i == j else 0.0) for j in range(k)] for i in range(k)]
+    # Cramer's rule for all choices of slopes at once: entries are vectors of length 2^k.
+    takes = np.array(list(product((False, True), repeat=k))).T
+    rows = _rows(gain, jnp.where(takes, pulls[:, None], 1.0))
+    determinant = _determinant(rows)
+    right, violation = _constant(jnp.unstack(normal)), jnp.zeros(2**k, normal.dtype)
+    rows, divisor = _constant(rows), _constant(determinant)
+    for j in range(k):
+        replaced = [[*row[:j], right[i] + 0.0 * row[j], *row[j + 1 :]] for i, row in enumerate(rows)]
+        signed = _determinant(replaced) / jnp.where(divisor == 0, jnp.nan, divisor)
+        violation = violation + jnp.maximum(jnp.where(takes[j], signed, -signed), 0.0)
+    # The choice whose signs agree with its slopes; two agree where a load is zero, and either is right.
+    best = jnp.min(jnp.where(jnp.isnan(violation), jnp.inf, violation))
+    slope = jnp.where(jnp.any(takes & (violation <= best)[None, :], axis=1), pulls, 1.0)
+    signed = jnp.stack(factor_lu(_rows(gain, _constant(slope)), pivot=True)(list(jnp.unstack(normal))))
+    return jnp.where(signed > 0, 1.0, pulls) * signed, jnp.min(determinant)
 
-    signed = normal
-    for _ in range(2 * k):  # Newton's iteration on a piecewise linear function
-        signed = jnp.stack(factor_lu(rows(_constant(slope)), pivot=True)([normal[i] for i in range(k)]))
-        slope = jnp.where(signed > 0, 1.0, pulls)
-    corners = [jnp.stack(each) for each in product(*((jnp.ones_like(x), x) for x in pulls))]
-    margin = jnp.min(jnp.stack([_determinant(rows(corner)) for corner in corners]))
-    return slope * signed, margin
+
+def _rows(gain: Float[Array, "k k"], slope: Float[Array, "k *m"]) -> list[list[Array]]:
+    """Entries of `I + gain S`, for one vector of slopes or several."""
+    k = gain.shape[0]
+    expand = (k, k, *(1,) * (slope.ndim - 1))
+    matrix = gain.reshape(expand) * slope[None] + jnp.eye(k, dtype=gain.dtype).reshape(expand)
+    return [list(jnp.unstack(row)) for row in jnp.unstack(matrix)]
 
 
 def _determinant(rows: list[list[Array]]) -> Array:
+    """Determinants of matrices whose entries are vectors."""
     if len(rows) == 1:
         return rows[0][0]
-    signs = [1.0 if j % 2 == 0 else -1.0 for j in range(len(rows))]
-    minors = [_determinant([row[:j] + row[j + 1 :] for row in rows[1:]]) for j in range(len(rows))]
-    return jnp.sum(jnp.stack([s * a * m for s, a, m in zip(signs, rows[0], minors, strict=True)]))
+    total = jnp.zeros_like(rows[0][0])
+    for j, entry in enumerate(rows[0]):
+        minor = entry * _determinant([row[:j] + row[j + 1 :] for row in rows[1:]])
+        total = total - minor if j % 2 else total + minor
+    return total
 
 
 def _multipliers(
-    elements: FrictionElements, drive: Float[Array, " n"], sticks: Bool[Array, " n"]
-) -> Float[Array, " n"]:
+    elements: FrictionElements, drive: Float[Array, "n *k"], sticks: Bool[Array, " n"]
+) -> Float[Array, "n *k"]:
     """Forces of the sticking elements that cancel their slip accelerations `drive`; zero for the others.
 
     Where sticking elements are redundant (two on one coordinate), the equations do not determine the share of each.

@@ -132,7 +132,7 @@ def _struck(
         )
     if scene.bilateral:
         held = linearize_constraints(scene.bilateral, t, q, qd, scene.params, mass)
-        reach = jnp.stack([held.respond(row) for row in reach])
+        reach = held.respond(reach.T).T
     delassus = jnp.sum(rows[:, None, :] * reach[None, :, :], axis=2)
     size = [each.per_multiplier(t, q, scene.params) for each in scene.contacts.values()]
     zero = jnp.zeros_like(t)

@@ -109,7 +109,7 @@ def scene_step(scene: Scene, t0: Scalar, t1: Scalar, y: State) -> tuple[State, B
     sizes = tuple(each.belt.shape[0] for each in elements.values())
     starts = [sum(sizes[:i]) for i in range(1, len(sizes))]
     rows = jnp.concatenate([each.rows for each in elements.values()])
-    reach = jnp.stack([mobility.respond(row) for row in rows])
+    reach = mobility.respond(rows.T).T
     coupling = h * jnp.sum(rows[:, None, :] * reach[None, :, :], axis=2)
     belts = jnp.concatenate([each.belt for each in elements.values()])
     solution = solve_monotone(forces, jnp.sum(rows * free[None, :], axis=1) - belts, coupling, sizes)

@@ -52,7 +52,7 @@ def karnopp_forces(
         limits.append([effect.static_limit(-one, load), effect.static_limit(one, load)])
         active.append(holds)
         rows.append(effect.direction(q, params))
-    reach = [respond(row) for row in rows]
+    reach = [*respond(jnp.stack(rows, axis=1)).T]
     qdd = accelerate(free)
     drive = [elements[name].slip_and_rate(t, q, qd, qdd, params)[1] for name in names]
     coupling = [[jnp.sum(a * b) for b in reach] for a in rows]
