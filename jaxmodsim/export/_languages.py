@@ -181,7 +181,8 @@ class _BlockText:
         declared = self.language.declared(word, np.dtype(int), counter)
         yield f"for ({declared} = 0; {counter} < {loop.bound}; ++{counter}) {{"
         yield from self.block(loop.head, "  ")
-        yield f"  if (!{self.value(loop.condition)}) break;"
+        if isinstance(loop.condition, Symbol):
+            yield f"  if (!{self.value(loop.condition)}) break;"
         yield from self.block(loop.body, "  ")
         # A value that is another carry is copied before that carry changes.
         changed = {carry.symbol for carry in loop.carries}
