@@ -61,6 +61,7 @@ static fmi3Instance instantiate(fmi3String token, bool steps, bool logs, fmi3Ins
   }
   c->steps = steps, c->logs = logs, c->environment = environment, c->log = log;
   motion_reset(&c->motion);
+  c->motion.coarse = !steps;
   return c;
 }
 
@@ -97,6 +98,7 @@ void fmi3FreeInstance(fmi3Instance instance) { free(instance); }
 fmi3Status fmi3Reset(fmi3Instance instance) {
   SELF;
   motion_reset(&c->motion);
+  c->motion.coarse = !c->steps;
   return fmi3OK;
 }
 
@@ -134,6 +136,7 @@ fmi3Status fmi3EnterEventMode(fmi3Instance instance) {
   SELF;
   STATE;
   if (s->phase != CONTINUOUS_TIME && s->phase != STEP_MODE) return fail(c, "the event mode follows a step");
+  if (!c->steps) s->moved = motion_project(&c->motion, s->y) > 0.0;
   if (!c->steps && motion_due(&c->motion, 64.0 * 2.3e-16 * fabs(s->t))) {
     /* Importers stop behind the root; the event is at the root, but not before the last one. */
     s->back = motion_to_root(&c->motion);
@@ -182,9 +185,9 @@ fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *again, f
   if (s->phase != EVENT_MODE) return fail(c, "discrete states are updated in the event mode");
   *again = *terminate = *nominalsChanged = *nextTimeDefined = false, *nextTime = 0.0;
   memcpy(y, s->y, sizeof y);
-  if (!c->steps) motion_project(&c->motion, s->y);
   if (!events(&c->motion)) return fail(c, c->motion.failure);
-  *statesChanged = memcmp(y, s->y, sizeof y) != 0;
+  *statesChanged = s->moved || memcmp(y, s->y, sizeof y) != 0;
+  s->moved = 0;
   return fmi3OK;
 }
 
@@ -452,8 +455,8 @@ fmi3Status fmi3CompletedIntegratorStep(fmi3Instance instance, fmi3Boolean noSetS
   double y[STATES];
   memcpy(y, c->motion.s.y, sizeof y);
   *terminate = false;
-  /* An event moves the state back onto constraints, and to zero slip in stick. */
-  *enterEventMode = motion_project(&c->motion, y) > 0.5;
+  /* An event moves the state back onto constraints, and to zero slip in stick; an importer may have missed another. */
+  *enterEventMode = motion_project(&c->motion, y) > 0.5 || motion_violated(&c->motion);
   return fmi3OK;
 }
 

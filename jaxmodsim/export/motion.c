@@ -288,6 +288,16 @@ static int mark(Motion *c, double near, int first) {
 
 int motion_due(Motion *c, double near) { return mark(c, near, -1); }
 
+int motion_violated(Motion *c) {
+  const State *s = &c->s;
+  double g[3 * MODES];
+  model_guards(s->t, s->numbers, s->y, s->mode, c->tolerances, g);
+  for (int i = 0; i < MODES; ++i) {
+    if (!s->waits[i] && g[i] < -g[MODES + i]) return 1;
+  }
+  return 0;
+}
+
 void motion_move(Motion *c, double by) {
   State *s = &c->s;
   double rate[STATES], y[STATES];
@@ -327,7 +337,8 @@ int motion_fire(Motion *c) {
     const double since = s->t - s->last;
     double y[STATES], mode[MODES];
     s->spread = s->resets == 0 ? since : larger(since, FORGET * s->spread);
-    const double vanishes = larger(ACCUMULATION * sqrt(DBL_EPSILON) * (s->t - s->begin), 64.0 * DBL_EPSILON * fabs(s->t));
+    const double unit = c->coarse ? larger(s->rtol, DBL_EPSILON) : DBL_EPSILON;
+    const double vanishes = larger(ACCUMULATION * sqrt(unit) * (s->t - s->begin), 64.0 * DBL_EPSILON * fabs(s->t));
     const int dense = s->resets >= FEWEST && s->spread <= vanishes;
     if (dense && !CONTACTS) {
       c->failure = "events accumulate: friction switches again and again without time between (chatter)";
@@ -374,6 +385,7 @@ static void land(Motion *c, double h, double part, int first) {
 }
 #else
 int motion_due(Motion *c, double near) { return (void)c, (void)near, 0; }
+int motion_violated(Motion *c) { return (void)c, 0; }
 double motion_to_root(Motion *c) { return (void)c, 0.0; }
 void motion_move(Motion *c, double by) { (void)c, (void)by; }
 int motion_fire(Motion *c) { return (void)c, 1; }

@@ -15,13 +15,14 @@ typedef struct {
   double back;                /* time from the instant of an importer to the root of the event there */
   double fired[SPACE(MODES)]; /* guards whose event is pending */
   int32_t waits[SPACE(MODES)]; /* guards that must be positive before they fire */
-  int32_t resets, pending, changed, phase;
+  int32_t resets, pending, changed, moved, phase;
 } State;
 
 typedef struct {
   State s;
   double tolerances[3]; /* speed of rest, relative and absolute tolerance */
   int linearised;
+  int coarse; /* whether an importer integrates: what it does not resolve are events without time between */
   double linear[STATES * (STATES + 2)]; /* rates, their time derivative, and their Jacobian */
   double factors[STATES][STATES], stage[8][STATES], end[STATES], raw[STATES], dense[3][STATES];
   int rows[STATES];
@@ -42,6 +43,8 @@ void motion_start(Motion *c);
 double motion_project(Motion *c, double y[STATES]);
 /* Marks the guards whose event is now, or within the time `near`; whether there is one. */
 int motion_due(Motion *c, double near);
+/* Whether a guard is below zero by more than its tolerance. */
+int motion_violated(Motion *c);
 /* Time from now to the root of the first of the guards that are marked. */
 double motion_to_root(Motion *c);
 /* Moves the state by a short time. */
