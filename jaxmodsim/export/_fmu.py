@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import ArrayLike
 
 from .._core.arguments import as_mapping, as_names, did_you_mean
 from ..scene import (
@@ -52,8 +51,8 @@ PARAMETER, CONTINUOUS, DISCRETE = range(3)
 
 def fmu(
     scene: Scene,
-    q0: ArrayLike,
-    qd0: ArrayLike,
+    q0: Any,
+    qd0: Any,
     path: str | PathLike[str],
     *,
     inputs: Sequence[str] = (),
@@ -178,7 +177,7 @@ def _targets(platforms: Sequence[str] | None) -> tuple[str, ...]:
 
 
 def _model(
-    scene: Scene, q0: ArrayLike, qd0: ArrayLike, inputs: Sequence[str], outputs: Mapping[str, Callable[..., Any]] | None
+    scene: Scene, q0: Any, qd0: Any, inputs: Sequence[str], outputs: Mapping[str, Callable[..., Any]] | None
 ) -> tuple[Model, list[int]]:
     """The scene with numbers in place of signals, and the kind of each number."""
     zero = jnp.zeros(())

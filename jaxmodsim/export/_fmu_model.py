@@ -57,10 +57,16 @@ class Model(NamedTuple):
 
 
 def series_of(model: Model) -> dict[str, tuple[int, ...]]:
-    """Shapes of the outputs by name."""
-    t = jnp.zeros(())
-    shapes = jax.eval_shape(lambda y, scene: model.observe(t, y, scene, model.mode)[1], model.y, model.scene)
-    return {name: x.shape for name, x in shapes.items()}
+    """Shapes of the outputs by name, in their order; JAX sorts the keys of mappings."""
+    t, names = jnp.zeros(()), []
+
+    def values(y: State, scene: Scene) -> list[Array]:
+        outputs = model.observe(t, y, scene, model.mode)[1]
+        names[:] = outputs
+        return list(outputs.values())
+
+    shapes = jax.eval_shape(values, model.y, model.scene)
+    return {name: x.shape for name, x in zip(names, shapes, strict=True)}
 
 
 def _routines(model: Model) -> dict[str, tuple[str, tuple[str, ...], str, Callable[..., PyTree]]]:

@@ -195,9 +195,10 @@ fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *again, f
 
 static bool settable(const Instance *c, fmi3ValueReference r) {
   const int phase = c->motion.s.phase;
-  if (r < FIRST_NUMBER || r >= FIRST_EVALUATED || phase == TERMINATED) return false;
+  if (phase == TERMINATED) return false;
   if (r >= FIRST_STATE) return phase <= INITIALIZATION;
-  return phase != CONTINUOUS_TIME || model_kinds[r - FIRST_NUMBER] == CONTINUOUS_INPUT;
+  /* The next event decides modes for discrete inputs that an importer changes in continuous time. */
+  return phase != CONTINUOUS_TIME || model_kinds[r - FIRST_NUMBER] != PARAMETER;
 }
 
 fmi3Status fmi3SetFloat64(fmi3Instance instance, REFERENCES, const fmi3Float64 values[], size_t nValues) {
@@ -206,15 +207,16 @@ fmi3Status fmi3SetFloat64(fmi3Instance instance, REFERENCES, const fmi3Float64 v
   if (nValues != nReferences) return fail(c, "set: one value for each variable is needed");
   for (size_t i = 0; i < nValues; ++i) {
     const fmi3ValueReference r = references[i];
+    if (r < FIRST_NUMBER || r >= FIRST_EVALUATED) return no_variable(c, "set Float64", r);
+    double *at = r >= FIRST_STATE ? &s->y[r - FIRST_STATE] : &s->numbers[r - FIRST_NUMBER];
+    if (*at == values[i]) continue; /* importers repeat values outside of events */
     if (!settable(c, r)) return no_variable(c, "set at this time", r);
     if (!isfinite(values[i])) return fail(c, "set: the value is not finite");
-    double *at = r >= FIRST_STATE ? &s->y[r - FIRST_STATE] : &s->numbers[r - FIRST_NUMBER];
-    if (*at != values[i] && r < FIRST_STATE && model_kinds[r - FIRST_NUMBER] != CONTINUOUS_INPUT) {
+    if (r < FIRST_STATE && model_kinds[r - FIRST_NUMBER] != CONTINUOUS_INPUT) {
       s->changed = s->phase > INITIALIZATION;
     }
-    *at = values[i];
+    *at = values[i], c->motion.linearised = 0;
   }
-  c->motion.linearised = 0;
   return fmi3OK;
 }
 
