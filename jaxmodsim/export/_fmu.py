@@ -5,7 +5,6 @@ import hashlib
 import tempfile
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from importlib.resources import files
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from ..scene import (
     scene_units,
 )
 from ._compile import PLATFORMS, compile_library, compiler_of, own_platform
-from ._fmu_description import Variable, describe
+from ._fmu_description import FmuVariable, describe
 from ._fmu_model import Model, header, series_of, write_model
 from ._scene_code import _state_names
 
@@ -113,7 +112,11 @@ def fmu(
     ```python
     scene = jms.problems.belt_oscillator.scene()
     path = jms.export.fmu(scene, [0.0], [0.1], "belt.fmu", inputs=["friction.belt_velocity"], platforms=())
-    print(path.name, sorted(zipfile.ZipFile(path).namelist())[:2])
+    print(path.name)
+    ```
+
+    ```text
+    belt.fmu
     ```
     """
     path, targets = _path(path), _targets(platforms)
@@ -127,13 +130,13 @@ def fmu(
     variables, guards = _variables(model, numbers, states, kinds, units)
     run = {"startTime": 0.0, "stopTime": t1, "tolerance": rtol}
     text = describe(path.stem, "TOKEN", variables, guards, run)
-    sources = {each: files(__package__).joinpath(each).read_text() for each in _WRITTEN}
+    sources = {each: (Path(__file__).parent / each).read_text() for each in _WRITTEN}
     declared = header(model, numbers, states, kinds, RTOL=rtol, ATOL=atol)
     token = hashlib.sha256("".join([text, declared, functions, *sources.values()]).encode()).hexdigest()
     text = text.replace('"TOKEN"', f'"{token}"', 1)
     sources["model.h"] = (
-        f"/* Generated. Numbers of the scene: {', '.join(elements(model.scene))}. */\n#ifndef MODEL_H\n#define MODEL_H\n"
-        f'#define TOKEN "{token}"\n{declared}\n{prototypes}\n#endif\n'
+        f"/* Generated. Numbers of the scene: {', '.join(elements(model.scene))}. */\n"
+        f'#ifndef MODEL_H\n#define MODEL_H\n#define TOKEN "{token}"\n{declared}\n{prototypes}\n#endif\n'
     )
     sources["model.c"] = f'/* Generated. */\n#include "model.h"\n#include <math.h>\n\n{functions}'
     sources["buildDescription.xml"] = _BUILD.format(name=path.stem)
@@ -221,7 +224,7 @@ def _is_signal(x: object) -> bool:
 
 def _variables(
     model: Model, numbers: Sequence[float], states: Sequence[float], kinds: Sequence[int], units: Mapping[str, str]
-) -> tuple[list[Variable], range]:
+) -> tuple[list[FmuVariable], range]:
     """All variables in the order of their value references, and the references of the event indicators.
 
     **Raises:**
@@ -229,10 +232,10 @@ def _variables(
     - `ValueError` if two variables have the same name.
     """
     scene, known, ranges = model.scene, scene_units(model.scene), scene_ranges(model.scene)
-    variables = [Variable("time", 0, "independent", "continuous", unit="s")]
+    variables = [FmuVariable("time", 0, "independent", "continuous", unit="s")]
 
     def add(name: str, causality: str, variability: str, **more: Any) -> None:
-        variables.append(Variable(name, len(variables), causality, variability, **more))
+        variables.append(FmuVariable(name, len(variables), causality, variability, **more))
 
     for (name, (array, _)), start, kind in zip(elements(scene).items(), numbers, kinds, strict=True):
         causality, variability = (("parameter", "tunable"), ("input", "continuous"), ("input", "discrete"))[kind]

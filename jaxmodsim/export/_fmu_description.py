@@ -31,7 +31,7 @@ _DERIVED |= {"kJ": (1e3, "J"), "kW": (1e3, "W"), "kPa": (1e3, "Pa"), "MPa": (1e6
 _DERIVED |= {"mA": (1e-3, "A"), "mV": (1e-3, "V")}
 
 
-class Variable(NamedTuple):
+class FmuVariable(NamedTuple):
     """A variable of an FMU.
 
     - `causality`, `variability`: as in FMI 3.0; `start`: None if it is computed.
@@ -68,9 +68,7 @@ def base_unit(text: str) -> tuple[float, dict[str, int]] | None:
     return factor, {base: each for base, each in exponents.items() if each}
 
 
-def describe(
-    name: str, token: str, variables: Sequence[Variable], guards: range, run: dict[str, float]
-) -> str:
+def describe(name: str, token: str, variables: Sequence[FmuVariable], guards: range, run: dict[str, float]) -> str:
     """The text of modelDescription.xml.
 
     **Arguments:**
@@ -123,7 +121,7 @@ def describe(
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + et.tostring(root, encoding="unicode") + "\n"
 
 
-def _add_variable(listed: et.Element, each: Variable) -> None:
+def _add_variable(listed: et.Element, each: FmuVariable) -> None:
     attributes = {"name": each.name, "valueReference": str(each.reference), "causality": each.causality}
     attributes["variability"] = each.variability
     if each.causality not in ("independent", "input", "parameter"):
@@ -139,7 +137,7 @@ def _add_variable(listed: et.Element, each: Variable) -> None:
     et.SubElement(listed, "Int32" if each.integer else "Float64", attributes)
 
 
-def _add_structure(root: et.Element, variables: Sequence[Variable], guards: range) -> None:
+def _add_structure(root: et.Element, variables: Sequence[FmuVariable], guards: range) -> None:
     structure = et.SubElement(root, "ModelStructure")
 
     def add(kind: str, references: Sequence[int]) -> None:

@@ -55,6 +55,79 @@ class Model(NamedTuple):
         observed |= {name: jnp.asarray(fn(t, y.q, y.qd, bound), y.q.dtype) for name, fn in self.outputs.items()}
         return dynamics, observed
 
+    def rate(self, t: Array, p: Scene, y: State, m: Array) -> PyTree:
+        """Rates."""
+        return vector_field(t, y, p, self.modes_or_none(m))
+
+    def linear(self, t: Array, p: Scene, y: State, m: Array) -> PyTree:
+        """Rates, their derivative by time, and their Jacobian."""
+        flat, unravel = jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(y)]), jtu.tree_structure(y)
+        sizes = np.cumsum([np.size(x) for x in jtu.tree_leaves(y)])[:-1]
+
+        def field(ty: Array) -> tuple[Array, Array]:
+            leaves = [
+                jnp.reshape(x, np.shape(like))
+                for x, like in zip(jnp.split(ty[1:], sizes), jtu.tree_leaves(y), strict=True)
+            ]
+            out = self.rate(ty[0], p, jtu.tree_unflatten(unravel, leaves), m)
+            out = jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(out)])
+            return out, out
+
+        jacobian, rates = jax.jacfwd(field, has_aux=True)(jnp.concatenate([t[None], flat]))
+        return rates, jacobian[:, 0], jacobian[:, 1:]
+
+    def evaluate(self, t: Array, p: Scene, y: State, m: Array, tol: Array) -> PyTree:
+        """Rates, guards and outputs."""
+        dynamics, outputs = self.observe(t, y, p, m)
+        guards = dynamics.guards(tol[0], (tol[1], tol[2]))[0] if self.modes else ()
+        return dynamics.rate, guards, list(outputs.values())
+
+    def push(self, t: Array, p: Scene, y: State, m: Array, tol: Array, along: Array, dp: Scene, dy: State) -> PyTree:
+        """Directional derivative of `evaluate`."""
+        return jax.jvp(lambda t, p, y: self.evaluate(t, p, y, m, tol), (t, p, y), (along, dp, dy))[1]
+
+    def pull(self, t: Array, p: Scene, y: State, m: Array, tol: Array, seed: Array) -> PyTree:
+        """Adjoint derivative of `evaluate`."""
+        out, transposed = jax.vjp(lambda t, p, y: self.evaluate(t, p, y, m, tol), t, p, y)
+        leaves, parts = jtu.tree_leaves(out), []
+        for leaf in leaves:
+            parts.append(jnp.reshape(seed[: np.size(leaf)], np.shape(leaf)))
+            seed = seed[np.size(leaf) :]
+        return transposed(jtu.tree_unflatten(jtu.tree_structure(out), parts))
+
+    def guards(self, t: Array, p: Scene, y: State, m: Array, tol: Array) -> PyTree:
+        """Guards, their tolerances, and their values at events."""
+        given = forward_dynamics(t, y, p, m).guards(tol[0], (tol[1], tol[2]))
+        return (*given, *([jnp.zeros_like(m)] * (3 - len(given))))
+
+    def on_constraints(self, t: Array, p: Scene, y: State, m: Array) -> State:
+        """The state on the constraints."""
+        if not p.bilateral and not p.contacts:
+            return y
+        p = p.bind_state(t, y.q, y.qd)
+        mass = motion_equations(p.lagrangian, t, y.q, y.qd, p.params).mass
+        q, qd = project(p.constraints_in(self.modes_or_none(m)), t, y.q, y.qd, p.params, mass)
+        return y._replace(q=q, qd=qd)
+
+    def projected(self, t: Array, p: Scene, m: Array, y: State) -> State:
+        """The state on the constraints, without slip in stick."""
+        y = self.on_constraints(t, p, y, m)
+        return forward_dynamics(t, y, p, m).stick(m) if p.stick_drifts else y
+
+    def begin(self, t: Array, p: Scene, tol: Array, y: State, m: Array) -> tuple[State, Array]:
+        """State and modes at the start of a run."""
+        y = self.on_constraints(t, p, y, jnp.zeros_like(m))
+        return start(t, y, p, m, tol[0]) if self.modes else (y, m)
+
+    def after(self, t: Array, p: Scene, tol: Array, fired: Array, y: State, m: Array) -> tuple[State, Array]:
+        """State and modes after the guards that `fired`."""
+        return switch(t, y, p, m, fired > 0, tol[0])
+
+    def settle(self, t: Array, p: Scene, tol: Array, fired: Array, y: State, m: Array) -> tuple[State, Array]:
+        """The same where impacts accumulate."""
+        n = p.split_modes(fired)[0].shape[0]
+        return switch(t, y, p, m, (fired > 0).at[:n].set(False), tol[0], False)
+
 
 def series_of(model: Model) -> dict[str, tuple[int, ...]]:
     """Shapes of the outputs by name, in their order; JAX sorts the keys of mappings."""
@@ -71,95 +144,42 @@ def series_of(model: Model) -> dict[str, tuple[int, ...]]:
 
 def _routines(model: Model) -> dict[str, tuple[str, tuple[str, ...], str, Callable[..., PyTree]]]:
     """Purpose, arguments, results (an array, or "y m" in place) and function of each C function, by name."""
-
-    def rate(t: Array, p: Scene, y: State, m: Array) -> PyTree:
-        return vector_field(t, y, p, model.modes_or_none(m))
-
-    def linear(t: Array, p: Scene, y: State, m: Array) -> PyTree:
-        flat, unravel = jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(y)]), jtu.tree_structure(y)
-        sizes = np.cumsum([np.size(x) for x in jtu.tree_leaves(y)])[:-1]
-
-        def field(ty: Array) -> tuple[Array, Array]:
-            leaves = [
-                jnp.reshape(x, np.shape(like))
-                for x, like in zip(jnp.split(ty[1:], sizes), jtu.tree_leaves(y), strict=True)
-            ]
-            out = rate(ty[0], p, jtu.tree_unflatten(unravel, leaves), m)
-            out = jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(out)])
-            return out, out
-
-        jacobian, rates = jax.jacfwd(field, has_aux=True)(jnp.concatenate([t[None], flat]))
-        return rates, jacobian[:, 0], jacobian[:, 1:]
-
-    def evaluate(t: Array, p: Scene, y: State, m: Array, tol: Array) -> PyTree:
-        dynamics, outputs = model.observe(t, y, p, m)
-        guards = dynamics.guards(tol[0], (tol[1], tol[2]))[0] if model.modes else ()
-        return dynamics.rate, guards, list(outputs.values())
-
-    def push(t: Array, p: Scene, y: State, m: Array, tol: Array, along: Array, dp: Scene, dy: State) -> PyTree:
-        return jax.jvp(lambda t, p, y: evaluate(t, p, y, m, tol), (t, p, y), (along, dp, dy))[1]
-
-    def pull(t: Array, p: Scene, y: State, m: Array, tol: Array, seed: Array) -> PyTree:
-        out, transposed = jax.vjp(lambda t, p, y: evaluate(t, p, y, m, tol), t, p, y)
-        leaves, parts = jtu.tree_leaves(out), []
-        for leaf in leaves:
-            parts.append(jnp.reshape(seed[: np.size(leaf)], np.shape(leaf)))
-            seed = seed[np.size(leaf) :]
-        return transposed(jtu.tree_unflatten(jtu.tree_structure(out), parts))
-
-    def guards(t: Array, p: Scene, y: State, m: Array, tol: Array) -> PyTree:
-        given = forward_dynamics(t, y, p, m).guards(tol[0], (tol[1], tol[2]))
-        return (*given, *([jnp.zeros_like(m)] * (3 - len(given))))
-
-    def on_constraints(t: Array, p: Scene, y: State, m: Array) -> State:
-        if not p.bilateral and not p.contacts:
-            return y
-        p = p.bind_state(t, y.q, y.qd)
-        mass = motion_equations(p.lagrangian, t, y.q, y.qd, p.params).mass
-        q, qd = project(p.constraints_in(model.modes_or_none(m)), t, y.q, y.qd, p.params, mass)
-        return y._replace(q=q, qd=qd)
-
-    def projected(t: Array, p: Scene, m: Array, y: State) -> State:
-        y = on_constraints(t, p, y, m)
-        return forward_dynamics(t, y, p, m).stick(m) if p.stick_drifts else y
-
-    def begin(t: Array, p: Scene, tol: Array, y: State, m: Array) -> tuple[State, Array]:
-        y = on_constraints(t, p, y, jnp.zeros_like(m))
-        return start(t, y, p, m, tol[0]) if model.modes else (y, m)
-
-    def after(t: Array, p: Scene, tol: Array, fired: Array, y: State, m: Array) -> tuple[State, Array]:
-        return switch(t, y, p, m, fired > 0, tol[0])
-
-    def settle(t: Array, p: Scene, tol: Array, fired: Array, y: State, m: Array) -> tuple[State, Array]:
-        n = p.split_modes(fired)[0].shape[0]
-        return switch(t, y, p, m, (fired > 0).at[:n].set(False), tol[0], False)
-
     state = ("t", "p", "y", "m")
     routines = {
-        "rate": ("Rates of the state.", state, "out", rate),
-        "linear": ("Rates, their derivative by time, and their Jacobian by rows.", state, "out", linear),
-        "evaluate": ("Rates, guards and outputs.", (*state, "tol"), "out", evaluate),
+        "rate": ("Rates of the state.", state, "out", model.rate),
+        "linear": ("Rates, their derivative by time, and their Jacobian by rows.", state, "out", model.linear),
+        "evaluate": ("Rates, guards and outputs.", (*state, "tol"), "out", model.evaluate),
         "push": (
             "Directional derivative of model_evaluate, along time, numbers and states.",
             (*state, "tol", "along", "dp", "dy"),
             "out",
-            push,
+            model.push,
         ),
         "pull": (
             "Adjoint derivative of model_evaluate, by time, numbers and states.",
             (*state, "tol", "seed"),
             "out",
-            pull,
+            model.pull,
         ),
-        "start": ("State and modes at the start.", ("t", "p", "tol"), "y m", begin),
+        "start": ("State and modes at the start.", ("t", "p", "tol"), "y m", model.begin),
     }
     if model.modes:
-        routines["guards"] = ("Guards, their tolerances, and their values at events.", (*state, "tol"), "out", guards)
+        routines["guards"] = (
+            "Guards, their tolerances, and their values at events.",
+            (*state, "tol"),
+            "out",
+            model.guards,
+        )
         event = ("t", "p", "tol", "fired")
-        routines["switch"] = ("State and modes after the guards that fired.", event, "y m", after)
-        routines["settle"] = ("The same where impacts accumulate.", event, "y m", settle)
+        routines["switch"] = ("State and modes after the guards that fired.", event, "y m", model.after)
+        routines["settle"] = ("The same where impacts accumulate.", event, "y m", model.settle)
     if model.projects:
-        routines["project"] = ("The state on the constraints, without slip in stick.", ("t", "p", "m"), "y", projected)
+        routines["project"] = (
+            "The state on the constraints, without slip in stick.",
+            ("t", "p", "m"),
+            "y",
+            model.projected,
+        )
     return routines
 
 
@@ -229,7 +249,9 @@ def _rebuilt(like: PyTree, entries: list[Array]) -> PyTree:
     return _filled(like, entries)
 
 
-def header(model: Model, numbers: Sequence[float], states: Sequence[float], kinds: Sequence[int], **defined: Any) -> str:
+def header(
+    model: Model, numbers: Sequence[float], states: Sequence[float], kinds: Sequence[int], **defined: Any
+) -> str:
     """Declarations of model.h up to the prototypes: sizes, start values, and coefficients of Rodas5P."""
     widths = model.scene.mode_widths(model.y.q.shape[0])
     stops = np.concatenate([[0], np.cumsum(widths)]).astype(int)

@@ -19,6 +19,8 @@ _FOLDS |= {"reduce_and": jax.lax.bitwise_and, "reduce_or": jax.lax.bitwise_or}
 _ARGUMENTS = {"argmin": (jax.lax.lt, "lt"), "argmax": (jax.lax.gt, "gt")}
 # Operations that move entries to known positions.
 _INDEXED = {"gather", "scatter", "dynamic_slice", "dynamic_update_slice"}
+# Largest number of entries of an array in generated code.
+_MOST_ENTRIES = 10_000
 _FUNCTIONS = {"custom_jvp_call", "custom_vjp_call"}
 
 
@@ -201,9 +203,10 @@ class _StatementWriter(AbstractScalars):
             return self.scan(params, inputs)
         if name == "cond":
             return self.branch(params["branches"], inputs)
+        kinds: list[Any] = [var.aval for var in eqn.invars]
         known = [
-            np.zeros(var.aval.shape, var.aval.dtype) if var.aval.size == 0 else _known_array(x)
-            for var, x in zip(eqn.invars, inputs, strict=True)
+            _known_array(x) if kind.size else np.asarray(np.zeros(kind.shape, kind.dtype))
+            for kind, x in zip(kinds, inputs, strict=True)
         ]
         if all(x is not None for x in known):
             out = eqn.primitive.bind(*known, **params)
@@ -220,12 +223,12 @@ class _StatementWriter(AbstractScalars):
         if name in _INDEXED and all(x is not None for x in known[1:2]):
             return [self.move(eqn, inputs, known)]
         if name == "scatter-add" and known[1] is not None:
-            return [self.scatter_add(eqn, *map(self.parts, inputs[::2]), known[1])]
+            return [self.scatter_add(eqn, self.parts(inputs[0]), self.parts(inputs[2]), known[1])]
         raise ValueError(f"{name} of arrays with {max(sizes)} entries" if max(sizes) > 1 else name)
 
     def divides(self, size: int) -> bool:
-        """Arrays of any size are written entry by entry."""
-        return True
+        """Whether arrays of this size are written entry by entry."""
+        return size <= _MOST_ENTRIES
 
     def fold(self, compute: Callable[..., Any], name: str, axes: tuple[int, ...], x: Parts) -> Parts:
         x = np.moveaxis(x, axes, range(len(axes)))
@@ -235,7 +238,7 @@ class _StatementWriter(AbstractScalars):
             out[i] = functools.reduce(lambda a, b: self.apply(compute, name, {}, [a, b]), x[(slice(None), *i)])
         return out
 
-    def move(self, eqn: JaxprEqn, inputs: list[Value], known: list[np.ndarray | None]) -> Parts:
+    def move(self, eqn: JaxprEqn, inputs: list[Value], known: Sequence[np.ndarray | None]) -> Parts:
         """The entries of the operands, rearranged as the operation rearranges their indices."""
         entries: list[Any] = []
         numbered: list[Any] = []
@@ -252,7 +255,7 @@ class _StatementWriter(AbstractScalars):
             out[i] = entries[places[i]]
         return out
 
-    def choose(self, test: Entry, one: Parts, other: Parts) -> Parts:
+    def choose(self, test: Value, one: Parts, other: Parts) -> Parts:
         """`one` if `test` is true, else `other`."""
         out = np.empty(one.shape, object)
         for i in np.ndindex(*out.shape):
