@@ -46,8 +46,8 @@ def _scenes() -> dict[str, tuple[jms.Scene, Any, Any, float]]:
     return {
         "box": (ramped_box.scene(ramped_box.lugre()), [0.0], [0.0], 10.0),
         "belt": (belt_oscillator.scene(), [0.0], [0.1], 20.0),
-        "double pendulum": (jms.Scene(plain.lagrangian, plain.params, joints), [2.0, 1.0], [0.0, 0.0], 5.0),
-        "slider-crank": (slider_crank.scene(torque=3.0, mu=0.3), *slider_crank.state(0.6, 2.0), 3.0),
+        "double_pendulum": (jms.Scene(plain.lagrangian, plain.params, joints), [2.0, 1.0], [0.0, 0.0], 5.0),
+        "slider_crank": (slider_crank.scene(torque=3.0, mu=0.3), *slider_crank.state(0.6, 2.0), 3.0),
         "ball": (bouncing_ball.scene(e=0.7), [1.0], [0.0], 4.0),
     }
 
