@@ -277,6 +277,17 @@ REPORTS = {
             ("peer", "at"),
         ),),
     ),
+    "fmu": Report(
+        "Scenes as FMUs in FMPy: errors against `simulate`, and the time of a step.", "howto/fmu",
+        (Table(
+            "Five scenes as FMUs in FMPy at rtol {rtol:g}, against `simulate` at 1e-10: largest error of the"
+            " coordinates in co-simulation and in model exchange (by CVODE of FMPy), and of event times in"
+            " co-simulation; median time of a step of 1 ms, the call from Python included; processor time"
+            " to write the FMU, compilation excluded.",
+            ("error of coordinates", "events", "error of event times", "step of 1 ms", "export"),
+            ("case", "at"),
+        ),),
+    ),
     "periodic_orbit": Report(
         "Periodic orbits by shooting, and by simulations that settle.", "orbits",
         (Table(

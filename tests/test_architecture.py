@@ -28,10 +28,10 @@ APPLICATIONS = {
     "orbits": 3200,
     "identify": 10000,
     "sweeps": 2150,
-    "export": 1150,
+    "export": 2000,
     "problems": 2900,
     "plot": 1750,
-    "cli": 3400,
+    "cli": 3500,
 }
 LABORATORY = ("tests", "bench")
 ROOMS = (*CORE, *APPLICATIONS)

@@ -178,6 +178,10 @@ class AbstractScalars(abc.ABC):
     def whole(self, eqn: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
         """Outputs of an equation on whole arrays."""
 
+    @abc.abstractmethod
+    def divides(self, size: int) -> bool:
+        """Whether arrays of this size are evaluated entry by entry."""
+
     def parts(self, x: Any) -> Parts:
         """A value as an array of scalars."""
         if is_apart(x):
@@ -207,7 +211,7 @@ class AbstractScalars(abc.ABC):
         if name in _CALLS:
             return self.run(params["jaxpr"].jaxpr, params["jaxpr"].consts, inputs)
         kinds = [x.aval for x in (*eqn.invars, *eqn.outvars)]
-        if not all(0 < kind.size <= MAX_ENTRIES for kind in kinds):
+        if not all(self.divides(kind.size) for kind in kinds):
             return self.whole(eqn, inputs)
         if name in _ELEMENTWISE:
             arrays = np.broadcast_arrays(*map(self.parts, inputs))
@@ -221,7 +225,7 @@ class AbstractScalars(abc.ABC):
         if name == "unstack":
             moved = np.moveaxis(self.parts(inputs[0]), params["axis"], 0)
             return [moved[i, ...] for i in range(len(moved))]
-        if name in _SUMS and len({kind.dtype for kind in kinds}) == 1:
+        if name in _SUMS and len({kind.dtype for kind in kinds}) == 1 and all(kind.size for kind in kinds):
             return [getattr(self, name)(params, *map(self.parts, inputs))]
         return self.whole(eqn, inputs)
 
@@ -285,6 +289,10 @@ class _Scalars(AbstractScalars):
         """The operation of JAX."""
         out = compute(*operands, **params)
         return fusion_barrier(out, self.unit) if name in _REPEATED else out
+
+    def divides(self, size: int) -> bool:
+        """Whether arrays of this size are small."""
+        return 0 < size <= MAX_ENTRIES
 
     def whole(self, eqn: JaxprEqn, inputs: list[Value]) -> list[Value]:
         """Outputs of an equation on whole arrays."""

@@ -163,6 +163,26 @@ def branch(spec: SpecFile, out: Out = Path("jaxmodsim-branch")) -> None:
     run_branch(spec, out)
 
 
+@app.command()
+def export(
+    spec: SpecFile,
+    model: Annotated[Path, typer.Argument(help="File NAME.fmu; NAME is the name of the model.", metavar="MODEL.fmu")],
+) -> None:
+    r"""Write a scene as an FMU of FMI 3.0, for model exchange and co-simulation, as a SPEC says.
+
+    SPEC is a TOML file; \[scene] as for jaxmodsim sweep.
+
+    \[export] has q0 and qd0, the start values; inputs, a list of names of
+    numbers that are inputs; t1, the end of the default experiment; rtol, atol;
+    platforms, a list such as \["x86_64-linux"], by default all that the
+    compilers here support.
+    """
+    _start()
+    from ._export import run_export
+
+    run_export(spec, model)
+
+
 @app.command("bench", context_settings={"ignore_unknown_options": True})
 def run_benches(
     arguments: Annotated[

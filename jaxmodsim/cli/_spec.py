@@ -93,6 +93,21 @@ class _BranchTable(_toml.AbstractTable):
     max_orbits: _toml.Whole | None = None
 
 
+class _ExportTables(_toml.AbstractTable):
+    scene: _toml.Table
+    export: _toml.Table
+
+
+class _ExportTable(_toml.AbstractTable):
+    q0: _toml.Numbers
+    qd0: _toml.Numbers
+    inputs: _toml.Texts | None = None
+    platforms: _toml.Texts | None = None
+    t1: _toml.Number | None = None
+    rtol: _toml.Number | None = None
+    atol: _toml.Number | None = None
+
+
 _SPAN_KEYS = tuple(field.alias or name for name, field in _SpanTable.model_fields.items())
 
 
@@ -274,3 +289,28 @@ def read_orbit_spec(path: Path) -> OrbitSpec:
             " period, frequency and settle."
         )
     return OrbitSpec(scene, guess, options, branch, from_rest)
+
+
+@dataclass(frozen=True)
+class ExportSpec:
+    """The arguments of `export.fmu`, read from a file; `start` is `(q0, qd0)`."""
+
+    scene: Scene
+    start: tuple[list[float], list[float]]
+    options: dict[str, Any]
+
+
+def read_export_spec(path: Path) -> ExportSpec:
+    """Read the SPEC of an FMU.
+
+    **Raises:**
+
+    - `ValueError` for a mistake, as one sentence with the table and the key.
+    """
+    whole = _toml.read_table(_ExportTables, _toml.read_toml(path), path.name)
+    scene = _toml.read_system(whole.scene, _toml.inner(path.name, "scene"), path.parent)
+    if not isinstance(scene, Scene):
+        raise ValueError(f"{_toml.inner(path.name, 'scene')}: object must be a Scene, but it is a function.")
+    table = _toml.read_table(_ExportTable, whole.export, _toml.inner(path.name, "export"))
+    options = table.model_dump(exclude_none=True)
+    return ExportSpec(scene, (options.pop("q0"), options.pop("qd0")), options)

@@ -132,7 +132,8 @@ class _BlockText:
             yield f"{type_of(carry.symbol.dtype)} {self.new(carry.symbol)} = {start};"
         yield f"for (int {counter} = 0; {counter} < {loop.bound}; ++{counter}) {{"
         yield from self.block(loop.head, "  ")
-        yield f"  if (!{self.value(loop.condition)}) break;"
+        if isinstance(loop.condition, Symbol):
+            yield f"  if (!{self.value(loop.condition)}) break;"
         yield from self.block(loop.body, "  ")
         # A value that is another carry is copied before that carry changes.
         changed = {carry.symbol for carry in loop.carries}

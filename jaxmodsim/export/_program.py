@@ -14,10 +14,13 @@ from .._core.lu import is_constant
 from .._core.scalarise import AbstractScalars, AbstractSymbol, Params, Parts, Value, is_apart
 
 _COMPARISONS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
-_FOLDS = {"reduce_max": jax.lax.max, "reduce_min": jax.lax.min}
+_FOLDS = {"reduce_max": jax.lax.max, "reduce_min": jax.lax.min, "reduce_prod": jax.lax.mul}
 _FOLDS |= {"reduce_and": jax.lax.bitwise_and, "reduce_or": jax.lax.bitwise_or}
+_ARGUMENTS = {"argmin": (jax.lax.lt, "lt"), "argmax": (jax.lax.gt, "gt")}
 # Operations that move entries to known positions.
 _INDEXED = {"gather", "scatter", "dynamic_slice", "dynamic_update_slice"}
+# Largest number of entries of an array in generated code.
+_MOST_ENTRIES = 10_000
 _FUNCTIONS = {"custom_jvp_call", "custom_vjp_call"}
 
 
@@ -196,19 +199,36 @@ class _StatementWriter(AbstractScalars):
             return [np.asarray(params["platforms"].index(("cpu",)) if ("cpu",) in params["platforms"] else 0)]
         if name == "while":
             return self.loop(params, inputs)
+        if name == "scan":
+            return self.scan(params, inputs)
         if name == "cond":
             return self.branch(params["branches"], inputs)
-        known = [_known_array(x) for x in inputs]
+        kinds: list[Any] = [var.aval for var in eqn.invars]
+        known = [
+            _known_array(x) if kind.size else np.asarray(np.zeros(kind.shape, kind.dtype))
+            for kind, x in zip(kinds, inputs, strict=True)
+        ]
         if all(x is not None for x in known):
             out = eqn.primitive.bind(*known, **params)
             return [np.asarray(x) for x in (out if eqn.primitive.multiple_results else [out])]
         sizes = [self.parts(x).size for x in inputs]
         if name in _FOLDS:
             axes = tuple(map(int, params["axes"]))
-            return [self.fold(_FOLDS[name], name.removeprefix("reduce_"), axes, self.parts(inputs[0]))]
+            operation = name.removeprefix("reduce_").replace("prod", "mul")
+            return [self.fold(_FOLDS[name], operation, axes, self.parts(inputs[0]))]
+        if name in _ARGUMENTS and len(params["axes"]) == 1:
+            return [self.argument(*_ARGUMENTS[name], params, self.parts(inputs[0]))]
+        if name == "dynamic_slice" and any(x is None for x in known[1:]):
+            return [self.slice_at(params["slice_sizes"], self.parts(inputs[0]), inputs[1:])]
         if name in _INDEXED and all(x is not None for x in known[1:2]):
             return [self.move(eqn, inputs, known)]
+        if name == "scatter-add" and known[1] is not None:
+            return [self.scatter_add(eqn, self.parts(inputs[0]), self.parts(inputs[2]), known[1])]
         raise ValueError(f"{name} of arrays with {max(sizes)} entries" if max(sizes) > 1 else name)
+
+    def divides(self, size: int) -> bool:
+        """Whether arrays of this size are written entry by entry."""
+        return size <= _MOST_ENTRIES
 
     def fold(self, compute: Callable[..., Any], name: str, axes: tuple[int, ...], x: Parts) -> Parts:
         x = np.moveaxis(x, axes, range(len(axes)))
@@ -218,7 +238,7 @@ class _StatementWriter(AbstractScalars):
             out[i] = functools.reduce(lambda a, b: self.apply(compute, name, {}, [a, b]), x[(slice(None), *i)])
         return out
 
-    def move(self, eqn: JaxprEqn, inputs: list[Value], known: list[np.ndarray | None]) -> Parts:
+    def move(self, eqn: JaxprEqn, inputs: list[Value], known: Sequence[np.ndarray | None]) -> Parts:
         """The entries of the operands, rearranged as the operation rearranges their indices."""
         entries: list[Any] = []
         numbered: list[Any] = []
@@ -233,6 +253,48 @@ class _StatementWriter(AbstractScalars):
         out = np.empty(places.shape, object)
         for i in np.ndindex(*places.shape):
             out[i] = entries[places[i]]
+        return out
+
+    def choose(self, test: Value, one: Parts, other: Parts) -> Parts:
+        """`one` if `test` is true, else `other`."""
+        out = np.empty(one.shape, object)
+        for i in np.ndindex(*out.shape):
+            out[i] = self.apply(jax.lax.select_n, "select_n", {}, [test, other[i], one[i]])
+        return out
+
+    def argument(self, compute: Callable[..., Any], name: str, params: Params, x: Parts) -> Parts:
+        """Index of the first of the smallest, or largest, entries along an axis."""
+        x, kind = np.moveaxis(x, params["axes"][0], 0), np.dtype(params["index_dtype"]).type
+        out = np.empty(x.shape[1:], object)
+        for i in np.ndindex(*out.shape):
+            best, out[i] = x[(0, *i)], kind(0)
+            for k in range(1, len(x)):
+                better = self.apply(compute, name, {}, [x[(k, *i)], best])
+                best = self.apply(jax.lax.select_n, "select_n", {}, [better, best, x[(k, *i)]])
+                out[i] = self.apply(jax.lax.select_n, "select_n", {}, [better, out[i], kind(k)])
+        return out
+
+    def slice_at(self, sizes: Sequence[int], x: Parts, starts: Sequence[Value]) -> Parts:
+        """A slice that starts at computed indices, which are clamped: a choice among all slices."""
+        for axis, (size, start) in enumerate(zip(sizes, starts, strict=True)):
+            (at,) = self.parts(start).flat
+            last = x.shape[axis] - size
+            slices = [np.take(x, range(k, k + size), axis) for k in range(last + 1)]
+            x = slices[0]
+            for k in range(1, last + 1):
+                beyond = self.apply(jax.lax.ge, "ge", {}, [at, at.dtype.type(k)])
+                x = self.choose(beyond, slices[k], x)
+        return x
+
+    def scatter_add(self, eqn: JaxprEqn, x: Parts, updates: Parts, places: np.ndarray) -> Parts:
+        """Entries of `updates` added to those of `x` at known places."""
+        out = x.copy()
+        for i in np.ndindex(*updates.shape):
+            one = np.zeros(updates.shape)
+            one[i] = 1.0
+            (at,) = np.nonzero(np.ravel(eqn.primitive.bind(np.zeros(x.shape), places, one, **eqn.params)))
+            for k in at:
+                out.flat[k] = self.add(out.flat[k], updates[i])
         return out
 
     @contextmanager
@@ -263,6 +325,28 @@ class _StatementWriter(AbstractScalars):
         ]
         carries = [Carry(*each) for parts in changed for each in zip(*(x.flat for x in parts), strict=True)]
         self.block.append(Loop(self.bound(condition, carries), carries, head, condition, inside))
+        return list(symbols)
+
+    def scan(self, params: Params, inputs: list[Value]) -> list[Value]:
+        """A loop with a known number of iterations, written out if it reads or writes rows of arrays."""
+        body, length, n_carry = params["jaxpr"], params["length"], params["num_carry"]
+        consts, inputs = inputs[: params["num_consts"]], inputs[params["num_consts"] :]
+        starts, rows = [self.parts(x) for x in inputs[:n_carry]], [self.parts(x) for x in inputs[n_carry:]]
+        if rows or len(body.jaxpr.outvars) > n_carry or length == 1:
+            outputs: list[list[Value]] = []
+            carry: list[Value] = list(starts)
+            for k in range(length)[:: -1 if params["reverse"] else 1]:
+                out = self.run(body.jaxpr, body.consts, [*consts, *carry, *(x[k, ...] for x in rows)])
+                carry = out[:n_carry]
+                outputs.append(out[n_carry:])
+            outputs = outputs[:: -1 if params["reverse"] else 1]
+            return [*carry, *(np.stack([self.parts(x) for x in column]) for column in zip(*outputs, strict=True))]
+        symbols = [_symbols(x) for x in starts]
+        with self.inner_block() as inside:
+            after = [self.parts(x) for x in self.run(body.jaxpr, body.consts, [*consts, *symbols])]
+        triples = zip(symbols, starts, after, strict=True)
+        carries = [Carry(*each) for parts in triples for each in zip(*(x.flat for x in parts), strict=True)]
+        self.block.append(Loop(length, carries, [], np.bool_(True), inside))
         return list(symbols)
 
     def bound(self, condition: Entry, carries: list[Carry]) -> int:

@@ -321,7 +321,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "sort": (lambda: with_force(lambda t, q, qd, p: jnp.sort(jnp.stack([q[0], qd[0]]))[:1]), "does not support sort"),
     "gamma function": (lambda: with_force(lambda t, q, qd, p: jax.lax.lgamma(q)), "does not support lgamma"),
     "loop without a limit": (lambda: with_force(endless), "loop without a known limit"),
-    "large array": (lambda: with_force(lambda t, q, qd, p: jnp.sum(q[0] * jnp.arange(200.0))[None]), "arrays with 200"),
+    "large array": (lambda: with_force(lambda t, q, qd, p: jnp.sum(q[0] * jnp.arange(2e4))[None]), "arrays with 20000"),
 }
 
 

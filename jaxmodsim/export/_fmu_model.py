@@ -1,0 +1,281 @@
+"""The equations of a scene as C functions of flat arrays: rates, guards, events, outputs and their derivatives."""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from .._core.scalarise import trace_in_arrays
+from ..mechanics import motion_equations, project
+from ..scene import Scene, State, forward_dynamics, start, switch, vector_field
+from ..solvers import RODAS5P
+from ._c_code import write_program
+from ._program import Symbol, program_of
+from ._scene_code import _filled
+
+# Arguments of the functions: scalars, and arrays that a function reads or changes in place.
+_READ = {"t": "double t", "along": "double along"}
+_READ |= {x: f"const double *{x}" for x in ("p", "y", "m", "tol", "fired", "dp", "dy", "seed")}
+
+
+class Model(NamedTuple):
+    """A scene with the parts of an FMU.
+
+    - `scene`: the scene; `y`: its initial state.
+    - `modes`: number of entries of all modes; `projects`: whether constraints or stick drift.
+    - `outputs`: functions of (t, q, qd, params) by name, beside the forces and reactions.
+    """
+
+    scene: Scene
+    y: State
+    modes: int
+    projects: bool
+    outputs: Mapping[str, Callable[..., Any]]
+
+    @property
+    def mode(self) -> Array:
+        """Modes of zero."""
+        return jnp.zeros(self.modes)
+
+    def modes_or_none(self, mode: Array) -> Array | None:
+        """`mode`, or None for a scene without modes."""
+        return mode if self.modes else None
+
+    def observe(self, t: Array, y: State, scene: Scene, mode: Array) -> tuple[Any, dict[str, Array]]:
+        """Dynamics, and outputs by name."""
+        dynamics = forward_dynamics(t, y, scene, self.modes_or_none(mode))
+        observed = dict(dynamics.forces)
+        observed |= {name: each.multiplier for name, each in dynamics.reactions.items()}
+        bound = scene.bind_state(t, y.q, y.qd).params
+        observed |= {name: jnp.asarray(fn(t, y.q, y.qd, bound), y.q.dtype) for name, fn in self.outputs.items()}
+        return dynamics, observed
+
+    def rate(self, t: Array, p: Scene, y: State, m: Array) -> PyTree:
+        """Rates."""
+        return vector_field(t, y, p, self.modes_or_none(m))
+
+    def linear(self, t: Array, p: Scene, y: State, m: Array) -> PyTree:
+        """Rates, their derivative by time, and their Jacobian."""
+        flat, unravel = jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(y)]), jtu.tree_structure(y)
+        sizes = np.cumsum([np.size(x) for x in jtu.tree_leaves(y)])[:-1]
+
+        def field(ty: Array) -> tuple[Array, Array]:
+            leaves = [
+                jnp.reshape(x, np.shape(like))
+                for x, like in zip(jnp.split(ty[1:], sizes), jtu.tree_leaves(y), strict=True)
+            ]
+            out = self.rate(ty[0], p, jtu.tree_unflatten(unravel, leaves), m)
+            out = jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(out)])
+            return out, out
+
+        jacobian, rates = jax.jacfwd(field, has_aux=True)(jnp.concatenate([t[None], flat]))
+        return rates, jacobian[:, 0], jacobian[:, 1:]
+
+    def evaluate(self, t: Array, p: Scene, y: State, m: Array, tol: Array) -> PyTree:
+        """Rates, guards and outputs."""
+        dynamics, outputs = self.observe(t, y, p, m)
+        guards = dynamics.guards(tol[0], (tol[1], tol[2]))[0] if self.modes else ()
+        return dynamics.rate, guards, list(outputs.values())
+
+    def push(self, t: Array, p: Scene, y: State, m: Array, tol: Array, along: Array, dp: Scene, dy: State) -> PyTree:
+        """Directional derivative of `evaluate`."""
+        return jax.jvp(lambda t, p, y: self.evaluate(t, p, y, m, tol), (t, p, y), (along, dp, dy))[1]
+
+    def pull(self, t: Array, p: Scene, y: State, m: Array, tol: Array, seed: Array) -> PyTree:
+        """Adjoint derivative of `evaluate`."""
+        out, transposed = jax.vjp(lambda t, p, y: self.evaluate(t, p, y, m, tol), t, p, y)
+        leaves, parts = jtu.tree_leaves(out), []
+        for leaf in leaves:
+            parts.append(jnp.reshape(seed[: np.size(leaf)], np.shape(leaf)))
+            seed = seed[np.size(leaf) :]
+        return transposed(jtu.tree_unflatten(jtu.tree_structure(out), parts))
+
+    def guards(self, t: Array, p: Scene, y: State, m: Array, tol: Array) -> PyTree:
+        """Guards, their tolerances, and their values at events."""
+        given = forward_dynamics(t, y, p, m).guards(tol[0], (tol[1], tol[2]))
+        return (*given, *([jnp.zeros_like(m)] * (3 - len(given))))
+
+    def on_constraints(self, t: Array, p: Scene, y: State, m: Array) -> State:
+        """The state on the constraints."""
+        if not p.bilateral and not p.contacts:
+            return y
+        p = p.bind_state(t, y.q, y.qd)
+        mass = motion_equations(p.lagrangian, t, y.q, y.qd, p.params).mass
+        q, qd = project(p.constraints_in(self.modes_or_none(m)), t, y.q, y.qd, p.params, mass)
+        return y._replace(q=q, qd=qd)
+
+    def projected(self, t: Array, p: Scene, m: Array, y: State) -> State:
+        """The state on the constraints, without slip in stick."""
+        y = self.on_constraints(t, p, y, m)
+        return forward_dynamics(t, y, p, m).stick(m) if p.stick_drifts else y
+
+    def begin(self, t: Array, p: Scene, tol: Array, y: State, m: Array) -> tuple[State, Array]:
+        """State and modes at the start of a run."""
+        y = self.on_constraints(t, p, y, jnp.zeros_like(m))
+        return start(t, y, p, m, tol[0]) if self.modes else (y, m)
+
+    def after(self, t: Array, p: Scene, tol: Array, fired: Array, y: State, m: Array) -> tuple[State, Array]:
+        """State and modes after the guards that `fired`."""
+        return switch(t, y, p, m, fired > 0, tol[0])
+
+    def settle(self, t: Array, p: Scene, tol: Array, fired: Array, y: State, m: Array) -> tuple[State, Array]:
+        """The same where impacts accumulate."""
+        n = p.split_modes(fired)[0].shape[0]
+        return switch(t, y, p, m, (fired > 0).at[:n].set(False), tol[0], False)
+
+
+def series_of(model: Model) -> dict[str, tuple[int, ...]]:
+    """Shapes of the outputs by name, in their order; JAX sorts the keys of mappings."""
+    t, names = jnp.zeros(()), []
+
+    def values(y: State, scene: Scene) -> list[Array]:
+        outputs = model.observe(t, y, scene, model.mode)[1]
+        names[:] = outputs
+        return list(outputs.values())
+
+    shapes = jax.eval_shape(values, model.y, model.scene)
+    return {name: x.shape for name, x in zip(names, shapes, strict=True)}
+
+
+def _routines(model: Model) -> dict[str, tuple[str, tuple[str, ...], str, Callable[..., PyTree]]]:
+    """Purpose, arguments, results (an array, or "y m" in place) and function of each C function, by name."""
+    state = ("t", "p", "y", "m")
+    routines = {
+        "rate": ("Rates of the state.", state, "out", model.rate),
+        "linear": ("Rates, their derivative by time, and their Jacobian by rows.", state, "out", model.linear),
+        "evaluate": ("Rates, guards and outputs.", (*state, "tol"), "out", model.evaluate),
+        "push": (
+            "Directional derivative of model_evaluate, along time, numbers and states.",
+            (*state, "tol", "along", "dp", "dy"),
+            "out",
+            model.push,
+        ),
+        "pull": (
+            "Adjoint derivative of model_evaluate, by time, numbers and states.",
+            (*state, "tol", "seed"),
+            "out",
+            model.pull,
+        ),
+        "start": ("State and modes at the start.", ("t", "p", "tol"), "y m", model.begin),
+    }
+    if model.modes:
+        routines["guards"] = (
+            "Guards, their tolerances, and their values at events.",
+            (*state, "tol"),
+            "out",
+            model.guards,
+        )
+        event = ("t", "p", "tol", "fired")
+        routines["switch"] = ("State and modes after the guards that fired.", event, "y m", model.after)
+        routines["settle"] = ("The same where impacts accumulate.", event, "y m", model.settle)
+    if model.projects:
+        routines["project"] = (
+            "The state on the constraints, without slip in stick.",
+            ("t", "p", "m"),
+            "y",
+            model.projected,
+        )
+    return routines
+
+
+def write_model(model: Model) -> tuple[str, str]:
+    """Prototypes and functions of the equations, in C99.
+
+    **Raises:**
+
+    - `ValueError` naming an unsupported operation of JAX, and the function that needs it.
+    """
+    like = {"t": 0.0, "along": 0.0, "p": model.scene, "y": model.y, "m": model.mode, "fired": model.mode}
+    like |= {"dp": model.scene, "dy": model.y, "tol": jnp.zeros(3)}
+    outputs = sum(int(np.prod(shape)) for shape in series_of(model).values())
+    like["seed"] = jnp.zeros(_size(model.y) + model.modes + outputs)
+    prototypes, functions = [], []
+    for name, (purpose, arguments, results, fn) in _routines(model).items():
+        changed = () if results == "out" else tuple(results.split())
+        order = (*arguments, *(x for x in ("y", "m") if x in changed and x not in arguments))
+        lines = _lines(name, fn, order, like, changed)
+        declared = [_READ[x] for x in arguments]
+        declared += [f"double *{x}" for x in (changed or ("out",))]
+        signature = f"void model_{name}({', '.join(declared)})"
+        unused = [x for x in (*order, *(() if changed else ("out",))) if not re.search(rf"\b{x}\b", "\n".join(lines))]
+        prototypes.append(f"/* {purpose} */\n{signature};")
+        functions.append("\n".join([signature + " {", *(f"  (void){x};" for x in unused), *lines, "}\n"]))
+    return "\n".join(prototypes), "\n".join(functions)
+
+
+def _lines(
+    name: str, fn: Callable[..., PyTree], order: Sequence[str], like: Mapping[str, PyTree], changed: Sequence[str]
+) -> list[str]:
+    symbols = {x: _symbols(x, like[x]) for x in order}
+
+    def flat(*arrays: Any) -> list[Array]:
+        return jtu.tree_leaves(fn(*(_rebuilt(like[x], array) for x, array in zip(order, arrays, strict=True))))
+
+    entries = [[jnp.zeros((), x.dtype) for x in symbols[each]] for each in order]
+    try:
+        closed, shapes = trace_in_arrays(flat, *entries)
+        program = program_of(closed, [x for each in order for x in symbols[each]])
+        places = [f"{x}[{i}]" for x in changed for i in range(_size(like[x]))]
+        count = sum(int(np.prod(x.shape)) for x in shapes)
+        return write_program(program, places or [f"out[{i}]" for i in range(count)])
+    except ValueError as error:
+        raise ValueError(
+            f"fmu does not support {error}, which the function `{name}` of the scene needs. It supports arithmetic,"
+            " elementary functions, choices (jnp.where) and loops with a known limit, of scalars and small arrays:"
+            " express the Lagrangian, force or law by these."
+        ) from error
+
+
+def _size(tree: PyTree) -> int:
+    return sum(int(np.size(x)) for x in jtu.tree_leaves(tree))
+
+
+def _symbols(name: str, like: PyTree) -> list[Symbol]:
+    if isinstance(like, float):
+        return [Symbol(np.dtype(float), name)]
+    return [Symbol(np.dtype(float), f"{name}[{i}]") for i in range(_size(like))]
+
+
+def _rebuilt(like: PyTree, entries: list[Array]) -> PyTree:
+    if isinstance(like, float):
+        return entries[0]
+    if isinstance(like, jax.Array):
+        return jnp.stack(entries) if entries else jnp.zeros(0)
+    return _filled(like, entries)
+
+
+def header(
+    model: Model, numbers: Sequence[float], states: Sequence[float], kinds: Sequence[int], **defined: Any
+) -> str:
+    """Declarations of model.h up to the prototypes: sizes, start values, and coefficients of Rodas5P."""
+    widths = model.scene.mode_widths(model.y.q.shape[0])
+    stops = np.concatenate([[0], np.cumsum(widths)]).astype(int)
+    outputs = sum(int(np.prod(shape)) for shape in series_of(model).values())
+    sizes = {"NUMBERS": len(numbers), "STATES": len(states), "MODES": model.modes, "THINGS": len(widths)}
+    sizes |= {"EVALUATED": len(states) + model.modes + outputs, "CONTACTS": len(model.scene.contacts)}
+    sizes |= {"PROJECTS": int(model.projects), "GAMMA": repr(RODAS5P.gamma)} | defined
+    lines = [f"#define {name} {value}" for name, value in sizes.items()]
+    lines += ["enum { PARAMETER, CONTINUOUS_INPUT, DISCRETE_INPUT };"]
+    lines += [
+        _array("static const double model_numbers", numbers),
+        _array("static const double model_states", states),
+        _array("static const int model_kinds", kinds),
+        _array("static const int model_modes", stops),
+        _array("static const double NODE", RODAS5P.nodes),
+        _array("static const double TIME", RODAS5P.time),
+    ]
+    tables = {"STAGE": RODAS5P.stage, "COUPLING": RODAS5P.coupling, "DENSE": RODAS5P.dense}
+    return "\n".join([*lines, *(_array(f"static const double {name}", rows) for name, rows in tables.items())])
+
+
+def _array(name: str, values: Any) -> str:
+    """A constant array; one zero in place of no entry."""
+    values = np.asarray(values)
+    values = values if values.size else np.zeros(1, values.dtype)
+    sizes = "".join(f"[{n}]" for n in values.shape)
+    return f"{name}{sizes} = {str(values.tolist()).replace('[', '{').replace(']', '}')};"
