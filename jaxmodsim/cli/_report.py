@@ -6,7 +6,7 @@ import io
 import jinja2
 import pandas as pd
 
-from ..identify import InputDesign, remarks, residual_tests
+from ..identify import InputDesign, residual_tests, warnings_for
 from ..plot import Figure, comparison_figure, design_figure, fit_figure, profile_figure, result_figure, score_figure
 from ._outcome import FitOutcome, agreement_table, record_table
 from ._output import frame_of
@@ -35,7 +35,7 @@ def report_page(outcome: FitOutcome) -> str:
         result=result,
         records=record_table(outcome),
         parameters=frame_of(parameters, "parameter", "value", "standard error", "95 % from", "to", "start", "unit"),
-        remarks=remarks(result),
+        remarks=warnings_for(result),
         held=", ".join(f"{name} = {value:.6g}" for name, value in outcome.held.items()),
         figures=figures,
         residual_tests=residual_tests(result),

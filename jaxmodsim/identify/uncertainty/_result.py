@@ -199,7 +199,7 @@ class FitResult(AbstractReadable):
                 "evaluations": diagnostics.evaluations,
                 "ending": diagnostics.ending,
                 "step_error": diagnostics.step_error,
-                "remarks": list(remarks(self)),
+                "remarks": list(warnings_for(self)),
             }
         )
 
@@ -222,10 +222,10 @@ def _(result: FitResult) -> Table:
     names = ", ".join(record.name for record in result.provenance.records)
     head = ("parameter", "value", "standard error", "95 % interval")
     ending = f"{result.diagnostics.evaluations} evaluations, {result.diagnostics.ending}"
-    return Table(f"Fit to {names}, RMSE {errors}", head, rows, (ending, *remarks(result)))
+    return Table(f"Fit to {names}, RMSE {errors}", head, rows, (ending, *warnings_for(result)))
 
 
-def remarks(result: FitResult) -> tuple[str, ...]:
+def warnings_for(result: FitResult) -> tuple[str, ...]:
     """Limitations of a fit, in sentences: causes of wrong standard errors, undetermined parameters, and the reasons.
 
     Parameters and pairs that an issue of the motion or a weak combination explains are not listed again.
