@@ -24,7 +24,7 @@ APPLICATIONS = {
     "metrics": 650,
     "analysis": 2100,
     "orbits": 3200,
-    "identify": 10000,
+    "identify": 9872,
     "sweeps": 2150,
     "export": 1150,
     "problems": 2900,

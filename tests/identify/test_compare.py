@@ -145,7 +145,7 @@ def test_a_model_that_fails_stays_with_its_reason_and_interruption_keeps_what_is
     [
         ({"limits": {"mass": (0.0, None)}}, "mass is no number of any candidate"),
         ({"initializer": Continuation("friction.wide")}, "friction.wide is no number"),
-        ({"folds": 1}, "folds must be at least 2"),
+        ({"folds": 1}, "folds must be an integer >= 2"),
     ],
 )
 def test_wrong_questions_are_refused(options, text):

@@ -406,10 +406,7 @@ def _unpacked(x: object, arrays: Mapping[str, np.ndarray]) -> Any:
     ((kind, inside),) = x.items()
     if kind == "record":
         parts = _unpacked(inside, arrays)
-        return Record(
-            parts["t"], parts["channels"], parts["inputs"], parts["name"], linear=parts["linear"],
-            noise=parts["noise"] or None, slips=parts["slips"],
-        )  # fmt: skip
+        return Record(measured=parts.pop("channels"), **parts)
     if kind == "issue":
         return IdentifiabilityIssue(inside[0], tuple(inside[1]))
     if kind == "dict":
