@@ -29,7 +29,7 @@ APPLICATIONS = {
     "export": 1150,
     "problems": 2900,
     "plot": 1750,
-    "cli": 3359,
+    "cli": 3323,
 }
 LABORATORY = ("tests", "bench")
 ROOMS = (*CORE, *APPLICATIONS)

@@ -14,8 +14,8 @@ from ..identify import SERVO_LAWS, Record, Servo, ServoFit, ServoPrediction, fit
 from ..plot import servo_figure
 from ._files import Columns, read_columns
 from ._options import FitRequest, PredictRequest
-from ._plan import known_name, listed, number_of
 from ._output import Content, frame_of, say, show_paths, show_table, write
+from ._plan import known_name, listed, number_of
 
 # Full duty as the servo reports it; standard gravity [m/s^2].
 _FULL_DUTY, _GRAVITY = 885.0, 9.80665
