@@ -26,12 +26,12 @@ APPLICATIONS = {
     "metrics": 650,
     "analysis": 2100,
     "orbits": 3200,
-    "identify": 10000,
+    "identify": 9900,
     "sweeps": 2150,
     "export": 2000,
     "problems": 2900,
     "plot": 1750,
-    "cli": 3500,
+    "cli": 3450,
 }
 LABORATORY = ("tests", "bench")
 ROOMS = (*CORE, *APPLICATIONS)

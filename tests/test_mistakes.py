@@ -25,7 +25,7 @@ def loud(caplog: pytest.LogCaptureFixture) -> None:
         exec(block[1], NAMES)
 
 
-def test_there_are_twenty() -> None:
+def test_the_page_lists_at_least_twenty_mistakes() -> None:
     assert len(ROWS) >= 20
 
 

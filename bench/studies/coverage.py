@@ -17,7 +17,7 @@ import numpy as np
 
 import jaxmodsim as jms
 from bench.record import Result
-from jaxmodsim.identify import Staged, coverage, remarks, replay
+from jaxmodsim.identify import Staged, coverage, replay, warnings_for
 
 NOISE = 1e-5
 TRUTH, WRONG = (1e4, 40.0, 2.0, 1.0, 1.5, 0.02), (1e5, 4.0, 0.2, 0.3, 2.0, 0.1)
@@ -62,7 +62,7 @@ def _default_start(result: Result, label: str, measure: Measure, repeats: int) -
         fitted = jms.fit(dry(1.6, 1.0, 0.9), record, ("m", "friction.Fc", "viscous.Fv"), substeps=4)
         spans = fitted.estimate.intervals().values()
         inside = [low <= true <= high for true, (low, high) in zip(DRY.values(), spans, strict=True)]
-        said = any("constant offset" in each for each in remarks(fitted))
+        said = any("constant offset" in each for each in warnings_for(fitted))
         held, remarked, right = held + inside, remarked + said, right + (said or all(inside))
     for name, count in zip(DRY, held, strict=True):
         result.add("held", 100.0 * float(count) / repeats, "%", case=label, at=name)

@@ -63,7 +63,7 @@ result
 # The truth was 24 kg, 15 N and 40 N s/m. What the records cannot tell, or the model misses, would be said here:
 
 # %%
-print(*identify.remarks(result) or ["No remarks."], sep="\n")
+print(*identify.warnings_for(result) or ["No warnings."], sep="\n")
 plot.fit_figure(result)
 
 # %%

@@ -21,7 +21,7 @@ from ..identify import (
     RecordAgreement,
     RecordPrediction,
     Score,
-    remarks,
+    warnings_for,
 )
 from ..scene import Scene, scene_numbers
 from ._output import frame_of
@@ -143,7 +143,7 @@ class FitOutcome:
             *self.plan.notes,
             *self.differences,
             *(remark for each in self.scores for remark in each.remarks),
-            *remarks(result),
+            *warnings_for(result),
         )
         return (
             f"{self.model.capitalize()}: {numbers}.",

@@ -68,15 +68,15 @@ def plan_of(request: FitRequest) -> FitPlan:
     _check(request)
     models = _models(request)
     options = {
-        "loss": _LOSSES[_known("--loss", request.loss, _LOSSES)](),
+        "loss": _LOSSES[known_name("--loss", request.loss, _LOSSES)](),
         "initializer": [
-            *_INITIALIZERS[_known("--initializer", request.initializer, _INITIALIZERS)],
+            *_INITIALIZERS[known_name("--initializer", request.initializer, _INITIALIZERS)],
             *([MultiStart(request.starts)] if request.starts > 1 else []),
         ],
         "max_steps": request.max_steps,
     }
     units = parse_units(request.units)
-    dropped = frozenset(_known("--drop", kind, DROPS, "kind of sample") for kind in _listed(request.drop))
+    dropped = frozenset(known_name("--drop", kind, DROPS, "kind of sample") for kind in listed(request.drop))
     columns = AxisColumns(request.time, request.position, request.force, units, dropped)
     files = read_records([*request.records, *request.held_out], columns)
     records, held_out = (
@@ -100,10 +100,10 @@ def plan_of(request: FitRequest) -> FitPlan:
         for name, model in models.items()
     }
     start, fixed = _values("--start", request.start, numbers), _values("--fix", request.fix, numbers)
-    chosen = [name for name in _listed(request.free) if not name.startswith("+")]
-    added = [name.removeprefix("+") for name in _listed(request.free) if name.startswith("+")]
+    chosen = [name for name in listed(request.free) if not name.startswith("+")]
+    added = [name.removeprefix("+") for name in listed(request.free) if name.startswith("+")]
     for name in (*chosen, *added):
-        _known("--free", name, (*next(iter(numbers.values())), *_ALSO_FREE), stem=name.split("[")[0].split(".")[0])
+        known_name("--free", name, (*next(iter(numbers.values())), *_ALSO_FREE), stem=name.split("[")[0].split(".")[0])
     for option, others in (("--start", start), ("--free", (*chosen, *added))):
         if both := sorted(set(fixed) & set(others)):
             raise ValueError(f"{both[0]} stands in {option} and in --fix: it can be fitted or fixed, not both.")
@@ -149,10 +149,10 @@ def _check(request: FitRequest) -> None:
 
 def _models(request: FitRequest) -> dict[str, AxisModel]:
     """The models that --laws names."""
-    known, names = axis_models(), _listed(["coulomb" if request.laws is None else request.laws])
+    known, names = axis_models(), listed(["coulomb" if request.laws is None else request.laws])
     if not names:
         raise ValueError(f"--laws needs a law, several as A,B, or `all`, but {request.laws!r} was given.")
-    names = list(known) if "all" in names else [_known("--laws", name, known, "law") for name in names]
+    names = list(known) if "all" in names else [known_name("--laws", name, known, "law") for name in names]
     if len(names) > 1 and any(not name.strip().startswith("+") for text in request.free for name in text.split(",")):
         raise ValueError(
             "--free excludes several --laws, each of which has its own parameters: use --fix, or --free +NAME."
@@ -160,12 +160,12 @@ def _models(request: FitRequest) -> dict[str, AxisModel]:
     return {name: known[name] for name in names}
 
 
-def _listed(texts: Sequence[str]) -> list[str]:
+def listed(texts: Sequence[str]) -> list[str]:
     """Names that are separated by commas, each once."""
     return list(dict.fromkeys(name.strip() for text in texts for name in text.split(",") if name.strip()))
 
 
-def _known(option: str, name: str, known: Iterable[str], noun: str = "name", stem: str | None = None) -> str:
+def known_name(option: str, name: str, known: Iterable[str], noun: str = "name", stem: str | None = None) -> str:
     """The name, if it or its stem is known."""
     known = tuple(known)
     if name in known or stem in known:
@@ -176,7 +176,7 @@ def _known(option: str, name: str, known: Iterable[str], noun: str = "name", ste
 
 
 def _known_of_any(option: str, name: str, numbers: Mapping[str, Sequence[str]]) -> str:
-    return _known(option, name, dict.fromkeys(x for own in numbers.values() for x in own), "parameter")
+    return known_name(option, name, dict.fromkeys(x for own in numbers.values() for x in own), "parameter")
 
 
 def _values(option: str, texts: Sequence[str], numbers: Mapping[str, Sequence[str]]) -> dict[str, float]:
@@ -184,7 +184,7 @@ def _values(option: str, texts: Sequence[str], numbers: Mapping[str, Sequence[st
     values: dict[str, float] = {}
     for text in texts:
         name, equals, number = text.partition("=")
-        value = _number(number)
+        value = number_of(number)
         if not equals or value is None:
             raise ValueError(f"{option} needs NAME=VALUE with a number, but {text!r} was given.")
         values[_known_of_any(option, name, numbers)] = value
@@ -197,7 +197,7 @@ def _limits(texts: Sequence[str], numbers: Mapping[str, Sequence[str]]) -> Limit
     for text in texts:
         name, _, span = text.partition("=")
         low, colon, high = span.partition(":")
-        least, most = (_number(side) if side.strip() else None for side in (low, high))
+        least, most = (number_of(side) if side.strip() else None for side in (low, high))
         wrong = (low.strip() and least is None) or (high.strip() and most is None)
         if not colon or wrong or (least is None and most is None):
             raise ValueError(
@@ -209,7 +209,8 @@ def _limits(texts: Sequence[str], numbers: Mapping[str, Sequence[str]]) -> Limit
     return limits
 
 
-def _number(text: str) -> float | None:
+def number_of(text: str) -> float | None:
+    """The finite number in a text; None for another text."""
     try:
         value = float(text)
     except ValueError:

@@ -6,9 +6,10 @@ import io
 import jinja2
 import pandas as pd
 
-from ..identify import InputDesign, remarks, residual_tests
+from .._core.readable import table_of
+from ..identify import residual_tests, warnings_for
 from ..plot import Figure, comparison_figure, design_figure, fit_figure, profile_figure, result_figure, score_figure
-from ._outcome import FitOutcome, agreement_table, record_table
+from ._outcome import FitOutcome, record_table
 from ._output import frame_of
 
 # Magnitude of a correlation above which its cell is marked.
@@ -20,7 +21,7 @@ def report_page(outcome: FitOutcome) -> str:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("jaxmodsim.cli", "."), autoescape=True, undefined=jinja2.StrictUndefined
     )
-    environment.filters |= {"html": _html, "png": _png}
+    environment.filters |= {"html": _html, "png": _png, "own_table": table_of}
     result, measured = outcome.result, outcome.measured
     first, *others = result.provenance.records
     figures = [(first.name, result_figure(result, units={"measured": measured["unit"]}))]
@@ -35,53 +36,16 @@ def report_page(outcome: FitOutcome) -> str:
         result=result,
         records=record_table(outcome),
         parameters=frame_of(parameters, "parameter", "value", "standard error", "95 % from", "to", "start", "unit"),
-        remarks=remarks(result),
+        remarks=warnings_for(result),
         held=", ".join(f"{name} = {value:.6g}" for name, value in outcome.held.items()),
         figures=figures,
         residual_tests=residual_tests(result),
         strong=_STRONG,
         scores=[(f"{x.score.record.name}, held out", score_figure(x, **measured), x) for x in outcome.predictions],
-        agreement=None if outcome.agreement is None else agreement_table(outcome.agreement),
-        comparison=_comparison(outcome),
+        comparison=outcome.comparison and comparison_figure(outcome.comparison),
         profiles=[(profile, profile_figure(profile)) for profile in outcome.profiles],
-        design=None if outcome.design is None else _design(outcome.design, measured["unit"]),
+        design=outcome.design and design_figure(outcome.design),
     )
-
-
-def _comparison(outcome: FitOutcome) -> dict[str, object] | None:
-    compared, unit = outcome.comparison, f"RMSE [{outcome.measured['unit']}]"
-    if compared is None:
-        return None
-    columns = {
-        "name": "model",
-        "parameters": "parameters",
-        "held_back": f"held out, {unit}",
-        "standard_error": "standard error",
-        "expected": f"new record, {unit}",
-        "over_the_best": "above the best",
-        "over_the_best_standard_error": "its standard error",
-        "start_fitted": f"start fitted, {unit}",
-        "fitted": f"fitted, {unit}",
-        "undetermined": "not determined",
-    }
-    table = pd.DataFrame(compared.table[: len(compared.ranked)])[list(columns)].astype({"start_fitted": float})
-    table["undetermined"] = [", ".join(each.undetermined) or "-" for each in compared.ranked]
-    table.columns = pd.Index(columns.values())
-    sentences = [compared.conclusion, f"Held out: {compared.by}."]
-    sentences += [f"{name} failed: {reason}" for name, reason in compared.failures.items()]
-    sentences += [f"{name} was not finished." for name in compared.left]
-    return {"table": table, "sentences": sentences, "drawing": comparison_figure(compared)}
-
-
-def _design(design: InputDesign, unit: str) -> dict[str, object]:
-    t, used = design.best.t, ", ".join(f"{name} {100 * share:.0f} %" for name, share in design.used.items())
-    sentences = [
-        f"{len(t)} samples over {t[-1] - t[0]:g} s; limits: {design.limits}; used: {used}.",
-        f"Assumed noise: {1e3 * design.noise:.4g} m{unit}, the residual of this fit.",
-        *design.remarks,
-    ]
-    table = frame_of(design.rows(), "parameter", "value", "predicted standard error", "of a plain sine", "unit")
-    return {"table": table, "sentences": sentences, "drawing": design_figure(design)}
 
 
 def _html(frame: pd.DataFrame) -> str:

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from .._core.arguments import did_you_mean
 from .._core.progress import progress_line
 from ..identify import SERVO_LAWS, Record, Servo, ServoFit, ServoPrediction, fit_servo, predict_servo, servo_record
 from ..plot import servo_figure
 from ._files import Columns, read_columns
 from ._options import FitRequest, PredictRequest
 from ._output import Content, frame_of, say, show_paths, show_table, write
+from ._plan import known_name, listed, number_of
 
 # Full duty as the servo reports it; standard gravity [m/s^2].
 _FULL_DUTY, _GRAVITY = 885.0, 9.80665
@@ -36,10 +36,8 @@ def run_servo_fit(request: FitRequest) -> None:
     for i, name in enumerate(names):
         if name in names[:i]:
             raise ValueError(f"Two files have the name {name}: rename one of them.")
-    known = {name for law in laws for name in Servo.free(law)}
     for name in prior:
-        if name not in known:
-            raise ValueError(f"--prior: there is no parameter {name!r}.{did_you_mean(name, sorted(known))}")
+        known_name("--prior", name, dict.fromkeys(x for law in laws for x in Servo.free(law)), "parameter")
     groups, started, fits = groups_of(records), time.perf_counter(), {}
     with progress_line("fit") as show:
         for law in laws:
@@ -208,31 +206,22 @@ def _gain(table: Columns, path: Path, gain: str | None) -> float:
         if match is None:
             raise ValueError("the gain of the position loop is unknown: add a column kp, or --gain NUMBER.")
         return float(match.group(1))
-    try:
-        value = float(gain)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
+    value = number_of(gain)
+    if value is None or value <= 0:
         raise ValueError(f"--gain must be a number > 0 or a column, but {gain!r} was given.")
     return value
 
 
 def _laws(text: str | None) -> tuple[str, ...]:
-    names = ["all"] if text is None else [name.strip() for name in text.split(",") if name.strip()]
+    names = ["all"] if text is None else listed([text])
     if names == ["all"]:
         return tuple(SERVO_LAWS)
-    for name in names or [""]:
-        if name not in SERVO_LAWS:
-            raise ValueError(f"--laws: a servo has the laws {', '.join(SERVO_LAWS)}, but {name!r} was given.")
-    return tuple(names)
+    return tuple(known_name("--laws", name, SERVO_LAWS, "servo law") for name in names or [""])
 
 
 def _pendulum(text: str) -> tuple[float, float]:
-    try:
-        mass, length = (float(x) for x in text.split(","))
-    except ValueError:
-        mass = length = math.nan
-    if not (mass > 0 and length > 0):
+    mass, length = map(number_of, text.partition(",")[::2])
+    if mass is None or length is None or min(mass, length) <= 0:
         raise ValueError(f"--pendulum needs MASS,LENGTH, two numbers > 0, but {text!r} was given.")
     return mass, length
 
@@ -242,11 +231,8 @@ def _prior(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
     prior = {}
     for text in texts:
         name, _, numbers = text.partition("=")
-        try:
-            mean, deviation = (float(x) for x in numbers.split(":"))
-        except ValueError:
-            mean = deviation = math.nan
-        if not (math.isfinite(mean) and deviation > 0):
+        mean, deviation = map(number_of, numbers.partition(":")[::2])
+        if mean is None or deviation is None or deviation <= 0:
             raise ValueError(f"--prior needs NAME=MEAN:DEVIATION with a deviation > 0, but {text!r} was given.")
         prior[name] = (mean, deviation)
     return prior

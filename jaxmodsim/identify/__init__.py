@@ -56,4 +56,4 @@ from .uncertainty._profile import profile as profile
 from .uncertainty._residual_tests import residual_tests as residual_tests
 from .uncertainty._result import FitResult as FitResult
 from .uncertainty._result import is_step_size_limited as is_step_size_limited
-from .uncertainty._result import remarks as remarks
+from .uncertainty._result import warnings_for as warnings_for

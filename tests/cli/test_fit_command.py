@@ -16,7 +16,7 @@ import scipy.io
 from jaxmodsim.cli import _fit
 from jaxmodsim.cli._records import AxisColumns, read_record, read_records
 from jaxmodsim.cli._units import parse_units
-from jaxmodsim.identify import FitResult, Record, axis_models, axis_scene, estimate_axis, fit, remarks
+from jaxmodsim.identify import FitResult, Record, axis_models, axis_scene, estimate_axis, fit, warnings_for
 from jaxmodsim.identify.model._axis import AxisEstimate
 
 from ..helpers.axis_records import GAIN, TRUTH, axis_frame
@@ -317,7 +317,7 @@ def test_a_fit_that_follows_nothing_says_so(volt):
     record, rough = record_of(FRAME, volt=volt), AxisEstimate(5.0, 8.0, 3.0, 0.7, 0.5)
     model = axis_models()["coulomb"]
     result = fit(axis_scene(model, rough), record, model.free, limits={"m": (0.0, 50.0)})
-    assert any("the model follows nothing of the record" in remark for remark in remarks(result))
+    assert any("the model follows nothing of the record" in remark for remark in warnings_for(result))
     assert str(result)
 
 

@@ -113,10 +113,17 @@ def test_wrong_options_and_files_are_named(folder, run_command) -> None:
         "no column 'supply'": ["predict", fit, str(folder / "nameless.csv"), "--supply", "supply", "--gain", "9"],
         "is no JSON file": ["predict", str(folder / "nameless.csv"), str(folder / "nameless.csv"), "--gain", "9"],
         "--pendulum needs MASS,LENGTH": ["fit", *records(folder), "--axis", "servo", "--pendulum", "1"],
-        "a servo has the laws": ["fit", *records(folder), "--axis", "servo", "--laws", "lugre"],
+        "there is no servo law 'lugre'; the servo laws are: M1": [
+            "fit",
+            *records(folder),
+            "--axis",
+            "servo",
+            "--laws",
+            "lugre",
+        ],
         "there is no parameter 'kv'": ["fit", *records(folder), "--axis", "servo", "--prior", "kv=1:2"],
         "--prior needs NAME=MEAN:DEVIATION": ["fit", *records(folder), "--axis", "servo", "--prior", "kt=1"],
-        "a servo has the laws M1, M2, M3, M4, M5, M6, MQ, but 'coulomb'": [
+        "there is no servo law 'coulomb'; the servo laws are: M1, M2, M3, M4, M5, M6, MQ": [
             *("fit", *records(folder), "--axis", "servo", "--laws", "coulomb"),
         ],
         "--units does not belong to --axis servo": ["fit", *records(folder), "--axis", "servo", "--units", "time=ms"],

@@ -1,4 +1,4 @@
-"""Which model: the truth or a simpler one that suffices is named, by what was held back from the fit."""
+"""Which model: the truth or a simpler one that suffices is named, by the held-out error."""
 
 import json
 from dataclasses import replace
@@ -59,7 +59,7 @@ def test_the_truth_is_named_and_what_has_more_parameters_is_not(comparison):
     assert set(comparison.results) == set(candidates())
     by_name = {each.name: each for each in comparison.ranked}
     assert [each.name for each in comparison.ranked][2:] == ["coulomb", "viscous"]
-    # With starts fitted to all samples the error on what was held back is the noise, where the model is right: 1600
+    # With starts fitted to all samples the held-out error is the noise, where the model is right: 1600
     # samples, 5 parameters and 8 numbers of start states; three standard errors of a root mean square of 1600 samples
     # are 5 %. What a twentieth of the samples shows of the starts is off by a part of the noise.
     assert by_name["stribeck"].start_fitted == pytest.approx(NOISE, rel=0.06)
@@ -142,7 +142,7 @@ def test_a_model_that_fails_stays_with_its_reason_and_interruption_keeps_what_is
     [
         ({"limits": {"mass": (0.0, None)}}, "mass is no number of any candidate"),
         ({"initializer": Continuation("friction.wide")}, "friction.wide is no number"),
-        ({"folds": 1}, "folds must be at least 2"),
+        ({"folds": 1}, "folds must be an integer >= 2"),
     ],
 )
 def test_wrong_questions_are_refused(options, text):

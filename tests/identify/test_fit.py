@@ -9,7 +9,7 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim._core.parameters import Range
-from jaxmodsim.identify import FitResult, law_force, remarks, replay
+from jaxmodsim.identify import FitResult, law_force, replay, warnings_for
 from jaxmodsim.identify.model._parameters import FreeParameters
 from jaxmodsim.identify.uncertainty._estimate import BLOCKS, covariance_estimate
 from jaxmodsim.scene import replace_numbers, scene_numbers, scene_ranges
@@ -125,7 +125,7 @@ def test_a_parameter_without_effect_is_reported_and_not_given_an_error_of_zero(c
         result._repr_html_()
     )
     assert np.isinf(result.errors["Fs"])
-    assert any("Fs is not seen" in remark for remark in remarks(result))
+    assert any("Fs is not seen" in remark for remark in warnings_for(result))
     assert result.values["Fc"] == pytest.approx(1.0, rel=1e-3)
 
 
@@ -246,7 +246,7 @@ def test_a_start_beyond_its_limit_is_refused(clean):
 def test_a_limit_is_reached_exactly_and_said(clean):
     result = jms.fit(sprung(1.2, Fv=0.0), noisy(clean, 0), ("friction.Fc", "m"), q0=[0.0], limits={"m": (0.0, 1.5)})
     assert result.values["m"] == 1.5
-    assert "m ended on its limit 1.5." in remarks(result)
+    assert "m ended on its limit 1.5." in warnings_for(result)
 
 
 def test_inputs_that_the_scene_does_not_know_are_refused(clean):
@@ -300,7 +300,7 @@ def test_a_step_too_long_for_the_friction_is_remarked(clean):
     result = jms.fit(start, coarse, ("friction.Fc",), q0=[0.0])
     assert result.diagnostics.step_error is not None
     assert result.diagnostics.step_error > 0.1 * result.rmse
-    assert any("Raise substeps" in remark for remark in remarks(result))
+    assert any("Raise substeps" in remark for remark in warnings_for(result))
 
 
 @pytest.mark.parametrize(
@@ -338,7 +338,7 @@ def test_ctrl_c_keeps_the_best_so_far(clean):
     result = jms.fit(sprung(1.0, 0.5, 1.5), noisy(clean, 0), tuple(TRUTH), q0=[0.0], progress=impatient)
     assert result.diagnostics.ending.startswith("interrupted")
     assert result.diagnostics.evaluations == 4
-    assert any("interrupted" in remark for remark in remarks(result))
+    assert any("interrupted" in remark for remark in warnings_for(result))
 
 
 @pytest.mark.parametrize(

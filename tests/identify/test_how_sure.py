@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 import jaxmodsim as jms
 from jaxmodsim._core.parameters import Range
-from jaxmodsim.identify import FitResult, evaluate_on, law_force, profile, remarks, replay, residual_tests
+from jaxmodsim.identify import FitResult, evaluate_on, law_force, profile, replay, residual_tests, warnings_for
 from jaxmodsim.identify.data._record import cut, runs_of
 from jaxmodsim.identify.estimate._problem import FitProblem, Prior, SquaredLoss
 from jaxmodsim.identify.estimate._search import SearchOptions, solve_with_noise
@@ -193,7 +193,7 @@ def test_a_profile_goes_on_from_a_better_value():
     assert "search continued from there in" in curve.notes[-1]
     assert "; continued once from a better value of w" in str(curve.result)
     assert curve.result.diagnostics.evaluations > result.diagnostics.evaluations
-    assert not any("do not trust" in remark for remark in remarks(curve.result))
+    assert not any("do not trust" in remark for remark in warnings_for(curve.result))
     # What is good already is left as it is.
     assert profile(curve.result, "w", points=3).result is curve.result
 
@@ -214,11 +214,11 @@ def test_a_search_goes_on_at_a_hundred_iterations_within_its_limit():
     assert result.diagnostics.evaluations > 200
     assert result.diagnostics.ending == "converged; continued 2 times after 100 iterations each"
     assert result.values == pytest.approx({"a": 1.0, "b": 1.0})
-    assert not any("The search" in remark for remark in remarks(result))
+    assert not any("The search" in remark for remark in warnings_for(result))
     never = fitted(Valley(jnp.asarray(1e6)), t, 0 * t, start)
     ending = "stopped at the limit of 400 iterations (max_steps); continued 3 times after 100 iterations each"
     assert never.diagnostics.ending == ending
-    assert any(ending in remark for remark in remarks(never))
+    assert any(ending in remark for remark in warnings_for(never))
 
 
 @pytest.mark.parametrize(
@@ -232,15 +232,15 @@ def test_a_direction_that_is_not_determined_is_named(engine, start, sentence):
     t = np.linspace(0.0, 6.0, 200)
     y = 3.0 * np.sin(t) + 0.5 * t + 0.01 * np.random.default_rng(4).standard_normal(t.size)
     result = fitted(engine, t, y, start)
-    assert any(sentence in remark for remark in remarks(result)), remarks(result)
+    assert any(sentence in remark for remark in warnings_for(result)), warnings_for(result)
     # The pair is explained, so it is not named a second time.
-    assert not any("hardly told apart" in remark for remark in remarks(result))
+    assert not any("hardly told apart" in remark for remark in warnings_for(result))
 
 
 def test_nothing_is_said_of_parameters_that_are_determined():
     t = np.linspace(0.0, 3.0, 100)
     y = 1.0 + t + 0.01 * np.random.default_rng(5).standard_normal(t.size)
-    assert not remarks(fitted(Line(), t, y, {"a": 1.0, "b": 0.5}))
+    assert not warnings_for(fitted(Line(), t, y, {"a": 1.0, "b": 0.5}))
 
 
 # Motions that show what a rule looks for, and nearly the same that do not.
@@ -329,10 +329,10 @@ def presliding() -> FitResult:
 
 
 def test_a_record_in_presliding_says_so_once(presliding):
-    about = [remark for remark in remarks(presliding) if "presliding" in remark]
-    assert len(about) == 1, remarks(presliding)
+    about = [remark for remark in warnings_for(presliding) if "presliding" in remark]
+    assert len(about) == 1, warnings_for(presliding)
     assert "Fc, Fs and vs cannot be told apart" in about[0]
-    assert not any("Fs and" in remark and "hardly told apart" in remark for remark in remarks(presliding))
+    assert not any("Fs and" in remark and "hardly told apart" in remark for remark in warnings_for(presliding))
     assert presliding.diagnostics.issues[0].about == ("Fc", "Fs", "vs")
 
 
@@ -584,7 +584,7 @@ def test_a_file_gives_back_every_bit(odd, tmp_path):
                 assert same(kept, read), field.name
     assert again.search is None
     assert again.model is None
-    assert remarks(again) == remarks(odd)
+    assert warnings_for(again) == warnings_for(odd)
     assert str(residual_tests(again)) == str(residual_tests(odd))
     result_figure(again)
     with pytest.raises(ValueError, match="loaded result"):

@@ -136,9 +136,9 @@ def test_steps_on_a_few_of_many_records_come_near(moved):
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: MultiStart(0), "count >= 1"),
-        (lambda: MultiStart(spread=1.0), "spread > 1"),
-        (lambda: Continuation("friction.width", factor=0.5), "factor > 1"),
+        (lambda: MultiStart(0), "MultiStart count must be a positive integer"),
+        (lambda: MultiStart(spread=1.0), "MultiStart spread must be one finite number > 1"),
+        (lambda: Continuation("friction.width", factor=0.5), "Continuation factor must be one finite number > 1"),
         (lambda: Stochastic(0.05), "must be one of optax"),
     ],
 )

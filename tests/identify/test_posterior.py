@@ -174,7 +174,7 @@ def test_its_figure_has_a_panel_for_each_pair(posterior: Posterior) -> None:
 def test_it_refuses_what_it_cannot_do(tmp_path) -> None:
     result = fitted(noisy())
     for numbers in ({"draws": 3}, {"warmup": 5}, {"chains": 1}):
-        with pytest.raises(ValueError, match="At least 4 draws, a warmup of 20 and 2 chains are needed"):
+        with pytest.raises(ValueError, match="must be an integer >= "):
             sample_posterior(result, **numbers)
     result.save(tmp_path / "fit.npz")
     with pytest.raises(ValueError, match="a loaded result does not have"):

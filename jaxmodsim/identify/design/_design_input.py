@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..._core.arguments import as_whole
+from ..._core.arguments import as_float, as_whole
 from ..._core.parameters import check_ranges, modules_of
 from ..._core.progress import reported
 from ..._core.trace_checks import traced
@@ -161,9 +161,11 @@ def design_input(
     - `ValueError` for names that are unknown, a scene that has several coordinates or needs events, an input that is
       not in the scene or does not move it, or limits that allow no motion.
     """
-    _check(
-        {"duration": duration, "dt": dt}, {"noise": noise, "uncertainty": uncertainty}, harmonics, max_steps, criterion
-    )
+    duration, dt = as_float(duration, name="duration", lower=0.0), as_float(dt, name="dt", lower=0.0)
+    noise = as_float(noise, name="noise", lower=0.0)
+    uncertainty = as_float(uncertainty, name="uncertainty", lower=0.0)
+    harmonics, max_steps = as_whole(harmonics, name="harmonics"), as_whole(max_steps, name="max_steps")
+    _check(duration, dt, harmonics, criterion)
     axis, parameters, scale = _axis(scene, free, q0, observe, input_name, noise)
     samples = round(duration / dt) + 1
     stride = max((samples - 1) // _COARSE, 1)
@@ -206,16 +208,7 @@ def design_input(
     )
 
 
-def _check(
-    times: dict[str, float], numbers: dict[str, float], harmonics: int, max_steps: int, criterion: object
-) -> None:
-    for unit, arguments in ((" s", times), ("", numbers)):
-        for label, number in arguments.items():
-            if not np.isfinite(number) or number <= 0:
-                raise ValueError(f"{label} must be finite and > 0{unit}, but {number!r} was given.")
-    for label, count in (("harmonics", harmonics), ("max_steps", max_steps)):
-        as_whole(count, name=label)
-    duration, dt = times["duration"], times["dt"]
+def _check(duration: float, dt: float, harmonics: int, criterion: object) -> None:
     samples = min(round(duration / dt) + 1, _COARSE)
     if samples < _SAMPLES_A_PERIOD * harmonics:
         raise ValueError(
@@ -492,10 +485,7 @@ def _run(task: _Task, x: Float[Array, " weights"]) -> tuple[Array, ...]:
 
 def _inverse(information: Float[np.ndarray, "free free"]) -> Float[np.ndarray, "free free"]:
     """Inverse with eigenvalues bounded from below; infinite variance where nothing is known."""
-    scale = np.sqrt(np.diag(information))
-    silent = scale == 0
-    scale = np.where(silent, 1.0, scale)
-    inverse = floored_inverse(information / np.outer(scale, scale), _LEAST) / np.outer(scale, scale)
+    silent, inverse = np.diag(information) == 0, floored_inverse(information, _LEAST)
     inverse[silent, :], inverse[:, silent] = 0.0, 0.0
     inverse[silent, silent] = np.inf
     return inverse

@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..._core.arguments import as_float
 from ..._core.readable import AbstractReadable, Table, table_of
 from ..._core.system import jsonable, written_whole
 from ...scene import Scene, State, replace_numbers, scene_numbers, vector_field
@@ -85,8 +86,7 @@ class AxisLimits:
                 " infinite."
             )
         for name, (value, unit) in self.active.items():
-            if isinstance(value, bool) or not np.isfinite(value) or value <= 0:
-                raise ValueError(f"The limit of {name} must be finite and > 0 {unit}, but it is {value!r}.")
+            as_float(value, name=f"The limit of {name} [{unit}]", lower=0.0)
 
     @property
     def active(self) -> dict[str, tuple[float, str]]:
@@ -345,27 +345,12 @@ def feed_forward(
     return jnp.concatenate([force, force[-1:]])
 
 
-def _record(
-    axis: DrivenAxis,
-    scene: Scene,
-    t: Float[Array, " time"],
-    force: Float[Array, " time"],
-    observe: Callable[[Array, Array], Array],
-    substeps: int = 1,
-) -> Float[Array, " time"]:
-    """The observed quantity under a force that is held from each sample to the next."""
-    return replay(scene, t, {axis.input_name: force}, axis.q0, jnp.zeros_like(axis.q0), substeps, observe)
-
-
 def driven_motion(
     axis: DrivenAxis, t: Float[Array, " time"], force: Float[Array, " time"], substeps: int = 1
 ) -> Float[Array, "2 time"]:
-    """Position and velocity of the model under a force, without feedback."""
-
-    def part(position: Array) -> Array:
-        return _record(axis, axis.scene, t, force, lambda q, qd: jnp.where(position, q[0], qd[0]), substeps)
-
-    return jax.vmap(part)(jnp.array([True, False]))
+    """Position and velocity of the model under a force that is held from each sample to the next."""
+    inputs, rest = {axis.input_name: force}, jnp.zeros_like(axis.q0)
+    return replay(axis.scene, t, inputs, axis.q0, rest, substeps, lambda q, qd: jnp.stack([q[0], qd[0]])).T
 
 
 def sensitivities(
@@ -374,7 +359,8 @@ def sensitivities(
     """The observed quantity under a force, and its derivatives by the free numbers, in noise levels."""
 
     def record(x: Array) -> Array:
-        return _record(axis, axis.at(x), t, force, axis.observe) / axis.noise
+        inputs, rest = {axis.input_name: force}, jnp.zeros_like(axis.q0)
+        return replay(axis.at(x), t, inputs, axis.q0, rest, observe=axis.observe) / axis.noise
 
     size = next(iter(axis.slopes.values())).shape[0]
     zero, units = jnp.zeros(size, force.dtype), jnp.eye(size, dtype=force.dtype)

@@ -12,6 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from ..._core.arguments import as_float, as_whole
 from ..._core.arrays import on_device
 from ..._core.speed import cores
 from ._problem import FitProblem
@@ -83,11 +84,9 @@ class MultiStart(AbstractInitializer):
 
     def __check_init__(self) -> None:
         """Refuse numbers out of range."""
-        if self.count < 1 or self.steps < 1 or not self.spread > 1:
-            raise ValueError(
-                f"MultiStart needs count >= 1, steps >= 1 and spread > 1, but they are {self.count}, {self.steps} and"
-                f" {self.spread}."
-            )
+        as_whole(self.count, name="MultiStart count")
+        as_whole(self.steps, name="MultiStart steps")
+        as_float(self.spread, name="MultiStart spread", lower=1.0)
 
     def starts(self, problem: FitProblem, x: Float[Array, " n"]) -> Float[np.ndarray, "count n"]:
         """The starts, the first one at `x`."""
@@ -204,10 +203,8 @@ class Continuation(AbstractInitializer):
 
     def __check_init__(self) -> None:
         """Refuse numbers out of range."""
-        if self.stages < 1 or not self.factor > 1:
-            raise ValueError(
-                f"Continuation needs stages >= 1 and factor > 1, but they are {self.stages} and {self.factor}."
-            )
+        as_whole(self.stages, name="Continuation stages")
+        as_float(self.factor, name="Continuation factor", lower=1.0)
 
     def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
         """The end of the last fit before the actual one."""
@@ -278,8 +275,8 @@ class Stochastic(AbstractInitializer):
         """Refuse other objects than optimisers, and numbers out of range."""
         if not (hasattr(self.optimiser, "init") and hasattr(self.optimiser, "update")):
             raise ValueError(f"optimiser must be one of optax, as optax.adam(0.05), but it is {self.optimiser!r}.")
-        if self.batch < 1 or self.steps < 1:
-            raise ValueError(f"Stochastic needs batch >= 1 and steps >= 1, but they are {self.batch} and {self.steps}.")
+        as_whole(self.batch, name="Stochastic batch")
+        as_whole(self.steps, name="Stochastic steps")
 
     def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
         """The end of the last step; Ctrl-C ends at the previous step."""

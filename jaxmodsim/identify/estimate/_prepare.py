@@ -151,7 +151,7 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
         runs_of(several, windows),
         noise,
         options.loss,
-        _prior(options.prior, parameters.names),
+        Prior.of(options.prior, parameters.names),
         _jump(options.shooting, windows, base),
         len(unknown),
         _shown_by_opening(several, observables, (*local, *unknown), unknown, states.q.shape[1]),
@@ -384,19 +384,6 @@ def _level(channel: str, records: tuple[Record, ...]) -> float:
     # The interval of the samples, for slip instants.
     size = float(np.std(np.concatenate(values))) if values else float(np.median(np.diff(records[0].t)))
     return size or 1.0
-
-
-def _prior(prior: Mapping[str, tuple[float, float]], names: tuple[str, ...]) -> Prior:
-    mean, weight = np.zeros(len(names)), np.zeros(len(names))
-    for name, pair in prior.items():
-        if name not in names:
-            raise ValueError(f"prior names {name!r}, but the free parameters are: {', '.join(names)}.")
-        numbers = [as_float(x, name=f"prior of {name!r}") for x in pair] if isinstance(pair, tuple | list) else []
-        if len(numbers) != 2 or not numbers[1] > 0:
-            raise ValueError(f"prior of {name} must be a mean and a standard deviation > 0, but it is {pair}.")
-        mean[names.index(name)], weight[names.index(name)] = numbers[0], 1 / numbers[1]
-    dtype = jnp.result_type(float)
-    return Prior(on_device(mean.astype(dtype)), on_device(weight.astype(dtype)))
 
 
 def _jump(shooting: MultipleShooting | None, windows: Windows, base: State) -> Array | None:

@@ -1,7 +1,7 @@
 """The problem of a fit as arrays, from coordinates to weighted residuals and their Jacobian, and the losses."""
 
 import abc
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -12,6 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from ..._core.arguments import as_float
 from ..._core.arrays import on_device
 from ..._core.parameters import Number, check_ranges, parameter
 from ...scene import State, replace_numbers, scene_numbers
@@ -145,6 +146,24 @@ class Prior(eqx.Module):
 
     mean: Float[Array, " free"]
     weight: Float[Array, " free"]
+
+    @staticmethod
+    def of(prior: Mapping[str, tuple[float, float]], names: tuple[str, ...]) -> "Prior":
+        """From means and standard deviations by name.
+
+        **Raises:**
+
+        - `ValueError` for a name that is not free, and anything but a mean and a standard deviation > 0.
+        """
+        mean, weight = np.zeros(len(names)), np.zeros(len(names))
+        for name, pair in prior.items():
+            if name not in names:
+                raise ValueError(f"prior names {name!r}, but the free parameters are: {', '.join(names)}.")
+            numbers = [as_float(x, name=f"prior of {name!r}") for x in pair] if isinstance(pair, tuple | list) else []
+            if len(numbers) != 2 or not numbers[1] > 0:
+                raise ValueError(f"prior of {name} must be a mean and a standard deviation > 0, but it is {pair}.")
+            mean[names.index(name)], weight[names.index(name)] = numbers[0], 1 / numbers[1]
+        return Prior(*(on_device(x.astype(jnp.result_type(float))) for x in (mean, weight)))
 
 
 class FitProblem(eqx.Module):

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ...friction import AbstractDynamicLaw, AbstractForceLaw, AbstractLaw, AbstractSetValuedLaw
 from ...scene import Friction, Scene, State, scene_ranges, vector_field
 from ..data._signals import differentiate, smooth, smooth_span
-from ..model._engines import with_values
+from ..model._engines import driven, mass_of, with_values
 from ..model._observe import coordinates_seen
 from ._initializers import AbstractInitializer, Initialized
 from ._problem import Box, FitProblem, SquaredLoss
@@ -137,22 +137,17 @@ def _sizes(problem: FitProblem, sampled: _Sampled, values: dict[str, float]) -> 
     return {"N": force, "m/s": 0.05 * speed, "N s/m": 0.1 * force / speed, "N/m": 1e2 * force / travel}
 
 
-def _driven(scene: Scene, inputs: dict[str, Array]) -> Scene:
-    return eqx.tree_at(lambda x: x.params, scene, {**scene.params, **inputs}) if inputs else scene
-
-
 def _required(problem: FitProblem, values: Mapping[str, ArrayLike]) -> Callable[[_Sampled], Array]:
     """Generalised friction force at a sample, by the equations of motion without friction."""
-    scene = with_values(problem.engine.model, {name: jnp.asarray(x) for name, x in values.items()})
+    scene = with_values(problem.engine.model, values)
     others = tuple(effect for effect in scene.effects if not isinstance(effect, Friction))
 
     def required(s: _Sampled) -> Array:
-        here = _driven(scene, s.inputs)
+        here = driven(scene, s.inputs)
         bare = Scene(here.lagrangian, params=here.params, effects=others)
         q, qd = s.q[None], s.v[None]
         free = vector_field(s.t, State(q, qd, bare.initial_state(q)), bare).qd[0]
-        mass = jax.hessian(lambda qd: here.lagrangian(s.t, q, qd, here.params))(qd)[0, 0]
-        return mass * (free - s.a)
+        return mass_of(here, s.t, q, qd) * (free - s.a)
 
     return required
 
@@ -177,7 +172,7 @@ def _friction(problem: FitProblem, values: Mapping[str, ArrayLike]) -> Callable[
     elements = list(scene.friction.values())
 
     def friction(s: _Sampled) -> Array:
-        here = _driven(scene, s.inputs)
+        here = driven(scene, s.inputs)
         q, qd, total = s.q[None], s.v[None], jnp.zeros_like(s.v)
         for effect in elements:
             settled = effect.bind_state(s.t, q, qd, here.params)
@@ -197,7 +192,7 @@ def _slip(problem: FitProblem) -> Callable[[_Sampled], Array]:
     elements = list(scene.friction.values())
 
     def slip(s: _Sampled) -> Array:
-        here = _driven(scene, s.inputs)
+        here = driven(scene, s.inputs)
         speeds = [jnp.abs(each.slip(s.t, s.q[None], s.v[None], here.params)) for each in elements]
         return jnp.min(jnp.stack(speeds)) if speeds else s.v
 
@@ -261,7 +256,6 @@ def _mass(problem: FitProblem, values: dict[str, float]) -> float | None:
     """Mass at the first state; None for a law by itself."""
     if problem.base is None:
         return None
-    scene = with_values(problem.engine.model, {name: jnp.asarray(x) for name, x in values.items()})
-    t, q = problem.runs.t[0, 0], problem.base.q[0]
-    params = {**scene.params, **{name: column[0, 0] for name, column in problem.runs.inputs.items()}}
-    return float(jax.hessian(lambda qd: scene.lagrangian(t, q, qd, params))(jnp.zeros_like(q))[0, 0])
+    inputs, q = {name: column[0, 0] for name, column in problem.runs.inputs.items()}, problem.base.q[0]
+    scene = driven(with_values(problem.engine.model, values), inputs)
+    return float(mass_of(scene, problem.runs.t[0, 0], q, jnp.zeros_like(q)))

@@ -210,17 +210,17 @@ def run_samples(
 
     def advance(carry: tuple[Any, PyTree], sample: tuple[Array, Array, PyTree, PyTree]) -> tuple[Any, PyTree]:
         ((y, mode), memory), (start, dt, held, slopes) = carry, sample
-        here = _driven(scene, held)
+        here = driven(scene, held)
         outputs: dict[str, Array] = {}
         if controller is not None:
             outputs, memory = controller.fn(start, y.q, y.qd, memory, here.params)
-            here = _driven(here, outputs)
+            here = driven(here, outputs)
         if exact:
             y, mode = settle(start, y, here, mode)
         seen = observe(start, y, here, mode)
 
         def scene_at(t: Array) -> Scene:
-            return _driven(here, {k: held[k] + (t - start) * x for k, x in slopes.items()})
+            return driven(here, {k: held[k] + (t - start) * x for k, x in slopes.items()})
 
         def field(t: Array, y: State) -> State:
             return vector_field(t, y, scene_at(t))
@@ -242,11 +242,11 @@ def run_samples(
     slopes = {name: jnp.diff(inputs[name]) / jnp.where(dt > 0, dt, 1.0) for name in sorted(linear)}
     memory = () if controller is None else controller.memory
     samples = (t[:-1], dt, jtu.tree_map(lambda x: x[:-1], inputs), slopes)
-    begin = first_modes(t[0], y0, _driven(scene, jtu.tree_map(lambda x: x[0], inputs))) if exact else (y0, None)
+    begin = first_modes(t[0], y0, driven(scene, jtu.tree_map(lambda x: x[0], inputs))) if exact else (y0, None)
     ((end, mode), memory), seen = jax.lax.scan(advance, (begin, memory), samples)
-    last = _driven(scene, jtu.tree_map(lambda x: x[-1], inputs))
+    last = driven(scene, jtu.tree_map(lambda x: x[-1], inputs))
     if controller is not None:
-        last = _driven(last, controller.fn(t[-1], end.q, end.qd, memory, last.params)[0])
+        last = driven(last, controller.fn(t[-1], end.q, end.qd, memory, last.params)[0])
     if exact:
         end, mode = settle(t[-1], end, last, mode)
     final = observe(t[-1], end, last, mode)
@@ -261,18 +261,18 @@ def replay(
     qd0: Float[Array, " dof"],
     substeps: int = 1,
     observe: Callable[[Array, Array], Array] = first_coordinate,
-) -> Float[Array, " samples"]:
+) -> Float[Array, "samples ..."]:
     """Run a scene over the samples of a record, with the inputs held from each sample to the next.
 
     **Arguments:**
 
     - `scene`, `t`, `inputs`, `substeps`: see `run_samples`.
     - `q0`, `qd0`: state at the first sample.
-    - `observe`: `observe(q, qd)`, the observed number; by default the first coordinate.
+    - `observe`: `observe(q, qd)`, the observed number or array; by default the first coordinate.
 
     **Returns:**
 
-    The observed number at each sample, shape `[samples]`.
+    The observed number at each sample, shape `[samples]`, or `[samples, ...]` of arrays.
     """
     y0 = State(q0, qd0, scene.initial_state(q0))
 
@@ -283,10 +283,14 @@ def replay(
     return run_samples(scene, t, inputs, y0, look, substeps=substeps)[0]
 
 
-def _driven(scene: Scene, held: dict[str, Array]) -> Scene:
-    if not held:
-        return scene
-    return eqx.tree_at(lambda x: x.params, scene, {**scene.params, **held})
+def driven(scene: Scene, held: Mapping[str, Array | Signal]) -> Scene:
+    """The scene with inputs in its params."""
+    return eqx.tree_at(lambda x: x.params, scene, {**scene.params, **held}) if held else scene
+
+
+def mass_of(scene: Scene, t: Array, q: Float[Array, " one"], qd: Float[Array, " one"]) -> Float[Array, ""]:
+    """Mass of a scene of one coordinate, from its Lagrangian."""
+    return jax.hessian(lambda qd: scene.lagrangian(t, q, qd, scene.params))(qd)[0, 0]
 
 
 class ModelOutput(NamedTuple):
@@ -340,9 +344,7 @@ class EventEngine(eqx.Module):
         """Run the scene with these values over the samples."""
         scene = with_values(self.model, values)
         inputs = delayed(run.t, run.inputs, self.linear, self.delays | values)
-        if inputs:
-            signals = {name: Signal(run.t, x, linear=name in self.linear) for name, x in inputs.items()}
-            scene = eqx.tree_at(lambda x: x.params, scene, {**scene.params, **signals})
+        scene = driven(scene, {name: Signal(run.t, x, linear=name in self.linear) for name, x in inputs.items()})
         done = simulate(
             scene,
             start.q,

@@ -126,11 +126,10 @@ def compare(
     - `ValueError` for fewer than two folds, parts that are too short, no candidates, limits that no candidate has, and
       as `fit` does.
     """
-    _check(candidates, folds)
     options = CompareOptions(
         records=(records,) if isinstance(records, Record) else tuple(records),
         hold_out=(hold_out,) if isinstance(hold_out, Record) else tuple(hold_out),
-        folds=folds,
+        folds=as_whole(folds, name="folds", least=2),
         fit=FitOptions(observe=observe, q0=q0, qd0=qd0, limits=limits, loss=loss, substeps=substeps),
         initializers=as_initializers(initializer),
         max_steps=as_whole(max_steps, name="max_steps"),
@@ -150,13 +149,10 @@ def compare(
     unknown += [each.name for each in options.initializers if isinstance(each, Continuation) and each.name not in known]
     if unknown:
         raise ValueError(f"{unknown[0]} is no number of any candidate; there are: {', '.join(sorted(known))}.")
-    judges = {
-        name: partial(_validate_scene, name, candidate, options)
-        for name, candidate in sorted(candidates.items(), key=lambda item: len(item[1].free or ()))
-    }
-    description = {name: candidate.description for name, candidate in candidates.items()}
-    by = ", ".join(record.name for record in options.hold_out) or f"{folds} folds"
-    return _compared(judges, description, by, progress, new_records=bool(options.hold_out))
+    sizes = {name: len(candidate.free or ()) for name, candidate in candidates.items()}
+    by = ", ".join(record.name for record in options.hold_out) or f"{options.folds} folds"
+    judge = partial(_validate_scene, options)
+    return _compared(candidates, sizes, judge, by, progress, new_records=bool(options.hold_out))
 
 
 def compare_laws(
@@ -189,9 +185,8 @@ def compare_laws(
 
     - `ValueError` for fewer than two folds, no laws, and as `fit_law` does.
     """
-    _check(laws, folds)
+    folds = as_whole(folds, name="folds", least=2)
     candidates = {name: x if isinstance(x, Candidate) else Candidate(x, None) for name, x in laws.items()}
-
     own = as_initializers(initializer)
 
     def judge(
@@ -213,19 +208,8 @@ def compare_laws(
             held += _held_back(problem, search.state.x, result, block == fold, block, options)[0]
         return CrossValidated(result, tuple(held), ())
 
-    judges = {
-        name: partial(judge, name, candidate)
-        for name, candidate in sorted(candidates.items(), key=lambda item: len(ranges_of(item[1].scene)))
-    }
-    description = {name: each.description for name, each in candidates.items()}
-    return _compared(judges, description, f"{folds} folds", progress, new_records=False)
-
-
-def _check(candidates: Mapping[str, object], folds: int) -> None:
-    if not candidates:
-        raise ValueError("There must be one candidate at least.")
-    if isinstance(folds, bool) or folds < 2:
-        raise ValueError(f"folds must be at least 2, an integer, but {folds!r} was given.")
+    sizes = {name: len(ranges_of(candidate.scene)) for name, candidate in candidates.items()}
+    return _compared(candidates, sizes, judge, f"{folds} folds", progress, new_records=False)
 
 
 def _limited(name: str) -> str:
@@ -261,27 +245,32 @@ def _from_smaller(free: Sequence[str], judged: Mapping[str, CrossValidated]) -> 
 
 
 def _compared(
-    judges: Mapping[str, Callable[[CompareProgress | None, Mapping[str, CrossValidated]], CrossValidated]],
-    description: Mapping[str, str],
+    candidates: Mapping[str, Candidate],
+    sizes: Mapping[str, int],
+    judge: Callable[[str, Candidate, CompareProgress | None, Mapping[str, CrossValidated]], CrossValidated],
     by: str,
     progress: bool | CompareProgress,
     *,
     new_records: bool,
 ) -> Comparison:
-    """Judge one candidate after the other, each with the earlier ones; keep the reasons of failures."""
+    """Judge the candidates in the order of their sizes, each with the earlier ones; keep the reasons of failures."""
+    if not candidates:
+        raise ValueError("There must be one candidate at least.")
+    order = sorted(candidates, key=lambda name: sizes[name])
     judged: dict[str, CrossValidated] = {}
     failures: dict[str, str] = {}
     with reported(progress, "compare", candidate_words) as report:
-        for name, judge in judges.items():
+        for name in order:
             try:
-                judged[name] = judge(report, judged)
+                judged[name] = judge(name, candidates[name], report, judged)
             except KeyboardInterrupt:
                 if not judged:
                     raise
                 break
             except RuntimeError as error:
                 failures[name] = str(error).splitlines()[0]
-    left = tuple(name for name in judges if name not in judged and name not in failures)
+    left = tuple(name for name in order if name not in judged and name not in failures)
+    description = {name: candidate.description for name, candidate in candidates.items()}
     return comparison_of(judged, failures, left, description, by, new_records=new_records)
 
 
@@ -296,9 +285,9 @@ def _finished(search: SearchResult | None) -> SearchResult:
 
 
 def _validate_scene(
+    options: CompareOptions,
     name: str,
     candidate: Candidate,
-    options: CompareOptions,
     report: CompareProgress | None,
     judged: Mapping[str, CrossValidated],
 ) -> CrossValidated:

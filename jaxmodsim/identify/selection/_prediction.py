@@ -283,7 +283,7 @@ def _record_problem(result: FitResult, record: Record, start: Mapping[str, _Star
         runs,
         {name: fitted.noise[name] for name in record.channels},
         SquaredLoss(),
-        Prior(jnp.zeros(0), jnp.zeros(0)),
+        Prior.of({}, ()),
     )
 
 

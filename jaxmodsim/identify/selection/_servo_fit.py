@@ -324,13 +324,12 @@ def _problem(start: Servo, law: str, records: tuple[Record, ...], prior: PriorNu
         low, high = _LIMITS.get(name, (ranges[name].lower, ranges[name].upper))
         ranges[name] = replace(ranges[name], lower=low, upper=high, strict=low is not None)
     free = FreeParameters.of(numbers, ranges, names)
-    means, deviations = np.array([*_priors(start, law, prior).values()]).T
     runs = runs_of(records, cut(records, None))
     samples = float(np.sum(np.asarray(runs.weight[SINGLE])))
     noise = on_device(np.asarray(_ERROR * np.sqrt(samples / _INDEPENDENT)))
     return FitProblem(
         ServoEngine(start), free, (), None, runs, {SINGLE: noise}, SquaredLoss(),
-        Prior(on_device(means), on_device(1 / deviations)),
+        Prior.of(_priors(start, law, prior), names),
     )  # fmt: skip
 
 

@@ -262,10 +262,9 @@ def covariance_estimate(
         np.fill_diagonal(covariance, np.where(silent[first], np.inf, np.diagonal(covariance)))
         return covariance
 
-    back, normal = np.linalg.pinv(slopes[first, first]), matrix / size
-    cross = normal[first, nuisance]
-    known = normal[first, first] - cross @ floored_inverse(normal[nuisance, nuisance], rounding) @ cross.T
-    information = back.T @ (known * size[first, first]) @ back
+    back, cross = np.linalg.pinv(slopes[first, first]), matrix[first, nuisance]
+    known = matrix[first, first] - cross @ floored_inverse(matrix[nuisance, nuisance], rounding) @ cross.T
+    information = back.T @ known @ back
     return CovarianceEstimate(of_parameters(bread @ meat @ bread), of_parameters(bread @ if_white @ bread), information)
 
 
@@ -284,19 +283,21 @@ def _chance(
 
 
 def floored_inverse(matrix: Float[np.ndarray, "n n"], least: float) -> Float[np.ndarray, "n n"]:
-    """Inverse of a scaled normal matrix, with eigenvalues bounded from below.
+    """Inverse of a normal matrix, with eigenvalues bounded from below in columns of unit length.
 
     A direction that the record does not determine gets a huge error.
 
     **Arguments:**
 
-    - `matrix`: symmetric, its diagonal one, shape `[n, n]`.
+    - `matrix`: symmetric, shape `[n, n]`. A column of zeros counts as one of unit length.
     - `least`: smallest eigenvalue, as a share of the largest one.
     """
     if not matrix.size:
         return matrix
-    values, vectors = np.linalg.eigh(matrix)
-    return vectors / np.maximum(values, least * max(values[-1], 1.0)) @ vectors.T
+    scale = np.sqrt(np.diagonal(matrix))
+    size = np.multiply.outer(*[np.where(scale > 0, scale, 1.0)] * 2)
+    values, vectors = np.linalg.eigh(matrix / size)
+    return vectors / np.maximum(values, least * max(values[-1], 1.0)) @ vectors.T / size
 
 
 def correlation_of(covariance: Float[np.ndarray, "free free"]) -> Float[np.ndarray, "free free"]:
@@ -461,20 +462,23 @@ def sample_blocks(problem: FitProblem, blocks: int = BLOCKS) -> tuple[Int[np.nda
 
 
 def _passes_for_white(problem: FitProblem, residual: Float[np.ndarray, " rows"]) -> bool:
-    """Whether the test of Ljung and Box (1978, Biometrika 65:297) finds no correlation in any channel."""
+    """Whether the test of `whiteness` finds no correlation in any channel."""
     for name, (rows, weight) in problem.by_channel(residual.astype(float)).items():
         if name not in problem.runs.weight:
             continue  # slip instants are no series
         counted = float(np.sum(weight))
         e = np.where(weight > 0, rows - np.sum(rows) / counted, 0.0)
-        lags = lag_number(rows.shape[1])
-        later = np.arange(1, lags + 1)
-        products = np.array([np.sum(e[:, :-lag] * e[:, lag:]) for lag in later])
-        correlation = products / max(float(np.sum(e**2)), _TINY)
-        left = np.maximum(counted - later, 1)
-        if not counted * (counted + 2) * np.sum(correlation**2 / left) < special.chdtri(lags, _CHANCE):
+        lags = range(1, lag_number(rows.shape[1]) + 1)
+        products = np.array([np.sum(e[:, :-lag] * e[:, lag:]) for lag in lags])
+        if not whiteness(products / max(float(np.sum(e**2)), _TINY), counted) > _CHANCE:
             return False
     return True
+
+
+def whiteness(correlation: Float[np.ndarray, " lags"], samples: float) -> float:
+    """Probability that white noise has such an autocorrelation at lags from 1: Ljung, Box 1978, Biometrika 65:297."""
+    left = np.maximum(samples - np.arange(1, len(correlation) + 1), 1)
+    return float(special.chdtrc(len(correlation), samples * (samples + 2) * np.sum(correlation**2 / left)))
 
 
 def lag_number(n: int) -> int:

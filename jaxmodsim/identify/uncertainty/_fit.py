@@ -249,7 +249,7 @@ def fit_law(
         runs_of(several, windows),
         {name: on_device(noise.get(name, size)) for name in several[0].channels},
         SquaredLoss() if loss is None else loss,
-        Prior(*(on_device(np.zeros(len(parameters.names))) for _ in range(2))),
+        Prior.of({}, parameters.names),
     )
     with reported(progress, "fit", iteration_words) as report:
         options = SearchOptions(rtol, as_whole(max_steps, name="max_steps"), report)

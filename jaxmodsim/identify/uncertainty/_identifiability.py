@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Float, PyTree
 
 from ..._core.arrays import on_device
 from ..._core.parameters import modules_of
 from ...friction import AbstractAsymmetric, AbstractLaw
 from ...scene import Friction, Scene, replace_numbers, scene_numbers
+from ..model._engines import mass_of
 from ..model._observe import RecordedMotion, Slip, slip_of
 from ._estimate import FitDiagnostics, IdentifiabilityIssue, ParameterEstimate
 
@@ -283,9 +283,7 @@ def slow(
     )
 
 
-@eqx.filter_jit
-def _mass(scene: Scene, t: Array, q: Float[Array, " one"], qd: Float[Array, " one"]) -> Array:
-    return jax.hessian(lambda qd: scene.lagrangian(t, q, qd, scene.params))(qd)[0, 0]
+_mass = eqx.filter_jit(mass_of)
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -349,13 +349,8 @@ def sample_posterior(
     - `ValueError` for a loaded result, or numbers out of range.
     """
     blackjax = extra("blackjax", "sample_posterior", "posterior")
-    draws, warmup, chains = (
-        as_whole(x, name=name) for x, name in ((draws, "draws"), (warmup, "warmup"), (chains, "chains"))
-    )
-    if draws < 4 or warmup < 20 or chains < 2:
-        raise ValueError(
-            f"At least 4 draws, a warmup of 20 and 2 chains are needed, but {draws}, {warmup} and {chains} were given."
-        )
+    draws, warmup = as_whole(draws, name="draws", least=4), as_whole(warmup, name="warmup", least=20)
+    chains = as_whole(chains, name="chains", least=2)
     density = log_density(result)
     keys = jax.random.split(jax.random.key(seed), chains)
     # In threads, since under vmap all chains would wait at each draw for the longest path.

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy import special  # scipy.stats takes most of a second to import
@@ -13,7 +12,7 @@ from scipy import special  # scipy.stats takes most of a second to import
 from ..._core.arguments import as_share, as_whole
 from ..._core.arrays import on_device
 from ..estimate._problem import FitProblem, Prior
-from ..estimate._search import SearchOptions, SearchResult, SearchState, cost_of, start_search, step, weighted_by
+from ..estimate._search import SearchOptions, SearchResult, cost_of, start_search, step, weighted_by
 from ._estimate import BLOCKS, ROUNDING, ParameterEstimate, floored_inverse
 from ._fit import searched_on
 from ._result import FitResult
@@ -261,9 +260,10 @@ def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tu
     value, error = estimate.values[name], estimate.errors[name]
     slopes = np.zeros(state.x.shape[0])
     slopes[:size] = problem.at(state.x).slopes[i]
-    sensitivity = _inverse_normal(problem, state) @ slopes
+    residual, jacobian = weighted_by(problem.loss, state)
+    rounding = ROUNDING * float(np.finfo(jacobian.dtype).eps)
+    sensitivity = floored_inverse(jacobian.astype(float).T @ jacobian, rounding) @ slopes
     by_losses = float(slopes @ sensitivity)
-    residual, _ = weighted_by(problem.loss, state)
     counted = float(np.sum(problem.weights > 0))
     variance = float(np.sum(residual[: problem.samples] ** 2)) / max(counted - state.x.shape[0], 1)
     # One standard error costs error^2 / by_losses: the variance, for white residuals. If one block of samples
@@ -286,16 +286,6 @@ def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tu
     line = _Line(name, problem, i, floor, unit, reach, limits, inflation, 0.0, known)
     line = replace(line, best=line.cost(np.asarray(state.residual), value))
     return line, sensitivity / by_losses * (1.0 if floor is None else size_of)
-
-
-def _inverse_normal(problem: FitProblem, state: SearchState) -> np.ndarray:
-    """Inverse of the normal matrix of the fit by x, very large in undetermined directions."""
-    weighted = weighted_by(problem.loss, state)[1].astype(float)
-    matrix = weighted.T @ weighted
-    scale = np.sqrt(np.diag(matrix))
-    scale = np.where(scale > 0, scale, 1.0)
-    size = np.outer(scale, scale)
-    return floored_inverse(matrix / size, ROUNDING * float(jnp.finfo(problem.prior.mean.dtype).eps)) / size
 
 
 def _walk(

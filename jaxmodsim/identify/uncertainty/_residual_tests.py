@@ -10,7 +10,7 @@ from scipy import special  # scipy.stats takes most of a second to import
 
 from ..estimate._search import SearchResult
 from ..model._observe import RecordedMotion
-from ._estimate import BLOCKS, lag_number
+from ._estimate import BLOCKS, lag_number, whiteness
 from ._result import FitResult
 
 # A trend or an input is reported from this share of the variance, below this p-value.
@@ -178,9 +178,6 @@ def channel_tests(
     memory = remembered(correlation)
     # Negative correlation helps the mean alone, so samples count as n at most.
     tau = max(1 + 2 * float(np.sum(correlation[1:memory])), 1.0)
-    # Ljung, Box 1978, Biometrika 65:297.
-    statistic = n * (n + 2) * float(np.sum(correlation[1 : lags + 1] ** 2 / (n - np.arange(1, lags + 1))))
-    whiteness = float(special.chdtrc(lags, statistic))
     skewness, kurtosis, normality = _normality(e, correlation, memory)
     regressors = {f"q[{i}]": x for i, x in motion.q.items()} | {f"qd[{i}]": x for i, x in motion.qd.items()}
     regressors["t"] = motion.t
@@ -193,7 +190,7 @@ def channel_tests(
         n / tau,
         interval * (tau - 1) / 2,
         lags,
-        whiteness,
+        whiteness(correlation[1 : lags + 1], float(n)),
         correlation[: min(max(lags, 4 * memory), n - 1) + 1],
         skewness,
         kurtosis,

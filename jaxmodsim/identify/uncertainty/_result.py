@@ -199,7 +199,7 @@ class FitResult(AbstractReadable):
                 "evaluations": diagnostics.evaluations,
                 "ending": diagnostics.ending,
                 "step_error": diagnostics.step_error,
-                "remarks": list(remarks(self)),
+                "remarks": list(warnings_for(self)),
             }
         )
 
@@ -222,10 +222,10 @@ def _(result: FitResult) -> Table:
     names = ", ".join(record.name for record in result.provenance.records)
     head = ("parameter", "value", "standard error", "95 % interval")
     ending = f"{result.diagnostics.evaluations} evaluations, {result.diagnostics.ending}"
-    return Table(f"Fit to {names}, RMSE {errors}", head, rows, (ending, *remarks(result)))
+    return Table(f"Fit to {names}, RMSE {errors}", head, rows, (ending, *warnings_for(result)))
 
 
-def remarks(result: FitResult) -> tuple[str, ...]:
+def warnings_for(result: FitResult) -> tuple[str, ...]:
     """Limitations of a fit, in sentences: causes of wrong standard errors, undetermined parameters, and the reasons.
 
     Parameters and pairs that an issue of the motion or a weak combination explains are not listed again.
@@ -406,10 +406,7 @@ def _unpacked(x: object, arrays: Mapping[str, np.ndarray]) -> Any:
     ((kind, inside),) = x.items()
     if kind == "record":
         parts = _unpacked(inside, arrays)
-        return Record(
-            parts["t"], parts["channels"], parts["inputs"], parts["name"], linear=parts["linear"],
-            noise=parts["noise"] or None, slips=parts["slips"],
-        )  # fmt: skip
+        return Record(measured=parts.pop("channels"), **parts)
     if kind == "issue":
         return IdentifiabilityIssue(inside[0], tuple(inside[1]))
     if kind == "dict":
