@@ -245,19 +245,19 @@ class FrictionFilter(eqx.Module):
 
     def run(
         self,
-        t: Float[ArrayLike, " time"],
-        measured: Float[ArrayLike, "time m"],
-        inputs: Mapping[str, Float[ArrayLike, " time"]],
+        t: ArrayLike,
+        measured: ArrayLike,
+        inputs: Mapping[str, ArrayLike],
         start: Gaussian,
     ) -> FilterRun:
         """Filter a record; compiled inside.
 
         **Arguments:**
 
-        - `t`: times [s], increasing, at any distance. Steps must resolve the motion of the mechanism: insert times
+        - `t`: times [s], increasing, at any distance, shape `[time]`. Steps must resolve the motion of the mechanism: insert times
           without a measurement where they do not.
-        - `measured`: channels at these times, NaN where there is none.
-        - `inputs`: values of `params` by name, each held until the next time.
+        - `measured`: channels at these times, NaN where there is none, shape `[time, m]`.
+        - `inputs`: values of `params` by name, each held until the next time, shape `[time]`.
         - `start`: the state at the first time before its measurement, see `start`.
 
         **Returns:**

@@ -1,9 +1,9 @@
 """Kalman filters and smoothers in square-root form: covariances are `S S^T` with lower triangular factors S.
 
 All of them need the mean and the spread of a function of a Gaussian variable, which a `Transform` gives. Every factor
-comes from one triangularization, so that covariances are never subtracted (P. Kaminski, A. Bryson, S. Schmidt, "Discrete
-square root filtering", IEEE Transactions on Automatic Control 16, 1971). It is written out in elementary operations,
-which C code needs too.
+comes from one triangularization, so that covariances are never subtracted (P. Kaminski, A. Bryson, S. Schmidt,
+"Discrete square root filtering", IEEE Transactions on Automatic Control 16, 1971). It is written out in elementary
+operations, which C code needs too.
 """
 
 import math
@@ -101,13 +101,13 @@ def triangular_factor(matrix: Float[Array, "n k"]) -> Float[Array, "n n"]:
         size = jnp.where(largest > 0, scale * jnp.sqrt(jnp.where(largest > 0, squares, 1.0)), 0.0)
         side = jnp.where(row[0] < 0, -1.0, 1.0).astype(row.dtype)
         # The reflection along `normal` moves the row to -side size in its first place.
-        normal = jnp.concatenate([(row[0] + side * size)[None], row[1:]]) / scale
+        normal = (row + jnp.where(jnp.arange(row.size) == 0, side * size, 0.0)) / scale
         square = jnp.sum(normal**2)
         share = 2.0 / jnp.where(square > 0, square, 1.0)
         turned = rest - share * jnp.sum(rest * normal[None, :], axis=1)[:, None] * normal[None, :]
-        below = -side * turned[1:, 0]
-        columns.append(jnp.concatenate([jnp.zeros(i, row.dtype), size[None], below]))
-        rest = turned[1:, 1:]
+        columns.append(jnp.pad(jnp.where(jnp.arange(len(rest)) == 0, size, -side * turned[:, 0]), (i, 0)))
+        if i + 1 < matrix.shape[0]:
+            rest = turned[1:, 1:]
     return jnp.stack(columns, axis=1)
 
 
