@@ -158,5 +158,5 @@ def check_observer(law: LuGre, m: float, kp: float, kd: float, ki: float = 0.0, 
     )
     if over:
         condition += f" Over-compensation: {level:g} of the friction is compensated, and the rest drives the motion."
-    ok = kd >= least and integral and not over and kp > 0
-    return Passivity(ok, -math.inf if over else kd - least, math.inf if ok else 0.0, condition)
+    ok = bool(kd >= least and integral and not over and kp > 0)
+    return Passivity(ok, -math.inf if over else float(kd - least), math.inf if ok else 0.0, condition)
