@@ -87,8 +87,8 @@ def compensate_friction(
             law = effect.law
             if not isinstance(law, LuGre) or jnp.ndim(v):
                 raise ValueError(
-                    f"compensate_friction: an observer needs LuGre along a scalar displacement, but friction {name!r} is"
-                    f" {type(law).__name__}. Leave `error` out, and write the planned motion to y."
+                    f"compensate_friction: an observer needs LuGre along a scalar displacement, but friction {name!r}"
+                    f" is {type(law).__name__}. Leave `error` out, and write the planned motion to y."
                 )
             # The equation is linear in z: the correction acts like a slip at the rate -k e.
             slip_error = jnp.sum(effect.direction(y.q, scene.params) * error)

@@ -254,8 +254,8 @@ class FrictionFilter(eqx.Module):
 
         **Arguments:**
 
-        - `t`: times [s], increasing, at any distance, shape `[time]`. Steps must resolve the motion of the mechanism: insert times
-          without a measurement where they do not.
+        - `t`: times [s], increasing, at any distance, shape `[time]`. Steps must resolve the motion of the mechanism:
+          insert times without a measurement where they do not.
         - `measured`: channels at these times, NaN where there is none, shape `[time, m]`.
         - `inputs`: values of `params` by name, each held until the next time, shape `[time]`.
         - `start`: the state at the first time before its measurement, see `start`.
