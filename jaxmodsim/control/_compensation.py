@@ -94,9 +94,9 @@ def compensate_friction(
             slip_error = jnp.sum(effect.direction(y.q, scene.params) * error)
             most = law.Fs / law.sigma0
             rate = law.sigma0 * jnp.abs(v) / law.stribeck_curve(v)
-            push = -gain * slip_error * decay_mean(rate * h) * h
+            push = -jnp.asarray(gain) * slip_error * decay_mean(rate * h) * h
             z, before = jnp.clip(moved + push, -most, most), z
-            force = law.force_given_zdot(v, z, (z - before) / h)
+            force = law.force_given_zdot(v, z, (z - before) / h)  # pyright: ignore[reportOperatorIssue] - a bristle has a state
             force = force if load is None else load * force
             moved = z
         total = total - effect.apply_force(y.q, jnp.asarray(share) * force, scene.params)
