@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .lu import MAX_UNROLLED_LU, factor_lu, invert
@@ -113,8 +115,8 @@ def solve_monotone(
     points where a block vanishes: steep equations have kinks there. If `p` is not increasing there may be several
     solutions; the result is one near that for constant p.
 
-    Forward and reverse derivatives are those of the exact solution, by the implicit function theorem. They do not pass
-    through the search.
+    Derivatives of any order, forward and reverse, are those of the exact solution, by the implicit function theorem.
+    They do not pass through the search.
 
     **Arguments:**
 
@@ -125,19 +127,30 @@ def solve_monotone(
     """
     tiny = float(jnp.finfo(free.dtype).tiny)
     fixed, constants = jax.closure_convert(fn, free)
-    constants, free0, a = jax.lax.stop_gradient((constants, free, coupling))
 
-    def value(x: Array) -> Array:
-        return fixed(x, *constants)
+    @jax.custom_jvp
+    def root(free: Array, coupling: Array, *constants: Array) -> Monotone:
+        return (_solve_one if free.shape[0] == 1 else _solve_several)(
+            lambda x: fixed(x, *constants), free, coupling, blocks
+        )
 
-    solution = (_solve_one if free.shape[0] == 1 else _solve_several)(value, free0, a, blocks)
-    x = jax.lax.stop_gradient(solution.x)
-    # A law may have no derivative at x = 0, but it has one on either side.
-    aside = jnp.where(x == 0, tiny, x)
-    residual = aside - free + _times(coupling, fn(aside))
-    slopes = _slopes(value, aside, blocks)[1]
-    change = _newton(a, slopes, residual - jax.lax.stop_gradient(residual))
-    return Monotone(x + change, solution.solved, solution.iterations)
+    def derivative(primals: tuple[Array, ...], tangents: tuple[Array | SymbolicZero, ...]) -> tuple[Monotone, Monotone]:
+        solution = root(*primals)
+        # A law may have no derivative at x = 0, but it has one on either side.
+        aside = jnp.where(solution.x == 0, tiny, solution.x)
+        moving = [i for i, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero)]
+
+        def residual(*values: Array) -> Array:
+            free, coupling, *constants = [values[moving.index(i)] if i in moving else x for i, x in enumerate(primals)]
+            return aside - free + _times(coupling, fixed(aside, *constants))
+
+        _, change = jax.jvp(residual, tuple(primals[i] for i in moving), tuple(tangents[i] for i in moving))
+        _, slopes = _slopes(lambda x: fixed(x, *primals[2:]), aside, blocks)
+        flags = [np.zeros(x.shape, jax.dtypes.float0) for x in solution[1:]]
+        return solution, Monotone(_newton(primals[1], slopes, change), *flags)
+
+    root.defjvp(derivative, symbolic_zeros=True)
+    return root(free, coupling, *constants)
 
 
 def _times(matrix: Array, x: Array) -> Array:

@@ -25,11 +25,11 @@ from ..scene import (
     read_element,
     scene_ranges,
     scene_units,
+    state_names,
 )
 from ._compile import PLATFORMS, compile_library, compiler_of, own_platform
 from ._fmu_description import FmuVariable, describe
 from ._fmu_model import Model, header, series_of, write_model
-from ._scene_code import _state_names
 
 _WRITTEN = ("fmi3.c", "fmi3.h", "motion.c", "motion.h")
 _BUILD = """\
@@ -243,7 +243,7 @@ def _variables(
         least = float(least) if isinstance(least, float | int) and np.isfinite(least) else None
         add(name, causality, variability, start=start, unit=_unit(known.get(array, "")), least=least)
     first, dof = len(variables), model.y.q.shape[0]
-    labels = [quantity_of(scene, name) for name in _state_names(model.y)]
+    labels = [quantity_of(scene, name) for name in state_names(model.y)]
     for i, (label, start) in enumerate(zip(labels, states, strict=True)):
         add(label.name, "output" if i < 2 * dof else "local", "continuous", start=start, unit=_unit(label.unit))
     for i, label in enumerate(labels):

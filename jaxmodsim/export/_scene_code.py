@@ -12,7 +12,7 @@ from jaxtyping import Array, PyTree
 from .._core.arguments import as_whole
 from .._core.arrays import PerDof, Scalar
 from .._core.scalarise import trace_in_arrays
-from ..scene import Scene, State, check_scene, check_step, elements, scene_step, signals_of, vector_field
+from ..scene import Scene, State, check_scene, check_step, elements, scene_step, signals_of, state_names, vector_field
 from ._c_code import literal, type_of, write_program
 from ._program import Symbol, program_of
 
@@ -155,8 +155,8 @@ def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
         numbers=numbers,
         rest=rest,
         places="\n".join(f"  {place}, /* {each} */" for place, each in places.items()),
-        states=", ".join(_state_names(y)),
-        size=len(_state_names(y)),
+        states=", ".join(state_names(y)),
+        size=len(state_names(y)),
         dof=dof,
         real=real,
         prototypes="\n".join([*(_c_signature(each, name, real) + ";" for each in routines), run + ";"]),
@@ -165,7 +165,7 @@ def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
 
 
 def _routines(scene: Scene, y: State) -> list[_Routine]:
-    names, dof = _state_names(y), y.q.shape[0]
+    names, dof = state_names(y), y.q.shape[0]
     own = [f"y[{i}]" for i in range(2 * dof, len(names))]
     whole = [f"y[{i}]" for i in range(len(names))]
     rates = [f"rate[{i}]" for i in range(len(names))]
@@ -250,13 +250,3 @@ def _filled(like: PyTree, entries: list[Array]) -> PyTree:
         part = [next(left) for _ in range(np.size(leaf))]
         leaves.append(jnp.stack(part).reshape(np.shape(leaf)) if np.ndim(leaf) else part[0])
     return jtu.tree_unflatten(jtu.tree_structure(like), leaves)
-
-
-def _state_names(y: State) -> list[str]:
-    """Names of the entries of a state: q[0], qd[0], and friction.z for the state of a law."""
-    names = []
-    for path, leaf in jtu.tree_leaves_with_path(y):
-        words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]
-        word = ".".join([*words[1:], "z"] if words[0] == "z" else words)
-        names += [word + (f"[{','.join(map(str, i))}]" if i else "") for i in np.ndindex(np.shape(leaf))]
-    return names

@@ -31,6 +31,7 @@ from ._law import AbstractLaw as AbstractLaw
 from ._law import AbstractPlanarLaw as AbstractPlanarLaw
 from ._law import AbstractSetValuedLaw as AbstractSetValuedLaw
 from ._law import LawCase as LawCase
+from ._law import Passivity as Passivity
 from ._law import laws as laws
 from ._law import register_law as register_law
 from ._modifiers import AbstractAsymmetric as AbstractAsymmetric

@@ -7,6 +7,7 @@ from ._dynamics import ConstraintReaction as ConstraintReaction
 from ._dynamics import State as State
 from ._dynamics import forward_dynamics as forward_dynamics
 from ._dynamics import from_dynamics as from_dynamics
+from ._dynamics import state_names as state_names
 from ._dynamics import vector_field as vector_field
 from ._event_driven import mode_numbers as mode_numbers
 from ._implicit import check_step as check_step

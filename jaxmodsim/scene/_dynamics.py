@@ -5,6 +5,8 @@ from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._core.arrays import PerDof, Scalar
@@ -53,6 +55,21 @@ class State(NamedTuple):
     q: PerDof
     qd: PerDof
     z: dict[str, PyTree]
+
+
+def state_names(y: State) -> list[str]:
+    """Names of the entries of a state: q[0], qd[0], and friction.z for the state of a law.
+
+    **Returns:**
+
+    One name for each number, in the order of the leaves.
+    """
+    names = []
+    for path, leaf in jtu.tree_leaves_with_path(y):
+        words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]
+        word = ".".join([*words[1:], "z"] if words[0] == "z" else words)
+        names += [word + (f"[{','.join(map(str, i))}]" if i else "") for i in np.ndindex(np.shape(leaf))]
+    return names
 
 
 class ConstraintReaction(NamedTuple):

@@ -11,8 +11,9 @@ import pytest
 import jaxmodsim as jms
 from jaxmodsim._core.monotone import rising_root, solve_monotone
 from jaxmodsim.problems import ramped_box
+from jaxmodsim.scene import State, scene_step
 
-from ..helpers.differences import flat, gradient_by_differences
+from ..helpers.differences import central_difference, flat, gradient_by_differences
 
 SOLVER = jms.ImplicitFriction()
 M = 2.0
@@ -338,3 +339,19 @@ def test_coupled_steep_equations(blocks: tuple[int, ...]) -> None:
     solved, misfit = jax.jit(jax.vmap(solve))(free, coupling, widths)
     assert solved.all()
     assert np.max(misfit) < 1e-8
+
+
+def test_second_derivatives_of_a_step() -> None:
+    """Against differences of first derivatives, in slip, in both modes."""
+    scene = ramped_box.scene(ramped_box.lugre(sigma1=20.0))
+
+    def after(x: Any) -> Any:
+        y = State(jnp.zeros(1), x[:1], {"friction": 1e-3 * x[1]})
+        return scene_step(scene, jnp.array(0.0), jnp.array(1e-2), y)[0].qd[0]
+
+    x = jnp.array([0.1, 1.0])
+    forward = jax.jacfwd(jax.jacfwd(after))(x)
+    np.testing.assert_allclose(jax.hessian(after)(x), forward, rtol=1e-10)
+    for i in range(2):
+        slope = central_difference(lambda s, i=i: jax.jacfwd(after)(x.at[i].add(s)), 0.0, 1e-3)
+        np.testing.assert_allclose(forward[i], slope, rtol=1e-6, atol=1e-9)
