@@ -78,7 +78,8 @@ def rising_root(
         forced = (s.tries % _HALVES == _HALVES - 1) & jnp.isfinite(above)
         x = jnp.where(inside & ~forced, newton, _between(below, above, least))
         still = rises & (jnp.abs(newton - s.x) <= eps * s.x)
-        settled = (jnp.abs(value) <= small) | still | (above - below <= 2.0 * eps * above)
+        closed = jnp.isfinite(above) & (above - below <= 2.0 * eps * above)  # inf <= inf is true
+        settled = (jnp.abs(value) <= small) | still | closed
         return _Bracket(jnp.where(settled, s.x, x), below, above, settled, s.tries + 1)
 
     start = _Bracket(first, jnp.zeros_like(first), above, jnp.array(False), jnp.array(0))
@@ -147,7 +148,8 @@ def solve_monotone(
         _, change = jax.jvp(residual, tuple(primals[i] for i in moving), tuple(tangents[i] for i in moving))
         _, slopes = _slopes(lambda x: fixed(x, *primals[2:]), aside, blocks)
         flags = [np.zeros(x.shape, jax.dtypes.float0) for x in solution[1:]]
-        return solution, Monotone(_newton(primals[1], slopes, change), *flags)
+        change = _newton(primals[1], slopes, change)
+        return solution, Monotone(change, *flags)  # pyright: ignore[reportArgumentType] # float0 is NumPy's
 
     root.defjvp(derivative, symbolic_zeros=True)
     return root(free, coupling, *constants)

@@ -105,7 +105,7 @@ class FrictionFilter(eqx.Module):
     keep their values, and their variance grows by their drift (a consider filter).
 
     The extended filter (`linearized`) takes one derivative of the step, the unscented one (`unscented`) 2 n steps.
-    Noise levels can be fitted by the gradient of the likelihood, which is accurate to 1e-4.
+    Noise levels can be fitted by the gradient of the likelihood.
 
     **Arguments:**
 

@@ -68,10 +68,9 @@ def branch_figure(branch: Branch[PeriodicOrbit], coordinate: int = 0, *, beside:
     orbits = branch.orbits
     autonomous = orbits[0].autonomous
     figure = Figure(figsize=(9.0, 5.0), layout="constrained")
-    rows = [["amplitude", "orbits"], ["period", "orbits"]] if autonomous else [["amplitude", "orbits"]]
-    sizes = {"height_ratios": (2.2, 1.0)[: len(rows)], "width_ratios": (1.3, 1.0)}
-    panels = figure.subplot_mosaic(rows, **sizes)
-    left, right = panels["amplitude"], panels["orbits"]
+    heights = (2.2, 1.0) if autonomous else (1.0,)
+    panels = figure.subplot_mosaic("ab;cb" if autonomous else "ab", height_ratios=heights, width_ratios=(1.3, 1.0))
+    left, right = panels["a"], panels["b"]
     scene = orbits[0].runs[0].scene
     name, unit = quantity_of(scene, f"q[{coordinate}]")
     for each in (branch, *beside):
@@ -83,7 +82,7 @@ def branch_figure(branch: Branch[PeriodicOrbit], coordinate: int = 0, *, beside:
     left.set(xlabel="" if autonomous else parameter, ylabel=with_unit(f"amplitude of {name}", unit))
     left.ticklabel_format(axis="y", scilimits=_PLAIN)
     if autonomous:
-        period = panels["period"]
+        period = panels["c"]
         period.sharex(left)
         left.tick_params(labelbottom=False)
         period.plot(branch.values, branch.period, color=GREY, lw=1.3)

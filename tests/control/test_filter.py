@@ -90,13 +90,7 @@ def test_consistency_through_stick_and_slip(transform, runs):
         np.testing.assert_allclose(mean.mean(), degrees, rtol=0.03 if runs == 200 else 0.1)
 
 
-# Forward and reverse mode agree, and differ from differences by 1e-4 of the gradient; the cause is not known.
-_OFF = pytest.mark.xfail(
-    strict=True, reason="the gradient through the scene's step is off by 1e-4; that of a linear filter is right"
-)
-
-
-@pytest.mark.parametrize("transform", [pytest.param(linearized, marks=_OFF), pytest.param(unscented, marks=_OFF)])
+@pytest.mark.parametrize("transform", [linearized, unscented])
 def test_gradient_of_the_likelihood_by_noise_levels(transform):
     """Second derivatives of the implicit step enter that of the extended filter.
 

@@ -341,6 +341,24 @@ def test_coupled_steep_equations(blocks: tuple[int, ...]) -> None:
     assert np.max(misfit) < 1e-8
 
 
+def test_a_step_with_falling_friction_is_solved() -> None:
+    """The root lies beyond the first value of the search where friction falls with speed."""
+    law, h = jms.LuGre(sigma0=1e4, sigma1=0.0, sigma2=1.0, Fc=2.0, Fs=3.0, vs=0.02), 7e-3
+    rng = np.random.default_rng(0)
+    free = rng.normal(size=300) * 10.0 ** rng.uniform(-3.0, -0.5, 300)
+    z0 = rng.uniform(-2.5e-4, 2.5e-4, 300)
+
+    def impulse(v: Any, z: Any) -> Any:
+        after = law.step_exact(v, z, jnp.asarray(h))
+        return law.force_given_zdot(v, after, (after - z) / h)
+
+    solve = jax.vmap(lambda free, z: solve_monotone(lambda x: impulse(x, z), free[None], jnp.array([[h]]), (1,)))
+    found = solve(jnp.asarray(free), jnp.asarray(z0))
+    x = found.x[:, 0]
+    assert found.solved.all()
+    np.testing.assert_allclose(x + h * jax.vmap(impulse)(x, z0), free, rtol=0, atol=1e-15)
+
+
 def test_second_derivatives_of_a_step() -> None:
     """Against differences of first derivatives, in slip, in both modes."""
     scene = ramped_box.scene(ramped_box.lugre(sigma1=20.0))
