@@ -88,7 +88,7 @@ def branch_figure(branch: Branch[PeriodicOrbit], coordinate: int = 0, *, beside:
         period.plot(branch.values, branch.period, color=GREY, lw=1.3)
         period.set(xlabel=parameter, ylabel="period [s]")
         period.ticklabel_format(axis="y", scilimits=_PLAIN)
-        middle = np.mean(period.get_ylim())
+        middle = float(np.mean(period.get_ylim()))
         if np.ptp(period.get_ylim()) < _LEAST_RANGE * middle:
             period.set_ylim((1.0 - 0.5 * _LEAST_RANGE) * middle, (1.0 + 0.5 * _LEAST_RANGE) * middle)
     handles = dict(zip(*reversed(left.get_legend_handles_labels()), strict=True))

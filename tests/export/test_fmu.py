@@ -52,7 +52,7 @@ CASES: dict[str, Callable[[], tuple[Any, Any, Any, float, float, float]]] = {
         1e-5,
     ),
 }
-NAMES = ["box", "belt", "ball", *(pytest.param(each, marks=pytest.mark.deep) for each in ("pendulum", "crank"))]
+NAMES = ["box", "belt", "ball", "pendulum", "crank"]
 
 
 @functools.cache
@@ -319,7 +319,6 @@ def test_refusals_come_by_name_before_anything_is_written(tmp_path: Path) -> Non
     refused("while", scene=endless)
 
 
-@pytest.mark.deep
 @pytest.mark.skipif(_compile.compiler_of("x86_64-windows") is None, reason="needs ziglang, which compiles for all")
 def test_one_machine_compiles_for_all(tmp_path: Path) -> None:
     path = jms.export.fmu(ramped_box.scene(ramped_box.lugre()), [0.0], [0.0], tmp_path / "box.fmu")
