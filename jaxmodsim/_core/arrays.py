@@ -46,6 +46,11 @@ def is_one_of(times: Float[Array, " n"], t: Float[Array, ""]) -> Bool[Array, ""]
     return entry(times, jnp.maximum(after(times, t) - 1, 0)) == t
 
 
+def apply_matrix(matrix: Float[Array, "m n"], vectors: Float[Array, "n *k"]) -> Float[Array, "m *k"]:
+    """Product with one vector, or with several as columns, written as a sum: see `in_scalars`."""
+    return jnp.sum((matrix if vectors.ndim == 1 else matrix[:, :, None]) * vectors[None], axis=1)
+
+
 def entry(x: Array, i: Int[Array, ""]) -> Array:
     """`x[i]`."""
     return jax.lax.dynamic_index_in_dim(x, i, keepdims=False)

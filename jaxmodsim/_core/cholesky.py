@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .arrays import apply_matrix
+
 MAX_UNROLLED_CHOLESKY = 12
 
 
@@ -145,8 +147,7 @@ def solve_semidefinite(
     solve = factor_positive_definite(shifted)
     solution = solve(right)
     for _ in range(_REFINEMENTS):
-        product = jnp.sum((scaled[:, :, None] if rhs.ndim == 2 else scaled) * solution[None], axis=1)
-        solution = solution + solve(right - product)
+        solution = solution + solve(right - apply_matrix(scaled, solution))
     # In the null space of the matrix the solution contains rounding divided by the shift. Two more solves isolate that
     # part: they scale the other components by (shift/eigenvalue)^2.
     solution = solution - shift**2 * solve(solve(solution))

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact, PyTree
 
+from .arrays import apply_matrix
+
 MAX_UNROLLED_LU = 12
 
 # An array, or a NumPy scalar for a number that is known while tracing.
@@ -127,15 +129,14 @@ def invert(matrix: Float[Array, "n n"], *, pivot: bool) -> Callable[[Array], Arr
     # Derivatives are those of the solution; none passes through the elimination.
     inverse, order = jax.lax.fori_loop(0, matrix.shape[0], eliminate, (jax.lax.stop_gradient(matrix), places))
 
-    def product(a: Array, x: Array) -> Array:
-        return jnp.sum(a * x[None, :], axis=1)
-
     def transposed(_: object, x: Array) -> Array:
-        return jnp.zeros_like(x).at[order].set(product(inverse.T, x)) if pivot else product(inverse.T, x)
+        out = apply_matrix(inverse.T, x)
+        return jnp.zeros_like(x).at[order].set(out) if pivot else out
 
-    return lambda rhs: jax.lax.custom_linear_solve(
-        lambda x: product(matrix, x), rhs, lambda _, b: product(inverse, b[order] if pivot else b), transposed
-    )
+    def solve(_: object, b: Array) -> Array:
+        return apply_matrix(inverse, b[order] if pivot else b)
+
+    return lambda rhs: jax.lax.custom_linear_solve(lambda x: apply_matrix(matrix, x), rhs, solve, transposed)
 
 
 def _order(rows: Sequence[Sequence[Scalar]]) -> tuple[int, ...]:

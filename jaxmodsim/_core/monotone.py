@@ -14,6 +14,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from .arrays import apply_matrix
 from .lu import MAX_UNROLLED_LU, factor_lu, invert
 
 # Largest numbers of evaluations in one line search, and of Newton steps for several unknowns.
@@ -143,7 +144,7 @@ def solve_monotone(
 
         def residual(*values: Array) -> Array:
             free, coupling, *constants = [values[moving.index(i)] if i in moving else x for i, x in enumerate(primals)]
-            return aside - free + _times(coupling, fixed(aside, *constants))
+            return aside - free + apply_matrix(coupling, fixed(aside, *constants))
 
         _, change = jax.jvp(residual, tuple(primals[i] for i in moving), tuple(tangents[i] for i in moving))
         _, slopes = _slopes(lambda x: fixed(x, *primals[2:]), aside, blocks)
@@ -153,10 +154,6 @@ def solve_monotone(
 
     root.defjvp(derivative, symbolic_zeros=True)
     return root(free, coupling, *constants)
-
-
-def _times(matrix: Array, x: Array) -> Array:
-    return jnp.sum(matrix * x[None, :], axis=1)
 
 
 def _slopes(fn: Callable[[Array], Array], x: Array, blocks: tuple[int, ...]) -> tuple[Array, Array]:
@@ -223,14 +220,14 @@ def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, b
 
     def iterate(s: _RootIterate) -> _RootIterate:
         value, slopes = _slopes(fn, s.x, blocks)
-        residual = s.x - free + _times(coupling, value)
-        size = jnp.abs(value) + _times(jnp.abs(slopes), jnp.abs(s.x))
-        scale = jnp.abs(s.x) + jnp.abs(free) + _times(jnp.abs(coupling), size)
+        residual = s.x - free + apply_matrix(coupling, value)
+        size = jnp.abs(value) + apply_matrix(jnp.abs(slopes), jnp.abs(s.x))
+        scale = jnp.abs(s.x) + jnp.abs(free) + apply_matrix(jnp.abs(coupling), size)
         misfit = jnp.max(jnp.abs(residual) / jnp.where(scale > 0, eps * scale, 1.0))
         # If p decreases, Newton steps may cycle; those of an increasing model do not.
         slopes = jnp.where(s.tries < _PATIENCE, slopes, _increasing(slopes))
         step = _newton(coupling, slopes, residual)
-        change = value - s.push + _times(slopes, step)
+        change = value - s.push + apply_matrix(slopes, step)
         descends = jnp.sum(step * (value - s.push)) < 0
         step = jnp.where(descends, step, -residual)
         change = jnp.where(descends, change, value - s.push)
@@ -247,7 +244,7 @@ def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, b
 
     push = fn(jnp.zeros_like(free))
     never = jnp.full_like(free[0], jnp.inf)
-    start = _RootIterate(free - _times(coupling, push), push, jnp.array(False), never, jnp.array(0))
+    start = _RootIterate(free - apply_matrix(coupling, push), push, jnp.array(False), never, jnp.array(0))
     end = jax.lax.while_loop(lambda s: ~s.settled & (s.tries < _MOST_STEPS), iterate, start)
     return Monotone(end.x, end.settled | (end.misfit <= _LOST), end.tries)
 

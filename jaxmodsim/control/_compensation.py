@@ -2,14 +2,15 @@
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
 from .._core.arrays import PerDof, Scalar
 from .._core.safe import decay_mean
 from ..friction import LuGre, Passivity
-from ..scene import Scene, State
+from ..scene import Friction, Scene, State, compensating_force
 
 
 def compensate_friction(
@@ -77,31 +78,28 @@ def compensate_friction(
         ```
     """
     scene = scene.bind_state(t0, y.q, y.qd)
-    total, after, h = jnp.zeros_like(y.q), dict(y.z), t1 - t0
+    if error is None:
+        force, after = compensating_force(scene, t0, t1, y)
+        return jnp.asarray(share) * force, after
     for name, effect in scene.friction.items():
-        v = effect.slip(t0, y.q, y.qd, scene.params)
-        load = effect.load(t0, y.q, y.qd, scene.params)
-        z = y.z.get(name)
-        force, moved = effect.step_exact(v, z, h, load)
-        if error is not None:
-            law = effect.law
-            if not isinstance(law, LuGre) or jnp.ndim(v):
-                raise ValueError(
-                    f"compensate_friction: an observer needs LuGre along a scalar displacement, but friction {name!r}"
-                    f" is {type(law).__name__}. Leave `error` out, and write the planned motion to y."
-                )
-            # The equation is linear in z: the correction acts like a slip at the rate -k e.
-            slip_error = jnp.sum(effect.direction(y.q, scene.params) * error)
-            most = law.Fs / law.sigma0
-            rate = law.sigma0 * jnp.abs(v) / law.stribeck_curve(v)
-            push = -jnp.asarray(gain) * slip_error * decay_mean(rate * h) * h
-            z, before = jnp.clip(moved + push, -most, most), z
-            force = law.force_given_zdot(v, z, (z - before) / h)  # pyright: ignore[reportOperatorIssue] - a bristle has a state
-            force = force if load is None else load * force
-            moved = z
-        total = total - effect.apply_force(y.q, jnp.asarray(share) * force, scene.params)
-        after |= {name: moved} if name in y.z else {}
-    return total, after
+        if not isinstance(effect.law, LuGre) or jnp.ndim(effect.slip(t0, y.q, y.qd, scene.params)):
+            raise ValueError(
+                f"compensate_friction: an observer needs LuGre along a scalar displacement, but friction {name!r} is"
+                f" {type(effect.law).__name__}. Leave `error` out, and write the planned motion to y."
+            )
+
+    def observe(effect: Friction, v: Array, z: PyTree, h: Scalar, load: Scalar | None) -> tuple[Array, PyTree]:
+        """The equation is linear in z: the correction acts like a slip at the rate -k e."""
+        law: Any = effect.law
+        slip_error = jnp.sum(effect.direction(y.q, scene.params) * error)
+        most, rate = law.Fs / law.sigma0, law.sigma0 * jnp.abs(v) / law.stribeck_curve(v)
+        push = -jnp.asarray(gain) * slip_error * decay_mean(rate * h) * h
+        moved = jnp.clip(law.step_exact(v, z, h) + push, -most, most)
+        force = law.force_given_zdot(v, moved, (moved - z) / h)
+        return (force if load is None else load * force), moved
+
+    force, after = compensating_force(scene, t0, t1, y, observe)
+    return jnp.asarray(share) * force, after
 
 
 def check_observer(law: LuGre, m: float, kp: float, kd: float, ki: float = 0.0, *, level: float = 1.0) -> Passivity:

@@ -2,11 +2,16 @@
 
 import itertools
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
+import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array, PyTree
 
-from ._program import Assign, Block, Choice, Entry, Loop, Program, Symbol
+from .._core.scalarise import trace_in_arrays
+from ._program import Assign, Block, Choice, Entry, Loop, Program, Symbol, program_of
 
 # Operands are names or literals.
 _FORMS = {
@@ -81,16 +86,62 @@ def _conversion(old: np.dtype, new: np.dtype, x: str) -> str:
     return f"{x} != 0" if new.kind == "b" else f"({type_of(new)}){x}"
 
 
-def write_program(program: Program, outputs: list[str], indent: str = "  ") -> list[str]:
-    """Lines of code that compute the results of a program and assign them to `outputs`, or "return" them.
+def write_function(
+    fn: Callable[..., PyTree],
+    arguments: Mapping[str, PyTree],
+    places: Callable[[list[int]], Sequence[str]],
+) -> list[str]:
+    """Lines of C that compute the results of a function and assign them, or "return" them.
+
+    **Arguments:**
+
+    - `fn`: a function of the values of `arguments`, which returns a pytree.
+    - `arguments`: pytrees by their names in C. A number `t` is named `t`; entries of a pytree `p` are `p[0]`, `p[1]`.
+    - `places`: names of the results, one for each entry, from the sizes of the leaves that `fn` returns.
 
     **Raises:**
 
     - `ValueError` naming an unsupported operation or type.
     """
-    text = _BlockText()
+    symbols = {name: _symbols(name, like) for name, like in arguments.items()}
+
+    def flat(*entries: list[Array]) -> list[Array]:
+        return jtu.tree_leaves(fn(*(_filled(like, x) for like, x in zip(arguments.values(), entries, strict=True))))
+
+    entries = [[jnp.zeros((), x.dtype) for x in own] for own in symbols.values()]
+    closed, shapes = trace_in_arrays(flat, *entries)
+    program = program_of(closed, list(itertools.chain(*symbols.values())))
+    return _program_lines(program, places([math.prod(x.shape) for x in shapes]))
+
+
+def unused(names: Iterable[str], lines: list[str]) -> list[str]:
+    """Statements for arguments that the lines do not use, which compilers would report."""
+    text = "\n".join(lines)
+    return [f"  (void){name};" for name in names if not re.search(rf"\b{name}\b", text)]
+
+
+def _symbols(name: str, like: PyTree) -> list[Symbol]:
+    leaves = [np.asarray(leaf) for leaf in jtu.tree_leaves(like)]
+    if jtu.all_leaves([like]) and leaves[0].ndim == 0:
+        return [Symbol(leaves[0].dtype, name)]
+    kinds = [leaf.dtype for leaf in leaves for _ in range(leaf.size)]
+    return [Symbol(kind, f"{name}[{i}]") for i, kind in enumerate(kinds)]
+
+
+def _filled(like: PyTree, entries: list[Array]) -> PyTree:
+    """The pytree with these scalars as the entries of its arrays."""
+    leaves, left = [], iter(entries)
+    for leaf in jtu.tree_leaves(like):
+        part = [next(left) for _ in range(np.size(leaf))]
+        array = jnp.stack(part) if part else jnp.zeros(0, np.asarray(leaf).dtype)
+        leaves.append(array.reshape(np.shape(leaf)) if np.ndim(leaf) else part[0])
+    return jtu.tree_unflatten(jtu.tree_structure(like), leaves)
+
+
+def _program_lines(program: Program, places: Sequence[str]) -> list[str]:
+    text, indent = _BlockText(), "  "
     lines = text.block(program.block, indent)
-    for to, x in zip(outputs, program.results, strict=True):
+    for to, x in zip(places, program.results, strict=True):
         lines.append(f"{indent}return {text.value(x)};" if to == "return" else f"{indent}{to} = {text.value(x)};")
     return lines
 

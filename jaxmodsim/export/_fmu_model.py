@@ -1,6 +1,5 @@
 """The equations of a scene as C functions of flat arrays: rates, guards, events, outputs and their derivatives."""
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -10,13 +9,10 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._core.scalarise import trace_in_arrays
 from ..mechanics import motion_equations, project
 from ..scene import Scene, State, forward_dynamics, start, switch, vector_field
 from ..solvers import RODAS5P
-from ._c_code import write_program
-from ._program import Symbol, program_of
-from ._scene_code import _filled
+from ._c_code import unused, write_function
 
 # Arguments of the functions: scalars, and arrays that a function reads or changes in place.
 _READ = {"t": "double t", "along": "double along"}
@@ -198,31 +194,20 @@ def write_model(model: Model) -> tuple[str, str]:
     for name, (purpose, arguments, results, fn) in _routines(model).items():
         changed = () if results == "out" else tuple(results.split())
         order = (*arguments, *(x for x in ("y", "m") if x in changed and x not in arguments))
-        lines = _lines(name, fn, order, like, changed)
+        fixed = [f"{x}[{i}]" for x in changed for i in range(_size(like[x]))]
+        lines = _lines(name, fn, {x: like[x] for x in order}, fixed)
         declared = [_READ[x] for x in arguments]
         declared += [f"double *{x}" for x in (changed or ("out",))]
         signature = f"void model_{name}({', '.join(declared)})"
-        unused = [x for x in (*order, *(() if changed else ("out",))) if not re.search(rf"\b{x}\b", "\n".join(lines))]
+        idle = unused((*order, *(() if changed else ("out",))), lines)
         prototypes.append(f"/* {purpose} */\n{signature};")
-        functions.append("\n".join([signature + " {", *(f"  (void){x};" for x in unused), *lines, "}\n"]))
+        functions.append("\n".join([signature + " {", *idle, *lines, "}\n"]))
     return "\n".join(prototypes), "\n".join(functions)
 
 
-def _lines(
-    name: str, fn: Callable[..., PyTree], order: Sequence[str], like: Mapping[str, PyTree], changed: Sequence[str]
-) -> list[str]:
-    symbols = {x: _symbols(x, like[x]) for x in order}
-
-    def flat(*arrays: Any) -> list[Array]:
-        return jtu.tree_leaves(fn(*(_rebuilt(like[x], array) for x, array in zip(order, arrays, strict=True))))
-
-    entries = [[jnp.zeros((), x.dtype) for x in symbols[each]] for each in order]
+def _lines(name: str, fn: Callable[..., PyTree], like: Mapping[str, PyTree], places: Sequence[str]) -> list[str]:
     try:
-        closed, shapes = trace_in_arrays(flat, *entries)
-        program = program_of(closed, [x for each in order for x in symbols[each]])
-        places = [f"{x}[{i}]" for x in changed for i in range(_size(like[x]))]
-        count = sum(int(np.prod(x.shape)) for x in shapes)
-        return write_program(program, places or [f"out[{i}]" for i in range(count)])
+        return write_function(fn, like, lambda sizes: places or [f"out[{i}]" for i in range(sum(sizes))])
     except ValueError as error:
         raise ValueError(
             f"fmu does not support {error}, which the function `{name}` of the scene needs. It supports arithmetic,"
@@ -233,20 +218,6 @@ def _lines(
 
 def _size(tree: PyTree) -> int:
     return sum(int(np.size(x)) for x in jtu.tree_leaves(tree))
-
-
-def _symbols(name: str, like: PyTree) -> list[Symbol]:
-    if isinstance(like, float):
-        return [Symbol(np.dtype(float), name)]
-    return [Symbol(np.dtype(float), f"{name}[{i}]") for i in range(_size(like))]
-
-
-def _rebuilt(like: PyTree, entries: list[Array]) -> PyTree:
-    if isinstance(like, float):
-        return entries[0]
-    if isinstance(like, jax.Array):
-        return jnp.stack(entries) if entries else jnp.zeros(0)
-    return _filled(like, entries)
 
 
 def header(

@@ -7,14 +7,22 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from .._core.arguments import as_whole
-from .._core.arrays import PerDof, Scalar
-from .._core.scalarise import trace_in_arrays
-from ..scene import Scene, State, check_scene, check_step, elements, scene_step, signals_of, state_names, vector_field
-from ._c_code import literal, type_of, write_program
-from ._program import Symbol, program_of
+from ..scene import (
+    Scene,
+    State,
+    check_scene,
+    check_step,
+    compensating_force,
+    elements,
+    scene_step,
+    signals_of,
+    state_names,
+    vector_field,
+)
+from ._c_code import literal, type_of, unused, write_function
 
 _C_TEXT = """\
 /* {name}: a scene of jaxmodsim as C99. Generated; change the scene, not this file. Units are SI. */
@@ -54,7 +62,7 @@ class _Routine(NamedTuple):
     - `times`: names of its first arguments; the numbers p and the state y follow.
     - `extra`: name and size of an array for its results, or None.
     - `results`: the variables of its results.
-    - `fn`: `fn(scene, y, *times)` -> a pytree of these results.
+    - `fn`: `fn(*times, scene, y)` -> a pytree of these results.
     """
 
     name: str
@@ -177,7 +185,7 @@ def _routines(scene: Scene, y: State) -> list[_Routine]:
             ("t",),
             ("rate", len(names)),
             rates,
-            lambda scene, y, t: vector_field(t, y, scene),
+            lambda t, scene, y: vector_field(t, y, scene),
         ),
         _Routine(
             "step",
@@ -185,52 +193,36 @@ def _routines(scene: Scene, y: State) -> list[_Routine]:
             ("t0", "t1"),
             None,
             [*whole, "return"],
-            lambda scene, y, t0, t1: scene_step(scene, t0, t1, y),
+            lambda t0, t1, scene, y: scene_step(scene, t0, t1, y),
         ),
     ]
     if scene.friction:
         purpose = "Force that makes up for friction at the motion in y; states of the laws in y go from t0 to t1."
         routines.append(
-            _Routine("friction", purpose, ("t0", "t1"), ("force", dof), [*force, *own], _friction_feed_forward)
+            _Routine(
+                "friction",
+                purpose,
+                ("t0", "t1"),
+                ("force", dof),
+                [*force, *own],
+                lambda t0, t1, scene, y: compensating_force(scene, t0, t1, y),
+            )
         )
     return routines
 
 
-def _friction_feed_forward(scene: Scene, y: State, t0: Scalar, t1: Scalar) -> tuple[PerDof, dict[str, PyTree]]:
-    """Generalised force [N or N m] that compensates friction, and the states of the laws at t1."""
-    scene = scene.bind_state(t0, y.q, y.qd)
-    total, after = jnp.zeros_like(y.q), dict(y.z)
-    for name, effect in scene.friction.items():
-        v = effect.slip(t0, y.q, y.qd, scene.params)
-        force, z = effect.step_exact(v, y.z.get(name), t1 - t0, effect.load(t0, y.q, y.qd, scene.params))
-        total = total + -effect.apply_force(y.q, force, scene.params)
-        after |= {name: z} if name in y.z else {}
-    return total, after
-
-
 def _routine_text(routine: _Routine, scene: Scene, y: State, name: str) -> str:
-    numbers, states = [], []
-    for like, symbols, array in ((scene, numbers, "p"), (y, states, "y")):
-        kinds = [leaf.dtype for leaf in jtu.tree_leaves(like) for _ in range(np.size(leaf))]
-        symbols += [Symbol(kind, f"{array}[{i}]") for i, kind in enumerate(kinds)]
-    times = [Symbol(y.q.dtype, each) for each in routine.times]
-
-    def flat(times: list[Array], numbers: list[Array], states: list[Array]) -> list[Array]:
-        return jtu.tree_leaves(routine.fn(_filled(scene, numbers), _filled(y, states), *times))
-
-    like = [[jnp.zeros((), x.dtype) for x in symbols] for symbols in (times, numbers, states)]
-    closed, _ = trace_in_arrays(flat, *like)
+    arguments = {**dict.fromkeys(routine.times, jnp.zeros((), y.q.dtype)), "p": scene, "y": y}
     try:
-        lines = write_program(program_of(closed, [*times, *numbers, *states]), routine.results)
+        lines = write_function(routine.fn, arguments, lambda _: routine.results)
     except ValueError as error:
         raise ValueError(
             f"to_c does not support {error}, which `{routine.name}` of the scene needs. It supports arithmetic,"
             " elementary functions and choices (jnp.where) of scalars and small arrays: express the Lagrangian, force"
             " or law by these."
         ) from error
-    unused = [x for x in (*routine.times, "p", "y") if not re.search(rf"\b{x}\b", "\n".join(lines))]
     head = [f"/* {routine.purpose} */", _c_signature(routine, name, type_of(y.q.dtype)) + " {"]
-    return "\n".join([*head, *(f"  (void){x};" for x in unused), *lines, "}\n"])
+    return "\n".join([*head, *unused(arguments, lines), *lines, "}\n"])
 
 
 def _c_signature(routine: _Routine, name: str, real: str) -> str:
@@ -241,12 +233,3 @@ def _c_signature(routine: _Routine, name: str, real: str) -> str:
     if routine.extra:
         arguments.append(f"{real} {routine.extra[0]}[{routine.extra[1]}]")
     return f"{returns} {name}_{routine.name}({', '.join(arguments)})"
-
-
-def _filled(like: PyTree, entries: list[Array]) -> PyTree:
-    """The pytree with these scalars as the entries of its arrays."""
-    leaves, left = [], iter(entries)
-    for leaf in jtu.tree_leaves(like):
-        part = [next(left) for _ in range(np.size(leaf))]
-        leaves.append(jnp.stack(part).reshape(np.shape(leaf)) if np.ndim(leaf) else part[0])
-    return jtu.tree_unflatten(jtu.tree_structure(like), leaves)

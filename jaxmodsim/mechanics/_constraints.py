@@ -18,7 +18,7 @@ from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
 from .._core.arguments import as_label
-from .._core.arrays import PerDof, Scalar
+from .._core.arrays import PerDof, Scalar, apply_matrix
 from .._core.cholesky import factor_positive_definite, solve_balanced
 from .._core.functions import as_function, result_shape
 from .._core.parameters import Number, check_ranges, parameter
@@ -258,11 +258,11 @@ class LinearizedConstraints(NamedTuple):
 
     def multipliers(self, qdd: PerDof) -> Float[Array, " m"]:
         """Multipliers that make the accelerations `qdd` admissible."""
-        return -solve_balanced(self.matrix, _times(self.rows, qdd) + self.bias)
+        return -solve_balanced(self.matrix, apply_matrix(self.rows, qdd) + self.bias)
 
     def multiplier_response(self, qdd: Float[Array, "dof *k"]) -> Float[Array, "m *k"]:
         """Change of the multipliers if the unconstrained accelerations change by `qdd`, one or several."""
-        return -solve_balanced(self.matrix, _times(self.rows, qdd))
+        return -solve_balanced(self.matrix, apply_matrix(self.rows, qdd))
 
     def respond(self, qdd: Float[Array, "dof *k"]) -> Float[Array, "dof *k"]:
         """Change of the accelerations if the unconstrained accelerations change by `qdd`, one or several."""
@@ -270,7 +270,7 @@ class LinearizedConstraints(NamedTuple):
 
     def apply_force(self, multipliers: Float[Array, "m *k"]) -> Float[Array, "dof *k"]:
         """Accelerations by the multipliers."""
-        return _times(self.minv_jt.T, multipliers)
+        return apply_matrix(self.minv_jt.T, multipliers)
 
     def force(self, multipliers: Float[Array, " m"]) -> PerDof:
         """Generalised force of the multipliers."""
@@ -393,8 +393,3 @@ def _mobility(rows: Float[Array, "m dof"], mass: Float[Array, "dof dof"]) -> tup
     """Rows `M^-1 J_k`, and `J M^-1 J^T`."""
     minv_jt = factor_positive_definite(mass)(rows.T).T
     return minv_jt, jnp.sum(rows[:, None, :] * minv_jt[None, :, :], axis=2)
-
-
-def _times(matrix: Float[Array, "m n"], vectors: Float[Array, "n *k"]) -> Float[Array, "m *k"]:
-    """Product with one vector, or with several as columns, written as a sum: see `in_scalars`."""
-    return jnp.sum((matrix if vectors.ndim == 1 else matrix[:, :, None]) * vectors[None], axis=1)

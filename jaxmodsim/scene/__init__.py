@@ -11,6 +11,7 @@ from ._dynamics import state_names as state_names
 from ._dynamics import vector_field as vector_field
 from ._event_driven import mode_numbers as mode_numbers
 from ._implicit import check_step as check_step
+from ._implicit import compensating_force as compensating_force
 from ._implicit import scene_step as scene_step
 from ._linear_solver import has_linear_solver as has_linear_solver
 from ._linear_solver import linear_solver as linear_solver

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._core.arrays import PerDof, Scalar
+from .._core.arrays import PerDof, Scalar, apply_matrix
 from .._core.cholesky import solve_semidefinite
 from .._core.lu import factor_lu
 from .._core.safe import safe_norm
@@ -274,7 +274,7 @@ def solve_friction_forces(
 
     if elements.loads is None:
         slipping = jnp.where(sticks, 0.0, slip_force)
-        drive = elements.free_slip_acceleration - jnp.sum(elements.delassus * slipping[None, :], axis=1)
+        drive = elements.free_slip_acceleration - apply_matrix(elements.delassus, slipping)
         force = jnp.where(sticks, _multipliers(elements, drive, sticks), slip_force)
         return FrictionForces(force, elements.upper, elements.lower, jnp.ones_like(elements.v[0]))
     # Forces are linear in the loads. Columns: the slip forces without loads, beside the accelerations without friction;
@@ -284,14 +284,14 @@ def solve_friction_forces(
     slip_forces = jnp.concatenate([jnp.where(loaded > 0, 0.0, slip_force)[:, None], on * slip_force[:, None]], axis=1)
     slipping = jnp.where(sticks[:, None], 0.0, slip_forces)
     free = jnp.pad(elements.free_slip_acceleration[:, None], ((0, 0), (0, on.shape[1])))
-    drive = free - jnp.sum(elements.delassus[:, :, None] * slipping[None], axis=1)
+    drive = free - apply_matrix(elements.delassus, slipping)
     forces = jnp.where(sticks[:, None], _multipliers(elements, drive, sticks), slip_forces)
     fixed, per_load = forces[:, 0], forces[:, 1:]
-    normal = elements.loads.normal - jnp.sum(coupling * fixed[None, :], axis=1)
-    gain = jnp.sum(coupling[:, :, None] * per_load[None], axis=1)
+    normal = elements.loads.normal - apply_matrix(coupling, fixed)
+    gain = apply_matrix(coupling, per_load)
     load, margin = _solve_loads(normal, gain, elements.loads.pulls)
-    factor = jnp.where(loaded > 0, jnp.sum(on * load[None, :], axis=1), 1.0)
-    force = fixed + jnp.sum(per_load * load[None, :], axis=1)
+    factor = jnp.where(loaded > 0, apply_matrix(on, load), 1.0)
+    force = fixed + apply_matrix(per_load, load)
     return FrictionForces(force, factor * elements.upper, factor * elements.lower, margin)
 
 

@@ -1,5 +1,6 @@
 """A step of a scene that is implicit in friction and explicit in everything else."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -7,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._core.arrays import Scalar
+from .._core.arrays import PerDof, Scalar
 from .._core.cholesky import factor_positive_definite
 from .._core.monotone import solve_monotone
 from ..friction import Sign
@@ -126,3 +127,28 @@ def _element(effect: Friction, t0: Array, t1: Array, q: Array, qd: Array, params
     rows = jax.jacfwd(slip)(qd) if planar else effect.direction(q, params)[None]
     belt = jnp.broadcast_to(effect.belt(t1), (rows.shape[0],))
     return _StepElement(effect, effect.load(t0, q, qd, params), rows, belt, planar)
+
+
+def compensating_force(
+    scene: Scene,
+    t0: Scalar,
+    t1: Scalar,
+    y: State,
+    advance: Callable[[Friction, Array, PyTree, Scalar, Scalar | None], tuple[Array, PyTree]] = Friction.step_exact,
+) -> tuple[PerDof, dict[str, PyTree]]:
+    """Force that compensates friction at the motion in `y`, and the states of the laws at `t1`.
+
+    `advance(element, v, z, h, load)` returns the force of an element over the time h, and the state of its law after.
+
+    **Returns:**
+
+    Generalised force [N or N m], shape `[dof]`; and states by name.
+    """
+    scene = scene.bind_state(t0, y.q, y.qd)
+    total, after = jnp.zeros_like(y.q), dict(y.z)
+    for name, effect in scene.friction.items():
+        v = effect.slip(t0, y.q, y.qd, scene.params)
+        force, z = advance(effect, v, y.z.get(name), t1 - t0, effect.load(t0, y.q, y.qd, scene.params))
+        total = total - effect.apply_force(y.q, force, scene.params)
+        after |= {name: z} if name in y.z else {}
+    return total, after

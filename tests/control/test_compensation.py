@@ -9,8 +9,7 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim.control import check_observer, compensate_friction
-from jaxmodsim.export._scene_code import _friction_feed_forward
-from jaxmodsim.scene import State, replace_elements, scene_step
+from jaxmodsim.scene import State, compensating_force, replace_elements, scene_step
 
 # A geared shoulder: friction falls from 2.8 N m by about 7 N m s/rad, as published for such a joint.
 LAW = jms.LuGre(sigma0=2000.0, sigma1=60.0, sigma2=0.5, Fc=0.7, Fs=2.8, vs=0.2)
@@ -111,7 +110,7 @@ def test_the_feedforward_is_that_in_c():
     ours = compensate_friction(JOINT, jnp.zeros(()), jnp.array(H), y)
     for a, b in zip(
         jax.tree.leaves(ours),
-        jax.tree.leaves(_friction_feed_forward(JOINT, y, jnp.zeros(()), jnp.array(H))),
+        jax.tree.leaves(compensating_force(JOINT, jnp.zeros(()), jnp.array(H), y)),
         strict=True,
     ):
         np.testing.assert_array_equal(a, b)
