@@ -11,8 +11,8 @@ import numpy as np
 
 import jaxmodsim as jms
 
-# Tolerances of our runs. The step of central differences of a reference, relative to a number.
-RTOL, ATOL, STEP = 1e-12, 1e-14, 1e-3
+# Tolerances of our runs.
+RTOL, ATOL = 1e-12, 1e-14
 
 Numbers = dict[str, Any]
 Event = tuple[float, str]
@@ -43,7 +43,7 @@ class Case:
     - `reference`: outputs and events from the same numbers, by a method that knows nothing of `jaxmodsim`.
     - `published`: published outputs, None for those that are not. `modes`: published mode changes.
     - `compared`: names of effects whose events are compared; all by default.
-    - `by`: parameters of the derivative.
+    - `by`: parameters of the derivative. `step`: of its central differences of the reference, relative to a number.
     - `note`: what differs from the published model, or why the case fails.
     """
 
@@ -59,6 +59,7 @@ class Case:
     modes: tuple[Event, ...] = ()
     compared: tuple[str, ...] = ()
     by: tuple[str, ...] = ()
+    step: float = 1e-3
     note: str = ""
     results: str = ""
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -71,7 +72,7 @@ class Case:
         """Derivatives of the outputs by the numbers `by`, shape `[by, outputs]`: central differences of sixth order."""
         rows = []
         for name in self.by:
-            h = STEP * (abs(self.numbers[name]) or 1.0)
+            h = self.step * (abs(self.numbers[name]) or 1.0)
             ends = [self.exact(**{name: self.numbers[name] + k * h}).values for k in (-3, -2, -1, 1, 2, 3)]
             weights = np.array([-1.0, 9.0, -45.0, 45.0, -9.0, 1.0]) / (60.0 * h)
             rows.append(weights @ np.array(ends, float))

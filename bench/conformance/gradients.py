@@ -14,6 +14,8 @@ from bench.conformance.case import ATOL, RTOL, Case, Numbers, Reference, Setup
 SOURCE = "DesmondZhong/diff_sim_grads @ 1fa5ccb3, {}"
 # Steps of a second in task 1; radius of the balls and weight of the control in task 3.
 STEPS, RADIUS, EPSILON = 480, 0.2, 0.1
+# Thickness of the wall [m], and published costs over it and against it.
+THICKNESS, WALL_COSTS = 1e-3, (-((np.sin(1.5) / 9.81) ** 2), -(0.06**2))
 # Losses of task 3 after 1000 iterations, as published; the optimum there is the least value on a grid of 100 instants.
 TASK3_LOSSES = {
     "PBD (Warp)": 1.4302428, "PBD (Brax)": 1.4297202, "compliant (Warp)": 1.6622765, "compliant (Brax)": 2.0000002,
@@ -103,6 +105,38 @@ def exact_two_balls(u, start) -> Reference:
     way = -1.0 - start - 2.0 * RADIUS / np.sqrt(2.0)
     t = np.sqrt(2.0 * way / u)
     return Reference(np.array([-1.0 + u * t * (1.0 - t)]), [(t, "balls open")])
+
+
+def ball_with_wall(p: Numbers) -> Setup:
+    """A ball is thrown at a wall of finite height; it stays where it lands."""
+
+    def wall(t, q, p):
+        return jnp.maximum(jnp.maximum(p["d"] - q[0], q[0] - p["d"] - THICKNESS), q[1] - 0.02)
+
+    contacts = (jms.Contact(wall, name="wall"), jms.Contact(lambda t, q, p: q[1], name="ground"))
+    grip = jms.Friction(jms.Coulomb(10.0), along=lambda q: q[0], normal_force="ground", name="grip")
+    scene = jms.Scene(ball, {"g": p["g"], "d": p["d"]}, (grip,), constraints=contacts)
+    v = p["v"] * jnp.stack([jnp.cos(p["angle"]), jnp.sin(p["angle"])])
+    return Setup(scene, np.array([0.0, 1e-12]), v)
+
+
+def exact_ball_with_wall(angle, v, g, d) -> Reference:
+    """The end of the parabola, or the wall where the ball is too low there."""
+    end = v**2 * np.sin(2.0 * angle) / g
+    height = d * np.tan(angle) - 0.5 * g * (d / (v * np.cos(angle))) ** 2
+    return Reference(np.array([-(min(end, d if height <= 0.02 else end) ** 2)]), [])
+
+
+def bouncing_block(p: Numbers) -> Setup:
+    """A block without weight strikes the ground after 10 us."""
+    ground = jms.Contact(lambda t, q, p: q[1], restitution=p["e"], name="ground")
+    scene = jms.Scene(ball, {"g": 0.0}, constraints=(ground,))
+    return Setup(scene, jnp.stack([0.0 * p["y"], p["y"]]), jnp.stack([0.0 * p["y"], p["v"]]))
+
+
+def exact_bouncing_block(y, v, e) -> Reference:
+    """Straight lines before and after the impact."""
+    return Reference(np.array([-e * v * (1e-3 + y / v)]), [(-y / v, "ground open")])
 
 
 def least_loss() -> float:
@@ -198,5 +232,21 @@ CASES = (
     _case(
         "task3_two_balls", two_balls, {"u": 3.0, "start": -2.0}, 1.0, ("place of ball 2 [m]",), lambda q, qd: (q[2],),
         (), exact_two_balls, by=("u", "start"),
+    ),
+    *(
+        Case(
+            f"alpha_gradient ball_with_wall, {name}",
+            "hjsuh94/alpha_gradient @ 5e2ef6f3, examples/ball_with_wall/ball_with_wall.py",
+            {"angle": angle, "v": 1.0, "g": 9.81, "d": 0.06}, ball_with_wall, 0.3, ("cost [m^2]",),
+            lambda q, qd: (-(q[0] ** 2),), lambda **n: exact_ball_with_wall(*n.values()), (published,),
+            by=("angle", "v", "d"), note="Published: the closed form. The wall has a thickness of 1 mm here.",
+        )
+        for name, angle, published in (("over", 0.75, WALL_COSTS[0]), ("against", 0.5, WALL_COSTS[1]))
+    ),
+    Case(
+        "nimblephysics bouncing block", "keenon/nimblephysics @ c405b056, unittests/comprehensive/test_Gradients.cpp",
+        {"y": 1e-5, "v": -1.0, "e": 0.5}, bouncing_block, 1e-3, ("y [m]",), lambda q, qd: (q[1],),
+        lambda **n: exact_bouncing_block(*n.values()), by=("y", "v", "e"),
+        note="Published: the derivative -0.5 by y, which the test accepts with an error of 0.005.",
     ),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Cases of other simulators with friction or impacts: EXUDYN, nosnoc."""
+"""Cases of other simulators with friction or impacts: EXUDYN, nosnoc, Chrono, Siconos."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -86,6 +86,55 @@ def exact_slip_stick(m, k, Fs) -> Reference:
     return Reference(path.y, path.events)
 
 
+def sliding_box(p: Numbers) -> Setup:
+    """A box slides on a plate until it stops."""
+
+    def lagrangian(t, q, qd, p):
+        return 0.5 * p["m"] * jnp.sum(qd**2) - p["m"] * p["g"] * q[1]
+
+    plate = jms.Contact(lambda t, q, p: q[1], name="plate")
+    slip = jms.Friction(jms.Coulomb(p["mu"]), along=lambda q: q[0], normal_force="plate", name="box")
+    scene = jms.Scene(lagrangian, {"m": p["m"], "g": p["g"]}, (slip,), constraints=(plate,))
+    return Setup(scene, np.zeros(2), jnp.stack([p["v"], 0.0 * p["v"]]))
+
+
+def exact_sliding_box(m, g, mu, v) -> Reference:
+    """Constant deceleration, whatever the mass."""
+    return Reference(np.array([0.5 * v**2 / (mu * g), 0.0 * m]), [(v / (mu * g), "box stick")])
+
+
+def impacting_stick(p: Numbers) -> Setup:
+    """A stick whose lower end strikes a floor with friction; coordinates are its centre and its angle."""
+
+    def lagrangian(t, q, qd, p):
+        return 0.5 * p["m"] * (qd[0] ** 2 + qd[1] ** 2 + p["length"] ** 2 / 12.0 * qd[2] ** 2) - p["m"] * p["g"] * q[1]
+
+    floor = jms.Contact(lambda t, q, p: q[1] - 0.5 * p["length"] * jnp.cos(q[2]), restitution=p["e"], name="floor")
+
+    def end(q, p):
+        return q[0] + 0.5 * p["length"] * jnp.sin(q[2])
+
+    slip = jms.Friction(jms.Coulomb(p["mu"]), along=end, normal_force="floor", name="end")
+    scene = jms.Scene(lagrangian, {name: p[name] for name in ("m", "length", "g")}, (slip,), constraints=(floor,))
+    q0 = np.array([0.5 * np.sin(np.pi / 4), 0.5 * np.cos(np.pi / 4) + 0.01, np.pi / 4])
+    return Setup(scene, q0, np.array([-0.5, 0.1, 0.1]))
+
+
+def exact_impacting_stick(m, length, g, e, mu) -> Reference:
+    """Free flight, and impacts whose friction is that of the slip after them."""
+    inertia, half = m * length**2 / 12.0, 0.5 * length
+    path = Path([0.5 * np.sin(np.pi / 4), 0.5 * np.cos(np.pi / 4) + 0.01, np.pi / 4, -0.5, 0.1, 0.1])
+    flight = driven([([0.0, -1.0, 0.0], Wave(g))])
+    while path.to_zero(flight, lambda t, y: y[1] - half * np.cos(y[2]), 0.2, "floor open"):
+        sin, cos = half * np.sin(path.y[2]), half * np.cos(path.y[2])
+        normal, along = np.array([0.0, 1.0, sin]), np.array([1.0, 0.0, cos])
+        mass, v = np.array([m, m, inertia]), path.y[3:]
+        pushes = [(normal - sign * mu * along) / mass for sign in (1.0, -1.0)]
+        after = [v - (1.0 + e) * (normal @ v) / (normal @ push) * push for push in pushes]
+        path.y[3:] = next(w for sign, w in zip((1.0, -1.0), after, strict=True) if sign * (along @ w) > 0)
+    return Reference(path.y, path.events)
+
+
 def _case(name, source, make, numbers, t1, outputs, observe, published, reference, **more) -> Case:
     return Case(
         name, source, numbers, make, t1, outputs, observe, lambda **n: reference(*n.values()), published, **more
@@ -115,5 +164,22 @@ CASES = (
         "nosnoc/nosnoc @ 0abef401, examples/periodic_slip_stick/periodic_slip_stick_codim1.m",
         slip_stick, {"m": 1.0, "k": 1.0, "Fs": 1.0}, 40.0, ("x1 [m]", "x2 [m/s]"), _end, (), exact_slip_stick,
         by=("m", "k", "Fs"), note="The repository has figures, and no numbers.",
+    ),
+    _case(
+        "Chrono SlidingGravityTest",
+        "projectchrono/chrono @ 7689fbc0, src/tests/unit_tests/smc_contact/sequential/utest_SMC_sliding_gravity.cpp",
+        sliding_box, {"m": 1.0, "g": 9.81, "mu": 0.5, "v": 5.0}, 2.0, ("travel [m]", "v [m/s]"), _end,
+        (25.0 / 9.81, None), exact_sliding_box, by=("mu", "v", "g"), compared=("box",),
+        note="Published: the closed form. The test accepts an error of 0.5 %, with contacts as springs and dampers.",
+    ),
+    _case(
+        "Siconos ImpactingStick",
+        "siconos/siconos-tutorials @ b6c9bfd1, examples/mechanics/ImpactingStick/ImpactingStick.cpp",
+        impacting_stick, {"m": 1.0, "length": 1.0, "g": 10.0, "e": 1.0, "mu": 0.01}, 0.2,
+        ("x [m]", "y [m]", "angle [rad]", "dx/dt [m/s]", "dy/dt [m/s]", "rate [rad/s]"), lambda q, qd: (*q, *qd),
+        (2.529172311983667e-01, 2.471693300826099e-01, 1.081891493988364, -5.068672606709300e-01, -1.213273932906967,
+         3.212070578753687), exact_impacting_stick, by=("g", "e", "mu"), compared=("floor",),
+        results="siconos/siconos-tutorials @ b6c9bfd1, examples/mechanics/ImpactingStick/ImpactingStick.ref",
+        note="Published: Moreau-Jean time-stepping of first order with steps of 0.1 ms.",
     ),
 )  # fmt: skip

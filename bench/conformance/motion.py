@@ -59,6 +59,26 @@ class Path:
         self.log(*labels)
         return True
 
+    def to_first(self, piece: Piece, guards: Callable[[Any, Any], Any], end: float, points: int = FEWER) -> int | None:
+        """Advance to the first zero of `guards(t, y)`, all positive until then; its index, or None at `end`."""
+        motion = piece(self.t, self.y, end)
+        ts = np.linspace(self.t, end, points)
+        samples = getattr(motion, "samples", None)
+        states = [motion(t) for t in ts] if samples is None else samples(ts)
+        refined = getattr(motion, "refined", motion)
+        below = np.array([guards(t, y) for t, y in zip(ts, states, strict=True)]) < 0
+        below[0] = False
+        roots = [
+            (_root(lambda t, i=i: guards(t, refined(t))[i], ts[k - 1], ts[k]), i)
+            for i, k in enumerate(np.argmax(below, axis=0)) if k
+        ]  # fmt: skip
+        if not roots:
+            self.y, self.t = np.asarray(states[-1], float), end
+            return None
+        root, i = min(roots)
+        self.y, self.t = np.asarray(refined(root), float), root
+        return i
+
 
 class Wave:
     """`amplitude sin(omega t + phase)`, or a power `amplitude t^power`, with its two antiderivatives."""
