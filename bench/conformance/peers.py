@@ -193,8 +193,12 @@ def mujoco_friction(step: float) -> Callable[[], np.ndarray]:
 
 
 def _elastic(step: float, e: float) -> str:
-    """A contact as a spring and damper of about ten steps with this restitution."""
-    frequency = math.pi / (10.0 * step)
+    """A contact as a spring and damper with this restitution.
+
+    It takes ten steps, and more where steps are shorter than 0.1 ms: the restitution depends on where in a step the
+    impact falls, and this error falls with the number of steps alone.
+    """
+    frequency = math.pi / (10.0 * max(1.0, math.sqrt(1e-4 / step)) * step)
     damping = 0.0 if e == 1.0 else brentq(lambda damping: restitution(damping) - e, 1e-6, 0.6)
     return (
         '<default><geom condim="1" solimp="0.9999 0.9999 0.001"'

@@ -274,8 +274,10 @@ CASES = (
         "LossyGearDemo3", lossy_gear_demo3, {"J1": 1e-3, "J2": 1e-3, "bearing": 0.5}, 1.0,
         _INERTIA_2, _second, (0.099999999016922012, -1.0000009709187907e-09),
         references.lossy_gear_demo3, by=("bearing", "J1"), modes=((0.020000000002, "gear stick"),),
-        note="The run refuses to start. Friction under the reaction of a constraint has one coefficient for each"
-        " direction of slip; this gear needs one for each direction of power, as the torque in the mesh is zero.",
+        note="The run refuses to start. The torque x in the mesh is zero here, and its equation is 2 x + f = 0 with the"
+        " friction f of the teeth. Modelica takes f = 3 x for x > 0 and -0.75 x for x < 0, by the direction of power;"
+        " friction under the reaction of a constraint has one coefficient for each direction of slip, and 2 x + 3 |x|"
+        " falls for x < 0.",
     ),
     _case(
         "Backlash", backlash, {"J": 5.0, "c": 20e3, "d": 50.0, "b": 0.7853981633974483}, 1.0,

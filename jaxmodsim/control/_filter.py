@@ -76,6 +76,10 @@ class FilterRun(eqx.Module):
     def smooth(self) -> "FilterRun":
         """The same record with states given all measurements, those after each time included.
 
+        With `rest` > 0 the smoother is approximate: its recursion assumes the gain of least variance, which a filter
+        that holds numbers in stick does not use. Their estimates in stick then follow the later measurements, and the
+        covariance of the other states there is not exact.
+
         **Returns:**
 
         A `FilterRun` with other `states`.

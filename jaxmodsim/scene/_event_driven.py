@@ -353,8 +353,9 @@ def _multipliers(
 
     Where sticking elements are redundant (two on one coordinate), the equations do not determine the share of each.
     This takes the solution with the smallest sum of `f_i^2/limit_i`: elements in parallel then share in proportion to
-    their limits and reach them together, unless a limit is less than 1 % of the largest one: `solve_semidefinite` is
-    inaccurate for weights that small.
+    their limits and reach them together. An element whose limit is less than 1 % of the largest one has the share of
+    1 %, as `solve_semidefinite` is inaccurate for smaller weights: it reaches its limit early, and its slip is then an
+    event at rest. The motion stays exact, as the others take the rest of the load.
     """
     weight = 0.5 * (elements.upper + elements.lower)
     largest = jnp.max(weight)

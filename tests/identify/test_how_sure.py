@@ -1,6 +1,7 @@
 """How sure a fit is: profiles, combinations and causes in words, tests of residuals, other records, files, figures."""
 
 import json
+import re
 import zipfile
 from dataclasses import fields, replace
 from pathlib import Path
@@ -9,6 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.optimize import brentq
 
 import jaxmodsim as jms
@@ -118,6 +120,9 @@ def test_the_profile_of_a_linear_model_is_the_interval_of_student():
     assert result.errors["b"] > 1.5 * np.sqrt(result.estimate.white[1, 1])
     for name in ("a", "b"):
         curve = profile(result, name, points=3)
+        # As many degrees of freedom as the docstring says: Student's t of the intervals, squared.
+        freedom = int(re.search(r"with 1 and (\d+) degrees", str(Profile.__doc__))[1])  # pyright: ignore
+        assert curve.threshold == pytest.approx(stats.t.ppf(0.975, freedom) ** 2, rel=1e-12)
         np.testing.assert_allclose(curve.interval, result.estimate.intervals()[name], rtol=2e-4)
         np.testing.assert_allclose(
             curve.ratio, ((curve.values - curve.estimate) / curve.error) ** 2, rtol=2e-3, atol=1e-6

@@ -47,7 +47,7 @@ class Profile:
       `covariance` to `white` (at least 1/2), which accounts for correlation.
     - `cost`: half the sum of losses in noise levels, shape `[points]`.
     - `floor`: the number that the parameter must lie above, which is then walked in the logarithm; None for others.
-    - `level`, `threshold`: of the interval, and the ratio at its ends: the quantile of F with 1 and 31 degrees of
+    - `level`, `threshold`: of the interval, and the ratio at its ends: the quantile of F with 1 and 15 degrees of
       freedom (blocks of samples less one), the square of Student's t in the intervals of the estimate.
     - `interval`: where the ratio is below the threshold; infinite or on a limit if the record sets no end.
     - `notes`: reasons for open ends, in words.
