@@ -332,8 +332,8 @@ REPORTS = {
             Table(
                 "Five cases in other programs: largest error of the outputs, and the time of one run, medians. At:"
                 " rtol, or the step of MuJoCo [s]. SciPy runs legs with terminal events, in an order written by hand."
-                " Contacts of MuJoCo are springs and dampers of ten steps, of 32 at 10 us. A contact delays the ball, and"
-                " its restitution depends on where in a step the impact falls: only more steps reduce that error.",
+                " Contacts of MuJoCo are springs and dampers of ten steps or more. Their restitution depends on where"
+                " in a step the impact falls, an error that does not fall with the step, but with the number of steps.",
                 ("error", "run"), ("case", "peer", "at"),
             ),
             Table("Sources, and what differs.", ("source", "published results", "remark"), ("case",)),

@@ -69,7 +69,7 @@ class Path:
         below = np.array([guards(t, y) for t, y in zip(ts, states, strict=True)]) < 0
         below[0] = False
         roots = [
-            (_root(lambda t, i=i: guards(t, refined(t))[i], ts[k - 1], ts[k]), i)
+            (_root(lambda t, i=i: guards(t, refined(t))[i], float(ts[k - 1]), float(ts[k])), i)
             for i, k in enumerate(np.argmax(below, axis=0)) if k
         ]  # fmt: skip
         if not roots:

@@ -355,7 +355,8 @@ def _multipliers(
     This takes the solution with the smallest sum of `f_i^2/limit_i`: elements in parallel then share in proportion to
     their limits and reach them together. An element whose limit is less than 1 % of the largest one has the share of
     1 %, as `solve_semidefinite` is inaccurate for smaller weights: it reaches its limit early, and its slip is then an
-    event at rest. The motion stays exact, as the others take the rest of the load.
+    event at rest. The motion stays exact until the load reverses; the largest element then slips early by twice that
+    limit, and a run may end in chatter. One element with the sum of the limits avoids this.
     """
     weight = 0.5 * (elements.upper + elements.lower)
     largest = jnp.max(weight)

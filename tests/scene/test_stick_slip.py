@@ -352,3 +352,17 @@ def test_no_bouncing_ball_falls_through_the_floor(dtype: str) -> None:
     np.testing.assert_allclose(last.y[:, 0, 0], 0.0, atol=1e-8)
     rest = jax.vmap(lambda e: problems.bouncing_ball.rest(h=1.0, e=e))(es.astype(float))
     np.testing.assert_allclose(last.t[:, 0], rest, rtol=1e-4 if dtype == "float32" else 1e-8)
+
+
+def test_an_element_below_a_hundredth_of_the_largest_limit_logs_its_slip_early_and_the_motion_is_exact() -> None:
+    """Limits of 1 N and 5 mN on one coordinate, under a load that rises by 1 N/s."""
+    small, large = (jms.Friction(jms.Coulomb(limit), name=name) for limit, name in ((0.005, "small"), (1.0, "large")))
+    pull = jms.AppliedForce(lambda t, q, qd, p: jnp.reshape(t, (1,)))
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, {}, (pull, small, large))
+    run = jms.simulate(scene, [0.0], [0.0], 1.2, ts=[1.0, 1.2], rtol=1e-12, atol=1e-14)
+    # Together they hold up to 1.005 N.
+    np.testing.assert_allclose(run.q[:, 0], [0.0, (1.2 - 1.005) ** 3 / 6.0], atol=1e-14)
+    first, second = run.mode_changes
+    # The small one takes 1 % of the load of the large one, and so reaches its limit at 0.505 N, at rest.
+    assert (first.effect, second.effect) == ("small", "large")
+    np.testing.assert_allclose([first.t, second.t], [0.505, 1.005], atol=1e-12)
