@@ -121,7 +121,7 @@ def test_the_profile_of_a_linear_model_is_the_interval_of_student():
     for name in ("a", "b"):
         curve = profile(result, name, points=3)
         # As many degrees of freedom as the docstring says: Student's t of the intervals, squared.
-        freedom = int(re.search(r"with 1 and (\d+) degrees", str(Profile.__doc__))[1])  # pyright: ignore
+        freedom = int(re.search(r"with 1 and (\d+) degrees", str(type(curve).__doc__))[1])  # pyright: ignore
         assert curve.threshold == pytest.approx(stats.t.ppf(0.975, freedom) ** 2, rel=1e-12)
         np.testing.assert_allclose(curve.interval, result.estimate.intervals()[name], rtol=2e-4)
         np.testing.assert_allclose(
