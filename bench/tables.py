@@ -288,6 +288,29 @@ REPORTS = {
             ("case", "at"),
         ),),
     ),
+    "shoulder_joint": Report(
+        "A joint with stiction under PID control: hunting, and a ramp with friction compensated.",
+        "howto/compensate_friction",
+        (
+            Table(
+                "Hunting of a geared shoulder joint with a break-away of {Fs:g} N m, whose friction falls by {slope:g}"
+                " N m s/rad near rest, kp {kp:g} N m/rad, ki {ki:g} N m/(rad s): the limit cycle by `continue_orbits`"
+                " and by SciPy, slip by slip; zero: the errors vanish. The last two values of kd are 5 % below and"
+                " above the closed form.",
+                ("amplitude", "period"), ("at",), ("quantity", "peer"), where={"case": "limit cycle"},
+            ),
+            Table(
+                "Damping at which the limit cycle vanishes: extrapolated from the branch to zero amplitude, and in"
+                " closed form.",
+                ("damping without hunting",), where={"case": "vanishing"},
+            ),
+            Table(
+                "A ramp of {speed:g} mrad/s with kd {kd:g} N m s/rad, gravity compensated, after the first fifth of"
+                " 10 s. At: compensated friction over friction. Stair: largest step between two sticks.",
+                ("stair", "tracking error", "over-compensation"), ("at",), where={"case": "ramp"},
+            ),
+        ),
+    ),
     "periodic_orbit": Report(
         "Periodic orbits by shooting, and by simulations that settle.", "orbits",
         (Table(

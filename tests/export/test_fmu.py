@@ -2,6 +2,7 @@
 
 import functools
 import shutil
+import subprocess
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
@@ -244,6 +245,69 @@ def test_a_saved_state_continues_bit_by_bit_in_another_instance() -> None:
     assert other.getFloat64([x]) == [0.0]
     one.freeInstance()
     other.freeInstance()
+
+
+# Counts calls of the allocator while an instance steps through events, and is reset, saved and restored.
+_HARNESS = """
+#include <stdio.h>
+#include <stdlib.h>
+#include <stdbool.h>
+#include "fmi3.h"
+#include "model.h"
+static int calls;
+void *__real_malloc(size_t); void *__real_calloc(size_t, size_t); void *__real_realloc(void *, size_t);
+void *__wrap_malloc(size_t n) { ++calls; return __real_malloc(n); }
+void *__wrap_calloc(size_t n, size_t m) { ++calls; return __real_calloc(n, m); }
+void *__wrap_realloc(void *p, size_t n) { ++calls; return __real_realloc(p, n); }
+int main(void) {
+  bool event, stop, early, again, known, states;
+  double last, next, along = 1.0, out;
+  int events = 0;
+  fmi3ValueReference one = POSITION, of = ACCELERATION;
+  fmi3FMUState saved = NULL;
+  fmi3Instance c = fmi3InstantiateCoSimulation("one", TOKEN, "", 0, 0, 1, 1, NULL, 0, NULL, NULL, NULL);
+  const int made = calls;
+  fmi3EnterInitializationMode(c, true, 1e-6, 0.0, false, 0.0);
+  fmi3ExitInitializationMode(c);
+  do fmi3UpdateDiscreteStates(c, &again, &stop, &known, &states, &event, &next); while (again);
+  fmi3EnterStepMode(c);
+  for (double t = 0.0; t < 5.0; t = last) {
+    if (fmi3DoStep(c, t, 0.05, true, &event, &stop, &early, &last) != fmi3OK) return 1;
+    if (!event) continue;
+    ++events;
+    fmi3EnterEventMode(c);
+    do fmi3UpdateDiscreteStates(c, &again, &stop, &known, &states, &event, &next); while (again);
+    fmi3EnterStepMode(c);
+  }
+  if (fmi3GetDirectionalDerivative(c, &of, 1, &one, 1, &along, 1, &out, 1) != fmi3OK) return 2;
+  const int stepped = calls;
+  fmi3GetFMUState(c, &saved);
+  const int kept = calls;
+  fmi3SetFMUState(c, saved);
+  fmi3Reset(c);
+  printf("%d %d %d %d %d\\n", events, made, stepped - made, kept - stepped, calls - kept);
+  fmi3FreeFMUState(c, &saved);
+  fmi3FreeInstance(c);
+  return 0;
+}
+"""
+
+
+@needs_fmpy
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc, whose linker replaces the allocator")
+def test_steps_and_events_allocate_no_memory(tmp_path: Path) -> None:
+    """One allocation for the instance and one for a saved state; none in steps, events and derivatives."""
+    places, sources = references("belt"), Path(unpacked("belt")) / "sources"
+    (tmp_path / "harness.c").write_text(_HARNESS)
+    wrapped = [f"-Wl,--wrap={name}" for name in ("malloc", "calloc", "realloc")]
+    numbers = [f"-DPOSITION={places['x']}", f"-DACCELERATION={places['der(x_dot)']}"]
+    files = [str(tmp_path / "harness.c"), *map(str, sorted(sources.glob("*.c")))]
+    command = ["gcc", "-std=c99", "-I", str(sources), *numbers, *wrapped, *files, "-o", str(tmp_path / "run"), "-lm"]
+    subprocess.run(command, check=True, capture_output=True)
+    done = subprocess.run([str(tmp_path / "run")], check=True, capture_output=True, text=True)
+    events, made, stepped, saved, restored = map(int, done.stdout.split())
+    assert events > 5
+    assert (made, stepped, saved, restored) == (1, 0, 1, 0)
 
 
 @needs_fmpy
