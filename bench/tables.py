@@ -367,7 +367,7 @@ REPORTS = {
         (Table(
             "EMPS record, {samples:,} samples, open-loop error of the position over the whole record, and in four parts"
             " held out one after the other. Target: {goal} mm with at most 8 parameters. One command, {seconds} s.",
-            ("parameters", "RMSE", "RMSE with 5 steps a sample", "held back", "standard error", "not determined"),
+            ("parameters", "RMSE", "RMSE with 5 steps a sample", "held-out error", "standard error", "not determined"),
         ),),
     ),
     "servo": Report(
@@ -409,7 +409,7 @@ REPORTS = {
             "Fits with default options and an unknown start of the record. Held: share of {repeats} repeats whose 95 %"
             " interval contains the truth. Remark: share that report a constant offset of the sensor;"
             " in the last column also those whose intervals all hold.",
-            ("held", "remark on an offset", "remark, or all hold"), ("case",), ("quantity", "at"),
+            ("held", "warning on an offset", "warning, or all hold"), ("case",), ("quantity", "at"),
         )),
     ),
 }  # fmt: skip

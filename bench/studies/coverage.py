@@ -3,7 +3,7 @@
 A mass on a spring is driven through stick and slip, with 2 000 samples of its position. Every repeat has its own noise,
 white or correlated, starts from parameters wrong by up to a factor of ten, and is fitted in one batch with the others.
 Then the default `fit` estimates mass, Coulomb and viscous friction from records of 600 samples, each of another motion:
-with white noise, a sensor resolution of 1 mm, or a sensor offset of 5 mm, for which a remark is right too.
+with white noise, a sensor resolution of 1 mm, or a sensor offset of 5 mm, for which a warning is right too.
 """
 
 import time
@@ -50,24 +50,24 @@ def main(smoke: bool, out: Path) -> Result:
 
 
 def _default_start(result: Result, label: str, measure: Measure, repeats: int) -> None:
-    """Measure the coverage of default fits, and the share of fits with a remark on a sensor offset."""
+    """Measure the coverage of default fits, and the share of fits with a warning on a sensor offset."""
     rng, t, zero = np.random.default_rng(0), 5e-3 * np.arange(600), jnp.zeros(1)
     rates = 2 * np.pi * rng.uniform([0.15, 0.7, 1.5], [0.55, 1.1, 1.9], (repeats, 3))
     phases = rng.uniform(0, 2 * np.pi, (repeats, 3, 1))
     forces = np.sum(np.array([2.0, 1.5, 2.0])[:, None] * np.sin(rates[..., None] * t + phases), axis=1)
     run = jax.jit(jax.vmap(lambda u: replay(dry(**DRY), jnp.asarray(t), {"u": u}, zero, zero, 4)))
-    held, remarked, right = np.zeros(3), 0, 0
+    held, warned, right = np.zeros(3), 0, 0
     for u, q in zip(forces, np.asarray(run(jnp.asarray(forces))), strict=True):
         record = jms.Record(t, measure(q, rng), {"u": u})
         fitted = jms.fit(dry(1.6, 1.0, 0.9), record, ("m", "friction.Fc", "viscous.Fv"), substeps=4)
         spans = fitted.estimate.intervals().values()
         inside = [low <= true <= high for true, (low, high) in zip(DRY.values(), spans, strict=True)]
         said = any("constant offset" in each for each in warnings_for(fitted))
-        held, remarked, right = held + inside, remarked + said, right + (said or all(inside))
+        held, warned, right = held + inside, warned + said, right + (said or all(inside))
     for name, count in zip(DRY, held, strict=True):
         result.add("held", 100.0 * float(count) / repeats, "%", case=label, at=name)
-    result.add("remark on an offset", 100.0 * remarked / repeats, "%", case=label)
-    result.add("remark, or all hold", 100.0 * right / repeats, "%", case=label)
+    result.add("warning on an offset", 100.0 * warned / repeats, "%", case=label)
+    result.add("warning, or all hold", 100.0 * right / repeats, "%", case=label)
 
 
 def _lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:

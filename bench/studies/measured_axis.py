@@ -48,7 +48,7 @@ def main(smoke: bool, out: Path) -> Result | None:
     for each in report["comparison"]["models"]:
         name = each["name"]
         result.add("parameters", each["parameters"], peer=name)
-        for quantity, key in (("RMSE", "fitted"), ("held back", "held_back"), ("standard error", "standard_error")):
+        for quantity, key in (("RMSE", "fitted"), ("held-out error", "held_out"), ("standard error", "standard_error")):
             result.add(quantity, each[key], "m", peer=name)
         fine = _rmse(record, name, report["comparison"]["fits"][name]["parameters"], 5)
         result.add("RMSE with 5 steps a sample", fine, "m", peer=name)

@@ -44,7 +44,7 @@ def main(smoke: bool, out: Path) -> Result | None:
         for peer, errors in PUBLISHED.items():
             for gain, error in zip(GAINS, errors, strict=True):
                 result.add(f"gain {gain}", error, "mrad", peer=peer)
-        result.settings["undetermined"] = " ".join(report["undetermined"])
+        result.settings["warnings"] = " ".join(report["warnings"])
         for group in GROUPS[:1] if smoke else GROUPS:
             _predict_left_out(result, paths, group, folder / group, report["model"])
     return result

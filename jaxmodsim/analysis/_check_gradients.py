@@ -14,6 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from .._core.readable import Table
 from ..scene import Scene, elements, read_element, replace_elements
 from ..simulation import Trajectory, simulate
 from ..solvers import StoredSteps
@@ -61,7 +62,7 @@ class NumberCheck:
       two steps of the extrapolation; NaN without differences.
     - `verdict`: `agree`; `disagree`; `modes change`, `grazing` or `kink` (not differentiable here, see
       `check_gradients`); `unclear` (the differences are too noisy); `no differences` (the runs next to this one fail).
-    - `remarks`: sentences that explain the verdict and advise.
+    - `warnings`: sentences that explain the verdict and advise.
     """
 
     name: str
@@ -72,7 +73,7 @@ class NumberCheck:
     error: float
     step: float
     verdict: Verdict
-    remarks: tuple[str, ...]
+    warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,8 @@ class GradientCheck:
     - `value`: of the function.
     - `dtype`: floating type of the function.
     - `numbers`: a `NumberCheck` for each number, by name.
-    - `remarks`: sentences about the numbers and the check as a whole.
-    - `ok`: whether all derivatives agree with each other and with the differences. Remarks may still limit the range
+    - `warnings`: sentences about the numbers and the check as a whole.
+    - `ok`: whether all derivatives agree with each other and with the differences. Warnings may still limit the range
       in which they do.
 
     **Example:**
@@ -93,7 +94,7 @@ class GradientCheck:
         return simulate(scene, [1.0], [0.0], 2.0).q[-1, 0]
 
     check = jms.check_gradients(end, jms.problems.braked_spring.scene(), names=("k",))
-    print(check.numbers["k"].verdict, check.remarks)
+    print(check.numbers["k"].verdict, check.warnings)
     ```
 
     ```text
@@ -104,7 +105,7 @@ class GradientCheck:
     value: float
     dtype: str
     numbers: dict[str, NumberCheck]
-    remarks: tuple[str, ...]
+    warnings: tuple[str, ...]
 
     @property
     def ok(self) -> bool:
@@ -112,14 +113,16 @@ class GradientCheck:
         return all(number.verdict == "agree" for number in self.numbers.values())
 
     def __str__(self) -> str:
-        """A table of the numbers, and the remarks."""
-        width = max(len(name) for name in self.numbers)
-        heads = f"{'value':>11}  {'forward':>13}  {'reverse':>13}  {'differences':>13}  {'+-':>8}  {'step':>8}"
-        lines = [f"fn = {self.value:.9g} ({self.dtype})", f"{'':{width}}  {heads}  verdict"]
-        for n in self.numbers.values():
-            values = f"{n.value:11.5g}  {n.forward:13.7g}  {n.reverse:13.7g}  {n.differences:13.7g}"
-            lines.append(f"{n.name:{width}}  {values}  {n.error:8.1g}  {n.step:8.2g}  {n.verdict}")
-        return "\n".join([*lines, *(f"- {remark}" for remark in self.remarks)])
+        """A table of the numbers, and the warnings."""
+        rows = [
+            (
+                *(n.name, f"{n.value:.5g}", f"{n.forward:.7g}", f"{n.reverse:.7g}", f"{n.differences:.7g}"),
+                *(f"{n.error:.1g}", f"{n.step:.2g}", n.verdict),
+            )
+            for n in self.numbers.values()
+        ]
+        head = ("number", "value", "forward", "reverse", "differences", "+-", "step", "verdict")
+        return Table(f"fn = {self.value:.9g} ({self.dtype})", head, rows, self.warnings).text()
 
 
 def check_gradients(
@@ -146,12 +149,12 @@ def check_gradients(
     **Not differentiable here.**
 
     - `modes change`: the sequence of mode changes of an effect differs at one of the two smallest steps. If it differs
-      at larger steps only, the derivative is right, and a remark gives the distance. This is also the only check for
+      at larger steps only, the derivative is right, and a warning gives the distance. This is also the only check for
       events that just fail to happen, such as a load that almost reaches the limit of stick. Mode changes of two
       effects that swap their order count as unchanged.
     - `grazing`: derivatives and differences disagree or are unclear, and the time of an event follows a square root
       that ends within 5 % of the number. A guard that crosses zero at a vanishing rate has such an event. If
-      derivatives and differences agree, a remark names the event. Grazing in a combination of numbers alone is not
+      derivatives and differences agree, a warning names the event. Grazing in a combination of numbers alone is not
       detected.
     - `kink`: the modes are the same, but the slopes from below and above differ at the three smallest steps, as at the
       corner of `abs` or `maximum`.
@@ -170,7 +173,7 @@ def check_gradients(
 
     **Returns:**
 
-    A `GradientCheck`: `.ok`, `.numbers[name]`, `.remarks`, and a table when printed.
+    A `GradientCheck`: `.ok`, `.numbers[name]`, `.warnings`, and a table when printed.
 
     **Raises:**
 
@@ -216,15 +219,17 @@ def check_gradients(
         sample = functools.partial(evaluate, name)
         evaluations = probe(sample, sample(x), scale[name], itemsize)
         numbers[name] = _judge(name, evaluations, forward[name], reverse[name], scale[name], limits)
-    remarks = [remark for number in numbers.values() for remark in number.remarks]
+    warnings = [warning for number in numbers.values() for warning in number.warnings]
     if adjoints and any(number.verdict == "disagree" for number in numbers.values()):
-        remarks.append(
+        warnings.append(
             f"The steps of a run with adjoint={' or '.join(adjoints)} control the error of the motion alone, which can"
             " leave derivatives wrong. Omit adjoint: by default the steps control the error of the derivatives too."
         )
     if not recorded:
-        remarks.append("Modes of runs inside jax.jit or jax.vmap are not recorded: mode changes and grazing go unseen.")
-    return GradientCheck(float(value), f"float{8 * itemsize}", numbers, tuple(remarks))
+        warnings.append(
+            "Modes of runs inside jax.jit or jax.vmap are not recorded: mode changes and grazing go unseen."
+        )
+    return GradientCheck(float(value), f"float{8 * itemsize}", numbers, tuple(warnings))
 
 
 def _entries(scene: object, names: Sequence[str] | None, scales: Mapping[str, float]) -> dict[str, float]:
@@ -341,34 +346,34 @@ def _histories(run: Trajectory) -> dict[str, History]:
 def _judge(
     name: str, evaluations: Probe, forward: float, reverse: float, scale: float, limits: Agreement
 ) -> NumberCheck:
-    """The verdict on one number, with its remarks."""
+    """The verdict on one number, with its warnings."""
     center, guess = evaluations.center, estimate(evaluations, limits.eps)
     shown = guess or DerivativeEstimate(float("nan"), float("nan"), float("nan"), "")
     number = functools.partial(NumberCheck, name, center.x, forward, reverse, shown.value, shown.error, shown.step)
     sides = [(side, usable(center, side)) for side in (evaluations.below, evaluations.above)]
-    ends = tuple(_end_remark(name, center, side[first - 1]) for side, first in sides if first)
+    ends = tuple(_end_warning(name, center, side[first - 1]) for side, first in sides if first)
     if any(len(side) - 2 < first and not side[first - 1].trouble for side, first in sides):
-        remark = (
+        warning = (
             f"{name}: not differentiable here, as far as the steps can resolve: the modes change next to this value,"
             " and a gradient is valid on one side at most. Move away from this value before you use a gradient."
         )
-        return number("modes change", (*ends, remark))
+        return number("modes change", (*ends, warning))
     if guess is None:
-        remark = f"{name}: too few runs near this value succeed. Pass smaller steps by scales={{{name!r}: ...}}."
-        return number("no differences", (*ends, remark))
+        warning = f"{name}: too few runs near this value succeed. Pass smaller steps by scales={{{name!r}: ...}}."
+        return number("no differences", (*ends, warning))
     if guess.sides != "both":
         ends = (*ends, f"{name}: the differences are from {guess.sides} only.")
     least = limits.rtol * limits.size / scale
     corner = kink(evaluations)
     if corner is not None and abs(corner[1] - corner[0]) > max(limits.rtol * max(map(abs, corner)), least):
-        remark = (
+        warning = (
             f"{name}: not differentiable here: the slope is {corner[0]:.7g} from below and {corner[1]:.7g} from above,"
             " with the same modes. Look for abs, maximum, sign or where at a corner, or move away from this value."
         )
-        return number("kink", (remark, *ends))
+        return number("kink", (warning, *ends))
     near = grazing(evaluations, scale)
-    touch = () if near is None else (_grazing_remark(name, center.x, near),)
-    disagreements = _disagreement_remarks(name, forward, reverse, guess, limits, scale)
+    touch = () if near is None else (_grazing_warning(name, center.x, near),)
+    disagreements = _disagreement_warnings(name, forward, reverse, guess, limits, scale)
     size = max(abs(forward), abs(reverse), abs(guess.value))
     unclear = 3 * guess.error > max(_UNCLEAR * size, least)
     if near is not None and (disagreements or unclear):
@@ -376,15 +381,15 @@ def _judge(
     if disagreements:
         return number("disagree", (*disagreements, *ends))
     if unclear:
-        remark = (
+        warning = (
             f"{name}: the differences have an error of {guess.error:.1g} and are inconclusive. Tighten rtol and atol of"
             f" simulate, or pass other steps by scales={{{name!r}: ...}}."
         )
-        return number("unclear", (remark, *ends))
+        return number("unclear", (warning, *ends))
     return number("agree", (*touch, *ends))
 
 
-def _end_remark(name: str, center: Sample, beside: Sample) -> str:
+def _end_warning(name: str, center: Sample, beside: Sample) -> str:
     """Why the differences end at the evaluation `beside`: it fails, or its modes are others."""
     place = f"{name}: at {beside.x:.7g}, {_percent(beside.x - center.x, center.x)} from here,"
     if beside.trouble:
@@ -402,7 +407,7 @@ def _end_remark(name: str, center: Sample, beside: Sample) -> str:
     return f"{text} is {new} in place of {old}."
 
 
-def _grazing_remark(name: str, x: float, near: Grazing) -> str:
+def _grazing_warning(name: str, x: float, near: Grazing) -> str:
     return (
         f"{name}: grazing suspected: the time of the event of {near.effect!r} at t = {near.t:.6g}{_run(near.run)}"
         f" follows a square root that ends near {name} = {near.vanishes:.6g}, {_percent(near.vanishes - x, x)} from"
@@ -410,7 +415,7 @@ def _grazing_remark(name: str, x: float, near: Grazing) -> str:
     )
 
 
-def _disagreement_remarks(
+def _disagreement_warnings(
     name: str, forward: float, reverse: float, guess: DerivativeEstimate, limits: Agreement, scale: float
 ) -> tuple[str, ...]:
     """How the three derivatives disagree; empty if they agree."""

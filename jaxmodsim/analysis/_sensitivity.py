@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from .._core.readable import Table
 from ..scene import (
     Scene,
     elements,
@@ -42,10 +43,10 @@ class Sensitivity:
     - `derivatives`: dy/dp by name, of the shape of the observable.
     - `normalised`: `p dy/dp / scale` by name: the relative change of y per relative change of p. The scale is the rms
       of y over the run if y is a function of time, else the magnitude of each y. A zero p or scale is replaced by one
-      unit; `remarks` says so.
+      unit; `warnings` says so.
     - `ranking`: pairs of name and rms of the normalised sensitivity, the largest first.
     - `mode`: of differentiation, `forward` or `reverse`.
-    - `remarks`: sentences on replaced zeros and on mode changes.
+    - `warnings`: sentences on replaced zeros and on mode changes.
 
     **Example:**
 
@@ -70,7 +71,7 @@ class Sensitivity:
     normalised: dict[str, Float[Array, "..."]]
     ranking: tuple[tuple[str, float], ...]
     mode: str
-    remarks: tuple[str, ...]
+    warnings: tuple[str, ...]
 
     @property
     def over_time(self) -> bool:
@@ -78,19 +79,16 @@ class Sensitivity:
         return _over_time(self.observable, self.t)
 
     def __str__(self) -> str:
-        """A table in the order of the ranking, and the remarks."""
+        """A table in the order of the ranking, and the warnings."""
         shape = f"{self.t.shape[0]} times" if self.over_time else f"shape {self.observable.shape}"
         unit = f" [{self.unit}]" if self.unit else ""
         names = [f"{name} [{self.units[name]}]" if name in self.units else name for name, _ in self.ranking]
-        width = max(map(len, names))
-        lines = [
-            f"{self.label}{unit}: {shape}, rms {_rms(self.observable):.5g}; {self.mode} mode",
-            f"{'':{width}}  {'value':>11}  {'rms dy/dp':>11}  {'rms p dy/dp / scale':>19}",
+        rows = [
+            (text, f"{self.values[name]:.5g}", f"{_rms(self.derivatives[name]):.5g}", f"{size:.5g}")
+            for text, (name, size) in zip(names, self.ranking, strict=True)
         ]
-        for text, (name, size) in zip(names, self.ranking, strict=True):
-            slope = _rms(self.derivatives[name])
-            lines.append(f"{text:{width}}  {self.values[name]:11.5g}  {slope:11.5g}  {size:19.5g}")
-        return "\n".join([*lines, *(f"- {remark}" for remark in self.remarks)])
+        title = f"{self.label}{unit}: {shape}, rms {_rms(self.observable):.5g}; {self.mode} mode"
+        return Table(title, ("number", "value", "rms dy/dp", "rms p dy/dp / scale"), rows, self.warnings).text()
 
 
 def sensitivity(
@@ -172,13 +170,13 @@ def sensitivity(
     differentiate = jax.jacfwd if mode == "forward" else jax.jacrev
     derivatives = differentiate(at)({name: jnp.asarray(x, y.dtype) for name, x in values.items()})
     derivatives = {name: derivatives[name] for name in values}
-    normalised, remarks = _normalised(y, run, values, derivatives)
+    normalised, warnings = _normalised(y, run, values, derivatives)
     sizes = {name: _rms(x) for name, x in normalised.items()}
     ranking = tuple(sorted(sizes.items(), key=lambda pair: -pair[1]))
     ranges, places = scene_ranges(scene), elements(scene)
     leaves = {name: places[name][0] for name in values if name in places}
     units = {name: ranges[leaf].unit for name, leaf in leaves.items() if leaf in ranges and ranges[leaf].unit}
-    return Sensitivity(label, unit, run.t, y, values, units, derivatives, normalised, ranking, mode, remarks)
+    return Sensitivity(label, unit, run.t, y, values, units, derivatives, normalised, ranking, mode, warnings)
 
 
 def chosen_numbers(scene: Scene, q0: object, qd0: object, wrt: Sequence[str] | str | None) -> dict[str, float]:
@@ -262,22 +260,22 @@ def observed(y: Any) -> Array:
 def _normalised(
     y: Array, run: Trajectory, values: Mapping[str, float], derivatives: Mapping[str, Array]
 ) -> tuple[dict[str, Array], tuple[str, ...]]:
-    """Derivatives relative to parameters and observable, and the remarks."""
-    remarks = []
+    """Derivatives relative to parameters and observable, and the warnings."""
+    warnings = []
     scale = jnp.full(y.shape, _rms(y), y.dtype) if _over_time(y, run.t) else jnp.abs(y)
     if not (scale > 0).all():
-        remarks.append("The observable is zero at some times: its scale there is taken as one unit.")
+        warnings.append("The observable is zero at some times: its scale there is taken as one unit.")
         scale = jnp.where(scale > 0, scale, 1.0)
     zero = [name for name, x in values.items() if x == 0]
     if zero:
-        remarks.append(f"These parameters are zero, and their change is taken as one unit: {', '.join(zero)}.")
+        warnings.append(f"These parameters are zero, and their change is taken as one unit: {', '.join(zero)}.")
     events = int(run.stats.get("num_events", 0))
     if events:
-        remarks.append(
+        warnings.append(
             f"The run has mode changes at {events} times: derivatives are valid while their sequence stays the same."
             " jaxmodsim.check_gradients checks that."
         )
-    return {name: (x or 1.0) * derivatives[name] / scale for name, x in values.items()}, tuple(remarks)
+    return {name: (x or 1.0) * derivatives[name] / scale for name, x in values.items()}, tuple(warnings)
 
 
 def _over_time(y: Array, t: Array) -> bool:

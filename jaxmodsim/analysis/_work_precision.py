@@ -438,7 +438,7 @@ def _row(
     failed = [report["failed"] for report in outcome.reports.values() if "failed" in report]
     if failed:
         return replace(row, failed=failed[0])
-    run, remarks = outcome.given["run"], []
+    run, warnings = outcome.given["run"], []
     y = np.asarray(observed(question.observe(run)), float)
 
     def apart(a: np.ndarray, b: np.ndarray) -> float:
@@ -448,7 +448,7 @@ def _row(
     if limit is None:
         numerical, model = error, 0.0
     elif isinstance(limit, str):
-        remarks.append(limit)
+        warnings.append(limit)
     else:
         numerical, model = apart(y, limit.y), apart(limit.y, target.y)
     events, changes = None, mode_changes_of(run)
@@ -456,7 +456,7 @@ def _row(
         events = event_error(changes, target.events)
         if events is None:
             counts = f"{changes.t.size} changes, in the reference {target.events.t.size}"
-            remarks.append(f"The sequence of modes differs from that of the reference: {counts}.")
+            warnings.append(f"The sequence of modes differs from that of the reference: {counts}.")
     derivatives = [outcome.given[cost] for cost in ("forward", "reverse") if cost in outcome.given]
     gradient = None
     if derivatives and target.gradient is not None:
@@ -473,5 +473,5 @@ def _row(
         rejected=int(run.stats["num_rejected_steps"]),
         evaluations=None if each is None else each * steps,
         times=timings,
-        remarks=tuple(remarks),
+        warnings=tuple(warnings),
     )

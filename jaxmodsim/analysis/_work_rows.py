@@ -8,12 +8,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .._core.readable import Table
 from .._core.system import extra, written_whole
 
 if TYPE_CHECKING:
     import pandas as pd
 
-_KIND, _VERSION = "jaxmodsim work precision", 3
+_KIND, _VERSION = "jaxmodsim work precision", 4
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Row:
     - `steps`, `rejected`: number of all steps, and of rejected steps.
     - `evaluations`: of the vector field in all steps, including Jacobians; None for methods that iterate.
     - `times`: a `Timing` for each of the costs: `run`, `vmap` (for each run of the batch), `forward`, `reverse`.
-    - `remarks`: sentences on missing entries.
+    - `warnings`: sentences on missing entries.
     """
 
     method: str
@@ -62,7 +63,7 @@ class Row:
     rejected: int | None = None
     evaluations: int | None = None
     times: dict[str, Timing] | None = None
-    remarks: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def setting(self) -> str:
@@ -171,24 +172,24 @@ class WorkPrecision:
             file.write(text.encode() + b"\n")
 
     def __str__(self) -> str:
-        """A table with the problem, failures, remarks and reference."""
+        """A table with the problem, failures, warnings and reference."""
         heads = ["method", "setting", "error", "numerical", "model", "events [s]", "gradient", "steps", "evaluations"]
         heads += [f"{cost} [ms]" for cost in self.costs] + ["compile [s]"]
         floors = {"error": self.disagreement, "numerical": self.disagreement, "model": self.disagreement}
         floors |= {"events [s]": self.events_disagreement, "gradient": self.gradient_disagreement}
         cells = [[_cell(row, head, floors, self.costs) for head in heads] for row in self.rows if not row.failed]
         kept = [i for i, _ in enumerate(heads) if any(line[i] for line in cells)]
-        lines = [[heads[i] for i in kept], *([line[i] for i in kept] for line in cells)]
         unit = f" {self.unit}" if self.unit else ""
-        return "\n".join(
-            [
-                f"{self.problem}: {self.observable} {self.when}, errors relative to {self.scale:.4g}{unit}",
-                *_aligned(lines),
+        return Table(
+            f"{self.problem}: {self.observable} {self.when}, errors relative to {self.scale:.4g}{unit}",
+            tuple(heads[i] for i in kept),
+            [tuple(line[i] for i in kept) for line in cells],
+            (
                 *(f"failed: {row.method} at {row.setting}: {row.failed}" for row in self.rows if row.failed),
-                *(f"{row.method} at {row.setting}: {remark}" for row in self.rows for remark in row.remarks),
+                *(f"{row.method} at {row.setting}: {warning}" for row in self.rows for warning in row.warnings),
                 f"Reference: {self.reference}, which agree to {self.disagreement:.1e}.",
-            ]
-        )
+            ),
+        ).text()
 
 
 def _cell(row: Row, head: str, floors: dict[str, float], costs: Sequence[str]) -> str:
@@ -208,17 +209,6 @@ def _cell(row: Row, head: str, floors: dict[str, float], costs: Sequence[str]) -
     if value == 0.0 and name == "model":
         return "0"
     return f"<{floors[head]:.0e}" if value < floors[head] else f"{value:.1e}"
-
-
-def _aligned(lines: list[list[str]]) -> list[str]:
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    return [
-        "  ".join(
-            cell.ljust(width) if i < 2 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in lines
-    ]
 
 
 def _columns(row: Row, costs: Sequence[str]) -> dict[str, object]:
@@ -282,4 +272,4 @@ def load_work_precision(path: str | os.PathLike[str]) -> WorkPrecision:
 def _row(row: dict[str, Any]) -> Row:
     times = row["times"]
     timings = None if times is None else {cost: Timing(**timing) for cost, timing in times.items()}
-    return Row(**{**row, "times": timings, "remarks": tuple(row["remarks"])})
+    return Row(**{**row, "times": timings, "warnings": tuple(row["warnings"])})

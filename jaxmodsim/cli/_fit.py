@@ -125,49 +125,41 @@ def _validated(outcome: FitOutcome) -> FitOutcome:
 
 
 @contextmanager
-def _ctrl_c() -> Iterator[Callable[[], None]]:
-    """Let Ctrl-C end all searches, and not only the one in progress; yields a function that ends a later one."""
-    before = signal.getsignal(signal.SIGINT)
-    pressed = threading.Event()
+def _progress(title: str, text_of: Callable[..., str]) -> Iterator[Callable[..., None]]:
+    """A function that shows its reports in a line; Ctrl-C ends all searches, and not only the one in progress."""
+    before, pressed = signal.getsignal(signal.SIGINT), threading.Event()
 
     def press(*_: object) -> None:
         pressed.set()
         raise KeyboardInterrupt
 
-    def end() -> None:
-        if pressed.is_set():
-            raise KeyboardInterrupt
+    with progress_line(title) as show:
 
-    signal.signal(signal.SIGINT, press)
-    try:
-        yield end
-    finally:
-        signal.signal(signal.SIGINT, before)
+        def report(*progress: Any) -> None:
+            show(text_of(*progress))
+            if pressed.is_set():
+                raise KeyboardInterrupt
+
+        signal.signal(signal.SIGINT, press)
+        try:
+            yield report
+        finally:
+            signal.signal(signal.SIGINT, before)
 
 
 def _compared(plan: FitPlan, substeps: int) -> Comparison:
     validation: dict[str, Any] = {"hold_out": plan.held_out} if plan.folds is None else {"folds": plan.folds}
-    with progress_line("compare") as show, _ctrl_c() as end:
-
-        def progress(name: str, fold: int | None, step: int, rms: float) -> None:
-            show(candidate_words(name, fold, step, rms))
-            end()
-
-        options = {**validation, **plan.options, "substeps": substeps, "progress": progress}
-        return compare(plan.candidates, plan.records, limits=plan.limits, **options)
+    options = {**validation, **plan.options, "substeps": substeps}
+    with _progress("compare", candidate_words) as report:
+        return compare(plan.candidates, plan.records, limits=plan.limits, progress=report, **options)
 
 
 def fit_with_progress(
     scene: Scene, records: Record | Sequence[Record], free: Sequence[str], **options: Any
 ) -> FitResult:
     """`fit` with a progress line."""
-    with progress_line("fit") as show, _ctrl_c() as end:
-
-        def progress(step: int, rms: float, values: dict[str, float]) -> None:
-            show(iteration_words(step, rms, values))
-            end()
-
-        return fit(scene, records, free, progress=progress, **options)
+    with _progress("fit", iteration_words) as report:
+        return fit(scene, records, free, progress=report, **options)
 
 
 def _show(outcome: FitOutcome) -> None:

@@ -24,7 +24,9 @@ def command_of(record: type[Options]) -> Callable[[Callable[[Options], None]], C
             function(record(**options))
 
         parameters = []
-        for each in fields(record):  # pyright: ignore[reportArgumentType] # a dataclass
+        # Its own first, as --help lists them.
+        every = fields(record)  # pyright: ignore[reportArgumentType] # a dataclass
+        for each in sorted(every, key=lambda each: each.name not in record.__annotations__):
             default = each.default if each.default_factory is MISSING else each.default_factory()
             default = inspect.Parameter.empty if default is MISSING else default
             kind = inspect.Parameter.KEYWORD_ONLY
@@ -47,23 +49,38 @@ SpecFile = Annotated[Path, typer.Argument(help="TOML file of the tables describe
 _COLUMNS, _MODEL, _VALIDATION, _SEARCH, _NEXT = "Columns", "Model", "Validation", "Search", "The next record"
 _SERVO = "Servo"
 
-# Options of `fit` and `predict` for a servo.
-_Goal = Annotated[str, _option(_SERVO, r"Column of the commanded angle \[rad].")]
-_Supply = Annotated[str, _option(_SERVO, r"Column of the supply \[V].")]
-_Enable = Annotated[str, _option(_SERVO, "Column that is 0 while the motor is off; without it always on.")]
-_Gain = Annotated[
-    str | None,
-    _option(
-        _SERVO,
-        "Gain of the position loop: a number, or a column. The default is the column kp, or the number after kp in"
-        " the name of the file.",
-        "NUMBER|COLUMN",
-    ),
-]
+
+@dataclass(frozen=True, kw_only=True)
+class AbstractServoColumns:
+    """Columns of a record of a servo, in `jaxmodsim fit` and `jaxmodsim predict`."""
+
+    goal: Annotated[str, _option(_SERVO, r"Column of the commanded angle \[rad].")] = "q_goal"
+    supply: Annotated[str, _option(_SERVO, r"Column of the supply \[V].")] = "volts"
+    enable: Annotated[str, _option(_SERVO, "Column that is 0 while the motor is off; without it always on.")] = (
+        "torque_enable"
+    )
+    gain: Annotated[
+        str | None,
+        _option(
+            _SERVO,
+            "Gain of the position loop: a number, or a column. The default is the column kp, or the number after kp in"
+            " the name of the file.",
+            "NUMBER|COLUMN",
+        ),
+    ] = None
+    duty: Annotated[
+        str | None,
+        _option(
+            _SERVO,
+            "Simulate from the measured duty in this column, from -885 to 885, and not from the command. A prediction"
+            " must do as the fit did.",
+            "COLUMN",
+        ),
+    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitRequest:
+class FitRequest(AbstractServoColumns):
     """Arguments and options of `jaxmodsim fit`, as typed."""
 
     records: Annotated[
@@ -190,18 +207,6 @@ class FitRequest:
             "driven|servo",
         ),
     ] = "driven"
-    goal: _Goal = "q_goal"
-    supply: _Supply = "volts"
-    enable: _Enable = "torque_enable"
-    gain: _Gain = None
-    duty: Annotated[
-        str | None,
-        _option(
-            _SERVO,
-            "Simulate from the measured duty in this column, from -885 to 885, and not from the command.",
-            "COLUMN",
-        ),
-    ] = None
     pendulum: Annotated[
         str,
         _option(_SERVO, r"Mass \[kg] and distance \[m] of the pendulum from the servo.", "MASS,LENGTH"),
@@ -238,7 +243,7 @@ def check_axis(request: FitRequest) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PredictRequest:
+class PredictRequest(AbstractServoColumns):
     """Arguments and options of `jaxmodsim predict`, as typed."""
 
     fit: Annotated[Path, typer.Argument(help="fit.json of jaxmodsim fit --axis servo.", metavar="FIT")]
@@ -250,18 +255,6 @@ class PredictRequest:
     position: Annotated[
         str, _option(_COLUMNS, "Column of the measured angle, if any: its first sample is the start.")
     ] = "q"
-    goal: _Goal = "q_goal"
-    supply: _Supply = "volts"
-    enable: _Enable = "torque_enable"
-    gain: _Gain = None
-    duty: Annotated[
-        str | None,
-        _option(
-            _SERVO,
-            "Simulate from the measured duty in this column, from -885 to 885, if the fit did.",
-            "COLUMN",
-        ),
-    ] = None
     q0: Annotated[
         float | None,
         _option(None, r"Angle at rest at the first sample \[rad]; default: that of --position, or of --goal."),

@@ -142,7 +142,7 @@ class FitOutcome:
         warnings = (
             *self.plan.notes,
             *self.differences,
-            *(remark for each in self.scores for remark in each.remarks),
+            *(warning for each in self.scores for warning in each.warnings),
             *warnings_for(result),
         )
         return (

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .._core.arguments import did_you_mean
+from .._core.arguments import as_float, as_whole, did_you_mean
 from ..identify import (
     AxisModel,
     Candidate,
@@ -130,19 +130,18 @@ def _check(request: FitRequest) -> None:
     for option, path in (("--out", request.out), ("--report", request.report)):
         if path is not None and path.exists() and not path.is_dir():
             raise ValueError(f"{option} {path} is a file; a folder is needed.")
-    least = {"--starts": 1, "--max-steps": 1, "--substeps": 1, "--folds": 2}
-    counts = (request.starts, request.max_steps, request.substeps, request.folds)
-    for (option, low), count in zip(least.items(), counts, strict=True):
-        if count is not None and count < low:
-            raise ValueError(f"{option} must be at least {low}, but it is {count}.")
+    counts = {"--starts": request.starts, "--max-steps": request.max_steps, "--substeps": request.substeps}
+    for option, count in (counts | {"--folds": request.folds}).items():
+        if count is not None:
+            as_whole(count, name=option, least=2 if option == "--folds" else 1)
     if request.folds is not None and request.held_out:
         raise ValueError("--folds and --held-out exclude each other: a model is validated by one of them.")
     numbers = {"force": request.max_force, "speed": request.max_speed, "travel": request.max_travel}
     for option, number in ({f"--max-{x}": n for x, n in numbers.items()} | {"--duration": request.duration}).items():
         if number is not None and request.next is None:
             raise ValueError(f"{option} belongs to --next FILE.csv, which is missing.")
-        if number is not None and not (math.isfinite(number) and number > 0):
-            raise ValueError(f"{option} must be finite and > 0, but it is {number}.")
+        if number is not None:
+            as_float(number, name=option, lower=0.0)
     if request.next is not None and request.next.is_dir():
         raise ValueError(f"--next {request.next} is a folder; a file is needed.")
 

@@ -36,7 +36,7 @@ def report_page(outcome: FitOutcome) -> str:
         result=result,
         records=record_table(outcome),
         parameters=frame_of(parameters, "parameter", "value", "standard error", "95 % from", "to", "start", "unit"),
-        remarks=warnings_for(result),
+        warnings=warnings_for(result),
         held=", ".join(f"{name} = {value:.6g}" for name, value in outcome.held.items()),
         figures=figures,
         residual_tests=residual_tests(result),

@@ -51,7 +51,7 @@ def run_servo_fit(request: FitRequest) -> None:
     ranking = ranking_of(fits)
     show_table(ranking, "Gear laws by the error of records that were left out")
     say(f"\n{best.law}\n{best.result}")
-    for line in best.undetermined:
+    for line in best.warnings:
         say(line)
     show_table(record_errors(best), f"{best.law}: mean absolute errors by record [mrad]")
     seconds = time.perf_counter() - started
@@ -61,7 +61,7 @@ def run_servo_fit(request: FitRequest) -> None:
     }
     files["ranking.csv"] = ranking
     files["fit.json"] = {
-        "model": best.law, "servo": best.to_dict(), "undetermined": list(best.undetermined), "seconds": seconds,
+        "model": best.law, "servo": best.to_dict(), "warnings": list(best.warnings), "seconds": seconds,
         "ranking": ranking.to_dict("records"), "laws": {law: fit.to_dict() for law, fit in fits.items()},
     }  # fmt: skip
     show_paths(write(request.out, files))

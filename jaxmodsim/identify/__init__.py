@@ -35,10 +35,10 @@ from .selection._compare import Candidate as Candidate
 from .selection._compare import compare as compare
 from .selection._compare import compare_laws as compare_laws
 from .selection._comparison import Comparison as Comparison
+from .selection._evaluation import Score as Score
+from .selection._evaluation import evaluate_on as evaluate_on
 from .selection._prediction import PredictionError as PredictionError
 from .selection._prediction import RecordPrediction as RecordPrediction
-from .selection._prediction import Score as Score
-from .selection._prediction import evaluate_on as evaluate_on
 from .selection._prediction import predict as predict
 from .selection._prediction import prediction_error as prediction_error
 from .selection._servo_fit import ServoFit as ServoFit

@@ -332,10 +332,10 @@ def comparison_figure(comparison: Comparison, *, unit: str = "m", caption: str =
     axis: Axes = figure.subplots()
     for i, each in enumerate(ranked):
         height, colour = np.full(len(each.parts), i - 0.17), GREEN if each.name == simplest else BLUE
-        axis.barh(i - 0.17, factor * each.held_back, 0.4, color=colour, alpha=0.75)
+        axis.barh(i - 0.17, factor * each.held_out, 0.4, color=colour, alpha=0.75)
         (parts,) = axis.plot(factor * each.parts, height, "o", color="white", mec="black", ms=4)
         bar = axis.errorbar(
-            factor * each.held_back, i - 0.17, xerr=factor * each.standard_error, color="black", capsize=4, lw=1.2
+            factor * each.held_out, i - 0.17, xerr=factor * each.standard_error, color="black", capsize=4, lw=1.2
         )
         axis.barh(i + 0.2, factor * each.fitted, 0.24, color=GREY)
         parts.set_label("" if i else "each held-out part")
@@ -344,7 +344,7 @@ def comparison_figure(comparison: Comparison, *, unit: str = "m", caption: str =
     names = [f"{x.name}\n{x.parameters} parameters{doubt}" for x, doubt in zip(ranked, doubts, strict=True)]
     axis.set_yticks(range(len(ranked)), names, fontsize=9)
     axis.invert_yaxis()
-    errors = np.concatenate([[each.held_back, each.fitted] for each in ranked])
+    errors = np.concatenate([[each.held_out, each.fitted] for each in ranked])
     if errors.max() > 20 * errors.min() > 0:
         axis.set_xscale("log")
         axis.set_xlim(left=0.5 * factor * errors.min())

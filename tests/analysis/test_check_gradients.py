@@ -76,7 +76,7 @@ def test_stick_slip_agrees_with_differences_and_closed_form() -> None:
         assert found.reverse == pytest.approx(value, rel=1e-6, abs=1e-9)
         assert abs(found.differences - value) <= found.error + 1e-7
         assert found.error < 1e-5
-    assert not check.remarks
+    assert not check.warnings
 
 
 def test_break_away_agrees_and_a_belt_at_rest_is_named() -> None:
@@ -101,7 +101,7 @@ def test_lugre_in_single_precision_without_events() -> None:
         assert check.numbers[name].differences == pytest.approx(value, rel=1e-3)
         assert check.numbers[name].error < 1e-2
     # sigma1 is at the end of its range.
-    assert "the differences are from above only" in " ".join(check.numbers["friction.sigma1"].remarks)
+    assert "the differences are from above only" in " ".join(check.numbers["friction.sigma1"].warnings)
 
     def stopped(scene: jms.Scene, simulate: Any) -> Any:
         return slide(scene, simulate) + jax.lax.stop_gradient(scene.params["box"][1])
@@ -129,9 +129,9 @@ def test_a_wrong_rule_and_a_stopped_gradient_are_named() -> None:
 
     check = jms.check_gradients(off, spring(**BRAKED), names=FREE)
     assert verdicts(check) == {"m": "disagree"}
-    (remark,) = check.remarks
-    assert remark.startswith("m: both modes give -4.2")
-    assert "custom_jvp" in remark
+    (warning,) = check.warnings
+    assert warning.startswith("m: both modes give -4.2")
+    assert "custom_jvp" in warning
 
     def stopped(scene: jms.Scene, simulate: Any) -> Any:
         run = end(scene, simulate)
@@ -139,7 +139,7 @@ def test_a_wrong_rule_and_a_stopped_gradient_are_named() -> None:
 
     check = jms.check_gradients(stopped, spring(**BRAKED), names=["friction.Fs"])
     assert verdicts(check) == {"friction.Fs": "disagree"}
-    assert "cut off from the result" in check.remarks[0]
+    assert "cut off from the result" in check.warnings[0]
 
 
 def test_the_edge_of_another_number_of_half_cycles() -> None:
@@ -148,11 +148,11 @@ def test_the_edge_of_another_number_of_half_cycles() -> None:
     assert verdicts(check) == dict.fromkeys(("k", "x0", "friction.Fs"), "modes change")
     assert "backward slip to forward slip at t = 2.17992 in place of backward slip to stick" in str(check)
 
-    # Half a percent away the gradient is right, and a remark says how far it holds.
+    # Half a percent away the gradient is right, and a warning says how far it holds.
     check = jms.check_gradients(end, spring(**{**BRAKED, "x0": 1.005 * edge}), names=["x0"])
     assert check.ok
-    (remark,) = check.remarks
-    assert "1 % from here, the sequence of modes differs: change 1 of 'friction'" in remark
+    (warning,) = check.warnings
+    assert "1 % from here, the sequence of modes differs: change 1 of 'friction'" in warning
 
 
 def test_a_load_that_peaks_at_the_limit() -> None:
@@ -160,22 +160,22 @@ def test_a_load_that_peaks_at_the_limit() -> None:
     limit = BRAKED["Fs"]
     above = jms.check_gradients(end, spring(**{**BOX, "A": 1.02 * limit}), names=["A"])
     assert above.ok
-    assert "A: grazing suspected: the time of the event of 'friction' at t = 1.372" in above.remarks[0]
+    assert "A: grazing suspected: the time of the event of 'friction' at t = 1.372" in above.warnings[0]
 
     close = jms.check_gradients(end, spring(**{**BOX, "A": 1.0002 * limit}), names=["A", "m"])
     assert verdicts(close) == {"A": "grazing"}
-    assert "happen" in " ".join(close.remarks)
+    assert "happen" in " ".join(close.warnings)
 
     at = jms.check_gradients(end, spring(**{**BOX, "A": limit}), names=["A"])
     assert verdicts(at) == {"A": "modes change"}
 
     below = jms.check_gradients(end, spring(**{**BOX, "A": 0.995 * limit}), names=["A"])
     assert below.ok
-    assert "happens there only" in below.remarks[0]
+    assert "happens there only" in below.warnings[0]
 
     far = jms.check_gradients(end, spring(**{**BOX, "A": 2.0 * limit}), names=["A"])
     assert far.ok
-    assert not far.remarks
+    assert not far.warnings
 
 
 def test_kinks_and_ends_of_ranges() -> None:
@@ -184,13 +184,13 @@ def test_kinks_and_ends_of_ranges() -> None:
 
     check = jms.check_gradients(corner, spring(**BRAKED), names=["x0", "m"])
     assert verdicts(check) == {"x0": "kink"}
-    assert "-0.67" in check.remarks[0]
-    assert "1.32" in check.remarks[0]
+    assert "-0.67" in check.warnings[0]
+    assert "1.32" in check.warnings[0]
 
     check = jms.check_gradients(end, spring(**{**BRAKED, "Fs": BRAKED["Fc"]}), names=["friction.Fc", "friction.Fs"])
     assert check.ok, str(check)
-    assert "from below only" in " ".join(check.numbers["friction.Fc"].remarks)
-    assert "from above only" in " ".join(check.numbers["friction.Fs"].remarks)
+    assert "from below only" in " ".join(check.numbers["friction.Fc"].warnings)
+    assert "from above only" in " ".join(check.numbers["friction.Fs"].warnings)
     assert "must be finite and >= Fc" in str(check)
 
 
@@ -201,7 +201,7 @@ def test_traced_runs_are_not_recorded() -> None:
 
     check = jms.check_gradients(hidden, lugre_box(), names=["box[0]"])
     assert check.ok
-    assert "are not recorded" in check.remarks[-1]
+    assert "are not recorded" in check.warnings[-1]
 
 
 @jax.custom_vjp

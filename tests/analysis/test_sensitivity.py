@@ -58,7 +58,7 @@ def test_resting_place_and_time_of_a_braked_spring(mode: Any) -> None:
         relative = SPRING[short] * expected / np.abs([rest.t, rest.x])
         np.testing.assert_allclose(found.normalised[name], relative, atol=1e-8)
     assert not found.over_time
-    assert "mode changes" in found.remarks[0]
+    assert "mode changes" in found.warnings[0]
 
 
 @pytest.fixture(scope="module")
@@ -115,13 +115,13 @@ def test_many_parameters_and_one_output_run_in_reverse() -> None:
     assert len(plot.sensitivity_figure(found).axes) == 1
 
 
-def test_zeros_count_as_one_unit_with_a_remark() -> None:
+def test_zeros_count_as_one_unit_with_a_warning() -> None:
     scene = jms.Scene(free, params={"m": 2.0}, effects=(jms.Friction(jms.Viscous(0.5)),))
     found = jms.sensitivity(scene, "friction", ("qd0", "friction.Fv"), q0=[0.0], qd0=[0.0], t1=1.0, ts=[0.0, 1.0])
     assert set(found.derivatives) == {"qd0[0]", "friction.Fv"}
     np.testing.assert_allclose(found.normalised["qd0[0]"], 0.5 * np.exp([0.0, -0.25]), rtol=1e-5)
-    assert any("one unit: qd0[0]" in remark for remark in found.remarks)
-    assert any("observable is zero" in remark for remark in found.remarks)
+    assert any("one unit: qd0[0]" in warning for warning in found.warnings)
+    assert any("observable is zero" in warning for warning in found.warnings)
 
 
 def test_numerical_settings_of_laws_are_left_out() -> None:

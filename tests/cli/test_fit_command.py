@@ -123,8 +123,8 @@ def test_a_report_is_one_page_that_needs_nothing_else(fitted):
                  "90 % band", "Correlation", "likelihood"):  # fmt: skip
         assert text in page.text, text
     result = json.loads((out / "fit.json").read_text())
-    for remark in result["remarks"]:
-        assert remark in page.text
+    for warning in result["warnings"]:
+        assert warning in page.text
     for name in TRUTH:
         assert f"{result['parameters'][name]['value']:.5g}" in page.text
 
@@ -317,7 +317,7 @@ def test_a_fit_that_follows_nothing_says_so(volt):
     record, rough = record_of(FRAME, volt=volt), AxisEstimate(5.0, 8.0, 3.0, 0.7, 0.5)
     model = axis_models()["coulomb"]
     result = fit(axis_scene(model, rough), record, model.free, limits={"m": (0.0, 50.0)})
-    assert any("the model follows nothing of the record" in remark for remark in warnings_for(result))
+    assert any("the model follows nothing of the record" in warning for warning in warnings_for(result))
     assert str(result)
 
 
@@ -372,16 +372,16 @@ def check_refusal(run_command, out: Path, text: str, *command: str) -> None:
         (("--units", "force=mA"), "mA is a unit of current, .*as in --units force=12.5"),
         (("--units", "position=deg,force=N"), "'pos' is in deg and 'volt' in N, but a rotary axis needs"),
         (("--drop", "zero"), "no kind of sample 'zero'; the kind of samples are: nan, repeated"),
-        (("--max-steps", "0"), "--max-steps must be at least 1"),
-        (("--substeps", "0"), "--substeps must be at least 1"),
-        (("--starts", "0"), "--starts must be at least 1"),
-        (("--folds", "1"), "--folds must be at least 2"),
+        (("--max-steps", "0"), "--max-steps must be a positive integer"),
+        (("--substeps", "0"), "--substeps must be a positive integer"),
+        (("--starts", "0"), "--starts must be a positive integer"),
+        (("--folds", "1"), "--folds must be an integer >= 2"),
         (("--loss", "absolute"), "no name 'absolute'; the names are: squares, huber, cauchy"),
         (("--initializer", "stage"), "no name 'stage'; .* Did you mean 'staged'"),
         (("--time", "volt"), "times must increase, but column 'volt'"),
         (("--max-force", "3"), "--max-force belongs to --next"),
         (("--fix", "dry.width=1e-6"), "there is no parameter 'dry.width'; the parameters are: m, offset, dry.Fc"),
-        (("--next", "n.csv", "--duration", "-1"), "--duration must be finite and > 0"),
+        (("--next", "n.csv", "--duration", "-1"), "--duration must be one finite number > 0"),
         (("--held-out", "nowhere.csv"), "There is no file nowhere.csv"),
     ],
 )

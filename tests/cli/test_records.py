@@ -183,7 +183,7 @@ def test_dates_are_times(tmp_path):
         ("phi [deg]", "phi", np.pi / 180), ("phi (°)", "phi", np.pi / 180), ("phi_deg", "phi", np.pi / 180),
         ("x_mm", "x", 1e-3), ("t [µs]", "t", 1e-6), ("v_mm_s", "v", 1e-3), ("n [1/min]", "n", np.pi / 30),
         ("tau [N m]", "tau", 1.0), ("tau_Nm", "tau", 1.0), ("F [kN]", "F", 1e3), ("motor x [mm/s]", "motor x", 1e-3),
-        # No units: a measured q, the least force, a remark.
+        # No units: a measured q, the least force, a warning.
         ("q_m", "q_m", None), ("F_min", "F_min", None), ("x (raw)", "x (raw)", None), ("_s", "_s", None),
         ("", "", None),
     ],

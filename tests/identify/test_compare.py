@@ -63,8 +63,8 @@ def test_the_truth_is_named_and_what_has_more_parameters_is_not(comparison):
     # samples, 5 parameters and 8 numbers of start states; three standard errors of a root mean square of 1600 samples
     # are 5 %. What a twentieth of the samples shows of the starts is off by a part of the noise.
     assert by_name["stribeck"].start_fitted == pytest.approx(NOISE, rel=0.06)
-    assert by_name["stribeck"].start_fitted < by_name["stribeck"].held_back < 1.5 * NOISE
-    assert by_name["coulomb"].held_back > 10 * NOISE
+    assert by_name["stribeck"].start_fitted < by_name["stribeck"].held_out < 1.5 * NOISE
+    assert by_name["coulomb"].held_out > 10 * NOISE
     assert by_name["viscous"].over_the_best > by_name["viscous"].over_the_best_standard_error
 
 
@@ -115,7 +115,7 @@ def test_records_that_were_not_fitted_judge_open_loop():
     assert found.ranked[0].start_fitted == pytest.approx(NOISE, rel=0.06)
     best = found.ranked[0]
     assert best.start_fitted is not None
-    assert best.start_fitted < best.held_back < 1.5 * NOISE
+    assert best.start_fitted < best.held_out < 1.5 * NOISE
     assert found.ranked[0].parts.shape == (16,)
 
 
@@ -150,7 +150,7 @@ def test_wrong_questions_are_refused(options, text):
         compare(candidates(), _record(0, 1.0), **options)
 
 
-def test_laws_are_compared_by_blocks_that_were_held_back():
+def test_laws_are_compared_by_blocks_that_were_held_out():
     t = np.arange(0.0, 6.0, 5e-3)
     x = 3e-4 * np.sin(2 * np.pi * 0.7 * t) + 2e-4 * np.sin(2 * np.pi * 0.23 * t)
     truth = jms.Dahl(8e3, 0.4)
@@ -161,7 +161,7 @@ def test_laws_are_compared_by_blocks_that_were_held_back():
     found = compare_laws(laws, record, folds=3)
     assert found.simplest == "Dahl"
     by_name = {each.name: each for each in found.ranked}
-    assert by_name["Dahl"].held_back == pytest.approx(2e-3, rel=0.07)
+    assert by_name["Dahl"].held_out == pytest.approx(2e-3, rel=0.07)
     assert by_name["Dahl"].start_fitted is None  # a law by itself starts unloaded
     assert by_name["LuGre"].undetermined  # its Stribeck effect, of which there is nothing in the record
 
@@ -197,7 +197,7 @@ def test_what_determines_its_parameters_comes_first_among_those_that_are_as_good
 
 
 def test_a_level_that_varies_adds_the_same_to_all_and_uncertain_parameters_their_own(comparison):
-    added = {each.name: each.expected**2 - each.held_back**2 for each in comparison.ranked}
+    added = {each.name: each.expected**2 - each.held_out**2 for each in comparison.ranked}
     least = min(added.values())
     assert least > 0
     assert added["stribeck"] < 1.05 * least  # well determined: next to nothing but the level

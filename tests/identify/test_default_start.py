@@ -48,17 +48,17 @@ def test_intervals_hold_with_the_default_start(runs, kind):
     # The start is fitted, and no parameter that anyone asked for.
     assert set(results[0].values) == set(TRUTH)
     # Of 40 fits without an offset none is said to have one: the chance of one is 4 %.
-    assert not any("constant offset" in remark for each in results for remark in warnings_for(each))
+    assert not any("constant offset" in warning for each in results for warning in warnings_for(each))
 
 
-def test_an_offset_of_the_sensor_is_remarked(runs):
+def test_an_offset_of_the_sensor_causes_a_warning(runs):
     u, x = runs
     noise = 2e-4 * np.random.default_rng(1).standard_normal(x.shape)
     results = fits(u[:20], (x + noise + 5e-3)[:20])
-    said = [[remark for remark in warnings_for(each) if "constant offset of 0.00" in remark] for each in results]
+    said = [[warning for warning in warnings_for(each) if "constant offset of 0.00" in warning] for each in results]
     right = [bool(each) or all(held([result], name) for name in TRUTH)
              for each, result in zip(said, results, strict=True)]  # fmt: skip
-    # Without the remark a third of them would miss the truth in silence.
+    # Without the warning a third of them would miss the truth in silence.
     assert sum(right) >= 19
     assert sum(map(bool, said)) >= 15
 

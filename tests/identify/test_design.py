@@ -233,7 +233,7 @@ def test_the_seed_decides_and_a_prior_adds_what_is_known(design, fits):
     assert np.array_equal(first.best.force, same.best.force)
     assert [n for n, _ in seen] == [1, 2]
     assert np.isfinite([goal for _, goal in seen]).all()
-    assert any("more steps or another seed" in remark for remark in first.remarks)
+    assert any("more steps or another seed" in warning for warning in first.warnings)
     again = design_input(box(), MODEL.free, LIMITS, max_steps=1, seed=3, prior=fits[0], **OPTIONS)
     for name in design.values:
         assert again.best.errors[name] < fits[0].errors[name]
@@ -272,7 +272,7 @@ def test_what_cannot_be_learned_is_said_and_keeps_the_goal_finite(design):
     tiny = AxisLimits(force=40.0, speed=0.1, travel=1e-6)
     still = design_input(box(), MODEL.free, tiny, max_steps=1, **OPTIONS)
     assert np.isfinite(still.best.errors["friction.sigma0"])
-    text = " ".join(still.remarks)
+    text = " ".join(still.warnings)
     assert "Within force 40 N, speed 0.1 m/s, travel 1e-06 m, friction.vs is not determined" in text
     assert "What limits it: travel." in text
     assert still.best.errors["friction.Fs"] > 1e3 * design.best.errors["friction.Fs"]
@@ -334,7 +334,7 @@ def test_wrong_limits_are_refused(limits, text):
         ({"free": ("u",)}, "u is the input"),
         ({"input_name": "force"}, r"'force' must be a single number in the scene's params \(m, offset, u\)"),
         ({"input_name": "m", "free": ("offset",)}, "does not move the first coordinate"),
-        ({"duration": -1.0}, "duration must be one finite number > 0"),
+        ({"duration": -1.0}, r"duration \[s\] must be one finite number > 0"),
         ({"noise": 0.0}, "noise must be one finite number > 0"),
         ({"harmonics": 0}, "harmonics must be a positive integer"),
         ({"harmonics": 100}, "6 samples in a period of the fastest, but 20 are needed"),

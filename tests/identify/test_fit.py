@@ -125,7 +125,7 @@ def test_a_parameter_without_effect_is_reported_and_not_given_an_error_of_zero(c
         result._repr_html_()
     )
     assert np.isinf(result.errors["Fs"])
-    assert any("Fs is not seen" in remark for remark in warnings_for(result))
+    assert any("Fs is not seen" in warning for warning in warnings_for(result))
     assert result.values["Fc"] == pytest.approx(1.0, rel=1e-3)
 
 
@@ -293,14 +293,14 @@ def test_lower_limits_tighten_declared_ranges(clean):
     assert result.values["friction.Fc"] >= 2.0
 
 
-def test_a_step_too_long_for_the_friction_is_remarked(clean):
+def test_a_step_too_long_for_the_friction_is_warned(clean):
     t, u, q = clean
     coarse = jms.Record(t[::10], q[::10], {"u": u[::10]})
     start = replace_numbers(sprung(), {"friction.width": jnp.asarray(1e-3)})
     result = jms.fit(start, coarse, ("friction.Fc",), q0=[0.0])
     assert result.diagnostics.step_error is not None
     assert result.diagnostics.step_error > 0.1 * result.rmse
-    assert any("Raise substeps" in remark for remark in warnings_for(result))
+    assert any("Raise substeps" in warning for warning in warnings_for(result))
 
 
 @pytest.mark.parametrize(
@@ -338,7 +338,7 @@ def test_ctrl_c_keeps_the_best_so_far(clean):
     result = jms.fit(sprung(1.0, 0.5, 1.5), noisy(clean, 0), tuple(TRUTH), q0=[0.0], progress=impatient)
     assert result.diagnostics.ending.startswith("interrupted")
     assert result.diagnostics.evaluations == 4
-    assert any("interrupted" in remark for remark in warnings_for(result))
+    assert any("interrupted" in warning for warning in warnings_for(result))
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,7 @@ def same_result(a: FitResult, b: FitResult) -> bool:
 
 
 def work() -> WorkPrecision:
-    row = Row("Rodas5P", 1e-6, None, "float64", "", 1e-7, remarks=("none",))
+    row = Row("Rodas5P", 1e-6, None, "float64", "", 1e-7, warnings=("none",))
     return WorkPrecision(
         "box", "q[0]", "m", "at the end", 1.0, "two solvers", 1e-12, 0.0, 0.0, ("run",), 64, (row,), {"cpu": "x"}
     )

@@ -111,7 +111,7 @@ def test_measured_records_left_out_are_predicted_better_than_by_published_parame
     assert fit.left_out_error < 0.036  # the published M6 at these gains
     at_100 = [group[name] for group in fit.left_out.values() for name in group if name.startswith("kp100")]
     assert np.mean(at_100) < 0.0185
-    assert any("kt and R" in line for line in fit.undetermined)
+    assert any("kt and R" in line for line in fit.warnings)
 
 
 def test_supply_of_pulses_is_found_among_aliased_samples() -> None:

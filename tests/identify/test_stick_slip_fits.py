@@ -52,7 +52,7 @@ def test_an_axis_that_stands_still_is_found_within_its_intervals():
         assert low < TRUTH.get(name, 0.0) < high, name
     assert result.errors["dry.Fc"] < 1e-4
     assert result.rmse == pytest.approx(NOISE, rel=0.05)
-    assert not any("sample to sample" in remark for remark in warnings_for(result))
+    assert not any("sample to sample" in warning for warning in warnings_for(result))
 
 
 def test_a_small_constant_force_is_determined_if_its_error_is_small_beside_the_forces():
@@ -62,13 +62,13 @@ def test_a_small_constant_force_is_determined_if_its_error_is_small_beside_the_f
     result = jms.fit(axis(jms.Coulomb(4.01)), record, tuple(TRUTH))
     assert result.errors["offset"] > 0.5 * abs(result.values["offset"])
     assert result.errors["offset"] < 0.01
-    assert not any("determine" in remark or "offset" in remark for remark in warnings_for(result))
+    assert not any("determine" in warning or "offset" in warning for warning in warnings_for(result))
 
 
 def test_a_residual_above_the_noise_is_said(record):
     smooth = jms.fit(axis(jms.Regularized(jms.Coulomb(4.01), 5e-4)), record, tuple(TRUTH), substeps=8)
     assert smooth.rmse > 5 * NOISE
-    assert any("is above the noise from sample to sample, 1.9e-06" in remark for remark in warnings_for(smooth))
+    assert any("is above the noise from sample to sample, 1.9e-06" in warning for warning in warnings_for(smooth))
 
 
 @pytest.mark.parametrize(
@@ -102,8 +102,8 @@ def test_standard_errors_of_derivatives_that_do_not_hold_are_refused(width):
     result = jms.fit(axis(jms.Regularized(jms.Coulomb(4.01), width)), record, tuple(TRUTH), max_steps=20)
     assert set(result.errors.values()) == {np.inf}
     said = warnings_for(result)
-    assert any(remark.startswith("Standard errors are refused") for remark in said)
-    assert not any("no effect" in remark or "told apart" in remark for remark in said)
+    assert any(warning.startswith("Standard errors are refused") for warning in said)
+    assert not any("no effect" in warning or "told apart" in warning for warning in said)
 
 
 def test_a_residual_of_nothing_but_rounding_gives_no_standard_errors():

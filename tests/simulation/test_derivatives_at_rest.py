@@ -315,11 +315,11 @@ def test_the_cause_of_derivatives_that_disagree_is_named() -> None:
 
     check = check_gradients(end, MASS, names=["m"])
     assert check.numbers["m"].verdict == "disagree"
-    assert any("adjoint=DirectAdjoint" in remark and "Omit adjoint" in remark for remark in check.remarks)
+    assert any("adjoint=DirectAdjoint" in warning and "Omit adjoint" in warning for warning in check.warnings)
 
 
 @pytest.mark.parametrize("name", ["Tsit5", "Rodas5P"])
-def test_fixed_steps_that_are_too_long_are_remarked_on(name: str, caplog: Any) -> None:
+def test_fixed_steps_that_are_too_long_are_warned_on(name: str, caplog: Any) -> None:
     """The fastest rate is 20 1/s: 0.05 s is right, 0.2 s is too long for explicit steps."""
     exact = slopes_at_rest(1.0, 400.0, 4.0, 10.0)[0]
 

@@ -161,7 +161,7 @@ def design_input(
     - `ValueError` for names that are unknown, a scene that has several coordinates or needs events, an input that is
       not in the scene or does not move it, or limits that allow no motion.
     """
-    duration, dt = as_float(duration, name="duration", lower=0.0), as_float(dt, name="dt", lower=0.0)
+    duration, dt = as_float(duration, name="duration [s]", lower=0.0), as_float(dt, name="dt [s]", lower=0.0)
     noise = as_float(noise, name="noise", lower=0.0)
     uncertainty = as_float(uncertainty, name="uncertainty", lower=0.0)
     harmonics, max_steps = as_whole(harmonics, name="harmonics"), as_whole(max_steps, name="max_steps")

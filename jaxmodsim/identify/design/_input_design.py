@@ -158,41 +158,41 @@ class InputDesign(AbstractReadable):
         return {name: float(peaks[name]) / value for name, (value, _) in self.limits.active.items()}
 
     @property
-    def remarks(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """Limitations of the design, in words."""
-        remarks = []
+        warnings = []
         where = f"Within {self.limits}"
         for name, value in self.values.items():
             share = self.best.errors[name] / abs(value) if value else 0.0
             if not np.isfinite(self.best.errors[name]):
-                remarks.append(f"{where}, {name} has no effect on the record.")
+                warnings.append(f"{where}, {name} has no effect on the record.")
             elif share > _VAGUE:
-                remarks.append(
+                warnings.append(
                     f"{where}, {name} is not determined: its standard error would be {100 * share:.0f} % of its value."
                 )
         names = list(self.values)
         for i, first in enumerate(names):
             for j in range(i):
                 if abs(self.best.correlation[i, j]) > _ALIKE:
-                    remarks.append(
+                    warnings.append(
                         f"{where}, {names[j]} and {first} can hardly be told apart (correlation"
                         f" {self.best.correlation[i, j]:+.3f})."
                     )
         full = [name for name, share in self.used.items() if share > _REACHED]
         if full:
-            remarks.append(f"What limits it: {' and '.join(full)}.")
+            warnings.append(f"What limits it: {' and '.join(full)}.")
         off = float(np.max(np.abs(self.best.q - self.best.q_ref)))
         reach = float(np.max(np.abs(self.best.q_ref - self.best.q_ref[0])))
         if off > _OFF * reach:
-            remarks.append(
+            warnings.append(
                 f"The force alone does not keep the model on its reference: it is off by up to {off:.2g} m."
                 " Control position and velocity of the axis, or choose a shorter dt."
             )
         if self.ending != "converged":
-            remarks.append(f"The search {self.ending}: more steps or another seed may find a better input.")
+            warnings.append(f"The search {self.ending}: more steps or another seed may find a better input.")
         if self.single_precision:
-            remarks.append("Computed in single precision: enable jax_enable_x64 for reliable numbers.")
-        return tuple(remarks)
+            warnings.append("Computed in single precision: enable jax_enable_x64 for reliable numbers.")
+        return tuple(warnings)
 
     def rows(self) -> list[tuple[str, float, float, float, str]]:
         """Rows of a table: name, value, predicted standard error, that of the best sine, unit."""
@@ -216,7 +216,7 @@ class InputDesign(AbstractReadable):
                 },
                 "information": {"names": list(self.values), "matrix": self.best.information.tolist()},
                 "ending": self.ending,
-                "remarks": list(self.remarks),
+                "warnings": list(self.warnings),
             }
         )
 
@@ -245,7 +245,7 @@ def _(design: InputDesign) -> Table:
     head = ("parameter", "value", "standard error", "in %", "of a plain sine", "unit")
     used = ", ".join(f"{name} {100 * share:.0f} %" for name, share in design.used.items())
     title = f"{len(best.t)} samples, {best.t[-1] - best.t[0]:g} s, noise {design.noise:g}; used: {used}"
-    return Table(title, head, rows, design.remarks)
+    return Table(title, head, rows, design.warnings)
 
 
 class DrivenAxis(eqx.Module):

@@ -28,7 +28,7 @@ from ..model._parameters import split_entries
 from ..uncertainty._fit import fit_law, fit_scene
 from ..uncertainty._result import FitResult
 from ._comparison import Comparison, CrossValidated, Part, comparison_of
-from ._prediction import after, begin, check_lengths, sample_counts, shown_starts
+from ._evaluation import after, begin, check_lengths, sample_counts, shown_starts
 
 # Called after each iteration with the name of the model, the number of the held-out fold (None: the fit to everything),
 # the number of the iteration and the root mean square of the residual.
@@ -205,7 +205,7 @@ def compare_laws(
         block = _blocks(problem.runs, folds)
         for fold in range(folds):
             options = SearchOptions(_ENOUGH, max_steps, _progress_of(report, name, fold))
-            held += _held_back(problem, search.state.x, result, block == fold, block, options)[0]
+            held += _held_out(problem, search.state.x, result, block == fold, block, options)[0]
         return CrossValidated(result, tuple(held), ())
 
     sizes = {name: len(ranges_of(candidate.scene)) for name, candidate in candidates.items()}
@@ -325,12 +325,12 @@ def _validate_scene(
     pinned = problem.pinned(x, result.estimate.information)
     tied = shown_starts(problem, _finished(begin(pinned, x, search_options(None))))
     everything = _finished(solve(tied, x, search_options(None)))
-    parts = [_held_back(tied, everything.state.x, result, block == k, block, search_options(k)) for k in range(folds)]
+    parts = [_held_out(tied, everything.state.x, result, block == k, block, search_options(k)) for k in range(folds)]
     held, fitted = zip(*parts, strict=True)
     return CrossValidated(result, sum(held, ()), sum(fitted, ()))
 
 
-def _held_back(
+def _held_out(
     problem: FitProblem,
     x: Float[Array, " n"],
     result: FitResult,

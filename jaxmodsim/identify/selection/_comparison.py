@@ -75,13 +75,13 @@ class Ranked:
     """One model of a comparison.
 
     - `name`, `description`: of the model. `parameters`: number of all fitted numbers, initial states included.
-    - `held_back`, `standard_error`: root mean square held-out error, and its standard error; only the start of each
+    - `held_out`, `standard_error`: root mean square held-out error, and its standard error; only the start of each
       part was fitted, to its first samples. `start_fitted`: the error with starts fitted to all of each part; None for
       laws, which have none.
     - `parts`: the root mean square errors of the held-out parts, shape `[parts]`.
-    - `expected`: root mean square error to expect on a new record. Its square is that of `held_back`, plus the
+    - `expected`: root mean square error to expect on a new record. Its square is that of `held_out`, plus the
       variances that uncertain parameters add over whole records and that a varying friction level adds. With held-out
-      records, which show these, it is `held_back`.
+      records, which show these, it is `held_out`.
     - `over_the_best`, `over_the_best_standard_error`: `expected` less that of the best model, and the standard error of
       this difference, from the differences in each part.
     - `fitted`: root mean square error of the fit to everything.
@@ -93,7 +93,7 @@ class Ranked:
     name: str
     description: str
     parameters: int
-    held_back: float
+    held_out: float
     standard_error: float
     parts: Float[np.ndarray, " parts"]
     expected: float
@@ -183,7 +183,7 @@ class Comparison(AbstractReadable):
             for each in self.ranked
             if each is best
             or (
-                each.held_back <= _AS_GOOD * best.held_back
+                each.held_out <= _AS_GOOD * best.held_out
                 and (each.over_the_best <= each.over_the_best_standard_error or bool(best.undetermined))
             )
         ]
@@ -208,9 +208,9 @@ class Comparison(AbstractReadable):
         best, simple = self._of(self.best), self._of(self.simplest)
         text = (
             f"The simplest sufficient law is {simple.name}{f' ({simple.description})' if simple.description else ''}:"
-            f" {simple.parameters} parameters, held-out error {simple.held_back:.4g}"
+            f" {simple.parameters} parameters, held-out error {simple.held_out:.4g}"
         )
-        if simple.expected > simple.held_back:
+        if simple.expected > simple.held_out:
             text += f", {simple.expected:.4g} to expect on a new record"
         simpler = [each for each in self.ranked if each.parameters < best.parameters]
         if simple is not best:
@@ -238,7 +238,7 @@ class Comparison(AbstractReadable):
         """Everything except samples and models, in types of JSON; numbers that are not finite are None."""
         return jsonable(
             {
-                "held_back": self.by,
+                "held_out": self.by,
                 "samples": self.samples,
                 "effective_samples": self.effective,
                 "models": self.table,
@@ -259,7 +259,7 @@ def _(comparison: Comparison) -> Table:
         over = f"{each.over_the_best:.3g} +- {each.over_the_best_standard_error:.2g}"
         start_fitted = "" if each.start_fitted is None else f"{each.start_fitted:.4g}"
         over = "" if each is comparison.ranked[0] else over
-        numbers = f"{each.held_back:.4g}", f"{each.standard_error:.2g}", f"{each.expected:.4g}", over, start_fitted
+        numbers = f"{each.held_out:.4g}", f"{each.standard_error:.2g}", f"{each.expected:.4g}", over, start_fitted
         criteria = f"{each.fitted:.4g}", f"{each.takeuchi:.1f}", f"{each.bic:.1f}"
         rows.append((each.name, str(each.parameters), *numbers, *criteria))
         if each.undetermined:
@@ -317,8 +317,8 @@ def comparison_of(
     bic = {name: d[name] * effective / samples + size[name] * np.log(effective) for name in kept}
     ranked = []
     for name in order:
-        held_back, root, least = (float(np.sqrt(x)) for x in (means[name], expected[name], expected[best]))
-        error = _standard_error(losses[name], count) / (2 * held_back) if held_back > 0 else 0.0
+        held_out, root, least = (float(np.sqrt(x)) for x in (means[name], expected[name], expected[best]))
+        error = _standard_error(losses[name], count) / (2 * held_out) if held_out > 0 else 0.0
         difference = _standard_error(losses[name] - losses[best], count)
         difference = difference / (root + least) if root + least else 0.0
         starts = kept[name].start_fitted
@@ -332,7 +332,7 @@ def comparison_of(
                 name=name,
                 description=descriptions.get(name, ""),
                 parameters=size[name],
-                held_back=held_back,
+                held_out=held_out,
                 standard_error=error,
                 parts=np.sqrt(losses[name]),
                 expected=root,

@@ -1,323 +1,22 @@
-"""A fitted model on a record that it was not fitted to: its error, a prediction band, and the error to expect."""
+"""A prediction band on a new record, and the error to expect there."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple, TypeAlias
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 from scipy import special  # scipy.stats takes most of a second to import
 
 from ..._core.arguments import as_share
-from ..._core.arrays import on_device
-from ...scene import Scene, State
-from ..data._record import Record, Runs, cut, runs_of
-from ..data._signals import sample_noise
-from ..estimate._prepare import measured_start
-from ..estimate._problem import FitProblem, Prior, SquaredLoss
-from ..estimate._search import SearchOptions, SearchResult, SearchState, channels_seen, solve, start_search, step
-from ..model._engines import DELAY, EventEngine, ReplayEngine, with_values
-from ..model._parameters import FreeParameters
+from ..data._record import Record
+from ..estimate._search import SearchOptions, SearchResult, channels_seen, start_search, step
+from ..model._engines import DELAY, with_values
 from ..uncertainty._result import FitResult
 from ._agreement import VARIATION, RecordAgreement, change_between, covariances, mean_variances, output_changes
 from ._comparison import penalty
-
-_Start: TypeAlias = ArrayLike | Sequence[ArrayLike] | None
-# The first samples that show the state at the start: at least _LEAST, and as many as give the velocity with an error of
-# _ERROR times the speed of the record; at most the share _MOST of the samples (or _LEAST), and at most half of them.
-_LEAST, _ERROR, _MOST = 20, 0.002, 0.05
-# Standard error of the slope at the start of a parabola through n samples, in noise levels over n^1.5 intervals.
-_SLOPE = 192.0**0.5
-# Largest inverse standard deviation of a start that the first samples show, and the least noise.
-_STIFF, _TINY = 1e6, float(np.finfo(float).tiny)
-# Standard errors beyond which a fitted start contradicts the first samples.
-_FAR = 3.0
-
-
-def sample_counts(runs: Runs) -> Int[np.ndarray, "runs 1"]:
-    """Number of the samples of each run that count in any channel."""
-    return np.sum(np.any([np.asarray(x) > 0 for x in runs.weight.values()], axis=0), axis=1, keepdims=True)
-
-
-def opening(runs: Runs) -> Bool[np.ndarray, "runs samples"]:
-    """The first samples of each run: as few as show where it starts.
-
-    The more samples a start is fitted to, the more of the model's error it takes up.
-    """
-    count = sample_counts(runs)
-    needed = np.full(count.shape, np.inf)
-    for x in runs.measured.values():
-        far = np.asarray(x)[:, _LEAST:] - np.asarray(x)[:, :-_LEAST]
-        speed = np.sqrt(np.mean(far**2, axis=1, keepdims=True)) / _LEAST if far.size else np.zeros(count.shape)
-        noise = np.array([[sample_noise(row)] for row in np.asarray(x)])
-        own = (_SLOPE * noise / np.maximum(_ERROR * speed, _TINY)) ** (2 / 3)
-        needed = np.minimum(needed, np.where(speed > 0, own, np.inf))
-    most = np.maximum(np.ceil(_MOST * count), _LEAST)
-    return np.arange(runs.t.shape[1]) < np.minimum(np.clip(np.ceil(needed), _LEAST, most), count // 2)
-
-
-def check_lengths(records: Iterable[Record], numbers: int) -> None:
-    """Refuse records, or parts of them, half of which cannot show this many numbers of a state.
-
-    **Raises:**
-
-    - `ValueError` naming the record.
-    """
-    for record in records:
-        if len(record.t) // 2 <= numbers:
-            raise ValueError(
-                f"{record.name} has {len(record.t)} samples, too few to show the {numbers} numbers of its start and to"
-                f" judge the model by the others: {2 * numbers + 2} are needed. Take a longer record, or fewer folds."
-            )
-
-
-def begin(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> SearchResult:
-    """Fit the states at the first samples to the opening alone; all parameters must be pinned."""
-    return solve(problem.counting(opening(problem.runs), slips=False), x, options)
-
-
-def shown_starts(problem: FitProblem, begun: SearchResult) -> FitProblem:
-    """The problem with initial states tied to those that `begin` returned, within their standard errors.
-
-    The errors are those of the noise from sample to sample in the first channel. The residual of the model is larger:
-    a start with errors of that size would take up the model's error.
-    """
-    runs, local = problem.count, len(problem.local)
-    name = next(iter(problem.known))
-    own = np.asarray(begun.state.jacobian, float)[:, len(problem.free.names) :]
-    measured, noise = np.asarray(problem.runs.measured[name]), float(problem.noise[name])
-    counts = np.asarray(problem.runs.weight[name]) > 0
-    weights = np.zeros((runs, local))
-    for run in range(runs):
-        errors = start_errors_of(own[:, run * local : (run + 1) * local])
-        level = max(sample_noise(measured[run][counts[run]]), _TINY)
-        weights[run] = noise**2 / np.maximum(errors * level, noise / _STIFF)
-    known = {name: on_device(weights)}
-    return eqx.tree_at(lambda p: (p.base, p.known), problem, (problem.starts(begun.state.x), known))
-
-
-def start_errors_of(jacobian: Float[np.ndarray, "rows local"]) -> Float[np.ndarray, " local"]:
-    """Standard errors of a start from the Jacobian of its residual; infinite for numbers without effect."""
-    size = np.linalg.norm(jacobian, axis=0)
-    scaled = jacobian / np.where(size > 0, size, 1.0)
-    error = np.sqrt(np.diag(np.linalg.pinv(scaled.T @ scaled, rcond=1e-12, hermitian=True)))
-    return np.where(size > 0, error / np.where(size > 0, size, 1.0), np.inf)
-
-
-def after(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> tuple[FitProblem, SearchState]:
-    """The problem without the opening, and its residual at `x`."""
-    rest = problem.counting(~opening(problem.runs))
-    # The first step of a search only evaluates x.
-    return rest, step(rest, start_search(x, rest.rows), on_device(np.asarray(options.rtol, x.dtype)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Score:
-    """The error of a fitted model on a record.
-
-    - `record`: the record. `outputs`: the model's output at its times, by channel.
-    - `rmse`: root mean square of output less measured value, by channel, in its unit, without the opening.
-    - `fit`: `100 (1 - rmse/standard deviation of the channel)` [%], by channel: 100 is perfect, 0 no better than the
-      mean.
-    - `q0`, `qd0`: coordinates and velocities at the first sample, shape `[dof]`; None for a law by itself.
-    - `opening`: number of the first samples that the start was fitted to; 0 for a known start.
-    - `start_fitted`: the same samples with a start fitted to the whole record; None for a law by itself.
-    """
-
-    record: Record
-    outputs: dict[str, Float[np.ndarray, " samples"]]
-    rmse: dict[str, float]
-    fit: dict[str, float]
-    q0: Float[np.ndarray, " dof"] | None
-    qd0: Float[np.ndarray, " dof"] | None
-    opening: int = 0
-    start_fitted: "StartFitted | None" = None
-
-    @property
-    def residuals(self) -> dict[str, Float[np.ndarray, " samples"]]:
-        """Output less measured value by channel."""
-        return {name: x - self.record.channels[name] for name, x in self.outputs.items()}
-
-    def __str__(self) -> str:
-        """A line for each channel."""
-        lines = [f"{self.record.name}{f', started from its first {self.opening} samples' if self.opening else ''}:"]
-        lines += [f"  {name}: RMSE {x:.6g}, fit {self.fit[name]:.2f} %" for name, x in self.rmse.items()]
-        fitted = {} if self.start_fitted is None else self.start_fitted.rmse
-        lines += [f"  {name}: RMSE {x:.6g} with a start fitted to all of it" for name, x in fitted.items()]
-        return "\n".join(lines + [f"  {each}" for each in self.remarks])
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """Numbers of the fitted start that the first samples contradict: they have taken up an error of the model."""
-        away = {} if self.start_fitted is None else self.start_fitted.away
-        return tuple(
-            f"Fitted to all of {self.record.name}, {name} moves by {abs(x):.3g} standard errors from what its first"
-            " samples show: the start takes up an error of the model."
-            for name, x in away.items()
-            if abs(x) > _FAR
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class StartFitted:
-    """A record with the state at its first sample fitted to all of its samples.
-
-    - `rmse`: by channel, as in `Score`. `q0`, `qd0`: the state, shape `[dof]`. `ending`: how the search ended.
-    - `away`: distance of each number of the state, such as `q0[0]`, from the value that the first samples show, in
-      standard errors of that value; without the numbers that they do not show.
-    """
-
-    rmse: dict[str, float]
-    q0: Float[np.ndarray, " dof"]
-    qd0: Float[np.ndarray, " dof"]
-    away: dict[str, float]
-    ending: str
-
-
-def evaluate_on(result: FitResult, record: Record, *, q0: _Start = None, qd0: _Start = None) -> Score:
-    """Run a fitted model on another record; only the start is fitted.
-
-    The start is fitted to the first samples: 20, or as many more as show the velocity to 0.2 % of the speed of the
-    record, at most a twentieth of all samples. These samples do not count in the error. `start_fitted` has the error
-    with a start fitted to all samples, which is smaller because that start takes up part of the model's error.
-
-    **Arguments:**
-
-    - `result`: a fit that was not loaded from a file.
-    - `record`: with the inputs, and some of the channels, of the fitted records. Preferably a part of the measurement
-      that was held out of the fit.
-    - `q0`, `qd0`: state at the first sample, shape `[dof]`, if it is known: both or none. All samples count then.
-      A law by itself always starts unloaded at rest.
-
-    **Returns:**
-
-    A `Score`.
-
-    **Raises:**
-
-    - `ValueError` for channels or inputs that the fit does not know, a record that is too short, or a loaded result.
-    - `RuntimeError` if the model's output is not finite.
-    """
-    return _score(_run_on(result, record, q0, qd0))
-
-
-class _RecordRun(NamedTuple):
-    """A fitted model on one record.
-
-    - `problem`: the record with only the state at its first sample free; for a law by itself, its parameters.
-    - `x`: where that is known. `errors`: standard errors of the free numbers of the state, infinite if they are known.
-    - `counts`: the samples that did not show the start.
-    """
-
-    record: Record
-    problem: FitProblem
-    x: Float[Array, " n"]
-    errors: Float[np.ndarray, " local"]
-    counts: Bool[np.ndarray, " samples"]
-
-
-def _run_on(result: FitResult, record: Record, q0: _Start, qd0: _Start) -> _RecordRun:
-    """The model on the record, from the given start or from the one that the first samples show."""
-    search = result.search_for("An evaluation")
-    known = search.problem.runs
-    unknown = [name for name in record.channels if name not in known.measured]
-    if unknown:
-        raise ValueError(
-            f"{record.name} has the channel {unknown[0]!r}, but the fit observed: {', '.join(known.measured)}."
-        )
-    if set(record.inputs) != set(known.inputs):
-        raise ValueError(
-            f"{record.name} has the inputs {', '.join(record.inputs) or 'none'}, but the model was fitted with:"
-            f" {', '.join(known.inputs) or 'none'}."
-        )
-    if (q0 is None) != (qd0 is None):
-        raise ValueError("A start has positions and velocities: give q0 and qd0, or neither.")
-    problem = _record_problem(result, record, {"q0": q0, "qd0": qd0})
-    counts, local = np.ones(len(record.t), bool), len(problem.local)
-    if not local:
-        return _RecordRun(record, problem, search.state.x, np.zeros(0), counts)
-    if q0 is not None:
-        return _RecordRun(record, problem, problem.x0, np.full(local, np.inf), counts)
-    check_lengths((record,), local)
-    begun = begin(problem, problem.x0, SearchOptions()).state
-    counts = ~opening(problem.runs)[0]
-    return _RecordRun(record, problem, begun.x, start_errors_of(np.asarray(begun.jacobian)), counts)
-
-
-def _record_problem(result: FitResult, record: Record, start: Mapping[str, _Start]) -> FitProblem:
-    """The fitted model with only the initial state free; for a law by itself, which has none, the parameters."""
-    # Slip instants are no channel of a score.
-    bare = Record(record.t, record.channels, record.inputs, record.name, linear=record.linear)
-    fitted, runs = result.search_for("An evaluation").problem, runs_of((bare,), cut((bare,), None))
-    engine, first = fitted.engine, fitted.base
-    if not isinstance(engine, ReplayEngine | EventEngine):
-        return dataclasses.replace(fitted, runs=runs)
-    scene = result.model
-    assert isinstance(scene, Scene)
-    assert isinstance(first, State)
-    late = {name: jnp.asarray(x) for name, x in result.values.items() if name.startswith(DELAY)}
-    observables = tuple((name, x) for name, x in engine.observables if name in record.channels)
-    engine = dataclasses.replace(
-        engine, model=scene, delays={**engine.delays, **late}, observables=observables, linear=record.linear
-    )
-    if isinstance(engine, EventEngine):
-        engine = dataclasses.replace(engine, slips=())
-    dof = first.q.shape[-1]
-    states = []
-    for (name, known), measured in zip(start.items(), measured_start(record, observables, dof), strict=True):
-        array = measured if known is None else np.asarray(known, float)
-        if array.shape != (dof,) or not np.isfinite(array).all():
-            raise ValueError(f"{name} must be finite and of the shape {(dof,)}, but it is {known!r}.")
-        states.append(jnp.asarray(array, float)[None])
-    q, qd = states
-    return FitProblem(
-        engine,
-        FreeParameters.none(),
-        tuple(f"{x}[{i}]" for x in start for i in range(dof)),
-        State(q, qd, jax.tree.map(lambda x: jnp.asarray(x)[None], scene.initial_state(q[0]))),
-        runs,
-        {name: fitted.noise[name] for name in record.channels},
-        SquaredLoss(),
-        Prior.of({}, ()),
-    )
-
-
-def _score(run: _RecordRun) -> Score:
-    """The error with the start of the run, beside that with a start fitted to all samples."""
-    score, problem = _score_at(run, run.x), run.problem
-    if not problem.local:
-        return score
-    best = solve(problem, run.x, SearchOptions())
-    fitted = _score_at(run, best.state.x)
-    assert fitted.q0 is not None
-    assert fitted.qd0 is not None
-    moved = np.asarray(best.state.x - run.x)
-    away = {name: float(d / e) for name, d, e in zip(problem.local, moved, run.errors, strict=True) if np.isfinite(e)}
-    start = StartFitted(rmse=fitted.rmse, q0=fitted.q0, qd0=fitted.qd0, away=away, ending=best.ending)
-    return dataclasses.replace(score, opening=int(np.sum(~run.counts)), start_fitted=start)
-
-
-def _score_at(run: _RecordRun, x: Float[Array, " n"]) -> Score:
-    record, start, seen = run.record, run.problem.starts(x), channels_seen(run.problem, x)
-    outputs = {name: np.asarray(seen[name], float)[0] for name in record.channels}
-    rmse, fit = {}, {}
-    for name, output in outputs.items():
-        measured = record.channels[name]
-        rmse[name] = _rms((output - measured)[run.counts])
-        if not np.isfinite(rmse[name]):
-            raise RuntimeError(
-                f"{record.name}: the model gives values of {name} that are not finite. Check the units and the"
-                " start of the record, or fit with more substeps."
-            )
-        scatter = float(np.std(measured))
-        fit[name] = 100 * (1 - rmse[name] / scatter) if scatter else float("nan")
-    q0, qd0 = (None, None) if start is None else (np.asarray(start.q[0]), np.asarray(start.qd[0]))
-    return Score(record=record, outputs=outputs, rmse=rmse, fit=fit, q0=q0, qd0=qd0)
+from ._evaluation import RecordRun, RecordStart, Score, rms, run_on, score_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -394,13 +93,13 @@ class RecordPrediction:
         for name, share in self.shares.items():
             half = 0.5 * (self.upper[name] - self.lower[name])[self.counts]
             causes = ", ".join(
-                f"{cause} {_rms(deviation[name][self.counts]):.3g}"
+                f"{cause} {rms(deviation[name][self.counts]):.3g}"
                 for cause, deviation in (("model", self.model), ("parameters", self.parameters),
                                          ("change between records", self.between))
             )  # fmt: skip
             lines.append(
                 f"  {name}: {100 * share:.0f} % of the samples within the {100 * self.level:g} % band of"
-                f" +-{_rms(half):.3g} (standard deviations: {causes})"
+                f" +-{rms(half):.3g} (standard deviations: {causes})"
             )
         return "\n".join([*lines, f"  with {self.assumption}"])
 
@@ -416,8 +115,8 @@ def predict(
     result: FitResult,
     record: Record,
     *,
-    q0: _Start = None,
-    qd0: _Start = None,
+    q0: RecordStart = None,
+    qd0: RecordStart = None,
     level: float = 0.9,
     variation: float = VARIATION,
     agreement: RecordAgreement | None = None,
@@ -455,8 +154,8 @@ def predict(
     level = as_share(level, name="level")
     search = result.search_for("A prediction")
     own, between = covariances(result, variation, agreement)
-    run = _run_on(result, record, q0, qd0)
-    score, noise, channels = _score(run), search.problem.noise, sorted(record.channels)
+    run = run_on(result, record, q0, qd0)
+    score, noise, channels = score_of(run), search.problem.noise, sorted(record.channels)
     by_start, back = _start(run, np.tile(~run.counts, len(channels)))
 
     def deviations(covariance: np.ndarray, beside: np.ndarray) -> dict[str, np.ndarray]:
@@ -529,7 +228,7 @@ def _model_excess(search: SearchResult) -> dict[str, float]:
 
 
 def _start(
-    run: _RecordRun, shown: Bool[np.ndarray, " rows"]
+    run: RecordRun, shown: Bool[np.ndarray, " rows"]
 ) -> tuple[Float[np.ndarray, "rows local"], Float[np.ndarray, "local rows"]]:
     """Derivatives of the output by the start, and of a start that is fitted to the rows `shown`, in noise levels."""
     if not shown.any():
@@ -540,7 +239,7 @@ def _start(
     return jacobian, np.linalg.pinv(np.where(shown[:, None], jacobian, 0.0), rcond=1e-10)
 
 
-def _output(run: _RecordRun, search: SearchResult, x: Float[Array, " free"]) -> dict[str, Array]:
+def _output(run: RecordRun, search: SearchResult, x: Float[Array, " free"]) -> dict[str, Array]:
     """Output of the record with other parameters; only arrays differ, so nothing compiles again."""
     problem = run.problem
     if not problem.local:
@@ -549,7 +248,3 @@ def _output(run: _RecordRun, search: SearchResult, x: Float[Array, " free"]) -> 
     late = {name: value for name, value in values.items() if name.startswith(DELAY)}
     engine = dataclasses.replace(engine, model=with_values(engine.model, values), delays={**engine.delays, **late})
     return channels_seen(dataclasses.replace(problem, engine=engine), run.x)
-
-
-def _rms(x: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(x**2)))

@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from ..._core.arguments import as_share, axis_unit
 from ..._core.arrays import on_device
@@ -17,7 +16,7 @@ from ..._core.system import jsonable
 from ...scene import replace_numbers, scene_numbers, scene_ranges
 from ..data._record import SINGLE, Record, cut, runs_of
 from ..estimate._problem import FitProblem, Prior, SquaredLoss
-from ..estimate._search import SearchOptions, SearchResult, solve
+from ..estimate._search import SearchOptions, SearchResult, channels_seen, solve
 from ..model._parameters import FreeParameters
 from ..model._servo import SERVO_LAWS, Servo, ServoEngine, servo_windows
 from ..uncertainty._fit import result_of
@@ -75,7 +74,7 @@ class ServoFit:
         return float(np.mean([np.mean(list(group.values())) for group in self.left_out.values()]))
 
     @property
-    def undetermined(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """Sentences on parameters that the records do not determine; none for a loaded fit."""
         if self.result is None:
             return ()
@@ -236,11 +235,11 @@ def fit_servo(
         out = np.isin(names, group)
         x = search(f"without {name}", ~out).state.x
         members[name] = {k: float(v) for k, v in whole.at(x).values.items()}
-        angles = _angles(whole, x)
+        angles = np.asarray(channels_seen(whole, x)[SINGLE])
         without.append((np.flatnonzero(out), angles))
         left_out[name] = {names[i]: error(angles, i) for i in np.flatnonzero(out)}
     x = everything.state.x
-    model, centre = replace_numbers(start, dict(whole.at(x).values)), _angles(whole, x)
+    model, centre = replace_numbers(start, dict(whole.at(x).values)), np.asarray(channels_seen(whole, x)[SINGLE])
     units = {name: axis_unit(allowed.unit, True) for name, allowed in scene_ranges(start).items()}
     return ServoFit(
         law=law, model=model, members=members, left_out=left_out,
@@ -338,13 +337,3 @@ def _priors(start: Servo, law: str, prior: PriorNumbers) -> dict[str, tuple[floa
     numbers = {name: float(scene_numbers(start)[name]) for name in Servo.free(law)}
     own = {name: (x, _PRIOR_ANGLE if name == "tilt" else _PRIOR * x) for name, x in numbers.items()}
     return own | {name: (float(mean), float(deviation)) for name, (mean, deviation) in prior.items()}
-
-
-def _angles(problem: FitProblem, x: Array) -> Float[np.ndarray, "runs samples"]:
-    return np.asarray(_run(problem, x))
-
-
-@eqx.filter_jit
-def _run(problem: FitProblem, x: Array) -> Array:
-    values = problem.free.values(x)
-    return jax.vmap(lambda run: problem.engine(values, None, run).channels[SINGLE])(problem.runs)

@@ -119,7 +119,7 @@ class FitDiagnostics:
       steps.
     - `starts`: root mean square, in noise levels, at the end from each of several starts, best first.
     - `single_precision`: whether it was computed in float32.
-    - `issues`: deficiencies of the motion, with the parameters that they leave unknown; part of the remarks.
+    - `issues`: deficiencies of the motion, with the parameters that they leave unknown; part of the warnings.
     """
 
     rmse: dict[str, float]

@@ -267,7 +267,7 @@ class Posterior(AbstractReadable):
         return {name: tuple(np.quantile(x, edges).tolist()) for name, x in self.draws.items()}
 
     @property
-    def remarks(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """Reliability of the samples, and differences from the fit, in sentences."""
         sentences = []
         worst = max(self.rhat, key=lambda name: self.rhat[name] if math.isfinite(self.rhat[name]) else math.inf)
@@ -321,7 +321,7 @@ def _(posterior: Posterior) -> Table:
     chains, draws = next(iter(posterior.draws.values())).shape
     head = ("unknown", "mean", "std. dev.", "95 % interval", "fit", "std. error", "R-hat", "effective samples")
     title = f"{chains} chains of {draws} draws, {posterior.divergences} divergences"
-    return Table(title, head, rows, posterior.remarks)
+    return Table(title, head, rows, posterior.warnings)
 
 
 def sample_posterior(

@@ -86,7 +86,7 @@ class ChannelTests:
     inputs: dict[str, Cross]
 
     @property
-    def remarks(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """The meaning of the tests, in words."""
         sentences = []
         for trend in self.trends:
@@ -143,7 +143,7 @@ class ResidualTests:
                     f"  {'no trace of input ' + name:34} p = {cross.p:.2g}   correlation {cross.correlation:+.2f} at"
                     f" {cross.lag:.3g} s"
                 )
-            lines += [f"  - {remark}" for remark in each.remarks]
+            lines += [f"  - {warning}" for warning in each.warnings]
         return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""The result of a fit: parameters, remarks on what the records do not determine, and its files."""
+"""The result of a fit: parameters, warnings on what the records do not determine, and its files."""
 
 import io
 import json
@@ -199,12 +199,12 @@ class FitResult(AbstractReadable):
                 "evaluations": diagnostics.evaluations,
                 "ending": diagnostics.ending,
                 "step_error": diagnostics.step_error,
-                "remarks": list(warnings_for(self)),
+                "warnings": list(warnings_for(self)),
             }
         )
 
     def __str__(self) -> str:
-        """A table of all parameters, and the remarks."""
+        """A table of all parameters, and the warnings."""
         return table_of(self).text()
 
     __repr__ = __str__
