@@ -39,6 +39,32 @@ def double_pendulum() -> jms.Scene:
     return jms.Scene(plain.lagrangian, plain.params, joints, coordinates=plain.coordinates)
 
 
+def mass(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    del t
+    return 0.5 * p["m"] * jnp.sum(qd**2) + p["f"] * q[0]
+
+
+def puck() -> jms.Scene:
+    return jms.Scene(mass, {"m": 2.0, "f": 1.0}, (jms.Friction(jms.Coulomb(1.5, 2.0), along=lambda q: q),))
+
+
+def switched_spring() -> jms.Scene:
+    spring = jms.Switch(lambda t, q, qd, p: q[0], above=lambda t, q, qd, p: -p["k"] * q)
+    pull = jms.AppliedForce(lambda t, q, qd, p: -q, name="pull")
+    return jms.Scene(mass, {"m": 1.0, "f": 0.0, "k": 4.0}, (spring, pull))
+
+
+def skate() -> jms.Scene:
+    """A blade on a slope, which moves only along its direction q[2]."""
+
+    def lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t
+        return 0.5 * (qd[0] ** 2 + qd[1] ** 2) + 0.05 * qd[2] ** 2 - p["g"] * q[1]
+
+    blade = jms.VelocityConstraint(lambda t, q, qd, p: -jnp.sin(q[2]) * qd[0] + jnp.cos(q[2]) * qd[1], name="blade")
+    return jms.Scene(lagrangian, {"g": 2.0}, constraints=(blade,))
+
+
 # Scene, start, end, largest error of coordinates at rtol 1e-6, and of event times.
 CASES: dict[str, Callable[[], tuple[Any, Any, Any, float, float, float]]] = {
     "box": lambda: (ramped_box.scene(ramped_box.lugre()), [0.0], [0.0], 10.0, 2e-6, 0.0),
@@ -54,6 +80,13 @@ CASES: dict[str, Callable[[], tuple[Any, Any, Any, float, float, float]]] = {
     ),
 }
 NAMES = ["box", "belt", "ball", "pendulum", "crank"]
+# Friction in the plane, a switch, and a velocity constraint; validation and derivatives are as above.
+CASES |= {
+    "puck": lambda: (puck(), [0.0, 0.0], [3.0, 4.0], 10.0, 1e-7, 0.0),
+    "switch": lambda: (switched_spring(), [-1.0], [1.0], 6.0, 1e-7, 1e-6),
+    "skate": lambda: (skate(), [0.0, 0.0, 0.0], [1.0, 0.0, 1.0], 3.0, 1e-7, 0.0),
+}
+OTHERS = ["puck", "switch", "skate"]
 
 
 @functools.cache
@@ -119,7 +152,7 @@ def test_validation_has_no_finding(name: str) -> None:
 
 @needs_fmpy
 @pytest.mark.parametrize("kind", ["CoSimulation", "ModelExchange"])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *OTHERS])
 def test_both_modes_agree_with_simulate(name: str, kind: str) -> None:
     _, q0, _, t1, error, _ = CASES[name]()
     exact, importer = tight_run(name), kind == "ModelExchange"
