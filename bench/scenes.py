@@ -72,6 +72,38 @@ def shaken_table() -> jms.Scene:
     return jms.Scene(lagrangian, {"g": 9.81, "A": 1e-3, "omega": 120.0}, (friction,), (table,))
 
 
+def woodpecker() -> jms.Scene:
+    """The woodpecker toy: three rigid contacts with friction between a sleeve, a bird on a spring, and a pole.
+
+    Model and numbers: R. I. Leine, D. H. van Campen, C. Glocker, Nonlinear dynamics and modeling of various wooden
+    toys with impact and friction, J. Vibration and Control 9 (2003) 25-78.
+    """
+    params = {"m": 3e-4, "J": 5e-9, "mb": 4.5e-3, "Jb": 7e-7, "c": 5.6e-3, "g": 9.81, "l": 0.010, "lb": 0.015}
+    radius, gap, h, beak = 0.0031, 0.0006, 0.0058, 0.02
+
+    def lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t
+        bird = qd[0] + p["l"] * qd[1] + p["lb"] * qd[2]
+        kinetic = p["m"] * qd[0] ** 2 + p["J"] * qd[1] ** 2 + p["mb"] * bird**2 + p["Jb"] * qd[2] ** 2
+        height = p["m"] * q[0] + p["mb"] * (q[0] + p["l"] * q[1] + p["lb"] * q[2])
+        return 0.5 * (kinetic - p["c"] * (q[1] - q[2]) ** 2) - p["g"] * height
+
+    def touch(name: str, distance: Callable[[Any], Any], along: Callable[[Any], Any], e: float) -> tuple[Any, Any]:
+        contact = jms.Contact(lambda _t, q, _p: distance(q), restitution=e, name=name)
+        return contact, jms.Friction(jms.Coulomb(0.3), along=along, normal_force=name, name=f"friction of the {name}")
+
+    def sleeve(q: Any) -> Any:
+        return q[0] + radius * q[1]
+
+    pairs = (
+        touch("beak", lambda q: 0.0024 - beak * q[2], lambda q: q[0] + 0.01 * q[1] - 0.0051 * q[2], 0.5),
+        touch("lower edge", lambda q: gap + h * q[1], sleeve, 0.0),
+        touch("upper edge", lambda q: gap - h * q[1], sleeve, 0.0),
+    )
+    contacts, frictions = zip(*pairs, strict=True)
+    return jms.Scene(lagrangian, params, frictions, contacts)
+
+
 def lugre(p: Any) -> jms.LuGre:
     """A LuGre law with six parameters."""
     return jms.LuGre(*(p[i] for i in range(6)))
@@ -103,6 +135,7 @@ SCENES: dict[str, Callable[[], Task]] = {
     **TIMED,
     "ball on a floor": lambda: fixed(bouncing_ball.scene(e=0.8), [1.0], [0.0], 2.0),
     "ball on a shaken table": lambda: fixed(shaken_table(), [0.0, 0.1], [0.5, 0.0], 2.0),
+    "woodpecker": lambda: fixed(woodpecker(), [0.0, -0.1034, -0.2788], [-0.3411, 0.0, -7.4583], 0.2),
     "slider-crank": lambda: fixed(slider_crank.scene(torque=2.3), *slider_crank.state(0.7, 8.0), 1.0),
     "worm drive": lambda: fixed(worm_drive.scene(motor=0.9), *worm_drive.state(0.0), 0.05),
     **{name: partial(_named, name) for name in named_problems()},

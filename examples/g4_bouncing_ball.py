@@ -21,7 +21,7 @@ from jaxmodsim.problems import bouncing_ball
 def main(out: Path, smoke: bool = False) -> None:
     """Drop it, hold it, and compare; --smoke changes nothing."""
     ball, h, e, t1 = bouncing_ball.BouncingBall(e=0.62), 1.0, 0.62, 3.0
-    solver = jms.EventSolver(diffrax.Tsit5(), ball.guards, ball.reset, on_zeno=ball.hold, max_events=64)
+    solver = jms.EventSolver(diffrax.Tsit5(), ball.guards, ball.reset, carries_on=True, max_events=64)
     done = diffrax.diffeqsolve(
         diffrax.ODETerm(ball.field),
         solver,

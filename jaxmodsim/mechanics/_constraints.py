@@ -256,17 +256,15 @@ class LinearizedConstraints(NamedTuple):
     minv_jt: Float[Array, "m dof"]
     matrix: Float[Array, "m m"]
 
-    def multipliers(self, qdd: PerDof) -> Float[Array, " m"]:
-        """Multipliers that make the accelerations `qdd` admissible."""
-        return -solve_balanced(self.matrix, apply_matrix(self.rows, qdd) + self.bias)
-
-    def multiplier_response(self, qdd: Float[Array, "dof *k"]) -> Float[Array, "m *k"]:
-        """Change of the multipliers if the unconstrained accelerations change by `qdd`, one or several."""
-        return -solve_balanced(self.matrix, apply_matrix(self.rows, qdd))
+    def multipliers(self, qdd: Float[Array, "dof *k"]) -> Float[Array, "m *k"]:
+        """Multipliers that make the accelerations `qdd` admissible; of k columns the first, the others are changes."""
+        rate = apply_matrix(self.rows, qdd)
+        bias = self.bias if qdd.ndim == 1 else jnp.pad(self.bias[:, None], ((0, 0), (0, qdd.shape[1] - 1)))
+        return -solve_balanced(self.matrix, rate + bias)
 
     def respond(self, qdd: Float[Array, "dof *k"]) -> Float[Array, "dof *k"]:
         """Change of the accelerations if the unconstrained accelerations change by `qdd`, one or several."""
-        return qdd + self.apply_force(self.multiplier_response(qdd))
+        return qdd - self.apply_force(solve_balanced(self.matrix, apply_matrix(self.rows, qdd)))
 
     def apply_force(self, multipliers: Float[Array, "m *k"]) -> Float[Array, "dof *k"]:
         """Accelerations by the multipliers."""

@@ -24,7 +24,8 @@ class BouncingBall(eqx.Module):
     """A point mass that bounces on a floor, as functions for `jaxmodsim.EventSolver`.
 
     The state is (height [m], velocity [m/s]), positive upwards, shape `[2]`. The mode is 0 in flight, and 1 at rest on
-    the floor after `hold`. `bounces` has the times of the bounces, `motion` the motion, `rest` the time of the rest.
+    the floor, where bounces accumulate. `bounces` has the times of the bounces, `motion` the motion, `rest` the time of
+    the rest.
 
     **Arguments:**
 
@@ -39,7 +40,7 @@ class BouncingBall(eqx.Module):
 
     ```python
     ball = jms.problems.bouncing_ball.BouncingBall(e=0.5)
-    solver = jms.EventSolver(diffrax.Tsit5(), ball.guards, ball.reset, on_zeno=ball.hold)
+    solver = jms.EventSolver(diffrax.Tsit5(), ball.guards, ball.reset, carries_on=True)
     control = jms.EventController(diffrax.PIDController(rtol=1e-8, atol=1e-8))
     start, field = solver.start(0.0, ball.dropped(h=1.0), mode=0.0), diffrax.ODETerm(ball.field)
     solution = diffrax.diffeqsolve(field, solver, 0.0, 2.0, None, start, stepsize_controller=control)
@@ -72,12 +73,10 @@ class BouncingBall(eqx.Module):
         return s.y[:1]
 
     def reset(self, t: object, s: EventState, args: object, fired: Bool[Array, "1"]) -> EventState:
-        """Bounce: multiply the velocity by -e."""
-        return s._replace(y=jnp.stack([jnp.zeros_like(s.y[0]), -self.e * s.y[1]]))
-
-    def hold(self, t: object, s: EventState, args: object, fired: Bool[Array, "1"]) -> EventState:
-        """Stop the ball on the floor."""
-        return s._replace(y=jnp.zeros_like(s.y), mode=jnp.ones_like(s.mode))
+        """Bounce: multiply the velocity by -e. Where bounces accumulate, stop the ball on the floor."""
+        assert s.dense is not None
+        after = jnp.stack([jnp.zeros_like(s.y[0]), -self.e * s.y[1]])
+        return s._replace(y=jnp.where(s.dense, 0.0, after), mode=jnp.where(s.dense, 1.0, s.mode))
 
 
 def _height(t: Array, q: Array, p: dict[str, Array]) -> Array:

@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._core.arrays import PerDof, Scalar
+from .._core.arrays import PerDof, Scalar, apply_matrix
 from .._core.cholesky import factor_positive_definite
 from .._core.functions import depends_on
 from .._core.scalarise import in_scalars
@@ -227,7 +227,12 @@ class Dynamics(NamedTuple):
         return self._stick(mode), mode
 
     def switch_struck(
-        self, fired: Bool[Array, " n"], stopped: Bool[Array, " elements"], struck: Bool[Array, ""], rest: Scalar
+        self,
+        fired: Bool[Array, " n"],
+        stopped: Bool[Array, " elements"],
+        struck: Bool[Array, ""],
+        rest: Scalar,
+        held: Bool[Array, " n"] | None,
     ) -> tuple[State, Float[Array, " n"]]:
         """State and modes of the friction elements after an impact, which may reverse a slip, and end a stick.
 
@@ -238,27 +243,28 @@ class Dynamics(NamedTuple):
         turned = struck & (elements.magnitude(v) > rest)
         fired = (fired & ~turned) | (elements.in_rows(stopped) & ~elements.sticks(mode))
         mode = jnp.where(turned, elements.slip_mode(v, self._speed_of_rest(rest)), mode)
-        return self.switch_friction(fired, mode, rest)
+        return self.switch_friction(fired, mode, rest, held)
 
     def switch_friction(
-        self, fired: Bool[Array, " n"], mode: Float[Array, " n"], rest: Scalar
+        self,
+        fired: Bool[Array, " n"],
+        mode: Float[Array, " n"],
+        rest: Scalar,
+        held: Bool[Array, " n"] | None = None,
     ) -> tuple[State, Float[Array, " n"]]:
-        """State and modes of the friction elements after the guards that `fired`."""
+        """State and modes of the friction elements after the guards that `fired`.
+
+        The elements that are `held` stick regardless of their limits.
+        """
         elements, rest = self.friction_elements, self._speed_of_rest(rest)
         mode, fired = renew_slip(elements, mode, fired, rest) if elements.planes else (mode, fired)
         sticks = elements.sticks(mode)
         new = next_modes(elements, mode, sticks | fired, fired & sticks, rest)
+        if held is not None:
+            new = jnp.where(elements.in_planes(held, lambda part: jnp.any(held[part])), 0.0, new)
         # The remaining slip of a plane that stops is removed in any case: it does not determine the next direction.
         stops = elements.in_planes(elements.sticks(new), lambda part: fired[part] | elements.sticks(new)[part])
         return self.y._replace(qd=stop_slip(elements, self.y.qd, stops)), new
-
-    def hold(self, fired: Bool[Array, " guards"]) -> tuple[State, Float[Array, " n"]]:
-        """State and modes if the friction elements that `fired` stick, regardless of their limits."""
-        (modes, *others), elements = self._modes, self.friction_elements
-        n = modes.size
-        held = elements.in_planes(fired[:n], lambda part: jnp.any(fired[part]))
-        mode = jnp.concatenate([jnp.where(held, 0.0, modes), *others])
-        return self.stick(mode), mode
 
     def stick(self, mode: Modes) -> State:
         """State without the slip velocity of elements that stick in `mode`, which drifts from zero."""
@@ -324,11 +330,6 @@ class Mobility(NamedTuple):
         free = self.solve(force)
         return free if self.constraints is None else self.constraints.respond(free)
 
-    def least(self, rows: Float[Array, "n dof"]) -> Float[Array, " n"]:
-        """Least mobility [1/kg] along each direction within constraints that is above rounding."""
-        eps = float(jnp.finfo(rows.dtype).eps)
-        return _ROUNDING * eps * jnp.sum(rows.T * self.solve(rows.T), axis=0)
-
 
 def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> Dynamics:
     """Solve for the accelerations, and for the forces that depend on them, for the modes `mode`.
@@ -368,29 +369,31 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
         for name, action in held.items():
             rhs = rhs + action.generalised - actions[name].generalised
             actions[name] = action
-    qdd = mobility.solve(rhs)
-    multipliers, reported = None, linearized
+    units = {name: each.force_per_load(t, q, qd, y.z.get(name), params) for name, each in scene.reaction_loaded.items()}
+    pushes = [-each.apply_force(q, units[name][0], params) for name, each in scene.reaction_loaded.items()]
+    friction = [*scene.event_driven.values()]
+    # Columns: the motion without these elements, then a unit force along each of their rows.
+    directions = [*(jnp.atleast_2d(each.direction(q, params)) for each in friction), *(push[None] for push in pushes)]
+    free = mobility.solve(jnp.concatenate([rhs[None], *directions]).T if directions else rhs)
+    moves, multipliers, yields, reported = free, None, None, linearized
     if linearized is not None:
-        multipliers = linearized.multipliers(qdd)
-        qdd = qdd + linearized.apply_force(multipliers)
+        reactions = linearized.multipliers(free)
+        moves = free + linearized.apply_force(reactions)
+        multipliers, yields = (reactions[:, 0], reactions[:, 1:]) if directions else (reactions, None)
         if compliant is not None:
             multipliers = multipliers + compliant.force
             reported = linearized._replace(rows=linearized.rows + compliant.rate)
-    if not (scene.event_driven or scene.reaction_loaded):
-        return Dynamics(t, y, mode, scene, actions, qdd, None, None, reported, multipliers, None)
+    if not directions:
+        return Dynamics(t, y, mode, scene, actions, moves, None, None, reported, multipliers, None)
 
-    units = {name: each.force_per_load(t, q, qd, y.z.get(name), params) for name, each in scene.reaction_loaded.items()}
-    pushes = [-each.apply_force(q, units[name][0], params) for name, each in scene.reaction_loaded.items()]
-
-    def loads(rows: Array, widths: tuple[int, ...]) -> Loads | None:
-        return _loads(scene, mobility, t, y, rows, widths, multipliers)
-
-    least_mobility = mobility.least if linearized is not None else None
-    friction = [*scene.event_driven.values()]
+    qdd, minv_jt = moves[:, 0], moves[:, 1:].T
+    along, loads, least_mobility = jnp.concatenate(directions), None, None
+    if yields is not None:
+        least_mobility = _ROUNDING * float(jnp.finfo(q.dtype).eps) * jnp.sum(along.T * free[:, 1:], axis=0)
+        if scene.loaded:
+            loads = _loads(scene, t, y, [len(each) for each in directions], multipliers, yields)
     modes = jnp.zeros(0, q.dtype) if mode is None else scene.split_modes(mode)[0]
-    elements = assemble_friction(
-        friction, pushes, mobility.respond, least_mobility, loads, t, q, qd, params, qdd, modes
-    )
+    elements = assemble_friction(friction, along, minv_jt, least_mobility, loads, t, q, qd, params, qdd, modes)
     solved = solve_friction_forces(elements, modes)
     forces = [solved.force[part] for part in elements.parts]
     for force, (name, effect) in zip(forces, scene.event_driven.items(), strict=False):
@@ -400,37 +403,31 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
         unit, rate = units[name]
         actions[name] = Action(-force * push, force * unit, rate)
     qdd = qdd - jnp.sum(elements.minv_jt * solved.force[:, None], axis=0)
-    if (within := mobility.constraints) is not None and multipliers is not None:
-        taken = sum(actions[name].generalised for name in (*scene.event_driven, *scene.reaction_loaded))
-        multipliers = multipliers + within.multiplier_response(mobility.solve(jnp.asarray(taken)))
+    if multipliers is not None and yields is not None:
+        multipliers = multipliers - apply_matrix(yields, solved.force)
     uniqueness = solved.margin if scene.loaded else None
     return Dynamics(t, y, mode, scene, actions, qdd, elements, solved, reported, multipliers, uniqueness)
 
 
 def _loads(
     scene: Scene,
-    mobility: Mobility,
     t: Array,
     y: State,
-    rows: Float[Array, "n dof"],
-    widths: tuple[int, ...],
-    multipliers: Any,
-) -> Loads | None:
+    widths: list[int],
+    multipliers: Array | None,
+    yields: Float[Array, "m n"],
+) -> Loads:
     """Normal forces of the constraints that load friction, and their change by the friction forces.
 
-    `widths`: the number of `rows` of each element.
+    `widths`: the number of rows of each element. `yields`: change of the multipliers with unit forces along the rows.
     """
-    names = scene.loaded
-    if not names:
-        return None
-    assert mobility.constraints is not None
-    friction = (*scene.event_driven.values(), *scene.reaction_loaded.values())
+    assert multipliers is not None
+    names, friction = scene.loaded, (*scene.event_driven.values(), *scene.reaction_loaded.values())
     loaded = [x.load_constraint for x, width in zip(friction, widths, strict=True) for _ in range(width)]
     where = by_constraint(scene, t, y, jnp.arange(multipliers.shape[0]))
     chosen = dict(zip(scene.constraint_names, scene.constraints, strict=True))
     at = jnp.concatenate([where[name] for name in names])
     size = jnp.stack([chosen[name].per_multiplier(t, y.q, scene.params) for name in names])
-    yields = mobility.constraints.multiplier_response(mobility.solve(rows.T))
     return Loads(
         jnp.asarray([[float(name == each) for name in names] for each in loaded], y.q.dtype),
         size * multipliers[at],

@@ -189,10 +189,10 @@ class FrictionForces(NamedTuple):
 
 def assemble_friction(
     friction: list[Friction],
-    reaction_loaded: list[PerDof],
-    respond: Callable[[Array], Array],
-    least_mobility: Callable[[Array], Array] | None,
-    loads: Callable[[Float[Array, "n dof"], tuple[int, ...]], Loads | None],
+    along: Float[Array, "n dof"],
+    minv_jt: Float[Array, "n dof"],
+    least_mobility: Float[Array, " n"] | None,
+    loads: Loads | None,
     t: Scalar,
     q: PerDof,
     qd: PerDof,
@@ -205,52 +205,42 @@ def assemble_friction(
     **Arguments:**
 
     - `friction`: elements with a mode.
-    - `reaction_loaded`: for each element without a mode, which a reaction loads, the generalised force that it takes
-      away per newton of load.
-    - `respond`: maps generalised forces, as columns, to accelerations within the constraints.
-    - `least_mobility`: maps directions, as rows, to the least mobilities [1/kg] above rounding; None without
-      constraints, where nothing cancels.
-    - `loads`: the `Loads`, from the directions of all rows and the number of rows of each element.
+    - `along`: directions of their rows; then, for each element without a mode, which a reaction loads, the generalised
+      force that it takes away per newton of load.
+    - `minv_jt`: accelerations within the constraints by these generalised forces.
+    - `least_mobility`: the least mobility [1/kg] of each row above rounding; None without constraints, where nothing
+      cancels.
+    - `loads`: normal forces that are reactions.
     - `t`, `q`, `qd`, `params`: the state.
     - `mode`: modes, from which planes take their reference velocities.
     """
-    slips = [element.slip_and_rate(t, q, qd, qdd, params) for element in friction]
-    given_loads = [element.load(t, q, qd, params) for element in friction]
     one, zero = jnp.ones_like(t), jnp.zeros_like(t)
-    directions: list[PerDof] = []
     rows: list[tuple[Array, ...]] = []
     planes: list[tuple[int, int]] = []
-    widths: list[int] = []
-    for element, (v, rate), load in zip(friction, slips, given_loads, strict=True):
+    for element in friction:
+        v, rate = element.slip_and_rate(t, q, qd, qdd, params)
+        load = element.load(t, q, qd, params)
         upper, lower = (element.static_limit(sign * one, load) for sign in (1.0, -1.0))
-        widths.append(max(1, v.size))
         if v.ndim == 0:
-            directions.append(element.direction(q, params))
             positive, negative = (element.slip_force(v, sign * one, load) for sign in (1.0, -1.0))
             rows.append((v, rate, positive, negative, upper, lower, zero, zero))
             continue
         start, stop = len(rows), len(rows) + v.shape[0]
         planes.append((start, stop))
-        directions += [*element.direction(q, params)]
         v, rate = element.stretch(v), element.stretch(rate)
         onset = element.slip_force(zero, one, load)
         force = element.slip_force_in_plane(v, mode[start:stop] if mode.shape[0] else v, load)
         rows += [(v[i], rate[i], zero, zero, upper, lower, force[i], onset) for i in range(v.shape[0])]
-    directions += reaction_loaded
-    rows += [(zero, zero, one, one, one, one, zero, zero) for _ in reaction_loaded]
-    along = jnp.stack(directions)
-    minv_jt = respond(along.T).T
+    rows += [(zero, zero, one, one, one, one, zero, zero)] * (along.shape[0] - len(rows))
     delassus = jnp.sum(along[:, None, :] * minv_jt[None], axis=2)
     if least_mobility is not None:
         # Where constraints leave a direction no mobility (a slider at its dead centre), no force holds it. Rounding may
         # leave a mobility of zero or less, which would look as if no force were needed.
-        delassus = delassus + jnp.diag(least_mobility(along))
+        delassus = delassus + jnp.diag(least_mobility)
     columns = [*zip(*rows, strict=True)]
     v, rate, *forces = (jnp.stack(column) for column in columns[:6])
     planar = PlanarSlip(*(jnp.stack(column) for column in columns[6:])) if planes else None
-    widths += [1] * len(reaction_loaded)
-    loaded = loads(along, tuple(widths))
-    return FrictionElements(v, rate, delassus, minv_jt, *forces, planar=planar, loads=loaded, planes=tuple(planes))
+    return FrictionElements(v, rate, delassus, minv_jt, *forces, planar=planar, loads=loads, planes=tuple(planes))
 
 
 def solve_friction_forces(

@@ -55,7 +55,8 @@ def impact(
     closed: Float[Array, " contacts"],
     fired: Bool[Array, " contacts"],
     rest: Scalar,
-    bounces: Bool[Array, " contacts"] | None,
+    bounces: Bool[Array, " contacts"],
+    dense: Bool[Array, ""],
 ) -> tuple[PerDof, Float[Array, " contacts"], Bool[Array, " elements"]]:
     """Velocities and modes after the instant at which the contacts `fired`.
 
@@ -68,8 +69,9 @@ def impact(
     - `closed`: modes before.
     - `fired`: contacts whose guards fired.
     - `rest`: speed of rest [m/s].
-    - `bounces`: which contacts rebound; None if impacts have accumulated. The remaining velocity of a gap, of either
-      sign, is then below what time resolves, and is removed.
+    - `bounces`: which contacts rebound.
+    - `dense`: whether impacts have accumulated. The remaining velocity of a gap, of either sign, is then below what
+      time resolves, and is removed.
 
     **Returns:**
 
@@ -85,16 +87,15 @@ def impact(
     struck, rows, reach = _struck(t, (q, qd), scene, mass, gaps, touches)
     v = jnp.concatenate([w, *(jnp.reshape(x.slip(t, q, qd, params), (1,)) for x in rubbing.values())])
     e, none = jnp.stack([each.coefficient.astype(w.dtype) for each in contacts]), jnp.zeros_like(w)
-    if bounces is None:
-        normal = solve_semidefinite(struck.delassus[:n, :n], jnp.where(touches, -w, 0.0), jnp.ones_like(w), touches)
-        impulse = jnp.concatenate([normal, jnp.zeros_like(v[n:])])
-    elif any(isinstance(each.restitution, Poisson) for each in contacts):
+    if any(isinstance(each.restitution, Poisson) for each in contacts):
         squeeze = _impulses(struck, v, none)
         halfway = v + jnp.sum(struck.delassus * squeeze[None, :], axis=1)
         impulse = squeeze + _impulses(struck, halfway, jnp.where(bounces, e, 0.0) * squeeze[:n])
     else:
         aimed = (1.0 + jnp.where(bounces & (closed == 0), e, 0.0)) * w
         impulse = _impulses(struck, jnp.concatenate([aimed, v[n:]]), none)
+    normal = solve_semidefinite(struck.delassus[:n, :n], jnp.where(touches, -w, 0.0), jnp.ones_like(w), touches)
+    impulse = jnp.where(dense, jnp.concatenate([normal, jnp.zeros_like(v[n:])]), impulse)
     after = v + jnp.sum(struck.delassus * impulse[None, :], axis=1)
     rounding = _ROUNDING * float(jnp.finfo(w.dtype).eps) * jnp.sum(jnp.abs(rows * qd[None, :]), axis=1)
     still = _constant(jnp.abs(after) <= jnp.maximum(rest, rounding))

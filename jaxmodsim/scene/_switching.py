@@ -75,9 +75,13 @@ def switch(
     mode: Float[Array, " modes"],
     fired: Bool[Array, " guards"],
     rest: Scalar,
-    elastic: bool = True,
+    dense: Bool[Array, ""],
+    holds: bool,
 ) -> tuple[State, Float[Array, " modes"]]:
-    """State and modes after the guards that `fired`; `elastic` is False if impacts have accumulated.
+    """State and modes after the guards that `fired`.
+
+    Where events accumulate (`dense`) struck contacts close without a rebound. Friction elements that fired there stick
+    regardless of their limits if chatter is held (`holds`), and keep their modes otherwise.
 
     The impact and the friction after it are two functions of `in_scalars`, as one would be too large for it.
 
@@ -92,7 +96,8 @@ def switch(
     if not scene.contacts:
         if slips.size:
             whole = _join(slips, sides)
-            y, slips = from_dynamics(lambda d: d.switch_friction(slip_fired, slips, rest), t, y, scene, whole)
+            held = slip_fired & dense if holds else None
+            y, slips = from_dynamics(lambda d: d.switch_friction(slip_fired, slips, rest, held), t, y, scene, whole)
         return y, _join(slips, sides)
 
     if scene.switches:
@@ -100,17 +105,20 @@ def switch(
         push = from_dynamics(lambda d: d.contact_forces, t, y, scene, _join(slips, closed, sides))
         contact_fired = contact_fired | ((closed > 0) & (push < 0))
 
-    bounces = _bounces(t, y, scene, _join(slips, closed, sides)) if elastic else None
+    held = slip_fired & dense if holds else None
+    if not holds:
+        slip_fired = slip_fired & ~dense
+    bounces = _bounces(t, y, scene, _join(slips, closed, sides))
 
     def strike(t: Array, q: Array, qd: Array) -> tuple[Array, Array, Array]:
-        return impact(t, q, qd, scene.bind_state(t, q, qd), closed, contact_fired, rest, bounces)
+        return impact(t, q, qd, scene.bind_state(t, q, qd), closed, contact_fired, rest, bounces, dense)
 
     qd, closed, stopped = in_scalars(strike, t, y.q, y.qd, seed=y.q)
     after = y._replace(qd=qd)
     if slips.size:
         struck = jnp.any(contact_fired) & jnp.any(qd != y.qd)
         after, slips = from_dynamics(
-            lambda d: d.switch_struck(slip_fired, jnp.asarray(stopped), struck, rest),
+            lambda d: d.switch_struck(slip_fired, jnp.asarray(stopped), struck, rest, held),
             *(t, after, scene, _join(slips, closed, sides)),
         )
     return after, _join(slips, closed, sides)

@@ -191,11 +191,9 @@ class RunFunctions(eqx.Module):
     @at_time
     def reset(self, t: Array, s: EventState, scene: Scene, fired: Array) -> EventState:
         """State after changes of modes and impacts; the same state without them."""
-        return self._switch(t, s, scene, fired, True)
-
-    def _switch(self, t: Array, s: EventState, scene: Scene, fired: Array, elastic: bool) -> EventState:
         before = self.system.state(t, s.y, scene)
-        state, mode = switch(t, before, scene, s.mode, fired, self.rest, elastic)
+        assert s.dense is not None
+        state, mode = switch(t, before, scene, s.mode, fired, self.rest, s.dense, self.holds)
         after = self.system.replace(t, s.y, state, scene)
         if scene.contacts:  # a contact may have closed; the derivative, too, or the next step would move it
             after = self.project(t, after, scene, mode)
@@ -205,17 +203,6 @@ class RunFunctions(eqx.Module):
     def event_mode(self, mode: Array) -> Array:
         """The parts of the modes that an event changes: without the reference velocities of planes."""
         return mode_numbers(mode, self.widths)
-
-    @at_time
-    def on_zeno(self, t: Array, s: EventState, scene: Scene, fired: Array) -> EventState:
-        """Stick of chattering elements, if these are held in stick, and closed contacts if impacts accumulate."""
-        n = scene.split_modes(fired)[0].shape[0]
-        if scene.contacts:
-            s = self._switch(t, s, scene, fired if self.holds else fired.at[:n].set(False), False)
-        if not (n and self.holds):
-            return s
-        state, mode = from_dynamics(lambda d: d.hold(fired), t, self.system.state(t, s.y, scene), scene, s.mode)
-        return s._replace(y=self.system.replace(t, s.y, state, scene), mode=mode)
 
     def _stick(self, t: Array, s: EventState, scene: Scene) -> EventState:
         state = from_dynamics(lambda d: d.stick(s.mode), t, self.system.state(t, s.y, scene), scene, s.mode)

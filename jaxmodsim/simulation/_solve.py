@@ -145,7 +145,7 @@ def _solver(
             solver,
             functions.guards,
             functions.reset,
-            on_zeno=functions.on_zeno if request.choices.stick_on_chatter or scene.contacts else None,
+            carries_on=request.choices.stick_on_chatter or bool(scene.contacts),
             project=functions.project_and_stick if functions.projects or functions.sticks else None,
             samples=samples,
             rtol=functions.tolerances[0],

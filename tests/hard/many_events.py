@@ -49,8 +49,7 @@ def _solve(
 
 def _bounce(e: Array, held: bool) -> Answer:
     ball = bouncing_ball.BouncingBall(e=e, g=jnp.asarray(_G, e.dtype))
-    hold = ball.hold if held else None
-    solver = EventSolver(dfx.Tsit5(), ball.guards, ball.reset, on_zeno=hold, max_events=512, log=0)
+    solver = EventSolver(dfx.Tsit5(), ball.guards, ball.reset, carries_on=held, max_events=512, log=0)
     start = solver.start(jnp.zeros((), e.dtype), ball.dropped(1.0), mode=jnp.zeros((), e.dtype))
     code, ys = _solve(ball.field, solver, 2.0, start)
     return Answer(code, ys.t[-1])

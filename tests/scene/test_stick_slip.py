@@ -258,9 +258,9 @@ def test_pendulum_loses_torque_times_angle_and_rests_within_the_range() -> None:
 
 
 def drop(ball: problems.bouncing_ball.BouncingBall, y0: Any, t1: Any, adjoint: Any = None, **options: Any) -> Any:
-    hold, tol = ball.hold if options.pop("hold", False) else None, options.pop("tol", 1e-12)
+    hold, tol = options.pop("hold", False), options.pop("tol", 1e-12)
     solver = jms.EventSolver(
-        dfx.Tsit5(), ball.guards, ball.reset, on_zeno=hold, max_events=options.pop("max_events", 16)
+        dfx.Tsit5(), ball.guards, ball.reset, carries_on=hold, max_events=options.pop("max_events", 16)
     )
     return dfx.diffeqsolve(
         dfx.ODETerm(ball.field),

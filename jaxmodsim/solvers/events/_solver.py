@@ -112,8 +112,9 @@ class EventSolver(AbstractSolverWrapper):
 
     **Accumulation of events** (a ball that comes to rest, chatter): if the last intervals between events fall below
     1e-3 sqrt(eps) of the time since the start, the run ends with `status = 1` in the state and diffrax's result
-    `dt_min_reached`. With `on_zeno`, that function replaces `reset` there, and guards that are not positive
-    after it wait. After `max_events` events the next one ends the run with `status = 2` and `max_steps_reached`.
+    `dt_min_reached`. With `carries_on` it goes on: `reset` finds `s.dense` true there, and guards that are not
+    positive after it wait. After `max_events` events the next one ends the run with `status = 2` and
+    `max_steps_reached`.
 
     **Arguments:**
 
@@ -124,7 +125,7 @@ class EventSolver(AbstractSolverWrapper):
       times in between have the state after the event.
     - `reset`: `reset(t, s, args, fired)` -> `s` with another `y` or `mode` (by `s._replace`); `fired` are booleans,
       shape `[guards]`.
-    - `on_zeno`: as `reset`, for events that accumulate; by default the run ends there.
+    - `carries_on`: whether the run goes on where events accumulate, which `reset` finds in `s.dense`.
     - `project`: `project(t, s, args)` -> `s`, applied after every step, for invariants that drift.
     - `enforce`: whether the guards are conditions that have to hold, instead of crossings.
     - `samples`: a `SampledJumps` if `args` hold sampled values.
@@ -175,11 +176,11 @@ class EventSolver(AbstractSolverWrapper):
     solver: dfx.AbstractSolver  # pyright: ignore[reportIncompatibleVariableOverride]
     guards: Callable[..., Array | tuple[Array, ...]]
     reset: Callable[..., EventState]
-    on_zeno: Callable[..., EventState] | None = None
     project: Callable[..., EventState] | None = None
     samples: SampledJumps | None = None
     rtol: Real = 1e-6
     event_mode: Callable[[PyTree], PyTree] | None = None
+    carries_on: bool = eqx.field(default=False, static=True)
     enforce: bool = eqx.field(default=False, static=True)
     max_events: int = eqx.field(default=128, static=True)
     log: int | None = eqx.field(default=None, static=True)
@@ -398,11 +399,8 @@ class EventSolver(AbstractSolverWrapper):
         rate = jnp.where(rate == 0, 1.0, rate)
 
         def reset(t_event: Array, y: PyTree) -> tuple[PyTree, PyTree]:
-            before = state._replace(y=y)
-            after = self.reset(t_event, before, whole, fired)
-            if self.on_zeno is not None:
-                held, dense = self.on_zeno(t_event, before, whole, fired), _spread(t_event, state.t, memory)[1]
-                after = jtu.tree_map(lambda a, b: jnp.where(dense, a, b), held, after)
+            dense = _spread(t_event, state.t, memory)[1] & self.carries_on
+            after = self.reset(t_event, state._replace(y=y, dense=dense), whole, fired)
             return after.y, after.mode
 
         # The event of a guard that arrives is at its value `root`, that of others at zero, `early` later.
@@ -413,7 +411,7 @@ class EventSolver(AbstractSolverWrapper):
         passage = pass_event(landed, evaluate, (args, new_args), reset)
         t_event, values, (y, mode, slope) = passage.t, passage.guards, passage.after
         spread, dense = _spread(t_event, state.t, memory)
-        ends = dense & (self.on_zeno is None)
+        ends = dense & (not self.carries_on)
         status = jnp.where(ends, jnp.asarray(ACCUMULATION, spread.dtype), ONGOING)
         # A reset that changes nothing is no event.
         happened = _differ(*zip((passage.before, y), self._event_modes(state.mode, mode), strict=True))
@@ -425,7 +423,7 @@ class EventSolver(AbstractSolverWrapper):
             return self._guard_rates(t_event, state._replace(y=y, mode=mode), slope, new_args) > 0
 
         armed = self._policy.armed_after(clear, fired, memory.armed, rises)
-        if self.on_zeno is not None:
+        if self.carries_on:
             armed = jnp.where(dense, values > 0, armed)
         flags = _flags(fired, values)
         entry = EventLog(t_event, flags, (passage.before, state.mode), (y, mode))

@@ -50,6 +50,7 @@ class EventState(NamedTuple):
     - `fired`: 1 for each guard that fired in the last event, shape `[guards]`.
     - `log`: an `EventLog`, or None.
     - `report`: the report of the last step to the controller.
+    - `dense`: in a call of `reset`, whether events accumulate and the run carries on; None elsewhere.
     """
 
     y: PyTree
@@ -60,6 +61,7 @@ class EventState(NamedTuple):
     fired: Float[Array, "*s guards"]
     log: EventLog | None
     report: StepReport
+    dense: Bool[Array, ""] | None = None
 
     def rate(self, dy: PyTree) -> "EventState":
         """The value of a vector field: `dy` for `y`, and zero for everything else, which is constant in a step."""
