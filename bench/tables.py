@@ -133,7 +133,8 @@ REPORTS = {
         (
             Table(
                 "First calls: processor time of tracing and compilation. Warm calls of jitted functions: medians. Runs"
-                " have {samples} saved times, derivatives six parameters (belt: five). With `jaxmodsim.tune_cpu()`.",
+                " have {samples} saved times, derivatives six parameters (belt: five, the last scenes: all their"
+                " numbers). With `jaxmodsim.tune_cpu()`.",
                 (
                     "first run", "first gradient", "first jacobian", "equations of run", "equations of gradient",
                     "steps of run", "run", "gradient", "jacobian",

@@ -1,11 +1,12 @@
 """Cost of the first call of a scene, traced and compiled, and of its derivatives.
 
 Times are processor times, because compilation uses all cores: of a run with 51 saved times, and of derivatives of the
-sum of its positions by six parameters (five of the belt). The number of equations that XLA receives is recorded too.
-Warm times are those of jitted functions.
+sum of its positions by six parameters (five of the belt), or by all numbers of a large scene. The number of equations
+that XLA receives is recorded too. Warm times are those of jitted functions.
 """
 
 import time
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 import jaxmodsim as jms
 from bench.census import equations
 from bench.record import Result, timed
-from bench.scenes import SAMPLES, SIX, TIMED, chain
+from bench.scenes import LARGE, SAMPLES, SIX, TIMED, WOODPECKER, chain
 
 
 def main(smoke: bool, out: Path) -> Result:
@@ -25,13 +26,14 @@ def main(smoke: bool, out: Path) -> Result:
     result = Result("first_calls", ("diffrax",), {"samples": SAMPLES})
     once = chain(1, lambda p: jms.Viscous(p[2]))  # JAX loads its own modules here
     jax.jit(once.ways()["gradient"]).lower(jnp.asarray(once.numbers)).compile()
-    for name in list(TIMED)[: 2 if smoke else None]:
-        task = TIMED[name]()
-        ways = {way: function for way, function in task.ways().items() if way != "batch"}
+    for name in [*TIMED, *LARGE][: 2 if smoke else None]:
+        task = (TIMED | LARGE)[name]()
+        # The run, its gradient, its Jacobian.
+        ways = dict(islice(task.ways().items(), 3 if name in TIMED else 1 if name == WOODPECKER else 2))
         if name == SIX:
             ways["run by Tsit5"] = lambda p, task=task: task.total(p, solver=dfx.Tsit5(), max_steps=1_000_000)
         calls: dict[str, Any] = {}
-        p = jnp.asarray(task.numbers)
+        p = jax.tree.map(jnp.asarray, task.numbers)
         for way, function in ways.items():
             began = time.process_time()
             traced = jax.jit(function).trace(p)
