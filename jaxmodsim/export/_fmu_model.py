@@ -15,7 +15,7 @@ from ..solvers import RODAS5P
 from ._c_code import unused, write_function
 
 # Arguments of the functions: scalars, and arrays that a function reads or changes in place.
-_READ = {"t": "double t", "along": "double along"}
+_READ = {x: f"double {x}" for x in ("t", "along", "dense")}
 _READ |= {x: f"const double *{x}" for x in ("p", "y", "m", "tol", "fired", "dp", "dy", "seed")}
 
 
@@ -115,14 +115,11 @@ class Model(NamedTuple):
         y = self.on_constraints(t, p, y, jnp.zeros_like(m))
         return start(t, y, p, m, tol[0]) if self.modes else (y, m)
 
-    def after(self, t: Array, p: Scene, tol: Array, fired: Array, y: State, m: Array) -> tuple[State, Array]:
-        """State and modes after the guards that `fired`."""
-        return switch(t, y, p, m, fired > 0, tol[0])
-
-    def settle(self, t: Array, p: Scene, tol: Array, fired: Array, y: State, m: Array) -> tuple[State, Array]:
-        """The same where impacts accumulate."""
-        n = p.split_modes(fired)[0].shape[0]
-        return switch(t, y, p, m, (fired > 0).at[:n].set(False), tol[0], False)
+    def after(
+        self, t: Array, p: Scene, tol: Array, fired: Array, dense: Array, y: State, m: Array
+    ) -> tuple[State, Array]:
+        """State and modes after the guards that `fired`; `dense`: whether impacts accumulate."""
+        return switch(t, y, p, m, fired > 0, tol[0], dense > 0, False)
 
 
 def series_of(model: Model) -> dict[str, tuple[int, ...]]:
@@ -166,9 +163,12 @@ def _routines(model: Model) -> dict[str, tuple[str, tuple[str, ...], str, Callab
             "out",
             model.guards,
         )
-        event = ("t", "p", "tol", "fired")
-        routines["switch"] = ("State and modes after the guards that fired.", event, "y m", model.after)
-        routines["settle"] = ("The same where impacts accumulate.", event, "y m", model.settle)
+        routines["switch"] = (
+            "State and modes after the guards that fired; dense: whether impacts accumulate.",
+            ("t", "p", "tol", "fired", "dense"),
+            "y m",
+            model.after,
+        )
     if model.projects:
         routines["project"] = (
             "The state on the constraints, without slip in stick.",
@@ -187,7 +187,7 @@ def write_model(model: Model) -> tuple[str, str]:
     - `ValueError` naming an unsupported operation of JAX, and the function that needs it.
     """
     like = {"t": 0.0, "along": 0.0, "p": model.scene, "y": model.y, "m": model.mode, "fired": model.mode}
-    like |= {"dp": model.scene, "dy": model.y, "tol": jnp.zeros(3)}
+    like |= {"dp": model.scene, "dy": model.y, "tol": jnp.zeros(3), "dense": 0.0}
     outputs = sum(int(np.prod(shape)) for shape in series_of(model).values())
     like["seed"] = jnp.zeros(_size(model.y) + model.modes + outputs)
     prototypes, functions = [], []

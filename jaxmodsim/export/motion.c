@@ -345,8 +345,7 @@ int motion_fire(Motion *c) {
       return 0;
     }
     memcpy(y, s->y, sizeof y), memcpy(mode, s->mode, sizeof mode);
-    if (dense) model_settle(s->t, s->numbers, c->tolerances, s->fired, s->y, s->mode);
-    else model_switch(s->t, s->numbers, c->tolerances, s->fired, s->y, s->mode);
+    model_switch(s->t, s->numbers, c->tolerances, s->fired, dense, s->y, s->mode);
     if (CONTACTS && (memcmp(mode, s->mode, sizeof mode) || memcmp(y, s->y, sizeof y))) motion_project(c, s->y);
     ++s->resets, s->last = s->t, c->linearised = 0;
     if (dense) {

@@ -74,7 +74,7 @@ def _guards(t: Array, y: State, scene: Scene, mode: Array) -> Float[Array, " mod
 
 
 _field = jax.jit(vector_field)
-_switch = jax.jit(switch)
+_switch = jax.jit(switch, static_argnames="holds")
 
 
 def first_modes(t: Array, y: State, scene: Scene) -> tuple[State, Float[Array, " modes"]]:
@@ -85,7 +85,8 @@ def first_modes(t: Array, y: State, scene: Scene) -> tuple[State, Float[Array, "
 
 def settle(t: Array, y: State, scene: Scene, mode: Array) -> tuple[State, Float[Array, " modes"]]:
     """State and modes at a sample, where inputs may jump."""
-    return _switch(t, y, scene, mode, _guards(t, y, scene, mode) < 0, jnp.asarray(_REST, y.q.dtype))
+    fired, rest = _guards(t, y, scene, mode) < 0, jnp.asarray(_REST, y.q.dtype)
+    return _switch(t, y, scene, mode, fired, rest, jnp.zeros((), bool), False)
 
 
 def pass_modes(
@@ -138,7 +139,8 @@ def pass_modes(
         late = jnp.where(lands, late / jnp.maximum(jnp.sum(first), 1), 0.0)
         before = jtu.tree_map(lambda y, f: y + late * f, y1, slope)
         instant, left = t1 + late, at.left - length - late
-        after, mode = _switch(instant, before, scene_at(instant), at.mode, fired & lands, rest)
+        never = jnp.zeros((), bool)
+        after, mode = _switch(instant, before, scene_at(instant), at.mode, fired & lands, rest, never, False)
         after = jtu.tree_map(lambda a, b: jnp.where(lands, a, b), after, before)
 
         lower, upper = jnp.where(over, at.lower, length), jnp.where(over, length, at.upper)
