@@ -54,6 +54,17 @@ def switched_spring() -> jms.Scene:
     return jms.Scene(mass, {"m": 1.0, "f": 0.0, "k": 4.0}, (spring, pull))
 
 
+def end_stops() -> jms.Scene:
+    """A mass between two stops, under a sine force."""
+
+    def lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        return 0.5 * qd[0] ** 2 + p["f"] * jnp.sin(3.0 * t) * q[0]
+
+    lower = jms.Contact(lambda t, q, p: q[0] + 0.1, restitution=0.5, name="lower")
+    upper = jms.Contact(lambda t, q, p: 0.1 - q[0], restitution=0.5, name="upper")
+    return jms.Scene(lagrangian, {"f": 2.0}, constraints=(lower, upper))
+
+
 def skate() -> jms.Scene:
     """A blade on a slope, which moves only along its direction q[2]."""
 
@@ -80,13 +91,14 @@ CASES: dict[str, Callable[[], tuple[Any, Any, Any, float, float, float]]] = {
     ),
 }
 NAMES = ["box", "belt", "ball", "pendulum", "crank"]
-# Friction in the plane, a switch, and a velocity constraint; validation and derivatives are as above.
+# Friction in the plane, a switch, two stops, and a velocity constraint; validation and derivatives are as above.
 CASES |= {
     "puck": lambda: (puck(), [0.0, 0.0], [3.0, 4.0], 10.0, 1e-7, 0.0),
     "switch": lambda: (switched_spring(), [-1.0], [1.0], 6.0, 1e-7, 1e-6),
+    "stops": lambda: (end_stops(), [0.0], [0.3], 3.0, 1e-7, 0.0),
     "skate": lambda: (skate(), [0.0, 0.0, 0.0], [1.0, 0.0, 1.0], 3.0, 1e-7, 0.0),
 }
-OTHERS = ["puck", "switch", "skate"]
+OTHERS = ["puck", "switch", "stops", "skate"]
 
 
 @functools.cache
