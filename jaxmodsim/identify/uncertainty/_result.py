@@ -29,7 +29,7 @@ _UNCERTAIN, _ALIKE = 0.1, 0.98
 # Relative standard error from which a parameter is undetermined; number of pairs that are named.
 _UNKNOWN, _PAIRS = 0.5, 4
 # Share of the scatter of a channel from which the RMSE is that of a constant.
-_FOLLOWS = 0.95
+_FOLLOWS = 0.9
 # Excess of the mean square error over the noise from sample to sample that is reported: at least this share, and so
 # many times one over the root of the number of samples, which is four standard deviations of the ratio.
 _EXCESS, _SCATTER = 0.2, 15.0
@@ -300,8 +300,8 @@ def _of_the_search(result: FitResult) -> list[str]:
         scatter = np.sqrt(np.mean(np.concatenate([x - np.mean(x) for x in columns]) ** 2)) if columns else 0.0
         if columns and rmse > _FOLLOWS * scatter > 0:
             sentences.append(
-                f"{channel}: the model follows nothing of the record; its RMSE of {rmse:.2g} is no less than that of a"
-                f" constant, {scatter:.2g}. Check column, sign and unit of the input."
+                f"{channel}: the model follows nothing of the record; its RMSE of {rmse:.2g} is hardly less than that"
+                f" of a constant, {scatter:.2g}, if at all. Check column, sign and unit of the input."
             )
     return sentences
 
