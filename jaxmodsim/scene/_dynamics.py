@@ -250,7 +250,7 @@ class Dynamics(NamedTuple):
         fired: Bool[Array, " n"],
         mode: Float[Array, " n"],
         rest: Scalar,
-        held: Bool[Array, " n"] | None = None,
+        held: Bool[Array, " n"] | None,
     ) -> tuple[State, Float[Array, " n"]]:
         """State and modes of the friction elements after the guards that `fired`.
 
@@ -388,7 +388,7 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
 
     qdd, minv_jt = moves[:, 0], moves[:, 1:].T
     along, loads, least_mobility = jnp.concatenate(directions), None, None
-    if yields is not None:
+    if multipliers is not None and yields is not None:
         least_mobility = _ROUNDING * float(jnp.finfo(q.dtype).eps) * jnp.sum(along.T * free[:, 1:], axis=0)
         if scene.loaded:
             loads = _loads(scene, t, y, [len(each) for each in directions], multipliers, yields)
@@ -414,14 +414,13 @@ def _loads(
     t: Array,
     y: State,
     widths: list[int],
-    multipliers: Array | None,
+    multipliers: Float[Array, " m"],
     yields: Float[Array, "m n"],
 ) -> Loads:
     """Normal forces of the constraints that load friction, and their change by the friction forces.
 
     `widths`: the number of rows of each element. `yields`: change of the multipliers with unit forces along the rows.
     """
-    assert multipliers is not None
     names, friction = scene.loaded, (*scene.event_driven.values(), *scene.reaction_loaded.values())
     loaded = [x.load_constraint for x, width in zip(friction, widths, strict=True) for _ in range(width)]
     where = by_constraint(scene, t, y, jnp.arange(multipliers.shape[0]))

@@ -91,12 +91,12 @@ def switch(
     """
     slips, closed, sides = scene.split_modes(mode)
     slip_fired, contact_fired, side_fired = scene.split_modes(fired)
+    held = slip_fired & dense if holds else None
     if scene.switches:
         sides = jnp.where(side_fired, -sides, sides)
     if not scene.contacts:
         if slips.size:
             whole = _join(slips, sides)
-            held = slip_fired & dense if holds else None
             y, slips = from_dynamics(lambda d: d.switch_friction(slip_fired, slips, rest, held), t, y, scene, whole)
         return y, _join(slips, sides)
 
@@ -105,7 +105,6 @@ def switch(
         push = from_dynamics(lambda d: d.contact_forces, t, y, scene, _join(slips, closed, sides))
         contact_fired = contact_fired | ((closed > 0) & (push < 0))
 
-    held = slip_fired & dense if holds else None
     if not holds:
         slip_fired = slip_fired & ~dense
     bounces = _bounces(t, y, scene, _join(slips, closed, sides))

@@ -74,7 +74,8 @@ def _guards(t: Array, y: State, scene: Scene, mode: Array) -> Float[Array, " mod
 
 
 _field = jax.jit(vector_field)
-_switch = jax.jit(switch, static_argnames="holds")
+# Events of a record that is replayed do not accumulate.
+_switch = jax.jit(lambda *instant: switch(*instant, dense=jnp.zeros((), bool), holds=False))
 
 
 def first_modes(t: Array, y: State, scene: Scene) -> tuple[State, Float[Array, " modes"]]:
@@ -85,8 +86,7 @@ def first_modes(t: Array, y: State, scene: Scene) -> tuple[State, Float[Array, "
 
 def settle(t: Array, y: State, scene: Scene, mode: Array) -> tuple[State, Float[Array, " modes"]]:
     """State and modes at a sample, where inputs may jump."""
-    fired, rest = _guards(t, y, scene, mode) < 0, jnp.asarray(_REST, y.q.dtype)
-    return _switch(t, y, scene, mode, fired, rest, jnp.zeros((), bool), False)
+    return _switch(t, y, scene, mode, _guards(t, y, scene, mode) < 0, jnp.asarray(_REST, y.q.dtype))
 
 
 def pass_modes(
@@ -139,8 +139,7 @@ def pass_modes(
         late = jnp.where(lands, late / jnp.maximum(jnp.sum(first), 1), 0.0)
         before = jtu.tree_map(lambda y, f: y + late * f, y1, slope)
         instant, left = t1 + late, at.left - length - late
-        never = jnp.zeros((), bool)
-        after, mode = _switch(instant, before, scene_at(instant), at.mode, fired & lands, rest, never, False)
+        after, mode = _switch(instant, before, scene_at(instant), at.mode, fired & lands, rest)
         after = jtu.tree_map(lambda a, b: jnp.where(lands, a, b), after, before)
 
         lower, upper = jnp.where(over, at.lower, length), jnp.where(over, length, at.upper)
