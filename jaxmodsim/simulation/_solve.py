@@ -149,6 +149,7 @@ def _solver(
             project=functions.project_and_stick if functions.projects or functions.sticks else None,
             samples=samples,
             rtol=functions.tolerances[0],
+            dtmin=_shortest(request),
             enforce=True,
             event_mode=functions.event_mode if sum(functions.widths) > len(functions.widths) else None,
             max_events=request.choices.max_events,

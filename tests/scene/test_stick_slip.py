@@ -366,3 +366,84 @@ def test_an_element_below_a_hundredth_of_the_largest_limit_logs_its_slip_early_a
     # The small one takes 1 % of the load of the large one, and so reaches its limit at 0.505 N, at rest.
     assert (first.effect, second.effect) == ("small", "large")
     np.testing.assert_allclose([first.t, second.t], [0.505, 1.005], atol=1e-12)
+
+
+def test_an_axis_that_starts_at_break_away_slips_at_once() -> None:
+    """Friction is at its limit up to rounding, and the integral of a controller raises the load."""
+    kp, kd, inertia, weight, target, t1 = 300.0, 5.0, 0.4, 9.0, 0.5, 0.05
+    law = jms.Stribeck(Fc=0.7, Fs=2.8, vs=0.28, exponent=2.0)
+    friction = jms.Friction(law, along=lambda q: q[0], name="friction")
+
+    def lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t, p
+        return 0.5 * inertia * qd[0] ** 2 + weight * jnp.cos(target + q[0]) + 0.5 * qd[1] ** 2
+
+    def motor(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        # The integral of the error is a coordinate, of unit mass.
+        del t
+        return jnp.stack([-kp * q[0] - p["ki"] * q[1] - kd * qd[0], qd[0]])
+
+    @jax.jit
+    @jax.vmap
+    def slips(x: Any, ki: Any, integral: Any) -> Any:
+        scene = jms.Scene(lagrangian, {"ki": ki}, (jms.AppliedForce(motor), friction))
+        start = jnp.stack([x, integral]), jnp.stack([jnp.zeros_like(x), x])
+        run = jms.simulate(scene, *start, t1, ts=[t1], rtol=1e-10, atol=1e-13, throw=False)
+        return run.q[-1, 0], run.events.t[0]
+
+    rng = np.random.default_rng(0)
+    x = rng.choice([-1.0, 1.0], 128) * 10.0 ** rng.uniform(-4.0, -1.0, 128)
+    ki = 10.0 ** rng.uniform(1.0, 5.0, 128)
+    integral = (-kp * x - weight * np.sin(target + x) + np.sign(x) * 2.8) / ki
+    q, begin = slips(x, ki, integral)
+    # The load is known to about 16 rounding units of its largest term, and rises by ki x.
+    assert np.all((begin >= 0.0) & (begin * ki * np.abs(x) <= 1e-14 * np.maximum(30.0, kp * np.abs(x))))
+    for k in range(0, 128, 8):
+
+        def rates(t: float, y: Any, k: int = k) -> list[float]:
+            del t
+            force = -np.sign(x[k]) * (0.7 + 2.1 * np.exp(-((y[1] / 0.28) ** 2)))
+            load = -kp * y[0] - ki[k] * y[2] - kd * y[1] - weight * np.sin(target + y[0])
+            return [y[1], (load - force) / inertia, y[0]]
+
+        exact = solve_ivp(rates, (0.0, t1), [x[k], 0.0, integral[k]], "DOP853", rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(q[k], exact.y[0, -1], rtol=1e-8, atol=1e-11)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_what_starts_at_its_limit_lets_go_at_once(dtype: str) -> None:
+    """A contact and two friction elements hold all but a rounding, or a little more, of loads that rise slowly or fast.
+
+    The least load that a type resolves is reached within times that are far shorter than its rounding of t1.
+    """
+    t1, limits = 0.5, jnp.array([1.0, 2.0], dtype)
+    load = jms.AppliedForce(lambda t, q, qd, p: p["limit"] - p["short"] + p["rate"] * t)
+
+    def lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t
+        return 0.5 * jnp.sum(qd**2) - p["weight"] * q[0]
+
+    def lifted(params: Any) -> Any:
+        floor = jms.Contact(lambda t, q, p: q[0], restitution=0.5, name="floor")
+        return jms.Scene(lagrangian, params | {"weight": 9.81, "limit": jnp.array([9.81], dtype)}, (load,), (floor,))
+
+    def dragged(params: Any) -> Any:
+        elements = (jms.Friction(jms.Coulomb(limits[i]), along=lambda q, i=i: q[i], name="ab"[i]) for i in (0, 1))
+        return jms.Scene(lagrangian, params | {"weight": 0.0, "limit": limits}, (load, *elements))
+
+    rng = np.random.default_rng(0)
+    units = float(jnp.finfo(dtype).eps) * rng.choice([0.0, 0.1, 1.0, 8.0, 80.0], 128)
+    rate = 10.0 ** rng.uniform(-1.0, 5.0, 128)
+    params = {"short": jnp.asarray(units, dtype), "rate": jnp.asarray(rate, dtype)}
+    for make, dof in ((lifted, 1), (dragged, 2)):
+
+        @jax.jit
+        @jax.vmap
+        def end(params: Any, make: Any = make, dof: int = dof) -> Any:
+            rest, rtol = jnp.zeros(dof, dtype), 1e-5 if dtype == "float32" else 1e-9
+            run = jms.simulate(make(params), rest, rest, t1, ts=[t1], rtol=rtol, atol=1e-2 * rtol, throw=False)
+            return run.q[-1]
+
+        exact = rate * (t1 - units / rate) ** 3 / 6.0
+        # Rounding of a load of 9.81 N is 8 units, and delays the least rates by that.
+        np.testing.assert_allclose(end(params), np.stack([exact] * dof, 1), rtol=1e-3 if dtype == "float32" else 1e-11)

@@ -157,7 +157,9 @@ class EventController(AbstractControllerWrapper):
         accept = fusion_barrier(jnp.where(accept, 1.0, jnp.zeros_like(length)), opaque_one(length)) > 0.5
         landed = landed & accept
 
-        shortest = jnp.maximum(4.0 * float(jnp.finfo(length.dtype).eps) * jnp.abs(t0), _SHORTEST * length)
+        dtmin = getattr(self.controller, "dtmin", None)
+        resolution = jnp.maximum(float(jnp.finfo(length.dtype).eps) * jnp.abs(t0), 0.0 if dtmin is None else dtmin)
+        shortest = jnp.maximum(4.0 * resolution, _SHORTEST * length)
         unlimited = proposed > _UNLIMITED * length
         usual = jnp.where(accept & ~unlimited, proposed, old.usual)
         step = jnp.minimum(proposed, jnp.clip(_SHRINK * factor, _SMALLEST, _LARGEST) * length)

@@ -22,7 +22,7 @@ from ._state import ACCUMULATION, ONGOING, TOO_MANY, EventLog, EventMemory, Even
 # Landing distance, the largest distance of the end of a step from a root, as a fraction of the last steps, and of the
 # time since the last event. The state is carried over that distance with an error of its third power.
 _LANDING, _LANDING_OF_INTERVAL = 1e-5, 1e-2
-# A step that is at most this part of the last ones counts as one without length.
+# A step that is at most this part of the last ones counts as one without length: guards vary by their rounding.
 _SHORT = 1e-6
 # Events accumulate where the longest of the last intervals is below this part of the time since the start, times the
 # square root of the rounding unit.
@@ -130,6 +130,8 @@ class EventSolver(AbstractSolverWrapper):
     - `enforce`: whether the guards are conditions that have to hold, instead of crossings.
     - `samples`: a `SampledJumps` if `args` hold sampled values.
     - `rtol`: the part of its largest magnitude in a step by which a guard may fall below zero, and return, undetected.
+    - `dtmin`: that of the controller, which ends the run at shorter steps. Events are located to four of it, or to four
+      rounding units of time.
     - `event_mode`: `event_mode(mode)` -> the part of the mode that an event changes. A reset that changes only other
       parts, such as the choice of coordinates, is no event. By default all of it.
     - `max_events`: limit of the number of events, > 0.
@@ -179,6 +181,7 @@ class EventSolver(AbstractSolverWrapper):
     project: Callable[..., EventState] | None = None
     samples: SampledJumps | None = None
     rtol: Real = 1e-6
+    dtmin: Real = 0.0
     event_mode: Callable[[PyTree], PyTree] | None = None
     carries_on: bool = eqx.field(default=False, static=True)
     enforce: bool = eqx.field(default=False, static=True)
@@ -263,22 +266,27 @@ class EventSolver(AbstractSolverWrapper):
         if self.project is not None:
             y1, error = projected(y1, error, self.project(t1, y0._replace(y=y1), args).y)
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
-        unit = opaque_one(_constant(t1 - t0))
-        # Near t0 = 0 the resolution of time is that of the step itself.
         length = _constant(t1 - t0)
-        resolution = 4.0 * float(jnp.finfo(length.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+        unit = opaque_one(length)
+        eps = float(jnp.finfo(length.dtype).eps)
+        resolution = 4.0 * jnp.maximum(eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1)), _constant(jnp.asarray(self.dtmin)))
         seen, end, root = self._look(path, (t0, t1), y0._replace(y=y1), memory, args, resolution)
         # At rest steps grow without limit, and their length says nothing about the motion after the event.
         measure = jnp.minimum(length, _GROW * memory.pace)
         jumps = None if self.samples is None else self.samples.at(t1, length)
-        landing = self._land(seen, (end, root), (t1, length, resolution, y0.t), (measure, memory.pace), jumps)
+        # Before the first event, intervals begin a step before the run: an event may be as close to t0 as rounding.
+        last = jnp.where(memory.resets == 0, memory.begin, y0.t)
+        shortest = jnp.maximum(_SHORT * memory.pace, 2.0 * _constant(resolution))
+        steps = jnp.maximum(measure, memory.pace), shortest
+        landing = self._land(seen, (end, root), (t1, length, resolution, last), steps, jumps)
         next_root = fusion_barrier(landing.next_root, unit)
         landed = fusion_barrier(_flags(landing.landed, next_root), unit)
         landing = landing._replace(next_root=next_root, landed=landed > 0.5, happens=landed > 0.5)
         if jumps is not None:
             landing = on_jump(landing, jumps)
-        step_factor = jnp.min(jnp.where(landing.fired, seen.landing_factor, seen.step_factor))
-        report = StepReport(landed, landing.next_root, fusion_barrier(step_factor, unit))
+        factor = jnp.min(jnp.where(landing.fired, seen.landing_factor, seen.step_factor))
+        factor = jnp.maximum(factor, jnp.where(length <= shortest, 1.0, 0.0))
+        report = StepReport(landed, landing.next_root, fusion_barrier(factor, unit))
         pace = jnp.maximum(measure, _FORGET_STEPS * memory.pace)
         at_end = y0._replace(y=y1, report=report), memory._replace(guard=end, armed=seen.armed, pace=pace)
         (state1, memory), (t_event, slope) = jax.lax.cond(
@@ -308,11 +316,11 @@ class EventSolver(AbstractSolverWrapper):
         values, atol, root = jax.lax.map(
             lambda at: self._guards_and_limits(at[0], state._replace(y=at[1]), args), looks
         )
-        unit = opaque_one(_constant(t1 - t0))
+        length = _constant(t1 - t0)
+        unit = opaque_one(length)
         one, middle, two, end = fusion_barrier(_constant([*values]), unit)
         # If limits vanish at one end of the step, the other end gives their size.
         tolerances = jnp.asarray(_constant(self.rtol), end.dtype), _constant(jnp.maximum(atol[0], atol[-1]))
-        length = _constant(t1 - t0)
         blur = _constant(resolution) / jnp.where(length > 0, length, 1.0)
         seen = scan_guards((memory.guard, one, two, end), middle, memory.armed, tolerances, blur, unit)
         return seen, end, _constant(root[-1])
@@ -322,15 +330,15 @@ class EventSolver(AbstractSolverWrapper):
         seen: GuardScan,
         ends: tuple[Float[Array, " guards"], Float[Array, " guards"]],
         step: tuple[Array, Array, Array, Array],
-        paces: tuple[Array, Array],
+        steps: tuple[Array, Array],
         jumps: Bool[Array, ""] | None,
     ) -> Landing:
         """Which guards fire at the end of a step, and the end of the next step.
 
         `ends`: values of the guards there, and at events. `step`: its end, its length, the resolution of time and the
-        time of the last event. `paces`: the length of the last steps, with this one and without.
+        time of the last event. `steps`: the length of this or the last steps, and that of one that counts as none.
         """
-        (end, root), (t1, length, resolution, last), (measure, pace) = ends, step, paces
+        (end, root), (t1, length, resolution, last), (longest, shortest) = ends, step, steps
         divisor, tiny = jnp.where(length > 0, length, 1.0), float(jnp.finfo(length.dtype).tiny)
 
         def landing(place: Array) -> Array:
@@ -338,11 +346,10 @@ class EventSolver(AbstractSolverWrapper):
             slope, bend = seen.slopes(jnp.minimum(place, 1.0))
             blur = jnp.abs(slope) + jnp.sqrt(jnp.maximum(slope * slope + 2.0 * root * jnp.abs(bend), tiny))
             since = _constant(t1 - last) + (jnp.minimum(place, 2.0) - 1.0) * length
-            near = jnp.minimum(_LANDING * jnp.maximum(measure, pace), _LANDING_OF_INTERVAL * since)
+            near = jnp.minimum(_LANDING * longest, _LANDING_OF_INTERVAL * since)
             return jnp.maximum(jnp.maximum(near, length * 2.0 * root / blur), _constant(resolution))
 
         near = landing(jnp.ones_like(length))
-        shortest = jnp.maximum(_SHORT * pace, 2.0 * _constant(resolution))
         if jumps is not None:  # an event before a jump is another event
             near = jnp.where(jumps, _constant(resolution), near)
         near = near / divisor
@@ -414,7 +421,8 @@ class EventSolver(AbstractSolverWrapper):
         ends = dense & (not self.carries_on)
         status = jnp.where(ends, jnp.asarray(ACCUMULATION, spread.dtype), ONGOING)
         # A reset that changes nothing is no event.
-        happened = _differ(*zip((passage.before, y), self._event_modes(state.mode, mode), strict=True))
+        part = (lambda mode: mode) if self.event_mode is None else self.event_mode
+        happened = _differ((passage.before, part(state.mode)), (y, part(mode)))
         events, index = jnp.where(happened, state.events + 1.0, state.events), jnp.where(happened, state.events, -1.0)
         status = jnp.where((status == ONGOING) & (events > self.max_events), TOO_MANY, status)
         clear = _constant(values) > jnp.where(fired, LATITUDE * jnp.abs(rate) * near, 0.0)
@@ -440,22 +448,14 @@ class EventSolver(AbstractSolverWrapper):
         chatters = jnp.any(fired) if self.event_mode is None else jnp.any(fired) & ~_differ(state.mode, mode)
         return jtu.tree_map(lambda a, b: jnp.where(happened | chatters, a, b), after_reset, passed), event
 
-    def _event_modes(self, *modes: PyTree) -> tuple[PyTree, ...]:
-        """The parts of the modes that an event changes."""
-        return modes if self.event_mode is None else tuple(self.event_mode(mode) for mode in modes)
-
 
 def _spread(t_event: Array, last: Array, memory: EventMemory) -> tuple[Array, Bool[Array, ""]]:
-    """The longest of the last intervals between events, the latest one since `last`, and whether they accumulate."""
-    since = t_event - last
+    """The longest of the last intervals between events, and whether it vanishes against the run or rounding."""
+    since, t = t_event - last, _constant(t_event)
     spread = _constant(jnp.where(memory.resets == 0, since, jnp.maximum(since, _FORGET_INTERVALS * memory.spread)))
-    return spread, _accumulates(spread, _constant(t_event), memory.begin) & (memory.resets >= _FEWEST)
-
-
-def _accumulates(spread: Array, t: Array, begin: Array) -> Array:
-    """Whether intervals of at most `spread` between events vanish on the scale of the run, or below rounding of `t`."""
     eps = float(jnp.finfo(spread.dtype).eps)
-    return spread <= jnp.maximum(_ACCUMULATION * eps**0.5 * (t - begin), 64.0 * eps * jnp.abs(t))
+    vanishes = spread <= jnp.maximum(_ACCUMULATION * eps**0.5 * (t - memory.begin), 64.0 * eps * jnp.abs(t))
+    return spread, vanishes & (memory.resets >= _FEWEST)
 
 
 def _held(tree: PyTree) -> PyTree:
