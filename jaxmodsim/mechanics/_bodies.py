@@ -34,30 +34,42 @@ class AbstractBody(eqx.Module):
 
     def __add__(self, other: Any) -> "Bodies":
         """The sum of both; a sum of sums has their parts side by side."""
-        return Bodies((*_parts(self), *_parts(other)))
+        return _sum(self, other)
 
     def __radd__(self, other: Any) -> "AbstractBody":
         """The sum of both; `sum` starts from zero, which adds nothing."""
-        return self if other == 0 else Bodies((*_parts(other), *_parts(self)))
+        return self if other == 0 else _sum(other, self)
 
 
 class Bodies(AbstractBody):
-    """A sum of Lagrangians."""
+    """A sum of Lagrangians, by name."""
 
-    parts: tuple[Callable[..., Any], ...]
+    parts: dict[str, Callable[..., Any]]
 
     def __call__(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """Sum of the Lagrangians [J]."""
-        total = self.parts[0](t, q, qd, params)
-        for part in self.parts[1:]:
-            total = total + part(t, q, qd, params)
-        return total
+        first, *others = (self.parts[name](t, q, qd, params) for name in sorted(self.parts))
+        for each in others:
+            first = first + each
+        return first
 
 
-def _parts(lagrangian: Any) -> tuple[Callable[..., Any], ...]:
-    if isinstance(lagrangian, Bodies):
-        return lagrangian.parts
-    return (as_function(lagrangian, name="The term added to a body"),)
+def _sum(*terms: Any) -> Bodies:
+    """The sum; of terms with one name, the second is called `name_2`."""
+    parts: dict[str, Callable[..., Any]] = {}
+    for term in terms:
+        for name, part in term.parts.items() if isinstance(term, Bodies) else [(_name(term), _term(term))]:
+            names = (name, *(f"{name}_{i}" for i in range(2, len(parts) + 2)))
+            parts[next(each for each in names if each not in parts)] = part
+    return Bodies(parts)
+
+
+def _name(term: Any) -> str:
+    name = getattr(term, "name", None) or getattr(term, "__name__", type(term).__name__)
+    return name if name.isidentifier() else "term"
+
+
+_term = partial(as_function, name="The term added to a body")
 
 
 class PointMass(AbstractBody):
@@ -66,6 +78,7 @@ class PointMass(AbstractBody):
     m: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="point_mass m", allowed=_MASS))
     position: PositionFn = eqx.field(converter=partial(as_position_fn, name="point_mass position"))
     gravity: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="point_mass gravity", allowed=_GRAVITY))
+    name: str = eqx.field(static=True)
 
     def __call__(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """`m v^2/2 - m g z` [J]."""
@@ -98,7 +111,7 @@ class PointMass(AbstractBody):
         return safe_norm(self.reaction(t, q, qd, params))
 
 
-def point_mass(m: Any, position: Any, gravity: Any = _ON_EARTH) -> PointMass:
+def point_mass(m: Any, position: Any, gravity: Any = _ON_EARTH, name: str = "point_mass") -> PointMass:
     """Lagrangian of a point mass whose position is a function of the coordinates.
 
     Bodies add up: `jms.point_mass(...) + jms.rigid_body(...) + spring`, with `spring(t, q, qd, params)` any Lagrangian.
@@ -108,6 +121,7 @@ def point_mass(m: Any, position: Any, gravity: Any = _ON_EARTH) -> PointMass:
     - `m`: mass [kg], > 0, or a function `m(params)`, so that several functions can share a number in `params`.
     - `position`: `position(q)` or `position(q, params)` in space [m], shape `[3]`, z upwards.
     - `gravity`: acceleration [m/s^2] along -z, or a function of `params`; by default 9.81.
+    - `name`: in a sum of bodies, the numbers of this one are `lagrangian.parts.NAME.m` and so on.
 
     **Returns:**
 
@@ -131,7 +145,7 @@ def point_mass(m: Any, position: Any, gravity: Any = _ON_EARTH) -> PointMass:
     0.2988 J
     ```
     """
-    return PointMass(m, position, gravity)
+    return PointMass(m, position, gravity, name)
 
 
 def _inertia(value: object) -> ScalarOrFn:
@@ -156,6 +170,7 @@ class RigidBody(AbstractBody):
     position: PositionFn = eqx.field(converter=partial(as_position_fn, name="rigid_body position"))
     orientation: PositionFn = eqx.field(converter=partial(as_position_fn, name="rigid_body orientation"))
     gravity: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="rigid_body gravity", allowed=_GRAVITY))
+    name: str = eqx.field(static=True)
 
     def __call__(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """`m v^2/2 + w I w/2 - m g z` [J]."""
@@ -173,7 +188,9 @@ class RigidBody(AbstractBody):
         return 0.5 * m * jnp.sum(v**2) + spin - m * self.gravity(params) * x[2]
 
 
-def rigid_body(m: Any, inertia: Any, position: Any, orientation: Any, gravity: Any = _ON_EARTH) -> RigidBody:
+def rigid_body(
+    m: Any, inertia: Any, position: Any, orientation: Any, gravity: Any = _ON_EARTH, name: str = "rigid_body"
+) -> RigidBody:
     """Lagrangian of a rigid body, from the motion of its centre of mass and of a body-fixed frame.
 
     **Arguments:**
@@ -185,7 +202,7 @@ def rigid_body(m: Any, inertia: Any, position: Any, orientation: Any, gravity: A
     - `position`: `position(q)` or `position(q, params)` of the centre of mass [m], shape `[3]`, z upwards.
     - `orientation`: `orientation(q)` or `orientation(q, params)`: the rotation matrix, shape `[3, 3]`, with the axes of
       the body frame as columns; or, for plane motion, the angle [rad] about a fixed axis.
-    - `gravity`: acceleration [m/s^2] along -z, or a function of `params`; by default 9.81.
+    - `gravity`, `name`: see `point_mass`.
 
     **Returns:**
 
@@ -211,7 +228,7 @@ def rigid_body(m: Any, inertia: Any, position: Any, orientation: Any, gravity: A
     [[0.6667]]
     ```
     """
-    return RigidBody(m, inertia, position, orientation, gravity)
+    return RigidBody(m, inertia, position, orientation, gravity, name)
 
 
 def body_rates(turn: Float[Array, "3 3"], rate: Float[Array, "3 3"]) -> Float[Array, "3"]:

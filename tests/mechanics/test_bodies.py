@@ -206,12 +206,19 @@ def test_an_inertia_tensor_and_an_angle() -> None:
     )
 
 
-def test_numbers_of_a_sum_are_named_by_the_place_of_their_body() -> None:
+def test_numbers_of_a_sum_have_the_names_of_their_bodies() -> None:
     many: Any = sum  # type checkers know of sums of numbers
-    body = point_mass(1.0, lambda q: jnp.stack([q[0], 0.0 * q[0], 0.0 * q[0]]))
-    for total in (body + body + body, body + (body + body), many([body, body, body])):
-        names = scene_numbers(Scene(total))
-        assert list(names) == [f"lagrangian.parts.{i}.{x}" for i in range(3) for x in ("m", "gravity")]
+    line = lambda q: jnp.stack([q[0], 0.0 * q[0], 0.0 * q[0]])  # noqa: E731
+    body, bob = point_mass(1.0, line), point_mass(2.0, line, name="bob")
+    rod = rigid_body(3.0, 0.1, line, lambda q: q[0])
+    for total in (body + bob + rod + body, body + (bob + rod) + body, many([body, bob, rod, body])):
+        numbers = scene_numbers(Scene(total))
+        masses = {"bob": 2.0, "point_mass": 1.0, "point_mass_2": 1.0, "rigid_body": 3.0}
+        assert {k: float(x) for k, x in numbers.items() if k.endswith("m")} == {
+            f"lagrangian.parts.{name}.m": m for name, m in masses.items()
+        }
+    # Terms without a name that can be written are terms.
+    assert list((bob + (lambda t, q, qd, p: 0.0 * q[0]) + bob).parts) == ["bob", "term", "bob_2"]
 
 
 def test_bodies_and_springs_add_up() -> None:
