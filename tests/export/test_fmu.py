@@ -1,8 +1,11 @@
 """Scenes as FMUs: validated and run by FMPy in both modes, and compared with `simulate` and JAX."""
 
 import functools
+import importlib.util
+import json
 import shutil
 import subprocess
+import sys
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
@@ -26,6 +29,11 @@ OWN = _compile.own_platform()
 needs_fmpy = pytest.mark.skipif(
     "jaxprs" not in AVAILABLE or _compile.compiler_of(OWN) is None,
     reason="needs the programs that JAX traces, and a C compiler: ziglang, cc, gcc or clang",
+)
+# The wheel of Ecos leaves its library for threads to another wheel, which puts it here.
+THREADS = Path(sys.prefix) / "lib" / "libtbb.so.12"
+needs_ecos = pytest.mark.skipif(
+    importlib.util.find_spec("ecospy") is None or not THREADS.exists(), reason="needs ecospy and tbb, wheels for Linux"
 )
 fmpy = pytest.importorskip("fmpy", reason="needs FMPy, which runs FMUs")
 
@@ -183,6 +191,39 @@ def test_both_modes_agree_with_simulate(name: str, kind: str) -> None:
     for effect, force in exact.forces.items():
         series = rows[effect if force.ndim == 1 else f"{effect}[0]"][at]
         np.testing.assert_allclose(series[-1], np.ravel(force[-1])[0], rtol=1e-3, atol=1e-3)
+
+
+# In a process of its own, which may crash: arguments are the library for threads, the file, the step and names.
+ECOS = """
+import ctypes, json, sys
+threads, path, step, *names = sys.argv[1:]
+ctypes.CDLL(threads, mode=ctypes.RTLD_GLOBAL)
+from ecospy import EcosSimulation, EcosSimulationStructure
+parts = EcosSimulationStructure()
+parts.add_model("one", path)
+simulation = EcosSimulation(structure=parts, step_size=float(step))
+simulation.init()
+rows = [[simulation.get_real(f"one::{name}") for name in names]]
+for _ in range(100):
+    simulation.step()
+    rows.append([simulation.get_real(f"one::{name}") for name in names])
+simulation.terminate()
+print("rows", json.dumps(rows))
+"""
+
+
+@needs_fmpy
+@needs_ecos
+@pytest.mark.parametrize("name", [*NAMES, *OTHERS])
+def test_another_importer_agrees_with_simulate(name: str) -> None:
+    """Ecos, a program in C++ that reads FMI 3.0 without any code of FMPy."""
+    _, q0, _, t1, error, _ = CASES[name]()
+    path, description = exported(name)
+    names = [each.name for each in description.modelVariables if each.causality == "output"][: len(q0)]
+    command = [sys.executable, "-c", ECOS, str(THREADS), str(path), repr(t1 / 100), *names]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=100)
+    rows = json.loads(done.stdout.partition("rows ")[2])
+    np.testing.assert_allclose(rows, tight_run(name).q, atol=error, rtol=0)
 
 
 @needs_fmpy
